@@ -1,0 +1,236 @@
+"""The bundles that stages pass to each other: shape, dtype, frame and unit of every field.
+
+N Gaussians, K spherical-harmonic coefficients a channel, D image channels, M (tile, Gaussian) pairs, H x W pixels.
+Arrays are C-contiguous; floating fields of one bundle share one dtype, float32 or float64, and every stage returns the
+dtype that it is given. World and camera frames are right-handed; camera axes are OpenCV's: x right, y down, z forward.
+Image coordinates are in pixels, x right and y down, and the centre of the top-left pixel is (0.5, 0.5).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.floating]
+Ints = NDArray[np.integer]
+Bools = NDArray[np.bool_]
+
+
+class Gaussians(NamedTuple):
+    """A population of Gaussians: the trained parameters, before their activations.
+
+    Gradients, Adam moments and learning rates share this type. An extension adds fields of shape [N, ...] in a NamedTuple
+    of its own.
+    """
+
+    means: Floats
+    """[N, 3] centres, world frame, world units."""
+    quats: Floats
+    """[N, 4] rotations world_from_gaussian, wxyz, not normalised."""
+    log_scales: Floats
+    """[N, 3] natural logarithm of the standard deviations along the Gaussian's axes."""
+    opacity_logits: Floats
+    """[N] opacity = 1 / (1 + exp(-logit))."""
+    sh_dc: Floats
+    """[N, 3] spherical-harmonic coefficient of degree 0, RGB; colour = 0.5 + SH_C0 * sh_dc + ..."""
+    sh_rest: Floats
+    """[N, K-1, 3] coefficients of degree 1 and above; K = (degree + 1)^2, so K - 1 is 0, 3, 8 or 15."""
+
+
+class Camera(NamedTuple):
+    """A pinhole camera: x_cam = R x_world + t; u = fx x/z + cx; v = fy y/z + cy."""
+
+    cam_from_world_R: Floats
+    """[3, 3] rotation."""
+    cam_from_world_t: Floats
+    """[3] translation, world units."""
+    fx: float
+    """Focal length, pixels."""
+    fy: float
+    """Focal length, pixels."""
+    cx: float
+    """Principal point, pixels; width / 2 when centred."""
+    cy: float
+    """Principal point, pixels."""
+    width: int
+    """Image width, pixels."""
+    height: int
+    """Image height, pixels."""
+
+
+class Projection(NamedTuple):
+    """What one camera sees of each Gaussian: its footprint in the image. Culled Gaussians have zeros everywhere."""
+
+    means2d: Floats
+    """[N, 2] projected centres, pixels."""
+    depths: Floats
+    """[N] camera z of the means, world units."""
+    conics: Floats
+    """[N, 3] inverse projected covariance (a, b, c) of a dx^2 + 2 b dx dy + c dy^2, px^-2."""
+    opacities: Floats
+    """[N] opacities, multiplied by the antialiasing compensation where the conventions ask for it."""
+    radii: Ints
+    """[N, 2] int32 half-extents along x and y, pixels; 0 where culled."""
+    boxes: Ints
+    """[N, 4] int32 pixels x0, y0, x1, y1 (half-open, inside the image) that the Gaussian may touch; empty where culled."""
+
+
+class ProjectionGradient(NamedTuple):
+    """Gradient of the loss with respect to the differentiable fields of a :class:`Projection`."""
+
+    means2d: Floats
+    """[N, 2] per pixel."""
+    depths: Floats
+    """[N]."""
+    conics: Floats
+    """[N, 3]; the entry of b is the derivative by b itself, which stands twice in the symmetric matrix."""
+    opacities: Floats
+    """[N]."""
+
+
+class PrimitiveGradient(NamedTuple):
+    """Gradient of the loss with respect to what :func:`project` takes."""
+
+    means: Floats
+    """[N, 3]."""
+    quats: Floats
+    """[N, 4]."""
+    scales: Floats
+    """[N, 3] by the activated scales."""
+    opacities: Floats
+    """[N] by the activated opacities."""
+    cam_from_world_R: Floats
+    """[3, 3] by the nine entries, unconstrained."""
+    cam_from_world_t: Floats
+    """[3]."""
+
+
+class SHGradient(NamedTuple):
+    """Gradient of the loss with respect to what :func:`sh_colors` takes."""
+
+    means: Floats
+    """[N, 3] through the viewing direction."""
+    sh_dc: Floats
+    """[N, 3]."""
+    sh_rest: Floats
+    """[N, K-1, 3]; zero above the active degree."""
+    cam_from_world_R: Floats
+    """[3, 3] through the camera centre -R^T t."""
+    cam_from_world_t: Floats
+    """[3]."""
+
+
+class TileGrid(NamedTuple):
+    """How an image is cut into tiles; the last column and row of tiles may hang over the edge."""
+
+    width: int
+    """Image width, pixels."""
+    height: int
+    """Image height, pixels."""
+    tile_width: int
+    """Pixels."""
+    tile_height: int
+    """Pixels."""
+
+    @property
+    def n_tiles_x(self) -> int:
+        """Number of tile columns."""
+        return -(-self.width // self.tile_width)
+
+    @property
+    def n_tiles_y(self) -> int:
+        """Number of tile rows."""
+        return -(-self.height // self.tile_height)
+
+
+class TileBins(NamedTuple):
+    """For every tile the Gaussians that may touch it, front to back; tiles in row-major order."""
+
+    gaussian_ids: Ints
+    """[M] int32, ordered by (tile, depth, index)."""
+    tile_offsets: Ints
+    """[n_tiles + 1] int64; tile t owns gaussian_ids[tile_offsets[t]:tile_offsets[t + 1]]."""
+    grid: TileGrid
+    """The tiling."""
+
+
+class BlendStats(NamedTuple):
+    """Per-Gaussian statistics of one view's compositing (Mini-Splatting); w = alpha T is the weight of a hit."""
+
+    blend_weight_sum: Floats
+    """[N] sum of w over the pixels."""
+    hit_count: Ints
+    """[N] int32 number of pixels with a blended hit."""
+    dominant_count: Ints
+    """[N] int32 number of pixels at which the Gaussian has the largest w (the front-most of equals)."""
+    dominant_ids: Ints
+    """[H, W] int32 Gaussian of the largest w; -1 where nothing was hit."""
+
+
+class RenderOutput(NamedTuple):
+    """One composited view."""
+
+    image: Floats
+    """[H, W, D] blended channels, background included."""
+    alpha: Floats
+    """[H, W] accumulated opacity, 1 - final transmittance."""
+    median_depth: Floats | None
+    """[H, W] depth of the hit that takes the transmittance below one half, 0 where none does; None if not asked for."""
+    stats: BlendStats | None
+    """Blend statistics; None if not asked for."""
+
+
+class CompositeGradient(NamedTuple):
+    """Gradient of the loss with respect to what :func:`composite` takes."""
+
+    means2d: Floats
+    """[N, 2] per pixel."""
+    conics: Floats
+    """[N, 3]; see :class:`ProjectionGradient`."""
+    opacities: Floats
+    """[N]."""
+    colors: Floats
+    """[N, D]."""
+    background: Floats
+    """[D]."""
+
+
+class SurfacePoints(NamedTuple):
+    """Where each pixel's ray meets its dominant Gaussian (Mini-Splatting, depth reinitialisation)."""
+
+    points: Floats
+    """[H, W, 3] world frame; 0 where there is none."""
+    depths: Floats
+    """[H, W] camera z, world units; 0 where there is none or the point lies behind the camera."""
+
+
+class View(NamedTuple):
+    """A photograph with its camera."""
+
+    name: str
+    """File name without its suffix, unique in a scene."""
+    camera: Camera
+    """Camera; its width and height are the image's."""
+    image: NDArray[np.uint8]
+    """[H, W, 3] sRGB as stored in the file; an alpha channel is already composited onto the scene's background."""
+    mask: Bools | None
+    """[H, W] True where the pixel counts in the loss; None where all do."""
+
+
+class Scene(NamedTuple):
+    """Photographs split into training and test views, with the sparse points of structure from motion."""
+
+    name: str
+    """Name for reports."""
+    train_views: tuple[View, ...]
+    """Views that are trained on."""
+    test_views: tuple[View, ...]
+    """Held-out views; may be empty."""
+    points: Floats
+    """[P, 3] float64 SfM points, world frame; P may be 0."""
+    point_colors: NDArray[np.uint8]
+    """[P, 3] sRGB."""
+    background: Floats
+    """[3] in [0, 1], the colour behind everything; black unless the data say otherwise."""
+    extent: float
+    """1.1 x the largest distance of a training camera from their mean, world units: scales position learning rates."""
