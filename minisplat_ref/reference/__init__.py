@@ -1,0 +1,23 @@
+"""The book: every formula of the renderer once, as matrices in NumPy, forward and derivative side by side.
+
+Read the modules in this order; it is that of the papers.
+
+===================  ==============================================================  ============================
+module               what a reader knows afterwards                                  equations
+===================  ==============================================================  ============================
+covariance           how a quaternion and three scales make an ellipsoid             3DGS (6)
+pinhole              where a camera sees a point, and how that moves with the point  EWA splatting (29)
+projection           how the camera flattens an ellipsoid to an ellipse in pixels    3DGS (5), EWA splatting (31)
+extent               which pixels that ellipse can reach                             Mini-Splatting2, gsplat
+spherical_harmonics  how its colour depends on the viewing direction                 3DGS sec. 5.2
+tiling               how ellipses are sorted, tile by tile, front to back            3DGS sec. 6
+hits                 how strongly an ellipse covers a pixel, and what it leaves      3DGS (3), (4)
+compositing          how hits become a pixel, and a pixel's error becomes theirs     3DGS (3)
+depth                where a pixel's ray meets the Gaussian that it mostly shows     Mini-Splatting appendix D
+loss                 how far a rendered picture is from a photograph                 3DGS (7), Wang et al. 2004
+===================  ==============================================================  ============================
+
+Nothing here is written for speed and nothing here is differentiated by a framework. ``v_x`` is the derivative of the
+loss by ``x`` and has its shape; a function ``f_vjp`` maps the derivative by the outputs of ``f`` to that by its inputs.
+Arrays keep the dtype that they come in with.
+"""

@@ -1,0 +1,199 @@
+"""Stage 5: sorted Gaussians are blended front to back into pixels, and a pixel's derivative goes back to them.
+
+3DGS equation (3) with the hits of :mod:`hits`, each of weight ``w_g = alpha_g T_g``::
+
+    image = sum_g w_g c_g + T_end background,   alpha = 1 - T_end = sum_g w_g
+
+Left out: sorting per pixel; the order is that of the tile's list.
+"""
+
+import numpy as np
+
+from minisplat_ref.constants import MEDIAN_TRANSMITTANCE, Conventions
+from minisplat_ref.reference.hits import conic_matrices, goes_on, tile_hits
+from minisplat_ref.types import BlendStats, CompositeGradient, Floats, Projection, RenderOutput, TileBins
+
+
+def composite(
+    projection: Projection,
+    colors: Floats,
+    background: Floats,
+    bins: TileBins,
+    conventions: Conventions,
+    *,
+    with_stats: bool = False,
+    with_median_depth: bool = False,
+) -> RenderOutput:
+    """Blend the Gaussians of every tile, front to back.
+
+    Parameters
+    ----------
+    projection : Projection
+        Footprints, opacities and depths.
+    colors : ndarray of shape (N, D)
+        Any number of channels, also none.
+    background : ndarray of shape (D,)
+        Seen through what transmittance is left.
+    bins : TileBins
+        The Gaussians of each tile, nearest first.
+    conventions : Conventions
+        Clamp, skip and stop thresholds.
+    with_stats : bool
+        Also collect :class:`BlendStats`.
+    with_median_depth : bool
+        Also return the depth at which the transmittance falls below one half.
+
+    Returns
+    -------
+    RenderOutput
+        Image [H, W, D] and alpha [H, W], and what was asked for.
+    """
+    height, width, n = bins.grid.height, bins.grid.width, len(colors)
+    dtype = projection.means2d.dtype
+    image = np.empty((height, width, len(background)), dtype=dtype)
+    alpha = np.empty((height, width), dtype=dtype)
+    median_depth = np.zeros((height, width), dtype=dtype) if with_median_depth else None
+    stats = _no_hits(n, height, width, dtype) if with_stats else None
+    for tile in tile_hits(projection, bins, conventions):
+        ids, ys, xs = tile.ids, tile.ys, tile.xs
+        weights, transmittance = tile.alphas * tile.transmittances[:-1], tile.transmittances[-1]  # [G, P], [P]
+        image[ys, xs] = weights.T @ colors[ids] + transmittance[:, None] * background
+        alpha[ys, xs] = 1 - transmittance
+        if median_depth is not None:
+            is_beyond = tile.transmittances[1:] < MEDIAN_TRANSMITTANCE  # [G, P] from the hit on that crosses one half
+            crossing = np.argmax(is_beyond, axis=0) if len(ids) else np.zeros(len(ys), dtype=int)
+            has_crossing = transmittance < MEDIAN_TRANSMITTANCE
+            median_depth[ys[has_crossing], xs[has_crossing]] = projection.depths[ids[crossing[has_crossing]]]
+        if stats is not None and len(ids):
+            stats.blend_weight_sum[ids] += weights.sum(axis=1)
+            stats.hit_count[ids] += (weights > 0).sum(axis=1, dtype=np.int32)
+            heaviest = np.argmax(weights, axis=0)  # the first, so the front-most, of equals
+            dominant = np.where(weights.max(axis=0) > 0, ids[heaviest], -1)
+            stats.dominant_ids[ys, xs] = dominant
+            np.add.at(stats.dominant_count, dominant[dominant >= 0], 1)
+    return RenderOutput(image, alpha, median_depth, stats)
+
+
+def composite_vjp(
+    projection: Projection,
+    colors: Floats,
+    background: Floats,
+    bins: TileBins,
+    conventions: Conventions,
+    output: RenderOutput,
+    v_image: Floats,
+    v_alpha: Floats,
+) -> CompositeGradient:
+    """Gradient of :func:`composite` by image and alpha.
+
+    For one pixel with ``v = v_image``: alpha is ``1 - T_end``, so the derivative by ``T_end`` is ``v . background -
+    v_alpha``. And ``alpha_g`` multiplies its own light by ``T_g`` and, in every later T, what lies behind by
+    ``1 - alpha_g``::
+
+        v_c_g        = w_g v
+        v_background = T_end v
+        behind_g     = sum_{j > g} w_j (c_j . v) + T_end (v . background - v_alpha)
+        v_alpha_g    = T_g (c_g . v) - behind_g / (1 - alpha_g)
+
+    For one hit with ``alpha = o E``, ``E = exp(-sigma)``, ``sigma = d^T Q d / 2``::
+
+        v_o = E v_alpha_g,  v_sigma = -o E v_alpha_g          both 0 where alpha was clamped
+        v_p = v_sigma Q d
+        v_a = v_sigma dx^2 / 2,  v_b = v_sigma dx dy,  v_c = v_sigma dy^2 / 2
+
+    The skip, the stop and the order are treated as fixed: the image jumps there and has no derivative.
+
+    Parameters
+    ----------
+    projection, colors, background, bins, conventions
+        As for :func:`composite`.
+    output : RenderOutput
+        Its result. Not needed here: kernels start from its alpha.
+    v_image : ndarray of shape (H, W, D)
+        Derivative by the image.
+    v_alpha : ndarray of shape (H, W)
+        Derivative by the accumulated opacity.
+
+    Returns
+    -------
+    CompositeGradient
+        Zeros for Gaussians without hits.
+    """
+    n, dtype = len(colors), projection.means2d.dtype
+    v_means2d, v_conics, v_opacities = np.zeros((n, 2), dtype), np.zeros((n, 3), dtype), np.zeros(n, dtype)
+    v_colors, v_background = np.zeros_like(colors), np.zeros_like(background)
+    for tile in tile_hits(projection, bins, conventions):
+        ids, alphas, T = tile.ids, tile.alphas, tile.transmittances
+        v, c = v_image[tile.ys, tile.xs], colors[ids]  # [P, D], [G, D]
+        weights = alphas * T[:-1]  # [G, P]
+        v_colors[ids] += weights @ v
+        v_background += T[-1] @ v
+
+        light = c @ v.T  # [G, P] c_g . v
+        v_T_end = v @ background - v_alpha[tile.ys, tile.xs]  # [P]
+        behind = _sum_behind(weights * light) + T[-1] * v_T_end
+        v_alphas = np.where(alphas > 0, T[:-1] * light - behind / (1 - alphas), 0)
+
+        v_shape = np.where(tile.is_clamped & conventions.clamp_stops_shape_gradient, 0, v_alphas)
+        v_mean = np.where(tile.is_clamped & conventions.clamp_stops_mean_gradient, 0, v_alphas)
+        v_opacities[ids] += np.sum(tile.falloffs * v_shape, axis=1)
+        unclamped = projection.opacities[ids, None] * tile.falloffs  # [G, P] o E
+        Q = conic_matrices(projection.conics[ids])
+        v_means2d[ids] += np.einsum("gp,gij,gpj->gi", -unclamped * v_mean, Q, tile.offsets)
+        v_Q = np.einsum("gp,gpi,gpj->gij", -unclamped * v_shape / 2, tile.offsets, tile.offsets)
+        v_conics[ids] += np.column_stack([v_Q[:, 0, 0], 2 * v_Q[:, 0, 1], v_Q[:, 1, 1]])
+    return CompositeGradient(v_means2d, v_conics, v_opacities, v_colors, v_background)
+
+
+def composite_all_pairs(
+    projection: Projection, colors: Floats, background: Floats, width: int, height: int, conventions: Conventions
+) -> tuple[Floats, Floats]:
+    """Blend without tiles and without products: the recursion of 3DGS over all Gaussians, to check :func:`composite`.
+
+    Every pixel carries its transmittance T and whether it is finished. For each Gaussian from near to far::
+
+        image <- image + T alpha c,   T <- T (1 - alpha)
+
+    Parameters
+    ----------
+    projection, colors, background, conventions
+        As for :func:`composite`.
+    width, height : int
+        Size of the image.
+
+    Returns
+    -------
+    image : ndarray of shape (H, W, D)
+        As from :func:`composite`.
+    alpha : ndarray of shape (H, W)
+        As from :func:`composite`.
+    """
+    ys, xs = np.mgrid[:height, :width]
+    T = np.ones((height, width), dtype=projection.means2d.dtype)
+    image = np.zeros((height, width, len(background)), dtype=T.dtype)
+    is_open = np.ones((height, width), dtype=bool)
+    for g in np.argsort(projection.depths, kind="stable"):
+        x0, y0, x1, y1 = projection.boxes[g]
+        a, b, c = projection.conics[g]
+        dx = projection.means2d[g, 0] - (xs + 0.5).astype(T.dtype)
+        dy = projection.means2d[g, 1] - (ys + 0.5).astype(T.dtype)
+        sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+        alpha = np.minimum(conventions.alpha_max, projection.opacities[g] * np.exp(-np.maximum(sigma, 0)))
+        is_hit = (x0 <= xs) & (xs < x1) & (y0 <= ys) & (ys < y1)
+        is_hit &= (sigma >= 0) & (alpha >= conventions.alpha_min)
+        is_open &= ~(is_hit & ~goes_on(T * (1 - alpha), conventions))
+        alpha = np.where(is_hit & is_open, alpha, 0)
+        image += (T * alpha)[:, :, None] * colors[g]
+        T = T * (1 - alpha)
+    return image + T[:, :, None] * background, 1 - T
+
+
+def _sum_behind(terms: Floats) -> Floats:
+    """Sums [G, P] of the rows after each row."""
+    sums = np.cumsum(terms[::-1], axis=0)[::-1]  # [G, P] itself included
+    return np.concatenate([sums[1:], np.zeros_like(terms[:1])])
+
+
+def _no_hits(n: int, height: int, width: int, dtype: np.dtype) -> BlendStats:
+    counts = np.zeros(n, dtype=np.int32)
+    return BlendStats(np.zeros(n, dtype), counts, counts.copy(), np.full((height, width), -1, dtype=np.int32))

@@ -1,0 +1,87 @@
+"""The camera model: a point in the camera frame becomes a pixel, and a Gaussian there needs the map's derivative.
+
+The derivative is EWA splatting (Zwicker et al. 2002) equation (29). Left out: lens distortion (images are undistorted
+beforehand) and rolling shutter.
+"""
+
+import numpy as np
+
+from minisplat_ref.constants import JACOBIAN_CLAMP, Conventions
+from minisplat_ref.types import Camera, Floats
+
+
+def pose(camera: Camera, dtype: np.dtype) -> tuple[Floats, Floats]:
+    """Return R [3, 3] and t [3] of ``x = R mu + t`` in the dtype of the data; the camera's centre is ``-R^T t``."""
+    return np.asarray(camera.cam_from_world_R, dtype=dtype), np.asarray(camera.cam_from_world_t, dtype=dtype)
+
+
+def pinhole(means_cam: Floats, camera: Camera) -> Floats:
+    """Pixel positions [N, 2] of points [N, 3] in the camera frame: ``p_k = f_k x_k / z + c_k`` for k = x, y."""
+    focal = np.array([camera.fx, camera.fy], dtype=means_cam.dtype)
+    center = np.array([camera.cx, camera.cy], dtype=means_cam.dtype)
+    return focal * means_cam[:, :2] / means_cam[:, 2:] + center
+
+
+def pinhole_vjp(means_cam: Floats, camera: Camera, v_means2d: Floats) -> Floats:
+    """Gradient [N, 3] of :func:`pinhole`: ``v_x = J^T v_p`` with the Jacobian J of the pinhole, nowhere clamped."""
+    limits = np.full(2, np.inf, dtype=means_cam.dtype)
+    return np.einsum("nki,nk->ni", pinhole_jacobians(means_cam, camera, -limits, limits), v_means2d)
+
+
+def pinhole_jacobians(means_cam: Floats, camera: Camera, low: Floats, high: Floats) -> Floats:
+    """Jacobians [N, 2, 3] of :func:`pinhole`, with the slopes x/z and y/z kept in [low, high].
+
+    ::
+
+        u = clip((x, y) / z, low, high)
+        J = [[f_x / z, 0, -f_x u_x / z], [0, f_y / z, -f_y u_y / z]]
+    """
+    focal = np.array([camera.fx, camera.fy], dtype=means_cam.dtype)
+    z = means_cam[:, 2:]  # [N, 1]
+    slopes = np.clip(means_cam[:, :2] / z, low, high)
+    J = np.zeros((len(means_cam), 2, 3), dtype=means_cam.dtype)
+    J[:, [0, 1], [0, 1]] = focal / z
+    J[:, :, 2] = -focal * slopes / z
+    return J
+
+
+def pinhole_jacobians_vjp(means_cam: Floats, camera: Camera, low: Floats, high: Floats, v_jacobians: Floats) -> Floats:
+    """Gradient [N, 3] of :func:`pinhole_jacobians` by the points.
+
+    Every entry is proportional to 1/z, and a slope that is not clamped depends on x and on z once more::
+
+        v_u_k = -f_k / z V_k2          where low_k < x_k / z < high_k, else 0
+        v_x_k = v_u_k / z
+        v_z   = -<J, V> / z - sum_k v_u_k u_k / z
+    """
+    focal = np.array([camera.fx, camera.fy], dtype=means_cam.dtype)
+    z = means_cam[:, 2:]
+    slopes = means_cam[:, :2] / z  # [N, 2]
+    J = pinhole_jacobians(means_cam, camera, low, high)
+    v_slopes = np.where((low < slopes) & (slopes < high), -focal / z * v_jacobians[:, :, 2], 0)
+    v_z = -np.einsum("nki,nki->n", J, v_jacobians) - np.einsum("nk,nk->n", v_slopes, slopes)
+    return np.column_stack([v_slopes, v_z]) / z
+
+
+def slope_limits(camera: Camera, conventions: Conventions, dtype: np.dtype) -> tuple[Floats, Floats]:
+    """Lowest and highest (x/z, y/z), each of shape (2,), up to which the Jacobian follows the mean.
+
+    Far outside the image the expansion is worthless and its 1/z^2 entry explodes, so the 3DGS code freezes the slope
+    there. gsplat counts the margin from the image's edges, INRIA from the axis.
+    """
+    focal, center = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+    size = np.array([camera.width, camera.height])
+    half_width = 0.5 * size / focal  # tan(half field of view)
+    if conventions.clamp_is_symmetric:
+        low, high = -JACOBIAN_CLAMP * half_width, JACOBIAN_CLAMP * half_width
+    else:
+        margin = (JACOBIAN_CLAMP - 1) * half_width
+        low, high = -center / focal - margin, (size - center) / focal + margin
+    return low.astype(dtype), high.astype(dtype)
+
+
+def with_principal_point(camera: Camera, conventions: Conventions) -> Camera:
+    """Return the camera as the conventions see it: INRIA's rasteriser puts the axis through the image's centre."""
+    if conventions.uses_principal_point:
+        return camera
+    return camera._replace(cx=0.5 * camera.width, cy=0.5 * camera.height)

@@ -1,0 +1,203 @@
+"""Stage 2: a pinhole camera turns each 3D Gaussian into a 2D Gaussian on the image.
+
+A perspective map is not affine, so it is replaced by its first-order expansion at the mean: EWA splatting (Zwicker et
+al. 2002) equation (31), 3DGS equation (5), ``Sigma' = J W Sigma W^T J^T``. The low-pass is EWA's
+reconstruction filter with the 3DGS code's width. Left out: EWA's per-footprint normalisation (3DGS blends peaks).
+"""
+
+import numpy as np
+
+from minisplat_ref.constants import COMPENSATION_FLOOR, Conventions
+from minisplat_ref.reference.covariance import covariances, covariances_vjp
+from minisplat_ref.reference.extent import extents
+from minisplat_ref.reference.pinhole import (
+    pinhole,
+    pinhole_jacobians,
+    pinhole_jacobians_vjp,
+    pinhole_vjp,
+    pose,
+    slope_limits,
+    with_principal_point,
+)
+from minisplat_ref.types import Camera, Floats, PrimitiveGradient, Projection, ProjectionGradient
+
+
+def compensations(sharp: Floats, blurred: Floats) -> Floats:
+    """Opacity factors [N] that keep a Gaussian's total weight when the low-pass widens it (Mip-Splatting).
+
+    ``rho = sqrt(max(floor^2, det(C) / det(C + eps I)))`` for covariances C = ``sharp`` [N, 2, 2].
+    """
+    return np.sqrt(np.maximum(COMPENSATION_FLOOR**2, _det(sharp) / _det(blurred)))
+
+
+def compensations_vjp(sharp: Floats, blurred: Floats, v_compensations: Floats) -> Floats:
+    """Gradient [N, 2, 2] of :func:`compensations` by C; both of its arguments move with C.
+
+    With ``r = det(C) / det(B)``, ``B = C + eps I`` and ``d det(C) = <adj(C), dC>``::
+
+        v_r = v_rho / (2 rho)          where r is above the floor, else 0
+        v_C = v_r (adj(C) - r adj(B)) / det(B)
+    """
+    ratio = _det(sharp) / _det(blurred)
+    v_ratio = np.where(ratio > COMPENSATION_FLOOR**2, v_compensations / (2 * compensations(sharp, blurred)), 0)
+    v_dets = v_ratio / _det(blurred)
+    return v_dets[:, None, None] * (_adjugate(sharp) - ratio[:, None, None] * _adjugate(blurred))
+
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # non-finite rows are culled, not reported
+def project(
+    means: Floats, quats: Floats, scales: Floats, opacities: Floats, camera: Camera, conventions: Conventions
+) -> Projection:
+    """Project Gaussians into the image and cull those that it cannot show.
+
+    ::
+
+        x = R mu + t,  p = pinhole(x),  A = J(x) R,  C = A Sigma A^T,  B = C + eps I,  Q = B^-1
+
+    Culled: not ``near < z < far``; opacity (compensated) below ``alpha_min``; a box outside the image; B not finite or
+    not invertible.
+
+    Parameters
+    ----------
+    means : ndarray of shape (N, 3)
+        World frame.
+    quats : ndarray of shape (N, 4)
+        wxyz, any length.
+    scales : ndarray of shape (N, 3)
+        Standard deviations, world units.
+    opacities : ndarray of shape (N,)
+        In [0, 1].
+    camera : Camera
+        The view.
+    conventions : Conventions
+        Planes, low-pass, antialiasing, extent rule, principal point and clamp.
+
+    Returns
+    -------
+    Projection
+        Zeros in every field of a culled Gaussian.
+    """
+    camera = with_principal_point(camera, conventions)
+    means_cam, *_, sharp, blurred = _expand(means, quats, scales, camera, conventions)
+    means2d, depths, det = pinhole(means_cam, camera), means_cam[:, 2], _det(blurred)
+    conics = _entries(_adjugate(blurred) / det[:, None, None])
+    if conventions.is_antialiased:
+        opacities = opacities * compensations(sharp, blurred)
+    radii, boxes = extents(means2d, blurred, opacities, camera, conventions)
+
+    is_visible = (conventions.near_plane < depths) & (depths < conventions.far_plane)
+    is_visible &= opacities >= conventions.alpha_min
+    is_visible &= (det > 0) & np.isfinite(np.column_stack([det, means2d, conics, opacities, radii, boxes])).all(axis=1)
+    is_visible &= (radii > 0).all(axis=1) & (boxes[:, :2] < boxes[:, 2:]).all(axis=1)
+    rows = is_visible[:, None]
+    return Projection(
+        means2d=np.where(rows, means2d, 0),
+        depths=np.where(is_visible, depths, 0),
+        conics=np.where(rows, conics, 0),
+        opacities=np.where(is_visible, opacities, 0),
+        radii=np.where(rows, radii, 0).astype(np.int32),
+        boxes=np.where(rows, boxes, 0).astype(np.int32),
+    )
+
+
+def project_vjp(
+    means: Floats,
+    quats: Floats,
+    scales: Floats,
+    opacities: Floats,
+    camera: Camera,
+    conventions: Conventions,
+    projection: Projection,
+    v_projection: ProjectionGradient,
+) -> PrimitiveGradient:
+    """Gradient of :func:`project`; culled Gaussians get zeros.
+
+    With ``V_Q = [[v_a, v_b / 2], [v_b / 2, v_c]]``, since b stands twice in Q::
+
+        v_B = -Q V_Q Q
+        v_C = v_B + compensation's share;  v_rho = opacity v_opacity'
+        v_A = 2 v_C A Sigma,  v_Sigma = A^T v_C A              (v_C is symmetric)
+        v_J = v_A R^T
+        v_x = pinhole's share + J's share + (0, 0, v_depth)
+        v_mu = R^T v_x
+        v_R = sum_n J^T v_A + v_x mu^T,  v_t = sum_n v_x
+
+    Parameters
+    ----------
+    means, quats, scales, opacities, camera, conventions
+        As for :func:`project`.
+    projection : Projection
+        Its result; tells which rows were culled.
+    v_projection : ProjectionGradient
+        Derivative of the loss by its fields.
+
+    Returns
+    -------
+    PrimitiveGradient
+        Derivative by the Gaussians and by the camera's pose.
+    """
+    camera = with_principal_point(camera, conventions)
+    rows = np.flatnonzero(projection.radii[:, 0] > 0)  # [V] visible
+    v_means2d, v_depths, v_conics, v_opacities = (field[rows] for field in v_projection)
+    means_cam, J, Sigma, A, sharp, blurred = _expand(means[rows], quats[rows], scales[rows], camera, conventions)
+    R, _ = pose(camera, means.dtype)
+    low, high = slope_limits(camera, conventions, means.dtype)
+
+    Q = _adjugate(blurred) / _det(blurred)[:, None, None]
+    v_C = -Q @ _symmetric(v_conics * np.array([1, 0.5, 1], dtype=means.dtype)) @ Q
+    if conventions.is_antialiased:
+        v_C += compensations_vjp(sharp, blurred, opacities[rows] * v_opacities)
+        v_opacities = v_opacities * compensations(sharp, blurred)
+    v_A = 2 * v_C @ A @ Sigma  # [V, 2, 3]
+    v_Sigma = np.swapaxes(A, 1, 2) @ v_C @ A
+    v_x = pinhole_vjp(means_cam, camera, v_means2d) + pinhole_jacobians_vjp(means_cam, camera, low, high, v_A @ R.T)
+    v_x[:, 2] += v_depths
+    v_quats, v_scales = covariances_vjp(quats[rows], scales[rows], v_Sigma)
+    return PrimitiveGradient(
+        means=_scatter(v_x @ R, rows, len(means)),
+        quats=_scatter(v_quats, rows, len(means)),
+        scales=_scatter(v_scales, rows, len(means)),
+        opacities=_scatter(v_opacities, rows, len(means)),
+        cam_from_world_R=np.einsum("nki,nkj->ij", J, v_A) + v_x.T @ means[rows],
+        cam_from_world_t=v_x.sum(axis=0),
+    )
+
+
+def _expand(
+    means: Floats, quats: Floats, scales: Floats, camera: Camera, conventions: Conventions
+) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
+    """Return x [N, 3], J [N, 2, 3], Sigma [N, 3, 3], A [N, 2, 3], C and B [N, 2, 2] of :func:`project`."""
+    R, t = pose(camera, means.dtype)
+    means_cam = means @ R.T + t
+    J = pinhole_jacobians(means_cam, camera, *slope_limits(camera, conventions, means.dtype))
+    Sigma = covariances(quats, scales)
+    A = J @ R
+    sharp = A @ Sigma @ np.swapaxes(A, 1, 2)
+    return means_cam, J, Sigma, A, sharp, sharp + conventions.eps2d * np.eye(2, dtype=means.dtype)
+
+
+def _det(matrices: Floats) -> Floats:
+    return matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] * matrices[:, 1, 0]
+
+
+def _adjugate(symmetric: Floats) -> Floats:
+    """``adj(C) = tr(C) I - C``, so that ``C adj(C) = det(C) I``; exists where the inverse does not."""
+    trace = np.trace(symmetric, axis1=1, axis2=2)[:, None, None]
+    return trace * np.eye(2, dtype=symmetric.dtype) - symmetric
+
+
+def _entries(symmetric: Floats) -> Floats:
+    """Return (a, b, c) [N, 3] of [[a, b], [b, c]]."""
+    return symmetric[:, [0, 0, 1], [0, 1, 1]]
+
+
+def _symmetric(entries: Floats) -> Floats:
+    """[[a, b], [b, c]] of (a, b, c) [N, 3]."""
+    return entries[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+
+
+def _scatter(values: Floats, rows: np.ndarray, n: int) -> Floats:
+    """Array of n rows with ``values`` at ``rows`` and zeros elsewhere."""
+    full = np.zeros((n, *values.shape[1:]), dtype=values.dtype)
+    full[rows] = values
+    return full
