@@ -1,0 +1,55 @@
+"""Files in and out: scenes of photographs, Gaussians, images."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.io.colmap import MODEL_FOLDERS, find_model, load_colmap
+from minisplat_ref.io.images import read_image, write_image
+from minisplat_ref.io.ply import load_ply, save_ply
+from minisplat_ref.io.transforms import BLENDER_FILES, SINGLE_FILE, find_transforms, load_transforms
+from minisplat_ref.types import Floats, Scene
+
+__all__ = ["load_colmap", "load_ply", "load_scene", "load_transforms", "read_image", "save_ply", "write_image"]
+
+
+def load_scene(
+    path: str | Path,
+    *,
+    downscale: int = 1,
+    test_every: int = 8,
+    background: Sequence[float] | Floats | None = None,
+    undistort: bool = False,
+) -> Scene:
+    """Load a scene of photographs with cameras, whichever way it is described.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder of a COLMAP scene or of a transforms.json (COLMAP wins where both are there), or a transforms.json file.
+    downscale, test_every, background, undistort
+        See :func:`load_colmap` and :func:`load_transforms`.
+
+    Returns
+    -------
+    Scene
+
+    Raises
+    ------
+    InputError
+        If there is nothing that can be loaded, or what is there cannot.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"{path}: no such folder; give the folder of a scene")
+    if find_model(path) is not None:
+        load = load_colmap
+    elif find_transforms(path):
+        load = load_transforms
+    else:
+        models = [f"{folder}/cameras.bin or .txt" for folder in MODEL_FOLDERS]
+        raise InputError(
+            f"{path}: no scene here, looked for {', '.join([*models, BLENDER_FILES[0], SINGLE_FILE])};"
+            " to make one from photographs run `python -m data_tools.sfm PHOTOS --out SCENE`"
+        )
+    return load(path, downscale=downscale, test_every=test_every, background=background, undistort=undistort)

@@ -1,0 +1,150 @@
+"""Scenes that COLMAP has calibrated: ``images/`` with ``sparse/0/`` or ``sparse/``, binary or text, read by pycolmap.
+
+Poses are COLMAP's, which are ours: cam_from_world, OpenCV axes, the centre of the top-left pixel at (0.5, 0.5). Masks
+are where COLMAP looks for them (``masks/<file>.png``, as in ``0001.jpg.png``) or at ``masks/<name>.png``. An alpha
+channel is a mask too. Left out: 2D features, tracks, and images that COLMAP could not register.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.io.lens import PINHOLE_MODELS, POLYNOMIAL_MODELS, Lens, import_pycolmap
+from minisplat_ref.io.scene import Photo, build_reading, build_scene, split_photos
+from minisplat_ref.types import Camera, Floats, Scene
+
+MODEL_FOLDERS = ("sparse/0", "sparse")
+DAMAGE_ERRORS = (
+    ValueError,
+    IndexError,
+    RuntimeError,
+    MemoryError,
+    OSError,
+)  # its checks; garbage as a count
+
+
+def load_colmap(
+    path: str | Path,
+    *,
+    downscale: int = 1,
+    test_every: int = 8,
+    background: Sequence[float] | Floats | None = None,
+    undistort: bool = False,
+) -> Scene:
+    """Load a COLMAP scene.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder with ``images/`` and ``sparse/0/`` or ``sparse/``.
+    downscale : int
+        Divide the image size by this. ``images_<downscale>/`` is used where it exists, otherwise images are resized
+        to the rounded size; intrinsics scale by the exact ratio either way.
+    test_every : int
+        Of the images sorted by name, every ``test_every``-th is a test view, beginning with the first; 0 for none.
+    background : array_like of shape (3,), optional
+        Colour behind everything, in [0, 1]; black by default.
+    undistort : bool
+        Warp images of other camera models to a pinhole, instead of refusing them.
+
+    Returns
+    -------
+    Scene
+
+    Raises
+    ------
+    InputError
+        If a file is missing or damaged, a camera model is distorted, or an image does not fit its camera.
+    """
+    path = Path(path)
+    reading = build_reading(downscale, background, undistort, alpha_is_mask=True)
+    reconstruction = read_model(path)
+    train_photos, test_photos = split_photos(colmap_photos(path, reconstruction), test_every)
+    points, colors = _points(reconstruction)
+    return build_scene(path, train_photos, test_photos, points, colors, reading)
+
+
+def find_model(path: Path) -> Path | None:
+    """Folder of the COLMAP model of a scene, None if it has none."""
+    folders = (path / folder for folder in MODEL_FOLDERS)
+    return next((f for f in folders if (f / "cameras.bin").is_file() or (f / "cameras.txt").is_file()), None)
+
+
+def read_model(path: Path) -> Any:
+    """Read the COLMAP model of the scene at ``path`` as a ``pycolmap.Reconstruction``."""
+    model = find_model(path)
+    if model is None:
+        raise InputError(
+            f"{path}: no COLMAP model, looked for cameras.bin or cameras.txt in {' and '.join(MODEL_FOLDERS)};"
+            f" to make one from photographs run `python -m data_tools.sfm PHOTOS --out {path}`"
+        )
+    pycolmap = import_pycolmap()
+    try:
+        reconstruction = pycolmap.Reconstruction(str(model))
+    except DAMAGE_ERRORS as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{model}: damaged or incomplete COLMAP model ({reason}); copy or export it again") from None
+    if (model / "cameras.bin").is_file():
+        _check_complete(model, reconstruction)
+    return reconstruction
+
+
+def colmap_photos(path: Path, reconstruction: Any) -> list[Photo]:
+    """List the registered images of a model, in no particular order."""
+    folder = path / "images"
+    if not folder.is_dir():
+        raise InputError(f"{path}: no folder images/; put the photographs there, named as in the model")
+    return [_photo(path, folder, image) for image in reconstruction.images.values() if image.has_pose]
+
+
+def _photo(path: Path, folder: Path, image: Any) -> Photo:
+    """One registered image of the model."""
+    masks = path / "masks"
+    candidates = (masks / f"{image.name}.png", (masks / image.name).with_suffix(".png"))
+    pose = image.cam_from_world().matrix()  # [3, 4]
+    model = image.camera
+    camera = Camera(
+        cam_from_world_R=np.ascontiguousarray(pose[:, :3]),
+        cam_from_world_t=np.ascontiguousarray(pose[:, 3]),
+        fx=model.focal_length_x,
+        fy=model.focal_length_y,
+        cx=model.principal_point_x,
+        cy=model.principal_point_y,
+        width=model.width,
+        height=model.height,
+    )
+    return Photo(folder, image.name, next((c for c in candidates if c.is_file()), None), camera, _lens(model))
+
+
+def _lens(camera: Any) -> Lens | None:
+    """Distortion of a ``pycolmap.Camera``; a polynomial model whose coefficients are all zero has none."""
+    name, params = camera.model.name, np.asarray(camera.params)
+    has_zero_distortion = name in POLYNOMIAL_MODELS and not params[list(camera.extra_params_idxs())].any()
+    return None if name in PINHOLE_MODELS or has_zero_distortion else Lens(name, tuple(params.tolist()))
+
+
+def _points(reconstruction: Any) -> tuple[Floats, NDArray[np.uint8]]:
+    """Sparse points and their colours, [P, 3] each, by ascending id so that the order does not depend on the file's."""
+    points = [point for _, point in sorted(reconstruction.points3D.items())]
+    positions = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
+    return positions, np.array([point.color for point in points], np.uint8).reshape(-1, 3)
+
+
+def _check_complete(model: Path, reconstruction: Any) -> None:
+    """Compare file sizes with what was read: pycolmap does not notice a cameras.bin that is cut short."""
+    cameras, images = reconstruction.cameras.values(), reconstruction.images.values()
+    expected = {
+        "cameras.bin": 8 + sum(24 + 8 * len(camera.params) for camera in cameras),
+        "images.bin": 8 + sum(73 + len(image.name.encode()) + 24 * image.num_points2D() for image in images),
+        "points3D.bin": 8 + sum(51 + 8 * point.track.length() for point in reconstruction.points3D.values()),
+    }
+    for name, size in expected.items():
+        found = (model / name).stat().st_size
+        if found < size:
+            raise InputError(
+                f"{model / name}: truncated, {size} bytes expected, {found} found; copy or export it again"
+            )

@@ -1,0 +1,91 @@
+"""Lens distortion: the renderer knows pinhole cameras only, so other photographs are warped to a pinhole by pycolmap.
+
+COLMAP chooses the pinhole: the same focal length, and the largest image without blank pixels.
+"""
+
+from types import ModuleType
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Pillow must be loaded before pycolmap: pycolmap 4.2 exports a zlib of its own, and when it comes first the system's
+# zlib binds to it half and half; the next PNG that Pillow writes then aborts the process.
+from PIL import Image as _loaded_before_pycolmap  # noqa: F401
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.io.images import MASK_THRESHOLD
+from minisplat_ref.types import Bools, Camera
+
+PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
+POLYNOMIAL_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+"""Models of which all-zero distortion coefficients make a pinhole."""
+
+
+class Lens(NamedTuple):
+    """A lens that is not a pinhole, in COLMAP's terms."""
+
+    model: str
+    """Name of a COLMAP camera model."""
+    params: tuple[float, ...]
+    """Its parameters in COLMAP's order, pixels."""
+
+
+def import_pycolmap() -> ModuleType:
+    """Import pycolmap when it is first needed: it takes a while to load, and a few platforms have no wheel."""
+    try:
+        import pycolmap
+    except ImportError:
+        raise InputError(
+            "pycolmap, which reads COLMAP models and undistorts images, is not installed;"
+            " run `pip install pycolmap`, or describe the scene with a transforms.json"
+        ) from None
+    return pycolmap
+
+
+def undistort(
+    image: NDArray[np.uint8], mask: Bools | None, camera: Camera, lens: Lens
+) -> tuple[NDArray[np.uint8], Bools | None, Camera]:
+    """Warp a photograph and its mask to a pinhole camera with the same pose.
+
+    Parameters
+    ----------
+    image : ndarray of shape (H, W, 3)
+        uint8.
+    mask : ndarray of shape (H, W) or None
+        bool.
+    camera : Camera
+        Pose and size of the photograph.
+    lens : Lens
+        Its projection.
+
+    Returns
+    -------
+    tuple
+        Image [H', W', 3], mask [H', W'] or None, and the pinhole camera, of which H' and W' may differ from H and W.
+
+    Raises
+    ------
+    InputError
+        If no pinhole can show what the lens shows (a panorama).
+    """
+    pycolmap = import_pycolmap()
+    distorted = pycolmap.Camera(model=lens.model, width=camera.width, height=camera.height, params=lens.params)
+    options = pycolmap.UndistortCameraOptions()
+    bitmap, pinhole = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(image), distorted)
+    if pinhole.model.name not in PINHOLE_MODELS:
+        raise InputError(
+            f"camera model {lens.model} has no undistorted pinhole; cut pinhole views out of its images first"
+        )
+    if mask is not None:
+        white = pycolmap.Bitmap.from_array(mask.astype(np.uint8) * np.uint8(255))
+        mask = pycolmap.undistort_image(options, white, distorted)[0].to_array() >= MASK_THRESHOLD
+    camera = camera._replace(
+        fx=pinhole.focal_length_x,
+        fy=pinhole.focal_length_y,
+        cx=pinhole.principal_point_x,
+        cy=pinhole.principal_point_y,
+        width=pinhole.width,
+        height=pinhole.height,
+    )
+    return bitmap.to_array(), mask, camera

@@ -1,0 +1,291 @@
+"""PLY files: trained Gaussians in the 3DGS layout, and the vertices of any point cloud.
+
+The 3DGS layout holds one vertex per Gaussian: ``x y z``, normals (unused, zero), ``f_dc_0..2``, ``f_rest_*``,
+``opacity``, ``scale_0..2``, ``rot_0..3``, all before their activations. The higher spherical harmonics are
+channel-major: all red coefficients, then all green, then all blue, whereas :class:`Gaussians` keeps RGB last. Rotations
+are wxyz, the frame is COLMAP's (x right, y down, z forward).
+
+Files are read by property name, so order, normals and extra properties do not matter; ASCII, little- and big-endian,
+any scalar type. Left out: faces and other elements, lists, compressed variants.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from minisplat_ref.constants import SH_DEGREE_MAX
+from minisplat_ref.errors import InputError
+from minisplat_ref.io.atomic import replacing
+from minisplat_ref.types import Floats, Gaussians
+
+MEANS = ("x", "y", "z")
+NORMALS = ("nx", "ny", "nz")
+SH_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+SCALES = ("scale_0", "scale_1", "scale_2")
+QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
+COLORS = ("red", "green", "blue")
+
+SCALAR_TYPES = {
+    **{name: "i1" for name in ("char", "int8")},
+    **{name: "u1" for name in ("uchar", "uint8")},
+    **{name: "i2" for name in ("short", "int16")},
+    **{name: "u2" for name in ("ushort", "uint16")},
+    **{name: "i4" for name in ("int", "int32")},
+    **{name: "u4" for name in ("uint", "uint32")},
+    **{name: "f4" for name in ("float", "float32")},
+    **{name: "f8" for name in ("double", "float64")},
+}
+BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+GRAY = 128  # colour of a point cloud that has none
+HEADER_LINE_MAX = 4096  # bytes; no header line is longer, and a file without line breaks must not be read whole
+
+
+def load_ply(path: str | Path) -> Gaussians:
+    """Read trained Gaussians from a PLY in the 3DGS layout.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; spherical harmonics of degree 0 to 3, with or without normals. Bytes after the declared vertices do
+        not matter.
+
+    Returns
+    -------
+    Gaussians
+        N may be 0. float64 if any property of the file is, else float32.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, truncated, not a PLY of Gaussians, or holds NaN, infinity or a zero quaternion.
+    """
+    columns = read_vertices(path)
+    rest_names = _sh_rest_names(columns, path)
+    names = (*MEANS, *SH_DC, *rest_names, "opacity", *SCALES, *QUATS)
+    missing = [name for name in names if name not in columns]
+    if missing:
+        raise InputError(f"{path}: not a PLY of Gaussians, no property {', '.join(missing)}; {_way_out(columns)}")
+    check_finite(path, {name: columns[name] for name in names})
+    dtype = np.result_type(np.float32, *(columns[name].dtype for name in names if columns[name].dtype.kind == "f"))
+
+    def stack(names: tuple[str, ...]) -> Floats:
+        return np.stack([columns[name].astype(dtype) for name in names], axis=1)
+
+    quats = stack(QUATS)  # [N, 4]
+    zero_rows = np.flatnonzero(~quats.any(axis=1))
+    if zero_rows.size:
+        raise InputError(f"{path}: the rotation of row {zero_rows[0]} is a zero quaternion; remove that Gaussian")
+    n, n_rest = len(quats), len(rest_names) // 3
+    rest = stack(rest_names) if rest_names else np.zeros((n, 0), dtype)  # [N, 3 (K-1)], channel-major
+    return Gaussians(
+        means=stack(MEANS),
+        quats=quats,
+        log_scales=stack(SCALES),
+        opacity_logits=columns["opacity"].astype(dtype),
+        sh_dc=stack(SH_DC),
+        sh_rest=np.ascontiguousarray(rest.reshape(n, 3, n_rest).transpose(0, 2, 1)),  # [N, K-1, 3]
+    )
+
+
+def save_ply(path: str | Path, gaussians: Gaussians) -> None:
+    """Write trained Gaussians as a PLY in the 3DGS layout: binary, little-endian, float32, with zero normals.
+
+    Parameters
+    ----------
+    path : str or Path
+        File to make or replace; it is complete or not there.
+    gaussians : Gaussians
+        Any spherical-harmonic degree, which is kept; N may be 0.
+
+    Raises
+    ------
+    InputError
+        If a value is NaN or beyond float32, or the folder does not exist.
+    """
+    n, n_rest = gaussians.sh_rest.shape[:2]
+    rest_names = tuple(f"f_rest_{i}" for i in range(3 * n_rest))
+    fields = (
+        (MEANS, gaussians.means),
+        (NORMALS, np.zeros((n, 3))),
+        (SH_DC, gaussians.sh_dc),
+        (rest_names, gaussians.sh_rest.transpose(0, 2, 1).reshape(n, 3 * n_rest)),
+        (("opacity",), gaussians.opacity_logits[:, None]),
+        (SCALES, gaussians.log_scales),
+        (QUATS, gaussians.quats),
+    )
+    columns: dict[str, NDArray] = {}
+    with np.errstate(over="ignore"):  # becomes infinite, which check_finite names
+        for names, values in fields:
+            columns |= zip(names, values.astype(np.float32).T, strict=True)
+    check_finite(path, columns)
+    write_vertices(path, columns)
+
+
+def read_point_cloud(path: str | Path) -> tuple[Floats, NDArray[np.uint8]]:
+    """Read the points of a PLY, with their colours.
+
+    Returns
+    -------
+    points : ndarray of shape (P, 3)
+        float64, the file's frame and unit.
+    colors : ndarray of shape (P, 3)
+        uint8; floating colours of the file count as [0, 1]; middle gray if it has none.
+    """
+    columns = read_vertices(path)
+    missing = [name for name in MEANS if name not in columns]
+    if missing:
+        raise InputError(f"{path}: not a point cloud, it has no property {', '.join(missing)}")
+    check_finite(path, {name: columns[name] for name in (*MEANS, *COLORS) if name in columns})
+    points = np.stack([columns[name].astype(np.float64) for name in MEANS], axis=1)  # [P, 3]
+    if not all(name in columns for name in COLORS):
+        return points, np.full(points.shape, GRAY, np.uint8)
+    colors = np.stack([columns[name] for name in COLORS], axis=1)  # [P, 3]
+    if colors.dtype.kind == "f":
+        colors = np.rint(colors * 255.0)
+    return points, colors.clip(0, 255).astype(np.uint8)
+
+
+def read_vertices(path: str | Path) -> dict[str, NDArray]:
+    """Read every property of the vertices of a PLY file.
+
+    Returns
+    -------
+    dict of ndarray of shape (P,)
+        One column per property, in the file's order and scalar type, native byte order.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, malformed or ends before its last declared vertex.
+    """
+    path = Path(path)
+    try:
+        file = path.open("rb")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be opened ({error.strerror})") from None
+    with file:
+        encoding, n_skipped, n, dtype = _read_header(file, path)
+        if encoding == "ascii":
+            rows = _read_ascii(file, path, n_skipped, n, dtype)
+        else:
+            rows = _read_binary(file, path, n, dtype)
+    return {name: rows[name].astype(rows[name].dtype.newbyteorder("=")) for name in rows.dtype.names or ()}
+
+
+def write_vertices(path: str | Path, columns: Mapping[str, NDArray]) -> None:
+    """Write columns of equal length P as the vertices of a little-endian PLY, complete or not at all.
+
+    Each property has the scalar type of its column: uint8, int32, float32 and so on.
+    """
+    type_names = {code: name for name, code in reversed(SCALAR_TYPES.items()) if not name[-1].isdigit()}
+    dtype = np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
+    rows = np.empty(len(next(iter(columns.values()))), dtype)  # [P]
+    for name, column in columns.items():
+        rows[name] = column
+    properties = "".join(f"property {type_names[c.dtype.str[1:]]} {name}\n" for name, c in columns.items())
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
+    with replacing(path) as temporary:
+        temporary.write_bytes(header.encode("ascii") + rows.tobytes())
+
+
+def check_finite(path: str | Path, columns: Mapping[str, NDArray]) -> None:
+    """Raise an InputError that names the property and the first row of a NaN or an infinity."""
+    for name, column in columns.items():
+        bad_rows = np.flatnonzero(~np.isfinite(column))
+        if bad_rows.size:
+            raise InputError(
+                f"{path}: property {name} is {column[bad_rows[0]]} in row {bad_rows[0]}"
+                f" ({bad_rows.size} of {column.size} rows are not finite); remove those rows"
+            )
+
+
+def _sh_rest_names(columns: Mapping[str, NDArray], path: str | Path) -> tuple[str, ...]:
+    """Names of the higher coefficients, f_rest_0 first: the file may list them in any order."""
+    n_rest = sum(name.startswith("f_rest_") for name in columns)
+    allowed = [3 * ((degree + 1) ** 2 - 1) for degree in range(SH_DEGREE_MAX + 1)]
+    if n_rest not in allowed:
+        raise InputError(
+            f"{path}: {n_rest} properties f_rest_*, but spherical harmonics of degree 0 to {SH_DEGREE_MAX}"
+            f" have {', '.join(map(str, allowed[:-1]))} or {allowed[-1]}; export it again"
+        )
+    return tuple(f"f_rest_{i}" for i in range(n_rest))
+
+
+def _way_out(columns: Mapping[str, NDArray]) -> str:
+    """What to do with a PLY that does not hold Gaussians."""
+    if "packed_position" in columns:
+        return "it is a compressed splat: export it as a plain PLY"
+    if all(name in columns for name in MEANS):
+        return "it is a point cloud: give it as a scene's points, or give a trained point_cloud.ply"
+    return "give a trained point_cloud.ply"
+
+
+def _read_header(file: BinaryIO, path: Path) -> tuple[str, int, int, np.dtype]:
+    """Encoding, rows of elements before the vertices (ASCII only), number of vertices, and their structured dtype."""
+    if file.readline(8).strip() != b"ply":
+        raise InputError(f"{path}: not a PLY file, it does not begin with 'ply'")
+    encoding, element, n_skipped, n = "", "", 0, -1
+    properties: list[tuple[str, str]] = []
+    words: list[str] = []
+    while words != ["end_header"]:
+        words = file.readline(HEADER_LINE_MAX).decode("ascii", errors="replace").split()
+        match words:
+            case ["end_header"]:
+                pass
+            case []:
+                raise InputError(f"{path}: truncated, the PLY header has no end_header; copy or export the file again")
+            case ["format", name, _] if name in BYTE_ORDERS:
+                encoding = name
+            case ["element", element, count] if count.isdecimal():
+                if element == "vertex":
+                    n = int(count)
+                elif n < 0:
+                    n_skipped += int(count)
+            case ["property", kind, name] if kind in SCALAR_TYPES:
+                if element == "vertex":
+                    properties.append((name, SCALAR_TYPES[kind]))
+            case ["property", "list", *_] if element != "vertex":
+                pass
+            case ["comment" | "obj_info", *_]:
+                pass
+            case _:
+                raise InputError(f"{path}: cannot read the header line '{' '.join(words)}'; export the PLY again")
+    names = [name for name, _ in properties]
+    if not encoding or n < 0 or not names or len(set(names)) < len(names):
+        raise InputError(
+            f"{path}: the PLY header lacks its format, vertices or properties, or repeats one; export it again"
+        )
+    if n_skipped and encoding != "ascii":
+        raise InputError(f"{path}: elements stand before the vertices; export the PLY with its vertices first")
+    return encoding, n_skipped, n, np.dtype([(name, BYTE_ORDERS[encoding] + code) for name, code in properties])
+
+
+def _read_binary(file: BinaryIO, path: Path, n: int, dtype: np.dtype) -> NDArray:
+    """Read the n declared vertices; what follows them is not looked at."""
+    found = path.stat().st_size - file.tell()
+    expected = n * dtype.itemsize
+    if found < expected:
+        raise InputError(
+            f"{path}: truncated, {n} vertices of {dtype.itemsize} bytes need {expected} bytes after the header"
+            f" but there are {found}; copy or export the file again"
+        )
+    return np.frombuffer(file.read(expected), dtype)
+
+
+def _read_ascii(file: BinaryIO, path: Path, n_skipped: int, n: int, dtype: np.dtype) -> NDArray:
+    """Read the n declared vertices, one a line."""
+    lines = file.read().decode("ascii", errors="replace").splitlines()[n_skipped : n_skipped + n]
+    if len(lines) < n:
+        raise InputError(f"{path}: truncated, {n} vertices expected, {len(lines)} lines found; copy or export it again")
+    rows = np.empty(n, dtype)
+    for row, line in enumerate(lines):
+        try:
+            rows[row] = tuple(float(word) for word in line.split())
+        except (ValueError, OverflowError):
+            raise InputError(
+                f"{path}: row {row} is '{line[:60]}', not {len(dtype.names or ())} numbers; copy or export it again"
+            ) from None
+    return rows

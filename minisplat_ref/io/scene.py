@@ -1,0 +1,254 @@
+"""From photographs with cameras to a :class:`Scene`: what the COLMAP and transforms.json readers have in common.
+
+Pixels are read, masked, composited, undistorted and downscaled here, and everything that makes a scene unusable is
+found here. Left out: lazy loading, all pictures are held in memory as uint8.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.io.images import (
+    MASK_THRESHOLD,
+    composite_alpha,
+    downscaled_size,
+    read_image,
+    read_mask,
+    resize_image,
+    resize_mask,
+)
+from minisplat_ref.io.lens import Lens, undistort
+from minisplat_ref.types import Bools, Camera, Floats, Scene, View
+
+EXTENT_MARGIN = 1.1  # the 3DGS code's factor on the radius of the cameras; the learning rates were tuned with it
+ROTATION_TOLERANCE = 1e-3  # greatest error of R R^T = I: poses written with four digits pass, scaled ones do not
+
+
+class Photo(NamedTuple):
+    """A photograph before its pixels are read."""
+
+    folder: Path
+    """Folder of images, the one that has a sibling ``<folder>_D`` when downscaled images are ready."""
+    file: str
+    """Path inside the folder, with suffix."""
+    mask_path: Path | None
+    """Its mask file, if it has one."""
+    camera: Camera
+    """Pose, intrinsics and size at full resolution; the pinhole part of the lens."""
+    lens: Lens | None
+    """None for a pinhole."""
+
+    @property
+    def path(self) -> Path:
+        """The image file at full resolution."""
+        return self.folder / self.file
+
+
+class Reading(NamedTuple):
+    """How photographs become views."""
+
+    downscale: int
+    """Divide the image size by this; ``<folder>_D`` is used where it exists."""
+    background: Floats
+    """[3] in [0, 1]."""
+    undistort: bool
+    """Warp photographs of other lenses to a pinhole; False refuses them."""
+    alpha_is_mask: bool
+    """An alpha channel masks the loss; False composites it onto the background."""
+
+
+def build_reading(
+    downscale: int, background: Sequence[float] | Floats | None, undistort: bool, alpha_is_mask: bool
+) -> Reading:
+    """Check the arguments that all loaders share."""
+    if downscale < 1 or downscale != int(downscale):
+        raise InputError(f"downscale is {downscale}; it must be a whole number of at least 1")
+    color = np.zeros(3) if background is None else np.asarray(background, np.float64)
+    if color.shape != (3,) or not np.all((color >= 0) & (color <= 1)):
+        raise InputError(f"background is {background}; it must be three numbers in [0, 1]")
+    return Reading(int(downscale), color, undistort, alpha_is_mask)
+
+
+def split_photos(photos: Sequence[Photo], test_every: int) -> tuple[list[Photo], list[Photo]]:
+    """Sort by file name and hold out every ``test_every``-th, beginning with the first; 0 holds out none."""
+    if test_every < 0:
+        raise InputError(f"test_every is {test_every}; it must be 0 (no test views) or positive")
+    ordered = sorted(photos, key=lambda photo: photo.path.as_posix())
+    is_test = [test_every > 0 and i % test_every == 0 for i in range(len(ordered))]
+    train = [photo for photo, held_out in zip(ordered, is_test, strict=True) if not held_out]
+    return train, [photo for photo, held_out in zip(ordered, is_test, strict=True) if held_out]
+
+
+def build_scene(
+    source: Path,
+    train_photos: Sequence[Photo],
+    test_photos: Sequence[Photo],
+    points: Floats,
+    point_colors: NDArray[np.uint8],
+    reading: Reading,
+) -> Scene:
+    """Read all pixels and put the scene together.
+
+    Parameters
+    ----------
+    source : Path
+        What the user asked for; named in errors, and its folder names the scene.
+    train_photos, test_photos : sequence of Photo
+        At least two training photographs.
+    points : ndarray of shape (P, 3)
+        World frame.
+    point_colors : ndarray of shape (P, 3)
+        uint8.
+    reading : Reading
+        How photographs become views.
+
+    Returns
+    -------
+    Scene
+
+    Raises
+    ------
+    InputError
+        If there are too few views, a camera is not usable, or an image is missing or does not fit its camera.
+    """
+    if len(train_photos) < 2:
+        raise InputError(
+            f"{source}: {len(train_photos)} training and {len(test_photos)} test view(s), training needs at least 2;"
+            " add photographs or hold out fewer"
+        )
+    photos = (*train_photos, *test_photos)
+    for photo in photos:
+        check_photo(photo, source, reading.undistort)
+    extent = camera_extent([photo.camera for photo in train_photos])
+    if extent == 0.0:
+        raise InputError(f"{source}: all training cameras stand at one point, which shows no depth; move between shots")
+    names = _view_names(photos, source)
+    views = tuple(read_view(photo, name, reading) for photo, name in zip(photos, names, strict=True))
+    folder = source if source.is_dir() else source.parent
+    return Scene(
+        name=folder.resolve().name,
+        train_views=views[: len(train_photos)],
+        test_views=views[len(train_photos) :],
+        points=points,
+        point_colors=point_colors,
+        background=reading.background,
+        extent=extent,
+    )
+
+
+def check_photo(photo: Photo, source: Path, undistort: bool) -> None:
+    """Raise an InputError for a photograph that cannot become a view."""
+    camera = photo.camera
+    intrinsics = camera[2:]
+    if not np.isfinite(intrinsics).all() or min(camera.fx, camera.fy, camera.width, camera.height) <= 0:
+        raise InputError(
+            f"{source}: the camera of {photo.file} is not usable (fx, fy, cx, cy, width, height are"
+            f" {', '.join(f'{value:g}' for value in intrinsics)}); repair or remove that image"
+        )
+    R, t = camera.cam_from_world_R, camera.cam_from_world_t
+    is_rotation = np.abs(R @ R.T - np.eye(3)).max() <= ROTATION_TOLERANCE and np.linalg.det(R) > 0  # False for NaN
+    if not is_rotation or not np.isfinite(t).all():
+        raise InputError(f"{source}: the pose of {photo.file} is not a rotation and a translation; repair or remove it")
+    if photo.lens is not None and not undistort:
+        raise InputError(
+            f"{source}: {photo.file} has lens distortion (camera model {photo.lens.model}), only pinholes are rendered;"
+            f" run `python -m data_tools.undistort {source} --out DIR`, or load with undistort=True"
+        )
+    if not photo.path.is_file():
+        raise InputError(f"{photo.path}: missing, but {source} has a camera for it; add the image or remove its camera")
+
+
+def camera_extent(cameras: Sequence[Camera]) -> float:
+    """1.1 x the largest distance of a camera centre from the mean centre, world units."""
+    centers = np.stack([-camera.cam_from_world_R.T @ camera.cam_from_world_t for camera in cameras])  # [V, 3]
+    return EXTENT_MARGIN * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+
+
+def read_view(photo: Photo, name: str, reading: Reading) -> View:
+    """Read one photograph: alpha, mask, undistortion, downscaling, in this order."""
+    camera, path = photo.camera, photo.path
+    small_folder = photo.folder.with_name(f"{photo.folder.name}_{reading.downscale}")
+    is_small = reading.downscale > 1 and photo.lens is None and small_folder.is_dir()
+    if is_small:
+        path = small_folder / photo.file
+    image = read_image(path)  # [H, W, 3 or 4]
+    height, width = image.shape[:2]
+    if is_small:
+        _check_downscaled(photo, width, height, reading.downscale)
+    elif (width, height) != (camera.width, camera.height):
+        raise InputError(
+            f"{path}: the image is {width}x{height} but its camera is {camera.width}x{camera.height};"
+            f" put the full-size image there (smaller ones belong in {photo.folder.name}_D, loaded with downscale=D)"
+        )
+    image, mask = _apply_alpha_and_mask(image, photo, reading)
+    if photo.lens is not None:
+        image, mask, camera = undistort(image, mask, camera, photo.lens)
+    if not is_small:
+        width, height = downscaled_size(camera.width, camera.height, reading.downscale)
+    if (width, height) != (image.shape[1], image.shape[0]):
+        image = resize_image(image, width, height)
+        mask = None if mask is None else resize_mask(mask, width, height)
+    return View(name, rescale_camera(camera, width, height), image, mask)
+
+
+def rescale_camera(camera: Camera, width: int, height: int) -> Camera:
+    """Intrinsics of the same view at another size; exact ratios, since the image's corner is the origin."""
+    ratio_x, ratio_y = width / camera.width, height / camera.height
+    return camera._replace(
+        fx=camera.fx * ratio_x,
+        fy=camera.fy * ratio_y,
+        cx=camera.cx * ratio_x,
+        cy=camera.cy * ratio_y,
+        width=width,
+        height=height,
+    )
+
+
+def _apply_alpha_and_mask(
+    image: NDArray[np.uint8], photo: Photo, reading: Reading
+) -> tuple[NDArray[np.uint8], Bools | None]:
+    """RGB image and mask at the image's size, from its alpha channel and its mask file."""
+    height, width = image.shape[:2]
+    mask = None if photo.mask_path is None else read_mask(photo.mask_path)
+    if mask is not None and mask.shape not in ((height, width), (photo.camera.height, photo.camera.width)):
+        raise InputError(
+            f"{photo.mask_path}: the mask is {mask.shape[1]}x{mask.shape[0]} but its image {photo.file} is"
+            f" {photo.camera.width}x{photo.camera.height}; resize or remove the mask"
+        )
+    if mask is not None:
+        mask = resize_mask(mask, width, height)
+    if image.shape[2] == 3:
+        return image, mask
+    if not reading.alpha_is_mask:
+        return composite_alpha(image, reading.background), mask
+    opaque = image[..., 3] >= MASK_THRESHOLD
+    return np.ascontiguousarray(image[..., :3]), opaque if mask is None else opaque & mask
+
+
+def _check_downscaled(photo: Photo, width: int, height: int, downscale: int) -> None:
+    """A ready-made downscaled image may be rounded up or down, no more."""
+    exact_width, exact_height = photo.camera.width / downscale, photo.camera.height / downscale
+    if abs(width - exact_width) >= 1 or abs(height - exact_height) >= 1:
+        small_folder = f"{photo.folder}_{downscale}"
+        raise InputError(
+            f"{small_folder}/{photo.file}: the image is {width}x{height} but 1/{downscale} of its camera is"
+            f" {exact_width:g}x{exact_height:g}; remove {small_folder} and run"
+            f" `python -m data_tools.downscale {photo.folder} --factor {downscale}`"
+        )
+
+
+def _view_names(photos: Sequence[Photo], source: Path) -> list[str]:
+    """File names without suffix; with their folders where that is not unique (train/r_0 and test/r_0)."""
+    files = [Path(photo.folder.name, photo.file).with_suffix("") for photo in photos]
+    names = [file.name for file in files]
+    if len(set(names)) < len(names):
+        names = ["_".join(file.parts) for file in files]
+    name, count = Counter(names).most_common(1)[0]
+    if count > 1:
+        raise InputError(f"{source}: {count} images are called {name}; give each its own name, suffix aside")
+    return names

@@ -1,0 +1,201 @@
+"""Scenes described by transforms.json, in its three dialects.
+
+* Blender (NeRF-synthetic): ``transforms_train.json`` and ``transforms_test.json``, one ``camera_angle_x``, square
+  pixels, ``file_path`` without suffix, RGBA images, points in ``points3d.ply`` if there are any.
+* nerfstudio: ``fl_x fl_y cx cy w h`` at top level or per frame, ``mask_path``, ``ply_file_path``. Its
+  ``applied_transform`` has already been applied to poses and points alike, so nothing is left to do with it.
+* instant-ngp: as nerfstudio's, with ``aabb_scale``, ``scale`` and ``offset``, which only place the NeRF in its cube;
+  often lists images that do not exist: those are named in a warning and skipped.
+
+Poses are world_from_camera in OpenGL axes (x right, y up, z backward); flipping the y and z columns gives OpenCV axes,
+and the inverse gives cam_from_world. The world frame stays the file's. An alpha channel is composited onto the
+background. Left out: ``depth_file_path``, file lists of splits, per-frame exposure, rolling shutter.
+"""
+
+import json
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.io.images import IMAGE_SUFFIXES, image_size
+from minisplat_ref.io.lens import PINHOLE_MODELS, POLYNOMIAL_MODELS, Lens
+from minisplat_ref.io.ply import read_point_cloud
+from minisplat_ref.io.scene import Photo, build_reading, build_scene, split_photos
+from minisplat_ref.types import Camera, Floats, Scene
+
+BLENDER_FILES = ("transforms_train.json", "transforms_test.json")
+SINGLE_FILE = "transforms.json"
+BLENDER_POINTS = ("points3d.ply", "points3D.ply")
+OPENCV_FROM_OPENGL = np.array([1.0, -1.0, -1.0])  # factors of the camera's x, y and z axis
+NAMED_MISSING_MAX = 20  # missing images that a warning names; all of them would not be one line
+
+
+def load_transforms(
+    path: str | Path,
+    *,
+    downscale: int = 1,
+    test_every: int = 8,
+    background: Sequence[float] | Floats | None = None,
+    undistort: bool = False,
+) -> Scene:
+    """Load a scene described by transforms.json.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder with ``transforms_train.json`` or ``transforms.json``, or one such file.
+    downscale : int
+        Divide the image size by this. A folder ``<images>_<downscale>`` is used where it exists, otherwise images are
+        resized to the rounded size; intrinsics scale by the exact ratio either way.
+    test_every : int
+        Of the images sorted by name, every ``test_every``-th is a test view, beginning with the first; 0 for none.
+        Where there is a ``transforms_test.json``, it is the test set, unless this is 0.
+    background : array_like of shape (3,), optional
+        Colour in [0, 1] under transparent images and behind everything; black by default.
+    undistort : bool
+        Warp images with lens distortion to a pinhole, instead of refusing them.
+
+    Returns
+    -------
+    Scene
+
+    Raises
+    ------
+    InputError
+        If a file is missing or malformed, no image exists, there is distortion, or an image does not fit its camera.
+    """
+    path = Path(path)
+    reading = build_reading(downscale, background, undistort, alpha_is_mask=False)
+    files = find_transforms(path)
+    if not files:
+        raise InputError(f"{path}: no {BLENDER_FILES[0]} or {SINGLE_FILE}; give the folder that holds one, or the file")
+    transforms = read_transforms(files[0])
+    photos = transforms_photos(files[0], transforms)
+    if len(files) == 1:
+        train_photos, test_photos = split_photos(photos, test_every)
+    else:
+        train_photos, _ = split_photos(photos, 0)
+        test_photos, _ = split_photos(transforms_photos(files[1], read_transforms(files[1])) if test_every else [], 0)
+    points_file = find_points(files[0], transforms)
+    no_points = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    points, colors = no_points if points_file is None else read_point_cloud(points_file)
+    return build_scene(path, train_photos, test_photos, points, colors, reading)
+
+
+def find_transforms(path: Path) -> tuple[Path, ...]:
+    """Training file and, for Blender scenes that have one, test file; empty if there is none."""
+    if path.is_file():
+        return (path,)
+    train, test = (path / name for name in BLENDER_FILES)
+    if train.is_file():
+        return (train, test) if test.is_file() else (train,)
+    return (path / SINGLE_FILE,) if (path / SINGLE_FILE).is_file() else ()
+
+
+def read_transforms(file: Path) -> dict[str, Any]:
+    """Parse the JSON and check that it has frames, each with an image and a 4x4 or 3x4 matrix."""
+    try:
+        transforms: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{file}: not valid JSON ({error}); copy or export it again") from None
+    frames = transforms.get("frames") if isinstance(transforms, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise InputError(f"{file}: no list 'frames', so this is not a transforms.json with cameras")
+    for i, frame in enumerate(frames):
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+            raise InputError(f"{file}: frame {i} has no file_path; add it or remove the frame")
+        try:
+            matrix = np.array(frame.get("transform_matrix"), np.float64)
+        except (TypeError, ValueError):
+            matrix = np.zeros(0)
+        if matrix.shape not in ((4, 4), (3, 4)):
+            raise InputError(f"{file}: transform_matrix of {frame['file_path']} is not 4x4; repair or remove the frame")
+    return transforms
+
+
+def transforms_photos(file: Path, transforms: Mapping[str, Any]) -> list[Photo]:
+    """List the frames of a file whose image exists; one warning names the others."""
+    frames = [(frame, _image_file(file, frame["file_path"])) for frame in transforms["frames"]]
+    missing = [frame["file_path"] for frame, image_file in frames if image_file is None]
+    if len(missing) == len(frames):
+        raise InputError(f"{file}: none of its {len(frames)} images exists, first {missing[0]}; put them beside it")
+    if missing:
+        names = ", ".join(missing[:NAMED_MISSING_MAX]) + (" and more" if len(missing) > NAMED_MISSING_MAX else "")
+        warnings.warn(f"{file}: {len(missing)} of {len(frames)} images are missing and skipped: {names}", stacklevel=2)
+    return [_photo(file, {**transforms, **frame}, image) for frame, image in frames if image is not None]
+
+
+def find_points(file: Path, transforms: Mapping[str, Any]) -> Path | None:
+    """Find the point cloud that a file names, or the Blender scene's; None if there is none."""
+    if "ply_file_path" in transforms:
+        points_file = Path(file.parent, transforms["ply_file_path"])
+        if not points_file.is_file():
+            raise InputError(f"{points_file}: missing, but {file} names it; add it or remove ply_file_path")
+        return points_file
+    candidates = (file.parent / name for name in BLENDER_POINTS) if file.name == BLENDER_FILES[0] else ()
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
+
+
+def _image_file(file: Path, file_path: str) -> Path | None:
+    """Image of a frame: the path relative to the JSON file, with a suffix tried where it has none; None if missing."""
+    path = file.parent / file_path.replace("\\", "/")  # some exporters run on Windows
+    candidates = (path, *(path.with_name(path.name + suffix) for suffix in IMAGE_SUFFIXES))
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
+
+
+def _photo(file: Path, frame: Mapping[str, Any], image_file: Path) -> Photo:
+    """One frame; ``frame`` already holds the top level's entries that it does not override."""
+    mask_path = file.parent / frame["mask_path"] if frame.get("mask_path") else None
+    camera, lens = _camera(file, frame, image_file)
+    return Photo(image_file.parent, image_file.name, mask_path, camera, lens)
+
+
+def _camera(file: Path, frame: Mapping[str, Any], image_file: Path) -> tuple[Camera, Lens | None]:
+    """Camera and lens of a frame, whichever dialect describes its focal length."""
+
+    def number(key: str, default: float = 0.0) -> float:
+        try:
+            return float(frame.get(key, default))
+        except (TypeError, ValueError):
+            raise InputError(f"{file}: {key} of {frame['file_path']} is {frame[key]!r}, not a number") from None
+
+    def focal(key: str, angle_key: str, size: int, default: float) -> float:
+        angle = number(angle_key)
+        return number(key) if key in frame else size / (2.0 * math.tan(angle / 2.0)) if 0 < angle < math.pi else default
+
+    width, height = int(number("w")), int(number("h"))
+    if width <= 0 or height <= 0:
+        width, height = image_size(image_file)
+    fx = focal("fl_x", "camera_angle_x", width, 0.0)
+    if fx <= 0.0:
+        raise InputError(f"{file}: {frame['file_path']} has neither fl_x nor camera_angle_x; add one of them")
+    matrix = np.array(frame["transform_matrix"], np.float64)
+    R = (matrix[:3, :3] * OPENCV_FROM_OPENGL).T
+    camera = Camera(
+        cam_from_world_R=np.ascontiguousarray(R),
+        cam_from_world_t=-R @ matrix[:3, 3],
+        fx=fx,
+        fy=focal("fl_y", "camera_angle_y", height, fx),
+        cx=number("cx", width / 2),
+        cy=number("cy", height / 2),
+        width=width,
+        height=height,
+    )
+    pinhole = (camera.fx, camera.fy, camera.cx, camera.cy)
+    k1, k2, k3, k4, p1, p2 = (number(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    model = frame.get("camera_model", "OPENCV")
+    if frame.get("is_fisheye") or model == "OPENCV_FISHEYE":
+        return camera, Lens("OPENCV_FISHEYE", (*pinhole, k1, k2, k3, k4))
+    if model not in (*PINHOLE_MODELS, *POLYNOMIAL_MODELS) or k4 != 0.0:
+        raise InputError(
+            f"{file}: camera_model {model} with k4 = {k4:g} of {frame['file_path']} is not supported;"
+            " undistort it with the program that calibrated it"
+        )
+    if k3 != 0.0:
+        return camera, Lens("FULL_OPENCV", (*pinhole, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
+    return camera, Lens("OPENCV", (*pinhole, k1, k2, p1, p2)) if any((k1, k2, p1, p2)) else None
