@@ -98,8 +98,8 @@ def render(
         raise InputError(f"sh_degree is {sh_degree}; these Gaussians store degrees 0 to {stored_degree}")
     background = np.zeros(3, dtype) if background is None else np.asarray(background, dtype)
 
-    with np.errstate(over="ignore"):  # an infinite scale is culled by the projection
-        scales = np.exp(gaussians.log_scales)
+    with np.errstate(over="ignore"):  # the projection culls the largest number; infinity times a zero gradient is NaN
+        scales = np.minimum(np.exp(gaussians.log_scales), np.finfo(dtype).max)
     opacities = 0.5 * (1 + np.tanh(0.5 * gaussians.opacity_logits))  # the sigmoid, which cannot overflow in this form
     projection = backend.project(gaussians.means, gaussians.quats, scales, opacities, camera, conventions)
     channels = backend.sh_colors(

@@ -1,0 +1,35 @@
+"""Fixtures for all test files."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from minisplat_ref.backends import BACKENDS, REFERENCE
+
+SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(20240229)
+
+
+@pytest.fixture(params=BACKENDS.values(), ids=BACKENDS.keys())
+def backend(request):
+    """Every backend: closed forms, gradients and hard cases hold for each."""
+    return request.param
+
+
+@pytest.fixture(params=[b for b in BACKENDS.values() if b is not REFERENCE], ids=lambda b: b.name)
+def fast_backend(request):
+    """Every backend but the reference, for parity with it."""
+    return request.param
+
+
+@pytest.fixture(scope="session")
+def shared_data():
+    """Folder of real scenes, beside the repository; tests that need it are skipped where it is absent."""
+    if not SHARED_DATA.is_dir():
+        pytest.skip(f"no real scenes at {SHARED_DATA}")
+    return SHARED_DATA

@@ -1,0 +1,173 @@
+import numpy as np
+import pytest
+from gradcheck import check_jacobian
+from numpy.testing import assert_allclose, assert_array_equal
+from scenes import make_camera, make_gaussians
+from tolerances import (
+    CLOSED_FORM,
+    GRADIENT_FLOOR,
+    PARITY_FLOAT32_GRADIENT,
+    PARITY_FLOAT32_IMAGE,
+    PARITY_FLOAT64,
+    SH_CONSTANTS,
+)
+
+from minisplat_ref.backends import REFERENCE
+from minisplat_ref.constants import SH_C0, SH_C1, SH_C2, SH_C3
+from minisplat_ref.reference.spherical_harmonics import sh_basis, sh_basis_jacobian
+
+VISIBLE = np.array([[1, 1]], dtype=np.int32)
+
+# --- closed form ---
+
+
+def sphere_quadrature():
+    """Directions and weights that integrate polynomials of degree 7 over the sphere exactly."""
+    z, z_weights = np.polynomial.legendre.leggauss(8)
+    azimuths = np.arange(16) * 2 * np.pi / 16
+    ring = np.sqrt(1 - z**2)
+    directions = np.stack(
+        [np.outer(ring, np.cos(azimuths)), np.outer(ring, np.sin(azimuths)), np.outer(z, np.ones(16))], axis=-1
+    )
+    return directions.reshape(-1, 3), np.repeat(z_weights, 16) * 2 * np.pi / 16
+
+
+def test_basis_is_orthonormal_over_the_sphere():
+    directions, weights = sphere_quadrature()
+    basis = sh_basis(directions, 3)
+    assert_allclose(basis.T @ (weights[:, None] * basis), np.eye(16), atol=SH_CONSTANTS)
+
+
+def test_basis_spans_each_degree(rng):
+    # Addition theorem: the squares of the 2l + 1 functions of a degree sum to (2l + 1) / (4 pi) everywhere.
+    directions = rng.normal(size=(30, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    squares = sh_basis(directions, 3) ** 2
+    for degree in range(4):
+        total = squares[:, degree**2 : (degree + 1) ** 2].sum(axis=1)
+        assert_allclose(total, (2 * degree + 1) / (4 * np.pi), rtol=SH_CONSTANTS)
+
+
+def test_order_and_signs_by_hand():
+    h = np.sqrt(0.5)
+    x, y, z, xy, yz, xz = np.eye(3)[0], np.eye(3)[1], np.eye(3)[2], [h, h, 0], [0, h, h], [h, 0, h]
+    expected = {  # coefficient: (direction, value)
+        0: (x, SH_C0), 1: (y, -SH_C1), 2: (z, SH_C1), 3: (x, -SH_C1),
+        4: (xy, SH_C2[0] / 2), 5: (yz, -SH_C2[0] / 2), 6: (z, 2 * SH_C2[1]), 7: (xz, -SH_C2[0] / 2), 8: (x, SH_C2[2]),
+        9: (y, SH_C3[0]), 11: (yz, -3 * h / 2 * SH_C3[2]), 12: (z, 2 * SH_C3[3]), 13: (xz, -3 * h / 2 * SH_C3[2]),
+        14: (xz, h / 2 * SH_C3[4]), 15: (x, -SH_C3[0]),
+    }  # fmt: skip
+    for k, (direction, value) in expected.items():
+        assert_allclose(sh_basis(np.array([direction]), 3)[0, k], value, rtol=CLOSED_FORM)
+    diagonal = np.full((1, 3), np.sqrt(1 / 3))
+    assert_allclose(sh_basis(diagonal, 3)[0, 10], SH_C3[1] / np.sqrt(27), rtol=CLOSED_FORM)
+
+
+def test_color_by_hand(backend):
+    # Camera centre (0, 0, -1), mean (0, 3, 3): direction (0, 0.6, 0.8).
+    camera = make_camera()._replace(cam_from_world_t=np.array([0.0, 0, 1]))
+    sh_dc, sh_rest = np.array([[1.0, -2, 0]]), np.zeros((1, 3, 3))
+    sh_rest[0, 0, 0], sh_rest[0, 1, 2] = 0.5, 0.25
+    colors = backend.sh_colors(np.array([[0.0, 3, 3]]), sh_dc, sh_rest, camera, 1, VISIBLE)
+    expected = [0.5 + SH_C0 - 0.5 * SH_C1 * 0.6, 0, 0.5 + 0.25 * SH_C1 * 0.8]  # green would be 0.5 - 0.56: clamped
+    assert_allclose(colors, [expected], rtol=CLOSED_FORM)
+
+
+def test_camera_centre_uses_the_rotation(backend, rng):
+    camera = make_camera(rng=rng)
+    centre = -camera.cam_from_world_R.T @ camera.cam_from_world_t
+    sh_rest = np.zeros((1, 3, 3))
+    sh_rest[0, 1] = 1
+    colors = backend.sh_colors(centre[None] + [[0, 0, 5.0]], np.zeros((1, 3)), sh_rest, camera, 1, VISIBLE)
+    assert_allclose(colors, 0.5 + SH_C1, rtol=CLOSED_FORM)
+
+
+def test_higher_degrees_wait_until_they_are_active(backend, rng):
+    gaussians, camera = make_gaussians(rng, 5), make_camera()
+    radii = np.ones((5, 2), dtype=np.int32)
+    for degree in range(4):
+        k = (degree + 1) ** 2 - 1
+        cut = backend.sh_colors(
+            gaussians.means, gaussians.sh_dc, np.ascontiguousarray(gaussians.sh_rest[:, :k]), camera, degree, radii
+        )
+        full = backend.sh_colors(gaussians.means, gaussians.sh_dc, gaussians.sh_rest, camera, degree, radii)
+        assert_array_equal(cut, full)
+
+
+def test_culled_gaussians_are_black(backend, rng):
+    gaussians, camera = make_gaussians(rng, 4), make_camera()
+    gaussians.means[1] = np.nan
+    radii = np.array([[1, 1], [0, 0], [3, 2], [0, 0]], dtype=np.int32)
+    arguments = (gaussians.means, gaussians.sh_dc + 2, gaussians.sh_rest, camera, 3, radii)
+    colors = backend.sh_colors(*arguments)
+    assert colors[[0, 2]].any(axis=1).all() and not colors[[1, 3]].any()
+    gradient = backend.sh_colors_vjp(*arguments, np.ones((4, 3)))
+    for field in gradient[:3]:
+        assert field[[0, 2]].any() and not field[[1, 3]].any()
+    assert all(np.isfinite(field).all() for field in gradient)
+
+
+# --- gradient ---
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_basis_jacobian(rng, degree):
+    directions = rng.normal(size=(3, 3))
+    check_jacobian(
+        lambda d: (sh_basis(d, degree),),
+        lambda v: (np.einsum("nk,nki->ni", v, sh_basis_jacobian(directions, degree)),),
+        (directions,),
+        names=["directions"],
+    )
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_color_jacobian(backend, rng, degree):
+    camera = make_camera(rng=rng)
+    gaussians = make_gaussians(rng, 4)
+    radii = np.ones((4, 2), dtype=np.int32)
+    inputs = (gaussians.means, 3 * gaussians.sh_dc, gaussians.sh_rest, camera.cam_from_world_R, camera.cam_from_world_t)
+
+    def function(means, sh_dc, sh_rest, R, t):
+        view = camera._replace(cam_from_world_R=R, cam_from_world_t=t)
+        return (backend.sh_colors(means, sh_dc, sh_rest, view, degree, radii),)
+
+    colors = function(*inputs)[0]
+    assert (colors == 0).any() and (colors > 0).sum() > 6  # both sides of the clamp
+    names = ["means", "sh_dc", "sh_rest", "R", "t"]
+    if degree == 0:  # a constant colour: nothing but sh_dc has a gradient
+        gradient = backend.sh_colors_vjp(*inputs[:3], camera, degree, radii, np.ones((4, 3)))
+        assert not any(gradient[k].any() for k in (0, 2, 3, 4))
+        check_jacobian(
+            lambda sh_dc: function(inputs[0], sh_dc, *inputs[2:]),
+            lambda v: (backend.sh_colors_vjp(*inputs[:3], camera, degree, radii, v).sh_dc,),
+            inputs[1:2],
+            names=["sh_dc"],
+        )
+    else:
+        check_jacobian(
+            function, lambda v: backend.sh_colors_vjp(*inputs[:3], camera, degree, radii, v), inputs, names=names
+        )
+
+
+# --- parity ---
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_backends_agree(fast_backend, degree, dtype, rng):
+    gaussians, camera = make_gaussians(rng, 100), make_camera(rng=rng)
+    radii = rng.integers(0, 2, size=100)[:, None].repeat(2, axis=1).astype(np.int32)
+    v = rng.normal(size=(100, 3))
+    arrays = (gaussians.means, gaussians.sh_dc, gaussians.sh_rest)
+    expected = REFERENCE.sh_colors(*arrays, camera, degree, radii)
+    v_expected = REFERENCE.sh_colors_vjp(*arrays, camera, degree, radii, v)
+    cast = tuple(array.astype(dtype) for array in arrays)
+    actual = fast_backend.sh_colors(*cast, camera, degree, radii)
+    v_actual = fast_backend.sh_colors_vjp(*cast, camera, degree, radii, v.astype(dtype))
+    assert actual.dtype == dtype and expected.max() > GRADIENT_FLOOR
+    assert_allclose(actual, expected, rtol=0, atol=PARITY_FLOAT64 if dtype == np.float64 else PARITY_FLOAT32_IMAGE)
+    tolerance = PARITY_FLOAT64 if dtype == np.float64 else PARITY_FLOAT32_GRADIENT
+    for a, e in zip(v_actual, v_expected, strict=True):
+        assert a.dtype == dtype
+        assert_allclose(a, e, rtol=0, atol=tolerance * max(np.abs(e).max(), GRADIENT_FLOOR))
