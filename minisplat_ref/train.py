@@ -1,0 +1,210 @@
+"""The training loop: one photograph, one gradient step, and whatever the recipe says is due.
+
+Order inside an iteration: render, loss, gradients, Adam, then the events that are due. 3DGS runs its density control
+*before* Adam, and because it replaces the parameter tensors, that iteration's step is silently lost (likewise in
+Mini-Splatting; gsplat steps first, as here). Here no step is lost, the last iteration's included.
+
+Left out: image pyramids, exposure compensation, regularisers.
+"""
+
+import json
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref.backends import REFERENCE, Backend
+from minisplat_ref.constants import GSPLAT_MAIN, Conventions
+from minisplat_ref.errors import InputError
+from minisplat_ref.events import Iteration, TrainState
+from minisplat_ref.io.checkpoint import load_checkpoint, save_checkpoint
+from minisplat_ref.optim.adam import AdamState, adam_step, zero_moments
+from minisplat_ref.optim.schedules import active_sh_degree
+from minisplat_ref.recipes import During, Recipe, describe
+from minisplat_ref.render import render, render_vjp
+from minisplat_ref.strategy.initialization import initial_gaussians
+from minisplat_ref.types import Gaussians, RenderOutput, Scene, View
+
+__all__ = ["StepReport", "TrainState", "initial_state", "load_state", "save_state", "train"]
+
+
+class StepReport(NamedTuple):
+    """What ``on_step`` is told after every iteration."""
+
+    step: int
+    """Iterations done, from 1."""
+    loss: float
+    """Training loss of ``view``, before this iteration's update."""
+    view: View
+    output: RenderOutput
+    """The rendering that ``loss`` measures, float32, not clipped."""
+    state: TrainState
+    """The state after the iteration; it is safe to save."""
+
+
+def initial_state(scene: Scene, recipe: Recipe, seed: int) -> TrainState:
+    """Return the state before the first iteration.
+
+    Raises
+    ------
+    InputError
+        The scene has no training views.
+    """
+    if not scene.train_views:
+        raise InputError(f"scene {scene.name} has no training views: lower the share of test views or add photographs")
+    rng = np.random.default_rng(seed)
+    gaussians = initial_gaussians(scene, recipe.sh_degree, rng)
+    return TrainState(gaussians, zero_moments(gaussians), step=0, view_order=[], rng=rng, stats={})
+
+
+def train(
+    scene: Scene,
+    recipe: Recipe,
+    *,
+    seed: int,
+    state: TrainState | None = None,
+    on_step: Callable[[StepReport], None] | None = None,
+    backend: Backend = REFERENCE,
+    conventions: Conventions = GSPLAT_MAIN,
+) -> TrainState:
+    """Train until ``recipe.iterations``.
+
+    Parameters
+    ----------
+    scene : Scene
+    recipe : Recipe
+    seed : int
+        Seed of the whole run; without effect when ``state`` is given, which carries its generator.
+    state : TrainState, optional
+        Where to start or continue, changed in place and returned; default ``initial_state(scene, recipe, seed)``.
+    on_step : callable, optional
+        Called with a :class:`StepReport` after every iteration.
+    backend : Backend
+    conventions : Conventions
+
+    Returns
+    -------
+    state : TrainState
+        The same seed gives the same bytes; a state that was saved, loaded and continued does, too.
+
+    Raises
+    ------
+    InputError
+        The scene has no training views or is not the one that ``state`` was trained on.
+    KeyboardInterrupt
+        After Ctrl-C, at the end of the running iteration: the ``state`` that was passed in is whole and can be saved.
+    """
+    state = initial_state(scene, recipe, seed) if state is None else state
+    if max(state.view_order, default=0) >= len(scene.train_views):
+        raise InputError(f"scene {scene.name} has fewer training views than the run to continue: give the same scene")
+    with _interrupts_held_back() as raise_if_interrupted:
+        while state.step < recipe.iterations:
+            report = _iterate(state, scene, recipe, backend, conventions)
+            if on_step is not None:
+                on_step(report)
+            raise_if_interrupted()
+    return state
+
+
+def _iterate(state: TrainState, scene: Scene, recipe: Recipe, backend: Backend, conventions: Conventions) -> StepReport:
+    step = state.step + 1
+    view = _next_view(state, scene)
+    due = [event for event in recipe.events if event.is_due(step)]
+    background = state.rng.random(3) if recipe.has_random_background else scene.background
+    output, tape = render(
+        state.gaussians,
+        view.camera,
+        background=background.astype(np.float32),
+        sh_degree=active_sh_degree(step, recipe.sh_milestones, recipe.sh_degree),
+        conventions=conventions,
+        backend=backend,
+        with_stats=any(isinstance(event, During) and event.needs_blend_stats for event in due),
+    )
+    target = np.multiply(view.image, np.float32(1 / 255), dtype=np.float32)  # [H, W, 3]
+    loss, loss_tape = backend.photometric_loss(output.image, target, recipe.dssim_weight, view.mask)
+    gradient = render_vjp(tape, backend.photometric_loss_vjp(loss_tape))
+
+    visible_ids = np.flatnonzero(tape.projection.radii[:, 0])
+    rates = recipe.learning_rates.at(step, scene.extent)
+    state.adam = adam_step(state.gaussians, gradient.gaussians, state.adam, rates, recipe.adam, visible_ids)
+    iteration = Iteration(scene, view, output, visible_ids, gradient.means2d, backend, conventions)
+    for event in due:
+        event.action(state, iteration)
+    state.step = step
+    return StepReport(step, loss, view, output, state)
+
+
+def _next_view(state: TrainState, scene: Scene) -> View:
+    """Draw without replacement; when all views have been seen, shuffle them anew."""
+    if not state.view_order:
+        state.view_order = state.rng.permutation(len(scene.train_views)).tolist()
+    return scene.train_views[state.view_order.pop()]
+
+
+@contextmanager
+def _interrupts_held_back() -> Iterator[Callable[[], None]]:
+    """Hold Ctrl-C back until the yielded function is called: half an Adam step must not be saved."""
+    is_interrupted = False
+
+    def note(signal_number: int, frame: FrameType | None) -> None:
+        nonlocal is_interrupted
+        is_interrupted = True
+
+    def raise_if_interrupted() -> None:
+        if is_interrupted:
+            raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():  # where Python delivers no signals
+        yield raise_if_interrupted
+        return
+    previous = signal.signal(signal.SIGINT, note)
+    try:
+        yield raise_if_interrupted
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
+def save_state(path: str | Path, state: TrainState, recipe: Recipe) -> None:
+    """Write a checkpoint from which :func:`load_state` continues bit by bit."""
+    groups = {"gaussians": state.gaussians, "first": state.adam.first, "second": state.adam.second}
+    arrays = {f"{group}.{name}": field for group, fields in groups.items() for name, field in fields._asdict().items()}
+    arrays |= {f"stats.{name}": field for name, field in state.stats.items()}
+    metadata = {
+        "step": state.step,
+        "adam_step": state.adam.step,
+        "view_order": state.view_order,
+        "rng": state.rng.bit_generator.state,
+        "recipe": describe(recipe),
+    }
+    save_checkpoint(path, arrays, metadata)
+
+
+def load_state(path: str | Path, recipe: Recipe) -> TrainState:
+    """Read what :func:`save_state` wrote.
+
+    Raises
+    ------
+    InputError
+        The file is missing or damaged, or was written under another recipe.
+    """
+    arrays, metadata = load_checkpoint(path)
+    if metadata["recipe"] != json.loads(json.dumps(describe(recipe))):
+        was = metadata["recipe"]
+        raise InputError(
+            f"{path} was written by recipe {was['name']} of {was['iterations']} iterations with other settings than "
+            f"{recipe.name} of {recipe.iterations} iterations: continue with the recipe of the run"
+        )
+    rng = np.random.default_rng()
+    rng.bit_generator.state = metadata["rng"]
+
+    def population(group: str) -> Gaussians:
+        return Gaussians(*(arrays[f"{group}.{name}"] for name in Gaussians._fields))
+
+    stats: dict[str, Any] = {name.removeprefix("stats."): a for name, a in arrays.items() if name.startswith("stats.")}
+    adam = AdamState(population("first"), population("second"), metadata["adam_step"])
+    return TrainState(population("gaussians"), adam, metadata["step"], metadata["view_order"], rng, stats)
