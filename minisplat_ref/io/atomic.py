@@ -29,6 +29,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
         If the folder does not exist.
     """
     path = Path(path)
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"{path}: the folder {path.absolute().parent} does not exist; create it first")
     temporary = _part_of(path)
     try:
         yield temporary
@@ -44,14 +46,16 @@ def making_folder(path: str | Path) -> Iterator[Path]:
     Raises
     ------
     InputError
-        If ``path`` exists and is not an empty folder. Parents are made.
+        If ``path`` exists and is not an empty folder, or cannot be made. Parents are made.
     """
     path = Path(path)
     if path.exists() and not (path.is_dir() and not any(path.iterdir())):
         raise InputError(f"{path}: already there and not empty; choose another name or remove it first")
-    path.absolute().parent.mkdir(parents=True, exist_ok=True)
     temporary = _part_of(path)
-    temporary.mkdir()
+    try:
+        temporary.mkdir(parents=True)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be made ({error.strerror}); choose another place") from None
     try:
         yield temporary
         if path.exists():  # empty, see above; elsewhere than on POSIX a folder cannot be renamed onto another
@@ -63,6 +67,4 @@ def making_folder(path: str | Path) -> Iterator[Path]:
 
 def _part_of(path: Path) -> Path:
     """Name for what is being written, unique to this process."""
-    if not path.absolute().parent.is_dir():
-        raise InputError(f"{path}: the folder {path.absolute().parent} does not exist; create it first")
     return path.absolute().with_name(f".{path.absolute().name}.{os.getpid()}.part")

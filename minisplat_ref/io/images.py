@@ -9,6 +9,7 @@ alias, and area means for masks. Left out: colour profiles, raw formats, high dy
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from minisplat_ref.types import Bools, Floats
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 """Files that count as photographs."""
 
-SAVE_OPTIONS: dict[str, dict[str, int]] = {"JPEG": {"quality": 95, "subsampling": 0}}
+SAVE_OPTIONS: dict[str, dict[str, Any]] = {"JPEG": {"quality": 95, "subsampling": 0}}
 MASK_THRESHOLD = 128  # a mask pixel counts from half white on; masks saved as JPEG are not exactly 0 and 255
 
 

@@ -74,14 +74,12 @@ def load_transforms(
     files = find_transforms(path)
     if not files:
         raise InputError(f"{path}: no {BLENDER_FILES[0]} or {SINGLE_FILE}; give the folder that holds one, or the file")
-    transforms = read_transforms(files[0])
-    photos = transforms_photos(files[0], transforms)
-    if len(files) == 1:
-        train_photos, test_photos = split_photos(photos, test_every)
-    else:
-        train_photos, _ = split_photos(photos, 0)
-        test_photos, _ = split_photos(transforms_photos(files[1], read_transforms(files[1])) if test_every else [], 0)
-    points_file = find_points(files[0], transforms)
+    sets = [read_transforms(file) for file in files[: 1 if test_every == 0 else 2]]
+    photos = [[photo for _, photo in existing_frames(*pair)] for pair in zip(files, sets, strict=False)]
+    train_photos, test_photos = split_photos(photos[0], test_every if len(files) == 1 else 0)
+    if len(photos) == 2:
+        test_photos, _ = split_photos(photos[1], 0)
+    points_file = find_points(files[0], sets[0])
     no_points = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     points, colors = no_points if points_file is None else read_point_cloud(points_file)
     return build_scene(path, train_photos, test_photos, points, colors, reading)
@@ -118,8 +116,8 @@ def read_transforms(file: Path) -> dict[str, Any]:
     return transforms
 
 
-def transforms_photos(file: Path, transforms: Mapping[str, Any]) -> list[Photo]:
-    """List the frames of a file whose image exists; one warning names the others."""
+def existing_frames(file: Path, transforms: Mapping[str, Any]) -> list[tuple[dict[str, Any], Photo]]:
+    """Pair the frames of a file with their photographs; one warning names the images that do not exist."""
     frames = [(frame, _image_file(file, frame["file_path"])) for frame in transforms["frames"]]
     missing = [frame["file_path"] for frame, image_file in frames if image_file is None]
     if len(missing) == len(frames):
@@ -127,7 +125,7 @@ def transforms_photos(file: Path, transforms: Mapping[str, Any]) -> list[Photo]:
     if missing:
         names = ", ".join(missing[:NAMED_MISSING_MAX]) + (" and more" if len(missing) > NAMED_MISSING_MAX else "")
         warnings.warn(f"{file}: {len(missing)} of {len(frames)} images are missing and skipped: {names}", stacklevel=2)
-    return [_photo(file, {**transforms, **frame}, image) for frame, image in frames if image is not None]
+    return [(frame, _photo(file, {**transforms, **frame}, image)) for frame, image in frames if image is not None]
 
 
 def find_points(file: Path, transforms: Mapping[str, Any]) -> Path | None:
