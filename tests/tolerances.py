@@ -36,3 +36,28 @@ SSIM_BY_SCIPY = 1e-12
 
 # The same in float32: 1e-7 of a mean near 1 against C2 = 9e-4 is 1e-4 of a pixel's SSIM.
 PARITY_FLOAT32_LOSS = 1e-3
+
+# A few Adam steps in float32 on values of order 1: some roundings of 6e-8 each.
+ADAM_FLOAT32 = 1e-6
+
+# A ray-traced point against the surface it was computed from, metres or relative: 1e-16 times distances of up to 150 m,
+# divided by grazing cosines and, in a sphere's root, by its square.
+SYNTHETIC_SURFACE = 1e-7
+
+# A sparse point against the pixel that it falls on, 8-bit levels: half a pixel away on a texture, and shadows' edges.
+SYNTHETIC_COLOR_LEVELS = 20
+
+# Depth and normals on disk are float32: half a unit in its last place, 6e-8.
+SYNTHETIC_FLOAT32 = 1e-7
+
+# A float64 result stored as float32, of magnitude up to 10.
+ROUNDED_TO_FLOAT32 = 1e-6
+
+# Mean and covariance of 8000 draws, relative to the largest standard deviation (squared): 4 sigma of 1 / sqrt(8000).
+SAMPLE_MEAN = 0.045
+
+# .splat files hold bytes: 128 + 128 q and 255 alpha, rounded or truncated by whoever wrote them.
+SPLAT_BYTE = 1.0
+
+# .splat files hold exp(log_scale) in float32: the exponential of a float32 that is rounded once more.
+SPLAT_SCALE = 1e-6

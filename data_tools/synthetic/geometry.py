@@ -213,7 +213,7 @@ def first_hits(primitives: tuple[Primitive, ...], origins: Floats, directions: F
     for index, primitive in enumerate(primitives):
         if np.isinf(primitive.shape.bound_radius):
             t = primitive.distances(origins, directions)
-            winners = np.flatnonzero(t < nearest)
+            winners: Ints = np.flatnonzero(t < nearest)
             nearest[winners] = t[winners]
         else:
             rays = _rays_near(primitive, origins, unit)

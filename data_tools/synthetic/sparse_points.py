@@ -64,15 +64,26 @@ def sample_points(
         Each seen by at least two of the cameras.
     """
     weights = np.stack([_feature_weights(view) for view in traced]).ravel()  # [V H W]
-    n_candidates = min(int(OVERSAMPLING * n_points), int(np.count_nonzero(weights)))
-    if n_candidates == 0:
-        return SparsePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((len(cameras), 0), bool))
-    pixels = rng.choice(weights.size, n_candidates, replace=False, p=weights / weights.sum())
-    points, colors = _lift(world, cameras, traced, pixels)
-    visibility = np.stack([_sees(world, camera, points) for camera in cameras])  # [V, P]
-    kept = np.flatnonzero(visibility.sum(axis=0) >= N_VIEWS_MIN)[:n_points]
-    moved = points[kept] + noise * rng.standard_normal((len(kept), 3))
-    return SparsePoints(moved, colors[kept], visibility[:, kept])
+    pixels = np.flatnonzero(weights)
+    # The first of several exponential clocks to ring is each with probability proportional to its rate, so sorting the
+    # ringing times draws without replacement.
+    pixels = pixels[np.argsort(rng.exponential(size=len(pixels)) / weights[pixels])]
+    batches = [SparsePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((len(cameras), 0), bool))]
+    n_missing = n_points
+    while n_missing > 0 and len(pixels):
+        n_drawn = int(OVERSAMPLING * n_missing) + 1
+        points, colors = _lift(world, cameras, traced, pixels[:n_drawn])
+        visibility = np.stack([_sees(world, camera, points) for camera in cameras])  # [V, n_drawn]
+        shared = np.flatnonzero(visibility.sum(axis=0) >= N_VIEWS_MIN)[:n_missing]
+        batches.append(SparsePoints(points[shared], colors[shared], visibility[:, shared]))
+        pixels = pixels[n_drawn:]
+        n_missing -= len(shared)
+    points = np.concatenate([batch.points for batch in batches])
+    return SparsePoints(
+        points=points + noise * rng.standard_normal(points.shape),
+        colors=np.concatenate([batch.colors for batch in batches]),
+        visibility=np.concatenate([batch.visibility for batch in batches], axis=1),
+    )
 
 
 def project_points(camera: Camera, points: Floats) -> tuple[Floats, Floats]:
