@@ -1,0 +1,7 @@
+"""``python -m minisplat_ref``: the command line."""
+
+import sys
+
+from minisplat_ref.cli import main
+
+sys.exit(main())

@@ -1,0 +1,77 @@
+"""The command line ``minisplat-ref``: reads arguments, shows progress, writes files; everything else lives below it.
+
+One module per command, each with ``add_parser`` (arguments and help) and ``run`` (the work; returns the exit code). A
+new command is such a module, named in ``COMMANDS``. These modules import only the standard library at their top, and
+what they need inside ``run``, so that ``--help`` does not wait for Numba.
+
+Exit codes: 0 done, 2 the input or the arguments are wrong (one line on stderr says which and what to do), 130
+interrupted. A programming error keeps its traceback.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from typing import NoReturn
+
+from minisplat_ref.cli.arguments import HelpFormatter
+from minisplat_ref.errors import InputError
+
+from . import demo, evaluate, info, render, train
+
+COMMANDS = (demo, train, render, evaluate, info)
+
+DESCRIPTION = """\
+3D Gaussian Splatting on the CPU: train a scene from photographs, look at it,
+measure it, and check every formula against a reference that can be read.
+
+First time here:   minisplat-ref demo
+Your own photos:   minisplat-ref train SCENE --out runs/mine
+"""
+EPILOG = "minisplat-ref COMMAND --help explains a command. Exit codes: 0 done, 2 bad input, 130 interrupted."
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose errors are one line, like those of bad input."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print one line to stderr and exit with code 2."""
+        self.exit(2, f"minisplat-ref: error: {message} (see: {self.prog} --help)\n")
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of all commands; ``args.run`` is the function of the chosen one, None where there is none."""
+    parser = Parser(prog="minisplat-ref", description=DESCRIPTION, epilog=EPILOG, formatter_class=HelpFormatter)
+    parser.set_defaults(run=None)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
+    for command in COMMANDS:
+        command.add_parser(commands)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        Arguments without the program's name; those of the process by default.
+
+    Returns
+    -------
+    int
+        Exit code: 0, 2 for bad input, 130 when interrupted.
+    """
+    parser = build_parser()
+    args = parser.parse_args(argv)
+    if args.run is None:
+        parser.print_help()
+        return 0
+    try:
+        code: int = args.run(args)
+    except InputError as error:
+        print(f"minisplat-ref: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("minisplat-ref: interrupted", file=sys.stderr)
+        return 130
+    return code

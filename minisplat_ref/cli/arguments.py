@@ -1,0 +1,58 @@
+"""What the commands' arguments share: the look of the help, and the types of values."""
+
+import argparse
+from collections.abc import Callable
+
+from minisplat_ref.constants import GSPLAT_MAIN, PROFILES
+
+Commands = argparse._SubParsersAction
+
+
+class HelpFormatter(argparse.RawDescriptionHelpFormatter):
+    """Keeps the line breaks of descriptions and leaves the options room in a terminal of 100 columns."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=26, width=100)
+
+
+def integer(minimum: int) -> Callable[[str], int]:
+    """Return the type of a whole number that is at least ``minimum``."""
+
+    def parse(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = minimum - 1
+        if value < minimum:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least {minimum}")
+        return value
+
+    return parse
+
+
+def add_renderer_arguments(parser: argparse._ActionsContainer, default: str | None, whose: str = "") -> None:
+    """Add ``--profile``, a key of ``PROFILES``, and ``--backend``.
+
+    Parameters
+    ----------
+    parser : ArgumentParser or group
+    default : str or None
+        Value of both when they are not given.
+    whose : str
+        What the command falls back to before GSPLAT_MAIN and cpu, for the help.
+    """
+    parser.add_argument(
+        "--profile",
+        type=str.upper,
+        choices=tuple(PROFILES),
+        default=default,
+        metavar="NAME",
+        help=f"rasteriser conventions: {', '.join(PROFILES)} (default {whose}{GSPLAT_MAIN.name})",
+    )
+    parser.add_argument(
+        "--backend",
+        choices=("cpu", "reference"),
+        default=default,
+        metavar="NAME",
+        help=f"cpu (Numba) or reference (NumPy, slow) (default {whose}cpu)",
+    )

@@ -1,0 +1,61 @@
+"""``eval``: measures a run on its test views again."""
+
+import argparse
+from pathlib import Path
+
+from minisplat_ref.cli.arguments import Commands, HelpFormatter
+from minisplat_ref.errors import InputError
+
+DESCRIPTION = """\
+Measure a run on its test views: PSNR and SSIM of point_cloud.ply, view by view.
+
+Rewrites DIR/metrics.json and DIR/renders/ (truth | render | error side by side). Pictures are compared
+as floats clipped to [0, 1]; SSIM has an 11 x 11 window with zero padding. Means over views are means of
+the views' values. LPIPS is null: its network's weights do not come with this program.
+"""
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "eval",
+        help="measure a run on its test views",
+        description=DESCRIPTION,
+        epilog="example:\n  minisplat-ref eval runs/fox",
+        formatter_class=HelpFormatter,
+    )
+    parser.add_argument("folder", type=Path, metavar="DIR", help="the --out folder of a training")
+    parser.add_argument(
+        "--scene",
+        type=Path,
+        metavar="PATH",
+        help="where the photographs are now, if they have moved since the training",
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, print a table, rewrite the files."""
+    from minisplat_ref.cli import run_folder
+    from minisplat_ref.cli.scoring import score, summary, to_metrics
+    from minisplat_ref.cli.settings import load, load_photographs
+    from minisplat_ref.io import load_ply
+
+    settings = load(args.folder)
+    if args.scene is not None:
+        settings = settings._replace(scene=str(args.scene))
+    gaussians = load_ply(args.folder / run_folder.POINT_CLOUD)
+    scene = load_photographs(settings)
+    if not scene.test_views:
+        raise InputError(f"{settings.scene} was split without test views (--test-every 0): nothing to measure")
+    evaluation = score(args.folder, scene, gaussians, settings)
+
+    path = args.folder / run_folder.METRICS
+    metrics = run_folder.read_json_object(path) if path.exists() else {}
+    run_folder.write_json(path, {**metrics, **to_metrics(evaluation), "n_gaussians": len(gaussians.means)})
+    width = max(len(view.name) for view in evaluation.per_view)
+    print(f"{'view':<{width}}  PSNR dB    SSIM")
+    for view in evaluation.per_view:
+        print(f"{view.name:<{width}}  {view.psnr:7.2f}  {view.ssim:.4f}")
+    print(summary(evaluation))
+    return 0

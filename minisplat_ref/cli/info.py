@@ -1,0 +1,169 @@
+"""``info``: what is in a PLY, a checkpoint, a run or a scene."""
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from minisplat_ref.cli.arguments import Commands, HelpFormatter
+from minisplat_ref.errors import InputError
+
+if TYPE_CHECKING:
+    from minisplat_ref.types import Floats, Gaussians
+
+Rows = list[tuple[str, str]]
+
+DESCRIPTION = """\
+Say what is in a file or folder: counts, spherical-harmonics degree, bounds, sizes.
+
+  point_cloud.ply   Gaussians in the 3DGS layout, whoever wrote them
+  checkpoint.npz    a training that can be continued
+  run folder        the --out of a training: settings, measures and Gaussians
+  scene folder      COLMAP (images/, sparse/0/) or transforms.json: views, points, cameras
+
+Everything is read and checked: what is damaged is named, with what is wrong (exit code 2).
+"""
+EPILOG = """\
+examples:
+  minisplat-ref info runs/fox/point_cloud.ply
+  minisplat-ref info photos/fox
+"""
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "info",
+        help="say what is in a PLY, a checkpoint, a run or a scene",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=HelpFormatter,
+    )
+    parser.add_argument("path", type=Path, metavar="FILE", help="any of these")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print a table of names and values."""
+    from minisplat_ref.cli.run_folder import CONFIG
+
+    path: Path = args.path
+    if not path.exists():
+        raise InputError(f"{path} does not exist: give a file or folder to look into")
+    if path.suffix == ".ply":
+        rows = _ply_rows(path)
+    elif path.suffix == ".npz":
+        rows = _checkpoint_rows(path)
+    elif (path / CONFIG).exists():
+        rows = _run_rows(path)
+    elif path.is_dir() or path.suffix == ".json":
+        rows = _scene_rows(path)
+    else:
+        raise InputError(f"{path} is none of .ply, checkpoint .npz, run folder, scene folder, transforms.json")
+    width = max(len(name) for name, _ in rows)
+    for name, value in rows:
+        print(f"{name:<{width}}  {value}")
+    return 0
+
+
+def _ply_rows(path: Path) -> Rows:
+    from minisplat_ref.io import load_ply
+
+    return [("size", _size(path)), *_gaussian_rows(load_ply(path))]
+
+
+def _checkpoint_rows(path: Path) -> Rows:
+    from minisplat_ref.io.checkpoint import load_checkpoint
+    from minisplat_ref.types import Gaussians
+
+    arrays, metadata = load_checkpoint(path)
+    try:
+        gaussians = Gaussians(*(arrays[f"gaussians.{name}"] for name in Gaussians._fields))
+        recipe = metadata["recipe"]
+        rows = [
+            ("iteration", f"{metadata['step']:,}"),
+            ("recipe", f"{recipe['name']} for {recipe['iterations']:,} iterations"),
+        ]
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path} is not the checkpoint of a training: it lacks {error}") from error
+    return [("size", _size(path)), *rows, *_gaussian_rows(gaussians)]
+
+
+def _run_rows(folder: Path) -> Rows:
+    from minisplat_ref.cli.run_folder import METRICS, POINT_CLOUD, read_json_object
+    from minisplat_ref.cli.settings import load
+
+    rows = [(name.replace("_", " "), str(value)) for name, value in load(folder)._asdict().items()]
+    if (folder / METRICS).exists():
+        metrics = read_json_object(folder / METRICS)
+        rows += [(name.replace("_", " "), _short(value)) for name, value in metrics.items() if name != "per_view"]
+    if (folder / POINT_CLOUD).exists():
+        rows += _ply_rows(folder / POINT_CLOUD)
+    return rows
+
+
+def _scene_rows(path: Path) -> Rows:
+    from minisplat_ref.io import load_scene
+
+    scene = load_scene(path, undistort=True)
+    views = (*scene.train_views, *scene.test_views)
+    sizes = sorted({(view.camera.width, view.camera.height) for view in views})
+    focals = sorted(view.camera.fx for view in views)
+    return [
+        ("scene", scene.name),
+        ("views", f"{len(views)}: {len(scene.train_views)} training, {len(scene.test_views)} test"),
+        ("image sizes", ", ".join(f"{width} x {height}" for width, height in sizes)),
+        ("focal length", f"{focals[0]:.1f} to {focals[-1]:.1f} px"),
+        ("masks", f"{sum(view.mask is not None for view in views)} views"),
+        ("points", f"{len(scene.points):,}"),
+        *_bounds_rows(scene.points),
+        ("extent", f"{scene.extent:.4g} world units"),
+        ("background", _vector(scene.background)),
+    ]
+
+
+def _gaussian_rows(gaussians: "Gaussians") -> Rows:
+    import numpy as np
+
+    n, n_rest = gaussians.sh_rest.shape[:2]
+    degree = math.isqrt(n_rest + 1) - 1
+    rows = [("Gaussians", f"{n:,}"), ("SH degree", str(degree)), *_bounds_rows(gaussians.means)]
+    if n == 0:
+        return rows
+    opacities = 0.5 * (1 + np.tanh(0.5 * gaussians.opacity_logits))  # [N]
+    return [
+        *rows,
+        ("scales", _quantiles(np.exp(gaussians.log_scales)) + " world units"),
+        ("opacities", _quantiles(opacities)),
+    ]
+
+
+def _bounds_rows(points: "Floats") -> Rows:
+    import numpy as np
+
+    if len(points) == 0:
+        return []
+    low, high = np.quantile(points, (0.01, 0.99), axis=0)
+    return [
+        ("bounds", f"{_vector(points.min(axis=0))} to {_vector(points.max(axis=0))}"),
+        ("1 to 99 %", f"{_vector(low)} to {_vector(high)}"),
+    ]
+
+
+def _quantiles(values: "Floats") -> str:
+    import numpy as np
+
+    low, median, high = np.quantile(values, (0.01, 0.5, 0.99))
+    return f"median {median:.3g}, 1 to 99 %: {low:.3g} to {high:.3g}"
+
+
+def _vector(values: "Floats") -> str:
+    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"
+
+
+def _size(path: Path) -> str:
+    return f"{path.stat().st_size / 1e6:.2f} MB"
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4f}" if isinstance(value, float) else str(value)

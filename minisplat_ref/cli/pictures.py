@@ -1,0 +1,51 @@
+"""Pictures for a person to look at: renders beside photographs, errors and depths in colour."""
+
+import numpy as np
+from matplotlib import colormaps
+from numpy.typing import NDArray
+
+from minisplat_ref.types import Floats
+
+Picture = NDArray[np.uint8]  # [H, W, 3] sRGB
+
+ERROR_RANGE = 0.25  # of [0, 1]: larger differences are all shown as the brightest colour
+GAP = 4  # white pixels between pictures side by side
+
+
+def to_picture(image: Floats) -> Picture:
+    """Round a render [H, W, 3] in [0, 1] to 8 bits; values outside are clipped."""
+    return np.rint(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+def error_picture(truth: Picture, render: Picture) -> Picture:
+    """Colour the mean absolute difference of the three channels: dark is none, bright is ERROR_RANGE or more."""
+    difference = np.abs(truth.astype(np.float32) - render.astype(np.float32)).mean(axis=2) / 255.0  # [H, W]
+    return colored(difference, 0.0, ERROR_RANGE, "magma")
+
+
+def depth_picture(depth: Floats, near: float, far: float) -> Picture:
+    """Colour a depth map [H, W]: near is bright, far is dark, pixels that see nothing (0) are black."""
+    return colored(depth, far, near, "viridis") * (depth > 0)[..., None].astype(np.uint8)
+
+
+def depth_range(depth: Floats) -> tuple[float, float]:
+    """Near and far end for :func:`depth_picture`: the 1st and 99th percentile of what is seen."""
+    seen = depth[depth > 0]
+    if seen.size == 0:
+        return 0.0, 1.0
+    near, far = np.quantile(seen, (0.01, 0.99))
+    return float(near), float(far)
+
+
+def colored(values: Floats, low: float, high: float, colormap: str) -> Picture:
+    """Colour values [H, W] with a map whose ends stand for ``low`` and ``high``, in either order."""
+    fractions = np.clip((values - low) / ((high - low) or 1.0), 0.0, 1.0)  # [H, W]
+    picture: Picture = colormaps[colormap](fractions, bytes=True)[..., :3]  # [H, W, 3]
+    return picture
+
+
+def side_by_side(pictures: list[Picture]) -> Picture:
+    """Join pictures of one height from left to right with a white gap."""
+    gap = np.full((pictures[0].shape[0], GAP, 3), 255, dtype=np.uint8)
+    with_gaps = [part for picture in pictures for part in (gap, picture)]
+    return np.concatenate(with_gaps[1:], axis=1)

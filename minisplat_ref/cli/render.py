@@ -1,0 +1,165 @@
+"""``render``: pictures of a trained scene from a run's cameras, an orbit or a camera file."""
+
+import argparse
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from minisplat_ref.cli.arguments import Commands, HelpFormatter, add_renderer_arguments, integer
+from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.errors import InputError
+
+if TYPE_CHECKING:
+    from minisplat_ref.cli.viewpoints import Viewpoint
+    from minisplat_ref.types import Floats, Gaussians
+
+DESCRIPTION = """\
+Render a run (its --out folder) or a PLY of Gaussians, from whoever wrote it, to PNG pictures.
+
+Cameras, by --cameras:
+  test, train, all   those of the run (default test)
+  orbit              a circle around the scene (the only choice, and the default, for a bare PLY)
+  FILE.json          a list of cameras in the layout of 3DGS's cameras.json: img_name, width, height,
+                     position, rotation (3 x 3, world_from_camera), fx, fy, and optionally cx, cy
+"""
+EPILOG = """\
+examples:
+  minisplat-ref render runs/fox
+  minisplat-ref render runs/fox --cameras orbit --frames 120 --depth
+  minisplat-ref render point_cloud.ply --size 640x360 --profile INRIA --out pictures
+"""
+RUN_CAMERAS = ("test", "train", "all")
+ORBIT_SIZE = (640, 480)  # pixels, where no run says otherwise
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "render",
+        help="render a run or a PLY to pictures",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=HelpFormatter,
+    )
+    parser.add_argument("input", type=Path, metavar="DIR|PLY", help="run folder or PLY file")
+    parser.add_argument("--cameras", metavar="WHICH", help="see above")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="where to write (default: beside the input)")
+    parser.add_argument("--depth", action="store_true", help="also NAME_depth.npy (camera z) and its picture")
+    parser.add_argument("--frames", type=integer(1), default=60, metavar="N", help="of an orbit (default 60)")
+    parser.add_argument("--size", type=_size, metavar="WxH", help="of an orbit (default: the run's, or 640x480)")
+    parser.add_argument(
+        "--background", type=_color, metavar="R,G,B", help="0 to 255 each (default: the run's, or 0,0,0)"
+    )
+    add_renderer_arguments(parser, None, "the run's, or ")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Render every camera to a PNG; pictures of the same names are replaced."""
+    import numpy as np
+    from tqdm import tqdm
+
+    from minisplat_ref.backends import get_backend
+    from minisplat_ref.cli import run_folder
+    from minisplat_ref.cli.pictures import depth_picture, depth_range
+    from minisplat_ref.constants import DEPTH_ALPHA_MIN, PROFILES
+    from minisplat_ref.io import write_image
+    from minisplat_ref.render import render
+
+    source = _open(args)
+    views = _choose_views(args, source)
+    out: Path = args.out or source.default_out
+    run_folder.create(out)
+    for name, view in zip(_file_names(views), tqdm(views, desc="rendering", unit="view"), strict=True):
+        output, _ = render(
+            source.gaussians,
+            view.camera,
+            background=source.background,
+            conventions=PROFILES[source.profile],
+            backend=get_backend(source.backend),
+            with_depth=args.depth,
+        )
+        write_image(out / f"{name}.png", output.image[..., :3])
+        if args.depth:
+            depth = output.image[..., 3] / np.maximum(output.alpha, DEPTH_ALPHA_MIN)  # [H, W], 0 where nothing was hit
+            np.save(out / f"{name}_depth.npy", depth)
+            write_image(out / f"{name}_depth.png", depth_picture(depth, *depth_range(depth)))
+    print(f"{len(views)} pictures in {out}")
+    return 0
+
+
+class _Source(NamedTuple):
+    """What to render, and how unless the command line says otherwise."""
+
+    gaussians: "Gaussians"
+    cameras: "list[Viewpoint]"
+    background: "Floats"
+    profile: str
+    backend: str
+    default_out: Path
+
+
+def _open(args: argparse.Namespace) -> _Source:
+    import numpy as np
+
+    from minisplat_ref.cli import run_folder, settings, viewpoints
+    from minisplat_ref.io import load_ply
+
+    path: Path = args.input
+    cameras: list[Viewpoint] = []
+    background: Floats = np.zeros(3)
+    profile, backend = GSPLAT_MAIN.name, "cpu"
+    ply_path, default_out = path, path.with_name(f"{path.stem}-views")
+    if not path.exists():
+        raise InputError(f"{path} does not exist: give the --out folder of a training or a PLY file")
+    if path.is_dir():
+        ours = settings.load(path)
+        profile, backend = ours.profile, ours.backend
+        cameras = viewpoints.read(path / run_folder.CAMERAS)
+        background = settings.load_background(path)
+        ply_path, default_out = path / run_folder.POINT_CLOUD, path / "views"
+    if args.background is not None:
+        background = np.array(args.background) / 255.0
+    return _Source(
+        load_ply(ply_path), cameras, background, args.profile or profile, args.backend or backend, default_out
+    )
+
+
+def _choose_views(args: argparse.Namespace, source: _Source) -> "list[Viewpoint]":
+    from minisplat_ref.cli import viewpoints
+
+    which: str = args.cameras or ("test" if source.cameras else "orbit")
+    if which == "orbit":
+        like = source.cameras[0].camera if source.cameras else None
+        width, height = args.size or ((like.width, like.height) if like else ORBIT_SIZE)
+        return viewpoints.orbit(source.gaussians.means, source.cameras, args.frames, width, height)
+    if which not in RUN_CAMERAS:
+        return viewpoints.read(Path(which))
+    if not source.cameras:
+        raise InputError(f"--cameras {which} needs a run folder: give --cameras orbit or a JSON file with {args.input}")
+    views = [view for view in source.cameras if which in ("all", view.split)]
+    if not views:
+        raise InputError(f"{args.input} has no {which} views: give --cameras train, orbit or a JSON file")
+    return views
+
+
+def _file_names(views: "Sequence[Viewpoint]") -> list[str]:
+    """File names without suffix: the views' own, with their number where those cannot name files or are not unique."""
+    names = [re.sub(r"[^\w.-]", "_", view.name) for view in views]
+    is_usable = len(set(names)) == len(names) and all(name.strip("._") for name in names)
+    return names if is_usable else [f"{index:04d}_{name}" for index, name in enumerate(names)]
+
+
+def _size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([1-9]\d*)[xX]([1-9]\d*)", text)
+    if match is None:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a width and height in pixels such as 640x480")
+    return int(match[1]), int(match[2])
+
+
+def _color(text: str) -> tuple[int, ...]:
+    values = tuple(int(word) if word.isdecimal() else -1 for word in text.split(","))
+    if len(values) != 3 or not all(0 <= value <= 255 for value in values):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a colour such as 255,255,255")
+    return values

@@ -1,0 +1,70 @@
+"""The folder that ``train`` leaves: which file is called what, and how each is read and written."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.io.atomic import replacing
+
+CONFIG = "config.json"  # everything needed to run it again
+POINT_CLOUD = "point_cloud.ply"  # the Gaussians
+METRICS = "metrics.json"  # what was measured on the test views
+LOG = "log.jsonl"  # one record every few steps
+CHECKPOINT = "checkpoint.npz"  # what `--resume` continues from
+CAMERAS = "cameras.json"  # cameras of all views, so that they can be rendered without the photographs
+RENDERS = "renders"  # truth | render | error of each test view
+
+
+def check_free(folder: Path) -> None:
+    """Refuse a folder for new output that already holds something.
+
+    Raises
+    ------
+    InputError
+        ``folder`` is a file or a folder with anything in it.
+    """
+    if (folder / CONFIG).exists():
+        raise InputError(
+            f"{folder} already holds a run: give another --out, or continue it with train --resume {folder}"
+        )
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder} is not an empty folder: give another --out")
+
+
+def create(folder: Path) -> None:
+    """Make the folder, after everything that could be wrong with the input has been checked.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder} cannot be created ({error.strerror}): give another --out") from error
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write indented JSON; a reader sees the old file or the new one, never a part of it."""
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
+
+
+def read_json_object(path: Path) -> dict[str, Any]:
+    """Read a JSON file that must hold an object.
+
+    Raises
+    ------
+    InputError
+        The file is not JSON or holds something else.
+    """
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read as JSON: {error}") from error
+    if not isinstance(value, Mapping):
+        raise InputError(f"{path} does not hold a JSON object")
+    return dict(value)

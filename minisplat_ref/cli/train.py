@@ -1,0 +1,155 @@
+"""``train``: from photographs with cameras to a folder with Gaussians, measures and pictures."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from minisplat_ref.cli.arguments import Commands, HelpFormatter, add_renderer_arguments, integer
+from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.errors import InputError
+
+if TYPE_CHECKING:
+    from minisplat_ref.cli.settings import Settings
+    from minisplat_ref.recipes import Recipe
+    from minisplat_ref.train import TrainState
+    from minisplat_ref.types import Scene
+
+DEFAULTS = {
+    "downscale": 1,
+    "test_every": 8,
+    "undistort": False,
+    "recipe": "3dgs-accel",
+    "iterations": 3000,
+    "seed": 0,
+    "profile": GSPLAT_MAIN.name,
+    "backend": "cpu",
+}
+
+DESCRIPTION = """\
+Train Gaussians on photographs with cameras and leave in DIR: point_cloud.ply, metrics.json, renders/
+(truth | render | error of each test view), config.json, log.jsonl, cameras.json, checkpoint.npz.
+
+Ctrl-C saves what there is. --resume DIR continues with the run's own settings; --iterations then says
+where to stop, while schedule and density control stay those of the first start.
+"""
+EPILOG = """\
+examples:
+  minisplat-ref train photos/fox --out runs/fox
+  minisplat-ref train photos/garden --downscale 4 --iterations 7000 --out runs/garden
+  minisplat-ref train --resume runs/fox --iterations 4000
+"""
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command. Options that are not given are absent, so that ``--resume`` can tell."""
+    parser = commands.add_parser(
+        "train",
+        help="train Gaussians on photographs with cameras",
+        usage="minisplat-ref train [-h] SCENE [options]\n       minisplat-ref train --resume DIR [--iterations N]",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=HelpFormatter,
+        argument_default=argparse.SUPPRESS,
+    )
+    parser.add_argument(
+        "scene",
+        nargs="?",
+        metavar="SCENE",
+        help="folder of a COLMAP scene (images/, sparse/0/) or of a transforms.json",
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="new folder for the results (default runs/SCENE-RECIPE)"
+    )
+    parser.add_argument("--resume", type=Path, metavar="DIR", help="continue the run in DIR from its last checkpoint")
+
+    data = parser.add_argument_group("photographs")
+    data.add_argument("--downscale", type=integer(1), metavar="D", help="make them D times smaller (default 1)")
+    data.add_argument(
+        "--test-every", type=integer(0), metavar="K", help="hold out every K-th for testing, 0: none (default 8)"
+    )
+    data.add_argument("--undistort", action="store_true", help="remove lens distortion instead of refusing it")
+
+    training = parser.add_argument_group("training")
+    training.add_argument("--recipe", metavar="R", help="3dgs or 3dgs-accel (default), scaled to the iterations")
+    training.add_argument("--iterations", type=integer(1), metavar="N", help="one view each (default 3000)")
+    training.add_argument("--seed", type=integer(0), metavar="S", help="of all random draws (default 0)")
+    add_renderer_arguments(training, argparse.SUPPRESS)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Train, or continue a training; nothing is written before the input has been read and found good."""
+    given = vars(args)
+    return _resume(args.resume, given) if "resume" in given else _start(given)
+
+
+def _start(given: dict[str, Any]) -> int:
+    if "scene" not in given:
+        raise InputError("give a SCENE to train on, or --resume DIR to continue a run")
+    options = {name: given.get(name, default) for name, default in DEFAULTS.items()}
+    scene_path = Path(given["scene"])
+    scene_folder = scene_path.parent if scene_path.is_file() else scene_path
+    folder: Path = given.get("out", Path("runs") / f"{scene_folder.resolve().name}-{options['recipe']}")
+
+    from minisplat_ref.cli import run_folder
+    from minisplat_ref.cli.settings import Settings, load_photographs
+    from minisplat_ref.recipes import get_recipe
+    from minisplat_ref.train import initial_state
+
+    run_folder.check_free(folder)
+    recipe = get_recipe(options["recipe"], options["iterations"])
+    settings = Settings(scene=str(scene_path.resolve()), schedule_iterations=options["iterations"], **options)
+    scene = load_photographs(settings)
+    return _train(folder, scene, settings, recipe, initial_state(scene, recipe, settings.seed))
+
+
+def _resume(folder: Path, given: dict[str, Any]) -> int:
+    surplus = [name for name in ("scene", "out", *DEFAULTS) if name in given and name != "iterations"]
+    if surplus:
+        raise InputError(
+            f"--resume takes the run's own settings: leave out {', '.join(_option(name) for name in surplus)}"
+        )
+
+    from minisplat_ref.cli import run_folder, settings
+    from minisplat_ref.recipes import get_recipe
+    from minisplat_ref.train import load_state
+
+    ours = settings.load(folder)
+    ours = ours._replace(iterations=given.get("iterations", ours.iterations))
+    recipe = get_recipe(ours.recipe, ours.schedule_iterations)
+    state = load_state(folder / run_folder.CHECKPOINT, recipe)
+    if state.step >= ours.iterations:
+        raise InputError(
+            f"{folder} has done {state.step} iterations: give --iterations above {state.step} to train further"
+        )
+    return _train(folder, settings.load_photographs(ours), ours, recipe, state)
+
+
+def _train(folder: Path, scene: "Scene", settings: "Settings", recipe: "Recipe", state: "TrainState") -> int:
+    from minisplat_ref.cli.scoring import summary
+    from minisplat_ref.cli.training import run_training
+
+    size = scene.train_views[0].camera
+    print(
+        f"{scene.name}: {len(scene.train_views)} training and {len(scene.test_views)} test views of"
+        f" {size.width} x {size.height}, {len(scene.points):,} points"
+    )
+    outcome = run_training(folder, scene, settings, recipe, state)
+    if not outcome.is_complete:
+        print(
+            f"minisplat-ref: stopped after {state.step} of {settings.iterations} iterations, all saved;"
+            f" to continue: minisplat-ref train --resume {folder}",
+            file=sys.stderr,
+        )
+        return 130
+    print(
+        f"{summary(outcome.evaluation)}, {len(state.gaussians.means):,} Gaussians, {outcome.seconds:.0f} s of training"
+    )
+    print(f"results in {folder}: point_cloud.ply, metrics.json, renders/")
+    return 0
+
+
+def _option(name: str) -> str:
+    """How a setting is called on the command line."""
+    return name.upper() if name == "scene" else f"--{name.replace('_', '-')}"
