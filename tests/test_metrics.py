@@ -1,0 +1,70 @@
+"""PSNR, SSIM and the evaluation of views."""
+
+import math
+
+import numpy as np
+import pytest
+from scenes import as_dtype, make_camera, make_gaussians
+from tolerances import CLOSED_FORM, PARITY_FLOAT64
+
+from minisplat_ref.backends import REFERENCE
+from minisplat_ref.errors import InputError
+from minisplat_ref.metrics import evaluate, psnr, ssim
+from minisplat_ref.reference.loss import ssim_map
+from minisplat_ref.render import render
+from minisplat_ref.types import View
+
+
+def test_psnr_of_a_constant_error():
+    image = np.zeros((4, 5, 3))
+    assert psnr(image, image + 0.1) == pytest.approx(20.0, rel=CLOSED_FORM)
+    assert psnr(image, image) == math.inf
+
+
+def test_psnr_pools_the_channels():
+    """Errors 0.1, 0, 0: pooled MSE 0.01 / 3. A mean of channel PSNRs would be infinite."""
+    assert psnr(np.zeros((4, 5, 3)), np.broadcast_to([0.1, 0, 0], (4, 5, 3))) == pytest.approx(20 + 10 * math.log10(3))
+
+
+def test_masked_pixels_do_not_count(rng):
+    image, target = rng.random((8, 9, 3)), rng.random((8, 9, 3))
+    mask = rng.random((8, 9)) < 0.5
+    changed = np.where(mask[:, :, None], image, 0.5)
+    assert psnr(image, target, mask) == psnr(changed, target, mask) != psnr(image, target)
+    assert ssim(image, target, mask, backend=REFERENCE) == ssim(changed, target, mask, backend=REFERENCE)
+    with pytest.raises(InputError, match="mask"):
+        psnr(image, target, np.zeros((8, 9), bool))
+
+
+def test_ssim_is_the_mean_of_the_map(rng, backend):
+    image, target = rng.random((15, 13, 3)), rng.random((15, 13, 3))
+    assert ssim(image, image, backend=backend) == pytest.approx(1.0, abs=CLOSED_FORM)
+    assert ssim(image, target, backend=backend) == pytest.approx(ssim_map(image, target).mean(), rel=PARITY_FLOAT64)
+
+
+def test_evaluation(rng, backend):
+    gaussians = as_dtype(make_gaussians(rng, 30), np.float32)
+    background = np.array([0.2, 0.4, 0.6])
+    cameras = [make_camera(rng=rng) for _ in range(3)]
+    views = []
+    for i, camera in enumerate(cameras):
+        image = np.clip(render(gaussians, camera, background=background)[0].image, 0, 1)
+        worse = np.clip(image + 0.05 * i, 0, 1)
+        views.append(View(f"view{i}", camera, np.round(255 * worse).astype(np.uint8), None))
+    seen = []
+    result = evaluate(gaussians, views, background=background, on_view=lambda *args: seen.append(args), backend=backend)
+    values = [view.psnr for view in result.per_view]
+    assert [view.name for view in result.per_view] == ["view0", "view1", "view2"]
+    assert values[0] > 50  # rounding to 8 bits only: 10 log10(12 * 255^2) = 58.9 dB
+    assert 25 < values[1] < 30 and 19 < values[2] < 25  # 26 and 20 dB, less where the addition is clipped
+    assert result.psnr == pytest.approx(np.mean(values))
+    assert result.ssim == pytest.approx(np.mean([view.ssim for view in result.per_view]))
+    assert result.per_view[0].ssim > result.per_view[1].ssim > result.per_view[2].ssim
+    assert result.lpips is None and "weights" in result.lpips_reason
+    assert [view.name for view, _, _ in seen] == ["view0", "view1", "view2"]
+    assert seen[0][1].shape == (18, 24, 3) and seen[0][1].max() <= 1.0
+
+
+def test_no_views(rng):
+    result = evaluate(make_gaussians(rng, 3), [], background=np.zeros(3), backend=REFERENCE)
+    assert result.psnr is None and result.ssim is None and result.per_view == []

@@ -1,0 +1,108 @@
+"""Recipes: events at exactly the right iterations, also when scaled."""
+
+import json
+from functools import partial
+
+import pytest
+
+from minisplat_ref import events
+from minisplat_ref.errors import InputError
+from minisplat_ref.recipes import RECIPES, At, During, Every, describe, get_recipe, scaled
+
+
+def nothing(state, iteration, **settings):
+    pass
+
+
+def firing(event, n=30_000):
+    return [step for step in range(1, n + 1) if event.is_due(step)]
+
+
+def firings(recipe):
+    """Iterations of each event by the name of its action."""
+    return {getattr(e.action, "func", e.action).__name__: firing(e, recipe.iterations) for e in recipe.events}
+
+
+def test_every_is_open_at_both_ends():
+    assert firing(Every(3, nothing, start=3, stop=12), 20) == [6, 9]
+    assert firing(Every(3, nothing), 10) == [3, 6, 9]
+    assert firing(Every(3, nothing, skip=6), 20) == [3, 9, 15]
+
+
+def test_at_and_during():
+    assert firing(At(4, nothing), 10) == [4]
+    assert firing(During(nothing, start=2, stop=6), 10) == [3, 4, 5]
+    assert firing(During(nothing), 3) == [1, 2, 3]
+
+
+@pytest.mark.parametrize("name", ["3dgs", "3dgs-accel"])
+def test_3dgs_schedule(name):
+    """As the released code: first densification at 600, last at 14,900; resets at 3000 to 12,000; sizes from 3100."""
+    fired = firings(RECIPES[name])
+    assert fired["collect_gradients"] == list(range(1, 15_000))
+    assert fired["clone_and_split"] == fired["prune_faint"] == list(range(600, 15_000, 100))
+    assert fired["prune_large"] == list(range(3_100, 15_000, 100))
+    assert fired["reset_opacity"] == [3_000, 6_000, 9_000, 12_000]
+    assert fired["reset_opacity_on_white"] == [500]
+
+
+def test_scaled_to_a_tenth():
+    recipe = get_recipe("3dgs", 3_000)
+    fired = firings(recipe)
+    assert fired["collect_gradients"] == list(range(1, 1_500))
+    assert fired["clone_and_split"] == fired["prune_faint"] == list(range(60, 1_500, 10))
+    assert fired["prune_large"] == list(range(310, 1_500, 10))
+    assert fired["reset_opacity"] == [300, 600, 900, 1_200]
+    assert fired["reset_opacity_on_white"] == [50]
+    assert recipe.sh_milestones == (100, 200, 300)
+    assert recipe.learning_rates.means.at(1_500) == RECIPES["3dgs"].learning_rates.means.at(15_000)
+    assert recipe.learning_rates[1:] == RECIPES["3dgs"].learning_rates[1:]
+
+
+def test_scaled_rounds_periods_and_keeps_every_iteration():
+    recipe = get_recipe("3dgs", 7_000)  # 100 becomes 23.3
+    fired = firings(recipe)
+    assert set(b - a for a, b in zip(fired["clone_and_split"], fired["clone_and_split"][1:], strict=False)) == {23}
+    assert fired["clone_and_split"][0] == 138 and 117 < 138  # start 500 becomes 117, the next multiple is 138
+    longer = firings(scaled(RECIPES["3dgs"], 60_000))
+    assert longer["collect_gradients"] == list(range(1, 30_000))  # every iteration, not every second one
+    assert longer["clone_and_split"] == list(range(1_200, 30_000, 200))
+
+
+def test_scaled_to_next_to_nothing():
+    for event in get_recipe("3dgs", 1).events:
+        assert getattr(event, "period", 1) == 1
+    assert Every(100, nothing, skip=1_000).scaled(0.001) == Every(1, nothing, skip=1)
+    assert At(100, nothing).scaled(0.001) == At(1, nothing)
+
+
+def test_scaled_by_one_changes_nothing():
+    assert scaled(RECIPES["3dgs"], 30_000) == RECIPES["3dgs"]
+
+
+def test_what_tells_the_two_recipes_apart():
+    dense, accelerated = RECIPES["3dgs"], RECIPES["3dgs-accel"]
+    assert (dense.learning_rates.opacity_logits, accelerated.learning_rates.opacity_logits) == (0.05, 0.025)
+    assert not dense.adam.is_visible_only and dense.adam.has_bias_correction
+    assert accelerated.adam.is_visible_only and not accelerated.adam.has_bias_correction
+    assert dense.adam.eps == accelerated.adam.eps == 1e-15
+    assert dense.events == accelerated.events
+
+
+def test_bad_input():
+    with pytest.raises(InputError, match="'4dgs' does not exist: choose from 3dgs, 3dgs-accel"):
+        get_recipe("4dgs")
+    with pytest.raises(InputError, match="iterations is 0"):
+        get_recipe("3dgs", 0)
+
+
+def test_description_is_json_and_tells_settings_apart():
+    recipe = RECIPES["3dgs"]
+    description = json.loads(json.dumps(describe(recipe)))
+    assert description["iterations"] == 30_000
+    assert description["learning_rates"]["means"] == {"first": 1.6e-4, "last": 1.6e-6, "steps": 30_000}
+    densify = description["events"][1]
+    assert densify["event"] == "Every" and densify["action"] == "clone_and_split"
+    assert densify["settings"] == {"threshold": 2e-4, "size_fraction": 0.01}
+    other = recipe._replace(events=(Every(100, partial(events.prune_faint, least_opacity=0.1)),))
+    assert json.loads(json.dumps(describe(other))) != description

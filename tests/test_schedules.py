@@ -1,0 +1,33 @@
+"""Learning rates and spherical-harmonic degree."""
+
+import pytest
+
+from minisplat_ref.optim.schedules import LearningRates, LogLinear, active_sh_degree
+from minisplat_ref.types import Gaussians
+
+
+# Closed form: 1.6e-4 * 0.01^(i / 30000), to the digits of the published table of the 3DGS schedule.
+@pytest.mark.parametrize(
+    ("step", "rate"), [(0, 1.6e-4), (2_000, 1.177e-4), (15_000, 1.6e-5), (20_000, 7.43e-6), (30_000, 1.6e-6)]
+)
+def test_log_linear(step, rate):
+    assert LogLinear(1.6e-4, 1.6e-6, 30_000).at(step) == pytest.approx(rate, rel=1e-3)
+
+
+def test_log_linear_stays_at_its_end():
+    assert LogLinear(1.0, 0.25, 10).at(5) == pytest.approx(0.5)
+    assert LogLinear(1.0, 0.25, 10).at(11) == LogLinear(1.0, 0.25, 10).at(10) == pytest.approx(0.25)
+
+
+def test_only_the_means_scale_with_the_scene():
+    rates = LearningRates(LogLinear(1.0, 0.25, 10), 2.0, 3.0, 4.0, 5.0, 6.0)
+    assert rates.at(5, 10.0) == pytest.approx((5.0, 2.0, 3.0, 4.0, 5.0, 6.0))
+    assert LearningRates._fields == Gaussians._fields
+
+
+def test_sh_degree_rises_at_each_milestone_up_to_the_stored_one():
+    milestones = (10, 20, 30)
+    degrees = {step: active_sh_degree(step, milestones, 3) for step in (1, 9, 10, 19, 20, 29, 30, 99)}
+    assert degrees == {1: 0, 9: 0, 10: 1, 19: 1, 20: 2, 29: 2, 30: 3, 99: 3}
+    assert active_sh_degree(99, milestones, 1) == 1
+    assert active_sh_degree(99, (), 3) == 0
