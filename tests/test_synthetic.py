@@ -15,8 +15,9 @@ from data_tools.synthetic import SCENE_NAMES, make_scene
 from data_tools.synthetic.__main__ import main
 from data_tools.synthetic.cameras import look_at
 from data_tools.synthetic.files import write_scene
-from data_tools.synthetic.geometry import Box, Cylinder, Primitive, Rectangle, Sphere, first_hits
+from data_tools.synthetic.geometry import Primitive, first_hits
 from data_tools.synthetic.materials import Checker, Material, Noise, Plain, encode_srgb, linear_rgb, random_lattice
+from data_tools.synthetic.shapes import Box, Cylinder, Rectangle, Sphere
 from data_tools.synthetic.sparse_points import project_points
 from data_tools.synthetic.tracer import World, camera_centre, pixel_rays, radiance
 from minisplat_ref.errors import InputError
@@ -140,13 +141,16 @@ def test_light_and_shadow_by_hand():
     assert_allclose(colors, expected, rtol=CLOSED_FORM)
 
 
-def test_mirror_by_hand():
-    """Looking straight down into a mirror of reflectance one half shows half of the sky and half of its own black."""
-    mirror = place(Rectangle(1, 1), [0, 0, 0])._replace(material=Material(Plain("#000000"), reflectance=0.5))
+def test_mirror_and_sky_by_hand():
+    """A black mirror of reflectance 1/2 under a sky of colour |direction|, looked at from above and at 60 degrees."""
+    mirror = place(Rectangle(9, 9), [0, 0, 0])._replace(material=Material(Plain("#000000"), reflectance=0.5))
     world = World((mirror,), np.array([[0, 0, 3.0]]), np.ones(3), 1.0, np.ones(3), np.ones(3), np.abs)
-    down, hits = np.array([[0, 0, -2.0]]), first_hits((mirror,), np.array([0, 0, 1.0]), np.array([[0, 0, -2.0]]))
-    color = radiance(world, np.array([0, 0, 1.0]), down, hits, np.zeros(1, int))
-    assert_allclose(color, [[0, 0, 0.5]], atol=CLOSED_FORM)
+    slant = np.array([0, np.sqrt(0.75), 0.5])
+    directions = np.stack([np.array([0, 0, -2.0]), 2 * slant * [1, 1, -1], 2 * slant])
+    hits = first_hits(world.primitives, np.array([0, 0, 1.0]), directions)
+    colors = radiance(world, np.array([0, 0, 1.0]), directions, hits, np.zeros(3, int))
+    # Schlick: F(0) = 1/2, F(60 degrees) = 1/2 + 1/2 (1 - 1/2)^5 = 33/64; the third ray goes up to the sky.
+    assert_allclose(colors, [[0, 0, 0.5], 33 / 64 * slant, slant], atol=CLOSED_FORM)
 
 
 def test_textures_by_hand(rng):
@@ -156,6 +160,9 @@ def test_textures_by_hand(rng):
     noise = Noise("#000000", "#ffffff", np.array([1.0, 2.0, 4.0]), random_lattice(rng), n_octaves=1)
     corners = np.array([[3, 8, 12], [-1, 0, 0]])  # lattice points (3, 4, 3) and (31, 0, 0), the lattice being periodic
     assert_allclose(noise.values(corners), noise.lattice[[3, 31], [4, 0], [3, 0]], rtol=CLOSED_FORM)
+    start, end = noise.lattice[[3, 4], 4, 3]
+    quarter = start + (3 / 16 - 2 / 64) * (end - start)  # 3 f^2 - 2 f^3 at f = 1/4
+    assert_allclose(noise.values(np.array([[3.25, 8, 12]])), [quarter], rtol=CLOSED_FORM)
     assert_allclose(noise.values(corners + 1e-9), noise.values(corners - 1e-9), atol=1e-8)
 
 

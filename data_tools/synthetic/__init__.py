@@ -1,9 +1,10 @@
 """Synthetic scenes with exact truth: photographs, depth, normals and sparse points, ray-traced with NumPy.
 
-Reading order: geometry, materials, tracer, cameras, scenes, sparse_points; files writes a scene as a COLMAP folder.
+Reading order: shapes, geometry, materials, tracer, cameras, furniture, scenes, sparse_points; files writes a scene as a
+COLMAP folder.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from data_tools.synthetic.scenes import SETTINGS
 from data_tools.synthetic.sparse_points import sample_points
 from data_tools.synthetic.tracer import TracedView, World, camera_centre, trace_view
 from minisplat_ref.errors import InputError
-from minisplat_ref.types import Bools, Floats, Scene, View
+from minisplat_ref.types import Bools, Camera, Floats, Scene, View
 
 __all__ = ["SCENE_NAMES", "SyntheticScene", "make_scene"]
 
@@ -53,7 +54,7 @@ def make_scene(
     n_points: int = 4000,
     point_noise: float = 0.0,
     test_every: int = 8,
-    on_view: Callable[[], object] = lambda: None,
+    progress: Callable[[Sequence[Camera]], Iterable[Camera]] = iter,
 ) -> SyntheticScene:
     """Ray-trace a scene. Equal arguments give equal bytes.
 
@@ -75,8 +76,8 @@ def make_scene(
         Standard deviation of the error of each point coordinate, metres.
     test_every : int
         In walking order the first of every so many views is a test view, as loaders split; 0 for no test views.
-    on_view : callable
-        Called after each finished view, for a progress bar.
+    progress : callable
+        Wraps the sequence of cameras while the views are traced; ``tqdm.tqdm`` shows a bar.
 
     Returns
     -------
@@ -93,10 +94,7 @@ def make_scene(
     world, orbit = SETTINGS[name](scene_rng)
     n_total = n_views + (-(-n_views // (test_every - 1)) if test_every else 0)
     cameras = orbit_cameras(orbit, n_total, width, height, camera_rng)
-    traced = []
-    for camera in cameras:
-        traced.append(trace_view(world, camera, supersampling))
-        on_view()
+    traced = [trace_view(world, camera, supersampling) for camera in progress(cameras)]
     views = [View(f"view_{i:04d}", cameras[i], traced[i].image, None) for i in range(n_total)]
     test_ids = list(range(0, n_total, test_every)) if test_every else []
     train_ids = [i for i in range(n_total) if i not in test_ids]

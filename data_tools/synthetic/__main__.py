@@ -3,6 +3,7 @@
 import argparse
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from tqdm import tqdm
@@ -20,7 +21,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument("name", metavar="NAME", help=f"scene: {', '.join(SCENE_NAMES)}")
-    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to make")
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, required=True, default=argparse.SUPPRESS, help="folder to make"
+    )
     parser.add_argument("--views", metavar="N", type=int, default=24, help="training views; test views come on top")
     parser.add_argument("--width", metavar="PX", type=int, default=160, help="image width")
     parser.add_argument("--height", metavar="PX", type=int, default=120, help="image height")
@@ -42,8 +45,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     }
     try:
         check_free(options.out)
-        with tqdm(desc=options.name, unit=" views", leave=False) as bar:
-            synthetic = make_scene(options.name, **settings, on_view=bar.update)
+        progress = partial(tqdm, desc=options.name, unit=" views", leave=False)
+        synthetic = make_scene(options.name, **settings, progress=progress)
         write_scene(synthetic, options.out, {"scene": options.name, **settings})
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""Synthetic scenes, stage 4: where the photographer stands.
+"""Synthetic scenes, stage 5: where the photographer stands.
 
 A walk around the scene at changing distance and height, always looking inwards and upright.
 """

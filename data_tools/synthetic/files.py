@@ -1,4 +1,4 @@
-"""Synthetic scenes, stage 7: a scene as a folder that every splatting program reads.
+"""Synthetic scenes, stage 9: a scene as a folder that every splatting program reads.
 
 ``images/*.png`` and ``sparse/0/{cameras,images,points3D}.txt`` are a COLMAP text model with tracks. Beside it, what no
 photograph has: ``depths/*.npy`` and ``normals/*.npy`` (float32), and ``scene_info.json``.

@@ -1,4 +1,4 @@
-"""Synthetic scenes, stage 2: what surfaces look like. Procedural solid textures and the parameters of the shading.
+"""Synthetic scenes, stage 3: what surfaces look like. Procedural solid textures and the parameters of the shading.
 
 A texture maps points [n, 3] in the frame of a shape to linear RGB [n, 3]. It is a pattern in space, so that every shape
 can wear every texture without texture coordinates. Colours are given as sRGB hex codes and kept linear, because light

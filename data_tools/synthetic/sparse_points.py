@@ -1,4 +1,4 @@
-"""Synthetic scenes, stage 6: the points that structure from motion would have found.
+"""Synthetic scenes, stage 8: the points that structure from motion would have found.
 
 Feature detectors fire where the picture changes, so that points are drawn in proportion to the image gradient: many on
 textures and edges, hardly any on bare walls, none at the sky. A point counts when at least two training views see it.

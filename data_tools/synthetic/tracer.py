@@ -1,4 +1,4 @@
-"""Synthetic scenes, stage 3: light. Ray-traces one view of a world: colour, exact depth, exact normals.
+"""Synthetic scenes, stage 4: light. Ray-traces one view of a world: colour, exact depth, exact normals.
 
 Lambert's law under one small area light with shadows, a sky-to-ground gradient of ambient light, Blinn-Phong
 highlights, and mirror reflections with Schlick's Fresnel term. No indirect light beyond one reflection, no refraction,
