@@ -5,16 +5,27 @@ the only module that sees both the reference and the kernels.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from types import ModuleType
 from typing import Any
 
+import minisplat_ref.cpu.compositing
+import minisplat_ref.cpu.compositing_exact
+import minisplat_ref.cpu.depth
+import minisplat_ref.cpu.loss
+import minisplat_ref.cpu.projection
+import minisplat_ref.cpu.spherical_harmonics
+import minisplat_ref.cpu.tiling
+import minisplat_ref.reference.compositing
+import minisplat_ref.reference.depth
+import minisplat_ref.reference.loss
+import minisplat_ref.reference.projection
+import minisplat_ref.reference.spherical_harmonics
+import minisplat_ref.reference.tiling  # noqa: F401  (the linter sees only the last import of a package)
+import minisplat_ref.reference.tiling  # noqa: F401 (the last of these names the package; all of them are used below)
+from minisplat_ref import cpu, reference
+from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
 from minisplat_ref.errors import InputError
-from minisplat_ref.reference.compositing import composite, composite_vjp
-from minisplat_ref.reference.depth import surface_points
-from minisplat_ref.reference.loss import photometric_loss, photometric_loss_vjp
-from minisplat_ref.reference.projection import project, project_vjp
-from minisplat_ref.reference.spherical_harmonics import sh_colors, sh_colors_vjp
-from minisplat_ref.reference.tiling import bin_gaussians
 from minisplat_ref.types import (
     CompositeGradient,
     Floats,
@@ -50,28 +61,46 @@ class Backend:
     composite: Callable[..., RenderOutput]
     composite_vjp: Callable[..., CompositeGradient]
     surface_points: Callable[..., SurfacePoints]
+    surface_points_vjp: Callable[..., tuple[Floats, Floats, Floats]]
     photometric_loss: Callable[..., tuple[float, Any]]
     photometric_loss_vjp: Callable[..., Floats]
 
 
-REFERENCE = Backend(
-    name="reference",
-    tile_width=16,
-    tile_height=16,
-    project=project,
-    project_vjp=project_vjp,
-    sh_colors=sh_colors,
-    sh_colors_vjp=sh_colors_vjp,
-    bin_gaussians=bin_gaussians,
-    composite=composite,
-    composite_vjp=composite_vjp,
-    surface_points=surface_points,
-    photometric_loss=photometric_loss,
-    photometric_loss_vjp=photometric_loss_vjp,
-)
+def _from_package(name: str, package: ModuleType, tile_width: int, tile_height: int) -> Backend:
+    """Collect the stages of a package whose modules and functions bear the reference's names."""
+    return Backend(
+        name=name,
+        tile_width=tile_width,
+        tile_height=tile_height,
+        project=package.projection.project,
+        project_vjp=package.projection.project_vjp,
+        sh_colors=package.spherical_harmonics.sh_colors,
+        sh_colors_vjp=package.spherical_harmonics.sh_colors_vjp,
+        bin_gaussians=package.tiling.bin_gaussians,
+        composite=package.compositing.composite,
+        composite_vjp=package.compositing.composite_vjp,
+        surface_points=package.depth.surface_points,
+        surface_points_vjp=package.depth.surface_points_vjp,
+        photometric_loss=package.loss.photometric_loss,
+        photometric_loss_vjp=package.loss.photometric_loss_vjp,
+    )
+
+
+REFERENCE = _from_package("reference", reference, tile_width=16, tile_height=16)
 """NumPy, as in the papers: to read and to check against."""
 
-BACKENDS = {backend.name: backend for backend in (REFERENCE,)}
+CPU = _from_package("cpu", cpu, TILE_WIDTH, TILE_HEIGHT)
+"""Numba on all cores; float32 data use a polynomial exponential."""
+
+CPU_EXACT = replace(
+    CPU,
+    name="cpu-exact",
+    composite=cpu.compositing_exact.composite,
+    composite_vjp=cpu.compositing_exact.composite_vjp,
+)
+"""The same with libm's exponential in float32 too."""
+
+BACKENDS = {backend.name: backend for backend in (REFERENCE, CPU, CPU_EXACT)}
 
 
 def get_backend(name: str) -> Backend:
@@ -80,7 +109,7 @@ def get_backend(name: str) -> Backend:
     Parameters
     ----------
     name : str
-        ``"cpu"`` or ``"reference"``.
+        ``"cpu"``, ``"cpu-exact"`` or ``"reference"``.
 
     Returns
     -------

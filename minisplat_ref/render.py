@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import REFERENCE, Backend
+from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.types import (
@@ -58,7 +58,7 @@ def render(
     background: Floats | None = None,
     sh_degree: int | None = None,
     conventions: Conventions = GSPLAT_MAIN,
-    backend: Backend = REFERENCE,
+    backend: Backend = CPU,
     with_depth: bool = False,
     with_stats: bool = False,
     with_median_depth: bool = False,

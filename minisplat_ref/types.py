@@ -150,6 +150,10 @@ class TileBins(NamedTuple):
     """[M] int32, ordered by (tile, depth, index)."""
     tile_offsets: Ints
     """[n_tiles + 1] int64; tile t owns gaussian_ids[tile_offsets[t]:tile_offsets[t + 1]]."""
+    slots: Ints
+    """[M] int32 place of each pair when the pairs are grouped by Gaussian instead of by tile."""
+    gaussian_offsets: Ints
+    """[N + 1] int64; Gaussian n owns the slots gaussian_offsets[n]:gaussian_offsets[n + 1]."""
     grid: TileGrid
     """The tiling."""
 

@@ -1,0 +1,1 @@
+"""All Gaussians or all pixels: parallel loops over the formulas of ``scalar``."""

@@ -1,0 +1,125 @@
+"""The forward kernel: all tiles, every tile's Gaussians front to back, channel by channel, and the blend statistics.
+
+The number of channels and the exponential are compile-time constants: each combination is its own compiled kernel. The
+weight of a hit is a field of the tile's state, from which the channels and, if asked for, the statistics are fed.
+"""
+
+import functools
+from collections.abc import Callable
+
+import numpy as np
+
+from minisplat_ref.constants import MEDIAN_TRANSMITTANCE
+from minisplat_ref.cpu.tile_state import (
+    CHANNELS,
+    CHECK_EVERY,
+    PIXELS,
+    TILE_WIDTH,
+    WEIGHT,
+    T,
+    X,
+    Y,
+    is_finished,
+    pixel_run,
+    start_tile,
+)
+from minisplat_ref.scalar._jit import REASSOCIATE, kernel, prange, scalar
+from minisplat_ref.scalar.compositing import blend, mahalanobis
+from minisplat_ref.scalar.literals import ONE, ZERO
+
+MEDIAN = np.float32(MEDIAN_TRANSMITTANCE)  # one half: exact in float32
+
+
+@scalar
+def _collect(s, n_pixels, n, depth, best, best_ids, median):
+    """Statistics of the hit whose weights stand in the state: its weight sum and hit count, and the pixels' records."""
+    weight_sum = ZERO
+    hit_count = 0
+    for i in range(n_pixels):
+        weight = s[WEIGHT + i]
+        if weight > ZERO:
+            weight_sum += weight
+            hit_count += 1
+            if weight > best[i]:
+                best[i] = weight
+                best_ids[i] = n
+            if abs(s[T + i]) < MEDIAN <= abs(s[T + i]) + weight:  # T after and before the hit
+                median[i] = depth
+    return weight_sum, hit_count
+
+
+@functools.cache
+def forward_kernel(exp: Callable, n_channels: int) -> Callable:
+    """Compile the forward kernel for an exponential and a number of channels."""
+
+    @scalar
+    def blend_hit(s, n_pixels, n, projection, color, frame):
+        mx, my = projection.means2d[n, 0], projection.means2d[n, 1]
+        a, b, c = projection.conics[n, 0], projection.conics[n, 1], projection.conics[n, 2]
+        opacity = projection.opacities[n]
+        for i in range(n_pixels):
+            sigma = mahalanobis(mx - s[X + i], my - s[Y + i], a, b, c)
+            s[T + i], s[WEIGHT + i] = blend(s[T + i], sigma, opacity * exp(-sigma), frame)
+        for k in range(n_channels):
+            value = color[k]
+            for i in range(n_pixels):
+                s[CHANNELS + k * PIXELS + i] += s[WEIGHT + i] * value
+
+    @scalar
+    def store(state, x0, y0, background, frame, image, alpha):
+        for i in range(PIXELS):
+            x = x0 + i % TILE_WIDTH
+            y = y0 + i // TILE_WIDTH
+            if x < frame.width and y < frame.height:
+                left = abs(state[T + i])
+                alpha[y, x] = ONE - left
+                for k in range(n_channels):
+                    image[y, x, k] = state[CHANNELS + k * PIXELS + i] + left * background[k]
+
+    @scalar
+    def store_records(x0, y0, frame, median, best_ids, median_depth, dominant_ids):
+        for i in range(PIXELS):
+            x = x0 + i % TILE_WIDTH
+            y = y0 + i // TILE_WIDTH
+            if x < frame.width and y < frame.height:
+                median_depth[y, x] = median[i]
+                dominant_ids[y, x] = best_ids[i]
+
+    @kernel(REASSOCIATE)
+    def composite_tiles(projection, colors, background, offsets, ids, tiles, n_threads, frame, image, alpha, records):
+        median_depth, dominant_ids, weight_sums, hit_counts = records
+        collects = median_depth.size > 0
+        for thread in prange(n_threads):
+            state = np.zeros(CHANNELS + n_channels * PIXELS, image.dtype)
+            best = np.empty(PIXELS, image.dtype)
+            median = np.empty(PIXELS, image.dtype)
+            best_ids = np.empty(PIXELS, np.int32)
+            for turn in range(thread, tiles.size, n_threads):
+                tile = tiles[turn]
+                x0, y0 = start_tile(state, tile, frame)
+                state[CHANNELS:] = ZERO
+                if collects:
+                    best[:] = ZERO
+                    median[:] = ZERO
+                    best_ids[:] = -1
+                for m in range(offsets[tile], offsets[tile + 1]):
+                    if m % CHECK_EVERY == 0 and is_finished(state):
+                        break
+                    n = ids[m]
+                    start, n_pixels = pixel_run(projection.boxes, n, y0)
+                    blend_hit(state[start:], n_pixels, n, projection, colors[n], frame)
+                    if collects:
+                        weight_sums[m], hit_counts[m] = _collect(
+                            state[start:],
+                            n_pixels,
+                            n,
+                            projection.depths[n],
+                            best[start:],
+                            best_ids[start:],
+                            median[start:],
+                        )
+                store(state, x0, y0, background, frame, image, alpha)
+                if collects:
+                    store_records(x0, y0, frame, median, best_ids, median_depth, dominant_ids)
+
+    return composite_tiles

@@ -1,0 +1,139 @@
+"""Front-to-back blending of all tiles, forward and backward: the functions around the kernels.
+
+float32 data use the polynomial exponential, which vectorises; ``compositing_exact`` uses libm's. float64 always does.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from minisplat_ref.constants import Conventions
+from minisplat_ref.cpu.blend_backward import N_MOMENTS, backward_kernel, sum_slots
+from minisplat_ref.cpu.blend_forward import forward_kernel
+from minisplat_ref.cpu.exponential import exp_exact, exp_fast
+from minisplat_ref.cpu.tile_state import frame_of, tile_order
+from minisplat_ref.scalar._jit import n_threads
+from minisplat_ref.types import BlendStats, CompositeGradient, Floats, Projection, RenderOutput, TileBins
+
+
+def _exponential(dtype: np.dtype) -> Callable:
+    return exp_fast if dtype == np.float32 else exp_exact
+
+
+def composite(
+    projection: Projection,
+    colors: Floats,
+    background: Floats,
+    bins: TileBins,
+    conventions: Conventions,
+    *,
+    with_stats: bool = False,
+    with_median_depth: bool = False,
+) -> RenderOutput:
+    """Blend every tile's Gaussians front to back; see ``reference.compositing.composite``."""
+    exp = _exponential(colors.dtype)
+    return composite_with(exp, projection, colors, background, bins, conventions, with_stats, with_median_depth)
+
+
+def composite_vjp(
+    projection: Projection,
+    colors: Floats,
+    background: Floats,
+    bins: TileBins,
+    conventions: Conventions,
+    output: RenderOutput,
+    v_image: Floats,
+    v_alpha: Floats,
+) -> CompositeGradient:
+    """Chain the gradient of the image to its inputs; see ``reference.compositing.composite_vjp``."""
+    exp = _exponential(colors.dtype)
+    return composite_vjp_with(exp, projection, colors, background, bins, conventions, output, v_image, v_alpha)
+
+
+def composite_with(
+    exp: Callable,
+    projection: Projection,
+    colors: Floats,
+    background: Floats,
+    bins: TileBins,
+    conventions: Conventions,
+    with_stats: bool,
+    with_median_depth: bool,
+) -> RenderOutput:
+    """Blend with one of the exponentials of :mod:`minisplat_ref.cpu.exponential`."""
+    height, width, dtype = bins.grid.height, bins.grid.width, colors.dtype
+    image = np.empty((height, width, colors.shape[1]), dtype)
+    alpha = np.empty((height, width), dtype)
+    collects = with_stats or with_median_depth
+    record_size = (height, width) if collects else (0, 0)
+    n_pairs = len(bins.gaussian_ids) if collects else 0
+    records = (
+        np.empty(record_size, dtype),
+        np.empty(record_size, np.int32),
+        np.zeros(n_pairs, dtype),
+        np.zeros(n_pairs, np.int32),
+    )
+    forward_kernel(exp, colors.shape[1])(
+        projection,
+        colors,
+        background,
+        bins.tile_offsets,
+        bins.gaussian_ids,
+        tile_order(bins),
+        n_threads(),
+        frame_of(bins, conventions, dtype),
+        image,
+        alpha,
+        records,
+    )
+    median_depth, dominant_ids, weight_sums, hit_counts = records
+    stats = None
+    if with_stats:
+        n = len(colors)
+        stats = BlendStats(
+            np.bincount(bins.gaussian_ids, weight_sums, n).astype(dtype),  # adds up in tile order, in float64
+            np.bincount(bins.gaussian_ids, hit_counts, n).astype(np.int32),
+            np.bincount(dominant_ids[dominant_ids >= 0], minlength=n).astype(np.int32),
+            dominant_ids,
+        )
+    return RenderOutput(image, alpha, median_depth if with_median_depth else None, stats)
+
+
+def composite_vjp_with(
+    exp: Callable,
+    projection: Projection,
+    colors: Floats,
+    background: Floats,
+    bins: TileBins,
+    conventions: Conventions,
+    output: RenderOutput,
+    v_image: Floats,
+    v_alpha: Floats,
+) -> CompositeGradient:
+    """Chain gradients with the exponential that the forward pass used."""
+    dtype, n_channels = colors.dtype, colors.shape[1]
+    slots = np.empty((len(bins.gaussian_ids), N_MOMENTS + n_channels), dtype)
+    backward_kernel(exp, n_channels)(
+        projection,
+        colors,
+        bins.tile_offsets,
+        bins.gaussian_ids,
+        bins.slots,
+        tile_order(bins),
+        n_threads(),
+        frame_of(bins, conventions, dtype),
+        output.image,
+        output.alpha,
+        np.ascontiguousarray(v_image, dtype),
+        np.ascontiguousarray(v_alpha, dtype),
+        slots,
+    )
+    out = CompositeGradient(
+        np.zeros_like(projection.means2d),
+        np.zeros_like(projection.conics),
+        np.zeros_like(projection.opacities),
+        np.zeros_like(colors),
+        np.einsum("yx,yxk->k", 1 - output.alpha, v_image).astype(dtype),
+    )
+    sum_slots(slots, bins.gaussian_offsets, projection, out)
+    return out

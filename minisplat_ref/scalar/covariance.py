@@ -1,0 +1,55 @@
+"""Rotation of one Gaussian from its quaternion (3DGS section 4), as nine scalars.
+
+The covariance itself is never formed here: projection uses its square root ``R diag(s)``, which loses no digits for
+needle-shaped Gaussians.
+"""
+
+import math
+
+from minisplat_ref.scalar._jit import scalar
+from minisplat_ref.scalar.literals import ONE, TWO
+
+
+@scalar
+def normalized(w, x, y, z):
+    """Return the unit quaternion and the reciprocal of its former length."""
+    inverse_length = ONE / math.sqrt(w * w + x * x + y * y + z * z)
+    return w * inverse_length, x * inverse_length, y * inverse_length, z * inverse_length, inverse_length
+
+
+@scalar
+def rotation(w, x, y, z):
+    """Return the nine entries, row by row, of the rotation of a unit quaternion."""
+    return (
+        (ONE - TWO * (y * y + z * z), TWO * (x * y - w * z), TWO * (x * z + w * y)),
+        (TWO * (x * y + w * z), ONE - TWO * (x * x + z * z), TWO * (y * z - w * x)),
+        (TWO * (x * z - w * y), TWO * (y * z + w * x), ONE - TWO * (x * x + y * y)),
+    )
+
+
+@scalar
+def rotation_vjp(w, x, y, z, v):
+    """Chain ``v[i][j] = dL/dR_ij`` to a unit quaternion: each line collects the entries in which it stands."""
+    v_w = TWO * (x * (v[2][1] - v[1][2]) + y * (v[0][2] - v[2][0]) + z * (v[1][0] - v[0][1]))
+    v_x = TWO * (
+        w * (v[2][1] - v[1][2]) + y * (v[0][1] + v[1][0]) + z * (v[0][2] + v[2][0]) - TWO * x * (v[1][1] + v[2][2])
+    )
+    v_y = TWO * (
+        w * (v[0][2] - v[2][0]) + x * (v[0][1] + v[1][0]) + z * (v[1][2] + v[2][1]) - TWO * y * (v[0][0] + v[2][2])
+    )
+    v_z = TWO * (
+        w * (v[1][0] - v[0][1]) + x * (v[0][2] + v[2][0]) + y * (v[1][2] + v[2][1]) - TWO * z * (v[0][0] + v[1][1])
+    )
+    return v_w, v_x, v_y, v_z
+
+
+@scalar
+def normalized_vjp(w, x, y, z, inverse_length, v_w, v_x, v_y, v_z):
+    """Chain through q / |q|: the part of the cotangent along the unit quaternion (w, x, y, z) is lost."""
+    along = w * v_w + x * v_x + y * v_y + z * v_z
+    return (
+        (v_w - along * w) * inverse_length,
+        (v_x - along * x) * inverse_length,
+        (v_y - along * y) * inverse_length,
+        (v_z - along * z) * inverse_length,
+    )

@@ -1,0 +1,48 @@
+"""Which pixels one projected Gaussian may touch: radii and a half-open box of pixels inside the image.
+
+Floats are clamped to the image before they become integers, because a cast of a float beyond the integer range is
+undefined.
+"""
+
+import math
+
+from minisplat_ref.constants import SUPPORT_SIGMA_MAX
+from minisplat_ref.scalar._jit import scalar
+from minisplat_ref.scalar.literals import HALF, THREE, TWO, ZERO
+
+INRIA_TILE = 16  # px; INRIA's rule is stated in tiles of this size
+INRIA_ROOT_MIN = 0.1  # px^4; floor of (lambda_1 - lambda_2)^2 / 4 in INRIA's largest eigenvalue
+RADIUS_MAX = 1 << 24  # px; covers any image, survives the cast to int32, and is exact in float32
+
+
+@scalar
+def support_box(footprint, opacity, alpha_min, width, height):
+    """Extent at which alpha falls to alpha_min: sqrt(2 ln(opacity / alpha_min)) standard deviations along x and y."""
+    reach = min(SUPPORT_SIGMA_MAX, math.sqrt(TWO * math.log(opacity / alpha_min)))
+    rx = math.ceil(min(reach * math.sqrt(footprint.cov_xx), RADIUS_MAX))
+    ry = math.ceil(min(reach * math.sqrt(footprint.cov_yy), RADIUS_MAX))
+    x0 = math.floor(min(max(footprint.x - rx, ZERO), width))
+    y0 = math.floor(min(max(footprint.y - ry, ZERO), height))
+    x1 = math.ceil(min(max(footprint.x + rx, ZERO), width))
+    y1 = math.ceil(min(max(footprint.y + ry, ZERO), height))
+    return rx, ry, x0, y0, x1, y1
+
+
+@scalar
+def inria_tiles(x, r, size):
+    """Pixels of the tiles that INRIA counts under [x - r, x + r], where x counts pixel centres as integers."""
+    beyond = size + INRIA_TILE - 1
+    first = math.floor(min(max(x - r, ZERO), beyond) / INRIA_TILE)
+    end = math.floor(min(max(x + r + INRIA_TILE - 1, ZERO), beyond) / INRIA_TILE)
+    return first * INRIA_TILE, min(end * INRIA_TILE, size)
+
+
+@scalar
+def inria_box(footprint, width, height):
+    """Tiles touched by the square of half-side ceil(3 sqrt(lambda_1)), three standard deviations of the longer axis."""
+    middle = HALF * (footprint.cov_xx + footprint.cov_yy)
+    largest = middle + math.sqrt(max(INRIA_ROOT_MIN, middle * middle - footprint.det))
+    r = math.ceil(min(THREE * math.sqrt(largest), RADIUS_MAX))
+    x0, x1 = inria_tiles(footprint.x - HALF, r, width)
+    y0, y1 = inria_tiles(footprint.y - HALF, r, height)
+    return r, r, x0, y0, x1, y1

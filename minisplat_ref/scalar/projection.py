@@ -1,0 +1,253 @@
+"""EWA projection of one Gaussian (3DGS section 4; Zwicker et al. 2001), in square-root form.
+
+With the Gaussian's axes as the columns of M = R_g diag(s), the projected covariance is U U^T + eps2d I, where
+
+    V = R M                     camera frame                      [3, 3]
+    u = (fx / z) (V_0 - x' V_2) first row of U = J V; x' = clamp(x / z)
+    w = (fy / z) (V_1 - y' V_2) second row
+
+so that cov = (u.u, u.w, w.w), and its determinant is the squared area |u x w|^2: a sum of squares, which stays accurate
+for needles where u.u * w.w - (u.w)^2 would cancel.
+"""
+
+import math
+from typing import NamedTuple
+
+from minisplat_ref.scalar._jit import scalar
+from minisplat_ref.scalar.covariance import normalized, normalized_vjp, rotation, rotation_vjp
+from minisplat_ref.scalar.literals import HALF, ONE, TWO, ZERO
+
+
+class Lens(NamedTuple):
+    """A camera and the conventions as scalars of the data's dtype."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    x_min: float
+    """Jacobian clamp of x / z, likewise below."""
+    x_max: float
+    y_min: float
+    y_max: float
+    near: float
+    far: float
+    eps2d: float
+    compensation_floor: float
+    is_antialiased: bool
+
+
+class Footprint(NamedTuple):
+    """One projected Gaussian and what its gradient needs again."""
+
+    x: float
+    """Image position, pixels."""
+    y: float
+    u: tuple
+    """Rows of U."""
+    w: tuple
+    cov_xx: float
+    """Covariance with the low-pass, px^2."""
+    cov_xy: float
+    cov_yy: float
+    det: float
+    """Its determinant, px^4."""
+    compensation: float
+    """sqrt(det before the low-pass / det after), or 1."""
+
+
+@scalar
+def dot(a, b):
+    """Inner product of two triples."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@scalar
+def rows_of(matrix):
+    """Tuple of rows of a 3 x 3 array."""
+    return (
+        (matrix[0, 0], matrix[0, 1], matrix[0, 2]),
+        (matrix[1, 0], matrix[1, 1], matrix[1, 2]),
+        (matrix[2, 0], matrix[2, 1], matrix[2, 2]),
+    )
+
+
+@scalar
+def to_camera(R, centre, x, y, z):
+    """Camera coordinates of a world point; subtracting the centre first keeps digits far from the world's origin."""
+    d = (x - centre[0], y - centre[1], z - centre[2])
+    return dot(R[0], d), dot(R[1], d), dot(R[2], d)
+
+
+@scalar
+def axes(quat, scale):
+    """Columns R_g diag(s) as rows: M[j][k] is world component j of axis k times its standard deviation."""
+    qw, qx, qy, qz, _ = normalized(quat[0], quat[1], quat[2], quat[3])
+    r = rotation(qw, qx, qy, qz)
+    return (
+        (r[0][0] * scale[0], r[0][1] * scale[1], r[0][2] * scale[2]),
+        (r[1][0] * scale[0], r[1][1] * scale[1], r[1][2] * scale[2]),
+        (r[2][0] * scale[0], r[2][1] * scale[1], r[2][2] * scale[2]),
+    )
+
+
+@scalar
+def rotated(R, M):
+    """Matrix product of two 3 x 3 tuples of rows."""
+    c0 = (M[0][0], M[1][0], M[2][0])
+    c1 = (M[0][1], M[1][1], M[2][1])
+    c2 = (M[0][2], M[1][2], M[2][2])
+    return (
+        (dot(R[0], c0), dot(R[0], c1), dot(R[0], c2)),
+        (dot(R[1], c0), dot(R[1], c1), dot(R[1], c2)),
+        (dot(R[2], c0), dot(R[2], c1), dot(R[2], c2)),
+    )
+
+
+@scalar
+def transposed(M):
+    """Transpose of a 3 x 3 tuple of rows."""
+    return ((M[0][0], M[1][0], M[2][0]), (M[0][1], M[1][1], M[2][1]), (M[0][2], M[1][2], M[2][2]))
+
+
+@scalar
+def image_row(focal_over_z, direction, V_row, V_2):
+    """One row of U."""
+    return (
+        focal_over_z * (V_row[0] - direction * V_2[0]),
+        focal_over_z * (V_row[1] - direction * V_2[1]),
+        focal_over_z * (V_row[2] - direction * V_2[2]),
+    )
+
+
+@scalar
+def project_gaussian(p, V, lens):
+    """Footprint of a Gaussian with camera coordinates p and camera-frame axes V."""
+    inverse_z = ONE / p[2]
+    x = p[0] * inverse_z
+    y = p[1] * inverse_z
+    u = image_row(lens.fx * inverse_z, min(max(x, lens.x_min), lens.x_max), V[0], V[2])
+    w = image_row(lens.fy * inverse_z, min(max(y, lens.y_min), lens.y_max), V[1], V[2])
+    cov_xx = dot(u, u)
+    cov_xy = dot(u, w)
+    cov_yy = dot(w, w)
+    area = (u[1] * w[2] - u[2] * w[1], u[2] * w[0] - u[0] * w[2], u[0] * w[1] - u[1] * w[0])
+    det_sharp = dot(area, area)
+    det = det_sharp + lens.eps2d * (cov_xx + cov_yy) + lens.eps2d * lens.eps2d
+    compensation = ONE * det / det  # 1 in the data's dtype, NaN where det is not finite
+    if lens.is_antialiased:
+        compensation = math.sqrt(max(lens.compensation_floor * lens.compensation_floor, det_sharp / det))
+    return Footprint(
+        lens.fx * x + lens.cx,
+        lens.fy * y + lens.cy,
+        u,
+        w,
+        cov_xx + lens.eps2d,
+        cov_xy,
+        cov_yy + lens.eps2d,
+        det,
+        compensation,
+    )
+
+
+@scalar
+def conic(footprint):
+    """Inverse of the projected covariance."""
+    inverse_det = ONE / footprint.det
+    return footprint.cov_yy * inverse_det, -footprint.cov_xy * inverse_det, footprint.cov_xx * inverse_det
+
+
+@scalar
+def conic_vjp(footprint, v_conic):
+    """Gradient by (cov_xx, cov_xy, cov_yy): d(S^-1) = -S^-1 dS S^-1, the off-diagonal entry counted twice."""
+    a, b, c = conic(footprint)
+    v_a = v_conic[0]
+    v_b = v_conic[1]
+    v_c = v_conic[2]
+    return (
+        -(a * a * v_a + a * b * v_b + b * b * v_c),
+        -(TWO * a * b * v_a + (a * c + b * b) * v_b + TWO * b * c * v_c),
+        -(b * b * v_a + b * c * v_b + c * c * v_c),
+    )
+
+
+@scalar
+def compensation_vjp(footprint, v_compensation, lens):
+    """Gradient of sqrt(det_sharp / det) by (cov_xx, cov_xy, cov_yy); zero on the floor."""
+    rho = footprint.compensation
+    if not lens.is_antialiased or rho <= lens.compensation_floor:
+        return ZERO * rho, ZERO * rho, ZERO * rho
+    k = HALF * v_compensation / (rho * footprint.det)
+    keep = rho * rho
+    return (
+        k * (footprint.cov_yy - lens.eps2d - keep * footprint.cov_yy),
+        -TWO * k * footprint.cov_xy * (ONE - keep),
+        k * (footprint.cov_xx - lens.eps2d - keep * footprint.cov_xx),
+    )
+
+
+@scalar
+def image_row_vjp(focal_over_z, direction, V_2, v_row):
+    """Gradient of one row of U by (V_row, V_2, direction)."""
+    v_V_row = (focal_over_z * v_row[0], focal_over_z * v_row[1], focal_over_z * v_row[2])
+    v_V_2 = (-direction * v_V_row[0], -direction * v_V_row[1], -direction * v_V_row[2])
+    return v_V_row, v_V_2, -dot(v_V_row, V_2)
+
+
+@scalar
+def project_gaussian_vjp(p, V, lens, footprint, v_x, v_y, v_depth, v_cov):
+    """Chain gradients of image position, depth and projected covariance to p and V.
+
+    The focal factor of a row is f / z, so the row's own share of dL/dz is -(row . v_row) / z; a clamped direction does
+    not move with p.
+    """
+    inverse_z = ONE / p[2]
+    x = p[0] * inverse_z
+    y = p[1] * inverse_z
+    u = footprint.u
+    w = footprint.w
+    v_u = (
+        TWO * v_cov[0] * u[0] + v_cov[1] * w[0],
+        TWO * v_cov[0] * u[1] + v_cov[1] * w[1],
+        TWO * v_cov[0] * u[2] + v_cov[1] * w[2],
+    )
+    v_w = (
+        TWO * v_cov[2] * w[0] + v_cov[1] * u[0],
+        TWO * v_cov[2] * w[1] + v_cov[1] * u[1],
+        TWO * v_cov[2] * w[2] + v_cov[1] * u[2],
+    )
+    v_V0, v_V2x, v_dir_x = image_row_vjp(lens.fx * inverse_z, min(max(x, lens.x_min), lens.x_max), V[2], v_u)
+    v_V1, v_V2y, v_dir_y = image_row_vjp(lens.fy * inverse_z, min(max(y, lens.y_min), lens.y_max), V[2], v_w)
+    v_V2 = (v_V2x[0] + v_V2y[0], v_V2x[1] + v_V2y[1], v_V2x[2] + v_V2y[2])
+
+    v_ratio_x = lens.fx * v_x
+    v_ratio_y = lens.fy * v_y
+    if lens.x_min < x < lens.x_max:
+        v_ratio_x += v_dir_x
+    if lens.y_min < y < lens.y_max:
+        v_ratio_y += v_dir_y
+    v_p = (
+        v_ratio_x * inverse_z,
+        v_ratio_y * inverse_z,
+        v_depth - (v_ratio_x * x + v_ratio_y * y + dot(u, v_u) + dot(w, v_w)) * inverse_z,
+    )
+    return v_p, (v_V0, v_V1, v_V2)
+
+
+@scalar
+def axes_vjp(quat, scale, v_M):
+    """Chain dL/dM to the quaternion, as given, and the scales."""
+    qw, qx, qy, qz, inverse_length = normalized(quat[0], quat[1], quat[2], quat[3])
+    r = rotation(qw, qx, qy, qz)
+    v_scale = (
+        v_M[0][0] * r[0][0] + v_M[1][0] * r[1][0] + v_M[2][0] * r[2][0],
+        v_M[0][1] * r[0][1] + v_M[1][1] * r[1][1] + v_M[2][1] * r[2][1],
+        v_M[0][2] * r[0][2] + v_M[1][2] * r[1][2] + v_M[2][2] * r[2][2],
+    )
+    v_r = (
+        (v_M[0][0] * scale[0], v_M[0][1] * scale[1], v_M[0][2] * scale[2]),
+        (v_M[1][0] * scale[0], v_M[1][1] * scale[1], v_M[1][2] * scale[2]),
+        (v_M[2][0] * scale[0], v_M[2][1] * scale[1], v_M[2][2] * scale[2]),
+    )
+    v_qw, v_qx, v_qy, v_qz = rotation_vjp(qw, qx, qy, qz, v_r)
+    return normalized_vjp(qw, qx, qy, qz, inverse_length, v_qw, v_qx, v_qy, v_qz), v_scale
