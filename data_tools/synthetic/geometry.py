@@ -28,7 +28,7 @@ class Primitive(NamedTuple):
     world_from_local_R: Floats
     """[3, 3] rotation."""
     casts_shadow: bool = True
-    """False for walls and the ground, which have nothing behind them: saves the test."""
+    """False for walls and the ground, which have nothing behind them, and for the thinnest rods."""
 
     def to_local(self, points: Floats) -> Floats:
         """World points [n, 3] in the shape's frame."""
