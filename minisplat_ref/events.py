@@ -38,7 +38,10 @@ class TrainState:
 
 
 class Iteration(NamedTuple):
-    """What an action may look at: the iteration that has just been done, and its surroundings."""
+    """What an action may look at: the iteration that has just been done, and its surroundings.
+
+    Rows are those that were rendered; a recipe lists the actions that use them before those that edit rows.
+    """
 
     scene: Scene
     view: View

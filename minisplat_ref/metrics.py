@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import REFERENCE, Backend
+from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.render import render
@@ -72,7 +72,7 @@ def psnr(image: Floats, target: Floats, mask: Bools | None = None) -> float:
     return math.inf if mse == 0.0 else -10.0 * math.log10(mse)
 
 
-def ssim(image: Floats, target: Floats, mask: Bools | None = None, *, backend: Backend = REFERENCE) -> float:
+def ssim(image: Floats, target: Floats, mask: Bools | None = None, *, backend: Backend = CPU) -> float:
     """Return the mean structural similarity, by the window and zero padding of the training loss.
 
     Parameters
@@ -93,7 +93,7 @@ def evaluate(
     *,
     background: Floats,
     on_view: Callable[[View, Floats, ViewMetrics], None] | None = None,
-    backend: Backend = REFERENCE,
+    backend: Backend = CPU,
     conventions: Conventions = GSPLAT_MAIN,
 ) -> Evaluation:
     """Render views with all stored spherical-harmonic degrees and compare them with their photographs.

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import REFERENCE, Backend
+from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.events import Iteration, TrainState
@@ -69,7 +69,7 @@ def train(
     seed: int,
     state: TrainState | None = None,
     on_step: Callable[[StepReport], None] | None = None,
-    backend: Backend = REFERENCE,
+    backend: Backend = CPU,
     conventions: Conventions = GSPLAT_MAIN,
 ) -> TrainState:
     """Train until ``recipe.iterations``.

@@ -38,8 +38,8 @@ def screen_gradient_norms(v_means2d: Floats, width: int, height: int) -> Floats:
     -------
     norms : ndarray of shape (V,)
     """
-    half_size = np.array([0.5 * width, 0.5 * height], v_means2d.dtype)
-    return np.hypot(*(v_means2d * half_size).T)
+    v_x, v_y = 0.5 * width * v_means2d[:, 0], 0.5 * height * v_means2d[:, 1]  # [V]
+    return np.sqrt(v_x * v_x + v_y * v_y)
 
 
 def clone_and_split(

@@ -1,0 +1,219 @@
+"""The loop on a scene of five tiny pictures: it learns, it repeats, it resumes, it stops when told to."""
+
+import os
+import signal
+from functools import partial
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+from scenes import as_dtype, make_camera, make_gaussians
+
+from minisplat_ref import events
+from minisplat_ref.backends import CPU, REFERENCE
+from minisplat_ref.errors import InputError
+from minisplat_ref.metrics import evaluate
+from minisplat_ref.recipes import RECIPES, At, During, Every
+from minisplat_ref.render import render
+from minisplat_ref.train import initial_state, load_state, save_state, train
+from minisplat_ref.types import Scene, View
+
+N_VIEWS, N_GAUSSIANS = 4, 30
+
+# Every kind of event within 40 iterations.
+EVENTS = (
+    During(events.collect_gradients, stop=30),
+    Every(10, partial(events.clone_and_split, threshold=2e-3, size_fraction=0.15), start=5, stop=30),
+    Every(10, partial(events.prune_faint, least_opacity=0.005), start=5, stop=30),
+    Every(10, partial(events.prune_large, size_fraction=2.0), start=15, stop=30),
+    Every(25, partial(events.reset_opacity, ceiling=0.05)),
+)
+RECIPE = RECIPES["3dgs-accel"]._replace(iterations=40, sh_degree=1, sh_milestones=(10,), events=EVENTS)
+PLAIN = RECIPE._replace(iterations=60, events=())
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Pictures of 30 Gaussians, and their centres with wrong colours as the points to start from."""
+    rng = np.random.default_rng(5)
+    truth = as_dtype(make_gaussians(rng, N_GAUSSIANS), np.float32)
+    views = []
+    for i in range(N_VIEWS):
+        camera = make_camera(24, 16, rng=rng)
+        image = render(truth, camera, background=np.array([0.0, 0.2, 0.4]), backend=REFERENCE)[0].image
+        views.append(View(f"view{i}", camera, np.round(255 * np.clip(image, 0, 1)).astype(np.uint8), None))
+    colors = rng.integers(0, 256, (N_GAUSSIANS, 3), np.uint8)
+    return Scene("tiny", tuple(views), (), truth.means.astype(float), colors, np.array([0.0, 0.2, 0.4]), 1.0)
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(scene):
+    return train(scene, RECIPE, seed=3)
+
+
+def all_arrays(state):
+    return {
+        **{f"p.{name}": field for name, field in state.gaussians._asdict().items()},
+        **{f"m.{name}": field for name, field in state.adam.first._asdict().items()},
+        **{f"v.{name}": field for name, field in state.adam.second._asdict().items()},
+        **state.stats,
+    }
+
+
+def assert_same_bytes(state, other):
+    assert (state.step, state.adam.step, state.view_order) == (other.step, other.adam.step, other.view_order)
+    assert state.rng.bit_generator.state == other.rng.bit_generator.state
+    arrays, others = all_arrays(state), all_arrays(other)
+    assert arrays.keys() == others.keys()
+    for name, array in arrays.items():
+        assert array.dtype == others[name].dtype and array.tobytes() == others[name].tobytes(), name
+
+
+# It learns ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", RECIPES)
+@pytest.mark.parametrize("backend", [REFERENCE, CPU], ids=lambda b: b.name)
+def test_overfits_a_tiny_scene(scene, name, backend):
+    recipe = PLAIN._replace(name=name, adam=RECIPES[name].adam, learning_rates=RECIPES[name].learning_rates)
+    state, losses = initial_state(scene, recipe, 0), []
+    before = evaluate(state.gaussians, scene.train_views, background=scene.background, backend=backend)
+    train(scene, recipe, seed=0, state=state, on_step=lambda report: losses.append(report.loss), backend=backend)
+    after = evaluate(state.gaussians, scene.train_views, background=scene.background, backend=backend)
+    assert len(losses) == 60
+    assert np.mean(losses[-N_VIEWS:]) < 0.75 * np.mean(losses[:N_VIEWS])
+    assert after.psnr > before.psnr + 3.0
+    assert after.ssim > before.ssim
+
+
+def test_backends_train_alike(scene):
+    """Twelve iterations of either backend: the same views, and renderings that agree."""
+    reference, cpu = (
+        train(scene, PLAIN._replace(iterations=12), seed=0, backend=backend) for backend in (REFERENCE, CPU)
+    )
+    assert reference.view_order == cpu.view_order
+    images = [render(s.gaussians, scene.train_views[0].camera, backend=REFERENCE)[0].image for s in (reference, cpu)]
+    assert np.abs(images[0] - images[1]).mean() < 1e-3
+
+
+def test_every_event_happens(scene):
+    counts = []
+    state = train(
+        scene, RECIPE, seed=0, on_step=lambda report: counts.append(len(report.state.gaussians.means)), backend=CPU
+    )
+    assert set(counts[:9]) == {N_GAUSSIANS}
+    assert counts[9] > N_GAUSSIANS  # iteration 10 densifies
+    assert len(counts) == 40 and counts[-1] == len(state.gaussians.means)
+    assert all(len(array) == counts[-1] for array in all_arrays(state).values())
+    assert state.gaussians.sh_rest.any()  # degree 1 from iteration 10 on
+
+
+def test_mask_and_random_background(scene):
+    masked = tuple(view._replace(mask=np.zeros((16, 24), bool)) for view in scene.train_views)
+    state = initial_state(scene, PLAIN, 0)
+    before = state.gaussians.means.copy()
+    train(scene._replace(train_views=masked), PLAIN._replace(iterations=3), seed=0, state=state)
+    assert_array_equal(state.gaussians.means, before)  # nothing counts, nothing moves
+
+    corners = []
+    random = PLAIN._replace(iterations=4, has_random_background=True)
+    train(scene, random, seed=0, on_step=lambda report: corners.append(report.output.image[0, 0]))
+    assert np.ptp(corners, axis=0).max() > 0.1
+
+
+def test_blend_statistics_only_where_asked_for(scene):
+    seen = {}
+    note = lambda state, iteration: seen.update({state.step + 1: iteration.output.stats})  # noqa: E731
+    recipe = PLAIN._replace(
+        iterations=4, events=(During(note, stop=4), During(lambda *_: None, 1, 3, needs_blend_stats=True))
+    )
+    train(scene, recipe, seed=0)
+    assert {step: stats is not None for step, stats in seen.items()} == {1: False, 2: True, 3: False}
+
+
+# It repeats -----------------------------------------------------------------------------------------------------------
+
+
+def test_views_come_once_per_round_in_changing_order(scene):
+    names = []
+    train(scene, PLAIN._replace(iterations=24), seed=1, on_step=lambda report: names.append(report.view.name))
+    rounds = [names[i : i + N_VIEWS] for i in range(0, 24, N_VIEWS)]
+    assert all(sorted(one) == ["view0", "view1", "view2", "view3"] for one in rounds)
+    assert len({tuple(one) for one in rounds}) > 1
+
+
+def test_same_seed_same_bytes(scene, uninterrupted):
+    assert_same_bytes(train(scene, RECIPE, seed=3), uninterrupted)
+    briefly = RECIPE._replace(iterations=3)
+    first, other = (train(scene, briefly, seed=seed) for seed in (3, 4))
+    assert first.gaussians.means.tobytes() != other.gaussians.means.tobytes()
+
+
+@pytest.mark.parametrize("stop", [14, 20])
+def test_resumed_is_bit_equal_to_uninterrupted(scene, uninterrupted, stop, tmp_path):
+    """In the middle of a round of views, when statistics are half collected, and right after an event."""
+    path = tmp_path / "checkpoint.npz"
+    save_state(path, train(scene, RECIPE._replace(iterations=stop), seed=3), RECIPE)
+    resumed = load_state(path, RECIPE)
+    assert resumed.step == stop
+    train(scene, RECIPE, seed=999, state=resumed)
+    assert_same_bytes(resumed, uninterrupted)
+
+
+def test_finished_training_stays_as_it_is(scene):
+    state = train(scene, RECIPE, seed=0)
+    before = state.gaussians.means.tobytes()
+    train(scene, RECIPE, seed=0, state=state)
+    assert state.step == 40 and state.gaussians.means.tobytes() == before
+
+
+# It stops when told to ------------------------------------------------------------------------------------------------
+
+
+def test_ctrl_c_waits_for_the_end_of_the_iteration(scene, uninterrupted):
+    """The signal arrives inside an iteration; the state that remains continues as if nothing had been."""
+
+    def press(state, iteration):
+        os.kill(os.getpid(), signal.SIGINT)
+        pressed.append(state.step)
+
+    pressed = []
+    handler = signal.getsignal(signal.SIGINT)
+    recipe = RECIPE._replace(events=(At(12, press), *EVENTS))
+    state = initial_state(scene, recipe, 3)
+    with pytest.raises(KeyboardInterrupt):
+        train(scene, recipe, seed=3, state=state)
+    assert pressed == [11] and state.step == 12
+    assert signal.getsignal(signal.SIGINT) is handler
+    train(scene, RECIPE, seed=3, state=state)
+    assert_same_bytes(state, uninterrupted)
+
+
+# Bad input ------------------------------------------------------------------------------------------------------------
+
+
+def test_scene_without_views(scene):
+    with pytest.raises(InputError, match="tiny has no training views"):
+        train(scene._replace(train_views=()), RECIPE, seed=0)
+
+
+def test_resuming_another_scene(scene):
+    state = initial_state(scene, RECIPE, 0)
+    state.view_order = [3, 0]
+    with pytest.raises(InputError, match="fewer training views"):
+        train(scene._replace(train_views=scene.train_views[:2]), RECIPE, seed=0, state=state)
+
+
+def test_resuming_with_another_recipe(scene, tmp_path):
+    path = tmp_path / "checkpoint.npz"
+    save_state(path, initial_state(scene, RECIPE, 0), RECIPE)
+    load_state(path, RECIPE)
+    with pytest.raises(InputError, match=r"written by recipe 3dgs-accel of 40 iterations.*continue with the recipe"):
+        load_state(path, RECIPE._replace(iterations=50))
+
+
+def test_no_gaussians_left(scene):
+    """A recipe that prunes everybody goes on rendering the background."""
+    recipe = RECIPE._replace(events=(*EVENTS, At(5, partial(events.prune_large, size_fraction=1e-9))))
+    state = train(scene, recipe, seed=0)
+    assert len(state.gaussians.means) == 0 and state.step == 40
