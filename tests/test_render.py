@@ -13,7 +13,7 @@ from tolerances import (
     PARITY_FLOAT64,
 )
 
-from minisplat_ref.backends import REFERENCE, get_backend
+from minisplat_ref.backends import CPU, REFERENCE, get_backend
 from minisplat_ref.constants import GSPLAT_MAIN, INRIA, SH_C0
 from minisplat_ref.errors import InputError
 from minisplat_ref.render import render, render_vjp
@@ -176,7 +176,7 @@ def test_degree_that_is_not_stored(sh_degree, rng):
 
 
 def test_get_backend():
-    assert get_backend("reference") is REFERENCE
+    assert get_backend("reference") is REFERENCE and get_backend("cpu") is CPU
     with pytest.raises(InputError, match="'gpu' is unknown"):
         get_backend("gpu")
 

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from gradcheck import check_jacobian
+from gradcheck import check_inner_products, check_jacobian
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import make_camera, make_gaussians
 from tolerances import (
@@ -16,6 +16,7 @@ from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import SH_C0, SH_C1, SH_C2, SH_C3
 from minisplat_ref.reference.spherical_harmonics import sh_basis, sh_basis_jacobian
 
+NAMES = ["means", "sh_dc", "sh_rest", "R", "t"]
 VISIBLE = np.array([[1, 1]], dtype=np.int32)
 
 # --- closed form ---
@@ -121,33 +122,52 @@ def test_basis_jacobian(rng, degree):
     )
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_color_jacobian(backend, rng, degree):
-    camera = make_camera(rng=rng)
-    gaussians = make_gaussians(rng, 4)
-    radii = np.ones((4, 2), dtype=np.int32)
-    inputs = (gaussians.means, 3 * gaussians.sh_dc, gaussians.sh_rest, camera.cam_from_world_R, camera.cam_from_world_t)
+def functions_of_arrays(backend, camera, degree, inputs):
+    """`sh_colors` and `sh_colors_vjp` over the arrays that have a gradient, pose included."""
+    radii = np.ones((len(inputs[0]), 2), dtype=np.int32)
 
     def function(means, sh_dc, sh_rest, R, t):
         view = camera._replace(cam_from_world_R=R, cam_from_world_t=t)
         return (backend.sh_colors(means, sh_dc, sh_rest, view, degree, radii),)
 
+    def vjp(v_colors):
+        return backend.sh_colors_vjp(*inputs[:3], camera, degree, radii, v_colors)
+
     colors = function(*inputs)[0]
-    assert (colors == 0).any() and (colors > 0).sum() > 6  # both sides of the clamp
-    names = ["means", "sh_dc", "sh_rest", "R", "t"]
-    if degree == 0:  # a constant colour: nothing but sh_dc has a gradient
-        gradient = backend.sh_colors_vjp(*inputs[:3], camera, degree, radii, np.ones((4, 3)))
-        assert not any(gradient[k].any() for k in (0, 2, 3, 4))
-        check_jacobian(
-            lambda sh_dc: function(inputs[0], sh_dc, *inputs[2:]),
-            lambda v: (backend.sh_colors_vjp(*inputs[:3], camera, degree, radii, v).sh_dc,),
-            inputs[1:2],
-            names=["sh_dc"],
-        )
-    else:
-        check_jacobian(
-            function, lambda v: backend.sh_colors_vjp(*inputs[:3], camera, degree, radii, v), inputs, names=names
-        )
+    assert (colors == 0).any() and (colors > 0).any()  # both sides of the clamp
+    return function, vjp
+
+
+def inputs_of(rng, n, camera):
+    gaussians = make_gaussians(rng, n)
+    pose = camera.cam_from_world_R, camera.cam_from_world_t
+    return gaussians.means, 3 * gaussians.sh_dc, gaussians.sh_rest, *pose
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_color_jacobian(rng, degree):
+    camera = make_camera(rng=rng)
+    inputs = inputs_of(rng, 4, camera)
+    check_jacobian(*functions_of_arrays(REFERENCE, camera, degree, inputs), inputs, names=NAMES)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_color_gradient_of_many(backend, rng, degree):
+    camera = make_camera(rng=rng)
+    inputs = inputs_of(rng, 50, camera)
+    function, vjp = functions_of_arrays(backend, camera, degree, inputs)
+    cotangents = (rng.normal(size=(50, 3)),)
+    check_inner_products(function, vjp(*cotangents), inputs, cotangents, rng, names=NAMES)
+
+
+def test_constant_color_has_no_gradient_but_its_own(backend, rng):
+    camera = make_camera(rng=rng)
+    inputs = inputs_of(rng, 50, camera)
+    function, vjp = functions_of_arrays(backend, camera, 0, inputs)
+    v_colors = rng.normal(size=(50, 3))
+    gradient = vjp(v_colors)
+    assert_allclose(gradient.sh_dc, np.where(function(*inputs)[0] > 0, SH_C0 * v_colors, 0), rtol=CLOSED_FORM)
+    assert not any(gradient[k].any() for k in (0, 2, 3, 4))
 
 
 # --- parity ---

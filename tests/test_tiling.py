@@ -33,39 +33,42 @@ def lists(bins):
 # --- closed form ---
 
 
-def test_lists_by_hand(backend):
+def test_lists_by_hand():
     # 3 x 2 tiles of 8 x 8 over 20 x 12 pixels: the last column and row hang over the edge.
     boxes = [[0, 0, 20, 12], [7, 7, 9, 9], [8, 0, 16, 8], [0, 0, 0, 0], [19, 11, 20, 12]]
-    bins = backend.bin_gaussians(footprints(boxes, [3, 2, 1, 0, 4]), TileGrid(20, 12, 8, 8), GSPLAT_MAIN)
+    bins = REFERENCE.bin_gaussians(footprints(boxes, [3, 2, 1, 0, 4]), TileGrid(20, 12, 8, 8), GSPLAT_MAIN)
     assert lists(bins) == [[1, 0], [2, 1, 0], [0], [1, 0], [1, 0], [0, 4]]
     assert bins.gaussian_ids.dtype == np.int32 and bins.tile_offsets.dtype == np.int64
     assert bins.grid == TileGrid(20, 12, 8, 8)
-
-
-def test_pairs_are_findable_from_their_gaussian(backend):
-    boxes = [[0, 0, 20, 12], [7, 7, 9, 9], [8, 0, 16, 8], [0, 0, 0, 0], [19, 11, 20, 12]]
-    bins = backend.bin_gaussians(footprints(boxes, [3, 2, 1, 0, 4]), TileGrid(20, 12, 8, 8), GSPLAT_MAIN)
-    assert_array_equal(np.sort(bins.slots), np.arange(len(bins.gaussian_ids)))
-    owners = np.empty_like(bins.gaussian_ids)
-    owners[bins.slots] = bins.gaussian_ids
-    assert_array_equal(owners, np.repeat(np.arange(5), np.diff(bins.gaussian_offsets)))
     assert_array_equal(np.diff(bins.gaussian_offsets), [6, 4, 1, 0, 1])
 
 
+def test_box_that_ends_on_a_tile_border_stays_on_its_side():
+    bins = REFERENCE.bin_gaussians(footprints([[4, 0, 8, 4]], [1]), TileGrid(12, 4, 4, 4), GSPLAT_MAIN)
+    assert lists(bins) == [[], [0], []]
+
+
 def test_equal_depths_keep_the_order_of_the_rows(backend):
-    bins = backend.bin_gaussians(footprints([[0, 0, 4, 4]] * 4, [2, 1, 2, 1]), TileGrid(4, 4, 4, 4), GSPLAT_MAIN)
+    grid = TileGrid(4, 4, backend.tile_width, backend.tile_height)
+    bins = backend.bin_gaussians(footprints([[0, 0, 4, 4]] * 4, [2, 1, 2, 1]), grid, GSPLAT_MAIN)
     assert lists(bins) == [[1, 3, 0, 2]]
 
 
-def test_box_that_ends_on_a_tile_border_stays_on_its_side(backend):
-    bins = backend.bin_gaussians(footprints([[4, 0, 8, 4]], [1]), TileGrid(12, 4, 4, 4), GSPLAT_MAIN)
-    assert lists(bins) == [[], [0], []]
+def test_pairs_are_findable_from_their_gaussian(backend, rng):
+    projection = REFERENCE.project(*activated(make_gaussians(rng, 60)), make_camera(50, 40, fx=50, fy=60), GSPLAT_MAIN)
+    bins = backend.bin_gaussians(projection, TileGrid(50, 40, backend.tile_width, backend.tile_height), GSPLAT_MAIN)
+    assert_array_equal(np.sort(bins.slots), np.arange(len(bins.gaussian_ids)))
+    owners = np.empty_like(bins.gaussian_ids)
+    owners[bins.slots] = bins.gaussian_ids
+    assert len(owners) > 100
+    assert_array_equal(owners, np.repeat(np.arange(60), np.diff(bins.gaussian_offsets)))
 
 
 @pytest.mark.parametrize("boxes", [[], [[0, 0, 0, 0]]])
 def test_nothing_to_bin(backend, boxes):
-    bins = backend.bin_gaussians(footprints(boxes, [0] * len(boxes)), TileGrid(20, 12, 8, 8), GSPLAT_MAIN)
-    assert lists(bins) == [[]] * 6
+    grid = TileGrid(20, 12, backend.tile_width, backend.tile_height)
+    bins = backend.bin_gaussians(footprints(boxes, [0] * len(boxes)), grid, GSPLAT_MAIN)
+    assert lists(bins) == [[]] * (grid.n_tiles_x * grid.n_tiles_y)
     assert_array_equal(bins.gaussian_offsets, [0] * (len(boxes) + 1))
 
 
