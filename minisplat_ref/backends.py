@@ -22,7 +22,6 @@ import minisplat_ref.reference.loss
 import minisplat_ref.reference.projection
 import minisplat_ref.reference.spherical_harmonics
 import minisplat_ref.reference.tiling  # noqa: F401  (the linter sees only the last import of a package)
-import minisplat_ref.reference.tiling  # noqa: F401 (the last of these names the package; all of them are used below)
 from minisplat_ref import cpu, reference
 from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
 from minisplat_ref.errors import InputError
