@@ -1,4 +1,4 @@
-"""From parameters to an image and back: the stages chained through one backend.
+"""From trained parameters to an image and back.
 
 Activations live here (3DGS section 5.1): ``scales = exp(log_scales)``, ``opacities = sigmoid(opacity_logits)``. Left
 out: checks for NaN, which belong to whoever reads a file; a Gaussian whose footprint is not finite is culled.
@@ -12,33 +12,21 @@ import numpy as np
 from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
-from minisplat_ref.types import (
-    Camera,
-    Floats,
-    Gaussians,
-    Projection,
-    ProjectionGradient,
-    RenderOutput,
-    TileBins,
-    TileGrid,
-)
+from minisplat_ref.splatting import Primitives, SplatTape, splat, splat_vjp
+from minisplat_ref.types import Camera, Floats, Gaussians, Ints, Projection, RenderOutput
 
 
 class RenderTape(NamedTuple):
     """What :func:`render` did, for :func:`render_vjp` and for statistics of what was visible."""
 
     gaussians: Gaussians
-    scales: Floats  # [N, 3] activated
-    opacities: Floats  # [N] activated
-    camera: Camera
-    background: Floats  # [D] with a depth channel's 0
     sh_degree: int  # active
-    conventions: Conventions
-    backend: Backend
-    projection: Projection  # radii are 0 where culled
-    channels: Floats  # [N, D] colours, then the depth if asked for
-    bins: TileBins
-    output: RenderOutput
+    splats: SplatTape  # the activated Gaussians and what became of them
+
+    @property
+    def projection(self) -> Projection:
+        """Footprints in the image; radii are 0 where culled."""
+        return self.splats.projection
 
 
 class RenderGradient(NamedTuple):
@@ -101,32 +89,22 @@ def render(
     with np.errstate(over="ignore"):  # the projection culls the largest number; infinity times a zero gradient is NaN
         scales = np.minimum(np.exp(gaussians.log_scales), np.finfo(dtype).max)
     opacities = 0.5 * (1 + np.tanh(0.5 * gaussians.opacity_logits))  # the sigmoid, which cannot overflow in this form
-    projection = backend.project(gaussians.means, gaussians.quats, scales, opacities, camera, conventions)
-    channels = backend.sh_colors(
-        gaussians.means, gaussians.sh_dc, gaussians.sh_rest, camera, sh_degree, projection.radii
-    )
-    if with_depth:
-        channels = np.column_stack([channels, projection.depths])
-        background = np.append(background, dtype.type(0))
-    grid = TileGrid(camera.width, camera.height, backend.tile_width, backend.tile_height)
-    bins = backend.bin_gaussians(projection, grid, conventions)
-    output = backend.composite(
-        projection, channels, background, bins, conventions, with_stats=with_stats, with_median_depth=with_median_depth
-    )
-    return output, RenderTape(
-        gaussians,
-        scales,
-        opacities,
+
+    def shade(radii: Ints) -> Floats:
+        return backend.sh_colors(gaussians.means, gaussians.sh_dc, gaussians.sh_rest, camera, sh_degree, radii)
+
+    splats = splat(
+        Primitives(gaussians.means, gaussians.quats, scales, opacities),
+        shade,
         camera,
         background,
-        sh_degree,
         conventions,
         backend,
-        projection,
-        channels,
-        bins,
-        output,
+        with_depth=with_depth,
+        with_stats=with_stats,
+        with_median_depth=with_median_depth,
     )
+    return splats.output, RenderTape(gaussians, sh_degree, splats)
 
 
 def render_vjp(tape: RenderTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
@@ -151,30 +129,24 @@ def render_vjp(tape: RenderTape, v_image: Floats, v_alpha: Floats | None = None)
     RenderGradient
         Zeros for Gaussians that were not visible.
     """
-    g, camera, conventions, backend = tape.gaussians, tape.camera, tape.conventions, tape.backend
-    projection = tape.projection
-    v_alpha = np.zeros_like(tape.output.alpha) if v_alpha is None else v_alpha
-    v = backend.composite_vjp(
-        projection, tape.channels, tape.background, tape.bins, conventions, tape.output, v_image, v_alpha
-    )
-    v_colors = np.ascontiguousarray(v.colors[:, :3])
-    v_depths = v.colors[:, 3].copy() if v.colors.shape[1] == 4 else np.zeros_like(tape.opacities)
-    v_sh = backend.sh_colors_vjp(g.means, g.sh_dc, g.sh_rest, camera, tape.sh_degree, projection.radii, v_colors)
-    v_projection = ProjectionGradient(v.means2d, v_depths, v.conics, v.opacities)
-    v_primitive = backend.project_vjp(
-        g.means, g.quats, tape.scales, tape.opacities, camera, conventions, projection, v_projection
+    g, splats = tape.gaussians, tape.splats
+    scales, opacities = splats.primitives.scales, splats.primitives.opacities
+    v_alpha = np.zeros_like(splats.output.alpha) if v_alpha is None else v_alpha
+    v = splat_vjp(splats, v_image, v_alpha)
+    v_sh = splats.backend.sh_colors_vjp(
+        g.means, g.sh_dc, g.sh_rest, splats.camera, tape.sh_degree, splats.projection.radii, v.colors
     )
     return RenderGradient(
         gaussians=Gaussians(
-            means=v_primitive.means + v_sh.means,
-            quats=v_primitive.quats,
-            log_scales=tape.scales * v_primitive.scales,
-            opacity_logits=tape.opacities * (1 - tape.opacities) * v_primitive.opacities,
+            means=v.primitives.means + v_sh.means,
+            quats=v.primitives.quats,
+            log_scales=scales * v.primitives.scales,
+            opacity_logits=opacities * (1 - opacities) * v.primitives.opacities,
             sh_dc=v_sh.sh_dc,
             sh_rest=v_sh.sh_rest,
         ),
-        background=v.background[:3],
-        cam_from_world_R=v_primitive.cam_from_world_R + v_sh.cam_from_world_R,
-        cam_from_world_t=v_primitive.cam_from_world_t + v_sh.cam_from_world_t,
+        background=v.background,
+        cam_from_world_R=v.primitives.cam_from_world_R + v_sh.cam_from_world_R,
+        cam_from_world_t=v.primitives.cam_from_world_t + v_sh.cam_from_world_t,
         means2d=v.means2d,
     )

@@ -1,0 +1,141 @@
+"""One view of activated Gaussians: projected, shaded, sorted into tiles, composited; and the way back.
+
+The order of the stages is 3DGS section 6's. What the Gaussians are before their activations, and where their colours
+come from, is left to the caller: :mod:`minisplat_ref.render` holds trained parameters and spherical harmonics,
+:mod:`minisplat_ref.rasterization` whatever it is given.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from minisplat_ref.backends import Backend
+from minisplat_ref.constants import Conventions
+from minisplat_ref.types import (
+    Camera,
+    Floats,
+    Ints,
+    PrimitiveGradient,
+    Projection,
+    ProjectionGradient,
+    RenderOutput,
+    TileBins,
+    TileGrid,
+)
+
+
+class Primitives(NamedTuple):
+    """Gaussians after their activations: what a camera can be pointed at."""
+
+    means: Floats  # [N, 3] world frame
+    quats: Floats  # [N, 4] wxyz, any length but zero
+    scales: Floats  # [N, 3] standard deviations, world units
+    opacities: Floats  # [N] in [0, 1]
+
+
+class SplatTape(NamedTuple):
+    """What :func:`splat` did, for :func:`splat_vjp`."""
+
+    primitives: Primitives
+    camera: Camera
+    conventions: Conventions
+    backend: Backend
+    projection: Projection  # radii are 0 where culled
+    channels: Floats  # [N, D] colours, then the depth if asked for
+    background: Floats  # [D] with a depth channel's 0
+    has_depth: bool
+    bins: TileBins
+    output: RenderOutput
+
+
+class SplatGradient(NamedTuple):
+    """Gradient of the loss with respect to what :func:`splat` takes, and by the projected centres."""
+
+    primitives: PrimitiveGradient  # and the pose, as far as the projection depends on it
+    colors: Floats  # [N, D] without the depth channel
+    background: Floats  # [D] without the depth channel
+    means2d: Floats  # [N, 2] per pixel: what density control looks at
+
+
+def splat(
+    primitives: Primitives,
+    shade: Callable[[Ints], Floats],
+    camera: Camera,
+    background: Floats,
+    conventions: Conventions,
+    backend: Backend,
+    *,
+    with_depth: bool = False,
+    with_stats: bool = False,
+    with_median_depth: bool = False,
+) -> SplatTape:
+    """Draw one view.
+
+    Parameters
+    ----------
+    primitives : Primitives
+        Activated Gaussians; may be none.
+    shade : callable
+        Maps the radii [N, 2] of the projection, 0 where culled, to colours [N, D].
+    camera : Camera
+        View.
+    background : ndarray of shape (D,)
+        Behind everything.
+    conventions : Conventions
+        Profile of the rasteriser.
+    backend : Backend
+        Implementation of the stages.
+    with_depth : bool
+        Append the accumulated depth, ``sum w z``, as the last channel; its background is 0.
+    with_stats, with_median_depth : bool
+        As for :func:`composite`.
+
+    Returns
+    -------
+    SplatTape
+        Its ``output`` is the view.
+    """
+    projection = backend.project(*primitives, camera, conventions)
+    channels = shade(projection.radii)  # [N, D]
+    if with_depth:
+        channels = np.column_stack([channels, projection.depths])  # [N, D + 1]
+        background = np.append(background, background.dtype.type(0))
+    grid = TileGrid(camera.width, camera.height, backend.tile_width, backend.tile_height)
+    bins = backend.bin_gaussians(projection, grid, conventions)
+    output = backend.composite(
+        projection, channels, background, bins, conventions, with_stats=with_stats, with_median_depth=with_median_depth
+    )
+    return SplatTape(
+        primitives, camera, conventions, backend, projection, channels, background, with_depth, bins, output
+    )
+
+
+def splat_vjp(tape: SplatTape, v_image: Floats, v_alpha: Floats) -> SplatGradient:
+    """Gradient of :func:`splat`: the stages' gradients in reverse order; the caller chains on through its ``shade``.
+
+    Parameters
+    ----------
+    tape : SplatTape
+        From the forward function.
+    v_image : ndarray of shape (H, W, D)
+        Derivative by the image, depth channel included where there is one.
+    v_alpha : ndarray of shape (H, W)
+        Derivative by the accumulated opacity.
+
+    Returns
+    -------
+    SplatGradient
+        Zeros for Gaussians that were not visible.
+    """
+    projection, conventions, backend = tape.projection, tape.conventions, tape.backend
+    v = backend.composite_vjp(
+        projection, tape.channels, tape.background, tape.bins, conventions, tape.output, v_image, v_alpha
+    )
+    v_colors, v_background, v_depths = v.colors, v.background, np.zeros_like(projection.depths)
+    if tape.has_depth:
+        v_colors, v_depths = np.ascontiguousarray(v.colors[:, :-1]), v.colors[:, -1].copy()
+        v_background = v.background[:-1]
+    v_projection = ProjectionGradient(v.means2d, v_depths, v.conics, v.opacities)
+    v_primitives = backend.project_vjp(*tape.primitives, tape.camera, conventions, projection, v_projection)
+    return SplatGradient(v_primitives, v_colors, v_background, v.means2d)
