@@ -6,6 +6,7 @@ from scenes import ALL_CONVENTIONS, ANTIALIASED, as_dtype, make_camera, make_gau
 from tolerances import (
     CLOSED_FORM,
     COVERAGE_MIN,
+    FLIPPED_PIXELS_MAX,
     GRADIENT_FLOOR,
     GRADIENT_STEP_IMAGE,
     PARITY_FLOAT32_GRADIENT,
@@ -17,7 +18,7 @@ from minisplat_ref.backends import CPU, REFERENCE, get_backend
 from minisplat_ref.constants import GSPLAT_MAIN, INRIA, SH_C0
 from minisplat_ref.errors import InputError
 from minisplat_ref.render import render, render_vjp
-from minisplat_ref.types import Gaussians
+from minisplat_ref.types import Camera, Gaussians
 
 BACKGROUND = np.array([0.2, 0.5, 0.9])
 
@@ -204,3 +205,32 @@ def test_backends_agree(fast_backend, conventions, dtype, rng):
     for a, e in zip((*v_actual.gaussians, *v_actual[1:]), (*v_expected.gaussians, *v_expected[1:]), strict=True):
         assert np.abs(e).max() > GRADIENT_FLOOR
         assert_allclose(a, e, rtol=0, atol=(PARITY_FLOAT64 if is_exact else PARITY_FLOAT32_GRADIENT) * np.abs(e).max())
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_backends_agree_on_real_points(fast_backend, dtype, shared_data, rng):
+    # Points and camera of the garden scene; shapes and opacities, which the file does not have, are random.
+    data = np.load(shared_data / "gsplat_garden" / "test_garden.npz")
+    chosen = rng.choice(len(data["means3d"]), 3000, replace=False)
+    gaussians = Gaussians(
+        means=data["means3d"][chosen].astype(float),
+        quats=rng.normal(size=(3000, 4)),
+        log_scales=np.log(rng.uniform(1e-3, 0.04, size=(3000, 3))),
+        opacity_logits=2 * rng.normal(size=3000),
+        sh_dc=(data["colors"][chosen] / 255 - 0.5) / SH_C0,
+        sh_rest=np.zeros((3000, 0, 3)),
+    )
+    view, K = data["viewmats"][0].astype(float), data["Ks"][0].astype(float) / 8
+    camera = Camera(view[:3, :3], view[:3, 3], K[0, 0], K[1, 1], K[0, 2], K[1, 2], 81, 52)
+    v_image = rng.normal(size=(52, 81, 3))
+    results = []
+    for backend, kind in ((REFERENCE, np.float64), (fast_backend, dtype)):
+        output, tape = render(as_dtype(gaussians, kind), camera, backend=backend)
+        results.append((output, render_vjp(tape, v_image.astype(kind))))
+    (expected, v_expected), (actual, v_actual) = results
+    assert expected.alpha.mean() > 0.5
+    tolerance = PARITY_FLOAT64 if dtype == np.float64 else PARITY_FLOAT32_IMAGE
+    is_off = np.abs(actual.image - expected.image).max(axis=2) > tolerance
+    assert is_off.mean() <= (0 if dtype == np.float64 else FLIPPED_PIXELS_MAX)
+    for a, e in zip(v_actual.gaussians[:5], v_expected.gaussians[:5], strict=True):
+        assert_allclose(a, e, rtol=0, atol=tolerance * np.abs(e).max())
