@@ -20,6 +20,7 @@ from minisplat_ref.constants import SH_DEGREE_MAX
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import replacing
 from minisplat_ref.types import Floats, Gaussians
+from minisplat_ref.validation import check_quats
 
 MEANS = ("x", "y", "z")
 NORMALS = ("nx", "ny", "nz")
@@ -75,9 +76,7 @@ def load_ply(path: str | Path) -> Gaussians:
         return np.stack([columns[name].astype(dtype) for name in names], axis=1)
 
     quats = stack(QUATS)  # [N, 4]
-    zero_rows = np.flatnonzero(~quats.any(axis=1))
-    if zero_rows.size:
-        raise InputError(f"{path}: the rotation of row {zero_rows[0]} is a zero quaternion; remove that Gaussian")
+    check_quats(path, quats)
     n, n_rest = len(quats), len(rest_names) // 3
     rest = stack(rest_names) if rest_names else np.zeros((n, 0), dtype)  # [N, 3 (K-1)], channel-major
     return Gaussians(
