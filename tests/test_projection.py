@@ -55,6 +55,12 @@ def test_rotated_gaussian_has_a_mixed_term(backend):
     assert_allclose(projection.conics, [[expected[0, 0], expected[0, 1], expected[1, 1]]], rtol=1e3 * CLOSED_FORM)
 
 
+def test_disc_seen_edge_on_keeps_its_precision(backend):
+    # 50,000 px by 0.5 px: the inverse must not lose the small variance in the large one.
+    projection = project_one(backend, [0, 0, 2], [1e3, 0.02, 1e-3], 1.0)
+    assert_allclose(projection.conics, [[1 / (2.5e9 + 0.3), 0, 1 / 0.55]], rtol=CLOSED_FORM, atol=1e-16)
+
+
 def test_camera_pose_moves_the_gaussian(backend):
     # x_cam = R x + t, with R a quarter turn about y: (x, y, z) -> (z, y, -x).
     R = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])

@@ -7,6 +7,7 @@ module               what a reader knows afterwards                             
 ===================  ==============================================================  ============================
 covariance           how a quaternion and three scales make an ellipsoid             3DGS (6)
 pinhole              where a camera sees a point, and how that moves with the point  EWA splatting (29)
+antialiasing         how to make up for the blur that keeps ellipses visible         EWA splatting, Mip-Splatting
 projection           how the camera flattens an ellipsoid to an ellipse in pixels    3DGS (5), EWA splatting (31)
 extent               which pixels that ellipse can reach                             Mini-Splatting2, gsplat
 spherical_harmonics  how its colour depends on the viewing direction                 3DGS sec. 5.2

@@ -1,4 +1,4 @@
-"""Stage 2b: how far a projected Gaussian reaches, as a box of pixels. Nothing here has a gradient.
+"""Stage 2c: how far a projected Gaussian reaches, as a box of pixels. Nothing here has a gradient.
 
 Two rules, chosen by the conventions. Full support (gsplat, Mini-Splatting2): the box holds every pixel whose alpha
 reaches ``alpha_min``, solved from ``opacity exp(-r^2 / 2) = alpha_min``. INRIA's (the 3DGS code): all 16-pixel tiles

@@ -32,7 +32,22 @@ class TileHits(NamedTuple):
 
 
 def tile_hits(projection: Projection, bins: TileBins, conventions: Conventions) -> Iterator[TileHits]:
-    """Evaluate the tiles of an image, one after the other."""
+    """Evaluate the tiles of an image, one after the other.
+
+    Parameters
+    ----------
+    projection : Projection
+        Footprints and opacities.
+    bins : TileBins
+        The Gaussians of each tile, nearest first.
+    conventions : Conventions
+        Clamp, skip and stop thresholds.
+
+    Yields
+    ------
+    TileHits
+        One per tile, in row-major order.
+    """
     grid, dtype = bins.grid, projection.means2d.dtype
     for t in range(grid.n_tiles_x * grid.n_tiles_y):
         ids = bins.gaussian_ids[bins.tile_offsets[t] : bins.tile_offsets[t + 1]]

@@ -1,7 +1,6 @@
-"""The camera model: a point in the camera frame becomes a pixel, and a Gaussian there needs the map's derivative.
+"""Stage 2a: the camera model. A point in the camera frame becomes a pixel; a Gaussian there needs the map's derivative.
 
-The derivative is EWA splatting (Zwicker et al. 2002) equation (29). Left out: lens distortion (images are undistorted
-beforehand) and rolling shutter.
+Left out: lens distortion (images are undistorted beforehand) and rolling shutter.
 """
 
 import numpy as np
@@ -16,25 +15,65 @@ def pose(camera: Camera, dtype: np.dtype) -> tuple[Floats, Floats]:
 
 
 def pinhole(means_cam: Floats, camera: Camera) -> Floats:
-    """Pixel positions [N, 2] of points [N, 3] in the camera frame: ``p_k = f_k x_k / z + c_k`` for k = x, y."""
+    """Pixel positions of points: ``p_k = f_k x_k / z + c_k`` for k = x, y.
+
+    Parameters
+    ----------
+    means_cam : ndarray of shape (N, 3)
+        Camera frame, world units.
+    camera : Camera
+        Focal lengths and principal point.
+
+    Returns
+    -------
+    ndarray of shape (N, 2)
+        Pixels.
+    """
     focal = np.array([camera.fx, camera.fy], dtype=means_cam.dtype)
     center = np.array([camera.cx, camera.cy], dtype=means_cam.dtype)
     return focal * means_cam[:, :2] / means_cam[:, 2:] + center
 
 
 def pinhole_vjp(means_cam: Floats, camera: Camera, v_means2d: Floats) -> Floats:
-    """Gradient [N, 3] of :func:`pinhole`: ``v_x = J^T v_p`` with the Jacobian J of the pinhole, nowhere clamped."""
+    """Gradient of :func:`pinhole`: ``v_x = J^T v_p`` with its Jacobian J, nowhere clamped.
+
+    Parameters
+    ----------
+    means_cam, camera
+        As for the forward function.
+    v_means2d : ndarray of shape (N, 2)
+        Derivative by the pixel positions.
+
+    Returns
+    -------
+    ndarray of shape (N, 3)
+        Derivative by ``means_cam``.
+    """
     limits = np.full(2, np.inf, dtype=means_cam.dtype)
     return np.einsum("nki,nk->ni", pinhole_jacobians(means_cam, camera, -limits, limits), v_means2d)
 
 
 def pinhole_jacobians(means_cam: Floats, camera: Camera, low: Floats, high: Floats) -> Floats:
-    """Jacobians [N, 2, 3] of :func:`pinhole`, with the slopes x/z and y/z kept in [low, high].
+    """Jacobians of :func:`pinhole`, EWA splatting equation (29), with the slopes x/z and y/z kept in [low, high].
 
     ::
 
         u = clip((x, y) / z, low, high)
         J = [[f_x / z, 0, -f_x u_x / z], [0, f_y / z, -f_y u_y / z]]
+
+    Parameters
+    ----------
+    means_cam : ndarray of shape (N, 3)
+        Camera frame, world units.
+    camera : Camera
+        Focal lengths.
+    low, high : ndarray of shape (2,)
+        From :func:`slope_limits`.
+
+    Returns
+    -------
+    ndarray of shape (N, 2, 3)
+        Pixels per world unit.
     """
     focal = np.array([camera.fx, camera.fy], dtype=means_cam.dtype)
     z = means_cam[:, 2:]  # [N, 1]
@@ -46,13 +85,25 @@ def pinhole_jacobians(means_cam: Floats, camera: Camera, low: Floats, high: Floa
 
 
 def pinhole_jacobians_vjp(means_cam: Floats, camera: Camera, low: Floats, high: Floats, v_jacobians: Floats) -> Floats:
-    """Gradient [N, 3] of :func:`pinhole_jacobians` by the points.
+    """Gradient of :func:`pinhole_jacobians` by the points.
 
     Every entry is proportional to 1/z, and a slope that is not clamped depends on x and on z once more::
 
         v_u_k = -f_k / z V_k2          where low_k < x_k / z < high_k, else 0
         v_x_k = v_u_k / z
         v_z   = -<J, V> / z - sum_k v_u_k u_k / z
+
+    Parameters
+    ----------
+    means_cam, camera, low, high
+        As for the forward function.
+    v_jacobians : ndarray of shape (N, 2, 3)
+        V, derivative by the entries of J.
+
+    Returns
+    -------
+    ndarray of shape (N, 3)
+        Derivative by ``means_cam``.
     """
     focal = np.array([camera.fx, camera.fy], dtype=means_cam.dtype)
     z = means_cam[:, 2:]
@@ -64,10 +115,24 @@ def pinhole_jacobians_vjp(means_cam: Floats, camera: Camera, low: Floats, high: 
 
 
 def slope_limits(camera: Camera, conventions: Conventions, dtype: np.dtype) -> tuple[Floats, Floats]:
-    """Lowest and highest (x/z, y/z), each of shape (2,), up to which the Jacobian follows the mean.
+    """Lowest and highest (x/z, y/z) up to which the Jacobian follows the mean.
 
     Far outside the image the expansion is worthless and its 1/z^2 entry explodes, so the 3DGS code freezes the slope
     there. gsplat counts the margin from the image's edges, INRIA from the axis.
+
+    Parameters
+    ----------
+    camera : Camera
+        Intrinsics and size of the image.
+    conventions : Conventions
+        ``clamp_is_symmetric`` chooses the rule.
+    dtype : dtype
+        Of the results.
+
+    Returns
+    -------
+    low, high : ndarray of shape (2,)
+        Slopes, no unit.
     """
     focal, center = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
     size = np.array([camera.width, camera.height])

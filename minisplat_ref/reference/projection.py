@@ -1,13 +1,14 @@
 """Stage 2: a pinhole camera turns each 3D Gaussian into a 2D Gaussian on the image.
 
 A perspective map is not affine, so it is replaced by its first-order expansion at the mean: EWA splatting (Zwicker et
-al. 2002) equation (31), 3DGS equation (5), ``Sigma' = J W Sigma W^T J^T``. The low-pass is EWA's
-reconstruction filter with the 3DGS code's width. Left out: EWA's per-footprint normalisation (3DGS blends peaks).
+al. 2002) equation (31), 3DGS equation (5), ``Sigma' = J W Sigma W^T J^T``. Left out: EWA's normalisation of the
+footprint; in 3DGS the opacity is that of the peak.
 """
 
 import numpy as np
 
-from minisplat_ref.constants import COMPENSATION_FLOOR, Conventions
+from minisplat_ref.constants import Conventions
+from minisplat_ref.reference.antialiasing import adjugates, compensations, compensations_vjp, determinants
 from minisplat_ref.reference.covariance import covariances, covariances_vjp
 from minisplat_ref.reference.extent import extents
 from minisplat_ref.reference.pinhole import (
@@ -20,28 +21,6 @@ from minisplat_ref.reference.pinhole import (
     with_principal_point,
 )
 from minisplat_ref.types import Camera, Floats, PrimitiveGradient, Projection, ProjectionGradient
-
-
-def compensations(sharp: Floats, blurred: Floats) -> Floats:
-    """Opacity factors [N] that keep a Gaussian's total weight when the low-pass widens it (Mip-Splatting).
-
-    ``rho = sqrt(max(floor^2, det(C) / det(C + eps I)))`` for covariances C = ``sharp`` [N, 2, 2].
-    """
-    return np.sqrt(np.maximum(COMPENSATION_FLOOR**2, _det(sharp) / _det(blurred)))
-
-
-def compensations_vjp(sharp: Floats, blurred: Floats, v_compensations: Floats) -> Floats:
-    """Gradient [N, 2, 2] of :func:`compensations` by C; both of its arguments move with C.
-
-    With ``r = det(C) / det(B)``, ``B = C + eps I`` and ``d det(C) = <adj(C), dC>``::
-
-        v_r = v_rho / (2 rho)          where r is above the floor, else 0
-        v_C = v_r (adj(C) - r adj(B)) / det(B)
-    """
-    ratio = _det(sharp) / _det(blurred)
-    v_ratio = np.where(ratio > COMPENSATION_FLOOR**2, v_compensations / (2 * compensations(sharp, blurred)), 0)
-    v_dets = v_ratio / _det(blurred)
-    return v_dets[:, None, None] * (_adjugate(sharp) - ratio[:, None, None] * _adjugate(blurred))
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # non-finite rows are culled, not reported
@@ -79,8 +58,8 @@ def project(
     """
     camera = with_principal_point(camera, conventions)
     means_cam, *_, sharp, blurred = _expand(means, quats, scales, camera, conventions)
-    means2d, depths, det = pinhole(means_cam, camera), means_cam[:, 2], _det(blurred)
-    conics = _entries(_adjugate(blurred) / det[:, None, None])
+    means2d, depths, det = pinhole(means_cam, camera), means_cam[:, 2], determinants(blurred)
+    conics = _entries(adjugates(blurred) / det[:, None, None])
     if conventions.is_antialiased:
         opacities = opacities * compensations(sharp, blurred)
     radii, boxes = extents(means2d, blurred, opacities, camera, conventions)
@@ -115,7 +94,8 @@ def project_vjp(
     With ``V_Q = [[v_a, v_b / 2], [v_b / 2, v_c]]``, since b stands twice in Q::
 
         v_B = -Q V_Q Q
-        v_C = v_B + compensation's share;  v_rho = opacity v_opacity'
+        v_rho = o v_o',  v_o = rho v_o'                        (o' = rho o is the projection's opacity)
+        v_C = v_B + compensation's share of v_rho
         v_A = 2 v_C A Sigma,  v_Sigma = A^T v_C A              (v_C is symmetric)
         v_J = v_A R^T
         v_x = pinhole's share + J's share + (0, 0, v_depth)
@@ -143,7 +123,7 @@ def project_vjp(
     R, _ = pose(camera, means.dtype)
     low, high = slope_limits(camera, conventions, means.dtype)
 
-    Q = _adjugate(blurred) / _det(blurred)[:, None, None]
+    Q = adjugates(blurred) / determinants(blurred)[:, None, None]
     v_C = -Q @ _symmetric(v_conics * np.array([1, 0.5, 1], dtype=means.dtype)) @ Q
     if conventions.is_antialiased:
         v_C += compensations_vjp(sharp, blurred, opacities[rows] * v_opacities)
@@ -174,16 +154,6 @@ def _expand(
     A = J @ R
     sharp = A @ Sigma @ np.swapaxes(A, 1, 2)
     return means_cam, J, Sigma, A, sharp, sharp + conventions.eps2d * np.eye(2, dtype=means.dtype)
-
-
-def _det(matrices: Floats) -> Floats:
-    return matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] * matrices[:, 1, 0]
-
-
-def _adjugate(symmetric: Floats) -> Floats:
-    """``adj(C) = tr(C) I - C``, so that ``C adj(C) = det(C) I``; exists where the inverse does not."""
-    trace = np.trace(symmetric, axis1=1, axis2=2)[:, None, None]
-    return trace * np.eye(2, dtype=symmetric.dtype) - symmetric
 
 
 def _entries(symmetric: Floats) -> Floats:

@@ -1,0 +1,70 @@
+"""Stage 2b: what the low-pass does to a projected covariance, and how to undo its brightening.
+
+The 3DGS code adds ``eps I`` to every projected covariance C, so that no Gaussian is thinner than about a pixel; this is
+EWA splatting's prefilter. A Gaussian of unchanged opacity then covers more; Mip-Splatting's factor makes its integral
+what it was. Left out: Mip-Splatting's 3D smoothing filter.
+"""
+
+import numpy as np
+
+from minisplat_ref.constants import COMPENSATION_FLOOR
+from minisplat_ref.types import Floats
+
+
+def compensations(sharp: Floats, blurred: Floats) -> Floats:
+    """Opacity factors that keep a Gaussian's integral when the low-pass widens it.
+
+    With covariances C and ``B = C + eps I``::
+
+        rho = sqrt(max(floor^2, det(C) / det(B)))
+
+    Parameters
+    ----------
+    sharp : ndarray of shape (N, 2, 2)
+        C, px^2.
+    blurred : ndarray of shape (N, 2, 2)
+        B, px^2.
+
+    Returns
+    -------
+    ndarray of shape (N,)
+        rho, at most 1.
+    """
+    return np.sqrt(np.maximum(COMPENSATION_FLOOR**2, determinants(sharp) / determinants(blurred)))
+
+
+def compensations_vjp(sharp: Floats, blurred: Floats, v_compensations: Floats) -> Floats:
+    """Gradient of :func:`compensations` by C; both of its arguments move with C.
+
+    With ``r = det(C) / det(B)`` and ``d det(C) = <adj(C), dC>``::
+
+        v_r = v_rho / (2 rho)          where r is above the floor, else 0
+        v_C = v_r (adj(C) - r adj(B)) / det(B)
+
+    Parameters
+    ----------
+    sharp, blurred : ndarray of shape (N, 2, 2)
+        As for the forward function.
+    v_compensations : ndarray of shape (N,)
+        Derivative by rho.
+
+    Returns
+    -------
+    ndarray of shape (N, 2, 2)
+        Derivative by the four entries of C; symmetric.
+    """
+    ratios = determinants(sharp) / determinants(blurred)
+    v_ratios = np.where(ratios > COMPENSATION_FLOOR**2, v_compensations / (2 * compensations(sharp, blurred)), 0)
+    v_dets = v_ratios / determinants(blurred)
+    return v_dets[:, None, None] * (adjugates(sharp) - ratios[:, None, None] * adjugates(blurred))
+
+
+def determinants(matrices: Floats) -> Floats:
+    """Determinants [N] of matrices [N, 2, 2]."""
+    return matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] * matrices[:, 1, 0]
+
+
+def adjugates(matrices: Floats) -> Floats:
+    """[[d, -b], [-c, a]] of [[a, b], [c, d]]: ``adj(C) C = det(C) I``, which exists where the inverse does not."""
+    signs = np.array([[1, -1], [-1, 1]], dtype=matrices.dtype)
+    return signs * matrices[:, ::-1, ::-1].swapaxes(1, 2)
