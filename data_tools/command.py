@@ -1,10 +1,12 @@
-"""What the data tools have in common on the command line: bad input is one line and exit code 2."""
+"""What the data tools have in common: bad input is one line and exit code 2, and pycolmap is quiet."""
 
 import argparse
 import sys
 from collections.abc import Callable, Sequence
+from types import ModuleType
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.io.lens import import_pycolmap
 
 
 def run_command(
@@ -36,3 +38,10 @@ def run_command(
         print("interrupted, nothing was written", file=sys.stderr)
         return 130
     return 0
+
+
+def import_quiet_pycolmap() -> ModuleType:
+    """Import pycolmap without its log on stderr: what goes wrong comes as an exception or an empty result."""
+    pycolmap = import_pycolmap()
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL
+    return pycolmap

@@ -52,7 +52,7 @@ def downscale_images(images: Path, factor: int) -> Path:
     files = list_images(images)
     target = images.with_name(f"{images.name}_{factor}")
     with making_folder(target) as folder:
-        for file in tqdm(files, desc=target.name, unit=" images", leave=False):
+        for file in tqdm(files, desc=target.name, unit=" images", leave=False, disable=None):
             image = read_image(file)
             small = folder / file.relative_to(images)
             small.parent.mkdir(parents=True, exist_ok=True)

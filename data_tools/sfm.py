@@ -16,13 +16,12 @@ from typing import Any, NamedTuple
 from PIL import ExifTags, Image, ImageOps
 from tqdm import tqdm
 
-from data_tools.command import run_command
+from data_tools.command import import_quiet_pycolmap, run_command
 from data_tools.downscale import list_images
 from data_tools.undistort import undistort_model
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.images import SAVE_OPTIONS, open_image
-from minisplat_ref.io.lens import import_pycolmap
 
 CAMERA_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")
 MATCHINGS = ("exhaustive", "sequential")
@@ -92,7 +91,7 @@ def run_sfm(
 def prepare_photos(files: Sequence[Path], photos: Path, target: Path, long_side: int) -> dict[str, tuple[int, int]]:
     """Copy photographs upright and shrunk; return the size of each by its new name, relative to ``target``."""
     sizes: dict[str, tuple[int, int]] = {}
-    for file in tqdm(files, desc="photographs", unit=" images", leave=False):
+    for file in tqdm(files, desc="photographs", unit=" images", leave=False, disable=None):
         relative = file.relative_to(photos)
         name = relative.with_suffix(".png" if relative.suffix.lower() == ".png" else ".jpg").as_posix()
         if name in sizes:
@@ -118,14 +117,13 @@ def _focal_exif(image: Image.Image) -> Image.Exif:
 
 def _reconstruct(work: Path, sizes: dict[str, tuple[int, int]], matching: str, camera_model: str, photos: Path) -> Any:
     """Features, matches, and the largest model of incremental mapping, a ``pycolmap.Reconstruction``."""
-    pycolmap = import_pycolmap()
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR
+    pycolmap = import_quiet_pycolmap()
     pycolmap.set_random_seed(SEED)
     database, images = work / "database.db", work / "images"
     mode = pycolmap.CameraMode.SINGLE if len(set(sizes.values())) == 1 else pycolmap.CameraMode.PER_IMAGE
     reader = pycolmap.ImageReaderOptions(camera_model=camera_model)
     cpu = pycolmap.Device.cpu
-    with tqdm(total=3, desc="features", unit=" steps", leave=False) as bar:
+    with tqdm(total=3, desc="features", unit=" steps", leave=False, disable=None) as bar:
         pycolmap.extract_features(database, images, camera_mode=mode, reader_options=reader, device=cpu)
         bar.update()
         bar.set_description("matches")

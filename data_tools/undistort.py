@@ -17,12 +17,11 @@ from typing import Any
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from data_tools.command import run_command
+from data_tools.command import import_quiet_pycolmap, run_command
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.colmap import colmap_photos, find_model, read_model
 from minisplat_ref.io.images import SAVE_OPTIONS, write_image
-from minisplat_ref.io.lens import import_pycolmap
 from minisplat_ref.io.scene import Photo, build_reading, check_photo, read_view
 from minisplat_ref.io.transforms import existing_frames, find_points, find_transforms, read_transforms
 from minisplat_ref.types import Camera
@@ -63,7 +62,7 @@ def undistort_scene(scene: Path, out: Path) -> None:
 
 def undistort_model(model: Path, images: Path, out: Path) -> None:
     """Undistort a COLMAP model and its images into ``out/images`` and ``out/sparse/0``; ``out`` must exist."""
-    pycolmap = import_pycolmap()
+    pycolmap = import_quiet_pycolmap()
     with tempfile.TemporaryDirectory(dir=out) as temporary:
         quality = SAVE_OPTIONS["JPEG"]["quality"]
         pycolmap.undistort_images(temporary, str(model), str(images), jpeg_quality=quality)
@@ -78,7 +77,7 @@ def _undistort_colmap(scene: Path, model: Path, folder: Path) -> None:
     _check_distorted(scene, photos)
     undistort_model(model, scene / "images", folder)
     reading = build_reading(1, None, undistort=True, alpha_is_mask=True)
-    for photo in tqdm(photos, desc="masks", unit=" images", leave=False):
+    for photo in tqdm(photos, desc="masks", unit=" images", leave=False, disable=None):
         mask = read_view(photo, photo.file, reading).mask
         if mask is not None:
             _write(folder / "masks" / f"{photo.file}.png", mask)
@@ -91,7 +90,7 @@ def _undistort_transforms(file: Path, folder: Path) -> None:
     _check_distorted(file, [photo for _, photo in pairs])
     reading = build_reading(1, None, undistort=True, alpha_is_mask=False)
     frames = []
-    for frame, photo in tqdm(pairs, desc="images", unit=" images", leave=False):
+    for frame, photo in tqdm(pairs, desc="images", unit=" images", leave=False, disable=None):
         is_below = photo.path.is_relative_to(file.parent)
         name = photo.path.relative_to(file.parent) if is_below else Path("images", photo.file)
         view = read_view(photo, photo.file, reading)

@@ -62,13 +62,13 @@ SPLAT_BYTE = 1.0
 # .splat files hold exp(log_scale) in float32: the exponential of a float32 that is rounded once more.
 SPLAT_SCALE = 1e-6
 
-# COLMAP text files print 17 digits, but a quaternion is normalised when it is read: roundings of 1e-16 on values up to 10.
+# COLMAP text files print 17 digits, but a quaternion is normalised when it is read: 1e-16 on values up to 10.
 CAMERA_TEXT = 1e-12
 
 # scene_info.json of the real scenes rounds to 4 to 6 decimals.
 SCENE_INFO = 6e-5
 
-# Bilinear interpolation of 8-bit levels: half a level of rounding twice, and the curvature of the distortion in a pixel.
+# Bilinear interpolation of 8-bit levels: half a level of rounding twice, and the distortion's curvature in a pixel.
 UNDISTORTED_LEVELS = 1.5
 
 # The same cameras written as quaternions and as matrices, with 16 digits each.

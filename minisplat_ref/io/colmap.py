@@ -5,9 +5,10 @@ are where COLMAP looks for them (``masks/<file>.png``, as in ``0001.jpg.png``) o
 channel is a mask too. Left out: 2D features, tracks, and images that COLMAP could not register.
 """
 
+import struct
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,26 @@ from minisplat_ref.io.scene import Photo, build_reading, build_scene, split_phot
 from minisplat_ref.types import Camera, Floats, Scene
 
 MODEL_FOLDERS = ("sparse/0", "sparse")
+
+
+class Records(NamedTuple):
+    """Layout of a binary file of COLMAP: a count of records, each fixed bytes, a name, and a counted list of items."""
+
+    n_fixed: int
+    """Bytes before the name or the count."""
+    has_name: bool
+    """Whether a zero-terminated name follows."""
+    count_format: str
+    """Of the number of items, for :mod:`struct`."""
+    n_item: int
+    """Bytes of an item."""
+
+
+BINARY_RECORDS = {
+    "images.bin": Records(n_fixed=64, has_name=True, count_format="<Q", n_item=24),
+    "points3D.bin": Records(n_fixed=43, has_name=False, count_format="<Q", n_item=8),
+    "frames.bin": Records(n_fixed=64, has_name=False, count_format="<I", n_item=16),
+}
 DAMAGE_ERRORS = (
     ValueError,
     IndexError,
@@ -82,14 +103,22 @@ def read_model(path: Path) -> Any:
             f"{path}: no COLMAP model, looked for cameras.bin or cameras.txt in {' and '.join(MODEL_FOLDERS)};"
             f" to make one from photographs run `python -m data_tools.sfm PHOTOS --out {path}`"
         )
+    is_binary = (model / "cameras.bin").is_file()
+    if is_binary:
+        for name, layout in BINARY_RECORDS.items():
+            if (model / name).is_file():
+                _check_records(model / name, layout)
     pycolmap = import_pycolmap()
     try:
         reconstruction = pycolmap.Reconstruction(str(model))
     except DAMAGE_ERRORS as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{model}: damaged or incomplete COLMAP model ({reason}); copy or export it again") from None
-    if (model / "cameras.bin").is_file():
-        _check_complete(model, reconstruction)
+    if is_binary:
+        size = 8 + sum(24 + 8 * len(camera.params) for camera in reconstruction.cameras.values())
+        found = (model / "cameras.bin").stat().st_size
+        if found < size:  # which pycolmap does not notice
+            raise InputError(f"{model / 'cameras.bin'}: truncated, {found} of {size} bytes; copy or export it again")
     return reconstruction
 
 
@@ -107,6 +136,11 @@ def _photo(path: Path, folder: Path, image: Any) -> Photo:
     candidates = (masks / f"{image.name}.png", (masks / image.name).with_suffix(".png"))
     pose = image.cam_from_world().matrix()  # [3, 4]
     model = image.camera
+    if len(model.focal_length_idxs()) == 0:  # asking it for a focal length would abort the process
+        raise InputError(
+            f"{path}: {image.name} has camera model {model.model.name}, a panorama, of which there is no pinhole view;"
+            " cut pinhole views out of it and run COLMAP on those"
+        )
     camera = Camera(
         cam_from_world_R=np.ascontiguousarray(pose[:, :3]),
         cam_from_world_t=np.ascontiguousarray(pose[:, 3]),
@@ -134,17 +168,18 @@ def _points(reconstruction: Any) -> tuple[Floats, NDArray[np.uint8]]:
     return positions, np.array([point.color for point in points], np.uint8).reshape(-1, 3)
 
 
-def _check_complete(model: Path, reconstruction: Any) -> None:
-    """Compare file sizes with what was read: pycolmap does not notice a cameras.bin that is cut short."""
-    cameras, images = reconstruction.cameras.values(), reconstruction.images.values()
-    expected = {
-        "cameras.bin": 8 + sum(24 + 8 * len(camera.params) for camera in cameras),
-        "images.bin": 8 + sum(73 + len(image.name.encode()) + 24 * image.num_points2D() for image in images),
-        "points3D.bin": 8 + sum(51 + 8 * point.track.length() for point in reconstruction.points3D.values()),
-    }
-    for name, size in expected.items():
-        found = (model / name).stat().st_size
-        if found < size:
-            raise InputError(
-                f"{model / name}: truncated, {size} bytes expected, {found} found; copy or export it again"
-            )
+def _check_records(file: Path, layout: Records) -> None:
+    """Walk over the records of a binary file before pycolmap does: it takes what is not there for counts, and hangs."""
+    content = file.read_bytes()
+    offset = 8
+    try:
+        for _ in range(struct.unpack_from("<Q", content)[0]):
+            offset += layout.n_fixed
+            if layout.has_name:
+                offset = content.index(b"\0", offset) + 1
+            (n_items,) = struct.unpack_from(layout.count_format, content, offset)
+            offset += struct.calcsize(layout.count_format) + n_items * layout.n_item
+    except (struct.error, ValueError):
+        offset = len(content) + 1
+    if offset > len(content):
+        raise InputError(f"{file}: truncated at {len(content)} bytes; copy or export it again")

@@ -63,11 +63,6 @@ def undistort(
     -------
     tuple
         Image [H', W', 3], mask [H', W'] or None, and the pinhole camera, of which H' and W' may differ from H and W.
-
-    Raises
-    ------
-    InputError
-        If no pinhole can show what the lens shows (a panorama).
     """
     pycolmap = import_pycolmap()
     distorted = pycolmap.Camera(model=lens.model, width=camera.width, height=camera.height, params=lens.params)
