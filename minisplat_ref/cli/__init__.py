@@ -27,7 +27,9 @@ measure it, and check every formula against a reference that can be read.
 First time here:   minisplat-ref demo
 Your own photos:   minisplat-ref train SCENE --out runs/mine
 """
-EPILOG = "minisplat-ref COMMAND --help explains a command. Exit codes: 0 done, 2 bad input, 130 interrupted."
+EPILOG = """\
+minisplat-ref COMMAND --help explains a command.
+Exit codes: 0 done, 2 bad input, 130 interrupted."""
 
 
 class Parser(argparse.ArgumentParser):

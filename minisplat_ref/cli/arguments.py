@@ -1,18 +1,21 @@
 """What the commands' arguments share: the look of the help, and the types of values."""
 
 import argparse
+import shutil
 from collections.abc import Callable
 
 from minisplat_ref.constants import GSPLAT_MAIN, PROFILES
 
 Commands = argparse._SubParsersAction
 
+BACKENDS = ("cpu", "cpu-exact", "reference")  # keys of backends.BACKENDS, which would load Numba
+
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):
-    """Keeps the line breaks of descriptions and leaves the options room in a terminal of 100 columns."""
+    """Keeps the line breaks of descriptions, which are 80 columns wide at most, and uses up to 100 for options."""
 
     def __init__(self, prog: str) -> None:
-        super().__init__(prog, max_help_position=26, width=100)
+        super().__init__(prog, max_help_position=26, width=min(100, shutil.get_terminal_size().columns))
 
 
 def integer(minimum: int) -> Callable[[str], int]:
@@ -51,8 +54,8 @@ def add_renderer_arguments(parser: argparse._ActionsContainer, default: str | No
     )
     parser.add_argument(
         "--backend",
-        choices=("cpu", "reference"),
+        choices=BACKENDS,
         default=default,
         metavar="NAME",
-        help=f"cpu (Numba) or reference (NumPy, slow) (default {whose}cpu)",
+        help=f"cpu (Numba), cpu-exact (libm's exp) or reference (NumPy) (default {whose}cpu)",
     )

@@ -6,6 +6,7 @@ import os
 import platform
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -67,8 +68,7 @@ def run(args: argparse.Namespace) -> int:
     start = time.perf_counter()
     folder = args.out or _first_free(Path(DEFAULT_OUT))
     run_folder.check_free(folder)
-    with tqdm(desc="ray-tracing photographs", unit="view", leave=False) as bar:
-        synthetic = make_scene("room", **SCENE, on_view=bar.update)
+    synthetic = make_scene("room", **SCENE, progress=partial(tqdm, desc="ray-tracing", unit="view"))
     write_scene(synthetic, folder / "scene", {"scene": "room", **SCENE})
     settings = Settings(
         scene=str((folder / "scene").resolve()),

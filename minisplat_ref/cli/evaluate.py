@@ -9,9 +9,10 @@ from minisplat_ref.errors import InputError
 DESCRIPTION = """\
 Measure a run on its test views: PSNR and SSIM of point_cloud.ply, view by view.
 
-Rewrites DIR/metrics.json and DIR/renders/ (truth | render | error side by side). Pictures are compared
-as floats clipped to [0, 1]; SSIM has an 11 x 11 window with zero padding. Means over views are means of
-the views' values. LPIPS is null: its network's weights do not come with this program.
+Rewrites DIR/metrics.json and DIR/renders/ (truth | render | error). Renders
+are clipped to [0, 1] and not rounded; SSIM has an 11 x 11 window and zero
+padding; what stands for all views is the mean of theirs. LPIPS is null: the
+weights of its network do not come with this program.
 """
 
 

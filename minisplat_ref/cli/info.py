@@ -11,17 +11,19 @@ from minisplat_ref.errors import InputError
 if TYPE_CHECKING:
     from minisplat_ref.types import Floats, Gaussians
 
+NOT_SHOWN = ("per_view", "n_gaussians", "iterations")  # of metrics.json: too long, or said by the PLY or checkpoint
+
 Rows = list[tuple[str, str]]
 
 DESCRIPTION = """\
-Say what is in a file or folder: counts, spherical-harmonics degree, bounds, sizes.
+Say what is in a file or folder: counts, SH degree, bounds, sizes.
 
   point_cloud.ply   Gaussians in the 3DGS layout, whoever wrote them
   checkpoint.npz    a training that can be continued
   run folder        the --out of a training: settings, measures and Gaussians
-  scene folder      COLMAP (images/, sparse/0/) or transforms.json: views, points, cameras
+  scene folder      COLMAP (images/, sparse/0/) or transforms.json
 
-Everything is read and checked: what is damaged is named, with what is wrong (exit code 2).
+Everything is read and checked; of damaged input it says what is wrong.
 """
 EPILOG = """\
 examples:
@@ -69,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
 def _ply_rows(path: Path) -> Rows:
     from minisplat_ref.io import load_ply
 
-    return [("size", _size(path)), *_gaussian_rows(load_ply(path))]
+    return [("PLY", _size(path)), *_gaussian_rows(load_ply(path))]
 
 
 def _checkpoint_rows(path: Path) -> Rows:
@@ -86,19 +88,19 @@ def _checkpoint_rows(path: Path) -> Rows:
         ]
     except (KeyError, TypeError) as error:
         raise InputError(f"{path} is not the checkpoint of a training: it lacks {error}") from error
-    return [("size", _size(path)), *rows, *_gaussian_rows(gaussians)]
+    return [("checkpoint", _size(path)), *rows, *_gaussian_rows(gaussians)]
 
 
 def _run_rows(folder: Path) -> Rows:
-    from minisplat_ref.cli.run_folder import METRICS, POINT_CLOUD, read_json_object
+    from minisplat_ref.cli.run_folder import CHECKPOINT, METRICS, read_json_object
     from minisplat_ref.cli.settings import load
 
     rows = [(name.replace("_", " "), str(value)) for name, value in load(folder)._asdict().items()]
     if (folder / METRICS).exists():
         metrics = read_json_object(folder / METRICS)
-        rows += [(name.replace("_", " "), _short(value)) for name, value in metrics.items() if name != "per_view"]
-    if (folder / POINT_CLOUD).exists():
-        rows += _ply_rows(folder / POINT_CLOUD)
+        rows += [(name.replace("_", " "), _short(metrics[name])) for name in metrics if name not in NOT_SHOWN]
+    if (folder / CHECKPOINT).exists():
+        rows += _checkpoint_rows(folder / CHECKPOINT)
     return rows
 
 

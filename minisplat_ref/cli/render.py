@@ -15,19 +15,20 @@ if TYPE_CHECKING:
     from minisplat_ref.types import Floats, Gaussians
 
 DESCRIPTION = """\
-Render a run (its --out folder) or a PLY of Gaussians, from whoever wrote it, to PNG pictures.
+Render a run (its --out folder), or a PLY of Gaussians from whoever wrote it.
 
 Cameras, by --cameras:
   test, train, all   those of the run (default test)
-  orbit              a circle around the scene (the only choice, and the default, for a bare PLY)
-  FILE.json          a list of cameras in the layout of 3DGS's cameras.json: img_name, width, height,
-                     position, rotation (3 x 3, world_from_camera), fx, fy, and optionally cx, cy
+  orbit              a circle around the scene (default for a PLY)
+  FILE.json          list of cameras, as in the cameras.json of 3DGS: img_name,
+                     width, height, position, rotation (world_from_camera),
+                     fx, fy and, if the principal point is off centre, cx, cy
 """
 EPILOG = """\
 examples:
   minisplat-ref render runs/fox
   minisplat-ref render runs/fox --cameras orbit --frames 120 --depth
-  minisplat-ref render point_cloud.ply --size 640x360 --profile INRIA --out pictures
+  minisplat-ref render point_cloud.ply --size 640x360 --profile INRIA
 """
 RUN_CAMERAS = ("test", "train", "all")
 ORBIT_SIZE = (640, 480)  # pixels, where no run says otherwise

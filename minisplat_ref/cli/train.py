@@ -27,16 +27,17 @@ DEFAULTS = {
 }
 
 DESCRIPTION = """\
-Train Gaussians on photographs with cameras and leave in DIR: point_cloud.ply, metrics.json, renders/
-(truth | render | error of each test view), config.json, log.jsonl, cameras.json, checkpoint.npz.
+Train Gaussians on photographs with cameras. DIR will hold point_cloud.ply,
+metrics.json, renders/ (truth | render | error of each test view), config.json,
+log.jsonl, cameras.json and checkpoint.npz.
 
-Ctrl-C saves what there is. --resume DIR continues with the run's own settings; --iterations then says
-where to stop, while schedule and density control stay those of the first start.
+Ctrl-C saves what there is. --resume continues with the run's own settings;
+--iterations then says where to stop, and all schedules stay as they were.
 """
 EPILOG = """\
 examples:
   minisplat-ref train photos/fox --out runs/fox
-  minisplat-ref train photos/garden --downscale 4 --iterations 7000 --out runs/garden
+  minisplat-ref train garden --downscale 4 --iterations 7000 --out runs/garden
   minisplat-ref train --resume runs/fox --iterations 4000
 """
 
@@ -127,9 +128,11 @@ def _resume(folder: Path, given: dict[str, Any]) -> int:
 
 
 def _train(folder: Path, scene: "Scene", settings: "Settings", recipe: "Recipe", state: "TrainState") -> int:
+    from minisplat_ref.cli import run_folder
     from minisplat_ref.cli.scoring import summary
     from minisplat_ref.cli.training import run_training
 
+    run_folder.create(folder)
     size = scene.train_views[0].camera
     print(
         f"{scene.name}: {len(scene.train_views)} training and {len(scene.test_views)} test views of"

@@ -39,7 +39,7 @@ def run_training(folder: Path, scene: Scene, settings: Settings, recipe: Recipe,
     Parameters
     ----------
     folder : Path
-        The run; made if it does not exist.
+        The run; exists.
     scene : Scene
         The loaded scene.
     settings : Settings
@@ -53,7 +53,6 @@ def run_training(folder: Path, scene: Scene, settings: Settings, recipe: Recipe,
     -------
     Outcome
     """
-    run_folder.create(folder)
     run_folder.write_json(folder / run_folder.CONFIG, to_config(settings, recipe, scene))
     run_folder.write_json(folder / run_folder.CAMERAS, viewpoints.to_json(viewpoints.scene_viewpoints(scene)))
     progress = Progress(folder / run_folder.LOG, state.step, settings.iterations)
