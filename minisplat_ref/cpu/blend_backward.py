@@ -18,10 +18,19 @@ from collections.abc import Callable
 
 import numpy as np
 
+from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.cpu.tile_state import (
     BEHIND,
     CHANNELS,
     CHECK_EVERY,
+    COLOR,
+    CONIC_A,
+    CONIC_B,
+    CONIC_C,
+    MEAN_X,
+    MEAN_Y,
+    N_FUSED,
+    OPACITY,
     PIXELS,
     SHADE,
     TILE_WIDTH,
@@ -29,6 +38,7 @@ from minisplat_ref.cpu.tile_state import (
     T,
     X,
     Y,
+    fused_colors,
     is_finished,
     pixel_run,
     start_tile,
@@ -41,11 +51,10 @@ N_MOMENTS = 6  # sums of q, q dx, q dy, q dx^2, q dx dy, q dy^2
 
 
 @scalar
-def _sum_slots(n, slots, offsets, projection, out):
-    """Gradient of one Gaussian from the moments in its slots."""
-    first, last = offsets[n], offsets[n + 1]
-    total = np.zeros(slots.shape[1], slots.dtype)
-    for slot in range(first, last):
+def _sum_slots(n, slots, offsets, projection, total, out):
+    """Gradient of one Gaussian from the moments in its slots; ``total`` is scratch."""
+    total[:] = ZERO
+    for slot in range(offsets[n], offsets[n + 1]):
         for j in range(total.size):
             total[j] += slots[slot, j]
     a, b, c = projection.conics[n, 0], projection.conics[n, 1], projection.conics[n, 2]
@@ -62,9 +71,12 @@ def _sum_slots(n, slots, offsets, projection, out):
 @kernel()
 def sum_slots(slots, offsets, projection, out):
     """Gradients of all Gaussians; those without a pair keep their zeros."""
-    for n in prange(offsets.size - 1):
-        if offsets[n] < offsets[n + 1]:
-            _sum_slots(n, slots, offsets, projection, out)
+    n_gaussians = offsets.size - 1
+    for chunk in prange(N_CHUNKS):
+        total = np.empty(slots.shape[1], slots.dtype)
+        for n in range(n_gaussians * chunk // N_CHUNKS, n_gaussians * (chunk + 1) // N_CHUNKS):
+            if offsets[n] < offsets[n + 1]:
+                _sum_slots(n, slots, offsets, projection, total, out)
 
 
 @functools.cache
@@ -83,26 +95,30 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
             state[BEHIND + i] = behind
 
     @scalar
-    def hit_vjp(s, n_pixels, n, projection, color, frame, sums):
-        mx, my = projection.means2d[n, 0], projection.means2d[n, 1]
-        a, b, c = projection.conics[n, 0], projection.conics[n, 1], projection.conics[n, 2]
-        opacity = projection.opacities[n]
-        for i in range(n_pixels):
-            s[SHADE + i] = ZERO
-        for k in range(n_channels):
-            value = color[k]
+    def hit_vjp(s, n_pixels, record, frame, sums):
+        mx, my, opacity = record[MEAN_X], record[MEAN_Y], record[OPACITY]
+        a, b, c = record[CONIC_A], record[CONIC_B], record[CONIC_C]
+        color = fused_colors(record, n_channels)
+        if n_channels > N_FUSED:
+            s[SHADE : SHADE + n_pixels] = ZERO
+        for k in range(N_FUSED, n_channels):
+            value = record[COLOR + k]
             for i in range(n_pixels):
                 s[SHADE + i] += s[CHANNELS + k * PIXELS + i] * value
-        q_sum = qx = qy = qxx = qxy = qyy = ZERO * a
+        q_sum = qx = qy = qxx = qxy = qyy = v_red = v_green = v_blue = ZERO * a
         for i in range(n_pixels):
             dx = mx - s[X + i]
             dy = my - s[Y + i]
             sigma = mahalanobis(dx, dy, a, b, c)
             unclamped = opacity * exp(-sigma)
             transmittance = s[T + i]
-            after, weight = blend(transmittance, sigma, unclamped, frame)
-            behind = s[BEHIND + i] - weight * s[SHADE + i]
-            q = -unclamped * alpha_vjp(transmittance, weight, unclamped, behind, s[SHADE + i], frame)
+            s[T + i], weight = blend(transmittance, sigma, unclamped, frame)
+            s[WEIGHT + i] = weight
+            v_0, v_1, v_2 = s[CHANNELS + i], s[CHANNELS + PIXELS + i], s[CHANNELS + 2 * PIXELS + i]
+            shade = s[SHADE + i] + v_0 * color[0] + v_1 * color[1] + v_2 * color[2]
+            behind = s[BEHIND + i] - weight * shade
+            s[BEHIND + i] = behind
+            q = -unclamped * alpha_vjp(transmittance, weight, unclamped, behind, shade, frame)
             q_mean = q if unclamped <= frame.mean_gradient_max else ZERO * q
             q_shape = q if unclamped <= frame.shape_gradient_max else ZERO * q
             q_sum += q_shape
@@ -111,34 +127,41 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
             qxx += q_shape * dx * dx
             qxy += q_shape * dx * dy
             qyy += q_shape * dy * dy
-            s[T + i] = after
-            s[BEHIND + i] = behind
-            s[WEIGHT + i] = weight
+            v_red += weight * v_0
+            v_green += weight * v_1
+            v_blue += weight * v_2
         sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = q_sum, qx, qy, qxx, qxy, qyy
-        for k in range(n_channels):
+        fused = (v_red, v_green, v_blue)
+        for k in range(min(n_channels, N_FUSED)):
+            sums[N_MOMENTS + k] = fused[k]
+        for k in range(N_FUSED, n_channels):
             total = ZERO * a
             for i in range(n_pixels):
                 total += s[WEIGHT + i] * s[CHANNELS + k * PIXELS + i]
             sums[N_MOMENTS + k] = total
 
+    @scalar
+    def tile_vjp(state, tile, records, offsets, ids, places, frame, y0, slots):
+        is_over = False
+        for m in range(offsets[tile], offsets[tile + 1]):
+            is_over = is_over or (m % CHECK_EVERY == 0 and is_finished(state))
+            if is_over:
+                slots[places[m]] = ZERO
+                continue
+            record = records[ids[m]]
+            first, n_pixels = pixel_run(record, y0)
+            hit_vjp(state[first:], n_pixels, record, frame, slots[places[m]])
+
     @kernel(REASSOCIATE)
     def composite_tiles_vjp(
-        projection, colors, offsets, ids, places, tiles, n_threads, frame, image, alpha, v_image, v_alpha, slots
+        records, offsets, ids, places, ranges, n_threads, frame, image, alpha, v_image, v_alpha, slots
     ):
         for thread in prange(n_threads):
-            state = np.zeros(CHANNELS + n_channels * PIXELS, image.dtype)
-            for turn in range(thread, tiles.size, n_threads):
-                tile = tiles[turn]
-                x0, y0 = start_tile(state, tile, frame)
-                start(state, x0, y0, frame, image, alpha, v_image, v_alpha)
-                finished = False
-                for m in range(offsets[tile], offsets[tile + 1]):
-                    finished = finished or (m % CHECK_EVERY == 0 and is_finished(state))
-                    if finished:
-                        slots[places[m]] = ZERO
-                        continue
-                    n = ids[m]
-                    first, n_pixels = pixel_run(projection.boxes, n, y0)
-                    hit_vjp(state[first:], n_pixels, n, projection, colors[n], frame, slots[places[m]])
+            state = np.zeros(CHANNELS + max(n_channels, N_FUSED) * PIXELS, image.dtype)
+            for turn in range(thread, ranges.size - 1, n_threads):
+                for tile in range(ranges[turn], ranges[turn + 1]):
+                    x0, y0 = start_tile(state, tile, frame)
+                    start(state, x0, y0, frame, image, alpha, v_image, v_alpha)
+                    tile_vjp(state, tile, records, offsets, ids, places, frame, y0, slots)
 
     return composite_tiles_vjp

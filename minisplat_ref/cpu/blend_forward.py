@@ -13,12 +13,21 @@ from minisplat_ref.constants import MEDIAN_TRANSMITTANCE
 from minisplat_ref.cpu.tile_state import (
     CHANNELS,
     CHECK_EVERY,
+    COLOR,
+    CONIC_A,
+    CONIC_B,
+    CONIC_C,
+    MEAN_X,
+    MEAN_Y,
+    N_FUSED,
+    OPACITY,
     PIXELS,
     TILE_WIDTH,
     WEIGHT,
     T,
     X,
     Y,
+    fused_colors,
     is_finished,
     pixel_run,
     start_tile,
@@ -32,7 +41,7 @@ MEDIAN = np.float32(MEDIAN_TRANSMITTANCE)  # one half: exact in float32
 
 @scalar
 def _collect(s, n_pixels, n, depth, best, best_ids, median):
-    """Statistics of the hit whose weights stand in the state: its weight sum and hit count, and the pixels' records."""
+    """Statistics of the hit whose weights stand in the state: its weight sum and hit count, and the pixels' maxima."""
     weight_sum = ZERO
     hit_count = 0
     for i in range(n_pixels):
@@ -53,15 +62,19 @@ def forward_kernel(exp: Callable, n_channels: int) -> Callable:
     """Compile the forward kernel for an exponential and a number of channels."""
 
     @scalar
-    def blend_hit(s, n_pixels, n, projection, color, frame):
-        mx, my = projection.means2d[n, 0], projection.means2d[n, 1]
-        a, b, c = projection.conics[n, 0], projection.conics[n, 1], projection.conics[n, 2]
-        opacity = projection.opacities[n]
+    def blend_hit(s, n_pixels, record, frame):
+        mx, my, opacity = record[MEAN_X], record[MEAN_Y], record[OPACITY]
+        a, b, c = record[CONIC_A], record[CONIC_B], record[CONIC_C]
+        color = fused_colors(record, n_channels)
         for i in range(n_pixels):
             sigma = mahalanobis(mx - s[X + i], my - s[Y + i], a, b, c)
-            s[T + i], s[WEIGHT + i] = blend(s[T + i], sigma, opacity * exp(-sigma), frame)
-        for k in range(n_channels):
-            value = color[k]
+            s[T + i], weight = blend(s[T + i], sigma, opacity * exp(-sigma), frame)
+            s[WEIGHT + i] = weight
+            s[CHANNELS + i] += weight * color[0]
+            s[CHANNELS + PIXELS + i] += weight * color[1]
+            s[CHANNELS + 2 * PIXELS + i] += weight * color[2]
+        for k in range(N_FUSED, n_channels):
+            value = record[COLOR + k]
             for i in range(n_pixels):
                 s[CHANNELS + k * PIXELS + i] += s[WEIGHT + i] * value
 
@@ -77,7 +90,7 @@ def forward_kernel(exp: Callable, n_channels: int) -> Callable:
                     image[y, x, k] = state[CHANNELS + k * PIXELS + i] + left * background[k]
 
     @scalar
-    def store_records(x0, y0, frame, median, best_ids, median_depth, dominant_ids):
+    def store_stats(x0, y0, frame, median, best_ids, median_depth, dominant_ids):
         for i in range(PIXELS):
             x = x0 + i % TILE_WIDTH
             y = y0 + i // TILE_WIDTH
@@ -85,41 +98,43 @@ def forward_kernel(exp: Callable, n_channels: int) -> Callable:
                 median_depth[y, x] = median[i]
                 dominant_ids[y, x] = best_ids[i]
 
+    @scalar
+    def blend_tile(state, tile, records, depths, offsets, ids, frame, y0, pixel_stats, pair_stats):
+        best, best_ids, median = pixel_stats
+        weight_sums, hit_counts = pair_stats
+        for m in range(offsets[tile], offsets[tile + 1]):
+            if m % CHECK_EVERY == 0 and is_finished(state):
+                break
+            record = records[ids[m]]
+            start, n_pixels = pixel_run(record, y0)
+            blend_hit(state[start:], n_pixels, record, frame)
+            if weight_sums.size > 0:
+                weight_sums[m], hit_counts[m] = _collect(
+                    state[start:], n_pixels, ids[m], depths[ids[m]], best[start:], best_ids[start:], median[start:]
+                )
+
     @kernel(REASSOCIATE)
-    def composite_tiles(projection, colors, background, offsets, ids, tiles, n_threads, frame, image, alpha, records):
-        median_depth, dominant_ids, weight_sums, hit_counts = records
-        collects = median_depth.size > 0
+    def composite_tiles(
+        records, depths, background, offsets, ids, ranges, n_threads, frame, image, alpha, pair_stats, images
+    ):
+        median_depth, dominant_ids = images
         for thread in prange(n_threads):
-            state = np.zeros(CHANNELS + n_channels * PIXELS, image.dtype)
+            state = np.zeros(CHANNELS + max(n_channels, N_FUSED) * PIXELS, image.dtype)
             best = np.empty(PIXELS, image.dtype)
             median = np.empty(PIXELS, image.dtype)
             best_ids = np.empty(PIXELS, np.int32)
-            for turn in range(thread, tiles.size, n_threads):
-                tile = tiles[turn]
-                x0, y0 = start_tile(state, tile, frame)
-                state[CHANNELS:] = ZERO
-                if collects:
+            for turn in range(thread, ranges.size - 1, n_threads):
+                for tile in range(ranges[turn], ranges[turn + 1]):
+                    x0, y0 = start_tile(state, tile, frame)
+                    state[CHANNELS:] = ZERO
                     best[:] = ZERO
                     median[:] = ZERO
                     best_ids[:] = -1
-                for m in range(offsets[tile], offsets[tile + 1]):
-                    if m % CHECK_EVERY == 0 and is_finished(state):
-                        break
-                    n = ids[m]
-                    start, n_pixels = pixel_run(projection.boxes, n, y0)
-                    blend_hit(state[start:], n_pixels, n, projection, colors[n], frame)
-                    if collects:
-                        weight_sums[m], hit_counts[m] = _collect(
-                            state[start:],
-                            n_pixels,
-                            n,
-                            projection.depths[n],
-                            best[start:],
-                            best_ids[start:],
-                            median[start:],
-                        )
-                store(state, x0, y0, background, frame, image, alpha)
-                if collects:
-                    store_records(x0, y0, frame, median, best_ids, median_depth, dominant_ids)
+                    blend_tile(
+                        state, tile, records, depths, offsets, ids, frame, y0, (best, best_ids, median), pair_stats
+                    )
+                    store(state, x0, y0, background, frame, image, alpha)
+                    if median_depth.size > 0:
+                        store_stats(x0, y0, frame, median, best_ids, median_depth, dominant_ids)
 
     return composite_tiles

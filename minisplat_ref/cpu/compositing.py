@@ -11,7 +11,7 @@ from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.blend_backward import N_MOMENTS, backward_kernel, sum_slots
 from minisplat_ref.cpu.blend_forward import forward_kernel
 from minisplat_ref.cpu.exponential import exp_exact, exp_fast
-from minisplat_ref.cpu.tile_state import frame_of, tile_order
+from minisplat_ref.cpu.tile_state import frame_of, records_of, tile_ranges
 from minisplat_ref.scalar._jit import n_threads
 from minisplat_ref.types import BlendStats, CompositeGradient, Floats, Projection, RenderOutput, TileBins
 
@@ -65,28 +65,23 @@ def composite_with(
     image = np.empty((height, width, colors.shape[1]), dtype)
     alpha = np.empty((height, width), dtype)
     collects = with_stats or with_median_depth
-    record_size = (height, width) if collects else (0, 0)
-    n_pairs = len(bins.gaussian_ids) if collects else 0
-    records = (
-        np.empty(record_size, dtype),
-        np.empty(record_size, np.int32),
-        np.zeros(n_pairs, dtype),
-        np.zeros(n_pairs, np.int32),
-    )
+    shape, n_pairs = ((height, width), len(bins.gaussian_ids)) if collects else ((0, 0), 0)
+    median_depth, dominant_ids = np.empty(shape, dtype), np.empty(shape, np.int32)
+    weight_sums, hit_counts = np.zeros(n_pairs, dtype), np.zeros(n_pairs, np.int32)
     forward_kernel(exp, colors.shape[1])(
-        projection,
-        colors,
+        records_of(projection, colors),
+        projection.depths,
         background,
         bins.tile_offsets,
         bins.gaussian_ids,
-        tile_order(bins),
+        tile_ranges(bins),
         n_threads(),
         frame_of(bins, conventions, dtype),
         image,
         alpha,
-        records,
+        (weight_sums, hit_counts),
+        (median_depth, dominant_ids),
     )
-    median_depth, dominant_ids, weight_sums, hit_counts = records
     stats = None
     if with_stats:
         n = len(colors)
@@ -114,12 +109,11 @@ def composite_vjp_with(
     dtype, n_channels = colors.dtype, colors.shape[1]
     slots = np.empty((len(bins.gaussian_ids), N_MOMENTS + n_channels), dtype)
     backward_kernel(exp, n_channels)(
-        projection,
-        colors,
+        records_of(projection, colors),
         bins.tile_offsets,
         bins.gaussian_ids,
         bins.slots,
-        tile_order(bins),
+        tile_ranges(bins),
         n_threads(),
         frame_of(bins, conventions, dtype),
         output.image,
