@@ -50,8 +50,8 @@ def test_scaled_to_a_tenth():
     recipe = get_recipe("3dgs", 3_000)
     fired = firings(recipe)
     assert fired["collect_gradients"] == list(range(1, 1_500))
-    assert fired["clone_and_split"] == fired["prune_faint"] == list(range(60, 1_500, 10))
-    assert fired["prune_large"] == list(range(310, 1_500, 10))
+    assert fired["clone_and_split"] == fired["prune_faint"] == list(range(100, 1_500, 100))  # not every 10
+    assert fired["prune_large"] == list(range(400, 1_500, 100))
     assert fired["reset_opacity"] == [300, 600, 900, 1_200]
     assert fired["reset_opacity_on_white"] == [50]
     assert recipe.sh_milestones == (100, 200, 300)
@@ -60,19 +60,18 @@ def test_scaled_to_a_tenth():
 
 
 def test_scaled_rounds_periods_and_keeps_every_iteration():
-    recipe = get_recipe("3dgs", 7_000)  # 100 becomes 23.3
-    fired = firings(recipe)
-    assert set(b - a for a, b in zip(fired["clone_and_split"], fired["clone_and_split"][1:], strict=False)) == {23}
-    assert fired["clone_and_split"][0] == 138 and 117 < 138  # start 500 becomes 117, the next multiple is 138
+    event = Every(100, nothing, start=500, stop=15_000).scaled(7 / 30)  # 23.3, 116.7, 3500
+    assert event == Every(23, nothing, start=117, stop=3_500)
+    assert firing(event)[0] == 138  # the first multiple above 117
     longer = firings(scaled(RECIPES["3dgs"], 60_000))
     assert longer["collect_gradients"] == list(range(1, 30_000))  # every iteration, not every second one
     assert longer["clone_and_split"] == list(range(1_200, 30_000, 200))
 
 
 def test_scaled_to_next_to_nothing():
-    for event in get_recipe("3dgs", 1).events:
-        assert getattr(event, "period", 1) == 1
+    assert firings(get_recipe("3dgs", 1)).keys() == firings(RECIPES["3dgs"]).keys()
     assert Every(100, nothing, skip=1_000).scaled(0.001) == Every(1, nothing, skip=1)
+    assert Every(100, nothing, least_period=40).scaled(0.001).period == 40
     assert At(100, nothing).scaled(0.001) == At(1, nothing)
 
 
