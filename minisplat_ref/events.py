@@ -56,6 +56,20 @@ class Iteration(NamedTuple):
     conventions: Conventions
 
 
+class StepReport(NamedTuple):
+    """What ``train(on_step=...)`` is told after every iteration."""
+
+    step: int
+    """Iterations done, from 1."""
+    loss: float
+    """Training loss of ``view``, before this iteration's update."""
+    view: View
+    output: RenderOutput
+    """The rendering that ``loss`` measures, float32, not clipped."""
+    state: TrainState
+    """The state after the iteration; it is safe to save."""
+
+
 def apply_edit(state: TrainState, edit: Edit) -> None:
     """Replace the population; new rows get zero moments, statistics follow the parents."""
     no_reset = np.zeros(len(edit.parent_ids), bool)

@@ -8,43 +8,30 @@ Left out: image pyramids, exposure compensation, regularisers.
 """
 
 import json
+import math
 import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
-from minisplat_ref.events import Iteration, TrainState
+from minisplat_ref.events import Iteration, StepReport, TrainState
 from minisplat_ref.io.checkpoint import load_checkpoint, save_checkpoint
 from minisplat_ref.optim.adam import AdamState, adam_step, zero_moments
 from minisplat_ref.optim.schedules import active_sh_degree
 from minisplat_ref.recipes import During, Recipe, describe
 from minisplat_ref.render import render, render_vjp
 from minisplat_ref.strategy.initialization import initial_gaussians
-from minisplat_ref.types import Gaussians, RenderOutput, Scene, View
+from minisplat_ref.types import Gaussians, Scene, View
 
 __all__ = ["StepReport", "TrainState", "initial_state", "load_state", "save_state", "train"]
-
-
-class StepReport(NamedTuple):
-    """What ``on_step`` is told after every iteration."""
-
-    step: int
-    """Iterations done, from 1."""
-    loss: float
-    """Training loss of ``view``, before this iteration's update."""
-    view: View
-    output: RenderOutput
-    """The rendering that ``loss`` measures, float32, not clipped."""
-    state: TrainState
-    """The state after the iteration; it is safe to save."""
 
 
 def initial_state(scene: Scene, recipe: Recipe, seed: int) -> TrainState:
@@ -115,12 +102,13 @@ def _iterate(state: TrainState, scene: Scene, recipe: Recipe, backend: Backend, 
     step = state.step + 1
     view = _next_view(state, scene)
     due = [event for event in recipe.events if event.is_due(step)]
+    stored_degree = math.isqrt(state.gaussians.sh_rest.shape[1] + 1) - 1
     background = state.rng.random(3) if recipe.has_random_background else scene.background
     output, tape = render(
         state.gaussians,
         view.camera,
         background=background.astype(np.float32),
-        sh_degree=active_sh_degree(step, recipe.sh_milestones, recipe.sh_degree),
+        sh_degree=active_sh_degree(step, recipe.sh_milestones, stored_degree),
         conventions=conventions,
         backend=backend,
         with_stats=any(isinstance(event, During) and event.needs_blend_stats for event in due),
