@@ -131,6 +131,20 @@ def test_blend_statistics_only_where_asked_for(scene):
     assert {step: stats is not None for step, stats in seen.items()} == {1: False, 2: True, 3: False}
 
 
+def test_action_may_raise_the_stored_degree(scene):
+    """Mini-Splatting starts without view-dependent colour and makes room for it later."""
+
+    def widen(population):
+        return population._replace(sh_rest=np.zeros((len(population.means), 3, 3), np.float32))
+
+    def store_degree_one(state, iteration):
+        state.gaussians = widen(state.gaussians)
+        state.adam = state.adam._replace(first=widen(state.adam.first), second=widen(state.adam.second))
+
+    recipe = PLAIN._replace(iterations=6, sh_degree=0, sh_milestones=(2,), events=(At(4, store_degree_one),))
+    assert train(scene, recipe, seed=0).gaussians.sh_rest.any()
+
+
 # It repeats -----------------------------------------------------------------------------------------------------------
 
 
