@@ -1,9 +1,9 @@
 """Lists of the Gaussians that touch each tile, front to back.
 
-The Gaussians are sorted once, by depth; the pairs (tile, Gaussian) never are. A counting pass and a filling pass go
-over the sorted Gaussians in a fixed number of chunks: with the counts of each chunk in each tile known, every chunk
-knows where in each tile's list its pairs start, so the chunks fill the lists independently and the order in each is
-by depth.
+The Gaussians are sorted once, by depth; the pairs (tile, Gaussian) never are. A fixed number of chunks of the sorted
+Gaussians each write down the tiles of their Gaussians and count them per tile. With the counts of all chunks known,
+every chunk knows where in each tile's list its pairs start, so that the chunks fill the lists independently, and the
+order in each list is by depth.
 
 A pair is made only where the visible ellipse reaches a pixel centre of the tile, row of tiles by row of tiles; that
 drops most of the pairs that the bounding box of an oblique ellipse would give.
@@ -15,10 +15,10 @@ import numpy as np
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.sorting import depth_order
-from minisplat_ref.scalar._jit import kernel, prange
+from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.literals import HALF, ZERO
-from minisplat_ref.scalar.tiling import rightmost_offset, support
-from minisplat_ref.types import Projection, TileBins, TileGrid
+from minisplat_ref.scalar.tiling import rightmost_offset, visible_ellipse
+from minisplat_ref.types import Ints, Projection, TileBins, TileGrid
 
 TILE_WIDTH = 8  # one row of a tile is one AVX2 register of float32; divides INRIA's 16
 TILE_HEIGHT = 16
@@ -27,53 +27,65 @@ MARGIN = np.float32(0.02)  # px and relative: rounding must not lose a pixel tha
 OBLIQUE_MIN = np.float32(1e-3)  # det / (a c) below this has lost its digits in float32: fall back to the box
 
 
+@scalar
+def _columns(ellipse, mx, low, high, x0, x1):
+    """Tile columns, half-open, that the ellipse reaches in a band of rows at low <= dy <= high."""
+    if low > ellipse.half_height or high < -ellipse.half_height:
+        return 0, 0
+    low = max(low, -ellipse.half_height)
+    high = min(high, ellipse.half_height)
+    right = mx + rightmost_offset(ellipse, low, high, 1) + MARGIN
+    left = mx - rightmost_offset(ellipse, low, high, -1) - MARGIN
+    first = max(x0, math.ceil(max(left - HALF, ZERO)))
+    end = min(x1, math.floor(min(right + HALF, x1)))
+    return (first // TILE_WIDTH, (end - 1) // TILE_WIDTH + 1) if first < end else (0, 0)
+
+
+@scalar
+def _write_tiles(n, projection, alpha_min, n_tiles_x, tiles, place, counts):
+    """Write the tiles of one Gaussian from ``place`` on and count them; return how many there are."""
+    x0, y0, x1, y1 = projection.boxes[n, 0], projection.boxes[n, 1], projection.boxes[n, 2], projection.boxes[n, 3]
+    mx, my = projection.means2d[n, 0], projection.means2d[n, 1]
+    a, b, c = projection.conics[n, 0], projection.conics[n, 1], projection.conics[n, 2]
+    has_digits = a * c - b * b > OBLIQUE_MIN * a * c
+    ellipse = visible_ellipse(a, b, c, projection.opacities[n], alpha_min, MARGIN)
+    n_pairs = 0
+    for row in range(y0 // TILE_HEIGHT, (y1 - 1) // TILE_HEIGHT + 1):
+        first, end = x0 // TILE_WIDTH, (x1 - 1) // TILE_WIDTH + 1
+        if has_digits:
+            low = max(row * TILE_HEIGHT, y0) + HALF - my
+            high = min((row + 1) * TILE_HEIGHT, y1) - HALF - my
+            first, end = _columns(ellipse, mx, low, high, x0, x1)
+        for column in range(first, end):
+            tile = row * n_tiles_x + column
+            tiles[place + n_pairs] = tile
+            counts[tile] += 1
+            n_pairs += 1
+    return n_pairs
+
+
 @kernel()
-def _count_or_fill(projection, order, alpha_min, n_tiles_x, offsets, gaussian_offsets, ids, slots):
-    fills = ids.size > 0
+def _list_tiles(projection, order, alpha_min, n_tiles_x, chunk_starts, tiles, counts, n_pairs):
     for chunk in prange(N_CHUNKS):
+        place = chunk_starts[chunk]
         for rank in range(order.size * chunk // N_CHUNKS, order.size * (chunk + 1) // N_CHUNKS):
             n = order[rank]
-            x0, y0, x1, y1 = (
-                projection.boxes[n, 0],
-                projection.boxes[n, 1],
-                projection.boxes[n, 2],
-                projection.boxes[n, 3],
-            )
-            mx, my = projection.means2d[n, 0], projection.means2d[n, 1]
-            a, b, c = projection.conics[n, 0], projection.conics[n, 1], projection.conics[n, 2]
-            q = support(projection.opacities[n], alpha_min)
-            q += MARGIN * (q + MARGIN)
-            det = a * c - b * b
-            is_ellipse = det > OBLIQUE_MIN * a * c
-            half_height = math.sqrt(max(q * a / det, ZERO)) if is_ellipse else ZERO * a
-            n_pairs = 0
-            for row in range(y0 // TILE_HEIGHT, (y1 - 1) // TILE_HEIGHT + 1):
-                first, last = x0, x1
-                if is_ellipse:
-                    low = max(row * TILE_HEIGHT, y0) + HALF - my
-                    high = min((row + 1) * TILE_HEIGHT, y1) - HALF - my
-                    if low > half_height or high < -half_height:
-                        continue
-                    low = max(low, -half_height)
-                    high = min(high, half_height)
-                    right = mx + rightmost_offset(a, b, c, det, q, low, high) + MARGIN
-                    left = mx - rightmost_offset(a, b, c, det, q, -high, -low) - MARGIN
-                    first = max(first, math.ceil(max(left - HALF, ZERO)))
-                    last = min(last, math.floor(min(right + HALF, x1)))
-                    if first >= last:
-                        continue
-                for column in range(first // TILE_WIDTH, (last - 1) // TILE_WIDTH + 1):
-                    tile = row * n_tiles_x + column
-                    if fills:
-                        place = offsets[chunk, tile]
-                        offsets[chunk, tile] = place + 1
-                        ids[place] = n
-                        slots[place] = gaussian_offsets[n] + n_pairs
-                    else:
-                        offsets[chunk, tile] += 1
-                    n_pairs += 1
-            if not fills:
-                gaussian_offsets[n + 1] = n_pairs
+            n_pairs[n] = _write_tiles(n, projection, alpha_min, n_tiles_x, tiles, place, counts[chunk])
+            place += n_pairs[n]
+
+
+@kernel()
+def _fill(order, chunk_starts, tiles, starts, gaussian_offsets, ids, slots):
+    for chunk in prange(N_CHUNKS):
+        source = chunk_starts[chunk]
+        for rank in range(order.size * chunk // N_CHUNKS, order.size * (chunk + 1) // N_CHUNKS):
+            n = order[rank]
+            for slot in range(gaussian_offsets[n], gaussian_offsets[n + 1]):
+                place = starts[chunk, tiles[source]]
+                starts[chunk, tiles[source]] = place + 1
+                source += 1
+                ids[place] = n
+                slots[place] = slot
 
 
 @kernel(parallel=False)
@@ -95,16 +107,24 @@ def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventio
     """
     n_tiles = grid.n_tiles_x * grid.n_tiles_y
     order = depth_order(projection.depths, projection.radii)
-    alpha_min = projection.depths.dtype.type(conventions.alpha_min)
+    chunk_starts = _room_for_boxes(projection.boxes[order])
+    tiles = np.empty(chunk_starts[-1], np.int32)
     starts = np.zeros((N_CHUNKS, n_tiles), np.int64)
     tile_offsets = np.empty(n_tiles + 1, np.int64)
     gaussian_offsets = np.zeros(len(projection.depths) + 1, np.int64)
-    nothing = np.empty(0, np.int32)
-    _count_or_fill(projection, order, alpha_min, grid.n_tiles_x, starts, gaussian_offsets, nothing, nothing)
+    alpha_min = projection.depths.dtype.type(conventions.alpha_min)
+    _list_tiles(projection, order, alpha_min, grid.n_tiles_x, chunk_starts, tiles, starts, gaussian_offsets[1:])
     _starts_from_counts(starts, tile_offsets)
     np.cumsum(gaussian_offsets, out=gaussian_offsets)
     ids = np.empty(tile_offsets[-1], np.int32)
     slots = np.empty(tile_offsets[-1], np.int32)
-    if ids.size:
-        _count_or_fill(projection, order, alpha_min, grid.n_tiles_x, starts, gaussian_offsets, ids, slots)
+    _fill(order, chunk_starts, tiles, starts, gaussian_offsets, ids, slots)
     return TileBins(ids, tile_offsets, slots, gaussian_offsets, grid)
+
+
+def _room_for_boxes(boxes: Ints) -> Ints:
+    """Where each chunk of the sorted boxes starts to write, with room for every tile under its boxes."""
+    columns = (boxes[:, 2] - 1) // TILE_WIDTH - boxes[:, 0] // TILE_WIDTH + 1
+    rows = (boxes[:, 3] - 1) // TILE_HEIGHT - boxes[:, 1] // TILE_HEIGHT + 1
+    room = np.concatenate([[0], np.cumsum(columns.astype(np.int64) * rows)])
+    return room[len(boxes) * np.arange(N_CHUNKS + 1) // N_CHUNKS]
