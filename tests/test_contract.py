@@ -1,22 +1,38 @@
 """What the modules promise about each other."""
 
 import inspect
+import re
 from dataclasses import fields
 from importlib import import_module
 from pkgutil import iter_modules
 
 import pytest
 
-from minisplat_ref import reference
+from minisplat_ref import cpu, reference, scalar
 from minisplat_ref.backends import BACKENDS, REFERENCE, Backend
 
 MODULES = [module.name for module in iter_modules(reference.__path__)]
 STAGES = [field.name for field in fields(Backend) if field.name not in ("name", "tile_width", "tile_height")]
 
+# Modules of cpu without a twin of their name: parts of the compositing and sorting kernels, not stages.
+KERNEL_PARTS = {"blend_forward", "blend_backward", "tile_state", "sorting", "exponential"}
 
-def public_functions(name):
-    """Functions that a module of the reference defines, in the order of the file."""
-    module = import_module(f"minisplat_ref.reference.{name}")
+# Public functions of cpu without a twin: they prepare arguments for kernels.
+CPU_ONLY = {
+    "projection.camera_centre": "computed in float64 before the loop; the reference does it with matrices",
+    "projection.pose_of": "the same for the point that the camera maps to 0",
+    "projection.lens_of": "conventions as scalars of the data's dtype",
+    "compositing.composite_with": "the exponential is an argument, which compositing_exact fills in, too",
+    "compositing.composite_vjp_with": "as composite_with",
+}
+
+# Backward formulas whose forward has another name, since one scalar function returns several things.
+FORWARD_OF = {"compositing.alpha_vjp": "blend", "projection.compensation_vjp": "project_gaussian"}
+
+
+def public_functions(name, package="reference"):
+    """Functions that a module defines, in the order of the file."""
+    module = import_module(f"minisplat_ref.{package}.{name}")
     functions = [
         f for f in vars(module).values() if inspect.isfunction(f) and inspect.unwrap(f).__module__ == module.__name__
     ]
@@ -56,3 +72,63 @@ def test_gradients_write_their_chain_rule(module):
 
 def test_the_book_has_its_stages():
     assert sum(name.endswith("_vjp") for module in MODULES for name in public_functions(module)) >= 10
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_every_argument_is_documented(module):
+    for name, function in public_functions(module).items():
+        for argument in inspect.signature(function).parameters:
+            assert re.search(rf"\b{argument}\b", function.__doc__), f"{name} does not mention {argument}"
+
+
+def twins():
+    """Public functions of cpu and what they must look like: (label, function, twin or None)."""
+    for info in iter_modules(cpu.__path__):
+        name = info.name
+        if name in KERNEL_PARTS:
+            continue
+        twin = public_functions(name.removesuffix("_exact"))
+        for key, function in public_functions(name, "cpu").items():
+            if f"{name}.{key}" not in CPU_ONLY:
+                yield f"{name}.{key}", function, twin.get(key)
+
+
+@pytest.mark.parametrize(("function", "twin"), [row[1:] for row in twins()], ids=[row[0] for row in twins()])
+def test_cpu_has_the_signature_of_the_reference(function, twin):
+    assert twin is not None, "no function of this name in the reference"
+
+    def arguments(f):
+        # A tape belongs to its package; all other types are shared.
+        rows = inspect.signature(f).parameters.values()
+        return [(p.name, p.kind, p.default, p.annotation if p.name != "tape" else None) for p in rows]
+
+    assert arguments(function) == arguments(twin)
+
+
+def test_every_stage_is_compared():
+    assert {row[0] for row in twins()} >= {
+        *("projection.project", "projection.project_vjp", "tiling.bin_gaussians"),
+        *("spherical_harmonics.sh_colors", "spherical_harmonics.sh_colors_vjp"),
+        *("compositing.composite", "compositing.composite_vjp"),
+        *("compositing_exact.composite", "compositing_exact.composite_vjp"),
+        *("depth.surface_points", "depth.surface_points_vjp"),
+        *("loss.photometric_loss", "loss.photometric_loss_vjp", "loss.ssim_map"),
+    }
+
+
+def test_exceptions_exist():
+    for key in (*CPU_ONLY, *FORWARD_OF):
+        module, _, name = key.partition(".")
+        package = "cpu" if key in CPU_ONLY else "scalar"
+        assert name in public_functions(module, package), f"{key} is gone: strike it out"
+
+
+def test_every_scalar_gradient_has_its_forward():
+    n_pairs = 0
+    for info in iter_modules(scalar.__path__):
+        names = public_functions(info.name, "scalar")
+        for name in names:
+            if name.endswith("_vjp"):
+                n_pairs += 1
+                assert FORWARD_OF.get(f"{info.name}.{name}", name.removesuffix("_vjp")) in names, name
+    assert n_pairs >= 5

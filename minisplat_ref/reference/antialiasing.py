@@ -65,6 +65,6 @@ def determinants(matrices: Floats) -> Floats:
 
 
 def adjugates(matrices: Floats) -> Floats:
-    """[[d, -b], [-c, a]] of [[a, b], [c, d]]: ``adj(C) C = det(C) I``, which exists where the inverse does not."""
+    """[[d, -b], [-c, a]] of ``matrices`` [[a, b], [c, d]]: ``adj(C) C = det(C) I``, also where no inverse exists."""
     signs = np.array([[1, -1], [-1, 1]], dtype=matrices.dtype)
     return signs * matrices[:, ::-1, ::-1].swapaxes(1, 2)

@@ -81,12 +81,12 @@ def _transmittances(alphas: Floats) -> Floats:
 
 
 def goes_on(transmittances: Floats, conventions: Conventions) -> Bools:
-    """Whether a pixel takes the hit that would leave it with this transmittance."""
+    """Whether a pixel takes the hit that would leave it with ``transmittances``; ``conventions`` set the bound."""
     if conventions.stops_at_equality:
         return transmittances > conventions.transmittance_min
     return transmittances >= conventions.transmittance_min
 
 
 def conic_matrices(conics: Floats) -> Floats:
-    """[[a, b], [b, c]] of (a, b, c) [G, 3]."""
+    """[[a, b], [b, c]] of ``conics`` (a, b, c) [G, 3]."""
     return conics[:, [0, 1, 1, 2]].reshape(-1, 2, 2)

@@ -53,7 +53,7 @@ def sh_basis(directions: Floats, degree: int) -> Floats:
 
 
 def sh_basis_jacobian(directions: Floats, degree: int) -> Floats:
-    """Derivative [N, (degree + 1)^2, 3] of the polynomials of :func:`sh_basis` by x, y and z."""
+    """Derivative [N, (degree + 1)^2, 3] of the polynomials of :func:`sh_basis` by the x, y, z of ``directions``."""
     x, y, z = directions.T
     xx, yy, zz = x * x, y * y, z * z
     o, one = np.zeros_like(x), np.ones_like(x)

@@ -1,0 +1,143 @@
+"""How kernels are run must not show in what they return: dtype, threads, compiled or not, fresh or from the cache."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scenes import activated, as_dtype, make_camera, make_gaussians
+from tolerances import COVERAGE_MIN, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT32_IMAGE
+
+import minisplat_ref
+from minisplat_ref.backends import CPU, REFERENCE
+from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.render import render, render_vjp
+from minisplat_ref.scalar import _jit
+from minisplat_ref.types import ProjectionGradient, TileGrid
+
+PACKAGE = Path(minisplat_ref.__file__).parent
+
+
+# --- dtype ---
+
+
+def test_stages_keep_float32(rng):
+    gaussians, camera = as_dtype(make_gaussians(rng, 20, size=0.25), np.float32), make_camera(rng=rng)
+    means, quats, scales, opacities = activated(gaussians)
+    primitives = (means, quats, scales, opacities, camera, GSPLAT_MAIN)
+    projection = CPU.project(*primitives)
+    sh = (means, gaussians.sh_dc, gaussians.sh_rest, camera, 3, projection.radii)
+    colors, background = CPU.sh_colors(*sh), np.zeros(3, np.float32)
+    bins = CPU.bin_gaussians(projection, TileGrid(24, 18, CPU.tile_width, CPU.tile_height), GSPLAT_MAIN)
+    composited = (projection, colors, background, bins, GSPLAT_MAIN)
+    output = CPU.composite(*composited, with_stats=True, with_median_depth=True)
+    v = CPU.composite_vjp(*composited, output, output.image, output.alpha)
+    v_projection = ProjectionGradient(v.means2d, v.opacities, v.conics, v.opacities)
+    ids = output.stats.dominant_ids
+    points = CPU.surface_points(means, quats, scales, camera, ids)
+    _, tape = CPU.photometric_loss(output.image, output.image[::-1].copy(), 0.2)
+    results = {
+        "project": projection,
+        "project_vjp": CPU.project_vjp(*primitives, projection, v_projection),
+        "sh_colors": (colors,),
+        "sh_colors_vjp": CPU.sh_colors_vjp(*sh, v.colors),
+        "composite": (output.image, output.alpha, output.median_depth, output.stats.blend_weight_sum),
+        "composite_vjp": v,
+        "surface_points": points,
+        "surface_points_vjp": CPU.surface_points_vjp(means, quats, scales, camera, ids, points.points, points.depths),
+        "photometric_loss_vjp": (CPU.photometric_loss_vjp(tape),),
+    }
+    for stage, arrays in results.items():
+        floats = [array for array in arrays if array.dtype.kind == "f"]
+        assert floats and {array.dtype for array in floats} == {np.dtype(np.float32)}, stage
+        assert any(array.any() for array in floats), stage
+
+
+# --- the same result however it is run ---
+
+
+def drawn(gaussians, camera, backend):
+    """Image, alpha and every gradient of one view."""
+    output, tape = render(gaussians, camera, backend=backend, with_depth=True)
+    gradient = render_vjp(tape, output.image, output.alpha)
+    return output.image, output.alpha, *gradient.gaussians, *gradient[1:]
+
+
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="needs two threads")
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_same_bytes_at_any_number_of_threads(dtype, rng):
+    gaussians, camera = as_dtype(make_gaussians(rng, 150), dtype), make_camera(64, 48, fx=80, fy=75)
+    n_threads = numba.get_num_threads()
+    results = []
+    try:
+        for n in (1, 2, 2):
+            numba.set_num_threads(n)
+            results.append(drawn(gaussians, camera, CPU))
+    finally:
+        numba.set_num_threads(n_threads)
+    assert results[0][1].mean() > COVERAGE_MIN
+    for one, *others in zip(*results, strict=True):
+        assert one.any() and all(one.tobytes() == other.tobytes() for other in others)
+
+
+IN_PYTHON = """
+import sys
+import numba
+import numpy as np
+from test_kernels import drawn, small_view
+from minisplat_ref.backends import CPU
+assert numba.config.DISABLE_JIT and not hasattr(numba.njit(lambda: 0), "signatures"), "kernels are compiled after all"
+np.savez(sys.argv[1], *drawn(*small_view(), CPU))
+"""
+
+
+def small_view():
+    return make_gaussians(np.random.default_rng(5), 4), make_camera(8, 8, fx=10.0, fy=10.0)
+
+
+def test_kernels_run_as_python(tmp_path):
+    path = tmp_path / "drawn.npz"
+    folders = os.pathsep.join([str(Path(__file__).parent), str(PACKAGE.parent)])
+    environment = os.environ | {"NUMBA_DISABLE_JIT": "1", "PYTHONPATH": folders}
+    subprocess.run([sys.executable, "-W", "error", "-c", IN_PYTHON, str(path)], env=environment, check=True)
+    # In Python a float32 literal times a float of `math` is float32: half of the digits of the compiled kernels.
+    expected = drawn(*small_view(), REFERENCE)
+    assert expected[1].mean() > COVERAGE_MIN
+    with np.load(path) as actual:
+        for i, (array, key) in enumerate(zip(expected, actual.files, strict=True)):
+            assert array.any()
+            tolerance = PARITY_FLOAT32_IMAGE if i < 2 else PARITY_FLOAT32_GRADIENT
+            assert_allclose(actual[key], array, rtol=0, atol=tolerance * np.abs(array).max())
+
+
+# --- kernel cache ---
+
+
+@pytest.mark.parametrize("source", ["scalar/covariance.py", "cpu/blend_forward.py", "constants.py", "types.py"])
+def test_cache_folder_follows_the_sources(source, tmp_path, monkeypatch):
+    # Numba notices no change in a function that a kernel calls from another file: hence a folder per source hash.
+    copy = tmp_path / "minisplat_ref"
+    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    before = _jit.source_hash.__wrapped__()
+    monkeypatch.setattr(_jit, "_PACKAGE", copy)
+    monkeypatch.setattr(_jit, "source_hash", _jit.source_hash.__wrapped__)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    folder = _jit._cache_folder.__wrapped__()
+    assert Path(folder) == tmp_path / "cache" / before and Path(folder).is_dir()
+    with (copy / source).open("a") as file:
+        file.write("\n")
+    assert _jit._cache_folder.__wrapped__() != folder
+
+
+def test_cache_folder_ignores_what_no_kernel_is_made_of(tmp_path, monkeypatch):
+    copy = tmp_path / "minisplat_ref"
+    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(_jit, "_PACKAGE", copy)
+    before = _jit.source_hash.__wrapped__()
+    (copy / "render.py").write_text("")
+    assert _jit.source_hash.__wrapped__() == before
