@@ -179,8 +179,8 @@ show_code(sh_colors)
 #
 # A red ball of 1,500 flat Gaussians under one lamp. Its true colour is matte shading plus a highlight,
 # $0.6\,(n\cdot h)^{p}$ with the normal $n$, the direction $h$ halfway between lamp and viewer, and the shininess $p$.
-# For each Gaussian the coefficients are fitted by least squares to 100 random directions from which it can be seen. Then
-# the ball is rendered from one viewpoint.
+# For each Gaussian the coefficients are fitted by least squares to 100 random directions from which it can be seen.
+# Then the ball is rendered from one viewpoint.
 
 # %%
 shininess = 40.0  # play: 5 is satin, 200 is lacquer
@@ -273,8 +273,8 @@ plt.show()
 # ## Play
 #
 # Set `shininess` to 5 or to 200 and run the two cells above again. The finest bumps of degree 3 are about 60 degrees
-# wide, so a lacquered highlight stays out of its reach. Training then blurs it, or puts Gaussians behind the surface that
-# imitate the mirror image.
+# wide, so a lacquered highlight stays out of its reach. Training then blurs it, or puts Gaussians behind the surface
+# that imitate the mirror image.
 #
 # ## What was shown, checked
 
