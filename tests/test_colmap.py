@@ -214,6 +214,8 @@ def test_masks_are_undistorted_along(tmp_path):
 
 
 def test_panorama_has_no_pinhole(tmp_path):
+    if not hasattr(import_pycolmap().CameraModelId, "EQUIRECTANGULAR"):
+        pytest.skip("this pycolmap knows no panoramas")
     write_colmap(tmp_path, model="EQUIRECTANGULAR", params=(32.0, 24.0))
     with pytest.raises(InputError, match=r"png has camera model EQUIRECTANGULAR, a panorama, .*; cut pinhole views"):
         load_colmap(tmp_path, undistort=True)
@@ -276,8 +278,8 @@ BAD_SCENES = {
         {},
         r"the camera of 0001\.png is not usable \(fx, .* are 0, 42",
     ),
-    "NaN": (rewrite("cameras.txt", "15.5", "nan"), {}, "damaged or incomplete COLMAP model"),
-    "infinite pose": (rewrite("images.txt", " -2.0 ", " inf "), {}, "damaged or incomplete COLMAP model"),
+    "NaN": (rewrite("cameras.txt", "15.5", "nan"), {}, r"damaged or incomplete|png is not usable \(fx"),  # by version
+    "infinite pose": (rewrite("images.txt", " -2.0 ", " inf "), {}, r"damaged or incomplete|pose of 0002\.png is not"),
     "all held out": (
         lambda folder: None,
         {"test_every": 1},

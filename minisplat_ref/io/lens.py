@@ -9,10 +9,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-# Pillow must be loaded before pycolmap: pycolmap 4.2 exports a zlib of its own, and when it comes first the system's
-# zlib binds to it half and half; the next PNG that Pillow writes then aborts the process.
-from PIL import Image as _loaded_before_pycolmap  # noqa: F401
-
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.images import MASK_THRESHOLD
 from minisplat_ref.types import Bools, Camera
@@ -32,7 +28,12 @@ class Lens(NamedTuple):
 
 
 def import_pycolmap() -> ModuleType:
-    """Import pycolmap when it is first needed: it takes a while to load, and a few platforms have no wheel."""
+    """Import pycolmap when it is first needed: it takes a while to load, and a few platforms have no wheel.
+
+    Pillow must be loaded before, as it is by the imports of this module: pycolmap 4.2 exports a zlib of its own, and
+    when it comes first, the zlib of the system binds to it half and half; the next PNG that Pillow writes then aborts
+    the process.
+    """
     try:
         import pycolmap
     except ImportError:
