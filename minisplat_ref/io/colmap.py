@@ -39,13 +39,8 @@ BINARY_RECORDS = {
     "points3D.bin": Records(n_fixed=43, has_name=False, count_format="<Q", n_item=8),
     "frames.bin": Records(n_fixed=64, has_name=False, count_format="<I", n_item=16),
 }
-DAMAGE_ERRORS = (
-    ValueError,
-    IndexError,
-    RuntimeError,
-    MemoryError,
-    OSError,
-)  # its checks; garbage as a count
+# What pycolmap raises for damaged files: its own checks, and what garbage leads to that is read as an id or a count.
+DAMAGE_ERRORS = (ValueError, IndexError, RuntimeError, MemoryError, OSError)
 
 
 def load_colmap(
