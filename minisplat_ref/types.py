@@ -216,8 +216,8 @@ class View(NamedTuple):
     camera: Camera
     """Camera; its width and height are the image's."""
     image: NDArray[np.uint8]
-    """[H, W, 3] sRGB as stored in the file; an alpha channel is already composited onto the scene's background, or is the
-    mask (COLMAP scenes)."""
+    """[H, W, 3] sRGB as stored in the file; an alpha channel is already composited onto the scene's background, or has
+    become the mask (COLMAP scenes)."""
     mask: Bools | None
     """[H, W] True where the pixel counts in the loss; None where all do."""
 
