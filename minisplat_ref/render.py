@@ -86,9 +86,10 @@ def render(
         raise InputError(f"sh_degree is {sh_degree}; these Gaussians store degrees 0 to {stored_degree}")
     background = np.zeros(3, dtype) if background is None else np.asarray(background, dtype)
 
-    with np.errstate(over="ignore"):  # the projection culls the largest number; infinity times a zero gradient is NaN
+    with np.errstate(over="ignore"):
+        # The projection culls the largest number; infinity times a zero gradient would be NaN.
         scales = np.minimum(np.exp(gaussians.log_scales), np.finfo(dtype).max)
-    opacities = 0.5 * (1 + np.tanh(0.5 * gaussians.opacity_logits))  # the sigmoid, which cannot overflow in this form
+        opacities = 1 / (1 + np.exp(-gaussians.opacity_logits))
 
     def shade(radii: Ints) -> Floats:
         return backend.sh_colors(gaussians.means, gaussians.sh_dc, gaussians.sh_rest, camera, sh_degree, radii)
