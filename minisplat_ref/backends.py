@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
+import minisplat_ref.cpu.adam
 import minisplat_ref.cpu.compositing
 import minisplat_ref.cpu.compositing_exact
 import minisplat_ref.cpu.depth
@@ -16,6 +17,7 @@ import minisplat_ref.cpu.loss
 import minisplat_ref.cpu.projection
 import minisplat_ref.cpu.spherical_harmonics
 import minisplat_ref.cpu.tiling
+import minisplat_ref.reference.adam
 import minisplat_ref.reference.compositing
 import minisplat_ref.reference.depth
 import minisplat_ref.reference.loss
@@ -63,6 +65,7 @@ class Backend:
     surface_points_vjp: Callable[..., tuple[Floats, Floats, Floats]]
     photometric_loss: Callable[..., tuple[float, Any]]
     photometric_loss_vjp: Callable[..., Floats]
+    adam_update: Callable[..., None]
 
 
 def _from_package(name: str, package: ModuleType, tile_width: int, tile_height: int) -> Backend:
@@ -82,6 +85,7 @@ def _from_package(name: str, package: ModuleType, tile_width: int, tile_height: 
         surface_points_vjp=package.depth.surface_points_vjp,
         photometric_loss=package.loss.photometric_loss,
         photometric_loss_vjp=package.loss.photometric_loss_vjp,
+        adam_update=package.adam.adam_update,
     )
 
 

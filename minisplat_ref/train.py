@@ -119,7 +119,7 @@ def _iterate(state: TrainState, scene: Scene, recipe: Recipe, backend: Backend, 
 
     visible_ids = np.flatnonzero(tape.projection.radii[:, 0])
     rates = recipe.learning_rates.at(step, scene.extent)
-    state.adam = adam_step(state.gaussians, gradient.gaussians, state.adam, rates, recipe.adam, visible_ids)
+    state.adam = adam_step(state.gaussians, gradient.gaussians, state.adam, rates, recipe.adam, visible_ids, backend)
     iteration = Iteration(scene, view, output, visible_ids, gradient.means2d, backend, conventions)
     for event in due:
         event.action(state, iteration)

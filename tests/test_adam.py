@@ -8,7 +8,6 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from tolerances import ADAM_FLOAT32, CLOSED_FORM
 
-from minisplat_ref.optim import adam
 from minisplat_ref.optim.adam import AdamRule, adam_step, zero_moments
 
 
@@ -78,15 +77,13 @@ def test_first_step_without_correction_is_the_root_of_ten_larger(rng):
 
 
 @pytest.mark.parametrize("rule", [DENSE, SPARSE, SPARSE._replace(has_bias_correction=True)])
-@pytest.mark.parametrize("block_values", [1, 7, adam.BLOCK_VALUES])
-def test_many_steps_follow_the_scalar_loop(rng, rule, block_values, monkeypatch):
-    monkeypatch.setattr(adam, "BLOCK_VALUES", block_values)
+def test_many_steps_follow_the_scalar_loop(backend, rng, rule):
     n = 4
     before = random_pair(rng, n)
     gradients = [random_pair(rng, n) for _ in range(12)]
     after, state = copy(before), zero_moments(before)
     for gradient in gradients:
-        state = adam_step(after, gradient, state, RATES, rule, np.arange(n))
+        state = adam_step(after, gradient, state, RATES, rule, np.arange(n), backend)
     for name, rate in zip(Pair._fields, RATES, strict=True):
         values = getattr(before, name).ravel()
         series = np.array([getattr(gradient, name).ravel() for gradient in gradients])
@@ -94,13 +91,13 @@ def test_many_steps_follow_the_scalar_loop(rng, rule, block_values, monkeypatch)
         assert_allclose(getattr(after, name).ravel(), expected, rtol=0, atol=CLOSED_FORM * 10)
 
 
-def test_float32_stays_float32(rng):
+def test_float32_stays_float32(backend, rng):
     single, gradient = random_pair(rng, 300, np.float32), random_pair(rng, 300, np.float32)
     double = Pair(*(field.astype(np.float64) for field in single))
     state, state64 = zero_moments(single), zero_moments(double)
     for _ in range(3):
-        state = adam_step(single, gradient, state, RATES, DENSE, np.arange(300))
-        state64 = adam_step(double, gradient, state64, RATES, DENSE, np.arange(300))
+        state = adam_step(single, gradient, state, RATES, DENSE, np.arange(300), backend)
+        state64 = adam_step(double, gradient, state64, RATES, DENSE, np.arange(300), backend)
     assert all(field.dtype == np.float32 for field in (*single, *state.first, *state.second))
     for field, field64 in zip(single, double, strict=True):
         assert_allclose(field, field64, rtol=0, atol=ADAM_FLOAT32)
@@ -109,13 +106,13 @@ def test_float32_stays_float32(rng):
 # Rows -----------------------------------------------------------------------------------------------------------------
 
 
-def test_visible_only_leaves_the_other_rows_alone(rng):
+def test_visible_only_leaves_the_other_rows_alone(backend, rng):
     """Rows that are not visible may hold any gradient; the visible ones move as if they were alone."""
     n, visible_ids = 9, np.array([0, 3, 4, 8])
     hidden = np.setdiff1d(np.arange(n), visible_ids)
     start, gradient = random_pair(rng, n), random_pair(rng, n)
     state = zero_moments(start)
-    adam_step(start, gradient, state, RATES, SPARSE, np.arange(n))  # moments that are not zero
+    adam_step(start, gradient, state, RATES, SPARSE, np.arange(n), backend)  # moments that are not zero
     after = copy(start)
     moments_before = [field.copy() for moment in (state.first, state.second) for field in moment]
     alone = Pair(*(field[visible_ids] for field in start))
@@ -124,8 +121,8 @@ def test_visible_only_leaves_the_other_rows_alone(rng):
         second=Pair(*(field[visible_ids] for field in state.second)),
     )
     gradient.a[hidden] = np.nan
-    adam_step(after, gradient, state, RATES, SPARSE, visible_ids)
-    adam_step(alone, Pair(*(f[visible_ids] for f in gradient)), alone_state, RATES, SPARSE, np.arange(4))
+    adam_step(after, gradient, state, RATES, SPARSE, visible_ids, backend)
+    adam_step(alone, Pair(*(f[visible_ids] for f in gradient)), alone_state, RATES, SPARSE, np.arange(4), backend)
     for p0, p1, p_alone in zip(start, after, alone, strict=True):
         assert_array_equal(p1[hidden], p0[hidden])
         assert_array_equal(p1[visible_ids], p_alone)

@@ -123,10 +123,10 @@ def composite_vjp_with(
         slots,
     )
     out = CompositeGradient(
-        np.zeros_like(projection.means2d),
-        np.zeros_like(projection.conics),
-        np.zeros_like(projection.opacities),
-        np.zeros_like(colors),
+        np.zeros(projection.means2d.shape, projection.means2d.dtype),
+        np.zeros(projection.conics.shape, projection.conics.dtype),
+        np.zeros(projection.opacities.shape, projection.opacities.dtype),
+        np.zeros(colors.shape, colors.dtype),
         np.einsum("yx,yxk->k", 1 - output.alpha, v_image).astype(dtype),
     )
     sum_slots(slots, bins.gaussian_offsets, projection, out)

@@ -115,7 +115,11 @@ def surface_points_vjp(
     v_depths: Floats,
 ) -> tuple[Floats, Floats, Floats]:
     """Chain the gradient of the surface points to the Gaussians; see ``reference.depth.surface_points_vjp``."""
-    v_means, v_quats, v_scales = np.zeros_like(means), np.zeros_like(quats), np.zeros_like(scales)
+    v_means, v_quats, v_scales = (
+        np.zeros(means.shape, means.dtype),
+        np.zeros(quats.shape, quats.dtype),
+        np.zeros(scales.shape, scales.dtype),
+    )
     ids = dominant_ids.ravel()
     pixels = np.argsort(ids, kind="stable")[np.count_nonzero(ids < 0) :]  # grouped by Gaussian
     offsets = np.concatenate([[0], np.cumsum(np.bincount(ids[ids >= 0], minlength=len(means)))])

@@ -180,10 +180,10 @@ def project_vjp(
     dtype = means.dtype
     v_poses = np.zeros((N_CHUNKS, 12), np.float64)
     out = PrimitiveGradient(
-        np.zeros_like(means),
-        np.zeros_like(quats),
-        np.zeros_like(scales),
-        np.zeros_like(opacities),
+        np.zeros(means.shape, means.dtype),
+        np.zeros(quats.shape, quats.dtype),
+        np.zeros(scales.shape, scales.dtype),
+        np.zeros(opacities.shape, opacities.dtype),
         np.zeros((3, 3), dtype),
         np.zeros(3, dtype),
     )

@@ -37,7 +37,7 @@ def _sh_colors(means, sh_dc, sh_rest, centre, degree, c, radii, colors):
 
 def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int, radii: Ints) -> Floats:
     """Evaluate the colour of every visible Gaussian; see ``reference.spherical_harmonics.sh_colors``."""
-    colors = np.zeros_like(sh_dc)
+    colors = np.zeros(sh_dc.shape, sh_dc.dtype)
     centre = camera_centre(camera, means.dtype)
     _sh_colors(means, sh_dc, sh_rest, centre, degree, np.array(_CONSTANTS, means.dtype), radii, colors)
     return colors
@@ -85,9 +85,9 @@ def sh_colors_vjp(
     dtype = means.dtype
     v_centres = np.zeros((N_CHUNKS, 3), np.float64)
     out = SHGradient(
-        np.zeros_like(means),
-        np.zeros_like(sh_dc),
-        np.zeros_like(sh_rest),
+        np.zeros(means.shape, means.dtype),
+        np.zeros(sh_dc.shape, sh_dc.dtype),
+        np.zeros(sh_rest.shape, sh_rest.dtype),
         np.zeros((3, 3), dtype),
         np.zeros(3, dtype),
     )

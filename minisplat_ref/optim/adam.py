@@ -15,11 +15,10 @@ from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from minisplat_ref.types import Floats, Ints
+from minisplat_ref.backends import CPU, Backend
+from minisplat_ref.types import Ints
 
 Population = TypeVar("Population", bound=NamedTuple)
-
-BLOCK_VALUES = 1 << 14  # values updated at once: five blocks of float32 are 320 KiB, which stay in the cache of a core
 
 
 class AdamRule(NamedTuple):
@@ -64,6 +63,7 @@ def adam_step(
     rates: Sequence[float],
     rule: AdamRule,
     visible_ids: Ints,
+    backend: Backend = CPU,
 ) -> AdamState[Population]:
     """Update ``parameters`` and the moments in place.
 
@@ -78,6 +78,8 @@ def adam_step(
     rule : AdamRule
     visible_ids : ndarray of shape (V,)
         Rows that a visible-only rule updates, ascending; the others are neither read nor written.
+    backend : Backend
+        Implementation of the update.
 
     Returns
     -------
@@ -87,36 +89,8 @@ def adam_step(
     step = state.step + 1
     correction = math.sqrt(1 - rule.beta2**step) / (1 - rule.beta1**step) if rule.has_bias_correction else 1.0
     eps = rule.eps * (math.sqrt(1 - rule.beta2**step) if rule.has_bias_correction else 1.0)
-    rows = visible_ids if rule.is_visible_only else None
+    rows = visible_ids if rule.is_visible_only else np.arange(len(parameters[0]))
     for *arrays, rate in zip(parameters, gradient, state.first, state.second, rates, strict=True):
-        field, g, m, v = (array.reshape(len(array), math.prod(array.shape[1:])) for array in arrays)  # [N, width]
-        _update_field(field, g, m, v, rate * correction, eps, rule, rows)
+        tables = (array.reshape(len(array), math.prod(array.shape[1:])) for array in arrays)  # [N, width] each
+        backend.adam_update(*tables, rows, rate * correction, rule.beta1, rule.beta2, eps)
     return state._replace(step=step)
-
-
-def _update_field(
-    field: Floats,
-    gradient: Floats,
-    first: Floats,
-    second: Floats,
-    rate: float,
-    eps: float,
-    rule: AdamRule,
-    rows: Ints | None,
-) -> None:
-    """Update one [N, width] field, all of it or the chosen rows, as many rows at a time as the cache holds."""
-    n_rows = len(field) if rows is None else len(rows)
-    n_block_rows = max(1, BLOCK_VALUES // max(1, field.shape[1]))
-    for start in range(0, n_rows, n_block_rows):
-        block = slice(start, start + n_block_rows) if rows is None else rows[start : start + n_block_rows]
-        g, m, v = (_read(array, block) for array in (gradient, first, second))  # [B, width]
-        m += (1 - rule.beta1) * (g - m)
-        v += (1 - rule.beta2) * (g * g - v)
-        field[block] -= rate * m / (np.sqrt(v) + eps)
-        if rows is not None:
-            first[block], second[block] = m, v
-
-
-def _read(array: Floats, block: slice | Ints) -> Floats:
-    """Return a view of a slice, or a copy of rows: ``take`` copies them twice as fast as an index does."""
-    return array[block] if isinstance(block, slice) else array.take(block, axis=0)

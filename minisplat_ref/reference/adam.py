@@ -1,0 +1,47 @@
+"""The optimiser step: Adam (Kingma and Ba 2015, algorithm 1) on the chosen rows of one array.
+
+::
+
+    m <- m + (1 - beta1) (g - m)          v <- v + (1 - beta2) (g^2 - v)
+    p <- p - rate m / (sqrt(v) + eps)
+
+Left out: the bias corrections, which are the same number for all values of a step, so the caller folds them into the
+rate and into eps.
+"""
+
+import numpy as np
+
+from minisplat_ref.types import Floats, Ints
+
+
+def adam_update(
+    values: Floats,
+    gradient: Floats,
+    first: Floats,
+    second: Floats,
+    rows: Ints,
+    rate: float,
+    beta1: float,
+    beta2: float,
+    eps: float,
+) -> None:
+    """Update ``values`` and both moments in place.
+
+    Parameters
+    ----------
+    values, gradient, first, second : ndarray of shape (N, W)
+        Parameters, their gradient, and the decaying means of the gradient and of its square.
+    rows : ndarray of shape (V,)
+        Rows to update, each once; the others are neither read nor written.
+    rate : float
+        Learning rate, bias corrections included.
+    beta1, beta2 : float
+        Decay of the two means.
+    eps : float
+        Added to the root.
+    """
+    g, m, v = gradient[rows], first[rows], second[rows]  # [V, W]
+    m = m + (1 - beta1) * (g - m)
+    v = v + (1 - beta2) * (g * g - v)
+    first[rows], second[rows] = m, v
+    values[rows] -= rate * m / (np.sqrt(v) + eps)

@@ -1,0 +1,13 @@
+"""Adam for one value (Kingma and Ba 2015)."""
+
+import math
+
+from minisplat_ref.scalar._jit import scalar
+
+
+@scalar
+def adam_value(value, gradient, first, second, rate, keep1, keep2, eps):
+    """Return the value and both moments one step on; ``keep1`` and ``keep2`` are 1 - beta1 and 1 - beta2."""
+    first += keep1 * (gradient - first)
+    second += keep2 * (gradient * gradient - second)
+    return value - rate * first / (math.sqrt(second) + eps), first, second
