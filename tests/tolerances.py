@@ -79,7 +79,7 @@ FOX_CENTERS = 2.5e-3
 FOX_ROTATIONS = 1.0
 
 # Thousands of real points in float32: two depths that become equal, or a hit that crosses a threshold, change a pixel
-# by more than rounding. This part of the pixels may do so: none in the scene of the test, 2 of 17,010 with 20,000 points.
+# by more than rounding. This part of the pixels may do so: none in the scene of the test, 2 of 17,010 with 20,000.
 FLIPPED_PIXELS_MAX = 1e-3
 
 # Colours of sparse points against the pixels where they are seen, relative to shuffled ones: 0.38 to 0.65 on the real
