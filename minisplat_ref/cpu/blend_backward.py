@@ -19,10 +19,7 @@ from collections.abc import Callable
 import numpy as np
 
 from minisplat_ref.cpu.projection import N_CHUNKS
-from minisplat_ref.cpu.tile_state import (
-    BEHIND,
-    CHANNELS,
-    CHECK_EVERY,
+from minisplat_ref.cpu.records import (
     COLOR,
     CONIC_A,
     CONIC_B,
@@ -31,6 +28,13 @@ from minisplat_ref.cpu.tile_state import (
     MEAN_Y,
     N_FUSED,
     OPACITY,
+    fused_colors,
+    pixel_run,
+)
+from minisplat_ref.cpu.tile_state import (
+    BEHIND,
+    CHANNELS,
+    CHECK_EVERY,
     PIXELS,
     SHADE,
     TILE_WIDTH,
@@ -38,9 +42,7 @@ from minisplat_ref.cpu.tile_state import (
     T,
     X,
     Y,
-    fused_colors,
     is_finished,
-    pixel_run,
     start_tile,
 )
 from minisplat_ref.scalar._jit import REASSOCIATE, kernel, prange, scalar

@@ -10,9 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from minisplat_ref.constants import MEDIAN_TRANSMITTANCE
-from minisplat_ref.cpu.tile_state import (
-    CHANNELS,
-    CHECK_EVERY,
+from minisplat_ref.cpu.records import (
     COLOR,
     CONIC_A,
     CONIC_B,
@@ -21,15 +19,19 @@ from minisplat_ref.cpu.tile_state import (
     MEAN_Y,
     N_FUSED,
     OPACITY,
+    fused_colors,
+    pixel_run,
+)
+from minisplat_ref.cpu.tile_state import (
+    CHANNELS,
+    CHECK_EVERY,
     PIXELS,
     TILE_WIDTH,
     WEIGHT,
     T,
     X,
     Y,
-    fused_colors,
     is_finished,
-    pixel_run,
     start_tile,
 )
 from minisplat_ref.scalar._jit import REASSOCIATE, kernel, prange, scalar

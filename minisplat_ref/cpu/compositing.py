@@ -11,7 +11,8 @@ from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.blend_backward import N_MOMENTS, backward_kernel, sum_slots
 from minisplat_ref.cpu.blend_forward import forward_kernel
 from minisplat_ref.cpu.exponential import exp_exact, exp_fast
-from minisplat_ref.cpu.tile_state import frame_of, records_of, tile_ranges
+from minisplat_ref.cpu.records import records_of
+from minisplat_ref.cpu.tile_state import frame_of, tile_ranges
 from minisplat_ref.scalar._jit import n_threads
 from minisplat_ref.types import BlendStats, CompositeGradient, Floats, Projection, RenderOutput, TileBins
 
@@ -69,7 +70,7 @@ def composite_with(
     median_depth, dominant_ids = np.empty(shape, dtype), np.empty(shape, np.int32)
     weight_sums, hit_counts = np.zeros(n_pairs, dtype), np.zeros(n_pairs, np.int32)
     forward_kernel(exp, colors.shape[1])(
-        records_of(projection, colors),
+        records_of(projection, colors, conventions),
         projection.depths,
         background,
         bins.tile_offsets,
@@ -109,7 +110,7 @@ def composite_vjp_with(
     dtype, n_channels = colors.dtype, colors.shape[1]
     slots = np.empty((len(bins.gaussian_ids), N_MOMENTS + n_channels), dtype)
     backward_kernel(exp, n_channels)(
-        records_of(projection, colors),
+        records_of(projection, colors, conventions),
         bins.tile_offsets,
         bins.gaussian_ids,
         bins.slots,

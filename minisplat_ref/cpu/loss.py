@@ -47,12 +47,11 @@ def _kernels(dtype: np.dtype) -> tuple[Callable, Callable]:
     c1, c2 = dtype.type(SSIM_C1), dtype.type(SSIM_C2)
 
     @scalar
-    def filter_horizontally(s, source, target, n):
-        for i in range(n):
-            total = window[0] * s[source + i]
-            for k in range(1, SSIM_WINDOW):
-                total += window[k] * s[source + i + 3 * k]
-            s[target + i] = total
+    def across(s, start):
+        total = window[0] * s[start]
+        for k in range(1, SSIM_WINDOW):
+            total += window[k] * s[start + 3 * k]
+        return total
 
     @scalar
     def add_row_products(a, b, n, weight, s):
@@ -71,27 +70,40 @@ def _kernels(dtype: np.dtype) -> tuple[Callable, Callable]:
     @scalar
     def evaluate(s, n):
         for i in range(n):
-            i_, t_, ii, tt = s[5 * FIELD + i], s[6 * FIELD + i], s[7 * FIELD + i], s[8 * FIELD + i]
-            it = s[9 * FIELD + i]
-            s[i] = ssim(i_, t_, ii, tt, it, c1, c2)
-            s[FIELD + i], s[2 * FIELD + i], s[3 * FIELD + i] = ssim_vjp(i_, t_, ii, tt, it, c1, c2)
+            mean_i, mean_t = across(s, i), across(s, FIELD + i)
+            mean_ii, mean_tt, mean_it = across(s, 2 * FIELD + i), across(s, 3 * FIELD + i), across(s, 4 * FIELD + i)
+            by_i, by_ii, by_it = ssim_vjp(mean_i, mean_t, mean_ii, mean_tt, mean_it, c1, c2)
+            s[5 * FIELD + i] = ssim(mean_i, mean_t, mean_ii, mean_tt, mean_it, c1, c2)
+            s[6 * FIELD + i] = by_i
+            s[7 * FIELD + i] = by_ii
+            s[8 * FIELD + i] = by_it
+
+    @scalar
+    def combine(s, image, target, n, v_l1, v_ssim, out):
+        for i in range(n):
+            s[3 * FIELD + i] = across(s, i)
+            s[4 * FIELD + i] = across(s, FIELD + i)
+            s[5 * FIELD + i] = across(s, 2 * FIELD + i)
+        for i in range(n):
+            a, b = image[i], target[i]
+            by_ssim = s[3 * FIELD + i] + TWO * a * s[4 * FIELD + i] + b * s[5 * FIELD + i]
+            sign = ZERO if a == b else (ONE if a > b else -ONE)
+            out[i] = v_l1 * sign + v_ssim * by_ssim
 
     @kernel(REASSOCIATE)
     def ssim_rows(image, target, values, derivatives):
         height, length = values.shape
         for y in prange(height):
-            s = np.empty(10 * FIELD, image.dtype)
+            s = np.empty(9 * FIELD, image.dtype)
             for x in range(0, length, BLOCK):
                 n = min(BLOCK, length - x)
                 s[: 5 * FIELD] = ZERO
                 for k in range(SSIM_WINDOW):
                     add_row_products(image[y + k, x:], target[y + k, x:], n + 2 * PAD, window[k], s)
-                for field in range(5):
-                    filter_horizontally(s, field * FIELD, (5 + field) * FIELD, n)
                 evaluate(s, n)
-                values[y, x : x + n] = s[:n]
+                values[y, x : x + n] = s[5 * FIELD : 5 * FIELD + n]
                 for field in range(3):
-                    start = (1 + field) * FIELD
+                    start = (6 + field) * FIELD
                     derivatives[field, y + HALF_WINDOW, PAD + x : PAD + x + n] = s[start : start + n]
 
     @kernel(REASSOCIATE)
@@ -105,13 +117,8 @@ def _kernels(dtype: np.dtype) -> tuple[Callable, Callable]:
                 for field in range(3):
                     for k in range(SSIM_WINDOW):
                         add_row(derivatives[field, y + k, x:], n + 2 * PAD, window[k], s[field * FIELD :])
-                    filter_horizontally(s, field * FIELD, (3 + field) * FIELD, n)
-                for i in range(n):
-                    a = image[y + HALF_WINDOW, PAD + x + i]
-                    b = target[y + HALF_WINDOW, PAD + x + i]
-                    by_ssim = s[3 * FIELD + i] + TWO * a * s[4 * FIELD + i] + b * s[5 * FIELD + i]
-                    sign = ZERO if a == b else (ONE if a > b else -ONE)
-                    out[y, x + i] = v_l1 * sign + v_ssim * by_ssim
+                row, first = y + HALF_WINDOW, PAD + x
+                combine(s, image[row, first:], target[row, first:], n, v_l1, v_ssim, out[y, x:])
 
     return ssim_rows, loss_vjp_rows
 

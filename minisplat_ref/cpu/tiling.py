@@ -23,8 +23,14 @@ from minisplat_ref.types import Ints, Projection, TileBins, TileGrid
 TILE_WIDTH = 8  # one row of a tile is one AVX2 register of float32; divides INRIA's 16
 TILE_HEIGHT = 16
 N_CHUNKS = 16  # fixed, so that the lists do not depend on the number of threads
-MARGIN = np.float32(0.02)  # px and relative: rounding must not lose a pixel that the compositor would blend
+ELLIPSE_MARGIN = np.float32(0.02)  # px and relative: rounding must not lose a pixel that the compositor would blend
 OBLIQUE_MIN = np.float32(1e-3)  # det / (a c) below this has lost its digits in float32: fall back to the box
+
+
+@scalar
+def has_digits(a, b, c):
+    """Whether the determinant of a conic can be trusted; where not, the box has to do."""
+    return a * c - b * b > OBLIQUE_MIN * a * c
 
 
 @scalar
@@ -34,8 +40,8 @@ def _columns(ellipse, mx, low, high, x0, x1):
         return 0, 0
     low = max(low, -ellipse.half_height)
     high = min(high, ellipse.half_height)
-    right = mx + rightmost_offset(ellipse, low, high, 1) + MARGIN
-    left = mx - rightmost_offset(ellipse, low, high, -1) - MARGIN
+    right = mx + rightmost_offset(ellipse, low, high, 1) + ELLIPSE_MARGIN
+    left = mx - rightmost_offset(ellipse, low, high, -1) - ELLIPSE_MARGIN
     first = max(x0, math.ceil(max(left - HALF, ZERO)))
     end = min(x1, math.floor(min(right + HALF, x1)))
     return (first // TILE_WIDTH, (end - 1) // TILE_WIDTH + 1) if first < end else (0, 0)
@@ -47,12 +53,11 @@ def _write_tiles(n, projection, alpha_min, n_tiles_x, tiles, place, counts):
     x0, y0, x1, y1 = projection.boxes[n, 0], projection.boxes[n, 1], projection.boxes[n, 2], projection.boxes[n, 3]
     mx, my = projection.means2d[n, 0], projection.means2d[n, 1]
     a, b, c = projection.conics[n, 0], projection.conics[n, 1], projection.conics[n, 2]
-    has_digits = a * c - b * b > OBLIQUE_MIN * a * c
-    ellipse = visible_ellipse(a, b, c, projection.opacities[n], alpha_min, MARGIN)
+    ellipse = visible_ellipse(a, b, c, projection.opacities[n], alpha_min, ELLIPSE_MARGIN)
     n_pairs = 0
     for row in range(y0 // TILE_HEIGHT, (y1 - 1) // TILE_HEIGHT + 1):
         first, end = x0 // TILE_WIDTH, (x1 - 1) // TILE_WIDTH + 1
-        if has_digits:
+        if has_digits(a, b, c):
             low = max(row * TILE_HEIGHT, y0) + HALF - my
             high = min((row + 1) * TILE_HEIGHT, y1) - HALF - my
             first, end = _columns(ellipse, mx, low, high, x0, x1)
