@@ -132,6 +132,8 @@ dark is none, bright is a quarter of the range or more.</p>
 of the ray tracer. Near is bright; the third picture is the difference relative to the true depth.</p>
 {"".join(map(_depth_panel, report.views))}
 <h2>How the training went</h2>
+<p>Where the number of Gaussians jumps, those with a large gradient were cloned or split: the loss
+jumps with it, and recovers.</p>
 <div class="panel row">{"".join(_curves(report.log))}</div>
 <h2>What was run</h2>
 <div class="panel"><table>{settings}</table></div>
