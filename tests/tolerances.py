@@ -89,5 +89,5 @@ COLOR_RATIO = 0.8
 # Camera centres from four 512-pixel photographs against those from 1600-pixel ones, relative to their radius.
 SFM_CENTERS = 0.05
 
-# A PSNR of photographs in float32 against one in float64: the pixels differ by 6e-8, the dB by less than this relatively.
+# A PSNR of photographs in float32 against one in float64: pixels differ by 6e-8, the dB by less than this relatively.
 PSNR_FLOAT32 = 1e-6
