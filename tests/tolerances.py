@@ -91,3 +91,6 @@ SFM_CENTERS = 0.05
 
 # A PSNR of photographs in float32 against one in float64: pixels differ by 6e-8, the dB by less than this relatively.
 PSNR_FLOAT32 = 1e-6
+
+# World units, for a ring of radius 2: damping of 1e-3 moves the point nearest to all optical axes by about as much.
+ORBIT_DAMPING = 0.01
