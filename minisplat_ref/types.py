@@ -19,8 +19,8 @@ Bools = NDArray[np.bool_]
 class Gaussians(NamedTuple):
     """A population of Gaussians: the trained parameters, before their activations.
 
-    Gradients, Adam moments and learning rates share this type. An extension adds fields of shape [N, ...] in a NamedTuple
-    of its own.
+    Gradients, Adam moments and learning rates share this type. An extension adds fields of shape [N, ...] in a
+    NamedTuple of its own.
     """
 
     means: Floats
@@ -72,7 +72,7 @@ class Projection(NamedTuple):
     radii: Ints
     """[N, 2] int32 half-extents along x and y, pixels; 0 where culled."""
     boxes: Ints
-    """[N, 4] int32 pixels x0, y0, x1, y1 (half-open, inside the image) that the Gaussian may touch; empty where culled."""
+    """[N, 4] int32 pixels x0, y0, x1, y1 (half-open, in the image) that the Gaussian may touch; empty where culled."""
 
 
 class ProjectionGradient(NamedTuple):

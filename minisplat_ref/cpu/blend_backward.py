@@ -37,7 +37,6 @@ from minisplat_ref.cpu.tile_state import (
     CHECK_EVERY,
     PIXELS,
     SHADE,
-    TILE_WIDTH,
     WEIGHT,
     T,
     X,
@@ -45,7 +44,8 @@ from minisplat_ref.cpu.tile_state import (
     is_finished,
     start_tile,
 )
-from minisplat_ref.scalar._jit import REASSOCIATE, kernel, prange, scalar
+from minisplat_ref.cpu.tiling import TILE_WIDTH
+from minisplat_ref.scalar._jit import add_in_any_order, kernel, prange, scalar
 from minisplat_ref.scalar.compositing import alpha_vjp, blend, mahalanobis
 from minisplat_ref.scalar.literals import HALF, ONE, ZERO
 
@@ -115,23 +115,26 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
             unclamped = opacity * exp(-sigma)
             transmittance = s[T + i]
             s[T + i], weight = blend(transmittance, sigma, unclamped, frame)
-            s[WEIGHT + i] = weight
+            if n_channels > N_FUSED:
+                s[WEIGHT + i] = weight
             v_0, v_1, v_2 = s[CHANNELS + i], s[CHANNELS + PIXELS + i], s[CHANNELS + 2 * PIXELS + i]
-            shade = s[SHADE + i] + v_0 * color[0] + v_1 * color[1] + v_2 * color[2]
+            shade = v_0 * color[0] + v_1 * color[1] + v_2 * color[2]
+            if n_channels > N_FUSED:
+                shade += s[SHADE + i]
             behind = s[BEHIND + i] - weight * shade
             s[BEHIND + i] = behind
             q = -unclamped * alpha_vjp(transmittance, weight, unclamped, behind, shade, frame)
-            q_mean = q if unclamped <= frame.mean_gradient_max else ZERO * q
-            q_shape = q if unclamped <= frame.shape_gradient_max else ZERO * q
-            q_sum += q_shape
-            qx += q_mean * dx
-            qy += q_mean * dy
-            qxx += q_shape * dx * dx
-            qxy += q_shape * dx * dy
-            qyy += q_shape * dy * dy
-            v_red += weight * v_0
-            v_green += weight * v_1
-            v_blue += weight * v_2
+            q_mean = q if unclamped <= frame.mean_gradient_max else ZERO
+            q_shape = q if unclamped <= frame.shape_gradient_max else ZERO
+            q_sum = add_in_any_order(q_sum, q_shape)
+            qx = add_in_any_order(qx, q_mean * dx)
+            qy = add_in_any_order(qy, q_mean * dy)
+            qxx = add_in_any_order(qxx, q_shape * dx * dx)
+            qxy = add_in_any_order(qxy, q_shape * dx * dy)
+            qyy = add_in_any_order(qyy, q_shape * dy * dy)
+            v_red = add_in_any_order(v_red, weight * v_0)
+            v_green = add_in_any_order(v_green, weight * v_1)
+            v_blue = add_in_any_order(v_blue, weight * v_2)
         sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = q_sum, qx, qy, qxx, qxy, qyy
         fused = (v_red, v_green, v_blue)
         for k in range(min(n_channels, N_FUSED)):
@@ -139,7 +142,7 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
         for k in range(N_FUSED, n_channels):
             total = ZERO * a
             for i in range(n_pixels):
-                total += s[WEIGHT + i] * s[CHANNELS + k * PIXELS + i]
+                total = add_in_any_order(total, s[WEIGHT + i] * s[CHANNELS + k * PIXELS + i])
             sums[N_MOMENTS + k] = total
 
     @scalar
@@ -154,7 +157,7 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
             first, n_pixels = pixel_run(record, y0)
             hit_vjp(state[first:], n_pixels, record, frame, slots[places[m]])
 
-    @kernel(REASSOCIATE)
+    @kernel()
     def composite_tiles_vjp(
         records, offsets, ids, places, ranges, n_threads, frame, image, alpha, v_image, v_alpha, slots
     ):

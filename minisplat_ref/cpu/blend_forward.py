@@ -26,7 +26,6 @@ from minisplat_ref.cpu.tile_state import (
     CHANNELS,
     CHECK_EVERY,
     PIXELS,
-    TILE_WIDTH,
     WEIGHT,
     T,
     X,
@@ -34,7 +33,8 @@ from minisplat_ref.cpu.tile_state import (
     is_finished,
     start_tile,
 )
-from minisplat_ref.scalar._jit import REASSOCIATE, kernel, prange, scalar
+from minisplat_ref.cpu.tiling import TILE_WIDTH
+from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.compositing import blend, mahalanobis
 from minisplat_ref.scalar.literals import ONE, ZERO
 
@@ -115,7 +115,7 @@ def forward_kernel(exp: Callable, n_channels: int) -> Callable:
                     state[start:], n_pixels, ids[m], depths[ids[m]], best[start:], best_ids[start:], median[start:]
                 )
 
-    @kernel(REASSOCIATE)
+    @kernel()
     def composite_tiles(
         records, depths, background, offsets, ids, ranges, n_threads, frame, image, alpha, pair_stats, images
     ):

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import SSIM_C1, SSIM_C2, SSIM_SIGMA, SSIM_WINDOW
-from minisplat_ref.scalar._jit import REASSOCIATE, kernel, prange, scalar
+from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.literals import ONE, TWO, ZERO
 from minisplat_ref.scalar.loss import ssim, ssim_vjp
 from minisplat_ref.types import Bools, Floats
@@ -90,7 +90,7 @@ def _kernels(dtype: np.dtype) -> tuple[Callable, Callable]:
             sign = ZERO if a == b else (ONE if a > b else -ONE)
             out[i] = v_l1 * sign + v_ssim * by_ssim
 
-    @kernel(REASSOCIATE)
+    @kernel()
     def ssim_rows(image, target, values, derivatives):
         height, length = values.shape
         for y in prange(height):
@@ -106,7 +106,7 @@ def _kernels(dtype: np.dtype) -> tuple[Callable, Callable]:
                     start = (6 + field) * FIELD
                     derivatives[field, y + HALF_WINDOW, PAD + x : PAD + x + n] = s[start : start + n]
 
-    @kernel(REASSOCIATE)
+    @kernel()
     def loss_vjp_rows(image, target, derivatives, v_l1, v_ssim, out):
         height, length = out.shape
         for y in prange(height):

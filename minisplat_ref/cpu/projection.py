@@ -66,9 +66,9 @@ def lens_of(camera: Camera, conventions: Conventions, dtype: np.dtype) -> Lens:
             -(cy / camera.fy + margin * tan_y),
             (camera.height - cy) / camera.fy + margin * tan_y,
         )
-    values = (camera.fx, camera.fy, cx, cy, *limits, conventions.near_plane, conventions.far_plane)
-    values += (conventions.eps2d, COMPENSATION_FLOOR)
-    return Lens(*(dtype.type(value) for value in values), conventions.is_antialiased)
+    numbers = (camera.fx, camera.fy, cx, cy, *limits, conventions.near_plane, conventions.far_plane)
+    scalars = [dtype.type(number) for number in (*numbers, conventions.eps2d, COMPENSATION_FLOOR)]
+    return Lens._make([*scalars, conventions.is_antialiased])
 
 
 @scalar

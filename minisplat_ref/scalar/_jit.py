@@ -1,15 +1,18 @@
 """The only place where jit flags, caching and threading are decided.
 
 ``scalar`` marks a formula of one Gaussian or one pixel: it stays a plain Python function and is inlined into the
-kernels that call it. ``kernel`` compiles a parallel loop. Three facts shape this file:
+kernels that call it. ``kernel`` compiles a parallel loop. Four facts shape this file:
 
 * Numba's on-disk cache does not notice that a function *called* by a kernel has changed. The cache therefore lives in a
   folder named by a hash of all sources that kernels are made of: an edit anywhere makes a new folder.
 * Numba's ``workqueue`` threading layer aborts the process when two Python threads enter parallel regions, so all
   kernels share one lock.
-* ``fastmath=True`` would let the compiler assume that no NaN exists and ``isnan`` return False. ``REASSOCIATE`` only
-  lets it reorder sums and use fused multiply-adds, without which no reduction vectorises. The order it picks is fixed
-  at compile time, so results stay the same bytes on every run and at any number of threads.
+* ``fastmath=True`` would let the compiler assume that no NaN exists and ``isnan`` return False. Kernels may only
+  contract ``a * b + c`` to one rounding.
+* A sum over pixels is vectorised only if the compiler may change its order, but a kernel that may do so everywhere
+  gives other last digits when it is loaded from the cache than when it was just compiled (what is cached has been
+  optimised twice). The permission is therefore given addition by addition, with ``add_in_any_order``; the order is
+  fixed at compile time, and the bytes are the same in every process and at any number of threads.
 """
 
 import functools
@@ -22,11 +25,9 @@ from typing import Any
 
 import numba
 from numba import prange
-from numba.extending import register_jitable
+from numba.extending import intrinsic, register_jitable
 
-__all__ = ["REASSOCIATE", "kernel", "n_threads", "prange", "scalar", "source_hash"]
-
-REASSOCIATE = {"reassoc", "contract", "arcp", "nsz"}
+__all__ = ["add_in_any_order", "kernel", "n_threads", "prange", "scalar", "source_hash"]
 
 _KERNEL_LOCK = threading.RLock()
 _PACKAGE = Path(__file__).parent.parent
@@ -69,13 +70,27 @@ def scalar(function: Callable) -> Callable:
     return register_jitable(function)
 
 
-def kernel(fastmath: set[str] | bool = False, parallel: bool = True) -> Callable[[Callable], Callable]:
+def _add(a: Any, b: Any) -> Any:
+    return a + b
+
+
+@intrinsic
+def _add_reassociable(context: Any, a: Any, b: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.fadd(*args, flags=["reassoc", "contract", "nsz"])
+
+    return a(a, b), generate
+
+
+add_in_any_order: Any = _add if numba.config.DISABLE_JIT else _add_reassociable  # type: ignore[attr-defined]
+"""``a + b`` of two floats of one dtype, as a step of a sum whose order the compiler may choose."""
+
+
+def kernel(parallel: bool = True) -> Callable[[Callable], Callable]:
     """Compile a parallel loop over bundles of arrays.
 
     Parameters
     ----------
-    fastmath : set of str or bool
-        ``REASSOCIATE`` for kernels whose inner loop is a reduction, otherwise False.
     parallel : bool
         False for the few loops whose steps depend on each other.
 
@@ -87,14 +102,14 @@ def kernel(fastmath: set[str] | bool = False, parallel: bool = True) -> Callable
 
     def decorate(function: Callable) -> Callable:
         folder = _cache_folder()
-        previous = numba.config.CACHE_DIR
-        numba.config.CACHE_DIR = folder or previous  # read by numba at decoration only
+        previous = numba.config.CACHE_DIR  # type: ignore[attr-defined]  # numba sets its options at import
+        numba.config.CACHE_DIR = folder or previous  # type: ignore[attr-defined]  # read at decoration only
         try:
-            compiled = numba.njit(parallel=parallel, cache=folder is not None, error_model="numpy", fastmath=fastmath)(
-                function
-            )
+            compiled = numba.njit(
+                parallel=parallel, cache=folder is not None, error_model="numpy", fastmath={"contract"}
+            )(function)
         finally:
-            numba.config.CACHE_DIR = previous
+            numba.config.CACHE_DIR = previous  # type: ignore[attr-defined]
 
         @functools.wraps(function)
         def locked(*args: Any) -> Any:

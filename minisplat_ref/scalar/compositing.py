@@ -47,7 +47,7 @@ def blend(transmittance, sigma, unclamped, frame):
     after = transmittance * (ONE - alpha)
     is_hit = (alpha >= frame.alpha_min) & (sigma >= ZERO)
     is_open = after >= frame.transmittance_min
-    weight = alpha * transmittance if is_hit & is_open else ZERO * alpha
+    weight = alpha * transmittance if is_hit & is_open else ZERO
     stopped = after if is_open else -abs(transmittance)
     return (stopped if is_hit else transmittance), weight
 
@@ -79,4 +79,4 @@ def alpha_vjp(transmittance, weight, unclamped, behind, shade, frame):
     """
     alpha = min(unclamped, frame.alpha_max)
     value = transmittance * shade - behind / (ONE - alpha)
-    return value if weight > ZERO else ZERO * alpha
+    return value if weight > ZERO else ZERO

@@ -29,7 +29,7 @@ def support_box(footprint, opacity, alpha_min, width, height):
 
 
 @scalar
-def inria_tiles(x, r, size):
+def inria_tiles(x: float, r: float, size: float) -> tuple[int, int]:
     """Pixels of the tiles that INRIA counts under [x - r, x + r], where x counts pixel centres as integers."""
     beyond = size + INRIA_TILE - 1
     first = math.floor(min(max(x - r, ZERO), beyond) / INRIA_TILE)
