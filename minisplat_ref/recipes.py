@@ -169,9 +169,9 @@ def get_recipe(name: str, iterations: int | None = None) -> Recipe:
     return RECIPES[name] if iterations is None else scaled(RECIPES[name], iterations)
 
 
-# Densification needs the mean gradient over about all views, and time to settle: each event multiplies the Gaussians by
-# up to two. In 3,000 iterations, an event every 10 turned 13,275 points of a 43-view scene into 195,000 Gaussians by
-# iteration 300; an event every 100 ends at 49,000.
+# Densification needs the mean gradient over about all views, and time to settle: each event multiplies the Gaussians
+# by up to two, so that events compressed to every few iterations let their number explode. What an opacity reset fades
+# needs some hundred iterations to come back.
 _densifying = partial(Every, 100, stop=15_000, least_period=100)
 
 _3DGS = Recipe(
@@ -195,7 +195,7 @@ _3DGS = Recipe(
         _densifying(partial(events.clone_and_split, threshold=2e-4, size_fraction=0.01), start=500),
         _densifying(partial(events.prune_faint, least_opacity=0.005), start=500),
         _densifying(partial(events.prune_large, size_fraction=0.1), start=3_000),
-        Every(3_000, partial(events.reset_opacity, ceiling=0.01), stop=15_000),
+        Every(3_000, partial(events.reset_opacity, ceiling=0.01), stop=15_000, least_period=300),
         At(500, partial(events.reset_opacity_on_white, ceiling=0.01)),
     ),
 )

@@ -6,13 +6,15 @@ undefined.
 
 import math
 
+import numpy as np
+
 from minisplat_ref.constants import SUPPORT_SIGMA_MAX
 from minisplat_ref.scalar._jit import scalar
 from minisplat_ref.scalar.literals import HALF, THREE, TWO, ZERO
 
 INRIA_TILE = 16  # px; INRIA's rule is stated in tiles of this size
 INRIA_ROOT_MIN = 0.1  # px^4; floor of (lambda_1 - lambda_2)^2 / 4 in INRIA's largest eigenvalue
-RADIUS_MAX = 1 << 24  # px; covers any image, survives the cast to int32, and is exact in float32
+RADIUS_MAX = np.float32(1 << 24)  # px; covers any image, survives the cast to int32, and is exact in float32
 
 
 @scalar
@@ -29,7 +31,7 @@ def support_box(footprint, opacity, alpha_min, width, height):
 
 
 @scalar
-def inria_tiles(x: float, r: float, size: float) -> tuple[int, int]:
+def inria_tiles(x, r, size):
     """Pixels of the tiles that INRIA counts under [x - r, x + r], where x counts pixel centres as integers."""
     beyond = size + INRIA_TILE - 1
     first = math.floor(min(max(x - r, ZERO), beyond) / INRIA_TILE)
