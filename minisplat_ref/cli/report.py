@@ -9,10 +9,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any, NamedTuple
 
-import imageio.v3 as imageio
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
+from PIL import Image
 
 from minisplat_ref.cli.pictures import Picture, colored, depth_picture, depth_range
 from minisplat_ref.types import Floats
@@ -172,9 +172,11 @@ def _panel(label: str, figures: Iterable[str]) -> str:
 
 
 def _figure(picture: Picture, caption: str) -> str:
-    png = base64.b64encode(imageio.imwrite("<bytes>", picture, extension=".png")).decode("ascii")
+    png = io.BytesIO()
+    Image.fromarray(picture).save(png, format="PNG")
+    content = base64.b64encode(png.getvalue()).decode("ascii")
     return (
-        f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{png}">'
+        f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{content}">'
         f"<figcaption>{escape(caption)}</figcaption></figure>"
     )
 
