@@ -1,7 +1,8 @@
 """The README's measurements: the tables appear, and the errors in them are those of a working backend."""
 
-from data_tools.measure import measure_stages
 from tolerances import PARITY_FLOAT32_IMAGE, PARITY_FLOAT64
+
+from data_tools.measure import measure_stages
 
 
 def test_stage_table(capsys):
