@@ -118,6 +118,31 @@ def test_kernels_run_as_python(tmp_path):
 # --- kernel cache ---
 
 
+FROM_CACHE = """
+import sys
+import numpy as np
+from scenes import as_dtype, make_camera, make_gaussians
+from test_kernels import drawn
+from minisplat_ref.backends import CPU
+gaussians = as_dtype(make_gaussians(np.random.default_rng(5), 150), np.float32)
+np.savez(sys.argv[1], *drawn(gaussians, make_camera(64, 48, fx=80, fy=75), CPU))
+"""
+
+
+def test_compiled_and_cached_kernels_give_the_same_bytes(tmp_path):
+    """A run and its continuation in another process must agree; the second process must not compile anything anew."""
+    folders = os.pathsep.join([str(Path(__file__).parent), str(PACKAGE.parent)])
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels"), "PYTHONPATH": folders}
+    results, cached = [], []
+    for name in ("compiled.npz", "cached.npz"):
+        subprocess.run([sys.executable, "-c", FROM_CACHE, str(tmp_path / name)], env=environment, check=True)
+        with np.load(tmp_path / name) as arrays:
+            results.append([arrays[key].tobytes() for key in arrays.files])
+        cached.append(sorted(path.name for path in (tmp_path / "kernels").rglob("*.nbc")))
+    assert results[0] == results[1]
+    assert len(cached[0]) > 5 and cached[0] == cached[1]
+
+
 @pytest.mark.parametrize("source", ["scalar/covariance.py", "cpu/blend_forward.py", "constants.py", "types.py"])
 def test_cache_folder_follows_the_sources(source, tmp_path, monkeypatch):
     # Numba notices no change in a function that a kernel calls from another file: hence a folder per source hash.

@@ -25,7 +25,7 @@ from typing import Any
 
 import numba
 from numba import prange
-from numba.extending import intrinsic, register_jitable
+from numba.extending import intrinsic, overload, register_jitable
 
 __all__ = ["add_in_any_order", "kernel", "n_threads", "prange", "scalar", "source_hash"]
 
@@ -70,7 +70,8 @@ def scalar(function: Callable) -> Callable:
     return register_jitable(function)
 
 
-def _add(a: Any, b: Any) -> Any:
+def add_in_any_order(a, b):
+    """Return ``a + b`` of two floats of one dtype, as a step of a sum whose order the compiler may choose."""
     return a + b
 
 
@@ -82,8 +83,12 @@ def _add_reassociable(context: Any, a: Any, b: Any) -> Any:
     return a(a, b), generate
 
 
-add_in_any_order: Any = _add if numba.config.DISABLE_JIT else _add_reassociable  # type: ignore[attr-defined]
-"""``a + b`` of two floats of one dtype, as a step of a sum whose order the compiler may choose."""
+@overload(add_in_any_order)
+def _overload_add_in_any_order(a, b):
+    def add(a, b):
+        return _add_reassociable(a, b)  # type: ignore[call-arg]  # the typing context is numba's to pass
+
+    return add
 
 
 def kernel(parallel: bool = True) -> Callable[[Callable], Callable]:
