@@ -3,7 +3,8 @@
 ``python -m data_tools.measure stages`` times one fixed workload, 50,000 Gaussians at 480 x 270 drawn from a seeded
 generator, and prints beside each time how far the result is from the float64 reference.
 ``python -m data_tools.measure scenes SCENE... --out DIR`` trains every scene through the command line, as a user would,
-and prints a table. Times depend on the machine; compare figures of one run only.
+and prints a table. ``python -m data_tools.measure rate SCENE`` times training iterations while the number of Gaussians
+stays the same. Times depend on the machine; compare figures of one run only.
 """
 
 import argparse
@@ -19,10 +20,14 @@ import numpy as np
 
 from minisplat_ref.backends import CPU, CPU_EXACT, REFERENCE, Backend
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
+from minisplat_ref.io import load_scene
+from minisplat_ref.recipes import get_recipe
 from minisplat_ref.render import RenderGradient, render, render_vjp
+from minisplat_ref.train import train
 from minisplat_ref.types import Camera, Floats, Gaussians
 
 WIDTH, HEIGHT, FOCAL = 480, 270, 400.0
+WARM_UP = 20  # iterations that compile and are not timed
 
 
 def trained_like(n: int, seed: int = 0) -> tuple[Gaussians, Camera]:
@@ -122,6 +127,20 @@ def measure_scenes(scenes: list[Path], out: Path, recipe: str, iterations: int) 
     print("|---|---|---|---|---|---|---|", *rows, sep="\n")
 
 
+def measure_rate(scene_folder: Path, n: int, iterations: int) -> None:
+    """Print how many training iterations a second there are while the number of Gaussians stays at ``n``."""
+    scene = load_scene(scene_folder)
+    chosen = np.random.default_rng(0).choice(len(scene.points), n, replace=False)
+    scene = scene._replace(points=scene.points[chosen], point_colors=scene.point_colors[chosen])
+    recipe = get_recipe("3dgs-accel")._replace(iterations=WARM_UP + iterations, events=())
+    times: list[float] = []
+    train(scene, recipe, seed=0, on_step=lambda _: times.append(time.perf_counter()))
+    seconds = np.diff(times[WARM_UP - 1 :])
+    camera = scene.train_views[0].camera
+    print(f"{scene.name}, {camera.width} x {camera.height}, {n} Gaussians, {iterations} iterations; {machine()}")
+    print(f"{iterations / seconds.sum():.1f} iterations/s, median {1e3 * np.median(seconds):.1f} ms")
+
+
 def machine() -> str:
     """Return what the figures depend on: processor, threads, versions."""
     import numba
@@ -147,9 +166,15 @@ def main() -> None:
     scenes.add_argument("--out", type=Path, required=True, help="new folder for the runs")
     scenes.add_argument("--recipe", default="3dgs-accel")
     scenes.add_argument("--iterations", type=int, default=3_000)
+    rate = commands.add_parser("rate", help="training iterations per second at a constant number of Gaussians")
+    rate.add_argument("scene", type=Path)
+    rate.add_argument("--gaussians", type=int, default=10_000)
+    rate.add_argument("--iterations", type=int, default=300)
     arguments = parser.parse_args()
     if arguments.command == "stages":
         measure_stages(arguments.gaussians, arguments.repeats)
+    elif arguments.command == "rate":
+        measure_rate(arguments.scene, arguments.gaussians, arguments.iterations)
     else:
         measure_scenes(arguments.scene, arguments.out, arguments.recipe, arguments.iterations)
 
