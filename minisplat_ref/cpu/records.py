@@ -23,8 +23,7 @@ N_FUSED = 3  # channels that ride in the pixel loop itself; fewer are padded wit
 def _write_record(n, projection, colors, alpha_min, records):
     a, b, c = projection.conics[n, 0], projection.conics[n, 1], projection.conics[n, 2]
     my = projection.means2d[n, 1]
-    first = projection.boxes[n, 1] + HALF * 0
-    end = projection.boxes[n, 3] + HALF * 0
+    first, end = ONE * projection.boxes[n, 1], ONE * projection.boxes[n, 3]  # as floats
     if has_digits(a, b, c):
         reach = visible_ellipse(a, b, c, projection.opacities[n], alpha_min, ELLIPSE_MARGIN).half_height
         first = max(first, math.ceil(my - reach - HALF - ELLIPSE_MARGIN))
