@@ -77,7 +77,8 @@ def train(
     Returns
     -------
     state : TrainState
-        The same seed gives the same bytes; a state that was saved, loaded and continued does, too.
+        The same seed gives the same bytes, and so does a state that was saved, loaded and continued, once the kernels
+        are in the cache: a process that compiles them itself can differ in the last digit.
 
     Raises
     ------

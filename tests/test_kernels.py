@@ -130,7 +130,10 @@ np.savez(sys.argv[1], *drawn(gaussians, make_camera(64, 48, fx=80, fy=75), CPU))
 
 
 def test_compiled_and_cached_kernels_give_the_same_bytes(tmp_path):
-    """A run and its continuation in another process must agree; the second process must not compile anything anew."""
+    """Blending must agree in both, and the second process must not compile anything anew.
+
+    Projection can differ in the last digit, a known limit in the README; this view is one in which it does not.
+    """
     folders = os.pathsep.join([str(Path(__file__).parent), str(PACKAGE.parent)])
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels"), "PYTHONPATH": folders}
     results, cached = [], []

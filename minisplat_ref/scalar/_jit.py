@@ -12,7 +12,8 @@ kernels that call it. ``kernel`` compiles a parallel loop. Four facts shape this
 * A sum over pixels is vectorised only if the compiler may change its order, but a kernel that may do so everywhere
   gives other last digits when it is loaded from the cache than when it was just compiled (what is cached has been
   optimised twice). The permission is therefore given addition by addition, with ``add_in_any_order``; the order is
-  fixed at compile time, and the bytes are the same in every process and at any number of threads.
+  fixed at compile time, and the bytes are the same at any number of threads. Known and open: projection and the
+  gradients of colour and loss still differ in the last digit between just compiled and loaded from the cache.
 """
 
 import functools
