@@ -10,12 +10,13 @@ figures were measured like this. The removal of those large in the world does wo
 """
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.strategy.ops import Edit, concat, keep, take
-from minisplat_ref.types import Floats, Gaussians, Ints
+from minisplat_ref.types import Bools, Floats, Gaussians, Ints
 
 N_CHILDREN = 2  # a split Gaussian is replaced by this many
 SPLIT_SHRINK = 0.8 * N_CHILDREN  # children's scales are the parent's divided by this: 1.6 in the paper
@@ -42,14 +43,47 @@ def screen_gradient_norms(v_means2d: Floats, width: int, height: int) -> Floats:
     return np.sqrt(v_x * v_x + v_y * v_y)
 
 
+def random_children(gaussians: Gaussians, parent_ids: Ints, rng: np.random.Generator) -> Gaussians:
+    """Return two children of each parent, drawn from it: mu + R (s * n) with n ~ N(0, I).
+
+    They have 1/1.6 of its scales and the same opacity and colour.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+    parent_ids : ndarray of shape (P,)
+        Rows to split.
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    children : Gaussians
+        2 P rows: the first child of every parent, then the second.
+    """
+    parents = take(gaussians, np.tile(parent_ids, N_CHILDREN))
+    dtype = parents.means.dtype
+    offsets = np.exp(parents.log_scales) * rng.standard_normal(parents.means.shape).astype(dtype)  # [2P, 3] own axes
+    rotations = rotation_matrices(parents.quats)  # [2P, 3, 3]
+    return parents._replace(
+        means=parents.means + (rotations @ offsets[:, :, None])[:, :, 0],
+        log_scales=parents.log_scales - dtype.type(math.log(SPLIT_SHRINK)),
+    )
+
+
 def clone_and_split(
-    gaussians: Gaussians, mean_norms: Floats, *, threshold: float, size_limit: float, rng: np.random.Generator
+    gaussians: Gaussians,
+    mean_norms: Floats,
+    *,
+    threshold: float,
+    size_limit: float,
+    rng: np.random.Generator,
+    is_blurred: Bools | None = None,
+    draw_children: Callable[[Gaussians, Ints, np.random.Generator], Gaussians] = random_children,
 ) -> Edit:
     """Clone the small and split the large among the Gaussians whose mean gradient reaches ``threshold``.
 
     A clone is an exact copy in the same place: the paper moves it along the gradient, the released code does not, and
-    the two drift apart because the copy starts without momentum. A split Gaussian is replaced by two drawn from it,
-    mu + R (s * n) with n ~ N(0, I), of 1/1.6 its scales and the same opacity and colour.
+    the two drift apart because the copy starts without momentum. A split Gaussian is replaced by its children.
 
     Parameters
     ----------
@@ -62,6 +96,11 @@ def clone_and_split(
         Largest scale up to which a Gaussian is cloned rather than split, world units.
     rng : numpy.random.Generator
         Draws the children's positions.
+    is_blurred : ndarray of shape (N,) of booleans, optional
+        Split these too, whatever their gradient and size (Mini-Splatting,
+        :func:`minisplat_ref.strategy.blur_split.is_blurred`).
+    draw_children : function
+        :func:`random_children`, or another with its signature and order of rows.
 
     Returns
     -------
@@ -70,24 +109,16 @@ def clone_and_split(
     """
     is_pulled = mean_norms >= threshold  # [N]
     is_large = np.exp(gaussians.log_scales.max(axis=1, initial=-np.inf)) > size_limit  # [N]
-    survivor_ids = np.flatnonzero(~(is_pulled & is_large))
-    clone_ids = np.flatnonzero(is_pulled & ~is_large)
-    parent_ids = np.tile(np.flatnonzero(is_pulled & is_large), N_CHILDREN)
+    is_split = is_pulled & is_large  # [N]
+    if is_blurred is not None:
+        is_split |= is_blurred
+    survivor_ids, split_ids = np.flatnonzero(~is_split), np.flatnonzero(is_split)
+    clone_ids = np.flatnonzero(is_pulled & ~is_split)
+    parent_ids = np.concatenate([survivor_ids, clone_ids, np.tile(split_ids, N_CHILDREN)])
     return Edit(
-        concat(take(gaussians, survivor_ids), take(gaussians, clone_ids), _draw_children(gaussians, parent_ids, rng)),
-        np.concatenate([survivor_ids, clone_ids, parent_ids]),
-        np.arange(len(survivor_ids) + len(clone_ids) + len(parent_ids)) >= len(survivor_ids),
-    )
-
-
-def _draw_children(gaussians: Gaussians, parent_ids: Ints, rng: np.random.Generator) -> Gaussians:
-    parents = take(gaussians, parent_ids)
-    dtype = parents.means.dtype
-    offsets = np.exp(parents.log_scales) * rng.standard_normal(parents.means.shape).astype(dtype)  # [C, 3] own axes
-    rotations = rotation_matrices(parents.quats)  # [C, 3, 3]
-    return parents._replace(
-        means=parents.means + (rotations @ offsets[:, :, None])[:, :, 0],
-        log_scales=parents.log_scales - dtype.type(math.log(SPLIT_SHRINK)),
+        concat(take(gaussians, survivor_ids), take(gaussians, clone_ids), draw_children(gaussians, split_ids, rng)),
+        parent_ids,
+        np.arange(len(parent_ids)) >= len(survivor_ids),
     )
 
 
