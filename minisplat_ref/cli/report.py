@@ -1,67 +1,17 @@
-"""The demo's ``report.html``: one file with pictures, curves and settings, and nothing that it loads from elsewhere.
+"""What the demo's ``report.html`` holds, top to bottom."""
 
-Pictures are PNG in base64, curves are inline SVG, the style sheet is in the page.
-"""
-
-import base64
-import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.figure import Figure
-from PIL import Image
 
+from minisplat_ref.cli.page import captioned, cards, page, panel, table
 from minisplat_ref.cli.pictures import Picture, colored, depth_picture, depth_range
+from minisplat_ref.cli.plots import plot, to_svg
 from minisplat_ref.types import Floats
 
 DEPTH_ERROR_RANGE = 0.1  # of the true depth: larger differences are all shown as the brightest colour
-
-PLOT_STYLE: dict[Any, Any] = {
-    "svg.fonttype": "none",  # text stays text: smaller, and in the page's own font
-    "svg.hashsalt": "minisplat-ref",  # the same run gives the same bytes
-    "font.family": "sans-serif",
-    "font.size": 11,
-    "axes.edgecolor": "#8a94a0",
-    "axes.labelcolor": "#4a5560",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#e6eaee",
-    "xtick.color": "#6a7580",
-    "ytick.color": "#6a7580",
-}
-
-STYLE = """
-:root { color-scheme: light }
-body { margin: 0; background: #f6f7f9; color: #25303b; font: 16px/1.55 system-ui, "DejaVu Sans", sans-serif }
-main { max-width: 1080px; margin: 0 auto; padding: 40px 24px 64px }
-h1 { font-size: 30px; line-height: 1.2; margin: 0 0 8px; font-weight: 650 }
-h2 { font-size: 20px; margin: 48px 0 4px; font-weight: 600 }
-p { margin: 4px 0 16px; color: #4a5560; max-width: 74ch }
-.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 12px; margin: 24px 0 }
-.card, .panel { background: #fff; border: 1px solid #e3e7eb; border-radius: 10px }
-.card { padding: 14px 16px }
-.card b { display: block; font-size: 24px; font-weight: 600; font-variant-numeric: tabular-nums }
-.card span { color: #6a7580; font-size: 13.5px }
-.panel { padding: 16px; margin: 12px 0 }
-.row { display: grid; grid-template-columns: repeat(3, minmax(0, 1fr)); gap: 12px }
-figure { margin: 0 }
-figure img { display: block; width: 100%; border-radius: 4px }
-figcaption { color: #6a7580; font-size: 13.5px; padding: 6px 0 2px }
-.label { font-size: 14px; color: #4a5560; margin: 0 0 8px }
-svg { display: block; width: 100%; height: auto }
-table { border-collapse: collapse; width: 100%; font-size: 15px }
-td { padding: 6px 8px; border-bottom: 1px solid #eef1f4; vertical-align: top }
-tr:last-child td { border-bottom: 0 }
-td:first-child { color: #6a7580; width: 30% }
-pre { background: #eef2f6; border-radius: 8px; padding: 12px 14px; margin: 6px 0 16px; overflow-x: auto }
-pre, code { font-size: 14px }
-code, pre { font-family: ui-monospace, "DejaVu Sans Mono", monospace }
-@media (max-width: 700px) { .row { grid-template-columns: 1fr } }
-"""
 
 
 class ViewPictures(NamedTuple):
@@ -104,25 +54,8 @@ class Report(NamedTuple):
 
 def report_html(report: Report) -> str:
     """Return the page as text of one self-contained HTML file."""
-    cards = "".join(
-        f'<div class="card"><b>{escape(value)}</b><span>{escape(meaning)}</span></div>'
-        for value, meaning in report.figures
-    )
-    settings = "".join(f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>" for name, value in report.settings)
     steps = "".join(f"<p>{escape(text)}</p><pre>{escape(command)}</pre>" for text, command in report.next_steps)
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{escape(report.title)}</title>
-<style>{STYLE}</style>
-</head>
-<body>
-<main>
-<h1>{escape(report.title)}</h1>
-<p>{escape(report.introduction)}</p>
-<div class="cards">{cards}</div>
+    body = f"""{cards(report.figures)}
 <h2>Held-out views</h2>
 <p>The training never saw these views. Error is the mean absolute difference of the three channels:
 dark is none, bright is a quarter of the range or more.</p>
@@ -136,22 +69,19 @@ of the ray tracer. Near is bright; the third picture is the difference relative 
 jumps with it, and recovers.</p>
 <div class="panel row">{"".join(_curves(report.log))}</div>
 <h2>What was run</h2>
-<div class="panel"><table>{settings}</table></div>
+{table(report.settings)}
 <h2>What to try next</h2>
-{steps}
-</main>
-</body>
-</html>
-"""
+{steps}"""
+    return page(report.title, report.introduction, body)
 
 
 def _color_panel(view: ViewPictures) -> str:
     pictures = [
-        _figure(view.truth, "truth"),
-        _figure(view.render, "render"),
-        _figure(view.error, "error"),
+        captioned(view.truth, "truth"),
+        captioned(view.render, "render"),
+        captioned(view.error, "error"),
     ]
-    return _panel(f"{view.name}: {view.caption}", pictures)
+    return panel(f"{view.name}: {view.caption}", pictures)
 
 
 def _depth_panel(view: ViewPictures) -> str:
@@ -160,25 +90,11 @@ def _depth_panel(view: ViewPictures) -> str:
     relative = np.abs(view.depth - view.true_depth) / np.where(is_seen, view.true_depth, 1.0) * is_seen  # [H, W]
     median = float(np.median(relative[is_seen])) if is_seen.any() else 0.0
     pictures = [
-        _figure(depth_picture(view.true_depth, near, far), f"true depth, {near:.2f} to {far:.2f} units"),
-        _figure(depth_picture(view.depth, near, far), "rendered depth, same colours"),
-        _figure(colored(relative, 0.0, DEPTH_ERROR_RANGE, "magma"), "relative difference, 0 to 10 % or more"),
+        captioned(depth_picture(view.true_depth, near, far), f"true depth, {near:.2f} to {far:.2f} units"),
+        captioned(depth_picture(view.depth, near, far), "rendered depth, same colours"),
+        captioned(colored(relative, 0.0, DEPTH_ERROR_RANGE, "magma"), "relative difference, 0 to 10 % or more"),
     ]
-    return _panel(f"{view.name}: median difference {100 * median:.1f} %", pictures)
-
-
-def _panel(label: str, figures: Iterable[str]) -> str:
-    return f'<div class="panel"><div class="label">{escape(label)}</div><div class="row">{"".join(figures)}</div></div>'
-
-
-def _figure(picture: Picture, caption: str) -> str:
-    png = io.BytesIO()
-    Image.fromarray(picture).save(png, format="PNG")
-    content = base64.b64encode(png.getvalue()).decode("ascii")
-    return (
-        f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{content}">'
-        f"<figcaption>{escape(caption)}</figcaption></figure>"
-    )
+    return panel(f"{view.name}: median difference {100 * median:.1f} %", pictures)
 
 
 def _curves(log: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -193,15 +109,6 @@ def _curves(log: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _curve(steps: Sequence[int], values: Sequence[float], title: str, color: str) -> str:
-    with rc_context(PLOT_STYLE):
-        figure = Figure(figsize=(4.4, 3.0), layout="constrained")
-        axes = figure.subplots()
+    with plot(title, "step") as (figure, axes):
         axes.plot(steps, values, color=color, linewidth=1.8)
-        axes.set_title(title, fontsize=11, loc="left", color="#4a5560")
-        axes.set_xlabel("step")
-        axes.margins(x=0.01)
-        buffer = io.StringIO()
-        no_metadata = dict.fromkeys(("Creator", "Date", "Format", "Type"))
-        figure.savefig(buffer, format="svg", transparent=True, metadata=no_metadata)
-    svg = buffer.getvalue()
-    return svg[svg.index("<svg") :]
+    return to_svg(figure)

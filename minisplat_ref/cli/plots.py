@@ -1,0 +1,67 @@
+"""Curves in one style, as inline SVG for a page and as PNG files."""
+
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from minisplat_ref.io.atomic import replacing
+
+TITLE_COLOR = "#4a5560"
+PNG_DPI = 150
+PLOT_STYLE: dict[Any, Any] = {
+    "svg.fonttype": "none",  # text stays text: smaller, and in the page's own font
+    "svg.hashsalt": "minisplat-ref",  # the same run gives the same bytes
+    "font.family": "sans-serif",
+    "font.size": 11,
+    "axes.edgecolor": "#8a94a0",
+    "axes.labelcolor": TITLE_COLOR,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#e6eaee",
+    "xtick.color": "#6a7580",
+    "ytick.color": "#6a7580",
+}
+
+
+@contextmanager
+def plot(title: str, x_label: str, size: tuple[float, float] = (4.4, 3.0)) -> Iterator[tuple[Figure, Axes]]:
+    """Give a new figure and its axes to draw on.
+
+    Parameters
+    ----------
+    title : str
+        What the y axis shows, with its unit; written above it.
+    x_label : str
+    size : pair of float
+        Width and height, inches.
+    """
+    with rc_context(PLOT_STYLE):
+        figure = Figure(figsize=size, layout="constrained")
+        axes = figure.subplots()
+        axes.set_title(title, fontsize=11, loc="left", color=TITLE_COLOR)
+        axes.set_xlabel(x_label)
+        axes.margins(x=0.01)
+        yield figure, axes
+
+
+def to_svg(figure: Figure) -> str:
+    """Return the figure as an element of a page."""
+    buffer = io.StringIO()
+    no_metadata = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+    with rc_context(PLOT_STYLE):
+        figure.savefig(buffer, format="svg", transparent=True, metadata=no_metadata)
+    svg = buffer.getvalue()
+    return svg[svg.index("<svg") :]
+
+
+def save_png(figure: Figure, path: Path) -> None:
+    """Write the figure on white."""
+    with rc_context(PLOT_STYLE), replacing(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=PNG_DPI, facecolor="white")
