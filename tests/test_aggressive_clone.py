@@ -69,7 +69,7 @@ def test_copies_keep_the_integral_of_alpha(factor):
 
 @pytest.mark.parametrize("factor", [2, 3, 5])
 def test_same_as_the_double_sum_of_3dgs_mcmc(factor):
-    """sum_i sum_(k <= i) C(i, k) (-1)^k o'^(k+1) / sqrt(k+1), i from 0, copy by copy: what copy i adds to the profile."""
+    """sum_i sum_(k <= i) C(i, k) (-1)^k o'^(k+1) / sqrt(k+1): what copy i adds, i from 0."""
     one = 1 - (1 - OPACITIES) ** (1 / factor)
     terms = [
         math.comb(i - 1, k) * (-1) ** k * one ** (k + 1) / np.sqrt(k + 1)
