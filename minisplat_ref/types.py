@@ -163,6 +163,8 @@ class BlendStats(NamedTuple):
 
     blend_weight_sum: Floats
     """[N] sum of w over the pixels."""
+    blend_weight_max: Floats
+    """[N] largest w over the pixels."""
     hit_count: Ints
     """[N] int32 number of pixels with a blended hit."""
     dominant_count: Ints

@@ -11,6 +11,7 @@ from tolerances import (
     PARITY_FLOAT32_GRADIENT,
     PARITY_FLOAT32_IMAGE,
     PARITY_FLOAT64,
+    ROUNDED_TO_FLOAT32,
 )
 
 from minisplat_ref.backends import REFERENCE
@@ -35,11 +36,11 @@ def splats(means2d, conics, opacities, depths, size=(6, 5), boxes=None):
     )
 
 
-def blend(backend, projection, colors, background, *, size=(6, 5), conventions=GSPLAT_MAIN, **options):
+def blend(backend, projection, colors, background, *, size=(6, 5), conventions=GSPLAT_MAIN, dtype=float, **options):
     grid = TileGrid(*size, backend.tile_width, backend.tile_height)
     bins = backend.bin_gaussians(projection, grid, conventions)
     return backend.composite(
-        projection, np.array(colors, dtype=float), np.array(background, dtype=float), bins, conventions, **options
+        projection, np.array(colors, dtype=dtype), np.array(background, dtype=dtype), bins, conventions, **options
     )
 
 
@@ -132,12 +133,42 @@ def test_stats_by_hand(backend):
     stats = blend(backend, projection, np.ones((3, 1)), [0], with_stats=True).stats
     beside = 0.5 * np.exp(-0.25 * np.array([4, 1, 1, 4, 9]))
     assert_allclose(stats.blend_weight_sum, [0.3, 0.7 * 0.5 + beside.sum(), 0.9], rtol=CLOSED_FORM)
+    assert_allclose(
+        stats.blend_weight_max, [0.3, beside[1], 0.9], rtol=CLOSED_FORM
+    )  # 0.39 beside, 0.35 behind the first
     assert_array_equal(stats.hit_count, [1, 6, 1])
     assert_array_equal(stats.dominant_count, [0, 6, 1])  # 0.35 > 0.3 on the shared pixel
     expected = np.full((5, 6), -1)
     expected[1] = 1
     expected[4, 5] = 2
     assert_array_equal(stats.dominant_ids, expected)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_the_largest_weight_of_many_tiles(backend, dtype):
+    # The wide one covers all tiles and is half hidden at its centre, so its largest weight is a pixel beside it; the
+    # faint one is hit nowhere and the last one lies behind pixels that are finished.
+    projection = splats(
+        [[20.5, 18.5]] * 4,
+        [[20, 0, 20], [0.002, 0, 0.002], [0.002, 0, 0.002], [20, 0, 20]],
+        [0.5, 0.95, 0.003, 0.9],
+        [1, 2, 3, 4],
+        size=(40, 36),
+    )
+    conventions = GSPLAT_MAIN._replace(transmittance_min=0.024)  # below 0.5 * 0.05, above 0.1 times that
+    stats = blend(
+        backend,
+        as_dtype(projection, dtype),
+        np.ones((4, 1)),
+        [0],
+        size=(40, 36),
+        conventions=conventions,
+        with_stats=True,
+        dtype=dtype,
+    ).stats
+    assert stats.hit_count[1] > 1000 and stats.blend_weight_max.dtype == dtype
+    expected = [0.5, 0.95 * np.exp(-0.001), 0, 0]
+    assert_allclose(stats.blend_weight_max, expected, rtol=CLOSED_FORM if dtype == np.float64 else ROUNDED_TO_FLOAT32)
 
 
 def test_the_front_most_of_equal_weights_dominates(backend):
@@ -206,6 +237,23 @@ def test_tiles_change_nothing(backend, conventions, rng):
     assert_allclose(output.alpha, alpha, rtol=0, atol=PARITY_FLOAT64)
     assert_allclose(output.stats.blend_weight_sum.sum(), alpha.sum(), rtol=PARITY_FLOAT64)
     assert output.stats.dominant_count.sum() == (alpha > 0).sum()
+
+
+@pytest.mark.parametrize("conventions", ALL_CONVENTIONS, ids=lambda c: c.name)
+def test_statistics_of_single_weights(backend, conventions, rng):
+    # A channel of one's own is an image of one's weights.
+    projection = REFERENCE.project(
+        *activated(make_gaussians(rng, 40, size=0.3, opacity_logit=2)), make_camera(37, 29, fx=40, fy=45), conventions
+    )
+    weights, _ = composite_all_pairs(projection, np.eye(40), np.zeros(40), 37, 29, conventions)  # [H, W, N]
+    stats = blend(
+        backend, projection, np.zeros((40, 0)), [], size=(37, 29), conventions=conventions, with_stats=True
+    ).stats
+    assert (weights.max(axis=(0, 1)) > 0).sum() > 20
+    assert_allclose(stats.blend_weight_sum, weights.sum(axis=(0, 1)), rtol=PARITY_FLOAT64)
+    assert_allclose(stats.blend_weight_max, weights.max(axis=(0, 1)), rtol=0, atol=PARITY_FLOAT64)
+    assert_array_equal(stats.hit_count, (weights > 0).sum(axis=(0, 1)))
+    assert_array_equal(stats.dominant_ids, np.where(weights.any(axis=2), weights.argmax(axis=2), -1))
 
 
 @pytest.mark.parametrize("tile", [(16, 16), (5, 7), (64, 1)])
@@ -358,6 +406,8 @@ def test_backends_agree(fast_backend, conventions, dtype, rng):
     assert_allclose(actual.median_depth, expected.median_depth, rtol=forward)
     weight_sums = expected.stats.blend_weight_sum
     assert_allclose(actual.stats.blend_weight_sum, weight_sums, rtol=0, atol=forward * weight_sums.max())
+    assert_allclose(actual.stats.blend_weight_max, expected.stats.blend_weight_max, rtol=0, atol=forward)
+    assert actual.stats.blend_weight_sum.dtype == actual.stats.blend_weight_max.dtype == dtype
     for a, e in zip(v_actual, v_expected, strict=True):
         assert a.dtype == dtype and np.abs(e).max() > GRADIENT_FLOOR
         assert_allclose(a, e, rtol=0, atol=(PARITY_FLOAT64 if is_exact else PARITY_FLOAT32_GRADIENT) * np.abs(e).max())

@@ -46,7 +46,7 @@ def test_stages_keep_float32(rng):
         "project_vjp": CPU.project_vjp(*primitives, projection, v_projection),
         "sh_colors": (colors,),
         "sh_colors_vjp": CPU.sh_colors_vjp(*sh, v.colors),
-        "composite": (output.image, output.alpha, output.median_depth, output.stats.blend_weight_sum),
+        "composite": (output.image, output.alpha, output.median_depth, *output.stats[:2]),
         "composite_vjp": v,
         "surface_points": points,
         "surface_points_vjp": CPU.surface_points_vjp(means, quats, scales, camera, ids, points.points, points.depths),

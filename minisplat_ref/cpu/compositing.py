@@ -9,7 +9,7 @@ import numpy as np
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.blend_backward import N_MOMENTS, backward_kernel, sum_slots
-from minisplat_ref.cpu.blend_forward import forward_kernel
+from minisplat_ref.cpu.blend_forward import N_PAIR_STATS, forward_kernel, sum_pair_stats
 from minisplat_ref.cpu.exponential import exp_exact, exp_fast
 from minisplat_ref.cpu.records import records_of
 from minisplat_ref.cpu.tile_state import frame_of, tile_ranges
@@ -68,30 +68,28 @@ def composite_with(
     collects = with_stats or with_median_depth
     shape, n_pairs = ((height, width), len(bins.gaussian_ids)) if collects else ((0, 0), 0)
     median_depth, dominant_ids = np.empty(shape, dtype), np.empty(shape, np.int32)
-    weight_sums, hit_counts = np.zeros(n_pairs, dtype), np.zeros(n_pairs, np.int32)
+    slots = np.zeros((n_pairs, N_PAIR_STATS), dtype)  # stay zero behind the hit that finishes a tile
     forward_kernel(exp, colors.shape[1])(
         records_of(projection, colors, conventions),
         projection.depths,
         background,
         bins.tile_offsets,
         bins.gaussian_ids,
+        bins.slots,
         tile_ranges(bins),
         n_threads(),
         frame_of(bins, conventions, dtype),
         image,
         alpha,
-        (weight_sums, hit_counts),
+        slots,
         (median_depth, dominant_ids),
     )
     stats = None
     if with_stats:
         n = len(colors)
-        stats = BlendStats(
-            np.bincount(bins.gaussian_ids, weight_sums, n).astype(dtype),  # adds up in tile order, in float64
-            np.bincount(bins.gaussian_ids, hit_counts, n).astype(np.int32),
-            np.bincount(dominant_ids[dominant_ids >= 0], minlength=n).astype(np.int32),
-            dominant_ids,
-        )
+        dominant_count = np.bincount(dominant_ids[dominant_ids >= 0], minlength=n).astype(np.int32)
+        stats = BlendStats(np.empty(n, dtype), np.empty(n, dtype), np.empty(n, np.int32), dominant_count, dominant_ids)
+        sum_pair_stats(slots, bins.gaussian_offsets, stats)
     return RenderOutput(image, alpha, median_depth if with_median_depth else None, stats)
 
 

@@ -23,7 +23,10 @@ Y = 2 * PIXELS
 WEIGHT = 3 * PIXELS  # alpha T of the current hit
 BEHIND = 4 * PIXELS  # backward: the part of <v, image> that lies behind the current hit
 SHADE = 5 * PIXELS  # backward: <v, colour of the current hit> over the channels beyond the third
-CHANNELS = 6 * PIXELS  # forward: the image so far; backward: v
+BEST = 4 * PIXELS  # forward: largest weight so far
+BEST_PLACE = 5 * PIXELS  # forward: place of its Gaussian in the tile's list, -1 for none
+CROSSING = 6 * PIXELS  # forward: depth of the hit that took the transmittance below one half, or 0
+CHANNELS = 7 * PIXELS  # forward: the image so far; backward: v
 RANGES_PER_THREAD = 8
 CHECK_EVERY = 8  # hits between two tests whether the whole tile is finished
 

@@ -66,6 +66,7 @@ def composite(
             median_depth[ys[has_crossing], xs[has_crossing]] = projection.depths[ids[crossing[has_crossing]]]
         if stats is not None and len(ids):
             stats.blend_weight_sum[ids] += weights.sum(axis=1)
+            stats.blend_weight_max[ids] = np.maximum(stats.blend_weight_max[ids], weights.max(axis=1))
             stats.hit_count[ids] += (weights > 0).sum(axis=1, dtype=np.int32)
             heaviest = np.argmax(weights, axis=0)  # the first, so the front-most, of equals
             dominant = np.where(weights.max(axis=0) > 0, ids[heaviest], -1)
@@ -196,4 +197,5 @@ def _sum_behind(terms: Floats) -> Floats:
 
 def _no_hits(n: int, height: int, width: int, dtype: np.dtype) -> BlendStats:
     counts = np.zeros(n, dtype=np.int32)
-    return BlendStats(np.zeros(n, dtype), counts, counts.copy(), np.full((height, width), -1, dtype=np.int32))
+    dominant_ids = np.full((height, width), -1, dtype=np.int32)
+    return BlendStats(np.zeros(n, dtype), np.zeros(n, dtype), counts, counts.copy(), dominant_ids)

@@ -12,7 +12,8 @@ kernels that call it. ``kernel`` compiles a parallel loop. Four facts shape this
 * A sum over pixels is vectorised only if the compiler may change its order, but a kernel that may do so everywhere
   gives other last digits when it is loaded from the cache than when it was just compiled (what is cached has been
   optimised twice). The permission is therefore given addition by addition, with ``add_in_any_order``; the order is
-  fixed at compile time, and the bytes are the same at any number of threads. Known and open: projection and the
+  fixed at compile time, and the bytes are the same at any number of threads. A maximum over pixels needs the promise
+  that none of them is NaN, which ``larger_number`` gives. Known and open: projection and the
   gradients of colour and loss still differ in the last digit between just compiled and loaded from the cache.
 """
 
@@ -28,7 +29,7 @@ import numba
 from numba import prange
 from numba.extending import intrinsic, overload, register_jitable
 
-__all__ = ["add_in_any_order", "kernel", "n_threads", "prange", "scalar", "source_hash"]
+__all__ = ["add_in_any_order", "kernel", "larger_number", "n_threads", "prange", "scalar", "source_hash"]
 
 _KERNEL_LOCK = threading.RLock()
 _PACKAGE = Path(__file__).parent.parent
@@ -90,6 +91,28 @@ def _overload_add_in_any_order(a, b):
         return _add_reassociable(a, b)  # type: ignore[call-arg]  # the typing context is numba's to pass
 
     return add
+
+
+def larger_number(a, b):
+    """Return the larger of two floats of one dtype that are not NaN, as a step of a maximum over many."""
+    return max(a, b)
+
+
+@intrinsic
+def _select_larger(context: Any, a: Any, b: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        flags = ["nnan", "nsz"]
+        return builder.select(builder.fcmp_ordered(">", *args, flags=flags), *args, flags=flags)
+
+    return a(a, b), generate
+
+
+@overload(larger_number)
+def _overload_larger_number(a, b):
+    def larger(a, b):
+        return _select_larger(a, b)  # type: ignore[call-arg]  # the typing context is numba's to pass
+
+    return larger
 
 
 def kernel(parallel: bool = True) -> Callable[[Callable], Callable]:
