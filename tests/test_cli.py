@@ -98,6 +98,7 @@ def test_train_leaves_a_complete_folder(run_folder, scene_folder):
         "seed": 3,
         "profile": "GSPLAT_MAIN",
         "backend": "cpu",
+        "eval_every": 0,
     }
     assert config["recipe"]["iterations"] == ITERATIONS and config["versions"]["numba"]
 
@@ -106,7 +107,8 @@ def test_train_logs_every_few_steps(run_folder):
     log = read_log(run_folder / "log.jsonl")
     assert [record["step"] for record in log] == list(range(LOG_EVERY, ITERATIONS + 1, LOG_EVERY))
     for record in log:
-        assert set(record) == {"step", "loss", "psnr", "n_gaussians", "seconds", "its/s"}
+        assert set(record) == {"step", "loss", "psnr", "n_gaussians", "model_mb", "seconds", "its/s"}
+        assert record["model_mb"] == pytest.approx(record["n_gaussians"] * 59 * 4 / 1e6)  # 59 float32 at SH degree 3
         assert record["its/s"] == pytest.approx(record["step"] / record["seconds"])
     assert np.all(np.diff([record["seconds"] for record in log]) > 0)
     assert log[-1]["n_gaussians"] == len(load_ply(run_folder / "point_cloud.ply").means)

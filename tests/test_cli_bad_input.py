@@ -195,6 +195,11 @@ def test_bad_options(options, culprit, tmp_path, capfd):
     assert not (tmp_path / "out").exists()
 
 
+def test_curve_of_no_test_views(train_refused, tmp_path):
+    scene = write_colmap(tmp_path / "scene", n=4)
+    assert "--test-every" in train_refused(scene, "--test-every", "0", "--eval-every", "1")
+
+
 # Gaussians
 
 

@@ -4,7 +4,8 @@ import json
 import sys
 import time
 from collections import deque
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any, Self
 
@@ -59,8 +60,21 @@ class Progress(AbstractContextManager["Progress"]):
         """Training time so far, with that of earlier parts of a continued run."""
         return self._seconds_before + time.perf_counter() - self._start
 
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Stop the clock for what is not training."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._start += time.perf_counter() - start
+
     def __call__(self, report: StepReport) -> None:
-        """Move the bar; every LOG_EVERY iterations measure, show and write."""
+        """Move the bar; every LOG_EVERY iterations measure, show and write.
+
+        ``model_mb`` of a record is what the arrays of the Gaussians take. During an iteration their gradients take as
+        much again, and Adam's two moments twice as much all the time.
+        """
         if self._bar.n == self._first_step:
             self._bar.set_description_str("training", refresh=False)
         self._bar.update()
@@ -71,7 +85,8 @@ class Progress(AbstractContextManager["Progress"]):
         view_psnr = psnr(image, report.view.image.astype(image.dtype) / 255, report.view.mask)
         self._psnrs.append(min(view_psnr, PSNR_MAX))
         loss, mean_psnr = float(np.mean(self._losses)), float(np.mean(self._psnrs))
-        n_gaussians = len(report.state.gaussians.means)
+        gaussians = report.state.gaussians
+        n_gaussians = len(gaussians.means)
         seconds = self.seconds
         self._write(
             {
@@ -79,6 +94,7 @@ class Progress(AbstractContextManager["Progress"]):
                 "loss": loss,
                 "psnr": mean_psnr,
                 "n_gaussians": n_gaussians,
+                "model_mb": sum(field.nbytes for field in gaussians) / 1e6,
                 "seconds": seconds,
                 "its/s": report.step / seconds,
             }

@@ -12,6 +12,7 @@ CONFIG = "config.json"  # everything needed to run it again
 POINT_CLOUD = "point_cloud.ply"  # the Gaussians
 METRICS = "metrics.json"  # what was measured on the test views
 LOG = "log.jsonl"  # one record every few steps
+CURVE = "curve.jsonl"  # the test views measured every --eval-every steps, if that was asked for
 CHECKPOINT = "checkpoint.npz"  # what `--resume` continues from
 CAMERAS = "cameras.json"  # cameras of all views, so that they can be rendered without the photographs
 RENDERS = "renders"  # truth | render | error of each test view

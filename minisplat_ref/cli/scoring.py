@@ -1,6 +1,7 @@
 """Measures a trained scene on its test views, and keeps the pictures: ``metrics.json`` and ``renders/``."""
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,23 @@ from minisplat_ref.constants import PROFILES
 from minisplat_ref.io import write_image
 from minisplat_ref.metrics import Evaluation, ViewMetrics, evaluate
 from minisplat_ref.types import Floats, Gaussians, Scene, View
+
+
+def measure(
+    scene: Scene,
+    gaussians: Gaussians,
+    settings: Settings,
+    on_view: Callable[[View, Floats, ViewMetrics], None] | None = None,
+) -> Evaluation:
+    """Evaluate the test views with the profile and backend of the settings: :func:`minisplat_ref.metrics.evaluate`."""
+    return evaluate(
+        gaussians,
+        scene.test_views,
+        background=scene.background,
+        on_view=on_view,
+        backend=get_backend(settings.backend),
+        conventions=PROFILES[settings.profile],
+    )
 
 
 def score(folder: Path, scene: Scene, gaussians: Gaussians, settings: Settings) -> Evaluation:
@@ -31,7 +49,6 @@ def score(folder: Path, scene: Scene, gaussians: Gaussians, settings: Settings) 
     Returns
     -------
     Evaluation
-        See :func:`minisplat_ref.metrics.evaluate`.
     """
     renders = folder / RENDERS
     renders.mkdir(exist_ok=True)
@@ -40,14 +57,7 @@ def score(folder: Path, scene: Scene, gaussians: Gaussians, settings: Settings) 
         render = to_picture(image)
         write_image(renders / f"{view.name}.png", side_by_side([view.image, render, error_picture(view.image, render)]))
 
-    return evaluate(
-        gaussians,
-        scene.test_views,
-        background=scene.background,
-        on_view=save,
-        backend=get_backend(settings.backend),
-        conventions=PROFILES[settings.profile],
-    )
+    return measure(scene, gaussians, settings, on_view=save)
 
 
 def to_metrics(evaluation: Evaluation) -> dict[str, Any]:

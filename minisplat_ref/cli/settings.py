@@ -40,6 +40,8 @@ class Settings(NamedTuple):
     """Name of the rasteriser's conventions."""
     backend: str
     """Name of the backend."""
+    eval_every: int = 0
+    """Iterations after which the test views are measured again; 0: only in the end. Does not change the result."""
 
 
 def to_config(settings: Settings, recipe: Recipe, scene: Scene) -> dict[str, Any]:

@@ -21,6 +21,7 @@ DEFAULTS = {
     "undistort": False,
     "recipe": "3dgs-accel",
     "iterations": 3000,
+    "eval_every": 0,
     "seed": 0,
     "profile": GSPLAT_MAIN.name,
     "backend": "cpu",
@@ -74,6 +75,12 @@ def add_parser(commands: Commands) -> None:
     training = parser.add_argument_group("training")
     training.add_argument("--recipe", metavar="R", help="3dgs or 3dgs-accel (default), scaled to the iterations")
     training.add_argument("--iterations", type=integer(1), metavar="N", help="one view each (default 3000)")
+    training.add_argument(
+        "--eval-every",
+        type=integer(0),
+        metavar="K",
+        help="measure the test views every K-th, clock stopped, into curve.jsonl (default 0: never)",
+    )
     training.add_argument("--seed", type=integer(0), metavar="S", help="of all random draws (default 0)")
     add_renderer_arguments(training, argparse.SUPPRESS)
     parser.set_defaults(run=run)
@@ -93,7 +100,7 @@ def _start(given: dict[str, Any]) -> int:
     scene_folder = scene_path.parent if scene_path.is_file() else scene_path
     folder: Path = given.get("out", Path("runs") / f"{scene_folder.resolve().name}-{options['recipe']}")
 
-    from minisplat_ref.cli import run_folder
+    from minisplat_ref.cli import curve, run_folder
     from minisplat_ref.cli.settings import Settings, load_photographs
     from minisplat_ref.recipes import get_recipe
     from minisplat_ref.train import initial_state
@@ -102,6 +109,8 @@ def _start(given: dict[str, Any]) -> int:
     recipe = get_recipe(options["recipe"], options["iterations"])
     settings = Settings(scene=str(scene_path.resolve()), schedule_iterations=options["iterations"], **options)
     scene = load_photographs(settings)
+    if settings.eval_every:
+        curve.check_views(scene)
     return _train(folder, scene, settings, recipe, initial_state(scene, recipe, settings.seed))
 
 

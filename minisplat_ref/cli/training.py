@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from minisplat_ref.backends import get_backend
-from minisplat_ref.cli import run_folder, viewpoints
+from minisplat_ref.cli import curve, run_folder, viewpoints
 from minisplat_ref.cli.progress import Progress
-from minisplat_ref.cli.scoring import score, to_metrics
+from minisplat_ref.cli.scoring import measure, score, to_metrics
 from minisplat_ref.cli.settings import Settings, to_config
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.events import TrainState
@@ -56,6 +56,15 @@ def run_training(folder: Path, scene: Scene, settings: Settings, recipe: Recipe,
     run_folder.write_json(folder / run_folder.CONFIG, to_config(settings, recipe, scene))
     run_folder.write_json(folder / run_folder.CAMERAS, viewpoints.to_json(viewpoints.scene_viewpoints(scene)))
     progress = Progress(folder / run_folder.LOG, state.step, settings.iterations)
+    callbacks: list[Callable[[StepReport], None]] = [progress, _checkpoints(folder, recipe)]
+    if settings.eval_every:
+        curve.keep_until(folder / run_folder.CURVE, state.step)
+        callbacks.append(_curve(folder / run_folder.CURVE, scene, settings, progress))
+
+    def on_step(report: StepReport) -> None:
+        for callback in callbacks:
+            callback(report)
+
     is_complete = True
     with progress:
         try:
@@ -64,7 +73,7 @@ def run_training(folder: Path, scene: Scene, settings: Settings, recipe: Recipe,
                 recipe._replace(iterations=settings.iterations),
                 seed=settings.seed,
                 state=state,
-                on_step=_with_checkpoints(progress, folder, recipe),
+                on_step=on_step,
                 backend=get_backend(settings.backend),
                 conventions=PROFILES[settings.profile],
             )
@@ -74,8 +83,11 @@ def run_training(folder: Path, scene: Scene, settings: Settings, recipe: Recipe,
     save_state(folder / run_folder.CHECKPOINT, state, recipe)
     save_ply(folder / run_folder.POINT_CLOUD, state.gaussians)
     evaluation = score(folder, scene, state.gaussians, settings)
+    n_gaussians = len(state.gaussians.means)
+    if settings.eval_every:
+        curve.append(folder / run_folder.CURVE, state.step, seconds, evaluation, n_gaussians)
     metrics = {
-        "n_gaussians": len(state.gaussians.means),
+        "n_gaussians": n_gaussians,
         "iterations": state.step,
         "train_seconds": seconds,
         "peak_rss_mb": peak_rss_mb(),
@@ -85,16 +97,28 @@ def run_training(folder: Path, scene: Scene, settings: Settings, recipe: Recipe,
     return Outcome(evaluation, seconds, is_complete)
 
 
-def _with_checkpoints(progress: Progress, folder: Path, recipe: Recipe) -> Callable[[StepReport], None]:
-    """Return the callback of the loop: progress, and every CHECKPOINT_SECONDS a checkpoint."""
+def _checkpoints(folder: Path, recipe: Recipe) -> Callable[[StepReport], None]:
+    """Return a callback of the loop that saves the state every CHECKPOINT_SECONDS."""
     last_saved = time.monotonic()
 
     def on_step(report: StepReport) -> None:
         nonlocal last_saved
-        progress(report)
         if time.monotonic() - last_saved > CHECKPOINT_SECONDS:
             save_state(folder / run_folder.CHECKPOINT, report.state, recipe)
             last_saved = time.monotonic()
+
+    return on_step
+
+
+def _curve(path: Path, scene: Scene, settings: Settings, progress: Progress) -> Callable[[StepReport], None]:
+    """Return a callback of the loop that measures the test views on the way, off the training's clock."""
+
+    def on_step(report: StepReport) -> None:
+        if report.step % settings.eval_every or report.step == settings.iterations:  # the end is measured anyway
+            return
+        seconds, gaussians = progress.seconds, report.state.gaussians
+        with progress.paused():
+            curve.append(path, report.step, seconds, measure(scene, gaussians, settings), len(gaussians.means))
 
     return on_step
 
