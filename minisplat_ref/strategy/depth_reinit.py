@@ -9,8 +9,8 @@ photograph's. The paper compares three meanings of "where" (Table 4):
 - blended: the ray at the blended depth, ``sum w z / sum w``.
 
 The paper says that pixels are chosen at random; the released code draws them with probability proportional to the
-accumulated opacity, and so do we. Two guards are ours: a floor of the accumulated opacity, below which a pixel is never
-drawn, and a test whether another view sees a surface at the same place.
+accumulated opacity, and so do we. Two guards are ours, for what photographs do not settle, such as sky and bare walls:
+a floor of the accumulated opacity, below which no pixel is drawn, and a vote of other views on each point.
 
 Left out: that a Gaussian whose densest point lies behind the camera leaves the transmittance untouched, as in the
 released kernel. Such a pixel has no point here.
@@ -27,11 +27,17 @@ from minisplat_ref.constants import DEPTH_ALPHA_MIN, GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.reference.pinhole import with_principal_point
 from minisplat_ref.render import render
-from minisplat_ref.types import Camera, Floats, Gaussians, Ints, View
+from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Ints, View
+
+N_PARTNERS = 8  # views that vote on a point: more of them admit more chance agreements, and cost time
+BEST_PARALLAX = np.radians(
+    20.0
+)  # of partners: from a nearer one a floater looks the same, from a farther one less is seen
+N_PROBES = 256  # points of a view by which its partners are chosen
 
 
 class PixelPoints(NamedTuple):
-    """Where each pixel's ray meets what the pixel shows."""
+    """Where the ray of each pixel's centre meets what the pixel shows."""
 
     points: Floats
     """[H, W, 3] world frame; 0 where there is none."""
@@ -39,9 +45,6 @@ class PixelPoints(NamedTuple):
     """[H, W] camera z, world units; 0 where there is none."""
     alpha: Floats
     """[H, W] accumulated opacity."""
-
-
-PointsOf = Callable[[Gaussians, Camera, Conventions, Backend], PixelPoints]
 
 
 def midpoint_points(gaussians: Gaussians, camera: Camera, conventions: Conventions, backend: Backend) -> PixelPoints:
@@ -62,8 +65,9 @@ def midpoint_points(gaussians: Gaussians, camera: Camera, conventions: Conventio
     output, tape = render(gaussians, camera, sh_degree=0, conventions=conventions, backend=backend, with_stats=True)
     assert output.stats is not None
     means, quats, scales, _ = tape.splats.primitives
-    seen_camera = with_principal_point(camera, conventions)
-    surface = backend.surface_points(means, quats, scales, seen_camera, output.stats.dominant_ids)
+    surface = backend.surface_points(
+        means, quats, scales, with_principal_point(camera, conventions), output.stats.dominant_ids
+    )
     return PixelPoints(surface.points, surface.depths, output.alpha)
 
 
@@ -84,15 +88,15 @@ def centre_points(gaussians: Gaussians, camera: Camera, conventions: Conventions
     """
     output, tape = render(gaussians, camera, sh_degree=0, conventions=conventions, backend=backend, with_stats=True)
     assert output.stats is not None
-    dominant_ids = output.stats.dominant_ids
-    depths = np.append(tape.projection.depths, gaussians.means.dtype.type(0))[dominant_ids]  # [H, W], 0 for id -1
-    return PixelPoints(_unproject(depths, with_principal_point(camera, conventions)), depths, output.alpha)
+    depths_or_none = np.append(tape.projection.depths, tape.projection.depths.dtype.type(0))  # [N + 1]: id -1 gets 0
+    depths = depths_or_none[output.stats.dominant_ids]  # [H, W]
+    return _on_rays(depths, output.alpha, camera, conventions)
 
 
 def blended_points(gaussians: Gaussians, camera: Camera, conventions: Conventions, backend: Backend) -> PixelPoints:
     """Point of each ray at the blended depth, ``sum w z / sum w``.
 
-    At the edge of an object the mean of two depths lies on neither surface.
+    Where a ray passes through several surfaces, at the edge of an object or under a floater, it lies on none of them.
 
     Parameters
     ----------
@@ -106,7 +110,7 @@ def blended_points(gaussians: Gaussians, camera: Camera, conventions: Convention
     """
     output, _ = render(gaussians, camera, sh_degree=0, conventions=conventions, backend=backend, with_depth=True)
     depths = output.image[..., 3] / np.maximum(output.alpha, output.alpha.dtype.type(DEPTH_ALPHA_MIN))  # [H, W]
-    return PixelPoints(_unproject(depths, with_principal_point(camera, conventions)), depths, output.alpha)
+    return _on_rays(depths, output.alpha, camera, conventions)
 
 
 def reinitial_points(
@@ -114,7 +118,7 @@ def reinitial_points(
     views: Sequence[View],
     n_points: int,
     *,
-    points_of: PointsOf = midpoint_points,
+    points_of: Callable[[Gaussians, Camera, Conventions, Backend], PixelPoints] = midpoint_points,
     least_alpha: float,
     depth_tolerance: float | None,
     rng: np.random.Generator,
@@ -124,7 +128,7 @@ def reinitial_points(
     """Draw points of the surface that the Gaussians show, equally many from every view.
 
     Within a view pixels are drawn without replacement, with probability proportional to the accumulated opacity. Where
-    fewer pixels can be drawn than asked for, all of them are.
+    fewer pixels can be drawn than asked for, all of them are. Masked pixels are never drawn.
 
     Parameters
     ----------
@@ -137,8 +141,9 @@ def reinitial_points(
     least_alpha : float
         Pixels of lower accumulated opacity are not drawn; 0 for the paper's rule.
     depth_tolerance : float or None
-        A pixel is drawn only if its point has, in another view, that view's depth up to this relative difference; None
-        for the paper's rule, which does not ask.
+        Up to this relative difference between its depth and another view's, a point is on that view's surface. It is
+        drawn only if more of up to 8 other views have it on their surface than see through it. None for the paper's
+        rule, which does not ask; a single view has nobody to ask.
     rng : numpy.random.Generator
         Draws the pixels.
     conventions : Conventions
@@ -156,19 +161,56 @@ def reinitial_points(
     InputError
         No pixel of any view can be drawn.
     """
-    n_per_view = n_points // len(views)
-    pixel_points = [points_of(gaussians, view.camera, conventions, backend) for view in views]
-    points, colors = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
-    for view, (view_points, depths, alpha) in zip(views, pixel_points, strict=True):
-        weights = np.where((depths > 0) & (alpha >= least_alpha), alpha, 0)
+    cameras = [with_principal_point(view.camera, conventions) for view in views]
+    depth_maps, weight_maps = [], []  # 8 bytes a pixel of all views; points would be 12 more
+    for view in views:
+        _, depths, alpha = points_of(gaussians, view.camera, conventions, backend)
+        is_drawable = (depths > 0) & (alpha >= least_alpha)
         if view.mask is not None:
-            weights = np.where(view.mask, weights, 0)
-        pixels = _draw(weights.ravel(), n_per_view, rng)
-        points.append(view_points.reshape(-1, 3)[pixels].astype(np.float64))
+            is_drawable &= view.mask
+        depth_maps.append(depths)
+        weight_maps.append(np.where(is_drawable, alpha, 0))
+
+    points: list[Floats] = []
+    colors: list[NDArray[np.uint8]] = []
+    for i, view in enumerate(views):
+        view_points, weights = unprojected(depth_maps[i], cameras[i]).reshape(-1, 3), weight_maps[i].ravel()
+        if depth_tolerance is not None and len(views) > 1:
+            candidates = np.flatnonzero(weights)
+            is_confirmed = _confirmed(view_points[candidates], i, cameras, depth_maps, depth_tolerance)
+            weights[candidates[~is_confirmed]] = 0
+        pixels = _draw(weights, n_points // len(views), rng)
+        points.append(view_points[pixels])
         colors.append(view.image.reshape(-1, 3)[pixels])
     if sum(map(len, points)) == 0:
-        raise InputError("no pixel of any view shows a surface: lower least_alpha or reinitialise later")
+        raise InputError("no pixel of any view shows a surface: lower least_alpha or raise depth_tolerance")
     return np.concatenate(points), np.concatenate(colors)
+
+
+def unprojected(depths: Floats, camera: Camera) -> Floats:
+    """Return the points on the rays of the pixels' centres.
+
+    Parameters
+    ----------
+    depths : ndarray of shape (H, W)
+        Camera z, world units.
+    camera : Camera
+        Its principal point is used.
+
+    Returns
+    -------
+    points : ndarray of shape (H, W, 3), float64
+        World frame; the camera's centre where the depth is 0.
+    """
+    height, width = depths.shape
+    x, y = (np.arange(width) + 0.5 - camera.cx) / camera.fx, (np.arange(height) + 0.5 - camera.cy) / camera.fy
+    slopes = np.stack(np.broadcast_arrays(x, y[:, None], 1.0), axis=-1)  # [H, W, 3]
+    return (depths[:, :, None] * slopes - camera.cam_from_world_t) @ camera.cam_from_world_R  # rows of R^T (x - t)
+
+
+def _on_rays(depths: Floats, alpha: Floats, camera: Camera, conventions: Conventions) -> PixelPoints:
+    points = unprojected(depths, with_principal_point(camera, conventions))  # [H, W, 3]
+    return PixelPoints(np.where(depths[:, :, None] > 0, points, 0).astype(depths.dtype), depths, alpha)
 
 
 def _draw(weights: Floats, n: int, rng: np.random.Generator) -> Ints:
@@ -184,10 +226,50 @@ def _draw(weights: Floats, n: int, rng: np.random.Generator) -> Ints:
     return np.sort(rows[np.argpartition(ringing_times, n)[:n]])
 
 
-def _unproject(depths: Floats, camera: Camera) -> Floats:
-    """Return the points [H, W, 3] on the pixels' rays at these camera z; 0 where the depth is."""
-    height, width = depths.shape
-    x, y = (np.arange(width) + 0.5 - camera.cx) / camera.fx, (np.arange(height) + 0.5 - camera.cy) / camera.fy
-    in_camera = np.stack(np.broadcast_arrays(x, y[:, None], 1.0), axis=-1) * depths[:, :, None]  # [H, W, 3]
-    points = (in_camera - camera.cam_from_world_t) @ camera.cam_from_world_R  # R^T (x - t) for rows
-    return np.where(depths[:, :, None] > 0, points, 0).astype(depths.dtype)
+def _confirmed(
+    points: Floats, own_id: int, cameras: Sequence[Camera], depth_maps: Sequence[Floats], tolerance: float
+) -> Bools:
+    """Return which points [P, 3] of a view are on the surface of more of its partners than see through them.
+
+    A partner that sees something nearer in that place, or whose image does not contain the point, has no vote.
+    """
+    votes = np.zeros(len(points), np.int32)
+    for j in _partners(points, own_id, cameras):
+        z, pixels = _project(points, cameras[j])
+        depths = np.where(pixels >= 0, depth_maps[j].ravel()[pixels], 0)  # [P], 0 where the partner sees nothing
+        is_near = np.abs(depths - z) <= tolerance * z
+        votes += is_near
+        votes -= ~is_near & (depths > z)
+    return votes > 0
+
+
+def _partners(points: Floats, own_id: int, cameras: Sequence[Camera]) -> Ints:
+    """Return up to ``N_PARTNERS`` views that see many of the points [P, 3] from another side, but not too much so."""
+    probes = points[:: -(-len(points) // N_PROBES)] if len(points) else points  # [S, 3]
+    own_rays = _rays(probes, cameras[own_id])  # [S, 3]
+    scores = np.zeros(len(cameras))
+    for j, camera in enumerate(cameras):
+        parallaxes = np.arccos(np.clip((own_rays * _rays(probes, camera)).sum(axis=1), -1, 1))  # [S]
+        ratios = parallaxes / BEST_PARALLAX
+        _, pixels = _project(probes, camera)
+        scores[j] = np.where(pixels >= 0, np.minimum(ratios, 1 / np.maximum(ratios, 1)), 0).sum()
+    scores[own_id] = 0  # not rounding's
+    best = np.argsort(-scores, kind="stable")[:N_PARTNERS]
+    return best[scores[best] > 0]
+
+
+def _rays(points: Floats, camera: Camera) -> Floats:
+    """Return the unit vectors [P, 3] from the camera's centre to points [P, 3]."""
+    rays = points + camera.cam_from_world_R.T @ camera.cam_from_world_t
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def _project(points: Floats, camera: Camera) -> tuple[Floats, Ints]:
+    """Return camera z [P] of points [P, 3] and the pixels [P] that they fall on, counted row by row; -1 outside."""
+    x, y, z = camera.cam_from_world_R @ points.T + camera.cam_from_world_t[:, None]
+    is_in_front = z > 0
+    depths = np.where(is_in_front, z, 1.0)
+    u, v = camera.fx * x / depths + camera.cx, camera.fy * y / depths + camera.cy  # pixels
+    is_inside = is_in_front & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    pixels = np.where(is_inside, v, 0).astype(np.intp) * camera.width + np.where(is_inside, u, 0).astype(np.intp)
+    return z, np.where(is_inside, pixels, -1)
