@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from minisplat_ref.strategy.importance import ImportanceStats
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import as_dtype, make_camera, make_gaussians
 from scipy.integrate import quad
@@ -21,6 +20,7 @@ from minisplat_ref.strategy.aggressive_clone import (
     shared_scale_factors,
 )
 from minisplat_ref.strategy.clone_split import logit
+from minisplat_ref.strategy.importance import ImportanceStats
 
 OPACITIES = np.array([0.005, 0.1, 0.5, 0.9, 0.99, 1 - 1e-9])
 
