@@ -101,3 +101,6 @@ PRINTED_DIGITS = 6e-5
 # The integral of a composited profile by adaptive quadrature (1e-12), against sums of up to 8 alternating terms that
 # lose up to 8 log10(1 + 0.92) = 2.3 of 16 digits.
 ALPHA_INTEGRAL = 1e-11
+
+# Shares of 4000 draws: 4 sigma of sqrt(0.25 / 4000).
+SAMPLED_SHARE = 0.032

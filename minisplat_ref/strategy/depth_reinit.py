@@ -33,6 +33,7 @@ N_PARTNERS = 8  # views that vote on a point: more of them admit more chance agr
 BEST_PARALLAX = np.radians(
     20.0
 )  # of partners: from a nearer one a floater looks the same, from a farther one less is seen
+LEAST_SCORE = 0.05  # of a partner: 1 degree of parallax on all points, or the best on a twentieth of them
 N_PROBES = 256  # points of a view by which its partners are chosen
 
 
@@ -143,7 +144,7 @@ def reinitial_points(
     depth_tolerance : float or None
         Up to this relative difference between its depth and another view's, a point is on that view's surface. It is
         drawn only if more of up to 8 other views have it on their surface than see through it. None for the paper's
-        rule, which does not ask; a single view has nobody to ask.
+        rule, which does not ask. A view that no other one overlaps from another side has nobody to ask.
     rng : numpy.random.Generator
         Draws the pixels.
     conventions : Conventions
@@ -175,7 +176,7 @@ def reinitial_points(
     colors: list[NDArray[np.uint8]] = []
     for i, view in enumerate(views):
         view_points, weights = unprojected(depth_maps[i], cameras[i]).reshape(-1, 3), weight_maps[i].ravel()
-        if depth_tolerance is not None and len(views) > 1:
+        if depth_tolerance is not None:
             candidates = np.flatnonzero(weights)
             is_confirmed = _confirmed(view_points[candidates], i, cameras, depth_maps, depth_tolerance)
             weights[candidates[~is_confirmed]] = 0
@@ -231,10 +232,14 @@ def _confirmed(
 ) -> Bools:
     """Return which points [P, 3] of a view are on the surface of more of its partners than see through them.
 
-    A partner that sees something nearer in that place, or whose image does not contain the point, has no vote.
+    A partner that sees something nearer in that place, or whose image does not contain the point, has no vote. Without
+    partners all points are confirmed: a single photograph, or a camera that only turned on its tripod.
     """
+    partner_ids = _partners(points, own_id, cameras)
+    if len(partner_ids) == 0:
+        return np.ones(len(points), bool)
     votes = np.zeros(len(points), np.int32)
-    for j in _partners(points, own_id, cameras):
+    for j in partner_ids:
         z, pixels = _project(points, cameras[j])
         depths = np.where(pixels >= 0, depth_maps[j].ravel()[pixels], 0)  # [P], 0 where the partner sees nothing
         is_near = np.abs(depths - z) <= tolerance * z
@@ -245,7 +250,7 @@ def _confirmed(
 
 def _partners(points: Floats, own_id: int, cameras: Sequence[Camera]) -> Ints:
     """Return up to ``N_PARTNERS`` views that see many of the points [P, 3] from another side, but not too much so."""
-    probes = points[:: -(-len(points) // N_PROBES)] if len(points) else points  # [S, 3]
+    probes = points[:: max(1, len(points) // N_PROBES)]  # [S, 3]
     own_rays = _rays(probes, cameras[own_id])  # [S, 3]
     scores = np.zeros(len(cameras))
     for j, camera in enumerate(cameras):
@@ -253,15 +258,14 @@ def _partners(points: Floats, own_id: int, cameras: Sequence[Camera]) -> Ints:
         ratios = parallaxes / BEST_PARALLAX
         _, pixels = _project(probes, camera)
         scores[j] = np.where(pixels >= 0, np.minimum(ratios, 1 / np.maximum(ratios, 1)), 0).sum()
-    scores[own_id] = 0  # not rounding's
     best = np.argsort(-scores, kind="stable")[:N_PARTNERS]
-    return best[scores[best] > 0]
+    return best[scores[best] >= LEAST_SCORE * len(probes)]
 
 
 def _rays(points: Floats, camera: Camera) -> Floats:
     """Return the unit vectors [P, 3] from the camera's centre to points [P, 3]."""
     rays = points + camera.cam_from_world_R.T @ camera.cam_from_world_t
-    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), np.finfo(rays.dtype).tiny)
 
 
 def _project(points: Floats, camera: Camera) -> tuple[Floats, Ints]:

@@ -1,0 +1,176 @@
+"""Depth reinitialisation: where pixels have their points, which are drawn, and what other views say about them."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scenes import as_dtype, make_camera, make_gaussians
+from tolerances import CLOSED_FORM, PARITY_FLOAT64, SAMPLED_SHARE
+
+from data_tools.synthetic import make_scene
+from minisplat_ref.constants import GSPLAT_MAIN, INRIA
+from minisplat_ref.errors import InputError
+from minisplat_ref.reference.pinhole import pinhole
+from minisplat_ref.strategy.depth_reinit import (
+    PixelPoints,
+    blended_points,
+    centre_points,
+    midpoint_points,
+    reinitial_points,
+    unprojected,
+)
+from minisplat_ref.strategy.ops import concat
+from minisplat_ref.types import Gaussians, View
+
+ALL_KINDS = pytest.mark.parametrize("points_of", [midpoint_points, centre_points, blended_points])
+LEAST_ALPHA, DEPTH_TOLERANCE = 0.5, 0.05
+
+
+def round_gaussian(z, opacity, size=0.5):
+    """One on the axis of :func:`make_camera`."""
+    return Gaussians(
+        means=np.array([[0.0, 0.0, z]]),
+        quats=np.array([[1.0, 0.0, 0.0, 0.0]]),
+        log_scales=np.full((1, 3), np.log(size)),
+        opacity_logits=np.array([np.log(opacity / (1 - opacity))]),
+        sh_dc=np.zeros((1, 3)),
+        sh_rest=np.zeros((1, 0, 3)),
+    )
+
+
+def views_of(cameras, rng):
+    images = [rng.integers(0, 256, (camera.height, camera.width, 3), np.uint8) for camera in cameras]
+    return [View(f"view{i}", *pair, None) for i, pair in enumerate(zip(cameras, images, strict=True))]
+
+
+def given(*pixel_points):
+    """A ``points_of`` that answers with these depths and alphas, view by view, whatever the Gaussians."""
+    answers = iter([PixelPoints(unprojected(d, make_camera()), d, a) for d, a in pixel_points])
+    return lambda *_: next(answers)
+
+
+def draw(views, n_points, points_of, rng, least_alpha=0.0, depth_tolerance=None, gaussians=None):
+    return reinitial_points(
+        gaussians,
+        views,
+        n_points,
+        points_of=points_of,
+        least_alpha=least_alpha,
+        depth_tolerance=depth_tolerance,
+        rng=rng,
+    )
+
+
+def pixel_ids(colors, view):
+    """Which pixels these are, by their colours."""
+    code = view.image.reshape(-1, 3) @ np.array([65536, 256, 1])
+    assert len(np.unique(code)) == len(code)
+    order = np.argsort(code)
+    return order[np.searchsorted(code[order], colors @ np.array([65536, 256, 1]))]
+
+
+# Closed form ----------------------------------------------------------------------------------------------------------
+
+
+def test_midpoint_lies_on_a_sphere_and_centre_on_a_plane(backend):
+    """Of a round Gaussian at (0, 0, 3) the densest point of the ray t (x, y, 1) is at t = 3 / (x^2 + y^2 + 1)."""
+    camera, gaussians = make_camera(width=5, height=5), round_gaussian(3.0, 0.9)
+    slopes = (np.arange(5) - 2) / np.array([[30.0], [28.0]])  # [2, 5]
+    squared = slopes[0] ** 2 + slopes[1][:, None] ** 2
+    midpoint = midpoint_points(gaussians, camera, GSPLAT_MAIN, backend)
+    assert_allclose(midpoint.depths, 3 / (1 + squared), rtol=CLOSED_FORM)
+    assert_allclose(midpoint.points[4, 1], midpoint.depths[4, 1] * np.array([-1 / 30, 2 / 28, 1]), rtol=CLOSED_FORM)
+    assert midpoint.alpha[2, 2] == pytest.approx(0.9, rel=CLOSED_FORM)
+    centre = centre_points(gaussians, camera, GSPLAT_MAIN, backend)
+    assert_allclose(centre.depths, 3.0, rtol=CLOSED_FORM)
+    assert_allclose(centre.points[4, 1], 3 * np.array([-1 / 30, 2 / 28, 1]), rtol=CLOSED_FORM)
+
+
+def test_blended_depth_lies_between_surfaces(backend):
+    """Opacities 0.5 and 0.8 at depths 2 and 4: weights 0.5 and 0.4, so the dominant is at 2, the mean at 2.6 / 0.9."""
+    camera = make_camera(width=5, height=5)
+    gaussians = concat(round_gaussian(4.0, 0.8), round_gaussian(2.0, 0.5))
+    blended = blended_points(gaussians, camera, GSPLAT_MAIN, backend)
+    assert blended.depths[2, 2] == pytest.approx(2.6 / 0.9, rel=CLOSED_FORM)
+    assert blended.alpha[2, 2] == pytest.approx(0.9, rel=CLOSED_FORM)
+    for points_of in (midpoint_points, centre_points):
+        assert points_of(gaussians, camera, GSPLAT_MAIN, backend).depths[2, 2] == pytest.approx(2.0, rel=CLOSED_FORM)
+
+
+@ALL_KINDS
+def test_points_fall_back_on_the_centres_of_their_pixels(points_of, backend, rng):
+    camera = make_camera(rng=rng, cx=10.0, cy=11.0)
+    points, depths, _ = points_of(make_gaussians(rng, 60), camera, GSPLAT_MAIN, backend)
+    assert (depths > 0).any()
+    assert not points[depths == 0].any()
+    in_camera = points[depths > 0] @ camera.cam_from_world_R.T + camera.cam_from_world_t
+    ys, xs = np.nonzero(depths > 0)
+    assert_allclose(in_camera[:, 2], depths[depths > 0], rtol=PARITY_FLOAT64)
+    assert_allclose(pinhole(in_camera, camera), np.column_stack([xs, ys]) + 0.5, rtol=PARITY_FLOAT64)
+
+
+@ALL_KINDS
+def test_principal_point_is_the_conventions(points_of, rng):
+    """INRIA's rasteriser takes it for the image's centre, so the rays of its pictures go through there."""
+    from minisplat_ref.backends import CPU
+
+    gaussians, moved, centred = make_gaussians(rng, 60), make_camera(cx=10.0, cy=11.0), make_camera()
+    for of_moved, of_centred in zip(
+        points_of(gaussians, moved, INRIA, CPU), points_of(gaussians, centred, INRIA, CPU), strict=True
+    ):
+        assert_array_equal(of_moved, of_centred)
+
+
+# Which pixels are drawn -----------------------------------------------------------------------------------------------
+
+
+def test_probability_is_the_accumulated_opacity(rng):
+    """4000 times one pixel of four, with alpha 0.1, 0.2, 0.3, 0.4."""
+    camera = make_camera(width=2, height=2)
+    views = views_of([camera], rng) * 4_000
+    depths, alpha = np.ones((2, 2)), np.array([[0.1, 0.2], [0.3, 0.4]])
+    _, colors = draw(views, 4_000, lambda *_: PixelPoints(np.zeros((2, 2, 3)), depths, alpha), rng)
+    counts = np.bincount(pixel_ids(colors, views[0]), minlength=4)
+    assert_allclose(counts / 4_000, alpha.ravel(), atol=SAMPLED_SHARE)
+
+
+def test_drawing_is_without_replacement_and_spares_what_has_no_point(rng):
+    views = views_of([make_camera()] * 2, rng)
+    depths, alpha = rng.uniform(1, 2, (18, 24)), rng.uniform(0.1, 1, (18, 24))
+    depths[:, :4], alpha[:2] = 0, 0
+    points, colors = draw(views, 601, given((depths, alpha), (2 * depths, alpha)), rng)
+    assert len(points) == len(colors) == 600  # 300 a view of 20 x 16 = 320
+    assert points.dtype == np.float64 and colors.dtype == np.uint8
+    for i, view in enumerate(views):
+        ids = pixel_ids(colors[300 * i : 300 * (i + 1)], view)
+        assert len(np.unique(ids)) == 300
+        assert np.all((depths * alpha).ravel()[ids] > 0)
+        expected = unprojected((i + 1) * depths, make_camera()).reshape(-1, 3)[ids]
+        assert_allclose(points[300 * i : 300 * (i + 1)], expected, rtol=PARITY_FLOAT64)
+
+
+def test_more_than_there_are_takes_all(rng):
+    views = views_of([make_camera()], rng)
+    alpha = np.zeros((18, 24))
+    alpha[3:5] = 0.7
+    _, colors = draw(views, 10_000, given((np.ones((18, 24)), alpha)), rng)
+    assert_array_equal(pixel_ids(colors, views[0]), np.arange(3 * 24, 5 * 24))
+
+
+def test_opacity_floor_and_mask(rng):
+    view = views_of([make_camera()], rng)[0]
+    alpha = np.full((18, 24), 0.49)
+    alpha[:10] = 0.5
+    view = view._replace(mask=np.arange(24) < np.full((18, 1), 6))
+    _, colors = draw([view], 10_000, given((np.ones((18, 24)), alpha)), rng, least_alpha=0.5)
+    assert_array_equal(np.unique(pixel_ids(colors, view)), np.flatnonzero(view.mask & (alpha >= 0.5)))
+
+
+def test_same_generator_same_points(rng):
+    gaussians, views = as_dtype(make_gaussians(rng, 60), np.float32), views_of([make_camera()], rng)
+    first, second = (
+        draw(views, 50, midpoint_points, np.random.default_rng(7), gaussians=gaussians) for _ in range(2)
+    )
+    assert_array_equal(first[0], second[0])
+    assert_array_equal(first[1], second[1])
