@@ -104,3 +104,9 @@ ALPHA_INTEGRAL = 1e-11
 
 # Shares of 4000 draws: 4 sigma of sqrt(0.25 / 4000).
 SAMPLED_SHARE = 0.032
+
+# Frequency of one outcome in 10,000 draws, in units of its own deviation sqrt(p (1 - p)): 4 sigma of 1 / sqrt(10,000).
+SAMPLE_FREQUENCY = 0.04
+
+# Mean and covariance of 120 Gaussians, world units up to 3 (squared), by way of logarithms and eigenvectors.
+MERGED_MOMENTS = 1e-12

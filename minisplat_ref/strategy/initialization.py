@@ -63,20 +63,42 @@ def from_points(points: Floats, colors: NDArray[np.uint8], sh_degree: int) -> Ga
     InputError
         There are fewer than 4 points.
     """
-    n = len(points)
+    return from_means(points, ((colors / 255.0 - 0.5) / SH_C0).astype(np.float32), sh_degree)
+
+
+def from_means(means: Floats, sh_dc: Floats, sh_degree: int) -> Gaussians:
+    """Return what :func:`from_points` does, of colours that are given as coefficients and in their dtype.
+
+    Parameters
+    ----------
+    means : ndarray of shape (P, 3)
+        World frame.
+    sh_dc : ndarray of shape (P, 3)
+    sh_degree : int
+
+    Returns
+    -------
+    gaussians : Gaussians
+
+    Raises
+    ------
+    InputError
+        There are fewer than 4.
+    """
+    n, dtype = len(means), sh_dc.dtype
     if n <= N_NEIGHBOURS:
         raise InputError(f"points has {n} rows, a scale needs {N_NEIGHBOURS} neighbours: give more points")
-    distances, _ = cKDTree(points).query(points, N_NEIGHBOURS + 1)  # [P, 4], the first is the point itself
+    distances, _ = cKDTree(means).query(means, N_NEIGHBOURS + 1)  # [P, 4], the first is the point itself
     squared = np.maximum((distances[:, 1:] ** 2).mean(axis=1), LEAST_SQUARED_DISTANCE)  # [P]
-    quats = np.zeros((n, 4), np.float32)
-    quats[:, 0] = 1.0
+    quats = np.zeros((n, 4), dtype)
+    quats[:, 0] = 1
     return Gaussians(
-        means=points.astype(np.float32),
+        means=means.astype(dtype),
         quats=quats,
-        log_scales=np.repeat(0.5 * np.log(squared)[:, None], 3, axis=1).astype(np.float32),
-        opacity_logits=np.full(n, logit(INITIAL_OPACITY), np.float32),
-        sh_dc=((colors / 255.0 - 0.5) / SH_C0).astype(np.float32),
-        sh_rest=np.zeros((n, (sh_degree + 1) ** 2 - 1, 3), np.float32),
+        log_scales=np.repeat(0.5 * np.log(squared)[:, None], 3, axis=1).astype(dtype),
+        opacity_logits=np.full(n, logit(INITIAL_OPACITY), dtype),
+        sh_dc=sh_dc.copy(),
+        sh_rest=np.zeros((n, (sh_degree + 1) ** 2 - 1, 3), dtype),
     )
 
 

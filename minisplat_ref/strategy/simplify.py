@@ -1,0 +1,251 @@
+"""Simplification: few Gaussians that show nearly the same (Mini-Splatting, equation 3).
+
+Importance (:mod:`minisplat_ref.strategy.importance`) says how much a Gaussian matters to the training views. Four ways
+of using it are here, to be compared at equal numbers:
+
+- sampling, the paper's: draw Gaussians with probability proportional to importance, so that plain regions keep some;
+- rank: keep the most important ones;
+- mass: keep those that together carry a part of all importance;
+- merging: replace near neighbours by one Gaussian with their common mean and covariance. It is not in the paper.
+
+Left out: when each is done, and that the optimiser starts anew, which are the recipe's.
+"""
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.reference.covariance import covariances
+from minisplat_ref.strategy.clone_split import logit
+from minisplat_ref.strategy.importance import mass_mask
+from minisplat_ref.strategy.initialization import from_means
+from minisplat_ref.strategy.ops import Edit, keep, take
+from minisplat_ref.types import Floats, Gaussians, Ints
+
+LARGEST_OPACITY = 0.99  # of a merged Gaussian: alpha is clamped here, so that more is neither seen nor trained
+
+
+def intersection_preserving(importance: Floats, dominant_count: Ints) -> Floats:
+    """Return the importance with 0 where the Gaussian dominates no pixel of any view (equation 3).
+
+    Those that do are the ones that rays meet first and foremost; the others are buried or smeared over many.
+
+    Parameters
+    ----------
+    importance : ndarray of shape (N,)
+    dominant_count : ndarray of shape (N,)
+        Pixels of all training views that each dominates.
+    """
+    return np.where(dominant_count > 0, importance, 0.0)
+
+
+def sample(importance: Floats, n: int, rng: np.random.Generator) -> Ints:
+    """Draw ``n`` different rows with probability proportional to importance.
+
+    The law is that of drawing one after the other among those that are left. Drawing all at once has the same law: add
+    to every log importance a number from the standard Gumbel distribution, and take the ``n`` largest.
+
+    Parameters
+    ----------
+    importance : ndarray of shape (N,)
+        Not negative; rows of 0 are never drawn.
+    n : int
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    ids : ndarray of shape (n,)
+        Ascending.
+
+    Raises
+    ------
+    InputError
+        Fewer than ``n`` rows have any importance, or ``n`` is below 1.
+    """
+    ids = _candidates(importance, n)
+    keys = np.log(importance[ids]) + rng.gumbel(size=len(ids))
+    return np.sort(ids[np.argpartition(-keys, n - 1)[:n]])
+
+
+def most_important(importance: Floats, n: int) -> Ints:
+    """Return the ``n`` rows of largest importance, ascending; of equals the first.
+
+    Parameters, result and errors as for :func:`sample`.
+    """
+    ids = _candidates(importance, n)
+    return np.sort(ids[np.argsort(-importance[ids], kind="stable")[:n]])
+
+
+def carrying_mass(importance: Floats, mass: float) -> Ints:
+    """Return the rows, ascending, that :func:`mass_mask` marks.
+
+    Raises
+    ------
+    InputError
+        All importance is 0.
+    """
+    _candidates(importance, 1)
+    return np.flatnonzero(mass_mask(importance, mass))
+
+
+def _candidates(importance: Floats, n: int) -> Ints:
+    """Return the rows that are not 0, of which there must be ``n``."""
+    ids = np.flatnonzero(importance)
+    if n < 1:
+        raise InputError(f"budget is {n:,}, but a scene needs a Gaussian: give a budget of at least 1")
+    if len(ids) == 0:
+        raise InputError("all importance is 0, nothing is seen in any view: check the cameras, or train longer before")
+    if n > len(ids):
+        raise InputError(f"budget is {n:,} but only {len(ids):,} Gaussians have any importance: lower the budget")
+    return ids
+
+
+def by_sampling(gaussians: Gaussians, importance: Floats, n: int, rng: np.random.Generator) -> Edit:
+    """Keep the ``n`` Gaussians that :func:`sample` draws. As the next two, a choice that an event is given."""
+    return keep(gaussians, sample(importance, n, rng))
+
+
+def by_rank(gaussians: Gaussians, importance: Floats, n: int, rng: np.random.Generator) -> Edit:
+    """Keep the ``n`` Gaussians of :func:`most_important`; nothing is drawn."""
+    return keep(gaussians, most_important(importance, n))
+
+
+def by_merging(gaussians: Gaussians, importance: Floats, n: int, rng: np.random.Generator) -> Edit:
+    """Leave ``n`` Gaussians by :func:`merge_neighbours`; nothing is drawn."""
+    return merge_neighbours(gaussians, importance, n)
+
+
+def merge_neighbours(gaussians: Gaussians, importance: Floats, n: int) -> Edit:
+    """Merge near neighbours until ``n`` Gaussians are left; those without importance are dropped first.
+
+    In each round every two that are each other's nearest neighbour become one, the closest first. Of the members m of
+    such a cluster, with importance w_m and d_m = mu_m - mu::
+
+        mu    = sum w_m mu_m / sum w_m                      the colour's coefficients alike
+        Sigma = sum w_m (Sigma_m + d_m d_m^T) / sum w_m     quaternion and scales by its eigenvectors and eigenvalues
+        tau A = sum tau_m A_m,   o = 1 - exp(-tau)
+
+    tau is the optical thickness of a Gaussian, and A^2 = s1^2 s2^2 + s2^2 s3^2 + s3^2 s1^2 of its scales stands for
+    its cross-section. So two in one place stop as much light as both did, and two side by side become a larger one of
+    about their opacity.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+    importance : ndarray of shape (N,)
+    n : int
+
+    Returns
+    -------
+    edit : Edit
+        Ordered by the first member of each. Who was not merged stays the same; a merged row is new, and its parent is
+        its most important member.
+
+    Raises
+    ------
+    InputError
+        As for :func:`sample`.
+    """
+    ids = _candidates(importance, n)
+    weights = importance[ids].astype(np.float64)
+    labels = _clusters(gaussians.means[ids].astype(np.float64), weights, n)  # [C] in [0, n)
+    order = np.lexsort([-weights, labels])  # by cluster, its most important member first
+    ids, weights, labels = ids[order], weights[order], labels[order]
+    parent_ids = ids[np.flatnonzero(np.diff(labels, prepend=-1))]  # [n]
+    is_merged = np.bincount(labels, minlength=n) > 1  # [n]
+    left = take(gaussians, parent_ids)
+    if is_merged.any():
+        is_member = is_merged[labels]
+        members = Gaussians._make(field.astype(np.float64) for field in take(gaussians, ids[is_member]))
+        for field, merged in zip(left, _merged(members, weights[is_member], labels[is_member]), strict=True):
+            field[is_merged] = merged
+    return Edit(left, parent_ids, is_merged)
+
+
+def _clusters(means: Floats, weights: Floats, n: int) -> Ints:
+    """Return for each row the number of its cluster, of which there are ``n``, in the order of their first rows."""
+    labels = np.arange(len(means))
+    sums = np.column_stack([weights[:, None] * means, weights])  # [C, 4]
+    while len(sums) > n:
+        pairs = _mutual_neighbours(sums[:, :3] / sums[:, 3:])[: len(sums) - n]
+        into = np.arange(len(sums))
+        into[pairs[:, 1]] = pairs[:, 0]
+        into = np.unique(into, return_inverse=True)[1]
+        labels = into[labels]
+        sums = np.column_stack([np.bincount(into, column) for column in sums.T])
+    return labels
+
+
+def _mutual_neighbours(means: Floats) -> Ints:
+    """Return pairs [P, 2] of rows that are nearest to each other, the closest pair first, the lower row first.
+
+    Where distances are equal, neighbours may go round in a circle (points in one place, grids). All pairs of a row and
+    its neighbour are therefore ranked, and a pair counts if it is the first of both its rows: the closest always does.
+    """
+    rows = np.arange(len(means))
+    distances, nearest = cKDTree(means).query(means, 2)  # [M, 2] a row itself need not come before one in its place
+    is_self = nearest[:, 0] == rows
+    other = np.where(is_self, nearest[:, 1], nearest[:, 0])
+    order = np.argsort(np.where(is_self, distances[:, 1], distances[:, 0]), kind="stable")
+    pairs = np.column_stack([np.minimum(rows, other), np.maximum(rows, other)])[order]
+    ranks = np.full(len(means), len(pairs))
+    for column in pairs.T:
+        np.minimum.at(ranks, column, rows)
+    return pairs[(ranks[pairs[:, 0]] == rows) & (ranks[pairs[:, 1]] == rows)]
+
+
+def _merged(members: Gaussians, weights: Floats, labels: Ints) -> Gaussians:
+    """Return one Gaussian, float64, per cluster; the members of a cluster stand together."""
+    starts = np.flatnonzero(np.diff(labels, prepend=-1))  # [n]
+    sizes = np.diff(starts, append=len(labels))
+    shares = weights / np.repeat(np.add.reduceat(weights, starts), sizes)  # [M]
+
+    def mean_of(values: Floats) -> Floats:
+        return np.add.reduceat(shares.reshape(-1, *[1] * (values.ndim - 1)) * values, starts, axis=0)
+
+    means = mean_of(members.means)  # [n, 3]
+    offsets = members.means - np.repeat(means, sizes, axis=0)
+    scales = np.exp(members.log_scales)
+    sigmas = mean_of(covariances(members.quats, scales) + offsets[:, :, None] * offsets[:, None, :])  # [n, 3, 3]
+    variances, axes = np.linalg.eigh(sigmas)
+    # No variance is below the least of the members', but rounding does not know that.
+    variances = np.maximum(variances, np.minimum.reduceat(scales.min(axis=1) ** 2, starts)[:, None])
+    axes[np.linalg.det(axes) < 0, :, 0] *= -1  # a rotation, not a reflection
+
+    thickness = np.logaddexp(0.0, members.opacity_logits)  # tau = -ln(1 - o), of the logit
+    tau = np.add.reduceat(thickness * _cross_sections(scales**2), starts) / _cross_sections(variances)
+    return Gaussians(
+        means=means,
+        quats=Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]],
+        log_scales=0.5 * np.log(variances),
+        opacity_logits=np.minimum(tau + np.log(-np.expm1(-tau)), logit(LARGEST_OPACITY)),
+        sh_dc=mean_of(members.sh_dc),
+        sh_rest=mean_of(members.sh_rest),
+    )
+
+
+def _cross_sections(variances: Floats) -> Floats:
+    """Return s1 s2, s2 s3 and s3 s1 added as squares, of variances s^2 [M, 3]: proportional to an area [M]."""
+    s1, s2, s3 = variances.T
+    return np.sqrt(s1 * s2 + s2 * s3 + s3 * s1)
+
+
+def reinitialised(gaussians: Gaussians, sh_degree: int) -> Gaussians:
+    """Return Gaussians with these centres and colours, and all else as at the start of training.
+
+    Mini-Splatting does it after it has sampled: what remains has to grow over the gaps.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        At least 4.
+    sh_degree : int
+        Degree that is stored from now on; coefficients above 0 are zero.
+
+    Returns
+    -------
+    gaussians : Gaussians
+        In the dtype of the old ones.
+    """
+    return from_means(gaussians.means, gaussians.sh_dc, sh_degree)
