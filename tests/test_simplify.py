@@ -193,13 +193,12 @@ def test_grids_and_heaps_merge_to_the_end(n):
 
 
 def test_thin_needles_stay_finite():
-    """Rounding makes the smallest eigenvalues negative."""
-    gaussians = make_gaussians(np.random.default_rng(3), 40)._replace(
-        log_scales=np.tile(np.log([1.0, 1e-9, 1e-12]), (40, 1))
-    )
-    merged = merge_neighbours(gaussians._replace(means=np.zeros((40, 3))), np.ones(40), 3).gaussians
-    assert all(np.isfinite(field).all() for field in merged)
-    assert merged.log_scales.min() >= np.log(0.99e-12)
+    """Two alike in one place, forty times: rounding makes the smallest eigenvalue of some negative."""
+    needles = make_gaussians(np.random.default_rng(3), 40)
+    needles = needles._replace(log_scales=np.tile(np.log([1.0, 1e-9, 1e-12]), (40, 1)))
+    merged = merge_neighbours(take(needles, np.repeat(np.arange(40), 2)), np.ones(80), 40)
+    assert merged.is_new.all() and all(np.isfinite(field).all() for field in merged.gaussians)
+    assert merged.gaussians.log_scales.min() >= np.log(0.99e-12)
 
 
 def test_nothing_to_merge_changes_nothing(rng):
