@@ -222,6 +222,9 @@ class View(NamedTuple):
     become the mask (COLMAP scenes)."""
     mask: Bools | None
     """[H, W] True where the pixel counts in the loss; None where all do."""
+    point_ids: Ints | None = None
+    """[Q] rows of :attr:`Scene.points` that structure from motion found in the photograph, ascending; None where that
+    is not known."""
 
 
 class Scene(NamedTuple):

@@ -55,6 +55,20 @@ def test_rotation_and_simple_pinhole_by_hand(tmp_path):
     assert (camera.fx, camera.fy) == (40.0, 40.0)
 
 
+def test_tracks_say_which_view_sees_which_point(tmp_path):
+    sparse = write_colmap(tmp_path) / "sparse" / "0"
+    assert all(view.point_ids is None for view in views_of(load_colmap(tmp_path)).values())  # no tracks: not known
+    tracks = {7: "1 0 3 0", 3: "1 1 1 2", 9: "3 1 1 3"}  # pairs of image and observation; image 1 has point 3 twice
+    lines = (sparse / "points3D.txt").read_text().splitlines()
+    (sparse / "points3D.txt").write_text("".join(f"{line} {tracks[int(line.split()[0])]}\n" for line in lines))
+    seen = {1: "1 1 7 2 2 3 3 3 3 4 4 9", 3: "1 1 7 2 2 9"}  # x, y and point of each observation
+    poses = [line for line in (sparse / "images.txt").read_text().splitlines() if line]
+    (sparse / "images.txt").write_text("".join(f"{pose}\n{seen.get(int(pose.split()[0]), '')}\n" for pose in poses))
+    views = views_of(load_colmap(tmp_path))
+    for name, rows in {"0000": [0, 1, 2], "0001": [], "0002": [1, 2], "0003": []}.items():  # points sorted by id
+        np.testing.assert_array_equal(views[name].point_ids, rows)
+
+
 def test_no_test_views(tmp_path):
     scene = load_colmap(write_colmap(tmp_path), test_every=0)
     assert len(scene.train_views) == 4 and scene.test_views == ()
@@ -89,6 +103,17 @@ def test_real_scene_agrees_with_its_description(shared_data, name):
     for view in everything.train_views:
         np.testing.assert_allclose(view.camera[2:6], info["fx_fy_cx_cy"], atol=SCENE_INFO)
         assert view.image.shape == (info["height"], info["width"], 3)
+
+
+def test_real_views_see_their_points(shared_data):
+    scene = load_scene(shared_data / "banana", test_every=0)
+    for view in scene.train_views:
+        camera, ids = view.camera, view.point_ids
+        assert len(ids) > 20 and (np.diff(ids) > 0).all()
+        x, y, z = (scene.points[ids] @ camera.cam_from_world_R.T + camera.cam_from_world_t).T
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        assert (z > 0).all() and (u > 0).all() and (u < camera.width).all() and (v > 0).all()
+        assert (v < camera.height).all()
 
 
 def test_points_have_the_colours_of_the_images(shared_data):

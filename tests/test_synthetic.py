@@ -369,6 +369,12 @@ def test_folder(tmp_path, capsys):
             assert one.camera[2:] == two.camera[2:]
             assert_allclose(one.camera.cam_from_world_R, two.camera.cam_from_world_R, atol=CLOSED_FORM)
             assert_allclose(one.camera.cam_from_world_t, two.camera.cam_from_world_t, atol=CLOSED_FORM)
+    for view, made, seen in zip(
+        loaded.train_views, synthetic.scene.train_views, synthetic.point_visibility, strict=True
+    ):
+        assert_array_equal(view.point_ids, np.flatnonzero(seen))
+        assert_array_equal(made.point_ids, np.flatnonzero(seen))
+    assert all(view.point_ids is None for view in synthetic.scene.test_views)
     assert_allclose(loaded.points, synthetic.scene.points, atol=CLOSED_FORM)
     assert_array_equal(loaded.point_colors, synthetic.scene.point_colors)
     assert loaded.extent == pytest.approx(synthetic.scene.extent)

@@ -104,9 +104,10 @@ def make_scene(
     )
     train_centres = np.stack([camera_centre(cameras[i]) for i in train_ids])  # [V, 3]
     reach = np.linalg.norm(train_centres - train_centres.mean(axis=0), axis=1).max()
+    seen = [np.flatnonzero(row) for row in visibility]  # of V views: the points that each sees
     scene = Scene(
         name=name,
-        train_views=tuple(views[i] for i in train_ids),
+        train_views=tuple(views[i]._replace(point_ids=ids) for i, ids in zip(train_ids, seen, strict=True)),
         test_views=tuple(views[i] for i in test_ids),
         points=points,
         point_colors=colors,

@@ -2,11 +2,12 @@
 
 Poses are COLMAP's, which are ours: cam_from_world, OpenCV axes, the centre of the top-left pixel at (0.5, 0.5). Masks
 are where COLMAP looks for them (``masks/<file>.png``, as in ``0001.jpg.png``) or at ``masks/<name>.png``. An alpha
-channel is a mask too. Left out: 2D features, tracks, and images that COLMAP could not register.
+channel is a mask too. A point's track says which views see it. Left out: 2D features, and images that COLMAP could not
+register.
 """
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.lens import PINHOLE_MODELS, POLYNOMIAL_MODELS, Lens, import_pycolmap
 from minisplat_ref.io.scene import Photo, build_reading, build_scene, split_photos
-from minisplat_ref.types import Camera, Floats, Scene
+from minisplat_ref.types import Camera, Floats, Ints, Scene
 
 MODEL_FOLDERS = ("sparse/0", "sparse")
 
@@ -122,11 +123,12 @@ def colmap_photos(path: Path, reconstruction: Any) -> list[Photo]:
     folder = path / "images"
     if not folder.is_dir():
         raise InputError(f"{path}: no folder images/; put the photographs there, named as in the model")
-    return [_photo(path, folder, image) for image in reconstruction.images.values() if image.has_pose]
+    seen = _point_ids(reconstruction)
+    return [_photo(path, folder, image, seen) for image in reconstruction.images.values() if image.has_pose]
 
 
-def _photo(path: Path, folder: Path, image: Any) -> Photo:
-    """One registered image of the model."""
+def _photo(path: Path, folder: Path, image: Any, seen: Mapping[int, Ints] | None) -> Photo:
+    """One registered image of the model, and what it sees of the points where there are tracks."""
     masks = path / "masks"
     candidates = (masks / f"{image.name}.png", (masks / image.name).with_suffix(".png"))
     pose = image.cam_from_world().matrix()  # [3, 4]
@@ -146,7 +148,9 @@ def _photo(path: Path, folder: Path, image: Any) -> Photo:
         width=model.width,
         height=model.height,
     )
-    return Photo(folder, image.name, next((c for c in candidates if c.is_file()), None), camera, _lens(model))
+    mask_path = next((c for c in candidates if c.is_file()), None)
+    point_ids = None if seen is None else seen.get(image.image_id, np.zeros(0, np.int64))
+    return Photo(folder, image.name, mask_path, camera, _lens(model), point_ids)
 
 
 def _lens(camera: Any) -> Lens | None:
@@ -156,9 +160,24 @@ def _lens(camera: Any) -> Lens | None:
     return None if name in PINHOLE_MODELS or has_zero_distortion else Lens(name, tuple(params.tolist()))
 
 
+def _sorted_points(reconstruction: Any) -> list[Any]:
+    """Sparse points by ascending id, so that the order does not depend on the file's."""
+    return [point for _, point in sorted(reconstruction.points3D.items())]
+
+
+def _point_ids(reconstruction: Any) -> dict[int, Ints] | None:
+    """Rows of the points that each image sees, by the image's id; None for a model that was written without tracks."""
+    rows: dict[int, list[int]] = {}
+    for row, point in enumerate(_sorted_points(reconstruction)):
+        for element in point.track.elements:
+            rows.setdefault(element.image_id, []).append(row)
+    # An image may have matched a point twice.
+    return {image_id: np.unique(np.array(ids, np.int64)) for image_id, ids in rows.items()} if rows else None
+
+
 def _points(reconstruction: Any) -> tuple[Floats, NDArray[np.uint8]]:
-    """Sparse points and their colours, [P, 3] each, by ascending id so that the order does not depend on the file's."""
-    points = [point for _, point in sorted(reconstruction.points3D.items())]
+    """Sparse points and their colours, [P, 3] each."""
+    points = _sorted_points(reconstruction)
     positions = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
     return positions, np.array([point.color for point in points], np.uint8).reshape(-1, 3)
 

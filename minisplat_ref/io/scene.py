@@ -23,7 +23,7 @@ from minisplat_ref.io.images import (
     resize_mask,
 )
 from minisplat_ref.io.lens import Lens, undistort
-from minisplat_ref.types import Bools, Camera, Floats, Scene, View
+from minisplat_ref.types import Bools, Camera, Floats, Ints, Scene, View
 
 EXTENT_MARGIN = 1.1  # the 3DGS code's factor on the radius of the cameras; the learning rates were tuned with it
 ROTATION_TOLERANCE = 1e-3  # greatest error of R R^T = I: poses written with four digits pass, scaled ones do not
@@ -42,6 +42,8 @@ class Photo(NamedTuple):
     """Pose, intrinsics and size at full resolution; the pinhole part of the lens."""
     lens: Lens | None
     """None for a pinhole."""
+    point_ids: Ints | None = None
+    """As :attr:`View.point_ids`."""
 
     @property
     def path(self) -> Path:
@@ -193,7 +195,7 @@ def read_view(photo: Photo, name: str, reading: Reading) -> View:
     if (width, height) != (image.shape[1], image.shape[0]):
         image = resize_image(image, width, height)
         mask = None if mask is None else resize_mask(mask, width, height)
-    return View(name, rescale_camera(camera, width, height), image, mask)
+    return View(name, rescale_camera(camera, width, height), image, mask, photo.point_ids)
 
 
 def rescale_camera(camera: Camera, width: int, height: int) -> Camera:
