@@ -13,6 +13,7 @@ import minisplat_ref.cpu.adam
 import minisplat_ref.cpu.compositing
 import minisplat_ref.cpu.compositing_exact
 import minisplat_ref.cpu.depth
+import minisplat_ref.cpu.geometric_loss
 import minisplat_ref.cpu.loss
 import minisplat_ref.cpu.projection
 import minisplat_ref.cpu.spherical_harmonics
@@ -20,6 +21,7 @@ import minisplat_ref.cpu.tiling
 import minisplat_ref.reference.adam
 import minisplat_ref.reference.compositing
 import minisplat_ref.reference.depth
+import minisplat_ref.reference.geometric_loss
 import minisplat_ref.reference.loss
 import minisplat_ref.reference.projection
 import minisplat_ref.reference.spherical_harmonics
@@ -65,6 +67,8 @@ class Backend:
     surface_points_vjp: Callable[..., tuple[Floats, Floats, Floats]]
     photometric_loss: Callable[..., tuple[float, Any]]
     photometric_loss_vjp: Callable[..., Floats]
+    geometric_loss: Callable[..., tuple[float, Any]]
+    geometric_loss_vjp: Callable[..., tuple[Floats, Floats]]
     adam_update: Callable[..., None]
 
 
@@ -85,6 +89,8 @@ def _from_package(name: str, package: ModuleType, tile_width: int, tile_height: 
         surface_points_vjp=package.depth.surface_points_vjp,
         photometric_loss=package.loss.photometric_loss,
         photometric_loss_vjp=package.loss.photometric_loss_vjp,
+        geometric_loss=package.geometric_loss.geometric_loss,
+        geometric_loss_vjp=package.geometric_loss.geometric_loss_vjp,
         adam_update=package.adam.adam_update,
     )
 

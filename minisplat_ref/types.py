@@ -210,6 +210,17 @@ class SurfacePoints(NamedTuple):
     """[H, W] camera z, world units; 0 where there is none or the point lies behind the camera."""
 
 
+class GeometricWeights(NamedTuple):
+    """Factors of the geometric loss terms, beside the photometric loss; 0 leaves a term out."""
+
+    sfm_depth: float = 0.0
+    """Of the depth error at the points of structure from motion."""
+    depth_smoothness: float = 0.0
+    """Of the relative depth steps between neighbouring pixels."""
+    normal_smoothness: float = 0.0
+    """Of the turns of the surface between neighbouring pixels."""
+
+
 class View(NamedTuple):
     """A photograph with its camera."""
 

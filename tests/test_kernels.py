@@ -18,7 +18,7 @@ from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.render import render, render_vjp
 from minisplat_ref.scalar import _jit
-from minisplat_ref.types import ProjectionGradient, TileGrid
+from minisplat_ref.types import GeometricWeights, ProjectionGradient, TileGrid
 
 PACKAGE = Path(minisplat_ref.__file__).parent
 
@@ -41,6 +41,8 @@ def test_stages_keep_float32(rng):
     ids = output.stats.dominant_ids
     points = CPU.surface_points(means, quats, scales, camera, ids)
     _, tape = CPU.photometric_loss(output.image, output.image[::-1].copy(), 0.2)
+    geometry = (output.image[..., 0] + 1, output.alpha, output.image, camera, means.astype(float))
+    _, geometric_tape = CPU.geometric_loss(*geometry, GeometricWeights(1.0, 1.0, 1.0))
     results = {
         "project": projection,
         "project_vjp": CPU.project_vjp(*primitives, projection, v_projection),
@@ -51,6 +53,7 @@ def test_stages_keep_float32(rng):
         "surface_points": points,
         "surface_points_vjp": CPU.surface_points_vjp(means, quats, scales, camera, ids, points.points, points.depths),
         "photometric_loss_vjp": (CPU.photometric_loss_vjp(tape),),
+        "geometric_loss_vjp": CPU.geometric_loss_vjp(geometric_tape),
     }
     for stage, arrays in results.items():
         floats = [array for array in arrays if array.dtype.kind == "f"]

@@ -1,0 +1,268 @@
+"""Losses of a depth map, forward and backward: the loops over ``scalar/geometric_loss.py``.
+
+All three terms depend on ratios of depths alone, so that backward everything is collected by the logarithm of the
+depth; and log z = log(sum w z) - log(alpha). Backward, a pixel gathers from its neighbours: each number has one writer.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from minisplat_ref.constants import DEPTH_ALPHA_MIN, EDGE_SHARPNESS, SFM_DEPTH_TOLERANCE
+from minisplat_ref.cpu.projection import pose_of
+from minisplat_ref.scalar._jit import kernel, prange, scalar
+from minisplat_ref.scalar.geometric_loss import edge_weight, facing, facing_vjp, huber, huber_vjp
+from minisplat_ref.scalar.literals import HALF, ONE, ZERO
+from minisplat_ref.scalar.projection import dot, rows_of, to_camera
+from minisplat_ref.types import Bools, Camera, Floats, GeometricWeights, Ints
+
+
+class GeometricTape(NamedTuple):
+    """What the gradient of the geometric loss needs again."""
+
+    accumulated_depth: Floats
+    alpha: Floats
+    depth: Floats
+    """[H, W] 0 for none."""
+    lens: Floats
+    """[4] fx, fy, cx, cy."""
+    ties: Floats
+    """[2, H, W] weight between a pixel and its right and its lower neighbour; 0 where one of them has no depth."""
+    normals: Floats
+    """[H, W, 3] 0 for none."""
+    counts: Ints
+    """[2] pairs of depths and pairs of normals."""
+    point_pixels: Ints
+    """[n] flat index of the pixel that a point falls on."""
+    point_slopes: Floats
+    """[n] derivative of each point's cost by the pixel's log depth."""
+    weights: GeometricWeights
+
+
+# --- pairs of pixels ---
+
+
+@kernel()
+def _tie(depth, photograph, sharpness, ties):
+    height, width = depth.shape
+    for y in prange(height):
+        for x in range(width):
+            if depth[y, x] <= ZERO:
+                continue
+            if x + 1 < width and depth[y, x + 1] > ZERO:
+                ties[0, y, x] = edge_weight(photograph[y, x], photograph[y, x + 1], sharpness)
+            if y + 1 < height and depth[y + 1, x] > ZERO:
+                ties[1, y, x] = edge_weight(photograph[y, x], photograph[y + 1, x], sharpness)
+
+
+@kernel()
+def _depth_steps(depth, ties, sums):
+    height, width = depth.shape
+    for y in prange(height):
+        for x in range(width):
+            if x + 1 < width and depth[y, x] > ZERO and depth[y, x + 1] > ZERO:
+                sums[y, 0] += ties[0, y, x] * abs(math.log(depth[y, x + 1] / depth[y, x]))
+                sums[y, 1] += ONE
+            if y + 1 < height and depth[y, x] > ZERO and depth[y + 1, x] > ZERO:
+                sums[y, 0] += ties[1, y, x] * abs(math.log(depth[y + 1, x] / depth[y, x]))
+                sums[y, 1] += ONE
+
+
+@scalar
+def _pull(tie, z, z_other):
+    """Derivative of a pair's cost by log z."""
+    if z > z_other:
+        return tie
+    return -tie if z < z_other else ZERO * tie
+
+
+@kernel()
+def _depth_steps_vjp(depth, ties, v_pair, v_logs):
+    height, width = depth.shape
+    for y in prange(height):
+        for x in range(width):
+            z = depth[y, x]
+            v = ZERO * z
+            if x + 1 < width:
+                v += _pull(ties[0, y, x], z, depth[y, x + 1])
+            if x > 0:
+                v += _pull(ties[0, y, x - 1], z, depth[y, x - 1])
+            if y + 1 < height:
+                v += _pull(ties[1, y, x], z, depth[y + 1, x])
+            if y > 0:
+                v += _pull(ties[1, y - 1, x], z, depth[y - 1, x])
+            v_logs[y, x] += v_pair * v
+
+
+# --- pairs of normals ---
+
+
+@kernel()
+def _normals(depth, lens, normals):
+    height, width = depth.shape
+    fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
+    for y in prange(height - 1):
+        for x in range(width - 1):
+            z, z_right, z_down = depth[y, x], depth[y, x + 1], depth[y + 1, x]
+            if z > ZERO and z_right > ZERO and z_down > ZERO:
+                s, t = (x + HALF - cx) / fx, (y + HALF - cy) / fy
+                normal, _ = facing(z, z_right, z_down, s, t, fx, fy)
+                for i in range(3):
+                    normals[y, x, i] = normal[i]
+
+
+@scalar
+def _is_normal(normal):
+    return dot(normal, normal) > HALF  # of length 1 or 0
+
+
+@scalar
+def _half_square(a, b):
+    x, y, z = a[0] - b[0], a[1] - b[1], a[2] - b[2]
+    return HALF * (x * x + y * y + z * z)
+
+
+@kernel()
+def _turns(normals, ties, sums):
+    height, width, _ = normals.shape
+    for y in prange(height):
+        for x in range(width):
+            normal = normals[y, x]
+            if not _is_normal(normal):
+                continue
+            if x + 1 < width and _is_normal(normals[y, x + 1]):
+                sums[y, 0] += ties[0, y, x] * ties[0, y, x + 1] * _half_square(normal, normals[y, x + 1])
+                sums[y, 1] += ONE
+            if y + 1 < height and _is_normal(normals[y + 1, x]):
+                sums[y, 0] += ties[1, y, x] * ties[1, y + 1, x] * _half_square(normal, normals[y + 1, x])
+                sums[y, 1] += ONE
+
+
+@scalar
+def _add_turn(v, tie, a, b):
+    """Add the derivative of a pair's cost by its first normal; no normal has no part in it."""
+    if not _is_normal(b):
+        return v
+    return v[0] + tie * (a[0] - b[0]), v[1] + tie * (a[1] - b[1]), v[2] + tie * (a[2] - b[2])
+
+
+@kernel()
+def _turns_vjp(depth, lens, normals, ties, v_pair, v_steps):
+    height, width = depth.shape
+    fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
+    for y in prange(height - 1):
+        for x in range(width - 1):
+            n = normals[y, x]
+            if not _is_normal(n):
+                continue
+            # The last row and column have no normals, so neighbours to the right and below are always there.
+            v = (ZERO * fx, ZERO * fx, ZERO * fx)
+            v = _add_turn(v, v_pair * ties[0, y, x] * ties[0, y, x + 1], n, normals[y, x + 1])
+            v = _add_turn(v, v_pair * ties[1, y, x] * ties[1, y + 1, x], n, normals[y + 1, x])
+            if x > 0:
+                v = _add_turn(v, v_pair * ties[0, y, x - 1] * ties[0, y, x], n, normals[y, x - 1])
+            if y > 0:
+                v = _add_turn(v, v_pair * ties[1, y - 1, x] * ties[1, y, x], n, normals[y - 1, x])
+            s, t = (x + HALF - cx) / fx, (y + HALF - cy) / fy
+            v_right, v_down = facing_vjp(depth[y, x], depth[y, x + 1], depth[y + 1, x], s, t, fx, fy, v)
+            v_steps[0, y, x] = v_right
+            v_steps[1, y, x] = v_down
+
+
+# --- points ---
+
+
+@kernel()
+def _look_up(points, rotation, centre, lens, depth, tolerance, pixels, costs, slopes):
+    height, width = depth.shape
+    for i in prange(points.shape[0]):
+        x, y, z = to_camera(rows_of(rotation), centre, points[i, 0], points[i, 1], points[i, 2])
+        if not z > ZERO:
+            continue
+        u, v = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
+        if not (u >= ZERO and u < width and v >= ZERO and v < height):
+            continue
+        column, row = int(u), int(v)
+        if depth[row, column] > ZERO:
+            error = math.log(depth[row, column] / z)
+            pixels[i] = row * width + column
+            costs[i] = huber(error, tolerance)
+            slopes[i] = huber_vjp(error, tolerance)
+
+
+# --- the stage ---
+
+
+def geometric_loss(
+    accumulated_depth: Floats,
+    alpha: Floats,
+    photograph: Floats,
+    camera: Camera,
+    points: Floats,
+    weights: GeometricWeights,
+    mask: Bools | None = None,
+) -> tuple[float, GeometricTape]:
+    """Weighted sum of the terms, of which those of weight 0 are not computed; see ``reference.geometric_loss``."""
+    dtype, (height, width) = accumulated_depth.dtype, accumulated_depth.shape
+    counts_here = (alpha > DEPTH_ALPHA_MIN) & (accumulated_depth > 0)
+    if mask is not None:
+        counts_here &= mask
+    depth = np.zeros((height, width), dtype)
+    np.divide(accumulated_depth, alpha, out=depth, where=counts_here)
+    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    ties, normals = np.zeros((2, height, width), dtype), np.zeros((height, width, 3), dtype)
+    sums = np.zeros((2, height, 2))  # depth and normals: of costs, of pairs
+    if weights.depth_smoothness or weights.normal_smoothness:
+        photograph = np.ascontiguousarray(photograph, dtype)
+        _tie(depth, photograph, dtype.type(EDGE_SHARPNESS), ties)
+    if weights.depth_smoothness:
+        _depth_steps(depth, ties, sums[0])
+    if weights.normal_smoothness:
+        _normals(depth, lens.astype(dtype), normals)
+        _turns(normals, ties, sums[1])
+    pixels, costs, slopes = _seen_points(depth, camera, lens, points if weights.sfm_depth else points[:0])
+
+    costs_of_pairs, n_pairs = np.moveaxis(sums.sum(axis=1), 1, 0)
+    means = costs_of_pairs / np.maximum(n_pairs, 1)
+    loss = weights.depth_smoothness * means[0] + weights.normal_smoothness * means[1]
+    loss += weights.sfm_depth * costs.sum() / max(1, len(costs))
+    counts = n_pairs.astype(np.int64)
+    lens = lens.astype(dtype)
+    tape = GeometricTape(accumulated_depth, alpha, depth, lens, ties, normals, counts, pixels, slopes, weights)
+    return float(loss), tape
+
+
+def _seen_points(depth: Floats, camera: Camera, lens: Floats, points: Floats) -> tuple[Ints, Floats, Floats]:
+    """Pixel, cost and slope [n] of the points that fall on a pixel with depth, in float64 like their positions."""
+    n = len(points)
+    pixels, costs, slopes = np.full(n, -1), np.zeros(n), np.zeros(n)
+    rotation, centre = pose_of(camera, np.dtype(np.float64))
+    points = np.ascontiguousarray(points, np.float64)
+    _look_up(points, rotation, centre, lens, depth, SFM_DEPTH_TOLERANCE, pixels, costs, slopes)
+    is_seen = pixels >= 0
+    return pixels[is_seen], costs[is_seen], slopes[is_seen]
+
+
+def geometric_loss_vjp(tape: GeometricTape, v_loss: float = 1.0) -> tuple[Floats, Floats]:
+    """Chain the derivative by the loss to accumulated depth and opacity; see ``reference.geometric_loss``."""
+    depth, weights, dtype = tape.depth, tape.weights, tape.depth.dtype
+    v_logs = np.zeros(depth.shape, dtype)
+    if weights.depth_smoothness:
+        v_pair = dtype.type(v_loss * weights.depth_smoothness / max(1, tape.counts[0]))
+        _depth_steps_vjp(depth, tape.ties, v_pair, v_logs)
+    if weights.normal_smoothness:
+        v_pair = dtype.type(v_loss * weights.normal_smoothness / max(1, tape.counts[1]))
+        v_right, v_down = v_steps = np.zeros((2, *depth.shape), dtype)
+        _turns_vjp(depth, tape.lens, tape.normals, tape.ties, v_pair, v_steps)
+        v_logs -= v_right + v_down
+        v_logs[:, 1:] += v_right[:, :-1]
+        v_logs[1:] += v_down[:-1]
+    if len(tape.point_pixels):
+        v_point = v_loss * weights.sfm_depth / len(tape.point_pixels)
+        v_seen = np.bincount(tape.point_pixels, weights=v_point * tape.point_slopes, minlength=depth.size)
+        v_logs += v_seen.reshape(depth.shape).astype(dtype)
+    v_accumulated_depth, v_alpha = np.zeros_like(depth), np.zeros_like(depth)
+    np.divide(v_logs, tape.accumulated_depth, out=v_accumulated_depth, where=depth > 0)
+    np.divide(-v_logs, tape.alpha, out=v_alpha, where=depth > 0)
+    return v_accumulated_depth, v_alpha

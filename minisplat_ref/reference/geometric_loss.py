@@ -1,0 +1,317 @@
+"""Stage 7, optional: how far a rendered depth map is from what is known or likely about surfaces.
+
+Three terms beside the photometric loss, none of them part of 3DGS or Mini-Splatting, all weighted 0 by default:
+
+* depth at the points of structure from motion, as in DS-NeRF (Deng et al. 2022), here robust (Huber 1964);
+* depth smoothness that photographed edges switch off, as in Monodepth (Godard et al. 2017);
+* normal smoothness with the same edges: half the squared difference of neighbouring normals, 1 minus their cosine.
+
+Depths are compared by the logarithm of their ratio. The unit of a scene from structure from motion is arbitrary, so a
+weight must not depend on it; triangulation errors grow with the distance; too near and too far count alike, where
+inverse depth hardly sees an error behind a far point. A point looks at the pixel it falls on: interpolating would mix
+both sides of a silhouette, and half a pixel of a surface tilted by 60 degrees is 0.2 % of its depth at a focal length
+of 500 pixels, less than the tolerance. Left out: uncertainties of single points, and gradients by the pose.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from minisplat_ref.constants import EDGE_SHARPNESS, SFM_DEPTH_TOLERANCE
+from minisplat_ref.reference.depth_map import depth_normals, depth_normals_vjp, expected_depth, expected_depth_vjp
+from minisplat_ref.reference.pinhole import pinhole, pose
+from minisplat_ref.types import Bools, Camera, Floats, GeometricWeights, Ints
+
+
+class GeometricTape(NamedTuple):
+    """What the gradient of the geometric loss needs."""
+
+    accumulated_depth: Floats
+    """[H, W]."""
+    alpha: Floats
+    """[H, W]."""
+    depth: Floats
+    """[H, W] expected depth; 0 for none, also where masked out."""
+    photograph: Floats
+    """[H, W, 3]."""
+    camera: Camera
+    points: Floats
+    """[Q, 3] world frame."""
+    weights: GeometricWeights
+
+
+def geometric_loss(
+    accumulated_depth: Floats,
+    alpha: Floats,
+    photograph: Floats,
+    camera: Camera,
+    points: Floats,
+    weights: GeometricWeights,
+    mask: Bools | None = None,
+) -> tuple[float, GeometricTape]:
+    """Weighted sum of :func:`sfm_depth_loss`, :func:`depth_smoothness` and :func:`normal_smoothness`.
+
+    Parameters
+    ----------
+    accumulated_depth : ndarray of shape (H, W)
+        ``sum_g w_g z_g``, the last channel of an image that was rendered with depth.
+    alpha : ndarray of shape (H, W)
+        Accumulated opacity.
+    photograph : ndarray of shape (H, W, 3)
+        In [0, 1].
+    camera : Camera
+        The view; its principal point is used.
+    points : ndarray of shape (Q, 3)
+        Points that the view is known to see, world frame; Q may be 0.
+    weights : GeometricWeights
+        Factors of the terms.
+    mask : ndarray of bool of shape (H, W), optional
+        Pixels that count; the others are treated as if nothing was hit.
+
+    Returns
+    -------
+    loss : float
+        The loss.
+    tape : GeometricTape
+        For the gradient.
+    """
+    depth = expected_depth(accumulated_depth, alpha)
+    if mask is not None:
+        depth = np.where(mask, depth, 0)
+    loss = weights.sfm_depth * sfm_depth_loss(depth, camera, points)
+    loss += weights.depth_smoothness * depth_smoothness(depth, photograph)
+    loss += weights.normal_smoothness * normal_smoothness(depth_normals(depth, camera), photograph)
+    return loss, GeometricTape(accumulated_depth, alpha, depth, photograph, camera, points, weights)
+
+
+def geometric_loss_vjp(tape: GeometricTape, v_loss: float = 1.0) -> tuple[Floats, Floats]:
+    """Gradient of :func:`geometric_loss`: those of the terms through depth and normals.
+
+    ::
+
+        v_z = v_loss (w_1 v_z1 + w_2 v_z2 + depth_normals_vjp(w_3 v_n)),   v_D, v_alpha = expected_depth_vjp(v_z)
+
+    Parameters
+    ----------
+    tape : GeometricTape
+        From the forward function.
+    v_loss : float
+        Derivative by the loss.
+
+    Returns
+    -------
+    v_accumulated_depth : ndarray of shape (H, W)
+        Derivative by the accumulated depth.
+    v_alpha : ndarray of shape (H, W)
+        Derivative by the accumulated opacity.
+    """
+    depth, photograph, camera, weights = tape.depth, tape.photograph, tape.camera, tape.weights
+    v_normals = normal_smoothness_vjp(depth_normals(depth, camera), photograph, v_loss * weights.normal_smoothness)
+    v_depth = depth_normals_vjp(depth, camera, v_normals)
+    v_depth += depth_smoothness_vjp(depth, photograph, v_loss * weights.depth_smoothness)
+    v_depth += sfm_depth_loss_vjp(depth, camera, tape.points, v_loss * weights.sfm_depth)
+    return expected_depth_vjp(tape.accumulated_depth, tape.alpha, v_depth)
+
+
+def sfm_depth_loss(depth: Floats, camera: Camera, points: Floats) -> float:
+    """Mean over the points of ``h(log(z / z_p))``: z of the pixel that a point falls on, z_p of the point itself.
+
+    h is Huber's function with the tolerance tau, a quadratic that goes on as a line::
+
+        h(e) = e^2 / (2 tau)  where |e| <= tau,   |e| - tau / 2  beyond
+
+    Parameters
+    ----------
+    depth : ndarray of shape (H, W)
+        Camera z; 0 for none.
+    camera : Camera
+        The view.
+    points : ndarray of shape (Q, 3)
+        World frame. Points behind the camera, outside the image or on a pixel without depth are left out.
+
+    Returns
+    -------
+    float
+        0 if no point is left.
+    """
+    _, _, errors = _depth_errors(depth, camera, points)
+    sizes = np.abs(errors)
+    is_small = sizes <= SFM_DEPTH_TOLERANCE
+    costs = np.where(is_small, errors**2 / (2 * SFM_DEPTH_TOLERANCE), sizes - SFM_DEPTH_TOLERANCE / 2)
+    return float(np.sum(costs, dtype=np.float64)) / max(1, len(errors))
+
+
+def sfm_depth_loss_vjp(depth: Floats, camera: Camera, points: Floats, v_loss: float = 1.0) -> Floats:
+    """Gradient of :func:`sfm_depth_loss`.
+
+    With n points that count::
+
+        v_z = sum over the pixel's points of  v_loss h'(e) / (n z),   h'(e) = e / tau kept in [-1, 1]
+
+    Parameters
+    ----------
+    depth, camera, points
+        As for the forward function.
+    v_loss : float
+        Derivative by the loss.
+
+    Returns
+    -------
+    ndarray of shape (H, W)
+        Derivative by the depth.
+    """
+    rows, columns, errors = _depth_errors(depth, camera, points)
+    slopes = np.clip(errors / SFM_DEPTH_TOLERANCE, -1, 1)
+    v_depth = np.zeros_like(depth)
+    np.add.at(v_depth, (rows, columns), v_loss * slopes / (max(1, len(errors)) * depth[rows, columns]))
+    return v_depth
+
+
+def depth_smoothness(depth: Floats, photograph: Floats) -> float:
+    """Mean of ``e |log z' - log z|`` over all pairs of horizontal or vertical neighbours that both have a depth.
+
+    Parameters
+    ----------
+    depth : ndarray of shape (H, W)
+        Camera z; 0 for none.
+    photograph : ndarray of shape (H, W, 3)
+        Gives the weights e, :func:`edge_weights`.
+
+    Returns
+    -------
+    float
+        0 for equal depths everywhere; a plane that is tilted against the image is not free.
+    """
+    logs, weights = _logs_and_weights(depth, photograph)
+    terms = [e * np.abs(np.diff(logs, axis=axis)) for axis, e in enumerate(weights)]
+    return sum(float(np.sum(term, dtype=np.float64)) for term in terms)
+
+
+def depth_smoothness_vjp(depth: Floats, photograph: Floats, v_loss: float = 1.0) -> Floats:
+    """Gradient of :func:`depth_smoothness`.
+
+    With n pairs; each difference hands its derivative to its second pixel and the negative to its first::
+
+        v_difference = v_loss e sign(log z' - log z) / n
+        v_z = (sum of v_difference where second - sum of v_difference where first) / z
+
+    Parameters
+    ----------
+    depth, photograph
+        As for the forward function.
+    v_loss : float
+        Derivative by the loss.
+
+    Returns
+    -------
+    ndarray of shape (H, W)
+        Derivative by the depth.
+    """
+    logs, weights = _logs_and_weights(depth, photograph)
+    v_logs = np.zeros_like(depth)
+    for axis, e in enumerate(weights):
+        v_logs += _diff_vjp(v_loss * e * np.sign(np.diff(logs, axis=axis)), axis)
+    return v_logs / np.where(depth > 0, depth, 1)
+
+
+def normal_smoothness(normals: Floats, photograph: Floats) -> float:
+    """Mean of ``e (1 - n . n') = e |n' - n|^2 / 2`` over all pairs of horizontal or vertical neighbours.
+
+    Parameters
+    ----------
+    normals : ndarray of shape (H - 1, W - 1, 3)
+        :func:`depth_normals`; 0 for none. Pairs of two normals count.
+    photograph : ndarray of shape (H, W, 3)
+        Gives the weights. A normal spans two pixels, so a pair of them may step over two edges: e is the product of
+        their :func:`edge_weights`.
+
+    Returns
+    -------
+    float
+        0 for any plane.
+    """
+    terms = [e[:, :, None] * np.diff(normals, axis=axis) ** 2 / 2 for axis, e in enumerate(_turns(normals, photograph))]
+    return sum(float(np.sum(term, dtype=np.float64)) for term in terms)
+
+
+def normal_smoothness_vjp(normals: Floats, photograph: Floats, v_loss: float = 1.0) -> Floats:
+    """Gradient of :func:`normal_smoothness`.
+
+    With n pairs; each difference hands its derivative to its second normal and the negative to its first::
+
+        v_difference = v_loss e (n' - n) / n_pairs
+
+    Parameters
+    ----------
+    normals, photograph
+        As for the forward function.
+    v_loss : float
+        Derivative by the loss.
+
+    Returns
+    -------
+    ndarray of shape (H - 1, W - 1, 3)
+        Derivative by the normals.
+    """
+    v_normals = np.zeros_like(normals)
+    for axis, e in enumerate(_turns(normals, photograph)):
+        v_normals += _diff_vjp(v_loss * e[:, :, None] * np.diff(normals, axis=axis), axis)
+    return v_normals
+
+
+def edge_weights(photograph: Floats) -> tuple[Floats, Floats]:
+    """Weights ``exp(-k mean |I' - I|)`` of neighbouring pixels: 1 where equal, near 0 across an edge.
+
+    Parameters
+    ----------
+    photograph : ndarray of shape (H, W, 3)
+        In [0, 1]; the mean is over its channels.
+
+    Returns
+    -------
+    down : ndarray of shape (H - 1, W)
+        Between a pixel and the one below.
+    right : ndarray of shape (H, W - 1)
+        Between a pixel and the one to the right.
+    """
+    down, right = (np.exp(-EDGE_SHARPNESS * np.mean(np.abs(np.diff(photograph, axis=axis)), axis=2)) for axis in (0, 1))
+    return down, right
+
+
+def _depth_errors(depth: Floats, camera: Camera, points: Floats) -> tuple[Ints, Ints, Floats]:
+    """Row, column and ``log(z / z_p)`` [n] of the points that fall on a pixel with a depth."""
+    R, t = pose(camera, points.dtype)
+    in_camera = points @ R.T + t
+    in_camera = in_camera[in_camera[:, 2] > 0]
+    pixels = pinhole(in_camera, camera)  # [n, 2]
+    is_inside = np.all((pixels >= 0) & (pixels < [camera.width, camera.height]), axis=1)
+    columns, rows = pixels[is_inside].astype(int).T  # rounds down: the centre of pixel 0 is at 0.5
+    has_depth = depth[rows, columns] > 0
+    rows, columns, z_points = rows[has_depth], columns[has_depth], in_camera[is_inside, 2][has_depth]
+    return rows, columns, np.log(depth[rows, columns] / z_points.astype(depth.dtype))
+
+
+def _logs_and_weights(depth: Floats, photograph: Floats) -> tuple[Floats, tuple[Floats, Floats]]:
+    """Log depths [H, W], 0 where there is none, and what each difference along axis 0 and 1 counts in the mean."""
+    has_depth = depth > 0
+    return np.log(np.where(has_depth, depth, 1)), _mean_weights(edge_weights(photograph), has_depth)
+
+
+def _turns(normals: Floats, photograph: Floats) -> tuple[Floats, Floats]:
+    """What each difference of normals along axis 0 and 1 counts in the mean."""
+    down, right = edge_weights(photograph)
+    spanned = down[:-1, :-1] * down[1:, :-1], right[:-1, :-1] * right[:-1, 1:]  # [H - 2, W - 1], [H - 1, W - 2]
+    return _mean_weights(spanned, np.any(normals != 0, axis=2))
+
+
+def _mean_weights(weights: tuple[Floats, Floats], exists: Bools) -> tuple[Floats, Floats]:
+    """Weights of neighbours that both exist, 0 for the others, divided by the number of such pairs in both axes."""
+    both_down, both_right = exists[:-1] & exists[1:], exists[:, :-1] & exists[:, 1:]
+    n = max(1, np.count_nonzero(both_down) + np.count_nonzero(both_right))
+    return np.where(both_down, weights[0], 0) / n, np.where(both_right, weights[1], 0) / n
+
+
+def _diff_vjp(v_difference: Floats, axis: int) -> Floats:
+    """Gradient of ``np.diff``: v_x_j = v_difference_(j-1) - v_difference_j."""
+    padding = [(1, 1) if a == axis else (0, 0) for a in range(v_difference.ndim)]
+    return -np.diff(np.pad(v_difference, padding), axis=axis)
