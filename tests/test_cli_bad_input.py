@@ -200,6 +200,73 @@ def test_curve_of_no_test_views(train_refused, tmp_path):
     assert "--test-every" in train_refused(scene, "--test-every", "0", "--eval-every", "1")
 
 
+# Comparisons
+
+
+@pytest.fixture
+def compare_refused(refused, tmp_path):
+    """Compare on a scene that could be trained; return the line that says why not."""
+    scene = write_colmap(tmp_path / "scene", n=6)
+
+    def run(*options, recipes="3dgs,3dgs-accel"):
+        return refused("compare", scene, "--out", tmp_path / "out", "--recipes", recipes, "--test-every", "3", *options)
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (["--iterations", "3,2,1"], "3 numbers for 2 recipes"),
+        (["--test-every", "0"], "without test views"),
+        (["--test-every", "1"], "0 training and 6 test"),
+        (["--seeds", "1,0,1"], "--seeds names 1 more than once"),
+        (["--budget", "10"], "--budget means nothing to 3dgs, 3dgs-accel"),
+        (["--scene-type", "outdoor"], "--scene-type means nothing to 3dgs, 3dgs-accel"),
+    ],
+)
+def test_bad_comparison(compare_refused, options, reason):
+    assert reason in compare_refused(*options)
+
+
+@pytest.mark.parametrize(("recipes", "culprit"), [("3dgs,5dgs", "'5dgs'"), ("3dgs,3dgs", "--recipes names 3dgs")])
+def test_bad_recipes_to_compare(compare_refused, recipes, culprit):
+    assert culprit in compare_refused(recipes=recipes)
+
+
+def test_comparison_of_a_missing_scene(refused, tmp_path):
+    options = ["--recipes", "3dgs", "--out", tmp_path / "out"]
+    assert str(tmp_path / "nowhere") in refused("compare", tmp_path / "nowhere", *options)
+
+
+def test_comparison_into_an_occupied_folder(compare_refused, tmp_path):
+    write_run(tmp_path / "out", tmp_path / "scene")
+    assert str(tmp_path / "out") in compare_refused()
+    (tmp_path / "out" / "config.json").unlink()
+    assert f"{tmp_path / 'out'} is not an empty folder" in compare_refused()
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (["--out", "there"], "--recipes"),
+        (["--recipes", "3dgs"], "--out"),
+        (["--recipes", "3dgs,,3dgs-accel", "--out", "there"], "a name is missing"),
+        (["--recipes", "", "--out", "there"], "a name is missing"),
+        (["--recipes", "3dgs", "--iterations", "10,x", "--out", "there"], "'x' is not a whole number"),
+        (["--recipes", "3dgs", "--seeds", "0,", "--out", "there"], "'' is not a whole number"),
+    ],
+)
+def test_bad_options_of_a_comparison(options, reason, tmp_path, capfd, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as exit_info:
+        main(["compare", "scene", *options])
+    captured = capfd.readouterr()
+    assert (exit_info.value.code, captured.out, len(captured.err.splitlines())) == (2, "", 1)
+    assert reason in captured.err
+    assert not any(tmp_path.iterdir())
+
+
 # Gaussians
 
 

@@ -16,9 +16,9 @@ from typing import NoReturn
 from minisplat_ref.cli.arguments import HelpFormatter
 from minisplat_ref.errors import InputError
 
-from . import demo, evaluate, info, render, train
+from . import compare, demo, evaluate, info, render, train
 
-COMMANDS = (demo, train, render, evaluate, info)
+COMMANDS = (demo, train, render, evaluate, compare, info)
 
 DESCRIPTION = """\
 3D Gaussian Splatting on the CPU: train a scene from photographs, look at it,

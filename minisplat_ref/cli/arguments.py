@@ -3,6 +3,7 @@
 import argparse
 import shutil
 from collections.abc import Callable
+from typing import Any
 
 from minisplat_ref.constants import GSPLAT_MAIN, PROFILES
 
@@ -31,6 +32,18 @@ def integer(minimum: int) -> Callable[[str], int]:
         return value
 
     return parse
+
+
+def name(text: str) -> str:
+    """Type of a name, which must be there."""
+    if not text:
+        raise argparse.ArgumentTypeError("a name is missing")
+    return text
+
+
+def listed(parse: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
+    """Return the type of values between commas."""
+    return lambda text: tuple(parse(part.strip()) for part in text.split(","))
 
 
 def add_renderer_arguments(parser: argparse._ActionsContainer, default: str | None, whose: str = "") -> None:

@@ -29,6 +29,7 @@ p { margin: 4px 0 16px; color: #4a5560; max-width: 74ch }
 figure { margin: 0 }
 figure img { display: block; width: 100%; border-radius: 4px }
 figcaption { color: #6a7580; font-size: 13.5px; padding: 6px 0 2px }
+.pixels img { image-rendering: pixelated }
 .label { font-size: 14px; color: #4a5560; margin: 0 0 8px }
 svg { display: block; width: 100%; height: auto }
 table { border-collapse: collapse; width: 100%; font-size: 15px }
