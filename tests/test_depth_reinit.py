@@ -174,3 +174,110 @@ def test_same_generator_same_points(rng):
     )
     assert_array_equal(first[0], second[0])
     assert_array_equal(first[1], second[1])
+
+
+# What other views say -------------------------------------------------------------------------------------------------
+
+WALL = 30.0 / 7.0  # depth that a row of cameras sees everywhere: 7 px of disparity between neighbours
+
+
+def row_of_views(n, rng):
+    """Cameras side by side, one unit apart, all looking along +z: 13 degrees of parallax between neighbours."""
+    cameras = [make_camera()._replace(cam_from_world_t=np.array([-float(i), 0.0, 0.0])) for i in range(n)]
+    return views_of(cameras, rng)
+
+
+def kept_pixels(depth_maps, views, rng, tolerance=DEPTH_TOLERANCE):
+    """[V, H, W] which pixels are drawn when all that can be are."""
+    full = np.ones(depth_maps[0].shape)
+    _, colors = draw(views, 10**9, given(*((d, full) for d in depth_maps)), rng, depth_tolerance=tolerance)
+    is_drawn = [(view.image[:, :, None] == colors).all(axis=-1).any(axis=-1) for view in views]
+    return np.array(is_drawn)
+
+
+def walls(n):
+    return [np.full((18, 24), WALL) for _ in range(n)]
+
+
+def test_a_wall_is_confirmed_where_two_views_see_it(rng):
+    """The first 7 columns of the left view are not in the right one, and the last 7 of the right one not in the left."""
+    left, right = kept_pixels(walls(2), row_of_views(2, rng), rng)
+    assert_array_equal(left, np.arange(24) >= np.full((18, 1), 7))
+    assert_array_equal(right, np.arange(24) <= np.full((18, 1), 16))
+
+
+@pytest.mark.parametrize(("factor", "is_kept"), [(1.04, True), (0.96, True), (1.06, False), (0.94, False)])
+def test_tolerance_is_relative(factor, is_kept, rng):
+    """Of the left of three views, whose fellows agree with each other."""
+    depth_maps = walls(3)
+    depth_maps[0] *= factor
+    assert kept_pixels(depth_maps, row_of_views(3, rng), rng)[0].any() == is_kept
+
+
+def test_a_floater_is_outvoted(rng):
+    """The left one of three views shows something at depth 3 in its last columns, where both others see the wall."""
+    depth_maps = walls(3)
+    depth_maps[0][:, 18:] = 3.0
+    left = kept_pixels(depth_maps, row_of_views(3, rng), rng)[0]
+    assert not left[:, 18:].any()
+    assert left[:, 8:18].all()
+
+
+def test_who_sees_something_nearer_has_no_vote(rng):
+    """What stands in front of the middle camera hides the wall from it, and says nothing on what the left one sees."""
+    depth_maps = walls(3)
+    depth_maps[1][:] = 1.0
+    left = kept_pixels(depth_maps, row_of_views(3, rng), rng)[0]
+    assert_array_equal(left, np.arange(24) >= np.full((18, 1), 14))  # the right one, 14 px away, confirms
+
+
+def test_a_tie_does_not_confirm(rng):
+    """Of the two others, one has the left view's surface at depth 3, one sees through it."""
+    depth_maps = walls(3)
+    depth_maps[0][:], depth_maps[1][:] = 3.0, 3.0
+    left = kept_pixels(depth_maps, row_of_views(3, rng), rng)[0]
+    assert not left[:, 20:].any()  # seen by both: a shift of 2 units at depth 3 is 20 px
+    assert left[:, 10:20].all()  # seen by the middle one
+
+
+def test_views_that_cannot_compare_keep_their_points(rng):
+    """A single photograph, and a camera that turns about its own centre."""
+    assert kept_pixels(walls(1), row_of_views(1, rng), rng).all()
+    camera = make_camera()
+    turned = camera._replace(cam_from_world_R=np.array([[0.8, 0.0, -0.6], [0.0, 1.0, 0.0], [0.6, 0.0, 0.8]]))
+    assert kept_pixels([np.full((18, 24), d) for d in (4.0, 9.0)], views_of([camera, turned], rng), rng).all()
+
+
+@pytest.mark.parametrize("name", ["room", "plain-wall", "outdoor"])
+def test_true_depths_are_confirmed_and_wrong_ones_are_not(name, rng):
+    """Exact depths of a ring of views, one in five replaced by 0.3 to 0.8 of it, the sky by 2 m."""
+    truth = make_scene(name, n_views=16, width=80, height=60, supersampling=1, n_points=0, test_every=0)
+    is_wrong = rng.random(truth.train_depths.shape) < 0.2
+    depths = np.where(is_wrong, truth.train_depths * rng.uniform(0.3, 0.8, is_wrong.shape), truth.train_depths)
+    depths = np.where(depths == 0, 2.0, depths)
+    is_wrong |= truth.train_depths == 0
+    number = np.arange(is_wrong.size, dtype=np.uint32).reshape(is_wrong.shape)  # a colour for each pixel of all views
+    images = np.stack([number >> 16, number >> 8, number], axis=-1).astype(np.uint8)
+    views = [view._replace(image=image) for view, image in zip(truth.scene.train_views, images, strict=True)]
+    full = np.ones(depths.shape[1:])
+    _, colors = draw(views, 10**9, given(*((d, full) for d in depths)), rng, depth_tolerance=DEPTH_TOLERANCE)
+    is_kept = np.zeros(is_wrong.size, bool)
+    is_kept[colors @ np.array([65536, 256, 1])] = True
+    is_kept = is_kept.reshape(is_wrong.shape)
+    print(name, is_kept[~is_wrong].mean(), is_kept[is_wrong].mean())
+    assert is_kept[~is_wrong].mean() > 0.8
+    assert is_kept[is_wrong].mean() < 0.1
+
+
+# A trained scene ------------------------------------------------------------------------------------------------------
+
+
+def off_surface(points, truth, n_per_view):
+    """Share of points, ``n_per_view`` of each view in turn, that lie more than 5 % in depth off what their view sees."""
+    n_off = 0
+    for i, view in enumerate(truth.scene.train_views):
+        own = points[i * n_per_view : (i + 1) * n_per_view]
+        in_camera = own @ view.camera.cam_from_world_R.T + view.camera.cam_from_world_t
+        x, y = np.floor(pinhole(in_camera, view.camera)).astype(int).T
+        n_off += (np.abs(in_camera[:, 2] - truth.train_depths[i][y, x]) > 0.05 * in_camera[:, 2]).sum()
+    return n_off / len(points)

@@ -122,6 +122,7 @@ def reinitial_points(
     points_of: Callable[[Gaussians, Camera, Conventions, Backend], PixelPoints] = midpoint_points,
     least_alpha: float,
     depth_tolerance: float | None,
+    backdrop_distance: float | None = None,
     rng: np.random.Generator,
     conventions: Conventions = GSPLAT_MAIN,
     backend: Backend = CPU,
@@ -143,8 +144,11 @@ def reinitial_points(
         Pixels of lower accumulated opacity are not drawn; 0 for the paper's rule.
     depth_tolerance : float or None
         Up to this relative difference between its depth and another view's, a point is on that view's surface. It is
-        drawn only if more of up to 8 other views have it on their surface than see through it. None for the paper's
+        confirmed if more of up to 8 other views have it on their surface than see through it. None for the paper's
         rule, which does not ask. A view that no other one overlaps from another side has nobody to ask.
+    backdrop_distance : float or None
+        A point that is not confirmed moves along its ray to this distance from the camera, world units: behind the
+        scene. None: it is not drawn.
     rng : numpy.random.Generator
         Draws the pixels.
     conventions : Conventions
@@ -179,7 +183,12 @@ def reinitial_points(
         if depth_tolerance is not None:
             candidates = np.flatnonzero(weights)
             is_confirmed = _confirmed(view_points[candidates], i, cameras, depth_maps, depth_tolerance)
-            weights[candidates[~is_confirmed]] = 0
+            unsure = candidates[~is_confirmed]
+            if backdrop_distance is None:
+                weights[unsure] = 0
+            else:
+                rays = _rays(view_points[unsure], cameras[i])
+                view_points[unsure] = _centre(cameras[i]) + backdrop_distance * rays
         pixels = _draw(weights, n_points // len(views), rng)
         points.append(view_points[pixels])
         colors.append(view.image.reshape(-1, 3)[pixels])
@@ -264,8 +273,13 @@ def _partners(points: Floats, own_id: int, cameras: Sequence[Camera]) -> Ints:
 
 def _rays(points: Floats, camera: Camera) -> Floats:
     """Return the unit vectors [P, 3] from the camera's centre to points [P, 3]."""
-    rays = points + camera.cam_from_world_R.T @ camera.cam_from_world_t
+    rays = points - _centre(camera)
     return rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), np.finfo(rays.dtype).tiny)
+
+
+def _centre(camera: Camera) -> Floats:
+    """Return the camera's centre [3], world frame."""
+    return -camera.cam_from_world_R.T @ camera.cam_from_world_t
 
 
 def _project(points: Floats, camera: Camera) -> tuple[Floats, Ints]:
