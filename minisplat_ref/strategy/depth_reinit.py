@@ -164,8 +164,10 @@ def reinitial_points(
     Raises
     ------
     InputError
-        No pixel of any view can be drawn.
+        There are fewer points than views, or no pixel of any view can be drawn.
     """
+    if n_points < len(views):
+        raise InputError(f"{n_points} points from {len(views)} views are none from each: ask for more points")
     cameras = [with_principal_point(view.camera, conventions) for view in views]
     depth_maps, weight_maps = [], []  # 8 bytes a pixel of all views; points would be 12 more
     for view in views:
