@@ -224,8 +224,11 @@ def test_seconds_to_reach():
 
 
 def test_peak_of_model_gradients_and_moments():
-    assert peak_training_mb([{"model_mb": 1.0}, {"model_mb": 3.5}, {"model_mb": 2.0}]) == 14.0
-    assert peak_training_mb([]) is None
+    """The record of the last iteration of densification is written after its events, the simplification among them."""
+    log = [{"step": step, "model_mb": mb} for step, mb in ((5, 1.0), (10, 3.5), (15, 2.5), (20, 0.75), (25, 0.5))]
+    assert peak_training_mb(log, 20) == (14.0, 3.0)
+    assert peak_training_mb(log, math.inf) == (14.0, None)
+    assert peak_training_mb([], 20) == (None, None)
 
 
 @pytest.mark.parametrize("name", RECIPES)

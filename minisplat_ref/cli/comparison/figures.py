@@ -59,6 +59,7 @@ def psnr_over_count(curves: Curves) -> Figure:
                     label=recipe if number == 0 else None,
                 )
         axes.set_xscale("log")
+        axes.margins(x=0.05)  # room for the discs
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
         axes.xaxis.set_minor_formatter(NullFormatter())

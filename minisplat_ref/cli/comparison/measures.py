@@ -95,7 +95,7 @@ def read_measures(folder: Path, target_psnr: float, render_fps: float) -> dict[s
     """
     metrics = run_folder.read_json_object(folder / run_folder.METRICS)
     end = densification_end(run_folder.read_json_object(folder / run_folder.CONFIG)["recipe"])
-    log = read_log(folder / run_folder.LOG)
+    densifying, densified = peak_training_mb(read_log(folder / run_folder.LOG), end)
     return {
         "psnr": metrics["psnr"],
         "ssim": metrics["ssim"],
@@ -105,8 +105,8 @@ def read_measures(folder: Path, target_psnr: float, render_fps: float) -> dict[s
         "seconds_to_first": seconds_to_reach(read_curve(folder), target_psnr),
         "iterations_per_second": metrics["iterations"] / metrics["train_seconds"],
         "peak_rss_mb": metrics["peak_rss_mb"],
-        "densifying_mb": peak_training_mb([record for record in log if record["step"] < end]),
-        "densified_mb": peak_training_mb([record for record in log if record["step"] >= end]),
+        "densifying_mb": densifying,
+        "densified_mb": densified,
         "render_fps": render_fps,
         "ply_bytes": (folder / run_folder.POINT_CLOUD).stat().st_size,
     }
@@ -125,9 +125,18 @@ def seconds_to_reach(curve: Sequence[Mapping[str, Any]], psnr: float) -> float |
     return next((float(record["seconds"]) for record in curve if record["psnr"] >= psnr), None)
 
 
-def peak_training_mb(log: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return what model, gradients and moments take at most in these records, MB; None without records."""
-    return max((TRAINING_COPIES * float(record["model_mb"]) for record in log), default=None)
+def peak_training_mb(log: Sequence[Mapping[str, Any]], end: float) -> tuple[float | None, float | None]:
+    """Return what model, gradients and moments take at most before iteration ``end``, and from it on, MB.
+
+    None for a stage without records.
+    """
+    before = [record for record in log if record["step"] < end]
+    after = [record for record in log if record["step"] >= end]
+
+    def peak(records: Sequence[Mapping[str, Any]]) -> float | None:
+        return max((TRAINING_COPIES * float(record["model_mb"]) for record in records), default=None)
+
+    return peak(before), peak(after)
 
 
 def densification_end(recipe: Mapping[str, Any]) -> float:
