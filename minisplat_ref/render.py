@@ -13,7 +13,7 @@ from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.splatting import Primitives, SplatTape, splat, splat_vjp
-from minisplat_ref.types import Camera, Floats, Gaussians, Ints, Projection, RenderOutput
+from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Ints, Projection, RenderOutput
 
 
 class RenderTape(NamedTuple):
@@ -47,6 +47,7 @@ def render(
     sh_degree: int | None = None,
     conventions: Conventions = GSPLAT_MAIN,
     backend: Backend = CPU,
+    is_visible: Bools | None = None,
     with_depth: bool = False,
     with_stats: bool = False,
     with_median_depth: bool = False,
@@ -67,6 +68,8 @@ def render(
         Profile of the rasteriser.
     backend : Backend
         Implementation of the stages.
+    is_visible : ndarray of shape (N,) of booleans, optional
+        Rows that take part; the others are culled as if they were transparent. All by default.
     with_depth : bool
         Append the accumulated depth, ``sum w z``, as the last channel of the image.
     with_stats, with_median_depth : bool
@@ -90,6 +93,8 @@ def render(
         # The projection culls the largest number; infinity times a zero gradient would be NaN.
         scales = np.minimum(np.exp(gaussians.log_scales), np.finfo(dtype).max)
         opacities = 1 / (1 + np.exp(-gaussians.opacity_logits))
+    if is_visible is not None:
+        opacities = np.where(is_visible, opacities, opacities.dtype.type(0))
 
     def shade(radii: Ints) -> Floats:
         return backend.sh_colors(gaussians.means, gaussians.sh_dc, gaussians.sh_rest, camera, sh_degree, radii)

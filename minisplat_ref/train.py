@@ -4,7 +4,10 @@ Order inside an iteration: render, loss, gradients, Adam, then the events that a
 *before* Adam, and because it replaces the parameter tensors, that iteration's step is silently lost (likewise in
 Mini-Splatting; gsplat steps first, as here). Here no step is lost, the last iteration's included.
 
-Left out: image pyramids, exposure compensation, regularisers.
+While a recipe warms up on views of half the size, they are the scene's views to everything in the loop. A culling table
+of Mini-Splatting2, if an event has made one, says which Gaussians take part in a view.
+
+Left out: exposure compensation.
 """
 
 import json
@@ -23,13 +26,17 @@ from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.events import Iteration, StepReport, TrainState
+from minisplat_ref.events.importance import is_culling
 from minisplat_ref.io.checkpoint import load_checkpoint, save_checkpoint
+from minisplat_ref.io.scene import half_size
 from minisplat_ref.optim.adam import AdamState, adam_step, zero_moments
 from minisplat_ref.optim.schedules import active_sh_degree
 from minisplat_ref.recipes import During, Recipe, describe
 from minisplat_ref.render import render, render_vjp
 from minisplat_ref.strategy.initialization import initial_gaussians
-from minisplat_ref.types import Gaussians, Scene, View
+from minisplat_ref.types import Gaussians, Scene
+
+LEAST_HALF_SIZE = 32  # pixels a side; the window of SSIM is 11 wide
 
 __all__ = ["StepReport", "TrainState", "initial_state", "load_state", "save_state", "train"]
 
@@ -40,10 +47,16 @@ def initial_state(scene: Scene, recipe: Recipe, seed: int) -> TrainState:
     Raises
     ------
     InputError
-        The scene has no training views.
+        The scene has no training views, or fewer than the recipe needs.
     """
-    if not scene.train_views:
+    n_views = len(scene.train_views)
+    if n_views == 0:
         raise InputError(f"scene {scene.name} has no training views: lower the share of test views or add photographs")
+    if n_views < recipe.least_views:
+        raise InputError(
+            f"scene {scene.name} has {n_views} training views, recipe {recipe.name} compares what at least"
+            f" {recipe.least_views} see: add photographs or use 3dgs-accel"
+        )
     rng = np.random.default_rng(seed)
     gaussians = initial_gaussians(scene, recipe.sh_degree, rng)
     return TrainState(gaussians, zero_moments(gaussians), step=0, view_order=[], rng=rng, stats={})
@@ -90,9 +103,11 @@ def train(
     state = initial_state(scene, recipe, seed) if state is None else state
     if max(state.view_order, default=0) >= len(scene.train_views):
         raise InputError(f"scene {scene.name} has fewer training views than the run to continue: give the same scene")
+    small_scene = _half_size(scene) if state.step < recipe.half_size_until else scene
     with _interrupts_held_back() as raise_if_interrupted:
         while state.step < recipe.iterations:
-            report = _iterate(state, scene, recipe, backend, conventions)
+            seen = small_scene if state.step < recipe.half_size_until else scene
+            report = _iterate(state, seen, recipe, backend, conventions)
             if on_step is not None:
                 on_step(report)
             raise_if_interrupted()
@@ -101,7 +116,8 @@ def train(
 
 def _iterate(state: TrainState, scene: Scene, recipe: Recipe, backend: Backend, conventions: Conventions) -> StepReport:
     step = state.step + 1
-    view = _next_view(state, scene)
+    view_id = _next_view(state, len(scene.train_views))
+    view = scene.train_views[view_id]
     due = [event for event in recipe.events if event.is_due(step)]
     stored_degree = math.isqrt(state.gaussians.sh_rest.shape[1] + 1) - 1
     background = state.rng.random(3) if recipe.has_random_background else scene.background
@@ -112,6 +128,7 @@ def _iterate(state: TrainState, scene: Scene, recipe: Recipe, backend: Backend, 
         sh_degree=active_sh_degree(step, recipe.sh_milestones, stored_degree),
         conventions=conventions,
         backend=backend,
+        is_visible=state.stats["is_visible"][:, view_id] if is_culling(state) else None,
         with_stats=any(isinstance(event, During) and event.needs_blend_stats for event in due),
     )
     target = np.multiply(view.image, np.float32(1 / 255), dtype=np.float32)  # [H, W, 3]
@@ -128,11 +145,19 @@ def _iterate(state: TrainState, scene: Scene, recipe: Recipe, backend: Backend, 
     return StepReport(step, loss, view, output, state)
 
 
-def _next_view(state: TrainState, scene: Scene) -> View:
+def _next_view(state: TrainState, n_views: int) -> int:
     """Draw without replacement; when all views have been seen, shuffle them anew."""
     if not state.view_order:
-        state.view_order = state.rng.permutation(len(scene.train_views)).tolist()
-    return scene.train_views[state.view_order.pop()]
+        state.view_order = state.rng.permutation(n_views).tolist()
+    return state.view_order.pop()
+
+
+def _half_size(scene: Scene) -> Scene:
+    """Halve the training views, unless they are so small that no structure would be left in them."""
+    sizes = [min(view.camera.width, view.camera.height) for view in scene.train_views]
+    if min(sizes) < 2 * LEAST_HALF_SIZE:
+        return scene
+    return scene._replace(train_views=tuple(half_size(view) for view in scene.train_views))
 
 
 @contextmanager

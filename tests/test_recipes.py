@@ -7,7 +7,8 @@ import pytest
 
 from minisplat_ref import events
 from minisplat_ref.errors import InputError
-from minisplat_ref.recipes import RECIPES, At, During, Every, describe, get_recipe, scaled
+from minisplat_ref.recipes import RECIPES, At, During, Every, configured, describe, get_recipe, scaled
+from minisplat_ref.strategy.importance import outdoor
 
 
 def nothing(state, iteration, **settings):
@@ -18,9 +19,13 @@ def firing(event, n=30_000):
     return [step for step in range(1, n + 1) if event.is_due(step)]
 
 
+def name_of(event):
+    return getattr(event.action, "func", event.action).__name__
+
+
 def firings(recipe):
     """Iterations of each event by the name of its action."""
-    return {getattr(e.action, "func", e.action).__name__: firing(e, recipe.iterations) for e in recipe.events}
+    return {name_of(event): firing(event, recipe.iterations) for event in recipe.events}
 
 
 def test_every_is_open_at_both_ends():
@@ -44,6 +49,65 @@ def test_3dgs_schedule(name):
     assert fired["prune_large"] == list(range(3_100, 15_000, 100))
     assert fired["reset_opacity"] == [3_000, 6_000, 9_000, 12_000]
     assert fired["reset_opacity_on_white"] == [500]
+
+
+def test_mini_splatting_schedule():
+    """As the released code: densification from 600 to 14,900 but not where depth reinitialises, at 5000 and 10,000."""
+    recipe = RECIPES["mini-splatting"]
+    fired = firings(recipe)
+    assert fired["collect_gradients"] == fired["collect_blur"] == list(range(1, 15_000))
+    densified = [step for step in range(600, 15_000, 100) if step % 5_000]
+    assert fired["clone_and_split"] == fired["prune_faint"] == densified and len(densified) == 142
+    assert fired["prune_large"] == [step for step in densified if step > 3_000]
+    assert fired["reinitialise_from_depth"] == [5_000, 10_000]
+    assert fired["simplify"] == fired["restart_from_means"] == [15_000]
+    assert fired["prune_tail"] == fired["restart_adam"] == [20_000]
+    assert "reset_opacity" not in fired
+    assert recipe.sh_degree == 0 and recipe.sh_milestones == (16_000, 17_000, 18_000)
+    means = recipe.learning_rates.means
+    assert means.at(14_999) == pytest.approx(1.6e-5, rel=1e-3) and means.at(15_000) == means.at(5_000)
+
+
+def test_mini_splatting2_schedule():
+    """As the released code: clones every 250 from 500 to 2750 but not at 2000, where depth reinitialises."""
+    recipe = RECIPES["mini-splatting2"]
+    fired = firings(recipe)
+    assert recipe.iterations == 18_000 and recipe.half_size_until == 3_000
+    assert fired["aggressive_clone"] == [500, 750, 1_000, 1_250, 1_500, 1_750, 2_250, 2_500, 2_750]
+    assert fired["clone_and_split"] == [step for step in range(600, 3_000, 100) if step != 2_000]
+    assert fired["reinitialise_from_depth"] == [2_000]
+    assert fired["simplify"] == fired["store_sh"] == [3_000]
+    assert fired["stop_culling"] == [13_000]
+    assert [e.step for e in recipe.events if name_of(e) == "prune_tail"] == [2_000, 8_000]
+    assert recipe.adam.is_visible_only and recipe.adam.has_bias_correction
+    assert recipe.learning_rates.opacity_logits == 0.025
+    assert recipe.learning_rates.means == RECIPES["3dgs"].learning_rates.means
+
+
+@pytest.mark.parametrize("name", ["mini-splatting-d", "mini-splatting2-d"])
+def test_dense_recipes_do_not_sample(name):
+    assert not {"simplify"} & firings(RECIPES[name]).keys()
+
+
+def test_settings_are_replaced_in_every_event_that_has_them():
+    recipe = configured(RECIPES["mini-splatting"], metric=outdoor, budget=1_000)
+    settings = [event["settings"] for event in describe(recipe)["events"]]
+    assert [s["metric"] for s in settings if "metric" in s] == ["outdoor", "outdoor"]
+    assert [s["budget"] for s in settings if "budget" in s] == [1_000]
+    assert firings(recipe) == firings(RECIPES["mini-splatting"])
+    with pytest.raises(InputError, match="recipe 3dgs has no budget to set"):
+        configured(RECIPES["3dgs"], budget=1_000)
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_every_recipe_can_be_described_and_scaled(name):
+    for recipe in (RECIPES[name], get_recipe(name, 3_000), get_recipe(name, 1)):
+        assert json.loads(json.dumps(describe(recipe)))["name"] == name
+
+
+def test_rewind_and_warm_up_are_scaled():
+    assert get_recipe("mini-splatting", 3_000).learning_rates.means.rewind == (1_500, 500)
+    assert get_recipe("mini-splatting2", 1_800).half_size_until == 300
 
 
 def test_scaled_to_a_tenth():
@@ -99,7 +163,9 @@ def test_description_is_json_and_tells_settings_apart():
     recipe = RECIPES["3dgs"]
     description = json.loads(json.dumps(describe(recipe)))
     assert description["iterations"] == 30_000
-    assert description["learning_rates"]["means"] == {"first": 1.6e-4, "last": 1.6e-6, "steps": 30_000}
+    assert description["learning_rates"]["means"] == {
+        **{"first": 1.6e-4, "last": 1.6e-6, "steps": 30_000, "rewind": None}
+    }
     densify = description["events"][1]
     assert densify["event"] == "Every" and densify["action"] == "clone_and_split"
     assert densify["settings"] == {"threshold": 2e-4, "size_fraction": 0.01}

@@ -2,7 +2,7 @@
 
 import pytest
 
-from minisplat_ref.optim.schedules import LearningRates, LogLinear, active_sh_degree
+from minisplat_ref.optim.schedules import LearningRates, LogLinear, Rewind, active_sh_degree
 from minisplat_ref.types import Gaussians
 
 
@@ -17,6 +17,12 @@ def test_log_linear(step, rate):
 def test_log_linear_stays_at_its_end():
     assert LogLinear(1.0, 0.25, 10).at(5) == pytest.approx(0.5)
     assert LogLinear(1.0, 0.25, 10).at(11) == LogLinear(1.0, 0.25, 10).at(10) == pytest.approx(0.25)
+
+
+# Closed form: lr(i) before 15,000, lr(i - 15,000 + 5000) from then on.
+@pytest.mark.parametrize(("step", "rate"), [(14_999, 1.6e-5), (15_000, 7.43e-5), (30_000, 7.43e-6)])
+def test_rewind(step, rate):
+    assert LogLinear(1.6e-4, 1.6e-6, 30_000, Rewind(at=15_000, to=5_000)).at(step) == pytest.approx(rate, rel=1e-3)
 
 
 def test_only_the_means_scale_with_the_scene():

@@ -52,10 +52,9 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.cli.demo_report import demo_report, view_pictures
     from minisplat_ref.cli.report import report_html
     from minisplat_ref.cli.scoring import summary
-    from minisplat_ref.cli.settings import Settings, load_photographs
+    from minisplat_ref.cli.settings import Settings, load_photographs, recipe_of
     from minisplat_ref.cli.training import run_training
     from minisplat_ref.constants import GSPLAT_MAIN
-    from minisplat_ref.recipes import get_recipe
     from minisplat_ref.train import initial_state
 
     start = time.perf_counter()
@@ -71,12 +70,14 @@ def run(args: argparse.Namespace) -> int:
         recipe=RECIPE,
         schedule_iterations=SCHEDULE_ITERATIONS,
         iterations=args.iterations,
+        budget=None,
+        scene_type=None,
         seed=0,
         profile=GSPLAT_MAIN.name,
         backend="cpu",
     )
     scene = load_photographs(settings)
-    recipe = get_recipe(settings.recipe, settings.schedule_iterations)
+    recipe = recipe_of(settings)
     state = initial_state(scene, recipe, settings.seed)
     outcome = run_training(folder, scene, settings, recipe, state)
     pictures = view_pictures(synthetic, scene, state.gaussians, settings, outcome)

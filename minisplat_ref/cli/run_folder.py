@@ -1,6 +1,7 @@
 """The folder that ``train`` leaves: which file is called what, and how each is read and written."""
 
 import json
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,11 @@ def create(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder} cannot be created ({error.strerror}): give another --out") from error
+
+
+def remove(folder: Path) -> None:
+    """Take back a folder that :func:`create` made and a training that cannot go on has begun to fill."""
+    shutil.rmtree(folder)
 
 
 def write_json(path: Path, value: Any) -> None:

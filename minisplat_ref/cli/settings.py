@@ -11,9 +11,11 @@ from minisplat_ref import __version__
 from minisplat_ref.cli.run_folder import CONFIG, read_json_object
 from minisplat_ref.errors import InputError
 from minisplat_ref.io import load_scene
-from minisplat_ref.recipes import Recipe, describe
+from minisplat_ref.recipes import Recipe, configured, describe, get_recipe
+from minisplat_ref.strategy import importance
 from minisplat_ref.types import Floats, Scene
 
+METRICS = {"indoor": importance.indoor, "outdoor": importance.outdoor}
 REPORTED_PACKAGES = ("numpy", "numba", "scipy", "pillow", "pycolmap")
 
 
@@ -34,6 +36,10 @@ class Settings(NamedTuple):
     """Number of iterations that the recipe's milestones are scaled to; stays when a run is made longer."""
     iterations: int
     """Iteration at which to stop."""
+    budget: int | None
+    """Gaussians that a simplification keeps; None for the recipe's own part of the candidates."""
+    scene_type: str | None
+    """``indoor`` or ``outdoor``, which decides what importance means; None for the recipe's own choice."""
     seed: int
     """Seed of all random draws."""
     profile: str
@@ -42,6 +48,22 @@ class Settings(NamedTuple):
     """Name of the backend."""
     eval_every: int = 0
     """Iterations after which the test views are measured again; 0: only in the end. Does not change the result."""
+
+
+def recipe_of(settings: Settings) -> Recipe:
+    """Return the recipe of a run, scaled and with the run's budget and metric.
+
+    Raises
+    ------
+    InputError
+        There is no such recipe, or it has no such setting.
+    """
+    recipe = get_recipe(settings.recipe, settings.schedule_iterations)
+    if settings.budget is not None:
+        recipe = configured(recipe, budget=settings.budget)
+    if settings.scene_type is not None:
+        recipe = configured(recipe, metric=METRICS[settings.scene_type])
+    return recipe
 
 
 def to_config(settings: Settings, recipe: Recipe, scene: Scene) -> dict[str, Any]:

@@ -21,6 +21,8 @@ DEFAULTS = {
     "undistort": False,
     "recipe": "3dgs-accel",
     "iterations": 3000,
+    "budget": None,
+    "scene_type": None,
     "eval_every": 0,
     "seed": 0,
     "profile": GSPLAT_MAIN.name,
@@ -58,7 +60,7 @@ def add_parser(commands: Commands) -> None:
         "scene",
         nargs="?",
         metavar="SCENE",
-        help="folder of a COLMAP scene (images/, sparse/0/) or of a transforms.json",
+        help="folder of a COLMAP scene or of a transforms.json",
     )
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="new folder for the results (default runs/SCENE-RECIPE)"
@@ -73,13 +75,27 @@ def add_parser(commands: Commands) -> None:
     data.add_argument("--undistort", action="store_true", help="remove lens distortion instead of refusing it")
 
     training = parser.add_argument_group("training")
-    training.add_argument("--recipe", metavar="R", help="3dgs or 3dgs-accel (default), scaled to the iterations")
+    training.add_argument(
+        "--recipe",
+        metavar="R",
+        help="3dgs, 3dgs-accel (default), mini-splatting, mini-splatting-d, mini-splatting2 or mini-splatting2-d,"
+        " scaled to the iterations",
+    )
     training.add_argument("--iterations", type=integer(1), metavar="N", help="one view each (default 3000)")
+    training.add_argument(
+        "--budget", type=integer(1), metavar="N", help="Gaussians that simplification keeps (default: a fixed part)"
+    )
+    training.add_argument(
+        "--scene-type",
+        choices=("indoor", "outdoor"),
+        metavar="T",
+        help="indoor (default) or outdoor: what counts as important",
+    )
     training.add_argument(
         "--eval-every",
         type=integer(0),
         metavar="K",
-        help="measure the test views every K-th, clock stopped, into curve.jsonl (default 0: never)",
+        help="measure test views each K-th, into curve.jsonl (default 0)",
     )
     training.add_argument("--seed", type=integer(0), metavar="S", help="of all random draws (default 0)")
     add_renderer_arguments(training, argparse.SUPPRESS)
@@ -101,17 +117,21 @@ def _start(given: dict[str, Any]) -> int:
     folder: Path = given.get("out", Path("runs") / f"{scene_folder.resolve().name}-{options['recipe']}")
 
     from minisplat_ref.cli import curve, run_folder
-    from minisplat_ref.cli.settings import Settings, load_photographs
-    from minisplat_ref.recipes import get_recipe
+    from minisplat_ref.cli.settings import Settings, load_photographs, recipe_of
     from minisplat_ref.train import initial_state
 
     run_folder.check_free(folder)
-    recipe = get_recipe(options["recipe"], options["iterations"])
     settings = Settings(scene=str(scene_path.resolve()), schedule_iterations=options["iterations"], **options)
+    recipe = recipe_of(settings)
     scene = load_photographs(settings)
     if settings.eval_every:
         curve.check_views(scene)
-    return _train(folder, scene, settings, recipe, initial_state(scene, recipe, settings.seed))
+    state = initial_state(scene, recipe, settings.seed)
+    try:
+        return _train(folder, scene, settings, recipe, state)
+    except InputError:  # a budget, for one, can only be found too large when there is something to choose from
+        run_folder.remove(folder)
+        raise
 
 
 def _resume(folder: Path, given: dict[str, Any]) -> int:
@@ -122,12 +142,11 @@ def _resume(folder: Path, given: dict[str, Any]) -> int:
         )
 
     from minisplat_ref.cli import run_folder, settings
-    from minisplat_ref.recipes import get_recipe
     from minisplat_ref.train import load_state
 
     ours = settings.load(folder)
     ours = ours._replace(iterations=given.get("iterations", ours.iterations))
-    recipe = get_recipe(ours.recipe, ours.schedule_iterations)
+    recipe = settings.recipe_of(ours)
     state = load_state(folder / run_folder.CHECKPOINT, recipe)
     if state.step >= ours.iterations:
         raise InputError(

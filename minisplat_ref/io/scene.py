@@ -198,6 +198,16 @@ def read_view(photo: Photo, name: str, reading: Reading) -> View:
     return View(name, rescale_camera(camera, width, height), image, mask, photo.point_ids)
 
 
+def half_size(view: View) -> View:
+    """Return the view with half as many pixels a side, rounded, and its camera's intrinsics to match."""
+    width, height = downscaled_size(view.camera.width, view.camera.height, 2)
+    return view._replace(
+        camera=rescale_camera(view.camera, width, height),
+        image=resize_image(view.image, width, height),
+        mask=None if view.mask is None else resize_mask(view.mask, width, height),
+    )
+
+
 def rescale_camera(camera: Camera, width: int, height: int) -> Camera:
     """Intrinsics of the same view at another size; exact ratios, since the image's corner is the origin."""
     ratio_x, ratio_y = width / camera.width, height / camera.height

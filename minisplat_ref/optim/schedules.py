@@ -7,6 +7,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 
+class Rewind(NamedTuple):
+    """A schedule that goes back once: from iteration ``at`` on it runs again from where it stood at ``to``."""
+
+    at: int
+    to: int
+
+
 class LogLinear(NamedTuple):
     """A rate whose logarithm moves linearly with the iteration: ``first (last / first)^(step / steps)``."""
 
@@ -16,9 +23,13 @@ class LogLinear(NamedTuple):
     """Value at ``steps`` and after."""
     steps: int
     """Iterations from ``first`` to ``last``."""
+    rewind: Rewind | None = None
+    """Mini-Splatting: Gaussians that were made anew in mid-run may move as far as young ones do."""
 
     def at(self, step: int) -> float:
         """Return the rate at ``step``."""
+        if self.rewind is not None and step >= self.rewind.at:
+            step = step - self.rewind.at + self.rewind.to
         progress = min(step / self.steps, 1.0)
         return float(self.first * (self.last / self.first) ** progress)
 

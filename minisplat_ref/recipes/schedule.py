@@ -1,17 +1,12 @@
-"""Recipes: all that distinguishes one training method from another, as data.
-
-A recipe is written for its published number of iterations; :func:`scaled` compresses or stretches it. Events act after
-the optimiser step of their iteration, in the order in which they are listed.
-"""
+"""What a recipe is made of: events with their iterations, rates, milestones; and how it is scaled and described."""
 
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-from minisplat_ref import events
 from minisplat_ref.errors import InputError
 from minisplat_ref.optim.adam import AdamRule
-from minisplat_ref.optim.schedules import LearningRates, LogLinear
+from minisplat_ref.optim.schedules import LearningRates, Rewind
 
 Action = Callable[..., None]
 """``action(state, iteration)``; see :mod:`minisplat_ref.events`. Settings are bound with ``functools.partial``."""
@@ -98,6 +93,10 @@ class Recipe(NamedTuple):
     """Render each iteration over a random colour rather than the scene's background."""
     events: tuple[Event, ...]
     """What happens besides gradient steps; several due in one iteration act in this order."""
+    half_size_until: int = 0
+    """Iterations that train on views of half the width and height, from the first on (Mini-Splatting2)."""
+    least_views: int = 1
+    """Training views without which the method makes no sense."""
 
 
 def scaled(recipe: Recipe, iterations: int) -> Recipe:
@@ -117,14 +116,39 @@ def scaled(recipe: Recipe, iterations: int) -> Recipe:
         raise InputError(f"iterations is {iterations}: give at least 1")
     factor = iterations / recipe.iterations
     means_rate = recipe.learning_rates.means
+    rewind = means_rate.rewind
     return recipe._replace(
         iterations=iterations,
         learning_rates=recipe.learning_rates._replace(
-            means=means_rate._replace(steps=max(1, _scaled(means_rate.steps, factor)))
+            means=means_rate._replace(
+                steps=max(1, _scaled(means_rate.steps, factor)),
+                rewind=rewind and Rewind(_scaled(rewind.at, factor), _scaled(rewind.to, factor)),
+            )
         ),
         sh_milestones=tuple(_scaled(milestone, factor) for milestone in recipe.sh_milestones),
         events=tuple(event.scaled(factor) for event in recipe.events),
+        half_size_until=_scaled(recipe.half_size_until, factor),
     )
+
+
+def configured(recipe: Recipe, **settings: Any) -> Recipe:
+    """Return the recipe with settings of its events replaced, each wherever an event has it.
+
+    Raises
+    ------
+    InputError
+        No event has such a setting.
+    """
+    for name, value in settings.items():
+        if not any(name in _settings(event) for event in recipe.events):
+            raise InputError(f"recipe {recipe.name} has no {name.replace('_', ' ')} to set: leave it out")
+        recipe = recipe._replace(
+            events=tuple(
+                event._replace(action=partial(event.action, **{name: value})) if name in _settings(event) else event
+                for event in recipe.events
+            )
+        )
+    return recipe
 
 
 def _scaled(step: int, factor: float) -> int:
@@ -147,64 +171,19 @@ def describe(recipe: Recipe) -> dict[str, Any]:
 
 
 def _describe_event(event: Event) -> dict[str, Any]:
-    action = event.action if isinstance(event.action, partial) else partial(event.action)
-    return {
-        "event": type(event).__name__,
-        **event._asdict(),
-        "action": getattr(action.func, "__name__", repr(action.func)),
-        "settings": dict(action.keywords),
-    }
+    settings = {name: _describe_setting(value) for name, value in _settings(event).items()}
+    return {"event": type(event).__name__, **event._asdict(), "action": _name(event.action), "settings": settings}
 
 
-def get_recipe(name: str, iterations: int | None = None) -> Recipe:
-    """Return the recipe of that name, scaled if ``iterations`` is given.
-
-    Raises
-    ------
-    InputError
-        There is no such recipe, or ``iterations`` is below 1.
-    """
-    if name not in RECIPES:
-        raise InputError(f"recipe {name!r} does not exist: choose from {', '.join(RECIPES)}")
-    return RECIPES[name] if iterations is None else scaled(RECIPES[name], iterations)
+def _describe_setting(value: Any) -> Any:
+    return _name(value) if callable(value) else value
 
 
-# Densification needs the mean gradient over about all views, and time to settle: each event multiplies the Gaussians
-# by up to two, so that events compressed to every few iterations let their number explode. What an opacity reset fades
-# needs some hundred iterations to come back.
-_densifying = partial(Every, 100, stop=15_000, least_period=100)
+def _name(function: Any) -> str:
+    """Return what a function is called; a partial by the function inside."""
+    function = function.func if isinstance(function, partial) else function
+    return getattr(function, "__name__", repr(function))
 
-_3DGS = Recipe(
-    name="3dgs",
-    iterations=30_000,
-    learning_rates=LearningRates(
-        means=LogLinear(1.6e-4, 1.6e-6, 30_000),
-        quats=1e-3,
-        log_scales=5e-3,
-        opacity_logits=5e-2,
-        sh_dc=2.5e-3,
-        sh_rest=2.5e-3 / 20,
-    ),
-    adam=AdamRule(is_visible_only=False, has_bias_correction=True),
-    sh_degree=3,
-    sh_milestones=(1_000, 2_000, 3_000),
-    dssim_weight=0.2,
-    has_random_background=False,
-    events=(
-        During(events.collect_gradients, stop=15_000),
-        _densifying(partial(events.clone_and_split, threshold=2e-4, size_fraction=0.01), start=500),
-        _densifying(partial(events.prune_faint, least_opacity=0.005), start=500),
-        _densifying(partial(events.prune_large, size_fraction=0.1), start=3_000),
-        Every(3_000, partial(events.reset_opacity, ceiling=0.01), stop=15_000, least_period=300),
-        At(500, partial(events.reset_opacity_on_white, ceiling=0.01)),
-    ),
-)
 
-_3DGS_ACCEL = _3DGS._replace(
-    name="3dgs-accel",
-    learning_rates=_3DGS.learning_rates._replace(opacity_logits=2.5e-2),
-    adam=AdamRule(is_visible_only=True, has_bias_correction=False),
-)
-
-RECIPES = {recipe.name: recipe for recipe in (_3DGS, _3DGS_ACCEL)}
-"""``3dgs``: Kerbl et al. 2023 as released. ``3dgs-accel``: the same with the authors' later optimiser settings."""
+def _settings(event: Event) -> dict[str, Any]:
+    return dict(event.action.keywords) if isinstance(event.action, partial) else {}
