@@ -288,18 +288,23 @@ def test_markdown():
 
 
 def test_models_are_rendered_by_turns(scene_folder, monkeypatch):
-    """A clock that each rendering moves on: model 0 takes 1 s a view, model 1 takes 2 s, and twice that at first."""
+    """By a clock that renderings move on: 1 s a view in the first timed round, 2 s in the next, and so on.
+
+    Model 1 takes twice that, and the round before them is slow; the middle one of the timed rounds counts.
+    """
     scene = load_scene(scene_folder, test_every=4)
+    n_views = len(scene.test_views)
     now, order = [0.0], []
 
     def slow_render(model, camera, **_):
-        now[0] += (1.0 if model == 0 else 2.0) * (2.0 if len(order) < 2 * len(scene.test_views) else 1.0)
+        round_number = len(order) // (2 * n_views)
+        now[0] += (round_number or 100.0) * (1.0 if model == 0 else 2.0)
         order.append(model)
 
     monkeypatch.setattr(speed, "render", slow_render)
     monkeypatch.setattr(speed.time, "perf_counter", lambda: now[0])
-    assert speed.render_rates([0, 1], scene) == [1.0, 0.5]
-    n_views = len(scene.test_views)
+    middle = (speed.ROUNDS + 1) / 2
+    assert speed.render_rates([0, 1], scene) == pytest.approx([1 / middle, 0.5 / middle], rel=CLOSED_FORM)
     assert order == ([0] * n_views + [1] * n_views) * (speed.ROUNDS + 1)
 
 
@@ -310,6 +315,13 @@ def test_best_window_by_hand():
     assert best_window(values, 2, 2) == (1, 3, 1.5)
     assert best_window(values, 1, 1) == (4, 0, 5.0)
     assert best_window(values, 5, 6) == (0, 0, pytest.approx(11 / 30))
+
+
+def test_best_window_is_the_best_of_all(rng):
+    values = rng.normal(size=(9, 7))
+    means = {(i, j): values[i : i + 4, j : j + 3].mean() for i in range(6) for j in range(5)}
+    row, column, mean = best_window(values, 4, 3)
+    assert mean == pytest.approx(means[row, column], rel=CLOSED_FORM) == pytest.approx(max(means.values()))
 
 
 def test_difference_is_that_of_the_errors():
