@@ -153,18 +153,25 @@ TRAINING_THAT_SAVES = """
 import os, signal, sys, pathlib, time
 folder = pathlib.Path(sys.argv[1])
 def save(*_):
+    signal.signal(signal.SIGINT, lambda *_: sys.exit("interrupted while saving"))
+    time.sleep(0.3)
     (folder / "saved").touch()
     sys.exit(130)
 signal.signal(signal.SIGINT, save)
 os.kill(os.getppid(), signal.SIGINT)
+if sys.argv[2] == "too":
+    os.kill(os.getpid(), signal.SIGINT)
 time.sleep(60)
 """
 
 
-def test_interrupted_while_training(scene_folder, tmp_path, monkeypatch, capfd):
-    """The comparison alone is interrupted: it passes that on, and waits until the training has saved."""
+@pytest.mark.parametrize(("who", "saving_seconds"), [("too", 30.0), ("not", 0.1)])
+def test_interrupted_while_training(scene_folder, tmp_path, monkeypatch, capfd, who, saving_seconds):
+    """The training is interrupted as well, by the terminal, or it is not and must be told; once in both cases."""
+    monkeypatch.setattr(runs_module, "SAVING_SECONDS", saving_seconds)
     out = tmp_path / "out"
-    assert compare_with([sys.executable, "-c", TRAINING_THAT_SAVES, str(out)], monkeypatch, scene_folder, out) == 130
+    command = [sys.executable, "-c", TRAINING_THAT_SAVES, str(out), who]
+    assert compare_with(command, monkeypatch, scene_folder, out) == 130
     assert [path.name for path in out.iterdir()] == ["saved"]
     assert capfd.readouterr().err == "minisplat-ref: interrupted\n"
 

@@ -13,6 +13,7 @@ from minisplat_ref.types import Scene
 
 WARM_UP = 20  # iterations, to which each recipe is scaled, so that all its events happen
 WARM_UP_VIEWS = 4
+SAVING_SECONDS = 5.0  # after Ctrl-C; a training that goes on for longer has not been told
 
 REPORTED_CODES = (0, 2, 130)  # after which the training has said all there is to say
 
@@ -71,8 +72,10 @@ def _train(command: list[str]) -> int:
         try:
             code = process.wait()
         except KeyboardInterrupt:
-            # A terminal's Ctrl-C has reached the training, too; one that was sent to this process alone has not.
-            process.send_signal(signal.SIGINT)
+            # A terminal's Ctrl-C has reached the training, too, which saves now and is better left alone.
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(SAVING_SECONDS)
+            process.send_signal(signal.SIGINT)  # does nothing when the training has ended
             process.wait()
             raise
     if code not in REPORTED_CODES:
