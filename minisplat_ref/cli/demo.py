@@ -70,8 +70,6 @@ def run(args: argparse.Namespace) -> int:
         recipe=RECIPE,
         schedule_iterations=SCHEDULE_ITERATIONS,
         iterations=args.iterations,
-        budget=None,
-        scene_type=None,
         seed=0,
         profile=GSPLAT_MAIN.name,
         backend="cpu",

@@ -36,16 +36,16 @@ class Settings(NamedTuple):
     """Number of iterations that the recipe's milestones are scaled to; stays when a run is made longer."""
     iterations: int
     """Iteration at which to stop."""
-    budget: int | None
-    """Gaussians that a simplification keeps; None for the recipe's own part of the candidates."""
-    scene_type: str | None
-    """``indoor`` or ``outdoor``, which decides what importance means; None for the recipe's own choice."""
     seed: int
     """Seed of all random draws."""
     profile: str
     """Name of the rasteriser's conventions."""
     backend: str
     """Name of the backend."""
+    budget: int | None = None
+    """Gaussians that a simplification keeps; None for the recipe's own part of the candidates."""
+    scene_type: str | None = None
+    """``indoor`` or ``outdoor``, which decides what importance means; None for the recipe's own choice."""
     eval_every: int = 0
     """Iterations after which the test views are measured again; 0: only in the end. Does not change the result."""
 

@@ -127,6 +127,7 @@ def _start(given: dict[str, Any]) -> int:
     if settings.eval_every:
         curve.check_views(scene)
     state = initial_state(scene, recipe, settings.seed)
+    run_folder.create(folder)
     try:
         return _train(folder, scene, settings, recipe, state)
     except InputError:  # a budget, for one, can only be found too large when there is something to choose from
@@ -156,11 +157,9 @@ def _resume(folder: Path, given: dict[str, Any]) -> int:
 
 
 def _train(folder: Path, scene: "Scene", settings: "Settings", recipe: "Recipe", state: "TrainState") -> int:
-    from minisplat_ref.cli import run_folder
     from minisplat_ref.cli.scoring import summary
     from minisplat_ref.cli.training import run_training
 
-    run_folder.create(folder)
     size = scene.train_views[0].camera
     print(
         f"{scene.name}: {len(scene.train_views)} training and {len(scene.test_views)} test views of"
