@@ -1,0 +1,130 @@
+"""The studies: through the command line with tiny settings, and what their tables say must be what was measured."""
+
+import json
+
+import numpy as np
+import pytest
+from tolerances import PRINTED_DIGITS
+
+from data_tools.studies import split_forms
+from data_tools.studies.__main__ import main
+from data_tools.studies.front import FIGURE, RESULT
+from data_tools.synthetic.__main__ import main as write_synthetic
+from minisplat_ref import events
+from minisplat_ref.io import load_scene, save_ply
+from minisplat_ref.io.images import read_image
+from minisplat_ref.recipes import get_recipe
+from minisplat_ref.strategy.blur_split import principal_axis_children
+from minisplat_ref.strategy.clone_split import random_children
+from minisplat_ref.train import initial_state
+
+TINY = ("--views", "6", "--width", "32", "--height", "24", "--supersampling", "1", "--points", "150")
+
+
+@pytest.fixture(scope="module")
+def scene_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("studies") / "room"
+    assert write_synthetic(["room", "--out", str(folder), *TINY]) == 0
+    return folder
+
+
+def read_result(folder):
+    """The JSON, and a figure that is a picture with something in it."""
+    assert sorted(path.name for path in folder.iterdir()) == sorted([FIGURE, RESULT])
+    assert read_image(folder / FIGURE).std() > 1
+    return json.loads((folder / RESULT).read_text())
+
+
+def table_rows(text):
+    """Cells of the Markdown table without its header."""
+    lines = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("|")]
+    return {line[0]: line[1:] for line in lines[2:]}
+
+
+# split
+
+
+def test_split_forms(scene_folder, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["split", str(scene_folder), "--out", str(out), "--iterations", "30", "--seeds", "0,1"]) == 0
+    result, rows = read_result(out), table_rows(capsys.readouterr().out)
+    assert list(rows) == list(result["summary"]) == list(split_forms.FORMS)
+    assert result["machine"] and result["size"] == [32, 24] and len(result["runs"]) == 8
+    for form, cells in rows.items():
+        values = [run["psnr"] for run in result["runs"] if run["form"] == form]
+        mean, deviation = map(float, cells[0].split(" ± "))
+        assert abs(mean - np.mean(values)) < 100 * PRINTED_DIGITS
+        assert abs(deviation - abs(values[0] - values[1]) / np.sqrt(2)) < 100 * PRINTED_DIGITS
+        assert all(0 < run["ssim"] < 1 and run["seconds"] > 0 for run in result["runs"])
+
+
+@pytest.mark.parametrize("name", ["mini-splatting-d", "mini-splatting2"])
+def test_split_variants_differ_in_blur_split_and_children_alone(name):
+    recipe = get_recipe(name)
+    for form, (has_blur_split, children) in split_forms.FORMS.items():
+        variant = split_forms.variant(recipe, form)
+        actions = [getattr(event.action, "func", event.action) for event in variant.events]
+        assert (events.collect_blur in actions) == has_blur_split
+        assert len(recipe.events) - len(variant.events) == (not has_blur_split)
+        (split,) = [event for event in variant.events if getattr(event.action, "func", None) is events.clone_and_split]
+        assert split.action.keywords["draw_children"] is children
+    assert {children for _, children in split_forms.FORMS.values()} == {random_children, principal_axis_children}
+
+
+# culling
+
+
+def check_culling(row):
+    """The fraction from the table of who is visible agrees with what was drawn view by view."""
+    drawn, tile_pairs = np.array(row["views"]["gaussians"]), np.array(row["views"]["tile_pairs"])
+    assert (drawn[:, 1] <= drawn[:, 0]).all() and (tile_pairs[:, 1] <= tile_pairs[:, 0]).all()
+    assert row["culled_fraction"] == pytest.approx(1 - drawn[:, 1].sum() / drawn[:, 0].sum())
+    assert 0 < row["culled_fraction"] < 1 and 0 < row["culled_fraction_of_tile_pairs"] < 1
+    assert row["ratio_of_medians"] == pytest.approx(row["ms_without"] / row["ms_with"])
+    assert abs(row["train_psnr_with"] - row["train_psnr_without"]) < 1
+
+
+def test_culling_of_a_training(scene_folder, tmp_path, capsys):
+    out = tmp_path / "out"
+    arguments = ["culling", str(scene_folder), "--out", str(out), "--iterations", "54", "--repeats", "2"]
+    assert main(arguments) == 0
+    result, rows = read_result(out), table_rows(capsys.readouterr().out)
+    assert list(rows) == list(result["places"]) == ["before simplification", "before culling ends"]
+    before, after = result["places"].values()
+    for row in (before, after):
+        check_culling(row)
+    assert after["n_gaussians"] < before["n_gaussians"]
+    assert rows["before simplification"][2] == f"{before['culled_fraction']:.1%}"
+
+
+def test_culling_of_given_gaussians(scene_folder, tmp_path, capsys):
+    scene = load_scene(scene_folder)
+    gaussians = initial_state(scene, get_recipe("3dgs"), seed=0).gaussians
+    save_ply(tmp_path / "some.ply", gaussians)
+    out, ply = tmp_path / "out", str(tmp_path / "some.ply")
+    assert main(["culling", str(scene_folder), "--out", str(out), "--ply", ply, "--repeats", "2"]) == 0
+    result, rows = read_result(out), table_rows(capsys.readouterr().out)
+    assert list(rows) == ["some.ply"]
+    check_culling(result["places"]["some.ply"])
+    assert result["places"]["some.ply"]["n_gaussians"] == len(gaussians.means)
+
+
+# bad input
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["split", "nowhere"], "nowhere: neither a folder nor one of room, "),
+        (["culling", "room", "--downscale", "2"], "room is made at 160 x 120; write it with data_tools.synthetic"),
+        (["culling", "SCENE", "--ply", "no.ply"], "no.ply"),
+        (["culling", "SCENE", "--out", "SCENE"], "already there and not empty"),
+    ],
+)
+def test_bad_input_is_one_line(scene_folder, tmp_path, capsys, arguments, message):
+    arguments = [str(scene_folder) if argument == "SCENE" else argument for argument in arguments]
+    out = [] if "--out" in arguments else ["--out", str(tmp_path / "out")]
+    assert main([*arguments, *out]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and error.count("\n") == 1 and message in error
+    assert not (tmp_path / "out").exists()
