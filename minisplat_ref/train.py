@@ -96,11 +96,16 @@ def train(
     Raises
     ------
     InputError
-        The scene has no training views or is not the one that ``state`` was trained on.
+        The scene has no training views, is not the one that ``state`` was trained on, or lacks what a loss term needs.
     KeyboardInterrupt
         After Ctrl-C, at the end of the running iteration: the ``state`` that was passed in is whole and can be saved.
     """
     state = initial_state(scene, recipe, seed) if state is None else state
+    if recipe.geometry.sfm_depth and any(view.point_ids is None for view in scene.train_views):
+        raise InputError(
+            f"scene {scene.name} does not say which view sees which point, as COLMAP scenes do: leave the points' depth"
+            " out of the loss"
+        )
     if max(state.view_order, default=0) >= len(scene.train_views):
         raise InputError(f"scene {scene.name} has fewer training views than the run to continue: give the same scene")
     small_scene = _half_size(scene) if state.step < recipe.half_size_until else scene
@@ -129,11 +134,22 @@ def _iterate(state: TrainState, scene: Scene, recipe: Recipe, backend: Backend, 
         conventions=conventions,
         backend=backend,
         is_visible=state.stats["is_visible"][:, view_id] if is_culling(state) else None,
+        with_depth=any(recipe.geometry),
         with_stats=any(isinstance(event, During) and event.needs_blend_stats for event in due),
     )
     target = np.multiply(view.image, np.float32(1 / 255), dtype=np.float32)  # [H, W, 3]
-    loss, loss_tape = backend.photometric_loss(output.image, target, recipe.dssim_weight, view.mask)
-    gradient = render_vjp(tape, backend.photometric_loss_vjp(loss_tape))
+    image = np.ascontiguousarray(output.image[..., :3])
+    loss, loss_tape = backend.photometric_loss(image, target, recipe.dssim_weight, view.mask)
+    v_image, v_alpha = backend.photometric_loss_vjp(loss_tape), None
+    if any(recipe.geometry):
+        points = scene.points[view.point_ids] if view.point_ids is not None else scene.points[:0]
+        term, term_tape = backend.geometric_loss(
+            output.image[..., 3], output.alpha, target, view.camera, points, recipe.geometry, view.mask
+        )
+        v_depth, v_alpha = backend.geometric_loss_vjp(term_tape)
+        loss, v_image = loss + term, np.dstack([v_image, v_depth])
+        output = output._replace(image=image)
+    gradient = render_vjp(tape, v_image, v_alpha)
 
     visible_ids = np.flatnonzero(tape.projection.radii[:, 0])
     rates = recipe.learning_rates.at(step, scene.extent)

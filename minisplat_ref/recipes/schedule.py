@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 from minisplat_ref.errors import InputError
 from minisplat_ref.optim.adam import AdamRule
 from minisplat_ref.optim.schedules import LearningRates, Rewind
+from minisplat_ref.types import GeometricWeights
 
 Action = Callable[..., None]
 """``action(state, iteration)``; see :mod:`minisplat_ref.events`. Settings are bound with ``functools.partial``."""
@@ -97,6 +98,8 @@ class Recipe(NamedTuple):
     """Iterations that train on views of half the width and height, from the first on (Mini-Splatting2)."""
     least_views: int = 1
     """Training views without which the method makes no sense."""
+    geometry: GeometricWeights = GeometricWeights()
+    """Geometric loss terms beside the photometric one; none in any of the papers here."""
 
 
 def scaled(recipe: Recipe, iterations: int) -> Recipe:
@@ -165,6 +168,7 @@ def describe(recipe: Recipe) -> dict[str, Any]:
         **recipe._asdict(),
         "learning_rates": {**recipe.learning_rates._asdict(), "means": recipe.learning_rates.means._asdict()},
         "adam": recipe.adam._asdict(),
+        "geometry": recipe.geometry._asdict(),
         "sh_milestones": list(recipe.sh_milestones),
         "events": [_describe_event(event) for event in recipe.events],
     }
