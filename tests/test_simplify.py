@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import as_dtype, make_gaussians
 from tolerances import CLOSED_FORM, MERGED_MOMENTS, ROUNDED_TO_FLOAT32, SAMPLE_FREQUENCY
 
+from minisplat_ref.constants import SH_C0
 from minisplat_ref.errors import InputError
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.strategy.initialization import from_points
@@ -170,13 +171,33 @@ def test_merging_keeps_mass_mean_and_covariance(n, rng):
     assert np.all(np.diff(is_member.argmax(axis=1)) > 0)  # in the order of the first members
 
 
-def test_nearest_merge_first(rng):
-    """On a line with gaps 5, 1, 5, 2, 5, ...: the gaps of 1 close before those of 2."""
-    x = np.cumsum([0, 5, 1, 5, 2, 5, 1.5, 5])
-    gaussians = balls(np.column_stack([x, 0 * x, 0 * x]), sizes=0.1, opacities=0.5)
+def on_a_line(x):
+    return balls(np.column_stack([x, np.zeros((len(x), 2))]), sizes=0.1, opacities=0.5)._replace(
+        sh_dc=np.zeros((len(x), 3))
+    )
+
+
+def test_nearest_merge_first():
+    """Gaps of 1, 2 and 1.5 between wide ones: they close in the order of their widths."""
+    gaussians = on_a_line(np.cumsum([0, 5, 1, 5, 2, 5, 1.5, 5]))
     assert_array_equal(np.flatnonzero(merge_neighbours(gaussians, np.ones(8), 7).is_new), [1])
     assert_array_equal(np.flatnonzero(merge_neighbours(gaussians, np.ones(8), 6).is_new), [1, 4])
     assert_array_equal(np.flatnonzero(merge_neighbours(gaussians, np.ones(8), 5).is_new), [1, 2, 3])
+
+
+def test_unimportant_ones_merge_first():
+    """Ward: 1 * 1 / 2 for the gap of 1, against 4 * 0.1 / 1.1 for that of 2."""
+    gaussians = on_a_line(np.array([0.0, 1, 10, 12]))
+    assert_array_equal(merge_neighbours(gaussians, np.array([1, 1, 1, 0.1]), 3).is_new, [False, False, True])
+    assert_array_equal(merge_neighbours(gaussians, np.array([1, 1, 1, 0.5]), 3).is_new, [True, False, False])
+
+
+def test_colours_that_differ_are_far_apart():
+    """The distances to the nearest are 1 and 1.2, so a difference of 1 in colour is 11 apart."""
+    gaussians = on_a_line(np.array([0.0, 1, 20, 21.2]))
+    gaussians.sh_dc[0] = 1 / np.sqrt(3) / SH_C0
+    edit = merge_neighbours(gaussians, np.ones(4), 3)
+    assert_array_equal(edit.is_new, [False, False, True])
 
 
 # Hard cases -----------------------------------------------------------------------------------------------------------

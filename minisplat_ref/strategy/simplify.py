@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from minisplat_ref.constants import SH_C0
 from minisplat_ref.errors import InputError
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.strategy.clone_split import logit
@@ -23,6 +24,7 @@ from minisplat_ref.strategy.initialization import from_means
 from minisplat_ref.strategy.ops import Edit, keep, take
 from minisplat_ref.types import Floats, Gaussians, Ints
 
+COLOR_REACH = 10.0  # a difference of 1 in colour is as far as this many median distances to the nearest centre
 LARGEST_OPACITY = 0.99  # of a merged Gaussian: alpha is clamped here, so that more is neither seen nor trained
 
 
@@ -119,8 +121,9 @@ def by_merging(gaussians: Gaussians, importance: Floats, n: int, rng: np.random.
 def merge_neighbours(gaussians: Gaussians, importance: Floats, n: int) -> Edit:
     """Merge near neighbours until ``n`` Gaussians are left; those without importance are dropped first.
 
-    In each round every two that are each other's nearest neighbour become one, the closest first. Of the members m of
-    such a cluster, with importance w_m and d_m = mu_m - mu::
+    Neighbours are near in space and in colour. In each round pairs that are each other's nearest neighbour become one,
+    the cheaper half of them by Ward's criterion, squared distance times w_1 w_2 / (w_1 + w_2), by which unimportant
+    ones go first. Of the members m of a cluster, with importance w_m and d_m = mu_m - mu::
 
         mu    = sum w_m mu_m / sum w_m                      the colour's coefficients alike
         Sigma = sum w_m (Sigma_m + d_m d_m^T) / sum w_m     quaternion and scales by its eigenvectors and eigenvalues
@@ -148,48 +151,60 @@ def merge_neighbours(gaussians: Gaussians, importance: Floats, n: int) -> Edit:
         As for :func:`sample`.
     """
     ids = _candidates(importance, n)
+    if len(ids) == n:
+        return keep(gaussians, ids)
     weights = importance[ids].astype(np.float64)
-    labels = _clusters(gaussians.means[ids].astype(np.float64), weights, n)  # [C] in [0, n)
+    labels = _clusters(_places(take(gaussians, ids)), weights, n)  # [C] in [0, n)
     order = np.lexsort([-weights, labels])  # by cluster, its most important member first
     ids, weights, labels = ids[order], weights[order], labels[order]
     parent_ids = ids[np.flatnonzero(np.diff(labels, prepend=-1))]  # [n]
-    is_merged = np.bincount(labels, minlength=n) > 1  # [n]
+    is_merged = np.bincount(labels) > 1  # [n]
+    is_member = is_merged[labels]  # [C]
     left = take(gaussians, parent_ids)
-    if is_merged.any():
-        is_member = is_merged[labels]
-        members = Gaussians._make(field.astype(np.float64) for field in take(gaussians, ids[is_member]))
-        for field, merged in zip(left, _merged(members, weights[is_member], labels[is_member]), strict=True):
-            field[is_merged] = merged
+    members = Gaussians._make(field.astype(np.float64) for field in take(gaussians, ids[is_member]))
+    for field, merged in zip(left, _merged(members, weights[is_member], labels[is_member]), strict=True):
+        field[is_merged] = merged
     return Edit(left, parent_ids, is_merged)
 
 
-def _clusters(means: Floats, weights: Floats, n: int) -> Ints:
+def _places(gaussians: Gaussians) -> Floats:
+    """Return centres and colours [C, 6] in one unit of length, float64."""
+    means, colors = gaussians.means.astype(np.float64), SH_C0 * gaussians.sh_dc.astype(np.float64)
+    distances, _ = cKDTree(means).query(means, 2)
+    return np.column_stack([means, COLOR_REACH * np.median(distances[:, 1]) * colors])
+
+
+def _clusters(places: Floats, weights: Floats, n: int) -> Ints:
     """Return for each row the number of its cluster, of which there are ``n``, in the order of their first rows."""
-    labels = np.arange(len(means))
-    sums = np.column_stack([weights[:, None] * means, weights])  # [C, 4]
+    labels = np.arange(len(places))
+    sums = np.column_stack([weights[:, None] * places, weights])  # [C, 7]
     while len(sums) > n:
-        pairs = _mutual_neighbours(sums[:, :3] / sums[:, 3:])[: len(sums) - n]
+        places, weights = sums[:, :-1] / sums[:, -1:], sums[:, -1]
+        first, second = _mutual_neighbours(places).T  # [P]
+        squared = np.sum((places[first] - places[second]) ** 2, axis=1)
+        costs = squared * weights[first] * weights[second] / (weights[first] + weights[second])
+        chosen = np.argsort(costs, kind="stable")[: min(len(sums) - n, -(-len(costs) // 2))]
         into = np.arange(len(sums))
-        into[pairs[:, 1]] = pairs[:, 0]
+        into[second[chosen]] = first[chosen]
         into = np.unique(into, return_inverse=True)[1]
         labels = into[labels]
         sums = np.column_stack([np.bincount(into, column) for column in sums.T])
     return labels
 
 
-def _mutual_neighbours(means: Floats) -> Ints:
-    """Return pairs [P, 2] of rows that are nearest to each other, the closest pair first, the lower row first.
+def _mutual_neighbours(places: Floats) -> Ints:
+    """Return pairs [P, 2] of rows that are nearest to each other, the lower row first.
 
     Where distances are equal, neighbours may go round in a circle (points in one place, grids). All pairs of a row and
     its neighbour are therefore ranked, and a pair counts if it is the first of both its rows: the closest always does.
     """
-    rows = np.arange(len(means))
-    distances, nearest = cKDTree(means).query(means, 2)  # [M, 2] a row itself need not come before one in its place
+    rows = np.arange(len(places))
+    distances, nearest = cKDTree(places).query(places, 2)  # [M, 2] a row itself need not come before one in its place
     is_self = nearest[:, 0] == rows
     other = np.where(is_self, nearest[:, 1], nearest[:, 0])
     order = np.argsort(np.where(is_self, distances[:, 1], distances[:, 0]), kind="stable")
     pairs = np.column_stack([np.minimum(rows, other), np.maximum(rows, other)])[order]
-    ranks = np.full(len(means), len(pairs))
+    ranks = np.full(len(places), len(pairs))
     for column in pairs.T:
         np.minimum.at(ranks, column, rows)
     return pairs[(ranks[pairs[:, 0]] == rows) & (ranks[pairs[:, 1]] == rows)]
