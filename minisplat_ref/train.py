@@ -36,7 +36,7 @@ from minisplat_ref.render import render, render_vjp
 from minisplat_ref.strategy.initialization import initial_gaussians
 from minisplat_ref.types import Gaussians, Scene
 
-LEAST_HALF_SIZE = 32  # pixels a side; the window of SSIM is 11 wide
+LEAST_HALF_SIZE = 100  # pixels a side
 
 __all__ = ["StepReport", "TrainState", "initial_state", "load_state", "save_state", "train"]
 

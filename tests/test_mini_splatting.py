@@ -14,7 +14,7 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.events import Iteration
 from minisplat_ref.events.importance import is_culling, measure_importance
-from minisplat_ref.recipes import RECIPES, At, Every, configured, scaled
+from minisplat_ref.recipes import RECIPES, At, During, Every, configured, scaled
 from minisplat_ref.render import render, render_vjp
 from minisplat_ref.strategy import importance, simplify
 from minisplat_ref.strategy.ops import n_rows
@@ -51,23 +51,29 @@ def iteration(scene):
 
 
 def compressed(name):
-    """The recipe in 90 iterations.
+    """The recipe in 90 iterations, with every event.
 
     Mini-Splatting2's events come as close together as it takes; Mini-Splatting's keep their distance, or pruning, which
     has no time to be undone, would leave nothing.
     """
     recipe = RECIPES[name]
+    events = [e if isinstance(e, During) else e._replace(least_step=0) for e in recipe.events]
     if name.startswith("mini-splatting2"):
-        events = tuple(e._replace(least_period=2) if isinstance(e, Every) else e for e in recipe.events)
-        recipe = recipe._replace(events=events)
-    return scaled(recipe, ITERATIONS)
+        events = [e._replace(least_period=2) if isinstance(e, Every) else e for e in events]
+    return scaled(recipe._replace(events=tuple(events)), ITERATIONS)
+
+
+@pytest.fixture
+def small_warm_up(monkeypatch):
+    """Views of 72 x 64 pixels are halved."""
+    monkeypatch.setattr("minisplat_ref.train.LEAST_HALF_SIZE", 32)
 
 
 # Whole recipes --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", NEW_RECIPES)
-def test_recipe_runs_to_the_end(scene, name):
+def test_recipe_runs_to_the_end(scene, name, small_warm_up):
     """Every event happens, what they upset is learnt again, and view-dependent colour exists after simplification."""
     recipe = compressed(name)
     losses, degrees, sizes = [], [], []
@@ -237,7 +243,7 @@ def test_too_few_views(scene, name):
         initial_state(scene._replace(train_views=scene.train_views[:2]), RECIPES[name], 0)
 
 
-def test_tiny_images_are_not_halved(scene):
+def test_tiny_images_are_not_halved(scene, small_warm_up):
     """Half of 63 pixels would be fewer than 32."""
     views = tuple(
         view._replace(camera=view.camera._replace(width=63), image=view.image[:, :63]) for view in scene.train_views

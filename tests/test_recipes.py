@@ -60,7 +60,7 @@ def test_mini_splatting_schedule():
     assert fired["clone_and_split"] == fired["prune_faint"] == densified and len(densified) == 142
     assert fired["prune_large"] == [step for step in densified if step > 3_000]
     assert fired["reinitialise_from_depth"] == [5_000, 10_000]
-    assert fired["simplify"] == fired["restart_from_means"] == [15_000]
+    assert fired["simplify"] == fired["store_sh"] == fired["restart_from_means"] == [15_000]
     assert fired["prune_tail"] == fired["restart_adam"] == [20_000]
     assert "reset_opacity" not in fired
     assert recipe.sh_degree == 0 and recipe.sh_milestones == (16_000, 17_000, 18_000)
@@ -103,6 +103,25 @@ def test_settings_are_replaced_in_every_event_that_has_them():
 def test_every_recipe_can_be_described_and_scaled(name):
     for recipe in (RECIPES[name], get_recipe(name, 3_000), get_recipe(name, 1)):
         assert json.loads(json.dumps(describe(recipe)))["name"] == name
+
+
+def test_what_needs_time_is_left_out_of_short_runs():
+    """Published, depth reinitialises at 5000 and 10,000; compressed to 6000 iterations at 1000 and 2000, to 3000 once."""
+    fired = {n: firings(get_recipe("mini-splatting", n)) for n in (3_000, 6_000)}
+    assert fired[3_000]["reinitialise_from_depth"] == [1_000]
+    assert fired[6_000]["reinitialise_from_depth"] == [1_000, 2_000]
+    assert fired[3_000]["restart_from_means"] == [] and fired[6_000]["restart_from_means"] == [3_000]
+    assert fired[3_000]["store_sh"] == [1_500]
+    assert firing(At(4, nothing, least_step=5)) == [] and firing(At(5, nothing, least_step=5)) == [5]
+    assert firing(Every(3, nothing, least_step=7), 12) == [9, 12]
+
+
+def test_rates_of_short_runs_are_raised_where_the_recipe_says_so():
+    recipe = RECIPES["3dgs"]._replace(short_run_exponent=0.5)
+    short, rates = scaled(recipe, 7_500).learning_rates, recipe.learning_rates
+    assert short[1:] == pytest.approx([2 * rate for rate in rates[1:]])
+    assert (short.means.first, short.means.last) == (rates.means.first, rates.means.last)
+    assert scaled(recipe, 60_000).learning_rates[1:] == rates[1:]  # longer runs keep them
 
 
 def test_rewind_and_warm_up_are_scaled():

@@ -1,6 +1,7 @@
 """What the commands' arguments share: the look of the help, and the types of values."""
 
 import argparse
+import math
 import shutil
 from collections.abc import Callable
 from typing import Any
@@ -44,6 +45,17 @@ def name(text: str) -> str:
 def listed(parse: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
     """Return the type of values between commas."""
     return lambda text: tuple(parse(part.strip()) for part in text.split(","))
+
+
+def weights(text: str) -> tuple[float, float, float]:
+    """Parse three numbers of at least 0 between commas."""
+    try:
+        first, second, third = map(float, text.split(","))
+    except ValueError:
+        first = second = third = math.nan
+    if not all(0 <= weight < math.inf for weight in (first, second, third)):
+        raise argparse.ArgumentTypeError(f"{text!r} is not three numbers of at least 0, like 0.1,0,0.05")
+    return first, second, third
 
 
 def add_renderer_arguments(parser: argparse._ActionsContainer, default: str | None, whose: str = "") -> None:

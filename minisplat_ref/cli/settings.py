@@ -13,7 +13,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.io import load_scene
 from minisplat_ref.recipes import Recipe, configured, describe, get_recipe
 from minisplat_ref.strategy import importance
-from minisplat_ref.types import Floats, Scene
+from minisplat_ref.types import Floats, GeometricWeights, Scene
 
 METRICS = {"indoor": importance.indoor, "outdoor": importance.outdoor}
 REPORTED_PACKAGES = ("numpy", "numba", "scipy", "pillow", "pycolmap")
@@ -46,12 +46,14 @@ class Settings(NamedTuple):
     """Gaussians that a simplification keeps; None for the recipe's own part of the candidates."""
     scene_type: str | None = None
     """``indoor`` or ``outdoor``, which decides what importance means; None for the recipe's own choice."""
+    geometry: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Weights of the geometric loss terms: depth of the scene's points, smooth depth, smooth normals."""
     eval_every: int = 0
     """Iterations after which the test views are measured again; 0: only in the end. Does not change the result."""
 
 
 def recipe_of(settings: Settings) -> Recipe:
-    """Return the recipe of a run, scaled and with the run's budget and metric.
+    """Return the recipe of a run, scaled and with the run's budget, metric and geometric terms.
 
     Raises
     ------
@@ -63,7 +65,7 @@ def recipe_of(settings: Settings) -> Recipe:
         recipe = configured(recipe, budget=settings.budget)
     if settings.scene_type is not None:
         recipe = configured(recipe, metric=METRICS[settings.scene_type])
-    return recipe
+    return recipe._replace(geometry=GeometricWeights(*settings.geometry))
 
 
 def to_config(settings: Settings, recipe: Recipe, scene: Scene) -> dict[str, Any]:

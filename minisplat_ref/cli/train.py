@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from minisplat_ref.cli.arguments import Commands, HelpFormatter, add_renderer_arguments, integer
+from minisplat_ref.cli.arguments import Commands, HelpFormatter, add_renderer_arguments, integer, weights
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 
@@ -23,6 +23,7 @@ DEFAULTS = {
     "iterations": 3000,
     "budget": None,
     "scene_type": None,
+    "geometry": (0.0, 0.0, 0.0),
     "eval_every": 0,
     "seed": 0,
     "profile": GSPLAT_MAIN.name,
@@ -78,8 +79,7 @@ def add_parser(commands: Commands) -> None:
     training.add_argument(
         "--recipe",
         metavar="R",
-        help="3dgs, 3dgs-accel (default), mini-splatting, mini-splatting-d, mini-splatting2 or mini-splatting2-d,"
-        " scaled to the iterations",
+        help="3dgs, 3dgs-accel (default), mini-splatting, mini-splatting2; or the latter with -d",
     )
     training.add_argument("--iterations", type=integer(1), metavar="N", help="one view each (default 3000)")
     training.add_argument(
@@ -90,6 +90,9 @@ def add_parser(commands: Commands) -> None:
         choices=("indoor", "outdoor"),
         metavar="T",
         help="indoor (default) or outdoor: what counts as important",
+    )
+    training.add_argument(
+        "--geometry", type=weights, metavar="A,B,C", help="loss of points' depth, smooth depth, smooth normals (0,0,0)"
     )
     training.add_argument(
         "--eval-every",

@@ -3,14 +3,15 @@
 The mathematics is in :mod:`minisplat_ref.strategy`: ``aggressive_clone``, ``visibility``, ``importance``.
 """
 
+import math
 from collections.abc import Callable
 
 from minisplat_ref.events.importance import cull, measure_importance
-from minisplat_ref.events.state import Iteration, TrainState, apply_edit
+from minisplat_ref.events.state import Iteration, TrainState, apply_edit, n_pixels
 from minisplat_ref.strategy import aggressive_clone as cloning
 from minisplat_ref.strategy import visibility
 from minisplat_ref.strategy.importance import ImportanceStats, indoor, mass_mask
-from minisplat_ref.strategy.ops import keep, take
+from minisplat_ref.strategy.ops import keep, n_rows, take
 from minisplat_ref.types import Bools
 
 COLLECTED = ("gradient_sum", "view_count", "is_blurred")
@@ -24,6 +25,7 @@ def aggressive_clone(
     factor: int,
     tail_mass: float,
     least_views: int,
+    most_per_pixel: float = math.inf,
 ) -> None:
     """Clone the critical Gaussians, after dropping those that hardly any view sees, and cull views from now on.
 
@@ -39,13 +41,16 @@ def aggressive_clone(
         Only the most important Gaussians that carry this part of the importance stay.
     least_views : int
         Those that belong to the visible part of fewer views go.
+    most_per_pixel : float
+        Nothing is cloned while there are this many Gaussians or more for each pixel of the training views.
     """
     stats = measure_importance(state, iteration)
     stays = mass_mask(indoor(stats), tail_mass) & ~visibility.seen_by_few(stats.is_visible, least_views)  # [N]
     apply_edit(state, keep(state.gaussians, stays))
     stats = take(stats, stays)
     cull(state, stats)
-    apply_edit(state, cloning.clone(state.gaussians, critical(stats), factor=factor))
+    if n_rows(state.gaussians) < most_per_pixel * n_pixels(iteration.scene):
+        apply_edit(state, cloning.clone(state.gaussians, critical(stats), factor=factor))
     for name in COLLECTED:
         state.stats.pop(name, None)
 

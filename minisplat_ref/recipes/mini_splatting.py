@@ -15,6 +15,13 @@ from minisplat_ref.strategy import blur_split, depth_reinit, importance, simplif
 POINTS_PER_PIXEL = 0.014  # 3.5 million points for some 200 photographs of 1.2 megapixels
 MOST_PER_PIXEL = 0.018  # densification pauses above 4.5 million Gaussians for the same
 BLUR_AREA = 2e-4  # paper, equation 2: what dominates more of an image than this is too large
+
+# To begin anew, from depth or from the centres alone, takes a scene that is known by then and time to learn it again:
+# in runs of a few thousand iterations it costs more than it gives.
+REINITIALISE_LEAST_STEP = 1_000
+RESTART_LEAST_STEP = 3_000
+SHORT_RUN_EXPONENT = 0.3  # simplified Gaussians are few and change much: compressed runs raise their rates
+
 _densifying = partial(Every, 100, stop=15_000, skip=5_000, least_period=DENSIFY_LEAST_PERIOD)
 
 _densify = partial(
@@ -37,7 +44,11 @@ _DENSIFICATION = (
     _densifying(_densify, start=500),
     _densifying(partial(events.prune_faint, least_opacity=0.005), start=500),
     _densifying(partial(events.prune_large, size_fraction=0.1), start=3_000),
-    Every(5_000, _reinitialise, stop=15_000),
+    Every(5_000, _reinitialise, stop=15_000, least_step=REINITIALISE_LEAST_STEP),
+)
+_AFTER_SIMPLIFICATION = (
+    At(15_000, partial(events.store_sh, sh_degree=3)),
+    At(15_000, partial(events.restart_from_means, sh_degree=3), least_step=RESTART_LEAST_STEP),
 )
 
 MINI_SPLATTING = GS._replace(
@@ -57,16 +68,17 @@ MINI_SPLATTING = GS._replace(
                 budget=None,
             ),
         ),
-        At(15_000, partial(events.restart_from_means, sh_degree=3)),
+        *_AFTER_SIMPLIFICATION,
         At(20_000, partial(events.prune_tail, metric=importance.indoor, mass=0.99)),
         At(20_000, events.restart_adam),
     ),
     least_views=3,
+    short_run_exponent=SHORT_RUN_EXPONENT,
 )
 """``mini-splatting``: few Gaussians."""
 
 MINI_SPLATTING_D = MINI_SPLATTING._replace(
     name="mini-splatting-d",
-    events=(*_DENSIFICATION, At(15_000, partial(events.restart_from_means, sh_degree=3))),
+    events=(*_DENSIFICATION, *_AFTER_SIMPLIFICATION),
 )
 """``mini-splatting-d``: densification without simplification, for quality."""

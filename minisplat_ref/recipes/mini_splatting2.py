@@ -5,10 +5,11 @@ from functools import partial
 from minisplat_ref import events
 from minisplat_ref.optim.adam import AdamRule
 from minisplat_ref.recipes.gaussian_splatting import DENSIFY_LEAST_PERIOD, GS
-from minisplat_ref.recipes.mini_splatting import BLUR_AREA
+from minisplat_ref.recipes.mini_splatting import BLUR_AREA, REINITIALISE_LEAST_STEP, SHORT_RUN_EXPONENT
 from minisplat_ref.recipes.schedule import At, During, Every
 from minisplat_ref.strategy import aggressive_clone, blur_split, depth_reinit, importance, simplify
 
+MOST_PER_PIXEL = 0.05  # of the small views; densification pauses above it
 CLONE_LEAST_PERIOD = 50  # copies start in one place and need some steps to part
 _LEAST_VIEWS = 2  # what only one view sees is as likely a floater as a surface
 _cloning = partial(
@@ -17,12 +18,14 @@ _cloning = partial(
     factor=2,
     tail_mass=0.999,
     least_views=_LEAST_VIEWS,
+    most_per_pixel=MOST_PER_PIXEL,
 )
 _densify = partial(
     events.clone_and_split,
     threshold=2e-4,
     size_fraction=0.01,
     draw_children=blur_split.principal_axis_children,
+    most_per_pixel=MOST_PER_PIXEL,
 )
 _reinitialise = partial(
     events.reinitialise_from_depth,
@@ -39,7 +42,7 @@ _DENSIFICATION = (
     _densifying(_densify),
     _densifying(partial(events.prune_faint, least_opacity=0.005)),
     At(2_000, partial(events.prune_tail, metric=importance.indoor, mass=0.99)),
-    At(2_000, _reinitialise),
+    At(2_000, _reinitialise, least_step=REINITIALISE_LEAST_STEP),
     Every(250, _cloning, start=499, stop=3_000, skip=2_000, least_period=CLONE_LEAST_PERIOD),
 )
 
@@ -72,6 +75,7 @@ MINI_SPLATTING2 = GS._replace(
     ),
     half_size_until=3_000,
     least_views=3,
+    short_run_exponent=SHORT_RUN_EXPONENT,
 )
 """``mini-splatting2``: few Gaussians, fast."""
 

@@ -41,10 +41,12 @@ class Every(NamedTuple):
     skip: int | None = None
     least_period: int = 1
     """Scaling does not make the period shorter than this."""
+    least_step: int = 0
+    """The action never happens before this iteration, however far the recipe is compressed."""
 
     def is_due(self, step: int) -> bool:
         """Return whether the action belongs to iteration ``step``, counted from 1."""
-        is_inside = self.start < step and (self.stop is None or step < self.stop)
+        is_inside = max(self.start + 1, self.least_step) <= step and (self.stop is None or step < self.stop)
         is_skipped = self.skip is not None and step % self.skip == 0
         return is_inside and step % self.period == 0 and not is_skipped
 
@@ -63,10 +65,12 @@ class At(NamedTuple):
 
     step: int
     action: Action
+    least_step: int = 0
+    """The action does not happen at all if scaling moves it before this iteration."""
 
     def is_due(self, step: int) -> bool:
         """Return whether the action belongs to iteration ``step``, counted from 1."""
-        return step == self.step
+        return step == self.step and step >= self.least_step
 
     def scaled(self, factor: float) -> "At":
         """Return the event with its iteration multiplied by ``factor``, at least the first."""
@@ -98,6 +102,9 @@ class Recipe(NamedTuple):
     """Iterations that train on views of half the width and height, from the first on (Mini-Splatting2)."""
     least_views: int = 1
     """Training views without which the method makes no sense."""
+    short_run_exponent: float = 0.0
+    """p of the factor ``(published / iterations)^p`` by which :func:`scaled` raises all rates but the means' in runs
+    that are shorter than published."""
     geometry: GeometricWeights = GeometricWeights()
     """Geometric loss terms beside the photometric one; none in any of the papers here."""
 
@@ -108,7 +115,9 @@ def scaled(recipe: Recipe, iterations: int) -> Recipe:
     Start, stop and period of each event, the spherical-harmonic milestones and the length of the position schedule are
     multiplied by ``iterations / recipe.iterations`` and rounded to the nearest integer (ties to even); a one-time event
     happens at iteration 1 at the earliest, a period is at least the event's ``least_period``. Because the period is
-    rounded by itself, the number of events can differ by a few from the original's. Learning rates and thresholds stay.
+    rounded by itself, the number of events can differ by a few from the original's. What must not come before its
+    ``least_step`` is left out of runs that are too short for it. Thresholds stay; so do learning rates, unless the
+    recipe has a ``short_run_exponent``.
 
     Raises
     ------
@@ -122,7 +131,7 @@ def scaled(recipe: Recipe, iterations: int) -> Recipe:
     rewind = means_rate.rewind
     return recipe._replace(
         iterations=iterations,
-        learning_rates=recipe.learning_rates._replace(
+        learning_rates=_raised(recipe.learning_rates, max(1.0, 1 / factor) ** recipe.short_run_exponent)._replace(
             means=means_rate._replace(
                 steps=max(1, _scaled(means_rate.steps, factor)),
                 rewind=rewind and Rewind(_scaled(rewind.at, factor), _scaled(rewind.to, factor)),
@@ -132,6 +141,11 @@ def scaled(recipe: Recipe, iterations: int) -> Recipe:
         events=tuple(event.scaled(factor) for event in recipe.events),
         half_size_until=_scaled(recipe.half_size_until, factor),
     )
+
+
+def _raised(rates: LearningRates, factor: float) -> LearningRates:
+    """Return the rates times ``factor``, except that of the means."""
+    return LearningRates(rates.means, *(factor * rate for rate in rates[1:]))
 
 
 def configured(recipe: Recipe, **settings: Any) -> Recipe:
