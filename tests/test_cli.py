@@ -98,6 +98,8 @@ def test_train_leaves_a_complete_folder(run_folder, scene_folder):
         "seed": 3,
         "profile": "GSPLAT_MAIN",
         "backend": "cpu",
+        "simplify": None,
+        "geometry": [0.0, 0.0, 0.0],
         "budget": None,
         "scene_type": None,
         "eval_every": 0,

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from photo_scenes import PINHOLE, edit_transforms, write_colmap, write_transforms
 
+from data_tools.synthetic import make_scene
+from data_tools.synthetic.files import write_scene
 from minisplat_ref import Gaussians, save_ply
 from minisplat_ref.cli import main
 from minisplat_ref.io.images import write_image
@@ -181,6 +183,10 @@ def test_out_below_a_file(refused, tmp_path):
         (["--profile", "none"], "--profile"),
         (["--unknown"], "--unknown"),
         (["--resume", "."], "leave out"),
+        (["--budget", "0"], "--budget"),
+        (["--budget", "9"], "recipe 3dgs-accel has no budget to set"),
+        (["--geometry", "1,2"], "'1,2' is not three numbers"),
+        (["--geometry", "1,-2,0"], "'1,-2,0' is not three numbers"),
     ],
 )
 def test_bad_options(options, culprit, tmp_path, capfd):
@@ -192,6 +198,32 @@ def test_bad_options(options, culprit, tmp_path, capfd):
     captured = capfd.readouterr()
     assert (code, captured.out, len(captured.err.splitlines())) == (2, "", 1)
     assert culprit in captured.err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("recipe", ["mini-splatting", "mini-splatting2"])
+def test_two_views_for_a_recipe_that_compares_views(train_refused, tmp_path, recipe):
+    scene = write_colmap(tmp_path / "scene", n=3)
+    line = train_refused(scene, "--recipe", recipe, "--test-every", "3")
+    assert "2 training views" in line and "use 3dgs-accel" in line
+
+
+def test_budget_above_the_candidates(tmp_path, capfd):
+    """How many there are is known only when it comes to choosing; nothing remains of the run."""
+    write_scene(
+        make_scene("room", supersampling=1, n_views=4, width=24, height=18, n_points=60), tmp_path / "scene", {}
+    )
+    options = ["--recipe", "mini-splatting", "--iterations", "8", "--budget", "100000", "--out", str(tmp_path / "out")]
+    assert main(["train", str(tmp_path / "scene"), *options]) == 2
+    (line,) = [line for line in capfd.readouterr().err.splitlines() if "error" in line]
+    assert "budget is 100,000 but only" in line and "lower the budget" in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_depth_of_points_without_tracks(tmp_path, capfd):
+    scene = write_transforms(tmp_path / "scene", fl_x=40.0)
+    assert main(["train", str(scene), "--geometry", "1,0,0", "--iterations", "2", "--out", str(tmp_path / "out")]) == 2
+    assert "does not say which view sees which point" in capfd.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

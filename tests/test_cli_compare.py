@@ -181,7 +181,7 @@ def test_interrupted_while_training(scene_folder, tmp_path, monkeypatch, capfd, 
 
 def plan(**changes):
     defaults = {"scene": Path("scene"), "folder": Path("out"), "recipes": ("a", "b"), "iterations": (300, 100)}
-    options = {"seeds": (0, 5), "downscale": 2, "test_every": 4, "budget": None, "scene_type": None}
+    options = {"seeds": (0, 5), "downscale": 2, "test_every": 4, "budget": None, "simplify": None, "scene_type": None}
     return Plan(**{**defaults, **options, **changes})
 
 

@@ -106,7 +106,7 @@ def test_every_recipe_can_be_described_and_scaled(name):
 
 
 def test_what_needs_time_is_left_out_of_short_runs():
-    """Published, depth reinitialises at 5000 and 10,000; compressed to 6000 iterations at 1000 and 2000, to 3000 once."""
+    """Published, depth reinitialises at 5000 and 10,000; in 6000 iterations at 1000 and 2000, in 3000 once."""
     fired = {n: firings(get_recipe("mini-splatting", n)) for n in (3_000, 6_000)}
     assert fired[3_000]["reinitialise_from_depth"] == [1_000]
     assert fired[6_000]["reinitialise_from_depth"] == [1_000, 2_000]

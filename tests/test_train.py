@@ -16,7 +16,7 @@ from minisplat_ref.metrics import evaluate
 from minisplat_ref.recipes import RECIPES, At, During, Every
 from minisplat_ref.render import render
 from minisplat_ref.train import initial_state, load_state, save_state, train
-from minisplat_ref.types import Scene, View
+from minisplat_ref.types import GeometricWeights, Scene, View
 
 N_VIEWS, N_GAUSSIANS = 4, 30
 
@@ -129,6 +129,30 @@ def test_blend_statistics_only_where_asked_for(scene):
     )
     train(scene, recipe, seed=0)
     assert {step: stats is not None for step, stats in seen.items()} == {1: False, 2: True, 3: False}
+
+
+def test_geometric_terms_join_the_loss(scene):
+    """Smooth depth is paid for, and trained: the same run with the term ends with less of it."""
+
+    def roughness(state):
+        camera = scene.train_views[0].camera
+        output, _ = render(state.gaussians, camera, with_depth=True)
+        target = np.zeros((camera.height, camera.width, 3), np.float32)
+        weights = GeometricWeights(depth_smoothness=1.0)
+        return CPU.geometric_loss(output.image[..., 3], output.alpha, target, camera, scene.points[:0], weights)[0]
+
+    plain, smooth = [], []
+    recipe = PLAIN._replace(geometry=GeometricWeights(depth_smoothness=2.0))
+    rough = train(scene, PLAIN, seed=0, on_step=lambda report: plain.append(report.loss))
+    smoothed = train(scene, recipe, seed=0, on_step=lambda report: smooth.append(report.loss))
+    assert smooth[0] > plain[0]
+    assert roughness(smoothed) < 0.8 * roughness(rough)
+
+
+def test_depth_of_points_needs_to_know_who_sees_them(scene):
+    recipe = PLAIN._replace(geometry=GeometricWeights(sfm_depth=0.1))
+    with pytest.raises(InputError, match="tiny does not say which view sees which point"):
+        train(scene, recipe, seed=0)
 
 
 def test_action_may_raise_the_stored_degree(scene):

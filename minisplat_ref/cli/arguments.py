@@ -82,5 +82,5 @@ def add_renderer_arguments(parser: argparse._ActionsContainer, default: str | No
         choices=BACKENDS,
         default=default,
         metavar="NAME",
-        help=f"cpu (Numba), cpu-exact (libm's exp) or reference (NumPy) (default {whose}cpu)",
+        help=f"cpu, cpu-exact or reference (default {whose}cpu)",
     )

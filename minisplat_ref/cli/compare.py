@@ -47,6 +47,9 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--budget", type=integer(1), metavar="N", help="as for train, for the recipes that simplify to one"
     )
+    parser.add_argument(
+        "--simplify", choices=("sampling", "rank", "merging"), metavar="S", help="likewise: sampling, rank or merging"
+    )
     parser.add_argument("--scene-type", choices=("indoor", "outdoor"), metavar="T", help="likewise: indoor or outdoor")
     parser.add_argument(
         "--downscale", type=integer(1), default=1, metavar="D", help="make the photographs D times smaller (default 1)"
@@ -72,6 +75,7 @@ def run(args: argparse.Namespace) -> int:
         downscale=args.downscale,
         test_every=args.test_every,
         budget=args.budget,
+        simplify=args.simplify,
         scene_type=args.scene_type,
     )
     scene = check(plan)

@@ -12,9 +12,10 @@ from minisplat_ref.cli.run_folder import CONFIG, read_json_object
 from minisplat_ref.errors import InputError
 from minisplat_ref.io import load_scene
 from minisplat_ref.recipes import Recipe, configured, describe, get_recipe
-from minisplat_ref.strategy import importance
+from minisplat_ref.strategy import importance, simplify
 from minisplat_ref.types import Floats, GeometricWeights, Scene
 
+CHOICES = {"sampling": simplify.by_sampling, "rank": simplify.by_rank, "merging": simplify.by_merging}
 METRICS = {"indoor": importance.indoor, "outdoor": importance.outdoor}
 REPORTED_PACKAGES = ("numpy", "numba", "scipy", "pillow", "pycolmap")
 
@@ -44,6 +45,8 @@ class Settings(NamedTuple):
     """Name of the backend."""
     budget: int | None = None
     """Gaussians that a simplification keeps; None for the recipe's own part of the candidates."""
+    simplify: str | None = None
+    """How simplification chooses, a key of ``CHOICES``; None for the recipe's own way."""
     scene_type: str | None = None
     """``indoor`` or ``outdoor``, which decides what importance means; None for the recipe's own choice."""
     geometry: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -53,7 +56,7 @@ class Settings(NamedTuple):
 
 
 def recipe_of(settings: Settings) -> Recipe:
-    """Return the recipe of a run, scaled and with the run's budget, metric and geometric terms.
+    """Return the recipe of a run, scaled and with what the run sets differently.
 
     Raises
     ------
@@ -63,6 +66,8 @@ def recipe_of(settings: Settings) -> Recipe:
     recipe = get_recipe(settings.recipe, settings.schedule_iterations)
     if settings.budget is not None:
         recipe = configured(recipe, budget=settings.budget)
+    if settings.simplify is not None:
+        recipe = configured(recipe, choose=CHOICES[settings.simplify])
     if settings.scene_type is not None:
         recipe = configured(recipe, metric=METRICS[settings.scene_type])
     return recipe._replace(geometry=GeometricWeights(*settings.geometry))

@@ -22,6 +22,7 @@ DEFAULTS = {
     "recipe": "3dgs-accel",
     "iterations": 3000,
     "budget": None,
+    "simplify": None,
     "scene_type": None,
     "geometry": (0.0, 0.0, 0.0),
     "eval_every": 0,
@@ -41,7 +42,6 @@ Ctrl-C saves what there is. --resume continues with the run's own settings;
 EPILOG = """\
 examples:
   minisplat-ref train photos/fox --out runs/fox
-  minisplat-ref train garden --downscale 4 --iterations 7000 --out runs/garden
   minisplat-ref train --resume runs/fox --iterations 4000
 """
 
@@ -79,11 +79,17 @@ def add_parser(commands: Commands) -> None:
     training.add_argument(
         "--recipe",
         metavar="R",
-        help="3dgs, 3dgs-accel (default), mini-splatting, mini-splatting2; or the latter with -d",
+        help="3dgs, 3dgs-accel (default), mini-splatting, mini-splatting2, mini-splatting-d or mini-splatting2-d",
     )
     training.add_argument("--iterations", type=integer(1), metavar="N", help="one view each (default 3000)")
     training.add_argument(
         "--budget", type=integer(1), metavar="N", help="Gaussians that simplification keeps (default: a fixed part)"
+    )
+    training.add_argument(
+        "--simplify",
+        choices=("sampling", "rank", "merging"),
+        metavar="S",
+        help="by sampling (default), rank or merging",
     )
     training.add_argument(
         "--scene-type",

@@ -14,7 +14,7 @@ from minisplat_ref.types import Scene
 POINTS_PER_RUN = 12  # of each curve: enough to see when a quality is reached, and a small part of the time
 
 
-RECIPE_OPTIONS = {"budget": "budget", "scene_type": "metric"}
+RECIPE_OPTIONS = {"budget": "budget", "simplify": "choose", "scene_type": "metric"}
 """Options of ``train`` that not every recipe takes, and the setting of an event that each is."""
 
 
@@ -52,6 +52,8 @@ class Plan(NamedTuple):
     """One view of so many is held out."""
     budget: int | None
     """Gaussians that the recipes with a simplification keep; None for their own choice."""
+    simplify: str | None
+    """How the recipes with a simplification choose; None for their own way."""
     scene_type: str | None
     """``indoor`` or ``outdoor``, for the recipes that weigh importance; None for their own choice."""
 
