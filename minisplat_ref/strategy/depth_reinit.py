@@ -27,6 +27,7 @@ from minisplat_ref.constants import DEPTH_ALPHA_MIN, GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.reference.pinhole import with_principal_point
 from minisplat_ref.render import render
+from minisplat_ref.strategy.simplify import sample
 from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Ints, View
 
 N_PARTNERS = 8  # views that vote on a point: more of them admit more chance agreements, and cost time
@@ -191,7 +192,8 @@ def reinitial_points(
             else:
                 rays = _rays(view_points[unsure], cameras[i])
                 view_points[unsure] = _centre(cameras[i]) + backdrop_distance * rays
-        pixels = _draw(weights, n_points // len(views), rng)
+        n = min(n_points // len(views), int(np.count_nonzero(weights)))
+        pixels = sample(weights, n, rng) if n > 0 else np.zeros(0, np.intp)
         points.append(view_points[pixels])
         colors.append(view.image.reshape(-1, 3)[pixels])
     if sum(map(len, points)) == 0:
@@ -223,19 +225,6 @@ def unprojected(depths: Floats, camera: Camera) -> Floats:
 def _on_rays(depths: Floats, alpha: Floats, camera: Camera, conventions: Conventions) -> PixelPoints:
     points = unprojected(depths, with_principal_point(camera, conventions))  # [H, W, 3]
     return PixelPoints(np.where(depths[:, :, None] > 0, points, 0).astype(depths.dtype), depths, alpha)
-
-
-def _draw(weights: Floats, n: int, rng: np.random.Generator) -> Ints:
-    """Return up to ``n`` rows in ascending order, drawn without replacement with probability proportional to weight.
-
-    The first of several exponential clocks to ring is each with probability proportional to its rate, so the first n
-    to ring are such a draw.
-    """
-    rows = np.flatnonzero(weights)
-    if n >= len(rows):
-        return rows
-    ringing_times = rng.exponential(size=len(rows)) / weights[rows]
-    return np.sort(rows[np.argpartition(ringing_times, n)[:n]])
 
 
 def _confirmed(
