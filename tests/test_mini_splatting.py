@@ -210,10 +210,10 @@ def test_blur_is_remembered_from_view_to_view(state, scene):
         stats = SimpleNamespace(dominant_count=np.array(counts + [0] * (n - 3)))
         output = SimpleNamespace(stats=stats)
         iteration = Iteration(scene, scene.train_views[0], output, np.arange(0), None, CPU, GSPLAT_MAIN)
-        events.collect_blur(state, iteration, area_fraction=0.01)  # of 72 x 64: 46 pixels
+        events.collect_blur(state, iteration, area_fraction=64 / (72 * 64))
 
-    see([47, 46, 0])
-    see([0, 46, 50])
+    see([65, 64, 0])
+    see([0, 64, 70])
     assert_array_equal(np.flatnonzero(state.stats["is_blurred"]), [0, 2])
 
 

@@ -13,7 +13,7 @@ from minisplat_ref.recipes.schedule import At, During, Every
 from minisplat_ref.strategy import blur_split, depth_reinit, importance, simplify
 
 POINTS_PER_PIXEL = 0.014  # 3.5 million points for some 200 photographs of 1.2 megapixels
-MOST_PER_PIXEL = 0.018  # densification pauses above 4.5 million Gaussians for the same
+MOST_PER_PIXEL = 0.05  # densification pauses above it; released: 0.018, which is too few where pixels are few
 BLUR_AREA = 2e-4  # paper, equation 2: what dominates more of an image than this is too large
 
 # To begin anew, from depth or from the centres alone, takes a scene that is known by then and time to learn it again:

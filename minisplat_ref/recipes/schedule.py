@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.optim.adam import AdamRule
-from minisplat_ref.optim.schedules import LearningRates, Rewind
+from minisplat_ref.optim.schedules import LearningRates, LogLinear, Rewind
 from minisplat_ref.types import GeometricWeights
 
 Action = Callable[..., None]
@@ -103,8 +103,8 @@ class Recipe(NamedTuple):
     least_views: int = 1
     """Training views without which the method makes no sense."""
     short_run_exponent: float = 0.0
-    """p of the factor ``(published / iterations)^p`` by which :func:`scaled` raises all rates but the means' in runs
-    that are shorter than published."""
+    """p of the factor ``(published / iterations)^p`` by which :func:`scaled` raises the rates of runs that are shorter
+    than published; that of the means by the square of it."""
     geometry: GeometricWeights = GeometricWeights()
     """Geometric loss terms beside the photometric one; none in any of the papers here."""
 
@@ -127,25 +127,25 @@ def scaled(recipe: Recipe, iterations: int) -> Recipe:
     if iterations < 1:
         raise InputError(f"iterations is {iterations}: give at least 1")
     factor = iterations / recipe.iterations
-    means_rate = recipe.learning_rates.means
+    raised = max(1.0, 1 / factor) ** recipe.short_run_exponent
+    others = recipe.learning_rates._asdict()
+    means_rate = others.pop("means")
     rewind = means_rate.rewind
     return recipe._replace(
         iterations=iterations,
-        learning_rates=_raised(recipe.learning_rates, max(1.0, 1 / factor) ** recipe.short_run_exponent)._replace(
-            means=means_rate._replace(
-                steps=max(1, _scaled(means_rate.steps, factor)),
-                rewind=rewind and Rewind(_scaled(rewind.at, factor), _scaled(rewind.to, factor)),
-            )
+        learning_rates=LearningRates(
+            means=LogLinear(
+                means_rate.first * raised**2,
+                means_rate.last * raised**2,
+                max(1, _scaled(means_rate.steps, factor)),
+                rewind and Rewind(_scaled(rewind.at, factor), _scaled(rewind.to, factor)),
+            ),
+            **{name: rate * raised for name, rate in others.items()},
         ),
         sh_milestones=tuple(_scaled(milestone, factor) for milestone in recipe.sh_milestones),
         events=tuple(event.scaled(factor) for event in recipe.events),
         half_size_until=_scaled(recipe.half_size_until, factor),
     )
-
-
-def _raised(rates: LearningRates, factor: float) -> LearningRates:
-    """Return the rates times ``factor``, except that of the means."""
-    return LearningRates(rates.means, *(factor * rate for rate in rates[1:]))
 
 
 def configured(recipe: Recipe, **settings: Any) -> Recipe:

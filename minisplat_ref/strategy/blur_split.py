@@ -18,10 +18,10 @@ from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.strategy.ops import concat, take
 from minisplat_ref.types import Bools, Gaussians, Ints
 
-LEAST_BLURRED_AREA = 4
-"""Pixels. Who leads at no more than 2 x 2 pixels would have children too small for the image to tell apart. The
-paper's fraction of 2e-4 falls below this under 20,000 pixels, and below one pixel under 5000, where everybody who leads
-anywhere would be split."""
+LEAST_BLURRED_AREA = 64
+"""Pixels. Who leads at no more than 8 x 8 of them is small enough, whatever the size of the image. The paper's fraction
+of 2e-4 falls below this under 320,000 pixels, and below one pixel under 5000, where everybody who leads anywhere would
+be split."""
 
 HALF_MEAN = math.sqrt(2 / math.pi)  # mean of |x| for x ~ N(0, 1): the centre of mass of the right half
 HALF_SCALE = math.sqrt(1 - 2 / math.pi)  # its standard deviation; 1 / 1.66
