@@ -214,7 +214,7 @@ display(Markdown("\n".join(["| module | what it says of itself |", "|---|---|", 
 # | 4 | `reference/tiling.py`, `hits.py`, `compositing.py` | 03 | how ellipses become pixels |
 # | 5 | the `_vjp` functions beside them | 04 | how a pixel's error reaches every parameter |
 # | 6 | `reference/loss.py`, `depth.py` | 05 | what is minimised |
-# | 7 | `render.py`, `train.py`, `recipes.py`, `events.py`, `strategy/` | 06 | how a scene is trained |
+# | 7 | `render.py`, `train.py`, `recipes/`, `events/`, `strategy/` | 06 | how a scene is trained |
 # | 8 | `scalar/`, then `cpu/` | | how the same formulas run fast |
 #
 # Names are the field's own: `means`, `quats` (wxyz, any length), `log_scales`, `opacity_logits` are what is trained;

@@ -23,7 +23,7 @@
 # | file | what it holds | where in the paper |
 # |---|---|---|
 # | `minisplat_ref/train.py` | the loop | 3DGS sec. 4 |
-# | `minisplat_ref/recipes.py` | what is due when, as data | 3DGS sec. 7.1 |
+# | `minisplat_ref/recipes/` | what is due when, as data | 3DGS sec. 7.1 |
 # | `minisplat_ref/strategy/` | initialisation; clone, split, prune, opacity reset | 3DGS sec. 5.1, 5.2 |
 # | `minisplat_ref/optim/` | Adam, schedules of the learning rates | |
 #
