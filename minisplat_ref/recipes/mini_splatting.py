@@ -18,7 +18,7 @@ BLUR_AREA = 2e-4  # paper, equation 2: what dominates more of an image than this
 
 # To begin anew, from depth or from the centres alone, takes a scene that is known by then and time to learn it again:
 # in runs of a few thousand iterations it costs more than it gives.
-REINITIALISE_LEAST_STEP = 1_000
+REINITIALISE_LEAST_STEP = 2_000
 RESTART_LEAST_STEP = 3_000
 SHORT_RUN_EXPONENT = 0.3  # simplified Gaussians are few and change much: compressed runs raise their rates
 

@@ -5,10 +5,11 @@ from functools import partial
 from minisplat_ref import events
 from minisplat_ref.optim.adam import AdamRule
 from minisplat_ref.recipes.gaussian_splatting import DENSIFY_LEAST_PERIOD, GS
-from minisplat_ref.recipes.mini_splatting import BLUR_AREA, MOST_PER_PIXEL, REINITIALISE_LEAST_STEP, SHORT_RUN_EXPONENT
+from minisplat_ref.recipes.mini_splatting import BLUR_AREA, REINITIALISE_LEAST_STEP, SHORT_RUN_EXPONENT
 from minisplat_ref.recipes.schedule import At, During, Every
 from minisplat_ref.strategy import aggressive_clone, blur_split, depth_reinit, importance, simplify
 
+MOST_PER_PIXEL = 0.025  # densification pauses above it; cloning may go beyond once, to twice as many
 CLONE_LEAST_PERIOD = 50  # copies start in one place and need some steps to part
 _LEAST_VIEWS = 2  # what only one view sees is as likely a floater as a surface
 _cloning = partial(
