@@ -33,12 +33,14 @@ def reinitialise_from_depth(
     points_of: Callable[..., PixelPoints],
     least_alpha: float,
     depth_tolerance: float | None,
+    backdrop_extents: float | None,
     points_per_pixel: float = 0.0,
     points_per_gaussian: float = 0.0,
 ) -> None:
     """Begin again with points that the views' depths give, without view-dependent colour.
 
     Their number is ``points_per_pixel`` of the training views' pixels and ``points_per_gaussian`` of the population.
+    Points that no other view confirms to ``depth_tolerance`` move out to ``backdrop_extents`` times the scene's extent.
     """
     n_points = round(points_per_pixel * n_pixels(iteration.scene) + points_per_gaussian * n_rows(state.gaussians))
     points, colors = reinitial_points(
@@ -48,6 +50,7 @@ def reinitialise_from_depth(
         points_of=points_of,
         least_alpha=least_alpha,
         depth_tolerance=depth_tolerance,
+        backdrop_distance=None if backdrop_extents is None else backdrop_extents * iteration.scene.extent,
         rng=state.rng,
         conventions=iteration.conventions,
         backend=iteration.backend,

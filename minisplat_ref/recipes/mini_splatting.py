@@ -20,6 +20,10 @@ BLUR_AREA = 2e-4  # paper, equation 2: what dominates more of an image than this
 # in runs of a few thousand iterations it costs more than it gives.
 REINITIALISE_LEAST_STEP = 2_000
 RESTART_LEAST_STEP = 3_000
+# Sky and bare walls have no depth that photographs settle. The paper takes the points as they come, which leaves veils
+# in the air; here what other views do not confirm goes far behind the scene.
+DEPTH_TOLERANCE = 0.05
+BACKDROP_EXTENTS = 30.0
 SHORT_RUN_EXPONENT = 0.3  # simplified Gaussians are few and change much: compressed runs raise their rates
 
 _densifying = partial(Every, 100, stop=15_000, skip=5_000, least_period=DENSIFY_LEAST_PERIOD)
@@ -36,7 +40,8 @@ _reinitialise = partial(
     points_of=depth_reinit.midpoint_points,
     points_per_pixel=POINTS_PER_PIXEL,
     least_alpha=0.0,
-    depth_tolerance=None,
+    depth_tolerance=DEPTH_TOLERANCE,
+    backdrop_extents=BACKDROP_EXTENTS,
 )
 _DENSIFICATION = (
     During(events.collect_gradients, stop=15_000),

@@ -5,7 +5,13 @@ from functools import partial
 from minisplat_ref import events
 from minisplat_ref.optim.adam import AdamRule
 from minisplat_ref.recipes.gaussian_splatting import DENSIFY_LEAST_PERIOD, GS
-from minisplat_ref.recipes.mini_splatting import BLUR_AREA, REINITIALISE_LEAST_STEP, SHORT_RUN_EXPONENT
+from minisplat_ref.recipes.mini_splatting import (
+    BACKDROP_EXTENTS,
+    BLUR_AREA,
+    DEPTH_TOLERANCE,
+    REINITIALISE_LEAST_STEP,
+    SHORT_RUN_EXPONENT,
+)
 from minisplat_ref.recipes.schedule import At, During, Every
 from minisplat_ref.strategy import aggressive_clone, blur_split, depth_reinit, importance, simplify
 
@@ -32,7 +38,8 @@ _reinitialise = partial(
     points_of=depth_reinit.midpoint_points,
     points_per_gaussian=1.0,
     least_alpha=0.0,
-    depth_tolerance=None,
+    depth_tolerance=DEPTH_TOLERANCE,
+    backdrop_extents=BACKDROP_EXTENTS,
 )
 _densifying = partial(Every, 100, start=500, stop=3_000, skip=2_000, least_period=DENSIFY_LEAST_PERIOD)
 
