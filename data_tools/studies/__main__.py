@@ -5,9 +5,9 @@ import sys
 from collections.abc import Sequence
 
 from data_tools.command import run_command
-from data_tools.studies import culling, simplify, split_forms
+from data_tools.studies import culling, depth_types, simplify, split_forms
 
-STUDIES = (split_forms, culling, simplify)
+STUDIES = (split_forms, culling, simplify, depth_types)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
