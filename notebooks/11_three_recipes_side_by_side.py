@@ -1,0 +1,289 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: ipynb,py:percent
+#     notebook_metadata_filter: -jupytext.text_representation.jupytext_version
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#       format_version: '1.3'
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # 11 Three recipes side by side
+#
+# One scene, one start, three methods: `3dgs-accel` adds Gaussians where gradients ask for them and keeps them;
+# `mini-splatting` adds more, then draws a few by importance; `mini-splatting2` does the same much sooner, so that most
+# of the time is spent on few. The stages are those of notebooks 06 to 10; here is what they are worth together.
+#
+# | file | what it holds | where in the paper |
+# |---|---|---|
+# | `minisplat_ref/recipes/` | what is due when, as data | |
+# | `minisplat_ref/recipes/gaussian_splatting.py` | `3dgs`, `3dgs-accel` | 3DGS sec. 7.1 |
+# | `minisplat_ref/recipes/mini_splatting.py` | `mini-splatting`, and `-d` without simplification | MS sec. 3 |
+# | `minisplat_ref/recipes/mini_splatting2.py` | `mini-splatting2`, and `-d` | MS2 sec. 3 |
+# | `minisplat_ref/events/` | the actions: from the training state to `strategy/` and back | |
+#
+# *3DGS* is Kerbl et al. 2023, *MS* and *MS2* are Mini-Splatting and Mini-Splatting2, both Fang and Wang 2024.
+# **Frames and units:** the world is in metres; images are in pixels, the centre of the top-left one at (0.5, 0.5). The
+# kernels are compiled on first use, which takes some twenty seconds once.
+
+# %%
+import itertools
+import os
+import time
+from functools import partial
+
+# Read when NumPy loads: the matrices here are small, and on a busy machine waiting threads cost more than they help.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from data_tools.synthetic import make_scene
+from minisplat_ref.metrics import evaluate
+from minisplat_ref.recipes import RECIPES, During, Every, scaled
+from minisplat_ref.render import render
+from minisplat_ref.train import initial_state, train
+
+plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
+RED, BLUE, YELLOW, GREEN, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#8a8580"
+
+
+def show(axes, image, title="", **style):
+    """Show an image or a map without ticks."""
+    shown = axes.imshow(np.clip(image, 0, 1) if image.ndim == 3 else image, interpolation="nearest", **style)
+    axes.set(title=title, xticks=[], yticks=[])
+    return shown
+
+
+# %% [markdown]
+# ## The recipes
+#
+# A recipe is data, and scales with the number of iterations. `least_period` keeps density control from coming so often
+# that the gradients of most views are not in, or that the last event has not healed. With 24 views half of it will do.
+# What is due *never* is left out of short runs: to begin anew, from depth (notebook 08) or from the centres alone
+# (notebook 09), takes time to learn everything again.
+
+# %%
+ITERATIONS = 600
+NAMES = ("3dgs-accel", "mini-splatting", "mini-splatting2")
+COLORS = dict(zip(NAMES, (RED, BLUE, GREEN), strict=True))
+
+
+def named(action):
+    """The function inside a partial, and what is bound to it."""
+    action = action if isinstance(action, partial) else partial(action)
+    return action.func.__name__, action.keywords
+
+
+def shortened(recipe):
+    """Return the recipe for our few views and iterations."""
+    halved = [e._replace(least_period=e.least_period // 2) if isinstance(e, Every) else e for e in recipe.events]
+    return scaled(recipe._replace(events=tuple(halved)), ITERATIONS)
+
+
+def due_steps(event):
+    """The iterations at which an event acts."""
+    return [step for step in range(1, ITERATIONS + 1) if event.is_due(step)]
+
+
+recipes = {name: shortened(RECIPES[name]) for name in NAMES}
+for recipe in recipes.values():
+    print(f"{recipe.name}: half size until {recipe.half_size_until}, colour degrees at {recipe.sh_milestones}")
+    for event in recipe.events:
+        steps = due_steps(event)
+        when = f"{steps[0]} to {steps[-1]}" if isinstance(event, During) else ", ".join(map(str, steps)) or "never"
+        print(f"    {named(event.action)[0]:<26}{when}")
+
+# %% [markdown]
+# ## Train, and keep a log
+#
+# Each event is wrapped by a function that notes count and quality before and after it. Measuring takes time, which is
+# subtracted from the clock.
+
+# %%
+scene = make_scene("room", n_views=24, width=88, height=66, n_points=800, seed=0).scene
+held_out = scene.test_views[1]
+spent = [0.0]  # seconds of measuring, of the current run
+
+
+def quality(gaussians):
+    """PSNR of the views that training never sees, dB."""
+    start = time.perf_counter()
+    result = evaluate(gaussians, scene.test_views, background=scene.background)
+    spent[0] += time.perf_counter() - start
+    return result.psnr
+
+
+def copied(gaussians):
+    """A copy, because training works in place."""
+    return gaussians._make(field.copy() for field in gaussians)
+
+
+def noted(log, action, state, iteration):
+    """Do what the action does, and note what it did."""
+    before, psnr_before = copied(state.gaussians), quality(state.gaussians)
+    action(state, iteration)
+    log.append(
+        {
+            "step": state.step + 1,
+            "action": named(action)[0],
+            "gaussians": (before, copied(state.gaussians)),
+            "counts": (len(before.means), len(state.gaussians.means)),
+            "psnrs": (psnr_before, quality(state.gaussians)),
+        }
+    )
+
+
+def run(recipe):
+    """Train; return the state, the log of events, and the curve: step, seconds, count, PSNR, ms of the iteration."""
+    log, curve, ticks = [], [], []
+    events = tuple(
+        event if isinstance(event, During) else event._replace(action=partial(noted, log, event.action))
+        for event in recipe.events
+    )
+    state = initial_state(scene, recipe, seed=0)
+    curve.append((0, 0.0, len(state.gaussians.means), quality(state.gaussians)))
+    spent[0], begin = 0.0, time.perf_counter()
+
+    def on_step(report):
+        ticks.append(time.perf_counter() - begin - spent[0])
+        if report.step % 20 == 0:
+            n = len(report.state.gaussians.means)
+            curve.append((report.step, ticks[-1], n, quality(report.state.gaussians)))
+
+    train(scene, recipe._replace(events=events), seed=0, state=state, on_step=on_step)
+    return state.gaussians, log, np.array(curve), np.diff(ticks, prepend=0.0)
+
+
+train(scene, recipes["mini-splatting2"]._replace(iterations=3), seed=0)  # compiles, or loads, the kernels
+results = {name: run(recipe) for name, recipe in recipes.items()}
+print(f"{'recipe':<18}{'Gaussians':>10}{'at most':>10}{'PSNR (dB)':>11}{'seconds':>9}")
+for name, (gaussians, log, curve, _) in results.items():
+    most = max(max(entry["counts"]) for entry in log)
+    print(f"{name:<18}{len(gaussians.means):>10,}{most:>10,}{curve[-1, 3]:>11.2f}{curve[-1, 1]:>9.1f}")
+
+# %% [markdown]
+# ## What came out
+
+# %%
+truth = held_out.image / 255
+figure, axes = plt.subplots(2, 4, figsize=(13, 5.2))
+show(axes[0, 0], truth, "photograph, held out")
+axes[1, 0].axis("off")
+for column, (name, (gaussians, _, curve, _)) in enumerate(results.items(), start=1):
+    image = render(gaussians, held_out.camera, background=scene.background)[0].image
+    show(axes[0, column], image, f"{name}: {len(gaussians.means):,}, {curve[-1, 3]:.2f} dB")
+    error = show(axes[1, column], np.abs(image - truth).mean(axis=2), "error", cmap="magma", vmin=0, vmax=0.3)
+figure.colorbar(error, ax=axes[1, 0], location="right", shrink=0.9)
+plt.show()
+
+# %% [markdown]
+# ## On the way there
+#
+# The same three runs by iteration, by time and by number. The dots in the last panel are the ends.
+
+# %%
+figure, axes = plt.subplots(1, 4, figsize=(14, 3.2))
+for name, (_, _, curve, seconds) in results.items():
+    steps, clock, counts, psnrs = curve.T
+    color = COLORS[name]
+    axes[0].step(steps, counts, where="post", color=color, label=name)
+    axes[1].plot(np.arange(10, ITERATIONS, 20), 1e3 * np.median(seconds.reshape(-1, 20), axis=1), color=color)
+    axes[2].plot(clock, psnrs, color=color)
+    axes[3].plot(counts, psnrs, color=color, linewidth=0.8, alpha=0.6)
+    axes[3].plot(counts[-1], psnrs[-1], "o", color=color, ms=8)
+axes[0].set(title="Gaussians", xlabel="iteration", ylim=(0, None))
+axes[0].legend(frameon=False, fontsize=8)
+axes[1].set(title="time of an iteration", xlabel="iteration", ylabel="ms", ylim=(0, None))
+axes[2].set(title="PSNR over training time", xlabel="s", ylabel="dB")
+axes[3].set(title="PSNR over count", xlabel="Gaussians", ylabel="dB", xlim=(0, None))
+plt.show()
+
+# %% [markdown]
+# ## What each event does
+#
+# Gaussians and PSNR (dB, held-out views) right before and right after; events that left both as they were are not
+# listed.
+
+# %%
+for name, (_, log, _, _) in results.items():
+    print(f"{name}\n{'iteration':>11}  {'event':<24}{'Gaussians':>18}{'PSNR (dB)':>20}")
+    for entry in log:
+        (n_before, n_after), (psnr_before, psnr_after) = entry["counts"], entry["psnrs"]
+        if n_before != n_after or psnr_before != psnr_after:
+            print(
+                f"{entry['step']:>11}  {entry['action']:<24}{n_before:>8,} -> {n_after:>6,}"
+                f"{psnr_before:>12.2f} -> {psnr_after:.2f}"
+            )
+
+# %% [markdown]
+# Four of them in pictures: the same held-out view before, after, and the difference. A clone of 3DGS is as opaque as what
+# it copies, and adds to it; one of Mini-Splatting2 shares opacity with it, so that hardly anything changes.
+
+# %%
+
+
+def last_event(name, action):
+    """The log entry of a run's last such event."""
+    return [entry for entry in results[name][1] if entry["action"] == action][-1]
+
+
+chosen = (
+    ("3dgs-accel", "clone_and_split"),
+    ("mini-splatting", "simplify"),
+    ("mini-splatting2", "aggressive_clone"),
+    ("mini-splatting2", "simplify"),
+)
+figure, axes = plt.subplots(3, len(chosen), figsize=(13, 7.6))
+for column, (name, action) in zip(axes.T, chosen, strict=True):
+    entry = last_event(name, action)
+    images = [render(g, held_out.camera, background=scene.background)[0].image for g in entry["gaussians"]]
+    counts, psnrs = entry["counts"], entry["psnrs"]
+    show(column[0], images[0], f"{name}\nbefore {action}\n{counts[0]:,}, {psnrs[0]:.2f} dB")
+    show(column[1], images[1], f"after\n{counts[1]:,}, {psnrs[1]:.2f} dB")
+    difference = show(column[2], np.abs(images[1] - images[0]).mean(axis=2), "", cmap="magma", vmin=0, vmax=0.2)
+figure.colorbar(difference, ax=axes[2], shrink=0.9)
+plt.show()
+
+# %% [markdown]
+# **To try:** raise the number of iterations; set a budget, `configured(recipe, budget=500)`; take `mini-splatting-d`,
+# which simplifies nothing. On a scene of your own, `minisplat-ref compare SCENE --recipes a,b,c` trains recipes and
+# writes tables, figures and crops.
+#
+# ## What was shown
+
+# %%
+ends = {name: (len(gaussians.means), curve[-1, 3]) for name, (gaussians, _, curve, _) in results.items()}
+for name, (_, log, curve, _) in results.items():
+    # Training shows views that it never saw, and the books balance: what one event left, the next one found.
+    assert curve[-1, 3] > curve[0, 3] + 4
+    assert all(entry["counts"][1] == following["counts"][0] for entry, following in itertools.pairwise(log))
+    assert log[0]["counts"][0] == curve[0, 2] and log[-1]["counts"][1] == ends[name][0]
+    # What only prepares later iterations leaves the picture as it is.
+    for entry in log:
+        if entry["action"] in ("store_sh", "restart_adam", "stop_culling"):
+            assert entry["counts"][0] == entry["counts"][1] and entry["psnrs"][0] == entry["psnrs"][1]
+
+n_accel, psnr_accel = ends["3dgs-accel"]
+for name in ("mini-splatting", "mini-splatting2"):
+    # Dense first, then simplified, and learned again: far fewer Gaussians show nearly the same.
+    (n, psnr), (_, log, curve, _) = ends[name], results[name]
+    simplified = last_event(name, "simplify")
+    assert simplified["counts"][1] < 0.7 * simplified["counts"][0]
+    assert simplified["psnrs"][1] < simplified["psnrs"][0] < psnr
+    assert n < 0.5 * n_accel and psnr > psnr_accel - 3
+    # The work of an iteration goes with its Gaussians.
+    assert curve[:, 2].sum() < 0.5 * results["3dgs-accel"][2][:, 2].sum()
+
+# An opacity reset costs much at once, an aggressive clone next to nothing.
+before, after = last_event("3dgs-accel", "reset_opacity")["psnrs"]
+assert after < before - 3
+before, after = last_event("mini-splatting2", "aggressive_clone")["psnrs"]
+assert abs(after - before) < 0.5
+print("all of the above holds")
