@@ -223,10 +223,16 @@ for name, (_, log, _, _) in results.items():
             )
 
 # %% [markdown]
-# Four of them in pictures: the same held-out view before, after, and the difference. A clone of 3DGS is as opaque as what
-# it copies, and adds to it; one of Mini-Splatting2 shares opacity with it, so that hardly anything changes.
+# Four of them in pictures: the same held-out view before, after, and the difference. A clone of 3DGS is as opaque as
+# what it copies, and adds to it; one of Mini-Splatting2 shares opacity with it, so that hardly anything changes.
 
 # %%
+chosen = (
+    ("3dgs-accel", "clone_and_split"),
+    ("mini-splatting", "simplify"),
+    ("mini-splatting2", "aggressive_clone"),
+    ("mini-splatting2", "simplify"),
+)
 
 
 def last_event(name, action):
@@ -234,12 +240,6 @@ def last_event(name, action):
     return [entry for entry in results[name][1] if entry["action"] == action][-1]
 
 
-chosen = (
-    ("3dgs-accel", "clone_and_split"),
-    ("mini-splatting", "simplify"),
-    ("mini-splatting2", "aggressive_clone"),
-    ("mini-splatting2", "simplify"),
-)
 figure, axes = plt.subplots(3, len(chosen), figsize=(13, 7.6))
 for column, (name, action) in zip(axes.T, chosen, strict=True):
     entry = last_event(name, action)
