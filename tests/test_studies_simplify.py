@@ -72,12 +72,12 @@ def test_study(scene_folder, dense_file, tmp_path, capsys, restart):
         assert row["n_gaussians"] == result["counts"][kept] and row["chamfer_dense"] > 0
         assert row["psnr"] != row["psnr_tuned"]
     for kept in result["counts"]:
-        assert runs[kept, "rank", 0]["psnr"] == runs[kept, "rank", 1]["psnr"]
+        assert runs[kept, "rank, mass", 0]["psnr"] == runs[kept, "rank, mass", 1]["psnr"]
         assert runs[kept, "sampling", 0]["psnr"] != runs[kept, "sampling", 1]["psnr"]
 
     # One of the measures by another way.
     kept = dense._make(field[most_important(importance, n_of_mass)] for field in dense)
-    row = runs["mass 0.99", "rank", 0]
+    row = runs["mass 0.99", "rank, mass", 0]
     assert row["psnr"] == evaluate(kept, scene.test_views, background=scene.background).psnr
     nearest = np.linalg.norm(dense.means[:, None].astype(float) - kept.means, axis=2).min(axis=1)
     assert abs(row["chamfer_dense"] - nearest.mean()) < CLOSED_FORM  # the other way it is 0: they were kept

@@ -3,7 +3,7 @@
 A dense population is trained once, or read from a PLY. Each choice leaves the same numbers of its Gaussians, and all
 are then fine-tuned for the same number of iterations, without any event. A seed decides what is sampled and the order
 of views. Who dominates no pixel is no candidate, whatever the choice. Pruning to a mass keeps what rank keeps, and
-only sets the number by itself; so its number is one of those that are measured, and rank's line is its line too.
+only sets the number by itself; so its number is one of those that are measured, and both have one line.
 
 Chamfer distances are those of the centres that are kept, before fine-tuning: the mean distance to the nearest point of
 a cloud, and the mean distance from the cloud's points to the nearest centre, added. The clouds are the dense
@@ -16,9 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
@@ -49,8 +47,9 @@ from minisplat_ref.strategy.ops import Edit, contiguous, n_rows
 from minisplat_ref.train import train
 from minisplat_ref.types import Floats, Gaussians, Scene
 
-CHOICES = {"sampling": simplify.by_sampling, "rank": simplify.by_rank, "merging": simplify.by_merging}
+CHOICES = {"sampling": simplify.by_sampling, "rank, mass": simplify.by_rank, "merging": simplify.by_merging}
 COLORS = dict(zip(CHOICES, (BLUE, RED, "#e0a526"), strict=True))
+GREY = "#8a8580"
 MASS = 0.99  # of both papers
 FINE_TUNING = "3dgs"  # its learning rates, from the first to the last
 SH_DEGREE = 3  # stored when fine-tuning begins from the centres
@@ -267,7 +266,7 @@ def to_table(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
     headers = {
         "psnr": "PSNR at once (dB)",
         "psnr_tuned": f"after {result['fine_tune']} iterations (dB)",
-        "chamfer_dense": "Chamfer to dense",
+        "chamfer_dense": "Chamfer to dense (world units)",
         "chamfer_surface": "to the surface",
     }
     measures = [name for name in headers if name in result["summary"][0]]
@@ -287,8 +286,8 @@ def draw(result: dict[str, Any]) -> Figure:
     panels = {
         "psnr": ("right after simplification", "PSNR (dB)"),
         "psnr_tuned": (f"after {result['fine_tune']} more iterations", "PSNR (dB)"),
-        "chamfer_dense": ("kept centres and dense centres", "Chamfer distance"),
-        "chamfer_surface": ("kept centres and true surface", "Chamfer distance"),
+        "chamfer_dense": ("kept centres and dense centres", "Chamfer distance (world units)"),
+        "chamfer_surface": ("kept centres and true surface", "Chamfer distance (world units)"),
     }
     panels = {name: labels for name, labels in panels.items() if name in result["summary"][0]}
     figure = Figure(figsize=(3.6 * len(panels), 3.2), layout="constrained")
@@ -299,30 +298,26 @@ def draw(result: dict[str, Any]) -> Figure:
             counts = [row["n_gaussians"] for row in rows]
             axes.errorbar(counts, means, yerr=deviations, color=color, marker="o", ms=4, capsize=3, label=choice)
         if name.startswith("psnr"):
-            axes.axhline(result["dense"]["psnr"], color="#8a8580", linestyle="--", linewidth=1, label="dense")
-        _finish(axes, heading, label, result["counts"])
+            axes.axhline(result["dense"]["psnr"], color=GREY, linestyle="--", linewidth=1, label="dense")
+        n_of_mass = result["counts"][f"mass {MASS:g}"]
+        axes.axvline(n_of_mass, color=GREY, linestyle=":", linewidth=1)
+        is_rising = name.startswith("psnr")
+        axes.annotate(
+            f"mass {MASS:g}",
+            (n_of_mass, 0.03 if is_rising else 0.97),
+            xycoords=("data", "axes fraction"),
+            ha="right",
+            va="bottom" if is_rising else "top",
+            rotation=90,
+            fontsize=8,
+            color=GREY,
+        )
+        ticks = [n for kept, n in result["counts"].items() if kept.endswith("%")]
+        axes.set(title=heading, ylabel=label, xlabel="Gaussians", xscale="log")
+        axes.set_xticks(ticks, [f"{n:,}" for n in ticks])
+        axes.minorticks_off()
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(color="#e6eaee")
         if name == "psnr":
-            axes.legend(frameon=False, fontsize=8)
+            axes.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(0, 0.92))
     return figure
-
-
-def _finish(axes: Axes, heading: str, label: str, counts: dict[str, int]) -> None:
-    n_of_mass = counts[f"mass {MASS:g}"]
-    axes.axvline(n_of_mass, color="#8a8580", linestyle=":", linewidth=1)
-    axes.annotate(
-        f"mass {MASS:g}",
-        (n_of_mass, 0.02),
-        xycoords=("data", "axes fraction"),
-        xytext=(-3, 0),
-        textcoords="offset points",
-        ha="right",
-        rotation=90,
-        fontsize=8,
-        color="#8a8580",
-    )
-    axes.set(title=heading, ylabel=label, xlabel="Gaussians", xscale="log")
-    ticks = [n for kept, n in counts.items() if kept.endswith("%")]
-    axes.set_xticks(ticks, [f"{n:,}" for n in ticks])
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(color="#e6eaee")
