@@ -5,7 +5,7 @@ points, and all begin anew from theirs and train for the same number of iteratio
 the order of views and which pixels are drawn.
 
 A point's error is its camera z against the true depth at its pixel, relative to the latter. A point of the sky has no
-true depth: it hangs in front of the sky if it is nearer than the farthest surface of any view.
+true depth: it hangs in front of the sky if it is nearer than the depth within which most of the surfaces are.
 """
 
 import argparse
@@ -53,6 +53,7 @@ POINTS_PER_PIXEL = 0.03  # twice the recipes' number, as nothing is added afterw
 LEAST_ALPHA, DEPTH_TOLERANCE = 0.9, 0.05  # of the guards
 BACKDROP = 10.0  # distance of what is not confirmed, in extents of the scene
 OFF_SURFACE = 0.05  # relative error above which a point is not on its surface
+SKY_BEHIND = 0.95  # share of the surfaces that a point of the sky has to be behind
 
 
 class Choice(NamedTuple):
@@ -211,7 +212,8 @@ def depth_errors(points: Floats, pixels: NDArray[np.int64], truth: SyntheticScen
     depths = (forward * points).sum(axis=1) + np.array([camera.cam_from_world_t[2] for camera in cameras])[view_ids]
     is_sky = true_depths == 0
     relative = np.abs(depths - true_depths) / np.where(is_sky, np.nan, true_depths)
-    return relative, is_sky & (depths < truth.train_depths.max())
+    sky_depth = np.quantile(truth.train_depths[truth.train_depths > 0], SKY_BEHIND)
+    return relative, is_sky & (depths < sky_depth)
 
 
 def errors(points: Floats, pixels: NDArray[np.int64], truth: SyntheticScene) -> dict[str, float]:
