@@ -214,8 +214,13 @@ display(Markdown("\n".join(["| module | what it says of itself |", "|---|---|", 
 # | 4 | `reference/tiling.py`, `hits.py`, `compositing.py` | 03 | how ellipses become pixels |
 # | 5 | the `_vjp` functions beside them | 04 | how a pixel's error reaches every parameter |
 # | 6 | `reference/loss.py`, `depth.py` | 05 | what is minimised |
-# | 7 | `render.py`, `train.py`, `recipes/`, `events/`, `strategy/` | 06 | how a scene is trained |
-# | 8 | `scalar/`, then `cpu/` | | how the same formulas run fast |
+# | 7 | `render.py`, `train.py`, `recipes/`, `events/`, `strategy/initialization.py` | 06 | how a scene is trained |
+# | 8 | `strategy/clone_split.py`, `blur_split.py` | 07 | density control and blur split: who becomes two |
+# | 9 | `strategy/depth_reinit.py` | 08 | depth reinitialisation: where surfaces are, and what fools it |
+# | 10 | `strategy/importance.py`, `simplify.py` | 09 | importance and simplification: who may go |
+# | 11 | `strategy/aggressive_clone.py`, `visibility.py` | 10 | aggressive clone and visibility culling |
+# | 12 | `recipes/mini_splatting.py`, `mini_splatting2.py` | 11 | three recipes side by side |
+# | 13 | `scalar/`, then `cpu/` | | how the same formulas run fast |
 #
 # Names are the field's own: `means`, `quats` (wxyz, any length), `log_scales`, `opacity_logits` are what is trained;
 # `scales` and `opacities` are what comes out of the activations. `v_x` is the derivative of the loss by `x`.
