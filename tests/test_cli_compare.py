@@ -5,6 +5,7 @@ import io
 import json
 import math
 import re
+import signal
 import subprocess
 import sys
 from functools import partial
@@ -165,8 +166,16 @@ time.sleep(60)
 """
 
 
+@pytest.fixture
+def heeds_interrupts():
+    """Ctrl-C interrupts also where the tests run in the background, whose shell has it ignored."""
+    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, previous)
+
+
 @pytest.mark.parametrize(("who", "saving_seconds"), [("too", 30.0), ("not", 0.1)])
-def test_interrupted_while_training(scene_folder, tmp_path, monkeypatch, capfd, who, saving_seconds):
+def test_interrupted_while_training(scene_folder, tmp_path, monkeypatch, capfd, heeds_interrupts, who, saving_seconds):
     """The training is interrupted as well, by the terminal, or it is not and must be told; once in both cases."""
     monkeypatch.setattr(runs_module, "SAVING_SECONDS", saving_seconds)
     out = tmp_path / "out"
