@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 from tqdm import tqdm
 
@@ -229,8 +230,7 @@ def draw(places: dict[str, dict[str, NDArray[Any]]]) -> Figure:
         cost.plot(views, measures["psnr"][:, 1] - measures["psnr"][:, 0], ".", color=color, label=name)
         shares = np.linspace(0, 100, len(measures["seconds"]))
         for k, style in enumerate(("--", "-")):
-            label = f"{name}, {('without', 'with')[k]}"
-            times.plot(1e3 * np.sort(measures["seconds"][:, k]), shares, style, color=color, label=label)
+            times.plot(1e3 * np.sort(measures["seconds"][:, k]), shares, style, color=color)
     culled.set(title="culled of what the frustum leaves", xlabel="training view", ylabel="%", ylim=(0, None))
     times.set(title="training iterations that take at most", xlabel="ms", ylabel="%", xlim=(0, None))
     cost.set(title="PSNR with culling less PSNR without", xlabel="training view", ylabel="dB")
@@ -238,5 +238,6 @@ def draw(places: dict[str, dict[str, NDArray[Any]]]) -> Figure:
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(color="#e6eaee")
     culled.legend(frameon=False, fontsize=8)
-    times.legend(frameon=False, fontsize=8)
+    styles = [Line2D([], [], color="black", linestyle=style) for style in ("--", "-")]
+    times.legend(styles, ["without", "with"], frameon=False, fontsize=8, loc="center left")
     return figure
