@@ -346,7 +346,7 @@ for name in ("outdoor", "plain-wall"):
 # No. The points of the vote are the better ones, and the pictures are worse by decibels: the sky and the wall still
 # have to be painted, and nothing is left there to paint them on. Wrong points are of use. With the backdrop there is
 # something again, this time behind the scene and not in the middle of it, and the pictures are about as good as the
-# paper's. (One seed, at a small size.) The recipes take the vote with the backdrop: better points, no worse pictures.
+# paper's. (One seed, at a small size.) The recipes take the vote with the backdrop, for the better points.
 #
 # **To try:** `python -m data_tools.studies depth outdoor --out DIR` does the same at 160 x 120, over three seeds; set
 # `depth_tolerance` to 0.01 and to 0.3; train for longer before reinitialisation, and see whether the sky settles.
