@@ -146,9 +146,11 @@ def draw(summary: dict[str, dict[str, tuple[float, float]]], runs: list[dict[str
             mean, deviation = summary[form][name]
             axes.errorbar(mean, line, xerr=deviation, color=color, marker="o", capsize=4)
             values = [run[name] for run in runs if run["form"] == form]
-            axes.plot(values, [line - 0.18] * len(values), "|", color=color, markersize=5)
+            axes.plot(values, [line + 0.18] * len(values), "|", color=color, markersize=5)
         axes.set(title=label, yticks=range(len(FORMS)), yticklabels=FORMS, ylim=(-0.6, len(FORMS) - 0.4))
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="x", color="#e6eaee")
+        axes.locator_params(axis="x", nbins=5)
+    panels[0].invert_yaxis()  # in the order of the table
     panels[0].set_ylabel("blur split, children")
     return figure
