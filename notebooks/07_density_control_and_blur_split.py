@@ -38,8 +38,10 @@ import inspect
 import os
 from functools import partial
 
-# Read when NumPy loads: the matrices here are small, and on a busy machine waiting threads cost more than they help.
+# Read when NumPy and Numba load: matrices and pictures are small here, and on a busy machine threads that wait for each
+# other cost more than they help.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 
 import matplotlib.pyplot as plt
 import numpy as np
