@@ -4,8 +4,8 @@ One module per command, each with ``add_parser`` (arguments and help) and ``run`
 new command is such a module, named in ``COMMANDS``. These modules import only the standard library at their top, and
 what they need inside ``run``, so that ``--help`` does not wait for Numba.
 
-Exit codes: 0 done, 2 the input or the arguments are wrong (one line on stderr says which and what to do), 130
-interrupted. A programming error keeps its traceback.
+Exit codes: 0 done, 1 a check of the oracle failed, 2 the input or the arguments are wrong (one line on stderr says
+which and what to do), 130 interrupted. A programming error keeps its traceback.
 """
 
 import argparse
@@ -16,9 +16,9 @@ from typing import NoReturn
 from minisplat_ref.cli.arguments import HelpFormatter
 from minisplat_ref.errors import InputError
 
-from . import compare, demo, evaluate, info, render, train
+from . import compare, demo, evaluate, info, oracle, render, train
 
-COMMANDS = (demo, train, render, evaluate, compare, info)
+COMMANDS = (demo, train, render, evaluate, compare, info, oracle)
 
 DESCRIPTION = """\
 3D Gaussian Splatting on the CPU: train a scene from photographs, look at it,
@@ -29,7 +29,7 @@ Your own photos:   minisplat-ref train SCENE --out runs/mine
 """
 EPILOG = """\
 minisplat-ref COMMAND --help explains a command.
-Exit codes: 0 done, 2 bad input, 130 interrupted."""
+Exit codes: 0 done, 1 a check failed, 2 bad input, 130 interrupted."""
 
 
 class Parser(argparse.ArgumentParser):

@@ -1,0 +1,47 @@
+"""``oracle``: checks gradients, hard cases and other backends against the reference; one module per check."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from minisplat_ref.cli.arguments import Commands, HelpFormatter
+
+if TYPE_CHECKING:
+    from minisplat_ref.oracle.cases import Report
+
+DESCRIPTION = """\
+Check the renderer, or another one, against the float64 reference.
+"""
+EPILOG = """\
+Exit codes: 0 all passed, 1 a case failed, 2 bad input."""
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command and its checks."""
+    from . import compare, export, gradients, hard_cases
+
+    parser = commands.add_parser(
+        "oracle",
+        help="check gradients, hard cases and other backends",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=HelpFormatter,
+    )
+    checks = parser.add_subparsers(title="checks", metavar="CHECK", required=True)
+    for check in (gradients, hard_cases, compare, export):
+        check.add_parser(checks)
+
+
+def add_json_argument(parser: argparse.ArgumentParser) -> None:
+    """Add ``--json FILE``."""
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the cases to FILE")
+
+
+def publish(report: "Report", json_file: Path | None) -> int:
+    """Print the table and the verdict, write the file that was asked for; return the exit code, 1 where a case failed."""
+    from minisplat_ref.oracle.cases import as_markdown, save_json, verdict
+
+    print(f"{report.title}\n\n{as_markdown(report)}\n\n{verdict([report])}")
+    if json_file is not None:
+        save_json(report, json_file)
+    return 1 if report.n_failed else 0

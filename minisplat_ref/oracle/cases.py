@@ -1,0 +1,113 @@
+"""What a check reports: named cases that passed or did not, each with its figures; as a table and as JSON."""
+
+import json
+import platform
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+
+from minisplat_ref.io.atomic import replacing
+
+Figure = float | int | str | None
+
+
+class Case(NamedTuple):
+    """One thing that was checked."""
+
+    name: str
+    """Unique in its report."""
+    passed: bool
+    """Whether it is as it should be."""
+    figures: dict[str, Figure]
+    """What was measured, by the heading of its column."""
+    note: str = ""
+    """Why it failed, or what else a reader must know; one line."""
+
+
+class Report(NamedTuple):
+    """The cases of one command."""
+
+    title: str
+    """What was checked, one line."""
+    cases: tuple[Case, ...]
+    """In the order in which they are read."""
+    settings: dict[str, Any]
+    """What the figures depend on."""
+
+    @property
+    def n_failed(self) -> int:
+        """Number of cases that did not pass."""
+        return sum(not case.passed for case in self.cases)
+
+
+def as_markdown(report: Report) -> str:
+    """Return the cases as an aligned table: name, verdict, figures, note."""
+    headings = list(dict.fromkeys(key for case in report.cases for key in case.figures))
+    has_notes = any(case.note for case in report.cases)
+    rows = [["case", "verdict", *headings, *(["note"] if has_notes else [])]]
+    for case in report.cases:
+        cells = [_cell(case.figures.get(heading)) for heading in headings]
+        rows.append([case.name, "passed" if case.passed else "FAILED", *cells, *([case.note] if has_notes else [])])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["| " + " | ".join(map(str.ljust, row, widths)) + " |" for row in rows]
+    return "\n".join([lines[0], "|" + "|".join("-" * (width + 2) for width in widths) + "|", *lines[1:]])
+
+
+def save_json(report: Report, path: str | Path) -> None:
+    """Write the report; the file is there complete or not at all.
+
+    Parameters
+    ----------
+    report : Report
+        A figure that is not finite becomes a string, since JSON has no such numbers.
+    path : str or Path
+        Its folder must exist.
+
+    Raises
+    ------
+    InputError
+        If the folder does not exist.
+    """
+    cases = [
+        {"name": case.name, "passed": case.passed, **{k: _plain(v) for k, v in case.figures.items()}, "note": case.note}
+        for case in report.cases
+    ]
+    settings = {**report.settings, **versions()}
+    with replacing(path) as temporary:
+        text = json.dumps({"title": report.title, "settings": settings, "cases": cases}, indent=1, allow_nan=False)
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def versions() -> dict[str, Figure]:
+    """Return the machine and the versions of what computes."""
+    cpu_info = Path("/proc/cpuinfo")
+    lines = cpu_info.read_text().splitlines() if cpu_info.exists() else []
+    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return {
+        "processor": models[0] if models else platform.processor(),
+        "threads": numba.get_num_threads(),
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "numba": numba.__version__,
+    }
+
+
+def verdict(reports: Sequence[Report]) -> str:
+    """Return the closing line: how many of how many passed."""
+    n, n_failed = sum(len(report.cases) for report in reports), sum(report.n_failed for report in reports)
+    return f"all {n} cases passed" if n_failed == 0 else f"{n_failed} of {n} cases failed"
+
+
+def _cell(value: Figure) -> str:
+    if value is None:
+        return ""
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def _plain(value: Figure) -> Figure:
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else str(float(value))
+    return int(value) if isinstance(value, np.integer) else value
