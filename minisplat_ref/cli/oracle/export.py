@@ -1,16 +1,44 @@
-"""``oracle export``."""
+"""``oracle export``: golden vectors, with which a renderer in any language can be tested."""
 
 import argparse
+from pathlib import Path
 
 from minisplat_ref.cli.arguments import Commands, HelpFormatter
 
+DESCRIPTION = """\
+Write golden vectors: the inputs, outputs, cotangents and gradients of every
+stage of the reference, in float64, as plain arrays in .npz files.
+
+With them a renderer in any language can be tested without our code. DIR/README.md
+explains every array; DIR/manifest.json says the same to programs, with the
+conventions of each scene, tolerances, and a hash of each file.
+"""
+EPILOG = """\
+example:
+  minisplat-ref oracle export golden    # 6 scenes, 2 MB
+  YOUR_PROGRAM golden mine              # reads golden/SCENE/*.npz, writes mine/SCENE/*.npz
+  minisplat-ref oracle compare mine     # names the first stage that differs"""
+
 
 def add_parser(checks: Commands) -> None:
-    """Add the check."""
-    parser = checks.add_parser("export", help="(stub)", formatter_class=HelpFormatter)
+    """Add the command."""
+    parser = checks.add_parser(
+        "export",
+        help="write golden vectors for testing another renderer",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=HelpFormatter,
+    )
+    parser.add_argument("out", type=Path, metavar="DIR", help="new folder")
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check, print the table."""
-    raise NotImplementedError
+    """Write the folder and check it by reading it."""
+    from minisplat_ref.oracle.golden.files import export, load
+    from minisplat_ref.oracle.golden.stages import golden_scenes
+
+    export(args.out, golden_scenes())
+    scenes = load(args.out)
+    print(f"wrote {args.out}: {len(scenes)} scenes ({', '.join(scenes)}); start with {args.out / 'README.md'}")
+    return 0

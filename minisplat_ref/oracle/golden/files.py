@@ -1,0 +1,196 @@
+"""A folder of golden vectors: written whole or not at all, and checked when it is read."""
+
+import hashlib
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from minisplat_ref.constants import Conventions
+from minisplat_ref.errors import InputError
+from minisplat_ref.io.atomic import making_folder
+from minisplat_ref.oracle.golden.arrays import SPECS, STAGE_COTANGENTS, STAGE_INPUTS, Arrays, names_of
+from minisplat_ref.oracle.golden.readme import FRAMES, readme
+from minisplat_ref.oracle.golden.scenes import Golden
+
+FORMAT = "minisplat_ref golden vectors"
+VERSION = 1  # changes when an older folder can no longer be read
+MANIFEST, README = "manifest.json", "README.md"
+AGAIN = "write it anew with: minisplat-ref oracle export DIR"
+
+
+def export(path: str | Path, scenes: Mapping[str, Golden]) -> None:
+    """Write scenes: one folder each, one .npz for each stage; a manifest and a README beside them.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder to make; may exist if it is empty.
+    scenes : mapping of str to Golden
+        With all arrays.
+
+    Raises
+    ------
+    InputError
+        If the folder is not empty or cannot be made.
+    """
+    with making_folder(path) as folder:
+        listed = {name: _write_scene(folder, scene) for name, scene in scenes.items()}
+        text = json.dumps(_manifest(listed, scenes), indent=1, allow_nan=False)
+        (folder / MANIFEST).write_text(text + "\n", encoding="utf-8")
+        (folder / README).write_text(readme(scenes), encoding="utf-8")
+
+
+def load(path: str | Path) -> dict[str, Golden]:
+    """Read what :func:`export` wrote, and check it: format, version, hashes, names, shapes, dtypes.
+
+    Parameters
+    ----------
+    path : str or Path
+        The folder.
+
+    Returns
+    -------
+    dict
+        Scenes by name.
+
+    Raises
+    ------
+    InputError
+        If anything is missing, damaged or of another version; one line says what.
+    """
+    folder = Path(path)
+    manifest = read_manifest(folder)
+    if manifest is None:
+        raise InputError(f"{folder / MANIFEST} does not exist: give a folder of minisplat-ref oracle export")
+    try:
+        return {name: _read_scene(folder, name, entry) for name, entry in manifest["scenes"].items()}
+    except (KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{folder / MANIFEST} lacks {error}; {AGAIN}") from error
+
+
+def read_manifest(folder: Path) -> dict[str, Any] | None:
+    """Manifest of a folder, None where there is none.
+
+    Raises
+    ------
+    InputError
+        If it is no manifest, of another version, or a file that it lists is missing or is not what was written.
+    """
+    path = folder / MANIFEST
+    if not path.exists():
+        return None
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+        found = manifest["format"], manifest["version"]
+        files = {
+            f"{scene}/{file}": entry for scene, s in manifest["scenes"].items() for file, entry in s["files"].items()
+        }
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path} is not a manifest of golden vectors ({error}); {AGAIN}") from error
+    if found != (FORMAT, VERSION):
+        raise InputError(f"{path} is {found[0]!r} version {found[1]}, this reads {FORMAT!r} version {VERSION}; {AGAIN}")
+    for file, entry in files.items():
+        if not (folder / file).is_file():
+            raise InputError(f"{folder / file} is missing, though {MANIFEST} lists it; {AGAIN}")
+        if _sha256(folder / file) != entry["sha256"]:
+            raise InputError(f"{folder / file} is not the file that {MANIFEST} lists (SHA-256 differs); {AGAIN}")
+    return manifest
+
+
+def read_npz(path: Path) -> Arrays:
+    """Arrays of a file.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, or holds anything but arrays of numbers.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path} is not an .npz of plain arrays, or is damaged ({error}); write it anew") from error
+    for name, array in arrays.items():
+        if array.dtype.kind not in "fiu":
+            raise InputError(f"{path}: {name} has dtype {array.dtype}; only floating point and integers are read")
+    return arrays
+
+
+def _write_scene(folder: Path, scene: Golden) -> dict[str, Any]:
+    """Write the files of a scene and return their entry of the manifest."""
+    (folder / scene.name).mkdir()
+    files = {}
+    for stage in dict.fromkeys(spec.stage for spec in SPECS.values()):
+        names = names_of(stage, "input", "output", "cotangent", "gradient")
+        arrays = {name: np.ascontiguousarray(scene.arrays[name]).reshape(scene.arrays[name].shape) for name in names}
+        path = folder / scene.name / f"{stage}.npz"
+        np.savez(path, allow_pickle=False, **arrays)
+        shapes = {name: {"shape": list(array.shape), "dtype": str(array.dtype)} for name, array in arrays.items()}
+        files[path.name] = {"sha256": _sha256(path), "arrays": shapes}
+    return {
+        "what": scene.what,
+        "sh_degree": scene.sh_degree,
+        "conventions": scene.conventions._asdict(),
+        "files": files,
+    }
+
+
+def _manifest(listed: Mapping[str, Any], scenes: Mapping[str, Golden]) -> dict[str, Any]:
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "loss": "L = sum(v_image * image) + sum(v_alpha * alpha) + sum(v_depths * depths); v_x = dL/dx, of the shape of x",
+        "frames": FRAMES,
+        "arrays": {
+            spec.name: {
+                "file": f"{spec.stage}.npz",
+                "role": spec.role,
+                "shape": list(spec.shape),
+                "dtype": spec.kind,
+                "unit": spec.unit,
+                "meaning": spec.meaning,
+                "tolerance": {
+                    "relative_to": "largest magnitude in the array",
+                    "float64": spec.tolerance.float64,
+                    "float32": spec.tolerance.float32,
+                    "reason": spec.tolerance.reason,
+                },
+            }
+            for spec in SPECS.values()
+        },
+        "stages": {
+            stage: {
+                "inputs": list(STAGE_INPUTS[stage]),
+                "outputs": list(names_of(stage, "output")),
+                "cotangents": list(STAGE_COTANGENTS[stage]),
+                "gradients": list(names_of(stage, "gradient")),
+            }
+            for stage in STAGE_INPUTS
+        },
+        "scenes": dict(listed),
+    }
+
+
+def _read_scene(folder: Path, name: str, entry: Mapping[str, Any]) -> Golden:
+    arrays: Arrays = {}
+    for file, about in entry["files"].items():
+        found = read_npz(folder / name / file)
+        for key, array in found.items():
+            promised = about["arrays"].get(key)
+            if promised != {"shape": list(array.shape), "dtype": str(array.dtype)}:
+                raise InputError(
+                    f"{folder / name / file}: {key} is {array.dtype}{list(array.shape)}, not as in {MANIFEST}"
+                )
+        arrays |= found
+    missing = [key for key in SPECS if key not in arrays]
+    if missing:
+        raise InputError(f"{folder / name} lacks {', '.join(missing)}; {AGAIN}")
+    return Golden(name, entry["what"], Conventions(**entry["conventions"]), arrays)
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -1,0 +1,129 @@
+"""From the inputs of a scene to its arrays, through the stages of any :class:`Backend`.
+
+Fed with the arrays of a truth, every stage by itself is given the truth's input, so that an error stays in its stage.
+"""
+
+from collections import ChainMap
+
+import numpy as np
+
+from minisplat_ref.backends import REFERENCE, Backend
+from minisplat_ref.constants import Conventions
+from minisplat_ref.oracle.golden.arrays import STAGE_COTANGENTS, Arrays
+from minisplat_ref.oracle.golden.flips import flip_candidates
+from minisplat_ref.oracle.golden.scenes import RECIPES, Golden, inputs
+from minisplat_ref.types import Floats, Projection, ProjectionGradient, RenderOutput, TileBins, TileGrid
+
+PROJECTION = ("means2d", "depths", "conics", "opacities2d", "radii", "boxes")  # fields of a Projection, by array
+
+
+def projection_of(arrays: Arrays) -> Projection:
+    """Projection of the arrays of these names."""
+    return Projection(*(arrays[name] for name in PROJECTION))
+
+
+def reference_bins(arrays: Arrays, conventions: Conventions, tile_size: tuple[int, int]) -> TileBins:
+    """Tile lists that the reference makes of a projection, on tiles of any size."""
+    grid = TileGrid(*map(int, arrays["image_size"]), *tile_size)
+    return REFERENCE.bin_gaussians(projection_of(arrays), grid, conventions)
+
+
+def run_stages(backend: Backend, scene: Golden, dtype: str, fed: Arrays | None = None) -> Arrays:
+    """Outputs and gradients of every stage.
+
+    Parameters
+    ----------
+    backend : Backend
+        The renderer.
+    scene : Golden
+        Its inputs and the cotangents are read; whatever else it has is not.
+    dtype : str
+        ``"float32"`` or ``"float64"``: what the stages compute in.
+    fed : dict, optional
+        All arrays of a truth: the input of each stage. By default each stage reads what the stage before it gave.
+
+    Returns
+    -------
+    dict
+        By the names of the golden format; the totals only where no truth was fed, of which they would be sums.
+    """
+    out: Arrays = {}
+    known = ChainMap(out if fed is None else fed, scene.arrays)
+
+    def take(name: str) -> Floats:
+        array = known[name]
+        return np.asarray(array, dtype, order="C") if array.dtype.kind == "f" else array
+
+    c, camera = scene.conventions, scene.camera
+    primitives = tuple(take(name) for name in ("means", "quats", "scales", "opacities"))
+    out |= zip(PROJECTION, backend.project(*primitives, camera, c), strict=True)
+    projection = Projection(*map(take, PROJECTION))
+
+    grid = TileGrid(camera.width, camera.height, backend.tile_width, backend.tile_height)
+    bins = backend.bin_gaussians(projection, grid, c)
+    out["tile_size"] = np.array([grid.tile_width, grid.tile_height], np.int32)
+    out["gaussian_ids"], out["tile_offsets"] = bins.gaussian_ids, bins.tile_offsets
+    if fed is not None:
+        bins = reference_bins(fed, c, (grid.tile_width, grid.tile_height))
+
+    shading = (take("means"), take("sh_dc"), take("sh_rest"), camera, scene.sh_degree, take("radii"))
+    out["colors"] = backend.sh_colors(*shading)
+    blending = (projection, take("colors"), take("background"), bins, c)
+    output = backend.composite(*blending)
+    out["image"], out["alpha"] = output.image, output.alpha
+    if "v_image" not in known:
+        return out
+
+    v = backend.composite_vjp(
+        *blending, RenderOutput(take("image"), take("alpha"), None, None), take("v_image"), take("v_alpha")
+    )
+    names = ("v_means2d", "v_conics", "v_opacities2d", "v_colors", "v_background")
+    out |= zip(names, v, strict=True)
+    v_projection = ProjectionGradient(*map(take, STAGE_COTANGENTS["project"]))
+    names = ("v_means_projection", "v_quats", "v_scales", "v_opacities", "v_R_projection", "v_t_projection")
+    out |= zip(names, backend.project_vjp(*primitives, camera, c, projection, v_projection), strict=True)
+    names = ("v_means_colors", "v_sh_dc", "v_sh_rest", "v_R_colors", "v_t_colors")
+    out |= zip(names, backend.sh_colors_vjp(*shading, take("v_colors")), strict=True)
+    if fed is None:
+        for name in ("v_means", "v_R", "v_t"):
+            out[name] = out[f"{name}_projection"] + out[f"{name}_colors"]
+
+    loss, tape = backend.photometric_loss(take("image"), take("target"), float(take("dssim_weight")))
+    out["loss"], out["v_image_of_loss"] = np.array(loss, dtype), backend.photometric_loss_vjp(tape)
+    return out
+
+
+def truth(scene: Golden, seed: int = 0) -> Golden:
+    """Scene with all arrays, by the reference in float64.
+
+    Parameters
+    ----------
+    scene : Golden
+        With its inputs.
+    seed : int
+        Of the cotangents. They are 0 at the pixels whose hits rounding decides: no gradient is to depend on those.
+
+    Returns
+    -------
+    Golden
+        All arrays of the format.
+    """
+    forward = run_stages(REFERENCE, scene, "float64")
+    known = scene.arrays | forward
+    tile_size = (REFERENCE.tile_width, REFERENCE.tile_height)
+    bins = reference_bins(known, scene.conventions, tile_size)
+    is_sure = ~flip_candidates(projection_of(known), bins, scene.conventions)
+    rng = np.random.default_rng(seed)
+    cotangents = {
+        "v_image": rng.uniform(-1, 1, forward["image"].shape) * is_sure[:, :, None],
+        "v_alpha": rng.uniform(-1, 1, forward["alpha"].shape) * is_sure,
+        "v_depths": rng.uniform(-1, 1, forward["depths"].shape),
+    }
+    rounded = {name: array.astype(np.float32).astype(np.float64) for name, array in cotangents.items()}
+    scene = scene._replace(arrays=scene.arrays | rounded)
+    return scene._replace(arrays=scene.arrays | run_stages(REFERENCE, scene, "float64"))
+
+
+def golden_scenes() -> dict[str, Golden]:
+    """All scenes with all arrays, by name."""
+    return {recipe.name: truth(inputs(recipe)) for recipe in RECIPES}
