@@ -11,3 +11,24 @@ GRADIENT_FLOOR = 1e-6
 
 # Alpha must cover this part of an image before a check on it says anything.
 COVERAGE_MIN = 0.05
+
+# A stage of another float64 renderer, fed with the same input: 1e-16 times conditions up to 1e4, in sums of thousands
+# of terms. Wrong formulas are off by 1e-4 and more.
+COMPARE_FLOAT64 = 1e-9
+
+# The same in float32, fed with the input rounded or with its own of the stage before: a few roundings of 6e-8 ...
+COMPARE_FLOAT32_POSITION = 2e-6
+# ... divided by the determinant of a covariance whose condition number is up to 1e2 ...
+COMPARE_FLOAT32_SHAPE = 2e-5
+# ... through an exponential of relative error 1e-7 to 1e-6, hundreds of times in a pixel ...
+COMPARE_FLOAT32_IMAGE = 2e-5
+# ... relative to windowed variances, differences of means, which count beside C2 = 9e-4 ...
+COMPARE_FLOAT32_LOSS = 5e-5
+# ... and in sums of either sign over pixels, divided by 1 - alpha >= 0.01.
+COMPARE_FLOAT32_GRADIENT = 1e-4
+
+# A hit whose alpha is so near to alpha_min, absolutely, may be skipped by one renderer and blended by another: float32
+# gives alpha an error of 1e-7 of its value near 4e-3, and 1e-6 px of the centre moves it by less than 1e-6.
+FLIP_ALPHA = 1e-6
+# The same as a part of 1/255; the transmittance is held against its stop threshold with this relative margin.
+FLIP_RELATIVE = 255 * FLIP_ALPHA
