@@ -13,7 +13,7 @@ from minisplat_ref.constants import Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.oracle.golden.arrays import SPECS, STAGE_COTANGENTS, STAGE_INPUTS, Arrays, names_of
-from minisplat_ref.oracle.golden.readme import FRAMES, readme
+from minisplat_ref.oracle.golden.readme import FRAMES, LOSS, convention_words, readme
 from minisplat_ref.oracle.golden.scenes import Golden
 
 FORMAT = "minisplat_ref golden vectors"
@@ -39,7 +39,7 @@ def export(path: str | Path, scenes: Mapping[str, Golden]) -> None:
     """
     with making_folder(path) as folder:
         listed = {name: _write_scene(folder, scene) for name, scene in scenes.items()}
-        text = json.dumps(_manifest(listed, scenes), indent=1, allow_nan=False)
+        text = json.dumps(_manifest(listed), indent=1, allow_nan=False)
         (folder / MANIFEST).write_text(text + "\n", encoding="utf-8")
         (folder / README).write_text(readme(scenes), encoding="utf-8")
 
@@ -139,12 +139,13 @@ def _write_scene(folder: Path, scene: Golden) -> dict[str, Any]:
     }
 
 
-def _manifest(listed: Mapping[str, Any], scenes: Mapping[str, Golden]) -> dict[str, Any]:
+def _manifest(listed: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "version": VERSION,
-        "loss": "L = sum(v_image * image) + sum(v_alpha * alpha) + sum(v_depths * depths); v_x = dL/dx, of the shape of x",
+        "loss": f"{LOSS}; v_x = dL/dx, of the shape of x",
         "frames": FRAMES,
+        "conventions": convention_words(),
         "arrays": {
             spec.name: {
                 "file": f"{spec.stage}.npz",

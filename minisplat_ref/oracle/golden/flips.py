@@ -1,7 +1,7 @@
 """Pixels that rounding decides: a hit at the skip threshold, a transmittance at the stop threshold.
 
-The image jumps there. Two renderers that agree to the last digit but one may differ by a whole hit, so such a pixel says
-nothing about either; it is counted, not averaged in.
+The image jumps there. Two renderers that agree to the last digit but one may differ by a whole hit, so such a pixel
+says nothing about either; it is counted, not averaged in.
 """
 
 import numpy as np

@@ -1,7 +1,9 @@
 """The golden format in words, for people who will never read our Python."""
 
+import inspect
 from collections.abc import Mapping
 
+from minisplat_ref.constants import Conventions
 from minisplat_ref.oracle.golden.arrays import SPECS, STAGE_COTANGENTS, STAGE_INPUTS, names_of
 from minisplat_ref.oracle.golden.scenes import Golden
 
@@ -13,6 +15,8 @@ FRAMES = {
     "matrices": "row-major, as C arrays",
     "spherical harmonics": "real, orthonormal, with Condon-Shortley signs, order m = -l..l: as in 3DGS PLY files",
 }
+
+LOSS = "L = sum(v_image * image) + sum(v_alpha * alpha) + sum(v_depths * depths)"
 
 TEXT = """\
 # Golden vectors of a Gaussian-splatting renderer
@@ -44,11 +48,11 @@ little-endian), then the numbers. https://numpy.org/doc/stable/reference/generat
 
 ## The loss that is differentiated
 
-    L = sum(v_image * image) + sum(v_alpha * alpha) + sum(v_depths * depths)
+    {loss}
 
-`v_x` is dL/dx and has the shape of x. So `v_image`, `v_alpha` and `v_depths` are given, and every other `v_` follows by
-the chain rule. `v_image` and `v_alpha` are 0 at pixels whose alpha or transmittance is so near a threshold that rounding
-decides. The loss stage is by itself: its gradient `v_image_of_loss` is that of `loss`, not of L.
+`v_x` is dL/dx and has the shape of x. So `v_image`, `v_alpha` and `v_depths` are given, and every other `v_` follows
+by the chain rule. `v_image` and `v_alpha` are 0 at pixels whose alpha or transmittance is so near a threshold that
+rounding decides. The loss stage is by itself: its gradient `v_image_of_loss` is that of `loss`, not of L.
 
 `b` of a conic stands twice in its matrix; `v_conics[:, 1]` is the derivative by b itself, so it holds both. Pose
 gradients are by the nine entries of R as if they were free. Skips, stops, boxes and the order of the Gaussians count as
@@ -61,13 +65,19 @@ fixed.
 ## Arrays
 
 N Gaussians, R higher coefficients of the spherical harmonics, M (tile, Gaussian) pairs, T1 tiles + 1, H x W pixels.
-Rows of culled Gaussians are 0 in the outputs and gradients of every stage. Tolerances are parts of the largest magnitude
-in the array.
+Rows of culled Gaussians are 0 in the outputs and gradients of every stage. Tolerances are parts of the largest
+magnitude in the array.
 
 {arrays}
 
 Radii, boxes and tile lists may be larger than ours, or for other tiles (write your `tile_size`): a difference that does
 not change the image is reported as harmless.
+
+## Conventions
+
+Each scene has a value for each of these; `manifest.json` holds them in full.
+
+{conventions}
 
 ## Scenes
 
@@ -103,6 +113,8 @@ def readme(scenes: Mapping[str, Golden]) -> str:
     ]
     described = [_scene(scene) for scene in scenes.values()]
     return TEXT.format(
+        loss=LOSS,
+        conventions="\n".join(f"- `{names}`: {words}" for names, words in convention_words().items()),
         frames="\n".join(f"- {name}: {words}" for name, words in FRAMES.items()),
         stages=_table(("stage", "reads", "gives", "gradient reads also", "gradient gives"), stages),
         arrays=_table(
@@ -110,6 +122,18 @@ def readme(scenes: Mapping[str, Golden]) -> str:
         ),
         scenes="\n".join(described),
     )
+
+
+def convention_words() -> dict[str, str]:
+    """What each field of :class:`Conventions` means, by its name or names: the words of its own documentation."""
+    words: dict[str, str] = {}
+    _, _, attributes = inspect.cleandoc(Conventions.__doc__ or "").partition("----------\n")
+    for line in attributes.splitlines():
+        if not line.startswith(" "):
+            names = line.partition(" : ")[0]
+        else:
+            words[names] = f"{words.get(names, '')} {line.strip()}".strip()
+    return words
 
 
 def _scene(scene: Golden) -> str:
