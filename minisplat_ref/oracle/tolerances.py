@@ -32,3 +32,18 @@ COMPARE_FLOAT32_GRADIENT = 1e-4
 FLIP_ALPHA = 1e-6
 # The same as a part of 1/255; the transmittance is held against its stop threshold with this relative margin.
 FLIP_RELATIVE = 255 * FLIP_ALPHA
+
+# What float32 promises of an image where no hit falls on the other side of a threshold: hundreds of hits, each with an
+# exponential of 1e-7 relative error at a distance that has lost digits to a coordinate of some hundred pixels.
+BENCH_FLOAT32_IMAGE = 2e-5
+# The same of every parameter's gradient, relative L2, without the pixels that stand at a threshold.
+BENCH_FLOAT32_GRADIENT = 1e-4
+# float64 kernels against the reference: another order of sums of up to thousands of terms of 1e-16 each.
+BENCH_FLOAT64 = 1e-11
+# Gradient of a polynomial exponential, in units of its relative error: behind / (1 - alpha) multiplies it.
+BENCH_EXPONENTIAL_GRADIENT = 10.0
+
+# Depths that differ by less, relatively, may be sorted either way: three products and sums of 6e-8 each in float32.
+FLIP_DEPTH = 5e-7
+# An alpha so near to its clamp may be clamped or not; the image does not notice, the gradient does.
+FLIP_CLAMP = 1e-5
