@@ -1,16 +1,101 @@
-"""``oracle compare``."""
+"""``oracle compare``: where does another renderer differ from the reference?"""
 
 import argparse
 
 from minisplat_ref.cli.arguments import Commands, HelpFormatter
+from minisplat_ref.cli.oracle import add_json_argument, publish
+from minisplat_ref.constants import PROFILES
+
+DESCRIPTION = """\
+Compare a renderer with the float64 reference, stage by stage, and name the first
+stage that differs: projection, tile lists, colours, compositing, loss, and then
+the gradients from the image back to the scene.
+
+BACKEND is one of
+
+  DIR             a folder of arrays that your own renderer has written, in the
+                  format of minisplat-ref oracle export (its README.md explains it)
+  cpu, cpu-exact, reference
+                  ours
+  gsplat-torch    gsplat's functions in plain PyTorch, on the CPU
+  gsplat, inria   gsplat's kernels, and the rasteriser of the 3DGS paper, where they
+                  are installed and there is a CUDA device
+  profile:NAME    the reference by the conventions of another renderer: what a
+                  difference in conventions looks like
+  planted:ERROR   ours with one error in it, to see how it is reported
+
+Ours, gsplat-torch and gsplat are given the reference's own input at every stage, so
+that an error stays where it arose. For the others, later differences may follow
+from the first.
+
+A pixel of which rounding decides a hit (alpha within 1e-6 of 1/255, or the
+transmittance as near to the stop threshold) counts as a candidate for a flip; its
+error is counted, neither failed nor averaged in. Boxes and tile lists that differ
+without changing the image are harmless.
+"""
+EPILOG = """\
+examples:
+  minisplat-ref oracle compare cpu --dtype float32
+  minisplat-ref oracle compare planted:half-off-diagonal --scene ordinary
+  minisplat-ref oracle compare profile:INRIA --scene ordinary --json differences.json
+
+your own renderer, in three lines:
+  minisplat-ref oracle export golden
+  YOUR_PROGRAM golden mine              # reads golden/SCENE/*.npz, writes mine/SCENE/*.npz
+  minisplat-ref oracle compare mine
+
+Exit codes: 0 every stage that was given agrees, 1 one diverges, 2 bad input."""
 
 
 def add_parser(checks: Commands) -> None:
     """Add the check."""
-    parser = checks.add_parser("compare", help="(stub)", formatter_class=HelpFormatter)
+    parser = checks.add_parser(
+        "compare",
+        help="name the first stage in which another renderer differs",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=HelpFormatter,
+    )
+    parser.add_argument("backend", metavar="BACKEND", help="a renderer's name, or a folder of its arrays")
+    parser.add_argument("--scene", default="all", metavar="NAME", help="a golden scene, or all (default)")
+    parser.add_argument(
+        "--against",
+        default="reference",
+        metavar="WHAT",
+        help="reference, computed now (default), or a folder that oracle export wrote",
+    )
+    parser.add_argument(
+        "--profile",
+        type=str.upper,
+        choices=tuple(PROFILES),
+        metavar="NAME",
+        help=f"conventions for every scene, in place of its own: {', '.join(PROFILES)}",
+    )
+    parser.add_argument(
+        "--dtype",
+        choices=("float32", "float64"),
+        metavar="TYPE",
+        help="float32 or float64: what is computed in, and so the tolerances (default: float64 for ours and"
+        " gsplat-torch, that of each array for a folder)",
+    )
+    add_json_argument(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check, print the table."""
-    raise NotImplementedError
+    """Compare every scene, print the table of stages."""
+    from minisplat_ref.oracle.comparison.choose import choose_renderer, choose_scenes
+    from minisplat_ref.oracle.comparison.staged import as_report, compare_scene
+
+    renderer = choose_renderer(args.backend, args.dtype)
+    scenes, left_out = choose_scenes(renderer, args.scene, args.against, args.profile)
+    rows = [row for scene in scenes.values() for row in compare_scene(renderer, scene)]
+    settings = {
+        "against": args.against,
+        "conventions": {name: scene.conventions.name for name, scene in scenes.items()},
+        "left_out": list(left_out),
+    }
+    code = publish(as_report(renderer, rows, settings), args.json)
+    if left_out:
+        print(f"left out, since {renderer.name} follows other conventions: {', '.join(left_out)}")
+    return code

@@ -93,7 +93,7 @@ def run_stages(backend: Backend, scene: Golden, dtype: str, fed: Arrays | None =
     return out
 
 
-def truth(scene: Golden, seed: int = 0) -> Golden:
+def truth(scene: Golden, *, seed: int = 0, zeros: tuple[str, ...] = ()) -> Golden:
     """Scene with all arrays, by the reference in float64.
 
     Parameters
@@ -102,6 +102,8 @@ def truth(scene: Golden, seed: int = 0) -> Golden:
         With its inputs.
     seed : int
         Of the cotangents. They are 0 at the pixels whose hits rounding decides: no gradient is to depend on those.
+    zeros : tuple of str
+        Cotangents that are zero throughout, for a renderer that cannot take them.
 
     Returns
     -------
@@ -120,6 +122,7 @@ def truth(scene: Golden, seed: int = 0) -> Golden:
         "v_depths": rng.uniform(-1, 1, forward["depths"].shape),
     }
     rounded = {name: array.astype(np.float32).astype(np.float64) for name, array in cotangents.items()}
+    rounded |= {name: np.zeros_like(rounded[name]) for name in zeros}
     scene = scene._replace(arrays=scene.arrays | rounded)
     return scene._replace(arrays=scene.arrays | run_stages(REFERENCE, scene, "float64"))
 

@@ -1,0 +1,134 @@
+"""Boxes and tile lists differ between renderers for good reasons; what counts is whether the image does.
+
+So the reference draws the truth's footprints once more, within the other's bounds or in the other's order.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from minisplat_ref.backends import REFERENCE
+from minisplat_ref.oracle.comparison.measure import difference
+from minisplat_ref.oracle.golden.arrays import Arrays
+from minisplat_ref.oracle.golden.flips import flip_candidates
+from minisplat_ref.oracle.golden.scenes import Golden
+from minisplat_ref.oracle.golden.stages import projection_of, reference_bins
+from minisplat_ref.oracle.tolerances import COMPARE_FLOAT64
+from minisplat_ref.types import Bools, Floats, Ints, Projection, TileBins, TileGrid
+
+FOOTPRINT = {"means2d": "means2d", "depths": "depths", "conics": "conics", "opacities": "opacities2d"}  # array by field
+
+
+class Bounds(NamedTuple):
+    """What became of a difference in bounds or lists."""
+
+    n_different: int  # rows, or tiles
+    n: int
+    changes_image: bool
+    note: str
+
+
+def compare_bounds(given: Arrays, truth: Golden) -> Bounds | None:
+    """Judge radii and boxes, whichever were given; None where neither was.
+
+    A Gaussian that the truth culls is drawn with the other renderer's footprint, if that was given.
+    """
+    if "radii" not in given and "boxes" not in given:
+        return None
+    expected, n = truth.arrays, len(truth.arrays["means"])
+    radii = given.get("radii")
+    if radii is not None:  # a single radius is that of a square
+        radii = np.broadcast_to(np.asarray(radii).reshape(n, -1), (n, 2))
+    same = np.ones(n, bool)
+    for key, array in (("radii", radii), ("boxes", given.get("boxes"))):
+        if array is not None:
+            same &= (array == expected[key]).all(axis=1)
+    is_different = ~same
+    if not is_different.any():
+        return Bounds(0, n, False, "")
+
+    projection = projection_of(expected)
+    is_shown = expected["radii"][:, 0] > 0
+    shows = radii[:, 0] > 0 if radii is not None else (given["boxes"][:, 2:] > given["boxes"][:, :2]).all(axis=1)
+    is_extra = shows & ~is_shown
+    if is_extra.any() and all(key in given for key in FOOTPRINT.values()):
+        rows = {field: _merged(is_extra, given[key], expected[key]) for field, key in FOOTPRINT.items()}
+        projection = projection._replace(**rows)
+    boxes = given["boxes"] if "boxes" in given else _boxes_of(projection, radii, truth)
+    projection = projection._replace(boxes=np.where(shows[:, None], boxes, 0).astype(np.int32))
+    bins = REFERENCE.bin_gaussians(projection, _grid(truth, (16, 16)), truth.conventions)
+    changes = _changes_image(projection, bins, truth)
+    parts = [
+        _count(int((is_shown & ~shows).sum()), "culled that the reference shows"),
+        _count(int(is_extra.sum()), "shown that the reference culls"),
+        _count(int((is_different & shows & is_shown).sum()), "bounded differently"),
+    ]
+    return Bounds(int(is_different.sum()), n, changes, ", ".join(part for part in parts if part))
+
+
+def compare_lists(given: Arrays, truth: Golden) -> Bounds | None:
+    """Judge tile lists; None where none were given.
+
+    They are compared with those that the reference makes for tiles of the same size: as sets, then in their order.
+    """
+    if "gaussian_ids" not in given or "tile_offsets" not in given:
+        return None
+    size = given.get("tile_size", truth.arrays["tile_size"])
+    tile_size = (int(size[0]), int(size[1]))
+    grid, expected = _grid(truth, tile_size), reference_bins(truth.arrays, truth.conventions, tile_size)
+    ids, offsets = given["gaussian_ids"].astype(np.int64), given["tile_offsets"].astype(np.int64)
+    n_tiles, n = grid.n_tiles_x * grid.n_tiles_y, len(truth.arrays["means"])
+    is_list = offsets.shape == (n_tiles + 1,) and offsets[0] == 0 and offsets[-1] == len(ids)
+    if not (is_list and (np.diff(offsets) >= 0).all() and (ids >= 0).all() and (ids < n).all()):
+        return Bounds(n_tiles, n_tiles, True, f"no lists of rows below {n} for {n_tiles} tiles")
+
+    n_fewer = n_more = n_sets = n_orders = 0
+    for tile in range(n_tiles):
+        ours = expected.gaussian_ids[expected.tile_offsets[tile] : expected.tile_offsets[tile + 1]]
+        theirs = ids[offsets[tile] : offsets[tile + 1]]
+        n_fewer += len(np.setdiff1d(ours, theirs))
+        n_more += len(theirs) - len(np.intersect1d(ours, theirs))
+        n_sets += set(ours) != set(theirs) or len(set(theirs)) != len(theirs)
+        n_orders += not np.array_equal(ours[np.isin(ours, theirs)], theirs[np.isin(theirs, ours)])
+    if n_sets + n_orders == 0:
+        return Bounds(0, n_tiles, False, "")
+    bins = TileBins(ids.astype(np.int32), offsets, expected.slots, expected.gaussian_offsets, grid)
+    parts = [
+        _count(n_fewer, "pairs fewer"),
+        _count(n_more, "pairs more"),
+        _count(n_orders, "tiles in another order"),
+    ]
+    changes = _changes_image(projection_of(truth.arrays), bins, truth)
+    return Bounds(max(n_sets, n_orders), n_tiles, changes, ", ".join(part for part in parts if part))
+
+
+def _changes_image(projection: Projection, bins: TileBins, truth: Golden) -> bool:
+    """Whether the reference's image is another one with these boxes and lists."""
+    arrays = truth.arrays
+    output = REFERENCE.composite(projection, arrays["colors"], arrays["background"], bins, truth.conventions)
+    may_flip = flip_candidates(projection, bins, truth.conventions)
+    pairs = ((output.image, arrays["image"]), (output.alpha, arrays["alpha"]))
+    return any(difference(a, b, COMPARE_FLOAT64, may_flip).n_over for a, b in pairs)
+
+
+def _boxes_of(projection: Projection, radii: Ints, truth: Golden) -> Ints:
+    """Boxes of half-sides ``radii`` around the means, in the image."""
+    size = truth.arrays["image_size"]
+    low = np.clip(np.floor(projection.means2d - radii), 0, size)
+    high = np.clip(np.ceil(projection.means2d + radii), 0, size)
+    return np.hstack([low, high]).astype(np.int32)
+
+
+def _grid(truth: Golden, tile_size: tuple[int, int]) -> TileGrid:
+    return TileGrid(*map(int, truth.arrays["image_size"]), *tile_size)
+
+
+def _merged(rows: Bools, given: Floats, expected: Floats) -> Floats:
+    """The given values in these rows, the expected ones in all others."""
+    merged = expected.copy()
+    merged[rows] = given[rows]
+    return merged
+
+
+def _count(n: int, what: str) -> str:
+    return f"{n} {what}" if n else ""

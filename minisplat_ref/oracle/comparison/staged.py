@@ -1,0 +1,258 @@
+"""The stages in their order, each compared with the truth; the first that diverges is named.
+
+Forward from the projection to the image and the loss, then the gradients from the image back to the scene.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.oracle.cases import Case, Figure, Report
+from minisplat_ref.oracle.comparison.harmless import Bounds, compare_bounds, compare_lists
+from minisplat_ref.oracle.comparison.measure import Difference, difference
+from minisplat_ref.oracle.comparison.renderers import Renderer
+from minisplat_ref.oracle.golden.arrays import SPECS, Arrays
+from minisplat_ref.oracle.golden.flips import flip_candidates
+from minisplat_ref.oracle.golden.scenes import Golden
+from minisplat_ref.oracle.golden.stages import projection_of, reference_bins
+from minisplat_ref.types import Bools
+
+Status = Literal["agrees", "diverges", "harmless", "not given"]
+
+STAGES: dict[str, tuple[str, ...]] = {
+    "means2d": ("means2d",),
+    "depths": ("depths",),
+    "conics": ("conics",),
+    "opacities2d": ("opacities2d",),
+    "radii": ("radii", "boxes"),
+    "tile lists": ("gaussian_ids", "tile_offsets"),
+    "colors": ("colors",),
+    "T": ("alpha",),
+    "image": ("image",),
+    "loss": ("loss",),
+    "v_image_of_loss": ("v_image_of_loss",),
+    "v_colors": ("v_colors",),
+    "v_background": ("v_background",),
+    "v_means2d": ("v_means2d",),
+    "v_conics": ("v_conics",),
+    "v_opacities2d": ("v_opacities2d",),
+    "v_means": ("v_means_projection", "v_means_colors", "v_means"),
+    "v_quats": ("v_quats",),
+    "v_scales": ("v_scales",),
+    "v_opacities": ("v_opacities",),
+    "v_sh": ("v_sh_dc", "v_sh_rest"),
+    "v_R": ("v_R_projection", "v_R_colors", "v_R"),
+    "v_t": ("v_t_projection", "v_t_colors", "v_t"),
+}
+"""Arrays of each stage; T is compared by alpha = 1 - T."""
+BY_ROW = ("means2d", "depths", "conics", "opacities2d", "colors")  # compared where both show the Gaussian
+
+
+class Row(NamedTuple):
+    """One stage of one scene."""
+
+    scene: str
+    stage: str
+    status: Status
+    difference: Difference | None
+    """Of the array that is furthest off; None where nothing was given, or where it was not measured by numbers."""
+    bounds: Bounds | None = None
+    """For radii and tile lists."""
+    n_candidates: int = 0
+    """Pixels that rounding decides, for T and image."""
+    note: str = ""
+    """One line."""
+
+
+def compare_scene(renderer: Renderer, truth: Golden) -> list[Row]:
+    """Compare one scene.
+
+    Parameters
+    ----------
+    renderer : Renderer
+        Whoever is compared.
+    truth : Golden
+        All arrays, by the conventions that the renderer follows.
+
+    Returns
+    -------
+    list of Row
+        In the order of :data:`STAGES`.
+
+    Raises
+    ------
+    InputError
+        If an array has another shape than the truth's, or nothing was given.
+    """
+    given = renderer.arrays(truth)
+    _check_shapes(renderer, given, truth)
+    tile_size = tuple(map(int, truth.arrays["tile_size"]))
+    bins = reference_bins(truth.arrays, truth.conventions, (tile_size[0], tile_size[1]))
+    may_flip = flip_candidates(projection_of(truth.arrays), bins, truth.conventions)
+    rows: list[Row] = []
+    for stage, names in STAGES.items():
+        if stage == "radii":
+            row = _row_of_bounds(truth.name, stage, compare_bounds(given, truth))
+        elif stage == "tile lists":
+            row = _row_of_bounds(truth.name, stage, compare_lists(given, truth))
+        else:
+            row = _row_of_arrays(renderer, given, truth, stage, names, may_flip)
+        first = next((r.stage for r in rows if r.status == "diverges"), None)
+        if row.status == "diverges" and first is not None and not renderer.is_staged:
+            row = row._replace(note=", ".join(filter(None, [row.note, f"may follow from {first}"])))
+        rows.append(row)
+    if all(row.status == "not given" for row in rows):
+        raise InputError(f"{renderer.name} gives no array of scene {truth.name}: there is nothing to compare")
+    return rows
+
+
+def first_divergence(rows: Iterable[Row]) -> Row | None:
+    """Row of the earliest stage that diverges, in the scene where it is furthest off; None where all agree."""
+    diverging = [row for row in rows if row.status == "diverges"]
+    order = list(STAGES)
+    return min(diverging, key=lambda row: (order.index(row.stage), -_excess(row)), default=None)
+
+
+def as_report(renderer: Renderer, rows: list[Row], settings: Mapping[str, Any]) -> Report:
+    """One case for each stage, with the scene where it is furthest off."""
+    scenes = list(dict.fromkeys(row.scene for row in rows))
+    first = first_divergence(rows)
+    n_given = sum(any(r.stage == stage and r.status != "not given" for r in rows) for stage in STAGES)
+    verdict = (
+        f"all {n_given} stages that it gives agree"
+        if first is None
+        else f"the first stage that diverges is {first.stage}, in scene {first.scene}"
+    )
+    where = f"scene {scenes[0]}" if len(scenes) == 1 else f"{len(scenes)} scenes"
+    cases = [_case([row for row in rows if row.stage == stage], first) for stage in STAGES]
+    details = [{"scene": row.scene, "stage": row.stage, "result": row.status, **_figures([row])} for row in rows]
+    return Report(
+        title=f"{renderer.name} against the reference, {where}: {verdict}",
+        cases=tuple(cases),
+        settings={
+            **settings,
+            "renderer": renderer.name,
+            "fed_with_truth": renderer.is_staged,
+            "first_divergence": None if first is None else {"stage": first.stage, "scene": first.scene},
+            "scenes": [{k: _finite(v) for k, v in detail.items()} for detail in details],
+        },
+    )
+
+
+def _check_shapes(renderer: Renderer, given: Arrays, truth: Golden) -> None:
+    free = ("gaussian_ids", "tile_offsets", "tile_size", "radii")  # checked where they are judged
+    for name, array in given.items():
+        expected = truth.arrays[name].shape
+        if name not in free and array.shape != expected:
+            raise InputError(
+                f"{renderer.name}, scene {truth.name}: {name} has shape {list(array.shape)}, expected {list(expected)}"
+            )
+    n = len(truth.arrays["means"])
+    if "radii" in given and given["radii"].shape not in ((n,), (n, 1), (n, 2)):
+        shape = list(given["radii"].shape)
+        raise InputError(f"{renderer.name}, scene {truth.name}: radii has shape {shape}, expected {[n, 2]} or {[n]}")
+    if "tile_size" in given and (given["tile_size"].shape != (2,) or given["tile_size"].min() < 1):
+        raise InputError(f"{renderer.name}, scene {truth.name}: tile_size must be width, height in pixels")
+
+
+def _row_of_bounds(scene: str, stage: str, bounds: Bounds | None) -> Row:
+    if bounds is None:
+        return Row(scene, stage, "not given", None)
+    if bounds.n_different == 0:
+        return Row(scene, stage, "agrees", None, bounds)
+    if bounds.changes_image:
+        return Row(scene, stage, "diverges", None, bounds, note=f"{bounds.note}; the image changes")
+    return Row(scene, stage, "harmless", None, bounds, note=f"{bounds.note}; same image")
+
+
+def _row_of_arrays(
+    renderer: Renderer, given: Arrays, truth: Golden, stage: str, names: tuple[str, ...], may_flip: Bools
+) -> Row:
+    found = [name for name in names if name in given]
+    if not found:
+        return Row(truth.name, stage, "not given", None)
+    is_pixelwise = stage in ("T", "image")
+    differences = {}
+    for name in found:
+        a, b = given[name], truth.arrays[name]
+        if name in BY_ROW:
+            rows = truth.arrays["radii"][:, 0] > 0
+            if "radii" in given:
+                rows = rows & (given["radii"].reshape(len(rows), -1)[:, 0] > 0)
+            a, b = a[rows], b[rows]
+        tolerance = SPECS[name].tolerance.of(renderer.dtype or given[name].dtype)
+        differences[name] = difference(a, b, tolerance, may_flip if is_pixelwise else None)
+    worst = max(differences, key=lambda name: differences[name].excess)
+    d = differences[worst]
+    notes = [worst if len(names) > 1 and d.n_over else "", _shape_of_error(given[worst], truth.arrays[worst], d)]
+    return Row(
+        truth.name,
+        stage,
+        "diverges" if any(d.n_over for d in differences.values()) else "agrees",
+        d,
+        n_candidates=int(may_flip.sum()) if is_pixelwise else 0,
+        note=", ".join(filter(None, notes)),
+    )
+
+
+def _shape_of_error(given: np.ndarray, expected: np.ndarray, d: Difference) -> str:
+    """Say where an error sits if it sits in one column, and whether it is a factor."""
+    if d.n_over == 0 or not np.isfinite(given).all():
+        return "" if d.n_over == 0 else "not finite"
+    given, expected = np.asarray(given, np.float64), np.asarray(expected, np.float64)
+    words = ""
+    if expected.ndim == 2 and expected.shape[1] <= 4:
+        is_off = (np.abs(given - expected) > d.tolerance * d.scale).any(axis=0)
+        if is_off.sum() == 1:
+            column = int(np.flatnonzero(is_off)[0])
+            words, given, expected = f"only [:, {column}]", given[:, column], expected[:, column]
+    factor = float(np.vdot(given, expected) / np.vdot(expected, expected)) if expected.any() else 1.0
+    is_factor = np.abs(given - factor * expected).max() <= d.tolerance * d.scale and abs(factor - 1) > d.tolerance
+    return " ".join(filter(None, [words, f"times {factor:.4g}" if is_factor else ""]))
+
+
+def _case(rows: list[Row], first: Row | None) -> Case:
+    """One stage over all scenes."""
+    order: tuple[Status, ...] = ("diverges", "harmless", "agrees", "not given")
+    worst = min(rows, key=lambda row: (order.index(row.status), -_excess(row)))
+    is_first = first is not None and worst.stage == first.stage
+    where = f"{worst.scene}: " if len(rows) > 1 and worst.status in ("diverges", "harmless") else ""
+    return Case(
+        name=worst.stage,
+        passed=worst.status != "diverges",
+        figures={"result": "DIVERGES FIRST" if is_first else worst.status, **_figures(rows)},
+        note=f"{where}{worst.note}".removesuffix(": ") if worst.note or where else "",
+    )
+
+
+def _figures(rows: list[Row]) -> dict[str, Figure]:
+    """Largest errors and summed counts of a stage."""
+    figures: dict[str, Figure] = {}
+    differences = [row.difference for row in rows if row.difference is not None]
+    bounds = [row.bounds for row in rows if row.bounds is not None]
+    if differences:
+        worst = max(differences, key=lambda d: d.excess)
+        figures = {
+            "max error": worst.max_error,
+            "RMS": worst.rms_error,
+            "relative": worst.relative,
+            "allowed": worst.tolerance,
+            "over": sum(d.n_over for d in differences),
+            "of": sum(d.n for d in differences),
+        }
+    if bounds:
+        figures = {"over": sum(b.n_different for b in bounds), "of": sum(b.n for b in bounds)}
+    if any(row.stage in ("T", "image") for row in rows) and differences:
+        figures["flips"] = sum(d.n_flips for d in differences)
+        figures["candidates"] = sum(row.n_candidates for row in rows)
+    return figures
+
+
+def _excess(row: Row) -> float:
+    return row.difference.excess if row.difference is not None else 0.0
+
+
+def _finite(value: Any) -> Any:
+    return str(value) if isinstance(value, float) and not np.isfinite(value) else value
