@@ -1,4 +1,4 @@
-"""``oracle compare``: where does another renderer differ from the reference?"""
+"""``oracle compare``: names the stage in which another renderer differs from the reference."""
 
 import argparse
 
@@ -95,7 +95,10 @@ def run(args: argparse.Namespace) -> int:
         "conventions": {name: scene.conventions.name for name, scene in scenes.items()},
         "left_out": list(left_out),
     }
-    code = publish(as_report(renderer, rows, settings), args.json)
+    report = as_report(renderer, rows, settings)
+    code = publish(report, args.json)
+    if report.settings["not_given"]:
+        print(f"not given: {', '.join(report.settings['not_given'])}")
     if left_out:
         print(f"left out, since {renderer.name} follows other conventions: {', '.join(left_out)}")
     return code

@@ -4,11 +4,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from minisplat_ref.backends import BACKENDS
-from minisplat_ref.constants import PROFILES, Conventions
+from minisplat_ref.constants import GSPLAT_1_5, PROFILES, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.comparison.dumps import from_dumps
 from minisplat_ref.oracle.comparison.own import by_profile, from_backend, with_planted_error
 from minisplat_ref.oracle.comparison.renderers import Renderer
+from minisplat_ref.oracle.golden.arrays import SPECS, Arrays
 from minisplat_ref.oracle.golden.files import load
 from minisplat_ref.oracle.golden.scenes import RECIPES, Golden, inputs
 from minisplat_ref.oracle.golden.stages import truth
@@ -16,9 +17,15 @@ from minisplat_ref.oracle.planted import PLANTED
 
 
 def _gsplat_torch(dtype: str) -> Renderer:
-    from minisplat_ref.oracle.comparison.gsplat_torch import gsplat_torch
+    from minisplat_ref.oracle.comparison.gsplat_cuda import rules_of
+    from minisplat_ref.oracle.peers.gsplat_torch import gsplat_torch
 
-    return gsplat_torch(dtype)
+    renderer = from_backend(gsplat_torch(), dtype)
+
+    def arrays(scene: Golden) -> Arrays:
+        return {name: a for name, a in renderer.arrays(scene).items() if SPECS[name].stage != "loss"}  # not gsplat's
+
+    return renderer._replace(arrays=arrays, rules=rules_of(GSPLAT_1_5))
 
 
 def _gsplat() -> Renderer:

@@ -116,17 +116,17 @@ def first_divergence(rows: Iterable[Row]) -> Row | None:
 
 
 def as_report(renderer: Renderer, rows: list[Row], settings: Mapping[str, Any]) -> Report:
-    """One case for each stage, with the scene where it is furthest off."""
+    """One case for each stage that was given, with the scene where it is furthest off."""
     scenes = list(dict.fromkeys(row.scene for row in rows))
     first = first_divergence(rows)
-    n_given = sum(any(r.stage == stage and r.status != "not given" for r in rows) for stage in STAGES)
+    given = [stage for stage in STAGES if any(r.stage == stage and r.status != "not given" for r in rows)]
     verdict = (
-        f"all {n_given} stages that it gives agree"
+        f"all {len(given)} stages that it gives agree"
         if first is None
         else f"the first stage that diverges is {first.stage}, in scene {first.scene}"
     )
     where = f"scene {scenes[0]}" if len(scenes) == 1 else f"{len(scenes)} scenes"
-    cases = [_case([row for row in rows if row.stage == stage], first) for stage in STAGES]
+    cases = [_case([row for row in rows if row.stage == stage], first) for stage in given]
     details = [{"scene": row.scene, "stage": row.stage, "result": row.status, **_figures([row])} for row in rows]
     return Report(
         title=f"{renderer.name} against the reference, {where}: {verdict}",
@@ -135,6 +135,7 @@ def as_report(renderer: Renderer, rows: list[Row], settings: Mapping[str, Any]) 
             **settings,
             "renderer": renderer.name,
             "fed_with_truth": renderer.is_staged,
+            "not_given": [stage for stage in STAGES if stage not in given],
             "first_divergence": None if first is None else {"stage": first.stage, "scene": first.scene},
             "scenes": [{k: _finite(v) for k, v in detail.items()} for detail in details],
         },
