@@ -1,41 +1,9 @@
-"""Central differences against analytic gradients, refusing to pass on nothing.
-
-A function under test maps arrays to a tuple of arrays. Differences are taken in float64 with a step that keeps both the
-truncation (step^2) and the rounding (1e-16 / step) near 1e-10.
-"""
+"""The oracle's differences as assertions with the tests' tolerances; functions here have no thresholds to report."""
 
 import numpy as np
 from tolerances import GRADIENT_FLOOR, GRADIENT_REL, GRADIENT_STEP
 
-
-def inner(a, b):
-    """Sum of products over two tuples of arrays."""
-    return sum(float(np.vdot(x, y)) for x, y in zip(a, b, strict=True))
-
-
-def numeric_jacobian(function, inputs, index, step=GRADIENT_STEP):
-    """Derivatives [n_outputs, n_inputs] of all outputs by the entries of one input, by central differences."""
-    columns = []
-    for k in range(inputs[index].size):
-        sides = []
-        for sign in (1, -1):
-            moved = list(inputs)
-            moved[index] = moved[index].copy()
-            moved[index].flat[k] += sign * step
-            sides.append(np.concatenate([np.ravel(output) for output in function(*moved)]))
-        columns.append((sides[0] - sides[1]) / (2 * step))
-    return np.stack(columns, axis=1)
-
-
-def analytic_jacobian(vjp, outputs, index):
-    """The same from one call of the VJP for every output entry."""
-    rows = []
-    for o, output in enumerate(outputs):
-        for k in range(np.size(output)):
-            cotangents = [np.zeros_like(np.asarray(other, dtype=float)) for other in outputs]
-            cotangents[o].flat[k] = 1
-            rows.append(np.ravel(vjp(*cotangents)[index]))
-    return np.stack(rows)
+from minisplat_ref.oracle.differences import CENTRAL, Point, analytic_jacobians, derivative, inner
 
 
 def check_jacobian(function, vjp, inputs, *, names, rel=GRADIENT_REL):
@@ -43,13 +11,22 @@ def check_jacobian(function, vjp, inputs, *, names, rel=GRADIENT_REL):
 
     `function(*inputs)` returns a tuple of arrays, `vjp(*cotangents)` a tuple of gradients in the order of the inputs.
     """
-    outputs = function(*inputs)
+
+    def point(*moved):
+        return Point(function(*moved))
+
+    analytic = analytic_jacobians(vjp, function(*inputs))
     for index, name in enumerate(names):
-        numeric = numeric_jacobian(function, inputs, index)
-        analytic = analytic_jacobian(vjp, outputs, index)
+        columns = []
+        for k in range(inputs[index].size):
+            direction = np.zeros_like(inputs[index])
+            direction.flat[k] = 1
+            outputs = derivative(point, inputs, index, direction, GRADIENT_STEP, CENTRAL)
+            columns.append(np.concatenate([np.ravel(output) for output in outputs]))
+        numeric = np.stack(columns, axis=1)
         size = np.abs(numeric).max()
         assert size > GRADIENT_FLOOR, f"the Jacobian by {name} is zero: nothing was checked"
-        error = np.abs(analytic - numeric).max() / size
+        error = np.abs(analytic[index] - numeric).max() / size
         assert error <= rel, f"Jacobian by {name}: relative error {error:.1e}"
 
 
@@ -60,14 +37,8 @@ def check_inner_products(function, gradients, inputs, cotangents, rng, *, names,
     """
     for index, name in enumerate(names):
         direction = rng.uniform(-1, 1, size=inputs[index].shape)
-        sides = []
-        for sign in (1, -1):
-            moved = list(inputs)
-            moved[index] = moved[index] + sign * step * direction
-            sides.append(function(*moved))
-        numeric = (inner(cotangents, sides[0]) - inner(cotangents, sides[1])) / (2 * step)
-        analytic = float(np.vdot(gradients[index], direction))
-        # The scale is that of the terms of the sum, so a direction that happens to cancel is not judged by its rest.
+        outputs = derivative(lambda *moved: Point(function(*moved)), inputs, index, direction, step, CENTRAL)
+        numeric, analytic = inner(cotangents, outputs), float(np.vdot(gradients[index], direction))
         size = float(np.abs(gradients[index] * direction).sum())
         assert size > GRADIENT_FLOOR, f"the gradient by {name} is zero: nothing was checked"
         assert abs(analytic - numeric) <= rel * size, f"gradient by {name}: {analytic} against {numeric}"

@@ -9,6 +9,9 @@ GRADIENT_REL_NEAR_THRESHOLD = 1e-6
 # A block of a Jacobian or a gradient below this is vacuous or meant to be zero: real ones here are 1e-4 to 1e3.
 GRADIENT_FLOOR = 1e-6
 
+# gsplat's torch functions in float64, with a stage's input in common: 1e-16 times condition numbers up to 1e3.
+PEER_REL = 1e-9
+
 # Alpha must cover this part of an image before a check on it says anything.
 COVERAGE_MIN = 0.05
 

@@ -1,0 +1,146 @@
+"""The gradient proof: each stage of a backend by full Jacobians, by inner products and against automatic derivatives.
+
+Full Jacobians on a tiny scene see every entry of every gradient, also those that a random direction would cancel; inner
+products on a larger one see many tiles and long lists. A check that could not fail is a failure: nothing in the image,
+a gradient of zero, a column that no step could reach without crossing a threshold.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from minisplat_ref.backends import REFERENCE, Backend
+from minisplat_ref.constants import GSPLAT_1_5, Conventions
+from minisplat_ref.errors import InputError
+from minisplat_ref.oracle.cases import Case, Report
+from minisplat_ref.oracle.differences import STEPS, check_inner_products, check_jacobians
+from minisplat_ref.oracle.pieces import PIECES, SEED, tiny_setting
+from minisplat_ref.oracle.stages import Stage, backend_stages, composite_stage, make_setting, project_stage, sh_stage
+from minisplat_ref.oracle.tolerances import (
+    COVERAGE_MIN,
+    GRADIENT_FLOOR,
+    GRADIENT_REL,
+    GRADIENT_REL_NEAR_THRESHOLD,
+    PEER_REL,
+)
+from minisplat_ref.types import Floats
+
+AUTOGRAD = "torch autograd"
+"""Setting of the report: what was compared with, or why nothing was."""
+
+MANY_STEPS = STEPS[2:]  # among thousands of hits some cross a threshold at any larger step
+
+
+def check_gradients(backend: Backend, conventions: Conventions) -> Report:
+    """Check all stages of a backend.
+
+    Parameters
+    ----------
+    backend : Backend
+        Whose forward and backward functions have to fit; in float64.
+    conventions : Conventions
+        Profile to do it under. The comparison with gsplat is done under gsplat's.
+
+    Returns
+    -------
+    Report
+        A case for each stage and way of checking; the formulas below the stages, too, for the reference.
+    """
+    rng = np.random.default_rng(SEED)
+    tiny, larger = tiny_setting(conventions), make_setting(rng, 60, 40, 30, conventions, sh_degree=3)
+    cases = [jacobian_case(stage) for stage in backend_stages(backend, tiny, rng)]
+    if backend is REFERENCE:
+        done = {case.name for case in cases}
+        pieces = [stage for module, pieces_of in PIECES.items() for stage in pieces_of(module)]
+        cases += [jacobian_case(stage) for stage in pieces if f"{stage.name}: Jacobian" not in done]
+    cases += [inner_product_case(stage, rng) for stage in backend_stages(backend, larger, rng)]
+    settings = {"backend": backend.name, "profile": conventions.name, "dtype": "float64", "seed": SEED}
+    try:
+        cases += autograd_cases(backend)
+        settings[AUTOGRAD] = "through gsplat's functions, profile GSPLAT_1_5"
+    except InputError as error:
+        settings[AUTOGRAD] = f"not run: {error}"
+    return Report(f"gradients of {backend.name}, profile {conventions.name}, float64", tuple(cases), settings)
+
+
+def jacobian_case(stage: Stage) -> Case:
+    """Full Jacobians of a stage, by its VJP and by differences."""
+    inputs, outputs = list(stage.inputs.values()), stage.function(*stage.inputs.values()).outputs
+    check = check_jacobians(
+        stage.function, stage.vjp, inputs, names=list(stage.inputs), output_names=list(stage.outputs)
+    )
+    limit = _limit(check.step)
+    problems = [f"d {block.output} / d {block.input} is wrong" for block in check.blocks if not block.error <= limit]
+    problems += [f"nothing was checked about {name}" for name in check.vacuous]
+    problems += [f"{check.n_refused} columns cross a threshold at every step"] if check.n_refused else []
+    figures = {
+        "error": max((block.error for block in check.blocks), default=np.nan),
+        "limit": limit,
+        "step": check.step,
+        "entries": sum(map(np.size, outputs)) * sum(map(np.size, inputs)),
+        "least block": min((block.size for block in check.blocks if not block.is_zero), default=0.0),
+    }
+    return _case(f"{stage.name}: Jacobian", stage, outputs, figures, problems)
+
+
+def inner_product_case(stage: Stage, rng: np.random.Generator) -> Case:
+    """Directional derivatives of a stage, one for each input."""
+    inputs, outputs = list(stage.inputs.values()), stage.function(*stage.inputs.values()).outputs
+    products = check_inner_products(stage.function, stage.vjp, inputs, rng, names=list(stage.inputs), steps=MANY_STEPS)
+    problems = [f"{p.input}: every step crosses a threshold" for p in products if p.step == 0]
+    problems += [f"the gradient by {p.input} is zero" for p in products if p.size <= GRADIENT_FLOOR]
+    problems += [f"gradient by {p.input} is wrong" for p in products if p.step > 0 and not p.error <= _limit(p.step)]
+    step = min(p.step for p in products)
+    figures = {
+        "error": max(p.error for p in products),
+        "limit": _limit(step),
+        "step": step,
+        "entries": sum(map(np.size, outputs)) * sum(map(np.size, inputs)),
+        "least block": min(p.size for p in products),
+    }
+    return _case(f"{stage.name}: inner products", stage, outputs, figures, problems)
+
+
+def autograd_cases(backend: Backend) -> list[Case]:
+    """Gradients of projection, colours and compositing beside torch's own, through gsplat's functions.
+
+    Raises
+    ------
+    InputError
+        If torch or gsplat is not installed.
+    """
+    from minisplat_ref.oracle.peers.gsplat_torch import gsplat_torch
+
+    peer = gsplat_torch()
+    setting = make_setting(np.random.default_rng(SEED), 20, 20, 15, GSPLAT_1_5, sh_degree=3)
+    cases = []
+    for make_stage in (project_stage, sh_stage, composite_stage):
+        ours, theirs = make_stage(backend, setting), make_stage(peer, setting)
+        outputs = ours.function(*ours.inputs.values()).outputs
+        rng = np.random.default_rng(SEED)
+        cotangents = [rng.normal(size=np.shape(output)) for output in outputs]
+        gradients = zip(ours.vjp(*cotangents), theirs.vjp(*cotangents), strict=True)
+        errors = [_relative(got, expected) for got, expected in gradients]
+        wrong = zip(ours.inputs, errors, strict=True)
+        problems = [f"gradient by {name} differs" for name, error in wrong if not error <= PEER_REL]
+        figures = {"error": max(errors), "limit": PEER_REL}
+        cases.append(_case(f"{ours.name}: {AUTOGRAD}", ours, outputs, figures, problems))
+    return cases
+
+
+def _case(name: str, stage: Stage, outputs: Sequence[Floats], figures: dict[str, float], problems: list[str]) -> Case:
+    named = dict(zip(stage.outputs, outputs, strict=True))
+    if "alpha" in named:
+        coverage = float(named["alpha"].mean())
+        figures = {**figures, "mean alpha": coverage}
+        problems = [*problems, "the image is all but empty"] if coverage < COVERAGE_MIN else problems
+    return Case(name, not problems, dict(figures), "; ".join(problems))
+
+
+def _limit(step: float) -> float:
+    return GRADIENT_REL if step >= min(MANY_STEPS[:1]) else GRADIENT_REL_NEAR_THRESHOLD
+
+
+def _relative(got: Floats, expected: Floats) -> float:
+    size = float(np.abs(expected).max())
+    return float(np.abs(got - expected).max()) / (size if size > GRADIENT_FLOOR else 1.0)

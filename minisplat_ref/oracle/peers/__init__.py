@@ -1,0 +1,1 @@
+"""Other renderers, called through their own functions."""

@@ -1,0 +1,213 @@
+"""The reference's formulas one by one, below the stages: what a stage's gradient is built of.
+
+Each function here takes a module of :mod:`minisplat_ref.reference`, so that a copy of it with an error in one place can
+be put in; the tests do that with every operator of every gradient.
+"""
+
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from minisplat_ref import reference, render, splatting
+from minisplat_ref.constants import COMPENSATION_FLOOR, GSPLAT_MAIN, Conventions
+from minisplat_ref.oracle.differences import Point
+from minisplat_ref.oracle.stages import (
+    Setting,
+    Stage,
+    composite_stage,
+    geometric_stage,
+    make_setting,
+    photometric_stage,
+    points_near,
+    project_stage,
+    render_stage,
+    sh_stage,
+    splat_stage,
+    surface_stage,
+    with_module,
+)
+from minisplat_ref.types import Floats
+
+Module = Any
+"""A module, or a changed copy of it."""
+SEED = 20240229
+
+
+def tiny_setting(conventions: Conventions = GSPLAT_MAIN, sh_degree: int = 1) -> Setting:
+    """Five Gaussians in 9 x 7 pixels."""
+    return make_setting(np.random.default_rng(SEED), 5, 9, 7, conventions, sh_degree)
+
+
+def covariance_pieces(m: Module) -> tuple[Stage, ...]:
+    """``rotation_matrices`` and ``covariances``."""
+    rng = np.random.default_rng(SEED)
+    quats, scales = rng.normal(size=(2, 4)), rng.uniform(0.3, 2, size=(2, 3))
+    return (
+        Stage(
+            "rotation_matrices",
+            {"quats": quats},
+            ("rotations",),
+            lambda quats: Point((m.rotation_matrices(quats),)),
+            lambda v: (m.rotation_matrices_vjp(quats, v),),
+        ),
+        Stage(
+            "covariances",
+            {"quats": quats, "scales": scales},
+            ("covariances",),
+            lambda quats, scales: Point((m.covariances(quats, scales),)),
+            lambda v: m.covariances_vjp(quats, scales, v),
+        ),
+    )
+
+
+def pinhole_pieces(m: Module) -> tuple[Stage, ...]:
+    """``pinhole`` and its Jacobian, inside and outside the clamp, on either side of each axis."""
+    camera = tiny_setting().camera
+    points = np.array([[0.2, -0.3, 2.0], [3.0, 0.2, 2.5], [-0.4, -2.0, 1.5], [-4.0, 5.0, 3.0]])
+    limits = m.slope_limits(camera, GSPLAT_MAIN, points.dtype)
+
+    def jacobians(points: Floats) -> Point:
+        slopes = points[:, :2] / points[:, 2:]
+        return Point((m.pinhole_jacobians(points, camera, *limits),), (limits[0] < slopes, slopes < limits[1]))
+
+    return (
+        Stage(
+            "pinhole",
+            {"means_cam": points},
+            ("means2d",),
+            lambda points: Point((m.pinhole(points, camera),)),
+            lambda v: (m.pinhole_vjp(points, camera, v),),
+        ),
+        Stage(
+            "pinhole_jacobians",
+            {"means_cam": points},
+            ("jacobians",),
+            jacobians,
+            lambda v: (m.pinhole_jacobians_vjp(points, camera, *limits, v),),
+        ),
+    )
+
+
+def antialiasing_pieces(m: Module) -> tuple[Stage, ...]:
+    """``compensations``, above and on their floor."""
+    blur = GSPLAT_MAIN.eps2d * np.eye(2)
+    sharp = np.array([[[1.5, 0.4], [0.4, 0.7]], [[0.2, -0.05], [-0.05, 0.1]], [[1e-3, 0.0], [0.0, 1e-3]]])
+
+    def function(sharp: Floats) -> Point:
+        rho = m.compensations(sharp, sharp + blur)
+        return Point((rho,), (rho > COMPENSATION_FLOOR,))
+
+    def vjp(v: Floats) -> tuple[Floats, ...]:
+        return (m.compensations_vjp(sharp, sharp + blur, v),)
+
+    return (Stage("compensations", {"covariances2d": sharp}, ("compensations",), function, vjp),)
+
+
+def ssim_pieces(m: Module) -> tuple[Stage, ...]:
+    """``ssim_map``, and the loss."""
+    rng = np.random.default_rng(SEED)
+    image, target = rng.uniform(size=(2, 6, 5, 1))
+    ssim = Stage(
+        "ssim_map",
+        {"image": image},
+        ("ssim",),
+        lambda image: Point((m.ssim_map(image, target),)),
+        lambda v: (m.ssim_map_vjp(image, target, v),),
+    )
+    stages = with_module(photometric_loss=m.photometric_loss, photometric_loss_vjp=m.photometric_loss_vjp)
+    return ssim, photometric_stage(stages, tiny_setting().camera, rng)
+
+
+def depth_map_pieces(m: Module) -> tuple[Stage, ...]:
+    """``expected_depth`` and ``depth_normals``; one pixel has no depth."""
+    rng, camera = np.random.default_rng(SEED), tiny_setting().camera
+    depth, alpha = rng.uniform(2, 3, size=(4, 5)), rng.uniform(0.3, 1, size=(4, 5))
+    alpha[3, 4] = 0.0
+    with_hole = np.where(alpha > 0, depth, 0)
+    has_depth = (alpha > 0).astype(float)  # a pixel that was not hit cannot be moved into a hit by a derivative
+
+    def expected(accumulated: Floats, alpha: Floats) -> Point:
+        return Point((m.expected_depth(accumulated * has_depth, alpha * has_depth),))
+
+    return (
+        Stage(
+            "expected_depth",
+            {"accumulated_depth": with_hole * alpha, "alpha": alpha},
+            ("depth",),
+            expected,
+            lambda v: m.expected_depth_vjp(with_hole * alpha, alpha, v),
+        ),
+        Stage(
+            "depth_normals",
+            {"depth": with_hole},
+            ("normals",),
+            lambda depth: Point((m.depth_normals(depth * has_depth, camera),)),
+            lambda v: (m.depth_normals_vjp(with_hole, camera, v),),
+        ),
+    )
+
+
+def geometric_pieces(m: Module) -> tuple[Stage, ...]:
+    """The three terms, and their sum."""
+    rng, camera = np.random.default_rng(SEED), tiny_setting().camera
+    depth, photograph = rng.uniform(2, 3, size=(7, 9)), rng.uniform(size=(7, 9, 3))
+    points = points_near(depth, camera, rng)
+    normals = rng.normal(size=(6, 8, 3))
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+
+    def term(name: str, array: Floats, input_name: str, *others: Any) -> Stage:
+        function, vjp = getattr(m, name), getattr(m, f"{name}_vjp")
+        return Stage(
+            name,
+            {input_name: array},
+            ("loss",),
+            lambda moved: Point((np.asarray(function(moved, *others)),)),
+            lambda v: (vjp(array, *others, float(v)),),
+        )
+
+    stages = with_module(geometric_loss=m.geometric_loss, geometric_loss_vjp=m.geometric_loss_vjp)
+    return (
+        term("sfm_depth_loss", depth, "depth", camera, points),
+        term("depth_smoothness", depth, "depth", photograph),
+        term("normal_smoothness", normals, "normals", photograph),
+        geometric_stage(stages, camera, rng),
+    )
+
+
+def _projection_pieces(m: Module) -> tuple[Stage, ...]:
+    stages, setting = with_module(project=m.project, project_vjp=m.project_vjp), tiny_setting()
+    antialiased = setting._replace(conventions=setting.conventions._replace(is_antialiased=True))
+    return project_stage(stages, setting), project_stage(stages, antialiased)
+
+
+def _sh_pieces(m: Module) -> tuple[Stage, ...]:
+    stages = with_module(sh_colors=m.sh_colors, sh_colors_vjp=m.sh_colors_vjp)
+    return (sh_stage(stages, tiny_setting(sh_degree=3)),)
+
+
+def _compositing_pieces(m: Module) -> tuple[Stage, ...]:
+    return (composite_stage(with_module(composite=m.composite, composite_vjp=m.composite_vjp), tiny_setting()),)
+
+
+def _depth_pieces(m: Module) -> tuple[Stage, ...]:
+    stages = with_module(surface_points=m.surface_points, surface_points_vjp=m.surface_points_vjp)
+    return (surface_stage(stages, tiny_setting()),)
+
+
+PIECES: dict[ModuleType, Callable[[Module], tuple[Stage, ...]]] = {
+    reference.covariance: covariance_pieces,
+    reference.pinhole: pinhole_pieces,
+    reference.antialiasing: antialiasing_pieces,
+    reference.projection: _projection_pieces,
+    reference.spherical_harmonics: _sh_pieces,
+    reference.compositing: _compositing_pieces,
+    reference.depth: _depth_pieces,
+    reference.loss: ssim_pieces,
+    reference.depth_map: depth_map_pieces,
+    reference.geometric_loss: geometric_pieces,
+    splatting: lambda m: (splat_stage(with_module(), tiny_setting(), m),),
+    render: lambda m: (render_stage(with_module(), tiny_setting(), m),),
+}
+"""Every module with gradients, and the stages that its functions are tested in."""

@@ -1,0 +1,372 @@
+"""Every differentiable stage of a backend as a function of arrays with its VJP, on a scene that leaves nothing out.
+
+The scene is small and drawn by hand where it matters: a hit that is clamped, a pixel that stops early, a mean outside
+the clamp of the Jacobian, a colour below zero, a principal point off centre and a turned camera, so that every branch
+of every gradient is taken. What is not differentiated (tile lists, dominant Gaussians, radii) is held as it is at the
+scene itself.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+
+from minisplat_ref import render as rendering
+from minisplat_ref import splatting
+from minisplat_ref.backends import REFERENCE, Backend
+from minisplat_ref.constants import Conventions
+from minisplat_ref.oracle.differences import Function, Point, Vjp
+from minisplat_ref.reference.covariance import rotation_matrices
+from minisplat_ref.reference.depth_map import expected_depth
+from minisplat_ref.reference.hits import tile_hits
+from minisplat_ref.reference.pinhole import pinhole_jacobians, pose, slope_limits, with_principal_point
+from minisplat_ref.splatting import Primitives
+from minisplat_ref.types import (
+    Camera,
+    Floats,
+    Gaussians,
+    GeometricWeights,
+    Projection,
+    ProjectionGradient,
+    TileBins,
+    TileGrid,
+)
+
+Sides = tuple[np.ndarray, ...]
+
+POSE = ("cam_from_world_R", "cam_from_world_t")
+PRIMITIVES = ("means", "quats", "scales", "opacities")
+
+
+class Stage(NamedTuple):
+    """A function under test, where it is tested."""
+
+    name: str
+    inputs: dict[str, Floats]
+    """By name, in the order of the arguments; float64."""
+    outputs: tuple[str, ...]
+    """Names, in the order of the results."""
+    function: Function
+    vjp: Vjp
+    """At ``inputs``."""
+
+
+class Setting(NamedTuple):
+    """What a stage is tested on."""
+
+    gaussians: Gaussians
+    camera: Camera
+    background: Floats
+    conventions: Conventions
+
+    @property
+    def primitives(self) -> Primitives:
+        """The Gaussians, activated."""
+        g = self.gaussians
+        return Primitives(g.means, g.quats, np.exp(g.log_scales), 1 / (1 + np.exp(-g.opacity_logits)))
+
+    @property
+    def pose(self) -> dict[str, Floats]:
+        """What moves the camera."""
+        return dict(zip(POSE, pose(self.camera, np.dtype(float)), strict=True))
+
+
+def make_setting(
+    rng: np.random.Generator, n: int, width: int, height: int, conventions: Conventions, sh_degree: int
+) -> Setting:
+    """Draw a scene.
+
+    Parameters
+    ----------
+    rng : Generator
+        For all but the Gaussians that are placed on purpose: row 0 is opaque and on a pixel's centre, rows 1 and 2 lie
+        behind it, row 3 is beyond the clamp of the Jacobian.
+    n : int
+        Gaussians, at least 5.
+    width, height : int
+        Image, pixels.
+    conventions : Conventions
+        Where its gradient is not the derivative of what is computed, as for INRIA's clamp, no alpha is clamped.
+    sh_degree : int
+        Stored and active.
+
+    Returns
+    -------
+    Setting
+        Float64.
+    """
+    fx, fy = 1.2 * width, 1.1 * width
+    R = rotation_matrices(np.array([[1.0, 0.12, -0.07, 0.05]]))[0]
+    camera = Camera(R, np.array([0.1, -0.2, 0.15]), fx, fy, 0.53 * width, 0.46 * height, width, height)
+    seen = with_principal_point(camera, conventions)
+    half_view = np.array([width / fx, height / fy]) / 2
+
+    z = 3 + rng.uniform(-0.8, 0.8, size=n)
+    slopes = rng.uniform(-1, 1, size=(n, 2)) * half_view
+    center = (np.array([width // 2 + 0.54, height // 2 + 0.47]) - (seen.cx, seen.cy)) / (fx, fy)
+    slopes[:3] = center + rng.uniform(-0.02, 0.02, size=(3, 2)) * [[0], [1], [1]]
+    z[:3] = 2.0, 2.3, 2.6
+    _, beyond = slope_limits(seen, conventions, np.dtype(float))
+    slopes[3] = beyond[0] + 0.03, 0.1 * beyond[1]
+    in_camera = np.column_stack([slopes * z[:, None], z])
+
+    log_scales = np.log(0.15 if n > 20 else 0.3) + rng.uniform(-0.5, 0.5, size=(n, 3))
+    log_scales[:4] += np.log([1.5, 1.5, 1.5, 2.5])[:, None]
+    logits = rng.normal(size=n)
+    has_derivative = conventions.clamp_stops_mean_gradient and conventions.clamp_stops_shape_gradient
+    logits[:3] = 6.0 if has_derivative else 4.0, 4.0, 4.0  # opacities 0.998 or 0.982, then 0.982
+    sh_dc = rng.normal(size=(n, 3))
+    sh_dc[1, 1] = -4.0  # a colour of 0.5 - 4 SH_C0 < 0
+    gaussians = Gaussians(
+        means=(in_camera - camera.cam_from_world_t) @ R,
+        quats=rng.normal(size=(n, 4)),
+        log_scales=log_scales,
+        opacity_logits=logits,
+        sh_dc=sh_dc,
+        sh_rest=0.2 * rng.normal(size=(n, (sh_degree + 1) ** 2 - 1, 3)),
+    )
+    return Setting(gaussians, camera, rng.uniform(0.2, 1, size=3), conventions)
+
+
+def backend_stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
+    """All differentiable stages of a backend, and the whole render.
+
+    Parameters
+    ----------
+    backend : Backend
+        Whose forward and backward functions are tested.
+    setting : Setting
+        On what.
+    rng : Generator
+        For photographs and depth maps.
+
+    Returns
+    -------
+    tuple of Stage
+        In the order of the pipeline.
+    """
+    antialiased = setting._replace(conventions=setting.conventions._replace(is_antialiased=True))
+    return (
+        project_stage(backend, setting),
+        project_stage(backend, antialiased)._replace(name="project antialiased"),
+        sh_stage(backend, setting),
+        composite_stage(backend, setting),
+        surface_stage(backend, setting),
+        photometric_stage(backend, setting.camera, rng),
+        geometric_stage(backend, setting.camera, rng),
+        render_stage(backend, setting),
+    )
+
+
+def project_stage(backend: Backend, setting: Setting) -> Stage:
+    """``project`` by Gaussians and pose."""
+    _, camera, _, conventions = setting
+    inputs = {**setting.primitives._asdict(), **setting.pose}
+
+    def function(means: Floats, quats: Floats, scales: Floats, opacities: Floats, R: Floats, t: Floats) -> Point:
+        moved = _moved(camera, R, t)
+        p = backend.project(means, quats, scales, opacities, moved, conventions)
+        return Point(
+            (p.means2d, p.depths, p.conics, p.opacities), (p.radii > 0, _slope_sides(means, moved, conventions))
+        )
+
+    def vjp(*cotangents: Floats) -> tuple[Floats, ...]:
+        projection = backend.project(*setting.primitives, camera, conventions)
+        return backend.project_vjp(
+            *setting.primitives, camera, conventions, projection, ProjectionGradient(*cotangents)
+        )
+
+    return Stage("project", inputs, ProjectionGradient._fields, function, vjp)
+
+
+def sh_stage(backend: Backend, setting: Setting) -> Stage:
+    """``sh_colors`` by means, coefficients and pose."""
+    g, camera = setting.gaussians, setting.camera
+    radii = backend.project(*setting.primitives, camera, setting.conventions).radii
+    degree = int(np.sqrt(g.sh_rest.shape[1] + 1)) - 1
+    inputs = {"means": g.means, "sh_dc": g.sh_dc, "sh_rest": g.sh_rest, **setting.pose}
+
+    def function(means: Floats, sh_dc: Floats, sh_rest: Floats, R: Floats, t: Floats) -> Point:
+        colors = backend.sh_colors(means, sh_dc, sh_rest, _moved(camera, R, t), degree, radii)
+        return Point((colors,), (colors > 0,))
+
+    def vjp(v_colors: Floats) -> tuple[Floats, ...]:
+        return backend.sh_colors_vjp(g.means, g.sh_dc, g.sh_rest, camera, degree, radii, v_colors)
+
+    return Stage("sh_colors", inputs, ("colors",), function, vjp)
+
+
+def composite_stage(backend: Backend, setting: Setting) -> Stage:
+    """``composite`` by footprints, opacities, three channels and background; tile lists and boxes are held."""
+    projection, bins, colors = _composited(backend, setting)
+    conventions, background = setting.conventions, setting.background
+    inputs = {
+        "means2d": projection.means2d,
+        "conics": projection.conics,
+        "opacities": projection.opacities,
+        "colors": colors,
+        "background": background,
+    }
+
+    def function(means2d: Floats, conics: Floats, opacities: Floats, colors: Floats, background: Floats) -> Point:
+        p = projection._replace(means2d=means2d, conics=conics, opacities=opacities)
+        output = backend.composite(p, colors, background, bins, conventions)
+        return Point((output.image, output.alpha), _hit_sides(p, bins, conventions))
+
+    def vjp(v_image: Floats, v_alpha: Floats) -> tuple[Floats, ...]:
+        output = backend.composite(projection, colors, background, bins, conventions)
+        return backend.composite_vjp(projection, colors, background, bins, conventions, output, v_image, v_alpha)
+
+    return Stage("composite", inputs, ("image", "alpha"), function, vjp)
+
+
+def surface_stage(backend: Backend, setting: Setting) -> Stage:
+    """``surface_points`` by Gaussians, for the dominant Gaussians of the view."""
+    projection, bins, colors = _composited(backend, setting)
+    output = backend.composite(projection, colors, setting.background, bins, setting.conventions, with_stats=True)
+    ids, camera = output.stats.dominant_ids, setting.camera  # type: ignore[union-attr]  # stats were asked for
+    inputs = {name: getattr(setting.primitives, name) for name in PRIMITIVES[:3]}
+
+    def function(means: Floats, quats: Floats, scales: Floats) -> Point:
+        surface = backend.surface_points(means, quats, scales, camera, ids)
+        return Point(tuple(surface), (surface.depths > 0,))
+
+    def vjp(v_points: Floats, v_depths: Floats) -> tuple[Floats, ...]:
+        return backend.surface_points_vjp(*inputs.values(), camera, ids, v_points, v_depths)
+
+    return Stage("surface_points", inputs, ("points", "depths"), function, vjp)
+
+
+def photometric_stage(backend: Backend, camera: Camera, rng: np.random.Generator) -> Stage:
+    """``photometric_loss`` by the image, some pixels masked out."""
+    shape = camera.height, camera.width, 3
+    target, image = rng.uniform(size=shape), rng.uniform(size=shape)
+    mask = rng.uniform(size=shape[:2]) < 0.8
+
+    def function(image: Floats) -> Point:
+        loss, _ = backend.photometric_loss(image, target, 0.2, mask)
+        return Point((np.asarray(loss),), (np.sign(image - target),))
+
+    def vjp(v_loss: Floats) -> tuple[Floats, ...]:
+        _, tape = backend.photometric_loss(image, target, 0.2, mask)
+        return (backend.photometric_loss_vjp(tape, float(v_loss)),)
+
+    return Stage("photometric_loss", {"image": image}, ("loss",), function, vjp)
+
+
+def geometric_stage(backend: Backend, camera: Camera, rng: np.random.Generator) -> Stage:
+    """``geometric_loss`` with all its terms by accumulated depth and opacity, one pixel masked out."""
+    shape = camera.height, camera.width
+    depth, alpha = rng.uniform(2, 3, size=shape), rng.uniform(0.3, 1, size=shape)
+    photograph = rng.uniform(size=(*shape, 3))
+    points, weights = points_near(depth, camera, rng), GeometricWeights(0.7, 1.3, 0.9)
+    mask = np.ones(shape, dtype=bool)
+    mask[1, 1] = False
+    inputs = {"accumulated_depth": depth * alpha, "alpha": alpha}
+
+    def function(accumulated_depth: Floats, alpha: Floats) -> Point:
+        loss, _ = backend.geometric_loss(accumulated_depth, alpha, photograph, camera, points, weights, mask)
+        depth = expected_depth(accumulated_depth, alpha)
+        return Point((np.asarray(loss),), tuple(np.sign(np.diff(depth, axis=axis)) for axis in (0, 1)))
+
+    def vjp(v_loss: Floats) -> tuple[Floats, ...]:
+        _, tape = backend.geometric_loss(*inputs.values(), photograph, camera, points, weights, mask)
+        return backend.geometric_loss_vjp(tape, float(v_loss))
+
+    return Stage("geometric_loss", inputs, ("loss",), function, vjp)
+
+
+def points_near(depth: Floats, camera: Camera, rng: np.random.Generator) -> Floats:
+    """Points [6, 3], world frame, in front of and behind a depth map: by 0.3 % and by 6 %, Huber's two regimes."""
+    rows, columns = (rng.choice(size, 6, replace=size < 6) for size in depth.shape)
+    z = depth[rows, columns] * (1 + np.array([0.003, -0.004, 0.002, 0.06, -0.06, 0.05]))
+    pixels = np.column_stack([columns, rows]) + 0.5
+    slopes = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    in_camera = np.column_stack([slopes * z[:, None], z])
+    return (in_camera - camera.cam_from_world_t) @ camera.cam_from_world_R
+
+
+def splat_stage(backend: Backend, setting: Setting, module: object = splatting) -> Stage:
+    """``splat`` with depth, by activated Gaussians, colours, background and pose."""
+    _, _, colors = _composited(backend, setting)
+    _, camera, background, conventions = setting
+    inputs = {**setting.primitives._asdict(), "colors": colors, "background": background, **setting.pose}
+
+    def tape_of(*args: Floats) -> splatting.SplatTape:
+        *primitives, colors, background, R, t = args
+        view = Primitives(*primitives), lambda radii: colors, _moved(camera, R, t), background, conventions, backend
+        return module.splat(*view, with_depth=True)  # type: ignore[attr-defined]
+
+    def vjp(v_image: Floats, v_alpha: Floats) -> tuple[Floats, ...]:
+        v = module.splat_vjp(tape_of(*inputs.values()), v_image, v_alpha)  # type: ignore[attr-defined]
+        return (*v.primitives[:4], v.colors, v.background, *v.primitives[4:])
+
+    return Stage("splat", inputs, ("image", "alpha"), lambda *args: _view_point(tape_of(*args)), vjp)
+
+
+def render_stage(backend: Backend, setting: Setting, module: object = rendering) -> Stage:
+    """``render`` with depth, by every trained parameter, background and pose."""
+    gaussians, camera, background, conventions = setting
+    inputs = {**gaussians._asdict(), "background": background, **setting.pose}
+
+    def tape_of(*args: Floats) -> rendering.RenderTape:
+        *parameters, background, R, t = args
+        _, tape = module.render(  # type: ignore[attr-defined]
+            Gaussians(*parameters),
+            _moved(camera, R, t),
+            background=background,
+            conventions=conventions,
+            backend=backend,
+            with_depth=True,
+        )
+        return tape
+
+    def function(*args: Floats) -> Point:
+        splats = tape_of(*args).splats
+        outputs, sides = _view_point(splats)
+        return Point(outputs, (*sides, splats.channels > 0))
+
+    def vjp(v_image: Floats, v_alpha: Floats) -> tuple[Floats, ...]:
+        v = module.render_vjp(tape_of(*inputs.values()), v_image, v_alpha)  # type: ignore[attr-defined]
+        return (*v.gaussians, v.background, v.cam_from_world_R, v.cam_from_world_t)
+
+    return Stage("render", inputs, ("image", "alpha"), function, vjp)
+
+
+def with_module(**functions: object) -> Backend:
+    """Return the reference with some of its stages replaced."""
+    return dataclasses.replace(REFERENCE, **functions)  # type: ignore[arg-type]
+
+
+def _moved(camera: Camera, R: Floats, t: Floats) -> Camera:
+    return camera._replace(cam_from_world_R=R, cam_from_world_t=t)
+
+
+def _composited(backend: Backend, setting: Setting) -> tuple[Projection, TileBins, Floats]:
+    """Footprints, tile lists and degree-0 colours of the scene, to start in the middle of the pipeline."""
+    camera, conventions = setting.camera, setting.conventions
+    projection = backend.project(*setting.primitives, camera, conventions)
+    grid = TileGrid(camera.width, camera.height, backend.tile_width, backend.tile_height)
+    return projection, backend.bin_gaussians(projection, grid, conventions), setting.gaussians.sh_dc
+
+
+def _view_point(tape: splatting.SplatTape) -> Point:
+    sides = _hit_sides(tape.projection, tape.bins, tape.conventions)
+    slopes = _slope_sides(tape.primitives.means, tape.camera, tape.conventions)
+    return Point((tape.output.image, tape.output.alpha), (*sides, slopes))
+
+
+def _hit_sides(projection: Projection, bins: TileBins, conventions: Conventions) -> Sides:
+    """Which Gaussians are listed, which hits are blended and which are clamped."""
+    tiles = list(tile_hits(projection, bins, conventions))
+    blended = np.concatenate([np.ravel(tile.alphas > 0) for tile in tiles])
+    return bins.gaussian_ids, bins.tile_offsets, blended, np.concatenate([np.ravel(tile.is_clamped) for tile in tiles])
+
+
+def _slope_sides(means: Floats, camera: Camera, conventions: Conventions) -> np.ndarray:
+    """Whether the Jacobian of each point's projection follows its slopes."""
+    camera = with_principal_point(camera, conventions)
+    R, t = pose(camera, means.dtype)
+    in_camera, limits = means @ R.T + t, np.full(2, np.inf)
+    free = pinhole_jacobians(in_camera, camera, -limits, limits)
+    return pinhole_jacobians(in_camera, camera, *slope_limits(camera, conventions, means.dtype)) == free
