@@ -110,3 +110,7 @@ SAMPLE_FREQUENCY = 0.04
 
 # Mean and covariance of 120 Gaussians, world units up to 3 (squared), by way of logarithms and eigenvectors.
 MERGED_MOMENTS = 1e-12
+
+# Largest error of a Chebyshev interpolant against the first term that it leaves out, relative: the later terms add some
+# percent, and the factor 2^f by which the relative error divides is between 0.7 and 1.4.
+BENCH_ROOM_FOR_EXPONENTIAL = 0.5
