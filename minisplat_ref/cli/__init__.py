@@ -16,9 +16,9 @@ from typing import NoReturn
 from minisplat_ref.cli.arguments import HelpFormatter
 from minisplat_ref.errors import InputError
 
-from . import compare, demo, evaluate, info, oracle, render, train
+from . import bench, compare, demo, evaluate, info, oracle, render, train
 
-COMMANDS = (demo, train, render, evaluate, compare, info, oracle)
+COMMANDS = (demo, train, render, evaluate, compare, info, oracle, bench)
 
 DESCRIPTION = """\
 3D Gaussian Splatting on the CPU: train a scene from photographs, look at it,

@@ -1,0 +1,231 @@
+"""``bench``: what each backend and precision costs in time and in error, measured in one run."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from minisplat_ref.cli.arguments import Commands, HelpFormatter, integer, listed, name
+from minisplat_ref.cli.oracle import add_json_argument
+from minisplat_ref.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from minisplat_ref.backends import Backend
+    from minisplat_ref.oracle.cases import Case, Report
+    from minisplat_ref.types import Scene
+
+DEFAULT_WORKLOADS = ("synth", "synth5k")
+DATA_WORKLOADS = ("garden", "garden20k")
+JSON, TABLE, FIGURE = "bench.json", "bench.md", "bench.png"
+WARM_UP = 5  # iterations that compile and are not timed
+ROOM: dict[str, Any] = {"n_views": 6, "width": 192, "height": 144, "n_points": 8000}  # where no scene is given
+
+DESCRIPTION = """\
+Time every backend and precision on fixed workloads, and measure its error
+against the float64 reference in the same run. What exceeds its bound of error
+has failed and gets no time.
+
+Columns of errors: of the whole image and gradient, and without the pixels at
+which a hit stands at a threshold (alpha 1/255, the stop, equal depths); two
+correct renderers differ there. "flips" counts those that did.
+
+Leave the machine alone meanwhile. Ratios inside one run mean something; times
+of two runs, or of two machines, do not compare.
+"""
+EPILOG = """\
+examples:
+  minisplat-ref bench --out bench
+  minisplat-ref bench --workloads synth5k --backends cpu-f32,textbook-f32
+  minisplat-ref bench --workloads garden --data test_garden.npz
+  minisplat-ref bench --stages
+  minisplat-ref bench --scene photos/fox --against opensplat=build/opensplat
+
+Exit codes: 0 all within their bounds, 1 something failed, 2 bad input."""
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "bench",
+        help="measure speed against error",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=HelpFormatter,
+    )
+    parser.add_argument(
+        "--workloads",
+        type=listed(name),
+        metavar="A,B",
+        help="synth, synth5k, garden, garden20k (default the first two, and all four with --data)",
+    )
+    parser.add_argument("--data", type=Path, metavar="FILE", help="test_garden.npz of gsplat's repository, for garden")
+    parser.add_argument(
+        "--backends", type=listed(name), metavar="A,B", help="contenders, like cpu-f32,textbook-f32 (default all)"
+    )
+    parser.add_argument("--repeats", type=integer(1), default=10, metavar="N", help="turns of each (default 10)")
+    parser.add_argument(
+        "--against",
+        type=listed(name),
+        default=(),
+        metavar="A,B",
+        help="gsplat-torch, opensplat=PROGRAM: peers to time in the same run",
+    )
+    parser.add_argument(
+        "--stages", action="store_true", help="instead: a training iteration by stages, and how far from the limits"
+    )
+    parser.add_argument(
+        "--scene", type=Path, metavar="SCENE", help="photographs, for --stages (default a made room) and opensplat"
+    )
+    parser.add_argument("--downscale", type=integer(1), default=1, metavar="K", help="of the photographs (default 1)")
+    parser.add_argument("--iterations", type=integer(1), default=100, metavar="N", help="of the scene (default 100)")
+    outputs = parser.add_mutually_exclusive_group()
+    outputs.add_argument("--out", type=Path, metavar="DIR", help=f"write {JSON}, {TABLE} and {FIGURE}")
+    add_json_argument(outputs)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, print the table, write what was asked for."""
+    from minisplat_ref.oracle.cases import save_json, verdict
+
+    report = _stages(args) if args.stages else _race(args)
+    print(f"{report.title}\n\n{_tables(report)}\n\n{verdict([report])}")
+    if args.json is not None:
+        save_json(report, args.json)
+    if args.out is not None:
+        _save_folder(report, args.out)
+    return 1 if report.n_failed else 0
+
+
+def _race(args: argparse.Namespace) -> "Report":
+    from minisplat_ref.oracle.bench.contenders import choose
+    from minisplat_ref.oracle.bench.peers import peers_of
+    from minisplat_ref.oracle.bench.race import race
+    from minisplat_ref.oracle.bench.workloads import get_workload
+    from minisplat_ref.oracle.cases import Report
+
+    peers, opensplat = peers_of(args.against)
+    if opensplat is not None and args.scene is None:
+        raise InputError("opensplat trains on photographs: give a scene with --scene")
+    contenders = [*choose(args.backends), *peers]
+    names = args.workloads or (*DEFAULT_WORKLOADS, *(DATA_WORKLOADS if args.data else ()))
+    workloads = [get_workload(workload, args.data) for workload in names]  # before the first one takes its time
+    cases = [case for workload in workloads for case in race(workload, contenders, args.repeats, _progress)]
+    if opensplat is not None:
+        cases += _against_opensplat(opensplat, args)
+    if args.data is None and args.workloads is None:
+        _progress("garden, garden20k: skipped, they need gsplat's test_garden.npz (--data)")
+    title = "Speed against error: every time beside its error against the float64 reference"
+    return Report(title, tuple(cases), {"workloads": list(names), "repeats": args.repeats})
+
+
+def _stages(args: argparse.Namespace) -> "Report":
+    from minisplat_ref.oracle.bench.roofs import adam_case, blending_cases
+    from minisplat_ref.oracle.bench.workloads import get_workload
+    from minisplat_ref.oracle.cases import Report
+
+    cases = _profile(args)
+    for workload in args.workloads or ("synth",):
+        _progress(f"{workload}: blending against straight-line loops")
+        cases += blending_cases(get_workload(workload, args.data), args.repeats)
+    _progress("Adam against a copy")
+    cases.append(adam_case(200_000, args.repeats))
+    return Report("A training iteration by stages, and how far the kernels are from the limits", tuple(cases), {})
+
+
+def _profile(args: argparse.Namespace) -> "list[Case]":
+    """Train with a stopwatch in every stage, while the number of Gaussians stays the same."""
+    from minisplat_ref.backends import CPU
+    from minisplat_ref.oracle.bench.profiling import profile_cases, timed
+
+    seconds: dict[str, float] = {}
+    total = _train(_scene(args), args.iterations, timed(CPU, seconds), seconds.clear)
+    return profile_cases(seconds, total, args.iterations)
+
+
+def _against_opensplat(program: Path, args: argparse.Namespace) -> "list[Case]":
+    """Time training iterations of OpenSplat and ours on the same photographs, from the same points, by turns."""
+    from minisplat_ref.backends import CPU
+    from minisplat_ref.oracle.bench.opensplat import training_seconds
+    from minisplat_ref.oracle.cases import Case
+
+    scene, n = _scene(args), args.iterations
+    _progress(f"{scene.name}: opensplat, {n} and {2 * n} iterations, and ours")
+    first = training_seconds(program, args.scene, args.downscale, n)
+    ours = _train(scene, n, CPU)
+    theirs = training_seconds(program, args.scene, args.downscale, 2 * n) - first
+    ours = min(ours, _train(scene, n, CPU))
+    figures = {"iteration ms": 1e3 * theirs / n, "x ours": theirs / ours}
+    note = f"of {n} iterations; what it renders is not compared here"
+    return [
+        Case(f"{scene.name}/cpu-f32 training", True, {"iteration ms": 1e3 * ours / n}, f"of {n} iterations"),
+        Case(f"{scene.name}/opensplat training", theirs > 0, figures, note if theirs > 0 else "no time to tell apart"),
+    ]
+
+
+def _train(scene: "Scene", iterations: int, backend: "Backend", on_warm: "Callable[[], None]" = lambda: None) -> float:
+    """Return the seconds of some iterations while the number of Gaussians stays the same, after some that compile."""
+    import time
+
+    from minisplat_ref.recipes import get_recipe
+    from minisplat_ref.train import train
+
+    recipe = get_recipe("3dgs-accel")._replace(iterations=WARM_UP + iterations, events=())
+    ends: list[float] = []
+
+    def on_step(step_report: object) -> None:
+        ends.append(time.perf_counter())
+        if len(ends) == WARM_UP:
+            on_warm()
+
+    train(scene, recipe, seed=0, backend=backend, on_step=on_step)
+    return ends[-1] - ends[WARM_UP - 1]
+
+
+def _scene(args: argparse.Namespace) -> "Scene":
+    """Load the photographs, or make some."""
+    if args.scene is not None:
+        from minisplat_ref.io import load_scene
+
+        scene = load_scene(args.scene, downscale=args.downscale, undistort=True)
+    else:
+        from data_tools.synthetic import make_scene
+
+        _progress("making photographs of a room")
+        scene = make_scene("room", **ROOM).scene
+    camera = scene.train_views[0].camera
+    _progress(f"{scene.name}: {len(scene.points):,} Gaussians, {camera.width} x {camera.height}")
+    return scene
+
+
+def _tables(report: "Report") -> str:
+    """Return a table for each kind of case."""
+    from minisplat_ref.oracle.cases import as_markdown
+
+    kinds: dict[tuple[str, ...], list[Case]] = {}
+    for case in report.cases:
+        kinds.setdefault(tuple(case.figures), []).append(case)
+    return "\n\n".join(as_markdown(report._replace(cases=tuple(cases))) for cases in kinds.values())
+
+
+def _save_folder(report: "Report", folder: Path) -> None:
+    """Write JSON, tables and figure into a folder, which is made."""
+    from minisplat_ref.io.atomic import replacing
+    from minisplat_ref.oracle.bench.figure import save_figure
+    from minisplat_ref.oracle.cases import save_json
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder} cannot be made: {error.strerror}") from error
+    with replacing(folder / TABLE) as temporary:
+        temporary.write_text(f"{report.title}\n\n{_tables(report)}\n", encoding="utf-8")
+    if any("both ms" in case.figures for case in report.cases):
+        save_figure(report.cases, folder / FIGURE)
+    save_json(report, folder / JSON)
+
+
+def _progress(line: str) -> None:
+    print(f"minisplat-ref: {line}", file=sys.stderr, flush=True)

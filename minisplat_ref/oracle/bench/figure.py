@@ -1,0 +1,91 @@
+"""The Pareto figure: time of forward and backward against error, both on logarithmic axes."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from minisplat_ref.io.atomic import replacing
+from minisplat_ref.oracle.cases import Case
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+TIME = "least both ms"
+PANELS = (
+    ("image max, no flips", "image max", "largest error of the image"),
+    ("gradient, no flips", "gradient", "error of the gradient, relative L2, worst parameter"),
+)
+EXACT = 1e-16  # where an error of 0 stands on a logarithmic axis
+COLORS = ("#3d4650", "#35608c", "#3f8f6b", "#d2493f", "#e0a526", "#8e5ea2", "#4aa0a8", "#b5651d")
+MARKERS = "o^s"  # colours repeat in another shape
+Style = dict[str, Any]
+
+
+def save_figure(cases: Sequence[Case], path: str | Path) -> None:
+    """Draw every workload as a row: error of the image on the left, of the gradient on the right.
+
+    A mark is the error without the pixels at thresholds; a faint line leads from it to the error with them. An error of
+    0 stands at the left edge. What failed has no time and is not drawn. The step line is the front: nothing is below
+    and left of it.
+
+    Parameters
+    ----------
+    cases : sequence of Case
+        From ``race``, of any number of workloads.
+    path : str or Path
+        A PNG. Its folder must exist.
+
+    Raises
+    ------
+    InputError
+        If the folder does not exist.
+    """
+    from matplotlib.figure import Figure
+
+    timed = [case for case in cases if case.passed and case.figures.get(TIME)]
+    workloads = list(dict.fromkeys(_workload(case) for case in timed)) or ["nothing was timed"]
+    styles = {name: _style(i) for i, name in enumerate(dict.fromkeys(_contender(case) for case in timed))}
+    figure = Figure(figsize=(12, 0.8 + 4.4 * len(workloads)), layout="constrained")
+    grid = figure.subplots(len(workloads), len(PANELS), squeeze=False, sharex="col")
+    for row, workload in zip(grid, workloads, strict=True):
+        own = [case for case in timed if _workload(case) == workload]
+        for axes, (quiet, full, label) in zip(row, PANELS, strict=True):
+            _draw(axes, own, quiet, full, styles)
+            axes.set(xscale="log", yscale="log", xlabel=label, ylabel="forward + backward, least time (ms)")
+            axes.set_title(workload, loc="left", fontsize=10)
+            axes.grid(color="#e6eaee")
+            axes.set_axisbelow(True)
+            axes.spines[["top", "right"]].set_visible(False)
+    if timed:
+        figure.legend(*_legend(styles), loc="outside right upper", frameon=False, fontsize=9)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=120, facecolor="white")
+
+
+def _draw(axes: "Axes", cases: Sequence[Case], quiet: str, full: str, styles: dict[str, Style]) -> None:
+    points = [(max(float(c.figures[quiet] or 0), EXACT), float(c.figures[TIME] or 0)) for c in cases]
+    for case, (error, time) in zip(cases, points, strict=True):
+        style = styles[_contender(case)]
+        axes.plot([error, max(error, float(case.figures[full] or 0))], [time, time], color=style["color"], alpha=0.35)
+        axes.plot([error], [time], linestyle="none", markeredgecolor="white", markersize=8, **style)
+    front = [p for p in sorted(points) if not any(q[0] <= p[0] and q[1] < p[1] for q in points)]
+    if front:
+        axes.step(*zip(*front, strict=True), where="post", color="#8a94a0", linewidth=0.8, linestyle=":", zorder=0)
+
+
+def _legend(styles: dict[str, Style]) -> tuple[list, list[str]]:
+    from matplotlib.lines import Line2D
+
+    return [Line2D([], [], linestyle="none", markersize=8, **style) for style in styles.values()], list(styles)
+
+
+def _style(i: int) -> Style:
+    return {"color": COLORS[i % len(COLORS)], "marker": MARKERS[i // len(COLORS) % len(MARKERS)]}
+
+
+def _workload(case: Case) -> str:
+    return case.name.split("/", 1)[0]
+
+
+def _contender(case: Case) -> str:
+    return case.name.split("/", 1)[1]

@@ -1,0 +1,252 @@
+"""Speed against error: everyone is judged, the wrong get no time, and the files are there. No time is asserted."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tolerances import BENCH_ROOM_FOR_EXPONENTIAL
+
+from minisplat_ref.backends import CPU, REFERENCE
+from minisplat_ref.cli import main
+from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.io.images import read_image
+from minisplat_ref.oracle.bench import contenders, profiling, race, roofs, workloads
+from minisplat_ref.oracle.bench.exponentials import EXPONENTIALS, relative_errors
+from minisplat_ref.oracle.bench.flips import thresholds
+from minisplat_ref.oracle.planted import planted
+from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_GRADIENT, BENCH_FLOAT32_IMAGE, BENCH_FLOAT64
+from minisplat_ref.render import render
+from minisplat_ref.types import Gaussians
+
+NAMES = ("reference-f64", "cpu-f64", "cpu-f32", "cpu-f32-exp3", "cpu-f32-3-sigma", "textbook-f32")
+pytestmark = pytest.mark.usefixtures("tiny_workloads")
+
+
+def tiny():
+    return workloads.synth(400, width=48, height=40, focal=40.0)
+
+
+@pytest.fixture
+def tiny_workloads(monkeypatch):
+    monkeypatch.setitem(workloads.FREE, "synth", tiny)
+    monkeypatch.setitem(workloads.FREE, "synth5k", lambda: tiny()._replace(name="synth5k"))
+
+
+@pytest.fixture(scope="module")
+def cases():
+    return {case.name: case for case in race.race(tiny(), contenders.choose(NAMES), repeats=2)}
+
+
+def test_everyone_is_judged_and_timed(cases):
+    assert list(cases) == [f"synth/{name}" for name in NAMES]
+    assert all(case.passed for case in cases.values()), cases
+    for case in cases.values():
+        assert case.figures["turns"] == (1 if case.name == "synth/reference-f64" else 2)
+        assert case.figures["forward ms"] > 0 and case.figures["both ms"] > case.figures["least forward ms"]
+
+
+def test_errors_are_those_of_the_precision(cases):
+    assert 0 < cases["synth/cpu-f64"].figures["image max"] < BENCH_FLOAT64
+    assert 0 < cases["synth/cpu-f64"].figures["gradient, no flips"] < BENCH_FLOAT64
+    for name in ("cpu-f32", "textbook-f32"):
+        figures = cases[f"synth/{name}"].figures
+        assert 1e-8 < figures["image max, no flips"] < BENCH_FLOAT32_IMAGE
+        assert 1e-8 < figures["gradient, no flips"] < BENCH_FLOAT32_GRADIENT
+        assert figures["image RMS"] < figures["image max"]
+    assert cases["synth/cpu-f32-exp3"].figures["image max, no flips"] > BENCH_FLOAT32_IMAGE
+    assert cases["synth/cpu-f32-3-sigma"].figures["image max"] > 1e-3
+    assert cases["synth/cpu-f32-3-sigma"].figures["flips"] is None
+
+
+def with_pixel(value):
+    """The CPU backend with one pixel multiplied by a number."""
+
+    def composite(*args, **kwargs):
+        output = CPU.composite(*args, **kwargs)
+        output.image[20, 24] *= value
+        return output
+
+    return replace(CPU, composite=composite)
+
+
+@pytest.mark.parametrize(
+    ("backend", "reason"),
+    [(planted("half-off-diagonal"), "gradient of"), (with_pixel(1.001), "1 pixels"), (with_pixel(np.nan), "1 pixels")],
+    ids=["half-off-diagonal", "pixel", "nan"],
+)
+def test_a_wrong_backend_gets_no_time(backend, reason):
+    wrong = contenders.Contender("wrong", backend, np.float32)
+    [_, case] = race.race(tiny(), [*contenders.choose(())[:1], wrong], repeats=2)
+    assert not case.passed and reason in case.note
+    assert case.figures["turns"] == 0 and case.figures["both ms"] is None
+
+
+def test_flips_are_explained_and_nothing_else():
+    """A hit just below and one just above 1/255: the image differs by a whole hit, exactly where it is allowed to."""
+    camera = workloads.synth(1, width=16, height=16, focal=20.0).camera
+    base = Gaussians(
+        means=np.array([[0.02, 0.01, 2.0], [-0.3, 0.2, 2.5]]),
+        quats=np.array([[1.0, 0, 0, 0], [1.0, 0, 0, 0]]),
+        log_scales=np.log(np.full((2, 3), 0.2)),
+        opacity_logits=np.zeros(2),
+        sh_dc=np.ones((2, 3)),
+        sh_rest=np.zeros((2, 0, 3)),
+    )
+    output, tape = render(base, camera, backend=REFERENCE)
+    assert (thresholds(tape).allowance == 0).mean() > 0.99
+    projection = tape.projection
+    center = np.array([4.5, 5.5]) - projection.means2d[0]
+    a, b, c = projection.conics[0]
+    sigma = 0.5 * (a * center[0] ** 2 + c * center[1] ** 2) + b * center[0] * center[1]
+    images, allowances = [], []
+    for factor in (1 - 1e-5, 1 + 1e-5):
+        alpha = factor / 255 * np.exp(sigma)  # opacity that gives alpha = 1/255 at pixel (5, 4)
+        logits = np.array([np.log(alpha / (1 - alpha)), 0.0])
+        output, tape = render(base._replace(opacity_logits=logits), camera, backend=REFERENCE)
+        images.append(output.image)
+        allowances.append(thresholds(tape).allowance)
+    changed = np.abs(images[0] - images[1]).max(axis=2)
+    assert changed[5, 4] > 1e-3
+    for allowance in allowances:
+        assert changed[5, 4] <= allowance[5, 4] < 3 * changed[5, 4]
+        assert allowance[8, 12] == 0
+        assert (changed <= allowance + 1e-6).all()
+
+
+def test_exponentials_get_better_with_their_degree():
+    xs = np.linspace(-6, 0, 601, dtype=np.float32)
+    errors = [relative_errors(EXPONENTIALS[degree], xs).max() for degree in (3, 4, 5)]
+    assert errors[0] > 10 * errors[1] > 50 * errors[2]
+    # Chebyshev's remainder: 2 (ln 2 / 4)^(d + 1) / (d + 1)!
+    assert errors[0] == pytest.approx(2 * (np.log(2) / 4) ** 4 / 24, rel=BENCH_ROOM_FOR_EXPONENTIAL)
+    assert errors[1] == pytest.approx(2 * (np.log(2) / 4) ** 5 / 120, rel=BENCH_ROOM_FOR_EXPONENTIAL)
+
+
+def test_workloads_are_fixed():
+    for make, n, size in ((workloads.synth, 50_000, (480, 270)), (workloads.synth5k, 5_000, (240, 135))):
+        first, second = make(), make()
+        assert len(first.gaussians.means) == n and (first.camera.width, first.camera.height) == size
+        for a, b in zip(first.gaussians, second.gaussians, strict=True):
+            assert np.array_equal(a, b) and np.array_equal(a, a.astype(np.float32))
+
+
+def test_garden_is_the_published_workload(shared_data):
+    garden = workloads.get_workload("garden", shared_data / "gsplat_garden")
+    assert len(garden.gaussians.means) == 101_201
+    subset = workloads.get_workload("garden20k", shared_data / "gsplat_garden" / "test_garden.npz")
+    assert len(subset.gaussians.means) == 20_000 and subset.name == "garden20k"
+    assert np.isin(subset.gaussians.means[:, 0], garden.gaussians.means[:, 0]).all()
+
+
+def test_command_writes_json_table_and_figure(tmp_path, capsys):
+    folder = tmp_path / "new" / "bench"
+    args = ["bench", "--workloads", "synth,synth5k", "--backends", "cpu-f32,textbook-f32", "--repeats", "1"]
+    assert main([*args, "--out", str(folder)]) == 0
+    report = json.loads((folder / "bench.json").read_text())
+    expected = [f"{w}/{c}" for w in ("synth", "synth5k") for c in ("reference-f64", "cpu-f32", "textbook-f32")]
+    assert [case["name"] for case in report["cases"]] == expected
+    assert all(case["passed"] and case["both ms"] > 0 for case in report["cases"])
+    assert report["settings"]["repeats"] == 1 and report["settings"]["processor"]
+    table = (folder / "bench.md").read_text()
+    assert all(name in table for name in expected)
+    picture = read_image(folder / "bench.png")
+    assert picture.shape[1] > 800 and len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 20
+    assert "all 6 cases passed" in capsys.readouterr().out
+
+
+def test_command_fails_with_a_wrong_backend(monkeypatch, tmp_path, capsys):
+    listed = contenders.all_contenders()
+    wrong = {**listed, "cpu-f32": listed["cpu-f32"]._replace(backend=planted("half-off-diagonal"))}
+    monkeypatch.setattr(contenders, "all_contenders", lambda: wrong)
+    file = tmp_path / "bench.json"
+    args = ["bench", "--workloads", "synth", "--backends", "cpu-f32", "--repeats", "1", "--json", str(file)]
+    assert main(args) == 1
+    case = json.loads(file.read_text())["cases"][-1]
+    assert case["name"] == "synth/cpu-f32" and not case["passed"] and case["both ms"] is None
+    assert "1 of 2 cases failed" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--workloads", "nothing"], ["nothing", "synth5k"]),
+        (["--workloads", "garden"], ["garden", "--data"]),
+        (["--workloads", "garden", "--data", "missing.npz"], ["missing.npz"]),
+        (["--backends", "gpu"], ["gpu", "cpu-f32"]),
+        (["--against", "brush"], ["brush", "opensplat=PATH"]),
+        (["--against", "opensplat=missing"], ["missing", "opensplat=PATH"]),
+    ],
+)
+def test_unknown_names_are_one_line(arguments, words, capsys):
+    assert main(["bench", *arguments]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and all(word in lines[0] for word in words), lines
+
+
+def test_opensplat_needs_photographs(tmp_path, capsys):
+    program = _fake_opensplat(tmp_path, "exit 0")
+    assert main(["bench", "--against", f"opensplat={program}"]) == 2
+    assert "--scene" in capsys.readouterr().err
+
+
+def test_opensplat_is_timed_by_its_command_line(tmp_path, capsys):
+    from data_tools.synthetic import make_scene
+    from data_tools.synthetic.files import write_scene
+
+    settings = {"n_views": 4, "width": 32, "height": 24, "n_points": 300}
+    write_scene(make_scene("room", **settings), tmp_path / "room", settings)
+    log = tmp_path / "calls"
+    program = _fake_opensplat(tmp_path, f'echo "$@" >> {log}; sleep "0.$3"')  # the third argument is -n's value
+    scene = ["--scene", str(tmp_path / "room"), "--iterations", "2"]
+    race_ = ["--workloads", "synth", "--backends", "cpu-f32", "--repeats", "1"]
+    assert main(["bench", *race_, *scene, "--against", f"opensplat={program}", "--json", str(tmp_path / "b.json")]) == 0
+    calls = log.read_text().splitlines()
+    assert [call.split()[1:5] for call in calls] == [["-n", "2", "-d", "1"], ["-n", "4", "-d", "1"]]
+    cases = {case["name"]: case for case in json.loads((tmp_path / "b.json").read_text())["cases"]}
+    assert cases["room/opensplat training"]["passed"] and cases["room/opensplat training"]["x ours"] > 0
+    assert "not compared here" in cases["room/opensplat training"]["note"]
+    broken = _fake_opensplat(tmp_path, "echo no such scene >&2; exit 3")
+    assert main(["bench", *race_, *scene, "--against", f"opensplat={broken}"]) == 2
+    assert "no such scene" in capsys.readouterr().err
+
+
+def test_stages_add_up_to_the_iteration(tmp_path, capsys):
+    file = tmp_path / "stages.json"
+    args = ["bench", "--stages", "--workloads", "synth", "--iterations", "2", "--repeats", "1", "--json", str(file)]
+    assert main(args) == 0
+    cases = {case["name"]: case for case in json.loads(file.read_text())["cases"]}
+    stages = [case for name, case in cases.items() if name.startswith("iteration/") and "whole" not in name]
+    assert {"project", "composite", "composite_vjp", "photometric_loss", "adam_update", "rest"} <= {
+        case["name"].split("/")[1] for case in stages
+    }
+    assert sum(case["share %"] for case in stages) == pytest.approx(100)
+    assert all(case["ms"] > 0 for case in stages)
+    assert {"roof/synth forward", "roof/synth backward", "roof/adam 200,000"} <= set(cases)
+
+
+def test_straight_lines_do_the_arithmetic_of_a_hit():
+    lines = roofs.StraightLines()
+    lines.forward()
+    lines.backward()
+    assert 0 < lines.image_error() < BENCH_FLOAT32_IMAGE
+    assert 0 < lines.gradient_error() < BENCH_FLOAT32_GRADIENT
+    lines.sums[3] *= 1.01
+    assert lines.gradient_error() > BENCH_FLOAT32_GRADIENT
+
+
+def test_stopwatches_change_nothing():
+    seconds = {}
+    backend = profiling.timed(CPU, seconds)
+    workload = tiny()
+    plain, _ = render(workload.gaussians, workload.camera, conventions=GSPLAT_MAIN)
+    watched, _ = render(workload.gaussians, workload.camera, conventions=GSPLAT_MAIN, backend=backend)
+    assert np.array_equal(plain.image, watched.image)
+    assert list(seconds) == ["project", "sh_colors", "bin_gaussians", "composite"]
+
+
+def _fake_opensplat(folder, script):
+    program = folder / "opensplat"
+    program.write_text(f"#!/bin/sh\n{script}\n")
+    program.chmod(0o755)
+    return program
