@@ -124,7 +124,7 @@ def depth_map_pieces(m: Module) -> tuple[Stage, ...]:
     """``expected_depth`` and ``depth_normals``; one pixel has no depth."""
     rng, camera = np.random.default_rng(SEED), tiny_setting().camera
     depth, alpha = rng.uniform(2, 3, size=(4, 5)), rng.uniform(0.3, 1, size=(4, 5))
-    alpha[3, 4] = 0.0
+    alpha[1, 2] = 0.0
     with_hole = np.where(alpha > 0, depth, 0)
     has_depth = (alpha > 0).astype(float)  # a pixel that was not hit cannot be moved into a hit by a derivative
 
@@ -207,7 +207,7 @@ PIECES: dict[ModuleType, Callable[[Module], tuple[Stage, ...]]] = {
     reference.loss: ssim_pieces,
     reference.depth_map: depth_map_pieces,
     reference.geometric_loss: geometric_pieces,
-    splatting: lambda m: (splat_stage(with_module(), tiny_setting(), m),),
+    splatting: lambda m: tuple(splat_stage(with_module(), tiny_setting(), m, with_depth=d) for d in (False, True)),
     render: lambda m: (render_stage(with_module(), tiny_setting(), m),),
 }
 """Every module with gradients, and the stages that its functions are tested in."""

@@ -144,7 +144,7 @@ def _three_sigma(base: Backend) -> Backend:
 def _negated_band(base: Backend) -> Backend:
     def negated(sh_rest: Floats) -> Floats:
         flipped = sh_rest.copy()
-        flipped[:, 4] *= -1  # Y_2-1: the second of degree 2
+        flipped[:, 4:5] *= -1  # Y_2-1, the second of degree 2, where there is one
         return flipped
 
     @wraps(base.sh_colors)

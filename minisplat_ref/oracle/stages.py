@@ -35,7 +35,6 @@ from minisplat_ref.types import (
 Sides = tuple[np.ndarray, ...]
 
 POSE = ("cam_from_world_R", "cam_from_world_t")
-PRIMITIVES = ("means", "quats", "scales", "opacities")
 
 
 class Stage(NamedTuple):
@@ -116,14 +115,16 @@ def make_setting(
     has_derivative = conventions.clamp_stops_mean_gradient and conventions.clamp_stops_shape_gradient
     logits[:3] = 6.0 if has_derivative else 4.0, 4.0, 4.0  # opacities 0.998 or 0.982, then 0.982
     sh_dc = rng.normal(size=(n, 3))
-    sh_dc[1, 1] = -4.0  # a colour of 0.5 - 4 SH_C0 < 0
+    sh_dc[1, 1] = -2.5  # a colour of about 0.5 - 2.5 SH_C0 < 0
+    sh_rest = 0.2 * rng.normal(size=(n, (sh_degree + 1) ** 2 - 1, 3))
+    sh_rest[1, :, 1] *= 0.1
     gaussians = Gaussians(
         means=(in_camera - camera.cam_from_world_t) @ R,
         quats=rng.normal(size=(n, 4)),
         log_scales=log_scales,
         opacity_logits=logits,
         sh_dc=sh_dc,
-        sh_rest=0.2 * rng.normal(size=(n, (sh_degree + 1) ** 2 - 1, 3)),
+        sh_rest=sh_rest,
     )
     return Setting(gaussians, camera, rng.uniform(0.2, 1, size=3), conventions)
 
@@ -221,11 +222,14 @@ def composite_stage(backend: Backend, setting: Setting) -> Stage:
 
 
 def surface_stage(backend: Backend, setting: Setting) -> Stage:
-    """``surface_points`` by Gaussians, for the dominant Gaussians of the view."""
+    """``surface_points`` by Gaussians, for the dominant Gaussians of the view; one is put behind the camera then."""
     projection, bins, colors = _composited(backend, setting)
     output = backend.composite(projection, colors, setting.background, bins, setting.conventions, with_stats=True)
     ids, camera = output.stats.dominant_ids, setting.camera  # type: ignore[union-attr]  # stats were asked for
-    inputs = {name: getattr(setting.primitives, name) for name in PRIMITIVES[:3]}
+    means, quats, scales, _ = setting.primitives
+    origin = -camera.cam_from_world_R.T @ camera.cam_from_world_t
+    means = np.where(np.arange(len(means))[:, None] == ids[0, 0], 2 * origin - means, means)
+    inputs = {"means": means, "quats": quats, "scales": scales}
 
     def function(means: Floats, quats: Floats, scales: Floats) -> Point:
         surface = backend.surface_points(means, quats, scales, camera, ids)
@@ -286,8 +290,8 @@ def points_near(depth: Floats, camera: Camera, rng: np.random.Generator) -> Floa
     return (in_camera - camera.cam_from_world_t) @ camera.cam_from_world_R
 
 
-def splat_stage(backend: Backend, setting: Setting, module: object = splatting) -> Stage:
-    """``splat`` with depth, by activated Gaussians, colours, background and pose."""
+def splat_stage(backend: Backend, setting: Setting, module: object = splatting, *, with_depth: bool = True) -> Stage:
+    """``splat`` by activated Gaussians, colours, background and pose."""
     _, _, colors = _composited(backend, setting)
     _, camera, background, conventions = setting
     inputs = {**setting.primitives._asdict(), "colors": colors, "background": background, **setting.pose}
@@ -295,13 +299,19 @@ def splat_stage(backend: Backend, setting: Setting, module: object = splatting) 
     def tape_of(*args: Floats) -> splatting.SplatTape:
         *primitives, colors, background, R, t = args
         view = Primitives(*primitives), lambda radii: colors, _moved(camera, R, t), background, conventions, backend
-        return module.splat(*view, with_depth=True)  # type: ignore[attr-defined]
+        return module.splat(*view, with_depth=with_depth)  # type: ignore[attr-defined]
 
     def vjp(v_image: Floats, v_alpha: Floats) -> tuple[Floats, ...]:
         v = module.splat_vjp(tape_of(*inputs.values()), v_image, v_alpha)  # type: ignore[attr-defined]
         return (*v.primitives[:4], v.colors, v.background, *v.primitives[4:])
 
-    return Stage("splat", inputs, ("image", "alpha"), lambda *args: _view_point(tape_of(*args)), vjp)
+    return Stage(
+        "splat with depth" if with_depth else "splat",
+        inputs,
+        ("image", "alpha"),
+        lambda *args: _view_point(tape_of(*args)),
+        vjp,
+    )
 
 
 def render_stage(backend: Backend, setting: Setting, module: object = rendering) -> Stage:

@@ -12,6 +12,11 @@ GRADIENT_FLOOR = 1e-6
 # gsplat's torch functions in float64, with a stage's input in common: 1e-16 times condition numbers up to 1e3.
 PEER_REL = 1e-9
 
+# Against 50 digits, divided by the condition number: a few dozen roundings of 1e-16 ...
+TRUTH_FLOAT64 = 1e-13
+# ... and of 6e-8, with a polynomial exponential of 1e-7.
+TRUTH_FLOAT32 = 2e-6
+
 # Alpha must cover this part of an image before a check on it says anything.
 COVERAGE_MIN = 0.05
 
