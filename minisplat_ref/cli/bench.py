@@ -131,7 +131,7 @@ def _stages(args: argparse.Namespace) -> "Report":
         _progress(f"{workload}: blending against straight-line loops")
         cases += blending_cases(get_workload(workload, args.data), args.repeats)
     _progress("Adam against a copy")
-    cases.append(adam_case(200_000, args.repeats))
+    cases.append(adam_case(args.repeats))
     return Report("A training iteration by stages, and how far the kernels are from the limits", tuple(cases), {})
 
 

@@ -4,6 +4,7 @@ A shorter cut-off is another image by intention. It is held to the float64 kerne
 is reported is the one that counts for its user, against the reference with the default's.
 """
 
+import functools
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
@@ -49,6 +50,7 @@ BASELINE_NAME = "textbook-f32"
 CHECKED_NAME = "cpu-f64"  # judged first: it says what a shorter cut-off should give
 
 
+@functools.cache
 def all_contenders() -> dict[str, Contender]:
     """Return every contender that needs no other program, by name, the reference first."""
     f32, f64 = np.float32, np.float64
@@ -94,7 +96,7 @@ def choose(names: tuple[str, ...] | None) -> list[Contender]:
 
 def _of_degree(degree: int) -> Contender:
     exp = EXPONENTIALS[degree]
-    error = float(relative_errors(exp, np.linspace(-6, 0, 4001, dtype=np.float32)).max())  # exp(-6) < 1/255
+    error = float(relative_errors(exp, np.linspace(-6, 0, 601, dtype=np.float32)).max())  # exp(-6) < 1/255
     return Contender(
         f"cpu-f32-exp{degree}",
         with_exponential(exp, f"cpu-exp{degree}"),

@@ -1,7 +1,7 @@
 """Which pixels stand at a threshold, and how much they may change when a hit falls on its other side.
 
 An image is discontinuous where a hit's alpha is ``alpha_min``, where the transmittance reaches the stop, and where two
-Gaussians have the same depth; a gradient also where alpha reaches its clamp. Two correct renderers that round
+Gaussians change places in depth; a gradient also where alpha reaches its clamp. Two correct renderers that round
 differently disagree there, by up to ``alpha_min`` and more, and no precision but the other one's own mends that. Such
 pixels are found in float64 and counted; they are not averaged into an error of arithmetic, nor excused beyond what the
 hits at their thresholds can change.
@@ -67,7 +67,8 @@ def _of_tile(tile: TileHits, opacities: Floats, depths: Floats, conventions: Con
     doubt = FLIP_RELATIVE + 2 * alpha_min * np.cumsum(is_skip, axis=0)  # relative, of the transmittance
     is_open = before > stop * (1 - doubt)
     is_stop = is_open & (tile.alphas > 0) & (np.abs(after / stop - 1) < doubt)
-    is_tie = np.diff(depths, append=np.inf)[:, None] < FLIP_DEPTH * depths[:, None]
+    gaps = np.diff(depths, append=np.inf)[:, None]
+    is_tie = (gaps > 0) & (gaps < FLIP_DEPTH * depths[:, None])  # of exactly equal ones the lower row is first
     behind = np.concatenate([alphas[1:], np.zeros_like(alphas[:1])])  # alpha of the next in the list
     is_clamp = is_open & (np.abs(opacities[:, None] * tile.falloffs - conventions.alpha_max) < FLIP_CLAMP)
     change = np.where(is_skip & is_open, before * (alpha_min + FLIP_ALPHA), 0).sum(axis=0)

@@ -1,11 +1,19 @@
-"""Other people's renderers, timed in the same run where the user has them."""
+"""Other people's renderers, timed in the same run where the user has them.
+
+gsplat's functions in plain PyTorch have no list of the hits of a pixel; theirs is made by CUDA. The adapter takes it
+from the reference, in NumPy, and that is part of its time.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
+from minisplat_ref.constants import GSPLAT_1_5
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.bench.contenders import Contender
 from minisplat_ref.oracle.bench.opensplat import check_program
+from minisplat_ref.oracle.peers.gsplat_torch import gsplat_torch
 
 GSPLAT_TORCH, OPENSPLAT = "gsplat-torch", "opensplat"
 
@@ -34,7 +42,7 @@ def peers_of(names: Sequence[str]) -> tuple[list[Contender], Path | None]:
     program = None
     for name in names:
         if name == GSPLAT_TORCH:
-            raise InputError("gsplat-torch cannot be timed yet")
+            contenders.append(Contender(GSPLAT_TORCH, gsplat_torch(), np.float32, conventions=GSPLAT_1_5))
         elif name.startswith(f"{OPENSPLAT}="):
             program = Path(name.removeprefix(f"{OPENSPLAT}="))
             check_program(program)

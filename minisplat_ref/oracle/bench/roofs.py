@@ -29,6 +29,7 @@ from minisplat_ref.scalar.compositing import alpha_vjp, blend, mahalanobis
 from minisplat_ref.scalar.literals import HALF, ZERO
 from minisplat_ref.types import CompositeGradient, Gaussians, Projection, TileGrid
 
+ADAM_GAUSSIANS = 200_000
 N_HITS = 100  # of opacity 0.005: transmittance 0.6 is left, so that none of them stops
 N_PASSES = 200
 N_SUMS = 9
@@ -158,8 +159,9 @@ def blending_cases(workload: Workload, repeats: int) -> list[Case]:
     return cases
 
 
-def adam_case(n: int, repeats: int) -> Case:
-    """Time Adam on ``n`` Gaussians of 59 numbers against a copy that moves as many bytes, taking turns."""
+def adam_case(repeats: int) -> Case:
+    """Time Adam on Gaussians of 59 numbers against a copy that moves as many bytes, taking turns."""
+    n = ADAM_GAUSSIANS
     gaussians, gradient = (Gaussians._make(np.full((n, w), 0.5, np.float32) for w in WIDTHS) for _ in range(2))
     state, rule, rows = zero_moments(gaussians), AdamRule(is_visible_only=True, has_bias_correction=False), np.arange(n)
     n_numbers = ADAM_ARRAYS * n * sum(WIDTHS)
