@@ -126,7 +126,7 @@ def _arrays(functions: ModuleType, truth: Golden, device: str) -> Arrays:
     coefficients = torch.cat([shading["sh_dc"][:, None], shading["sh_rest"]], dim=1)  # [N, K, 3]
     directions = shading["means"] + R.T @ t
     is_shown = tensor("radii")[:, 0] > 0
-    sums = functions.spherical_harmonics(truth.sh_degree, directions[None], coefficients[None], is_shown[None])[0]
+    sums = functions.spherical_harmonics(truth.sh_degree, directions, coefficients, masks=is_shown)
     colors = torch.where(is_shown[:, None], torch.clamp_min(sums + 0.5, 0), 0)
     out["colors"] = numpy(colors)
     names = ("v_means_colors", "v_sh_dc", "v_sh_rest", "v_R_colors", "v_t_colors")

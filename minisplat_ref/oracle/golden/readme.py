@@ -52,7 +52,8 @@ little-endian), then the numbers. https://numpy.org/doc/stable/reference/generat
 
 `v_x` is dL/dx and has the shape of x. So `v_image`, `v_alpha` and `v_depths` are given, and every other `v_` follows
 by the chain rule. `v_image` and `v_alpha` are 0 at pixels whose alpha or transmittance is so near a threshold that
-rounding decides. The loss stage is by itself: its gradient `v_image_of_loss` is that of `loss`, not of L.
+rounding decides, and `v_depths` is 0 at culled Gaussians. The loss stage is by itself: its gradient `v_image_of_loss`
+is that of `loss`, not of L.
 
 `b` of a conic stands twice in its matrix; `v_conics[:, 1]` is the derivative by b itself, so it holds both. Pose
 gradients are by the nine entries of R as if they were free. Skips, stops, boxes and the order of the Gaussians count as

@@ -101,7 +101,8 @@ def truth(scene: Golden, *, seed: int = 0, zeros: tuple[str, ...] = ()) -> Golde
     scene : Golden
         With its inputs.
     seed : int
-        Of the cotangents. They are 0 at the pixels whose hits rounding decides: no gradient is to depend on those.
+        Of the cotangents. They are 0 at the pixels whose hits rounding decides, and at Gaussians that are culled: no
+        gradient is to depend on those.
     zeros : tuple of str
         Cotangents that are zero throughout, for a renderer that cannot take them.
 
@@ -119,7 +120,7 @@ def truth(scene: Golden, *, seed: int = 0, zeros: tuple[str, ...] = ()) -> Golde
     cotangents = {
         "v_image": rng.uniform(-1, 1, forward["image"].shape) * is_sure[:, :, None],
         "v_alpha": rng.uniform(-1, 1, forward["alpha"].shape) * is_sure,
-        "v_depths": rng.uniform(-1, 1, forward["depths"].shape),
+        "v_depths": rng.uniform(-1, 1, forward["depths"].shape) * (forward["radii"][:, 0] > 0),
     }
     rounded = {name: array.astype(np.float32).astype(np.float64) for name, array in cotangents.items()}
     rounded |= {name: np.zeros_like(rounded[name]) for name in zeros}
