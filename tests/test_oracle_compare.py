@@ -9,6 +9,7 @@ from tolerances import PARITY_FLOAT64
 
 from minisplat_ref.backends import CPU, CPU_EXACT, REFERENCE
 from minisplat_ref.cli import main
+from minisplat_ref.cli.oracle import compare as compare_command
 from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN, INRIA
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.comparison.choose import choose_renderer, choose_scenes
@@ -334,6 +335,13 @@ def test_the_truth_follows_the_renderers_rules():
     assert forced["inria"].conventions == GSPLAT_MAIN
     with pytest.raises(InputError, match="can draw none of the scenes inria"):
         choose_scenes(renderer, "inria", "reference", None)
+
+
+def test_the_help_names_every_scene(capsys):
+    assert compare_command.SCENES == tuple(SCENES)
+    with pytest.raises(SystemExit):
+        main(["oracle", "compare", "--help"])
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 100
 
 
 def test_the_command_names_the_stage_and_writes_json(tmp_path, capsys):

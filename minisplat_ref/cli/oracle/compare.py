@@ -14,37 +14,43 @@ the gradients from the image back to the scene.
 BACKEND is one of
 
   DIR             a folder of arrays that your own renderer has written, in the
-                  format of minisplat-ref oracle export (its README.md explains it)
+                  format of oracle export; the README.md in there explains it
   cpu, cpu-exact, reference
                   ours
   gsplat-torch    gsplat's functions in plain PyTorch, on the CPU
-  gsplat, inria   gsplat's kernels, and the rasteriser of the 3DGS paper, where they
-                  are installed and there is a CUDA device
+  gsplat, inria   gsplat's kernels, and the rasteriser of the 3DGS paper, where
+                  they are installed and there is a CUDA device
   profile:NAME    the reference by the conventions of another renderer: what a
                   difference in conventions looks like
-  planted:ERROR   ours with one error in it, to see how it is reported
+  planted:ERROR   ours with one error in it, to see how that is reported
 
-Ours, gsplat-torch and gsplat are given the reference's own input at every stage, so
-that an error stays where it arose. For the others, later differences may follow
-from the first.
+Ours, gsplat-torch and gsplat are given the reference's own input at every
+stage, so that an error stays where it arose. With the others, later differences
+may follow from the first, and are marked so.
 
-A pixel of which rounding decides a hit (alpha within 1e-6 of 1/255, or the
-transmittance as near to the stop threshold) counts as a candidate for a flip; its
-error is counted, neither failed nor averaged in. Boxes and tile lists that differ
-without changing the image are harmless.
+A pixel in which rounding decides a hit (alpha within 1e-6 of 1/255, or the
+transmittance as near to the stop threshold) is a candidate for a flip: its
+error is counted, neither failed nor averaged in. Boxes and tile lists that
+differ without changing the image are harmless.
 """
 EPILOG = """\
+columns: largest and RMS error; the largest as a part of the largest value of the
+array, and what is allowed of that; how many values are over it, and of how many;
+flips, and the candidates for them. For radii and tile lists: rows and tiles that
+differ. Every stage is reported in the scene where it is furthest off.
+
 examples:
   minisplat-ref oracle compare cpu --dtype float32
   minisplat-ref oracle compare planted:half-off-diagonal --scene ordinary
-  minisplat-ref oracle compare profile:INRIA --scene ordinary --json differences.json
+  minisplat-ref oracle compare profile:INRIA --scene sh3 --json differences.json
 
 your own renderer, in three lines:
   minisplat-ref oracle export golden
-  YOUR_PROGRAM golden mine              # reads golden/SCENE/*.npz, writes mine/SCENE/*.npz
+  YOUR_PROGRAM golden mine      # reads golden/SCENE/*.npz, writes mine/SCENE/*.npz
   minisplat-ref oracle compare mine
 
 Exit codes: 0 every stage that was given agrees, 1 one diverges, 2 bad input."""
+SCENES = ("ordinary", "antialiased", "inria", "off-centre", "sh3", "odd-size")  # as in oracle.golden.scenes
 
 
 def add_parser(checks: Commands) -> None:
@@ -57,7 +63,7 @@ def add_parser(checks: Commands) -> None:
         formatter_class=HelpFormatter,
     )
     parser.add_argument("backend", metavar="BACKEND", help="a renderer's name, or a folder of its arrays")
-    parser.add_argument("--scene", default="all", metavar="NAME", help="a golden scene, or all (default)")
+    parser.add_argument("--scene", default="all", metavar="NAME", help=f"{', '.join(SCENES)}, or all (default)")
     parser.add_argument(
         "--against",
         default="reference",

@@ -11,12 +11,12 @@ stage of the reference, in float64, as plain arrays in .npz files.
 
 With them a renderer in any language can be tested without our code. DIR/README.md
 explains every array; DIR/manifest.json says the same to programs, with the
-conventions of each scene, tolerances, and a hash of each file.
+conventions of each scene, the tolerances and a hash of each file.
 """
 EPILOG = """\
 example:
   minisplat-ref oracle export golden    # 6 scenes, 2 MB
-  YOUR_PROGRAM golden mine              # reads golden/SCENE/*.npz, writes mine/SCENE/*.npz
+  YOUR_PROGRAM golden mine              # reads golden/SCENE/*.npz, writes mine
   minisplat-ref oracle compare mine     # names the first stage that differs"""
 
 

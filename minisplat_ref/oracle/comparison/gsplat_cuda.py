@@ -5,7 +5,7 @@ Left out: its rendering of batches, packed projection, and the loss, which gspla
 
 from collections.abc import Callable
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,9 +14,11 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.comparison.renderers import Renderer
 from minisplat_ref.oracle.golden.arrays import Arrays
 from minisplat_ref.oracle.golden.scenes import Golden
-from minisplat_ref.oracle.golden.stages import reference_bins
+from minisplat_ref.oracle.golden.stages import COLORS_GRADIENT, PROJECT_GRADIENT, grid_of, reference_bins
+from minisplat_ref.types import Floats
 
 TILE = 16  # pixels
+Tensor = Any
 
 
 def gsplat_cuda() -> Renderer:
@@ -53,7 +55,12 @@ def from_functions(functions: ModuleType, name: str, profile: Conventions, devic
     device : str
         Where the functions compute.
     """
-    return Renderer(name, "float32", True, lambda truth: _arrays(functions, truth, device), rules_of(profile))
+
+    def arrays(truth: Golden) -> Arrays:
+        scene = _Scene(functions, truth, device)
+        return _project(scene) | _list_tiles(scene) | _shade(scene) | _composite(scene)
+
+    return Renderer(name, "float32", True, arrays, rules_of(profile))
 
 
 def rules_of(profile: Conventions) -> Callable[[Conventions], Conventions | None]:
@@ -68,31 +75,40 @@ def rules_of(profile: Conventions) -> Callable[[Conventions], Conventions | None
     return rules
 
 
-def _arrays(functions: ModuleType, truth: Golden, device: str) -> Arrays:
+class _Scene(NamedTuple):
+    """A scene as tensors."""
+
+    functions: ModuleType
+    truth: Golden
+    device: str
+
+    def tensor(self, name: str, *, is_leaf: bool = False) -> Tensor:
+        """An array of the truth, in float32 where it is floating; differentiable if it is a leaf."""
+        import torch
+
+        array = self.truth.arrays[name]
+        array = array.astype(np.float32) if array.dtype.kind == "f" else array
+        return torch.tensor(array, device=self.device, requires_grad=is_leaf)
+
+    def leaves(self, *names: str) -> list[Tensor]:
+        """Differentiable tensors of these names."""
+        return [self.tensor(name, is_leaf=True) for name in names]
+
+
+def _project(scene: _Scene) -> Arrays:
     import torch
 
-    c, a, camera = truth.conventions, truth.arrays, truth.camera
-
-    def tensor(name: str, *, is_leaf: bool = False) -> Any:
-        array = a[name].astype(np.float32) if a[name].dtype.kind == "f" else a[name]
-        return torch.tensor(array, device=device, requires_grad=is_leaf)
-
-    def numpy(value: Any) -> Any:
-        return value.detach().cpu().numpy()
-
-    out: Arrays = {}
-    R, t = tensor("cam_from_world_R", is_leaf=True), tensor("cam_from_world_t", is_leaf=True)
-    bottom = torch.tensor([[0.0, 0.0, 0.0, 1.0]], device=device)
-    viewmat = torch.cat([torch.cat([R, t[:, None]], dim=1), bottom])  # [4, 4]
-    K = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], device=device)
-
-    leaves = {name: tensor(name, is_leaf=True) for name in ("means", "quats", "scales", "opacities")}
-    radii, means2d, depths, conics, compensations = functions.fully_fused_projection(
-        leaves["means"],
+    c, camera = scene.truth.conventions, scene.truth.camera
+    leaves = scene.leaves("means", "quats", "scales", "opacities", "cam_from_world_R", "cam_from_world_t")
+    means, quats, scales, opacities, R, t = leaves
+    bottom = torch.tensor([[0.0, 0.0, 0.0, 1.0]], device=scene.device)
+    K = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], device=scene.device)
+    radii, means2d, depths, conics, compensations = scene.functions.fully_fused_projection(
+        means,
         None,
-        leaves["quats"],
-        leaves["scales"],
-        viewmat[None],
+        quats,
+        scales,
+        torch.cat([torch.cat([R, t[:, None]], dim=1), bottom])[None],
         K[None],
         camera.width,
         camera.height,
@@ -100,53 +116,78 @@ def _arrays(functions: ModuleType, truth: Golden, device: str) -> Arrays:
         near_plane=c.near_plane,
         far_plane=c.far_plane,
         calc_compensations=c.is_antialiased,
-        opacities=leaves["opacities"].detach(),
+        opacities=opacities.detach(),
     )
-    opacities2d = leaves["opacities"][None] * (compensations if c.is_antialiased else 1)
-    shown = (radii[0] > 0).all(dim=-1)  # gsplat leaves rows of culled Gaussians as they were
-    footprint = {"means2d": means2d[0], "depths": depths[0], "conics": conics[0], "opacities2d": opacities2d[0]}
-    out |= {name: numpy(torch.where(shown.view(-1, *(1,) * (x.dim() - 1)), x, 0)) for name, x in footprint.items()}
-    out["radii"] = numpy(radii[0])
-    total = sum(
-        (torch.where(shown.view(-1, *(1,) * (x.dim() - 1)), x, 0) * tensor(f"v_{name}")).sum()
-        for name, x in footprint.items()
-    )
-    names = ("v_means_projection", "v_quats", "v_scales", "v_opacities", "v_R_projection", "v_t_projection")
-    out |= zip(names, map(numpy, torch.autograd.grad(total, [*leaves.values(), R, t])), strict=True)
+    opacities2d = opacities * (compensations[0] if c.is_antialiased else 1)
+    is_shown = (radii[0] > 0).all(dim=1)  # the rows of culled Gaussians hold whatever was there before
+    fields = {"means2d": means2d[0], "depths": depths[0], "conics": conics[0], "opacities2d": opacities2d}
+    fields = {name: torch.where(is_shown.view(-1, *(1,) * (x.dim() - 1)), x, 0) for name, x in fields.items()}
+    gradients = _gradients([(x, scene.tensor(f"v_{name}")) for name, x in fields.items()], leaves)
+    shown = {name: _numpy(x) for name, x in fields.items()}
+    return shown | {"radii": _numpy(radii[0])} | dict(zip(PROJECT_GRADIENT, gradients, strict=True))
 
-    n_x, n_y = -(-camera.width // TILE), -(-camera.height // TILE)
-    seen = [tensor(name)[None].contiguous() for name in ("means2d", "radii", "depths")]
-    _, isect_ids, flatten_ids = functions.isect_tiles(*seen, TILE, n_x, n_y)
-    offsets = functions.isect_offset_encode(isect_ids, 1, n_x, n_y)
-    out["tile_size"] = np.array([TILE, TILE], np.int32)
-    out["gaussian_ids"] = numpy(flatten_ids)
-    out["tile_offsets"] = np.append(numpy(offsets).ravel(), len(out["gaussian_ids"])).astype(np.int64)
 
-    shading = {name: tensor(name, is_leaf=True) for name in ("means", "sh_dc", "sh_rest")}
-    coefficients = torch.cat([shading["sh_dc"][:, None], shading["sh_rest"]], dim=1)  # [N, K, 3]
-    directions = shading["means"] + R.T @ t
-    is_shown = tensor("radii")[:, 0] > 0
-    sums = functions.spherical_harmonics(truth.sh_degree, directions, coefficients, masks=is_shown)
+def _list_tiles(scene: _Scene) -> Arrays:
+    n_x, n_y = _tiles(scene)
+    inputs = [scene.tensor(name)[None].contiguous() for name in ("means2d", "radii", "depths")]
+    _, isect_ids, flatten_ids = scene.functions.isect_tiles(*inputs, TILE, n_x, n_y)
+    starts = scene.functions.isect_offset_encode(isect_ids, 1, n_x, n_y)
+    return {
+        "tile_size": np.array([TILE, TILE], np.int32),
+        "gaussian_ids": _numpy(flatten_ids),
+        "tile_offsets": np.append(_numpy(starts).ravel(), len(flatten_ids)).astype(np.int64),
+    }
+
+
+def _shade(scene: _Scene) -> Arrays:
+    import torch
+
+    leaves = scene.leaves("means", "sh_dc", "sh_rest", "cam_from_world_R", "cam_from_world_t")
+    means, sh_dc, sh_rest, R, t = leaves
+    coefficients = torch.cat([sh_dc[:, None], sh_rest], dim=1)  # [N, K, 3]
+    is_shown = scene.tensor("radii")[:, 0] > 0
+    sums = scene.functions.spherical_harmonics(scene.truth.sh_degree, means + R.T @ t, coefficients, masks=is_shown)
     colors = torch.where(is_shown[:, None], torch.clamp_min(sums + 0.5, 0), 0)
-    out["colors"] = numpy(colors)
-    names = ("v_means_colors", "v_sh_dc", "v_sh_rest", "v_R_colors", "v_t_colors")
-    total = (colors * tensor("v_colors")).sum()
-    out |= zip(names, map(numpy, torch.autograd.grad(total, [*shading.values(), R, t])), strict=True)
+    gradients = _gradients([(colors, scene.tensor("v_colors"))], leaves)
+    return {"colors": _numpy(colors), **dict(zip(COLORS_GRADIENT, gradients, strict=True))}
 
-    bins = reference_bins(a, c, (TILE, TILE))
-    blended = {name: tensor(name, is_leaf=True) for name in ("means2d", "conics", "colors", "opacities2d")}
-    background = tensor("background", is_leaf=True)
-    image, alpha = functions.rasterize_to_pixels(
-        *(value[None] for value in blended.values()),
+
+def _composite(scene: _Scene) -> Arrays:
+    import torch
+
+    n_x, n_y = _tiles(scene)
+    camera = scene.truth.camera
+    bins = reference_bins(scene.truth.arrays, scene.truth.conventions, (TILE, TILE))
+    names = ("means2d", "conics", "colors", "opacities2d", "background")
+    leaves = scene.leaves(*names)
+    *footprints, background = leaves
+    image, alpha = scene.functions.rasterize_to_pixels(
+        *(value[None] for value in footprints),
         camera.width,
         camera.height,
         TILE,
-        torch.tensor(bins.tile_offsets[:-1].reshape(1, n_y, n_x).astype(np.int32), device=device),
-        torch.tensor(bins.gaussian_ids, device=device),
+        torch.tensor(bins.tile_offsets[:-1].reshape(1, n_y, n_x).astype(np.int32), device=scene.device),
+        torch.tensor(bins.gaussian_ids, device=scene.device),
         backgrounds=background[None],
     )
-    out["image"], out["alpha"] = numpy(image[0]), numpy(alpha[0, :, :, 0])
-    total = (image[0] * tensor("v_image")).sum() + (alpha[0, :, :, 0] * tensor("v_alpha")).sum()
-    names = ("v_means2d", "v_conics", "v_colors", "v_opacities2d", "v_background")
-    out |= zip(names, map(numpy, torch.autograd.grad(total, [*blended.values(), background])), strict=True)
-    return out
+    image, alpha = image[0], alpha[0, :, :, 0]
+    gradients = _gradients([(image, scene.tensor("v_image")), (alpha, scene.tensor("v_alpha"))], leaves)
+    out = {f"v_{name}": v for name, v in zip(names, gradients, strict=True)}
+    return {"image": _numpy(image), "alpha": _numpy(alpha), **out}
+
+
+def _tiles(scene: _Scene) -> tuple[int, int]:
+    grid = grid_of(scene.truth.arrays, (TILE, TILE))
+    return grid.n_tiles_x, grid.n_tiles_y
+
+
+def _gradients(pairs: list[tuple[Tensor, Tensor]], leaves: list[Tensor]) -> list[Floats]:
+    """Gradients of the sum of output times cotangent."""
+    import torch
+
+    return [_numpy(v) for v in torch.autograd.grad(sum((x * v).sum() for x, v in pairs), leaves)]
+
+
+def _numpy(value: Tensor) -> Floats:
+    array: Floats = value.detach().cpu().numpy()
+    return array

@@ -12,11 +12,11 @@ from minisplat_ref.oracle.comparison.measure import difference
 from minisplat_ref.oracle.golden.arrays import Arrays
 from minisplat_ref.oracle.golden.flips import flip_candidates
 from minisplat_ref.oracle.golden.scenes import Golden
-from minisplat_ref.oracle.golden.stages import projection_of, reference_bins
+from minisplat_ref.oracle.golden.stages import grid_of, projection_of, reference_bins
 from minisplat_ref.oracle.tolerances import COMPARE_FLOAT64
-from minisplat_ref.types import Bools, Floats, Ints, Projection, TileBins, TileGrid
+from minisplat_ref.types import Bools, Floats, Ints, Projection, TileBins
 
-FOOTPRINT = {"means2d": "means2d", "depths": "depths", "conics": "conics", "opacities": "opacities2d"}  # array by field
+FOOTPRINT = ("means2d", "depths", "conics", "opacities2d")
 
 
 class Bounds(NamedTuple):
@@ -36,27 +36,26 @@ def compare_bounds(given: Arrays, truth: Golden) -> Bounds | None:
     if "radii" not in given and "boxes" not in given:
         return None
     expected, n = truth.arrays, len(truth.arrays["means"])
-    radii = given.get("radii")
-    if radii is not None:  # a single radius is that of a square
-        radii = np.broadcast_to(np.asarray(radii).reshape(n, -1), (n, 2))
-    same = np.ones(n, bool)
-    for key, array in (("radii", radii), ("boxes", given.get("boxes"))):
-        if array is not None:
-            same &= (array == expected[key]).all(axis=1)
-    is_different = ~same
+    bounds = {key: given[key] for key in ("radii", "boxes") if key in given}
+    if "radii" in bounds:  # a single radius is that of a square
+        bounds["radii"] = np.broadcast_to(bounds["radii"].reshape(n, -1), (n, 2))
+    is_different = np.logical_or.reduce([(array != expected[key]).any(axis=1) for key, array in bounds.items()])
     if not is_different.any():
         return Bounds(0, n, False, "")
 
     projection = projection_of(expected)
     is_shown = expected["radii"][:, 0] > 0
-    shows = radii[:, 0] > 0 if radii is not None else (given["boxes"][:, 2:] > given["boxes"][:, :2]).all(axis=1)
+    if "radii" in bounds:
+        shows = bounds["radii"][:, 0] > 0
+    else:
+        shows = np.min(bounds["boxes"][:, 2:] - bounds["boxes"][:, :2], axis=1) > 0
     is_extra = shows & ~is_shown
-    if is_extra.any() and all(key in given for key in FOOTPRINT.values()):
-        rows = {field: _merged(is_extra, given[key], expected[key]) for field, key in FOOTPRINT.items()}
-        projection = projection._replace(**rows)
-    boxes = given["boxes"] if "boxes" in given else _boxes_of(projection, radii, truth)
+    if is_extra.any() and all(key in given for key in FOOTPRINT):
+        rows = {key: _merged(is_extra, given[key], expected[key]) for key in FOOTPRINT}
+        projection = projection_of(expected | rows)
+    boxes = bounds["boxes"] if "boxes" in bounds else _boxes_of(projection, bounds["radii"], truth)
     projection = projection._replace(boxes=np.where(shows[:, None], boxes, 0).astype(np.int32))
-    bins = REFERENCE.bin_gaussians(projection, _grid(truth, (16, 16)), truth.conventions)
+    bins = REFERENCE.bin_gaussians(projection, grid_of(expected, (16, 16)), truth.conventions)
     changes = _changes_image(projection, bins, truth)
     parts = [
         _count(int((is_shown & ~shows).sum()), "culled that the reference shows"),
@@ -75,7 +74,7 @@ def compare_lists(given: Arrays, truth: Golden) -> Bounds | None:
         return None
     size = given.get("tile_size", truth.arrays["tile_size"])
     tile_size = (int(size[0]), int(size[1]))
-    grid, expected = _grid(truth, tile_size), reference_bins(truth.arrays, truth.conventions, tile_size)
+    grid, expected = grid_of(truth.arrays, tile_size), reference_bins(truth.arrays, truth.conventions, tile_size)
     ids, offsets = given["gaussian_ids"].astype(np.int64), given["tile_offsets"].astype(np.int64)
     n_tiles, n = grid.n_tiles_x * grid.n_tiles_y, len(truth.arrays["means"])
     is_list = offsets.shape == (n_tiles + 1,) and offsets[0] == 0 and offsets[-1] == len(ids)
@@ -117,10 +116,6 @@ def _boxes_of(projection: Projection, radii: Ints, truth: Golden) -> Ints:
     low = np.clip(np.floor(projection.means2d - radii), 0, size)
     high = np.clip(np.ceil(projection.means2d + radii), 0, size)
     return np.hstack([low, high]).astype(np.int32)
-
-
-def _grid(truth: Golden, tile_size: tuple[int, int]) -> TileGrid:
-    return TileGrid(*map(int, truth.arrays["image_size"]), *tile_size)
 
 
 def _merged(rows: Bools, given: Floats, expected: Floats) -> Floats:

@@ -1,7 +1,7 @@
 """The golden format in words, for people who will never read our Python."""
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.oracle.golden.arrays import SPECS, STAGE_COTANGENTS, STAGE_INPUTS, names_of
@@ -156,6 +156,6 @@ def _listed(names: tuple[str, ...]) -> str:
     return ", ".join(f"`{name}`" for name in names)
 
 
-def _table(headings: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+def _table(headings: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
     lines = [headings, ("---",) * len(headings), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)

@@ -40,8 +40,9 @@ class Golden(NamedTuple):
     def camera(self) -> Camera:
         """The view, in float64."""
         a = self.arrays
-        intrinsics, (width, height) = map(float, a["intrinsics"]), map(int, a["image_size"])
-        return Camera(a["cam_from_world_R"], a["cam_from_world_t"], *intrinsics, width, height)
+        fx, fy, cx, cy = map(float, a["intrinsics"])
+        width, height = map(int, a["image_size"])
+        return Camera(a["cam_from_world_R"], a["cam_from_world_t"], fx, fy, cx, cy, width, height)
 
     @property
     def sh_degree(self) -> int:

@@ -14,7 +14,11 @@ from minisplat_ref.oracle.golden.flips import flip_candidates
 from minisplat_ref.oracle.golden.scenes import RECIPES, Golden, inputs
 from minisplat_ref.types import Floats, Projection, ProjectionGradient, RenderOutput, TileBins, TileGrid
 
-PROJECTION = ("means2d", "depths", "conics", "opacities2d", "radii", "boxes")  # fields of a Projection, by array
+# Fields of a stage's result, by array.
+PROJECTION = ("means2d", "depths", "conics", "opacities2d", "radii", "boxes")
+PROJECT_GRADIENT = ("v_means_projection", "v_quats", "v_scales", "v_opacities", "v_R_projection", "v_t_projection")
+COLORS_GRADIENT = ("v_means_colors", "v_sh_dc", "v_sh_rest", "v_R_colors", "v_t_colors")
+COMPOSITE_GRADIENT = ("v_means2d", "v_conics", "v_opacities2d", "v_colors", "v_background")
 
 
 def projection_of(arrays: Arrays) -> Projection:
@@ -22,10 +26,15 @@ def projection_of(arrays: Arrays) -> Projection:
     return Projection(*(arrays[name] for name in PROJECTION))
 
 
+def grid_of(arrays: Arrays, tile_size: tuple[int, int]) -> TileGrid:
+    """Tiles of any size over the image."""
+    width, height = map(int, arrays["image_size"])
+    return TileGrid(width, height, *tile_size)
+
+
 def reference_bins(arrays: Arrays, conventions: Conventions, tile_size: tuple[int, int]) -> TileBins:
     """Tile lists that the reference makes of a projection, on tiles of any size."""
-    grid = TileGrid(*map(int, arrays["image_size"]), *tile_size)
-    return REFERENCE.bin_gaussians(projection_of(arrays), grid, conventions)
+    return REFERENCE.bin_gaussians(projection_of(arrays), grid_of(arrays, tile_size), conventions)
 
 
 def run_stages(backend: Backend, scene: Golden, dtype: str, fed: Arrays | None = None) -> Arrays:
@@ -57,14 +66,14 @@ def run_stages(backend: Backend, scene: Golden, dtype: str, fed: Arrays | None =
     c, camera = scene.conventions, scene.camera
     primitives = tuple(take(name) for name in ("means", "quats", "scales", "opacities"))
     out |= zip(PROJECTION, backend.project(*primitives, camera, c), strict=True)
-    projection = Projection(*map(take, PROJECTION))
+    projection = projection_of({name: take(name) for name in PROJECTION})
 
-    grid = TileGrid(camera.width, camera.height, backend.tile_width, backend.tile_height)
-    bins = backend.bin_gaussians(projection, grid, c)
-    out["tile_size"] = np.array([grid.tile_width, grid.tile_height], np.int32)
+    tile_size = backend.tile_width, backend.tile_height
+    bins = backend.bin_gaussians(projection, grid_of(scene.arrays, tile_size), c)
+    out["tile_size"] = np.array(tile_size, np.int32)
     out["gaussian_ids"], out["tile_offsets"] = bins.gaussian_ids, bins.tile_offsets
     if fed is not None:
-        bins = reference_bins(fed, c, (grid.tile_width, grid.tile_height))
+        bins = reference_bins(fed, c, tile_size)
 
     shading = (take("means"), take("sh_dc"), take("sh_rest"), camera, scene.sh_degree, take("radii"))
     out["colors"] = backend.sh_colors(*shading)
@@ -77,13 +86,10 @@ def run_stages(backend: Backend, scene: Golden, dtype: str, fed: Arrays | None =
     v = backend.composite_vjp(
         *blending, RenderOutput(take("image"), take("alpha"), None, None), take("v_image"), take("v_alpha")
     )
-    names = ("v_means2d", "v_conics", "v_opacities2d", "v_colors", "v_background")
-    out |= zip(names, v, strict=True)
+    out |= zip(COMPOSITE_GRADIENT, v, strict=True)
     v_projection = ProjectionGradient(*map(take, STAGE_COTANGENTS["project"]))
-    names = ("v_means_projection", "v_quats", "v_scales", "v_opacities", "v_R_projection", "v_t_projection")
-    out |= zip(names, backend.project_vjp(*primitives, camera, c, projection, v_projection), strict=True)
-    names = ("v_means_colors", "v_sh_dc", "v_sh_rest", "v_R_colors", "v_t_colors")
-    out |= zip(names, backend.sh_colors_vjp(*shading, take("v_colors")), strict=True)
+    out |= zip(PROJECT_GRADIENT, backend.project_vjp(*primitives, camera, c, projection, v_projection), strict=True)
+    out |= zip(COLORS_GRADIENT, backend.sh_colors_vjp(*shading, take("v_colors")), strict=True)
     if fed is None:
         for name in ("v_means", "v_R", "v_t"):
             out[name] = out[f"{name}_projection"] + out[f"{name}_colors"]
