@@ -9,6 +9,7 @@ from minisplat_ref.oracle.cases import Case
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 TIME = "least both ms"
 PANELS = (
@@ -21,7 +22,7 @@ MARKERS = "o^s"  # colours repeat in another shape
 Style = dict[str, Any]
 
 
-def save_figure(cases: Sequence[Case], path: str | Path) -> None:
+def pareto_figure(cases: Sequence[Case]) -> "Figure":
     """Draw every workload as a row: error of the image on the left, of the gradient on the right.
 
     A mark is the error without the pixels at thresholds; a faint line leads from it to the error with them. An error of
@@ -32,13 +33,6 @@ def save_figure(cases: Sequence[Case], path: str | Path) -> None:
     ----------
     cases : sequence of Case
         From ``race``, of any number of workloads.
-    path : str or Path
-        A PNG. Its folder must exist.
-
-    Raises
-    ------
-    InputError
-        If the folder does not exist.
     """
     from matplotlib.figure import Figure
 
@@ -58,6 +52,18 @@ def save_figure(cases: Sequence[Case], path: str | Path) -> None:
             axes.spines[["top", "right"]].set_visible(False)
     if timed:
         figure.legend(*_legend(styles), loc="outside right upper", frameon=False, fontsize=9)
+    return figure
+
+
+def save_figure(cases: Sequence[Case], path: str | Path) -> None:
+    """Write the figure as a PNG.
+
+    Raises
+    ------
+    InputError
+        If the folder does not exist.
+    """
+    figure = pareto_figure(cases)
     with replacing(path) as temporary:
         figure.savefig(temporary, format="png", dpi=120, facecolor="white")
 
