@@ -9,6 +9,7 @@ from minisplat_ref.recipes.mini_splatting import (
     BACKDROP_EXTENTS,
     BLUR_AREA,
     DEPTH_TOLERANCE,
+    KEEP_FRACTION,
     REINITIALISE_LEAST_STEP,
     SHORT_RUN_EXPONENT,
 )
@@ -68,7 +69,7 @@ MINI_SPLATTING2 = GS._replace(
                 events.simplify,
                 metric=importance.indoor,
                 choose=simplify.by_sampling,
-                keep_fraction=0.6,
+                keep_fraction=KEEP_FRACTION,
                 budget=None,
                 least_views=_LEAST_VIEWS,
             ),
