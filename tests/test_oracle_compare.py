@@ -17,7 +17,8 @@ from minisplat_ref.oracle.comparison.dumps import from_dumps
 from minisplat_ref.oracle.comparison.measure import difference
 from minisplat_ref.oracle.comparison.own import by_profile, from_backend, with_planted_error
 from minisplat_ref.oracle.comparison.renderers import Renderer
-from minisplat_ref.oracle.comparison.staged import STAGES, as_report, compare_scene, first_divergence
+from minisplat_ref.oracle.comparison.report import as_report
+from minisplat_ref.oracle.comparison.staged import STAGES, compare_scene, first_divergence
 from minisplat_ref.oracle.golden.arrays import SPECS
 from minisplat_ref.oracle.golden.files import export
 from minisplat_ref.oracle.golden.scenes import RECIPES, inputs
@@ -86,6 +87,8 @@ def test_an_error_stays_in_its_stage(error, ordinary):
     assert diverging[0] == DIVERGING[error][0] and set(diverging) <= {*DIVERGING[error], "v_sh"}
     if error == "half-off-diagonal":
         assert rows["v_conics"].note == "only [:, 1] times 0.5"
+    later = [rows[stage].note for stage in diverging[1:]]
+    assert all(note.endswith(f"may follow from {diverging[0]}") for note in later), "one function made them all"
 
 
 def test_bounds_are_judged_by_the_image(ordinary):
