@@ -138,6 +138,8 @@ def render_vjp(tape: RenderTape, v_image: Floats, v_alpha: Floats | None = None)
     g, splats = tape.gaussians, tape.splats
     scales, opacities = splats.primitives.scales, splats.primitives.opacities
     v_alpha = np.zeros_like(splats.output.alpha) if v_alpha is None else v_alpha
+    with np.errstate(over="ignore"):
+        transparencies = 1 / (1 + np.exp(g.opacity_logits))  # 1 - o, of which few digits are left in 1 - 0.9999
     v = splat_vjp(splats, v_image, v_alpha)
     v_sh = splats.backend.sh_colors_vjp(
         g.means, g.sh_dc, g.sh_rest, splats.camera, tape.sh_degree, splats.projection.radii, v.colors
@@ -147,7 +149,7 @@ def render_vjp(tape: RenderTape, v_image: Floats, v_alpha: Floats | None = None)
             means=v.primitives.means + v_sh.means,
             quats=v.primitives.quats,
             log_scales=scales * v.primitives.scales,
-            opacity_logits=opacities * (1 - opacities) * v.primitives.opacities,
+            opacity_logits=opacities * transparencies * v.primitives.opacities,
             sh_dc=v_sh.sh_dc,
             sh_rest=v_sh.sh_rest,
         ),

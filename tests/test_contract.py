@@ -19,10 +19,10 @@ KERNEL_PARTS = {"blend_forward", "blend_backward", "tile_state", "sorting", "exp
 
 # Public functions of cpu without a twin: they prepare arguments for kernels.
 CPU_ONLY = {
-    "tiling.has_digits": "whether the tight ellipse may replace the box; the reference always takes the box",
     "projection.camera_centre": "computed in float64 before the loop; the reference does it with matrices",
     "projection.pose_of": "the same for the point that the camera maps to 0",
-    "projection.lens_of": "conventions as scalars of the data's dtype",
+    "projection.lens_of": "conventions as float64 scalars",
+    "projection.wide": "a quaternion in float64; the reference's arithmetic has the data's dtype",
     "compositing.composite_with": "the exponential is an argument, which compositing_exact fills in, too",
     "compositing.composite_vjp_with": "as composite_with",
 }

@@ -26,7 +26,7 @@ PACKAGE = Path(minisplat_ref.__file__).parent
 # --- dtype ---
 
 
-def test_stages_keep_float32(rng):
+def test_stages_keep_float32_but_for_conics(rng):
     gaussians, camera = as_dtype(make_gaussians(rng, 20, size=0.25), np.float32), make_camera(rng=rng)
     means, quats, scales, opacities = activated(gaussians)
     primitives = (means, quats, scales, opacities, camera, GSPLAT_MAIN)
@@ -43,13 +43,14 @@ def test_stages_keep_float32(rng):
     _, tape = CPU.photometric_loss(output.image, output.image[::-1].copy(), 0.2)
     geometry = (output.image[..., 0] + 1, output.alpha, output.image, camera, means.astype(float))
     _, geometric_tape = CPU.geometric_loss(*geometry, GeometricWeights(1.0, 1.0, 1.0))
+    assert projection.conics.dtype == v.conics.dtype == np.float64  # and nothing else
     results = {
-        "project": projection,
+        "project": projection._replace(conics=projection.depths),
         "project_vjp": CPU.project_vjp(*primitives, projection, v_projection),
         "sh_colors": (colors,),
         "sh_colors_vjp": CPU.sh_colors_vjp(*sh, v.colors),
         "composite": (output.image, output.alpha, output.median_depth, *output.stats[:2]),
-        "composite_vjp": v,
+        "composite_vjp": v._replace(conics=v.opacities),
         "surface_points": points,
         "surface_points_vjp": CPU.surface_points_vjp(means, quats, scales, camera, ids, points.points, points.depths),
         "photometric_loss_vjp": (CPU.photometric_loss_vjp(tape),),

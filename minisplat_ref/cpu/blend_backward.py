@@ -4,9 +4,14 @@ Front to back with the forward's arithmetic, so that every threshold falls the s
 besides its transmittance, the part S of <v, image> that lies behind the current hit: it starts as the whole and shrinks
 hit by hit.
 
-With d = mean - pixel and q = dL/dsigma, all gradients of a footprint are moments of q over its pixels:
+With d = mean - pixel, e = dx + slope dy, sigma = (a e^2 + pivot dy^2) / 2 and q = dL/dsigma, all gradients of a
+footprint are moments of q over its pixels:
 
-    dL/dmean = conic (sum q d)      dL/dconic = (sum q dx^2 / 2, sum q dx dy, sum q dy^2 / 2)      dL/do = -(sum q) / o
+    dL/dmean = (a sum q e, slope a sum q e + pivot sum q dy)      dL/do = -(sum q) / o
+    dL/da = (sum q e^2) / 2      dL/dslope = a sum q e dy      dL/dpivot = (sum q dy^2) / 2
+
+The moments over e rather than over dx keep a needle's gradient: over dx they grow with its length squared and cancel
+later. They are changed to those by the conic's entries in float64.
 
 A pair (tile, Gaussian) has a slot of its own for its moments, and afterwards each Gaussian adds up its slots in order.
 No two threads write the same number, and the sums have the same bytes at any number of threads. Cost: 6 + D numbers a
@@ -21,13 +26,13 @@ import numpy as np
 from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.cpu.records import (
     COLOR,
-    CONIC_A,
-    CONIC_B,
-    CONIC_C,
+    HALF_A,
+    HALF_PIVOT,
     MEAN_X,
     MEAN_Y,
     N_FUSED,
     OPACITY,
+    SLOPE,
     fused_colors,
     pixel_run,
 )
@@ -46,25 +51,24 @@ from minisplat_ref.cpu.tile_state import (
 )
 from minisplat_ref.cpu.tiling import TILE_WIDTH
 from minisplat_ref.scalar._jit import add_in_any_order, kernel, prange, scalar
-from minisplat_ref.scalar.compositing import alpha_vjp, blend, mahalanobis
-from minisplat_ref.scalar.literals import HALF, ONE, ZERO
+from minisplat_ref.scalar.compositing import alpha_vjp, blend, conic_vjp_of_moments, factors, mahalanobis
+from minisplat_ref.scalar.literals import ONE, ZERO
 
-N_MOMENTS = 6  # sums of q, q dx, q dy, q dx^2, q dx dy, q dy^2
+N_MOMENTS = 6  # sums of q, q e, q dy, q e^2, q e dy, q dy^2
 
 
 @scalar
 def _sum_slots(n, slots, offsets, projection, total, out):
-    """Gradient of one Gaussian from the moments in its slots; ``total`` is scratch."""
+    """Gradient of one Gaussian from the moments in its slots; ``total`` is scratch in float64."""
     total[:] = ZERO
     for slot in range(offsets[n], offsets[n + 1]):
         for j in range(total.size):
             total[j] += slots[slot, j]
-    a, b, c = projection.conics[n, 0], projection.conics[n, 1], projection.conics[n, 2]
-    out.means2d[n, 0] = a * total[1] + b * total[2]
-    out.means2d[n, 1] = b * total[1] + c * total[2]
-    out.conics[n, 0] = HALF * total[3]
-    out.conics[n, 1] = total[4]
-    out.conics[n, 2] = HALF * total[5]
+    a, slope, pivot = factors(projection.conics[n, 0], projection.conics[n, 1], projection.conics[n, 2])
+    out.means2d[n, 0] = a * total[1]
+    out.means2d[n, 1] = slope * a * total[1] + pivot * total[2]
+    v_a, v_b, v_c = conic_vjp_of_moments(slope, total[3], total[4], total[5])
+    out.conics[n, 0], out.conics[n, 1], out.conics[n, 2] = v_a, v_b, v_c
     out.opacities[n] = -total[0] / projection.opacities[n]
     for k in range(out.colors.shape[1]):
         out.colors[n, k] = total[N_MOMENTS + k]
@@ -75,7 +79,7 @@ def sum_slots(slots, offsets, projection, out):
     """Gradients of all Gaussians; those without a pair keep their zeros."""
     n_gaussians = offsets.size - 1
     for chunk in prange(N_CHUNKS):
-        total = np.empty(slots.shape[1], slots.dtype)
+        total = np.empty(slots.shape[1], np.float64)
         for n in range(n_gaussians * chunk // N_CHUNKS, n_gaussians * (chunk + 1) // N_CHUNKS):
             if offsets[n] < offsets[n + 1]:
                 _sum_slots(n, slots, offsets, projection, total, out)
@@ -99,7 +103,7 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
     @scalar
     def hit_vjp(s, n_pixels, record, frame, sums):
         mx, my, opacity = record[MEAN_X], record[MEAN_Y], record[OPACITY]
-        a, b, c = record[CONIC_A], record[CONIC_B], record[CONIC_C]
+        half_a, slope, half_pivot = record[HALF_A], record[SLOPE], record[HALF_PIVOT]
         color = fused_colors(record, n_channels)
         if n_channels > N_FUSED:
             s[SHADE : SHADE + n_pixels] = ZERO
@@ -107,11 +111,11 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
             value = record[COLOR + k]
             for i in range(n_pixels):
                 s[SHADE + i] += s[CHANNELS + k * PIXELS + i] * value
-        q_sum = qx = qy = qxx = qxy = qyy = v_red = v_green = v_blue = ZERO * a
+        q_sum = qe = qy = qee = qey = qyy = v_red = v_green = v_blue = ZERO * half_a
         for i in range(n_pixels):
-            dx = mx - s[X + i]
             dy = my - s[Y + i]
-            sigma = mahalanobis(dx, dy, a, b, c)
+            e = mx - s[X + i] + slope * dy
+            sigma = mahalanobis(e, dy, half_a, half_pivot)
             unclamped = opacity * exp(-sigma)
             transmittance = s[T + i]
             s[T + i], weight = blend(transmittance, sigma, unclamped, frame)
@@ -127,20 +131,20 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
             q_mean = q if unclamped <= frame.mean_gradient_max else ZERO
             q_shape = q if unclamped <= frame.shape_gradient_max else ZERO
             q_sum = add_in_any_order(q_sum, q_shape)
-            qx = add_in_any_order(qx, q_mean * dx)
+            qe = add_in_any_order(qe, q_mean * e)
             qy = add_in_any_order(qy, q_mean * dy)
-            qxx = add_in_any_order(qxx, q_shape * dx * dx)
-            qxy = add_in_any_order(qxy, q_shape * dx * dy)
+            qee = add_in_any_order(qee, q_shape * e * e)
+            qey = add_in_any_order(qey, q_shape * e * dy)
             qyy = add_in_any_order(qyy, q_shape * dy * dy)
             v_red = add_in_any_order(v_red, weight * v_0)
             v_green = add_in_any_order(v_green, weight * v_1)
             v_blue = add_in_any_order(v_blue, weight * v_2)
-        sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = q_sum, qx, qy, qxx, qxy, qyy
+        sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = q_sum, qe, qy, qee, qey, qyy
         fused = (v_red, v_green, v_blue)
         for k in range(min(n_channels, N_FUSED)):
             sums[N_MOMENTS + k] = fused[k]
         for k in range(N_FUSED, n_channels):
-            total = ZERO * a
+            total = ZERO * half_a
             for i in range(n_pixels):
                 total = add_in_any_order(total, s[WEIGHT + i] * s[CHANNELS + k * PIXELS + i])
             sums[N_MOMENTS + k] = total

@@ -16,13 +16,13 @@ from minisplat_ref.constants import MEDIAN_TRANSMITTANCE
 from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.cpu.records import (
     COLOR,
-    CONIC_A,
-    CONIC_B,
-    CONIC_C,
+    HALF_A,
+    HALF_PIVOT,
     MEAN_X,
     MEAN_Y,
     N_FUSED,
     OPACITY,
+    SLOPE,
     fused_colors,
     pixel_run,
 )
@@ -106,10 +106,11 @@ def forward_kernel(exp: Callable, n_channels: int) -> Callable:
     @scalar
     def blend_hit(s, n_pixels, record, frame):
         mx, my, opacity = record[MEAN_X], record[MEAN_Y], record[OPACITY]
-        a, b, c = record[CONIC_A], record[CONIC_B], record[CONIC_C]
+        half_a, slope, half_pivot = record[HALF_A], record[SLOPE], record[HALF_PIVOT]
         color = fused_colors(record, n_channels)
         for i in range(n_pixels):
-            sigma = mahalanobis(mx - s[X + i], my - s[Y + i], a, b, c)
+            dy = my - s[Y + i]
+            sigma = mahalanobis(mx - s[X + i] + slope * dy, dy, half_a, half_pivot)
             s[T + i], weight = blend(s[T + i], sigma, opacity * exp(-sigma), frame)
             s[WEIGHT + i] = weight
             s[CHANNELS + i] += weight * color[0]

@@ -5,7 +5,7 @@ Backward, the pixels are grouped by their Gaussian first, so that each Gaussian 
 
 import numpy as np
 
-from minisplat_ref.cpu.projection import pose_of
+from minisplat_ref.cpu.projection import pose_of, wide
 from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.covariance import normalized, normalized_vjp, rotation_vjp
 from minisplat_ref.scalar.depth import densest_depth, densest_depth_vjp, gaussian_axes, pixel_ray
@@ -19,6 +19,12 @@ def _offset(means, n, centre):
     return means[n, 0] - centre[0], means[n, 1] - centre[1], means[n, 2] - centre[2]
 
 
+@scalar
+def _scale(scales, n):
+    """Return three float64: the square of a float32 below 1e-19 would be 0."""
+    return np.float64(scales[n, 0]), np.float64(scales[n, 1]), np.float64(scales[n, 2])
+
+
 @kernel()
 def _surface_points(means, quats, scales, rotation, centre, lens, dominant_ids, points, depths):
     for y in prange(dominant_ids.shape[0]):
@@ -28,22 +34,22 @@ def _surface_points(means, quats, scales, rotation, centre, lens, dominant_ids, 
             if n < 0:
                 continue
             d = pixel_ray(R, x + HALF, y + HALF, lens[0], lens[1], lens[2], lens[3])
-            t = densest_depth(gaussian_axes(quats[n]), scales[n], _offset(means, n, centre), d)
+            t = densest_depth(gaussian_axes(wide(quats[n])), _scale(scales, n), _offset(means, n, centre), d)
             if t > 0:
                 depths[y, x] = t
                 for i in range(3):
                     points[y, x, i] = centre[i] + t * d[i]
 
 
-def _lens(camera: Camera, dtype: np.dtype) -> Floats:
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy], dtype)
+def _lens(camera: Camera) -> Floats:
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float64)
 
 
 def surface_points(means: Floats, quats: Floats, scales: Floats, camera: Camera, dominant_ids: Ints) -> SurfacePoints:
     """Densest point of each pixel's dominant Gaussian; see ``reference.depth.surface_points``."""
     out = SurfacePoints(np.zeros((*dominant_ids.shape, 3), means.dtype), np.zeros(dominant_ids.shape, means.dtype))
-    rotation, centre = pose_of(camera, means.dtype)
-    lens = _lens(camera, means.dtype)
+    rotation, centre = pose_of(camera)
+    lens = _lens(camera)
     _surface_points(means, quats, scales, rotation, centre, lens, dominant_ids, out.points, out.depths)
     return out
 
@@ -52,9 +58,10 @@ def surface_points(means: Floats, quats: Floats, scales: Floats, camera: Camera,
 def _gaussian_vjp(n, pixels, means, quats, scales, rotation, centre, lens, depths, v_points, v_depths, v_mean, v_scale):
     """Add the shares of one Gaussian's pixels; return the gradient by its axes, one per row."""
     R = rows_of(rotation)
-    axes = gaussian_axes(quats[n])
+    axes = gaussian_axes(wide(quats[n]))
+    scale = _scale(scales, n)
     u = _offset(means, n, centre)
-    v_axes = np.zeros((3, 3), means.dtype)
+    v_axes = np.zeros((3, 3))
     for pixel in pixels:
         y, x = pixel // depths.shape[1], pixel % depths.shape[1]
         t = depths[y, x]
@@ -64,9 +71,9 @@ def _gaussian_vjp(n, pixels, means, quats, scales, rotation, centre, lens, depth
         v_t = v_depths[y, x] + dot(v_points[y, x], d)
         precision = ZERO * t
         for k in range(3):
-            precision += (dot(axes[k], d) / scales[n, k]) ** 2
+            precision += (dot(axes[k], d) / scale[k]) ** 2
         for k in range(3):
-            v_axis, v_s, v_p = densest_depth_vjp(axes[k], scales[n, k], t, precision, v_t, u, d)
+            v_axis, v_s, v_p = densest_depth_vjp(axes[k], scale[k], t, precision, v_t, u, d)
             v_scale[k] += v_s
             for i in range(3):
                 v_axes[k, i] += v_axis[i]
@@ -98,7 +105,7 @@ def _surface_points_vjp(
         v_axes = _gaussian_vjp(
             n, own, means, quats, scales, rotation, centre, lens, depths, v_points, v_depths, v_means[n], v_scales[n]
         )
-        w, x, y, z, inverse_length = normalized(quats[n, 0], quats[n, 1], quats[n, 2], quats[n, 3])
+        w, x, y, z, inverse_length = normalized(*wide(quats[n]))
         v_w, v_x, v_y, v_z = rotation_vjp(w, x, y, z, transposed(rows_of(v_axes)))
         v = normalized_vjp(w, x, y, z, inverse_length, v_w, v_x, v_y, v_z)
         for i in range(4):
@@ -123,8 +130,8 @@ def surface_points_vjp(
     ids = dominant_ids.ravel()
     pixels = np.argsort(ids, kind="stable")[np.count_nonzero(ids < 0) :]  # grouped by Gaussian
     offsets = np.concatenate([[0], np.cumsum(np.bincount(ids[ids >= 0], minlength=len(means)))])
-    rotation, centre = pose_of(camera, means.dtype)
-    lens = _lens(camera, means.dtype)
+    rotation, centre = pose_of(camera)
+    lens = _lens(camera)
     depths = surface_points(means, quats, scales, camera, dominant_ids).depths
     args = (means, quats, scales, rotation, centre, lens, pixels, offsets, depths)
     _surface_points_vjp(*args, v_points, v_depths, v_means, v_quats, v_scales)

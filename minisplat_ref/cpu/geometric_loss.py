@@ -237,7 +237,7 @@ def _seen_points(depth: Floats, camera: Camera, lens: Floats, points: Floats) ->
     """Pixel, cost and slope [n] of the points that fall on a pixel with depth, in float64 like their positions."""
     n = len(points)
     pixels, costs, slopes = np.full(n, -1), np.zeros(n), np.zeros(n)
-    rotation, centre = pose_of(camera, np.dtype(np.float64))
+    rotation, centre = pose_of(camera)
     points = np.ascontiguousarray(points, np.float64)
     _look_up(points, rotation, centre, lens, depth, SFM_DEPTH_TOLERANCE, pixels, costs, slopes)
     is_seen = pixels >= 0

@@ -4,6 +4,10 @@ The body of a parallel loop is a function of its own: Numba 0.68 loses writes to
 directly under ``prange``. Every Gaussian has one writer. Only the camera gradient is a sum over Gaussians: a fixed
 number of chunks, whatever the number of threads, each adds up its own part in float64, and the parts are added in
 order.
+
+The arithmetic is float64 whatever the data: it is scalar code, where a float64 costs what a float32 costs, and float32
+would lose the position of a mean far from the world's origin, the overflow of f / z squared, and the thin axis of a
+needle. Results are rounded when they are stored, except conics: see :class:`Projection`.
 """
 
 import math
@@ -33,25 +37,23 @@ from minisplat_ref.types import Camera, Floats, PrimitiveGradient, Projection, P
 N_CHUNKS = 64  # parts of the camera-gradient sum; fixed, so that its rounding does not depend on the thread count
 
 
-def camera_centre(camera: Camera, dtype: np.dtype) -> Floats:
-    """Camera centre -R^T t [3], computed in float64."""
-    centre = -np.asarray(camera.cam_from_world_R, np.float64).T @ np.asarray(camera.cam_from_world_t, np.float64)
-    return centre.astype(dtype)
+def camera_centre(camera: Camera) -> Floats:
+    """Camera centre -R^T t [3], float64."""
+    return -np.asarray(camera.cam_from_world_R, np.float64).T @ np.asarray(camera.cam_from_world_t, np.float64)
 
 
-def pose_of(camera: Camera, dtype: np.dtype) -> tuple[Floats, Floats]:
-    """Return R [3, 3] and the point [3] that R x + t takes to the origin.
+def pose_of(camera: Camera) -> tuple[Floats, Floats]:
+    """Return R [3, 3] and the point [3] that R x + t takes to the origin, float64.
 
     The point is the camera centre. It is solved for rather than taken as -R^T t, so that R (x - point) equals R x + t
     also where R is not quite a rotation: the gradient counts its nine entries as free.
     """
     R = np.asarray(camera.cam_from_world_R, np.float64)
-    origin = -np.linalg.solve(R, np.asarray(camera.cam_from_world_t, np.float64))
-    return R.astype(dtype), origin.astype(dtype)
+    return R, -np.linalg.solve(R, np.asarray(camera.cam_from_world_t, np.float64))
 
 
-def lens_of(camera: Camera, conventions: Conventions, dtype: np.dtype) -> Lens:
-    """Camera intrinsics and conventions as scalars of the data's dtype."""
+def lens_of(camera: Camera, conventions: Conventions) -> Lens:
+    """Camera intrinsics and conventions as float64 scalars."""
     cx, cy = camera.cx, camera.cy
     if not conventions.uses_principal_point:
         cx, cy = camera.width / 2, camera.height / 2
@@ -67,8 +69,14 @@ def lens_of(camera: Camera, conventions: Conventions, dtype: np.dtype) -> Lens:
             (camera.height - cy) / camera.fy + margin * tan_y,
         )
     numbers = (camera.fx, camera.fy, cx, cy, *limits, conventions.near_plane, conventions.far_plane)
-    scalars = [dtype.type(number) for number in (*numbers, conventions.eps2d, COMPENSATION_FLOOR)]
+    scalars = [np.float64(number) for number in (*numbers, conventions.eps2d, COMPENSATION_FLOOR)]
     return Lens._make([*scalars, conventions.is_antialiased])
+
+
+@scalar
+def wide(quat):
+    """Return the four numbers in float64."""
+    return np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
 
 
 @scalar
@@ -79,9 +87,12 @@ def _project_one(
     p = to_camera(R, centre, means[n, 0], means[n, 1], means[n, 2])
     if not (lens.near < p[2] < lens.far):
         return
-    footprint = project_gaussian(p, rotated(R, axes(quats[n], scales[n])), lens)
+    footprint = project_gaussian(p, rotated(R, axes(wide(quats[n]), scales[n])), lens)
     opacity = opacities[n] * footprint.compensation
     if not (opacity >= alpha_min and footprint.det > 0 and math.isfinite(footprint.det)):
+        return
+    a, b, c = conic(footprint)
+    if not (math.isfinite(a) and math.isfinite(c)):
         return
     if not (math.isfinite(footprint.x) and math.isfinite(footprint.y)):
         return
@@ -94,7 +105,7 @@ def _project_one(
     out.means2d[n, 0] = footprint.x
     out.means2d[n, 1] = footprint.y
     out.depths[n] = p[2]
-    out.conics[n, 0], out.conics[n, 1], out.conics[n, 2] = conic(footprint)
+    out.conics[n, 0], out.conics[n, 1], out.conics[n, 2] = a, b, c
     out.opacities[n] = opacity
     out.radii[n, 0] = rx
     out.radii[n, 1] = ry
@@ -120,13 +131,13 @@ def project(
     out = Projection(
         np.zeros((n, 2), dtype),
         np.zeros(n, dtype),
-        np.zeros((n, 3), dtype),
+        np.zeros((n, 3), np.float64),
         np.zeros(n, dtype),
         np.zeros((n, 2), np.int32),
         np.zeros((n, 4), np.int32),
     )
-    rotation, centre = pose_of(camera, dtype)
-    lens, alpha_min = lens_of(camera, conventions, dtype), dtype.type(conventions.alpha_min)
+    rotation, centre = pose_of(camera)
+    lens, alpha_min = lens_of(camera, conventions), dtype.type(conventions.alpha_min)
     full_support, width, height = conventions.has_full_support, camera.width, camera.height
     _project(means, quats, scales, opacities, rotation, centre, lens, alpha_min, full_support, width, height, out)
     return out
@@ -135,7 +146,8 @@ def project(
 @scalar
 def _project_one_vjp(n, means, quats, scales, opacities, R, centre, lens, v, out, v_pose):
     p = to_camera(R, centre, means[n, 0], means[n, 1], means[n, 2])
-    M = axes(quats[n], scales[n])
+    quat = wide(quats[n])
+    M = axes(quat, scales[n])
     V = rotated(R, M)
     footprint = project_gaussian(p, V, lens)
     from_conic = conic_vjp(footprint, v.conics[n])
@@ -143,7 +155,7 @@ def _project_one_vjp(n, means, quats, scales, opacities, R, centre, lens, v, out
     v_cov = (from_conic[0] + from_blur[0], from_conic[1] + from_blur[1], from_conic[2] + from_blur[2])
     v_p, v_V = project_gaussian_vjp(p, V, lens, footprint, v.means2d[n, 0], v.means2d[n, 1], v.depths[n], v_cov)
     R_transposed = transposed(R)
-    v_quat, v_scale = axes_vjp(quats[n], scales[n], rotated(R_transposed, v_V))
+    v_quat, v_scale = axes_vjp(quat, scales[n], rotated(R_transposed, v_V))
     for i in range(3):
         out.means[n, i] = dot(R_transposed[i], v_p)
         out.scales[n, i] = v_scale[i]
@@ -187,8 +199,8 @@ def project_vjp(
         np.zeros((3, 3), dtype),
         np.zeros(3, dtype),
     )
-    rotation, centre = pose_of(camera, dtype)
-    lens = lens_of(camera, conventions, dtype)
+    rotation, centre = pose_of(camera)
+    lens = lens_of(camera, conventions)
     _project_vjp(means, quats, scales, opacities, projection.radii, rotation, centre, lens, v_projection, out, v_poses)
     total = v_poses.sum(axis=0)
     out.cam_from_world_R[:] = total[:9].reshape(3, 3)

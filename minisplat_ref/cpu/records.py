@@ -9,27 +9,30 @@ import math
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.cpu.tiling import ELLIPSE_MARGIN, TILE_HEIGHT, TILE_WIDTH, has_digits
+from minisplat_ref.cpu.tiling import ELLIPSE_MARGIN, TILE_HEIGHT, TILE_WIDTH
 from minisplat_ref.scalar._jit import kernel, prange, scalar
-from minisplat_ref.scalar.literals import HALF, ONE
+from minisplat_ref.scalar.compositing import factors
+from minisplat_ref.scalar.literals import HALF
 from minisplat_ref.scalar.tiling import visible_ellipse
 from minisplat_ref.types import Floats, Projection
 
-MEAN_X, MEAN_Y, CONIC_A, CONIC_B, CONIC_C, OPACITY, ROW_FIRST, ROW_END, COLOR = range(9)  # columns; rows as floats
+# Columns. The conic is there as its factors, two of them halved as sigma wants them; rows of pixels are floats.
+MEAN_X, MEAN_Y, HALF_A, SLOPE, HALF_PIVOT, OPACITY, ROW_FIRST, ROW_END, COLOR = range(9)
+HALF_A_MAX = np.float32(1e30)  # without a low-pass a footprint can be thinner than float32 can square
 N_FUSED = 3  # channels that ride in the pixel loop itself; fewer are padded with zeros, further ones have own loops
 
 
 @scalar
 def _write_record(n, projection, colors, alpha_min, records):
-    a, b, c = projection.conics[n, 0], projection.conics[n, 1], projection.conics[n, 2]
+    a, slope, pivot = factors(projection.conics[n, 0], projection.conics[n, 1], projection.conics[n, 2])
     my = projection.means2d[n, 1]
-    first, end = ONE * projection.boxes[n, 1], ONE * projection.boxes[n, 3]  # as floats
-    if has_digits(a, b, c):
-        reach = visible_ellipse(a, b, c, projection.opacities[n], alpha_min, ELLIPSE_MARGIN).half_height
-        first = max(first, math.ceil(my - reach - HALF - ELLIPSE_MARGIN))
-        end = min(end, math.floor(my + reach - HALF + ELLIPSE_MARGIN) + ONE)
+    reach = visible_ellipse(a, slope, pivot, projection.opacities[n], alpha_min, ELLIPSE_MARGIN).half_height
+    first = math.ceil(max(my - reach - HALF - ELLIPSE_MARGIN, projection.boxes[n, 1]))
+    end = math.floor(min(my + reach + HALF + ELLIPSE_MARGIN, projection.boxes[n, 3]))
     records[n, MEAN_X], records[n, MEAN_Y] = projection.means2d[n, 0], my
-    records[n, CONIC_A], records[n, CONIC_B], records[n, CONIC_C] = a, b, c
+    records[n, HALF_A] = min(HALF * a, HALF_A_MAX)
+    records[n, SLOPE] = slope
+    records[n, HALF_PIVOT] = min(HALF * pivot, HALF_A_MAX)
     records[n, OPACITY] = projection.opacities[n]
     records[n, ROW_FIRST], records[n, ROW_END] = first, end
     for k in range(colors.shape[1]):

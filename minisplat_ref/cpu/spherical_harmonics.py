@@ -17,6 +17,14 @@ _CONSTANTS = (SH_C0, SH_C1, *SH_C2, *SH_C3)
 N_BASES = 16
 
 
+@scalar
+def _direction(centre, means, n):
+    """Direction to a mean in the data's dtype; the difference is float64, for worlds whose origin is far away."""
+    dx, dy, dz, inverse = direction(centre, means[n, 0], means[n, 1], means[n, 2])
+    as_data = means.dtype.type
+    return as_data(dx), as_data(dy), as_data(dz), as_data(inverse)
+
+
 @kernel()
 def _sh_colors(means, sh_dc, sh_rest, centre, degree, c, radii, colors):
     n_gaussians = means.shape[0]
@@ -26,7 +34,7 @@ def _sh_colors(means, sh_dc, sh_rest, centre, degree, c, radii, colors):
         for n in range(n_gaussians * chunk // N_CHUNKS, n_gaussians * (chunk + 1) // N_CHUNKS):
             if radii[n, 0] == 0:
                 continue
-            dx, dy, dz, _ = direction(centre, means[n, 0], means[n, 1], means[n, 2])
+            dx, dy, dz, _ = _direction(centre, means, n)
             basis(dx, dy, dz, c, degree, y)
             for channel in range(3):
                 value = HALF + c[0] * sh_dc[n, channel]
@@ -38,7 +46,7 @@ def _sh_colors(means, sh_dc, sh_rest, centre, degree, c, radii, colors):
 def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int, radii: Ints) -> Floats:
     """Evaluate the colour of every visible Gaussian; see ``reference.spherical_harmonics.sh_colors``."""
     colors = np.zeros(sh_dc.shape, sh_dc.dtype)
-    centre = camera_centre(camera, means.dtype)
+    centre = camera_centre(camera)
     _sh_colors(means, sh_dc, sh_rest, centre, degree, np.array(_CONSTANTS, means.dtype), radii, colors)
     return colors
 
@@ -46,7 +54,7 @@ def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, deg
 @scalar
 def _sh_color_vjp(n, means, sh_dc, sh_rest, centre, degree, c, v_colors, out, v_centre, y, v_y):
     n_rest = (degree + 1) * (degree + 1) - 1
-    dx, dy, dz, inverse = direction(centre, means[n, 0], means[n, 1], means[n, 2])
+    dx, dy, dz, inverse = _direction(centre, means, n)
     basis(dx, dy, dz, c, degree, y)
     v_y[:] = ZERO
     for channel in range(3):
@@ -91,7 +99,7 @@ def sh_colors_vjp(
         np.zeros((3, 3), dtype),
         np.zeros(3, dtype),
     )
-    centre = camera_centre(camera, dtype)
+    centre = camera_centre(camera)
     constants = np.array(_CONSTANTS, dtype)
     _sh_colors_vjp(means, sh_dc, sh_rest, centre, degree, constants, radii, v_colors, out, v_centres)
     v_centre = v_centres.sum(axis=0)

@@ -16,6 +16,7 @@ import numpy as np
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.sorting import depth_order
 from minisplat_ref.scalar._jit import kernel, prange, scalar
+from minisplat_ref.scalar.compositing import factors
 from minisplat_ref.scalar.literals import HALF, ZERO
 from minisplat_ref.scalar.tiling import rightmost_offset, visible_ellipse
 from minisplat_ref.types import Ints, Projection, TileBins, TileGrid
@@ -24,13 +25,6 @@ TILE_WIDTH = 8  # one row of a tile is one AVX2 register of float32; divides INR
 TILE_HEIGHT = 16
 N_CHUNKS = 16  # fixed, so that the lists do not depend on the number of threads
 ELLIPSE_MARGIN = np.float32(0.02)  # px and relative: rounding must not lose a pixel that the compositor would blend
-OBLIQUE_MIN = np.float32(1e-3)  # det / (a c) below this has lost its digits in float32: fall back to the box
-
-
-@scalar
-def has_digits(a, b, c):
-    """Whether the determinant of a conic can be trusted; where not, the box has to do."""
-    return a * c - b * b > OBLIQUE_MIN * a * c
 
 
 @scalar
@@ -52,15 +46,13 @@ def _write_tiles(n, projection, alpha_min, n_tiles_x, tiles, place, counts):
     """Write the tiles of one Gaussian from ``place`` on and count them; return how many there are."""
     x0, y0, x1, y1 = projection.boxes[n, 0], projection.boxes[n, 1], projection.boxes[n, 2], projection.boxes[n, 3]
     mx, my = projection.means2d[n, 0], projection.means2d[n, 1]
-    a, b, c = projection.conics[n, 0], projection.conics[n, 1], projection.conics[n, 2]
-    ellipse = visible_ellipse(a, b, c, projection.opacities[n], alpha_min, ELLIPSE_MARGIN)
+    a, slope, pivot = factors(projection.conics[n, 0], projection.conics[n, 1], projection.conics[n, 2])
+    ellipse = visible_ellipse(a, slope, pivot, projection.opacities[n], alpha_min, ELLIPSE_MARGIN)
     n_pairs = 0
     for row in range(y0 // TILE_HEIGHT, (y1 - 1) // TILE_HEIGHT + 1):
-        first, end = x0 // TILE_WIDTH, (x1 - 1) // TILE_WIDTH + 1
-        if has_digits(a, b, c):
-            low = max(row * TILE_HEIGHT, y0) + HALF - my
-            high = min((row + 1) * TILE_HEIGHT, y1) - HALF - my
-            first, end = _columns(ellipse, mx, low, high, x0, x1)
+        low = max(row * TILE_HEIGHT, y0) + HALF - my
+        high = min((row + 1) * TILE_HEIGHT, y1) - HALF - my
+        first, end = _columns(ellipse, mx, low, high, x0, x1)
         for column in range(first, end):
             tile = row * n_tiles_x + column
             tiles[place + n_pairs] = tile

@@ -7,8 +7,12 @@ and no second array is needed to remember it.
 
 from typing import NamedTuple
 
+import numpy as np
+
 from minisplat_ref.scalar._jit import scalar
-from minisplat_ref.scalar.literals import HALF, ONE, ZERO
+from minisplat_ref.scalar.literals import HALF, ONE, TWO, ZERO
+
+PIVOT_MIN = np.float32(1e-14)  # of a conic, relative to c: a little above float64's rounding
 
 
 class Frame(NamedTuple):
@@ -27,9 +31,26 @@ class Frame(NamedTuple):
 
 
 @scalar
-def mahalanobis(dx, dy, a, b, c):
-    """Return sigma = d^T conic d / 2."""
-    return HALF * (a * dx * dx + c * dy * dy) + b * dx * dy
+def factors(a, b, c):
+    """Return (a, slope, pivot) with a dx^2 + 2 b dx dy + c dy^2 = a (dx + slope dy)^2 + pivot dy^2.
+
+    A sum of squares: for a long oblique needle the three terms on the left are many orders larger than their sum. The
+    pivot c - b^2 / a is such a difference itself, so conics are float64. Where they were rounded, it is kept positive.
+    """
+    slope = b / a
+    return a, slope, max(c - b * slope, PIVOT_MIN * c)
+
+
+@scalar
+def mahalanobis(e, dy, half_a, half_pivot):
+    """Return sigma = d^T conic d / 2 of e = dx + slope dy; see ``factors``."""
+    return half_a * e * e + half_pivot * dy * dy
+
+
+@scalar
+def conic_vjp_of_moments(slope, ee, ey, yy):
+    """Gradient by (a, b, c) from the moments of dL/dsigma over e^2, e dy and dy^2, with dx = e - slope dy."""
+    return HALF * (ee - slope * (TWO * ey - slope * yy)), ey - slope * yy, HALF * yy
 
 
 @scalar

@@ -7,14 +7,21 @@ needle-shaped Gaussians.
 import math
 
 from minisplat_ref.scalar._jit import scalar
-from minisplat_ref.scalar.literals import ONE, TWO
+from minisplat_ref.scalar.literals import ONE, TWO, ZERO
 
 
 @scalar
 def normalized(w, x, y, z):
-    """Return the unit quaternion and the reciprocal of its former length."""
-    inverse_length = ONE / math.sqrt(w * w + x * x + y * y + z * z)
-    return w * inverse_length, x * inverse_length, y * inverse_length, z * inverse_length, inverse_length
+    """Return the unit quaternion and the reciprocal of its former length; zeros for the zero quaternion.
+
+    It is divided by its largest entry first, so that no square leaves the range of floats.
+    """
+    largest = max(max(abs(w), abs(x)), max(abs(y), abs(z)))
+    if largest == ZERO:
+        return w, x, y, z, largest
+    w, x, y, z = w / largest, x / largest, y / largest, z / largest
+    inverse = ONE / math.sqrt(w * w + x * x + y * y + z * z)
+    return w * inverse, x * inverse, y * inverse, z * inverse, inverse / largest
 
 
 @scalar

@@ -43,7 +43,9 @@ def inria_tiles(x, r, size):
 def inria_box(footprint, width, height):
     """Tiles touched by the square of half-side ceil(3 sqrt(lambda_1)), three standard deviations of the longer axis."""
     middle = HALF * (footprint.cov_xx + footprint.cov_yy)
-    largest = middle + math.sqrt(max(INRIA_ROOT_MIN, middle * middle - footprint.det))
+    half_difference = HALF * (footprint.cov_xx - footprint.cov_yy)  # middle^2 - det, without its cancellation
+    root = half_difference * half_difference + footprint.cov_xy * footprint.cov_xy
+    largest = middle + math.sqrt(max(INRIA_ROOT_MIN, root))
     r = math.ceil(min(THREE * math.sqrt(largest), RADIUS_MAX))
     x0, x1 = inria_tiles(footprint.x - HALF, r, width)
     y0, y1 = inria_tiles(footprint.y - HALF, r, height)

@@ -7,7 +7,8 @@ With the Gaussian's axes as the columns of M = R_g diag(s), the projected covari
     w = (fy / z) (V_1 - y' V_2) second row
 
 so that cov = (u.u, u.w, w.w), and its determinant is the squared area |u x w|^2: a sum of squares, which stays accurate
-for needles where u.u * w.w - (u.w)^2 would cancel.
+for needles where u.u * w.w - (u.w)^2 would cancel. For the same reason the conic is built from its factors (see
+``conic``) rather than as the inverse of rounded entries.
 """
 
 import math
@@ -152,22 +153,31 @@ def project_gaussian(p, V, lens):
 
 @scalar
 def conic(footprint):
-    """Inverse of the projected covariance."""
-    inverse_det = ONE / footprint.det
-    return footprint.cov_yy * inverse_det, -footprint.cov_xy * inverse_det, footprint.cov_xx * inverse_det
+    """Inverse (a, b, c) of the projected covariance.
+
+    c is put together so that the pivot c - b^2 / a is 1 / cov_yy to all digits, which cov_xx / det would not give.
+    """
+    a = footprint.cov_yy / footprint.det
+    slope = -footprint.cov_xy / footprint.cov_yy
+    return a, a * slope, ONE / footprint.cov_yy + a * slope * slope
 
 
 @scalar
 def conic_vjp(footprint, v_conic):
-    """Gradient by (cov_xx, cov_xy, cov_yy): d(S^-1) = -S^-1 dS S^-1, the off-diagonal entry counted twice."""
-    a, b, c = conic(footprint)
-    v_a = v_conic[0]
-    v_b = v_conic[1]
-    v_c = v_conic[2]
+    """Gradient by (cov_xx, cov_xy, cov_yy), by way of the factors a, slope = b / a and pivot = c - b^2 / a.
+
+    The three are 1 / (cov_xx - cov_xy^2 / cov_yy), -cov_xy / cov_yy and 1 / cov_yy. For a needle the entries of
+    ``v_conic`` are large and cancel in the gradients by a and slope; they do so here, in two sums, and nowhere else.
+    """
+    a = footprint.cov_yy / footprint.det
+    slope = -footprint.cov_xy / footprint.cov_yy
+    pivot = ONE / footprint.cov_yy
+    by_schur = -a * (a * (v_conic[0] + slope * (v_conic[1] + slope * v_conic[2])))
+    by_slope = pivot * a * (v_conic[1] + TWO * slope * v_conic[2])
     return (
-        -(a * a * v_a + a * b * v_b + b * b * v_c),
-        -(TWO * a * b * v_a + (a * c + b * b) * v_b + TWO * b * c * v_c),
-        -(b * b * v_a + b * c * v_b + c * c * v_c),
+        by_schur,
+        TWO * slope * by_schur - by_slope,
+        slope * slope * by_schur - slope * by_slope - pivot * pivot * v_conic[2],
     )
 
 

@@ -1,26 +1,28 @@
 """How far one Gaussian's visible ellipse reaches within a band of pixel rows.
 
-The ellipse is the set a dx^2 + 2 b dx dy + c dy^2 <= q with q = 2 ln(opacity / alpha_min): outside, alpha is below
-alpha_min. It is convex, so its right-most point within a band of rows is the right-most point of all if that lies in
-the band, and otherwise lies on the nearer edge of the band.
+The ellipse is the set a (dx + slope dy)^2 + pivot dy^2 <= q with q = 2 ln(opacity / alpha_min) and the factors a, slope
+and pivot of the conic: outside, alpha is below alpha_min. It is convex, so its right-most point within a band of rows
+is the right-most point of all if that lies in the band, and otherwise lies on the nearer edge of the band.
 """
 
 import math
 from typing import NamedTuple
 
+import numpy as np
+
 from minisplat_ref.scalar._jit import scalar
 from minisplat_ref.scalar.literals import ONE, TWO, ZERO
+
+FLAT = np.float32(1e-30)  # px^-2: a conic that is no ellipse reaches over any image
 
 
 class Ellipse(NamedTuple):
     """A visible ellipse around the origin."""
 
-    b: float
+    slope: float
     inverse_a: float
-    det: float
-    """a c - b^2."""
-    qa: float
-    """q a."""
+    pivot: float
+    q: float
     half_height: float
     """Largest dy."""
     tilt: float
@@ -28,13 +30,16 @@ class Ellipse(NamedTuple):
 
 
 @scalar
-def visible_ellipse(a, b, c, opacity, alpha_min, margin):
+def visible_ellipse(a, slope, pivot, opacity, alpha_min, margin):
     """Ellipse on which alpha equals alpha_min, its level raised by a relative and an absolute margin."""
     q = TWO * math.log(opacity / alpha_min)
     q += margin * (q + margin)
-    det = a * c - b * b
-    half_width = math.sqrt(q * c / det)
-    return Ellipse(b, ONE / a, det, q * a, math.sqrt(q * a / det), -(b / c) * half_width)
+    a, pivot = max(a, FLAT), max(pivot, FLAT)
+    half_height = math.sqrt(q / pivot)
+    # Where the ellipse is widest, its gradient has no y: slope a (dx + slope dy) + pivot dy = 0.
+    steepness = slope * math.sqrt(a / pivot)
+    tilt = -half_height * steepness / math.sqrt(ONE + steepness * steepness)
+    return Ellipse(slope, ONE / a, pivot, q, half_height, tilt)
 
 
 @scalar
@@ -44,5 +49,5 @@ def rightmost_offset(ellipse, low, high, side):
     The band has to meet the ellipse. The left side is the right side of the ellipse turned by half a circle.
     """
     dy = min(max(side * ellipse.tilt, low), high)
-    root = math.sqrt(max(ellipse.qa - ellipse.det * dy * dy, ZERO))
-    return (root - side * ellipse.b * dy) * ellipse.inverse_a
+    root = math.sqrt(max(ellipse.q - ellipse.pivot * dy * dy, ZERO) * ellipse.inverse_a)
+    return root - side * ellipse.slope * dy
