@@ -1,16 +1,46 @@
-"""``oracle hard-cases``."""
+"""``oracle hard-cases``: scenes that break renderers, through every precision, forward and backward."""
 
 import argparse
 
 from minisplat_ref.cli.arguments import Commands, HelpFormatter
+from minisplat_ref.cli.oracle import add_json_argument, publish
+
+DESCRIPTION = """\
+Run the catalogue of hard cases through cpu float64, cpu-exact float32 and cpu
+float32, forward and backward, against the reference in float64.
+
+Each must be finite and within its tolerance, or refused in one clear line.
+Image errors are relative to the largest value where that is above 1; gradient
+errors are relative, of the worst block of parameters. Pixels on a threshold,
+where a rounding decides whether a hit counts, are counted by themselves; a
+flip is one that decided otherwise.
+"""
+EPILOG = """\
+examples:
+  minisplat-ref oracle hard-cases
+  minisplat-ref oracle hard-cases --only needle
+  minisplat-ref oracle hard-cases --json hard_cases.json"""
 
 
 def add_parser(checks: Commands) -> None:
     """Add the check."""
-    parser = checks.add_parser("hard-cases", help="(stub)", formatter_class=HelpFormatter)
+    parser = checks.add_parser(
+        "hard-cases",
+        help="needles, huge worlds, empty scenes, NaN: finite or refused",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=HelpFormatter,
+    )
+    parser.add_argument(
+        "--only", metavar="PATTERN", default="", help="cases whose name holds this; * and ? are wildcards"
+    )
+    add_json_argument(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check, print the table."""
-    raise NotImplementedError
+    """Run the cases, print the table."""
+    from minisplat_ref.oracle.hard_cases import HARD_CASES
+    from minisplat_ref.oracle.hard_cases.run import matching, run_hard_cases
+
+    return publish(run_hard_cases(matching(HARD_CASES, args.only)), args.json)

@@ -1,0 +1,190 @@
+"""Means where a camera cannot see them, and cameras that no photographer has."""
+
+import numpy as np
+
+from minisplat_ref.constants import INRIA
+from minisplat_ref.oracle.hard_cases.case import HardCase
+from minisplat_ref.oracle.hard_cases.scenes import call, camera, cloud, gaussians, intrinsics
+from minisplat_ref.oracle.hard_cases.subjects import Parameters
+from minisplat_ref.oracle.hard_cases.tolerances import LONG
+
+CULLED = "culled: the background, and no gradient"
+BESIDE = [[1.2, 0.1, 1.0], [-1.4, -0.3, 1.0], [0.2, 1.1, 1.0], [0.1, 0.2, 3.0]]  # slopes beyond 1.3 tan(fov / 2)
+
+
+CAMERAS = (
+    HardCase(
+        "on-the-near-plane",
+        "z is the near plane itself",
+        CULLED,
+        lambda: call([[0, 0, 0.5]], near_plane=0.5),
+        is_background=True,
+    ),
+    HardCase(
+        "just-beyond-the-near-plane",
+        "one float32 beyond",
+        "drawn, 100 times larger than at arm's length",
+        lambda: call([[0, 0, float(np.nextafter(np.float32(0.5), np.float32(1)))]], 0.05, near_plane=0.5),
+    ),
+    HardCase(
+        "near-plane-of-the-profile",
+        "0.01 is no float32: float32's 0.01 lies before it",
+        CULLED,
+        lambda: call([[0, 0, 0.01]]),
+        is_background=True,
+    ),
+    HardCase(
+        "behind",
+        "z is negative: the pinhole mirrors it into the image",
+        CULLED,
+        lambda: call([[0, 0, -3.0]]),
+        is_background=True,
+    ),
+    HardCase("beside", "z = 0: the slope is infinite", CULLED, lambda: call([[1, 0, 0.0]], 1.0), is_background=True),
+    HardCase(
+        "at-the-camera-centre",
+        "x = y = z = 0: the slope is 0 / 0",
+        CULLED,
+        lambda: call([[0, 0, 0.0]], 1.0),
+        is_background=True,
+    ),
+    HardCase(
+        "at-the-camera-centre-without-near-plane",
+        "nothing but z > 0 keeps it out",
+        CULLED,
+        lambda: call([[0, 0, 0.0]], 1.0, near_plane=0.0),
+        is_background=True,
+    ),
+    HardCase(
+        "behind-beside-and-before",
+        "one of each in a batch",
+        "only what is before is drawn",
+        lambda: call([[0, 0, -3], [1, 0, 0], [0, 0, 0], [0, 0, 3], [0.1, 0, 1e-3]]),
+    ),
+    HardCase(
+        "1e-6-before-the-camera",
+        "1 / z^2 = 1e12, without a near plane",
+        "its footprint covers the image",
+        lambda: call([[1e-8, 1e-8, 1e-6]], 0.1, near_plane=0.0),
+        LONG,
+    ),
+    HardCase(
+        "1e-25-before-the-camera",
+        "z^2 is 0 in float32",
+        "its footprint covers the image",
+        lambda: call([[0, 0, 1e-25]], 1e-26, near_plane=0.0),
+    ),
+    HardCase(
+        "1e25-away",
+        "z^2 is infinite in float32",
+        "its footprint, as of a small one near by",
+        lambda: call([[0, 0, 1e25]], 1e24, far_plane=1e30),
+    ),
+    HardCase(
+        "on-the-far-plane",
+        "z is the far plane itself",
+        CULLED,
+        lambda: call([[0, 0, 8.0]], far_plane=8.0),
+        is_background=True,
+    ),
+    HardCase("beyond-the-far-plane", "z = 1e11", CULLED, lambda: call([[0, 0, 1e11]], 1e11), is_background=True),
+    HardCase(
+        "clamp-active",
+        "means beside the view whose footprints reach in: the Jacobian is frozen at 1.3 tan(fov / 2)",
+        "no gradient through the frozen slope",
+        lambda: call(BESIDE, 0.4, size=(24, 18)),
+    ),
+    HardCase(
+        "clamp-active-inria",
+        "the same, counted from the axis",
+        "as above",
+        lambda: call(BESIDE, 0.4, size=(24, 18), profile="INRIA"),
+    ),
+    HardCase(
+        "clamp-off-centre",
+        "the clamp counts from a principal point at the edge",
+        "limits that are not symmetric",
+        lambda: call(BESIDE, 0.4, size=(24, 18), Ks=intrinsics(30, 28, 2.0, 16.0)),
+    ),
+    HardCase(
+        "principal-point-off-centre",
+        "cx = 3 and cy = 15 of 24 x 18",
+        "the image moves with it",
+        lambda: Parameters(cloud(), camera(cx=3.0, cy=15.0)),
+    ),
+    HardCase(
+        "principal-point-outside",
+        "the axis does not meet the image",
+        "what is left of the picture",
+        lambda: Parameters(cloud(60, scales=0.5), camera(cx=-8.0, cy=30.0)),
+    ),
+    HardCase(
+        "principal-point-ignored",
+        "INRIA's rasteriser centres it whatever the camera says",
+        "the image of the centred camera",
+        lambda: Parameters(cloud(), camera(cx=3.0, cy=15.0), conventions=INRIA),
+    ),
+    HardCase(
+        "fov-170-degrees",
+        "focal length 1 pixel of 24: Jacobians are extreme at the edges",
+        "small footprints, stretched outwards",
+        lambda: Parameters(cloud(), camera(fx=1.05, fy=1.05)),
+    ),
+    HardCase(
+        "fov-0.01-degrees",
+        "focal length 1e5 pixels, things 1e4 units away",
+        "as seen through a telescope",
+        lambda: call(
+            np.random.default_rng(4).uniform(-1, 1, (20, 3)) * [1, 1, 50] + [0, 0, 1e4],
+            0.2,
+            Ks=intrinsics(1e5, 1e5, 4.5, 4.5),
+        ),
+    ),
+    HardCase(
+        "focal-length-1e-3",
+        "everything falls into a thousandth of a pixel",
+        "the low-pass's dot, all Gaussians in one pixel",
+        lambda: Parameters(cloud(), camera(fx=1e-3, fy=1e-3)),
+    ),
+    HardCase(
+        "focal-length-1e6",
+        "a Gaussian of 0.2 units is 1e5 pixels wide",
+        "a constant image",
+        lambda: Parameters(gaussians([[0, 0, 3]]), camera(fx=1e6, fy=1e6)),
+    ),
+    HardCase(
+        "focal-lengths-differ-1e3",
+        "pixels that are 1000 times taller than wide",
+        "stretched footprints",
+        lambda: Parameters(cloud(), camera(fx=3000.0, fy=3.0)),
+        LONG,
+    ),
+    HardCase(
+        "mirrored-view",
+        "the matrix mirrors: its determinant is -1",
+        "the mirrored image; nine free entries, no rotation assumed",
+        lambda: call([[0.1, 0.2, 3], [-0.3, 0, 4]], viewmats=np.diag([-1.0, 1, 1, 1])[None]),
+    ),
+    HardCase(
+        "view-in-other-units",
+        "R and t times 1000: the camera's frame is in millimetres",
+        "the same image",
+        lambda: call([[0.1, 0.2, 3], [-0.3, 0, 4]], viewmats=np.diag([1e3, 1e3, 1e3, 1])[None]),
+    ),
+    HardCase(
+        "sheared-view",
+        "R is no rotation",
+        "the linear map that is given; its inverse takes the camera to its centre",
+        lambda: call(
+            [[0.1, 0.2, 3], [-0.3, 0, 4]],
+            viewmats=np.array([[[1, 0.5, 0, 0.125], [0, 1, 0.25, 0], [0, 0, 1, 0.5], [0, 0, 0, 1.0]]]),
+        ),
+    ),
+    HardCase(
+        "far-beside",
+        "a footprint 1e6 pixels away that covers the image",
+        "a gentle slope of alpha",
+        lambda: Parameters(gaussians([[3e3, 0, 1]], 1e5), camera()),
+        LONG,
+    ),
+)

@@ -1,0 +1,208 @@
+"""Each hard case through every precision, forward and backward, against the reference in float64.
+
+Verdict of a case: refused with the message that it expects, in every precision; or all outputs and all gradients finite
+and as near to the reference as its tolerance says. Derivatives by the outputs are random, fixed and the same in all
+precisions, and zero at pixels that stand on a threshold: see :mod:`minisplat_ref.oracle.hard_cases.thresholds`.
+"""
+
+import fnmatch
+import zlib
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from minisplat_ref.backends import CPU, CPU_EXACT, REFERENCE, Backend
+from minisplat_ref.errors import InputError
+from minisplat_ref.oracle.cases import Case, Figure, Report
+from minisplat_ref.oracle.hard_cases.case import HardCase
+from minisplat_ref.oracle.hard_cases.subjects import Arrays, Drawing, Subject, drawing, splat_tapes
+from minisplat_ref.oracle.hard_cases.thresholds import jump_max, pixels_at_thresholds
+from minisplat_ref.types import Bools
+
+# A gradient smaller than this part of the median block is judged by the median: it is the rounding of the others.
+BLOCK_FLOOR = 1e-2
+
+
+class Precision(NamedTuple):
+    """A backend with a dtype."""
+
+    label: str
+    backend: Backend
+    dtype: type
+
+
+PRECISIONS = (
+    Precision("f64", CPU, np.float64),
+    Precision("f32 exact", CPU_EXACT, np.float32),
+    Precision("f32", CPU, np.float32),
+)
+
+
+class Outcome(NamedTuple):
+    """What one precision made of a case."""
+
+    outputs: Arrays
+    gradients: Arrays
+
+
+def run_hard_cases(cases: Sequence[HardCase], precisions: Sequence[Precision] = PRECISIONS) -> Report:
+    """Run cases.
+
+    Parameters
+    ----------
+    cases : sequence of HardCase
+        From the catalogue.
+    precisions : sequence of Precision
+        Compared with the reference in float64.
+
+    Returns
+    -------
+    Report
+        A :class:`Case` for each; columns are image and gradient errors by precision, pixels on a threshold and flips.
+    """
+    return Report(
+        "Hard cases: every precision against the reference in float64, forward and backward",
+        tuple(run_hard_case(case, precisions) for case in cases),
+        {"precisions": [precision.label for precision in precisions]},
+    )
+
+
+def matching(cases: Sequence[HardCase], pattern: str) -> tuple[HardCase, ...]:
+    """Return the cases whose name holds the pattern, in which ``*`` and ``?`` are wildcards.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    found = tuple(case for case in cases if fnmatch.fnmatch(case.name, f"*{pattern}*"))
+    if not found:
+        raise InputError(f"no hard case is named like {pattern!r}; run without --only to see all names")
+    return found
+
+
+def run_hard_case(case: HardCase, precisions: Sequence[Precision] = PRECISIONS) -> Case:
+    """Run one case; see :func:`run_hard_cases`."""
+    subject = case.build()
+    if case.refusal is not None:
+        return _refusal(case, subject, precisions)
+    try:
+        return _comparison(case, subject, precisions)
+    except InputError as error:
+        return Case(case.name, False, {}, f"refused: {error}")
+
+
+def _refusal(case: HardCase, subject: Subject, precisions: Sequence[Precision]) -> Case:
+    """Check that the reference and every precision refuse the subject, in one line that holds what it should."""
+    for precision in (Precision("reference", REFERENCE, np.float64), *precisions):
+        try:
+            drawing(subject, precision.backend, np.dtype(precision.dtype))
+        except InputError as error:
+            message = str(error)
+            if case.refusal not in message or "\n" in message:
+                return Case(case.name, False, {}, f"{precision.label} says {message!r}, not {case.refusal!r}")
+        else:
+            return Case(case.name, False, {}, f"{precision.label} does not refuse it")
+    return Case(case.name, True, {}, f"refused: {case.refusal}")
+
+
+def _comparison(case: HardCase, subject: Subject, precisions: Sequence[Precision]) -> Case:
+    expected_drawing = drawing(subject, REFERENCE, np.dtype(np.float64))
+    tapes = splat_tapes(subject, REFERENCE)
+    at_threshold = pixels_at_thresholds(tapes[0]) if tapes else None
+    cotangents = _cotangents(case.name, subject.cotangent_scale, expected_drawing, at_threshold)
+    expected = _outcome(expected_drawing, cotangents, np.float64)
+    problems = _problems_of_reference(case, expected)
+    figures: dict[str, Figure] = {}
+    flip_errors, n_flips = [0.0], 0
+    for precision in precisions:
+        actual = _outcome(drawing(subject, precision.backend, np.dtype(precision.dtype)), cotangents, precision.dtype)
+        image_error, flips = _image_error(actual.outputs, expected.outputs, at_threshold)
+        block, gradient_error = _gradient_error(actual.gradients, expected.gradients, expected_drawing.gradient_size)
+        is_wide = precision.dtype is np.float64
+        image_max = case.tolerance.image64 if is_wide else case.tolerance.image32
+        gradient_max = case.tolerance.gradient64 if is_wide else case.tolerance.gradient32
+        if (name := _not_finite(actual)) is not None:
+            problems.append(f"{precision.label}: {name} is not finite")
+        if not image_error <= image_max:
+            problems.append(f"{precision.label}: image off by {image_error:.1e}, allowed are {image_max:.0e}")
+        if not gradient_error <= gradient_max:
+            problems.append(f"{precision.label}: v_{block} off by {gradient_error:.1e}, allowed are {gradient_max:.0e}")
+        figures |= {f"image {precision.label}": image_error, f"grad {precision.label}": gradient_error}
+        flip_errors.append(flips.max(initial=0.0))
+        n_flips = max(n_flips, int((flips > image_max).sum()))
+    if tapes and max(flip_errors) > jump_max(tapes[0]) * _size(expected.outputs):
+        problems.append(f"a pixel on a threshold is off by {max(flip_errors):.1e}, more than one hit")
+    n_near = 0 if at_threshold is None else int(at_threshold.sum())
+    figures |= {"on threshold": n_near, "flips": n_flips}
+    order = ("image", "grad", "on", "flips")
+    columns = {key: figures[key] for prefix in order for key in figures if key.startswith(prefix)}
+    return Case(case.name, not problems, columns, "; ".join(problems))
+
+
+def _outcome(drawn: Drawing, cotangents: Arrays, dtype: type) -> Outcome:
+    with np.errstate(all="ignore"):  # a cotangent below float32's range becomes 0
+        v = {name: array.astype(dtype) for name, array in cotangents.items()}
+        return Outcome(drawn.outputs, drawn.vjp(v))
+
+
+def _cotangents(name: str, scale: float, drawn: Drawing, at_threshold: Bools | None) -> Arrays:
+    """Random derivatives that float32 holds, the same in every precision and every run."""
+    rng = np.random.default_rng(zlib.crc32(name.encode()))
+    cotangents = {}
+    for key in drawn.differentiable:
+        v = scale * rng.normal(size=drawn.outputs[key].shape).astype(np.float32).astype(np.float64)
+        if at_threshold is not None:
+            v[at_threshold] = 0
+        cotangents[key] = v
+    return cotangents
+
+
+def _problems_of_reference(case: HardCase, expected: Outcome) -> list[str]:
+    """What is wrong with the reference itself, or with a case that checks nothing."""
+    if (name := _not_finite(expected)) is not None:
+        return [f"reference: {name} is not finite"]
+    moved = [key for key, v in expected.gradients.items() if "background" not in key and v.any()]
+    if case.is_background and (moved or expected.outputs["alpha"].any()):
+        return ["reference: something is drawn, or has a gradient"]
+    if not case.is_background and "alpha" in expected.outputs and not expected.outputs["alpha"].any():
+        return ["nothing is drawn: the case checks nothing"]
+    return []
+
+
+def _not_finite(outcome: Outcome) -> str | None:
+    named = {**outcome.outputs, **{f"v_{key.removeprefix('v_')}": value for key, value in outcome.gradients.items()}}
+    return next((name for name, value in named.items() if not np.isfinite(value).all()), None)
+
+
+def _size(outputs: Arrays) -> float:
+    return max(1.0, max(float(np.abs(value).max(initial=0.0)) for value in outputs.values()))
+
+
+def _image_error(actual: Arrays, expected: Arrays, at_threshold: Bools | None) -> tuple[float, np.ndarray]:
+    """Largest error of the outputs off the thresholds, each relative to its size, and the errors on them [P]."""
+    worst, on_threshold = 0.0, np.zeros(0 if at_threshold is None else at_threshold.sum())
+    for name, value in expected.items():
+        with np.errstate(invalid="ignore"):
+            error = np.abs(actual[name] - value) / _size({name: value})
+        if at_threshold is not None:
+            if name in ("image", "alpha"):
+                worst_channel = error.reshape(*at_threshold.shape, error[0, 0].size).max(axis=2)  # [H, W]
+                on_threshold = np.maximum(on_threshold, worst_channel[at_threshold])
+            error = error[~at_threshold]
+        worst = max(worst, float(error.max(initial=0.0)))  # NaN is found by _not_finite
+    return worst, on_threshold
+
+
+def _gradient_error(actual: Arrays, expected: Arrays, least: float) -> tuple[str, float]:
+    """Block with the largest relative L2 error, and that error."""
+    norms = {key: float(np.linalg.norm(value)) for key, value in expected.items()}
+    present = [norm for norm in norms.values() if norm > 0]
+    floor = max(least, BLOCK_FLOOR * float(np.median(present)) if present else 0.0)
+    errors = {}
+    for key, value in expected.items():
+        difference = float(np.linalg.norm(actual[key].astype(np.float64) - value))
+        errors[key] = 0.0 if difference == 0 else difference / max(norms[key], floor, np.finfo(np.float32).tiny)
+    worst = max(errors, key=lambda key: errors[key])
+    return worst.removeprefix("v_"), errors[worst]

@@ -1,0 +1,189 @@
+"""What can be drawn, as data, and how each kind goes through the public boundary and back.
+
+A subject holds float64 arrays whose numbers float32 holds too, so that every precision is given the same scene. What is
+refused is refused where users' input is: by :func:`check_gaussians`, with which every reader of a file ends, and by the
+checks of :func:`rasterization`.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref.backends import Backend
+from minisplat_ref.batch import checked_batch, draw
+from minisplat_ref.constants import GSPLAT_MAIN, PROFILES, Conventions
+from minisplat_ref.gsplat_door import rasterization, rasterization_vjp
+from minisplat_ref.render import render, render_vjp
+from minisplat_ref.splatting import SplatTape
+from minisplat_ref.types import Bools, Camera, Floats, Gaussians
+from minisplat_ref.validation import check_gaussians, chosen_conventions
+
+Arrays = dict[str, Floats]
+
+
+class Parameters(NamedTuple):
+    """Trained parameters and a camera: through :func:`check_gaussians` and :func:`render`."""
+
+    gaussians: Gaussians
+    camera: Camera
+    background: tuple[float, float, float] = (0.25, 0.5, 0.75)
+    conventions: Conventions = GSPLAT_MAIN
+    with_depth: bool = False
+    with_median_depth: bool = False
+    cotangent_scale: float = 1.0
+
+
+class Call(NamedTuple):
+    """Activated Gaussians and matrices: through :func:`rasterization`."""
+
+    arrays: dict[str, Any]  # means to Ks, by name
+    width: int
+    height: int
+    options: dict[str, Any]  # of rasterization, backgrounds too
+    cotangent_scale: float = 1.0
+
+
+class Pictures(NamedTuple):
+    """A rendered image and a photograph: the photometric loss."""
+
+    image: Floats
+    target: Floats
+    dssim_weight: float = 0.2
+    mask: Bools | None = None
+    cotangent_scale: float = 1.0
+
+
+class Surface(NamedTuple):
+    """Gaussians whose surface points are asked for: the stage that depth reinitialisation uses."""
+
+    gaussians: Gaussians
+    camera: Camera
+    cotangent_scale: float = 1.0
+
+
+Subject = Parameters | Call | Pictures | Surface
+
+
+class Drawing(NamedTuple):
+    """What a precision made of a subject."""
+
+    outputs: Arrays
+    """By name; the first two axes of those that a pixel has are its row and column."""
+    vjp: Callable[[Arrays], Arrays]
+    """From derivatives by the differentiable outputs to gradients by block."""
+    differentiable: tuple[str, ...]
+    gradient_size: float = 0.0
+    """Norm of an ordinary gradient, where that of a subject may be nothing but rounding."""
+
+
+def cast(bundle: Any, dtype: np.dtype) -> Any:
+    """Return a NamedTuple or dict with its floating arrays in another precision."""
+    if isinstance(bundle, dict):
+        return {key: cast(value, dtype) for key, value in bundle.items()}
+    if isinstance(bundle, np.ndarray):
+        return bundle.astype(dtype) if bundle.dtype.kind == "f" else bundle
+    return type(bundle)(*(cast(field, dtype) for field in bundle)) if isinstance(bundle, tuple) else bundle
+
+
+@np.errstate(all="ignore")  # the cast overflows where that is what makes the case hard
+def drawing(subject: Subject, backend: Backend, dtype: np.dtype) -> Drawing:
+    """Draw a subject in one precision.
+
+    Raises
+    ------
+    InputError
+        If the subject is refused.
+    """
+    if isinstance(subject, Parameters):
+        return _draw_parameters(subject, backend, dtype)
+    if isinstance(subject, Call):
+        return _draw_call(subject, backend, dtype)
+    if isinstance(subject, Surface):
+        return _draw_surface(subject, backend, dtype)
+    image, target = subject.image.astype(dtype), subject.target.astype(dtype)
+    loss, tape = backend.photometric_loss(image, target, subject.dssim_weight, subject.mask)
+
+    def vjp(v: Arrays) -> Arrays:
+        return {"image": backend.photometric_loss_vjp(tape, float(v["loss"]))}
+
+    size = 1 / np.sqrt(image.size)  # of image.size signs, each divided by image.size
+    return Drawing({"loss": np.array(loss)}, vjp, ("loss",), size)
+
+
+def splat_tapes(subject: Subject, backend: Backend) -> list[SplatTape]:
+    """Return what was splatted in float64, view by view, to look for pixels at thresholds; nothing of a loss."""
+    if isinstance(subject, Parameters):
+        gaussians, camera = subject.gaussians, subject.camera
+        _, tape = render(gaussians, camera, conventions=subject.conventions, backend=backend)
+        return [tape.splats]
+    if not isinstance(subject, Call):
+        return []
+    a, options = subject.arrays, subject.options
+    primitives = (a["means"], a["quats"], a["scales"], a["opacities"])
+    conventions = chosen_conventions(
+        options.get("profile", GSPLAT_MAIN),
+        options.get("near_plane"),
+        options.get("far_plane"),
+        options.get("eps2d"),
+        options.get("rasterize_mode", "classic"),
+    )
+    views = (a["colors"], a["viewmats"], a["Ks"], subject.width, subject.height)
+    batch = checked_batch(primitives, *views, options.get("sh_degree"), options.get("backgrounds"), "RGB")
+    return [draw(batch, c, conventions, backend) for c in range(len(batch.cameras))]
+
+
+def _draw_parameters(subject: Parameters, backend: Backend, dtype: np.dtype) -> Drawing:
+    gaussians, background = cast(subject.gaussians, dtype), np.array(subject.background, dtype)
+    check_gaussians(gaussians, "scene")
+    output, tape = render(
+        gaussians,
+        subject.camera,
+        background=background,
+        conventions=subject.conventions,
+        backend=backend,
+        with_depth=subject.with_depth,
+        with_median_depth=subject.with_median_depth,
+    )
+    outputs = {"image": output.image, "alpha": output.alpha}
+    if output.median_depth is not None:
+        outputs["median depth"] = output.median_depth
+
+    def vjp(v: Arrays) -> Arrays:
+        gradient = render_vjp(tape, v["image"], v["alpha"])
+        blocks = {**gradient.gaussians._asdict(), **gradient._asdict()}
+        del blocks["gaussians"], blocks["means2d"]
+        return blocks
+
+    return Drawing(outputs, vjp, ("image", "alpha"))
+
+
+def _draw_call(subject: Call, backend: Backend, dtype: np.dtype) -> Drawing:
+    arrays, options = cast(subject.arrays, dtype), cast(subject.options, dtype)
+    sized = {**arrays, "width": subject.width, "height": subject.height, **options, "backend": backend}
+    images, alphas, _ = rasterization(**sized)
+    outputs = {"image": images[0], "alpha": alphas[0, ..., 0]}
+
+    def vjp(v: Arrays) -> Arrays:
+        cotangents = {"v_render_colors": v["image"][None], "v_render_alphas": v["alpha"][None, ..., None]}
+        return rasterization_vjp(**sized, **cotangents)
+
+    return Drawing(outputs, vjp, ("image", "alpha"))
+
+
+def _draw_surface(subject: Surface, backend: Backend, dtype: np.dtype) -> Drawing:
+    g, camera = cast(subject.gaussians, dtype), subject.camera
+    scales = np.exp(g.log_scales)
+    ids = np.arange(camera.height * camera.width, dtype=np.int32).reshape(camera.height, -1) % len(g.means)
+    points, depths = backend.surface_points(g.means, g.quats, scales, camera, ids)
+
+    def vjp(v: Arrays) -> Arrays:
+        v_means, v_quats, v_scales = backend.surface_points_vjp(
+            g.means, g.quats, scales, camera, ids, v["points"], v["depths"]
+        )
+        return {"means": v_means, "quats": v_quats, "log_scales": scales * v_scales}
+
+    return Drawing({"points": points, "depths": depths}, vjp, ("points", "depths"))
+
+
+__all__ = ["PROFILES", "Call", "Drawing", "Parameters", "Pictures", "Subject", "Surface", "cast", "drawing"]
