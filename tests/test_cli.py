@@ -1,6 +1,7 @@
 """The command line from end to end: what each command leaves, how it is continued and interrupted, its help."""
 
 import json
+import os
 import re
 import signal
 import subprocess
@@ -331,6 +332,15 @@ def test_runs_as_a_module():
     done = subprocess.run([sys.executable, "-m", "minisplat_ref", "train"], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("minisplat-ref: error: give a SCENE")
+
+
+def test_a_reader_that_has_seen_enough_is_no_error(run_folder):
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    command = [sys.executable, "-m", "minisplat_ref", "info", str(run_folder)]
+    done = subprocess.run(command, stdout=write_end, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(write_end)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_public_names_are_all_there():
