@@ -96,6 +96,12 @@ def test_full_mask_is_no_mask(backend, rng):
     assert_array_equal(*(backend.photometric_loss_vjp(tape) for _, tape in results))
 
 
+def test_gradient_has_the_dtype_of_the_image(backend, rng):
+    image, target = (array.astype(np.float32) for array in two_images(rng))
+    _, tape = backend.photometric_loss(image, target, 0.2, np.ones((20, 17), dtype=bool))
+    assert backend.photometric_loss_vjp(tape).dtype == np.float32
+
+
 def test_empty_mask_gives_nothing(backend, rng):
     image, target = two_images(rng)
     loss, tape = backend.photometric_loss(image, target, 0.2, np.zeros((20, 17), dtype=bool))

@@ -307,7 +307,7 @@ def _turns(normals: Floats, photograph: Floats) -> tuple[Floats, Floats]:
 def _mean_weights(weights: tuple[Floats, Floats], exists: Bools) -> tuple[Floats, Floats]:
     """Weights of neighbours that both exist, 0 for the others, divided by the number of such pairs in both axes."""
     both_down, both_right = exists[:-1] & exists[1:], exists[:, :-1] & exists[:, 1:]
-    n = max(1, np.count_nonzero(both_down) + np.count_nonzero(both_right))
+    n = max(1, int(np.count_nonzero(both_down) + np.count_nonzero(both_right)))
     return np.where(both_down, weights[0], 0) / n, np.where(both_right, weights[1], 0) / n
 
 

@@ -78,7 +78,7 @@ def photometric_loss_vjp(tape: LossTape, v_loss: float = 1.0) -> Floats:
         Derivative by the image; zero outside the mask.
     """
     image, target, w, mask = tape
-    n = max(1, image.shape[2] * np.count_nonzero(mask))  # an empty mask gives zeros, not 0/0
+    n = max(1, image.shape[2] * int(np.count_nonzero(mask)))  # an empty mask gives zeros, not 0/0
     one_over_n = np.where(mask[:, :, None], np.ones_like(image) / n, 0)
     v_l1 = one_over_n * np.sign(image - target)
     v_ssim = ssim_map_vjp(image, target, one_over_n)
