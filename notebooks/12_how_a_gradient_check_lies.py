@@ -23,7 +23,7 @@
 # | file | what it holds |
 # |---|---|
 # | `minisplat_ref/oracle/differences.py` | stencils, the refusal to cross a threshold, Jacobians block by block |
-# | `minisplat_ref/oracle/stages.py` | every stage as a function with its gradient |
+# | `minisplat_ref/oracle/stages.py`, `setting.py` | every stage as a function with its gradient, and a scene for them |
 # | `minisplat_ref/oracle/planted.py` | backends that are wrong in one formula, on purpose |
 # | `minisplat_ref/oracle/gradients.py` | the whole proof, and what does not count as one |
 #
@@ -57,7 +57,8 @@ from minisplat_ref.oracle.differences import (
 from minisplat_ref.oracle.gradients import inner_product_case, jacobian_case
 from minisplat_ref.oracle.pieces import tiny_setting
 from minisplat_ref.oracle.planted import PLANTED, planted
-from minisplat_ref.oracle.stages import Setting, composite_stage, make_setting, project_stage, render_stage, sh_stage
+from minisplat_ref.oracle.setting import Setting, make_setting
+from minisplat_ref.oracle.stages import composite_stage, project_stage, render_stage, sh_stage
 from minisplat_ref.oracle.tolerances import GRADIENT_REL, GRADIENT_REL_NEAR_THRESHOLD
 from minisplat_ref.types import Camera, Gaussians
 
@@ -291,7 +292,8 @@ for axis, results, title in zip(axes, (relative, by_terms), titles, strict=True)
     axis.axvline(-3, color=GREY, linewidth=1, label="rtol = 1e-3")
     axis.axvline(np.log10(GRADIENT_REL), color=BLUE, linewidth=1, label="the oracle's tolerance")
     axis.set(title=title, xlabel="log10 of the discrepancy", ylabel="directions")
-axes[0].legend()
+axes[0].set_ylim(0, 1.45 * axes[0].get_ylim()[1])
+axes[0].legend(ncols=2, loc="upper right")
 plt.show()
 passes_lazily = np.mean(relative["one of 12 Gaussians 1 % off"] < 1e-3)
 print(f"the wrong gradient passes at rtol = 1e-3 in {100 * passes_lazily:.0f} % of the directions")

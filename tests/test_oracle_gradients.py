@@ -22,15 +22,8 @@ from minisplat_ref.oracle.differences import (
 )
 from minisplat_ref.oracle.gradients import inner_product_case, jacobian_case
 from minisplat_ref.oracle.pieces import PIECES, tiny_setting
-from minisplat_ref.oracle.stages import (
-    Stage,
-    backend_stages,
-    composite_stage,
-    make_setting,
-    project_stage,
-    render_stage,
-    sh_stage,
-)
+from minisplat_ref.oracle.setting import make_setting
+from minisplat_ref.oracle.stages import Stage, backend_stages, composite_stage, project_stage, render_stage, sh_stage
 from minisplat_ref.oracle.tolerances import GRADIENT_REL
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.types import TileGrid

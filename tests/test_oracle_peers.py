@@ -11,7 +11,8 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.oracle import gradients
 from minisplat_ref.oracle.peers import gsplat_torch as adapter
 from minisplat_ref.oracle.pieces import tiny_setting
-from minisplat_ref.oracle.stages import composite_stage, make_setting, project_stage, render_stage, sh_stage
+from minisplat_ref.oracle.setting import make_setting
+from minisplat_ref.oracle.stages import composite_stage, project_stage, render_stage, sh_stage
 from minisplat_ref.oracle.tolerances import PEER_REL
 from minisplat_ref.types import TileGrid
 

@@ -11,7 +11,8 @@ from minisplat_ref.oracle.differences import careful_derivative
 from minisplat_ref.oracle.gradients import inner_product_case, jacobian_case
 from minisplat_ref.oracle.pieces import PIECES, tiny_setting
 from minisplat_ref.oracle.planted import PLANTED, planted
-from minisplat_ref.oracle.stages import composite_stage, make_setting, project_stage, render_stage, sh_stage
+from minisplat_ref.oracle.setting import make_setting
+from minisplat_ref.oracle.stages import composite_stage, project_stage, render_stage, sh_stage
 from minisplat_ref.oracle.tolerances import GRADIENT_REL
 from minisplat_ref.types import ProjectionGradient, TileGrid
 
@@ -129,8 +130,8 @@ EQUIVALENT = {
     " -> np.einsum('gp,gpi,gpj->gji', -unclamped * v_shape / 2, tile.offsets, tile.offsets)": SYMMETRIC,
     "surface_points_vjp: _whiten(means, quats, scales, camera, ids, ys, xs)"
     " -> _whiten(means, 0.5 * quats, scales, camera, ids, ys, xs)": HOMOGENEOUS,
-    "photometric_loss_vjp: max(1, image.shape[2] * np.count_nonzero(mask))"
-    " -> max(0.5 * 1, image.shape[2] * np.count_nonzero(mask))": COUNTED,
+    "photometric_loss_vjp: max(1, image.shape[2] * int(np.count_nonzero(mask)))"
+    " -> max(0.5 * 1, image.shape[2] * int(np.count_nonzero(mask)))": COUNTED,
     "photometric_loss_vjp: one_over_n * np.sign(image - target) -> one_over_n / np.sign(image - target)": ONES,
     "expected_depth_vjp: is_hit = _is_hit(accumulated_depth, alpha)"
     " -> is_hit = 0.5 * _is_hit(accumulated_depth, alpha)": COUNTED,

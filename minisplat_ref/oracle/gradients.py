@@ -15,7 +15,8 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.cases import Case, Report
 from minisplat_ref.oracle.differences import STEPS, check_inner_products, check_jacobians
 from minisplat_ref.oracle.pieces import PIECES, SEED, tiny_setting
-from minisplat_ref.oracle.stages import Stage, backend_stages, composite_stage, make_setting, project_stage, sh_stage
+from minisplat_ref.oracle.setting import make_setting
+from minisplat_ref.oracle.stages import Stage, backend_stages, composite_stage, project_stage, sh_stage
 from minisplat_ref.oracle.tolerances import (
     COVERAGE_MIN,
     GRADIENT_FLOOR,

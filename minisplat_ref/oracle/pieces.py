@@ -13,12 +13,11 @@ import numpy as np
 from minisplat_ref import reference, render, splatting
 from minisplat_ref.constants import COMPENSATION_FLOOR, GSPLAT_MAIN, Conventions
 from minisplat_ref.oracle.differences import Point
+from minisplat_ref.oracle.setting import Setting, make_setting
 from minisplat_ref.oracle.stages import (
-    Setting,
     Stage,
     composite_stage,
     geometric_stage,
-    make_setting,
     photometric_stage,
     points_near,
     project_stage,

@@ -224,7 +224,13 @@ def _transposed_rs(base: Backend) -> Backend:
         return rotation_matrices_vjp(quats, rows * v_M), np.sum(R * v_M, axis=2)
 
     names = {**reference_project_vjp.__globals__, "covariances_vjp": covariances_vjp}
-    return replace(base, project_vjp=wraps(base.project_vjp)(FunctionType(reference_project_vjp.__code__, names)))
+    changed = FunctionType(reference_project_vjp.__code__, names)
+
+    @wraps(base.project_vjp)
+    def project_vjp(means: Floats, *rest: Any) -> PrimitiveGradient:
+        return PrimitiveGradient._make(field.astype(means.dtype) for field in changed(means, *rest))
+
+    return replace(base, project_vjp=project_vjp)
 
 
 def _changed_project_vjp(change: Callable[[PrimitiveGradient, Floats], PrimitiveGradient]) -> Change:

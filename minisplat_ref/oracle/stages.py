@@ -1,9 +1,6 @@
-"""Every differentiable stage of a backend as a function of arrays with its VJP, on a scene that leaves nothing out.
+"""Every differentiable stage of a backend as a function of arrays with its VJP.
 
-The scene is small and drawn by hand where it matters: a hit that is clamped, a pixel that stops early, a mean outside
-the clamp of the Jacobian, a colour below zero, a principal point off centre and a turned camera, so that every branch
-of every gradient is taken. What is not differentiated (tile lists, dominant Gaussians, radii) is held as it is at the
-scene itself.
+What is not differentiated (tile lists, dominant Gaussians, radii) is held as it is at the scene itself.
 """
 
 import dataclasses
@@ -16,7 +13,7 @@ from minisplat_ref import splatting
 from minisplat_ref.backends import REFERENCE, Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.oracle.differences import Function, Point, Vjp
-from minisplat_ref.reference.covariance import rotation_matrices
+from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.reference.depth_map import expected_depth
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.reference.pinhole import pinhole_jacobians, pose, slope_limits, with_principal_point
@@ -34,8 +31,6 @@ from minisplat_ref.types import (
 
 Sides = tuple[np.ndarray, ...]
 
-POSE = ("cam_from_world_R", "cam_from_world_t")
-
 
 class Stage(NamedTuple):
     """A function under test, where it is tested."""
@@ -48,85 +43,6 @@ class Stage(NamedTuple):
     function: Function
     vjp: Vjp
     """At ``inputs``."""
-
-
-class Setting(NamedTuple):
-    """What a stage is tested on."""
-
-    gaussians: Gaussians
-    camera: Camera
-    background: Floats
-    conventions: Conventions
-
-    @property
-    def primitives(self) -> Primitives:
-        """The Gaussians, activated."""
-        g = self.gaussians
-        return Primitives(g.means, g.quats, np.exp(g.log_scales), 1 / (1 + np.exp(-g.opacity_logits)))
-
-    @property
-    def pose(self) -> dict[str, Floats]:
-        """What moves the camera."""
-        return dict(zip(POSE, pose(self.camera, np.dtype(float)), strict=True))
-
-
-def make_setting(
-    rng: np.random.Generator, n: int, width: int, height: int, conventions: Conventions, sh_degree: int
-) -> Setting:
-    """Draw a scene.
-
-    Parameters
-    ----------
-    rng : Generator
-        For all but the Gaussians that are placed on purpose: row 0 is opaque and on a pixel's centre, rows 1 and 2 lie
-        behind it, row 3 is beyond the clamp of the Jacobian.
-    n : int
-        Gaussians, at least 5.
-    width, height : int
-        Image, pixels.
-    conventions : Conventions
-        Where its gradient is not the derivative of what is computed, as for INRIA's clamp, no alpha is clamped.
-    sh_degree : int
-        Stored and active.
-
-    Returns
-    -------
-    Setting
-        Float64.
-    """
-    fx, fy = 1.2 * width, 1.1 * width
-    R = rotation_matrices(np.array([[1.0, 0.12, -0.07, 0.05]]))[0]
-    camera = Camera(R, np.array([0.1, -0.2, 0.15]), fx, fy, 0.53 * width, 0.46 * height, width, height)
-    seen = with_principal_point(camera, conventions)
-    half_view = np.array([width / fx, height / fy]) / 2
-
-    z = 3 + rng.uniform(-0.8, 0.8, size=n)
-    slopes = rng.uniform(-1, 1, size=(n, 2)) * half_view
-    center = (np.array([width // 2 + 0.54, height // 2 + 0.47]) - (seen.cx, seen.cy)) / (fx, fy)
-    slopes[:3] = center + rng.uniform(-0.02, 0.02, size=(3, 2)) * [[0], [1], [1]]
-    z[:3] = 2.0, 2.3, 2.6
-    _, beyond = slope_limits(seen, conventions, np.dtype(float))
-    slopes[3] = beyond[0] + 0.03, 0.1 * beyond[1]
-    in_camera = np.column_stack([slopes * z[:, None], z])
-
-    log_scales = np.log(0.15 if n > 20 else 0.3) + rng.uniform(-0.5, 0.5, size=(n, 3))
-    log_scales[:4] += np.log([1.5, 1.5, 1.5, 2.5])[:, None]
-    logits = rng.normal(size=n)
-    has_derivative = conventions.clamp_stops_mean_gradient and conventions.clamp_stops_shape_gradient
-    logits[:3] = 6.0 if has_derivative else 4.0, 4.0, 4.0  # opacities 0.998 or 0.982, then 0.982
-    sh_dc = rng.normal(size=(n, 3))
-    sh_dc[1, 1] = -2.5  # a colour of about 0.5 - 2.5 SH_C0 < 0
-    sh_rest = 0.2 * rng.normal(size=(n, (sh_degree + 1) ** 2 - 1, 3))
-    sh_rest[1, :, 1] *= 0.1
-    gaussians = Gaussians(
-        means=(in_camera - camera.cam_from_world_t) @ R,
-        quats=rng.normal(size=(n, 4)),
-        log_scales=log_scales,
-        opacity_logits=logits,
-        sh_dc=sh_dc,
-        sh_rest=sh_rest,
-    )
-    return Setting(gaussians, camera, rng.uniform(0.2, 1, size=3), conventions)
 
 
 def backend_stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
@@ -266,7 +182,7 @@ def geometric_stage(backend: Backend, camera: Camera, rng: np.random.Generator) 
     points, weights = points_near(depth, camera, rng), GeometricWeights(0.7, 1.3, 0.9)
     mask = np.ones(shape, dtype=bool)
     mask[1, 1] = False
-    inputs = {"accumulated_depth": depth * alpha, "alpha": alpha}
+    inputs: dict[str, Floats] = {"accumulated_depth": depth * alpha, "alpha": alpha}
 
     def function(accumulated_depth: Floats, alpha: Floats) -> Point:
         loss, _ = backend.geometric_loss(accumulated_depth, alpha, photograph, camera, points, weights, mask)

@@ -2,9 +2,9 @@
 
 Nothing here is one of our formulas. A rotation turns vectors by the sandwich q v q*; a projected covariance uses the
 numerical derivative of the camera's map itself; an inverse is a linear solve; the densest point of a ray is a minimum;
-transmittance is a product. From that follow error figures for the float64 reference, for the float32 kernels, and for
-the textbook's formulas in float32, which the reference has when it is given float32: ``R mu + t``, ``A Sigma A^T``,
-``a c - b^2``.
+transmittance is a product. From that follow error figures for the float64 reference, for the kernels with float32 data,
+which project in float64, and for the textbook's formulas in float32, which the reference has when it is given float32:
+``R mu + t``, ``A Sigma A^T``, ``a c - b^2``.
 
 A relative error is divided by the condition number of what is computed, the factor by which any formula may enlarge
 the rounding of its input: for positions the distance to the world's origin over the depth, for conics that times the
@@ -70,15 +70,15 @@ def views() -> tuple[View, ...]:
     rng = np.random.default_rng(SEED)
     z = rng.uniform(2, 4, size=N_GAUSSIANS)
     means = np.column_stack([rng.uniform(-0.25, 0.25, size=(N_GAUSSIANS, 2)) * z[:, None], z])
-    quats = rng.normal(size=(N_GAUSSIANS, 4))
-    scales = np.exp(rng.uniform(np.log(0.03), np.log(0.3), size=(N_GAUSSIANS, 3)))
+    quats = _rounded(rng.normal(size=(N_GAUSSIANS, 4)))
+    scales = _rounded(np.exp(rng.uniform(np.log(0.03), np.log(0.3), size=(N_GAUSSIANS, 3))))
     needles = scales.copy()
     needles[:, 0], needles[:, 1:] = 3.0, 1e-3
     far = np.array([1e6, -5e5, 2.5e5])
     return (
-        View("ordinary", *map(_rounded, (means, quats, scales)), _camera(np.zeros(3))),
-        View("needles", *map(_rounded, (means, quats, needles)), _camera(np.zeros(3))),
-        View("far world", *map(_rounded, (means + far, quats, scales)), _camera(far)),
+        View("ordinary", _rounded(means), quats, scales, _camera(np.zeros(3))),
+        View("needles", _rounded(means), quats, _rounded(needles), _camera(np.zeros(3))),
+        View("far world", _rounded(means + far), quats, scales, _camera(far)),
     )
 
 
@@ -164,8 +164,9 @@ def _transmittance_cases() -> Iterator[Case]:
     conventions = GSPLAT_MAIN._replace(transmittance_min=0.0)  # no pixel is finished
 
     def error(backend: Backend, dtype: Any) -> float:
-        fields = [x.astype(dtype) for x in (means2d, np.arange(1.0, n + 1), conics, opacities)]
-        projection = Projection(*fields, np.full((n, 2), 9, np.int32), np.tile(np.int32([0, 0, 9, 9]), (n, 1)))
+        fields = (x.astype(dtype) for x in (means2d, np.arange(1.0, n + 1), conics, opacities))
+        boxes = np.tile(np.array([0, 0, 9, 9], np.int32), (n, 1))
+        projection = Projection._make([*fields, np.full((n, 2), 9, np.int32), boxes])
         bins = backend.bin_gaussians(projection, TileGrid(9, 9, backend.tile_width, backend.tile_height), conventions)
         # Nothing but the background shines: the image is the transmittance, without the rounding of 1 - alpha.
         output = backend.composite(projection, np.zeros((n, 1), dtype), np.ones(1, dtype), bins, conventions)

@@ -151,9 +151,8 @@ def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventio
     """``_isect_tiles`` and ``_isect_offset_encode``; sorted by the depth in float32."""
     torch, gsplat = load()
     with torch.no_grad():
-        means2d, radii, depths = (
-            _tensor(x)[None] for x in (projection.means2d, projection.radii, projection.depths.astype(np.float32))
-        )
+        means2d, radii = _tensor(projection.means2d)[None], _tensor(projection.radii)[None]
+        depths = _tensor(projection.depths.astype(np.float32))[None]
         shape = grid.n_tiles_x, grid.n_tiles_y
         _, keys, ids = gsplat._isect_tiles(means2d, radii, depths, grid.tile_width, *shape)
         starts = gsplat._isect_offset_encode(keys, 1, *shape).numpy().ravel()
@@ -314,6 +313,6 @@ def _pose(camera: Camera, like: Floats) -> tuple[Floats, Floats]:
     return np.asarray(R, like.dtype), np.asarray(t, like.dtype)
 
 
-def _tensor(array: Floats) -> Tensor:
+def _tensor(array: Floats | Ints) -> Tensor:
     torch, _ = load()
     return torch.from_numpy(np.array(array))
