@@ -27,18 +27,14 @@ Time every backend and precision on fixed workloads, and measure its error
 against the float64 reference in the same run. What exceeds its bound of error
 has failed and gets no time.
 
-Columns of errors: of the whole image and gradient, and without the pixels at
-which a hit stands at a threshold (alpha 1/255, the stop, equal depths); two
-correct renderers differ there. "flips" counts those that did.
-
-Leave the machine alone meanwhile. Ratios inside one run mean something; times
-of two runs, or of two machines, do not compare.
+Errors are given with and without the pixels at which a hit stands at a
+threshold (alpha 1/255, the stop, depths); correct renderers differ there, and
+"flips" counts where. Ratios of times mean something inside one run only.
 """
 EPILOG = """\
 examples:
   minisplat-ref bench --out bench
   minisplat-ref bench --workloads synth5k --backends cpu-f32,textbook-f32
-  minisplat-ref bench --workloads garden --data test_garden.npz
   minisplat-ref bench --stages
   minisplat-ref bench --scene photos/fox --against opensplat=build/opensplat
 
@@ -58,7 +54,7 @@ def add_parser(commands: Commands) -> None:
         "--workloads",
         type=listed(name),
         metavar="A,B",
-        help="synth, synth5k, garden, garden20k (default the first two, and all four with --data)",
+        help="synth, synth5k, garden, garden20k (default: those that there are data for)",
     )
     parser.add_argument("--data", type=Path, metavar="FILE", help="test_garden.npz of gsplat's repository, for garden")
     parser.add_argument(
@@ -70,13 +66,13 @@ def add_parser(commands: Commands) -> None:
         type=listed(name),
         default=(),
         metavar="A,B",
-        help="gsplat-torch, opensplat=PROGRAM: peers to time in the same run",
+        help="gsplat-torch, opensplat=PROGRAM: time them, too",
     )
     parser.add_argument(
-        "--stages", action="store_true", help="instead: a training iteration by stages, and how far from the limits"
+        "--stages", action="store_true", help="instead: a training iteration, and how far from the limits"
     )
     parser.add_argument(
-        "--scene", type=Path, metavar="SCENE", help="photographs, for --stages (default a made room) and opensplat"
+        "--scene", type=Path, metavar="SCENE", help="photographs for --stages (default a made room) and opensplat"
     )
     parser.add_argument("--downscale", type=integer(1), default=1, metavar="K", help="of the photographs (default 1)")
     parser.add_argument("--iterations", type=integer(1), default=100, metavar="N", help="of the scene (default 100)")

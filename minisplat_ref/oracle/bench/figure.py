@@ -18,7 +18,7 @@ PANELS = (
 )
 EXACT = 1e-16  # where an error of 0 stands on a logarithmic axis
 COLORS = ("#3d4650", "#35608c", "#3f8f6b", "#d2493f", "#e0a526", "#8e5ea2", "#4aa0a8", "#b5651d")
-MARKERS = "o^s"  # colours repeat in another shape
+SHAPES = {"-exp": "^", "-cut": "s", "-sigma": "s"}  # of variants, which are drawn hollow: they crowd around the default
 Style = dict[str, Any]
 
 
@@ -38,7 +38,7 @@ def pareto_figure(cases: Sequence[Case]) -> "Figure":
 
     timed = [case for case in cases if case.passed and case.figures.get(TIME)]
     workloads = list(dict.fromkeys(_workload(case) for case in timed)) or ["nothing was timed"]
-    styles = {name: _style(i) for i, name in enumerate(dict.fromkeys(_contender(case) for case in timed))}
+    styles = {name: _style(i, name) for i, name in enumerate(dict.fromkeys(_contender(case) for case in timed))}
     figure = Figure(figsize=(12, 0.8 + 4.4 * len(workloads)), layout="constrained")
     grid = figure.subplots(len(workloads), len(PANELS), squeeze=False, sharex="col")
     for row, workload in zip(grid, workloads, strict=True):
@@ -73,7 +73,7 @@ def _draw(axes: "Axes", cases: Sequence[Case], quiet: str, full: str, styles: di
     for case, (error, time) in zip(cases, points, strict=True):
         style = styles[_contender(case)]
         axes.plot([error, max(error, float(case.figures[full] or 0))], [time, time], color=style["color"], alpha=0.35)
-        axes.plot([error], [time], linestyle="none", markeredgecolor="white", markersize=8, **style)
+        axes.plot([error], [time], **style)
     front = [p for p in sorted(points) if not any(q[0] <= p[0] and q[1] < p[1] for q in points)]
     if front:
         axes.step(*zip(*front, strict=True), where="post", color="#8a94a0", linewidth=0.8, linestyle=":", zorder=0)
@@ -82,11 +82,14 @@ def _draw(axes: "Axes", cases: Sequence[Case], quiet: str, full: str, styles: di
 def _legend(styles: dict[str, Style]) -> tuple[list, list[str]]:
     from matplotlib.lines import Line2D
 
-    return [Line2D([], [], linestyle="none", markersize=8, **style) for style in styles.values()], list(styles)
+    return [Line2D([], [], **style) for style in styles.values()], list(styles)
 
 
-def _style(i: int) -> Style:
-    return {"color": COLORS[i % len(COLORS)], "marker": MARKERS[i // len(COLORS) % len(MARKERS)]}
+def _style(i: int, name: str) -> Style:
+    shape = next((shape for part, shape in SHAPES.items() if part in name), "o")
+    color = COLORS[i % len(COLORS)]
+    filling = {"markerfacecolor": color, "zorder": 3} if shape == "o" else {"markerfacecolor": "none", "zorder": 4}
+    return {"color": color, "marker": shape, "linestyle": "none", "markersize": 8, **filling}
 
 
 def _workload(case: Case) -> str:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import Backend
+from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.oracle.bench.contenders import Contender
 from minisplat_ref.oracle.bench.flips import Thresholds, thresholds
@@ -62,6 +62,14 @@ def expect(workload: Workload, backend: Backend, conventions: Conventions = GSPL
     at = thresholds(tape)
     quiet = render_vjp(tape, quiet_cotangent(workload, at)).gaussians
     return Expected(output.image, gradient, quiet, at, drawn - start, differentiated - drawn)
+
+
+def with_slack(expected: Expected, workload: Workload, conventions: Conventions, slack: float) -> Expected:
+    """Return the same answer with wider margins at the thresholds."""
+    _, tape = render(workload.gaussians, workload.camera, conventions=conventions, backend=CPU)
+    at = thresholds(tape, slack)
+    quiet = render_vjp(tape, quiet_cotangent(workload, at)).gaussians
+    return expected._replace(thresholds=at, quiet_gradient=quiet)
 
 
 def judge(contender: Contender, workload: Workload, expected: Expected) -> Verdict:

@@ -13,7 +13,7 @@ import numpy as np
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.oracle.bench.contenders import BASELINE_NAME, CHECKED_NAME, REFERENCE_NAME, Contender, all_contenders
-from minisplat_ref.oracle.bench.judging import Expected, Verdict, backward, expect, failure, forward, judge
+from minisplat_ref.oracle.bench.judging import Expected, Verdict, backward, expect, failure, forward, judge, with_slack
 from minisplat_ref.oracle.bench.workloads import Workload
 from minisplat_ref.oracle.cases import Case, Figure
 
@@ -89,10 +89,12 @@ def race(
 
 
 def _judged(contender: Contender, workload: Workload, expected: Expected, trust: str) -> Entry:
+    if contender.slack:  # its margins come from the float64 kernels, if those are right
+        expected = with_slack(expected, workload, contender.conventions, contender.slack)
     verdict = judge(contender, workload, expected)
     if contender.conventions == GSPLAT_MAIN:
-        wrong = failure(contender, verdict)
-    else:  # its own image is judged by the float64 kernels, if those are right
+        wrong = (trust if contender.slack else "") or failure(contender, verdict)
+    else:  # and so does the answer to another cut-off
         own = expect(workload, CPU, contender.conventions)
         wrong = trust or failure(contender, judge(contender, workload, own))
     return Entry(contender, verdict, wrong, Times([], []))

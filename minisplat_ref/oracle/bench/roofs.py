@@ -25,8 +25,8 @@ from minisplat_ref.oracle.cases import Case, Figure
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_GRADIENT, BENCH_FLOAT32_IMAGE
 from minisplat_ref.render import render
 from minisplat_ref.scalar._jit import add_in_any_order, kernel, n_threads, prange
-from minisplat_ref.scalar.compositing import alpha_vjp, blend, mahalanobis
-from minisplat_ref.scalar.literals import HALF, ZERO
+from minisplat_ref.scalar.compositing import alpha_vjp, blend, conic_vjp_of_moments, factors, mahalanobis
+from minisplat_ref.scalar.literals import ZERO
 from minisplat_ref.types import CompositeGradient, Gaussians, Projection, TileGrid
 
 ADAM_GAUSSIANS = 200_000
@@ -43,9 +43,9 @@ class Hit(NamedTuple):
 
     x: np.float32
     y: np.float32
-    a: np.float32
-    b: np.float32
-    c: np.float32
+    half_a: np.float32
+    slope: np.float32
+    half_pivot: np.float32
     opacity: np.float32
     red: np.float32
     green: np.float32
@@ -59,7 +59,8 @@ def _forward_line(state, n_pixels, hit, frame, n_hits, n_passes):  # type: ignor
         state[CHANNELS:] = ZERO
         for _ in range(n_hits):
             for i in range(n_pixels):
-                sigma = mahalanobis(hit.x - state[X + i], hit.y - state[Y + i], hit.a, hit.b, hit.c)
+                dy = hit.y - state[Y + i]
+                sigma = mahalanobis(hit.x - state[X + i] + hit.slope * dy, dy, hit.half_a, hit.half_pivot)
                 state[T + i], weight = blend(state[T + i], sigma, hit.opacity * exp_fast(-sigma), frame)
                 state[CHANNELS + i] += weight * hit.red
                 state[CHANNELS + PIXELS + i] += weight * hit.green
@@ -73,11 +74,11 @@ def _backward_line(state, n_pixels, hit, frame, behind, sums, n_hits, n_passes):
         state[BEHIND : BEHIND + PIXELS] = behind
         sums[:] = ZERO
         for _ in range(n_hits):
-            q_sum = qx = qy = qxx = qxy = qyy = v_red = v_green = v_blue = ZERO * hit.a
+            q_sum = qe = qy = qee = qey = qyy = v_red = v_green = v_blue = ZERO * hit.half_a
             for i in range(n_pixels):
-                dx = hit.x - state[X + i]
                 dy = hit.y - state[Y + i]
-                sigma = mahalanobis(dx, dy, hit.a, hit.b, hit.c)
+                e = hit.x - state[X + i] + hit.slope * dy
+                sigma = mahalanobis(e, dy, hit.half_a, hit.half_pivot)
                 unclamped = hit.opacity * exp_fast(-sigma)
                 transmittance = state[T + i]
                 state[T + i], weight = blend(transmittance, sigma, unclamped, frame)
@@ -90,15 +91,15 @@ def _backward_line(state, n_pixels, hit, frame, behind, sums, n_hits, n_passes):
                 q_mean = q if unclamped <= frame.mean_gradient_max else ZERO
                 q_shape = q if unclamped <= frame.shape_gradient_max else ZERO
                 q_sum = add_in_any_order(q_sum, q_shape)  # type: ignore[no-untyped-call]
-                qx = add_in_any_order(qx, q_mean * dx)  # type: ignore[no-untyped-call]
+                qe = add_in_any_order(qe, q_mean * e)  # type: ignore[no-untyped-call]
                 qy = add_in_any_order(qy, q_mean * dy)  # type: ignore[no-untyped-call]
-                qxx = add_in_any_order(qxx, q_shape * dx * dx)  # type: ignore[no-untyped-call]
-                qxy = add_in_any_order(qxy, q_shape * dx * dy)  # type: ignore[no-untyped-call]
+                qee = add_in_any_order(qee, q_shape * e * e)  # type: ignore[no-untyped-call]
+                qey = add_in_any_order(qey, q_shape * e * dy)  # type: ignore[no-untyped-call]
                 qyy = add_in_any_order(qyy, q_shape * dy * dy)  # type: ignore[no-untyped-call]
                 v_red = add_in_any_order(v_red, weight * v_0)  # type: ignore[no-untyped-call]
                 v_green = add_in_any_order(v_green, weight * v_1)  # type: ignore[no-untyped-call]
                 v_blue = add_in_any_order(v_blue, weight * v_2)  # type: ignore[no-untyped-call]
-            parts = (q_sum, qx, qy, qxx, qxy, qyy, v_red, v_green, v_blue)
+            parts = (q_sum, qe, qy, qee, qey, qyy, v_red, v_green, v_blue)
             for j in range(N_SUMS):
                 sums[j] += parts[j]
 
@@ -191,18 +192,19 @@ class StraightLines:
     def __init__(self) -> None:
         f32 = np.float32
         grid = TileGrid(TILE_WIDTH, TILE_HEIGHT, TILE_WIDTH, TILE_HEIGHT)
-        shape = (3.5, 8.25, 4e-3, 1e-3, 3e-3, 5e-3)  # alpha stays above 1/255 in the whole tile
-        self.hit = Hit(*map(f32, (*shape, 0.9, 0.5, 0.2)))
+        mean, conic, opacity, color = (3.5, 8.25), (4e-3, 1e-3, 3e-3), 5e-3, (0.9, 0.5, 0.2)  # alpha > 1/255 everywhere
+        a, slope, pivot = factors(*conic)
+        self.hit = Hit(*map(f32, (*mean, a / 2, slope, pivot / 2, opacity, *color)))
         n = N_HITS
         self.projection = Projection(
-            means2d=np.tile(np.array(self.hit[:2], np.float64), (n, 1)),
+            means2d=np.tile(mean, (n, 1)),
             depths=np.arange(1.0, n + 1),
-            conics=np.tile(np.array(self.hit[2:5], np.float64), (n, 1)),
-            opacities=np.full(n, self.hit.opacity, np.float64),
+            conics=np.tile(conic, (n, 1)),
+            opacities=np.full(n, opacity),
             radii=np.full((n, 2), 99, np.int32),
             boxes=np.tile(np.array([0, 0, TILE_WIDTH, TILE_HEIGHT], np.int32), (n, 1)),
         )
-        self.colors, self.background = np.tile(np.array(self.hit[6:], np.float64), (n, 1)), np.zeros(3)
+        self.colors, self.background = np.tile(color, (n, 1)), np.zeros(3)
         self.bins = REFERENCE.bin_gaussians(self.projection, grid, GSPLAT_MAIN)
         self.frame = frame_of(self.bins, GSPLAT_MAIN, np.dtype(f32))
         self.expected = REFERENCE.composite(self.projection, self.colors, self.background, self.bins, GSPLAT_MAIN)
@@ -232,9 +234,11 @@ class StraightLines:
         v: CompositeGradient = REFERENCE.composite_vjp(
             self.projection, self.colors, self.background, self.bins, GSPLAT_MAIN, self.expected, self.v_image, v_alpha
         )
-        q, qx, qy, qxx, qxy, qyy = self.sums[:6]
-        a, b, c = self.hit[2:5]
-        found = (a * qx + b * qy, b * qx + c * qy, HALF * qxx, qxy, HALF * qyy, -q / self.hit.opacity, *self.sums[6:])
+        q, qe, qy, *second = self.sums[:6]
+        a, slope, pivot = 2 * self.hit.half_a, self.hit.slope, 2 * self.hit.half_pivot
+        v_mean = (a * qe, slope * a * qe + pivot * qy)
+        v_conic = conic_vjp_of_moments(slope, *second)
+        found = (*v_mean, *v_conic, -q / self.hit.opacity, *self.sums[6:])
         expected = np.hstack([part.reshape(N_HITS, -1) for part in (v.means2d, v.conics, v.opacities, v.colors)])
         expected = expected.sum(axis=0)
         return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
