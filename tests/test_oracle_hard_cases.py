@@ -11,6 +11,7 @@ from minisplat_ref.oracle import hard_cases
 from minisplat_ref.oracle.hard_cases import GROUPS, HARD_CASES
 from minisplat_ref.oracle.hard_cases.run import PRECISIONS, Precision, matching, run_hard_case, run_hard_cases
 from minisplat_ref.oracle.hard_cases.subjects import Call, Parameters, drawing
+from minisplat_ref.oracle.hard_cases.summary import by_group
 from minisplat_ref.oracle.hard_cases.tolerances import ORDINARY
 
 BY_NAME = {case.name: case for case in HARD_CASES}
@@ -167,7 +168,7 @@ def test_command_fails_with_a_planted_error(monkeypatch, capsys):
     monkeypatch.setattr(hard_cases, "HARD_CASES", (BY_NAME["1x1"], planted))
     assert main(["oracle", "hard-cases"]) == 1
     printed = capsys.readouterr().out
-    assert "| planted | FAILED" in printed and "1 of 2 cases failed" in printed
+    assert "| planted | FAILED" in printed and "worst of each kind" in printed and "1 of 2 cases failed" in printed
 
 
 def test_command_knows_its_cases(capsys):
@@ -176,6 +177,16 @@ def test_command_knows_its_cases(capsys):
     with pytest.raises(InputError, match="run without --only"):
         matching(HARD_CASES, "no such case")
     assert {case.name for case in matching(HARD_CASES, "needle-*-oblique")} < set(BY_NAME)
+
+
+def test_summary_has_the_worst_of_each_kind():
+    cases = (BY_NAME["ball"], BY_NAME["needle-1e6-tilted"], BY_NAME["nan-in-means"], BY_NAME["call-skew"])
+    report = run_hard_cases(cases)
+    shapes, refused = by_group(report, GROUPS).cases
+    assert (shapes.name, refused.name) == ("shapes", "bad input")
+    assert shapes.figures["image f32"] == max(case.figures["image f32"] for case in report.cases[:2])
+    assert (shapes.figures["cases"], shapes.figures["refused"]) == (2, 0) and shapes.passed
+    assert refused.figures == {"cases": 2, "refused": 2}
 
 
 def test_report_has_every_case():

@@ -39,8 +39,13 @@ def add_parser(checks: Commands) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the cases, print the table."""
-    from minisplat_ref.oracle.hard_cases import HARD_CASES
+    """Run the cases, print the table and the worst of each kind."""
+    from minisplat_ref.oracle.cases import as_markdown
+    from minisplat_ref.oracle.hard_cases import GROUPS, HARD_CASES
     from minisplat_ref.oracle.hard_cases.run import matching, run_hard_cases
+    from minisplat_ref.oracle.hard_cases.summary import by_group
 
-    return publish(run_hard_cases(matching(HARD_CASES, args.only)), args.json)
+    report = run_hard_cases(matching(HARD_CASES, args.only))
+    exit_code = publish(report, args.json)
+    print(f"\nworst of each kind\n\n{as_markdown(by_group(report, GROUPS))}")
+    return exit_code

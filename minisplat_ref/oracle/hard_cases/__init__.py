@@ -2,7 +2,7 @@
 
 Reading order: ``case`` (what an entry is), ``shapes``, ``layers``, ``cameras``, ``images``, ``world``, ``colors``,
 ``losses``, ``bad_input`` (the entries), ``run`` (every precision, forward and backward), ``thresholds`` (pixels at
-which rounding decides).
+which rounding decides), ``summary`` (the worst of each kind).
 """
 
 from minisplat_ref.oracle.hard_cases.bad_input import BAD_INPUT

@@ -12,7 +12,7 @@ import numpy as np
 
 from minisplat_ref.backends import Backend
 from minisplat_ref.batch import checked_batch, draw
-from minisplat_ref.constants import GSPLAT_MAIN, PROFILES, Conventions
+from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.gsplat_door import rasterization, rasterization_vjp
 from minisplat_ref.render import render, render_vjp
 from minisplat_ref.splatting import SplatTape
@@ -165,7 +165,10 @@ def _draw_call(subject: Call, backend: Backend, dtype: np.dtype) -> Drawing:
     outputs = {"image": images[0], "alpha": alphas[0, ..., 0]}
 
     def vjp(v: Arrays) -> Arrays:
-        cotangents = {"v_render_colors": v["image"][None], "v_render_alphas": v["alpha"][None, ..., None]}
+        cotangents: dict[str, Any] = {
+            "v_render_colors": v["image"][None],
+            "v_render_alphas": v["alpha"][None, ..., None],
+        }
         return rasterization_vjp(**sized, **cotangents)
 
     return Drawing(outputs, vjp, ("image", "alpha"))
@@ -184,6 +187,3 @@ def _draw_surface(subject: Surface, backend: Backend, dtype: np.dtype) -> Drawin
         return {"means": v_means, "quats": v_quats, "log_scales": scales * v_scales}
 
     return Drawing({"points": points, "depths": depths}, vjp, ("points", "depths"))
-
-
-__all__ = ["PROFILES", "Call", "Drawing", "Parameters", "Pictures", "Subject", "Surface", "cast", "drawing"]
