@@ -122,6 +122,23 @@ def test_kernels_run_as_python(tmp_path):
 # --- kernel cache ---
 
 
+def test_a_function_is_named_after_what_it_closes_over():
+    def make(number, other):
+        @_jit.scalar
+        def inner(x):
+            return x + number
+
+        @_jit.scalar
+        def outer(x):
+            return inner(x) * other
+
+        return outer.__qualname__
+
+    names = [make(1, 2), make(2, 2), make(1, 3)]
+    assert len(set(names)) == 3  # by its own number, and by that of the function inside
+    assert make(1, 2) == names[0]
+
+
 FROM_CACHE = """
 import sys
 import numpy as np

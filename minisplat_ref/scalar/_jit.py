@@ -1,10 +1,13 @@
 """The only place where jit flags, caching and threading are decided.
 
 ``scalar`` marks a formula of one Gaussian or one pixel: it stays a plain Python function and is inlined into the
-kernels that call it. ``kernel`` compiles a parallel loop. Four facts shape this file:
+kernels that call it. ``kernel`` compiles a parallel loop. Five facts shape this file:
 
 * Numba's on-disk cache does not notice that a function *called* by a kernel has changed. The cache therefore lives in a
   folder named by a hash of all sources that kernels are made of: an edit anywhere makes a new folder.
+* Numba tells functions of one name apart by a counter of the process, and writes it into the cached code. Kernels that
+  different processes compiled for different numbers of channels can so hold different functions under one name, and a
+  process that loads both runs one of them twice. What a function closes over is therefore part of its name here.
 * Numba's ``workqueue`` threading layer aborts the process when two Python threads enter parallel regions, so all
   kernels share one lock.
 * ``fastmath=True`` would let the compiler assume that no NaN exists and ``isnan`` return False. Kernels may only
@@ -69,7 +72,16 @@ def _cache_folder() -> str | None:
 
 def scalar(function: Callable) -> Callable:
     """Mark a formula of one Gaussian or one pixel that kernels call; in Python it is the function itself."""
-    return register_jitable(function)
+    return register_jitable(_named_after_closure(function))
+
+
+def _named_after_closure(function: Callable) -> Callable:
+    """Make the name of a function unique to what it closes over; compiled symbols are named after it."""
+    cells = (cell.cell_contents for cell in function.__closure__ or ())
+    values = [str(getattr(value, "__qualname__", value)) for value in cells]
+    if values:
+        function.__qualname__ += "_" + hashlib.sha256("|".join(values).encode()).hexdigest()[:16]
+    return function
 
 
 def add_in_any_order(a, b):
@@ -136,7 +148,7 @@ def kernel(parallel: bool = True) -> Callable[[Callable], Callable]:
         try:
             compiled = numba.njit(
                 parallel=parallel, cache=folder is not None, error_model="numpy", fastmath={"contract"}
-            )(function)
+            )(_named_after_closure(function))
         finally:
             numba.config.CACHE_DIR = previous  # type: ignore[attr-defined]
 
