@@ -9,10 +9,10 @@ import pytest
 from tolerances import BENCH_ROOM_FOR_EXPONENTIAL
 
 from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.cli import bench, main
+from minisplat_ref.cli import main, training_time
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.io.images import read_image
-from minisplat_ref.oracle.bench import contenders, profiling, race, roofs, workloads
+from minisplat_ref.oracle.bench import contenders, limits, profiling, race, roofs, workloads
 from minisplat_ref.oracle.bench.exponentials import EXPONENTIALS, relative_errors
 from minisplat_ref.oracle.bench.flips import thresholds
 from minisplat_ref.oracle.bench.peers import peers_of
@@ -222,8 +222,8 @@ def test_gsplat_is_a_contender():
 
 
 def test_stages_add_up_to_the_iteration(tmp_path, monkeypatch):
-    monkeypatch.setattr(roofs, "ADAM_GAUSSIANS", 2_000)
-    monkeypatch.setattr(bench, "ROOM", {"n_views": 2, "width": 48, "height": 36, "n_points": 500})
+    monkeypatch.setattr(limits, "N", 1_000)
+    monkeypatch.setattr(training_time, "ROOM", {"n_views": 2, "width": 48, "height": 36, "n_points": 500})
     file = tmp_path / "stages.json"
     args = ["bench", "--stages", "--workloads", "synth", "--iterations", "2", "--repeats", "1", "--json", str(file)]
     assert main(args) == 0
@@ -234,7 +234,8 @@ def test_stages_add_up_to_the_iteration(tmp_path, monkeypatch):
     }
     assert sum(case["share %"] for case in stages) == pytest.approx(100)
     assert all(case["ms"] > 0 for case in stages)
-    assert {"roof/synth forward", "roof/synth backward", "roof/adam 2,000"} <= set(cases)
+    assert {"roof/synth forward", "roof/synth backward", "roof/adam 1,000", "stage/sort and bin"} <= set(cases)
+    assert 1e-9 < cases["stage/project and SH, both ways"]["error"] < BENCH_FLOAT32_GRADIENT
 
 
 def test_straight_lines_do_the_arithmetic_of_a_hit():
@@ -245,6 +246,11 @@ def test_straight_lines_do_the_arithmetic_of_a_hit():
     assert 0 < lines.gradient_error() < BENCH_FLOAT32_GRADIENT
     lines.sums[3] *= 1.01
     assert lines.gradient_error() > BENCH_FLOAT32_GRADIENT
+
+
+def test_threads_give_the_same_bytes():
+    case = limits.thread_case(tiny(), repeats=1)
+    assert case is None or (case.passed and case.figures["x"] > 0)
 
 
 def test_stopwatches_change_nothing():

@@ -3,24 +3,18 @@
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from minisplat_ref.cli.arguments import Commands, HelpFormatter, integer, listed, name
 from minisplat_ref.cli.oracle import add_json_argument
 from minisplat_ref.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from minisplat_ref.backends import Backend
     from minisplat_ref.oracle.cases import Case, Report
-    from minisplat_ref.types import Scene
 
 DEFAULT_WORKLOADS = ("synth", "synth5k")
 DATA_WORKLOADS = ("garden", "garden20k")
 JSON, TABLE, FIGURE = "bench.json", "bench.md", "bench.png"
-WARM_UP = 5  # iterations that compile and are not timed
-ROOM: dict[str, Any] = {"n_views": 6, "width": 192, "height": 144, "n_points": 8000}  # where no scene is given
 
 DESCRIPTION = """\
 Time every backend and precision on fixed workloads, and measure its error
@@ -96,6 +90,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _race(args: argparse.Namespace) -> "Report":
+    from minisplat_ref.cli.training_time import against_opensplat
     from minisplat_ref.oracle.bench.contenders import choose
     from minisplat_ref.oracle.bench.peers import peers_of
     from minisplat_ref.oracle.bench.race import race
@@ -108,92 +103,32 @@ def _race(args: argparse.Namespace) -> "Report":
     contenders = [*choose(args.backends), *peers]
     names = args.workloads or (*DEFAULT_WORKLOADS, *(DATA_WORKLOADS if args.data else ()))
     workloads = [get_workload(workload, args.data) for workload in names]  # before the first one takes its time
-    cases = [case for workload in workloads for case in race(workload, contenders, args.repeats, _progress)]
+    cases = [case for workload in workloads for case in race(workload, contenders, args.repeats, progress)]
     if opensplat is not None:
-        cases += _against_opensplat(opensplat, args)
+        cases += against_opensplat(opensplat, args.scene, args.downscale, args.iterations)
     if args.data is None and args.workloads is None:
-        _progress("garden, garden20k: skipped, they need gsplat's test_garden.npz (--data)")
+        progress("garden, garden20k: skipped, they need gsplat's test_garden.npz (--data)")
     title = "Speed against error: every time beside its error against the float64 reference"
     return Report(title, tuple(cases), {"workloads": list(names), "repeats": args.repeats})
 
 
 def _stages(args: argparse.Namespace) -> "Report":
-    from minisplat_ref.oracle.bench.roofs import adam_case, blending_cases
+    from minisplat_ref.cli.training_time import profile
+    from minisplat_ref.oracle.bench.limits import adam_case, stage_cases, thread_case
+    from minisplat_ref.oracle.bench.roofs import blending_cases
     from minisplat_ref.oracle.bench.workloads import get_workload
     from minisplat_ref.oracle.cases import Report
 
-    cases = _profile(args)
+    cases = profile(args.scene, args.downscale, args.iterations)
     for workload in args.workloads or ("synth",):
-        _progress(f"{workload}: blending against straight-line loops")
-        cases += blending_cases(get_workload(workload, args.data), args.repeats)
-    _progress("Adam against a copy")
-    cases.append(adam_case(args.repeats))
+        progress(f"{workload}: blending against straight-line loops")
+        made = get_workload(workload, args.data)
+        cases += blending_cases(made, args.repeats)
+        threads = thread_case(made, args.repeats)
+        cases += [] if threads is None else [threads]
+    progress("Adam against a copy, other stages by themselves")
+    cases += [adam_case(args.repeats), *stage_cases(args.repeats)]
     return Report("A training iteration by stages, and how far the kernels are from the limits", tuple(cases), {})
-
-
-def _profile(args: argparse.Namespace) -> "list[Case]":
-    """Train with a stopwatch in every stage, while the number of Gaussians stays the same."""
-    from minisplat_ref.backends import CPU
-    from minisplat_ref.oracle.bench.profiling import profile_cases, timed
-
-    seconds: dict[str, float] = {}
-    total = _train(_scene(args), args.iterations, timed(CPU, seconds), seconds.clear)
-    return profile_cases(seconds, total, args.iterations)
-
-
-def _against_opensplat(program: Path, args: argparse.Namespace) -> "list[Case]":
-    """Time training iterations of OpenSplat and ours on the same photographs, from the same points, by turns."""
-    from minisplat_ref.backends import CPU
-    from minisplat_ref.oracle.bench.opensplat import training_seconds
-    from minisplat_ref.oracle.cases import Case
-
-    scene, n = _scene(args), args.iterations
-    _progress(f"{scene.name}: opensplat, {n} and {2 * n} iterations, and ours")
-    first = training_seconds(program, args.scene, args.downscale, n)
-    ours = _train(scene, n, CPU)
-    theirs = training_seconds(program, args.scene, args.downscale, 2 * n) - first
-    ours = min(ours, _train(scene, n, CPU))
-    figures = {"iteration ms": 1e3 * theirs / n, "x ours": theirs / ours}
-    note = f"of {n} iterations; what it renders is not compared here"
-    return [
-        Case(f"{scene.name}/cpu-f32 training", True, {"iteration ms": 1e3 * ours / n}, f"of {n} iterations"),
-        Case(f"{scene.name}/opensplat training", theirs > 0, figures, note if theirs > 0 else "no time to tell apart"),
-    ]
-
-
-def _train(scene: "Scene", iterations: int, backend: "Backend", on_warm: "Callable[[], None]" = lambda: None) -> float:
-    """Return the seconds of some iterations while the number of Gaussians stays the same, after some that compile."""
-    import time
-
-    from minisplat_ref.recipes import get_recipe
-    from minisplat_ref.train import train
-
-    recipe = get_recipe("3dgs-accel")._replace(iterations=WARM_UP + iterations, events=())
-    ends: list[float] = []
-
-    def on_step(step_report: object) -> None:
-        ends.append(time.perf_counter())
-        if len(ends) == WARM_UP:
-            on_warm()
-
-    train(scene, recipe, seed=0, backend=backend, on_step=on_step)
-    return ends[-1] - ends[WARM_UP - 1]
-
-
-def _scene(args: argparse.Namespace) -> "Scene":
-    """Load the photographs, or make some."""
-    if args.scene is not None:
-        from minisplat_ref.io import load_scene
-
-        scene = load_scene(args.scene, downscale=args.downscale, undistort=True)
-    else:
-        from data_tools.synthetic import make_scene
-
-        _progress("making photographs of a room")
-        scene = make_scene("room", **ROOM).scene
-    camera = scene.train_views[0].camera
-    _progress(f"{scene.name}: {len(scene.points):,} Gaussians, {camera.width} x {camera.height}")
-    return scene
 
 
 def _tables(report: "Report") -> str:
@@ -223,5 +158,6 @@ def _save_folder(report: "Report", folder: Path) -> None:
     save_json(report, folder / JSON)
 
 
-def _progress(line: str) -> None:
+def progress(line: str) -> None:
+    """Say on stderr what is being done."""
     print(f"minisplat-ref: {line}", file=sys.stderr, flush=True)

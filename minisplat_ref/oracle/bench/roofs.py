@@ -1,4 +1,4 @@
-"""How far the machine would let it go: the kernels against straight-line loops, Adam against a copy.
+"""How far the processor would let it go: the blending kernels against straight-line loops.
 
 The straight-line loops do the arithmetic of one hit, 128 pixels at a time as in a tile, over and over on the same
 numbers: no lists, no sorting, nothing fetched from memory. A kernel that took no longer per pair would be perfect. One
@@ -6,9 +6,6 @@ thread; the kernels' times are multiplied by their threads. A *listed* pair is a
 ellipse of a Gaussian of its list reaches; those that a finished tile leaves out are counted too.
 """
 
-import math
-import time
-from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,23 +16,19 @@ from minisplat_ref.cpu.exponential import exp_fast
 from minisplat_ref.cpu.records import ROW_END, ROW_FIRST, records_of
 from minisplat_ref.cpu.tile_state import BEHIND, CHANNELS, PIXELS, T, X, Y, frame_of, start_tile
 from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
-from minisplat_ref.optim.adam import AdamRule, adam_step, zero_moments
+from minisplat_ref.oracle.bench.limits import least_seconds
 from minisplat_ref.oracle.bench.workloads import Workload
 from minisplat_ref.oracle.cases import Case, Figure
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_GRADIENT, BENCH_FLOAT32_IMAGE
 from minisplat_ref.render import render
-from minisplat_ref.scalar._jit import add_in_any_order, kernel, n_threads, prange
+from minisplat_ref.scalar._jit import add_in_any_order, kernel, n_threads
 from minisplat_ref.scalar.compositing import alpha_vjp, blend, conic_vjp_of_moments, factors, mahalanobis
 from minisplat_ref.scalar.literals import ZERO
 from minisplat_ref.types import CompositeGradient, Gaussians, Projection, TileGrid
 
-ADAM_GAUSSIANS = 200_000
 N_HITS = 100  # of opacity 0.005: transmittance 0.6 is left, so that none of them stops
 N_PASSES = 200
 N_SUMS = 9
-WIDTHS = (3, 4, 3, 1, 3, 45)  # numbers of a Gaussian of degree 3, field by field
-ADAM_ARRAYS = 7  # values, gradient and both moments are read, all but the gradient are written
-COPY_CHUNKS = 64
 
 
 class Hit(NamedTuple):
@@ -104,13 +97,6 @@ def _backward_line(state, n_pixels, hit, frame, behind, sums, n_hits, n_passes):
                 sums[j] += parts[j]
 
 
-@kernel()
-def _copy(source, target):  # type: ignore[no-untyped-def]
-    for chunk in prange(COPY_CHUNKS):
-        first, end = source.size * chunk // COPY_CHUNKS, source.size * (chunk + 1) // COPY_CHUNKS
-        target[first:end] = source[first:end]
-
-
 def blending_cases(workload: Workload, repeats: int) -> list[Case]:
     """Time the blending kernels in float32 on a workload against the straight-line loops, taking turns.
 
@@ -125,7 +111,7 @@ def blending_cases(workload: Workload, repeats: int) -> list[Case]:
     inputs = (splats.projection, splats.channels, splats.background, splats.bins, GSPLAT_MAIN)
     v_image, v_alpha = workload.v_image.astype(np.float32), np.zeros(output.alpha.shape, np.float32)
     loops = StraightLines()
-    least = _least_seconds(
+    least = least_seconds(
         (
             lambda: CPU.composite(*inputs),
             loops.forward,
@@ -158,32 +144,6 @@ def blending_cases(workload: Workload, repeats: int) -> list[Case]:
         note = "" if error <= bound else f"the straight-line loop is off by {error:.1e}"
         cases.append(Case(f"roof/{workload.name} {name}", not note, figures, note))
     return cases
-
-
-def adam_case(repeats: int) -> Case:
-    """Time Adam on Gaussians of 59 numbers against a copy that moves as many bytes, taking turns."""
-    n = ADAM_GAUSSIANS
-    gaussians, gradient = (Gaussians._make(np.full((n, w), 0.5, np.float32) for w in WIDTHS) for _ in range(2))
-    state, rule, rows = zero_moments(gaussians), AdamRule(is_visible_only=True, has_bias_correction=False), np.arange(n)
-    n_numbers = ADAM_ARRAYS * n * sum(WIDTHS)
-    n_bytes = 4 * n_numbers
-    source = np.ones(n_numbers // 2, np.float32)  # read once and written once
-    target = np.empty_like(source)
-    step, copy = _least_seconds(
-        (
-            lambda: adam_step(gaussians, gradient, state, [1e-3] * len(WIDTHS), rule, rows),
-            lambda: _copy(source, target),
-        ),
-        repeats,
-    )
-    figures: dict[str, Figure] = {
-        "ms": 1e3 * step,
-        "GB/s": n_bytes / step / 1e9,
-        "copy GB/s": n_bytes / copy / 1e9,
-        "x copy": step / copy,
-    }
-    has_moved = bool((target == 1).all() and (gaussians.means < 0.5).all())
-    return Case(f"roof/adam {n:,}", has_moved, figures, "" if has_moved else "nothing was updated")
 
 
 class StraightLines:
@@ -242,16 +202,3 @@ class StraightLines:
         expected = np.hstack([part.reshape(N_HITS, -1) for part in (v.means2d, v.conics, v.opacities, v.colors)])
         expected = expected.sum(axis=0)
         return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
-
-
-def _least_seconds(functions: Sequence[Callable[[], object]], repeats: int) -> list[float]:
-    """Least time of each, one turn after the other, after a turn that compiles."""
-    least = [math.inf] * len(functions)
-    for function in functions:
-        function()
-    for _ in range(repeats):
-        for i, function in enumerate(functions):
-            start = time.perf_counter()
-            function()
-            least[i] = min(least[i], time.perf_counter() - start)
-    return least

@@ -1,0 +1,173 @@
+"""Single stages on 200,000 Gaussians, Adam against a copy, and what further threads bring."""
+
+import time
+from collections.abc import Callable, Sequence
+
+import numba
+import numpy as np
+
+from minisplat_ref.backends import CPU, REFERENCE, Backend
+from minisplat_ref.constants import GSPLAT_MAIN, SH_DEGREE_MAX
+from minisplat_ref.optim.adam import AdamRule, adam_step, zero_moments
+from minisplat_ref.oracle.bench.workloads import Workload, synth
+from minisplat_ref.oracle.cases import Case, Figure
+from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_GRADIENT
+from minisplat_ref.render import render, render_vjp
+from minisplat_ref.scalar._jit import kernel, prange
+from minisplat_ref.splatting import Primitives
+from minisplat_ref.types import Floats, Gaussians, Ints, ProjectionGradient
+
+N = 200_000
+SH_COEFFICIENTS = 16  # degree 3
+IMAGE_SHAPE = (270, 480, 3)
+WIDTHS = (3, 4, 3, 1, 3, 45)  # numbers of a Gaussian of degree 3, field by field
+ADAM_ARRAYS = 7  # values, gradient and both moments are read, all but the gradient are written
+COPY_CHUNKS = 64
+
+
+@kernel()
+def _copy(source, target):  # type: ignore[no-untyped-def]
+    for chunk in prange(COPY_CHUNKS):
+        first, end = source.size * chunk // COPY_CHUNKS, source.size * (chunk + 1) // COPY_CHUNKS
+        target[first:end] = source[first:end]
+
+
+def least_seconds(functions: Sequence[Callable[[], object]], repeats: int) -> list[float]:
+    """Return the least time of each, one turn after the other, after a turn that compiles."""
+    times: list[list[float]] = [[] for _ in functions]
+    for function in functions:
+        function()
+    for _ in range(repeats):
+        for function, own in zip(functions, times, strict=True):
+            start = time.perf_counter()
+            function()
+            own.append(time.perf_counter() - start)
+    return [min(own) for own in times]
+
+
+def stage_cases(repeats: int) -> list[Case]:
+    """Time projection with colours, tile lists and the loss in float32, each beside its error.
+
+    Returns
+    -------
+    list of Case
+        A case fails if its result is not the reference's, in float64 on the same numbers.
+    """
+    return [_projection_case(repeats), _lists_case(repeats), _loss_case(repeats)]
+
+
+def adam_case(repeats: int) -> Case:
+    """Time Adam on Gaussians of 59 numbers against a copy that moves as many bytes, taking turns."""
+    n = N
+    gaussians, gradient = (Gaussians._make(np.full((n, w), 0.5, np.float32) for w in WIDTHS) for _ in range(2))
+    state, rule, rows = zero_moments(gaussians), AdamRule(is_visible_only=True, has_bias_correction=False), np.arange(n)
+    n_numbers = ADAM_ARRAYS * n * sum(WIDTHS)
+    n_bytes = 4 * n_numbers
+    source = np.ones(n_numbers // 2, np.float32)  # read once and written once
+    target = np.empty_like(source)
+    step, copy = least_seconds(
+        (
+            lambda: adam_step(gaussians, gradient, state, [1e-3] * len(WIDTHS), rule, rows),
+            lambda: _copy(source, target),
+        ),
+        repeats,
+    )
+    figures: dict[str, Figure] = {
+        "ms": 1e3 * step,
+        "GB/s": n_bytes / step / 1e9,
+        "copy GB/s": n_bytes / copy / 1e9,
+        "x copy": step / copy,
+    }
+    has_moved = bool((target == 1).all() and (gaussians.means < 0.5).all())
+    return Case(f"roof/adam {n:,}", has_moved, figures, "" if has_moved else "nothing was updated")
+
+
+def thread_case(workload: Workload, repeats: int) -> Case | None:
+    """Time forward and backward on one thread and on all; None where there is only one."""
+    n_all = numba.get_num_threads()
+    if n_all == 1:
+        return None
+    gaussians, v_image = _float32(workload.gaussians), workload.v_image.astype(np.float32)
+
+    def gradient(n_threads: int) -> Gaussians:
+        numba.set_num_threads(n_threads)
+        try:
+            return render_vjp(render(gaussians, workload.camera)[1], v_image).gaussians
+        finally:
+            numba.set_num_threads(n_all)
+
+    one, all_ = least_seconds([lambda: gradient(1), lambda: gradient(n_all)], repeats)
+    is_same = all(np.array_equal(a, b) for a, b in zip(gradient(1), gradient(n_all), strict=True))
+    figures: dict[str, Figure] = {"1 thread ms": 1e3 * one, f"{n_all} threads ms": 1e3 * all_, "x": one / all_}
+    return Case(f"threads/{workload.name}", is_same, figures, "" if is_same else "the gradients are not the same bytes")
+
+
+def _projection_case(repeats: int) -> Case:
+    workload = synth(N)
+    rng = np.random.default_rng(3)
+    sh_rest = (0.1 * rng.normal(size=(N, SH_COEFFICIENTS - 1, 3))).astype(np.float32).astype(np.float64)
+    exact = workload.gaussians._replace(sh_rest=sh_rest)
+    single = _float32(exact)
+    weights = [rng.normal(size=(N, *shape)) for shape in ((2,), (), (3,), (), (3,))]
+    reference, cpu = (_project_and_shade(*pair, workload, weights) for pair in ((REFERENCE, exact), (CPU, single)))
+    [seconds] = least_seconds([lambda: _project_and_shade(CPU, single, workload, weights)], repeats)
+    rows = (reference[0][:, 0] > 0) & (cpu[0][:, 0] > 0)  # one on the edge of being culled says nothing
+    pairs = zip(reference[1:], cpu[1:], strict=True)
+    error = max(float(np.linalg.norm(b[rows] - a[rows]) / np.linalg.norm(a[rows])) for a, b in pairs)
+    return _case("project and SH, both ways", error, BENCH_FLOAT32_GRADIENT, {"ms": 1e3 * seconds})
+
+
+def _project_and_shade(
+    backend: Backend, g: Gaussians, workload: Workload, weights: Sequence[Floats]
+) -> tuple[Ints, Floats, Floats, Floats, Floats, Floats]:
+    """Radii, then centres, colours and gradients by means, scales and SH for weights on the visible Gaussians."""
+    camera = workload.camera
+    primitives = Primitives(g.means, g.quats, np.exp(g.log_scales), 1 / (1 + np.exp(-g.opacity_logits)))
+    projection = backend.project(*primitives, camera, GSPLAT_MAIN)
+    sh = (g.means, g.sh_dc, g.sh_rest, camera, SH_DEGREE_MAX, projection.radii)
+    colors = backend.sh_colors(*sh)
+    is_visible = projection.radii[:, 0] > 0
+    v = [np.where(is_visible.reshape(-1, *[1] * (w.ndim - 1)), w, 0).astype(g.means.dtype) for w in weights]
+    v_sh = backend.sh_colors_vjp(*sh, v[4])
+    v_primitives = backend.project_vjp(*primitives, camera, GSPLAT_MAIN, projection, ProjectionGradient(*v[:4]))
+    return projection.radii, projection.means2d, colors, v_primitives.means, v_primitives.scales, v_sh.sh_rest
+
+
+def _lists_case(repeats: int) -> Case:
+    workload = synth(N)
+    tape = render(_float32(workload.gaussians), workload.camera)[1].splats
+    projection, grid = tape.projection, tape.bins.grid
+    sort, lists = least_seconds(
+        [
+            lambda: np.argsort(projection.depths, kind="stable"),
+            lambda: CPU.bin_gaussians(projection, grid, GSPLAT_MAIN),
+        ],
+        repeats,
+    )
+    # The reference lists more pairs; those that ours leave out must not change the image.
+    longer = REFERENCE.bin_gaussians(projection, grid, GSPLAT_MAIN)
+    image = CPU.composite(projection, tape.channels, tape.background, longer, GSPLAT_MAIN).image
+    error = float(np.abs(image - tape.output.image).max())
+    return _case("sort and bin", error, 0.0, {"ms": 1e3 * lists, "argsort alone ms": 1e3 * sort})
+
+
+def _loss_case(repeats: int) -> Case:
+    rng = np.random.default_rng(4)
+    image, target = (rng.random(IMAGE_SHAPE).astype(np.float32) for _ in range(2))
+
+    def gradient(backend: Backend, image: Floats, target: Floats) -> Floats:
+        return backend.photometric_loss_vjp(backend.photometric_loss(image, target, 1.0)[1])
+
+    [seconds] = least_seconds([lambda: gradient(CPU, image, target)], repeats)
+    exact = gradient(REFERENCE, image.astype(np.float64), target.astype(np.float64))
+    error = float(np.linalg.norm(gradient(CPU, image, target) - exact) / np.linalg.norm(exact))
+    return _case("D-SSIM, both ways", error, BENCH_FLOAT32_GRADIENT, {"ms": 1e3 * seconds})
+
+
+def _case(name: str, error: float, bound: float, figures: dict[str, Figure]) -> Case:
+    note = "" if error <= bound else f"off by {error:.1e}, more than {bound:.1e}"
+    return Case(f"stage/{name}", not note, {**figures, "error": error}, note)
+
+
+def _float32(gaussians: Gaussians) -> Gaussians:
+    return Gaussians._make(field.astype(np.float32) for field in gaussians)
