@@ -181,12 +181,13 @@ def _meta(tapes: list[SplatTape]) -> dict[str, Any]:
     bins = [bin_gaussians(tape.projection, grid, tape.conventions) for tape in tapes]
     n_pairs = np.cumsum([0] + [len(lists.gaussian_ids) for lists in bins])  # before each camera, and in all
     n, dtype = len(projections[0].depths), projections[0].depths.dtype
+    largest = np.finfo(dtype).max  # kernels hold conics in float64
     ids = [lists.gaussian_ids + c * n for c, lists in enumerate(bins)]
     starts = [lists.tile_offsets[:-1] + before for lists, before in zip(bins, n_pairs, strict=False)]
     names = ("means2d", "depths", "opacities", "radii")
     return {
         **{name: np.stack([getattr(projection, name) for projection in projections]) for name in names},
-        "conics": np.stack([projection.conics for projection in projections]).astype(dtype),
+        "conics": np.clip([projection.conics for projection in projections], -largest, largest).astype(dtype),
         "tiles_per_gauss": np.stack([np.diff(lists.gaussian_offsets) for lists in bins]).astype(np.int32),
         "flatten_ids": np.concatenate(ids).astype(np.int32),
         "isect_offsets": np.stack(starts).reshape(-1, grid.n_tiles_y, grid.n_tiles_x).astype(np.int32),

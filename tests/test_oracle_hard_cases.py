@@ -6,6 +6,7 @@ import pytest
 
 from minisplat_ref.backends import BACKENDS, CPU, REFERENCE
 from minisplat_ref.cli import main
+from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle import hard_cases
 from minisplat_ref.oracle.hard_cases import GROUPS, HARD_CASES
@@ -194,3 +195,37 @@ def test_report_has_every_case():
     report = run_hard_cases(cases)
     assert [case.name for case in report.cases] == [case.name for case in cases] and report.n_failed == 0
     assert REFERENCE not in [precision.backend for precision in PRECISIONS]
+
+
+# --- scenes that nobody thought of ---
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_extreme_numbers_stay_finite(dtype, rng):
+    n_drawn = 0
+    for turn in range(60):
+        extreme = rng.choice([1, 3, 8])
+        means = rng.normal(size=(20, 3)) * 10 ** rng.uniform(-extreme, extreme, size=(20, 1))
+        means[:10, :2] = means[:10, 2:] * rng.uniform(-0.3, 0.3, size=(10, 2))  # these are in the view or behind it
+        scales = 10 ** rng.uniform(-2 * extreme, extreme, size=(20, 3)) * (rng.random((20, 3)) > 0.05)
+        arrays = {
+            "means": means,
+            "quats": rng.normal(size=(20, 4)) * 10 ** rng.uniform(-2 * extreme, 2 * extreme, size=(20, 1)),
+            "scales": scales,
+            "opacities": rng.choice([0, 1 / 255, 0.5, 0.99, 1], size=20),
+            "colors": rng.normal(size=(20, 3)),
+            "viewmats": np.eye(4)[None],
+            "Ks": np.array([[[10 ** rng.uniform(-1, 4), 0, 8], [0, 10 ** rng.uniform(-1, 4), 6], [0, 0, 1]]]),
+        }
+        options = {
+            "eps2d": float(turn % 2) * 0.3,
+            "rasterize_mode": ("classic", "antialiased")[turn // 2 % 2],
+            "profile": tuple(PROFILES)[turn // 4 % 4],
+        }
+        subject = Call(arrays, 16, 12, options)
+        drawn = drawing(subject, CPU, np.dtype(dtype))
+        v = {name: rng.normal(size=drawn.outputs[name].shape).astype(dtype) for name in drawn.differentiable}
+        for name, values in {**drawn.outputs, **drawn.vjp(v)}.items():
+            assert np.isfinite(values).all(), (turn, name)
+        n_drawn += drawn.outputs["alpha"].any()
+    assert n_drawn > 20

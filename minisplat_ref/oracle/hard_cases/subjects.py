@@ -86,7 +86,6 @@ def cast(bundle: Any, dtype: np.dtype) -> Any:
     return type(bundle)(*(cast(field, dtype) for field in bundle)) if isinstance(bundle, tuple) else bundle
 
 
-@np.errstate(all="ignore")  # the cast overflows where that is what makes the case hard
 def drawing(subject: Subject, backend: Backend, dtype: np.dtype) -> Drawing:
     """Draw a subject in one precision.
 
