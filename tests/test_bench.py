@@ -6,7 +6,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
-from tolerances import BENCH_ROOM_FOR_EXPONENTIAL
+from tolerances import BENCH_ROOM_FOR_EXPONENTIAL, ROUNDED_TO_FLOAT32
 
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main, training_time
@@ -56,7 +56,9 @@ def test_errors_are_those_of_the_precision(cases):
         assert 1e-8 < figures["image max, no flips"] < BENCH_FLOAT32_IMAGE
         assert 1e-8 < figures["gradient, no flips"] < BENCH_FLOAT32_GRADIENT
         assert figures["image RMS"] < figures["image max"]
-    assert cases["synth/cpu-f32-exp3"].figures["image max, no flips"] > BENCH_FLOAT32_IMAGE
+    cubic = cases["synth/cpu-f32-exp3"].figures
+    assert cubic["image max, no flips"] > BENCH_FLOAT32_IMAGE
+    assert 1e-5 < cubic["gradient, no flips"] < BENCH_FLOAT32_GRADIENT
     assert cases["synth/cpu-f32-3-sigma"].figures["image max"] > 1e-3
     assert cases["synth/cpu-f32-3-sigma"].figures["flips"] is None
 
@@ -125,7 +127,39 @@ def test_exponentials_get_better_with_their_degree():
     assert errors[1] == pytest.approx(2 * (np.log(2) / 4) ** 5 / 120, rel=BENCH_ROOM_FOR_EXPONENTIAL)
 
 
+def opaque_stack(logit, last_logit):
+    """Three opaque Gaussians, one behind the other in the middle of the image, and a faint one behind them."""
+    camera = workloads.synth(1, width=16, height=16, focal=20.0).camera
+    gaussians = Gaussians(
+        means=np.array([[0, 0, 2.0], [0, 0, 2.1], [0, 0, 2.2], [0, 0, 2.5]]),
+        quats=np.tile([1.0, 0, 0, 0], (4, 1)),
+        log_scales=np.log(np.full((4, 3), 500.0)),  # flat over the image
+        opacity_logits=np.array([logit, logit, logit, last_logit]),
+        sh_dc=np.ones((4, 3)),
+        sh_rest=np.zeros((4, 0, 3)),
+    )
+    return render(gaussians, camera, backend=REFERENCE)[1]
+
+
+def test_what_lies_behind_the_stop_does_not_count():
+    faint = float(np.log(1 / 254))  # opacity 1/255
+    assert (thresholds(opaque_stack(-3.0, faint)).allowance[6:10, 6:10] > 0).all()
+    assert not thresholds(opaque_stack(4.5, faint)).is_near[6:10, 6:10].any()
+
+
+def test_transmittance_at_the_stop_is_a_threshold():
+    opacity = 1 - 1e-4 ** (1 / 3)  # three of them leave the least transmittance
+    near, far = (thresholds(opaque_stack(np.log(o / (1 - o)), -9.0)) for o in (opacity, opacity + 1e-3))
+    middle = np.s_[7:9, 7:9]
+    assert (near.allowance[middle] > 1e-3).all() and not far.is_near[middle].any()
+    assert thresholds(opaque_stack(np.log(opacity / (1 - opacity)) + 0.01, -9.0), slack=0.01).is_near[middle].all()
+
+
 def test_workloads_are_fixed():
+    first = workloads.synth().gaussians
+    doubled = workloads.synth5k().gaussians
+    assert np.allclose(np.exp(doubled.log_scales), 2 * np.exp(first.log_scales[:5000]), rtol=ROUNDED_TO_FLOAT32)
+    assert np.array_equal(doubled.means, first.means[:5000])
     for make, n, size in ((workloads.synth, 50_000, (480, 270)), (workloads.synth5k, 5_000, (240, 135))):
         first, second = make(), make()
         assert len(first.gaussians.means) == n and (first.camera.width, first.camera.height) == size
@@ -244,8 +278,10 @@ def test_straight_lines_do_the_arithmetic_of_a_hit():
     lines.backward()
     assert 0 < lines.image_error() < BENCH_FLOAT32_IMAGE
     assert 0 < lines.gradient_error() < BENCH_FLOAT32_GRADIENT
-    lines.sums[3] *= 1.01
-    assert lines.gradient_error() > BENCH_FLOAT32_GRADIENT
+    for i in range(len(lines.sums)):
+        lines.sums[i] *= 1.01
+        assert lines.gradient_error() > BENCH_FLOAT32_GRADIENT
+        lines.sums[i] /= 1.01
 
 
 def test_threads_give_the_same_bytes():
