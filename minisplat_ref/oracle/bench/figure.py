@@ -18,7 +18,8 @@ PANELS = (
 )
 EXACT = 1e-16  # where an error of 0 stands on a logarithmic axis
 COLORS = ("#3d4650", "#35608c", "#3f8f6b", "#d2493f", "#e0a526", "#8e5ea2", "#4aa0a8", "#b5651d")
-SHAPES = {"-exp": "^", "-cut": "s", "-sigma": "s"}  # of variants, which are drawn hollow: they crowd around the default
+SHAPES = {"-exp": "^", "-cut": "s", "-sigma": "s", "textbook": "D"}
+HOLLOW = "^s"  # variants: they crowd around the default
 Style = dict[str, Any]
 
 
@@ -88,7 +89,7 @@ def _legend(styles: dict[str, Style]) -> tuple[list, list[str]]:
 def _style(i: int, name: str) -> Style:
     shape = next((shape for part, shape in SHAPES.items() if part in name), "o")
     color = COLORS[i % len(COLORS)]
-    filling = {"markerfacecolor": color, "zorder": 3} if shape == "o" else {"markerfacecolor": "none", "zorder": 4}
+    filling = {"markerfacecolor": "none", "zorder": 4} if shape in HOLLOW else {"markerfacecolor": color, "zorder": 3}
     return {"color": color, "marker": shape, "linestyle": "none", "markersize": 8, **filling}
 
 
