@@ -26,7 +26,6 @@ SH_DEGREE_MAX = 3
 
 JACOBIAN_CLAMP = 1.3  # the EWA Jacobian is frozen beyond 1.3 x the half field of view: it explodes as 1/z^2 outside
 COMPENSATION_FLOOR = 0.005  # least factor of the antialiasing compensation, keeps its square root differentiable
-SUPPORT_SIGMA_MAX = 3.33  # > sqrt(2 ln 255) = 3.3290: at opacity 1, alpha has fallen below 1/255 here
 MEDIAN_TRANSMITTANCE = 0.5  # the median depth is that of the Gaussian that takes the transmittance below one half
 DEPTH_ALPHA_MIN = 1e-10  # expected depth = sum(w z) / max(alpha, this): an empty pixel gets depth 0, not 0/0
 

@@ -4,6 +4,8 @@ import os
 import shutil
 import subprocess
 import sys
+import threading
+from contextlib import nullcontext
 from pathlib import Path
 
 import numba
@@ -120,6 +122,39 @@ def test_kernels_run_as_python(tmp_path):
 
 
 # --- kernel cache ---
+
+
+def test_the_cache_has_one_writer_at_a_time(tmp_path):
+    order = []
+
+    def write():
+        with _jit._one_process_at_a_time(str(tmp_path)):
+            order.append("second")
+
+    with _jit._one_process_at_a_time(str(tmp_path)):
+        second = threading.Thread(target=write)
+        second.start()
+        second.join(0.2)
+        order.append("first")
+    second.join()
+    assert order == ["first", "second"]
+
+
+def test_kernels_are_saved_under_the_lock(tmp_path, monkeypatch):
+    locked = []
+    monkeypatch.setattr(_jit, "_cache_folder", lambda: str(tmp_path))
+    monkeypatch.setattr(_jit, "_one_process_at_a_time", lambda folder: nullcontext(locked.append(folder)))
+
+    @_jit.kernel(parallel=False)
+    def doubled(values):
+        for i in range(values.size):
+            values[i] *= 2
+
+    for dtype in (np.float32, np.float64, np.float32):
+        values = np.ones(3, dtype)
+        doubled(values)
+        assert (values == 2).all()
+    assert locked == [str(tmp_path)] * 2 and len(list(tmp_path.rglob("*.nbc"))) == 2
 
 
 def test_a_function_is_named_after_what_it_closes_over():

@@ -207,6 +207,20 @@ def test_backends_agree(fast_backend, conventions, dtype, rng):
         assert_allclose(a, e, rtol=0, atol=(PARITY_FLOAT64 if is_exact else PARITY_FLOAT32_GRADIENT) * np.abs(e).max())
 
 
+def test_alpha_min_sets_the_extent(rng):
+    # One that falls below 1/255 reaches beyond the 3.33 sigma that are enough for 1/255.
+    gaussians, camera = make_gaussians(rng, 30, opacity_logit=3.0), make_camera(64, 48, fx=80, fy=75, rng=rng)
+    images = {}
+    for alpha_min in (1 / 255, 1e-5):
+        conventions = GSPLAT_MAIN._replace(name="far", alpha_min=alpha_min)
+        one, other = (
+            render(gaussians, camera, conventions=conventions, backend=backend)[0].image for backend in (CPU, REFERENCE)
+        )
+        assert_allclose(one, other, rtol=0, atol=PARITY_FLOAT64)
+        images[alpha_min] = one
+    assert np.abs(images[1e-5] - images[1 / 255]).max() > 1 / 255
+
+
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_backends_agree_on_real_points(fast_backend, dtype, shared_data, rng):
     # Points and camera of the garden scene; shapes and opacities, which the file does not have, are random.

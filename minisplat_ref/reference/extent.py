@@ -7,7 +7,7 @@ that the square of half-side 3 sigma touches, whatever the opacity.
 
 import numpy as np
 
-from minisplat_ref.constants import SUPPORT_SIGMA_MAX, Conventions
+from minisplat_ref.constants import Conventions
 from minisplat_ref.types import Camera, Floats
 
 INRIA_TILE = 16  # pixels
@@ -54,7 +54,7 @@ def _full_support(
     means2d: Floats, covariances2d: Floats, opacities: Floats, alpha_min: float
 ) -> tuple[Floats, Floats, Floats]:
     """Tight box of the ellipse ``d^T conic d = e^2``: its half-sides are ``e sqrt(cov_xx)`` and ``e sqrt(cov_yy)``."""
-    e = np.minimum(SUPPORT_SIGMA_MAX, np.sqrt(2 * np.log(np.maximum(opacities / alpha_min, 1))))  # [N] sigmas
+    e = np.sqrt(2 * np.log(np.maximum(opacities / alpha_min, 1)))  # [N] sigmas
     variances = np.diagonal(covariances2d, axis1=1, axis2=2)  # [N, 2]
     radii = np.ceil(e[:, None] * np.sqrt(variances))
     return radii, np.floor(means2d - radii), np.ceil(means2d + radii)

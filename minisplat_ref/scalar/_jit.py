@@ -1,13 +1,15 @@
 """The only place where jit flags, caching and threading are decided.
 
 ``scalar`` marks a formula of one Gaussian or one pixel: it stays a plain Python function and is inlined into the
-kernels that call it. ``kernel`` compiles a parallel loop. Five facts shape this file:
+kernels that call it. ``kernel`` compiles a parallel loop. Six facts shape this file:
 
 * Numba's on-disk cache does not notice that a function *called* by a kernel has changed. The cache therefore lives in a
   folder named by a hash of all sources that kernels are made of: an edit anywhere makes a new folder.
 * Numba tells functions of one name apart by a counter of the process, and writes it into the cached code. Kernels that
   different processes compiled for different numbers of channels can so hold different functions under one name, and a
   process that loads both runs one of them twice. What a function closes over is therefore part of its name here.
+* Two processes that save to Numba's cache at the same moment take the same file name, and later processes load the
+  wrong kernel. Saving is therefore one process at a time.
 * Numba's ``workqueue`` threading layer aborts the process when two Python threads enter parallel regions, so all
   kernels share one lock.
 * ``fastmath=True`` would let the compiler assume that no NaN exists and ``isnan`` return False. Kernels may only
@@ -24,7 +26,8 @@ import functools
 import hashlib
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +71,32 @@ def _cache_folder() -> str | None:
     except OSError:
         return None
     return str(folder) if os.access(folder, os.W_OK) else None
+
+
+@contextmanager
+def _one_process_at_a_time(folder: str) -> Iterator[None]:
+    """Hold a lock on the cache; the system gives it back when the file is closed, however the process ends."""
+    with open(Path(folder) / "lock", "a+b") as file:
+        if os.name == "nt":
+            import msvcrt
+
+            msvcrt.locking(file.fileno(), msvcrt.LK_LOCK, 1)  # type: ignore[attr-defined]  # exists on Windows only
+        else:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _save_alone(compiled: Any, folder: str) -> None:
+    """Make a compiled function save itself to the cache under the lock."""
+    save = compiled._cache.save_overload
+
+    def save_overload(signature: Any, result: Any) -> None:
+        with _one_process_at_a_time(folder):
+            save(signature, result)
+
+    compiled._cache.save_overload = save_overload
 
 
 def scalar(function: Callable) -> Callable:
@@ -151,6 +180,8 @@ def kernel(parallel: bool = True) -> Callable[[Callable], Callable]:
             )(_named_after_closure(function))
         finally:
             numba.config.CACHE_DIR = previous  # type: ignore[attr-defined]
+        if folder is not None:
+            _save_alone(compiled, folder)
 
         @functools.wraps(function)
         def locked(*args: Any) -> Any:

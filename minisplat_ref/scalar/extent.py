@@ -8,7 +8,6 @@ import math
 
 import numpy as np
 
-from minisplat_ref.constants import SUPPORT_SIGMA_MAX
 from minisplat_ref.scalar._jit import scalar
 from minisplat_ref.scalar.literals import HALF, THREE, TWO, ZERO
 
@@ -20,7 +19,7 @@ RADIUS_MAX = np.float32(1 << 24)  # px; covers any image, survives the cast to i
 @scalar
 def support_box(footprint, opacity, alpha_min, width, height):
     """Extent at which alpha falls to alpha_min: sqrt(2 ln(opacity / alpha_min)) standard deviations along x and y."""
-    reach = min(SUPPORT_SIGMA_MAX, math.sqrt(TWO * math.log(opacity / alpha_min)))
+    reach = math.sqrt(TWO * math.log(opacity / alpha_min))
     rx = math.ceil(min(reach * math.sqrt(footprint.cov_xx), RADIUS_MAX))
     ry = math.ceil(min(reach * math.sqrt(footprint.cov_yy), RADIUS_MAX))
     x0 = math.floor(min(max(footprint.x - rx, ZERO), width))
