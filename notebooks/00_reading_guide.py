@@ -220,7 +220,10 @@ display(Markdown("\n".join(["| module | what it says of itself |", "|---|---|", 
 # | 10 | `strategy/importance.py`, `simplify.py` | 09 | importance and simplification: who may go |
 # | 11 | `strategy/aggressive_clone.py`, `visibility.py` | 10 | aggressive clone and visibility culling |
 # | 12 | `recipes/mini_splatting.py`, `mini_splatting2.py` | 11 | three recipes side by side |
-# | 13 | `scalar/`, then `cpu/` | | how the same formulas run fast |
+# | 13 | `oracle/differences.py`, `gradients.py`, `planted.py` | 12 | how a gradient check lies |
+# | 14 | `oracle/golden/`, `comparison/` | 13 | comparing a backend with the oracle |
+# | 15 | `scalar/`, then `cpu/` | | how the same formulas run fast |
+# | 16 | `oracle/bench/` | 14 | speed against error |
 #
 # Names are the field's own: `means`, `quats` (wxyz, any length), `log_scales`, `opacity_logits` are what is trained;
 # `scales` and `opacities` are what comes out of the activations. `v_x` is the derivative of the loss by `x`.
