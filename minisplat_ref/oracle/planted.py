@@ -130,7 +130,7 @@ def _three_sigma(base: Backend) -> Backend:
     def project(*args: Any) -> Projection:
         p: Projection = base.project(*args)
         camera: Camera = args[4]
-        a, b, c = np.where(p.radii[:, :1] > 0, p.conics, 1).T  # [N]; rows that are culled stay so
+        a, b, c = np.where(p.radii[:, :1] > 0, p.conics, (1, 0, 1)).T  # [N]; rows that are culled stay so
         sigmas = np.sqrt(np.column_stack([c, a]) / (a * c - b * b)[:, None])
         radii = np.minimum(p.radii, np.ceil(3 * sigmas)).astype(np.int32)
         size = np.array([camera.width, camera.height])
