@@ -180,7 +180,7 @@ def kernel(parallel: bool = True) -> Callable[[Callable], Callable]:
             )(_named_after_closure(function))
         finally:
             numba.config.CACHE_DIR = previous  # type: ignore[attr-defined]
-        if folder is not None:
+        if folder is not None and not numba.config.DISABLE_JIT:  # type: ignore[attr-defined]  # then it is plain Python
             _save_alone(compiled, folder)
 
         @functools.wraps(function)
