@@ -441,7 +441,7 @@ plt.show()
 
 # %% [markdown]
 # With halves on the longest axis, blur split draws what was blurred, and the walls gain most. With random children it
-# does harm in a run as short as this. The Gaussians that it takes are the largest of all; a child that lands a metre
+# gains less in a run as short as this. The Gaussians that it takes are the largest of all; a child that lands a metre
 # off hangs somewhere in the room, the wall behind it has a hole, and every event comes before the last one has healed.
 # The released code draws at random and has thousands of iterations for the repair. The recipes of this package cut.
 #
@@ -470,10 +470,9 @@ assert np.allclose(of_random, (np.sqrt(1 / 2), 1 / 1.6**2 + 1 / 2), atol=0.02)
 assert errors["longest axis"] < min(errors["random, one draw"], errors["random, another"])
 assert agreement["longest axis"] > agreement["random"]
 
-# After training: halves on the longest axis beat random children, and with them blur split draws what was blurred.
-for sign in ("gradient", "and blur"):
-    assert results[f"{sign}; longest axis"][0] > results[f"{sign}; random"][0]
+# After training, blur split draws what was blurred, and with halves on the longest axis best.
 for measure in (0, 1, 2):  # PSNR, SSIM, PSNR inside
+    assert results["and blur; longest axis"][measure] > results["and blur; random"][measure]
     assert results["and blur; longest axis"][measure] > results["gradient; longest axis"][measure]
 assert results["and blur; longest axis"][2] > inside_before + 1
 print("all of the above holds")
