@@ -1,5 +1,9 @@
 """Every tolerance of the tests, with its reason. Relative ones are relative to the largest value compared."""
 
+# What makes a check vacuous is the same for the tests and for the installed command.
+from minisplat_ref.oracle.tolerances import COVERAGE_MIN as COVERAGE_MIN
+from minisplat_ref.oracle.tolerances import GRADIENT_FLOOR as GRADIENT_FLOOR
+
 # A float64 formula against the same number by hand: a few dozen roundings of 1e-16.
 CLOSED_FORM = 1e-13
 
@@ -10,9 +14,6 @@ GRADIENT_REL = 1e-6
 # Through whole images the step is smaller, so that no hit crosses a threshold on the way; rounding is 1e-16 / step.
 GRADIENT_STEP_IMAGE = 1e-8
 
-# A block of a Jacobian or an inner product below this is vacuous: real ones here are 1e-3 to 1e3.
-GRADIENT_FLOOR = 1e-6
-
 # Two derivations of the same sums in float64, in another order: sums of up to a few thousand terms of 1e-16 each.
 PARITY_FLOAT64 = 1e-12
 
@@ -21,9 +22,6 @@ PARITY_FLOAT32_IMAGE = 2e-5
 
 # Gradients in float32, relative to the largest: 1e-7 a hundredfold, by divisions by 1 - alpha <= 0.99 and by z^2.
 PARITY_FLOAT32_GRADIENT = 2e-5
-
-# Alpha must cover this part of an image before a test on it says anything.
-COVERAGE_MIN = 0.05
 
 # Footprints in float32: a 2x2 inverse loses the condition number of the covariance, up to 1e2 here, of 1e-7.
 PARITY_FLOAT32_PROJECTION = 1e-5
