@@ -23,38 +23,41 @@ from collections.abc import Callable
 
 import numpy as np
 
+from minisplat_ref.cpu.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, reached_rows, start_scratch, to_mean
 from minisplat_ref.cpu.projection import N_CHUNKS
-from minisplat_ref.cpu.records import (
-    COLOR,
-    HALF_A,
-    HALF_PIVOT,
-    MEAN_X,
-    MEAN_Y,
-    N_FUSED,
-    OPACITY,
-    SLOPE,
-    fused_colors,
-    pixel_run,
-)
+from minisplat_ref.cpu.records import COLOR, MEAN_X, MEAN_Y, SLOPE
 from minisplat_ref.cpu.tile_state import (
-    BEHIND,
-    CHANNELS,
     CHECK_EVERY,
-    PIXELS,
-    SHADE,
-    WEIGHT,
-    T,
-    X,
-    Y,
-    is_finished,
+    N_ROWS,
+    corner,
+    open_rows,
+    pixel_place,
     start_tile,
 )
-from minisplat_ref.cpu.tiling import TILE_WIDTH
-from minisplat_ref.scalar._jit import add_in_any_order, kernel, prange, scalar
-from minisplat_ref.scalar.compositing import alpha_vjp, blend, conic_vjp_of_moments, factors, mahalanobis
+from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
+from minisplat_ref.scalar._jit import kernel, prange, scalar
+from minisplat_ref.scalar.compositing import alpha_vjp, blend, conic_vjp_of_moments, factors
+from minisplat_ref.scalar.lanes import WIDTH, counted, load, select, store, sum_of, sums_of
 from minisplat_ref.scalar.literals import ONE, ZERO
 
 N_MOMENTS = 6  # sums of q, q e, q dy, q e^2, q e dy, q dy^2
+N_FUSED = 3  # channels whose sums are kept in registers; fewer are padded with zeros, further ones wait in memory
+
+
+def slot_size(n_channels: int) -> int:
+    """Numbers in a pair's slot: its moments and the sums of its channels, three at least."""
+    return N_MOMENTS + max(n_channels, N_FUSED)
+
+
+@scalar
+def fused_colors(records, n, n_channels):
+    """First three channels of a Gaussian, zeros for those that there are not."""
+    zero = records.dtype.type(0)
+    return (
+        records[n, COLOR] if n_channels > 0 else zero,
+        records[n, COLOR + 1] if n_channels > 1 else zero,
+        records[n, COLOR + 2] if n_channels > 2 else zero,
+    )
 
 
 @scalar
@@ -88,89 +91,98 @@ def sum_slots(slots, offsets, projection, out):
 @functools.cache
 def backward_kernel(exp: Callable, n_channels: int) -> Callable:
     """Compile the backward kernel for an exponential and a number of channels."""
+    behind_place = WIDTH  # fields after the transmittance: the part of <v, image> that lies behind the current hit
+    channels = 2 * WIDTH  # v
+    n_fields = 2 + n_channels
+    slot_width = slot_size(n_channels)
+    row_size = n_fields * WIDTH
+    write_alphas = alpha_writer(exp)
 
     @scalar
-    def start(state, x0, y0, frame, image, alpha, v_image, v_alpha):
-        for i in range(PIXELS):
-            x = min(x0 + i % TILE_WIDTH, frame.width - 1)
-            y = min(y0 + i // TILE_WIDTH, frame.height - 1)
-            behind = -v_alpha[y, x] * (ONE - alpha[y, x])  # alpha = 1 - T_final
-            for k in range(n_channels):
-                state[CHANNELS + k * PIXELS + i] = v_image[y, x, k]
-                behind += v_image[y, x, k] * image[y, x, k]
-            state[BEHIND + i] = behind
+    def start_vjp(state, x0, y0, frame, image, alpha, v_image, v_alpha):
+        for y in range(min(TILE_HEIGHT, frame.height - y0)):
+            for x in range(min(TILE_WIDTH, frame.width - x0)):
+                i = pixel_place(x, y, n_fields)
+                behind = -v_alpha[y0 + y, x0 + x] * (ONE - alpha[y0 + y, x0 + x])  # alpha = 1 - T_final
+                for k in range(n_channels):
+                    v = v_image[y0 + y, x0 + x, k]
+                    state[i + channels + k * WIDTH] = v
+                    behind += v * image[y0 + y, x0 + x, k]
+                state[i + behind_place] = behind
 
     @scalar
-    def hit_vjp(s, n_pixels, record, frame, sums):
-        mx, my, opacity = record[MEAN_X], record[MEAN_Y], record[OPACITY]
-        half_a, slope, half_pivot = record[HALF_A], record[SLOPE], record[HALF_PIVOT]
-        color = fused_colors(record, n_channels)
-        if n_channels > N_FUSED:
-            s[SHADE : SHADE + n_pixels] = ZERO
-        for k in range(N_FUSED, n_channels):
-            value = record[COLOR + k]
-            for i in range(n_pixels):
-                s[SHADE + i] += s[CHANNELS + k * PIXELS + i] * value
-        q_sum = qe = qy = qee = qey = qyy = v_red = v_green = v_blue = ZERO * half_a
-        for i in range(n_pixels):
-            dy = my - s[Y + i]
-            e = mx - s[X + i] + slope * dy
-            sigma = mahalanobis(e, dy, half_a, half_pivot)
-            unclamped = opacity * exp(-sigma)
-            transmittance = s[T + i]
-            s[T + i], weight = blend(transmittance, sigma, unclamped, frame)
-            if n_channels > N_FUSED:
-                s[WEIGHT + i] = weight
-            v_0, v_1, v_2 = s[CHANNELS + i], s[CHANNELS + PIXELS + i], s[CHANNELS + 2 * PIXELS + i]
-            shade = v_0 * color[0] + v_1 * color[1] + v_2 * color[2]
-            if n_channels > N_FUSED:
-                shade += s[SHADE + i]
-            behind = s[BEHIND + i] - weight * shade
-            s[BEHIND + i] = behind
-            q = -unclamped * alpha_vjp(transmittance, weight, unclamped, behind, shade, frame)
-            q_mean = q if unclamped <= frame.mean_gradient_max else ZERO
-            q_shape = q if unclamped <= frame.shape_gradient_max else ZERO
-            q_sum = add_in_any_order(q_sum, q_shape)
-            qe = add_in_any_order(qe, q_mean * e)
-            qy = add_in_any_order(qy, q_mean * dy)
-            qee = add_in_any_order(qee, q_shape * e * e)
-            qey = add_in_any_order(qey, q_shape * e * dy)
-            qyy = add_in_any_order(qyy, q_shape * dy * dy)
-            v_red = add_in_any_order(v_red, weight * v_0)
-            v_green = add_in_any_order(v_green, weight * v_1)
-            v_blue = add_in_any_order(v_blue, weight * v_2)
-        sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = q_sum, qe, qy, qee, qey, qyy
-        fused = (v_red, v_green, v_blue)
-        for k in range(min(n_channels, N_FUSED)):
-            sums[N_MOMENTS + k] = fused[k]
-        for k in range(N_FUSED, n_channels):
-            total = ZERO * half_a
-            for i in range(n_pixels):
-                total = add_in_any_order(total, s[WEIGHT + i] * s[CHANNELS + k * PIXELS + i])
-            sums[N_MOMENTS + k] = total
+    def v_channel(s, k, i):
+        return load(s, i + channels + k * WIDTH) if k < n_channels else ZERO * counted(s[0])
 
     @scalar
-    def tile_vjp(state, tile, records, offsets, ids, places, frame, y0, slots):
-        is_over = False
-        for m in range(offsets[tile], offsets[tile + 1]):
-            is_over = is_over or (m % CHECK_EVERY == 0 and is_finished(state))
-            if is_over:
-                slots[places[m]] = ZERO
+    def tile_vjp(s, scratch, row_ids, further, records, ids, slots_of, frame, x0, y0, slots):
+        as_data = s.dtype.type
+        zero = ZERO * counted(s[0])
+        is_open = open_rows(s, n_fields)
+        next_rows = reached_rows(records, ids, 0, x0, y0, scratch)
+        for m in range(ids.size):
+            place = np.int64(slots_of[m]) * slot_width
+            if m % CHECK_EVERY == CHECK_EVERY - 1 and is_open != np.uint64(0):
+                is_open = open_rows(s, n_fields)
+            if is_open == np.uint64(0):
+                slots[place : place + slot_width] = ZERO
                 continue
-            record = records[ids[m]]
-            first, n_pixels = pixel_run(record, y0)
-            hit_vjp(state[first:], n_pixels, record, frame, slots[places[m]])
+            reached = next_rows & is_open
+            next_rows = reached_rows(records, ids, m + 1, x0, y0, scratch)
+            n = ids[m]
+            n_rows = write_alphas(scratch, row_ids, reached, records, n, x0, y0)
+            mx, my, slope = records[n, MEAN_X] - as_data(x0), records[n, MEAN_Y] - as_data(y0), records[n, SLOPE]
+            color = fused_colors(records, n, n_channels)
+            q_sum = qe = qy = qee = qey = qyy = v_red = v_green = v_blue = zero
+            further[:] = ZERO
+            for j in range(n_rows):
+                i = row_ids[j] * row_size
+                unclamped = load(scratch, ALPHAS + j * WIDTH)
+                e, dy = to_mean(scratch, row_ids[j], mx, my, slope)
+                transmittance = load(s, i)
+                after, weight = blend(transmittance, unclamped, frame)
+                store(s, i, after)
+                v_0, v_1, v_2 = v_channel(s, 0, i), v_channel(s, 1, i), v_channel(s, 2, i)
+                v_red = v_red + weight * v_0
+                v_green = v_green + weight * v_1
+                v_blue = v_blue + weight * v_2
+                shade = v_0 * color[0] + v_1 * color[1] + v_2 * color[2]
+                for k in range(N_FUSED, n_channels):
+                    v, at = v_channel(s, k, i), (k - N_FUSED) * WIDTH
+                    shade = shade + v * records[n, COLOR + k]
+                    store(further, at, load(further, at) + weight * v)
+                behind = load(s, i + behind_place) - weight * shade
+                store(s, i + behind_place, behind)
+                q = -unclamped * alpha_vjp(transmittance, weight, unclamped, behind, shade, frame)
+                q_mean = select(unclamped <= frame.mean_gradient_max, q, ZERO)
+                q_shape = select(unclamped <= frame.shape_gradient_max, q, ZERO)
+                shape_e = q_shape * e
+                q_sum = q_sum + q_shape
+                qe = qe + q_mean * e
+                qy = qy + q_mean * dy
+                qee = qee + shape_e * e
+                qey = qey + shape_e * dy
+                qyy = qyy + q_shape * (dy * dy)
+            store(slots, place, sums_of(q_sum, qe, qy, qee, qey, qyy, v_red, v_green))
+            slots[place + WIDTH] = sum_of(v_blue)
+            for k in range(N_FUSED, n_channels):
+                slots[place + N_MOMENTS + k] = sum_of(load(further, (k - N_FUSED) * WIDTH))
 
     @kernel()
     def composite_tiles_vjp(
-        records, offsets, ids, places, ranges, n_threads, frame, image, alpha, v_image, v_alpha, slots
+        records, offsets, ids, slots_of, ranges, n_threads, frame, image, alpha, v_image, v_alpha, slots
     ):
         for thread in prange(n_threads):
-            state = np.zeros(CHANNELS + max(n_channels, N_FUSED) * PIXELS, image.dtype)
+            state = np.empty(N_ROWS * row_size, image.dtype)
+            scratch, row_ids = np.empty(SCRATCH_SIZE, image.dtype), np.empty(N_ROWS, np.int32)
+            start_scratch(scratch)
+            further = np.empty((slot_width - N_MOMENTS - N_FUSED) * WIDTH, image.dtype)  # sums of further channels
             for turn in range(thread, ranges.size - 1, n_threads):
                 for tile in range(ranges[turn], ranges[turn + 1]):
-                    x0, y0 = start_tile(state, tile, frame)
-                    start(state, x0, y0, frame, image, alpha, v_image, v_alpha)
-                    tile_vjp(state, tile, records, offsets, ids, places, frame, y0, slots)
+                    x0, y0 = corner(tile, frame)
+                    start_tile(state, x0, y0, frame, n_fields)
+                    start_vjp(state, x0, y0, frame, image, alpha, v_image, v_alpha)
+                    tile_ids, tile_slots = ids[offsets[tile] : offsets[tile + 1]], slots_of[offsets[tile] :]
+                    tile_vjp(state, scratch, row_ids, further, records, tile_ids, tile_slots, frame, x0, y0, slots)
 
     return composite_tiles_vjp

@@ -1,7 +1,7 @@
-"""The forward kernel: all tiles, every tile's Gaussians front to back, channel by channel, and the blend statistics.
+"""The forward kernel: all tiles, every tile's Gaussians front to back, eight pixels at a time, and the blend statistics.
 
-The number of channels and the exponential are compile-time constants: each combination is its own compiled kernel. The
-weight of a hit is a field of the tile's state, from which the channels and, if asked for, the statistics are fed.
+The number of channels, the exponential and whether statistics are collected are compile-time constants: each
+combination is its own compiled kernel.
 
 What the weights of one Gaussian in one tile add up to goes into the slot of this pair, and each Gaussian then goes
 through its slots in order, as in :mod:`minisplat_ref.cpu.blend_backward`.
@@ -13,68 +13,25 @@ from collections.abc import Callable
 import numpy as np
 
 from minisplat_ref.constants import MEDIAN_TRANSMITTANCE
+from minisplat_ref.cpu.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, reached_rows, start_scratch
 from minisplat_ref.cpu.projection import N_CHUNKS
-from minisplat_ref.cpu.records import (
-    COLOR,
-    HALF_A,
-    HALF_PIVOT,
-    MEAN_X,
-    MEAN_Y,
-    N_FUSED,
-    OPACITY,
-    SLOPE,
-    fused_colors,
-    pixel_run,
-)
+from minisplat_ref.cpu.records import COLOR
 from minisplat_ref.cpu.tile_state import (
-    BEST,
-    BEST_PLACE,
-    CHANNELS,
     CHECK_EVERY,
-    CROSSING,
-    PIXELS,
-    WEIGHT,
-    T,
-    X,
-    Y,
-    is_finished,
+    N_ROWS,
+    corner,
+    open_rows,
+    pixel_place,
     start_tile,
 )
-from minisplat_ref.cpu.tiling import TILE_WIDTH
-from minisplat_ref.scalar._jit import add_in_any_order, kernel, larger_number, prange, scalar
-from minisplat_ref.scalar.compositing import blend, mahalanobis
+from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
+from minisplat_ref.scalar._jit import kernel, prange, scalar
+from minisplat_ref.scalar.compositing import blend
+from minisplat_ref.scalar.lanes import WIDTH, counted, larger, largest_of, load, select, store, sum_of
 from minisplat_ref.scalar.literals import ONE, ZERO
 
 MEDIAN = np.float32(MEDIAN_TRANSMITTANCE)  # one half: exact in float32
-
-
 N_PAIR_STATS = 3  # of a pair: sum of the weights, largest weight, number of hits
-
-
-@scalar
-def _collect(s, n_pixels, place, depth, slot):
-    """Statistics of the hit whose weights stand in the state: sum, maximum and count, and the pixels' own records.
-
-    Two loops that vectorise; the second is needed only where something was hit.
-    """
-    total = largest = ZERO * depth
-    n_hits = np.int32(0)
-    for i in range(n_pixels):
-        weight = s[WEIGHT + i]
-        total = add_in_any_order(total, weight)
-        largest = larger_number(largest, weight)
-        n_hits += np.int32(weight > ZERO)
-    slot[0], slot[1], slot[2] = total, largest, n_hits
-    if n_hits == 0:
-        return
-    for i in range(n_pixels):
-        weight = s[WEIGHT + i]
-        is_best = weight > s[BEST + i]
-        s[BEST + i] = weight if is_best else s[BEST + i]
-        s[BEST_PLACE + i] = place if is_best else s[BEST_PLACE + i]
-        after = abs(s[T + i])
-        is_crossing = (after < MEDIAN) & (after + weight >= MEDIAN)
-        s[CROSSING + i] = depth if is_crossing else s[CROSSING + i]
 
 
 @scalar
@@ -100,75 +57,93 @@ def sum_pair_stats(slots, offsets, stats):
 
 
 @functools.cache
-def forward_kernel(exp: Callable, n_channels: int) -> Callable:
-    """Compile the forward kernel for an exponential and a number of channels."""
+def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
+    """Compile the forward kernel for an exponential, a number of channels, with or without statistics."""
+    channels = WIDTH  # fields after the transmittance: the image so far
+    best = channels + n_channels * WIDTH  # largest weight so far
+    best_place = best + WIDTH  # place of its Gaussian in the tile's list, counted from 1, 0 for none
+    crossing = best_place + WIDTH  # depth of the hit that took the transmittance below one half, or 0
+    n_fields = 1 + n_channels + (3 if has_stats else 0)
+    row_size = n_fields * WIDTH
+    write_alphas = alpha_writer(exp)
 
     @scalar
-    def blend_hit(s, n_pixels, record, frame):
-        mx, my, opacity = record[MEAN_X], record[MEAN_Y], record[OPACITY]
-        half_a, slope, half_pivot = record[HALF_A], record[SLOPE], record[HALF_PIVOT]
-        color = fused_colors(record, n_channels)
-        for i in range(n_pixels):
-            dy = my - s[Y + i]
-            sigma = mahalanobis(mx - s[X + i] + slope * dy, dy, half_a, half_pivot)
-            s[T + i], weight = blend(s[T + i], sigma, opacity * exp(-sigma), frame)
-            s[WEIGHT + i] = weight
-            s[CHANNELS + i] += weight * color[0]
-            s[CHANNELS + PIXELS + i] += weight * color[1]
-            s[CHANNELS + 2 * PIXELS + i] += weight * color[2]
-        for k in range(N_FUSED, n_channels):
-            value = record[COLOR + k]
-            for i in range(n_pixels):
-                s[CHANNELS + k * PIXELS + i] += s[WEIGHT + i] * value
+    def record_hit(s, i, weight, place, depth):
+        is_best = weight > load(s, i + best)
+        store(s, i + best, select(is_best, weight, load(s, i + best)))
+        store(s, i + best_place, select(is_best, place + ZERO * weight, load(s, i + best_place)))
+        after = abs(load(s, i))
+        is_crossing = (after < MEDIAN) & (after + weight >= MEDIAN)
+        store(s, i + crossing, select(is_crossing, depth + ZERO * weight, load(s, i + crossing)))
 
     @scalar
-    def store(state, x0, y0, background, frame, image, alpha):
-        for i in range(PIXELS):
-            x = x0 + i % TILE_WIDTH
-            y = y0 + i // TILE_WIDTH
-            if x < frame.width and y < frame.height:
-                left = abs(state[T + i])
-                alpha[y, x] = ONE - left
+    def store_tile(state, x0, y0, background, frame, image, alpha):
+        for y in range(min(TILE_HEIGHT, frame.height - y0)):
+            for x in range(min(TILE_WIDTH, frame.width - x0)):
+                i = pixel_place(x, y, n_fields)
+                left = abs(state[i])
+                alpha[y0 + y, x0 + x] = ONE - left
                 for k in range(n_channels):
-                    image[y, x, k] = state[CHANNELS + k * PIXELS + i] + left * background[k]
+                    image[y0 + y, x0 + x, k] = state[i + channels + k * WIDTH] + left * background[k]
 
     @scalar
     def store_stats(state, x0, y0, frame, tile_ids, median_depth, dominant_ids):
-        for i in range(PIXELS):
-            x = x0 + i % TILE_WIDTH
-            y = y0 + i // TILE_WIDTH
-            if x < frame.width and y < frame.height:
-                place = np.int64(state[BEST_PLACE + i])
-                dominant_ids[y, x] = tile_ids[place] if place >= 0 else -1
-                median_depth[y, x] = state[CROSSING + i]
+        for y in range(min(TILE_HEIGHT, frame.height - y0)):
+            for x in range(min(TILE_WIDTH, frame.width - x0)):
+                i = pixel_place(x, y, n_fields)
+                place = np.int64(state[i + best_place])
+                dominant_ids[y0 + y, x0 + x] = tile_ids[place - 1] if place > 0 else -1
+                median_depth[y0 + y, x0 + x] = state[i + crossing]
 
     @scalar
-    def blend_tile(state, tile, records, depths, offsets, ids, places, frame, y0, slots):
-        for m in range(offsets[tile], offsets[tile + 1]):
-            if m % CHECK_EVERY == 0 and is_finished(state):
-                break
-            record = records[ids[m]]
-            start, n_pixels = pixel_run(record, y0)
-            blend_hit(state[start:], n_pixels, record, frame)
-            if slots.size > 0:
-                place = depths.dtype.type(m - offsets[tile])  # exact in float32 up to 16 million
-                _collect(state[start:], n_pixels, place, depths[ids[m]], slots[places[m]])
+    def blend_tile(s, scratch, row_ids, records, depths, ids, slots_of, frame, x0, y0, slots):
+        as_data = s.dtype.type
+        lane = counted(s[0])
+        is_open = open_rows(s, n_fields)
+        next_rows = reached_rows(records, ids, 0, x0, y0, scratch)
+        for m in range(ids.size):
+            if m % CHECK_EVERY == CHECK_EVERY - 1:
+                is_open = open_rows(s, n_fields)
+                if is_open == np.uint64(0):
+                    break
+            reached = next_rows & is_open
+            next_rows = reached_rows(records, ids, m + 1, x0, y0, scratch)
+            n = ids[m]
+            n_rows = write_alphas(scratch, row_ids, reached, records, n, x0, y0)
+            total = largest = hits = ZERO * lane
+            for j in range(n_rows):
+                i = row_ids[j] * row_size
+                after, weight = blend(load(s, i), load(scratch, ALPHAS + j * WIDTH), frame)
+                store(s, i, after)
+                for k in range(n_channels):
+                    place_k = i + channels + k * WIDTH
+                    store(s, place_k, load(s, place_k) + weight * records[n, COLOR + k])
+                if has_stats:
+                    record_hit(s, i, weight, as_data(m + 1), depths[n])  # exact in float32 up to 16 million
+                    total = total + weight
+                    largest = larger(largest, weight)
+                    hits = hits + select(weight > ZERO, ONE + ZERO * weight, ZERO)
+            if has_stats:
+                slot = slots[slots_of[m]]
+                slot[0], slot[1], slot[2] = sum_of(total), largest_of(largest), sum_of(hits)
 
     @kernel()
     def composite_tiles(
-        records, depths, background, offsets, ids, places, ranges, n_threads, frame, image, alpha, slots, images
+        records, depths, background, offsets, ids, slots_of, ranges, n_threads, frame, image, alpha, slots, images
     ):
         median_depth, dominant_ids = images
         for thread in prange(n_threads):
-            state = np.zeros(CHANNELS + max(n_channels, N_FUSED) * PIXELS, image.dtype)
+            state = np.empty(N_ROWS * row_size, image.dtype)
+            scratch, row_ids = np.empty(SCRATCH_SIZE, image.dtype), np.empty(N_ROWS, np.int32)
+            start_scratch(scratch)
             for turn in range(thread, ranges.size - 1, n_threads):
                 for tile in range(ranges[turn], ranges[turn + 1]):
-                    x0, y0 = start_tile(state, tile, frame)
-                    state[BEST:] = ZERO
-                    state[BEST_PLACE : BEST_PLACE + PIXELS] = -ONE
-                    blend_tile(state, tile, records, depths, offsets, ids, places, frame, y0, slots)
-                    store(state, x0, y0, background, frame, image, alpha)
-                    if median_depth.size > 0:
-                        store_stats(state, x0, y0, frame, ids[offsets[tile] :], median_depth, dominant_ids)
+                    x0, y0 = corner(tile, frame)
+                    start_tile(state, x0, y0, frame, n_fields)
+                    tile_ids, tile_slots = ids[offsets[tile] : offsets[tile + 1]], slots_of[offsets[tile] :]
+                    blend_tile(state, scratch, row_ids, records, depths, tile_ids, tile_slots, frame, x0, y0, slots)
+                    store_tile(state, x0, y0, background, frame, image, alpha)
+                    if has_stats:
+                        store_stats(state, x0, y0, frame, tile_ids, median_depth, dominant_ids)
 
     return composite_tiles

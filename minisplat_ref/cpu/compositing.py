@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.cpu.blend_backward import N_MOMENTS, backward_kernel, sum_slots
+from minisplat_ref.cpu.blend_backward import backward_kernel, slot_size, sum_slots
 from minisplat_ref.cpu.blend_forward import N_PAIR_STATS, forward_kernel, sum_pair_stats
 from minisplat_ref.cpu.exponential import exp_exact, exp_fast
 from minisplat_ref.cpu.records import records_of
@@ -69,7 +69,7 @@ def composite_with(
     shape, n_pairs = ((height, width), len(bins.gaussian_ids)) if collects else ((0, 0), 0)
     median_depth, dominant_ids = np.empty(shape, dtype), np.empty(shape, np.int32)
     slots = np.zeros((n_pairs, N_PAIR_STATS), dtype)  # stay zero behind the hit that finishes a tile
-    forward_kernel(exp, colors.shape[1])(
+    forward_kernel(exp, colors.shape[1], collects)(
         records_of(projection, colors, conventions),
         projection.depths,
         background,
@@ -106,7 +106,7 @@ def composite_vjp_with(
 ) -> CompositeGradient:
     """Chain gradients with the exponential that the forward pass used."""
     dtype, n_channels = colors.dtype, colors.shape[1]
-    slots = np.empty((len(bins.gaussian_ids), N_MOMENTS + n_channels), dtype)
+    slots = np.empty((len(bins.gaussian_ids), slot_size(n_channels)), dtype)
     backward_kernel(exp, n_channels)(
         records_of(projection, colors, conventions),
         bins.tile_offsets,
@@ -119,7 +119,7 @@ def composite_vjp_with(
         output.alpha,
         np.ascontiguousarray(v_image, dtype),
         np.ascontiguousarray(v_alpha, dtype),
-        slots,
+        slots.reshape(-1),
     )
     out = CompositeGradient(
         np.zeros(projection.means2d.shape, projection.means2d.dtype),

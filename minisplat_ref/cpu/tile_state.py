@@ -1,10 +1,9 @@
 """What the pixels of one tile remember while its Gaussians pass by, and how tiles are dealt out to threads.
 
-A tile is 8 pixels wide, so any run of its rows is one contiguous run of pixels, and one flat loop per Gaussian covers
-the rows that its box touches. All that the pixels remember lies in ONE array, field after field at a compile-time
-distance: the compiler then proves that stores do not overlap loads and turns the loop into vector code; separate
-arrays exceed its alias checks. The pixel centres are fields too: two loads are cheaper than integer arithmetic on the
-loop index.
+A tile of 32 x 16 pixels is 64 rows of eight pixels, and any set of them is an integer of 64 bits: the rows that a
+Gaussian reaches, the rows in which a pixel still accepts hits, and by one ``&`` the rows that there is work to do in.
+The rows are numbered down a strip eight pixels wide, then down the next. Of each row all fields lie side by side in
+memory, the transmittance first, then whatever a kernel keeps.
 """
 
 import numpy as np
@@ -13,22 +12,14 @@ from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
 from minisplat_ref.scalar._jit import n_threads, scalar
 from minisplat_ref.scalar.compositing import Frame
-from minisplat_ref.scalar.literals import HALF, ONE, ZERO
+from minisplat_ref.scalar.lanes import WIDTH, any_of, counted, filled, load, select, store
+from minisplat_ref.scalar.literals import ONE, ZERO
 from minisplat_ref.types import Ints, TileBins
 
-PIXELS = TILE_WIDTH * TILE_HEIGHT
-T = 0  # transmittance, negative once the pixel is finished
-X = PIXELS  # pixel centre
-Y = 2 * PIXELS
-WEIGHT = 3 * PIXELS  # alpha T of the current hit
-BEHIND = 4 * PIXELS  # backward: the part of <v, image> that lies behind the current hit
-SHADE = 5 * PIXELS  # backward: <v, colour of the current hit> over the channels beyond the third
-BEST = 4 * PIXELS  # forward: largest weight so far
-BEST_PLACE = 5 * PIXELS  # forward: place of its Gaussian in the tile's list, -1 for none
-CROSSING = 6 * PIXELS  # forward: depth of the hit that took the transmittance below one half, or 0
-CHANNELS = 7 * PIXELS  # forward: the image so far; backward: v
+N_STRIPS = TILE_WIDTH // WIDTH
+N_ROWS = N_STRIPS * TILE_HEIGHT  # bits of an integer
 RANGES_PER_THREAD = 8
-CHECK_EVERY = 8  # hits between two tests whether the whole tile is finished
+CHECK_EVERY = 16  # hits between two looks at which pixels are finished
 
 
 def frame_of(bins: TileBins, conventions: Conventions, dtype: np.dtype) -> Frame:
@@ -58,24 +49,34 @@ def tile_ranges(bins: TileBins) -> Ints:
 
 
 @scalar
-def start_tile(state, tile, frame):
-    """Reset the transmittances and pixel centres; pixels beyond the image's edge start finished. Return its corner."""
+def corner(tile, frame):
+    """Return column and row of a tile's first pixel."""
     n_tiles_x = (frame.width + TILE_WIDTH - 1) // TILE_WIDTH
-    x0 = tile % n_tiles_x * TILE_WIDTH
-    y0 = tile // n_tiles_x * TILE_HEIGHT
-    for i in range(PIXELS):
-        x = x0 + i % TILE_WIDTH
-        y = y0 + i // TILE_WIDTH
-        state[X + i] = x + HALF
-        state[Y + i] = y + HALF
-        state[T + i] = ONE if x < frame.width and y < frame.height else -ONE
-    return x0, y0
+    return tile % n_tiles_x * TILE_WIDTH, tile // n_tiles_x * TILE_HEIGHT
 
 
 @scalar
-def is_finished(state):
-    """Whether no pixel of the tile accepts another hit: an integer sum, which vectorises where a maximum does not."""
-    n_open = np.int32(0)
-    for i in range(PIXELS):
-        n_open += np.int32(state[T + i] > ZERO)
-    return n_open == 0
+def pixel_place(x, y, n_fields):
+    """Place of the transmittance of a pixel of the tile; the next field is ``WIDTH`` further."""
+    return (x // WIDTH * TILE_HEIGHT + y) * n_fields * WIDTH + x % WIDTH
+
+
+@scalar
+def start_tile(state, x0, y0, frame, n_fields):
+    """Set all fields to zero and the transmittances to one; pixels beyond the image's edge start finished."""
+    as_data = state.dtype.type
+    state[:] = ZERO
+    for row in range(N_ROWS):
+        columns = counted(as_data(0)) + as_data(x0 + row // TILE_HEIGHT * WIDTH)
+        n_columns = as_data(frame.width if y0 + row % TILE_HEIGHT < frame.height else 0)
+        store(state, row * n_fields * WIDTH, select(columns < n_columns, filled(as_data(1)), -ONE))
+
+
+@scalar
+def open_rows(state, n_fields):
+    """Rows with a pixel that accepts hits, as bits."""
+    rows = np.uint64(0)
+    for row in range(N_ROWS):
+        is_open = any_of(load(state, row * n_fields * WIDTH) > ZERO)
+        rows |= np.uint64(is_open) << np.uint64(row)
+    return rows

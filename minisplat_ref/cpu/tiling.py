@@ -21,7 +21,7 @@ from minisplat_ref.scalar.literals import HALF, ZERO
 from minisplat_ref.scalar.tiling import rightmost_offset, visible_ellipse
 from minisplat_ref.types import Ints, Projection, TileBins, TileGrid
 
-TILE_WIDTH = 8  # one row of a tile is one AVX2 register of float32; divides INRIA's 16
+TILE_WIDTH = 32
 TILE_HEIGHT = 16
 N_CHUNKS = 16  # fixed, so that the lists do not depend on the number of threads
 ELLIPSE_MARGIN = np.float32(0.02)  # px and relative: rounding must not lose a pixel that the compositor would blend

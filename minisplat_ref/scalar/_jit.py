@@ -101,7 +101,7 @@ def _save_alone(compiled: Any, folder: str) -> None:
 
 def scalar(function: Callable) -> Callable:
     """Mark a formula of one Gaussian or one pixel that kernels call; in Python it is the function itself."""
-    return register_jitable(_named_after_closure(function))
+    return register_jitable(forceinline=True)(_named_after_closure(function))
 
 
 def _named_after_closure(function: Callable) -> Callable:

@@ -1,8 +1,7 @@
 """Alpha blending of one hit at one pixel (3DGS equations 2 and 3), forward and backward.
 
-Selections instead of branches: the pixel loops that call these functions are vectorised, and every lane computes both
-sides anyway. A finished pixel keeps the negative of its transmittance, so that no later hit can pass the stop test
-and no second array is needed to remember it.
+Eight pixels at a time (``lanes``), with selections instead of branches. A finished pixel keeps the negative of its
+transmittance, so that no later hit can pass the stop test and no second array is needed to remember it.
 """
 
 from typing import NamedTuple
@@ -10,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.scalar._jit import scalar
+from minisplat_ref.scalar.lanes import select, smaller
 from minisplat_ref.scalar.literals import HALF, ONE, TWO, ZERO
 
 PIVOT_MIN = np.float32(1e-14)  # of a conic, relative to c: a little above float64's rounding
@@ -54,23 +54,30 @@ def conic_vjp_of_moments(slope, ee, ey, yy):
 
 
 @scalar
-def blend(transmittance, sigma, unclamped, frame):
+def blend(transmittance, unclamped, frame):
     """Blend one hit.
+
+    Parameters
+    ----------
+    transmittance : lanes
+        T before the hit; negative where the pixel is finished.
+    unclamped : lanes
+        opacity exp(-sigma); sigma is a sum of squares and never negative.
 
     Returns
     -------
-    transmittance : float
+    transmittance : lanes
         After the hit; negative once the pixel is finished.
-    weight : float
+    weight : lanes
         alpha T of the hit, 0 where it is skipped.
     """
-    alpha = min(unclamped, frame.alpha_max)
+    alpha = smaller(unclamped, frame.alpha_max)
     after = transmittance * (ONE - alpha)
-    is_hit = (alpha >= frame.alpha_min) & (sigma >= ZERO)
-    is_open = after >= frame.transmittance_min
-    weight = alpha * transmittance if is_hit & is_open else ZERO
-    stopped = after if is_open else -abs(transmittance)
-    return (stopped if is_hit else transmittance), weight
+    is_hit = alpha >= frame.alpha_min
+    is_blended = is_hit & (after >= frame.transmittance_min)
+    weight = select(is_blended, alpha * transmittance, ZERO)
+    stopped = select(is_hit, -abs(transmittance), transmittance)
+    return select(is_blended, after, stopped), weight
 
 
 @scalar
@@ -82,22 +89,21 @@ def alpha_vjp(transmittance, weight, unclamped, behind, shade, frame):
 
     Parameters
     ----------
-    transmittance : float
+    transmittance : lanes
         T before the hit.
-    weight : float
+    weight : lanes
         alpha T, 0 where the hit was skipped.
-    unclamped : float
+    unclamped : lanes
         opacity exp(-sigma).
-    behind : float
+    behind : lanes
         S.
-    shade : float
+    shade : lanes
         <v, c>.
 
     Returns
     -------
-    float
+    lanes
         dL/dalpha, 0 where the hit was skipped.
     """
-    alpha = min(unclamped, frame.alpha_max)
-    value = transmittance * shade - behind / (ONE - alpha)
-    return value if weight > ZERO else ZERO
+    alpha = smaller(unclamped, frame.alpha_max)
+    return select(weight > ZERO, transmittance * shade - behind / (ONE - alpha), ZERO)

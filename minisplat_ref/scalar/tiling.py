@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.scalar._jit import scalar
+from minisplat_ref.scalar.lanes import larger, smaller, sqrt
 from minisplat_ref.scalar.literals import ONE, TWO, ZERO
 
 FLAT = np.float32(1e-30)  # px^-2: a conic that is no ellipse reaches over any image
@@ -48,6 +49,6 @@ def rightmost_offset(ellipse, low, high, side):
 
     The band has to meet the ellipse. The left side is the right side of the ellipse turned by half a circle.
     """
-    dy = min(max(side * ellipse.tilt, low), high)
-    root = math.sqrt(max(ellipse.q - ellipse.pivot * dy * dy, ZERO) * ellipse.inverse_a)
+    dy = smaller(larger(side * ellipse.tilt, low), high)
+    root = sqrt(larger(ellipse.q - ellipse.pivot * dy * dy, ZERO) * ellipse.inverse_a)
     return root - side * ellipse.slope * dy
