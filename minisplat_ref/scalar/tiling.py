@@ -23,6 +23,8 @@ class Ellipse(NamedTuple):
     inverse_a: float
     pivot: float
     q: float
+    half_width: float
+    """Largest dx."""
     half_height: float
     """Largest dy."""
     tilt: float
@@ -34,12 +36,13 @@ def visible_ellipse(a, slope, pivot, opacity, alpha_min, margin):
     """Ellipse on which alpha equals alpha_min, its level raised by a relative and an absolute margin."""
     q = TWO * math.log(opacity / alpha_min)
     q += margin * (q + margin)
-    a, pivot = max(a, FLAT), max(pivot, FLAT)
+    inverse_a, pivot = ONE / max(a, FLAT), max(pivot, FLAT)
     half_height = math.sqrt(q / pivot)
-    # Where the ellipse is widest, its gradient has no y: slope a (dx + slope dy) + pivot dy = 0.
-    steepness = slope * math.sqrt(a / pivot)
-    tilt = -half_height * steepness / math.sqrt(ONE + steepness * steepness)
-    return Ellipse(slope, ONE / a, pivot, q, half_height, tilt)
+    # The inverse of the conic has 1 / a + slope^2 / pivot as its first entry, and -slope / pivot beside the diagonal.
+    lean = slope * half_height
+    half_width = math.sqrt(q * inverse_a + lean * lean)
+    tilt = -lean * (half_height / half_width)
+    return Ellipse(slope, inverse_a, pivot, q, half_width, half_height, tilt)
 
 
 @scalar
