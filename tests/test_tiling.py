@@ -1,11 +1,12 @@
 from itertools import pairwise
 
+import numba
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 from scenes import activated, make_camera, make_gaussians
 
-from minisplat_ref.backends import REFERENCE
+from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN, INRIA
 from minisplat_ref.types import Projection, TileGrid
 
@@ -28,6 +29,45 @@ def lists(bins):
     """Python lists of Gaussians, tile by tile."""
     ids, offsets = bins.gaussian_ids.tolist(), bins.tile_offsets.tolist()
     return [ids[start:end] for start, end in pairwise(offsets)]
+
+
+def pairs(bins):
+    """Set of (tile, Gaussian)."""
+    return {(t, n) for t, ids in enumerate(lists(bins)) for n in ids}
+
+
+def assert_in_order(bins, depths):
+    """Lists are ordered by depth, then index; slots number the pairs Gaussian by Gaussian."""
+    tiles = np.repeat(np.arange(len(bins.tile_offsets) - 1), np.diff(bins.tile_offsets))
+    order = np.lexsort((bins.gaussian_ids, depths[bins.gaussian_ids], tiles))
+    assert_array_equal(order, np.arange(len(order)))
+    owners = np.full_like(bins.gaussian_ids, -1)
+    owners[bins.slots] = bins.gaussian_ids
+    assert_array_equal(owners, np.repeat(np.arange(len(depths)), np.diff(bins.gaussian_offsets)))
+
+
+def random_footprints(rng, n, dtype, size=(300, 200), depths=None):
+    """Projection of ellipses from dots to needles over the whole image, each in its smallest box, some culled."""
+    angles, opacities = rng.uniform(0, np.pi, n), rng.uniform(0.004, 1, n)
+    sigmas = np.exp(rng.uniform(np.log(0.3), np.log(80), (n, 2)))
+    axes = np.stack([np.cos(angles), np.sin(angles)], axis=1)  # [n, 2]
+    across = axes[:, ::-1] * [-1, 1]
+    outer = [np.einsum("ni,nj->nij", v, v) for v in (axes, across)]
+    covariances = sum(o * s[:, None, None] ** 2 for o, s in zip(outer, sigmas.T, strict=True))
+    inverse = sum(o / s[:, None, None] ** 2 for o, s in zip(outer, sigmas.T, strict=True))
+    means2d = rng.uniform(-20, 20, (n, 2)) + rng.uniform(0, 1, (n, 2)) * size
+    reach = np.sqrt(2 * np.log(opacities / GSPLAT_MAIN.alpha_min)[:, None] * np.diagonal(covariances, axis1=1, axis2=2))
+    boxes = np.concatenate([np.floor(means2d - reach), np.ceil(means2d + reach)], axis=1)
+    boxes = np.clip(boxes, 0, np.tile(size, 2)).astype(np.int32)
+    is_visible = (boxes[:, :2] < boxes[:, 2:]).all(axis=1) & (rng.uniform(size=n) < 0.9)
+    return Projection(
+        means2d=means2d.astype(dtype),
+        depths=(rng.uniform(1, 9, n) if depths is None else depths).astype(dtype) * is_visible,
+        conics=np.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], axis=1),
+        opacities=opacities.astype(dtype),
+        radii=np.ceil(reach).astype(np.int32) * is_visible[:, None],
+        boxes=boxes * is_visible[:, None],
+    )
 
 
 # --- closed form ---
@@ -117,3 +157,71 @@ def test_fast_lists_leave_out_only_what_no_pixel_sees(fast_backend, dtype, rng):
                 seen.append(n)
         assert [n for n in ids if n in kept_ids] == kept_ids  # a part of the list, in its order
         assert set(seen) <= set(kept_ids)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_fast_lists_over_many_tiles(fast_backend, dtype, rng):
+    size = (300, 200)
+    projection = random_footprints(rng, 600, dtype, size)
+    grid = TileGrid(*size, fast_backend.tile_width, fast_backend.tile_height)
+    bins, every = (b.bin_gaussians(projection, grid, GSPLAT_MAIN) for b in (fast_backend, REFERENCE))
+    listed = pairs(bins)
+    assert listed <= pairs(every)
+    ys, xs = np.mgrid[: size[1], : size[0]]
+    tiles = ys // grid.tile_height * grid.n_tiles_x + xs // grid.tile_width  # [H, W]
+    n_seen = 0
+    for n in np.flatnonzero(projection.radii[:, 0]):
+        a, b, c = projection.conics[n]
+        dx, dy = xs + 0.5 - float(projection.means2d[n, 0]), ys + 0.5 - float(projection.means2d[n, 1])
+        sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+        x0, y0, x1, y1 = projection.boxes[n]
+        is_seen = projection.opacities[n] * np.exp(-sigma) >= GSPLAT_MAIN.alpha_min
+        is_seen &= (x0 <= xs) & (xs < x1) & (y0 <= ys) & (ys < y1)
+        seen = {(tile, n) for tile in np.unique(tiles[is_seen])}
+        assert seen <= listed
+        n_seen += len(seen)
+    assert 3000 < n_seen and len(listed) < 1.05 * n_seen < 0.8 * len(pairs(every))
+    assert_in_order(bins, projection.depths)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("spread", ["three", "one", "neighbours", "wide"])
+def test_order_of_any_depths(fast_backend, dtype, spread, rng):
+    n = 400
+    depths = {
+        "three": rng.choice([0.5, 2.0, 7.0], n),
+        "one": np.full(n, 3.0),
+        "neighbours": dtype(3) + np.spacing(dtype(3)) * rng.integers(0, 50, n),  # float64: alike as float32
+        "wide": 10.0 ** rng.uniform(-30, 30, n),
+    }[spread]
+    projection = random_footprints(rng, n, dtype, depths=depths)
+    grid = TileGrid(300, 200, fast_backend.tile_width, fast_backend.tile_height)
+    bins = fast_backend.bin_gaussians(projection, grid, GSPLAT_MAIN)
+    assert len(bins.gaussian_ids) > 1500
+    assert_in_order(bins, projection.depths)
+
+
+def test_a_gaussian_over_all_tiles(fast_backend):
+    projection = footprints([[0, 0, 1000, 700]] * 3, [2, 3, 1])._replace(conics=np.tile([1e-9, 0, 1e-9], (3, 1)))
+    grid = TileGrid(1000, 700, fast_backend.tile_width, fast_backend.tile_height)
+    bins = fast_backend.bin_gaussians(projection, grid, GSPLAT_MAIN)
+    assert lists(bins) == [[2, 0, 1]] * (grid.n_tiles_x * grid.n_tiles_y)
+    assert_array_equal(np.diff(bins.gaussian_offsets), [grid.n_tiles_x * grid.n_tiles_y] * 3)
+
+
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="needs two threads")
+@pytest.mark.parametrize("n", [7, 900])  # fewer Gaussians than parts, and more
+def test_same_lists_at_any_number_of_threads(n, rng):
+    projection = random_footprints(rng, n, np.float32)
+    grid = TileGrid(300, 200, CPU.tile_width, CPU.tile_height)
+    n_threads = numba.get_num_threads()
+    try:
+        results = []
+        for count in (1, 2):
+            numba.set_num_threads(count)
+            results.append(CPU.bin_gaussians(projection, grid, GSPLAT_MAIN))
+    finally:
+        numba.set_num_threads(n_threads)
+    one, two = results
+    assert len(one.gaussian_ids) > n and one.grid == two.grid
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(one[:4], two[:4], strict=True))

@@ -11,7 +11,7 @@ from minisplat_ref.cpu.tiling import ELLIPSE_MARGIN
 from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.compositing import factors
 from minisplat_ref.scalar.literals import HALF
-from minisplat_ref.scalar.tiling import Ellipse, visible_ellipse
+from minisplat_ref.scalar.tiling import Outline, visible_ellipse
 from minisplat_ref.types import Floats, Projection
 
 # Columns. The conic is there as its factors, two of them halved as sigma wants them; columns of pixels are floats.
@@ -24,29 +24,28 @@ HALF_A_MAX = np.float32(1e30)  # without a low-pass a footprint can be thinner t
 def _write_record(n, projection, colors, alpha_min, records):
     a, slope, pivot = factors(projection.conics[n, 0], projection.conics[n, 1], projection.conics[n, 2])
     turned = factors(projection.conics[n, 2], projection.conics[n, 1], projection.conics[n, 0])
-    ellipse = visible_ellipse(*turned, projection.opacities[n], alpha_min, ELLIPSE_MARGIN)
+    outline = visible_ellipse(*turned, projection.opacities[n], alpha_min, ELLIPSE_MARGIN).outline
     records[n, MEAN_X], records[n, MEAN_Y] = projection.means2d[n, 0], projection.means2d[n, 1]
     records[n, HALF_A] = min(HALF * a, HALF_A_MAX)
     records[n, SLOPE] = slope
     records[n, HALF_PIVOT] = min(HALF * pivot, HALF_A_MAX)
     records[n, OPACITY] = projection.opacities[n]
-    records[n, TURNED_SLOPE], records[n, TURNED_INVERSE_A] = ellipse.slope, ellipse.inverse_a
-    records[n, TURNED_PIVOT], records[n, Q] = min(ellipse.pivot, HALF_A_MAX), ellipse.q
-    records[n, TURNED_TILT] = ellipse.tilt
+    records[n, TURNED_SLOPE], records[n, TURNED_INVERSE_A] = outline.slope, outline.inverse_a
+    records[n, TURNED_PIVOT], records[n, Q] = min(outline.pivot, HALF_A_MAX), outline.q
+    records[n, TURNED_TILT] = outline.tilt
     records[n, COLUMN_FIRST], records[n, COLUMN_END] = projection.boxes[n, 0], projection.boxes[n, 2]
     for k in range(colors.shape[1]):
         records[n, COLOR + k] = colors[n, k]
 
 
 @scalar
-def turned_ellipse(records, n):
-    """Visible ellipse of a record with x and y exchanged, as ``rightmost_offset`` takes it."""
-    return Ellipse(
+def turned_outline(records, n):
+    """Outline of the visible ellipse of a record with x and y exchanged: ``rightmost_offset`` gives its lowest point."""
+    return Outline(
         records[n, TURNED_SLOPE],
         records[n, TURNED_INVERSE_A],
         records[n, TURNED_PIVOT],
         records[n, Q],
-        records[n, Q],  # its half height: not asked for
         records[n, TURNED_TILT],
     )
 

@@ -1,62 +1,51 @@
-"""Front-to-back order of the visible Gaussians: a radix sort of the depths' bits.
+"""Order of positive floats: a radix sort of their bits.
 
-Positive IEEE floats are ordered as the integers that their bits spell, so that sorting them takes a fixed number of
-linear passes: 3 of 11 bits for float32, 6 for float64. Each pass is stable, which makes equal depths keep the order of
-their rows.
+Positive IEEE floats are ordered as the integers that their bits spell, and those are sorted digit by digit in linear
+passes. Each pass is stable, which makes equal keys keep their order. Keys that are near each other share their leading
+bits: digits are those of the difference to the smallest key, and there are as few as the largest difference needs.
 """
 
-import numpy as np
-
-from minisplat_ref.scalar._jit import kernel
-from minisplat_ref.types import Floats, Ints
+from minisplat_ref.scalar._jit import scalar
 
 DIGIT_BITS = 11  # 2048 counters: they fit the first-level cache
-_PASSES = {np.dtype(np.float32): 3, np.dtype(np.float64): 6}
 
 
-@kernel(parallel=False)
-def _radix_order(keys, order, n_passes):
-    other_keys = np.empty_like(keys)
-    other_order = np.empty_like(order)
-    n = keys.size
-    n_digits = 1 << DIGIT_BITS
-    counts = np.zeros((n_passes, n_digits), np.int64)
-    for i in range(n):
-        for digit in range(n_passes):
-            counts[digit, (keys[i] >> (DIGIT_BITS * digit)) & (n_digits - 1)] += 1
-    for digit in range(n_passes):
-        shift = DIGIT_BITS * digit
-        total = 0
-        for value in range(n_digits):
-            count = counts[digit, value]
-            counts[digit, value] = total
-            total += count
-        for i in range(n):
-            value = (keys[i] >> shift) & (n_digits - 1)
-            place = counts[digit, value]
-            counts[digit, value] = place + 1
-            other_keys[place] = keys[i]
-            other_order[place] = order[i]
-        keys, other_keys = other_keys, keys
-        order, other_order = other_order, order
-    return order
-
-
-def depth_order(depths: Floats, radii: Ints) -> Ints:
-    """Sort the visible Gaussians front to back.
+@scalar
+def sort_stably(keys, values, other_keys, other_values, places):
+    """Sort values [n] by their integer keys [n]; equal keys keep their order.
 
     Parameters
     ----------
-    depths : ndarray of shape (N,)
-        Camera z, positive where visible.
-    radii : ndarray of shape (N, 2)
-        0 where culled.
+    keys, values : ndarray of shape (n,)
+        Overwritten.
+    other_keys, other_values : ndarray of shape (n,)
+        Scratch.
+    places : ndarray of shape (2^DIGIT_BITS,)
+        Scratch.
 
     Returns
     -------
-    ndarray of shape (V,), int32
-        Rows of the visible Gaussians, nearest first, equal depths in row order.
+    ndarray of shape (n,)
+        ``values`` or ``other_values``, in which the sorted values are.
     """
-    visible = np.flatnonzero(radii[:, 0]).astype(np.int32)
-    bits = np.int32 if depths.dtype == np.float32 else np.int64  # positive floats: the sign bit is 0
-    return _radix_order(depths[visible].view(bits), visible, _PASSES[depths.dtype])
+    lowest = highest = keys[0] if keys.size > 0 else 0
+    for key in keys:
+        lowest, highest = min(lowest, key), max(highest, key)
+    mask = places.size - 1
+    shift = 0
+    while (highest - lowest) >> shift > 0:
+        places[:] = 0
+        for key in keys:
+            places[((key - lowest) >> shift) & mask] += 1
+        place = 0
+        for digit in range(places.size):
+            place, places[digit] = place + places[digit], place
+        for i in range(keys.size):
+            digit = ((keys[i] - lowest) >> shift) & mask
+            place = places[digit]
+            places[digit] = place + 1
+            other_keys[place], other_values[place] = keys[i], values[i]
+        keys, other_keys = other_keys, keys
+        values, other_values = other_values, values
+        shift += DIGIT_BITS
+    return values

@@ -19,7 +19,7 @@ from minisplat_ref.cpu.records import (
     MEAN_Y,
     OPACITY,
     SLOPE,
-    turned_ellipse,
+    turned_outline,
 )
 from minisplat_ref.cpu.tile_state import N_ROWS, N_STRIPS
 from minisplat_ref.cpu.tiling import ELLIPSE_MARGIN, TILE_HEIGHT
@@ -88,7 +88,7 @@ def reached_rows(records, ids, m, x0, y0, scratch):
     left = (k - select(is_up, ZERO * k, FOUR)) * as_data(WIDTH)  # edges of the strips
     side = select(is_up, -ONE + ZERO * k, ONE)
     low = left + (HALF - mx)
-    offset = rightmost_offset(turned_ellipse(records, n), low, low + as_data(WIDTH - 1), side)
+    offset = rightmost_offset(turned_outline(records, n), low, low + as_data(WIDTH - 1), side)
     bound = floor(side * my + offset + (HALF + ELLIPSE_MARGIN))  # minus the first row, or the one after the last
     bound = smaller(bound, select(is_up, ZERO * k, as_data(TILE_HEIGHT)))
     is_in_box = (left < records[n, COLUMN_END] - as_data(x0)) & (left > records[n, COLUMN_FIRST] - as_data(x0 + WIDTH))

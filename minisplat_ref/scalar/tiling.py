@@ -17,17 +17,25 @@ from minisplat_ref.scalar.literals import ONE, TWO, ZERO
 FLAT = np.float32(1e-30)  # px^-2: a conic that is no ellipse reaches over any image
 
 
-class Ellipse(NamedTuple):
-    """A visible ellipse around the origin."""
+class Outline(NamedTuple):
+    """Edge of a visible ellipse around the origin."""
 
     slope: float
     inverse_a: float
     pivot: float
     q: float
-    half_height: float
-    """Largest dy."""
     tilt: float
     """dy of the right-most point."""
+
+
+class Ellipse(NamedTuple):
+    """A visible ellipse around the origin."""
+
+    outline: Outline
+    half_width: float
+    """Largest dx."""
+    half_height: float
+    """Largest dy."""
 
 
 @scalar
@@ -35,20 +43,21 @@ def visible_ellipse(a, slope, pivot, opacity, alpha_min, margin):
     """Ellipse on which alpha equals alpha_min, its level raised by a relative and an absolute margin."""
     q = TWO * math.log(opacity / alpha_min)
     q += margin * (q + margin)
-    a, pivot = max(a, FLAT), max(pivot, FLAT)
+    inverse_a, pivot = ONE / max(a, FLAT), max(pivot, FLAT)
     half_height = math.sqrt(q / pivot)
-    # Where the ellipse is widest, its gradient has no y: slope a (dx + slope dy) + pivot dy = 0.
-    steepness = slope * math.sqrt(a / pivot)
-    tilt = -half_height * steepness / math.sqrt(ONE + steepness * steepness)
-    return Ellipse(slope, ONE / a, pivot, q, half_height, tilt)
+    # The inverse of the conic has 1 / a + slope^2 / pivot as its first entry, and -slope / pivot beside the diagonal.
+    lean = slope * half_height
+    half_width = math.sqrt(q * inverse_a + lean * lean)
+    tilt = -lean * (half_height / half_width)
+    return Ellipse(Outline(slope, inverse_a, pivot, q, tilt), half_width, half_height)
 
 
 @scalar
-def rightmost_offset(ellipse, low, high, side):
+def rightmost_offset(outline, low, high, side):
     """Return the largest dx (side 1) or the largest -dx (side -1) of the ellipse with low <= dy <= high.
 
-    The band has to meet the ellipse. The left side is the right side of the ellipse turned by half a circle.
+    Numbers or lanes. The band has to meet the ellipse. The left side is the right side of the ellipse turned by half a circle.
     """
-    dy = smaller(larger(side * ellipse.tilt, low), high)
-    root = sqrt(larger(ellipse.q - ellipse.pivot * dy * dy, ZERO) * ellipse.inverse_a)
-    return root - side * ellipse.slope * dy
+    dy = smaller(larger(side * outline.tilt, low), high)
+    root = sqrt(larger(outline.q - outline.pivot * dy * dy, ZERO) * outline.inverse_a)
+    return root - side * outline.slope * dy
