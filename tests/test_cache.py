@@ -85,6 +85,16 @@ def test_numba_notices_another_processor_and_another_numba(tmp_path, monkeypatch
     assert index.load("key") is None
 
 
+def test_a_training_starts_without_plots_and_readers_of_other_scenes():
+    code = """
+import sys
+import minisplat_ref.cli.settings, minisplat_ref.cli.training
+print("LOADED", {"matplotlib", "pycolmap", "torch", "IPython"} & set(sys.modules))
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert "LOADED set()" in done.stdout
+
+
 # --- what is compiled ahead is what is used ---
 
 UNDER_WATCH = """
