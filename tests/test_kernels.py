@@ -202,7 +202,10 @@ def test_compiled_and_cached_kernels_give_the_same_bytes(tmp_path):
     assert len(cached[0]) > 5 and cached[0] == cached[1]
 
 
-@pytest.mark.parametrize("source", ["scalar/covariance.py", "cpu/blend_forward.py", "constants.py", "types.py"])
+@pytest.mark.parametrize(
+    "source",
+    ["scalar/covariance.py", "cpu/blend_forward.py", "oracle/bench/exponentials.py", "constants.py", "types.py"],
+)
 def test_cache_folder_follows_the_sources(source, tmp_path, monkeypatch):
     # Numba notices no change in a function that a kernel calls from another file: hence a folder per source hash.
     copy = tmp_path / "minisplat_ref"
