@@ -77,10 +77,10 @@ def _adam(dtype: Dtype) -> None:
 
 
 STAGES: dict[str, Callable[[Dtype], None]] = {
-    "projection, backward": _stage("project_vjp"),
+    "blending, backward": _stage("composite_vjp"),
     "photometric loss, both ways": _photometric_loss,
     "colours, backward": _stage("sh_colors_vjp"),
-    "blending, backward": _stage("composite_vjp"),
+    "projection, backward": _stage("project_vjp"),
     "blending": _stage("composite"),
     "projection": _stage("project"),
     "tile lists": _stage("bin_gaussians"),
