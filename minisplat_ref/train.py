@@ -141,12 +141,14 @@ def _iterate(state: TrainState, scene: Scene, recipe: Recipe, backend: Backend, 
     image = np.ascontiguousarray(output.image[..., :3])
     loss, loss_tape = backend.photometric_loss(image, target, recipe.dssim_weight, view.mask)
     v_image, v_alpha = backend.photometric_loss_vjp(loss_tape), None
+    del loss_tape  # larger than all images together, and the gradients of the Gaussians need the room
     if any(recipe.geometry):
         points = scene.points[view.point_ids] if view.point_ids is not None else scene.points[:0]
         term, term_tape = backend.geometric_loss(
             output.image[..., 3], output.alpha, target, view.camera, points, recipe.geometry, view.mask
         )
         v_depth, v_alpha = backend.geometric_loss_vjp(term_tape)
+        del term_tape
         loss, v_image = loss + term, np.dstack([v_image, v_depth])
         output = output._replace(image=image)
     gradient = render_vjp(tape, v_image, v_alpha)

@@ -1,26 +1,36 @@
 """Speed against error: everyone is judged, the wrong get no time, and the files are there. No time is asserted."""
 
 import json
+import os
 from dataclasses import replace
 from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
 import pytest
 from tolerances import BENCH_ROOM_FOR_EXPONENTIAL, ROUNDED_TO_FLOAT32
 
 from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.cli import main, training_time
+from minisplat_ref.cli import main, peak_memory, start_time, training_time
 from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.errors import InputError
 from minisplat_ref.io.images import read_image
-from minisplat_ref.oracle.bench import contenders, limits, profiling, race, roofs, workloads
+from minisplat_ref.oracle.bench import contenders, limits, profiling, race, roofs, slopes, workloads
 from minisplat_ref.oracle.bench.exponentials import EXPONENTIALS, relative_errors
 from minisplat_ref.oracle.bench.flips import thresholds
 from minisplat_ref.oracle.bench.peers import peers_of
 from minisplat_ref.oracle.planted import planted
-from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_GRADIENT, BENCH_FLOAT32_IMAGE, BENCH_FLOAT64
+from minisplat_ref.oracle.tolerances import (
+    BENCH_FLOAT32_GRADIENT,
+    BENCH_FLOAT32_IMAGE,
+    BENCH_FLOAT32_LOSS,
+    BENCH_FLOAT64,
+)
 from minisplat_ref.render import render
+from minisplat_ref.scalar._jit import cache_root
 from minisplat_ref.types import Gaussians
 
+PEAK = ("peak", "bound")
 NAMES = ("reference-f64", "cpu-f64", "cpu-f32", "cpu-f32-exp3", "cpu-f32-3-sigma", "textbook-f32")
 pytestmark = pytest.mark.usefixtures("tiny_workloads")
 
@@ -304,3 +314,72 @@ def _fake_opensplat(folder, script):
     program.write_text(f"#!/bin/sh\n{script}\n")
     program.chmod(0o755)
     return program
+
+
+def test_time_against_hits_is_fitted_and_checked(monkeypatch, tmp_path):
+    monkeypatch.setattr(slopes, "VIEWS", ((200, (32, 24)), (800, (32, 24)), (400, (64, 48))))
+    file = tmp_path / "slopes.json"
+    assert main(["bench", "--slopes", "--repeats", "1", "--json", str(file)]) == 0
+    *views, by_hits, by_size = json.loads(file.read_text())["cases"]
+    assert len(views) == 3 and all(view["ms"] > 0 and view["flips %"] < 0.1 for view in views)
+    assert views[1]["ns a hit"] == pytest.approx(1e6 * views[1]["ms"] / views[1]["hits"])
+    assert views[0]["hits"] < views[1]["hits"] < 800 * 32 * 24
+    assert by_hits["name"].endswith("hits") and by_size["name"].endswith("pixels")
+    assert by_hits["spread"] >= 1
+
+
+def test_slopes_of_powers_are_their_exponents():
+    costs = np.array([1e3, 1e4, 3e5])
+    assert slopes.fitted_slope(costs, 5 * costs**0.7) == pytest.approx((0.7, 1.0))
+    assert slopes.fitted_slope([1, 10, 100], [1, 20, 100])[1] == pytest.approx(2 ** (2 / 3))
+
+
+def test_a_wrong_image_has_no_slope(monkeypatch):
+    monkeypatch.setattr(slopes, "VIEWS", ((200, (32, 24)), (400, (32, 24))))
+    monkeypatch.setattr(slopes, "CPU", with_pixel(np.nan))
+    assert not any(case.passed for case in slopes.slope_cases(1))
+    assert slopes.flipped_pixels(np.full((2, 2, 3), np.nan), np.zeros((2, 2, 3))) == 1
+
+
+def test_peak_memory_is_that_of_the_arrays(monkeypatch):
+    monkeypatch.setattr(peak_memory, "N", 2000)
+    monkeypatch.setattr(peak_memory, "SIZE", (640, 480))
+    case = peak_memory.memory_case()
+    figures = case.figures
+    assert case.passed, case
+    assert figures["moments MB"] == 2 * figures["model MB"] == pytest.approx(2 * 2000 * 59 * 4 / 1e6)
+    assert figures["images MB"] == pytest.approx(640 * 480 * (3 + 4 * 10) / 1e6)
+    assert figures["pairs MB"] == pytest.approx(48 * figures["pairs"] / 1e6) and figures["pairs"] > 1000
+    terms = sum(value for name, value in figures.items() if name.endswith("MB") and name.split()[0] not in PEAK)
+    assert figures["bound MB"] == pytest.approx(terms)
+    assert figures["peak MB"] > figures["images MB"] / 2  # they are there, whatever else is
+
+
+def test_a_wrong_image_has_no_peak(monkeypatch):
+    monkeypatch.setattr(peak_memory, "N", 500)
+    monkeypatch.setattr(peak_memory, "SIZE", (32, 24))
+    monkeypatch.setattr(peak_memory, "CPU", with_pixel(1.1))
+    case = peak_memory.memory_case()
+    assert not case.passed and "float64" in case.note
+
+
+def test_start_is_timed_by_the_command(monkeypatch):
+    monkeypatch.setattr(start_time, "WARM_STARTS", 1)
+    folders = []
+    kernels = os.environ.get("NUMBA_CACHE_DIR", str(cache_root()))
+    start = start_time._start
+    # An empty folder would take as long as compiling does; the commands themselves are real.
+    monkeypatch.setattr(
+        start_time, "_start", lambda scene, run, folder: folders.append(folder) or start(scene, run, Path(kernels))
+    )
+    cold, warm = start_time.start_cases()
+    assert cold.passed and warm.passed, (cold, warm)
+    assert folders[0] == folders[1] and folders[0].name == "kernels"
+    assert cold.figures["first iteration s"] > 0 and 0 < cold.figures["error of loss"] < BENCH_FLOAT32_LOSS
+    monkeypatch.setattr(start_time, "_reference_loss", lambda scene: 0.1)
+    assert not any(case.passed for case in start_time.start_cases())
+
+
+def test_a_start_that_fails_says_why(tmp_path):
+    with pytest.raises(InputError, match=r"code 2.*no such folder"):
+        start_time._start(tmp_path / "absent", tmp_path / "run", tmp_path / "kernels")

@@ -142,7 +142,7 @@ def test_the_cache_has_one_writer_at_a_time(tmp_path):
 
 def test_kernels_are_saved_under_the_lock(tmp_path, monkeypatch):
     locked = []
-    monkeypatch.setattr(_jit, "_cache_folder", lambda: str(tmp_path))
+    monkeypatch.setattr(_jit, "cache_folder", lambda: str(tmp_path))
     monkeypatch.setattr(_jit, "_one_process_at_a_time", lambda folder: nullcontext(locked.append(folder)))
 
     @_jit.kernel(parallel=False)
@@ -202,7 +202,10 @@ def test_compiled_and_cached_kernels_give_the_same_bytes(tmp_path):
     assert len(cached[0]) > 5 and cached[0] == cached[1]
 
 
-@pytest.mark.parametrize("source", ["scalar/covariance.py", "cpu/blend_forward.py", "constants.py", "types.py"])
+@pytest.mark.parametrize(
+    "source",
+    ["scalar/covariance.py", "cpu/blend_forward.py", "oracle/bench/exponentials.py", "constants.py", "types.py"],
+)
 def test_cache_folder_follows_the_sources(source, tmp_path, monkeypatch):
     # Numba notices no change in a function that a kernel calls from another file: hence a folder per source hash.
     copy = tmp_path / "minisplat_ref"
@@ -211,11 +214,11 @@ def test_cache_folder_follows_the_sources(source, tmp_path, monkeypatch):
     monkeypatch.setattr(_jit, "_PACKAGE", copy)
     monkeypatch.setattr(_jit, "source_hash", _jit.source_hash.__wrapped__)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    folder = _jit._cache_folder.__wrapped__()
+    folder = _jit.cache_folder.__wrapped__()
     assert Path(folder) == tmp_path / "cache" / before and Path(folder).is_dir()
     with (copy / source).open("a") as file:
         file.write("\n")
-    assert _jit._cache_folder.__wrapped__() != folder
+    assert _jit.cache_folder.__wrapped__() != folder
 
 
 def test_cache_folder_ignores_what_no_kernel_is_made_of(tmp_path, monkeypatch):

@@ -17,9 +17,9 @@ from typing import NoReturn
 from minisplat_ref.cli.arguments import HelpFormatter
 from minisplat_ref.errors import InputError
 
-from . import bench, compare, demo, evaluate, info, oracle, render, train
+from . import bench, cache, compare, demo, evaluate, info, oracle, render, train
 
-COMMANDS = (demo, train, render, evaluate, compare, info, oracle, bench)
+COMMANDS = (demo, train, render, evaluate, compare, info, oracle, bench, cache)
 
 DESCRIPTION = """\
 3D Gaussian Splatting on the CPU: train a scene from photographs, look at it,

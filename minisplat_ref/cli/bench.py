@@ -62,9 +62,13 @@ def add_parser(commands: Commands) -> None:
         metavar="A,B",
         help="gsplat-torch, opensplat=PROGRAM: time them, too",
     )
-    parser.add_argument(
+    others = parser.add_mutually_exclusive_group()
+    others.add_argument(
         "--stages", action="store_true", help="instead: a training iteration, and how far from the limits"
     )
+    others.add_argument("--slopes", action="store_true", help="instead: time against hits, 12,500 to 200,000 Gaussians")
+    others.add_argument("--memory", action="store_true", help="instead: peak of an iteration, 200,000 in 1920 x 1080")
+    others.add_argument("--start", action="store_true", help="instead: seconds to the first iteration, cold and warm")
     parser.add_argument(
         "--scene", type=Path, metavar="SCENE", help="photographs for --stages (default a made room) and opensplat"
     )
@@ -80,13 +84,36 @@ def run(args: argparse.Namespace) -> int:
     """Measure, print the table, write what was asked for."""
     from minisplat_ref.oracle.cases import save_json, verdict
 
-    report = _stages(args) if args.stages else _race(args)
+    report = _measure(args)
     print(f"{report.title}\n\n{_tables(report)}\n\n{verdict([report])}")
     if args.json is not None:
         save_json(report, args.json)
     if args.out is not None:
         _save_folder(report, args.out)
     return 1 if report.n_failed else 0
+
+
+def _measure(args: argparse.Namespace) -> "Report":
+    from minisplat_ref.oracle.cases import Report
+
+    if args.stages:
+        return _stages(args)
+    if args.slopes:
+        from minisplat_ref.oracle.bench.slopes import slope_cases
+
+        cases = slope_cases(args.repeats, progress)
+        return Report("What time grows with: forward and backward, float32", tuple(cases), {"repeats": args.repeats})
+    if args.memory:
+        from minisplat_ref.cli.peak_memory import memory_case
+
+        progress("memory: one training iteration in a process of its own")
+        return Report("Peak memory of a training iteration", (memory_case(),), {})
+    if args.start:
+        from minisplat_ref.cli.start_time import start_cases
+
+        progress("start: train with no compiled kernels, then with them")
+        return Report("From the start of train to the end of its first iteration", tuple(start_cases()), {})
+    return _race(args)
 
 
 def _race(args: argparse.Namespace) -> "Report":

@@ -50,6 +50,7 @@ def run(args: argparse.Namespace) -> int:
     from data_tools.synthetic.files import write_scene
     from minisplat_ref.cli import run_folder
     from minisplat_ref.cli.demo_report import demo_report, view_pictures
+    from minisplat_ref.cli.first_use import compile_kernels
     from minisplat_ref.cli.report import report_html
     from minisplat_ref.cli.scoring import summary
     from minisplat_ref.cli.settings import Settings, load_photographs, recipe_of
@@ -77,6 +78,7 @@ def run(args: argparse.Namespace) -> int:
     scene = load_photographs(settings)
     recipe = recipe_of(settings)
     state = initial_state(scene, recipe, settings.seed)
+    compile_kernels(settings.backend)
     outcome = run_training(folder, scene, settings, recipe, state)
     pictures = view_pictures(synthetic, scene, state.gaussians, settings, outcome)
     page = report_html(demo_report(folder, scene, settings, outcome, pictures, time.perf_counter() - start))

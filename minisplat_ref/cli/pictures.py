@@ -1,7 +1,6 @@
 """Pictures for a person to look at: renders beside photographs, errors and depths in colour."""
 
 import numpy as np
-from matplotlib import colormaps
 from numpy.typing import NDArray
 
 from minisplat_ref.constants import DEPTH_ALPHA_MIN
@@ -46,6 +45,8 @@ def depth_range(depth: Floats) -> tuple[float, float]:
 
 def colored(values: Floats, low: float, high: float, colormap: str) -> Picture:
     """Colour values [H, W] with a map whose ends stand for ``low`` and ``high``, in either order."""
+    from matplotlib import colormaps  # not at the top: a training would wait for it before its first iteration
+
     fractions = np.clip((values - low) / ((high - low) or 1.0), 0.0, 1.0)  # [H, W]
     picture: Picture = colormaps[colormap](fractions, bytes=True)[..., :3]  # [H, W, 3]
     return picture

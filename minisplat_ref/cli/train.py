@@ -126,6 +126,7 @@ def _start(given: dict[str, Any]) -> int:
     folder: Path = given.get("out", Path("runs") / f"{scene_folder.resolve().name}-{options['recipe']}")
 
     from minisplat_ref.cli import curve, run_folder
+    from minisplat_ref.cli.first_use import compile_kernels
     from minisplat_ref.cli.settings import Settings, load_photographs, recipe_of
     from minisplat_ref.train import initial_state
 
@@ -136,6 +137,7 @@ def _start(given: dict[str, Any]) -> int:
     if settings.eval_every:
         curve.check_views(scene)
     state = initial_state(scene, recipe, settings.seed)
+    compile_kernels(settings.backend)
     run_folder.create(folder)
     try:
         return _train(folder, scene, settings, recipe, state)
@@ -152,6 +154,7 @@ def _resume(folder: Path, given: dict[str, Any]) -> int:
         )
 
     from minisplat_ref.cli import run_folder, settings
+    from minisplat_ref.cli.first_use import compile_kernels
     from minisplat_ref.train import load_state
 
     ours = settings.load(folder)
@@ -162,7 +165,9 @@ def _resume(folder: Path, given: dict[str, Any]) -> int:
         raise InputError(
             f"{folder} has done {state.step} iterations: give --iterations above {state.step} to train further"
         )
-    return _train(folder, settings.load_photographs(ours), ours, recipe, state)
+    scene = settings.load_photographs(ours)
+    compile_kernels(ours.backend)
+    return _train(folder, scene, ours, recipe, state)
 
 
 def _train(folder: Path, scene: "Scene", settings: "Settings", recipe: "Recipe", state: "TrainState") -> int:

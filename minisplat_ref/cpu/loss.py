@@ -151,6 +151,9 @@ def photometric_loss(
     n_values = image.size if mask is None else 3 * int(np.count_nonzero(mask))
     if mask is not None:
         image = np.where(mask[..., None], image, target)
+    difference = image - target
+    l1 = np.abs(difference, out=difference).sum(dtype=np.float64)
+    del difference  # before the larger arrays come
     padded_image, padded_target = _padded(image), _padded(target)
     values, derivatives = _ssim(padded_image, padded_target, image.shape)
     tape = LossTape(padded_image, padded_target, derivatives, dssim_weight, mask, n_values)
@@ -159,9 +162,8 @@ def photometric_loss(
     if mask is not None:
         values = values[mask]
         derivatives[:, HALF_WINDOW:-HALF_WINDOW, PAD:-PAD] *= np.repeat(mask, 3, axis=1)
-    l1 = np.abs(image - target).sum(dtype=np.float64) / n_values
     dssim = 1 - values.sum(dtype=np.float64) / n_values
-    return float((1 - dssim_weight) * l1 + dssim_weight * dssim), tape
+    return float((1 - dssim_weight) * (l1 / n_values) + dssim_weight * dssim), tape
 
 
 def photometric_loss_vjp(tape: LossTape, v_loss: float = 1.0) -> Floats:

@@ -46,6 +46,11 @@ FLIP_RELATIVE = 255 * FLIP_ALPHA
 BENCH_FLOAT32_IMAGE = 2e-5
 # The same of every parameter's gradient, relative L2, without the pixels that stand at a threshold.
 BENCH_FLOAT32_GRADIENT = 1e-4
+# Part of the pixels in which a hit may fall on the other side of a threshold in float32: none to 1e-4 on random scenes.
+BENCH_FLIPPED_PIXELS = 1e-3
+# The loss of a made room before any training, float32 against float32: its points lie on walls, many at one depth, and
+# each renderer rounds them into another order. A pixel changes by up to 7e-3, one in five does; their mean by 4e-5.
+BENCH_FLOAT32_LOSS = 1e-4
 # float64 kernels against the reference: another order of sums of up to thousands of terms of 1e-16 each.
 BENCH_FLOAT64 = 1e-11
 # Gradient of a polynomial exponential, in units of its relative error: behind / (1 - alpha) multiplies it.

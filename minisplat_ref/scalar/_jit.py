@@ -4,7 +4,9 @@
 kernels that call it. ``kernel`` compiles a parallel loop. Six facts shape this file:
 
 * Numba's on-disk cache does not notice that a function *called* by a kernel has changed. The cache therefore lives in a
-  folder named by a hash of all sources that kernels are made of: an edit anywhere makes a new folder.
+  folder named by a hash of all sources that kernels are made of: an edit anywhere makes a new folder. So does another
+  version of what compiles them: Numba's own index notices another processor and another Numba, but not another LLVM,
+  another NumPy, which computes the constants that are compiled in, or other options of the compiler.
 * Numba tells functions of one name apart by a counter of the process, and writes it into the cached code. Kernels that
   different processes compiled for different numbers of channels can so hold different functions under one name, and a
   process that loads both runs one of them twice. What a function closes over is therefore part of its name here.
@@ -25,28 +27,44 @@ kernels that call it. ``kernel`` compiles a parallel loop. Six facts shape this 
 import functools
 import hashlib
 import os
+import platform
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import llvmlite
 import numba
+import numpy as np
 from numba import prange
 from numba.extending import intrinsic, overload, register_jitable
 
-__all__ = ["add_in_any_order", "kernel", "larger_number", "n_threads", "prange", "scalar", "source_hash"]
+__all__ = [
+    "add_in_any_order",
+    "cache_folder",
+    "cache_root",
+    "kernel",
+    "larger_number",
+    "n_threads",
+    "prange",
+    "scalar",
+    "source_hash",
+]
 
 _KERNEL_LOCK = threading.RLock()
 _PACKAGE = Path(__file__).parent.parent
+_COMPILER_OPTIONS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "BOUNDSCHECK", "DEBUGINFO_DEFAULT")
 
 
 @functools.cache
 def source_hash() -> str:
-    """Hash of every source file that is compiled into a kernel."""
-    digest = hashlib.sha256()
+    """Hash of every source file that is compiled into a kernel, and of what compiles it."""
+    versions = (platform.python_version(), np.__version__, numba.__version__, llvmlite.__version__)
+    options = (str(getattr(numba.config, name)) for name in _COMPILER_OPTIONS)
+    digest = hashlib.sha256("|".join((*versions, *options)).encode())
     sources = [_PACKAGE / "constants.py", _PACKAGE / "types.py"]
-    for folder in ("scalar", "cpu"):
+    for folder in ("scalar", "cpu", "oracle/bench"):
         sources += sorted((_PACKAGE / folder).glob("*.py"))
     for source in sources:
         digest.update(source.name.encode())
@@ -54,7 +72,8 @@ def source_hash() -> str:
     return digest.hexdigest()[:16]
 
 
-def _cache_root() -> Path:
+def cache_root() -> Path:
+    """Return the folder in which every version of the kernels has one of its own."""
     if base := os.environ.get("NUMBA_CACHE_DIR"):
         return Path(base)
     if os.name == "nt":
@@ -63,9 +82,9 @@ def _cache_root() -> Path:
 
 
 @functools.cache
-def _cache_folder() -> str | None:
-    """Folder for compiled kernels, or None where it cannot be written (kernels then compile in every process)."""
-    folder = _cache_root() / source_hash()
+def cache_folder() -> str | None:
+    """Return the folder for compiled kernels; None where it cannot be written, and every process compiles its own."""
+    folder = cache_root() / source_hash()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
@@ -76,6 +95,7 @@ def _cache_folder() -> str | None:
 @contextmanager
 def _one_process_at_a_time(folder: str) -> Iterator[None]:
     """Hold a lock on the cache; the system gives it back when the file is closed, however the process ends."""
+    Path(folder).mkdir(parents=True, exist_ok=True)  # somebody may have cleared the cache
     with open(Path(folder) / "lock", "a+b") as file:
         if os.name == "nt":
             import msvcrt
@@ -101,7 +121,9 @@ def _save_alone(compiled: Any, folder: str) -> None:
 
 def scalar(function: Callable) -> Callable:
     """Mark a formula of one Gaussian or one pixel that kernels call; in Python it is the function itself."""
-    return register_jitable(forceinline=True)(_named_after_closure(function))
+    # Inlined always: a call would count the references of every array it is given, an atomic operation each. Nobody
+    # calls it through a C pointer, and the wrapper for that would be a tenth of what is compiled.
+    return register_jitable(forceinline=True, no_cfunc_wrapper=True)(_named_after_closure(function))
 
 
 def _named_after_closure(function: Callable) -> Callable:
@@ -171,12 +193,16 @@ def kernel(parallel: bool = True) -> Callable[[Callable], Callable]:
     """
 
     def decorate(function: Callable) -> Callable:
-        folder = _cache_folder()
+        folder = cache_folder()
         previous = numba.config.CACHE_DIR  # type: ignore[attr-defined]  # numba sets its options at import
         numba.config.CACHE_DIR = folder or previous  # type: ignore[attr-defined]  # read at decoration only
         try:
             compiled = numba.njit(
-                parallel=parallel, cache=folder is not None, error_model="numpy", fastmath={"contract"}
+                parallel=parallel,
+                cache=folder is not None,
+                error_model="numpy",
+                fastmath={"contract"},
+                no_cfunc_wrapper=True,
             )(_named_after_closure(function))
         finally:
             numba.config.CACHE_DIR = previous  # type: ignore[attr-defined]

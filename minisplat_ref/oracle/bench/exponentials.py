@@ -2,8 +2,7 @@
 
 The form is that of :mod:`minisplat_ref.cpu.exponential`: exp(x) = 2^n 2^f with n the nearest integer to x log2(e), 2^f
 by a polynomial on [-1/2, 1/2], n added to the exponent bits. Each function is of its own at module level, because the
-compiled kernels on disk are found again by the name of the exponential. The names carry the degree and nothing else, so
-whoever edits a formula here must empty the folder of compiled kernels.
+compiled kernels on disk are found again by the name of the exponential.
 """
 
 import math

@@ -1,0 +1,179 @@
+"""Compile the kernels of training, rendering and evaluation ahead of their use, on all processors.
+
+A process compiles one function at a time, so that a first iteration waits for one kernel after the other. Here every
+stage is compiled by itself, in several processes, and found on disk by whoever needs it. A stage alone needs arguments
+of the types that the stages before it would give; they come from the reference, which compiles nothing.
+
+Left out: numbers of channels other than those that training and rendering use (3, and 4 with depth), which gsplat's
+signature allows, and the kernels of ``bench``. They are compiled at their first use.
+"""
+
+import gc
+import os
+import signal
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import replace
+from multiprocessing import get_context
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref.backends import CPU, REFERENCE, Backend
+from minisplat_ref.render import RenderTape, render, render_vjp
+from minisplat_ref.types import Camera, Floats, Gaussians, GeometricWeights
+
+WIDTH, HEIGHT = 24, 18
+N_GAUSSIANS = 4
+DEGREE = 1  # of the spherical harmonics: a number at run time, so that any will do
+
+Dtype = type[np.floating]
+
+
+class Compiled(NamedTuple):
+    """One stage that is ready."""
+
+    name: str
+    """Key of ``STAGES``."""
+    seconds: float
+    """That it took; little where it was on disk already."""
+
+
+def _stage(name: str, with_depth: bool = False, with_stats: bool = False) -> Callable[[Dtype], None]:
+    """Return a task that draws and differentiates a view with one stage compiled."""
+
+    def compile_stage(dtype: Dtype) -> None:
+        backend = replace(_REFERENCE, **{name: getattr(CPU, name)})
+        tape = _draw(dtype, backend, with_depth, with_stats)
+        if name.endswith("_vjp"):
+            render_vjp(tape, np.ones_like(tape.splats.output.image))
+
+    return compile_stage
+
+
+def _surface_points(dtype: Dtype) -> None:
+    tape = _draw(dtype, _REFERENCE, False, with_stats=True)
+    primitives, stats = tape.splats.primitives, tape.splats.output.stats
+    assert stats is not None
+    CPU.surface_points(primitives.means, primitives.quats, primitives.scales, tape.splats.camera, stats.dominant_ids)
+
+
+def _photometric_loss(dtype: Dtype) -> None:
+    image = np.zeros((HEIGHT, WIDTH, 3), dtype)
+    CPU.photometric_loss_vjp(CPU.photometric_loss(image, image, 0.2)[1])
+
+
+def _geometric_loss(dtype: Dtype) -> None:
+    output = _draw(dtype, _REFERENCE, with_depth=True).splats.output
+    image, depth = np.ascontiguousarray(output.image[..., :3]), output.image[..., 3]
+    weights, points = GeometricWeights(1.0, 1.0, 1.0), np.ones((2, 3))
+    CPU.geometric_loss_vjp(CPU.geometric_loss(depth, output.alpha, image, _camera(), points, weights)[1])
+
+
+def _adam(dtype: Dtype) -> None:
+    tables = (np.zeros((N_GAUSSIANS, 3), dtype) for _ in range(4))
+    CPU.adam_update(*tables, np.arange(N_GAUSSIANS), 0.1, 0.9, 0.999, 1e-15)
+
+
+STAGES: dict[str, Callable[[Dtype], None]] = {
+    "blending, backward": _stage("composite_vjp"),
+    "photometric loss, both ways": _photometric_loss,
+    "colours, backward": _stage("sh_colors_vjp"),
+    "projection, backward": _stage("project_vjp"),
+    "blending": _stage("composite"),
+    "projection": _stage("project"),
+    "tile lists": _stage("bin_gaussians"),
+    "colours": _stage("sh_colors"),
+    "Adam": _adam,
+    # From here on not every training and no ordinary rendering.
+    "geometric loss, both ways": _geometric_loss,
+    "blending with depth, backward": _stage("composite_vjp", with_depth=True),
+    "blending with depth": _stage("composite", with_depth=True),
+    "blend statistics": _stage("composite", with_stats=True),
+    "surface points": _surface_points,
+}
+"""What is compiled together, by what it is called; the slow ones first, so that no process is left with one."""
+
+FIRST_ITERATION = tuple(STAGES)[:9]
+"""Those that the first iteration of every training needs."""
+
+
+def warm_up(
+    stages: Iterable[str] | None = None, dtype: Dtype = np.float32, n_processes: int | None = None
+) -> Iterator[Compiled]:
+    """Compile stages in processes of their own, and yield each when it is ready.
+
+    The main module of the program is imported by each of those processes: a script must call this under
+    ``if __name__ == "__main__"``.
+
+    Parameters
+    ----------
+    stages : iterable of str, optional
+        Keys of ``STAGES``; all by default.
+    dtype : type
+        ``numpy.float32``, or ``numpy.float64``.
+    n_processes : int, optional
+        One per processor by default; each takes some 300 MB.
+    """
+    names = tuple(STAGES if stages is None else stages)
+    n_processes = min(n_processes or os.cpu_count() or 1, len(names))
+    # Fresh interpreters: a fork of a process in which kernels have run could not run any.
+    pool = ProcessPoolExecutor(n_processes, get_context("spawn"), initializer=_prepare_process)
+    try:
+        futures = [pool.submit(_compile, name, dtype) for name in names]
+        for future in as_completed(futures):
+            yield future.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _prepare_process() -> None:
+    gc.disable()  # what the compiler makes is many small objects, of which few can go
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+
+
+def _compile(name: str, dtype: Dtype) -> Compiled:
+    start = time.perf_counter()
+    STAGES[name](dtype)
+    return Compiled(name, time.perf_counter() - start)
+
+
+def _in_kernel_types(function: Callable) -> Callable:
+    """Return a stage of the reference whose conics, or gradient by them, are float64 as those of the kernels."""
+
+    def stage(*args: Any) -> Any:
+        bundle = function(*args)
+        bundle = bundle._replace(conics=bundle.conics.astype(np.float64))
+        return bundle._make(map(np.ascontiguousarray, bundle))
+
+    return stage
+
+
+_REFERENCE: Backend = replace(
+    REFERENCE,
+    tile_width=CPU.tile_width,
+    tile_height=CPU.tile_height,
+    project=_in_kernel_types(REFERENCE.project),
+    composite_vjp=_in_kernel_types(REFERENCE.composite_vjp),
+)
+
+
+def _draw(dtype: Dtype, backend: Backend, with_depth: bool = False, with_stats: bool = False) -> RenderTape:
+    return render(_gaussians(dtype), _camera(), backend=backend, with_depth=with_depth, with_stats=with_stats)[1]
+
+
+def _camera() -> Camera:
+    return Camera(np.eye(3), np.zeros(3), 20.0, 20.0, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
+
+
+def _gaussians(dtype: Dtype) -> Gaussians:
+    """Return a few Gaussians, one behind the other in the middle of the view."""
+    n = N_GAUSSIANS
+
+    def full(value: float, *shape: int) -> Floats:
+        return np.full((n, *shape), value, dtype)
+
+    means = np.zeros((n, 3), dtype)
+    means[:, 2] = 2 + np.arange(n)
+    return Gaussians(means, full(0.5, 4), full(-2, 3), full(0), full(0.5, 3), full(0.1, (DEGREE + 1) ** 2 - 1, 3))
