@@ -23,9 +23,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from minisplat_ref.cpu.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, reached_rows, start_scratch, to_mean
 from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.cpu.records import COLOR, MEAN_X, MEAN_Y, SLOPE
+from minisplat_ref.cpu.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, reached_rows, start_scratch, to_mean
 from minisplat_ref.cpu.tile_state import (
     CHECK_EVERY,
     N_ROWS,
@@ -37,7 +37,7 @@ from minisplat_ref.cpu.tile_state import (
 from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
 from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.compositing import alpha_vjp, blend, conic_vjp_of_moments, factors
-from minisplat_ref.scalar.lanes import WIDTH, counted, load, select, store, sum_of, sums_of
+from minisplat_ref.scalar.lanes import WIDTH, filled, load, select, store, sum_of, sums_of
 from minisplat_ref.scalar.literals import ONE, ZERO
 
 N_MOMENTS = 6  # sums of q, q e, q dy, q e^2, q e dy, q dy^2
@@ -112,12 +112,12 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
 
     @scalar
     def v_channel(s, k, i):
-        return load(s, i + channels + k * WIDTH) if k < n_channels else ZERO * counted(s[0])
+        return load(s, i + channels + k * WIDTH) if k < n_channels else filled(s.dtype.type(0))
 
     @scalar
     def tile_vjp(s, scratch, row_ids, further, records, ids, slots_of, frame, x0, y0, slots):
         as_data = s.dtype.type
-        zero = ZERO * counted(s[0])
+        zero = filled(as_data(0))
         is_open = open_rows(s, n_fields)
         next_rows = reached_rows(records, ids, 0, x0, y0, scratch)
         for m in range(ids.size):
@@ -164,7 +164,7 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
                 qey = qey + shape_e * dy
                 qyy = qyy + q_shape * (dy * dy)
             store(slots, place, sums_of(q_sum, qe, qy, qee, qey, qyy, v_red, v_green))
-            slots[place + WIDTH] = sum_of(v_blue)
+            slots[place + N_MOMENTS + 2] = sum_of(v_blue)
             for k in range(N_FUSED, n_channels):
                 slots[place + N_MOMENTS + k] = sum_of(load(further, (k - N_FUSED) * WIDTH))
 

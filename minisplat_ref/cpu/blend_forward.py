@@ -1,4 +1,4 @@
-"""The forward kernel: all tiles, every tile's Gaussians front to back, eight pixels at a time, and the blend statistics.
+"""The forward kernel: all tiles, every tile's Gaussians front to back, eight pixels at a time; and blend statistics.
 
 The number of channels, the exponential and whether statistics are collected are compile-time constants: each
 combination is its own compiled kernel.
@@ -13,9 +13,9 @@ from collections.abc import Callable
 import numpy as np
 
 from minisplat_ref.constants import MEDIAN_TRANSMITTANCE
-from minisplat_ref.cpu.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, reached_rows, start_scratch
 from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.cpu.records import COLOR
+from minisplat_ref.cpu.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, reached_rows, start_scratch
 from minisplat_ref.cpu.tile_state import (
     CHECK_EVERY,
     N_ROWS,
@@ -27,7 +27,7 @@ from minisplat_ref.cpu.tile_state import (
 from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
 from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.compositing import blend
-from minisplat_ref.scalar.lanes import WIDTH, counted, larger, largest_of, load, select, store, sum_of
+from minisplat_ref.scalar.lanes import WIDTH, filled, larger, largest_of, load, select, store, sum_of
 from minisplat_ref.scalar.literals import ONE, ZERO
 
 MEDIAN = np.float32(MEDIAN_TRANSMITTANCE)  # one half: exact in float32
@@ -71,10 +71,10 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
     def record_hit(s, i, weight, place, depth):
         is_best = weight > load(s, i + best)
         store(s, i + best, select(is_best, weight, load(s, i + best)))
-        store(s, i + best_place, select(is_best, place + ZERO * weight, load(s, i + best_place)))
+        store(s, i + best_place, select(is_best, place, load(s, i + best_place)))
         after = abs(load(s, i))
         is_crossing = (after < MEDIAN) & (after + weight >= MEDIAN)
-        store(s, i + crossing, select(is_crossing, depth + ZERO * weight, load(s, i + crossing)))
+        store(s, i + crossing, select(is_crossing, depth, load(s, i + crossing)))
 
     @scalar
     def store_tile(state, x0, y0, background, frame, image, alpha):
@@ -98,7 +98,7 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
     @scalar
     def blend_tile(s, scratch, row_ids, records, depths, ids, slots_of, frame, x0, y0, slots):
         as_data = s.dtype.type
-        lane = counted(s[0])
+        zero = filled(as_data(0))
         is_open = open_rows(s, n_fields)
         next_rows = reached_rows(records, ids, 0, x0, y0, scratch)
         for m in range(ids.size):
@@ -110,22 +110,22 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
             next_rows = reached_rows(records, ids, m + 1, x0, y0, scratch)
             n = ids[m]
             n_rows = write_alphas(scratch, row_ids, reached, records, n, x0, y0)
-            total = largest = hits = ZERO * lane
+            total = largest = hits = zero
             for j in range(n_rows):
                 i = row_ids[j] * row_size
                 after, weight = blend(load(s, i), load(scratch, ALPHAS + j * WIDTH), frame)
                 store(s, i, after)
                 for k in range(n_channels):
-                    place_k = i + channels + k * WIDTH
-                    store(s, place_k, load(s, place_k) + weight * records[n, COLOR + k])
+                    field = i + channels + k * WIDTH
+                    store(s, field, load(s, field) + weight * records[n, COLOR + k])
                 if has_stats:
                     record_hit(s, i, weight, as_data(m + 1), depths[n])  # exact in float32 up to 16 million
                     total = total + weight
                     largest = larger(largest, weight)
-                    hits = hits + select(weight > ZERO, ONE + ZERO * weight, ZERO)
+                    hits = hits + select(weight > ZERO, filled(as_data(1)), ZERO)
             if has_stats:
-                slot = slots[slots_of[m]]
-                slot[0], slot[1], slot[2] = sum_of(total), largest_of(largest), sum_of(hits)
+                slot = slots_of[m]
+                slots[slot, 0], slots[slot, 1], slots[slot, 2] = sum_of(total), largest_of(largest), sum_of(hits)
 
     @kernel()
     def composite_tiles(

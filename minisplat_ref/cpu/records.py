@@ -10,7 +10,7 @@ from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.tiling import ELLIPSE_MARGIN
 from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.compositing import factors
-from minisplat_ref.scalar.literals import HALF
+from minisplat_ref.scalar.literals import HALF, ZERO
 from minisplat_ref.scalar.tiling import Outline, visible_ellipse
 from minisplat_ref.types import Floats, Projection
 
@@ -21,14 +21,20 @@ HALF_A_MAX = np.float32(1e30)  # without a low-pass a footprint can be thinner t
 
 
 @scalar
+def _half(factor):
+    """Half of a factor of a conic; one that is negative becomes so large that its negative squares are no hits."""
+    return min(HALF * factor, HALF_A_MAX) if factor >= ZERO else HALF_A_MAX
+
+
+@scalar
 def _write_record(n, projection, colors, alpha_min, records):
     a, slope, pivot = factors(projection.conics[n, 0], projection.conics[n, 1], projection.conics[n, 2])
     turned = factors(projection.conics[n, 2], projection.conics[n, 1], projection.conics[n, 0])
     outline = visible_ellipse(*turned, projection.opacities[n], alpha_min, ELLIPSE_MARGIN).outline
     records[n, MEAN_X], records[n, MEAN_Y] = projection.means2d[n, 0], projection.means2d[n, 1]
-    records[n, HALF_A] = min(HALF * a, HALF_A_MAX)
+    records[n, HALF_A] = _half(a)
     records[n, SLOPE] = slope
-    records[n, HALF_PIVOT] = min(HALF * pivot, HALF_A_MAX)
+    records[n, HALF_PIVOT] = _half(pivot)
     records[n, OPACITY] = projection.opacities[n]
     records[n, TURNED_SLOPE], records[n, TURNED_INVERSE_A] = outline.slope, outline.inverse_a
     records[n, TURNED_PIVOT], records[n, Q] = min(outline.pivot, HALF_A_MAX), outline.q
@@ -40,7 +46,7 @@ def _write_record(n, projection, colors, alpha_min, records):
 
 @scalar
 def turned_outline(records, n):
-    """Outline of the visible ellipse of a record with x and y exchanged: ``rightmost_offset`` gives its lowest point."""
+    """Outline of the visible ellipse with x and y exchanged: ``rightmost_offset`` then gives its lowest point."""
     return Outline(
         records[n, TURNED_SLOPE],
         records[n, TURNED_INVERSE_A],

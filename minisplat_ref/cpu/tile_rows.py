@@ -2,8 +2,8 @@
 
 The rows that the visible ellipse reaches are found strip by strip, so that a slanted ellipse is a staircase of rows
 rather than its box. Alpha is written down for all of them before any is blended: the exponential is a long chain of
-operations of which each waits for the one before. A processor hides the waiting behind other pixels, as far ahead as
-it can look, and it looks further if there is less to do for each. One loop for both took half as long again.
+operations of which each waits for the one before, and blending another. A processor hides the waiting behind other
+pixels, as far ahead as it can look, and it looks further ahead if there is less to do for each pixel.
 """
 
 from collections.abc import Callable
@@ -38,14 +38,13 @@ from minisplat_ref.scalar.lanes import (
     smaller,
     store,
 )
-from minisplat_ref.scalar.literals import FOUR, HALF, ONE, ZERO
+from minisplat_ref.scalar.literals import FOUR, HALF, ONE
 from minisplat_ref.scalar.tiling import rightmost_offset
 
 FETCH_AHEAD = 8  # Gaussians
 
-
-# Places in the scratch of a thread. It fits a page of memory: a load whose address differs from that of a store before it
-# by whole pages waits for the store.
+# Places in the scratch of a thread, which fits a page of memory: a load from an address that lies whole pages from
+# where something has just been stored waits for it.
 ALPHAS = 0  # of the rows that the current Gaussian reaches
 CENTRES_X = N_ROWS * WIDTH  # pixel centres of a row of each strip, counted from the tile's edge
 CENTRES_Y = CENTRES_X + N_STRIPS * WIDTH  # and of every row
@@ -83,17 +82,17 @@ def reached_rows(records, ids, m, x0, y0, scratch):
     as_data = records.dtype.type
     n = ids[m]
     mx, my = records[n, MEAN_X] - as_data(x0), records[n, MEAN_Y] - as_data(y0)
-    k = counted(mx)
+    k, zero = counted(mx), filled(as_data(0))
     is_up = k < FOUR
-    left = (k - select(is_up, ZERO * k, FOUR)) * as_data(WIDTH)  # edges of the strips
-    side = select(is_up, -ONE + ZERO * k, ONE)
+    left = (k - select(is_up, zero, FOUR)) * as_data(WIDTH)  # edges of the strips
+    side = select(is_up, filled(as_data(-1)), ONE)
     low = left + (HALF - mx)
     offset = rightmost_offset(turned_outline(records, n), low, low + as_data(WIDTH - 1), side)
     bound = floor(side * my + offset + (HALF + ELLIPSE_MARGIN))  # minus the first row, or the one after the last
-    bound = smaller(bound, select(is_up, ZERO * k, as_data(TILE_HEIGHT)))
+    bound = smaller(bound, select(is_up, zero, as_data(TILE_HEIGHT)))
     is_in_box = (left < records[n, COLUMN_END] - as_data(x0)) & (left > records[n, COLUMN_FIRST] - as_data(x0 + WIDTH))
     store(scratch, BOUNDS, select(is_in_box, larger(bound, as_data(-TILE_HEIGHT)), as_data(-TILE_HEIGHT)))
-    rows = np.uint64(0)
+    rows = np.uint64(0)  # without branches: which strips are reached cannot be foreseen, and a wrong guess is dear
     for strip in range(N_STRIPS):
         first, end = -np.int64(scratch[BOUNDS + strip]), np.int64(scratch[BOUNDS + N_STRIPS + strip])
         reached = (np.uint64(1) << np.uint64(max(first, end))) - (np.uint64(1) << np.uint64(first))
@@ -111,18 +110,14 @@ def alpha_writer(exp: Callable) -> Callable:
         half_a, slope, half_pivot, opacity = (
             records[n, HALF_A], records[n, SLOPE], records[n, HALF_PIVOT], records[n, OPACITY]
         )  # fmt: skip
-        j = np.uint64(0)
+        j = 0
         while reached != np.uint64(0):
-            row = lowest_bit(reached)
+            row_ids[j] = lowest_bit(reached)
             reached &= reached - np.uint64(1)
-            e, dy = to_mean(scratch, row, mx, my, slope)
-            store(
-                scratch,
-                np.uint64(ALPHAS) + j * np.uint64(WIDTH),
-                opacity * exp(-mahalanobis(e, dy, half_a, half_pivot)),
-            )
-            row_ids[j] = row
-            j += np.uint64(1)
+            e, dy = to_mean(scratch, row_ids[j], mx, my, slope)
+            alpha = opacity * exp(-mahalanobis(e, dy, half_a, half_pivot))
+            store(scratch, ALPHAS + j * WIDTH, alpha)
+            j += 1
         return j
 
     return write_alphas

@@ -16,12 +16,10 @@ kernels that call it. ``kernel`` compiles a parallel loop. Six facts shape this 
   kernels share one lock.
 * ``fastmath=True`` would let the compiler assume that no NaN exists and ``isnan`` return False. Kernels may only
   contract ``a * b + c`` to one rounding.
-* A sum over pixels is vectorised only if the compiler may change its order, but a kernel that may do so everywhere
-  gives other last digits when it is loaded from the cache than when it was just compiled (what is cached has been
-  optimised twice). The permission is therefore given addition by addition, with ``add_in_any_order``; the order is
-  fixed at compile time, and the bytes are the same at any number of threads. A maximum over pixels needs the promise
-  that none of them is NaN, which ``larger_number`` gives. Known and open: projection and the
-  gradients of colour and loss still differ in the last digit between just compiled and loaded from the cache.
+* What stands in the cache has been optimised twice, and a compiler that may change the order of a sum gives other last
+  digits the second time. Where eight numbers are computed at once, :mod:`minisplat_ref.scalar.lanes` says so and fixes
+  the order. Known and open: projection and the gradients of colour and loss still differ in the last digit between
+  just compiled and loaded from the cache.
 """
 
 import functools
@@ -38,14 +36,12 @@ import llvmlite
 import numba
 import numpy as np
 from numba import prange
-from numba.extending import intrinsic, overload, register_jitable
+from numba.extending import register_jitable
 
 __all__ = [
-    "add_in_any_order",
     "cache_folder",
     "cache_root",
     "kernel",
-    "larger_number",
     "n_threads",
     "prange",
     "scalar",
@@ -133,49 +129,6 @@ def _named_after_closure(function: Callable) -> Callable:
     if values:
         function.__qualname__ += "_" + hashlib.sha256("|".join(values).encode()).hexdigest()[:16]
     return function
-
-
-def add_in_any_order(a, b):
-    """Return ``a + b`` of two floats of one dtype, as a step of a sum whose order the compiler may choose."""
-    return a + b
-
-
-@intrinsic
-def _add_reassociable(context: Any, a: Any, b: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.fadd(*args, flags=["reassoc", "contract", "nsz"])
-
-    return a(a, b), generate
-
-
-@overload(add_in_any_order)
-def _overload_add_in_any_order(a, b):
-    def add(a, b):
-        return _add_reassociable(a, b)  # type: ignore[call-arg]  # the typing context is numba's to pass
-
-    return add
-
-
-def larger_number(a, b):
-    """Return the larger of two floats of one dtype that are not NaN, as a step of a maximum over many."""
-    return max(a, b)
-
-
-@intrinsic
-def _select_larger(context: Any, a: Any, b: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        flags = ["nnan", "nsz"]
-        return builder.select(builder.fcmp_ordered(">", *args, flags=flags), *args, flags=flags)
-
-    return a(a, b), generate
-
-
-@overload(larger_number)
-def _overload_larger_number(a, b):
-    def larger(a, b):
-        return _select_larger(a, b)  # type: ignore[call-arg]  # the typing context is numba's to pass
-
-    return larger
 
 
 def kernel(parallel: bool = True) -> Callable[[Callable], Callable]:

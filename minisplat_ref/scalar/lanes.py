@@ -7,6 +7,7 @@ nothing is left over after it, and every sum has the order that is written. In p
 
 A single number that meets lanes is taken eight times. It may be narrower than they are but not wider: a float64 that
 meets float32 lanes by mistake does not compile. Where the lanes differ in what they should do, ``select`` chooses.
+Lanes are values: ``x += y`` would change every name of the same array in Python, and does not compile.
 """
 
 import math
@@ -21,9 +22,26 @@ from numba.core import cgutils
 from numba.extending import intrinsic, models, overload, register_model
 
 __all__ = [
-    "WIDTH", "any_of", "counted", "exp_of", "filled", "floor", "larger", "largest_of", "load", "nearest", "scaled_by_power", "select",
-    "smaller", "sqrt", "store", "sum_of", "sums_of",
-]  # fmt: skip
+    "WIDTH",
+    "any_of",
+    "counted",
+    "exp_of",
+    "filled",
+    "floor",
+    "larger",
+    "largest_of",
+    "load",
+    "lowest_bit",
+    "nearest",
+    "prefetch",
+    "scaled_by_power",
+    "select",
+    "smaller",
+    "sqrt",
+    "store",
+    "sum_of",
+    "sums_of",
+]
 
 WIDTH = 8
 _I32 = ir.IntType(32)
@@ -332,6 +350,8 @@ def _overload_store(array, i, lanes):
 @intrinsic
 def _store(typing: Any, array: Any, i: Any, lanes: Any) -> Any:
     kind = _Lanes(array.dtype)
+    if _joined(kind, lanes) is None:
+        return None
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         value = _spread(context, builder, args[2], lanes, kind)
@@ -415,9 +435,7 @@ def _prefetch(typing: Any, table: Any, row: Any) -> Any:
         array = context.make_array(table)(context, builder, args[0])
         address = builder.add(
             builder.ptrtoint(array.data, ir.IntType(64)),
-            builder.mul(
-                context.cast(builder, args[1], row, types.int64), builder.extract_value(array.strides, 0)
-            ),
+            builder.mul(context.cast(builder, args[1], row, types.int64), builder.extract_value(array.strides, 0)),
         )
         byte = ir.IntType(8).as_pointer()
         kind = ir.FunctionType(ir.VoidType(), [byte, _I32, _I32, _I32])

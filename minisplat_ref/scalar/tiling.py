@@ -56,7 +56,8 @@ def visible_ellipse(a, slope, pivot, opacity, alpha_min, margin):
 def rightmost_offset(outline, low, high, side):
     """Return the largest dx (side 1) or the largest -dx (side -1) of the ellipse with low <= dy <= high.
 
-    Numbers or lanes. The band has to meet the ellipse. The left side is the right side of the ellipse turned by half a circle.
+    Of numbers or lanes. The band has to meet the ellipse. The left side is the right side of the ellipse turned by half
+    a circle.
     """
     dy = smaller(larger(side * outline.tilt, low), high)
     root = sqrt(larger(outline.q - outline.pivot * dy * dy, ZERO) * outline.inverse_a)

@@ -1,9 +1,9 @@
 """How far the processor would let it go: the blending kernels against straight-line loops.
 
-The straight-line loops do the arithmetic of one hit, 128 pixels at a time as in a tile, over and over on the same
-numbers: no lists, no sorting, nothing fetched from memory. A kernel that took no longer per pair would be perfect. One
-thread; the kernels' times are multiplied by their threads. A *listed* pair is a pixel of a tile's rows that the visible
-ellipse of a Gaussian of its list reaches; those that a finished tile leaves out are counted too.
+The straight-line loops do the arithmetic of one hit on all pixels of a tile, over and over on the same numbers: no
+lists, no sorting, nothing fetched from memory, nothing to find out. A kernel that took no longer per pair would be
+perfect. One thread; the kernels' times are multiplied by their threads. A *pair* is a Gaussian and a pixel in one of
+the rows of eight that a kernel computes for it: those that the visible ellipse reaches and that are not finished.
 """
 
 from typing import NamedTuple
@@ -13,22 +13,27 @@ import numpy as np
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.cpu.exponential import exp_fast
-from minisplat_ref.cpu.records import ROW_END, ROW_FIRST, records_of
-from minisplat_ref.cpu.tile_state import BEHIND, CHANNELS, PIXELS, T, X, Y, frame_of, start_tile
+from minisplat_ref.cpu.records import records_of
+from minisplat_ref.cpu.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, reached_rows, start_scratch, to_mean
+from minisplat_ref.cpu.tile_state import CHECK_EVERY, N_ROWS, corner, frame_of, open_rows, start_tile
 from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
 from minisplat_ref.oracle.bench.limits import least_seconds
 from minisplat_ref.oracle.bench.workloads import Workload
 from minisplat_ref.oracle.cases import Case, Figure
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_GRADIENT, BENCH_FLOAT32_IMAGE
 from minisplat_ref.render import render
-from minisplat_ref.scalar._jit import add_in_any_order, kernel, n_threads
+from minisplat_ref.scalar._jit import kernel, n_threads
 from minisplat_ref.scalar.compositing import alpha_vjp, blend, conic_vjp_of_moments, factors, mahalanobis
+from minisplat_ref.scalar.lanes import WIDTH, filled, load, select, store, sum_of
 from minisplat_ref.scalar.literals import ZERO
-from minisplat_ref.types import CompositeGradient, Gaussians, Projection, TileGrid
+from minisplat_ref.types import CompositeGradient, Floats, Gaussians, Projection, TileGrid
 
 N_HITS = 100  # of opacity 0.005: transmittance 0.6 is left, so that none of them stops
-N_PASSES = 200
+N_PASSES = 50
 N_SUMS = 9
+N_COLORS = 3
+DRAWN_FIELDS = 1 + N_COLORS  # of a pixel: transmittance, colours
+SHADED_FIELDS = 2 + N_COLORS  # transmittance, what lies behind, v
 
 
 class Hit(NamedTuple):
@@ -46,55 +51,89 @@ class Hit(NamedTuple):
 
 
 @kernel(parallel=False)
-def _forward_line(state, n_pixels, hit, frame, n_hits, n_passes):  # type: ignore[no-untyped-def]
+def _forward_line(state, scratch, hit, frame, n_hits, n_passes):  # type: ignore[no-untyped-def]
     for _ in range(n_passes):
-        start_tile(state, 0, frame)
-        state[CHANNELS:] = ZERO
+        start_tile(state, 0, 0, frame, DRAWN_FIELDS)
         for _ in range(n_hits):
-            for i in range(n_pixels):
-                dy = hit.y - state[Y + i]
-                sigma = mahalanobis(hit.x - state[X + i] + hit.slope * dy, dy, hit.half_a, hit.half_pivot)
-                state[T + i], weight = blend(state[T + i], sigma, hit.opacity * exp_fast(-sigma), frame)
-                state[CHANNELS + i] += weight * hit.red
-                state[CHANNELS + PIXELS + i] += weight * hit.green
-                state[CHANNELS + 2 * PIXELS + i] += weight * hit.blue
+            for row in range(N_ROWS):
+                e, dy = to_mean(scratch, row, hit.x, hit.y, hit.slope)
+                alpha = hit.opacity * exp_fast(-mahalanobis(e, dy, hit.half_a, hit.half_pivot))
+                store(scratch, ALPHAS + row * WIDTH, alpha)
+            for row in range(N_ROWS):
+                i = row * DRAWN_FIELDS * WIDTH
+                after, weight = blend(load(state, i), load(scratch, ALPHAS + row * WIDTH), frame)
+                store(state, i, after)
+                store(state, i + WIDTH, load(state, i + WIDTH) + weight * hit.red)
+                store(state, i + 2 * WIDTH, load(state, i + 2 * WIDTH) + weight * hit.green)
+                store(state, i + 3 * WIDTH, load(state, i + 3 * WIDTH) + weight * hit.blue)
 
 
 @kernel(parallel=False)
-def _backward_line(state, n_pixels, hit, frame, behind, sums, n_hits, n_passes):  # type: ignore[no-untyped-def]
+def _backward_line(state, fresh, scratch, hit, frame, sums, n_hits, n_passes):  # type: ignore[no-untyped-def]
+    zero = filled(ZERO * hit.x)
     for _ in range(n_passes):
-        start_tile(state, 0, frame)
-        state[BEHIND : BEHIND + PIXELS] = behind
+        state[:] = fresh
         sums[:] = ZERO
         for _ in range(n_hits):
-            q_sum = qe = qy = qee = qey = qyy = v_red = v_green = v_blue = ZERO * hit.half_a
-            for i in range(n_pixels):
-                dy = hit.y - state[Y + i]
-                e = hit.x - state[X + i] + hit.slope * dy
-                sigma = mahalanobis(e, dy, hit.half_a, hit.half_pivot)
-                unclamped = hit.opacity * exp_fast(-sigma)
-                transmittance = state[T + i]
-                state[T + i], weight = blend(transmittance, sigma, unclamped, frame)
-                v_0 = state[CHANNELS + i]
-                v_1 = state[CHANNELS + PIXELS + i]
-                v_2 = state[CHANNELS + 2 * PIXELS + i]
+            for row in range(N_ROWS):
+                e, dy = to_mean(scratch, row, hit.x, hit.y, hit.slope)
+                alpha = hit.opacity * exp_fast(-mahalanobis(e, dy, hit.half_a, hit.half_pivot))
+                store(scratch, ALPHAS + row * WIDTH, alpha)
+            q_sum = qe = qy = qee = qey = qyy = v_red = v_green = v_blue = zero
+            for row in range(N_ROWS):
+                i = row * SHADED_FIELDS * WIDTH
+                e, dy = to_mean(scratch, row, hit.x, hit.y, hit.slope)
+                unclamped = load(scratch, ALPHAS + row * WIDTH)
+                transmittance = load(state, i)
+                after, weight = blend(transmittance, unclamped, frame)
+                store(state, i, after)
+                v_0, v_1, v_2 = load(state, i + 2 * WIDTH), load(state, i + 3 * WIDTH), load(state, i + 4 * WIDTH)
+                v_red = v_red + weight * v_0
+                v_green = v_green + weight * v_1
+                v_blue = v_blue + weight * v_2
                 shade = v_0 * hit.red + v_1 * hit.green + v_2 * hit.blue
-                state[BEHIND + i] -= weight * shade
-                q = -unclamped * alpha_vjp(transmittance, weight, unclamped, state[BEHIND + i], shade, frame)
-                q_mean = q if unclamped <= frame.mean_gradient_max else ZERO
-                q_shape = q if unclamped <= frame.shape_gradient_max else ZERO
-                q_sum = add_in_any_order(q_sum, q_shape)  # type: ignore[no-untyped-call]
-                qe = add_in_any_order(qe, q_mean * e)  # type: ignore[no-untyped-call]
-                qy = add_in_any_order(qy, q_mean * dy)  # type: ignore[no-untyped-call]
-                qee = add_in_any_order(qee, q_shape * e * e)  # type: ignore[no-untyped-call]
-                qey = add_in_any_order(qey, q_shape * e * dy)  # type: ignore[no-untyped-call]
-                qyy = add_in_any_order(qyy, q_shape * dy * dy)  # type: ignore[no-untyped-call]
-                v_red = add_in_any_order(v_red, weight * v_0)  # type: ignore[no-untyped-call]
-                v_green = add_in_any_order(v_green, weight * v_1)  # type: ignore[no-untyped-call]
-                v_blue = add_in_any_order(v_blue, weight * v_2)  # type: ignore[no-untyped-call]
+                behind = load(state, i + WIDTH) - weight * shade
+                store(state, i + WIDTH, behind)
+                q = -unclamped * alpha_vjp(transmittance, weight, unclamped, behind, shade, frame)
+                q_mean = select(unclamped <= frame.mean_gradient_max, q, ZERO)
+                q_shape = select(unclamped <= frame.shape_gradient_max, q, ZERO)
+                q_sum = q_sum + q_shape
+                qe = qe + q_mean * e
+                qy = qy + q_mean * dy
+                qee = qee + q_shape * e * e
+                qey = qey + q_shape * e * dy
+                qyy = qyy + q_shape * dy * dy
             parts = (q_sum, qe, qy, qee, qey, qyy, v_red, v_green, v_blue)
             for j in range(N_SUMS):
-                sums[j] += parts[j]
+                sums[j] += sum_of(parts[j])
+
+
+_write_alphas = alpha_writer(exp_fast)
+
+
+@kernel(parallel=False)
+def _rows_worked_on(records, ids, tile_offsets, frame):  # type: ignore[no-untyped-def]
+    """Rows of eight pixels that blending computes: the kernels' steps with nothing but the transmittance."""
+    state, scratch = np.empty(N_ROWS * WIDTH, records.dtype), np.empty(SCRATCH_SIZE, records.dtype)
+    row_ids = np.empty(N_ROWS, np.int32)
+    start_scratch(scratch)
+    total = 0
+    for tile in range(tile_offsets.size - 1):
+        x0, y0 = corner(tile, frame)
+        tile_ids = ids[tile_offsets[tile] : tile_offsets[tile + 1]]
+        start_tile(state, x0, y0, frame, 1)
+        is_open = open_rows(state, 1)
+        for m in range(tile_ids.size):
+            if m % CHECK_EVERY == CHECK_EVERY - 1:
+                is_open = open_rows(state, 1)
+            reached = reached_rows(records, tile_ids, m, x0, y0, scratch) & is_open
+            n_rows = _write_alphas(scratch, row_ids, reached, records, tile_ids[m], x0, y0)
+            total += n_rows
+            for j in range(n_rows):
+                i = row_ids[j] * WIDTH
+                after, _ = blend(load(state, i), load(scratch, ALPHAS + j * WIDTH), frame)
+                store(state, i, after)
+    return total
 
 
 def blending_cases(workload: Workload, repeats: int) -> list[Case]:
@@ -121,10 +160,9 @@ def blending_cases(workload: Workload, repeats: int) -> list[Case]:
         repeats,
     )
     records = records_of(splats.projection, splats.channels, GSPLAT_MAIN)
-    tile_tops = np.repeat(np.arange(len(splats.bins.tile_offsets) - 1), np.diff(splats.bins.tile_offsets))
-    tile_tops = tile_tops // splats.bins.grid.n_tiles_x * TILE_HEIGHT
-    rows = records[splats.bins.gaussian_ids][:, [ROW_FIRST, ROW_END]].astype(np.int64) - tile_tops[:, None]
-    n_listed = TILE_WIDTH * int(np.clip(rows, 0, TILE_HEIGHT) @ [-1, 1] @ np.ones(len(rows), np.int64))
+    bins = splats.bins
+    frame = frame_of(bins, GSPLAT_MAIN, records.dtype)
+    n_pairs = WIDTH * int(_rows_worked_on(records, bins.gaussian_ids, bins.tile_offsets, frame))
     assert output.stats is not None
     n_hits = int(output.stats.hit_count.sum())
     cases = []
@@ -132,12 +170,13 @@ def blending_cases(workload: Workload, repeats: int) -> list[Case]:
         ("forward", least[0], least[1], loops.image_error(), BENCH_FLOAT32_IMAGE),
         ("backward", least[2], least[3], loops.gradient_error(), BENCH_FLOAT32_GRADIENT),
     ):
-        pair, roof = 1e9 * seconds * n_threads() / n_listed, 1e9 * line / (N_HITS * N_PASSES * PIXELS)
+        pair, roof = 1e9 * seconds * n_threads() / n_pairs, 1e9 * line / (N_HITS * N_PASSES * N_ROWS * WIDTH)
         figures: dict[str, Figure] = {
             "ms": 1e3 * seconds,
             "million hits": n_hits / 1e6,
-            "million hits/s": n_hits / seconds / 1e6,
-            "ns a listed pair and core": pair,
+            "million pairs": n_pairs / 1e6,
+            "million pairs/s": n_pairs / seconds / 1e6,
+            "ns a pair and core": pair,
             "straight line ns": roof,
             "x straight line": pair / roof,
         }
@@ -169,24 +208,28 @@ class StraightLines:
         self.frame = frame_of(self.bins, GSPLAT_MAIN, np.dtype(f32))
         self.expected = REFERENCE.composite(self.projection, self.colors, self.background, self.bins, GSPLAT_MAIN)
         self.v_image = np.random.default_rng(2).normal(size=self.expected.image.shape).astype(f32)
-        self.drawn = np.zeros(CHANNELS + 3 * PIXELS, f32)
-        self.differentiated = np.zeros_like(self.drawn)
-        self.differentiated[CHANNELS:] = np.moveaxis(self.v_image, 2, 0).ravel()
-        self.behind = (self.v_image * self.expected.image).sum(axis=2, dtype=np.float64).astype(f32).ravel()
+        self.scratch = np.zeros(SCRATCH_SIZE, f32)
+        start_scratch(self.scratch)
+        self.drawn = np.zeros((N_ROWS, DRAWN_FIELDS, WIDTH), f32)
+        self.fresh = np.zeros((N_ROWS, SHADED_FIELDS, WIDTH), f32)
+        self.fresh[:, 0] = 1
+        self.fresh[:, 1] = _by_rows((self.v_image * self.expected.image).sum(axis=2, keepdims=True))[:, 0]
+        self.fresh[:, 2:] = _by_rows(self.v_image)
+        self.shaded = np.zeros_like(self.fresh)
         self.sums = np.zeros(N_SUMS, np.float64)
 
     def forward(self) -> None:
         """Draw the tile, many times."""
-        _forward_line(self.drawn, PIXELS, self.hit, self.frame, N_HITS, N_PASSES)
+        _forward_line(self.drawn.ravel(), self.scratch, self.hit, self.frame, N_HITS, N_PASSES)
 
     def backward(self) -> None:
         """Differentiate it, many times."""
-        _backward_line(self.differentiated, PIXELS, self.hit, self.frame, self.behind, self.sums, N_HITS, N_PASSES)
+        state, fresh = self.shaded.ravel(), self.fresh.ravel()
+        _backward_line(state, fresh, self.scratch, self.hit, self.frame, self.sums, N_HITS, N_PASSES)
 
     def image_error(self) -> float:
         """Return the largest error of what was drawn."""
-        image = np.moveaxis(self.drawn[CHANNELS:].reshape(3, TILE_HEIGHT, TILE_WIDTH), 0, 2)
-        return float(np.abs(image - self.expected.image).max())
+        return float(np.abs(self.drawn[:, 1:] - _by_rows(self.expected.image)).max())
 
     def gradient_error(self) -> float:
         """Return the largest relative L2 error of a gradient, summed over the equal hits."""
@@ -205,3 +248,9 @@ class StraightLines:
         expected = [np.sum(part.reshape(N_HITS, -1), axis=0) for part in v[:4]]
         pairs = zip(found, expected, strict=True)
         return max(float(np.linalg.norm(a - b) / np.linalg.norm(b)) for a, b in pairs)
+
+
+def _by_rows(image: Floats) -> Floats:
+    """Image [TILE_HEIGHT, TILE_WIDTH, D] of one tile as its rows of eight pixels [N_ROWS, D, WIDTH]."""
+    strips = image.reshape(TILE_HEIGHT, -1, WIDTH, image.shape[2])
+    return np.ascontiguousarray(strips.transpose(1, 0, 3, 2).reshape(N_ROWS, image.shape[2], WIDTH))

@@ -1,0 +1,198 @@
+"""Lanes compute, lane by lane, what single numbers do, compiled as in plain Python."""
+
+import numba
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from minisplat_ref.cpu.exponential import exp_exact, exp_fast
+from minisplat_ref.scalar import lanes
+from minisplat_ref.scalar.lanes import (
+    WIDTH,
+    any_of,
+    counted,
+    filled,
+    floor,
+    larger,
+    largest_of,
+    load,
+    lowest_bit,
+    nearest,
+    prefetch,
+    scaled_by_power,
+    select,
+    smaller,
+    sqrt,
+    store,
+    sum_of,
+    sums_of,
+)
+
+DTYPES = [np.float32, np.float64]
+
+
+def compiled(function):
+    return numba.njit(error_model="numpy")(function)
+
+
+def two_ways(function, *args):
+    """Result of a function that writes to its last argument, compiled and in Python."""
+    *inputs, out = args
+    results = []
+    for run in (compiled(function), function):
+        result = out.copy()
+        run(*inputs, result)
+        results.append(result)
+    return results
+
+
+OPERATIONS = {
+    "add": lambda a, b: a + b,
+    "subtract": lambda a, b: a - b,
+    "multiply": lambda a, b: a * b,
+    "divide": lambda a, b: a / b,
+    "negative": lambda a, b: -a,
+    "absolute": lambda a, b: abs(a),
+    "larger": lambda a, b: larger(a, b),
+    "smaller": lambda a, b: smaller(a, b),
+    "floor": lambda a, b: floor(a),
+    "nearest": lambda a, b: nearest(a),
+    "root": lambda a, b: sqrt(abs(a)),
+    "select": lambda a, b: select((a < b) & (a > -b), a, b),
+    "select at equality": lambda a, b: select(a >= a, select(b <= b, a, b), b),
+    "whole number": lambda a, b: 2 * a - b / 4,
+    "number among lanes": lambda a, b: select(a < b, a, 1),
+}
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("operation", OPERATIONS.values(), ids=OPERATIONS)
+def test_operation(operation, dtype, rng):
+    operation = numba.extending.register_jitable(operation)
+
+    def run(a, b, out):
+        for i in range(0, a.size, WIDTH):
+            store(out, i, operation(load(a, i), load(b, i)))
+
+    a, b = (rng.normal(scale=3, size=4 * WIDTH).astype(dtype) for _ in range(2))
+    fast, plain = two_ways(run, a, b, np.zeros_like(a))
+    single = np.array([operation(x, y) for x, y in zip(a, b, strict=True)], dtype)
+    assert fast.any() and len(set(fast)) > WIDTH
+    assert_array_equal(fast, plain)
+    assert_array_equal(fast, single)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_single_number_is_taken_eight_times(dtype, rng):
+    def run(a, number, out):
+        store(out, 0, number - load(a, 0))
+        store(out, WIDTH, filled(a[0]))
+        store(out, 2 * WIDTH, counted(a[0]))
+        store(out, 3 * WIDTH, number)
+
+    a, number = rng.normal(size=WIDTH).astype(dtype), np.float32(0.75)
+    fast, plain = two_ways(run, a, number, np.zeros(4 * WIDTH, dtype))
+    assert_array_equal(fast, plain)
+    assert_array_equal(fast, np.concatenate([number - a, a[:1].repeat(8), np.arange(8), [number] * 8]))
+
+
+def test_wider_number_does_not_meet_narrower_lanes():
+    product = compiled(lambda a, number: sum_of(load(a, 0) * number))
+    with pytest.raises(numba.TypingError):
+        product(np.ones(WIDTH, np.float32), 0.5)
+    assert product(np.ones(WIDTH), np.float32(0.5)) == 4
+
+
+def test_lanes_are_not_changed_in_place():
+    """In Python ``+=`` would change every name of the same array."""
+
+    @compiled
+    def add(a):
+        total = load(a, 0)
+        total += load(a, 0)
+        return sum_of(total)
+
+    with pytest.raises(numba.TypingError):
+        add(np.ones(WIDTH))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_reductions_have_one_order(dtype, rng):
+    def run(a, out):
+        first = load(a, 0), load(a, WIDTH), load(a, 2 * WIDTH), load(a, 3 * WIDTH)
+        last = load(a, 4 * WIDTH), load(a, 5 * WIDTH), load(a, 6 * WIDTH), load(a, 7 * WIDTH)
+        store(out, 0, sums_of(*first, *last))
+        for i in range(8):
+            out[WIDTH + i] = sum_of(load(a, i * WIDTH))
+            out[2 * WIDTH + i] = largest_of(load(a, i * WIDTH))
+
+    a = rng.normal(size=8 * WIDTH).astype(dtype)
+    fast, plain = two_ways(run, a, np.zeros(3 * WIDTH, dtype))
+    assert_array_equal(fast, plain)
+    assert_array_equal(fast[:8], fast[8:16])
+    assert_array_equal(fast[16:], a.reshape(8, WIDTH).max(axis=1))
+    halves = a.reshape(8, 2, 4)
+    quarters = (halves[:, 0] + halves[:, 1]).reshape(8, 2, 2)
+    assert_array_equal(fast[:8], (quarters[:, 0] + quarters[:, 1]).sum(axis=1))
+
+
+@pytest.mark.parametrize("lane", range(WIDTH))
+def test_any_sees_every_lane(lane):
+    a = np.zeros(WIDTH, np.float32)
+    found = compiled(lambda a: any_of(load(a, 0) > np.float32(0.5)))
+    assert not found(a) and not any_of(a > 0.5)
+    a[lane] = 1
+    assert found(a) and any_of(a > 0.5)
+
+
+def test_power_of_two_is_added_to_the_exponent(rng):
+    def run(a, n, out):
+        store(out, 0, scaled_by_power(load(a, 0), load(n, 0)))
+
+    a, n = rng.uniform(0.7, 1.4, WIDTH).astype(np.float32), rng.integers(-60, 1, WIDTH).astype(np.float32)
+    fast, plain = two_ways(run, a, n, np.zeros_like(a))
+    assert_array_equal(fast, plain)
+    assert_array_equal(fast, a * np.exp2(n))
+
+
+@pytest.mark.parametrize("bits", [1, 2, 0b1010000, 1 << 63, (1 << 64) - 1])
+def test_lowest_bit(bits):
+    expected = next(k for k in range(64) if bits >> k & 1)
+    assert lowest_bit(np.uint64(bits)) == expected
+    assert compiled(lambda bits: lowest_bit(bits))(np.uint64(bits)) == expected
+
+
+def test_prefetch_changes_nothing():
+    table = np.arange(40.0).reshape(5, 8)
+    expected = table.copy()
+    compiled(lambda table: prefetch(table, 4))(table)
+    prefetch(table, 4)
+    assert_array_equal(table, expected)
+
+
+def test_exponentials():
+    def run(exp):
+        exp = numba.extending.register_jitable(exp)
+
+        @compiled
+        def all_of(x, out):
+            for i in range(0, x.size, WIDTH):
+                store(out, i, exp(load(x, i)))
+
+        return all_of
+
+    x = -np.linspace(0, 6, 8000, dtype=np.float32)
+    expected = np.exp(x.astype(np.float64))
+    for exp, bound in ((exp_fast, 6e-7), (exp_exact, 1e-7)):  # of the docstring; half a unit in the last place is 6e-8
+        out = np.zeros_like(x)
+        run(exp)(x, out)
+        assert np.abs(out / expected - 1).max() < bound
+        assert np.abs(exp(x) / expected - 1).max() < 2 * bound  # in Python: NumPy's own exp is off by two units
+    far = np.full(WIDTH, -1e30, np.float32)
+    out = far.copy()
+    run(exp_fast)(far, out)
+    assert_array_equal(out, np.float32(2.0**-60))
+
+
+def test_all_names_are_there():
+    assert all(hasattr(lanes, name) for name in lanes.__all__)
