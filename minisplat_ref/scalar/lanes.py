@@ -15,11 +15,12 @@ import operator
 from collections.abc import Callable
 from typing import Any
 
+import numba.extending
 import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic, models, overload, register_model
+from numba.extending import models, overload, register_model
 
 __all__ = [
     "WIDTH",
@@ -44,6 +45,7 @@ __all__ = [
 ]
 
 WIDTH = 8
+intrinsic: Any = numba.extending.intrinsic  # its functions are called without their first argument
 _I32 = ir.IntType(32)
 
 
@@ -89,7 +91,7 @@ def _spread(context: Any, builder: Any, value: Any, kind: types.Type, lanes: _La
 
 
 def _operands(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
-    lanes = _joined(*signature.args)
+    lanes: Any = _joined(*signature.args)
     return [_spread(context, builder, *pair, lanes) for pair in zip(args, signature.args, strict=True)]
 
 
@@ -163,32 +165,32 @@ for _sign, _operator in {">": operator.gt, ">=": operator.ge, "<": operator.lt, 
 # --- functions; each has its meaning in Python first ---
 
 
-def larger(a, b):
+def larger(a: Any, b: Any) -> Any:
     """Return the larger of two, lane by lane; ``a`` where one is NaN."""
     return np.where(b > a, b, a)[()]
 
 
-def smaller(a, b):
+def smaller(a: Any, b: Any) -> Any:
     """Return the smaller of two, lane by lane; ``a`` where one is NaN."""
     return np.where(b < a, b, a)[()]
 
 
-def floor(a):
+def floor(a: Any) -> Any:
     """Return the next integer below."""
     return np.floor(a)
 
 
-def nearest(a):
+def nearest(a: Any) -> Any:
     """Return the nearest integer, as a float."""
     return np.rint(a)
 
 
-def sqrt(a):
+def sqrt(a: Any) -> Any:
     """Return the square root."""
     return np.sqrt(a)
 
 
-def exp_of(a):
+def exp_of(a: Any) -> Any:
     """Return libm's exp of every lane."""
     return np.exp(a)
 
@@ -209,14 +211,14 @@ _register_unary(sqrt, lambda builder, a: _call(builder, "llvm.sqrt", a.type, [a]
 _register_unary(exp_of, lambda builder, a: _call(builder, "llvm.exp", a.type, [a]))
 
 
-def scaled_by_power(a, n):
+def scaled_by_power(a: Any, n: Any) -> Any:
     """Return ``a 2^n`` of float32 lanes, for integers n that keep it a normal number: n is added to the exponent."""
     return np.ldexp(a, np.asarray(n, np.int32))
 
 
 @overload(scaled_by_power)
 def _overload_scaled_by_power(a, n):
-    return lambda a, n: _scaled_by_power(a, n)  # type: ignore[call-arg]  # the typing context is numba's to pass
+    return lambda a, n: _scaled_by_power(a, n)
 
 
 @intrinsic
@@ -229,7 +231,7 @@ def _scaled_by_power(typing: Any, a: Any, n: Any) -> Any:
     return a(a, n), generate
 
 
-def select(condition, a, b):
+def select(condition: Any, a: Any, b: Any) -> Any:
     """Return ``a`` in the lanes where the condition holds and ``b`` in the others."""
     return np.where(condition, a, b)[()]
 
@@ -237,71 +239,71 @@ def select(condition, a, b):
 @overload(select)
 def _overload_select(condition, a, b):
     if isinstance(condition, _Lanes):
-        return lambda condition, a, b: _select(condition, a, b)  # type: ignore[call-arg]
+        return lambda condition, a, b: _select(condition, a, b)
     return lambda condition, a, b: a if condition else b
 
 
 @intrinsic
 def _select(typing: Any, condition: Any, a: Any, b: Any) -> Any:
-    lanes = _joined(a, b)
+    lanes: Any = _joined(a, b)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         pair = zip(args[1:], signature.args[1:], strict=True)
         return builder.select(args[0], *(_spread(context, builder, *one, lanes) for one in pair))
 
-    return lanes(condition, a, b), generate  # type: ignore[misc]
+    return lanes(condition, a, b), generate
 
 
 # --- from and to single numbers ---
 
 
-def filled(number):
+def filled(number: Any) -> Any:
     """Return lanes that all hold a number."""
     return np.full(WIDTH, number)
 
 
-def counted(zero):
+def counted(zero: Any) -> Any:
     """Return lanes 0, 1, ... 7 of the dtype of a number."""
     return np.arange(WIDTH).astype(zero.dtype)
 
 
-def load(array, i):
+def load(array: Any, i: Any) -> Any:
     """Return the eight numbers of a 1-d array from ``i`` on."""
     return array[i : i + WIDTH].copy()
 
 
-def store(array, i, lanes):
+def store(array: Any, i: Any, lanes: Any) -> None:
     """Write lanes to a 1-d array from ``i`` on."""
     array[i : i + WIDTH] = lanes
 
 
-def sum_of(lanes):
+def sum_of(lanes: Any) -> Any:
     """Return the sum of the lanes: of halves, then of quarters, then of the last two."""
     while len(lanes) > 1:
         lanes = lanes[: len(lanes) // 2] + lanes[len(lanes) // 2 :]
     return lanes[0]
 
 
-def sums_of(a, b, c, d, e, f, g, h):
+def sums_of(a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
     """Return the sums of eight lanes as lanes: what eight times ``sum_of`` gives, for half of the instructions."""
     return np.array([sum_of(lanes) for lanes in (a, b, c, d, e, f, g, h)])
 
 
-def largest_of(lanes):
+def largest_of(lanes: Any) -> Any:
     """Return the largest lane."""
     while len(lanes) > 1:
         lanes = larger(lanes[: len(lanes) // 2], lanes[len(lanes) // 2 :])
     return lanes[0]
 
 
-def any_of(condition):
+def any_of(condition: Any) -> bool:
     """Whether a condition holds in any lane."""
     return bool(np.any(condition))
 
 
 @overload(filled)
 def _overload_filled(number):
-    return lambda number: _filled(number)  # type: ignore[call-arg]
+    return lambda number: _filled(number)
 
 
 @intrinsic
@@ -312,7 +314,7 @@ def _filled(typing: Any, number: Any) -> Any:
 
 @overload(counted)
 def _overload_counted(zero):
-    return lambda zero: _counted(zero)  # type: ignore[call-arg]
+    return lambda zero: _counted(zero)
 
 
 @intrinsic
@@ -331,7 +333,7 @@ def _pointer(context: Any, builder: Any, signature: Any, args: Any) -> Any:
 
 @overload(load)
 def _overload_load(array, i):
-    return lambda array, i: _load(array, i)  # type: ignore[call-arg]
+    return lambda array, i: _load(array, i)
 
 
 @intrinsic
@@ -344,7 +346,7 @@ def _load(typing: Any, array: Any, i: Any) -> Any:
 
 @overload(store)
 def _overload_store(array, i, lanes):
-    return lambda array, i, lanes: _store(array, i, lanes)  # type: ignore[call-arg]
+    return lambda array, i, lanes: _store(array, i, lanes)
 
 
 @intrinsic
@@ -384,7 +386,7 @@ def _register_reduction(function: Callable, emit: Callable) -> None:
 
 @overload(sums_of)
 def _overload_sums_of(a, b, c, d, e, f, g, h):
-    return lambda a, b, c, d, e, f, g, h: _sums_of(a, b, c, d, e, f, g, h)  # type: ignore[call-arg]
+    return lambda a, b, c, d, e, f, g, h: _sums_of(a, b, c, d, e, f, g, h)
 
 
 @intrinsic
@@ -408,7 +410,7 @@ _register_reduction(largest_of, _larger)
 
 @overload(any_of)
 def _overload_any_of(condition):
-    return lambda condition: _any_of(condition)  # type: ignore[call-arg]
+    return lambda condition: _any_of(condition)
 
 
 @intrinsic
@@ -420,13 +422,13 @@ def _any_of(typing: Any, condition: Any) -> Any:
     return types.boolean(condition), generate
 
 
-def prefetch(table, row):
+def prefetch(table: Any, row: Any) -> None:
     """Ask for a row of a table [N, D] before it is needed: memory answers while something else is computed."""
 
 
 @overload(prefetch)
 def _overload_prefetch(table, row):
-    return lambda table, row: _prefetch(table, row)  # type: ignore[call-arg]
+    return lambda table, row: _prefetch(table, row)
 
 
 @intrinsic
@@ -448,14 +450,14 @@ def _prefetch(typing: Any, table: Any, row: Any) -> Any:
     return types.void(table, row), generate
 
 
-def lowest_bit(bits):
+def lowest_bit(bits: Any) -> int:
     """Return the place of the lowest bit that is set in an integer that is not zero."""
     return (int(bits) & -int(bits)).bit_length() - 1
 
 
 @overload(lowest_bit)
 def _overload_lowest_bit(bits):
-    return lambda bits: _lowest_bit(bits)  # type: ignore[call-arg]
+    return lambda bits: _lowest_bit(bits)
 
 
 @intrinsic
