@@ -26,7 +26,7 @@ from minisplat_ref.scalar._jit import kernel, n_threads
 from minisplat_ref.scalar.compositing import alpha_vjp, blend, conic_vjp_of_moments, factors, mahalanobis
 from minisplat_ref.scalar.lanes import WIDTH, filled, load, select, store, sum_of
 from minisplat_ref.scalar.literals import ZERO
-from minisplat_ref.types import CompositeGradient, Floats, Gaussians, Projection, TileGrid
+from minisplat_ref.types import CompositeGradient, Floats, Gaussians, Projection, TileBins, TileGrid
 
 N_HITS = 100  # of opacity 0.005: transmittance 0.6 is left, so that none of them stops
 N_PASSES = 50
@@ -112,8 +112,8 @@ _write_alphas = alpha_writer(exp_fast)
 
 
 @kernel(parallel=False)
-def _rows_worked_on(records, ids, tile_offsets, frame):  # type: ignore[no-untyped-def]
-    """Rows of eight pixels that blending computes: the kernels' steps with nothing but the transmittance."""
+def _count_rows(records, ids, tile_offsets, frame):  # type: ignore[no-untyped-def]
+    """Take the kernels' steps with nothing but the transmittance."""
     state, scratch = np.empty(N_ROWS * WIDTH, records.dtype), np.empty(SCRATCH_SIZE, records.dtype)
     row_ids = np.empty(N_ROWS, np.int32)
     start_scratch(scratch)
@@ -134,6 +134,13 @@ def _rows_worked_on(records, ids, tile_offsets, frame):  # type: ignore[no-untyp
                 after, _ = blend(load(state, i), load(scratch, ALPHAS + j * WIDTH), frame)
                 store(state, i, after)
     return total
+
+
+def rows_worked_on(projection: Projection, channels: Floats, bins: TileBins) -> int:
+    """Return how many rows of eight pixels the blending kernels compute, all Gaussians and tiles together."""
+    records = records_of(projection, channels, GSPLAT_MAIN)
+    frame = frame_of(bins, GSPLAT_MAIN, records.dtype)
+    return int(_count_rows(records, bins.gaussian_ids, bins.tile_offsets, frame))
 
 
 def blending_cases(workload: Workload, repeats: int) -> list[Case]:
@@ -159,10 +166,7 @@ def blending_cases(workload: Workload, repeats: int) -> list[Case]:
         ),
         repeats,
     )
-    records = records_of(splats.projection, splats.channels, GSPLAT_MAIN)
-    bins = splats.bins
-    frame = frame_of(bins, GSPLAT_MAIN, records.dtype)
-    n_pairs = WIDTH * int(_rows_worked_on(records, bins.gaussian_ids, bins.tile_offsets, frame))
+    n_pairs = WIDTH * rows_worked_on(splats.projection, splats.channels, splats.bins)
     assert output.stats is not None
     n_hits = int(output.stats.hit_count.sum())
     cases = []
