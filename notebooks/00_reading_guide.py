@@ -222,7 +222,7 @@ display(Markdown("\n".join(["| module | what it says of itself |", "|---|---|", 
 # | 12 | `recipes/mini_splatting.py`, `mini_splatting2.py` | 11 | three recipes side by side |
 # | 13 | `oracle/differences.py`, `gradients.py`, `planted.py` | 12 | how a gradient check lies |
 # | 14 | `oracle/golden/`, `comparison/` | 13 | comparing a backend with the oracle |
-# | 15 | `scalar/`, then `cpu/` | | how the same formulas run fast |
+# | 15 | `scalar/`, then `cpu/` | 15 | how the same formulas run fast: eight pixels at a time |
 # | 16 | `oracle/bench/` | 14 | speed against error |
 #
 # Names are the field's own: `means`, `quats` (wxyz, any length), `log_scales`, `opacity_logits` are what is trained;

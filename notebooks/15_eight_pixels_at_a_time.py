@@ -241,7 +241,7 @@ axis.spines[["top", "right"]].set_visible(False)
 # %% [markdown]
 # Why not leave this to the compiler? It vectorises a loop if it can prove that no store overlaps a load and that no
 # step depends on the one before; otherwise it silently does not, and the loop takes several times as long. Here the
-# code says what happens. There are no branches either: where one cannot be foreseen, all that was begun behind it is lost.
+# code says what happens. There are no branches either: where one cannot be foreseen, what was begun behind it is lost.
 #
 # ## What it costs in digits
 #
