@@ -89,9 +89,9 @@ def reached_rows(records, ids, m, x0, y0, scratch):
     low = left + (HALF - mx)
     offset = rightmost_offset(turned_outline(records, n), low, low + as_data(WIDTH - 1), side)
     bound = floor(side * my + offset + (HALF + ELLIPSE_MARGIN))  # minus the first row, or the one after the last
-    bound = smaller(bound, select(is_up, zero, as_data(TILE_HEIGHT)))
+    bound = larger(as_data(-TILE_HEIGHT), smaller(select(is_up, zero, as_data(TILE_HEIGHT)), bound))
     is_in_box = (left < records[n, COLUMN_END] - as_data(x0)) & (left > records[n, COLUMN_FIRST] - as_data(x0 + WIDTH))
-    store(scratch, BOUNDS, select(is_in_box, larger(bound, as_data(-TILE_HEIGHT)), as_data(-TILE_HEIGHT)))
+    store(scratch, BOUNDS, select(is_in_box, bound, as_data(-TILE_HEIGHT)))
     rows = np.uint64(0)  # without branches: which strips are reached cannot be foreseen, and a wrong guess is dear
     for strip in range(N_STRIPS):
         first, end = -np.int64(scratch[BOUNDS + strip]), np.int64(scratch[BOUNDS + N_STRIPS + strip])
