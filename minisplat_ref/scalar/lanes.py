@@ -21,8 +21,9 @@ from numba.core import cgutils
 from numba.extending import intrinsic, models, overload, register_model
 
 __all__ = [
-    "WIDTH", "any_of", "counted", "exp_of", "filled", "floor", "larger", "largest_of", "load", "nearest", "scaled_by_power", "select",
-    "smaller", "sqrt", "store", "sum_of", "sums_of",
+    "WIDTH", "any_of", "ceil", "converted", "counted", "exp_of", "filled", "floor", "gather", "larger", "largest_of",
+    "load", "log_of", "nearest", "scaled_by_power", "scatter", "select", "smaller", "sqrt", "store", "sum_of", "sums_of",
+    "transposed",
 ]  # fmt: skip
 
 WIDTH = 8
@@ -160,6 +161,11 @@ def floor(a):
     return np.floor(a)
 
 
+def ceil(a):
+    """Return the next integer above."""
+    return np.ceil(a)
+
+
 def nearest(a):
     """Return the nearest integer, as a float."""
     return np.rint(a)
@@ -175,6 +181,11 @@ def exp_of(a):
     return np.exp(a)
 
 
+def log_of(a):
+    """Return libm's natural logarithm of every lane."""
+    return np.log(a)
+
+
 def _larger(builder: Any, a: Any, b: Any) -> Any:
     return builder.select(builder.fcmp_ordered(">", b, a), b, a)
 
@@ -186,9 +197,11 @@ def _smaller(builder: Any, a: Any, b: Any) -> Any:
 _register_binary(larger, _larger, of_one=lambda a, b: b if b > a else a)
 _register_binary(smaller, _smaller, of_one=lambda a, b: b if b < a else a)
 _register_unary(floor, lambda builder, a: _call(builder, "llvm.floor", a.type, [a]))
+_register_unary(ceil, lambda builder, a: _call(builder, "llvm.ceil", a.type, [a]))
 _register_unary(nearest, lambda builder, a: _call(builder, "llvm.rint", a.type, [a]))
 _register_unary(sqrt, lambda builder, a: _call(builder, "llvm.sqrt", a.type, [a]), of_one=lambda a: math.sqrt(a))
 _register_unary(exp_of, lambda builder, a: _call(builder, "llvm.exp", a.type, [a]))
+_register_unary(log_of, lambda builder, a: _call(builder, "llvm.log", a.type, [a]))
 
 
 def scaled_by_power(a, n):
@@ -253,8 +266,29 @@ def load(array, i):
 
 
 def store(array, i, lanes):
-    """Write lanes to a 1-d array from ``i`` on."""
-    array[i : i + WIDTH] = lanes
+    """Write lanes, or a tuple of lanes one after the other, to a 1-d array from ``i`` on."""
+    numbers = np.ravel(lanes)
+    array[i : i + max(numbers.size, WIDTH)] = numbers
+
+
+def gather(table, rows, column):
+    """Return one number from each of eight rows of a C-contiguous table [N, ...], whose rows count as flat."""
+    return table.reshape(len(table), -1)[list(rows), column]
+
+
+def scatter(table, rows, column, lanes):
+    """Write one number to each of eight rows of a table, rounded to its dtype: the inverse of ``gather``."""
+    table.reshape(len(table), -1)[list(rows), column] = lanes
+
+
+def transposed(a, b, c, d, e, f, g, h):
+    """Return eight lanes: the first of all, the second of all, and so on."""
+    return tuple(np.array([a, b, c, d, e, f, g, h]).T)
+
+
+def converted(lanes, zero):
+    """Return lanes in the dtype of a number."""
+    return lanes.astype(zero.dtype)
 
 
 def sum_of(lanes):
@@ -332,13 +366,105 @@ def _overload_store(array, i, lanes):
 @intrinsic
 def _store(typing: Any, array: Any, i: Any, lanes: Any) -> Any:
     kind = _Lanes(array.dtype)
+    kinds = list(lanes) if isinstance(lanes, types.BaseTuple) else [lanes]
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        value = _spread(context, builder, args[2], lanes, kind)
-        builder.store(value, _pointer(context, builder, signature, args), align=array.dtype.bitwidth // 8)
+        first = _pointer(context, builder, signature, args)
+        for k, of_one in enumerate(kinds):
+            one = builder.extract_value(args[2], k) if isinstance(lanes, types.BaseTuple) else args[2]
+            value = _spread(context, builder, one, of_one, kind)
+            builder.store(value, builder.gep(first, [_I32(k)]), align=array.dtype.bitwidth // 8)
         return context.get_dummy_value()
 
     return types.void(array, i, lanes), generate
+
+
+@overload(gather)
+def _overload_gather(table, rows, column):
+    return lambda table, rows, column: _gather(table, rows, column)  # type: ignore[call-arg]
+
+
+def _row_pointers(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
+    """Where the numbers of a column stand; a table of one dimension has one column, 0."""
+    array = context.make_array(signature.args[0])(context, builder, args[0])
+    stride, byte = builder.extract_value(array.strides, 0), ir.IntType(8).as_pointer()
+    start = builder.bitcast(builder.gep(array.data, [args[2]], inbounds=True), byte)
+    rows = (builder.extract_value(args[1], k) for k in range(WIDTH))
+    return [builder.bitcast(builder.gep(start, [builder.mul(row, stride)]), array.data.type) for row in rows]
+
+
+@intrinsic
+def _gather(typing: Any, table: Any, rows: Any, column: Any) -> Any:
+    lanes = _Lanes(table.dtype)
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        vector = ir.Constant(context.get_value_type(lanes), ir.Undefined)
+        for k, pointer in enumerate(_row_pointers(context, builder, signature, args)):
+            vector = builder.insert_element(vector, builder.load(pointer), _I32(k))
+        return vector
+
+    return lanes(table, rows, types.int64), generate
+
+
+@overload(scatter)
+def _overload_scatter(table, rows, column, lanes):
+    return lambda table, rows, column, lanes: _scatter(table, rows, column, lanes)  # type: ignore[call-arg]
+
+
+@intrinsic
+def _scatter(typing: Any, table: Any, rows: Any, column: Any, lanes: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        vector = _convert(builder, args[3], context.get_value_type(_Lanes(table.dtype)))
+        for k, pointer in enumerate(_row_pointers(context, builder, signature, args)):
+            builder.store(builder.extract_element(vector, _I32(k)), pointer)
+        return context.get_dummy_value()
+
+    return types.void(table, rows, types.int64, lanes), generate
+
+
+def _convert(builder: Any, vector: Any, kind: Any) -> Any:
+    if vector.type == kind:
+        return vector
+    if isinstance(kind.element, ir.IntType):
+        return builder.fptosi(vector, kind)
+    return (builder.fptrunc if isinstance(kind.element, ir.FloatType) else builder.fpext)(vector, kind)
+
+
+@overload(converted)
+def _overload_converted(lanes, zero):
+    return lambda lanes, zero: _converted(lanes, zero)  # type: ignore[call-arg]
+
+
+@intrinsic
+def _converted(typing: Any, lanes: Any, zero: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return _convert(builder, args[0], context.get_value_type(_Lanes(zero)))
+
+    return _Lanes(zero)(lanes, zero), generate
+
+
+@overload(transposed)
+def _overload_transposed(a, b, c, d, e, f, g, h):
+    return lambda a, b, c, d, e, f, g, h: _transposed(a, b, c, d, e, f, g, h)  # type: ignore[call-arg]
+
+
+@intrinsic
+def _transposed(typing: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
+    result = types.UniTuple(a, WIDTH)
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        vectors, size = list(args), 1
+        while size < WIDTH:  # blocks of this size change places across the diagonal
+            for k in (k for k in range(WIDTH) if not k & size):
+                pair = vectors[k], vectors[k + size]
+                for place, shift in ((k, 0), (k + size, size)):
+                    mask = [i + shift if not i & size else WIDTH + (i ^ size) + shift for i in range(WIDTH)]
+                    mask = ir.Constant(ir.VectorType(_I32, WIDTH), mask)
+                    vectors[place] = builder.shuffle_vector(*pair, mask)
+            size *= 2
+        return context.make_tuple(builder, result, vectors)
+
+    return result(a, b, c, d, e, f, g, h), generate
 
 
 def _register_reduction(function: Callable, emit: Callable) -> None:
