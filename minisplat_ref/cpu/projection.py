@@ -236,14 +236,15 @@ def _scatter_triple(table, rows, lanes):
 @scalar
 def _add_row(v_pose, first, is_counted, v_p, v_V, mean, M):
     """Add to the gradient by a row of R, and then of t: p = R x + t and V = R M."""
-    _add(v_pose, first, is_counted, v_p * mean[0] + dot(v_V, M[0]))
-    _add(v_pose, first + 1, is_counted, v_p * mean[1] + dot(v_V, M[1]))
-    _add(v_pose, first + 2, is_counted, v_p * mean[2] + dot(v_V, M[2]))
-    _add(v_pose, first + 3, is_counted, v_p)
+    add(v_pose, first, is_counted, v_p * mean[0] + dot(v_V, M[0]))
+    add(v_pose, first + 1, is_counted, v_p * mean[1] + dot(v_V, M[1]))
+    add(v_pose, first + 2, is_counted, v_p * mean[2] + dot(v_V, M[2]))
+    add(v_pose, first + 3, is_counted, v_p)
 
 
 @scalar
-def _add(sums, k, is_counted, lanes):
+def add(sums, k, is_counted, lanes):
+    """Add to the eight sums number k of a buffer."""
     store(sums, k * WIDTH, load(sums, k * WIDTH) + select(is_counted, lanes, ZERO))
 
 
@@ -265,9 +266,7 @@ def _project_chunk_vjp(chunk, means, quats, scales, opacities, radii, rotation, 
     for i in range(0, count, WIDTH):
         is_counted = counted(DOUBLE) < count - i
         rows = listed_rows(visible, i)
-        _project_eight_vjp(
-            rows, is_counted, means, quats, scales, opacities, R, centre, lens, v, out, v_poses[chunk]
-        )
+        _project_eight_vjp(rows, is_counted, means, quats, scales, opacities, R, centre, lens, v, out, v_poses[chunk])
 
 
 @kernel()

@@ -453,15 +453,14 @@ def _transposed(typing: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: 
     result = types.UniTuple(a, WIDTH)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        vectors, size = list(args), 1
-        while size < WIDTH:  # blocks of this size change places across the diagonal
+        vectors = list(args)
+        for size in (4, 2, 1):  # blocks of this size change places across the diagonal
             for k in (k for k in range(WIDTH) if not k & size):
                 pair = vectors[k], vectors[k + size]
                 for place, shift in ((k, 0), (k + size, size)):
                     mask = [i + shift if not i & size else WIDTH + (i ^ size) + shift for i in range(WIDTH)]
                     mask = ir.Constant(ir.VectorType(_I32, WIDTH), mask)
                     vectors[place] = builder.shuffle_vector(*pair, mask)
-            size *= 2
         return context.make_tuple(builder, result, vectors)
 
     return result(a, b, c, d, e, f, g, h), generate
@@ -541,9 +540,7 @@ def _prefetch(typing: Any, table: Any, row: Any) -> Any:
         array = context.make_array(table)(context, builder, args[0])
         address = builder.add(
             builder.ptrtoint(array.data, ir.IntType(64)),
-            builder.mul(
-                context.cast(builder, args[1], row, types.int64), builder.extract_value(array.strides, 0)
-            ),
+            builder.mul(context.cast(builder, args[1], row, types.int64), builder.extract_value(array.strides, 0)),
         )
         byte = ir.IntType(8).as_pointer()
         kind = ir.FunctionType(ir.VoidType(), [byte, _I32, _I32, _I32])
