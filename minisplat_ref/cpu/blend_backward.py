@@ -23,9 +23,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from minisplat_ref.cpu.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, reached_rows, start_scratch, to_mean
 from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.cpu.records import COLOR, MEAN_X, MEAN_Y, SLOPE
-from minisplat_ref.cpu.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, reached_rows, start_scratch, to_mean
 from minisplat_ref.cpu.tile_state import (
     CHECK_EVERY,
     N_ROWS,

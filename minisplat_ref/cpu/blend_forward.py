@@ -13,9 +13,9 @@ from collections.abc import Callable
 import numpy as np
 
 from minisplat_ref.constants import MEDIAN_TRANSMITTANCE
+from minisplat_ref.cpu.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, reached_rows, start_scratch
 from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.cpu.records import COLOR
-from minisplat_ref.cpu.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, reached_rows, start_scratch
 from minisplat_ref.cpu.tile_state import (
     CHECK_EVERY,
     N_ROWS,

@@ -5,17 +5,20 @@ directly under ``prange``. Every Gaussian has one writer. Only the camera gradie
 number of chunks, whatever the number of threads, each adds up its own part in float64, and the parts are added in
 order.
 
-The arithmetic is float64 whatever the data: it is scalar code, where a float64 costs what a float32 costs, and float32
-would lose the position of a mean far from the world's origin, the overflow of f / z squared, and the thin axis of a
-needle. Results are rounded when they are stored, except conics: see :class:`Projection`.
+Eight Gaussians are one step. Branches become masks: culled Gaussians are computed too, and stored as zeros.
+
+The arithmetic is float64 whatever the data: float32 would lose the position of a mean far from the world's origin, the
+overflow of f / z squared, and the thin axis of a needle. Results are rounded when they are stored, except conics: see
+:class:`Projection`.
 """
 
 import numpy as np
 
 from minisplat_ref.constants import COMPENSATION_FLOOR, JACOBIAN_CLAMP, Conventions
+from minisplat_ref.cpu.gaussian_rows import DOUBLE, add, gather_wide, list_visible, listed_rows, rows_from, triple
 from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.extent import inria_box, support_box
-from minisplat_ref.scalar.lanes import WIDTH, converted, counted, gather, load, scatter, select, store
+from minisplat_ref.scalar.lanes import WIDTH, counted, scatter, select
 from minisplat_ref.scalar.literals import ZERO
 from minisplat_ref.scalar.projection import (
     Lens,
@@ -35,8 +38,6 @@ from minisplat_ref.scalar.projection import (
 from minisplat_ref.types import Camera, Floats, PrimitiveGradient, Projection, ProjectionGradient
 
 N_CHUNKS = 64  # parts of the camera-gradient sum; fixed, so that its rounding does not depend on the thread count
-DOUBLE = np.float64(0)  # names a dtype
-INFINITY = np.inf
 
 
 def camera_centre(camera: Camera) -> Floats:
@@ -76,58 +77,6 @@ def lens_of(camera: Camera, conventions: Conventions) -> Lens:
 
 
 @scalar
-def wide(quat):
-    """Return the four numbers in float64."""
-    return np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
-
-
-@scalar
-def rows_from(n, end):
-    """Return eight consecutive rows; beyond the last one it is repeated, and what is written to it is the same."""
-    last = end - 1
-    return (
-        n,
-        min(n + 1, last),
-        min(n + 2, last),
-        min(n + 3, last),
-        min(n + 4, last),
-        min(n + 5, last),
-        min(n + 6, last),
-        min(n + 7, last),
-    )
-
-
-@scalar
-def listed_rows(rows, i):
-    """Return the eight rows of a list from ``i`` on."""
-    return rows[i], rows[i + 1], rows[i + 2], rows[i + 3], rows[i + 4], rows[i + 5], rows[i + 6], rows[i + 7]
-
-
-@scalar
-def list_visible(radii, first, end, rows):
-    """List the visible Gaussians of a range; return their number. The last is repeated until eight are full."""
-    count = 0
-    for n in range(first, end):
-        rows[count] = n
-        count += np.int64(radii[n, 0] > 0)
-    for i in range(count, count + WIDTH):
-        rows[i] = rows[max(count - 1, 0)]
-    return count
-
-
-@scalar
-def gather_wide(table, rows, column):
-    """Return a column of eight rows in float64."""
-    return converted(gather(table, rows, column), DOUBLE)
-
-
-@scalar
-def triple(table, rows):
-    """Return the three columns of eight rows in float64."""
-    return gather_wide(table, rows, 0), gather_wide(table, rows, 1), gather_wide(table, rows, 2)
-
-
-@scalar
 def _quaternion(quats, rows):
     return (*triple(quats, rows), gather_wide(quats, rows, 3))
 
@@ -148,7 +97,7 @@ def _project_eight(
         rx, ry, x0, y0, x1, y1 = inria_box(footprint, width, height)
     is_seen = (p[2] > lens.near) & (p[2] < lens.far) & (opacity >= alpha_min) & (footprint.det > ZERO)
     size = footprint.det + abs(a) + abs(c) + abs(footprint.x) + abs(footprint.y)  # finite if all of them are
-    is_seen = is_seen & (size < INFINITY) & (x1 > x0) & (y1 > y0)
+    is_seen = is_seen & (size < np.inf) & (x1 > x0) & (y1 > y0)
     _scatter_seen(is_seen, out.means2d, rows, 0, footprint.x)
     _scatter_seen(is_seen, out.means2d, rows, 1, footprint.y)
     _scatter_seen(is_seen, out.depths, rows, 0, p[2])
@@ -240,12 +189,6 @@ def _add_row(v_pose, first, is_counted, v_p, v_V, mean, M):
     add(v_pose, first + 1, is_counted, v_p * mean[1] + dot(v_V, M[1]))
     add(v_pose, first + 2, is_counted, v_p * mean[2] + dot(v_V, M[2]))
     add(v_pose, first + 3, is_counted, v_p)
-
-
-@scalar
-def add(sums, k, is_counted, lanes):
-    """Add to the eight sums number k of a buffer."""
-    store(sums, k * WIDTH, load(sums, k * WIDTH) + select(is_counted, lanes, ZERO))
 
 
 @scalar

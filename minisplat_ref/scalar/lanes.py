@@ -21,9 +21,9 @@ from numba.core import cgutils
 from numba.extending import intrinsic, models, overload, register_model
 
 __all__ = [
-    "WIDTH", "any_of", "ceil", "converted", "counted", "exp_of", "filled", "floor", "gather", "larger", "largest_of",
-    "load", "log_of", "nearest", "scaled_by_power", "scatter", "select", "smaller", "sqrt", "store", "sum_of", "sums_of",
-    "transposed",
+    "WIDTH", "any_of", "ceil", "columns_of", "converted", "counted", "exp_of", "filled", "floor", "gather", "larger",
+    "largest_of", "load", "log_of", "nearest", "scaled_by_power", "scatter", "select", "smaller", "sqrt", "store",
+    "sum_of", "sums_of",
 ]  # fmt: skip
 
 WIDTH = 8
@@ -281,8 +281,8 @@ def scatter(table, rows, column, lanes):
     table.reshape(len(table), -1)[list(rows), column] = lanes
 
 
-def transposed(a, b, c, d, e, f, g, h):
-    """Return eight lanes: the first of all, the second of all, and so on."""
+def columns_of(a, b, c, d, e, f, g, h):
+    """Return the columns of the square whose rows are eight lanes: the first number of each, the second, and so on."""
     return tuple(np.array([a, b, c, d, e, f, g, h]).T)
 
 
@@ -443,13 +443,13 @@ def _converted(typing: Any, lanes: Any, zero: Any) -> Any:
     return _Lanes(zero)(lanes, zero), generate
 
 
-@overload(transposed)
-def _overload_transposed(a, b, c, d, e, f, g, h):
-    return lambda a, b, c, d, e, f, g, h: _transposed(a, b, c, d, e, f, g, h)  # type: ignore[call-arg]
+@overload(columns_of)
+def _overload_columns_of(a, b, c, d, e, f, g, h):
+    return lambda a, b, c, d, e, f, g, h: _columns_of(a, b, c, d, e, f, g, h)  # type: ignore[call-arg]
 
 
 @intrinsic
-def _transposed(typing: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
+def _columns_of(typing: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
     result = types.UniTuple(a, WIDTH)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
