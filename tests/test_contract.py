@@ -16,14 +16,13 @@ STAGES = [field.name for field in fields(Backend) if field.name not in ("name", 
 
 # Modules of cpu without a twin of their name: parts of the compositing and sorting kernels, not stages.
 BLENDING_PARTS = {"blend_forward", "blend_backward", "tile_state", "tile_rows", "records", "exponential"}
-KERNEL_PARTS = BLENDING_PARTS | {"footprints", "sorting"}
+KERNEL_PARTS = BLENDING_PARTS | {"footprints", "sorting", "gaussian_rows"}
 
 # Public functions of cpu without a twin: they prepare arguments for kernels.
 CPU_ONLY = {
     "projection.camera_centre": "computed in float64 before the loop; the reference does it with matrices",
     "projection.pose_of": "the same for the point that the camera maps to 0",
     "projection.lens_of": "conventions as float64 scalars",
-    "projection.wide": "a quaternion in float64; the reference's arithmetic has the data's dtype",
     "compositing.composite_with": "the exponential is an argument, which compositing_exact fills in, too",
     "compositing.composite_vjp_with": "as composite_with",
 }

@@ -6,7 +6,6 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from minisplat_ref.cpu.exponential import exp_exact, exp_fast
-from minisplat_ref.scalar import lanes
 from minisplat_ref.scalar.lanes import (
     WIDTH,
     any_of,
@@ -192,7 +191,3 @@ def test_exponentials():
     out = far.copy()
     run(exp_fast)(far, out)
     assert_allclose(out, 2.0**-60, rtol=6e-7)
-
-
-def test_all_names_are_there():
-    assert all(hasattr(lanes, name) for name in lanes.__all__)

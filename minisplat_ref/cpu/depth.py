@@ -5,13 +5,19 @@ Backward, the pixels are grouped by their Gaussian first, so that each Gaussian 
 
 import numpy as np
 
-from minisplat_ref.cpu.projection import pose_of, wide
+from minisplat_ref.cpu.projection import pose_of
 from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.covariance import normalized, normalized_vjp, rotation_vjp
 from minisplat_ref.scalar.depth import densest_depth, densest_depth_vjp, gaussian_axes, pixel_ray
 from minisplat_ref.scalar.literals import HALF, ZERO
 from minisplat_ref.scalar.projection import dot, rows_of, transposed
 from minisplat_ref.types import Camera, Floats, Ints, SurfacePoints
+
+
+@scalar
+def _wide(quat):
+    """Return the four numbers in float64."""
+    return np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
 
 
 @scalar
@@ -34,7 +40,7 @@ def _surface_points(means, quats, scales, rotation, centre, lens, dominant_ids, 
             if n < 0:
                 continue
             d = pixel_ray(R, x + HALF, y + HALF, lens[0], lens[1], lens[2], lens[3])
-            t = densest_depth(gaussian_axes(wide(quats[n])), _scale(scales, n), _offset(means, n, centre), d)
+            t = densest_depth(gaussian_axes(_wide(quats[n])), _scale(scales, n), _offset(means, n, centre), d)
             if t > 0:
                 depths[y, x] = t
                 for i in range(3):
@@ -58,7 +64,7 @@ def surface_points(means: Floats, quats: Floats, scales: Floats, camera: Camera,
 def _gaussian_vjp(n, pixels, means, quats, scales, rotation, centre, lens, depths, v_points, v_depths, v_mean, v_scale):
     """Add the shares of one Gaussian's pixels; return the gradient by its axes, one per row."""
     R = rows_of(rotation)
-    axes = gaussian_axes(wide(quats[n]))
+    axes = gaussian_axes(_wide(quats[n]))
     scale = _scale(scales, n)
     u = _offset(means, n, centre)
     v_axes = np.zeros((3, 3))
@@ -105,7 +111,7 @@ def _surface_points_vjp(
         v_axes = _gaussian_vjp(
             n, own, means, quats, scales, rotation, centre, lens, depths, v_points, v_depths, v_means[n], v_scales[n]
         )
-        w, x, y, z, inverse_length = normalized(*wide(quats[n]))
+        w, x, y, z, inverse_length = normalized(*_wide(quats[n]))
         v_w, v_x, v_y, v_z = rotation_vjp(w, x, y, z, transposed(rows_of(v_axes)))
         v = normalized_vjp(w, x, y, z, inverse_length, v_w, v_x, v_y, v_z)
         for i in range(4):

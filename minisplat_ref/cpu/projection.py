@@ -5,18 +5,21 @@ directly under ``prange``. Every Gaussian has one writer. Only the camera gradie
 number of chunks, whatever the number of threads, each adds up its own part in float64, and the parts are added in
 order.
 
-The arithmetic is float64 whatever the data: it is scalar code, where a float64 costs what a float32 costs, and float32
-would lose the position of a mean far from the world's origin, the overflow of f / z squared, and the thin axis of a
-needle. Results are rounded when they are stored, except conics: see :class:`Projection`.
-"""
+Eight Gaussians are one step. Branches become masks: culled Gaussians are computed too, and stored as zeros.
 
-import math
+The arithmetic is float64 whatever the data: float32 would lose the position of a mean far from the world's origin, the
+overflow of f / z squared, and the thin axis of a needle. Results are rounded when they are stored, except conics: see
+:class:`Projection`.
+"""
 
 import numpy as np
 
 from minisplat_ref.constants import COMPENSATION_FLOOR, JACOBIAN_CLAMP, Conventions
+from minisplat_ref.cpu.gaussian_rows import DOUBLE, add, gather_wide, list_visible, listed_rows, rows_from, triple
 from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.extent import inria_box, support_box
+from minisplat_ref.scalar.lanes import WIDTH, counted, scatter, select
+from minisplat_ref.scalar.literals import ZERO
 from minisplat_ref.scalar.projection import (
     Lens,
     axes,
@@ -48,7 +51,7 @@ def pose_of(camera: Camera) -> tuple[Floats, Floats]:
     The point is the camera centre. It is solved for rather than taken as -R^T t, so that R (x - point) equals R x + t
     also where R is not quite a rotation: the gradient counts its nine entries as free.
     """
-    R = np.asarray(camera.cam_from_world_R, np.float64)
+    R = np.ascontiguousarray(camera.cam_from_world_R, np.float64)
     return R, -np.linalg.solve(R, np.asarray(camera.cam_from_world_t, np.float64))
 
 
@@ -74,52 +77,55 @@ def lens_of(camera: Camera, conventions: Conventions) -> Lens:
 
 
 @scalar
-def wide(quat):
-    """Return the four numbers in float64."""
-    return np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
+def _quaternion(quats, rows):
+    return (*triple(quats, rows), gather_wide(quats, rows, 3))
 
 
 @scalar
-def _project_one(
-    n, means, quats, scales, opacities, rotation, centre, lens, alpha_min, full_support, width, height, out
+def _project_eight(
+    rows, means, quats, scales, opacities, rotation, centre, lens, alpha_min, full_support, width, height, out
 ):
     R = rows_of(rotation)
-    p = to_camera(R, centre, means[n, 0], means[n, 1], means[n, 2])
-    if not (lens.near < p[2] < lens.far):
-        return
-    footprint = project_gaussian(p, rotated(R, axes(wide(quats[n]), scales[n])), lens)
-    opacity = opacities[n] * footprint.compensation
-    if not (opacity >= alpha_min and footprint.det > 0 and math.isfinite(footprint.det)):
-        return
+    x, y, z = triple(means, rows)
+    p = to_camera(R, centre, x, y, z)
+    footprint = project_gaussian(p, rotated(R, axes(_quaternion(quats, rows), triple(scales, rows))), lens)
+    opacity = gather_wide(opacities, rows, 0) * footprint.compensation
     a, b, c = conic(footprint)
-    if not (math.isfinite(a) and math.isfinite(c)):
-        return
-    if not (math.isfinite(footprint.x) and math.isfinite(footprint.y)):
-        return
     if full_support:
         rx, ry, x0, y0, x1, y1 = support_box(footprint, opacity, alpha_min, width, height)
     else:
         rx, ry, x0, y0, x1, y1 = inria_box(footprint, width, height)
-    if x0 >= x1 or y0 >= y1:
-        return
-    out.means2d[n, 0] = footprint.x
-    out.means2d[n, 1] = footprint.y
-    out.depths[n] = p[2]
-    out.conics[n, 0], out.conics[n, 1], out.conics[n, 2] = a, b, c
-    out.opacities[n] = opacity
-    out.radii[n, 0] = rx
-    out.radii[n, 1] = ry
-    out.boxes[n, 0] = x0
-    out.boxes[n, 1] = y0
-    out.boxes[n, 2] = x1
-    out.boxes[n, 3] = y1
+    is_seen = (p[2] > lens.near) & (p[2] < lens.far) & (opacity >= alpha_min) & (footprint.det > ZERO)
+    size = footprint.det + abs(a) + abs(c) + abs(footprint.x) + abs(footprint.y)  # finite if all of them are
+    is_seen = is_seen & (size < np.inf) & (x1 > x0) & (y1 > y0)
+    _scatter_seen(is_seen, out.means2d, rows, 0, footprint.x)
+    _scatter_seen(is_seen, out.means2d, rows, 1, footprint.y)
+    _scatter_seen(is_seen, out.depths, rows, 0, p[2])
+    _scatter_seen(is_seen, out.conics, rows, 0, a)
+    _scatter_seen(is_seen, out.conics, rows, 1, b)
+    _scatter_seen(is_seen, out.conics, rows, 2, c)
+    _scatter_seen(is_seen, out.opacities, rows, 0, opacity)
+    _scatter_seen(is_seen, out.radii, rows, 0, rx)
+    _scatter_seen(is_seen, out.radii, rows, 1, ry)
+    _scatter_seen(is_seen, out.boxes, rows, 0, x0)
+    _scatter_seen(is_seen, out.boxes, rows, 1, y0)
+    _scatter_seen(is_seen, out.boxes, rows, 2, x1)
+    _scatter_seen(is_seen, out.boxes, rows, 3, y1)
+
+
+@scalar
+def _scatter_seen(is_seen, table, rows, column, lanes):
+    """Write lanes to a column; zeros where a Gaussian is culled."""
+    scatter(table, rows, column, select(is_seen, lanes, ZERO))
 
 
 @kernel()
 def _project(means, quats, scales, opacities, rotation, centre, lens, alpha_min, full_support, width, height, out):
-    for n in prange(means.shape[0]):
-        _project_one(
-            n, means, quats, scales, opacities, rotation, centre, lens, alpha_min, full_support, width, height, out
+    n_gaussians = means.shape[0]
+    for block in prange((n_gaussians + WIDTH - 1) // WIDTH):
+        rows = rows_from(block * WIDTH, n_gaussians)
+        _project_eight(
+            rows, means, quats, scales, opacities, rotation, centre, lens, alpha_min, full_support, width, height, out
         )
 
 
@@ -129,12 +135,12 @@ def project(
     """Project every Gaussian into the image; see ``reference.projection.project``."""
     n, dtype = len(means), means.dtype
     out = Projection(
-        np.zeros((n, 2), dtype),
-        np.zeros(n, dtype),
-        np.zeros((n, 3), np.float64),
-        np.zeros(n, dtype),
-        np.zeros((n, 2), np.int32),
-        np.zeros((n, 4), np.int32),
+        np.empty((n, 2), dtype),
+        np.empty(n, dtype),
+        np.empty((n, 3), np.float64),
+        np.empty(n, dtype),
+        np.empty((n, 2), np.int32),
+        np.empty((n, 4), np.int32),
     )
     rotation, centre = pose_of(camera)
     lens, alpha_min = lens_of(camera, conventions), dtype.type(conventions.alpha_min)
@@ -144,38 +150,72 @@ def project(
 
 
 @scalar
-def _project_one_vjp(n, means, quats, scales, opacities, R, centre, lens, v, out, v_pose):
-    p = to_camera(R, centre, means[n, 0], means[n, 1], means[n, 2])
-    quat = wide(quats[n])
-    M = axes(quat, scales[n])
+def _project_eight_vjp(rows, is_counted, means, quats, scales, opacities, R, centre, lens, v, out, v_pose):
+    x, y, z = triple(means, rows)
+    p = to_camera(R, centre, x, y, z)
+    quat, scale = _quaternion(quats, rows), triple(scales, rows)
+    M = axes(quat, scale)
     V = rotated(R, M)
     footprint = project_gaussian(p, V, lens)
-    from_conic = conic_vjp(footprint, v.conics[n])
-    from_blur = compensation_vjp(footprint, v.opacities[n] * opacities[n], lens)
+    v_opacity = gather_wide(v.opacities, rows, 0)
+    from_conic = conic_vjp(footprint, triple(v.conics, rows))
+    from_blur = compensation_vjp(footprint, v_opacity * gather_wide(opacities, rows, 0), lens)
     v_cov = (from_conic[0] + from_blur[0], from_conic[1] + from_blur[1], from_conic[2] + from_blur[2])
-    v_p, v_V = project_gaussian_vjp(p, V, lens, footprint, v.means2d[n, 0], v.means2d[n, 1], v.depths[n], v_cov)
+    v_x, v_y, v_z = gather_wide(v.means2d, rows, 0), gather_wide(v.means2d, rows, 1), gather_wide(v.depths, rows, 0)
+    v_p, v_V = project_gaussian_vjp(p, V, lens, footprint, v_x, v_y, v_z, v_cov)
     R_transposed = transposed(R)
-    v_quat, v_scale = axes_vjp(quat, scales[n], rotated(R_transposed, v_V))
-    for i in range(3):
-        out.means[n, i] = dot(R_transposed[i], v_p)
-        out.scales[n, i] = v_scale[i]
-        v_pose[9 + i] += v_p[i]
-        for j in range(3):  # p = R x + t and V = R M
-            v_pose[3 * i + j] += v_p[i] * means[n, j] + dot(v_V[i], M[j])
-    for i in range(4):
-        out.quats[n, i] = v_quat[i]
-    out.opacities[n] = v.opacities[n] * footprint.compensation
+    v_quat, v_scale = axes_vjp(quat, scale, rotated(R_transposed, v_V))
+    _scatter_triple(out.means, rows, (dot(R_transposed[0], v_p), dot(R_transposed[1], v_p), dot(R_transposed[2], v_p)))
+    _scatter_triple(out.scales, rows, v_scale)
+    _scatter_triple(out.quats, rows, v_quat)
+    scatter(out.quats, rows, 3, v_quat[3])
+    scatter(out.opacities, rows, 0, v_opacity * footprint.compensation)
+    _add_row(v_pose, 0, is_counted, v_p[0], v_V[0], (x, y, z), M)
+    _add_row(v_pose, 4, is_counted, v_p[1], v_V[1], (x, y, z), M)
+    _add_row(v_pose, 8, is_counted, v_p[2], v_V[2], (x, y, z), M)
+
+
+@scalar
+def _scatter_triple(table, rows, lanes):
+    scatter(table, rows, 0, lanes[0])
+    scatter(table, rows, 1, lanes[1])
+    scatter(table, rows, 2, lanes[2])
+
+
+@scalar
+def _add_row(v_pose, first, is_counted, v_p, v_V, mean, M):
+    """Add to the gradient by a row of R, and then of t: p = R x + t and V = R M."""
+    add(v_pose, first, is_counted, v_p * mean[0] + dot(v_V, M[0]))
+    add(v_pose, first + 1, is_counted, v_p * mean[1] + dot(v_V, M[1]))
+    add(v_pose, first + 2, is_counted, v_p * mean[2] + dot(v_V, M[2]))
+    add(v_pose, first + 3, is_counted, v_p)
+
+
+@scalar
+def _project_chunk_vjp(chunk, means, quats, scales, opacities, radii, rotation, centre, lens, v, out, v_poses):
+    n_chunks, n_gaussians = v_poses.shape[0], means.shape[0]
+    first, end = n_gaussians * chunk // n_chunks, n_gaussians * (chunk + 1) // n_chunks
+    for n in range(first, end):
+        if radii[n, 0] == 0:
+            out.opacities[n] = ZERO
+            for i in range(3):
+                out.means[n, i] = ZERO
+                out.scales[n, i] = ZERO
+            for i in range(4):
+                out.quats[n, i] = ZERO
+    visible = np.empty(end - first + WIDTH, np.int64)
+    count = list_visible(radii, first, end, visible)
+    R = rows_of(rotation)
+    for i in range(0, count, WIDTH):
+        is_counted = counted(DOUBLE) < count - i
+        rows = listed_rows(visible, i)
+        _project_eight_vjp(rows, is_counted, means, quats, scales, opacities, R, centre, lens, v, out, v_poses[chunk])
 
 
 @kernel()
 def _project_vjp(means, quats, scales, opacities, radii, rotation, centre, lens, v, out, v_poses):
-    n_chunks = v_poses.shape[0]
-    n_gaussians = means.shape[0]
-    for chunk in prange(n_chunks):
-        R = rows_of(rotation)
-        for n in range(n_gaussians * chunk // n_chunks, n_gaussians * (chunk + 1) // n_chunks):
-            if radii[n, 0] > 0:
-                _project_one_vjp(n, means, quats, scales, opacities, R, centre, lens, v, out, v_poses[chunk])
+    for chunk in prange(v_poses.shape[0]):
+        _project_chunk_vjp(chunk, means, quats, scales, opacities, radii, rotation, centre, lens, v, out, v_poses)
 
 
 def project_vjp(
@@ -190,19 +230,19 @@ def project_vjp(
 ) -> PrimitiveGradient:
     """Chain the gradient of a projection to its inputs; see ``reference.projection.project_vjp``."""
     dtype = means.dtype
-    v_poses = np.zeros((N_CHUNKS, 12), np.float64)
+    v_poses = np.zeros((N_CHUNKS, 12 * WIDTH), np.float64)
     out = PrimitiveGradient(
-        np.zeros(means.shape, means.dtype),
-        np.zeros(quats.shape, quats.dtype),
-        np.zeros(scales.shape, scales.dtype),
-        np.zeros(opacities.shape, opacities.dtype),
-        np.zeros((3, 3), dtype),
-        np.zeros(3, dtype),
+        np.empty(means.shape, means.dtype),
+        np.empty(quats.shape, quats.dtype),
+        np.empty(scales.shape, scales.dtype),
+        np.empty(opacities.shape, opacities.dtype),
+        np.empty((3, 3), dtype),
+        np.empty(3, dtype),
     )
     rotation, centre = pose_of(camera)
     lens = lens_of(camera, conventions)
     _project_vjp(means, quats, scales, opacities, projection.radii, rotation, centre, lens, v_projection, out, v_poses)
-    total = v_poses.sum(axis=0)
-    out.cam_from_world_R[:] = total[:9].reshape(3, 3)
-    out.cam_from_world_t[:] = total[9:]
+    v_pose = v_poses.reshape(N_CHUNKS, 3, 4, WIDTH).sum(axis=(0, 3))
+    out.cam_from_world_R[:] = v_pose[:, :3]
+    out.cam_from_world_t[:] = v_pose[:, 3]
     return out

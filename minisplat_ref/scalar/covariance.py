@@ -4,24 +4,27 @@ The covariance itself is never formed here: projection uses its square root ``R 
 needle-shaped Gaussians.
 """
 
-import math
+import numpy as np
 
 from minisplat_ref.scalar._jit import scalar
+from minisplat_ref.scalar.lanes import larger, select, sqrt
 from minisplat_ref.scalar.literals import ONE, TWO, ZERO
+
+TINY = np.finfo(np.float64).tiny  # the smallest number whose reciprocal is finite
 
 
 @scalar
 def normalized(w, x, y, z):
     """Return the unit quaternion and the reciprocal of its former length; zeros for the zero quaternion.
 
-    It is divided by its largest entry first, so that no square leaves the range of floats.
+    It is float64, and divided by its largest entry first, so that no square leaves the range of floats.
     """
-    largest = max(max(abs(w), abs(x)), max(abs(y), abs(z)))
-    if largest == ZERO:
-        return w, x, y, z, largest
-    w, x, y, z = w / largest, x / largest, y / largest, z / largest
-    inverse = ONE / math.sqrt(w * w + x * x + y * y + z * z)
-    return w * inverse, x * inverse, y * inverse, z * inverse, inverse / largest
+    largest = larger(larger(abs(w), abs(x)), larger(abs(y), abs(z)))
+    unit = ONE / larger(largest, TINY)
+    w, x, y, z = w * unit, x * unit, y * unit, z * unit
+    squared = w * w + x * x + y * y + z * z
+    inverse = ONE / sqrt(select(largest > ZERO, squared, ONE))
+    return w * inverse, x * inverse, y * inverse, z * inverse, select(largest > ZERO, inverse * unit, ZERO)
 
 
 @scalar

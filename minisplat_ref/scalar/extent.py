@@ -1,15 +1,13 @@
 """Which pixels one projected Gaussian may touch: radii and a half-open box of pixels inside the image.
 
-Floats are clamped to the image before they become integers, because a cast of a float beyond the integer range is
-undefined.
+The numbers are whole but floats. They are clamped to the image, so that a cast to integers is defined.
 """
-
-import math
 
 import numpy as np
 
 from minisplat_ref.scalar._jit import scalar
-from minisplat_ref.scalar.literals import HALF, THREE, TWO, ZERO
+from minisplat_ref.scalar.lanes import ceil, floor, larger, log_of, smaller, sqrt
+from minisplat_ref.scalar.literals import HALF, ONE, THREE, TWO, ZERO
 
 INRIA_TILE = 16  # px; INRIA's rule is stated in tiles of this size
 INRIA_ROOT_MIN = 0.1  # px^4; floor of (lambda_1 - lambda_2)^2 / 4 in INRIA's largest eigenvalue
@@ -19,13 +17,13 @@ RADIUS_MAX = np.float32(1 << 24)  # px; covers any image, survives the cast to i
 @scalar
 def support_box(footprint, opacity, alpha_min, width, height):
     """Extent at which alpha falls to alpha_min: sqrt(2 ln(opacity / alpha_min)) standard deviations along x and y."""
-    reach = math.sqrt(TWO * math.log(opacity / alpha_min))
-    rx = math.ceil(min(reach * math.sqrt(footprint.cov_xx), RADIUS_MAX))
-    ry = math.ceil(min(reach * math.sqrt(footprint.cov_yy), RADIUS_MAX))
-    x0 = math.floor(min(max(footprint.x - rx, ZERO), width))
-    y0 = math.floor(min(max(footprint.y - ry, ZERO), height))
-    x1 = math.ceil(min(max(footprint.x + rx, ZERO), width))
-    y1 = math.ceil(min(max(footprint.y + ry, ZERO), height))
+    squared = TWO * log_of(larger(opacity / alpha_min, ONE))
+    rx = ceil(smaller(sqrt(squared * footprint.cov_xx), RADIUS_MAX))
+    ry = ceil(smaller(sqrt(squared * footprint.cov_yy), RADIUS_MAX))
+    x0 = floor(smaller(larger(footprint.x - rx, ZERO), width))
+    y0 = floor(smaller(larger(footprint.y - ry, ZERO), height))
+    x1 = ceil(smaller(larger(footprint.x + rx, ZERO), width))
+    y1 = ceil(smaller(larger(footprint.y + ry, ZERO), height))
     return rx, ry, x0, y0, x1, y1
 
 
@@ -33,9 +31,9 @@ def support_box(footprint, opacity, alpha_min, width, height):
 def inria_tiles(x, r, size):
     """Pixels of the tiles that INRIA counts under [x - r, x + r], where x counts pixel centres as integers."""
     beyond = size + INRIA_TILE - 1
-    first = math.floor(min(max(x - r, ZERO), beyond) / INRIA_TILE)
-    end = math.floor(min(max(x + r + INRIA_TILE - 1, ZERO), beyond) / INRIA_TILE)
-    return first * INRIA_TILE, min(end * INRIA_TILE, size)
+    first = floor(smaller(larger(x - r, ZERO), beyond) / INRIA_TILE)
+    end = floor(smaller(larger(x + r + (INRIA_TILE - 1), ZERO), beyond) / INRIA_TILE)
+    return first * INRIA_TILE, smaller(end * INRIA_TILE, size)
 
 
 @scalar
@@ -44,8 +42,8 @@ def inria_box(footprint, width, height):
     middle = HALF * (footprint.cov_xx + footprint.cov_yy)
     half_difference = HALF * (footprint.cov_xx - footprint.cov_yy)  # middle^2 - det, without its cancellation
     root = half_difference * half_difference + footprint.cov_xy * footprint.cov_xy
-    largest = middle + math.sqrt(max(INRIA_ROOT_MIN, root))
-    r = math.ceil(min(THREE * math.sqrt(largest), RADIUS_MAX))
+    largest = middle + sqrt(larger(root, INRIA_ROOT_MIN))
+    r = ceil(smaller(THREE * sqrt(largest), RADIUS_MAX))
     x0, x1 = inria_tiles(footprint.x - HALF, r, width)
     y0, y1 = inria_tiles(footprint.y - HALF, r, height)
     return r, r, x0, y0, x1, y1

@@ -10,159 +10,11 @@ meets float32 lanes by mistake does not compile. Where the lanes differ in what 
 Lanes are values: ``x += y`` would change every name of the same array in Python, and does not compile.
 """
 
-import math
-import operator
-from collections.abc import Callable
 from typing import Any
 
-import numba.extending
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.core import cgutils
-from numba.extending import models, overload, register_model
-
-__all__ = [
-    "WIDTH",
-    "any_of",
-    "counted",
-    "exp_of",
-    "filled",
-    "floor",
-    "larger",
-    "largest_of",
-    "load",
-    "lowest_bit",
-    "nearest",
-    "prefetch",
-    "scaled_by_power",
-    "select",
-    "smaller",
-    "sqrt",
-    "store",
-    "sum_of",
-    "sums_of",
-]
 
 WIDTH = 8
-intrinsic: Any = numba.extending.intrinsic  # its functions are called without their first argument
-_I32 = ir.IntType(32)
-
-
-class _Lanes(types.Type):
-    """Numba's type of eight numbers or booleans."""
-
-    def __init__(self, element: types.Type) -> None:
-        self.element = element
-        super().__init__(f"lanes({element})")
-
-
-@register_model(_Lanes)
-class _LanesModel(models.PrimitiveModel):
-    """A vector of LLVM."""
-
-    def __init__(self, manager: Any, lanes: _Lanes) -> None:
-        element = ir.IntType(1) if lanes.element == types.boolean else manager.lookup(lanes.element).get_value_type()
-        super().__init__(manager, lanes, ir.VectorType(element, WIDTH))
-
-
-# --- how operations are made ---
-
-
-def _joined(*kinds: types.Type) -> _Lanes | None:
-    """Lanes that all operands become; None where none are lanes, or one is too wide for them."""
-    lanes = next((kind for kind in kinds if isinstance(kind, _Lanes)), None)
-    if lanes is None:
-        return None
-    for kind in kinds:
-        is_narrow = isinstance(kind, types.Float) and kind.bitwidth <= getattr(lanes.element, "bitwidth", 0)
-        if kind != lanes and not is_narrow and not isinstance(kind, types.Integer | types.IntegerLiteral):
-            return None
-    return lanes
-
-
-def _spread(context: Any, builder: Any, value: Any, kind: types.Type, lanes: _Lanes) -> Any:
-    """Take a single number eight times; lanes are what they are."""
-    if isinstance(kind, _Lanes):
-        return value
-    nothing = ir.Constant(context.get_value_type(lanes), ir.Undefined)
-    single = builder.insert_element(nothing, context.cast(builder, value, kind, lanes.element), _I32(0))
-    return builder.shuffle_vector(single, nothing, ir.Constant(ir.VectorType(_I32, WIDTH), [0] * WIDTH))
-
-
-def _operands(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
-    lanes: Any = _joined(*signature.args)
-    return [_spread(context, builder, *pair, lanes) for pair in zip(args, signature.args, strict=True)]
-
-
-def _call(builder: Any, name: str, result: Any, args: Any) -> Any:
-    """Call one of LLVM's vector intrinsics, whose name ends with the operand's type."""
-    element = {"float": "f32", "double": "f64"}[str(args[-1].type.element)]
-    kind = ir.FunctionType(result, [arg.type for arg in args])
-    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"{name}.v{WIDTH}{element}"), args)
-
-
-def _lower(emit: Callable, has_boolean_result: bool = False, of_one: Callable | None = None) -> Callable:
-    """Return a function of one or two operands for compiled code.
-
-    ``emit`` writes the instruction for lanes; ``of_one`` is the function of single numbers, where Numba knows none.
-    """
-
-    def typed(*kinds: Any) -> Any:
-        lanes = _joined(*kinds)
-        if lanes is None:
-            return None
-        result = _Lanes(types.boolean) if has_boolean_result else lanes
-
-        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            return emit(builder, *_operands(context, builder, signature, args))
-
-        return result(*kinds), generate
-
-    @intrinsic
-    def unary(typing: Any, a: Any) -> Any:
-        return typed(a)
-
-    @intrinsic
-    def binary(typing: Any, a: Any, b: Any) -> Any:
-        return typed(a, b)
-
-    def compiled(*kinds: Any) -> Any:
-        if _joined(*kinds) is None:
-            return None if any(isinstance(kind, _Lanes) for kind in kinds) else of_one
-        return (lambda a: unary(a)) if len(kinds) == 1 else (lambda a, b: binary(a, b))
-
-    return compiled
-
-
-def _register_unary(function: Callable, emit: Callable, of_one: Callable | None = None) -> None:
-    compiled = _lower(emit, of_one=of_one)
-    overload(function)(lambda a: compiled(a))
-
-
-def _register_binary(
-    function: Callable, emit: Callable, has_boolean_result: bool = False, of_one: Callable | None = None
-) -> None:
-    compiled = _lower(emit, has_boolean_result, of_one)
-    overload(function)(lambda a, b: compiled(a, b))
-
-
-# --- arithmetic and comparisons; a product that is added is rounded once, as everywhere in the kernels ---
-
-_register_binary(operator.add, lambda builder, a, b: builder.fadd(a, b, flags=["contract"]))
-_register_binary(operator.sub, lambda builder, a, b: builder.fsub(a, b, flags=["contract"]))
-_register_binary(operator.mul, lambda builder, a, b: builder.fmul(a, b, flags=["contract"]))
-_register_binary(operator.truediv, lambda builder, a, b: builder.fdiv(a, b))
-_register_unary(operator.neg, lambda builder, a: builder.fneg(a))
-_register_unary(abs, lambda builder, a: _call(builder, "llvm.fabs", a.type, [a]))
-_register_binary(operator.and_, lambda builder, a, b: builder.and_(a, b))
-for _sign, _operator in {">": operator.gt, ">=": operator.ge, "<": operator.lt, "<=": operator.le}.items():
-    _register_binary(
-        _operator, lambda builder, a, b, sign=_sign: builder.fcmp_ordered(sign, a, b), has_boolean_result=True
-    )
-
-
-# --- functions; each has its meaning in Python first ---
 
 
 def larger(a: Any, b: Any) -> Any:
@@ -180,6 +32,11 @@ def floor(a: Any) -> Any:
     return np.floor(a)
 
 
+def ceil(a: Any) -> Any:
+    """Return the next integer above."""
+    return np.ceil(a)
+
+
 def nearest(a: Any) -> Any:
     """Return the nearest integer, as a float."""
     return np.rint(a)
@@ -195,20 +52,9 @@ def exp_of(a: Any) -> Any:
     return np.exp(a)
 
 
-def _larger(builder: Any, a: Any, b: Any) -> Any:
-    return builder.select(builder.fcmp_ordered(">", b, a), b, a)
-
-
-def _smaller(builder: Any, a: Any, b: Any) -> Any:
-    return builder.select(builder.fcmp_ordered("<", b, a), b, a)
-
-
-_register_binary(larger, _larger, of_one=lambda a, b: b if b > a else a)
-_register_binary(smaller, _smaller, of_one=lambda a, b: b if b < a else a)
-_register_unary(floor, lambda builder, a: _call(builder, "llvm.floor", a.type, [a]))
-_register_unary(nearest, lambda builder, a: _call(builder, "llvm.rint", a.type, [a]))
-_register_unary(sqrt, lambda builder, a: _call(builder, "llvm.sqrt", a.type, [a]), of_one=lambda a: math.sqrt(a))
-_register_unary(exp_of, lambda builder, a: _call(builder, "llvm.exp", a.type, [a]))
+def log_of(a: Any) -> Any:
+    """Return libm's natural logarithm of every lane."""
+    return np.log(a)
 
 
 def scaled_by_power(a: Any, n: Any) -> Any:
@@ -216,45 +62,9 @@ def scaled_by_power(a: Any, n: Any) -> Any:
     return np.ldexp(a, np.asarray(n, np.int32))
 
 
-@overload(scaled_by_power)
-def _overload_scaled_by_power(a, n):
-    return lambda a, n: _scaled_by_power(a, n)
-
-
-@intrinsic
-def _scaled_by_power(typing: Any, a: Any, n: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        bits = ir.VectorType(_I32, WIDTH)
-        exponent = builder.shl(builder.fptosi(args[1], bits), ir.Constant(bits, [23] * WIDTH))
-        return builder.bitcast(builder.add(builder.bitcast(args[0], bits), exponent), args[0].type)
-
-    return a(a, n), generate
-
-
 def select(condition: Any, a: Any, b: Any) -> Any:
     """Return ``a`` in the lanes where the condition holds and ``b`` in the others."""
     return np.where(condition, a, b)[()]
-
-
-@overload(select)
-def _overload_select(condition, a, b):
-    if isinstance(condition, _Lanes):
-        return lambda condition, a, b: _select(condition, a, b)
-    return lambda condition, a, b: a if condition else b
-
-
-@intrinsic
-def _select(typing: Any, condition: Any, a: Any, b: Any) -> Any:
-    lanes: Any = _joined(a, b)
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        pair = zip(args[1:], signature.args[1:], strict=True)
-        return builder.select(args[0], *(_spread(context, builder, *one, lanes) for one in pair))
-
-    return lanes(condition, a, b), generate
-
-
-# --- from and to single numbers ---
 
 
 def filled(number: Any) -> Any:
@@ -273,8 +83,29 @@ def load(array: Any, i: Any) -> Any:
 
 
 def store(array: Any, i: Any, lanes: Any) -> None:
-    """Write lanes to a 1-d array from ``i`` on."""
-    array[i : i + WIDTH] = lanes
+    """Write lanes, or a tuple of lanes one after the other, to a 1-d array from ``i`` on."""
+    numbers = np.ravel(lanes)
+    array[i : i + max(numbers.size, WIDTH)] = numbers
+
+
+def gather(table: Any, rows: Any, column: Any) -> Any:
+    """Return one number from each of eight rows of a C-contiguous table [N, ...], whose rows count as flat."""
+    return table.reshape(len(table), -1)[list(rows), column]
+
+
+def scatter(table: Any, rows: Any, column: Any, lanes: Any) -> None:
+    """Write one number to each of eight rows of a table, rounded to its dtype: the inverse of ``gather``."""
+    table.reshape(len(table), -1)[list(rows), column] = lanes
+
+
+def columns_of(a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
+    """Return the columns of the square whose rows are eight lanes: the first number of each, the second, and so on."""
+    return tuple(np.array([a, b, c, d, e, f, g, h]).T)
+
+
+def converted(lanes: Any, zero: Any) -> Any:
+    """Return lanes in the dtype of a number."""
+    return lanes.astype(zero.dtype)
 
 
 def sum_of(lanes: Any) -> Any:
@@ -301,168 +132,10 @@ def any_of(condition: Any) -> bool:
     return bool(np.any(condition))
 
 
-@overload(filled)
-def _overload_filled(number):
-    return lambda number: _filled(number)
-
-
-@intrinsic
-def _filled(typing: Any, number: Any) -> Any:
-    lanes = _Lanes(number)
-    return lanes(number), lambda context, builder, signature, args: _spread(context, builder, args[0], number, lanes)
-
-
-@overload(counted)
-def _overload_counted(zero):
-    return lambda zero: _counted(zero)
-
-
-@intrinsic
-def _counted(typing: Any, zero: Any) -> Any:
-    lanes = _Lanes(zero)
-    return lanes(zero), lambda context, builder, signature, args: ir.Constant(
-        context.get_value_type(lanes), [float(k) for k in range(WIDTH)]
-    )
-
-
-def _pointer(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-    array, vector = signature.args[0], context.get_value_type(_Lanes(signature.args[0].dtype))
-    data = context.make_array(array)(context, builder, args[0]).data
-    return builder.bitcast(builder.gep(data, [args[1]], inbounds=True), vector.as_pointer())
-
-
-@overload(load)
-def _overload_load(array, i):
-    return lambda array, i: _load(array, i)
-
-
-@intrinsic
-def _load(typing: Any, array: Any, i: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.load(_pointer(context, builder, signature, args), align=array.dtype.bitwidth // 8)
-
-    return _Lanes(array.dtype)(array, i), generate
-
-
-@overload(store)
-def _overload_store(array, i, lanes):
-    return lambda array, i, lanes: _store(array, i, lanes)
-
-
-@intrinsic
-def _store(typing: Any, array: Any, i: Any, lanes: Any) -> Any:
-    kind = _Lanes(array.dtype)
-    if _joined(kind, lanes) is None:
-        return None
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        value = _spread(context, builder, args[2], lanes, kind)
-        builder.store(value, _pointer(context, builder, signature, args), align=array.dtype.bitwidth // 8)
-        return context.get_dummy_value()
-
-    return types.void(array, i, lanes), generate
-
-
-def _register_reduction(function: Callable, emit: Callable) -> None:
-    """Fold lanes in halves with an instruction for two operands."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        (vector,) = args
-        width = WIDTH
-        while width > 1:
-            width //= 2
-            halves = (
-                ir.Constant(ir.VectorType(_I32, width), list(range(start, start + width))) for start in (0, width)
-            )
-            vector = emit(builder, *(builder.shuffle_vector(vector, vector, half) for half in halves))
-        return builder.extract_element(vector, _I32(0))
-
-    @intrinsic
-    def reduced(typing: Any, lanes: Any) -> Any:
-        return lanes.element(lanes), generate
-
-    overload(function)(lambda lanes: lambda lanes: reduced(lanes))
-
-
-@overload(sums_of)
-def _overload_sums_of(a, b, c, d, e, f, g, h):
-    return lambda a, b, c, d, e, f, g, h: _sums_of(a, b, c, d, e, f, g, h)
-
-
-@intrinsic
-def _sums_of(typing: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        vectors, width = list(args), WIDTH
-        while width > 1:  # two vectors become one: the sums of the halves of what each holds, one after the other
-            width //= 2
-            firsts = [k for k in range(2 * WIDTH) if k // width % 2 == 0]
-            masks = [ir.Constant(ir.VectorType(_I32, WIDTH), [k + shift for k in firsts]) for shift in (0, width)]
-            pairs = zip(vectors[::2], vectors[1::2], strict=True)
-            vectors = [builder.fadd(*(builder.shuffle_vector(*pair, mask) for mask in masks)) for pair in pairs]
-        return vectors[0]
-
-    return a(a, b, c, d, e, f, g, h), generate
-
-
-_register_reduction(sum_of, lambda builder, a, b: builder.fadd(a, b))
-_register_reduction(largest_of, _larger)
-
-
-@overload(any_of)
-def _overload_any_of(condition):
-    return lambda condition: _any_of(condition)
-
-
-@intrinsic
-def _any_of(typing: Any, condition: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        bits = builder.bitcast(args[0], ir.IntType(WIDTH))
-        return builder.icmp_unsigned("!=", bits, ir.IntType(WIDTH)(0))
-
-    return types.boolean(condition), generate
-
-
 def prefetch(table: Any, row: Any) -> None:
     """Ask for a row of a table [N, D] before it is needed: memory answers while something else is computed."""
-
-
-@overload(prefetch)
-def _overload_prefetch(table, row):
-    return lambda table, row: _prefetch(table, row)
-
-
-@intrinsic
-def _prefetch(typing: Any, table: Any, row: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        array = context.make_array(table)(context, builder, args[0])
-        address = builder.add(
-            builder.ptrtoint(array.data, ir.IntType(64)),
-            builder.mul(context.cast(builder, args[1], row, types.int64), builder.extract_value(array.strides, 0)),
-        )
-        byte = ir.IntType(8).as_pointer()
-        kind = ir.FunctionType(ir.VoidType(), [byte, _I32, _I32, _I32])
-        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        for line in (0, 60):
-            pointer = builder.inttoptr(builder.add(address, ir.IntType(64)(line)), byte)
-            builder.call(function, [pointer, _I32(0), _I32(3), _I32(1)])
-        return context.get_dummy_value()
-
-    return types.void(table, row), generate
 
 
 def lowest_bit(bits: Any) -> int:
     """Return the place of the lowest bit that is set in an integer that is not zero."""
     return (int(bits) & -int(bits)).bit_length() - 1
-
-
-@overload(lowest_bit)
-def _overload_lowest_bit(bits):
-    return lambda bits: _lowest_bit(bits)
-
-
-@intrinsic
-def _lowest_bit(typing: Any, bits: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.cttz(args[0], ir.IntType(1)(1))
-
-    return types.int64(bits), generate

@@ -11,11 +11,11 @@ for needles where u.u * w.w - (u.w)^2 would cancel. For the same reason the coni
 ``conic``) rather than as the inverse of rounded entries.
 """
 
-import math
 from typing import NamedTuple
 
 from minisplat_ref.scalar._jit import scalar
 from minisplat_ref.scalar.covariance import normalized, normalized_vjp, rotation, rotation_vjp
+from minisplat_ref.scalar.lanes import larger, select, smaller, sqrt
 from minisplat_ref.scalar.literals import HALF, ONE, TWO, ZERO
 
 
@@ -127,17 +127,17 @@ def project_gaussian(p, V, lens):
     inverse_z = ONE / p[2]
     x = p[0] * inverse_z
     y = p[1] * inverse_z
-    u = image_row(lens.fx * inverse_z, min(max(x, lens.x_min), lens.x_max), V[0], V[2])
-    w = image_row(lens.fy * inverse_z, min(max(y, lens.y_min), lens.y_max), V[1], V[2])
+    u = image_row(lens.fx * inverse_z, smaller(larger(x, lens.x_min), lens.x_max), V[0], V[2])
+    w = image_row(lens.fy * inverse_z, smaller(larger(y, lens.y_min), lens.y_max), V[1], V[2])
     cov_xx = dot(u, u)
     cov_xy = dot(u, w)
     cov_yy = dot(w, w)
     area = (u[1] * w[2] - u[2] * w[1], u[2] * w[0] - u[0] * w[2], u[0] * w[1] - u[1] * w[0])
     det_sharp = dot(area, area)
     det = det_sharp + lens.eps2d * (cov_xx + cov_yy) + lens.eps2d * lens.eps2d
-    compensation = ONE * det / det  # 1 in the data's dtype, NaN where det is not finite
+    compensation = ZERO * det + ONE  # NaN where det is not finite
     if lens.is_antialiased:
-        compensation = math.sqrt(max(lens.compensation_floor * lens.compensation_floor, det_sharp / det))
+        compensation = sqrt(larger(det_sharp / det, lens.compensation_floor * lens.compensation_floor))
     return Footprint(
         lens.fx * x + lens.cx,
         lens.fy * y + lens.cy,
@@ -158,8 +158,9 @@ def conic(footprint):
     c is put together so that the pivot c - b^2 / a is 1 / cov_yy to all digits, which cov_xx / det would not give.
     """
     a = footprint.cov_yy / footprint.det
-    slope = -footprint.cov_xy / footprint.cov_yy
-    return a, a * slope, ONE / footprint.cov_yy + a * slope * slope
+    pivot = ONE / footprint.cov_yy
+    slope = -footprint.cov_xy * pivot
+    return a, a * slope, pivot + a * slope * slope
 
 
 @scalar
@@ -170,8 +171,8 @@ def conic_vjp(footprint, v_conic):
     ``v_conic`` are large and cancel in the gradients by a and slope; they do so here, in two sums, and nowhere else.
     """
     a = footprint.cov_yy / footprint.det
-    slope = -footprint.cov_xy / footprint.cov_yy
     pivot = ONE / footprint.cov_yy
+    slope = -footprint.cov_xy * pivot
     by_schur = -a * (a * (v_conic[0] + slope * (v_conic[1] + slope * v_conic[2])))
     by_slope = pivot * a * (v_conic[1] + TWO * slope * v_conic[2])
     return (
@@ -185,9 +186,9 @@ def conic_vjp(footprint, v_conic):
 def compensation_vjp(footprint, v_compensation, lens):
     """Gradient of sqrt(det_sharp / det) by (cov_xx, cov_xy, cov_yy); zero on the floor."""
     rho = footprint.compensation
-    if not lens.is_antialiased or rho <= lens.compensation_floor:
+    if not lens.is_antialiased:
         return ZERO * rho, ZERO * rho, ZERO * rho
-    k = HALF * v_compensation / (rho * footprint.det)
+    k = select(rho > lens.compensation_floor, HALF * v_compensation / (rho * footprint.det), ZERO)
     keep = rho * rho
     return (
         k * (footprint.cov_yy - lens.eps2d - keep * footprint.cov_yy),
@@ -226,16 +227,12 @@ def project_gaussian_vjp(p, V, lens, footprint, v_x, v_y, v_depth, v_cov):
         TWO * v_cov[2] * w[1] + v_cov[1] * u[1],
         TWO * v_cov[2] * w[2] + v_cov[1] * u[2],
     )
-    v_V0, v_V2x, v_dir_x = image_row_vjp(lens.fx * inverse_z, min(max(x, lens.x_min), lens.x_max), V[2], v_u)
-    v_V1, v_V2y, v_dir_y = image_row_vjp(lens.fy * inverse_z, min(max(y, lens.y_min), lens.y_max), V[2], v_w)
+    v_V0, v_V2x, v_dir_x = image_row_vjp(lens.fx * inverse_z, smaller(larger(x, lens.x_min), lens.x_max), V[2], v_u)
+    v_V1, v_V2y, v_dir_y = image_row_vjp(lens.fy * inverse_z, smaller(larger(y, lens.y_min), lens.y_max), V[2], v_w)
     v_V2 = (v_V2x[0] + v_V2y[0], v_V2x[1] + v_V2y[1], v_V2x[2] + v_V2y[2])
 
-    v_ratio_x = lens.fx * v_x
-    v_ratio_y = lens.fy * v_y
-    if lens.x_min < x < lens.x_max:
-        v_ratio_x += v_dir_x
-    if lens.y_min < y < lens.y_max:
-        v_ratio_y += v_dir_y
+    v_ratio_x = lens.fx * v_x + select((x > lens.x_min) & (x < lens.x_max), v_dir_x, ZERO)
+    v_ratio_y = lens.fy * v_y + select((y > lens.y_min) & (y < lens.y_max), v_dir_y, ZERO)
     v_p = (
         v_ratio_x * inverse_z,
         v_ratio_y * inverse_z,

@@ -4,10 +4,9 @@ The sixteen basis functions are polynomials of the unit direction (x, y, z). The
 first-degree terms, and their gradients are the derivatives of those polynomials.
 """
 
-import math
-
 from minisplat_ref.scalar._jit import scalar
-from minisplat_ref.scalar.literals import FOUR, ONE, THREE, TWO, ZERO
+from minisplat_ref.scalar.lanes import select, sqrt
+from minisplat_ref.scalar.literals import FOUR, ONE, SIX, THREE, TWO, ZERO
 
 
 @scalar
@@ -17,9 +16,7 @@ def direction(centre, x, y, z):
     dy = y - centre[1]
     dz = z - centre[2]
     squared = dx * dx + dy * dy + dz * dz
-    if squared == ZERO:
-        return squared, squared, squared, squared
-    inverse = ONE / math.sqrt(squared)
+    inverse = select(squared > ZERO, ONE / sqrt(select(squared > ZERO, squared, ONE)), ZERO)
     return dx * inverse, dy * inverse, dz * inverse, inverse
 
 
@@ -31,68 +28,81 @@ def direction_vjp(x, y, z, inverse, v_x, v_y, v_z):
 
 
 @scalar
-def basis(x, y, z, c, degree, out):
-    """Write the (degree + 1)^2 basis functions into ``out``; ``c`` holds the constants of degrees 1, 2 (3), 3 (5)."""
-    if degree >= 1:
-        out[1] = -c[1] * y
-        out[2] = c[1] * z
-        out[3] = -c[1] * x
-    if degree >= 2:
-        out[4] = c[2] * x * y
-        out[5] = -c[2] * y * z
-        out[6] = c[3] * (TWO * z * z - x * x - y * y)
-        out[7] = -c[2] * x * z
-        out[8] = c[4] * (x * x - y * y)
-    if degree >= 3:
-        out[9] = -c[5] * y * (THREE * x * x - y * y)
-        out[10] = c[6] * x * y * z
-        out[11] = -c[7] * y * (FOUR * z * z - x * x - y * y)
-        out[12] = c[8] * z * (TWO * z * z - THREE * x * x - THREE * y * y)
-        out[13] = -c[7] * x * (FOUR * z * z - x * x - y * y)
-        out[14] = c[9] * z * (x * x - y * y)
-        out[15] = -c[5] * x * (x * x - THREE * y * y)
+def basis_1(x, y, z, c):
+    """Return the basis functions 1 to 3, of degree 1; ``c`` holds the constants of degrees 0, 1, 2 (3) and 3 (5)."""
+    return -c[1] * y, c[1] * z, -c[1] * x
 
 
 @scalar
-def basis_vjp(x, y, z, c, degree, v):
-    """Chain ``v[k] = dL/dY_k`` to the direction, degree by degree."""
-    v_x = ZERO * x
-    v_y = ZERO * x
-    v_z = ZERO * x
-    if degree >= 1:
-        v_x -= c[1] * v[3]
-        v_y -= c[1] * v[1]
-        v_z += c[1] * v[2]
-    if degree >= 2:
-        v_x += c[2] * (y * v[4] - z * v[7]) - TWO * x * (c[3] * v[6] - c[4] * v[8])
-        v_y += c[2] * (x * v[4] - z * v[5]) - TWO * y * (c[3] * v[6] + c[4] * v[8])
-        v_z += FOUR * c[3] * z * v[6] - c[2] * (y * v[5] + x * v[7])
-    if degree >= 3:
-        xx = x * x
-        yy = y * y
-        zz = z * z
-        v_x += (
-            -TWO * THREE * c[5] * x * y * v[9]
-            + c[6] * y * z * v[10]
-            + TWO * c[7] * x * y * v[11]
-            - TWO * THREE * c[8] * x * z * v[12]
-            - c[7] * (FOUR * zz - THREE * xx - yy) * v[13]
-            + TWO * c[9] * x * z * v[14]
-            - THREE * c[5] * (xx - yy) * v[15]
-        )
-        v_y += (
-            -THREE * c[5] * (xx - yy) * v[9]
-            + c[6] * x * z * v[10]
-            - c[7] * (FOUR * zz - xx - THREE * yy) * v[11]
-            - TWO * THREE * c[8] * y * z * v[12]
-            + TWO * c[7] * x * y * v[13]
-            - TWO * c[9] * y * z * v[14]
-            + TWO * THREE * c[5] * x * y * v[15]
-        )
-        v_z += (
-            c[6] * x * y * v[10]
-            - TWO * FOUR * c[7] * z * (y * v[11] + x * v[13])
-            + THREE * c[8] * (TWO * zz - xx - yy) * v[12]
-            + c[9] * (xx - yy) * v[14]
-        )
+def basis_2(x, y, z, c):
+    """Return the basis functions 4 to 8, of degree 2."""
+    return (
+        c[2] * x * y,
+        -c[2] * y * z,
+        c[3] * (TWO * z * z - x * x - y * y),
+        -c[2] * x * z,
+        c[4] * (x * x - y * y),
+    )
+
+
+@scalar
+def basis_3(x, y, z, c):
+    """Return the basis functions 9 to 15, of degree 3."""
+    return (
+        -c[5] * y * (THREE * x * x - y * y),
+        c[6] * x * y * z,
+        -c[7] * y * (FOUR * z * z - x * x - y * y),
+        c[8] * z * (TWO * z * z - THREE * x * x - THREE * y * y),
+        -c[7] * x * (FOUR * z * z - x * x - y * y),
+        c[9] * z * (x * x - y * y),
+        -c[5] * x * (x * x - THREE * y * y),
+    )
+
+
+@scalar
+def basis_1_vjp(c, v):
+    """Chain the gradient by the basis functions of degree 1 to the direction."""
+    return -c[1] * v[2], -c[1] * v[0], c[1] * v[1]
+
+
+@scalar
+def basis_2_vjp(x, y, z, c, v):
+    """Chain the gradient by the basis functions of degree 2 to the direction."""
+    return (
+        c[2] * (y * v[0] - z * v[3]) - TWO * x * (c[3] * v[2] - c[4] * v[4]),
+        c[2] * (x * v[0] - z * v[1]) - TWO * y * (c[3] * v[2] + c[4] * v[4]),
+        FOUR * c[3] * z * v[2] - c[2] * (y * v[1] + x * v[3]),
+    )
+
+
+@scalar
+def basis_3_vjp(x, y, z, c, v):
+    """Chain the gradient by the basis functions of degree 3 to the direction."""
+    xx = x * x
+    yy = y * y
+    zz = z * z
+    v_x = (
+        -SIX * c[5] * x * y * v[0]
+        + c[6] * y * z * v[1]
+        + TWO * c[7] * x * y * v[2]
+        - SIX * c[8] * x * z * v[3]
+        - c[7] * (FOUR * zz - THREE * xx - yy) * v[4]
+        + TWO * c[9] * x * z * v[5]
+        - THREE * c[5] * (xx - yy) * v[6]
+    )
+    v_y = (
+        -THREE * c[5] * (xx - yy) * v[0]
+        + c[6] * x * z * v[1]
+        - c[7] * (FOUR * zz - xx - THREE * yy) * v[2]
+        - SIX * c[8] * y * z * v[3]
+        + TWO * c[7] * x * y * v[4]
+        - TWO * c[9] * y * z * v[5]
+        + SIX * c[5] * x * y * v[6]
+    )
+    v_z = (
+        c[6] * x * y * v[1]
+        - TWO * FOUR * c[7] * z * (y * v[2] + x * v[4])
+        + THREE * c[8] * (TWO * zz - xx - yy) * v[3]
+        + c[9] * (xx - yy) * v[5]
+    )
     return v_x, v_y, v_z

@@ -15,7 +15,7 @@ from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_GRADIENT
 from minisplat_ref.render import render, render_vjp
 from minisplat_ref.scalar._jit import kernel, prange
 from minisplat_ref.splatting import Primitives
-from minisplat_ref.types import Floats, Gaussians, Ints, ProjectionGradient
+from minisplat_ref.types import Camera, Floats, Gaussians, Ints, ProjectionGradient
 
 N = 200_000
 SH_COEFFICIENTS = 16  # degree 3
@@ -109,8 +109,9 @@ def _projection_case(repeats: int) -> Case:
     exact = workload.gaussians._replace(sh_rest=sh_rest)
     single = _float32(exact)
     weights = [rng.normal(size=(N, *shape)) for shape in ((2,), (), (3,), (), (3,))]
-    reference, cpu = (_project_and_shade(*pair, workload, weights) for pair in ((REFERENCE, exact), (CPU, single)))
-    [seconds] = least_seconds([lambda: _project_and_shade(CPU, single, workload, weights)], repeats)
+    camera = workload.camera
+    reference, cpu = (_project_and_shade(*pair, camera, weights)() for pair in ((REFERENCE, exact), (CPU, single)))
+    [seconds] = least_seconds([_project_and_shade(CPU, single, camera, weights)], repeats)
     rows = (reference[0][:, 0] > 0) & (cpu[0][:, 0] > 0)  # one on the edge of being culled says nothing
     pairs = zip(reference[1:], cpu[1:], strict=True)
     error = max(float(np.linalg.norm(b[rows] - a[rows]) / np.linalg.norm(a[rows])) for a, b in pairs)
@@ -118,19 +119,28 @@ def _projection_case(repeats: int) -> Case:
 
 
 def _project_and_shade(
-    backend: Backend, g: Gaussians, workload: Workload, weights: Sequence[Floats]
-) -> tuple[Ints, Floats, Floats, Floats, Floats, Floats]:
-    """Radii, then centres, colours and gradients by means, scales and SH for weights on the visible Gaussians."""
-    camera = workload.camera
+    backend: Backend, g: Gaussians, camera: Camera, weights: Sequence[Floats]
+) -> Callable[[], tuple[Ints, Floats, Floats, Floats, Floats, Floats]]:
+    """Return a task; activations and what it differentiates, ``weights`` on the visible Gaussians, are made before.
+
+    It returns radii, then centres, colours and gradients by means, scales and SH.
+    """
     primitives = Primitives(g.means, g.quats, np.exp(g.log_scales), 1 / (1 + np.exp(-g.opacity_logits)))
-    projection = backend.project(*primitives, camera, GSPLAT_MAIN)
-    sh = (g.means, g.sh_dc, g.sh_rest, camera, SH_DEGREE_MAX, projection.radii)
-    colors = backend.sh_colors(*sh)
-    is_visible = projection.radii[:, 0] > 0
-    v = [np.where(is_visible.reshape(-1, *[1] * (w.ndim - 1)), w, 0).astype(g.means.dtype) for w in weights]
-    v_sh = backend.sh_colors_vjp(*sh, v[4])
-    v_primitives = backend.project_vjp(*primitives, camera, GSPLAT_MAIN, projection, ProjectionGradient(*v[:4]))
-    return projection.radii, projection.means2d, colors, v_primitives.means, v_primitives.scales, v_sh.sh_rest
+    is_visible = backend.project(*primitives, camera, GSPLAT_MAIN).radii[:, 0] > 0
+    v = [np.where(is_visible.reshape(-1, *[1] * (w.ndim - 1)), w, 0) for w in weights]
+    # The kernels give and take conics in float64, whatever the data.
+    dtypes = [g.means.dtype if backend is REFERENCE or k != 2 else np.float64 for k in range(len(v))]
+    v = [array.astype(dtype) for array, dtype in zip(v, dtypes, strict=True)]
+
+    def task() -> tuple[Ints, Floats, Floats, Floats, Floats, Floats]:
+        projection = backend.project(*primitives, camera, GSPLAT_MAIN)
+        sh = (g.means, g.sh_dc, g.sh_rest, camera, SH_DEGREE_MAX, projection.radii)
+        colors = backend.sh_colors(*sh)
+        v_sh = backend.sh_colors_vjp(*sh, v[4])
+        v_primitives = backend.project_vjp(*primitives, camera, GSPLAT_MAIN, projection, ProjectionGradient(*v[:4]))
+        return projection.radii, projection.means2d, colors, v_primitives.means, v_primitives.scales, v_sh.sh_rest
+
+    return task
 
 
 def _lists_case(repeats: int) -> Case:

@@ -1,0 +1,61 @@
+"""Eight Gaussians as one step: which rows of the tables they are, and their numbers as lanes.
+
+Forward, all Gaussians are gone through in order; backward, and for colours, those that the camera sees, from a list.
+The last row of a range fills up the last eight. What is written to it several times is the same; only sums over
+Gaussians have to leave the copies out.
+"""
+
+import numpy as np
+
+from minisplat_ref.scalar._jit import scalar
+from minisplat_ref.scalar.lanes import WIDTH, converted, gather, load, select, store
+from minisplat_ref.scalar.literals import ZERO
+
+DOUBLE = np.float64(0)  # names the dtype
+
+
+@scalar
+def rows_from(n, end):
+    """Return eight rows from ``n`` on, below ``end``."""
+    last = end - 1
+    near = n, min(n + 1, last), min(n + 2, last), min(n + 3, last)
+    return (*near, min(n + 4, last), min(n + 5, last), min(n + 6, last), min(n + 7, last))
+
+
+@scalar
+def listed_rows(rows, i):
+    """Return the eight rows of a list from ``i`` on."""
+    return rows[i], rows[i + 1], rows[i + 2], rows[i + 3], rows[i + 4], rows[i + 5], rows[i + 6], rows[i + 7]
+
+
+@scalar
+def list_visible(radii, first, end, rows):
+    """List the visible Gaussians of a range, and the last of them again; return their number.
+
+    There is no branch: it could not be foreseen.
+    """
+    count = 0
+    for n in range(first, end):
+        rows[count] = n
+        count += int(radii[n, 0] > 0)
+    for i in range(count, count + WIDTH):
+        rows[i] = rows[max(count - 1, 0)]
+    return count
+
+
+@scalar
+def gather_wide(table, rows, column):
+    """Return a column of eight rows in float64."""
+    return converted(gather(table, rows, column), DOUBLE)
+
+
+@scalar
+def triple(table, rows):
+    """Return the first three columns of eight rows in float64."""
+    return gather_wide(table, rows, 0), gather_wide(table, rows, 1), gather_wide(table, rows, 2)
+
+
+@scalar
+def add(sums, k, is_counted, lanes):
+    """Add to the eight sums number ``k`` of a buffer."""
+    store(sums, k * WIDTH, load(sums, k * WIDTH) + select(is_counted, lanes, ZERO))
