@@ -9,10 +9,10 @@ import operator
 from collections.abc import Callable
 from typing import Any
 
-import numba.extending
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
+from numba.core.typing.templates import infer, infer_global, make_intrinsic_template
 from numba.extending import models, overload, register_model
 
 from minisplat_ref.scalar.lanes import (
@@ -29,7 +29,6 @@ from minisplat_ref.scalar.lanes import (
     sqrt,
 )
 
-intrinsic: Any = numba.extending.intrinsic  # its functions are called without their first argument
 I32 = ir.IntType(32)
 
 
@@ -86,11 +85,22 @@ def _call(builder: Any, name: str, result: Any, args: Any) -> Any:
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"{name}.v{WIDTH}{element}"), args)
 
 
-def _lower(emit: Callable, has_boolean_result: bool = False, of_one: Callable | None = None) -> Callable:
-    """Return a function of one or two operands for compiled code.
+def compiled(function: Callable) -> Callable[[Callable], None]:
+    """Register what a function is in compiled code.
 
-    ``emit`` writes the instruction for lanes; ``of_one`` is the function of single numbers, where Numba knows none.
+    Numba's ``overload`` would do, but compiles a function around each of them, which takes longer than all the rest.
     """
+
+    def register(definition: Callable) -> None:
+        template = make_intrinsic_template(function, definition, function.__name__)
+        infer(template)
+        infer_global(function, types.Function(template))
+
+    return register
+
+
+def _typed(emit: Callable, has_boolean_result: bool = False) -> Callable:
+    """Return the typing of a function of lanes, and with it ``emit``, which writes its instruction."""
 
     def typed(*kinds: Any) -> Any:
         lanes = joined(*kinds)
@@ -103,32 +113,24 @@ def _lower(emit: Callable, has_boolean_result: bool = False, of_one: Callable | 
 
         return result(*kinds), generate
 
-    @intrinsic
-    def unary(typing: Any, a: Any) -> Any:
-        return typed(a)
-
-    @intrinsic
-    def binary(typing: Any, a: Any, b: Any) -> Any:
-        return typed(a, b)
-
-    def compiled(*kinds: Any) -> Any:
-        if joined(*kinds) is None:
-            return None if any(isinstance(kind, LanesType) for kind in kinds) else of_one
-        return (lambda a: unary(a)) if len(kinds) == 1 else (lambda a, b: binary(a, b))
-
-    return compiled
+    return typed
 
 
 def _register_unary(function: Callable, emit: Callable, of_one: Callable | None = None) -> None:
-    compiled = _lower(emit, of_one=of_one)
-    overload(function)(lambda a: compiled(a))
+    """Register a function of lanes; ``of_one`` is the function of single numbers, where Numba knows none."""
+    typed = _typed(emit)
+    compiled(function)(lambda typing, a: typed(a))
+    if of_one is not None:
+        overload(function)(lambda a: None if isinstance(a, LanesType) else of_one)
 
 
 def _register_binary(
     function: Callable, emit: Callable, has_boolean_result: bool = False, of_one: Callable | None = None
 ) -> None:
-    compiled = _lower(emit, has_boolean_result, of_one)
-    overload(function)(lambda a, b: compiled(a, b))
+    typed = _typed(emit, has_boolean_result)
+    compiled(function)(lambda typing, a, b: typed(a, b))
+    if of_one is not None:
+        overload(function)(lambda a, b: None if isinstance(a, LanesType) or isinstance(b, LanesType) else of_one)
 
 
 # --- arithmetic and comparisons; a product that is added is rounded once, as everywhere in the kernels ---
@@ -167,12 +169,7 @@ _register_unary(exp_of, lambda builder, a: _call(builder, "llvm.exp", a.type, [a
 _register_unary(log_of, lambda builder, a: _call(builder, "llvm.log", a.type, [a]))
 
 
-@overload(scaled_by_power)
-def _overload_scaled_by_power(a, n):
-    return lambda a, n: _scaled_by_power(a, n)
-
-
-@intrinsic
+@compiled(scaled_by_power)
 def _scaled_by_power(typing: Any, a: Any, n: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bits = ir.VectorType(I32, WIDTH)
@@ -183,15 +180,15 @@ def _scaled_by_power(typing: Any, a: Any, n: Any) -> Any:
 
 
 @overload(select)
-def _overload_select(condition, a, b):
-    if isinstance(condition, LanesType):
-        return lambda condition, a, b: _select(condition, a, b)
-    return lambda condition, a, b: a if condition else b
+def _select_one(condition, a, b):
+    return None if isinstance(condition, LanesType) else lambda condition, a, b: a if condition else b
 
 
-@intrinsic
+@compiled(select)
 def _select(typing: Any, condition: Any, a: Any, b: Any) -> Any:
-    lanes: Any = joined(a, b)
+    lanes = joined(a, b)
+    if lanes is None or not isinstance(condition, LanesType):
+        return None
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         pair = zip(args[1:], signature.args[1:], strict=True)

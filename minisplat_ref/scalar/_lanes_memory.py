@@ -6,9 +6,8 @@ from typing import Any
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.extending import overload
 
-from minisplat_ref.scalar._lanes_arithmetic import I32, LanesType, intrinsic, joined, larger_lanes, spread
+from minisplat_ref.scalar._lanes_arithmetic import I32, LanesType, compiled, joined, larger_lanes, spread
 from minisplat_ref.scalar.lanes import (
     WIDTH,
     any_of,
@@ -28,23 +27,13 @@ from minisplat_ref.scalar.lanes import (
 )
 
 
-@overload(filled)
-def _overload_filled(number):
-    return lambda number: _filled(number)
-
-
-@intrinsic
+@compiled(filled)
 def _filled(typing: Any, number: Any) -> Any:
     lanes = LanesType(number)
     return lanes(number), lambda context, builder, signature, args: spread(context, builder, args[0], number, lanes)
 
 
-@overload(counted)
-def _overload_counted(zero):
-    return lambda zero: _counted(zero)
-
-
-@intrinsic
+@compiled(counted)
 def _counted(typing: Any, zero: Any) -> Any:
     lanes = LanesType(zero)
     return lanes(zero), lambda context, builder, signature, args: ir.Constant(
@@ -58,12 +47,7 @@ def _pointer(context: Any, builder: Any, signature: Any, args: Any) -> Any:
     return builder.bitcast(builder.gep(data, [args[1]], inbounds=True), vector.as_pointer())
 
 
-@overload(load)
-def _overload_load(array, i):
-    return lambda array, i: _load(array, i)
-
-
-@intrinsic
+@compiled(load)
 def _load(typing: Any, array: Any, i: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.load(_pointer(context, builder, signature, args), align=array.dtype.bitwidth // 8)
@@ -71,12 +55,7 @@ def _load(typing: Any, array: Any, i: Any) -> Any:
     return LanesType(array.dtype)(array, i), generate
 
 
-@overload(store)
-def _overload_store(array, i, lanes):
-    return lambda array, i, lanes: _store(array, i, lanes)
-
-
-@intrinsic
+@compiled(store)
 def _store(typing: Any, array: Any, i: Any, lanes: Any) -> Any:
     kind = LanesType(array.dtype)
     kinds = list(lanes) if isinstance(lanes, types.BaseTuple) else [lanes]
@@ -94,11 +73,6 @@ def _store(typing: Any, array: Any, i: Any, lanes: Any) -> Any:
     return types.void(array, i, lanes), generate
 
 
-@overload(gather)
-def _overload_gather(table, rows, column):
-    return lambda table, rows, column: _gather(table, rows, column)
-
-
 def _row_pointers(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
     """Where the numbers of a column stand; a table of one dimension has one column, 0."""
     array = context.make_array(signature.args[0])(context, builder, args[0])
@@ -108,7 +82,7 @@ def _row_pointers(context: Any, builder: Any, signature: Any, args: Any) -> list
     return [builder.bitcast(builder.gep(start, [builder.mul(row, stride)]), array.data.type) for row in rows]
 
 
-@intrinsic
+@compiled(gather)
 def _gather(typing: Any, table: Any, rows: Any, column: Any) -> Any:
     lanes = LanesType(table.dtype)
 
@@ -121,12 +95,7 @@ def _gather(typing: Any, table: Any, rows: Any, column: Any) -> Any:
     return lanes(table, rows, types.int64), generate
 
 
-@overload(scatter)
-def _overload_scatter(table, rows, column, lanes):
-    return lambda table, rows, column, lanes: _scatter(table, rows, column, lanes)
-
-
-@intrinsic
+@compiled(scatter)
 def _scatter(typing: Any, table: Any, rows: Any, column: Any, lanes: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         vector = _convert(builder, args[3], context.get_value_type(LanesType(table.dtype)))
@@ -145,12 +114,7 @@ def _convert(builder: Any, vector: Any, kind: Any) -> Any:
     return (builder.fptrunc if isinstance(kind.element, ir.FloatType) else builder.fpext)(vector, kind)
 
 
-@overload(converted)
-def _overload_converted(lanes, zero):
-    return lambda lanes, zero: _converted(lanes, zero)
-
-
-@intrinsic
+@compiled(converted)
 def _converted(typing: Any, lanes: Any, zero: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return _convert(builder, args[0], context.get_value_type(LanesType(zero)))
@@ -158,12 +122,7 @@ def _converted(typing: Any, lanes: Any, zero: Any) -> Any:
     return LanesType(zero)(lanes, zero), generate
 
 
-@overload(columns_of)
-def _overload_columns_of(a, b, c, d, e, f, g, h):
-    return lambda a, b, c, d, e, f, g, h: _columns_of(a, b, c, d, e, f, g, h)
-
-
-@intrinsic
+@compiled(columns_of)
 def _columns_of(typing: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
     result = types.UniTuple(a, WIDTH)
 
@@ -193,19 +152,10 @@ def _register_reduction(function: Callable, emit: Callable) -> None:
             vector = emit(builder, *(builder.shuffle_vector(vector, vector, half) for half in halves))
         return builder.extract_element(vector, I32(0))
 
-    @intrinsic
-    def reduced(typing: Any, lanes: Any) -> Any:
-        return lanes.element(lanes), generate
-
-    overload(function)(lambda lanes: lambda lanes: reduced(lanes))
+    compiled(function)(lambda typing, lanes: (lanes.element(lanes), generate))
 
 
-@overload(sums_of)
-def _overload_sums_of(a, b, c, d, e, f, g, h):
-    return lambda a, b, c, d, e, f, g, h: _sums_of(a, b, c, d, e, f, g, h)
-
-
-@intrinsic
+@compiled(sums_of)
 def _sums_of(typing: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         vectors, width = list(args), WIDTH
@@ -224,12 +174,7 @@ _register_reduction(sum_of, lambda builder, a, b: builder.fadd(a, b))
 _register_reduction(largest_of, larger_lanes)
 
 
-@overload(any_of)
-def _overload_any_of(condition):
-    return lambda condition: _any_of(condition)
-
-
-@intrinsic
+@compiled(any_of)
 def _any_of(typing: Any, condition: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bits = builder.bitcast(args[0], ir.IntType(WIDTH))
@@ -238,12 +183,7 @@ def _any_of(typing: Any, condition: Any) -> Any:
     return types.boolean(condition), generate
 
 
-@overload(prefetch)
-def _overload_prefetch(table, row):
-    return lambda table, row: _prefetch(table, row)
-
-
-@intrinsic
+@compiled(prefetch)
 def _prefetch(typing: Any, table: Any, row: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         array = context.make_array(table)(context, builder, args[0])
@@ -262,12 +202,7 @@ def _prefetch(typing: Any, table: Any, row: Any) -> Any:
     return types.void(table, row), generate
 
 
-@overload(lowest_bit)
-def _overload_lowest_bit(bits):
-    return lambda bits: _lowest_bit(bits)
-
-
-@intrinsic
+@compiled(lowest_bit)
 def _lowest_bit(typing: Any, bits: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.cttz(args[0], ir.IntType(1)(1))
