@@ -34,7 +34,7 @@ def list_visible(radii, first, end, rows):
 
     There is no branch: it could not be foreseen.
     """
-    count = 0
+    count = np.int64(0)
     for n in range(first, end):
         rows[count] = n
         count += np.int64(radii[n, 0] > 0)

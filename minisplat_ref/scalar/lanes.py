@@ -18,7 +18,8 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic, models, overload, register_model
+from numba.core.typing.templates import infer, infer_global, make_intrinsic_template
+from numba.extending import models, overload, register_model
 
 __all__ = [
     "WIDTH", "any_of", "ceil", "columns_of", "converted", "counted", "exp_of", "filled", "floor", "gather", "larger",
@@ -83,11 +84,22 @@ def _call(builder: Any, name: str, result: Any, args: Any) -> Any:
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"{name}.v{WIDTH}{element}"), args)
 
 
-def _lower(emit: Callable, has_boolean_result: bool = False, of_one: Callable | None = None) -> Callable:
-    """Return a function of one or two operands for compiled code.
+def _compiled(function: Callable) -> Callable[[Callable], None]:
+    """Register what a function is in compiled code.
 
-    ``emit`` writes the instruction for lanes; ``of_one`` is the function of single numbers, where Numba knows none.
+    Numba's ``overload`` would do, but compiles a function around each of them, which takes longer than all the rest.
     """
+
+    def register(definition: Callable) -> None:
+        template = make_intrinsic_template(function, definition, function.__name__)
+        infer(template)
+        infer_global(function, types.Function(template))
+
+    return register
+
+
+def _typed(emit: Callable, has_boolean_result: bool = False) -> Callable:
+    """Return the typing of a function of lanes, and with it ``emit``, which writes its instruction."""
 
     def typed(*kinds: Any) -> Any:
         lanes = _joined(*kinds)
@@ -100,32 +112,24 @@ def _lower(emit: Callable, has_boolean_result: bool = False, of_one: Callable | 
 
         return result(*kinds), generate
 
-    @intrinsic
-    def unary(typing: Any, a: Any) -> Any:
-        return typed(a)
-
-    @intrinsic
-    def binary(typing: Any, a: Any, b: Any) -> Any:
-        return typed(a, b)
-
-    def compiled(*kinds: Any) -> Any:
-        if _joined(*kinds) is None:
-            return None if any(isinstance(kind, _Lanes) for kind in kinds) else of_one
-        return (lambda a: unary(a)) if len(kinds) == 1 else (lambda a, b: binary(a, b))
-
-    return compiled
+    return typed
 
 
 def _register_unary(function: Callable, emit: Callable, of_one: Callable | None = None) -> None:
-    compiled = _lower(emit, of_one=of_one)
-    overload(function)(lambda a: compiled(a))
+    """Register a function of lanes; ``of_one`` is the function of single numbers, where Numba knows none."""
+    typed = _typed(emit)
+    _compiled(function)(lambda typing, a: typed(a))
+    if of_one is not None:
+        overload(function)(lambda a: None if isinstance(a, _Lanes) else of_one)
 
 
 def _register_binary(
     function: Callable, emit: Callable, has_boolean_result: bool = False, of_one: Callable | None = None
 ) -> None:
-    compiled = _lower(emit, has_boolean_result, of_one)
-    overload(function)(lambda a, b: compiled(a, b))
+    typed = _typed(emit, has_boolean_result)
+    _compiled(function)(lambda typing, a, b: typed(a, b))
+    if of_one is not None:
+        overload(function)(lambda a, b: None if isinstance(a, _Lanes) or isinstance(b, _Lanes) else of_one)
 
 
 # --- arithmetic and comparisons; a product that is added is rounded once, as everywhere in the kernels ---
@@ -209,12 +213,7 @@ def scaled_by_power(a, n):
     return np.ldexp(a, np.asarray(n, np.int32))
 
 
-@overload(scaled_by_power)
-def _overload_scaled_by_power(a, n):
-    return lambda a, n: _scaled_by_power(a, n)  # type: ignore[call-arg]  # the typing context is numba's to pass
-
-
-@intrinsic
+@_compiled(scaled_by_power)
 def _scaled_by_power(typing: Any, a: Any, n: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bits = ir.VectorType(_I32, WIDTH)
@@ -230,21 +229,21 @@ def select(condition, a, b):
 
 
 @overload(select)
-def _overload_select(condition, a, b):
-    if isinstance(condition, _Lanes):
-        return lambda condition, a, b: _select(condition, a, b)  # type: ignore[call-arg]
-    return lambda condition, a, b: a if condition else b
+def _select_one(condition, a, b):
+    return None if isinstance(condition, _Lanes) else lambda condition, a, b: a if condition else b
 
 
-@intrinsic
+@_compiled(select)
 def _select(typing: Any, condition: Any, a: Any, b: Any) -> Any:
     lanes = _joined(a, b)
+    if lanes is None or not isinstance(condition, _Lanes):
+        return None
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         pair = zip(args[1:], signature.args[1:], strict=True)
         return builder.select(args[0], *(_spread(context, builder, *one, lanes) for one in pair))
 
-    return lanes(condition, a, b), generate  # type: ignore[misc]
+    return lanes(condition, a, b), generate
 
 
 # --- from and to single numbers ---
@@ -315,23 +314,13 @@ def any_of(condition):
     return bool(np.any(condition))
 
 
-@overload(filled)
-def _overload_filled(number):
-    return lambda number: _filled(number)  # type: ignore[call-arg]
-
-
-@intrinsic
+@_compiled(filled)
 def _filled(typing: Any, number: Any) -> Any:
     lanes = _Lanes(number)
     return lanes(number), lambda context, builder, signature, args: _spread(context, builder, args[0], number, lanes)
 
 
-@overload(counted)
-def _overload_counted(zero):
-    return lambda zero: _counted(zero)  # type: ignore[call-arg]
-
-
-@intrinsic
+@_compiled(counted)
 def _counted(typing: Any, zero: Any) -> Any:
     lanes = _Lanes(zero)
     return lanes(zero), lambda context, builder, signature, args: ir.Constant(
@@ -345,12 +334,7 @@ def _pointer(context: Any, builder: Any, signature: Any, args: Any) -> Any:
     return builder.bitcast(builder.gep(data, [args[1]], inbounds=True), vector.as_pointer())
 
 
-@overload(load)
-def _overload_load(array, i):
-    return lambda array, i: _load(array, i)  # type: ignore[call-arg]
-
-
-@intrinsic
+@_compiled(load)
 def _load(typing: Any, array: Any, i: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.load(_pointer(context, builder, signature, args), align=array.dtype.bitwidth // 8)
@@ -358,12 +342,7 @@ def _load(typing: Any, array: Any, i: Any) -> Any:
     return _Lanes(array.dtype)(array, i), generate
 
 
-@overload(store)
-def _overload_store(array, i, lanes):
-    return lambda array, i, lanes: _store(array, i, lanes)  # type: ignore[call-arg]
-
-
-@intrinsic
+@_compiled(store)
 def _store(typing: Any, array: Any, i: Any, lanes: Any) -> Any:
     kind = _Lanes(array.dtype)
     kinds = list(lanes) if isinstance(lanes, types.BaseTuple) else [lanes]
@@ -379,11 +358,6 @@ def _store(typing: Any, array: Any, i: Any, lanes: Any) -> Any:
     return types.void(array, i, lanes), generate
 
 
-@overload(gather)
-def _overload_gather(table, rows, column):
-    return lambda table, rows, column: _gather(table, rows, column)  # type: ignore[call-arg]
-
-
 def _row_pointers(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
     """Where the numbers of a column stand; a table of one dimension has one column, 0."""
     array = context.make_array(signature.args[0])(context, builder, args[0])
@@ -393,7 +367,7 @@ def _row_pointers(context: Any, builder: Any, signature: Any, args: Any) -> list
     return [builder.bitcast(builder.gep(start, [builder.mul(row, stride)]), array.data.type) for row in rows]
 
 
-@intrinsic
+@_compiled(gather)
 def _gather(typing: Any, table: Any, rows: Any, column: Any) -> Any:
     lanes = _Lanes(table.dtype)
 
@@ -406,12 +380,7 @@ def _gather(typing: Any, table: Any, rows: Any, column: Any) -> Any:
     return lanes(table, rows, types.int64), generate
 
 
-@overload(scatter)
-def _overload_scatter(table, rows, column, lanes):
-    return lambda table, rows, column, lanes: _scatter(table, rows, column, lanes)  # type: ignore[call-arg]
-
-
-@intrinsic
+@_compiled(scatter)
 def _scatter(typing: Any, table: Any, rows: Any, column: Any, lanes: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         vector = _convert(builder, args[3], context.get_value_type(_Lanes(table.dtype)))
@@ -430,12 +399,7 @@ def _convert(builder: Any, vector: Any, kind: Any) -> Any:
     return (builder.fptrunc if isinstance(kind.element, ir.FloatType) else builder.fpext)(vector, kind)
 
 
-@overload(converted)
-def _overload_converted(lanes, zero):
-    return lambda lanes, zero: _converted(lanes, zero)  # type: ignore[call-arg]
-
-
-@intrinsic
+@_compiled(converted)
 def _converted(typing: Any, lanes: Any, zero: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return _convert(builder, args[0], context.get_value_type(_Lanes(zero)))
@@ -443,12 +407,7 @@ def _converted(typing: Any, lanes: Any, zero: Any) -> Any:
     return _Lanes(zero)(lanes, zero), generate
 
 
-@overload(columns_of)
-def _overload_columns_of(a, b, c, d, e, f, g, h):
-    return lambda a, b, c, d, e, f, g, h: _columns_of(a, b, c, d, e, f, g, h)  # type: ignore[call-arg]
-
-
-@intrinsic
+@_compiled(columns_of)
 def _columns_of(typing: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
     result = types.UniTuple(a, WIDTH)
 
@@ -480,19 +439,10 @@ def _register_reduction(function: Callable, emit: Callable) -> None:
             vector = emit(builder, *(builder.shuffle_vector(vector, vector, half) for half in halves))
         return builder.extract_element(vector, _I32(0))
 
-    @intrinsic
-    def reduced(typing: Any, lanes: Any) -> Any:
-        return lanes.element(lanes), generate
-
-    overload(function)(lambda lanes: lambda lanes: reduced(lanes))
+    _compiled(function)(lambda typing, lanes: (lanes.element(lanes), generate))
 
 
-@overload(sums_of)
-def _overload_sums_of(a, b, c, d, e, f, g, h):
-    return lambda a, b, c, d, e, f, g, h: _sums_of(a, b, c, d, e, f, g, h)  # type: ignore[call-arg]
-
-
-@intrinsic
+@_compiled(sums_of)
 def _sums_of(typing: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         vectors, width = list(args), WIDTH
@@ -511,12 +461,7 @@ _register_reduction(sum_of, lambda builder, a, b: builder.fadd(a, b))
 _register_reduction(largest_of, _larger)
 
 
-@overload(any_of)
-def _overload_any_of(condition):
-    return lambda condition: _any_of(condition)  # type: ignore[call-arg]
-
-
-@intrinsic
+@_compiled(any_of)
 def _any_of(typing: Any, condition: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bits = builder.bitcast(args[0], ir.IntType(WIDTH))
@@ -529,12 +474,7 @@ def prefetch(table, row):
     """Ask for a row of a table [N, D] before it is needed: memory answers while something else is computed."""
 
 
-@overload(prefetch)
-def _overload_prefetch(table, row):
-    return lambda table, row: _prefetch(table, row)  # type: ignore[call-arg]
-
-
-@intrinsic
+@_compiled(prefetch)
 def _prefetch(typing: Any, table: Any, row: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         array = context.make_array(table)(context, builder, args[0])
@@ -558,12 +498,7 @@ def lowest_bit(bits):
     return (int(bits) & -int(bits)).bit_length() - 1
 
 
-@overload(lowest_bit)
-def _overload_lowest_bit(bits):
-    return lambda bits: _lowest_bit(bits)  # type: ignore[call-arg]
-
-
-@intrinsic
+@_compiled(lowest_bit)
 def _lowest_bit(typing: Any, bits: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.cttz(args[0], ir.IntType(1)(1))
