@@ -16,7 +16,7 @@ from minisplat_ref.constants import SSIM_C1, SSIM_C2, SSIM_SIGMA, SSIM_WINDOW
 from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.lanes import WIDTH, filled, load, select, store, sum_of
 from minisplat_ref.scalar.literals import TWO, ZERO
-from minisplat_ref.scalar.loss import ssim_with_vjp
+from minisplat_ref.scalar.loss import ssim_and_derivatives
 
 HALF_WINDOW = SSIM_WINDOW // 2
 PAD = 3 * HALF_WINDOW  # numbers of margin before an interleaved row, and at least as many behind it
@@ -90,7 +90,7 @@ def loss_kernels(dtype: np.dtype) -> LossKernels:
         field = derivatives.size // 3
         for i in range(0, n_values, WIDTH):
             means = across(s, i), across(s, length + i), across(s, 2 * length + i), across(s, 3 * length + i)
-            value, by_i, by_ii, by_it = ssim_with_vjp(*means, c1, c2)
+            value, by_i, by_ii, by_it = ssim_and_derivatives(*means, c1, c2)
             store(values, y * length + i, value)
             store(derivatives, row + PAD + i, by_i)
             store(derivatives, field + row + PAD + i, by_ii)

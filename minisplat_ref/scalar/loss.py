@@ -5,7 +5,7 @@ from minisplat_ref.scalar.literals import ONE, TWO
 
 
 @scalar
-def ssim_with_vjp(mean_i, mean_t, mean_squares, mean_it, c1, c2):
+def ssim_and_derivatives(mean_i, mean_t, mean_squares, mean_it, c1, c2):
     """Return SSIM = (A1 A2) / (B1 B2), and its derivatives by the windowed means of I, I^2 and I T.
 
     Of I^2 and T^2 it needs the sum of the means only. The variance and the covariance depend on mean_i too, which gives
