@@ -32,11 +32,13 @@ def _row_length(width: int) -> int:
     return n_blocks * WIDTH
 
 
-def _padded(image: Floats) -> Floats:
+def _padded(image: Floats, target: Floats) -> tuple[Floats, Floats]:
     height, width, _ = image.shape
-    rows = np.empty((height + 2 * HALF_WINDOW, _row_length(width)), image.dtype)
-    pad_rows(image.reshape(height, 3 * width), rows)
-    return rows
+    shape = (height + 2 * HALF_WINDOW, _row_length(width))
+    padded = np.empty(shape, image.dtype), np.empty(shape, image.dtype)
+    rows = (array.astype(image.dtype, copy=False).reshape(height, 3 * width) for array in (image, target))
+    pad_rows(*rows, *padded)
+    return padded
 
 
 def _ssim(image: Floats, target: Floats, shape: tuple[int, ...]) -> tuple[Floats, Floats]:
@@ -53,7 +55,7 @@ def _ssim(image: Floats, target: Floats, shape: tuple[int, ...]) -> tuple[Floats
 
 def ssim_map(image: Floats, target: Floats) -> Floats:
     """Structural similarity of every value; see ``reference.loss.ssim_map``."""
-    values, _ = _ssim(_padded(image), _padded(target.astype(image.dtype, copy=False)), image.shape)
+    values, _ = _ssim(*_padded(image, target), image.shape)
     return values[:, : 3 * image.shape[1]].reshape(image.shape)
 
 
@@ -61,12 +63,11 @@ def photometric_loss(
     image: Floats, target: Floats, dssim_weight: float, mask: Bools | None = None
 ) -> tuple[float, LossTape]:
     """(1 - w) mean |I - T| + w (1 - mean SSIM); see ``reference.loss.photometric_loss``."""
-    target = target.astype(image.dtype, copy=False)
     height, width, _ = image.shape
     n_values = image.size if mask is None else 3 * int(np.count_nonzero(mask))
     if mask is not None:
-        image = np.where(mask[..., None], image, target)
-    padded_image, padded_target = _padded(image), _padded(target)
+        image = np.where(mask[..., None], image, target.astype(image.dtype, copy=False))
+    padded_image, padded_target = _padded(image, target)
     values, derivatives = _ssim(padded_image, padded_target, image.shape)
     tape = LossTape(padded_image, padded_target, derivatives, image.shape, dssim_weight, mask, n_values)
     if n_values == 0:

@@ -2,8 +2,8 @@
 
 The Gaussian window is separable, and the row of an interleaved RGB image is one flat array in which the horizontal
 neighbours of a channel lie three numbers apart. A row is filtered completely, vertically and then horizontally, while
-it is in the cache. The images have margins of zeros, wide enough for the window and for the last eight numbers of a row,
-so that no number is a special case.
+it is in the cache. The images have margins of zeros, wide enough for the window and for the last eight numbers of a
+row, so that no number is a special case.
 """
 
 import functools
@@ -30,18 +30,19 @@ class LossKernels(NamedTuple):
     loss_vjp_rows: Callable
 
 
+@scalar
+def _pad_row(image, row, padded):
+    padded[:] = ZERO
+    if 0 <= row < image.shape[0]:
+        padded[PAD : PAD + image.shape[1]] = image[row]
+
+
 @kernel()
-def pad_rows(image, padded):
-    """Copy [H, 3 W] into the middle of [H + 10, L] and write zeros around it."""
-    height, n_values = image.shape
-    for y in prange(padded.shape[0]):
-        row = y - HALF_WINDOW
-        if 0 <= row < height:
-            padded[y, :PAD] = ZERO
-            padded[y, PAD : PAD + n_values] = image[row]
-            padded[y, PAD + n_values :] = ZERO
-        else:
-            padded[y] = ZERO
+def pad_rows(image, target, padded_image, padded_target):
+    """Copy two images [H, 3 W] into the middle of [H + 10, L] and write zeros around them."""
+    for y in prange(padded_image.shape[0]):
+        _pad_row(image, y - HALF_WINDOW, padded_image[y])
+        _pad_row(target, y - HALF_WINDOW, padded_target[y])
 
 
 @functools.cache
