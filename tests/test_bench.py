@@ -6,6 +6,7 @@ from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 from tolerances import BENCH_ROOM_FOR_EXPONENTIAL, ROUNDED_TO_FLOAT32
@@ -15,6 +16,7 @@ from minisplat_ref.cli import main, peak_memory, start_time, training_time
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.images import read_image
+from minisplat_ref.optim.adam import adam_step
 from minisplat_ref.oracle.bench import contenders, limits, profiling, race, roofs, slopes, workloads
 from minisplat_ref.oracle.bench.exponentials import EXPONENTIALS, relative_errors
 from minisplat_ref.oracle.bench.flips import thresholds
@@ -28,6 +30,7 @@ from minisplat_ref.oracle.tolerances import (
 )
 from minisplat_ref.render import render
 from minisplat_ref.scalar._jit import cache_root
+from minisplat_ref.train import train
 from minisplat_ref.types import Gaussians
 
 PEAK = ("peak", "bound")
@@ -297,6 +300,36 @@ def test_straight_lines_do_the_arithmetic_of_a_hit():
 def test_threads_give_the_same_bytes():
     case = limits.thread_case(tiny(), repeats=1)
     assert case is None or (case.passed and case.figures["x"] > 0)
+
+
+def test_training_on_one_thread_gives_the_same_bytes(monkeypatch):
+    monkeypatch.setattr(training_time, "ROOM", {"n_views": 2, "width": 48, "height": 36, "n_points": 500})
+    if numba.get_num_threads() == 1:
+        assert training_time.thread_cases(None, 1, iterations=1) == []
+        return
+    cases = {case.name.removeprefix("threads/iteration/"): case for case in training_time.thread_cases(None, 1, 1)}
+    assert {"composite_vjp", "adam_update", "rest", "whole iteration"} <= set(cases)
+    assert all(case.passed and case.figures["x"] > 0 for case in cases.values())
+
+    def train_otherwise_on_one(*args, state, **kwargs):
+        state.gaussians.means[0] += numba.get_num_threads() == 1
+        return train(*args, state=state, **kwargs)
+
+    monkeypatch.setattr(training_time, "train", train_otherwise_on_one)
+    assert not any(case.passed for case in training_time.thread_cases(None, 1, 1))
+
+
+def test_adam_moves_the_part_that_is_seen(monkeypatch):
+    monkeypatch.setattr(limits, "N", 1_000)
+    whole, part = limits.adam_cases(repeats=1)
+    assert whole.passed and part.passed and part.name == "roof/adam 30% of 1,000"
+
+    def step_of_all(parameters, gradient, state, rates, rule, rows):
+        return adam_step(parameters, gradient, state, rates, rule._replace(is_visible_only=False), rows)
+
+    monkeypatch.setattr(limits, "adam_step", step_of_all)
+    whole, part = limits.adam_cases(repeats=1)
+    assert whole.passed and not part.passed
 
 
 def test_stopwatches_change_nothing():

@@ -1,18 +1,24 @@
-"""What training iterations cost, while the number of Gaussians stays the same: by stages, and beside OpenSplat's."""
+"""What training iterations cost, while the number of Gaussians stays the same.
+
+By stages, on one thread and on all, and beside OpenSplat's.
+"""
 
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numba
+import numpy as np
+
 from data_tools.synthetic import make_scene
 from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.io import load_scene
 from minisplat_ref.oracle.bench.opensplat import training_seconds
-from minisplat_ref.oracle.bench.profiling import profile_cases, timed
+from minisplat_ref.oracle.bench.profiling import REST, WHOLE, profile_cases, timed
 from minisplat_ref.oracle.cases import Case, Figure
 from minisplat_ref.recipes import get_recipe
-from minisplat_ref.train import train
+from minisplat_ref.train import initial_state, train
 from minisplat_ref.types import Scene
 
 WARM_UP = 5  # iterations that compile and are not timed
@@ -34,6 +40,47 @@ def profile(folder: Path | None, downscale: int, iterations: int) -> list[Case]:
     seconds: dict[str, float] = {}
     total = _train(_scene(folder, downscale), iterations, timed(CPU, seconds), seconds.clear)
     return profile_cases(seconds, total, iterations)
+
+
+def thread_cases(folder: Path | None, downscale: int, iterations: int) -> list[Case]:
+    """Train twice by turns, on one thread and on all; nothing where there is only one.
+
+    Returns
+    -------
+    list of Case
+        The least time of every stage and of the whole iteration. A stage with a factor near 1 is what does not run in
+        parallel. All fail if the two trainings do not end with the same bytes.
+    """
+    n_all = numba.get_num_threads()
+    if n_all == 1:
+        return []
+    scene, recipe = _scene(folder, downscale), get_recipe("3dgs-accel")._replace(events=())
+    states = {n: initial_state(scene, recipe, seed=0) for n in (1, n_all)}
+    turns: dict[int, list[dict[str, float]]] = {n: [] for n in states}
+    try:
+        for step in range(1, WARM_UP + iterations + 1):
+            for n, state in states.items():
+                numba.set_num_threads(n)
+                seconds: dict[str, float] = {}
+                start = time.perf_counter()
+                train(scene, recipe._replace(iterations=step), seed=0, state=state, backend=timed(CPU, seconds))
+                total = time.perf_counter() - start
+                turns[n].append({**seconds, REST: total - sum(seconds.values()), WHOLE: total})
+    finally:
+        numba.set_num_threads(n_all)
+    one, all_ = (state.gaussians for state in states.values())
+    is_same = all(np.array_equal(a, b) for a, b in zip(one, all_, strict=True))
+    note = "" if is_same else "the trained Gaussians are not the same bytes"
+    cases = []
+    for stage in turns[1][0]:
+        times = [min(turn[stage] for turn in turns[n][WARM_UP:]) for n in states]
+        figures: dict[str, Figure] = {
+            "1 thread ms": 1e3 * times[0],
+            f"{n_all} threads ms": 1e3 * times[1],
+            "x": times[0] / times[1],
+        }
+        cases.append(Case(f"threads/iteration/{stage}", is_same, figures, note))
+    return cases
 
 
 def against_opensplat(program: Path, folder: Path, downscale: int, iterations: int) -> list[Case]:

@@ -1,26 +1,53 @@
-"""The optimiser step on the chosen rows of one array: bound by memory, so each number is read and written once."""
+"""The optimiser step on one array: bound by memory, so each number is read and written once.
+
+The array is taken as flat: rows that follow one another are one run of numbers, whatever their width, and eight numbers
+are updated at a time. Without this a row of three numbers costs as much as one of ten.
+"""
 
 from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.adam import adam_value
+from minisplat_ref.scalar.lanes import WIDTH, load, store
 from minisplat_ref.types import Floats, Ints
 
 N_CHUNKS = 64
 
 
 @scalar
-def _update_row(values, gradient, first, second, rate, keep1, keep2, eps):
-    for i in range(values.size):
+def _update_run(values, gradient, first, second, start, end, rate, keep1, keep2, eps):
+    i = start
+    while i + WIDTH <= end:
+        value, mean, square = adam_value(
+            load(values, i), load(gradient, i), load(first, i), load(second, i), rate, keep1, keep2, eps
+        )
+        store(values, i, value)
+        store(first, i, mean)
+        store(second, i, square)
+        i += WIDTH
+    while i < end:
         values[i], first[i], second[i] = adam_value(
             values[i], gradient[i], first[i], second[i], rate, keep1, keep2, eps
         )
+        i += 1
 
 
 @kernel()
-def _adam_update(values, gradient, first, second, rows, rate, keep1, keep2, eps):
+def _update_all(values, gradient, first, second, rate, keep1, keep2, eps):
     for chunk in prange(N_CHUNKS):
-        for i in range(rows.size * chunk // N_CHUNKS, rows.size * (chunk + 1) // N_CHUNKS):
-            n = rows[i]
-            _update_row(values[n], gradient[n], first[n], second[n], rate, keep1, keep2, eps)
+        start, end = values.size * chunk // N_CHUNKS, values.size * (chunk + 1) // N_CHUNKS
+        _update_run(values, gradient, first, second, start, end, rate, keep1, keep2, eps)
+
+
+@kernel()
+def _update_rows(values, gradient, first, second, rows, width, rate, keep1, keep2, eps):
+    for chunk in prange(N_CHUNKS):
+        i, end = rows.size * chunk // N_CHUNKS, rows.size * (chunk + 1) // N_CHUNKS
+        while i < end:
+            row, after = rows[i], rows[i] + 1
+            i += 1
+            while i < end and rows[i] == after:
+                after += 1
+                i += 1
+            _update_run(values, gradient, first, second, row * width, after * width, rate, keep1, keep2, eps)
 
 
 def adam_update(
@@ -28,7 +55,7 @@ def adam_update(
     gradient: Floats,
     first: Floats,
     second: Floats,
-    rows: Ints,
+    rows: Ints | None,
     rate: float,
     beta1: float,
     beta2: float,
@@ -36,4 +63,8 @@ def adam_update(
 ) -> None:
     """Update values and moments in place; see ``reference.adam.adam_update``."""
     constants = (values.dtype.type(number) for number in (rate, 1 - beta1, 1 - beta2, eps))
-    _adam_update(values, gradient, first, second, rows, *constants)
+    flat = (array.reshape(-1) for array in (values, gradient, first, second))
+    if rows is None:
+        _update_all(*flat, *constants)
+    else:
+        _update_rows(*flat, rows, values.shape[1], *constants)

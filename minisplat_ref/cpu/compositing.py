@@ -13,12 +13,34 @@ from minisplat_ref.cpu.blend_forward import N_PAIR_STATS, forward_kernel, sum_pa
 from minisplat_ref.cpu.exponential import exp_exact, exp_fast
 from minisplat_ref.cpu.records import records_of
 from minisplat_ref.cpu.tile_state import frame_of, tile_ranges
-from minisplat_ref.scalar._jit import n_threads
+from minisplat_ref.scalar._jit import kernel, n_threads, prange, scalar
+from minisplat_ref.scalar.literals import ONE
 from minisplat_ref.types import BlendStats, CompositeGradient, Floats, Projection, RenderOutput, TileBins
 
 
 def _exponential(dtype: np.dtype) -> Callable:
     return exp_fast if dtype == np.float32 else exp_exact
+
+
+@scalar
+def _background_vjp_row(alpha, v_image, sums):
+    for x in range(alpha.size):
+        transmittance = ONE - alpha[x]
+        for k in range(sums.size):
+            sums[k] += transmittance * v_image[x, k]
+
+
+@kernel()
+def _background_vjp_rows(alpha, v_image, sums):
+    for y in prange(alpha.shape[0]):
+        _background_vjp_row(alpha[y], v_image[y], sums[y])
+
+
+def _background_vjp(alpha: Floats, v_image: Floats) -> Floats:
+    """Derivative by the background [D], row by row in float64: what passes all Gaussians, times the pixel's share."""
+    sums = np.zeros((v_image.shape[0], v_image.shape[2]))
+    _background_vjp_rows(alpha, v_image, sums)
+    return sums.sum(axis=0).astype(v_image.dtype)
 
 
 def composite(
@@ -106,6 +128,7 @@ def composite_vjp_with(
 ) -> CompositeGradient:
     """Chain gradients with the exponential that the forward pass used."""
     dtype, n_channels = colors.dtype, colors.shape[1]
+    v_image, v_alpha = np.ascontiguousarray(v_image, dtype), np.ascontiguousarray(v_alpha, dtype)
     slots = np.empty((len(bins.gaussian_ids), slot_size(n_channels)), dtype)
     backward_kernel(exp, n_channels)(
         records_of(projection, colors, conventions),
@@ -117,8 +140,8 @@ def composite_vjp_with(
         frame_of(bins, conventions, dtype),
         output.image,
         output.alpha,
-        np.ascontiguousarray(v_image, dtype),
-        np.ascontiguousarray(v_alpha, dtype),
+        v_image,
+        v_alpha,
         slots.reshape(-1),
     )
     out = CompositeGradient(
@@ -126,7 +149,7 @@ def composite_vjp_with(
         np.zeros(projection.conics.shape, projection.conics.dtype),
         np.zeros(projection.opacities.shape, projection.opacities.dtype),
         np.zeros(colors.shape, colors.dtype),
-        np.einsum("yx,yxk->k", 1 - output.alpha, v_image).astype(dtype),
+        _background_vjp(output.alpha, v_image),
     )
     sum_slots(slots, bins.gaussian_offsets, projection, out)
     return out

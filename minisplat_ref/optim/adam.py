@@ -89,7 +89,7 @@ def adam_step(
     step = state.step + 1
     correction = math.sqrt(1 - rule.beta2**step) / (1 - rule.beta1**step) if rule.has_bias_correction else 1.0
     eps = rule.eps * (math.sqrt(1 - rule.beta2**step) if rule.has_bias_correction else 1.0)
-    rows = visible_ids if rule.is_visible_only else np.arange(len(parameters[0]))
+    rows = visible_ids if rule.is_visible_only else None
     for *arrays, rate in zip(parameters, gradient, state.first, state.second, rates, strict=True):
         tables = (array.reshape(len(array), math.prod(array.shape[1:])) for array in arrays)  # [N, width] each
         backend.adam_update(*tables, rows, rate * correction, rule.beta1, rule.beta2, eps)

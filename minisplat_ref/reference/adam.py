@@ -19,7 +19,7 @@ def adam_update(
     gradient: Floats,
     first: Floats,
     second: Floats,
-    rows: Ints,
+    rows: Ints | None,
     rate: float,
     beta1: float,
     beta2: float,
@@ -31,8 +31,8 @@ def adam_update(
     ----------
     values, gradient, first, second : ndarray of shape (N, W)
         Parameters, their gradient, and the decaying means of the gradient and of its square.
-    rows : ndarray of shape (V,)
-        Rows to update, each once; the others are neither read nor written.
+    rows : ndarray of shape (V,), optional
+        Rows to update, each once; the others are neither read nor written. None for all.
     rate : float
         Learning rate, bias corrections included.
     beta1, beta2 : float
@@ -40,8 +40,9 @@ def adam_update(
     eps : float
         Added to the root.
     """
-    g, m, v = gradient[rows], first[rows], second[rows]  # [V, W]
+    chosen = slice(None) if rows is None else rows
+    g, m, v = gradient[chosen], first[chosen], second[chosen]  # [V, W]
     m = m + (1 - beta1) * (g - m)
     v = v + (1 - beta2) * (g * g - v)
-    first[rows], second[rows] = m, v
-    values[rows] -= rate * m / (np.sqrt(v) + eps)
+    first[chosen], second[chosen] = m, v
+    values[chosen] -= rate * m / (np.sqrt(v) + eps)

@@ -12,7 +12,7 @@ from typing import Any
 from minisplat_ref.backends import Backend
 from minisplat_ref.oracle.cases import Case
 
-REST = "rest"
+REST, WHOLE = "rest", "whole iteration"
 
 
 def timed(backend: Backend, seconds: dict[str, float]) -> Backend:
@@ -51,7 +51,7 @@ def profile_cases(seconds: dict[str, float], total: float, iterations: int) -> l
         Seconds of all iterations.
     iterations : int
     """
-    rows = {**seconds, REST: total - sum(seconds.values()), "whole iteration": total}
+    rows = {**seconds, REST: total - sum(seconds.values()), WHOLE: total}
     return [
         Case(f"iteration/{name}", True, {"ms": 1e3 * s / iterations, "share %": 100 * s / total})
         for name, s in rows.items()
