@@ -19,7 +19,7 @@ from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.footprints import ELLIPSE_MARGIN, SPARE, TILE_HEIGHT, TILE_WIDTH, tiles_of_box, write_tiles
 from minisplat_ref.cpu.sorting import DIGIT_BITS, sort_stably
 from minisplat_ref.scalar._jit import kernel, n_threads, prange, scalar
-from minisplat_ref.scalar.lanes import WIDTH
+from minisplat_ref.scalar.lanes import WIDTH, prefetch
 from minisplat_ref.types import Ints, Projection, TileBins, TileGrid
 
 __all__ = ["ELLIPSE_MARGIN", "TILE_HEIGHT", "TILE_WIDTH", "bin_gaussians"]
@@ -30,7 +30,7 @@ N_BUCKETS = 1 << (31 - BUCKET_SHIFT)
 VISIBLE, TILES = 0, 1  # columns of a count: Gaussians, and tiles under their boxes
 GAUSSIAN, PART, SLOT, FIRST, COUNT = range(5)  # columns of a record: the slots of its pairs, and the cells
 N_COLUMNS = 5
-BLOCK = 128  # records that are fetched at once
+FETCH_AHEAD = 16  # records
 
 
 class Layers(NamedTuple):
@@ -38,8 +38,6 @@ class Layers(NamedTuple):
 
     keys: Ints
     """[N] bits of the depths: positive floats are ordered as their bits are."""
-    rows: Ints
-    """[N] int32 numbers 0, 1, ..., to be sorted by the keys."""
     records: Ints
     """[N, N_COLUMNS] int32."""
     cells: Ints
@@ -84,8 +82,8 @@ def _list_part(part, projection, keys, alpha_min, n_tiles_x, layer_of, cursors, 
             row, first = cursors[layer, VISIBLE], cursors[layer, TILES]
             end = write_tiles(n, projection, alpha_min, n_tiles_x, layer * n_tiles, bounds, layers.cells, first)
             cursors[layer, VISIBLE], cursors[layer, TILES] = row + 1, end
-            layers.keys[row], layers.rows[row] = keys[n], row
-            layers.records[row, GAUSSIAN], layers.records[row, PART], layers.records[row, SLOT] = n, part, slot
+            layers.keys[row], layers.records[row, GAUSSIAN] = keys[n], n
+            layers.records[row, PART], layers.records[row, SLOT] = part, slot
             layers.records[row, FIRST], layers.records[row, COUNT] = first, end - first
             slot += end - first
         offsets[n + 1] = slot
@@ -105,36 +103,36 @@ def _list_parts(projection, keys, alpha_min, n_tiles_x, layer_of, cursors, layer
 
 
 @scalar
-def _fill_layer(layer, edges, layers, first_slots, offsets, other_keys, other_rows, digits, starts, ids, slots):
+def _fill_layer(layer, edges, layers, first_slots, offsets, other_keys, rows, other_rows, digits, starts, ids, slots):
     """Sort one layer and write its pairs."""
-    n, cells, block = other_keys.size, layers.cells, np.empty((BLOCK, N_COLUMNS), np.int32)
+    records, cells, n = layers.records, layers.cells, other_keys.size
     for i in range(n * layer // N_PARTS, n * (layer + 1) // N_PARTS):
         offsets[i + 1] += first_slots[layer]  # of the part of the same number
     own = slice(edges[layer], edges[layer + 1])
-    rows = sort_stably(layers.keys[own], layers.rows[own], other_keys[own], other_rows[own], digits)
-    for start in range(0, rows.size, BLOCK):
-        n_rows = min(BLOCK, rows.size - start)
-        for i in range(n_rows):  # without branches, so that the cache is waited for many times at once
-            for column in range(N_COLUMNS):
-                block[i, column] = layers.records[rows[start + i], column]
-        for i in range(n_rows):
-            slot = first_slots[block[i, PART]] + block[i, SLOT]
-            for k in range(block[i, COUNT]):
-                cell = cells[block[i, FIRST] + k]
-                place = starts[cell]
-                starts[cell] = place + 1
-                ids[place] = block[i, GAUSSIAN]
-                slots[place] = slot + k
+    for row in range(edges[layer], edges[layer + 1]):
+        rows[row] = row
+    in_order = sort_stably(layers.keys[own], rows[own], other_keys[own], other_rows[own], digits)
+    for i in range(in_order.size):
+        prefetch(records, in_order[min(i + FETCH_AHEAD, in_order.size - 1)])
+        row = in_order[i]
+        n, first, slot = records[row, GAUSSIAN], records[row, FIRST], records[row, SLOT]
+        slot += first_slots[records[row, PART]]
+        for k in range(records[row, COUNT]):
+            place = starts[cells[first + k]]
+            starts[cells[first + k]] = place + 1
+            ids[place] = n
+            slots[place] = slot + k
 
 
 @kernel()
-def _fill_layers(edges, layers, first_slots, offsets, other_keys, other_rows, digits, starts, ids, slots):
+def _fill_layers(edges, layers, first_slots, offsets, other_keys, rows, other_rows, digits, starts, ids, slots):
     n_threads = digits.shape[0]
     for thread in prange(n_threads):
         for layer in range(thread, N_PARTS, n_threads):
             _fill_layer(
-                layer, edges, layers, first_slots, offsets, other_keys, other_rows, digits[thread], starts, ids, slots
-            )
+                layer, edges, layers, first_slots, offsets, other_keys, rows, other_rows, digits[thread], starts, ids,
+                slots,
+            )  # fmt: skip
 
 
 def _cut_layers(up_to: Ints) -> tuple[Ints, Ints]:
@@ -193,7 +191,7 @@ def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventio
 
     keys = projection.depths.view(np.int32 if dtype == np.float32 else np.int64)
     rows, other_rows = np.empty((2, n), np.int32)
-    layers = Layers(np.empty_like(keys), rows, np.empty((n, N_COLUMNS), np.int32), np.empty(edges[-1, TILES], np.int32))
+    layers = Layers(np.empty_like(keys), np.empty((n, N_COLUMNS), np.int32), np.empty(edges[-1, TILES], np.int32))
     offsets = np.empty(n + 1, np.int64)
     offsets[0] = 0
     counts = np.zeros((n_threads(), N_PARTS * n_tiles), np.int32)
@@ -208,5 +206,5 @@ def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventio
     ids, slots = np.empty((2, tile_offsets[-1]), np.int32)
     digits = np.empty((n_threads(), 1 << DIGIT_BITS), np.int32)
     layer_edges, other_keys = edges[::N_PARTS, VISIBLE].copy(), np.empty_like(keys)
-    _fill_layers(layer_edges, layers, first_slots, offsets, other_keys, other_rows, digits, starts, ids, slots)
+    _fill_layers(layer_edges, layers, first_slots, offsets, other_keys, rows, other_rows, digits, starts, ids, slots)
     return TileBins(ids, tile_offsets, slots, offsets, grid)
