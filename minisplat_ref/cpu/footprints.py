@@ -5,8 +5,9 @@ it lies over several rows and several columns it is asked which of the tiles the
 most of those that the box of a slanted needle would give. Asking everywhere would take longer than the blending of the
 few tiles more, in which it finds no row of pixels to visit.
 
-The numbers of rows and columns cannot be foreseen, and a loop over one or two tiles ends with a wrong guess of the
-processor. So two tiles are written wherever there may be one, and the place moves on by as many as there are.
+A processor guesses which way a branch goes and works ahead; a wrong guess costs as much as it worked ahead, and that is
+most where the answer is the end of a long chain of divisions and roots. So no branch depends on the ellipse: every tile
+under the box is written, and the place moves on where it is reached. The others are overwritten by what follows.
 """
 
 import numpy as np
@@ -20,8 +21,8 @@ from minisplat_ref.scalar.tiling import rightmost_offset, visible_outline
 TILE_WIDTH = 32  # pixels
 TILE_HEIGHT = 16
 ELLIPSE_MARGIN = np.float32(0.02)  # px and relative: rounding must not lose a pixel that the compositor would blend
-ROWS_AT_ONCE = WIDTH // 2
-SPARE = 1  # tiles that may be written behind the last
+ROWS_AT_ONCE = WIDTH // 2  # of tiles, each with a right and a left end
+SPARE = 1  # places behind the last that may be written
 
 
 @scalar
@@ -87,7 +88,9 @@ def write_tiles(n, projection, alpha_min, n_tiles_x, base, bounds, tiles, place)
     """
     column, row, n_columns, n_rows = tiles_of_box(projection.boxes, n)
     if (n_columns > 1) & (n_rows > 1):
-        return _write_ellipse(n, column, row, n_columns, n_rows, projection, alpha_min, n_tiles_x, base, bounds, tiles, place)
+        return _write_ellipse(
+            n, column, row, n_columns, n_rows, projection, alpha_min, n_tiles_x, base, bounds, tiles, place
+        )
     first, step = base + row * n_tiles_x + column, n_tiles_x if n_rows > 1 else 1
     tiles[place], tiles[place + 1] = first, first + step
     for k in range(2, n_columns * n_rows):

@@ -6,7 +6,8 @@ pairs start, so that the layers are sorted by depth and written into the lists i
 
 1. The survey counts the Gaussians of each part of the input by depth, which says where layers begin.
 2. Every part finds the tiles of its Gaussians, in the order of the input, and enters each Gaussian into its layer.
-3. Every layer is sorted, and fills the lists. Its records fit the second-level cache, where random access is cheap.
+3. Every layer is sorted, and fills the lists. Its tiles fit the second-level cache, where random access is cheap; what
+   else is needed of a Gaussian is asked for ahead, since memory answers slowly.
 
 Parts and layers are fixed in number, so that no result depends on the number of threads.
 """
@@ -28,20 +29,22 @@ N_PARTS = 16  # of the input, and as many layers
 BUCKET_SHIFT = 18  # of the bits of a float32: 32 buckets of depth to a factor of two
 N_BUCKETS = 1 << (31 - BUCKET_SHIFT)
 VISIBLE, TILES = 0, 1  # columns of a count: Gaussians, and tiles under their boxes
-GAUSSIAN, PART, SLOT, FIRST, COUNT = range(5)  # columns of a record: the slots of its pairs, and the cells
-N_COLUMNS = 5
-FETCH_AHEAD = 16  # records
+FIRST, COUNT, SLOT, PART = range(4)  # columns of a record: the cells of a Gaussian, and its first slot within a part
+FETCH_AHEAD = 16  # Gaussians
 
 
 class Layers(NamedTuple):
-    """The visible Gaussians, layer by layer, and within a layer in the order of the input."""
+    """The visible Gaussians, layer by layer, and within a layer in the order of the input.
+
+    A cell is one tile in one layer.
+    """
 
     keys: Ints
     """[N] bits of the depths: positive floats are ordered as their bits are."""
-    records: Ints
-    """[N, N_COLUMNS] int32."""
+    ids: Ints
+    """[N] int32."""
     cells: Ints
-    """int32 layer * n_tiles + tile of the pairs, with gaps."""
+    """layer * n_tiles + tile of each pair, int32; between the parts of a layer places are left over."""
 
 
 @scalar
@@ -72,19 +75,18 @@ def _survey(boxes, depths, n_threads, up_to):
 
 
 @scalar
-def _list_part(part, projection, keys, alpha_min, n_tiles_x, layer_of, cursors, layers, offsets, counts):
-    """Enter each Gaussian of a part into its layer, and count the pairs of each layer and tile."""
+def _list_part(part, projection, keys, alpha_min, n_tiles_x, layer_of, cursors, layers, records, offsets, counts):
+    """Enter each Gaussian of a part into its layer, and count the pairs of each cell."""
     boxes, depths, n_tiles, slot = projection.boxes, projection.depths, counts.size // N_PARTS, 0
-    bounds, first_cells = np.empty(WIDTH, depths.dtype), cursors[:, TILES].copy()
+    scratch, first_cells = np.empty(WIDTH, depths.dtype), cursors[:, TILES].copy()
     for n in range(keys.size * part // N_PARTS, keys.size * (part + 1) // N_PARTS):
         if (boxes[n, 0] < boxes[n, 2]) & (boxes[n, 1] < boxes[n, 3]):
             layer = layer_of[_bucket(depths[n])]
             row, first = cursors[layer, VISIBLE], cursors[layer, TILES]
-            end = write_tiles(n, projection, alpha_min, n_tiles_x, layer * n_tiles, bounds, layers.cells, first)
+            end = write_tiles(n, projection, alpha_min, n_tiles_x, layer * n_tiles, scratch, layers.cells, first)
             cursors[layer, VISIBLE], cursors[layer, TILES] = row + 1, end
-            layers.keys[row], layers.records[row, GAUSSIAN] = keys[n], n
-            layers.records[row, PART], layers.records[row, SLOT] = part, slot
-            layers.records[row, FIRST], layers.records[row, COUNT] = first, end - first
+            layers.keys[row], layers.ids[row] = keys[n], n
+            records[n, FIRST], records[n, COUNT], records[n, SLOT], records[n, PART] = first, end - first, slot, part
             slot += end - first
         offsets[n + 1] = slot
     for layer in range(N_PARTS):
@@ -93,31 +95,29 @@ def _list_part(part, projection, keys, alpha_min, n_tiles_x, layer_of, cursors, 
 
 
 @kernel()
-def _list_parts(projection, keys, alpha_min, n_tiles_x, layer_of, cursors, layers, offsets, counts):
+def _list_parts(projection, keys, alpha_min, n_tiles_x, layer_of, cursors, layers, records, offsets, counts):
     n_threads = counts.shape[0]
     for thread in prange(n_threads):
         for part in range(thread, N_PARTS, n_threads):
             _list_part(
-                part, projection, keys, alpha_min, n_tiles_x, layer_of, cursors[part], layers, offsets, counts[thread]
-            )
+                part, projection, keys, alpha_min, n_tiles_x, layer_of, cursors[part], layers, records, offsets,
+                counts[thread],
+            )  # fmt: skip
 
 
 @scalar
-def _fill_layer(layer, edges, layers, first_slots, offsets, other_keys, rows, other_rows, digits, starts, ids, slots):
+def _fill_layer(layer, edges, layers, records, first_slots, offsets, other_keys, other_ids, digits, starts, ids, slots):
     """Sort one layer and write its pairs."""
-    records, cells, n = layers.records, layers.cells, other_keys.size
+    cells, n = layers.cells, other_keys.size
     for i in range(n * layer // N_PARTS, n * (layer + 1) // N_PARTS):
         offsets[i + 1] += first_slots[layer]  # of the part of the same number
     own = slice(edges[layer], edges[layer + 1])
-    for row in range(edges[layer], edges[layer + 1]):
-        rows[row] = row
-    in_order = sort_stably(layers.keys[own], rows[own], other_keys[own], other_rows[own], digits)
+    in_order = sort_stably(layers.keys[own], layers.ids[own], other_keys[own], other_ids[own], digits)
     for i in range(in_order.size):
         prefetch(records, in_order[min(i + FETCH_AHEAD, in_order.size - 1)])
-        row = in_order[i]
-        n, first, slot = records[row, GAUSSIAN], records[row, FIRST], records[row, SLOT]
-        slot += first_slots[records[row, PART]]
-        for k in range(records[row, COUNT]):
+        n = in_order[i]
+        first, slot = records[n, FIRST], records[n, SLOT] + first_slots[records[n, PART]]
+        for k in range(records[n, COUNT]):
             place = starts[cells[first + k]]
             starts[cells[first + k]] = place + 1
             ids[place] = n
@@ -125,12 +125,12 @@ def _fill_layer(layer, edges, layers, first_slots, offsets, other_keys, rows, ot
 
 
 @kernel()
-def _fill_layers(edges, layers, first_slots, offsets, other_keys, rows, other_rows, digits, starts, ids, slots):
+def _fill_layers(edges, layers, records, first_slots, offsets, other_keys, other_ids, digits, starts, ids, slots):
     n_threads = digits.shape[0]
     for thread in prange(n_threads):
         for layer in range(thread, N_PARTS, n_threads):
             _fill_layer(
-                layer, edges, layers, first_slots, offsets, other_keys, rows, other_rows, digits[thread], starts, ids,
+                layer, edges, layers, records, first_slots, offsets, other_keys, other_ids, digits[thread], starts, ids,
                 slots,
             )  # fmt: skip
 
@@ -154,8 +154,8 @@ def _cut_layers(up_to: Ints) -> tuple[Ints, Ints]:
     wanted = int(total[-1]) * np.arange(1, N_PARTS) // N_PARTS  # Gaussians in front of the second layer, and so on
     cuts = np.concatenate([[0], np.searchsorted(total, wanted), [N_BUCKETS]])
     layer_of = np.repeat(np.arange(N_PARTS, dtype=np.int32), np.diff(cuts))
-    sizes = np.diff(up_to[:, cuts], axis=1).swapaxes(0, 1).reshape(-1, 2) + (0, SPARE)  # by layer and part
-    return layer_of, np.concatenate([[[0, 0]], np.cumsum(sizes, axis=0)])
+    sizes = np.diff(up_to[:, cuts], axis=1).swapaxes(0, 1).reshape(-1, 2)  # by layer and part
+    return layer_of, np.concatenate([[[0, 0]], np.cumsum(sizes + np.array([0, SPARE]), axis=0)])
 
 
 def _list_starts(counts: Ints) -> tuple[Ints, Ints]:
@@ -190,14 +190,15 @@ def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventio
     layer_of, edges = _cut_layers(up_to)
 
     keys = projection.depths.view(np.int32 if dtype == np.float32 else np.int64)
-    rows, other_rows = np.empty((2, n), np.int32)
-    layers = Layers(np.empty_like(keys), np.empty((n, N_COLUMNS), np.int32), np.empty(edges[-1, TILES], np.int32))
+    ids, other_ids = np.empty((2, n), np.int32)
+    layers = Layers(np.empty_like(keys), ids, np.empty(edges[-1, TILES], np.int32))
+    records = np.empty((n, 4), np.int32)
     offsets = np.empty(n + 1, np.int64)
     offsets[0] = 0
     counts = np.zeros((n_threads(), N_PARTS * n_tiles), np.int32)
     cursors = edges[:-1].reshape(N_PARTS, N_PARTS, 2).swapaxes(0, 1).copy()  # by part and layer
     alpha_min = dtype.type(conventions.alpha_min)
-    _list_parts(projection, keys, alpha_min, grid.n_tiles_x, layer_of, cursors, layers, offsets, counts)
+    _list_parts(projection, keys, alpha_min, grid.n_tiles_x, layer_of, cursors, layers, records, offsets, counts)
 
     tile_offsets, starts = _list_starts(counts)
     part_edges = n * np.arange(N_PARTS + 1) // N_PARTS
@@ -206,5 +207,5 @@ def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventio
     ids, slots = np.empty((2, tile_offsets[-1]), np.int32)
     digits = np.empty((n_threads(), 1 << DIGIT_BITS), np.int32)
     layer_edges, other_keys = edges[::N_PARTS, VISIBLE].copy(), np.empty_like(keys)
-    _fill_layers(layer_edges, layers, first_slots, offsets, other_keys, rows, other_rows, digits, starts, ids, slots)
+    _fill_layers(layer_edges, layers, records, first_slots, offsets, other_keys, other_ids, digits, starts, ids, slots)
     return TileBins(ids, tile_offsets, slots, offsets, grid)
