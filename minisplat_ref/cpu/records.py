@@ -11,7 +11,7 @@ from minisplat_ref.cpu.tiling import ELLIPSE_MARGIN
 from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.compositing import factors
 from minisplat_ref.scalar.literals import HALF, ZERO
-from minisplat_ref.scalar.tiling import Outline, visible_ellipse
+from minisplat_ref.scalar.tiling import Outline, visible_outline
 from minisplat_ref.types import Floats, Projection
 
 # Columns. The conic is there as its factors, two of them halved as sigma wants them; columns of pixels are floats.
@@ -30,7 +30,7 @@ def _half(factor):
 def _write_record(n, projection, colors, alpha_min, records):
     a, slope, pivot = factors(projection.conics[n, 0], projection.conics[n, 1], projection.conics[n, 2])
     turned = factors(projection.conics[n, 2], projection.conics[n, 1], projection.conics[n, 0])
-    outline = visible_ellipse(*turned, projection.opacities[n], alpha_min, ELLIPSE_MARGIN).outline
+    outline = visible_outline(*turned, projection.opacities[n], alpha_min, ELLIPSE_MARGIN)
     records[n, MEAN_X], records[n, MEAN_Y] = projection.means2d[n, 0], projection.means2d[n, 1]
     records[n, HALF_A] = _half(a)
     records[n, SLOPE] = slope

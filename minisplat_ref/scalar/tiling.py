@@ -11,9 +11,10 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.scalar._jit import scalar
-from minisplat_ref.scalar.lanes import larger, smaller, sqrt
+from minisplat_ref.scalar.lanes import larger, select, smaller, sqrt
 from minisplat_ref.scalar.literals import ONE, TWO, ZERO
 
+FAR = np.float32(1e9)  # px
 FLAT = np.float32(1e-30)  # px^-2: a conic that is no ellipse reaches over any image
 
 
@@ -28,37 +29,25 @@ class Outline(NamedTuple):
     """dy of the right-most point."""
 
 
-class Ellipse(NamedTuple):
-    """A visible ellipse around the origin."""
-
-    outline: Outline
-    half_width: float
-    """Largest dx."""
-    half_height: float
-    """Largest dy."""
-
-
 @scalar
-def visible_ellipse(a, slope, pivot, opacity, alpha_min, margin):
-    """Ellipse on which alpha equals alpha_min, its level raised by a relative and an absolute margin."""
+def visible_outline(a, slope, pivot, opacity, alpha_min, margin):
+    """Outline on which alpha equals alpha_min, its level raised by a relative and an absolute margin."""
     q = TWO * math.log(opacity / alpha_min)
     q += margin * (q + margin)
     inverse_a, pivot = ONE / max(a, FLAT), max(pivot, FLAT)
-    half_height = math.sqrt(q / pivot)
     # The inverse of the conic has 1 / a + slope^2 / pivot as its first entry, and -slope / pivot beside the diagonal.
-    lean = slope * half_height
-    half_width = math.sqrt(q * inverse_a + lean * lean)
-    tilt = -lean * (half_height / half_width)
-    return Ellipse(Outline(slope, inverse_a, pivot, q, tilt), half_width, half_height)
+    lean = slope / pivot
+    tilt = -lean * math.sqrt(q / (inverse_a + slope * lean))
+    return Outline(slope, inverse_a, pivot, q, tilt)
 
 
 @scalar
 def rightmost_offset(outline, low, high, side):
     """Return the largest dx (side 1) or the largest -dx (side -1) of the ellipse with low <= dy <= high.
 
-    Of numbers or lanes. The band has to meet the ellipse. The left side is the right side of the ellipse turned by half
-    a circle.
+    Of numbers or lanes; -FAR where the band does not meet the ellipse. The left side is the right side of the ellipse
+    turned by half a circle.
     """
     dy = smaller(larger(side * outline.tilt, low), high)
-    root = sqrt(larger(outline.q - outline.pivot * dy * dy, ZERO) * outline.inverse_a)
-    return root - side * outline.slope * dy
+    room = outline.q - outline.pivot * dy * dy  # negative nowhere else, as dy is the nearest to a point of the ellipse
+    return select(room < ZERO, -FAR, sqrt(larger(room, ZERO) * outline.inverse_a) - side * outline.slope * dy)
