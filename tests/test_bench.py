@@ -243,16 +243,22 @@ def test_opensplat_is_timed_by_its_command_line(tmp_path, capsys):
     settings = {"n_views": 4, "width": 32, "height": 24, "n_points": 300}
     write_scene(make_scene("room", **settings), tmp_path / "room", settings)
     log = tmp_path / "calls"
-    program = _fake_opensplat(tmp_path, f'echo "$@" >> {log}; sleep "0.$3"')  # the third argument is -n's value
+    (tmp_path / "room" / "transforms.json").write_text("{}")  # it would read this instead of the model
+    # The third argument is -n's value.
+    program = _fake_opensplat(tmp_path, f'echo $(ls $1 $1/sparse/0 $1/images/) "$@" >> {log}; sleep "0.$3"')
     scene = ["--scene", str(tmp_path / "room"), "--iterations", "2"]
     race_ = ["--workloads", "synth", "--backends", "cpu-f32", "--repeats", "1"]
     assert main(["bench", *race_, *scene, "--against", f"opensplat={program}", "--json", str(tmp_path / "b.json")]) == 0
     calls = log.read_text().splitlines()
-    assert [call.split()[1:5] for call in calls] == [["-n", "2", "-d", "1"], ["-n", "4", "-d", "1"]]
+    assert [call.split(" -n ")[1].split()[:3] for call in calls] == [["2", "-d", "1"], ["4", "-d", "1"]]
+    for call in calls:
+        assert {"cameras.bin", "images.bin", "points3D.bin", "images"} < set(call.split()) and ".png" in call
+        assert "transforms.json" not in call
     cases = {case["name"]: case for case in json.loads((tmp_path / "b.json").read_text())["cases"]}
     assert cases["room/opensplat training"]["passed"] and cases["room/opensplat training"]["x ours"] > 0
     assert "not compared here" in cases["room/opensplat training"]["note"]
-    broken = _fake_opensplat(tmp_path, "echo no such scene >&2; exit 3")
+    assert "32 x 24" in cases["room/cpu-f32 training"]["note"]
+    broken = _fake_opensplat(tmp_path, "echo no such scene >&2; echo usage >&2; exit 3")
     assert main(["bench", *race_, *scene, "--against", f"opensplat={broken}"]) == 2
     assert "no such scene" in capsys.readouterr().err
 
