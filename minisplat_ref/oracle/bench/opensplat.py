@@ -1,8 +1,8 @@
 """OpenSplat, a trainer in C++, timed through its command line; the options are those of version 1.2.
 
-Nothing that it prints is read: it trains twice, for n and for 2n iterations, and the difference of the two times is
-that of n iterations, without loading and start. What it renders is not compared here; ``oracle compare`` does that with
-its dumps.
+It prints a line in every iteration, and when a line comes is all that is read of it: times of single iterations have a
+median, which survives that other programs run now and then, and the difference of two whole runs does not. What it
+renders is not compared here; ``oracle compare`` does that with its dumps.
 
 Its iteration is made as like ours as its options allow. The number of Gaussians stays, because it never comes to a
 refinement. It counts as densifying all the while, because afterwards it would step its optimiser in every 32nd or 64th
@@ -14,6 +14,7 @@ import os
 import subprocess
 import tempfile
 import time
+from itertools import pairwise
 from pathlib import Path
 
 from minisplat_ref.errors import InputError
@@ -23,8 +24,8 @@ NEVER = 10**9  # iterations
 FIXED_POPULATION = ("--num-downscales", "0", "--refine-every", str(NEVER), "--densify-until", str(NEVER))
 
 
-def training_seconds(program: Path, scene: Path, downscale: int, iterations: int) -> float:
-    """Return the seconds that a whole run takes, loading included.
+def iteration_seconds(program: Path, scene: Path, downscale: int, iterations: int) -> list[float]:
+    """Train, and return the seconds from each iteration to the next.
 
     Parameters
     ----------
@@ -37,25 +38,35 @@ def training_seconds(program: Path, scene: Path, downscale: int, iterations: int
     iterations : int
         Of the training, on the processor.
 
+    Returns
+    -------
+    seconds : list of float
+        ``iterations - 1`` of them.
+
     Raises
     ------
     InputError
-        It cannot be run, or fails.
+        It cannot be run, or fails, or does not say when an iteration is over.
     """
     with tempfile.TemporaryDirectory() as folder:
         options = ["-n", str(iterations), "-d", str(downscale), *FIXED_POPULATION, "--cpu"]
         laid_out = _lay_out(scene.resolve(), Path(folder) / "scene")
         command = [str(program.resolve()), str(laid_out), *options, "-o", str(Path(folder) / "out.ply")]
-        start = time.perf_counter()
-        try:
-            done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-        except OSError as error:
-            raise InputError(f"{program} cannot be run: {error.strerror}") from error
-        seconds = time.perf_counter() - start
-    if done.returncode != 0:
-        first = (done.stderr or done.stdout).strip().splitlines()[:1] or ["it says nothing"]
-        raise InputError(f"{program} failed with exit code {done.returncode}: {first[0]}")
-    return seconds
+        with (Path(folder) / "errors").open("w+") as errors:
+            try:
+                process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=errors, text=True)
+            except OSError as error:
+                raise InputError(f"{program} cannot be run: {error.strerror}") from error
+            with process:
+                assert process.stdout is not None
+                times = [time.perf_counter() for line in process.stdout if line.startswith("Step ")]
+            errors.seek(0)
+            first = errors.read().strip().splitlines()[:1] or ["it says nothing"]
+    if process.returncode != 0:
+        raise InputError(f"{program} failed with exit code {process.returncode}: {first[0]}")
+    if len(times) != iterations:
+        raise InputError(f"{program} printed {len(times)} lines for {iterations} iterations: OpenSplat 1.2 prints each")
+    return [later - earlier for earlier, later in pairwise(times)]
 
 
 def _lay_out(scene: Path, folder: Path) -> Path:
