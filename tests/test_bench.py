@@ -246,18 +246,29 @@ def test_opensplat_is_timed_by_its_command_line(tmp_path, capsys):
     settings = {"n_views": 4, "width": 32, "height": 24, "n_points": 300}
     write_scene(make_scene("room", **settings), tmp_path / "room", settings)
     log = tmp_path / "calls"
-    program = _fake_opensplat(tmp_path, f'echo "$@" >> {log}; sleep "0.$3"')  # the third argument is -n's value
+    (tmp_path / "room" / "transforms.json").write_text("{}")  # it would read this instead of the model
+    steps = 'for i in $(seq "$3"); do sleep 0.02; echo "Step $i: 0.4 [50%]"; done'  # the third argument is -n's value
+    program = _fake_opensplat(tmp_path, f'echo $(ls $1 $1/sparse/0 $1/images/) "$@" >> {log}; {steps}')
     scene = ["--scene", str(tmp_path / "room"), "--iterations", "2"]
     race_ = ["--workloads", "synth", "--backends", "cpu-f32", "--repeats", "1"]
     assert main(["bench", *race_, *scene, "--against", f"opensplat={program}", "--json", str(tmp_path / "b.json")]) == 0
     calls = log.read_text().splitlines()
-    assert [call.split()[1:5] for call in calls] == [["-n", "2", "-d", "1"], ["-n", "4", "-d", "1"]]
+    assert [call.split(" -n ")[1].split()[:3] for call in calls] == [["7", "-d", "1"]] * 2  # five warm up
+    for call in calls:
+        assert {"cameras.bin", "images.bin", "points3D.bin", "images"} < set(call.split()) and ".png" in call
+        assert "transforms.json" not in call
     cases = {case["name"]: case for case in json.loads((tmp_path / "b.json").read_text())["cases"]}
-    assert cases["room/opensplat training"]["passed"] and cases["room/opensplat training"]["x ours"] > 0
-    assert "not compared here" in cases["room/opensplat training"]["note"]
-    broken = _fake_opensplat(tmp_path, "echo no such scene >&2; exit 3")
+    ours, theirs = cases["room/cpu-f32 training"], cases["room/opensplat training"]
+    assert theirs["iteration ms"] >= theirs["least ms"] >= 20
+    assert theirs["x ours"] == pytest.approx(theirs["iteration ms"] / ours["iteration ms"])
+    assert "not compared here" in theirs["note"] and "of 4 iterations, " in theirs["note"]
+    assert ours["note"].endswith("Gaussians, 32 x 24")
+    broken = _fake_opensplat(tmp_path, "echo no such scene >&2; echo usage >&2; exit 3")
     assert main(["bench", *race_, *scene, "--against", f"opensplat={broken}"]) == 2
     assert "no such scene" in capsys.readouterr().err
+    silent = _fake_opensplat(tmp_path, "echo Done")
+    assert main(["bench", *race_, *scene, "--against", f"opensplat={silent}"]) == 2
+    assert "0 lines for 7 iterations" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(not (find_spec("torch") and find_spec("gsplat")), reason="needs torch and gsplat, the extra peers")
