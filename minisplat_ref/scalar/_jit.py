@@ -49,12 +49,12 @@ __all__ = [
 ]
 
 if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
-    # Numba would take TBB first where it is installed; on two threads a parallel loop costs 55 us more with it.
+    # Numba would take TBB first where it is installed; it takes longer to start and end a parallel loop.
     numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # type: ignore[attr-defined]
 
 if "OMP_WAIT_POLICY" not in os.environ:
-    # Between parallel loops OpenMP's threads wait some 0.2 ms for the next one before they sleep, not 12 ms: as fast on
-    # free cores, and on busy ones a thread that waits does not keep the one that it waits for from running.
+    # OpenMP's threads wait for the next parallel loop for a fraction of a millisecond before they sleep, not for many:
+    # as fast on free cores, and on busy ones a thread that waits does not keep the one that it waits for from running.
     os.environ.setdefault("GOMP_SPINCOUNT", "5000")
 
 _KERNEL_LOCK = threading.RLock()
