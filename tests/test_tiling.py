@@ -209,6 +209,15 @@ def test_a_gaussian_over_all_tiles(fast_backend):
     assert_array_equal(np.diff(bins.gaussian_offsets), [grid.n_tiles_x * grid.n_tiles_y] * 3)
 
 
+def test_a_row_under_the_box_that_the_ellipse_does_not_reach(fast_backend):
+    width, height = fast_backend.tile_width, fast_backend.tile_height
+    circle = footprints([[0, 0, 2 * width, 2 * height]], [1])._replace(  # of radius 3.3
+        means2d=np.array([[width - 1.0, height - 4.0]]), conics=np.array([[1.0, 0.0, 1.0]])
+    )
+    bins = fast_backend.bin_gaussians(circle, TileGrid(2 * width, 2 * height, width, height), GSPLAT_MAIN)
+    assert lists(bins) == [[0], [0], [], []]
+
+
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="needs two threads")
 @pytest.mark.parametrize("n", [7, 900])  # fewer Gaussians than parts, and more
 def test_same_lists_at_any_number_of_threads(n, rng):
