@@ -164,8 +164,8 @@ def test_stages_are_compiled_by_other_processes(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     [compiled] = warm_up(["Adam"], n_processes=1)
     assert compiled.name == "Adam" and compiled.seconds > 0
-    [kernel] = files(tmp_path, ".nbc")
-    assert kernel.startswith("adam.")
+    kernels = files(tmp_path, ".nbc")
+    assert len(kernels) == 2 and all(kernel.startswith("adam.") for kernel in kernels)  # of all rows, and of some
 
 
 def test_warm_says_what_it_did(root, monkeypatch, capsys):
@@ -175,7 +175,7 @@ def test_warm_says_what_it_did(root, monkeypatch, capsys):
     assert "1 of 1" in captured.err and "Adam (float32)" in captured.err
     assert str(root / _jit.source_hash()) in captured.out and "ready after" in captured.out
     assert "1 folders of other versions hold 0.0 MB" in captured.out and "clear --stale" in captured.out
-    assert len(files(root / _jit.source_hash(), ".nbc")) == 2  # and the made one
+    assert len(files(root / _jit.source_hash(), ".nbc")) == 3  # two, and the made one
 
 
 def test_info_lists_only_our_folders(root, capsys):

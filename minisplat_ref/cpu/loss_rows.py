@@ -4,6 +4,9 @@ The Gaussian window is separable, and the row of an interleaved RGB image is one
 neighbours of a channel lie three numbers apart. A row is filtered completely, vertically and then horizontally, while
 it is in the cache. The images have margins of zeros, wide enough for the window and for the last eight numbers of a
 row, so that no number is a special case.
+
+Moments are those of I - 1/2 and T - 1/2: variances are differences of moments, and of these smaller ones few digits
+cancel.
 """
 
 import functools
@@ -15,7 +18,7 @@ import numpy as np
 from minisplat_ref.constants import SSIM_C1, SSIM_C2, SSIM_SIGMA, SSIM_WINDOW
 from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.lanes import WIDTH, filled, load, select, store, sum_of
-from minisplat_ref.scalar.literals import TWO, ZERO
+from minisplat_ref.scalar.literals import HALF, TWO, ZERO
 from minisplat_ref.scalar.loss import ssim_and_derivatives
 
 HALF_WINDOW = SSIM_WINDOW // 2
@@ -64,7 +67,7 @@ def loss_kernels(dtype: np.dtype) -> LossKernels:
     def moments_down(image, target, i, length):
         mean_i = mean_t = squares = products = ZERO * filled(c1)
         for k in range(SSIM_WINDOW):
-            a, b = load(image, i + k * length), load(target, i + k * length)
+            a, b = load(image, i + k * length) - HALF, load(target, i + k * length) - HALF
             weighted_a, weighted_b = window[k] * a, window[k] * b
             mean_i = mean_i + weighted_a
             mean_t = mean_t + weighted_b
@@ -113,7 +116,8 @@ def loss_kernels(dtype: np.dtype) -> LossKernels:
         up = filled(v_l1)
         for i in range(0, n_values, WIDTH):
             a, b = load(image, first + i), load(target, first + i)
-            by_ssim = across(s, i) + TWO * a * across(s, length + i) + b * across(s, 2 * length + i)
+            by_squares = TWO * (a - HALF) * across(s, length + i) + (b - HALF) * across(s, 2 * length + i)
+            by_ssim = across(s, i) + by_squares
             by_l1 = select(a > b, up, select(a < b, -up, ZERO * up))
             store(s, 3 * length + i, by_l1 + v_ssim * by_ssim)
         out[y] = s[3 * length : 3 * length + n_values]
