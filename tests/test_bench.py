@@ -239,23 +239,24 @@ def test_opensplat_needs_photographs(tmp_path, capsys):
     assert "--scene" in capsys.readouterr().err
 
 
-def test_opensplat_is_timed_by_its_command_line(tmp_path, capsys):
+def test_opensplat_is_timed_by_its_command_line(tmp_path, capsys, monkeypatch):
     from data_tools.synthetic import make_scene
     from data_tools.synthetic.files import write_scene
 
     settings = {"n_views": 4, "width": 32, "height": 24, "n_points": 300}
     write_scene(make_scene("room", **settings), tmp_path / "room", settings)
     log = tmp_path / "calls"
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
     (tmp_path / "room" / "transforms.json").write_text("{}")  # it would read this instead of the model
     steps = 'for i in $(seq "$3"); do sleep 0.02; echo "Step $i: 0.4 [50%]"; done'  # the third argument is -n's value
-    program = _fake_opensplat(tmp_path, f'echo $(ls $1 $1/sparse/0 $1/images/) "$@" >> {log}; {steps}')
+    program = _fake_opensplat(tmp_path, f'echo $(ls $1 $1/sparse/0 $1/images/) $OMP_WAIT_POLICY "$@" >> {log}; {steps}')
     scene = ["--scene", str(tmp_path / "room"), "--iterations", "2"]
     race_ = ["--workloads", "synth", "--backends", "cpu-f32", "--repeats", "1"]
     assert main(["bench", *race_, *scene, "--against", f"opensplat={program}", "--json", str(tmp_path / "b.json")]) == 0
     calls = log.read_text().splitlines()
     assert [call.split(" -n ")[1].split()[:3] for call in calls] == [["7", "-d", "1"]] * 2  # five warm up
     for call in calls:
-        assert {"cameras.bin", "images.bin", "points3D.bin", "images"} < set(call.split()) and ".png" in call
+        assert {"cameras.bin", "images.bin", "points3D.bin", "images", "PASSIVE"} < set(call.split()) and ".png" in call
         assert "transforms.json" not in call
     cases = {case["name"]: case for case in json.loads((tmp_path / "b.json").read_text())["cases"]}
     ours, theirs = cases["room/cpu-f32 training"], cases["room/opensplat training"]

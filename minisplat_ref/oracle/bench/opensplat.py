@@ -8,6 +8,9 @@ Its iteration is made as like ours as its options allow. The number of Gaussians
 refinement. It counts as densifying all the while, because afterwards it would step its optimiser in every 32nd or 64th
 iteration only. What remains different: it steps the SH coefficients above degree 0 in every 16th iteration, all other
 parameters of all Gaussians in every one, and it adds up the statistics that a refinement would use.
+
+It draws with threads of its own, while those of OpenMP, which its libtorch calculates with, spin while they wait
+for more and take the cores from them, which on a busy machine costs it a multiple of its time. They are told to sleep.
 """
 
 import os
@@ -22,6 +25,7 @@ from minisplat_ref.io.colmap import find_model, read_model
 
 NEVER = 10**9  # iterations
 FIXED_POPULATION = ("--num-downscales", "0", "--refine-every", str(NEVER), "--densify-until", str(NEVER))
+SLEEPING_THREADS = {"OMP_WAIT_POLICY": "PASSIVE"}
 
 
 def iteration_seconds(program: Path, scene: Path, downscale: int, iterations: int) -> list[float]:
@@ -54,7 +58,14 @@ def iteration_seconds(program: Path, scene: Path, downscale: int, iterations: in
         command = [str(program.resolve()), str(laid_out), *options, "-o", str(Path(folder) / "out.ply")]
         with (Path(folder) / "errors").open("w+") as errors:
             try:
-                process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=errors, text=True)
+                process = subprocess.Popen(
+                    command,
+                    cwd=folder,
+                    env={**SLEEPING_THREADS, **os.environ},
+                    stdout=subprocess.PIPE,
+                    stderr=errors,
+                    text=True,
+                )
             except OSError as error:
                 raise InputError(f"{program} cannot be run: {error.strerror}") from error
             with process:
