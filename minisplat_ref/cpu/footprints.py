@@ -2,8 +2,8 @@
 
 A box of pixels within one row or one column of tiles reaches all of these tiles, nearly always one or two. Only where
 it lies over several rows and several columns it is asked which of the tiles the visible ellipse reaches: that drops
-most of those that the box of a slanted needle would give. Asking everywhere would take longer than the blending of the
-few tiles more, in which it finds no row of pixels to visit.
+most of those that the box of a slanted needle would give. Elsewhere few would be dropped, and blending finds out by
+itself that there is no row of pixels to visit.
 
 A processor guesses which way a branch goes and works ahead; a wrong guess costs as much as it worked ahead, and that is
 most where the answer is the end of a long chain of divisions and roots. So no branch depends on the ellipse: every tile
