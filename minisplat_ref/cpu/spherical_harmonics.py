@@ -2,7 +2,7 @@
 
 Eight Gaussians are one step. The formulas want the same coefficient of all eight, but in memory the coefficients of one
 Gaussian stand together. They are therefore turned in small buffers that stay in the cache. To and from memory they go
-row after row: processors fetch ahead of a single stream, and eight rows taken column by column cost twice the time.
+row after row: processors fetch ahead of a single stream, and not of eight rows taken column by column.
 Work is proportional to what the camera sees: a chunk of Gaussians goes through the list of its visible ones.
 
 Helpers have no loops and no branches: the compiler would count references of the arrays that such a helper is given,
