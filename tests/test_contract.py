@@ -15,7 +15,7 @@ MODULES = [module.name for module in iter_modules(reference.__path__)]
 STAGES = [field.name for field in fields(Backend) if field.name not in ("name", "tile_width", "tile_height")]
 
 # Modules of cpu without a twin of their name: parts of the compositing and sorting kernels, not stages.
-BLENDING_PARTS = {"blend_forward", "blend_backward", "tile_state", "tile_rows", "records", "exponential"}
+BLENDING_PARTS = {"blend_forward", "blend_backward", "tile_state", "tile_rows", "records", "pair_sums", "exponential"}
 KERNEL_PARTS = BLENDING_PARTS | {"footprints", "sorting", "gaussian_rows", "loss_rows"}
 
 # Public functions of cpu without a twin: they prepare arguments for kernels.

@@ -9,9 +9,11 @@ from minisplat_ref.cpu.exponential import exp_exact, exp_fast
 from minisplat_ref.scalar.lanes import (
     WIDTH,
     any_of,
+    converted,
     counted,
     filled,
     floor,
+    gather,
     larger,
     largest_of,
     load,
@@ -19,6 +21,7 @@ from minisplat_ref.scalar.lanes import (
     nearest,
     prefetch,
     scaled_by_power,
+    scatter,
     select,
     smaller,
     sqrt,
@@ -167,6 +170,40 @@ def test_prefetch_changes_nothing():
     compiled(lambda table: prefetch(table, 4))(table)
     prefetch(table, 4)
     assert_array_equal(table, expected)
+
+
+ROWS = (9, 0, 4, 4, 7, 2, 11, 5)
+
+
+@pytest.mark.parametrize("table_dtype", [np.int32, *DTYPES])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_gather_takes_a_column_of_eight_rows(dtype, table_dtype, rng):
+    def run(table, zero, out):
+        store(out, 0, converted(gather(table, ROWS, 2), zero))
+
+    table = (10 * rng.normal(size=(12, 3))).astype(table_dtype)
+    fast, plain = two_ways(run, table, dtype(0), np.zeros(WIDTH, dtype))
+    assert_array_equal(fast, plain)
+    assert_array_equal(fast, table[ROWS, 2].astype(dtype))
+    for other in (np.asfortranarray(table), np.repeat(table, 2, axis=1)[:, ::2]):
+        assert_array_equal(two_ways(run, other, dtype(0), np.zeros(WIDTH, dtype))[0], fast)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_scatter_writes_a_column_or_eight_of_them(dtype, rng):
+    def run(a, table):
+        scatter(table, ROWS, 1, load(a, 0))
+        first = load(a, 0), load(a, WIDTH), load(a, 2 * WIDTH), load(a, 3 * WIDTH)
+        last = load(a, 4 * WIDTH), load(a, 5 * WIDTH), load(a, 6 * WIDTH), load(a, 7 * WIDTH)
+        scatter(table, ROWS, 2, (*first, *last))
+
+    a = rng.normal(size=8 * WIDTH)
+    a[[3, 11, 19, 27, 35, 43, 51, 59]] = a[[2, 10, 18, 26, 34, 42, 50, 58]]  # one row is there twice
+    fast, plain = two_ways(run, a, np.zeros((12, 11), dtype))
+    assert_array_equal(fast, plain)
+    expected = np.zeros((12, 11), dtype)
+    expected[ROWS, 1], expected[ROWS, 2:10] = a[:WIDTH], a.reshape(8, WIDTH).T
+    assert_array_equal(fast, expected)
 
 
 def test_exponentials():

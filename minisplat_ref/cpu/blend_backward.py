@@ -13,9 +13,8 @@ footprint are moments of q over its pixels:
 The moments over e rather than over dx keep a needle's gradient: over dx they grow with its length squared and cancel
 later. They are changed to those by the conic's entries in float64.
 
-A pair (tile, Gaussian) has a slot of its own for its moments, and afterwards each Gaussian adds up its slots in order.
-No two threads write the same number, and the sums have the same bytes at any number of threads. Cost: 6 + D numbers a
-pair.
+A pair (tile, Gaussian) has a slot of its own for its moments, and afterwards each Gaussian adds up its slots
+(:mod:`.pair_sums`). The background is behind them all: what of <v, colour> each tile gives it is added up likewise.
 """
 
 import functools
@@ -23,69 +22,21 @@ from collections.abc import Callable
 
 import numpy as np
 
-from minisplat_ref.cpu.projection import N_CHUNKS
-from minisplat_ref.cpu.records import COLOR, MEAN_X, MEAN_Y, SLOPE
+from minisplat_ref.cpu.pair_sums import N_MOMENTS, slot_size
+from minisplat_ref.cpu.records import COLOR, MEAN_X, MEAN_Y, N_FUSED, SLOPE
 from minisplat_ref.cpu.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, reached_rows, start_scratch, to_mean
 from minisplat_ref.cpu.tile_state import (
     CHECK_EVERY,
     N_ROWS,
     corner,
     open_rows,
-    pixel_place,
+    row_in_image,
     start_tile,
 )
-from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
 from minisplat_ref.scalar._jit import kernel, prange, scalar
-from minisplat_ref.scalar.compositing import alpha_vjp, blend, conic_vjp_of_moments, factors
+from minisplat_ref.scalar.compositing import alpha_vjp, blend
 from minisplat_ref.scalar.lanes import WIDTH, filled, load, select, store, sum_of, sums_of
 from minisplat_ref.scalar.literals import ONE, ZERO
-
-N_MOMENTS = 6  # sums of q, q e, q dy, q e^2, q e dy, q dy^2
-N_FUSED = 3  # channels whose sums are kept in registers; fewer are padded with zeros, further ones wait in memory
-
-
-def slot_size(n_channels: int) -> int:
-    """Numbers in a pair's slot: its moments and the sums of its channels, three at least."""
-    return N_MOMENTS + max(n_channels, N_FUSED)
-
-
-@scalar
-def fused_colors(records, n, n_channels):
-    """First three channels of a Gaussian, zeros for those that there are not."""
-    zero = records.dtype.type(0)
-    return (
-        records[n, COLOR] if n_channels > 0 else zero,
-        records[n, COLOR + 1] if n_channels > 1 else zero,
-        records[n, COLOR + 2] if n_channels > 2 else zero,
-    )
-
-
-@scalar
-def _sum_slots(n, slots, offsets, projection, total, out):
-    """Gradient of one Gaussian from the moments in its slots; ``total`` is scratch in float64."""
-    total[:] = ZERO
-    for slot in range(offsets[n], offsets[n + 1]):
-        for j in range(total.size):
-            total[j] += slots[slot, j]
-    a, slope, pivot = factors(projection.conics[n, 0], projection.conics[n, 1], projection.conics[n, 2])
-    out.means2d[n, 0] = a * total[1]
-    out.means2d[n, 1] = slope * a * total[1] + pivot * total[2]
-    v_a, v_b, v_c = conic_vjp_of_moments(slope, total[3], total[4], total[5])
-    out.conics[n, 0], out.conics[n, 1], out.conics[n, 2] = v_a, v_b, v_c
-    out.opacities[n] = -total[0] / projection.opacities[n]
-    for k in range(out.colors.shape[1]):
-        out.colors[n, k] = total[N_MOMENTS + k]
-
-
-@kernel()
-def sum_slots(slots, offsets, projection, out):
-    """Gradients of all Gaussians; those without a pair keep their zeros."""
-    n_gaussians = offsets.size - 1
-    for chunk in prange(N_CHUNKS):
-        total = np.empty(slots.shape[1], np.float64)
-        for n in range(n_gaussians * chunk // N_CHUNKS, n_gaussians * (chunk + 1) // N_CHUNKS):
-            if offsets[n] < offsets[n + 1]:
-                _sum_slots(n, slots, offsets, projection, total, out)
 
 
 @functools.cache
@@ -100,15 +51,25 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
 
     @scalar
     def start_vjp(state, x0, y0, frame, image, alpha, v_image, v_alpha):
-        for y in range(min(TILE_HEIGHT, frame.height - y0)):
-            for x in range(min(TILE_WIDTH, frame.width - x0)):
-                i = pixel_place(x, y, n_fields)
-                behind = -v_alpha[y0 + y, x0 + x] * (ONE - alpha[y0 + y, x0 + x])  # alpha = 1 - T_final
+        for row in range(N_ROWS):
+            x, y, n_pixels = row_in_image(row, x0, y0, frame)
+            for i in range(n_pixels):
+                place = row * row_size + i
+                behind = -v_alpha[y, x + i] * (ONE - alpha[y, x + i])  # alpha = 1 - T_final
                 for k in range(n_channels):
-                    v = v_image[y0 + y, x0 + x, k]
-                    state[i + channels + k * WIDTH] = v
-                    behind += v * image[y0 + y, x0 + x, k]
-                state[i + behind_place] = behind
+                    v = v_image[y, x + i, k]
+                    state[place + channels + k * WIDTH] = v
+                    behind += v * image[y, x + i, k]
+                state[place + behind_place] = behind
+
+    @scalar
+    def background_vjp(state, sums):
+        """What reaches the background of one tile: its pixels' transmittances times v."""
+        for k in range(n_channels):
+            total = filled(state.dtype.type(0))
+            for i in range(0, N_ROWS * row_size, row_size):
+                total = total + abs(load(state, i)) * load(state, i + channels + k * WIDTH)
+            sums[k] = sum_of(total)
 
     @scalar
     def v_channel(s, k, i):
@@ -132,7 +93,7 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
             n = ids[m]
             n_rows = write_alphas(scratch, row_ids, reached, records, n, x0, y0)
             mx, my, slope = records[n, MEAN_X] - as_data(x0), records[n, MEAN_Y] - as_data(y0), records[n, SLOPE]
-            color = fused_colors(records, n, n_channels)
+            red, green, blue = records[n, COLOR], records[n, COLOR + 1], records[n, COLOR + 2]
             q_sum = qe = qy = qee = qey = qyy = v_red = v_green = v_blue = zero
             further[:] = ZERO
             for j in range(n_rows):
@@ -146,7 +107,7 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
                 v_red = v_red + weight * v_0
                 v_green = v_green + weight * v_1
                 v_blue = v_blue + weight * v_2
-                shade = v_0 * color[0] + v_1 * color[1] + v_2 * color[2]
+                shade = v_0 * red + v_1 * green + v_2 * blue
                 for k in range(N_FUSED, n_channels):
                     v, at = v_channel(s, k, i), (k - N_FUSED) * WIDTH
                     shade = shade + v * records[n, COLOR + k]
@@ -170,7 +131,7 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
 
     @kernel()
     def composite_tiles_vjp(
-        records, offsets, ids, slots_of, ranges, n_threads, frame, image, alpha, v_image, v_alpha, slots
+        records, offsets, ids, slots_of, ranges, n_threads, frame, image, alpha, v_image, v_alpha, slots, v_backgrounds
     ):
         for thread in prange(n_threads):
             state = np.empty(N_ROWS * row_size, image.dtype)
@@ -184,5 +145,6 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
                     start_vjp(state, x0, y0, frame, image, alpha, v_image, v_alpha)
                     tile_ids, tile_slots = ids[offsets[tile] : offsets[tile + 1]], slots_of[offsets[tile] :]
                     tile_vjp(state, scratch, row_ids, further, records, tile_ids, tile_slots, frame, x0, y0, slots)
+                    background_vjp(state, v_backgrounds[tile])
 
     return composite_tiles_vjp

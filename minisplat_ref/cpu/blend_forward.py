@@ -3,8 +3,7 @@
 The number of channels, the exponential and whether statistics are collected are compile-time constants: each
 combination is its own compiled kernel.
 
-What the weights of one Gaussian in one tile add up to goes into the slot of this pair, and each Gaussian then goes
-through its slots in order, as in :mod:`minisplat_ref.cpu.blend_backward`.
+What the weights of one Gaussian in one tile add up to goes into the slot of this pair (:mod:`.pair_sums`).
 """
 
 import functools
@@ -13,7 +12,6 @@ from collections.abc import Callable
 import numpy as np
 
 from minisplat_ref.constants import MEDIAN_TRANSMITTANCE
-from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.cpu.records import COLOR
 from minisplat_ref.cpu.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, reached_rows, start_scratch
 from minisplat_ref.cpu.tile_state import (
@@ -21,39 +19,15 @@ from minisplat_ref.cpu.tile_state import (
     N_ROWS,
     corner,
     open_rows,
-    pixel_place,
+    row_in_image,
     start_tile,
 )
-from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
 from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.compositing import blend
 from minisplat_ref.scalar.lanes import WIDTH, filled, larger, largest_of, load, select, store, sum_of
 from minisplat_ref.scalar.literals import ONE, ZERO
 
 MEDIAN = np.float32(MEDIAN_TRANSMITTANCE)  # one half: exact in float32
-N_PAIR_STATS = 3  # of a pair: sum of the weights, largest weight, number of hits
-
-
-@scalar
-def _sum_pair_stats(n, slots, offsets, stats):
-    """Statistics of one Gaussian from those of its pairs, summed in float64."""
-    total = 0.0
-    largest = slots.dtype.type(0)
-    n_hits = 0
-    for slot in range(offsets[n], offsets[n + 1]):
-        total += slots[slot, 0]
-        largest = max(largest, slots[slot, 1])
-        n_hits += int(slots[slot, 2])
-    stats.blend_weight_sum[n], stats.blend_weight_max[n], stats.hit_count[n] = total, largest, n_hits
-
-
-@kernel()
-def sum_pair_stats(slots, offsets, stats):
-    """Write the weights' sums and maxima and the hit counts of all Gaussians."""
-    n_gaussians = offsets.size - 1
-    for chunk in prange(N_CHUNKS):
-        for n in range(n_gaussians * chunk // N_CHUNKS, n_gaussians * (chunk + 1) // N_CHUNKS):
-            _sum_pair_stats(n, slots, offsets, stats)
 
 
 @functools.cache
@@ -78,22 +52,24 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
 
     @scalar
     def store_tile(state, x0, y0, background, frame, image, alpha):
-        for y in range(min(TILE_HEIGHT, frame.height - y0)):
-            for x in range(min(TILE_WIDTH, frame.width - x0)):
-                i = pixel_place(x, y, n_fields)
-                left = abs(state[i])
-                alpha[y0 + y, x0 + x] = ONE - left
+        for row in range(N_ROWS):
+            x, y, n_pixels = row_in_image(row, x0, y0, frame)
+            for i in range(n_pixels):
+                place = row * row_size + i
+                left = abs(state[place])
+                alpha[y, x + i] = ONE - left
                 for k in range(n_channels):
-                    image[y0 + y, x0 + x, k] = state[i + channels + k * WIDTH] + left * background[k]
+                    image[y, x + i, k] = state[place + channels + k * WIDTH] + left * background[k]
 
     @scalar
     def store_stats(state, x0, y0, frame, tile_ids, median_depth, dominant_ids):
-        for y in range(min(TILE_HEIGHT, frame.height - y0)):
-            for x in range(min(TILE_WIDTH, frame.width - x0)):
-                i = pixel_place(x, y, n_fields)
-                place = np.int64(state[i + best_place])
-                dominant_ids[y0 + y, x0 + x] = tile_ids[place - 1] if place > 0 else -1
-                median_depth[y0 + y, x0 + x] = state[i + crossing]
+        for row in range(N_ROWS):
+            x, y, n_pixels = row_in_image(row, x0, y0, frame)
+            for i in range(n_pixels):
+                place = row * row_size + i
+                best_hit = np.int64(state[place + best_place])
+                dominant_ids[y, x + i] = tile_ids[best_hit - 1] if best_hit > 0 else -1
+                median_depth[y, x + i] = state[place + crossing]
 
     @scalar
     def blend_tile(s, scratch, row_ids, records, depths, ids, slots_of, frame, x0, y0, slots):

@@ -8,39 +8,18 @@ from collections.abc import Callable
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.cpu.blend_backward import backward_kernel, slot_size, sum_slots
-from minisplat_ref.cpu.blend_forward import N_PAIR_STATS, forward_kernel, sum_pair_stats
+from minisplat_ref.cpu.blend_backward import backward_kernel
+from minisplat_ref.cpu.blend_forward import forward_kernel
 from minisplat_ref.cpu.exponential import exp_exact, exp_fast
+from minisplat_ref.cpu.pair_sums import N_PAIR_STATS, slot_size, sum_pair_stats, sum_slots
 from minisplat_ref.cpu.records import records_of
 from minisplat_ref.cpu.tile_state import frame_of, tile_ranges
-from minisplat_ref.scalar._jit import kernel, n_threads, prange, scalar
-from minisplat_ref.scalar.literals import ONE
+from minisplat_ref.scalar._jit import n_threads
 from minisplat_ref.types import BlendStats, CompositeGradient, Floats, Projection, RenderOutput, TileBins
 
 
 def _exponential(dtype: np.dtype) -> Callable:
     return exp_fast if dtype == np.float32 else exp_exact
-
-
-@scalar
-def _background_vjp_row(alpha, v_image, sums):
-    for x in range(alpha.size):
-        transmittance = ONE - alpha[x]
-        for k in range(sums.size):
-            sums[k] += transmittance * v_image[x, k]
-
-
-@kernel()
-def _background_vjp_rows(alpha, v_image, sums):
-    for y in prange(alpha.shape[0]):
-        _background_vjp_row(alpha[y], v_image[y], sums[y])
-
-
-def _background_vjp(alpha: Floats, v_image: Floats) -> Floats:
-    """Derivative by the background [D], row by row in float64: what passes all Gaussians, times the pixel's share."""
-    sums = np.zeros((v_image.shape[0], v_image.shape[2]))
-    _background_vjp_rows(alpha, v_image, sums)
-    return sums.sum(axis=0).astype(v_image.dtype)
 
 
 def composite(
@@ -129,7 +108,9 @@ def composite_vjp_with(
     """Chain gradients with the exponential that the forward pass used."""
     dtype, n_channels = colors.dtype, colors.shape[1]
     v_image, v_alpha = np.ascontiguousarray(v_image, dtype), np.ascontiguousarray(v_alpha, dtype)
-    slots = np.empty((len(bins.gaussian_ids), slot_size(n_channels)), dtype)
+    width = slot_size(n_channels)
+    slots = np.empty(len(bins.gaussian_ids) * width, dtype)
+    v_backgrounds = np.empty((len(bins.tile_offsets) - 1, n_channels))  # by tiles
     backward_kernel(exp, n_channels)(
         records_of(projection, colors, conventions),
         bins.tile_offsets,
@@ -142,14 +123,15 @@ def composite_vjp_with(
         output.alpha,
         v_image,
         v_alpha,
-        slots.reshape(-1),
+        slots,
+        v_backgrounds,
     )
     out = CompositeGradient(
-        np.zeros(projection.means2d.shape, projection.means2d.dtype),
-        np.zeros(projection.conics.shape, projection.conics.dtype),
-        np.zeros(projection.opacities.shape, projection.opacities.dtype),
-        np.zeros(colors.shape, colors.dtype),
-        _background_vjp(output.alpha, v_image),
+        np.empty(projection.means2d.shape, projection.means2d.dtype),
+        np.empty(projection.conics.shape, projection.conics.dtype),
+        np.empty(projection.opacities.shape, projection.opacities.dtype),
+        np.empty(colors.shape, dtype),
+        v_backgrounds.sum(axis=0).astype(dtype),
     )
-    sum_slots(slots, bins.gaussian_offsets, projection, out)
+    sum_slots(slots, width, bins.gaussian_offsets, projection, out)
     return out

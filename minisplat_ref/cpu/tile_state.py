@@ -56,9 +56,10 @@ def corner(tile, frame):
 
 
 @scalar
-def pixel_place(x, y, n_fields):
-    """Place of the transmittance of a pixel of the tile; the next field is ``WIDTH`` further."""
-    return (x // WIDTH * TILE_HEIGHT + y) * n_fields * WIDTH + x % WIDTH
+def row_in_image(row, x0, y0, frame):
+    """Return column and line of a row's first pixel, and how many of its eight pixels the image has."""
+    x, y = x0 + row // TILE_HEIGHT * WIDTH, y0 + row % TILE_HEIGHT
+    return x, y, max(0, min(WIDTH, frame.width - x)) if y < frame.height else 0
 
 
 @scalar
@@ -67,9 +68,9 @@ def start_tile(state, x0, y0, frame, n_fields):
     as_data = state.dtype.type
     state[:] = ZERO
     for row in range(N_ROWS):
-        columns = counted(as_data(0)) + as_data(x0 + row // TILE_HEIGHT * WIDTH)
-        n_columns = as_data(frame.width if y0 + row % TILE_HEIGHT < frame.height else 0)
-        store(state, row * n_fields * WIDTH, select(columns < n_columns, filled(as_data(1)), -ONE))
+        _, _, n_pixels = row_in_image(row, x0, y0, frame)
+        is_inside = counted(as_data(0)) < as_data(n_pixels)
+        store(state, row * n_fields * WIDTH, select(is_inside, filled(as_data(1)), -ONE))
 
 
 @scalar

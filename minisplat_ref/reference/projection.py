@@ -72,7 +72,7 @@ def project(
     return Projection(
         means2d=np.where(rows, means2d, 0),
         depths=np.where(is_visible, depths, 0),
-        conics=np.where(rows, conics, 0),
+        conics=np.where(rows, conics, 0).copy(order="C"),
         opacities=np.where(is_visible, opacities, 0),
         radii=np.where(rows, radii, 0).astype(np.int32),
         boxes=np.where(rows, boxes, 0).astype(np.int32),

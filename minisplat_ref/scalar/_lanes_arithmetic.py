@@ -166,7 +166,7 @@ _register_unary(ceil, lambda builder, a: _call(builder, "llvm.ceil", a.type, [a]
 _register_unary(nearest, lambda builder, a: _call(builder, "llvm.rint", a.type, [a]))
 _register_unary(sqrt, lambda builder, a: _call(builder, "llvm.sqrt", a.type, [a]), of_one=lambda a: math.sqrt(a))
 _register_unary(exp_of, lambda builder, a: _call(builder, "llvm.exp", a.type, [a]))
-_register_unary(log_of, lambda builder, a: _call(builder, "llvm.log", a.type, [a]))
+_register_unary(log_of, lambda builder, a: _call(builder, "llvm.log", a.type, [a]), of_one=lambda a: math.log(a))
 
 
 @compiled(scaled_by_power)

@@ -75,15 +75,20 @@ def _store(typing: Any, array: Any, i: Any, lanes: Any) -> Any:
 
 def _row_pointers(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
     """Where the numbers of a column stand; a table of one dimension has one column, 0."""
-    array = context.make_array(signature.args[0])(context, builder, args[0])
+    table = signature.args[0]
+    array = context.make_array(table)(context, builder, args[0])
     stride, byte = builder.extract_value(array.strides, 0), ir.IntType(8).as_pointer()
-    start = builder.bitcast(builder.gep(array.data, [args[2]], inbounds=True), byte)
+    is_strided = table.layout != "C" and table.ndim == 2
+    step = builder.extract_value(array.strides, 1) if is_strided else ir.IntType(64)(table.dtype.bitwidth // 8)
+    start = builder.gep(builder.bitcast(array.data, byte), [builder.mul(args[2], step)])
     rows = (builder.extract_value(args[1], k) for k in range(WIDTH))
     return [builder.bitcast(builder.gep(start, [builder.mul(row, stride)]), array.data.type) for row in rows]
 
 
 @compiled(gather)
 def _gather(typing: Any, table: Any, rows: Any, column: Any) -> Any:
+    if table.ndim > 2 and table.layout != "C":
+        return None
     lanes = LanesType(table.dtype)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -97,10 +102,20 @@ def _gather(typing: Any, table: Any, rows: Any, column: Any) -> Any:
 
 @compiled(scatter)
 def _scatter(typing: Any, table: Any, rows: Any, column: Any, lanes: Any) -> Any:
+    if table.layout != "C" and (table.ndim > 2 or not isinstance(lanes, LanesType)):
+        return None
+
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        vector = _convert(builder, args[3], context.get_value_type(LanesType(table.dtype)))
-        for k, pointer in enumerate(_row_pointers(context, builder, signature, args)):
-            builder.store(builder.extract_element(vector, I32(k)), pointer)
+        kind = context.get_value_type(LanesType(table.dtype))
+        pointers = _row_pointers(context, builder, signature, args)
+        if isinstance(lanes, LanesType):
+            vector = _convert(builder, args[3], kind)
+            for k, pointer in enumerate(pointers):
+                builder.store(builder.extract_element(vector, I32(k)), pointer)
+            return context.get_dummy_value()
+        columns = [_convert(builder, builder.extract_value(args[3], k), kind) for k in range(WIDTH)]
+        for row, pointer in zip(_turned(builder, columns), pointers, strict=True):
+            builder.store(row, builder.bitcast(pointer, kind.as_pointer()), align=table.dtype.bitwidth // 8)
         return context.get_dummy_value()
 
     return types.void(table, rows, types.int64, lanes), generate
@@ -111,6 +126,8 @@ def _convert(builder: Any, vector: Any, kind: Any) -> Any:
         return vector
     if isinstance(kind.element, ir.IntType):
         return builder.fptosi(vector, kind)
+    if isinstance(vector.type.element, ir.IntType):
+        return builder.sitofp(vector, kind)
     return (builder.fptrunc if isinstance(kind.element, ir.FloatType) else builder.fpext)(vector, kind)
 
 
@@ -122,20 +139,25 @@ def _converted(typing: Any, lanes: Any, zero: Any) -> Any:
     return LanesType(zero)(lanes, zero), generate
 
 
+def _turned(builder: Any, rows: list[Any]) -> list[Any]:
+    """Columns of a square of eight rows."""
+    vectors = list(rows)
+    for size in (4, 2, 1):  # blocks of this size change places across the diagonal
+        for k in (k for k in range(WIDTH) if not k & size):
+            pair = vectors[k], vectors[k + size]
+            for place, shift in ((k, 0), (k + size, size)):
+                mask = [i + shift if not i & size else WIDTH + (i ^ size) + shift for i in range(WIDTH)]
+                mask = ir.Constant(ir.VectorType(I32, WIDTH), mask)
+                vectors[place] = builder.shuffle_vector(*pair, mask)
+    return vectors
+
+
 @compiled(columns_of)
 def _columns_of(typing: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
     result = types.UniTuple(a, WIDTH)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        vectors = list(args)
-        for size in (4, 2, 1):  # blocks of this size change places across the diagonal
-            for k in (k for k in range(WIDTH) if not k & size):
-                pair = vectors[k], vectors[k + size]
-                for place, shift in ((k, 0), (k + size, size)):
-                    mask = [i + shift if not i & size else WIDTH + (i ^ size) + shift for i in range(WIDTH)]
-                    mask = ir.Constant(ir.VectorType(I32, WIDTH), mask)
-                    vectors[place] = builder.shuffle_vector(*pair, mask)
-        return context.make_tuple(builder, result, vectors)
+        return context.make_tuple(builder, result, _turned(builder, args))
 
     return result(a, b, c, d, e, f, g, h), generate
 

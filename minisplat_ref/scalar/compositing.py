@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.scalar._jit import scalar
-from minisplat_ref.scalar.lanes import select, smaller
+from minisplat_ref.scalar.lanes import larger, select, smaller
 from minisplat_ref.scalar.literals import HALF, ONE, TWO, ZERO
 
 PIVOT_MIN = np.float32(1e-14)  # of a conic, relative to c: a little above float64's rounding
@@ -38,7 +38,7 @@ def factors(a, b, c):
     pivot c - b^2 / a is such a difference itself, so conics are float64. Where they were rounded, it is kept positive.
     """
     slope = b / a
-    return a, slope, max(c - b * slope, PIVOT_MIN * c)
+    return a, slope, larger(c - b * slope, PIVOT_MIN * c)
 
 
 @scalar

@@ -89,13 +89,17 @@ def store(array: Any, i: Any, lanes: Any) -> None:
 
 
 def gather(table: Any, rows: Any, column: Any) -> Any:
-    """Return one number from each of eight rows of a C-contiguous table [N, ...], whose rows count as flat."""
+    """Return one number from each of eight rows of a table [N, ...]; further dimensions count as flat."""
     return table.reshape(len(table), -1)[list(rows), column]
 
 
 def scatter(table: Any, rows: Any, column: Any, lanes: Any) -> None:
-    """Write one number to each of eight rows of a table, rounded to its dtype: the inverse of ``gather``."""
-    table.reshape(len(table), -1)[list(rows), column] = lanes
+    """Write one number to each of eight rows of a table, rounded to its dtype: the inverse of ``gather``.
+
+    A tuple of eight lanes is eight columns, of which the first is ``column``.
+    """
+    columns = range(column, column + WIDTH) if isinstance(lanes, tuple) else [column]
+    table.reshape(len(table), -1)[np.ix_(rows, columns)] = np.reshape(lanes, (len(columns), WIDTH)).T
 
 
 def columns_of(a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:

@@ -5,13 +5,12 @@ and pivot of the conic: outside, alpha is below alpha_min. It is convex, so its 
 is the right-most point of all if that lies in the band, and otherwise lies on the nearer edge of the band.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
 from minisplat_ref.scalar._jit import scalar
-from minisplat_ref.scalar.lanes import larger, select, smaller, sqrt
+from minisplat_ref.scalar.lanes import larger, log_of, select, smaller, sqrt
 from minisplat_ref.scalar.literals import ONE, TWO, ZERO
 
 FAR = np.float32(1e9)  # px
@@ -31,13 +30,13 @@ class Outline(NamedTuple):
 
 @scalar
 def visible_outline(a, slope, pivot, opacity, alpha_min, margin):
-    """Outline on which alpha equals alpha_min, its level raised by a relative and an absolute margin."""
-    q = TWO * math.log(opacity / alpha_min)
-    q += margin * (q + margin)
-    inverse_a, pivot = ONE / max(a, FLAT), max(pivot, FLAT)
+    """Outline on which alpha equals alpha_min, its level raised by a relative and an absolute margin; also of lanes."""
+    q = TWO * log_of(opacity / alpha_min)
+    q = q + margin * (q + margin)
+    inverse_a, pivot = ONE / larger(a, FLAT), larger(pivot, FLAT)
     # The inverse of the conic has 1 / a + slope^2 / pivot as its first entry, and -slope / pivot beside the diagonal.
     lean = slope / pivot
-    tilt = -lean * math.sqrt(q / (inverse_a + slope * lean))
+    tilt = -lean * sqrt(q / (inverse_a + slope * lean))
     return Outline(slope, inverse_a, pivot, q, tilt)
 
 
