@@ -137,13 +137,13 @@ def _iterate(state: TrainState, scene: Scene, recipe: Recipe, backend: Backend, 
         with_depth=any(recipe.geometry),
         with_stats=any(isinstance(event, During) and event.needs_blend_stats for event in due),
     )
-    target = np.multiply(view.image, np.float32(1 / 255), dtype=np.float32)  # [H, W, 3]
     image = np.ascontiguousarray(output.image[..., :3])
-    loss, loss_tape = backend.photometric_loss(image, target, recipe.dssim_weight, view.mask)
+    loss, loss_tape = backend.photometric_loss(image, view.image, recipe.dssim_weight, view.mask)
     v_image, v_alpha = backend.photometric_loss_vjp(loss_tape), None
     del loss_tape  # larger than all images together, and the gradients of the Gaussians need the room
     if any(recipe.geometry):
         points = scene.points[view.point_ids] if view.point_ids is not None else scene.points[:0]
+        target = view.image * np.float32(1 / 255)  # [H, W, 3]
         term, term_tape = backend.geometric_loss(
             output.image[..., 3], output.alpha, target, view.camera, points, recipe.geometry, view.mask
         )

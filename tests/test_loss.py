@@ -74,6 +74,22 @@ def test_loss_mixes_its_terms(backend, rng, weight):
     assert_allclose(loss, expected, rtol=1e2 * CLOSED_FORM)
 
 
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("is_masked", [False, True])
+def test_bytes_are_255ths(backend, dtype, is_masked, rng):
+    image, photograph = two_images(rng)[0].astype(dtype), rng.integers(0, 256, (20, 17, 3), np.uint8)
+    mask = rng.uniform(size=(20, 17)) < 0.6 if is_masked else None
+    losses, gradients = [], []
+    for target in (photograph, (photograph / 255).astype(dtype)):
+        loss, tape = backend.photometric_loss(image, target, 0.2, mask)
+        losses.append(loss)
+        gradients.append(backend.photometric_loss_vjp(tape))
+    tolerance = 1e2 * CLOSED_FORM if dtype == np.float64 else PARITY_FLOAT32_LOSS
+    assert_allclose(*losses, rtol=tolerance)
+    assert gradients[0].dtype == dtype
+    assert_allclose(*gradients, rtol=0, atol=tolerance * np.abs(gradients[1]).max())
+
+
 def test_masked_pixels_neither_count_nor_leak(backend, rng):
     image, target = two_images(rng)
     mask = rng.uniform(size=image.shape[:2]) < 0.6

@@ -6,7 +6,7 @@ import numpy as np
 
 from minisplat_ref.cpu.loss_rows import HALF_WINDOW, PAD, loss_kernels, pad_rows
 from minisplat_ref.scalar.lanes import WIDTH
-from minisplat_ref.types import Bools, Floats
+from minisplat_ref.types import Bools, Floats, Ints
 
 
 class LossTape(NamedTuple):
@@ -32,54 +32,47 @@ def _row_length(width: int) -> int:
     return n_blocks * WIDTH
 
 
-def _padded(image: Floats, target: Floats) -> tuple[Floats, Floats]:
+def _padded(image: Floats, target: Floats | Ints) -> tuple[Floats, Floats]:
     height, width, _ = image.shape
     shape = (height + 2 * HALF_WINDOW, _row_length(width))
     padded = np.empty(shape, image.dtype), np.empty(shape, image.dtype)
-    rows = (array.astype(image.dtype, copy=False).reshape(height, 3 * width) for array in (image, target))
-    pad_rows(*rows, *padded)
+    rows = (array.reshape(height, 3 * width) for array in (image, target))
+    pad_rows(*rows, image.dtype.type(1 / 255 if target.dtype == np.uint8 else 1), *padded)
     return padded
 
 
-def _ssim(image: Floats, target: Floats, shape: tuple[int, ...]) -> tuple[Floats, Floats]:
-    """SSIM [H, L] of two padded images, each row from its beginning, and its derivatives by the windowed means."""
-    height, width, _ = shape
-    values = np.empty((height, image.shape[1]), image.dtype)
-    derivatives = np.empty((3, *image.shape), image.dtype)
-    derivatives[:, :HALF_WINDOW] = derivatives[:, -HALF_WINDOW:] = 0
-    loss_kernels(image.dtype).ssim_rows(
-        image.reshape(-1), target.reshape(-1), values.reshape(-1), derivatives.reshape(-1), 3 * width, image.shape[1]
-    )
-    return values, derivatives
-
-
-def ssim_map(image: Floats, target: Floats) -> Floats:
-    """Structural similarity of every value; see ``reference.loss.ssim_map``."""
-    values, _ = _ssim(*_padded(image, target), image.shape)
-    return values[:, : 3 * image.shape[1]].reshape(image.shape)
+def _counts(mask: Bools | None, width: int, dtype: np.dtype) -> Floats:
+    """1 for each number that counts and 0 for the others [H, L]; one row stands for all where there is no mask."""
+    counts = np.zeros((1 if mask is None else len(mask), _row_length(width)), dtype)
+    counts[:, : 3 * width] = 1 if mask is None else np.repeat(mask, 3, axis=1)
+    return counts
 
 
 def photometric_loss(
-    image: Floats, target: Floats, dssim_weight: float, mask: Bools | None = None
+    image: Floats, target: Floats | Ints, dssim_weight: float, mask: Bools | None = None
 ) -> tuple[float, LossTape]:
     """(1 - w) mean |I - T| + w (1 - mean SSIM); see ``reference.loss.photometric_loss``."""
-    height, width, _ = image.shape
+    (height, width, _), dtype = image.shape, image.dtype
     n_values = image.size if mask is None else 3 * int(np.count_nonzero(mask))
-    if mask is not None:
-        image = np.where(mask[..., None], image, target.astype(image.dtype, copy=False))
     padded_image, padded_target = _padded(image, target)
-    values, derivatives = _ssim(padded_image, padded_target, image.shape)
+    if mask is not None:
+        middle = (slice(HALF_WINDOW, -HALF_WINDOW), slice(PAD, PAD + 3 * width))
+        np.copyto(padded_image[middle], padded_target[middle], where=~np.repeat(mask, 3, axis=1))
+    derivatives = np.empty((3, *padded_image.shape), dtype)
+    derivatives[:, :HALF_WINDOW] = derivatives[:, -HALF_WINDOW:] = 0
+    sums = np.empty((height, 2))
+    loss_kernels(dtype).loss_rows(
+        padded_image.reshape(-1),
+        padded_target.reshape(-1),
+        _counts(mask, width, dtype).reshape(-1),
+        derivatives.reshape(-1),
+        3 * width,
+        padded_image.shape[1],
+        sums,
+    )
     tape = LossTape(padded_image, padded_target, derivatives, image.shape, dssim_weight, mask, n_values)
     if n_values == 0:
         return 0.0, tape
-    if mask is not None:
-        is_in = np.repeat(mask, 3, axis=1)  # [H, 3 W]
-        values[:, : 3 * width] *= is_in
-        derivatives[:, HALF_WINDOW:-HALF_WINDOW, PAD : PAD + 3 * width] *= is_in
-    sums = np.empty((height, 2))
-    loss_kernels(image.dtype).sum_rows(
-        padded_image.reshape(-1), padded_target.reshape(-1), values.reshape(-1), 3 * width, values.shape[1], sums
-    )
     l1, ssim = sums.sum(axis=0) / n_values
     return float((1 - dssim_weight) * l1 + dssim_weight * (1 - ssim)), tape
 

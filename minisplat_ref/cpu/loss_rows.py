@@ -26,26 +26,26 @@ PAD = 3 * HALF_WINDOW  # numbers of margin before an interleaved row, and at lea
 
 
 class LossKernels(NamedTuple):
-    """Images, values and derivatives are flat in all of them; see :class:`minisplat_ref.cpu.loss.LossTape`."""
+    """Images and derivatives are flat in both; see :class:`minisplat_ref.cpu.loss.LossTape`."""
 
-    ssim_rows: Callable
-    sum_rows: Callable
+    loss_rows: Callable
     loss_vjp_rows: Callable
 
 
 @scalar
-def _pad_row(image, row, padded):
+def _pad_row(image, unit, row, padded):
     padded[:] = ZERO
     if 0 <= row < image.shape[0]:
-        padded[PAD : PAD + image.shape[1]] = image[row]
+        for i in range(image.shape[1]):
+            padded[PAD + i] = unit * padded.dtype.type(image[row, i])
 
 
 @kernel()
-def pad_rows(image, target, padded_image, padded_target):
-    """Copy two images [H, 3 W] into the middle of [H + 10, L] and write zeros around them."""
+def pad_rows(image, target, unit, padded_image, padded_target):
+    """Copy two images [H, 3 W] into the middle of [H + 10, L], the target times its unit, with zeros around them."""
     for y in prange(padded_image.shape[0]):
-        _pad_row(image, y - HALF_WINDOW, padded_image[y])
-        _pad_row(target, y - HALF_WINDOW, padded_target[y])
+        _pad_row(image, padded_image.dtype.type(1), y - HALF_WINDOW, padded_image[y])
+        _pad_row(target, unit, y - HALF_WINDOW, padded_target[y])
 
 
 @functools.cache
@@ -83,27 +83,30 @@ def loss_kernels(dtype: np.dtype) -> LossKernels:
         return total
 
     @scalar
-    def ssim_row(y, image, target, values, derivatives, n_values, length, s):
+    def loss_row(y, image, target, counts, derivatives, n_values, length, s, sums):
         for i in range(0, length, WIDTH):
             mean_i, mean_t, squares, products = moments_down(image, target, y * length + i, length)
             store(s, i, mean_i)
             store(s, length + i, mean_t)
             store(s, 2 * length + i, squares)
             store(s, 3 * length + i, products)
-        row = (y + HALF_WINDOW) * length
+        first, counts_row = (y + HALF_WINDOW) * length + PAD, y * length % counts.size
         field = derivatives.size // 3
+        l1 = ssim = ZERO * filled(c1)
         for i in range(0, n_values, WIDTH):
             means = across(s, i), across(s, length + i), across(s, 2 * length + i), across(s, 3 * length + i)
             value, by_i, by_ii, by_it = ssim_and_derivatives(*means, c1, c2)
-            store(values, y * length + i, value)
-            store(derivatives, row + PAD + i, by_i)
-            store(derivatives, field + row + PAD + i, by_ii)
-            store(derivatives, 2 * field + row + PAD + i, by_it)
-        values[y * length + n_values : (y + 1) * length] = ZERO
+            count = load(counts, counts_row + i)
+            l1 = l1 + abs(load(image, first + i) - load(target, first + i))  # equal where they do not count
+            ssim = ssim + count * value
+            store(derivatives, first + i, count * by_i)
+            store(derivatives, field + first + i, count * by_ii)
+            store(derivatives, 2 * field + first + i, count * by_it)
+        sums[y, 0], sums[y, 1] = sum_of(l1), sum_of(ssim)
         for k in range(3):
-            start = k * field + row
-            derivatives[start : start + PAD] = ZERO
-            derivatives[start + PAD + n_values : start + length] = ZERO
+            start = k * field + first
+            derivatives[start - PAD : start] = ZERO
+            derivatives[start + n_values : start - PAD + length] = ZERO
 
     @scalar
     def vjp_row(y, image, target, derivatives, v_l1, v_ssim, out, s):
@@ -122,28 +125,15 @@ def loss_kernels(dtype: np.dtype) -> LossKernels:
             store(s, 3 * length + i, by_l1 + v_ssim * by_ssim)
         out[y] = s[3 * length : 3 * length + n_values]
 
-    @scalar
-    def sums_of_row(y, image, target, values, n_values, length, sums):
-        first = (y + HALF_WINDOW) * length + PAD
-        l1 = ssim = ZERO * filled(c1)
-        for i in range(0, n_values, WIDTH):
-            l1 = l1 + abs(load(image, first + i) - load(target, first + i))
-            ssim = ssim + load(values, y * length + i)
-        sums[y, 0], sums[y, 1] = sum_of(l1), sum_of(ssim)
-
     @kernel()
-    def ssim_rows(image, target, values, derivatives, n_values, length):
-        for y in prange(values.size // length):
-            ssim_row(y, image, target, values, derivatives, n_values, length, np.empty(4 * length, image.dtype))
+    def loss_rows(image, target, counts, derivatives, n_values, length, sums):
+        for y in prange(len(sums)):
+            s = np.empty(4 * length, image.dtype)
+            loss_row(y, image, target, counts, derivatives, n_values, length, s, sums)
 
     @kernel()
     def loss_vjp_rows(image, target, derivatives, v_l1, v_ssim, out, length):
         for y in prange(out.shape[0]):
             vjp_row(y, image, target, derivatives, v_l1, v_ssim, out, np.empty(4 * length, image.dtype))
 
-    @kernel()
-    def sum_rows(image, target, values, n_values, length, sums):
-        for y in prange(len(sums)):
-            sums_of_row(y, image, target, values, n_values, length, sums)
-
-    return LossKernels(ssim_rows, sum_rows, loss_vjp_rows)
+    return LossKernels(loss_rows, loss_vjp_rows)

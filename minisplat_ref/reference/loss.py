@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import SSIM_C1, SSIM_C2, SSIM_SIGMA, SSIM_WINDOW
-from minisplat_ref.types import Bools, Floats
+from minisplat_ref.types import Bools, Floats, Ints
 
 
 class LossTape(NamedTuple):
@@ -27,14 +27,14 @@ class LossTape(NamedTuple):
 
 
 def photometric_loss(
-    image: Floats, target: Floats, dssim_weight: float, mask: Bools | None = None
+    image: Floats, target: Floats | Ints, dssim_weight: float, mask: Bools | None = None
 ) -> tuple[float, LossTape]:
     """Loss of an image: ``(1 - w) mean |I - T| + w (1 - mean SSIM)``.
 
     Parameters
     ----------
     image, target : ndarray of shape (H, W, 3)
-        Rendered image and photograph.
+        Rendered image and photograph, in [0, 1]; a photograph may also be bytes, of which 255 is 1.
     dssim_weight : float
         w; 0.2 in 3DGS.
     mask : ndarray of bool of shape (H, W), optional
@@ -48,6 +48,7 @@ def photometric_loss(
     tape : LossTape
         For the gradient.
     """
+    target = target.astype(image.dtype) / 255 if target.dtype == np.uint8 else target
     mask = np.ones(image.shape[:2], dtype=bool) if mask is None else mask
     image = np.where(mask[:, :, None], image, target)
     tape = LossTape(image, target, dssim_weight, mask)
