@@ -56,6 +56,12 @@ def triple(table, rows):
 
 
 @scalar
+def rounded(lanes, zero):
+    """Return three lanes in the dtype of a number."""
+    return converted(lanes[0], zero), converted(lanes[1], zero), converted(lanes[2], zero)
+
+
+@scalar
 def add(sums, k, is_counted, lanes):
     """Add to the eight sums number ``k`` of a buffer."""
     store(sums, k * WIDTH, load(sums, k * WIDTH) + select(is_counted, lanes, ZERO))

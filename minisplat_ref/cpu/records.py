@@ -8,7 +8,7 @@ numbers of eight Gaussians in, their columns out.
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.cpu.gaussian_rows import list_visible, listed_rows, triple
+from minisplat_ref.cpu.gaussian_rows import list_visible, listed_rows, rounded, triple
 from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.cpu.tiling import ELLIPSE_MARGIN
 from minisplat_ref.scalar._jit import kernel, prange, scalar
@@ -32,23 +32,17 @@ def _half(factor):
 
 
 @scalar
-def _rounded(lanes, zero):
-    """Three lanes in the dtype of a number."""
-    return converted(lanes[0], zero), converted(lanes[1], zero), converted(lanes[2], zero)
-
-
-@scalar
 def _write_eight(rows, projection, colors, alpha_min, records):
     """Write the records of eight Gaussians, up to the third channel."""
     zero = records.dtype.type(0)
     a, b, c = triple(projection.conics, rows)
     a_factor, slope, pivot = factors(a, b, c)
     opacity = gather(projection.opacities, rows, 0)
-    outline = visible_outline(*_rounded(factors(c, b, a), zero), opacity, alpha_min, ELLIPSE_MARGIN)
+    outline = visible_outline(*rounded(factors(c, b, a), zero), opacity, alpha_min, ELLIPSE_MARGIN)
     means2d, boxes = projection.means2d, projection.boxes
     first_half = (
         *(gather(means2d, rows, 0), gather(means2d, rows, 1)),
-        *_rounded((_half(a_factor), slope, _half(pivot)), zero),
+        *rounded((_half(a_factor), slope, _half(pivot)), zero),
         *(opacity, outline.slope, outline.inverse_a),
     )
     second_half = (
