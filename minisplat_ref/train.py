@@ -140,7 +140,6 @@ def _iterate(state: TrainState, scene: Scene, recipe: Recipe, backend: Backend, 
     image = np.ascontiguousarray(output.image[..., :3])
     loss, loss_tape = backend.photometric_loss(image, view.image, recipe.dssim_weight, view.mask)
     v_image, v_alpha = backend.photometric_loss_vjp(loss_tape), None
-    del loss_tape  # larger than all images together, and the gradients of the Gaussians need the room
     if any(recipe.geometry):
         points = scene.points[view.point_ids] if view.point_ids is not None else scene.points[:0]
         target = view.image * np.float32(1 / 255)  # [H, W, 3]

@@ -1,9 +1,13 @@
-"""The kernels of L1 + D-SSIM: every row of the image by itself, eight numbers at a time.
+"""The kernel of L1 + D-SSIM, forward and backward: row after row of the image, eight numbers at a time.
 
 The Gaussian window is separable, and the row of an interleaved RGB image is one flat array in which the horizontal
 neighbours of a channel lie three numbers apart. A row is filtered completely, vertically and then horizontally, while
 it is in the cache. The images have margins of zeros, wide enough for the window and for the last eight numbers of a
 row, so that no number is a special case.
+
+The gradient of a row needs the derivatives of SSIM in the eleven rows around it. They are kept in a ring of as many
+rows, which stays in the cache, instead of three more images in memory: so the gradient, but for a factor, is made
+together with the loss. Each thread goes down a band of rows, and the rows beyond its edges are computed once more.
 
 Moments are those of I - 1/2 and T - 1/2: variances are differences of moments, and of these smaller ones few digits
 cancel.
@@ -11,7 +15,6 @@ cancel.
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
@@ -23,13 +26,6 @@ from minisplat_ref.scalar.loss import ssim_and_derivatives
 
 HALF_WINDOW = SSIM_WINDOW // 2
 PAD = 3 * HALF_WINDOW  # numbers of margin before an interleaved row, and at least as many behind it
-
-
-class LossKernels(NamedTuple):
-    """Images and derivatives are flat in both; see :class:`minisplat_ref.cpu.loss.LossTape`."""
-
-    loss_rows: Callable
-    loss_vjp_rows: Callable
 
 
 @scalar
@@ -49,19 +45,12 @@ def pad_rows(image, target, unit, padded_image, padded_target):
 
 
 @functools.cache
-def loss_kernels(dtype: np.dtype) -> LossKernels:
-    """Compile the kernels for a dtype; its window and constants are compiled in."""
+def loss_kernel(dtype: np.dtype) -> Callable:
+    """Compile the kernel for a dtype; its window and constants are compiled in."""
     offsets = np.arange(SSIM_WINDOW) - HALF_WINDOW
     weights = np.exp(-0.5 * (offsets / SSIM_SIGMA) ** 2)
     window = tuple(dtype.type(weight) for weight in weights / weights.sum())
     c1, c2 = dtype.type(SSIM_C1), dtype.type(SSIM_C2)
-
-    @scalar
-    def down(a, i, length):
-        total = window[0] * load(a, i)
-        for k in range(1, SSIM_WINDOW):
-            total = total + window[k] * load(a, i + k * length)
-        return total
 
     @scalar
     def moments_down(image, target, i, length):
@@ -76,6 +65,13 @@ def loss_kernels(dtype: np.dtype) -> LossKernels:
         return mean_i, mean_t, squares, products
 
     @scalar
+    def down(ring, places, i):
+        total = window[0] * load(ring, places[0] + i)
+        for k in range(1, SSIM_WINDOW):
+            total = total + window[k] * load(ring, places[k] + i)
+        return total
+
+    @scalar
     def across(s, i):
         total = window[0] * load(s, i)
         for k in range(1, SSIM_WINDOW):
@@ -83,7 +79,8 @@ def loss_kernels(dtype: np.dtype) -> LossKernels:
         return total
 
     @scalar
-    def loss_row(y, image, target, counts, derivatives, n_values, length, s, sums):
+    def similarity_row(y, image, target, counts, n_values, length, s, derivatives):
+        """Sums of one row, and the derivatives of its SSIM by the three windowed means that hold the image."""
         for i in range(0, length, WIDTH):
             mean_i, mean_t, squares, products = moments_down(image, target, y * length + i, length)
             store(s, i, mean_i)
@@ -91,7 +88,6 @@ def loss_kernels(dtype: np.dtype) -> LossKernels:
             store(s, 2 * length + i, squares)
             store(s, 3 * length + i, products)
         first, counts_row = (y + HALF_WINDOW) * length + PAD, y * length % counts.size
-        field = derivatives.size // 3
         l1 = ssim = ZERO * filled(c1)
         for i in range(0, n_values, WIDTH):
             means = across(s, i), across(s, length + i), across(s, 2 * length + i), across(s, 3 * length + i)
@@ -99,23 +95,17 @@ def loss_kernels(dtype: np.dtype) -> LossKernels:
             count = load(counts, counts_row + i)
             l1 = l1 + abs(load(image, first + i) - load(target, first + i))  # equal where they do not count
             ssim = ssim + count * value
-            store(derivatives, first + i, count * by_i)
-            store(derivatives, field + first + i, count * by_ii)
-            store(derivatives, 2 * field + first + i, count * by_it)
-        sums[y, 0], sums[y, 1] = sum_of(l1), sum_of(ssim)
-        for k in range(3):
-            start = k * field + first
-            derivatives[start - PAD : start] = ZERO
-            derivatives[start + n_values : start - PAD + length] = ZERO
+            store(derivatives, PAD + i, count * by_i)
+            store(derivatives, length + PAD + i, count * by_ii)
+            store(derivatives, 2 * length + PAD + i, count * by_it)
+        return sum_of(l1), sum_of(ssim)
 
     @scalar
-    def vjp_row(y, image, target, derivatives, v_l1, v_ssim, out, s):
-        n_values, length = out.shape[1], s.size // 4
-        field = derivatives.size // 3
+    def vjp_row(y, image, target, ring, places, v_l1, v_ssim, length, s, v_row):
         for i in range(0, length, WIDTH):
             for k in range(3):
-                store(s, k * length + i, down(derivatives, k * field + y * length + i, length))
-        first = (y + HALF_WINDOW) * length + PAD
+                store(s, k * length + i, down(ring, places, k * length + i))
+        first, n_values = (y + HALF_WINDOW) * length + PAD, v_row.size
         up = filled(v_l1)
         for i in range(0, n_values, WIDTH):
             a, b = load(image, first + i), load(target, first + i)
@@ -123,17 +113,33 @@ def loss_kernels(dtype: np.dtype) -> LossKernels:
             by_ssim = across(s, i) + by_squares
             by_l1 = select(a > b, up, select(a < b, -up, ZERO * up))
             store(s, 3 * length + i, by_l1 + v_ssim * by_ssim)
-        out[y] = s[3 * length : 3 * length + n_values]
+        v_row[:] = s[3 * length : 3 * length + n_values]
+
+    @scalar
+    def loss_band(start, end, image, target, counts, v_l1, v_ssim, length, sums, v_image):
+        ring, s = np.zeros(SSIM_WINDOW * 3 * length, image.dtype), np.empty(4 * length, image.dtype)
+        places = np.empty(SSIM_WINDOW, np.int64)
+        for y in range(start - HALF_WINDOW, end + HALF_WINDOW):
+            place = y % SSIM_WINDOW * 3 * length
+            if 0 <= y < len(sums):
+                l1, ssim = similarity_row(
+                    y, image, target, counts, v_image.shape[1], length, s, ring[place : place + 3 * length]
+                )
+                if start <= y < end:
+                    sums[y, 0], sums[y, 1] = l1, ssim
+            else:
+                ring[place : place + 3 * length] = ZERO
+            if y >= start + HALF_WINDOW:
+                for k in range(SSIM_WINDOW):
+                    places[k] = (y + 1 + k) % SSIM_WINDOW * 3 * length
+                row = y - HALF_WINDOW
+                vjp_row(row, image, target, ring, places, v_l1, v_ssim, length, s, v_image[row])
 
     @kernel()
-    def loss_rows(image, target, counts, derivatives, n_values, length, sums):
-        for y in prange(len(sums)):
-            s = np.empty(4 * length, image.dtype)
-            loss_row(y, image, target, counts, derivatives, n_values, length, s, sums)
+    def loss_rows(image, target, counts, v_l1, v_ssim, length, n_bands, sums, v_image):
+        n_rows = len(sums)
+        for band in prange(n_bands):
+            start, end = n_rows * band // n_bands, n_rows * (band + 1) // n_bands
+            loss_band(start, end, image, target, counts, v_l1, v_ssim, length, sums, v_image)
 
-    @kernel()
-    def loss_vjp_rows(image, target, derivatives, v_l1, v_ssim, out, length):
-        for y in prange(out.shape[0]):
-            vjp_row(y, image, target, derivatives, v_l1, v_ssim, out, np.empty(4 * length, image.dtype))
-
-    return LossKernels(loss_rows, loss_vjp_rows)
+    return loss_rows
