@@ -17,7 +17,7 @@ from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.render import render
-from minisplat_ref.types import Bools, Floats, Gaussians, View
+from minisplat_ref.types import Bools, Floats, Gaussians, Ints, View
 
 LPIPS_UNAVAILABLE = (None, "LPIPS needs the weights of a trained network, which are not part of minisplat_ref")
 
@@ -72,13 +72,13 @@ def psnr(image: Floats, target: Floats, mask: Bools | None = None) -> float:
     return math.inf if mse == 0.0 else -10.0 * math.log10(mse)
 
 
-def ssim(image: Floats, target: Floats, mask: Bools | None = None, *, backend: Backend = CPU) -> float:
+def ssim(image: Floats, target: Floats | Ints, mask: Bools | None = None, *, backend: Backend = CPU) -> float:
     """Return the mean structural similarity, by the window and zero padding of the training loss.
 
     Parameters
     ----------
     image, target : ndarray of shape (H, W, 3)
-        In [0, 1].
+        In [0, 1]; the target may also be bytes, of which 255 is 1.
     mask : ndarray of shape (H, W) of booleans, optional
         Pixels that count; default all.
     backend : Backend
@@ -114,9 +114,10 @@ def evaluate(
     for view in views:
         output, _ = render(gaussians, view.camera, background=background, conventions=conventions, backend=backend)
         image = np.clip(output.image, 0.0, 1.0)  # [H, W, 3]
-        target = view.image.astype(image.dtype) / 255
         metrics = ViewMetrics(
-            view.name, psnr(image, target, view.mask), ssim(image, target, view.mask, backend=backend)
+            view.name,
+            psnr(image, view.image.astype(image.dtype) / 255, view.mask),
+            ssim(image, view.image, view.mask, backend=backend),
         )
         per_view.append(metrics)
         if on_view is not None:

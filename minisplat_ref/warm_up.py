@@ -60,8 +60,8 @@ def _surface_points(dtype: Dtype) -> None:
 
 
 def _photometric_loss(dtype: Dtype) -> None:
-    image = np.zeros((HEIGHT, WIDTH, 3), dtype)
-    CPU.photometric_loss_vjp(CPU.photometric_loss(image, image, 0.2)[1])
+    image, photograph = np.zeros((HEIGHT, WIDTH, 3), dtype), np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    CPU.photometric_loss_vjp(CPU.photometric_loss(image, photograph, 0.2)[1])
 
 
 def _geometric_loss(dtype: Dtype) -> None:

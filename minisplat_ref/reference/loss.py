@@ -48,7 +48,7 @@ def photometric_loss(
     tape : LossTape
         For the gradient.
     """
-    target = target.astype(image.dtype) / 255 if target.dtype == np.uint8 else target
+    target = target / image.dtype.type(255 if target.dtype == np.uint8 else 1)
     mask = np.ones(image.shape[:2], dtype=bool) if mask is None else mask
     image = np.where(mask[:, :, None], image, target)
     tape = LossTape(image, target, dssim_weight, mask)
