@@ -207,6 +207,20 @@ def test_backends_agree(fast_backend, conventions, dtype, rng):
         assert_allclose(a, e, rtol=0, atol=(PARITY_FLOAT64 if is_exact else PARITY_FLOAT32_GRADIENT) * np.abs(e).max())
 
 
+@pytest.mark.parametrize(
+    "layout", [np.asfortranarray, lambda a: np.repeat(a, 2, axis=-1)[..., ::2]], ids=["F", "strided"]
+)
+def test_layout_in_memory_does_not_matter(layout, rng):
+    gaussians, camera = make_gaussians(rng, 40), make_camera()
+    results = []
+    for given in (gaussians, Gaussians._make(map(layout, gaussians))):
+        output, tape = render(given, camera)
+        results.append((output.image, *render_vjp(tape, layout(output.image)).gaussians))
+    assert results[0][0].any() and not gaussians.means.flags.f_contiguous
+    for expected, found in zip(*results, strict=True):
+        assert_array_equal(found, expected)
+
+
 def test_alpha_min_sets_the_extent(rng):
     # One that falls below 1/255 reaches beyond the 3.33 sigma that are enough for 1/255.
     gaussians, camera = make_gaussians(rng, 30, opacity_logit=3.0), make_camera(64, 48, fx=80, fy=75, rng=rng)

@@ -13,8 +13,8 @@ footprint are moments of q over its pixels:
 The moments over e rather than over dx keep a needle's gradient: over dx they grow with its length squared and cancel
 later. They are changed to those by the conic's entries in float64.
 
-A pair (tile, Gaussian) has a slot of its own for its moments, and afterwards each Gaussian adds up its slots
-(:mod:`.pair_sums`). The background is behind them all: what of <v, colour> each tile gives it is added up likewise.
+A pair (tile, Gaussian) has a slot of its own for its moments, which afterwards are added up: see
+:mod:`minisplat_ref.cpu.pair_sums`. The background lies behind all Gaussians; each tile says what reaches it.
 """
 
 import functools
@@ -25,14 +25,7 @@ import numpy as np
 from minisplat_ref.cpu.pair_sums import N_MOMENTS, slot_size
 from minisplat_ref.cpu.records import COLOR, MEAN_X, MEAN_Y, N_FUSED, SLOPE
 from minisplat_ref.cpu.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, reached_rows, start_scratch, to_mean
-from minisplat_ref.cpu.tile_state import (
-    CHECK_EVERY,
-    N_ROWS,
-    corner,
-    open_rows,
-    row_in_image,
-    start_tile,
-)
+from minisplat_ref.cpu.tile_state import CHECK_EVERY, N_ROWS, corner, open_rows, row_in_image, start_tile
 from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.compositing import alpha_vjp, blend
 from minisplat_ref.scalar.lanes import WIDTH, filled, load, select, store, sum_of, sums_of

@@ -3,7 +3,8 @@
 The number of channels, the exponential and whether statistics are collected are compile-time constants: each
 combination is its own compiled kernel.
 
-What the weights of one Gaussian in one tile add up to goes into the slot of this pair (:mod:`.pair_sums`).
+What the weights of one Gaussian in one tile add up to goes into the slot of this pair, as in
+:mod:`minisplat_ref.cpu.pair_sums`.
 """
 
 import functools
@@ -14,14 +15,7 @@ import numpy as np
 from minisplat_ref.constants import MEDIAN_TRANSMITTANCE
 from minisplat_ref.cpu.records import COLOR
 from minisplat_ref.cpu.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, reached_rows, start_scratch
-from minisplat_ref.cpu.tile_state import (
-    CHECK_EVERY,
-    N_ROWS,
-    corner,
-    open_rows,
-    row_in_image,
-    start_tile,
-)
+from minisplat_ref.cpu.tile_state import CHECK_EVERY, N_ROWS, corner, open_rows, row_in_image, start_tile
 from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.compositing import blend
 from minisplat_ref.scalar.lanes import WIDTH, filled, larger, largest_of, load, select, store, sum_of
