@@ -16,7 +16,7 @@ STAGES = [field.name for field in fields(Backend) if field.name not in ("name", 
 
 # Modules of cpu without a twin of their name: parts of the compositing and sorting kernels, not stages.
 BLENDING_PARTS = {"blend_forward", "blend_backward", "tile_state", "tile_rows", "records", "pair_sums", "exponential"}
-KERNEL_PARTS = BLENDING_PARTS | {"footprints", "layers", "sorting", "gaussian_rows", "loss_rows"}
+KERNEL_PARTS = BLENDING_PARTS | {"footprints", "layers", "sorting", "gaussian_rows", "loss_rows", "memory"}
 
 # Public functions of cpu without a twin: they prepare arguments for kernels.
 CPU_ONLY = {

@@ -11,6 +11,7 @@ from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.blend_backward import backward_kernel
 from minisplat_ref.cpu.blend_forward import forward_kernel
 from minisplat_ref.cpu.exponential import exp_exact, exp_fast
+from minisplat_ref.cpu.memory import large_empty
 from minisplat_ref.cpu.pair_sums import N_PAIR_STATS, slot_size, sum_pair_stats, sum_slots
 from minisplat_ref.cpu.records import records_of
 from minisplat_ref.cpu.tile_state import frame_of, tile_ranges
@@ -109,7 +110,7 @@ def composite_vjp_with(
     dtype, n_channels = colors.dtype, colors.shape[1]
     v_image, v_alpha = np.ascontiguousarray(v_image, dtype), np.ascontiguousarray(v_alpha, dtype)
     width = slot_size(n_channels)
-    slots = np.empty(len(bins.gaussian_ids) * width, dtype)
+    slots = large_empty((len(bins.gaussian_ids) * width,), dtype)
     v_backgrounds = np.empty((len(bins.tile_offsets) - 1, n_channels))  # by tiles
     backward_kernel(exp, n_channels)(
         records_of(projection, colors, conventions),

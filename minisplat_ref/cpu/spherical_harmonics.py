@@ -13,6 +13,7 @@ import numpy as np
 
 from minisplat_ref.constants import SH_C0, SH_C1, SH_C2, SH_C3
 from minisplat_ref.cpu.gaussian_rows import DOUBLE, add, list_visible, listed_rows, triple
+from minisplat_ref.cpu.memory import large_empty
 from minisplat_ref.cpu.projection import N_CHUNKS, camera_centre
 from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.lanes import (
@@ -269,7 +270,7 @@ def sh_colors_vjp(
     out = SHGradient(
         np.empty(means.shape, means.dtype),
         np.empty(sh_dc.shape, sh_dc.dtype),
-        np.empty(sh_rest.shape, sh_rest.dtype),
+        large_empty(sh_rest.shape, sh_rest.dtype),
         np.empty((3, 3), dtype),
         np.empty(3, dtype),
     )
