@@ -152,7 +152,7 @@ def _iterate(state: TrainState, scene: Scene, recipe: Recipe, backend: Backend, 
         output = output._replace(image=image)
     gradient = render_vjp(tape, v_image, v_alpha)
 
-    visible_ids = np.flatnonzero(tape.projection.radii[:, 0])
+    visible_ids = np.flatnonzero(tape.projection.radii[:, 0] > 0)
     rates = recipe.learning_rates.at(step, scene.extent)
     state.adam = adam_step(state.gaussians, gradient.gaussians, state.adam, rates, recipe.adam, visible_ids, backend)
     iteration = Iteration(scene, view, output, visible_ids, gradient.means2d, backend, conventions)

@@ -72,7 +72,7 @@ def survey(boxes, depths, n_threads, up_to):
 
 @scalar
 def _list_wide(start, end, projection, alpha_min, n_tiles_x, n_tiles, layer_of, cursors, cells, wide):
-    """List the Gaussians of a part whose boxes are wide, with the cells that they reach: its id, the first, the end."""
+    """Write the cells of the Gaussians of a part whose boxes are wide; ``wide`` gets the first of each and the end."""
     boxes, depths = projection.boxes, projection.depths
     ids, spans = np.empty(end - start + WIDTH, np.int64), np.empty(2 * WIDTH * (n_tiles // n_tiles_x), depths.dtype)
     count = 0
