@@ -20,7 +20,7 @@ from minisplat_ref.scalar.lanes import WIDTH, ceil, converted, floor, gather, la
 from minisplat_ref.scalar.literals import HALF, ONE
 from minisplat_ref.scalar.tiling import rightmost_offset, visible_outline
 
-COLUMN_BITS, ROW_BITS = 5, 4  # a shift takes half of the time of //, which must mind the sign
+COLUMN_BITS, ROW_BITS = 5, 4  # for shifts: // must mind the sign, which no box has
 TILE_WIDTH = 1 << COLUMN_BITS  # pixels
 TILE_HEIGHT = 1 << ROW_BITS
 COLUMNS_PER_PIXEL, ROWS_PER_PIXEL = np.float32(1 / TILE_WIDTH), np.float32(1 / TILE_HEIGHT)  # exact
@@ -71,7 +71,7 @@ def write_line(box, n_tiles_x, base, tiles, place):
 def write_wide(box, spans, i, n_tiles_x, base, tiles, place):
     """Write the tiles that the ellipse in a wide box reaches: number ``i`` of the eight whose ``spans`` these are.
 
-    Most wide boxes have two columns; a loop that nearly always ends at once is foreseen.
+    Many wide boxes have two columns; a loop that nearly always ends at once is foreseen.
     """
     column, row, n_columns, n_rows = box
     for k in range(n_rows):

@@ -1,9 +1,8 @@
 """The loops behind the tile lists: the survey, the parts of the input that enter Gaussians into layers, the layers.
 
-:mod:`minisplat_ref.cpu.tiling` tells the plan. What slows these loops down is neither arithmetic nor the number of
-writes but guesses that fail and memory that answers late. There are no branches on what cannot be foreseen: the culled
-are a layer of their own, behind all others, and boxes that are wide are listed first and measured together. What is
-about to be written or read at random is asked for ahead.
+:mod:`minisplat_ref.cpu.tiling` tells the plan. A guess that fails and memory that answers late are dear. So there are
+no branches on what cannot be foreseen: the culled are a layer of their own, behind all others, and boxes that are wide
+are listed first and measured together. What is about to be written or read at random is asked for ahead.
 """
 
 from typing import NamedTuple

@@ -1,8 +1,7 @@
 """Large arrays that live for part of an iteration, in memory that is used again.
 
 The C library keeps the memory of smaller arrays for the next. That of large ones goes back to the system, which clears
-what it gives: for 36 MB that took as long as all of what the kernel did with it, and a multiple where memory had to be
-moved together first.
+what it gives, and where memory is scattered moves it together first.
 
 One block is kept, the one that was let go last. The moments of all pairs and, when they are summed, the gradient by the
 coefficients of colour take turns in it.
@@ -23,9 +22,12 @@ def large_empty(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
     n_bytes = int(np.prod(shape)) * dtype.itemsize
     if n_bytes < LARGE:
         return np.empty(shape, dtype)
-    blocks = [block for block in _kept if n_bytes <= block.size <= SLACK * n_bytes]
-    _kept.clear()
-    block = blocks[0] if blocks else np.empty(n_bytes, np.uint8)
+    try:
+        block = _kept.pop()  # in one step: two threads never get the same block
+    except IndexError:
+        block = np.empty(0, np.uint8)
+    if not n_bytes <= block.size <= SLACK * n_bytes:
+        block = np.empty(n_bytes, np.uint8)
     numbers = np.frombuffer(block.data, dtype, int(np.prod(shape)))  # every view of it holds on to it
     weakref.finalize(numbers, _keep, block).atexit = False
     return numbers.reshape(shape)
