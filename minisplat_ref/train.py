@@ -115,6 +115,7 @@ def train(
             report = _iterate(state, seen, recipe, backend, conventions)
             if on_step is not None:
                 on_step(report)
+            del report  # and with it the image, before the next is made
             raise_if_interrupted()
     return state
 

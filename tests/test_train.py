@@ -2,6 +2,8 @@
 
 import os
 import signal
+import weakref
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -67,6 +69,20 @@ def assert_same_bytes(state, other):
     assert arrays.keys() == others.keys()
     for name, array in arrays.items():
         assert array.dtype == others[name].dtype and array.tobytes() == others[name].tobytes(), name
+
+
+def test_an_image_is_gone_before_the_next_is_made(scene):
+    last, was_alive = [], []
+
+    def project(*args, **kwargs):
+        was_alive.extend(image() is not None for image in last)
+        return CPU.project(*args, **kwargs)
+
+    def on_step(report):
+        last[:] = [weakref.ref(report.output.image)]
+
+    train(scene, PLAIN._replace(iterations=4), seed=0, on_step=on_step, backend=replace(CPU, project=project))
+    assert was_alive == [False] * 3
 
 
 # It learns ------------------------------------------------------------------------------------------------------------
