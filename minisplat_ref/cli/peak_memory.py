@@ -2,9 +2,9 @@
 
 Several, because the first does without the moments, which are only then written, and without what one iteration leaves
 to the next. Counted is what that process holds at its peak beyond what it held before the Gaussians were there, with
-all kernels loaded. The bound is what no training can do without: the model, Adam's two moments, the gradients, the images of an
-iteration, and 48 bytes for every pair (tile, Gaussian): the 9 sums of its gradient, its places in the tile's list and
-in the Gaussian's, and one number to spare.
+all kernels loaded. The bound is what no training can do without: the model, Adam's two moments, the gradients, the
+images of an iteration, and 48 bytes for every pair (tile, Gaussian): the 9 sums of its gradient, its places in the
+tile's list and in the Gaussian's, and one number to spare.
 """
 
 import json

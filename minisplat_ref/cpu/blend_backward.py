@@ -25,11 +25,21 @@ import numpy as np
 from minisplat_ref.cpu.pair_sums import N_MOMENTS, slot_size
 from minisplat_ref.cpu.records import COLOR, MEAN_X, MEAN_Y, N_FUSED, SLOPE
 from minisplat_ref.cpu.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, reached_rows, start_scratch, to_mean
-from minisplat_ref.cpu.tile_state import CHECK_EVERY, N_ROWS, corner, open_rows, row_in_image, start_tile
+from minisplat_ref.cpu.tile_state import (
+    CHECK_EVERY,
+    N_ROWS,
+    RANGES_PER_THREAD,
+    corner,
+    first_tile,
+    open_rows,
+    row_in_image,
+    start_tile,
+)
 from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.compositing import alpha_vjp, blend
 from minisplat_ref.scalar.lanes import WIDTH, filled, load, select, store, sum_of, sums_of
 from minisplat_ref.scalar.literals import ONE, ZERO
+from minisplat_ref.scalar.turns import no_turns, turns
 
 
 @functools.cache
@@ -124,15 +134,16 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
 
     @kernel()
     def composite_tiles_vjp(
-        records, offsets, ids, slots_of, ranges, n_threads, frame, image, alpha, v_image, v_alpha, slots, v_backgrounds
+        records, offsets, ids, slots_of, n_threads, frame, image, alpha, v_image, v_alpha, slots, v_backgrounds
     ):
-        for thread in prange(n_threads):
+        taken, n_ranges = no_turns(), RANGES_PER_THREAD * n_threads
+        for _ in prange(n_threads):
             state = np.empty(N_ROWS * row_size, image.dtype)
             scratch, row_ids = np.empty(SCRATCH_SIZE, image.dtype), np.empty(N_ROWS, np.int32)
             start_scratch(scratch)
             further = np.empty((slot_width - N_MOMENTS - N_FUSED) * WIDTH, image.dtype)  # sums of further channels
-            for turn in range(thread, ranges.size - 1, n_threads):
-                for tile in range(ranges[turn], ranges[turn + 1]):
+            for turn in turns(taken, n_ranges):
+                for tile in range(first_tile(turn, n_ranges, offsets), first_tile(turn + 1, n_ranges, offsets)):
                     x0, y0 = corner(tile, frame)
                     start_tile(state, x0, y0, frame, n_fields)
                     start_vjp(state, x0, y0, frame, image, alpha, v_image, v_alpha)

@@ -15,11 +15,21 @@ import numpy as np
 from minisplat_ref.constants import MEDIAN_TRANSMITTANCE
 from minisplat_ref.cpu.records import COLOR
 from minisplat_ref.cpu.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, reached_rows, start_scratch
-from minisplat_ref.cpu.tile_state import CHECK_EVERY, N_ROWS, corner, open_rows, row_in_image, start_tile
+from minisplat_ref.cpu.tile_state import (
+    CHECK_EVERY,
+    N_ROWS,
+    RANGES_PER_THREAD,
+    corner,
+    first_tile,
+    open_rows,
+    row_in_image,
+    start_tile,
+)
 from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.compositing import blend
 from minisplat_ref.scalar.lanes import WIDTH, filled, larger, largest_of, load, select, store, sum_of
 from minisplat_ref.scalar.literals import ONE, ZERO
+from minisplat_ref.scalar.turns import no_turns, turns
 
 MEDIAN = np.float32(MEDIAN_TRANSMITTANCE)  # one half: exact in float32
 
@@ -99,15 +109,16 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
 
     @kernel()
     def composite_tiles(
-        records, depths, background, offsets, ids, slots_of, ranges, n_threads, frame, image, alpha, slots, images
+        records, depths, background, offsets, ids, slots_of, n_threads, frame, image, alpha, slots, images
     ):
         median_depth, dominant_ids = images
-        for thread in prange(n_threads):
+        taken, n_ranges = no_turns(), RANGES_PER_THREAD * n_threads
+        for _ in prange(n_threads):
             state = np.empty(N_ROWS * row_size, image.dtype)
             scratch, row_ids = np.empty(SCRATCH_SIZE, image.dtype), np.empty(N_ROWS, np.int32)
             start_scratch(scratch)
-            for turn in range(thread, ranges.size - 1, n_threads):
-                for tile in range(ranges[turn], ranges[turn + 1]):
+            for turn in turns(taken, n_ranges):
+                for tile in range(first_tile(turn, n_ranges, offsets), first_tile(turn + 1, n_ranges, offsets)):
                     x0, y0 = corner(tile, frame)
                     start_tile(state, x0, y0, frame, n_fields)
                     tile_ids, tile_slots = ids[offsets[tile] : offsets[tile + 1]], slots_of[offsets[tile] :]

@@ -14,7 +14,7 @@ from minisplat_ref.cpu.exponential import exp_exact, exp_fast
 from minisplat_ref.cpu.memory import large_empty
 from minisplat_ref.cpu.pair_sums import N_PAIR_STATS, slot_size, sum_pair_stats, sum_slots
 from minisplat_ref.cpu.records import records_of
-from minisplat_ref.cpu.tile_state import frame_of, tile_ranges
+from minisplat_ref.cpu.tile_state import frame_of
 from minisplat_ref.scalar._jit import n_threads
 from minisplat_ref.types import BlendStats, CompositeGradient, Floats, Projection, RenderOutput, TileBins
 
@@ -78,7 +78,6 @@ def composite_with(
         bins.tile_offsets,
         bins.gaussian_ids,
         bins.slots,
-        tile_ranges(bins),
         n_threads(),
         frame_of(bins, conventions, dtype),
         image,
@@ -117,7 +116,6 @@ def composite_vjp_with(
         bins.tile_offsets,
         bins.gaussian_ids,
         bins.slots,
-        tile_ranges(bins),
         n_threads(),
         frame_of(bins, conventions, dtype),
         output.image,

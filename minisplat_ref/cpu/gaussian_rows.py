@@ -8,7 +8,7 @@ Gaussians have to leave the copies out.
 import numpy as np
 
 from minisplat_ref.scalar._jit import scalar
-from minisplat_ref.scalar.lanes import WIDTH, converted, gather, load, select, store
+from minisplat_ref.scalar.lanes import WIDTH, converted, filled, gather, load, select, store, sum_of
 from minisplat_ref.scalar.literals import ZERO
 
 DOUBLE = np.float64(0)  # names the dtype
@@ -65,3 +65,15 @@ def rounded(lanes, zero):
 def add(sums, k, is_counted, lanes):
     """Add to the eight sums number ``k`` of a buffer."""
     store(sums, k * WIDTH, load(sums, k * WIDTH) + select(is_counted, lanes, ZERO))
+
+
+@scalar
+def total_of(parts):
+    """Add up the sums of all parts [n, K * 8], in the order of the parts; return [K]."""
+    totals = np.empty(parts.shape[1] // WIDTH, np.float64)
+    for k in range(totals.size):
+        total = filled(DOUBLE)
+        for part in range(parts.shape[0]):
+            total = total + load(parts[part], k * WIDTH)
+        totals[k] = sum_of(total)
+    return totals

@@ -1,4 +1,4 @@
-"""The loops behind the tile lists: the survey, the parts of the input that enter Gaussians into layers, the layers.
+"""What is done with each part of the input and with each layer, while tile lists are made.
 
 :mod:`minisplat_ref.cpu.tiling` tells the plan. A guess that fails and memory that answers late are dear. So there are
 no branches on what cannot be foreseen: the culled are a layer of their own, behind all others, and boxes that are wide
@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.cpu.footprints import outlines, tiles_of_box, write_line, write_spans, write_wide
+from minisplat_ref.cpu.footprints import SPARE, outlines, tiles_of_box, write_line, write_spans, write_wide
 from minisplat_ref.cpu.gaussian_rows import listed_rows
 from minisplat_ref.cpu.sorting import sort_stably
-from minisplat_ref.scalar._jit import kernel, prange, scalar
+from minisplat_ref.scalar._jit import scalar
 from minisplat_ref.scalar.lanes import WIDTH, prefetch
 from minisplat_ref.types import Ints
 
@@ -26,12 +26,29 @@ ID, FIRST, COUNT, SLOT = range(4)  # columns of an entry: a Gaussian, its cells,
 FETCH_AHEAD = 8  # entries
 
 
+class Survey(NamedTuple):
+    """What the first pass learns of each part."""
+
+    up_to: Ints
+    """[N_PARTS, CULLED + 2, 2] Gaussians of each part below each bucket, and tiles under their boxes; int32."""
+    buckets: Ints
+    """[N] bucket of each Gaussian, int16."""
+    squares: Ints
+    """[N_PARTS, WIDTH + Gaussians of a part] those whose boxes lie over two columns and two rows of tiles, int32."""
+    others: Ints
+    """Likewise the others whose boxes are wide."""
+
+
 class Layers(NamedTuple):
     """The Gaussians, layer by layer, and within a layer in the order of the input; the culled come last.
 
     A cell is one tile in one layer.
     """
 
+    of_buckets: Ints
+    """[CULLED + 1] layer of each bucket, int32."""
+    edges: Ints
+    """[(N_PARTS + 1) * N_PARTS + 1, 2] where the Gaussians of each layer and part start, and their cells; the ends."""
     keys: Ints
     """[N] bits of the depths: positive floats are ordered as their bits are."""
     entries: Ints
@@ -41,107 +58,181 @@ class Layers(NamedTuple):
 
 
 @scalar
+def part_of(n, i):
+    """First and end of part ``i`` of ``n`` things."""
+    return n * i // N_PARTS, n * (i + 1) // N_PARTS
+
+
+@scalar
 def _bucket(depth, is_visible):
     bucket = (np.float32(depth).view(np.int32) >> BUCKET_SHIFT) - FIRST_BUCKET
     return min(max(bucket, 0), N_BUCKETS - 1) if is_visible else CULLED
 
 
+# --- first pass ---
+
+
 @scalar
-def _survey_part(start, end, boxes, depths, up_to):
-    """Count the Gaussians below each bucket, and the tiles under their boxes."""
+def survey_part(part, boxes, depths, survey):
+    """Count the Gaussians of a part and their tiles, and list those whose boxes are wide."""
+    up_to, squares, others = survey.up_to[part], survey.squares[part], survey.others[part]
+    start, end = part_of(depths.size, part)
     up_to[:] = 0
+    n_squares = n_others = 0
     for n in range(start, end):
         _, _, n_columns, n_rows = tiles_of_box(boxes, n)
-        behind = _bucket(depths[n], n_columns > 0) + 1
-        up_to[behind, GAUSSIANS] += 1
-        up_to[behind, TILES] += n_columns * n_rows
+        is_square = (n_columns == 2) & (n_rows == 2)
+        bucket = _bucket(depths[n], n_columns > 0)
+        survey.buckets[n] = bucket
+        up_to[bucket + 1, GAUSSIANS] += 1
+        up_to[bucket + 1, TILES] += n_columns * n_rows
+        squares[n_squares], others[n_others] = n, n
+        n_squares += is_square
+        n_others += (n_columns > 1) & (n_rows > 1) & (not is_square)
     for bucket in range(CULLED + 1):
         for column in (GAUSSIANS, TILES):
             up_to[bucket + 1, column] += up_to[bucket, column]
-
-
-@kernel()
-def survey(boxes, depths, n_threads, up_to):
-    """First pass; writes ``up_to`` [N_PARTS, CULLED + 2, 2]."""
-    n = depths.size
-    for thread in prange(n_threads):
-        for part in range(thread, N_PARTS, n_threads):
-            _survey_part(n * part // N_PARTS, n * (part + 1) // N_PARTS, boxes, depths, up_to[part])
+    _end_list(squares, n_squares)
+    _end_list(others, n_others)
 
 
 @scalar
-def _list_wide(start, end, projection, alpha_min, n_tiles_x, n_tiles, layer_of, cursors, cells, wide):
-    """Write the cells of the Gaussians of a part whose boxes are wide; ``wide`` gets the first of each and the end."""
-    boxes, depths = projection.boxes, projection.depths
-    ids, spans = np.empty(end - start + WIDTH, np.int64), np.empty(2 * WIDTH * (n_tiles // n_tiles_x), depths.dtype)
-    count = 0
-    for n in range(start, end):  # without branches: which are wide cannot be foreseen
-        _, _, n_columns, n_rows = tiles_of_box(boxes, n)
-        ids[count] = n
-        count += (n_columns > 1) & (n_rows > 1)
+def _end_list(ids, count):
+    """Fill up the last eight of a list, and write how many it has behind them all."""
     ids[count : count + WIDTH] = ids[max(count - 1, 0)]
+    ids[-1] = count
+
+
+@scalar
+def cut_layers(up_to, of_buckets, edges):
+    """Cut the buckets into layers of about equal numbers of Gaussians, and one of the culled.
+
+    Parameters
+    ----------
+    up_to : ndarray
+        That of :class:`Survey`.
+    of_buckets, edges : ndarray
+        Those of :class:`Layers`; overwritten.
+    """
+    total, cuts = np.empty(CULLED + 1, np.int64), np.empty(N_PARTS + 2, np.int64)
+    total[:] = 0  # Gaussians below each bucket
+    for part in range(N_PARTS):
+        for bucket in range(CULLED + 1):
+            total[bucket] += up_to[part, bucket, GAUSSIANS]
+    cuts[:] = CULLED  # the buckets at which layers begin
+    cuts[0], cuts[N_PARTS + 1] = 0, CULLED + 1
+    of_buckets[CULLED], layer = N_PARTS, 0
+    for bucket in range(CULLED):
+        while layer + 1 < N_PARTS and total[bucket] >= total[CULLED] * (layer + 1) // N_PARTS:
+            layer += 1
+            cuts[layer] = bucket
+        of_buckets[bucket] = layer
+    edges[0] = 0
+    for i in range((N_PARTS + 1) * N_PARTS):
+        layer, part = i // N_PARTS, i % N_PARTS
+        for column in (GAUSSIANS, TILES):
+            size = up_to[part, cuts[layer + 1], column] - up_to[part, cuts[layer], column]
+            edges[i + 1, column] = edges[i, column] + size
+        edges[i + 1, TILES] += SPARE
+
+
+# --- second pass ---
+
+
+@scalar
+def _write_wide(ids, are_squares, start, projection, alpha_min, n_tiles_x, n_tiles, buckets, layers, cursors, wide):
+    """Write the cells of listed Gaussians of a part, eight at a time; ``wide`` gets the first of each and the end."""
+    boxes, count = projection.boxes, ids[-1]
+    spans = np.empty(2 * WIDTH * (n_tiles // n_tiles_x), projection.depths.dtype)
     for i in range(0, count, WIDTH):
         rows = listed_rows(ids, i)
         outline, most_rows = outlines(rows, projection, alpha_min)
-        for row in range(most_rows):
+        for row in range(2 if are_squares else most_rows):
             write_spans(rows, row, outline, projection, spans)
         for k in range(min(WIDTH, count - i)):
-            layer = layer_of[_bucket(depths[rows[k]], True)]
+            n = ids[i + k]
+            column, row, n_columns, n_rows = tiles_of_box(boxes, n)
+            box = (column, row, 2, 2) if are_squares else (column, row, n_columns, n_rows)
+            layer = layers.of_buckets[buckets[n]]
             first = cursors[layer, TILES]
-            behind = write_wide(tiles_of_box(boxes, rows[k]), spans, k, n_tiles_x, layer * n_tiles, cells, first)
-            cursors[layer, TILES] = behind
-            wide[i + k, 0], wide[i + k, 1] = first, behind
+            behind = write_wide(box, spans, k, n_tiles_x, layer * n_tiles, layers.cells, first)
+            cursors[layer, TILES], wide[n - start, 0], wide[n - start, 1] = behind, first, behind
 
 
 @scalar
-def _list_part(part, projection, keys, alpha_min, n_tiles_x, layer_of, cursors, layers, offsets, counts):
-    """Enter each Gaussian of a part into its layer, and count the pairs of each cell."""
-    boxes, cells = projection.boxes, layers.cells
-    start, end, n_tiles = keys.size * part // N_PARTS, keys.size * (part + 1) // N_PARTS, counts.size // N_PARTS
-    first_cells, wide = cursors[:, TILES].copy(), np.empty((end - start + 1, 2), np.int32)
-    _list_wide(start, end, projection, alpha_min, n_tiles_x, n_tiles, layer_of, cursors, cells, wide)
-    slot = n_wide = 0
+def list_part(part, survey, projection, keys, alpha_min, n_tiles_x, layers, offsets, counts):
+    """Enter each Gaussian of a part into its layer, and count the pairs of each cell; return the pairs of the part."""
+    start, end = part_of(keys.size, part)
+    boxes, entries, cells, n_tiles = projection.boxes, layers.entries, layers.cells, counts.size // N_PARTS
+    cursors, wide = layers.edges[part:-1:N_PARTS].copy(), np.empty((end - start, 2), np.int32)
+    for_all = (start, projection, alpha_min, n_tiles_x, n_tiles, survey.buckets, layers, cursors, wide)
+    _write_wide(survey.squares[part], True, *for_all)
+    _write_wide(survey.others[part], False, *for_all)
+    slot = 0
     for n in range(start, end):  # without branches: what can be seen cannot be foreseen either
         column, row, n_columns, n_rows = tiles_of_box(boxes, n)
-        layer = layer_of[_bucket(projection.depths[n], n_columns > 0)]
+        layer = layers.of_buckets[survey.buckets[n]]
         is_wide = (n_columns > 1) & (n_rows > 1)
         place, first = cursors[layer, GAUSSIANS], cursors[layer, TILES]
         line = (column, row, n_columns * (not is_wide), n_rows)
         behind = write_line(line, n_tiles_x, layer * n_tiles, cells, first)
         cursors[layer, GAUSSIANS], cursors[layer, TILES] = place + 1, behind
-        first, behind = (wide[n_wide, 0], wide[n_wide, 1]) if is_wide else (first, behind)
-        n_wide += is_wide
+        first, behind = (wide[n - start, 0], wide[n - start, 1]) if is_wide else (first, behind)
         layers.keys[place] = keys[n]
-        entries = layers.entries
         prefetch(entries, place + FETCH_AHEAD)
         entries[place, ID], entries[place, FIRST], entries[place, COUNT] = n, first, behind - first
         entries[place, SLOT] = slot
         slot += behind - first
         offsets[n + 1] = slot
     for layer in range(N_PARTS):
-        for i in range(first_cells[layer], cursors[layer, TILES]):
+        for i in range(layers.edges[layer * N_PARTS + part, TILES], cursors[layer, TILES]):
             counts[cells[i]] += 1
-
-
-@kernel()
-def list_parts(projection, keys, alpha_min, n_tiles_x, layer_of, cursors, layers, offsets, counts):
-    """Second pass; writes the layers, the offsets of the slots within each part, and the pairs of each cell."""
-    n_threads = counts.shape[0]
-    for thread in prange(n_threads):
-        for part in range(thread, N_PARTS, n_threads):
-            _list_part(
-                part, projection, keys, alpha_min, n_tiles_x, layer_of, cursors[part], layers, offsets, counts[thread]
-            )
+    return slot
 
 
 @scalar
-def _fill_layer(
-    layer, edges, layers, first_slots, offsets, places, other_keys, other_places, digits, starts, ids, slots
-):
-    """Sort one layer and write its pairs."""
-    entries, cells, n = layers.entries, layers.cells, other_keys.size
-    for i in range(n * layer // N_PARTS, n * (layer + 1) // N_PARTS):
-        offsets[i + 1] += first_slots[layer]  # of the part of the same number
+def start_lists(counts, n_pairs, tile_offsets, starts, first_slots):
+    """Find where each tile's list starts, where each layer starts in it, and where the slots of each part start.
+
+    Parameters
+    ----------
+    counts : ndarray of shape (threads, N_PARTS * n_tiles)
+        Pairs of each cell; how they are spread over the threads does not matter.
+    n_pairs : ndarray of shape (N_PARTS,)
+        Pairs of each part.
+    tile_offsets, starts, first_slots : ndarrays of shapes (n_tiles + 1,), (N_PARTS * n_tiles,) and (N_PARTS,)
+        Overwritten.
+    """
+    n_tiles = tile_offsets.size - 1
+    tile_offsets[:] = 0
+    for layer in range(N_PARTS):
+        for tile in range(n_tiles):
+            count = 0
+            for thread in range(counts.shape[0]):
+                count += counts[thread, layer * n_tiles + tile]
+            starts[layer * n_tiles + tile] = tile_offsets[tile + 1]
+            tile_offsets[tile + 1] += count
+    for tile in range(n_tiles):
+        tile_offsets[tile + 1] += tile_offsets[tile]
+    for layer in range(N_PARTS):
+        for tile in range(n_tiles):
+            starts[layer * n_tiles + tile] += tile_offsets[tile]
+    slot = 0
+    for part in range(N_PARTS):
+        first_slots[part] = slot
+        slot += n_pairs[part]
+
+
+# --- third pass ---
+
+
+@scalar
+def fill_layer(layer, layers, first_slots, offsets, places, other_keys, other_places, digits, starts, ids, slots):
+    """Sort one layer and write its pairs; and complete the offsets of the part of the same number."""
+    edges, entries, cells = layers.edges[:, GAUSSIANS], layers.entries, layers.cells
+    start, end = part_of(other_keys.size, layer)
+    for i in range(start, end):
+        offsets[i + 1] += first_slots[layer]
     for part in range(N_PARTS):
         for place in range(edges[layer * N_PARTS + part], edges[layer * N_PARTS + part + 1]):
             places[place] = place
@@ -155,17 +246,4 @@ def _fill_layer(
         for k in range(count):
             place = starts[cells[first + k]]
             starts[cells[first + k]] = place + 1
-            ids[place] = n
-            slots[place] = slot + k
-
-
-@kernel()
-def fill_layers(edges, layers, first_slots, offsets, places, other_keys, other_places, digits, starts, ids, slots):
-    """Third pass; writes the lists and the slots of their pairs, and completes the offsets."""
-    n_threads = digits.shape[0]
-    for thread in prange(n_threads):
-        for layer in range(thread, N_PARTS, n_threads):
-            _fill_layer(
-                layer, edges, layers, first_slots, offsets, places, other_keys, other_places, digits[thread], starts,
-                ids, slots,
-            )  # fmt: skip
+            ids[place], slots[place] = n, slot + k

@@ -15,7 +15,16 @@ overflow of f / z squared, and the thin axis of a needle. Results are rounded wh
 import numpy as np
 
 from minisplat_ref.constants import COMPENSATION_FLOOR, JACOBIAN_CLAMP, Conventions
-from minisplat_ref.cpu.gaussian_rows import DOUBLE, add, gather_wide, list_visible, listed_rows, rows_from, triple
+from minisplat_ref.cpu.gaussian_rows import (
+    DOUBLE,
+    add,
+    gather_wide,
+    list_visible,
+    listed_rows,
+    rows_from,
+    total_of,
+    triple,
+)
 from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.extent import inria_box, support_box
 from minisplat_ref.scalar.lanes import WIDTH, counted, scatter, select
@@ -206,6 +215,7 @@ def _project_chunk_vjp(chunk, means, quats, scales, opacities, radii, rotation, 
     visible = np.empty(end - first + WIDTH, np.int64)
     count = list_visible(radii, first, end, visible)
     R = rows_of(rotation)
+    v_poses[chunk] = ZERO
     for i in range(0, count, WIDTH):
         is_counted = counted(DOUBLE) < count - i
         rows = listed_rows(visible, i)
@@ -213,9 +223,11 @@ def _project_chunk_vjp(chunk, means, quats, scales, opacities, radii, rotation, 
 
 
 @kernel()
-def _project_vjp(means, quats, scales, opacities, radii, rotation, centre, lens, v, out, v_poses):
-    for chunk in prange(v_poses.shape[0]):
+def _project_vjp(means, quats, scales, opacities, radii, rotation, centre, lens, v, out):
+    v_poses = np.empty((N_CHUNKS, 12 * WIDTH), np.float64)
+    for chunk in prange(N_CHUNKS):
         _project_chunk_vjp(chunk, means, quats, scales, opacities, radii, rotation, centre, lens, v, out, v_poses)
+    return total_of(v_poses)
 
 
 def project_vjp(
@@ -230,7 +242,6 @@ def project_vjp(
 ) -> PrimitiveGradient:
     """Chain the gradient of a projection to its inputs; see ``reference.projection.project_vjp``."""
     dtype = means.dtype
-    v_poses = np.zeros((N_CHUNKS, 12 * WIDTH), np.float64)
     out = PrimitiveGradient(
         np.empty(means.shape, means.dtype),
         np.empty(quats.shape, quats.dtype),
@@ -241,8 +252,8 @@ def project_vjp(
     )
     rotation, centre = pose_of(camera)
     lens = lens_of(camera, conventions)
-    _project_vjp(means, quats, scales, opacities, projection.radii, rotation, centre, lens, v_projection, out, v_poses)
-    v_pose = v_poses.reshape(N_CHUNKS, 3, 4, WIDTH).sum(axis=(0, 3))
+    v_pose = _project_vjp(means, quats, scales, opacities, projection.radii, rotation, centre, lens, v_projection, out)
+    v_pose = v_pose.reshape(3, 4)
     out.cam_from_world_R[:] = v_pose[:, :3]
     out.cam_from_world_t[:] = v_pose[:, 3]
     return out

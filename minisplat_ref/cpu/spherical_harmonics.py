@@ -12,7 +12,7 @@ an atomic operation each.
 import numpy as np
 
 from minisplat_ref.constants import SH_C0, SH_C1, SH_C2, SH_C3
-from minisplat_ref.cpu.gaussian_rows import DOUBLE, add, list_visible, listed_rows, triple
+from minisplat_ref.cpu.gaussian_rows import DOUBLE, add, list_visible, listed_rows, total_of, triple
 from minisplat_ref.cpu.memory import large_empty
 from minisplat_ref.cpu.projection import N_CHUNKS, camera_centre
 from minisplat_ref.scalar._jit import kernel, prange, scalar
@@ -191,13 +191,14 @@ def _zero_culled(first, end, width, radii, v_means, v_dc, v_rest):
 
 
 @scalar
-def _chunk_vjp(first, end, means, sh_dc, sh_rest, width, centre, degree, c, radii, v_colors, out, v_rest, v_centre):
+def _chunk_vjp(first, end, means, sh_dc, sh_rest, width, centre, degree, c, radii, v_colors, out, v_rest, v_offset):
     staged = np.empty(STAGE * WIDTH, means.dtype)
     y = np.empty(N_BASES * WIDTH, means.dtype)
     rest = np.zeros(max(width, WIDTH) * WIDTH, means.dtype)  # beyond the active degree the gradient is zero
     visible = np.empty(end - first + WIDTH, np.int64)
     count = list_visible(radii, first, end, visible)
     n_rest = (degree + 1) * (degree + 1) - 1
+    v_offset[:] = ZERO
     _zero_culled(first, end, width, radii, out.means, out.sh_dc, v_rest)
     for i in range(0, count, WIDTH):
         rows = listed_rows(visible, i)
@@ -247,18 +248,20 @@ def _chunk_vjp(first, end, means, sh_dc, sh_rest, width, centre, degree, c, radi
         scatter(out.means, rows, 1, v_y)
         scatter(out.means, rows, 2, v_z)
         is_counted = counted(means.dtype.type(0)) < count - i
-        add(v_centre, 0, is_counted, converted(v_x, DOUBLE))
-        add(v_centre, 1, is_counted, converted(v_y, DOUBLE))
-        add(v_centre, 2, is_counted, converted(v_z, DOUBLE))
+        add(v_offset, 0, is_counted, converted(v_x, DOUBLE))
+        add(v_offset, 1, is_counted, converted(v_y, DOUBLE))
+        add(v_offset, 2, is_counted, converted(v_z, DOUBLE))
 
 
 @kernel()
-def _sh_colors_vjp(means, sh_dc, sh_rest, width, centre, degree, c, radii, v_colors, out, v_rest, v_centres):
+def _sh_colors_vjp(means, sh_dc, sh_rest, width, centre, degree, c, radii, v_colors, out, v_rest):
     n_gaussians = means.shape[0]
+    v_offsets = np.empty((N_CHUNKS, 3 * WIDTH), np.float64)
     for chunk in prange(N_CHUNKS):
         first, end = n_gaussians * chunk // N_CHUNKS, n_gaussians * (chunk + 1) // N_CHUNKS
-        v_centre = v_centres[chunk]
-        _chunk_vjp(first, end, means, sh_dc, sh_rest, width, centre, degree, c, radii, v_colors, out, v_rest, v_centre)
+        v_offset = v_offsets[chunk]
+        _chunk_vjp(first, end, means, sh_dc, sh_rest, width, centre, degree, c, radii, v_colors, out, v_rest, v_offset)
+    return total_of(v_offsets)
 
 
 def sh_colors_vjp(
@@ -266,7 +269,6 @@ def sh_colors_vjp(
 ) -> SHGradient:
     """Chain the gradient of the colours to their inputs; see ``reference.spherical_harmonics.sh_colors_vjp``."""
     dtype = means.dtype
-    v_centres = np.zeros((N_CHUNKS, 3 * WIDTH), np.float64)
     out = SHGradient(
         np.empty(means.shape, means.dtype),
         np.empty(sh_dc.shape, sh_dc.dtype),
@@ -275,7 +277,7 @@ def sh_colors_vjp(
         np.empty(3, dtype),
     )
     constants = np.array(_CONSTANTS, dtype)
-    _sh_colors_vjp(
+    v_offset = _sh_colors_vjp(
         means,
         sh_dc,
         sh_rest.ravel(),
@@ -287,9 +289,8 @@ def sh_colors_vjp(
         v_colors,
         out,
         out.sh_rest.reshape(-1),
-        v_centres,
     )
-    v_centre = -v_centres.reshape(N_CHUNKS, 3, WIDTH).sum(axis=(0, 2))
-    out.cam_from_world_R[:] = -np.outer(camera.cam_from_world_t, v_centre)  # centre = -R^T t
-    out.cam_from_world_t[:] = -camera.cam_from_world_R @ v_centre
+    # The sum over the Gaussians of the gradient by their offset, mean - centre, with centre = -R^T t.
+    out.cam_from_world_R[:] = np.outer(camera.cam_from_world_t, v_offset)
+    out.cam_from_world_t[:] = camera.cam_from_world_R @ v_offset
     return out

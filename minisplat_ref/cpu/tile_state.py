@@ -10,15 +10,15 @@ import numpy as np
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
-from minisplat_ref.scalar._jit import n_threads, scalar
+from minisplat_ref.scalar._jit import scalar
 from minisplat_ref.scalar.compositing import Frame
 from minisplat_ref.scalar.lanes import WIDTH, any_of, counted, filled, load, select, store
 from minisplat_ref.scalar.literals import ONE, ZERO
-from minisplat_ref.types import Ints, TileBins
+from minisplat_ref.types import TileBins
 
 N_STRIPS = TILE_WIDTH // WIDTH
 N_ROWS = N_STRIPS * TILE_HEIGHT  # bits of an integer
-RANGES_PER_THREAD = 8
+RANGES_PER_THREAD = 32
 CHECK_EVERY = 16  # hits between two looks at which pixels are finished
 
 
@@ -37,15 +37,23 @@ def frame_of(bins: TileBins, conventions: Conventions, dtype: np.dtype) -> Frame
     return Frame(bins.grid.width, bins.grid.height, *(dtype.type(value) for value in thresholds))
 
 
-def tile_ranges(bins: TileBins) -> Ints:
-    """Cut the tiles, in their order, into ranges of about equal numbers of pairs; return the ends, from 0.
+@scalar
+def first_tile(i, n_ranges, offsets):
+    """First tile of range ``i``, if the tiles, in their order, are cut into ranges of about equal numbers of pairs.
 
     Neighbouring tiles share Gaussians, so a range of them keeps records in the cache. A range is one thread's work;
-    there are several per thread because equal pairs are not equal work where pixels finish early.
+    there are many per thread because equal pairs are not equal work where pixels finish early, nor threads equally
+    fast.
     """
-    n_ranges = RANGES_PER_THREAD * n_threads()
-    work = bins.tile_offsets + np.arange(len(bins.tile_offsets))  # an empty tile is some work too
-    return np.searchsorted(work, np.linspace(0, work[-1], n_ranges + 1)).astype(np.int64)
+    first, end = 0, offsets.size - 1
+    wanted = (offsets[end] + end) * i // n_ranges  # an empty tile is some work too
+    while first < end:
+        middle = (first + end) // 2
+        if offsets[middle] + middle < wanted:
+            first = middle + 1
+        else:
+            end = middle
+    return first
 
 
 @scalar

@@ -59,6 +59,10 @@ if "OMP_WAIT_POLICY" not in os.environ:
 
 _KERNEL_LOCK = threading.RLock()
 _PACKAGE = Path(__file__).parent.parent
+_PARALLEL = {  # loops over prange, in the order in which they stand, and nothing that Numba finds by itself
+    "prange": True,
+    **dict.fromkeys(("comprehension", "fusion", "inplace_binop", "numpy", "reduction", "setitem", "stencil"), False),
+}
 _COMPILER_OPTIONS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "BOUNDSCHECK", "DEBUGINFO_DEFAULT")
 
 
@@ -160,7 +164,7 @@ def kernel(parallel: bool = True) -> Callable[[Callable], Callable]:
         numba.config.CACHE_DIR = folder or previous  # type: ignore[attr-defined]  # read at decoration only
         try:
             compiled = numba.njit(
-                parallel=parallel,
+                parallel=_PARALLEL if parallel else False,
                 cache=folder is not None,
                 error_model="numpy",
                 fastmath={"contract"},

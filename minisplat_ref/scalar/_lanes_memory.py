@@ -82,7 +82,10 @@ def _row_pointers(context: Any, builder: Any, signature: Any, args: Any) -> list
     step = builder.extract_value(array.strides, 1) if is_strided else ir.IntType(64)(table.dtype.bitwidth // 8)
     start = builder.gep(builder.bitcast(array.data, byte), [builder.mul(args[2], step)])
     rows = (builder.extract_value(args[1], k) for k in range(WIDTH))
-    return [builder.bitcast(builder.gep(start, [builder.mul(row, stride)]), array.data.type) for row in rows]
+    return [
+        builder.bitcast(builder.gep(start, [builder.mul(builder.sext(row, stride.type), stride)]), array.data.type)
+        for row in rows
+    ]
 
 
 @compiled(gather)

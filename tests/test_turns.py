@@ -1,0 +1,32 @@
+"""Parts of work that threads take: each exactly once, however many threads there are."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from minisplat_ref.scalar._jit import kernel, n_threads, prange
+from minisplat_ref.scalar.turns import next_turn, no_turns, turns
+
+
+@kernel()
+def count_turns(n_threads, counts, who):
+    taken = no_turns()
+    for thread in prange(n_threads):
+        for part in turns(taken, counts.size):
+            counts[part] += 1
+            who[part] = thread
+
+
+@pytest.mark.parametrize("n_parts", [0, 1, 3, 100_000])
+def test_every_part_is_taken_once(n_parts):
+    counts, who = np.zeros((2, n_parts), np.int64)
+    count_turns(4 * n_threads(), counts, who)
+    assert_array_equal(counts, 1)
+    assert np.all(who < 4 * n_threads())
+
+
+def test_python_takes_the_same_turns():
+    taken = no_turns()
+    assert next_turn(taken) == 0
+    assert list(turns(taken, 4)) == [1, 2, 3]
+    assert list(turns(taken, 4)) == []
