@@ -9,9 +9,9 @@ from minisplat_ref.scalar.turns import next_turn, no_turns, turns
 
 
 @kernel()
-def count_turns(n_threads, counts, who):
+def count_turns(n, counts, who):
     taken = no_turns()
-    for thread in prange(n_threads):
+    for thread in prange(n):
         for part in turns(taken, counts.size):
             counts[part] += 1
             who[part] = thread

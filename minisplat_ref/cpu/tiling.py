@@ -93,4 +93,5 @@ def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventio
     keys = projection.depths.view(np.int32 if dtype == np.float32 else np.int64)
     n_tiles = grid.n_tiles_x * grid.n_tiles_y
     alpha_min = dtype.type(conventions.alpha_min)
-    return TileBins(*_list_tiles(projection, keys, alpha_min, grid.n_tiles_x, n_tiles, n_threads()), grid)
+    ids, tile_offsets, slots, offsets = _list_tiles(projection, keys, alpha_min, grid.n_tiles_x, n_tiles, n_threads())
+    return TileBins(ids, tile_offsets, slots, offsets, grid)

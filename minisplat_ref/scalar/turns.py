@@ -1,7 +1,8 @@
 """Work that threads take part by part: whoever is free takes the next.
 
 Parts are never equal work and threads never equally fast: another program may hold a core, and the cores of a laptop
-differ. So nothing may depend on which thread takes which part.
+differ. So nothing may depend on which thread takes which part. Loops over Gaussians keep to fixed shares instead: they
+do little with each number, and what a core had in its cache it has again in the next loop.
 
 In a kernel::
 
