@@ -79,12 +79,12 @@ def _adam(dtype: Dtype) -> None:
 
 STAGES: dict[str, Callable[[Dtype], None]] = {
     "blending, backward": _stage("composite_vjp"),
+    "tile lists": _stage("bin_gaussians"),
     "photometric loss, both ways": _photometric_loss,
     "colours, backward": _stage("sh_colors_vjp"),
     "projection, backward": _stage("project_vjp"),
     "blending": _stage("composite"),
     "projection": _stage("project"),
-    "tile lists": _stage("bin_gaussians"),
     "colours": _stage("sh_colors"),
     "Adam": _adam,
     # From here on not every training and no ordinary rendering.

@@ -22,6 +22,7 @@ N_BUCKETS = 1 << 10  # from 1/128 to 2^25; the first and the last also take what
 FIRST_BUCKET = int(np.float32(1 / 128).view(np.int32)) >> BUCKET_SHIFT
 CULLED = N_BUCKETS  # the bucket behind them all
 GAUSSIANS, TILES = 0, 1  # columns of a count; the tiles are those under boxes
+SQUARES, OTHERS = 0, 1  # lists of Gaussians with wide boxes
 ID, FIRST, COUNT, SLOT = range(4)  # columns of an entry: a Gaussian, its cells, its first slot within its part
 FETCH_AHEAD = 8  # entries
 
@@ -33,10 +34,9 @@ class Survey(NamedTuple):
     """[N_PARTS, CULLED + 2, 2] Gaussians of each part below each bucket, and tiles under their boxes; int32."""
     buckets: Ints
     """[N] bucket of each Gaussian, int16."""
-    squares: Ints
-    """[N_PARTS, WIDTH + Gaussians of a part] those whose boxes lie over two columns and two rows of tiles, int32."""
-    others: Ints
-    """Likewise the others whose boxes are wide."""
+    wide: Ints
+    """[N_PARTS, 2, at least Gaussians of a part + 9] those with wide boxes, int32: in the first list those over two
+    columns and two rows of tiles, as most are, in the second the others. The last number of a list is its length."""
 
 
 class Layers(NamedTuple):
@@ -75,7 +75,7 @@ def _bucket(depth, is_visible):
 @scalar
 def survey_part(part, boxes, depths, survey):
     """Count the Gaussians of a part and their tiles, and list those whose boxes are wide."""
-    up_to, squares, others = survey.up_to[part], survey.squares[part], survey.others[part]
+    up_to, squares, others = survey.up_to[part], survey.wide[part, SQUARES], survey.wide[part, OTHERS]
     start, end = part_of(depths.size, part)
     up_to[:] = 0
     n_squares = n_others = 0
@@ -140,34 +140,35 @@ def cut_layers(up_to, of_buckets, edges):
 
 
 @scalar
-def _write_wide(ids, are_squares, start, projection, alpha_min, n_tiles_x, n_tiles, buckets, layers, cursors, wide):
-    """Write the cells of listed Gaussians of a part, eight at a time; ``wide`` gets the first of each and the end."""
-    boxes, count = projection.boxes, ids[-1]
+def _write_wide(part, survey, projection, alpha_min, n_tiles_x, n_tiles, layers, cursors, wide):
+    """Write the cells of the wide boxes of a part, eight at a time; ``wide`` gets the first of each and the end."""
+    start, _ = part_of(projection.depths.size, part)
     spans = np.empty(2 * WIDTH * (n_tiles // n_tiles_x), projection.depths.dtype)
-    for i in range(0, count, WIDTH):
-        rows = listed_rows(ids, i)
-        outline, most_rows = outlines(rows, projection, alpha_min)
-        for row in range(2 if are_squares else most_rows):
-            write_spans(rows, row, outline, projection, spans)
-        for k in range(min(WIDTH, count - i)):
-            n = ids[i + k]
-            column, row, n_columns, n_rows = tiles_of_box(boxes, n)
-            box = (column, row, 2, 2) if are_squares else (column, row, n_columns, n_rows)
-            layer = layers.of_buckets[buckets[n]]
-            first = cursors[layer, TILES]
-            behind = write_wide(box, spans, k, n_tiles_x, layer * n_tiles, layers.cells, first)
-            cursors[layer, TILES], wide[n - start, 0], wide[n - start, 1] = behind, first, behind
+    for kind in (SQUARES, OTHERS):
+        ids = survey.wide[part, kind]
+        for i in range(0, ids[-1], WIDTH):
+            rows = listed_rows(ids, i)
+            outline, most_rows = outlines(rows, projection, alpha_min)
+            for row in range(most_rows):
+                write_spans(rows, row, outline, projection, spans)
+            for k in range(min(WIDTH, ids[-1] - i)):
+                n = ids[i + k]
+                box, layer = tiles_of_box(projection.boxes, n), layers.of_buckets[survey.buckets[n]]
+                first, base = cursors[layer, TILES], layer * n_tiles
+                if kind == SQUARES:  # foreseen, and then the loops of write_wide have a fixed length
+                    behind = write_wide((box[0], box[1], 2, 2), spans, k, n_tiles_x, base, layers.cells, first)
+                else:
+                    behind = write_wide(box, spans, k, n_tiles_x, base, layers.cells, first)
+                cursors[layer, TILES], wide[n - start, 0], wide[n - start, 1] = behind, first, behind
 
 
 @scalar
 def list_part(part, survey, projection, keys, alpha_min, n_tiles_x, layers, offsets, counts):
-    """Enter each Gaussian of a part into its layer, and count the pairs of each cell; return the pairs of the part."""
+    """Enter each Gaussian of a part into its layer, and count the pairs of each cell."""
     start, end = part_of(keys.size, part)
     boxes, entries, cells, n_tiles = projection.boxes, layers.entries, layers.cells, counts.size // N_PARTS
     cursors, wide = layers.edges[part:-1:N_PARTS].copy(), np.empty((end - start, 2), np.int32)
-    for_all = (start, projection, alpha_min, n_tiles_x, n_tiles, survey.buckets, layers, cursors, wide)
-    _write_wide(survey.squares[part], True, *for_all)
-    _write_wide(survey.others[part], False, *for_all)
+    _write_wide(part, survey, projection, alpha_min, n_tiles_x, n_tiles, layers, cursors, wide)
     slot = 0
     for n in range(start, end):  # without branches: what can be seen cannot be foreseen either
         column, row, n_columns, n_rows = tiles_of_box(boxes, n)
@@ -187,29 +188,30 @@ def list_part(part, survey, projection, keys, alpha_min, n_tiles_x, layers, offs
     for layer in range(N_PARTS):
         for i in range(layers.edges[layer * N_PARTS + part, TILES], cursors[layer, TILES]):
             counts[cells[i]] += 1
-    return slot
 
 
 @scalar
-def start_lists(counts, n_pairs, tile_offsets, starts, first_slots):
-    """Find where each tile's list starts, where each layer starts in it, and where the slots of each part start.
+def start_lists(counts, offsets, first_slots, tile_offsets):
+    """Find where each tile's list starts, and the slots of each part.
 
     Parameters
     ----------
     counts : ndarray of shape (threads, N_PARTS * n_tiles)
-        Pairs of each cell; how they are spread over the threads does not matter.
-    n_pairs : ndarray of shape (N_PARTS,)
-        Pairs of each part.
-    tile_offsets, starts, first_slots : ndarrays of shapes (n_tiles + 1,), (N_PARTS * n_tiles,) and (N_PARTS,)
+        Pairs of each cell; how they are spread over the threads does not matter. The first row receives where each cell
+        starts, a layer's share of a tile's list.
+    offsets : ndarray of shape (N + 1,)
+        Pairs of each part, up to each Gaussian.
+    first_slots, tile_offsets : ndarrays of shapes (N_PARTS,) and (n_tiles + 1,)
         Overwritten.
     """
-    n_tiles = tile_offsets.size - 1
+    n_tiles, starts = tile_offsets.size - 1, counts[0]
+    for thread in range(1, len(counts)):
+        for cell in range(starts.size):
+            starts[cell] += counts[thread, cell]
     tile_offsets[:] = 0
     for layer in range(N_PARTS):
         for tile in range(n_tiles):
-            count = 0
-            for thread in range(counts.shape[0]):
-                count += counts[thread, layer * n_tiles + tile]
+            count = starts[layer * n_tiles + tile]
             starts[layer * n_tiles + tile] = tile_offsets[tile + 1]
             tile_offsets[tile + 1] += count
     for tile in range(n_tiles):
@@ -220,16 +222,22 @@ def start_lists(counts, n_pairs, tile_offsets, starts, first_slots):
     slot = 0
     for part in range(N_PARTS):
         first_slots[part] = slot
-        slot += n_pairs[part]
+        start, end = part_of(offsets.size - 1, part)
+        if end > start:
+            slot += offsets[end]
 
 
 # --- third pass ---
 
 
 @scalar
-def fill_layer(layer, layers, first_slots, offsets, places, other_keys, other_places, digits, starts, ids, slots):
-    """Sort one layer and write its pairs; and complete the offsets of the part of the same number."""
+def fill_layer(layer, layers, first_slots, offsets, scratch, digits, starts, ids, slots):
+    """Sort one layer and write its pairs; and complete the offsets of the part of the same number.
+
+    ``scratch`` are places, keys and other places, each as long as the input.
+    """
     edges, entries, cells = layers.edges[:, GAUSSIANS], layers.entries, layers.cells
+    places, other_keys, other_places = scratch
     start, end = part_of(other_keys.size, layer)
     for i in range(start, end):
         offsets[i + 1] += first_slots[layer]
