@@ -67,7 +67,7 @@ def add_parser(commands: Commands) -> None:
         "--stages", action="store_true", help="instead: a training iteration, and how far from the limits"
     )
     others.add_argument("--slopes", action="store_true", help="instead: time against hits, 12,500 to 200,000 Gaussians")
-    others.add_argument("--memory", action="store_true", help="instead: peak of an iteration, 200,000 in 1920 x 1080")
+    others.add_argument("--memory", action="store_true", help="instead: peak of training, 200,000 in 1920 x 1080")
     others.add_argument("--start", action="store_true", help="instead: seconds to the first iteration, cold and warm")
     parser.add_argument(
         "--scene", type=Path, metavar="SCENE", help="photographs for --stages (default a made room) and opensplat"
@@ -106,8 +106,8 @@ def _measure(args: argparse.Namespace) -> "Report":
     if args.memory:
         from minisplat_ref.cli.peak_memory import memory_case
 
-        progress("memory: one training iteration in a process of its own")
-        return Report("Peak memory of a training iteration", (memory_case(),), {})
+        progress("memory: a few iterations in a process of its own")
+        return Report("Peak memory of training", (memory_case(),), {})
     if args.start:
         from minisplat_ref.cli.start_time import start_cases
 
