@@ -42,7 +42,8 @@ class Survey(NamedTuple):
 class Layers(NamedTuple):
     """The Gaussians, layer by layer, and within a layer in the order of the input; the culled come last.
 
-    A cell is one tile in one layer.
+    A cell is one tile in one layer. Beside them stand the cells of all pairs, an array of layer * n_tiles + tile, int32;
+    between the parts of a layer places are left over.
     """
 
     of_buckets: Ints
@@ -53,8 +54,6 @@ class Layers(NamedTuple):
     """[N] bits of the depths: positive floats are ordered as their bits are."""
     entries: Ints
     """[N, 4] int32."""
-    cells: Ints
-    """layer * n_tiles + tile of each pair, int32; between the parts of a layer places are left over."""
 
 
 @scalar
@@ -140,7 +139,7 @@ def cut_layers(up_to, of_buckets, edges):
 
 
 @scalar
-def _write_wide(part, survey, projection, alpha_min, n_tiles_x, n_tiles, layers, cursors, wide):
+def _write_wide(part, survey, projection, alpha_min, n_tiles_x, n_tiles, layers, cells, cursors, wide):
     """Write the cells of the wide boxes of a part, eight at a time; ``wide`` gets the first of each and the end."""
     start, _ = part_of(projection.depths.size, part)
     spans = np.empty(2 * WIDTH * (n_tiles // n_tiles_x), projection.depths.dtype)
@@ -156,19 +155,19 @@ def _write_wide(part, survey, projection, alpha_min, n_tiles_x, n_tiles, layers,
                 box, layer = tiles_of_box(projection.boxes, n), layers.of_buckets[survey.buckets[n]]
                 first, base = cursors[layer, TILES], layer * n_tiles
                 if kind == SQUARES:  # foreseen, and then the loops of write_wide have a fixed length
-                    behind = write_wide((box[0], box[1], 2, 2), spans, k, n_tiles_x, base, layers.cells, first)
+                    behind = write_wide((box[0], box[1], 2, 2), spans, k, n_tiles_x, base, cells, first)
                 else:
-                    behind = write_wide(box, spans, k, n_tiles_x, base, layers.cells, first)
+                    behind = write_wide(box, spans, k, n_tiles_x, base, cells, first)
                 cursors[layer, TILES], wide[n - start, 0], wide[n - start, 1] = behind, first, behind
 
 
 @scalar
-def list_part(part, survey, projection, keys, alpha_min, n_tiles_x, layers, offsets, counts):
+def list_part(part, survey, projection, keys, alpha_min, n_tiles_x, layers, cells, offsets, counts):
     """Enter each Gaussian of a part into its layer, and count the pairs of each cell."""
     start, end = part_of(keys.size, part)
-    boxes, entries, cells, n_tiles = projection.boxes, layers.entries, layers.cells, counts.size // N_PARTS
+    boxes, entries, n_tiles = projection.boxes, layers.entries, counts.size // N_PARTS
     cursors, wide = layers.edges[part:-1:N_PARTS].copy(), np.empty((end - start, 2), np.int32)
-    _write_wide(part, survey, projection, alpha_min, n_tiles_x, n_tiles, layers, cursors, wide)
+    _write_wide(part, survey, projection, alpha_min, n_tiles_x, n_tiles, layers, cells, cursors, wide)
     slot = 0
     for n in range(start, end):  # without branches: what can be seen cannot be foreseen either
         column, row, n_columns, n_rows = tiles_of_box(boxes, n)
@@ -231,13 +230,14 @@ def start_lists(counts, offsets, first_slots, tile_offsets):
 
 
 @scalar
-def fill_layer(layer, layers, first_slots, offsets, scratch, digits, starts, ids, slots):
+def fill_layer(layer, layers, cells, first_slots, offsets, scratch, digits, starts, lists):
     """Sort one layer and write its pairs; and complete the offsets of the part of the same number.
 
-    ``scratch`` are places, keys and other places, each as long as the input.
+    ``scratch`` are places, keys and other places, each as long as the input; ``lists`` [2, M] gets Gaussians and slots.
     """
-    edges, entries, cells = layers.edges[:, GAUSSIANS], layers.entries, layers.cells
+    edges, entries = layers.edges[:, GAUSSIANS], layers.entries
     places, other_keys, other_places = scratch
+    ids, slots = lists[0], lists[1]
     start, end = part_of(other_keys.size, layer)
     for i in range(start, end):
         offsets[i + 1] += first_slots[layer]

@@ -39,32 +39,30 @@ __all__ = ["ELLIPSE_MARGIN", "TILE_HEIGHT", "TILE_WIDTH", "bin_gaussians"]
 
 
 @kernel()
-def _survey(boxes, depths, n_threads, survey, of_buckets, edges):
-    """First pass; writes the survey, and which layers it makes."""
+def _list_tiles(
+    projection, keys, alpha_min, n_tiles_x, survey, layers, offsets, counts, first_slots, tile_offsets, scratch, digits
+):
+    """Write the offsets; return the lists and the slots of their pairs. The three passes are one kernel."""
+    n_threads = len(counts)
     taken = no_turns()
     for _ in prange(n_threads):
         for part in turns(taken, N_PARTS):
-            survey_part(part, boxes, depths, survey)
-    cut_layers(survey.up_to, of_buckets, edges)
+            survey_part(part, projection.boxes, projection.depths, survey)
+    cut_layers(survey.up_to, layers.of_buckets, layers.edges)
 
-
-@kernel()
-def _list_parts(survey, projection, keys, alpha_min, n_tiles_x, layers, offsets, counts, first_slots, tile_offsets):
-    """Second pass; writes the layers, the offsets within each part, and where everything starts that is filled then."""
+    cells = np.empty(layers.edges[-1, TILES], np.int32)
     taken = no_turns()
-    for thread in prange(len(counts)):
+    for thread in prange(n_threads):
         for part in turns(taken, N_PARTS):
-            list_part(part, survey, projection, keys, alpha_min, n_tiles_x, layers, offsets, counts[thread])
+            list_part(part, survey, projection, keys, alpha_min, n_tiles_x, layers, cells, offsets, counts[thread])
     start_lists(counts, offsets, first_slots, tile_offsets)
 
-
-@kernel()
-def _fill_layers(layers, first_slots, offsets, scratch, digits, starts, ids, slots):
-    """Third pass; writes the lists and the slots of their pairs, and completes the offsets."""
+    lists = np.empty((2, tile_offsets[-1]), np.int32)
     taken = no_turns()
-    for thread in prange(len(digits)):
+    for thread in prange(n_threads):
         for layer in turns(taken, N_PARTS):
-            fill_layer(layer, layers, first_slots, offsets, scratch, digits[thread], starts, ids, slots)
+            fill_layer(layer, layers, cells, first_slots, offsets, scratch, digits[thread], counts[0], lists)
+    return lists
 
 
 def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventions) -> TileBins:
@@ -74,25 +72,26 @@ def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventio
     ``conventions.alpha_min``; a box within one row or one column of tiles is not looked at so closely.
     """
     n, n_tiles, dtype = len(projection.depths), grid.n_tiles_x * grid.n_tiles_y, projection.depths.dtype
-    of_buckets, edges = np.empty(CULLED + 1, np.int32), np.empty(((N_PARTS + 1) * N_PARTS + 1, 2), np.int64)
+    keys = projection.depths.view(np.int32 if dtype == np.float32 else np.int64)
+    alpha_min = dtype.type(conventions.alpha_min)
     survey = Survey(
         np.empty((N_PARTS, CULLED + 2, 2), np.int32),
         np.empty(n, np.int16),
         np.empty((N_PARTS, 2, n // N_PARTS + 2 * WIDTH), np.int32),
     )
-    _survey(projection.boxes, projection.depths, n_threads(), survey, of_buckets, edges)
-
-    keys = projection.depths.view(np.int32 if dtype == np.float32 else np.int64)
-    cells = np.empty(edges[-1, TILES], np.int32)
-    layers = Layers(of_buckets, edges, np.empty_like(keys), np.empty((n, 4), np.int32), cells)
+    layers = Layers(
+        np.empty(CULLED + 1, np.int32),
+        np.empty(((N_PARTS + 1) * N_PARTS + 1, 2), np.int64),
+        np.empty_like(keys),
+        np.empty((n, 4), np.int32),
+    )
     offsets, tile_offsets = np.empty(n + 1, np.int64), np.empty(n_tiles + 1, np.int64)
     offsets[0] = 0
     counts, first_slots = np.zeros((n_threads(), N_PARTS * n_tiles), np.int32), np.empty(N_PARTS, np.int64)
-    alpha_min = dtype.type(conventions.alpha_min)
-    _list_parts(survey, projection, keys, alpha_min, grid.n_tiles_x, layers, offsets, counts, first_slots, tile_offsets)
-
-    ids, slots = np.empty((2, tile_offsets[-1]), np.int32)
     scratch = (np.empty(n, np.int32), np.empty_like(keys), np.empty(n, np.int32))
     digits = np.empty((n_threads(), 1 << DIGIT_BITS), np.int32)
-    _fill_layers(layers, first_slots, offsets, scratch, digits, counts[0], ids, slots)
+    ids, slots = _list_tiles(
+        projection, keys, alpha_min, grid.n_tiles_x, survey, layers, offsets, counts, first_slots, tile_offsets,
+        scratch, digits,
+    )  # fmt: skip
     return TileBins(ids, tile_offsets, slots, offsets, grid)
