@@ -42,7 +42,7 @@ class Survey(NamedTuple):
 class Layers(NamedTuple):
     """The Gaussians, layer by layer, and within a layer in the order of the input; the culled come last.
 
-    A cell is one tile in one layer. Beside them stand the cells of all pairs, an array of layer * n_tiles + tile, int32;
+    A cell is one tile in one layer. Beside the layers stand the cells of all pairs, layer * n_tiles + tile as int32;
     between the parts of a layer places are left over.
     """
 
