@@ -46,15 +46,15 @@ from matplotlib.patches import Rectangle
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.cpu.records import records_of
-from minisplat_ref.cpu.tile_rows import SCRATCH_SIZE, reached_rows, start_scratch
-from minisplat_ref.cpu.tile_state import N_ROWS, N_STRIPS
+from minisplat_ref.cpu.tile_rows import reached_rows
+from minisplat_ref.cpu.tile_state import N_ROWS, N_STRIPS, rows_of
 from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
 from minisplat_ref.oracle.bench.roofs import rows_worked_on
 from minisplat_ref.oracle.bench.workloads import synth
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.render import render
 from minisplat_ref.scalar.compositing import Frame, blend
-from minisplat_ref.scalar.lanes import WIDTH, load, lowest_bit, store
+from minisplat_ref.scalar.lanes import WIDTH, load, store
 from minisplat_ref.types import Projection, TileGrid
 
 plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
@@ -89,24 +89,13 @@ def footprint(mean, slant, sigmas, opacity):
     )
 
 
-def rows_of(bits):
-    """Numbers of the rows in a set."""
-    rows = []
-    while bits:
-        rows.append(lowest_bit(bits))
-        bits &= bits - np.uint64(1)
-    return rows
-
-
 GRID = TileGrid(TILE_WIDTH, TILE_HEIGHT, TILE_WIDTH, TILE_HEIGHT)
-scratch = np.empty(SCRATCH_SIZE)
-start_scratch(scratch)
 
 
 def reached(projection):
     """Rows that the kernel looks at, as bits."""
     records = records_of(projection, np.zeros((1, 3)), GSPLAT_MAIN)
-    return reached_rows(records, np.zeros(1, np.int32), 0, 0, 0, scratch)
+    return reached_rows(records, np.zeros(1, np.int32), 0, 0, 0)
 
 
 slanted = footprint(np.array([15.3, 8.1]), 0.5, (5.5, 0.8), 0.8)
@@ -114,6 +103,7 @@ slanted = footprint(np.array([15.3, 8.1]), 0.5, (5.5, 0.8), 0.8)
 alphas = np.zeros((TILE_HEIGHT, TILE_WIDTH))
 alphas[hits.ys, hits.xs] = hits.alphas[0]
 bits = reached(slanted)
+n_rows = len(list(rows_of(bits)))
 
 figure, axis = plt.subplots(figsize=(9.5, 4.4))
 axis.imshow(
@@ -130,7 +120,7 @@ axis.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=RED, 
 axis.set(
     xlim=(-0.3, TILE_WIDTH + 0.3),
     ylim=(TILE_HEIGHT + 0.3, -0.3),
-    title=f"one tile: {np.count_nonzero(alphas)} hits, {len(rows_of(bits))} rows of eight looked at, 64 in the tile",
+    title=f"one tile: {np.count_nonzero(alphas)} hits, {n_rows} rows of eight looked at, 64 in the tile",
 )
 axis.set_aspect("equal")
 print(f"the set of rows, strip by strip: {int(bits):064b}")

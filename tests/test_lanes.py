@@ -9,6 +9,7 @@ from minisplat_ref.cpu.exponential import exp_exact, exp_fast
 from minisplat_ref.scalar.lanes import (
     WIDTH,
     any_of,
+    bits_between,
     converted,
     counted,
     filled,
@@ -162,6 +163,21 @@ def test_lowest_bit(bits):
     expected = next(k for k in range(64) if bits >> k & 1)
     assert lowest_bit(np.uint64(bits)) == expected
     assert compiled(lambda bits: lowest_bit(bits))(np.uint64(bits)) == expected
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(
+    ("firsts", "ends", "quarters"),
+    [
+        ((0, 3, 15, 0), (1, 5, 16, 16), ("0001", "0018", "8000", "ffff")),
+        ((16, 7, 9, 2), (16, 7, 4, -16), ("0000", "0000", "0000", "0000")),  # no end is behind its start
+        ((0, 0, 16, 4), (16, 0, 0, 15), ("ffff", "0000", "0000", "7ff0")),
+    ],
+)
+def test_bits_between_bounds(firsts, ends, quarters, dtype):
+    bounds, expected = np.array([*firsts, *ends], dtype), int("".join(reversed(quarters)), 16)
+    assert bits_between(bounds) == expected
+    assert compiled(lambda bounds: bits_between(load(bounds, 0)))(bounds) == expected
 
 
 def test_prefetch_changes_nothing():

@@ -22,24 +22,25 @@ from collections.abc import Callable
 
 import numpy as np
 
+from minisplat_ref.cpu.gaussian_rows import rows_from
 from minisplat_ref.cpu.pair_sums import N_MOMENTS, slot_size
 from minisplat_ref.cpu.records import COLOR, MEAN_X, MEAN_Y, N_FUSED, SLOPE
 from minisplat_ref.cpu.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, reached_rows, start_scratch, to_mean
 from minisplat_ref.cpu.tile_state import (
     CHECK_EVERY,
     N_ROWS,
-    RANGES_PER_THREAD,
     corner,
-    first_tile,
     open_rows,
     row_in_image,
+    rows_of,
     start_tile,
+    tiles_in_turn,
 )
 from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.compositing import alpha_vjp, blend
-from minisplat_ref.scalar.lanes import WIDTH, filled, load, select, store, sum_of, sums_of
+from minisplat_ref.scalar.lanes import WIDTH, counted, filled, gather, load, select, store, sum_of, sums_of
 from minisplat_ref.scalar.literals import ONE, ZERO
-from minisplat_ref.scalar.turns import no_turns, turns
+from minisplat_ref.scalar.turns import no_turns
 
 
 @functools.cache
@@ -54,16 +55,20 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
 
     @scalar
     def start_vjp(state, x0, y0, frame, image, alpha, v_image, v_alpha):
+        as_data = state.dtype.type
         for row in range(N_ROWS):
             x, y, n_pixels = row_in_image(row, x0, y0, frame)
-            for i in range(n_pixels):
-                place = row * row_size + i
-                behind = -v_alpha[y, x + i] * (ONE - alpha[y, x + i])  # alpha = 1 - T_final
-                for k in range(n_channels):
-                    v = v_image[y, x + i, k]
-                    state[place + channels + k * WIDTH] = v
-                    behind += v * image[y, x + i, k]
-                state[place + behind_place] = behind
+            if n_pixels == 0:
+                continue  # as start_tile left it
+            first = y * frame.width + x
+            pixels, is_inside = rows_from(first, first + n_pixels), counted(as_data(0)) < as_data(n_pixels)
+            behind = gather(v_alpha, pixels, 0) * (gather(alpha, pixels, 0) - ONE)  # alpha = 1 - T_final
+            place = row * row_size
+            for k in range(n_channels):
+                v = gather(v_image, pixels, k)
+                store(state, place + channels + k * WIDTH, select(is_inside, v, ZERO))
+                behind = behind + v * gather(image, pixels, k)
+            store(state, place + behind_place, behind)
 
     @scalar
     def background_vjp(state, sums):
@@ -79,11 +84,11 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
         return load(s, i + channels + k * WIDTH) if k < n_channels else filled(s.dtype.type(0))
 
     @scalar
-    def tile_vjp(s, scratch, row_ids, further, records, ids, slots_of, frame, x0, y0, slots):
+    def tile_vjp(s, scratch, further, records, ids, slots_of, frame, x0, y0, slots):
         as_data = s.dtype.type
         zero = filled(as_data(0))
         is_open = open_rows(s, n_fields)
-        next_rows = reached_rows(records, ids, 0, x0, y0, scratch)
+        next_rows = reached_rows(records, ids, 0, x0, y0)
         for m in range(ids.size):
             place = np.int64(slots_of[m]) * slot_width
             if m % CHECK_EVERY == CHECK_EVERY - 1 and is_open != np.uint64(0):
@@ -91,18 +96,18 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
             if is_open == np.uint64(0):
                 slots[place : place + slot_width] = ZERO
                 continue
-            reached = next_rows & is_open
-            next_rows = reached_rows(records, ids, m + 1, x0, y0, scratch)
+            rows = next_rows & is_open
+            next_rows = reached_rows(records, ids, m + 1, x0, y0)
             n = ids[m]
-            n_rows = write_alphas(scratch, row_ids, reached, records, n, x0, y0)
+            write_alphas(scratch, rows, records, n, x0, y0)
             mx, my, slope = records[n, MEAN_X] - as_data(x0), records[n, MEAN_Y] - as_data(y0), records[n, SLOPE]
             red, green, blue = records[n, COLOR], records[n, COLOR + 1], records[n, COLOR + 2]
             q_sum = qe = qy = qee = qey = qyy = v_red = v_green = v_blue = zero
             further[:] = ZERO
-            for j in range(n_rows):
-                i = row_ids[j] * row_size
-                unclamped = load(scratch, ALPHAS + j * WIDTH)
-                e, dy = to_mean(scratch, row_ids[j], mx, my, slope)
+            for row in rows_of(rows):
+                i = row * row_size
+                unclamped = load(scratch, ALPHAS + row * WIDTH)
+                e, dy = to_mean(scratch, row, mx, my, slope)
                 transmittance = load(s, i)
                 after, weight = blend(transmittance, unclamped, frame)
                 store(s, i, after)
@@ -136,19 +141,18 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
     def composite_tiles_vjp(
         records, offsets, ids, slots_of, n_threads, frame, image, alpha, v_image, v_alpha, slots, v_backgrounds
     ):
-        taken, n_ranges = no_turns(), RANGES_PER_THREAD * n_threads
+        taken = no_turns()
         for _ in prange(n_threads):
             state = np.empty(N_ROWS * row_size, image.dtype)
-            scratch, row_ids = np.empty(SCRATCH_SIZE, image.dtype), np.empty(N_ROWS, np.int32)
+            scratch = np.empty(SCRATCH_SIZE, image.dtype)
             start_scratch(scratch)
             further = np.empty((slot_width - N_MOMENTS - N_FUSED) * WIDTH, image.dtype)  # sums of further channels
-            for turn in turns(taken, n_ranges):
-                for tile in range(first_tile(turn, n_ranges, offsets), first_tile(turn + 1, n_ranges, offsets)):
-                    x0, y0 = corner(tile, frame)
-                    start_tile(state, x0, y0, frame, n_fields)
-                    start_vjp(state, x0, y0, frame, image, alpha, v_image, v_alpha)
-                    tile_ids, tile_slots = ids[offsets[tile] : offsets[tile + 1]], slots_of[offsets[tile] :]
-                    tile_vjp(state, scratch, row_ids, further, records, tile_ids, tile_slots, frame, x0, y0, slots)
-                    background_vjp(state, v_backgrounds[tile])
+            for tile in tiles_in_turn(taken, n_threads, offsets):
+                x0, y0 = corner(tile, frame)
+                start_tile(state, x0, y0, frame, n_fields)
+                start_vjp(state, x0, y0, frame, image, alpha, v_image, v_alpha)
+                tile_ids, tile_slots = ids[offsets[tile] : offsets[tile + 1]], slots_of[offsets[tile] :]
+                tile_vjp(state, scratch, further, records, tile_ids, tile_slots, frame, x0, y0, slots)
+                background_vjp(state, v_backgrounds[tile])
 
     return composite_tiles_vjp

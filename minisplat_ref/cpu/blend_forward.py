@@ -13,23 +13,23 @@ from collections.abc import Callable
 import numpy as np
 
 from minisplat_ref.constants import MEDIAN_TRANSMITTANCE
-from minisplat_ref.cpu.records import COLOR
+from minisplat_ref.cpu.records import COLOR, N_FUSED
 from minisplat_ref.cpu.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, reached_rows, start_scratch
 from minisplat_ref.cpu.tile_state import (
     CHECK_EVERY,
     N_ROWS,
-    RANGES_PER_THREAD,
     corner,
-    first_tile,
     open_rows,
     row_in_image,
+    rows_of,
     start_tile,
+    tiles_in_turn,
 )
 from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.compositing import blend
 from minisplat_ref.scalar.lanes import WIDTH, filled, larger, largest_of, load, select, store, sum_of
 from minisplat_ref.scalar.literals import ONE, ZERO
-from minisplat_ref.scalar.turns import no_turns, turns
+from minisplat_ref.scalar.turns import no_turns
 
 MEDIAN = np.float32(MEDIAN_TRANSMITTANCE)  # one half: exact in float32
 
@@ -76,28 +76,29 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
                 median_depth[y, x + i] = state[place + crossing]
 
     @scalar
-    def blend_tile(s, scratch, row_ids, records, depths, ids, slots_of, frame, x0, y0, slots):
+    def blend_tile(s, scratch, records, depths, ids, slots_of, frame, x0, y0, slots):
         as_data = s.dtype.type
         zero = filled(as_data(0))
         is_open = open_rows(s, n_fields)
-        next_rows = reached_rows(records, ids, 0, x0, y0, scratch)
+        next_rows = reached_rows(records, ids, 0, x0, y0)
         for m in range(ids.size):
             if m % CHECK_EVERY == CHECK_EVERY - 1:
                 is_open = open_rows(s, n_fields)
                 if is_open == np.uint64(0):
                     break
-            reached = next_rows & is_open
-            next_rows = reached_rows(records, ids, m + 1, x0, y0, scratch)
+            rows = next_rows & is_open
+            next_rows = reached_rows(records, ids, m + 1, x0, y0)
             n = ids[m]
-            n_rows = write_alphas(scratch, row_ids, reached, records, n, x0, y0)
+            write_alphas(scratch, rows, records, n, x0, y0)
+            fused = records[n, COLOR], records[n, COLOR + 1], records[n, COLOR + 2]
             total = largest = hits = zero
-            for j in range(n_rows):
-                i = row_ids[j] * row_size
-                after, weight = blend(load(s, i), load(scratch, ALPHAS + j * WIDTH), frame)
+            for row in rows_of(rows):
+                i = row * row_size
+                after, weight = blend(load(s, i), load(scratch, ALPHAS + row * WIDTH), frame)
                 store(s, i, after)
                 for k in range(n_channels):
                     field = i + channels + k * WIDTH
-                    store(s, field, load(s, field) + weight * records[n, COLOR + k])
+                    store(s, field, load(s, field) + weight * (fused[k] if k < N_FUSED else records[n, COLOR + k]))
                 if has_stats:
                     record_hit(s, i, weight, as_data(m + 1), depths[n])  # exact in float32 up to 16 million
                     total = total + weight
@@ -112,19 +113,18 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
         records, depths, background, offsets, ids, slots_of, n_threads, frame, image, alpha, slots, images
     ):
         median_depth, dominant_ids = images
-        taken, n_ranges = no_turns(), RANGES_PER_THREAD * n_threads
+        taken = no_turns()
         for _ in prange(n_threads):
             state = np.empty(N_ROWS * row_size, image.dtype)
-            scratch, row_ids = np.empty(SCRATCH_SIZE, image.dtype), np.empty(N_ROWS, np.int32)
+            scratch = np.empty(SCRATCH_SIZE, image.dtype)
             start_scratch(scratch)
-            for turn in turns(taken, n_ranges):
-                for tile in range(first_tile(turn, n_ranges, offsets), first_tile(turn + 1, n_ranges, offsets)):
-                    x0, y0 = corner(tile, frame)
-                    start_tile(state, x0, y0, frame, n_fields)
-                    tile_ids, tile_slots = ids[offsets[tile] : offsets[tile + 1]], slots_of[offsets[tile] :]
-                    blend_tile(state, scratch, row_ids, records, depths, tile_ids, tile_slots, frame, x0, y0, slots)
-                    store_tile(state, x0, y0, background, frame, image, alpha)
-                    if has_stats:
-                        store_stats(state, x0, y0, frame, tile_ids, median_depth, dominant_ids)
+            for tile in tiles_in_turn(taken, n_threads, offsets):
+                x0, y0 = corner(tile, frame)
+                start_tile(state, x0, y0, frame, n_fields)
+                tile_ids, tile_slots = ids[offsets[tile] : offsets[tile + 1]], slots_of[offsets[tile] :]
+                blend_tile(state, scratch, records, depths, tile_ids, tile_slots, frame, x0, y0, slots)
+                store_tile(state, x0, y0, background, frame, image, alpha)
+                if has_stats:
+                    store_stats(state, x0, y0, frame, tile_ids, median_depth, dominant_ids)
 
     return composite_tiles

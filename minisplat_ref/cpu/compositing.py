@@ -106,7 +106,7 @@ def composite_vjp_with(
     v_alpha: Floats,
 ) -> CompositeGradient:
     """Chain gradients with the exponential that the forward pass used."""
-    dtype, n_channels = colors.dtype, colors.shape[1]
+    dtype, n_channels, n_pixels = colors.dtype, colors.shape[1], output.alpha.size
     v_image, v_alpha = np.ascontiguousarray(v_image, dtype), np.ascontiguousarray(v_alpha, dtype)
     width = slot_size(n_channels)
     slots = large_empty((len(bins.gaussian_ids) * width,), dtype)
@@ -118,10 +118,10 @@ def composite_vjp_with(
         bins.slots,
         n_threads(),
         frame_of(bins, conventions, dtype),
-        output.image,
-        output.alpha,
-        v_image,
-        v_alpha,
+        output.image.reshape(n_pixels, n_channels),
+        output.alpha.ravel(),
+        v_image.reshape(n_pixels, n_channels),
+        v_alpha.ravel(),
         slots,
         v_backgrounds,
     )

@@ -21,18 +21,18 @@ from minisplat_ref.cpu.records import (
     SLOPE,
     turned_outline,
 )
-from minisplat_ref.cpu.tile_state import N_ROWS, N_STRIPS
+from minisplat_ref.cpu.tile_state import N_ROWS, N_STRIPS, rows_of
 from minisplat_ref.cpu.tiling import ELLIPSE_MARGIN, TILE_HEIGHT
 from minisplat_ref.scalar._jit import scalar
 from minisplat_ref.scalar.compositing import mahalanobis
 from minisplat_ref.scalar.lanes import (
     WIDTH,
+    bits_between,
     counted,
     filled,
     floor,
     larger,
     load,
-    lowest_bit,
     prefetch,
     select,
     smaller,
@@ -48,8 +48,7 @@ FETCH_AHEAD = 8  # Gaussians
 ALPHAS = 0  # of the rows that the current Gaussian reaches
 CENTRES_X = N_ROWS * WIDTH  # pixel centres of a row of each strip, counted from the tile's edge
 CENTRES_Y = CENTRES_X + N_STRIPS * WIDTH  # and of every row
-BOUNDS = CENTRES_Y + N_ROWS
-SCRATCH_SIZE = BOUNDS + WIDTH
+SCRATCH_SIZE = CENTRES_Y + N_ROWS
 
 
 @scalar
@@ -64,13 +63,13 @@ def start_scratch(scratch):
 
 @scalar
 def to_mean(scratch, row, mx, my, slope):
-    """Return dx + slope dy and dy from the pixel centres of a row to a mean."""
-    dy = my - filled(scratch[CENTRES_Y + row])
-    return mx - load(scratch, CENTRES_X + row // TILE_HEIGHT * WIDTH) + slope * dy, dy
+    """Return dx + slope dy and, as a single number, dy from the pixel centres of a row to a mean."""
+    dy = my - scratch[CENTRES_Y + row]
+    return (mx + slope * dy) - load(scratch, CENTRES_X + row // TILE_HEIGHT * WIDTH), dy
 
 
 @scalar
-def reached_rows(records, ids, m, x0, y0, scratch):
+def reached_rows(records, ids, m, x0, y0):
     """Rows of eight pixels that the visible ellipse of the tile's m-th Gaussian reaches, as bits.
 
     Eight bounds at once: how far it reaches up in each of the four strips, and how far down. A kernel asks one Gaussian
@@ -89,35 +88,23 @@ def reached_rows(records, ids, m, x0, y0, scratch):
     low = left + (HALF - mx)
     offset = rightmost_offset(turned_outline(records, n), low, low + as_data(WIDTH - 1), side)
     bound = floor(side * my + offset + (HALF + ELLIPSE_MARGIN))  # minus the first row, or the one after the last
-    bound = larger(as_data(-TILE_HEIGHT), smaller(select(is_up, zero, as_data(TILE_HEIGHT)), bound))
+    bound = side * larger(as_data(-TILE_HEIGHT), smaller(select(is_up, zero, as_data(TILE_HEIGHT)), bound))
     is_in_box = (left < records[n, COLUMN_END] - as_data(x0)) & (left > records[n, COLUMN_FIRST] - as_data(x0 + WIDTH))
-    store(scratch, BOUNDS, select(is_in_box, bound, as_data(-TILE_HEIGHT)))
-    rows = np.uint64(0)  # without branches: which strips are reached cannot be foreseen, and a wrong guess is dear
-    for strip in range(N_STRIPS):
-        first, end = -np.int64(scratch[BOUNDS + strip]), np.int64(scratch[BOUNDS + N_STRIPS + strip])
-        reached = (np.uint64(1) << np.uint64(max(first, end))) - (np.uint64(1) << np.uint64(first))
-        rows |= reached << np.uint64(strip * TILE_HEIGHT)
-    return rows
+    return bits_between(select(is_in_box, bound, zero))  # no branches: what is reached cannot be foreseen
 
 
 def alpha_writer(exp: Callable) -> Callable:
-    """Return the function that writes opacity exp(-sigma) of a Gaussian, row after row, and the rows' numbers."""
+    """Return the function that writes opacity exp(-sigma) of a Gaussian, to the places of the rows it reaches."""
 
     @scalar
-    def write_alphas(scratch, row_ids, reached, records, n, x0, y0):
+    def write_alphas(scratch, rows, records, n, x0, y0):
         as_data = scratch.dtype.type
         mx, my = records[n, MEAN_X] - as_data(x0), records[n, MEAN_Y] - as_data(y0)
         half_a, slope, half_pivot, opacity = (
             records[n, HALF_A], records[n, SLOPE], records[n, HALF_PIVOT], records[n, OPACITY]
         )  # fmt: skip
-        j = 0
-        while reached != np.uint64(0):
-            row_ids[j] = lowest_bit(reached)
-            reached &= reached - np.uint64(1)
-            e, dy = to_mean(scratch, row_ids[j], mx, my, slope)
-            alpha = opacity * exp(-mahalanobis(e, dy, half_a, half_pivot))
-            store(scratch, ALPHAS + j * WIDTH, alpha)
-            j += 1
-        return j
+        for row in rows_of(rows):
+            e, dy = to_mean(scratch, row, mx, my, slope)
+            store(scratch, ALPHAS + row * WIDTH, opacity * exp(-mahalanobis(e, dy, half_a, half_pivot)))
 
     return write_alphas

@@ -12,8 +12,9 @@ from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
 from minisplat_ref.scalar._jit import scalar
 from minisplat_ref.scalar.compositing import Frame
-from minisplat_ref.scalar.lanes import WIDTH, any_of, counted, filled, load, select, store
+from minisplat_ref.scalar.lanes import WIDTH, any_of, counted, filled, load, lowest_bit, select, store
 from minisplat_ref.scalar.literals import ONE, ZERO
+from minisplat_ref.scalar.turns import turns
 from minisplat_ref.types import TileBins
 
 N_STRIPS = TILE_WIDTH // WIDTH
@@ -57,6 +58,15 @@ def first_tile(i, n_ranges, offsets):
 
 
 @scalar
+def tiles_in_turn(taken, n_threads, offsets):
+    """Yield the tiles of the ranges that this thread gets."""
+    n_ranges = RANGES_PER_THREAD * n_threads
+    for turn in turns(taken, n_ranges):
+        for tile in range(first_tile(turn, n_ranges, offsets), first_tile(turn + 1, n_ranges, offsets)):  # noqa: UP028
+            yield tile
+
+
+@scalar
 def corner(tile, frame):
     """Return column and row of a tile's first pixel."""
     n_tiles_x = (frame.width + TILE_WIDTH - 1) // TILE_WIDTH
@@ -89,3 +99,11 @@ def open_rows(state, n_fields):
         is_open = any_of(load(state, row * n_fields * WIDTH) > ZERO)
         rows |= np.uint64(is_open) << np.uint64(row)
     return rows
+
+
+@scalar
+def rows_of(bits):
+    """Yield the rows of a set, from the first to the last."""
+    while bits != np.uint64(0):
+        yield lowest_bit(bits)
+        bits &= bits - np.uint64(1)

@@ -11,6 +11,7 @@ from minisplat_ref.scalar._lanes_arithmetic import I32, LanesType, compiled, joi
 from minisplat_ref.scalar.lanes import (
     WIDTH,
     any_of,
+    bits_between,
     columns_of,
     converted,
     counted,
@@ -233,3 +234,18 @@ def _lowest_bit(typing: Any, bits: Any) -> Any:
         return builder.cttz(args[0], ir.IntType(1)(1))
 
     return types.int64(bits), generate
+
+
+@compiled(bits_between)
+def _bits_between(typing: Any, bounds: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        half = WIDTH // 2
+        numbers = builder.fptosi(args[0], ir.VectorType(I32, WIDTH))
+        masks = (ir.Constant(ir.VectorType(I32, half), list(range(start, start + half))) for start in (0, half))
+        firsts, ends = (builder.shuffle_vector(numbers, numbers, mask) for mask in masks)
+        ends = builder.select(builder.icmp_signed(">", ends, firsts), ends, firsts)
+        one = ir.Constant(firsts.type, [1] * half)
+        bits = builder.sub(builder.shl(one, ends), builder.shl(one, firsts))
+        return builder.bitcast(builder.trunc(bits, ir.VectorType(ir.IntType(16), half)), ir.IntType(64))
+
+    return types.uint64(bounds), generate

@@ -143,3 +143,15 @@ def prefetch(table: Any, row: Any) -> None:
 def lowest_bit(bits: Any) -> int:
     """Return the place of the lowest bit that is set in an integer that is not zero."""
     return (int(bits) & -int(bits)).bit_length() - 1
+
+
+def bits_between(bounds: Any) -> Any:
+    """Return an integer of 64 bits: of its quarter ``k``, the bits from ``bounds[k]`` to before ``bounds[4 + k]``.
+
+    Bounds are integers up to 16, in lanes. A start is not negative; no bits lie before an end that is not behind it.
+    """
+    bits = 0
+    for k in range(4):
+        first, end = int(bounds[k]), int(bounds[4 + k])
+        bits |= ((1 << max(first, end)) - (1 << first)) << 16 * k
+    return np.uint64(bits)

@@ -15,7 +15,7 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.cpu.exponential import exp_fast
 from minisplat_ref.cpu.records import records_of
 from minisplat_ref.cpu.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, reached_rows, start_scratch, to_mean
-from minisplat_ref.cpu.tile_state import CHECK_EVERY, N_ROWS, corner, frame_of, open_rows, start_tile
+from minisplat_ref.cpu.tile_state import CHECK_EVERY, N_ROWS, corner, frame_of, open_rows, rows_of, start_tile
 from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
 from minisplat_ref.oracle.bench.limits import least_seconds
 from minisplat_ref.oracle.bench.workloads import Workload
@@ -115,7 +115,6 @@ _write_alphas = alpha_writer(exp_fast)
 def _count_rows(records, ids, tile_offsets, frame):  # type: ignore[no-untyped-def]
     """Take the kernels' steps with nothing but the transmittance."""
     state, scratch = np.empty(N_ROWS * WIDTH, records.dtype), np.empty(SCRATCH_SIZE, records.dtype)
-    row_ids = np.empty(N_ROWS, np.int32)
     start_scratch(scratch)
     total = 0
     for tile in range(tile_offsets.size - 1):
@@ -126,13 +125,12 @@ def _count_rows(records, ids, tile_offsets, frame):  # type: ignore[no-untyped-d
         for m in range(tile_ids.size):
             if m % CHECK_EVERY == CHECK_EVERY - 1:
                 is_open = open_rows(state, 1)
-            reached = reached_rows(records, tile_ids, m, x0, y0, scratch) & is_open
-            n_rows = _write_alphas(scratch, row_ids, reached, records, tile_ids[m], x0, y0)
-            total += n_rows
-            for j in range(n_rows):
-                i = row_ids[j] * WIDTH
-                after, _ = blend(load(state, i), load(scratch, ALPHAS + j * WIDTH), frame)
-                store(state, i, after)
+            rows = reached_rows(records, tile_ids, m, x0, y0) & is_open
+            _write_alphas(scratch, rows, records, tile_ids[m], x0, y0)
+            for row in rows_of(rows):
+                total += 1
+                after, _ = blend(load(state, row * WIDTH), load(scratch, ALPHAS + row * WIDTH), frame)
+                store(state, row * WIDTH, after)
     return total
 
 
