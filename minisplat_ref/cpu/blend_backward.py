@@ -24,8 +24,16 @@ import numpy as np
 
 from minisplat_ref.cpu.gaussian_rows import rows_from
 from minisplat_ref.cpu.pair_sums import N_MOMENTS, slot_size
-from minisplat_ref.cpu.records import COLOR, MEAN_X, MEAN_Y, N_FUSED, SLOPE
-from minisplat_ref.cpu.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, reached_rows, start_scratch, to_mean
+from minisplat_ref.cpu.records import COLOR, N_FUSED
+from minisplat_ref.cpu.tile_rows import (
+    ALPHAS,
+    SCRATCH_SIZE,
+    alpha_writer,
+    reached_rows,
+    start_scratch,
+    to_mean_y,
+    to_ridge,
+)
 from minisplat_ref.cpu.tile_state import (
     CHECK_EVERY,
     N_ROWS,
@@ -100,14 +108,13 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
             next_rows = reached_rows(records, ids, m + 1, x0, y0)
             n = ids[m]
             write_alphas(scratch, rows, records, n, x0, y0)
-            mx, my, slope = records[n, MEAN_X] - as_data(x0), records[n, MEAN_Y] - as_data(y0), records[n, SLOPE]
             red, green, blue = records[n, COLOR], records[n, COLOR + 1], records[n, COLOR + 2]
             q_sum = qe = qy = qee = qey = qyy = v_red = v_green = v_blue = zero
             further[:] = ZERO
             for row in rows_of(rows):
                 i = row * row_size
                 unclamped = load(scratch, ALPHAS + row * WIDTH)
-                e, dy = to_mean(scratch, row, mx, my, slope)
+                e, dy = to_ridge(scratch, row), to_mean_y(scratch, row)
                 transmittance = load(s, i)
                 after, weight = blend(transmittance, unclamped, frame)
                 store(s, i, after)
@@ -125,13 +132,13 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
                 q = -unclamped * alpha_vjp(transmittance, weight, unclamped, behind, shade, frame)
                 q_mean = select(unclamped <= frame.mean_gradient_max, q, ZERO)
                 q_shape = select(unclamped <= frame.shape_gradient_max, q, ZERO)
-                shape_e = q_shape * e
+                shape_e, shape_y = q_shape * e, q_shape * dy
                 q_sum = q_sum + q_shape
                 qe = qe + q_mean * e
                 qy = qy + q_mean * dy
                 qee = qee + shape_e * e
                 qey = qey + shape_e * dy
-                qyy = qyy + q_shape * (dy * dy)
+                qyy = qyy + shape_y * dy
             store(slots, place, sums_of(q_sum, qe, qy, qee, qey, qyy, v_red, v_green))
             slots[place + N_MOMENTS + 2] = sum_of(v_blue)
             for k in range(N_FUSED, n_channels):

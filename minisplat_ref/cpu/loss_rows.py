@@ -30,10 +30,10 @@ PAD = 3 * HALF_WINDOW  # numbers of margin before an interleaved row, and at lea
 
 @scalar
 def _pad_row(image, unit, row, padded):
-    padded[:] = ZERO
+    padded[:] = -HALF
     if 0 <= row < image.shape[0]:
         for i in range(image.shape[1]):
-            padded[PAD + i] = unit * padded.dtype.type(image[row, i])
+            padded[PAD + i] = unit * padded.dtype.type(image[row, i]) - HALF
 
 
 @kernel()
@@ -54,28 +54,34 @@ def loss_kernel(dtype: np.dtype) -> Callable:
 
     @scalar
     def moments_down(image, target, i, length):
-        mean_i = mean_t = squares = products = ZERO * filled(c1)
-        for k in range(SSIM_WINDOW):
-            a, b = load(image, i + k * length) - HALF, load(target, i + k * length) - HALF
-            weighted_a, weighted_b = window[k] * a, window[k] * b
-            mean_i = mean_i + weighted_a
-            mean_t = mean_t + weighted_b
-            squares = squares + weighted_a * a + weighted_b * b
-            products = products + weighted_a * b
+        """Windowed means down a column of I, T, I^2 + T^2 and I T; rows at the same distance have the same weight."""
+        a, b = load(image, i + HALF_WINDOW * length), load(target, i + HALF_WINDOW * length)
+        middle = filled(window[HALF_WINDOW])
+        means = middle * a, middle * b, middle * (a * a + b * b), middle * (a * b)
+        mean_i, mean_t, squares, products = means
+        for k in range(HALF_WINDOW):
+            j = i + k * length
+            a, b = load(image, j), load(target, j)
+            j = i + (SSIM_WINDOW - 1 - k) * length
+            c, d = load(image, j), load(target, j)
+            mean_i = mean_i + window[k] * (a + c)
+            mean_t = mean_t + window[k] * (b + d)
+            squares = squares + window[k] * ((a * a + b * b) + (c * c + d * d))
+            products = products + window[k] * (a * b + c * d)
         return mean_i, mean_t, squares, products
 
     @scalar
     def down(ring, places, i):
-        total = window[0] * load(ring, places[0] + i)
-        for k in range(1, SSIM_WINDOW):
-            total = total + window[k] * load(ring, places[k] + i)
+        total = window[HALF_WINDOW] * load(ring, places[HALF_WINDOW] + i)
+        for k in range(HALF_WINDOW):
+            total = total + window[k] * (load(ring, places[k] + i) + load(ring, places[SSIM_WINDOW - 1 - k] + i))
         return total
 
     @scalar
     def across(s, i):
-        total = window[0] * load(s, i)
-        for k in range(1, SSIM_WINDOW):
-            total = total + window[k] * load(s, i + 3 * k)
+        total = window[HALF_WINDOW] * load(s, i + 3 * HALF_WINDOW)
+        for k in range(HALF_WINDOW):
+            total = total + window[k] * (load(s, i + 3 * k) + load(s, i + 3 * (SSIM_WINDOW - 1 - k)))
         return total
 
     @scalar
@@ -109,7 +115,7 @@ def loss_kernel(dtype: np.dtype) -> Callable:
         up = filled(v_l1)
         for i in range(0, n_values, WIDTH):
             a, b = load(image, first + i), load(target, first + i)
-            by_squares = TWO * (a - HALF) * across(s, length + i) + (b - HALF) * across(s, 2 * length + i)
+            by_squares = TWO * a * across(s, length + i) + b * across(s, 2 * length + i)
             by_ssim = across(s, i) + by_squares
             by_l1 = select(a > b, up, select(a < b, -up, ZERO * up))
             store(s, 3 * length + i, by_l1 + v_ssim * by_ssim)

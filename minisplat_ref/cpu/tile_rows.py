@@ -1,9 +1,11 @@
 """Which part of a tile a Gaussian reaches, and its alpha there.
 
 The rows that the visible ellipse reaches are found strip by strip, so that a slanted ellipse is a staircase of rows
-rather than its box. Alpha is written down for all of them before any is blended: the exponential is a long chain of
-operations of which each waits for the one before, and blending another. A processor hides the waiting behind other
-pixels, as far ahead as it can look, and it looks further ahead if there is less to do for each pixel.
+rather than its box. What all pixels of a line share is computed once, for all lines of the tile together.
+
+Alpha is written down for all rows before any is blended: the exponential is a long chain of operations of which each
+waits for the one before, and blending another. A processor hides the waiting behind other pixels, as far ahead as it
+can look, and it looks further ahead if there is less to do for each pixel.
 """
 
 from collections.abc import Callable
@@ -47,8 +49,11 @@ FETCH_AHEAD = 8  # Gaussians
 # where something has just been stored waits for it.
 ALPHAS = 0  # of the rows that the current Gaussian reaches
 CENTRES_X = N_ROWS * WIDTH  # pixel centres of a row of each strip, counted from the tile's edge
-CENTRES_Y = CENTRES_X + N_STRIPS * WIDTH  # and of every row
-SCRATCH_SIZE = CENTRES_Y + N_ROWS
+CENTRES_Y = CENTRES_X + N_STRIPS * WIDTH  # and of every line of pixels
+TO_MEAN_Y = CENTRES_Y + TILE_HEIGHT  # dy of each line
+RIDGE = TO_MEAN_Y + TILE_HEIGHT  # where sigma is least on each line
+LEAST = RIDGE + TILE_HEIGHT  # and that sigma
+SCRATCH_SIZE = LEAST + TILE_HEIGHT
 
 
 @scalar
@@ -57,15 +62,39 @@ def start_scratch(scratch):
     as_data = scratch.dtype.type
     for strip in range(N_STRIPS):
         store(scratch, CENTRES_X + strip * WIDTH, counted(as_data(0)) + (HALF + as_data(strip * WIDTH)))
-    for row in range(N_ROWS):
-        scratch[CENTRES_Y + row] = HALF + as_data(row % TILE_HEIGHT)
+    for line in range(TILE_HEIGHT):
+        scratch[CENTRES_Y + line] = HALF + as_data(line)
 
 
 @scalar
-def to_mean(scratch, row, mx, my, slope):
-    """Return dx + slope dy and, as a single number, dy from the pixel centres of a row to a mean."""
-    dy = my - scratch[CENTRES_Y + row]
-    return (mx + slope * dy) - load(scratch, CENTRES_X + row // TILE_HEIGHT * WIDTH), dy
+def write_lines(scratch, mx, my, slope, half_pivot):
+    """Write what all pixels of a line share: with e = dx + slope dy, sigma is (a e^2 + pivot dy^2) / 2.
+
+    On each line it is least at mx + slope dy, and e is the way from there.
+    """
+    for i in range(0, TILE_HEIGHT, WIDTH):
+        dy = my - load(scratch, CENTRES_Y + i)
+        store(scratch, TO_MEAN_Y + i, dy)
+        store(scratch, RIDGE + i, mx + slope * dy)
+        store(scratch, LEAST + i, half_pivot * dy * dy)
+
+
+@scalar
+def to_ridge(scratch, row):
+    """Return e at the pixel centres of a row."""
+    return scratch[RIDGE + row % TILE_HEIGHT] - load(scratch, CENTRES_X + row // TILE_HEIGHT * WIDTH)
+
+
+@scalar
+def to_mean_y(scratch, row):
+    """Return dy of a row, a single number."""
+    return scratch[TO_MEAN_Y + row % TILE_HEIGHT]
+
+
+@scalar
+def sigma_of(scratch, row, half_a):
+    """Return sigma at the pixel centres of a row."""
+    return mahalanobis(to_ridge(scratch, row), half_a, scratch[LEAST + row % TILE_HEIGHT])
 
 
 @scalar
@@ -100,11 +129,9 @@ def alpha_writer(exp: Callable) -> Callable:
     def write_alphas(scratch, rows, records, n, x0, y0):
         as_data = scratch.dtype.type
         mx, my = records[n, MEAN_X] - as_data(x0), records[n, MEAN_Y] - as_data(y0)
-        half_a, slope, half_pivot, opacity = (
-            records[n, HALF_A], records[n, SLOPE], records[n, HALF_PIVOT], records[n, OPACITY]
-        )  # fmt: skip
+        write_lines(scratch, mx, my, records[n, SLOPE], records[n, HALF_PIVOT])
+        half_a, opacity = records[n, HALF_A], records[n, OPACITY]
         for row in rows_of(rows):
-            e, dy = to_mean(scratch, row, mx, my, slope)
-            store(scratch, ALPHAS + row * WIDTH, opacity * exp(-mahalanobis(e, dy, half_a, half_pivot)))
+            store(scratch, ALPHAS + row * WIDTH, opacity * exp(-sigma_of(scratch, row, half_a)))
 
     return write_alphas

@@ -42,9 +42,9 @@ def factors(a, b, c):
 
 
 @scalar
-def mahalanobis(e, dy, half_a, half_pivot):
-    """Return sigma = d^T conic d / 2 of e = dx + slope dy; see ``factors``."""
-    return half_a * e * e + half_pivot * dy * dy
+def mahalanobis(e, half_a, least):
+    """Return sigma = d^T conic d / 2 of e = dx + slope dy and ``least`` = pivot dy^2 / 2; see ``factors``."""
+    return half_a * e * e + least
 
 
 @scalar

@@ -14,7 +14,17 @@ from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.cpu.exponential import exp_fast
 from minisplat_ref.cpu.records import records_of
-from minisplat_ref.cpu.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, reached_rows, start_scratch, to_mean
+from minisplat_ref.cpu.tile_rows import (
+    ALPHAS,
+    SCRATCH_SIZE,
+    alpha_writer,
+    reached_rows,
+    sigma_of,
+    start_scratch,
+    to_mean_y,
+    to_ridge,
+    write_lines,
+)
 from minisplat_ref.cpu.tile_state import CHECK_EVERY, N_ROWS, corner, frame_of, open_rows, rows_of, start_tile
 from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
 from minisplat_ref.oracle.bench.limits import least_seconds
@@ -23,7 +33,7 @@ from minisplat_ref.oracle.cases import Case, Figure
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_GRADIENT, BENCH_FLOAT32_IMAGE
 from minisplat_ref.render import render
 from minisplat_ref.scalar._jit import kernel, n_threads
-from minisplat_ref.scalar.compositing import alpha_vjp, blend, conic_vjp_of_moments, factors, mahalanobis
+from minisplat_ref.scalar.compositing import alpha_vjp, blend, conic_vjp_of_moments, factors
 from minisplat_ref.scalar.lanes import WIDTH, filled, load, select, store, sum_of
 from minisplat_ref.scalar.literals import ZERO
 from minisplat_ref.types import CompositeGradient, Floats, Gaussians, Projection, TileBins, TileGrid
@@ -55,9 +65,9 @@ def _forward_line(state, scratch, hit, frame, n_hits, n_passes):  # type: ignore
     for _ in range(n_passes):
         start_tile(state, 0, 0, frame, DRAWN_FIELDS)
         for _ in range(n_hits):
+            write_lines(scratch, hit.x, hit.y, hit.slope, hit.half_pivot)
             for row in range(N_ROWS):
-                e, dy = to_mean(scratch, row, hit.x, hit.y, hit.slope)
-                alpha = hit.opacity * exp_fast(-mahalanobis(e, dy, hit.half_a, hit.half_pivot))
+                alpha = hit.opacity * exp_fast(-sigma_of(scratch, row, hit.half_a))
                 store(scratch, ALPHAS + row * WIDTH, alpha)
             for row in range(N_ROWS):
                 i = row * DRAWN_FIELDS * WIDTH
@@ -75,14 +85,14 @@ def _backward_line(state, fresh, scratch, hit, frame, sums, n_hits, n_passes):  
         state[:] = fresh
         sums[:] = ZERO
         for _ in range(n_hits):
+            write_lines(scratch, hit.x, hit.y, hit.slope, hit.half_pivot)
             for row in range(N_ROWS):
-                e, dy = to_mean(scratch, row, hit.x, hit.y, hit.slope)
-                alpha = hit.opacity * exp_fast(-mahalanobis(e, dy, hit.half_a, hit.half_pivot))
+                alpha = hit.opacity * exp_fast(-sigma_of(scratch, row, hit.half_a))
                 store(scratch, ALPHAS + row * WIDTH, alpha)
             q_sum = qe = qy = qee = qey = qyy = v_red = v_green = v_blue = zero
             for row in range(N_ROWS):
                 i = row * SHADED_FIELDS * WIDTH
-                e, dy = to_mean(scratch, row, hit.x, hit.y, hit.slope)
+                e, dy = to_ridge(scratch, row), to_mean_y(scratch, row)
                 unclamped = load(scratch, ALPHAS + row * WIDTH)
                 transmittance = load(state, i)
                 after, weight = blend(transmittance, unclamped, frame)
