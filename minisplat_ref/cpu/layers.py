@@ -177,7 +177,8 @@ def list_part(part, survey, projection, keys, alpha_min, n_tiles_x, layers, cell
         line = (column, row, n_columns * (not is_wide), n_rows)
         behind = write_line(line, n_tiles_x, layer * n_tiles, cells, first)
         cursors[layer, GAUSSIANS], cursors[layer, TILES] = place + 1, behind
-        first, behind = (wide[n - start, 0], wide[n - start, 1]) if is_wide else (first, behind)
+        wide_first, wide_behind = wide[n - start, 0], wide[n - start, 1]
+        first, behind = wide_first if is_wide else first, wide_behind if is_wide else behind
         layers.keys[place] = keys[n]
         prefetch(entries, place + FETCH_AHEAD)
         entries[place, ID], entries[place, FIRST], entries[place, COUNT] = n, first, behind - first
