@@ -28,7 +28,7 @@ CPU_ONLY = {
 }
 
 # Backward formulas whose forward has another name, since one scalar function returns several things.
-FORWARD_OF = {"compositing.alpha_vjp": "blend", "projection.compensation_vjp": "project_gaussian"}
+FORWARD_OF = {"compositing.sigma_vjp": "blend", "projection.compensation_vjp": "project_gaussian"}
 
 
 def public_functions(name, package="reference"):

@@ -45,7 +45,7 @@ from minisplat_ref.cpu.tile_state import (
     tiles_in_turn,
 )
 from minisplat_ref.scalar._jit import kernel, prange, scalar
-from minisplat_ref.scalar.compositing import alpha_vjp, blend
+from minisplat_ref.scalar.compositing import blend, sigma_vjp
 from minisplat_ref.scalar.lanes import WIDTH, counted, filled, gather, load, select, store, sum_of, sums_of
 from minisplat_ref.scalar.literals import ONE, ZERO
 from minisplat_ref.scalar.turns import no_turns
@@ -129,7 +129,7 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
                     store(further, at, load(further, at) + weight * v)
                 behind = load(s, i + behind_place) - weight * shade
                 store(s, i + behind_place, behind)
-                q = -unclamped * alpha_vjp(transmittance, weight, unclamped, behind, shade, frame)
+                q = sigma_vjp(transmittance, weight, unclamped, behind, shade, frame)
                 q_mean = select(unclamped <= frame.mean_gradient_max, q, ZERO)
                 q_shape = select(unclamped <= frame.shape_gradient_max, q, ZERO)
                 shape_e, shape_y = q_shape * e, q_shape * dy

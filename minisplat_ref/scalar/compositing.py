@@ -81,11 +81,12 @@ def blend(transmittance, unclamped, frame):
 
 
 @scalar
-def alpha_vjp(transmittance, weight, unclamped, behind, shade, frame):
-    """Gradient of the loss by the alpha of one hit.
+def sigma_vjp(transmittance, weight, unclamped, behind, shade, frame):
+    """Gradient of the loss by the sigma of one hit, where alpha is not clamped.
 
     With S the part of <v, image> that is composited behind the hit, background and alpha channel included, the image is
-    ... + T alpha c + (1 - alpha) (S / (1 - alpha)), so that dL/dalpha = T <v, c> - S / (1 - alpha).
+    ... + T alpha c + (1 - alpha) (S / (1 - alpha)), so that dL/dalpha = T <v, c> - S / (1 - alpha); and
+    dalpha/dsigma = -alpha.
 
     Parameters
     ----------
@@ -103,7 +104,7 @@ def alpha_vjp(transmittance, weight, unclamped, behind, shade, frame):
     Returns
     -------
     lanes
-        dL/dalpha, 0 where the hit was skipped.
+        dL/dsigma, 0 where the hit was skipped.
     """
     alpha = smaller(unclamped, frame.alpha_max)
-    return select(weight > ZERO, transmittance * shade - behind / (ONE - alpha), ZERO)
+    return select(weight > ZERO, unclamped * (behind / (ONE - alpha) - transmittance * shade), ZERO)

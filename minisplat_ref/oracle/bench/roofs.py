@@ -33,7 +33,7 @@ from minisplat_ref.oracle.cases import Case, Figure
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_GRADIENT, BENCH_FLOAT32_IMAGE
 from minisplat_ref.render import render
 from minisplat_ref.scalar._jit import kernel, n_threads
-from minisplat_ref.scalar.compositing import alpha_vjp, blend, conic_vjp_of_moments, factors
+from minisplat_ref.scalar.compositing import blend, conic_vjp_of_moments, factors, sigma_vjp
 from minisplat_ref.scalar.lanes import WIDTH, filled, load, select, store, sum_of
 from minisplat_ref.scalar.literals import ZERO
 from minisplat_ref.types import CompositeGradient, Floats, Gaussians, Projection, TileBins, TileGrid
@@ -104,7 +104,7 @@ def _backward_line(state, fresh, scratch, hit, frame, sums, n_hits, n_passes):  
                 shade = v_0 * hit.red + v_1 * hit.green + v_2 * hit.blue
                 behind = load(state, i + WIDTH) - weight * shade
                 store(state, i + WIDTH, behind)
-                q = -unclamped * alpha_vjp(transmittance, weight, unclamped, behind, shade, frame)
+                q = sigma_vjp(transmittance, weight, unclamped, behind, shade, frame)
                 q_mean = select(unclamped <= frame.mean_gradient_max, q, ZERO)
                 q_shape = select(unclamped <= frame.shape_gradient_max, q, ZERO)
                 q_sum = q_sum + q_shape
