@@ -22,6 +22,7 @@ N_BUCKETS = 1 << 10  # from 1/128 to 2^25; the first and the last also take what
 FIRST_BUCKET = int(np.float32(1 / 128).view(np.int32)) >> BUCKET_SHIFT
 CULLED = N_BUCKETS  # the bucket behind them all
 GAUSSIANS, TILES = 0, 1  # columns of a count; the tiles are those under boxes
+TILES_BIT, GAUSSIANS_MASK = 32, (1 << 32) - 1  # of a count in one number
 SQUARES, OTHERS = 0, 1  # lists of Gaussians with wide boxes
 ID, FIRST, COUNT, SLOT = range(4)  # columns of an entry: a Gaussian, its cells, its first slot within its part
 FETCH_AHEAD = 8  # entries
@@ -31,7 +32,8 @@ class Survey(NamedTuple):
     """What the first pass learns of each part."""
 
     up_to: Ints
-    """[N_PARTS, CULLED + 2, 2] Gaussians of each part below each bucket, and tiles under their boxes; int32."""
+    """[N_PARTS, CULLED + 2] Gaussians of each part below each bucket, and 2^32 times the tiles under their boxes, so
+    that both are added, and subtracted, at once; int64."""
     buckets: Ints
     """[N] bucket of each Gaussian, int16."""
     wide: Ints
@@ -83,14 +85,12 @@ def survey_part(part, boxes, depths, survey):
         is_square = (n_columns == 2) & (n_rows == 2)
         bucket = _bucket(depths[n], n_columns > 0)
         survey.buckets[n] = bucket
-        up_to[bucket + 1, GAUSSIANS] += 1
-        up_to[bucket + 1, TILES] += n_columns * n_rows
+        up_to[bucket + 1] += 1 + (np.int64(n_columns * n_rows) << TILES_BIT)
         squares[n_squares], others[n_others] = n, n
         n_squares += is_square
         n_others += (n_columns > 1) & (n_rows > 1) & (not is_square)
     for bucket in range(CULLED + 1):
-        for column in (GAUSSIANS, TILES):
-            up_to[bucket + 1, column] += up_to[bucket, column]
+        up_to[bucket + 1] += up_to[bucket]
     _end_list(squares, n_squares)
     _end_list(others, n_others)
 
@@ -117,7 +117,7 @@ def cut_layers(up_to, of_buckets, edges):
     total[:] = 0  # Gaussians below each bucket
     for part in range(N_PARTS):
         for bucket in range(CULLED + 1):
-            total[bucket] += up_to[part, bucket, GAUSSIANS]
+            total[bucket] += up_to[part, bucket] & GAUSSIANS_MASK
     cuts[:] = CULLED  # the buckets at which layers begin
     cuts[0], cuts[N_PARTS + 1] = 0, CULLED + 1
     of_buckets[CULLED], layer = N_PARTS, 0
@@ -129,10 +129,9 @@ def cut_layers(up_to, of_buckets, edges):
     edges[0] = 0
     for i in range((N_PARTS + 1) * N_PARTS):
         layer, part = i // N_PARTS, i % N_PARTS
-        for column in (GAUSSIANS, TILES):
-            size = up_to[part, cuts[layer + 1], column] - up_to[part, cuts[layer], column]
-            edges[i + 1, column] = edges[i, column] + size
-        edges[i + 1, TILES] += SPARE
+        size = up_to[part, cuts[layer + 1]] - up_to[part, cuts[layer]]
+        edges[i + 1, GAUSSIANS] = edges[i, GAUSSIANS] + (size & GAUSSIANS_MASK)
+        edges[i + 1, TILES] = edges[i, TILES] + (size >> TILES_BIT) + SPARE
 
 
 # --- second pass ---
@@ -247,7 +246,8 @@ def fill_layer(layer, layers, cells, first_slots, offsets, scratch, digits, star
             places[place] = place
             entries[place, SLOT] += first_slots[part]
     own = slice(edges[layer * N_PARTS], edges[(layer + 1) * N_PARTS])
-    in_order = sort_stably(layers.keys[own], places[own], other_keys[own], other_places[own], digits)
+    in_order = places[own]
+    sort_stably(layers.keys[own], in_order, other_keys[own], other_places[own], digits)
     for i in range(in_order.size):
         prefetch(entries, in_order[min(i + FETCH_AHEAD, in_order.size - 1)])
         n, first = entries[in_order[i], ID], entries[in_order[i], FIRST]

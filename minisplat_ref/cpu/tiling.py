@@ -60,7 +60,8 @@ def _list_tiles(
     lists = np.empty((2, tile_offsets[-1]), np.int32)
     taken = no_turns()
     for thread in prange(n_threads):
-        for layer in turns(taken, N_PARTS):
+        for turn in turns(taken, N_PARTS):
+            layer = turn % 2 * (N_PARTS // 2) + turn // 2  # neighbours write to the same cache lines: not at once
             fill_layer(layer, layers, cells, first_slots, offsets, scratch, digits[thread], counts[0], lists)
     return lists
 
@@ -75,7 +76,7 @@ def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventio
     keys = projection.depths.view(np.int32 if dtype == np.float32 else np.int64)
     alpha_min = dtype.type(conventions.alpha_min)
     survey = Survey(
-        np.empty((N_PARTS, CULLED + 2, 2), np.int32),
+        np.empty((N_PARTS, CULLED + 2), np.int64),
         np.empty(n, np.int16),
         np.empty((N_PARTS, 2, n // N_PARTS + 2 * WIDTH), np.int32),
     )
@@ -89,7 +90,7 @@ def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventio
     offsets[0] = 0
     counts, first_slots = np.zeros((n_threads(), N_PARTS * n_tiles), np.int32), np.empty(N_PARTS, np.int64)
     scratch = (np.empty(n, np.int32), np.empty_like(keys), np.empty(n, np.int32))
-    digits = np.empty((n_threads(), 1 << DIGIT_BITS), np.int32)
+    digits = np.empty((n_threads(), 2, 1 << DIGIT_BITS), np.int32)
     ids, slots = _list_tiles(
         projection, keys, alpha_min, grid.n_tiles_x, survey, layers, offsets, counts, first_slots, tile_offsets,
         scratch, digits,
