@@ -2,15 +2,15 @@
 
 The Gaussian window is separable, and the row of an interleaved RGB image is one flat array in which the horizontal
 neighbours of a channel lie three numbers apart. A row is filtered completely, vertically and then horizontally, while
-it is in the cache. The images have margins of zeros, wide enough for the window and for the last eight numbers of a
-row, so that no number is a special case.
+it is in the cache. The images have margins as black as zeros, wide enough for the window and for the last eight numbers
+of a row, so that no number is a special case. Rows, and numbers of a row, that have the same weight are added first.
 
 The gradient of a row needs the derivatives of SSIM in the eleven rows around it. They are kept in a ring of as many
 rows, which stays in the cache, instead of three more images in memory: so the gradient, but for a factor, is made
 together with the loss. Each thread goes down a band of rows, and the rows beyond its edges are computed once more.
 
-Moments are those of I - 1/2 and T - 1/2: variances are differences of moments, and of these smaller ones few digits
-cancel.
+Images are copied less one half, and moments are those of I - 1/2 and T - 1/2: variances are differences of moments, and
+of these smaller ones few digits cancel.
 """
 
 import functools
@@ -38,7 +38,7 @@ def _pad_row(image, unit, row, padded):
 
 @kernel()
 def pad_rows(image, target, unit, padded_image, padded_target):
-    """Copy two images [H, 3 W] into the middle of [H + 10, L], the target times its unit, with zeros around them."""
+    """Copy two images [H, 3 W], less 1/2, into the middle of [H + 10, L], the target times its unit, black around."""
     for y in prange(padded_image.shape[0]):
         _pad_row(image, padded_image.dtype.type(1), y - HALF_WINDOW, padded_image[y])
         _pad_row(target, unit, y - HALF_WINDOW, padded_target[y])

@@ -2,7 +2,7 @@
 
 Positive IEEE floats are ordered as the integers that their bits spell, and those are sorted digit by digit in linear
 passes. Each pass is stable, which makes equal keys keep their order. Keys that are near each other share their leading
-bits: digits are those of the difference to the smallest key, and there are as few as the largest difference needs.
+bits: digits are those of the difference to the smallest key, and there are as few pairs of them as the largest needs.
 """
 
 from minisplat_ref.scalar._jit import scalar

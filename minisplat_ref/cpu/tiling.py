@@ -61,7 +61,7 @@ def _list_tiles(
     taken = no_turns()
     for thread in prange(n_threads):
         for turn in turns(taken, N_PARTS):
-            layer = turn % 2 * (N_PARTS // 2) + turn // 2  # neighbours write to the same cache lines: not at once
+            layer = turn % 2 * (N_PARTS // 2) + turn // 2  # neighbours share cache lines: far apart in time
             fill_layer(layer, layers, cells, first_slots, offsets, scratch, digits[thread], counts[0], lists)
     return lists
 
