@@ -17,7 +17,8 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.images import read_image
 from minisplat_ref.optim.adam import adam_step
-from minisplat_ref.oracle.bench import contenders, limits, profiling, race, roofs, slopes, workloads
+from minisplat_ref.oracle.bench import by_turns, contenders, limits, profiling, race, roofs, slopes, workloads
+from minisplat_ref.oracle.bench.by_turns import Contest, hold, times_by_turns
 from minisplat_ref.oracle.bench.exponentials import EXPONENTIALS, relative_errors
 from minisplat_ref.oracle.bench.flips import thresholds
 from minisplat_ref.oracle.bench.peers import peers_of
@@ -297,21 +298,42 @@ def test_stages_add_up_to_the_iteration(tmp_path, monkeypatch):
     assert 1e-9 < cases["stage/project and SH, both ways"]["error"] < BENCH_FLOAT32_GRADIENT
 
 
+def test_tasks_alternate_in_every_round(monkeypatch):
+    clock, turns = [0.0], []
+
+    def task(name, *seconds):
+        def run():
+            turns.append(name)
+            clock[0] += seconds[turns.count(name) - 1]
+
+        return run
+
+    monkeypatch.setattr(by_turns.time, "perf_counter", lambda: clock[0])
+    groups = [[task("a", 9, 1, 5, 2, 1), task("b", 9, 3, 3, 3, 3)], [task("c", 9, 4, 4, 4, 4)]]
+    [a, b], [c] = times_by_turns(groups, rounds=2, repeats=2)
+    assert "".join(turns) == "abc" + "ababcc" * 2
+    assert (a, b, c) == ((1, 1.5), (3, 3), (4, 4))  # without the first turn, which compiles
+
+
 def test_straight_lines_do_the_arithmetic_of_a_hit():
-    lines = roofs.StraightLines()
+    lines = roofs.StraightLines(2)
     lines.forward()
     lines.backward()
     assert 0 < lines.image_error() < BENCH_FLOAT32_IMAGE
     assert 0 < lines.gradient_error() < BENCH_FLOAT32_GRADIENT
-    for i in range(len(lines.sums)):
-        lines.sums[i] *= 1.01
+    assert lines.n_pairs == 2 * roofs.N_PASSES * roofs.N_HITS * 32 * 16
+    for copy, i in np.ndindex(2, roofs.N_SUMS):
+        lines.sums[copy, i] *= 1.01
         assert lines.gradient_error() > BENCH_FLOAT32_GRADIENT
-        lines.sums[i] /= 1.01
+        lines.sums[copy, i] /= 1.01
+    lines.drawn[1, -1, -1, -1] += 0.01
+    assert lines.image_error() > BENCH_FLOAT32_IMAGE
 
 
 def test_threads_give_the_same_bytes():
-    case = limits.thread_case(tiny(), repeats=1)
-    assert case is None or (case.passed and case.figures["x"] > 0)
+    cases = hold(limits.threads(tiny()), repeats=1)
+    assert len(cases) == (numba.get_num_threads() > 1)
+    assert all(case.passed and case.figures["x"] > 0 for case in cases)
 
 
 def test_training_on_one_thread_gives_the_same_bytes(monkeypatch):
@@ -320,7 +342,7 @@ def test_training_on_one_thread_gives_the_same_bytes(monkeypatch):
         assert training_time.thread_cases(None, 1, iterations=1) == []
         return
     cases = {case.name.removeprefix("threads/iteration/"): case for case in training_time.thread_cases(None, 1, 1)}
-    assert {"composite_vjp", "adam_update", "rest", "whole iteration"} <= set(cases)
+    assert {"composite_vjp", "adam_update", "rest", "whole iteration", "straight line"} <= set(cases)
     assert all(case.passed and case.figures["x"] > 0 for case in cases.values())
 
     def train_otherwise_on_one(*args, state, **kwargs):
@@ -333,14 +355,14 @@ def test_training_on_one_thread_gives_the_same_bytes(monkeypatch):
 
 def test_adam_moves_the_part_that_is_seen(monkeypatch):
     monkeypatch.setattr(limits, "N", 1_000)
-    whole, part = limits.adam_cases(repeats=1)
+    whole, part = hold(limits.adams(), repeats=1)
     assert whole.passed and part.passed and part.name == "roof/adam 30% of 1,000"
 
     def step_of_all(parameters, gradient, state, rates, rule, rows):
         return adam_step(parameters, gradient, state, rates, rule._replace(is_visible_only=False), rows)
 
     monkeypatch.setattr(limits, "adam_step", step_of_all)
-    whole, part = limits.adam_cases(repeats=1)
+    whole, part = hold(limits.adams(), repeats=1)
     assert whole.passed and not part.passed
 
 

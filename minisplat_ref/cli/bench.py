@@ -141,22 +141,19 @@ def _race(args: argparse.Namespace) -> "Report":
 
 def _stages(args: argparse.Namespace) -> "Report":
     from minisplat_ref.cli.training_time import profile, thread_cases
-    from minisplat_ref.oracle.bench.limits import adam_cases, stage_cases, thread_case
-    from minisplat_ref.oracle.bench.roofs import blending_cases
+    from minisplat_ref.oracle.bench.by_turns import hold
+    from minisplat_ref.oracle.bench.limits import adams, stages, threads
+    from minisplat_ref.oracle.bench.roofs import blending
     from minisplat_ref.oracle.bench.workloads import get_workload
     from minisplat_ref.oracle.cases import Report
 
     cases = profile(args.scene, args.downscale, args.iterations)
     progress("the same on one thread and on all, by turns")
     cases += thread_cases(args.scene, args.downscale, args.iterations)
-    for workload in args.workloads or ("synth",):
-        progress(f"{workload}: blending against straight-line loops")
-        made = get_workload(workload, args.data)
-        cases += blending_cases(made, args.repeats)
-        threads = thread_case(made, args.repeats)
-        cases += [] if threads is None else [threads]
-    progress("Adam against a copy, other stages by themselves")
-    cases += [*adam_cases(args.repeats), *stage_cases(args.repeats)]
+    progress("blending against straight-line loops, Adam against a copy, other stages by themselves, all by turns")
+    workloads = [get_workload(workload, args.data) for workload in args.workloads or ("synth",)]
+    contests = [contest for made in workloads for contest in (blending(made), *threads(made))]
+    cases += hold([*contests, *adams(), *stages()], args.repeats)
     return Report("A training iteration by stages, and how far the kernels are from the limits", tuple(cases), {})
 
 

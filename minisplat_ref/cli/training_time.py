@@ -18,6 +18,7 @@ from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.io import load_scene
 from minisplat_ref.oracle.bench.opensplat import iteration_seconds
 from minisplat_ref.oracle.bench.profiling import REST, WHOLE, profile_cases, timed
+from minisplat_ref.oracle.bench.roofs import StraightLines
 from minisplat_ref.oracle.cases import Case, Figure
 from minisplat_ref.recipes import get_recipe
 from minisplat_ref.train import initial_state, train
@@ -26,6 +27,7 @@ from minisplat_ref.types import Scene
 WARM_UP = 5  # iterations that compile and are not timed
 TURNS = 2  # of each trainer
 TURN = 10  # iterations on as many threads: after the first few, the caches hold this training and not the other
+LINE = "straight line"
 ROOM: dict[str, Any] = {"n_views": 6, "width": 192, "height": 144, "n_points": 8000}  # where no scene is given
 
 
@@ -49,6 +51,9 @@ def profile(folder: Path | None, downscale: int, iterations: int) -> list[Case]:
 def thread_cases(folder: Path | None, downscale: int, iterations: int) -> list[Case]:
     """Train twice by turns of some iterations, on one thread and on all; nothing where there is only one.
 
+    In every turn straight-line loops are run as well, equal and independent ones for all threads: what these gain is
+    what the processor has to give.
+
     Returns
     -------
     list of Case
@@ -60,6 +65,8 @@ def thread_cases(folder: Path | None, downscale: int, iterations: int) -> list[C
         return []
     scene, recipe = _scene(folder, downscale), get_recipe("3dgs-accel")._replace(events=())
     states = {n: initial_state(scene, recipe, seed=0) for n in (1, n_all)}
+    lines = StraightLines(n_all)
+    lines.forward()  # compiled
     turns: dict[int, list[dict[str, float]]] = {n: [] for n in states}
     try:
         for first in range(1, WARM_UP + iterations + 1, TURN):
@@ -70,7 +77,8 @@ def thread_cases(folder: Path | None, downscale: int, iterations: int) -> list[C
                     start = time.perf_counter()
                     train(scene, recipe._replace(iterations=step), seed=0, state=state, backend=timed(CPU, seconds))
                     total = time.perf_counter() - start
-                    turns[n].append({**seconds, REST: total - sum(seconds.values()), WHOLE: total})
+                    line = _seconds(lines.forward)
+                    turns[n].append({**seconds, REST: total - sum(seconds.values()), WHOLE: total, LINE: line})
     finally:
         numba.set_num_threads(n_all)
     one, all_ = (state.gaussians for state in states.values())
@@ -86,6 +94,12 @@ def thread_cases(folder: Path | None, downscale: int, iterations: int) -> list[C
         }
         cases.append(Case(f"threads/iteration/{stage}", is_same, figures, note))
     return cases
+
+
+def _seconds(task: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    task()
+    return time.perf_counter() - start
 
 
 def against_opensplat(program: Path, folder: Path, downscale: int, iterations: int) -> list[Case]:

@@ -1,6 +1,5 @@
 """Single stages on 200,000 Gaussians, Adam against a copy, and what further threads bring."""
 
-import time
 from collections.abc import Callable, Sequence
 
 import numba
@@ -9,6 +8,7 @@ import numpy as np
 from minisplat_ref.backends import CPU, REFERENCE, Backend
 from minisplat_ref.constants import GSPLAT_MAIN, SH_DEGREE_MAX
 from minisplat_ref.optim.adam import AdamRule, adam_step, zero_moments
+from minisplat_ref.oracle.bench.by_turns import Contest, Task, Times
 from minisplat_ref.oracle.bench.workloads import Workload, synth
 from minisplat_ref.oracle.cases import Case, Figure
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_GRADIENT
@@ -34,72 +34,65 @@ def _copy(source, target):  # type: ignore[no-untyped-def]
         target[first:end] = source[first:end]
 
 
-def least_seconds(functions: Sequence[Callable[[], object]], repeats: int) -> list[float]:
-    """Return the least time of each, one turn after the other, after a turn that compiles."""
-    times: list[list[float]] = [[] for _ in functions]
-    for function in functions:
-        function()
-    for _ in range(repeats):
-        for function, own in zip(functions, times, strict=True):
-            start = time.perf_counter()
-            function()
-            own.append(time.perf_counter() - start)
-    return [min(own) for own in times]
-
-
-def stage_cases(repeats: int) -> list[Case]:
-    """Time projection with colours, tile lists and the loss in float32, each beside its error.
+def stages() -> list[Contest]:
+    """Projection with colours, tile lists and the loss in float32, each beside its error.
 
     Returns
     -------
-    list of Case
+    list of Contest
         A case fails if its result is not the reference's, in float64 on the same numbers.
     """
-    return [_projection_case(repeats), _lists_case(repeats), _loss_case(repeats)]
+    return [_projection(), _lists(), _loss()]
 
 
-def adam_cases(repeats: int) -> list[Case]:
-    """Time Adam on Gaussians of 59 numbers against a copy that moves as many bytes, taking turns.
+def adams() -> list[Contest]:
+    """Adam on Gaussians of 59 numbers against a copy that moves as many bytes.
 
     Once on all of them, once on a random part as a view that sees few would; only the rows of that part count as moved.
     """
     is_seen = np.random.default_rng(5).random(N) < VISIBLE_SHARE
     return [
-        _adam_case(f"roof/adam {N:,}", np.ones(N, bool), False, repeats),
-        _adam_case(f"roof/adam {VISIBLE_SHARE:.0%} of {N:,}", is_seen, True, repeats),
+        _adam(f"roof/adam {N:,}", np.ones(N, bool), False),
+        _adam(f"roof/adam {VISIBLE_SHARE:.0%} of {N:,}", is_seen, True),
     ]
 
 
-def _adam_case(name: str, is_seen: Bools, is_visible_only: bool, repeats: int) -> Case:
+def _adam(name: str, is_seen: Bools, is_visible_only: bool) -> Contest:
     gaussians, gradient = (Gaussians._make(np.full((N, w), 0.5, np.float32) for w in WIDTHS) for _ in range(2))
     state, rule, rows = zero_moments(gaussians), AdamRule(is_visible_only, False), np.flatnonzero(is_seen)
     n_numbers = ADAM_ARRAYS * len(rows) * sum(WIDTHS)
     n_bytes = 4 * n_numbers
     source = np.ones(n_numbers // COPY_TRANSFERS, np.float32)
     target = np.empty_like(source)
-    step, copy = least_seconds(
-        (
-            lambda: adam_step(gaussians, gradient, state, [1e-3] * len(WIDTHS), rule, rows),
-            lambda: _copy(source, target),
-        ),
-        repeats,
-    )
-    figures: dict[str, Figure] = {
-        "ms": 1e3 * step,
-        "GB/s": n_bytes / step / 1e9,
-        "copy GB/s": n_bytes / copy / 1e9,
-        "x copy": step / copy,
-    }
-    has_moved = all(np.array_equal((field < 0.5).all(axis=1), is_seen) for field in gaussians)
-    passed = has_moved and bool((target == 1).all())
-    return Case(name, passed, figures, "" if passed else "other rows were updated than should be")
+
+    def judge(times: Sequence[Times]) -> list[Case]:
+        step, copy = times
+        figures: dict[str, Figure] = {
+            **in_ms(step),
+            "GB/s": n_bytes / step.least / 1e9,
+            "copy GB/s": n_bytes / copy.least / 1e9,
+            "x copy": step.least / copy.least,
+        }
+        has_moved = all(np.array_equal((field < 0.5).all(axis=1), is_seen) for field in gaussians)
+        passed = has_moved and bool((target == 1).all())
+        return [Case(name, passed, figures, "" if passed else "other rows were updated than should be")]
+
+    def step() -> None:
+        adam_step(gaussians, gradient, state, [1e-3] * len(WIDTHS), rule, rows)
+
+    return Contest((step, lambda: _copy(source, target)), judge)
 
 
-def thread_case(workload: Workload, repeats: int) -> Case | None:
-    """Time forward and backward on one thread and on all; None where there is only one."""
+def in_ms(times: Times) -> dict[str, Figure]:
+    """Return both times as figures."""
+    return {"ms": 1e3 * times.least, "median ms": 1e3 * times.median}
+
+
+def threads(workload: Workload) -> list[Contest]:
+    """Forward and backward on one thread and on all; nothing where there is only one."""
     n_all = numba.get_num_threads()
     if n_all == 1:
-        return None
+        return []
     gaussians, v_image = _float32(workload.gaussians), workload.v_image.astype(np.float32)
 
     def gradient(n_threads: int) -> Gaussians:
@@ -109,13 +102,17 @@ def thread_case(workload: Workload, repeats: int) -> Case | None:
         finally:
             numba.set_num_threads(n_all)
 
-    one, all_ = least_seconds([lambda: gradient(1), lambda: gradient(n_all)], repeats)
-    is_same = all(np.array_equal(a, b) for a, b in zip(gradient(1), gradient(n_all), strict=True))
-    figures: dict[str, Figure] = {"1 thread ms": 1e3 * one, f"{n_all} threads ms": 1e3 * all_, "x": one / all_}
-    return Case(f"threads/{workload.name}", is_same, figures, "" if is_same else "the gradients are not the same bytes")
+    def judge(times: Sequence[Times]) -> list[Case]:
+        one, all_ = (1e3 * own.least for own in times)
+        is_same = all(np.array_equal(a, b) for a, b in zip(gradient(1), gradient(n_all), strict=True))
+        figures: dict[str, Figure] = {"1 thread ms": one, f"{n_all} threads ms": all_, "x": one / all_}
+        note = "" if is_same else "the gradients are not the same bytes"
+        return [Case(f"threads/{workload.name}", is_same, figures, note)]
+
+    return [Contest((lambda: gradient(1), lambda: gradient(n_all)), judge)]
 
 
-def _projection_case(repeats: int) -> Case:
+def _projection() -> Contest:
     workload = synth(N)
     rng = np.random.default_rng(3)
     sh_rest = (0.1 * rng.normal(size=(N, SH_COEFFICIENTS - 1, 3))).astype(np.float32).astype(np.float64)
@@ -124,11 +121,11 @@ def _projection_case(repeats: int) -> Case:
     weights = [rng.normal(size=(N, *shape)) for shape in ((2,), (), (3,), (), (3,))]
     camera = workload.camera
     reference, cpu = (_project_and_shade(*pair, camera, weights)() for pair in ((REFERENCE, exact), (CPU, single)))
-    [seconds] = least_seconds([_project_and_shade(CPU, single, camera, weights)], repeats)
     rows = (reference[0][:, 0] > 0) & (cpu[0][:, 0] > 0)  # one on the edge of being culled says nothing
     pairs = zip(reference[1:], cpu[1:], strict=True)
     error = max(float(np.linalg.norm(b[rows] - a[rows]) / np.linalg.norm(a[rows])) for a, b in pairs)
-    return _case("project and SH, both ways", error, BENCH_FLOAT32_GRADIENT, {"ms": 1e3 * seconds})
+    task = _project_and_shade(CPU, single, camera, weights)
+    return _contest("project and SH, both ways", (task,), error, BENCH_FLOAT32_GRADIENT)
 
 
 def _project_and_shade(
@@ -156,40 +153,42 @@ def _project_and_shade(
     return task
 
 
-def _lists_case(repeats: int) -> Case:
+def _lists() -> Contest:
     workload = synth(N)
     tape = render(_float32(workload.gaussians), workload.camera)[1].splats
     projection, grid = tape.projection, tape.bins.grid
-    sort, lists = least_seconds(
-        [
-            lambda: np.argsort(projection.depths, kind="stable"),
-            lambda: CPU.bin_gaussians(projection, grid, GSPLAT_MAIN),
-        ],
-        repeats,
-    )
     # The reference lists more pairs; those that ours leave out must not change the image.
     longer = REFERENCE.bin_gaussians(projection, grid, GSPLAT_MAIN)
     image = CPU.composite(projection, tape.channels, tape.background, longer, GSPLAT_MAIN).image
     error = float(np.abs(image - tape.output.image).max())
-    return _case("sort and bin", error, 0.0, {"ms": 1e3 * lists, "argsort alone ms": 1e3 * sort})
+    tasks = (
+        lambda: CPU.bin_gaussians(projection, grid, GSPLAT_MAIN),
+        lambda: np.argsort(projection.depths, kind="stable"),
+    )
+    return _contest("sort and bin", tasks, error, 0.0, "argsort alone")
 
 
-def _loss_case(repeats: int) -> Case:
+def _loss() -> Contest:
     rng = np.random.default_rng(4)
     image, target = (rng.random(IMAGE_SHAPE).astype(np.float32) for _ in range(2))
 
     def gradient(backend: Backend, image: Floats, target: Floats) -> Floats:
         return backend.photometric_loss_vjp(backend.photometric_loss(image, target, 1.0)[1])
 
-    [seconds] = least_seconds([lambda: gradient(CPU, image, target)], repeats)
     exact = gradient(REFERENCE, image.astype(np.float64), target.astype(np.float64))
     error = float(np.linalg.norm(gradient(CPU, image, target) - exact) / np.linalg.norm(exact))
-    return _case("D-SSIM, both ways", error, BENCH_FLOAT32_GRADIENT, {"ms": 1e3 * seconds})
+    return _contest("D-SSIM, both ways", (lambda: gradient(CPU, image, target),), error, BENCH_FLOAT32_GRADIENT)
 
 
-def _case(name: str, error: float, bound: float, figures: dict[str, Figure]) -> Case:
+def _contest(name: str, tasks: tuple[Task, ...], error: float, bound: float, other: str = "") -> Contest:
+    """Return the contest of a stage, whose error is known; ``other`` is what it is compared with, if anything."""
     note = "" if error <= bound else f"off by {error:.1e}, more than {bound:.1e}"
-    return Case(f"stage/{name}", not note, {**figures, "error": error}, note)
+
+    def judge(times: Sequence[Times]) -> list[Case]:
+        others: dict[str, Figure] = {f"{other} ms": 1e3 * own.least for own in times[1:]}
+        return [Case(f"stage/{name}", not note, {**in_ms(times[0]), **others, "error": error}, note)]
+
+    return Contest(tasks, judge)
 
 
 def _float32(gaussians: Gaussians) -> Gaussians:

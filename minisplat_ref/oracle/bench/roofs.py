@@ -2,11 +2,13 @@
 
 The straight-line loops do the arithmetic of one hit on all pixels of a tile, over and over on the same numbers: no
 lists, no sorting, nothing fetched from memory, nothing to find out. A kernel that took no longer per pair would be
-perfect. One thread; the kernels' times are multiplied by their threads. A *pair* is a Gaussian and a pixel in one of
-the rows of eight that a kernel computes for it: those that the visible ellipse reaches and that are not finished.
+perfect. They run on as many threads as the kernels, one copy on each: cores that share their clock or their arithmetic
+with each other, or with somebody else, slow down both. A *pair* is a Gaussian and a pixel in one of the rows of eight
+that a kernel computes for it: those that the visible ellipse reaches and that are not finished.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,12 +29,13 @@ from minisplat_ref.cpu.tile_rows import (
 )
 from minisplat_ref.cpu.tile_state import CHECK_EVERY, N_ROWS, corner, frame_of, open_rows, rows_of, start_tile
 from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
-from minisplat_ref.oracle.bench.limits import least_seconds
+from minisplat_ref.oracle.bench.by_turns import Contest, Times
+from minisplat_ref.oracle.bench.limits import in_ms
 from minisplat_ref.oracle.bench.workloads import Workload
 from minisplat_ref.oracle.cases import Case, Figure
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_GRADIENT, BENCH_FLOAT32_IMAGE
 from minisplat_ref.render import render
-from minisplat_ref.scalar._jit import kernel, n_threads
+from minisplat_ref.scalar._jit import kernel, n_threads, prange, scalar
 from minisplat_ref.scalar.compositing import blend, conic_vjp_of_moments, factors, sigma_vjp
 from minisplat_ref.scalar.lanes import WIDTH, filled, load, select, store, sum_of
 from minisplat_ref.scalar.literals import ZERO
@@ -41,6 +44,7 @@ from minisplat_ref.types import CompositeGradient, Floats, Gaussians, Projection
 N_HITS = 100  # of opacity 0.005: transmittance 0.6 is left, so that none of them stops
 N_PASSES = 50
 N_SUMS = 9
+SUMS_SIZE = 16  # so that no two copies write to the same cache line
 N_COLORS = 3
 DRAWN_FIELDS = 1 + N_COLORS  # of a pixel: transmittance, colours
 SHADED_FIELDS = 2 + N_COLORS  # transmittance, what lies behind, v
@@ -60,8 +64,10 @@ class Hit(NamedTuple):
     blue: np.float32
 
 
-@kernel(parallel=False)
-def _forward_line(state, scratch, hit, frame, n_hits, n_passes):  # type: ignore[no-untyped-def]
+@scalar
+def _forward_line(drawn, hit, frame, n_hits, n_passes):  # type: ignore[no-untyped-def]
+    state, scratch = np.empty(drawn.size, drawn.dtype), np.empty(SCRATCH_SIZE, drawn.dtype)
+    start_scratch(scratch)
     for _ in range(n_passes):
         start_tile(state, 0, 0, frame, DRAWN_FIELDS)
         for _ in range(n_hits):
@@ -76,10 +82,19 @@ def _forward_line(state, scratch, hit, frame, n_hits, n_passes):  # type: ignore
                 store(state, i + WIDTH, load(state, i + WIDTH) + weight * hit.red)
                 store(state, i + 2 * WIDTH, load(state, i + 2 * WIDTH) + weight * hit.green)
                 store(state, i + 3 * WIDTH, load(state, i + 3 * WIDTH) + weight * hit.blue)
+    drawn[:] = state
 
 
-@kernel(parallel=False)
-def _backward_line(state, fresh, scratch, hit, frame, sums, n_hits, n_passes):  # type: ignore[no-untyped-def]
+@kernel()
+def _forward_lines(drawn, hit, frame, n_hits, n_passes):  # type: ignore[no-untyped-def]
+    for copy in prange(len(drawn)):
+        _forward_line(drawn[copy], hit, frame, n_hits, n_passes)
+
+
+@scalar
+def _backward_line(fresh, hit, frame, sums, n_hits, n_passes):  # type: ignore[no-untyped-def]
+    state, scratch = np.empty(fresh.size, fresh.dtype), np.empty(SCRATCH_SIZE, fresh.dtype)
+    start_scratch(scratch)
     zero = filled(ZERO * hit.x)
     for _ in range(n_passes):
         state[:] = fresh
@@ -118,6 +133,12 @@ def _backward_line(state, fresh, scratch, hit, frame, sums, n_hits, n_passes):  
                 sums[j] += sum_of(parts[j])
 
 
+@kernel()
+def _backward_lines(fresh, hit, frame, sums, n_hits, n_passes):  # type: ignore[no-untyped-def]
+    for copy in prange(len(sums)):
+        _backward_line(fresh, hit, frame, sums[copy], n_hits, n_passes)
+
+
 _write_alphas = alpha_writer(exp_fast)
 
 
@@ -151,12 +172,12 @@ def rows_worked_on(projection: Projection, channels: Floats, bins: TileBins) -> 
     return int(_count_rows(records, bins.gaussian_ids, bins.tile_offsets, frame))
 
 
-def blending_cases(workload: Workload, repeats: int) -> list[Case]:
-    """Time the blending kernels in float32 on a workload against the straight-line loops, taking turns.
+def blending(workload: Workload) -> Contest:
+    """Return the contest of the blending kernels in float32 on a workload with the straight-line loops.
 
     Returns
     -------
-    list of Case
+    Contest
         Forward and backward. A case fails if its straight-line loop does not give what the reference gives.
     """
     gaussians = Gaussians._make(field.astype(np.float32) for field in workload.gaussians)
@@ -164,43 +185,44 @@ def blending_cases(workload: Workload, repeats: int) -> list[Case]:
     splats = tape.splats
     inputs = (splats.projection, splats.channels, splats.background, splats.bins, GSPLAT_MAIN)
     v_image, v_alpha = workload.v_image.astype(np.float32), np.zeros(output.alpha.shape, np.float32)
-    loops = StraightLines()
-    least = least_seconds(
-        (
-            lambda: CPU.composite(*inputs),
-            loops.forward,
-            lambda: CPU.composite_vjp(*inputs, output, v_image, v_alpha),
-            loops.backward,
-        ),
-        repeats,
-    )
+    lines = StraightLines(n_threads())
     n_pairs = WIDTH * rows_worked_on(splats.projection, splats.channels, splats.bins)
     assert output.stats is not None
     n_hits = int(output.stats.hit_count.sum())
-    cases = []
-    for name, seconds, line, error, bound in (
-        ("forward", least[0], least[1], loops.image_error(), BENCH_FLOAT32_IMAGE),
-        ("backward", least[2], least[3], loops.gradient_error(), BENCH_FLOAT32_GRADIENT),
-    ):
-        pair, roof = 1e9 * seconds * n_threads() / n_pairs, 1e9 * line / (N_HITS * N_PASSES * N_ROWS * WIDTH)
-        figures: dict[str, Figure] = {
-            "ms": 1e3 * seconds,
-            "million hits": n_hits / 1e6,
-            "million pairs": n_pairs / 1e6,
-            "million pairs/s": n_pairs / seconds / 1e6,
-            "ns a pair and core": pair,
-            "straight line ns": roof,
-            "x straight line": pair / roof,
-        }
-        note = "" if error <= bound else f"the straight-line loop is off by {error:.1e}"
-        cases.append(Case(f"roof/{workload.name} {name}", not note, figures, note))
-    return cases
+
+    def judge(times: Sequence[Times]) -> list[Case]:
+        cases = []
+        for name, own, line, error, bound in (
+            ("forward", times[0], times[1], lines.image_error(), BENCH_FLOAT32_IMAGE),
+            ("backward", times[2], times[3], lines.gradient_error(), BENCH_FLOAT32_GRADIENT),
+        ):
+            pair, roof = own.least * n_threads() / n_pairs, line.least * n_threads() / lines.n_pairs
+            figures: dict[str, Figure] = {
+                **in_ms(own),
+                "million hits": n_hits / 1e6,
+                "million pairs": n_pairs / 1e6,
+                "million pairs/s": n_pairs / own.least / 1e6,
+                "ns a pair and core": 1e9 * pair,
+                "straight line ns": 1e9 * roof,
+                "x straight line": pair / roof,
+            }
+            note = "" if error <= bound else f"the straight-line loop is off by {error:.1e}"
+            cases.append(Case(f"roof/{workload.name} {name}", not note, figures, note))
+        return cases
+
+    tasks = (
+        lambda: CPU.composite(*inputs),
+        lines.forward,
+        lambda: CPU.composite_vjp(*inputs, output, v_image, v_alpha),
+        lines.backward,
+    )
+    return Contest(tasks, judge)
 
 
 class StraightLines:
-    """The loops on one tile, and the same hits for the reference."""
+    """The loops on copies of one tile, as many as there are parts, and the same hits for the reference."""
 
-    def __init__(self) -> None:
+    def __init__(self, n_copies: int) -> None:
         f32 = np.float32
         grid = TileGrid(TILE_WIDTH, TILE_HEIGHT, TILE_WIDTH, TILE_HEIGHT)
         mean, conic, opacity, color = (3.5, 8.25), (4e-3, 1e-3, 3e-3), 5e-3, (0.9, 0.5, 0.2)  # alpha > 1/255 everywhere
@@ -220,28 +242,25 @@ class StraightLines:
         self.frame = frame_of(self.bins, GSPLAT_MAIN, np.dtype(f32))
         self.expected = REFERENCE.composite(self.projection, self.colors, self.background, self.bins, GSPLAT_MAIN)
         self.v_image = np.random.default_rng(2).normal(size=self.expected.image.shape).astype(f32)
-        self.scratch = np.zeros(SCRATCH_SIZE, f32)
-        start_scratch(self.scratch)
-        self.drawn = np.zeros((N_ROWS, DRAWN_FIELDS, WIDTH), f32)
+        self.drawn = np.zeros((n_copies, N_ROWS, DRAWN_FIELDS, WIDTH), f32)
         self.fresh = np.zeros((N_ROWS, SHADED_FIELDS, WIDTH), f32)
         self.fresh[:, 0] = 1
         self.fresh[:, 1] = _by_rows((self.v_image * self.expected.image).sum(axis=2, keepdims=True))[:, 0]
         self.fresh[:, 2:] = _by_rows(self.v_image)
-        self.shaded = np.zeros_like(self.fresh)
-        self.sums = np.zeros(N_SUMS, np.float64)
+        self.sums = np.zeros((n_copies, SUMS_SIZE), np.float64)
+        self.n_pairs = n_copies * N_PASSES * N_HITS * N_ROWS * WIDTH
 
     def forward(self) -> None:
         """Draw the tile, many times."""
-        _forward_line(self.drawn.ravel(), self.scratch, self.hit, self.frame, N_HITS, N_PASSES)
+        _forward_lines(self.drawn.reshape(len(self.drawn), -1), self.hit, self.frame, N_HITS, N_PASSES)
 
     def backward(self) -> None:
         """Differentiate it, many times."""
-        state, fresh = self.shaded.ravel(), self.fresh.ravel()
-        _backward_line(state, fresh, self.scratch, self.hit, self.frame, self.sums, N_HITS, N_PASSES)
+        _backward_lines(self.fresh.ravel(), self.hit, self.frame, self.sums, N_HITS, N_PASSES)
 
     def image_error(self) -> float:
         """Return the largest error of what was drawn."""
-        return float(np.abs(self.drawn[:, 1:] - _by_rows(self.expected.image)).max())
+        return float(np.abs(self.drawn[:, :, 1:] - _by_rows(self.expected.image)).max())
 
     def gradient_error(self) -> float:
         """Return the largest relative L2 error of a gradient, summed over the equal hits."""
@@ -249,17 +268,20 @@ class StraightLines:
         v: CompositeGradient = REFERENCE.composite_vjp(
             self.projection, self.colors, self.background, self.bins, GSPLAT_MAIN, self.expected, self.v_image, v_alpha
         )
-        q, qe, qy, *second = self.sums[:6]
+        expected = [np.sum(part.reshape(N_HITS, -1), axis=0) for part in v[:4]]
+        pairs = [pair for sums in self.sums for pair in zip(self._gradient(sums), expected, strict=True)]
+        return max(float(np.linalg.norm(a - b) / np.linalg.norm(b)) for a, b in pairs)
+
+    def _gradient(self, sums: Floats) -> tuple[Any, ...]:
+        """Gradient by centre, conic, opacity and colour."""
+        q, qe, qy, *second = sums[:6]
         a, slope, pivot = 2 * self.hit.half_a, self.hit.slope, 2 * self.hit.half_pivot
-        found = (
+        return (
             (a * qe, slope * a * qe + pivot * qy),
             conic_vjp_of_moments(slope, *second),
             (-q / self.hit.opacity,),
-            self.sums[6:],
+            sums[6:N_SUMS],
         )
-        expected = [np.sum(part.reshape(N_HITS, -1), axis=0) for part in v[:4]]
-        pairs = zip(found, expected, strict=True)
-        return max(float(np.linalg.norm(a - b) / np.linalg.norm(b)) for a, b in pairs)
 
 
 def _by_rows(image: Floats) -> Floats:
