@@ -13,6 +13,7 @@ from collections.abc import Callable
 import numpy as np
 
 from minisplat_ref.constants import MEDIAN_TRANSMITTANCE
+from minisplat_ref.cpu.gaussian_rows import rows_from
 from minisplat_ref.cpu.records import COLOR, N_FUSED
 from minisplat_ref.cpu.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, reached_rows, start_scratch
 from minisplat_ref.cpu.tile_state import (
@@ -27,7 +28,7 @@ from minisplat_ref.cpu.tile_state import (
 )
 from minisplat_ref.scalar._jit import kernel, prange, scalar
 from minisplat_ref.scalar.compositing import blend
-from minisplat_ref.scalar.lanes import WIDTH, filled, larger, largest_of, load, select, store, sum_of
+from minisplat_ref.scalar.lanes import WIDTH, filled, gather, larger, largest_of, load, scatter, select, store, sum_of
 from minisplat_ref.scalar.literals import ONE, ZERO
 from minisplat_ref.scalar.turns import no_turns
 
@@ -55,15 +56,23 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
         store(s, i + crossing, select(is_crossing, depth, load(s, i + crossing)))
 
     @scalar
+    def pixels_of(state, place, n_pixels):
+        """Load a field of a row; where the image ends within the row, its last pixel fills up the eight."""
+        return load(state, place) if n_pixels == WIDTH else gather(state, rows_from(place, place + n_pixels), 0)
+
+    @scalar
     def store_tile(state, x0, y0, background, frame, image, alpha):
         for row in range(N_ROWS):
             x, y, n_pixels = row_in_image(row, x0, y0, frame)
-            for i in range(n_pixels):
-                place = row * row_size + i
-                left = abs(state[place])
-                alpha[y, x + i] = ONE - left
-                for k in range(n_channels):
-                    image[y, x + i, k] = state[place + channels + k * WIDTH] + left * background[k]
+            if n_pixels == 0:
+                continue
+            first, place = y * frame.width + x, row * row_size
+            pixels = rows_from(first, first + n_pixels)
+            left = abs(pixels_of(state, place, n_pixels))
+            scatter(alpha, pixels, 0, ONE - left)
+            for k in range(n_channels):
+                color = pixels_of(state, place + channels + k * WIDTH, n_pixels)
+                scatter(image, pixels, k, color + left * background[k])
 
     @scalar
     def store_stats(state, x0, y0, frame, tile_ids, median_depth, dominant_ids):

@@ -80,8 +80,8 @@ def composite_with(
         bins.slots,
         n_threads(),
         frame_of(bins, conventions, dtype),
-        image,
-        alpha,
+        image.reshape(height * width, image.shape[2]),
+        alpha.reshape(-1),
         slots,
         (median_depth, dominant_ids),
     )
