@@ -7,7 +7,7 @@ right-handed; camera axes are OpenCV's: x right, y down, z forward. Image coordi
 and the centre of the top-left pixel is (0.5, 0.5).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -189,6 +189,8 @@ class RenderOutput(NamedTuple):
     """[H, W] depth of the hit that takes the transmittance below one half, 0 where none does; None if not asked for."""
     stats: BlendStats | None
     """Blend statistics; None if not asked for."""
+    kept: Any = None
+    """What the backend that made it keeps for its gradient, which is as right, but slower, without."""
 
 
 class CompositeGradient(NamedTuple):

@@ -18,7 +18,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.io.images import read_image
 from minisplat_ref.optim.adam import adam_step
 from minisplat_ref.oracle.bench import by_turns, contenders, limits, profiling, race, roofs, slopes, workloads
-from minisplat_ref.oracle.bench.by_turns import Contest, hold, times_by_turns
+from minisplat_ref.oracle.bench.by_turns import hold, times_by_turns
 from minisplat_ref.oracle.bench.exponentials import EXPONENTIALS, relative_errors
 from minisplat_ref.oracle.bench.flips import thresholds
 from minisplat_ref.oracle.bench.peers import peers_of

@@ -71,8 +71,9 @@ def composite_with(
     shape, n_pairs = ((height, width), len(bins.gaussian_ids)) if collects else ((0, 0), 0)
     median_depth, dominant_ids = np.empty(shape, dtype), np.empty(shape, np.int32)
     slots = np.zeros((n_pairs, N_PAIR_STATS), dtype)  # stay zero behind the hit that finishes a tile
+    records = records_of(projection, colors, conventions)
     forward_kernel(exp, colors.shape[1], collects)(
-        records_of(projection, colors, conventions),
+        records,
         projection.depths,
         background,
         bins.tile_offsets,
@@ -91,7 +92,7 @@ def composite_with(
         dominant_count = np.bincount(dominant_ids[dominant_ids >= 0], minlength=n).astype(np.int32)
         stats = BlendStats(np.empty(n, dtype), np.empty(n, dtype), np.empty(n, np.int32), dominant_count, dominant_ids)
         sum_pair_stats(slots, bins.gaussian_offsets, stats)
-    return RenderOutput(image, alpha, median_depth if with_median_depth else None, stats)
+    return RenderOutput(image, alpha, median_depth if with_median_depth else None, stats, records)
 
 
 def composite_vjp_with(
@@ -112,7 +113,7 @@ def composite_vjp_with(
     slots = large_empty((len(bins.gaussian_ids) * width,), dtype)
     v_backgrounds = np.empty((len(bins.tile_offsets) - 1, n_channels))  # by tiles
     backward_kernel(exp, n_channels)(
-        records_of(projection, colors, conventions),
+        output.kept if output.kept is not None else records_of(projection, colors, conventions),
         bins.tile_offsets,
         bins.gaussian_ids,
         bins.slots,

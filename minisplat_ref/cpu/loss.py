@@ -4,9 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.cpu.loss_rows import HALF_WINDOW, PAD, loss_kernel, pad_rows
+from minisplat_ref.cpu.loss_rows import loss_kernel, row_length
 from minisplat_ref.scalar._jit import n_threads
-from minisplat_ref.scalar.lanes import WIDTH
 from minisplat_ref.types import Bools, Floats, Ints
 
 
@@ -17,28 +16,9 @@ class LossTape(NamedTuple):
     """[H, W, 3] derivative of the loss by the image."""
 
 
-def _row_length(width: int) -> int:
-    """Numbers in an interleaved row with margins, a multiple of eight."""
-    n_blocks = -(-3 * width // WIDTH) - (-2 * PAD // WIDTH)
-    return n_blocks * WIDTH
-
-
-def _padded(image: Floats, target: Floats | Ints, mask: Bools | None) -> tuple[Floats, Floats]:
-    """Both images [H + 10, L] with margins, equal where the mask is False."""
-    height, width, _ = image.shape
-    shape = (height + 2 * HALF_WINDOW, _row_length(width))
-    padded = np.empty(shape, image.dtype), np.empty(shape, image.dtype)
-    rows = (array.reshape(height, 3 * width) for array in (image, target))
-    pad_rows(*rows, image.dtype.type(1 / 255 if target.dtype == np.uint8 else 1), *padded)
-    if mask is not None:
-        middle = (slice(HALF_WINDOW, -HALF_WINDOW), slice(PAD, PAD + 3 * width))
-        np.copyto(padded[0][middle], padded[1][middle], where=~np.repeat(mask, 3, axis=1))
-    return padded
-
-
 def _counts(mask: Bools | None, width: int, dtype: np.dtype) -> Floats:
     """1 for each number that counts and 0 for the others [H, L]; one row stands for all where there is no mask."""
-    counts = np.zeros((1 if mask is None else len(mask), _row_length(width)), dtype)
+    counts = np.zeros((1 if mask is None else len(mask), row_length(width)), dtype)
     counts[:, : 3 * width] = 1 if mask is None else np.repeat(mask, 3, axis=1)
     return counts
 
@@ -51,15 +31,14 @@ def photometric_loss(
     n_values = image.size if mask is None else 3 * int(np.count_nonzero(mask))
     if n_values == 0:
         return 0.0, LossTape(np.zeros_like(image))
-    padded_image, padded_target = _padded(image, target, mask)
     sums, v_image = np.empty((height, 2)), np.empty((height, 3 * width), dtype)
     loss_kernel(dtype)(
-        padded_image.reshape(-1),
-        padded_target.reshape(-1),
-        _counts(mask, width, dtype).reshape(-1),
+        image.reshape(height, 3 * width),
+        target.reshape(height, 3 * width),
+        dtype.type(1 / 255 if target.dtype == np.uint8 else 1),
+        _counts(mask, width, dtype),
         dtype.type((1 - dssim_weight) / n_values),
         dtype.type(-dssim_weight / n_values),
-        padded_image.shape[1],
         n_threads(),
         sums,
         v_image,

@@ -109,7 +109,7 @@ def composite_vjp(
     projection, colors, background, bins, conventions
         As for :func:`composite`.
     output : RenderOutput
-        Its result. Not needed here: kernels start from its alpha.
+        Its result for these inputs. Not needed here: kernels start from its alpha.
     v_image : ndarray of shape (H, W, D)
         Derivative by the image.
     v_alpha : ndarray of shape (H, W)
