@@ -2,12 +2,13 @@
 
 The Gaussian window is separable, and the row of an interleaved RGB image is one flat array in which the horizontal
 neighbours of a channel lie three numbers apart. A row is filtered completely, vertically and then horizontally, while
-it is in the cache. Rows, and numbers of a row, that have the same weight are added first.
+it is in the cache. Numbers of a row that have the same weight are added first.
 
 A window needs eleven rows of both images, and the gradient of a row the derivatives of SSIM in the eleven rows around
-it. Both are kept in rings of as many rows, which stay in the cache, instead of five more images in memory: so the
-gradient, but for a factor, is made together with the loss. Each thread goes down a band of rows, and the rows beyond
-its edges are computed once more.
+it. Both are kept in rings of rows, which stay in the cache, instead of five more images in memory: so the gradient, but
+for a factor, is made together with the loss. Rows are filtered vertically two at a time, for what two windows share is
+read once; a ring has twelve rows. Each thread goes down a band of rows, and the rows beyond its edges are computed once
+more.
 
 Rows of the images get margins as black as zeros, wide enough for the window and for the last eight numbers of a row, so
 that no number is a special case. They are kept less one half, and moments are those of I - 1/2 and T - 1/2: variances
@@ -26,6 +27,7 @@ from minisplat_ref.scalar.literals import HALF, TWO, ZERO
 from minisplat_ref.scalar.loss import ssim_and_derivatives
 
 HALF_WINDOW = SSIM_WINDOW // 2
+N_RING = SSIM_WINDOW + 1  # rows that two windows cover
 PAD = 3 * HALF_WINDOW  # numbers of margin before an interleaved row, and at least as many behind it
 
 
@@ -37,22 +39,23 @@ def row_length(width: int) -> int:
 
 @scalar
 def _pad_row(row, image, target, unit, counts, padded_image, padded_target):
-    """Copy a row of both images, less 1/2, into rows with margins; they are equal where they do not count."""
-    padded_image[:] = -HALF
-    padded_target[:] = -HALF
-    if 0 <= row < image.shape[0]:
-        counts_row = counts[row % counts.shape[0]]
-        for i in range(image.shape[1]):
-            found, wanted = image[row, i] - HALF, unit * padded_target.dtype.type(target[row, i]) - HALF
-            padded_image[PAD + i] = found if counts_row[i] > ZERO else wanted
-            padded_target[PAD + i] = wanted
+    """Copy a row of both images, less 1/2, between margins that are black; they are equal where they do not count."""
+    if row < 0 or row >= image.shape[0]:
+        padded_image[:] = -HALF
+        padded_target[:] = -HALF
+        return
+    counts_row = counts[row % counts.shape[0]]
+    for i in range(image.shape[1]):
+        found, wanted = image[row, i] - HALF, unit * padded_target.dtype.type(target[row, i]) - HALF
+        padded_image[PAD + i] = found if counts_row[i] > ZERO else wanted
+        padded_target[PAD + i] = wanted
 
 
 @scalar
 def _find_rows(first, length, places):
-    """Find where the eleven rows of an image from ``first`` on, in its coordinates, are in a ring of rows."""
-    for k in range(SSIM_WINDOW):
-        places[k] = (first + k) % SSIM_WINDOW * length
+    """Find where the rows from ``first`` on, in the image's coordinates, are in a ring."""
+    for k in range(N_RING):
+        places[k] = (first + k) % N_RING * length
 
 
 @functools.cache
@@ -61,30 +64,32 @@ def loss_kernel(dtype: np.dtype) -> Callable:
     offsets = np.arange(SSIM_WINDOW) - HALF_WINDOW
     weights = np.exp(-0.5 * (offsets / SSIM_SIGMA) ** 2)
     window = tuple(dtype.type(weight) for weight in weights / weights.sum())
-    c1, c2 = dtype.type(SSIM_C1), dtype.type(SSIM_C2)
+    edge, c1, c2 = window[0], dtype.type(SSIM_C1), dtype.type(SSIM_C2)
 
     @scalar
     def moments_down(image, target, places, i):
-        """Windowed means down a column of I, T, I^2 + T^2 and I T; rows at the same distance have the same weight."""
-        a, b = load(image, places[HALF_WINDOW] + i), load(target, places[HALF_WINDOW] + i)
-        middle = filled(window[HALF_WINDOW])
-        means = middle * a, middle * b, middle * (a * a + b * b), middle * (a * b)
-        mean_i, mean_t, squares, products = means
-        for k in range(HALF_WINDOW):
+        """Windowed means down a column of I, T, I^2 + T^2 and I T: four for a row and four for the next."""
+        a, b = load(image, places[0] + i), load(target, places[0] + i)
+        i_0, t_0, squares_0, products_0 = edge * a, edge * b, edge * (a * a + b * b), edge * (a * b)
+        a, b = load(image, places[SSIM_WINDOW] + i), load(target, places[SSIM_WINDOW] + i)
+        i_1, t_1, squares_1, products_1 = edge * a, edge * b, edge * (a * a + b * b), edge * (a * b)
+        for k in range(1, SSIM_WINDOW):
             a, b = load(image, places[k] + i), load(target, places[k] + i)
-            c, d = load(image, places[SSIM_WINDOW - 1 - k] + i), load(target, places[SSIM_WINDOW - 1 - k] + i)
-            mean_i = mean_i + window[k] * (a + c)
-            mean_t = mean_t + window[k] * (b + d)
-            squares = squares + window[k] * ((a * a + b * b) + (c * c + d * d))
-            products = products + window[k] * (a * b + c * d)
-        return mean_i, mean_t, squares, products
+            squares, products = a * a + b * b, a * b
+            i_0, t_0 = i_0 + window[k] * a, t_0 + window[k] * b
+            squares_0, products_0 = squares_0 + window[k] * squares, products_0 + window[k] * products
+            i_1, t_1 = i_1 + window[k - 1] * a, t_1 + window[k - 1] * b
+            squares_1, products_1 = squares_1 + window[k - 1] * squares, products_1 + window[k - 1] * products
+        return i_0, t_0, squares_0, products_0, i_1, t_1, squares_1, products_1
 
     @scalar
     def down(ring, places, i):
-        total = window[HALF_WINDOW] * load(ring, places[HALF_WINDOW] + i)
-        for k in range(HALF_WINDOW):
-            total = total + window[k] * (load(ring, places[k] + i) + load(ring, places[SSIM_WINDOW - 1 - k] + i))
-        return total
+        """Windowed means down a column, for a row and the next."""
+        mean_0, mean_1 = edge * load(ring, places[0] + i), edge * load(ring, places[SSIM_WINDOW] + i)
+        for k in range(1, SSIM_WINDOW):
+            a = load(ring, places[k] + i)
+            mean_0, mean_1 = mean_0 + window[k] * a, mean_1 + window[k - 1] * a
+        return mean_0, mean_1
 
     @scalar
     def across(s, i):
@@ -94,15 +99,21 @@ def loss_kernel(dtype: np.dtype) -> Callable:
         return total
 
     @scalar
-    def similarity_row(image, target, places, counts, n_values, length, s, derivatives):
-        """Sums of one row, and the derivatives of its SSIM by the three windowed means that hold the image."""
+    def filter_images(image, target, places, length, s):
         for i in range(0, length, WIDTH):
-            mean_i, mean_t, squares, products = moments_down(image, target, places, i)
-            store(s, i, mean_i)
-            store(s, length + i, mean_t)
-            store(s, 2 * length + i, squares)
-            store(s, 3 * length + i, products)
-        first = places[HALF_WINDOW] + PAD
+            means = moments_down(image, target, places, i)
+            store(s, i, means[0])
+            store(s, length + i, means[1])
+            store(s, 2 * length + i, means[2])
+            store(s, 3 * length + i, means[3])
+            store(s, 4 * length + i, means[4])
+            store(s, 5 * length + i, means[5])
+            store(s, 6 * length + i, means[6])
+            store(s, 7 * length + i, means[7])
+
+    @scalar
+    def similarity_row(image, target, first, counts, n_values, length, s, derivatives):
+        """Sums of a row that starts at ``first``, and the derivatives of its SSIM by the means that hold the image."""
         l1 = ssim = ZERO * filled(c1)
         for i in range(0, n_values, WIDTH):
             means = across(s, i), across(s, length + i), across(s, 2 * length + i), across(s, 3 * length + i)
@@ -116,11 +127,16 @@ def loss_kernel(dtype: np.dtype) -> Callable:
         return sum_of(l1), sum_of(ssim)
 
     @scalar
-    def vjp_row(image, target, first, ring, places, v_l1, v_ssim, length, s, v_row):
-        """Gradient by one row, which starts at ``first``."""
-        for i in range(0, length, WIDTH):
-            for k in range(3):
-                store(s, k * length + i, down(ring, places, k * length + i))
+    def filter_derivatives(ring, places, length, s):
+        for k in range(3):
+            for i in range(0, length, WIDTH):
+                both = down(ring, places, k * length + i)
+                store(s, k * length + i, both[0])
+                store(s, (4 + k) * length + i, both[1])
+
+    @scalar
+    def vjp_row(image, target, first, v_l1, v_ssim, length, s, v_row):
+        """Gradient by a row that starts at ``first``."""
         n_values = v_row.size
         up = filled(v_l1)
         for i in range(0, n_values, WIDTH):
@@ -129,35 +145,49 @@ def loss_kernel(dtype: np.dtype) -> Callable:
             by_ssim = across(s, i) + by_squares
             by_l1 = select(a > b, up, select(a < b, -up, ZERO * up))
             store(s, 3 * length + i, by_l1 + v_ssim * by_ssim)
-        v_row[:] = s[3 * length : 3 * length + n_values]
+        for i in range(n_values):  # a slice would be copied with a test for each number
+            v_row[i] = s[3 * length + i]
 
     @scalar
     def loss_band(start, end, image, target, unit, counts, v_l1, v_ssim, length, sums, v_image):
         n_rows, n_values = v_image.shape
-        images, targets = np.empty(SSIM_WINDOW * length, v_image.dtype), np.empty(SSIM_WINDOW * length, v_image.dtype)
-        ring, s = np.zeros(SSIM_WINDOW * 3 * length, v_image.dtype), np.empty(4 * length, v_image.dtype)
-        places = np.empty(SSIM_WINDOW, np.int64)
-        for row in range(start - 2 * HALF_WINDOW, end + 2 * HALF_WINDOW):
-            place = row % SSIM_WINDOW * length
-            own = slice(place, place + length)
-            _pad_row(row, image, target, unit, counts, images[own], targets[own])
-            y = row - HALF_WINDOW
-            place = y % SSIM_WINDOW * 3 * length
-            derivatives = ring[place : place + 3 * length]
-            if y < start - HALF_WINDOW or y < 0 or y >= n_rows:
-                derivatives[:] = ZERO
-            else:
-                _find_rows(y - HALF_WINDOW, length, places)
-                l1, ssim = similarity_row(
-                    images, targets, places, counts[y % counts.shape[0]], n_values, length, s, derivatives
-                )
-                if start <= y < end:
-                    sums[y, 0], sums[y, 1] = l1, ssim
-            y -= HALF_WINDOW
-            if y >= start:
-                first = y % SSIM_WINDOW * length + PAD
-                _find_rows(y - HALF_WINDOW, 3 * length, places)
-                vjp_row(images, targets, first, ring, places, v_l1, v_ssim, length, s, v_image[y])
+        images, targets = np.empty(N_RING * length, v_image.dtype), np.empty(N_RING * length, v_image.dtype)
+        images[:] = targets[:] = -HALF
+        ring, s = np.zeros(N_RING * 3 * length, v_image.dtype), np.empty(8 * length, v_image.dtype)
+        places = np.empty(N_RING, np.int64)
+        for y in range(start - 3 * HALF_WINDOW, end + HALF_WINDOW, 2):  # rows y and y + 1 get their similarity
+            for half in range(2):
+                row = y + HALF_WINDOW + half
+                place = row % N_RING * length
+                own = slice(place, place + length)
+                _pad_row(row, image, target, unit, counts, images[own], targets[own])
+            if y < start - HALF_WINDOW:
+                continue
+            _find_rows(y - HALF_WINDOW, length, places)
+            filter_images(images, targets, places, length, s)
+            for half in range(2):
+                row = y + half
+                place = row % N_RING * 3 * length
+                derivatives = ring[place : place + 3 * length]
+                if 0 <= row < n_rows:
+                    first, own_s, own_counts = (
+                        row % N_RING * length + PAD,
+                        s[4 * half * length :],
+                        counts[row % len(counts)],
+                    )
+                    l1, ssim = similarity_row(images, targets, first, own_counts, n_values, length, own_s, derivatives)
+                    if start <= row < end:
+                        sums[row, 0], sums[row, 1] = l1, ssim
+                else:
+                    derivatives[:] = ZERO
+            y -= HALF_WINDOW  # and these their gradient
+            if y < start:
+                continue
+            _find_rows(y - HALF_WINDOW, 3 * length, places)
+            filter_derivatives(ring, places, length, s)
+            for half in range(min(2, end - y)):
+                first, own_s = (y + half) % N_RING * length + PAD, s[4 * half * length :]
+                vjp_row(images, targets, first, v_l1, v_ssim, length, own_s, v_image[y + half])
 
     @kernel()
     def loss_rows(image, target, unit, counts, v_l1, v_ssim, n_bands, sums, v_image):
