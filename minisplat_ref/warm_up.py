@@ -21,8 +21,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.backends import CPU, REFERENCE, Backend
+from minisplat_ref.constants import Conventions
+from minisplat_ref.cpu.records import COLOR, N_FUSED
 from minisplat_ref.render import RenderTape, render, render_vjp
-from minisplat_ref.types import Camera, Floats, Gaussians, GeometricWeights
+from minisplat_ref.types import Camera, Floats, Gaussians, GeometricWeights, Projection, RenderOutput, TileBins
 
 WIDTH, HEIGHT = 24, 18
 N_GAUSSIANS = 4
@@ -151,11 +153,21 @@ def _in_kernel_types(function: Callable) -> Callable:
     return stage
 
 
+def _with_records(
+    projection: Projection, colors: Floats, background: Floats, bins: TileBins, conventions: Conventions, **asked: bool
+) -> RenderOutput:
+    """Composite by the reference, with records as the kernels keep: else their gradient would have to make them."""
+    records = np.zeros((len(colors), COLOR + max(colors.shape[1], N_FUSED)), colors.dtype)
+    output: RenderOutput = REFERENCE.composite(projection, colors, background, bins, conventions, **asked)
+    return output._replace(kept=records)
+
+
 _REFERENCE: Backend = replace(
     REFERENCE,
     tile_width=CPU.tile_width,
     tile_height=CPU.tile_height,
     project=_in_kernel_types(REFERENCE.project),
+    composite=_with_records,
     composite_vjp=_in_kernel_types(REFERENCE.composite_vjp),
 )
 
