@@ -80,12 +80,12 @@ def _adam(dtype: Dtype) -> None:
 
 
 STAGES: dict[str, Callable[[Dtype], None]] = {
-    "blending, backward": _stage("composite_vjp"),
     "tile lists": _stage("bin_gaussians"),
+    "blending": _stage("composite"),
+    "blending, backward": _stage("composite_vjp"),
     "photometric loss, both ways": _photometric_loss,
     "colours, backward": _stage("sh_colors_vjp"),
     "projection, backward": _stage("project_vjp"),
-    "blending": _stage("composite"),
     "projection": _stage("project"),
     "colours": _stage("sh_colors"),
     "Adam": _adam,
