@@ -54,7 +54,13 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--backends", type=listed(name), metavar="A,B", help="contenders, like cpu-f32,textbook-f32 (default all)"
     )
-    parser.add_argument("--repeats", type=integer(1), default=10, metavar="N", help="turns of each (default 10)")
+    parser.add_argument(
+        "--repeats",
+        type=integer(1),
+        default=10,
+        metavar="N",
+        help="turns of each, with --stages in each of ten rounds (default 10)",
+    )
     parser.add_argument(
         "--against",
         type=listed(name),
