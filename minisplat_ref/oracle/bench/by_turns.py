@@ -1,7 +1,7 @@
 """Times of tasks that take turns, again and again through a whole measurement.
 
-A shared machine is disturbed for seconds at a time: whoever works on the other half of a core makes it a third slower,
-or two threads as slow as one. Tasks timed one after the other would each meet another machine. So those that are to be
+A shared machine is disturbed for seconds at a time: what else it does makes one thread half as slow again, or two
+threads as slow as one. Tasks timed one after the other would each meet another machine. So those that are to be
 compared alternate, and all have their turns in every round. The least time is that of a free machine, the median what
 to expect of this one.
 """
