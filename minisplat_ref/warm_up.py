@@ -22,7 +22,7 @@ import numpy as np
 
 from minisplat_ref.backends import CPU, REFERENCE, Backend
 from minisplat_ref.constants import Conventions
-from minisplat_ref.cpu.records import COLOR, N_FUSED
+from minisplat_ref.cpu.records import record_size
 from minisplat_ref.render import RenderTape, render, render_vjp
 from minisplat_ref.types import Camera, Floats, Gaussians, GeometricWeights, Projection, RenderOutput, TileBins
 
@@ -157,7 +157,7 @@ def _with_records(
     projection: Projection, colors: Floats, background: Floats, bins: TileBins, conventions: Conventions, **asked: bool
 ) -> RenderOutput:
     """Composite by the reference, with records as the kernels keep: else their gradient would have to make them."""
-    records = np.zeros((len(colors), COLOR + max(colors.shape[1], N_FUSED)), colors.dtype)
+    records = np.zeros((len(colors), record_size(colors.shape[1])), colors.dtype)
     output: RenderOutput = REFERENCE.composite(projection, colors, background, bins, conventions, **asked)
     return output._replace(kept=records)
 

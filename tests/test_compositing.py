@@ -334,7 +334,8 @@ def test_composite_gradient_of_many(backend, conventions, rng):
 def test_gradient_of_an_output_from_elsewhere(fast_backend, rng):
     projection = stack([0.3, 0.6, 0.5])
     inputs = (projection, rng.uniform(size=(3, 3)), rng.uniform(size=3))
-    bins = fast_backend.bin_gaussians(projection, TileGrid(6, 5, 32, 16), GSPLAT_MAIN)
+    grid = TileGrid(6, 5, fast_backend.tile_width, fast_backend.tile_height)
+    bins = fast_backend.bin_gaussians(projection, grid, GSPLAT_MAIN)
     output = fast_backend.composite(*inputs, bins, GSPLAT_MAIN)
     assert output.kept is not None
     v = rng.normal(size=(5, 6, 3)), rng.normal(size=(5, 6))

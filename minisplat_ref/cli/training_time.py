@@ -16,6 +16,7 @@ import numpy as np
 from data_tools.synthetic import make_scene
 from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.io import load_scene
+from minisplat_ref.oracle.bench.by_turns import seconds_of
 from minisplat_ref.oracle.bench.opensplat import iteration_seconds
 from minisplat_ref.oracle.bench.profiling import REST, WHOLE, profile_cases, timed
 from minisplat_ref.oracle.bench.roofs import StraightLines
@@ -77,7 +78,7 @@ def thread_cases(folder: Path | None, downscale: int, iterations: int) -> list[C
                     start = time.perf_counter()
                     train(scene, recipe._replace(iterations=step), seed=0, state=state, backend=timed(CPU, seconds))
                     total = time.perf_counter() - start
-                    line = _seconds(lines.forward)
+                    line = seconds_of(lines.forward)
                     turns[n].append({**seconds, REST: total - sum(seconds.values()), WHOLE: total, LINE: line})
     finally:
         numba.set_num_threads(n_all)
@@ -94,12 +95,6 @@ def thread_cases(folder: Path | None, downscale: int, iterations: int) -> list[C
         }
         cases.append(Case(f"threads/iteration/{stage}", is_same, figures, note))
     return cases
-
-
-def _seconds(task: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    task()
-    return time.perf_counter() - start
 
 
 def against_opensplat(program: Path, folder: Path, downscale: int, iterations: int) -> list[Case]:

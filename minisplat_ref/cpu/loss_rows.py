@@ -155,7 +155,8 @@ def loss_kernel(dtype: np.dtype) -> Callable:
         images[:] = targets[:] = -HALF
         ring, s = np.zeros(N_RING * 3 * length, v_image.dtype), np.empty(8 * length, v_image.dtype)
         places = np.empty(N_RING, np.int64)
-        for y in range(start - 3 * HALF_WINDOW, end + HALF_WINDOW, 2):  # rows y and y + 1 get their similarity
+        # Each time two rows are padded, the two from y on get their similarity, and the two from v_y on their gradient.
+        for y in range(start - 3 * HALF_WINDOW, end + HALF_WINDOW, 2):
             for half in range(2):
                 row = y + HALF_WINDOW + half
                 place = row % N_RING * length
@@ -170,24 +171,22 @@ def loss_kernel(dtype: np.dtype) -> Callable:
                 place = row % N_RING * 3 * length
                 derivatives = ring[place : place + 3 * length]
                 if 0 <= row < n_rows:
-                    first, own_s, own_counts = (
-                        row % N_RING * length + PAD,
-                        s[4 * half * length :],
-                        counts[row % len(counts)],
-                    )
+                    first, own_s = row % N_RING * length + PAD, s[4 * half * length :]
+                    own_counts = counts[row % counts.shape[0]]
                     l1, ssim = similarity_row(images, targets, first, own_counts, n_values, length, own_s, derivatives)
                     if start <= row < end:
                         sums[row, 0], sums[row, 1] = l1, ssim
                 else:
                     derivatives[:] = ZERO
-            y -= HALF_WINDOW  # and these their gradient
-            if y < start:
+            v_y = y - HALF_WINDOW
+            if v_y < start:
                 continue
-            _find_rows(y - HALF_WINDOW, 3 * length, places)
+            _find_rows(v_y - HALF_WINDOW, 3 * length, places)
             filter_derivatives(ring, places, length, s)
-            for half in range(min(2, end - y)):
-                first, own_s = (y + half) % N_RING * length + PAD, s[4 * half * length :]
-                vjp_row(images, targets, first, v_l1, v_ssim, length, own_s, v_image[y + half])
+            for half in range(min(2, end - v_y)):
+                row = v_y + half
+                first, own_s = row % N_RING * length + PAD, s[4 * half * length :]
+                vjp_row(images, targets, first, v_l1, v_ssim, length, own_s, v_image[row])
 
     @kernel()
     def loss_rows(image, target, unit, counts, v_l1, v_ssim, n_bands, sums, v_image):

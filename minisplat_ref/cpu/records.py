@@ -25,6 +25,11 @@ N_FUSED = 3  # channels that every record has; fewer are filled up with zeros
 HALF_A_MAX = np.float32(1e30)  # without a low-pass a footprint can be thinner than float32 can square
 
 
+def record_size(n_channels: int) -> int:
+    """Numbers in a record."""
+    return COLOR + max(n_channels, N_FUSED)
+
+
 @scalar
 def _half(factor):
     """Half of a factor of a conic; one that is negative becomes so large that its negative squares are no hits."""
@@ -88,6 +93,6 @@ def records_of(projection: Projection, colors: Floats, conventions: Conventions)
     n, n_channels = colors.shape
     if n_channels < N_FUSED:
         colors = np.pad(colors, ((0, 0), (0, N_FUSED - n_channels)))
-    records = np.empty((n, COLOR + colors.shape[1]), colors.dtype)
+    records = np.empty((n, record_size(n_channels)), colors.dtype)
     _write_records(projection, colors, colors.dtype.type(conventions.alpha_min), records)
     return records

@@ -1,9 +1,9 @@
 """Times of tasks that take turns, again and again through a whole measurement.
 
-A shared machine is disturbed for seconds at a time: what else it does makes one thread half as slow again, or two
-threads as slow as one. Tasks timed one after the other would each meet another machine. So those that are to be
-compared alternate, and all have their turns in every round. The least time is that of a free machine, the median what
-to expect of this one.
+A shared machine is disturbed for seconds at a time: what else it does makes a thread slower, and lets a second one
+bring less. Tasks timed one after the other would each meet another machine. So those that are to be compared
+alternate, and all have their turns in every round. The least time is that of a free machine, the median what to expect
+of this one.
 """
 
 import statistics
@@ -33,6 +33,13 @@ class Contest(NamedTuple):
     """Makes the cases of the times, one of each task."""
 
 
+def seconds_of(task: Task) -> float:
+    """Return how long a task takes, once."""
+    start = time.perf_counter()
+    task()
+    return time.perf_counter() - start
+
+
 def times_by_turns(groups: Sequence[Sequence[Task]], rounds: int, repeats: int) -> list[list[Times]]:
     """Time tasks; those of a group alternate.
 
@@ -54,9 +61,7 @@ def times_by_turns(groups: Sequence[Sequence[Task]], rounds: int, repeats: int) 
         for tasks, of_group in zip(groups, seconds, strict=True):
             for _ in range(repeats):
                 for task, own in zip(tasks, of_group, strict=True):
-                    start = time.perf_counter()
-                    task()
-                    own.append(time.perf_counter() - start)
+                    own.append(seconds_of(task))
     return [[Times(min(own), statistics.median(own)) for own in of_group] for of_group in seconds]
 
 

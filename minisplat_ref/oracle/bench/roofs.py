@@ -220,7 +220,7 @@ def blending(workload: Workload) -> Contest:
 
 
 class StraightLines:
-    """The loops on copies of one tile, as many as there are parts, and the same hits for the reference."""
+    """The loops on copies of one tile, and the same hits for the reference."""
 
     def __init__(self, n_copies: int) -> None:
         f32 = np.float32
