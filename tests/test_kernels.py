@@ -5,8 +5,11 @@ import shutil
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -142,7 +145,7 @@ def test_the_cache_has_one_writer_at_a_time(tmp_path):
 
 def test_kernels_are_saved_under_the_lock(tmp_path, monkeypatch):
     locked = []
-    monkeypatch.setattr(_jit, "cache_folder", lambda: str(tmp_path))
+    monkeypatch.setattr(_jit, "cache_folder", lambda function: str(tmp_path))
     monkeypatch.setattr(_jit, "_one_process_at_a_time", lambda folder: nullcontext(locked.append(folder)))
 
     @_jit.kernel(parallel=False)
@@ -172,6 +175,90 @@ def test_a_function_is_named_after_what_it_closes_over():
     names = [make(1, 2), make(2, 2), make(1, 3)]
     assert len(set(names)) == 3  # by its own number, and by that of the function inside
     assert make(1, 2) == names[0]
+
+
+def hit(x):
+    return x
+
+
+class Functions(NamedTuple):
+    first: Callable
+    second: Callable
+
+
+def test_functions_of_one_name_are_told_apart():
+    def make(*functions):
+        bundle = Functions(*functions)
+
+        @_jit.scalar
+        def outer(x):
+            return bundle.first(bundle.second(x))
+
+        return outer.__qualname__
+
+    other = ModuleType("other_module")
+    exec("def hit(x):\n    return 2 * x", other.__dict__)
+    assert make(hit, other.hit) not in (make(hit, hit), make(other.hit, hit))
+    assert make(hit, hit) == make(hit, hit) and "0x" not in _jit._name_of(Functions(hit, other.hit))
+
+
+def test_a_closure_without_a_lasting_name_is_refused():
+    something = object()
+
+    def outer():
+        return something
+
+    with pytest.raises(TypeError, match="closes over a object, whose name would be an address"):
+        _jit.scalar(outer)
+
+
+MODULES_OF_ONE_NAME = {
+    "first.py": "def hit(x):\n    return x + 1\n",
+    "second.py": "def hit(x):\n    return 10 * x\n",
+    "factory.py": """
+import numba
+from minisplat_ref.scalar._jit import kernel, scalar
+
+def make(function):
+    hit = scalar(function)
+
+    @kernel(parallel=False)
+    def apply(values):
+        for i in range(values.size):
+            values[i] = hit(values[i])
+
+    return apply
+""",
+    "main.py": """
+import sys
+import numpy as np
+import first, second
+from factory import make
+for name in sys.argv[1:]:
+    values = np.full(3, 5.0)
+    make({"first": first, "second": second}[name].hit)(values)
+    print(values[0])
+""",
+}
+
+
+def test_kernels_of_functions_of_one_name_are_not_mixed_up(tmp_path):
+    for name, text in MODULES_OF_ONE_NAME.items():
+        (tmp_path / name).write_text(text)
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels"), "PYTHONPATH": str(PACKAGE.parent)}
+
+    def run(*names):
+        command = [sys.executable, "main.py", *names]
+        done = subprocess.run(command, cwd=tmp_path, env=environment, check=True, capture_output=True, text=True)
+        return [float(line) for line in done.stdout.split()]
+
+    assert run("first") == [6.0] and run("second") == [50.0]  # two processes, each compiles one
+    assert run("first", "second") == [6.0, 50.0]  # a third loads both
+    before = {path for path in (tmp_path / "kernels").rglob("*.nbc")}
+    assert len(before) == 2
+    (tmp_path / "second.py").write_text("def hit(x):\n    return 20 * x\n")
+    assert run("first", "second") == [6.0, 100.0]  # and an edit of one compiles that one again
+    assert len(set((tmp_path / "kernels").rglob("*.nbc")) - before) == 1
 
 
 FROM_CACHE = """
@@ -204,7 +291,7 @@ def test_compiled_and_cached_kernels_give_the_same_bytes(tmp_path):
 
 @pytest.mark.parametrize(
     "source",
-    ["scalar/covariance.py", "cpu/blend_forward.py", "oracle/bench/exponentials.py", "constants.py", "types.py"],
+    ["scalar/covariance.py", "cpu/blend_forward.py", "cpu/deeper/new.py", "oracle/bench/exponentials.py", "types.py"],
 )
 def test_cache_folder_follows_the_sources(source, tmp_path, monkeypatch):
     # Numba notices no change in a function that a kernel calls from another file: hence a folder per source hash.
@@ -214,11 +301,12 @@ def test_cache_folder_follows_the_sources(source, tmp_path, monkeypatch):
     monkeypatch.setattr(_jit, "_PACKAGE", copy)
     monkeypatch.setattr(_jit, "source_hash", _jit.source_hash.__wrapped__)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    folder = _jit.cache_folder.__wrapped__()
+    folder = _jit.cache_folder()
     assert Path(folder) == tmp_path / "cache" / before and Path(folder).is_dir()
+    (copy / source).parent.mkdir(exist_ok=True)
     with (copy / source).open("a") as file:
         file.write("\n")
-    assert _jit.cache_folder.__wrapped__() != folder
+    assert _jit.cache_folder() != folder
 
 
 def test_cache_folder_ignores_what_no_kernel_is_made_of(tmp_path, monkeypatch):
