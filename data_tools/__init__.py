@@ -1,1 +1,1 @@
-"""Programs that make and prepare scenes: synthetic scenes, structure from motion, undistortion, downscaling."""
+"""Scripts for work in the repository, which is where they run; the program itself is ``minisplat-ref``."""

@@ -11,7 +11,7 @@ from typing import Any
 
 import minisplat_ref.cpu.adam
 import minisplat_ref.cpu.compositing
-import minisplat_ref.cpu.compositing_exact
+import minisplat_ref.cpu.compositing.exact
 import minisplat_ref.cpu.depth
 import minisplat_ref.cpu.geometric_loss
 import minisplat_ref.cpu.loss
@@ -104,8 +104,8 @@ CPU = _from_package("cpu", cpu, TILE_WIDTH, TILE_HEIGHT)
 CPU_EXACT = replace(
     CPU,
     name="cpu-exact",
-    composite=cpu.compositing_exact.composite,
-    composite_vjp=cpu.compositing_exact.composite_vjp,
+    composite=cpu.compositing.exact.composite,
+    composite_vjp=cpu.compositing.exact.composite_vjp,
 )
 """The same with libm's exponential in float32 too."""
 

@@ -16,7 +16,7 @@ import numpy as np
 from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
-from minisplat_ref.render import render
+from minisplat_ref.rendering import render
 from minisplat_ref.types import Bools, Floats, Gaussians, Ints, View
 
 LPIPS_UNAVAILABLE = (None, "LPIPS needs the weights of a trained network, which are not part of minisplat_ref")

@@ -1,7 +1,7 @@
 """One view of activated Gaussians: projected, shaded, sorted into tiles, composited; and the way back.
 
 The order of the stages is 3DGS section 6's. What the Gaussians are before their activations, and where their colours
-come from, is left to the caller: :mod:`minisplat_ref.render` holds trained parameters and spherical harmonics,
+come from, is left to the caller: :mod:`minisplat_ref.rendering` holds trained parameters and spherical harmonics,
 :mod:`minisplat_ref.gsplat_door` whatever it is given.
 """
 

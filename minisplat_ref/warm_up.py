@@ -22,8 +22,8 @@ import numpy as np
 
 from minisplat_ref.backends import CPU, REFERENCE, Backend
 from minisplat_ref.constants import Conventions
-from minisplat_ref.cpu.records import record_size
-from minisplat_ref.render import RenderTape, render, render_vjp
+from minisplat_ref.cpu.compositing.records import record_size
+from minisplat_ref.rendering import RenderTape, render, render_vjp
 from minisplat_ref.types import Camera, Floats, Gaussians, GeometricWeights, Projection, RenderOutput, TileBins
 
 WIDTH, HEIGHT = 24, 18

@@ -34,14 +34,14 @@ from IPython.display import Markdown, display
 from matplotlib.patches import Ellipse, FancyBboxPatch
 
 import minisplat_ref
-from data_tools.synthetic import make_scene
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN, PROFILES
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import psnr
-from minisplat_ref.recipes import get_recipe
 from minisplat_ref.reference.tiling import bin_gaussians
-from minisplat_ref.render import render
-from minisplat_ref.train import initial_state, train
+from minisplat_ref.rendering import render
+from minisplat_ref.training.loop import initial_state, train
 from minisplat_ref.types import TileGrid
 
 plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
@@ -214,16 +214,16 @@ display(Markdown("\n".join(["| module | what it says of itself |", "|---|---|", 
 # | 4 | `reference/tiling.py`, `hits.py`, `compositing.py` | 03 | how ellipses become pixels |
 # | 5 | the `_vjp` functions beside them | 04 | how a pixel's error reaches every parameter |
 # | 6 | `reference/loss.py`, `depth.py` | 05 | what is minimised |
-# | 7 | `render.py`, `train.py`, `recipes/`, `events/`, `strategy/initialization.py` | 06 | how a scene is trained |
+# | 7 | `rendering.py`, `training/loop.py`, `methods/`, `strategy/initialization.py` | 06 | how a scene is trained |
 # | 8 | `strategy/clone_split.py`, `blur_split.py` | 07 | density control and blur split: who becomes two |
 # | 9 | `strategy/depth_reinit.py` | 08 | depth reinitialisation: where surfaces are, and what fools it |
 # | 10 | `strategy/importance.py`, `simplify.py` | 09 | importance and simplification: who may go |
 # | 11 | `strategy/aggressive_clone.py`, `visibility.py` | 10 | aggressive clone and visibility culling |
-# | 12 | `recipes/mini_splatting.py`, `mini_splatting2.py` | 11 | three recipes side by side |
+# | 12 | `methods/mini_splatting.py`, `mini_splatting2.py` | 11 | three recipes side by side |
 # | 13 | `oracle/differences.py`, `gradients.py`, `planted.py` | 12 | how a gradient check lies |
 # | 14 | `oracle/golden/`, `comparison/` | 13 | comparing a backend with the oracle |
 # | 15 | `scalar/`, then `cpu/` | 15 | how the same formulas run fast: eight pixels at a time |
-# | 16 | `oracle/bench/` | 14 | speed against error |
+# | 16 | `bench/` | 14 | speed against error |
 #
 # Names are the field's own: `means`, `quats` (wxyz, any length), `log_scales`, `opacity_logits` are what is trained;
 # `scales` and `opacities` are what comes out of the activations. `v_x` is the derivative of the loss by `x`.

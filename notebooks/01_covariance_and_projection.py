@@ -38,8 +38,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Ellipse, Rectangle
 
-from data_tools.synthetic.cameras import look_at
 from minisplat_ref.constants import GSPLAT_MAIN, INRIA
+from minisplat_ref.datasets.synthetic.cameras import look_at
 from minisplat_ref.reference.compositing import composite
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.reference.pinhole import pinhole, pinhole_jacobians, slope_limits

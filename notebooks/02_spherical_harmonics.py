@@ -31,12 +31,12 @@ import inspect
 import matplotlib.pyplot as plt
 import numpy as np
 
-from data_tools.synthetic.cameras import look_at
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
+from minisplat_ref.datasets.synthetic.cameras import look_at
 from minisplat_ref.reference.compositing import composite
 from minisplat_ref.reference.spherical_harmonics import sh_basis, sh_colors
-from minisplat_ref.render import render
+from minisplat_ref.rendering import render
 from minisplat_ref.types import Gaussians, TileGrid
 
 plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})

@@ -36,15 +36,15 @@ import inspect
 import matplotlib.pyplot as plt
 import numpy as np
 
-from data_tools.synthetic import make_scene
-from data_tools.synthetic.tracer import camera_centre, pixel_rays
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import DEPTH_ALPHA_MIN, GSPLAT_MAIN, SH_C0
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.datasets.synthetic.tracer import camera_centre, pixel_rays
 from minisplat_ref.reference.compositing import composite, composite_all_pairs
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.reference.projection import project
 from minisplat_ref.reference.tiling import bin_gaussians
-from minisplat_ref.render import render
+from minisplat_ref.rendering import render
 from minisplat_ref.types import Camera, Gaussians, TileGrid
 
 plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})

@@ -47,7 +47,7 @@ from minisplat_ref.reference.compositing import composite, composite_vjp
 from minisplat_ref.reference.extent import extents
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.reference.tiling import bin_gaussians
-from minisplat_ref.render import render, render_vjp
+from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.types import Camera, Gaussians, Projection, TileGrid
 
 plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})

@@ -40,8 +40,8 @@ import numpy as np
 from matplotlib.patches import Rectangle
 from scipy.ndimage import gaussian_filter
 
-from data_tools.synthetic import make_scene
 from minisplat_ref.constants import SSIM_SIGMA, SSIM_WINDOW
+from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.metrics import psnr
 from minisplat_ref.reference.loss import photometric_loss, photometric_loss_vjp, ssim_map, ssim_map_vjp
 

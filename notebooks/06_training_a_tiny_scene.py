@@ -44,12 +44,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.collections import EllipseCollection
 
-from data_tools.synthetic import make_scene
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.methods import RECIPES, get_recipe
 from minisplat_ref.metrics import evaluate
-from minisplat_ref.recipes import RECIPES, Every, get_recipe
-from minisplat_ref.render import render
+from minisplat_ref.rendering import render
 from minisplat_ref.strategy import clone_split
-from minisplat_ref.train import _iterate, initial_state, train
+from minisplat_ref.training.loop import _iterate, initial_state, train
+from minisplat_ref.training.schedule import Every
 
 plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
 RED, BLUE, YELLOW, GREEN, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#8a8580"

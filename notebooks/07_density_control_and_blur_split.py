@@ -47,16 +47,16 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.collections import EllipseCollection
 
-from data_tools.synthetic import make_scene
-from minisplat_ref import events
 from minisplat_ref.backends import CPU
 from minisplat_ref.constants import SH_C0
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.methods import gaussian_splatting, get_recipe, mini_splatting
 from minisplat_ref.metrics import evaluate, psnr
-from minisplat_ref.recipes import During, Every, get_recipe
-from minisplat_ref.render import render, render_vjp
+from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.strategy.blur_split import is_blurred, principal_axis_children
 from minisplat_ref.strategy.clone_split import clone_and_split, logit, random_children, screen_gradient_norms
-from minisplat_ref.train import initial_state, train
+from minisplat_ref.training.loop import initial_state, train
+from minisplat_ref.training.schedule import During, Every
 from minisplat_ref.types import Camera, Gaussians
 
 plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
@@ -152,14 +152,19 @@ base = get_recipe("3dgs-accel", 1000)._replace(sh_milestones=())
 def density_control(start, stop, has_blur_split=False, draw_children=random_children):
     """Events every 50 iterations."""
     densify = partial(
-        events.clone_and_split, threshold=THRESHOLD, size_fraction=SIZE_FRACTION, draw_children=draw_children
+        gaussian_splatting.clone_and_split,
+        threshold=THRESHOLD,
+        size_fraction=SIZE_FRACTION,
+        draw_children=draw_children,
     )
-    blur = During(partial(events.collect_blur, area_fraction=AREA_FRACTION), start, stop, needs_blend_stats=True)
+    blur = During(
+        partial(mini_splatting.collect_blur, area_fraction=AREA_FRACTION), start, stop, needs_blend_stats=True
+    )
     return (
-        During(events.collect_gradients),
+        During(gaussian_splatting.collect_gradients),
         *([blur] if has_blur_split else []),
         Every(50, densify, start, stop),
-        Every(50, partial(events.prune_faint, least_opacity=0.005), start, stop),
+        Every(50, partial(gaussian_splatting.prune_faint, least_opacity=0.005), start, stop),
     )
 
 
@@ -445,7 +450,7 @@ plt.show()
 # off hangs somewhere in the room, the wall behind it has a hole, and every event comes before the last one has healed.
 # The released code draws at random and has thousands of iterations for the repair. The recipes of this package cut.
 #
-# It is a matter of thresholds, too. `python -m data_tools.studies split SCENE --out DIR` trains a whole recipe all four
+# It is a matter of thresholds, too. `minisplat-ref study split SCENE --out DIR` trains a whole recipe all four
 # ways: on this room at 160 x 120 pixels, in 1500 iterations of `mini-splatting-d`, they end within 0.1 dB of each
 # other. There the gradient's threshold is the published one, which in small images asks for a split nearly everywhere,
 # and the area's adds hardly anybody.

@@ -44,13 +44,20 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Ellipse
 
-from data_tools.studies.depth_types import OFF_SURFACE, Choice, depth_errors, drawn_points, errors, train_from
-from data_tools.synthetic import make_scene
 from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.experiments.studies.depth_types import (
+    OFF_SURFACE,
+    Choice,
+    depth_errors,
+    drawn_points,
+    errors,
+    train_from,
+)
+from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
-from minisplat_ref.recipes import get_recipe
-from minisplat_ref.render import render
+from minisplat_ref.rendering import render
 from minisplat_ref.strategy.depth_reinit import (
     _confirmed,
     blended_points,
@@ -59,7 +66,7 @@ from minisplat_ref.strategy.depth_reinit import (
     reinitial_points,
 )
 from minisplat_ref.strategy.initialization import from_points
-from minisplat_ref.train import train
+from minisplat_ref.training.loop import train
 from minisplat_ref.types import Camera, Gaussians
 
 plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
@@ -349,7 +356,7 @@ for name in ("outdoor", "plain-wall"):
 # At 160 x 120, over three seeds, the outdoor scene ends at 19.1 dB from the paper's points, at 18.7 dB with the vote
 # and at 24.2 dB with vote and backdrop (the study below), which is what the recipes take.
 #
-# **To try:** `python -m data_tools.studies depth outdoor --out DIR` does the same at 160 x 120, over three seeds; set
+# **To try:** `minisplat-ref study depth outdoor --out DIR` does the same at 160 x 120, over three seeds; set
 # `depth_tolerance` to 0.01 and to 0.3; train for longer before reinitialisation, and see whether the sky settles.
 #
 # ## What was shown

@@ -46,17 +46,17 @@ import numpy as np
 from matplotlib.patches import Ellipse
 from scipy.spatial import cKDTree
 
-from data_tools.synthetic import make_scene
 from minisplat_ref.constants import SH_C0
-from minisplat_ref.events import TrainState
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
-from minisplat_ref.optim.adam import zero_moments
-from minisplat_ref.recipes import get_recipe
 from minisplat_ref.reference.covariance import covariances
-from minisplat_ref.render import render
+from minisplat_ref.rendering import render
 from minisplat_ref.strategy import importance, simplify
 from minisplat_ref.strategy.ops import take
-from minisplat_ref.train import train
+from minisplat_ref.training.adam import zero_moments
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Gaussians
 
 plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
@@ -400,7 +400,7 @@ plt.show()
 
 # %% [markdown]
 # **To try:** take `outdoor` for the candidates, and see which parts of the room thin out; set `FRACTION` to 0.05;
-# run `python -m data_tools.studies simplify --help`, which draws the curves on any scene, over several seeds and after
+# run `minisplat-ref study simplify --help`, which draws the curves on any scene, over several seeds and after
 # fine-tuning.
 #
 # ## What was shown

@@ -49,18 +49,19 @@ os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from data_tools.synthetic import make_scene
-from minisplat_ref import events
 from minisplat_ref.backends import CPU
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.methods import gaussian_splatting, get_recipe, mini_splatting2
 from minisplat_ref.metrics import evaluate, psnr
-from minisplat_ref.recipes import At, During, Every, get_recipe
-from minisplat_ref.render import render, render_vjp
+from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.strategy import aggressive_clone, visibility
 from minisplat_ref.strategy.blur_split import principal_axis_children
 from minisplat_ref.strategy.clone_split import screen_gradient_norms
 from minisplat_ref.strategy.importance import collect_importance, indoor, mass_mask
 from minisplat_ref.strategy.ops import Edit, concat
-from minisplat_ref.train import train
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.schedule import At, During, Every
+from minisplat_ref.training.state import apply_edit
 
 plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
 RED, BLUE, YELLOW, GREEN, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#8a8580"
@@ -159,11 +160,13 @@ base = get_recipe("3dgs-accel", 1000)._replace(sh_milestones=())
 
 def density_control(start, stop):
     """Events every 50 iterations; the threshold suits small images, the children are those of notebook 07."""
-    densify = partial(events.clone_and_split, threshold=1e-3, size_fraction=0.01, draw_children=principal_axis_children)
+    densify = partial(
+        gaussian_splatting.clone_and_split, threshold=1e-3, size_fraction=0.01, draw_children=principal_axis_children
+    )
     return (
-        During(events.collect_gradients, start, stop),
+        During(gaussian_splatting.collect_gradients, start, stop),
         Every(50, densify, start, stop),
-        Every(50, partial(events.prune_faint, least_opacity=0.005), start, stop),
+        Every(50, partial(gaussian_splatting.prune_faint, least_opacity=0.005), start, stop),
     )
 
 
@@ -379,19 +382,23 @@ for name, ratio in ratios.items():
 # clones. The latter remove, clone and cull:
 
 # %%
-show_code(events.aggressive_clone)
+show_code(mini_splatting2.aggressive_clone)
 
 
 def copy_plainly(state, iteration):
     """An event: double the critical Gaussians as they are."""
     found = collect_importance(state.gaussians, cameras)
-    events.apply_edit(state, plain_copies(state.gaussians, aggressive_clone.critical_by_mass(found)))
+    apply_edit(state, plain_copies(state.gaussians, aggressive_clone.critical_by_mass(found)))
     for name in ("gradient_sum", "view_count"):
         state.stats.pop(name, None)
 
 
 cloning = partial(
-    events.aggressive_clone, critical=aggressive_clone.critical_by_mass, factor=2, tail_mass=0.999, least_views=2
+    mini_splatting2.aggressive_clone,
+    critical=aggressive_clone.critical_by_mass,
+    factor=2,
+    tail_mass=0.999,
+    least_views=2,
 )
 CLONE_STEPS = (325, 425)
 ways = {
@@ -481,7 +488,7 @@ plt.show()
 # points from the depth of the views as there are Gaussians by then (notebook 08), and for that the number counts.
 #
 # **To try:** `factor=4` in the clone; `critical_by_weight`; a visibility mass of 0.9 in `collect_importance`, and what
-# it does to the picture. `python -m data_tools.studies culling SCENE --out DIR` measures fraction, time and PSNR on
+# it does to the picture. `minisplat-ref study culling SCENE --out DIR` measures fraction, time and PSNR on
 # any scene.
 #
 # ## What was shown

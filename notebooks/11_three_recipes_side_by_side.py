@@ -46,11 +46,12 @@ os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from data_tools.synthetic import make_scene
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.methods import RECIPES
 from minisplat_ref.metrics import evaluate
-from minisplat_ref.recipes import RECIPES, During, Every, scaled
-from minisplat_ref.render import render
-from minisplat_ref.train import initial_state, train
+from minisplat_ref.rendering import render
+from minisplat_ref.training.loop import initial_state, train
+from minisplat_ref.training.schedule import During, Every, scaled
 
 plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
 RED, BLUE, YELLOW, GREEN, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#8a8580"

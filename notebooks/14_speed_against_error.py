@@ -42,14 +42,14 @@ import numpy as np
 from IPython.display import display
 
 from minisplat_ref.backends import CPU, REFERENCE
+from minisplat_ref.bench.contenders import all_contenders
+from minisplat_ref.bench.exponentials import EXPONENTIALS, relative_errors
+from minisplat_ref.bench.figure import pareto_figure
+from minisplat_ref.bench.judging import backward, expect, failure, forward, judge
+from minisplat_ref.bench.judging import relative_errors as by_parameter
+from minisplat_ref.bench.race import race
+from minisplat_ref.bench.workloads import synth
 from minisplat_ref.constants import GSPLAT_MAIN
-from minisplat_ref.oracle.bench.contenders import all_contenders
-from minisplat_ref.oracle.bench.exponentials import EXPONENTIALS, relative_errors
-from minisplat_ref.oracle.bench.figure import pareto_figure
-from minisplat_ref.oracle.bench.judging import backward, expect, failure, forward, judge
-from minisplat_ref.oracle.bench.judging import relative_errors as by_parameter
-from minisplat_ref.oracle.bench.race import race
-from minisplat_ref.oracle.bench.workloads import synth
 from minisplat_ref.oracle.planted import planted
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_GRADIENT, BENCH_FLOAT32_IMAGE, BENCH_FLOAT64
 from minisplat_ref.reference.hits import tile_hits

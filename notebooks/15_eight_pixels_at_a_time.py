@@ -26,7 +26,7 @@
 # | `minisplat_ref/scalar/lanes.py` | eight numbers as one value |
 # | `minisplat_ref/cpu/tile_state.py` | what the pixels of a tile remember |
 # | `minisplat_ref/cpu/tile_rows.py` | which rows of a tile a Gaussian reaches, and its alpha there |
-# | `minisplat_ref/cpu/blend_forward.py`, `blend_backward.py` | the kernels |
+# | `minisplat_ref/cpu/compositing/forward.py`, `backward.py` | the kernels |
 #
 # **Frames and units:** pixels; x to the right, y down, the first pixel's centre at (0.5, 0.5).
 
@@ -44,17 +44,17 @@ import numpy as np
 from matplotlib.patches import Rectangle
 
 from minisplat_ref.backends import CPU, REFERENCE
+from minisplat_ref.bench.roofs import rows_worked_on
+from minisplat_ref.bench.workloads import synth
 from minisplat_ref.constants import GSPLAT_MAIN
-from minisplat_ref.cpu.records import records_of
-from minisplat_ref.cpu.tile_rows import reached_rows
-from minisplat_ref.cpu.tile_state import N_ROWS, N_STRIPS, rows_of
+from minisplat_ref.cpu.compositing.records import records_of
+from minisplat_ref.cpu.compositing.tile_rows import reached_rows
+from minisplat_ref.cpu.compositing.tile_state import N_ROWS, N_STRIPS, rows_of
 from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
-from minisplat_ref.oracle.bench.roofs import rows_worked_on
-from minisplat_ref.oracle.bench.workloads import synth
+from minisplat_ref.jit.lanes import WIDTH, load, store
 from minisplat_ref.reference.hits import tile_hits
-from minisplat_ref.render import render
+from minisplat_ref.rendering import render
 from minisplat_ref.scalar.compositing import Frame, blend
-from minisplat_ref.scalar.lanes import WIDTH, load, store
 from minisplat_ref.types import Projection, TileGrid
 
 plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})

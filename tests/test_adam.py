@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from tolerances import ADAM_FLOAT32, CLOSED_FORM
 
-from minisplat_ref.optim.adam import AdamRule, adam_step, zero_moments
+from minisplat_ref.training.adam import AdamRule, adam_step, zero_moments
 
 
 class Pair(NamedTuple):

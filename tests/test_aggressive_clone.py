@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from tolerances import ALPHA_INTEGRAL, CLOSED_FORM, PRINTED_DIGITS, ROUNDED_TO_FLOAT32
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.render import render
+from minisplat_ref.rendering import render
 from minisplat_ref.strategy.aggressive_clone import (
     LEAST_SHARED_OPACITY,
     clone,

@@ -12,16 +12,28 @@ import pytest
 from tolerances import BENCH_ROOM_FOR_EXPONENTIAL, ROUNDED_TO_FLOAT32
 
 from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.cli import main, peak_memory, start_time, training_time
+from minisplat_ref.bench import (
+    by_turns,
+    contenders,
+    limits,
+    peak_memory,
+    profiling,
+    race,
+    roofs,
+    slopes,
+    start_time,
+    training_time,
+    workloads,
+)
+from minisplat_ref.bench.by_turns import hold, times_by_turns
+from minisplat_ref.bench.exponentials import EXPONENTIALS, relative_errors
+from minisplat_ref.bench.flips import thresholds
+from minisplat_ref.bench.peers import peers_of
+from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.images import read_image
-from minisplat_ref.optim.adam import adam_step
-from minisplat_ref.oracle.bench import by_turns, contenders, limits, profiling, race, roofs, slopes, workloads
-from minisplat_ref.oracle.bench.by_turns import hold, times_by_turns
-from minisplat_ref.oracle.bench.exponentials import EXPONENTIALS, relative_errors
-from minisplat_ref.oracle.bench.flips import thresholds
-from minisplat_ref.oracle.bench.peers import peers_of
+from minisplat_ref.jit.compile import cache_root
 from minisplat_ref.oracle.planted import planted
 from minisplat_ref.oracle.tolerances import (
     BENCH_FLOAT32_GRADIENT,
@@ -29,9 +41,9 @@ from minisplat_ref.oracle.tolerances import (
     BENCH_FLOAT32_LOSS,
     BENCH_FLOAT64,
 )
-from minisplat_ref.render import render
-from minisplat_ref.scalar._jit import cache_root
-from minisplat_ref.train import train
+from minisplat_ref.rendering import render
+from minisplat_ref.training.adam import adam_step
+from minisplat_ref.training.loop import train
 from minisplat_ref.types import Gaussians
 
 PEAK = ("peak", "bound")
@@ -241,8 +253,8 @@ def test_opensplat_needs_photographs(tmp_path, capsys):
 
 
 def test_opensplat_is_timed_by_its_command_line(tmp_path, capsys, monkeypatch):
-    from data_tools.synthetic import make_scene
-    from data_tools.synthetic.files import write_scene
+    from minisplat_ref.datasets.synthetic import make_scene
+    from minisplat_ref.datasets.synthetic.files import write_scene
 
     settings = {"n_views": 4, "width": 32, "height": 24, "n_points": 300}
     write_scene(make_scene("room", **settings), tmp_path / "room", settings)

@@ -7,7 +7,7 @@ from scenes import as_dtype, make_camera, make_gaussians
 from tolerances import CLOSED_FORM, ROUNDED_TO_FLOAT32
 
 from minisplat_ref.reference.covariance import covariances
-from minisplat_ref.render import render
+from minisplat_ref.rendering import render
 from minisplat_ref.strategy.blur_split import LEAST_BLURRED_AREA, is_blurred, principal_axis_children
 from minisplat_ref.strategy.clone_split import clone_and_split, random_children
 from minisplat_ref.strategy.ops import take

@@ -12,18 +12,18 @@ import pytest
 from tolerances import PSNR_FLOAT32
 
 import minisplat_ref
-from data_tools.synthetic import make_scene
-from data_tools.synthetic.files import write_scene
 from minisplat_ref import InputError, load_ply, load_scene, save_ply
 from minisplat_ref.backends import BACKENDS, CPU
 from minisplat_ref.cli import COMMANDS, build_parser, demo, main
-from minisplat_ref.cli.arguments import BACKENDS as BACKEND_CHOICES
-from minisplat_ref.cli.pictures import GAP, error_picture, to_picture
-from minisplat_ref.cli.progress import LOG_EVERY, Progress, read_log
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.datasets.synthetic.files import write_scene
+from minisplat_ref.experiments.arguments import BACKENDS as BACKEND_CHOICES
+from minisplat_ref.experiments.pictures import GAP, error_picture, to_picture
+from minisplat_ref.experiments.progress import LOG_EVERY, Progress, read_log
 from minisplat_ref.io import read_image
+from minisplat_ref.methods import RECIPES
 from minisplat_ref.metrics import evaluate, psnr
-from minisplat_ref.recipes import RECIPES
-from minisplat_ref.render import render
+from minisplat_ref.rendering import render
 
 WIDTH, HEIGHT = 32, 24
 N_TRAIN, N_TEST = 6, 2

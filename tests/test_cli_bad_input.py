@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from photo_scenes import PINHOLE, edit_transforms, write_colmap, write_transforms
 
-from data_tools.synthetic import make_scene
-from data_tools.synthetic.files import write_scene
 from minisplat_ref import Gaussians, save_ply
 from minisplat_ref.cli import main
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.io.images import write_image
 from minisplat_ref.io.ply import load_ply
 
@@ -84,7 +84,7 @@ def test_missing_scene_folder(train_refused, tmp_path):
 def test_folder_without_a_scene(train_refused, tmp_path):
     (tmp_path / "empty").mkdir()
     line = train_refused(tmp_path / "empty")
-    assert str(tmp_path / "empty") in line and "data_tools.sfm" in line
+    assert str(tmp_path / "empty") in line and "minisplat-ref sfm" in line
 
 
 def test_missing_images_folder(train_refused, tmp_path):
@@ -116,7 +116,7 @@ def test_image_that_does_not_match_its_camera(train_refused, tmp_path):
 def test_distorted_camera_model_names_the_way_out(train_refused, tmp_path):
     scene = write_colmap(tmp_path / "scene", model="OPENCV", params=OPENCV)
     line = train_refused(scene)
-    assert "OPENCV" in line and "data_tools.undistort" in line
+    assert "OPENCV" in line and "minisplat-ref undistort" in line
 
 
 def test_unsupported_camera_model_with_undistort(train_refused, tmp_path):

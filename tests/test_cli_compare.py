@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 from tolerances import CLOSED_FORM
 
-from data_tools.synthetic import make_scene
-from data_tools.synthetic.files import write_scene
 from minisplat_ref.cli import main
-from minisplat_ref.cli.comparison import runs as runs_module
-from minisplat_ref.cli.comparison import speed
-from minisplat_ref.cli.comparison.crops import best_window, choose_crops, detail, difference
-from minisplat_ref.cli.comparison.measures import (
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.datasets.synthetic.files import write_scene
+from minisplat_ref.experiments.comparison import runs as runs_module
+from minisplat_ref.experiments.comparison import speed
+from minisplat_ref.experiments.comparison.crops import best_window, choose_crops, detail, difference
+from minisplat_ref.experiments.comparison.measures import (
     MEASURES,
     RecipeMeasures,
     Spread,
@@ -31,11 +31,12 @@ from minisplat_ref.cli.comparison.measures import (
     seconds_to_reach,
     spread,
 )
-from minisplat_ref.cli.comparison.plan import Plan, eval_every
-from minisplat_ref.cli.comparison.table import as_markdown, table_cells
-from minisplat_ref.cli.progress import read_log
+from minisplat_ref.experiments.comparison.plan import Plan, eval_every
+from minisplat_ref.experiments.comparison.table import as_markdown, table_cells
+from minisplat_ref.experiments.progress import read_log
 from minisplat_ref.io import load_ply, load_scene
-from minisplat_ref.recipes import RECIPES, At, describe
+from minisplat_ref.methods import RECIPES
+from minisplat_ref.training.schedule import At, describe
 from minisplat_ref.types import Gaussians
 
 SCENE = {"n_views": 8, "width": 32, "height": 24, "n_points": 60, "test_every": 4}

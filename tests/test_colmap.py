@@ -208,7 +208,7 @@ def test_distortion_is_refused_with_the_way_out(tmp_path):
     write_colmap(tmp_path, model="OPENCV", params=DISTORTED)
     with pytest.raises(InputError, match=r"lens distortion \(camera model OPENCV\)") as caught:
         load_colmap(tmp_path)
-    assert f"`python -m data_tools.undistort {tmp_path} --out DIR`" in str(caught.value)
+    assert f"`minisplat-ref undistort {tmp_path} --out DIR`" in str(caught.value)
 
 
 def test_undistorted_pixels_look_where_the_camera_says(tmp_path):
@@ -284,12 +284,12 @@ BAD_SCENES = {
     "wrong images_2": (
         write_wrong_downscaled_image,
         {"downscale": 2},
-        r"images_2/0001\.png: the image is 8x6 but 1/2 of its camera is 16x12; remove .*data_tools\.downscale .*images",
+        r"images_2/0001\.png: the image is 8x6 but 1/2 of its camera is 16x12; remove .*minisplat-ref downscale .*images",
     ),
     "no cameras": (
         remove("sparse", "0", "cameras.txt"),
         {},
-        r"no COLMAP model, looked for .* run `python -m data_tools\.sfm",
+        r"no COLMAP model, looked for .* run `minisplat-ref sfm",
     ),
     "no points": (
         remove("sparse", "0", "points3D.txt"),
@@ -383,7 +383,9 @@ def test_nothing_there(tmp_path):
     with pytest.raises(InputError, match=r"nowhere: no such folder"):
         load_scene(tmp_path / "nowhere")
     looked_for = "sparse/0/cameras.bin or .txt, sparse/cameras.bin or .txt, transforms_train.json, transforms.json;"
-    with pytest.raises(InputError, match=f"no scene here, looked for {looked_for} .*data_tools.sfm PHOTOS --out SCENE"):
+    with pytest.raises(
+        InputError, match=f"no scene here, looked for {looked_for} .*minisplat-ref sfm PHOTOS --out SCENE"
+    ):
         load_scene(tmp_path)
 
 

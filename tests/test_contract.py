@@ -14,16 +14,16 @@ from minisplat_ref.backends import BACKENDS, REFERENCE, Backend
 MODULES = [module.name for module in iter_modules(reference.__path__)]
 STAGES = [field.name for field in fields(Backend) if field.name not in ("name", "tile_width", "tile_height")]
 
-# Modules of cpu without a twin of their name: parts of the compositing and sorting kernels, not stages.
-BLENDING_PARTS = {"blend_forward", "blend_backward", "tile_state", "tile_rows", "records", "pair_sums", "exponential"}
-KERNEL_PARTS = BLENDING_PARTS | {"footprints", "layers", "sorting", "gaussian_rows", "loss_rows", "memory"}
+# Modules of cpu without a twin of their name: what several stages use. A stage of several files is a folder, and its
+# functions stand in the folder's own module.
+KERNEL_PARTS = {"gaussian_rows", "memory"}
 
 # Public functions of cpu without a twin: they prepare arguments for kernels.
 CPU_ONLY = {
     "projection.camera_centre": "computed in float64 before the loop; the reference does it with matrices",
     "projection.pose_of": "the same for the point that the camera maps to 0",
     "projection.lens_of": "conventions as float64 scalars",
-    "compositing.composite_with": "the exponential is an argument, which compositing_exact fills in, too",
+    "compositing.composite_with": "the exponential is an argument, which compositing.exact fills in, too",
     "compositing.composite_vjp_with": "as composite_with",
 }
 
@@ -84,11 +84,9 @@ def test_every_argument_is_documented(module):
 
 def twins():
     """Public functions of cpu and what they must look like: (label, function, twin or None)."""
-    for info in iter_modules(cpu.__path__):
-        name = info.name
-        if name in KERNEL_PARTS:
-            continue
-        twin = public_functions(name.removesuffix("_exact"))
+    names = [info.name for info in iter_modules(cpu.__path__) if info.name not in KERNEL_PARTS]
+    for name in (*names, "compositing.exact"):
+        twin = public_functions(name.removesuffix(".exact"))
         for key, function in public_functions(name, "cpu").items():
             if f"{name}.{key}" not in CPU_ONLY:
                 yield f"{name}.{key}", function, twin.get(key)
@@ -111,7 +109,7 @@ def test_every_stage_is_compared():
         *("projection.project", "projection.project_vjp", "tiling.bin_gaussians"),
         *("spherical_harmonics.sh_colors", "spherical_harmonics.sh_colors_vjp"),
         *("compositing.composite", "compositing.composite_vjp"),
-        *("compositing_exact.composite", "compositing_exact.composite_vjp"),
+        *("compositing.exact.composite", "compositing.exact.composite_vjp"),
         *("depth.surface_points", "depth.surface_points_vjp"),
         *("loss.photometric_loss", "loss.photometric_loss_vjp"),
         *("geometric_loss.geometric_loss", "geometric_loss.geometric_loss_vjp"),

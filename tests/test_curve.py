@@ -6,11 +6,13 @@ import time
 
 import pytest
 
-from data_tools.synthetic import make_scene
-from data_tools.synthetic.files import write_scene
-from minisplat_ref.cli import curve, main, training
-from minisplat_ref.cli import progress as progress_module
-from minisplat_ref.cli.progress import Progress, read_log
+from minisplat_ref.cli import main
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.datasets.synthetic.files import write_scene
+from minisplat_ref.experiments import curve
+from minisplat_ref.experiments import progress as progress_module
+from minisplat_ref.experiments import run as training
+from minisplat_ref.experiments.progress import Progress, read_log
 from minisplat_ref.metrics import Evaluation
 
 SCENE = {"n_views": 6, "width": 32, "height": 24, "n_points": 60, "test_every": 4}

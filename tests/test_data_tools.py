@@ -10,8 +10,8 @@ from photo_scenes import HEIGHT, WIDTH, colored_image, sparse_color_errors, writ
 from PIL import ExifTags, Image
 from tolerances import COLOR_RATIO, SAME_CAMERAS, SFM_CENTERS
 
-from data_tools import downscale, sfm, undistort
-from data_tools.sfm import prepare_photos
+from minisplat_ref.datasets import downscale, sfm, undistort
+from minisplat_ref.datasets.sfm import prepare_photos
 from minisplat_ref.io import load_scene
 from minisplat_ref.io.images import read_image, resize_image, write_image
 from minisplat_ref.io.lens import import_pycolmap

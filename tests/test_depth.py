@@ -8,7 +8,7 @@ from tolerances import CLOSED_FORM, COVERAGE_MIN, GRADIENT_FLOOR, PARITY_FLOAT32
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.reference.depth import surface_points, surface_points_vjp
-from minisplat_ref.render import render
+from minisplat_ref.rendering import render
 
 IDENTITY = np.array([[1.0, 0, 0, 0]])
 

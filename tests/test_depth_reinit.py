@@ -6,11 +6,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import as_dtype, make_camera, make_gaussians
 from tolerances import CLOSED_FORM, PARITY_FLOAT64, SAMPLED_SHARE
 
-from data_tools.synthetic import make_scene
 from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN, INRIA
+from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.recipes import get_recipe
+from minisplat_ref.methods import get_recipe
 from minisplat_ref.reference.pinhole import pinhole
 from minisplat_ref.strategy.depth_reinit import (
     PixelPoints,
@@ -22,7 +22,7 @@ from minisplat_ref.strategy.depth_reinit import (
 )
 from minisplat_ref.strategy.initialization import initial_gaussians
 from minisplat_ref.strategy.ops import concat
-from minisplat_ref.train import train
+from minisplat_ref.training.loop import train
 from minisplat_ref.types import Gaussians, View
 
 ALL_KINDS = pytest.mark.parametrize("points_of", [midpoint_points, centre_points, blended_points])

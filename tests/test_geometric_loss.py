@@ -24,7 +24,7 @@ from minisplat_ref.reference.depth_map import (
     expected_depth_vjp,
 )
 from minisplat_ref.reference.geometric_loss import edge_weights, normal_smoothness, normal_smoothness_vjp
-from minisplat_ref.render import render, render_vjp
+from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.types import Gaussians, GeometricWeights
 
 NO_POINTS = np.zeros((0, 3))

@@ -21,8 +21,8 @@ from tolerances import COVERAGE_MIN, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT32_IMA
 import minisplat_ref
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
-from minisplat_ref.render import render, render_vjp
-from minisplat_ref.scalar import _jit
+from minisplat_ref.jit import compile as _jit
+from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.types import GeometricWeights, ProjectionGradient, TileGrid
 
 PACKAGE = Path(minisplat_ref.__file__).parent
@@ -217,7 +217,7 @@ MODULES_OF_ONE_NAME = {
     "second.py": "def hit(x):\n    return 10 * x\n",
     "factory.py": """
 import numba
-from minisplat_ref.scalar._jit import kernel, scalar
+from minisplat_ref.jit.compile import kernel, scalar
 
 def make(function):
     hit = scalar(function)
@@ -291,7 +291,13 @@ def test_compiled_and_cached_kernels_give_the_same_bytes(tmp_path):
 
 @pytest.mark.parametrize(
     "source",
-    ["scalar/covariance.py", "cpu/blend_forward.py", "cpu/deeper/new.py", "oracle/bench/exponentials.py", "types.py"],
+    [
+        "scalar/covariance.py",
+        "cpu/compositing/forward.py",
+        "cpu/deeper/new.py",
+        "bench/exponentials.py",
+        "types.py",
+    ],
 )
 def test_cache_folder_follows_the_sources(source, tmp_path, monkeypatch):
     # Numba notices no change in a function that a kernel calls from another file: hence a folder per source hash.

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from minisplat_ref.cpu.exponential import exp_exact, exp_fast
-from minisplat_ref.scalar.lanes import (
+from minisplat_ref.cpu.compositing.exponential import exp_exact, exp_fast
+from minisplat_ref.jit.lanes import (
     WIDTH,
     any_of,
     bits_between,

@@ -4,9 +4,9 @@ import re
 
 import pytest
 
-from data_tools.measure import measure_rate
-from data_tools.synthetic import make_scene
-from data_tools.synthetic.files import write_scene
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.datasets.synthetic.files import write_scene
+from minisplat_ref.experiments.measure import measure_rate
 
 
 @pytest.fixture

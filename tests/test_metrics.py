@@ -11,7 +11,7 @@ from minisplat_ref.backends import REFERENCE
 from minisplat_ref.errors import InputError
 from minisplat_ref.metrics import evaluate, psnr, ssim
 from minisplat_ref.reference.loss import ssim_map
-from minisplat_ref.render import render
+from minisplat_ref.rendering import render
 from minisplat_ref.types import View
 
 

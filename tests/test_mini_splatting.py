@@ -8,17 +8,17 @@ import pytest
 from numpy.testing import assert_array_equal
 from scenes import as_dtype, make_camera, make_gaussians
 
-from minisplat_ref import events
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
-from minisplat_ref.events import Iteration
-from minisplat_ref.events.importance import is_culling, measure_importance
-from minisplat_ref.recipes import RECIPES, At, During, Every, configured, scaled
-from minisplat_ref.render import render, render_vjp
+from minisplat_ref.methods import RECIPES, gaussian_splatting, mini_splatting, mini_splatting2
+from minisplat_ref.methods.mini_splatting import is_culling, measure_importance
+from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.strategy import importance, simplify
 from minisplat_ref.strategy.ops import n_rows
-from minisplat_ref.train import initial_state, load_state, save_state, train
+from minisplat_ref.training.loop import initial_state, load_state, save_state, train
+from minisplat_ref.training.schedule import At, During, Every, configured, scaled
+from minisplat_ref.training.state import Iteration, n_pixels
 from minisplat_ref.types import Scene, View
 
 N_VIEWS, N_GAUSSIANS, ITERATIONS = 6, 60, 90
@@ -66,7 +66,7 @@ def compressed(name):
 @pytest.fixture
 def small_warm_up(monkeypatch):
     """Views of 72 x 64 pixels are halved."""
-    monkeypatch.setattr("minisplat_ref.train.LEAST_HALF_SIZE", 32)
+    monkeypatch.setattr("minisplat_ref.training.loop.LEAST_HALF_SIZE", 32)
 
 
 # Whole recipes --------------------------------------------------------------------------------------------------------
@@ -143,18 +143,20 @@ def test_gradients_are_lowered_while_views_are_culled(state, scene):
     state.stats["gradient_factor"] = np.full(n_rows(state.gaussians), 0.25, np.float32)
     v_means2d = np.ones((n_rows(state.gaussians), 2))
     ids = np.array([1, 4])
-    events.collect_gradients(state, Iteration(scene, scene.train_views[0], None, ids, v_means2d, CPU, GSPLAT_MAIN))
+    gaussian_splatting.collect_gradients(
+        state, Iteration(scene, scene.train_views[0], None, ids, v_means2d, CPU, GSPLAT_MAIN)
+    )
     assert state.stats["gradient_sum"][ids] == pytest.approx(0.25 * np.hypot(36, 32))
 
 
 def test_clone_culls_and_forgets_what_was_collected(state, iteration):
-    events.aggressive_clone(
+    mini_splatting2.aggressive_clone(
         state, iteration, critical=lambda stats: stats.dominant_count > 0, factor=2, tail_mass=0.999, least_views=0
     )
     n = n_rows(state.gaussians)
     assert n > N_GAUSSIANS * 0.9 and state.stats["is_visible"].shape == (n, N_VIEWS)
     assert set(state.stats) == {"is_visible", "gradient_factor"}
-    events.stop_culling(state, iteration)
+    mini_splatting2.stop_culling(state, iteration)
     assert state.stats == {}
 
 
@@ -163,14 +165,14 @@ def test_clone_culls_and_forgets_what_was_collected(state, iteration):
 
 @pytest.mark.parametrize("choose", [simplify.by_sampling, simplify.by_rank, simplify.by_merging])
 def test_each_choice_leaves_the_budget(state, iteration, choose):
-    events.simplify(
+    mini_splatting.simplify(
         state, iteration, metric=importance.indoor, choose=choose, keep_fraction=0.5, budget=17, least_views=0
     )
     assert n_rows(state.gaussians) == n_rows(state.adam.first) == 17
 
 
 def test_budget_above_the_candidates(state, iteration):
-    act = partial(events.simplify, metric=importance.indoor, choose=simplify.by_sampling, keep_fraction=0.5)
+    act = partial(mini_splatting.simplify, metric=importance.indoor, choose=simplify.by_sampling, keep_fraction=0.5)
     with pytest.raises(InputError, match=r"budget is 1,000.*lower the budget"):
         act(state, iteration, budget=1_000)
 
@@ -178,13 +180,13 @@ def test_budget_above_the_candidates(state, iteration):
 def test_nothing_is_important(state, iteration):
     state.gaussians.opacity_logits[:] = -30.0
     with pytest.raises(InputError, match="no Gaussian matters to any training view"):
-        events.prune_tail(state, iteration, metric=importance.indoor, mass=0.99)
+        mini_splatting.prune_tail(state, iteration, metric=importance.indoor, mass=0.99)
 
 
 def test_tail_is_pruned_and_moments_stay(state, iteration):
     stats = measure_importance(state, iteration)
     moment = state.adam.first.means.copy()
-    events.prune_tail(state, iteration, metric=importance.indoor, mass=0.9)
+    mini_splatting.prune_tail(state, iteration, metric=importance.indoor, mass=0.9)
     kept = importance.mass_mask(np.where(stats.dominant_count > 0, stats.blend_weight_sum, 0), 0.9)
     assert 0 < kept.sum() < len(kept)
     assert_array_equal(state.adam.first.means, moment[kept])
@@ -193,7 +195,7 @@ def test_tail_is_pruned_and_moments_stay(state, iteration):
 def test_start_anew_has_no_past(state, iteration):
     state.stats["is_blurred"] = np.zeros(n_rows(state.gaussians), bool)
     means = state.gaussians.means.copy()
-    events.restart_from_means(state, iteration, sh_degree=2)
+    mini_splatting.restart_from_means(state, iteration, sh_degree=2)
     assert_array_equal(state.gaussians.means, means)
     assert state.gaussians.sh_rest.shape[1] == 8 and state.adam.first.sh_rest.shape[1] == 8
     assert not state.adam.second.means.any() and state.adam.step == 0
@@ -210,7 +212,7 @@ def test_blur_is_remembered_from_view_to_view(state, scene):
         stats = SimpleNamespace(dominant_count=np.array(counts + [0] * (n - 3)))
         output = SimpleNamespace(stats=stats)
         iteration = Iteration(scene, scene.train_views[0], output, np.arange(0), None, CPU, GSPLAT_MAIN)
-        events.collect_blur(state, iteration, area_fraction=64 / (72 * 64))
+        mini_splatting.collect_blur(state, iteration, area_fraction=64 / (72 * 64))
 
     see([65, 64, 0])
     see([0, 64, 70])
@@ -219,10 +221,10 @@ def test_blur_is_remembered_from_view_to_view(state, scene):
 
 def test_densification_pauses_above_the_most(state, iteration):
     n = n_rows(state.gaussians)
-    act = partial(events.clone_and_split, threshold=0.0, size_fraction=10.0)
+    act = partial(gaussian_splatting.clone_and_split, threshold=0.0, size_fraction=10.0)
     for most, expected in ((n - 1, n), (n + 1, 2 * n)):
         state.stats = {"gradient_sum": np.ones(n), "view_count": np.ones(n), "is_blurred": np.zeros(n, bool)}
-        act(state, iteration, most_per_pixel=most / events.n_pixels(iteration.scene))
+        act(state, iteration, most_per_pixel=most / n_pixels(iteration.scene))
         assert n_rows(state.gaussians) == expected and state.stats == {}
 
 
@@ -230,7 +232,7 @@ def test_depth_gives_as_many_points_as_asked_for(state, iteration):
     recipe = RECIPES["mini-splatting"]
     act = next(event.action for event in recipe.events if "reinitialise_from_depth" in repr(event.action))
     act(state, iteration, points_per_pixel=0.01)
-    assert n_rows(state.gaussians) == N_VIEWS * round(0.01 * events.n_pixels(iteration.scene)) // N_VIEWS
+    assert n_rows(state.gaussians) == N_VIEWS * round(0.01 * n_pixels(iteration.scene)) // N_VIEWS
     assert state.gaussians.sh_rest.shape[1] == 0 and state.adam.step == 0
 
 

@@ -21,7 +21,7 @@ from minisplat_ref.oracle.golden.scenes import RECIPES, inputs
 from minisplat_ref.oracle.golden.stages import golden_scenes, projection_of, reference_bins, truth
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.reference.pinhole import slope_limits
-from minisplat_ref.render import render, render_vjp
+from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.types import Gaussians
 
 NAMES = [recipe.name for recipe in RECIPES]

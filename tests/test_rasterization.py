@@ -21,7 +21,7 @@ from minisplat_ref import rasterization, rasterization_vjp
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN, INRIA
 from minisplat_ref.errors import InputError
-from minisplat_ref.render import render
+from minisplat_ref.rendering import render
 from minisplat_ref.types import Camera
 from minisplat_ref.validation import check_gaussians
 

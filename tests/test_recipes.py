@@ -5,10 +5,10 @@ from functools import partial
 
 import pytest
 
-from minisplat_ref import events
 from minisplat_ref.errors import InputError
-from minisplat_ref.recipes import RECIPES, At, During, Every, configured, describe, get_recipe, scaled
+from minisplat_ref.methods import RECIPES, gaussian_splatting, get_recipe
 from minisplat_ref.strategy.importance import outdoor
+from minisplat_ref.training.schedule import At, During, Every, configured, describe, scaled
 
 
 def nothing(state, iteration, **settings):
@@ -188,5 +188,5 @@ def test_description_is_json_and_tells_settings_apart():
     densify = description["events"][1]
     assert densify["event"] == "Every" and densify["action"] == "clone_and_split"
     assert densify["settings"] == {"threshold": 2e-4, "size_fraction": 0.01}
-    other = recipe._replace(events=(Every(100, partial(events.prune_faint, least_opacity=0.1)),))
+    other = recipe._replace(events=(Every(100, partial(gaussian_splatting.prune_faint, least_opacity=0.1)),))
     assert json.loads(json.dumps(describe(other))) != description

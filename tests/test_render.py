@@ -17,7 +17,7 @@ from tolerances import (
 from minisplat_ref.backends import CPU, REFERENCE, get_backend
 from minisplat_ref.constants import GSPLAT_MAIN, INRIA, SH_C0
 from minisplat_ref.errors import InputError
-from minisplat_ref.render import render, render_vjp
+from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.types import Camera, Gaussians
 
 BACKGROUND = np.array([0.2, 0.5, 0.9])

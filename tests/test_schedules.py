@@ -2,7 +2,7 @@
 
 import pytest
 
-from minisplat_ref.optim.schedules import LearningRates, LogLinear, Rewind, active_sh_degree
+from minisplat_ref.training.rates import LearningRates, LogLinear, Rewind, active_sh_degree
 from minisplat_ref.types import Gaussians
 
 

@@ -6,17 +6,16 @@ import numpy as np
 import pytest
 from tolerances import PRINTED_DIGITS
 
-from data_tools.studies import split_forms
-from data_tools.studies.__main__ import main
-from data_tools.studies.front import FIGURE, RESULT
-from data_tools.synthetic.__main__ import main as write_synthetic
-from minisplat_ref import events
+from minisplat_ref.datasets.synthetic.__main__ import main as write_synthetic
+from minisplat_ref.experiments.studies import split_forms
+from minisplat_ref.experiments.studies.__main__ import main
+from minisplat_ref.experiments.studies.front import FIGURE, RESULT
 from minisplat_ref.io import load_scene, save_ply
 from minisplat_ref.io.images import read_image
-from minisplat_ref.recipes import get_recipe
+from minisplat_ref.methods import gaussian_splatting, get_recipe, mini_splatting
 from minisplat_ref.strategy.blur_split import principal_axis_children
 from minisplat_ref.strategy.clone_split import random_children
-from minisplat_ref.train import initial_state
+from minisplat_ref.training.loop import initial_state
 
 TINY = ("--views", "6", "--width", "32", "--height", "24", "--supersampling", "1", "--points", "150")
 
@@ -64,9 +63,13 @@ def test_split_variants_differ_in_blur_split_and_children_alone(name):
     for form, (has_blur_split, children) in split_forms.FORMS.items():
         variant = split_forms.variant(recipe, form)
         actions = [getattr(event.action, "func", event.action) for event in variant.events]
-        assert (events.collect_blur in actions) == has_blur_split
+        assert (mini_splatting.collect_blur in actions) == has_blur_split
         assert len(recipe.events) - len(variant.events) == (not has_blur_split)
-        (split,) = [event for event in variant.events if getattr(event.action, "func", None) is events.clone_and_split]
+        (split,) = [
+            event
+            for event in variant.events
+            if getattr(event.action, "func", None) is gaussian_splatting.clone_and_split
+        ]
         assert split.action.keywords["draw_children"] is children
     assert {children for _, children in split_forms.FORMS.values()} == {random_children, principal_axis_children}
 
@@ -117,7 +120,10 @@ def test_culling_of_given_gaussians(scene_folder, tmp_path, capsys):
     ("arguments", "message"),
     [
         (["split", "nowhere"], "nowhere: neither a folder nor one of room, "),
-        (["culling", "room", "--downscale", "2"], "room is made at 160 x 120; write it with data_tools.synthetic"),
+        (
+            ["culling", "room", "--downscale", "2"],
+            "room is made at 160 x 120; write it with minisplat-ref synthetic",
+        ),
         (["culling", "SCENE", "--ply", "no.ply"], "no.ply"),
         (["culling", "SCENE", "--out", "SCENE"], "already there and not empty"),
     ],

@@ -7,11 +7,11 @@ import pytest
 from numpy.testing import assert_allclose
 from tolerances import CLOSED_FORM, PRINTED_DIGITS
 
-from data_tools.studies import depth_types
-from data_tools.studies.__main__ import main
-from data_tools.studies.front import FIGURE, RESULT
-from data_tools.synthetic import make_scene
-from data_tools.synthetic.tracer import camera_centre, pixel_rays
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.datasets.synthetic.tracer import camera_centre, pixel_rays
+from minisplat_ref.experiments.studies import depth_types
+from minisplat_ref.experiments.studies.__main__ import main
+from minisplat_ref.experiments.studies.front import FIGURE, RESULT
 from minisplat_ref.io.images import read_image
 from minisplat_ref.strategy.initialization import from_points
 

@@ -7,19 +7,19 @@ import pytest
 from scipy.spatial import cKDTree
 from tolerances import CLOSED_FORM, PRINTED_DIGITS
 
-from data_tools.studies import simplify
-from data_tools.studies.__main__ import main
-from data_tools.studies.front import FIGURE, RESULT
-from data_tools.synthetic import make_scene
-from data_tools.synthetic.__main__ import main as write_synthetic
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.datasets.synthetic.__main__ import main as write_synthetic
+from minisplat_ref.experiments.studies import simplify
+from minisplat_ref.experiments.studies.__main__ import main
+from minisplat_ref.experiments.studies.front import FIGURE, RESULT
 from minisplat_ref.io import load_ply, load_scene, save_ply
 from minisplat_ref.io.images import read_image
+from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
-from minisplat_ref.recipes import get_recipe
 from minisplat_ref.strategy.importance import collect_importance, indoor
 from minisplat_ref.strategy.initialization import from_points
 from minisplat_ref.strategy.simplify import carrying_mass, intersection_preserving, most_important
-from minisplat_ref.train import train
+from minisplat_ref.training.loop import train
 
 TINY = ("--views", "6", "--width", "32", "--height", "24", "--supersampling", "1", "--points", "200")
 

@@ -11,15 +11,23 @@ from tolerances import (
     SYNTHETIC_SURFACE,
 )
 
-from data_tools.synthetic import SCENE_NAMES, make_scene
-from data_tools.synthetic.__main__ import main
-from data_tools.synthetic.cameras import look_at
-from data_tools.synthetic.files import write_scene
-from data_tools.synthetic.geometry import Primitive, first_hits
-from data_tools.synthetic.materials import Checker, Material, Noise, Plain, encode_srgb, linear_rgb, random_lattice
-from data_tools.synthetic.shapes import Box, Cylinder, Rectangle, Sphere
-from data_tools.synthetic.sparse_points import project_points
-from data_tools.synthetic.tracer import World, camera_centre, pixel_rays, radiance
+from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
+from minisplat_ref.datasets.synthetic.__main__ import main
+from minisplat_ref.datasets.synthetic.cameras import look_at
+from minisplat_ref.datasets.synthetic.files import write_scene
+from minisplat_ref.datasets.synthetic.geometry import Primitive, first_hits
+from minisplat_ref.datasets.synthetic.materials import (
+    Checker,
+    Material,
+    Noise,
+    Plain,
+    encode_srgb,
+    linear_rgb,
+    random_lattice,
+)
+from minisplat_ref.datasets.synthetic.shapes import Box, Cylinder, Rectangle, Sphere
+from minisplat_ref.datasets.synthetic.sparse_points import project_points
+from minisplat_ref.datasets.synthetic.tracer import World, camera_centre, pixel_rays, radiance
 from minisplat_ref.errors import InputError
 
 SMALL = {"n_views": 4, "width": 64, "height": 48, "supersampling": 1, "n_points": 300, "test_every": 4}

@@ -11,24 +11,24 @@ import pytest
 from numpy.testing import assert_array_equal
 from scenes import as_dtype, make_camera, make_gaussians
 
-from minisplat_ref import events
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.errors import InputError
+from minisplat_ref.methods import RECIPES, gaussian_splatting
 from minisplat_ref.metrics import evaluate
-from minisplat_ref.recipes import RECIPES, At, During, Every
-from minisplat_ref.render import render
-from minisplat_ref.train import initial_state, load_state, save_state, train
+from minisplat_ref.rendering import render
+from minisplat_ref.training.loop import initial_state, load_state, save_state, train
+from minisplat_ref.training.schedule import At, During, Every
 from minisplat_ref.types import GeometricWeights, Scene, View
 
 N_VIEWS, N_GAUSSIANS = 4, 30
 
 # Every kind of event within 40 iterations.
 EVENTS = (
-    During(events.collect_gradients, stop=30),
-    Every(10, partial(events.clone_and_split, threshold=2e-3, size_fraction=0.15), start=5, stop=30),
-    Every(10, partial(events.prune_faint, least_opacity=0.005), start=5, stop=30),
-    Every(10, partial(events.prune_large, size_fraction=2.0), start=15, stop=30),
-    Every(25, partial(events.reset_opacity, ceiling=0.05)),
+    During(gaussian_splatting.collect_gradients, stop=30),
+    Every(10, partial(gaussian_splatting.clone_and_split, threshold=2e-3, size_fraction=0.15), start=5, stop=30),
+    Every(10, partial(gaussian_splatting.prune_faint, least_opacity=0.005), start=5, stop=30),
+    Every(10, partial(gaussian_splatting.prune_large, size_fraction=2.0), start=15, stop=30),
+    Every(25, partial(gaussian_splatting.reset_opacity, ceiling=0.05)),
 )
 RECIPE = RECIPES["3dgs-accel"]._replace(iterations=40, sh_degree=1, sh_milestones=(10,), events=EVENTS)
 PLAIN = RECIPE._replace(iterations=60, events=())
@@ -268,6 +268,6 @@ def test_resuming_with_another_recipe(scene, tmp_path):
 
 def test_no_gaussians_left(scene):
     """A recipe that prunes everybody goes on rendering the background."""
-    recipe = RECIPE._replace(events=(*EVENTS, At(5, partial(events.prune_large, size_fraction=1e-9))))
+    recipe = RECIPE._replace(events=(*EVENTS, At(5, partial(gaussian_splatting.prune_large, size_fraction=1e-9))))
     state = train(scene, recipe, seed=0)
     assert len(state.gaussians.means) == 0 and state.step == 40

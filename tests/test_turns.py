@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from minisplat_ref.scalar._jit import kernel, n_threads, prange
-from minisplat_ref.scalar.turns import next_turn, no_turns, turns
+from minisplat_ref.jit.compile import kernel, n_threads, prange
+from minisplat_ref.jit.turns import next_turn, no_turns, turns
 
 
 @kernel()

@@ -14,8 +14,8 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from minisplat_ref.cli.arguments import HelpFormatter
 from minisplat_ref.errors import InputError
+from minisplat_ref.experiments.arguments import HelpFormatter
 
 from . import bench, cache, compare, demo, evaluate, info, oracle, render, train
 

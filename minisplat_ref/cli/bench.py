@@ -5,9 +5,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from minisplat_ref.cli.arguments import Commands, HelpFormatter, integer, listed, name
 from minisplat_ref.cli.oracle import add_json_argument
 from minisplat_ref.errors import InputError
+from minisplat_ref.experiments.arguments import Commands, HelpFormatter, integer, listed, name
 
 if TYPE_CHECKING:
     from minisplat_ref.oracle.cases import Case, Report
@@ -105,17 +105,17 @@ def _measure(args: argparse.Namespace) -> "Report":
     if args.stages:
         return _stages(args)
     if args.slopes:
-        from minisplat_ref.oracle.bench.slopes import slope_cases
+        from minisplat_ref.bench.slopes import slope_cases
 
         cases = slope_cases(args.repeats, progress)
         return Report("What time grows with: forward and backward, float32", tuple(cases), {"repeats": args.repeats})
     if args.memory:
-        from minisplat_ref.cli.peak_memory import memory_case
+        from minisplat_ref.bench.peak_memory import memory_case
 
         progress("memory: a few iterations in a process of its own")
         return Report("Peak memory of training", (memory_case(),), {})
     if args.start:
-        from minisplat_ref.cli.start_time import start_cases
+        from minisplat_ref.bench.start_time import start_cases
 
         progress("start: train with no compiled kernels, then with them")
         return Report("From the start of train to the end of its first iteration", tuple(start_cases()), {})
@@ -123,11 +123,11 @@ def _measure(args: argparse.Namespace) -> "Report":
 
 
 def _race(args: argparse.Namespace) -> "Report":
-    from minisplat_ref.cli.training_time import against_opensplat
-    from minisplat_ref.oracle.bench.contenders import choose
-    from minisplat_ref.oracle.bench.peers import peers_of
-    from minisplat_ref.oracle.bench.race import race
-    from minisplat_ref.oracle.bench.workloads import get_workload
+    from minisplat_ref.bench.contenders import choose
+    from minisplat_ref.bench.peers import peers_of
+    from minisplat_ref.bench.race import race
+    from minisplat_ref.bench.training_time import against_opensplat
+    from minisplat_ref.bench.workloads import get_workload
     from minisplat_ref.oracle.cases import Report
 
     peers, opensplat = peers_of(args.against)
@@ -146,11 +146,11 @@ def _race(args: argparse.Namespace) -> "Report":
 
 
 def _stages(args: argparse.Namespace) -> "Report":
-    from minisplat_ref.cli.training_time import profile, thread_cases
-    from minisplat_ref.oracle.bench.by_turns import hold
-    from minisplat_ref.oracle.bench.limits import adams, stages, threads
-    from minisplat_ref.oracle.bench.roofs import blending
-    from minisplat_ref.oracle.bench.workloads import get_workload
+    from minisplat_ref.bench.by_turns import hold
+    from minisplat_ref.bench.limits import adams, stages, threads
+    from minisplat_ref.bench.roofs import blending
+    from minisplat_ref.bench.training_time import profile, thread_cases
+    from minisplat_ref.bench.workloads import get_workload
     from minisplat_ref.oracle.cases import Report
 
     cases = profile(args.scene, args.downscale, args.iterations)
@@ -175,8 +175,8 @@ def _tables(report: "Report") -> str:
 
 def _save_folder(report: "Report", folder: Path) -> None:
     """Write JSON, tables and figure into a folder, which is made."""
+    from minisplat_ref.bench.figure import save_figure
     from minisplat_ref.io.atomic import replacing
-    from minisplat_ref.oracle.bench.figure import save_figure
     from minisplat_ref.oracle.cases import save_json
 
     try:

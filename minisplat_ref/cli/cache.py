@@ -5,11 +5,11 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
-from minisplat_ref.cli.arguments import Commands, HelpFormatter, integer
 from minisplat_ref.errors import InputError
+from minisplat_ref.experiments.arguments import Commands, HelpFormatter, integer
 
 if TYPE_CHECKING:
-    from minisplat_ref.kernel_cache import KernelFolder
+    from minisplat_ref.jit.kernel_cache import KernelFolder
 
 DESCRIPTION = """\
 The kernels are compiled for this processor at their first use and kept on disk.
@@ -48,8 +48,8 @@ def _warm(args: argparse.Namespace) -> int:
     """Compile, stage by stage."""
     import numpy as np
 
-    from minisplat_ref.kernel_cache import kernel_folders
-    from minisplat_ref.scalar._jit import cache_folder
+    from minisplat_ref.jit.compile import cache_folder
+    from minisplat_ref.jit.kernel_cache import kernel_folders
     from minisplat_ref.warm_up import STAGES, Dtype, warm_up
 
     if cache_folder() is None:
@@ -71,8 +71,8 @@ def _warm(args: argparse.Namespace) -> int:
 
 def _info(args: argparse.Namespace) -> int:
     """Print a line per folder."""
-    from minisplat_ref.kernel_cache import kernel_folders
-    from minisplat_ref.scalar._jit import cache_folder, cache_root, source_hash
+    from minisplat_ref.jit.compile import cache_folder, cache_root, source_hash
+    from minisplat_ref.jit.kernel_cache import kernel_folders
 
     print(f"place    {cache_root()}{'' if cache_folder() else ' (cannot be written: nothing is kept)'}")
     print(f"version  {source_hash()}")
@@ -83,7 +83,7 @@ def _info(args: argparse.Namespace) -> int:
 
 def _clear(args: argparse.Namespace) -> int:
     """Remove the folders and say which."""
-    from minisplat_ref.kernel_cache import kernel_folders, remove
+    from minisplat_ref.jit.kernel_cache import kernel_folders, remove
 
     folders = [folder for folder in kernel_folders() if not (args.stale and folder.is_current)]
     for folder in folders:

@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from minisplat_ref.cli.arguments import Commands, HelpFormatter, integer, listed, name
+from minisplat_ref.experiments.arguments import Commands, HelpFormatter, integer, listed, name
 
 DESCRIPTION = """\
 Train a scene by several recipes, one training after the other, and set the
@@ -62,9 +62,9 @@ def add_parser(commands: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Train, measure, write the files, print the table."""
-    from minisplat_ref.cli import run_folder
-    from minisplat_ref.cli.comparison.plan import Plan, check
-    from minisplat_ref.cli.comparison.runs import train_all, warm_up
+    from minisplat_ref.experiments import run_folder
+    from minisplat_ref.experiments.comparison.plan import Plan, check
+    from minisplat_ref.experiments.comparison.runs import train_all, warm_up
 
     plan = Plan(
         scene=args.scene,
@@ -87,11 +87,11 @@ def run(args: argparse.Namespace) -> int:
             plan.folder.rmdir()
         return code
 
-    from minisplat_ref.cli.comparison import figures
-    from minisplat_ref.cli.comparison.report import notes, report_html
-    from minisplat_ref.cli.comparison.results import collect, to_json
-    from minisplat_ref.cli.comparison.table import as_markdown, table_cells
-    from minisplat_ref.cli.plots import save_png
+    from minisplat_ref.experiments.comparison import figures
+    from minisplat_ref.experiments.comparison.report import notes, report_html
+    from minisplat_ref.experiments.comparison.results import collect, to_json
+    from minisplat_ref.experiments.comparison.table import as_markdown, table_cells
+    from minisplat_ref.experiments.plots import save_png
 
     results = collect(plan, scene)
     save_png(figures.psnr_over_time(results.curves), plan.folder / PSNR_OVER_TIME)

@@ -7,7 +7,7 @@ import time
 from functools import partial
 from pathlib import Path
 
-from minisplat_ref.cli.arguments import Commands, HelpFormatter, integer
+from minisplat_ref.experiments.arguments import Commands, HelpFormatter, integer
 
 SCENE = {"n_views": 28, "width": 192, "height": 144, "n_points": 8000, "seed": 0, "test_every": 8}
 RECIPE = "3dgs-accel"
@@ -46,17 +46,17 @@ def run(args: argparse.Namespace) -> int:
     """Make the scene, train, write the report, and say where it is."""
     from tqdm import tqdm
 
-    from data_tools.synthetic import make_scene
-    from data_tools.synthetic.files import write_scene
-    from minisplat_ref.cli import run_folder
-    from minisplat_ref.cli.demo_report import demo_report, view_pictures
-    from minisplat_ref.cli.first_use import compile_kernels
-    from minisplat_ref.cli.report import report_html
-    from minisplat_ref.cli.scoring import summary
-    from minisplat_ref.cli.settings import Settings, load_photographs, recipe_of
-    from minisplat_ref.cli.training import run_training
     from minisplat_ref.constants import GSPLAT_MAIN
-    from minisplat_ref.train import initial_state
+    from minisplat_ref.datasets.synthetic import make_scene
+    from minisplat_ref.datasets.synthetic.files import write_scene
+    from minisplat_ref.experiments import run_folder
+    from minisplat_ref.experiments.demo_report import demo_report, view_pictures
+    from minisplat_ref.experiments.first_use import compile_kernels
+    from minisplat_ref.experiments.report import report_html
+    from minisplat_ref.experiments.run import run_training
+    from minisplat_ref.experiments.scoring import summary
+    from minisplat_ref.experiments.settings import Settings, load_photographs, recipe_of
+    from minisplat_ref.training.loop import initial_state
 
     start = time.perf_counter()
     folder = args.out or _first_free(Path(DEFAULT_OUT))

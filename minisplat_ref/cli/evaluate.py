@@ -3,8 +3,8 @@
 import argparse
 from pathlib import Path
 
-from minisplat_ref.cli.arguments import Commands, HelpFormatter
 from minisplat_ref.errors import InputError
+from minisplat_ref.experiments.arguments import Commands, HelpFormatter
 
 DESCRIPTION = """\
 Measure a run on its test views: PSNR and SSIM of point_cloud.ply, view by view.
@@ -37,9 +37,9 @@ def add_parser(commands: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, print a table, rewrite the files."""
-    from minisplat_ref.cli import run_folder
-    from minisplat_ref.cli.scoring import score, summary, to_metrics
-    from minisplat_ref.cli.settings import load, load_photographs
+    from minisplat_ref.experiments import run_folder
+    from minisplat_ref.experiments.scoring import score, summary, to_metrics
+    from minisplat_ref.experiments.settings import load, load_photographs
     from minisplat_ref.io import load_ply
 
     settings = load(args.folder)

@@ -5,8 +5,8 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from minisplat_ref.cli.arguments import Commands, HelpFormatter
 from minisplat_ref.errors import InputError
+from minisplat_ref.experiments.arguments import Commands, HelpFormatter
 
 if TYPE_CHECKING:
     from minisplat_ref.types import Floats, Gaussians
@@ -47,7 +47,7 @@ def add_parser(commands: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print a table of names and values."""
-    from minisplat_ref.cli.run_folder import CONFIG
+    from minisplat_ref.experiments.run_folder import CONFIG
 
     path: Path = args.path
     if not path.exists():
@@ -92,8 +92,8 @@ def _checkpoint_rows(path: Path) -> Rows:
 
 
 def _run_rows(folder: Path) -> Rows:
-    from minisplat_ref.cli.run_folder import CHECKPOINT, METRICS, read_json_object
-    from minisplat_ref.cli.settings import load
+    from minisplat_ref.experiments.run_folder import CHECKPOINT, METRICS, read_json_object
+    from minisplat_ref.experiments.settings import load
 
     rows = [(name.replace("_", " "), str(value)) for name, value in load(folder)._asdict().items()]
     if (folder / METRICS).exists():

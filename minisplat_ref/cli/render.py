@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from minisplat_ref.cli.arguments import Commands, HelpFormatter, add_renderer_arguments, integer
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
+from minisplat_ref.experiments.arguments import Commands, HelpFormatter, add_renderer_arguments, integer
 
 if TYPE_CHECKING:
-    from minisplat_ref.cli.viewpoints import Viewpoint
+    from minisplat_ref.io.viewpoints import Viewpoint
     from minisplat_ref.types import Floats, Gaussians
 
 DESCRIPTION = """\
@@ -62,11 +62,11 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from minisplat_ref.backends import get_backend
-    from minisplat_ref.cli import run_folder
-    from minisplat_ref.cli.pictures import depth_picture, depth_range, expected_depth
     from minisplat_ref.constants import PROFILES
+    from minisplat_ref.experiments import run_folder
+    from minisplat_ref.experiments.pictures import depth_picture, depth_range, expected_depth
     from minisplat_ref.io import write_image
-    from minisplat_ref.render import render
+    from minisplat_ref.rendering import render
 
     source = _open(args)
     views = _choose_views(args, source)
@@ -104,8 +104,8 @@ class _Source(NamedTuple):
 def _open(args: argparse.Namespace) -> _Source:
     import numpy as np
 
-    from minisplat_ref.cli import run_folder, settings, viewpoints
-    from minisplat_ref.io import load_ply
+    from minisplat_ref.experiments import run_folder, settings
+    from minisplat_ref.io import load_ply, viewpoints
 
     path: Path = args.input
     cameras: list[Viewpoint] = []
@@ -128,7 +128,7 @@ def _open(args: argparse.Namespace) -> _Source:
 
 
 def _choose_views(args: argparse.Namespace, source: _Source) -> "list[Viewpoint]":
-    from minisplat_ref.cli import viewpoints
+    from minisplat_ref.io import viewpoints
 
     which: str = args.cameras or ("test" if source.cameras else "orbit")
     if which == "orbit":

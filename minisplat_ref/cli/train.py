@@ -5,14 +5,14 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from minisplat_ref.cli.arguments import Commands, HelpFormatter, add_renderer_arguments, integer, weights
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
+from minisplat_ref.experiments.arguments import Commands, HelpFormatter, add_renderer_arguments, integer, weights
 
 if TYPE_CHECKING:
-    from minisplat_ref.cli.settings import Settings
-    from minisplat_ref.recipes import Recipe
-    from minisplat_ref.train import TrainState
+    from minisplat_ref.experiments.settings import Settings
+    from minisplat_ref.training.loop import TrainState
+    from minisplat_ref.training.schedule import Recipe
     from minisplat_ref.types import Scene
 
 DEFAULTS = {
@@ -125,10 +125,10 @@ def _start(given: dict[str, Any]) -> int:
     scene_folder = scene_path.parent if scene_path.is_file() else scene_path
     folder: Path = given.get("out", Path("runs") / f"{scene_folder.resolve().name}-{options['recipe']}")
 
-    from minisplat_ref.cli import curve, run_folder
-    from minisplat_ref.cli.first_use import compile_kernels
-    from minisplat_ref.cli.settings import Settings, load_photographs, recipe_of
-    from minisplat_ref.train import initial_state
+    from minisplat_ref.experiments import curve, run_folder
+    from minisplat_ref.experiments.first_use import compile_kernels
+    from minisplat_ref.experiments.settings import Settings, load_photographs, recipe_of
+    from minisplat_ref.training.loop import initial_state
 
     run_folder.check_free(folder)
     settings = Settings(scene=str(scene_path.resolve()), schedule_iterations=options["iterations"], **options)
@@ -153,9 +153,9 @@ def _resume(folder: Path, given: dict[str, Any]) -> int:
             f"--resume takes the run's own settings: leave out {', '.join(_option(name) for name in surplus)}"
         )
 
-    from minisplat_ref.cli import run_folder, settings
-    from minisplat_ref.cli.first_use import compile_kernels
-    from minisplat_ref.train import load_state
+    from minisplat_ref.experiments import run_folder, settings
+    from minisplat_ref.experiments.first_use import compile_kernels
+    from minisplat_ref.training.loop import load_state
 
     ours = settings.load(folder)
     ours = ours._replace(iterations=given.get("iterations", ours.iterations))
@@ -171,8 +171,8 @@ def _resume(folder: Path, given: dict[str, Any]) -> int:
 
 
 def _train(folder: Path, scene: "Scene", settings: "Settings", recipe: "Recipe", state: "TrainState") -> int:
-    from minisplat_ref.cli.scoring import summary
-    from minisplat_ref.cli.training import run_training
+    from minisplat_ref.experiments.run import run_training
+    from minisplat_ref.experiments.scoring import summary
 
     size = scene.train_views[0].camera
     print(

@@ -4,9 +4,9 @@ The array is taken as flat: rows that follow one another are one run of numbers,
 are updated at a time. Without this a row of three numbers costs as much as one of ten.
 """
 
-from minisplat_ref.scalar._jit import kernel, prange, scalar
+from minisplat_ref.jit.compile import kernel, prange, scalar
+from minisplat_ref.jit.lanes import WIDTH, load, store
 from minisplat_ref.scalar.adam import adam_value
-from minisplat_ref.scalar.lanes import WIDTH, load, store
 from minisplat_ref.types import Floats, Ints
 
 N_CHUNKS = 64

@@ -6,10 +6,10 @@ Backward, the pixels are grouped by their Gaussian first, so that each Gaussian 
 import numpy as np
 
 from minisplat_ref.cpu.projection import pose_of
-from minisplat_ref.scalar._jit import kernel, prange, scalar
+from minisplat_ref.jit.compile import kernel, prange, scalar
+from minisplat_ref.jit.literals import HALF, ZERO
 from minisplat_ref.scalar.covariance import normalized, normalized_vjp, rotation_vjp
 from minisplat_ref.scalar.depth import densest_depth, densest_depth_vjp, gaussian_axes, pixel_ray
-from minisplat_ref.scalar.literals import HALF, ZERO
 from minisplat_ref.scalar.projection import dot, rows_of, transposed
 from minisplat_ref.types import Camera, Floats, Ints, SurfacePoints
 

@@ -7,9 +7,9 @@ Gaussians have to leave the copies out.
 
 import numpy as np
 
-from minisplat_ref.scalar._jit import scalar
-from minisplat_ref.scalar.lanes import WIDTH, converted, filled, gather, load, select, store, sum_of
-from minisplat_ref.scalar.literals import ZERO
+from minisplat_ref.jit.compile import scalar
+from minisplat_ref.jit.lanes import WIDTH, converted, filled, gather, load, select, store, sum_of
+from minisplat_ref.jit.literals import ZERO
 
 DOUBLE = np.float64(0)  # names the dtype
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from minisplat_ref.constants import DEPTH_ALPHA_MIN, EDGE_SHARPNESS, SFM_DEPTH_TOLERANCE
 from minisplat_ref.cpu.projection import pose_of
-from minisplat_ref.scalar._jit import kernel, prange, scalar
+from minisplat_ref.jit.compile import kernel, prange, scalar
+from minisplat_ref.jit.literals import HALF, ONE, ZERO
 from minisplat_ref.scalar.geometric_loss import edge_weight, facing, facing_vjp, huber, huber_vjp
-from minisplat_ref.scalar.literals import HALF, ONE, ZERO
 from minisplat_ref.scalar.projection import dot, rows_of, to_camera
 from minisplat_ref.types import Bools, Camera, Floats, GeometricWeights, Ints
 

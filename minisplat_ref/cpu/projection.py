@@ -25,10 +25,10 @@ from minisplat_ref.cpu.gaussian_rows import (
     total_of,
     triple,
 )
-from minisplat_ref.scalar._jit import kernel, prange, scalar
+from minisplat_ref.jit.compile import kernel, prange, scalar
+from minisplat_ref.jit.lanes import WIDTH, counted, scatter, select
+from minisplat_ref.jit.literals import ZERO
 from minisplat_ref.scalar.extent import inria_box, support_box
-from minisplat_ref.scalar.lanes import WIDTH, counted, scatter, select
-from minisplat_ref.scalar.literals import ZERO
 from minisplat_ref.scalar.projection import (
     Lens,
     axes,

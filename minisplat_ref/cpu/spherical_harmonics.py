@@ -15,8 +15,8 @@ from minisplat_ref.constants import SH_C0, SH_C1, SH_C2, SH_C3
 from minisplat_ref.cpu.gaussian_rows import DOUBLE, add, list_visible, listed_rows, total_of, triple
 from minisplat_ref.cpu.memory import large_empty
 from minisplat_ref.cpu.projection import N_CHUNKS, camera_centre
-from minisplat_ref.scalar._jit import kernel, prange, scalar
-from minisplat_ref.scalar.lanes import (
+from minisplat_ref.jit.compile import kernel, prange, scalar
+from minisplat_ref.jit.lanes import (
     WIDTH,
     columns_of,
     converted,
@@ -28,7 +28,7 @@ from minisplat_ref.scalar.lanes import (
     select,
     store,
 )
-from minisplat_ref.scalar.literals import HALF, ZERO
+from minisplat_ref.jit.literals import HALF, ZERO
 from minisplat_ref.scalar.spherical_harmonics import (
     basis_1,
     basis_1_vjp,

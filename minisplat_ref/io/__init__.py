@@ -50,6 +50,6 @@ def load_scene(
         models = [f"{folder}/cameras.bin or .txt" for folder in MODEL_FOLDERS]
         raise InputError(
             f"{path}: no scene here, looked for {', '.join([*models, BLENDER_FILES[0], SINGLE_FILE])};"
-            " to make one from photographs run `python -m data_tools.sfm PHOTOS --out SCENE`"
+            " to make one from photographs run `minisplat-ref sfm PHOTOS --out SCENE`"
         )
     return load(path, downscale=downscale, test_every=test_every, background=background, undistort=undistort)

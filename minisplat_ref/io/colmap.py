@@ -97,7 +97,7 @@ def read_model(path: Path) -> Any:
     if model is None:
         raise InputError(
             f"{path}: no COLMAP model, looked for cameras.bin or cameras.txt in {' and '.join(MODEL_FOLDERS)};"
-            f" to make one from photographs run `python -m data_tools.sfm PHOTOS --out {path}`"
+            f" to make one from photographs run `minisplat-ref sfm PHOTOS --out {path}`"
         )
     is_binary = (model / "cameras.bin").is_file()
     if is_binary:

@@ -1,7 +1,7 @@
 """Photographs in, renders out: 8-bit sRGB arrays of shape [H, W, 3], [H, W, 4] with alpha, or masks [H, W].
 
 Pixels come as the file stores them: an EXIF orientation is not applied, because cameras describe the stored grid
-(``data_tools.sfm`` turns photographs upright before it estimates cameras). Files of 16 bits a channel keep the upper
+(``minisplat-ref sfm`` turns photographs upright before it estimates cameras). Files of 16 bits a channel keep the upper
 8. Resizing uses Pillow's LANCZOS for colours, which averages over the widened filter when it shrinks and so does not
 alias, and area means for masks. Left out: colour profiles, raw formats, high dynamic range.
 """

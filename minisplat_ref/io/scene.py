@@ -159,7 +159,7 @@ def check_photo(photo: Photo, source: Path, undistort: bool) -> None:
     if photo.lens is not None and not undistort:
         raise InputError(
             f"{source}: {photo.file} has lens distortion (camera model {photo.lens.model}), only pinholes are rendered;"
-            f" run `python -m data_tools.undistort {source} --out DIR`, or load with undistort=True"
+            f" run `minisplat-ref undistort {source} --out DIR`, or load with undistort=True"
         )
     if not photo.path.is_file():
         raise InputError(f"{photo.path}: missing, but {source} has a camera for it; add the image or remove its camera")
@@ -250,7 +250,7 @@ def _check_downscaled(photo: Photo, width: int, height: int, downscale: int) -> 
         raise InputError(
             f"{small_folder}/{photo.file}: the image is {width}x{height} but 1/{downscale} of its camera is"
             f" {exact_width:g}x{exact_height:g}; remove {small_folder} and run"
-            f" `python -m data_tools.downscale {photo.folder} --factor {downscale}`"
+            f" `minisplat-ref downscale {photo.folder} --factor {downscale}`"
         )
 
 

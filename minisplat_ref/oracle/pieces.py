@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref import reference, render, splatting
+from minisplat_ref import reference, rendering, splatting
 from minisplat_ref.constants import COMPENSATION_FLOOR, GSPLAT_MAIN, Conventions
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.setting import Setting, make_setting
@@ -207,6 +207,6 @@ PIECES: dict[ModuleType, Callable[[Module], tuple[Stage, ...]]] = {
     reference.depth_map: depth_map_pieces,
     reference.geometric_loss: geometric_pieces,
     splatting: lambda m: tuple(splat_stage(with_module(), tiny_setting(), m, with_depth=d) for d in (False, True)),
-    render: lambda m: (render_stage(with_module(), tiny_setting(), m),),
+    rendering: lambda m: (render_stage(with_module(), tiny_setting(), m),),
 }
 """Every module with gradients, and the stages that its functions are tested in."""

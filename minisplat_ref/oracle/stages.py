@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref import render as rendering
-from minisplat_ref import splatting
+from minisplat_ref import rendering, splatting
 from minisplat_ref.backends import REFERENCE, Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.oracle.differences import Function, Point, Vjp

@@ -1,7 +1,7 @@
 """Adam for one value, or for eight as lanes (Kingma and Ba 2015)."""
 
-from minisplat_ref.scalar._jit import scalar
-from minisplat_ref.scalar.lanes import sqrt
+from minisplat_ref.jit.compile import scalar
+from minisplat_ref.jit.lanes import sqrt
 
 
 @scalar

@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.scalar._jit import scalar
-from minisplat_ref.scalar.lanes import larger, select, smaller
-from minisplat_ref.scalar.literals import HALF, ONE, TWO, ZERO
+from minisplat_ref.jit.compile import scalar
+from minisplat_ref.jit.lanes import larger, select, smaller
+from minisplat_ref.jit.literals import HALF, ONE, TWO, ZERO
 
 PIVOT_MIN = np.float32(1e-14)  # of a conic, relative to c: a little above float64's rounding
 

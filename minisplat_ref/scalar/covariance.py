@@ -6,9 +6,9 @@ needle-shaped Gaussians.
 
 import numpy as np
 
-from minisplat_ref.scalar._jit import scalar
-from minisplat_ref.scalar.lanes import larger, select, sqrt
-from minisplat_ref.scalar.literals import ONE, TWO, ZERO
+from minisplat_ref.jit.compile import scalar
+from minisplat_ref.jit.lanes import larger, select, sqrt
+from minisplat_ref.jit.literals import ONE, TWO, ZERO
 
 TINY = np.finfo(np.float64).tiny  # the smallest number whose reciprocal is finite
 

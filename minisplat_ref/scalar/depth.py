@@ -8,9 +8,9 @@ o + t d is greatest at the weighted least-squares solution of p = t r:
 which is also the middle of the chord through the ellipsoid at any number of standard deviations.
 """
 
-from minisplat_ref.scalar._jit import scalar
+from minisplat_ref.jit.compile import scalar
+from minisplat_ref.jit.literals import ONE, TWO
 from minisplat_ref.scalar.covariance import normalized, rotation
-from minisplat_ref.scalar.literals import ONE, TWO
 from minisplat_ref.scalar.projection import dot, transposed
 
 

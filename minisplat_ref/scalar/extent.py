@@ -5,9 +5,9 @@ The numbers are whole but floats. They are clamped to the image, so that a cast 
 
 import numpy as np
 
-from minisplat_ref.scalar._jit import scalar
-from minisplat_ref.scalar.lanes import ceil, floor, larger, log_of, smaller, sqrt
-from minisplat_ref.scalar.literals import HALF, ONE, THREE, TWO, ZERO
+from minisplat_ref.jit.compile import scalar
+from minisplat_ref.jit.lanes import ceil, floor, larger, log_of, smaller, sqrt
+from minisplat_ref.jit.literals import HALF, ONE, THREE, TWO, ZERO
 
 INRIA_TILE = 16  # px; INRIA's rule is stated in tiles of this size
 INRIA_ROOT_MIN = 0.1  # px^4; floor of (lambda_1 - lambda_2)^2 / 4 in INRIA's largest eigenvalue

@@ -12,8 +12,8 @@ No cross product is taken and no point is computed.
 
 import math
 
-from minisplat_ref.scalar._jit import scalar
-from minisplat_ref.scalar.literals import HALF, ONE, THREE
+from minisplat_ref.jit.compile import scalar
+from minisplat_ref.jit.literals import HALF, ONE, THREE
 from minisplat_ref.scalar.projection import dot
 
 

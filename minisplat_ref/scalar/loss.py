@@ -1,7 +1,7 @@
 """Structural similarity of one pixel (Wang et al. 2004) from its windowed moments, and its derivative."""
 
-from minisplat_ref.scalar._jit import scalar
-from minisplat_ref.scalar.literals import HALF, ONE, TWO
+from minisplat_ref.jit.compile import scalar
+from minisplat_ref.jit.literals import HALF, ONE, TWO
 
 
 @scalar

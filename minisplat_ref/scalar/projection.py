@@ -13,10 +13,10 @@ for needles where u.u * w.w - (u.w)^2 would cancel. For the same reason the coni
 
 from typing import NamedTuple
 
-from minisplat_ref.scalar._jit import scalar
+from minisplat_ref.jit.compile import scalar
+from minisplat_ref.jit.lanes import larger, select, smaller, sqrt
+from minisplat_ref.jit.literals import HALF, ONE, TWO, ZERO
 from minisplat_ref.scalar.covariance import normalized, normalized_vjp, rotation, rotation_vjp
-from minisplat_ref.scalar.lanes import larger, select, smaller, sqrt
-from minisplat_ref.scalar.literals import HALF, ONE, TWO, ZERO
 
 
 class Lens(NamedTuple):

@@ -4,9 +4,9 @@ The sixteen basis functions are polynomials of the unit direction (x, y, z). The
 first-degree terms, and their gradients are the derivatives of those polynomials.
 """
 
-from minisplat_ref.scalar._jit import scalar
-from minisplat_ref.scalar.lanes import select, sqrt
-from minisplat_ref.scalar.literals import FOUR, ONE, SIX, THREE, TWO, ZERO
+from minisplat_ref.jit.compile import scalar
+from minisplat_ref.jit.lanes import select, sqrt
+from minisplat_ref.jit.literals import FOUR, ONE, SIX, THREE, TWO, ZERO
 
 
 @scalar

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.scalar._jit import scalar
-from minisplat_ref.scalar.lanes import larger, log_of, select, smaller, sqrt
-from minisplat_ref.scalar.literals import ONE, TWO, ZERO
+from minisplat_ref.jit.compile import scalar
+from minisplat_ref.jit.lanes import larger, log_of, select, smaller, sqrt
+from minisplat_ref.jit.literals import ONE, TWO, ZERO
 
 FAR = np.float32(1e9)  # px
 FLAT = np.float32(1e-30)  # px^-2: a conic that is no ellipse reaches over any image

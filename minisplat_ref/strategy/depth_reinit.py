@@ -26,7 +26,7 @@ from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.constants import DEPTH_ALPHA_MIN, GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.reference.pinhole import with_principal_point
-from minisplat_ref.render import render
+from minisplat_ref.rendering import render
 from minisplat_ref.strategy.simplify import sample
 from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Ints, View
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
-from minisplat_ref.render import render
+from minisplat_ref.rendering import render
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Ints
 

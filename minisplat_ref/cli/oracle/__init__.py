@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from minisplat_ref.cli.arguments import Commands, HelpFormatter
+from minisplat_ref.experiments.arguments import Commands, HelpFormatter
 
 if TYPE_CHECKING:
     from minisplat_ref.oracle.cases import Report

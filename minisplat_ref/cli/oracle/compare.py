@@ -2,9 +2,9 @@
 
 import argparse
 
-from minisplat_ref.cli.arguments import Commands, HelpFormatter
 from minisplat_ref.cli.oracle import add_json_argument, publish
 from minisplat_ref.constants import PROFILES
+from minisplat_ref.experiments.arguments import Commands, HelpFormatter
 
 DESCRIPTION = """\
 Compare a renderer with the float64 reference, stage by stage, and name the first

@@ -2,9 +2,9 @@
 
 import argparse
 
-from minisplat_ref.cli.arguments import BACKENDS, Commands, HelpFormatter
 from minisplat_ref.cli.oracle import add_json_argument, publish
 from minisplat_ref.constants import GSPLAT_MAIN, PROFILES
+from minisplat_ref.experiments.arguments import BACKENDS, Commands, HelpFormatter
 
 DESCRIPTION = """\
 Check every stage's gradient, and the whole render's, in float64:

@@ -14,7 +14,7 @@ from minisplat_ref.backends import Backend
 from minisplat_ref.batch import checked_batch, draw
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.gsplat_door import rasterization, rasterization_vjp
-from minisplat_ref.render import render, render_vjp
+from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.splatting import SplatTape
 from minisplat_ref.types import Bools, Camera, Floats, Gaussians
 from minisplat_ref.validation import check_gaussians, chosen_conventions

@@ -1,0 +1,139 @@
+"""Who draws the workloads: backends in their precisions, exponentials of other degrees, shorter cut-offs, the baseline.
+
+A shorter cut-off is another image by intention. It is held to the float64 kernels with the same cut-off; the error that
+is reported is the one that counts for its user, against the reference with the default's.
+"""
+
+import functools
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from minisplat_ref.backends import BACKENDS, CPU, CPU_EXACT, REFERENCE, Backend
+from minisplat_ref.bench.exponentials import EXPONENTIALS, relative_errors
+from minisplat_ref.bench.textbook import TEXTBOOK
+from minisplat_ref.constants import GSPLAT_MAIN, Conventions
+from minisplat_ref.cpu.compositing import composite_vjp_with, composite_with
+from minisplat_ref.errors import InputError
+from minisplat_ref.oracle.tolerances import (
+    BENCH_EXPONENTIAL_GRADIENT,
+    BENCH_FLOAT32_GRADIENT,
+    BENCH_FLOAT32_IMAGE,
+    BENCH_FLOAT64,
+)
+from minisplat_ref.types import CompositeGradient, Floats, Projection, RenderOutput, TileBins
+
+DEGREE_IN_USE = 5
+
+
+class Contender(NamedTuple):
+    """A way to draw, and what it must be good for."""
+
+    name: str
+    """Unique."""
+    backend: Backend
+    """Implementation of the stages."""
+    dtype: type[np.floating]
+    """Of all data."""
+    image_bound: float = BENCH_FLOAT32_IMAGE
+    """Largest error of a channel at a pixel that stands at no threshold."""
+    gradient_bound: float = BENCH_FLOAT32_GRADIENT
+    """Largest relative L2 error of a parameter's gradient, the same pixels."""
+    conventions: Conventions = GSPLAT_MAIN
+    """The default's, or with another cut-off."""
+    slack: float = 0.0
+    """Relative error of its exponential: so far from a threshold, hits may still fall on the other side."""
+
+
+REFERENCE_NAME = "reference-f64"
+BASELINE_NAME = "textbook-f32"
+CHECKED_NAME = "cpu-f64"  # judged first: it says what a shorter cut-off should give
+
+
+@functools.cache
+def all_contenders() -> dict[str, Contender]:
+    """Return every contender that needs no other program, by name, the reference first."""
+    f32, f64 = np.float32, np.float64
+    contenders = [
+        Contender(REFERENCE_NAME, REFERENCE, f64, 0.0, 0.0),
+        Contender(CHECKED_NAME, CPU, f64, BENCH_FLOAT64, BENCH_FLOAT64),
+        Contender("cpu-exact-f32", CPU_EXACT, f32),
+        Contender("cpu-f32", CPU, f32),
+        *(_of_degree(degree) for degree in EXPONENTIALS if degree != DEGREE_IN_USE),
+        *(Contender(f"cpu-f32-{name}", CPU, f32, conventions=cut) for name, cut in CUT_OFFS.items()),
+        Contender(BASELINE_NAME, TEXTBOOK, f32),
+        *(Contender(f"{name}-f32", backend, f32) for name, backend in BACKENDS.items() if name not in KNOWN),
+    ]
+    return {contender.name: contender for contender in contenders}
+
+
+KNOWN = (REFERENCE.name, CPU.name, CPU_EXACT.name)  # backends that the list names itself; others may be installed
+
+CUT_OFFS = {
+    "cut-1/128": GSPLAT_MAIN._replace(name="CUT_1_128", alpha_min=1 / 128),
+    "cut-1/64": GSPLAT_MAIN._replace(name="CUT_1_64", alpha_min=1 / 64),
+    "3-sigma": GSPLAT_MAIN._replace(name="THREE_SIGMA", has_full_support=False),
+}
+"""Hits of higher alpha are skipped too; or a Gaussian ends at three standard deviations, by INRIA's tiles."""
+
+
+def choose(names: tuple[str, ...] | None) -> list[Contender]:
+    """Return the named contenders with the reference, in the order of the list; all by default.
+
+    Raises
+    ------
+    InputError
+        A name is unknown.
+    """
+    contenders = all_contenders()
+    if names is None:
+        return list(contenders.values())
+    for name in names:
+        if name not in contenders:
+            raise InputError(f"contender {name!r} is unknown; choose from {', '.join(contenders)}")
+    return [contenders[name] for name in contenders if name in (*names, REFERENCE_NAME)]
+
+
+def _of_degree(degree: int) -> Contender:
+    exp = EXPONENTIALS[degree]
+    error = float(relative_errors(exp, np.linspace(-6, 0, 601, dtype=np.float32)).max())  # exp(-6) < 1/255
+    return Contender(
+        f"cpu-f32-exp{degree}",
+        with_exponential(exp, f"cpu-exp{degree}"),
+        np.float32,
+        BENCH_FLOAT32_IMAGE + error,  # a pixel is a mean of colours: alphas off by e move it by at most e
+        BENCH_FLOAT32_GRADIENT + BENCH_EXPONENTIAL_GRADIENT * error,
+        slack=error,
+    )
+
+
+def with_exponential(exp: Callable, name: str) -> Backend:
+    """Return the CPU backend with blending by another exponential."""
+
+    def composite(
+        projection: Projection,
+        colors: Floats,
+        background: Floats,
+        bins: TileBins,
+        conventions: Conventions,
+        *,
+        with_stats: bool = False,
+        with_median_depth: bool = False,
+    ) -> RenderOutput:
+        return composite_with(exp, projection, colors, background, bins, conventions, with_stats, with_median_depth)
+
+    def composite_vjp(
+        projection: Projection,
+        colors: Floats,
+        background: Floats,
+        bins: TileBins,
+        conventions: Conventions,
+        output: RenderOutput,
+        v_image: Floats,
+        v_alpha: Floats,
+    ) -> CompositeGradient:
+        return composite_vjp_with(exp, projection, colors, background, bins, conventions, output, v_image, v_alpha)
+
+    return replace(CPU, name=name, composite=composite, composite_vjp=composite_vjp)

@@ -1,0 +1,162 @@
+"""How much memory training takes: a few iterations on 200,000 Gaussians in 1920 x 1080, in a process of its own.
+
+Several, because the first does without the moments, which are only then written, and without what one iteration leaves
+to the next. Counted is what that process holds at its peak beyond what it held before the Gaussians were there, with
+all kernels loaded. The bound is what no training can do without: the model, Adam's two moments, the gradients, the
+images of an iteration, and 48 bytes for every pair (tile, Gaussian): the 9 sums of its gradient, its places in the
+tile's list and in the Gaussian's, and one number to spare.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from minisplat_ref.backends import CPU
+from minisplat_ref.bench.slopes import FOCAL_OF_WIDTH, LARGE, flipped_pixels
+from minisplat_ref.bench.workloads import synth
+from minisplat_ref.errors import InputError
+from minisplat_ref.oracle.cases import Case, Figure
+from minisplat_ref.oracle.tolerances import BENCH_FLIPPED_PIXELS
+from minisplat_ref.rendering import render
+from minisplat_ref.types import Camera, Gaussians
+
+N, SIZE = 200_000, LARGE
+N_ITERATIONS = 4
+N_REST = 15  # coefficients of degree 3 beyond the constant
+BYTES_PER_PAIR = 48
+INPUTS, IMAGE, RESULT = "inputs.npz", "image.npy", "result.json"
+CHILD = "import sys; from minisplat_ref.bench.peak_memory import measure; measure(sys.argv[1])"
+MEGA = 1e6
+
+
+def memory_case() -> Case:
+    """Measure; the case fails if the image of the first iteration is not that of the float64 kernels.
+
+    Raises
+    ------
+    InputError
+        The system does not say how much memory a process holds, or the process ends before it is through.
+    """
+    width, height = SIZE
+    workload = synth(N, width, height, FOCAL_OF_WIDTH * width)
+    sh_rest = 0.05 * np.random.default_rng(2).normal(size=(N, N_REST, 3))
+    gaussians = Gaussians._make(f.astype(np.float32) for f in workload.gaussians._replace(sh_rest=sh_rest))
+    with tempfile.TemporaryDirectory() as folder:
+        camera = {f"camera_{name}": value for name, value in workload.camera._asdict().items()}
+        np.savez(Path(folder) / INPUTS, **gaussians._asdict(), **camera)
+        done = subprocess.run([sys.executable, "-c", CHILD, folder], capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            last = done.stderr.strip().splitlines()[-1:] or [f"exit code {done.returncode}"]
+            raise InputError(f"memory cannot be measured: {last[0]}")
+        result = json.loads((Path(folder) / RESULT).read_text())
+        image = np.load(Path(folder) / IMAGE)
+
+    exact = Gaussians._make(field.astype(np.float64) for field in gaussians)
+    output, tape = render(exact, workload.camera, sh_degree=0, backend=CPU)
+    n_pairs = len(tape.splats.bins.gaussian_ids)
+    model = sum(field.nbytes for field in gaussians)
+    terms = {
+        "model": model,
+        "moments": 2 * model,
+        "gradients": model,
+        "images": _image_bytes(width, height),
+        "pairs": BYTES_PER_PAIR * n_pairs,
+    }
+    bound = sum(terms.values())
+    figures: dict[str, Figure] = {
+        "peak MB": result["bytes"] / MEGA,
+        "bound MB": bound / MEGA,
+        "x bound": result["bytes"] / bound,
+        **{f"{name} MB": n_bytes / MEGA for name, n_bytes in terms.items()},
+        "pairs": n_pairs,
+    }
+    passed = flipped_pixels(image, output.image) <= BENCH_FLIPPED_PIXELS
+    note = result["note"] if passed else "the image is not that of float64"
+    return Case(f"memory/{N:,} Gaussians, {width} x {height}", passed, figures, note)
+
+
+def _image_bytes(width: int, height: int) -> int:
+    """Bytes of the photograph as it is kept and in float32, the image, its opacity, and the derivative by the image."""
+    bytes_, floats = 3, 3 + 3 + 1 + 3
+    return (bytes_ + 4 * floats) * width * height
+
+
+def measure(folder: str) -> None:
+    """Train on the inputs in a folder, and leave the first iteration's image and the peak there; for the process."""
+    from minisplat_ref.methods import get_recipe
+    from minisplat_ref.training.adam import zero_moments
+    from minisplat_ref.training.loop import StepReport, train
+    from minisplat_ref.training.state import TrainState
+    from minisplat_ref.types import Scene, View
+
+    recipe = get_recipe("3dgs-accel")._replace(iterations=N_ITERATIONS, events=())
+    path = Path(folder)
+
+    def iterate(gaussians: Gaussians, camera: Camera) -> None:
+        photograph = np.zeros((camera.height, camera.width, 3), np.uint8)
+        views = (View("view", camera, photograph, None),)
+        scene = Scene("synth", views, (), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(3), 1.0)
+        state = TrainState(gaussians, zero_moments(gaussians), 0, [], np.random.default_rng(0), {})
+
+        def on_step(report: StepReport) -> None:
+            if report.step == 1:
+                np.save(path / IMAGE, report.output.image)
+
+        train(scene, recipe, seed=0, state=state, on_step=on_step)
+
+    small = synth(500, 64, 48, 50.0)
+    iterate(Gaussians._make(field.astype(np.float32) for field in small.gaussians), small.camera)  # loads the kernels
+    note = _forget_peak()
+    before = _peak() if note else _held()
+    with np.load(path / INPUTS) as inputs:
+        gaussians = Gaussians._make(inputs[name] for name in Gaussians._fields)
+        camera = Camera._make(_plain(inputs[f"camera_{name}"]) for name in Camera._fields)
+    iterate(gaussians, camera)
+    n_bytes = _peak() - before
+    (path / RESULT).write_text(json.dumps({"bytes": n_bytes, "note": note}))
+
+
+def _plain(value: np.ndarray) -> Any:
+    return value.item() if value.ndim == 0 else value
+
+
+def _forget_peak() -> str:
+    """Make the system count the peak anew; return what a reader must know where it cannot."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return "at least: counted beyond the peak of loading the kernels"
+    return ""
+
+
+def _held() -> int:
+    """Bytes of memory in use now; Linux only, like :func:`_forget_peak`."""
+    return _from_status("VmRSS") or 0
+
+
+def _peak() -> int:
+    """Most bytes in use since :func:`_forget_peak`, or ever where that does not work."""
+    return _from_status("VmHWM") or _most_so_far()
+
+
+def _from_status(key: str) -> int | None:
+    """Read a line of what Linux says of this process."""
+    if not os.path.exists("/proc/self/status"):
+        return None
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(f"{key}:")), None)
+
+
+def _most_so_far() -> int:
+    from minisplat_ref.experiments.run import peak_rss_mb
+
+    peak = peak_rss_mb()
+    if peak is None:
+        raise InputError("this system does not say how much memory a process holds")
+    return int(MEGA * peak)

@@ -1,0 +1,151 @@
+"""Times and errors in one run: who is wrong gets no time, and all others take turns.
+
+The machine's other work and its clock change from minute to minute. So every round gives each contender one turn, and
+what is reported is the median and the least of its turns; a ratio of two of them is worth more than either.
+"""
+
+import time
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from minisplat_ref.backends import CPU, REFERENCE
+from minisplat_ref.bench.contenders import BASELINE_NAME, CHECKED_NAME, REFERENCE_NAME, Contender, all_contenders
+from minisplat_ref.bench.judging import Expected, Verdict, backward, expect, failure, forward, judge, with_slack
+from minisplat_ref.bench.workloads import Workload
+from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.oracle.cases import Case, Figure
+
+SLOW_SECONDS = 4.0  # a contender that takes longer a turn gets only one: it would heat the machine for the others
+MILLI = 1e3
+
+
+class Times(NamedTuple):
+    """Turns of one contender, seconds."""
+
+    forward: list[float]
+    """From parameters to image."""
+    backward: list[float]
+    """From the image's derivative to the parameters'."""
+
+    @property
+    def both(self) -> list[float]:
+        """Forward and backward of each turn together."""
+        return [a + b for a, b in zip(self.forward, self.backward, strict=True)]
+
+
+class Entry(NamedTuple):
+    """A contender on a workload."""
+
+    contender: Contender
+    verdict: Verdict
+    """Errors against the default's cut-off."""
+    failure: str
+    """Why it is wrong, empty where it is right."""
+    times: Times
+    """Empty where it is wrong."""
+
+
+def race(
+    workload: Workload, contenders: Iterable[Contender], repeats: int, report: Callable[[str], None] = lambda _: None
+) -> list[Case]:
+    """Judge every contender and time those that are right.
+
+    Parameters
+    ----------
+    workload : Workload
+    contenders : iterable of Contender
+        The reference is judged by nobody and timed once, while it gives the answer.
+    repeats : int
+        Turns of each.
+    report : callable
+        Called with a line on what is being done.
+
+    Returns
+    -------
+    list of Case
+        One per contender, named ``workload/contender``.
+    """
+    report(f"{workload.name}: the reference's answer")
+    expected = expect(workload, REFERENCE)
+    checked = all_contenders()[CHECKED_NAME]
+    trust = failure(checked, judge(checked, workload, expected))
+    entries = []
+    for contender in contenders:
+        report(f"{workload.name}: {contender.name}")
+        if contender.name == REFERENCE_NAME:
+            times = Times([expected.forward_seconds], [expected.backward_seconds])
+            entries.append(Entry(contender, _flawless(), "", times))
+        else:
+            entries.append(_judged(contender, workload, expected, trust))
+    for round_ in range(repeats):
+        report(f"{workload.name}: round {round_ + 1} of {repeats}")
+        for entry in entries:
+            if not entry.failure and entry.contender.name != REFERENCE_NAME:
+                _take_turn(entry, workload)
+    baseline = next((entry for entry in entries if entry.contender.name == BASELINE_NAME), None)
+    return [_case(workload, entry, baseline) for entry in entries]
+
+
+def _judged(contender: Contender, workload: Workload, expected: Expected, trust: str) -> Entry:
+    if contender.slack:  # its margins come from the float64 kernels, if those are right
+        expected = with_slack(expected, workload, contender.conventions, contender.slack)
+    verdict = judge(contender, workload, expected)
+    if contender.conventions == GSPLAT_MAIN:
+        wrong = (trust if contender.slack else "") or failure(contender, verdict)
+    else:  # and so does the answer to another cut-off
+        own = expect(workload, CPU, contender.conventions)
+        wrong = trust or failure(contender, judge(contender, workload, own))
+    return Entry(contender, verdict, wrong, Times([], []))
+
+
+def _take_turn(entry: Entry, workload: Workload) -> None:
+    contender, times = entry.contender, entry.times
+    if times.both and times.both[0] > SLOW_SECONDS:
+        return
+    start = time.perf_counter()
+    _, tape = forward(contender, workload)
+    drawn = time.perf_counter()
+    backward(contender, tape, workload.v_image)
+    times.forward.append(drawn - start)
+    times.backward.append(time.perf_counter() - drawn)
+
+
+def _case(workload: Workload, entry: Entry, baseline: Entry | None) -> Case:
+    v, times = entry.verdict, entry.times
+    figures: dict[str, Figure] = {
+        "forward ms": _median(times.forward),
+        "backward ms": _median(times.backward),
+        "both ms": _median(times.both),
+        "least forward ms": _least(times.forward),
+        "least both ms": _least(times.both),
+        "turns": len(times.both),
+        "x textbook": _ratio(baseline, entry),
+        "image max": v.image_max,
+        "image RMS": v.image_rms,
+        "flips": v.n_flips if entry.contender.conventions == GSPLAT_MAIN else None,
+        "image max, no flips": v.quiet_image_max,
+        "gradient": v.gradient,
+        "gradient, no flips": v.quiet_gradient,
+    }
+    return Case(f"{workload.name}/{entry.contender.name}", not entry.failure, figures, entry.failure)
+
+
+def _median(seconds: list[float]) -> float | None:
+    return MILLI * float(np.median(seconds)) if seconds else None
+
+
+def _least(seconds: list[float]) -> float | None:
+    return MILLI * min(seconds) if seconds else None
+
+
+def _ratio(baseline: Entry | None, entry: Entry) -> float | None:
+    """How many times faster than the baseline, by the least times of forward and backward."""
+    if baseline is None or not baseline.times.both or not entry.times.both:
+        return None
+    return min(baseline.times.both) / min(entry.times.both)
+
+
+def _flawless() -> Verdict:
+    return Verdict(0.0, 0.0, 0.0, 0, 0, 0.0, 0.0, "")

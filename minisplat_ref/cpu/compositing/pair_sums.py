@@ -1,0 +1,93 @@
+"""What a Gaussian's pairs with tiles add up to: its gradient, and its blend statistics.
+
+A pair (tile, Gaussian) has a slot of its own, which only the thread that blends the tile writes; afterwards each
+Gaussian adds up its slots in order, in float64. No two threads write the same number, and the sums have the same bytes
+at any number of threads. Cost: 6 + D numbers a pair.
+"""
+
+import numpy as np
+
+from minisplat_ref.cpu.compositing.records import N_FUSED
+from minisplat_ref.cpu.gaussian_rows import DOUBLE
+from minisplat_ref.cpu.projection import N_CHUNKS
+from minisplat_ref.jit.compile import kernel, prange, scalar
+from minisplat_ref.jit.lanes import WIDTH, converted, filled, load, store
+from minisplat_ref.jit.literals import ZERO
+from minisplat_ref.scalar.compositing import conic_vjp_of_moments, factors
+
+N_MOMENTS = 6  # sums of q, q e, q dy, q e^2, q e dy, q dy^2
+N_PAIR_STATS = 3  # sum of the weights, largest weight, number of hits
+
+
+def slot_size(n_channels: int) -> int:
+    """Numbers in a pair's slot: its moments and the sums of its channels, three at least."""
+    return N_MOMENTS + max(n_channels, N_FUSED)
+
+
+@scalar
+def _sum_slots(n, slots, width, first, end, sums, projection, out):
+    """Gradient of one Gaussian from the moments in its slots, the first eight numbers of a slot at a time."""
+    total, blue = filled(DOUBLE), DOUBLE
+    for slot in range(first, end):
+        total = total + converted(load(slots, slot * width), DOUBLE)
+        blue += slots[slot * width + WIDTH]
+    store(sums, 0, total)
+    sums[WIDTH] = blue
+    a, slope, pivot = factors(projection.conics[n, 0], projection.conics[n, 1], projection.conics[n, 2])
+    out.means2d[n, 0] = a * sums[1]
+    out.means2d[n, 1] = slope * a * sums[1] + pivot * sums[2]
+    v_a, v_b, v_c = conic_vjp_of_moments(slope, sums[3], sums[4], sums[5])
+    out.conics[n, 0], out.conics[n, 1], out.conics[n, 2] = v_a, v_b, v_c
+    out.opacities[n] = -sums[0] / projection.opacities[n]
+    for k in range(min(out.colors.shape[1], N_FUSED)):
+        out.colors[n, k] = sums[N_MOMENTS + k]
+    for k in range(N_FUSED, out.colors.shape[1]):
+        color = DOUBLE
+        for slot in range(first, end):
+            color += slots[slot * width + N_MOMENTS + k]
+        out.colors[n, k] = color
+
+
+@scalar
+def _write_zeros(n, out):
+    """Gradient of a Gaussian without a pair."""
+    out.means2d[n, 0] = out.means2d[n, 1] = out.opacities[n] = ZERO
+    for k in range(3):
+        out.conics[n, k] = ZERO
+    for k in range(out.colors.shape[1]):
+        out.colors[n, k] = ZERO
+
+
+@kernel()
+def sum_slots(slots, width, offsets, projection, out):
+    """Write the gradients of all Gaussians; ``slots`` are flat."""
+    n_gaussians = offsets.size - 1
+    for chunk in prange(N_CHUNKS):
+        sums = np.empty(WIDTH + 1, np.float64)
+        for n in range(n_gaussians * chunk // N_CHUNKS, n_gaussians * (chunk + 1) // N_CHUNKS):
+            if offsets[n] < offsets[n + 1]:
+                _sum_slots(n, slots, width, offsets[n], offsets[n + 1], sums, projection, out)
+            else:
+                _write_zeros(n, out)
+
+
+@scalar
+def _sum_pair_stats(n, slots, offsets, stats):
+    """Statistics of one Gaussian from those of its pairs."""
+    total = 0.0
+    largest = slots.dtype.type(0)
+    n_hits = 0
+    for slot in range(offsets[n], offsets[n + 1]):
+        total += slots[slot, 0]
+        largest = max(largest, slots[slot, 1])
+        n_hits += int(slots[slot, 2])
+    stats.blend_weight_sum[n], stats.blend_weight_max[n], stats.hit_count[n] = total, largest, n_hits
+
+
+@kernel()
+def sum_pair_stats(slots, offsets, stats):
+    """Write the weights' sums and maxima and the hit counts of all Gaussians."""
+    n_gaussians = offsets.size - 1
+    for chunk in prange(N_CHUNKS):
+        for n in range(n_gaussians * chunk // N_CHUNKS, n_gaussians * (chunk + 1) // N_CHUNKS):
+            _sum_pair_stats(n, slots, offsets, stats)

@@ -1,0 +1,98 @@
+"""What the blending kernels read of a Gaussian: one record of 13 numbers and its colours, with three a cache line.
+
+Beside centre, conic and opacity it holds the visible ellipse with x and y exchanged, from which a kernel learns the
+rows that the ellipse reaches in a strip of columns, and the columns of the box. Records are made eight at a time:
+numbers of eight Gaussians in, their columns out.
+"""
+
+import numpy as np
+
+from minisplat_ref.constants import Conventions
+from minisplat_ref.cpu.gaussian_rows import list_visible, listed_rows, rounded, triple
+from minisplat_ref.cpu.projection import N_CHUNKS
+from minisplat_ref.cpu.tiling import ELLIPSE_MARGIN
+from minisplat_ref.jit.compile import kernel, prange, scalar
+from minisplat_ref.jit.lanes import WIDTH, converted, gather, scatter, select, smaller
+from minisplat_ref.jit.literals import HALF, ZERO
+from minisplat_ref.scalar.compositing import factors
+from minisplat_ref.scalar.tiling import Outline, visible_outline
+from minisplat_ref.types import Floats, Projection
+
+# Columns. The conic is there as its factors, two of them halved as sigma wants them; columns of pixels are floats.
+MEAN_X, MEAN_Y, HALF_A, SLOPE, HALF_PIVOT, OPACITY = range(6)
+TURNED_SLOPE, TURNED_INVERSE_A, TURNED_PIVOT, Q, TURNED_TILT, COLUMN_FIRST, COLUMN_END, COLOR = range(6, 14)
+N_FUSED = 3  # channels that every record has; fewer are filled up with zeros
+HALF_A_MAX = np.float32(1e30)  # without a low-pass a footprint can be thinner than float32 can square
+
+
+def record_size(n_channels: int) -> int:
+    """Numbers in a record."""
+    return COLOR + max(n_channels, N_FUSED)
+
+
+@scalar
+def _half(factor):
+    """Half of a factor of a conic; one that is negative becomes so large that its negative squares are no hits."""
+    return select(factor >= ZERO, smaller(HALF * factor, HALF_A_MAX), HALF_A_MAX)
+
+
+@scalar
+def _write_eight(rows, projection, colors, alpha_min, records):
+    """Write the records of eight Gaussians, up to the third channel."""
+    zero = records.dtype.type(0)
+    a, b, c = triple(projection.conics, rows)
+    a_factor, slope, pivot = factors(a, b, c)
+    opacity = gather(projection.opacities, rows, 0)
+    outline = visible_outline(*rounded(factors(c, b, a), zero), opacity, alpha_min, ELLIPSE_MARGIN)
+    means2d, boxes = projection.means2d, projection.boxes
+    first_half = (
+        *(gather(means2d, rows, 0), gather(means2d, rows, 1)),
+        *rounded((_half(a_factor), slope, _half(pivot)), zero),
+        *(opacity, outline.slope, outline.inverse_a),
+    )
+    second_half = (
+        *(smaller(outline.pivot, HALF_A_MAX), outline.q, outline.tilt),
+        *(converted(gather(boxes, rows, 0), zero), converted(gather(boxes, rows, 2), zero)),
+        *(gather(colors, rows, 0), gather(colors, rows, 1), gather(colors, rows, 2)),
+    )
+    scatter(records, rows, MEAN_X, first_half)
+    scatter(records, rows, TURNED_PIVOT, second_half)
+
+
+@scalar
+def _write_part(first, end, projection, colors, alpha_min, records):
+    visible = np.empty(end - first + WIDTH, np.int64)
+    count = list_visible(projection.radii, first, end, visible)
+    for i in range(0, count, WIDTH):
+        _write_eight(listed_rows(visible, i), projection, colors, alpha_min, records)
+    for k in range(N_FUSED, colors.shape[1]):
+        records[first:end, COLOR + k] = colors[first:end, k]
+
+
+@kernel()
+def _write_records(projection, colors, alpha_min, records):
+    n = records.shape[0]
+    for part in prange(N_CHUNKS):
+        _write_part(n * part // N_CHUNKS, n * (part + 1) // N_CHUNKS, projection, colors, alpha_min, records)
+
+
+@scalar
+def turned_outline(records, n):
+    """Outline of the visible ellipse with x and y exchanged: ``rightmost_offset`` then gives its lowest point."""
+    return Outline(
+        records[n, TURNED_SLOPE],
+        records[n, TURNED_INVERSE_A],
+        records[n, TURNED_PIVOT],
+        records[n, Q],
+        records[n, TURNED_TILT],
+    )
+
+
+def records_of(projection: Projection, colors: Floats, conventions: Conventions) -> Floats:
+    """Return the records [N, 13 + D], D at least three; those of culled Gaussians are undefined."""
+    n, n_channels = colors.shape
+    if n_channels < N_FUSED:
+        colors = np.pad(colors, ((0, 0), (0, N_FUSED - n_channels)))
+    records = np.empty((n, record_size(n_channels)), colors.dtype)
+    _write_records(projection, colors, colors.dtype.type(conventions.alpha_min), records)
+    return records

@@ -1,0 +1,109 @@
+"""What the pixels of one tile remember while its Gaussians pass by, and how tiles are dealt out to threads.
+
+A tile of 32 x 16 pixels is 64 rows of eight pixels, and any set of them is an integer of 64 bits: the rows that a
+Gaussian reaches, the rows in which a pixel still accepts hits, and by one ``&`` the rows that there is work to do in.
+The rows are numbered down a strip eight pixels wide, then down the next. Of each row all fields lie side by side in
+memory, the transmittance first, then whatever a kernel keeps.
+"""
+
+import numpy as np
+
+from minisplat_ref.constants import Conventions
+from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
+from minisplat_ref.jit.compile import scalar
+from minisplat_ref.jit.lanes import WIDTH, any_of, counted, filled, load, lowest_bit, select, store
+from minisplat_ref.jit.literals import ONE, ZERO
+from minisplat_ref.jit.turns import turns
+from minisplat_ref.scalar.compositing import Frame
+from minisplat_ref.types import TileBins
+
+N_STRIPS = TILE_WIDTH // WIDTH
+N_ROWS = N_STRIPS * TILE_HEIGHT  # bits of an integer
+RANGES_PER_THREAD = 32
+CHECK_EVERY = 16  # hits between two looks at which pixels are finished
+
+
+def frame_of(bins: TileBins, conventions: Conventions, dtype: np.dtype) -> Frame:
+    """Image size and thresholds as the kernels take them."""
+    least = dtype.type(conventions.transmittance_min)
+    if conventions.stops_at_equality:
+        least = np.nextafter(least, dtype.type(1))  # T > t is T >= the next float above t
+    thresholds = (
+        conventions.alpha_min,
+        conventions.alpha_max,
+        least,
+        conventions.alpha_max if conventions.clamp_stops_mean_gradient else np.inf,
+        conventions.alpha_max if conventions.clamp_stops_shape_gradient else np.inf,
+    )
+    return Frame(bins.grid.width, bins.grid.height, *(dtype.type(value) for value in thresholds))
+
+
+@scalar
+def first_tile(i, n_ranges, offsets):
+    """First tile of range ``i``, if the tiles, in their order, are cut into ranges of about equal numbers of pairs.
+
+    Neighbouring tiles share Gaussians, so a range of them keeps records in the cache. A range is one thread's work;
+    there are many per thread because equal pairs are not equal work where pixels finish early, nor threads equally
+    fast.
+    """
+    first, end = 0, offsets.size - 1
+    wanted = (offsets[end] + end) * i // n_ranges  # an empty tile is some work too
+    while first < end:
+        middle = (first + end) // 2
+        if offsets[middle] + middle < wanted:
+            first = middle + 1
+        else:
+            end = middle
+    return first
+
+
+@scalar
+def tiles_in_turn(taken, n_threads, offsets):
+    """Yield the tiles of the ranges that this thread gets."""
+    n_ranges = RANGES_PER_THREAD * n_threads
+    for turn in turns(taken, n_ranges):
+        for tile in range(first_tile(turn, n_ranges, offsets), first_tile(turn + 1, n_ranges, offsets)):  # noqa: UP028
+            yield tile
+
+
+@scalar
+def corner(tile, frame):
+    """Return column and row of a tile's first pixel."""
+    n_tiles_x = (frame.width + TILE_WIDTH - 1) // TILE_WIDTH
+    return tile % n_tiles_x * TILE_WIDTH, tile // n_tiles_x * TILE_HEIGHT
+
+
+@scalar
+def row_in_image(row, x0, y0, frame):
+    """Return column and line of a row's first pixel, and how many of its eight pixels the image has."""
+    x, y = x0 + row // TILE_HEIGHT * WIDTH, y0 + row % TILE_HEIGHT
+    return x, y, max(0, min(WIDTH, frame.width - x)) if y < frame.height else 0
+
+
+@scalar
+def start_tile(state, x0, y0, frame, n_fields):
+    """Set all fields to zero and the transmittances to one; pixels beyond the image's edge start finished."""
+    as_data = state.dtype.type
+    state[:] = ZERO
+    for row in range(N_ROWS):
+        _, _, n_pixels = row_in_image(row, x0, y0, frame)
+        is_inside = counted(as_data(0)) < as_data(n_pixels)
+        store(state, row * n_fields * WIDTH, select(is_inside, filled(as_data(1)), -ONE))
+
+
+@scalar
+def open_rows(state, n_fields):
+    """Rows with a pixel that accepts hits, as bits."""
+    rows = np.uint64(0)
+    for row in range(N_ROWS):
+        is_open = any_of(load(state, row * n_fields * WIDTH) > ZERO)
+        rows |= np.uint64(is_open) << np.uint64(row)
+    return rows
+
+
+@scalar
+def rows_of(bits):
+    """Yield the rows of a set, from the first to the last."""
+    while bits != np.uint64(0):
+        yield lowest_bit(bits)
+        bits &= bits - np.uint64(1)

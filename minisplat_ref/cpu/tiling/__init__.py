@@ -1,0 +1,98 @@
+"""Lists of the Gaussians that touch each tile, front to back.
+
+The pairs (tile, Gaussian) are never sorted. The Gaussians are dealt into layers of about equal numbers, each behind the
+one before; when it is known how many pairs each layer has in each tile, every layer knows where in each tile's list its
+pairs start, so that the layers are sorted by depth and written into the lists independently. Three passes:
+
+1. The survey counts the Gaussians of each part of the input by depth, which says where layers begin, and finds the wide
+   boxes.
+2. Every part finds the tiles of its Gaussians and enters each Gaussian into its layer, in the order of the input.
+3. Every layer is sorted, and fills the lists. Its entries and cells fit the second-level cache, where random access is
+   cheap.
+
+Parts and layers are fixed in number, so that no result depends on the number of threads or on which of them takes what.
+"""
+
+import numpy as np
+
+from minisplat_ref.constants import Conventions
+from minisplat_ref.cpu.tiling.footprints import ELLIPSE_MARGIN, TILE_HEIGHT, TILE_WIDTH
+from minisplat_ref.cpu.tiling.layers import (
+    CULLED,
+    N_PARTS,
+    TILES,
+    Layers,
+    Survey,
+    cut_layers,
+    fill_layer,
+    list_part,
+    start_lists,
+    survey_part,
+)
+from minisplat_ref.cpu.tiling.sorting import DIGIT_BITS
+from minisplat_ref.jit.compile import kernel, n_threads, prange
+from minisplat_ref.jit.lanes import WIDTH
+from minisplat_ref.jit.turns import no_turns, turns
+from minisplat_ref.types import Projection, TileBins, TileGrid
+
+__all__ = ["ELLIPSE_MARGIN", "TILE_HEIGHT", "TILE_WIDTH", "bin_gaussians"]
+
+
+@kernel()
+def _list_tiles(
+    projection, keys, alpha_min, n_tiles_x, survey, layers, offsets, counts, first_slots, tile_offsets, scratch, digits
+):
+    """Write the offsets; return the lists and the slots of their pairs. The three passes are one kernel."""
+    n_threads = len(counts)
+    taken = no_turns()
+    for _ in prange(n_threads):
+        for part in turns(taken, N_PARTS):
+            survey_part(part, projection.boxes, projection.depths, survey)
+    cut_layers(survey.up_to, layers.of_buckets, layers.edges)
+
+    cells = np.empty(layers.edges[-1, TILES], np.int32)
+    taken = no_turns()
+    for thread in prange(n_threads):
+        for part in turns(taken, N_PARTS):
+            list_part(part, survey, projection, keys, alpha_min, n_tiles_x, layers, cells, offsets, counts[thread])
+    start_lists(counts, offsets, first_slots, tile_offsets)
+
+    lists = np.empty((2, tile_offsets[-1]), np.int32)
+    taken = no_turns()
+    for thread in prange(n_threads):
+        for turn in turns(taken, N_PARTS):
+            layer = turn % 2 * (N_PARTS // 2) + turn // 2  # neighbours share cache lines: far apart in time
+            fill_layer(layer, layers, cells, first_slots, offsets, scratch, digits[thread], counts[0], lists)
+    return lists
+
+
+def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventions) -> TileBins:
+    """List the Gaussians that touch each tile; see ``reference.tiling.bin_gaussians``.
+
+    Of the tiles under a Gaussian's box, those are left out in which no pixel centre can reach
+    ``conventions.alpha_min``; a box within one row or one column of tiles is not looked at so closely.
+    """
+    n, n_tiles, dtype = len(projection.depths), grid.n_tiles_x * grid.n_tiles_y, projection.depths.dtype
+    keys = projection.depths.view(np.int32 if dtype == np.float32 else np.int64)
+    alpha_min = dtype.type(conventions.alpha_min)
+    survey = Survey(
+        np.empty((N_PARTS, CULLED + 2), np.int64),
+        np.empty(n, np.int16),
+        np.empty((N_PARTS, 2, n // N_PARTS + 2 * WIDTH), np.int32),
+    )
+    layers = Layers(
+        np.empty(CULLED + 1, np.int32),
+        np.empty(((N_PARTS + 1) * N_PARTS + 1, 2), np.int64),
+        np.empty_like(keys),
+        np.empty((n, 4), np.int32),
+    )
+    offsets, tile_offsets = np.empty(n + 1, np.int64), np.empty(n_tiles + 1, np.int64)
+    offsets[0] = 0
+    counts, first_slots = np.zeros((n_threads(), N_PARTS * n_tiles), np.int32), np.empty(N_PARTS, np.int64)
+    scratch = (np.empty(n, np.int32), np.empty_like(keys), np.empty(n, np.int32))
+    digits = np.empty((n_threads(), 2, 1 << DIGIT_BITS), np.int32)
+    ids, slots = _list_tiles(
+        projection, keys, alpha_min, grid.n_tiles_x, survey, layers, offsets, counts, first_slots, tile_offsets,
+        scratch, digits,
+    )  # fmt: skip
+    return TileBins(ids, tile_offsets, slots, offsets, grid)

@@ -1,0 +1,60 @@
+"""Order of positive floats: a radix sort of their bits.
+
+Positive IEEE floats are ordered as the integers that their bits spell, and those are sorted digit by digit in linear
+passes. Each pass is stable, which makes equal keys keep their order. Keys that are near each other share their leading
+bits: digits are those of the difference to the smallest key, and there are as few pairs of them as the largest needs.
+"""
+
+from minisplat_ref.jit.compile import scalar
+
+DIGIT_BITS = 11  # 2048 counters, of two digits: they fit the first-level cache
+DIGIT_MASK = (1 << DIGIT_BITS) - 1
+KEY_BITS = 63  # of the longest keys; a shift by more has no meaning
+
+
+@scalar
+def _start_places(keys, lowest, shift, places, next_places):
+    """Find where the first key of each digit goes, for the two digits from ``shift`` on: one pass counts both."""
+    places[:] = 0
+    next_places[:] = 0
+    for key in keys:
+        bits = (key - lowest) >> shift
+        places[bits & DIGIT_MASK] += 1
+        next_places[(bits >> DIGIT_BITS) & DIGIT_MASK] += 1
+    place = next_place = 0
+    for digit in range(places.size):
+        place, places[digit] = place + places[digit], place
+        next_place, next_places[digit] = next_place + next_places[digit], next_place
+
+
+@scalar
+def _move(keys, values, lowest, shift, places, to_keys, to_values):
+    for i in range(keys.size):
+        digit = ((keys[i] - lowest) >> shift) & DIGIT_MASK
+        place = places[digit]
+        places[digit] = place + 1
+        to_keys[place], to_values[place] = keys[i], values[i]
+
+
+@scalar
+def sort_stably(keys, values, other_keys, other_values, places):
+    """Sort values [n] by their integer keys [n]; equal keys keep their order.
+
+    Parameters
+    ----------
+    keys, values : ndarray of shape (n,)
+        Sorted in place.
+    other_keys, other_values : ndarray of shape (n,)
+        Scratch.
+    places : ndarray of shape (2, 2^DIGIT_BITS)
+        Scratch.
+    """
+    lowest = highest = keys[0] if keys.size > 0 else 0
+    for key in keys:
+        lowest, highest = min(lowest, key), max(highest, key)
+    for shift in range(0, KEY_BITS, 2 * DIGIT_BITS):  # two digits each time: so the last pass is one back
+        if (highest - lowest) >> shift == 0:
+            break
+        _start_places(keys, lowest, shift, places[0], places[1])
+        _move(keys, values, lowest, shift, places[0], other_keys, other_values)
+        _move(other_keys, other_values, lowest, shift + DIGIT_BITS, places[1], keys, values)

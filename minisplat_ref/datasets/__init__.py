@@ -1,0 +1,1 @@
+"""Programs that make and prepare scenes: synthetic scenes, structure from motion, undistortion, downscaling."""

@@ -1,0 +1,174 @@
+"""``minisplat-ref sfm PHOTOS --out SCENE``: cameras and sparse points from a folder of photographs, on the CPU.
+
+Structure from motion by pycolmap: photographs are turned upright (EXIF) and shrunk, SIFT features are found and
+matched, cameras and points estimated one image after the other (incremental mapping), and the result is undistorted.
+What is left is a COLMAP scene with pinhole cameras: ``images/`` and ``sparse/0/``. Photographs that found no place are
+named and left out. The focal length in the EXIF data is COLMAP's first guess; place and time are not copied.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+from PIL import ExifTags, Image, ImageOps
+from tqdm import tqdm
+
+from minisplat_ref.datasets.command import import_quiet_pycolmap, run_command
+from minisplat_ref.datasets.downscale import list_images
+from minisplat_ref.datasets.undistort import undistort_model
+from minisplat_ref.errors import InputError
+from minisplat_ref.io.atomic import making_folder
+from minisplat_ref.io.images import SAVE_OPTIONS, open_image
+
+CAMERA_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")
+MATCHINGS = ("exhaustive", "sequential")
+CAMERA_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model)
+FOCAL_TAGS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
+SEED = 0  # of RANSAC: the same photographs give the same cameras, up to the order in which threads finish
+
+
+class SfmResult(NamedTuple):
+    """What came out, for the report."""
+
+    n_photos: int
+    """Photographs that were given."""
+    left_out: tuple[str, ...]
+    """Those that found no place."""
+    n_points: int
+    """Sparse points."""
+    error: float
+    """Mean reprojection error before undistortion, pixels."""
+
+
+def run_sfm(
+    photos: Path, out: Path, *, long_side: int = 1600, matching: str = "exhaustive", camera_model: str = "SIMPLE_RADIAL"
+) -> SfmResult:
+    """Make a COLMAP scene with pinhole cameras from photographs, complete or not at all.
+
+    Parameters
+    ----------
+    photos : Path
+        Folder of photographs.
+    out : Path
+        Folder to make.
+    long_side : int
+        Photographs with a longer side are shrunk to this, pixels.
+    matching : str
+        "exhaustive": every pair. "sequential": neighbours in the order of file names, for videos.
+    camera_model : str
+        COLMAP model that is estimated; one camera for all if all photographs have one size, else one for each.
+
+    Returns
+    -------
+    SfmResult
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two photographs, one cannot be read, or no scene comes out of them.
+    """
+    files = list_images(photos)
+    if len(files) < 2:
+        raise InputError(f"{photos}: 1 photograph, structure from motion needs at least 2 that overlap; take more")
+    if long_side < 1:
+        raise InputError(f"--long-side is {long_side}; it must be positive")
+    with making_folder(out) as folder, TemporaryDirectory(dir=folder) as temporary:
+        work = Path(temporary)
+        names = prepare_photos(files, photos, work / "images", long_side)
+        reconstruction = _reconstruct(work, names, matching, camera_model, photos)
+        (work / "model").mkdir()
+        reconstruction.write(work / "model")
+        undistort_model(work / "model", work / "images", folder)
+    registered = {image.name for image in reconstruction.images.values() if image.has_pose}
+    left_out = tuple(sorted(set(names) - registered))
+    error = reconstruction.compute_mean_reprojection_error()
+    return SfmResult(len(files), left_out, reconstruction.num_points3D(), error)
+
+
+def prepare_photos(files: Sequence[Path], photos: Path, target: Path, long_side: int) -> dict[str, tuple[int, int]]:
+    """Copy photographs upright and shrunk; return the size of each by its new name, relative to ``target``."""
+    sizes: dict[str, tuple[int, int]] = {}
+    for file in tqdm(files, desc="photographs", unit=" images", leave=False, disable=None):
+        relative = file.relative_to(photos)
+        name = relative.with_suffix(".png" if relative.suffix.lower() == ".png" else ".jpg").as_posix()
+        if name in sizes:
+            raise InputError(f"{file}: another photograph is called {name}; give each its own name, suffix aside")
+        with open_image(file) as opened:
+            exif = _focal_exif(opened)
+            image = ImageOps.exif_transpose(opened).convert("RGB")
+        image.thumbnail((long_side, long_side), Image.Resampling.LANCZOS)
+        (target / name).parent.mkdir(parents=True, exist_ok=True)
+        image.save(target / name, exif=exif, **SAVE_OPTIONS["JPEG"])  # a PNG does not look at these options
+        sizes[name] = image.size
+    return sizes
+
+
+def _focal_exif(image: Image.Image) -> Image.Exif:
+    """EXIF data with what tells the focal length; place, time and the orientation, which is applied, are left out."""
+    source, focal = image.getexif(), Image.Exif()
+    focal.update({tag: source[tag] for tag in CAMERA_TAGS if tag in source})
+    lens = source.get_ifd(ExifTags.IFD.Exif)
+    focal.get_ifd(ExifTags.IFD.Exif).update({tag: lens[tag] for tag in FOCAL_TAGS if tag in lens})
+    return focal
+
+
+def _reconstruct(work: Path, sizes: dict[str, tuple[int, int]], matching: str, camera_model: str, photos: Path) -> Any:
+    """Features, matches, and the largest model of incremental mapping, a ``pycolmap.Reconstruction``."""
+    pycolmap = import_quiet_pycolmap()
+    pycolmap.set_random_seed(SEED)
+    database, images = work / "database.db", work / "images"
+    mode = pycolmap.CameraMode.SINGLE if len(set(sizes.values())) == 1 else pycolmap.CameraMode.PER_IMAGE
+    reader = pycolmap.ImageReaderOptions(camera_model=camera_model)
+    cpu = pycolmap.Device.cpu
+    with tqdm(total=3, desc="features", unit=" steps", leave=False, disable=None) as bar:
+        pycolmap.extract_features(database, images, camera_mode=mode, reader_options=reader, device=cpu)
+        bar.update()
+        bar.set_description("matches")
+        match = pycolmap.match_exhaustive if matching == "exhaustive" else pycolmap.match_sequential
+        match(database, device=cpu)
+        bar.update()
+        bar.set_description("cameras")
+        options = pycolmap.IncrementalPipelineOptions(random_seed=SEED)
+        models = pycolmap.incremental_mapping(database, images, work, options)
+    if not models:
+        raise InputError(
+            f"{photos}: no two photographs could be placed; take them with more overlap, of something with texture"
+        )
+    return max(models.values(), key=lambda model: model.num_reg_images())
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(
+        prog="minisplat-ref sfm",
+        description="Estimate cameras and sparse points of photographs with COLMAP, on the CPU.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    parser.add_argument("photos", metavar="PHOTOS", type=Path, help="folder of photographs")
+    parser.add_argument("--out", metavar="SCENE", type=Path, required=True, help="folder to make")
+    parser.add_argument("--long-side", metavar="PX", type=int, default=1600, help="shrink photographs to this")
+    parser.add_argument("--matching", choices=MATCHINGS, default=MATCHINGS[0], help="sequential is for videos")
+    parser.add_argument("--camera-model", choices=CAMERA_MODELS, default=CAMERA_MODELS[0], help="lens to estimate")
+
+    def action(options: argparse.Namespace) -> None:
+        result = run_sfm(
+            options.photos,
+            options.out,
+            long_side=options.long_side,
+            matching=options.matching,
+            camera_model=options.camera_model,
+        )
+        n_placed = result.n_photos - len(result.left_out)
+        counts = f"{n_placed} of {result.n_photos} photographs, {result.n_points} points"
+        print(f"{options.out}: {counts}, reprojection error {result.error:.2f} px")
+        if result.left_out:
+            print(f"without a place: {', '.join(result.left_out)}")
+
+    return run_command(parser, action, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

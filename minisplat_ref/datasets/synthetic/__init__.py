@@ -1,0 +1,158 @@
+"""Synthetic scenes with exact truth: photographs, depth, normals and sparse points, ray-traced with NumPy.
+
+Reading order: shapes, geometry, materials, tracer, cameras, furniture, scenes, sparse_points; files writes a scene as a
+COLMAP folder.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from minisplat_ref.datasets.synthetic.cameras import orbit_cameras
+from minisplat_ref.datasets.synthetic.scenes import SETTINGS
+from minisplat_ref.datasets.synthetic.sparse_points import sample_points
+from minisplat_ref.datasets.synthetic.tracer import TracedView, World, camera_centre, trace_view
+from minisplat_ref.errors import InputError
+from minisplat_ref.types import Bools, Camera, Floats, Scene, View
+
+__all__ = ["SCENE_NAMES", "SyntheticScene", "make_scene"]
+
+SCENE_NAMES = tuple(SETTINGS)
+"""The scenes that :func:`make_scene` knows."""
+
+EXTENT_MARGIN = 1.1  # of the largest distance of a camera from the mean: the definition in types.Scene
+
+
+class SyntheticScene(NamedTuple):
+    """A scene with the truth that a photograph does not have. V training and T test views."""
+
+    scene: Scene
+    """What a loader would return."""
+    train_depths: Floats
+    """[V, H, W] float64 camera z at pixel centres, world units; 0 at the sky."""
+    test_depths: Floats
+    """[T, H, W] likewise."""
+    train_normals: Floats
+    """[V, H, W, 3] float64 unit normals towards the camera at pixel centres, world frame; 0 at the sky."""
+    test_normals: Floats
+    """[T, H, W, 3] likewise."""
+    point_visibility: Bools
+    """[V, P] which training view sees which of the scene's points."""
+    world: World
+    """The surfaces and their light, to trace further views."""
+
+
+def make_scene(
+    name: str,
+    *,
+    n_views: int = 24,
+    width: int = 160,
+    height: int = 120,
+    seed: int = 0,
+    supersampling: int = 2,
+    n_points: int = 4000,
+    point_noise: float = 0.0,
+    test_every: int = 8,
+    progress: Callable[[Sequence[Camera]], Iterable[Camera]] = iter,
+) -> SyntheticScene:
+    """Ray-trace a scene. Equal arguments give equal bytes.
+
+    Parameters
+    ----------
+    name : str
+        One of ``SCENE_NAMES``.
+    n_views : int
+        Training views; the test views come on top.
+    width, height : int
+        Image size, pixels.
+    seed : int
+        Textures, camera path and points follow from it.
+    supersampling : int
+        n of the n x n colour samples a pixel.
+    n_points : int
+        Sparse points; fewer when the views share too few surfaces.
+    point_noise : float
+        Standard deviation of the error of each point coordinate, metres.
+    test_every : int
+        In walking order the first of every so many views is a test view, as loaders split; 0 for no test views.
+    progress : callable
+        Wraps the sequence of cameras while the views are traced; ``tqdm.tqdm`` shows a bar.
+
+    Returns
+    -------
+    SyntheticScene
+        Metres, z up, the floor at z = 0; views named in walking order.
+
+    Raises
+    ------
+    InputError
+        An unknown name or a number out of range.
+    """
+    _check(name, n_views, width, height, seed, supersampling, n_points, point_noise, test_every)
+    scene_rng, camera_rng, point_rng = np.random.default_rng(seed).spawn(3)
+    world, orbit = SETTINGS[name](scene_rng)
+    n_total = n_views + (-(-n_views // (test_every - 1)) if test_every else 0)
+    cameras = orbit_cameras(orbit, n_total, width, height, camera_rng)
+    traced = [trace_view(world, camera, supersampling) for camera in progress(cameras)]
+    views = [View(f"view_{i:04d}", cameras[i], traced[i].image, None) for i in range(n_total)]
+    test_ids = list(range(0, n_total, test_every)) if test_every else []
+    train_ids = [i for i in range(n_total) if i not in test_ids]
+
+    points, colors, visibility = sample_points(
+        world, [cameras[i] for i in train_ids], [traced[i] for i in train_ids], n_points, point_noise, point_rng
+    )
+    train_centres = np.stack([camera_centre(cameras[i]) for i in train_ids])  # [V, 3]
+    reach = np.linalg.norm(train_centres - train_centres.mean(axis=0), axis=1).max()
+    seen = [np.flatnonzero(row) for row in visibility]  # of V views: the points that each sees
+    scene = Scene(
+        name=name,
+        train_views=tuple(views[i]._replace(point_ids=ids) for i, ids in zip(train_ids, seen, strict=True)),
+        test_views=tuple(views[i] for i in test_ids),
+        points=points,
+        point_colors=colors,
+        background=np.zeros(3),
+        extent=EXTENT_MARGIN * float(reach),
+    )
+    train_depths, train_normals = _stack_truth(traced, train_ids, width, height)
+    test_depths, test_normals = _stack_truth(traced, test_ids, width, height)
+    return SyntheticScene(scene, train_depths, test_depths, train_normals, test_normals, visibility, world)
+
+
+def _stack_truth(traced: Sequence[TracedView], ids: Sequence[int], width: int, height: int) -> tuple[Floats, Floats]:
+    """Depths [n, H, W] and normals [n, H, W, 3] of some views; n may be 0."""
+    depths, normals = np.zeros((len(ids), height, width)), np.zeros((len(ids), height, width, 3))
+    for row, index in enumerate(ids):
+        depths[row], normals[row] = traced[index].depth, traced[index].normals
+    return depths, normals
+
+
+def _check(
+    name: str,
+    n_views: int,
+    width: int,
+    height: int,
+    seed: int,
+    supersampling: int,
+    n_points: int,
+    point_noise: float,
+    test_every: int,
+) -> None:
+    """Refuse what cannot be traced."""
+    if name not in SETTINGS:
+        raise InputError(f"there is no synthetic scene {name!r}; choose one of {', '.join(SCENE_NAMES)}")
+    for argument, value, least in (
+        ("n_views", n_views, 2),
+        ("width", width, 8),
+        ("height", height, 8),
+        ("seed", seed, 0),
+        ("supersampling", supersampling, 1),
+        ("n_points", n_points, 0),
+        ("test_every", test_every, 0),
+    ):
+        if value < least:
+            raise InputError(f"{argument} is {value}; give {least} or more")
+    if test_every == 1:
+        raise InputError("test_every is 1, which leaves nothing to train on; give 0 for no test views, or 2 or more")
+    if not (0.0 <= point_noise < np.inf):
+        raise InputError(f"point_noise is {point_noise}; give a finite number of metres, 0 or more")

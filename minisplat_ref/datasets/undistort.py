@@ -1,0 +1,156 @@
+"""``minisplat-ref undistort SCENE --out DIR``: a copy of a scene whose images have no lens distortion.
+
+Every photograph is warped to the pinhole that COLMAP chooses for its lens (same focal length, no blank pixels). A
+COLMAP scene keeps its points and 2D features, a transforms.json scene its poses and points; masks are warped along, and
+an alpha channel is composited onto black in the latter, where it is no mask.
+"""
+
+import argparse
+import json
+import shutil
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from minisplat_ref.datasets.command import import_quiet_pycolmap, run_command
+from minisplat_ref.errors import InputError
+from minisplat_ref.io.atomic import making_folder
+from minisplat_ref.io.colmap import colmap_photos, find_model, read_model
+from minisplat_ref.io.images import SAVE_OPTIONS, write_image
+from minisplat_ref.io.scene import Photo, build_reading, check_photo, read_view
+from minisplat_ref.io.transforms import existing_frames, find_points, find_transforms, read_transforms
+from minisplat_ref.types import Camera
+
+# What a transforms.json says about lenses; every frame gets its pinhole's entries instead.
+LENS_KEYS = (
+    *("k1", "k2", "k3", "k4", "p1", "p2", "camera_model", "is_fisheye"),
+    *("camera_angle_x", "camera_angle_y", "fl_x", "fl_y", "cx", "cy", "w", "h"),
+)
+POINTS_FILE = "points3d.ply"
+
+
+def undistort_scene(scene: Path, out: Path) -> None:
+    """Write an undistorted copy of a scene, complete or not at all.
+
+    Parameters
+    ----------
+    scene : Path
+        Folder of a COLMAP scene or of a transforms.json, or a transforms.json file.
+    out : Path
+        Folder to make.
+
+    Raises
+    ------
+    InputError
+        If there is no scene, it has no distortion, or ``out`` is already there.
+    """
+    model, files = find_model(scene), find_transforms(scene)
+    if model is None and not files:
+        raise InputError(f"{scene}: neither a COLMAP model nor a transforms.json; give the folder of a scene")
+    with making_folder(out) as folder:
+        if model is not None:
+            _undistort_colmap(scene, model, folder)
+        else:
+            for file in files:
+                _undistort_transforms(file, folder)
+
+
+def undistort_model(model: Path, images: Path, out: Path) -> None:
+    """Undistort a COLMAP model and its images into ``out/images`` and ``out/sparse/0``; ``out`` must exist."""
+    pycolmap = import_quiet_pycolmap()
+    with tempfile.TemporaryDirectory(dir=out) as temporary:
+        quality = SAVE_OPTIONS["JPEG"]["quality"]
+        pycolmap.undistort_images(temporary, str(model), str(images), jpeg_quality=quality)
+        (out / "sparse").mkdir()
+        shutil.move(Path(temporary, "images"), out / "images")
+        shutil.move(Path(temporary, "sparse"), out / "sparse" / "0")
+
+
+def _undistort_colmap(scene: Path, model: Path, folder: Path) -> None:
+    """Undistort model and images by COLMAP's own program, masks by the loader's route, which gives the same camera."""
+    photos = colmap_photos(scene, read_model(scene))
+    _check_distorted(scene, photos)
+    undistort_model(model, scene / "images", folder)
+    reading = build_reading(1, None, undistort=True, alpha_is_mask=True)
+    for photo in tqdm(photos, desc="masks", unit=" images", leave=False, disable=None):
+        mask = read_view(photo, photo.file, reading).mask
+        if mask is not None:
+            _write(folder / "masks" / f"{photo.file}.png", mask)
+
+
+def _undistort_transforms(file: Path, folder: Path) -> None:
+    """Write images, masks, points and a transforms.json with intrinsics per frame."""
+    transforms = read_transforms(file)
+    pairs = existing_frames(file, transforms)
+    _check_distorted(file, [photo for _, photo in pairs])
+    reading = build_reading(1, None, undistort=True, alpha_is_mask=False)
+    frames = []
+    for frame, photo in tqdm(pairs, desc="images", unit=" images", leave=False, disable=None):
+        is_below = photo.path.is_relative_to(file.parent)
+        name = photo.path.relative_to(file.parent) if is_below else Path("images", photo.file)
+        view = read_view(photo, photo.file, reading)
+        changes = {"file_path": name.as_posix(), **_intrinsics(view.camera)}
+        _write(folder / name, view.image)
+        if view.mask is not None:
+            changes["mask_path"] = Path("masks", f"{name.name}.png").as_posix()
+            _write(folder / changes["mask_path"], view.mask)
+        frames.append({key: value for key, value in frame.items() if key not in LENS_KEYS} | changes)
+    changes = {"frames": frames}
+    points = find_points(file, transforms)
+    if points is not None:
+        shutil.copyfile(points, folder / POINTS_FILE)
+        changes["ply_file_path"] = POINTS_FILE
+    rest = {key: value for key, value in transforms.items() if key not in LENS_KEYS}
+    (folder / file.name).write_text(json.dumps(rest | changes, indent=1), encoding="utf-8")
+
+
+def _intrinsics(camera: Camera) -> dict[str, Any]:
+    """Pinhole entries of a frame."""
+    return {
+        "camera_model": "PINHOLE",
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "w": camera.width,
+        "h": camera.height,
+    }
+
+
+def _write(path: Path, image: NDArray) -> None:
+    """Write an image in a folder that may have to be made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_image(path, image)
+
+
+def _check_distorted(source: Path, photos: Sequence[Photo]) -> None:
+    """Refuse photographs that cannot be read, and work that is not needed."""
+    for photo in photos:
+        check_photo(photo, source, undistort=True)
+    if all(photo.lens is None for photo in photos):
+        raise InputError(f"{source}: all cameras are pinholes already, nothing to undistort; use the scene as it is")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(
+        prog="minisplat-ref undistort",
+        description="Copy a COLMAP or transforms.json scene, its images warped to pinhole cameras.",
+    )
+    parser.add_argument("scene", metavar="SCENE", type=Path, help="folder of the scene, or a transforms.json")
+    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to make")
+
+    def action(options: argparse.Namespace) -> None:
+        undistort_scene(options.scene, options.out)
+        print(options.out)
+
+    return run_command(parser, action, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,84 @@
+"""The figures of a comparison: PSNR over time, PSNR over the number of Gaussians, and the gallery."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+from minisplat_ref.experiments.comparison.crops import Crop
+from minisplat_ref.experiments.plots import PLOT_STYLE, TITLE_COLOR, plot
+
+COLORS = ("#b4553d", "#2d6a8e", "#4b7f52", "#8a5a9e", "#b08a2e", "#5a6570")  # of the recipes, in their order
+SIZE = (5.6, 4.0)  # inches, of a plot
+CROP_WIDTH = 2.2  # inches, in the gallery
+
+Curves = Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]
+"""For every recipe the records of ``curve.jsonl`` of each seed."""
+
+
+def color(index: int) -> str:
+    """Return the colour of a recipe."""
+    return COLORS[index % len(COLORS)]
+
+
+def psnr_over_time(curves: Curves) -> Figure:
+    """Draw the PSNR of the test views over the training time: a line per run, a colour per recipe."""
+    with plot("PSNR of the test views (dB)", "training time (s)", SIZE) as (figure, axes):
+        for index, (recipe, runs) in enumerate(curves.items()):
+            for number, records in enumerate(runs):
+                axes.plot(
+                    [record["seconds"] for record in records],
+                    [record["psnr"] for record in records],
+                    color=color(index),
+                    linewidth=1.8,
+                    marker="o",
+                    markersize=3,
+                    label=recipe if number == 0 else None,
+                )
+        axes.legend(loc="best", frameon=False)
+    return figure
+
+
+def psnr_over_count(curves: Curves) -> Figure:
+    """Draw the PSNR of the test views over the number of Gaussians: the way there thin, the end as a disc."""
+    with plot("PSNR of the test views (dB)", "Gaussians", SIZE) as (figure, axes):
+        for index, (recipe, runs) in enumerate(curves.items()):
+            for number, records in enumerate(runs):
+                counts = [record["n_gaussians"] for record in records]
+                psnrs = [record["psnr"] for record in records]
+                axes.plot(counts, psnrs, color=color(index), linewidth=0.8, alpha=0.6)
+                axes.plot(
+                    counts[-1:],
+                    psnrs[-1:],
+                    color=color(index),
+                    marker="o",
+                    markersize=8,
+                    linestyle="none",
+                    label=recipe if number == 0 else None,
+                )
+        axes.set_xscale("log")
+        axes.margins(x=0.05)  # room for the discs
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.legend(loc="best", frameon=False)
+    return figure
+
+
+def gallery(crops: Sequence[Crop], recipes: Sequence[str]) -> Figure:
+    """Draw the crops: a row each, the truth on the left, then a column per recipe."""
+    n_columns = 1 + len(recipes)
+    height, width = crops[0].truth.shape[:2]
+    row_height = CROP_WIDTH * height / width + 0.3  # with its title
+    with rc_context(PLOT_STYLE):
+        figure = Figure(figsize=(CROP_WIDTH * n_columns, row_height * len(crops)), layout="constrained")
+        rows = figure.subplots(len(crops), n_columns, squeeze=False)
+        for row, crop in zip(rows, crops, strict=True):
+            titles = (f"{crop.view}, truth", *recipes)
+            for axes, picture, title in zip(row, (crop.truth, *crop.renders), titles, strict=True):
+                axes.imshow(picture, interpolation="nearest")
+                axes.set_title(title, fontsize=9, loc="left", color=TITLE_COLOR)
+                axes.set_axis_off()
+    return figure

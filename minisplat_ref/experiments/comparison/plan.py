@@ -1,0 +1,124 @@
+"""Which recipe is trained with which seed, where, and for how long."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.experiments.run_folder import check_free
+from minisplat_ref.io import load_scene
+from minisplat_ref.methods import get_recipe
+from minisplat_ref.training.loop import initial_state
+from minisplat_ref.training.schedule import describe
+from minisplat_ref.types import Scene
+
+POINTS_PER_RUN = 12  # of each curve: enough to see when a quality is reached, and a small part of the time
+
+
+RECIPE_OPTIONS = {"budget": "budget", "simplify": "choose", "scene_type": "metric"}
+"""Options of ``train`` that not every recipe takes, and the setting of an event that each is."""
+
+
+class Run(NamedTuple):
+    """One training of the comparison."""
+
+    recipe: str
+    """Name of the recipe."""
+    iterations: int
+    """Its length; the recipe is scaled to it."""
+    seed: int
+    """Seed of all random draws."""
+    folder: Path
+    """The run folder, which does not exist yet."""
+    options: dict[str, object]
+    """Options of ``train`` that this recipe takes and not every one does, without those that are left to the recipe."""
+
+
+class Plan(NamedTuple):
+    """A comparison, checked: every recipe with every seed."""
+
+    scene: Path
+    """Folder or file of the scene, as it was given."""
+    folder: Path
+    """Where everything goes; empty or new."""
+    recipes: tuple[str, ...]
+    """Names; the first is what the others are compared with."""
+    iterations: tuple[int, ...]
+    """Length of the training, per recipe."""
+    seeds: tuple[int, ...]
+    """Seeds, the same for every recipe."""
+    downscale: int
+    """Factor by which the photographs are made smaller."""
+    test_every: int
+    """One view of so many is held out."""
+    budget: int | None
+    """Gaussians that the recipes with a simplification keep; None for their own choice."""
+    simplify: str | None
+    """How the recipes with a simplification choose; None for their own way."""
+    scene_type: str | None
+    """``indoor`` or ``outdoor``, for the recipes that weigh importance; None for their own choice."""
+
+    def runs_of(self, recipe: str) -> list[Run]:
+        """Return the trainings of one recipe, in the order of the seeds."""
+        return [run for run in self.runs if run.recipe == recipe]
+
+    @property
+    def runs(self) -> list[Run]:
+        """All trainings in their order: seed by seed, so that a machine that slows down does so for every recipe."""
+        return [
+            Run(recipe, iterations, seed, self.folder / f"{recipe}-seed{seed}", self._options_of(recipe))
+            for seed in self.seeds
+            for recipe, iterations in zip(self.recipes, self.iterations, strict=True)
+        ]
+
+    def _options_of(self, recipe: str) -> dict[str, object]:
+        return {name: value for name, value in self.options.items() if _takes(recipe, name)}
+
+    @property
+    def options(self) -> dict[str, object]:
+        """Options of ``train`` that have been given and that not every recipe takes."""
+        given = {name: getattr(self, name) for name in RECIPE_OPTIONS}
+        return {name: value for name, value in given.items() if value is not None}
+
+
+def check(plan: Plan) -> Scene:
+    """Refuse what could not be carried out, before anything is written; return the scene.
+
+    Raises
+    ------
+    InputError
+        A recipe is unknown or named twice, there is no length for each, the folder is occupied, no recipe takes
+        an option, the scene cannot be loaded, has no test views or too few to train on.
+    """
+    for name, values in (("--recipes", plan.recipes), ("--seeds", plan.seeds)):
+        _refuse_repetition(name, values)
+    recipes = [get_recipe(name) for name in plan.recipes]
+    if len(plan.iterations) != len(recipes):
+        raise InputError(
+            f"--iterations has {len(plan.iterations)} numbers for {len(recipes)} recipes: give one for all or one each"
+        )
+    for option in plan.options:
+        if not any(_takes(recipe.name, option) for recipe in recipes):
+            raise InputError(f"--{option.replace('_', '-')} means nothing to {', '.join(plan.recipes)}: leave it out")
+    check_free(plan.folder)
+    scene = load_scene(plan.scene, downscale=plan.downscale, test_every=plan.test_every)
+    if not scene.test_views:
+        raise InputError(f"scene {scene.name} was split without test views to compare on: give --test-every above 0")
+    for recipe in recipes:
+        initial_state(scene, recipe, seed=0)
+    return scene
+
+
+def _refuse_repetition(option: str, values: Sequence[object]) -> None:
+    for value in values:
+        if values.count(value) > 1:
+            raise InputError(f"{option} names {value} more than once: each has one folder")
+
+
+def _takes(recipe: str, option: str) -> bool:
+    return any(RECIPE_OPTIONS[option] in event["settings"] for event in describe(get_recipe(recipe))["events"])
+
+
+def eval_every(iterations: int) -> int:
+    """Return after how many iterations a training of this length is measured."""
+    return max(1, round(iterations / POINTS_PER_RUN))

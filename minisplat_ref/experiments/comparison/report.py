@@ -1,0 +1,98 @@
+"""The ``report.html`` of a comparison, and the sentences that its table needs."""
+
+import os
+from collections.abc import Sequence
+from html import escape
+
+from minisplat_ref import __version__
+from minisplat_ref.experiments.comparison.crops import Crop
+from minisplat_ref.experiments.comparison.figures import psnr_over_count, psnr_over_time
+from minisplat_ref.experiments.comparison.measures import MEASURES, RecipeMeasures
+from minisplat_ref.experiments.comparison.plan import Plan, eval_every
+from minisplat_ref.experiments.comparison.results import Results
+from minisplat_ref.experiments.comparison.table import table_cells
+from minisplat_ref.experiments.page import captioned, cards, page, panel, table
+from minisplat_ref.experiments.plots import to_svg
+from minisplat_ref.types import Scene
+
+
+def notes(plan: Plan, results: Results) -> list[str]:
+    """Return what a reader of the table has to know."""
+    first = plan.recipes[0]
+    seeds = ", ".join(map(str, plan.seeds))
+    values = f"Mean and standard deviation of seeds {seeds}" if len(plan.seeds) > 1 else f"Seed {seeds}"
+    steps = ", ".join(f"{eval_every(n)}" for n in dict.fromkeys(plan.iterations))
+    sentences = [
+        f"{values}; in brackets the ratio to {first}, or the difference from it.",
+        f"Until {first}'s final PSNR: the first time that at least this was measured; test views were measured every"
+        f" {steps} iterations, with the clock stopped.",
+        "Model, gradients and moments: their arrays, at most; while densifying is until cloning and splitting ends,"
+        " which is when Mini-Splatting simplifies.",
+        "Peak memory of the process: photographs, compiler and measuring included.",
+        "Rendering: all models in one process by turns, the median of several rounds.",
+    ]
+    return sentences if results.lpips_reason is None else [*sentences, f"LPIPS null: {results.lpips_reason}."]
+
+
+def report_html(plan: Plan, scene: Scene, results: Results) -> str:
+    """Return the page as text of one self-contained HTML file."""
+    n_train, n_test = len(scene.train_views), len(scene.test_views)
+    introduction = (
+        f"The same {n_train} photographs, trained in {len(plan.recipes)} ways on the CPU,"
+        f" and measured on {n_test} more that no training saw."
+    )
+    heading, *rows = table_cells(results.recipes)
+    body = f"""{cards(map(_card, results.recipes))}
+<h2>Measures</h2>
+{table(rows, heading)}
+<p>{escape(" ".join(notes(plan, results)))}</p>
+<h2>Quality over time and over the number of Gaussians</h2>
+<p>A line per training; up and to the left is better. On the right, the thin line is the way that a training
+took, and the disc its end.</p>
+<div class="panel row" style="--columns: 2">
+{to_svg(psnr_over_time(results.curves))}
+{to_svg(psnr_over_count(results.curves))}
+</div>
+<h2>Parts of held-out views</h2>
+<p>Half of them are where the recipes differ most, the others where there is most detail; seed {plan.seeds[0]}.</p>
+<div class="pixels">{"".join(_crop_panel(crop, plan.recipes) for crop in results.crops)}</div>
+<h2>What was run</h2>
+{table(_settings(plan, scene, results))}"""
+    return page(f"{_enumerated(plan.recipes)} on {scene.name}", introduction, body)
+
+
+def _card(recipe: RecipeMeasures) -> tuple[str, str]:
+    psnr, count, seconds, rate = (
+        "null" if value is None else f"{value:{measure.format}}"
+        for measure, value in ((m, recipe.spread_of(m).mean) for m in MEASURES)
+        if measure.key in ("psnr", "n_gaussians", "train_seconds", "render_fps")
+    )
+    return f"{psnr} dB", f"{recipe.recipe}: {count} Gaussians, trained in {seconds} s, {rate} views/s"
+
+
+def _crop_panel(crop: Crop, recipes: Sequence[str]) -> str:
+    pictures = [captioned(crop.truth, "truth")]
+    pictures += [captioned(image, recipe) for image, recipe in zip(crop.renders, recipes, strict=True)]
+    return panel(f"{crop.view}: {crop.reason}", pictures, n_columns=len(pictures))
+
+
+def _settings(plan: Plan, scene: Scene, results: Results) -> list[tuple[str, str]]:
+    camera = scene.test_views[0].camera
+    lengths = zip(plan.recipes, plan.iterations, strict=True)
+    return [
+        (
+            "Scene",
+            f"{scene.name}: {len(scene.train_views)} training and {len(scene.test_views)} test views of"
+            f" {camera.width} x {camera.height} pixels, {len(scene.points):,} points",
+        ),
+        ("Iterations", ", ".join(f"{recipe} {iterations:,}" for recipe, iterations in lengths)),
+        ("Seeds", ", ".join(map(str, plan.seeds))),
+        *((name.replace("_", " ").capitalize(), str(value)) for name, value in plan.options.items()),
+        ("Machine", f"{results.machine}, {os.cpu_count()} cores"),
+        ("Program", f"minisplat_ref {__version__}"),
+        ("Files", f"{plan.folder.resolve()}: a folder per run, compare.json, the figures as PNG"),
+    ]
+
+
+def _enumerated(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

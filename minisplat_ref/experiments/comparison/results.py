@@ -1,0 +1,105 @@
+"""What a comparison has found, from its finished runs, and how compare.json holds it."""
+
+import platform
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from minisplat_ref.experiments import run_folder
+from minisplat_ref.experiments.comparison.crops import Crop, choose_crops
+from minisplat_ref.experiments.comparison.measures import (
+    MEASURES,
+    RecipeMeasures,
+    final_psnr,
+    read_curve,
+    read_measures,
+    relation,
+)
+from minisplat_ref.experiments.comparison.plan import Plan, eval_every
+from minisplat_ref.experiments.comparison.speed import render_rates
+from minisplat_ref.experiments.measure import machine
+from minisplat_ref.io import load_ply
+from minisplat_ref.types import Scene
+
+
+class Results(NamedTuple):
+    """All that was found."""
+
+    recipes: Sequence[RecipeMeasures]
+    """Measures, in the order of the plan."""
+    curves: dict[str, list[list[dict[str, Any]]]]
+    """For every recipe the records of ``curve.jsonl`` of each seed."""
+    crops: Sequence[Crop]
+    """Parts of test views, rendered with the first seed of each recipe."""
+    lpips_reason: str | None
+    """Why LPIPS is missing."""
+    machine: str
+    """What times and memory depend on."""
+
+
+def collect(plan: Plan, scene: Scene) -> Results:
+    """Read and measure the runs of a plan that has been carried out.
+
+    Parameters
+    ----------
+    plan : Plan
+        All its runs are finished.
+    scene : Scene
+        As it was loaded for the plan.
+    """
+    runs = plan.runs
+    models = [load_ply(run.folder / run_folder.POINT_CLOUD) for run in runs]
+    rates = dict(zip((run.folder for run in runs), render_rates(models, scene), strict=True))
+    targets = {run.seed: final_psnr(run.folder) for run in plan.runs_of(plan.recipes[0])}
+    recipes = [
+        RecipeMeasures(
+            recipe, [read_measures(run.folder, targets[run.seed], rates[run.folder]) for run in plan.runs_of(recipe)]
+        )
+        for recipe in plan.recipes
+    ]
+    shown = [model for run, model in zip(runs, models, strict=True) if run.seed == plan.seeds[0]]
+    return Results(
+        recipes=recipes,
+        curves={recipe: [read_curve(run.folder) for run in plan.runs_of(recipe)] for recipe in plan.recipes},
+        crops=choose_crops(shown, scene),
+        lpips_reason=run_folder.read_json_object(runs[0].folder / run_folder.METRICS)["lpips_reason"],
+        machine=f"{machine()}, {platform.platform()}",
+    )
+
+
+def to_json(plan: Plan, scene: Scene, results: Results) -> dict[str, Any]:
+    """Return what compare.json holds."""
+    camera = scene.test_views[0].camera
+    return {
+        "settings": {
+            **plan._asdict(),
+            "scene": str(plan.scene.resolve()),
+            "folder": str(plan.folder.resolve()),
+            "eval_every": [eval_every(iterations) for iterations in plan.iterations],
+        },
+        "scene": {
+            "name": scene.name,
+            "n_train_views": len(scene.train_views),
+            "n_test_views": len(scene.test_views),
+            "width": camera.width,
+            "height": camera.height,
+            "n_points": len(scene.points),
+        },
+        "machine": results.machine,
+        "lpips_reason": results.lpips_reason,
+        "measures": [measure._asdict() for measure in MEASURES],
+        "recipes": [_recipe_to_json(plan, recipe, results.recipes[0]) for recipe in results.recipes],
+    }
+
+
+def _recipe_to_json(plan: Plan, recipe: RecipeMeasures, first: RecipeMeasures) -> dict[str, Any]:
+    spreads = {measure: recipe.spread_of(measure) for measure in MEASURES}
+    runs = zip(plan.runs_of(recipe.recipe), recipe.runs, strict=True)
+    return {
+        "recipe": recipe.recipe,
+        "mean": {measure.key: value.mean for measure, value in spreads.items()},
+        "std": {measure.key: value.std for measure, value in spreads.items()},
+        "relative_to_first": {
+            measure.key: relation(measure, value, first.spread_of(measure)) for measure, value in spreads.items()
+        },
+        "runs": [{"seed": run.seed, "folder": run.folder.name, **measures} for run, measures in runs],
+    }

@@ -1,0 +1,56 @@
+"""How good a training was when: ``curve.jsonl``, a record for each time that the test views were measured."""
+
+import json
+from pathlib import Path
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.experiments.progress import PSNR_MAX, read_log
+from minisplat_ref.metrics import Evaluation
+from minisplat_ref.types import Scene
+
+
+def check_views(scene: Scene) -> None:
+    """Refuse a scene that has nothing to measure.
+
+    Raises
+    ------
+    InputError
+        There are no test views.
+    """
+    if not scene.test_views:
+        raise InputError(f"scene {scene.name} was split without test views, which are to be measured: set --test-every")
+
+
+def keep_until(path: Path, step: int) -> None:
+    """Make the file, or drop the records after ``step``: they are of a part of the training that was lost."""
+    records = [record for record in read_log(path) if record["step"] <= step]
+    path.write_text("".join(json.dumps(record) + "\n" for record in records), encoding="utf-8")
+
+
+def append(path: Path, step: int, seconds: float, evaluation: Evaluation, n_gaussians: int) -> None:
+    """Add a record; a step that is there already, where a training was interrupted, is not measured twice.
+
+    Parameters
+    ----------
+    path : Path
+        The file; see :func:`keep_until`.
+    step : int
+        Iterations done.
+    seconds : float
+        Training time until then, without that of measuring.
+    evaluation : Evaluation
+        Of at least one view.
+    n_gaussians : int
+    """
+    assert evaluation.psnr is not None, "check_views has found views"
+    if any(record["step"] == step for record in read_log(path)):
+        return
+    record = {
+        "step": step,
+        "seconds": seconds,
+        "psnr": min(evaluation.psnr, PSNR_MAX),
+        "ssim": evaluation.ssim,
+        "n_gaussians": n_gaussians,
+    }
+    with open(path, "a", encoding="utf-8") as file:
+        file.write(json.dumps(record) + "\n")

@@ -1,0 +1,92 @@
+"""The measurements that the README reports of whole training runs on real scenes.
+
+``python -m data_tools.measure scenes SCENE... --out DIR`` trains every scene through the command line, as a user would,
+and prints a table. ``python -m data_tools.measure rate SCENE`` times training iterations while the number of Gaussians
+stays the same. Times depend on the machine; compare figures of one run only. Stages and kernels are measured by
+``minisplat-ref bench``, beside their errors.
+"""
+
+import argparse
+import json
+import platform
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from minisplat_ref.io import load_scene
+from minisplat_ref.methods import get_recipe
+from minisplat_ref.training.loop import train
+
+WARM_UP = 20  # iterations that compile and are not timed
+
+
+def measure_scenes(scenes: list[Path], out: Path, recipe: str, iterations: int) -> None:
+    """Train each scene through the command line into ``out/NAME`` and print a table of their ``metrics.json``."""
+    rows = []
+    for scene in scenes:
+        folder = out / scene.name
+        command = [sys.executable, "-m", "minisplat_ref", "train", str(scene), "--out", str(folder)]
+        subprocess.run([*command, "--recipe", recipe, "--iterations", str(iterations)], check=True)
+        metrics = json.loads((folder / "metrics.json").read_text())
+        rate = metrics["iterations"] / metrics["train_seconds"]
+        rows.append(
+            f"| {scene.name} | {metrics['psnr']:.2f} | {metrics['ssim']:.3f} | {metrics['n_gaussians']:,} "
+            f"| {metrics['train_seconds']:.0f} | {rate:.1f} | {metrics['peak_rss_mb']:.0f} |"
+        )
+    print(f"\n{recipe}, {iterations} iterations, seed 0, full size; {machine()}\n")
+    print("| scene | PSNR (dB) | SSIM | Gaussians | seconds | iterations/s | peak memory (MB) |")
+    print("|---|---|---|---|---|---|---|", *rows, sep="\n")
+
+
+def measure_rate(scene_folder: Path, n: int, iterations: int) -> None:
+    """Print how many training iterations a second there are while the number of Gaussians stays at ``n``."""
+    scene = load_scene(scene_folder)
+    chosen = np.random.default_rng(0).choice(len(scene.points), n, replace=False)
+    scene = scene._replace(points=scene.points[chosen], point_colors=scene.point_colors[chosen])
+    recipe = get_recipe("3dgs-accel")._replace(iterations=WARM_UP + iterations, events=())
+    times: list[float] = []
+    train(scene, recipe, seed=0, on_step=lambda _: times.append(time.perf_counter()))
+    seconds = np.diff(times[WARM_UP - 1 :])
+    camera = scene.train_views[0].camera
+    print(f"{scene.name}, {camera.width} x {camera.height}, {n} Gaussians, {iterations} iterations; {machine()}")
+    print(f"{iterations / seconds.sum():.1f} iterations/s, median {1e3 * np.median(seconds):.1f} ms")
+
+
+def machine() -> str:
+    """Return what the figures depend on: processor, threads, versions."""
+    import numba
+
+    cpu_info = Path("/proc/cpuinfo")
+    lines = cpu_info.read_text().splitlines() if cpu_info.exists() else []
+    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    processor = models[0] if models else platform.processor()
+    return (
+        f"{processor}, {numba.get_num_threads()} threads, Python {platform.python_version()}, Numba {numba.__version__}"
+    )
+
+
+def main() -> None:
+    """Run one of the measurements."""
+    parser = argparse.ArgumentParser(prog="python -m data_tools.measure", description=__doc__.split("\n")[0])
+    commands = parser.add_subparsers(dest="command", required=True)
+    scenes = commands.add_parser("scenes", help="train scenes and print PSNR, SSIM, count, time and memory")
+    scenes.add_argument("scene", type=Path, nargs="+")
+    scenes.add_argument("--out", type=Path, required=True, help="new folder for the runs")
+    scenes.add_argument("--recipe", default="3dgs-accel")
+    scenes.add_argument("--iterations", type=int, default=3_000)
+    rate = commands.add_parser("rate", help="training iterations per second at a constant number of Gaussians")
+    rate.add_argument("scene", type=Path)
+    rate.add_argument("--gaussians", type=int, default=10_000)
+    rate.add_argument("--iterations", type=int, default=300)
+    arguments = parser.parse_args()
+    if arguments.command == "rate":
+        measure_rate(arguments.scene, arguments.gaussians, arguments.iterations)
+    else:
+        measure_scenes(arguments.scene, arguments.out, arguments.recipe, arguments.iterations)
+
+
+if __name__ == "__main__":
+    main()

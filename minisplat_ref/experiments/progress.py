@@ -1,0 +1,128 @@
+"""What a person sees of a running training, and the same in a file: the progress bar and ``log.jsonl``."""
+
+import json
+import sys
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from tqdm import tqdm
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.metrics import psnr
+from minisplat_ref.training.loop import StepReport
+
+LOG_EVERY = 5  # iterations; a PSNR is measured as often
+PSNR_WINDOW = 20  # measured views that the shown PSNR is the mean of: single views differ too much to show a trend
+PSNR_MAX = 100.0  # dB; equal pictures have an infinite one, which JSON cannot hold
+BAR_SECONDS = 0.3  # between redraws of the bar
+PLAIN_SECONDS = 30.0  # likewise where stderr is a file, in which every redraw is a line
+
+
+class Progress(AbstractContextManager["Progress"]):
+    """Bar and log of one training: a context manager that is called with every :class:`StepReport`."""
+
+    def __init__(self, log_path: Path, first_step: int, last_step: int) -> None:
+        records = [record for record in read_log(log_path) if record["step"] <= first_step]
+        self._log_path, self._old_records = log_path, records
+        self._first_step, self._last_step = first_step, last_step
+        self._seconds_before: float = records[-1]["seconds"] if records else 0.0
+        self._losses: list[float] = []
+        self._psnrs: deque[float] = deque((record["psnr"] for record in records[-1:]), maxlen=PSNR_WINDOW)
+
+    def __enter__(self) -> Self:
+        """Start the clock; records after ``first_step``, of a part that was lost, leave the log."""
+        self._log = open(self._log_path, "w", encoding="utf-8", buffering=1)  # a line at a time, to be followed
+        for record in self._old_records:
+            self._write(record)
+        self._bar = tqdm(
+            total=self._last_step,
+            initial=self._first_step,
+            desc="compiling on first use",
+            unit="it",
+            dynamic_ncols=True,
+            mininterval=BAR_SECONDS if sys.stderr.isatty() else PLAIN_SECONDS,
+        )
+        self._start = time.perf_counter()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close bar and log."""
+        self._bar.close()
+        self._log.close()
+
+    @property
+    def seconds(self) -> float:
+        """Training time so far, with that of earlier parts of a continued run."""
+        return self._seconds_before + time.perf_counter() - self._start
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Stop the clock for what is not training."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._start += time.perf_counter() - start
+
+    def __call__(self, report: StepReport) -> None:
+        """Move the bar; every LOG_EVERY iterations measure, show and write.
+
+        ``model_mb`` of a record is what the arrays of the Gaussians take. During an iteration their gradients take as
+        much again, and Adam's two moments twice as much all the time.
+        """
+        if self._bar.n == self._first_step:
+            self._bar.set_description_str("training", refresh=False)
+        self._bar.update()
+        self._losses.append(report.loss)
+        if report.step % LOG_EVERY and report.step != self._last_step:
+            return
+        image = np.clip(report.output.image, 0.0, 1.0)  # [H, W, 3]
+        view_psnr = psnr(image, report.view.image.astype(image.dtype) / 255, report.view.mask)
+        self._psnrs.append(min(view_psnr, PSNR_MAX))
+        loss, mean_psnr = float(np.mean(self._losses)), float(np.mean(self._psnrs))
+        gaussians = report.state.gaussians
+        n_gaussians = len(gaussians.means)
+        seconds = self.seconds
+        self._write(
+            {
+                "step": report.step,
+                "loss": loss,
+                "psnr": mean_psnr,
+                "n_gaussians": n_gaussians,
+                "model_mb": sum(field.nbytes for field in gaussians) / 1e6,
+                "seconds": seconds,
+                "its/s": report.step / seconds,
+            }
+        )
+        self._bar.set_postfix_str(f"loss {loss:.4f}, {mean_psnr:.2f} dB, {n_gaussians:,} Gaussians", refresh=False)
+        self._losses.clear()
+
+    def _write(self, record: dict[str, Any]) -> None:
+        self._log.write(json.dumps(record) + "\n")
+
+
+def read_log(path: Path) -> list[dict[str, Any]]:
+    """Read the records of a ``log.jsonl``; none where there is no file.
+
+    Raises
+    ------
+    InputError
+        A line is not a record.
+    """
+    if not path.exists():
+        return []
+    records = []
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        try:
+            record = json.loads(line)
+            records.append({**record, "step": int(record["step"]), "seconds": float(record["seconds"])})
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(
+                f"{path}, line {number} is not a record of a training: remove it and what follows"
+            ) from error
+    return records

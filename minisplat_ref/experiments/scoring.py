@@ -1,0 +1,82 @@
+"""Measures a trained scene on its test views, and keeps the pictures: ``metrics.json`` and ``renders/``."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from minisplat_ref.backends import get_backend
+from minisplat_ref.constants import PROFILES
+from minisplat_ref.experiments.pictures import error_picture, side_by_side, to_picture
+from minisplat_ref.experiments.run_folder import RENDERS
+from minisplat_ref.experiments.settings import Settings
+from minisplat_ref.io import write_image
+from minisplat_ref.metrics import Evaluation, ViewMetrics, evaluate
+from minisplat_ref.types import Floats, Gaussians, Scene, View
+
+
+def measure(
+    scene: Scene,
+    gaussians: Gaussians,
+    settings: Settings,
+    on_view: Callable[[View, Floats, ViewMetrics], None] | None = None,
+) -> Evaluation:
+    """Evaluate the test views with the profile and backend of the settings: :func:`minisplat_ref.metrics.evaluate`."""
+    return evaluate(
+        gaussians,
+        scene.test_views,
+        background=scene.background,
+        on_view=on_view,
+        backend=get_backend(settings.backend),
+        conventions=PROFILES[settings.profile],
+    )
+
+
+def score(folder: Path, scene: Scene, gaussians: Gaussians, settings: Settings) -> Evaluation:
+    """Evaluate the test views and write ``renders/NAME.png``: truth, render and error side by side.
+
+    Parameters
+    ----------
+    folder : Path
+        The run.
+    scene : Scene
+        Its test views are measured.
+    gaussians : Gaussians
+        What was trained.
+    settings : Settings
+        Profile and backend to render with.
+
+    Returns
+    -------
+    Evaluation
+    """
+    renders = folder / RENDERS
+    renders.mkdir(exist_ok=True)
+
+    def save(view: View, image: Floats, _: ViewMetrics) -> None:
+        render = to_picture(image)
+        write_image(renders / f"{view.name}.png", side_by_side([view.image, render, error_picture(view.image, render)]))
+
+    return measure(scene, gaussians, settings, on_view=save)
+
+
+def to_metrics(evaluation: Evaluation) -> dict[str, Any]:
+    """Return the measures as ``metrics.json`` holds them; an infinite PSNR, of equal pictures, becomes null."""
+    per_view = [_finite(view._asdict()) for view in evaluation.per_view]
+    return {**_finite(evaluation._asdict()), "per_view": per_view}
+
+
+def _finite(values: dict[str, Any]) -> dict[str, Any]:
+    return {
+        key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in values.items()
+    }
+
+
+def summary(evaluation: Evaluation) -> str:
+    """Return the measures in half a line."""
+    if evaluation.psnr is None or evaluation.ssim is None:
+        return "no test views to measure"
+    n_views = len(evaluation.per_view)
+    return (
+        f"PSNR {evaluation.psnr:.2f} dB, SSIM {evaluation.ssim:.4f} (mean of {n_views} test view{'s'[: n_views > 1]})"
+    )

@@ -1,0 +1,141 @@
+"""What a training is asked to do, as it stands in ``config.json``."""
+
+import platform
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref import __version__
+from minisplat_ref.errors import InputError
+from minisplat_ref.experiments.run_folder import CONFIG, read_json_object
+from minisplat_ref.io import load_scene
+from minisplat_ref.methods import get_recipe
+from minisplat_ref.strategy import importance, simplify
+from minisplat_ref.training.schedule import Recipe, configured, describe
+from minisplat_ref.types import Floats, GeometricWeights, Scene
+
+CHOICES = {"sampling": simplify.by_sampling, "rank": simplify.by_rank, "merging": simplify.by_merging}
+METRICS = {"indoor": importance.indoor, "outdoor": importance.outdoor}
+REPORTED_PACKAGES = ("numpy", "numba", "scipy", "pillow", "pycolmap")
+
+
+class Settings(NamedTuple):
+    """Everything besides the scene's files that decides the result."""
+
+    scene: str
+    """Absolute path of the scene's folder."""
+    downscale: int
+    """Factor by which the photographs are made smaller."""
+    test_every: int
+    """One view of so many is held out for testing; 0: none."""
+    undistort: bool
+    """Whether lens distortion is removed while loading."""
+    recipe: str
+    """Name of the recipe."""
+    schedule_iterations: int
+    """Number of iterations that the recipe's milestones are scaled to; stays when a run is made longer."""
+    iterations: int
+    """Iteration at which to stop."""
+    seed: int
+    """Seed of all random draws."""
+    profile: str
+    """Name of the rasteriser's conventions."""
+    backend: str
+    """Name of the backend."""
+    budget: int | None = None
+    """Gaussians that a simplification keeps; None for the recipe's own part of the candidates."""
+    simplify: str | None = None
+    """How simplification chooses, a key of ``CHOICES``; None for the recipe's own way."""
+    scene_type: str | None = None
+    """``indoor`` or ``outdoor``, which decides what importance means; None for the recipe's own choice."""
+    geometry: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Weights of the geometric loss terms: depth of the scene's points, smooth depth, smooth normals."""
+    eval_every: int = 0
+    """Iterations after which the test views are measured again; 0: only in the end. Does not change the result."""
+
+
+def recipe_of(settings: Settings) -> Recipe:
+    """Return the recipe of a run, scaled and with what the run sets differently.
+
+    Raises
+    ------
+    InputError
+        There is no such recipe, or it has no such setting.
+    """
+    recipe = get_recipe(settings.recipe, settings.schedule_iterations)
+    if settings.budget is not None:
+        recipe = configured(recipe, budget=settings.budget)
+    if settings.simplify is not None:
+        recipe = configured(recipe, choose=CHOICES[settings.simplify])
+    if settings.scene_type is not None:
+        recipe = configured(recipe, metric=METRICS[settings.scene_type])
+    return recipe._replace(geometry=GeometricWeights(*settings.geometry))
+
+
+def to_config(settings: Settings, recipe: Recipe, scene: Scene) -> dict[str, Any]:
+    """Return what ``config.json`` holds: the settings, the recipe spelled out, and the versions that run it."""
+    versions = {package: version(package) for package in REPORTED_PACKAGES}
+    return {
+        "settings": settings._asdict(),
+        "background": scene.background.tolist(),
+        "recipe": describe(recipe),
+        "versions": {"minisplat_ref": __version__, "python": platform.python_version(), **versions},
+        "platform": platform.platform(),
+    }
+
+
+def load(folder: Path) -> Settings:
+    """Read the settings of a run.
+
+    Raises
+    ------
+    InputError
+        There is no such folder, it holds no run, or one of another version.
+    """
+    config = _read_config(folder)
+    try:
+        return Settings(**config["settings"])
+    except (KeyError, TypeError) as error:
+        raise InputError(
+            f"{folder / CONFIG} is not the configuration of a training of this version: {error}"
+        ) from error
+
+
+def load_background(folder: Path) -> Floats:
+    """Read the colour [3] in [0, 1] behind the scene of a run.
+
+    Raises
+    ------
+    InputError
+        As for :func:`load`.
+    """
+    background = np.array(_read_config(folder).get("background"), dtype=np.float64)
+    if background.shape != (3,):
+        raise InputError(f"{folder / CONFIG} has no background of three numbers")
+    return background
+
+
+def _read_config(folder: Path) -> dict[str, Any]:
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder: give the --out folder of a training")
+    if not (folder / CONFIG).is_file():
+        raise InputError(f"{folder} holds no run, {CONFIG} is missing: give the --out folder of a training")
+    return read_json_object(folder / CONFIG)
+
+
+def load_photographs(settings: Settings) -> Scene:
+    """Load the scene of a run as it was loaded for the training.
+
+    Raises
+    ------
+    InputError
+        See :func:`minisplat_ref.io.load_scene`.
+    """
+    return load_scene(
+        settings.scene,
+        downscale=settings.downscale,
+        test_every=settings.test_every,
+        undistort=settings.undistort,
+    )

@@ -1,0 +1,90 @@
+"""What the studies share: the scene, the arguments, tables, and a folder with JSON and a figure."""
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
+from minisplat_ref.errors import InputError
+from minisplat_ref.experiments.arguments import integer
+from minisplat_ref.experiments.measure import machine
+from minisplat_ref.io import load_scene
+from minisplat_ref.types import Scene
+
+RESULT, FIGURE = "result.json", "figure.png"
+PNG_DPI = 150
+BLUE, RED = "#35608c", "#d2493f"
+
+
+def add_scene_arguments(parser: argparse.ArgumentParser, iterations: int) -> None:
+    """Add the scene, ``--out``, ``--iterations`` and ``--downscale``."""
+    names = ", ".join(SCENE_NAMES)
+    parser.add_argument("scene", metavar="SCENE", help=f"folder of a scene, or a synthetic one: {names}")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=f"new folder for {RESULT} and {FIGURE}")
+    parser.add_argument(
+        "--iterations", type=integer(1), default=iterations, metavar="N", help=f"of a training (default {iterations})"
+    )
+    parser.add_argument(
+        "--downscale", type=integer(1), default=1, metavar="D", help="make a folder's photographs D times smaller"
+    )
+
+
+def read_scene(source: str, downscale: int) -> Scene:
+    """Load a folder, or make the synthetic scene of that name as ``minisplat-ref synthetic`` does by default.
+
+    Raises
+    ------
+    InputError
+        It is neither, or a synthetic scene is to be made smaller.
+    """
+    if Path(source).exists():
+        return load_scene(Path(source), downscale=downscale)
+    if source not in SCENE_NAMES:
+        raise InputError(f"{source}: neither a folder nor one of {', '.join(SCENE_NAMES)}; give a scene")
+    if downscale != 1:
+        raise InputError(f"{source} is made at 160 x 120; write it with minisplat-ref synthetic for another size")
+    return make_scene(source).scene
+
+
+def describe_scene(scene: Scene) -> dict[str, Any]:
+    """Return what the figures depend on besides the method: photographs, their size, points, machine."""
+    camera = scene.train_views[0].camera
+    return {
+        "scene": scene.name,
+        "size": [camera.width, camera.height],
+        "train_views": len(scene.train_views),
+        "test_views": len(scene.test_views),
+        "points": len(scene.points),
+        "machine": machine(),
+    }
+
+
+def title(description: dict[str, Any]) -> str:
+    """Return the description in one line."""
+    width, height = description["size"]
+    return (
+        f"{description['scene']}, {description['train_views']} training views of {width} x {height}; "
+        f"{description['machine']}"
+    )
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a Markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def mean_and_deviation(values: Sequence[float]) -> tuple[float, float]:
+    """Return mean and sample standard deviation; the latter is 0 for one value."""
+    return float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
+
+
+def write(folder: Path, result: dict[str, Any], figure: Figure) -> None:
+    """Write the results and the figure into a folder that exists."""
+    (folder / RESULT).write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    figure.savefig(folder / FIGURE, dpi=PNG_DPI, facecolor="white")

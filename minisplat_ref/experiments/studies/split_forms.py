@@ -1,0 +1,156 @@
+"""Blur split, its two forms: children drawn at random, as in the released code, or cut on the longest axis.
+
+The recipe is trained in four ways. Two of them switch blur split off: the rule for children is that of the split by
+gradients, too, and what it does there is to be told from what blur split does. Means and deviations are over seeds; a
+seed decides the order of views, random children and, in depth reinitialisation, pixels.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from matplotlib.figure import Figure
+from tqdm import tqdm
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.experiments.arguments import Commands, integer, listed
+from minisplat_ref.experiments.studies.front import (
+    BLUE,
+    RED,
+    add_scene_arguments,
+    describe_scene,
+    mean_and_deviation,
+    read_scene,
+    table,
+    title,
+    write,
+)
+from minisplat_ref.io.atomic import making_folder
+from minisplat_ref.methods import RECIPES, get_recipe, mini_splatting
+from minisplat_ref.metrics import evaluate
+from minisplat_ref.strategy.blur_split import principal_axis_children
+from minisplat_ref.strategy.clone_split import random_children
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.schedule import Event, Recipe, configured
+from minisplat_ref.types import Gaussians, Scene
+
+FORMS: dict[str, tuple[bool, Callable[..., Gaussians]]] = {
+    "none, random": (False, random_children),
+    "none, principal_axis": (False, principal_axis_children),
+    "random": (True, random_children),
+    "principal_axis": (True, principal_axis_children),
+}
+"""Whether there is blur split, and which children any split has."""
+
+MEASURES = ("psnr", "ssim", "n_gaussians", "seconds")
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "split",
+        help="blur split with random children, with children on the longest axis, and none",
+        description="Train a scene with blur split in its two forms and without it.",
+    )
+    add_scene_arguments(parser, iterations=3000)
+    names = tuple(name for name, recipe in RECIPES.items() if any(map(_collects_blur, recipe.events)))
+    parser.add_argument(
+        "--recipe",
+        choices=names,
+        default="mini-splatting-d",
+        metavar="R",
+        help=f"{', '.join(names)} (default %(default)s)",
+    )
+    parser.add_argument(
+        "--seeds", type=listed(integer(0)), default=(0, 1, 2), metavar="S,T", help="of the trainings (default 0,1,2)"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Train, measure, write, print the table.
+
+    Raises
+    ------
+    InputError
+        The scene or the output folder cannot be used.
+    """
+    scene = read_scene(args.scene, args.downscale)
+    if not scene.test_views:
+        raise InputError(f"scene {scene.name} has no test views to compare by: add photographs")
+    recipe = get_recipe(args.recipe, args.iterations)
+    with making_folder(args.out) as folder:
+        jobs = [(form, seed) for seed in args.seeds for form in FORMS]
+        runs = [measure(scene, recipe, form, seed) for form, seed in tqdm(jobs, desc="trainings", leave=False)]
+        summary = summarise(runs)
+        description = describe_scene(scene)
+        settings = {"recipe": args.recipe, "iterations": args.iterations, "seeds": list(args.seeds)}
+        write(folder, {**description, **settings, "summary": summary, "runs": runs}, draw(summary, runs))
+    print(title(description))
+    print(f"{args.recipe}, {args.iterations} iterations, seeds {', '.join(map(str, args.seeds))}\n")
+    print(table(["blur split, children", "PSNR (dB)", "SSIM", "Gaussians", "seconds"], to_rows(summary)))
+
+
+def variant(recipe: Recipe, form: str) -> Recipe:
+    """Return the recipe with blur split in one of the :data:`FORMS`."""
+    has_blur_split, children = FORMS[form]
+    recipe = configured(recipe, draw_children=children)
+    if has_blur_split:
+        return recipe
+    return recipe._replace(events=tuple(event for event in recipe.events if not _collects_blur(event)))
+
+
+def _collects_blur(event: Event) -> bool:
+    return isinstance(event.action, partial) and event.action.func is mini_splatting.collect_blur
+
+
+def measure(scene: Scene, recipe: Recipe, form: str, seed: int) -> dict[str, Any]:
+    """Train once and return the test views' measures; the seconds are those of the training alone."""
+    start = time.perf_counter()
+    state = train(scene, variant(recipe, form), seed=seed)
+    seconds = time.perf_counter() - start
+    result = evaluate(state.gaussians, scene.test_views, background=scene.background)
+    measures = (result.psnr, result.ssim, len(state.gaussians.means), seconds)
+    return {"form": form, "seed": seed, **dict(zip(MEASURES, measures, strict=True))}
+
+
+def summarise(runs: list[dict[str, Any]]) -> dict[str, dict[str, tuple[float, float]]]:
+    """Return mean and standard deviation over the seeds, for each form and measure."""
+    return {
+        form: {name: mean_and_deviation([run[name] for run in runs if run["form"] == form]) for name in MEASURES}
+        for form in FORMS
+    }
+
+
+def to_rows(summary: dict[str, dict[str, tuple[float, float]]]) -> list[list[str]]:
+    """Return the lines of the table."""
+    digits = dict(zip(MEASURES, (2, 4, 0, 0), strict=True))
+    return [
+        [
+            form,
+            *(f"{mean:,.{digits[name]}f} ± {deviation:,.{digits[name]}f}" for name, (mean, deviation) in row.items()),
+        ]
+        for form, row in summary.items()
+    ]
+
+
+def draw(summary: dict[str, dict[str, tuple[float, float]]], runs: list[dict[str, Any]]) -> Figure:
+    """Draw each seed as a point, and mean and deviation as a bar, for the three measures of the result."""
+    figure = Figure(figsize=(10, 2.6), layout="constrained")
+    panels = figure.subplots(1, 3, sharey=True)
+    colors = [RED if children is random_children else BLUE for _, children in FORMS.values()]
+    for axes, name, label in zip(panels, MEASURES, ("PSNR (dB)", "SSIM", "Gaussians"), strict=False):
+        for line, (form, color) in enumerate(zip(FORMS, colors, strict=True)):
+            mean, deviation = summary[form][name]
+            axes.errorbar(mean, line, xerr=deviation, color=color, marker="o", capsize=4)
+            values = [run[name] for run in runs if run["form"] == form]
+            axes.plot(values, [line + 0.18] * len(values), "|", color=color, markersize=5)
+        axes.set(title=label, yticks=range(len(FORMS)), yticklabels=FORMS, ylim=(-0.6, len(FORMS) - 0.4))
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(axis="x", color="#e6eaee")
+        axes.locator_params(axis="x", nbins=5)
+    panels[0].invert_yaxis()  # in the order of the table
+    panels[0].set_ylabel("blur split, children")
+    return figure

@@ -1,0 +1,281 @@
+"""The only place where jit flags, caching and threading are decided.
+
+``scalar`` marks a formula of one Gaussian or one pixel: it stays a plain Python function and is inlined into the
+kernels that call it. ``kernel`` compiles a parallel loop. Six facts shape this file:
+
+* Numba's on-disk cache does not notice that a function *called* by a kernel has changed. The cache therefore lives in a
+  folder named by a hash of all sources that kernels are made of: an edit anywhere makes a new folder. So does another
+  version of what compiles them: Numba's own index notices another processor and another Numba, but not another LLVM,
+  another NumPy, which computes the constants that are compiled in, or other options of the compiler. A kernel that is
+  made of an extension's functions, too, lives in a folder inside that one, named by a hash of the extension's sources:
+  editing an extension does not compile the core again.
+* Numba tells functions of one name apart by a counter of the process, and writes it into the cached code. Kernels that
+  different processes compiled for different numbers of channels can so hold different functions under one name, and a
+  process that loads both runs one of them twice. What a function closes over is therefore part of its name here:
+  functions by module and name, bundles of them field by field, numbers by type and value, and nothing by its address.
+* Two processes that save to Numba's cache at the same moment take the same file name, and later processes load the
+  wrong kernel. Saving is therefore one process at a time.
+* Numba's ``workqueue`` threading layer aborts the process when two Python threads enter parallel regions, so all
+  kernels share one lock.
+* ``fastmath=True`` would let the compiler assume that no NaN exists and ``isnan`` return False. Kernels may only
+  contract ``a * b + c`` to one rounding.
+* What stands in the cache has been optimised twice, and a compiler that may change the order of a sum gives other last
+  digits the second time. Where eight numbers are computed at once, :mod:`minisplat_ref.jit.lanes` says so and fixes
+  the order. Known and open: kernels can still differ in the last digit between just compiled and loaded from the
+  cache.
+"""
+
+import functools
+import hashlib
+import os
+import platform
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import BuiltinFunctionType, FunctionType, ModuleType
+from typing import Any
+
+import llvmlite
+import numba
+import numpy as np
+from numba import prange
+from numba.extending import register_jitable
+
+__all__ = [
+    "cache_folder",
+    "cache_root",
+    "kernel",
+    "n_threads",
+    "prange",
+    "scalar",
+    "source_hash",
+]
+
+if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
+    # Numba would take TBB first where it is installed; it takes longer to start and end a parallel loop.
+    numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # type: ignore[attr-defined]
+
+if "OMP_WAIT_POLICY" not in os.environ:
+    # OpenMP's threads wait for the next parallel loop for a fraction of a millisecond before they sleep, not for many:
+    # as fast on free cores, and on busy ones a thread that waits does not keep the one that it waits for from running.
+    os.environ.setdefault("GOMP_SPINCOUNT", "5000")
+
+_KERNEL_LOCK = threading.RLock()
+_PACKAGE = Path(__file__).parent.parent
+_PARALLEL = {  # loops over prange, in the order in which they stand, and nothing that Numba finds by itself
+    "prange": True,
+    **dict.fromkeys(("comprehension", "fusion", "inplace_binop", "numpy", "reduction", "setitem", "stencil"), False),
+}
+_KERNEL_FOLDERS = ("jit", "scalar", "cpu", "bench")
+_COMPILER_OPTIONS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "BOUNDSCHECK", "DEBUGINFO_DEFAULT")
+
+
+@functools.cache
+def source_hash() -> str:
+    """Hash of every source file of the core that is compiled into a kernel, and of what compiles it."""
+    versions = (platform.python_version(), np.__version__, numba.__version__, llvmlite.__version__)
+    options = (str(getattr(numba.config, name)) for name in _COMPILER_OPTIONS)
+    folders = (_PACKAGE / name for name in _KERNEL_FOLDERS)
+    sources = [_PACKAGE / "constants.py", _PACKAGE / "types.py", *(path for f in folders for path in f.rglob("*.py"))]
+    return _hash_of("|".join((*versions, *options)), sources, _PACKAGE)
+
+
+def _hash_of(text: str, sources: Iterable[Path], root: Path) -> str:
+    """Hash of a text, and of the names below ``root`` and the contents of files."""
+    digest = hashlib.sha256(text.encode())
+    for source in sorted(sources):
+        digest.update(source.relative_to(root).as_posix().encode())
+        digest.update(source.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def cache_root() -> Path:
+    """Return the folder in which every version of the kernels has one of its own."""
+    if base := os.environ.get("NUMBA_CACHE_DIR"):
+        return Path(base)
+    if os.name == "nt":
+        return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local")) / "minisplat_ref"
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "minisplat_ref"
+
+
+def cache_folder(function: Callable | None = None) -> str | None:
+    """Return the folder for compiled kernels.
+
+    Parameters
+    ----------
+    function : callable, optional
+        The kernel, where it may be made of functions from outside the core.
+
+    Returns
+    -------
+    str or None
+        None where nothing can be kept: the folder cannot be written, or a function was typed into a session and has no
+        source file. Every process then compiles its own.
+    """
+    folder = cache_root() / source_hash()
+    try:
+        for module in sorted(_modules_of(function)) if function is not None else ():
+            folder /= _folder_of_module(module)
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    return str(folder) if os.access(folder, os.W_OK) else None
+
+
+def _modules_of(value: Any) -> set[str]:
+    """Names of the modules outside the core whose functions a value is, holds or closes over.
+
+    Of an extension only the package itself is named: ``minisplat_ref.extensions.NAME``.
+    """
+    if isinstance(value, tuple):
+        return set[str]().union(*map(_modules_of, value))
+    if isinstance(value, functools.partial):
+        return _modules_of((value.func, *value.args, *value.keywords.values()))
+    if not isinstance(value, FunctionType):
+        return set()
+    modules = _modules_of(tuple(cell.cell_contents for cell in value.__closure__ or ()))
+    module = value.__module__ or ""
+    package, *names = module.split(".")
+    if names[:1] == ["extensions"] and package == _PACKAGE.name:
+        return modules | {".".join((package, *names[:2]))}
+    return modules if package in (_PACKAGE.name, "numba", "numpy") else modules | {module}
+
+
+def _folder_of_module(module: str) -> str:
+    """Name of the folder for kernels that a module outside the core is part of, by a hash of its sources.
+
+    Of a package all files count, and so do the files ``shared_*.py`` beside an extension.
+
+    Raises
+    ------
+    FileNotFoundError
+        The module has no source file.
+    """
+    file = Path(getattr(sys.modules.get(module), "__file__", None) or "")
+    if not file.is_file():
+        raise FileNotFoundError(f"module {module} has no source file")
+    sources = {file}
+    if file.name == "__init__.py":
+        sources = {*file.parent.rglob("*.py"), *file.parent.parent.glob("shared_*.py")}
+        file = file.parent
+    return f"{module.rpartition('.')[2]}-{_hash_of(module, sources, file.parent)}"
+
+
+@contextmanager
+def _one_process_at_a_time(folder: str) -> Iterator[None]:
+    """Hold a lock on the cache; the system gives it back when the file is closed, however the process ends."""
+    Path(folder).mkdir(parents=True, exist_ok=True)  # somebody may have cleared the cache
+    with open(Path(folder) / "lock", "a+b") as file:
+        if os.name == "nt":
+            import msvcrt
+
+            msvcrt.locking(file.fileno(), msvcrt.LK_LOCK, 1)  # type: ignore[attr-defined]  # exists on Windows only
+        else:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _save_alone(compiled: Any, folder: str) -> None:
+    """Make a compiled function save itself to the cache under the lock."""
+    save = compiled._cache.save_overload
+
+    def save_overload(signature: Any, result: Any) -> None:
+        with _one_process_at_a_time(folder):
+            save(signature, result)
+
+    compiled._cache.save_overload = save_overload
+
+
+def scalar(function: Callable) -> Callable:
+    """Mark a formula of one Gaussian or one pixel that kernels call; in Python it is the function itself."""
+    # Inlined always: a call would count the references of every array it is given, an atomic operation each. Nobody
+    # calls it through a C pointer, and the wrapper for that would be a tenth of what is compiled.
+    return register_jitable(forceinline=True, no_cfunc_wrapper=True)(_named_after_closure(function))
+
+
+def _named_after_closure(function: Callable) -> Callable:
+    """Make the name of a function unique to what it closes over; compiled symbols are named after it."""
+    names = [_name_of(cell.cell_contents) for cell in function.__closure__ or ()]
+    if names:
+        function.__qualname__ += "_" + hashlib.sha256("|".join(names).encode()).hexdigest()[:16]
+    return function
+
+
+def _name_of(value: Any) -> str:
+    """Describe what a function closes over: the same in every process, and different for different things.
+
+    Raises
+    ------
+    TypeError
+        Nothing but its address tells the value from others of its type.
+    """
+    if isinstance(value, FunctionType):
+        inside = (cell.cell_contents for cell in value.__closure__ or ())
+        line = value.__code__.co_firstlineno  # two lambdas of one function have one name
+        return f"{value.__module__}.{value.__qualname__}:{line}({','.join(map(_name_of, inside))})"
+    if isinstance(value, tuple):
+        return f"{type(value).__name__}({','.join(map(_name_of, value))})"
+    if isinstance(value, functools.partial):
+        return f"partial{_name_of((value.func, *value.args, *value.keywords, *value.keywords.values()))}"
+    if isinstance(value, type | BuiltinFunctionType | np.ufunc):
+        return f"{getattr(value, '__module__', '')}.{value.__name__}"
+    if isinstance(value, ModuleType):
+        return value.__name__
+    if value is None or isinstance(value, bool | int | float | complex | str | np.generic | np.dtype):
+        return f"{type(value).__name__} {value!r}"
+    if isinstance(value, np.ndarray):
+        return f"array {value.dtype} {value.shape} {hashlib.sha256(value.tobytes()).hexdigest()}"
+    raise TypeError(
+        f"a compiled function closes over a {type(value).__name__}, whose name would be an address: close over"
+        " functions, numbers, arrays, or tuples of them"
+    )
+
+
+def kernel(parallel: bool = True) -> Callable[[Callable], Callable]:
+    """Compile a parallel loop over bundles of arrays.
+
+    Parameters
+    ----------
+    parallel : bool
+        False for the few loops whose steps depend on each other.
+
+    Returns
+    -------
+    callable
+        A decorator; the decorated kernel takes the package-wide lock around each call.
+    """
+
+    def decorate(function: Callable) -> Callable:
+        folder = cache_folder(function)
+        previous = numba.config.CACHE_DIR  # type: ignore[attr-defined]  # numba sets its options at import
+        numba.config.CACHE_DIR = folder or previous  # type: ignore[attr-defined]  # read at decoration only
+        try:
+            compiled = numba.njit(
+                parallel=_PARALLEL if parallel else False,
+                cache=folder is not None,
+                error_model="numpy",
+                fastmath={"contract"},
+                no_cfunc_wrapper=True,
+            )(_named_after_closure(function))
+        finally:
+            numba.config.CACHE_DIR = previous  # type: ignore[attr-defined]
+        if folder is not None and not numba.config.DISABLE_JIT:  # type: ignore[attr-defined]  # then it is plain Python
+            _save_alone(compiled, folder)
+
+        @functools.wraps(function)
+        def locked(*args: Any) -> Any:
+            with _KERNEL_LOCK:
+                return compiled(*args)
+
+        return locked
+
+    return decorate
+
+
+def n_threads() -> int:
+    """Return the number of threads that kernels use."""
+    return int(numba.get_num_threads())

@@ -1,0 +1,198 @@
+"""How lanes are compiled: their type, arithmetic, and the functions that work lane by lane.
+
+Each Python function of :mod:`minisplat_ref.jit.lanes` gets a second meaning here, an instruction of LLVM for a
+vector of eight. No kernel names this file.
+"""
+
+import math
+import operator
+from collections.abc import Callable
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.typing.templates import infer, infer_global, make_intrinsic_template
+from numba.extending import models, overload, register_model
+
+from minisplat_ref.jit.lanes import (
+    WIDTH,
+    ceil,
+    exp_of,
+    floor,
+    larger,
+    log_of,
+    nearest,
+    scaled_by_power,
+    select,
+    smaller,
+    sqrt,
+)
+
+I32 = ir.IntType(32)
+
+
+class LanesType(types.Type):
+    """Numba's type of eight numbers or booleans."""
+
+    def __init__(self, element: types.Type) -> None:
+        self.element = element
+        super().__init__(f"lanes({element})")
+
+
+@register_model(LanesType)
+class _Model(models.PrimitiveModel):
+    """A vector of LLVM."""
+
+    def __init__(self, manager: Any, lanes: LanesType) -> None:
+        element = ir.IntType(1) if lanes.element == types.boolean else manager.lookup(lanes.element).get_value_type()
+        super().__init__(manager, lanes, ir.VectorType(element, WIDTH))
+
+
+# --- how operations are made ---
+
+
+def joined(*kinds: types.Type) -> LanesType | None:
+    """Lanes that all operands become; None where none are lanes, or one is too wide for them."""
+    lanes = next((kind for kind in kinds if isinstance(kind, LanesType)), None)
+    if lanes is None:
+        return None
+    for kind in kinds:
+        is_narrow = isinstance(kind, types.Float) and kind.bitwidth <= getattr(lanes.element, "bitwidth", 0)
+        if kind != lanes and not is_narrow and not isinstance(kind, types.Integer | types.IntegerLiteral):
+            return None
+    return lanes
+
+
+def spread(context: Any, builder: Any, value: Any, kind: types.Type, lanes: LanesType) -> Any:
+    """Take a single number eight times; lanes are what they are."""
+    if isinstance(kind, LanesType):
+        return value
+    nothing = ir.Constant(context.get_value_type(lanes), ir.Undefined)
+    single = builder.insert_element(nothing, context.cast(builder, value, kind, lanes.element), I32(0))
+    return builder.shuffle_vector(single, nothing, ir.Constant(ir.VectorType(I32, WIDTH), [0] * WIDTH))
+
+
+def _operands(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
+    lanes: Any = joined(*signature.args)
+    return [spread(context, builder, *pair, lanes) for pair in zip(args, signature.args, strict=True)]
+
+
+def _call(builder: Any, name: str, result: Any, args: Any) -> Any:
+    """Call one of LLVM's vector intrinsics, whose name ends with the operand's type."""
+    element = {"float": "f32", "double": "f64"}[str(args[-1].type.element)]
+    kind = ir.FunctionType(result, [arg.type for arg in args])
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"{name}.v{WIDTH}{element}"), args)
+
+
+def compiled(function: Callable) -> Callable[[Callable], None]:
+    """Register what a function is in compiled code.
+
+    Numba's ``overload`` would do, but compiles a function around each of them, which takes longer than all the rest.
+    """
+
+    def register(definition: Callable) -> None:
+        template = make_intrinsic_template(function, definition, function.__name__)
+        infer(template)
+        infer_global(function, types.Function(template))
+
+    return register
+
+
+def _typed(emit: Callable, has_boolean_result: bool = False) -> Callable:
+    """Return the typing of a function of lanes, and with it ``emit``, which writes its instruction."""
+
+    def typed(*kinds: Any) -> Any:
+        lanes = joined(*kinds)
+        if lanes is None:
+            return None
+        result = LanesType(types.boolean) if has_boolean_result else lanes
+
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            return emit(builder, *_operands(context, builder, signature, args))
+
+        return result(*kinds), generate
+
+    return typed
+
+
+def _register_unary(function: Callable, emit: Callable, of_one: Callable | None = None) -> None:
+    """Register a function of lanes; ``of_one`` is the function of single numbers, where Numba knows none."""
+    typed = _typed(emit)
+    compiled(function)(lambda typing, a: typed(a))
+    if of_one is not None:
+        overload(function)(lambda a: None if isinstance(a, LanesType) else of_one)
+
+
+def _register_binary(
+    function: Callable, emit: Callable, has_boolean_result: bool = False, of_one: Callable | None = None
+) -> None:
+    typed = _typed(emit, has_boolean_result)
+    compiled(function)(lambda typing, a, b: typed(a, b))
+    if of_one is not None:
+        overload(function)(lambda a, b: None if isinstance(a, LanesType) or isinstance(b, LanesType) else of_one)
+
+
+# --- arithmetic and comparisons; a product that is added is rounded once, as everywhere in the kernels ---
+
+_register_binary(operator.add, lambda builder, a, b: builder.fadd(a, b, flags=["contract"]))
+_register_binary(operator.sub, lambda builder, a, b: builder.fsub(a, b, flags=["contract"]))
+_register_binary(operator.mul, lambda builder, a, b: builder.fmul(a, b, flags=["contract"]))
+_register_binary(operator.truediv, lambda builder, a, b: builder.fdiv(a, b))
+_register_unary(operator.neg, lambda builder, a: builder.fneg(a))
+_register_unary(abs, lambda builder, a: _call(builder, "llvm.fabs", a.type, [a]))
+_register_binary(operator.and_, lambda builder, a, b: builder.and_(a, b))
+for _sign, _operator in {">": operator.gt, ">=": operator.ge, "<": operator.lt, "<=": operator.le}.items():
+    _register_binary(
+        _operator, lambda builder, a, b, sign=_sign: builder.fcmp_ordered(sign, a, b), has_boolean_result=True
+    )
+
+
+# --- functions; each has its meaning in Python first ---
+
+
+def larger_lanes(builder: Any, a: Any, b: Any) -> Any:
+    """Build the larger of two vectors lane by lane; ``a`` where one is NaN."""
+    return builder.select(builder.fcmp_ordered(">", b, a), b, a)
+
+
+def _smaller(builder: Any, a: Any, b: Any) -> Any:
+    return builder.select(builder.fcmp_ordered("<", b, a), b, a)
+
+
+_register_binary(larger, larger_lanes, of_one=lambda a, b: b if b > a else a)
+_register_binary(smaller, _smaller, of_one=lambda a, b: b if b < a else a)
+_register_unary(floor, lambda builder, a: _call(builder, "llvm.floor", a.type, [a]))
+_register_unary(ceil, lambda builder, a: _call(builder, "llvm.ceil", a.type, [a]))
+_register_unary(nearest, lambda builder, a: _call(builder, "llvm.rint", a.type, [a]))
+_register_unary(sqrt, lambda builder, a: _call(builder, "llvm.sqrt", a.type, [a]), of_one=lambda a: math.sqrt(a))
+_register_unary(exp_of, lambda builder, a: _call(builder, "llvm.exp", a.type, [a]))
+_register_unary(log_of, lambda builder, a: _call(builder, "llvm.log", a.type, [a]), of_one=lambda a: math.log(a))
+
+
+@compiled(scaled_by_power)
+def _scaled_by_power(typing: Any, a: Any, n: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        bits = ir.VectorType(I32, WIDTH)
+        exponent = builder.shl(builder.fptosi(args[1], bits), ir.Constant(bits, [23] * WIDTH))
+        return builder.bitcast(builder.add(builder.bitcast(args[0], bits), exponent), args[0].type)
+
+    return a(a, n), generate
+
+
+@overload(select)
+def _select_one(condition, a, b):
+    return None if isinstance(condition, LanesType) else lambda condition, a, b: a if condition else b
+
+
+@compiled(select)
+def _select(typing: Any, condition: Any, a: Any, b: Any) -> Any:
+    lanes = joined(a, b)
+    if lanes is None or not isinstance(condition, LanesType):
+        return None
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        pair = zip(args[1:], signature.args[1:], strict=True)
+        return builder.select(args[0], *(spread(context, builder, *one, lanes) for one in pair))
+
+    return lanes(condition, a, b), generate

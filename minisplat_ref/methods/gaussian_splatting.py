@@ -1,0 +1,134 @@
+"""3DGS (Kerbl et al. 2023): its density control and opacity reset as actions, and when each of them acts.
+
+The mathematics is in :mod:`minisplat_ref.strategy.clone_split`; an action takes its arguments from the training state
+and puts the result back. ``3dgs`` is the method as released, ``3dgs-accel`` the same with the authors' later optimiser.
+"""
+
+import math
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from minisplat_ref.strategy import clone_split
+from minisplat_ref.strategy.ops import n_rows
+from minisplat_ref.training.adam import AdamRule
+from minisplat_ref.training.rates import LearningRates, LogLinear
+from minisplat_ref.training.schedule import At, During, Every, Recipe
+from minisplat_ref.training.state import Iteration, TrainState, apply_edit, n_pixels
+from minisplat_ref.types import Gaussians
+
+
+def collect_gradients(state: TrainState, iteration: Iteration) -> None:
+    """Add the view's positional gradients to ``stats["gradient_sum"]`` and count it in ``stats["view_count"]``.
+
+    While views are culled (Mini-Splatting2), ``stats["gradient_factor"]`` says which part of its views a Gaussian is
+    still rendered in; gradients are lowered by it, so that their mean refers to all views, as the threshold does.
+    """
+    n = n_rows(state.gaussians)
+    if "gradient_sum" not in state.stats:
+        state.stats["gradient_sum"] = np.zeros(n, iteration.v_means2d.dtype)
+        state.stats["view_count"] = np.zeros(n, np.int32)
+    ids, camera = iteration.visible_ids, iteration.view.camera
+    norms = clone_split.screen_gradient_norms(iteration.v_means2d[ids], camera.width, camera.height)
+    if "gradient_factor" in state.stats:
+        norms = norms * state.stats["gradient_factor"][ids]
+    state.stats["gradient_sum"][ids] += norms
+    state.stats["view_count"][ids] += 1
+
+
+def clone_and_split(
+    state: TrainState,
+    iteration: Iteration,
+    *,
+    threshold: float,
+    size_fraction: float,
+    draw_children: Callable[..., Gaussians] = clone_split.random_children,
+    most_per_pixel: float = math.inf,
+) -> None:
+    """Densify where the mean of the collected gradients reaches ``threshold``, and start collecting anew.
+
+    Gaussians larger than ``size_fraction`` of the scene's extent are split, the others cloned; those that
+    ``stats["is_blurred"]`` marks are split whatever their size and gradient (Mini-Splatting). Nothing is done while
+    there are ``most_per_pixel`` Gaussians or more for each pixel of the training views.
+    """
+    means = state.stats.pop("gradient_sum") / np.maximum(state.stats.pop("view_count"), 1)
+    is_blurred = state.stats.pop("is_blurred", None)
+    if n_rows(state.gaussians) >= most_per_pixel * n_pixels(iteration.scene):
+        return
+    edit = clone_split.clone_and_split(
+        state.gaussians,
+        means,
+        is_blurred=is_blurred,
+        threshold=threshold,
+        size_limit=size_fraction * iteration.scene.extent,
+        draw_children=draw_children,
+        rng=state.rng,
+    )
+    apply_edit(state, edit)
+
+
+def prune_faint(state: TrainState, iteration: Iteration, *, least_opacity: float) -> None:
+    """Remove Gaussians of opacity below ``least_opacity``."""
+    apply_edit(state, clone_split.prune_faint(state.gaussians, least_opacity=least_opacity))
+
+
+def prune_large(state: TrainState, iteration: Iteration, *, size_fraction: float) -> None:
+    """Remove Gaussians larger than ``size_fraction`` of the scene's extent."""
+    size_limit = size_fraction * iteration.scene.extent
+    apply_edit(state, clone_split.prune_large(state.gaussians, size_limit=size_limit))
+
+
+def reset_opacity(state: TrainState, iteration: Iteration, *, ceiling: float) -> None:
+    """Lower all opacities to at most ``ceiling`` and forget their moments, which point back up."""
+    logits = clone_split.capped_opacity_logits(state.gaussians.opacity_logits, ceiling=ceiling)
+    state.gaussians = state.gaussians._replace(opacity_logits=logits)
+    for moment in (state.adam.first, state.adam.second):
+        moment.opacity_logits[:] = 0
+
+
+def reset_opacity_on_white(state: TrainState, iteration: Iteration, *, ceiling: float) -> None:
+    """As :func:`reset_opacity`, if the scene is in front of white, where early floaters hide best."""
+    if np.all(iteration.scene.background == 1.0):
+        reset_opacity(state, iteration, ceiling=ceiling)
+
+
+# Densification needs the mean gradient over about all views, and time to settle: each event multiplies the Gaussians
+# by up to two, so that events compressed to every few iterations let their number explode. What an opacity reset fades
+# needs some hundred iterations to come back.
+DENSIFY_LEAST_PERIOD = 100
+_densifying = partial(Every, 100, stop=15_000, least_period=DENSIFY_LEAST_PERIOD)
+
+GS = Recipe(
+    name="3dgs",
+    iterations=30_000,
+    learning_rates=LearningRates(
+        means=LogLinear(1.6e-4, 1.6e-6, 30_000),
+        quats=1e-3,
+        log_scales=5e-3,
+        opacity_logits=5e-2,
+        sh_dc=2.5e-3,
+        sh_rest=2.5e-3 / 20,
+    ),
+    adam=AdamRule(is_visible_only=False, has_bias_correction=True),
+    sh_degree=3,
+    sh_milestones=(1_000, 2_000, 3_000),
+    dssim_weight=0.2,
+    has_random_background=False,
+    events=(
+        During(collect_gradients, stop=15_000),
+        _densifying(partial(clone_and_split, threshold=2e-4, size_fraction=0.01), start=500),
+        _densifying(partial(prune_faint, least_opacity=0.005), start=500),
+        _densifying(partial(prune_large, size_fraction=0.1), start=3_000),
+        Every(3_000, partial(reset_opacity, ceiling=0.01), stop=15_000, least_period=300),
+        At(500, partial(reset_opacity_on_white, ceiling=0.01)),
+    ),
+)
+"""``3dgs``."""
+
+GS_ACCEL = GS._replace(
+    name="3dgs-accel",
+    learning_rates=GS.learning_rates._replace(opacity_logits=2.5e-2),
+    adam=AdamRule(is_visible_only=True, has_bias_correction=False),
+)
+"""``3dgs-accel``."""

@@ -1,0 +1,170 @@
+"""Mini-Splatting2 (Fang and Wang 2024): dense in 3000 iterations, then simplified, so that most train few Gaussians."""
+
+import math
+from collections.abc import Callable
+from functools import partial
+
+from minisplat_ref.methods.gaussian_splatting import (
+    DENSIFY_LEAST_PERIOD,
+    GS,
+    clone_and_split,
+    collect_gradients,
+    prune_faint,
+)
+from minisplat_ref.methods.mini_splatting import (
+    BACKDROP_EXTENTS,
+    BLUR_AREA,
+    DEPTH_TOLERANCE,
+    KEEP_FRACTION,
+    REINITIALISE_LEAST_STEP,
+    SHORT_RUN_EXPONENT,
+    collect_blur,
+    cull,
+    measure_importance,
+    prune_tail,
+    reinitialise_from_depth,
+    simplify,
+    store_sh,
+)
+from minisplat_ref.strategy import aggressive_clone as cloning
+from minisplat_ref.strategy import blur_split, depth_reinit, importance, visibility
+from minisplat_ref.strategy import simplify as simplification
+from minisplat_ref.strategy.importance import ImportanceStats, indoor, mass_mask
+from minisplat_ref.strategy.ops import keep, n_rows, take
+from minisplat_ref.training.adam import AdamRule
+from minisplat_ref.training.schedule import At, During, Every
+from minisplat_ref.training.state import Iteration, TrainState, apply_edit, n_pixels
+from minisplat_ref.types import Bools
+
+COLLECTED = ("gradient_sum", "view_count", "is_blurred")
+
+
+def aggressive_clone(
+    state: TrainState,
+    iteration: Iteration,
+    *,
+    critical: Callable[[ImportanceStats], Bools],
+    factor: int,
+    tail_mass: float,
+    least_views: int,
+    most_per_pixel: float = math.inf,
+) -> None:
+    """Clone the critical Gaussians, after dropping those that hardly any view sees, and cull views from now on.
+
+    Parameters
+    ----------
+    state, iteration
+        As for every action.
+    critical : callable
+        Which Gaussians [N] are critical, given the views' statistics.
+    factor : int
+        Copies that a critical Gaussian becomes.
+    tail_mass : float
+        Only the most important Gaussians that carry this part of the importance stay.
+    least_views : int
+        Those that belong to the visible part of fewer views go.
+    most_per_pixel : float
+        Nothing is cloned while there are this many Gaussians or more for each pixel of the training views.
+    """
+    stats = measure_importance(state, iteration)
+    stays = mass_mask(indoor(stats), tail_mass) & ~visibility.seen_by_few(stats.is_visible, least_views)  # [N]
+    apply_edit(state, keep(state.gaussians, stays))
+    stats = take(stats, stays)
+    cull(state, stats)
+    if n_rows(state.gaussians) < most_per_pixel * n_pixels(iteration.scene):
+        apply_edit(state, cloning.clone(state.gaussians, critical(stats), factor=factor))
+    for name in COLLECTED:
+        state.stats.pop(name, None)
+
+
+def stop_culling(state: TrainState, iteration: Iteration) -> None:
+    """Train each view with all Gaussians again."""
+    for name in ("is_visible", "gradient_factor"):
+        state.stats.pop(name, None)
+
+
+MOST_PER_PIXEL = 0.025  # densification pauses above it; cloning may go beyond once, to twice as many
+CLONE_LEAST_PERIOD = 50  # copies start in one place and need some steps to part
+_LEAST_VIEWS = 2  # what only one view sees is as likely a floater as a surface
+_cloning = partial(
+    aggressive_clone,
+    critical=cloning.critical_by_mass,
+    factor=2,
+    tail_mass=0.999,
+    least_views=_LEAST_VIEWS,
+    most_per_pixel=MOST_PER_PIXEL,
+)
+_densify = partial(
+    clone_and_split,
+    threshold=2e-4,
+    size_fraction=0.01,
+    draw_children=blur_split.principal_axis_children,
+    most_per_pixel=MOST_PER_PIXEL,
+)
+_reinitialise = partial(
+    reinitialise_from_depth,
+    points_of=depth_reinit.midpoint_points,
+    points_per_gaussian=1.0,
+    least_alpha=0.0,
+    depth_tolerance=DEPTH_TOLERANCE,
+    backdrop_extents=BACKDROP_EXTENTS,
+)
+_densifying = partial(Every, 100, start=500, stop=3_000, skip=2_000, least_period=DENSIFY_LEAST_PERIOD)
+
+_DENSIFICATION = (
+    During(collect_gradients, stop=3_000),
+    During(partial(collect_blur, area_fraction=BLUR_AREA), stop=3_000, needs_blend_stats=True),
+    _densifying(_densify),
+    _densifying(partial(prune_faint, least_opacity=0.005)),
+    At(2_000, partial(prune_tail, metric=importance.indoor, mass=0.99)),
+    At(2_000, _reinitialise, least_step=REINITIALISE_LEAST_STEP),
+    Every(250, _cloning, start=499, stop=3_000, skip=2_000, least_period=CLONE_LEAST_PERIOD),
+)
+
+MINI_SPLATTING2 = GS._replace(
+    name="mini-splatting2",
+    iterations=18_000,
+    learning_rates=GS.learning_rates._replace(opacity_logits=2.5e-2),
+    adam=AdamRule(is_visible_only=True, has_bias_correction=True),
+    sh_degree=0,
+    sh_milestones=(4_000, 5_000, 6_000),
+    events=(
+        *_DENSIFICATION,
+        At(
+            3_000,
+            partial(
+                simplify,
+                metric=importance.indoor,
+                choose=simplification.by_sampling,
+                keep_fraction=KEEP_FRACTION,
+                budget=None,
+                least_views=_LEAST_VIEWS,
+            ),
+        ),
+        At(3_000, partial(store_sh, sh_degree=3)),
+        At(
+            8_000,
+            partial(prune_tail, metric=importance.indoor, mass=0.99, least_views=_LEAST_VIEWS),
+        ),
+        At(13_000, stop_culling),
+    ),
+    half_size_until=3_000,
+    least_views=3,
+    short_run_exponent=SHORT_RUN_EXPONENT,
+)
+"""``mini-splatting2``: few Gaussians, fast."""
+
+_prune_unimportant = partial(
+    prune_tail, metric=importance.indoor, mass=0.99, least_views=_LEAST_VIEWS, is_intersecting=False
+)
+MINI_SPLATTING2_D = MINI_SPLATTING2._replace(
+    name="mini-splatting2-d",
+    events=(
+        *_DENSIFICATION,
+        At(3_000, _prune_unimportant),
+        At(3_000, partial(store_sh, sh_degree=3)),
+        At(8_000, _prune_unimportant),
+        At(13_000, stop_culling),
+    ),
+)
+"""``mini-splatting2-d``: dense within minutes, for quality."""

@@ -1,1 +1,0 @@
-"""How the parameters move: Adam over any population, and the schedules of its learning rates."""

@@ -1,0 +1,93 @@
+"""The training state, what an action may look at, and how rows come and go.
+
+An action is a function ``action(state, iteration, **settings)`` that changes the :class:`TrainState` it is given; a
+recipe names it, its settings and the iterations at which it acts. :func:`apply_edit` and :func:`start_anew` are the two
+places where rows come and go.
+"""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from minisplat_ref.backends import Backend
+from minisplat_ref.constants import Conventions
+from minisplat_ref.strategy.ops import Edit, contiguous, inherit, inherit_fields
+from minisplat_ref.training.adam import AdamState, zero_moments
+from minisplat_ref.types import Floats, Gaussians, Ints, RenderOutput, Scene, View
+
+
+@dataclass
+class TrainState:
+    """Everything that the next iteration depends on, besides the scene and the recipe."""
+
+    gaussians: Gaussians
+    """The parameters; their arrays are updated in place."""
+    adam: AdamState[Gaussians]
+    """Moments, row by row those of ``gaussians``."""
+    step: int
+    """Iterations done."""
+    view_order: list[int]
+    """Training views still to come before the list is shuffled anew; the next one stands last."""
+    rng: np.random.Generator
+    """The only source of randomness."""
+    stats: dict[str, NDArray[Any]]
+    """Arrays [N, ...] that actions collect per Gaussian; they follow the rows of ``gaussians``."""
+
+
+class Iteration(NamedTuple):
+    """What an action may look at: the iteration that has just been done, and its surroundings.
+
+    Rows are those that were rendered; a recipe lists the actions that use them before those that edit rows.
+    """
+
+    scene: Scene
+    view: View
+    """The training view that was rendered."""
+    output: RenderOutput
+    """Its rendering; with blend statistics if an action of this iteration needs them."""
+    visible_ids: Ints
+    """[V] rows that the view saw (radius above zero), ascending."""
+    v_means2d: Floats
+    """[N, 2] gradient of the loss by the projected centres, per pixel."""
+    backend: Backend
+    conventions: Conventions
+
+
+class StepReport(NamedTuple):
+    """What ``train(on_step=...)`` is told after every iteration."""
+
+    step: int
+    """Iterations done, from 1."""
+    loss: float
+    """Training loss of ``view``, before this iteration's update."""
+    view: View
+    output: RenderOutput
+    """The rendering that ``loss`` measures, float32, not clipped."""
+    state: TrainState
+    """The state after the iteration; it is safe to save."""
+
+
+def n_pixels(scene: Scene) -> int:
+    """Return the number of pixels of all training views: the size of a scene, as far as learning from it goes."""
+    return sum(view.camera.width * view.camera.height for view in scene.train_views)
+
+
+def apply_edit(state: TrainState, edit: Edit) -> None:
+    """Replace the population; new rows get zero moments, statistics follow the parents."""
+    no_reset = np.zeros(len(edit.parent_ids), bool)
+    state.gaussians = contiguous(edit.gaussians)  # Adam writes through views
+    state.adam = state.adam._replace(
+        first=inherit_fields(state.adam.first, edit.parent_ids, edit.is_new),
+        second=inherit_fields(state.adam.second, edit.parent_ids, edit.is_new),
+    )
+    state.stats = {name: inherit(field, edit.parent_ids, no_reset) for name, field in state.stats.items()}
+
+
+def start_anew(state: TrainState, gaussians: Gaussians) -> None:
+    """Replace the population by one that has no past: zero moments, no statistics, all views still to come."""
+    state.gaussians = contiguous(gaussians)
+    state.adam = zero_moments(state.gaussians)
+    state.stats = {}
+    state.view_order = []
