@@ -9,15 +9,15 @@ Left out: LPIPS, whose network weights are not ours to ship; an :class:`Evaluati
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
-from minisplat_ref.rendering import render
-from minisplat_ref.types import Bools, Floats, Gaussians, Ints, View
+from minisplat_ref.rendering import SPLATTING, Renderer, Request, as_model
+from minisplat_ref.types import Bools, Floats, Ints, View
 
 LPIPS_UNAVAILABLE = (None, "LPIPS needs the weights of a trained network, which are not part of minisplat_ref")
 
@@ -88,11 +88,12 @@ def ssim(image: Floats, target: Floats | Ints, mask: Bools | None = None, *, bac
 
 
 def evaluate(
-    gaussians: Gaussians,
+    model: Any,
     views: Sequence[View],
     *,
     background: Floats,
     on_view: Callable[[View, Floats, ViewMetrics], None] | None = None,
+    renderer: Renderer = SPLATTING,
     backend: Backend = CPU,
     conventions: Conventions = GSPLAT_MAIN,
 ) -> Evaluation:
@@ -100,19 +101,22 @@ def evaluate(
 
     Parameters
     ----------
-    gaussians : Gaussians
+    model : Model or Gaussians
     views : sequence of View
         Usually ``scene.test_views``; pixels outside a view's mask do not count.
     background : ndarray of shape (3,)
         ``scene.background``.
     on_view : callable, optional
         Called after each view with the view, its rendering [H, W, 3] clipped to [0, 1], and its metrics.
+    renderer : Renderer
+        How the model is drawn.
     backend : Backend
     conventions : Conventions
     """
     per_view = []
+    request = Request(background, conventions=conventions, backend=backend)
     for view in views:
-        output, _ = render(gaussians, view.camera, background=background, conventions=conventions, backend=backend)
+        output, _ = renderer.render(as_model(model), view, request)
         image = np.clip(output.image, 0.0, 1.0)  # [H, W, 3]
         metrics = ViewMetrics(
             view.name,

@@ -2,18 +2,25 @@
 
 Activations live here (3DGS section 5.1): ``scales = exp(log_scales)``, ``opacities = sigmoid(opacity_logits)``. Left
 out: checks for NaN, which belong to whoever reads a file; a Gaussian whose footprint is not finite is culled.
+
+A :class:`Renderer` is the pair of functions that everything calls which draws a model: training, evaluation,
+importance, depth reinitialisation, the commands. ``SPLATTING`` is that of 3DGS. Another way of drawing is another
+value; most wrap ``SPLATTING``: they make Gaussians of what they have (moved to the view's time, decoded, chosen by
+level), draw these, and carry the gradient back.
 """
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
+from minisplat_ref.reference.pinhole import with_principal_point
 from minisplat_ref.splatting import Primitives, SplatTape, splat, splat_vjp
-from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Ints, Projection, RenderOutput
+from minisplat_ref.types import NOTHING, Bools, Camera, Floats, Gaussians, Ints, Model, Projection, RenderOutput, View
 
 
 class RenderTape(NamedTuple):
@@ -30,13 +37,14 @@ class RenderTape(NamedTuple):
 
 
 class RenderGradient(NamedTuple):
-    """Gradient of the loss with respect to everything that :func:`render` depends on."""
+    """Gradient of the loss with respect to everything that a rendering depends on."""
 
-    gaussians: Gaussians  # by the parameters, before their activations
-    background: Floats  # [3] by the background colour
-    cam_from_world_R: Floats  # [3, 3] by the nine entries, unconstrained
+    gaussians: Any  # the population's type: with respect to the parameters, before their activations
+    background: Floats  # [3]
+    cam_from_world_R: Floats  # [3, 3] with respect to the nine entries, unconstrained
     cam_from_world_t: Floats  # [3]
-    means2d: Floats  # [N, 2] by the projected centres, per pixel: what density control looks at
+    means2d: Floats  # [N, 2] with respect to the projected centres, per pixel: what density control looks at
+    shared: Mapping[str, Floats] = NOTHING  # with respect to the model's shared parameters, by name
 
 
 def render(
@@ -110,7 +118,8 @@ def render(
         with_stats=with_stats,
         with_median_depth=with_median_depth,
     )
-    return splats.output, RenderTape(gaussians, sh_degree, splats)
+    visible_ids = np.flatnonzero(splats.projection.radii[:, 0] > 0)
+    return splats.output._replace(visible_ids=visible_ids), RenderTape(gaussians, sh_degree, splats)
 
 
 def render_vjp(tape: RenderTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
@@ -144,17 +153,102 @@ def render_vjp(tape: RenderTape, v_image: Floats, v_alpha: Floats | None = None)
     v_sh = splats.backend.sh_colors_vjp(
         g.means, g.sh_dc, g.sh_rest, splats.camera, tape.sh_degree, splats.projection.radii, v.colors
     )
+    further = {name: np.zeros_like(field) for name, field in g._asdict().items() if name not in Gaussians._fields}
     return RenderGradient(
-        gaussians=Gaussians(
+        gaussians=g._replace(
             means=v.primitives.means + v_sh.means,
             quats=v.primitives.quats,
             log_scales=scales * v.primitives.scales,
             opacity_logits=opacities * transparencies * v.primitives.opacities,
             sh_dc=v_sh.sh_dc,
             sh_rest=v_sh.sh_rest,
+            **further,
         ),
         background=v.background,
         cam_from_world_R=v.primitives.cam_from_world_R + v_sh.cam_from_world_R,
         cam_from_world_t=v.primitives.cam_from_world_t + v_sh.cam_from_world_t,
         means2d=v.means2d,
     )
+
+
+class Request(NamedTuple):
+    """How a view is to be rendered, and what is wanted besides its colours."""
+
+    background: Floats | None = None
+    """[3] RGB behind everything; black by default."""
+    sh_degree: int | None = None
+    """Highest degree of the spherical harmonics; all that are stored by default, and where fewer are stored."""
+    conventions: Conventions = GSPLAT_MAIN
+    backend: Backend = CPU
+    is_visible: Bools | None = None
+    """[N] rows that take part; all by default."""
+    wants: frozenset[str] = frozenset()
+    """``depth``: a channel with ``sum w z``. ``stats``: blend statistics. ``median_depth``. ``surface``, in the
+    output's extras: where each pixel's ray meets its dominant Gaussian. ``dominant_depth``, there too: [H, W] depth of
+    that Gaussian's mean. A renderer may know further names."""
+
+
+class Renderer(NamedTuple):
+    """A way of drawing a model, and its gradient."""
+
+    name: str
+    render: Callable[[Model, View, Request], tuple[RenderOutput, Any]]
+    """Returns the view, and a tape for the gradient."""
+    render_vjp: Callable[[Any, Floats, Floats | None], RenderGradient]
+    """``render_vjp(tape, v_image, v_alpha)``: v_image is [H, W, D] with all channels, v_alpha [H, W] or None."""
+    channels: Callable[[frozenset[str]], dict[str, slice]]
+    """``channels(wants)``: where the image has which channel."""
+
+
+def as_model(model: Any) -> Model:
+    """Return a :class:`Model`; a population without shared parameters becomes one."""
+    return model if isinstance(model, Model) else Model(model)
+
+
+def _render_model(model: Model, view: View, request: Request) -> tuple[RenderOutput, RenderTape]:
+    """Draw a model by :func:`render`."""
+    gaussians, wants = model.gaussians, request.wants
+    stored_degree = math.isqrt(gaussians.sh_rest.shape[1] + 1) - 1
+    output, tape = render(
+        gaussians,
+        view.camera,
+        background=request.background,
+        sh_degree=None if request.sh_degree is None else min(request.sh_degree, stored_degree),
+        conventions=request.conventions,
+        backend=request.backend,
+        is_visible=request.is_visible,
+        with_depth="depth" in wants,
+        with_stats=bool(wants & {"stats", *_EXTRAS}),
+        with_median_depth="median_depth" in wants,
+    )
+    extras = {name: extra(tape, output) for name, extra in _EXTRAS.items() if name in wants}
+    return output._replace(extras=extras), tape
+
+
+def _surface(tape: RenderTape, output: RenderOutput) -> Any:
+    """Return the densest point of the dominant Gaussian on each ray, a :class:`SurfacePoints`."""
+    assert output.stats is not None
+    means, quats, scales, _ = tape.splats.primitives
+    camera = with_principal_point(tape.splats.camera, tape.splats.conventions)
+    return tape.splats.backend.surface_points(means, quats, scales, camera, output.stats.dominant_ids)
+
+
+def _dominant_depth(tape: RenderTape, output: RenderOutput) -> Floats:
+    """Return the depth [H, W] of the dominant Gaussian's mean; 0 where nothing was hit."""
+    assert output.stats is not None
+    depths = np.append(tape.projection.depths, tape.projection.depths.dtype.type(0))  # [N + 1]: id -1 gets 0
+    return depths[output.stats.dominant_ids]
+
+
+_EXTRAS: dict[str, Callable[[RenderTape, RenderOutput], Any]] = {
+    "surface": _surface,
+    "dominant_depth": _dominant_depth,
+}
+
+
+def _channels(wants: frozenset[str]) -> dict[str, slice]:
+    return {"rgb": slice(0, 3), "depth": slice(3, 4)} if "depth" in wants else {"rgb": slice(0, 3)}
+
+
+SPLATTING = Renderer("splatting", _render_model, render_vjp, _channels)
+"""3DGS: any population that has the six fields of :class:`Gaussians`."""

@@ -7,6 +7,8 @@ right-handed; camera axes are OpenCV's: x right, y down, z forward. Image coordi
 and the centre of the top-left pixel is (0.5, 0.5).
 """
 
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,8 +22,8 @@ Bools = NDArray[np.bool_]
 class Gaussians(NamedTuple):
     """A population of Gaussians: the trained parameters, before their activations.
 
-    Gradients, Adam moments and learning rates share this type. An extension adds fields of shape [N, ...] in a
-    NamedTuple of its own.
+    Gradients and Adam moments share this type. Any NamedTuple of arrays [N, ...] whose first field is ``means`` is a
+    population, too: an extension's has further fields.
     """
 
     means: Floats
@@ -36,6 +38,19 @@ class Gaussians(NamedTuple):
     """[N, 3] spherical-harmonic coefficient of degree 0, RGB; colour = 0.5 + SH_C0 * sh_dc + ..."""
     sh_rest: Floats
     """[N, K-1, 3] coefficients of degree 1 and above; K = (degree + 1)^2, so K - 1 is 0, 3, 8 or 15."""
+
+
+NOTHING: Mapping[str, Any] = MappingProxyType({})
+"""The mapping without entries: the default where nothing is asked for, given or shared."""
+
+
+class Model(NamedTuple):
+    """What is trained and rendered: a population of primitives, and parameters that belong to none of them."""
+
+    gaussians: Any
+    """A population: :class:`Gaussians`, or another NamedTuple of arrays [N, ...] whose first field is ``means``."""
+    shared: Mapping[str, Floats] = NOTHING
+    """Arrays without rows, by name: an exposure or a pose for each photograph, the weights of a network."""
 
 
 class Camera(NamedTuple):
@@ -191,6 +206,10 @@ class RenderOutput(NamedTuple):
     """Blend statistics; None if not asked for."""
     kept: Any = None
     """What the backend that made it keeps for its gradient, which is as right, but slower, without."""
+    visible_ids: Ints | None = None
+    """[V] rows of the population that the view does not cull, ascending; None from a compositor alone."""
+    extras: Mapping[str, Any] = NOTHING
+    """What was asked for by name and is no channel, such as ``surface``, a :class:`SurfacePoints`."""
 
 
 class CompositeGradient(NamedTuple):
@@ -229,7 +248,7 @@ class GeometricWeights(NamedTuple):
 
 
 class View(NamedTuple):
-    """A photograph with its camera."""
+    """A photograph with its camera; or a camera alone, from :func:`view_from`."""
 
     name: str
     """File name without its suffix, unique in a scene."""
@@ -237,12 +256,27 @@ class View(NamedTuple):
     """Camera; its width and height are the image's."""
     image: NDArray[np.uint8]
     """[H, W, 3] sRGB as stored in the file; an alpha channel is already composited onto the scene's background, or has
-    become the mask (COLMAP scenes)."""
+    become the mask (COLMAP scenes). [0, 0, 3] where there is no photograph."""
     mask: Bools | None
     """[H, W] True where the pixel counts in the loss; None where all do."""
     point_ids: Ints | None = None
     """[Q] rows of :attr:`Scene.points` that structure from motion found in the photograph, ascending; None where that
     is not known."""
+    view_id: int = -1
+    """Place among the training views of its scene, which is where arrays of one row a photograph have its own; -1 for
+    a view that is not trained on."""
+    time: float = 0.0
+    """When it was taken, in the scene's own unit, from 0 to 1 as a rule; for scenes that move."""
+
+
+def numbered(views: Iterable[View]) -> tuple[View, ...]:
+    """Return training views with their places among themselves as ``view_id``."""
+    return tuple(view._replace(view_id=i) for i, view in enumerate(views))
+
+
+def view_from(camera: Camera, *, name: str = "", time: float = 0.0) -> View:
+    """Return a view without a photograph: a place to render from."""
+    return View(name, camera, np.zeros((0, 0, 3), np.uint8), None, time=time)
 
 
 class Scene(NamedTuple):

@@ -56,7 +56,7 @@ from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.strategy.blur_split import is_blurred, principal_axis_children
 from minisplat_ref.strategy.clone_split import clone_and_split, logit, random_children, screen_gradient_norms
 from minisplat_ref.training.loop import initial_state, train
-from minisplat_ref.training.schedule import During, Every
+from minisplat_ref.training.schedule import BLEND_STATS, During, Every
 from minisplat_ref.types import Camera, Gaussians
 
 plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
@@ -157,9 +157,7 @@ def density_control(start, stop, has_blur_split=False, draw_children=random_chil
         size_fraction=SIZE_FRACTION,
         draw_children=draw_children,
     )
-    blur = During(
-        partial(mini_splatting.collect_blur, area_fraction=AREA_FRACTION), start, stop, needs_blend_stats=True
-    )
+    blur = During(partial(mini_splatting.collect_blur, area_fraction=AREA_FRACTION), start, stop, wants=BLEND_STATS)
     return (
         During(gaussian_splatting.collect_gradients),
         *([blur] if has_blur_split else []),

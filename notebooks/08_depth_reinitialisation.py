@@ -67,7 +67,7 @@ from minisplat_ref.strategy.depth_reinit import (
 )
 from minisplat_ref.strategy.initialization import from_points
 from minisplat_ref.training.loop import train
-from minisplat_ref.types import Camera, Gaussians
+from minisplat_ref.types import Camera, Gaussians, view_from
 
 plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
 RED, BLUE, YELLOW, GREEN, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#8a8580"
@@ -112,7 +112,7 @@ toy = Gaussians(
     sh_dc=np.zeros((2, 3)),
     sh_rest=np.zeros((2, 0, 3)),
 )
-toy_points = {name: points_of(toy, toy_camera, GSPLAT_MAIN, CPU) for name, (points_of, _) in KINDS.items()}
+toy_points = {name: points_of(toy, view_from(toy_camera), GSPLAT_MAIN, CPU) for name, (points_of, _) in KINDS.items()}
 
 row = SIZE // 2
 figure, axes = plt.subplots(1, 3, figsize=(12, 3.9), sharex=True, sharey=True)
@@ -171,7 +171,7 @@ figure, axes = plt.subplots(2, 4, figsize=(12, 4.9))
 show(axes[0, 0], view.image / 255, "photograph")
 show(axes[1, 0], true_depth, "true depth", cmap="viridis", vmin=0, vmax=farthest)
 for k, (name, (points_of, _)) in enumerate(KINDS.items(), start=1):
-    pixel_points = points_of(room, view.camera, GSPLAT_MAIN, CPU)
+    pixel_points = points_of(room, view, GSPLAT_MAIN, CPU)
     shown_depth = show(axes[0, k], pixel_points.depths, name, cmap="viridis", vmin=0, vmax=farthest)
     error = relative_errors(pixel_points.depths, true_depth)
     shown_error = show(axes[1, k], error, f"error, median {np.median(error):.1%}", cmap="magma", vmin=0, vmax=0.3)
@@ -271,7 +271,7 @@ def elevation(axes, name, points, pixels, title):
 figure, axes = plt.subplots(2, 5, figsize=(14, 5), width_ratios=(1, 1, 1, 1, 1.7))
 for line, name in zip(axes, ("outdoor", "plain-wall"), strict=True):
     view, true_depth = truths[name].scene.train_views[VIEW_ID], truths[name].train_depths[VIEW_ID]
-    pixel_points = midpoint_points(trained[name], view.camera, GSPLAT_MAIN, CPU)
+    pixel_points = midpoint_points(trained[name], view, GSPLAT_MAIN, CPU)
     farthest = np.quantile(true_depth[true_depth > 0], 0.9)
     show(line[0], view.image / 255, name)
     show(line[1], pixel_points.alpha, "opacity of the rays", cmap="gray", vmin=0, vmax=1)

@@ -128,7 +128,7 @@ plt.show()
 show_code(importance.collect_importance)
 
 # %%
-stats = importance.collect_importance(dense, [view.camera for view in scene.train_views])
+stats = importance.collect_importance(dense, scene.train_views)
 metrics = {"indoor": importance.indoor(stats), "outdoor": importance.outdoor(stats)}
 
 
@@ -385,7 +385,7 @@ plt.show()
 
 # %%
 few = after["sampling"]
-few_stats = importance.collect_importance(few, [view.camera for view in scene.train_views])
+few_stats = importance.collect_importance(few, scene.train_views)
 few_candidates = simplify.intersection_preserving(importance.indoor(few_stats), few_stats.dominant_count)
 heavy_ids = simplify.carrying_mass(few_candidates, MASS)
 trimmed = take(few, heavy_ids)

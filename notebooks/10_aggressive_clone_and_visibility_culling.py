@@ -173,7 +173,7 @@ def density_control(start, stop):
 state = train(scene, base._replace(iterations=START, events=density_control(0, START - 10)), seed=0)
 gaussians = state.gaussians
 cameras = [view.camera for view in scene.train_views]
-stats = collect_importance(gaussians, cameras)
+stats = collect_importance(gaussians, scene.train_views)
 n = len(gaussians.means)
 print(f"{n} Gaussians, {len(cameras)} training views")
 
@@ -387,7 +387,7 @@ show_code(mini_splatting2.aggressive_clone)
 
 def copy_plainly(state, iteration):
     """An event: double the critical Gaussians as they are."""
-    found = collect_importance(state.gaussians, cameras)
+    found = collect_importance(state.gaussians, scene.train_views)
     apply_edit(state, plain_copies(state.gaussians, aggressive_clone.critical_by_mass(found)))
     for name in ("gradient_sum", "view_count"):
         state.stats.pop(name, None)

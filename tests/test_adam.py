@@ -20,7 +20,7 @@ class Pair(NamedTuple):
 
 DENSE = AdamRule(is_visible_only=False, has_bias_correction=True)
 SPARSE = AdamRule(is_visible_only=True, has_bias_correction=False)
-RATES = (0.1, 0.01)
+RATES = {"a": 0.1, "b": 0.01}
 
 
 def random_pair(rng, n, dtype=np.float64):
@@ -57,7 +57,7 @@ def test_first_step_is_the_rate_against_the_sign(rng):
     gradient.a[:] *= 1e-6
     after = copy(before)
     adam_step(after, gradient, zero_moments(after), RATES, DENSE, np.arange(5))
-    for p0, p1, g, rate in zip(before, after, gradient, RATES, strict=True):
+    for p0, p1, g, rate in zip(before, after, gradient, RATES.values(), strict=True):
         assert_allclose(p1 - p0, -rate * np.sign(g), rtol=2 * DENSE.eps / 1e-6)
 
 
@@ -66,7 +66,7 @@ def test_first_step_without_correction_is_the_root_of_ten_larger(rng):
     before, gradient = random_pair(rng, 5), random_gradient(rng, 5)
     after = copy(before)
     state = adam_step(after, gradient, zero_moments(after), RATES, SPARSE, np.arange(5))
-    for p0, p1, g, rate in zip(before, after, gradient, RATES, strict=True):
+    for p0, p1, g, rate in zip(before, after, gradient, RATES.values(), strict=True):
         assert_allclose(p1 - p0, -rate * math.sqrt(10) * np.sign(g), rtol=CLOSED_FORM * 10)
     assert_allclose(state.first.b, 0.1 * gradient.b)
     assert_allclose(state.second.b, 0.001 * gradient.b**2)

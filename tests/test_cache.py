@@ -103,13 +103,13 @@ import gc, sys
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 from minisplat_ref.backends import CPU
+from minisplat_ref.extensions.geometry import EXTENSION as GEOMETRY
 from minisplat_ref.io import load_scene
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.rendering import render
 from minisplat_ref.strategy.importance import collect_importance
 from minisplat_ref.training.loop import train
-from minisplat_ref.types import GeometricWeights
 from minisplat_ref.warm_up import FIRST_ITERATION, STAGES
 
 
@@ -131,12 +131,12 @@ for compile_stage in STAGES.values():
 every = signatures()
 assert len(every) > len(first) + 5
 camera = scene.train_views[0].camera
-collect_importance(state.gaussians, [camera])
+collect_importance(state.gaussians, scene.train_views[:1])
 output, tape = render(state.gaussians, camera, with_stats=True)
 g = tape.splats.primitives
 CPU.surface_points(g.means, g.quats, g.scales, camera, output.stats.dominant_ids)
 evaluate(state.gaussians, scene.train_views[:1], background=scene.background)
-smooth = recipe._replace(geometry=GeometricWeights(0.0, 1.0, 1.0))
+smooth = recipe._replace(losses=(*recipe.losses, *(term._replace(weight=1.0) for term in GEOMETRY.losses[1:])))
 train(scene, smooth, seed=0)
 assert signatures() == every, signatures() - every
 """

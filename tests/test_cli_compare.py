@@ -34,10 +34,12 @@ from minisplat_ref.experiments.comparison.measures import (
 from minisplat_ref.experiments.comparison.plan import Plan, eval_every
 from minisplat_ref.experiments.comparison.table import as_markdown, table_cells
 from minisplat_ref.experiments.progress import read_log
+from minisplat_ref.experiments.scoring import Trained
 from minisplat_ref.io import load_ply, load_scene
 from minisplat_ref.methods import RECIPES
+from minisplat_ref.rendering import SPLATTING
 from minisplat_ref.training.schedule import At, describe
-from minisplat_ref.types import Gaussians
+from minisplat_ref.types import Gaussians, Model
 
 SCENE = {"n_views": 8, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
 RECIPE_NAMES, ITERATIONS = ("3dgs", "3dgs-accel"), (24, 12)
@@ -313,15 +315,15 @@ def test_models_are_rendered_by_turns(scene_folder, monkeypatch):
     n_views = len(scene.test_views)
     now, order = [0.0], []
 
-    def slow_render(model, camera, **_):
-        round_number = len(order) // (2 * n_views)
-        now[0] += (round_number or 100.0) * (1.0 if model == 0 else 2.0)
-        order.append(model)
+    class Slow(int):
+        def render(self, view):
+            round_number = len(order) // (2 * n_views)
+            now[0] += (round_number or 100.0) * (1.0 if self == 0 else 2.0)
+            order.append(self)
 
-    monkeypatch.setattr(speed, "render", slow_render)
     monkeypatch.setattr(speed.time, "perf_counter", lambda: now[0])
     middle = (speed.ROUNDS + 1) / 2
-    assert speed.render_rates([0, 1], scene) == pytest.approx([1 / middle, 0.5 / middle], rel=CLOSED_FORM)
+    assert speed.render_rates([Slow(0), Slow(1)], scene) == pytest.approx([1 / middle, 0.5 / middle], rel=CLOSED_FORM)
     assert order == ([0] * n_views + [1] * n_views) * (speed.ROUNDS + 1)
 
 
@@ -360,7 +362,7 @@ def test_crops_show_what_differs(scene_folder):
     """One model is empty, so that its error is the photograph; each crop is of another view."""
     scene = load_scene(scene_folder, test_every=2)
     empty = Gaussians(*(np.zeros((0, *shape), np.float32) for shape in ((3,), (4,), (3,), (), (3,), (0, 3))))
-    crops = choose_crops([empty, empty], scene)
+    crops = choose_crops([Trained(Model(empty), SPLATTING, np.zeros(3), "GSPLAT_MAIN", "cpu")] * 2, scene)
     assert len({crop.view for crop in crops}) == len(crops) == 4
     assert [crop.reason.split()[-2:] for crop in crops] == [["differ", "most"]] * 2 + [["most", "detail"]] * 2
     assert all(crop.truth.shape == (7, 10, 3) and not np.any(crop.renders) for crop in crops)

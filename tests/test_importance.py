@@ -11,8 +11,14 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.reference.compositing import composite_all_pairs
 from minisplat_ref.strategy.importance import ImportanceStats, collect_importance, indoor, mass_mask, outdoor
 from minisplat_ref.strategy.ops import take
+from minisplat_ref.types import view_from
 
 N_GAUSSIANS = 30
+
+
+def looking(cameras):
+    """Views from these cameras."""
+    return [view_from(camera) for camera in cameras]
 
 
 @pytest.fixture
@@ -42,7 +48,7 @@ def weights_of(gaussians, camera):
 
 
 def test_sums_over_views(backend, gaussians, cameras):
-    stats = collect_importance(gaussians, cameras, backend=backend)
+    stats = collect_importance(gaussians, looking(cameras), backend=backend)
     expected_mean = np.zeros(N_GAUSSIANS)
     images = [weights_of(gaussians, camera) for camera in cameras]
     for image in images:
@@ -59,7 +65,7 @@ def test_sums_over_views(backend, gaussians, cameras):
 
 
 def test_visible_are_those_that_carry_the_view(backend, gaussians, cameras):
-    stats = collect_importance(gaussians, cameras, backend=backend, visibility_mass=0.9)
+    stats = collect_importance(gaussians, looking(cameras), backend=backend, visibility_mass=0.9)
     for v, camera in enumerate(cameras):
         weight_sums = weights_of(gaussians, camera).sum(axis=(0, 1))
         is_visible = stats.is_visible[:, v]
@@ -70,7 +76,7 @@ def test_visible_are_those_that_carry_the_view(backend, gaussians, cameras):
 
 
 def test_the_frustum_is_wider_than_what_is_seen(backend, gaussians, cameras):
-    stats = collect_importance(gaussians, cameras, backend=backend)
+    stats = collect_importance(gaussians, looking(cameras), backend=backend)
     radii = [backend.project(*activated(gaussians), camera, GSPLAT_MAIN).radii for camera in cameras]
     assert_array_equal(stats.frustum_count, np.sum([(r > 0).all(axis=1) for r in radii], axis=0))
     assert stats.frustum_count[-2] == 0 and stats.frustum_count.max() == 3
@@ -79,8 +85,8 @@ def test_the_frustum_is_wider_than_what_is_seen(backend, gaussians, cameras):
 
 @pytest.mark.parametrize("field", ImportanceStats._fields)
 def test_float32_and_types(gaussians, cameras, field):
-    expected = getattr(collect_importance(gaussians, cameras, backend=REFERENCE), field)
-    actual = getattr(collect_importance(as_dtype(gaussians, np.float32), cameras, backend=CPU), field)
+    expected = getattr(collect_importance(gaussians, looking(cameras), backend=REFERENCE), field)
+    actual = getattr(collect_importance(as_dtype(gaussians, np.float32), looking(cameras), backend=CPU), field)
     assert actual.dtype == expected.dtype
     if expected.dtype == np.float64:
         assert_allclose(actual, expected, rtol=0, atol=PARITY_FLOAT32_IMAGE * expected.max())
@@ -96,7 +102,7 @@ def test_hidden_gaussian_is_no_winner_but_has_weight():
         opacity_logits=np.log([0.6 / 0.4, 0.9 / 0.1]),
     )
     camera = make_camera(25, 19)
-    stats = collect_importance(pair, [camera, camera])
+    stats = collect_importance(pair, looking([camera, camera]))
     assert_allclose(stats.blend_weight_max, [0.6, 0.36], rtol=CLOSED_FORM)
     assert stats.dominant_count[1] == 0 and stats.blend_weight_sum[1] > 0.72
     assert outdoor(stats)[1] == 0 and outdoor(stats)[0] > 0
@@ -145,7 +151,7 @@ def test_mass_is_not_rank(rng):
 
 
 def test_nobody_and_no_view(rng, cameras):
-    stats = collect_importance(make_gaussians(rng, 0), cameras)
+    stats = collect_importance(make_gaussians(rng, 0), looking(cameras))
     assert stats.is_visible.shape == (0, 3) and stats.blend_weight_sum.shape == (0,)
     stats = collect_importance(make_gaussians(rng, 4), [])
     assert stats.is_visible.shape == (4, 0) and not stats.frustum_count.any()
@@ -153,10 +159,10 @@ def test_nobody_and_no_view(rng, cameras):
 
 def test_nothing_is_seen(gaussians):
     gaussians.means[:, 2] = -3
-    stats = collect_importance(gaussians, [make_camera()])
+    stats = collect_importance(gaussians, looking([make_camera()]))
     assert not any(field.any() for field in stats)
 
 
 def test_rows_follow_an_edit(gaussians, cameras):
-    stats = take(collect_importance(gaussians, cameras), np.array([4, 7]))
+    stats = take(collect_importance(gaussians, looking(cameras)), np.array([4, 7]))
     assert stats.is_visible.shape == (2, 3) and stats.dominant_count.shape == (2,)

@@ -64,7 +64,7 @@ def test_mini_splatting_schedule():
     assert fired["prune_tail"] == fired["restart_adam"] == [20_000]
     assert "reset_opacity" not in fired
     assert recipe.sh_degree == 0 and recipe.sh_milestones == (16_000, 17_000, 18_000)
-    means = recipe.learning_rates.means
+    means = recipe.learning_rates.of["means"]
     assert means.at(14_999) == pytest.approx(1.6e-5, rel=1e-3) and means.at(15_000) == means.at(5_000)
 
 
@@ -80,8 +80,8 @@ def test_mini_splatting2_schedule():
     assert fired["stop_culling"] == [13_000]
     assert [e.step for e in recipe.events if name_of(e) == "prune_tail"] == [2_000, 8_000]
     assert recipe.adam.is_visible_only and recipe.adam.has_bias_correction
-    assert recipe.learning_rates.opacity_logits == 0.025
-    assert recipe.learning_rates.means == RECIPES["3dgs"].learning_rates.means
+    assert recipe.learning_rates.of["opacity_logits"] == 0.025
+    assert recipe.learning_rates.of["means"] == RECIPES["3dgs"].learning_rates.of["means"]
 
 
 @pytest.mark.parametrize("name", ["mini-splatting-d", "mini-splatting2-d"])
@@ -118,14 +118,15 @@ def test_what_needs_time_is_left_out_of_short_runs():
 
 def test_rates_of_short_runs_are_raised_where_the_recipe_says_so():
     recipe = RECIPES["3dgs"]._replace(short_run_exponent=0.5)
-    short, rates = scaled(recipe, 7_500).learning_rates, recipe.learning_rates
-    assert short[1:] == pytest.approx([2 * rate for rate in rates[1:]])
-    assert (short.means.first, short.means.last) == pytest.approx((4 * rates.means.first, 4 * rates.means.last))
-    assert scaled(recipe, 60_000).learning_rates[1:] == rates[1:]  # longer runs keep them
+    short, rates = (dict(r.learning_rates.of) for r in (scaled(recipe, 7_500), recipe))
+    short_means, means = short.pop("means"), rates.pop("means")
+    assert len(short) == 5 and short == pytest.approx({name: 2 * rate for name, rate in rates.items()})
+    assert (short_means.first, short_means.last) == pytest.approx((4 * means.first, 4 * means.last))
+    assert rates.items() <= scaled(recipe, 60_000).learning_rates.of.items()  # longer runs keep them
 
 
 def test_rewind_and_warm_up_are_scaled():
-    assert get_recipe("mini-splatting", 3_000).learning_rates.means.rewind == (1_500, 500)
+    assert get_recipe("mini-splatting", 3_000).learning_rates.of["means"].rewind == (1_500, 500)
     assert get_recipe("mini-splatting2", 1_800).half_size_until == 300
 
 
@@ -138,8 +139,10 @@ def test_scaled_to_a_tenth():
     assert fired["reset_opacity"] == [300, 600, 900, 1_200]
     assert fired["reset_opacity_on_white"] == [50]
     assert recipe.sh_milestones == (100, 200, 300)
-    assert recipe.learning_rates.means.at(1_500) == RECIPES["3dgs"].learning_rates.means.at(15_000)
-    assert recipe.learning_rates[1:] == RECIPES["3dgs"].learning_rates[1:]
+    assert recipe.learning_rates.of["means"].at(1_500) == RECIPES["3dgs"].learning_rates.of["means"].at(15_000)
+    assert {name: r for name, r in recipe.learning_rates.of.items() if name != "means"} == {
+        name: r for name, r in RECIPES["3dgs"].learning_rates.of.items() if name != "means"
+    }
 
 
 def test_scaled_rounds_periods_and_keeps_every_iteration():
@@ -164,7 +167,7 @@ def test_scaled_by_one_changes_nothing():
 
 def test_what_tells_the_two_recipes_apart():
     dense, accelerated = RECIPES["3dgs"], RECIPES["3dgs-accel"]
-    assert (dense.learning_rates.opacity_logits, accelerated.learning_rates.opacity_logits) == (0.05, 0.025)
+    assert (dense.learning_rates.of["opacity_logits"], accelerated.learning_rates.of["opacity_logits"]) == (0.05, 0.025)
     assert not dense.adam.is_visible_only and dense.adam.has_bias_correction
     assert accelerated.adam.is_visible_only and not accelerated.adam.has_bias_correction
     assert dense.adam.eps == accelerated.adam.eps == 1e-15
@@ -182,7 +185,7 @@ def test_description_is_json_and_tells_settings_apart():
     recipe = RECIPES["3dgs"]
     description = json.loads(json.dumps(describe(recipe)))
     assert description["iterations"] == 30_000
-    assert description["learning_rates"]["means"] == {
+    assert description["learning_rates"]["of"]["means"] == {
         **{"first": 1.6e-4, "last": 1.6e-6, "steps": 30_000, "rewind": None}
     }
     densify = description["events"][1]

@@ -54,7 +54,7 @@ def test_study(scene_folder, dense_file, tmp_path, capsys, restart):
 
     # The numbers: parts of the candidates, and what carries the mass, which is what rank keeps of that number.
     scene, dense = load_scene(scene_folder), load_ply(dense_file)
-    stats = collect_importance(dense, [view.camera for view in scene.train_views])
+    stats = collect_importance(dense, scene.train_views)
     importance = intersection_preserving(indoor(stats), stats.dominant_count)
     n_candidates = np.count_nonzero(importance)
     n_of_mass = len(carrying_mass(importance, simplify.MASS))

@@ -13,11 +13,12 @@ from scenes import as_dtype, make_camera, make_gaussians
 
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.geometry import EXTENSION as GEOMETRY
 from minisplat_ref.methods import RECIPES, gaussian_splatting
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import render
 from minisplat_ref.training.loop import initial_state, load_state, save_state, train
-from minisplat_ref.training.schedule import At, During, Every
+from minisplat_ref.training.schedule import BLEND_STATS, At, During, Every, configured
 from minisplat_ref.types import GeometricWeights, Scene, View
 
 N_VIEWS, N_GAUSSIANS = 4, 30
@@ -141,10 +142,14 @@ def test_blend_statistics_only_where_asked_for(scene):
     seen = {}
     note = lambda state, iteration: seen.update({state.step + 1: iteration.output.stats})  # noqa: E731
     recipe = PLAIN._replace(
-        iterations=4, events=(During(note, stop=4), During(lambda *_: None, 1, 3, needs_blend_stats=True))
+        iterations=4, events=(During(note, stop=4), During(lambda *_: None, 1, 3, wants=BLEND_STATS))
     )
     train(scene, recipe, seed=0)
     assert {step: stats is not None for step, stats in seen.items()} == {1: False, 2: True, 3: False}
+
+
+def with_geometry(**weights):
+    return configured(PLAIN._replace(losses=(*PLAIN.losses, *GEOMETRY.losses)), **weights)
 
 
 def test_geometric_terms_join_the_loss(scene):
@@ -158,7 +163,7 @@ def test_geometric_terms_join_the_loss(scene):
         return CPU.geometric_loss(output.image[..., 3], output.alpha, target, camera, scene.points[:0], weights)[0]
 
     plain, smooth = [], []
-    recipe = PLAIN._replace(geometry=GeometricWeights(depth_smoothness=2.0))
+    recipe = with_geometry(depth_smoothness=2.0)
     rough = train(scene, PLAIN, seed=0, on_step=lambda report: plain.append(report.loss))
     smoothed = train(scene, recipe, seed=0, on_step=lambda report: smooth.append(report.loss))
     assert smooth[0] > plain[0]
@@ -166,7 +171,7 @@ def test_geometric_terms_join_the_loss(scene):
 
 
 def test_depth_of_points_needs_to_know_who_sees_them(scene):
-    recipe = PLAIN._replace(geometry=GeometricWeights(sfm_depth=0.1))
+    recipe = with_geometry(sfm_depth=0.1)
     with pytest.raises(InputError, match="tiny does not say which view sees which point"):
         train(scene, recipe, seed=0)
 

@@ -78,7 +78,7 @@ def _adam(name: str, is_seen: Bools, is_visible_only: bool) -> Contest:
         return [Case(name, passed, figures, "" if passed else "other rows were updated than should be")]
 
     def step() -> None:
-        adam_step(gaussians, gradient, state, [1e-3] * len(WIDTHS), rule, rows)
+        adam_step(gaussians, gradient, state, dict.fromkeys(Gaussians._fields, 1e-3), rule, rows)
 
     return Contest((step, lambda: _copy(source, target)), judge)
 

@@ -17,9 +17,9 @@ from typing import NoReturn
 from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.arguments import HelpFormatter
 
-from . import bench, cache, compare, demo, evaluate, info, oracle, render, train
+from . import bench, cache, compare, demo, evaluate, extensions, info, oracle, render, train
 
-COMMANDS = (demo, train, render, evaluate, compare, info, oracle, bench, cache)
+COMMANDS = (demo, train, render, evaluate, compare, info, extensions, oracle, bench, cache)
 
 DESCRIPTION = """\
 3D Gaussian Splatting on the CPU: train a scene from photographs, look at it,
@@ -51,6 +51,32 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _parser_of(argv: Sequence[str]) -> argparse.ArgumentParser:
+    """Return the parser of all commands; where the first word is an extension's name, of that extension's commands."""
+    parser = build_parser()
+    name = argv[0] if argv else ""
+    if not name.replace("-", "_").isidentifier() or name in {
+        command.__name__.rpartition(".")[2] for command in COMMANDS
+    }:
+        return parser
+    from minisplat_ref.extensions import folders
+
+    if name not in folders():
+        return parser
+    from minisplat_ref.extensions.extension import load_extension
+
+    extension = load_extension(name)
+    if not extension.commands:
+        raise InputError(f"extension {name} has no commands: see minisplat-ref extensions {name}")
+    parser = Parser(prog="minisplat-ref", formatter_class=HelpFormatter)
+    parser.set_defaults(run=None)
+    own = parser.add_subparsers(metavar="EXTENSION").add_parser(name, formatter_class=HelpFormatter)
+    commands = own.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for command in extension.commands:
+        command.add_parser(commands)
+    return parser
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command.
 
@@ -64,12 +90,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     int
         Exit code: 0, 2 for bad input, 130 when interrupted.
     """
-    parser = build_parser()
-    args = parser.parse_args(argv)
-    if args.run is None:
-        parser.print_help()
-        return 0
+    argv = sys.argv[1:] if argv is None else argv
     try:
+        parser = _parser_of(argv)
+        args = parser.parse_args(argv)
+        if args.run is None:
+            parser.print_help()
+            return 0
         code: int = args.run(args)
         sys.stdout.flush()
     except InputError as error:

@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
     state = initial_state(scene, recipe, settings.seed)
     compile_kernels(settings.backend)
     outcome = run_training(folder, scene, settings, recipe, state)
-    pictures = view_pictures(synthetic, scene, state.gaussians, settings, outcome)
+    pictures = view_pictures(folder, synthetic, scene, outcome)
     page = report_html(demo_report(folder, scene, settings, outcome, pictures, time.perf_counter() - start))
     (folder / REPORT).write_text(page, encoding="utf-8")
     if not outcome.is_complete:

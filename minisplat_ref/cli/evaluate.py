@@ -39,21 +39,20 @@ def run(args: argparse.Namespace) -> int:
     """Measure, print a table, rewrite the files."""
     from minisplat_ref.experiments import run_folder
     from minisplat_ref.experiments.scoring import score, summary, to_metrics
-    from minisplat_ref.experiments.settings import load, load_photographs
-    from minisplat_ref.io import load_ply
+    from minisplat_ref.experiments.settings import load, load_model, load_photographs
 
     settings = load(args.folder)
     if args.scene is not None:
         settings = settings._replace(scene=str(args.scene))
-    gaussians = load_ply(args.folder / run_folder.POINT_CLOUD)
+    model = load_model(args.folder, settings)
     scene = load_photographs(settings)
     if not scene.test_views:
         raise InputError(f"{settings.scene} was split without test views (--test-every 0): nothing to measure")
-    evaluation = score(args.folder, scene, gaussians, settings)
+    evaluation = score(args.folder, scene, model, settings)
 
     path = args.folder / run_folder.METRICS
     metrics = run_folder.read_json_object(path) if path.exists() else {}
-    run_folder.write_json(path, {**metrics, **to_metrics(evaluation), "n_gaussians": len(gaussians.means)})
+    run_folder.write_json(path, {**metrics, **to_metrics(evaluation), "n_gaussians": len(model.gaussians.means)})
     width = max(len(view.name) for view in evaluation.per_view)
     print(f"{'view':<{width}}  PSNR dB    SSIM")
     for view in evaluation.per_view:

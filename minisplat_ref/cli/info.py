@@ -2,6 +2,7 @@
 
 import argparse
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +10,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.arguments import Commands, HelpFormatter
 
 if TYPE_CHECKING:
-    from minisplat_ref.types import Floats, Gaussians
+    from minisplat_ref.types import Floats
 
 NOT_SHOWN = ("per_view", "n_gaussians", "iterations")  # of metrics.json: too long, or said by the PLY or checkpoint
 
@@ -71,24 +72,34 @@ def run(args: argparse.Namespace) -> int:
 def _ply_rows(path: Path) -> Rows:
     from minisplat_ref.io import load_ply
 
-    return [("PLY", _size(path)), *_gaussian_rows(load_ply(path))]
+    return [("PLY", _size(path)), *_field_rows(load_ply(path)._asdict())]
 
 
 def _checkpoint_rows(path: Path) -> Rows:
     from minisplat_ref.io.checkpoint import load_checkpoint
-    from minisplat_ref.types import Gaussians
 
     arrays, metadata = load_checkpoint(path)
+    fields = _group(arrays, "gaussians")
     try:
-        gaussians = Gaussians(*(arrays[f"gaussians.{name}"] for name in Gaussians._fields))
         recipe = metadata["recipe"]
         rows = [
             ("iteration", f"{metadata['step']:,}"),
             ("recipe", f"{recipe['name']} for {recipe['iterations']:,} iterations"),
+            *_field_rows(fields),
         ]
     except (KeyError, TypeError) as error:
         raise InputError(f"{path} is not the checkpoint of a training: it lacks {error}") from error
-    return [("checkpoint", _size(path)), *rows, *_gaussian_rows(gaussians)]
+    shared = ", ".join(f"{name} {_shape(array)}" for name, array in _group(arrays, "shared").items())
+    return [("checkpoint", _size(path)), *rows, *([("shared", shared)] if shared else [])]
+
+
+def _group(arrays: "Mapping[str, Floats]", name: str) -> "dict[str, Floats]":
+    """Return the arrays of one group of a checkpoint, by their own names."""
+    return {key.removeprefix(f"{name}."): array for key, array in arrays.items() if key.startswith(f"{name}.")}
+
+
+def _shape(array: "Floats") -> str:
+    return f"[{', '.join(map(str, array.shape))}]"
 
 
 def _run_rows(folder: Path) -> Rows:
@@ -124,20 +135,24 @@ def _scene_rows(path: Path) -> Rows:
     ]
 
 
-def _gaussian_rows(gaussians: "Gaussians") -> Rows:
+def _field_rows(fields: "Mapping[str, Floats]") -> Rows:
+    """Describe a population by its fields: the well-known ones by what they mean, others by their shapes."""
     import numpy as np
 
-    n, n_rest = gaussians.sh_rest.shape[:2]
-    degree = math.isqrt(n_rest + 1) - 1
-    rows = [("Gaussians", f"{n:,}"), ("SH degree", str(degree)), *_bounds_rows(gaussians.means)]
-    if n == 0:
-        return rows
-    opacities = 0.5 * (1 + np.tanh(0.5 * gaussians.opacity_logits))  # [N]
-    return [
-        *rows,
-        ("scales", _quantiles(np.exp(gaussians.log_scales)) + " world units"),
-        ("opacities", _quantiles(opacities)),
-    ]
+    from minisplat_ref.types import Gaussians
+
+    means = fields["means"]
+    rows = [("Gaussians", f"{len(means):,}")]
+    if "sh_rest" in fields:
+        rows.append(("SH degree", str(math.isqrt(fields["sh_rest"].shape[1] + 1) - 1)))
+    rows += _bounds_rows(means)
+    if len(means) and "log_scales" in fields:
+        rows.append(("scales", _quantiles(np.exp(fields["log_scales"])) + " world units"))
+    if len(means) and "opacity_logits" in fields:
+        opacities = 0.5 * (1 + np.tanh(0.5 * fields["opacity_logits"]))  # [N]
+        rows.append(("opacities", _quantiles(opacities)))
+    further = ", ".join(f"{name} {_shape(field)}" for name, field in fields.items() if name not in Gaussians._fields)
+    return [*rows, *([("further fields", further)] if further else [])]
 
 
 def _bounds_rows(points: "Floats") -> Rows:

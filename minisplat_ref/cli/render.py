@@ -11,8 +11,8 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.arguments import Commands, HelpFormatter, add_renderer_arguments, integer
 
 if TYPE_CHECKING:
+    from minisplat_ref.experiments.scoring import Trained
     from minisplat_ref.io.viewpoints import Viewpoint
-    from minisplat_ref.types import Floats, Gaussians
 
 DESCRIPTION = """\
 Render a run (its --out folder), or a PLY of Gaussians from whoever wrote it.
@@ -47,6 +47,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("--cameras", metavar="WHICH", help="see above")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where to write (default: beside the input)")
     parser.add_argument("--depth", action="store_true", help="also NAME_depth.npy (camera z) and its picture")
+    parser.add_argument("--extension", metavar="E", help="that the PLY was trained with (a run knows its own)")
     parser.add_argument("--frames", type=integer(1), default=60, metavar="N", help="of an orbit (default 60)")
     parser.add_argument("--size", type=_size, metavar="WxH", help="of an orbit (default: the run's, or 640x480)")
     parser.add_argument(
@@ -61,26 +62,18 @@ def run(args: argparse.Namespace) -> int:
     import numpy as np
     from tqdm import tqdm
 
-    from minisplat_ref.backends import get_backend
-    from minisplat_ref.constants import PROFILES
     from minisplat_ref.experiments import run_folder
     from minisplat_ref.experiments.pictures import depth_picture, depth_range, expected_depth
     from minisplat_ref.io import write_image
-    from minisplat_ref.rendering import render
+    from minisplat_ref.types import view_from
 
     source = _open(args)
     views = _choose_views(args, source)
     out: Path = args.out or source.default_out
     run_folder.create(out)
+    wants = frozenset({"depth"} if args.depth else ())
     for name, view in zip(_file_names(views), tqdm(views, desc="rendering", unit="view"), strict=True):
-        output, _ = render(
-            source.gaussians,
-            view.camera,
-            background=source.background,
-            conventions=PROFILES[source.profile],
-            backend=get_backend(source.backend),
-            with_depth=args.depth,
-        )
+        output = source.trained.render(view_from(view.camera, time=view.time), wants)
         write_image(out / f"{name}.png", output.image[..., :3])
         if args.depth:
             depth = expected_depth(output)  # [H, W]
@@ -91,40 +84,45 @@ def run(args: argparse.Namespace) -> int:
 
 
 class _Source(NamedTuple):
-    """What to render, and how unless the command line says otherwise."""
+    """What to render, and from where unless the command line says otherwise."""
 
-    gaussians: "Gaussians"
+    trained: "Trained"
     cameras: "list[Viewpoint]"
-    background: "Floats"
-    profile: str
-    backend: str
     default_out: Path
 
 
 def _open(args: argparse.Namespace) -> _Source:
-    import numpy as np
-
-    from minisplat_ref.experiments import run_folder, settings
-    from minisplat_ref.io import load_ply, viewpoints
-
     path: Path = args.input
-    cameras: list[Viewpoint] = []
-    background: Floats = np.zeros(3)
-    profile, backend = GSPLAT_MAIN.name, "cpu"
-    ply_path, default_out = path, path.with_name(f"{path.stem}-views")
     if not path.exists():
         raise InputError(f"{path} does not exist: give the --out folder of a training or a PLY file")
-    if path.is_dir():
-        ours = settings.load(path)
-        profile, backend = ours.profile, ours.backend
-        cameras = viewpoints.read(path / run_folder.CAMERAS)
-        background = settings.load_background(path)
-        ply_path, default_out = path / run_folder.POINT_CLOUD, path / "views"
-    if args.background is not None:
-        background = np.array(args.background) / 255.0
-    return _Source(
-        load_ply(ply_path), cameras, background, args.profile or profile, args.backend or backend, default_out
-    )
+    source = _open_run(path, args) if path.is_dir() else _open_ply(path, args)
+    given = {name: getattr(args, name) for name in ("background", "profile", "backend")}
+    given = {name: value for name, value in given.items() if value is not None}
+    return source._replace(trained=source.trained._replace(**given))
+
+
+def _open_run(folder: Path, args: argparse.Namespace) -> _Source:
+    from minisplat_ref.experiments import run_folder
+    from minisplat_ref.experiments.scoring import load_trained
+    from minisplat_ref.io import viewpoints
+
+    if args.extension is not None:
+        raise InputError(f"{folder} knows its extension: leave out --extension {args.extension}")
+    return _Source(load_trained(folder), viewpoints.read(folder / run_folder.CAMERAS), folder / "views")
+
+
+def _open_ply(path: Path, args: argparse.Namespace) -> _Source:
+    import numpy as np
+
+    from minisplat_ref.experiments.scoring import Trained
+    from minisplat_ref.extensions.extension import CORE, load_extension
+    from minisplat_ref.types import Model
+
+    owner = CORE if args.extension is None else load_extension(args.extension)
+    representation = owner.representation
+    model = Model(owner.load(path, representation.population))
+    trained = Trained(model, representation.renderer, np.zeros(3), GSPLAT_MAIN.name, "cpu")
+    return _Source(trained, [], path.with_name(f"{path.stem}-views"))
 
 
 def _choose_views(args: argparse.Namespace, source: _Source) -> "list[Viewpoint]":
@@ -134,7 +132,7 @@ def _choose_views(args: argparse.Namespace, source: _Source) -> "list[Viewpoint]
     if which == "orbit":
         like = source.cameras[0].camera if source.cameras else None
         width, height = args.size or ((like.width, like.height) if like else ORBIT_SIZE)
-        return viewpoints.orbit(source.gaussians.means, source.cameras, args.frames, width, height)
+        return viewpoints.orbit(source.trained.model.gaussians.means, source.cameras, args.frames, width, height)
     if which not in RUN_CAMERAS:
         return viewpoints.read(Path(which))
     if not source.cameras:
@@ -159,8 +157,8 @@ def _size(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def _color(text: str) -> tuple[int, ...]:
+def _color(text: str) -> tuple[float, ...]:
     values = tuple(int(word) if word.isdecimal() else -1 for word in text.split(","))
     if len(values) != 3 or not all(0 <= value <= 255 for value in values):
         raise argparse.ArgumentTypeError(f"{text!r} is not a colour such as 255,255,255")
-    return values
+    return tuple(value / 255.0 for value in values)

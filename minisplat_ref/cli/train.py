@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter, add_renderer_arguments, integer, weights
+from minisplat_ref.experiments.arguments import Commands, HelpFormatter, add_renderer_arguments, assignment, integer
 
 if TYPE_CHECKING:
     from minisplat_ref.experiments.settings import Settings
@@ -24,7 +24,8 @@ DEFAULTS = {
     "budget": None,
     "simplify": None,
     "scene_type": None,
-    "geometry": (0.0, 0.0, 0.0),
+    "extension": None,
+    "set": {},
     "eval_every": 0,
     "seed": 0,
     "profile": GSPLAT_MAIN.name,
@@ -79,7 +80,8 @@ def add_parser(commands: Commands) -> None:
     training.add_argument(
         "--recipe",
         metavar="R",
-        help="3dgs, 3dgs-accel (default), mini-splatting, mini-splatting2, mini-splatting-d or mini-splatting2-d",
+        help="3dgs, 3dgs-accel (default), mini-splatting, mini-splatting2, mini-splatting-d, mini-splatting2-d, or one"
+        " of an extension",
     )
     training.add_argument("--iterations", type=integer(1), metavar="N", help="one view each (default 3000)")
     training.add_argument(
@@ -98,7 +100,14 @@ def add_parser(commands: Commands) -> None:
         help="indoor (default) or outdoor: what counts as important",
     )
     training.add_argument(
-        "--geometry", type=weights, metavar="A,B,C", help="loss of points' depth, smooth depth, smooth normals (0,0,0)"
+        "--extension", metavar="E", help="train a recipe of the core with an extension: see minisplat-ref extensions"
+    )
+    training.add_argument(
+        "--set",
+        type=assignment,
+        action="append",
+        metavar="NAME=VALUE",
+        help="set what an event, loss or calibration of the recipe has, such as exposure=true (repeatable)",
     )
     training.add_argument(
         "--eval-every",
@@ -121,6 +130,7 @@ def _start(given: dict[str, Any]) -> int:
     if "scene" not in given:
         raise InputError("give a SCENE to train on, or --resume DIR to continue a run")
     options = {name: given.get(name, default) for name, default in DEFAULTS.items()}
+    options["set"] = dict(options["set"])  # of equal names the last
     scene_path = Path(given["scene"])
     scene_folder = scene_path.parent if scene_path.is_file() else scene_path
     folder: Path = given.get("out", Path("runs") / f"{scene_folder.resolve().name}-{options['recipe']}")

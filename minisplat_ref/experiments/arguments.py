@@ -1,7 +1,6 @@
 """What the commands' arguments share: the look of the help, and the types of values."""
 
 import argparse
-import math
 import shutil
 from collections.abc import Callable
 from typing import Any
@@ -47,15 +46,12 @@ def listed(parse: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
     return lambda text: tuple(parse(part.strip()) for part in text.split(","))
 
 
-def weights(text: str) -> tuple[float, float, float]:
-    """Parse three numbers of at least 0 between commas."""
-    try:
-        first, second, third = map(float, text.split(","))
-    except ValueError:
-        first = second = third = math.nan
-    if not all(0 <= weight < math.inf for weight in (first, second, third)):
-        raise argparse.ArgumentTypeError(f"{text!r} is not three numbers of at least 0, like 0.1,0,0.05")
-    return first, second, third
+def assignment(text: str) -> tuple[str, str]:
+    """Type of NAME=VALUE."""
+    name, separator, value = text.partition("=")
+    if not (name and separator and value):
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE, like exposure=true")
+    return name.strip(), value.strip()
 
 
 def add_renderer_arguments(parser: argparse._ActionsContainer, default: str | None, whose: str = "") -> None:

@@ -7,36 +7,25 @@ import sys
 from pathlib import Path
 
 from minisplat_ref import __version__
-from minisplat_ref.backends import get_backend
-from minisplat_ref.constants import PROFILES
 from minisplat_ref.datasets.synthetic import SyntheticScene
 from minisplat_ref.experiments import run_folder
 from minisplat_ref.experiments.pictures import error_picture, expected_depth, to_picture
 from minisplat_ref.experiments.progress import read_log
 from minisplat_ref.experiments.report import Report, ViewPictures
 from minisplat_ref.experiments.run import Outcome
+from minisplat_ref.experiments.scoring import load_trained
 from minisplat_ref.experiments.settings import Settings
-from minisplat_ref.rendering import render
-from minisplat_ref.types import Gaussians, Scene
+from minisplat_ref.types import Scene
 
 N_SHOWN = 3  # test views
 
 
-def view_pictures(
-    synthetic: SyntheticScene, scene: Scene, gaussians: Gaussians, settings: Settings, outcome: Outcome
-) -> list[ViewPictures]:
+def view_pictures(folder: Path, synthetic: SyntheticScene, scene: Scene, outcome: Outcome) -> list[ViewPictures]:
     """Render the first test views with depth."""
     true_depths = {view.name: synthetic.test_depths[i] for i, view in enumerate(synthetic.scene.test_views)}
-    pictures = []
+    trained, pictures = load_trained(folder), []
     for view, metrics in zip(scene.test_views[:N_SHOWN], outcome.evaluation.per_view, strict=False):
-        output, _ = render(
-            gaussians,
-            view.camera,
-            background=scene.background,
-            conventions=PROFILES[settings.profile],
-            backend=get_backend(settings.backend),
-            with_depth=True,
-        )
+        output = trained.render(view, frozenset({"depth"}))
         image = to_picture(output.image[..., :3])
         pictures.append(
             ViewPictures(

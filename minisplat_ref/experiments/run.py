@@ -11,8 +11,8 @@ from minisplat_ref.constants import PROFILES
 from minisplat_ref.experiments import curve, run_folder
 from minisplat_ref.experiments.progress import Progress
 from minisplat_ref.experiments.scoring import measure, score, to_metrics
-from minisplat_ref.experiments.settings import Settings, to_config
-from minisplat_ref.io import save_ply, viewpoints
+from minisplat_ref.experiments.settings import Settings, save_model, to_config
+from minisplat_ref.io import viewpoints
 from minisplat_ref.metrics import Evaluation
 from minisplat_ref.training.loop import StepReport, save_state, train
 from minisplat_ref.training.schedule import Recipe
@@ -81,8 +81,8 @@ def run_training(folder: Path, scene: Scene, settings: Settings, recipe: Recipe,
             is_complete = False
         seconds = progress.seconds
     save_state(folder / run_folder.CHECKPOINT, state, recipe)
-    save_ply(folder / run_folder.POINT_CLOUD, state.gaussians)
-    evaluation = score(folder, scene, state.gaussians, settings)
+    save_model(folder, settings, state.model)
+    evaluation = score(folder, scene, state.model, settings)
     n_gaussians = len(state.gaussians.means)
     if settings.eval_every:
         curve.append(folder / run_folder.CURVE, state.step, seconds, evaluation, n_gaussians)
@@ -116,9 +116,9 @@ def _curve(path: Path, scene: Scene, settings: Settings, progress: Progress) -> 
     def on_step(report: StepReport) -> None:
         if report.step % settings.eval_every or report.step == settings.iterations:  # the end is measured anyway
             return
-        seconds, gaussians = progress.seconds, report.state.gaussians
+        seconds, model = progress.seconds, report.state.model
         with progress.paused():
-            curve.append(path, report.step, seconds, measure(scene, gaussians, settings), len(gaussians.means))
+            curve.append(path, report.step, seconds, measure(scene, model, settings), len(model.gaussians.means))
 
     return on_step
 

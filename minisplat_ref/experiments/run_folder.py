@@ -11,6 +11,7 @@ from minisplat_ref.io.atomic import replacing
 
 CONFIG = "config.json"  # everything needed to run it again
 POINT_CLOUD = "point_cloud.ply"  # the Gaussians
+SHARED = "shared.npz"  # parameters that belong to no Gaussian, if there are any
 METRICS = "metrics.json"  # what was measured on the test views
 LOG = "log.jsonl"  # one record every few steps
 CURVE = "curve.jsonl"  # the test views measured every --eval-every steps, if that was asked for

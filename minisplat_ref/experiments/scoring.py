@@ -3,36 +3,69 @@
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from minisplat_ref.backends import get_backend
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.experiments.pictures import error_picture, side_by_side, to_picture
 from minisplat_ref.experiments.run_folder import RENDERS
-from minisplat_ref.experiments.settings import Settings
+from minisplat_ref.experiments.settings import Settings, load, load_background, load_model, recipe_of
 from minisplat_ref.io import write_image
 from minisplat_ref.metrics import Evaluation, ViewMetrics, evaluate
-from minisplat_ref.types import Floats, Gaussians, Scene, View
+from minisplat_ref.rendering import Renderer, Request
+from minisplat_ref.types import Floats, Model, RenderOutput, Scene, View
+
+
+class Trained(NamedTuple):
+    """The model of a run, and how the run draws it."""
+
+    model: Model
+    renderer: Renderer
+    background: Floats
+    """[3] RGB in [0, 1]."""
+    profile: str
+    backend: str
+
+    def render(self, view: View, wants: frozenset[str] = frozenset()) -> RenderOutput:
+        """Draw a view; ``wants`` as in :class:`minisplat_ref.rendering.Request`."""
+        request = Request(
+            self.background, conventions=PROFILES[self.profile], backend=get_backend(self.backend), wants=wants
+        )
+        return self.renderer.render(self.model, view, request)[0]
+
+
+def load_trained(folder: Path) -> Trained:
+    """Read the model of a run.
+
+    Raises
+    ------
+    InputError
+        The folder holds no run of this version, or a file of it is damaged.
+    """
+    settings = load(folder)
+    renderer, background = recipe_of(settings).renderer, load_background(folder)
+    return Trained(load_model(folder, settings), renderer, background, settings.profile, settings.backend)
 
 
 def measure(
     scene: Scene,
-    gaussians: Gaussians,
+    model: Model,
     settings: Settings,
     on_view: Callable[[View, Floats, ViewMetrics], None] | None = None,
 ) -> Evaluation:
-    """Evaluate the test views with the profile and backend of the settings: :func:`minisplat_ref.metrics.evaluate`."""
+    """Evaluate the test views with renderer, profile and backend of a run: :func:`minisplat_ref.metrics.evaluate`."""
     return evaluate(
-        gaussians,
+        model,
         scene.test_views,
         background=scene.background,
         on_view=on_view,
+        renderer=recipe_of(settings).renderer,
         backend=get_backend(settings.backend),
         conventions=PROFILES[settings.profile],
     )
 
 
-def score(folder: Path, scene: Scene, gaussians: Gaussians, settings: Settings) -> Evaluation:
+def score(folder: Path, scene: Scene, model: Model, settings: Settings) -> Evaluation:
     """Evaluate the test views and write ``renders/NAME.png``: truth, render and error side by side.
 
     Parameters
@@ -41,10 +74,10 @@ def score(folder: Path, scene: Scene, gaussians: Gaussians, settings: Settings) 
         The run.
     scene : Scene
         Its test views are measured.
-    gaussians : Gaussians
+    model : Model
         What was trained.
     settings : Settings
-        Profile and backend to render with.
+        Of the run: renderer, profile and backend.
 
     Returns
     -------
@@ -57,7 +90,7 @@ def score(folder: Path, scene: Scene, gaussians: Gaussians, settings: Settings) 
         render = to_picture(image)
         write_image(renders / f"{view.name}.png", side_by_side([view.image, render, error_picture(view.image, render)]))
 
-    return measure(scene, gaussians, settings, on_view=save)
+    return measure(scene, model, settings, on_view=save)
 
 
 def to_metrics(evaluation: Evaluation) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """What a training is asked to do, as it stands in ``config.json``."""
 
 import platform
+import zipfile
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,12 +10,13 @@ import numpy as np
 
 from minisplat_ref import __version__
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.run_folder import CONFIG, read_json_object
+from minisplat_ref.experiments.run_folder import CONFIG, POINT_CLOUD, SHARED, read_json_object
+from minisplat_ref.extensions.extension import CORE, find_recipe, owner_of
 from minisplat_ref.io import load_scene
-from minisplat_ref.methods import get_recipe
+from minisplat_ref.io.atomic import replacing
 from minisplat_ref.strategy import importance, simplify
-from minisplat_ref.training.schedule import Recipe, configured, describe
-from minisplat_ref.types import Floats, GeometricWeights, Scene
+from minisplat_ref.training.schedule import Recipe, configured, describe, parsed_settings
+from minisplat_ref.types import Floats, Model, Scene
 
 CHOICES = {"sampling": simplify.by_sampling, "rank": simplify.by_rank, "merging": simplify.by_merging}
 METRICS = {"indoor": importance.indoor, "outdoor": importance.outdoor}
@@ -50,8 +52,10 @@ class Settings(NamedTuple):
     """How simplification chooses, a key of ``CHOICES``; None for the recipe's own way."""
     scene_type: str | None = None
     """``indoor`` or ``outdoor``, which decides what importance means; None for the recipe's own choice."""
-    geometry: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Weights of the geometric loss terms: depth of the scene's points, smooth depth, smooth normals."""
+    extension: str | None = None
+    """Name of an extension that a recipe of the core is trained with; a recipe of an extension brings its own."""
+    set: dict[str, str] = {}  # noqa: RUF012  (never written to)
+    """Settings of the recipe's events, losses and calibrations, as text: ``--set NAME=VALUE``."""
     eval_every: int = 0
     """Iterations after which the test views are measured again; 0: only in the end. Does not change the result."""
 
@@ -62,16 +66,45 @@ def recipe_of(settings: Settings) -> Recipe:
     Raises
     ------
     InputError
-        There is no such recipe, or it has no such setting.
+        There is no such recipe or extension, or the recipe has no such setting.
     """
-    recipe = get_recipe(settings.recipe, settings.schedule_iterations)
+    recipe = find_recipe(settings.recipe, settings.schedule_iterations, extension=settings.extension)
+    recipe = configured(recipe, **parsed_settings(recipe, settings.set))
     if settings.budget is not None:
         recipe = configured(recipe, budget=settings.budget)
     if settings.simplify is not None:
         recipe = configured(recipe, choose=CHOICES[settings.simplify])
     if settings.scene_type is not None:
         recipe = configured(recipe, metric=METRICS[settings.scene_type])
-    return recipe._replace(geometry=GeometricWeights(*settings.geometry))
+    return recipe
+
+
+def save_model(folder: Path, settings: Settings, model: Model) -> None:
+    """Write the population, and the shared parameters if there are any, into the folder of a run."""
+    owner = owner_of(settings.recipe, settings.extension) or CORE
+    owner.save(folder / POINT_CLOUD, model.gaussians)
+    if model.shared:
+        with replacing(folder / SHARED) as temporary, open(temporary, "wb") as file:
+            np.savez(file, allow_pickle=False, **model.shared)
+
+
+def load_model(folder: Path, settings: Settings) -> Model:
+    """Read what :func:`save_model` wrote.
+
+    Raises
+    ------
+    InputError
+        A file is missing or damaged, or the extension is.
+    """
+    owner = owner_of(settings.recipe, settings.extension) or CORE
+    gaussians = owner.load(folder / POINT_CLOUD, owner.representation.population)
+    if not (folder / SHARED).exists():
+        return Model(gaussians)
+    try:
+        with np.load(folder / SHARED, allow_pickle=False) as archive:
+            return Model(gaussians, dict(archive))
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        raise InputError(f"{folder / SHARED} cannot be read ({error}): train anew") from error
 
 
 def to_config(settings: Settings, recipe: Recipe, scene: Scene) -> dict[str, Any]:

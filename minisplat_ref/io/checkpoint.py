@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import replacing
 
-FORMAT = "minisplat_ref checkpoint 1"  # changes when an older file can no longer be continued
+FORMAT = "minisplat_ref checkpoint 2"  # changes when an older file can no longer be continued
 _HEADER = "header"
 
 

@@ -9,9 +9,10 @@ Files are read by property name, so order, normals and extra properties do not m
 any scalar type. Left out: faces and other elements, lists, compressed variants.
 """
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +45,7 @@ GRAY = 128  # colour of a point cloud that has none
 HEADER_LINE_MAX = 4096  # bytes; no header line is longer, and a file without line breaks must not be read whole
 
 
-def load_ply(path: str | Path) -> Gaussians:
+def load_ply(path: str | Path, population: Any = Gaussians) -> Any:
     """Read trained Gaussians from a PLY in the 3DGS layout.
 
     Parameters
@@ -52,10 +53,13 @@ def load_ply(path: str | Path) -> Gaussians:
     path : str or Path
         The file; spherical harmonics of degree 0 to 3, with or without normals. Bytes after the declared vertices do
         not matter.
+    population : type
+        :class:`Gaussians`, or a NamedTuple that has its fields and others, which come from the properties that
+        :func:`save_ply` has written.
 
     Returns
     -------
-    Gaussians
+    Gaussians, or whatever ``population`` is
         N may be 0. float64 if any property of the file is, else float32.
 
     Raises
@@ -65,10 +69,17 @@ def load_ply(path: str | Path) -> Gaussians:
     """
     columns = read_vertices(path)
     rest_names = _sh_rest_names(columns, path)
+    further = {field: _further_names(columns, field) for field in population._fields if field not in Gaussians._fields}
     names = (*MEANS, *SH_DC, *rest_names, "opacity", *SCALES, *QUATS)
     missing = [name for name in names if name not in columns]
     if missing:
         raise InputError(f"{path}: not a PLY of Gaussians, no property {', '.join(missing)}; {_way_out(columns)}")
+    missing = [field for field, properties in further.items() if not properties]
+    if missing:
+        raise InputError(
+            f"{path}: no property {', '.join(missing)}: it was not trained with this extension; leave the extension out"
+        )
+    names = (*names, *(name for properties in further.values() for name in properties))
     check_finite(path, {name: columns[name] for name in names})
     dtype = np.result_type(np.float32, *(columns[name].dtype for name in names if columns[name].dtype.kind == "f"))
 
@@ -79,25 +90,36 @@ def load_ply(path: str | Path) -> Gaussians:
     check_quats(path, quats)
     n, n_rest = len(quats), len(rest_names) // 3
     rest = stack(rest_names) if rest_names else np.zeros((n, 0), dtype)  # [N, 3 (K-1)], channel-major
-    return Gaussians(
+    return population(
         means=stack(MEANS),
         quats=quats,
         log_scales=stack(SCALES),
         opacity_logits=columns["opacity"].astype(dtype),
         sh_dc=stack(SH_DC),
         sh_rest=np.ascontiguousarray(rest.reshape(n, 3, n_rest).transpose(0, 2, 1)),  # [N, K-1, 3]
+        **{
+            field: columns[field].astype(dtype) if properties == (field,) else stack(properties)
+            for field, properties in further.items()
+        },
     )
 
 
-def save_ply(path: str | Path, gaussians: Gaussians) -> None:
+def _further_names(columns: Iterable[str], field: str) -> tuple[str, ...]:
+    """Properties of a further field: ``FIELD`` if its shape is [N], ``FIELD_0``, ``FIELD_1``, ... if it is [N, k]."""
+    numbered = [name for name in columns if re.fullmatch(rf"{re.escape(field)}_\d+", name)]
+    return (field,) if field in columns else tuple(sorted(numbered, key=lambda name: int(name.rpartition("_")[2])))
+
+
+def save_ply(path: str | Path, gaussians: Any) -> None:
     """Write trained Gaussians as a PLY in the 3DGS layout: binary, little-endian, float32, with zero normals.
 
     Parameters
     ----------
     path : str or Path
         File to make or replace; it is complete or not there.
-    gaussians : Gaussians
-        Any spherical-harmonic degree, which is kept; N may be 0.
+    gaussians : Gaussians, or a NamedTuple that has its fields and others
+        Any spherical-harmonic degree, which is kept; N may be 0. A further field of shape [N] becomes a property of its
+        name, one of shape [N, k] the properties ``NAME_0``, ``NAME_1``, ...: other readers skip them.
 
     Raises
     ------
@@ -106,6 +128,7 @@ def save_ply(path: str | Path, gaussians: Gaussians) -> None:
     """
     n, n_rest = gaussians.sh_rest.shape[:2]
     rest_names = tuple(f"f_rest_{i}" for i in range(3 * n_rest))
+    further = {name: field for name, field in gaussians._asdict().items() if name not in Gaussians._fields}
     fields = (
         (MEANS, gaussians.means),
         (NORMALS, np.zeros((n, 3))),
@@ -114,6 +137,7 @@ def save_ply(path: str | Path, gaussians: Gaussians) -> None:
         (("opacity",), gaussians.opacity_logits[:, None]),
         (SCALES, gaussians.log_scales),
         (QUATS, gaussians.quats),
+        *(_further_properties(name, field) for name, field in further.items()),
     )
     columns: dict[str, NDArray] = {}
     with np.errstate(over="ignore"):  # becomes infinite, which check_finite names
@@ -121,6 +145,15 @@ def save_ply(path: str | Path, gaussians: Gaussians) -> None:
             columns |= zip(names, values.astype(np.float32).T, strict=True)
     check_finite(path, columns)
     write_vertices(path, columns)
+
+
+def _further_properties(name: str, field: NDArray) -> tuple[tuple[str, ...], NDArray]:
+    """Names of the properties of a further field, and their values [N, k]."""
+    if field.ndim == 1:
+        return (name,), field[:, None]
+    if field.ndim == 2:
+        return tuple(f"{name}_{i}" for i in range(field.shape[1])), field
+    raise TypeError(f"field {name} has {field.ndim} axes, a PLY holds two: give the extension save and load of its own")
 
 
 def read_point_cloud(path: str | Path) -> tuple[Floats, NDArray[np.uint8]]:

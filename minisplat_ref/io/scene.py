@@ -23,7 +23,7 @@ from minisplat_ref.io.images import (
     resize_mask,
 )
 from minisplat_ref.io.lens import Lens, undistort
-from minisplat_ref.types import Bools, Camera, Floats, Ints, Scene, View
+from minisplat_ref.types import Bools, Camera, Floats, Ints, Scene, View, numbered
 
 EXTENT_MARGIN = 1.1  # the 3DGS code's factor on the radius of the cameras; the learning rates were tuned with it
 ROTATION_TOLERANCE = 1e-3  # greatest error of R R^T = I: poses written with four digits pass, scaled ones do not
@@ -44,6 +44,8 @@ class Photo(NamedTuple):
     """None for a pinhole."""
     point_ids: Ints | None = None
     """As :attr:`View.point_ids`."""
+    time: float = 0.0
+    """As :attr:`View.time`."""
 
     @property
     def path(self) -> Path:
@@ -134,7 +136,7 @@ def build_scene(
     folder = source if source.is_dir() else source.parent
     return Scene(
         name=folder.resolve().name,
-        train_views=views[: len(train_photos)],
+        train_views=numbered(views[: len(train_photos)]),
         test_views=views[len(train_photos) :],
         points=points,
         point_colors=point_colors,
@@ -195,7 +197,7 @@ def read_view(photo: Photo, name: str, reading: Reading) -> View:
     if (width, height) != (image.shape[1], image.shape[0]):
         image = resize_image(image, width, height)
         mask = None if mask is None else resize_mask(mask, width, height)
-    return View(name, rescale_camera(camera, width, height), image, mask, photo.point_ids)
+    return View(name, rescale_camera(camera, width, height), image, mask, photo.point_ids, time=photo.time)
 
 
 def half_size(view: View) -> View:

@@ -146,11 +146,22 @@ def _image_file(file: Path, file_path: str) -> Path | None:
     return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
+def _time(file: Path, frame: Mapping[str, Any]) -> float:
+    """When the photograph was taken, the entry ``time`` of scenes that move; 0 where there is none."""
+    try:
+        time = float(frame.get("time", 0.0))
+    except (TypeError, ValueError):
+        time = math.nan
+    if not math.isfinite(time):
+        raise InputError(f"{file}: {frame.get('file_path')} has the time {frame['time']!r}: give a number")
+    return time
+
+
 def _photo(file: Path, frame: Mapping[str, Any], image_file: Path) -> Photo:
     """One frame; ``frame`` already holds the top level's entries that it does not override."""
     mask_path = file.parent / frame["mask_path"] if frame.get("mask_path") else None
     camera, lens = _camera(file, frame, image_file)
-    return Photo(image_file.parent, image_file.name, mask_path, camera, lens)
+    return Photo(image_file.parent, image_file.name, mask_path, camera, lens, time=_time(file, frame))
 
 
 def _camera(file: Path, frame: Mapping[str, Any], image_file: Path) -> tuple[Camera, Lens | None]:

@@ -2,7 +2,7 @@
 
 The JSON file is the ``cameras.json`` of 3DGS training folders: a list of objects with ``img_name, width, height``,
 ``position`` (camera centre, world frame), ``rotation`` (3 x 3, world_from_camera) and ``fx, fy``; and, of our own,
-``cx, cy`` (the image's centre where absent) and ``split`` (``train`` or ``test``).
+``cx, cy`` (the image's centre where absent), ``split`` (``train`` or ``test``) and ``time`` (0 where absent).
 """
 
 import json
@@ -30,12 +30,14 @@ class Viewpoint(NamedTuple):
     """The camera."""
     split: str
     """``train``, ``test`` or, where nothing says so, the empty string."""
+    time: float = 0.0
+    """When, in [0, 1]; for scenes that move."""
 
 
 def scene_viewpoints(scene: Scene) -> list[Viewpoint]:
     """Return the cameras of a scene, training views first."""
     splits = (("train", scene.train_views), ("test", scene.test_views))
-    return [Viewpoint(view.name, view.camera, split) for split, views in splits for view in views]
+    return [Viewpoint(view.name, view.camera, split, view.time) for split, views in splits for view in views]
 
 
 def to_json(viewpoints: Sequence[Viewpoint]) -> list[dict[str, Any]]:
@@ -53,8 +55,9 @@ def to_json(viewpoints: Sequence[Viewpoint]) -> list[dict[str, Any]]:
             "fy": camera.fy,
             "cx": camera.cx,
             "cy": camera.cy,
+            "time": time,
         }
-        for index, (name, camera, split) in enumerate(viewpoints)
+        for index, (name, camera, split, time) in enumerate(viewpoints)
     ]
 
 
@@ -82,24 +85,25 @@ def _viewpoint(entry: Any, where: str) -> Viewpoint:
         width, height = int(entry["width"]), int(entry["height"])
         fx, fy = float(entry["fx"]), float(entry["fy"])
         cx, cy = float(entry.get("cx", 0.5 * width)), float(entry.get("cy", 0.5 * height))
+        time = float(entry.get("time", 0.0))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(
             f"{where}: {type(error).__name__} {error}; needed are position, rotation, width, height, fx, fy"
         ) from error
-    numbers = np.array([fx, fy, cx, cy])
+    numbers = np.array([fx, fy, cx, cy, time])
     if (
         position.shape != (3,)
         or rotation.shape != (3, 3)
         or not np.isfinite([*position, *rotation.flat, *numbers]).all()
     ):
-        raise InputError(f"{where}: position must be 3 and rotation 3 x 3 finite numbers, like fx, fy, cx, cy")
+        raise InputError(f"{where}: position must be 3 and rotation 3 x 3 finite numbers, like fx, fy, cx, cy, time")
     if min(width, height) < 1 or min(fx, fy) <= 0:
         raise InputError(f"{where}: width, height, fx, fy must be positive")
     is_rotation = np.abs(rotation @ rotation.T - np.eye(3)).max() < ROTATION_TOLERANCE and np.linalg.det(rotation) > 0
     if not is_rotation:
         raise InputError(f"{where}: rotation is not a rotation matrix")
     camera = Camera(rotation.T.copy(), -rotation.T @ position, fx, fy, cx, cy, width, height)
-    return Viewpoint(str(entry.get("img_name", "")), camera, str(entry.get("split", "")))
+    return Viewpoint(str(entry.get("img_name", "")), camera, str(entry.get("split", "")), time)
 
 
 def orbit(means: Floats, like: Sequence[Viewpoint], n_frames: int, width: int, height: int) -> list[Viewpoint]:
@@ -121,7 +125,7 @@ def orbit(means: Floats, like: Sequence[Viewpoint], n_frames: int, width: int, h
     Returns
     -------
     list of Viewpoint
-        Named ``orbit_000`` onwards.
+        Named ``orbit_000`` onwards; the time goes once from 0 to 1 on the way round.
     """
     ring = _ring_of_cameras([view.camera for view in like], width) if like else _ring_of_means(means, width, height)
     viewpoints = []
@@ -133,7 +137,7 @@ def orbit(means: Floats, like: Sequence[Viewpoint], n_frames: int, width: int, h
         camera = Camera(
             rotation, -rotation @ position, ring.focal, ring.focal, 0.5 * width, 0.5 * height, width, height
         )
-        viewpoints.append(Viewpoint(f"orbit_{frame:03d}", camera, ""))
+        viewpoints.append(Viewpoint(f"orbit_{frame:03d}", camera, "", frame / n_frames))
     return viewpoints
 
 

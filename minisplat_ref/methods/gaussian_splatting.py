@@ -13,7 +13,8 @@ import numpy as np
 from minisplat_ref.strategy import clone_split
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.adam import AdamRule
-from minisplat_ref.training.rates import LearningRates, LogLinear
+from minisplat_ref.training.losses import LossTerm, photometric
+from minisplat_ref.training.rates import LogLinear, Rates
 from minisplat_ref.training.schedule import At, During, Every, Recipe
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit, n_pixels
 from minisplat_ref.types import Gaussians
@@ -102,18 +103,20 @@ _densifying = partial(Every, 100, stop=15_000, least_period=DENSIFY_LEAST_PERIOD
 GS = Recipe(
     name="3dgs",
     iterations=30_000,
-    learning_rates=LearningRates(
-        means=LogLinear(1.6e-4, 1.6e-6, 30_000),
-        quats=1e-3,
-        log_scales=5e-3,
-        opacity_logits=5e-2,
-        sh_dc=2.5e-3,
-        sh_rest=2.5e-3 / 20,
+    learning_rates=Rates(
+        {
+            "means": LogLinear(1.6e-4, 1.6e-6, 30_000),
+            "quats": 1e-3,
+            "log_scales": 5e-3,
+            "opacity_logits": 5e-2,
+            "sh_dc": 2.5e-3,
+            "sh_rest": 2.5e-3 / 20,
+        }
     ),
     adam=AdamRule(is_visible_only=False, has_bias_correction=True),
     sh_degree=3,
     sh_milestones=(1_000, 2_000, 3_000),
-    dssim_weight=0.2,
+    losses=(LossTerm("photometric", partial(photometric, dssim_weight=0.2), weight=1.0),),
     has_random_background=False,
     events=(
         During(collect_gradients, stop=15_000),
@@ -128,7 +131,7 @@ GS = Recipe(
 
 GS_ACCEL = GS._replace(
     name="3dgs-accel",
-    learning_rates=GS.learning_rates._replace(opacity_logits=2.5e-2),
+    learning_rates=GS.learning_rates.changed(opacity_logits=2.5e-2),
     adam=AdamRule(is_visible_only=True, has_bias_correction=False),
 )
 """``3dgs-accel``."""

@@ -26,7 +26,7 @@ from minisplat_ref.strategy.initialization import from_points
 from minisplat_ref.strategy.ops import Edit, keep, n_rows
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.rates import LogLinear, Rewind
-from minisplat_ref.training.schedule import At, During, Every
+from minisplat_ref.training.schedule import BLEND_STATS, At, During, Every
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit, n_pixels, start_anew
 from minisplat_ref.types import Floats
 
@@ -36,8 +36,13 @@ Metric = Callable[[ImportanceStats], Floats]
 
 def measure_importance(state: TrainState, iteration: Iteration) -> ImportanceStats:
     """Render all training views for their blend statistics, without culling."""
-    cameras = [view.camera for view in iteration.scene.train_views]
-    return collect_importance(state.gaussians, cameras, conventions=iteration.conventions, backend=iteration.backend)
+    return collect_importance(
+        state.model,
+        iteration.scene.train_views,
+        renderer=iteration.renderer,
+        conventions=iteration.conventions,
+        backend=iteration.backend,
+    )
 
 
 def candidates(stats: ImportanceStats, metric: Metric, least_views: int, *, is_intersecting: bool) -> Floats:
@@ -81,7 +86,7 @@ def is_culling(state: TrainState) -> bool:
 def collect_blur(state: TrainState, iteration: Iteration, *, area_fraction: float) -> None:
     """Mark in ``stats["is_blurred"]`` what dominates more than ``area_fraction`` of the view's pixels."""
     stats, camera = iteration.output.stats, iteration.view.camera
-    assert stats is not None, "listed in the recipe without needs_blend_stats"
+    assert stats is not None, "listed in the recipe without BLEND_STATS"
     is_blurred = blur_split.is_blurred(stats.dominant_count, camera.width, camera.height, area_fraction=area_fraction)
     marked = state.stats.get("is_blurred")
     state.stats["is_blurred"] = is_blurred if marked is None else marked | is_blurred
@@ -105,7 +110,7 @@ def reinitialise_from_depth(
     """
     n_points = round(points_per_pixel * n_pixels(iteration.scene) + points_per_gaussian * n_rows(state.gaussians))
     points, colors = reinitial_points(
-        state.gaussians,
+        state.model,
         iteration.scene.train_views,
         n_points,
         points_of=points_of,
@@ -113,10 +118,11 @@ def reinitialise_from_depth(
         depth_tolerance=depth_tolerance,
         backdrop_distance=None if backdrop_extents is None else backdrop_extents * iteration.scene.extent,
         rng=state.rng,
+        renderer=iteration.renderer,
         conventions=iteration.conventions,
         backend=iteration.backend,
     )
-    start_anew(state, from_points(points, colors, sh_degree=0))
+    start_anew(state, iteration, from_points(points, colors, sh_degree=0))
 
 
 def simplify(
@@ -177,7 +183,7 @@ def prune_tail(
 
 def restart_from_means(state: TrainState, iteration: Iteration, *, sh_degree: int) -> None:
     """Begin again with the Gaussians' own centres and colours; all else, the moments too, is as at the start."""
-    start_anew(state, simplification.reinitialised(state.gaussians, sh_degree))
+    start_anew(state, iteration, simplification.reinitialised(state.gaussians, sh_degree))
 
 
 def store_sh(state: TrainState, iteration: Iteration, *, sh_degree: int) -> None:
@@ -229,7 +235,7 @@ _reinitialise = partial(
 )
 _DENSIFICATION = (
     During(collect_gradients, stop=15_000),
-    During(partial(collect_blur, area_fraction=BLUR_AREA), stop=15_000, needs_blend_stats=True),
+    During(partial(collect_blur, area_fraction=BLUR_AREA), stop=15_000, wants=BLEND_STATS),
     _densifying(_densify, start=500),
     _densifying(partial(prune_faint, least_opacity=0.005), start=500),
     _densifying(partial(prune_large, size_fraction=0.1), start=3_000),
@@ -242,7 +248,7 @@ _AFTER_SIMPLIFICATION = (
 
 MINI_SPLATTING = GS._replace(
     name="mini-splatting",
-    learning_rates=GS.learning_rates._replace(means=LogLinear(1.6e-4, 1.6e-6, 30_000, Rewind(at=15_000, to=5_000))),
+    learning_rates=GS.learning_rates.changed(means=LogLinear(1.6e-4, 1.6e-6, 30_000, Rewind(at=15_000, to=5_000))),
     sh_degree=0,
     sh_milestones=(16_000, 17_000, 18_000),
     events=(

@@ -32,7 +32,7 @@ from minisplat_ref.strategy import simplify as simplification
 from minisplat_ref.strategy.importance import ImportanceStats, indoor, mass_mask
 from minisplat_ref.strategy.ops import keep, n_rows, take
 from minisplat_ref.training.adam import AdamRule
-from minisplat_ref.training.schedule import At, During, Every
+from minisplat_ref.training.schedule import BLEND_STATS, At, During, Every
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit, n_pixels
 from minisplat_ref.types import Bools
 
@@ -113,7 +113,7 @@ _densifying = partial(Every, 100, start=500, stop=3_000, skip=2_000, least_perio
 
 _DENSIFICATION = (
     During(collect_gradients, stop=3_000),
-    During(partial(collect_blur, area_fraction=BLUR_AREA), stop=3_000, needs_blend_stats=True),
+    During(partial(collect_blur, area_fraction=BLUR_AREA), stop=3_000, wants=BLEND_STATS),
     _densifying(_densify),
     _densifying(partial(prune_faint, least_opacity=0.005)),
     At(2_000, partial(prune_tail, metric=importance.indoor, mass=0.99)),
@@ -124,7 +124,7 @@ _DENSIFICATION = (
 MINI_SPLATTING2 = GS._replace(
     name="mini-splatting2",
     iterations=18_000,
-    learning_rates=GS.learning_rates._replace(opacity_logits=2.5e-2),
+    learning_rates=GS.learning_rates.changed(opacity_logits=2.5e-2),
     adam=AdamRule(is_visible_only=True, has_bias_correction=True),
     sh_degree=0,
     sh_milestones=(4_000, 5_000, 6_000),

@@ -17,7 +17,7 @@ released kernel. Such a pixel has no point here.
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,9 +26,9 @@ from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.constants import DEPTH_ALPHA_MIN, GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.reference.pinhole import with_principal_point
-from minisplat_ref.rendering import render
+from minisplat_ref.rendering import SPLATTING, Renderer, Request, as_model
 from minisplat_ref.strategy.simplify import sample
-from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Ints, View
+from minisplat_ref.types import Bools, Camera, Floats, Ints, View
 
 N_PARTNERS = 8  # views that vote on a point: more of them admit more chance agreements, and cost time
 BEST_PARALLAX = np.radians(
@@ -49,38 +49,41 @@ class PixelPoints(NamedTuple):
     """[H, W] accumulated opacity."""
 
 
-def midpoint_points(gaussians: Gaussians, camera: Camera, conventions: Conventions, backend: Backend) -> PixelPoints:
+def midpoint_points(
+    model: Any, view: View, conventions: Conventions, backend: Backend, renderer: Renderer = SPLATTING
+) -> PixelPoints:
     """Densest point of the dominant Gaussian on each ray, which is the middle of the ray's chord through it.
 
     Parameters
     ----------
-    gaussians : Gaussians
-    camera : Camera
+    model : Model or Gaussians
+    view : View
+        Its camera is looked through.
     conventions : Conventions
     backend : Backend
+    renderer : Renderer
 
     Returns
     -------
     PixelPoints
         In the dtype of the Gaussians.
     """
-    output, tape = render(gaussians, camera, sh_degree=0, conventions=conventions, backend=backend, with_stats=True)
-    assert output.stats is not None
-    means, quats, scales, _ = tape.splats.primitives
-    surface = backend.surface_points(
-        means, quats, scales, with_principal_point(camera, conventions), output.stats.dominant_ids
-    )
-    return PixelPoints(surface.points, surface.depths, output.alpha)
+    request = Request(sh_degree=0, conventions=conventions, backend=backend, wants=frozenset({"surface"}))
+    output, _ = renderer.render(as_model(model), view, request)
+    points, depths = output.extras["surface"]
+    return PixelPoints(points, depths, output.alpha)
 
 
-def centre_points(gaussians: Gaussians, camera: Camera, conventions: Conventions, backend: Backend) -> PixelPoints:
+def centre_points(
+    model: Any, view: View, conventions: Conventions, backend: Backend, renderer: Renderer = SPLATTING
+) -> PixelPoints:
     """Point of each ray at the depth of the dominant Gaussian's mean.
 
     Not the mean itself: all pixels of a large Gaussian would become one point.
 
     Parameters
     ----------
-    gaussians, camera, conventions, backend
+    model, view, conventions, backend, renderer
         As for :func:`midpoint_points`.
 
     Returns
@@ -88,21 +91,21 @@ def centre_points(gaussians: Gaussians, camera: Camera, conventions: Conventions
     PixelPoints
         In the dtype of the Gaussians.
     """
-    output, tape = render(gaussians, camera, sh_degree=0, conventions=conventions, backend=backend, with_stats=True)
-    assert output.stats is not None
-    depths_or_none = np.append(tape.projection.depths, tape.projection.depths.dtype.type(0))  # [N + 1]: id -1 gets 0
-    depths = depths_or_none[output.stats.dominant_ids]  # [H, W]
-    return _on_rays(depths, output.alpha, camera, conventions)
+    request = Request(sh_degree=0, conventions=conventions, backend=backend, wants=frozenset({"dominant_depth"}))
+    output, _ = renderer.render(as_model(model), view, request)
+    return _on_rays(output.extras["dominant_depth"], output.alpha, view.camera, conventions)
 
 
-def blended_points(gaussians: Gaussians, camera: Camera, conventions: Conventions, backend: Backend) -> PixelPoints:
+def blended_points(
+    model: Any, view: View, conventions: Conventions, backend: Backend, renderer: Renderer = SPLATTING
+) -> PixelPoints:
     """Point of each ray at the blended depth, ``sum w z / sum w``.
 
     Where a ray passes through several surfaces, at the edge of an object or under a floater, it lies on none of them.
 
     Parameters
     ----------
-    gaussians, camera, conventions, backend
+    model, view, conventions, backend, renderer
         As for :func:`midpoint_points`.
 
     Returns
@@ -110,21 +113,24 @@ def blended_points(gaussians: Gaussians, camera: Camera, conventions: Convention
     PixelPoints
         In the dtype of the Gaussians.
     """
-    output, _ = render(gaussians, camera, sh_degree=0, conventions=conventions, backend=backend, with_depth=True)
-    depths = output.image[..., 3] / np.maximum(output.alpha, output.alpha.dtype.type(DEPTH_ALPHA_MIN))  # [H, W]
-    return _on_rays(depths, output.alpha, camera, conventions)
+    request = Request(sh_degree=0, conventions=conventions, backend=backend, wants=frozenset({"depth"}))
+    output, _ = renderer.render(as_model(model), view, request)
+    sums = output.image[..., renderer.channels(request.wants)["depth"]][..., 0]  # [H, W]
+    depths = sums / np.maximum(output.alpha, output.alpha.dtype.type(DEPTH_ALPHA_MIN))  # [H, W]
+    return _on_rays(depths, output.alpha, view.camera, conventions)
 
 
 def reinitial_points(
-    gaussians: Gaussians,
+    model: Any,
     views: Sequence[View],
     n_points: int,
     *,
-    points_of: Callable[[Gaussians, Camera, Conventions, Backend], PixelPoints] = midpoint_points,
+    points_of: Callable[[Any, View, Conventions, Backend, Renderer], PixelPoints] = midpoint_points,
     least_alpha: float,
     depth_tolerance: float | None,
     backdrop_distance: float | None = None,
     rng: np.random.Generator,
+    renderer: Renderer = SPLATTING,
     conventions: Conventions = GSPLAT_MAIN,
     backend: Backend = CPU,
 ) -> tuple[Floats, NDArray[np.uint8]]:
@@ -135,7 +141,7 @@ def reinitial_points(
 
     Parameters
     ----------
-    gaussians : Gaussians
+    model : Model or Gaussians
     views : sequence of View
     n_points : int
         Points over all views; every view gives ``n_points // n_views``.
@@ -152,6 +158,7 @@ def reinitial_points(
         scene. None: it is not drawn.
     rng : numpy.random.Generator
         Draws the pixels.
+    renderer : Renderer
     conventions : Conventions
     backend : Backend
 
@@ -172,7 +179,7 @@ def reinitial_points(
     cameras = [with_principal_point(view.camera, conventions) for view in views]
     depth_maps, weight_maps = [], []  # 8 bytes a pixel of all views; points would be 12 more
     for view in views:
-        _, depths, alpha = points_of(gaussians, view.camera, conventions, backend)
+        _, depths, alpha = points_of(model, view, conventions, backend, renderer)
         is_drawable = (depths > 0) & (alpha >= least_alpha)
         if view.mask is not None:
             is_drawable &= view.mask

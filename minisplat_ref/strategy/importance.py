@@ -9,15 +9,15 @@ for a million Gaussians is a sum of its own.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
-from minisplat_ref.rendering import render
+from minisplat_ref.rendering import SPLATTING, Renderer, Request, as_model
 from minisplat_ref.strategy.ops import n_rows
-from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Ints
+from minisplat_ref.types import Bools, Floats, Ints, View
 
 
 class ImportanceStats(NamedTuple):
@@ -38,20 +38,22 @@ class ImportanceStats(NamedTuple):
 
 
 def collect_importance(
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
+    model: Any,
+    views: Sequence[View],
     *,
+    renderer: Renderer = SPLATTING,
     conventions: Conventions = GSPLAT_MAIN,
     backend: Backend = CPU,
     visibility_mass: float = 0.99,
 ) -> ImportanceStats:
-    """Render every camera for its blend statistics, and add them up in float64.
+    """Render every view for its blend statistics, and add them up in float64.
 
     Parameters
     ----------
-    gaussians : Gaussians
-    cameras : sequence of Camera
-        Those of the training views, at the resolution that is trained on.
+    model : Model or Gaussians
+    views : sequence of View
+        The training views, at the resolution that is trained on; only their cameras, indices and times matter.
+    renderer : Renderer
     conventions : Conventions
     backend : Backend
     visibility_mass : float
@@ -60,19 +62,21 @@ def collect_importance(
     Returns
     -------
     stats : ImportanceStats
-        Columns of ``is_visible`` in the order of ``cameras``.
+        Columns of ``is_visible`` in the order of ``views``.
     """
-    n = n_rows(gaussians)
+    model = as_model(model)
+    n = n_rows(model.gaussians)
     total = ImportanceStats(
         blend_weight_sum=np.zeros(n),
         mean_weight_sum=np.zeros(n),
         blend_weight_max=np.zeros(n),
         dominant_count=np.zeros(n, np.int64),
         frustum_count=np.zeros(n, np.int32),
-        is_visible=np.zeros((n, len(cameras)), bool),
+        is_visible=np.zeros((n, len(views)), bool),
     )
-    for v, camera in enumerate(cameras):
-        output, tape = render(gaussians, camera, sh_degree=0, conventions=conventions, backend=backend, with_stats=True)
+    request = Request(sh_degree=0, conventions=conventions, backend=backend, wants=frozenset({"stats"}))
+    for v, seen_from in enumerate(views):
+        output, _ = renderer.render(model, seen_from, request)
         view = output.stats
         assert view is not None
         total.blend_weight_sum[:] += view.blend_weight_sum
@@ -80,7 +84,7 @@ def collect_importance(
         total.mean_weight_sum[is_dominant] += view.blend_weight_sum[is_dominant] / view.hit_count[is_dominant]
         np.maximum(total.blend_weight_max, view.blend_weight_max, out=total.blend_weight_max)
         total.dominant_count[:] += view.dominant_count
-        total.frustum_count[:] += tape.projection.radii[:, 0] > 0
+        total.frustum_count[output.visible_ids] += 1
         total.is_visible[:, v] = mass_mask(view.blend_weight_sum, visibility_mass)
     return total
 

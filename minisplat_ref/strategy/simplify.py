@@ -11,6 +11,8 @@ of using it are here, to be compared at equal numbers:
 Left out: when each is done, and that the optimiser starts anew, which are the recipe's.
 """
 
+from typing import Any
+
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -125,7 +127,7 @@ def merge_neighbours(gaussians: Gaussians, importance: Floats, n: int) -> Edit:
     the cheaper half of them by Ward's criterion, squared distance times w_1 w_2 / (w_1 + w_2), by which unimportant
     ones go first. Of the members m of a cluster, with importance w_m and d_m = mu_m - mu::
 
-        mu    = sum w_m mu_m / sum w_m                      the colour's coefficients alike
+        mu    = sum w_m mu_m / sum w_m                      all other fields alike, such as the colour's coefficients
         Sigma = sum w_m (Sigma_m + d_m d_m^T) / sum w_m     quaternion and scales by its eigenvectors and eigenvalues
         tau A = sum tau_m A_m,   o = 1 - exp(-tau)
 
@@ -161,7 +163,7 @@ def merge_neighbours(gaussians: Gaussians, importance: Floats, n: int) -> Edit:
     is_merged = np.bincount(labels) > 1  # [n]
     is_member = is_merged[labels]  # [C]
     left = take(gaussians, parent_ids)
-    members = Gaussians._make(field.astype(np.float64) for field in take(gaussians, ids[is_member]))
+    members = type(gaussians)._make(field.astype(np.float64) for field in take(gaussians, ids[is_member]))
     for field, merged in zip(left, _merged(members, weights[is_member], labels[is_member]), strict=True):
         field[is_merged] = merged
     return Edit(left, parent_ids, is_merged)
@@ -210,7 +212,7 @@ def _mutual_neighbours(places: Floats) -> Ints:
     return pairs[(ranks[pairs[:, 0]] == rows) & (ranks[pairs[:, 1]] == rows)]
 
 
-def _merged(members: Gaussians, weights: Floats, labels: Ints) -> Gaussians:
+def _merged(members: Any, weights: Floats, labels: Ints) -> Gaussians:
     """Return one Gaussian, float64, per cluster; the members of a cluster stand together."""
     starts = np.flatnonzero(np.diff(labels, prepend=-1))  # [n]
     sizes = np.diff(starts, append=len(labels))
@@ -230,14 +232,14 @@ def _merged(members: Gaussians, weights: Floats, labels: Ints) -> Gaussians:
 
     thickness = np.logaddexp(0.0, members.opacity_logits)  # tau = -ln(1 - o), of the logit
     tau = np.add.reduceat(thickness * _cross_sections(scales**2), starts) / _cross_sections(variances)
-    return Gaussians(
+    averages = members._make(map(mean_of, members))
+    merged: Gaussians = averages._replace(
         means=means,
         quats=Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]],
         log_scales=0.5 * np.log(variances),
         opacity_logits=np.minimum(tau + np.log(-np.expm1(-tau)), logit(LARGEST_OPACITY)),
-        sh_dc=mean_of(members.sh_dc),
-        sh_rest=mean_of(members.sh_rest),
     )
+    return merged
 
 
 def _cross_sections(variances: Floats) -> Floats:

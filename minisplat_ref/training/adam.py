@@ -1,4 +1,4 @@
-"""Adam (Kingma and Ba 2015) over any NamedTuple of [N, ...] arrays, dense or on the visible rows only.
+"""Adam (Kingma and Ba 2015) over any bundle of [N, ...] arrays, dense or on the visible rows only.
 
     m <- m + (1 - beta1) (g - m)          v <- v + (1 - beta2) (g^2 - v)
     p <- p - rate  m / (1 - beta1^t)  /  (sqrt(v / (1 - beta2^t)) + eps)
@@ -10,15 +10,15 @@ times the rate. Mini-Splatting2 is visible-only with the corrections.
 """
 
 import math
-from collections.abc import Sequence
-from typing import Generic, NamedTuple, TypeVar
+from collections.abc import Mapping
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
 from minisplat_ref.backends import CPU, Backend
-from minisplat_ref.types import Ints
+from minisplat_ref.types import Floats, Ints
 
-Population = TypeVar("Population", bound=NamedTuple)
+Parameters = TypeVar("Parameters")  # a population, or a mapping of shared parameters
 
 
 class AdamRule(NamedTuple):
@@ -36,45 +36,51 @@ class AdamRule(NamedTuple):
     """Added to the root. Far below the usual 1e-8, because the gradient of one Gaussian is often as small as that."""
 
 
-class AdamState(NamedTuple, Generic[Population]):
+class AdamState(NamedTuple, Generic[Parameters]):
     """Moments of the gradient; the arrays are updated in place."""
 
-    first: Population
+    first: Parameters
     """Mean gradient, field by field."""
-    second: Population
+    second: Parameters
     """Mean squared gradient, field by field."""
     step: int
     """Steps taken."""
 
 
-def zero_moments(population: Population) -> AdamState[Population]:
+def zero_moments(parameters: Parameters) -> AdamState[Parameters]:
     """Return the state before the first step."""
-    return AdamState(
-        population._make(np.zeros_like(field) for field in population),
-        population._make(np.zeros_like(field) for field in population),
-        0,
-    )
+    return AdamState(_zeros_like(parameters), _zeros_like(parameters), 0)
+
+
+def _zeros_like(parameters: Parameters) -> Parameters:
+    zeros = {name: np.zeros_like(array) for name, array in fields_of(parameters).items()}
+    return zeros if isinstance(parameters, Mapping) else type(parameters)(**zeros)  # type: ignore[return-value]
+
+
+def fields_of(parameters: Any) -> dict[str, Floats]:
+    """Return the arrays of a population, or of shared parameters, by name."""
+    return dict(parameters) if isinstance(parameters, Mapping) else parameters._asdict()
 
 
 def adam_step(
-    parameters: Population,
-    gradient: Population,
-    state: AdamState[Population],
-    rates: Sequence[float],
+    parameters: Parameters,
+    gradient: Parameters,
+    state: AdamState[Parameters],
+    rates: Mapping[str, float],
     rule: AdamRule,
     visible_ids: Ints,
     backend: Backend = CPU,
-) -> AdamState[Population]:
+) -> AdamState[Parameters]:
     """Update ``parameters`` and the moments in place.
 
     Parameters
     ----------
-    parameters, gradient : NamedTuple of ndarrays of shape (N, ...)
-        All fields C-contiguous.
+    parameters, gradient : NamedTuple, or mapping, of ndarrays of shape (N, ...)
+        All C-contiguous; float32 or float64.
     state : AdamState
         Its arrays are updated in place.
-    rates : sequence of float
-        One learning rate per field.
+    rates : mapping of str to float
+        The learning rate of each field by name; further names do not matter.
     rule : AdamRule
     visible_ids : ndarray of shape (V,)
         Rows that a visible-only rule updates, ascending; the others are neither read nor written.
@@ -90,7 +96,9 @@ def adam_step(
     correction = math.sqrt(1 - rule.beta2**step) / (1 - rule.beta1**step) if rule.has_bias_correction else 1.0
     eps = rule.eps * (math.sqrt(1 - rule.beta2**step) if rule.has_bias_correction else 1.0)
     rows = visible_ids if rule.is_visible_only else None
-    for *arrays, rate in zip(parameters, gradient, state.first, state.second, rates, strict=True):
+    bundles = [fields_of(bundle) for bundle in (parameters, gradient, state.first, state.second)]
+    for name in bundles[0]:
+        arrays = (bundle[name] for bundle in bundles)
         tables = (array.reshape(len(array), math.prod(array.shape[1:])) for array in arrays)  # [N, width] each
-        backend.adam_update(*tables, rows, rate * correction, rule.beta1, rule.beta2, eps)
+        backend.adam_update(*tables, rows, rates[name] * correction, rule.beta1, rule.beta2, eps)
     return state._replace(step=step)

@@ -6,15 +6,12 @@ Mini-Splatting; gsplat steps first, as here). Here no step is lost, the last ite
 
 While a recipe warms up on views of half the size, they are the scene's views to everything in the loop. A culling table
 of Mini-Splatting2, if an event has made one, says which Gaussians take part in a view.
-
-Left out: exposure compensation.
 """
 
 import json
-import math
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -27,15 +24,17 @@ from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.checkpoint import load_checkpoint, save_checkpoint
 from minisplat_ref.io.scene import half_size
-from minisplat_ref.rendering import render, render_vjp
+from minisplat_ref.rendering import Request
 from minisplat_ref.strategy.initialization import initial_gaussians
-from minisplat_ref.training.adam import AdamState, adam_step, zero_moments
+from minisplat_ref.training.adam import AdamRule, AdamState, adam_step, fields_of, zero_moments
+from minisplat_ref.training.losses import Rendered, total_loss
 from minisplat_ref.training.rates import active_sh_degree
 from minisplat_ref.training.schedule import During, Recipe, describe
 from minisplat_ref.training.state import Iteration, StepReport, TrainState
-from minisplat_ref.types import Gaussians, Scene
+from minisplat_ref.types import Floats, Scene, numbered
 
 LEAST_HALF_SIZE = 100  # pixels a side
+SHARED_RULE = AdamRule(is_visible_only=False, has_bias_correction=True)  # shared parameters have no visible rows
 
 __all__ = ["StepReport", "TrainState", "initial_state", "load_state", "save_state", "train"]
 
@@ -57,8 +56,27 @@ def initial_state(scene: Scene, recipe: Recipe, seed: int) -> TrainState:
             f" {recipe.least_views} see: add photographs or use 3dgs-accel"
         )
     rng = np.random.default_rng(seed)
-    gaussians = initial_gaussians(scene, recipe.sh_degree, rng)
-    return TrainState(gaussians, zero_moments(gaussians), step=0, view_order=[], rng=rng, stats={})
+    representation = recipe.representation
+    gaussians = representation.extend(initial_gaussians(scene, recipe.sh_degree, rng), rng)
+    shared = dict(representation.shared(scene, rng))
+    for calibration in recipe.active_calibrations:
+        shared |= calibration.initial(n_views)
+    without_rate = [name for name in (*gaussians._fields, *shared) if name not in recipe.rates.of]
+    if without_rate:
+        raise InputError(
+            f"recipe {recipe.name} has no learning rate for {', '.join(without_rate)} of {representation.name}: give"
+            " the representation Rates for them"
+        )
+    return TrainState(
+        gaussians,
+        zero_moments(gaussians),
+        step=0,
+        view_order=[],
+        rng=rng,
+        stats={},
+        shared=shared,
+        shared_adam=zero_moments(shared),
+    )
 
 
 def train(
@@ -95,16 +113,13 @@ def train(
     Raises
     ------
     InputError
-        The scene has no training views, is not the one that ``state`` was trained on, or lacks what a loss term needs.
+        The scene has no training views or is not the one that ``state`` was trained on; or a loss term says that the
+        scene lacks what it needs.
     KeyboardInterrupt
         After Ctrl-C, at the end of the running iteration: the ``state`` that was passed in is whole and can be saved.
     """
     state = initial_state(scene, recipe, seed) if state is None else state
-    if recipe.geometry.sfm_depth and any(view.point_ids is None for view in scene.train_views):
-        raise InputError(
-            f"scene {scene.name} does not say which view sees which point, as COLMAP scenes do: leave the points' depth"
-            " out of the loss"
-        )
+    scene = scene._replace(train_views=numbered(scene.train_views))
     if max(state.view_order, default=0) >= len(scene.train_views):
         raise InputError(f"scene {scene.name} has fewer training views than the run to continue: give the same scene")
     small_scene = _half_size(scene) if state.step < recipe.half_size_until else scene
@@ -120,46 +135,61 @@ def train(
 
 
 def _iterate(state: TrainState, scene: Scene, recipe: Recipe, backend: Backend, conventions: Conventions) -> StepReport:
-    step = state.step + 1
+    step, renderer = state.step + 1, recipe.renderer
     view_id = _next_view(state, len(scene.train_views))
     view = scene.train_views[view_id]
     due = [event for event in recipe.events if event.is_due(step)]
-    stored_degree = math.isqrt(state.gaussians.sh_rest.shape[1] + 1) - 1
+    terms = [term for term in recipe.losses if term.is_due(step)]
     background = state.rng.random(3) if recipe.has_random_background else scene.background
-    output, tape = render(
-        state.gaussians,
-        view.camera,
-        background=background.astype(np.float32),
-        sh_degree=active_sh_degree(step, recipe.sh_milestones, stored_degree),
+    request = Request(
+        background.astype(np.float32),
+        sh_degree=active_sh_degree(step, recipe.sh_milestones),
         conventions=conventions,
         backend=backend,
         is_visible=state.stats["is_visible"][:, view_id] if "is_visible" in state.stats else None,
-        with_depth=any(recipe.geometry),
-        with_stats=any(isinstance(event, During) and event.needs_blend_stats for event in due),
+        wants=frozenset().union(
+            *(term.wants for term in terms), *(event.wants for event in due if isinstance(event, During))
+        ),
     )
-    image = np.ascontiguousarray(output.image[..., :3])
-    loss, loss_tape = backend.photometric_loss(image, view.image, recipe.dssim_weight, view.mask)
-    v_image, v_alpha = backend.photometric_loss_vjp(loss_tape), None
-    if any(recipe.geometry):
-        points = scene.points[view.point_ids] if view.point_ids is not None else scene.points[:0]
-        target = view.image * np.float32(1 / 255)  # [H, W, 3]
-        term, term_tape = backend.geometric_loss(
-            output.image[..., 3], output.alpha, target, view.camera, points, recipe.geometry, view.mask
-        )
-        v_depth, v_alpha = backend.geometric_loss_vjp(term_tape)
-        del term_tape
-        loss, v_image = loss + term, np.dstack([v_image, v_depth])
-        output = output._replace(image=image)
-    gradient = render_vjp(tape, v_image, v_alpha)
+    output, tape = renderer.render(state.model, view, request)
+    rendered = Rendered(output, renderer.channels(request.wants), view, scene, state.model, step, request)
+    loss = total_loss(terms, rendered)
+    gradient = renderer.render_vjp(tape, loss.v_image, loss.v_alpha)
 
-    visible_ids = np.flatnonzero(tape.projection.radii[:, 0] > 0)
-    rates = recipe.learning_rates.at(step, scene.extent)
-    state.adam = adam_step(state.gaussians, gradient.gaussians, state.adam, rates, recipe.adam, visible_ids, backend)
-    iteration = Iteration(scene, view, output, visible_ids, gradient.means2d, backend, conventions)
+    visible_ids = output.visible_ids
+    assert visible_ids is not None, "a renderer says which rows a view sees"
+    rates = recipe.rates.at(step, scene.extent)
+    v_gaussians = _with_direct(gradient.gaussians, loss.v_gaussians)
+    state.adam = adam_step(state.gaussians, v_gaussians, state.adam, rates, recipe.adam, visible_ids, backend)
+    if state.shared:
+        v_shared = {name: np.zeros_like(array) for name, array in state.shared.items()}
+        v_shared = _with_direct({**v_shared, **gradient.shared}, loss.v_shared)
+        state.shared_adam = adam_step(
+            state.shared, v_shared, state.shared_adam, rates, SHARED_RULE, visible_ids, backend
+        )
+
+    output = output._replace(image=rendered.channel("rgb"))
+    iteration = Iteration(
+        scene,
+        view,
+        output,
+        visible_ids,
+        gradient.means2d,
+        backend,
+        conventions,
+        renderer,
+        recipe.representation,
+    )
     for event in due:
         event.action(state, iteration)
     state.step = step
-    return StepReport(step, loss, view, output, state)
+    return StepReport(step, loss.value, view, output, state)
+
+
+def _with_direct(gradient: Any, direct: Mapping[str, Floats]) -> Any:
+    """Add derivatives that loss terms have with respect to parameters to those through the image."""
+    sums = {name: fields_of(gradient)[name] + v for name, v in direct.items()}
+    return {**gradient, **sums} if isinstance(gradient, Mapping) else gradient._replace(**sums)
 
 
 def _next_view(state: TrainState, n_views: int) -> int:
@@ -202,12 +232,16 @@ def _interrupts_held_back() -> Iterator[Callable[[], None]]:
 
 def save_state(path: str | Path, state: TrainState, recipe: Recipe) -> None:
     """Write a checkpoint from which :func:`load_state` continues bit by bit."""
-    groups = {"gaussians": state.gaussians, "first": state.adam.first, "second": state.adam.second}
-    arrays = {f"{group}.{name}": field for group, fields in groups.items() for name, field in fields._asdict().items()}
+    groups = {
+        **{"gaussians": state.gaussians, "first": state.adam.first, "second": state.adam.second},
+        **{"shared": state.shared, "shared_first": state.shared_adam.first, "shared_second": state.shared_adam.second},
+    }
+    arrays = {f"{group}.{name}": array for group, fields in groups.items() for name, array in fields_of(fields).items()}
     arrays |= {f"stats.{name}": field for name, field in state.stats.items()}
     metadata = {
         "step": state.step,
         "adam_step": state.adam.step,
+        "shared_adam_step": state.shared_adam.step,
         "view_order": state.view_order,
         "rng": state.rng.bit_generator.state,
         "recipe": describe(recipe),
@@ -233,9 +267,17 @@ def load_state(path: str | Path, recipe: Recipe) -> TrainState:
     rng = np.random.default_rng()
     rng.bit_generator.state = metadata["rng"]
 
-    def population(group: str) -> Gaussians:
-        return Gaussians(*(arrays[f"{group}.{name}"] for name in Gaussians._fields))
+    def group(name: str) -> dict[str, Any]:
+        return {key.removeprefix(f"{name}."): array for key, array in arrays.items() if key.startswith(f"{name}.")}
 
-    stats: dict[str, Any] = {name.removeprefix("stats."): a for name, a in arrays.items() if name.startswith("stats.")}
-    adam = AdamState(population("first"), population("second"), metadata["adam_step"])
-    return TrainState(population("gaussians"), adam, metadata["step"], metadata["view_order"], rng, stats)
+    population = recipe.representation.population
+    return TrainState(
+        population(**group("gaussians")),
+        AdamState(population(**group("first")), population(**group("second")), metadata["adam_step"]),
+        metadata["step"],
+        metadata["view_order"],
+        rng,
+        group("stats"),
+        group("shared"),
+        AdamState(group("shared_first"), group("shared_second"), metadata["shared_adam_step"]),
+    )

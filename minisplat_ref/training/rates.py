@@ -3,8 +3,8 @@
 Left out: the delayed start of the position rate, which the published settings never switch on.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 
 class Rewind(NamedTuple):
@@ -33,20 +33,25 @@ class LogLinear(NamedTuple):
         progress = min(step / self.steps, 1.0)
         return float(self.first * (self.last / self.first) ** progress)
 
+    def scaled(self, factor: float, times: float) -> "LogLinear":
+        """Return the rate with the iterations multiplied by ``factor``, and itself by ``times``."""
+        rewind = self.rewind and Rewind(round(self.rewind.at * factor), round(self.rewind.to * factor))
+        return LogLinear(self.first * times, self.last * times, max(1, round(self.steps * factor)), rewind)
 
-class LearningRates(NamedTuple):
-    """Adam's learning rate of each field of :class:`minisplat_ref.types.Gaussians`."""
+    def described(self) -> dict[str, Any]:
+        """Return the schedule in numbers and dicts."""
+        return {**self._asdict(), "rewind": self.rewind and self.rewind._asdict()}
 
-    means: LogLinear
-    """Per unit of the scene's extent: a scene twice as large moves its Gaussians twice as far."""
-    quats: float
-    log_scales: float
-    opacity_logits: float
-    sh_dc: float
-    sh_rest: float
 
-    def at(self, step: int, extent: float) -> tuple[float, ...]:
-        """Return one rate per field, in field order.
+class Rates(NamedTuple):
+    """Adam's learning rates by the name of the parameter: a field of the population, or a shared one."""
+
+    of: Mapping[str, float | LogLinear]
+    per_extent: frozenset[str] = frozenset({"means"})
+    """Those that are per unit of the scene's extent: a scene twice as large moves its Gaussians twice as far."""
+
+    def at(self, step: int, extent: float) -> dict[str, float]:
+        """Return every rate.
 
         Parameters
         ----------
@@ -55,9 +60,35 @@ class LearningRates(NamedTuple):
         extent : float
             ``Scene.extent``, world units.
         """
-        return (self.means.at(step) * extent, *self[1:])
+        rates = {name: rate.at(step) if isinstance(rate, LogLinear) else rate for name, rate in self.of.items()}
+        return {name: rate * extent if name in self.per_extent else rate for name, rate in rates.items()}
+
+    def changed(self, **rates: float | LogLinear) -> "Rates":
+        """Return the rates with some of them replaced or added."""
+        return self._replace(of={**self.of, **rates})
+
+    def joined(self, other: "Rates") -> "Rates":
+        """Return these rates and the other's; of one name, these."""
+        return Rates({**other.of, **self.of}, self.per_extent | other.per_extent)
+
+    def scaled(self, factor: float, raised: float) -> "Rates":
+        """Return the rates with the lengths of their schedules multiplied by ``factor``, and themselves by ``raised``.
+
+        Those per unit of the extent are multiplied by the square of ``raised``.
+        """
+
+        def scaled_one(name: str, rate: float | LogLinear) -> float | LogLinear:
+            times = raised**2 if name in self.per_extent else raised
+            return rate.scaled(factor, times) if isinstance(rate, LogLinear) else rate * times
+
+        return self._replace(of={name: scaled_one(name, rate) for name, rate in self.of.items()})
+
+    def described(self) -> dict[str, Any]:
+        """Return the rates in numbers, strings, lists and dicts."""
+        of = {name: rate.described() if isinstance(rate, LogLinear) else rate for name, rate in self.of.items()}
+        return {"of": of, "per_extent": sorted(self.per_extent)}
 
 
-def active_sh_degree(step: int, milestones: Sequence[int], stored: int) -> int:
-    """Return the spherical-harmonic degree rendered at ``step``: one more at each milestone, up to the stored one."""
-    return min(stored, sum(step >= milestone for milestone in milestones))
+def active_sh_degree(step: int, milestones: Sequence[int]) -> int:
+    """Return the degree of the spherical harmonics to render at ``step``, if it is stored: one more each milestone."""
+    return sum(step >= milestone for milestone in milestones)

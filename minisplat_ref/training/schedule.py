@@ -1,16 +1,28 @@
-"""What a recipe is made of: events with their iterations, rates, milestones; and how it is scaled and described."""
+"""What happens when: a training method as data, and how it is scaled to another length, set differently, described.
 
-from collections.abc import Callable
+Events act after the optimiser step of their iteration, in the order in which they are listed.
+"""
+
+import functools
+import inspect
+import sys
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.rendering import Renderer
 from minisplat_ref.training.adam import AdamRule
-from minisplat_ref.training.rates import LearningRates, LogLinear, Rewind
-from minisplat_ref.types import GeometricWeights
+from minisplat_ref.training.calibration import EXPOSURE, POSE, Calibration
+from minisplat_ref.training.losses import LossTerm
+from minisplat_ref.training.rates import Rates
+from minisplat_ref.training.representation import GAUSSIANS, Representation
 
 Action = Callable[..., None]
-"""``action(state, iteration)``; see :mod:`minisplat_ref.methods`. Settings are bound with ``functools.partial``."""
+"""``action(state, iteration)``; see :mod:`minisplat_ref.training.state`. Its settings are bound with ``partial``."""
+
+BLEND_STATS = frozenset({"stats"})
+"""For ``During.wants``: the action finds blend statistics in ``iteration.output.stats``."""
 
 
 class During(NamedTuple):
@@ -19,8 +31,8 @@ class During(NamedTuple):
     action: Action
     start: int = 0
     stop: int | None = None
-    needs_blend_stats: bool = False
-    """Render these iterations with blend statistics, for the action to find in ``iteration.output.stats``."""
+    wants: frozenset[str] = frozenset()
+    """What is to be rendered in these iterations for the action; see :class:`minisplat_ref.rendering.Request`."""
 
     def is_due(self, step: int) -> bool:
         """Return whether the action belongs to iteration ``step``, counted from 1."""
@@ -86,14 +98,14 @@ class Recipe(NamedTuple):
     name: str
     iterations: int
     """One training view each."""
-    learning_rates: LearningRates
+    learning_rates: Rates
     adam: AdamRule
     sh_degree: int
     """Degree that the initial Gaussians store."""
     sh_milestones: tuple[int, ...]
     """Iterations at which the rendered degree rises by one, starting from 0."""
-    dssim_weight: float
-    """w in the loss (1 - w) L1 + w (1 - SSIM)."""
+    losses: tuple[LossTerm, ...]
+    """Terms of the loss."""
     has_random_background: bool
     """Render each iteration over a random colour rather than the scene's background."""
     events: tuple[Event, ...]
@@ -105,19 +117,41 @@ class Recipe(NamedTuple):
     short_run_exponent: float = 0.0
     """p of the factor ``(published / iterations)^p`` by which :func:`scaled` raises the rates of runs that are shorter
     than published; that of the means by the square of it."""
-    geometry: GeometricWeights = GeometricWeights()
-    """Geometric loss terms beside the photometric one; none in any of the papers here."""
+    calibrations: tuple[Calibration, ...] = (EXPOSURE, POSE)
+    """Parameters of each photograph; both are off unless asked for."""
+    representation: Representation = GAUSSIANS
+    """What is trained and how it is drawn."""
+
+    @property
+    def active_calibrations(self) -> tuple[Calibration, ...]:
+        """Those that are on."""
+        return tuple(calibration for calibration in self.calibrations if calibration.is_on)
+
+    @property
+    def renderer(self) -> Renderer:
+        """The representation's, wrapped by the calibrations that are on."""
+        return functools.reduce(
+            lambda renderer, calibration: calibration.wrap(renderer),
+            self.active_calibrations,
+            self.representation.renderer,
+        )
+
+    @property
+    def rates(self) -> Rates:
+        """Learning rates of everything: the recipe's, the representation's own, those of the calibrations."""
+        rates = self.learning_rates.joined(self.representation.rates)
+        return functools.reduce(Rates.joined, (calibration.rates for calibration in self.active_calibrations), rates)
 
 
 def scaled(recipe: Recipe, iterations: int) -> Recipe:
     """Return the recipe for another number of iterations, all milestones moved in proportion.
 
-    Start, stop and period of each event, the spherical-harmonic milestones and the length of the position schedule are
-    multiplied by ``iterations / recipe.iterations`` and rounded to the nearest integer (ties to even); a one-time event
-    happens at iteration 1 at the earliest, a period is at least the event's ``least_period``. Because the period is
-    rounded by itself, the number of events can differ by a few from the original's. What must not come before its
-    ``least_step`` is left out of runs that are too short for it. Thresholds stay; so do learning rates, unless the
-    recipe has a ``short_run_exponent``.
+    Start, stop and period of each event and loss term, the spherical-harmonic milestones and the lengths of the rates'
+    schedules are multiplied by ``iterations / recipe.iterations`` and rounded to the nearest integer (ties to even); a
+    one-time event happens at iteration 1 at the earliest, a period is at least the event's ``least_period``. Because
+    the period is rounded by itself, the number of events can differ by a few from the original's. What must not come
+    before its ``least_step`` is left out of runs that are too short for it. Thresholds stay; so do learning rates,
+    unless the recipe has a ``short_run_exponent``.
 
     Raises
     ------
@@ -128,44 +162,16 @@ def scaled(recipe: Recipe, iterations: int) -> Recipe:
         raise InputError(f"iterations is {iterations}: give at least 1")
     factor = iterations / recipe.iterations
     raised = max(1.0, 1 / factor) ** recipe.short_run_exponent
-    others = recipe.learning_rates._asdict()
-    means_rate = others.pop("means")
-    rewind = means_rate.rewind
     return recipe._replace(
         iterations=iterations,
-        learning_rates=LearningRates(
-            means=LogLinear(
-                means_rate.first * raised**2,
-                means_rate.last * raised**2,
-                max(1, _scaled(means_rate.steps, factor)),
-                rewind and Rewind(_scaled(rewind.at, factor), _scaled(rewind.to, factor)),
-            ),
-            **{name: rate * raised for name, rate in others.items()},
-        ),
+        learning_rates=recipe.learning_rates.scaled(factor, raised),
         sh_milestones=tuple(_scaled(milestone, factor) for milestone in recipe.sh_milestones),
+        losses=tuple(term.scaled(factor) for term in recipe.losses),
         events=tuple(event.scaled(factor) for event in recipe.events),
         half_size_until=_scaled(recipe.half_size_until, factor),
+        calibrations=tuple(c._replace(rates=c.rates.scaled(factor, 1.0)) for c in recipe.calibrations),
+        representation=recipe.representation._replace(rates=recipe.representation.rates.scaled(factor, raised)),
     )
-
-
-def configured(recipe: Recipe, **settings: Any) -> Recipe:
-    """Return the recipe with settings of its events replaced, each wherever an event has it.
-
-    Raises
-    ------
-    InputError
-        No event has such a setting.
-    """
-    for name, value in settings.items():
-        if not any(name in _settings(event) for event in recipe.events):
-            raise InputError(f"recipe {recipe.name} has no {name.replace('_', ' ')} to set: leave it out")
-        recipe = recipe._replace(
-            events=tuple(
-                event._replace(action=partial(event.action, **{name: value})) if name in _settings(event) else event
-                for event in recipe.events
-            )
-        )
-    return recipe
 
 
 def _scaled(step: int, factor: float) -> int:
@@ -176,32 +182,139 @@ def _scaled_limit(step: int | None, factor: float) -> int | None:
     return None if step is None else _scaled(step, factor)
 
 
+# --- settings ---
+
+
+def settings_of(recipe: Recipe) -> dict[str, Any]:
+    """Return what :func:`configured` can replace, with its present value, the first where there are several.
+
+    Settings of events and of loss terms by their own names; the weight of a loss term by the term's name; whether a
+    calibration is on by the calibration's name.
+    """
+    events = [_settings(event.action) for event in recipe.events]
+    terms = [{term.name: term.weight, **_settings(term.function)} for term in recipe.losses]
+    switches = [{calibration.name: calibration.is_on for calibration in recipe.calibrations}]
+    return {name: value for settings in reversed([*events, *terms, *switches]) for name, value in settings.items()}
+
+
+def configured(recipe: Recipe, **settings: Any) -> Recipe:
+    """Return the recipe with settings replaced, each wherever the recipe has it; see :func:`settings_of`.
+
+    Raises
+    ------
+    InputError
+        The recipe has no such setting.
+    """
+    known = settings_of(recipe)
+    for name, value in settings.items():
+        if name not in known:
+            raise InputError(f"recipe {recipe.name} has no {name} to set: choose from {', '.join(sorted(known))}")
+        recipe = recipe._replace(
+            events=tuple(event._replace(action=_with(event.action, name, value)) for event in recipe.events),
+            losses=tuple(
+                term._replace(
+                    function=_with(term.function, name, value), weight=value if name == term.name else term.weight
+                )
+                for term in recipe.losses
+            ),
+            calibrations=tuple(
+                calibration._replace(is_on=value) if name == calibration.name else calibration
+                for calibration in recipe.calibrations
+            ),
+        )
+    return recipe
+
+
+def parsed_settings(recipe: Recipe, texts: Mapping[str, str]) -> dict[str, Any]:
+    """Return settings for :func:`configured` from text, each of the type of the present value.
+
+    A function is given by its name in the module of the present one, such as ``metric=outdoor``; ``none`` is None.
+
+    Raises
+    ------
+    InputError
+        The recipe has no such setting, or the text is no value of its type.
+    """
+    known = settings_of(recipe)
+    unknown = [name for name in texts if name not in known]
+    if unknown:
+        raise InputError(
+            f"recipe {recipe.name} has no {', '.join(unknown)} to set: choose from {', '.join(sorted(known))}"
+        )
+    return {name: _parsed(name, text, known[name]) for name, text in texts.items()}
+
+
+def _parsed(name: str, text: str, present: Any) -> Any:
+    if text.lower() == "none":
+        return None
+    if callable(present):
+        functions = inspect.getmembers(sys.modules[present.__module__], inspect.isfunction)
+        choices = {key: f for key, f in functions if f.__module__ == present.__module__ and not key.startswith("_")}
+        if text not in choices:
+            raise InputError(f"--set {name}={text} names no function: choose from {', '.join(choices)}")
+        return choices[text]
+    if isinstance(present, bool):
+        if text.lower() not in ("true", "false"):
+            raise InputError(f"--set {name}={text} is neither true nor false")
+        return text.lower() == "true"
+    try:
+        return int(text) if isinstance(present, int) else float(text) if isinstance(present, float) else _number(text)
+    except ValueError:
+        kind = "a whole number" if isinstance(present, int) else "a number"
+        raise InputError(f"--set {name}={text} is not {kind}, as {name}={present} is") from None
+
+
+def _number(text: str) -> int | float:
+    """Return a whole number if the text is one: the present value is None, which says nothing of the type."""
+    value = float(text)
+    return int(value) if value == int(value) else value
+
+
+def _settings(function: Callable[..., Any]) -> dict[str, Any]:
+    """Return what is bound to a function by name."""
+    return dict(function.keywords) if isinstance(function, partial) else {}
+
+
+def _with(function: Callable[..., Any], name: str, value: Any) -> Callable[..., Any]:
+    """Return a function with another value bound to ``name``, if one is."""
+    return partial(function, **{name: value}) if name in _settings(function) else function
+
+
+# --- description ---
+
+
 def describe(recipe: Recipe) -> dict[str, Any]:
     """Return the recipe in numbers, strings, lists and dicts, for ``config.json`` and to compare two recipes."""
     return {
         **recipe._asdict(),
-        "learning_rates": {**recipe.learning_rates._asdict(), "means": recipe.learning_rates.means._asdict()},
+        "learning_rates": recipe.rates.described(),
         "adam": recipe.adam._asdict(),
-        "geometry": recipe.geometry._asdict(),
         "sh_milestones": list(recipe.sh_milestones),
+        "losses": [_describe_term(term) for term in recipe.losses if term.weight != 0],
         "events": [_describe_event(event) for event in recipe.events],
+        "calibrations": [calibration.name for calibration in recipe.active_calibrations],
+        "representation": recipe.representation.name,
     }
 
 
 def _describe_event(event: Event) -> dict[str, Any]:
-    settings = {name: _describe_setting(value) for name, value in _settings(event).items()}
-    return {"event": type(event).__name__, **event._asdict(), "action": _name(event.action), "settings": settings}
+    return {"event": type(event).__name__, **_described(event._asdict()), **_describe_function(event.action, "action")}
 
 
-def _describe_setting(value: Any) -> Any:
-    return _name(value) if callable(value) else value
+def _describe_term(term: LossTerm) -> dict[str, Any]:
+    return {**_described(term._asdict()), **_describe_function(term.function, "function")}
+
+
+def _described(fields: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: sorted(value) if isinstance(value, frozenset) else value for name, value in fields.items()}
+
+
+def _describe_function(function: Callable[..., Any], role: str) -> dict[str, Any]:
+    settings = {name: _name(value) if callable(value) else value for name, value in _settings(function).items()}
+    return {role: _name(function), "settings": settings}
 
 
 def _name(function: Any) -> str:
     """Return what a function is called; a partial by the function inside."""
     function = function.func if isinstance(function, partial) else function
     return getattr(function, "__name__", repr(function))
-
-
-def _settings(event: Event) -> dict[str, Any]:
-    return dict(event.action.keywords) if isinstance(event.action, partial) else {}

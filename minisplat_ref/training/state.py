@@ -5,7 +5,7 @@ recipe names it, its settings and the iterations at which it acts. :func:`apply_
 places where rows come and go.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,18 +13,20 @@ from numpy.typing import NDArray
 
 from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
+from minisplat_ref.rendering import SPLATTING, Renderer
 from minisplat_ref.strategy.ops import Edit, contiguous, inherit, inherit_fields
 from minisplat_ref.training.adam import AdamState, zero_moments
-from minisplat_ref.types import Floats, Gaussians, Ints, RenderOutput, Scene, View
+from minisplat_ref.training.representation import GAUSSIANS, Representation
+from minisplat_ref.types import Floats, Gaussians, Ints, Model, RenderOutput, Scene, View
 
 
 @dataclass
 class TrainState:
     """Everything that the next iteration depends on, besides the scene and the recipe."""
 
-    gaussians: Gaussians
-    """The parameters; their arrays are updated in place."""
-    adam: AdamState[Gaussians]
+    gaussians: Any
+    """The population: :class:`Gaussians` or an extension's; its arrays are updated in place."""
+    adam: AdamState[Any]
     """Moments, row by row those of ``gaussians``."""
     step: int
     """Iterations done."""
@@ -34,6 +36,15 @@ class TrainState:
     """The only source of randomness."""
     stats: dict[str, NDArray[Any]]
     """Arrays [N, ...] that actions collect per Gaussian; they follow the rows of ``gaussians``."""
+    shared: dict[str, Floats] = field(default_factory=dict)
+    """Parameters without rows, by name; their arrays are updated in place."""
+    shared_adam: AdamState[Any] = field(default_factory=lambda: AdamState({}, {}, 0))
+    """Moments of the shared parameters."""
+
+    @property
+    def model(self) -> Model:
+        """The parameters, as they are rendered."""
+        return Model(self.gaussians, self.shared)
 
 
 class Iteration(NamedTuple):
@@ -50,9 +61,13 @@ class Iteration(NamedTuple):
     visible_ids: Ints
     """[V] rows that the view saw (radius above zero), ascending."""
     v_means2d: Floats
-    """[N, 2] gradient of the loss by the projected centres, per pixel."""
+    """[N, 2] gradient of the loss with respect to the projected centres, per pixel."""
     backend: Backend
     conventions: Conventions
+    renderer: Renderer = SPLATTING
+    """How the model is drawn."""
+    representation: Representation = GAUSSIANS
+    """What the model is made of."""
 
 
 class StepReport(NamedTuple):
@@ -82,12 +97,16 @@ def apply_edit(state: TrainState, edit: Edit) -> None:
         first=inherit_fields(state.adam.first, edit.parent_ids, edit.is_new),
         second=inherit_fields(state.adam.second, edit.parent_ids, edit.is_new),
     )
-    state.stats = {name: inherit(field, edit.parent_ids, no_reset) for name, field in state.stats.items()}
+    state.stats = {name: inherit(array, edit.parent_ids, no_reset) for name, array in state.stats.items()}
 
 
-def start_anew(state: TrainState, gaussians: Gaussians) -> None:
-    """Replace the population by one that has no past: zero moments, no statistics, all views still to come."""
-    state.gaussians = contiguous(gaussians)
+def start_anew(state: TrainState, iteration: Iteration, gaussians: Gaussians) -> None:
+    """Replace the population by one that has no past: zero moments, no statistics, all views still to come.
+
+    Fields that the representation has besides those of ``gaussians`` begin as at the start of training. Shared
+    parameters stay.
+    """
+    state.gaussians = contiguous(iteration.representation.extend(gaussians, state.rng))
     state.adam = zero_moments(state.gaussians)
     state.stats = {}
     state.view_order = []

@@ -5,11 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import CPU
-from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.experiments.pictures import Picture, to_picture
-from minisplat_ref.rendering import render
-from minisplat_ref.types import Floats, Gaussians, Scene, View
+from minisplat_ref.experiments.scoring import Trained
+from minisplat_ref.types import Floats, Scene, View
 
 N_CROPS = 4  # half of them chosen where the recipes differ, which by itself would show only what goes wrong
 CROP_FRACTION = 0.3  # of a view's width and height
@@ -35,17 +33,17 @@ class Scored(NamedTuple):
     crop: Crop
 
 
-def choose_crops(models: Sequence[Gaussians], scene: Scene) -> list[Crop]:
+def choose_crops(models: Sequence[Trained], scene: Scene) -> list[Crop]:
     """Return at most N_CROPS crops, each of another test view.
 
     Parameters
     ----------
-    models : sequence of Gaussians
+    models : sequence of Trained
         One per recipe.
     scene : Scene
         Its test views are shown.
     """
-    pairs = [_best_crops(models, view, scene) for view in scene.test_views]
+    pairs = [_best_crops(models, view) for view in scene.test_views]
     n_different = (min(N_CROPS, len(pairs)) + 1) // 2 if len(models) > 1 else 0
     pairs.sort(key=lambda pair: pair[0].score, reverse=True)
     different, others = pairs[:n_different], pairs[n_different:]
@@ -53,18 +51,13 @@ def choose_crops(models: Sequence[Gaussians], scene: Scene) -> list[Crop]:
     return [pair[0].crop for pair in different] + [pair[1].crop for pair in others[: N_CROPS - n_different]]
 
 
-def _best_crops(models: Sequence[Gaussians], view: View, scene: Scene) -> tuple[Scored, Scored]:
+def _best_crops(models: Sequence[Trained], view: View) -> tuple[Scored, Scored]:
     """Return the crop of a view in which the recipes differ most, and that with the most detail."""
-    renders = [_render(model, view, scene) for model in models]
+    renders = [to_picture(model.render(view).image) for model in models]
     return (
         _best_crop(view, renders, difference(view.image, renders), "where the recipes differ most"),
         _best_crop(view, renders, detail(view.image), "where there is most detail"),
     )
-
-
-def _render(model: Gaussians, view: View, scene: Scene) -> Picture:
-    output, _ = render(model, view.camera, background=scene.background, conventions=GSPLAT_MAIN, backend=CPU)
-    return to_picture(output.image)
 
 
 def _best_crop(view: View, renders: Sequence[Picture], values: Floats, reason: str) -> Scored:

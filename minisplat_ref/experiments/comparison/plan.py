@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.run_folder import check_free
+from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.io import load_scene
-from minisplat_ref.methods import get_recipe
 from minisplat_ref.training.loop import initial_state
 from minisplat_ref.training.schedule import describe
 from minisplat_ref.types import Scene
@@ -92,7 +92,7 @@ def check(plan: Plan) -> Scene:
     """
     for name, values in (("--recipes", plan.recipes), ("--seeds", plan.seeds)):
         _refuse_repetition(name, values)
-    recipes = [get_recipe(name) for name in plan.recipes]
+    recipes = [find_recipe(name) for name in plan.recipes]
     if len(plan.iterations) != len(recipes):
         raise InputError(
             f"--iterations has {len(plan.iterations)} numbers for {len(recipes)} recipes: give one for all or one each"
@@ -116,7 +116,7 @@ def _refuse_repetition(option: str, values: Sequence[object]) -> None:
 
 
 def _takes(recipe: str, option: str) -> bool:
-    return any(RECIPE_OPTIONS[option] in event["settings"] for event in describe(get_recipe(recipe))["events"])
+    return any(RECIPE_OPTIONS[option] in event["settings"] for event in describe(find_recipe(recipe))["events"])
 
 
 def eval_every(iterations: int) -> int:

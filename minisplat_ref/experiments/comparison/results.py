@@ -17,7 +17,7 @@ from minisplat_ref.experiments.comparison.measures import (
 from minisplat_ref.experiments.comparison.plan import Plan, eval_every
 from minisplat_ref.experiments.comparison.speed import render_rates
 from minisplat_ref.experiments.measure import machine
-from minisplat_ref.io import load_ply
+from minisplat_ref.experiments.scoring import load_trained
 from minisplat_ref.types import Scene
 
 
@@ -47,7 +47,7 @@ def collect(plan: Plan, scene: Scene) -> Results:
         As it was loaded for the plan.
     """
     runs = plan.runs
-    models = [load_ply(run.folder / run_folder.POINT_CLOUD) for run in runs]
+    models = [load_trained(run.folder) for run in runs]
     rates = dict(zip((run.folder for run in runs), render_rates(models, scene), strict=True))
     targets = {run.seed: final_psnr(run.folder) for run in plan.runs_of(plan.recipes[0])}
     recipes = [

@@ -7,7 +7,7 @@ import sys
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.comparison.plan import Plan, Run, eval_every
-from minisplat_ref.methods import get_recipe
+from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.training.loop import train
 from minisplat_ref.types import Scene
 
@@ -24,7 +24,7 @@ def warm_up(plan: Plan, scene: Scene) -> None:
     for recipe in plan.recipes:
         # So short a schedule may ask for what cannot be; a fault of the recipe itself shows in its own run.
         with contextlib.suppress(InputError):
-            train(scene, get_recipe(recipe, WARM_UP), seed=0)
+            train(scene, find_recipe(recipe, WARM_UP), seed=0)
 
 
 def train_all(plan: Plan) -> int:

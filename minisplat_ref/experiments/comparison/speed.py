@@ -4,15 +4,13 @@ import statistics
 import time
 from collections.abc import Sequence
 
-from minisplat_ref.backends import CPU
-from minisplat_ref.constants import GSPLAT_MAIN
-from minisplat_ref.rendering import render
-from minisplat_ref.types import Gaussians, Scene
+from minisplat_ref.experiments.scoring import Trained
+from minisplat_ref.types import Scene
 
 ROUNDS = 9  # that are timed; an untimed one before them compiles and fills the caches
 
 
-def render_rates(models: Sequence[Gaussians], scene: Scene) -> list[float]:
+def render_rates(models: Sequence[Trained], scene: Scene) -> list[float]:
     """Return the test views that are rendered in a second, per model.
 
     Each round renders all views with one model after the other; the median of the rounds counts.
@@ -22,6 +20,6 @@ def render_rates(models: Sequence[Gaussians], scene: Scene) -> list[float]:
         for model, own_times in zip(models, times, strict=True):
             start = time.perf_counter()
             for view in scene.test_views:
-                render(model, view.camera, background=scene.background, conventions=GSPLAT_MAIN, backend=CPU)
+                model.render(view)
             own_times.append(time.perf_counter() - start)
     return [len(scene.test_views) / statistics.median(own_times[1:]) for own_times in times]

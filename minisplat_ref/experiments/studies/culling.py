@@ -131,7 +131,7 @@ def measure(state: TrainState, scene: Scene, recipe: Recipe, repeats: int) -> di
     measures : dict of ndarrays
         ``frustum_count`` [N], ``is_visible`` [N, V], those of :func:`compare_views`, ``seconds`` [repeats, 2].
     """
-    stats = collect_importance(state.gaussians, [view.camera for view in scene.train_views])
+    stats = collect_importance(state.gaussians, scene.train_views)
     return {
         "frustum_count": stats.frustum_count,
         "is_visible": stats.is_visible,

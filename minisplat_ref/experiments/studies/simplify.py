@@ -114,7 +114,7 @@ def run(args: argparse.Namespace) -> None:
     with making_folder(args.out) as folder:
         dense = train_dense(scene, args.recipe, args.iterations, args.seeds[0]) if given is None else given
         clouds = {"dense": dense.means, **true_surface(args.scene)}
-        stats = collect_importance(dense, [view.camera for view in scene.train_views])
+        stats = collect_importance(dense, scene.train_views)
         importance = simplify.intersection_preserving(indoor(stats), stats.dominant_count)
         counts = counts_to_keep(importance, args.fractions)
         runs = list(

@@ -1,0 +1,135 @@
+"""What an extension is, and how the extensions, and recipes by their names, are loaded."""
+
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions import folders, module_of
+from minisplat_ref.io.ply import load_ply, save_ply
+from minisplat_ref.methods import RECIPES
+from minisplat_ref.study import Study
+from minisplat_ref.training.losses import LossTerm
+from minisplat_ref.training.representation import GAUSSIANS, Representation
+from minisplat_ref.training.schedule import Recipe, scaled
+
+
+class Extension(NamedTuple):
+    """A relative of 3DGS, as a value."""
+
+    name: str
+    """The name of its folder, with hyphens for underscores."""
+    recipes: tuple[Recipe, ...] = ()
+    """Methods that train it; they get ``representation`` and ``losses`` from here."""
+    representation: Representation = GAUSSIANS
+    """What is trained and how it is drawn."""
+    losses: tuple[LossTerm, ...] = ()
+    """Terms that join those of any recipe that is trained with the extension; ``--set NAME=WEIGHT`` weighs them."""
+    save: Callable[[str | Path, Any], None] = save_ply
+    """``save(path, population)``; by default further fields become PLY columns that other readers skip."""
+    load: Callable[[str | Path, Any], Any] = load_ply
+    """``load(path, type)`` of the population's type."""
+    commands: tuple[ModuleType, ...] = ()
+    """Modules with ``add_parser(commands)`` and ``run(args)``: ``minisplat-ref NAME COMMAND``."""
+    stages: Callable[..., Any] | None = None
+    """``stages(backend, setting, rng)``: what ``oracle gradients --extension NAME`` checks."""
+    studies: tuple[Study, ...] = ()
+    """Its measured claims: ``minisplat-ref study NAME/...``."""
+
+
+CORE = Extension("core")
+"""What there is without any extension."""
+
+
+def load_extension(name: str) -> Extension:
+    """Return an extension.
+
+    Raises
+    ------
+    InputError
+        There is none of that name, it cannot be imported, or it holds no ``EXTENSION`` of its folder's name.
+    """
+    found = folders()
+    if name not in found:
+        raise InputError(f"extension {name!r} does not exist: choose from {', '.join(found) or 'none'}")
+    try:
+        extension = import_module(module_of(name)).EXTENSION
+    except Exception as error:  # whatever the file of somebody else does
+        raise InputError(
+            f"extension {name} in {found[name]} cannot be loaded, {type(error).__name__}: {error}; mend or remove it"
+        ) from error
+    if extension.name != name:
+        raise InputError(f"extension {extension.name} lies in a folder called {found[name]}: rename one of them")
+    for recipe in extension.recipes:
+        if recipe.name in RECIPES:
+            raise InputError(
+                f"extension {name} has a recipe {recipe.name}, and so has the core: rename the extension's"
+            )
+    loaded: Extension = extension
+    return loaded
+
+
+def load_extensions() -> list[Extension]:
+    """Return all extensions; of one that cannot be loaded stderr says so in one line, once, and it is left out."""
+    extensions = []
+    for name in folders():
+        try:
+            extensions.append(load_extension(name))
+        except InputError as error:
+            if name not in _REPORTED:
+                print(f"minisplat-ref: warning: {error}", file=sys.stderr)
+                _REPORTED.add(name)
+    return extensions
+
+
+_REPORTED: set[str] = set()  # names of extensions that could not be loaded, and of which stderr has said so
+
+
+def find_recipe(name: str, iterations: int | None = None, *, extension: str | None = None) -> Recipe:
+    """Return the recipe of that name, of the core or of an extension, ready to train.
+
+    Parameters
+    ----------
+    name : str
+        Name of the recipe.
+    iterations : int, optional
+        Length to which it is scaled; the published one by default.
+    extension : str, optional
+        An extension to train a recipe of the core with. A recipe of an extension brings its own.
+
+    Raises
+    ------
+    InputError
+        There is no such recipe or extension, two extensions have a recipe of that name, the recipe belongs to another
+        extension, or ``iterations`` is below 1.
+    """
+    recipe, owner = (RECIPES[name], None) if name in RECIPES else _of_extensions(name)
+    if owner is not None and extension not in (None, owner.name):
+        raise InputError(f"recipe {name} belongs to extension {owner.name}: leave out --extension {extension}")
+    if owner is None and extension is not None:
+        owner = load_extension(extension)
+    if owner is not None:
+        recipe = recipe._replace(representation=owner.representation, losses=(*recipe.losses, *owner.losses))
+    return recipe if iterations is None else scaled(recipe, iterations)
+
+
+def owner_of(recipe: str, extension: str | None = None) -> Extension | None:
+    """Return the extension that a recipe is trained with, None for the core alone."""
+    if extension is not None:
+        return load_extension(extension)
+    return None if recipe in RECIPES else _of_extensions(recipe)[1]
+
+
+def _of_extensions(name: str) -> tuple[Recipe, Extension]:
+    extensions = load_extensions()
+    found = [(recipe, extension) for extension in extensions for recipe in extension.recipes if recipe.name == name]
+    if not found:
+        names = (*RECIPES, *(recipe.name for extension in extensions for recipe in extension.recipes))
+        raise InputError(f"recipe {name!r} does not exist: choose from {', '.join(names)}")
+    if len(found) > 1:
+        owners = " and ".join(extension.name for _, extension in found)
+        raise InputError(f"recipe {name} is in the extensions {owners}: rename one")
+    return found[0]

@@ -1,0 +1,56 @@
+"""The geometric terms as loss terms: what each is given, and to which channels its gradient goes."""
+
+from functools import partial
+
+import numpy as np
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.training.losses import Cotangents, LossTerm, Rendered
+from minisplat_ref.types import GeometricWeights
+
+
+def geometric(rendered: Rendered, weights: GeometricWeights) -> tuple[float, Cotangents]:
+    """Return the geometric loss with these weights, and its derivatives by depth channel and alpha."""
+    view, backend = rendered.view, rendered.request.backend
+    points = rendered.scene.points[view.point_ids] if view.point_ids is not None else rendered.scene.points[:0]
+    photograph = view.image * np.float32(1 / 255)  # [H, W, 3]
+    sums = np.ascontiguousarray(rendered.channel("depth")[..., 0])  # [H, W] sum w z
+    loss, tape = backend.geometric_loss(
+        sums, rendered.output.alpha, photograph, view.camera, points, weights, view.mask
+    )
+    v_sums, v_alpha = backend.geometric_loss_vjp(tape)
+    return loss, Cotangents({"depth": v_sums[..., None]}, v_alpha)
+
+
+def sfm_depth(rendered: Rendered) -> tuple[float, Cotangents]:
+    """Return how far the depth at the sparse points is from theirs.
+
+    Raises
+    ------
+    InputError
+        The scene does not say which view sees which point.
+    """
+    if rendered.view.point_ids is None:
+        raise InputError(
+            f"scene {rendered.scene.name} does not say which view sees which point, as COLMAP scenes do: leave"
+            " sfm_depth out of the loss"
+        )
+    return geometric(rendered, GeometricWeights(sfm_depth=1.0))
+
+
+_WANTS = frozenset({"depth"})
+LOSSES = (
+    LossTerm("sfm_depth", sfm_depth, weight=0.0, wants=_WANTS),
+    LossTerm(
+        "depth_smoothness",
+        partial(geometric, weights=GeometricWeights(depth_smoothness=1.0)),
+        weight=0.0,
+        wants=_WANTS,
+    ),
+    LossTerm(
+        "normal_smoothness",
+        partial(geometric, weights=GeometricWeights(normal_smoothness=1.0)),
+        weight=0.0,
+        wants=_WANTS,
+    ),
+)

@@ -1,0 +1,21 @@
+"""Linear motion: every Gaussian has a velocity, and a view shows the scene at its time.
+
+The smallest extension that is a method: one field more, a renderer that wraps 3DGS's, a recipe. It is the worked
+example of ``docs/EXTENDING.md``. The centre of a Gaussian at the time t of a view is
+
+    mu(t) = mu + t nu
+
+and everything else stays as it is (:mod:`minisplat_ref.extensions.velocity.reference`). Velocities start at zero, so
+that an untrained model is a static one. Times are those of the views, ``time`` in a transforms.json: 0 where a scene
+does not say, which leaves the velocities without a gradient.
+
+Left out: rotations and colours that change, and motion that is not straight; that is 4DGS's subject. No paper is
+followed here; linear motion is the first-order case of all of them.
+
+    minisplat-ref train SCENE --recipe velocity
+"""
+
+from minisplat_ref.extensions.extension import Extension
+from minisplat_ref.extensions.velocity.method import MOVING, VELOCITY
+
+EXTENSION = Extension("velocity", recipes=(VELOCITY,), representation=MOVING)

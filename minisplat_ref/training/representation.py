@@ -1,0 +1,42 @@
+"""What a scene is made of: the population that is trained, how it begins, how it is drawn.
+
+The first is :data:`GAUSSIANS`, 3DGS's own. An extension's has further fields or another renderer.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref.rendering import SPLATTING, Renderer
+from minisplat_ref.training.rates import Rates
+from minisplat_ref.types import NOTHING, Floats, Gaussians, Scene
+
+
+def as_it_is(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
+    """Return the Gaussians: the population is theirs."""
+    return gaussians
+
+
+def nothing_shared(scene: Scene, rng: np.random.Generator) -> Mapping[str, Floats]:
+    """Return no shared parameters."""
+    return NOTHING
+
+
+class Representation(NamedTuple):
+    """What a scene is made of."""
+
+    name: str
+    population: Any = Gaussians
+    """The NamedTuple of arrays [N, ...] that is trained; its first field is ``means``."""
+    extend: Callable[[Gaussians, np.random.Generator], Any] = as_it_is
+    """Makes Gaussians into the population: at the start, and after every reinitialisation."""
+    shared: Callable[[Scene, np.random.Generator], Mapping[str, Floats]] = nothing_shared
+    """Shared parameters before training."""
+    renderer: Renderer = SPLATTING
+    rates: Rates = Rates({}, frozenset())
+    """Learning rates of its own fields and shared parameters, where the recipe has none for them."""
+
+
+GAUSSIANS = Representation("gaussians")
+"""3DGS: static Gaussians with spherical harmonics."""
