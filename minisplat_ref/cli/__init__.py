@@ -55,9 +55,7 @@ def _parser_of(argv: Sequence[str]) -> argparse.ArgumentParser:
     """Return the parser of all commands; where the first word is an extension's name, of that extension's commands."""
     parser = build_parser()
     name = argv[0] if argv else ""
-    if not name.replace("-", "_").isidentifier() or name in {
-        command.__name__.rpartition(".")[2] for command in COMMANDS
-    }:
+    if name.startswith("-") or name in {command.__name__.rpartition(".")[2] for command in COMMANDS}:
         return parser
     from minisplat_ref.extensions import folders
 
