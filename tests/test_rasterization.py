@@ -191,15 +191,15 @@ def test_options_replace_the_profile(rng):
 
 
 def test_name_is_the_function_whatever_is_imported_first():
-    import_module("minisplat_ref.gsplat_door")
-    assert minisplat_ref.rasterization is minisplat_ref.gsplat_door.rasterization is rasterization
+    import_module("minisplat_ref.gsplat_compat")
+    assert minisplat_ref.rasterization is minisplat_ref.gsplat_compat.rasterization is rasterization
     assert minisplat_ref.rasterization_vjp is rasterization_vjp
 
 
 # --- gradient ---
 
 
-def door(scene, cotangents=None, **options):
+def call_with_gradient(scene, cotangents=None, **options):
     """Function of (means .. colors, viewmats [C, 3, 4], backgrounds) and, with cotangents, its gradients.
 
     The last row of a view matrix is no variable: it is dropped here.
@@ -241,7 +241,7 @@ CONFIGURATIONS = {
 def test_gradient(name, configuration, rng):
     kind, options = configuration
     scene = make_scene(rng, **kind)
-    function, vjp = door(scene, width=WIDTH, height=HEIGHT, backend=name, **options)
+    function, vjp = call_with_gradient(scene, width=WIDTH, height=HEIGHT, backend=name, **options)
     has_colors = options.get("render_mode", "RGB").startswith("RGB")
     n_colors = 3 if "sh_degree" in options else kind.get("channels", 3)
     inputs = [*(scene[key] for key in ARRAYS[:5]), scene["viewmats"][:, :3], rng.uniform(size=(2, n_colors))]
@@ -271,7 +271,7 @@ def test_full_jacobian(name, rng):
     scene["scales"] *= 2
     scene["Ks"] = np.array([[[6.0, 0, 1.7], [0, 5, 0.9], [0, 0, 1]]])
     options = {"width": 3, "height": 2, "sh_degree": 1, "render_mode": "RGB+ED", "backend": name}
-    function, vjp = door(scene, **options)
+    function, vjp = call_with_gradient(scene, **options)
     inputs = [*(scene[key] for key in ARRAYS[:5]), scene["viewmats"][:, :3], rng.uniform(size=(1, 3))]
     names = [*ARRAYS[:6], "backgrounds"]
     gradients = {}

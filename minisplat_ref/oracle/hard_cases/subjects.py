@@ -11,9 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.backends import Backend
-from minisplat_ref.batch import checked_batch, draw
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
-from minisplat_ref.gsplat_door import rasterization, rasterization_vjp
+from minisplat_ref.gsplat_compat import checked_batch, draw, rasterization, rasterization_vjp
 from minisplat_ref.render import render, render_vjp
 from minisplat_ref.splatting import SplatTape
 from minisplat_ref.types import Bools, Camera, Floats, Gaussians

@@ -1,24 +1,26 @@
-"""gsplat's door: activated Gaussians and a batch of cameras in, images out, with gsplat's names, shapes and meta keys.
+"""gsplat's call in NumPy: activated Gaussians and a batch of cameras in; images, opacities and gsplat's meta out.
 
 For code and tests that were written against ``gsplat.rasterization``: the same call on NumPy arrays and, in place of
 autograd, a second call that returns the gradients. N Gaussians, C cameras, D colour channels, K spherical-harmonic
-coefficients a channel. The twelve free entries of a view matrix count as independent. Left out: cameras other than
+coefficients a channel. Colours are D given channels, or spherical harmonics of the direction from the camera's centre
+``o = -R^-1 t``: with the inverse, not the transpose, because the twelve free entries of a view matrix count as
+independent, and that is the point which R mu + t maps to the origin whatever they are. Left out: cameras other than
 pinholes, packed output, and ``isect_ids`` in the meta, the keys of gsplat's own sort.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from minisplat_ref import validation as check
 from minisplat_ref.backends import Backend, get_backend
-from minisplat_ref.batch import checked_batch, draw, draw_vjp, expected_depth, expected_depth_vjp
-from minisplat_ref.constants import GSPLAT_MAIN, Conventions
+from minisplat_ref.constants import DEPTH_ALPHA_MIN, GSPLAT_MAIN, Conventions
 from minisplat_ref.reference.tiling import bin_gaussians
-from minisplat_ref.splatting import SplatTape
-from minisplat_ref.types import Floats, TileGrid
-from minisplat_ref.validation import check_array, chosen_conventions
+from minisplat_ref.splatting import Primitives, SplatTape, splat, splat_vjp
+from minisplat_ref.types import Camera, Floats, Ints, TileGrid
 
 META_TILE_SIZE = 16  # pixels; the tiles of the meta's lists are gsplat's, whatever tiles the backend works with
+RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 
 
 def rasterization(
@@ -92,7 +94,7 @@ def rasterization(
     InputError
         If an argument has a wrong shape, dtype or value. No Gaussians, or none in sight, is no error.
     """
-    conventions = chosen_conventions(profile, near_plane, far_plane, eps2d, rasterize_mode)
+    conventions = check.chosen_conventions(profile, near_plane, far_plane, eps2d, rasterize_mode)
     stages = get_backend(backend) if isinstance(backend, str) else backend
     primitives = (means, quats, scales, opacities)
     batch = checked_batch(primitives, colors, viewmats, Ks, width, height, sh_degree, backgrounds, render_mode)
@@ -144,15 +146,15 @@ def rasterization_vjp(
         ``v_means, v_quats, v_scales, v_opacities, v_colors, v_viewmats`` in the shapes of the arguments, summed over
         the cameras; ``v_backgrounds`` where there are backgrounds. The last row of ``v_viewmats`` is 0.
     """
-    conventions = chosen_conventions(profile, near_plane, far_plane, eps2d, rasterize_mode)
+    conventions = check.chosen_conventions(profile, near_plane, far_plane, eps2d, rasterize_mode)
     stages = get_backend(backend) if isinstance(backend, str) else backend
     primitives = (means, quats, scales, opacities)
     batch = checked_batch(primitives, colors, viewmats, Ks, width, height, sh_degree, backgrounds, render_mode)
     tapes = [draw(batch, c, conventions, stages) for c in range(len(batch.cameras))]
     dtype, sizes = batch.colors.dtype, {"C": len(tapes), "H": height, "W": width}
     sizes["D"] = tapes[0].output.image.shape[2]
-    v_images = check_array("v_render_colors", v_render_colors, (("C", "H", "W", "D"),), sizes, dtype)
-    v_alphas = check_array("v_render_alphas", v_render_alphas, (("C", "H", "W", 1),), sizes, dtype)[..., 0]
+    v_images = check.check_array("v_render_colors", v_render_colors, (("C", "H", "W", "D"),), sizes, dtype)
+    v_alphas = check.check_array("v_render_alphas", v_render_alphas, (("C", "H", "W", 1),), sizes, dtype)[..., 0]
 
     v_given = [np.zeros_like(field) for field in batch.primitives]
     v_colors, v_viewmats = np.zeros_like(batch.colors), np.zeros((len(tapes), 4, 4), dtype)
@@ -172,6 +174,168 @@ def rasterization_vjp(
     if backgrounds is None:
         del gradients["v_backgrounds"]
     return gradients
+
+
+class Batch(NamedTuple):
+    """The checked arguments of one call."""
+
+    primitives: Primitives
+    colors: Floats  # [N, D] or [N, K, 3], or one such array for every camera
+    has_own_colors: bool  # of every camera
+    cameras: tuple[Camera, ...]  # [C]
+    backgrounds: Floats  # [C, D]
+    sh_degree: int | None
+    render_mode: str
+
+    @property
+    def has_colors(self) -> bool:
+        """Whether the image has colour channels."""
+        return self.render_mode.startswith("RGB")
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether the last channel is a depth."""
+        return self.render_mode != "RGB"
+
+    @property
+    def has_expected_depth(self) -> bool:
+        """Whether that depth is divided by the accumulated opacity."""
+        return self.render_mode.endswith("ED")
+
+    def colors_of(self, c: int) -> Floats:
+        """Colours or coefficients that camera c sees."""
+        return self.colors[c] if self.has_own_colors else self.colors
+
+
+class ViewGradient(NamedTuple):
+    """Gradient of the loss with respect to a batch, through one of its views."""
+
+    primitives: Primitives
+    colors: Floats  # [N, D] or [N, K, 3]
+    viewmat: Floats  # [4, 4], last row 0
+    background: Floats  # [D]
+
+
+def checked_batch(
+    primitives: tuple[Any, Any, Any, Any],
+    colors: Any,
+    viewmats: Any,
+    Ks: Any,
+    width: int,
+    height: int,
+    sh_degree: int | None,
+    backgrounds: Any,
+    render_mode: str,
+) -> Batch:
+    """Check the arguments of :func:`rasterization` and pack them."""
+    means, quats, scales, opacities = primitives
+    dtype, sizes = check.check_dtype("means", means), dict[str, int]()
+
+    def array(name: str, value: Any, *shapes: check.Shape) -> Floats:
+        return check.check_array(name, value, shapes, sizes, dtype)
+
+    means = array("means", means, ("N", 3))
+    quats = array("quats", quats, ("N", 4))
+    scales = array("scales", scales, ("N", 3))
+    opacities = array("opacities", opacities, ("N",))
+    viewmats, Ks = array("viewmats", viewmats, ("C", 4, 4)), array("Ks", Ks, ("C", 3, 3))
+    if sh_degree is None:
+        colors = array("colors", colors, ("N", "D"), ("C", "N", "D"))
+    else:
+        colors = array("colors", colors, ("N", "K", 3), ("C", "N", "K", 3))
+        check.check_sh_degree("sh_degree", sh_degree, sizes["K"])
+        sizes["D"] = 3
+    zeros = np.zeros((sizes["C"], sizes["D"]), dtype)
+    backgrounds = zeros if backgrounds is None else array("backgrounds", backgrounds, ("C", "D"))
+
+    check.check_quats("quats", quats)
+    check.check_interval("scales", scales, 0, np.inf, "give exp(log_scales)")
+    check.check_interval("opacities", opacities, 0, 1, "give sigmoid(opacity_logits)")
+    check.check_viewmats("viewmats", viewmats)
+    check.check_intrinsics("Ks", Ks)
+    check.check_choice("render_mode", render_mode, RENDER_MODES)
+    width, height = check.check_size("width", width), check.check_size("height", height)
+    cameras = tuple(
+        Camera(M[:3, :3], M[:3, 3], float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), width, height)
+        for M, K in zip(viewmats, Ks, strict=True)
+    )
+    has_own_colors = colors.ndim == (3 if sh_degree is None else 4)
+    given = Primitives(means, quats, scales, opacities)
+    return Batch(given, colors, has_own_colors, cameras, backgrounds, sh_degree, render_mode)
+
+
+def draw(batch: Batch, c: int, conventions: Conventions, backend: Backend) -> SplatTape:
+    """Draw view c; an expected depth is still the accumulated one."""
+    means, colors = batch.primitives.means, batch.colors_of(c)
+    background = batch.backgrounds[c]
+
+    def shade(radii: Ints) -> Floats:
+        if not batch.has_colors:
+            return np.zeros((len(means), 0), means.dtype)
+        if batch.sh_degree is None:
+            return colors
+        return backend.sh_colors(means, *_split(colors), _lookout(batch.cameras[c]), batch.sh_degree, radii)
+
+    return splat(
+        batch.primitives,
+        shade,
+        batch.cameras[c],
+        background if batch.has_colors else background[:0],
+        conventions,
+        backend,
+        with_depth=batch.has_depth,
+    )
+
+
+def draw_vjp(batch: Batch, c: int, tape: SplatTape, v_image: Floats, v_alpha: Floats) -> ViewGradient:
+    """Gradient of :func:`draw`.
+
+    Spherical harmonics add, through the camera's centre::
+
+        o = -R^-1 t,  w = R^-T v_o:  v_R = -w o^T,  v_t = -w
+
+    The image, whose derivative is ``v_image`` [H, W, D], is the one with the accumulated depth.
+    """
+    v = splat_vjp(tape, v_image, v_alpha)
+    v_means, v_colors, v_background = v.primitives.means, np.zeros_like(batch.colors_of(c)), v.background
+    v_R, v_t = v.primitives.cam_from_world_R, v.primitives.cam_from_world_t
+    if not batch.has_colors:
+        v_background = np.zeros_like(batch.backgrounds[c])
+    elif batch.sh_degree is None:
+        v_colors = v.colors
+    else:
+        lookout = _lookout(tape.camera)
+        dc, rest = _split(batch.colors_of(c))
+        v_sh = tape.backend.sh_colors_vjp(
+            batch.primitives.means, dc, rest, lookout, batch.sh_degree, tape.projection.radii, v.colors
+        )
+        v_means = v_means + v_sh.means
+        v_colors = np.concatenate([v_sh.sh_dc[:, None], v_sh.sh_rest], axis=1)
+        w = np.linalg.solve(tape.camera.cam_from_world_R.T, -v_sh.cam_from_world_t)  # t of the lookout is -o
+        v_R, v_t = v_R + np.outer(w, lookout.cam_from_world_t), v_t - w
+    v_viewmat = np.zeros((4, 4), v_t.dtype)
+    v_viewmat[:3] = np.column_stack([v_R, v_t])
+    v_primitives = Primitives(v_means, v.primitives.quats, v.primitives.scales, v.primitives.opacities)
+    return ViewGradient(v_primitives, v_colors, v_viewmat, v_background)
+
+
+def expected_depth(images: Floats, alphas: Floats) -> Floats:
+    """Images [..., H, W, D] whose last channel, the accumulated depth S, is divided: ``E = S / max(alpha, 1e-10)``."""
+    depths = images[..., -1] / np.maximum(alphas, DEPTH_ALPHA_MIN)
+    return np.concatenate([images[..., :-1], depths[..., None]], axis=-1)
+
+
+def expected_depth_vjp(images: Floats, alphas: Floats, v_images: Floats, v_alphas: Floats) -> tuple[Floats, Floats]:
+    """Gradient of :func:`expected_depth` by the images, and by the alphas with ``v_alphas`` added.
+
+    ::
+
+        a = max(alpha, 1e-10),  v_S = v_E / a,  v_alpha -= v_S S / a   where alpha > 1e-10
+    """
+    weights = np.maximum(alphas, DEPTH_ALPHA_MIN)
+    v_depths = v_images[..., -1] / weights
+    v_weights = np.where(alphas > DEPTH_ALPHA_MIN, -v_depths * images[..., -1] / weights, 0)
+    return np.concatenate([v_images[..., :-1], v_depths[..., None]], axis=-1), v_alphas + v_weights
 
 
 def _meta(tapes: list[SplatTape]) -> dict[str, Any]:
@@ -198,3 +362,14 @@ def _meta(tapes: list[SplatTape]) -> dict[str, Any]:
         "height": camera.height,
         "n_cameras": len(tapes),
     }
+
+
+def _lookout(camera: Camera) -> Camera:
+    """Return a camera at the same centre with R = I: colours depend on the centre only."""
+    R, t = camera.cam_from_world_R.astype(np.float64), camera.cam_from_world_t.astype(np.float64)
+    return camera._replace(cam_from_world_R=np.eye(3), cam_from_world_t=np.linalg.solve(R, t))
+
+
+def _split(coefficients: Floats) -> tuple[Floats, Floats]:
+    """Coefficients [N, K, 3] as those of degree 0 [N, 3] and the others [N, K-1, 3]."""
+    return np.ascontiguousarray(coefficients[:, 0]), np.ascontiguousarray(coefficients[:, 1:])
