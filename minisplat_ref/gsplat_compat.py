@@ -8,6 +8,8 @@ independent, and that is the point which R mu + t maps to the origin whatever th
 pinholes, packed output, and ``isect_ids`` in the meta, the keys of gsplat's own sort.
 """
 
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,9 +19,10 @@ from minisplat_ref.backends import Backend, get_backend
 from minisplat_ref.constants import DEPTH_ALPHA_MIN, GSPLAT_MAIN, Conventions
 from minisplat_ref.reference.tiling import bin_gaussians
 from minisplat_ref.splatting import Primitives, SplatTape, splat, splat_vjp
-from minisplat_ref.types import Camera, Floats, Ints, TileGrid
+from minisplat_ref.types import Camera, Floats, Ints, Projection, TileGrid
 
 META_TILE_SIZE = 16  # pixels; the tiles of the meta's lists are gsplat's, whatever tiles the backend works with
+TILE_LISTS = ("tiles_per_gauss", "flatten_ids", "isect_offsets")  # keys of the meta
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 
 
@@ -43,7 +46,7 @@ def rasterization(
     rasterize_mode: str = "classic",
     backend: str | Backend = "cpu",
     profile: str | Conventions = GSPLAT_MAIN,
-) -> tuple[Floats, Floats, dict[str, Any]]:
+) -> tuple[Floats, Floats, "Meta"]:
     """Render Gaussians through C cameras.
 
     Parameters
@@ -83,11 +86,12 @@ def rasterization(
     -------
     render_colors : ndarray of shape (C, H, W, D), D + 1 with depth, or 1 for depth alone
     render_alphas : ndarray of shape (C, H, W, 1)
-    meta : dict
-        ``means2d`` [C, N, 2], ``depths`` [C, N], ``conics`` [C, N, 3], ``opacities`` [C, N] as blended, ``radii``
-        [C, N, 2] int32; all 0 where culled. Tiles of ``tile_size`` pixels, ``tile_height`` rows of ``tile_width``:
-        ``tiles_per_gauss`` [C, N], ``flatten_ids`` (c N + n, by camera, tile and depth), ``isect_offsets``
-        [C, tile_height, tile_width], where each tile's ids begin. ``width``, ``height``, ``n_cameras``.
+    meta : Meta
+        Read-only mapping. ``means2d`` [C, N, 2], ``depths`` [C, N], ``conics`` [C, N, 3], ``opacities`` [C, N] as
+        blended, ``radii`` [C, N, 2] int32; all 0 where culled. Tiles of ``tile_size`` pixels, ``tile_height`` rows of
+        ``tile_width``: ``tiles_per_gauss`` [C, N], ``flatten_ids`` (c N + n, by camera, tile and depth),
+        ``isect_offsets`` [C, tile_height, tile_width], where each tile's ids begin; these three are made when one of
+        them is first read. ``width``, ``height``, ``n_cameras``.
 
     Raises
     ------
@@ -96,11 +100,11 @@ def rasterization(
     """
     conventions = check.chosen_conventions(profile, near_plane, far_plane, eps2d, rasterize_mode)
     stages = get_backend(backend) if isinstance(backend, str) else backend
-    primitives = (means, quats, scales, opacities)
-    batch = checked_batch(primitives, colors, viewmats, Ks, width, height, sh_degree, backgrounds, render_mode)
+    primitives, views = Primitives(means, quats, scales, opacities), Views(viewmats, Ks, width, height)
+    batch = checked_batch(primitives, views, colors, sh_degree, backgrounds, render_mode)
     tapes = [draw(batch, c, conventions, stages) for c in range(len(batch.cameras))]
-    images = np.stack([tape.output.image for tape in tapes])  # [C, H, W, D]
-    alphas = np.stack([tape.output.alpha for tape in tapes])  # [C, H, W]
+    images = _stacked([tape.output.image for tape in tapes])  # [C, H, W, D]
+    alphas = _stacked([tape.output.alpha for tape in tapes])  # [C, H, W]
     if batch.has_expected_depth:
         images = expected_depth(images, alphas)
     return images, alphas[..., None], _meta(tapes)
@@ -148,8 +152,8 @@ def rasterization_vjp(
     """
     conventions = check.chosen_conventions(profile, near_plane, far_plane, eps2d, rasterize_mode)
     stages = get_backend(backend) if isinstance(backend, str) else backend
-    primitives = (means, quats, scales, opacities)
-    batch = checked_batch(primitives, colors, viewmats, Ks, width, height, sh_degree, backgrounds, render_mode)
+    primitives, views = Primitives(means, quats, scales, opacities), Views(viewmats, Ks, width, height)
+    batch = checked_batch(primitives, views, colors, sh_degree, backgrounds, render_mode)
     tapes = [draw(batch, c, conventions, stages) for c in range(len(batch.cameras))]
     dtype, sizes = batch.colors.dtype, {"C": len(tapes), "H": height, "W": width}
     sizes["D"] = tapes[0].output.image.shape[2]
@@ -174,6 +178,46 @@ def rasterization_vjp(
     if backgrounds is None:
         del gradients["v_backgrounds"]
     return gradients
+
+
+class Meta(Mapping[str, Any]):
+    """What gsplat tells about a batch: a read-only mapping whose tile lists are made when one of them is first read.
+
+    The lists take NumPy longer than the kernels take for the images, and most callers never look at them. To be asked
+    for its keys, its length or what it contains makes no list.
+    """
+
+    def __init__(self, values: dict[str, Any], make_tile_lists: Callable[[], dict[str, Any]]) -> None:
+        self._values = values  # None under the keys of lists that are not made yet
+        self._make_tile_lists: Callable[[], dict[str, Any]] | None = make_tile_lists
+
+    def __getitem__(self, key: str) -> Any:
+        make = self._make_tile_lists
+        if key in TILE_LISTS and make is not None:
+            self._values.update(make())
+            self._make_tile_lists = None  # and what they were made of
+        return self._values[key]
+
+    def __contains__(self, key: object) -> bool:
+        return key in self._values
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __repr__(self) -> str:
+        return f"Meta({', '.join(self)})"
+
+
+class Views(NamedTuple):
+    """C cameras as gsplat is given them."""
+
+    viewmats: Floats  # [C, 4, 4] cam_from_world, OpenCV axes
+    Ks: Floats  # [C, 3, 3] pixels
+    width: int  # pixels
+    height: int  # pixels
 
 
 class Batch(NamedTuple):
@@ -217,18 +261,16 @@ class ViewGradient(NamedTuple):
 
 
 def checked_batch(
-    primitives: tuple[Any, Any, Any, Any],
+    primitives: Primitives,
+    views: Views,
     colors: Any,
-    viewmats: Any,
-    Ks: Any,
-    width: int,
-    height: int,
     sh_degree: int | None,
     backgrounds: Any,
     render_mode: str,
 ) -> Batch:
     """Check the arguments of :func:`rasterization` and pack them."""
     means, quats, scales, opacities = primitives
+    viewmats, Ks, width, height = views
     dtype, sizes = check.check_dtype("means", means), dict[str, int]()
 
     def array(name: str, value: Any, *shapes: check.Shape) -> Floats:
@@ -238,7 +280,8 @@ def checked_batch(
     quats = array("quats", quats, ("N", 4))
     scales = array("scales", scales, ("N", 3))
     opacities = array("opacities", opacities, ("N",))
-    viewmats, Ks = array("viewmats", viewmats, ("C", 4, 4)), array("Ks", Ks, ("C", 3, 3))
+    viewmats = array("viewmats", viewmats, ("C", 4, 4))
+    Ks = array("Ks", Ks, ("C", 3, 3))
     if sh_degree is None:
         colors = array("colors", colors, ("N", "D"), ("C", "N", "D"))
     else:
@@ -338,30 +381,54 @@ def expected_depth_vjp(images: Floats, alphas: Floats, v_images: Floats, v_alpha
     return np.concatenate([v_images[..., :-1], v_depths[..., None]], axis=-1), v_alphas + v_weights
 
 
-def _meta(tapes: list[SplatTape]) -> dict[str, Any]:
+def _meta(tapes: list[SplatTape]) -> Meta:
     """What gsplat tells about a batch, every array [C, N, ...]."""
     projections, camera = [tape.projection for tape in tapes], tapes[0].camera
     grid = TileGrid(camera.width, camera.height, META_TILE_SIZE, META_TILE_SIZE)
-    bins = [bin_gaussians(tape.projection, grid, tape.conventions) for tape in tapes]
-    n_pairs = np.cumsum([0] + [len(lists.gaussian_ids) for lists in bins])  # before each camera, and in all
-    n, dtype = len(projections[0].depths), projections[0].depths.dtype
+    dtype = projections[0].depths.dtype
     largest = np.finfo(dtype).max  # kernels hold conics in float64
+    with np.errstate(over="ignore"):
+        conics = np.stack([projection.conics for projection in projections], dtype=dtype, casting="same_kind")
+    names = ("means2d", "depths", "opacities", "radii")
+    values: dict[str, Any] = {name: np.stack([getattr(p, name) for p in projections]) for name in names}
+    values["conics"] = np.clip(conics, -largest, largest, out=conics)
+    # The lists are made of boxes and of depths that no caller can change. All else they share with the meta: it would
+    # be kept alive for nothing.
+    shared = ("means2d", "opacities", "radii", "conics")
+    kept = [p._replace(**{name: values[name][c] for name in shared}) for c, p in enumerate(projections)]
+    return Meta(
+        {
+            **values,
+            **dict.fromkeys(TILE_LISTS),
+            "tile_width": grid.n_tiles_x,
+            "tile_height": grid.n_tiles_y,
+            "tile_size": META_TILE_SIZE,
+            "width": camera.width,
+            "height": camera.height,
+            "n_cameras": len(tapes),
+        },
+        partial(_tile_lists, kept, grid, tapes[0].conventions),
+    )
+
+
+def _tile_lists(projections: list[Projection], grid: TileGrid, conventions: Conventions) -> dict[str, Any]:
+    """Which Gaussians each tile holds, by the keys in ``TILE_LISTS``; the Gaussians of camera c begin at c N."""
+    n = len(projections[0].depths)
+    bins = [bin_gaussians(projection, grid, conventions) for projection in projections]
+    n_pairs = np.cumsum([0] + [len(lists.gaussian_ids) for lists in bins])  # before each camera, and in all
     ids = [lists.gaussian_ids + c * n for c, lists in enumerate(bins)]
     starts = [lists.tile_offsets[:-1] + before for lists, before in zip(bins, n_pairs, strict=False)]
-    names = ("means2d", "depths", "opacities", "radii")
-    return {
-        **{name: np.stack([getattr(projection, name) for projection in projections]) for name in names},
-        "conics": np.clip([projection.conics for projection in projections], -largest, largest).astype(dtype),
-        "tiles_per_gauss": np.stack([np.diff(lists.gaussian_offsets) for lists in bins]).astype(np.int32),
-        "flatten_ids": np.concatenate(ids).astype(np.int32),
-        "isect_offsets": np.stack(starts).reshape(-1, grid.n_tiles_y, grid.n_tiles_x).astype(np.int32),
-        "tile_width": grid.n_tiles_x,
-        "tile_height": grid.n_tiles_y,
-        "tile_size": META_TILE_SIZE,
-        "width": camera.width,
-        "height": camera.height,
-        "n_cameras": len(tapes),
-    }
+    arrays = (
+        np.stack([np.diff(lists.gaussian_offsets) for lists in bins]),  # [C, N]
+        np.concatenate(ids),  # [M]
+        np.stack(starts).reshape(-1, grid.n_tiles_y, grid.n_tiles_x),  # [C, tile_height, tile_width]
+    )
+    return {key: array.astype(np.int32) for key, array in zip(TILE_LISTS, arrays, strict=True)}
+
+
+def _stacked(arrays: list[Floats]) -> Floats:
+    """Arrays [C, ...]; that of a single camera is not copied."""
+    return arrays[0][None] if len(arrays) == 1 else np.stack(arrays)
 
 
 def _lookout(camera: Camera) -> Camera:
