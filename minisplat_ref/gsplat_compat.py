@@ -16,7 +16,8 @@ import numpy as np
 
 from minisplat_ref import validation as check
 from minisplat_ref.backends import Backend, get_backend
-from minisplat_ref.constants import DEPTH_ALPHA_MIN, GSPLAT_MAIN, Conventions
+from minisplat_ref.constants import GSPLAT_MAIN, Conventions
+from minisplat_ref.reference.depth import expected_depth, expected_depth_vjp
 from minisplat_ref.reference.tiling import bin_gaussians
 from minisplat_ref.splatting import Primitives, SplatTape, splat, splat_vjp
 from minisplat_ref.types import Camera, Floats, Ints, Projection, TileGrid
@@ -106,7 +107,7 @@ def rasterization(
     images = _stacked([tape.output.image for tape in tapes])  # [C, H, W, D]
     alphas = _stacked([tape.output.alpha for tape in tapes])  # [C, H, W]
     if batch.has_expected_depth:
-        images = expected_depth(images, alphas)
+        images[..., -1] = expected_depth(images[..., -1], alphas)
     return images, alphas[..., None], _meta(tapes)
 
 
@@ -166,7 +167,10 @@ def rasterization_vjp(
     for c, tape in enumerate(tapes):
         v_image, v_alpha = v_images[c], v_alphas[c]
         if batch.has_expected_depth:
-            v_image, v_alpha = expected_depth_vjp(tape.output.image, tape.output.alpha, v_image, v_alpha)
+            depth = tape.output.image[..., -1]  # [H, W] still the accumulated one
+            v_depth, v_alpha_of_depth = expected_depth_vjp(depth, tape.output.alpha, v_image[..., -1])
+            v_image = np.concatenate([v_image[..., :-1], v_depth[..., None]], axis=-1)
+            v_alpha = v_alpha + v_alpha_of_depth
         v = draw_vjp(batch, c, tape, v_image, v_alpha)
         for total, part in zip(v_given, v.primitives, strict=True):
             total += part
@@ -360,25 +364,6 @@ def draw_vjp(batch: Batch, c: int, tape: SplatTape, v_image: Floats, v_alpha: Fl
     v_viewmat[:3] = np.column_stack([v_R, v_t])
     v_primitives = Primitives(v_means, v.primitives.quats, v.primitives.scales, v.primitives.opacities)
     return ViewGradient(v_primitives, v_colors, v_viewmat, v_background)
-
-
-def expected_depth(images: Floats, alphas: Floats) -> Floats:
-    """Images [..., H, W, D] whose last channel, the accumulated depth S, is divided: ``E = S / max(alpha, 1e-10)``."""
-    depths = images[..., -1] / np.maximum(alphas, DEPTH_ALPHA_MIN)
-    return np.concatenate([images[..., :-1], depths[..., None]], axis=-1)
-
-
-def expected_depth_vjp(images: Floats, alphas: Floats, v_images: Floats, v_alphas: Floats) -> tuple[Floats, Floats]:
-    """Gradient of :func:`expected_depth` by the images, and by the alphas with ``v_alphas`` added.
-
-    ::
-
-        a = max(alpha, 1e-10),  v_S = v_E / a,  v_alpha -= v_S S / a   where alpha > 1e-10
-    """
-    weights = np.maximum(alphas, DEPTH_ALPHA_MIN)
-    v_depths = v_images[..., -1] / weights
-    v_weights = np.where(alphas > DEPTH_ALPHA_MIN, -v_depths * images[..., -1] / weights, 0)
-    return np.concatenate([v_images[..., :-1], v_depths[..., None]], axis=-1), v_alphas + v_weights
 
 
 def _meta(tapes: list[SplatTape]) -> Meta:

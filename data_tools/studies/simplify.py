@@ -32,7 +32,7 @@ from data_tools.studies.front import (
     write,
 )
 from data_tools.synthetic import SCENE_NAMES, make_scene
-from data_tools.synthetic.tracer import camera_centre, pixel_rays
+from data_tools.synthetic.tracer import pixel_rays
 from minisplat_ref.cli.arguments import Commands, integer, listed
 from minisplat_ref.errors import InputError
 from minisplat_ref.events import TrainState
@@ -154,7 +154,7 @@ def true_surface(source: str) -> dict[str, Floats]:
     for view, depth in zip(synthetic.scene.train_views, synthetic.train_depths, strict=True):
         rays = pixel_rays(view.camera, 0.5, 0.5, np.arange(view.camera.height))  # [H * W, 3] of camera z = 1
         depths = depth.ravel()[:, None]
-        points.append((camera_centre(view.camera) + depths * rays)[depths[:, 0] > 0])
+        points.append((view.camera.center + depths * rays)[depths[:, 0] > 0])
     return {"surface": np.concatenate(points)}
 
 

@@ -10,12 +10,13 @@ from data_tools.synthetic import SyntheticScene
 from minisplat_ref import __version__
 from minisplat_ref.backends import get_backend
 from minisplat_ref.cli import run_folder
-from minisplat_ref.cli.pictures import error_picture, expected_depth, to_picture
+from minisplat_ref.cli.pictures import error_picture, to_picture
 from minisplat_ref.cli.progress import read_log
 from minisplat_ref.cli.report import Report, ViewPictures
 from minisplat_ref.cli.settings import Settings
 from minisplat_ref.cli.training import Outcome
 from minisplat_ref.constants import PROFILES
+from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.render import render
 from minisplat_ref.types import Gaussians, Scene
 
@@ -46,7 +47,7 @@ def view_pictures(
                 render=image,
                 error=error_picture(view.image, image),
                 true_depth=true_depths[view.name],
-                depth=expected_depth(output),
+                depth=expected_depth(output.image[..., 3], output.alpha),
             )
         )
     return pictures

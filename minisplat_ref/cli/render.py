@@ -63,9 +63,10 @@ def run(args: argparse.Namespace) -> int:
 
     from minisplat_ref.backends import get_backend
     from minisplat_ref.cli import run_folder
-    from minisplat_ref.cli.pictures import depth_picture, depth_range, expected_depth
+    from minisplat_ref.cli.pictures import depth_picture, depth_range
     from minisplat_ref.constants import PROFILES
     from minisplat_ref.io import write_image
+    from minisplat_ref.reference.depth import expected_depth
     from minisplat_ref.render import render
 
     source = _open(args)
@@ -83,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
         )
         write_image(out / f"{name}.png", output.image[..., :3])
         if args.depth:
-            depth = expected_depth(output)  # [H, W]
+            depth = expected_depth(output.image[..., 3], output.alpha)  # [H, W]
             np.save(out / f"{name}_depth.npy", depth)
             write_image(out / f"{name}_depth.png", depth_picture(depth, *depth_range(depth)))
     print(f"{len(views)} pictures in {out}")
