@@ -27,7 +27,7 @@ SH_DEGREE_MAX = 3
 JACOBIAN_CLAMP = 1.3  # the EWA Jacobian is frozen beyond 1.3 x the half field of view: it explodes as 1/z^2 outside
 COMPENSATION_FLOOR = 0.005  # least factor of the antialiasing compensation, keeps its square root differentiable
 MEDIAN_TRANSMITTANCE = 0.5  # the median depth is that of the Gaussian that takes the transmittance below one half
-DEPTH_ALPHA_MIN = 1e-10  # expected depth = sum(w z) / max(alpha, this): an empty pixel gets depth 0, not 0/0
+DEPTH_ALPHA_MIN = 1e-10  # a pixel of lower accumulated opacity is empty: its expected depth is 0, not 0/0
 
 SSIM_WINDOW = 11  # pixels; Wang et al. 2004
 SSIM_SIGMA = 1.5  # pixels

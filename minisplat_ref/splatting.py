@@ -2,7 +2,7 @@
 
 The order of the stages is 3DGS section 6's. What the Gaussians are before their activations, and where their colours
 come from, is left to the caller: :mod:`minisplat_ref.rendering` holds trained parameters and spherical harmonics,
-:mod:`minisplat_ref.gsplat_door` whatever it is given.
+:mod:`minisplat_ref.gsplat_compat` whatever it is given.
 """
 
 from collections.abc import Callable

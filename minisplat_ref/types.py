@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.integer]
@@ -72,6 +72,16 @@ class Camera(NamedTuple):
     """Image width, pixels."""
     height: int
     """Image height, pixels."""
+
+    @property
+    def center(self) -> Floats:
+        """[3] position ``-R^T t``, world frame, in the dtype of the pose."""
+        return -self.cam_from_world_R.T @ self.cam_from_world_t
+
+    def astype(self, dtype: DTypeLike) -> "Camera":
+        """Return the same camera with its pose in another precision."""
+        R, t = np.asarray(self.cam_from_world_R, dtype), np.asarray(self.cam_from_world_t, dtype)
+        return self._replace(cam_from_world_R=R, cam_from_world_t=t)
 
 
 class Projection(NamedTuple):

@@ -232,7 +232,7 @@ for degree in range(4):
     output, tape = render(ball, camera, background=np.ones(3), sh_degree=degree, backend=REFERENCE)
     pictures[degree] = output.image
 
-center = -camera.cam_from_world_R.T @ camera.cam_from_world_t
+center = camera.center
 exact = glossy_color(normals, (center - normals) / np.linalg.norm(center - normals, axis=1, keepdims=True))
 bins = REFERENCE.bin_gaussians(tape.projection, TileGrid(96, 96, 16, 16), GSPLAT_MAIN)
 truth = composite(tape.projection, exact, np.ones(3), bins, GSPLAT_MAIN).image

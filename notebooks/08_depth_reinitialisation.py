@@ -263,7 +263,7 @@ def elevation(axes, name, points, pixels, title):
     for rows, color in ((~wrong, BLUE), (wrong, RED)):
         axes.scatter(points[rows, 0], points[rows, 2], s=2, color=color, linewidths=0)
     cameras = [v.camera for v in truths[name].scene.train_views]
-    centres = np.array([-c.cam_from_world_R.T @ c.cam_from_world_t for c in cameras])
+    centres = np.array([c.center for c in cameras])
     axes.plot(centres[:, 0], centres[:, 2], "k^", markersize=4)
     axes.set(title=f"{title}: {wrong.mean():.0%} of {len(points)} wrong", aspect="equal", xlabel="x (m)")
 

@@ -28,6 +28,7 @@ from minisplat_ref.bench import (
 from minisplat_ref.bench.by_turns import hold, times_by_turns
 from minisplat_ref.bench.exponentials import EXPONENTIALS, relative_errors
 from minisplat_ref.bench.flips import thresholds
+from minisplat_ref.bench.passes import RASTERIZATION
 from minisplat_ref.bench.peers import peers_of
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
@@ -47,7 +48,15 @@ from minisplat_ref.training.loop import train
 from minisplat_ref.types import Gaussians
 
 PEAK = ("peak", "bound")
-NAMES = ("reference-f64", "cpu-f64", "cpu-f32", "cpu-f32-exp3", "cpu-f32-3-sigma", "textbook-f32")
+NAMES = (
+    "reference-f64",
+    "cpu-f64",
+    "cpu-f32",
+    "rasterization-f32",
+    "cpu-f32-exp3",
+    "cpu-f32-3-sigma",
+    "textbook-f32",
+)
 pytestmark = pytest.mark.usefixtures("tiny_workloads")
 
 
@@ -77,7 +86,7 @@ def test_everyone_is_judged_and_timed(cases):
 def test_errors_are_those_of_the_precision(cases):
     assert 0 < cases["synth/cpu-f64"].figures["image max"] < BENCH_FLOAT64
     assert 0 < cases["synth/cpu-f64"].figures["gradient, no flips"] < BENCH_FLOAT64
-    for name in ("cpu-f32", "textbook-f32"):
+    for name in ("cpu-f32", "rasterization-f32", "textbook-f32"):
         figures = cases[f"synth/{name}"].figures
         assert 1e-8 < figures["image max, no flips"] < BENCH_FLOAT32_IMAGE
         assert 1e-8 < figures["gradient, no flips"] < BENCH_FLOAT32_GRADIENT
@@ -87,6 +96,25 @@ def test_errors_are_those_of_the_precision(cases):
     assert 1e-5 < cubic["gradient, no flips"] < BENCH_FLOAT32_GRADIENT
     assert cases["synth/cpu-f32-3-sigma"].figures["image max"] > 1e-3
     assert cases["synth/cpu-f32-3-sigma"].figures["flips"] is None
+
+
+def test_ratios_are_of_the_least_times(cases):
+    figures, textbook = cases["synth/rasterization-f32"].figures, cases["synth/textbook-f32"].figures
+    for ratio, time in (("x textbook", "least both ms"), ("x textbook, forward", "least forward ms")):
+        assert textbook[ratio] == 1
+        assert figures[ratio] == pytest.approx(textbook[time] / figures[time])
+    [reference] = race.race(tiny(), contenders.choose(()), repeats=1)  # and no baseline
+    assert reference.figures["x textbook"] is None and reference.figures["x textbook, forward"] is None
+
+
+@pytest.mark.parametrize("backend", [CPU, planted("half-off-diagonal")], ids=["right", "half-off-diagonal"])
+def test_rasterization_is_judged_as_render_is(backend):
+    """In float64 its image and gradient are the reference's, activations included, or it gets no time."""
+    bounds = BENCH_FLOAT64, BENCH_FLOAT64
+    contender = contenders.Contender("rasterization", backend, np.float64, *bounds, passes=RASTERIZATION)
+    [_, case] = race.race(tiny(), [*contenders.choose(()), contender], repeats=1)
+    assert case.passed == (backend is CPU) and (case.figures["both ms"] is None) == (backend is not CPU)
+    assert ("gradient of" in case.note) == (backend is not CPU)
 
 
 def with_pixel(value):

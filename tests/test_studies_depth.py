@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from tolerances import CLOSED_FORM, PRINTED_DIGITS
 
 from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.tracer import camera_centre, pixel_rays
+from minisplat_ref.datasets.synthetic.tracer import pixel_rays
 from minisplat_ref.experiments.studies import depth_types
 from minisplat_ref.experiments.studies.__main__ import main
 from minisplat_ref.experiments.studies.front import FIGURE, RESULT
@@ -30,7 +30,7 @@ def true_points(truth):
     points = []
     for view, depth in zip(truth.scene.train_views, truth.train_depths, strict=True):
         rays = pixel_rays(view.camera, 0.5, 0.5, np.arange(view.camera.height))
-        points.append(camera_centre(view.camera) + depth.reshape(-1, 1) * rays)
+        points.append(view.camera.center + depth.reshape(-1, 1) * rays)
     return np.concatenate(points)
 
 
@@ -61,7 +61,7 @@ def test_errors_of_known_points(outdoor):
     """One in five of the surface's points 10 % too near, the sky's points at the cameras."""
     points, true_depths = true_points(outdoor), outdoor.train_depths.ravel()
     pixels = np.arange(len(points))
-    centres = [camera_centre(view.camera) for view in outdoor.scene.train_views]
+    centres = [view.camera.center for view in outdoor.scene.train_views]
     centres = np.repeat(centres, len(points) // len(centres), axis=0)
     surface = np.flatnonzero(true_depths)
     moved = surface[::5]

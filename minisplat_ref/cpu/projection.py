@@ -49,11 +49,6 @@ from minisplat_ref.types import Camera, Floats, PrimitiveGradient, Projection, P
 N_CHUNKS = 64  # parts of the camera-gradient sum; fixed, so that its rounding does not depend on the thread count
 
 
-def camera_centre(camera: Camera) -> Floats:
-    """Camera centre -R^T t [3], float64."""
-    return -np.asarray(camera.cam_from_world_R, np.float64).T @ np.asarray(camera.cam_from_world_t, np.float64)
-
-
 def pose_of(camera: Camera) -> tuple[Floats, Floats]:
     """Return R [3, 3] and the point [3] that R x + t takes to the origin, float64.
 

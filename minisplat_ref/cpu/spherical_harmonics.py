@@ -14,7 +14,7 @@ import numpy as np
 from minisplat_ref.constants import SH_C0, SH_C1, SH_C2, SH_C3
 from minisplat_ref.cpu.gaussian_rows import DOUBLE, add, list_visible, listed_rows, total_of, triple
 from minisplat_ref.cpu.memory import large_empty
-from minisplat_ref.cpu.projection import N_CHUNKS, camera_centre
+from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.jit.lanes import (
     WIDTH,
@@ -156,7 +156,7 @@ def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, deg
     colors = np.empty(sh_dc.shape, sh_dc.dtype)
     constants = np.array(_CONSTANTS, means.dtype)
     width = 3 * sh_rest.shape[1]
-    _sh_colors(means, sh_dc, sh_rest.ravel(), width, camera_centre(camera), degree, constants, radii, colors)
+    _sh_colors(means, sh_dc, sh_rest.ravel(), width, camera.astype(np.float64).center, degree, constants, radii, colors)
     return colors
 
 
@@ -282,7 +282,7 @@ def sh_colors_vjp(
         sh_dc,
         sh_rest.ravel(),
         3 * sh_rest.shape[1],
-        camera_centre(camera),
+        camera.astype(np.float64).center,
         degree,
         constants,
         radii,

@@ -9,12 +9,13 @@ from pathlib import Path
 from minisplat_ref import __version__
 from minisplat_ref.datasets.synthetic import SyntheticScene
 from minisplat_ref.experiments import run_folder
-from minisplat_ref.experiments.pictures import error_picture, expected_depth, to_picture
+from minisplat_ref.experiments.pictures import error_picture, to_picture
 from minisplat_ref.experiments.progress import read_log
 from minisplat_ref.experiments.report import Report, ViewPictures
 from minisplat_ref.experiments.run import Outcome
 from minisplat_ref.experiments.scoring import load_trained
 from minisplat_ref.experiments.settings import Settings
+from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.types import Scene
 
 N_SHOWN = 3  # test views
@@ -35,7 +36,7 @@ def view_pictures(folder: Path, synthetic: SyntheticScene, scene: Scene, outcome
                 render=image,
                 error=error_picture(view.image, image),
                 true_depth=true_depths[view.name],
-                depth=expected_depth(output),
+                depth=expected_depth(output.image[..., 3], output.alpha),
             )
         )
     return pictures

@@ -49,7 +49,7 @@ def to_json(viewpoints: Sequence[Viewpoint]) -> list[dict[str, Any]]:
             "split": split,
             "width": camera.width,
             "height": camera.height,
-            "position": (-camera.cam_from_world_R.T @ camera.cam_from_world_t).tolist(),
+            "position": camera.center.tolist(),
             "rotation": camera.cam_from_world_R.T.tolist(),
             "fx": camera.fx,
             "fy": camera.fy,
@@ -160,7 +160,7 @@ class _Ring(NamedTuple):
 
 def _ring_of_cameras(cameras: Sequence[Camera], width: int) -> _Ring:
     rotations = np.array([camera.cam_from_world_R for camera in cameras])  # [V, 3, 3]
-    centres = np.array([-camera.cam_from_world_R.T @ camera.cam_from_world_t for camera in cameras])  # [V, 3]
+    centres = np.array([camera.center for camera in cameras])  # [V, 3]
     # The point nearest to all optical axes d: sum (I - d d^T)(x - c) = 0; the damping keeps parallel axes solvable.
     across = np.eye(3) - rotations[:, 2, :, None] * rotations[:, 2, None, :]  # [V, 3, 3]
     damping = 1e-3 * len(cameras) * np.eye(3)

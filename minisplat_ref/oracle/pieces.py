@@ -119,31 +119,43 @@ def ssim_pieces(m: Module) -> tuple[Stage, ...]:
     return ssim, photometric_stage(stages, tiny_setting().camera, rng)
 
 
-def depth_map_pieces(m: Module) -> tuple[Stage, ...]:
-    """``expected_depth`` and ``depth_normals``; one pixel has no depth."""
-    rng, camera = np.random.default_rng(SEED), tiny_setting().camera
+def depth_pieces(m: Module) -> tuple[Stage, ...]:
+    """``expected_depth``, one pixel without a hit, and ``surface_points``."""
+    rng = np.random.default_rng(SEED)
     depth, alpha = rng.uniform(2, 3, size=(4, 5)), rng.uniform(0.3, 1, size=(4, 5))
     alpha[1, 2] = 0.0
-    with_hole = np.where(alpha > 0, depth, 0)
-    has_depth = (alpha > 0).astype(float)  # a pixel that was not hit cannot be moved into a hit by a derivative
+    accumulated = depth * alpha
+    is_hit = (alpha > 0).astype(float)  # a pixel that was not hit cannot be moved into a hit by a derivative
 
     def expected(accumulated: Floats, alpha: Floats) -> Point:
-        return Point((m.expected_depth(accumulated * has_depth, alpha * has_depth),))
+        return Point((m.expected_depth(accumulated * is_hit, alpha * is_hit),))
 
+    stages = with_module(surface_points=m.surface_points, surface_points_vjp=m.surface_points_vjp)
     return (
         Stage(
             "expected_depth",
-            {"accumulated_depth": with_hole * alpha, "alpha": alpha},
+            {"accumulated_depth": accumulated, "alpha": alpha},
             ("depth",),
             expected,
-            lambda v: m.expected_depth_vjp(with_hole * alpha, alpha, v),
+            lambda v: m.expected_depth_vjp(accumulated, alpha, v),
         ),
+        surface_stage(stages, tiny_setting()),
+    )
+
+
+def depth_map_pieces(m: Module) -> tuple[Stage, ...]:
+    """``depth_normals``; one pixel has no depth."""
+    rng, camera = np.random.default_rng(SEED), tiny_setting().camera
+    depth = rng.uniform(2, 3, size=(4, 5))
+    depth[1, 2] = 0.0
+    has_depth = (depth > 0).astype(float)  # nor can a pixel without a depth be moved onto the surface
+    return (
         Stage(
             "depth_normals",
-            {"depth": with_hole},
+            {"depth": depth},
             ("normals",),
-            lambda depth: Point((m.depth_normals(depth * has_depth, camera),)),
-            lambda v: (m.depth_normals_vjp(with_hole, camera, v),),
+            lambda z: Point((m.depth_normals(z * has_depth, camera),)),
+            lambda v: (m.depth_normals_vjp(depth, camera, v),),
         ),
     )
 
@@ -190,11 +202,6 @@ def _compositing_pieces(m: Module) -> tuple[Stage, ...]:
     return (composite_stage(with_module(composite=m.composite, composite_vjp=m.composite_vjp), tiny_setting()),)
 
 
-def _depth_pieces(m: Module) -> tuple[Stage, ...]:
-    stages = with_module(surface_points=m.surface_points, surface_points_vjp=m.surface_points_vjp)
-    return (surface_stage(stages, tiny_setting()),)
-
-
 PIECES: dict[ModuleType, Callable[[Module], tuple[Stage, ...]]] = {
     reference.covariance: covariance_pieces,
     reference.pinhole: pinhole_pieces,
@@ -202,7 +209,7 @@ PIECES: dict[ModuleType, Callable[[Module], tuple[Stage, ...]]] = {
     reference.projection: _projection_pieces,
     reference.spherical_harmonics: _sh_pieces,
     reference.compositing: _compositing_pieces,
-    reference.depth: _depth_pieces,
+    reference.depth: depth_pieces,
     reference.loss: ssim_pieces,
     reference.depth_map: depth_map_pieces,
     reference.geometric_loss: geometric_pieces,

@@ -12,7 +12,7 @@ import numpy as np
 from minisplat_ref.datasets.synthetic.cameras import orbit_cameras
 from minisplat_ref.datasets.synthetic.scenes import SETTINGS
 from minisplat_ref.datasets.synthetic.sparse_points import sample_points
-from minisplat_ref.datasets.synthetic.tracer import TracedView, World, camera_centre, trace_view
+from minisplat_ref.datasets.synthetic.tracer import TracedView, World, trace_view
 from minisplat_ref.errors import InputError
 from minisplat_ref.types import Bools, Camera, Floats, Scene, View
 
@@ -102,7 +102,7 @@ def make_scene(
     points, colors, visibility = sample_points(
         world, [cameras[i] for i in train_ids], [traced[i] for i in train_ids], n_points, point_noise, point_rng
     )
-    train_centres = np.stack([camera_centre(cameras[i]) for i in train_ids])  # [V, 3]
+    train_centres = np.stack([cameras[i].center for i in train_ids])  # [V, 3]
     reach = np.linalg.norm(train_centres - train_centres.mean(axis=0), axis=1).max()
     seen = [np.flatnonzero(row) for row in visibility]  # of V views: the points that each sees
     scene = Scene(

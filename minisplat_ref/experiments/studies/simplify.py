@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from tqdm import tqdm
 
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
-from minisplat_ref.datasets.synthetic.tracer import camera_centre, pixel_rays
+from minisplat_ref.datasets.synthetic.tracer import pixel_rays
 from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.arguments import Commands, integer, listed
 from minisplat_ref.experiments.studies.front import (
@@ -154,7 +154,7 @@ def true_surface(source: str) -> dict[str, Floats]:
     for view, depth in zip(synthetic.scene.train_views, synthetic.train_depths, strict=True):
         rays = pixel_rays(view.camera, 0.5, 0.5, np.arange(view.camera.height))  # [H * W, 3] of camera z = 1
         depths = depth.ravel()[:, None]
-        points.append((camera_centre(view.camera) + depths * rays)[depths[:, 0] > 0])
+        points.append((view.camera.center + depths * rays)[depths[:, 0] > 0])
     return {"surface": np.concatenate(points)}
 
 

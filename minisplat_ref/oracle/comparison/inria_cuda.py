@@ -81,7 +81,7 @@ def _arrays(rasterizer: ModuleType, truth: Golden, device: str) -> Arrays:
         "viewmatrix": tensor(view.T),  # row vectors
         "projmatrix": tensor((clip @ view).T),
         "sh_degree": truth.sh_degree,
-        "campos": tensor(-camera.cam_from_world_R.T @ camera.cam_from_world_t),
+        "campos": tensor(camera.center),
         "prefiltered": False,
         "debug": False,
     }

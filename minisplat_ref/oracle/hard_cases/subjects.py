@@ -11,11 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.backends import Backend
-from minisplat_ref.batch import checked_batch, draw
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
-from minisplat_ref.gsplat_door import rasterization, rasterization_vjp
+from minisplat_ref.gsplat_compat import Views, checked_batch, draw, rasterization, rasterization_vjp
 from minisplat_ref.rendering import render, render_vjp
-from minisplat_ref.splatting import SplatTape
+from minisplat_ref.splatting import Primitives, SplatTape
 from minisplat_ref.types import Bools, Camera, Floats, Gaussians
 from minisplat_ref.validation import check_gaussians, chosen_conventions
 
@@ -119,7 +118,7 @@ def splat_tapes(subject: Subject, backend: Backend) -> list[SplatTape]:
     if not isinstance(subject, Call):
         return []
     a, options = subject.arrays, subject.options
-    primitives = (a["means"], a["quats"], a["scales"], a["opacities"])
+    primitives = Primitives(a["means"], a["quats"], a["scales"], a["opacities"])
     conventions = chosen_conventions(
         options.get("profile", GSPLAT_MAIN),
         options.get("near_plane"),
@@ -127,8 +126,9 @@ def splat_tapes(subject: Subject, backend: Backend) -> list[SplatTape]:
         options.get("eps2d"),
         options.get("rasterize_mode", "classic"),
     )
-    views = (a["colors"], a["viewmats"], a["Ks"], subject.width, subject.height)
-    batch = checked_batch(primitives, *views, options.get("sh_degree"), options.get("backgrounds"), "RGB")
+    views = Views(a["viewmats"], a["Ks"], subject.width, subject.height)
+    sh_degree, backgrounds = options.get("sh_degree"), options.get("backgrounds")
+    batch = checked_batch(primitives, views, a["colors"], sh_degree, backgrounds, "RGB")
     return [draw(batch, c, conventions, backend) for c in range(len(batch.cameras))]
 
 
