@@ -151,7 +151,7 @@ def _draw_parameters(subject: Parameters, backend: Backend, dtype: np.dtype) -> 
     def vjp(v: Arrays) -> Arrays:
         gradient = render_vjp(tape, v["image"], v["alpha"])
         blocks = {**gradient.gaussians._asdict(), **gradient._asdict()}
-        del blocks["gaussians"], blocks["means2d"]
+        del blocks["gaussians"], blocks["means2d"], blocks["shared"]
         return blocks
 
     return Drawing(outputs, vjp, ("image", "alpha"))
