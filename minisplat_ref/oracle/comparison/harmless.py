@@ -10,9 +10,9 @@ import numpy as np
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.oracle.comparison.measure import difference
 from minisplat_ref.oracle.golden.arrays import Arrays
-from minisplat_ref.oracle.golden.flips import flip_candidates
 from minisplat_ref.oracle.golden.scenes import Golden
 from minisplat_ref.oracle.golden.stages import grid_of, projection_of, reference_bins
+from minisplat_ref.oracle.thresholds import thresholds
 from minisplat_ref.oracle.tolerances import COMPARE_FLOAT64
 from minisplat_ref.types import Bools, Floats, Ints, Projection, TileBins
 
@@ -105,7 +105,7 @@ def _changes_image(projection: Projection, bins: TileBins, truth: Golden) -> boo
     """Whether the reference's image is another one with these boxes and lists."""
     arrays = truth.arrays
     output = REFERENCE.composite(projection, arrays["colors"], arrays["background"], bins, truth.conventions)
-    may_flip = flip_candidates(projection, bins, truth.conventions)
+    may_flip = thresholds(projection, bins, truth.conventions).jumps
     pairs = ((output.image, arrays["image"]), (output.alpha, arrays["alpha"]))
     return any(difference(a, b, COMPARE_FLOAT64, may_flip).n_over for a, b in pairs)
 

@@ -13,9 +13,9 @@ from minisplat_ref.oracle.comparison.harmless import Bounds, compare_bounds, com
 from minisplat_ref.oracle.comparison.measure import Difference, difference
 from minisplat_ref.oracle.comparison.renderers import Renderer
 from minisplat_ref.oracle.golden.arrays import SPECS, Arrays
-from minisplat_ref.oracle.golden.flips import flip_candidates
 from minisplat_ref.oracle.golden.scenes import Golden
 from minisplat_ref.oracle.golden.stages import projection_of, reference_bins
+from minisplat_ref.oracle.thresholds import thresholds
 from minisplat_ref.types import Bools
 
 Status = Literal["agrees", "diverges", "harmless", "not given"]
@@ -89,7 +89,7 @@ def compare_scene(renderer: Renderer, truth: Golden) -> list[Row]:
     _check_shapes(renderer, given, truth)
     tile_size = tuple(map(int, truth.arrays["tile_size"]))
     bins = reference_bins(truth.arrays, truth.conventions, (tile_size[0], tile_size[1]))
-    may_flip = flip_candidates(projection_of(truth.arrays), bins, truth.conventions)
+    may_flip = thresholds(projection_of(truth.arrays), bins, truth.conventions).jumps
     rows: list[Row] = []
     for stage, names in STAGES.items():
         if stage == "radii":

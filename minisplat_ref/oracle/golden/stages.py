@@ -10,8 +10,8 @@ import numpy as np
 from minisplat_ref.backends import REFERENCE, Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.oracle.golden.arrays import STAGE_COTANGENTS, Arrays
-from minisplat_ref.oracle.golden.flips import flip_candidates
 from minisplat_ref.oracle.golden.scenes import RECIPES, Golden, inputs
+from minisplat_ref.oracle.thresholds import thresholds
 from minisplat_ref.types import Floats, Projection, ProjectionGradient, RenderOutput, TileBins, TileGrid
 
 # Fields of a stage's result, by array.
@@ -121,7 +121,7 @@ def truth(scene: Golden, *, seed: int = 0, zeros: tuple[str, ...] = ()) -> Golde
     known = scene.arrays | forward
     tile_size = (REFERENCE.tile_width, REFERENCE.tile_height)
     bins = reference_bins(known, scene.conventions, tile_size)
-    is_sure = ~flip_candidates(projection_of(known), bins, scene.conventions)
+    is_sure = ~thresholds(projection_of(known), bins, scene.conventions).is_near
     rng = np.random.default_rng(seed)
     cotangents = {
         "v_image": rng.uniform(-1, 1, forward["image"].shape) * is_sure[:, :, None],

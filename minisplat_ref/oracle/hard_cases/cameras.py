@@ -6,7 +6,7 @@ from minisplat_ref.constants import INRIA
 from minisplat_ref.oracle.hard_cases.case import HardCase
 from minisplat_ref.oracle.hard_cases.scenes import call, camera, cloud, gaussians, intrinsics
 from minisplat_ref.oracle.hard_cases.subjects import Parameters
-from minisplat_ref.oracle.hard_cases.tolerances import LONG
+from minisplat_ref.oracle.tolerances import LONG
 
 CULLED = "culled: the background, and no gradient"
 BESIDE = [[1.2, 0.1, 1.0], [-1.4, -0.3, 1.0], [0.2, 1.1, 1.0], [0.1, 0.2, 3.0]]  # slopes beyond 1.3 tan(fov / 2)

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from minisplat_ref.oracle.hard_cases.subjects import Subject
-from minisplat_ref.oracle.hard_cases.tolerances import ORDINARY, Tolerance
+from minisplat_ref.oracle.tolerances import ORDINARY, HardCaseTolerance
 
 
 class HardCase(NamedTuple):
@@ -18,7 +18,7 @@ class HardCase(NamedTuple):
     """What a correct renderer does, one line."""
     build: Callable[[], Subject]
     """Makes the scene; its numbers are the same in every precision."""
-    tolerance: Tolerance = ORDINARY
+    tolerance: HardCaseTolerance = ORDINARY
     """How far each precision may be from the float64 reference."""
     is_background: bool = False
     """Whether the image is the background and nothing but the background has a gradient."""

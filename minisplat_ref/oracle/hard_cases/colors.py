@@ -6,7 +6,7 @@ from minisplat_ref.constants import SH_C0
 from minisplat_ref.oracle.hard_cases.case import HardCase
 from minisplat_ref.oracle.hard_cases.scenes import call, camera, cloud, gaussians, rounded
 from minisplat_ref.oracle.hard_cases.subjects import Call, Parameters
-from minisplat_ref.oracle.hard_cases.tolerances import HARMONICS
+from minisplat_ref.oracle.tolerances import HARMONICS
 from minisplat_ref.types import Floats
 
 AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}

@@ -5,7 +5,7 @@ import numpy as np
 from minisplat_ref.oracle.hard_cases.case import HardCase
 from minisplat_ref.oracle.hard_cases.scenes import call, camera, cloud, gaussians
 from minisplat_ref.oracle.hard_cases.subjects import Parameters
-from minisplat_ref.oracle.hard_cases.tolerances import FAINT
+from minisplat_ref.oracle.tolerances import FAINT
 
 EVERY_PIXEL = "as a cut from a larger image"
 

@@ -5,7 +5,7 @@ import numpy as np
 from minisplat_ref.oracle.hard_cases.case import HardCase
 from minisplat_ref.oracle.hard_cases.scenes import rounded
 from minisplat_ref.oracle.hard_cases.subjects import Pictures
-from minisplat_ref.oracle.hard_cases.tolerances import SIMILARITY
+from minisplat_ref.oracle.tolerances import SIMILARITY
 from minisplat_ref.types import Floats
 
 

@@ -5,7 +5,7 @@ import numpy as np
 from minisplat_ref.oracle.hard_cases.case import HardCase
 from minisplat_ref.oracle.hard_cases.scenes import cloud, moved_world
 from minisplat_ref.oracle.hard_cases.subjects import Call, Parameters
-from minisplat_ref.oracle.hard_cases.tolerances import ORDINARY, WORLD
+from minisplat_ref.oracle.tolerances import ORDINARY, WORLD
 
 RELATIVE = "the image of the means that float32 holds: the camera's centre is subtracted before anything is rounded"
 
