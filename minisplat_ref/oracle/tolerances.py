@@ -8,6 +8,8 @@ rounding decides. Relative tolerances are relative to the largest value compared
 
 from typing import NamedTuple
 
+import numpy as np
+
 # --- gradients against differences ---
 
 # Sixth-order differences in float64: rounding 1e-16 / 1e-4 of values up to 100, truncation below it.
@@ -38,16 +40,36 @@ TRUTH_FLOAT32 = 2e-6
 # of terms. Wrong formulas are off by 1e-4 and more.
 COMPARE_FLOAT64 = 1e-9
 
-# The same in float32, fed with the input rounded or with its own of the stage before: a few roundings of 6e-8 ...
-COMPARE_FLOAT32_POSITION = 2e-6
+
+class StageTolerance(NamedTuple):
+    """How far another renderer's array may be off, as a part of the largest value of the array."""
+
+    float64: float
+    float32: float
+    """Fed with the input rounded, or with its own of the stage before."""
+    reason: str
+    """Of float32, one line; published with the golden vectors."""
+
+    def of(self, dtype: str | np.dtype) -> float:
+        """Return the tolerance for results computed in ``dtype``."""
+        return self.float32 if np.dtype(dtype) == np.float32 else self.float64
+
+
+EXACT = StageTolerance(0.0, 0.0, "given or counted, not computed; a difference may still be harmless")
+# A few roundings of 6e-8 ...
+POSITION = StageTolerance(COMPARE_FLOAT64, 2e-6, "a product with the view matrix and one division")
 # ... divided by the determinant of a covariance whose condition number is up to 1e2 ...
-COMPARE_FLOAT32_SHAPE = 2e-5
+SHAPE = StageTolerance(
+    COMPARE_FLOAT64, 2e-5, "the 2x2 inverse multiplies rounding by the condition number of the covariance"
+)
 # ... through an exponential of relative error 1e-7 to 1e-6, hundreds of times in a pixel ...
-COMPARE_FLOAT32_IMAGE = 2e-5
+IMAGE = StageTolerance(COMPARE_FLOAT64, 2e-5, "hundreds of hits a pixel, each with an exponential")
 # ... relative to windowed variances, differences of means, which count beside C2 = 9e-4 ...
-COMPARE_FLOAT32_LOSS = 5e-5
+LOSS = StageTolerance(COMPARE_FLOAT64, 5e-5, "variances are differences of means, divided by at least C2 = 9e-4")
 # ... and in sums of either sign over pixels, divided by 1 - alpha >= 0.01.
-COMPARE_FLOAT32_GRADIENT = 1e-4
+GRADIENT = StageTolerance(
+    COMPARE_FLOAT64, 1e-4, "sums over pixels of either sign, divided by 1 - alpha >= 0.01 and by z^2"
+)
 
 # --- the benchmark's contenders ---
 

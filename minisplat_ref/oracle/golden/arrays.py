@@ -6,25 +6,12 @@ stand in theirs. Left out: the activations (exponential, sigmoid), which belong 
 
 from typing import Any, Literal, NamedTuple
 
-import numpy as np
 from numpy.typing import NDArray
 
-from minisplat_ref.oracle import tolerances
+from minisplat_ref.oracle.tolerances import EXACT, GRADIENT, IMAGE, LOSS, POSITION, SHAPE, StageTolerance
 
 Arrays = dict[str, NDArray[Any]]
 Role = Literal["input", "output", "cotangent", "gradient"]
-
-
-class Tolerance(NamedTuple):
-    """How far another backend may be off, as a part of the largest value of the array."""
-
-    float64: float
-    float32: float
-    reason: str
-
-    def of(self, dtype: str | np.dtype) -> float:
-        """Return the tolerance for results computed in ``dtype``."""
-        return self.float32 if np.dtype(dtype) == np.float32 else self.float64
 
 
 class ArraySpec(NamedTuple):
@@ -44,35 +31,8 @@ class ArraySpec(NamedTuple):
     """Unit and frame."""
     meaning: str
     """One line."""
-    tolerance: Tolerance
+    tolerance: StageTolerance
 
-
-EXACT = Tolerance(0.0, 0.0, "given or counted, not computed; a difference may still be harmless")
-POSITION = Tolerance(
-    tolerances.COMPARE_FLOAT64,
-    tolerances.COMPARE_FLOAT32_POSITION,
-    "a product with the view matrix and one division",
-)
-SHAPE = Tolerance(
-    tolerances.COMPARE_FLOAT64,
-    tolerances.COMPARE_FLOAT32_SHAPE,
-    "the 2x2 inverse multiplies rounding by the condition number of the covariance",
-)
-IMAGE = Tolerance(
-    tolerances.COMPARE_FLOAT64,
-    tolerances.COMPARE_FLOAT32_IMAGE,
-    "hundreds of hits a pixel, each with an exponential",
-)
-LOSS = Tolerance(
-    tolerances.COMPARE_FLOAT64,
-    tolerances.COMPARE_FLOAT32_LOSS,
-    "variances are differences of means, divided by at least C2 = 9e-4",
-)
-GRADIENT = Tolerance(
-    tolerances.COMPARE_FLOAT64,
-    tolerances.COMPARE_FLOAT32_GRADIENT,
-    "sums over pixels of either sign, divided by 1 - alpha >= 0.01 and by z^2",
-)
 
 _WORLD, _PX = "world units, world frame", "px"
 _SPECS: tuple[tuple[Any, ...], ...] = (
