@@ -13,11 +13,9 @@ from minisplat_ref.cli import main
 from minisplat_ref.constants import Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.golden import files
-from minisplat_ref.oracle.golden.arrays import SPECS, STAGE_COTANGENTS, STAGE_INPUTS
 from minisplat_ref.oracle.golden.files import MANIFEST, README, export, load
-from minisplat_ref.oracle.golden.readme import convention_words
-from minisplat_ref.oracle.golden.scenes import RECIPES, inputs
-from minisplat_ref.oracle.golden.stages import golden_scenes, projection_of, reference_bins, truth
+from minisplat_ref.oracle.golden.format import SPECS, STAGE_COTANGENTS, STAGE_INPUTS, convention_words
+from minisplat_ref.oracle.golden.scenes import RECIPES, golden_scenes, inputs, projection_of, reference_bins, truth
 from minisplat_ref.oracle.thresholds import thresholds
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.reference.pinhole import slope_limits

@@ -10,9 +10,8 @@ from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle import hard_cases
 from minisplat_ref.oracle.hard_cases import GROUPS, HARD_CASES
-from minisplat_ref.oracle.hard_cases.run import PRECISIONS, Precision, matching, run_hard_case, run_hard_cases
+from minisplat_ref.oracle.hard_cases.run import PRECISIONS, Precision, by_group, matching, run_hard_case, run_hard_cases
 from minisplat_ref.oracle.hard_cases.subjects import Call, Parameters, drawing
-from minisplat_ref.oracle.hard_cases.summary import by_group
 from minisplat_ref.oracle.tolerances import ORDINARY
 
 BY_NAME = {case.name: case for case in HARD_CASES}

@@ -165,4 +165,4 @@ def _of_tile(
     change = np.where(is_skip & is_open, before * (alpha_min + margin), 0).sum(axis=0)
     change += np.where(is_tie & is_open, before * alphas * behind, 0).sum(axis=0)
     change += np.where(is_stop, before, 0).max(axis=0)  # all that lies at and behind the hit that may stop
-    return _OfTile(change, change > 0, is_clamp.any(axis=0), is_median.any(axis=0))
+    return _OfTile(change, change > 0, np.logical_or.reduce(is_clamp, axis=0), np.logical_or.reduce(is_median, axis=0))

@@ -90,9 +90,8 @@ def add_parser(checks: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compare every scene, print the table of stages."""
-    from minisplat_ref.oracle.comparison.choose import choose_renderer, choose_scenes
-    from minisplat_ref.oracle.comparison.report import as_report
-    from minisplat_ref.oracle.comparison.staged import compare_scene
+    from minisplat_ref.oracle.comparison.renderers import choose_renderer, choose_scenes
+    from minisplat_ref.oracle.comparison.staged import as_report, compare_scene
 
     renderer = choose_renderer(args.backend, args.dtype)
     scenes, left_out = choose_scenes(renderer, args.scene, args.against, args.profile)

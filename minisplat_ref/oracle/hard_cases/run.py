@@ -2,12 +2,13 @@
 
 Verdict of a case: refused with the message that it expects, in every precision; or all outputs and all gradients finite
 and as near to the reference as its tolerance says. Derivatives by the outputs are random, fixed and the same in all
-precisions, and zero at pixels that stand on a threshold: see :mod:`minisplat_ref.oracle.thresholds`.
+precisions, and zero at pixels that stand on a threshold: see :mod:`minisplat_ref.oracle.thresholds`. The summary has a
+line for each kind: how many cases, how many are refused, and how far the worst is from the reference.
 """
 
 import fnmatch
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,8 +16,7 @@ import numpy as np
 from minisplat_ref.backends import CPU, CPU_EXACT, REFERENCE, Backend
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.cases import Case, Figure, Report
-from minisplat_ref.oracle.hard_cases.case import HardCase
-from minisplat_ref.oracle.hard_cases.subjects import Arrays, Drawing, Subject, drawing, splat_tapes
+from minisplat_ref.oracle.hard_cases.subjects import Arrays, Drawing, HardCase, Subject, drawing, splat_tapes
 from minisplat_ref.oracle.thresholds import Thresholds, thresholds
 from minisplat_ref.oracle.tolerances import BLOCK_FLOOR, OWN_KERNELS
 from minisplat_ref.splatting import SplatTape
@@ -210,3 +210,36 @@ def _gradient_error(actual: Arrays, expected: Arrays, least: float) -> tuple[str
         errors[key] = difference / size
     worst = max(errors, key=lambda key: errors[key])
     return worst.removeprefix("v_"), errors[worst]
+
+
+def by_group(report: Report, groups: Mapping[str, Sequence[HardCase]]) -> Report:
+    """Summarise a report, a row for each group that has cases in it.
+
+    Parameters
+    ----------
+    report : Report
+        From :func:`run_hard_cases`.
+    groups : mapping
+        The catalogue by kind.
+
+    Returns
+    -------
+    Report
+        Its figures: number of cases, how many were refused, the largest of each error, the sum of the flips.
+    """
+    rows = []
+    for name, members in groups.items():
+        names = {member.name for member in members}
+        cases = [case for case in report.cases if case.name in names]
+        if cases:
+            rows.append(Case(name, all(case.passed for case in cases), _figures(cases)))
+    return Report(report.title, tuple(rows), report.settings)
+
+
+def _figures(cases: Sequence[Case]) -> dict[str, Figure]:
+    drawn = [case.figures for case in cases if case.figures]
+    figures: dict[str, Figure] = {"cases": len(cases), "refused": sum(not case.figures for case in cases)}
+    for key in drawn[0] if drawn else ():
+        values = [value for row in drawn if isinstance(value := row[key], int | float)]
+        figures[key] = sum(values) if isinstance(values[0], int) else max(values)
+    return figures
