@@ -134,6 +134,20 @@ def test_flips_are_counted_and_bounded():
     assert not result.passed and "more than one hit" in result.note and result.figures["flips"] == 1
 
 
+def test_a_threshold_excuses_only_what_its_hits_can_change():
+    """At the clamp the gradient jumps, and the image does not."""
+
+    def brighter(image):
+        changed = image.copy()
+        changed[4, 4] += 1e-3
+        return changed
+
+    case = BY_NAME["alpha-at-the-clamp"]
+    assert run_hard_case(case).figures["on threshold"] >= 1
+    result = run_hard_case(case, with_composite(brighter))
+    assert not result.passed and "a pixel on a threshold is off by 1.0e-03" in result.note
+
+
 def test_tolerances_are_what_decides():
     strict = ORDINARY._replace(image32=0.0)
     assert not run_hard_case(BY_NAME["ball"]._replace(tolerance=strict), (PRECISIONS[-1],)).passed
