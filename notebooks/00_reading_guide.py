@@ -221,7 +221,7 @@ display(Markdown("\n".join(["| module | what it says of itself |", "|---|---|", 
 # | 11 | `strategy/aggressive_clone.py`, `visibility.py` | 10 | aggressive clone and visibility culling |
 # | 12 | `methods/mini_splatting.py`, `mini_splatting2.py` | 11 | three recipes side by side |
 # | 13 | `oracle/differences.py`, `gradients.py`, `planted.py` | 12 | how a gradient check lies |
-# | 14 | `oracle/golden/`, `comparison/` | 13 | comparing a backend with the oracle |
+# | 14 | `oracle/golden/`, `comparison/`, `thresholds.py` | 13 | comparing a backend with the oracle |
 # | 15 | `scalar/`, then `cpu/` | 15 | how the same formulas run fast: eight pixels at a time |
 # | 16 | `bench/` | 14 | speed against error |
 #

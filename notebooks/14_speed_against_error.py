@@ -24,7 +24,7 @@
 # |---|---|
 # | `minisplat_ref/bench/workloads.py` | what is drawn |
 # | `minisplat_ref/bench/contenders.py` | who draws it |
-# | `minisplat_ref/bench/flips.py` | which pixels stand at a threshold |
+# | `minisplat_ref/oracle/thresholds.py` | which pixels stand at a threshold |
 # | `minisplat_ref/bench/judging.py`, `race.py` | errors, then times |
 #
 # **Frames and units:** images are [H, W, 3] with values in [0, 1]; an error of an image is an absolute difference, an

@@ -7,9 +7,9 @@ import numpy as np
 
 from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.bench.contenders import Contender
-from minisplat_ref.bench.flips import Thresholds, thresholds
 from minisplat_ref.bench.workloads import Workload
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
+from minisplat_ref.oracle.thresholds import Thresholds, thresholds_of_view
 from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.types import Floats, Gaussians
 
@@ -59,7 +59,7 @@ def expect(workload: Workload, backend: Backend, conventions: Conventions = GSPL
     drawn = time.perf_counter()
     gradient = render_vjp(tape, workload.v_image).gaussians
     differentiated = time.perf_counter()
-    at = thresholds(tape)
+    at = thresholds_of_view(tape.splats)
     quiet = render_vjp(tape, quiet_cotangent(workload, at)).gaussians
     return Expected(output.image, gradient, quiet, at, drawn - start, differentiated - drawn)
 
@@ -67,7 +67,7 @@ def expect(workload: Workload, backend: Backend, conventions: Conventions = GSPL
 def with_slack(expected: Expected, workload: Workload, conventions: Conventions, slack: float) -> Expected:
     """Return the same answer with wider margins at the thresholds."""
     _, tape = render(workload.gaussians, workload.camera, conventions=conventions, backend=CPU)
-    at = thresholds(tape, slack)
+    at = thresholds_of_view(tape.splats, slack)
     quiet = render_vjp(tape, quiet_cotangent(workload, at)).gaussians
     return expected._replace(thresholds=at, quiet_gradient=quiet)
 

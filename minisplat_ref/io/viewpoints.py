@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.io.scene import ROTATION_TOLERANCE
 from minisplat_ref.types import Camera, Floats, Scene
 
 ORBIT_FOV = math.radians(50.0)  # horizontal, of an orbit that has no run's cameras to take it from
 ORBIT_ELEVATION = math.radians(20.0)  # likewise
-ROTATION_TOLERANCE = 1e-3  # of R R^T against the identity: files hold six digits or more
 
 
 class Viewpoint(NamedTuple):
@@ -99,7 +99,7 @@ def _viewpoint(entry: Any, where: str) -> Viewpoint:
         raise InputError(f"{where}: position must be 3 and rotation 3 x 3 finite numbers, like fx, fy, cx, cy, time")
     if min(width, height) < 1 or min(fx, fy) <= 0:
         raise InputError(f"{where}: width, height, fx, fy must be positive")
-    is_rotation = np.abs(rotation @ rotation.T - np.eye(3)).max() < ROTATION_TOLERANCE and np.linalg.det(rotation) > 0
+    is_rotation = np.abs(rotation @ rotation.T - np.eye(3)).max() <= ROTATION_TOLERANCE and np.linalg.det(rotation) > 0
     if not is_rotation:
         raise InputError(f"{where}: rotation is not a rotation matrix")
     camera = Camera(rotation.T.copy(), -rotation.T @ position, fx, fy, cx, cy, width, height)

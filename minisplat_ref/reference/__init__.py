@@ -10,7 +10,7 @@ pinhole              where a camera sees a point, and how that moves with the po
 antialiasing         how to make up for the blur that keeps ellipses visible         EWA splatting, Mip-Splatting
 projection           how the camera flattens an ellipsoid to an ellipse in pixels    3DGS (5), EWA splatting (31)
 extent               which pixels that ellipse can reach                             Mini-Splatting2, gsplat
-spherical_harmonics  how its colour depends on the viewing direction                 3DGS sec. 5.2
+spherical_harmonics  how its colour depends on the viewing direction                 3DGS sec. 3
 tiling               how ellipses are sorted, tile by tile, front to back            3DGS sec. 6
 hits                 how strongly an ellipse covers a pixel, and what it leaves      3DGS (3), (4)
 compositing          how hits become a pixel, and a pixel's error becomes theirs     3DGS (3)

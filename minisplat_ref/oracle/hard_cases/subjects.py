@@ -1,8 +1,9 @@
-"""What can be drawn, as data, and how each kind goes through the public boundary and back.
+"""What a hard case is, and how what it draws goes through the public boundary and back.
 
 A subject holds float64 arrays whose numbers float32 holds too, so that every precision is given the same scene. What is
 refused is refused where users' input is: by :func:`check_gaussians`, with which every reader of a file ends, and by the
-checks of :func:`rasterization`.
+checks of :func:`rasterization`. A case adds why the subject is hard, what is right, and how near a precision has to
+come.
 """
 
 from collections.abc import Callable
@@ -13,6 +14,7 @@ import numpy as np
 from minisplat_ref.backends import Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.gsplat_compat import Views, checked_batch, draw, rasterization, rasterization_vjp
+from minisplat_ref.oracle.tolerances import ORDINARY, HardCaseTolerance
 from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.splatting import Primitives, SplatTape
 from minisplat_ref.types import Bools, Camera, Floats, Gaussians
@@ -62,6 +64,25 @@ class Surface(NamedTuple):
 
 
 Subject = Parameters | Call | Pictures | Surface
+
+
+class HardCase(NamedTuple):
+    """One entry of the catalogue."""
+
+    name: str
+    """Unique; words with hyphens."""
+    why: str
+    """Why it is hard, one line."""
+    correct: str
+    """What a correct renderer does, one line."""
+    build: Callable[[], Subject]
+    """Makes the scene; its numbers are the same in every precision."""
+    tolerance: HardCaseTolerance = ORDINARY
+    """How far each precision may be from the float64 reference."""
+    is_background: bool = False
+    """Whether the image is the background and nothing but the background has a gradient."""
+    refusal: str | None = None
+    """Part of the message with which the input is refused; None where it is drawn."""
 
 
 class Drawing(NamedTuple):
