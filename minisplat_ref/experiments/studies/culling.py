@@ -9,7 +9,6 @@ without, one iteration of each in turn. Gaussians from a PLY are measured as the
 import argparse
 import copy
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,11 +17,9 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from minisplat_ref.experiments.arguments import Commands, integer
 from minisplat_ref.experiments.studies.front import (
     BLUE,
     RED,
-    add_scene_arguments,
     describe_scene,
     read_scene,
     table,
@@ -45,22 +42,6 @@ from minisplat_ref.types import Bools, Gaussians, Scene
 
 RECIPE = "mini-splatting2"
 WARM_UP = 5  # iterations of either arm that are not timed
-
-
-def add_parser(commands: Commands) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "culling",
-        help="the part of the Gaussians that visibility culling removes, and the time it saves",
-        description=f"Train a scene with {RECIPE}, and measure what visibility culling does on the way.",
-    )
-    add_scene_arguments(parser, iterations=1800)
-    parser.add_argument("--ply", type=Path, metavar="FILE", help="measure these Gaussians, and train nothing")
-    parser.add_argument("--seed", type=integer(0), default=0, metavar="S", help="of the training (default 0)")
-    parser.add_argument(
-        "--repeats", type=integer(1), default=100, metavar="N", help="iterations to time, of either kind (default 100)"
-    )
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:

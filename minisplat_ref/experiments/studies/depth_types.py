@@ -10,7 +10,6 @@ true depth: it hangs in front of the sky if it is nearer than the depth within w
 
 import argparse
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,12 +19,9 @@ from tqdm import tqdm
 
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, SyntheticScene, make_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.arguments import Commands, integer, listed
 from minisplat_ref.experiments.studies.front import (
     BLUE,
-    FIGURE,
     RED,
-    RESULT,
     describe_scene,
     mean_and_deviation,
     table,
@@ -83,25 +79,6 @@ MEASURES = {
     "n_points": "points",
     "psnr": "PSNR (dB)",
 }
-
-
-def add_parser(commands: Commands) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "depth",
-        help="depth reinitialisation from mid-points, centres and blended depth, and with guards",
-        description="Reinitialise a synthetic scene from depth in several ways, compare with the truth, and train on.",
-    )
-    parser.add_argument("scene", metavar="SCENE", help=f"a synthetic scene: {', '.join(SCENE_NAMES)}")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=f"new folder for {RESULT} and {FIGURE}")
-    parser.add_argument(
-        "--iterations", type=integer(1), default=1500, metavar="N", help="before reinitialisation (default 1500)"
-    )
-    parser.add_argument(
-        "--train-on", type=integer(1), default=500, metavar="M", help="iterations after it (default 500)"
-    )
-    parser.add_argument("--seeds", type=listed(integer(0)), default=(0, 1, 2), metavar="S,T", help="default 0,1,2")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:

@@ -1,6 +1,5 @@
-"""What the studies share: the scene, the arguments, tables, and a folder with JSON and a figure."""
+"""What the studies share: the scene, tables, and a folder with JSON and a figure."""
 
-import argparse
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,27 +10,13 @@ from matplotlib.figure import Figure
 
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.arguments import integer
 from minisplat_ref.experiments.measure import machine
+from minisplat_ref.experiments.studies import FIGURE, RESULT
 from minisplat_ref.io import load_scene
 from minisplat_ref.types import Scene
 
-RESULT, FIGURE = "result.json", "figure.png"
 PNG_DPI = 150
 BLUE, RED = "#35608c", "#d2493f"
-
-
-def add_scene_arguments(parser: argparse.ArgumentParser, iterations: int) -> None:
-    """Add the scene, ``--out``, ``--iterations`` and ``--downscale``."""
-    names = ", ".join(SCENE_NAMES)
-    parser.add_argument("scene", metavar="SCENE", help=f"folder of a scene, or a synthetic one: {names}")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=f"new folder for {RESULT} and {FIGURE}")
-    parser.add_argument(
-        "--iterations", type=integer(1), default=iterations, metavar="N", help=f"of a training (default {iterations})"
-    )
-    parser.add_argument(
-        "--downscale", type=integer(1), default=1, metavar="D", help="make a folder's photographs D times smaller"
-    )
 
 
 def read_scene(source: str, downscale: int) -> Scene:
