@@ -34,7 +34,7 @@ def read_result(folder):
 
 def table_rows(text):
     """Cells of the Markdown table without its header."""
-    lines = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("|")]
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
     return {line[0]: line[1:] for line in lines[2:]}
 
 

@@ -44,7 +44,8 @@ def test_study(tmp_path, capsys, monkeypatch):
     assert result["machine"] and result["size"] == [32, 24] and len(result["runs"]) == 2 * len(depth_types.CHOICES)
 
     runs = {(run["choice"], run["seed"]): run for run in result["runs"]}
-    lines = [line.strip("| ").split(" | ") for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
+    printed = capsys.readouterr().out.splitlines()
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in printed if line.startswith("|")]
     assert [line[0] for line in lines[2:]] == list(depth_types.CHOICES)
     for choice, *cells in lines[2:]:
         first, second = runs[choice, 0], runs[choice, 1]

@@ -81,7 +81,8 @@ def test_study(scene_folder, dense_file, tmp_path, capsys, restart):
     assert abs(row["chamfer_dense"] - nearest.mean()) < CLOSED_FORM  # the other way it is 0: they were kept
 
     # The table says the means and deviations.
-    lines = [line.strip("| ").split(" | ") for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
+    printed = capsys.readouterr().out.splitlines()
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in printed if line.startswith("|")]
     assert len(lines) == 2 + 9
     for label, n, choice, *cells in lines[2:]:
         values = [runs[label, choice, seed]["psnr_tuned"] for seed in (0, 1)]

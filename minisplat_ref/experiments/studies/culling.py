@@ -22,7 +22,7 @@ from minisplat_ref.experiments.studies.front import (
     RED,
     describe_scene,
     read_scene,
-    table,
+    tidy,
     title,
     write,
 )
@@ -31,6 +31,7 @@ from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.methods import get_recipe, mini_splatting, mini_splatting2
 from minisplat_ref.metrics import psnr
 from minisplat_ref.rendering import render
+from minisplat_ref.reporting import markdown_table
 from minisplat_ref.strategy.importance import collect_importance
 from minisplat_ref.strategy.ops import contiguous
 from minisplat_ref.strategy.visibility import culled_fraction
@@ -72,7 +73,9 @@ def run(args: argparse.Namespace) -> None:
         write(folder, {**description, **settings, "repeats": args.repeats, "places": result}, draw(rows))
     print(f"{title(description)}\n{RECIPE}, {args.iterations} iterations, seed {args.seed}, {args.repeats} timed\n")
     header = ("", "Gaussians", "in the frustum of a view", "culled of these", "of the pairs with tiles")
-    print(table([*header, "ms without", "ms with", "ratio", "PSNR without (dB)", "with (dB)"], to_rows(result)))
+    print(
+        markdown_table([*header, "ms without", "ms with", "ratio", "PSNR without (dB)", "with (dB)"], to_rows(result))
+    )
 
 
 def step_of(recipe: Recipe, action: object) -> int:
@@ -216,8 +219,7 @@ def draw(places: dict[str, dict[str, NDArray[Any]]]) -> Figure:
     times.set(title="training iterations that take at most", xlabel="ms", ylabel="%", xlim=(0, None))
     cost.set(title="PSNR with culling less PSNR without", xlabel="training view", ylabel="dB")
     for axes in (culled, times, cost):
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(color="#e6eaee")
+        tidy(axes)
     culled.legend(frameon=False, fontsize=8)
     styles = [Line2D([], [], color="black", linestyle=style) for style in ("--", "-")]
     times.legend(styles, ["without", "with"], frameon=False, fontsize=8, loc="center left")

@@ -24,13 +24,14 @@ from minisplat_ref.experiments.studies.front import (
     RED,
     describe_scene,
     mean_and_deviation,
-    table,
+    tidy,
     title,
     write,
 )
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
+from minisplat_ref.reporting import markdown_table
 from minisplat_ref.strategy.depth_reinit import (
     PixelPoints,
     blended_points,
@@ -109,7 +110,7 @@ def run(args: argparse.Namespace) -> None:
     print(title(result))
     seeds = ", ".join(map(str, args.seeds))
     print(f"{RECIPE}, {args.iterations} iterations, then {args.train_on} from the new points; seeds {seeds}\n")
-    print(table(["points", *MEASURES.values()], to_rows(summary)))
+    print(markdown_table(["points", *MEASURES.values()], to_rows(summary)))
 
 
 def measure(truth: SyntheticScene, iterations: int, train_on: int, seeds: tuple[int, ...]) -> Iterator[dict[str, Any]]:
@@ -241,6 +242,5 @@ def draw(summary: dict[str, dict[str, tuple[float, float]]]) -> Figure:
             axes.errorbar(mean, line, xerr=deviation, color=color, marker="o", capsize=4)
         axes.set(title=MEASURES[name], xlabel="" if name == "psnr" else "%", ylim=(len(summary) - 0.5, -0.5))
         axes.set_yticks(range(len(summary)), list(summary))
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(axis="x", color="#e6eaee")
+        tidy(axes, grid="x")
     return figure

@@ -29,7 +29,7 @@ from minisplat_ref.experiments.studies.front import (
     describe_scene,
     mean_and_deviation,
     read_scene,
-    table,
+    tidy,
     title,
     write,
 )
@@ -37,6 +37,7 @@ from minisplat_ref.io import load_ply
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
+from minisplat_ref.reporting import markdown_table
 from minisplat_ref.strategy import simplify
 from minisplat_ref.strategy.importance import collect_importance, indoor
 from minisplat_ref.strategy.ops import Edit, contiguous, n_rows
@@ -92,7 +93,7 @@ def run(args: argparse.Namespace) -> None:
         result = {**describe_scene(scene), **settings, "counts": counts, "summary": summarise(runs), "runs": runs}
         write(folder, result, draw(result))
     print(f"{title(result)}\n{describe_dense(result)}\n")
-    print(table(*to_table(result)))
+    print(markdown_table(*to_table(result)))
 
 
 def train_dense(scene: Scene, recipe: Recipe, seed: int) -> Gaussians:
@@ -272,8 +273,7 @@ def draw(result: dict[str, Any]) -> Figure:
         axes.set(title=heading, ylabel=label, xlabel="Gaussians", xscale="log")
         axes.set_xticks(ticks, [f"{n:,}" for n in ticks])
         axes.minorticks_off()
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(color="#e6eaee")
+        tidy(axes)
         if name == "psnr":
             axes.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(0, 0.92))
     return figure

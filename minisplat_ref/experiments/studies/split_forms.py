@@ -21,13 +21,14 @@ from minisplat_ref.experiments.studies.front import (
     describe_scene,
     mean_and_deviation,
     read_scene,
-    table,
+    tidy,
     title,
     write,
 )
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.methods import RECIPES, get_recipe, mini_splatting
 from minisplat_ref.metrics import evaluate
+from minisplat_ref.reporting import markdown_table
 from minisplat_ref.strategy.blur_split import principal_axis_children
 from minisplat_ref.strategy.clone_split import random_children
 from minisplat_ref.training.loop import train
@@ -69,7 +70,7 @@ def run(args: argparse.Namespace) -> None:
         write(folder, {**description, **settings, "summary": summary, "runs": runs}, draw(summary, runs))
     print(title(description))
     print(f"{args.recipe}, {args.iterations} iterations, seeds {', '.join(map(str, args.seeds))}\n")
-    print(table(["blur split, children", "PSNR (dB)", "SSIM", "Gaussians", "seconds"], to_rows(summary)))
+    print(markdown_table(["blur split, children", "PSNR (dB)", "SSIM", "Gaussians", "seconds"], to_rows(summary)))
 
 
 def variant(recipe: Recipe, form: str) -> Recipe:
@@ -131,8 +132,7 @@ def draw(summary: dict[str, dict[str, tuple[float, float]]], runs: list[dict[str
             values = [run[name] for run in runs if run["form"] == form]
             axes.plot(values, [line + 0.18] * len(values), "|", color=color, markersize=5)
         axes.set(title=label, yticks=range(len(FORMS)), yticklabels=FORMS, ylim=(-0.6, len(FORMS) - 0.4))
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(axis="x", color="#e6eaee")
+        tidy(axes, grid="x")
         axes.locator_params(axis="x", nbins=5)
     panels[0].invert_yaxis()  # in the order of the table
     panels[0].set_ylabel("blur split, children")

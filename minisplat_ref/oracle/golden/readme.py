@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from minisplat_ref.constants import Conventions
 from minisplat_ref.oracle.golden.arrays import SPECS, STAGE_COTANGENTS, STAGE_INPUTS, names_of
 from minisplat_ref.oracle.golden.scenes import Golden
+from minisplat_ref.reporting import markdown_table
 
 FRAMES = {
     "world": "right-handed; any unit, here called world unit",
@@ -157,5 +158,4 @@ def _listed(names: tuple[str, ...]) -> str:
 
 
 def _table(headings: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
-    lines = [headings, ("---",) * len(headings), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return markdown_table(headings, rows, is_aligned=False)  # whole sentences in columns would be wider than a screen
