@@ -148,3 +148,13 @@ def test_bad_input_is_one_line(scene_folder, tmp_path, capsys, arguments, messag
     error = capsys.readouterr().err
     assert error.startswith("minisplat-ref: error: ") and error.count("\n") == 1 and message in error
     assert not (tmp_path / "out").exists()
+
+
+def test_interrupted_study_leaves_nothing(scene_folder, tmp_path, capsys, monkeypatch):
+    def interrupt(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(split_forms, "measure", interrupt)
+    assert main(["study", "split", str(scene_folder), "--out", str(tmp_path / "out")]) == 130
+    assert "minisplat-ref: interrupted\n" in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())
