@@ -154,11 +154,11 @@ layers = [layer for layer in layers if layer and layer != ["__main__"]]
 notes = {
     "cli": "arguments, progress, files",
     "extensions": "further methods; never imported from below",
-    "train": "the loop",
-    "recipes": "training methods as data",
-    "events": "what a recipe can do besides gradient steps",
+    "datasets": "scenes to train on; what reports share",
+    "methods": "a file per paper: its events and when they happen",
+    "training": "the loop",
     "strategy": "who exists, how it moves, files, measures",
-    "render": "parameters to image and back",
+    "rendering": "parameters to image and back",
     "splatting": "the stages in a row",
     "backends": "one function for every stage",
     "cpu": "loops over all Gaussians, all pixels",
@@ -284,7 +284,9 @@ assert set(modules) == exists - {"__main__"} and {"reference", "scalar", "cpu", 
 
 # The reference stands below everything that uses it, and beside the scalars that it is checked against.
 level = {name: i for i, layer in enumerate(layers) for name in layer}
-assert level["train"] < level["render"] < level["backends"] < level["reference"] == level["scalar"] < level["types"]
+assert (
+    level["training"] < level["rendering"] < level["backends"] < level["reference"] == level["scalar"] < level["types"]
+)
 
 # Profiles differ, in name and in pixels, but little.
 assert len(set(PROFILES.values())) == len(PROFILES) == 4

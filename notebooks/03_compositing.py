@@ -181,7 +181,7 @@ plt.show()
 # %% [markdown]
 # ## A picture made of surface points
 #
-# For the rest of the notebook we need a picture. The ray tracer of `data_tools` gives exact depth, so every pixel of
+# For the rest of the notebook we need a picture. The ray tracer of `datasets` gives exact depth, so every pixel of
 # six views of a room becomes one small round Gaussian on the surface that it sees. Nothing is trained. A seventh
 # viewpoint, which was not used, shows what comes out: thin things too fat, and black where none of the six looked.
 

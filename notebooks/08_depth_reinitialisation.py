@@ -26,7 +26,7 @@
 # |---|---|---|
 # | `minisplat_ref/strategy/depth_reinit.py` | points of the pixels; which are drawn; the guards | MS sec. 4.1, app. D |
 # | `minisplat_ref/strategy/simplify.py` | `sample`: drawing without replacement | |
-# | `data_tools/studies/depth_types.py` | the comparison below, larger and over several seeds | MS table 4 |
+# | `minisplat_ref/experiments/studies/depth_types.py` | the comparison below, larger, with several seeds | MS table 4 |
 #
 # *MS* is Mini-Splatting, Fang and Wang 2024; the guards are not in the paper. **Frames and units:** the world is in
 # metres, z up; camera axes are x right, y down, z forward; a depth is the camera z.

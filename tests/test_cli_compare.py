@@ -32,7 +32,7 @@ from minisplat_ref.experiments.comparison.measures import (
     spread,
 )
 from minisplat_ref.experiments.comparison.plan import Plan, eval_every
-from minisplat_ref.experiments.comparison.table import as_markdown, table_cells
+from minisplat_ref.experiments.comparison.table import table_cells
 from minisplat_ref.experiments.progress import read_log
 from minisplat_ref.experiments.scoring import Trained
 from minisplat_ref.io import load_ply, load_scene
@@ -297,10 +297,6 @@ def test_table():
     assert by_title["LPIPS"] == ["null"] * 3
     assert by_title["Gaussians"][:2] == ["10,000 ± 1,414", "1,000 ± 1,414 (0.1x)"]
     assert by_title["until the first's final PSNR (s)"][1:] == ["not reached by 1 of 2", "not reached"]
-
-
-def test_markdown():
-    assert as_markdown([["", "a"], ["PSNR (dB)", "1"]]) == ("|           | a |\n|-----------|---|\n| PSNR (dB) | 1 |")
 
 
 # Speed and crops

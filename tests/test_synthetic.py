@@ -11,8 +11,8 @@ from tolerances import (
     SYNTHETIC_SURFACE,
 )
 
+from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
-from minisplat_ref.datasets.synthetic.__main__ import main
 from minisplat_ref.datasets.synthetic.cameras import look_at
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.datasets.synthetic.geometry import Primitive, first_hits
@@ -359,7 +359,7 @@ def test_point_noise():
 def test_folder(tmp_path, capsys):
     folder = tmp_path / "made" / "room"
     options = ["--views", "4", "--width", "64", "--height", "48", "--supersampling", "1", "--points", "300"]
-    assert main(["room", "--out", str(folder), *options, "--test-every", "4"]) == 0
+    assert main(["synthetic", "room", "--out", str(folder), *options, "--test-every", "4"]) == 0
     assert "4 training and 2 test views, 300 points" in capsys.readouterr().out
     assert [path.name for path in folder.parent.iterdir()] == ["room"]
     synthetic = make_scene("room", **SMALL)
@@ -434,8 +434,8 @@ def test_nothing_half_written(tmp_path, monkeypatch):
 )
 def test_bad_input_is_one_line(arguments, culprit, tmp_path, capsys):
     (tmp_path / "something").touch()
-    assert main([argument.format(tmp_path) for argument in arguments]) == 2
+    assert main(["synthetic", *(argument.format(tmp_path) for argument in arguments)]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert culprit in lines[-1]
-    assert lines[-1].startswith("error: ")
+    assert lines[-1].startswith("minisplat-ref: error: ")
     assert [path.name for path in tmp_path.iterdir()] == ["something"]

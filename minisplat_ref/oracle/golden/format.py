@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.oracle.tolerances import EXACT, GRADIENT, IMAGE, LOSS, POSITION, SHAPE, StageTolerance
+from minisplat_ref.reporting import markdown_table
 from minisplat_ref.types import Camera
 
 Arrays = dict[str, NDArray[Any]]
@@ -299,5 +300,4 @@ def _listed(names: tuple[str, ...]) -> str:
 
 
 def _table(headings: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
-    lines = [headings, ("---",) * len(headings), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return markdown_table(headings, rows, is_aligned=False)  # whole sentences in columns would be wider than a screen

@@ -193,7 +193,7 @@ RELATIVE = "the image of the means that float32 holds: the camera's centre is su
 
 
 def _georeferenced_call() -> Call:
-    """Through the door, whose view matrix is rounded like everything else: t = -R c is 1e6 too."""
+    """Through `rasterization`, whose view matrix is rounded like everything else: t = -R c is 1e6 too."""
     subject = moved_world((448000, 5412000, 300), scale=50.0)
     viewmat, K = np.eye(4), np.eye(3)
     view, g = subject.camera, subject.gaussians
