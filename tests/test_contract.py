@@ -16,7 +16,12 @@ STAGES = [field.name for field in fields(Backend) if field.name not in ("name", 
 
 # Modules of cpu without a twin of their name: parts of the compositing and sorting kernels, not stages.
 BLENDING_PARTS = {"blend_forward", "blend_backward", "tile_state", "tile_rows", "records", "pair_sums", "exponential"}
-KERNEL_PARTS = BLENDING_PARTS | {"footprints", "layers", "sorting", "gaussian_rows", "loss_rows", "memory"}
+PLAIN_PARTS = {"plain", "hit_buffer", "pixel_rows", "responses"}  # test_response.py compares them
+KERNEL_PARTS = (
+    BLENDING_PARTS | PLAIN_PARTS | {"footprints", "layers", "sorting", "gaussian_rows", "loss_rows", "memory"}
+)
+
+TWIN_OF = {"compositing_exact": "compositing", "plain_conic": "compositing"}
 
 # Public functions of cpu without a twin: they prepare arguments for kernels.
 CPU_ONLY = {
@@ -88,7 +93,7 @@ def twins():
         name = info.name
         if name in KERNEL_PARTS:
             continue
-        twin = public_functions(name.removesuffix("_exact"))
+        twin = public_functions(TWIN_OF.get(name, name))
         for key, function in public_functions(name, "cpu").items():
             if f"{name}.{key}" not in CPU_ONLY:
                 yield f"{name}.{key}", function, twin.get(key)
@@ -112,6 +117,7 @@ def test_every_stage_is_compared():
         *("spherical_harmonics.sh_colors", "spherical_harmonics.sh_colors_vjp"),
         *("compositing.composite", "compositing.composite_vjp"),
         *("compositing_exact.composite", "compositing_exact.composite_vjp"),
+        *("plain_conic.composite", "plain_conic.composite_vjp"),
         *("depth.surface_points", "depth.surface_points_vjp"),
         *("loss.photometric_loss", "loss.photometric_loss_vjp"),
         *("geometric_loss.geometric_loss", "geometric_loss.geometric_loss_vjp"),

@@ -88,6 +88,12 @@ def store(array: Any, i: Any, lanes: Any) -> None:
     array[i : i + max(numbers.size, WIDTH)] = numbers
 
 
+def accumulate(array: Any, i: Any, lanes: Any) -> None:
+    """Add lanes, or a tuple of lanes one after the other, to the numbers of a 1-d array from ``i`` on."""
+    numbers = np.ravel(lanes)
+    array[i : i + max(numbers.size, WIDTH)] += numbers
+
+
 def gather(table: Any, rows: Any, column: Any) -> Any:
     """Return one number from each of eight rows of a table [N, ...]; further dimensions count as flat."""
     return table.reshape(len(table), -1)[list(rows), column]

@@ -53,16 +53,13 @@ def thresholds(tape: RenderTape, slack: float = 0.0) -> Thresholds:
     span = max(splats.channels.max(initial=0), splats.background.max(initial=0))  # no two colours differ by more
     for tile in tile_hits(projection, CPU.bin_gaussians(projection, grid, lenient), lenient):
         if len(tile.ids):
-            opacities, depths = projection.opacities[tile.ids], projection.depths[tile.ids]
-            change, has_kink = _of_tile(tile, opacities, depths, conventions, slack)
+            change, has_kink = _of_tile(tile, projection.depths[tile.ids], conventions, slack)
             allowance[tile.ys, tile.xs] = span * change
             is_near[tile.ys, tile.xs] = (change > 0) | has_kink
     return Thresholds(allowance, is_near)
 
 
-def _of_tile(
-    tile: TileHits, opacities: Floats, depths: Floats, conventions: Conventions, slack: float
-) -> tuple[Floats, Bools]:
+def _of_tile(tile: TileHits, depths: Floats, conventions: Conventions, slack: float) -> tuple[Floats, Bools]:
     """Return for each of P pixels how much light may change, and whether a hit stands at the clamp."""
     alpha_min, stop = conventions.alpha_min, conventions.transmittance_min
     margin = FLIP_ALPHA + slack * alpha_min
@@ -77,7 +74,7 @@ def _of_tile(
     gaps = np.diff(depths, append=np.inf)[:, None]
     is_tie = (gaps > 0) & (gaps < FLIP_DEPTH * depths[:, None])  # of exactly equal ones the lower row is first
     behind = np.concatenate([alphas[1:], np.zeros_like(alphas[:1])])  # alpha of the next in the list
-    is_clamp = is_open & (np.abs(opacities[:, None] * tile.falloffs - conventions.alpha_max) < FLIP_CLAMP)
+    is_clamp = is_open & (np.abs(tile.hit.unclamped - conventions.alpha_max) < FLIP_CLAMP)
     change = np.where(is_skip & is_open, before * (alpha_min + margin), 0).sum(axis=0)
     change += np.where(is_tie & is_open, before * alphas * behind, 0).sum(axis=0)
     change += np.where(is_stop, before, 0).max(axis=0)  # all that lies at and behind the hit that may stop

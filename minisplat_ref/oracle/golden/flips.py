@@ -33,7 +33,7 @@ def flip_candidates(projection: Projection, bins: TileBins, conventions: Convent
     """
     candidates = np.zeros((bins.grid.height, bins.grid.width), bool)
     for tile in tile_hits(projection, bins, conventions):
-        unclamped = projection.opacities[tile.ids, None] * tile.falloffs
+        unclamped = tile.hit.unclamped
         alphas = np.where(tile.is_clamped, conventions.alpha_max, unclamped)  # [G, P] whether they count or not
         left = tile.transmittances[:-1] * (1 - alphas)  # T that the pixel would have after the hit
         stops = (alphas >= conventions.alpha_min + FLIP_ALPHA) & (tile.alphas == 0)

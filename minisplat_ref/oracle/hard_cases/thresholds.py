@@ -28,7 +28,7 @@ def pixels_at_thresholds(tape: SplatTape) -> Bools:
     conventions, grid = tape.conventions, tape.bins.grid
     is_near = np.zeros((grid.height, grid.width), dtype=bool)
     for tile in tile_hits(tape.projection, tape.bins, conventions):
-        unclamped = tape.projection.opacities[tile.ids, None] * tile.falloffs  # [G, P]
+        unclamped = tile.hit.unclamped  # [G, P]
         alphas = np.where(unclamped < conventions.alpha_min, 0, np.minimum(unclamped, conventions.alpha_max))
         after = tile.transmittances[:-1] * (1 - alphas)
         hits = _is_near(unclamped, conventions.alpha_min, ALPHA_MARGIN)

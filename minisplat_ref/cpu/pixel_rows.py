@@ -1,0 +1,80 @@
+"""Eight pixels of a line as one step, and the bundles that the plain kernels read and write."""
+
+from typing import NamedTuple
+
+from minisplat_ref.cpu.gaussian_rows import rows_from
+from minisplat_ref.scalar._jit import scalar
+from minisplat_ref.scalar.lanes import WIDTH, counted, filled, gather, select
+from minisplat_ref.scalar.literals import HALF, ONE, ZERO
+from minisplat_ref.types import Floats, Ints
+
+
+class Scene(NamedTuple):
+    """What the kernels read of the primitives."""
+
+    records: Floats  # [N, F] of the response
+    colors: Floats  # [N, S] coefficients of D channels
+    boxes: Ints  # [N, 4] pixels x0, y0, x1, y1, half-open
+
+
+class Lists(NamedTuple):
+    """Which primitives the pixels of every tile meet, and how many hits a pixel holds back to sort them."""
+
+    offsets: Ints  # [n_tiles + 1] tile t owns ids[offsets[t] : offsets[t + 1]]
+    ids: Ints  # [M] nearest first
+    slots: Ints  # [M] place of each pair when the pairs are grouped by primitive
+    tile_width: int  # pixels
+    tile_height: int  # pixels
+    buffer_size: int  # hits
+
+
+class Pixels(NamedTuple):
+    """An image and its accumulated opacity, or the derivative of the loss with respect to them."""
+
+    image: Floats  # [H * W, D]
+    alpha: Floats  # [H * W, 1]
+
+
+@scalar
+def rows_of_tile(tile, lists, frame):
+    """Yield column and line of the first pixel of every row of a tile."""
+    n_tiles_x = (frame.width + lists.tile_width - 1) // lists.tile_width
+    x0, y0 = tile % n_tiles_x * lists.tile_width, tile // n_tiles_x * lists.tile_height
+    for y in range(y0, min(y0 + lists.tile_height, frame.height)):
+        for x in range(x0, min(x0 + lists.tile_width, frame.width), WIDTH):
+            yield x, y
+
+
+@scalar
+def row_pixels(x, y, frame):
+    """Return the places of a row's pixels in the image; those beyond its edge repeat the last."""
+    first = y * frame.width + x
+    return rows_from(first, first + min(WIDTH, frame.width - x))
+
+
+@scalar
+def field_of(row, k, x, frame):
+    """Return field k of ``row`` [n_fields * 8]; pixels beyond the image's edge repeat the last, as their places do."""
+    return gather(row, rows_from(k * WIDTH, k * WIDTH + min(WIDTH, frame.width - x)), 0)
+
+
+@scalar
+def full_transmittance(x, frame, as_data):
+    """Return one, and minus one for pixels beyond the image's edge: they are finished."""
+    return select(counted(as_data(0)) < as_data(frame.width - x), filled(as_data(1)), -ONE)
+
+
+@scalar
+def meets_row(boxes, n, x, y):
+    """Whether box n of ``boxes`` [N, 4] holds one of the eight pixels from (x, y) on."""
+    return boxes[n, 1] <= y and y < boxes[n, 3] and boxes[n, 0] < x + WIDTH and x < boxes[n, 2]
+
+
+@scalar
+def hit_row(hit, scene, n, x, y):
+    """Return what ``hit`` of a response does, with alpha 0 in the pixels that the box does not hold."""
+    as_data = scene.records.dtype.type
+    xs = counted(as_data(0)) + (as_data(x) + HALF)  # pixel centres
+    unclamped, depth, place = hit(scene.records, n, xs, as_data(y) + HALF)
+    is_in_box = (xs > scene.boxes[n, 0]) & (xs < scene.boxes[n, 2])
+    return select(is_in_box, unclamped, ZERO), depth, place
