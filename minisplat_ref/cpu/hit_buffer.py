@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.cpu.gaussian_rows import rows_from
-from minisplat_ref.cpu.pixel_rows import hit_row, meets_row
+from minisplat_ref.cpu.pixel_rows import hit_row
 from minisplat_ref.scalar._jit import scalar
 from minisplat_ref.scalar.lanes import WIDTH, any_of, counted, filled, load, scatter, select, store
 from minisplat_ref.scalar.literals import ZERO
@@ -80,14 +80,12 @@ def walk_sorted(hit: Callable, shade: Callable, n_channels: int, take: Callable)
     """
 
     @scalar
-    def walk(row, buffer, scene, ids, buffer_size, x, y, frame):
+    def walk(row, buffer, scene, ids, members, buffer_size, x, y, frame):
         as_data = row.dtype.type
         zero, hits, queue = filled(as_data(0)), buffer.hits, buffer.queue
         first = end = 0
-        for m in range(ids.size):
+        for m in members:
             n = ids[m]
-            if not meets_row(scene.boxes, n, x, y):
-                continue
             unclamped, depth, place = hit_row(hit, scene, n, x, y)
             is_hit = unclamped >= frame.alpha_min
             if not any_of(is_hit):

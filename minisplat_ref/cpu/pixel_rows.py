@@ -2,6 +2,8 @@
 
 from typing import NamedTuple
 
+import numpy as np
+
 from minisplat_ref.cpu.gaussian_rows import rows_from
 from minisplat_ref.scalar._jit import scalar
 from minisplat_ref.scalar.lanes import WIDTH, counted, filled, gather, select
@@ -36,13 +38,46 @@ class Pixels(NamedTuple):
 
 
 @scalar
-def rows_of_tile(tile, lists, frame):
-    """Yield column and line of the first pixel of every row of a tile."""
+def start_tile(tile, lists, frame):
+    """Return column and line of a tile's first pixel, and how many rows of eight it has on a line."""
     n_tiles_x = (frame.width + lists.tile_width - 1) // lists.tile_width
     x0, y0 = tile % n_tiles_x * lists.tile_width, tile // n_tiles_x * lists.tile_height
-    for y in range(y0, min(y0 + lists.tile_height, frame.height)):
-        for x in range(x0, min(x0 + lists.tile_width, frame.width), WIDTH):
-            yield x, y
+    return x0, y0, (lists.tile_width + WIDTH - 1) // WIDTH
+
+
+@scalar
+def list_rows(boxes, ids, tile, lists, frame):
+    """Deal the list of a tile out to its rows of eight pixels.
+
+    Returns
+    -------
+    members : ndarray of shape (n_rows, M)
+        Places in ``ids`` [M] of the primitives whose box holds a pixel of the row, in the list's order.
+    counts : ndarray of shape (n_rows,)
+        How many they are.
+    """
+    x0, y0, n_per_line = start_tile(tile, lists, frame)
+    x_end, y_end = min(x0 + lists.tile_width, frame.width), min(y0 + lists.tile_height, frame.height)
+    members = np.empty((lists.tile_height * n_per_line, ids.size), np.int32)
+    counts = np.zeros(lists.tile_height * n_per_line, np.int64)
+    for m in range(ids.size):
+        n = ids[m]
+        first, end = (max(boxes[n, 0], x0) - x0) // WIDTH, (min(boxes[n, 2], x_end) - x0 + WIDTH - 1) // WIDTH
+        for y in range(max(boxes[n, 1], y0), min(boxes[n, 3], y_end)):
+            for row in range((y - y0) * n_per_line + first, (y - y0) * n_per_line + end):
+                members[row, counts[row]] = m
+                counts[row] += 1
+    return members, counts
+
+
+@scalar
+def rows_of_tile(tile, lists, frame):
+    """Yield number, column and line of every row of eight pixels of a tile that lies in the image."""
+    x0, y0, n_per_line = start_tile(tile, lists, frame)
+    for row in range(lists.tile_height * n_per_line):
+        x, y = x0 + row % n_per_line * WIDTH, y0 + row // n_per_line
+        if x < frame.width and y < frame.height:
+            yield row, x, y
 
 
 @scalar
@@ -62,12 +97,6 @@ def field_of(row, k, x, frame):
 def full_transmittance(x, frame, as_data):
     """Return one, and minus one for pixels beyond the image's edge: they are finished."""
     return select(counted(as_data(0)) < as_data(frame.width - x), filled(as_data(1)), -ONE)
-
-
-@scalar
-def meets_row(boxes, n, x, y):
-    """Whether box n of ``boxes`` [N, 4] holds one of the eight pixels from (x, y) on."""
-    return boxes[n, 1] <= y and y < boxes[n, 3] and boxes[n, 0] < x + WIDTH and x < boxes[n, 2]
 
 
 @scalar

@@ -40,7 +40,7 @@ from minisplat_ref.cpu.pixel_rows import (
     field_of,
     full_transmittance,
     hit_row,
-    meets_row,
+    list_rows,
     row_pixels,
     rows_of_tile,
 )
@@ -83,12 +83,11 @@ def forward_kernel(response: KernelResponse, n_channels: int) -> Callable:
     walk = walk_sorted(hit, shade, n_channels, take)
 
     @scalar
-    def draw_row(row, scene, ids, x, y, frame):
-        """Blend the list ``ids`` [M] into ``row`` [(1 + D) * 8]."""
+    def draw_row(row, scene, ids, members, x, y, frame):
+        """Blend the ``members`` of the list ``ids`` [M] into ``row`` [(1 + D) * 8]."""
         T = load(row, 0)
-        for n in ids:
-            if not meets_row(scene.boxes, n, x, y):
-                continue
+        for m in members:
+            n = ids[m]
             unclamped, _, place = hit_row(hit, scene, n, x, y)
             T, weight = blend(T, unclamped, frame)
             for k in range(n_channels):
@@ -105,13 +104,14 @@ def forward_kernel(response: KernelResponse, n_channels: int) -> Callable:
             for tile in turns(taken, lists.offsets.size - 1):
                 ids = lists.ids[lists.offsets[tile] : lists.offsets[tile + 1]]
                 buffer = hit_buffer(ids.size if is_sorted else 0, n_channels, row.dtype)
-                for x, y in rows_of_tile(tile, lists, frame):
+                members, counts = list_rows(scene.boxes, ids, tile, lists, frame)
+                for i, x, y in rows_of_tile(tile, lists, frame):
                     row[:] = ZERO
                     store(row, 0, full_transmittance(x, frame, row.dtype.type))
                     if is_sorted:
-                        walk(row, buffer, scene, ids, lists.buffer_size, x, y, frame)
+                        walk(row, buffer, scene, ids, members[i, : counts[i]], lists.buffer_size, x, y, frame)
                     else:
-                        draw_row(row, scene, ids, x, y, frame)
+                        draw_row(row, scene, ids, members[i, : counts[i]], x, y, frame)
                     pixels, T_end = row_pixels(x, y, frame), abs(field_of(row, 0, x, frame))
                     scatter(out.alpha, pixels, 0, ONE - T_end)
                     for k in range(n_channels):
@@ -177,12 +177,10 @@ def backward_kernel(response: KernelResponse, n_channels: int) -> Callable:
         accumulate(sums, 0, hit_vjp(scene.records, n, place, v_mean, v_shape, v_place))
 
     @scalar
-    def chain_row(row, sums, v_place, scene, ids, x, y, frame):
-        """Go through the list ``ids`` [M] once more and add to its ``sums``."""
-        for m in range(ids.size):
+    def chain_row(row, sums, v_place, scene, ids, members, x, y, frame):
+        """Go through the ``members`` of the list ``ids`` [M] once more and add to their ``sums``."""
+        for m in members:
             n = ids[m]
-            if not meets_row(scene.boxes, n, x, y):
-                continue
             unclamped, _, place = hit_row(hit, scene, n, x, y)
             light = filled(row.dtype.type(0))
             for k in range(n_channels):
@@ -194,9 +192,9 @@ def backward_kernel(response: KernelResponse, n_channels: int) -> Callable:
                 break
 
     @scalar
-    def chain_sorted_row(row, sums, v_place, buffer, scene, lists, ids, x, y, frame):
+    def chain_sorted_row(row, sums, v_place, buffer, scene, ids, members, lists, x, y, frame):
         """Do the same where pixels sort their hits: in their order for dL/dalpha, then in the list's."""
-        for h in range(walk(row, buffer, scene, ids, lists.buffer_size, x, y, frame)):
+        for h in range(walk(row, buffer, scene, ids, members, lists.buffer_size, x, y, frame)):
             m, rows = buffer.members[h], hit_rows(h)
             unclamped, _, place = hit_row(hit, scene, ids[m], x, y)
             gradient = unclamped, gather(buffer.hits, rows, V_ALPHA), gather(buffer.hits, rows, WEIGHT)
@@ -212,12 +210,13 @@ def backward_kernel(response: KernelResponse, n_channels: int) -> Callable:
                 first, end = lists.offsets[tile], lists.offsets[tile + 1]
                 ids, sums = lists.ids[first:end], np.zeros((end - first) * n_sums * WIDTH, slots.dtype)
                 buffer = hit_buffer(ids.size if is_sorted else 0, n_channels, row.dtype)
-                for x, y in rows_of_tile(tile, lists, frame):
+                members, counts = list_rows(scene.boxes, ids, tile, lists, frame)
+                for i, x, y in rows_of_tile(tile, lists, frame):
                     start_row(row, output, v_output, x, y, frame)
                     if is_sorted:
-                        chain_sorted_row(row, sums, v_place, buffer, scene, lists, ids, x, y, frame)
+                        chain_sorted_row(row, sums, v_place, buffer, scene, ids, members[i, : counts[i]], lists, x, y, frame)
                     else:
-                        chain_row(row, sums, v_place, scene, ids, x, y, frame)
+                        chain_row(row, sums, v_place, scene, ids, members[i, : counts[i]], x, y, frame)
                     for k in range(n_channels):
                         v_backgrounds[tile, k] += sum_of(abs(load(row, 0)) * load(row, v_first + k * WIDTH))
                 for m in range(ids.size):

@@ -104,17 +104,20 @@ def conic_response(exp: Callable) -> KernelResponse:
 
 def _conic_factors(projection: Projection) -> tuple[Floats, Floats, Floats]:
     """a, slope and pivot of every footprint in float64; those of a circle where it is culled."""
-    conics = np.where(projection.radii[:, :1] > 0, projection.conics, (1.0, 0.0, 1.0))
-    a, slope, pivot = factors(*conics.T)
-    return a, slope, pivot
+    is_culled = projection.radii[:, 0] == 0
+    a, b, c = projection.conics.T
+    return factors(a + is_culled, b, c + is_culled)  # conics of culled Gaussians are 0
 
 
 def _conic_records(projection: Projection, dtype: np.dtype) -> Floats:
     a, slope, pivot = _conic_factors(projection)
+    records = np.empty((len(a), DEPTH + 1), dtype)
+    records[:, MEAN_X], records[:, MEAN_Y] = projection.means2d.T
     # Rounding can leave a factor that is negative: then no pixel but the centre's is hit.
-    half_a, half_pivot = (np.where(f >= 0, np.minimum(f / 2, HALF_A_MAX), HALF_A_MAX) for f in (a, pivot))
-    columns = (projection.means2d, half_a, slope, half_pivot, projection.opacities, projection.depths)
-    return np.column_stack(columns).astype(dtype)
+    records[:, HALF_A] = np.where(a >= 0, np.minimum(a / 2, HALF_A_MAX), HALF_A_MAX)
+    records[:, HALF_PIVOT] = np.where(pivot >= 0, np.minimum(pivot / 2, HALF_A_MAX), HALF_A_MAX)
+    records[:, SLOPE], records[:, OPACITY], records[:, DEPTH] = slope, projection.opacities, projection.depths
+    return records
 
 
 def _conic_records_vjp(projection: Projection, v_records: Floats) -> tuple[Floats, ...]:
