@@ -76,17 +76,17 @@ def queued_rows(queue, at):
 def walk_sorted(hit: Callable, shade: Callable, n_channels: int, take: Callable) -> Callable:
     """Return the function that gives the hits of a row to ``take``, nearest first, and returns how many there are.
 
-    ``take(row, hits, rows, frame)`` reads and changes ``row``, whose first eight numbers are the transmittances.
+    ``take(state, hits, rows, frame)`` reads and changes ``state``, whose first eight numbers are the transmittances.
     """
 
     @scalar
-    def walk(row, buffer, scene, ids, members, buffer_size, x, y, frame):
-        as_data = row.dtype.type
+    def walk(state, buffer, scene, row, buffer_size, frame):
+        as_data = state.dtype.type
         zero, hits, queue = filled(as_data(0)), buffer.hits, buffer.queue
         first = end = 0
-        for m in members:
-            n = ids[m]
-            unclamped, depth, place = hit_row(hit, scene, n, x, y)
+        for m in row.members:
+            n = row.ids[m]
+            unclamped, depth, place = hit_row(hit, scene, n, row)
             is_hit = unclamped >= frame.alpha_min
             if not any_of(is_hit):
                 continue
@@ -100,12 +100,12 @@ def walk_sorted(hit: Callable, shade: Callable, n_channels: int, take: Callable)
             enqueue(queue, first, end, select(is_hit, zero + depth, MISSED), counted(as_data(0)) + as_data(end * WIDTH))
             end += 1
             if end - first == buffer_size:
-                take(row, hits, queued_rows(queue, first), frame)
+                take(state, hits, queued_rows(queue, first), frame)
                 first += 1
-            if not any_of(load(row, 0) > ZERO):
+            if not any_of(load(state, 0) > ZERO):
                 break
-        while first < end and any_of(load(row, 0) > ZERO):
-            take(row, hits, queued_rows(queue, first), frame)
+        while first < end and any_of(load(state, 0) > ZERO):
+            take(state, hits, queued_rows(queue, first), frame)
             first += 1
         return end
 

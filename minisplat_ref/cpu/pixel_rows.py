@@ -37,6 +37,15 @@ class Pixels(NamedTuple):
     alpha: Floats  # [H * W, 1]
 
 
+class Row(NamedTuple):
+    """Eight pixels of a line, and which primitives they may meet."""
+
+    x: int  # column of the first
+    y: int  # line
+    ids: Ints  # [M] list of the tile, nearest first
+    members: Ints  # [n] places in it of the primitives whose box holds one of the pixels
+
+
 @scalar
 def start_tile(tile, lists, frame):
     """Return column and line of a tile's first pixel, and how many rows of eight it has on a line."""
@@ -71,39 +80,41 @@ def list_rows(boxes, ids, tile, lists, frame):
 
 
 @scalar
-def rows_of_tile(tile, lists, frame):
-    """Yield number, column and line of every row of eight pixels of a tile that lies in the image."""
+def rows_of_tile(tile, scene, lists, frame):
+    """Yield the rows of a tile that lie in the image."""
+    ids = lists.ids[lists.offsets[tile] : lists.offsets[tile + 1]]
+    members, counts = list_rows(scene.boxes, ids, tile, lists, frame)
     x0, y0, n_per_line = start_tile(tile, lists, frame)
-    for row in range(lists.tile_height * n_per_line):
-        x, y = x0 + row % n_per_line * WIDTH, y0 + row // n_per_line
+    for i in range(counts.size):
+        x, y = x0 + i % n_per_line * WIDTH, y0 + i // n_per_line
         if x < frame.width and y < frame.height:
-            yield row, x, y
+            yield Row(x, y, ids, members[i, : counts[i]])
 
 
 @scalar
-def row_pixels(x, y, frame):
+def row_pixels(row, frame):
     """Return the places of a row's pixels in the image; those beyond its edge repeat the last."""
-    first = y * frame.width + x
-    return rows_from(first, first + min(WIDTH, frame.width - x))
+    first = row.y * frame.width + row.x
+    return rows_from(first, first + min(WIDTH, frame.width - row.x))
 
 
 @scalar
-def field_of(row, k, x, frame):
-    """Return field k of ``row`` [n_fields * 8]; pixels beyond the image's edge repeat the last, as their places do."""
-    return gather(row, rows_from(k * WIDTH, k * WIDTH + min(WIDTH, frame.width - x)), 0)
+def field_of(state, k, row, frame):
+    """Return field k of ``state`` [n_fields * 8]; pixels beyond the image's edge repeat the last, as their places do."""
+    return gather(state, rows_from(k * WIDTH, k * WIDTH + min(WIDTH, frame.width - row.x)), 0)
 
 
 @scalar
-def full_transmittance(x, frame, as_data):
+def full_transmittance(row, frame, as_data):
     """Return one, and minus one for pixels beyond the image's edge: they are finished."""
-    return select(counted(as_data(0)) < as_data(frame.width - x), filled(as_data(1)), -ONE)
+    return select(counted(as_data(0)) < as_data(frame.width - row.x), filled(as_data(1)), -ONE)
 
 
 @scalar
-def hit_row(hit, scene, n, x, y):
+def hit_row(hit, scene, n, row):
     """Return what ``hit`` of a response does, with alpha 0 in the pixels that the box does not hold."""
     as_data = scene.records.dtype.type
-    xs = counted(as_data(0)) + (as_data(x) + HALF)  # pixel centres
-    unclamped, depth, place = hit(scene.records, n, xs, as_data(y) + HALF)
+    xs = counted(as_data(0)) + (as_data(row.x) + HALF)  # pixel centres
+    unclamped, depth, place = hit(scene.records, n, xs, as_data(row.y) + HALF)
     is_in_box = (xs > scene.boxes[n, 0]) & (xs < scene.boxes[n, 2])
     return select(is_in_box, unclamped, ZERO), depth, place
