@@ -100,7 +100,7 @@ def row_pixels(row, frame):
 
 @scalar
 def field_of(state, k, row, frame):
-    """Return field k of ``state`` [n_fields * 8]; pixels beyond the image's edge repeat the last, as their places do."""
+    """Return field k of ``state`` [n_fields * 8]; pixels beyond the image's edge repeat the last."""
     return gather(state, rows_from(k * WIDTH, k * WIDTH + min(WIDTH, frame.width - row.x)), 0)
 
 

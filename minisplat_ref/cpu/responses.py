@@ -61,7 +61,7 @@ class KernelResponse(NamedTuple):
     shade: Callable = constant_color
     """(colors, n, k, place) -> channel k of the hit."""
     shade_vjp: Callable = constant_color_vjp
-    """(colors, n, k, place, v) -> lanes for the channel's coefficients, lanes for the first ``n_places`` of the place."""
+    """(colors, n, k, place, v) -> lanes for the coefficients of the channel, and for the start of the place."""
     n_coefficients: int = 1
     """Of each channel: those of channel k are ``colors[n, k * n_coefficients :]``."""
     n_places: int = 0

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.constants import EXACT_ORDER, LIST_ORDER, Conventions
+from minisplat_ref.constants import LIST_ORDER, Conventions
 from minisplat_ref.types import Bools, Floats, Ints, Projection, TileBins
 
 

@@ -90,8 +90,8 @@ def store(array: Any, i: Any, lanes: Any) -> None:
 
 def accumulate(array: Any, i: Any, lanes: Any) -> None:
     """Add lanes, or a tuple of lanes one after the other, to the numbers of a 1-d array from ``i`` on."""
-    numbers = np.ravel(lanes)
-    array[i : i + max(numbers.size, WIDTH)] += numbers
+    for k, one in enumerate(lanes if isinstance(lanes, tuple) else (lanes,)):
+        array[i + k * WIDTH : i + (k + 1) * WIDTH] += one
 
 
 def gather(table: Any, rows: Any, column: Any) -> Any:
