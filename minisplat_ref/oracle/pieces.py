@@ -228,7 +228,7 @@ def _blending_stage(compositing: Module, response: Response) -> Stage:
         q = moved(means2d, conics, opacities)
         output = compositing.composite_hits(response, q, colors, background, bins, GSPLAT_MAIN)
         tiles = tile_hits(q, bins, GSPLAT_MAIN, response)
-        sides = [side for tile in tiles for side in (tile.alphas > 0, tile.is_clamped, tile.order)]
+        sides = [side for tile in tiles for side in (tile.alphas > 0, tile.is_clamped, np.asarray(tile.order))]
         return Point((output.image, output.alpha), tuple(sides))
 
     def vjp(v_image: Floats, v_alpha: Floats) -> tuple[Floats, ...]:

@@ -84,7 +84,8 @@ def composite_hits(
             stats.blend_weight_max[ids] = np.maximum(stats.blend_weight_max[ids], weights.max(axis=1))
             stats.hit_count[ids] += (weights > 0).sum(axis=1, dtype=np.int32)
             heaviest = np.argmax(sorted_by(order, weights), axis=0)  # the first, so the front-most, of equals
-            dominant = np.where(weights.max(axis=0) > 0, ids[sorted_by(heaviest[None], order)[0]], -1)
+            ids_in_order = sorted_by(order, np.broadcast_to(ids[:, None], weights.shape))  # [G, P]
+            dominant = np.where(weights.max(axis=0) > 0, sorted_by(heaviest[None], ids_in_order)[0], -1)
             stats.dominant_ids[ys, xs] = dominant
             np.add.at(stats.dominant_count, dominant[dominant >= 0], 1)
     return RenderOutput(image, alpha, median_depth, stats)

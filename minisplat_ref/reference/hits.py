@@ -149,7 +149,7 @@ class TileHits(NamedTuple):
     hit: Hit  # of all pixels, whether they count or not
     is_clamped: Bools  # [G, P] unclamped > alpha_max
     alphas: Floats  # [G, P] 0 where there is no hit
-    order: Ints  # [G, P] each pixel takes the primitive of row order[0] first, then that of order[1]
+    order: Ints | None  # [G, P] each pixel takes the primitive of row order[0] first; None: that of the list
     transmittances: Floats  # [G + 1, P] row r is T before the r-th that a pixel takes, the last row is T_end
 
 
@@ -187,7 +187,8 @@ def tile_hits(
         x0, y0, x1, y1 = boxes[ids, :, None].swapaxes(0, 1)  # [G, 1] each
         is_hit = (x0 <= xs) & (xs < x1) & (y0 <= ys) & (ys < y1) & (alphas >= conventions.alpha_min)
         alphas = np.where(is_hit, alphas, 0)
-        order = blending_order(is_hit, hit.depths, response.buffer_size)
+        is_listed = response.buffer_size == LIST_ORDER
+        order = None if is_listed else blending_order(is_hit, hit.depths, response.buffer_size)
 
         # T never rises, so once a hit would take it below the threshold, that hit and all behind it are left out.
         in_order = sorted_by(order, alphas)
@@ -223,23 +224,25 @@ def blending_order(is_hit: Bools, depths: Floats, buffer_size: int) -> Ints:
         return np.argsort(np.where(is_hit, depths, np.inf), axis=0, kind="stable")
     order = np.empty((n_rows, n_pixels), dtype=int)
     for pixel in range(n_pixels):
-        taken = list(np.flatnonzero(~is_hit[:, pixel]))
+        taken = np.flatnonzero(~is_hit[:, pixel]).tolist()
         waiting: list[tuple[float, int]] = []
-        for row in np.flatnonzero(is_hit[:, pixel]):
-            heapq.heappush(waiting, (depths[row, pixel], row))
+        for row in np.flatnonzero(is_hit[:, pixel]).tolist():
+            heapq.heappush(waiting, (float(depths[row, pixel]), row))
             if len(waiting) == buffer_size:
                 taken.append(heapq.heappop(waiting)[1])
         order[:, pixel] = [*taken, *(row for _, row in sorted(waiting))]
     return order
 
 
-def sorted_by(order: Ints, values: Any) -> Any:
-    """Return ``values`` [G, P] of the list's rows in the pixels' own ``order`` [G, P]."""
-    return np.take_along_axis(values, order, axis=0)
+def sorted_by(order: Ints | None, values: Any) -> Any:
+    """Return ``values`` [G, P] of the list's rows in the pixels' own ``order`` [G, P], if they have one."""
+    return values if order is None else np.take_along_axis(values, order, axis=0)
 
 
-def unsorted_by(order: Ints, values: Any) -> Any:
+def unsorted_by(order: Ints | None, values: Any) -> Any:
     """Return ``values`` [G, P] in the pixels' own ``order`` [G, P] as rows of the list: undoes :func:`sorted_by`."""
+    if order is None:
+        return values
     rows = np.empty_like(values)
     np.put_along_axis(rows, order, values, axis=0)
     return rows
