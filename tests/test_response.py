@@ -280,7 +280,7 @@ def test_plain_conic_equals_the_reference_and_the_tuned_kernels(conventions, rng
     assert_same(got, by_stages(CPU, case), PARITY_FLOAT64)
 
 
-def test_plain_conic_in_float32(rng, monkeypatch):
+def test_plain_conic_in_float32(rng):
     case = conic_case(rng, 250, np.float32)
     got = by_stages(PLAIN, case)
     expected = by_stages(CPU, case)
@@ -348,6 +348,10 @@ def test_orders_meet(package, response, rng):
     ]
     assert_array_equal(*in_order)
     assert np.abs(in_order[0] - images[1]).max() == 0  # depths matter to the order alone
+    equal = flat._replace(depths=np.ones(60))  # and equal ones keep that of the list
+    for k in (3, EXACT_ORDER):
+        image = package.composite_hits(response._replace(buffer_size=k), equal, *case.arguments[1:]).image
+        assert_array_equal(image, images[1])
 
 
 def test_statistics_follow_the_order_of_the_pixel(rng):
