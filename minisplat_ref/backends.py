@@ -12,6 +12,7 @@ from typing import Any
 import minisplat_ref.cpu.adam
 import minisplat_ref.cpu.compositing
 import minisplat_ref.cpu.compositing.exact
+import minisplat_ref.cpu.compositing.plain_conic
 import minisplat_ref.cpu.depth
 import minisplat_ref.cpu.geometric_loss
 import minisplat_ref.cpu.loss
@@ -22,6 +23,7 @@ import minisplat_ref.reference.adam
 import minisplat_ref.reference.compositing
 import minisplat_ref.reference.depth
 import minisplat_ref.reference.geometric_loss
+import minisplat_ref.reference.hits
 import minisplat_ref.reference.loss
 import minisplat_ref.reference.projection
 import minisplat_ref.reference.spherical_harmonics
@@ -108,6 +110,14 @@ CPU_EXACT = replace(
     composite_vjp=cpu.compositing.exact.composite_vjp,
 )
 """The same with libm's exponential in float32 too."""
+
+PLAIN = replace(
+    CPU,
+    name="plain",
+    composite=cpu.compositing.plain_conic.composite,
+    composite_vjp=cpu.compositing.plain_conic.composite_vjp,
+)
+"""The same with the kernels that blend any primitive; without statistics, therefore not among ``BACKENDS``."""
 
 BACKENDS = {backend.name: backend for backend in (REFERENCE, CPU, CPU_EXACT)}
 

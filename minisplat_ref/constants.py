@@ -49,6 +49,9 @@ EDGE_SHARPNESS = 10.0  # neighbours that differ by 0.1, 25 of 255 levels, are ti
 # the median observation and 0.2 to 0.7 % for the 90th percentile; wrong matches and silhouettes are off by far more.
 SFM_DEPTH_TOLERANCE = 0.01
 
+LIST_ORDER = 1  # hits that a pixel holds back to sort them: each is taken as it comes
+EXACT_ORDER = 1 << 30  # more than any list holds: a pixel sorts all its hits
+
 
 class Conventions(NamedTuple):
     """One consistent set of rasteriser choices.

@@ -237,6 +237,17 @@ class CompositeGradient(NamedTuple):
     """[D]."""
 
 
+class BlendGradient(NamedTuple):
+    """Gradient of the loss with respect to what is blended, whatever the primitives are."""
+
+    primitives: tuple[Floats, ...]
+    """One array for each field of the primitives that their response has a derivative for."""
+    colors: Floats
+    """[N, S] coefficients of colour."""
+    background: Floats
+    """[D]."""
+
+
 class SurfacePoints(NamedTuple):
     """Where each pixel's ray meets its dominant Gaussian (Mini-Splatting, depth reinitialisation)."""
 

@@ -107,7 +107,7 @@ def alphas_at(dtype):
     for tile in tile_hits(projection, CPU.bin_gaussians(projection, grid, near), near):
         pixel = np.flatnonzero((tile.ys == y) & (tile.xs == x))
         if len(pixel):
-            return tile.ids, projection.opacities[tile.ids] * tile.falloffs[:, pixel[0]]
+            return tile.ids, tile.hit.unclamped[:, pixel[0]]
     raise AssertionError("every pixel is in a tile")
 
 

@@ -84,8 +84,8 @@ def test_every_argument_is_documented(module):
 def twins():
     """Public functions of cpu and what they must look like: (label, function, twin or None)."""
     names = [info.name for info in iter_modules(cpu.__path__) if info.name not in KERNEL_PARTS]
-    for name in (*names, "compositing.exact"):
-        twin = public_functions(name.removesuffix(".exact"))
+    for name in (*names, "compositing.exact", "compositing.plain_conic"):
+        twin = public_functions(name.partition(".")[0])
         for key, function in public_functions(name, "cpu").items():
             if f"{name}.{key}" not in CPU_ONLY:
                 yield f"{name}.{key}", function, twin.get(key)
@@ -109,6 +109,7 @@ def test_every_stage_is_compared():
         *("spherical_harmonics.sh_colors", "spherical_harmonics.sh_colors_vjp"),
         *("compositing.composite", "compositing.composite_vjp"),
         *("compositing.exact.composite", "compositing.exact.composite_vjp"),
+        *("compositing.plain_conic.composite", "compositing.plain_conic.composite_vjp"),
         *("depth.surface_points", "depth.surface_points_vjp"),
         *("loss.photometric_loss", "loss.photometric_loss_vjp"),
         *("geometric_loss.geometric_loss", "geometric_loss.geometric_loss_vjp"),

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import BACKENDS, CPU, CPU_EXACT, REFERENCE, Backend
+from minisplat_ref.backends import BACKENDS, CPU, CPU_EXACT, PLAIN, REFERENCE, Backend
 from minisplat_ref.bench.exponentials import EXPONENTIALS, relative_errors
 from minisplat_ref.bench.passes import RASTERIZATION, RENDER, Passes
 from minisplat_ref.bench.textbook import TEXTBOOK
@@ -67,6 +67,8 @@ def all_contenders() -> dict[str, Contender]:
         Contender("rasterization-f32", CPU, f32, passes=RASTERIZATION),
         *(_of_degree(degree) for degree in EXPONENTIALS if degree != DEGREE_IN_USE),
         *(Contender(f"cpu-f32-{name}", CPU, f32, conventions=cut) for name, cut in CUT_OFFS.items()),
+        Contender("plain-f64", PLAIN, f64, BENCH_FLOAT64, BENCH_FLOAT64),
+        Contender("plain-f32", PLAIN, f32),
         Contender(BASELINE_NAME, TEXTBOOK, f32),
         *(Contender(f"{name}-f32", backend, f32) for name, backend in BACKENDS.items() if name not in KNOWN),
     ]

@@ -88,6 +88,12 @@ def store(array: Any, i: Any, lanes: Any) -> None:
     array[i : i + max(numbers.size, WIDTH)] = numbers
 
 
+def accumulate(array: Any, i: Any, lanes: Any) -> None:
+    """Add lanes, or a tuple of lanes one after the other, to the numbers of a 1-d array from ``i`` on."""
+    for k, one in enumerate(lanes if isinstance(lanes, tuple) else (lanes,)):
+        array[i + k * WIDTH : i + (k + 1) * WIDTH] += one
+
+
 def gather(table: Any, rows: Any, column: Any) -> Any:
     """Return one number from each of eight rows of a table [N, ...]; further dimensions count as flat."""
     return table.reshape(len(table), -1)[list(rows), column]

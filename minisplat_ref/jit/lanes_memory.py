@@ -9,6 +9,7 @@ from numba.core import cgutils
 
 from minisplat_ref.jit.lanes import (
     WIDTH,
+    accumulate,
     any_of,
     bits_between,
     columns_of,
@@ -56,22 +57,28 @@ def _load(typing: Any, array: Any, i: Any) -> Any:
     return LanesType(array.dtype)(array, i), generate
 
 
-@compiled(store)
-def _store(typing: Any, array: Any, i: Any, lanes: Any) -> Any:
+def _written(typing: Any, array: Any, i: Any, lanes: Any, is_added: bool) -> Any:
+    """Typing of a function that writes lanes, or a tuple of them, to an array, or adds them to it."""
     kind = LanesType(array.dtype)
     kinds = list(lanes) if isinstance(lanes, types.BaseTuple) else [lanes]
     if any(joined(kind, one) is None for one in kinds):
         return None
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        first = _pointer(context, builder, signature, args)
+        first, align = _pointer(context, builder, signature, args), array.dtype.bitwidth // 8
         for k, of_one in enumerate(kinds):
             one = builder.extract_value(args[2], k) if isinstance(lanes, types.BaseTuple) else args[2]
-            value = spread(context, builder, one, of_one, kind)
-            builder.store(value, builder.gep(first, [I32(k)]), align=array.dtype.bitwidth // 8)
+            value, place = spread(context, builder, one, of_one, kind), builder.gep(first, [I32(k)])
+            if is_added:
+                value = builder.fadd(builder.load(place, align=align), value, flags=["contract"])
+            builder.store(value, place, align=align)
         return context.get_dummy_value()
 
     return types.void(array, i, lanes), generate
+
+
+compiled(store)(lambda typing, array, i, lanes: _written(typing, array, i, lanes, is_added=False))
+compiled(accumulate)(lambda typing, array, i, lanes: _written(typing, array, i, lanes, is_added=True))
 
 
 def _row_pointers(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
