@@ -21,7 +21,7 @@ from tolerances import (
 
 from minisplat_ref.backends import CPU, CPU_EXACT, PLAIN, REFERENCE
 from minisplat_ref.constants import EXACT_ORDER, GSPLAT_MAIN, INRIA, LIST_ORDER, MINI_SPLATTING2
-from minisplat_ref.cpu import plain
+from minisplat_ref.cpu.compositing import hits as plain
 from minisplat_ref.cpu.compositing.exponential import exp_exact
 from minisplat_ref.cpu.compositing.responses import KernelResponse, conic_response
 from minisplat_ref.errors import InputError

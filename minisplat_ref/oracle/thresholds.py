@@ -147,10 +147,8 @@ def _of_tile(
     """Look at every hit of a tile; the rows of the arrays are its G hits, front to back, the columns its P pixels."""
     alpha_min, stop = conventions.alpha_min, conventions.transmittance_min
     margin = (margins.skip + slack) * alpha_min
-    unclamped, depths = (
-        tile.hit.unclamped,
-        projection.depths[tile.ids, None],
-    )  # [G, P] whether they count or not, [G, 1]
+    unclamped = tile.hit.unclamped  # [G, P] whether they count or not
+    depths = projection.depths[tile.ids, None]  # [G, 1]
     is_skip = np.abs(np.minimum(unclamped, conventions.alpha_max) - alpha_min) <= margin
     alphas = np.where(tile.alphas < alpha_min, 0, tile.alphas)
     T = np.cumprod(np.concatenate([np.ones((1, alphas.shape[1])), 1 - alphas]), axis=0)  # [G + 1, P]
