@@ -50,6 +50,12 @@ def test_stages_have_the_same_signature_everywhere(backend, stage):
     assert parameters(getattr(backend, stage)) == parameters(getattr(REFERENCE, stage))
 
 
+@pytest.mark.parametrize("stage", STAGES)
+def test_protocols_are_the_signatures_of_the_reference(stage):
+    (protocol,) = (field.type for field in fields(Backend) if field.name == stage)
+    assert parameters(protocol.__call__)[1:] == parameters(getattr(REFERENCE, stage))
+
+
 def test_reading_order_names_every_module():
     _, _, table, *_ = reference.__doc__.split("===\n")
     assert sorted(line.split()[0] for line in table.splitlines() if not line.startswith("=")) == sorted(MODULES)

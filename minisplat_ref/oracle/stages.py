@@ -151,7 +151,7 @@ def surface_stage(backend: Backend, setting: Setting) -> Stage:
         return Point(tuple(surface), (surface.depths > 0,))
 
     def vjp(v_points: Floats, v_depths: Floats) -> tuple[Floats, ...]:
-        return backend.surface_points_vjp(*inputs.values(), camera, ids, v_points, v_depths)
+        return backend.surface_points_vjp(means, quats, scales, camera, ids, v_points, v_depths)
 
     return Stage("surface_points", inputs, ("points", "depths"), function, vjp)
 
@@ -181,7 +181,8 @@ def geometric_stage(backend: Backend, camera: Camera, rng: np.random.Generator) 
     points, weights = points_near(depth, camera, rng), GeometricWeights(0.7, 1.3, 0.9)
     mask = np.ones(shape, dtype=bool)
     mask[1, 1] = False
-    inputs: dict[str, Floats] = {"accumulated_depth": depth * alpha, "alpha": alpha}
+    accumulated = depth * alpha
+    inputs: dict[str, Floats] = {"accumulated_depth": accumulated, "alpha": alpha}
 
     def function(accumulated_depth: Floats, alpha: Floats) -> Point:
         loss, _ = backend.geometric_loss(accumulated_depth, alpha, photograph, camera, points, weights, mask)
@@ -189,7 +190,7 @@ def geometric_stage(backend: Backend, camera: Camera, rng: np.random.Generator) 
         return Point((np.asarray(loss),), tuple(np.sign(np.diff(depth, axis=axis)) for axis in (0, 1)))
 
     def vjp(v_loss: Floats) -> tuple[Floats, ...]:
-        _, tape = backend.geometric_loss(*inputs.values(), photograph, camera, points, weights, mask)
+        _, tape = backend.geometric_loss(accumulated, alpha, photograph, camera, points, weights, mask)
         return backend.geometric_loss_vjp(tape, float(v_loss))
 
     return Stage("geometric_loss", inputs, ("loss",), function, vjp)

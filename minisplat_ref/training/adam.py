@@ -91,6 +91,6 @@ def adam_step(
     eps = rule.eps * (math.sqrt(1 - rule.beta2**step) if rule.has_bias_correction else 1.0)
     rows = visible_ids if rule.is_visible_only else None
     for *arrays, rate in zip(parameters, gradient, state.first, state.second, rates, strict=True):
-        tables = (array.reshape(len(array), math.prod(array.shape[1:])) for array in arrays)  # [N, width] each
-        backend.adam_update(*tables, rows, rate * correction, rule.beta1, rule.beta2, eps)
+        values, g, first, second = (a.reshape(len(a), math.prod(a.shape[1:])) for a in arrays)  # [N, width] each
+        backend.adam_update(values, g, first, second, rows, rate * correction, rule.beta1, rule.beta2, eps)
     return state._replace(step=step)

@@ -12,6 +12,7 @@ from minisplat_ref.constants import Conventions
 from minisplat_ref.oracle.golden.arrays import STAGE_COTANGENTS, Arrays
 from minisplat_ref.oracle.golden.flips import flip_candidates
 from minisplat_ref.oracle.golden.scenes import RECIPES, Golden, inputs
+from minisplat_ref.splatting import Primitives
 from minisplat_ref.types import Floats, Projection, ProjectionGradient, RenderOutput, TileBins, TileGrid
 
 # Fields of a stage's result, by array.
@@ -64,7 +65,7 @@ def run_stages(backend: Backend, scene: Golden, dtype: str, fed: Arrays | None =
         return np.asarray(array, dtype, order="C") if array.dtype.kind == "f" else array
 
     c, camera = scene.conventions, scene.camera
-    primitives = tuple(take(name) for name in ("means", "quats", "scales", "opacities"))
+    primitives = Primitives(take("means"), take("quats"), take("scales"), take("opacities"))
     out |= zip(PROJECTION, backend.project(*primitives, camera, c), strict=True)
     projection = projection_of({name: take(name) for name in PROJECTION})
 
@@ -75,7 +76,7 @@ def run_stages(backend: Backend, scene: Golden, dtype: str, fed: Arrays | None =
     if fed is not None:
         bins = reference_bins(fed, c, tile_size)
 
-    shading = (take("means"), take("sh_dc"), take("sh_rest"), camera, scene.sh_degree, take("radii"))
+    shading = (take("means"), take("sh_dc"), take("sh_rest"), camera, scene.sh_degree, known["radii"])
     out["colors"] = backend.sh_colors(*shading)
     blending = (projection, take("colors"), take("background"), bins, c)
     output = backend.composite(*blending)
