@@ -12,8 +12,8 @@ import numpy as np
 from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
-from minisplat_ref.splatting import Primitives, SplatTape, splat, splat_vjp
-from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Ints, Projection, RenderOutput
+from minisplat_ref.splatting import SplatTape, splat, splat_vjp
+from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Ints, Primitives, Projection, RenderOutput
 
 
 class RenderTape(NamedTuple):

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.types import (
+    AdamStep,
     Bools,
     Camera,
     CompositeGradient,
@@ -204,8 +205,5 @@ class AdamUpdate(Protocol):
         first: Floats,  # [N, W] mean gradient
         second: Floats,  # [N, W] mean squared gradient
         rows: Ints | None,  # [V] to update, each once; None for all
-        rate: float,
-        beta1: float,
-        beta2: float,
-        eps: float,
+        step: AdamStep,
     ) -> None: ...

@@ -25,6 +25,7 @@ from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.compositing.records import record_size
 from minisplat_ref.rendering import RenderTape, render, render_vjp
 from minisplat_ref.types import (
+    AdamStep,
     Camera,
     CompositeGradient,
     Floats,
@@ -87,7 +88,7 @@ def _geometric_loss(dtype: Dtype) -> None:
 def _adam(dtype: Dtype) -> None:
     for rows in (None, np.arange(N_GAUSSIANS)):  # all, and the visible
         values, gradient, first, second = np.zeros((4, N_GAUSSIANS, 3), dtype)
-        CPU.adam_update(values, gradient, first, second, rows, 0.1, 0.9, 0.999, 1e-15)
+        CPU.adam_update(values, gradient, first, second, rows, AdamStep(0.1, 0.9, 0.999, 1e-15))
 
 
 STAGES: dict[str, Callable[[Dtype], None]] = {

@@ -16,12 +16,12 @@ from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.reference.depth_map import expected_depth
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.reference.pinhole import pinhole_jacobians, pose, slope_limits, with_principal_point
-from minisplat_ref.splatting import Primitives
 from minisplat_ref.types import (
     Camera,
     Floats,
     Gaussians,
     GeometricWeights,
+    Primitives,
     Projection,
     ProjectionGradient,
     TileBins,

@@ -16,7 +16,7 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 
 from minisplat_ref.backends import CPU, Backend
-from minisplat_ref.types import Ints
+from minisplat_ref.types import AdamStep, Ints
 
 Population = TypeVar("Population", bound=NamedTuple)
 
@@ -92,5 +92,5 @@ def adam_step(
     rows = visible_ids if rule.is_visible_only else None
     for *arrays, rate in zip(parameters, gradient, state.first, state.second, rates, strict=True):
         values, g, first, second = (a.reshape(len(a), math.prod(a.shape[1:])) for a in arrays)  # [N, width] each
-        backend.adam_update(values, g, first, second, rows, rate * correction, rule.beta1, rule.beta2, eps)
+        backend.adam_update(values, g, first, second, rows, AdamStep(rate * correction, rule.beta1, rule.beta2, eps))
     return state._replace(step=step)

@@ -12,8 +12,7 @@ from minisplat_ref.constants import Conventions
 from minisplat_ref.oracle.golden.arrays import STAGE_COTANGENTS, Arrays
 from minisplat_ref.oracle.golden.flips import flip_candidates
 from minisplat_ref.oracle.golden.scenes import RECIPES, Golden, inputs
-from minisplat_ref.splatting import Primitives
-from minisplat_ref.types import Floats, Projection, ProjectionGradient, RenderOutput, TileBins, TileGrid
+from minisplat_ref.types import Floats, Primitives, Projection, ProjectionGradient, RenderOutput, TileBins, TileGrid
 
 # Fields of a stage's result, by array.
 PROJECTION = ("means2d", "depths", "conics", "opacities2d", "radii", "boxes")
