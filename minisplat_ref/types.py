@@ -40,6 +40,19 @@ class Gaussians(NamedTuple):
     """[N, K-1, 3] coefficients of degree 1 and above; K = (degree + 1)^2, so K - 1 is 0, 3, 8 or 15."""
 
 
+class Primitives(NamedTuple):
+    """Gaussians after their activations: what a camera can be pointed at."""
+
+    means: Floats
+    """[N, 3] world frame, world units."""
+    quats: Floats
+    """[N, 4] wxyz, any length but zero."""
+    scales: Floats
+    """[N, 3] standard deviations, world units."""
+    opacities: Floats
+    """[N] in [0, 1]."""
+
+
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 """The mapping without entries: the default where nothing is asked for, given or shared."""
 
@@ -255,6 +268,19 @@ class SurfacePoints(NamedTuple):
     """[H, W, 3] world frame; 0 where there is none."""
     depths: Floats
     """[H, W] camera z, world units; 0 where there is none or the point lies behind the camera."""
+
+
+class AdamStep(NamedTuple):
+    """The numbers of one step of Adam that hold for a whole array."""
+
+    rate: float
+    """Learning rate, bias corrections included."""
+    beta1: float
+    """Decay of the mean gradient."""
+    beta2: float
+    """Decay of the mean squared gradient."""
+    eps: float
+    """Added to the root, bias corrections included."""
 
 
 class GeometricWeights(NamedTuple):

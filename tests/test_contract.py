@@ -1,13 +1,16 @@
 """What the modules promise about each other."""
 
+import ast
 import inspect
 import re
 from dataclasses import fields
 from importlib import import_module
+from pathlib import Path
 from pkgutil import iter_modules
 
 import pytest
 
+import minisplat_ref
 from minisplat_ref import cpu, reference, scalar
 from minisplat_ref.backends import BACKENDS, REFERENCE, Backend
 
@@ -29,6 +32,16 @@ CPU_ONLY = {
 # Backward formulas whose forward has another name, since one scalar function returns several things.
 FORWARD_OF = {"compositing.sigma_vjp": "blend", "projection.compensation_vjp": "project_gaussian"}
 
+PACKAGE = Path(minisplat_ref.__file__).parent
+MOST_ARGUMENTS = 8  # positional; what belongs together is a NamedTuple
+
+# Functions with more positional arguments than that.
+MANY_ARGUMENTS = {
+    "rasterization": "gsplat's own call, argument by argument",
+    "rasterization_vjp": "the arguments of rasterization and the cotangents",
+    "checked_batch": "checks what rasterization is given",
+}
+
 
 def public_functions(name, package="reference"):
     """Functions that a module defines, in the order of the file."""
@@ -47,6 +60,26 @@ def parameters(function):
 @pytest.mark.parametrize("stage", STAGES)
 def test_stages_have_the_same_signature_everywhere(backend, stage):
     assert parameters(getattr(backend, stage)) == parameters(getattr(REFERENCE, stage))
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_protocols_are_the_signatures_of_the_reference(stage):
+    (protocol,) = (field.type for field in fields(Backend) if field.name == stage)
+    assert parameters(protocol.__call__)[1:] == parameters(getattr(REFERENCE, stage))
+
+
+def positional_arguments(source):
+    """Names of all functions, methods and lambdas of a source, each with the number of its positional arguments."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            names = [argument.arg for argument in (*node.args.posonlyargs, *node.args.args)]
+            yield getattr(node, "name", "lambda"), len([name for name in names if name not in ("self", "cls")])
+
+
+def test_no_function_has_many_positional_arguments():
+    counts = [pair for path in PACKAGE.rglob("*.py") for pair in positional_arguments(path.read_text())]
+    assert len(counts) > 1000  # all folders were read, extensions too
+    assert {name for name, n in counts if n > MOST_ARGUMENTS} == MANY_ARGUMENTS.keys()
 
 
 def test_reading_order_names_every_module():

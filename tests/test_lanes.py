@@ -126,7 +126,7 @@ def test_reductions_have_one_order(dtype, rng):
     def run(a, out):
         first = load(a, 0), load(a, WIDTH), load(a, 2 * WIDTH), load(a, 3 * WIDTH)
         last = load(a, 4 * WIDTH), load(a, 5 * WIDTH), load(a, 6 * WIDTH), load(a, 7 * WIDTH)
-        store(out, 0, sums_of(*first, *last))
+        store(out, 0, sums_of((*first, *last)))
         for i in range(8):
             out[WIDTH + i] = sum_of(load(a, i * WIDTH))
             out[2 * WIDTH + i] = largest_of(load(a, i * WIDTH))

@@ -140,6 +140,6 @@ def with_exponential(exp: Callable, name: str) -> Backend:
         v_image: Floats,
         v_alpha: Floats,
     ) -> CompositeGradient:
-        return composite_vjp_with(exp, projection, colors, background, bins, conventions, output, v_image, v_alpha)
+        return composite_vjp_with(exp, projection, colors, bins, conventions, output, v_image, v_alpha)
 
     return replace(CPU, name=name, composite=composite, composite_vjp=composite_vjp)

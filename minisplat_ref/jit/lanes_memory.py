@@ -164,13 +164,11 @@ def _turned(builder: Any, rows: list[Any]) -> list[Any]:
 
 
 @compiled(columns_of)
-def _columns_of(typing: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
-    result = types.UniTuple(a, WIDTH)
-
+def _columns_of(typing: Any, rows: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return context.make_tuple(builder, result, _turned(builder, args))
+        return context.make_tuple(builder, rows, _turned(builder, cgutils.unpack_tuple(builder, args[0])))
 
-    return result(a, b, c, d, e, f, g, h), generate
+    return rows(rows), generate
 
 
 def _register_reduction(function: Callable, emit: Callable) -> None:
@@ -189,9 +187,9 @@ def _register_reduction(function: Callable, emit: Callable) -> None:
 
 
 @compiled(sums_of)
-def _sums_of(typing: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
+def _sums_of(typing: Any, rows: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        vectors, width = list(args), WIDTH
+        vectors, width = cgutils.unpack_tuple(builder, args[0]), WIDTH
         while width > 1:  # two vectors become one: the sums of the halves of what each holds, one after the other
             width //= 2
             firsts = [k for k in range(2 * WIDTH) if k // width % 2 == 0]
@@ -200,7 +198,7 @@ def _sums_of(typing: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any
             vectors = [builder.fadd(*(builder.shuffle_vector(*pair, mask) for mask in masks)) for pair in pairs]
         return vectors[0]
 
-    return a(a, b, c, d, e, f, g, h), generate
+    return rows.dtype(rows), generate
 
 
 _register_reduction(sum_of, lambda builder, a, b: builder.fadd(a, b))

@@ -11,8 +11,7 @@ import numpy as np
 from minisplat_ref.constants import Conventions
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.reference.pinhole import pinhole_rays, pose, slope_limits, with_principal_point
-from minisplat_ref.splatting import Primitives
-from minisplat_ref.types import Camera, Floats, Gaussians
+from minisplat_ref.types import Camera, Floats, Gaussians, Primitives
 
 POSE = ("cam_from_world_R", "cam_from_world_t")
 

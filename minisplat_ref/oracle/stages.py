@@ -16,12 +16,12 @@ from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.reference.pinhole import pinhole_jacobians, pinhole_rays, pose, slope_limits, with_principal_point
-from minisplat_ref.splatting import Primitives
 from minisplat_ref.types import (
     Camera,
     Floats,
     Gaussians,
     GeometricWeights,
+    Primitives,
     Projection,
     ProjectionGradient,
     TileBins,
@@ -150,7 +150,7 @@ def surface_stage(backend: Backend, setting: Setting) -> Stage:
         return Point(tuple(surface), (surface.depths > 0,))
 
     def vjp(v_points: Floats, v_depths: Floats) -> tuple[Floats, ...]:
-        return backend.surface_points_vjp(*inputs.values(), camera, ids, v_points, v_depths)
+        return backend.surface_points_vjp(means, quats, scales, camera, ids, v_points, v_depths)
 
     return Stage("surface_points", inputs, ("points", "depths"), function, vjp)
 
@@ -180,7 +180,8 @@ def geometric_stage(backend: Backend, camera: Camera, rng: np.random.Generator) 
     points, weights = points_near(depth, camera, rng), GeometricWeights(0.7, 1.3, 0.9)
     mask = np.ones(shape, dtype=bool)
     mask[1, 1] = False
-    inputs: dict[str, Floats] = {"accumulated_depth": depth * alpha, "alpha": alpha}
+    accumulated = depth * alpha
+    inputs: dict[str, Floats] = {"accumulated_depth": accumulated, "alpha": alpha}
 
     def function(accumulated_depth: Floats, alpha: Floats) -> Point:
         loss, _ = backend.geometric_loss(accumulated_depth, alpha, photograph, camera, points, weights, mask)
@@ -188,7 +189,7 @@ def geometric_stage(backend: Backend, camera: Camera, rng: np.random.Generator) 
         return Point((np.asarray(loss),), tuple(np.sign(np.diff(depth, axis=axis)) for axis in (0, 1)))
 
     def vjp(v_loss: Floats) -> tuple[Floats, ...]:
-        _, tape = backend.geometric_loss(*inputs.values(), photograph, camera, points, weights, mask)
+        _, tape = backend.geometric_loss(accumulated, alpha, photograph, camera, points, weights, mask)
         return backend.geometric_loss_vjp(tape, float(v_loss))
 
     return Stage("geometric_loss", inputs, ("loss",), function, vjp)

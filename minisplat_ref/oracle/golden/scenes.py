@@ -15,7 +15,7 @@ from minisplat_ref.constants import GSPLAT_MAIN, INRIA, Conventions
 from minisplat_ref.oracle.golden.format import STAGE_COTANGENTS, Arrays, Golden
 from minisplat_ref.oracle.thresholds import thresholds
 from minisplat_ref.reference.covariance import rotation_matrices
-from minisplat_ref.types import Floats, Projection, ProjectionGradient, RenderOutput, TileBins, TileGrid
+from minisplat_ref.types import Floats, Primitives, Projection, ProjectionGradient, RenderOutput, TileBins, TileGrid
 
 
 class Recipe(NamedTuple):
@@ -153,7 +153,7 @@ def run_stages(backend: Backend, scene: Golden, dtype: str, fed: Arrays | None =
         return np.asarray(array, dtype, order="C") if array.dtype.kind == "f" else array
 
     c, camera = scene.conventions, scene.camera
-    primitives = tuple(take(name) for name in ("means", "quats", "scales", "opacities"))
+    primitives = Primitives(take("means"), take("quats"), take("scales"), take("opacities"))
     out |= zip(PROJECTION, backend.project(*primitives, camera, c), strict=True)
     projection = projection_of({name: take(name) for name in PROJECTION})
 
@@ -164,7 +164,7 @@ def run_stages(backend: Backend, scene: Golden, dtype: str, fed: Arrays | None =
     if fed is not None:
         bins = reference_bins(fed, c, tile_size)
 
-    shading = (take("means"), take("sh_dc"), take("sh_rest"), camera, scene.sh_degree, take("radii"))
+    shading = (take("means"), take("sh_dc"), take("sh_rest"), camera, scene.sh_degree, known["radii"])
     out["colors"] = backend.sh_colors(*shading)
     blending = (projection, take("colors"), take("background"), bins, c)
     output = backend.composite(*blending)
