@@ -30,7 +30,6 @@ from minisplat_ref.types import (
     CompositeGradient,
     Floats,
     Gaussians,
-    GeometricWeights,
     Projection,
     RenderOutput,
     TileBins,
@@ -78,13 +77,6 @@ def _photometric_loss(dtype: Dtype) -> None:
     CPU.photometric_loss_vjp(CPU.photometric_loss(image, photograph, 0.2)[1])
 
 
-def _geometric_loss(dtype: Dtype) -> None:
-    output = _draw(dtype, _REFERENCE, with_depth=True).splats.output
-    image, depth = np.ascontiguousarray(output.image[..., :3]), output.image[..., 3]
-    weights, points = GeometricWeights(1.0, 1.0, 1.0), np.ones((2, 3))
-    CPU.geometric_loss_vjp(CPU.geometric_loss(depth, output.alpha, image, _camera(), points, weights)[1])
-
-
 def _adam(dtype: Dtype) -> None:
     for rows in (None, np.arange(N_GAUSSIANS)):  # all, and the visible
         values, gradient, first, second = np.zeros((4, N_GAUSSIANS, 3), dtype)
@@ -102,7 +94,6 @@ STAGES: dict[str, Callable[[Dtype], None]] = {
     "colours": _stage("sh_colors"),
     "Adam": _adam,
     # From here on not every training and no ordinary rendering.
-    "geometric loss, both ways": _geometric_loss,
     "blending with depth, backward": _stage("composite_vjp", with_depth=True),
     "blending with depth": _stage("composite", with_depth=True),
     "blend statistics": _stage("composite", with_stats=True),
