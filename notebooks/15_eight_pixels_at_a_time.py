@@ -23,7 +23,7 @@
 #
 # | file | what it holds |
 # |---|---|
-# | `minisplat_ref/scalar/lanes.py` | eight numbers as one value |
+# | `minisplat_ref/jit/lanes.py` | eight numbers as one value |
 # | `minisplat_ref/cpu/tile_state.py` | what the pixels of a tile remember |
 # | `minisplat_ref/cpu/tile_rows.py` | which rows of a tile a Gaussian reaches, and its alpha there |
 # | `minisplat_ref/cpu/compositing/forward.py`, `backward.py` | the kernels |

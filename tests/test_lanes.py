@@ -3,7 +3,6 @@
 import numba
 import numpy as np
 import pytest
-from minisplat_ref.scalar.literals import ONE
 from numpy.testing import assert_allclose, assert_array_equal
 
 from minisplat_ref.cpu.compositing.exponential import exp_exact, exp_fast
@@ -32,6 +31,7 @@ from minisplat_ref.jit.lanes import (
     sum_of,
     sums_of,
 )
+from minisplat_ref.jit.literals import ONE
 
 DTYPES = [np.float32, np.float64]
 
