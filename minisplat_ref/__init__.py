@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from minisplat_ref.backends import CPU, REFERENCE, Backend, get_backend
     from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN, INRIA, MINI_SPLATTING2, PROFILES, Conventions
     from minisplat_ref.errors import InputError
-    from minisplat_ref.gsplat_door import rasterization, rasterization_vjp
+    from minisplat_ref.gsplat_compat import rasterization, rasterization_vjp
     from minisplat_ref.io import load_scene
     from minisplat_ref.io.ply import load_ply, save_ply
     from minisplat_ref.types import Camera, Gaussians, RenderOutput, Scene, View
@@ -25,7 +25,7 @@ _MODULES = {
     "minisplat_ref.errors": ("InputError",),
     "minisplat_ref.io": ("load_scene",),
     "minisplat_ref.io.ply": ("load_ply", "save_ply"),
-    "minisplat_ref.gsplat_door": ("rasterization", "rasterization_vjp"),
+    "minisplat_ref.gsplat_compat": ("rasterization", "rasterization_vjp"),
     "minisplat_ref.types": ("Camera", "Gaussians", "RenderOutput", "Scene", "View"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}

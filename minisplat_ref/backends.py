@@ -4,46 +4,35 @@
 the only module that sees both the reference and the kernels.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from types import ModuleType
-from typing import Any
 
-import minisplat_ref.cpu.adam
-import minisplat_ref.cpu.compositing
-import minisplat_ref.cpu.compositing.exact
-import minisplat_ref.cpu.depth
-import minisplat_ref.cpu.geometric_loss
-import minisplat_ref.cpu.loss
-import minisplat_ref.cpu.projection
-import minisplat_ref.cpu.spherical_harmonics
-import minisplat_ref.cpu.tiling
-import minisplat_ref.reference.adam
-import minisplat_ref.reference.compositing
-import minisplat_ref.reference.depth
-import minisplat_ref.reference.geometric_loss
-import minisplat_ref.reference.loss
-import minisplat_ref.reference.projection
-import minisplat_ref.reference.spherical_harmonics
-import minisplat_ref.reference.tiling  # noqa: F401  (the linter sees only the last import of a package)
-from minisplat_ref import cpu, reference
-from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
+from minisplat_ref import stages
+from minisplat_ref.cpu import adam as cpu_adam
+from minisplat_ref.cpu import compositing as cpu_compositing
+from minisplat_ref.cpu import depth as cpu_depth
+from minisplat_ref.cpu import geometric_loss as cpu_geometric_loss
+from minisplat_ref.cpu import loss as cpu_loss
+from minisplat_ref.cpu import projection as cpu_projection
+from minisplat_ref.cpu import spherical_harmonics as cpu_spherical_harmonics
+from minisplat_ref.cpu import tiling as cpu_tiling
+from minisplat_ref.cpu.compositing import exact as cpu_compositing_exact
+from minisplat_ref.cpu.compositing import plain_conic as cpu_plain_conic
 from minisplat_ref.errors import InputError
-from minisplat_ref.types import (
-    CompositeGradient,
-    Floats,
-    PrimitiveGradient,
-    Projection,
-    RenderOutput,
-    SHGradient,
-    SurfacePoints,
-    TileBins,
+from minisplat_ref.reference import (
+    adam,
+    compositing,
+    depth,
+    geometric_loss,
+    loss,
+    projection,
+    spherical_harmonics,
+    tiling,
 )
 
 
 @dataclass(frozen=True)
 class Backend:
-    """One function per stage, with the signatures of the functions of the same names in :mod:`minisplat_ref.reference`.
+    """One function per stage; :mod:`minisplat_ref.stages` says what each takes and returns.
 
     Attributes
     ----------
@@ -56,58 +45,79 @@ class Backend:
     name: str
     tile_width: int
     tile_height: int
-    project: Callable[..., Projection]
-    project_vjp: Callable[..., PrimitiveGradient]
-    sh_colors: Callable[..., Floats]
-    sh_colors_vjp: Callable[..., SHGradient]
-    bin_gaussians: Callable[..., TileBins]
-    composite: Callable[..., RenderOutput]
-    composite_vjp: Callable[..., CompositeGradient]
-    surface_points: Callable[..., SurfacePoints]
-    surface_points_vjp: Callable[..., tuple[Floats, Floats, Floats]]
-    photometric_loss: Callable[..., tuple[float, Any]]
-    photometric_loss_vjp: Callable[..., Floats]
-    geometric_loss: Callable[..., tuple[float, Any]]
-    geometric_loss_vjp: Callable[..., tuple[Floats, Floats]]
-    adam_update: Callable[..., None]
+    project: stages.Project
+    project_vjp: stages.ProjectVjp
+    sh_colors: stages.SHColors
+    sh_colors_vjp: stages.SHColorsVjp
+    bin_gaussians: stages.BinGaussians
+    composite: stages.Composite
+    composite_vjp: stages.CompositeVjp
+    surface_points: stages.ComputeSurfacePoints
+    surface_points_vjp: stages.SurfacePointsVjp
+    photometric_loss: stages.PhotometricLoss
+    photometric_loss_vjp: stages.PhotometricLossVjp
+    geometric_loss: stages.GeometricLoss
+    geometric_loss_vjp: stages.GeometricLossVjp
+    adam_update: stages.AdamUpdate
 
 
-def _from_package(name: str, package: ModuleType, tile_width: int, tile_height: int) -> Backend:
-    """Collect the stages of a package whose modules and functions bear the reference's names."""
-    return Backend(
-        name=name,
-        tile_width=tile_width,
-        tile_height=tile_height,
-        project=package.projection.project,
-        project_vjp=package.projection.project_vjp,
-        sh_colors=package.spherical_harmonics.sh_colors,
-        sh_colors_vjp=package.spherical_harmonics.sh_colors_vjp,
-        bin_gaussians=package.tiling.bin_gaussians,
-        composite=package.compositing.composite,
-        composite_vjp=package.compositing.composite_vjp,
-        surface_points=package.depth.surface_points,
-        surface_points_vjp=package.depth.surface_points_vjp,
-        photometric_loss=package.loss.photometric_loss,
-        photometric_loss_vjp=package.loss.photometric_loss_vjp,
-        geometric_loss=package.geometric_loss.geometric_loss,
-        geometric_loss_vjp=package.geometric_loss.geometric_loss_vjp,
-        adam_update=package.adam.adam_update,
-    )
-
-
-REFERENCE = _from_package("reference", reference, tile_width=16, tile_height=16)
+REFERENCE = Backend(
+    name="reference",
+    tile_width=16,
+    tile_height=16,
+    project=projection.project,
+    project_vjp=projection.project_vjp,
+    sh_colors=spherical_harmonics.sh_colors,
+    sh_colors_vjp=spherical_harmonics.sh_colors_vjp,
+    bin_gaussians=tiling.bin_gaussians,
+    composite=compositing.composite,
+    composite_vjp=compositing.composite_vjp,
+    surface_points=depth.surface_points,
+    surface_points_vjp=depth.surface_points_vjp,
+    photometric_loss=loss.photometric_loss,
+    photometric_loss_vjp=loss.photometric_loss_vjp,
+    geometric_loss=geometric_loss.geometric_loss,
+    geometric_loss_vjp=geometric_loss.geometric_loss_vjp,
+    adam_update=adam.adam_update,
+)
 """NumPy, as in the papers: to read and to check against."""
 
-CPU = _from_package("cpu", cpu, TILE_WIDTH, TILE_HEIGHT)
+CPU = Backend(
+    name="cpu",
+    tile_width=cpu_tiling.TILE_WIDTH,
+    tile_height=cpu_tiling.TILE_HEIGHT,
+    project=cpu_projection.project,
+    project_vjp=cpu_projection.project_vjp,
+    sh_colors=cpu_spherical_harmonics.sh_colors,
+    sh_colors_vjp=cpu_spherical_harmonics.sh_colors_vjp,
+    bin_gaussians=cpu_tiling.bin_gaussians,
+    composite=cpu_compositing.composite,
+    composite_vjp=cpu_compositing.composite_vjp,
+    surface_points=cpu_depth.surface_points,
+    surface_points_vjp=cpu_depth.surface_points_vjp,
+    photometric_loss=cpu_loss.photometric_loss,
+    photometric_loss_vjp=cpu_loss.photometric_loss_vjp,
+    geometric_loss=cpu_geometric_loss.geometric_loss,
+    geometric_loss_vjp=cpu_geometric_loss.geometric_loss_vjp,
+    adam_update=cpu_adam.adam_update,
+)
 """Numba on all cores; float32 data use a polynomial exponential."""
 
 CPU_EXACT = replace(
     CPU,
     name="cpu-exact",
-    composite=cpu.compositing.exact.composite,
-    composite_vjp=cpu.compositing.exact.composite_vjp,
+    composite=cpu_compositing_exact.composite,
+    composite_vjp=cpu_compositing_exact.composite_vjp,
 )
 """The same with libm's exponential in float32 too."""
+
+PLAIN = replace(
+    CPU,
+    name="plain",
+    composite=cpu_plain_conic.composite,
+    composite_vjp=cpu_plain_conic.composite_vjp,
+)
+"""The same with the kernels that blend any primitive; without statistics, therefore not among ``BACKENDS``."""
 
 BACKENDS = {backend.name: backend for backend in (REFERENCE, CPU, CPU_EXACT)}
 

@@ -1,4 +1,7 @@
-"""Every constant of the renderer, each with its reason, and the conventions on which renderers differ.
+"""The numbers in the renderer's formulas, each with its reason, and the conventions on which renderers differ.
+
+Held here is what the book and the kernels, or several stages, must agree on. A number that one module alone needs (the
+design of a kernel, a date of a method, what a reader of files tolerates) stands in that module.
 
 There is no single "3DGS rasteriser": released backends clamp alpha at 0.99 or 0.999, cut a Gaussian's extent at three
 sigma or where it becomes invisible, ignore or use the principal point. A :class:`Conventions` value names one such set
@@ -24,10 +27,17 @@ SH_C3 = (
 )
 SH_DEGREE_MAX = 3
 
+INRIA_TILE = 16  # pixels; INRIA's rule of extent is stated in tiles of this size
+# px^4: floor of (lambda_1 - lambda_2)^2 / 4 in INRIA's largest eigenvalue: that of a disc is 0.3 px^2 too large.
+INRIA_ROOT_MIN = 0.1
+# Pixels. The largest power of two that fits int32; float32 and float64 hold it exactly. A lower bound would cull: the
+# box of a Gaussian whose centre lies further beside the image than this, and which covers it still, would miss it.
+RADIUS_MAX = 2.0**30
+
 JACOBIAN_CLAMP = 1.3  # the EWA Jacobian is frozen beyond 1.3 x the half field of view: it explodes as 1/z^2 outside
 COMPENSATION_FLOOR = 0.005  # least factor of the antialiasing compensation, keeps its square root differentiable
 MEDIAN_TRANSMITTANCE = 0.5  # the median depth is that of the Gaussian that takes the transmittance below one half
-DEPTH_ALPHA_MIN = 1e-10  # expected depth = sum(w z) / max(alpha, this): an empty pixel gets depth 0, not 0/0
+DEPTH_ALPHA_MIN = 1e-10  # a pixel of lower accumulated opacity is empty: its expected depth is 0, not 0/0
 
 SSIM_WINDOW = 11  # pixels; Wang et al. 2004
 SSIM_SIGMA = 1.5  # pixels
@@ -38,6 +48,9 @@ EDGE_SHARPNESS = 10.0  # neighbours that differ by 0.1, 25 of 255 levels, are ti
 # Depth ratios within 1 % count as noise. The covariances of the points of four photographed scenes say 0.1 to 0.2 % for
 # the median observation and 0.2 to 0.7 % for the 90th percentile; wrong matches and silhouettes are off by far more.
 SFM_DEPTH_TOLERANCE = 0.01
+
+LIST_ORDER = 1  # hits that a pixel holds back to sort them: each is taken as it comes
+EXACT_ORDER = 1 << 30  # more than any list holds: a pixel sorts all its hits
 
 
 class Conventions(NamedTuple):

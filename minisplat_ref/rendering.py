@@ -19,8 +19,20 @@ from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.reference.pinhole import with_principal_point
-from minisplat_ref.splatting import Primitives, SplatTape, splat, splat_vjp
-from minisplat_ref.types import NOTHING, Bools, Camera, Floats, Gaussians, Ints, Model, Projection, RenderOutput, View
+from minisplat_ref.splatting import SplatTape, splat, splat_vjp
+from minisplat_ref.types import (
+    NOTHING,
+    Bools,
+    Camera,
+    Floats,
+    Gaussians,
+    Ints,
+    Model,
+    Primitives,
+    Projection,
+    RenderOutput,
+    View,
+)
 
 
 class RenderTape(NamedTuple):

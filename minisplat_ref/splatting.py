@@ -2,7 +2,7 @@
 
 The order of the stages is 3DGS section 6's. What the Gaussians are before their activations, and where their colours
 come from, is left to the caller: :mod:`minisplat_ref.rendering` holds trained parameters and spherical harmonics,
-:mod:`minisplat_ref.gsplat_door` whatever it is given.
+:mod:`minisplat_ref.gsplat_compat` whatever it is given.
 """
 
 from collections.abc import Callable
@@ -17,6 +17,7 @@ from minisplat_ref.types import (
     Floats,
     Ints,
     PrimitiveGradient,
+    Primitives,
     Projection,
     ProjectionGradient,
     RenderOutput,
@@ -24,14 +25,7 @@ from minisplat_ref.types import (
     TileGrid,
 )
 
-
-class Primitives(NamedTuple):
-    """Gaussians after their activations: what a camera can be pointed at."""
-
-    means: Floats  # [N, 3] world frame
-    quats: Floats  # [N, 4] wxyz, any length but zero
-    scales: Floats  # [N, 3] standard deviations, world units
-    opacities: Floats  # [N] in [0, 1]
+__all__ = ["Primitives", "SplatGradient", "SplatTape", "splat", "splat_vjp"]
 
 
 class SplatTape(NamedTuple):

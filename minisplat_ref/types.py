@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.integer]
@@ -38,6 +38,19 @@ class Gaussians(NamedTuple):
     """[N, 3] spherical-harmonic coefficient of degree 0, RGB; colour = 0.5 + SH_C0 * sh_dc + ..."""
     sh_rest: Floats
     """[N, K-1, 3] coefficients of degree 1 and above; K = (degree + 1)^2, so K - 1 is 0, 3, 8 or 15."""
+
+
+class Primitives(NamedTuple):
+    """Gaussians after their activations: what a camera can be pointed at."""
+
+    means: Floats
+    """[N, 3] world frame, world units."""
+    quats: Floats
+    """[N, 4] wxyz, any length but zero."""
+    scales: Floats
+    """[N, 3] standard deviations, world units."""
+    opacities: Floats
+    """[N] in [0, 1]."""
 
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
@@ -72,6 +85,16 @@ class Camera(NamedTuple):
     """Image width, pixels."""
     height: int
     """Image height, pixels."""
+
+    @property
+    def center(self) -> Floats:
+        """[3] position ``-R^T t``, world frame, in the dtype of the pose."""
+        return -self.cam_from_world_R.T @ self.cam_from_world_t
+
+    def astype(self, dtype: DTypeLike) -> "Camera":
+        """Return the same camera with its pose in another precision."""
+        R, t = np.asarray(self.cam_from_world_R, dtype), np.asarray(self.cam_from_world_t, dtype)
+        return self._replace(cam_from_world_R=R, cam_from_world_t=t)
 
 
 class Projection(NamedTuple):
@@ -227,6 +250,17 @@ class CompositeGradient(NamedTuple):
     """[D]."""
 
 
+class BlendGradient(NamedTuple):
+    """Gradient of the loss with respect to what is blended, whatever the primitives are."""
+
+    primitives: tuple[Floats, ...]
+    """One array for each field of the primitives that their response has a derivative for."""
+    colors: Floats
+    """[N, S] coefficients of colour."""
+    background: Floats
+    """[D]."""
+
+
 class SurfacePoints(NamedTuple):
     """Where each pixel's ray meets its dominant Gaussian (Mini-Splatting, depth reinitialisation)."""
 
@@ -234,6 +268,19 @@ class SurfacePoints(NamedTuple):
     """[H, W, 3] world frame; 0 where there is none."""
     depths: Floats
     """[H, W] camera z, world units; 0 where there is none or the point lies behind the camera."""
+
+
+class AdamStep(NamedTuple):
+    """The numbers of one step of Adam that hold for a whole array."""
+
+    rate: float
+    """Learning rate, bias corrections included."""
+    beta1: float
+    """Decay of the mean gradient."""
+    beta2: float
+    """Decay of the mean squared gradient."""
+    eps: float
+    """Added to the root, bias corrections included."""
 
 
 class GeometricWeights(NamedTuple):

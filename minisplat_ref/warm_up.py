@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
 from multiprocessing import get_context
-from typing import Any, NamedTuple
+from typing import NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -24,13 +24,25 @@ from minisplat_ref.backends import CPU, REFERENCE, Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.compositing.records import record_size
 from minisplat_ref.rendering import RenderTape, render, render_vjp
-from minisplat_ref.types import Camera, Floats, Gaussians, GeometricWeights, Projection, RenderOutput, TileBins
+from minisplat_ref.types import (
+    AdamStep,
+    Camera,
+    CompositeGradient,
+    Floats,
+    Gaussians,
+    GeometricWeights,
+    Projection,
+    RenderOutput,
+    TileBins,
+)
 
 WIDTH, HEIGHT = 24, 18
 N_GAUSSIANS = 4
 DEGREE = 1  # of the spherical harmonics: a number at run time, so that any will do
 
 Dtype = type[np.floating]
+Arguments = ParamSpec("Arguments")
+HasConics = TypeVar("HasConics", Projection, CompositeGradient)
 
 
 class Compiled(NamedTuple):
@@ -75,8 +87,8 @@ def _geometric_loss(dtype: Dtype) -> None:
 
 def _adam(dtype: Dtype) -> None:
     for rows in (None, np.arange(N_GAUSSIANS)):  # all, and the visible
-        tables = (np.zeros((N_GAUSSIANS, 3), dtype) for _ in range(4))
-        CPU.adam_update(*tables, rows, 0.1, 0.9, 0.999, 1e-15)
+        values, gradient, first, second = np.zeros((4, N_GAUSSIANS, 3), dtype)
+        CPU.adam_update(values, gradient, first, second, rows, AdamStep(0.1, 0.9, 0.999, 1e-15))
 
 
 STAGES: dict[str, Callable[[Dtype], None]] = {
@@ -142,13 +154,13 @@ def _compile(name: str, dtype: Dtype) -> Compiled:
     return Compiled(name, time.perf_counter() - start)
 
 
-def _in_kernel_types(function: Callable) -> Callable:
+def _in_kernel_types(function: Callable[Arguments, HasConics]) -> Callable[Arguments, HasConics]:
     """Return a stage of the reference whose conics, or gradient by them, are float64 as those of the kernels."""
 
-    def stage(*args: Any) -> Any:
-        bundle = function(*args)
+    def stage(*args: Arguments.args, **named: Arguments.kwargs) -> HasConics:
+        bundle = function(*args, **named)
         bundle = bundle._replace(conics=bundle.conics.astype(np.float64))
-        return bundle._make(map(np.ascontiguousarray, bundle))
+        return type(bundle)._make(map(np.ascontiguousarray, bundle))
 
     return stage
 
@@ -158,11 +170,11 @@ def _with_records(
 ) -> RenderOutput:
     """Composite by the reference, with records as the kernels keep: else their gradient would have to make them."""
     records = np.zeros((len(colors), record_size(colors.shape[1])), colors.dtype)
-    output: RenderOutput = REFERENCE.composite(projection, colors, background, bins, conventions, **asked)
+    output = REFERENCE.composite(projection, colors, background, bins, conventions, **asked)
     return output._replace(kept=records)
 
 
-_REFERENCE: Backend = replace(
+_REFERENCE = replace(
     REFERENCE,
     tile_width=CPU.tile_width,
     tile_height=CPU.tile_height,

@@ -154,11 +154,11 @@ layers = [layer for layer in layers if layer and layer != ["__main__"]]
 notes = {
     "cli": "arguments, progress, files",
     "extensions": "further methods; never imported from below",
-    "train": "the loop",
-    "recipes": "training methods as data",
-    "events": "what a recipe can do besides gradient steps",
+    "datasets": "scenes to train on; what reports share",
+    "methods": "a file per paper: its events and when they happen",
+    "training": "the loop",
     "strategy": "who exists, how it moves, files, measures",
-    "render": "parameters to image and back",
+    "rendering": "parameters to image and back",
     "splatting": "the stages in a row",
     "backends": "one function for every stage",
     "cpu": "loops over all Gaussians, all pixels",
@@ -221,7 +221,7 @@ display(Markdown("\n".join(["| module | what it says of itself |", "|---|---|", 
 # | 11 | `strategy/aggressive_clone.py`, `visibility.py` | 10 | aggressive clone and visibility culling |
 # | 12 | `methods/mini_splatting.py`, `mini_splatting2.py` | 11 | three recipes side by side |
 # | 13 | `oracle/differences.py`, `gradients.py`, `planted.py` | 12 | how a gradient check lies |
-# | 14 | `oracle/golden/`, `comparison/` | 13 | comparing a backend with the oracle |
+# | 14 | `oracle/golden/`, `comparison/`, `thresholds.py` | 13 | comparing a backend with the oracle |
 # | 15 | `scalar/`, then `cpu/` | 15 | how the same formulas run fast: eight pixels at a time |
 # | 16 | `bench/` | 14 | speed against error |
 #
@@ -284,7 +284,9 @@ assert set(modules) == exists - {"__main__"} and {"reference", "scalar", "cpu", 
 
 # The reference stands below everything that uses it, and beside the scalars that it is checked against.
 level = {name: i for i, layer in enumerate(layers) for name in layer}
-assert level["train"] < level["render"] < level["backends"] < level["reference"] == level["scalar"] < level["types"]
+assert (
+    level["training"] < level["rendering"] < level["backends"] < level["reference"] == level["scalar"] < level["types"]
+)
 
 # Profiles differ, in name and in pixels, but little.
 assert len(set(PROFILES.values())) == len(PROFILES) == 4

@@ -42,7 +42,7 @@ from minisplat_ref.constants import GSPLAT_MAIN, INRIA
 from minisplat_ref.datasets.synthetic.cameras import look_at
 from minisplat_ref.reference.compositing import composite
 from minisplat_ref.reference.covariance import covariances
-from minisplat_ref.reference.pinhole import pinhole, pinhole_jacobians, slope_limits
+from minisplat_ref.reference.pinhole import pinhole, pinhole_jacobians, pinhole_rays, slope_limits
 from minisplat_ref.reference.projection import project
 from minisplat_ref.reference.tiling import bin_gaussians
 from minisplat_ref.types import Camera, TileGrid
@@ -113,9 +113,9 @@ projection = project(mean, quat, scale, opacity, camera, GSPLAT_MAIN)
 figure = plt.figure(figsize=(10, 3.9))
 space, image = figure.add_subplot(1, 2, 1, projection="3d"), figure.add_subplot(1, 2, 2)
 space.plot_surface(*ellipsoid(mean[0], Sigma[0]), color=RED, alpha=0.85, linewidth=0)
-center = -camera.cam_from_world_R.T @ camera.cam_from_world_t
+center = camera.center
 corners = np.array([[0, 0], [80, 0], [80, 60], [0, 60], [0, 0]])
-rays = np.column_stack([(corners - [camera.cx, camera.cy]) / camera.fx, np.ones(5)]) @ camera.cam_from_world_R
+rays = pinhole_rays(*corners.T, camera) @ camera.cam_from_world_R
 for ray in rays:
     space.plot(*np.stack([center, center + 0.8 * ray]).T, color=BLUE, linewidth=0.8)
 space.plot(*(center + 0.8 * rays).T, color=BLUE)

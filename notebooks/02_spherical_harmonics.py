@@ -19,7 +19,7 @@
 # A polished ball shows a highlight that moves when you move. A Gaussian imitates this with a colour that depends on the
 # direction from which it is seen: a sum of at most 16 fixed functions on the sphere, each with its own RGB coefficient.
 #
-# Read alongside: `minisplat_ref/reference/spherical_harmonics.py`, after section 5.2 of 3DGS (Kerbl et al. 2023).
+# Read alongside: `minisplat_ref/reference/spherical_harmonics.py`, after section 3 of 3DGS (Kerbl et al. 2023).
 #
 # **Frames and units:** directions are unit vectors in the world frame, here with z up. They point *from the camera to
 # the Gaussian*. Colours are sRGB values in [0, 1], blended as they are, without conversion to linear light.
@@ -68,7 +68,7 @@ def globe(n=90, azimuth=-50.0, elevation=25.0):
 # other, and each further degree adds finer detail and $2l+1$ coefficients per channel. The spheres are seen from a
 # little above, with z upwards.
 #
-# $$c(d) = \tfrac12 + \sum_{l=0}^{L} \sum_{m=-l}^{l} k_{lm}\,Y_{lm}(d), \qquad L \le 3 \qquad \text{3DGS sec. 5.2}$$
+# $$c(d) = \tfrac12 + \sum_{l=0}^{L} \sum_{m=-l}^{l} k_{lm}\,Y_{lm}(d), \qquad L \le 3 \qquad \text{3DGS sec. 3}$$
 
 # %%
 points, is_disc = globe()
@@ -232,7 +232,7 @@ for degree in range(4):
     output, tape = render(ball, camera, background=np.ones(3), sh_degree=degree, backend=REFERENCE)
     pictures[degree] = output.image
 
-center = -camera.cam_from_world_R.T @ camera.cam_from_world_t
+center = camera.center
 exact = glossy_color(normals, (center - normals) / np.linalg.norm(center - normals, axis=1, keepdims=True))
 bins = REFERENCE.bin_gaussians(tape.projection, TileGrid(96, 96, 16, 16), GSPLAT_MAIN)
 truth = composite(tape.projection, exact, np.ones(3), bins, GSPLAT_MAIN).image

@@ -37,10 +37,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from minisplat_ref.backends import REFERENCE
-from minisplat_ref.constants import DEPTH_ALPHA_MIN, GSPLAT_MAIN, SH_C0
+from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.tracer import camera_centre, pixel_rays
+from minisplat_ref.datasets.synthetic.tracer import pixel_rays
 from minisplat_ref.reference.compositing import composite, composite_all_pairs
+from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.reference.projection import project
 from minisplat_ref.reference.tiling import bin_gaussians
@@ -180,7 +181,7 @@ plt.show()
 # %% [markdown]
 # ## A picture made of surface points
 #
-# For the rest of the notebook we need a picture. The ray tracer of `data_tools` gives exact depth, so every pixel of
+# For the rest of the notebook we need a picture. The ray tracer of `datasets` gives exact depth, so every pixel of
 # six views of a room becomes one small round Gaussian on the surface that it sees. Nothing is trained. A seventh
 # viewpoint, which was not used, shows what comes out: thin things too fat, and black where none of the six looked.
 
@@ -194,7 +195,7 @@ def lift(step, scale_px):
     for v in (2, 4, 6, 7, 9, 11):
         view, depth = room.scene.train_views[v], room.train_depths[v][::step, ::step]
         rays = pixel_rays(view.camera, 0.5, 0.5, np.arange(72)).reshape(72, 96, 3)[::step, ::step]
-        means.append((camera_centre(view.camera) + depth[..., None] * rays).reshape(-1, 3))
+        means.append((view.camera.center + depth[..., None] * rays).reshape(-1, 3))
         scales.append(scale_px * depth.ravel() / view.camera.fx)
         colors.append(view.image[::step, ::step].reshape(-1, 3) / 255)
     n = sum(map(len, means))
@@ -309,7 +310,7 @@ layers = Gaussians(
     sh_rest=np.zeros((len(layer_means), 0, 3)),
 )
 layer_output, _ = render(layers, camera, backend=REFERENCE, with_depth=True, with_median_depth=True)
-expected = layer_output.image[..., 3] / np.maximum(layer_output.alpha, DEPTH_ALPHA_MIN)
+expected = expected_depth(layer_output.image[..., 3], layer_output.alpha)
 median = layer_output.median_depth
 figure, panels = plt.subplots(1, 4, figsize=(11.5, 2.6))
 show_image(panels[0], np.clip(layer_output.image[..., :3], 0, 1), "image")

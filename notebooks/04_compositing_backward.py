@@ -152,7 +152,7 @@ plt.show()
 # & c \end{pmatrix}$, and $i$ counted from the nearest:
 #
 # $$ \sigma_i = \tfrac12 d_i^\top Q_i d_i, \quad E_i = e^{-\sigma_i}, \quad \alpha_i = o_i E_i, \quad
-#    T_i = \prod_{j<i} (1 - \alpha_j) \tag{3DGS 4} $$
+#    T_i = \prod_{j<i} (1 - \alpha_j) \tag{3DGS 3, 4} $$
 #
 # $$ C = \sum_i \alpha_i T_i c_i + T_{\rm end}\, b, \qquad A = 1 - T_{\rm end} \tag{3DGS 3} $$
 #

@@ -26,7 +26,7 @@
 # |---|---|---|
 # | `minisplat_ref/strategy/depth_reinit.py` | points of the pixels; which are drawn; the guards | MS sec. 4.1, app. D |
 # | `minisplat_ref/strategy/simplify.py` | `sample`: drawing without replacement | |
-# | `data_tools/studies/depth_types.py` | the comparison below, larger and over several seeds | MS table 4 |
+# | `minisplat_ref/experiments/studies/depth_types.py` | the comparison below, larger, with several seeds | MS table 4 |
 #
 # *MS* is Mini-Splatting, Fang and Wang 2024; the guards are not in the paper. **Frames and units:** the world is in
 # metres, z up; camera axes are x right, y down, z forward; a depth is the camera z.
@@ -263,7 +263,7 @@ def elevation(axes, name, points, pixels, title):
     for rows, color in ((~wrong, BLUE), (wrong, RED)):
         axes.scatter(points[rows, 0], points[rows, 2], s=2, color=color, linewidths=0)
     cameras = [v.camera for v in truths[name].scene.train_views]
-    centres = np.array([-c.cam_from_world_R.T @ c.cam_from_world_t for c in cameras])
+    centres = np.array([c.center for c in cameras])
     axes.plot(centres[:, 0], centres[:, 2], "k^", markersize=4)
     axes.set(title=f"{title}: {wrong.mean():.0%} of {len(points)} wrong", aspect="equal", xlabel="x (m)")
 

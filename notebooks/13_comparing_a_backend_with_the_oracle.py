@@ -23,7 +23,8 @@
 # | file | what it holds |
 # |---|---|
 # | `minisplat_ref/oracle/golden/` | scenes with the input, output and gradient of every stage |
-# | `minisplat_ref/oracle/comparison/` | the comparison, and the renderers that it knows |
+# | `minisplat_ref/oracle/comparison/` | the comparison, and what can be compared |
+# | `minisplat_ref/oracle/thresholds.py` | pixels at which rounding decides whether a hit counts |
 # | `minisplat_ref/oracle/planted.py` | copies of our own renderer with one error each |
 #
 # On a command line the same is `minisplat-ref oracle compare BACKEND`. **Frames and units:** image positions in pixels,
@@ -46,13 +47,17 @@ from matplotlib.patches import Ellipse
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN
 from minisplat_ref.errors import InputError
-from minisplat_ref.oracle.comparison.choose import choose_renderer, choose_scenes
-from minisplat_ref.oracle.comparison.dumps import from_dumps
-from minisplat_ref.oracle.comparison.own import by_profile, from_backend, with_planted_error
+from minisplat_ref.oracle.comparison.renderers import (
+    by_profile,
+    choose_renderer,
+    choose_scenes,
+    from_backend,
+    from_dumps,
+    with_planted_error,
+)
 from minisplat_ref.oracle.comparison.staged import compare_scene, first_divergence
 from minisplat_ref.oracle.golden.files import export
-from minisplat_ref.oracle.golden.scenes import Recipe, inputs
-from minisplat_ref.oracle.golden.stages import run_stages, truth
+from minisplat_ref.oracle.golden.scenes import Recipe, inputs, run_stages, truth
 from minisplat_ref.oracle.planted import planted
 
 plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})

@@ -22,10 +22,10 @@
 #
 # | file | what it holds |
 # |---|---|
-# | `minisplat_ref/oracle/bench/workloads.py` | what is drawn |
-# | `minisplat_ref/oracle/bench/contenders.py` | who draws it |
-# | `minisplat_ref/oracle/bench/flips.py` | which pixels stand at a threshold |
-# | `minisplat_ref/oracle/bench/judging.py`, `race.py` | errors, then times |
+# | `minisplat_ref/bench/workloads.py` | what is drawn |
+# | `minisplat_ref/bench/contenders.py` | who draws it |
+# | `minisplat_ref/oracle/thresholds.py` | which pixels stand at a threshold |
+# | `minisplat_ref/bench/judging.py`, `race.py` | errors, then times |
 #
 # **Frames and units:** images are [H, W, 3] with values in [0, 1]; an error of an image is an absolute difference, an
 # error of a gradient is relative. Times are those of the machine that ran the notebook; the command `minisplat-ref
@@ -107,7 +107,7 @@ def alphas_at(dtype):
     for tile in tile_hits(projection, CPU.bin_gaussians(projection, grid, near), near):
         pixel = np.flatnonzero((tile.ys == y) & (tile.xs == x))
         if len(pixel):
-            return tile.ids, projection.opacities[tile.ids] * tile.falloffs[:, pixel[0]]
+            return tile.ids, tile.hit.unclamped[:, pixel[0]]
     raise AssertionError("every pixel is in a tile")
 
 

@@ -27,7 +27,7 @@ from minisplat_ref.bench import (
 )
 from minisplat_ref.bench.by_turns import hold, times_by_turns
 from minisplat_ref.bench.exponentials import EXPONENTIALS, relative_errors
-from minisplat_ref.bench.flips import thresholds
+from minisplat_ref.bench.passes import RASTERIZATION
 from minisplat_ref.bench.peers import peers_of
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
@@ -35,6 +35,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.io.images import read_image
 from minisplat_ref.jit.compile import cache_root
 from minisplat_ref.oracle.planted import planted
+from minisplat_ref.oracle.thresholds import thresholds_of_view
 from minisplat_ref.oracle.tolerances import (
     BENCH_FLOAT32_GRADIENT,
     BENCH_FLOAT32_IMAGE,
@@ -47,7 +48,15 @@ from minisplat_ref.training.loop import train
 from minisplat_ref.types import Gaussians
 
 PEAK = ("peak", "bound")
-NAMES = ("reference-f64", "cpu-f64", "cpu-f32", "cpu-f32-exp3", "cpu-f32-3-sigma", "textbook-f32")
+NAMES = (
+    "reference-f64",
+    "cpu-f64",
+    "cpu-f32",
+    "rasterization-f32",
+    "cpu-f32-exp3",
+    "cpu-f32-3-sigma",
+    "textbook-f32",
+)
 pytestmark = pytest.mark.usefixtures("tiny_workloads")
 
 
@@ -77,7 +86,7 @@ def test_everyone_is_judged_and_timed(cases):
 def test_errors_are_those_of_the_precision(cases):
     assert 0 < cases["synth/cpu-f64"].figures["image max"] < BENCH_FLOAT64
     assert 0 < cases["synth/cpu-f64"].figures["gradient, no flips"] < BENCH_FLOAT64
-    for name in ("cpu-f32", "textbook-f32"):
+    for name in ("cpu-f32", "rasterization-f32", "textbook-f32"):
         figures = cases[f"synth/{name}"].figures
         assert 1e-8 < figures["image max, no flips"] < BENCH_FLOAT32_IMAGE
         assert 1e-8 < figures["gradient, no flips"] < BENCH_FLOAT32_GRADIENT
@@ -87,6 +96,25 @@ def test_errors_are_those_of_the_precision(cases):
     assert 1e-5 < cubic["gradient, no flips"] < BENCH_FLOAT32_GRADIENT
     assert cases["synth/cpu-f32-3-sigma"].figures["image max"] > 1e-3
     assert cases["synth/cpu-f32-3-sigma"].figures["flips"] is None
+
+
+def test_ratios_are_of_the_least_times(cases):
+    figures, textbook = cases["synth/rasterization-f32"].figures, cases["synth/textbook-f32"].figures
+    for ratio, time in (("x textbook", "least both ms"), ("x textbook, forward", "least forward ms")):
+        assert textbook[ratio] == 1
+        assert figures[ratio] == pytest.approx(textbook[time] / figures[time])
+    [reference] = race.race(tiny(), contenders.choose(()), repeats=1)  # and no baseline
+    assert reference.figures["x textbook"] is None and reference.figures["x textbook, forward"] is None
+
+
+@pytest.mark.parametrize("backend", [CPU, planted("half-off-diagonal")], ids=["right", "half-off-diagonal"])
+def test_rasterization_is_judged_as_render_is(backend):
+    """In float64 its image and gradient are the reference's, activations included, or it gets no time."""
+    bounds = BENCH_FLOAT64, BENCH_FLOAT64
+    contender = contenders.Contender("rasterization", backend, np.float64, *bounds, passes=RASTERIZATION)
+    [_, case] = race.race(tiny(), [*contenders.choose(()), contender], repeats=1)
+    assert case.passed == (backend is CPU) and (case.figures["both ms"] is None) == (backend is not CPU)
+    assert ("gradient of" in case.note) == (backend is not CPU)
 
 
 def with_pixel(value):
@@ -124,7 +152,7 @@ def test_flips_are_explained_and_nothing_else():
         sh_rest=np.zeros((2, 0, 3)),
     )
     output, tape = render(base, camera, backend=REFERENCE)
-    assert (thresholds(tape).allowance == 0).mean() > 0.99
+    assert (thresholds_of_view(tape.splats).allowance == 0).mean() > 0.99
     projection = tape.projection
     center = np.array([4.5, 5.5]) - projection.means2d[0]
     a, b, c = projection.conics[0]
@@ -135,7 +163,7 @@ def test_flips_are_explained_and_nothing_else():
         logits = np.array([np.log(alpha / (1 - alpha)), 0.0])
         output, tape = render(base._replace(opacity_logits=logits), camera, backend=REFERENCE)
         images.append(output.image)
-        allowances.append(thresholds(tape).allowance)
+        allowances.append(thresholds_of_view(tape.splats).allowance)
     changed = np.abs(images[0] - images[1]).max(axis=2)
     assert changed[5, 4] > 1e-3
     for allowance in allowances:
@@ -164,21 +192,22 @@ def opaque_stack(logit, last_logit):
         sh_dc=np.ones((4, 3)),
         sh_rest=np.zeros((4, 0, 3)),
     )
-    return render(gaussians, camera, backend=REFERENCE)[1]
+    return render(gaussians, camera, backend=REFERENCE)[1].splats
 
 
 def test_what_lies_behind_the_stop_does_not_count():
     faint = float(np.log(1 / 254))  # opacity 1/255
-    assert (thresholds(opaque_stack(-3.0, faint)).allowance[6:10, 6:10] > 0).all()
-    assert not thresholds(opaque_stack(4.5, faint)).is_near[6:10, 6:10].any()
+    assert (thresholds_of_view(opaque_stack(-3.0, faint)).allowance[6:10, 6:10] > 0).all()
+    assert not thresholds_of_view(opaque_stack(4.5, faint)).is_near[6:10, 6:10].any()
 
 
 def test_transmittance_at_the_stop_is_a_threshold():
     opacity = 1 - 1e-4 ** (1 / 3)  # three of them leave the least transmittance
-    near, far = (thresholds(opaque_stack(np.log(o / (1 - o)), -9.0)) for o in (opacity, opacity + 1e-3))
+    near, far = (thresholds_of_view(opaque_stack(np.log(o / (1 - o)), -9.0)) for o in (opacity, opacity + 1e-3))
     middle = np.s_[7:9, 7:9]
     assert (near.allowance[middle] > 1e-3).all() and not far.is_near[middle].any()
-    assert thresholds(opaque_stack(np.log(opacity / (1 - opacity)) + 0.01, -9.0), slack=0.01).is_near[middle].all()
+    farther = opaque_stack(np.log(opacity / (1 - opacity)) + 0.01, -9.0)
+    assert thresholds_of_view(farther, slack=0.01).is_near[middle].all()
 
 
 def test_workloads_are_fixed():

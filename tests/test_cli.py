@@ -14,12 +14,14 @@ from tolerances import PSNR_FLOAT32
 import minisplat_ref
 from minisplat_ref import InputError, load_ply, load_scene, save_ply
 from minisplat_ref.backends import BACKENDS, CPU
-from minisplat_ref.cli import COMMANDS, build_parser, demo, main
-from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.cli import GROUPS, build_parser, demo, main
+from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.experiments.arguments import BACKENDS as BACKEND_CHOICES
+from minisplat_ref.experiments.arguments import SYNTHETIC_SCENES
 from minisplat_ref.experiments.pictures import GAP, error_picture, to_picture
 from minisplat_ref.experiments.progress import LOG_EVERY, Progress, read_log
+from minisplat_ref.experiments.studies import all_studies
 from minisplat_ref.io import read_image
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.metrics import evaluate, psnr
@@ -100,7 +102,8 @@ def test_train_leaves_a_complete_folder(run_folder, scene_folder):
         "profile": "GSPLAT_MAIN",
         "backend": "cpu",
         "simplify": None,
-        "geometry": [0.0, 0.0, 0.0],
+        "extension": None,
+        "set": {},
         "budget": None,
         "scene_type": None,
         "eval_every": 0,
@@ -288,7 +291,7 @@ def test_demo_writes_a_self_contained_report(tmp_path, monkeypatch, capsys):
 # help
 
 
-@pytest.mark.parametrize("command", ["", *commands()])
+@pytest.mark.parametrize("command", ["", *commands(), *(f"study {name}" for name in all_studies())])
 def test_help_fits_a_screen(command, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", str(HELP_COLUMNS_MAX))
     with pytest.raises(SystemExit) as exit_info:
@@ -304,11 +307,12 @@ def test_help_loads_nothing_heavy():
     code = f"""
 import sys
 from minisplat_ref.cli import main
-for command in {["", *commands()]!r}:
+for command in {["", *commands(), *(f"study {name}" for name in all_studies())]!r}:
     try:
         main([*command.split(), "--help"])
     except SystemExit:
         pass
+main(["study"])
 print("LOADED", {{"numba", "numpy", "scipy", "pycolmap", "matplotlib", "PIL", "tqdm"}} & set(sys.modules))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -321,11 +325,21 @@ def test_help_names_all_that_there_is(capsys):
     text = capsys.readouterr().out
     assert all(re.search(rf"\b{recipe}\b", text) for recipe in RECIPES)
     assert set(BACKEND_CHOICES) == set(BACKENDS)
+    assert SYNTHETIC_SCENES == SCENE_NAMES
+    with pytest.raises(SystemExit):
+        main(["synthetic", "--help"])
+    text = capsys.readouterr().out
+    assert all(re.search(rf"^  {name} +[a-z]", text, re.MULTILINE) for name in SCENE_NAMES)
 
 
-def test_every_command_module_is_a_command():
-    assert len(commands()) == len(COMMANDS)
+def test_every_command_module_is_a_command(capsys):
+    """And stands under a heading of the help, with a line that says what it does."""
+    assert len(commands()) == sum(map(len, GROUPS.values()))
     assert main([]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    listed = [line.split()[0] for line in lines if re.match(r"  [a-z]+ +[a-z]", line)]
+    assert listed == commands()
+    assert all(f"{title}:" in lines for title in GROUPS)
 
 
 def test_runs_as_a_module():

@@ -185,8 +185,11 @@ def test_out_below_a_file(refused, tmp_path):
         (["--resume", "."], "leave out"),
         (["--budget", "0"], "--budget"),
         (["--budget", "9"], "recipe 3dgs-accel has no budget to set"),
-        (["--geometry", "1,2"], "'1,2' is not three numbers"),
-        (["--geometry", "1,-2,0"], "'1,-2,0' is not three numbers"),
+        (["--set", "exposure"], "'exposure' is not NAME=VALUE"),
+        (["--set", "exposure=yes"], "exposure=yes is neither true nor false"),
+        (["--set", "threshold=x"], "threshold=x is not a number"),
+        (["--set", "thresholds=1"], "no thresholds to set: choose from ceiling, "),
+        (["--extension", "none"], "extension 'none' does not exist: choose from geometry"),
     ],
 )
 def test_bad_options(options, culprit, tmp_path, capfd):
@@ -222,7 +225,8 @@ def test_budget_above_the_candidates(tmp_path, capfd):
 
 def test_depth_of_points_without_tracks(tmp_path, capfd):
     scene = write_transforms(tmp_path / "scene", fl_x=40.0)
-    assert main(["train", str(scene), "--geometry", "1,0,0", "--iterations", "2", "--out", str(tmp_path / "out")]) == 2
+    options = ["--extension", "geometry", "--set", "sfm_depth=1", "--iterations", "2", "--out", str(tmp_path / "out")]
+    assert main(["train", str(scene), *options]) == 2
     assert "does not say which view sees which point" in capfd.readouterr().err
     assert not (tmp_path / "out").exists()
 

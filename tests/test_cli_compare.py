@@ -32,7 +32,7 @@ from minisplat_ref.experiments.comparison.measures import (
     spread,
 )
 from minisplat_ref.experiments.comparison.plan import Plan, eval_every
-from minisplat_ref.experiments.comparison.table import as_markdown, table_cells
+from minisplat_ref.experiments.comparison.table import table_cells
 from minisplat_ref.experiments.progress import read_log
 from minisplat_ref.experiments.scoring import Trained
 from minisplat_ref.io import load_ply, load_scene
@@ -299,10 +299,6 @@ def test_table():
     assert by_title["until the first's final PSNR (s)"][1:] == ["not reached by 1 of 2", "not reached"]
 
 
-def test_markdown():
-    assert as_markdown([["", "a"], ["PSNR (dB)", "1"]]) == ("|           | a |\n|-----------|---|\n| PSNR (dB) | 1 |")
-
-
 # Speed and crops
 
 
@@ -362,8 +358,9 @@ def test_crops_show_what_differs(scene_folder):
     """One model is empty, so that its error is the photograph; each crop is of another view."""
     scene = load_scene(scene_folder, test_every=2)
     empty = Gaussians(*(np.zeros((0, *shape), np.float32) for shape in ((3,), (4,), (3,), (), (3,), (0, 3))))
-    crops = choose_crops([Trained(Model(empty), SPLATTING, np.zeros(3), "GSPLAT_MAIN", "cpu")] * 2, scene)
+    trained = Trained(Model(empty), SPLATTING, np.zeros(3), "GSPLAT_MAIN", "cpu")
+    crops = choose_crops([trained, trained], scene)
     assert len({crop.view for crop in crops}) == len(crops) == 4
     assert [crop.reason.split()[-2:] for crop in crops] == [["differ", "most"]] * 2 + [["most", "detail"]] * 2
     assert all(crop.truth.shape == (7, 10, 3) and not np.any(crop.renders) for crop in crops)
-    assert len(choose_crops([empty], scene)) == 4
+    assert len(choose_crops([trained], scene)) == 4

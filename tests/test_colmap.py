@@ -284,8 +284,8 @@ BAD_SCENES = {
     "wrong images_2": (
         write_wrong_downscaled_image,
         {"downscale": 2},
-        r"images_2/0001\.png: the image is 8x6 but 1/2 of its camera is 16x12; remove .*"
-        "minisplat-ref downscale .*images",
+        r"images_2/0001\.png: the image is 8x6 but 1/2 of its camera is 16x12; "
+        r"remove .*minisplat-ref downscale .*images",
     ),
     "no cameras": (
         remove("sparse", "0", "cameras.txt"),

@@ -1,13 +1,16 @@
 """What the modules promise about each other."""
 
+import ast
 import inspect
 import re
 from dataclasses import fields
 from importlib import import_module
+from pathlib import Path
 from pkgutil import iter_modules
 
 import pytest
 
+import minisplat_ref
 from minisplat_ref import cpu, reference, scalar
 from minisplat_ref.backends import BACKENDS, REFERENCE, Backend
 
@@ -20,8 +23,7 @@ KERNEL_PARTS = {"gaussian_rows", "memory"}
 
 # Public functions of cpu without a twin: they prepare arguments for kernels.
 CPU_ONLY = {
-    "projection.camera_centre": "computed in float64 before the loop; the reference does it with matrices",
-    "projection.pose_of": "the same for the point that the camera maps to 0",
+    "projection.pose_of": "the point that the camera maps to 0, in float64; the reference adds t instead",
     "projection.lens_of": "conventions as float64 scalars",
     "compositing.composite_with": "the exponential is an argument, which compositing.exact fills in, too",
     "compositing.composite_vjp_with": "as composite_with",
@@ -29,6 +31,16 @@ CPU_ONLY = {
 
 # Backward formulas whose forward has another name, since one scalar function returns several things.
 FORWARD_OF = {"compositing.sigma_vjp": "blend", "projection.compensation_vjp": "project_gaussian"}
+
+PACKAGE = Path(minisplat_ref.__file__).parent
+MOST_ARGUMENTS = 8  # positional; what belongs together is a NamedTuple
+
+# Functions with more positional arguments than that.
+MANY_ARGUMENTS = {
+    "rasterization": "gsplat's own call, argument by argument",
+    "rasterization_vjp": "the arguments of rasterization and the cotangents",
+    "checked_batch": "checks what rasterization is given",
+}
 
 
 def public_functions(name, package="reference"):
@@ -48,6 +60,26 @@ def parameters(function):
 @pytest.mark.parametrize("stage", STAGES)
 def test_stages_have_the_same_signature_everywhere(backend, stage):
     assert parameters(getattr(backend, stage)) == parameters(getattr(REFERENCE, stage))
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_protocols_are_the_signatures_of_the_reference(stage):
+    (protocol,) = (field.type for field in fields(Backend) if field.name == stage)
+    assert parameters(protocol.__call__)[1:] == parameters(getattr(REFERENCE, stage))
+
+
+def positional_arguments(source):
+    """Names of all functions, methods and lambdas of a source, each with the number of its positional arguments."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            names = [argument.arg for argument in (*node.args.posonlyargs, *node.args.args)]
+            yield getattr(node, "name", "lambda"), len([name for name in names if name not in ("self", "cls")])
+
+
+def test_no_function_has_many_positional_arguments():
+    counts = [pair for path in PACKAGE.rglob("*.py") for pair in positional_arguments(path.read_text())]
+    assert len(counts) > 1000  # all folders were read, extensions too
+    assert {name for name, n in counts if n > MOST_ARGUMENTS} == MANY_ARGUMENTS.keys()
 
 
 def test_reading_order_names_every_module():
@@ -85,8 +117,8 @@ def test_every_argument_is_documented(module):
 def twins():
     """Public functions of cpu and what they must look like: (label, function, twin or None)."""
     names = [info.name for info in iter_modules(cpu.__path__) if info.name not in KERNEL_PARTS]
-    for name in (*names, "compositing.exact"):
-        twin = public_functions(name.removesuffix(".exact"))
+    for name in (*names, "compositing.exact", "compositing.plain_conic"):
+        twin = public_functions(name.partition(".")[0])
         for key, function in public_functions(name, "cpu").items():
             if f"{name}.{key}" not in CPU_ONLY:
                 yield f"{name}.{key}", function, twin.get(key)
@@ -110,6 +142,7 @@ def test_every_stage_is_compared():
         *("spherical_harmonics.sh_colors", "spherical_harmonics.sh_colors_vjp"),
         *("compositing.composite", "compositing.composite_vjp"),
         *("compositing.exact.composite", "compositing.exact.composite_vjp"),
+        *("compositing.plain_conic.composite", "compositing.plain_conic.composite_vjp"),
         *("depth.surface_points", "depth.surface_points_vjp"),
         *("loss.photometric_loss", "loss.photometric_loss_vjp"),
         *("geometric_loss.geometric_loss", "geometric_loss.geometric_loss_vjp"),

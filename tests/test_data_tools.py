@@ -1,8 +1,10 @@
-"""Programs that prepare scenes: downscaling, undistortion, structure from motion."""
+"""The commands that prepare scenes: downscaling, undistortion, structure from motion."""
 
 import json
 import shutil
+import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,13 +12,14 @@ from photo_scenes import HEIGHT, WIDTH, colored_image, sparse_color_errors, writ
 from PIL import ExifTags, Image
 from tolerances import COLOR_RATIO, SAME_CAMERAS, SFM_CENTERS
 
-from minisplat_ref.datasets import downscale, sfm, undistort
+from minisplat_ref.cli import main
 from minisplat_ref.datasets.sfm import prepare_photos
 from minisplat_ref.io import load_scene
 from minisplat_ref.io.images import read_image, resize_image, write_image
 from minisplat_ref.io.lens import import_pycolmap
 from minisplat_ref.io.ply import write_vertices
 
+ROOT = Path(__file__).parents[1]
 DISTORTED = (40.0, 42.0, 16.0, 12.0, 0.1, -0.05, 0.004, -0.003)  # OPENCV
 NERFSTUDIO = dict(zip(("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"), DISTORTED, strict=True))
 
@@ -25,7 +28,7 @@ def assert_refused(capsys, folder, code, message):
     """Exit code 2, one line that says why, and nothing new in the folder."""
     assert code == 2
     error = capsys.readouterr().err
-    assert error.startswith("error: ") and error.count("\n") == 1
+    assert error.startswith("minisplat-ref: error: ") and error.count("\n") == 1
     assert message in error
     assert not [path for path in folder.rglob("*") if path.name.startswith(".") or path.name == "out"]
 
@@ -41,14 +44,6 @@ def assert_same_views(scene, other, check_images):
         np.testing.assert_array_equal(a.mask, b.mask)
 
 
-@pytest.mark.parametrize("tool", [downscale, undistort, sfm])
-def test_help_fits_a_screen(tool, capsys):
-    with pytest.raises(SystemExit) as caught:
-        tool.main(["--help"])
-    assert caught.value.code == 0
-    assert 8 < len(capsys.readouterr().out.splitlines()) < 25
-
-
 # downscale
 
 
@@ -58,7 +53,7 @@ def test_downscale(tmp_path, rng, capsys):
     for name, image in images.items():
         write_image(tmp_path / "images" / name, image)
     on_the_fly = load_scene(tmp_path, downscale=5)
-    assert downscale.main([str(tmp_path), "--factor", "5"]) == 0
+    assert main(["downscale", str(tmp_path), "--factor", "5"]) == 0
     assert capsys.readouterr().out == f"{tmp_path / 'images_5'}\n"
     for name, image in images.items():
         np.testing.assert_array_equal(read_image(tmp_path / "images_5" / name), resize_image(image, 6, 5))
@@ -70,7 +65,7 @@ def test_downscale(tmp_path, rng, capsys):
 def test_downscale_of_a_folder_of_images(tmp_path):
     (tmp_path / "train").mkdir()
     write_image(tmp_path / "train" / "a.png", colored_image(1))
-    assert downscale.main([str(tmp_path / "train")]) == 0
+    assert main(["downscale", str(tmp_path / "train")]) == 0
     np.testing.assert_array_equal(read_image(tmp_path / "train_2" / "a.png"), colored_image(1, 16, 12))
 
 
@@ -92,7 +87,7 @@ def test_downscale_refuses(tmp_path, capsys, arguments, message):
     write_image(tmp_path / "broken" / "a.png", colored_image(1))
     (tmp_path / "broken" / "b.png").write_text("no picture")
     before = sorted(tmp_path.rglob("*"))
-    assert_refused(capsys, tmp_path, downscale.main([str(tmp_path / arguments[0]), *arguments[1:]]), message)
+    assert_refused(capsys, tmp_path, main(["downscale", str(tmp_path / arguments[0]), *arguments[1:]]), message)
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -104,7 +99,7 @@ def test_undistort_colmap_agrees_with_loading_undistorted(tmp_path, rng):
     write_image(scene / "images" / "0001.png", rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8))
     (scene / "masks").mkdir()
     write_image(scene / "masks" / "0002.png", rng.random((HEIGHT, WIDTH)) < 0.5)
-    assert undistort.main([str(scene), "--out", str(tmp_path / "deep" / "out")]) == 0
+    assert main(["undistort", str(scene), "--out", str(tmp_path / "deep" / "out")]) == 0
     undistorted = load_scene(tmp_path / "deep" / "out")
     expected = load_scene(scene, undistort=True)
     assert_same_views(undistorted, expected, check_images=True)
@@ -120,7 +115,7 @@ def test_undistort_transforms_agrees_with_loading_undistorted(tmp_path, rng):
     content = json.loads((scene / "transforms.json").read_text())
     content["frames"][2] |= {"mask_path": "m.png", "k1": 0.4}
     (scene / "transforms.json").write_text(json.dumps(content))
-    assert undistort.main([str(scene), "--out", str(tmp_path / "out")]) == 0
+    assert main(["undistort", str(scene), "--out", str(tmp_path / "out")]) == 0
     undistorted = load_scene(tmp_path / "out")
     expected = load_scene(scene, undistort=True)
     assert_same_views(undistorted, expected, check_images=True)
@@ -131,17 +126,17 @@ def test_undistort_transforms_agrees_with_loading_undistorted(tmp_path, rng):
 
 def test_undistort_refuses(tmp_path, capsys):
     pinhole = write_colmap(tmp_path / "pinhole")
-    code = undistort.main([str(pinhole), "--out", str(tmp_path / "out")])
+    code = main(["undistort", str(pinhole), "--out", str(tmp_path / "out")])
     assert_refused(capsys, tmp_path, code, "all cameras are pinholes already, nothing to undistort; use")
-    code = undistort.main([str(tmp_path), "--out", str(tmp_path / "out")])
+    code = main(["undistort", str(tmp_path), "--out", str(tmp_path / "out")])
     assert_refused(capsys, tmp_path, code, "neither a COLMAP model nor a transforms.json; give the folder of a scene")
     scene = write_colmap(tmp_path / "scene", model="OPENCV", params=DISTORTED)
-    code = undistort.main([str(scene), "--out", str(pinhole)])
+    code = main(["undistort", str(scene), "--out", str(pinhole)])
     assert_refused(capsys, tmp_path, code, "pinhole: already there and not empty; choose another name")
     (scene / "images" / "0003.png").unlink()
-    code = undistort.main([str(scene), "--out", str(tmp_path / "out")])
+    code = main(["undistort", str(scene), "--out", str(tmp_path / "out")])
     assert_refused(capsys, tmp_path, code, "0003.png: missing")
-    code = undistort.main([str(scene), "--out", str(scene / "images" / "0001.png" / "out")])
+    code = main(["undistort", str(scene), "--out", str(scene / "images" / "0001.png" / "out")])
     assert_refused(capsys, tmp_path, code, "out: cannot be made (")
 
 
@@ -151,8 +146,8 @@ def test_interruption_leaves_nothing(tmp_path, capsys, monkeypatch):
 
     scene = write_colmap(tmp_path / "scene", model="OPENCV", params=DISTORTED)
     monkeypatch.setattr(import_pycolmap(), "undistort_images", interrupt)
-    assert undistort.main([str(scene), "--out", str(tmp_path / "out")]) == 130
-    assert capsys.readouterr().err == "interrupted, nothing was written\n"
+    assert main(["undistort", str(scene), "--out", str(tmp_path / "out")]) == 130
+    assert capsys.readouterr().err == "minisplat-ref: interrupted\n"
     assert [path.name for path in tmp_path.iterdir()] == ["scene"]
 
 
@@ -185,7 +180,7 @@ def run_on_banana(shared_data, tmp_path, names):
     photos.mkdir()
     for name in names:
         shutil.copy(shared_data / "banana" / "images" / name, photos)
-    return sfm.main([str(photos), "--out", str(tmp_path / "scene"), "--long-side", "512"])
+    return main(["sfm", str(photos), "--out", str(tmp_path / "scene"), "--long-side", "512"])
 
 
 def check_sfm(shared_data, folder, n_min):
@@ -224,29 +219,42 @@ def test_sfm_refuses(tmp_path, capsys):
     photos = tmp_path / "photos"
     photos.mkdir()
     out = ["--out", str(tmp_path / "out")]
-    assert_refused(capsys, tmp_path, sfm.main([str(tmp_path / "nowhere"), *out]), "no such folder; give a folder")
-    assert_refused(capsys, tmp_path, sfm.main([str(photos), *out]), "no images in it (looked for .png .jpg")
+    assert_refused(capsys, tmp_path, main(["sfm", str(tmp_path / "nowhere"), *out]), "no such folder; give a folder")
+    assert_refused(capsys, tmp_path, main(["sfm", str(photos), *out]), "no images in it (looked for .png .jpg")
     write_image(photos / "a.png", colored_image(1))
     assert_refused(
-        capsys, tmp_path, sfm.main([str(photos), *out]), "1 photograph, structure from motion needs at least 2"
+        capsys, tmp_path, main(["sfm", str(photos), *out]), "1 photograph, structure from motion needs at least 2"
     )
     write_image(photos / "b.png", colored_image(2))
-    assert_refused(capsys, tmp_path, sfm.main([str(photos), *out, "--long-side", "0"]), "--long-side is 0")
+    assert_refused(capsys, tmp_path, main(["sfm", str(photos), *out, "--long-side", "0"]), "--long-side is 0")
     assert_refused(
-        capsys, tmp_path, sfm.main([str(photos), *out]), "no two photographs could be placed; take them with more"
+        capsys, tmp_path, main(["sfm", str(photos), *out]), "no two photographs could be placed; take them with more"
     )
     write_image(photos / "b.jpg", colored_image(2))
     (photos / "b.png").rename(photos / "b.bmp")
     assert_refused(
-        capsys, tmp_path, sfm.main([str(photos), *out]), "another photograph is called b.jpg; give each its own"
+        capsys, tmp_path, main(["sfm", str(photos), *out]), "another photograph is called b.jpg; give each its own"
     )
     (photos / "b.bmp").unlink()
     (photos / "b.jpg").write_text("no picture")
-    assert_refused(capsys, tmp_path, sfm.main([str(photos), *out]), "b.jpg: not an image that Pillow can read")
+    assert_refused(capsys, tmp_path, main(["sfm", str(photos), *out]), "b.jpg: not an image that Pillow can read")
 
 
 def test_pycolmap_is_missing(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     scene = write_colmap(tmp_path / "scene", model="OPENCV", params=DISTORTED)
-    code = undistort.main([str(scene), "--out", str(tmp_path / "out")])
+    code = main(["undistort", str(scene), "--out", str(tmp_path / "out")])
     assert_refused(capsys, tmp_path, code, "is not installed; run `pip install pycolmap`")
+
+
+# scripts
+
+
+@pytest.mark.parametrize("name", ["sfm", "undistort", "downscale", "synthetic", "study"])
+def test_script_is_the_command(name):
+    """Of a checkout that nothing has been installed from: the package is found beside the script's folder."""
+    command = [sys.executable, "-m", f"data_tools.{name}"]
+    shown = subprocess.run([*command, "--help"], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert shown.stdout.startswith(f"usage: minisplat-ref {name} ")
+    refused = subprocess.run([*command, "--unknown"], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (refused.returncode, refused.stdout) == (2, "")

@@ -7,7 +7,7 @@ from tolerances import CLOSED_FORM, COVERAGE_MIN, GRADIENT_FLOOR, PARITY_FLOAT32
 
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.reference.covariance import covariances
-from minisplat_ref.reference.depth import surface_points, surface_points_vjp
+from minisplat_ref.reference.depth import expected_depth, expected_depth_vjp, surface_points, surface_points_vjp
 from minisplat_ref.rendering import render
 
 IDENTITY = np.array([[1.0, 0, 0, 0]])
@@ -95,7 +95,32 @@ def test_dominant_gaussians_of_a_render(backend, rng):
     assert 1.5 < result.depths[result.depths > 0].min() and result.depths.max() < 5
 
 
+def test_expected_depth_by_hand():
+    alpha = np.array([[0.5, 1.0, 0.0]])
+    assert_array_equal(expected_depth(np.array([[1.0, 3.0, 0.0]]), alpha), [[2, 3, 0]])
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_expected_depth_of_an_empty_pixel_is_0_and_has_no_gradient(dtype):
+    accumulated, alpha = np.array([[0, 2e-12, 3]], dtype), np.array([[0, 1e-12, 0.5]], dtype)
+    v_depth = np.ones((1, 3), dtype)
+    depth, v = expected_depth(accumulated, alpha), expected_depth_vjp(accumulated, alpha, v_depth)
+    assert_array_equal(depth, np.array([[0, 0, 6]], dtype), strict=True)
+    assert_array_equal(v[0], np.array([[0, 0, 2]], dtype), strict=True)
+    assert_array_equal(v[1], np.array([[0, 0, -12]], dtype), strict=True)
+
+
 # --- gradient ---
+
+
+def test_expected_depth_jacobian(rng):
+    alpha, accumulated = rng.uniform(0.1, 1, size=(3, 4)), rng.uniform(1, 2, size=(3, 4))
+    check_jacobian(
+        lambda *x: (expected_depth(*x),),
+        lambda v: expected_depth_vjp(accumulated, alpha, v),
+        (accumulated, alpha),
+        names=["accumulated_depth", "alpha"],
+    )
 
 
 def test_surface_point_gradients(rng):

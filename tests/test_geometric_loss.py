@@ -17,12 +17,7 @@ from tolerances import (
 
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import EDGE_SHARPNESS, SFM_DEPTH_TOLERANCE
-from minisplat_ref.reference.depth_map import (
-    depth_normals,
-    depth_normals_vjp,
-    expected_depth,
-    expected_depth_vjp,
-)
+from minisplat_ref.reference.depth_map import depth_normals, depth_normals_vjp
 from minisplat_ref.reference.geometric_loss import edge_weights, normal_smoothness, normal_smoothness_vjp
 from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.types import Gaussians, GeometricWeights
@@ -78,11 +73,6 @@ def rough_view(rng, camera):
 
 
 # --- closed form ---
-
-
-def test_expected_depth_by_hand():
-    alpha = np.array([[0.5, 1.0, 0.0]])
-    assert_array_equal(expected_depth(np.array([[1.0, 3.0, 0.0]]), alpha), [[2, 3, 0]])
 
 
 def test_edge_weights_by_hand():
@@ -213,16 +203,6 @@ def test_smoothness_does_not_know_the_unit_of_length(backend, rng):
 
 
 # --- gradient ---
-
-
-def test_expected_depth_jacobian(rng):
-    alpha, accumulated = rng.uniform(0.1, 1, size=(3, 4)), rng.uniform(1, 2, size=(3, 4))
-    check_jacobian(
-        lambda *x: (expected_depth(*x),),
-        lambda v: expected_depth_vjp(accumulated, alpha, v),
-        (accumulated, alpha),
-        names=["accumulated_depth", "alpha"],
-    )
 
 
 def test_normals_jacobian(rng):

@@ -3,11 +3,13 @@
 import numba
 import numpy as np
 import pytest
+from minisplat_ref.scalar.literals import ONE
 from numpy.testing import assert_allclose, assert_array_equal
 
 from minisplat_ref.cpu.compositing.exponential import exp_exact, exp_fast
 from minisplat_ref.jit.lanes import (
     WIDTH,
+    accumulate,
     any_of,
     bits_between,
     converted,
@@ -124,7 +126,7 @@ def test_reductions_have_one_order(dtype, rng):
     def run(a, out):
         first = load(a, 0), load(a, WIDTH), load(a, 2 * WIDTH), load(a, 3 * WIDTH)
         last = load(a, 4 * WIDTH), load(a, 5 * WIDTH), load(a, 6 * WIDTH), load(a, 7 * WIDTH)
-        store(out, 0, sums_of(*first, *last))
+        store(out, 0, sums_of((*first, *last)))
         for i in range(8):
             out[WIDTH + i] = sum_of(load(a, i * WIDTH))
             out[2 * WIDTH + i] = largest_of(load(a, i * WIDTH))
@@ -219,6 +221,22 @@ def test_scatter_writes_a_column_or_eight_of_them(dtype, rng):
     assert_array_equal(fast, plain)
     expected = np.zeros((12, 11), dtype)
     expected[ROWS, 1], expected[ROWS, 2:10] = a[:WIDTH], a.reshape(8, WIDTH).T
+    assert_array_equal(fast, expected)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_accumulate_adds_one_or_several_lanes(dtype, rng):
+    def run(a, out):
+        accumulate(out, 2, load(a, 0))
+        accumulate(out, WIDTH, (load(a, WIDTH), ONE, load(a, 0)))
+        accumulate(out, 0, ())
+
+    a, start = rng.normal(size=2 * WIDTH).astype(dtype), rng.normal(size=5 * WIDTH).astype(dtype)
+    fast, plain = two_ways(run, a, start)
+    assert_array_equal(fast, plain)
+    expected = start.copy()
+    expected[2 : WIDTH + 2] += a[:WIDTH]
+    expected[WIDTH : 4 * WIDTH] += np.concatenate([a[WIDTH:], np.ones(WIDTH, dtype), a[:WIDTH]])
     assert_array_equal(fast, expected)
 
 

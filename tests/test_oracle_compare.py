@@ -12,17 +12,20 @@ from minisplat_ref.cli import main
 from minisplat_ref.cli.oracle import compare as compare_command
 from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN, INRIA
 from minisplat_ref.errors import InputError
-from minisplat_ref.oracle.comparison.choose import choose_renderer, choose_scenes
-from minisplat_ref.oracle.comparison.dumps import from_dumps
-from minisplat_ref.oracle.comparison.measure import difference
-from minisplat_ref.oracle.comparison.own import by_profile, from_backend, with_planted_error
-from minisplat_ref.oracle.comparison.renderers import Renderer
-from minisplat_ref.oracle.comparison.report import as_report
-from minisplat_ref.oracle.comparison.staged import STAGES, compare_scene, first_divergence
-from minisplat_ref.oracle.golden.arrays import SPECS
+from minisplat_ref.oracle.comparison.measures import difference
+from minisplat_ref.oracle.comparison.renderers import (
+    Renderer,
+    by_profile,
+    choose_renderer,
+    choose_scenes,
+    from_backend,
+    from_dumps,
+    with_planted_error,
+)
+from minisplat_ref.oracle.comparison.staged import STAGES, as_report, compare_scene, first_divergence
 from minisplat_ref.oracle.golden.files import export
-from minisplat_ref.oracle.golden.scenes import RECIPES, inputs
-from minisplat_ref.oracle.golden.stages import run_stages, truth
+from minisplat_ref.oracle.golden.format import SPECS
+from minisplat_ref.oracle.golden.scenes import RECIPES, inputs, run_stages, truth
 from minisplat_ref.oracle.planted import PLANTED
 from minisplat_ref.types import RenderOutput
 

@@ -9,11 +9,10 @@ import pytest
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN, INRIA
 from minisplat_ref.errors import InputError
-from minisplat_ref.oracle.comparison.choose import choose_renderer, choose_scenes
-from minisplat_ref.oracle.comparison.gsplat_cuda import from_functions, rules_of
-from minisplat_ref.oracle.comparison.inria_cuda import from_module
+from minisplat_ref.oracle.comparison.renderers import choose_renderer, choose_scenes
 from minisplat_ref.oracle.comparison.staged import compare_scene, first_divergence
 from minisplat_ref.oracle.golden.scenes import RECIPES
+from minisplat_ref.oracle.peers.cuda import from_functions, from_module, rules_of
 from minisplat_ref.reference.pinhole import pinhole
 from minisplat_ref.splatting import Primitives, splat, splat_vjp
 from minisplat_ref.types import Camera, Projection, TileBins, TileGrid

@@ -13,12 +13,10 @@ from minisplat_ref.cli import main
 from minisplat_ref.constants import Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.golden import files
-from minisplat_ref.oracle.golden.arrays import SPECS, STAGE_COTANGENTS, STAGE_INPUTS
 from minisplat_ref.oracle.golden.files import MANIFEST, README, export, load
-from minisplat_ref.oracle.golden.flips import flip_candidates
-from minisplat_ref.oracle.golden.readme import convention_words
-from minisplat_ref.oracle.golden.scenes import RECIPES, inputs
-from minisplat_ref.oracle.golden.stages import golden_scenes, projection_of, reference_bins, truth
+from minisplat_ref.oracle.golden.format import SPECS, STAGE_COTANGENTS, STAGE_INPUTS, convention_words
+from minisplat_ref.oracle.golden.scenes import RECIPES, golden_scenes, inputs, projection_of, reference_bins, truth
+from minisplat_ref.oracle.thresholds import thresholds
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.reference.pinhole import slope_limits
 from minisplat_ref.rendering import render, render_vjp
@@ -125,7 +123,7 @@ def test_numbers_are_those_of_float32_and_rounding_decides_nothing(scenes):
                 array = scene.arrays[spec.name]
                 assert np.array_equal(array, array.astype(np.float32)), spec.name
         bins = reference_bins(scene.arrays, scene.conventions, (16, 16))
-        may_flip = flip_candidates(projection_of(scene.arrays), bins, scene.conventions)
+        may_flip = thresholds(projection_of(scene.arrays), bins, scene.conventions).jumps
         assert not scene.arrays["v_image"][may_flip].any() and not scene.arrays["v_alpha"][may_flip].any()
         depths = np.sort(scene.arrays["depths"][scene.arrays["radii"][:, 0] > 0].astype(np.float32))
         assert (np.diff(depths) > 0).all(), "two depths are equal in float32"

@@ -128,7 +128,7 @@ def test_the_tiny_scene_takes_every_branch():
     projection = REFERENCE.project(*setting.primitives, camera, conventions)
     bins = REFERENCE.bin_gaussians(projection, TileGrid(camera.width, camera.height, 16, 16), conventions)
     (tile,) = tile_hits(projection, bins, conventions)
-    would_hit = tile.falloffs * projection.opacities[tile.ids, None] >= conventions.alpha_min
+    would_hit = tile.hit.unclamped >= conventions.alpha_min
     assert (projection.radii > 0).all()
     assert tile.is_clamped.any() and (would_hit & (tile.alphas == 0)).any()  # a clamped hit, and a stopped pixel
     sides = project_stage(REFERENCE, setting)

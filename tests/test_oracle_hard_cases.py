@@ -10,10 +10,9 @@ from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle import hard_cases
 from minisplat_ref.oracle.hard_cases import GROUPS, HARD_CASES
-from minisplat_ref.oracle.hard_cases.run import PRECISIONS, Precision, matching, run_hard_case, run_hard_cases
+from minisplat_ref.oracle.hard_cases.run import PRECISIONS, Precision, by_group, matching, run_hard_case, run_hard_cases
 from minisplat_ref.oracle.hard_cases.subjects import Call, Parameters, drawing
-from minisplat_ref.oracle.hard_cases.summary import by_group
-from minisplat_ref.oracle.hard_cases.tolerances import ORDINARY
+from minisplat_ref.oracle.tolerances import ORDINARY
 
 BY_NAME = {case.name: case for case in HARD_CASES}
 
@@ -133,6 +132,20 @@ def test_flips_are_counted_and_bounded():
     assert figures["on threshold"] == 1 and figures["flips"] <= 1
     result = run_hard_case(case, with_composite(one_hit_more))
     assert not result.passed and "more than one hit" in result.note and result.figures["flips"] == 1
+
+
+def test_a_threshold_excuses_only_what_its_hits_can_change():
+    """At the clamp the gradient jumps, and the image does not."""
+
+    def brighter(image):
+        changed = image.copy()
+        changed[4, 4] += 1e-3
+        return changed
+
+    case = BY_NAME["alpha-at-the-clamp"]
+    assert run_hard_case(case).figures["on threshold"] >= 1
+    result = run_hard_case(case, with_composite(brighter))
+    assert not result.passed and "a pixel on a threshold is off by 1.0e-03" in result.note
 
 
 def test_tolerances_are_what_decides():

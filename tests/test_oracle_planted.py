@@ -123,11 +123,10 @@ EQUIVALENT = {
     " -> _expand(means[rows], 0.5 * quats[rows], scales[rows], camera, conventions)": HOMOGENEOUS,
     "sh_basis_jacobian: SH_C1 * one -> SH_C1 / one": ONES,
     "sh_basis_jacobian: -SH_C1 * one -> -SH_C1 / one": ONES,
-    "composite_vjp: len(colors) -> len(0.5 * colors)": COUNTED,
-    "composite_vjp: np.einsum('gp,gij,gpj->gi', -unclamped * v_mean, Q, tile.offsets)"
-    " -> np.einsum('gp,gji,gpj->gi', -unclamped * v_mean, Q, tile.offsets)": SYMMETRIC,
-    "composite_vjp: np.einsum('gp,gpi,gpj->gij', -unclamped * v_shape / 2, tile.offsets, tile.offsets)"
-    " -> np.einsum('gp,gpi,gpj->gji', -unclamped * v_shape / 2, tile.offsets, tile.offsets)": SYMMETRIC,
+    "conic_hit_vjp: np.einsum('gp,gij,gpj->gi', -unclamped * v_mean, Q, offsets)"
+    " -> np.einsum('gp,gji,gpj->gi', -unclamped * v_mean, Q, offsets)": SYMMETRIC,
+    "conic_hit_vjp: np.einsum('gp,gpi,gpj->gij', -unclamped * v_shape / 2, offsets, offsets)"
+    " -> np.einsum('gp,gpi,gpj->gji', -unclamped * v_shape / 2, offsets, offsets)": SYMMETRIC,
     "surface_points_vjp: _whiten(means, quats, scales, camera, ids, ys, xs)"
     " -> _whiten(means, 0.5 * quats, scales, camera, ids, ys, xs)": HOMOGENEOUS,
     "photometric_loss_vjp: max(1, image.shape[2] * int(np.count_nonzero(mask)))"

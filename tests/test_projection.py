@@ -7,7 +7,14 @@ from tolerances import CLOSED_FORM, GRADIENT_FLOOR, PARITY_FLOAT32_GRADIENT, PAR
 
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import COMPENSATION_FLOOR, GSPLAT_MAIN, INRIA
-from minisplat_ref.reference.pinhole import pinhole, pinhole_jacobians, pinhole_jacobians_vjp, pinhole_vjp, slope_limits
+from minisplat_ref.reference.pinhole import (
+    pinhole,
+    pinhole_jacobians,
+    pinhole_jacobians_vjp,
+    pinhole_rays,
+    pinhole_vjp,
+    slope_limits,
+)
 from minisplat_ref.types import Camera, ProjectionGradient
 
 CAMERA = Camera(np.eye(3), np.zeros(3), 100.0, 50.0, 32.0, 24.0, 64, 48)
@@ -138,6 +145,29 @@ def test_pinhole_jacobian_is_the_derivative_of_the_pinhole(rng):
     check_jacobian(
         lambda x: (pinhole(x, CAMERA),), lambda v: (np.einsum("nki,nk->ni", J, v),), (points,), names=["points"]
     )
+
+
+def test_camera_center_is_where_the_camera_maps_to_0(rng):
+    quarter_turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    turned = CAMERA._replace(cam_from_world_R=quarter_turn, cam_from_world_t=np.array([1.0, 2, 3]))
+    assert_array_equal(turned.center, [-2, 1, -3])
+    assert_allclose(quarter_turn @ turned.center + turned.cam_from_world_t, 0, atol=CLOSED_FORM)
+    camera = make_camera(rng=rng)
+    assert camera.center.dtype == np.float64
+    single = camera.astype(np.float32)
+    assert single.center.dtype == single.cam_from_world_R.dtype == single.cam_from_world_t.dtype == np.float32
+    assert single[2:] == camera[2:] and camera.cam_from_world_R.dtype == np.float64
+    assert_array_equal(single.astype(np.float64).cam_from_world_t, camera.cam_from_world_t.astype(np.float32))
+
+
+def test_pinhole_rays_are_the_inverse_of_the_pinhole(rng):
+    camera = Camera(np.eye(3), np.zeros(3), 20.0, 25.0, 11.0, 6.0, 24, 14)
+    assert_allclose(pinhole_rays(0.5, 13.5, camera), [-10.5 / 20, 7.5 / 25, 1], rtol=CLOSED_FORM)
+    xs, ys, z = rng.uniform(-5, 30, 6), rng.uniform(-5, 20, 6), rng.uniform(0.5, 4, 6)
+    assert_allclose(pinhole(z[:, None] * pinhole_rays(xs, ys, camera), camera), np.column_stack([xs, ys]), rtol=1e-12)
+    grid = pinhole_rays(np.arange(24) + 0.5, np.arange(14)[:, None] + 0.5, camera)
+    assert grid.shape == (14, 24, 3)
+    assert_array_equal(grid[3, 7], pinhole_rays(7.5, 3.5, camera))
 
 
 # --- gradient ---

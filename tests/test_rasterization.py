@@ -1,4 +1,7 @@
+import dataclasses
 import re
+import weakref
+from collections.abc import Mapping
 from importlib import import_module
 
 import numpy as np
@@ -18,11 +21,13 @@ from tolerances import (
 
 import minisplat_ref
 from minisplat_ref import rasterization, rasterization_vjp
-from minisplat_ref.backends import REFERENCE
+from minisplat_ref.backends import REFERENCE, get_backend
 from minisplat_ref.constants import GSPLAT_MAIN, INRIA
 from minisplat_ref.errors import InputError
+from minisplat_ref.gsplat_compat import TILE_LISTS
+from minisplat_ref.reference.tiling import bin_gaussians
 from minisplat_ref.rendering import render
-from minisplat_ref.types import Camera
+from minisplat_ref.types import Camera, TileGrid
 from minisplat_ref.validation import check_gaussians
 
 WIDTH, HEIGHT = 24, 18
@@ -115,6 +120,108 @@ def test_meta_lists_hold_what_each_tile_may_touch(rng):
         assert_array_equal(ids[offsets[c, row, column] : ends[c, row, column]], c * 20 + by_depth[touches[by_depth]])
 
 
+def expected_lists(scene, backend):
+    """The three lists of the meta, made eagerly from every camera's projection."""
+    grid, bins = TileGrid(WIDTH, HEIGHT, 16, 16), []
+    for viewmat, K in zip(scene["viewmats"], scene["Ks"], strict=True):
+        camera = Camera(viewmat[:3, :3], viewmat[:3, 3], K[0, 0], K[1, 1], K[0, 2], K[1, 2], WIDTH, HEIGHT)
+        projection = backend.project(*(scene[key] for key in ARRAYS[:4]), camera, GSPLAT_MAIN)
+        bins.append(bin_gaussians(projection, grid, GSPLAT_MAIN))
+    n, starts = len(scene["means"]), np.cumsum([0, *(len(lists.gaussian_ids) for lists in bins)])
+    return {
+        "tiles_per_gauss": np.array([np.diff(lists.gaussian_offsets) for lists in bins], np.int32),
+        "flatten_ids": np.concatenate([c * n + lists.gaussian_ids for c, lists in enumerate(bins)], dtype=np.int32),
+        "isect_offsets": np.array(
+            [(starts[c] + lists.tile_offsets[:-1]).reshape(2, 2) for c, lists in enumerate(bins)], np.int32
+        ),
+    }
+
+
+@pytest.mark.parametrize("n_cameras", [1, 2])
+@both_backends
+def test_tile_lists_are_the_references(name, n_cameras, rng):
+    scene = make_scene(rng, 20, n_cameras=n_cameras)
+    _, _, meta = call(scene, backend=name)
+    for key, expected in expected_lists(scene, get_backend(name)).items():
+        assert expected.size and expected.any() and meta[key].dtype == np.int32
+        assert_array_equal(meta[key], expected, strict=True, err_msg=key)
+
+
+@pytest.mark.parametrize("first", TILE_LISTS)
+def test_tile_lists_are_made_once_and_only_when_read(first, rng, monkeypatch):
+    n_calls = 0
+
+    def counted(*args):
+        nonlocal n_calls
+        n_calls += 1
+        return bin_gaussians(*args)
+
+    monkeypatch.setattr(minisplat_ref.gsplat_compat, "bin_gaussians", counted)
+    _, _, meta = call(make_scene(rng), backend="cpu")
+    assert set(TILE_LISTS) < set(meta) and first in meta and first in meta.keys() and len(meta) == 14
+    assert first in repr(meta) and "isect_ids" not in meta and meta.get("isect_ids") is None
+    assert meta["depths"].any() and meta["n_cameras"] == 2
+    assert n_calls == 0
+    values = meta[first]
+    assert n_calls == 2  # one for each camera
+    assert meta[first] is values and all(meta[key].any() for key in TILE_LISTS)
+    assert n_calls == 2
+
+
+def test_meta_is_a_mapping_that_cannot_be_written_to(rng):
+    _, _, meta = call(make_scene(rng), backend="reference")
+    assert isinstance(meta, Mapping)
+    copy = dict(meta)
+    assert list(copy) == list(meta) == list(meta.keys()) and len(copy) == len(meta)
+    assert all(copy[key] is value is meta[key] for key, value in meta.items())
+    assert not any(value is None for value in {**meta}.values())
+    with pytest.raises(KeyError, match="isect_ids"):
+        meta["isect_ids"]
+    with pytest.raises(TypeError, match="item assignment"):
+        meta["depths"] = 0
+
+
+def test_tile_lists_do_not_see_what_a_caller_writes_into_the_meta(rng):
+    scene = make_scene(rng, n_cameras=1)
+    _, _, meta = call(scene, backend="reference")
+    for key in ("means2d", "depths", "opacities", "radii", "conics"):
+        meta[key][:] = 0
+    assert_array_equal(meta["flatten_ids"], expected_lists(scene, REFERENCE)["flatten_ids"])
+
+
+def test_meta_keeps_alive_what_the_lists_need_and_no_more(rng):
+    needed, others = [], []
+
+    def watched(projection, channels, background, bins, *args, **options):
+        output = REFERENCE.composite(projection, channels, background, bins, *args, **options)
+        needed.extend(map(weakref.ref, (projection.boxes, projection.depths)))
+        rest = (projection.means2d, projection.conics, projection.radii, channels, bins.gaussian_ids, output.image)
+        others.extend(map(weakref.ref, rest))
+        return output
+
+    backend = dataclasses.replace(REFERENCE, composite=watched)
+    _, _, meta = call(make_scene(rng), backend=backend)
+    assert len(others) == 12 and not any(reference() is not None for reference in others)
+    assert all(reference() is not None for reference in needed)
+    assert meta["flatten_ids"].size
+    assert not any(reference() is not None for reference in needed)
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGB+ED"])
+@both_backends
+def test_result_belongs_to_the_caller(name, mode, rng):
+    scene = make_scene(rng, n_cameras=1)
+    options = {"render_mode": mode, "backend": name, "backgrounds": rng.uniform(size=(1, 3))}
+    before = {key: array.copy() for key, array in scene.items()}
+    *results, meta = call(scene, **options)
+    again = [array.copy() for array in results]
+    for array in (*results, *(value for value in meta.values() if isinstance(value, np.ndarray))):
+        array[:] = 7
+    assert all(np.array_equal(scene[key], array) for key, array in before.items())
+    for array, expected in zip(call(scene, **options)[:2], again, strict=True):
+        assert_array_equal(array, expected)
+
+
 def test_modes_agree_with_each_other(rng):
     scene = make_scene(rng)
     images = {
@@ -191,15 +298,15 @@ def test_options_replace_the_profile(rng):
 
 
 def test_name_is_the_function_whatever_is_imported_first():
-    import_module("minisplat_ref.gsplat_door")
-    assert minisplat_ref.rasterization is minisplat_ref.gsplat_door.rasterization is rasterization
+    import_module("minisplat_ref.gsplat_compat")
+    assert minisplat_ref.rasterization is minisplat_ref.gsplat_compat.rasterization is rasterization
     assert minisplat_ref.rasterization_vjp is rasterization_vjp
 
 
 # --- gradient ---
 
 
-def door(scene, cotangents=None, **options):
+def call_with_gradient(scene, cotangents=None, **options):
     """Function of (means .. colors, viewmats [C, 3, 4], backgrounds) and, with cotangents, its gradients.
 
     The last row of a view matrix is no variable: it is dropped here.
@@ -241,7 +348,7 @@ CONFIGURATIONS = {
 def test_gradient(name, configuration, rng):
     kind, options = configuration
     scene = make_scene(rng, **kind)
-    function, vjp = door(scene, width=WIDTH, height=HEIGHT, backend=name, **options)
+    function, vjp = call_with_gradient(scene, width=WIDTH, height=HEIGHT, backend=name, **options)
     has_colors = options.get("render_mode", "RGB").startswith("RGB")
     n_colors = 3 if "sh_degree" in options else kind.get("channels", 3)
     inputs = [*(scene[key] for key in ARRAYS[:5]), scene["viewmats"][:, :3], rng.uniform(size=(2, n_colors))]
@@ -271,7 +378,7 @@ def test_full_jacobian(name, rng):
     scene["scales"] *= 2
     scene["Ks"] = np.array([[[6.0, 0, 1.7], [0, 5, 0.9], [0, 0, 1]]])
     options = {"width": 3, "height": 2, "sh_degree": 1, "render_mode": "RGB+ED", "backend": name}
-    function, vjp = door(scene, **options)
+    function, vjp = call_with_gradient(scene, **options)
     inputs = [*(scene[key] for key in ARRAYS[:5]), scene["viewmats"][:, :3], rng.uniform(size=(1, 3))]
     names = [*ARRAYS[:6], "backgrounds"]
     gradients = {}
@@ -421,6 +528,7 @@ def test_bad_input(message, rng):
 
 def test_check_gaussians(rng):
     gaussians = as_dtype(make_gaussians(rng, 5), np.float32)
+    gaussians.quats[1] = [0, 0, 0, -2]  # half a turn: no length is asked for, and w = 0 is no fault
     check_gaussians(gaussians, "a.ply")
     gaussians.quats[2] = 0
     with pytest.raises(InputError, match=r"a\.ply: the rotation of row 2 is a zero quaternion; remove"):

@@ -77,7 +77,7 @@ def test_dtype_is_that_of_the_gaussians(backend, dtype, rng):
     output, tape = render(gaussians, make_camera(), background=BACKGROUND, backend=backend, with_depth=True)
     gradient = render_vjp(tape, np.ones_like(output.image))
     assert output.image.dtype == output.alpha.dtype == dtype
-    assert {field.dtype for field in (*gradient.gaussians, *gradient[1:])} == {np.dtype(dtype)}
+    assert {field.dtype for field in (*gradient.gaussians, *gradient[1:5])} == {np.dtype(dtype)}
 
 
 # --- gradient ---
@@ -202,7 +202,7 @@ def test_backends_agree(fast_backend, conventions, dtype, rng):
     assert_allclose(actual.image[:, :, :3], expected.image[:, :, :3], rtol=0, atol=tolerance)
     assert_allclose(actual.alpha, expected.alpha, rtol=0, atol=tolerance)
     assert_allclose(actual.image[:, :, 3], expected.image[:, :, 3], rtol=0, atol=tolerance * expected.image.max())
-    for a, e in zip((*v_actual.gaussians, *v_actual[1:]), (*v_expected.gaussians, *v_expected[1:]), strict=True):
+    for a, e in zip((*v_actual.gaussians, *v_actual[1:5]), (*v_expected.gaussians, *v_expected[1:5]), strict=True):
         assert np.abs(e).max() > GRADIENT_FLOOR
         assert_allclose(a, e, rtol=0, atol=(PARITY_FLOAT64 if is_exact else PARITY_FLOAT32_GRADIENT) * np.abs(e).max())
 

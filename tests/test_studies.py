@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 from tolerances import PRINTED_DIGITS
 
-from minisplat_ref.datasets.synthetic.__main__ import main as write_synthetic
-from minisplat_ref.experiments.studies import split_forms
-from minisplat_ref.experiments.studies.__main__ import main
-from minisplat_ref.experiments.studies.front import FIGURE, RESULT
+from minisplat_ref.cli import main
+from minisplat_ref.experiments.studies import FIGURE, RESULT, all_studies, split_forms
 from minisplat_ref.io import load_scene, save_ply
 from minisplat_ref.io.images import read_image
 from minisplat_ref.methods import gaussian_splatting, get_recipe, mini_splatting
@@ -23,7 +21,7 @@ TINY = ("--views", "6", "--width", "32", "--height", "24", "--supersampling", "1
 @pytest.fixture(scope="module")
 def scene_folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("studies") / "room"
-    assert write_synthetic(["room", "--out", str(folder), *TINY]) == 0
+    assert main(["synthetic", "room", "--out", str(folder), *TINY]) == 0
     return folder
 
 
@@ -36,8 +34,16 @@ def read_result(folder):
 
 def table_rows(text):
     """Cells of the Markdown table without its header."""
-    lines = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("|")]
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
     return {line[0]: line[1:] for line in lines[2:]}
+
+
+def test_studies_are_listed(capsys):
+    assert main(["study"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    for name, study in all_studies().items():
+        (line,) = [line for line in lines if line.split()[:1] == [name]]
+        assert study.name == name and line.endswith(study.summary) and len(line) <= 80
 
 
 # split
@@ -45,7 +51,7 @@ def table_rows(text):
 
 def test_split_forms(scene_folder, tmp_path, capsys):
     out = tmp_path / "out"
-    assert main(["split", str(scene_folder), "--out", str(out), "--iterations", "30", "--seeds", "0,1"]) == 0
+    assert main(["study", "split", str(scene_folder), "--out", str(out), "--iterations", "30", "--seeds", "0,1"]) == 0
     result, rows = read_result(out), table_rows(capsys.readouterr().out)
     assert list(rows) == list(result["summary"]) == list(split_forms.FORMS)
     assert result["machine"] and result["size"] == [32, 24] and len(result["runs"]) == 8
@@ -89,7 +95,7 @@ def check_culling(row):
 
 def test_culling_of_a_training(scene_folder, tmp_path, capsys):
     out = tmp_path / "out"
-    arguments = ["culling", str(scene_folder), "--out", str(out), "--iterations", "54", "--repeats", "2"]
+    arguments = ["study", "culling", str(scene_folder), "--out", str(out), "--iterations", "54", "--repeats", "2"]
     assert main(arguments) == 0
     result, rows = read_result(out), table_rows(capsys.readouterr().out)
     assert list(rows) == list(result["places"]) == ["before simplification", "before culling ends"]
@@ -105,7 +111,7 @@ def test_culling_of_given_gaussians(scene_folder, tmp_path, capsys):
     gaussians = initial_state(scene, get_recipe("3dgs"), seed=0).gaussians
     save_ply(tmp_path / "some.ply", gaussians)
     out, ply = tmp_path / "out", str(tmp_path / "some.ply")
-    assert main(["culling", str(scene_folder), "--out", str(out), "--ply", ply, "--repeats", "2"]) == 0
+    assert main(["study", "culling", str(scene_folder), "--out", str(out), "--ply", ply, "--repeats", "2"]) == 0
     result, rows = read_result(out), table_rows(capsys.readouterr().out)
     assert list(rows) == ["some.ply"]
     row = result["places"]["some.ply"]
@@ -121,6 +127,13 @@ def test_culling_of_given_gaussians(scene_folder, tmp_path, capsys):
     [
         (["split", "nowhere"], "nowhere: neither a folder nor one of room, "),
         (
+            ["split", "SCENE", "--recipe", "3dgs"],
+            "recipe 3dgs has no blur split to compare: choose from mini-splatting, ",
+        ),
+        (["split", "SCENE", "--recipe", "5dgs"], "recipe '5dgs' does not exist"),
+        (["simplify", "SCENE", "--recipe", "5dgs"], "recipe '5dgs' does not exist"),
+        (["spilt", "SCENE"], "there is no study 'spilt': choose from split, culling, simplify, depth"),
+        (
             ["culling", "room", "--downscale", "2"],
             "room is made at 160 x 120; write it with minisplat-ref synthetic",
         ),
@@ -131,7 +144,17 @@ def test_culling_of_given_gaussians(scene_folder, tmp_path, capsys):
 def test_bad_input_is_one_line(scene_folder, tmp_path, capsys, arguments, message):
     arguments = [str(scene_folder) if argument == "SCENE" else argument for argument in arguments]
     out = [] if "--out" in arguments else ["--out", str(tmp_path / "out")]
-    assert main([*arguments, *out]) == 2
+    assert main(["study", *arguments, *out]) == 2
     error = capsys.readouterr().err
-    assert error.startswith("error: ") and error.count("\n") == 1 and message in error
+    assert error.startswith("minisplat-ref: error: ") and error.count("\n") == 1 and message in error
     assert not (tmp_path / "out").exists()
+
+
+def test_interrupted_study_leaves_nothing(scene_folder, tmp_path, capsys, monkeypatch):
+    def interrupt(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(split_forms, "measure", interrupt)
+    assert main(["study", "split", str(scene_folder), "--out", str(tmp_path / "out")]) == 130
+    assert "minisplat-ref: interrupted\n" in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())

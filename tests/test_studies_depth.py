@@ -7,11 +7,10 @@ import pytest
 from numpy.testing import assert_allclose
 from tolerances import CLOSED_FORM, PRINTED_DIGITS
 
+from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.tracer import camera_centre, pixel_rays
-from minisplat_ref.experiments.studies import depth_types
-from minisplat_ref.experiments.studies.__main__ import main
-from minisplat_ref.experiments.studies.front import FIGURE, RESULT
+from minisplat_ref.datasets.synthetic.tracer import pixel_rays
+from minisplat_ref.experiments.studies import FIGURE, RESULT, depth_types
 from minisplat_ref.io.images import read_image
 from minisplat_ref.strategy.initialization import from_points
 
@@ -30,7 +29,7 @@ def true_points(truth):
     points = []
     for view, depth in zip(truth.scene.train_views, truth.train_depths, strict=True):
         rays = pixel_rays(view.camera, 0.5, 0.5, np.arange(view.camera.height))
-        points.append(camera_centre(view.camera) + depth.reshape(-1, 1) * rays)
+        points.append(view.camera.center + depth.reshape(-1, 1) * rays)
     return np.concatenate(points)
 
 
@@ -38,14 +37,15 @@ def test_study(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(depth_types, "make_scene", small)
     out = tmp_path / "out"
     numbers = ("--iterations", "20", "--train-on", "3", "--seeds", "0,1")
-    assert main(["depth", "outdoor", "--out", str(out), *numbers]) == 0
+    assert main(["study", "depth", "outdoor", "--out", str(out), *numbers]) == 0
     assert sorted(path.name for path in out.iterdir()) == sorted([FIGURE, RESULT])
     assert read_image(out / FIGURE).std() > 1
     result = json.loads((out / RESULT).read_text())
     assert result["machine"] and result["size"] == [32, 24] and len(result["runs"]) == 2 * len(depth_types.CHOICES)
 
     runs = {(run["choice"], run["seed"]): run for run in result["runs"]}
-    lines = [line.strip("| ").split(" | ") for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
+    printed = capsys.readouterr().out.splitlines()
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in printed if line.startswith("|")]
     assert [line[0] for line in lines[2:]] == list(depth_types.CHOICES)
     for choice, *cells in lines[2:]:
         first, second = runs[choice, 0], runs[choice, 1]
@@ -61,7 +61,7 @@ def test_errors_of_known_points(outdoor):
     """One in five of the surface's points 10 % too near, the sky's points at the cameras."""
     points, true_depths = true_points(outdoor), outdoor.train_depths.ravel()
     pixels = np.arange(len(points))
-    centres = [camera_centre(view.camera) for view in outdoor.scene.train_views]
+    centres = [view.camera.center for view in outdoor.scene.train_views]
     centres = np.repeat(centres, len(points) // len(centres), axis=0)
     surface = np.flatnonzero(true_depths)
     moved = surface[::5]
@@ -93,7 +93,7 @@ def test_each_point_is_on_the_ray_of_its_pixel(outdoor, rng):
 
 @pytest.mark.parametrize(("scene", "message"), [("nowhere", "nowhere: true depths are known of room, ")])
 def test_bad_input_is_one_line(tmp_path, capsys, scene, message):
-    assert main(["depth", scene, "--out", str(tmp_path / "out")]) == 2
+    assert main(["study", "depth", scene, "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
-    assert error.startswith("error: ") and error.count("\n") == 1 and message in error
+    assert error.startswith("minisplat-ref: error: ") and error.count("\n") == 1 and message in error
     assert not (tmp_path / "out").exists()

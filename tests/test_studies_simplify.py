@@ -7,11 +7,9 @@ import pytest
 from scipy.spatial import cKDTree
 from tolerances import CLOSED_FORM, PRINTED_DIGITS
 
+from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.__main__ import main as write_synthetic
-from minisplat_ref.experiments.studies import simplify
-from minisplat_ref.experiments.studies.__main__ import main
-from minisplat_ref.experiments.studies.front import FIGURE, RESULT
+from minisplat_ref.experiments.studies import FIGURE, RESULT, simplify
 from minisplat_ref.io import load_ply, load_scene, save_ply
 from minisplat_ref.io.images import read_image
 from minisplat_ref.methods import get_recipe
@@ -27,7 +25,7 @@ TINY = ("--views", "6", "--width", "32", "--height", "24", "--supersampling", "1
 @pytest.fixture(scope="module")
 def scene_folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("study") / "room"
-    assert write_synthetic(["room", "--out", str(folder), *TINY]) == 0
+    assert main(["synthetic", "room", "--out", str(folder), *TINY]) == 0
     return folder
 
 
@@ -45,7 +43,7 @@ def dense_file(scene_folder):
 def test_study(scene_folder, dense_file, tmp_path, capsys, restart):
     out = tmp_path / "out"
     numbers = ("--fractions", "0.2,0.5", "--fine-tune", "2", "--seeds", "0,1")
-    arguments = ["simplify", str(scene_folder), "--out", str(out), "--ply", str(dense_file), *numbers]
+    arguments = ["study", "simplify", str(scene_folder), "--out", str(out), "--ply", str(dense_file), *numbers]
     assert main([*arguments, *restart]) == 0
     assert sorted(path.name for path in out.iterdir()) == sorted([FIGURE, RESULT])
     assert read_image(out / FIGURE).std() > 1
@@ -83,7 +81,8 @@ def test_study(scene_folder, dense_file, tmp_path, capsys, restart):
     assert abs(row["chamfer_dense"] - nearest.mean()) < CLOSED_FORM  # the other way it is 0: they were kept
 
     # The table says the means and deviations.
-    lines = [line.strip("| ").split(" | ") for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
+    printed = capsys.readouterr().out.splitlines()
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in printed if line.startswith("|")]
     assert len(lines) == 2 + 9
     for label, n, choice, *cells in lines[2:]:
         values = [runs[label, choice, seed]["psnr_tuned"] for seed in (0, 1)]
@@ -95,7 +94,17 @@ def test_study(scene_folder, dense_file, tmp_path, capsys, restart):
 
 def test_dense_population_is_trained(scene_folder, tmp_path):
     out = tmp_path / "out"
-    arguments = ["simplify", str(scene_folder), "--out", str(out), "--recipe", "3dgs-accel", "--iterations", "3"]
+    arguments = [
+        "study",
+        "simplify",
+        str(scene_folder),
+        "--out",
+        str(out),
+        "--recipe",
+        "3dgs-accel",
+        "--iterations",
+        "3",
+    ]
     assert main([*arguments, "--fractions", "0.5", "--fine-tune", "1", "--seeds", "0"]) == 0
     result = json.loads((out / RESULT).read_text())
     assert (result["recipe"], result["iterations"], result["ply"]) == ("3dgs-accel", 3, None)
@@ -133,7 +142,7 @@ def test_folder_has_no_true_surface(scene_folder, monkeypatch):
     ],
 )
 def test_bad_input(scene_folder, tmp_path, capsys, arguments, message):
-    command = ["simplify", str(scene_folder), "--out", str(tmp_path / "out"), *arguments]
+    command = ["study", "simplify", str(scene_folder), "--out", str(tmp_path / "out"), *arguments]
     try:
         assert main(command) == 2
     except SystemExit as stop:

@@ -11,8 +11,8 @@ from tolerances import (
     SYNTHETIC_SURFACE,
 )
 
+from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
-from minisplat_ref.datasets.synthetic.__main__ import main
 from minisplat_ref.datasets.synthetic.cameras import look_at
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.datasets.synthetic.geometry import Primitive, first_hits
@@ -27,7 +27,7 @@ from minisplat_ref.datasets.synthetic.materials import (
 )
 from minisplat_ref.datasets.synthetic.shapes import Box, Cylinder, Rectangle, Sphere
 from minisplat_ref.datasets.synthetic.sparse_points import project_points
-from minisplat_ref.datasets.synthetic.tracer import World, camera_centre, pixel_rays, radiance
+from minisplat_ref.datasets.synthetic.tracer import World, pixel_rays, radiance
 from minisplat_ref.errors import InputError
 
 SMALL = {"n_views": 4, "width": 64, "height": 48, "supersampling": 1, "n_points": 300, "test_every": 4}
@@ -179,7 +179,7 @@ def test_camera_looks_at_target_upright():
     camera = look_at(position, target, 50.0, 64, 48)
     assert_allclose(camera.cam_from_world_R @ camera.cam_from_world_R.T, np.eye(3), atol=CLOSED_FORM)
     assert np.linalg.det(camera.cam_from_world_R) > 0
-    assert_allclose(camera_centre(camera), position, rtol=CLOSED_FORM)
+    assert_allclose(camera.center, position, rtol=CLOSED_FORM)
     pixels, depths = project_points(camera, np.stack([target, target + np.array([0, 0, 0.3])]))
     assert_allclose(pixels[0], [32, 24], rtol=CLOSED_FORM)
     assert_allclose(depths[0], np.linalg.norm(target - position), rtol=CLOSED_FORM)
@@ -191,7 +191,7 @@ def test_camera_looks_at_target_upright():
 
 
 def surface_points(camera, depth):
-    return camera_centre(camera) + depth.reshape(-1, 1) * rays_of(camera)  # [H W, 3]
+    return camera.center + depth.reshape(-1, 1) * rays_of(camera)  # [H W, 3]
 
 
 def test_depth_agrees_between_views():
@@ -278,7 +278,7 @@ def test_scene_is_what_a_loader_gives(synthetic):
         assert (view.image.min(axis=2) == 255).mean() < 0.1
     assert synthetic.test_depths.shape == (2, 48, 64)
     assert synthetic.test_normals.shape == (2, 48, 64, 3)
-    centres = np.array([camera_centre(view.camera) for view in scene.train_views])
+    centres = np.array([view.camera.center for view in scene.train_views])
     assert_allclose(scene.extent, 1.1 * np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
 
 
@@ -333,7 +333,7 @@ def test_points_are_seen_where_they_say(synthetic):
 def test_points_lie_on_surfaces_and_not_on_the_sky(synthetic):
     view = synthetic.scene.train_views[0]
     seen = synthetic.scene.points[synthetic.point_visibility[0]]
-    origin = camera_centre(view.camera)
+    origin = view.camera.center
     assert_allclose(first_hits(synthetic.world.primitives, origin, seen - origin).distances, 1, rtol=SYNTHETIC_SURFACE)
 
 
@@ -359,7 +359,7 @@ def test_point_noise():
 def test_folder(tmp_path, capsys):
     folder = tmp_path / "made" / "room"
     options = ["--views", "4", "--width", "64", "--height", "48", "--supersampling", "1", "--points", "300"]
-    assert main(["room", "--out", str(folder), *options, "--test-every", "4"]) == 0
+    assert main(["synthetic", "room", "--out", str(folder), *options, "--test-every", "4"]) == 0
     assert "4 training and 2 test views, 300 points" in capsys.readouterr().out
     assert [path.name for path in folder.parent.iterdir()] == ["room"]
     synthetic = make_scene("room", **SMALL)
@@ -434,8 +434,8 @@ def test_nothing_half_written(tmp_path, monkeypatch):
 )
 def test_bad_input_is_one_line(arguments, culprit, tmp_path, capsys):
     (tmp_path / "something").touch()
-    assert main([argument.format(tmp_path) for argument in arguments]) == 2
+    assert main(["synthetic", *(argument.format(tmp_path) for argument in arguments)]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert culprit in lines[-1]
-    assert lines[-1].startswith("error: ")
+    assert lines[-1].startswith("minisplat-ref: error: ")
     assert [path.name for path in tmp_path.iterdir()] == ["something"]

@@ -11,8 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import BACKENDS, CPU, CPU_EXACT, REFERENCE, Backend
+from minisplat_ref.backends import BACKENDS, CPU, CPU_EXACT, PLAIN, REFERENCE, Backend
 from minisplat_ref.bench.exponentials import EXPONENTIALS, relative_errors
+from minisplat_ref.bench.passes import RASTERIZATION, RENDER, Passes
 from minisplat_ref.bench.textbook import TEXTBOOK
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.cpu.compositing import composite_vjp_with, composite_with
@@ -45,6 +46,8 @@ class Contender(NamedTuple):
     """The default's, or with another cut-off."""
     slack: float = 0.0
     """Relative error of its exponential: so far from a threshold, hits may still fall on the other side."""
+    passes: Passes = RENDER
+    """The public functions that it is called through."""
 
 
 REFERENCE_NAME = "reference-f64"
@@ -61,8 +64,11 @@ def all_contenders() -> dict[str, Contender]:
         Contender(CHECKED_NAME, CPU, f64, BENCH_FLOAT64, BENCH_FLOAT64),
         Contender("cpu-exact-f32", CPU_EXACT, f32),
         Contender("cpu-f32", CPU, f32),
+        Contender("rasterization-f32", CPU, f32, passes=RASTERIZATION),
         *(_of_degree(degree) for degree in EXPONENTIALS if degree != DEGREE_IN_USE),
         *(Contender(f"cpu-f32-{name}", CPU, f32, conventions=cut) for name, cut in CUT_OFFS.items()),
+        Contender("plain-f64", PLAIN, f64, BENCH_FLOAT64, BENCH_FLOAT64),
+        Contender("plain-f32", PLAIN, f32),
         Contender(BASELINE_NAME, TEXTBOOK, f32),
         *(Contender(f"{name}-f32", backend, f32) for name, backend in BACKENDS.items() if name not in KNOWN),
     ]
@@ -134,6 +140,6 @@ def with_exponential(exp: Callable, name: str) -> Backend:
         v_image: Floats,
         v_alpha: Floats,
     ) -> CompositeGradient:
-        return composite_vjp_with(exp, projection, colors, background, bins, conventions, output, v_image, v_alpha)
+        return composite_vjp_with(exp, projection, colors, bins, conventions, output, v_image, v_alpha)
 
     return replace(CPU, name=name, composite=composite, composite_vjp=composite_vjp)

@@ -1,16 +1,16 @@
 """Is what a contender draws right? Errors against float64 on the same numbers, flips of thresholds apart."""
 
 import time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.bench.contenders import Contender
-from minisplat_ref.bench.flips import Thresholds, thresholds
 from minisplat_ref.bench.workloads import Workload
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
-from minisplat_ref.rendering import RenderTape, render, render_vjp
+from minisplat_ref.oracle.thresholds import Thresholds, thresholds_of_view
+from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.types import Floats, Gaussians
 
 
@@ -59,7 +59,7 @@ def expect(workload: Workload, backend: Backend, conventions: Conventions = GSPL
     drawn = time.perf_counter()
     gradient = render_vjp(tape, workload.v_image).gaussians
     differentiated = time.perf_counter()
-    at = thresholds(tape)
+    at = thresholds_of_view(tape.splats)
     quiet = render_vjp(tape, quiet_cotangent(workload, at)).gaussians
     return Expected(output.image, gradient, quiet, at, drawn - start, differentiated - drawn)
 
@@ -67,7 +67,7 @@ def expect(workload: Workload, backend: Backend, conventions: Conventions = GSPL
 def with_slack(expected: Expected, workload: Workload, conventions: Conventions, slack: float) -> Expected:
     """Return the same answer with wider margins at the thresholds."""
     _, tape = render(workload.gaussians, workload.camera, conventions=conventions, backend=CPU)
-    at = thresholds(tape, slack)
+    at = thresholds_of_view(tape.splats, slack)
     quiet = render_vjp(tape, quiet_cotangent(workload, at)).gaussians
     return expected._replace(thresholds=at, quiet_gradient=quiet)
 
@@ -82,10 +82,10 @@ def judge(contender: Contender, workload: Workload, expected: Expected) -> Verdi
     expected : Expected
         For the conventions that it is held to: its own to be judged, the default's to be reported.
     """
-    _, tape = forward(contender, workload)
+    image, tape = forward(contender, workload)
     gradient = backward(contender, tape, workload.v_image)
     quiet = backward(contender, tape, quiet_cotangent(workload, expected.thresholds))
-    difference = np.abs(tape.splats.output.image - expected.image)
+    difference = np.abs(image - expected.image)
     error = difference.max(axis=2)  # [H, W]
     error = np.where(np.isnan(error), np.inf, error)
     allowance = expected.thresholds.allowance
@@ -115,16 +115,15 @@ def failure(contender: Contender, verdict: Verdict) -> str:
     return ""
 
 
-def forward(contender: Contender, workload: Workload) -> tuple[Floats, RenderTape]:
+def forward(contender: Contender, workload: Workload) -> tuple[Floats, Any]:
     """Draw; returns the image and what :func:`backward` needs."""
     gaussians = Gaussians._make(field.astype(contender.dtype, copy=False) for field in workload.gaussians)
-    output, tape = render(gaussians, workload.camera, conventions=contender.conventions, backend=contender.backend)
-    return output.image, tape
+    return contender.passes.forward(gaussians, workload.camera, contender.conventions, contender.backend)
 
 
-def backward(contender: Contender, tape: RenderTape, v_image: Floats) -> Gaussians:
+def backward(contender: Contender, tape: Any, v_image: Floats) -> Gaussians:
     """Differentiate what :func:`forward` drew."""
-    return render_vjp(tape, v_image.astype(contender.dtype, copy=False)).gaussians
+    return contender.passes.backward(tape, v_image.astype(contender.dtype, copy=False))
 
 
 def quiet_cotangent(workload: Workload, at: Thresholds) -> Floats:

@@ -13,9 +13,8 @@ from minisplat_ref.jit.compile import kernel, prange
 from minisplat_ref.oracle.cases import Case, Figure
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_GRADIENT
 from minisplat_ref.rendering import render, render_vjp
-from minisplat_ref.splatting import Primitives
 from minisplat_ref.training.adam import AdamRule, adam_step, zero_moments
-from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Ints, ProjectionGradient
+from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Ints, Primitives, ProjectionGradient
 
 N = 200_000
 SH_COEFFICIENTS = 16  # degree 3
@@ -28,7 +27,10 @@ VISIBLE_SHARE = 0.3
 
 
 @kernel()
-def _copy(source, target):  # type: ignore[no-untyped-def]
+def _copy(  # type: ignore[no-untyped-def]
+    source,  # [n]
+    target,  # [n]
+):
     for chunk in prange(COPY_CHUNKS):
         first, end = source.size * chunk // COPY_CHUNKS, source.size * (chunk + 1) // COPY_CHUNKS
         target[first:end] = source[first:end]

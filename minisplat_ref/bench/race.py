@@ -85,7 +85,7 @@ def race(
             if not entry.failure and entry.contender.name != REFERENCE_NAME:
                 _take_turn(entry, workload)
     baseline = next((entry for entry in entries if entry.contender.name == BASELINE_NAME), None)
-    return [_case(workload, entry, baseline) for entry in entries]
+    return [_case(workload, entry, baseline.times if baseline else Times([], [])) for entry in entries]
 
 
 def _judged(contender: Contender, workload: Workload, expected: Expected, trust: str) -> Entry:
@@ -112,7 +112,7 @@ def _take_turn(entry: Entry, workload: Workload) -> None:
     times.backward.append(time.perf_counter() - drawn)
 
 
-def _case(workload: Workload, entry: Entry, baseline: Entry | None) -> Case:
+def _case(workload: Workload, entry: Entry, baseline: Times) -> Case:
     v, times = entry.verdict, entry.times
     figures: dict[str, Figure] = {
         "forward ms": _median(times.forward),
@@ -121,7 +121,8 @@ def _case(workload: Workload, entry: Entry, baseline: Entry | None) -> Case:
         "least forward ms": _least(times.forward),
         "least both ms": _least(times.both),
         "turns": len(times.both),
-        "x textbook": _ratio(baseline, entry),
+        "x textbook": _ratio(baseline.both, times.both),
+        "x textbook, forward": _ratio(baseline.forward, times.forward),
         "image max": v.image_max,
         "image RMS": v.image_rms,
         "flips": v.n_flips if entry.contender.conventions == GSPLAT_MAIN else None,
@@ -140,11 +141,9 @@ def _least(seconds: list[float]) -> float | None:
     return MILLI * min(seconds) if seconds else None
 
 
-def _ratio(baseline: Entry | None, entry: Entry) -> float | None:
-    """How many times faster than the baseline, by the least times of forward and backward."""
-    if baseline is None or not baseline.times.both or not entry.times.both:
-        return None
-    return min(baseline.times.both) / min(entry.times.both)
+def _ratio(baseline: list[float], own: list[float]) -> float | None:
+    """How many times faster than the baseline, by the least times."""
+    return min(baseline) / min(own) if baseline and own else None
 
 
 def _flawless() -> Verdict:

@@ -10,6 +10,7 @@ Left out: blend statistics, conventions other than the default's.
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,15 +18,56 @@ from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.jit.compile import kernel, n_threads, prange
-from minisplat_ref.types import CompositeGradient, Floats, Projection, RenderOutput, TileBins
+from minisplat_ref.types import CompositeGradient, Floats, Ints, Projection, RenderOutput, TileBins
 
-Thresholds = tuple[float, float, float]  # alpha_min, alpha_max, transmittance_min
+
+class Splats(NamedTuple):
+    """What the loops read of the Gaussians."""
+
+    means2d: Floats
+    """[N, 2] pixels."""
+    conics: Floats
+    """[N, 3] px^-2."""
+    opacities: Floats
+    """[N]."""
+    colors: Floats
+    """[N, D]."""
+
+
+class Tiles(NamedTuple):
+    """The tiles and their lists; see :class:`~minisplat_ref.types.TileBins`."""
+
+    offsets: Ints
+    """[n_tiles + 1]."""
+    ids: Ints
+    """[M]."""
+    width: int
+    """Of a tile, pixels."""
+    height: int
+    """Pixels."""
+    n_x: int
+    """Columns of tiles."""
+
+
+class Thresholds(NamedTuple):
+    """Those of the conventions, float64."""
+
+    alpha_min: float
+    alpha_max: float
+    transmittance_min: float
 
 
 @kernel()
-def _draw(splats, colors, background, lists, tile_width, tile_height, n_tiles_x, thresholds, image, alpha):  # type: ignore[no-untyped-def]
-    means2d, conics, opacities = splats
-    tile_offsets, ids = lists
+def _draw(  # type: ignore[no-untyped-def]
+    splats,  # Splats
+    background,  # [D]
+    tiles,  # Tiles
+    thresholds,
+    image,  # [H, W, D] zeros
+    alpha,  # [H, W]
+):
+    means2d, conics, opacities, colors = splats
+    tile_offsets, ids, tile_width, tile_height, n_tiles_x = tiles
     alpha_min, alpha_max, transmittance_min = thresholds
     height, width, n_channels = image.shape
     for tile in prange(tile_offsets.size - 1):
@@ -52,10 +94,16 @@ def _draw(splats, colors, background, lists, tile_width, tile_height, n_tiles_x,
 
 @kernel()
 def _differentiate(  # type: ignore[no-untyped-def]
-    splats, colors, background, lists, tile_width, tile_height, n_tiles_x, thresholds, v_image, v_alpha, sums
+    splats,  # Splats
+    background,  # [D]
+    tiles,  # Tiles
+    thresholds,
+    v_image,  # [H, W, D]
+    v_alpha,  # [H, W]
+    sums,  # [threads, N, 6 + D] zeros
 ):
-    means2d, conics, opacities = splats
-    tile_offsets, ids = lists
+    means2d, conics, opacities, colors = splats
+    tile_offsets, ids, tile_width, tile_height, n_tiles_x = tiles
     alpha_min, alpha_max, transmittance_min = thresholds
     height, width, n_channels = v_image.shape
     n_workers, n_tiles = sums.shape[0], tile_offsets.size - 1
@@ -148,17 +196,13 @@ def composite_vjp(
 
 def _inputs(
     projection: Projection, colors: Floats, background: Floats, bins: TileBins, conventions: Conventions
-) -> tuple[object, ...]:
+) -> tuple[Splats, Floats, Tiles, Thresholds]:
     grid = bins.grid
     return (
-        (projection.means2d, projection.conics, projection.opacities),
-        colors,
+        Splats(projection.means2d, projection.conics, projection.opacities, colors),
         background,
-        (bins.tile_offsets, bins.gaussian_ids),
-        grid.tile_width,
-        grid.tile_height,
-        grid.n_tiles_x,
-        (conventions.alpha_min, conventions.alpha_max, conventions.transmittance_min),
+        Tiles(bins.tile_offsets, bins.gaussian_ids, grid.tile_width, grid.tile_height, grid.n_tiles_x),
+        Thresholds(conventions.alpha_min, conventions.alpha_max, conventions.transmittance_min),
     )
 
 

@@ -1,7 +1,7 @@
 """The command line ``minisplat-ref``: reads arguments, shows progress, writes files; everything else lives below it.
 
 One module per command, each with ``add_parser`` (arguments and help) and ``run`` (the work; returns the exit code). A
-new command is such a module, named in ``COMMANDS``. These modules import only the standard library at their top, and
+new command is such a module, named in ``GROUPS``. These modules import only the standard library at their top, and
 what they need inside ``run``, so that ``--help`` does not wait for Numba.
 
 Exit codes: 0 done, 1 a check of the oracle failed, 2 the input or the arguments are wrong (one line on stderr says
@@ -12,42 +12,72 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
-from typing import NoReturn
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.arguments import HelpFormatter
+from minisplat_ref.experiments.arguments import HelpFormatter, Parser
 
-from . import bench, cache, compare, demo, evaluate, extensions, info, oracle, render, train
+from . import (
+    bench,
+    cache,
+    compare,
+    demo,
+    downscale,
+    evaluate,
+    extensions,
+    info,
+    oracle,
+    render,
+    sfm,
+    study,
+    synthetic,
+    train,
+    undistort,
+)
 
-COMMANDS = (demo, train, render, evaluate, compare, info, extensions, oracle, bench, cache)
+GROUPS = {
+    "start here": (demo,),
+    "preparing scenes": (sfm, undistort, downscale, synthetic),
+    "training and its results": (train, render, evaluate, compare, info),
+    "checks and measurements": (oracle, bench, study),
+    "the program itself": (extensions, cache),
+}
+"""The commands under the headings of ``--help``."""
 
 DESCRIPTION = """\
 3D Gaussian Splatting on the CPU: train a scene from photographs, look at it,
 measure it, and check every formula against a reference that can be read.
 
 First time here:   minisplat-ref demo
-Your own photos:   minisplat-ref train SCENE --out runs/mine
+Your own photos:   minisplat-ref sfm PHOTOS --out SCENE
+                   minisplat-ref train SCENE --out runs/mine
 """
 EPILOG = """\
 minisplat-ref COMMAND --help explains a command.
 Exit codes: 0 done, 1 a check failed, 2 bad input, 130 interrupted."""
 
 
-class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are one line, like those of bad input."""
-
-    def error(self, message: str) -> NoReturn:
-        """Print one line to stderr and exit with code 2."""
-        self.exit(2, f"minisplat-ref: error: {message} (see: {self.prog} --help)\n")
-
-
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of all commands; ``args.run`` is the function of the chosen one, None where there is none."""
-    parser = Parser(prog="minisplat-ref", description=DESCRIPTION, epilog=EPILOG, formatter_class=HelpFormatter)
+    parser = Parser(
+        prog="minisplat-ref",
+        usage="minisplat-ref COMMAND ...",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=HelpFormatter,
+        add_help=False,
+    )
     parser.set_defaults(run=None)
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    for command in COMMANDS:
-        command.add_parser(commands)
+    commands = parser.add_subparsers(prog="minisplat-ref", metavar="COMMAND", help=argparse.SUPPRESS)
+    for title, modules in GROUPS.items():
+        group = parser.add_argument_group(title)
+        for command in modules:
+            command.add_parser(commands)
+        # argparse lists all commands under one heading; here each is listed under its own.
+        group._group_actions.extend(commands._choices_actions)
+        commands._choices_actions.clear()
+    parser.add_argument_group("options").add_argument(
+        "-h", "--help", action="help", help="show this help message and exit"
+    )
     return parser
 
 

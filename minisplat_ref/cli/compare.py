@@ -90,8 +90,9 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.experiments.comparison import figures
     from minisplat_ref.experiments.comparison.report import notes, report_html
     from minisplat_ref.experiments.comparison.results import collect, to_json
-    from minisplat_ref.experiments.comparison.table import as_markdown, table_cells
+    from minisplat_ref.experiments.comparison.table import table_cells
     from minisplat_ref.experiments.plots import save_png
+    from minisplat_ref.reporting import markdown_table
 
     results = collect(plan, scene)
     save_png(figures.psnr_over_time(results.curves), plan.folder / PSNR_OVER_TIME)
@@ -99,7 +100,8 @@ def run(args: argparse.Namespace) -> int:
     save_png(figures.gallery(results.crops, plan.recipes), plan.folder / GALLERY)
     (plan.folder / REPORT).write_text(report_html(plan, scene, results), encoding="utf-8")
     run_folder.write_json(plan.folder / COMPARE, to_json(plan, scene, results))
-    print(f"\n{scene.name}; {results.machine}\n\n{as_markdown(table_cells(results.recipes))}\n")
+    heading, *rows = table_cells(results.recipes)
+    print(f"\n{scene.name}; {results.machine}\n\n{markdown_table(heading, rows)}\n")
     print("\n".join(notes(plan, results)))
     print(f"open {(plan.folder / REPORT).resolve()}")
     return 0

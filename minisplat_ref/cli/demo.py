@@ -50,9 +50,8 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.datasets.synthetic import make_scene
     from minisplat_ref.datasets.synthetic.files import write_scene
     from minisplat_ref.experiments import run_folder
-    from minisplat_ref.experiments.demo_report import demo_report, view_pictures
+    from minisplat_ref.experiments.demo_report import report_html, view_pictures
     from minisplat_ref.experiments.first_use import compile_kernels
-    from minisplat_ref.experiments.report import report_html
     from minisplat_ref.experiments.run import run_training
     from minisplat_ref.experiments.scoring import summary
     from minisplat_ref.experiments.settings import Settings, load_photographs, recipe_of
@@ -81,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
     compile_kernels(settings.backend)
     outcome = run_training(folder, scene, settings, recipe, state)
     pictures = view_pictures(folder, synthetic, scene, outcome)
-    page = report_html(demo_report(folder, scene, settings, outcome, pictures, time.perf_counter() - start))
+    page = report_html(folder, scene, settings, outcome, pictures, time.perf_counter() - start)
     (folder / REPORT).write_text(page, encoding="utf-8")
     if not outcome.is_complete:
         print(

@@ -63,8 +63,9 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from minisplat_ref.experiments import run_folder
-    from minisplat_ref.experiments.pictures import depth_picture, depth_range, expected_depth
+    from minisplat_ref.experiments.pictures import depth_picture, depth_range
     from minisplat_ref.io import write_image
+    from minisplat_ref.reference.depth import expected_depth
     from minisplat_ref.types import view_from
 
     source = _open(args)
@@ -76,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
         output = source.trained.render(view_from(view.camera, time=view.time), wants)
         write_image(out / f"{name}.png", output.image[..., :3])
         if args.depth:
-            depth = expected_depth(output)  # [H, W]
+            depth = expected_depth(output.image[..., 3], output.alpha)  # [H, W]
             np.save(out / f"{name}_depth.npy", depth)
             write_image(out / f"{name}_depth.png", depth_picture(depth, *depth_range(depth)))
     print(f"{len(views)} pictures in {out}")

@@ -80,8 +80,7 @@ def add_parser(commands: Commands) -> None:
     training.add_argument(
         "--recipe",
         metavar="R",
-        help="3dgs, 3dgs-accel (default), mini-splatting, mini-splatting2, mini-splatting-d, mini-splatting2-d, or one"
-        " of an extension",
+        help="3dgs, 3dgs-accel (default), mini-splatting, mini-splatting2, either with -d, or one of an extension",
     )
     training.add_argument("--iterations", type=integer(1), metavar="N", help="one view each (default 3000)")
     training.add_argument(
@@ -99,15 +98,13 @@ def add_parser(commands: Commands) -> None:
         metavar="T",
         help="indoor (default) or outdoor: what counts as important",
     )
-    training.add_argument(
-        "--extension", metavar="E", help="train a recipe of the core with an extension: see minisplat-ref extensions"
-    )
+    training.add_argument("--extension", metavar="E", help="that a recipe of the core is trained with")
     training.add_argument(
         "--set",
         type=assignment,
         action="append",
         metavar="NAME=VALUE",
-        help="set what an event, loss or calibration of the recipe has, such as exposure=true (repeatable)",
+        help="a setting of the recipe, such as exposure=true",
     )
     training.add_argument(
         "--eval-every",

@@ -4,41 +4,58 @@ The array is taken as flat: rows that follow one another are one run of numbers,
 are updated at a time. Without this a row of three numbers costs as much as one of ten.
 """
 
+from typing import NamedTuple
+
 from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.jit.lanes import WIDTH, load, store
-from minisplat_ref.scalar.adam import adam_value
-from minisplat_ref.types import Floats, Ints
+from minisplat_ref.scalar.adam import Step, adam_value
+from minisplat_ref.types import AdamStep, Floats, Ints
 
 N_CHUNKS = 64
 
 
+class Tables(NamedTuple):
+    """The four arrays of a step, flat."""
+
+    values: Floats
+    """[N * W], likewise below."""
+    gradient: Floats
+    first: Floats
+    second: Floats
+
+
 @scalar
-def _update_run(values, gradient, first, second, start, end, rate, keep1, keep2, eps):
+def _update_run(tables, start, end, step):
+    values, gradient, first, second = tables
     i = start
     while i + WIDTH <= end:
-        value, mean, square = adam_value(
-            load(values, i), load(gradient, i), load(first, i), load(second, i), rate, keep1, keep2, eps
-        )
+        value, mean, square = adam_value(load(values, i), load(gradient, i), load(first, i), load(second, i), step)
         store(values, i, value)
         store(first, i, mean)
         store(second, i, square)
         i += WIDTH
     while i < end:
-        values[i], first[i], second[i] = adam_value(
-            values[i], gradient[i], first[i], second[i], rate, keep1, keep2, eps
-        )
+        values[i], first[i], second[i] = adam_value(values[i], gradient[i], first[i], second[i], step)
         i += 1
 
 
 @kernel()
-def _update_all(values, gradient, first, second, rate, keep1, keep2, eps):
+def _update_all(
+    tables,  # Tables
+    step,
+):
+    n = tables.values.size
     for chunk in prange(N_CHUNKS):
-        start, end = values.size * chunk // N_CHUNKS, values.size * (chunk + 1) // N_CHUNKS
-        _update_run(values, gradient, first, second, start, end, rate, keep1, keep2, eps)
+        _update_run(tables, n * chunk // N_CHUNKS, n * (chunk + 1) // N_CHUNKS, step)
 
 
 @kernel()
-def _update_rows(values, gradient, first, second, rows, width, rate, keep1, keep2, eps):
+def _update_rows(
+    tables,  # Tables
+    rows,  # [V] ascending
+    width,  # numbers in a row, W
+    step,
+):
     for chunk in prange(N_CHUNKS):
         i, end = rows.size * chunk // N_CHUNKS, rows.size * (chunk + 1) // N_CHUNKS
         while i < end:
@@ -47,7 +64,7 @@ def _update_rows(values, gradient, first, second, rows, width, rate, keep1, keep
             while i < end and rows[i] == after:
                 after += 1
                 i += 1
-            _update_run(values, gradient, first, second, row * width, after * width, rate, keep1, keep2, eps)
+            _update_run(tables, row * width, after * width, step)
 
 
 def adam_update(
@@ -56,15 +73,13 @@ def adam_update(
     first: Floats,
     second: Floats,
     rows: Ints | None,
-    rate: float,
-    beta1: float,
-    beta2: float,
-    eps: float,
+    step: AdamStep,
 ) -> None:
     """Update values and moments in place; see ``reference.adam.adam_update``."""
-    constants = (values.dtype.type(number) for number in (rate, 1 - beta1, 1 - beta2, eps))
-    flat = (array.reshape(-1) for array in (values, gradient, first, second))
+    numbers = (step.rate, 1 - step.beta1, 1 - step.beta2, step.eps)
+    in_dtype = Step._make(values.dtype.type(number) for number in numbers)
+    tables = Tables(values.reshape(-1), gradient.reshape(-1), first.reshape(-1), second.reshape(-1))
     if rows is None:
-        _update_all(*flat, *constants)
+        _update_all(tables, in_dtype)
     else:
-        _update_rows(*flat, rows, values.shape[1], *constants)
+        _update_rows(tables, rows, values.shape[1], in_dtype)

@@ -3,6 +3,8 @@
 Backward, the pixels are grouped by their Gaussian first, so that each Gaussian has one writer.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from minisplat_ref.cpu.projection import pose_of
@@ -12,6 +14,26 @@ from minisplat_ref.scalar.covariance import normalized, normalized_vjp, rotation
 from minisplat_ref.scalar.depth import densest_depth, densest_depth_vjp, gaussian_axes, pixel_ray
 from minisplat_ref.scalar.projection import dot, rows_of, transposed
 from minisplat_ref.types import Camera, Floats, Ints, SurfacePoints
+
+
+class Ellipsoids(NamedTuple):
+    """Gaussians without what does not move their surface points."""
+
+    means: Floats
+    """[N, 3] world frame."""
+    quats: Floats
+    """[N, 4] wxyz."""
+    scales: Floats
+    """[N, 3] standard deviations, world units."""
+
+
+class PixelLists(NamedTuple):
+    """The pixels of each Gaussian."""
+
+    pixels: Ints
+    """[P] flat indices, grouped by Gaussian."""
+    offsets: Ints
+    """[N + 1] Gaussian n owns pixels[offsets[n]:offsets[n + 1]]."""
 
 
 @scalar
@@ -32,9 +54,18 @@ def _scale(scales, n):
 
 
 @kernel()
-def _surface_points(means, quats, scales, rotation, centre, lens, dominant_ids, points, depths):
+def _surface_points(
+    ellipsoids,  # Ellipsoids
+    pose,  # Pose
+    lens,  # [4] fx, fy, cx, cy
+    dominant_ids,  # [H, W]
+    points,  # [H, W, 3]
+    depths,  # [H, W]
+):
+    means, quats, scales = ellipsoids
+    centre = pose.centre
     for y in prange(dominant_ids.shape[0]):
-        R = rows_of(rotation)
+        R = rows_of(pose.R)
         for x in range(dominant_ids.shape[1]):
             n = dominant_ids[y, x]
             if n < 0:
@@ -54,20 +85,19 @@ def _lens(camera: Camera) -> Floats:
 def surface_points(means: Floats, quats: Floats, scales: Floats, camera: Camera, dominant_ids: Ints) -> SurfacePoints:
     """Densest point of each pixel's dominant Gaussian; see ``reference.depth.surface_points``."""
     out = SurfacePoints(np.zeros((*dominant_ids.shape, 3), means.dtype), np.zeros(dominant_ids.shape, means.dtype))
-    rotation, centre = pose_of(camera)
-    lens = _lens(camera)
-    _surface_points(means, quats, scales, rotation, centre, lens, dominant_ids, out.points, out.depths)
+    ellipsoids = Ellipsoids(means, quats, scales)
+    _surface_points(ellipsoids, pose_of(camera), _lens(camera), dominant_ids, out.points, out.depths)
     return out
 
 
 @scalar
-def _gaussian_vjp(n, pixels, means, quats, scales, rotation, centre, lens, depths, v_points, v_depths, v_mean, v_scale):
-    """Add the shares of one Gaussian's pixels; return the gradient by its axes, one per row."""
-    R = rows_of(rotation)
-    axes = gaussian_axes(_wide(quats[n]))
-    scale = _scale(scales, n)
-    u = _offset(means, n, centre)
-    v_axes = np.zeros((3, 3))
+def _gaussian_vjp(n, pixels, ellipsoids, pose, lens, depths, v_surface, v):
+    """Write the gradient by one Gaussian, the sum of the shares of its pixels."""
+    R = rows_of(pose.R)
+    quat = _wide(ellipsoids.quats[n])
+    axes, scale, u = gaussian_axes(quat), _scale(ellipsoids.scales, n), _offset(ellipsoids.means, n, pose.centre)
+    v_points, v_depths = v_surface
+    v_mean, v_scale, v_axes = v.means[n], v.scales[n], np.zeros((3, 3))
     for pixel in pixels:
         y, x = pixel // depths.shape[1], pixel % depths.shape[1]
         t = depths[y, x]
@@ -84,38 +114,28 @@ def _gaussian_vjp(n, pixels, means, quats, scales, rotation, centre, lens, depth
             for i in range(3):
                 v_axes[k, i] += v_axis[i]
                 v_mean[i] += v_p * axes[k][i]
-    return v_axes
+    w, x, y, z, inverse_length = normalized(*quat)
+    v_unit = rotation_vjp(w, x, y, z, transposed(rows_of(v_axes)))
+    v_quat = normalized_vjp((w, x, y, z), inverse_length, v_unit)
+    for i in range(4):
+        v.quats[n, i] = v_quat[i]
 
 
 @kernel()
 def _surface_points_vjp(
-    means,
-    quats,
-    scales,
-    rotation,
-    centre,
-    lens,
-    pixels,
-    offsets,
-    depths,
-    v_points,
-    v_depths,
-    v_means,
-    v_quats,
-    v_scales,
+    ellipsoids,  # Ellipsoids
+    pose,  # Pose
+    lens,  # [4] fx, fy, cx, cy
+    lists,  # PixelLists
+    depths,  # [H, W]
+    v_surface,  # SurfacePoints
+    v,  # Ellipsoids, zeros
 ):
-    for n in prange(means.shape[0]):
-        if offsets[n] == offsets[n + 1]:
-            continue
-        own = pixels[offsets[n] : offsets[n + 1]]
-        v_axes = _gaussian_vjp(
-            n, own, means, quats, scales, rotation, centre, lens, depths, v_points, v_depths, v_means[n], v_scales[n]
-        )
-        w, x, y, z, inverse_length = normalized(*_wide(quats[n]))
-        v_w, v_x, v_y, v_z = rotation_vjp(w, x, y, z, transposed(rows_of(v_axes)))
-        v = normalized_vjp(w, x, y, z, inverse_length, v_w, v_x, v_y, v_z)
-        for i in range(4):
-            v_quats[n, i] = v[i]
+    pixels, offsets = lists
+    for n in prange(offsets.size - 1):
+        if offsets[n] < offsets[n + 1]:
+            own = pixels[offsets[n] : offsets[n + 1]]
+            _gaussian_vjp(n, own, ellipsoids, pose, lens, depths, v_surface, v)
 
 
 def surface_points_vjp(
@@ -128,17 +148,18 @@ def surface_points_vjp(
     v_depths: Floats,
 ) -> tuple[Floats, Floats, Floats]:
     """Chain the gradient of the surface points to the Gaussians; see ``reference.depth.surface_points_vjp``."""
-    v_means, v_quats, v_scales = (
-        np.zeros(means.shape, means.dtype),
-        np.zeros(quats.shape, quats.dtype),
-        np.zeros(scales.shape, scales.dtype),
-    )
     ids = dominant_ids.ravel()
-    pixels = np.argsort(ids, kind="stable")[np.count_nonzero(ids < 0) :]  # grouped by Gaussian
+    pixels = np.argsort(ids, kind="stable")[np.count_nonzero(ids < 0) :]
     offsets = np.concatenate([[0], np.cumsum(np.bincount(ids[ids >= 0], minlength=len(means)))])
-    rotation, centre = pose_of(camera)
-    lens = _lens(camera)
     depths = surface_points(means, quats, scales, camera, dominant_ids).depths
-    args = (means, quats, scales, rotation, centre, lens, pixels, offsets, depths)
-    _surface_points_vjp(*args, v_points, v_depths, v_means, v_quats, v_scales)
-    return v_means, v_quats, v_scales
+    v = Ellipsoids(*(np.zeros(array.shape, array.dtype) for array in (means, quats, scales)))
+    _surface_points_vjp(
+        Ellipsoids(means, quats, scales),
+        pose_of(camera),
+        _lens(camera),
+        PixelLists(pixels, offsets),
+        depths,
+        SurfacePoints(v_points, v_depths),
+        v,
+    )
+    return v

@@ -174,10 +174,19 @@ def _turns_vjp(depth, lens, normals, ties, v_pair, v_steps):
 
 
 @kernel()
-def _look_up(points, rotation, centre, lens, depth, tolerance, pixels, costs, slopes):
+def _look_up(
+    points,  # [P, 3]
+    pose,  # Pose
+    lens,  # [4] fx, fy, cx, cy
+    depth,  # [H, W]
+    tolerance,
+    pixels,  # [P]
+    costs,  # [P]
+    slopes,  # [P]
+):
     height, width = depth.shape
     for i in prange(points.shape[0]):
-        x, y, z = to_camera(rows_of(rotation), centre, points[i, 0], points[i, 1], points[i, 2])
+        x, y, z = to_camera(rows_of(pose.R), pose.centre, points[i, 0], points[i, 1], points[i, 2])
         if not z > ZERO:
             continue
         u, v = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
@@ -237,9 +246,8 @@ def _seen_points(depth: Floats, camera: Camera, lens: Floats, points: Floats) ->
     """Pixel, cost and slope [n] of the points that fall on a pixel with depth, in float64 like their positions."""
     n = len(points)
     pixels, costs, slopes = np.full(n, -1), np.zeros(n), np.zeros(n)
-    rotation, centre = pose_of(camera)
     points = np.ascontiguousarray(points, np.float64)
-    _look_up(points, rotation, centre, lens, depth, SFM_DEPTH_TOLERANCE, pixels, costs, slopes)
+    _look_up(points, pose_of(camera), lens, depth, SFM_DEPTH_TOLERANCE, pixels, costs, slopes)
     is_seen = pixels >= 0
     return pixels[is_seen], costs[is_seen], slopes[is_seen]
 

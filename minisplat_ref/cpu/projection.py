@@ -28,9 +28,10 @@ from minisplat_ref.cpu.gaussian_rows import (
 from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.jit.lanes import WIDTH, counted, scatter, select
 from minisplat_ref.jit.literals import ZERO
-from minisplat_ref.scalar.extent import inria_box, support_box
+from minisplat_ref.scalar.extent import Extent, inria_box, support_box
 from minisplat_ref.scalar.projection import (
     Lens,
+    Pose,
     axes,
     axes_vjp,
     compensation_vjp,
@@ -44,24 +45,19 @@ from minisplat_ref.scalar.projection import (
     to_camera,
     transposed,
 )
-from minisplat_ref.types import Camera, Floats, PrimitiveGradient, Projection, ProjectionGradient
+from minisplat_ref.types import Camera, Floats, PrimitiveGradient, Primitives, Projection, ProjectionGradient
 
 N_CHUNKS = 64  # parts of the camera-gradient sum; fixed, so that its rounding does not depend on the thread count
 
 
-def camera_centre(camera: Camera) -> Floats:
-    """Camera centre -R^T t [3], float64."""
-    return -np.asarray(camera.cam_from_world_R, np.float64).T @ np.asarray(camera.cam_from_world_t, np.float64)
-
-
-def pose_of(camera: Camera) -> tuple[Floats, Floats]:
-    """Return R [3, 3] and the point [3] that R x + t takes to the origin, float64.
+def pose_of(camera: Camera) -> Pose:
+    """Return R and the point that R x + t takes to the origin, float64.
 
     The point is the camera centre. It is solved for rather than taken as -R^T t, so that R (x - point) equals R x + t
     also where R is not quite a rotation: the gradient counts its nine entries as free.
     """
     R = np.ascontiguousarray(camera.cam_from_world_R, np.float64)
-    return R, -np.linalg.solve(R, np.asarray(camera.cam_from_world_t, np.float64))
+    return Pose(R, -np.linalg.solve(R, np.asarray(camera.cam_from_world_t, np.float64)))
 
 
 def lens_of(camera: Camera, conventions: Conventions) -> Lens:
@@ -91,20 +87,19 @@ def _quaternion(quats, rows):
 
 
 @scalar
-def _project_eight(
-    rows, means, quats, scales, opacities, rotation, centre, lens, alpha_min, full_support, width, height, out
-):
-    R = rows_of(rotation)
-    x, y, z = triple(means, rows)
-    p = to_camera(R, centre, x, y, z)
-    footprint = project_gaussian(p, rotated(R, axes(_quaternion(quats, rows), triple(scales, rows))), lens)
-    opacity = gather_wide(opacities, rows, 0) * footprint.compensation
+def _project_eight(rows, primitives, pose, lens, extent, out):
+    R = rows_of(pose.R)
+    x, y, z = triple(primitives.means, rows)
+    p = to_camera(R, pose.centre, x, y, z)
+    M = axes(_quaternion(primitives.quats, rows), triple(primitives.scales, rows))
+    footprint = project_gaussian(p, rotated(R, M), lens)
+    opacity = gather_wide(primitives.opacities, rows, 0) * footprint.compensation
     a, b, c = conic(footprint)
-    if full_support:
-        rx, ry, x0, y0, x1, y1 = support_box(footprint, opacity, alpha_min, width, height)
+    if extent.has_full_support:
+        rx, ry, x0, y0, x1, y1 = support_box(footprint, opacity, extent.alpha_min, extent.width, extent.height)
     else:
-        rx, ry, x0, y0, x1, y1 = inria_box(footprint, width, height)
-    is_seen = (p[2] > lens.near) & (p[2] < lens.far) & (opacity >= alpha_min) & (footprint.det > ZERO)
+        rx, ry, x0, y0, x1, y1 = inria_box(footprint, extent.width, extent.height)
+    is_seen = (p[2] > lens.near) & (p[2] < lens.far) & (opacity >= extent.alpha_min) & (footprint.det > ZERO)
     size = footprint.det + abs(a) + abs(c) + abs(footprint.x) + abs(footprint.y)  # finite if all of them are
     is_seen = is_seen & (size < np.inf) & (x1 > x0) & (y1 > y0)
     _scatter_seen(is_seen, out.means2d, rows, 0, footprint.x)
@@ -129,13 +124,16 @@ def _scatter_seen(is_seen, table, rows, column, lanes):
 
 
 @kernel()
-def _project(means, quats, scales, opacities, rotation, centre, lens, alpha_min, full_support, width, height, out):
-    n_gaussians = means.shape[0]
+def _project(
+    primitives,  # Primitives
+    pose,  # Pose
+    lens,
+    extent,
+    out,  # Projection
+):
+    n_gaussians = primitives.opacities.shape[0]
     for block in prange((n_gaussians + WIDTH - 1) // WIDTH):
-        rows = rows_from(block * WIDTH, n_gaussians)
-        _project_eight(
-            rows, means, quats, scales, opacities, rotation, centre, lens, alpha_min, full_support, width, height, out
-        )
+        _project_eight(rows_from(block * WIDTH, n_gaussians), primitives, pose, lens, extent, out)
 
 
 def project(
@@ -151,24 +149,25 @@ def project(
         np.empty((n, 2), np.int32),
         np.empty((n, 4), np.int32),
     )
-    rotation, centre = pose_of(camera)
-    lens, alpha_min = lens_of(camera, conventions), dtype.type(conventions.alpha_min)
-    full_support, width, height = conventions.has_full_support, camera.width, camera.height
-    _project(means, quats, scales, opacities, rotation, centre, lens, alpha_min, full_support, width, height, out)
+    primitives = Primitives(means, quats, scales, opacities)
+    alpha_min = dtype.type(conventions.alpha_min)
+    extent = Extent(alpha_min, conventions.has_full_support, camera.width, camera.height)
+    _project(primitives, pose_of(camera), lens_of(camera, conventions), extent, out)
     return out
 
 
 @scalar
-def _project_eight_vjp(rows, is_counted, means, quats, scales, opacities, R, centre, lens, v, out, v_pose):
-    x, y, z = triple(means, rows)
-    p = to_camera(R, centre, x, y, z)
-    quat, scale = _quaternion(quats, rows), triple(scales, rows)
+def _project_eight_vjp(rows, is_counted, primitives, pose, lens, v, out, v_pose):
+    R = rows_of(pose.R)
+    x, y, z = triple(primitives.means, rows)
+    p = to_camera(R, pose.centre, x, y, z)
+    quat, scale = _quaternion(primitives.quats, rows), triple(primitives.scales, rows)
     M = axes(quat, scale)
     V = rotated(R, M)
     footprint = project_gaussian(p, V, lens)
     v_opacity = gather_wide(v.opacities, rows, 0)
     from_conic = conic_vjp(footprint, triple(v.conics, rows))
-    from_blur = compensation_vjp(footprint, v_opacity * gather_wide(opacities, rows, 0), lens)
+    from_blur = compensation_vjp(footprint, v_opacity * gather_wide(primitives.opacities, rows, 0), lens)
     v_cov = (from_conic[0] + from_blur[0], from_conic[1] + from_blur[1], from_conic[2] + from_blur[2])
     v_x, v_y, v_z = gather_wide(v.means2d, rows, 0), gather_wide(v.means2d, rows, 1), gather_wide(v.depths, rows, 0)
     v_p, v_V = project_gaussian_vjp(p, V, lens, footprint, v_x, v_y, v_z, v_cov)
@@ -201,8 +200,8 @@ def _add_row(v_pose, first, is_counted, v_p, v_V, mean, M):
 
 
 @scalar
-def _project_chunk_vjp(chunk, means, quats, scales, opacities, radii, rotation, centre, lens, v, out, v_poses):
-    n_chunks, n_gaussians = v_poses.shape[0], means.shape[0]
+def _project_chunk_vjp(chunk, primitives, radii, pose, lens, v, out, v_poses):
+    n_chunks, n_gaussians = v_poses.shape[0], radii.shape[0]
     first, end = n_gaussians * chunk // n_chunks, n_gaussians * (chunk + 1) // n_chunks
     for n in range(first, end):
         if radii[n, 0] == 0:
@@ -214,19 +213,24 @@ def _project_chunk_vjp(chunk, means, quats, scales, opacities, radii, rotation, 
                 out.quats[n, i] = ZERO
     visible = np.empty(end - first + WIDTH, np.int64)
     count = list_visible(radii, first, end, visible)
-    R = rows_of(rotation)
     v_poses[chunk] = ZERO
     for i in range(0, count, WIDTH):
         is_counted = counted(DOUBLE) < count - i
-        rows = listed_rows(visible, i)
-        _project_eight_vjp(rows, is_counted, means, quats, scales, opacities, R, centre, lens, v, out, v_poses[chunk])
+        _project_eight_vjp(listed_rows(visible, i), is_counted, primitives, pose, lens, v, out, v_poses[chunk])
 
 
 @kernel()
-def _project_vjp(means, quats, scales, opacities, radii, rotation, centre, lens, v, out):
+def _project_vjp(
+    primitives,  # Primitives
+    radii,  # [N, 2]
+    pose,  # Pose
+    lens,
+    v,  # ProjectionGradient
+    out,  # PrimitiveGradient
+):
     v_poses = np.empty((N_CHUNKS, 12 * WIDTH), np.float64)
     for chunk in prange(N_CHUNKS):
-        _project_chunk_vjp(chunk, means, quats, scales, opacities, radii, rotation, centre, lens, v, out, v_poses)
+        _project_chunk_vjp(chunk, primitives, radii, pose, lens, v, out, v_poses)
     return total_of(v_poses)
 
 
@@ -250,10 +254,8 @@ def project_vjp(
         np.empty((3, 3), dtype),
         np.empty(3, dtype),
     )
-    rotation, centre = pose_of(camera)
-    lens = lens_of(camera, conventions)
-    v_pose = _project_vjp(means, quats, scales, opacities, projection.radii, rotation, centre, lens, v_projection, out)
-    v_pose = v_pose.reshape(3, 4)
+    primitives, pose, lens = Primitives(means, quats, scales, opacities), pose_of(camera), lens_of(camera, conventions)
+    v_pose = _project_vjp(primitives, projection.radii, pose, lens, v_projection, out).reshape(3, 4)
     out.cam_from_world_R[:] = v_pose[:, :3]
     out.cam_from_world_t[:] = v_pose[:, 3]
     return out

@@ -9,12 +9,14 @@ Helpers have no loops and no branches: the compiler would count references of th
 an atomic operation each.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from minisplat_ref.constants import SH_C0, SH_C1, SH_C2, SH_C3
 from minisplat_ref.cpu.gaussian_rows import DOUBLE, add, list_visible, listed_rows, total_of, triple
 from minisplat_ref.cpu.memory import large_empty
-from minisplat_ref.cpu.projection import N_CHUNKS, camera_centre
+from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.jit.lanes import (
     WIDTH,
@@ -47,6 +49,30 @@ N_REST = 3 * (N_BASES - 1)
 STAGE = 48  # N_REST in whole lanes
 
 
+class Shaded(NamedTuple):
+    """What the colours depend on of the Gaussians, or the gradient with respect to it."""
+
+    means: Floats
+    """[N, 3] world frame."""
+    sh_dc: Floats
+    """[N, 3]."""
+    sh_rest: Floats
+    """[N * width] flat."""
+    width: int
+    """Numbers in a row of ``sh_rest``, 3 (K - 1)."""
+
+
+class Harmonics(NamedTuple):
+    """Where they are seen from, and the basis functions."""
+
+    centre: Floats
+    """[3] of the camera, float64."""
+    degree: int
+    """Active degree."""
+    constants: Floats
+    """[10] of degrees 0, 1, 2 (3) and 3 (5)."""
+
+
 @scalar
 def _direction(centre, means, rows):
     """Directions to means in the data's dtype; the difference is float64, for worlds whose origin is far away."""
@@ -59,7 +85,7 @@ def _direction(centre, means, rows):
 @scalar
 def _turn(staged, column, buffer, k):
     """Turn eight columns of the rows on stage: number k of all eight comes to stand at 8 k of the buffer."""
-    lanes = columns_of(
+    rows = (
         load(staged, column),
         load(staged, column + STAGE),
         load(staged, column + 2 * STAGE),
@@ -69,13 +95,13 @@ def _turn(staged, column, buffer, k):
         load(staged, column + 6 * STAGE),
         load(staged, column + 7 * STAGE),
     )
-    store(buffer, k * WIDTH, lanes)
+    store(buffer, k * WIDTH, columns_of(rows))
 
 
 @scalar
 def _turn_back(buffer, k, staged, column):
     """Turn eight columns of a buffer back into rows on stage: the inverse of ``_turn``."""
-    a, b, c, d, e, f, g, h = columns_of(
+    columns = (
         _at(buffer, k),
         _at(buffer, k + 1),
         _at(buffer, k + 2),
@@ -85,6 +111,7 @@ def _turn_back(buffer, k, staged, column):
         _at(buffer, k + 6),
         _at(buffer, k + 7),
     )
+    a, b, c, d, e, f, g, h = columns_of(columns)
     store(staged, column, a)
     store(staged, column + STAGE, b)
     store(staged, column + 2 * STAGE, c)
@@ -108,7 +135,9 @@ def _constant(sh_dc, rows, c0):
 
 
 @scalar
-def _chunk_colors(first, end, means, sh_dc, sh_rest, width, centre, degree, c, radii, colors):
+def _chunk_colors(first, end, shaded, harmonics, radii, colors):
+    means, sh_dc, sh_rest, width = shaded
+    centre, degree, c = harmonics
     staged = np.empty(STAGE * WIDTH, means.dtype)
     y = np.empty(N_BASES * WIDTH, means.dtype)
     rest = np.empty(N_REST * WIDTH, means.dtype)
@@ -144,19 +173,27 @@ def _chunk_colors(first, end, means, sh_dc, sh_rest, width, centre, degree, c, r
 
 
 @kernel()
-def _sh_colors(means, sh_dc, sh_rest, width, centre, degree, c, radii, colors):
-    n_gaussians = means.shape[0]
+def _sh_colors(
+    shaded,  # Shaded
+    harmonics,  # Harmonics
+    radii,  # [N, 2]
+    colors,  # [N, 3]
+):
+    n_gaussians = radii.shape[0]
     for chunk in prange(N_CHUNKS):
         first, end = n_gaussians * chunk // N_CHUNKS, n_gaussians * (chunk + 1) // N_CHUNKS
-        _chunk_colors(first, end, means, sh_dc, sh_rest, width, centre, degree, c, radii, colors)
+        _chunk_colors(first, end, shaded, harmonics, radii, colors)
+
+
+def _harmonics(camera: Camera, degree: int, dtype: np.dtype) -> Harmonics:
+    return Harmonics(camera.astype(np.float64).center, degree, np.array(_CONSTANTS, dtype))
 
 
 def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int, radii: Ints) -> Floats:
     """Evaluate the colour of every visible Gaussian; see ``reference.spherical_harmonics.sh_colors``."""
     colors = np.empty(sh_dc.shape, sh_dc.dtype)
-    constants = np.array(_CONSTANTS, means.dtype)
-    width = 3 * sh_rest.shape[1]
-    _sh_colors(means, sh_dc, sh_rest.ravel(), width, camera_centre(camera), degree, constants, radii, colors)
+    shaded = Shaded(means, sh_dc, sh_rest.ravel(), 3 * sh_rest.shape[1])
+    _sh_colors(shaded, _harmonics(camera, degree, means.dtype), radii, colors)
     return colors
 
 
@@ -179,8 +216,9 @@ def _added(a, b):
 
 
 @scalar
-def _zero_culled(first, end, width, radii, v_means, v_dc, v_rest):
+def _zero_culled(first, end, radii, v):
     """Write the gradient of the Gaussians that the camera does not see."""
+    v_means, v_dc, v_rest, width = v
     for n in range(first, end):
         if radii[n, 0] == 0:
             for i in range(3):
@@ -191,7 +229,10 @@ def _zero_culled(first, end, width, radii, v_means, v_dc, v_rest):
 
 
 @scalar
-def _chunk_vjp(first, end, means, sh_dc, sh_rest, width, centre, degree, c, radii, v_colors, out, v_rest, v_offset):
+def _chunk_vjp(first, end, shaded, harmonics, radii, v_colors, v, v_offset):
+    means, sh_dc, sh_rest, width = shaded
+    centre, degree, c = harmonics
+    v_means, v_dc, v_rest, _ = v
     staged = np.empty(STAGE * WIDTH, means.dtype)
     y = np.empty(N_BASES * WIDTH, means.dtype)
     rest = np.zeros(max(width, WIDTH) * WIDTH, means.dtype)  # beyond the active degree the gradient is zero
@@ -199,7 +240,7 @@ def _chunk_vjp(first, end, means, sh_dc, sh_rest, width, centre, degree, c, radi
     count = list_visible(radii, first, end, visible)
     n_rest = (degree + 1) * (degree + 1) - 1
     v_offset[:] = ZERO
-    _zero_culled(first, end, width, radii, out.means, out.sh_dc, v_rest)
+    _zero_culled(first, end, radii, v)
     for i in range(0, count, WIDTH):
         rows = listed_rows(visible, i)
         dx, dy, dz, inverse = _direction(centre, means, rows)
@@ -224,9 +265,9 @@ def _chunk_vjp(first, end, means, sh_dc, sh_rest, width, centre, degree, c, radi
         v_red = select(red > ZERO, gather(v_colors, rows, 0), ZERO)
         v_green = select(green > ZERO, gather(v_colors, rows, 1), ZERO)
         v_blue = select(blue > ZERO, gather(v_colors, rows, 2), ZERO)
-        scatter(out.sh_dc, rows, 0, c[0] * v_red)
-        scatter(out.sh_dc, rows, 1, c[0] * v_green)
-        scatter(out.sh_dc, rows, 2, c[0] * v_blue)
+        scatter(v_dc, rows, 0, c[0] * v_red)
+        scatter(v_dc, rows, 1, c[0] * v_green)
+        scatter(v_dc, rows, 2, c[0] * v_blue)
         for k in range(n_rest):
             _rest_vjp(k, v_red, v_green, v_blue, y, rest)
         for column in range(0, width, WIDTH):
@@ -241,12 +282,12 @@ def _chunk_vjp(first, end, means, sh_dc, sh_rest, width, centre, degree, c, radi
         if degree >= 2:
             v_d = _added(v_d, basis_2_vjp(dx, dy, dz, c, (*_triple_at(y, 3), _at(y, 6), _at(y, 7))))
         if degree >= 3:
-            v = (*_triple_at(y, 8), *_triple_at(y, 11), _at(y, 14))
-            v_d = _added(v_d, basis_3_vjp(dx, dy, dz, c, v))
+            v_basis = (*_triple_at(y, 8), *_triple_at(y, 11), _at(y, 14))
+            v_d = _added(v_d, basis_3_vjp(dx, dy, dz, c, v_basis))
         v_x, v_y, v_z = direction_vjp(dx, dy, dz, inverse, v_d[0], v_d[1], v_d[2])
-        scatter(out.means, rows, 0, v_x)
-        scatter(out.means, rows, 1, v_y)
-        scatter(out.means, rows, 2, v_z)
+        scatter(v_means, rows, 0, v_x)
+        scatter(v_means, rows, 1, v_y)
+        scatter(v_means, rows, 2, v_z)
         is_counted = counted(means.dtype.type(0)) < count - i
         add(v_offset, 0, is_counted, converted(v_x, DOUBLE))
         add(v_offset, 1, is_counted, converted(v_y, DOUBLE))
@@ -254,13 +295,18 @@ def _chunk_vjp(first, end, means, sh_dc, sh_rest, width, centre, degree, c, radi
 
 
 @kernel()
-def _sh_colors_vjp(means, sh_dc, sh_rest, width, centre, degree, c, radii, v_colors, out, v_rest):
-    n_gaussians = means.shape[0]
+def _sh_colors_vjp(
+    shaded,  # Shaded
+    harmonics,  # Harmonics
+    radii,  # [N, 2]
+    v_colors,  # [N, 3]
+    v,  # Shaded
+):
+    n_gaussians = radii.shape[0]
     v_offsets = np.empty((N_CHUNKS, 3 * WIDTH), np.float64)
     for chunk in prange(N_CHUNKS):
         first, end = n_gaussians * chunk // N_CHUNKS, n_gaussians * (chunk + 1) // N_CHUNKS
-        v_offset = v_offsets[chunk]
-        _chunk_vjp(first, end, means, sh_dc, sh_rest, width, centre, degree, c, radii, v_colors, out, v_rest, v_offset)
+        _chunk_vjp(first, end, shaded, harmonics, radii, v_colors, v, v_offsets[chunk])
     return total_of(v_offsets)
 
 
@@ -276,20 +322,10 @@ def sh_colors_vjp(
         np.empty((3, 3), dtype),
         np.empty(3, dtype),
     )
-    constants = np.array(_CONSTANTS, dtype)
-    v_offset = _sh_colors_vjp(
-        means,
-        sh_dc,
-        sh_rest.ravel(),
-        3 * sh_rest.shape[1],
-        camera_centre(camera),
-        degree,
-        constants,
-        radii,
-        v_colors,
-        out,
-        out.sh_rest.reshape(-1),
-    )
+    width = 3 * sh_rest.shape[1]
+    shaded = Shaded(means, sh_dc, sh_rest.ravel(), width)
+    v_shaded = Shaded(out.means, out.sh_dc, out.sh_rest.reshape(-1), width)
+    v_offset = _sh_colors_vjp(shaded, _harmonics(camera, degree, dtype), radii, v_colors, v_shaded)
     # The sum over the Gaussians of the gradient by their offset, mean - centre, with centre = -R^T t.
     out.cam_from_world_R[:] = np.outer(camera.cam_from_world_t, v_offset)
     out.cam_from_world_t[:] = camera.cam_from_world_R @ v_offset

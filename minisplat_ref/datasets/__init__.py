@@ -1,1 +1,1 @@
-"""Programs that make and prepare scenes: synthetic scenes, structure from motion, undistortion, downscaling."""
+"""Making and preparing scenes: ray-traced ones with exact truth, structure from motion, undistortion, downscaling."""

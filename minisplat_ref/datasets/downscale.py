@@ -1,17 +1,13 @@
-"""``minisplat-ref downscale SCENE --factor D``: write ``SCENE/images_D``, the images at one D-th of their size.
+"""Write the images of a scene at one D-th of their size into the folder ``images_D`` beside them.
 
 Loading a scene with ``downscale=D`` uses that folder, and resizes on the fly without it: this only saves time. Sizes
 are rounded; colours pass through the same LANCZOS filter as on the fly.
 """
 
-import argparse
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 from tqdm import tqdm
 
-from minisplat_ref.datasets.command import run_command
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.images import IMAGE_SUFFIXES, downscaled_size, read_image, resize_image, write_image
@@ -58,23 +54,3 @@ def downscale_images(images: Path, factor: int) -> Path:
             small.parent.mkdir(parents=True, exist_ok=True)
             write_image(small, resize_image(image, *downscaled_size(image.shape[1], image.shape[0], factor)))
     return target
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line."""
-    parser = argparse.ArgumentParser(
-        prog="minisplat-ref downscale",
-        description="Write the images of a scene at 1/D of their size.",
-    )
-    parser.add_argument("scene", metavar="SCENE", type=Path, help="scene with images/, or a folder of images")
-    parser.add_argument("--factor", metavar="D", type=int, default=2, help="divide sizes by this (default: 2)")
-
-    def action(options: argparse.Namespace) -> None:
-        images = options.scene / "images"
-        print(downscale_images(images if images.is_dir() else options.scene, options.factor))
-
-    return run_command(parser, action, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

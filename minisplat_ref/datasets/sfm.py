@@ -1,13 +1,11 @@
-"""``minisplat-ref sfm PHOTOS --out SCENE``: cameras and sparse points from a folder of photographs, on the CPU.
+"""Estimate cameras and sparse points from a folder of photographs, on the CPU: structure from motion by pycolmap.
 
-Structure from motion by pycolmap: photographs are turned upright (EXIF) and shrunk, SIFT features are found and
-matched, cameras and points estimated one image after the other (incremental mapping), and the result is undistorted.
-What is left is a COLMAP scene with pinhole cameras: ``images/`` and ``sparse/0/``. Photographs that found no place are
-named and left out. The focal length in the EXIF data is COLMAP's first guess; place and time are not copied.
+Photographs are turned upright (EXIF) and shrunk, SIFT features are found and matched, cameras and points are estimated
+one image after the other (incremental mapping), and the result is undistorted. What is left is a COLMAP scene with
+pinhole cameras: ``images/`` and ``sparse/0/``. Photographs that found no place are named and left out. The focal length
+in the EXIF data is COLMAP's first guess; place and time are not copied.
 """
 
-import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,15 +14,13 @@ from typing import Any, NamedTuple
 from PIL import ExifTags, Image, ImageOps
 from tqdm import tqdm
 
-from minisplat_ref.datasets.command import import_quiet_pycolmap, run_command
 from minisplat_ref.datasets.downscale import list_images
 from minisplat_ref.datasets.undistort import undistort_model
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.images import SAVE_OPTIONS, open_image
+from minisplat_ref.io.lens import import_quiet_pycolmap
 
-CAMERA_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")
-MATCHINGS = ("exhaustive", "sequential")
 CAMERA_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model)
 FOCAL_TAGS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
 SEED = 0  # of RANSAC: the same photographs give the same cameras, up to the order in which threads finish
@@ -138,37 +134,3 @@ def _reconstruct(work: Path, sizes: dict[str, tuple[int, int]], matching: str, c
             f"{photos}: no two photographs could be placed; take them with more overlap, of something with texture"
         )
     return max(models.values(), key=lambda model: model.num_reg_images())
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line."""
-    parser = argparse.ArgumentParser(
-        prog="minisplat-ref sfm",
-        description="Estimate cameras and sparse points of photographs with COLMAP, on the CPU.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    parser.add_argument("photos", metavar="PHOTOS", type=Path, help="folder of photographs")
-    parser.add_argument("--out", metavar="SCENE", type=Path, required=True, help="folder to make")
-    parser.add_argument("--long-side", metavar="PX", type=int, default=1600, help="shrink photographs to this")
-    parser.add_argument("--matching", choices=MATCHINGS, default=MATCHINGS[0], help="sequential is for videos")
-    parser.add_argument("--camera-model", choices=CAMERA_MODELS, default=CAMERA_MODELS[0], help="lens to estimate")
-
-    def action(options: argparse.Namespace) -> None:
-        result = run_sfm(
-            options.photos,
-            options.out,
-            long_side=options.long_side,
-            matching=options.matching,
-            camera_model=options.camera_model,
-        )
-        n_placed = result.n_photos - len(result.left_out)
-        counts = f"{n_placed} of {result.n_photos} photographs, {result.n_points} points"
-        print(f"{options.out}: {counts}, reprojection error {result.error:.2f} px")
-        if result.left_out:
-            print(f"without a place: {', '.join(result.left_out)}")
-
-    return run_command(parser, action, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,14 +1,12 @@
-"""``minisplat-ref undistort SCENE --out DIR``: a copy of a scene whose images have no lens distortion.
+"""Copy a scene, its photographs warped so that they have no lens distortion.
 
 Every photograph is warped to the pinhole that COLMAP chooses for its lens (same focal length, no blank pixels). A
 COLMAP scene keeps its points and 2D features, a transforms.json scene its poses and points; masks are warped along, and
 an alpha channel is composited onto black in the latter, where it is no mask.
 """
 
-import argparse
 import json
 import shutil
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,11 +15,11 @@ from typing import Any
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from minisplat_ref.datasets.command import import_quiet_pycolmap, run_command
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.colmap import colmap_photos, find_model, read_model
 from minisplat_ref.io.images import SAVE_OPTIONS, write_image
+from minisplat_ref.io.lens import import_quiet_pycolmap
 from minisplat_ref.io.scene import Photo, build_reading, check_photo, read_view
 from minisplat_ref.io.transforms import existing_frames, find_points, find_transforms, read_transforms
 from minisplat_ref.types import Camera
@@ -134,23 +132,3 @@ def _check_distorted(source: Path, photos: Sequence[Photo]) -> None:
         check_photo(photo, source, undistort=True)
     if all(photo.lens is None for photo in photos):
         raise InputError(f"{source}: all cameras are pinholes already, nothing to undistort; use the scene as it is")
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line."""
-    parser = argparse.ArgumentParser(
-        prog="minisplat-ref undistort",
-        description="Copy a COLMAP or transforms.json scene, its images warped to pinhole cameras.",
-    )
-    parser.add_argument("scene", metavar="SCENE", type=Path, help="folder of the scene, or a transforms.json")
-    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to make")
-
-    def action(options: argparse.Namespace) -> None:
-        undistort_scene(options.scene, options.out)
-        print(options.out)
-
-    return run_command(parser, action, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,1 +1,18 @@
-"""Trainings with everything around them: runs and their folders, comparisons, studies, and the reports of all."""
+"""Trainings with everything around them: a run and its folder, comparisons, studies, and the reports of all.
+
+A run and its folder: what ``train`` does
+    :mod:`.settings` (what was asked for, ``config.json``), :mod:`.run_folder` (which file is called what), :mod:`.run`
+    (the training, with checkpoints), :mod:`.progress` (bar and ``log.jsonl``), :mod:`.curve` (``curve.jsonl``),
+    :mod:`.scoring` (``metrics.json`` and ``renders/``), :mod:`.first_use` (compiles the kernels ahead).
+
+More than one run
+    :mod:`.comparison` (several recipes side by side: ``compare``), :mod:`.studies` (what a choice in a method does:
+    ``study``), :mod:`.measure` (the README's runs: ``python -m data_tools.measure``).
+
+The report kit
+    :mod:`.page` (a page of HTML, from cards, tables, panels), :mod:`.plots` (curves as SVG and PNG), :mod:`.pictures`
+    (renders, errors and depths for the eye); :mod:`minisplat_ref.reporting` has tables in Markdown and the machine.
+    Two reports are made of it: :mod:`.demo_report` and :mod:`.comparison.report`.
+
+:mod:`.arguments` is what the command line's parsers share.
+"""

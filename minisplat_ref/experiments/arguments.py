@@ -1,15 +1,24 @@
-"""What the commands' arguments share: the look of the help, and the types of values."""
+"""What the commands' arguments share: the look of help and errors, and the types of values."""
 
 import argparse
 import shutil
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NoReturn
 
 from minisplat_ref.constants import GSPLAT_MAIN, PROFILES
 
 Commands = argparse._SubParsersAction
 
 BACKENDS = ("cpu", "cpu-exact", "reference")  # keys of backends.BACKENDS, which would load Numba
+SYNTHETIC_SCENES = ("room", "plain-wall", "glossy", "outdoor")  # datasets.synthetic.SCENE_NAMES, which would load NumPy
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose errors are one line, like those of bad input."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print one line to stderr and exit with code 2."""
+        self.exit(2, f"minisplat-ref: error: {message} (see: {self.prog} --help)\n")
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):
@@ -44,6 +53,17 @@ def name(text: str) -> str:
 def listed(parse: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
     """Return the type of values between commas."""
     return lambda text: tuple(parse(part.strip()) for part in text.split(","))
+
+
+def fraction(text: str) -> float:
+    """Parse a number above 0 and at most 1."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value <= 1.0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0 and at most 1")
+    return value
 
 
 def assignment(text: str) -> tuple[str, str]:

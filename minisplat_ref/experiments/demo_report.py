@@ -1,23 +1,66 @@
-"""What the demo's report says: pictures of held-out views, key figures, what was run, what to try next."""
+"""The demo's ``report.html``: pictures of held-out views, depth beside the true depth, curves, and what to try next."""
 
 import os
 import platform
 import shutil
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from minisplat_ref import __version__
 from minisplat_ref.datasets.synthetic import SyntheticScene
 from minisplat_ref.experiments import run_folder
-from minisplat_ref.experiments.pictures import error_picture, expected_depth, to_picture
+from minisplat_ref.experiments.page import captioned, cards, code, curves, page, panel, paragraph, section, table
+from minisplat_ref.experiments.pictures import (
+    Picture,
+    colored,
+    depth_picture,
+    depth_range,
+    error_picture,
+    to_picture,
+)
+from minisplat_ref.experiments.plots import plot, to_svg
 from minisplat_ref.experiments.progress import read_log
-from minisplat_ref.experiments.report import Report, ViewPictures
 from minisplat_ref.experiments.run import Outcome
 from minisplat_ref.experiments.scoring import load_trained
 from minisplat_ref.experiments.settings import Settings
-from minisplat_ref.types import Scene
+from minisplat_ref.reference.depth import expected_depth
+from minisplat_ref.types import Floats, Scene
 
 N_SHOWN = 3  # test views
+DEPTH_ERROR_RANGE = 0.1  # of the true depth: larger differences are all shown as the brightest colour
+
+VIEWS_TEXT = """\
+The training never saw these views. Error is the mean absolute difference of the three channels:
+dark is none, bright is a quarter of the range or more."""
+DEPTH_TEXT = """\
+Nothing taught the Gaussians depth. Here is the distance that they came to, next to the exact one
+of the ray tracer. Near is bright; the third picture is the difference relative to the true depth."""
+CURVES_TEXT = """\
+Where the number of Gaussians jumps, those with a large gradient were cloned or split: the loss
+jumps with it, and recovers."""
+
+
+class ViewPictures(NamedTuple):
+    """One held-out view of the report."""
+
+    name: str
+    """Name of the view."""
+    caption: str
+    """What was measured on it."""
+    truth: Picture
+    """[H, W, 3] photograph, sRGB."""
+    render: Picture
+    """[H, W, 3] render, sRGB."""
+    error: Picture
+    """[H, W, 3] picture of the difference."""
+    true_depth: Floats
+    """[H, W] exact camera z, world units; 0 where the view sees nothing."""
+    depth: Floats
+    """[H, W] rendered camera z, world units; 0 where nothing was hit."""
 
 
 def view_pictures(folder: Path, synthetic: SyntheticScene, scene: Scene, outcome: Outcome) -> list[ViewPictures]:
@@ -35,21 +78,21 @@ def view_pictures(folder: Path, synthetic: SyntheticScene, scene: Scene, outcome
                 render=image,
                 error=error_picture(view.image, image),
                 true_depth=true_depths[view.name],
-                depth=expected_depth(output),
+                depth=expected_depth(output.image[..., 3], output.alpha),
             )
         )
     return pictures
 
 
-def demo_report(
+def report_html(
     folder: Path,
     scene: Scene,
     settings: Settings,
     outcome: Outcome,
     pictures: list[ViewPictures],
     total_seconds: float,
-) -> Report:
-    """Return what the page says about the run."""
+) -> str:
+    """Return the page as text of one self-contained HTML file."""
     log = read_log(folder / run_folder.LOG)
     metrics = run_folder.read_json_object(folder / run_folder.METRICS)
     evaluation, n_gaussians = outcome.evaluation, metrics["n_gaussians"]
@@ -60,7 +103,7 @@ def demo_report(
         f" From the {n_train}, their cameras and {n_points:,} points on the surfaces, {n_gaussians:,} Gaussians were"
         " trained. Everything ran on the CPU."
     )
-    figures = [
+    key_figures = [
         (f"{evaluation.psnr:.2f} dB", f"PSNR, mean of {n_test} held-out views"),
         (f"{evaluation.ssim:.3f}", "SSIM, mean of the same"),
         (f"{n_gaussians:,}", f"Gaussians, from {n_points:,} points"),
@@ -80,15 +123,65 @@ def demo_report(
         ("Program", f"minisplat_ref {__version__}, Python {platform.python_version()}, {platform.system()}"),
         ("Files", f"{folder.resolve()}: Gaussians, measures, log, checkpoint, pictures"),
     ]
-    title = "A room, rebuilt from photographs"
-    return Report(title, introduction, figures, pictures, log, rows, _next_steps(folder, metrics["iterations"]))
+    steps = [
+        part
+        for text, command in _next_steps(folder, metrics["iterations"])
+        for part in (paragraph(text), code(command))
+    ]
+    sections = [
+        cards(key_figures),
+        section("Held-out views", paragraph(VIEWS_TEXT), *map(_color_panel, pictures)),
+        section("Depth", paragraph(DEPTH_TEXT), *map(_depth_panel, pictures)),
+        section("How the training went", paragraph(CURVES_TEXT), curves(_curves(log))),
+        section("What was run", table(rows)),
+        section("What to try next", *steps),
+    ]
+    return page("A room, rebuilt from photographs", introduction, sections)
+
+
+def _color_panel(view: ViewPictures) -> str:
+    pictures = [
+        captioned(view.truth, "truth"),
+        captioned(view.render, "render"),
+        captioned(view.error, "error"),
+    ]
+    return panel(f"{view.name}: {view.caption}", pictures)
+
+
+def _depth_panel(view: ViewPictures) -> str:
+    near, far = depth_range(view.true_depth)
+    is_seen = view.true_depth > 0  # [H, W]
+    relative = np.abs(view.depth - view.true_depth) / np.where(is_seen, view.true_depth, 1.0) * is_seen  # [H, W]
+    median = float(np.median(relative[is_seen])) if is_seen.any() else 0.0
+    pictures = [
+        captioned(depth_picture(view.true_depth, near, far), f"true depth, {near:.2f} to {far:.2f} units"),
+        captioned(depth_picture(view.depth, near, far), "rendered depth, same colours"),
+        captioned(colored(relative, 0.0, DEPTH_ERROR_RANGE, "magma"), "relative difference, 0 to 10 % or more"),
+    ]
+    return panel(f"{view.name}: median difference {100 * median:.1f} %", pictures)
+
+
+def _curves(log: Sequence[Mapping[str, Any]]) -> list[str]:
+    """SVG of loss, PSNR and number of Gaussians over the steps."""
+    steps = [record["step"] for record in log]
+    kinds = (
+        ("loss", "loss", "#b4553d"),
+        ("psnr", "PSNR of training views (dB)", "#2d6a8e"),
+        ("n_gaussians", "Gaussians", "#4b7f52"),
+    )
+    return [_curve(steps, [record[key] for record in log], title, color) for key, title, color in kinds]
+
+
+def _curve(steps: Sequence[int], values: Sequence[float], title: str, color: str) -> str:
+    with plot(title, "step") as (figure, axes):
+        axes.plot(steps, values, color=color, linewidth=1.8)
+    return to_svg(figure)
 
 
 def _next_steps(folder: Path, n_iterations: int) -> list[tuple[str, str]]:
     """Return sentences with the command to copy, which runs from the folder in which the demo was started."""
     is_installed = shutil.which("minisplat-ref") is not None  # otherwise the environment has not been activated
-    python = "python" if is_installed else os.path.relpath(sys.executable)
-    program = "minisplat-ref" if is_installed else f"{python} -m minisplat_ref"
+    program = "minisplat-ref" if is_installed else f"{os.path.relpath(sys.executable)} -m minisplat_ref"
     return [
         ("Walk around the room:", f"{program} render {folder} --cameras orbit --depth"),
         ("Train on, for a few minutes more:", f"{program} train --resume {folder} --iterations {2 * n_iterations}"),
@@ -98,6 +191,6 @@ def _next_steps(folder: Path, n_iterations: int) -> list[tuple[str, str]]:
         ),
         (
             "Train on your own photographs; the first command finds out where they were taken from:",
-            f"{python} -m minisplat-ref sfm PHOTOS --out SCENE\n{program} train SCENE --out runs/mine",
+            f"{program} sfm PHOTOS --out SCENE\n{program} train SCENE --out runs/mine",
         ),
     ]

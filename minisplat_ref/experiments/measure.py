@@ -8,7 +8,6 @@ stays the same. Times depend on the machine; compare figures of one run only. St
 
 import argparse
 import json
-import platform
 import subprocess
 import sys
 import time
@@ -18,6 +17,7 @@ import numpy as np
 
 from minisplat_ref.io import load_scene
 from minisplat_ref.methods import get_recipe
+from minisplat_ref.reporting import describe_machine, markdown_table
 from minisplat_ref.training.loop import train
 
 WARM_UP = 20  # iterations that compile and are not timed
@@ -33,12 +33,19 @@ def measure_scenes(scenes: list[Path], out: Path, recipe: str, iterations: int) 
         metrics = json.loads((folder / "metrics.json").read_text())
         rate = metrics["iterations"] / metrics["train_seconds"]
         rows.append(
-            f"| {scene.name} | {metrics['psnr']:.2f} | {metrics['ssim']:.3f} | {metrics['n_gaussians']:,} "
-            f"| {metrics['train_seconds']:.0f} | {rate:.1f} | {metrics['peak_rss_mb']:.0f} |"
+            [
+                scene.name,
+                f"{metrics['psnr']:.2f}",
+                f"{metrics['ssim']:.3f}",
+                f"{metrics['n_gaussians']:,}",
+                f"{metrics['train_seconds']:.0f}",
+                f"{rate:.1f}",
+                f"{metrics['peak_rss_mb']:.0f}",
+            ]
         )
-    print(f"\n{recipe}, {iterations} iterations, seed 0, full size; {machine()}\n")
-    print("| scene | PSNR (dB) | SSIM | Gaussians | seconds | iterations/s | peak memory (MB) |")
-    print("|---|---|---|---|---|---|---|", *rows, sep="\n")
+    print(f"\n{recipe}, {iterations} iterations, seed 0, full size; {describe_machine()}\n")
+    heading = ("scene", "PSNR (dB)", "SSIM", "Gaussians", "seconds", "iterations/s", "peak memory (MB)")
+    print(markdown_table(heading, rows))
 
 
 def measure_rate(scene_folder: Path, n: int, iterations: int) -> None:
@@ -51,21 +58,10 @@ def measure_rate(scene_folder: Path, n: int, iterations: int) -> None:
     train(scene, recipe, seed=0, on_step=lambda _: times.append(time.perf_counter()))
     seconds = np.diff(times[WARM_UP - 1 :])
     camera = scene.train_views[0].camera
-    print(f"{scene.name}, {camera.width} x {camera.height}, {n} Gaussians, {iterations} iterations; {machine()}")
-    print(f"{iterations / seconds.sum():.1f} iterations/s, median {1e3 * np.median(seconds):.1f} ms")
-
-
-def machine() -> str:
-    """Return what the figures depend on: processor, threads, versions."""
-    import numba
-
-    cpu_info = Path("/proc/cpuinfo")
-    lines = cpu_info.read_text().splitlines() if cpu_info.exists() else []
-    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    processor = models[0] if models else platform.processor()
-    return (
-        f"{processor}, {numba.get_num_threads()} threads, Python {platform.python_version()}, Numba {numba.__version__}"
+    print(
+        f"{scene.name}, {camera.width} x {camera.height}, {n} Gaussians, {iterations} iterations; {describe_machine()}"
     )
+    print(f"{iterations / seconds.sum():.1f} iterations/s, median {1e3 * np.median(seconds):.1f} ms")
 
 
 def main() -> None:
@@ -86,7 +82,3 @@ def main() -> None:
         measure_rate(arguments.scene, arguments.gaussians, arguments.iterations)
     else:
         measure_scenes(arguments.scene, arguments.out, arguments.recipe, arguments.iterations)
-
-
-if __name__ == "__main__":
-    main()

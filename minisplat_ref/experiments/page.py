@@ -1,4 +1,4 @@
-"""The look of the reports: one HTML file with pictures, curves and tables, and nothing that it loads from elsewhere.
+"""The look of a report: one HTML file with pictures, curves and tables, and nothing that it loads from elsewhere.
 
 Pictures are PNG in base64, curves are inline SVG (:mod:`minisplat_ref.experiments.plots`), the style sheet is in the
 page.
@@ -46,7 +46,7 @@ code, pre { font-family: ui-monospace, "DejaVu Sans Mono", monospace }
 """
 
 
-def page(title: str, introduction: str, body: str) -> str:
+def page(title: str, introduction: str, parts: Iterable[str]) -> str:
     """Return a self-contained HTML file.
 
     Parameters
@@ -55,9 +55,10 @@ def page(title: str, introduction: str, body: str) -> str:
         Heading, and name of the browser's tab.
     introduction : str
         One or two sentences under it.
-    body : str
-        HTML: what the functions below return, and headings and paragraphs between.
+    parts : iterable of str
+        HTML: what the functions below return.
     """
+    newline = "\n"  # an expression in an f-string holds no backslash before Python 3.12
     return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
@@ -70,11 +71,26 @@ def page(title: str, introduction: str, body: str) -> str:
 <main>
 <h1>{escape(title)}</h1>
 <p>{escape(introduction)}</p>
-{body}
+{newline.join(parts)}
 </main>
 </body>
 </html>
 """
+
+
+def section(heading: str, *parts: str) -> str:
+    """Return parts of a page under a heading."""
+    return "\n".join([f"<h2>{escape(heading)}</h2>", *parts])
+
+
+def paragraph(text: str) -> str:
+    """Return sentences."""
+    return f"<p>{escape(text)}</p>"
+
+
+def code(text: str) -> str:
+    """Return lines to be copied."""
+    return f"<pre>{escape(text)}</pre>"
 
 
 def cards(figures: Iterable[tuple[str, str]]) -> str:
@@ -102,6 +118,11 @@ def panel(label: str, figures: Sequence[str], n_columns: int = 3) -> str:
         f'<div class="panel"><div class="label">{escape(label)}</div>'
         f'<div class="row" style="--columns: {n_columns}">{"".join(figures)}</div></div>'
     )
+
+
+def curves(svgs: Sequence[str]) -> str:
+    """Return curves side by side."""
+    return f'<div class="panel row" style="--columns: {len(svgs)}">{"".join(svgs)}</div>'
 
 
 def captioned(picture: Picture, caption: str) -> str:

@@ -3,8 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from minisplat_ref.constants import DEPTH_ALPHA_MIN
-from minisplat_ref.types import Floats, RenderOutput
+from minisplat_ref.types import Floats
 
 Picture = NDArray[np.uint8]  # [H, W, 3] sRGB
 
@@ -21,12 +20,6 @@ def error_picture(truth: Picture, render: Picture) -> Picture:
     """Colour the mean absolute difference of the three channels: dark is none, bright is ERROR_RANGE or more."""
     difference = np.abs(truth.astype(np.float32) - render.astype(np.float32)).mean(axis=2) / 255.0  # [H, W]
     return colored(difference, 0.0, ERROR_RANGE, "magma")
-
-
-def expected_depth(output: RenderOutput) -> Floats:
-    """Return the mean depth [H, W] of what a view rendered with depth has hit, camera z; 0 where it has hit nothing."""
-    depth: Floats = output.image[..., 3] / np.maximum(output.alpha, DEPTH_ALPHA_MIN)
-    return depth
 
 
 def depth_picture(depth: Floats, near: float, far: float) -> Picture:

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from minisplat_ref.io.atomic import replacing
 
 TITLE_COLOR = "#4a5560"
+GRID_COLOR = "#e6eaee"
 PNG_DPI = 150
 PLOT_STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # text stays text: smaller, and in the page's own font
@@ -24,7 +25,7 @@ PLOT_STYLE: dict[Any, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
-    "grid.color": "#e6eaee",
+    "grid.color": GRID_COLOR,
     "xtick.color": "#6a7580",
     "ytick.color": "#6a7580",
 }

@@ -44,6 +44,13 @@ def import_pycolmap() -> ModuleType:
     return pycolmap
 
 
+def import_quiet_pycolmap() -> ModuleType:
+    """Import pycolmap and switch off its log: what goes wrong comes as an exception or an empty result."""
+    pycolmap = import_pycolmap()
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL
+    return pycolmap
+
+
 def undistort(
     image: NDArray[np.uint8], mask: Bools | None, camera: Camera, lens: Lens
 ) -> tuple[NDArray[np.uint8], Bools | None, Camera]:

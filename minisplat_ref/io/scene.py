@@ -169,7 +169,7 @@ def check_photo(photo: Photo, source: Path, undistort: bool) -> None:
 
 def camera_extent(cameras: Sequence[Camera]) -> float:
     """1.1 x the largest distance of a camera centre from the mean centre, world units."""
-    centers = np.stack([-camera.cam_from_world_R.T @ camera.cam_from_world_t for camera in cameras])  # [V, 3]
+    centers = np.stack([camera.center for camera in cameras])  # [V, 3]
     return EXTENT_MARGIN * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
 
 

@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.io.scene import ROTATION_TOLERANCE
 from minisplat_ref.types import Camera, Floats, Scene
 
 ORBIT_FOV = math.radians(50.0)  # horizontal, of an orbit that has no run's cameras to take it from
 ORBIT_ELEVATION = math.radians(20.0)  # likewise
-ROTATION_TOLERANCE = 1e-3  # of R R^T against the identity: files hold six digits or more
 
 
 class Viewpoint(NamedTuple):
@@ -49,7 +49,7 @@ def to_json(viewpoints: Sequence[Viewpoint]) -> list[dict[str, Any]]:
             "split": split,
             "width": camera.width,
             "height": camera.height,
-            "position": (-camera.cam_from_world_R.T @ camera.cam_from_world_t).tolist(),
+            "position": camera.center.tolist(),
             "rotation": camera.cam_from_world_R.T.tolist(),
             "fx": camera.fx,
             "fy": camera.fy,
@@ -99,7 +99,7 @@ def _viewpoint(entry: Any, where: str) -> Viewpoint:
         raise InputError(f"{where}: position must be 3 and rotation 3 x 3 finite numbers, like fx, fy, cx, cy, time")
     if min(width, height) < 1 or min(fx, fy) <= 0:
         raise InputError(f"{where}: width, height, fx, fy must be positive")
-    is_rotation = np.abs(rotation @ rotation.T - np.eye(3)).max() < ROTATION_TOLERANCE and np.linalg.det(rotation) > 0
+    is_rotation = np.abs(rotation @ rotation.T - np.eye(3)).max() <= ROTATION_TOLERANCE and np.linalg.det(rotation) > 0
     if not is_rotation:
         raise InputError(f"{where}: rotation is not a rotation matrix")
     camera = Camera(rotation.T.copy(), -rotation.T @ position, fx, fy, cx, cy, width, height)
@@ -160,7 +160,7 @@ class _Ring(NamedTuple):
 
 def _ring_of_cameras(cameras: Sequence[Camera], width: int) -> _Ring:
     rotations = np.array([camera.cam_from_world_R for camera in cameras])  # [V, 3, 3]
-    centres = np.array([-camera.cam_from_world_R.T @ camera.cam_from_world_t for camera in cameras])  # [V, 3]
+    centres = np.array([camera.center for camera in cameras])  # [V, 3]
     # The point nearest to all optical axes d: sum (I - d d^T)(x - c) = 0; the damping keeps parallel axes solvable.
     across = np.eye(3) - rotations[:, 2, :, None] * rotations[:, 2, None, :]  # [V, 3, 3]
     damping = 1e-3 * len(cameras) * np.eye(3)

@@ -88,6 +88,12 @@ def store(array: Any, i: Any, lanes: Any) -> None:
     array[i : i + max(numbers.size, WIDTH)] = numbers
 
 
+def accumulate(array: Any, i: Any, lanes: Any) -> None:
+    """Add lanes, or a tuple of lanes one after the other, to the numbers of a 1-d array from ``i`` on."""
+    for k, one in enumerate(lanes if isinstance(lanes, tuple) else (lanes,)):
+        array[i + k * WIDTH : i + (k + 1) * WIDTH] += one
+
+
 def gather(table: Any, rows: Any, column: Any) -> Any:
     """Return one number from each of eight rows of a table [N, ...]; further dimensions count as flat."""
     return table.reshape(len(table), -1)[list(rows), column]
@@ -102,9 +108,9 @@ def scatter(table: Any, rows: Any, column: Any, lanes: Any) -> None:
     table.reshape(len(table), -1)[np.ix_(rows, columns)] = np.reshape(lanes, (len(columns), WIDTH)).T
 
 
-def columns_of(a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
-    """Return the columns of the square whose rows are eight lanes: the first number of each, the second, and so on."""
-    return tuple(np.array([a, b, c, d, e, f, g, h]).T)
+def columns_of(rows: Any) -> Any:
+    """Return the columns of the square whose rows are a tuple of eight lanes: the first number of each, and so on."""
+    return tuple(np.array(rows).T)
 
 
 def converted(lanes: Any, zero: Any) -> Any:
@@ -119,9 +125,9 @@ def sum_of(lanes: Any) -> Any:
     return lanes[0]
 
 
-def sums_of(a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
-    """Return the sums of eight lanes as lanes: what eight times ``sum_of`` gives, for half of the instructions."""
-    return np.array([sum_of(lanes) for lanes in (a, b, c, d, e, f, g, h)])
+def sums_of(rows: Any) -> Any:
+    """Return the sums of a tuple of eight lanes as lanes: eight times ``sum_of``, for half of the instructions."""
+    return np.array([sum_of(lanes) for lanes in rows])
 
 
 def largest_of(lanes: Any) -> Any:

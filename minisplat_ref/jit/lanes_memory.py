@@ -9,6 +9,7 @@ from numba.core import cgutils
 
 from minisplat_ref.jit.lanes import (
     WIDTH,
+    accumulate,
     any_of,
     bits_between,
     columns_of,
@@ -56,22 +57,28 @@ def _load(typing: Any, array: Any, i: Any) -> Any:
     return LanesType(array.dtype)(array, i), generate
 
 
-@compiled(store)
-def _store(typing: Any, array: Any, i: Any, lanes: Any) -> Any:
+def _written(typing: Any, array: Any, i: Any, lanes: Any, is_added: bool) -> Any:
+    """Typing of a function that writes lanes, or a tuple of them, to an array, or adds them to it."""
     kind = LanesType(array.dtype)
     kinds = list(lanes) if isinstance(lanes, types.BaseTuple) else [lanes]
     if any(joined(kind, one) is None for one in kinds):
         return None
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        first = _pointer(context, builder, signature, args)
+        first, align = _pointer(context, builder, signature, args), array.dtype.bitwidth // 8
         for k, of_one in enumerate(kinds):
             one = builder.extract_value(args[2], k) if isinstance(lanes, types.BaseTuple) else args[2]
-            value = spread(context, builder, one, of_one, kind)
-            builder.store(value, builder.gep(first, [I32(k)]), align=array.dtype.bitwidth // 8)
+            value, place = spread(context, builder, one, of_one, kind), builder.gep(first, [I32(k)])
+            if is_added:
+                value = builder.fadd(builder.load(place, align=align), value, flags=["contract"])
+            builder.store(value, place, align=align)
         return context.get_dummy_value()
 
     return types.void(array, i, lanes), generate
+
+
+compiled(store)(lambda typing, array, i, lanes: _written(typing, array, i, lanes, is_added=False))
+compiled(accumulate)(lambda typing, array, i, lanes: _written(typing, array, i, lanes, is_added=True))
 
 
 def _row_pointers(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
@@ -157,13 +164,11 @@ def _turned(builder: Any, rows: list[Any]) -> list[Any]:
 
 
 @compiled(columns_of)
-def _columns_of(typing: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
-    result = types.UniTuple(a, WIDTH)
-
+def _columns_of(typing: Any, rows: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return context.make_tuple(builder, result, _turned(builder, args))
+        return context.make_tuple(builder, rows, _turned(builder, cgutils.unpack_tuple(builder, args[0])))
 
-    return result(a, b, c, d, e, f, g, h), generate
+    return rows(rows), generate
 
 
 def _register_reduction(function: Callable, emit: Callable) -> None:
@@ -182,9 +187,9 @@ def _register_reduction(function: Callable, emit: Callable) -> None:
 
 
 @compiled(sums_of)
-def _sums_of(typing: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
+def _sums_of(typing: Any, rows: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        vectors, width = list(args), WIDTH
+        vectors, width = cgutils.unpack_tuple(builder, args[0]), WIDTH
         while width > 1:  # two vectors become one: the sums of the halves of what each holds, one after the other
             width //= 2
             firsts = [k for k in range(2 * WIDTH) if k // width % 2 == 0]
@@ -193,7 +198,7 @@ def _sums_of(typing: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any
             vectors = [builder.fadd(*(builder.shuffle_vector(*pair, mask) for mask in masks)) for pair in pairs]
         return vectors[0]
 
-    return a(a, b, c, d, e, f, g, h), generate
+    return rows.dtype(rows), generate
 
 
 _register_reduction(sum_of, lambda builder, a, b: builder.fadd(a, b))

@@ -1,8 +1,25 @@
 """The oracle: what a backend is checked against, and how.
 
-Reading order: ``cases`` (what every check reports); ``setting``, ``stages`` and ``pieces`` (a small scene, each stage
-on it as a function with its gradient, and the formulas below the stages); ``differences`` and ``gradients`` (are the
-gradients derivatives?); ``truth`` (is float64 enough?); ``planted`` (would an error be found?); ``hard_cases`` (what
-breaks renderers); ``golden`` and ``comparison`` (where does another backend differ?); ``bench`` (what does precision
-cost?); ``peers`` (renderers of others that run here).
+Each check answers one question, and ``minisplat-ref oracle`` runs it. Read them in this order:
+
+===============  ============================================================================  =============
+module           what a reader finds there                                                     command
+===============  ============================================================================  =============
+``cases``        what every check reports: named cases that passed or not, as table and JSON
+``tolerances``   every tolerance and every margin, with its reason
+``thresholds``   pixels at which rounding decides whether a hit counts
+``setting``      a small scene on which every branch of every gradient is taken
+``stages``       each stage of a backend as a function with its gradient
+``pieces``       the same for the reference's formulas below the stages
+``differences``  sixth-order differences that refuse to cross a threshold
+``gradients``    are the gradients derivatives?                                                ``gradients``
+``planted``      would an error be found? Backends that are wrong in one formula, on purpose   ``compare``
+``truth``        is float64 enough? The formulas in 50 digits                                  ``truth``
+``hard_cases``   what breaks renderers, as data; every precision against the reference         ``hard-cases``
+``golden``       arrays of every stage, for whoever writes another renderer                    ``export``
+``comparison``   where does another renderer differ, and does it matter?                       ``compare``
+``peers``        renderers of others: gsplat in PyTorch and in CUDA, the 3DGS rasteriser       ``compare``
+===============  ============================================================================  =============
+
+Correctness only: speed, and what it costs in digits, is :mod:`minisplat_ref.bench`.
 """

@@ -1,15 +1,14 @@
 """What a check reports: named cases that passed or did not, each with its figures; as a table and as JSON."""
 
 import json
-import platform
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
 from minisplat_ref.io.atomic import replacing
+from minisplat_ref.reporting import machine, markdown_table
 
 Figure = float | int | str | None
 
@@ -47,13 +46,11 @@ def as_markdown(report: Report) -> str:
     """Return the cases as an aligned table: name, verdict, figures, note."""
     headings = list(dict.fromkeys(key for case in report.cases for key in case.figures))
     has_notes = any(case.note for case in report.cases)
-    rows = [["case", "verdict", *headings, *(["note"] if has_notes else [])]]
+    rows = []
     for case in report.cases:
         cells = [_cell(case.figures.get(heading)) for heading in headings]
         rows.append([case.name, "passed" if case.passed else "FAILED", *cells, *([case.note] if has_notes else [])])
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ["| " + " | ".join(map(str.ljust, row, widths)) + " |" for row in rows]
-    return "\n".join([lines[0], "|" + "|".join("-" * (width + 2) for width in widths) + "|", *lines[1:]])
+    return markdown_table(["case", "verdict", *headings, *(["note"] if has_notes else [])], rows)
 
 
 def save_json(report: Report, path: str | Path) -> None:
@@ -75,24 +72,10 @@ def save_json(report: Report, path: str | Path) -> None:
         {"name": case.name, "passed": case.passed, **{k: _plain(v) for k, v in case.figures.items()}, "note": case.note}
         for case in report.cases
     ]
-    settings = {**report.settings, **versions()}
+    settings = {**report.settings, **machine()}
     with replacing(path) as temporary:
         text = json.dumps({"title": report.title, "settings": settings, "cases": cases}, indent=1, allow_nan=False)
         temporary.write_text(text + "\n", encoding="utf-8")
-
-
-def versions() -> dict[str, Figure]:
-    """Return the machine and the versions of what computes."""
-    cpu_info = Path("/proc/cpuinfo")
-    lines = cpu_info.read_text().splitlines() if cpu_info.exists() else []
-    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return {
-        "processor": models[0] if models else platform.processor(),
-        "threads": numba.get_num_threads(),
-        "python": platform.python_version(),
-        "numpy": np.__version__,
-        "numba": numba.__version__,
-    }
 
 
 def verdict(reports: Sequence[Report]) -> str:

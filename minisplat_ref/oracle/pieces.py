@@ -27,7 +27,8 @@ from minisplat_ref.oracle.stages import (
     surface_stage,
     with_module,
 )
-from minisplat_ref.types import Floats
+from minisplat_ref.reference.hits import CONIC, Hit, Response, tile_hits
+from minisplat_ref.types import Floats, Ints, Projection, TileBins, TileGrid
 
 Module = Any
 """A module, or a changed copy of it."""
@@ -37,6 +38,14 @@ SEED = 20240229
 def tiny_setting(conventions: Conventions = GSPLAT_MAIN, sh_degree: int = 1) -> Setting:
     """Five Gaussians in 9 x 7 pixels."""
     return make_setting(np.random.default_rng(SEED), 5, 9, 7, conventions, sh_degree)
+
+
+def projected(setting: Setting) -> tuple[Projection, TileBins]:
+    """Footprints and tile lists by the reference."""
+    backend, camera, conventions = with_module(), setting.camera, setting.conventions
+    projection = backend.project(*setting.primitives, camera, conventions)
+    grid = TileGrid(camera.width, camera.height, backend.tile_width, backend.tile_height)
+    return projection, backend.bin_gaussians(projection, grid, conventions)
 
 
 def covariance_pieces(m: Module) -> tuple[Stage, ...]:
@@ -119,31 +128,43 @@ def ssim_pieces(m: Module) -> tuple[Stage, ...]:
     return ssim, photometric_stage(stages, tiny_setting().camera, rng)
 
 
-def depth_map_pieces(m: Module) -> tuple[Stage, ...]:
-    """``expected_depth`` and ``depth_normals``; one pixel has no depth."""
-    rng, camera = np.random.default_rng(SEED), tiny_setting().camera
+def depth_pieces(m: Module) -> tuple[Stage, ...]:
+    """``expected_depth``, one pixel without a hit, and ``surface_points``."""
+    rng = np.random.default_rng(SEED)
     depth, alpha = rng.uniform(2, 3, size=(4, 5)), rng.uniform(0.3, 1, size=(4, 5))
     alpha[1, 2] = 0.0
-    with_hole = np.where(alpha > 0, depth, 0)
-    has_depth = (alpha > 0).astype(float)  # a pixel that was not hit cannot be moved into a hit by a derivative
+    accumulated = depth * alpha
+    is_hit = (alpha > 0).astype(float)  # a pixel that was not hit cannot be moved into a hit by a derivative
 
     def expected(accumulated: Floats, alpha: Floats) -> Point:
-        return Point((m.expected_depth(accumulated * has_depth, alpha * has_depth),))
+        return Point((m.expected_depth(accumulated * is_hit, alpha * is_hit),))
 
+    stages = with_module(surface_points=m.surface_points, surface_points_vjp=m.surface_points_vjp)
     return (
         Stage(
             "expected_depth",
-            {"accumulated_depth": with_hole * alpha, "alpha": alpha},
+            {"accumulated_depth": accumulated, "alpha": alpha},
             ("depth",),
             expected,
-            lambda v: m.expected_depth_vjp(with_hole * alpha, alpha, v),
+            lambda v: m.expected_depth_vjp(accumulated, alpha, v),
         ),
+        surface_stage(stages, tiny_setting()),
+    )
+
+
+def depth_map_pieces(m: Module) -> tuple[Stage, ...]:
+    """``depth_normals``; one pixel has no depth."""
+    rng, camera = np.random.default_rng(SEED), tiny_setting().camera
+    depth = rng.uniform(2, 3, size=(4, 5))
+    depth[1, 2] = 0.0
+    has_depth = (depth > 0).astype(float)  # nor can a pixel without a depth be moved onto the surface
+    return (
         Stage(
             "depth_normals",
-            {"depth": with_hole},
+            {"depth": depth},
             ("normals",),
-            lambda depth: Point((m.depth_normals(depth * has_depth, camera),)),
-            lambda v: (m.depth_normals_vjp(with_hole, camera, v),),
+            lambda z: Point((m.depth_normals(z * has_depth, camera),)),
+            lambda v: (m.depth_normals_vjp(depth, camera, v),),
         ),
     )
 
@@ -186,13 +207,57 @@ def _sh_pieces(m: Module) -> tuple[Stage, ...]:
     return (sh_stage(stages, tiny_setting(sh_degree=3)),)
 
 
+def _slanted(hits: Module) -> Response:
+    """The conic with depths and colours that change over the Gaussian; pixels sort two hits at a time."""
+
+    def hit(projection: Projection, ids: Ints, centers: Floats) -> Hit:
+        flat: Hit = hits.conic_hit(projection, ids, centers)
+        return flat._replace(depths=flat.depths + 0.1 * flat.place.offsets.sum(axis=2))
+
+    def hit_vjp(p: Projection, ids: Ints, hit: Hit, v_mean: Floats, v_shape: Floats, v_x: Floats) -> Any:
+        v_means2d, v_conics, v_opacities = hits.conic_hit_vjp(p, ids, hit, v_mean, v_shape, None)
+        v_means2d[:, 0] += v_x.sum(axis=1)
+        return v_means2d, v_conics, v_opacities
+
+    def shade(colors: Floats, place: Any) -> Floats:
+        return colors[:, None] * np.sin(place.offsets[:, :, :1])
+
+    def shade_vjp(colors: Floats, place: Any, v: Floats) -> tuple[Floats, Floats]:
+        x = place.offsets[:, :, 0]
+        return np.einsum("gpd,gp->gd", v, np.sin(x)), np.einsum("gpd,gd,gp->gp", v, colors, np.cos(x))
+
+    return Response(CONIC.boxes, hit, hit_vjp, CONIC.fields, shade, shade_vjp, buffer_size=2)
+
+
+def _blending_stage(compositing: Module, response: Response) -> Stage:
+    """``composite_hits`` of a response to projected Gaussians; tile lists and boxes are held."""
+    plain, p, bins = composite_stage(with_module(), tiny_setting()), *projected(tiny_setting())
+
+    def moved(means2d: Floats, conics: Floats, opacities: Floats) -> Projection:
+        return p._replace(means2d=means2d, conics=conics, opacities=opacities)
+
+    def function(means2d: Floats, conics: Floats, opacities: Floats, colors: Floats, background: Floats) -> Point:
+        q = moved(means2d, conics, opacities)
+        output = compositing.composite_hits(response, q, colors, background, bins, GSPLAT_MAIN)
+        tiles = tile_hits(q, bins, GSPLAT_MAIN, response)
+        sides = [side for tile in tiles for side in (tile.alphas > 0, tile.is_clamped, np.asarray(tile.order))]
+        return Point((output.image, output.alpha), tuple(sides))
+
+    def vjp(v_image: Floats, v_alpha: Floats) -> tuple[Floats, ...]:
+        arguments = response, p, plain.inputs["colors"], plain.inputs["background"], bins, GSPLAT_MAIN
+        v = compositing.composite_hits_vjp(*arguments, compositing.composite_hits(*arguments), (v_image, v_alpha))
+        return *v.primitives, v.colors, v.background
+
+    return Stage("composite_hits", plain.inputs, ("image", "alpha"), function, vjp)
+
+
+def _hits_pieces(m: Module) -> tuple[Stage, ...]:
+    return (_blending_stage(reference.compositing, _slanted(m)),)
+
+
 def _compositing_pieces(m: Module) -> tuple[Stage, ...]:
-    return (composite_stage(with_module(composite=m.composite, composite_vjp=m.composite_vjp), tiny_setting()),)
-
-
-def _depth_pieces(m: Module) -> tuple[Stage, ...]:
-    stages = with_module(surface_points=m.surface_points, surface_points_vjp=m.surface_points_vjp)
-    return (surface_stage(stages, tiny_setting()),)
+    stage = composite_stage(with_module(composite=m.composite, composite_vjp=m.composite_vjp), tiny_setting())
+    return stage, _blending_stage(m, _slanted(reference.hits))
 
 
 PIECES: dict[ModuleType, Callable[[Module], tuple[Stage, ...]]] = {
@@ -201,8 +266,9 @@ PIECES: dict[ModuleType, Callable[[Module], tuple[Stage, ...]]] = {
     reference.antialiasing: antialiasing_pieces,
     reference.projection: _projection_pieces,
     reference.spherical_harmonics: _sh_pieces,
+    reference.hits: _hits_pieces,
     reference.compositing: _compositing_pieces,
-    reference.depth: _depth_pieces,
+    reference.depth: depth_pieces,
     reference.loss: ssim_pieces,
     reference.depth_map: depth_map_pieces,
     reference.geometric_loss: geometric_pieces,

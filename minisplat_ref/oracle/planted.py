@@ -19,6 +19,7 @@ from minisplat_ref.constants import SH_C2, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.reference.covariance import rotation_matrices, rotation_matrices_vjp
 from minisplat_ref.reference.projection import project_vjp as reference_project_vjp
+from minisplat_ref.stages import CompositeVjp
 from minisplat_ref.types import (
     Camera,
     CompositeGradient,
@@ -82,14 +83,16 @@ def planted(name: str, backend: Backend = CPU) -> Backend:
 
 def _corner_pixels(base: Backend) -> Backend:
     @wraps(base.project)
-    def project(means: Floats, quats: Floats, scales: Floats, opacities: Floats, camera: Camera, c: Conventions) -> Any:
-        return base.project(means, quats, scales, opacities, _shifted(camera), c)
+    def project(
+        means: Floats, quats: Floats, scales: Floats, opacities: Floats, camera: Camera, conventions: Conventions
+    ) -> Projection:
+        return base.project(means, quats, scales, opacities, _shifted(camera), conventions)
 
     @wraps(base.project_vjp)
     def project_vjp(
-        means: Floats, quats: Floats, scales: Floats, opacities: Floats, camera: Camera, *rest: Any
+        means: Floats, quats: Floats, scales: Floats, opacities: Floats, camera: Camera, *rest: Any, **named: Any
     ) -> PrimitiveGradient:
-        return base.project_vjp(means, quats, scales, opacities, _shifted(camera), *rest)
+        return base.project_vjp(means, quats, scales, opacities, _shifted(camera), *rest, **named)
 
     return replace(base, project=project, project_vjp=project_vjp)
 
@@ -114,10 +117,10 @@ def _transposed_view(base: Backend) -> Backend:
 
     @wraps(base.project_vjp)
     def project_vjp(
-        means: Floats, quats: Floats, scales: Floats, opacities: Floats, camera: Camera, *rest: Any
+        means: Floats, quats: Floats, scales: Floats, opacities: Floats, camera: Camera, *rest: Any, **named: Any
     ) -> PrimitiveGradient:
         turned_means, turned_camera, R = turned(means, camera)
-        v = base.project_vjp(turned_means, quats, scales, opacities, turned_camera, *rest)
+        v = base.project_vjp(turned_means, quats, scales, opacities, turned_camera, *rest, **named)
         v_RR = v.means.T @ means
         v_R = v.cam_from_world_R.T + v_RR @ R.T + R.T @ v_RR
         return v._replace(means=v.means @ (R @ R), cam_from_world_R=v_R)
@@ -127,9 +130,10 @@ def _transposed_view(base: Backend) -> Backend:
 
 def _three_sigma(base: Backend) -> Backend:
     @wraps(base.project)
-    def project(*args: Any) -> Projection:
-        p: Projection = base.project(*args)
-        camera: Camera = args[4]
+    def project(
+        means: Floats, quats: Floats, scales: Floats, opacities: Floats, camera: Camera, conventions: Conventions
+    ) -> Projection:
+        p = base.project(means, quats, scales, opacities, camera, conventions)
         a, b, c = np.where(p.radii[:, :1] > 0, p.conics, (1, 0, 1)).T  # [N]; rows that are culled stay so
         sigmas = np.sqrt(np.column_stack([c, a]) / (a * c - b * b)[:, None])
         radii = np.minimum(p.radii, np.ceil(3 * sigmas)).astype(np.int32)
@@ -148,12 +152,12 @@ def _negated_band(base: Backend) -> Backend:
         return flipped
 
     @wraps(base.sh_colors)
-    def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, *rest: Any) -> Floats:
-        return base.sh_colors(means, sh_dc, negated(sh_rest), *rest)
+    def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, *rest: Any, **named: Any) -> Floats:
+        return base.sh_colors(means, sh_dc, negated(sh_rest), *rest, **named)
 
     @wraps(base.sh_colors_vjp)
-    def sh_colors_vjp(means: Floats, sh_dc: Floats, sh_rest: Floats, *rest: Any) -> SHGradient:
-        v = base.sh_colors_vjp(means, sh_dc, negated(sh_rest), *rest)
+    def sh_colors_vjp(means: Floats, sh_dc: Floats, sh_rest: Floats, *rest: Any, **named: Any) -> SHGradient:
+        v = base.sh_colors_vjp(means, sh_dc, negated(sh_rest), *rest, **named)
         return v._replace(sh_rest=negated(v.sh_rest))
 
     return replace(base, sh_colors=sh_colors, sh_colors_vjp=sh_colors_vjp)
@@ -172,21 +176,34 @@ def _clamp(alpha_max: float) -> Change:
     def plant(base: Backend) -> Backend:
         @wraps(base.composite)
         def composite(
-            p: Projection, colors: Floats, background: Floats, bins: TileBins, c: Conventions, **asked: bool
+            projection: Projection,
+            colors: Floats,
+            background: Floats,
+            bins: TileBins,
+            conventions: Conventions,
+            **asked: bool,
         ) -> RenderOutput:
-            return base.composite(p, colors, background, bins, c._replace(alpha_max=alpha_max), **asked)
+            conventions = conventions._replace(alpha_max=alpha_max)
+            return base.composite(projection, colors, background, bins, conventions, **asked)
 
         return replace(base, composite=composite, composite_vjp=_with_conventions(base, alpha_max=alpha_max))
 
     return plant
 
 
-def _with_conventions(base: Backend, **changes: Any) -> Callable[..., CompositeGradient]:
+def _with_conventions(base: Backend, **changes: Any) -> CompositeVjp:
     @wraps(base.composite_vjp)
     def composite_vjp(
-        p: Projection, colors: Floats, background: Floats, bins: TileBins, c: Conventions, *rest: Any
+        projection: Projection,
+        colors: Floats,
+        background: Floats,
+        bins: TileBins,
+        conventions: Conventions,
+        *rest: Any,
+        **named: Any,
     ) -> CompositeGradient:
-        return base.composite_vjp(p, colors, background, bins, c._replace(**changes), *rest)
+        conventions = conventions._replace(**changes)
+        return base.composite_vjp(projection, colors, background, bins, conventions, *rest, **named)
 
     return composite_vjp
 
@@ -197,8 +214,8 @@ def _unclamped_mean_gradient(base: Backend) -> Backend:
 
 def _half_off_diagonal(base: Backend) -> Backend:
     @wraps(base.composite_vjp)
-    def composite_vjp(*args: Any) -> CompositeGradient:
-        v: CompositeGradient = base.composite_vjp(*args)
+    def composite_vjp(*args: Any, **named: Any) -> CompositeGradient:
+        v = base.composite_vjp(*args, **named)
         return v._replace(conics=v.conics * np.array([1, 0.5, 1], v.conics.dtype))
 
     return replace(base, composite_vjp=composite_vjp)
@@ -208,9 +225,18 @@ def _forgotten_background(base: Backend) -> Backend:
     """The derivative by T_end is ``v . background - v_alpha``, so this v_alpha takes the first term out."""
 
     @wraps(base.composite_vjp)
-    def composite_vjp(p: Projection, colors: Floats, background: Floats, *rest: Any) -> CompositeGradient:
-        *others, v_image, v_alpha = rest
-        return base.composite_vjp(p, colors, background, *others, v_image, v_alpha + v_image @ background)
+    def composite_vjp(
+        projection: Projection,
+        colors: Floats,
+        background: Floats,
+        bins: TileBins,
+        conventions: Conventions,
+        output: RenderOutput,
+        v_image: Floats,
+        v_alpha: Floats,
+    ) -> CompositeGradient:
+        v_alpha = v_alpha + v_image @ background
+        return base.composite_vjp(projection, colors, background, bins, conventions, output, v_image, v_alpha)
 
     return replace(base, composite_vjp=composite_vjp)
 
@@ -227,8 +253,8 @@ def _transposed_rs(base: Backend) -> Backend:
     changed = FunctionType(reference_project_vjp.__code__, names)
 
     @wraps(base.project_vjp)
-    def project_vjp(means: Floats, *rest: Any) -> PrimitiveGradient:
-        return PrimitiveGradient._make(field.astype(means.dtype) for field in changed(means, *rest))
+    def project_vjp(means: Floats, *rest: Any, **named: Any) -> PrimitiveGradient:
+        return PrimitiveGradient._make(field.astype(means.dtype) for field in changed(means, *rest, **named))
 
     return replace(base, project_vjp=project_vjp)
 
@@ -236,8 +262,8 @@ def _transposed_rs(base: Backend) -> Backend:
 def _changed_project_vjp(change: Callable[[PrimitiveGradient, Floats], PrimitiveGradient]) -> Change:
     def plant(base: Backend) -> Backend:
         @wraps(base.project_vjp)
-        def project_vjp(means: Floats, quats: Floats, *rest: Any) -> PrimitiveGradient:
-            return change(base.project_vjp(means, quats, *rest), quats)
+        def project_vjp(means: Floats, quats: Floats, *rest: Any, **named: Any) -> PrimitiveGradient:
+            return change(base.project_vjp(means, quats, *rest, **named), quats)
 
         return replace(base, project_vjp=project_vjp)
 
@@ -246,9 +272,18 @@ def _changed_project_vjp(change: Callable[[PrimitiveGradient, Floats], Primitive
 
 def _forgotten_depth(base: Backend) -> Backend:
     @wraps(base.project_vjp)
-    def project_vjp(*args: Any) -> PrimitiveGradient:
-        v_projection: ProjectionGradient = args[-1]
-        return base.project_vjp(*args[:-1], v_projection._replace(depths=np.zeros_like(v_projection.depths)))
+    def project_vjp(
+        means: Floats,
+        quats: Floats,
+        scales: Floats,
+        opacities: Floats,
+        camera: Camera,
+        conventions: Conventions,
+        projection: Projection,
+        v_projection: ProjectionGradient,
+    ) -> PrimitiveGradient:
+        v_projection = v_projection._replace(depths=np.zeros_like(v_projection.depths))
+        return base.project_vjp(means, quats, scales, opacities, camera, conventions, projection, v_projection)
 
     return replace(base, project_vjp=project_vjp)
 
@@ -258,7 +293,7 @@ def _frozen_direction(base: Backend) -> Backend:
     def sh_colors_vjp(
         means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int, radii: Ints, v_colors: Floats
     ) -> SHGradient:
-        v: SHGradient = base.sh_colors_vjp(means, sh_dc, sh_rest, camera, degree, radii, v_colors)
+        v = base.sh_colors_vjp(means, sh_dc, sh_rest, camera, degree, radii, v_colors)
         return v._replace(means=np.zeros_like(v.means))
 
     return replace(base, sh_colors_vjp=sh_colors_vjp)

@@ -10,9 +10,8 @@ import numpy as np
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.reference.covariance import rotation_matrices
-from minisplat_ref.reference.pinhole import pose, slope_limits, with_principal_point
-from minisplat_ref.splatting import Primitives
-from minisplat_ref.types import Camera, Floats, Gaussians
+from minisplat_ref.reference.pinhole import pinhole_rays, pose, slope_limits, with_principal_point
+from minisplat_ref.types import Camera, Floats, Gaussians, Primitives
 
 POSE = ("cam_from_world_R", "cam_from_world_t")
 
@@ -69,7 +68,7 @@ def make_setting(
 
     z = 3 + rng.uniform(-0.8, 0.8, size=n)
     slopes = rng.uniform(-1, 1, size=(n, 2)) * half_view
-    center = (np.array([width // 2 + 0.54, height // 2 + 0.47]) - (seen.cx, seen.cy)) / (fx, fy)
+    center = pinhole_rays(width // 2 + 0.54, height // 2 + 0.47, seen)[:2]
     slopes[:3] = center + rng.uniform(-0.02, 0.02, size=(3, 2)) * [[0], [1], [1]]
     z[:3] = 2.0, 2.3, 2.6
     _, beyond = slope_limits(seen, conventions, np.dtype(float))

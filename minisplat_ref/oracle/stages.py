@@ -13,15 +13,15 @@ from minisplat_ref.backends import REFERENCE, Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.oracle.differences import Function, Point, Vjp
 from minisplat_ref.oracle.setting import Setting
-from minisplat_ref.reference.depth_map import expected_depth
+from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.reference.hits import tile_hits
-from minisplat_ref.reference.pinhole import pinhole_jacobians, pose, slope_limits, with_principal_point
-from minisplat_ref.splatting import Primitives
+from minisplat_ref.reference.pinhole import pinhole_jacobians, pinhole_rays, pose, slope_limits, with_principal_point
 from minisplat_ref.types import (
     Camera,
     Floats,
     Gaussians,
     GeometricWeights,
+    Primitives,
     Projection,
     ProjectionGradient,
     TileBins,
@@ -142,8 +142,7 @@ def surface_stage(backend: Backend, setting: Setting) -> Stage:
     output = backend.composite(projection, colors, setting.background, bins, setting.conventions, with_stats=True)
     ids, camera = output.stats.dominant_ids, setting.camera  # type: ignore[union-attr]  # stats were asked for
     means, quats, scales, _ = setting.primitives
-    origin = -camera.cam_from_world_R.T @ camera.cam_from_world_t
-    means = np.where(np.arange(len(means))[:, None] == ids[0, 0], 2 * origin - means, means)
+    means = np.where(np.arange(len(means))[:, None] == ids[0, 0], 2 * camera.center - means, means)
     inputs = {"means": means, "quats": quats, "scales": scales}
 
     def function(means: Floats, quats: Floats, scales: Floats) -> Point:
@@ -151,7 +150,7 @@ def surface_stage(backend: Backend, setting: Setting) -> Stage:
         return Point(tuple(surface), (surface.depths > 0,))
 
     def vjp(v_points: Floats, v_depths: Floats) -> tuple[Floats, ...]:
-        return backend.surface_points_vjp(*inputs.values(), camera, ids, v_points, v_depths)
+        return backend.surface_points_vjp(means, quats, scales, camera, ids, v_points, v_depths)
 
     return Stage("surface_points", inputs, ("points", "depths"), function, vjp)
 
@@ -181,7 +180,8 @@ def geometric_stage(backend: Backend, camera: Camera, rng: np.random.Generator) 
     points, weights = points_near(depth, camera, rng), GeometricWeights(0.7, 1.3, 0.9)
     mask = np.ones(shape, dtype=bool)
     mask[1, 1] = False
-    inputs: dict[str, Floats] = {"accumulated_depth": depth * alpha, "alpha": alpha}
+    accumulated = depth * alpha
+    inputs: dict[str, Floats] = {"accumulated_depth": accumulated, "alpha": alpha}
 
     def function(accumulated_depth: Floats, alpha: Floats) -> Point:
         loss, _ = backend.geometric_loss(accumulated_depth, alpha, photograph, camera, points, weights, mask)
@@ -189,7 +189,7 @@ def geometric_stage(backend: Backend, camera: Camera, rng: np.random.Generator) 
         return Point((np.asarray(loss),), tuple(np.sign(np.diff(depth, axis=axis)) for axis in (0, 1)))
 
     def vjp(v_loss: Floats) -> tuple[Floats, ...]:
-        _, tape = backend.geometric_loss(*inputs.values(), photograph, camera, points, weights, mask)
+        _, tape = backend.geometric_loss(accumulated, alpha, photograph, camera, points, weights, mask)
         return backend.geometric_loss_vjp(tape, float(v_loss))
 
     return Stage("geometric_loss", inputs, ("loss",), function, vjp)
@@ -199,9 +199,7 @@ def points_near(depth: Floats, camera: Camera, rng: np.random.Generator) -> Floa
     """Points [6, 3], world frame, in front of and behind a depth map: by 0.3 % and by 6 %, Huber's two regimes."""
     rows, columns = (rng.choice(size, 6, replace=size < 6) for size in depth.shape)
     z = depth[rows, columns] * (1 + np.array([0.003, -0.004, 0.002, 0.06, -0.06, 0.05]))
-    pixels = np.column_stack([columns, rows]) + 0.5
-    slopes = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-    in_camera = np.column_stack([slopes * z[:, None], z])
+    in_camera = z[:, None] * pinhole_rays(columns + 0.5, rows + 0.5, camera)
     return (in_camera - camera.cam_from_world_t) @ camera.cam_from_world_R
 
 

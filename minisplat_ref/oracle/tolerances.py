@@ -1,6 +1,18 @@
-"""Every tolerance of the oracle, with its reason. Relative ones are relative to the largest value compared."""
+"""How far apart two results may be: every tolerance of the oracle and of the benchmarks, each with its reason.
 
-# Gradients against sixth-order differences in float64: rounding 1e-16 / 1e-4 of values up to 100, truncation below it.
+In order: gradients against differences; reference and kernels against 50 digits and against a peer; another renderer
+against the reference, stage by stage; the benchmark's contenders; the groups of hard cases; and how near to a threshold
+rounding decides. Relative tolerances are relative to the largest value compared. Tolerances that only tests need are in
+``tests/tolerances.py``; what a scene's photographs or a strategy tolerate stands where it is used.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+# --- gradients against differences ---
+
+# Sixth-order differences in float64: rounding 1e-16 / 1e-4 of values up to 100, truncation below it.
 GRADIENT_REL = 1e-8
 
 # Where a threshold is so near that only a step of 1e-8 stays on its side: rounding 1e-16 / 1e-8 on values up to 100.
@@ -8,6 +20,11 @@ GRADIENT_REL_NEAR_THRESHOLD = 1e-6
 
 # A block of a Jacobian or a gradient below this is vacuous or meant to be zero: real ones here are 1e-4 to 1e3.
 GRADIENT_FLOOR = 1e-6
+
+# Alpha must cover this part of an image before a check on it says anything.
+COVERAGE_MIN = 0.05
+
+# --- against a peer, against 50 digits ---
 
 # gsplat's torch functions in float64, with a stage's input in common: 1e-16 times condition numbers up to 1e3.
 PEER_REL = 1e-9
@@ -17,29 +34,44 @@ TRUTH_FLOAT64 = 1e-13
 # ... and of 6e-8, with a polynomial exponential of 1e-7.
 TRUTH_FLOAT32 = 2e-6
 
-# Alpha must cover this part of an image before a check on it says anything.
-COVERAGE_MIN = 0.05
+# --- another renderer against the reference, stage by stage ---
 
 # A stage of another float64 renderer, fed with the same input: 1e-16 times conditions up to 1e4, in sums of thousands
 # of terms. Wrong formulas are off by 1e-4 and more.
 COMPARE_FLOAT64 = 1e-9
 
-# The same in float32, fed with the input rounded or with its own of the stage before: a few roundings of 6e-8 ...
-COMPARE_FLOAT32_POSITION = 2e-6
-# ... divided by the determinant of a covariance whose condition number is up to 1e2 ...
-COMPARE_FLOAT32_SHAPE = 2e-5
-# ... through an exponential of relative error 1e-7 to 1e-6, hundreds of times in a pixel ...
-COMPARE_FLOAT32_IMAGE = 2e-5
-# ... relative to windowed variances, differences of means, which count beside C2 = 9e-4 ...
-COMPARE_FLOAT32_LOSS = 5e-5
-# ... and in sums of either sign over pixels, divided by 1 - alpha >= 0.01.
-COMPARE_FLOAT32_GRADIENT = 1e-4
 
-# A hit whose alpha is so near to alpha_min, absolutely, may be skipped by one renderer and blended by another: float32
-# gives alpha an error of 1e-7 of its value near 4e-3, and 1e-6 px of the centre moves it by less than 1e-6.
-FLIP_ALPHA = 1e-6
-# The same as a part of 1/255; the transmittance is held against its stop threshold with this relative margin.
-FLIP_RELATIVE = 255 * FLIP_ALPHA
+class StageTolerance(NamedTuple):
+    """How far another renderer's array may be off, as a part of the largest value of the array."""
+
+    float64: float
+    float32: float
+    """Fed with the input rounded, or with its own of the stage before."""
+    reason: str
+    """Of float32, one line; published with the golden vectors."""
+
+    def of(self, dtype: str | np.dtype) -> float:
+        """Return the tolerance for results computed in ``dtype``."""
+        return self.float32 if np.dtype(dtype) == np.float32 else self.float64
+
+
+EXACT = StageTolerance(0.0, 0.0, "given or counted, not computed; a difference may still be harmless")
+# A few roundings of 6e-8 ...
+POSITION = StageTolerance(COMPARE_FLOAT64, 2e-6, "a product with the view matrix and one division")
+# ... divided by the determinant of a covariance whose condition number is up to 1e2 ...
+SHAPE = StageTolerance(
+    COMPARE_FLOAT64, 2e-5, "the 2x2 inverse multiplies rounding by the condition number of the covariance"
+)
+# ... through an exponential of relative error 1e-7 to 1e-6, hundreds of times in a pixel ...
+IMAGE = StageTolerance(COMPARE_FLOAT64, 2e-5, "hundreds of hits a pixel, each with an exponential")
+# ... relative to windowed variances, differences of means, which count beside C2 = 9e-4 ...
+LOSS = StageTolerance(COMPARE_FLOAT64, 5e-5, "variances are differences of means, divided by at least C2 = 9e-4")
+# ... and in sums of either sign over pixels, divided by 1 - alpha >= 0.01.
+GRADIENT = StageTolerance(
+    COMPARE_FLOAT64, 1e-4, "sums over pixels of either sign, divided by 1 - alpha >= 0.01 and by z^2"
+)
+
+# --- the benchmark's contenders ---
 
 # What float32 promises of an image where no hit falls on the other side of a threshold: hundreds of hits, each with an
 # exponential of 1e-7 relative error at a distance that has lost digits to a coordinate of some hundred pixels.
@@ -56,7 +88,134 @@ BENCH_FLOAT64 = 1e-11
 # Gradient of a polynomial exponential, in units of its relative error: behind / (1 - alpha) multiplies it.
 BENCH_EXPONENTIAL_GRADIENT = 10.0
 
-# Depths that differ by less, relatively, may be sorted either way: three products and sums of 6e-8 each in float32.
-FLIP_DEPTH = 5e-7
-# An alpha so near to its clamp may be clamped or not; the image does not notice, the gradient does.
-FLIP_CLAMP = 1e-5
+# --- hard cases ---
+
+
+class HardCaseTolerance(NamedTuple):
+    """How far a precision may be from the float64 reference in one group of hard cases.
+
+    Images: largest difference, relative to the largest value where that is above 1. Gradients: relative L2 of each
+    block of parameters, the worst of all blocks.
+    """
+
+    reason: str
+    """Why these; one line."""
+    image64: float
+    """Of the kernels in float64."""
+    gradient64: float
+    image32: float
+    """Of the kernels in float32, with either exponential."""
+    gradient32: float
+
+
+ORDINARY = HardCaseTolerance(
+    "sums of up to a thousand rounded terms: 1e-16 and 6e-8 each", 1e-12, 1e-10, image32=2e-5, gradient32=1e-4
+)
+
+LONG = HardCaseTolerance(
+    "the reference subtracts products 1e12 times larger than their difference; float32 rounds 160 px beside half a px",
+    1e-6,
+    1e-4,
+    image32=2e-5,
+    gradient32=1e-3,
+)
+
+BEHIND = HardCaseTolerance(
+    "behind an opaque hit what is left is a difference from the whole pixel: 6e-8 of the whole, divided by 1 - alpha",
+    1e-12,
+    1e-9,
+    image32=2e-5,
+    gradient32=1e-3,
+)
+
+DEEP = HardCaseTolerance(
+    "a product of 1,500 factors and sums of as many terms: 6e-8 times their number, where roundings do not cancel",
+    1e-11,
+    1e-9,
+    image32=1e-4,
+    gradient32=1e-3,
+)
+
+WORLD = HardCaseTolerance(
+    "coordinates of 1e6 leave float64 1e-10 of a unit, and the reference does not subtract the centre first",
+    1e-8,
+    1e-7,
+    image32=2e-5,
+    gradient32=1e-4,
+)
+
+HARMONICS = HardCaseTolerance(
+    "terms that are 1e4 times larger than what is compared: relative to them it is 6e-8",
+    1e-11,
+    1e-10,
+    image32=1e-4,
+    gradient32=1e-3,
+)
+
+SIMILARITY = HardCaseTolerance(
+    "variances are differences of means, 6e-8 of values up to 1, beside C2 = 9e-4; gradients near 0 are all rounding",
+    1e-11,
+    1e-9,
+    image32=1e-5,
+    gradient32=1e-3,
+)
+
+FAINT = HardCaseTolerance(
+    "an expected depth divides by alpha, of which 1/255 is drawn: 6e-8 times 255",
+    1e-11,
+    1e-10,
+    image32=1e-4,
+    gradient32=1e-3,
+)
+
+# A gradient smaller than this part of the median block is judged by the median: it is the rounding of the others.
+BLOCK_FLOOR = 1e-2
+
+# --- pixels at thresholds ---
+
+
+class Margins(NamedTuple):
+    """How near to a threshold a value has to be for rounding to decide on which side it falls.
+
+    Each is a part of the threshold, for that is how values round; see :mod:`minisplat_ref.oracle.thresholds`.
+    """
+
+    reason: str
+    """Why these; one line."""
+    skip: float
+    """Of a hit's alpha from ``alpha_min``."""
+    clamp: float
+    """Of a hit's alpha from ``alpha_max``."""
+    stop: float
+    """Of the transmittance behind a hit from ``transmittance_min``."""
+    median: float
+    """Of the same from one half."""
+    order: float
+    """Of the depth of a hit from that of the next."""
+
+
+FLOAT32_RENDERER = Margins(
+    "a centre at some hundred pixels is off by 3e-5 px in float32, and the exponent of alpha changes by up to 6 a pixel"
+    " at 1/255, by up to 0.3 at the clamp; a depth is three products and sums of 6e-8 each",
+    skip=255e-6,  # 1e-6 absolutely, where alpha_min is 1/255
+    clamp=1e-5,
+    stop=255e-6,
+    median=255e-6,
+    order=5e-7,
+)
+"""Of any correct renderer in float32, whose own projection is compared."""
+
+OWN_KERNELS = Margins(
+    "footprints come from float64 and depths are the same numbers, in images of a few pixels: what is left is rounding"
+    " of 6e-8 in exponent and exponential; but 1 - 0.99 is off by 1e-6, and a pixel can take several such hits",
+    skip=1e-6,
+    clamp=1e-6,
+    stop=1e-5,
+    median=1e-6,
+    order=0.0,
+)
+"""Of our float32 kernels in the hard cases.
+
+By :data:`FLOAT32_RENDERER` a quarter of the pixels behind 4000 layers would be set aside, and every pixel where depths
+are one rounding apart: that case would check nothing.
+"""

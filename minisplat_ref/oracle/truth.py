@@ -198,8 +198,8 @@ def _case(
 
 
 def _projected(backend: Backend, view: View, dtype: Any) -> Projection:
-    arrays = [x.astype(dtype) for x in (view.means, view.quats, view.scales, np.full(N_GAUSSIANS, 0.5))]
-    return backend.project(*arrays, view.camera, GSPLAT_MAIN)
+    means, quats, scales = (x.astype(dtype) for x in (view.means, view.quats, view.scales))
+    return backend.project(means, quats, scales, np.full(N_GAUSSIANS, 0.5, dtype), view.camera, GSPLAT_MAIN)
 
 
 def _errors(truth: Any, got: Any) -> float:

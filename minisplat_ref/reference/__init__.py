@@ -10,13 +10,13 @@ pinhole              where a camera sees a point, and how that moves with the po
 antialiasing         how to make up for the blur that keeps ellipses visible         EWA splatting, Mip-Splatting
 projection           how the camera flattens an ellipsoid to an ellipse in pixels    3DGS (5), EWA splatting (31)
 extent               which pixels that ellipse can reach                             Mini-Splatting2, gsplat
-spherical_harmonics  how its colour depends on the viewing direction                 3DGS sec. 5.2
+spherical_harmonics  how its colour depends on the viewing direction                 3DGS sec. 3
 tiling               how ellipses are sorted, tile by tile, front to back            3DGS sec. 6
 hits                 how strongly an ellipse covers a pixel, and what it leaves      3DGS (3), (4)
 compositing          how hits become a pixel, and a pixel's error becomes theirs     3DGS (3)
-depth                where a pixel's ray meets the Gaussian that it mostly shows     Mini-Splatting appendix D
+depth                how far away what a pixel shows is, by two definitions          Mini-Splatting appendix D
 loss                 how far a rendered picture is from a photograph                 3DGS (7), Wang et al. 2004
-depth_map            which depth a pixel shows, and which way its surface faces      2D Gaussian Splatting
+depth_map            which way the surface of a depth map faces                      2D Gaussian Splatting
 geometric_loss       how wrong a depth map is at known points, and how rough         DS-NeRF, Monodepth
 adam                 how a gradient becomes a step                                   Kingma and Ba 2015
 ===================  ==============================================================  ============================

@@ -11,7 +11,7 @@ rate and into eps.
 
 import numpy as np
 
-from minisplat_ref.types import Floats, Ints
+from minisplat_ref.types import AdamStep, Floats, Ints
 
 
 def adam_update(
@@ -20,10 +20,7 @@ def adam_update(
     first: Floats,
     second: Floats,
     rows: Ints | None,
-    rate: float,
-    beta1: float,
-    beta2: float,
-    eps: float,
+    step: AdamStep,
 ) -> None:
     """Update ``values`` and both moments in place.
 
@@ -33,16 +30,12 @@ def adam_update(
         Parameters, their gradient, and the decaying means of the gradient and of its square.
     rows : ndarray of shape (V,), optional
         Rows to update, each once; the others are neither read nor written. None for all.
-    rate : float
-        Learning rate, bias corrections included.
-    beta1, beta2 : float
-        Decay of the two means.
-    eps : float
-        Added to the root.
+    step : AdamStep
+        Rate, decay of the two means, and what is added to the root.
     """
     chosen = slice(None) if rows is None else rows
     g, m, v = gradient[chosen], first[chosen], second[chosen]  # [V, W]
-    m = m + (1 - beta1) * (g - m)
-    v = v + (1 - beta2) * (g * g - v)
+    m = m + (1 - step.beta1) * (g - m)
+    v = v + (1 - step.beta2) * (g * g - v)
     first[chosen], second[chosen] = m, v
-    values[chosen] -= rate * m / (np.sqrt(v) + eps)
+    values[chosen] -= step.rate * m / (np.sqrt(v) + step.eps)

@@ -11,7 +11,7 @@ from minisplat_ref.constants import COMPENSATION_FLOOR
 from minisplat_ref.types import Floats
 
 
-def compensations(sharp: Floats, blurred: Floats) -> Floats:
+def compensations(C: Floats, B: Floats) -> Floats:
     """Opacity factors that keep a Gaussian's integral when the low-pass widens it.
 
     With covariances C and ``B = C + eps I``::
@@ -20,20 +20,18 @@ def compensations(sharp: Floats, blurred: Floats) -> Floats:
 
     Parameters
     ----------
-    sharp : ndarray of shape (N, 2, 2)
-        C, px^2.
-    blurred : ndarray of shape (N, 2, 2)
-        B, px^2.
+    C, B : ndarray of shape (N, 2, 2)
+        Without and with the low-pass, px^2.
 
     Returns
     -------
     ndarray of shape (N,)
         rho, at most 1.
     """
-    return np.sqrt(np.maximum(COMPENSATION_FLOOR**2, determinants(sharp) / determinants(blurred)))
+    return np.sqrt(np.maximum(COMPENSATION_FLOOR**2, determinants(C) / determinants(B)))
 
 
-def compensations_vjp(sharp: Floats, blurred: Floats, v_compensations: Floats) -> Floats:
+def compensations_vjp(C: Floats, B: Floats, v_compensations: Floats) -> Floats:
     """Gradient of :func:`compensations` by C; both of its arguments move with C.
 
     With ``r = det(C) / det(B)`` and ``d det(C) = <adj(C), dC>``::
@@ -43,7 +41,7 @@ def compensations_vjp(sharp: Floats, blurred: Floats, v_compensations: Floats) -
 
     Parameters
     ----------
-    sharp, blurred : ndarray of shape (N, 2, 2)
+    C, B : ndarray of shape (N, 2, 2)
         As for the forward function.
     v_compensations : ndarray of shape (N,)
         Derivative by rho.
@@ -53,10 +51,10 @@ def compensations_vjp(sharp: Floats, blurred: Floats, v_compensations: Floats) -
     ndarray of shape (N, 2, 2)
         Derivative by the four entries of C; symmetric.
     """
-    ratios = determinants(sharp) / determinants(blurred)
-    v_ratios = np.where(ratios > COMPENSATION_FLOOR**2, v_compensations / (2 * compensations(sharp, blurred)), 0)
-    v_dets = v_ratios / determinants(blurred)
-    return v_dets[:, None, None] * (adjugates(sharp) - ratios[:, None, None] * adjugates(blurred))
+    ratios = determinants(C) / determinants(B)
+    v_ratios = np.where(ratios > COMPENSATION_FLOOR**2, v_compensations / (2 * compensations(C, B)), 0)
+    v_dets = v_ratios / determinants(B)
+    return v_dets[:, None, None] * (adjugates(C) - ratios[:, None, None] * adjugates(B))
 
 
 def determinants(matrices: Floats) -> Floats:

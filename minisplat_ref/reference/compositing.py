@@ -4,14 +4,161 @@
 
     image = sum_g w_g c_g + T_end background,   alpha = 1 - T_end = sum_g w_g
 
-Left out: sorting per pixel; the order is that of the tile's list.
+``composite_hits`` does that for any :class:`~minisplat_ref.reference.hits.Response`; ``composite`` is 3DGS's.
 """
+
+from typing import Any
 
 import numpy as np
 
 from minisplat_ref.constants import MEDIAN_TRANSMITTANCE, Conventions
-from minisplat_ref.reference.hits import conic_matrices, goes_on, tile_hits
-from minisplat_ref.types import BlendStats, CompositeGradient, Floats, Projection, RenderOutput, TileBins
+from minisplat_ref.reference.hits import CONIC, Response, goes_on, sorted_by, tile_hits, unsorted_by
+from minisplat_ref.types import (
+    BlendGradient,
+    BlendStats,
+    CompositeGradient,
+    Floats,
+    Projection,
+    RenderOutput,
+    TileBins,
+)
+
+
+def composite_hits(
+    response: Response,
+    primitives: Any,
+    colors: Floats,
+    background: Floats,
+    bins: TileBins,
+    conventions: Conventions,
+    *,
+    with_stats: bool = False,
+    with_median_depth: bool = False,
+) -> RenderOutput:
+    """Blend the primitives of every tile, each pixel in the order of its response.
+
+    Parameters
+    ----------
+    response : Response
+        What a primitive does to a pixel.
+    primitives : NamedTuple
+        What ``response`` takes.
+    colors : ndarray of shape (N, S)
+        D channels, or what ``response.shade`` makes them of.
+    background : ndarray of shape (D,)
+        Seen through what transmittance is left.
+    bins : TileBins
+        The primitives of each tile, nearest first.
+    conventions : Conventions
+        Clamp, skip and stop thresholds.
+    with_stats, with_median_depth : bool
+        As for :func:`composite`.
+
+    Returns
+    -------
+    RenderOutput
+        Image [H, W, D] and alpha [H, W], and what was asked for.
+    """
+    height, width, n, dtype = bins.grid.height, bins.grid.width, len(colors), colors.dtype
+    image = np.empty((height, width, len(background)), dtype=dtype)
+    alpha = np.empty((height, width), dtype=dtype)
+    median_depth = np.zeros((height, width), dtype=dtype) if with_median_depth else None
+    stats = _no_hits(n, height, width, dtype) if with_stats else None
+    for tile in tile_hits(primitives, bins, conventions, response):
+        ids, ys, xs, order = tile.ids, tile.ys, tile.xs, tile.order
+        weights = tile.alphas * unsorted_by(order, tile.transmittances[:-1])  # [G, P]
+        transmittance = tile.transmittances[-1]  # [P]
+        if response.shade is None:
+            light = weights.T @ colors[ids]  # [P, D]
+        else:
+            light = np.einsum("gp,gpd->pd", weights, response.shade(colors[ids], tile.hit.place))
+        image[ys, xs] = light + transmittance[:, None] * background
+        alpha[ys, xs] = 1 - transmittance
+        if median_depth is not None and len(ids):
+            is_beyond = tile.transmittances[1:] < MEDIAN_TRANSMITTANCE  # [G, P] from the hit on that crosses one half
+            crossing = np.argmax(is_beyond, axis=0)[None]
+            depths = sorted_by(crossing, sorted_by(order, tile.hit.depths))[0]
+            median_depth[ys, xs] = np.where(transmittance < MEDIAN_TRANSMITTANCE, depths, 0)
+        if stats is not None and len(ids):
+            stats.blend_weight_sum[ids] += weights.sum(axis=1)
+            stats.blend_weight_max[ids] = np.maximum(stats.blend_weight_max[ids], weights.max(axis=1))
+            stats.hit_count[ids] += (weights > 0).sum(axis=1, dtype=np.int32)
+            heaviest = np.argmax(sorted_by(order, weights), axis=0)  # the first, so the front-most, of equals
+            ids_in_order = sorted_by(order, np.broadcast_to(ids[:, None], weights.shape))  # [G, P]
+            dominant = np.where(weights.max(axis=0) > 0, sorted_by(heaviest[None], ids_in_order)[0], -1)
+            stats.dominant_ids[ys, xs] = dominant
+            np.add.at(stats.dominant_count, dominant[dominant >= 0], 1)
+    return RenderOutput(image, alpha, median_depth, stats)
+
+
+def composite_hits_vjp(
+    response: Response,
+    primitives: Any,
+    colors: Floats,
+    background: Floats,
+    bins: TileBins,
+    conventions: Conventions,
+    output: RenderOutput,
+    v_output: tuple[Floats, Floats],
+) -> BlendGradient:
+    """Gradient of :func:`composite_hits` with respect to what it blends.
+
+    For one pixel with ``v = v_image``: alpha is ``1 - T_end``, so the derivative with respect to ``T_end`` is
+    ``v . background - v_alpha``. And ``alpha_g`` multiplies its own light by ``T_g`` and, in every later T, what lies
+    behind by ``1 - alpha_g``::
+
+        v_c_g        = w_g v
+        v_background = T_end v
+        behind_g     = sum_{j behind g} w_j (c_j . v) + T_end (v . background - v_alpha)
+        v_alpha_g    = T_g (c_g . v) - behind_g / (1 - alpha_g)
+
+    From there the response's own derivatives lead on: ``v_alpha_g`` is 0 where alpha was clamped. The skip, the stop
+    and the order are treated as fixed: the image jumps there and has no derivative.
+
+    Parameters
+    ----------
+    response, primitives, colors, background, bins, conventions
+        As for the forward function.
+    output : RenderOutput
+        Its result for these inputs. Not needed here: kernels start from its alpha.
+    v_output : tuple of ndarray
+        Derivatives with respect to the image [H, W, D] and the accumulated opacity [H, W].
+
+    Returns
+    -------
+    BlendGradient
+        Zeros for primitives without hits.
+    """
+    v_image, v_alpha = v_output
+    v_fields = tuple(np.zeros_like(getattr(primitives, name)) for name in response.fields)
+    v_colors, v_background = np.zeros_like(colors), np.zeros_like(background)
+    for tile in tile_hits(primitives, bins, conventions, response):
+        ids, alphas, hit = tile.ids, tile.alphas, tile.hit
+        T = unsorted_by(tile.order, tile.transmittances[:-1])  # [G, P]
+        T_end = tile.transmittances[-1]  # [P]
+        v, c = v_image[tile.ys, tile.xs], colors[ids]  # [P, D], [G, S]
+        weights, v_place = alphas * T, None  # [G, P]
+        if response.shade is None or response.shade_vjp is None:
+            v_colors[ids] += weights @ v
+            light = c @ v.T  # [G, P] c_g . v
+        else:
+            v_c, v_place = response.shade_vjp(c, hit.place, weights[:, :, None] * v)
+            v_colors[ids] += v_c
+            light = np.einsum("gpd,pd->gp", response.shade(c, hit.place), v)
+        v_background += T_end @ v
+
+        v_T_end = v @ background - v_alpha[tile.ys, tile.xs]  # [P]
+        in_front = sorted_by(tile.order, weights * light)
+        behind = unsorted_by(tile.order, _sum_behind(in_front)) + T_end * v_T_end
+        v_alphas = np.where(alphas > 0, T * light - behind / (1 - alphas), 0)
+
+        v_shape = np.where(tile.is_clamped & conventions.clamp_stops_shape_gradient, 0, v_alphas)
+        v_mean = np.where(tile.is_clamped & conventions.clamp_stops_mean_gradient, 0, v_alphas)
+        for v_field, v_rows in zip(
+            v_fields, response.hit_vjp(primitives, ids, hit, v_mean, v_shape, v_place), strict=True
+        ):
+            v_field[ids] += v_rows
+    return BlendGradient(v_fields, v_colors, v_background)
 
 
 def composite(
@@ -48,31 +195,16 @@ def composite(
     RenderOutput
         Image [H, W, D] and alpha [H, W], and what was asked for.
     """
-    height, width, n = bins.grid.height, bins.grid.width, len(colors)
-    dtype = projection.means2d.dtype
-    image = np.empty((height, width, len(background)), dtype=dtype)
-    alpha = np.empty((height, width), dtype=dtype)
-    median_depth = np.zeros((height, width), dtype=dtype) if with_median_depth else None
-    stats = _no_hits(n, height, width, dtype) if with_stats else None
-    for tile in tile_hits(projection, bins, conventions):
-        ids, ys, xs = tile.ids, tile.ys, tile.xs
-        weights, transmittance = tile.alphas * tile.transmittances[:-1], tile.transmittances[-1]  # [G, P], [P]
-        image[ys, xs] = weights.T @ colors[ids] + transmittance[:, None] * background
-        alpha[ys, xs] = 1 - transmittance
-        if median_depth is not None:
-            is_beyond = tile.transmittances[1:] < MEDIAN_TRANSMITTANCE  # [G, P] from the hit on that crosses one half
-            crossing = np.argmax(is_beyond, axis=0) if len(ids) else np.zeros(len(ys), dtype=int)
-            has_crossing = transmittance < MEDIAN_TRANSMITTANCE
-            median_depth[ys[has_crossing], xs[has_crossing]] = projection.depths[ids[crossing[has_crossing]]]
-        if stats is not None and len(ids):
-            stats.blend_weight_sum[ids] += weights.sum(axis=1)
-            stats.blend_weight_max[ids] = np.maximum(stats.blend_weight_max[ids], weights.max(axis=1))
-            stats.hit_count[ids] += (weights > 0).sum(axis=1, dtype=np.int32)
-            heaviest = np.argmax(weights, axis=0)  # the first, so the front-most, of equals
-            dominant = np.where(weights.max(axis=0) > 0, ids[heaviest], -1)
-            stats.dominant_ids[ys, xs] = dominant
-            np.add.at(stats.dominant_count, dominant[dominant >= 0], 1)
-    return RenderOutput(image, alpha, median_depth, stats)
+    return composite_hits(
+        CONIC,
+        projection,
+        colors,
+        background,
+        bins,
+        conventions,
+        with_stats=with_stats,
+        with_median_depth=with_median_depth,
+    )
 
 
 def composite_vjp(
@@ -85,24 +217,11 @@ def composite_vjp(
     v_image: Floats,
     v_alpha: Floats,
 ) -> CompositeGradient:
-    """Gradient of :func:`composite` by image and alpha.
+    """Gradient of :func:`composite` with respect to what it takes.
 
-    For one pixel with ``v = v_image``: alpha is ``1 - T_end``, so the derivative by ``T_end`` is ``v . background -
-    v_alpha``. And ``alpha_g`` multiplies its own light by ``T_g`` and, in every later T, what lies behind by
-    ``1 - alpha_g``::
+    ::
 
-        v_c_g        = w_g v
-        v_background = T_end v
-        behind_g     = sum_{j > g} w_j (c_j . v) + T_end (v . background - v_alpha)
-        v_alpha_g    = T_g (c_g . v) - behind_g / (1 - alpha_g)
-
-    For one hit with ``alpha = o E``, ``E = exp(-sigma)``, ``sigma = d^T Q d / 2``::
-
-        v_o = E v_alpha_g,  v_sigma = -o E v_alpha_g          both 0 where alpha was clamped
-        v_p = v_sigma Q d
-        v_a = v_sigma dx^2 / 2,  v_b = v_sigma dx dy,  v_c = v_sigma dy^2 / 2
-
-    The skip, the stop and the order are treated as fixed: the image jumps there and has no derivative.
+        v_projection, v_colors, v_background = those of :func:`composite_hits_vjp`
 
     Parameters
     ----------
@@ -120,30 +239,9 @@ def composite_vjp(
     CompositeGradient
         Zeros for Gaussians without hits.
     """
-    n, dtype = len(colors), projection.means2d.dtype
-    v_means2d, v_conics, v_opacities = np.zeros((n, 2), dtype), np.zeros((n, 3), dtype), np.zeros(n, dtype)
-    v_colors, v_background = np.zeros_like(colors), np.zeros_like(background)
-    for tile in tile_hits(projection, bins, conventions):
-        ids, alphas, T = tile.ids, tile.alphas, tile.transmittances
-        v, c = v_image[tile.ys, tile.xs], colors[ids]  # [P, D], [G, D]
-        weights = alphas * T[:-1]  # [G, P]
-        v_colors[ids] += weights @ v
-        v_background += T[-1] @ v
-
-        light = c @ v.T  # [G, P] c_g . v
-        v_T_end = v @ background - v_alpha[tile.ys, tile.xs]  # [P]
-        behind = _sum_behind(weights * light) + T[-1] * v_T_end
-        v_alphas = np.where(alphas > 0, T[:-1] * light - behind / (1 - alphas), 0)
-
-        v_shape = np.where(tile.is_clamped & conventions.clamp_stops_shape_gradient, 0, v_alphas)
-        v_mean = np.where(tile.is_clamped & conventions.clamp_stops_mean_gradient, 0, v_alphas)
-        v_opacities[ids] += np.sum(tile.falloffs * v_shape, axis=1)
-        unclamped = projection.opacities[ids, None] * tile.falloffs  # [G, P] o E
-        Q = conic_matrices(projection.conics[ids])
-        v_means2d[ids] += np.einsum("gp,gij,gpj->gi", -unclamped * v_mean, Q, tile.offsets)
-        v_Q = np.einsum("gp,gpi,gpj->gij", -unclamped * v_shape / 2, tile.offsets, tile.offsets)
-        v_conics[ids] += np.column_stack([v_Q[:, 0, 0], 2 * v_Q[:, 0, 1], v_Q[:, 1, 1]])
-    return CompositeGradient(v_means2d, v_conics, v_opacities, v_colors, v_background)
+    v = composite_hits_vjp(CONIC, projection, colors, background, bins, conventions, output, (v_image, v_alpha))
+    v_means2d, v_conics, v_opacities = v.primitives
+    return CompositeGradient(v_means2d, v_conics, v_opacities, v.colors, v.background)
 
 
 def composite_all_pairs(

@@ -1,60 +1,14 @@
-"""Stage 7, optional: the depth map that the Gaussians of a view add up to, and which way its surface faces.
+"""Stage 7, optional: which way the surface faces that the depth map of a view shows.
 
-The blended depth divided by the accumulated opacity is the mean depth of what a pixel shows. Its pixels, lifted to
-points, make a surface whose normals are cross products of neighbouring differences, as in 2D Gaussian Splatting (Huang
-et al. 2024). Left out: the depth of the first or of the middle hit, which is sharper at edges and has no derivative by
-opacities.
+The pixels of a depth map, lifted to points, make a surface whose normals are cross products of neighbouring
+differences, as in 2D Gaussian Splatting (Huang et al. 2024). Left out: the last row and column of pixels, which lack
+a neighbour.
 """
 
 import numpy as np
 
-from minisplat_ref.constants import DEPTH_ALPHA_MIN
+from minisplat_ref.reference.pinhole import pinhole_rays
 from minisplat_ref.types import Bools, Camera, Floats
-
-
-def expected_depth(accumulated_depth: Floats, alpha: Floats) -> Floats:
-    """Mean depth of what a pixel shows: ``z = D / alpha`` with ``D = sum_g w_g z_g`` and ``alpha = sum_g w_g``.
-
-    Parameters
-    ----------
-    accumulated_depth : ndarray of shape (H, W)
-        D, the last channel of an image that was rendered with depth.
-    alpha : ndarray of shape (H, W)
-        Accumulated opacity.
-
-    Returns
-    -------
-    ndarray of shape (H, W)
-        Camera z, world units; 0 where nothing was hit.
-    """
-    is_hit = _is_hit(accumulated_depth, alpha)
-    return np.where(is_hit, accumulated_depth / np.where(is_hit, alpha, 1), 0)
-
-
-def expected_depth_vjp(accumulated_depth: Floats, alpha: Floats, v_depth: Floats) -> tuple[Floats, Floats]:
-    """Gradient of :func:`expected_depth`.
-
-    ::
-
-        v_D = v_z / alpha,  v_alpha = -v_z z / alpha           0 where nothing was hit
-
-    Parameters
-    ----------
-    accumulated_depth, alpha
-        As for the forward function.
-    v_depth : ndarray of shape (H, W)
-        Derivative by the depth.
-
-    Returns
-    -------
-    v_accumulated_depth : ndarray of shape (H, W)
-        Derivative by ``accumulated_depth``.
-    v_alpha : ndarray of shape (H, W)
-        Derivative by ``alpha``.
-    """
-    is_hit = _is_hit(accumulated_depth, alpha)
-    v_accumulated_depth = np.where(is_hit, v_depth / np.where(is_hit, alpha, 1), 0)
-    return v_accumulated_depth, -v_accumulated_depth * expected_depth(accumulated_depth, alpha)
 
 
 def depth_normals(depth: Floats, camera: Camera) -> Floats:
@@ -116,17 +70,10 @@ def depth_normals_vjp(depth: Floats, camera: Camera, v_normals: Floats) -> Float
     return np.sum(rays * v_points, axis=2)
 
 
-def _is_hit(accumulated_depth: Floats, alpha: Floats) -> Bools:
-    return (alpha > DEPTH_ALPHA_MIN) & (accumulated_depth > 0)
-
-
 def _rays(camera: Camera, depth: Floats) -> Floats:
     """Camera-frame directions [H, W, 3] of the pixel centres, with z equal to 1."""
     height, width = depth.shape
-    slopes_x = (np.arange(width) + 0.5 - camera.cx) / camera.fx
-    slopes_y = (np.arange(height) + 0.5 - camera.cy) / camera.fy
-    s, t = np.meshgrid(slopes_x, slopes_y)
-    return np.stack([s, t, np.ones_like(s)], axis=2).astype(depth.dtype)
+    return pinhole_rays(np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5, camera).astype(depth.dtype)
 
 
 def _cross_products(depth: Floats, camera: Camera) -> tuple[Floats, Floats, Floats, Bools]:

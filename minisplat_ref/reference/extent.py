@@ -7,14 +7,8 @@ that the square of half-side 3 sigma touches, whatever the opacity.
 
 import numpy as np
 
-from minisplat_ref.constants import Conventions
+from minisplat_ref.constants import INRIA_ROOT_MIN, INRIA_TILE, RADIUS_MAX, Conventions
 from minisplat_ref.types import Camera, Floats
-
-INRIA_TILE = 16  # pixels
-INRIA_ROOT_MIN = (
-    0.1  # px^4: the 3DGS code keeps the root of the discriminant away from zero, so a disc gets 0.3 px more
-)
-RADIUS_MAX = 2.0**30  # pixels; exact in float32 and fits int32
 
 
 def extents(

@@ -1,54 +1,180 @@
-"""Stage 5a: which Gaussians hit which pixels of a tile, how strongly, and what light is left in front of each hit.
+"""Stage 5a: which primitives hit which pixels of a tile, how strongly, and what light is left in front of each hit.
 
 3DGS equations (3) and (4), the volume rendering of Max (1995) with one sample per Gaussian::
 
     alpha_g = min(alpha_max, o_g exp(-d^T Q_g d / 2)),   d = p_g - pixel centre
-    T_g = prod_{j < g} (1 - alpha_j)
+    T_g = prod_{j before g} (1 - alpha_j)
 
-A tile is one array with hits g along the rows and pixels along the columns. Skipping a hit is ``alpha_g = 0``, which
-changes no product and no sum. Left out: any use of the 3D shape; a Gaussian is a flat ellipse here.
+What a primitive does to a pixel is a :class:`Response`. That of 3DGS is ``CONIC``: a Gaussian is a flat ellipse here,
+without any use of its 3D shape. Rays against 3D Gaussians, surfels, masks and pixel integrals are other responses.
+
+A tile is one array with hits along the rows and pixels along the columns. Skipping a hit is ``alpha_g = 0``, which
+changes no product and no sum. What stands before a hit is the list's order, that of the means' depths; or each pixel
+sorts its own hits by their depths on its ray, all of them or those that fit a buffer (StopThePop, Radl et al. 2024).
 """
 
-from collections.abc import Iterator
-from typing import NamedTuple
+import heapq
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.constants import Conventions
+from minisplat_ref.constants import LIST_ORDER, Conventions
 from minisplat_ref.types import Bools, Floats, Ints, Projection, TileBins
 
 
-class TileHits(NamedTuple):
-    """The hits of G Gaussians on the P pixels of one tile."""
+class Hit(NamedTuple):
+    """What G primitives do to P pixels."""
 
-    ids: Ints  # [G] front to back
-    ys: Ints  # [P] pixel rows
-    xs: Ints  # [P] pixel columns
+    unclamped: Floats  # [G, P] alpha before the clamp
+    depths: Floats  # [G, P] along the ray; only their order counts
+    place: Any  # where inside of the primitive, arrays [G, P, ...]: what colours and gradients depend on
+
+
+class Response(NamedTuple):
+    """What a primitive does to a pixel, and in which order a pixel takes its hits.
+
+    ``primitives`` are any bundle that the functions understand. Without ``shade`` a primitive has the same colour
+    everywhere, D numbers; with it, S coefficients become D channels at the place of the hit: a texture, spherical
+    harmonics on an ellipsoid, the depth on the ray. Where a primitive is missed, places have to be finite, too.
+    """
+
+    boxes: Callable[[Any], Ints]
+    """[N, 4] half-open pixels x0, y0, x1, y1: nothing is hit elsewhere."""
+    hit: Callable[[Any, Ints, Floats], Hit]
+    """(primitives, ids [G], pixel centres [P, 2]) -> hits."""
+    hit_vjp: Callable[[Any, Ints, Hit, Floats, Floats, Any], tuple[Floats, ...]]
+    """(primitives, ids, hits, v_mean [G, P], v_shape [G, P], v_place) -> an array [G, ...] for each of ``fields``.
+
+    ``v_mean`` and ``v_shape`` are the derivative with respect to ``unclamped`` for what moves the primitive, and for
+    all else: conventions may stop either at the clamp. ``v_place`` comes from ``shade_vjp``; None without it.
+    """
+    fields: tuple[str, ...]
+    """Names of the fields of ``primitives`` that have a derivative."""
+    shade: Callable[[Floats, Any], Floats] | None = None
+    """(coefficients [G, S], place) -> channels [G, P, D]."""
+    shade_vjp: Callable[[Floats, Any, Floats], tuple[Floats, Any]] | None = None
+    """(coefficients, place, v [G, P, D]) -> (v_coefficients [G, S], v_place)."""
+    buffer_size: int = LIST_ORDER
+    """Hits that a pixel holds back, of which it takes the nearest when they are complete: a k-buffer.
+
+    ``LIST_ORDER`` = 1 takes them as they come, ``EXACT_ORDER`` holds any number.
+    """
+
+
+class ConicPlace(NamedTuple):
+    """Where pixels lie in a projected Gaussian."""
+
     offsets: Floats  # [G, P, 2] Gaussian's centre minus pixel's centre, px
     falloffs: Floats  # [G, P] E = exp(-sigma)
-    is_clamped: Bools  # [G, P] o E > alpha_max
-    alphas: Floats  # [G, P] 0 where there is no hit
-    transmittances: Floats  # [G + 1, P] row g is T before hit g, the last row is T_end
 
 
-def tile_hits(projection: Projection, bins: TileBins, conventions: Conventions) -> Iterator[TileHits]:
-    """Evaluate the tiles of an image, one after the other.
+def conic_boxes(projection: Projection) -> Ints:
+    """Return the boxes of ``projection``, which stage 3 made."""
+    return projection.boxes
+
+
+def conic_hit(projection: Projection, ids: Ints, centers: Floats) -> Hit:
+    """Evaluate the flat ellipses of projected Gaussians.
 
     Parameters
     ----------
     projection : Projection
         Footprints and opacities.
+    ids : ndarray of shape (G,)
+        Which of them.
+    centers : ndarray of shape (P, 2)
+        Pixel centres, px.
+
+    Returns
+    -------
+    Hit
+        The depth is that of the mean, the same for all pixels.
+    """
+    offsets = projection.means2d[ids, None] - centers.astype(projection.means2d.dtype)  # [G, P, 2]
+    sigmas = np.einsum("gpi,gij,gpj->gp", offsets, conic_matrices(projection.conics[ids]), offsets) / 2
+    falloffs = np.exp(-np.maximum(sigmas, 0))
+    # A negative square is a rounding error.
+    unclamped = np.where(sigmas >= 0, projection.opacities[ids, None] * falloffs, 0)
+    depths = np.broadcast_to(projection.depths[ids, None], unclamped.shape)
+    return Hit(unclamped, depths, ConicPlace(offsets, falloffs))
+
+
+def conic_hit_vjp(
+    projection: Projection, ids: Ints, hit: Hit, v_mean: Floats, v_shape: Floats, v_place: None
+) -> tuple[Floats, Floats, Floats]:
+    """Gradient of :func:`conic_hit`, summed over the pixels.
+
+    With ``alpha = o E``, ``E = exp(-sigma)``, ``sigma = d^T Q d / 2``::
+
+        v_o = E v_alpha,  v_sigma = -o E v_alpha
+        v_p = v_sigma Q d
+        v_a = v_sigma dx^2 / 2,  v_b = v_sigma dx dy,  v_c = v_sigma dy^2 / 2
+
+    Parameters
+    ----------
+    projection, ids
+        As for the forward function.
+    hit : Hit
+        Its result.
+    v_mean, v_shape : ndarray of shape (G, P)
+        ``v_alpha`` as it reaches p, and as it reaches o and the conic.
+    v_place : None
+        The colours do not depend on the place.
+
+    Returns
+    -------
+    tuple
+        With respect to means2d [G, 2], conics [G, 3] and opacities [G].
+    """
+    offsets, falloffs = hit.place
+    unclamped = projection.opacities[ids, None] * falloffs  # [G, P] o E
+    Q = conic_matrices(projection.conics[ids])
+    v_means2d = np.einsum("gp,gij,gpj->gi", -unclamped * v_mean, Q, offsets)
+    v_Q = np.einsum("gp,gpi,gpj->gij", -unclamped * v_shape / 2, offsets, offsets)
+    v_conics = np.column_stack([v_Q[:, 0, 0], 2 * v_Q[:, 0, 1], v_Q[:, 1, 1]])
+    return v_means2d, v_conics, np.sum(falloffs * v_shape, axis=1)
+
+
+CONIC = Response(conic_boxes, conic_hit, conic_hit_vjp, ("means2d", "conics", "opacities"))
+"""3DGS: a projected Gaussian of one colour, in the order of the list."""
+
+
+class TileHits(NamedTuple):
+    """The hits of G primitives on the P pixels of one tile."""
+
+    ids: Ints  # [G] front to back
+    ys: Ints  # [P] pixel rows
+    xs: Ints  # [P] pixel columns
+    hit: Hit  # of all pixels, whether they count or not
+    is_clamped: Bools  # [G, P] unclamped > alpha_max
+    alphas: Floats  # [G, P] 0 where there is no hit
+    order: Ints | None  # [G, P] each pixel takes the primitive of row order[0] first; None: that of the list
+    transmittances: Floats  # [G + 1, P] row r is T before the r-th that a pixel takes, the last row is T_end
+
+
+def tile_hits(
+    primitives: Any, bins: TileBins, conventions: Conventions, response: Response = CONIC
+) -> Iterator[TileHits]:
+    """Evaluate the tiles of an image, one after the other.
+
+    Parameters
+    ----------
+    primitives : Projection
+        Footprints and opacities, or what ``response`` takes.
     bins : TileBins
-        The Gaussians of each tile, nearest first.
+        The primitives of each tile, nearest first.
     conventions : Conventions
         Clamp, skip and stop thresholds.
+    response : Response
+        What a primitive does to a pixel.
 
     Yields
     ------
     TileHits
         One per tile, in row-major order.
     """
-    grid, dtype = bins.grid, projection.means2d.dtype
+    grid, boxes = bins.grid, response.boxes(primitives)
     for t in range(grid.n_tiles_x * grid.n_tiles_y):
         ids = bins.gaussian_ids[bins.tile_offsets[t] : bins.tile_offsets[t + 1]]
         x, y = t % grid.n_tiles_x * grid.tile_width, t // grid.n_tiles_x * grid.tile_height
@@ -56,22 +182,70 @@ def tile_hits(projection: Projection, bins: TileBins, conventions: Conventions) 
         rows = np.arange(y, min(y + grid.tile_height, grid.height))
         ys, xs = (index.ravel() for index in np.meshgrid(rows, columns, indexing="ij"))
 
-        centers = np.stack([xs, ys], axis=1).astype(dtype) + dtype.type(0.5)  # [P, 2]
-        offsets = projection.means2d[ids, None] - centers  # [G, P, 2]
-        sigmas = np.einsum("gpi,gij,gpj->gp", offsets, conic_matrices(projection.conics[ids]), offsets) / 2
-        falloffs = np.exp(-np.maximum(sigmas, 0))
-        unclamped = projection.opacities[ids, None] * falloffs
-        alphas = np.minimum(conventions.alpha_max, unclamped)
-
-        x0, y0, x1, y1 = projection.boxes[ids, :, None].swapaxes(0, 1)  # [G, 1] each
-        is_hit = (x0 <= xs) & (xs < x1) & (y0 <= ys) & (ys < y1)
-        is_hit &= (sigmas >= 0) & (alphas >= conventions.alpha_min)  # a negative square is a rounding error
+        hit = response.hit(primitives, ids, np.stack([xs, ys], axis=1) + 0.5)
+        alphas = np.minimum(conventions.alpha_max, hit.unclamped)
+        x0, y0, x1, y1 = boxes[ids, :, None].swapaxes(0, 1)  # [G, 1] each
+        is_hit = (x0 <= xs) & (xs < x1) & (y0 <= ys) & (ys < y1) & (alphas >= conventions.alpha_min)
         alphas = np.where(is_hit, alphas, 0)
+        is_listed = response.buffer_size == LIST_ORDER
+        order = None if is_listed else blending_order(is_hit, hit.depths, response.buffer_size)
+
         # T never rises, so once a hit would take it below the threshold, that hit and all behind it are left out.
-        alphas = np.where(goes_on(_transmittances(alphas)[1:], conventions), alphas, 0)
-        yield TileHits(
-            ids, ys, xs, offsets, falloffs, unclamped > conventions.alpha_max, alphas, _transmittances(alphas)
-        )
+        in_order = sorted_by(order, alphas)
+        in_order = np.where(goes_on(_transmittances(in_order)[1:], conventions), in_order, 0)
+        alphas, is_clamped = unsorted_by(order, in_order), hit.unclamped > conventions.alpha_max
+        yield TileHits(ids, ys, xs, hit, is_clamped, alphas, order, _transmittances(in_order))
+
+
+def blending_order(is_hit: Bools, depths: Floats, buffer_size: int) -> Ints:
+    """Return for each pixel the rows of its tile's list in the order in which it takes them.
+
+    A pixel goes through the list and holds back ``buffer_size`` hits; when they are complete it takes the nearest, of
+    equals the first. What misses it takes no room.
+
+    Parameters
+    ----------
+    is_hit : ndarray of shape (G, P)
+        Which rows of the list hit which pixels; the others may come anywhere.
+    depths : ndarray of shape (G, P)
+        Along the pixel's ray.
+    buffer_size : int
+        ``LIST_ORDER`` to ``EXACT_ORDER``.
+
+    Returns
+    -------
+    ndarray of shape (G, P)
+        A permutation of the rows for each pixel.
+    """
+    n_rows, n_pixels = is_hit.shape
+    if buffer_size == LIST_ORDER:
+        return np.broadcast_to(np.arange(n_rows)[:, None], is_hit.shape)
+    if buffer_size >= n_rows:
+        return np.argsort(np.where(is_hit, depths, np.inf), axis=0, kind="stable")
+    order = np.empty((n_rows, n_pixels), dtype=int)
+    for pixel in range(n_pixels):
+        taken = np.flatnonzero(~is_hit[:, pixel]).tolist()
+        waiting: list[tuple[float, int]] = []
+        for row in np.flatnonzero(is_hit[:, pixel]).tolist():
+            heapq.heappush(waiting, (float(depths[row, pixel]), row))
+            if len(waiting) == buffer_size:
+                taken.append(heapq.heappop(waiting)[1])
+        order[:, pixel] = [*taken, *(row for _, row in sorted(waiting))]
+    return order
+
+
+def sorted_by(order: Ints | None, values: Any) -> Any:
+    """Return ``values`` [G, P] of the list's rows in the pixels' own ``order`` [G, P], if they have one."""
+    return values if order is None else np.take_along_axis(values, order, axis=0)
+
+
+def unsorted_by(order: Ints | None, values: Any) -> Any:
+    """Return ``values`` [G, P] in the pixels' own ``order`` [G, P] as rows of the list: undoes :func:`sorted_by`."""
+    if order is None:
+        return values
+    rows = np.empty_like(values)
+    np.put_along_axis(rows, order, values, axis=0)
+    return rows
 
 
 def _transmittances(alphas: Floats) -> Floats:

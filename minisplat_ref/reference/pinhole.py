@@ -10,8 +10,9 @@ from minisplat_ref.types import Camera, Floats
 
 
 def pose(camera: Camera, dtype: np.dtype) -> tuple[Floats, Floats]:
-    """Return R [3, 3] and t [3] of ``x = R mu + t`` in the dtype of the data; the camera's centre is ``-R^T t``."""
-    return np.asarray(camera.cam_from_world_R, dtype=dtype), np.asarray(camera.cam_from_world_t, dtype=dtype)
+    """Return R [3, 3] and t [3] of the camera's ``x = R mu + t`` in the dtype of the data."""
+    camera = camera.astype(dtype)
+    return camera.cam_from_world_R, camera.cam_from_world_t
 
 
 def pinhole(means_cam: Floats, camera: Camera) -> Floats:
@@ -51,6 +52,27 @@ def pinhole_vjp(means_cam: Floats, camera: Camera, v_means2d: Floats) -> Floats:
     """
     limits = np.full(2, np.inf, dtype=means_cam.dtype)
     return np.einsum("nki,nk->ni", pinhole_jacobians(means_cam, camera, -limits, limits), v_means2d)
+
+
+def pinhole_rays(xs: Floats | float, ys: Floats | float, camera: Camera) -> Floats:
+    """Directions of the rays through image positions, ``r = ((x - c_x) / f_x, (y - c_y) / f_y, 1)``.
+
+    :func:`pinhole` maps every point ``z r`` back to (x, y), and z is its depth.
+
+    Parameters
+    ----------
+    xs, ys : ndarray or float
+        Pixels, of shapes that broadcast; the centre of the first pixel is (0.5, 0.5).
+    camera : Camera
+        Focal lengths and principal point.
+
+    Returns
+    -------
+    ndarray of the broadcast shape and (3,)
+        Camera frame.
+    """
+    slopes = (xs - camera.cx) / camera.fx, (ys - camera.cy) / camera.fy
+    return np.stack(np.broadcast_arrays(*slopes, 1.0), axis=-1)
 
 
 def pinhole_jacobians(means_cam: Floats, camera: Camera, low: Floats, high: Floats) -> Floats:

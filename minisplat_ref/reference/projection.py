@@ -57,12 +57,12 @@ def project(
         Zeros in every field of a culled Gaussian.
     """
     camera = with_principal_point(camera, conventions)
-    means_cam, *_, sharp, blurred = _expand(means, quats, scales, camera, conventions)
-    means2d, depths, det = pinhole(means_cam, camera), means_cam[:, 2], determinants(blurred)
-    conics = _entries(adjugates(blurred) / det[:, None, None])
+    x, *_, C, B = _expand(means, quats, scales, camera, conventions)
+    means2d, depths, det = pinhole(x, camera), x[:, 2], determinants(B)
+    conics = _entries(adjugates(B) / det[:, None, None])  # of Q
     if conventions.is_antialiased:
-        opacities = opacities * compensations(sharp, blurred)
-    radii, boxes = extents(means2d, blurred, opacities, camera, conventions)
+        opacities = opacities * compensations(C, B)
+    radii, boxes = extents(means2d, B, opacities, camera, conventions)
 
     is_visible = (conventions.near_plane < depths) & (depths < conventions.far_plane)
     is_visible &= opacities >= conventions.alpha_min
@@ -119,18 +119,19 @@ def project_vjp(
     camera = with_principal_point(camera, conventions)
     rows = np.flatnonzero(projection.radii[:, 0] > 0)  # [V] visible
     v_means2d, v_depths, v_conics, v_opacities = (field[rows] for field in v_projection)
-    means_cam, J, Sigma, A, sharp, blurred = _expand(means[rows], quats[rows], scales[rows], camera, conventions)
+    x, J, Sigma, A, C, B = _expand(means[rows], quats[rows], scales[rows], camera, conventions)
     R, _ = pose(camera, means.dtype)
     low, high = slope_limits(camera, conventions, means.dtype)
 
-    Q = adjugates(blurred) / determinants(blurred)[:, None, None]
-    v_C = -Q @ _symmetric(v_conics * np.array([1, 0.5, 1], dtype=means.dtype)) @ Q
+    Q = adjugates(B) / determinants(B)[:, None, None]
+    v_B = -Q @ _symmetric(v_conics * np.array([1, 0.5, 1], dtype=means.dtype)) @ Q
+    v_C = v_B  # B = C + eps I
     if conventions.is_antialiased:
-        v_C += compensations_vjp(sharp, blurred, opacities[rows] * v_opacities)
-        v_opacities = v_opacities * compensations(sharp, blurred)
+        v_C = v_B + compensations_vjp(C, B, opacities[rows] * v_opacities)
+        v_opacities = v_opacities * compensations(C, B)
     v_A = 2 * v_C @ A @ Sigma  # [V, 2, 3]
     v_Sigma = np.swapaxes(A, 1, 2) @ v_C @ A
-    v_x = pinhole_vjp(means_cam, camera, v_means2d) + pinhole_jacobians_vjp(means_cam, camera, low, high, v_A @ R.T)
+    v_x = pinhole_vjp(x, camera, v_means2d) + pinhole_jacobians_vjp(x, camera, low, high, v_A @ R.T)
     v_x[:, 2] += v_depths
     v_quats, v_scales = covariances_vjp(quats[rows], scales[rows], v_Sigma)
     return PrimitiveGradient(
@@ -148,12 +149,13 @@ def _expand(
 ) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
     """Return x [N, 3], J [N, 2, 3], Sigma [N, 3, 3], A [N, 2, 3], C and B [N, 2, 2] of :func:`project`."""
     R, t = pose(camera, means.dtype)
-    means_cam = means @ R.T + t
-    J = pinhole_jacobians(means_cam, camera, *slope_limits(camera, conventions, means.dtype))
+    x = means @ R.T + t
+    J = pinhole_jacobians(x, camera, *slope_limits(camera, conventions, means.dtype))
     Sigma = covariances(quats, scales)
     A = J @ R
-    sharp = A @ Sigma @ np.swapaxes(A, 1, 2)
-    return means_cam, J, Sigma, A, sharp, sharp + conventions.eps2d * np.eye(2, dtype=means.dtype)
+    C = A @ Sigma @ np.swapaxes(A, 1, 2)
+    B = C + conventions.eps2d * np.eye(2, dtype=means.dtype)
+    return x, J, Sigma, A, C, B
 
 
 def _entries(symmetric: Floats) -> Floats:

@@ -1,6 +1,6 @@
 """Stage 3: a Gaussian's colour as seen from the camera.
 
-3DGS section 5.2: each channel is a sum of real spherical harmonics of the viewing direction, up to degree 3. Left out:
+3DGS section 3: each channel is a sum of real spherical harmonics of the viewing direction, up to degree 3. Left out:
 the conversion from sRGB (3DGS blends in sRGB as it is).
 """
 

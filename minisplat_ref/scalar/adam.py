@@ -1,12 +1,24 @@
 """Adam for one value, or for eight as lanes (Kingma and Ba 2015)."""
 
+from typing import NamedTuple
+
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import sqrt
 
 
+class Step(NamedTuple):
+    """An :class:`~minisplat_ref.types.AdamStep` in the data's dtype."""
+
+    rate: float
+    keep1: float
+    """1 - beta1, likewise below."""
+    keep2: float
+    eps: float
+
+
 @scalar
-def adam_value(value, gradient, first, second, rate, keep1, keep2, eps):
-    """Return the value and both moments one step on; ``keep1`` and ``keep2`` are 1 - beta1 and 1 - beta2."""
-    first = first + keep1 * (gradient - first)
-    second = second + keep2 * (gradient * gradient - second)
-    return value - rate * first / (sqrt(second) + eps), first, second
+def adam_value(value, gradient, first, second, step):
+    """Return the value and both moments one step on."""
+    first = first + step.keep1 * (gradient - first)
+    second = second + step.keep2 * (gradient * gradient - second)
+    return value - step.rate * first / (sqrt(second) + step.eps), first, second

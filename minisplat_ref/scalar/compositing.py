@@ -81,6 +81,35 @@ def blend(transmittance, unclamped, frame):
 
 
 @scalar
+def blend_vjp(transmittance, weight, unclamped, behind, light, frame):
+    """Gradient of the loss with respect to the alpha of one hit, as if it were not clamped.
+
+    With S the part of <v, image> that is composited behind the hit, background and alpha channel included, the image is
+    ... + T alpha c + (1 - alpha) (S / (1 - alpha)), so that dL/dalpha = T <v, c> - S / (1 - alpha).
+
+    Parameters
+    ----------
+    transmittance : lanes
+        T before the hit.
+    weight : lanes
+        alpha T, 0 where the hit was skipped.
+    unclamped : lanes
+        alpha before the clamp.
+    behind : lanes
+        S.
+    light : lanes
+        <v, c>.
+
+    Returns
+    -------
+    lanes
+        dL/dalpha, 0 where the hit was skipped.
+    """
+    alpha = smaller(unclamped, frame.alpha_max)
+    return select(weight > ZERO, transmittance * light - behind / (ONE - alpha), ZERO)
+
+
+@scalar
 def sigma_vjp(transmittance, weight, unclamped, behind, shade, frame):
     """Gradient of the loss by the sigma of one hit, where alpha is not clamped.
 

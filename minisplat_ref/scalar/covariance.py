@@ -54,8 +54,10 @@ def rotation_vjp(w, x, y, z, v):
 
 
 @scalar
-def normalized_vjp(w, x, y, z, inverse_length, v_w, v_x, v_y, v_z):
-    """Chain through q / |q|: the part of the cotangent along the unit quaternion (w, x, y, z) is lost."""
+def normalized_vjp(unit, inverse_length, v_unit):
+    """Chain through q / |q|: the part of the cotangent along the unit quaternion is lost."""
+    w, x, y, z = unit
+    v_w, v_x, v_y, v_z = v_unit
     along = w * v_w + x * v_x + y * v_y + z * v_z
     return (
         (v_w - along * w) * inverse_length,

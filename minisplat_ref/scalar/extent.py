@@ -3,6 +3,8 @@
 The numbers are whole but floats. They are clamped to the image, so that a cast to integers is defined.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from minisplat_ref.jit.compile import scalar
@@ -12,6 +14,18 @@ from minisplat_ref.jit.literals import HALF, ONE, THREE, TWO, ZERO
 INRIA_TILE = 16  # px; INRIA's rule is stated in tiles of this size
 INRIA_ROOT_MIN = 0.1  # px^4; floor of (lambda_1 - lambda_2)^2 / 4 in INRIA's largest eigenvalue
 RADIUS_MAX = np.float32(1 << 24)  # px; covers any image, survives the cast to int32, and is exact in float32
+
+
+class Extent(NamedTuple):
+    """How far Gaussians reach, and the image that their boxes are cut to."""
+
+    alpha_min: np.floating
+    """In the data's dtype."""
+    has_full_support: bool
+    """As far as alpha can be ``alpha_min``; otherwise by INRIA's rule."""
+    width: int
+    """Of the image, pixels."""
+    height: int
 
 
 @scalar

@@ -17,6 +17,16 @@ from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import larger, select, smaller, sqrt
 from minisplat_ref.jit.literals import HALF, ONE, TWO, ZERO
 from minisplat_ref.scalar.covariance import normalized, normalized_vjp, rotation, rotation_vjp
+from minisplat_ref.types import Floats
+
+
+class Pose(NamedTuple):
+    """Where a camera is: a point x of the world has the camera coordinates R (x - centre)."""
+
+    R: Floats
+    """[3, 3] float64."""
+    centre: Floats
+    """[3] float64, world units."""
 
 
 class Lens(NamedTuple):
@@ -256,5 +266,4 @@ def axes_vjp(quat, scale, v_M):
         (v_M[1][0] * scale[0], v_M[1][1] * scale[1], v_M[1][2] * scale[2]),
         (v_M[2][0] * scale[0], v_M[2][1] * scale[1], v_M[2][2] * scale[2]),
     )
-    v_qw, v_qx, v_qy, v_qz = rotation_vjp(qw, qx, qy, qz, v_r)
-    return normalized_vjp(qw, qx, qy, qz, inverse_length, v_qw, v_qx, v_qy, v_qz), v_scale
+    return normalized_vjp((qw, qx, qy, qz), inverse_length, rotation_vjp(qw, qx, qy, qz, v_r)), v_scale

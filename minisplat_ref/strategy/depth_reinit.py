@@ -23,9 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from minisplat_ref.backends import CPU, Backend
-from minisplat_ref.constants import DEPTH_ALPHA_MIN, GSPLAT_MAIN, Conventions
+from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
-from minisplat_ref.reference.pinhole import with_principal_point
+from minisplat_ref.reference.depth import expected_depth
+from minisplat_ref.reference.pinhole import pinhole_rays, with_principal_point
 from minisplat_ref.rendering import SPLATTING, Renderer, Request, as_model
 from minisplat_ref.strategy.simplify import sample
 from minisplat_ref.types import Bools, Camera, Floats, Ints, View
@@ -116,7 +117,7 @@ def blended_points(
     request = Request(sh_degree=0, conventions=conventions, backend=backend, wants=frozenset({"depth"}))
     output, _ = renderer.render(as_model(model), view, request)
     sums = output.image[..., renderer.channels(request.wants)["depth"]][..., 0]  # [H, W]
-    depths = sums / np.maximum(output.alpha, output.alpha.dtype.type(DEPTH_ALPHA_MIN))  # [H, W]
+    depths = expected_depth(sums, output.alpha)  # [H, W]
     return _on_rays(depths, output.alpha, view.camera, conventions)
 
 
@@ -198,7 +199,7 @@ def reinitial_points(
                 weights[unsure] = 0
             else:
                 rays = _rays(view_points[unsure], cameras[i])
-                view_points[unsure] = _centre(cameras[i]) + backdrop_distance * rays
+                view_points[unsure] = cameras[i].center + backdrop_distance * rays
         n = min(n_points // len(views), int(np.count_nonzero(weights)))
         pixels = sample(weights, n, rng) if n > 0 else np.zeros(0, np.intp)
         points.append(view_points[pixels])
@@ -224,9 +225,8 @@ def unprojected(depths: Floats, camera: Camera) -> Floats:
         World frame; the camera's centre where the depth is 0.
     """
     height, width = depths.shape
-    x, y = (np.arange(width) + 0.5 - camera.cx) / camera.fx, (np.arange(height) + 0.5 - camera.cy) / camera.fy
-    slopes = np.stack(np.broadcast_arrays(x, y[:, None], 1.0), axis=-1)  # [H, W, 3]
-    return (depths[:, :, None] * slopes - camera.cam_from_world_t) @ camera.cam_from_world_R  # rows of R^T (x - t)
+    rays = pinhole_rays(np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5, camera)  # [H, W, 3]
+    return (depths[:, :, None] * rays - camera.cam_from_world_t) @ camera.cam_from_world_R  # rows of R^T (x - t)
 
 
 def _on_rays(depths: Floats, alpha: Floats, camera: Camera, conventions: Conventions) -> PixelPoints:
@@ -271,13 +271,8 @@ def _partners(points: Floats, own_id: int, cameras: Sequence[Camera]) -> Ints:
 
 def _rays(points: Floats, camera: Camera) -> Floats:
     """Return the unit vectors [P, 3] from the camera's centre to points [P, 3]."""
-    rays = points - _centre(camera)
+    rays = points - camera.center
     return rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), np.finfo(rays.dtype).tiny)
-
-
-def _centre(camera: Camera) -> Floats:
-    """Return the camera's centre [3], world frame."""
-    return -camera.cam_from_world_R.T @ camera.cam_from_world_t
 
 
 def _project(points: Floats, camera: Camera) -> tuple[Floats, Ints]:

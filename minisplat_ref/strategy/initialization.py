@@ -123,7 +123,7 @@ def random_points(cameras: Sequence[Camera], extent: float, n: int, rng: np.rand
     points : ndarray of shape (P, 3), float64
         P is at most ``n``.
     """
-    centres = np.array([-camera.cam_from_world_R.T @ camera.cam_from_world_t for camera in cameras])  # [C, 3]
+    centres = np.array([camera.center for camera in cameras])  # [C, 3]
     points = centres.mean(axis=0) + rng.uniform(-extent, extent, (n, 3))  # [n, 3]
     is_seen = np.zeros(n, bool)
     for camera in cameras:

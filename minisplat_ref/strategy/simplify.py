@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from minisplat_ref.constants import SH_C0
+from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.errors import InputError
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.strategy.clone_split import logit
@@ -27,7 +27,7 @@ from minisplat_ref.strategy.ops import Edit, keep, take
 from minisplat_ref.types import Floats, Gaussians, Ints
 
 COLOR_REACH = 10.0  # a difference of 1 in colour is as far as this many median distances to the nearest centre
-LARGEST_OPACITY = 0.99  # of a merged Gaussian: alpha is clamped here, so that more is neither seen nor trained
+LARGEST_OPACITY = GSPLAT_MAIN.alpha_max  # of a merged Gaussian: what is more is neither seen nor trained
 
 
 def intersection_preserving(importance: Floats, dominant_count: Ints) -> Floats:

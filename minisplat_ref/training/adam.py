@@ -16,7 +16,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 
 from minisplat_ref.backends import CPU, Backend
-from minisplat_ref.types import Floats, Ints
+from minisplat_ref.types import AdamStep, Floats, Ints
 
 Parameters = TypeVar("Parameters")  # a population, or a mapping of shared parameters
 
@@ -97,8 +97,8 @@ def adam_step(
     eps = rule.eps * (math.sqrt(1 - rule.beta2**step) if rule.has_bias_correction else 1.0)
     rows = visible_ids if rule.is_visible_only else None
     bundles = [fields_of(bundle) for bundle in (parameters, gradient, state.first, state.second)]
-    for name in bundles[0]:
+    for name, rate in ((name, rates[name]) for name in bundles[0]):
         arrays = (bundle[name] for bundle in bundles)
-        tables = (array.reshape(len(array), math.prod(array.shape[1:])) for array in arrays)  # [N, width] each
-        backend.adam_update(*tables, rows, rates[name] * correction, rule.beta1, rule.beta2, eps)
+        values, g, first, second = (a.reshape(len(a), math.prod(a.shape[1:])) for a in arrays)  # [N, width] each
+        backend.adam_update(values, g, first, second, rows, AdamStep(rate * correction, rule.beta1, rule.beta2, eps))
     return state._replace(step=step)

@@ -28,10 +28,11 @@ Ours, gsplat-torch and gsplat are given the reference's own input at every
 stage, so that an error stays where it arose. With the others, later differences
 may follow from the first, and are marked so.
 
-A pixel in which rounding decides a hit (alpha within 1e-6 of 1/255, or the
-transmittance as near to the stop threshold) is a candidate for a flip: its
-error is counted, neither failed nor averaged in. Boxes and tile lists that
-differ without changing the image are harmless.
+A pixel in which rounding decides a hit (alpha within 1e-6 of 1/255, the
+transmittance as near to the stop threshold, or two depths that float32 cannot
+tell apart) is a candidate for a flip: its error is counted, neither failed nor
+averaged in. Boxes and tile lists that differ without changing the image are
+harmless.
 """
 EPILOG = """\
 columns: largest and RMS error; the largest as a part of the largest value of the
@@ -90,9 +91,8 @@ def add_parser(checks: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compare every scene, print the table of stages."""
-    from minisplat_ref.oracle.comparison.choose import choose_renderer, choose_scenes
-    from minisplat_ref.oracle.comparison.report import as_report
-    from minisplat_ref.oracle.comparison.staged import compare_scene
+    from minisplat_ref.oracle.comparison.renderers import choose_renderer, choose_scenes
+    from minisplat_ref.oracle.comparison.staged import as_report, compare_scene
 
     renderer = choose_renderer(args.backend, args.dtype)
     scenes, left_out = choose_scenes(renderer, args.scene, args.against, args.profile)

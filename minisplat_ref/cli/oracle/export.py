@@ -36,7 +36,7 @@ def add_parser(checks: Commands) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write the folder and check it by reading it."""
     from minisplat_ref.oracle.golden.files import export, load
-    from minisplat_ref.oracle.golden.stages import golden_scenes
+    from minisplat_ref.oracle.golden.scenes import golden_scenes
 
     export(args.out, golden_scenes())
     scenes = load(args.out)

@@ -42,8 +42,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the cases, print the table and the worst of each kind."""
     from minisplat_ref.oracle.cases import as_markdown
     from minisplat_ref.oracle.hard_cases import GROUPS, HARD_CASES
-    from minisplat_ref.oracle.hard_cases.run import matching, run_hard_cases
-    from minisplat_ref.oracle.hard_cases.summary import by_group
+    from minisplat_ref.oracle.hard_cases.run import by_group, matching, run_hard_cases
 
     report = run_hard_cases(matching(HARD_CASES, args.only))
     exit_code = publish(report, args.json)

@@ -10,10 +10,10 @@ import numpy as np
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.compositing.backward import backward_kernel
 from minisplat_ref.cpu.compositing.exponential import exp_exact, exp_fast
-from minisplat_ref.cpu.compositing.forward import forward_kernel
+from minisplat_ref.cpu.compositing.forward import HitStats, forward_kernel
 from minisplat_ref.cpu.compositing.pair_sums import N_PAIR_STATS, slot_size, sum_pair_stats, sum_slots
 from minisplat_ref.cpu.compositing.records import records_of
-from minisplat_ref.cpu.compositing.tile_state import frame_of
+from minisplat_ref.cpu.compositing.tile_state import Pixels, frame_of, lists_of
 from minisplat_ref.cpu.memory import large_empty
 from minisplat_ref.jit.compile import n_threads
 from minisplat_ref.types import BlendStats, CompositeGradient, Floats, Projection, RenderOutput, TileBins
@@ -50,7 +50,7 @@ def composite_vjp(
 ) -> CompositeGradient:
     """Chain the gradient of the image to its inputs; see ``reference.compositing.composite_vjp``."""
     exp = _exponential(colors.dtype)
-    return composite_vjp_with(exp, projection, colors, background, bins, conventions, output, v_image, v_alpha)
+    return composite_vjp_with(exp, projection, colors, bins, conventions, output, v_image, v_alpha)
 
 
 def composite_with(
@@ -76,15 +76,11 @@ def composite_with(
         records,
         projection.depths,
         background,
-        bins.tile_offsets,
-        bins.gaussian_ids,
-        bins.slots,
+        lists_of(bins),
         n_threads(),
         frame_of(bins, conventions, dtype),
-        image.reshape(height * width, image.shape[2]),
-        alpha.reshape(-1),
-        slots,
-        (median_depth, dominant_ids),
+        Pixels(image.reshape(height * width, image.shape[2]), alpha.reshape(-1)),
+        HitStats(slots, median_depth, dominant_ids),
     )
     stats = None
     if with_stats:
@@ -99,7 +95,6 @@ def composite_vjp_with(
     exp: Callable,
     projection: Projection,
     colors: Floats,
-    background: Floats,
     bins: TileBins,
     conventions: Conventions,
     output: RenderOutput,
@@ -114,15 +109,11 @@ def composite_vjp_with(
     v_backgrounds = np.empty((len(bins.tile_offsets) - 1, n_channels))  # by tiles
     backward_kernel(exp, n_channels)(
         output.kept if output.kept is not None else records_of(projection, colors, conventions),
-        bins.tile_offsets,
-        bins.gaussian_ids,
-        bins.slots,
+        lists_of(bins),
         n_threads(),
         frame_of(bins, conventions, dtype),
-        output.image.reshape(n_pixels, n_channels),
-        output.alpha.ravel(),
-        v_image.reshape(n_pixels, n_channels),
-        v_alpha.ravel(),
+        Pixels(output.image.reshape(n_pixels, n_channels), output.alpha.ravel()),
+        Pixels(v_image.reshape(n_pixels, n_channels), v_alpha.ravel()),
         slots,
         v_backgrounds,
     )

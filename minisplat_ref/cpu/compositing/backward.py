@@ -37,11 +37,11 @@ from minisplat_ref.cpu.compositing.tile_rows import (
 from minisplat_ref.cpu.compositing.tile_state import (
     CHECK_EVERY,
     N_ROWS,
-    corner,
     open_rows,
     row_in_image,
     rows_of,
     start_tile,
+    tile_of,
     tiles_in_turn,
 )
 from minisplat_ref.cpu.gaussian_rows import rows_from
@@ -63,20 +63,22 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
     write_alphas = alpha_writer(exp)
 
     @scalar
-    def start_vjp(state, x0, y0, frame, image, alpha, v_image, v_alpha):
+    def start_vjp(state, tile, frame, pixels, v_pixels):
+        image, alpha = pixels
+        v_image, v_alpha = v_pixels
         as_data = state.dtype.type
         for row in range(N_ROWS):
-            x, y, n_pixels = row_in_image(row, x0, y0, frame)
+            x, y, n_pixels = row_in_image(row, tile.x0, tile.y0, frame)
             if n_pixels == 0:
                 continue  # as start_tile left it
             first = y * frame.width + x
-            pixels, is_inside = rows_from(first, first + n_pixels), counted(as_data(0)) < as_data(n_pixels)
-            behind = gather(v_alpha, pixels, 0) * (gather(alpha, pixels, 0) - ONE)  # alpha = 1 - T_final
+            rows, is_inside = rows_from(first, first + n_pixels), counted(as_data(0)) < as_data(n_pixels)
+            behind = gather(v_alpha, rows, 0) * (gather(alpha, rows, 0) - ONE)  # alpha = 1 - T_final
             place = row * row_size
             for k in range(n_channels):
-                v = gather(v_image, pixels, k)
+                v = gather(v_image, rows, k)
                 store(state, place + channels + k * WIDTH, select(is_inside, v, ZERO))
-                behind = behind + v * gather(image, pixels, k)
+                behind = behind + v * gather(image, rows, k)
             store(state, place + behind_place, behind)
 
     @scalar
@@ -93,7 +95,8 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
         return load(s, i + channels + k * WIDTH) if k < n_channels else filled(s.dtype.type(0))
 
     @scalar
-    def tile_vjp(s, scratch, further, records, ids, slots_of, frame, x0, y0, slots):
+    def tile_vjp(s, scratch, further, records, tile, frame, slots):
+        x0, y0, ids, slots_of = tile
         as_data = s.dtype.type
         zero = filled(as_data(0))
         is_open = open_rows(s, n_fields)
@@ -140,27 +143,33 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
                 qee = qee + shape_e * e
                 qey = qey + shape_e * dy
                 qyy = qyy + shape_y * dy
-            store(slots, place, sums_of(q_sum, qe, qy, qee, qey, qyy, v_red, v_green))
+            store(slots, place, sums_of((q_sum, qe, qy, qee, qey, qyy, v_red, v_green)))
             slots[place + N_MOMENTS + 2] = sum_of(v_blue)
             for k in range(N_FUSED, n_channels):
                 slots[place + N_MOMENTS + k] = sum_of(load(further, (k - N_FUSED) * WIDTH))
 
     @kernel()
     def composite_tiles_vjp(
-        records, offsets, ids, slots_of, n_threads, frame, image, alpha, v_image, v_alpha, slots, v_backgrounds
+        records,  # [N, 13 + D]
+        lists,  # TileLists
+        n_threads,
+        frame,
+        pixels,  # Pixels
+        v_pixels,  # Pixels
+        slots,  # [M * slot_width]
+        v_backgrounds,  # [n_tiles, D]
     ):
         taken = no_turns()
         for _ in prange(n_threads):
-            state = np.empty(N_ROWS * row_size, image.dtype)
-            scratch = np.empty(SCRATCH_SIZE, image.dtype)
+            state = np.empty(N_ROWS * row_size, pixels.image.dtype)
+            scratch = np.empty(SCRATCH_SIZE, pixels.image.dtype)
             start_scratch(scratch)
-            further = np.empty((slot_width - N_MOMENTS - N_FUSED) * WIDTH, image.dtype)  # sums of further channels
-            for tile in tiles_in_turn(taken, n_threads, offsets):
-                x0, y0 = corner(tile, frame)
-                start_tile(state, x0, y0, frame, n_fields)
-                start_vjp(state, x0, y0, frame, image, alpha, v_image, v_alpha)
-                tile_ids, tile_slots = ids[offsets[tile] : offsets[tile + 1]], slots_of[offsets[tile] :]
-                tile_vjp(state, scratch, further, records, tile_ids, tile_slots, frame, x0, y0, slots)
-                background_vjp(state, v_backgrounds[tile])
+            further = np.empty((slot_width - N_MOMENTS - N_FUSED) * WIDTH, pixels.image.dtype)  # further channels
+            for i in tiles_in_turn(taken, n_threads, lists.offsets):
+                tile = tile_of(i, lists, frame)
+                start_tile(state, tile.x0, tile.y0, frame, n_fields)
+                start_vjp(state, tile, frame, pixels, v_pixels)
+                tile_vjp(state, scratch, further, records, tile, frame, slots)
+                background_vjp(state, v_backgrounds[i])
 
     return composite_tiles_vjp

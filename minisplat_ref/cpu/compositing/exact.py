@@ -31,4 +31,4 @@ def composite_vjp(
     v_alpha: Floats,
 ) -> CompositeGradient:
     """Chain the gradient of the image to its inputs; see ``reference.compositing.composite_vjp``."""
-    return composite_vjp_with(exp_exact, projection, colors, background, bins, conventions, output, v_image, v_alpha)
+    return composite_vjp_with(exp_exact, projection, colors, bins, conventions, output, v_image, v_alpha)

@@ -9,6 +9,7 @@ What the weights of one Gaussian in one tile add up to goes into the slot of thi
 
 import functools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,11 +19,11 @@ from minisplat_ref.cpu.compositing.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_
 from minisplat_ref.cpu.compositing.tile_state import (
     CHECK_EVERY,
     N_ROWS,
-    corner,
     open_rows,
     row_in_image,
     rows_of,
     start_tile,
+    tile_of,
     tiles_in_turn,
 )
 from minisplat_ref.cpu.gaussian_rows import rows_from
@@ -31,8 +32,20 @@ from minisplat_ref.jit.lanes import WIDTH, filled, gather, larger, largest_of, l
 from minisplat_ref.jit.literals import ONE, ZERO
 from minisplat_ref.jit.turns import no_turns
 from minisplat_ref.scalar.compositing import blend
+from minisplat_ref.types import Floats, Ints
 
 MEDIAN = np.float32(MEDIAN_TRANSMITTANCE)  # one half: exact in float32
+
+
+class HitStats(NamedTuple):
+    """What is written about the hits; all of it empty where it is not asked for."""
+
+    slots: Floats
+    """[M, 3] sum of the weights, largest weight and number of hits of each pair, by slots."""
+    median_depth: Floats
+    """[H, W]."""
+    dominant_ids: Ints
+    """[H, W]."""
 
 
 @functools.cache
@@ -61,31 +74,34 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
         return load(state, place) if n_pixels == WIDTH else gather(state, rows_from(place, place + n_pixels), 0)
 
     @scalar
-    def store_tile(state, x0, y0, background, frame, image, alpha):
+    def store_tile(state, tile, background, frame, pixels):
+        image, alpha = pixels
         for row in range(N_ROWS):
-            x, y, n_pixels = row_in_image(row, x0, y0, frame)
+            x, y, n_pixels = row_in_image(row, tile.x0, tile.y0, frame)
             if n_pixels == 0:
                 continue
             first, place = y * frame.width + x, row * row_size
-            pixels = rows_from(first, first + n_pixels)
+            rows = rows_from(first, first + n_pixels)
             left = abs(pixels_of(state, place, n_pixels))
-            scatter(alpha, pixels, 0, ONE - left)
+            scatter(alpha, rows, 0, ONE - left)
             for k in range(n_channels):
                 color = pixels_of(state, place + channels + k * WIDTH, n_pixels)
-                scatter(image, pixels, k, color + left * background[k])
+                scatter(image, rows, k, color + left * background[k])
 
     @scalar
-    def store_stats(state, x0, y0, frame, tile_ids, median_depth, dominant_ids):
+    def store_stats(state, tile, frame, stats):
+        ids, median_depth, dominant_ids = tile.ids, stats.median_depth, stats.dominant_ids
         for row in range(N_ROWS):
-            x, y, n_pixels = row_in_image(row, x0, y0, frame)
+            x, y, n_pixels = row_in_image(row, tile.x0, tile.y0, frame)
             for i in range(n_pixels):
                 place = row * row_size + i
                 best_hit = np.int64(state[place + best_place])
-                dominant_ids[y, x + i] = tile_ids[best_hit - 1] if best_hit > 0 else -1
+                dominant_ids[y, x + i] = ids[best_hit - 1] if best_hit > 0 else -1
                 median_depth[y, x + i] = state[place + crossing]
 
     @scalar
-    def blend_tile(s, scratch, records, depths, ids, slots_of, frame, x0, y0, slots):
+    def blend_tile(s, scratch, records, depths, tile, frame, slots):
+        x0, y0, ids, slots_of = tile
         as_data = s.dtype.type
         zero = filled(as_data(0))
         is_open = open_rows(s, n_fields)
@@ -119,21 +135,26 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
 
     @kernel()
     def composite_tiles(
-        records, depths, background, offsets, ids, slots_of, n_threads, frame, image, alpha, slots, images
+        records,  # [N, 13 + D]
+        depths,  # [N]
+        background,  # [D]
+        lists,  # TileLists
+        n_threads,
+        frame,
+        pixels,  # Pixels
+        stats,  # HitStats
     ):
-        median_depth, dominant_ids = images
         taken = no_turns()
         for _ in prange(n_threads):
-            state = np.empty(N_ROWS * row_size, image.dtype)
-            scratch = np.empty(SCRATCH_SIZE, image.dtype)
+            state = np.empty(N_ROWS * row_size, pixels.image.dtype)
+            scratch = np.empty(SCRATCH_SIZE, pixels.image.dtype)
             start_scratch(scratch)
-            for tile in tiles_in_turn(taken, n_threads, offsets):
-                x0, y0 = corner(tile, frame)
-                start_tile(state, x0, y0, frame, n_fields)
-                tile_ids, tile_slots = ids[offsets[tile] : offsets[tile + 1]], slots_of[offsets[tile] :]
-                blend_tile(state, scratch, records, depths, tile_ids, tile_slots, frame, x0, y0, slots)
-                store_tile(state, x0, y0, background, frame, image, alpha)
+            for i in tiles_in_turn(taken, n_threads, lists.offsets):
+                tile = tile_of(i, lists, frame)
+                start_tile(state, tile.x0, tile.y0, frame, n_fields)
+                blend_tile(state, scratch, records, depths, tile, frame, stats.slots)
+                store_tile(state, tile, background, frame, pixels)
                 if has_stats:
-                    store_stats(state, x0, y0, frame, tile_ids, median_depth, dominant_ids)
+                    store_stats(state, tile, frame, stats)
 
     return composite_tiles

@@ -59,8 +59,14 @@ def _write_zeros(n, out):
 
 
 @kernel()
-def sum_slots(slots, width, offsets, projection, out):
-    """Write the gradients of all Gaussians; ``slots`` are flat."""
+def sum_slots(
+    slots,  # [M * width] flat
+    width,  # of a slot
+    offsets,  # [N + 1] Gaussian n owns the slots offsets[n]:offsets[n + 1]
+    projection,  # Projection
+    out,  # CompositeGradient
+):
+    """Write the gradients of all Gaussians."""
     n_gaussians = offsets.size - 1
     for chunk in prange(N_CHUNKS):
         sums = np.empty(WIDTH + 1, np.float64)
@@ -85,7 +91,11 @@ def _sum_pair_stats(n, slots, offsets, stats):
 
 
 @kernel()
-def sum_pair_stats(slots, offsets, stats):
+def sum_pair_stats(
+    slots,  # [M, 3]
+    offsets,  # [N + 1]
+    stats,  # BlendStats
+):
     """Write the weights' sums and maxima and the hit counts of all Gaussians."""
     n_gaussians = offsets.size - 1
     for chunk in prange(N_CHUNKS):

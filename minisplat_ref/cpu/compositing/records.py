@@ -70,7 +70,12 @@ def _write_part(first, end, projection, colors, alpha_min, records):
 
 
 @kernel()
-def _write_records(projection, colors, alpha_min, records):
+def _write_records(
+    projection,  # Projection
+    colors,  # [N, D]
+    alpha_min,
+    records,  # [N, 13 + D], D at least three
+):
     n = records.shape[0]
     for part in prange(N_CHUNKS):
         _write_part(n * part // N_CHUNKS, n * (part + 1) // N_CHUNKS, projection, colors, alpha_min, records)

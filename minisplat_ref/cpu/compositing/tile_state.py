@@ -6,6 +6,8 @@ The rows are numbered down a strip eight pixels wide, then down the next. Of eac
 memory, the transmittance first, then whatever a kernel keeps.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from minisplat_ref.constants import Conventions
@@ -15,12 +17,50 @@ from minisplat_ref.jit.lanes import WIDTH, any_of, counted, filled, load, lowest
 from minisplat_ref.jit.literals import ONE, ZERO
 from minisplat_ref.jit.turns import turns
 from minisplat_ref.scalar.compositing import Frame
-from minisplat_ref.types import TileBins
+from minisplat_ref.types import Floats, Ints, TileBins
 
 N_STRIPS = TILE_WIDTH // WIDTH
 N_ROWS = N_STRIPS * TILE_HEIGHT  # bits of an integer
 RANGES_PER_THREAD = 32
 CHECK_EVERY = 16  # hits between two looks at which pixels are finished
+
+
+class TileLists(NamedTuple):
+    """What kernels read of the tiles' lists; see :class:`~minisplat_ref.types.TileBins`."""
+
+    offsets: Ints
+    """[n_tiles + 1] tile t owns the pairs from offsets[t] to before offsets[t + 1]."""
+    ids: Ints
+    """[M] Gaussian of each pair."""
+    slots: Ints
+    """[M] slot of each pair."""
+
+
+class Tile(NamedTuple):
+    """One tile and its pairs."""
+
+    x0: int
+    """Column of its first pixel."""
+    y0: int
+    """Line of its first pixel."""
+    ids: Ints
+    """[m] Gaussian of each pair."""
+    slots: Ints
+    """[m or more] slot of each pair."""
+
+
+class Pixels(NamedTuple):
+    """All pixels of the image, line by line, or the gradient with respect to them."""
+
+    image: Floats
+    """[H * W, D]."""
+    alpha: Floats
+    """[H * W]."""
+
+
+def lists_of(bins: TileBins) -> TileLists:
+    """Return the lists without their grid."""
+    return TileLists(bins.tile_offsets, bins.gaussian_ids, bins.slots)
 
 
 def frame_of(bins: TileBins, conventions: Conventions, dtype: np.dtype) -> Frame:
@@ -71,6 +111,13 @@ def corner(tile, frame):
     """Return column and row of a tile's first pixel."""
     n_tiles_x = (frame.width + TILE_WIDTH - 1) // TILE_WIDTH
     return tile % n_tiles_x * TILE_WIDTH, tile // n_tiles_x * TILE_HEIGHT
+
+
+@scalar
+def tile_of(i, lists, frame):
+    """Return tile ``i``."""
+    x0, y0 = corner(i, frame)
+    return Tile(x0, y0, lists.ids[lists.offsets[i] : lists.offsets[i + 1]], lists.slots[lists.offsets[i] :])
 
 
 @scalar

@@ -17,6 +17,7 @@ are differences of moments, and of these smaller ones few digits cancel.
 
 import functools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,10 +26,24 @@ from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.jit.lanes import WIDTH, filled, load, select, store, sum_of
 from minisplat_ref.jit.literals import HALF, TWO, ZERO
 from minisplat_ref.scalar.loss import ssim_and_derivatives
+from minisplat_ref.types import Floats, Ints
 
 HALF_WINDOW = SSIM_WINDOW // 2
 N_RING = SSIM_WINDOW + 1  # rows that two windows cover
 PAD = 3 * HALF_WINDOW  # numbers of margin before an interleaved row, and at least as many behind it
+
+
+class Pictures(NamedTuple):
+    """An image and what it should look like, row by row."""
+
+    image: Floats
+    """[H, 3 W] interleaved RGB."""
+    target: Floats | Ints
+    """[H, 3 W] likewise, or bytes."""
+    unit: np.floating
+    """What a number of the target stands for, in the dtype of the image."""
+    counts: Floats
+    """[H, L] 1 where a number counts and 0 elsewhere; or one row [1, L] for all."""
 
 
 def row_length(width: int) -> int:
@@ -38,8 +53,9 @@ def row_length(width: int) -> int:
 
 
 @scalar
-def _pad_row(row, image, target, unit, counts, padded_image, padded_target):
+def _pad_row(row, pictures, padded_image, padded_target):
     """Copy a row of both images, less 1/2, between margins that are black; they are equal where they do not count."""
+    image, target, unit, counts = pictures
     if row < 0 or row >= image.shape[0]:
         padded_image[:] = -HALF
         padded_target[:] = -HALF
@@ -149,8 +165,9 @@ def loss_kernel(dtype: np.dtype) -> Callable:
             v_row[i] = s[3 * length + i]
 
     @scalar
-    def loss_band(start, end, image, target, unit, counts, v_l1, v_ssim, length, sums, v_image):
+    def loss_band(start, end, pictures, v_l1, v_ssim, sums, v_image):
         n_rows, n_values = v_image.shape
+        counts, length = pictures.counts, pictures.counts.shape[1]
         images, targets = np.empty(N_RING * length, v_image.dtype), np.empty(N_RING * length, v_image.dtype)
         images[:] = targets[:] = -HALF
         ring, s = np.zeros(N_RING * 3 * length, v_image.dtype), np.empty(8 * length, v_image.dtype)
@@ -161,7 +178,7 @@ def loss_kernel(dtype: np.dtype) -> Callable:
                 row = y + HALF_WINDOW + half
                 place = row % N_RING * length
                 own = slice(place, place + length)
-                _pad_row(row, image, target, unit, counts, images[own], targets[own])
+                _pad_row(row, pictures, images[own], targets[own])
             if y < start - HALF_WINDOW:
                 continue
             _find_rows(y - HALF_WINDOW, length, places)
@@ -189,10 +206,17 @@ def loss_kernel(dtype: np.dtype) -> Callable:
                 vjp_row(images, targets, first, v_l1, v_ssim, length, own_s, v_image[row])
 
     @kernel()
-    def loss_rows(image, target, unit, counts, v_l1, v_ssim, n_bands, sums, v_image):
-        n_rows, length = len(sums), counts.shape[1]
+    def loss_rows(
+        pictures,  # Pictures
+        v_l1,
+        v_ssim,
+        n_bands,
+        sums,  # [H, 2] of |I - T| and of SSIM
+        v_image,  # [H, 3 W]
+    ):
+        n_rows = len(sums)
         for band in prange(n_bands):
             start, end = n_rows * band // n_bands, n_rows * (band + 1) // n_bands
-            loss_band(start, end, image, target, unit, counts, v_l1, v_ssim, length, sums, v_image)
+            loss_band(start, end, pictures, v_l1, v_ssim, sums, v_image)
 
     return loss_rows

@@ -22,6 +22,8 @@ from minisplat_ref.cpu.tiling.layers import (
     N_PARTS,
     TILES,
     Layers,
+    Scratch,
+    Screen,
     Survey,
     cut_layers,
     fill_layer,
@@ -29,18 +31,24 @@ from minisplat_ref.cpu.tiling.layers import (
     start_lists,
     survey_part,
 )
-from minisplat_ref.cpu.tiling.sorting import DIGIT_BITS
 from minisplat_ref.jit.compile import kernel, n_threads, prange
 from minisplat_ref.jit.lanes import WIDTH
 from minisplat_ref.jit.turns import no_turns, turns
-from minisplat_ref.types import Projection, TileBins, TileGrid
+from minisplat_ref.types import Ints, Projection, TileBins, TileGrid
 
 __all__ = ["ELLIPSE_MARGIN", "TILE_HEIGHT", "TILE_WIDTH", "bin_gaussians"]
 
 
 @kernel()
 def _list_tiles(
-    projection, keys, alpha_min, n_tiles_x, survey, layers, offsets, counts, first_slots, tile_offsets, scratch, digits
+    projection,  # Projection
+    screen,
+    survey,  # Survey
+    layers,  # Layers
+    offsets,  # [N + 1]
+    counts,  # [threads, N_PARTS * n_tiles] zeros
+    tile_offsets,  # [n_tiles + 1]
+    scratch,  # Scratch
 ):
     """Write the offsets; return the lists and the slots of their pairs. The three passes are one kernel."""
     n_threads = len(counts)
@@ -54,15 +62,16 @@ def _list_tiles(
     taken = no_turns()
     for thread in prange(n_threads):
         for part in turns(taken, N_PARTS):
-            list_part(part, survey, projection, keys, alpha_min, n_tiles_x, layers, cells, offsets, counts[thread])
+            list_part(part, survey, projection, screen, layers, cells, offsets, counts[thread])
+    first_slots = np.empty(N_PARTS, np.int64)
     start_lists(counts, offsets, first_slots, tile_offsets)
 
     lists = np.empty((2, tile_offsets[-1]), np.int32)
     taken = no_turns()
-    for thread in prange(n_threads):
+    for _ in prange(n_threads):
         for turn in turns(taken, N_PARTS):
             layer = turn % 2 * (N_PARTS // 2) + turn // 2  # neighbours share cache lines: far apart in time
-            fill_layer(layer, layers, cells, first_slots, offsets, scratch, digits[thread], counts[0], lists)
+            fill_layer(layer, layers, cells, first_slots, offsets, scratch, counts[0], lists)
     return lists
 
 
@@ -73,9 +82,10 @@ def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventio
     ``conventions.alpha_min``; a box within one row or one column of tiles is not looked at so closely.
     """
     n, n_tiles, dtype = len(projection.depths), grid.n_tiles_x * grid.n_tiles_y, projection.depths.dtype
-    keys = projection.depths.view(np.int32 if dtype == np.float32 else np.int64)
-    alpha_min = dtype.type(conventions.alpha_min)
+    keys: Ints = projection.depths.view(np.int32 if dtype == np.float32 else np.int64)
+    screen = Screen(grid.n_tiles_x, n_tiles, dtype.type(conventions.alpha_min))
     survey = Survey(
+        keys,
         np.empty((N_PARTS, CULLED + 2), np.int64),
         np.empty(n, np.int16),
         np.empty((N_PARTS, 2, n // N_PARTS + 2 * WIDTH), np.int32),
@@ -88,11 +98,7 @@ def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventio
     )
     offsets, tile_offsets = np.empty(n + 1, np.int64), np.empty(n_tiles + 1, np.int64)
     offsets[0] = 0
-    counts, first_slots = np.zeros((n_threads(), N_PARTS * n_tiles), np.int32), np.empty(N_PARTS, np.int64)
-    scratch = (np.empty(n, np.int32), np.empty_like(keys), np.empty(n, np.int32))
-    digits = np.empty((n_threads(), 2, 1 << DIGIT_BITS), np.int32)
-    ids, slots = _list_tiles(
-        projection, keys, alpha_min, grid.n_tiles_x, survey, layers, offsets, counts, first_slots, tile_offsets,
-        scratch, digits,
-    )  # fmt: skip
+    counts = np.zeros((n_threads(), N_PARTS * n_tiles), np.int32)
+    scratch = Scratch(np.empty(n, np.int32), np.empty_like(keys), np.empty(n, np.int32))
+    ids, slots = _list_tiles(projection, screen, survey, layers, offsets, counts, tile_offsets, scratch)
     return TileBins(ids, tile_offsets, slots, offsets, grid)

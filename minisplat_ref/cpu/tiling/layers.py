@@ -11,7 +11,7 @@ import numpy as np
 
 from minisplat_ref.cpu.gaussian_rows import listed_rows
 from minisplat_ref.cpu.tiling.footprints import SPARE, outlines, tiles_of_box, write_line, write_spans, write_wide
-from minisplat_ref.cpu.tiling.sorting import sort_stably
+from minisplat_ref.cpu.tiling.sorting import DIGIT_BITS, sort_stably
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import WIDTH, prefetch
 from minisplat_ref.types import Ints
@@ -28,8 +28,20 @@ ID, FIRST, COUNT, SLOT = range(4)  # columns of an entry: a Gaussian, its cells,
 FETCH_AHEAD = 8  # entries
 
 
+class Screen(NamedTuple):
+    """The tiles of the image, and the alpha below which nothing is seen."""
+
+    n_tiles_x: int
+    n_tiles: int
+    alpha_min: np.floating
+    """In the data's dtype."""
+
+
 class Survey(NamedTuple):
-    """What the first pass learns of each part."""
+    """What the first pass learns of each part, and the depths as integers."""
+
+    keys: Ints
+    """[N] bits of the depths: positive floats are ordered as their bits are."""
 
     up_to: Ints
     """[N_PARTS, CULLED + 2] Gaussians of each part below each bucket, and 2^32 times the tiles under their boxes, so
@@ -53,9 +65,20 @@ class Layers(NamedTuple):
     edges: Ints
     """[(N_PARTS + 1) * N_PARTS + 1, 2] where the Gaussians of each layer and part start, and their cells; the ends."""
     keys: Ints
-    """[N] bits of the depths: positive floats are ordered as their bits are."""
+    """[N] those of the survey."""
     entries: Ints
     """[N, 4] int32."""
+
+
+class Scratch(NamedTuple):
+    """Memory for the sorting of a layer."""
+
+    places: Ints
+    """[N] int32."""
+    other_keys: Ints
+    """[N] of the dtype of the keys."""
+    other_places: Ints
+    """[N] int32."""
 
 
 @scalar
@@ -138,8 +161,9 @@ def cut_layers(up_to, of_buckets, edges):
 
 
 @scalar
-def _write_wide(part, survey, projection, alpha_min, n_tiles_x, n_tiles, layers, cells, cursors, wide):
+def _write_wide(part, survey, projection, screen, layers, cells, cursors, wide):
     """Write the cells of the wide boxes of a part, eight at a time; ``wide`` gets the first of each and the end."""
+    n_tiles_x, n_tiles, alpha_min = screen
     start, _ = part_of(projection.depths.size, part)
     spans = np.empty(2 * WIDTH * (n_tiles // n_tiles_x), projection.depths.dtype)
     for kind in (SQUARES, OTHERS):
@@ -161,12 +185,13 @@ def _write_wide(part, survey, projection, alpha_min, n_tiles_x, n_tiles, layers,
 
 
 @scalar
-def list_part(part, survey, projection, keys, alpha_min, n_tiles_x, layers, cells, offsets, counts):
+def list_part(part, survey, projection, screen, layers, cells, offsets, counts):
     """Enter each Gaussian of a part into its layer, and count the pairs of each cell."""
+    keys, boxes, entries = survey.keys, projection.boxes, layers.entries
+    n_tiles_x, n_tiles = screen.n_tiles_x, screen.n_tiles
     start, end = part_of(keys.size, part)
-    boxes, entries, n_tiles = projection.boxes, layers.entries, counts.size // N_PARTS
     cursors, wide = layers.edges[part:-1:N_PARTS].copy(), np.empty((end - start, 2), np.int32)
-    _write_wide(part, survey, projection, alpha_min, n_tiles_x, n_tiles, layers, cells, cursors, wide)
+    _write_wide(part, survey, projection, screen, layers, cells, cursors, wide)
     slot = 0
     for n in range(start, end):  # without branches: what can be seen cannot be foreseen either
         column, row, n_columns, n_rows = tiles_of_box(boxes, n)
@@ -230,13 +255,29 @@ def start_lists(counts, offsets, first_slots, tile_offsets):
 
 
 @scalar
-def fill_layer(layer, layers, cells, first_slots, offsets, scratch, digits, starts, lists):
+def fill_layer(layer, layers, cells, first_slots, offsets, scratch, starts, lists):
     """Sort one layer and write its pairs; and complete the offsets of the part of the same number.
 
-    ``scratch`` are places, keys and other places, each as long as the input; ``lists`` [2, M] gets Gaussians and slots.
+    Parameters
+    ----------
+    layer : int
+        Its number.
+    layers : Layers
+        Their edges, keys and entries.
+    cells : ndarray of shape (pairs and what is left over,)
+        Those of the entries.
+    first_slots, offsets : ndarrays of shapes (N_PARTS,) and (N + 1,)
+        First slot of each part, and pairs of the part up to each Gaussian; to the latter the former is added.
+    scratch : Scratch
+        Overwritten, where the layer and the part have their Gaussians.
+    starts : ndarray of shape (N_PARTS * n_tiles,)
+        Where each cell goes on in the lists; those of the layer move to their ends.
+    lists : ndarray of shape (2, M)
+        Receives Gaussians and slots.
     """
     edges, entries = layers.edges[:, GAUSSIANS], layers.entries
     places, other_keys, other_places = scratch
+    digits = np.empty((2, 1 << DIGIT_BITS), np.int32)
     ids, slots = lists[0], lists[1]
     start, end = part_of(other_keys.size, layer)
     for i in range(start, end):

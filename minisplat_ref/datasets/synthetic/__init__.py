@@ -12,7 +12,7 @@ import numpy as np
 from minisplat_ref.datasets.synthetic.cameras import orbit_cameras
 from minisplat_ref.datasets.synthetic.scenes import SETTINGS
 from minisplat_ref.datasets.synthetic.sparse_points import sample_points
-from minisplat_ref.datasets.synthetic.tracer import TracedView, World, camera_centre, trace_view
+from minisplat_ref.datasets.synthetic.tracer import TracedView, World, trace_view
 from minisplat_ref.errors import InputError
 from minisplat_ref.types import Bools, Camera, Floats, Scene, View
 
@@ -89,7 +89,16 @@ def make_scene(
     InputError
         An unknown name or a number out of range.
     """
-    _check(name, n_views, width, height, seed, supersampling, n_points, point_noise, test_every)
+    if name not in SETTINGS:
+        raise InputError(f"there is no synthetic scene {name!r}; choose one of {', '.join(SCENE_NAMES)}")
+    _at_least(0, seed=seed, n_points=n_points, test_every=test_every)
+    _at_least(1, supersampling=supersampling)
+    _at_least(2, n_views=n_views)
+    _at_least(8, width=width, height=height)
+    if test_every == 1:
+        raise InputError("test_every is 1, which leaves nothing to train on; give 0 for no test views, or 2 or more")
+    if not (0.0 <= point_noise < np.inf):
+        raise InputError(f"point_noise is {point_noise}; give a finite number of metres, 0 or more")
     scene_rng, camera_rng, point_rng = np.random.default_rng(seed).spawn(3)
     world, orbit = SETTINGS[name](scene_rng)
     n_total = n_views + (-(-n_views // (test_every - 1)) if test_every else 0)
@@ -102,7 +111,7 @@ def make_scene(
     points, colors, visibility = sample_points(
         world, [cameras[i] for i in train_ids], [traced[i] for i in train_ids], n_points, point_noise, point_rng
     )
-    train_centres = np.stack([camera_centre(cameras[i]) for i in train_ids])  # [V, 3]
+    train_centres = np.stack([cameras[i].center for i in train_ids])  # [V, 3]
     reach = np.linalg.norm(train_centres - train_centres.mean(axis=0), axis=1).max()
     seen = [np.flatnonzero(row) for row in visibility]  # of V views: the points that each sees
     scene = Scene(
@@ -127,32 +136,8 @@ def _stack_truth(traced: Sequence[TracedView], ids: Sequence[int], width: int, h
     return depths, normals
 
 
-def _check(
-    name: str,
-    n_views: int,
-    width: int,
-    height: int,
-    seed: int,
-    supersampling: int,
-    n_points: int,
-    point_noise: float,
-    test_every: int,
-) -> None:
-    """Refuse what cannot be traced."""
-    if name not in SETTINGS:
-        raise InputError(f"there is no synthetic scene {name!r}; choose one of {', '.join(SCENE_NAMES)}")
-    for argument, value, least in (
-        ("n_views", n_views, 2),
-        ("width", width, 8),
-        ("height", height, 8),
-        ("seed", seed, 0),
-        ("supersampling", supersampling, 1),
-        ("n_points", n_points, 0),
-        ("test_every", test_every, 0),
-    ):
+def _at_least(least: int, **arguments: int) -> None:
+    """Refuse arguments that are too small."""
+    for name, value in arguments.items():
         if value < least:
-            raise InputError(f"{argument} is {value}; give {least} or more")
-    if test_every == 1:
-        raise InputError("test_every is 1, which leaves nothing to train on; give 0 for no test views, or 2 or more")
-    if not (0.0 <= point_noise < np.inf):
-        raise InputError(f"point_noise is {point_noise}; give a finite number of metres, 0 or more")
+            raise InputError(f"{name} is {value}; give {least} or more")

@@ -17,7 +17,6 @@ from minisplat_ref.datasets.synthetic.tracer import (
     LIT_UP_TO,
     TracedView,
     World,
-    camera_centre,
     pixel_rays,
     points_along,
     radiance,
@@ -114,7 +113,7 @@ def _lift(
     """Surface points [n, 3] behind pixel centres and their colours [n, 3]; pixels index the views' stacked images."""
     height, width = traced[0].depth.shape
     view_ids, in_view = np.divmod(pixels, height * width)  # [n] each
-    origins = np.stack([camera_centre(camera) for camera in cameras])[view_ids]  # [n, 3]
+    origins = np.stack([camera.center for camera in cameras])[view_ids]  # [n, 3]
     directions = np.zeros((len(pixels), 3))
     for index, camera in enumerate(cameras):
         mine = view_ids == index
@@ -132,6 +131,6 @@ def _sees(world: World, camera: Camera, points: Floats) -> Bools:
     """[n] whether a point lies inside the image and nothing hides it."""
     pixels, depths = project_points(camera, points)
     is_inside = (depths > 0) & np.all((pixels >= 0) & (pixels <= [camera.width, camera.height]), axis=1)
-    origin = camera_centre(camera)
+    origin = camera.center
     is_inside[is_inside] = first_hits(world.primitives, origin, points[is_inside] - origin).distances > LIT_UP_TO
     return is_inside

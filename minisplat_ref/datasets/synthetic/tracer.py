@@ -23,6 +23,7 @@ from minisplat_ref.datasets.synthetic.geometry import (
     take_rows,
 )
 from minisplat_ref.datasets.synthetic.materials import encode_srgb
+from minisplat_ref.reference.pinhole import pinhole_rays
 from minisplat_ref.types import Camera, Floats, Ints
 
 SURFACE_OFFSET = 1e-6  # world units; a reflected ray starts this far off its surface, so that it does not hit it again
@@ -77,7 +78,7 @@ def trace_view(world: World, camera: Camera, supersampling: int) -> TracedView:
     TracedView
         Colour, depth and normals.
     """
-    origin = camera_centre(camera)
+    origin = camera.center
     offsets = (np.arange(supersampling) + 0.5) / supersampling  # [n] pixels from the pixel's edge
     n_samples = supersampling**2
     light = np.zeros((camera.height, camera.width, 3))
@@ -100,19 +101,12 @@ def trace_view(world: World, camera: Camera, supersampling: int) -> TracedView:
     return TracedView(image, depth.reshape(image.shape[:2]), normals.reshape(image.shape))
 
 
-def camera_centre(camera: Camera) -> Floats:
-    """[3] position of the camera, world frame: x_cam = R x + t is zero there."""
-    return -camera.cam_from_world_R.T @ camera.cam_from_world_t
-
-
 def pixel_rays(camera: Camera, offset_x: float, offset_y: float, image_rows: Ints) -> Floats:
     """[R * W, 3] directions through one point of every pixel of R rows, world frame, scaled to camera z = 1.
 
     The offsets are in pixels from the pixel's top-left corner: (0.5, 0.5) is its centre.
     """
-    directions = np.ones((len(image_rows), camera.width, 3))
-    directions[..., 0] = (np.arange(camera.width) + offset_x - camera.cx) / camera.fx
-    directions[..., 1] = ((image_rows + offset_y - camera.cy) / camera.fy)[:, None]
+    directions = pinhole_rays(np.arange(camera.width) + offset_x, image_rows[:, None] + offset_y, camera)  # [R, W, 3]
     return directions.reshape(-1, 3) @ camera.cam_from_world_R
 
 

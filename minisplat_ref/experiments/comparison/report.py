@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Sequence
-from html import escape
 
 from minisplat_ref import __version__
 from minisplat_ref.experiments.comparison.crops import Crop
@@ -11,9 +10,13 @@ from minisplat_ref.experiments.comparison.measures import MEASURES, RecipeMeasur
 from minisplat_ref.experiments.comparison.plan import Plan, eval_every
 from minisplat_ref.experiments.comparison.results import Results
 from minisplat_ref.experiments.comparison.table import table_cells
-from minisplat_ref.experiments.page import captioned, cards, page, panel, table
+from minisplat_ref.experiments.page import captioned, cards, curves, page, panel, paragraph, section, table
 from minisplat_ref.experiments.plots import to_svg
 from minisplat_ref.types import Scene
+
+CURVES_TEXT = """\
+A line per training; up and to the left is better. On the right, the thin line is the way that a training
+took, and the disc its end."""
 
 
 def notes(plan: Plan, results: Results) -> list[str]:
@@ -42,23 +45,23 @@ def report_html(plan: Plan, scene: Scene, results: Results) -> str:
         f" and measured on {n_test} more that no training saw."
     )
     heading, *rows = table_cells(results.recipes)
-    body = f"""{cards(map(_card, results.recipes))}
-<h2>Measures</h2>
-{table(rows, heading)}
-<p>{escape(" ".join(notes(plan, results)))}</p>
-<h2>Quality over time and over the number of Gaussians</h2>
-<p>A line per training; up and to the left is better. On the right, the thin line is the way that a training
-took, and the disc its end.</p>
-<div class="panel row" style="--columns: 2">
-{to_svg(psnr_over_time(results.curves))}
-{to_svg(psnr_over_count(results.curves))}
-</div>
-<h2>Parts of held-out views</h2>
-<p>Half of them are where the recipes differ most, the others where there is most detail; seed {plan.seeds[0]}.</p>
-<div class="pixels">{"".join(_crop_panel(crop, plan.recipes) for crop in results.crops)}</div>
-<h2>What was run</h2>
-{table(_settings(plan, scene, results))}"""
-    return page(f"{_enumerated(plan.recipes)} on {scene.name}", introduction, body)
+    svgs = [to_svg(psnr_over_time(results.curves)), to_svg(psnr_over_count(results.curves))]
+    crops = "".join(_crop_panel(crop, plan.recipes) for crop in results.crops)
+    sections = [
+        cards(map(_card, results.recipes)),
+        section("Measures", table(rows, heading), paragraph(" ".join(notes(plan, results)))),
+        section("Quality over time and over the number of Gaussians", paragraph(CURVES_TEXT), curves(svgs)),
+        section(
+            "Parts of held-out views",
+            paragraph(
+                "Half of them are where the recipes differ most, the others where there is most detail;"
+                f" seed {plan.seeds[0]}."
+            ),
+            f'<div class="pixels">{crops}</div>',
+        ),
+        section("What was run", table(_settings(plan, scene, results))),
+    ]
+    return page(f"{_enumerated(plan.recipes)} on {scene.name}", introduction, sections)
 
 
 def _card(recipe: RecipeMeasures) -> tuple[str, str]:

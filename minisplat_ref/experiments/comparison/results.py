@@ -16,8 +16,8 @@ from minisplat_ref.experiments.comparison.measures import (
 )
 from minisplat_ref.experiments.comparison.plan import Plan, eval_every
 from minisplat_ref.experiments.comparison.speed import render_rates
-from minisplat_ref.experiments.measure import machine
 from minisplat_ref.experiments.scoring import load_trained
+from minisplat_ref.reporting import describe_machine
 from minisplat_ref.types import Scene
 
 
@@ -62,7 +62,7 @@ def collect(plan: Plan, scene: Scene) -> Results:
         curves={recipe: [read_curve(run.folder) for run in plan.runs_of(recipe)] for recipe in plan.recipes},
         crops=choose_crops(shown, scene),
         lpips_reason=run_folder.read_json_object(runs[0].folder / run_folder.METRICS)["lpips_reason"],
-        machine=f"{machine()}, {platform.platform()}",
+        machine=f"{describe_machine()}, {platform.platform()}",
     )
 
 

@@ -38,11 +38,3 @@ def _missing(measure: Measure, recipe: RecipeMeasures) -> str:
 
 def _relation(measure: Measure, related: float) -> str:
     return f"{related:+{measure.format}}" if measure.relation == "difference" else f"{related:.3g}x"
-
-
-def as_markdown(cells: Sequence[Sequence[str]]) -> str:
-    """Return the table with aligned columns, to be read in a terminal and pasted into a document."""
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    lines = ["| " + " | ".join(map(str.ljust, row, widths)) + " |" for row in cells]
-    rule = "|" + "|".join("-" * (width + 2) for width in widths) + "|"
-    return "\n".join([lines[0], rule, *lines[1:]])

@@ -1,5 +1,146 @@
-"""Studies: what a choice in a method does to a scene, measured. ``minisplat-ref study STUDY --help``.
+"""The studies of this package: smaller claims of the papers, measured. ``minisplat-ref study NAME --help``.
 
-One module per study, each with ``add_parser`` (arguments and help) and ``run`` (trains, measures, writes). A new study
-is such a module, named in ``__main__.STUDIES``. What they share is in ``front``.
+==========================  =====================================================================
+:data:`SPLIT`               :mod:`.split_forms`: which children blur split has, and whether any
+:data:`CULLING`             :mod:`.culling`: what visibility culling removes, saves and costs
+:data:`SIMPLIFY`            :mod:`.simplify`: sampling, rank and mass, and merging at equal counts
+:data:`DEPTH`               :mod:`.depth_types`: from which depth Gaussians begin anew
+==========================  =====================================================================
+
+Here are their names and arguments. The modules hold the work; they load matplotlib and Numba, and so wait until a study
+runs. What they share is in :mod:`.front`.
 """
+
+import argparse
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+
+from minisplat_ref.experiments.arguments import SYNTHETIC_SCENES, fraction, integer, listed, name
+from minisplat_ref.study import Study
+
+RESULT, FIGURE = "result.json", "figure.png"  # what every study leaves in its folder
+RECIPE_HELP = "name as in train --recipe"
+
+
+def all_studies() -> dict[str, Study]:
+    """Return the studies of this package by the name that is typed; an extension's are EXTENSION/NAME."""
+    return {study.name: study for study in (SPLIT, CULLING, SIMPLIFY, DEPTH)}
+
+
+def _run_of(module: str) -> Callable[[argparse.Namespace], None]:
+    """Return ``run`` of a module of this folder, which is imported when it is called."""
+
+    def run(args: argparse.Namespace) -> None:
+        import_module(f"{__name__}.{module}").run(args)
+
+    return run
+
+
+def _add_folder_arguments(parser: argparse.ArgumentParser, iterations: int, whose: str) -> None:
+    """Add ``--out`` and ``--iterations``."""
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=f"new folder for {RESULT} and {FIGURE}")
+    parser.add_argument(
+        "--iterations", type=integer(1), default=iterations, metavar="N", help=f"{whose} (default {iterations})"
+    )
+
+
+def _add_scene_arguments(parser: argparse.ArgumentParser, iterations: int) -> None:
+    """Add a scene of any kind, ``--downscale``, ``--out`` and ``--iterations``."""
+    names = ", ".join(SYNTHETIC_SCENES)
+    parser.add_argument("scene", metavar="SCENE", help=f"folder of a scene, or a synthetic one: {names}")
+    _add_folder_arguments(parser, iterations, "of a training")
+    parser.add_argument(
+        "--downscale", type=integer(1), default=1, metavar="D", help="make a folder's photographs D times smaller"
+    )
+
+
+def _add_seeds(parser: argparse.ArgumentParser) -> None:
+    """Add ``--seeds``."""
+    parser.add_argument(
+        "--seeds", type=listed(integer(0)), default=(0, 1, 2), metavar="S,T", help="of the trainings (default 0,1,2)"
+    )
+
+
+def _add_split_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = "Train a scene with blur split in its two forms and without it."
+    _add_scene_arguments(parser, iterations=3000)
+    parser.add_argument(
+        "--recipe", type=name, default="mini-splatting-d", metavar="R", help=f"{RECIPE_HELP} (default %(default)s)"
+    )
+    _add_seeds(parser)
+
+
+def _add_culling_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = "Train a scene with mini-splatting2, and measure what visibility culling does."
+    _add_scene_arguments(parser, iterations=1800)
+    parser.add_argument("--ply", type=Path, metavar="FILE", help="measure these Gaussians, and train nothing")
+    parser.add_argument("--seed", type=integer(0), default=0, metavar="S", help="of the training (default 0)")
+    parser.add_argument(
+        "--repeats", type=integer(1), default=100, metavar="N", help="iterations to time, of either kind (default 100)"
+    )
+
+
+def _add_simplify_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = "Simplify a dense population in several ways to equal numbers, and fine-tune\nwhat is left."
+    _add_scene_arguments(parser, iterations=3000)
+    parser.add_argument(
+        "--recipe",
+        type=name,
+        default="mini-splatting-d",
+        metavar="R",
+        help=f"of the dense population, {RECIPE_HELP} (default %(default)s)",
+    )
+    parser.add_argument("--ply", type=Path, metavar="FILE", help="simplify these Gaussians, and train none")
+    parser.add_argument(
+        "--fractions",
+        type=listed(fraction),
+        default=(0.05, 0.1, 0.2, 0.4),
+        metavar="F,G",
+        help="of the candidates to keep (default 0.05,0.1,0.2,0.4)",
+    )
+    parser.add_argument(
+        "--fine-tune", type=integer(1), default=500, metavar="M", help="iterations after simplification (default 500)"
+    )
+    parser.add_argument(
+        "--restart", action="store_true", help="fine-tune from centres and colours alone, as mini-splatting does"
+    )
+    _add_seeds(parser)
+
+
+def _add_depth_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Reinitialise a synthetic scene from depth in several ways, compare with the\ntruth, and train on."
+    )
+    parser.add_argument("scene", metavar="SCENE", help=f"a synthetic scene: {', '.join(SYNTHETIC_SCENES)}")
+    _add_folder_arguments(parser, 1500, "before reinitialisation")
+    parser.add_argument(
+        "--train-on", type=integer(1), default=500, metavar="M", help="iterations after it (default 500)"
+    )
+    _add_seeds(parser)
+
+
+SPLIT = Study(
+    name="split",
+    summary="blur split: random children, children on the longest axis, and none",
+    add_arguments=_add_split_arguments,
+    run=_run_of("split_forms"),
+)
+CULLING = Study(
+    name="culling",
+    summary="visibility culling: what it removes, and the time it saves",
+    add_arguments=_add_culling_arguments,
+    run=_run_of("culling"),
+)
+SIMPLIFY = Study(
+    name="simplify",
+    summary="quality against count: sampling, rank and mass, merging",
+    add_arguments=_add_simplify_arguments,
+    run=_run_of("simplify"),
+)
+DEPTH = Study(
+    name="depth",
+    summary="depth reinitialisation: mid-points, centres, blended depth; guards",
+    add_arguments=_add_depth_arguments,
+    run=_run_of("depth_types"),
+)

@@ -9,7 +9,6 @@ without, one iteration of each in turn. Gaussians from a PLY are measured as the
 import argparse
 import copy
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,14 +17,12 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from minisplat_ref.experiments.arguments import Commands, integer
 from minisplat_ref.experiments.studies.front import (
     BLUE,
     RED,
-    add_scene_arguments,
     describe_scene,
     read_scene,
-    table,
+    tidy,
     title,
     write,
 )
@@ -34,6 +31,7 @@ from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.methods import get_recipe, mini_splatting, mini_splatting2
 from minisplat_ref.metrics import psnr
 from minisplat_ref.rendering import render
+from minisplat_ref.reporting import markdown_table
 from minisplat_ref.strategy.importance import collect_importance
 from minisplat_ref.strategy.ops import contiguous
 from minisplat_ref.strategy.visibility import culled_fraction
@@ -45,22 +43,6 @@ from minisplat_ref.types import Bools, Gaussians, Scene
 
 RECIPE = "mini-splatting2"
 WARM_UP = 5  # iterations of either arm that are not timed
-
-
-def add_parser(commands: Commands) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "culling",
-        help="the part of the Gaussians that visibility culling removes, and the time it saves",
-        description=f"Train a scene with {RECIPE}, and measure what visibility culling does on the way.",
-    )
-    add_scene_arguments(parser, iterations=1800)
-    parser.add_argument("--ply", type=Path, metavar="FILE", help="measure these Gaussians, and train nothing")
-    parser.add_argument("--seed", type=integer(0), default=0, metavar="S", help="of the training (default 0)")
-    parser.add_argument(
-        "--repeats", type=integer(1), default=100, metavar="N", help="iterations to time, of either kind (default 100)"
-    )
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -91,7 +73,9 @@ def run(args: argparse.Namespace) -> None:
         write(folder, {**description, **settings, "repeats": args.repeats, "places": result}, draw(rows))
     print(f"{title(description)}\n{RECIPE}, {args.iterations} iterations, seed {args.seed}, {args.repeats} timed\n")
     header = ("", "Gaussians", "in the frustum of a view", "culled of these", "of the pairs with tiles")
-    print(table([*header, "ms without", "ms with", "ratio", "PSNR without (dB)", "with (dB)"], to_rows(result)))
+    print(
+        markdown_table([*header, "ms without", "ms with", "ratio", "PSNR without (dB)", "with (dB)"], to_rows(result))
+    )
 
 
 def step_of(recipe: Recipe, action: object) -> int:
@@ -235,8 +219,7 @@ def draw(places: dict[str, dict[str, NDArray[Any]]]) -> Figure:
     times.set(title="training iterations that take at most", xlabel="ms", ylabel="%", xlim=(0, None))
     cost.set(title="PSNR with culling less PSNR without", xlabel="training view", ylabel="dB")
     for axes in (culled, times, cost):
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(color="#e6eaee")
+        tidy(axes)
     culled.legend(frameon=False, fontsize=8)
     styles = [Line2D([], [], color="black", linestyle=style) for style in ("--", "-")]
     times.legend(styles, ["without", "with"], frameon=False, fontsize=8, loc="center left")

@@ -10,7 +10,6 @@ true depth: it hangs in front of the sky if it is nearer than the depth within w
 
 import argparse
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,21 +19,19 @@ from tqdm import tqdm
 
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, SyntheticScene, make_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.arguments import Commands, integer, listed
 from minisplat_ref.experiments.studies.front import (
     BLUE,
-    FIGURE,
     RED,
-    RESULT,
     describe_scene,
     mean_and_deviation,
-    table,
+    tidy,
     title,
     write,
 )
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
+from minisplat_ref.reporting import markdown_table
 from minisplat_ref.strategy.depth_reinit import (
     PixelPoints,
     blended_points,
@@ -85,25 +82,6 @@ MEASURES = {
 }
 
 
-def add_parser(commands: Commands) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "depth",
-        help="depth reinitialisation from mid-points, centres and blended depth, and with guards",
-        description="Reinitialise a synthetic scene from depth in several ways, compare with the truth, and train on.",
-    )
-    parser.add_argument("scene", metavar="SCENE", help=f"a synthetic scene: {', '.join(SCENE_NAMES)}")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=f"new folder for {RESULT} and {FIGURE}")
-    parser.add_argument(
-        "--iterations", type=integer(1), default=1500, metavar="N", help="before reinitialisation (default 1500)"
-    )
-    parser.add_argument(
-        "--train-on", type=integer(1), default=500, metavar="M", help="iterations after it (default 500)"
-    )
-    parser.add_argument("--seeds", type=listed(integer(0)), default=(0, 1, 2), metavar="S,T", help="default 0,1,2")
-    parser.set_defaults(run=run)
-
-
 def run(args: argparse.Namespace) -> None:
     """Train, reinitialise, measure, write, print the table.
 
@@ -132,7 +110,7 @@ def run(args: argparse.Namespace) -> None:
     print(title(result))
     seeds = ", ".join(map(str, args.seeds))
     print(f"{RECIPE}, {args.iterations} iterations, then {args.train_on} from the new points; seeds {seeds}\n")
-    print(table(["points", *MEASURES.values()], to_rows(summary)))
+    print(markdown_table(["points", *MEASURES.values()], to_rows(summary)))
 
 
 def measure(truth: SyntheticScene, iterations: int, train_on: int, seeds: tuple[int, ...]) -> Iterator[dict[str, Any]]:
@@ -264,6 +242,5 @@ def draw(summary: dict[str, dict[str, tuple[float, float]]]) -> Figure:
             axes.errorbar(mean, line, xerr=deviation, color=color, marker="o", capsize=4)
         axes.set(title=MEASURES[name], xlabel="" if name == "psnr" else "%", ylim=(len(summary) - 0.5, -0.5))
         axes.set_yticks(range(len(summary)), list(summary))
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(axis="x", color="#e6eaee")
+        tidy(axes, grid="x")
     return figure

@@ -1,37 +1,23 @@
-"""What the studies share: the scene, the arguments, tables, and a folder with JSON and a figure."""
+"""What the studies share: the scene, means over seeds, the look of axes, and a folder with JSON and a figure."""
 
-import argparse
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.arguments import integer
-from minisplat_ref.experiments.measure import machine
+from minisplat_ref.experiments.plots import GRID_COLOR, PNG_DPI
+from minisplat_ref.experiments.studies import FIGURE, RESULT
 from minisplat_ref.io import load_scene
+from minisplat_ref.reporting import describe_machine
 from minisplat_ref.types import Scene
 
-RESULT, FIGURE = "result.json", "figure.png"
-PNG_DPI = 150
 BLUE, RED = "#35608c", "#d2493f"
-
-
-def add_scene_arguments(parser: argparse.ArgumentParser, iterations: int) -> None:
-    """Add the scene, ``--out``, ``--iterations`` and ``--downscale``."""
-    names = ", ".join(SCENE_NAMES)
-    parser.add_argument("scene", metavar="SCENE", help=f"folder of a scene, or a synthetic one: {names}")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=f"new folder for {RESULT} and {FIGURE}")
-    parser.add_argument(
-        "--iterations", type=integer(1), default=iterations, metavar="N", help=f"of a training (default {iterations})"
-    )
-    parser.add_argument(
-        "--downscale", type=integer(1), default=1, metavar="D", help="make a folder's photographs D times smaller"
-    )
 
 
 def read_scene(source: str, downscale: int) -> Scene:
@@ -60,7 +46,7 @@ def describe_scene(scene: Scene) -> dict[str, Any]:
         "train_views": len(scene.train_views),
         "test_views": len(scene.test_views),
         "points": len(scene.points),
-        "machine": machine(),
+        "machine": describe_machine(),
     }
 
 
@@ -73,15 +59,15 @@ def title(description: dict[str, Any]) -> str:
     )
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a Markdown table."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
 def mean_and_deviation(values: Sequence[float]) -> tuple[float, float]:
     """Return mean and sample standard deviation; the latter is 0 for one value."""
     return float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
+
+
+def tidy(axes: Axes, grid: Literal["x", "both"] = "both") -> None:
+    """Take away the frame above and on the right, and draw a pale grid across the named axes."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(axis=grid, color=GRID_COLOR)
 
 
 def write(folder: Path, result: dict[str, Any], figure: Figure) -> None:

@@ -21,29 +21,29 @@ from scipy.spatial import cKDTree
 from tqdm import tqdm
 
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
-from minisplat_ref.datasets.synthetic.tracer import camera_centre, pixel_rays
+from minisplat_ref.datasets.synthetic.tracer import pixel_rays
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.arguments import Commands, integer, listed
 from minisplat_ref.experiments.studies.front import (
     BLUE,
     RED,
-    add_scene_arguments,
     describe_scene,
     mean_and_deviation,
     read_scene,
-    table,
+    tidy,
     title,
     write,
 )
 from minisplat_ref.io import load_ply
 from minisplat_ref.io.atomic import making_folder
-from minisplat_ref.methods import RECIPES, get_recipe
+from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
+from minisplat_ref.reporting import markdown_table
 from minisplat_ref.strategy import simplify
 from minisplat_ref.strategy.importance import collect_importance, indoor
 from minisplat_ref.strategy.ops import Edit, contiguous, n_rows
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import train
+from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Floats, Gaussians, Scene
 
@@ -55,64 +55,21 @@ FINE_TUNING = "3dgs"  # its learning rates, from the first to the last
 SH_DEGREE = 3  # stored when fine-tuning begins from the centres
 
 
-def add_parser(commands: Commands) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "simplify",
-        help="quality against the number of Gaussians kept: sampling, rank and mass, merging",
-        description="Simplify a dense population in several ways to equal numbers, and fine-tune what is left.",
-    )
-    add_scene_arguments(parser, iterations=3000)
-    parser.add_argument(
-        "--recipe",
-        choices=tuple(RECIPES),
-        default="mini-splatting-d",
-        metavar="R",
-        help=f"of the dense population: {', '.join(RECIPES)} (default %(default)s)",
-    )
-    parser.add_argument("--ply", type=Path, metavar="FILE", help="simplify these Gaussians, and train none")
-    parser.add_argument(
-        "--fractions",
-        type=listed(_fraction),
-        default=(0.05, 0.1, 0.2, 0.4),
-        metavar="F,G",
-        help="of the candidates to keep (default 0.05,0.1,0.2,0.4)",
-    )
-    parser.add_argument(
-        "--fine-tune", type=integer(1), default=500, metavar="M", help="iterations after simplification (default 500)"
-    )
-    parser.add_argument(
-        "--restart", action="store_true", help="fine-tune from centres and colours alone, as mini-splatting does"
-    )
-    parser.add_argument("--seeds", type=listed(integer(0)), default=(0, 1, 2), metavar="S,T", help="default 0,1,2")
-    parser.set_defaults(run=run)
-
-
-def _fraction(text: str) -> float:
-    """Type of a number in (0, 1]."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value <= 1.0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0 and at most 1")
-    return value
-
-
 def run(args: argparse.Namespace) -> None:
     """Train, measure, write, print the table.
 
     Raises
     ------
     InputError
-        The scene, the PLY or the output folder cannot be used.
+        The scene, the recipe, the PLY or the output folder cannot be used.
     """
     scene = read_scene(args.scene, args.downscale)
     if not scene.test_views:
         raise InputError(f"scene {scene.name} has no test views to compare by: add photographs")
+    recipe = get_recipe(args.recipe, args.iterations)
     given = None if args.ply is None else load_ply(args.ply)
     with making_folder(args.out) as folder:
-        dense = train_dense(scene, args.recipe, args.iterations, args.seeds[0]) if given is None else given
+        dense = train_dense(scene, recipe, args.seeds[0]) if given is None else given
         clouds = {"dense": dense.means, **true_surface(args.scene)}
         stats = collect_importance(dense, scene.train_views)
         importance = simplify.intersection_preserving(indoor(stats), stats.dominant_count)
@@ -136,13 +93,13 @@ def run(args: argparse.Namespace) -> None:
         result = {**describe_scene(scene), **settings, "counts": counts, "summary": summarise(runs), "runs": runs}
         write(folder, result, draw(result))
     print(f"{title(result)}\n{describe_dense(result)}\n")
-    print(table(*to_table(result)))
+    print(markdown_table(*to_table(result)))
 
 
-def train_dense(scene: Scene, recipe: str, iterations: int, seed: int) -> Gaussians:
+def train_dense(scene: Scene, recipe: Recipe, seed: int) -> Gaussians:
     """Return the population that is to be simplified."""
-    with tqdm(total=iterations, desc=recipe, leave=False) as bar:
-        return train(scene, get_recipe(recipe, iterations), seed=seed, on_step=lambda _: bar.update()).gaussians
+    with tqdm(total=recipe.iterations, desc=recipe.name, leave=False) as bar:
+        return train(scene, recipe, seed=seed, on_step=lambda _: bar.update()).gaussians
 
 
 def true_surface(source: str) -> dict[str, Floats]:
@@ -154,7 +111,7 @@ def true_surface(source: str) -> dict[str, Floats]:
     for view, depth in zip(synthetic.scene.train_views, synthetic.train_depths, strict=True):
         rays = pixel_rays(view.camera, 0.5, 0.5, np.arange(view.camera.height))  # [H * W, 3] of camera z = 1
         depths = depth.ravel()[:, None]
-        points.append((camera_centre(view.camera) + depths * rays)[depths[:, 0] > 0])
+        points.append((view.camera.center + depths * rays)[depths[:, 0] > 0])
     return {"surface": np.concatenate(points)}
 
 
@@ -316,8 +273,7 @@ def draw(result: dict[str, Any]) -> Figure:
         axes.set(title=heading, ylabel=label, xlabel="Gaussians", xscale="log")
         axes.set_xticks(ticks, [f"{n:,}" for n in ticks])
         axes.minorticks_off()
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(color="#e6eaee")
+        tidy(axes)
         if name == "psnr":
             axes.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(0, 0.92))
     return figure

@@ -15,21 +15,20 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.arguments import Commands, integer, listed
 from minisplat_ref.experiments.studies.front import (
     BLUE,
     RED,
-    add_scene_arguments,
     describe_scene,
     mean_and_deviation,
     read_scene,
-    table,
+    tidy,
     title,
     write,
 )
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.methods import RECIPES, get_recipe, mini_splatting
 from minisplat_ref.metrics import evaluate
+from minisplat_ref.reporting import markdown_table
 from minisplat_ref.strategy.blur_split import principal_axis_children
 from minisplat_ref.strategy.clone_split import random_children
 from minisplat_ref.training.loop import train
@@ -47,40 +46,21 @@ FORMS: dict[str, tuple[bool, Callable[..., Gaussians]]] = {
 MEASURES = ("psnr", "ssim", "n_gaussians", "seconds")
 
 
-def add_parser(commands: Commands) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "split",
-        help="blur split with random children, with children on the longest axis, and none",
-        description="Train a scene with blur split in its two forms and without it.",
-    )
-    add_scene_arguments(parser, iterations=3000)
-    names = tuple(name for name, recipe in RECIPES.items() if any(map(_collects_blur, recipe.events)))
-    parser.add_argument(
-        "--recipe",
-        choices=names,
-        default="mini-splatting-d",
-        metavar="R",
-        help=f"{', '.join(names)} (default %(default)s)",
-    )
-    parser.add_argument(
-        "--seeds", type=listed(integer(0)), default=(0, 1, 2), metavar="S,T", help="of the trainings (default 0,1,2)"
-    )
-    parser.set_defaults(run=run)
-
-
 def run(args: argparse.Namespace) -> None:
     """Train, measure, write, print the table.
 
     Raises
     ------
     InputError
-        The scene or the output folder cannot be used.
+        The scene, the recipe or the output folder cannot be used.
     """
     scene = read_scene(args.scene, args.downscale)
     if not scene.test_views:
         raise InputError(f"scene {scene.name} has no test views to compare by: add photographs")
     recipe = get_recipe(args.recipe, args.iterations)
+    if not _has_blur_split(recipe):
+        names = ", ".join(name for name, other in RECIPES.items() if _has_blur_split(other))
+        raise InputError(f"recipe {args.recipe} has no blur split to compare: choose from {names}")
     with making_folder(args.out) as folder:
         jobs = [(form, seed) for seed in args.seeds for form in FORMS]
         runs = [measure(scene, recipe, form, seed) for form, seed in tqdm(jobs, desc="trainings", leave=False)]
@@ -90,7 +70,7 @@ def run(args: argparse.Namespace) -> None:
         write(folder, {**description, **settings, "summary": summary, "runs": runs}, draw(summary, runs))
     print(title(description))
     print(f"{args.recipe}, {args.iterations} iterations, seeds {', '.join(map(str, args.seeds))}\n")
-    print(table(["blur split, children", "PSNR (dB)", "SSIM", "Gaussians", "seconds"], to_rows(summary)))
+    print(markdown_table(["blur split, children", "PSNR (dB)", "SSIM", "Gaussians", "seconds"], to_rows(summary)))
 
 
 def variant(recipe: Recipe, form: str) -> Recipe:
@@ -100,6 +80,10 @@ def variant(recipe: Recipe, form: str) -> Recipe:
     if has_blur_split:
         return recipe
     return recipe._replace(events=tuple(event for event in recipe.events if not _collects_blur(event)))
+
+
+def _has_blur_split(recipe: Recipe) -> bool:
+    return any(map(_collects_blur, recipe.events))
 
 
 def _collects_blur(event: Event) -> bool:
@@ -148,8 +132,7 @@ def draw(summary: dict[str, dict[str, tuple[float, float]]], runs: list[dict[str
             values = [run[name] for run in runs if run["form"] == form]
             axes.plot(values, [line + 0.18] * len(values), "|", color=color, markersize=5)
         axes.set(title=label, yticks=range(len(FORMS)), yticklabels=FORMS, ylim=(-0.6, len(FORMS) - 0.4))
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(axis="x", color="#e6eaee")
+        tidy(axes, grid="x")
         axes.locator_params(axis="x", nbins=5)
     panels[0].invert_yaxis()  # in the order of the table
     panels[0].set_ylabel("blur split, children")

@@ -1,6 +1,6 @@
 """Comparison of another renderer with the reference, stage by stage.
 
-Reading order: ``renderers`` (whoever can be compared), ``measure`` (how far two arrays are apart), ``harmless`` (boxes
-and lists that differ and change nothing), ``staged`` (the stages in order, and the first that diverges), ``report``.
-``own``, ``dumps``, ``gsplat_cuda`` and ``inria_cuda`` are the renderers, ``choose`` finds one by its name.
+Reading order: ``renderers`` (what can be compared, and which renderer a name means), ``measures`` (how far two arrays
+are apart; boxes and lists that differ and change nothing), ``staged`` (the stages in order, the first that diverges,
+and the report).
 """

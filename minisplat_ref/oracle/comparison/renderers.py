@@ -1,11 +1,24 @@
-"""What a renderer must be able to do in order to be compared: give arrays of the golden format for a scene."""
+"""What can be compared: anything that gives arrays of the golden format for a scene; and which one a name means.
 
-from collections.abc import Callable
-from typing import NamedTuple
+First what a renderer is; then ours (the backends, a backend with a planted error, the reference by other conventions);
+then a folder of arrays that some other renderer has written; last, from what a user types to a renderer and to the
+scenes that it is compared on. Those of others are in :mod:`minisplat_ref.oracle.peers`.
+"""
 
-from minisplat_ref.constants import Conventions
-from minisplat_ref.oracle.golden.arrays import Arrays
-from minisplat_ref.oracle.golden.scenes import Golden
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from minisplat_ref.backends import BACKENDS, CPU, REFERENCE, Backend
+from minisplat_ref.constants import GSPLAT_1_5, PROFILES, Conventions
+from minisplat_ref.errors import InputError
+from minisplat_ref.oracle.golden.files import load, read_manifest, read_npz
+from minisplat_ref.oracle.golden.format import SPECS, Arrays, Golden
+from minisplat_ref.oracle.golden.scenes import RECIPES, inputs, run_stages, truth
+from minisplat_ref.oracle.planted import PLANTED, planted
 
 
 def _as_they_are(conventions: Conventions) -> Conventions:
@@ -13,7 +26,7 @@ def _as_they_are(conventions: Conventions) -> Conventions:
 
 
 class Renderer(NamedTuple):
-    """Whoever is compared."""
+    """A renderer that is compared."""
 
     name: str
     """For messages and reports."""
@@ -29,3 +42,223 @@ class Renderer(NamedTuple):
     """Cotangents that it cannot take; they are made zero for the truth as well."""
     scenes: tuple[str, ...] | None = None
     """Names of the scenes that it has; None for any."""
+
+
+def from_backend(backend: Backend, dtype: str, conventions: Conventions | None = None) -> Renderer:
+    """Compare a backend, every stage by itself.
+
+    Parameters
+    ----------
+    backend : Backend
+        Its stages.
+    dtype : str
+        ``"float32"`` or ``"float64"``.
+    conventions : Conventions, optional
+        Those that it follows, whatever the scene asks for; by default those of the scene.
+    """
+
+    def arrays(truth: Golden) -> Arrays:
+        scene = truth if conventions is None else truth._replace(conventions=conventions)
+        return run_stages(backend, scene, dtype, fed=truth.arrays)
+
+    name = f"{backend.name} {dtype}" if conventions is None else f"{backend.name} {dtype} by {conventions.name}"
+    return Renderer(name, dtype, True, arrays)
+
+
+def with_planted_error(name: str, dtype: str) -> Renderer:
+    """Compare the cpu backend with one error in it."""
+    renderer = from_backend(planted(name, CPU), dtype)
+
+    def arrays(truth: Golden) -> Arrays:
+        with np.errstate(all="ignore"):  # an error may divide by zero, and is then found
+            return renderer.arrays(truth)
+
+    return renderer._replace(arrays=arrays)
+
+
+def by_profile(conventions: Conventions, dtype: str) -> Renderer:
+    """Compare the reference by other conventions than the scene's: what a choice of conventions costs."""
+    return from_backend(REFERENCE, dtype, conventions)
+
+
+def from_dumps(path: str | Path, dtype: str | None = None) -> Renderer:
+    """Compare what is in ``path/SCENE/*.npz``.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder with a folder for each scene. A manifest is not needed; where there is one, its hashes are checked.
+    dtype : str, optional
+        What the renderer computed in, if it wrote another dtype than that.
+
+    Raises
+    ------
+    InputError
+        If there is no scene, or a manifest that does not fit.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder: give a renderer's name, or the folder of its arrays")
+    read_manifest(folder)
+    scenes = tuple(sorted(entry.name for entry in folder.iterdir() if entry.is_dir() and any(entry.glob("*.npz"))))
+    if not scenes:
+        raise InputError(f"{folder} holds no SCENE/*.npz; minisplat-ref oracle export DIR shows the format")
+    return Renderer(str(folder), dtype, False, lambda truth: _read(folder / truth.name, truth), scenes=scenes)
+
+
+def _read(folder: Path, truth: Golden) -> Arrays:
+    """Arrays of a scene that the truth has, too; the input among them must be the truth's."""
+    arrays: Arrays = {}
+    for file in sorted(folder.glob("*.npz")):
+        for name, array in read_npz(file).items():
+            if name not in SPECS:
+                raise InputError(f"{file}: {name!r} is no array of the golden format; its README.md lists the names")
+            if name in arrays:
+                raise InputError(f"{file}: {name} was already in another file of {folder}; write it once")
+            _check_kind(file, name, array)
+            arrays[name] = array
+    for name, array in arrays.items():
+        if SPECS[name].role in ("input", "cotangent") and name != "tile_size":
+            expected = truth.arrays[name].astype(np.float32)  # what float32 kept of it
+            if not np.array_equal(array.astype(np.float32), expected):
+                raise InputError(
+                    f"{folder}: its {name} is not that of the golden scene {truth.name!r}; render the scene that"
+                    " minisplat-ref oracle export writes, or give that folder with --against"
+                )
+    return arrays
+
+
+def _check_kind(file: Path, name: str, array: NDArray[Any]) -> None:
+    is_integer, is_float = array.dtype.kind in "iu", array.dtype in (np.float32, np.float64)
+    if not (is_float if SPECS[name].kind == "float64" else is_integer):
+        allowed = "float32 or float64" if SPECS[name].kind == "float64" else "integers"
+        raise InputError(f"{file}: {name} has dtype {array.dtype}; write {allowed}")
+
+
+def _gsplat_torch(dtype: str) -> Renderer:
+    from minisplat_ref.oracle.peers.cuda import rules_of
+    from minisplat_ref.oracle.peers.gsplat_torch import gsplat_torch
+
+    renderer = from_backend(gsplat_torch(), dtype)
+
+    def arrays(scene: Golden) -> Arrays:
+        return {name: a for name, a in renderer.arrays(scene).items() if SPECS[name].stage != "loss"}  # not gsplat's
+
+    return renderer._replace(arrays=arrays, rules=rules_of(GSPLAT_1_5))
+
+
+def _gsplat() -> Renderer:
+    from minisplat_ref.oracle.peers.cuda import gsplat_cuda
+
+    return gsplat_cuda()
+
+
+def _inria() -> Renderer:
+    from minisplat_ref.oracle.peers.cuda import inria_cuda
+
+    return inria_cuda()
+
+
+OTHERS: dict[str, Callable[[], Renderer]] = {"gsplat": _gsplat, "inria": _inria}  # float32 only
+
+
+def choose_renderer(name: str, dtype: str | None) -> Renderer:
+    """Renderer of a name.
+
+    Parameters
+    ----------
+    name : str
+        ``cpu``, ``cpu-exact``, ``reference``, ``planted:ERROR``, ``profile:NAME``, ``gsplat-torch``, ``gsplat``,
+        ``inria``, or a folder of dumps.
+    dtype : str, optional
+        ``"float32"`` or ``"float64"``; by default float64 for ours, float32 on a GPU, and that of each dumped array.
+
+    Raises
+    ------
+    InputError
+        If there is none, or it cannot run here.
+    """
+    kind, _, rest = name.partition(":")
+    own_dtype = dtype or "float64"
+    if name in BACKENDS:
+        return from_backend(BACKENDS[name], own_dtype)
+    if kind == "planted" and not Path(name).is_dir():
+        return with_planted_error(rest, own_dtype)
+    if kind == "profile" and not Path(name).is_dir():
+        if rest.upper() not in PROFILES:
+            raise InputError(f"profile {rest!r} is unknown; choose one of {', '.join(PROFILES)}")
+        return by_profile(PROFILES[rest.upper()], own_dtype)
+    if name == "gsplat-torch":
+        return _gsplat_torch(own_dtype)
+    if name in OTHERS:
+        if dtype == "float64":
+            raise InputError(f"{name} computes in float32; leave --dtype out")
+        return OTHERS[name]()
+    if Path(name).is_dir():
+        return from_dumps(name, dtype)
+    errors = ", ".join(error.name for error in PLANTED)
+    raise InputError(
+        f"{name!r} is neither a folder of dumps nor a renderer: {', '.join(BACKENDS)}, gsplat-torch, gsplat, inria,"
+        f" profile:NAME ({', '.join(PROFILES)}) or planted:ERROR ({errors})"
+    )
+
+
+def choose_scenes(
+    renderer: Renderer, name: str, against: str, profile: str | None
+) -> tuple[dict[str, Golden], tuple[str, ...]]:
+    """Truths for a renderer.
+
+    Parameters
+    ----------
+    renderer : Renderer
+        Says which conventions it follows, and which scenes it has.
+    name : str
+        Of a scene, or ``"all"`` that the renderer has.
+    against : str
+        ``"reference"``, computed now, or a folder of golden vectors.
+    profile : str, optional
+        Key of ``PROFILES`` that takes the place of every scene's conventions and of the renderer's own.
+
+    Returns
+    -------
+    scenes : dict of Golden
+        With all arrays, by name.
+    left_out : tuple of str
+        Names of the scenes that the renderer cannot draw, by their conventions.
+
+    Raises
+    ------
+    InputError
+        If there is no such scene, or the renderer has not drawn it.
+    """
+    known: Mapping[str, Golden | None]
+    known = dict.fromkeys(recipe.name for recipe in RECIPES) if against == "reference" else load(against)
+    wanted = tuple(known) if name == "all" else (name,)
+    if name not in ("all", *known):
+        raise InputError(f"scene {name!r} is unknown; choose all or one of {', '.join(known)}")
+    if renderer.scenes is not None:
+        strange = [scene for scene in renderer.scenes if scene not in known]
+        if strange:
+            raise InputError(f"{renderer.name}: {strange[0]!r} is no golden scene; there are {', '.join(known)}")
+        if name != "all" and name not in renderer.scenes:
+            raise InputError(f"{renderer.name} has no scene {name!r}; it has {', '.join(renderer.scenes)}")
+        wanted = tuple(scene for scene in wanted if scene in renderer.scenes)
+    chosen, left_out = {}, []
+    for scene in wanted:
+        golden = known[scene] or inputs(next(recipe for recipe in RECIPES if recipe.name == scene))
+        rules = renderer.rules(golden.conventions) if profile is None else PROFILES[profile]
+        if rules is None:
+            left_out.append(scene)
+        else:
+            chosen[scene] = _with_truth(golden, rules, renderer.ignores)
+    if not chosen:
+        raise InputError(f"{renderer.name} can draw none of the scenes {', '.join(wanted)}: other conventions")
+    return chosen, tuple(left_out)
+
+
+def _with_truth(golden: Golden, rules: Conventions, ignores: tuple[str, ...]) -> Golden:
+    """All arrays, by these rules and with zero for what is ignored; those of a folder where they are that already."""
+    is_complete = "v_means" in golden.arrays and not any(golden.arrays[name].any() for name in ignores)
+    if is_complete and rules == golden.conventions:
+        return golden
+    return truth(golden._replace(conventions=rules), zeros=ignores)

@@ -1,5 +1,5 @@
 """Golden vectors: what every stage of a renderer takes and gives, as plain arrays, for whoever writes another one.
 
-Reading order: ``arrays`` (the names), ``scenes`` (the inputs), ``stages`` (from inputs to arrays, through any backend),
-``flips`` (pixels that rounding decides), ``files`` (a folder of them), ``readme`` (the format in words).
+Reading order: ``format`` (the arrays by name, and their README), ``scenes`` (the inputs, and from inputs to arrays
+through any backend), ``files`` (a folder of them, written and checked).
 """

@@ -12,9 +12,18 @@ import numpy as np
 from minisplat_ref.constants import Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import making_folder
-from minisplat_ref.oracle.golden.arrays import SPECS, STAGE_COTANGENTS, STAGE_INPUTS, Arrays, names_of
-from minisplat_ref.oracle.golden.readme import FRAMES, LOSS, convention_words, readme
-from minisplat_ref.oracle.golden.scenes import Golden
+from minisplat_ref.oracle.golden.format import (
+    DIFFERENTIATED,
+    FRAMES,
+    SPECS,
+    STAGE_COTANGENTS,
+    STAGE_INPUTS,
+    Arrays,
+    Golden,
+    convention_words,
+    names_of,
+    readme,
+)
 
 FORMAT = "minisplat_ref golden vectors"
 VERSION = 1  # changes when an older folder can no longer be read
@@ -143,7 +152,7 @@ def _manifest(listed: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "version": VERSION,
-        "loss": f"{LOSS}; v_x = dL/dx, of the shape of x",
+        "loss": f"{DIFFERENTIATED}; v_x = dL/dx, of the shape of x",
         "frames": FRAMES,
         "conventions": convention_words(),
         "arrays": {

@@ -1,17 +1,21 @@
-"""The scenes of the golden vectors: small, random, and each with one thing that renderers get wrong.
+"""The scenes of the golden vectors: how their inputs are drawn, and how any backend's stages make all arrays of them.
 
-Numbers are rounded to float32, so that float32 and float64 renderers are given the same problem; only the rotation is
-not, which would no longer be one.
+The scenes are small, random, and each has one thing that renderers get wrong. Their numbers are rounded to float32, so
+that float32 and float64 renderers are given the same problem; only the rotation is not, which would no longer be one.
+Fed with the arrays of a truth, every stage by itself is given the truth's input, so that an error stays in its stage.
 """
 
+from collections import ChainMap
 from typing import NamedTuple
 
 import numpy as np
 
+from minisplat_ref.backends import REFERENCE, Backend
 from minisplat_ref.constants import GSPLAT_MAIN, INRIA, Conventions
-from minisplat_ref.oracle.golden.arrays import Arrays
+from minisplat_ref.oracle.golden.format import STAGE_COTANGENTS, Arrays, Golden
+from minisplat_ref.oracle.thresholds import thresholds
 from minisplat_ref.reference.covariance import rotation_matrices
-from minisplat_ref.types import Camera, Floats
+from minisplat_ref.types import Floats, Primitives, Projection, ProjectionGradient, RenderOutput, TileBins, TileGrid
 
 
 class Recipe(NamedTuple):
@@ -26,28 +30,6 @@ class Recipe(NamedTuple):
     scales: tuple[float, float] = (0.05, 0.5)  # world units, drawn uniformly in their logarithm
     spread: float = 1.0  # of the centres, in half images around the image's middle
     n: int = 150
-
-
-class Golden(NamedTuple):
-    """A scene with arrays of the golden format: its inputs alone, or all."""
-
-    name: str
-    what: str
-    conventions: Conventions
-    arrays: Arrays
-
-    @property
-    def camera(self) -> Camera:
-        """The view, in float64."""
-        a = self.arrays
-        fx, fy, cx, cy = map(float, a["intrinsics"])
-        width, height = map(int, a["image_size"])
-        return Camera(a["cam_from_world_R"], a["cam_from_world_t"], fx, fy, cx, cy, width, height)
-
-    @property
-    def sh_degree(self) -> int:
-        """Degree of the spherical harmonics; all that is stored is used."""
-        return round((self.arrays["sh_rest"].shape[1] + 1) ** 0.5) - 1
 
 
 RECIPES = (
@@ -119,3 +101,128 @@ def inputs(recipe: Recipe, seed: int = 0) -> Golden:
     rounded: Arrays = {name: array.astype(np.float32).astype(np.float64) for name, array in arrays.items()}
     exact: Arrays = {"cam_from_world_R": R, "image_size": size.astype(np.int32)}
     return Golden(recipe.name, recipe.what, recipe.conventions, rounded | exact)
+
+
+# Fields of a stage's result, by array.
+PROJECTION = ("means2d", "depths", "conics", "opacities2d", "radii", "boxes")
+PROJECT_GRADIENT = ("v_means_projection", "v_quats", "v_scales", "v_opacities", "v_R_projection", "v_t_projection")
+COLORS_GRADIENT = ("v_means_colors", "v_sh_dc", "v_sh_rest", "v_R_colors", "v_t_colors")
+COMPOSITE_GRADIENT = ("v_means2d", "v_conics", "v_opacities2d", "v_colors", "v_background")
+
+
+def projection_of(arrays: Arrays) -> Projection:
+    """Projection of the arrays of these names."""
+    return Projection(*(arrays[name] for name in PROJECTION))
+
+
+def grid_of(arrays: Arrays, tile_size: tuple[int, int]) -> TileGrid:
+    """Tiles of any size over the image."""
+    width, height = map(int, arrays["image_size"])
+    return TileGrid(width, height, *tile_size)
+
+
+def reference_bins(arrays: Arrays, conventions: Conventions, tile_size: tuple[int, int]) -> TileBins:
+    """Tile lists that the reference makes of a projection, on tiles of any size."""
+    return REFERENCE.bin_gaussians(projection_of(arrays), grid_of(arrays, tile_size), conventions)
+
+
+def run_stages(backend: Backend, scene: Golden, dtype: str, fed: Arrays | None = None) -> Arrays:
+    """Outputs and gradients of every stage.
+
+    Parameters
+    ----------
+    backend : Backend
+        The renderer.
+    scene : Golden
+        Its inputs and the cotangents are read; whatever else it has is not.
+    dtype : str
+        ``"float32"`` or ``"float64"``: what the stages compute in.
+    fed : dict, optional
+        All arrays of a truth: the input of each stage. By default each stage reads what the stage before it gave.
+
+    Returns
+    -------
+    dict
+        By the names of the golden format; the totals only where no truth was fed, of which they would be sums.
+    """
+    out: Arrays = {}
+    known = ChainMap(out if fed is None else fed, scene.arrays)
+
+    def take(name: str) -> Floats:
+        array = known[name]
+        return np.asarray(array, dtype, order="C") if array.dtype.kind == "f" else array
+
+    c, camera = scene.conventions, scene.camera
+    primitives = Primitives(take("means"), take("quats"), take("scales"), take("opacities"))
+    out |= zip(PROJECTION, backend.project(*primitives, camera, c), strict=True)
+    projection = projection_of({name: take(name) for name in PROJECTION})
+
+    tile_size = backend.tile_width, backend.tile_height
+    bins = backend.bin_gaussians(projection, grid_of(scene.arrays, tile_size), c)
+    out["tile_size"] = np.array(tile_size, np.int32)
+    out["gaussian_ids"], out["tile_offsets"] = bins.gaussian_ids, bins.tile_offsets
+    if fed is not None:
+        bins = reference_bins(fed, c, tile_size)
+
+    shading = (take("means"), take("sh_dc"), take("sh_rest"), camera, scene.sh_degree, known["radii"])
+    out["colors"] = backend.sh_colors(*shading)
+    blending = (projection, take("colors"), take("background"), bins, c)
+    output = backend.composite(*blending)
+    out["image"], out["alpha"] = output.image, output.alpha
+    if "v_image" not in known:
+        return out
+
+    v = backend.composite_vjp(
+        *blending, RenderOutput(take("image"), take("alpha"), None, None), take("v_image"), take("v_alpha")
+    )
+    out |= zip(COMPOSITE_GRADIENT, v, strict=True)
+    v_projection = ProjectionGradient(*map(take, STAGE_COTANGENTS["project"]))
+    out |= zip(PROJECT_GRADIENT, backend.project_vjp(*primitives, camera, c, projection, v_projection), strict=True)
+    out |= zip(COLORS_GRADIENT, backend.sh_colors_vjp(*shading, take("v_colors")), strict=True)
+    if fed is None:
+        for name in ("v_means", "v_R", "v_t"):
+            out[name] = out[f"{name}_projection"] + out[f"{name}_colors"]
+
+    loss, tape = backend.photometric_loss(take("image"), take("target"), float(take("dssim_weight")))
+    out["loss"], out["v_image_of_loss"] = np.array(loss, dtype), backend.photometric_loss_vjp(tape)
+    return out
+
+
+def truth(scene: Golden, *, seed: int = 0, zeros: tuple[str, ...] = ()) -> Golden:
+    """Scene with all arrays, by the reference in float64.
+
+    Parameters
+    ----------
+    scene : Golden
+        With its inputs.
+    seed : int
+        Of the cotangents. They are 0 at the pixels whose hits rounding decides, and at Gaussians that are culled: no
+        gradient is to depend on those.
+    zeros : tuple of str
+        Cotangents that are zero throughout, for a renderer that cannot take them.
+
+    Returns
+    -------
+    Golden
+        All arrays of the format.
+    """
+    forward = run_stages(REFERENCE, scene, "float64")
+    known = scene.arrays | forward
+    tile_size = (REFERENCE.tile_width, REFERENCE.tile_height)
+    bins = reference_bins(known, scene.conventions, tile_size)
+    is_sure = ~thresholds(projection_of(known), bins, scene.conventions).is_near
+    rng = np.random.default_rng(seed)
+    cotangents = {
+        "v_image": rng.uniform(-1, 1, forward["image"].shape) * is_sure[:, :, None],
+        "v_alpha": rng.uniform(-1, 1, forward["alpha"].shape) * is_sure,
+        "v_depths": rng.uniform(-1, 1, forward["depths"].shape) * (forward["radii"][:, 0] > 0),
+    }
+    rounded = {name: array.astype(np.float32).astype(np.float64) for name, array in cotangents.items()}
+    rounded |= {name: np.zeros_like(rounded[name]) for name in zeros}
+    scene = scene._replace(arrays=scene.arrays | rounded)
+    return scene._replace(arrays=scene.arrays | run_stages(REFERENCE, scene, "float64"))
+
+
+def golden_scenes() -> dict[str, Golden]:
+    """All scenes with all arrays, by name."""
+    return {recipe.name: truth(inputs(recipe)) for recipe in RECIPES}

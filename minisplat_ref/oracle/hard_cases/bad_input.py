@@ -4,9 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.oracle.hard_cases.case import HardCase
 from minisplat_ref.oracle.hard_cases.scenes import call, camera, cloud, intrinsics
-from minisplat_ref.oracle.hard_cases.subjects import Call, Parameters
+from minisplat_ref.oracle.hard_cases.subjects import Call, HardCase, Parameters
 from minisplat_ref.types import Gaussians
 
 ARRAYS = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")

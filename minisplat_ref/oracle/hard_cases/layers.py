@@ -3,10 +3,9 @@
 import numpy as np
 
 from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN, INRIA, MINI_SPLATTING2
-from minisplat_ref.oracle.hard_cases.case import HardCase
 from minisplat_ref.oracle.hard_cases.scenes import call, camera, cloud, gaussians, rounded
-from minisplat_ref.oracle.hard_cases.subjects import Parameters
-from minisplat_ref.oracle.hard_cases.tolerances import BEHIND, DEEP
+from minisplat_ref.oracle.hard_cases.subjects import HardCase, Parameters
+from minisplat_ref.oracle.tolerances import BEHIND, DEEP
 
 ALPHA_MIN = float(np.float32(1 / 255))
 

@@ -2,12 +2,13 @@
 
 Verdict of a case: refused with the message that it expects, in every precision; or all outputs and all gradients finite
 and as near to the reference as its tolerance says. Derivatives by the outputs are random, fixed and the same in all
-precisions, and zero at pixels that stand on a threshold: see :mod:`minisplat_ref.oracle.hard_cases.thresholds`.
+precisions, and zero at pixels that stand on a threshold: see :mod:`minisplat_ref.oracle.thresholds`. The summary has a
+line for each kind: how many cases, how many are refused, and how far the worst is from the reference.
 """
 
 import fnmatch
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,13 +16,11 @@ import numpy as np
 from minisplat_ref.backends import CPU, CPU_EXACT, REFERENCE, Backend
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.cases import Case, Figure, Report
-from minisplat_ref.oracle.hard_cases.case import HardCase
-from minisplat_ref.oracle.hard_cases.subjects import Arrays, Drawing, Subject, drawing, splat_tapes
-from minisplat_ref.oracle.hard_cases.thresholds import jump_max, pixels_at_thresholds
+from minisplat_ref.oracle.hard_cases.subjects import Arrays, Drawing, HardCase, Subject, drawing, splat_tapes
+from minisplat_ref.oracle.thresholds import Thresholds, thresholds
+from minisplat_ref.oracle.tolerances import BLOCK_FLOOR, OWN_KERNELS
+from minisplat_ref.splatting import SplatTape
 from minisplat_ref.types import Bools
-
-# A gradient smaller than this part of the median block is judged by the median: it is the rounding of the others.
-BLOCK_FLOOR = 1e-2
 
 
 class Precision(NamedTuple):
@@ -110,12 +109,13 @@ def _refusal(case: HardCase, refusal: str, subject: Subject, precisions: Sequenc
 def _comparison(case: HardCase, subject: Subject, precisions: Sequence[Precision]) -> Case:
     expected_drawing = drawing(subject, REFERENCE, np.dtype(np.float64))
     tapes = splat_tapes(subject, REFERENCE)
-    at_threshold = pixels_at_thresholds(tapes[0]) if tapes else None
+    at = _thresholds(tapes[0], _size(expected_drawing.outputs)) if tapes else None
+    at_threshold = None if at is None else at.is_near | at.medians
     cotangents = _cotangents(case.name, subject.cotangent_scale, expected_drawing, at_threshold)
     expected = _outcome(expected_drawing, cotangents, np.float64)
     problems = _problems_of_reference(case, expected)
     figures: dict[str, Figure] = {}
-    flip_errors, n_flips = [0.0], 0
+    n_flips = 0
     for precision in precisions:
         actual = _outcome(drawing(subject, precision.backend, np.dtype(precision.dtype)), cotangents, precision.dtype)
         image_error, flips = _image_error(actual.outputs, expected.outputs, at_threshold)
@@ -130,15 +130,18 @@ def _comparison(case: HardCase, subject: Subject, precisions: Sequence[Precision
         if not gradient_error <= gradient_max:
             problems.append(f"{precision.label}: v_{block} off by {gradient_error:.1e}, allowed are {gradient_max:.0e}")
         figures |= {f"image {precision.label}": image_error, f"grad {precision.label}": gradient_error}
-        flip_errors.append(flips.max(initial=0.0))
         n_flips = max(n_flips, int((flips > image_max).sum()))
-    if tapes and max(flip_errors) > jump_max(tapes[0]) * _size(expected.outputs):
-        problems.append(f"a pixel on a threshold is off by {max(flip_errors):.1e}, more than one hit")
+        if at is not None and (flips > image_max + at.allowance[at_threshold]).any():
+            problems.append(f"{precision.label}: a pixel on a threshold is off by {flips.max():.1e}, more than one hit")
     n_near = 0 if at_threshold is None else int(at_threshold.sum())
     figures |= {"on threshold": n_near, "flips": n_flips}
     order = ("image", "grad", "on", "flips")
     columns = {key: figures[key] for prefix in order for key in figures if key.startswith(prefix)}
     return Case(case.name, not problems, columns, "; ".join(problems))
+
+
+def _thresholds(tape: SplatTape, size: float) -> Thresholds:
+    return thresholds(tape.projection, tape.bins, tape.conventions, OWN_KERNELS, span=size)
 
 
 def _outcome(drawn: Drawing, cotangents: Arrays, dtype: type) -> Outcome:
@@ -207,3 +210,36 @@ def _gradient_error(actual: Arrays, expected: Arrays, least: float) -> tuple[str
         errors[key] = difference / size
     worst = max(errors, key=lambda key: errors[key])
     return worst.removeprefix("v_"), errors[worst]
+
+
+def by_group(report: Report, groups: Mapping[str, Sequence[HardCase]]) -> Report:
+    """Summarise a report, a row for each group that has cases in it.
+
+    Parameters
+    ----------
+    report : Report
+        From :func:`run_hard_cases`.
+    groups : mapping
+        The catalogue by kind.
+
+    Returns
+    -------
+    Report
+        Its figures: number of cases, how many were refused, the largest of each error, the sum of the flips.
+    """
+    rows = []
+    for name, members in groups.items():
+        names = {member.name for member in members}
+        cases = [case for case in report.cases if case.name in names]
+        if cases:
+            rows.append(Case(name, all(case.passed for case in cases), _figures(cases)))
+    return Report(report.title, tuple(rows), report.settings)
+
+
+def _figures(cases: Sequence[Case]) -> dict[str, Figure]:
+    drawn = [case.figures for case in cases if case.figures]
+    figures: dict[str, Figure] = {"cases": len(cases), "refused": sum(not case.figures for case in cases)}
+    for key in drawn[0] if drawn else ():
+        values = [value for row in drawn if isinstance(value := row[key], int | float)]
+        figures[key] = sum(values) if isinstance(values[0], int) else max(values)
+    return figures

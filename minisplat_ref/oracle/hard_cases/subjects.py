@@ -1,8 +1,9 @@
-"""What can be drawn, as data, and how each kind goes through the public boundary and back.
+"""What a hard case is, and how what it draws goes through the public boundary and back.
 
 A subject holds float64 arrays whose numbers float32 holds too, so that every precision is given the same scene. What is
 refused is refused where users' input is: by :func:`check_gaussians`, with which every reader of a file ends, and by the
-checks of :func:`rasterization`.
+checks of :func:`rasterization`. A case adds why the subject is hard, what is right, and how near a precision has to
+come.
 """
 
 from collections.abc import Callable
@@ -11,11 +12,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.backends import Backend
-from minisplat_ref.batch import checked_batch, draw
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
-from minisplat_ref.gsplat_door import rasterization, rasterization_vjp
+from minisplat_ref.gsplat_compat import Views, checked_batch, draw, rasterization, rasterization_vjp
+from minisplat_ref.oracle.tolerances import ORDINARY, HardCaseTolerance
 from minisplat_ref.rendering import render, render_vjp
-from minisplat_ref.splatting import SplatTape
+from minisplat_ref.splatting import Primitives, SplatTape
 from minisplat_ref.types import Bools, Camera, Floats, Gaussians
 from minisplat_ref.validation import check_gaussians, chosen_conventions
 
@@ -63,6 +64,25 @@ class Surface(NamedTuple):
 
 
 Subject = Parameters | Call | Pictures | Surface
+
+
+class HardCase(NamedTuple):
+    """One entry of the catalogue."""
+
+    name: str
+    """Unique; words with hyphens."""
+    why: str
+    """Why it is hard, one line."""
+    correct: str
+    """What a correct renderer does, one line."""
+    build: Callable[[], Subject]
+    """Makes the scene; its numbers are the same in every precision."""
+    tolerance: HardCaseTolerance = ORDINARY
+    """How far each precision may be from the float64 reference."""
+    is_background: bool = False
+    """Whether the image is the background and nothing but the background has a gradient."""
+    refusal: str | None = None
+    """Part of the message with which the input is refused; None where it is drawn."""
 
 
 class Drawing(NamedTuple):
@@ -119,7 +139,7 @@ def splat_tapes(subject: Subject, backend: Backend) -> list[SplatTape]:
     if not isinstance(subject, Call):
         return []
     a, options = subject.arrays, subject.options
-    primitives = (a["means"], a["quats"], a["scales"], a["opacities"])
+    primitives = Primitives(a["means"], a["quats"], a["scales"], a["opacities"])
     conventions = chosen_conventions(
         options.get("profile", GSPLAT_MAIN),
         options.get("near_plane"),
@@ -127,8 +147,9 @@ def splat_tapes(subject: Subject, backend: Backend) -> list[SplatTape]:
         options.get("eps2d"),
         options.get("rasterize_mode", "classic"),
     )
-    views = (a["colors"], a["viewmats"], a["Ks"], subject.width, subject.height)
-    batch = checked_batch(primitives, *views, options.get("sh_degree"), options.get("backgrounds"), "RGB")
+    views = Views(a["viewmats"], a["Ks"], subject.width, subject.height)
+    sh_degree, backgrounds = options.get("sh_degree"), options.get("backgrounds")
+    batch = checked_batch(primitives, views, a["colors"], sh_degree, backgrounds, "RGB")
     return [draw(batch, c, conventions, backend) for c in range(len(batch.cameras))]
 
 
@@ -151,7 +172,7 @@ def _draw_parameters(subject: Parameters, backend: Backend, dtype: np.dtype) -> 
     def vjp(v: Arrays) -> Arrays:
         gradient = render_vjp(tape, v["image"], v["alpha"])
         blocks = {**gradient.gaussians._asdict(), **gradient._asdict()}
-        del blocks["gaussians"], blocks["means2d"]
+        del blocks["gaussians"], blocks["means2d"], blocks["shared"]
         return blocks
 
     return Drawing(outputs, vjp, ("image", "alpha"))

@@ -1,1 +1,1 @@
-"""Other renderers, called through their own functions."""
+"""Renderers of others, called through their own functions: ``gsplat_torch`` on the CPU, ``cuda`` on a GPU."""

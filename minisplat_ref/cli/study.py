@@ -1,0 +1,69 @@
+"""``study``: measures what a choice in a method does."""
+
+import argparse
+from typing import TYPE_CHECKING
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.experiments.arguments import Commands, HelpFormatter, Parser
+
+if TYPE_CHECKING:
+    from minisplat_ref.study import Study
+
+DESCRIPTION = """\
+Measure what a choice in a method does to a scene: it is trained with and
+without, and a table and a figure say what that has changed.
+
+Without a NAME: list the studies.
+"""
+EPILOG = """\
+examples:
+  minisplat-ref study
+  minisplat-ref study split --help
+  minisplat-ref study split room --iterations 1500 --out studies/split"""
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command. A study's own arguments are parsed when it is known which one it is: see :func:`run`."""
+    parser = commands.add_parser(
+        "study",
+        help="measure what a choice in a method does",
+        usage="minisplat-ref study [-h] [NAME ...]",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=HelpFormatter,
+    )
+    parser.add_argument("name", nargs="?", metavar="NAME", help="of a study")
+    parser.add_argument(
+        "arguments", nargs=argparse.REMAINDER, metavar="...", help="its arguments: see minisplat-ref study NAME --help"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run a study, or list all."""
+    from minisplat_ref.experiments.studies import all_studies
+
+    studies = all_studies()
+    if args.name is None or args.name not in studies:
+        studies = {**studies, **_extension_studies(args.name)}
+    if args.name is None:
+        width = max(map(len, studies))
+        for name, study in studies.items():
+            print(f"{name:<{width}}  {study.summary}")
+        print("\nminisplat-ref study NAME --help explains one.")
+        return 0
+    if args.name not in studies:
+        raise InputError(f"there is no study {args.name!r}: choose from {', '.join(studies)}")
+    study = studies[args.name]
+    parser = Parser(prog=f"minisplat-ref study {args.name}", description=study.summary, formatter_class=HelpFormatter)
+    study.add_arguments(parser)
+    return study.run(parser.parse_args(args.arguments)) or 0
+
+
+def _extension_studies(name: str | None) -> "dict[str, Study]":
+    """Return the studies of the extension that ``EXTENSION/NAME`` names, of all for None, by their whole names."""
+    from minisplat_ref.extensions.extension import load_extension, load_extensions
+
+    owner, separator, _ = (name or "").partition("/")
+    extensions = [load_extension(owner)] if separator else load_extensions()
+    return {f"{extension.name}/{study.name}": study for extension in extensions for study in extension.studies}

@@ -1,0 +1,112 @@
+"""Pixels that sort their own hits: a buffer of those that wait, from which each pixel takes the nearest.
+
+A row of eight pixels goes through the list of its tile and writes down every hit; what waits is a queue of their
+numbers, sorted by depth in each of the eight pixels by itself::
+
+    hits   [M * 8, F]  row 8 h + i: hit h in pixel i | alpha | v_alpha | weight | D channels |
+    queue  [M, 2, 8]   depths and rows of hits       | taken ... | first: nearest | ... | end: farthest |
+
+A new hit enters at the end and moves forward past those that are deeper. When ``buffer_size`` hits wait, or the list is
+at its end, the first is taken. In a pixel that it misses, a hit is infinitely near: it is the next to be taken there,
+as nothing, and takes no room from the pixel's other hits.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from minisplat_ref.cpu.compositing.pixel_rows import hit_row
+from minisplat_ref.cpu.gaussian_rows import rows_from
+from minisplat_ref.jit.compile import scalar
+from minisplat_ref.jit.lanes import WIDTH, any_of, counted, filled, load, scatter, select, store
+from minisplat_ref.jit.literals import ZERO
+from minisplat_ref.types import Floats, Ints
+
+ALPHA, V_ALPHA, WEIGHT, CHANNELS = range(4)  # columns of a hit
+MISSED = np.float32(-np.inf)  # depth
+
+
+class HitBuffer(NamedTuple):
+    """The hits of a row of eight pixels."""
+
+    hits: Floats  # [M * 8, CHANNELS + D]
+    queue: Floats  # [M * 2 * 8]
+    members: Ints  # [M] place in the tile's list of each hit
+
+
+@scalar
+def hit_buffer(n, n_channels, as_data):
+    """Return a buffer for a list of ``n`` primitives."""
+    hits = np.empty((n * WIDTH, CHANNELS + n_channels), as_data)
+    return HitBuffer(hits, np.empty(n * 2 * WIDTH, as_data), np.empty(n, np.int64))
+
+
+@scalar
+def hit_rows(h):
+    """Return the eight rows of hit ``h``."""
+    return rows_from(h * WIDTH, (h + 1) * WIDTH)
+
+
+@scalar
+def enqueue(queue, first, end, depth, row):
+    """Insert eight hits into ``queue``, which holds the places from ``first`` to before ``end``."""
+    at = end
+    while at > first:
+        other = load(queue, (at - 1) * 2 * WIDTH)
+        is_deeper = other > depth  # of equals, the first in the list stays the first
+        if not any_of(is_deeper):
+            break
+        other_row = load(queue, (at - 1) * 2 * WIDTH + WIDTH)
+        store(queue, at * 2 * WIDTH, (select(is_deeper, other, depth), select(is_deeper, other_row, row)))
+        depth, row = select(is_deeper, depth, other), select(is_deeper, row, other_row)
+        at -= 1
+    store(queue, at * 2 * WIDTH, (depth, row))
+
+
+@scalar
+def queued_rows(queue, at):
+    """Return the eight rows of hits at a place of ``queue``."""
+    i = at * 2 * WIDTH + WIDTH
+    near = np.int64(queue[i]), np.int64(queue[i + 1]), np.int64(queue[i + 2]), np.int64(queue[i + 3])
+    far = np.int64(queue[i + 4]), np.int64(queue[i + 5]), np.int64(queue[i + 6]), np.int64(queue[i + 7])
+    return (*near, *far)
+
+
+def walk_sorted(hit: Callable, shade: Callable, n_channels: int, take: Callable) -> Callable:
+    """Return the function that gives the hits of a row to ``take``, nearest first, and returns how many there are.
+
+    ``take(state, hits, rows, frame)`` reads and changes ``state``, whose first eight numbers are the transmittances.
+    """
+
+    @scalar
+    def walk(state, buffer, scene, row, buffer_size, frame):
+        as_data = state.dtype.type
+        zero, hits, queue = filled(as_data(0)), buffer.hits, buffer.queue
+        first = end = 0
+        for m in row.members:
+            n = row.ids[m]
+            unclamped, depth, place = hit_row(hit, scene, n, row)
+            is_hit = unclamped >= frame.alpha_min
+            if not any_of(is_hit):
+                continue
+            rows = hit_rows(end)
+            scatter(hits, rows, ALPHA, unclamped)
+            scatter(hits, rows, V_ALPHA, zero)
+            scatter(hits, rows, WEIGHT, zero)
+            for k in range(n_channels):
+                scatter(hits, rows, CHANNELS + k, zero + shade(scene.colors, n, k, place))
+            buffer.members[end] = m
+            enqueue(queue, first, end, select(is_hit, zero + depth, MISSED), counted(as_data(0)) + as_data(end * WIDTH))
+            end += 1
+            if end - first == buffer_size:
+                take(state, hits, queued_rows(queue, first), frame)
+                first += 1
+            if not any_of(load(state, 0) > ZERO):
+                break
+        while first < end and any_of(load(state, 0) > ZERO):
+            take(state, hits, queued_rows(queue, first), frame)
+            first += 1
+        return end
+
+    return walk

@@ -1,0 +1,120 @@
+"""Eight pixels of a line as one step, and the bundles that the plain kernels read and write."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from minisplat_ref.cpu.gaussian_rows import rows_from
+from minisplat_ref.jit.compile import scalar
+from minisplat_ref.jit.lanes import WIDTH, counted, filled, gather, select
+from minisplat_ref.jit.literals import HALF, ONE, ZERO
+from minisplat_ref.types import Floats, Ints
+
+
+class Scene(NamedTuple):
+    """What the kernels read of the primitives."""
+
+    records: Floats  # [N, F] of the response
+    colors: Floats  # [N, S] coefficients of D channels
+    boxes: Ints  # [N, 4] pixels x0, y0, x1, y1, half-open
+
+
+class Lists(NamedTuple):
+    """Which primitives the pixels of every tile meet, and how many hits a pixel holds back to sort them."""
+
+    offsets: Ints  # [n_tiles + 1] tile t owns ids[offsets[t] : offsets[t + 1]]
+    ids: Ints  # [M] nearest first
+    slots: Ints  # [M] place of each pair when the pairs are grouped by primitive
+    tile_width: int  # pixels
+    tile_height: int  # pixels
+    buffer_size: int  # hits
+
+
+class Pixels(NamedTuple):
+    """An image and its accumulated opacity, or the derivative of the loss with respect to them."""
+
+    image: Floats  # [H * W, D]
+    alpha: Floats  # [H * W, 1]
+
+
+class Row(NamedTuple):
+    """Eight pixels of a line, and which primitives they may meet."""
+
+    x: int  # column of the first
+    y: int  # line
+    ids: Ints  # [M] list of the tile, nearest first
+    members: Ints  # [n] places in it of the primitives whose box holds one of the pixels
+
+
+@scalar
+def start_tile(tile, lists, frame):
+    """Return column and line of a tile's first pixel, and how many rows of eight it has on a line."""
+    n_tiles_x = (frame.width + lists.tile_width - 1) // lists.tile_width
+    x0, y0 = tile % n_tiles_x * lists.tile_width, tile // n_tiles_x * lists.tile_height
+    return x0, y0, (lists.tile_width + WIDTH - 1) // WIDTH
+
+
+@scalar
+def list_rows(boxes, ids, tile, lists, frame):
+    """Deal the list of a tile out to its rows of eight pixels.
+
+    Returns
+    -------
+    members : ndarray of shape (n_rows, M)
+        Places in ``ids`` [M] of the primitives whose box holds a pixel of the row, in the list's order.
+    counts : ndarray of shape (n_rows,)
+        How many they are.
+    """
+    x0, y0, n_per_line = start_tile(tile, lists, frame)
+    x_end, y_end = min(x0 + lists.tile_width, frame.width), min(y0 + lists.tile_height, frame.height)
+    members = np.empty((lists.tile_height * n_per_line, ids.size), np.int32)
+    counts = np.zeros(lists.tile_height * n_per_line, np.int64)
+    for m in range(ids.size):
+        n = ids[m]
+        first, end = (max(boxes[n, 0], x0) - x0) // WIDTH, (min(boxes[n, 2], x_end) - x0 + WIDTH - 1) // WIDTH
+        for y in range(max(boxes[n, 1], y0), min(boxes[n, 3], y_end)):
+            for row in range((y - y0) * n_per_line + first, (y - y0) * n_per_line + end):
+                members[row, counts[row]] = m
+                counts[row] += 1
+    return members, counts
+
+
+@scalar
+def rows_of_tile(tile, scene, lists, frame):
+    """Yield the rows of a tile that lie in the image."""
+    ids = lists.ids[lists.offsets[tile] : lists.offsets[tile + 1]]
+    members, counts = list_rows(scene.boxes, ids, tile, lists, frame)
+    x0, y0, n_per_line = start_tile(tile, lists, frame)
+    for i in range(counts.size):
+        x, y = x0 + i % n_per_line * WIDTH, y0 + i // n_per_line
+        if x < frame.width and y < frame.height:
+            yield Row(x, y, ids, members[i, : counts[i]])
+
+
+@scalar
+def row_pixels(row, frame):
+    """Return the places of a row's pixels in the image; those beyond its edge repeat the last."""
+    first = row.y * frame.width + row.x
+    return rows_from(first, first + min(WIDTH, frame.width - row.x))
+
+
+@scalar
+def field_of(state, k, row, frame):
+    """Return field k of ``state`` [n_fields * 8]; pixels beyond the image's edge repeat the last."""
+    return gather(state, rows_from(k * WIDTH, k * WIDTH + min(WIDTH, frame.width - row.x)), 0)
+
+
+@scalar
+def full_transmittance(row, frame, as_data):
+    """Return one, and minus one for pixels beyond the image's edge: they are finished."""
+    return select(counted(as_data(0)) < as_data(frame.width - row.x), filled(as_data(1)), -ONE)
+
+
+@scalar
+def hit_row(hit, scene, n, row):
+    """Return what ``hit`` of a response does, with alpha 0 in the pixels that the box does not hold."""
+    as_data = scene.records.dtype.type
+    xs = counted(as_data(0)) + (as_data(row.x) + HALF)  # pixel centres
+    unclamped, depth, place = hit(scene.records, n, xs, as_data(row.y) + HALF)
+    is_in_box = (xs > scene.boxes[n, 0]) & (xs < scene.boxes[n, 2])
+    return select(is_in_box, unclamped, ZERO), depth, place

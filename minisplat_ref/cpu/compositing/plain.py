@@ -1,0 +1,217 @@
+"""The plain kernels: blending forward and backward, for any primitive. Read these first, then the tuned ones.
+
+Every splatting method is this loop: a pixel meets the primitives of its tile, nearest first, and takes from each what
+the light in front has left. What a primitive is stands in a :class:`KernelResponse`; here is only the loop, eight
+pixels of a line at a time. The list of a tile is dealt out to its rows of eight, and each goes through its own::
+
+    a tile               its list [M]           members of row 0      state of a row, eight numbers each
+    +-------+-------+    +---+---+---+---+--    +---+---+---+--       forward            backward
+    | row 0 | row 1 |    | 7 | 3 | 9 | 4 |      | 0 | 2 | 3 |         +-------------+    +-------------+
+    +-------+-------+    +---+---+---+---+--    +---+---+---+--       | T           |    | T           |
+    | row 2 | ...   |      places 0, 1, ...       whose boxes hold    +-------------+    +-------------+
+    +-------+-------+      nearest first          a pixel of it       | image so    |    | behind      |
+    |       |       |                                                 | far [D]     |    +-------------+
+                                                                      +-------------+    | v [D]       |
+    T: transmittance, negative once the pixel is finished                                +-------------+
+
+    sums [M, G + S, 8] of a tile, backward:    | record's gradient: G | colours' gradient: S | of every listed primitive
+    slots [pairs, G + S] of all tiles:         the same with the eight added up; a primitive's slots lie side by side
+
+Backward, a row goes through the list from the front once more, so that every threshold falls as it did forward. Of
+<v, image> it keeps the part that lies behind the current hit: it starts as the whole and shrinks hit by hit. No two
+threads write to one slot, and slots are added up in their order, so that the bytes of a gradient do not depend on the
+number of threads.
+
+The functions around these kernels are in :mod:`minisplat_ref.cpu.compositing.hits`. Where pixels sort their hits
+(``buffer_size`` above 1), :mod:`minisplat_ref.cpu.compositing.hit_buffer` goes through the list. Left out: what the
+tuned kernels (``forward``, ``backward``) do to be faster, and blend statistics.
+"""
+
+import functools
+from collections.abc import Callable
+
+import numpy as np
+
+from minisplat_ref.constants import LIST_ORDER
+from minisplat_ref.cpu.compositing.hit_buffer import ALPHA, CHANNELS, V_ALPHA, WEIGHT, hit_buffer, hit_rows, walk_sorted
+from minisplat_ref.cpu.compositing.pixel_rows import (
+    field_of,
+    full_transmittance,
+    hit_row,
+    row_pixels,
+    rows_of_tile,
+)
+from minisplat_ref.cpu.compositing.responses import KernelResponse
+from minisplat_ref.jit.compile import kernel, prange, scalar
+from minisplat_ref.jit.lanes import (
+    WIDTH,
+    accumulate,
+    any_of,
+    filled,
+    gather,
+    load,
+    scatter,
+    select,
+    store,
+    sum_of,
+)
+from minisplat_ref.jit.literals import ONE, ZERO
+from minisplat_ref.jit.turns import no_turns, turns
+from minisplat_ref.scalar.compositing import blend, blend_vjp
+
+
+@functools.cache
+def forward_kernel(response: KernelResponse, n_channels: int) -> Callable:
+    """Compile the forward kernel for a response and a number of channels."""
+    hit, shade, is_sorted = response.hit, response.shade, response.buffer_size > LIST_ORDER
+
+    @scalar
+    def draw_row(state, scene, row, frame):
+        """Blend the members of a row's list, in its order."""
+        T = load(state, 0)
+        for m in row.members:
+            n = row.ids[m]
+            unclamped, _, place = hit_row(hit, scene, n, row)
+            T, weight = blend(T, unclamped, frame)
+            for k in range(n_channels):
+                accumulate(state, (1 + k) * WIDTH, weight * shade(scene.colors, n, k, place))
+            if not any_of(T > ZERO):
+                break
+        store(state, 0, T)
+
+    @scalar
+    def take(state, hits, rows, frame):
+        """Blend one hit of a buffer in each pixel."""
+        T, weight = blend(load(state, 0), gather(hits, rows, ALPHA), frame)
+        store(state, 0, T)
+        for k in range(n_channels):
+            accumulate(state, (1 + k) * WIDTH, weight * gather(hits, rows, CHANNELS + k))
+
+    draw_sorted_row = walk_sorted(hit, shade, n_channels, take)
+
+    @kernel()
+    def composite_tiles(scene, background, lists, frame, n_threads, out):
+        taken = no_turns()
+        for _ in prange(n_threads):
+            state = np.empty((1 + n_channels) * WIDTH, out.image.dtype)
+            for tile in turns(taken, lists.offsets.size - 1):
+                n_listed = lists.offsets[tile + 1] - lists.offsets[tile]
+                buffer = hit_buffer(n_listed if is_sorted else 0, n_channels, state.dtype)
+                for row in rows_of_tile(tile, scene, lists, frame):
+                    state[:] = ZERO
+                    store(state, 0, full_transmittance(row, frame, state.dtype.type))
+                    if is_sorted:
+                        draw_sorted_row(state, buffer, scene, row, lists.buffer_size, frame)
+                    else:
+                        draw_row(state, scene, row, frame)
+                    pixels, T_end = row_pixels(row, frame), abs(field_of(state, 0, row, frame))
+                    scatter(out.alpha, pixels, 0, ONE - T_end)
+                    for k in range(n_channels):
+                        scatter(out.image, pixels, k, field_of(state, 1 + k, row, frame) + T_end * background[k])
+
+    return composite_tiles
+
+
+@functools.cache
+def backward_kernel(response: KernelResponse, n_channels: int) -> Callable:
+    """Compile the backward kernel for a response and a number of channels."""
+    hit, hit_vjp, shade, shade_vjp = response.hit, response.hit_vjp, response.shade, response.shade_vjp
+    n_gradients, n_coefficients, n_places = response.n_gradients, response.n_coefficients, response.n_places
+    n_sums, is_sorted = n_gradients + n_channels * n_coefficients, response.buffer_size > LIST_ORDER
+    behind_place, v_first = WIDTH, 2 * WIDTH  # of a state, after the transmittance
+
+    @scalar
+    def start_row(state, output, v_output, row, frame):
+        """Fetch v for eight pixels, and <v, image> with the share of alpha = 1 - T_end."""
+        pixels, T = row_pixels(row, frame), full_transmittance(row, frame, state.dtype.type)
+        store(state, 0, T)
+        behind = gather(v_output.alpha, pixels, 0) * (gather(output.alpha, pixels, 0) - ONE)
+        for k in range(n_channels):
+            v = gather(v_output.image, pixels, k)
+            behind = behind + v * gather(output.image, pixels, k)
+            store(state, v_first + k * WIDTH, select(T > ZERO, v, ZERO))
+        store(state, behind_place, behind)
+
+    @scalar
+    def blend_again(state, unclamped, light, frame):
+        """Blend a hit with <v, colour> = ``light`` once more; return dL/dalpha and the weight."""
+        T = load(state, 0)
+        after, weight = blend(T, unclamped, frame)
+        behind = load(state, behind_place) - weight * light
+        store(state, 0, after)
+        store(state, behind_place, behind)
+        return blend_vjp(T, weight, unclamped, behind, light, frame), weight
+
+    @scalar
+    def chain(sums, v_place, state, scene, n, place, gradient, frame):
+        """Add what eight pixels contribute to the ``sums`` [(G + S) * 8] of primitive n."""
+        unclamped, v_alpha, weight = gradient
+        v_place[:] = ZERO
+        for k in range(n_channels):
+            v_channel = weight * load(state, v_first + k * WIDTH)
+            v_coefficients, v_place_k = shade_vjp(scene.colors, n, k, place, v_channel)
+            accumulate(sums, (n_gradients + k * n_coefficients) * WIDTH, v_coefficients)
+            accumulate(v_place, 0, v_place_k)
+        v_mean = select(unclamped <= frame.mean_gradient_max, v_alpha, ZERO)
+        v_shape = select(unclamped <= frame.shape_gradient_max, v_alpha, ZERO)
+        accumulate(sums, 0, hit_vjp(scene.records, n, place, v_mean, v_shape, v_place))
+
+    @scalar
+    def chain_row(sums, v_place, state, scene, row, frame):
+        """Go through the members of a row's list once more and add to their ``sums``."""
+        for m in row.members:
+            n = row.ids[m]
+            unclamped, _, place = hit_row(hit, scene, n, row)
+            light = filled(state.dtype.type(0))
+            for k in range(n_channels):
+                light = light + load(state, v_first + k * WIDTH) * shade(scene.colors, n, k, place)
+            v_alpha, weight = blend_again(state, unclamped, light, frame)
+            gradient = unclamped, v_alpha, weight
+            chain(sums[m * n_sums * WIDTH :], v_place, state, scene, n, place, gradient, frame)
+            if not any_of(load(state, 0) > ZERO):
+                break
+
+    @scalar
+    def take(state, hits, rows, frame):
+        """Blend one hit of a buffer in each pixel once more, and write its gradient down."""
+        light = filled(state.dtype.type(0))
+        for k in range(n_channels):
+            light = light + load(state, v_first + k * WIDTH) * gather(hits, rows, CHANNELS + k)
+        v_alpha, weight = blend_again(state, gather(hits, rows, ALPHA), light, frame)
+        scatter(hits, rows, V_ALPHA, v_alpha)
+        scatter(hits, rows, WEIGHT, weight)
+
+    walk = walk_sorted(hit, shade, n_channels, take)
+
+    @scalar
+    def chain_sorted_row(sums, v_place, buffer, state, scene, row, buffer_size, frame):
+        """Do the same where pixels sort their hits: in their order for dL/dalpha, then in the list's for the rest."""
+        for h in range(walk(state, buffer, scene, row, buffer_size, frame)):
+            m, rows = buffer.members[h], hit_rows(h)
+            unclamped, _, place = hit_row(hit, scene, row.ids[m], row)
+            gradient = unclamped, gather(buffer.hits, rows, V_ALPHA), gather(buffer.hits, rows, WEIGHT)
+            chain(sums[m * n_sums * WIDTH :], v_place, state, scene, row.ids[m], place, gradient, frame)
+
+    @kernel()
+    def composite_tiles_vjp(scene, lists, frame, n_threads, output, v_output, slots, v_backgrounds):
+        taken = no_turns()
+        for _ in prange(n_threads):
+            state = np.empty((2 + n_channels) * WIDTH, slots.dtype)
+            v_place = np.empty(n_places * WIDTH, slots.dtype)
+            for tile in turns(taken, lists.offsets.size - 1):
+                first, n_listed = lists.offsets[tile], lists.offsets[tile + 1] - lists.offsets[tile]
+                sums = np.zeros(n_listed * n_sums * WIDTH, slots.dtype)
+                buffer = hit_buffer(n_listed if is_sorted else 0, n_channels, state.dtype)
+                for row in rows_of_tile(tile, scene, lists, frame):
+                    start_row(state, output, v_output, row, frame)
+                    if is_sorted:
+                        chain_sorted_row(sums, v_place, buffer, state, scene, row, lists.buffer_size, frame)
+                    else:
+                        chain_row(sums, v_place, state, scene, row, frame)
+                    for k in range(n_channels):
+                        v_backgrounds[tile, k] += sum_of(abs(load(state, 0)) * load(state, v_first + k * WIDTH))
+                for m in range(n_listed):
+                    for j in range(n_sums):
+                        slots[lists.slots[first + m], j] = sum_of(load(sums, (m * n_sums + j) * WIDTH))
+
+    return composite_tiles_vjp

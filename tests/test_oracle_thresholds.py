@@ -1,0 +1,84 @@
+"""Pixels at a threshold: each kind is found where it was put, and nowhere else."""
+
+import numpy as np
+import pytest
+
+from minisplat_ref.backends import REFERENCE
+from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.oracle.thresholds import thresholds
+from minisplat_ref.oracle.tolerances import FLOAT32_RENDERER, OWN_KERNELS
+from minisplat_ref.types import Projection, TileGrid
+
+FAR = 0.01  # relative distance from a threshold that no margin bridges
+
+
+def flat_layers(alphas, depths=None):
+    """Layers of these alphas over 4 x 3 pixels, and the thresholds there; a conic of 1e-30 does not fall off."""
+    n = len(alphas)
+    depths = np.arange(1.0, n + 1) if depths is None else np.array(depths)
+    boxes = np.tile(np.array([0, 0, 4, 3], np.int32), (n, 1))
+    conics = np.tile([1e-30, 0, 1e-30], (n, 1))
+    projection = Projection(np.full((n, 2), 2.0), depths, conics, np.array(alphas), np.full((n, 2), 4, np.int32), boxes)
+    grid = TileGrid(4, 3, REFERENCE.tile_width, REFERENCE.tile_height)
+    return projection, REFERENCE.bin_gaussians(projection, grid, GSPLAT_MAIN)
+
+
+def found(alphas, depths=None, margins=FLOAT32_RENDERER, **options):
+    """Whether jumps, kinks and medians are found; the same in every pixel."""
+    at = thresholds(*flat_layers(alphas, depths), GSPLAT_MAIN, margins, **options)
+    masks = at.jumps, at.kinks, at.medians
+    assert all(mask.shape == (3, 4) and mask.all() == mask.any() for mask in masks)
+    assert ((at.allowance > 0) == at.jumps).all() and (at.is_near == at.jumps | at.kinks).all()
+    return tuple(bool(mask.all()) for mask in masks)
+
+
+@pytest.mark.parametrize("margins", [FLOAT32_RENDERER, OWN_KERNELS], ids=["renderer", "kernels"])
+@pytest.mark.parametrize(
+    ("kind", "alphas_at", "expected"),
+    [
+        ("skip", lambda x: [0.3, x * GSPLAT_MAIN.alpha_min], (True, False, False)),
+        ("clamp", lambda x: [x * GSPLAT_MAIN.alpha_max], (False, True, False)),
+        ("stop", lambda x: [0.95, 0.96, 1 - x * GSPLAT_MAIN.transmittance_min / (0.05 * 0.04)], (True, False, False)),
+        ("median", lambda x: [1 - 0.5 * x], (False, False, True)),
+    ],
+)
+def test_each_threshold_is_found_as_far_as_its_margin(kind, alphas_at, expected, margins):
+    margin = getattr(margins, kind)
+    for sign in (-1, 1):
+        assert found(alphas_at(1 + 0.5 * sign * margin), margins=margins) == expected
+        assert found(alphas_at(1 + 2 * sign * margin), margins=margins) == (False, False, False)
+
+
+def test_neighbours_in_depth_are_found_unless_they_are_equal_or_nothing():
+    near = 1 + FLOAT32_RENDERER.order / 2
+    assert found([0.3, 0.4], [2.0, 2.0 * near]) == (True, False, False)
+    assert found([0.3, 0.4], [2.0, 2.0]) == (False, False, False), "the lower row comes first in every renderer"
+    assert found([0.3, 0.4], [2.0, 2.0 * near], OWN_KERNELS) == (False, False, False), "they sort the same numbers"
+    assert found([0.3, 0.4], [2.0, 2.0 * (1 + FAR)]) == (False, False, False)
+
+
+def test_behind_the_stop_nothing_is_found():
+    at_skip = GSPLAT_MAIN.alpha_min
+    assert found([0.9, 0.9, at_skip]) == (True, False, False)
+    assert found([0.98, 0.98, 0.98, at_skip]) == (False, False, False)
+
+
+def test_allowance_is_what_the_hit_can_change():
+    alpha_min = GSPLAT_MAIN.alpha_min
+    projection, bins = flat_layers([0.3, alpha_min])
+    at = thresholds(projection, bins, GSPLAT_MAIN, span=2.0)
+    assert np.allclose(at.allowance, 2 * 0.7 * alpha_min * (1 + FLOAT32_RENDERER.skip), rtol=1e-12)
+    swapped = thresholds(*flat_layers([0.3, 0.4], [2.0, 2.0 + 1e-7]), GSPLAT_MAIN)
+    assert np.allclose(swapped.allowance, 0.3 * 0.4, rtol=1e-12), (
+        "0.3 + 0.7 * 0.4 or 0.4 + 0.6 * 0.3: each moves by 0.12"
+    )
+
+
+def test_slack_widens_skip_and_stop():
+    at_stop = 1 - (1 + FAR) * GSPLAT_MAIN.transmittance_min / (0.05 * 0.04)
+    for alphas in (
+        [0.3, GSPLAT_MAIN.alpha_min * (1 - FAR)],
+        [0.3, GSPLAT_MAIN.alpha_min * (1 + FAR)],
+        [0.95, 0.96, at_stop],
+    ):
+        assert found(alphas) == (False, False, False) and found(alphas, slack=2 * FAR) == (True, False, False)
