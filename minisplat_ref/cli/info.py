@@ -74,7 +74,7 @@ def _ply_rows(path: Path) -> Rows:
 
     rows = [("PLY", _size(path)), *_field_rows(load_ply(path)._asdict())]
     further = ", ".join(further_properties(path))
-    return [*rows, *([("further", further)] if further else [])]
+    return [*rows, *([("further properties", further)] if further else [])]
 
 
 def _checkpoint_rows(path: Path) -> Rows:

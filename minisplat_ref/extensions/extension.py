@@ -115,22 +115,6 @@ def load_extensions() -> list[Extension]:
 _REPORTED: set[str] = set()  # names of extensions that could not be loaded, and of which stderr has said so
 
 
-def find_study(name: str) -> Study:
-    """Return the study of an extension, by EXTENSION/NAME.
-
-    Raises
-    ------
-    InputError
-        There is no such extension or study.
-    """
-    owner, _, own_name = name.partition("/")
-    studies = {study.name: study for study in load_extension(owner).studies}
-    if own_name not in studies:
-        choices = ", ".join(f"{owner}/{choice}" for choice in studies) or "none"
-        raise InputError(f"there is no study {name!r}: choose from {choices}")
-    return studies[own_name]
-
-
 def find_recipe(name: str, iterations: int | None = None, *, extension: str | None = None) -> Recipe:
     """Return the recipe of that name, of the core or of an extension, ready to train.
 

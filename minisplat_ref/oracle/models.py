@@ -24,7 +24,7 @@ from minisplat_ref.oracle.setting import POSE, Setting, make_setting
 from minisplat_ref.oracle.stages import Stage, hit_sides, slope_sides
 from minisplat_ref.rendering import Request
 from minisplat_ref.training.representation import Representation
-from minisplat_ref.types import Camera, Floats, Gaussians, Model, Projection, RenderOutput, Scene, View
+from minisplat_ref.types import Camera, Floats, Gaussians, Ints, Model, Projection, RenderOutput, Scene, TileBins, View
 
 TIME = 0.7
 NOISE = 0.1  # standard deviation: the Gaussians lie at depth 3 and are 0.1 to 0.5 large
@@ -152,22 +152,27 @@ def _watched(backend: Backend) -> tuple[Backend, list[np.ndarray]]:
     """Return the backend, and a list to which its stages append on which side of their thresholds they were."""
     sides: list[np.ndarray] = []
 
-    def project(means: Floats, quats: Floats, scales: Floats, *args: Any) -> Projection:
-        projection = backend.project(means, quats, scales, *args)
-        _, camera, conventions = args
+    def project(
+        means: Floats, quats: Floats, scales: Floats, opacities: Floats, camera: Camera, conventions: Conventions
+    ) -> Projection:
+        projection = backend.project(means, quats, scales, opacities, camera, conventions)
         sides.extend((projection.radii > 0, slope_sides(means, camera, conventions)))
         return projection
 
-    def sh_colors(*args: Any) -> Floats:
-        colors = backend.sh_colors(*args)
+    def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int, radii: Ints) -> Floats:
+        colors = backend.sh_colors(means, sh_dc, sh_rest, camera, degree, radii)
         sides.append(colors > 0)
         return colors
 
     def composite(
-        projection: Projection, colors: Floats, background: Floats, *args: Any, **asked: bool
+        projection: Projection,
+        colors: Floats,
+        background: Floats,
+        bins: TileBins,
+        conventions: Conventions,
+        **asked: bool,
     ) -> RenderOutput:
-        bins, conventions = args
         sides.extend(hit_sides(projection, bins, conventions))
-        return backend.composite(projection, colors, background, *args, **asked)
+        return backend.composite(projection, colors, background, bins, conventions, **asked)
 
     return replace(backend, project=project, sh_colors=sh_colors, composite=composite), sides

@@ -1,6 +1,5 @@
 """Linear motion: where a Gaussian is at a time, its gradient, standing still exactly, velocities that are found."""
 
-import argparse
 import json
 from functools import partial
 
@@ -14,9 +13,8 @@ from tolerances import CLOSED_FORM, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT32_IMAG
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
-from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.progress import Progress
-from minisplat_ref.extensions.extension import find_recipe, find_study, load_extension
+from minisplat_ref.extensions.extension import find_recipe, load_extension
 from minisplat_ref.extensions.velocity.method import MOVING, MovingGaussians
 from minisplat_ref.extensions.velocity.reference import means_at, means_at_vjp
 from minisplat_ref.extensions.velocity.study import moving_gaussians, outcome, photographs
@@ -204,17 +202,14 @@ def test_velocities_are_found(seed, record_property):
 
 
 def test_the_study_prints_what_it_measures(capsys):
-    parser = argparse.ArgumentParser()
-    study = find_study("velocity/motion")
-    study.add_arguments(parser)
-    assert study.run(parser.parse_args(["--iterations", "20"])) == 0
+    assert main(["study", "velocity/motion", "--iterations", "20"]) == 0
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in capsys.readouterr().out.splitlines()]
     truth = moving_gaussians(np.random.default_rng(0))
     expected = outcome(find_recipe("velocity", 20), truth, 0)
     assert rows[0] == ["recipe", "PSNR dB", "error of velocities"] and rows[2][0] == "3dgs-accel"
     assert rows[3] == ["velocity", f"{expected.psnr:.2f}", f"{expected.velocity_rmse:.4f}"]
-    with pytest.raises(InputError, match="there is no study 'velocity/rest': choose from velocity/motion"):
-        find_study("velocity/rest")
+    assert main(["study", "velocity/rest"]) == 2
+    assert "there is no study 'velocity/rest'" in capsys.readouterr().err
 
 
 # From a folder of photographs to pictures
