@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from minisplat_ref.gsplat_compat import rasterization, rasterization_vjp
     from minisplat_ref.io import load_scene
     from minisplat_ref.io.ply import load_ply, save_ply
+    from minisplat_ref.rendering import render, render_vjp
     from minisplat_ref.types import Camera, Gaussians, RenderOutput, Scene, View
 
 __version__ = "0.1.0"
@@ -26,6 +27,7 @@ _MODULES = {
     "minisplat_ref.io": ("load_scene",),
     "minisplat_ref.io.ply": ("load_ply", "save_ply"),
     "minisplat_ref.gsplat_compat": ("rasterization", "rasterization_vjp"),
+    "minisplat_ref.rendering": ("render", "render_vjp"),
     "minisplat_ref.types": ("Camera", "Gaussians", "RenderOutput", "Scene", "View"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
@@ -51,6 +53,8 @@ __all__ = [
     "load_scene",
     "rasterization",
     "rasterization_vjp",
+    "render",
+    "render_vjp",
     "save_ply",
 ]
 

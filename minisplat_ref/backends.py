@@ -10,7 +10,6 @@ from minisplat_ref import stages
 from minisplat_ref.cpu import adam as cpu_adam
 from minisplat_ref.cpu import compositing as cpu_compositing
 from minisplat_ref.cpu import depth as cpu_depth
-from minisplat_ref.cpu import geometric_loss as cpu_geometric_loss
 from minisplat_ref.cpu import loss as cpu_loss
 from minisplat_ref.cpu import projection as cpu_projection
 from minisplat_ref.cpu import spherical_harmonics as cpu_spherical_harmonics
@@ -22,7 +21,6 @@ from minisplat_ref.reference import (
     adam,
     compositing,
     depth,
-    geometric_loss,
     loss,
     projection,
     spherical_harmonics,
@@ -38,11 +36,14 @@ class Backend:
     ----------
     name : str
         For messages and reports.
+    is_compiled : bool
+        Whether kernels do the work; an extension that has a stage of its own chooses its form by this.
     tile_width, tile_height : int
         Size of the tiles that the image is cut into, pixels.
     """
 
     name: str
+    is_compiled: bool
     tile_width: int
     tile_height: int
     project: stages.Project
@@ -56,13 +57,12 @@ class Backend:
     surface_points_vjp: stages.SurfacePointsVjp
     photometric_loss: stages.PhotometricLoss
     photometric_loss_vjp: stages.PhotometricLossVjp
-    geometric_loss: stages.GeometricLoss
-    geometric_loss_vjp: stages.GeometricLossVjp
     adam_update: stages.AdamUpdate
 
 
 REFERENCE = Backend(
     name="reference",
+    is_compiled=False,
     tile_width=16,
     tile_height=16,
     project=projection.project,
@@ -76,14 +76,13 @@ REFERENCE = Backend(
     surface_points_vjp=depth.surface_points_vjp,
     photometric_loss=loss.photometric_loss,
     photometric_loss_vjp=loss.photometric_loss_vjp,
-    geometric_loss=geometric_loss.geometric_loss,
-    geometric_loss_vjp=geometric_loss.geometric_loss_vjp,
     adam_update=adam.adam_update,
 )
 """NumPy, as in the papers: to read and to check against."""
 
 CPU = Backend(
     name="cpu",
+    is_compiled=True,
     tile_width=cpu_tiling.TILE_WIDTH,
     tile_height=cpu_tiling.TILE_HEIGHT,
     project=cpu_projection.project,
@@ -97,8 +96,6 @@ CPU = Backend(
     surface_points_vjp=cpu_depth.surface_points_vjp,
     photometric_loss=cpu_loss.photometric_loss,
     photometric_loss_vjp=cpu_loss.photometric_loss_vjp,
-    geometric_loss=cpu_geometric_loss.geometric_loss,
-    geometric_loss_vjp=cpu_geometric_loss.geometric_loss_vjp,
     adam_update=cpu_adam.adam_update,
 )
 """Numba on all cores; float32 data use a polynomial exponential."""

@@ -44,11 +44,6 @@ SSIM_SIGMA = 1.5  # pixels
 SSIM_C1 = 0.01**2  # (K1 L)^2 with dynamic range L = 1
 SSIM_C2 = 0.03**2  # (K2 L)^2
 
-EDGE_SHARPNESS = 10.0  # neighbours that differ by 0.1, 25 of 255 levels, are tied e times more loosely than equal ones
-# Depth ratios within 1 % count as noise. The covariances of the points of four photographed scenes say 0.1 to 0.2 % for
-# the median observation and 0.2 to 0.7 % for the 90th percentile; wrong matches and silhouettes are off by far more.
-SFM_DEPTH_TOLERANCE = 0.01
-
 LIST_ORDER = 1  # hits that a pixel holds back to sort them: each is taken as it comes
 EXACT_ORDER = 1 << 30  # more than any list holds: a pixel sorts all its hits
 

@@ -18,7 +18,6 @@ from minisplat_ref.types import (
     Camera,
     CompositeGradient,
     Floats,
-    GeometricWeights,
     Ints,
     PrimitiveGradient,
     Projection,
@@ -172,27 +171,6 @@ class PhotometricLossVjp(Protocol):
     """Chain the derivative by the loss to the image [H, W, 3]."""
 
     def __call__(self, tape: Any, v_loss: float = 1.0) -> Floats: ...
-
-
-class GeometricLoss(Protocol):
-    """Evaluate how wrong and how rough a depth map is; return it with a tape for the gradient."""
-
-    def __call__(
-        self,
-        accumulated_depth: Floats,  # [H, W] sum w z
-        alpha: Floats,  # [H, W]
-        photograph: Floats,  # [H, W, 3]
-        camera: Camera,
-        points: Floats,  # [P, 3] float64 world frame
-        weights: GeometricWeights,
-        mask: Bools | None = None,  # [H, W]
-    ) -> tuple[float, Any]: ...
-
-
-class GeometricLossVjp(Protocol):
-    """Chain the derivative by the loss to accumulated depth and opacity, [H, W] each."""
-
-    def __call__(self, tape: Any, v_loss: float = 1.0) -> tuple[Floats, Floats]: ...
 
 
 class AdamUpdate(Protocol):

@@ -283,17 +283,6 @@ class AdamStep(NamedTuple):
     """Added to the root, bias corrections included."""
 
 
-class GeometricWeights(NamedTuple):
-    """Factors of the geometric loss terms, beside the photometric loss; 0 leaves a term out."""
-
-    sfm_depth: float = 0.0
-    """Of the depth error at the points of structure from motion."""
-    depth_smoothness: float = 0.0
-    """Of the relative depth steps between neighbouring pixels."""
-    normal_smoothness: float = 0.0
-    """Of the turns of the surface between neighbouring pixels."""
-
-
 class View(NamedTuple):
     """A photograph with its camera; or a camera alone, from :func:`view_from`."""
 

@@ -3,12 +3,11 @@
 A process compiles one function at a time, so that a first iteration waits for one kernel after the other. Here every
 stage is compiled by itself, in several processes, and found on disk by whoever needs it. A stage alone needs arguments
 of the types that the stages before it would give; they come from the reference, which compiles nothing. An extension is
-warmed up by drawing and differentiating a tiny model with its renderer, after the stages: what is not its own is found
-on disk by then.
+warmed up by drawing and differentiating a tiny model with its renderer and losses, after the stages: what is not its
+own is found on disk by then.
 
 Left out: numbers of channels other than those that training and rendering use (3, and 4 with depth), which gsplat's
-signature allows, the kernels of ``bench``, and those of an extension's loss terms and actions. They are compiled at
-their first use.
+signature allows, the kernels of ``bench``, and those of an extension's actions. They are compiled at their first use.
 """
 
 import gc
@@ -18,6 +17,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
+from functools import partial
 from multiprocessing import get_context
 from typing import NamedTuple, ParamSpec, TypeVar
 
@@ -29,13 +29,13 @@ from minisplat_ref.cpu.compositing.records import record_size
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import Extension, load_extension
 from minisplat_ref.rendering import RenderTape, Request, render, render_vjp
+from minisplat_ref.training.losses import LossTerm, Rendered, photometric, total_loss
 from minisplat_ref.types import (
     AdamStep,
     Camera,
     CompositeGradient,
     Floats,
     Gaussians,
-    GeometricWeights,
     Model,
     Projection,
     RenderOutput,
@@ -47,6 +47,8 @@ from minisplat_ref.types import (
 WIDTH, HEIGHT = 24, 18
 N_GAUSSIANS = 4
 DEGREE = 1  # of the spherical harmonics: a number at run time, so that any will do
+
+PHOTOMETRIC = LossTerm("photometric", partial(photometric, dssim_weight=0.2), weight=1.0)
 
 Dtype = type[np.floating]
 Arguments = ParamSpec("Arguments")
@@ -88,13 +90,6 @@ def _photometric_loss(dtype: Dtype) -> None:
     CPU.photometric_loss_vjp(CPU.photometric_loss(image, photograph, 0.2)[1])
 
 
-def _geometric_loss(dtype: Dtype) -> None:
-    output = _draw(dtype, _REFERENCE, with_depth=True).splats.output
-    image, depth = np.ascontiguousarray(output.image[..., :3]), output.image[..., 3]
-    weights, points = GeometricWeights(1.0, 1.0, 1.0), np.ones((2, 3))
-    CPU.geometric_loss_vjp(CPU.geometric_loss(depth, output.alpha, image, _camera(), points, weights)[1])
-
-
 def _adam(dtype: Dtype) -> None:
     for rows in (None, np.arange(N_GAUSSIANS)):  # all, and the visible
         values, gradient, first, second = np.zeros((4, N_GAUSSIANS, 3), dtype)
@@ -112,7 +107,6 @@ STAGES: dict[str, Callable[[Dtype], None]] = {
     "colours": _stage("sh_colors"),
     "Adam": _adam,
     # From here on not every training and no ordinary rendering.
-    "geometric loss, both ways": _geometric_loss,
     "blending with depth, backward": _stage("composite_vjp", with_depth=True),
     "blending with depth": _stage("composite", with_depth=True),
     "blend statistics": _stage("composite", with_stats=True),
@@ -144,7 +138,7 @@ def warm_up(
     n_processes : int, optional
         One per processor by default; each takes some 300 MB.
     extensions : iterable of str, optional
-        Names of extensions, whose renderers come after the stages. None by default.
+        Names of extensions, whose renderers and losses come after the stages. None by default.
     """
     names, extension_names = tuple(STAGES if stages is None else stages), tuple(extensions)
     n_processes = min(n_processes or os.cpu_count() or 1, max(len(names), len(extension_names)))
@@ -182,17 +176,21 @@ def _compile_extension(name: str, dtype: Dtype) -> Compiled:
 
 
 def _draw_extension(extension: Extension, dtype: Dtype) -> None:
-    """Draw and differentiate a tiny model, with its colours alone and with what the extension's losses want."""
+    """Draw a tiny model, take every loss of the extension, and differentiate."""
     representation, rng = extension.representation, np.random.default_rng(0)
     gaussians = _gaussians(dtype)
-    view = View("a", _camera(), np.zeros((HEIGHT, WIDTH, 3), np.uint8), None, view_id=0, time=0.5)
-    gray = np.full((N_GAUSSIANS, 3), 128, np.uint8)
+    ids, gray = np.arange(N_GAUSSIANS), np.full((N_GAUSSIANS, 3), 128, np.uint8)
+    photograph = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    view = View("a", _camera(), photograph, None, point_ids=ids, view_id=0, time=0.5)
     scene = Scene("tiny", (view,), (), gaussians.means.astype(np.float64), gray, np.zeros(3), extent=1.0)
     model = Model(representation.extend(gaussians, rng), representation.shared(scene, rng))
-    for wants in {frozenset[str](), frozenset[str]().union(*(term.wants for term in extension.losses))}:
-        request = Request(np.zeros(3, dtype), wants=wants)
-        output, tape = representation.renderer.render(model, view, request)
-        representation.renderer.render_vjp(tape, np.ones_like(output.image), None)
+    renderer, own = representation.renderer, [term._replace(weight=1.0) for term in extension.losses]
+    for terms in ([PHOTOMETRIC], [PHOTOMETRIC, *own]):
+        request = Request(np.zeros(3, dtype), wants=frozenset[str]().union(*(term.wants for term in terms)))
+        output, tape = renderer.render(model, view, request)
+        channels = renderer.channels(request.wants)
+        loss = total_loss(terms, Rendered(output, channels, view, scene, model, step=1, request=request))
+        renderer.render_vjp(tape, loss.v_image, loss.v_alpha)
 
 
 def _in_kernel_types(function: Callable[Arguments, HasConics]) -> Callable[Arguments, HasConics]:

@@ -111,7 +111,7 @@ from minisplat_ref.methods import get_recipe
 from minisplat_ref.rendering import render
 from minisplat_ref.strategy.importance import collect_importance
 from minisplat_ref.training.loop import train
-from minisplat_ref.warm_up import FIRST_ITERATION, STAGES
+from minisplat_ref.warm_up import FIRST_ITERATION, STAGES, _draw_extension
 
 
 def signatures():
@@ -129,6 +129,7 @@ state = train(scene, recipe, seed=0)
 assert len(first) > 10 and signatures() == first, signatures() - first
 for compile_stage in STAGES.values():
     compile_stage(np.float32)
+_draw_extension(GEOMETRY, np.float32)
 every = signatures()
 assert len(every) > len(first) + 5
 camera = scene.train_views[0].camera

@@ -21,9 +21,11 @@ from tolerances import COVERAGE_MIN, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT32_IMA
 import minisplat_ref
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.extensions.geometry import kernels as geometry_kernels
+from minisplat_ref.extensions.geometry.weights import GeometricWeights
 from minisplat_ref.jit import compile as _jit
 from minisplat_ref.rendering import render, render_vjp
-from minisplat_ref.types import GeometricWeights, ProjectionGradient, TileGrid
+from minisplat_ref.types import ProjectionGradient, TileGrid
 
 PACKAGE = Path(minisplat_ref.__file__).parent
 
@@ -47,7 +49,7 @@ def test_stages_keep_float32_but_for_conics(rng):
     points = CPU.surface_points(means, quats, scales, camera, ids)
     _, tape = CPU.photometric_loss(output.image, output.image[::-1].copy(), 0.2)
     geometry = (output.image[..., 0] + 1, output.alpha, output.image, camera, means.astype(float))
-    _, geometric_tape = CPU.geometric_loss(*geometry, GeometricWeights(1.0, 1.0, 1.0))
+    _, geometric_tape = geometry_kernels.geometric_loss(*geometry, GeometricWeights(1.0, 1.0, 1.0))
     assert projection.conics.dtype == v.conics.dtype == np.float64  # and nothing else
     results = {
         "project": projection._replace(conics=projection.depths),
@@ -59,7 +61,7 @@ def test_stages_keep_float32_but_for_conics(rng):
         "surface_points": points,
         "surface_points_vjp": CPU.surface_points_vjp(means, quats, scales, camera, ids, points.points, points.depths),
         "photometric_loss_vjp": (CPU.photometric_loss_vjp(tape),),
-        "geometric_loss_vjp": CPU.geometric_loss_vjp(geometric_tape),
+        "geometric_loss_vjp": geometry_kernels.geometric_loss_vjp(geometric_tape),
     }
     for stage, arrays in results.items():
         floats = [array for array in arrays if array.dtype.kind == "f"]

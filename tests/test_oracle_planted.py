@@ -7,6 +7,7 @@ from mutants import mutants
 from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.geometry.stages import PIECES as GEOMETRY_PIECES
 from minisplat_ref.oracle.differences import careful_derivative
 from minisplat_ref.oracle.gradients import inner_product_case, jacobian_case
 from minisplat_ref.oracle.pieces import PIECES, tiny_setting
@@ -153,10 +154,13 @@ EQUIVALENT = {
 }
 
 
-@pytest.mark.parametrize("module", PIECES, ids=lambda module: module.__name__.rpartition(".")[2])
+ALL_PIECES = {**PIECES, **GEOMETRY_PIECES}
+
+
+@pytest.mark.parametrize("module", ALL_PIECES, ids=lambda module: module.__name__.rpartition(".")[2])
 def test_no_changed_gradient_survives(module):
     rng = np.random.default_rng(0)
-    stages = PIECES[module](module)
+    stages = ALL_PIECES[module](module)
     cotangents = [[rng.normal(size=np.shape(y)) for y in s.function(*s.inputs.values()).outputs] for s in stages]
     expected = [transposed_products(stage, v) for stage, v in zip(stages, cotangents, strict=True)]
     assert all(map(is_right, stages, cotangents, expected))
@@ -164,7 +168,7 @@ def test_no_changed_gradient_survives(module):
     n, survivors = 0, set()
     for what, mutant in mutants(module):
         n += 1
-        if all(map(is_right, PIECES[module](mutant), cotangents, expected)):
+        if all(map(is_right, ALL_PIECES[module](mutant), cotangents, expected)):
             survivors.add(what)
     assert n >= 10
     own = {name for name, value in vars(module).items() if getattr(value, "__module__", "") == module.__name__}

@@ -14,12 +14,14 @@ from scenes import as_dtype, make_camera, make_gaussians
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.geometry import EXTENSION as GEOMETRY
+from minisplat_ref.extensions.geometry import kernels
+from minisplat_ref.extensions.geometry.weights import GeometricWeights
 from minisplat_ref.methods import RECIPES, gaussian_splatting
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import render
 from minisplat_ref.training.loop import initial_state, load_state, save_state, train
 from minisplat_ref.training.schedule import BLEND_STATS, At, During, Every, configured
-from minisplat_ref.types import GeometricWeights, Scene, View
+from minisplat_ref.types import Scene, View
 
 N_VIEWS, N_GAUSSIANS = 4, 30
 
@@ -160,7 +162,7 @@ def test_geometric_terms_join_the_loss(scene):
         output, _ = render(state.gaussians, camera, with_depth=True)
         target = np.zeros((camera.height, camera.width, 3), np.float32)
         weights = GeometricWeights(depth_smoothness=1.0)
-        return CPU.geometric_loss(output.image[..., 3], output.alpha, target, camera, scene.points[:0], weights)[0]
+        return kernels.geometric_loss(output.image[..., 3], output.alpha, target, camera, scene.points[:0], weights)[0]
 
     plain, smooth = [], []
     recipe = with_geometry(depth_smoothness=2.0)

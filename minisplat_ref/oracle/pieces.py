@@ -17,9 +17,7 @@ from minisplat_ref.oracle.setting import Setting, make_setting
 from minisplat_ref.oracle.stages import (
     Stage,
     composite_stage,
-    geometric_stage,
     photometric_stage,
-    points_near,
     project_stage,
     render_stage,
     sh_stage,
@@ -152,50 +150,6 @@ def depth_pieces(m: Module) -> tuple[Stage, ...]:
     )
 
 
-def depth_map_pieces(m: Module) -> tuple[Stage, ...]:
-    """``depth_normals``; one pixel has no depth."""
-    rng, camera = np.random.default_rng(SEED), tiny_setting().camera
-    depth = rng.uniform(2, 3, size=(4, 5))
-    depth[1, 2] = 0.0
-    has_depth = (depth > 0).astype(float)  # nor can a pixel without a depth be moved onto the surface
-    return (
-        Stage(
-            "depth_normals",
-            {"depth": depth},
-            ("normals",),
-            lambda z: Point((m.depth_normals(z * has_depth, camera),)),
-            lambda v: (m.depth_normals_vjp(depth, camera, v),),
-        ),
-    )
-
-
-def geometric_pieces(m: Module) -> tuple[Stage, ...]:
-    """The three terms, and their sum."""
-    rng, camera = np.random.default_rng(SEED), tiny_setting().camera
-    depth, photograph = rng.uniform(2, 3, size=(7, 9)), rng.uniform(size=(7, 9, 3))
-    points = points_near(depth, camera, rng)
-    normals = rng.normal(size=(6, 8, 3))
-    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
-
-    def term(name: str, array: Floats, input_name: str, *others: Any) -> Stage:
-        function, vjp = getattr(m, name), getattr(m, f"{name}_vjp")
-        return Stage(
-            name,
-            {input_name: array},
-            ("loss",),
-            lambda moved: Point((np.asarray(function(moved, *others)),)),
-            lambda v: (vjp(array, *others, float(v)),),
-        )
-
-    stages = with_module(geometric_loss=m.geometric_loss, geometric_loss_vjp=m.geometric_loss_vjp)
-    return (
-        term("sfm_depth_loss", depth, "depth", camera, points),
-        term("depth_smoothness", depth, "depth", photograph),
-        term("normal_smoothness", normals, "normals", photograph),
-        geometric_stage(stages, camera, rng),
-    )
-
-
 def _projection_pieces(m: Module) -> tuple[Stage, ...]:
     stages, setting = with_module(project=m.project, project_vjp=m.project_vjp), tiny_setting()
     antialiased = setting._replace(conventions=setting.conventions._replace(is_antialiased=True))
@@ -270,8 +224,6 @@ PIECES: dict[ModuleType, Callable[[Module], tuple[Stage, ...]]] = {
     reference.compositing: _compositing_pieces,
     reference.depth: depth_pieces,
     reference.loss: ssim_pieces,
-    reference.depth_map: depth_map_pieces,
-    reference.geometric_loss: geometric_pieces,
     splatting: lambda m: tuple(splat_stage(with_module(), tiny_setting(), m, with_depth=d) for d in (False, True)),
     rendering: lambda m: (render_stage(with_module(), tiny_setting(), m),),
 }

@@ -13,14 +13,12 @@ from minisplat_ref.backends import REFERENCE, Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.oracle.differences import Function, Point, Vjp
 from minisplat_ref.oracle.setting import Setting
-from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.reference.hits import tile_hits
-from minisplat_ref.reference.pinhole import pinhole_jacobians, pinhole_rays, pose, slope_limits, with_principal_point
+from minisplat_ref.reference.pinhole import pinhole_jacobians, pose, slope_limits, with_principal_point
 from minisplat_ref.types import (
     Camera,
     Floats,
     Gaussians,
-    GeometricWeights,
     Primitives,
     Projection,
     ProjectionGradient,
@@ -69,7 +67,6 @@ def backend_stages(backend: Backend, setting: Setting, rng: np.random.Generator)
         composite_stage(backend, setting),
         surface_stage(backend, setting),
         photometric_stage(backend, setting.camera, rng),
-        geometric_stage(backend, setting.camera, rng),
         render_stage(backend, setting),
     )
 
@@ -170,37 +167,6 @@ def photometric_stage(backend: Backend, camera: Camera, rng: np.random.Generator
         return (backend.photometric_loss_vjp(tape, float(v_loss)),)
 
     return Stage("photometric_loss", {"image": image}, ("loss",), function, vjp)
-
-
-def geometric_stage(backend: Backend, camera: Camera, rng: np.random.Generator) -> Stage:
-    """``geometric_loss`` with all its terms by accumulated depth and opacity, one pixel masked out."""
-    shape = camera.height, camera.width
-    depth, alpha = rng.uniform(2, 3, size=shape), rng.uniform(0.3, 1, size=shape)
-    photograph = rng.uniform(size=(*shape, 3))
-    points, weights = points_near(depth, camera, rng), GeometricWeights(0.7, 1.3, 0.9)
-    mask = np.ones(shape, dtype=bool)
-    mask[1, 1] = False
-    accumulated = depth * alpha
-    inputs: dict[str, Floats] = {"accumulated_depth": accumulated, "alpha": alpha}
-
-    def function(accumulated_depth: Floats, alpha: Floats) -> Point:
-        loss, _ = backend.geometric_loss(accumulated_depth, alpha, photograph, camera, points, weights, mask)
-        depth = expected_depth(accumulated_depth, alpha)
-        return Point((np.asarray(loss),), tuple(np.sign(np.diff(depth, axis=axis)) for axis in (0, 1)))
-
-    def vjp(v_loss: Floats) -> tuple[Floats, ...]:
-        _, tape = backend.geometric_loss(accumulated, alpha, photograph, camera, points, weights, mask)
-        return backend.geometric_loss_vjp(tape, float(v_loss))
-
-    return Stage("geometric_loss", inputs, ("loss",), function, vjp)
-
-
-def points_near(depth: Floats, camera: Camera, rng: np.random.Generator) -> Floats:
-    """Points [6, 3], world frame, in front of and behind a depth map: by 0.3 % and by 6 %, Huber's two regimes."""
-    rows, columns = (rng.choice(size, 6, replace=size < 6) for size in depth.shape)
-    z = depth[rows, columns] * (1 + np.array([0.003, -0.004, 0.002, 0.06, -0.06, 0.05]))
-    in_camera = z[:, None] * pinhole_rays(columns + 0.5, rows + 0.5, camera)
-    return (in_camera - camera.cam_from_world_t) @ camera.cam_from_world_R
 
 
 def splat_stage(backend: Backend, setting: Setting, module: object = splatting, *, with_depth: bool = True) -> Stage:

@@ -16,8 +16,6 @@ hits                 how strongly an ellipse covers a pixel, and what it leaves 
 compositing          how hits become a pixel, and a pixel's error becomes theirs     3DGS (3)
 depth                how far away what a pixel shows is, by two definitions          Mini-Splatting appendix D
 loss                 how far a rendered picture is from a photograph                 3DGS (7), Wang et al. 2004
-depth_map            which way the surface of a depth map faces                      2D Gaussian Splatting
-geometric_loss       how wrong a depth map is at known points, and how rough         DS-NeRF, Monodepth
 adam                 how a gradient becomes a step                                   Kingma and Ba 2015
 ===================  ==============================================================  ============================
 

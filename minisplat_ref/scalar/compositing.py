@@ -1,4 +1,4 @@
-"""Alpha blending of one hit at one pixel (3DGS equations 2 and 3), forward and backward.
+"""Alpha blending of one hit at one pixel (3DGS equations (3) and (4)), forward and backward.
 
 Eight pixels at a time (``lanes``), with selections instead of branches. A finished pixel keeps the negative of its
 transmittance, so that no later hit can pass the stop test and no second array is needed to remember it.

@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from minisplat_ref import constants
+from minisplat_ref.constants import INRIA_ROOT_MIN, INRIA_TILE
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import ceil, floor, larger, log_of, smaller, sqrt
 from minisplat_ref.jit.literals import HALF, ONE, THREE, TWO, ZERO
 
-INRIA_TILE = 16  # px; INRIA's rule is stated in tiles of this size
-INRIA_ROOT_MIN = 0.1  # px^4; floor of (lambda_1 - lambda_2)^2 / 4 in INRIA's largest eigenvalue
-RADIUS_MAX = np.float32(1 << 24)  # px; covers any image, survives the cast to int32, and is exact in float32
+RADIUS_MAX = np.float32(constants.RADIUS_MAX)  # exact in float32
 
 
 class Extent(NamedTuple):

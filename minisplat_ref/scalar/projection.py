@@ -1,4 +1,4 @@
-"""EWA projection of one Gaussian (3DGS section 4; Zwicker et al. 2001), in square-root form.
+"""EWA projection of one Gaussian (3DGS section 4; Zwicker et al. 2002), in square-root form.
 
 With the Gaussian's axes as the columns of M = R_g diag(s), the projected covariance is U U^T + eps2d I, where
 

@@ -1,4 +1,4 @@
-"""View-dependent colour of one Gaussian: real spherical harmonics of degree 0 to 3 (3DGS section 4, Plenoxels).
+"""View-dependent colour of one Gaussian: real spherical harmonics of degree 0 to 3 (3DGS section 3, Plenoxels).
 
 The sixteen basis functions are polynomials of the unit direction (x, y, z). They are written once, as products of the
 first-degree terms, and their gradients are the derivatives of those polynomials.

@@ -15,5 +15,6 @@ All look at the expected depth ``sum w z / alpha``, so their gradient goes to th
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.geometry.losses import LOSSES
+from minisplat_ref.extensions.geometry.stages import stages
 
-EXTENSION = Extension("geometry", losses=LOSSES)
+EXTENSION = Extension("geometry", losses=LOSSES, stages=stages)

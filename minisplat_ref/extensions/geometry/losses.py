@@ -1,24 +1,25 @@
 """The geometric terms as loss terms: what each is given, and to which channels its gradient goes."""
 
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.geometry import kernels, reference
+from minisplat_ref.extensions.geometry.weights import GeometricWeights
 from minisplat_ref.training.losses import Cotangents, LossTerm, Rendered
-from minisplat_ref.types import GeometricWeights
 
 
 def geometric(rendered: Rendered, weights: GeometricWeights) -> tuple[float, Cotangents]:
     """Return the geometric loss with these weights, and its derivatives by depth channel and alpha."""
-    view, backend = rendered.view, rendered.request.backend
+    view = rendered.view
     points = rendered.scene.points[view.point_ids] if view.point_ids is not None else rendered.scene.points[:0]
     photograph = view.image * np.float32(1 / 255)  # [H, W, 3]
     sums = np.ascontiguousarray(rendered.channel("depth")[..., 0])  # [H, W] sum w z
-    loss, tape = backend.geometric_loss(
-        sums, rendered.output.alpha, photograph, view.camera, points, weights, view.mask
-    )
-    v_sums, v_alpha = backend.geometric_loss_vjp(tape)
+    module: Any = kernels if rendered.request.backend.is_compiled else reference
+    loss, tape = module.geometric_loss(sums, rendered.output.alpha, photograph, view.camera, points, weights, view.mask)
+    v_sums, v_alpha = module.geometric_loss_vjp(tape)
     return loss, Cotangents({"depth": v_sums[..., None]}, v_alpha)
 
 

@@ -15,14 +15,21 @@ from tolerances import (
     PARITY_FLOAT64,
 )
 
-from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.constants import EDGE_SHARPNESS, SFM_DEPTH_TOLERANCE
-from minisplat_ref.reference.depth_map import depth_normals, depth_normals_vjp
-from minisplat_ref.reference.geometric_loss import edge_weights, normal_smoothness, normal_smoothness_vjp
+from minisplat_ref.extensions.geometry import kernels, reference
+from minisplat_ref.extensions.geometry.depth_map import depth_normals, depth_normals_vjp
+from minisplat_ref.extensions.geometry.reference import edge_weights, normal_smoothness, normal_smoothness_vjp
+from minisplat_ref.extensions.geometry.weights import EDGE_SHARPNESS, SFM_DEPTH_TOLERANCE, GeometricWeights
 from minisplat_ref.rendering import render, render_vjp
-from minisplat_ref.types import Gaussians, GeometricWeights
+from minisplat_ref.types import Gaussians
 
 NO_POINTS = np.zeros((0, 3))
+
+
+def functions_of(backend):
+    """The module whose functions the loss terms take under a backend."""
+    return kernels if backend.is_compiled else reference
+
+
 SFM = GeometricWeights(sfm_depth=1.0)
 DEPTH = GeometricWeights(depth_smoothness=1.0)
 NORMALS = GeometricWeights(normal_smoothness=1.0)
@@ -58,7 +65,7 @@ def loss_of(backend, depth, camera, weights, *, photograph=None, points=NO_POINT
     """Loss of an expected depth map that is seen with an opacity."""
     alpha = np.broadcast_to(alpha, depth.shape).astype(depth.dtype)
     photograph = flat_photograph(camera) if photograph is None else photograph
-    return backend.geometric_loss(alpha * depth, alpha, photograph, camera, points, weights, mask)
+    return functions_of(backend).geometric_loss(alpha * depth, alpha, photograph, camera, points, weights, mask)
 
 
 def rough_view(rng, camera):
@@ -90,7 +97,7 @@ def test_plane_parallel_to_the_image_is_smooth(backend, weights):
     depth = np.full((18, 24), 2.5)
     loss, tape = loss_of(backend, depth, camera, weights)
     assert loss == pytest.approx(0, abs=CLOSED_FORM)
-    assert all(np.abs(v).max() < CLOSED_FORM for v in backend.geometric_loss_vjp(tape))
+    assert all(np.abs(v).max() < CLOSED_FORM for v in functions_of(backend).geometric_loss_vjp(tape))
     assert_allclose(depth_normals(depth, camera), np.broadcast_to([0.0, 0, -1], (17, 23, 3)), atol=CLOSED_FORM)
 
 
@@ -147,7 +154,7 @@ def test_depth_error_at_a_point(backend, ratio, rng):
     e = np.log(ratio)
     cost, slope = (e * e / (2 * tau), e / tau) if abs(e) <= tau else (abs(e) - tau / 2, np.sign(e))
     assert loss == pytest.approx(cost, rel=1e2 * CLOSED_FORM, abs=CLOSED_FORM)
-    v_depth, v_alpha = backend.geometric_loss_vjp(tape)
+    v_depth, v_alpha = functions_of(backend).geometric_loss_vjp(tape)
     expected = np.zeros((18, 24))
     expected[3, 5] = slope / 1.6  # by log z, both points' halves added up, over the accumulated depth
     assert_allclose(v_depth, expected, rtol=1e2 * CLOSED_FORM, atol=1e2 * CLOSED_FORM)
@@ -166,7 +173,7 @@ def test_mean_is_over_points_that_are_seen(backend):
     points = np.concatenate([outside, seen, behind, empty, masked, np.zeros((1, 3)), np.full((1, 3), np.nan)])
     loss, tape = loss_of(backend, depth, camera, SFM, points=points, alpha=alpha, mask=mask)
     assert loss == pytest.approx(np.log(2) - SFM_DEPTH_TOLERANCE / 2, rel=CLOSED_FORM)
-    v_depth, _ = backend.geometric_loss_vjp(tape)
+    v_depth, _ = functions_of(backend).geometric_loss_vjp(tape)
     assert_array_equal(np.argwhere(v_depth), [[0, 0], [4, 4]])
 
 
@@ -175,8 +182,8 @@ def test_terms_add_up(backend, rng):
     accumulated, alpha, photograph, points = rough_view(rng, camera)
 
     def run(weights):
-        loss, tape = backend.geometric_loss(accumulated, alpha, photograph, camera, points, weights)
-        return loss, *backend.geometric_loss_vjp(tape, 3.0)
+        loss, tape = functions_of(backend).geometric_loss(accumulated, alpha, photograph, camera, points, weights)
+        return loss, *functions_of(backend).geometric_loss_vjp(tape, 3.0)
 
     parts = [run(weights) for weights in (SFM, DEPTH, NORMALS)]
     for total, *terms in zip(run(ALL), *parts, strict=True):
@@ -190,10 +197,12 @@ def test_smoothness_does_not_know_the_unit_of_length(backend, rng):
     weights = GeometricWeights(0.0, 1.0, 1.0)
     losses = []
     for unit in (1.0, 1000.0):
-        loss, tape = backend.geometric_loss(unit * accumulated, alpha, photograph, camera, NO_POINTS, weights)
+        loss, tape = functions_of(backend).geometric_loss(
+            unit * accumulated, alpha, photograph, camera, NO_POINTS, weights
+        )
         losses.append(loss)
     assert losses[1] == pytest.approx(losses[0], rel=1e2 * CLOSED_FORM)
-    v_depth, v_alpha = backend.geometric_loss_vjp(tape)
+    v_depth, v_alpha = functions_of(backend).geometric_loss_vjp(tape)
     size = np.abs(v_depth * unit * accumulated).sum()
     assert size > GRADIENT_FLOOR
     assert abs(np.sum(v_depth * unit * accumulated)) < 1e2 * CLOSED_FORM * size  # scaling all depths changes nothing
@@ -230,12 +239,12 @@ def test_loss_gradient(backend, term, is_masked, rng):
     mask = rng.uniform(size=alpha.shape) < 0.8 if is_masked else None
 
     def function(accumulated, alpha):
-        loss, _ = backend.geometric_loss(accumulated, alpha, photograph, camera, points, weights, mask)
+        loss, _ = functions_of(backend).geometric_loss(accumulated, alpha, photograph, camera, points, weights, mask)
         return (np.array(loss),)
 
     # Empty pixels must stay so, hence moves in proportion.
-    _, tape = backend.geometric_loss(accumulated, alpha, photograph, camera, points, weights, mask)
-    v_accumulated, v_alpha = backend.geometric_loss_vjp(tape, 300.0)
+    _, tape = functions_of(backend).geometric_loss(accumulated, alpha, photograph, camera, points, weights, mask)
+    v_accumulated, v_alpha = functions_of(backend).geometric_loss_vjp(tape, 300.0)
     check_inner_products(
         lambda x, y: function(accumulated * (1 + x), alpha * (1 + y)),
         (v_accumulated * accumulated, v_alpha * alpha),
@@ -259,13 +268,15 @@ def test_gradient_through_the_renderer(backend, term, rng):
         output, tape = render(Gaussians(*fields), camera, backend=backend, with_depth=True, with_stats=True)
         hit_counts.append(output.stats.hit_count)
         assert_array_equal(hit_counts[-1], hit_counts[0], "a hit came or went: take a smaller step")
-        loss = backend.geometric_loss(output.image[..., 3], output.alpha, photograph, camera, points, weights)
+        loss = functions_of(backend).geometric_loss(
+            output.image[..., 3], output.alpha, photograph, camera, points, weights
+        )
         return output, tape, *loss
 
     output, tape, _, loss_tape = run(*gaussians)
     assert (output.alpha > 0).mean() > COVERAGE_MIN and (output.alpha == 0).any()
     v_image = np.zeros_like(output.image)
-    v_image[..., 3], v_alpha = backend.geometric_loss_vjp(loss_tape)
+    v_image[..., 3], v_alpha = functions_of(backend).geometric_loss_vjp(loss_tape)
     gradient = render_vjp(tape, v_image, v_alpha).gaussians
     names = ["means", "quats", "log_scales", "opacity_logits"]
     assert not gradient.sh_dc.any() and not gradient.sh_rest.any()
@@ -291,7 +302,7 @@ def test_tiny_images(backend, size, expected, dtype):
     points = lift(camera, [0.5], [0.5], 2.0)  # where they say
     loss, tape = loss_of(backend, depth, camera, GeometricWeights(1.0, 1.0, 1.0), points=points)
     assert loss == pytest.approx(expected * np.log(1.5), rel=PARITY_FLOAT32_LOSS)
-    v_depth, v_alpha = backend.geometric_loss_vjp(tape)
+    v_depth, v_alpha = functions_of(backend).geometric_loss_vjp(tape)
     assert v_depth.shape == v_alpha.shape == depth.shape and v_depth.dtype == v_alpha.dtype == dtype
     assert np.isfinite(v_depth).all() and v_depth.any() == (expected > 0)
 
@@ -300,28 +311,30 @@ def test_empty_view_has_no_loss(backend, rng):
     camera = make_camera()
     points = lift(camera, rng.uniform(0, 24, 9), rng.uniform(0, 18, 9), 2.0)
     loss, tape = loss_of(backend, np.full((18, 24), 2.0), camera, ALL, points=points, alpha=0.0)
-    assert loss == 0.0 and not any(v.any() for v in backend.geometric_loss_vjp(tape))
+    assert loss == 0.0 and not any(v.any() for v in functions_of(backend).geometric_loss_vjp(tape))
 
 
 def test_everything_masked_out(backend, rng):
     camera = make_camera()
     accumulated, alpha, photograph, points = rough_view(rng, camera)
     mask = np.zeros((18, 24), bool)
-    loss, tape = backend.geometric_loss(accumulated, alpha, photograph, camera, points, ALL, mask)
-    assert loss == 0.0 and not any(v.any() for v in backend.geometric_loss_vjp(tape))
+    loss, tape = functions_of(backend).geometric_loss(accumulated, alpha, photograph, camera, points, ALL, mask)
+    assert loss == 0.0 and not any(v.any() for v in functions_of(backend).geometric_loss_vjp(tape))
 
 
 def test_single_pixels_have_no_neighbours(backend):
     camera, alpha = make_camera(), np.zeros((18, 24))
     alpha[::2, ::2] = 1.0
     loss, tape = loss_of(backend, np.full((18, 24), 2.0), camera, ALL, alpha=alpha)
-    assert loss == 0.0 and not any(v.any() for v in backend.geometric_loss_vjp(tape))
+    assert loss == 0.0 and not any(v.any() for v in functions_of(backend).geometric_loss_vjp(tape))
 
 
 def test_no_weight_no_loss(backend, rng):
     camera = make_camera()
-    loss, tape = backend.geometric_loss(*rough_view(rng, camera)[:3], camera, NO_POINTS, GeometricWeights())
-    assert loss == 0.0 and not any(v.any() for v in backend.geometric_loss_vjp(tape))
+    loss, tape = functions_of(backend).geometric_loss(
+        *rough_view(rng, camera)[:3], camera, NO_POINTS, GeometricWeights()
+    )
+    assert loss == 0.0 and not any(v.any() for v in functions_of(backend).geometric_loss_vjp(tape))
 
 
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="needs two threads")
@@ -331,8 +344,8 @@ def test_same_bytes_at_any_number_of_threads(rng):
     try:
         for n in (1, 2, 2):
             numba.set_num_threads(n)
-            loss, tape = CPU.geometric_loss(accumulated, alpha, photograph, camera, np.tile(points, (9, 1)), ALL)
-            results.append((loss, *(v.tobytes() for v in CPU.geometric_loss_vjp(tape))))
+            loss, tape = kernels.geometric_loss(accumulated, alpha, photograph, camera, np.tile(points, (9, 1)), ALL)
+            results.append((loss, *(v.tobytes() for v in kernels.geometric_loss_vjp(tape))))
     finally:
         numba.set_num_threads(n_threads)
     assert results[0] == results[1] == results[2]
@@ -348,12 +361,12 @@ def test_backends_agree(fast_backend, term, dtype, is_masked, rng):
     camera, weights = make_camera(41, 37, cx=18.0, rng=rng), TERMS[term]
     *images, points = rough_view(rng, camera)
     mask = rng.uniform(size=(37, 41)) < 0.8 if is_masked else None
-    expected, tape = REFERENCE.geometric_loss(*images, camera, points, weights, mask)
-    v_expected = REFERENCE.geometric_loss_vjp(tape, 2.0)
+    expected, tape = reference.geometric_loss(*images, camera, points, weights, mask)
+    v_expected = reference.geometric_loss_vjp(tape, 2.0)
     images = (image.astype(dtype) for image in images)
-    actual, tape = fast_backend.geometric_loss(*images, camera, points, weights, mask)
+    actual, tape = functions_of(fast_backend).geometric_loss(*images, camera, points, weights, mask)
     tolerance = PARITY_FLOAT64 if dtype == np.float64 else PARITY_FLOAT32_GRADIENT
     assert actual == pytest.approx(expected, rel=tolerance)
-    for v, e in zip(fast_backend.geometric_loss_vjp(tape, 2.0), v_expected, strict=True):
+    for v, e in zip(functions_of(fast_backend).geometric_loss_vjp(tape, 2.0), v_expected, strict=True):
         assert v.dtype == dtype and np.abs(e).max() > GRADIENT_FLOOR
         assert_allclose(v, e, rtol=0, atol=tolerance * np.abs(e).max())

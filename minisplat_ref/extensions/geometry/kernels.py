@@ -1,4 +1,4 @@
-"""Losses of a depth map, forward and backward: the loops over ``scalar/geometric_loss.py``.
+"""Losses of a depth map, forward and backward: the loops over ``formulas.py``.
 
 All three terms depend on ratios of depths alone, so that backward everything is collected by the logarithm of the
 depth; and log z = log(sum w z) - log(alpha). Backward, a pixel gathers from its neighbours: each number has one writer.
@@ -9,13 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.constants import DEPTH_ALPHA_MIN, EDGE_SHARPNESS, SFM_DEPTH_TOLERANCE
+from minisplat_ref.constants import DEPTH_ALPHA_MIN
 from minisplat_ref.cpu.projection import pose_of
+from minisplat_ref.extensions.geometry.formulas import edge_weight, facing, facing_vjp, huber, huber_vjp
+from minisplat_ref.extensions.geometry.weights import EDGE_SHARPNESS, SFM_DEPTH_TOLERANCE, GeometricWeights
 from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.jit.literals import HALF, ONE, ZERO
-from minisplat_ref.scalar.geometric_loss import edge_weight, facing, facing_vjp, huber, huber_vjp
 from minisplat_ref.scalar.projection import dot, rows_of, to_camera
-from minisplat_ref.types import Bools, Camera, Floats, GeometricWeights, Ints
+from minisplat_ref.types import Bools, Camera, Floats, Ints
 
 
 class GeometricTape(NamedTuple):

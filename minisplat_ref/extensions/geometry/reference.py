@@ -17,11 +17,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.constants import EDGE_SHARPNESS, SFM_DEPTH_TOLERANCE
+from minisplat_ref.extensions.geometry.depth_map import depth_normals, depth_normals_vjp
+from minisplat_ref.extensions.geometry.weights import EDGE_SHARPNESS, SFM_DEPTH_TOLERANCE, GeometricWeights
 from minisplat_ref.reference.depth import expected_depth, expected_depth_vjp
-from minisplat_ref.reference.depth_map import depth_normals, depth_normals_vjp
 from minisplat_ref.reference.pinhole import pinhole, pose
-from minisplat_ref.types import Bools, Camera, Floats, GeometricWeights, Ints
+from minisplat_ref.types import Bools, Camera, Floats, Ints
 
 
 class GeometricTape(NamedTuple):

@@ -1,0 +1,107 @@
+"""What the gradient proof checks of the geometric losses: the whole loss, and the formulas that it is built of."""
+
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from minisplat_ref.backends import Backend
+from minisplat_ref.extensions.geometry import depth_map, kernels, reference
+from minisplat_ref.extensions.geometry.weights import GeometricWeights
+from minisplat_ref.oracle.differences import Point
+from minisplat_ref.oracle.pieces import SEED, Module, tiny_setting
+from minisplat_ref.oracle.setting import Setting
+from minisplat_ref.oracle.stages import Stage
+from minisplat_ref.reference.depth import expected_depth
+from minisplat_ref.reference.pinhole import pinhole_rays
+from minisplat_ref.types import Camera, Floats
+
+
+def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
+    """Return the loss as a backend computes it; of the reference its formulas, too."""
+    if backend.is_compiled:
+        return (geometric_stage(kernels, setting.camera, rng),)
+    pieces = [stage for module, pieces_of in PIECES.items() for stage in pieces_of(module)]
+    return (geometric_stage(reference, setting.camera, rng), *pieces[:-1])
+
+
+def geometric_stage(module: Module, camera: Camera, rng: np.random.Generator) -> Stage:
+    """``geometric_loss`` of a module, all its terms, by accumulated depth and opacity; one pixel is masked out."""
+    shape = camera.height, camera.width
+    depth, alpha = rng.uniform(2, 3, size=shape), rng.uniform(0.3, 1, size=shape)
+    photograph = rng.uniform(size=(*shape, 3))
+    points, weights = points_near(depth, camera, rng), GeometricWeights(0.7, 1.3, 0.9)
+    mask = np.ones(shape, dtype=bool)
+    mask[1, 1] = False
+    accumulated = depth * alpha
+    inputs: dict[str, Floats] = {"accumulated_depth": accumulated, "alpha": alpha}
+
+    def function(accumulated_depth: Floats, alpha: Floats) -> Point:
+        loss, _ = module.geometric_loss(accumulated_depth, alpha, photograph, camera, points, weights, mask)
+        depth = expected_depth(accumulated_depth, alpha)
+        return Point((np.asarray(loss),), tuple(np.sign(np.diff(depth, axis=axis)) for axis in (0, 1)))
+
+    def vjp(v_loss: Floats) -> tuple[Floats, ...]:
+        _, tape = module.geometric_loss(accumulated, alpha, photograph, camera, points, weights, mask)
+        return module.geometric_loss_vjp(tape, float(v_loss))
+
+    return Stage("geometric_loss", inputs, ("loss",), function, vjp)
+
+
+def points_near(depth: Floats, camera: Camera, rng: np.random.Generator) -> Floats:
+    """Points [6, 3], world frame, in front of and behind a depth map: by 0.3 % and by 6 %, Huber's two regimes."""
+    rows, columns = (rng.choice(size, 6, replace=size < 6) for size in depth.shape)
+    z = depth[rows, columns] * (1 + np.array([0.003, -0.004, 0.002, 0.06, -0.06, 0.05]))
+    in_camera = z[:, None] * pinhole_rays(columns + 0.5, rows + 0.5, camera)
+    return (in_camera - camera.cam_from_world_t) @ camera.cam_from_world_R
+
+
+def depth_map_pieces(m: Module) -> tuple[Stage, ...]:
+    """``depth_normals``; one pixel has no depth."""
+    rng, camera = np.random.default_rng(SEED), tiny_setting().camera
+    depth = rng.uniform(2, 3, size=(4, 5))
+    depth[1, 2] = 0.0
+    has_depth = (depth > 0).astype(float)  # nor can a pixel without a depth be moved onto the surface
+    return (
+        Stage(
+            "depth_normals",
+            {"depth": depth},
+            ("normals",),
+            lambda z: Point((m.depth_normals(z * has_depth, camera),)),
+            lambda v: (m.depth_normals_vjp(depth, camera, v),),
+        ),
+    )
+
+
+def geometric_pieces(m: Module) -> tuple[Stage, ...]:
+    """The three terms, and their sum."""
+    rng, camera = np.random.default_rng(SEED), tiny_setting().camera
+    depth, photograph = rng.uniform(2, 3, size=(7, 9)), rng.uniform(size=(7, 9, 3))
+    points = points_near(depth, camera, rng)
+    normals = rng.normal(size=(6, 8, 3))
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+
+    def term(name: str, array: Floats, input_name: str, *others: Any) -> Stage:
+        function, vjp = getattr(m, name), getattr(m, f"{name}_vjp")
+        return Stage(
+            name,
+            {input_name: array},
+            ("loss",),
+            lambda moved: Point((np.asarray(function(moved, *others)),)),
+            lambda v: (vjp(array, *others, float(v)),),
+        )
+
+    return (
+        term("sfm_depth_loss", depth, "depth", camera, points),
+        term("depth_smoothness", depth, "depth", photograph),
+        term("normal_smoothness", normals, "normals", photograph),
+        geometric_stage(m, camera, rng),
+    )
+
+
+PIECES: dict[ModuleType, Callable[[Module], tuple[Stage, ...]]] = {
+    depth_map: depth_map_pieces,
+    reference: geometric_pieces,
+}
+"""The modules with gradients, and the stages that their functions are tested in."""
