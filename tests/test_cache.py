@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -71,7 +72,26 @@ def test_folder_follows_what_compiles(owner, name, value, monkeypatch):
 def test_every_kernel_is_in_the_hash():
     users = {path.parent.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py") if "@kernel" in path.read_text()}
     users |= {path.parent.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py") if "@scalar" in path.read_text()}
-    assert {path.parts[0] for path in users} == {"jit", "scalar", "cpu", "bench"}, "see _jit.source_hash"
+    folders = {path.parts[0] for path in users} - {"extensions"}  # which have hashes of their own, as below
+    assert folders == {"jit", "scalar", "cpu", "bench"}, "see _jit.source_hash"
+
+
+def test_kernels_of_an_extension_are_hashed_with_its_sources():
+    """Every kernel of every extension of the package is kept in a folder inside the core's, named by the extension."""
+    n_kernels = 0
+    for name, folder in extensions.folders().items():
+        for file in folder.rglob("*.py"):
+            if "@kernel" not in file.read_text():
+                continue
+            module = import_module(
+                ".".join((extensions.module_of(name), *file.relative_to(folder).with_suffix("").parts))
+            )
+            wrapped = (f.__wrapped__ for f in vars(module).values() if hasattr(f, "__wrapped__"))
+            for function in (f for f in wrapped if f.__module__ == module.__name__):
+                kept = Path(_jit.cache_folder(function))
+                assert kept.name.startswith(f"{name.replace('-', '_')}-") and kept.parent.name == _jit.source_hash()
+                n_kernels += 1
+    assert n_kernels > 0
 
 
 def test_numba_notices_another_processor_and_another_numba(tmp_path, monkeypatch):
