@@ -2,10 +2,12 @@
 
 A process compiles one function at a time, so that a first iteration waits for one kernel after the other. Here every
 stage is compiled by itself, in several processes, and found on disk by whoever needs it. A stage alone needs arguments
-of the types that the stages before it would give; they come from the reference, which compiles nothing.
+of the types that the stages before it would give; they come from the reference, which compiles nothing. An extension is
+warmed up by drawing and differentiating a tiny model with its renderer and losses, after the stages: what is not its
+own is found on disk by then.
 
 Left out: numbers of channels other than those that training and rendering use (3, and 4 with depth), which gsplat's
-signature allows, and the kernels of ``bench``. They are compiled at their first use.
+signature allows, the kernels of ``bench``, and those of an extension's actions. They are compiled at their first use.
 """
 
 import gc
@@ -15,6 +17,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
+from functools import partial
 from multiprocessing import get_context
 from typing import NamedTuple, ParamSpec, TypeVar
 
@@ -23,21 +26,29 @@ import numpy as np
 from minisplat_ref.backends import CPU, REFERENCE, Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.compositing.records import record_size
-from minisplat_ref.rendering import RenderTape, render, render_vjp
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.extension import Extension, load_extension
+from minisplat_ref.rendering import RenderTape, Request, render, render_vjp
+from minisplat_ref.training.losses import LossTerm, Rendered, photometric, total_loss
 from minisplat_ref.types import (
     AdamStep,
     Camera,
     CompositeGradient,
     Floats,
     Gaussians,
+    Model,
     Projection,
     RenderOutput,
+    Scene,
     TileBins,
+    View,
 )
 
 WIDTH, HEIGHT = 24, 18
 N_GAUSSIANS = 4
 DEGREE = 1  # of the spherical harmonics: a number at run time, so that any will do
+
+PHOTOMETRIC = LossTerm("photometric", partial(photometric, dssim_weight=0.2), weight=1.0)
 
 Dtype = type[np.floating]
 Arguments = ParamSpec("Arguments")
@@ -48,9 +59,11 @@ class Compiled(NamedTuple):
     """One stage that is ready."""
 
     name: str
-    """Key of ``STAGES``."""
+    """Key of ``STAGES``, or ``extension NAME``."""
     seconds: float
     """That it took; little where it was on disk already."""
+    problem: str = ""
+    """Why an extension could not be drawn, one line; empty where all is well."""
 
 
 def _stage(name: str, with_depth: bool = False, with_stats: bool = False) -> Callable[[Dtype], None]:
@@ -106,7 +119,10 @@ FIRST_ITERATION = tuple(STAGES)[:9]
 
 
 def warm_up(
-    stages: Iterable[str] | None = None, dtype: Dtype = np.float32, n_processes: int | None = None
+    stages: Iterable[str] | None = None,
+    dtype: Dtype = np.float32,
+    n_processes: int | None = None,
+    extensions: Iterable[str] = (),
 ) -> Iterator[Compiled]:
     """Compile stages in processes of their own, and yield each when it is ready.
 
@@ -121,15 +137,18 @@ def warm_up(
         ``numpy.float32``, or ``numpy.float64``.
     n_processes : int, optional
         One per processor by default; each takes some 300 MB.
+    extensions : iterable of str, optional
+        Names of extensions, whose renderers and losses come after the stages. None by default.
     """
-    names = tuple(STAGES if stages is None else stages)
-    n_processes = min(n_processes or os.cpu_count() or 1, len(names))
+    names, extension_names = tuple(STAGES if stages is None else stages), tuple(extensions)
+    n_processes = min(n_processes or os.cpu_count() or 1, max(len(names), len(extension_names)))
     # Fresh interpreters: a fork of a process in which kernels have run could not run any.
     pool = ProcessPoolExecutor(n_processes, get_context("spawn"), initializer=_prepare_process)
     try:
-        futures = [pool.submit(_compile, name, dtype) for name in names]
-        for future in as_completed(futures):
-            yield future.result()
+        for task, batch in ((_compile, names), (_compile_extension, extension_names)):
+            futures = [pool.submit(task, name, dtype) for name in batch]
+            for future in as_completed(futures):
+                yield future.result()
     finally:
         pool.shutdown(cancel_futures=True)
 
@@ -143,6 +162,35 @@ def _compile(name: str, dtype: Dtype) -> Compiled:
     start = time.perf_counter()
     STAGES[name](dtype)
     return Compiled(name, time.perf_counter() - start)
+
+
+def _compile_extension(name: str, dtype: Dtype) -> Compiled:
+    start, problem = time.perf_counter(), ""
+    try:
+        _draw_extension(load_extension(name), dtype)
+    except InputError as error:
+        problem = " ".join(str(error).split())
+    except Exception as error:  # whatever the renderer of somebody else does
+        problem = f"extension {name} does not draw: {type(error).__name__}: {' '.join(str(error).split())}"
+    return Compiled(f"extension {name}", time.perf_counter() - start, problem)
+
+
+def _draw_extension(extension: Extension, dtype: Dtype) -> None:
+    """Draw a tiny model, take every loss of the extension, and differentiate."""
+    representation, rng = extension.representation, np.random.default_rng(0)
+    gaussians = _gaussians(dtype)
+    ids, gray = np.arange(N_GAUSSIANS), np.full((N_GAUSSIANS, 3), 128, np.uint8)
+    photograph = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    view = View("a", _camera(), photograph, None, point_ids=ids, view_id=0, time=0.5)
+    scene = Scene("tiny", (view,), (), gaussians.means.astype(np.float64), gray, np.zeros(3), extent=1.0)
+    model = Model(representation.extend(gaussians, rng), representation.shared(scene, rng))
+    renderer, own = representation.renderer, [term._replace(weight=1.0) for term in extension.losses]
+    for terms in ([PHOTOMETRIC], [PHOTOMETRIC, *own]):
+        request = Request(np.zeros(3, dtype), wants=frozenset[str]().union(*(term.wants for term in terms)))
+        output, tape = renderer.render(model, view, request)
+        channels = renderer.channels(request.wants)
+        loss = total_loss(terms, Rendered(output, channels, view, scene, model, step=1, request=request))
+        renderer.render_vjp(tape, loss.v_image, loss.v_alpha)
 
 
 def _in_kernel_types(function: Callable[Arguments, HasConics]) -> Callable[Arguments, HasConics]:

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from numba.core.registry import cpu_target
 from scenes import as_dtype, make_camera, make_gaussians
 
 import minisplat_ref
+from minisplat_ref import extensions
 from minisplat_ref import warm_up as warm_up_module
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
@@ -70,7 +72,26 @@ def test_folder_follows_what_compiles(owner, name, value, monkeypatch):
 def test_every_kernel_is_in_the_hash():
     users = {path.parent.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py") if "@kernel" in path.read_text()}
     users |= {path.parent.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py") if "@scalar" in path.read_text()}
-    assert {path.parts[0] for path in users} == {"jit", "scalar", "cpu", "bench"}, "see _jit.source_hash"
+    folders = {path.parts[0] for path in users} - {"extensions"}  # which have hashes of their own, as below
+    assert folders == {"jit", "scalar", "cpu", "bench"}, "see _jit.source_hash"
+
+
+def test_kernels_of_an_extension_are_hashed_with_its_sources():
+    """Every kernel of every extension of the package is kept in a folder inside the core's, named by the extension."""
+    n_kernels = 0
+    for name, folder in extensions.folders().items():
+        for file in folder.rglob("*.py"):
+            if "@kernel" not in file.read_text():
+                continue
+            module = import_module(
+                ".".join((extensions.module_of(name), *file.relative_to(folder).with_suffix("").parts))
+            )
+            wrapped = (f.__wrapped__ for f in vars(module).values() if hasattr(f, "__wrapped__"))
+            for function in (f for f in wrapped if f.__module__ == module.__name__):
+                kept = Path(_jit.cache_folder(function))
+                assert kept.name.startswith(f"{name.replace('-', '_')}-") and kept.parent.name == _jit.source_hash()
+                n_kernels += 1
+    assert n_kernels > 0
 
 
 def test_numba_notices_another_processor_and_another_numba(tmp_path, monkeypatch):
@@ -110,7 +131,7 @@ from minisplat_ref.methods import get_recipe
 from minisplat_ref.rendering import render
 from minisplat_ref.strategy.importance import collect_importance
 from minisplat_ref.training.loop import train
-from minisplat_ref.warm_up import FIRST_ITERATION, STAGES
+from minisplat_ref.warm_up import FIRST_ITERATION, STAGES, _draw_extension
 
 
 def signatures():
@@ -128,6 +149,7 @@ state = train(scene, recipe, seed=0)
 assert len(first) > 10 and signatures() == first, signatures() - first
 for compile_stage in STAGES.values():
     compile_stage(np.float32)
+_draw_extension(GEOMETRY, np.float32)
 every = signatures()
 assert len(every) > len(first) + 5
 camera = scene.train_views[0].camera
@@ -171,12 +193,55 @@ def test_stages_are_compiled_by_other_processes(tmp_path, monkeypatch):
 
 def test_warm_says_what_it_did(root, monkeypatch, capsys):
     monkeypatch.setattr(warm_up_module, "STAGES", {"Adam": STAGES["Adam"]})
+    monkeypatch.setattr(extensions, "folders", dict)
     assert main(["cache", "warm"]) == 0
     captured = capsys.readouterr()
     assert "1 of 1" in captured.err and "Adam (float32)" in captured.err
     assert str(root / _jit.source_hash()) in captured.out and "ready after" in captured.out
     assert "1 folders of other versions hold 0.0 MB" in captured.out and "clear --stale" in captured.out
     assert len(files(root / _jit.source_hash(), ".nbc")) == 3  # two, and the made one
+
+
+def test_warm_goes_on_after_a_broken_extension(root, tmp_path, monkeypatch, capsys):
+    """One that does not import, and one that does not draw: a line each, and the kernels are there."""
+    texts = {"broken": "raise RuntimeError('nothing')", "blank": BLANK}
+    for name, text in texts.items():
+        package = tmp_path / "mine" / name
+        package.mkdir(parents=True)
+        (package / "__init__.py").write_text(text)
+    monkeypatch.setenv("MINISPLAT_EXTENSIONS", str(tmp_path / "mine"))  # for the other processes
+    monkeypatch.setattr(extensions, "folders", lambda: dict.fromkeys(texts))
+    monkeypatch.setattr(warm_up_module, "STAGES", {"Adam": STAGES["Adam"]})
+    assert main(["cache", "warm"]) == 0
+    captured = capsys.readouterr()
+    warnings = sorted(line for line in captured.err.splitlines() if "warning" in line)
+    assert len(warnings) == 2 and all(line.startswith("minisplat-ref: warning: extension ") for line in warnings)
+    assert "extension blank does not draw: KeyError: 'no colours'" in warnings[0]
+    assert "extension broken in" in warnings[1] and "RuntimeError: nothing" in warnings[1]
+    assert "3 of 3" in captured.err and "ready after" in captured.out
+    assert len(files(root / _jit.source_hash(), ".nbc")) == 3  # as without them
+
+
+BLANK = """
+from minisplat_ref.extensions.extension import Extension
+from minisplat_ref.training.representation import GAUSSIANS
+
+def render(model, view, request):
+    raise KeyError("no colours")
+
+RENDERER = GAUSSIANS.renderer._replace(render=render)
+EXTENSION = Extension("blank", representation=GAUSSIANS._replace(renderer=RENDERER))
+"""
+
+
+def test_warm_goes_on_where_two_extensions_have_one_name(root, tmp_path, monkeypatch, capsys):
+    (tmp_path / "mine" / "velocity").mkdir(parents=True)
+    (tmp_path / "mine" / "velocity" / "__init__.py").touch()
+    monkeypatch.setattr(extensions, "__path__", [*extensions.__path__, str(tmp_path / "mine")])
+    monkeypatch.setattr(warm_up_module, "STAGES", {"Adam": STAGES["Adam"]})
+    assert main(["cache", "warm"]) == 0
+    captured = capsys.readouterr()
+    assert "minisplat-ref: warning: extension velocity is in" in captured.err and "1 of 1" in captured.err
 
 
 def test_info_lists_only_our_folders(root, capsys):

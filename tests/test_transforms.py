@@ -247,6 +247,23 @@ def first_frame(**entries):
     return lambda content: content["frames"][0].update(entries)
 
 
+def test_times(tmp_path):
+    """Of the frame, else of the whole file, else 0; the views of both sets have theirs."""
+    write_transforms(tmp_path / "a", **NERFSTUDIO)
+    edit_transforms(
+        tmp_path / "a" / "transforms.json", lambda c: [f.update(time=i / 4) for i, f in enumerate(c["frames"])]
+    )
+    scene = load_scene(tmp_path / "a", test_every=2)
+    assert [view.time for view in scene.test_views] == [0.0, 0.5]
+    assert [view.time for view in scene.train_views] == [0.25, 0.75]
+    write_transforms(tmp_path / "b", **NERFSTUDIO, time="0.5")
+    edit_transforms(tmp_path / "b" / "transforms.json", first_frame(time=1))
+    scene = load_scene(tmp_path / "b", test_every=0)
+    assert [view.time for view in scene.train_views] == [1.0, 0.5, 0.5, 0.5]
+    write_transforms(tmp_path / "c", **NERFSTUDIO)
+    assert all(view.time == 0.0 for view in load_scene(tmp_path / "c", test_every=0).train_views)
+
+
 BAD_FILES = {
     "no frames": (lambda content: content.pop("frames"), "no list 'frames'"),
     "empty frames": (lambda content: content.update(frames=[]), "no list 'frames'"),
@@ -273,6 +290,10 @@ BAD_FILES = {
         r"p\.ply: missing, but .* remove ply_file_path",
     ),
     "one view": (lambda content: content.update(frames=content["frames"][:1]), "0 training and 1 test view"),
+    "time in words": (first_frame(time="noon"), r"images/0000\.png has the time 'noon': give a number"),
+    "no time": (first_frame(time=None), r"images/0000\.png has the time None: give a number"),
+    "time that is NaN": (first_frame(time=math.nan), r"images/0000\.png has the time nan: give a number"),
+    "time without end": (lambda content: content.update(time=math.inf), r"images/0000\.png has the time inf"),
     "same image twice": (
         lambda content: content["frames"].append(content["frames"][1]),
         "2 images are called images_0001; give each its own name",

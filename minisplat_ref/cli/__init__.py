@@ -85,7 +85,7 @@ def _parser_of(argv: Sequence[str]) -> argparse.ArgumentParser:
     """Return the parser of all commands; where the first word is an extension's name, of that extension's commands."""
     parser = build_parser()
     name = argv[0] if argv else ""
-    if name.startswith("-") or name in {c.__name__.rpartition(".")[2] for group in GROUPS.values() for c in group}:
+    if name.startswith("-") or name in _command_names(parser):
         return parser
     from minisplat_ref.extensions import folders
 
@@ -103,6 +103,11 @@ def _parser_of(argv: Sequence[str]) -> argparse.ArgumentParser:
     for command in extension.commands:
         command.add_parser(commands)
     return parser
+
+
+def _command_names(parser: argparse.ArgumentParser) -> set[str]:
+    """Return what can be typed as the first word."""
+    return {name for action in parser._actions if isinstance(action.choices, dict) for name in action.choices}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

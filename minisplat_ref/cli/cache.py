@@ -48,6 +48,7 @@ def _warm(args: argparse.Namespace) -> int:
     """Compile, stage by stage."""
     import numpy as np
 
+    from minisplat_ref.extensions import folders
     from minisplat_ref.jit.compile import cache_folder
     from minisplat_ref.jit.kernel_cache import kernel_folders
     from minisplat_ref.warm_up import STAGES, Dtype, warm_up
@@ -56,12 +57,19 @@ def _warm(args: argparse.Namespace) -> int:
         raise InputError("the folder for kernels cannot be written: set NUMBA_CACHE_DIR to one that can")
     start = time.perf_counter()
     dtypes: list[Dtype] = [np.float32, np.float64] if args.float64 else [np.float32]
+    extensions: tuple[str, ...] = ()
+    try:
+        extensions = tuple(folders())
+    except InputError as error:  # the core's kernels do not depend on somebody's folders
+        print(f"minisplat-ref: warning: {error}", file=sys.stderr)
     done = 0
     for dtype in dtypes:
-        for compiled in warm_up(dtype=dtype, n_processes=args.processes):
+        for compiled in warm_up(dtype=dtype, n_processes=args.processes, extensions=extensions):
             done += 1
-            count = f"{done:>2} of {len(dtypes) * len(STAGES)}"
+            count = f"{done:>2} of {len(dtypes) * (len(STAGES) + len(extensions))}"
             print(f"{count}  {compiled.seconds:5.1f} s  {compiled.name} ({dtype.__name__})", file=sys.stderr)
+            if compiled.problem:
+                print(f"minisplat-ref: warning: {compiled.problem}", file=sys.stderr)
     current, *others = kernel_folders()
     print(f"{_line(current)}\nready after {time.perf_counter() - start:.1f} s")
     if others:

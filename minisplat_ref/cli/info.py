@@ -70,9 +70,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _ply_rows(path: Path) -> Rows:
-    from minisplat_ref.io import load_ply
+    from minisplat_ref.io.ply import further_properties, load_ply
 
-    return [("PLY", _size(path)), *_field_rows(load_ply(path)._asdict())]
+    rows = [("PLY", _size(path)), *_field_rows(load_ply(path)._asdict())]
+    further = ", ".join(further_properties(path))
+    return [*rows, *([("further properties", further)] if further else [])]
 
 
 def _checkpoint_rows(path: Path) -> Rows:

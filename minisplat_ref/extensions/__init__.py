@@ -19,7 +19,7 @@ VARIABLE = "MINISPLAT_EXTENSIONS"
 
 # Packages of other folders are found as if they were here, so that ``minisplat_ref.extensions.NAME`` is their name in
 # every process, wherever they lie.
-__path__ += [folder for folder in os.environ.get(VARIABLE, "").split(os.pathsep) if folder]
+__path__ += [os.path.abspath(folder) for folder in os.environ.get(VARIABLE, "").split(os.pathsep) if folder]
 
 
 def folders() -> dict[str, Path]:
@@ -28,10 +28,12 @@ def folders() -> dict[str, Path]:
     Raises
     ------
     InputError
-        Two extensions have one name.
+        Two extensions have one name, or the variable names what is no folder.
     """
     found: dict[str, Path] = {}
     for place in __path__:
+        if not os.path.isdir(place):
+            raise InputError(f"{VARIABLE} names {place}, which is no folder: correct or unset it")
         for module in iter_modules([place]):
             if not module.ispkg:
                 continue

@@ -50,26 +50,53 @@ def load_extension(name: str) -> Extension:
     Raises
     ------
     InputError
-        There is none of that name, it cannot be imported, or it holds no ``EXTENSION`` of its folder's name.
+        There is none of that name, it cannot be imported, or its ``EXTENSION`` is missing or not as it should be.
     """
     found = folders()
     if name not in found:
         raise InputError(f"extension {name!r} does not exist: choose from {', '.join(found) or 'none'}")
     try:
-        extension = import_module(module_of(name)).EXTENSION
-    except Exception as error:  # whatever the file of somebody else does
+        module = import_module(module_of(name))
+    except (Exception, SystemExit) as error:  # whatever the file of somebody else does
         raise InputError(
             f"extension {name} in {found[name]} cannot be loaded, {type(error).__name__}: {error}; mend or remove it"
         ) from error
+    extension = getattr(module, "EXTENSION", None)
+    if not isinstance(extension, Extension):
+        raise InputError(
+            f"extension {name} in {found[name]} has no EXTENSION that is an Extension: let its __init__.py say"
+            f' EXTENSION = Extension("{name}", ...)'
+        )
+    _check_parts(extension, name, found[name])
+    return extension
+
+
+_PARTS: dict[str, type] = {"recipes": Recipe, "losses": LossTerm, "commands": ModuleType, "studies": Study}
+
+
+def _check_parts(extension: Extension, name: str, folder: Path) -> None:
+    """Refuse an extension whose fields are not what they should be, before anything stumbles over them.
+
+    Raises
+    ------
+    InputError
+        It has another name than its folder, a recipe with the name of one of the core, or a field of a wrong type.
+    """
     if extension.name != name:
-        raise InputError(f"extension {extension.name} lies in a folder called {found[name]}: rename one of them")
+        raise InputError(f"extension {extension.name} lies in a folder called {folder}: rename one of them")
+    for part, kind in _PARTS.items():
+        values = getattr(extension, part)
+        if type(values) is not tuple or not all(isinstance(value, kind) for value in values):
+            raise InputError(
+                f"extension {name} in {folder}: {part} is not a tuple of {kind.__name__}; write {part}=(...,)"
+            )
+    if not isinstance(extension.representation, Representation):
+        raise InputError(f"extension {name} in {folder}: representation is not a Representation")
     for recipe in extension.recipes:
         if recipe.name in RECIPES:
             raise InputError(
                 f"extension {name} has a recipe {recipe.name}, and so has the core: rename the extension's"
             )
-    loaded: Extension = extension
-    return loaded
 
 
 def load_extensions() -> list[Extension]:
@@ -80,7 +107,7 @@ def load_extensions() -> list[Extension]:
             extensions.append(load_extension(name))
         except InputError as error:
             if name not in _REPORTED:
-                print(f"minisplat-ref: warning: {error}", file=sys.stderr)
+                print(f"minisplat-ref: warning: {' '.join(str(error).split())}", file=sys.stderr)
                 _REPORTED.add(name)
     return extensions
 

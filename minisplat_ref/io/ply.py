@@ -110,6 +110,24 @@ def _further_names(columns: Iterable[str], field: str) -> tuple[str, ...]:
     return (field,) if field in columns else tuple(sorted(numbered, key=lambda name: int(name.rpartition("_")[2])))
 
 
+def further_properties(path: str | Path) -> tuple[str, ...]:
+    """Return the names of the properties that a PLY of Gaussians has beyond those of 3DGS, such as an extension's.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be opened or its header is malformed.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            *_, dtype = _read_header(file, path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be opened ({error.strerror})") from None
+    usual = {*MEANS, *NORMALS, *SH_DC, "opacity", *SCALES, *QUATS}
+    return tuple(name for name in dtype.names or () if name not in usual and not name.startswith("f_rest_"))
+
+
 def save_ply(path: str | Path, gaussians: Any) -> None:
     """Write trained Gaussians as a PLY in the 3DGS layout: binary, little-endian, float32, with zero normals.
 

@@ -80,7 +80,7 @@ def project_stage(backend: Backend, setting: Setting) -> Stage:
         moved = _moved(camera, R, t)
         p = backend.project(means, quats, scales, opacities, moved, conventions)
         return Point(
-            (p.means2d, p.depths, p.conics, p.opacities), (p.radii > 0, _slope_sides(means, moved, conventions))
+            (p.means2d, p.depths, p.conics, p.opacities), (p.radii > 0, slope_sides(means, moved, conventions))
         )
 
     def vjp(*cotangents: Floats) -> tuple[Floats, ...]:
@@ -124,7 +124,7 @@ def composite_stage(backend: Backend, setting: Setting) -> Stage:
     def function(means2d: Floats, conics: Floats, opacities: Floats, colors: Floats, background: Floats) -> Point:
         p = projection._replace(means2d=means2d, conics=conics, opacities=opacities)
         output = backend.composite(p, colors, background, bins, conventions)
-        return Point((output.image, output.alpha), _hit_sides(p, bins, conventions))
+        return Point((output.image, output.alpha), hit_sides(p, bins, conventions))
 
     def vjp(v_image: Floats, v_alpha: Floats) -> tuple[Floats, ...]:
         output = backend.composite(projection, colors, background, bins, conventions)
@@ -240,19 +240,19 @@ def _composited(backend: Backend, setting: Setting) -> tuple[Projection, TileBin
 
 
 def _view_point(tape: splatting.SplatTape) -> Point:
-    sides = _hit_sides(tape.projection, tape.bins, tape.conventions)
-    slopes = _slope_sides(tape.primitives.means, tape.camera, tape.conventions)
+    sides = hit_sides(tape.projection, tape.bins, tape.conventions)
+    slopes = slope_sides(tape.primitives.means, tape.camera, tape.conventions)
     return Point((tape.output.image, tape.output.alpha), (*sides, slopes))
 
 
-def _hit_sides(projection: Projection, bins: TileBins, conventions: Conventions) -> Sides:
+def hit_sides(projection: Projection, bins: TileBins, conventions: Conventions) -> Sides:
     """Which Gaussians are listed, which hits are blended and which are clamped."""
     tiles = list(tile_hits(projection, bins, conventions))
     blended = np.concatenate([np.ravel(tile.alphas > 0) for tile in tiles])
     return bins.gaussian_ids, bins.tile_offsets, blended, np.concatenate([np.ravel(tile.is_clamped) for tile in tiles])
 
 
-def _slope_sides(means: Floats, camera: Camera, conventions: Conventions) -> np.ndarray:
+def slope_sides(means: Floats, camera: Camera, conventions: Conventions) -> np.ndarray:
     """Whether the Jacobian of each point's projection follows its slopes."""
     camera = with_principal_point(camera, conventions)
     R, t = pose(camera, means.dtype)

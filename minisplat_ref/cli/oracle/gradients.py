@@ -14,11 +14,15 @@ Check every stage's gradient, and the whole render's, in float64:
   torch autograd   through gsplat's functions, with the extra [peers]
 
 A difference across a threshold is refused, and a check of nothing fails.
+
+With --extension NAME: the extension's renderer as a whole, by every field of its
+population and every shared parameter, at time 0.7, and what stages it has.
 """
 EPILOG = """\
 examples:
   minisplat-ref oracle gradients
   minisplat-ref oracle gradients --backend reference --profile INRIA
+  minisplat-ref oracle gradients --extension velocity --backend cpu
 """
 
 
@@ -42,6 +46,7 @@ def add_parser(checks: Commands) -> None:
         metavar="NAME",
         help=f"rasteriser conventions: {', '.join(PROFILES)} (default {GSPLAT_MAIN.name})",
     )
+    parser.add_argument("--extension", metavar="NAME", help="check this extension instead of the core")
     add_json_argument(parser)
     parser.set_defaults(run=run)
 
@@ -49,8 +54,23 @@ def add_parser(checks: Commands) -> None:
 def run(args: argparse.Namespace) -> int:
     """Check, print the table."""
     from minisplat_ref.backends import get_backend
+
+    if args.extension is not None:
+        return _check_extension(args)
     from minisplat_ref.oracle.gradients import AUTOGRAD, check_gradients
 
     report = check_gradients(get_backend(args.backend), PROFILES[args.profile])
     print(f"{AUTOGRAD}: {report.settings[AUTOGRAD]}")
+    return publish(report, args.json)
+
+
+def _check_extension(args: argparse.Namespace) -> int:
+    from minisplat_ref.backends import get_backend
+    from minisplat_ref.extensions.extension import load_extension
+    from minisplat_ref.oracle.models import check_model_gradients
+
+    extension = load_extension(args.extension)
+    report = check_model_gradients(
+        get_backend(args.backend), PROFILES[args.profile], extension.representation, extension.stages
+    )
     return publish(report, args.json)

@@ -1,7 +1,8 @@
 """Linear motion: every Gaussian has a velocity, and a view shows the scene at its time.
 
-The smallest extension that is a method: one field more, a renderer that wraps 3DGS's, a recipe. It is the worked
-example of ``docs/EXTENDING.md``. The centre of a Gaussian at the time t of a view is
+The smallest extension that is a method: one field more, a renderer that wraps 3DGS's, a recipe; and, as others may have
+them, a command and a study. It is the worked example of ``docs/EXTENDING.md``. The centre of a Gaussian at the time t
+of a view is
 
     mu(t) = mu + t nu
 
@@ -13,9 +14,13 @@ Left out: rotations and colours that change, and motion that is not straight; th
 followed here; linear motion is the first-order case of all of them.
 
     minisplat-ref train SCENE --recipe velocity
+    minisplat-ref velocity freeze runs/SCENE-velocity/point_cloud.ply --time 0.5 --out still.ply
+    minisplat-ref oracle gradients --extension velocity
 """
 
 from minisplat_ref.extensions.extension import Extension
+from minisplat_ref.extensions.velocity import freeze
 from minisplat_ref.extensions.velocity.method import MOVING, VELOCITY
+from minisplat_ref.extensions.velocity.study import MOTION
 
-EXTENSION = Extension("velocity", recipes=(VELOCITY,), representation=MOVING)
+EXTENSION = Extension("velocity", recipes=(VELOCITY,), representation=MOVING, commands=(freeze,), studies=(MOTION,))

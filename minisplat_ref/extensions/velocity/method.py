@@ -28,7 +28,6 @@ class MovingGaussians(NamedTuple):
 
 class _Tape(NamedTuple):
     inner: Any  # of the renderer of 3DGS
-    moving: MovingGaussians
     time: float
 
 
@@ -37,21 +36,25 @@ def at_rest(gaussians: Gaussians, rng: np.random.Generator) -> MovingGaussians:
     return MovingGaussians(**gaussians._asdict(), velocities=np.zeros_like(gaussians.means))
 
 
+def still_at(moving: MovingGaussians, time: float) -> Gaussians:
+    """Return the Gaussians of 3DGS that stand where these are at a time."""
+    still = Gaussians(*(getattr(moving, name) for name in Gaussians._fields))
+    return still._replace(means=means_at(moving.means, moving.velocities, time))
+
+
 def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, _Tape]:
     """Draw the scene at the time of the view."""
-    moving = model.gaussians
-    static = Gaussians(*(getattr(moving, name) for name in Gaussians._fields))
-    static = static._replace(means=means_at(moving.means, moving.velocities, view.time))
-    output, tape = SPLATTING.render(model._replace(gaussians=static), view, request)
-    return output, _Tape(tape, moving, view.time)
+    still = still_at(model.gaussians, view.time)
+    output, tape = SPLATTING.render(model._replace(gaussians=still), view, request)
+    return output, _Tape(tape, view.time)
 
 
 def render_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None) -> RenderGradient:
     """Gradient of :func:`render`: that of 3DGS, carried on to the velocities."""
     v = SPLATTING.render_vjp(tape.inner, v_image, v_alpha)
     v_means, v_velocities = means_at_vjp(tape.time, v.gaussians.means)
-    v_static = v.gaussians._replace(means=v_means)
-    return v._replace(gaussians=MovingGaussians(**v_static._asdict(), velocities=v_velocities))
+    v_still = v.gaussians._replace(means=v_means)
+    return v._replace(gaussians=MovingGaussians(**v_still._asdict(), velocities=v_velocities))
 
 
 MOVING = Representation(

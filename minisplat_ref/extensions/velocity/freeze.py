@@ -1,0 +1,25 @@
+"""The command ``minisplat-ref velocity freeze``: the scene at one moment, as a PLY that every viewer shows."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from minisplat_ref.extensions.velocity.method import MovingGaussians, still_at
+from minisplat_ref.io.ply import load_ply, save_ply
+
+
+def add_parser(commands: Any) -> None:
+    """Add the command."""
+    parser = commands.add_parser("freeze", help="write the scene at one moment, for viewers that know no motion")
+    parser.add_argument("ply", type=Path, metavar="PLY", help="point_cloud.ply of a run of recipe velocity")
+    parser.add_argument("--time", type=float, default=0.0, metavar="T", help="the moment (default 0)")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="PLY to write")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Move the Gaussians to where they are then, and leave out their velocities."""
+    still = still_at(load_ply(args.ply, MovingGaussians), args.time)
+    save_ply(args.out, still)
+    print(f"{len(still.means):,} Gaussians at time {args.time:g} in {args.out}")
+    return 0

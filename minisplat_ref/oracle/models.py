@@ -1,0 +1,178 @@
+"""The gradient proof for a whole model: any representation through its own renderer, without code of its own.
+
+The Gaussians of the tiny scene become the representation's population. Fields that they did not have, and shared
+parameters, begin as training begins them, often at zero or at the identity, where much of a gradient vanishes: here
+they are moved by random noise. The view is at time 0.7, so that what depends on time does.
+
+Which hits are blended and which of them are clamped is noted as the renderer calls the stages of its backend. A
+threshold of the renderer's own, a gate or a ReLU, is not seen: its stage belongs into the extension's ``stages``.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from minisplat_ref.backends import Backend
+from minisplat_ref.constants import Conventions
+from minisplat_ref.oracle.cases import Case, Report
+from minisplat_ref.oracle.differences import Point
+from minisplat_ref.oracle.gradients import inner_product_case, jacobian_case
+from minisplat_ref.oracle.pieces import SEED, tiny_setting
+from minisplat_ref.oracle.setting import POSE, Setting, make_setting
+from minisplat_ref.oracle.stages import Stage, hit_sides, slope_sides
+from minisplat_ref.rendering import Request
+from minisplat_ref.training.representation import Representation
+from minisplat_ref.types import Camera, Floats, Gaussians, Ints, Model, Projection, RenderOutput, Scene, TileBins, View
+
+TIME = 0.7
+NOISE = 0.1  # standard deviation: the Gaussians lie at depth 3 and are 0.1 to 0.5 large
+N_POINTS = 6
+
+Stages = Callable[[Backend, Setting, np.random.Generator], Sequence[Stage]]
+
+
+def check_model_gradients(
+    backend: Backend, conventions: Conventions, representation: Representation, stages: Stages | None = None
+) -> Report:
+    """Check the renderer of a representation, and further stages.
+
+    Parameters
+    ----------
+    backend : Backend
+        That the renderer is asked to use; in float64.
+    conventions : Conventions
+        Profile to do it under.
+    representation : Representation
+        What is drawn.
+    stages : callable, optional
+        ``stages(backend, setting, rng)``: what an extension has besides its renderer.
+
+    Returns
+    -------
+    Report
+        A case for each stage and way of checking.
+    """
+    rng = np.random.default_rng(SEED)
+    tiny, larger = tiny_setting(conventions), make_setting(rng, 60, 40, 30, conventions, sh_degree=3)
+
+    def all_stages(setting: Setting) -> tuple[Stage, ...]:
+        further = () if stages is None else stages(backend, setting, rng)
+        return (model_stage(backend, setting, representation, rng), *further)
+
+    cases: list[Case] = [jacobian_case(stage) for stage in all_stages(tiny)]
+    cases += [inner_product_case(stage, rng) for stage in all_stages(larger)]
+    settings = {"backend": backend.name, "profile": conventions.name, "dtype": "float64", "seed": SEED, "time": TIME}
+    title = f"gradients of {representation.name} on {backend.name}, profile {conventions.name}, float64"
+    return Report(title, tuple(cases), settings)
+
+
+def model_stage(backend: Backend, setting: Setting, representation: Representation, rng: np.random.Generator) -> Stage:
+    """Return a renderer as a function of every field, every shared parameter, the background and the pose.
+
+    The background is left out where the image does not depend on it, as behind a sky of the renderer's own.
+
+    Parameters
+    ----------
+    backend : Backend
+        That the renderer is asked to use.
+    setting : Setting
+        Gaussians and camera.
+    representation : Representation
+        Makes the population and the shared parameters, and draws them.
+    rng : Generator
+        For the noise.
+    """
+    renderer, view = representation.renderer, _view(setting.camera)
+    population = _noisy_population(setting.gaussians, representation, rng)
+    shared = {name: _noisy(array, rng) for name, array in representation.shared(_scene(setting, view), rng).items()}
+    fields = population._asdict()
+    wants = frozenset({"depth"} & renderer.channels(frozenset({"depth"})).keys())
+    inputs = {**fields, **shared, "background": setting.background, **setting.pose}
+
+    def draw(arrays: dict[str, Floats], used: Backend) -> tuple[RenderOutput, Any]:
+        model = Model(population._make(arrays[name] for name in fields), {name: arrays[name] for name in shared})
+        R, t = (arrays[name] for name in POSE)
+        moved = view.camera._replace(cam_from_world_R=R, cam_from_world_t=t)
+        request = Request(arrays["background"], conventions=setting.conventions, backend=used, wants=wants)
+        return renderer.render(model, view._replace(camera=moved), request)
+
+    over_black = draw({**inputs, "background": np.zeros(3)}, backend)[0].image
+    if np.array_equal(draw(inputs, backend)[0].image, over_black):
+        del inputs["background"]
+
+    def arrays_of(args: Sequence[Floats]) -> dict[str, Floats]:
+        return {"background": setting.background, **dict(zip(inputs, args, strict=True))}
+
+    def function(*args: Floats) -> Point:
+        watched, sides = _watched(backend)
+        output, _ = draw(arrays_of(args), watched)
+        return Point((output.image, output.alpha), tuple(sides))
+
+    def vjp(v_image: Floats, v_alpha: Floats) -> tuple[Floats, ...]:
+        _, tape = draw(arrays_of(tuple(inputs.values())), backend)
+        v = renderer.render_vjp(tape, v_image, v_alpha)
+        by_name = {
+            **v.gaussians._asdict(),
+            **{name: v.shared.get(name, np.zeros_like(array)) for name, array in shared.items()},
+            **{name: getattr(v, name) for name in ("background", *POSE)},
+        }
+        return tuple(by_name[name] for name in inputs)
+
+    return Stage(f"render {representation.name}", inputs, ("image", "alpha"), function, vjp)
+
+
+def _noisy_population(gaussians: Gaussians, representation: Representation, rng: np.random.Generator) -> Any:
+    """Make the Gaussians into a population, and move what they did not have."""
+    population = representation.extend(gaussians, rng)
+    known = gaussians._asdict()
+    return population._make(
+        field if field is known.get(name) else _noisy(field, rng) for name, field in population._asdict().items()
+    )
+
+
+def _noisy(array: Floats, rng: np.random.Generator) -> Floats:
+    """Return the array in float64, each entry moved by NOISE."""
+    return array + NOISE * rng.normal(size=array.shape)
+
+
+def _view(camera: Camera) -> View:
+    """Return a training view at TIME, of a black photograph."""
+    return View("a", camera, np.zeros((camera.height, camera.width, 3), np.uint8), None, view_id=0, time=TIME)
+
+
+def _scene(setting: Setting, view: View) -> Scene:
+    """Return a scene of one view, from which shared parameters can begin."""
+    points = setting.gaussians.means[:N_POINTS]
+    return Scene("tiny", (view,), (), points, np.full(points.shape, 128, np.uint8), setting.background, extent=1.0)
+
+
+def _watched(backend: Backend) -> tuple[Backend, list[np.ndarray]]:
+    """Return the backend, and a list to which its stages append on which side of their thresholds they were."""
+    sides: list[np.ndarray] = []
+
+    def project(
+        means: Floats, quats: Floats, scales: Floats, opacities: Floats, camera: Camera, conventions: Conventions
+    ) -> Projection:
+        projection = backend.project(means, quats, scales, opacities, camera, conventions)
+        sides.extend((projection.radii > 0, slope_sides(means, camera, conventions)))
+        return projection
+
+    def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int, radii: Ints) -> Floats:
+        colors = backend.sh_colors(means, sh_dc, sh_rest, camera, degree, radii)
+        sides.append(colors > 0)
+        return colors
+
+    def composite(
+        projection: Projection,
+        colors: Floats,
+        background: Floats,
+        bins: TileBins,
+        conventions: Conventions,
+        **asked: bool,
+    ) -> RenderOutput:
+        sides.extend(hit_sides(projection, bins, conventions))
+        return backend.composite(projection, colors, background, bins, conventions, **asked)
+
+    return replace(backend, project=project, sh_colors=sh_colors, composite=composite), sides
