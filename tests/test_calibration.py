@@ -1,14 +1,31 @@
 """Exposure and pose of each photograph: closed forms, gradients, what they leave alone, and that they are recovered."""
 
+import argparse
+import json
+
 import numpy as np
 import pytest
 from gradcheck import check_inner_products, check_jacobian
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import as_dtype, make_camera, make_gaussians
 from scipy.linalg import expm
-from tolerances import CLOSED_FORM, GRADIENT_REL, GRADIENT_STEP_IMAGE, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT32_IMAGE
+from tolerances import (
+    CLOSED_FORM,
+    GRADIENT_REL,
+    GRADIENT_STEP_IMAGE,
+    PARITY_FLOAT32_GRADIENT,
+    PARITY_FLOAT32_IMAGE,
+    PRINTED_DIGITS,
+)
 
 from minisplat_ref.backends import CPU, REFERENCE
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.errors import InputError
+from minisplat_ref.experiments.studies import exposures as exposures_study
+from minisplat_ref.experiments.studies import poses as poses_study
+from minisplat_ref.experiments.studies.calibration import EXPOSURE_STUDY, POSE_STUDY
+from minisplat_ref.io.images import read_image
+from minisplat_ref.methods import get_recipe
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.training.calibration import (
     EXPOSURES,
@@ -35,7 +52,7 @@ DEPTH = frozenset({"depth"})
 # Angles with a formula of their own each: none, rounding alone, both sides of the series' limit, usual, half a turn.
 ANGLES = (0.0, 1e-9, 1e-5, 0.9 * LEAST_ANGLE, 1.1 * LEAST_ANGLE, 1.0, np.pi - 1e-6)
 
-# A Jacobian by central differences with a step of 1e-6: 1e-12 times third derivatives of order 1, rounding 1e-16 / 1e-6.
+# A Jacobian by central differences with a step of 1e-6: 1e-12 times third derivatives of order 1, 1e-16 by 1e-6.
 JACOBIAN_BY_DIFFERENCES = 1e-9
 
 
@@ -267,3 +284,118 @@ def test_order_of_wrapping_does_not_matter(rng, model, view):
     assert results[0][1].keys() == results[1][1].keys()
     for name, v in results[0][1].items():
         assert_allclose(results[1][1][name], v, rtol=GRADIENT_REL)
+
+
+# Recovery -------------------------------------------------------------------------------------------------------------
+# Photographs of 64 x 48 pixels and 300 iterations without density control: seconds. The studies do the same at length.
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene("room", n_views=12, width=64, height=48, n_points=1500, test_every=4).scene
+
+
+BRIEFLY = get_recipe("3dgs-accel", 300)._replace(events=())
+
+
+def test_common_map_is_found_exactly(rng):
+    """Maps that differ from the true ones by a common map, and by nothing else, have no error."""
+    exposures = np.eye(3, 4) + 0.2 * rng.normal(size=(5, 3, 4))
+    K = np.eye(3, 4) + 0.2 * rng.normal(size=(3, 4))
+    color = rng.random(3)
+    truth = exposures_study.composed(exposures, K)
+    assert_allclose(expose(expose(color, K), exposures[2]), expose(color, truth[2]), rtol=CLOSED_FORM)
+    assert_allclose(exposures_study.common_map(exposures, truth), K, atol=1e2 * CLOSED_FORM)  # by a 15 x 3 system
+    assert_allclose(expose(expose(color, K), exposures_study.inverse(K)), color, rtol=1e2 * CLOSED_FORM)
+
+
+def test_color_error_by_hand(rng):
+    """An offset of 0.1 in every channel is an error of 0.1; twice the colour is one of the colours' own size."""
+    colors, identity = rng.random((7, 3)), np.eye(3, 4)[None]
+    brighter, twice = identity + 0.1 * np.array([0, 0, 0, 1.0]), 2 * identity
+    assert_allclose(exposures_study.color_errors(brighter, identity, colors), [0.1], rtol=1e2 * CLOSED_FORM)
+    assert_allclose(
+        exposures_study.color_errors(twice, identity, colors), [np.sqrt((colors**2).mean())], rtol=CLOSED_FORM
+    )
+
+
+def test_exposures_are_recovered(scene):
+    result = exposures_study.measure(scene, BRIEFLY, seed=0)
+    levels = {arm: np.mean(row["levels"]) for arm, row in result.items()}
+    assert levels["undisturbed"] < 1e-9
+    assert levels["disturbed"] > 15  # of 255
+    assert levels["calibrated"] < 0.25 * levels["disturbed"]  # measured: a sixth
+    psnr = {arm: row["psnr"] for arm, row in result.items()}
+    lost = psnr["undisturbed"] - psnr["disturbed"]
+    assert lost > 1.0
+    assert psnr["calibrated"] > psnr["disturbed"] + 0.7 * lost  # measured: nine tenths of what was lost
+
+
+def test_similarity_is_found_exactly(rng):
+    """Cameras that are all moved by one similarity are the same cameras, and see the same."""
+    truth = [make_camera(rng=rng) for _ in range(5)]
+    similarity = poses_study.Similarity(1.3, expm(cross_matrix(rng.normal(size=3))), rng.normal(size=3))
+    given = [poses_study.carried_back(camera, similarity) for camera in truth]
+    found = poses_study.aligning(given, truth)
+    for field, expected in zip(found, similarity, strict=True):
+        assert_allclose(field, expected, atol=1e3 * CLOSED_FORM)  # centres are 0.1 apart
+    aligned = [poses_study.carried(camera, found) for camera in given]
+    degrees, shifts = poses_study.errors(aligned, truth)
+    assert max(degrees) < 1e-5 and max(shifts) < 1e3 * CLOSED_FORM  # an angle of 1e-13 radians is a cosine of 1
+    point = rng.normal(size=3)
+    in_trained_scene = similarity.S.T @ (point - similarity.d) / similarity.s
+    for camera, other in zip(truth, given, strict=True):
+        x_true = camera.cam_from_world_R @ point + camera.cam_from_world_t
+        x = other.cam_from_world_R @ in_trained_scene + other.cam_from_world_t
+        assert_allclose(similarity.s * x, x_true, atol=1e2 * CLOSED_FORM)  # the same pixel
+
+
+def test_disturbance_is_as_large_as_it_says(scene):
+    disturbance = poses_study.Disturbance(degrees=1.0, shift=0.01)
+    disturbed = poses_study.disturbed_poses(scene, disturbance, np.random.default_rng(0))
+    cameras, truth = ([view.camera for view in s.train_views] for s in (disturbed, scene))
+    degrees, _ = poses_study.errors(cameras, truth)
+    assert_allclose(degrees, 1.0, rtol=1e-9)  # an angle from a matrix loses half the digits of a small one
+    for camera, true in zip(cameras, truth, strict=True):
+        Q = camera.cam_from_world_R @ true.cam_from_world_R.T
+        shift = camera.cam_from_world_t - Q @ true.cam_from_world_t
+        assert_allclose(np.linalg.norm(shift), 0.01 * scene.extent, rtol=1e2 * CLOSED_FORM)
+
+
+def test_poses_are_recovered(scene):
+    result = poses_study.measure(scene, BRIEFLY, poses_study.Disturbance(degrees=1.0, shift=0.01), seed=0)
+    mean = {arm: {key: np.mean(row[key]) for key in ("degrees", "shifts", "pixels")} for arm, row in result.items()}
+    assert mean["disturbed"]["degrees"] > 0.9 and mean["disturbed"]["pixels"] > 0.7
+    # measured: a half, two thirds and a quarter of the error are left; a pixel is a degree
+    for key, part in (("degrees", 0.65), ("shifts", 0.8), ("pixels", 0.4)):
+        assert mean["calibrated"][key] < part * mean["disturbed"][key], key
+    psnr = {arm: row["psnr"] for arm, row in result.items()}
+    lost = psnr["undisturbed"] - psnr["disturbed"]
+    assert lost > 1.0
+    assert psnr["calibrated"] > psnr["disturbed"] + 0.7 * lost  # measured: six sevenths of what was lost
+
+
+@pytest.mark.parametrize("study", [EXPOSURE_STUDY, POSE_STUDY], ids=lambda study: study.name)
+def test_studies_write_what_they_print(study, tmp_path, capsys):
+    parser = argparse.ArgumentParser()
+    study.add_arguments(parser)
+    out = tmp_path / "out"
+    args = ["room", "--out", str(out), "--iterations", "5", "--views", "6", "--width", "32"]
+    assert not study.run(parser.parse_args(args))
+    (result,) = out.glob("*.json")
+    (figure,) = out.glob("*.png")
+    arms = json.loads(result.read_text())["arms"]
+    assert list(arms) == ["undisturbed", "disturbed", "calibrated"]
+    assert read_image(figure).std() > 1
+    rows = [line.strip("| ").split("|") for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
+    for arm, row in zip(arms, rows[2:], strict=True):
+        assert row[0].strip() == arm
+        assert abs(float(row[-1]) - arms[arm]["psnr"]) < 100 * PRINTED_DIGITS
+
+
+def test_study_needs_held_out_views_and_a_small_disturbance(tmp_path):
+    parser = argparse.ArgumentParser()
+    POSE_STUDY.add_arguments(parser)
+    with pytest.raises(InputError, match="--degrees is 100"):
+        POSE_STUDY.run(parser.parse_args(["room", "--out", str(tmp_path / "out"), "--degrees", "100"]))
+    assert not (tmp_path / "out").exists()

@@ -151,7 +151,7 @@ def scaled(recipe: Recipe, iterations: int) -> Recipe:
     one-time event happens at iteration 1 at the earliest, a period is at least the event's ``least_period``. Because
     the period is rounded by itself, the number of events can differ by a few from the original's. What must not come
     before its ``least_step`` is left out of runs that are too short for it. Thresholds stay; so do learning rates,
-    unless the recipe has a ``short_run_exponent``.
+    unless the recipe or the calibration has a ``short_run_exponent``.
 
     Raises
     ------
@@ -161,16 +161,24 @@ def scaled(recipe: Recipe, iterations: int) -> Recipe:
     if iterations < 1:
         raise InputError(f"iterations is {iterations}: give at least 1")
     factor = iterations / recipe.iterations
-    raised = max(1.0, 1 / factor) ** recipe.short_run_exponent
+    shortening = max(1.0, 1 / factor)
+    raised = shortening**recipe.short_run_exponent
+
+    def of_calibration(calibration: Calibration) -> Calibration:
+        raised = shortening**calibration.short_run_exponent
+        return calibration._replace(rates=calibration.rates.scaled(factor, raised, raised))
+
     return recipe._replace(
         iterations=iterations,
-        learning_rates=recipe.learning_rates.scaled(factor, raised),
+        learning_rates=recipe.learning_rates.scaled(factor, raised, raised**2),
         sh_milestones=tuple(_scaled(milestone, factor) for milestone in recipe.sh_milestones),
         losses=tuple(term.scaled(factor) for term in recipe.losses),
         events=tuple(event.scaled(factor) for event in recipe.events),
         half_size_until=_scaled(recipe.half_size_until, factor),
-        calibrations=tuple(c._replace(rates=c.rates.scaled(factor, 1.0)) for c in recipe.calibrations),
-        representation=recipe.representation._replace(rates=recipe.representation.rates.scaled(factor, raised)),
+        calibrations=tuple(map(of_calibration, recipe.calibrations)),
+        representation=recipe.representation._replace(
+            rates=recipe.representation.rates.scaled(factor, raised, raised**2)
+        ),
     )
 
 
