@@ -84,7 +84,7 @@ def test_many_steps_follow_the_scalar_loop(backend, rng, rule):
     after, state = copy(before), zero_moments(before)
     for gradient in gradients:
         state = adam_step(after, gradient, state, RATES, rule, np.arange(n), backend)
-    for name, rate in zip(Pair._fields, RATES, strict=True):
+    for name, rate in zip(Pair._fields, RATES.values(), strict=True):
         values = getattr(before, name).ravel()
         series = np.array([getattr(gradient, name).ravel() for gradient in gradients])
         expected = [scalar_adam(value, series[:, i], rate, rule) for i, value in enumerate(values)]
