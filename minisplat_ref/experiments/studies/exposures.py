@@ -82,8 +82,9 @@ def measure(scene: Scene, recipe: Recipe, seed: int, arms: tuple[str, ...] = ARM
 def disturbed_exposures(scene: Scene, rng: np.random.Generator) -> tuple[Scene, Floats]:
     """Return the scene with every training photograph mapped by a random T_v, and these maps [V, 3, 4]."""
     maps = np.zeros((len(scene.train_views), 3, 4))
+    low, high = np.log(GAINS)
     for T in maps:
-        T[:, :3] = DARKER * np.diag(np.exp(rng.uniform(*np.log(GAINS), 3)))
+        T[:, :3] = DARKER * np.diag(np.exp(rng.uniform(low, high, 3)))
         T[:, 3] = DARKER * rng.uniform(*OFFSETS, 3)
     views = tuple(
         view._replace(image=np.round(255 * expose(view.image / 255, T)).astype(np.uint8))
