@@ -263,7 +263,7 @@ POSE = Calibration(
     zero_corrections,
     with_poses,
     # The rate of gsplat's trainer. In R iterations a parameter can travel 0.2 rate R, here 0.06 radians; a shorter run
-    # keeps this path, not the rate. Measured on 24 cameras turned by 0.52 degrees, rate R and the degrees that are left:
+    # keeps this path, not the rate. Measured on 24 cameras turned by 0.52 degrees, rate R and the degrees that remain:
     # in 600 iterations 0.075: 0.35, 0.15: 0.31, 0.3: 0.31, 0.6: 0.32, 1.2: 0.35; in 2400 0.34, 0.27, 0.27, 0.31, 0.35.
     # A longer path spoils what has been found, a shorter one does not get there.
     Rates({ROTATIONS: LogLinear(1e-5, 1e-7, 30_000), SHIFTS: LogLinear(1e-5, 1e-7, 30_000)}, frozenset({SHIFTS})),
