@@ -26,6 +26,7 @@ from minisplat_ref.io.checkpoint import load_checkpoint, save_checkpoint
 from minisplat_ref.io.scene import half_size
 from minisplat_ref.rendering import Request
 from minisplat_ref.strategy.initialization import initial_gaussians
+from minisplat_ref.strategy.ops import contiguous
 from minisplat_ref.training.adam import AdamRule, AdamState, adam_step, fields_of, zero_moments
 from minisplat_ref.training.losses import Rendered, total_loss
 from minisplat_ref.training.rates import active_sh_degree
@@ -57,10 +58,11 @@ def initial_state(scene: Scene, recipe: Recipe, seed: int) -> TrainState:
         )
     rng = np.random.default_rng(seed)
     representation = recipe.representation
-    gaussians = representation.extend(initial_gaussians(scene, recipe.sh_degree, rng), rng)
+    gaussians = contiguous(representation.extend(initial_gaussians(scene, recipe.sh_degree, rng), rng))
     shared = dict(representation.shared(scene, rng))
     for calibration in recipe.active_calibrations:
         shared |= calibration.initial(n_views)
+    shared = {name: np.ascontiguousarray(array) for name, array in shared.items()}  # Adam writes through views
     without_rate = [name for name in (*gaussians._fields, *shared) if name not in recipe.rates.of]
     if without_rate:
         raise InputError(

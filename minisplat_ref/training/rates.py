@@ -68,17 +68,24 @@ class Rates(NamedTuple):
         return self._replace(of={**self.of, **rates})
 
     def joined(self, other: "Rates") -> "Rates":
-        """Return these rates and the other's; of one name, these."""
-        return Rates({**other.of, **self.of}, self.per_extent | other.per_extent)
+        """Return these rates and the other's; of one name, these, and whether it is per extent is theirs to say."""
+        return Rates({**other.of, **self.of}, self.per_extent | (other.per_extent - self.of.keys()))
 
-    def scaled(self, factor: float, raised: float) -> "Rates":
-        """Return the rates with the lengths of their schedules multiplied by ``factor``, and themselves by ``raised``.
+    def scaled(self, factor: float, raised: float, raised_per_extent: float) -> "Rates":
+        """Return the rates for a run of another length.
 
-        Those per unit of the extent are multiplied by the square of ``raised``.
+        Parameters
+        ----------
+        factor : float
+            The lengths of the schedules are multiplied by it.
+        raised : float
+            The rates themselves are multiplied by it,
+        raised_per_extent : float
+            except those per unit of the extent, which are multiplied by this.
         """
 
         def scaled_one(name: str, rate: float | LogLinear) -> float | LogLinear:
-            times = raised**2 if name in self.per_extent else raised
+            times = raised_per_extent if name in self.per_extent else raised
             return rate.scaled(factor, times) if isinstance(rate, LogLinear) else rate * times
 
         return self._replace(of={name: scaled_one(name, rate) for name, rate in self.of.items()})

@@ -5,6 +5,7 @@ Events act after the optimiser step of their iteration, in the order in which th
 
 import functools
 import inspect
+import math
 import sys
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -151,7 +152,7 @@ def scaled(recipe: Recipe, iterations: int) -> Recipe:
     one-time event happens at iteration 1 at the earliest, a period is at least the event's ``least_period``. Because
     the period is rounded by itself, the number of events can differ by a few from the original's. What must not come
     before its ``least_step`` is left out of runs that are too short for it. Thresholds stay; so do learning rates,
-    unless the recipe has a ``short_run_exponent``.
+    unless the recipe or the calibration has a ``short_run_exponent``.
 
     Raises
     ------
@@ -161,16 +162,24 @@ def scaled(recipe: Recipe, iterations: int) -> Recipe:
     if iterations < 1:
         raise InputError(f"iterations is {iterations}: give at least 1")
     factor = iterations / recipe.iterations
-    raised = max(1.0, 1 / factor) ** recipe.short_run_exponent
+    shortening = max(1.0, 1 / factor)
+    raised = shortening**recipe.short_run_exponent
+
+    def of_calibration(calibration: Calibration) -> Calibration:
+        raised = shortening**calibration.short_run_exponent
+        return calibration._replace(rates=calibration.rates.scaled(factor, raised, raised))
+
     return recipe._replace(
         iterations=iterations,
-        learning_rates=recipe.learning_rates.scaled(factor, raised),
+        learning_rates=recipe.learning_rates.scaled(factor, raised, raised**2),
         sh_milestones=tuple(_scaled(milestone, factor) for milestone in recipe.sh_milestones),
         losses=tuple(term.scaled(factor) for term in recipe.losses),
         events=tuple(event.scaled(factor) for event in recipe.events),
         half_size_until=_scaled(recipe.half_size_until, factor),
-        calibrations=tuple(c._replace(rates=c.rates.scaled(factor, 1.0)) for c in recipe.calibrations),
-        representation=recipe.representation._replace(rates=recipe.representation.rates.scaled(factor, raised)),
+        calibrations=tuple(map(of_calibration, recipe.calibrations)),
+        representation=recipe.representation._replace(
+            rates=recipe.representation.rates.scaled(factor, raised, raised**2)
+        ),
     )
 
 
@@ -228,7 +237,8 @@ def configured(recipe: Recipe, **settings: Any) -> Recipe:
 def parsed_settings(recipe: Recipe, texts: Mapping[str, str]) -> dict[str, Any]:
     """Return settings for :func:`configured` from text, each of the type of the present value.
 
-    A function is given by its name in the module of the present one, such as ``metric=outdoor``; ``none`` is None.
+    A function is given by its name, such as ``metric=outdoor``: one that stands in the module of the present one and
+    takes the same arguments. For a number, other than the weight of a loss term, ``none`` is None.
 
     Raises
     ------
@@ -241,15 +251,13 @@ def parsed_settings(recipe: Recipe, texts: Mapping[str, str]) -> dict[str, Any]:
         raise InputError(
             f"recipe {recipe.name} has no {', '.join(unknown)} to set: choose from {', '.join(sorted(known))}"
         )
-    return {name: _parsed(name, text, known[name]) for name, text in texts.items()}
+    weights = {term.name for term in recipe.losses}
+    return {name: _parsed(name, text, known[name], name not in weights) for name, text in texts.items()}
 
 
-def _parsed(name: str, text: str, present: Any) -> Any:
-    if text.lower() == "none":
-        return None
+def _parsed(name: str, text: str, present: Any, may_be_none: bool) -> Any:
     if callable(present):
-        functions = inspect.getmembers(sys.modules[present.__module__], inspect.isfunction)
-        choices = {key: f for key, f in functions if f.__module__ == present.__module__ and not key.startswith("_")}
+        choices = _alternatives(present)
         if text not in choices:
             raise InputError(f"--set {name}={text} names no function: choose from {', '.join(choices)}")
         return choices[text]
@@ -257,17 +265,33 @@ def _parsed(name: str, text: str, present: Any) -> Any:
         if text.lower() not in ("true", "false"):
             raise InputError(f"--set {name}={text} is neither true nor false")
         return text.lower() == "true"
+    if text.lower() == "none" and may_be_none:
+        return None
     try:
-        return int(text) if isinstance(present, int) else float(text) if isinstance(present, float) else _number(text)
+        number = int(text) if isinstance(present, int) else float(text) if isinstance(present, float) else _number(text)
     except ValueError:
+        number = math.nan
+    if math.isnan(number):
         kind = "a whole number" if isinstance(present, int) else "a number"
-        raise InputError(f"--set {name}={text} is not {kind}, as {name}={present} is") from None
+        raise InputError(f"--set {name}={text} is not {kind}, as {name}={present} is")
+    return number
 
 
 def _number(text: str) -> int | float:
     """Return a whole number if the text is one: the present value is None, which says nothing of the type."""
     value = float(text)
-    return int(value) if value == int(value) else value
+    return int(value) if value.is_integer() else value
+
+
+def _alternatives(function: Callable[..., Any]) -> dict[str, Callable[..., Any]]:
+    """Return the public functions that stand in the module of this one and take the same arguments, by name."""
+    names, module = list(inspect.signature(function).parameters), function.__module__
+    functions = inspect.getmembers(sys.modules[module], inspect.isfunction)
+    return {
+        key: other
+        for key, other in functions
+        if other.__module__ == module and not key.startswith("_") and list(inspect.signature(other).parameters) == names
+    }
 
 
 def _settings(function: Callable[..., Any]) -> dict[str, Any]:
