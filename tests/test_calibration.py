@@ -21,9 +21,9 @@ from tolerances import (
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
+from minisplat_ref.experiments.studies import EXPOSURE, POSE
 from minisplat_ref.experiments.studies import exposures as exposures_study
 from minisplat_ref.experiments.studies import poses as poses_study
-from minisplat_ref.experiments.studies.calibration import EXPOSURE_STUDY, POSE_STUDY
 from minisplat_ref.io.images import read_image
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.rendering import SPLATTING, Request
@@ -375,7 +375,7 @@ def test_poses_are_recovered(scene):
     assert psnr["calibrated"] > psnr["disturbed"] + 0.7 * lost  # measured: six sevenths of what was lost
 
 
-@pytest.mark.parametrize("study", [EXPOSURE_STUDY, POSE_STUDY], ids=lambda study: study.name)
+@pytest.mark.parametrize("study", [EXPOSURE, POSE], ids=lambda study: study.name)
 def test_studies_write_what_they_print(study, tmp_path, capsys):
     parser = argparse.ArgumentParser()
     study.add_arguments(parser)
@@ -395,7 +395,7 @@ def test_studies_write_what_they_print(study, tmp_path, capsys):
 
 def test_study_needs_held_out_views_and_a_small_disturbance(tmp_path):
     parser = argparse.ArgumentParser()
-    POSE_STUDY.add_arguments(parser)
+    POSE.add_arguments(parser)
     with pytest.raises(InputError, match="--degrees is 100"):
-        POSE_STUDY.run(parser.parse_args(["room", "--out", str(tmp_path / "out"), "--degrees", "100"]))
+        POSE.run(parser.parse_args(["room", "--out", str(tmp_path / "out"), "--degrees", "100"]))
     assert not (tmp_path / "out").exists()

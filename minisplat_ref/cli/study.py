@@ -44,13 +44,14 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.experiments.studies import all_studies
 
     studies = all_studies()
-    if args.name is None or args.name not in studies:
-        studies = {**studies, **_extension_studies(args.name)}
+    if args.name is not None and "/" in args.name:
+        studies |= _extension_studies(args.name)
     if args.name is None:
         width = max(map(len, studies))
         for name, study in studies.items():
             print(f"{name:<{width}}  {study.summary}")
-        print("\nminisplat-ref study NAME --help explains one.")
+        print("\nminisplat-ref study NAME --help explains one. Those of an extension are called EXTENSION/NAME:")
+        print("minisplat-ref extensions EXTENSION lists them.")
         return 0
     if args.name not in studies:
         raise InputError(f"there is no study {args.name!r}: choose from {', '.join(studies)}")
@@ -60,10 +61,9 @@ def run(args: argparse.Namespace) -> int:
     return study.run(parser.parse_args(args.arguments)) or 0
 
 
-def _extension_studies(name: str | None) -> "dict[str, Study]":
-    """Return the studies of the extension that ``EXTENSION/NAME`` names, of all for None, by their whole names."""
-    from minisplat_ref.extensions.extension import load_extension, load_extensions
+def _extension_studies(name: str) -> "dict[str, Study]":
+    """Return the studies of the extension that ``EXTENSION/NAME`` begins with, by their whole names."""
+    from minisplat_ref.extensions.extension import load_extension
 
-    owner, separator, _ = (name or "").partition("/")
-    extensions = [load_extension(owner)] if separator else load_extensions()
-    return {f"{extension.name}/{study.name}": study for extension in extensions for study in extension.studies}
+    extension = load_extension(name.partition("/")[0])
+    return {f"{extension.name}/{study.name}": study for study in extension.studies}

@@ -35,10 +35,9 @@ DEFAULTS = {
 DESCRIPTION = """\
 Train Gaussians on photographs with cameras. DIR will hold point_cloud.ply,
 metrics.json, renders/ (truth | render | error of each test view), config.json,
-log.jsonl, cameras.json and checkpoint.npz.
-
-Ctrl-C saves what there is. --resume continues with the run's own settings;
---iterations then says where to stop, and all schedules stay as they were.
+log.jsonl, cameras.json and checkpoint.npz. Ctrl-C saves what there is; --resume
+continues with the run's own settings, --iterations then says where to stop, and
+all schedules stay as they were.
 """
 EPILOG = """\
 examples:
@@ -80,7 +79,7 @@ def add_parser(commands: Commands) -> None:
     training.add_argument(
         "--recipe",
         metavar="R",
-        help="3dgs, 3dgs-accel (default), mini-splatting, mini-splatting2, either with -d, or one of an extension",
+        help="3dgs, 3dgs-accel (default), mini-splatting, mini-splatting2, mini-splatting-d or mini-splatting2-d",
     )
     training.add_argument("--iterations", type=integer(1), metavar="N", help="one view each (default 3000)")
     training.add_argument(
@@ -98,7 +97,7 @@ def add_parser(commands: Commands) -> None:
         metavar="T",
         help="indoor (default) or outdoor: what counts as important",
     )
-    training.add_argument("--extension", metavar="E", help="that a recipe of the core is trained with")
+    training.add_argument("--extension", metavar="E", help="train with it; its own recipes are names for --recipe")
     training.add_argument(
         "--set",
         type=assignment,

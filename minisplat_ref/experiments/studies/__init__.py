@@ -5,6 +5,8 @@
 :data:`CULLING`             :mod:`.culling`: what visibility culling removes, saves and costs
 :data:`SIMPLIFY`            :mod:`.simplify`: sampling, rank and mass, and merging at equal counts
 :data:`DEPTH`               :mod:`.depth_types`: from which depth Gaussians begin anew
+:data:`EXPOSURE`            :mod:`.exposures`: exposures that were disturbed, found again
+:data:`POSE`                :mod:`.poses`: poses that were disturbed, found again
 ==========================  =====================================================================
 
 Here are their names and arguments. The modules hold the work; they load matplotlib and Numba, and so wait until a study
@@ -25,7 +27,7 @@ RECIPE_HELP = "name as in train --recipe"
 
 def all_studies() -> dict[str, Study]:
     """Return the studies of this package by the name that is typed; an extension's are EXTENSION/NAME."""
-    return {study.name: study for study in (SPLIT, CULLING, SIMPLIFY, DEPTH)}
+    return {study.name: study for study in (SPLIT, CULLING, SIMPLIFY, DEPTH, EXPOSURE, POSE)}
 
 
 def _run_of(module: str) -> Callable[[argparse.Namespace], None]:
@@ -120,6 +122,29 @@ def _add_depth_arguments(parser: argparse.ArgumentParser) -> None:
     _add_seeds(parser)
 
 
+def _add_calibration_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scene", metavar="SCENE", help=f"a synthetic scene: {', '.join(SYNTHETIC_SCENES)}")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for the JSON and the figure")
+    parser.add_argument(
+        "--iterations", type=integer(1), default=3000, metavar="N", help="of each of three trainings (default 3000)"
+    )
+    parser.add_argument("--views", type=integer(4), default=24, metavar="V", help="to train on (default 24)")
+    parser.add_argument("--width", type=integer(16), default=160, metavar="PX", help="of 4:3 images (default 160)")
+    parser.add_argument(
+        "--seed", type=integer(0), default=0, metavar="S", help="of the disturbance and the trainings (default 0)"
+    )
+
+
+def _add_pose_arguments(parser: argparse.ArgumentParser) -> None:
+    _add_calibration_arguments(parser)
+    parser.add_argument(
+        "--degrees", type=float, default=0.5, metavar="A", help="by which each camera is turned (default 0.5)"
+    )
+    parser.add_argument(
+        "--shift", type=float, default=0.005, metavar="F", help="of the extent, of each camera (default 0.005)"
+    )
+
+
 SPLIT = Study(
     name="split",
     summary="blur split: random children, children on the longest axis, and none",
@@ -143,4 +168,16 @@ DEPTH = Study(
     summary="depth reinitialisation: mid-points, centres, blended depth; guards",
     add_arguments=_add_depth_arguments,
     run=_run_of("depth_types"),
+)
+EXPOSURE = Study(
+    name="exposure",
+    summary="exposure per photograph: disturbed by known maps, and recovered",
+    add_arguments=_add_calibration_arguments,
+    run=_run_of("exposures"),
+)
+POSE = Study(
+    name="pose",
+    summary="pose refinement: cameras moved by known amounts, and recovered",
+    add_arguments=_add_pose_arguments,
+    run=_run_of("poses"),
 )

@@ -19,11 +19,12 @@ from tqdm import tqdm
 
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.studies.front import BLUE, RED, describe_scene, table, title, write
+from minisplat_ref.experiments.studies.front import BLUE, RED, describe_scene, title, write
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import SPLATTING
+from minisplat_ref.reporting import markdown_table
 from minisplat_ref.training.calibration import EXPOSURES, expose, identity_exposures, with_exposures
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import Recipe, configured
@@ -55,7 +56,7 @@ def run(args: argparse.Namespace) -> None:
     print(title(description))
     print(f"{RECIPE}, {args.iterations} iterations, seed {args.seed}\n")
     rows = [[arm, f"{np.mean(row['levels']):.2f}", f"{row['psnr']:.2f}"] for arm, row in result.items()]
-    print(table(["training", "maps off by (levels of 255)", "held-out PSNR (dB)"], rows))
+    print(markdown_table(["training", "maps off by (levels of 255)", "held-out PSNR (dB)"], rows))
 
 
 def measure(scene: Scene, recipe: Recipe, seed: int, arms: tuple[str, ...] = ARMS) -> dict[str, dict[str, Any]]:

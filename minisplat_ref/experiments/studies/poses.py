@@ -20,10 +20,11 @@ from tqdm import tqdm
 
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.studies.front import BLUE, RED, describe_scene, table, title, write
+from minisplat_ref.experiments.studies.front import BLUE, RED, describe_scene, title, write
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
+from minisplat_ref.reporting import markdown_table
 from minisplat_ref.training.calibration import ROTATIONS, SHIFTS, correct_pose
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import Recipe, configured
@@ -82,7 +83,11 @@ def run(args: argparse.Namespace) -> None:
         ]
         for arm, row in result.items()
     ]
-    print(table(["training", "angle (degrees)", "centre (% of extent)", "points (px)", "held-out PSNR (dB)"], rows))
+    print(
+        markdown_table(
+            ["training", "angle (degrees)", "centre (% of extent)", "points (px)", "held-out PSNR (dB)"], rows
+        )
+    )
 
 
 def measure(
