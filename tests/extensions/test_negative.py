@@ -292,14 +292,14 @@ def test_equally_wide_in_one_direction():
 
 def test_jacobian_of_the_hills(rng):
     parameters = np.column_stack([rng.uniform(0.5, 1.5, 3), rng.uniform(-0.5, 0.5, (3, 5))])
-    signs, points = np.array([1.0, -1.0, 1.0]), rng.uniform(-1, 1, (20, 2))
-    (values, jacobian) = rings.hills(parameters, signs, points)
+    model, points = rings.Sum((1, -1, 1), 2.0, "red"), rng.uniform(-1, 1, (20, 2))
+    values, jacobian = rings.hills(parameters, model, points)
     assert values.shape == (3, 20)
 
     def vjp(v):
         return (np.einsum("kpn,kn->kp", jacobian, v),)
 
-    check_jacobian(lambda p: (rings.hills(p, signs, points)[0],), vjp, (parameters,), names=["parameters"])
+    check_jacobian(lambda p: (rings.hills(p, model, points)[0],), vjp, (parameters,), names=["parameters"])
 
 
 def run_study(name, folder, *arguments):

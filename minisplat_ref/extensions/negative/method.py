@@ -43,11 +43,11 @@ def signed_colors(
         RGB of either sign; zeros for culled rows.
     """
     colors = backend.sh_colors(means, sh_dc, sh_rest, camera, degree, radii)  # u [N, 3]
-    lower_radii = _where_clamped(colors, radii)
-    if lower_radii.any():
-        mirrored = backend.sh_colors(means, -sh_dc, -sh_rest, camera, degree, lower_radii)  # l [N, 3]
-        is_lower = (lower_radii[:, :1] > 0) & (colors == 0)  # [N, 3]
-        colors = np.where(is_lower, 1 - mirrored, colors)
+    rows = _clamped_rows(colors, radii)
+    if len(rows) > 0:
+        upper = colors[rows]  # [M, 3]
+        lower = backend.sh_colors(means[rows], -sh_dc[rows], -sh_rest[rows], camera, degree, radii[rows])  # l [M, 3]
+        colors[rows] = np.where(upper == 0, 1 - lower, upper)
     return colors
 
 
@@ -76,25 +76,24 @@ def signed_colors_vjp(
         Derivative with respect to the colours.
     """
     v = backend.sh_colors_vjp(means, sh_dc, sh_rest, camera, degree, radii, v_colors)  # zero where u = 0
-    upper = backend.sh_colors(means, sh_dc, sh_rest, camera, degree, radii)
-    lower_radii = _where_clamped(upper, radii)
-    if not lower_radii.any():
+    colors = backend.sh_colors(means, sh_dc, sh_rest, camera, degree, radii)  # u [N, 3]
+    rows = _clamped_rows(colors, radii)
+    if len(rows) == 0:
         return v
-    v_mirrored = np.where(upper == 0, -v_colors, v_colors.dtype.type(0))  # [N, 3]
-    v_l = backend.sh_colors_vjp(means, -sh_dc, -sh_rest, camera, degree, lower_radii, v_mirrored)
-    return SHGradient(
-        means=v.means + v_l.means,
-        sh_dc=v.sh_dc - v_l.sh_dc,
-        sh_rest=v.sh_rest - v_l.sh_rest,
+    v_lower = np.where(colors[rows] == 0, -v_colors[rows], v_colors.dtype.type(0))  # [M, 3]
+    v_l = backend.sh_colors_vjp(means[rows], -sh_dc[rows], -sh_rest[rows], camera, degree, radii[rows], v_lower)
+    v.means[rows] += v_l.means
+    v.sh_dc[rows] -= v_l.sh_dc
+    v.sh_rest[rows] -= v_l.sh_rest
+    return v._replace(
         cam_from_world_R=v.cam_from_world_R + v_l.cam_from_world_R,
         cam_from_world_t=v.cam_from_world_t + v_l.cam_from_world_t,
     )
 
 
-def _where_clamped(upper: Floats, radii: Ints) -> Ints:
-    """Return the radii [N, 2] with 0 where no channel of u [N, 3] is clamped: the others need no second call."""
-    is_clamped = (upper == 0).any(axis=1)  # [N], culled rows as well
-    return np.where(is_clamped[:, None], radii, radii.dtype.type(0))
+def _clamped_rows(upper: Floats, radii: Ints) -> Ints:
+    """Return the rows [M] of visible Gaussians with a channel of u [N, 3] at zero: the others need no second call."""
+    return np.flatnonzero((radii[:, 0] > 0) & (upper == 0).any(axis=1))
 
 
 def signed(backend: Backend) -> Backend:

@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.optimize import least_squares
-from scipy.special import erf
+from scipy.special import erf, expit, logit
 
 from minisplat_ref.types import Floats
 
@@ -22,9 +22,7 @@ OUTER = 0.7  # radius; the picture is the square from -1 to 1
 THICKNESSES = (0.9, 0.75, 0.6, 0.45, 0.3, 0.2)  # of the ring, in units of its outer radius
 BLUR = 0.04  # standard deviation of the edges
 SIZE = 32  # samples a side
-PARAMETERS = ("w", "m_x", "m_y", "log_L_xx", "log_L_yy", "L_yx")
-LEAST = (1e-6, -2.0, -2.0, -3.0, -3.0, -50.0)
-MOST = (np.inf, 2.0, 2.0, 4.0, 4.0, 50.0)  # exp(-4) is a third of a sample
+PARAMETERS = ("a", "m_x", "m_y", "L_xx", "L_yy", "L_yx")
 EVALUATIONS = 200  # at most, of one fit
 
 
@@ -67,18 +65,18 @@ def ring(thickness: float) -> Floats:
     return 0.5 * (inside - outside)
 
 
-def hills(parameters: Floats, signs: Floats, points: Floats) -> tuple[Floats, Floats]:
+def hills(parameters: Floats, model: Sum, points: Floats) -> tuple[Floats, Floats]:
     """Return the terms ``s_k w_k exp(-|L_k (x - m_k)|^2 / 2)``, and their derivatives.
 
-    With ``y = L (x - m)`` and the value f of the term::
+    The height is ``w = w_max sigmoid(a)``. With ``y = L (x - m)`` and the value f of the term::
 
-        df/dw = f / w,   df/dm = f L^T y,   df/d log L_ii = -f y_i L_ii (x - m)_i,   df/dL_yx = -f y_y (x - m)_x
+        df/da = f (1 - sigmoid(a)),   df/dm = f L^T y,   df/dL = -f y (x - m)^T
 
     Parameters
     ----------
     parameters : ndarray of shape (K, 6)
-        In the order of ``PARAMETERS``; L is lower triangular.
-    signs : ndarray of shape (K,)
+        In the order of ``PARAMETERS``; L is lower triangular, and of any sign.
+    model : Sum
     points : ndarray of shape (P, 2)
 
     Returns
@@ -86,45 +84,47 @@ def hills(parameters: Floats, signs: Floats, points: Floats) -> tuple[Floats, Fl
     values : ndarray of shape (K, P)
     jacobian : ndarray of shape (K, 6, P)
     """
-    w, m_x, m_y, log_xx, log_yy, L_yx = parameters.T[:, :, None]  # [K, 1] each
-    L_xx, L_yy = np.exp(log_xx), np.exp(log_yy)
+    a, m_x, m_y, L_xx, L_yy, L_yx = parameters.T[:, :, None]  # [K, 1] each
     x, y = points[:, 0] - m_x, points[:, 1] - m_y  # [K, P]
     u, v = L_xx * x, L_yx * x + L_yy * y  # [K, P]
-    f = signs[:, None] * w * np.exp(-0.5 * (u * u + v * v))  # [K, P]
+    f = _heights(parameters, model)[:, None] * np.exp(-0.5 * (u * u + v * v))  # [K, P]
     jacobian = np.stack(
-        [f / w, f * (L_xx * u + L_yx * v), f * L_yy * v, -f * u * L_xx * x, -f * v * L_yy * y, -f * v * x], axis=1
+        [f * expit(-a), f * (L_xx * u + L_yx * v), f * L_yy * v, -f * u * x, -f * v * y, -f * v * x], axis=1
     )
     return f, jacobian
 
 
+def _heights(parameters: Floats, model: Sum) -> Floats:
+    """Return s_k w_k [K]."""
+    return np.array(model.signs) * model.height_max * expit(parameters[:, 0])
+
+
 def fitted(target: Floats, model: Sum, n_starts: int, rng: np.random.Generator) -> Fit:
     """Return the best of ``n_starts`` least-squares fits to a picture [SIZE^2]."""
-    points, signs = grid(), np.array(model.signs, float)
-    shape = (len(signs), len(PARAMETERS))
+    points, n = grid(), len(model.signs)
 
     def residuals(flat: Floats) -> Floats:
-        return hills(flat.reshape(shape), signs, points)[0].sum(axis=0) - target
+        return hills(flat.reshape(n, -1), model, points)[0].sum(axis=0) - target
 
     def jacobian(flat: Floats) -> Floats:
-        return hills(flat.reshape(shape), signs, points)[1].reshape(flat.size, -1).T
+        return hills(flat.reshape(n, -1), model, points)[1].reshape(flat.size, -1).T
 
-    most = (model.height_max, *MOST[1:])
-    bounds = np.tile(LEAST, len(signs)), np.tile(most, len(signs))
     fits = [
-        least_squares(residuals, _start(len(signs), rng).ravel(), jacobian, bounds, max_nfev=EVALUATIONS)
+        least_squares(residuals, _start(model, rng).ravel(), jacobian, method="lm", max_nfev=EVALUATIONS)
         for _ in range(n_starts)
     ]
     best = min(fits, key=lambda fit: fit.cost)
-    heights = signs * best.x.reshape(shape)[:, 0]  # [K]
     picture = (best.fun + target).reshape(SIZE, SIZE)
+    heights = _heights(best.x.reshape(n, -1), model)  # [K]
     return Fit(float(-10 * np.log10(np.mean(best.fun**2))), picture, tuple(heights.tolist()))
 
 
-def _start(n: int, rng: np.random.Generator) -> Floats:
-    """Draw parameters [n, 6]: round, of a third to all of the ring's size, anywhere in it, of height 0.7."""
-    log_L = -np.log(OUTER) + rng.uniform(0, np.log(3), n)  # [n]
+def _start(model: Sum, rng: np.random.Generator) -> Floats:
+    """Draw parameters [K, 6]: round, of a third to all of the ring's size, anywhere in it, of height 0.7."""
+    n = len(model.signs)
+    L = np.exp(rng.uniform(0, np.log(3), n)) / OUTER  # [K]
     centres = rng.uniform(-OUTER, OUTER, (n, 2)) / np.sqrt(2)
-    return np.column_stack([np.full(n, 0.7), centres, log_L, log_L, np.zeros(n)])
+    return np.column_stack([np.full(n, logit(0.7 / model.height_max)), centres, L, L, np.zeros(n)])
 
 
 def measure(n_seeds: int, n_starts: int) -> dict[float, dict[str, list[Fit]]]:
@@ -150,7 +150,7 @@ def crossings(pair: list[float], other: list[float]) -> list[float]:
 def draw(fits: dict[float, dict[str, list[Fit]]]) -> Figure:
     """Draw the PSNR over the thickness, and the fits of a thick and of a thin ring."""
     figure = Figure(figsize=(11, 3.6), layout="constrained")
-    left, right = figure.subfigures(1, 2, width_ratios=(1, 1.35))
+    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1, 1.35))[0]
     axes = left.subplots()
     for name, model in MODELS.items():
         values = np.array([[fit.psnr for fit in fits[thickness][name]] for thickness in THICKNESSES])  # [T, seeds]

@@ -25,7 +25,7 @@ def add_ring_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--out``, ``--seeds`` and ``--starts``."""
     _add_out(parser)
     parser.add_argument("--seeds", type=int, default=3, metavar="N", help="from 0 on, for the starts (default 3)")
-    parser.add_argument("--starts", type=int, default=8, metavar="N", help="of each fit; the best counts (default 8)")
+    parser.add_argument("--starts", type=int, default=16, metavar="N", help="of each fit; the best counts (default 16)")
 
 
 def run_rings(args: argparse.Namespace) -> None:
