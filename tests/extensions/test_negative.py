@@ -314,7 +314,7 @@ def run_study(name, folder, *arguments):
 def test_rings_a_pair_beats_two_hills_on_a_thick_ring_and_loses_to_four_on_a_thin_one(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(rings, "THICKNESSES", (0.75, 0.2))
     monkeypatch.setattr(rings, "SIZE", 20)
-    means = run_study("rings", tmp_path / "out", "--seeds", "1", "--starts", "3")["mean_psnr"]
+    means = run_study("rings", tmp_path / "out", "--seeds", "1", "--starts", "16")["mean_psnr"]
     pair, two, three, four = (
         means[name] for name in ("pair, heights to 100", "2 positive", "3 positive", "4 positive")
     )

@@ -25,6 +25,11 @@ What to know:
   from one side to the other, stays. That colour has a gradient, which that of 3DGS loses at zero.
 - The PLY is that of 3DGS, with ``f_dc`` below -1.77 where the colour is negative. Other programs read it and clamp.
 
+Measured: in a plane one pair fits a ring better than two positive Gaussians at any thickness from 0.2 to 0.9 of the
+outer radius; better than three only above 0.42, and if the heights may be a hundred times the ring's; and never as well
+as four (``study negative/rings``). Before a black wall a negative colour makes the hole of a ring black, 37.5 dB there
+against 14.9 dB; before dots the hole of either lets 1 to 2 % through, where four Gaussians side by side leave 90 %.
+
 Where this deviates: how the released code chooses its negative components, and with which colours they start, was not
 known to us. Here they are drawn at random, and a drawn Gaussian starts with its colour negated. Left out: a density
 for each pair; the components pair up, or not, as the photographs want.

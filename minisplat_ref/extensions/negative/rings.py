@@ -157,9 +157,10 @@ def draw(fits: dict[float, dict[str, list[Fit]]]) -> Figure:
         axes.fill_between(THICKNESSES, values.min(axis=1), values.max(axis=1), color=model.color, alpha=0.25, lw=0)
         axes.plot(THICKNESSES, values.mean(axis=1), "o-", color=model.color, ms=4, label=name)
     axes.set(title="best fit, PSNR (dB)", xlabel="thickness of the ring / outer radius")
+    axes.set_ylim(bottom=axes.get_ylim()[0] - 2)  # room for the legend
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(color="#e6eaee")
-    axes.legend(frameon=False, fontsize=8)
+    axes.legend(frameon=False, fontsize=8, loc="lower center", ncols=2)
     for row, thickness in zip(right.subplots(2, len(MODELS)), (0.75, 0.2), strict=True):
         _panel(row[0], ring(thickness).reshape(SIZE, SIZE), f"ring of {thickness}")
         for ax, name in zip(row[1:], (*PAIRS, *POSITIVES[1:]), strict=True):
