@@ -112,3 +112,7 @@ MERGED_MOMENTS = 1e-12
 # Largest error of a Chebyshev interpolant against the first term that it leaves out, relative: the later terms add some
 # percent, and the factor 2^f by which the relative error divides is between 0.7 and 1.4.
 BENCH_ROOM_FOR_EXPONENTIAL = 0.5
+
+# The least quotient of two densities on a grid of spacing 0.025 against the true one, relative: half the curvature, 3
+# at most, times the squared distance to the nearest node, 3e-4; and their integral over 4.5 standard deviations, 1e-5.
+DENSITY_GRID = 1e-3
