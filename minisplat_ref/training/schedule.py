@@ -197,13 +197,15 @@ def _scaled_limit(step: int | None, factor: float) -> int | None:
 def settings_of(recipe: Recipe) -> dict[str, Any]:
     """Return what :func:`configured` can replace, with its present value, the first where there are several.
 
-    Settings of events and of loss terms by their own names; the weight of a loss term by the term's name; whether a
-    calibration is on by the calibration's name.
+    Settings of events, of loss terms and of how the representation begins by their own names; the weight of a loss term
+    by the term's name; whether a calibration is on by the calibration's name.
     """
     events = [_settings(event.action) for event in recipe.events]
     terms = [{term.name: term.weight, **_settings(term.function)} for term in recipe.losses]
     switches = [{calibration.name: calibration.is_on for calibration in recipe.calibrations}]
-    return {name: value for settings in reversed([*events, *terms, *switches]) for name, value in settings.items()}
+    begins = [_settings(recipe.representation.extend)]
+    found = [*events, *terms, *switches, *begins]
+    return {name: value for settings in reversed(found) for name, value in settings.items()}
 
 
 def configured(recipe: Recipe, **settings: Any) -> Recipe:
@@ -230,6 +232,7 @@ def configured(recipe: Recipe, **settings: Any) -> Recipe:
                 calibration._replace(is_on=value) if name == calibration.name else calibration
                 for calibration in recipe.calibrations
             ),
+            representation=recipe.representation._replace(extend=_with(recipe.representation.extend, name, value)),
         )
     return recipe
 
@@ -317,7 +320,10 @@ def describe(recipe: Recipe) -> dict[str, Any]:
         "losses": [_describe_term(term) for term in recipe.losses if term.weight != 0],
         "events": [_describe_event(event) for event in recipe.events],
         "calibrations": [calibration.name for calibration in recipe.active_calibrations],
-        "representation": recipe.representation.name,
+        "representation": {
+            "name": recipe.representation.name,
+            **_describe_function(recipe.representation.extend, "extend"),
+        },
     }
 
 

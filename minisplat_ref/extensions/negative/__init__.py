@@ -1,4 +1,4 @@
-"""Negative Gaussians: colours may be below zero, so that one Gaussian can be cut out of another.
+"""Negative Gaussians: colours may be below zero, so that one can be cut out of another.
 
 NegGS, Kasymov et al. 2024, arXiv 2405.18163. A sum of Gaussians is hilly, and a ring takes several of them. The
 difference of two, a wide one less a narrow one in its middle, has a hollow, with as many numbers as two hills:

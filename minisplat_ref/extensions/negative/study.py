@@ -13,6 +13,7 @@ import numpy as np
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import making_folder
+from minisplat_ref.reporting import markdown_table
 from minisplat_ref.study import Study
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ def run_rings(args: argparse.Namespace) -> None:
         for t, thickness in enumerate(rings.THICKNESSES)
     ]
     print("PSNR (dB) of the best fit: mean of the seeds, and half of their range\n")
-    _print_table(["thickness / outer radius", *rings.MODELS], rows)
+    print(markdown_table(["thickness / outer radius", *rings.MODELS], rows))
     print()
     for pair, others in result["crossings"].items():
         places = [f"{name} at {', '.join(f'{x:.2f}' for x in xs) or 'no thickness'}" for name, xs in others.items()]
@@ -82,7 +83,8 @@ def run_backdrop(args: argparse.Namespace) -> None:
         for wall, cases in result.items()
         for case, fit in cases.items()
     ]
-    _print_table(["wall", "Gaussians of the ring", "PSNR (dB)", "in the hole", "what the hole lets through"], rows)
+    heading = ["wall", "Gaussians of the ring", "PSNR (dB)", "in the hole", "what the hole lets through"]
+    print(markdown_table(heading, rows))
 
 
 def _add_out(parser: argparse.ArgumentParser) -> None:
@@ -99,11 +101,6 @@ def _check_positive(**numbers: int) -> None:
 
 def _mean_and_spread(values: Sequence[float]) -> str:
     return f"{np.mean(values):.1f} ± {np.ptp(values) / 2:.1f}"
-
-
-def _print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    for line in (header, ["---"] * len(header), *rows):
-        print("| " + " | ".join(line) + " |")
 
 
 def _write(folder: Path, result: dict[str, Any], figure: "Figure") -> None:
