@@ -320,7 +320,7 @@ def test_rings_a_pair_beats_two_hills_on_a_thick_ring_and_loses_to_four_on_a_thi
     )
     assert pair[0] > two[0] + 3 and pair[0] > three[0]
     assert pair[1] < three[1] < four[1]
-    assert "| 0.75 |" in capsys.readouterr().out
+    assert "| 0.75 " in capsys.readouterr().out
 
 
 def test_crossings_are_interpolated(monkeypatch):
@@ -335,7 +335,7 @@ def test_backdrop_a_negative_color_blackens_a_hole_and_does_not_open_it(tmp_path
     assert black["2, either sign"]["psnr"] > black["2, clamped"]["psnr"] + 2
     assert dots["2, either sign"]["see_through"] < 0.1 < 0.8 < dots["4, clamped"]["see_through"]
     assert dots["2, either sign"]["hole_psnr"] < dots["4, clamped"]["hole_psnr"] - 5
-    assert "| dots | 4, clamped |" in capsys.readouterr().out
+    assert "| dots  | 4, clamped " in capsys.readouterr().out
 
 
 def test_studies_refuse_to_fit_nothing(tmp_path):
