@@ -39,8 +39,10 @@ def test_camera_file_by_hand(tmp_path):
     """A camera at (1, 2, 3) that looks along world +x: its right is world -z where down is +y."""
     world_from_camera = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
     entry = {"img_name": "a", "width": 8, "height": 6, "fx": 9, "fy": 10}
-    (tmp_path / "c.json").write_text(json.dumps([{**entry, "position": [1, 2, 3], "rotation": world_from_camera}]))
-    ((name, camera, split),) = read(tmp_path / "c.json")
+    entry |= {"position": [1, 2, 3], "rotation": world_from_camera}
+    (tmp_path / "c.json").write_text(json.dumps([entry, {**entry, "time": 0.25}]))
+    (name, camera, split, time), later = read(tmp_path / "c.json")
+    assert (time, later.time) == (0.0, 0.25)
     assert (name, split, camera.width, camera.height) == ("a", "", 8, 6)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (9, 10, 4, 3)
     np.testing.assert_array_equal(centre(camera), [1, 2, 3])

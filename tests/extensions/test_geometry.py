@@ -15,10 +15,12 @@ from tolerances import (
     PARITY_FLOAT64,
 )
 
-from minisplat_ref.extensions.geometry import kernels, reference
+from minisplat_ref.extensions.geometry import EXTENSION, kernels, reference
 from minisplat_ref.extensions.geometry.depth_map import depth_normals, depth_normals_vjp
 from minisplat_ref.extensions.geometry.reference import edge_weights, normal_smoothness, normal_smoothness_vjp
 from minisplat_ref.extensions.geometry.weights import EDGE_SHARPNESS, SFM_DEPTH_TOLERANCE, GeometricWeights
+from minisplat_ref.oracle.gradients import jacobian_case
+from minisplat_ref.oracle.pieces import tiny_setting
 from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.types import Gaussians
 
@@ -349,6 +351,12 @@ def test_same_bytes_at_any_number_of_threads(rng):
     finally:
         numba.set_num_threads(n_threads)
     assert results[0] == results[1] == results[2]
+
+
+def test_the_gradient_proof_covers_it(backend, rng):
+    """What ``oracle gradients --extension geometry`` adds to the check of the whole model."""
+    cases = [jacobian_case(stage) for stage in EXTENSION.stages(backend, tiny_setting(), rng)]
+    assert len(cases) == (1 if backend.is_compiled else 5) and all(case.passed for case in cases), cases
 
 
 # --- parity ---
