@@ -37,11 +37,12 @@ from minisplat_ref.cpu.compositing.tile_rows import (
 from minisplat_ref.cpu.compositing.tile_state import (
     CHECK_EVERY,
     N_ROWS,
+    Tile,
+    corner,
     open_rows,
     row_in_image,
     rows_of,
     start_tile,
-    tile_of,
     tiles_in_turn,
 )
 from minisplat_ref.cpu.gaussian_rows import rows_from
@@ -63,12 +64,10 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
     write_alphas = alpha_writer(exp)
 
     @scalar
-    def start_vjp(state, tile, frame, pixels, v_pixels):
-        image, alpha = pixels
-        v_image, v_alpha = v_pixels
+    def start_vjp(state, x0, y0, frame, image, alpha, v_image, v_alpha):
         as_data = state.dtype.type
         for row in range(N_ROWS):
-            x, y, n_pixels = row_in_image(row, tile.x0, tile.y0, frame)
+            x, y, n_pixels = row_in_image(row, x0, y0, frame)
             if n_pixels == 0:
                 continue  # as start_tile left it
             first = y * frame.width + x
@@ -159,16 +158,21 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
         slots,  # [M * slot_width]
         v_backgrounds,  # [n_tiles, D]
     ):
+        # Taken apart here: bundles that parallel loops read take longer to compile.
+        offsets, ids, slots_of = lists
+        image, alpha = pixels
+        v_image, v_alpha = v_pixels
         taken = no_turns()
         for _ in prange(n_threads):
-            state = np.empty(N_ROWS * row_size, pixels.image.dtype)
-            scratch = np.empty(SCRATCH_SIZE, pixels.image.dtype)
+            state = np.empty(N_ROWS * row_size, image.dtype)
+            scratch = np.empty(SCRATCH_SIZE, image.dtype)
             start_scratch(scratch)
-            further = np.empty((slot_width - N_MOMENTS - N_FUSED) * WIDTH, pixels.image.dtype)  # further channels
-            for i in tiles_in_turn(taken, n_threads, lists.offsets):
-                tile = tile_of(i, lists, frame)
-                start_tile(state, tile.x0, tile.y0, frame, n_fields)
-                start_vjp(state, tile, frame, pixels, v_pixels)
+            further = np.empty((slot_width - N_MOMENTS - N_FUSED) * WIDTH, image.dtype)  # further channels
+            for i in tiles_in_turn(taken, n_threads, offsets):
+                x0, y0 = corner(i, frame)
+                tile = Tile(x0, y0, ids[offsets[i] : offsets[i + 1]], slots_of[offsets[i] :])
+                start_tile(state, x0, y0, frame, n_fields)
+                start_vjp(state, x0, y0, frame, image, alpha, v_image, v_alpha)
                 tile_vjp(state, scratch, further, records, tile, frame, slots)
                 background_vjp(state, v_backgrounds[i])
 

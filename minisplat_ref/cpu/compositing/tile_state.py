@@ -114,13 +114,6 @@ def corner(tile, frame):
 
 
 @scalar
-def tile_of(i, lists, frame):
-    """Return tile ``i``."""
-    x0, y0 = corner(i, frame)
-    return Tile(x0, y0, lists.ids[lists.offsets[i] : lists.offsets[i + 1]], lists.slots[lists.offsets[i] :])
-
-
-@scalar
 def row_in_image(row, x0, y0, frame):
     """Return column and line of a row's first pixel, and how many of its eight pixels the image has."""
     x, y = x0 + row // TILE_HEIGHT * WIDTH, y0 + row % TILE_HEIGHT
