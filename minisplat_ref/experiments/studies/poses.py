@@ -134,7 +134,7 @@ def moved(camera: Camera, w: Floats, u: Floats) -> Camera:
 
 def centres(cameras: list[Camera]) -> Floats:
     """Return the camera centres ``-R^T t`` [V, 3]."""
-    return np.array([-camera.cam_from_world_R.T @ camera.cam_from_world_t for camera in cameras])
+    return np.array([camera.center for camera in cameras])
 
 
 def aligning(cameras: list[Camera], truth: list[Camera]) -> Similarity:
