@@ -158,9 +158,9 @@ def project(
 
 @scalar
 def _project_eight_vjp(rows, is_counted, primitives, pose, lens, v, out, v_pose):
-    R = rows_of(pose.R)
+    R, centre = pose
     x, y, z = triple(primitives.means, rows)
-    p = to_camera(R, pose.centre, x, y, z)
+    p = to_camera(R, centre, x, y, z)
     quat, scale = _quaternion(primitives.quats, rows), triple(primitives.scales, rows)
     M = axes(quat, scale)
     V = rotated(R, M)
@@ -213,10 +213,11 @@ def _project_chunk_vjp(chunk, primitives, radii, pose, lens, v, out, v_poses):
                 out.quats[n, i] = ZERO
     visible = np.empty(end - first + WIDTH, np.int64)
     count = list_visible(radii, first, end, visible)
+    in_rows = Pose(rows_of(pose.R), pose.centre)  # read once
     v_poses[chunk] = ZERO
     for i in range(0, count, WIDTH):
         is_counted = counted(DOUBLE) < count - i
-        _project_eight_vjp(listed_rows(visible, i), is_counted, primitives, pose, lens, v, out, v_poses[chunk])
+        _project_eight_vjp(listed_rows(visible, i), is_counted, primitives, in_rows, lens, v, out, v_poses[chunk])
 
 
 @kernel()
