@@ -17,7 +17,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
-from functools import partial
 from multiprocessing import get_context
 from typing import NamedTuple, ParamSpec, TypeVar
 
@@ -28,8 +27,9 @@ from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.compositing.records import record_size
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import Extension, load_extension
+from minisplat_ref.methods.gaussian_splatting import GS
 from minisplat_ref.rendering import RenderTape, Request, render, render_vjp
-from minisplat_ref.training.losses import LossTerm, Rendered, photometric, total_loss
+from minisplat_ref.training.losses import Rendered, total_loss
 from minisplat_ref.types import (
     AdamStep,
     Camera,
@@ -47,8 +47,6 @@ from minisplat_ref.types import (
 WIDTH, HEIGHT = 24, 18
 N_GAUSSIANS = 4
 DEGREE = 1  # of the spherical harmonics: a number at run time, so that any will do
-
-PHOTOMETRIC = LossTerm("photometric", partial(photometric, dssim_weight=0.2), weight=1.0)
 
 Dtype = type[np.floating]
 Arguments = ParamSpec("Arguments")
@@ -185,7 +183,7 @@ def _draw_extension(extension: Extension, dtype: Dtype) -> None:
     scene = Scene("tiny", (view,), (), gaussians.means.astype(np.float64), gray, np.zeros(3), extent=1.0)
     model = Model(representation.extend(gaussians, rng), representation.shared(scene, rng))
     renderer, own = representation.renderer, [term._replace(weight=1.0) for term in extension.losses]
-    for terms in ([PHOTOMETRIC], [PHOTOMETRIC, *own]):
+    for terms in (GS.losses, (*GS.losses, *own)):
         request = Request(np.zeros(3, dtype), wants=frozenset[str]().union(*(term.wants for term in terms)))
         output, tape = renderer.render(model, view, request)
         channels = renderer.channels(request.wants)

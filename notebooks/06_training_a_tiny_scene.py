@@ -23,9 +23,9 @@
 # | file | what it holds | where in the paper |
 # |---|---|---|
 # | `minisplat_ref/train.py` | the loop | 3DGS sec. 4 |
-# | `minisplat_ref/recipes/` | what is due when, as data | 3DGS sec. 7.1 |
+# | `minisplat_ref/methods/`, `training/schedule.py` | what is due when, as data | 3DGS sec. 7.1 |
 # | `minisplat_ref/strategy/` | initialisation; clone, split, prune, opacity reset | 3DGS sec. 5.1, 5.2 |
-# | `minisplat_ref/optim/` | Adam, schedules of the learning rates | |
+# | `minisplat_ref/training/adam.py`, `rates.py` | Adam, schedules of the learning rates | |
 #
 # *3DGS* is Kerbl et al. 2023. **Frames and units:** the world is in metres, z up; camera axes are x right, y down, z
 # forward; images are in pixels, the centre of the top-left one at (0.5, 0.5). The kernels are compiled on first use,

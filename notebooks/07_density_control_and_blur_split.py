@@ -25,7 +25,7 @@
 # |---|---|---|
 # | `minisplat_ref/strategy/clone_split.py` | the gradient's sign; clone, split, prune | 3DGS sec. 5.2 |
 # | `minisplat_ref/strategy/blur_split.py` | the area's sign; children on the longest axis | MS sec. 4.1, eq. 2 |
-# | `minisplat_ref/events/` | the same as events of a recipe | |
+# | `minisplat_ref/methods/` | the same as events of a recipe | |
 #
 # *3DGS* is Kerbl et al. 2023, *MS* is Mini-Splatting, Fang and Wang 2024. **Frames and units:** the world is in metres;
 # image coordinates are pixels, x right, y down. Gradients by the position are taken in units in which the image is 2

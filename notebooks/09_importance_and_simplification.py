@@ -24,7 +24,7 @@
 # |---|---|---|
 # | `minisplat_ref/strategy/importance.py` | the weights of all views, added up | MS sec. 3.2, app. E |
 # | `minisplat_ref/strategy/simplify.py` | sampling, rank, mass, merging; a new start | MS eq. 3 |
-# | `minisplat_ref/events/mini_splatting.py` | the same as events of a recipe | MS sec. 3.2 |
+# | `minisplat_ref/methods/mini_splatting.py` | the same as events of a recipe | MS sec. 3.2 |
 #
 # *MS* is Mini-Splatting, Fang and Wang 2024. **Frames and units:** the world is in metres, z up; images are in pixels,
 # the centre of the top-left one at (0.5, 0.5). The kernels are compiled on first use, which takes some twenty seconds

@@ -22,11 +22,11 @@
 #
 # | file | what it holds | where in the paper |
 # |---|---|---|
-# | `minisplat_ref/recipes/` | what is due when, as data | |
-# | `minisplat_ref/recipes/gaussian_splatting.py` | `3dgs`, `3dgs-accel` | 3DGS sec. 7.1 |
-# | `minisplat_ref/recipes/mini_splatting.py` | `mini-splatting`, and `-d` without simplification | MS sec. 3 |
-# | `minisplat_ref/recipes/mini_splatting2.py` | `mini-splatting2`, and `-d` | MS2 sec. 3 |
-# | `minisplat_ref/events/` | the actions: from the training state to `strategy/` and back | |
+# | `minisplat_ref/training/schedule.py` | what a recipe is made of: what is due when, as data | |
+# | `minisplat_ref/methods/gaussian_splatting.py` | `3dgs`, `3dgs-accel` | 3DGS sec. 7.1 |
+# | `minisplat_ref/methods/mini_splatting.py` | `mini-splatting`, and `-d` without simplification | MS sec. 3 |
+# | `minisplat_ref/methods/mini_splatting2.py` | `mini-splatting2`, and `-d` | MS2 sec. 3 |
+# | `minisplat_ref/training/state.py` | what the actions in these files change: the training state | |
 #
 # *3DGS* is Kerbl et al. 2023, *MS* and *MS2* are Mini-Splatting and Mini-Splatting2, both Fang and Wang 2024.
 # **Frames and units:** the world is in metres; images are in pixels, the centre of the top-left one at (0.5, 0.5). The

@@ -322,5 +322,5 @@ def test_cache_folder_ignores_what_no_kernel_is_made_of(tmp_path, monkeypatch):
     shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.setattr(_jit, "_PACKAGE", copy)
     before = _jit.source_hash.__wrapped__()
-    (copy / "render.py").write_text("")
+    (copy / "rendering.py").write_text("")
     assert _jit.source_hash.__wrapped__() == before
