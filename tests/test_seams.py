@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from fractions import Fraction
 from functools import partial
 from typing import NamedTuple
 
@@ -113,7 +114,7 @@ def test_of_one_name_the_first_of_joined_rates_counts():
 
 def test_scaled_rates():
     rates = Rates({"means": LogLinear(1.0, 0.1, 100, Rewind(50, 20)), "quats": 2.0})
-    halved = rates.scaled(0.5, 3.0, 9.0)
+    halved = rates.scaled(Fraction(1, 2), 3.0, 9.0)
     assert halved.of["means"] == LogLinear(9.0, pytest.approx(0.9), 50, Rewind(25, 10))
     assert halved.of["quats"] == 6.0
     assert json.loads(json.dumps(halved.described()))["per_extent"] == ["means"]
@@ -254,8 +255,8 @@ def test_term_is_due_between_start_and_stop():
     assert [step for step in range(10) if term.is_due(step)] == [4, 5]
     assert not any(term._replace(weight=0.0).is_due(step) for step in range(10))
     assert [step for step in range(9) if term._replace(stop=None).is_due(step)] == [4, 5, 6, 7, 8]
-    assert term._replace(start=30, stop=60).scaled(0.1) == term
-    assert term._replace(stop=None).scaled(2.0) == term._replace(start=6, stop=None)
+    assert term._replace(start=30, stop=60).scaled(Fraction(1, 10)) == term
+    assert term._replace(stop=None).scaled(Fraction(2)) == term._replace(start=6, stop=None)
 
 
 def test_terms_act_in_training_when_they_are_due_alone(scene):
@@ -303,7 +304,7 @@ TEXTS = [
     ("budget", "1000", 1000),
     ("budget", "none", None),
     ("depth_tolerance", "None", None),
-    ("most_per_pixel", "inf", np.inf),
+    ("points_per_gaussian", "inf", np.inf),
     ("threshold", "1e-3", 1e-3),
     ("metric", "outdoor", outdoor),
     ("choose", "by_rank", by_rank),

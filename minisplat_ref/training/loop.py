@@ -34,7 +34,6 @@ from minisplat_ref.training.schedule import During, Recipe, describe
 from minisplat_ref.training.state import Iteration, StepReport, TrainState
 from minisplat_ref.types import Floats, Scene, numbered
 
-LEAST_HALF_SIZE = 100  # pixels a side
 SHARED_RULE = AdamRule(is_visible_only=False, has_bias_correction=True)  # shared parameters have no visible rows
 
 __all__ = ["StepReport", "TrainState", "initial_state", "load_state", "save_state", "train"]
@@ -124,7 +123,7 @@ def train(
     scene = scene._replace(train_views=numbered(scene.train_views))
     if max(state.view_order, default=0) >= len(scene.train_views):
         raise InputError(f"scene {scene.name} has fewer training views than the run to continue: give the same scene")
-    small_scene = _half_size(scene) if state.step < recipe.half_size_until else scene
+    small_scene = _half_size(scene, recipe.least_half_size) if state.step < recipe.half_size_until else scene
     with _interrupts_held_back() as raise_if_interrupted:
         while state.step < recipe.iterations:
             seen = small_scene if state.step < recipe.half_size_until else scene
@@ -201,10 +200,10 @@ def _next_view(state: TrainState, n_views: int) -> int:
     return state.view_order.pop()
 
 
-def _half_size(scene: Scene) -> Scene:
+def _half_size(scene: Scene, least: int) -> Scene:
     """Halve the training views, unless they are so small that no structure would be left in them."""
     sizes = [min(view.camera.width, view.camera.height) for view in scene.train_views]
-    if min(sizes) < 2 * LEAST_HALF_SIZE:
+    if min(sizes) < 2 * least:
         return scene
     return scene._replace(train_views=tuple(half_size(view) for view in scene.train_views))
 

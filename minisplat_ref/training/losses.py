@@ -7,6 +7,7 @@ when to when, is data of its recipe.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
@@ -67,7 +68,7 @@ class LossTerm(NamedTuple):
         """Return whether the term counts in iteration ``step``, counted from 1."""
         return self.weight != 0 and self.start < step and (self.stop is None or step < self.stop)
 
-    def scaled(self, factor: float) -> "LossTerm":
+    def scaled(self, factor: Fraction) -> "LossTerm":
         """Return the term with its iterations multiplied by ``factor``."""
         return self._replace(
             start=round(self.start * factor), stop=None if self.stop is None else round(self.stop * factor)

@@ -4,6 +4,7 @@ Left out: the delayed start of the position rate, which the published settings n
 """
 
 from collections.abc import Mapping, Sequence
+from fractions import Fraction
 from typing import Any, NamedTuple
 
 
@@ -33,7 +34,7 @@ class LogLinear(NamedTuple):
         progress = min(step / self.steps, 1.0)
         return float(self.first * (self.last / self.first) ** progress)
 
-    def scaled(self, factor: float, times: float) -> "LogLinear":
+    def scaled(self, factor: Fraction, times: float) -> "LogLinear":
         """Return the rate with the iterations multiplied by ``factor``, and itself by ``times``."""
         rewind = self.rewind and Rewind(round(self.rewind.at * factor), round(self.rewind.to * factor))
         return LogLinear(self.first * times, self.last * times, max(1, round(self.steps * factor)), rewind)
@@ -71,12 +72,12 @@ class Rates(NamedTuple):
         """Return these rates and the other's; of one name, these, and whether it is per extent is theirs to say."""
         return Rates({**other.of, **self.of}, self.per_extent | (other.per_extent - self.of.keys()))
 
-    def scaled(self, factor: float, raised: float, raised_per_extent: float) -> "Rates":
+    def scaled(self, factor: Fraction, raised: float, raised_per_extent: float) -> "Rates":
         """Return the rates for a run of another length.
 
         Parameters
         ----------
-        factor : float
+        factor : Fraction
             The lengths of the schedules are multiplied by it.
         raised : float
             The rates themselves are multiplied by it,

@@ -8,6 +8,7 @@ import inspect
 import math
 import sys
 from collections.abc import Callable, Mapping
+from fractions import Fraction
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -39,38 +40,52 @@ class During(NamedTuple):
         """Return whether the action belongs to iteration ``step``, counted from 1."""
         return self.start < step and (self.stop is None or step < self.stop)
 
-    def scaled(self, factor: float) -> "During":
+    def scaled(self, factor: Fraction) -> "During":
         """Return the event with all milestones multiplied by ``factor``."""
         return self._replace(start=_scaled(self.start, factor), stop=_scaled_limit(self.stop, factor))
 
 
 class Every(NamedTuple):
-    """Act at the multiples of ``period`` with ``start < step < stop``, except those of ``skip``."""
+    """Act at the multiples of ``period`` with ``start < step < stop``, except those of ``skip``.
+
+    These iterations are the published ones. In a run of another length the action comes at ``factor`` times each of
+    them, rounded like every other milestone, so that what was before something else stays before it, and the gaps
+    shrink alike.
+    """
 
     period: int
     action: Action
     start: int = 0
     stop: int | None = None
     skip: int | None = None
-    least_period: int = 1
-    """Scaling does not make the period shorter than this."""
-    least_step: int = 0
-    """The action never happens before this iteration, however far the recipe is compressed."""
+    least_gap: int = 1
+    """Iterations between two actions, and from the last one to ``stop``, below which no compression brings them: of
+    the published iterations only every second stays then, or every third, and so on, counted back from ``stop``."""
+    factor: Fraction = Fraction(1)
+    """Length of the run, divided by the published length."""
+
+    @property
+    def stride(self) -> int:
+        """Published iterations from one action that stays to the next."""
+        return self.period * math.ceil(self.least_gap / (self.period * self.factor))
 
     def is_due(self, step: int) -> bool:
         """Return whether the action belongs to iteration ``step``, counted from 1."""
-        is_inside = max(self.start + 1, self.least_step) <= step and (self.stop is None or step < self.stop)
-        is_skipped = self.skip is not None and step % self.skip == 0
-        return is_inside and step % self.period == 0 and not is_skipped
+        length, of = self.factor.as_integer_ratio()  # what is published at p comes at p length / of
+        first, last = (2 * step - 1) * of // (2 * length), (2 * step + 1) * of // (2 * length)
+        multiples = range(first + -first % self.period, last + 1, self.period)
+        return any(self._stays(published) and _scaled(published, self.factor) == step for published in multiples)
 
-    def scaled(self, factor: float) -> "Every":
-        """Return the event with all milestones multiplied by ``factor`` and the period at least ``least_period``."""
-        return self._replace(
-            period=max(self.least_period, _scaled(self.period, factor)),
-            start=_scaled(self.start, factor),
-            stop=_scaled_limit(self.stop, factor),
-            skip=None if self.skip is None else max(1, _scaled(self.skip, factor)),
-        )
+    def _stays(self, step: int) -> bool:
+        """Return whether the action belongs to this multiple of the period in the published schedule, and stays."""
+        if step <= self.start or (self.stop is not None and step >= self.stop):
+            return False
+        is_skipped = self.skip is not None and step % self.skip == 0
+        return not is_skipped and (step - (self.stop or 0)) % self.stride == 0
+
+    def scaled(self, factor: Fraction) -> "Every":
+        """Return the event for a run of ``factor`` times the length."""
+        return self._replace(factor=self.factor * factor)
 
 
 class At(NamedTuple):
@@ -85,7 +100,7 @@ class At(NamedTuple):
         """Return whether the action belongs to iteration ``step``, counted from 1."""
         return step == self.step and step >= self.least_step
 
-    def scaled(self, factor: float) -> "At":
+    def scaled(self, factor: Fraction) -> "At":
         """Return the event with its iteration multiplied by ``factor``, at least the first."""
         return self._replace(step=max(1, _scaled(self.step, factor)))
 
@@ -113,6 +128,8 @@ class Recipe(NamedTuple):
     """What happens besides gradient steps; several due in one iteration act in this order."""
     half_size_until: int = 0
     """Iterations that train on views of half the width and height, from the first on (Mini-Splatting2)."""
+    least_half_size: int = 100
+    """Pixels a side; if half of a view were smaller, no view is halved."""
     least_views: int = 1
     """Training views without which the method makes no sense."""
     short_run_exponent: float = 0.0
@@ -147,12 +164,12 @@ class Recipe(NamedTuple):
 def scaled(recipe: Recipe, iterations: int) -> Recipe:
     """Return the recipe for another number of iterations, all milestones moved in proportion.
 
-    Start, stop and period of each event and loss term, the spherical-harmonic milestones and the lengths of the rates'
-    schedules are multiplied by ``iterations / recipe.iterations`` and rounded to the nearest integer (ties to even); a
-    one-time event happens at iteration 1 at the earliest, a period is at least the event's ``least_period``. Because
-    the period is rounded by itself, the number of events can differ by a few from the original's. What must not come
-    before its ``least_step`` is left out of runs that are too short for it. Thresholds stay; so do learning rates,
-    unless the recipe or the calibration has a ``short_run_exponent``.
+    Every iteration at which something happens is multiplied by ``iterations / recipe.iterations`` and rounded to the
+    nearest integer (ties to even): of each event and loss term, of the spherical harmonics and of the rates' schedules.
+    So the order of events is that of the recipe, whatever the length. A one-time event happens at iteration 1 at the
+    earliest; of periodic ones fewer may stay, see :attr:`Every.least_gap`. What must not come before its ``least_step``
+    is left out of runs that are too short for it. Thresholds stay; so do learning rates, unless the recipe or the
+    calibration has a ``short_run_exponent``.
 
     Raises
     ------
@@ -161,8 +178,8 @@ def scaled(recipe: Recipe, iterations: int) -> Recipe:
     """
     if iterations < 1:
         raise InputError(f"iterations is {iterations}: give at least 1")
-    factor = iterations / recipe.iterations
-    shortening = max(1.0, 1 / factor)
+    factor = Fraction(iterations, recipe.iterations)
+    shortening = max(1.0, float(1 / factor))
     raised = shortening**recipe.short_run_exponent
 
     def of_calibration(calibration: Calibration) -> Calibration:
@@ -183,11 +200,11 @@ def scaled(recipe: Recipe, iterations: int) -> Recipe:
     )
 
 
-def _scaled(step: int, factor: float) -> int:
+def _scaled(step: int, factor: Fraction) -> int:
     return round(step * factor)
 
 
-def _scaled_limit(step: int | None, factor: float) -> int | None:
+def _scaled_limit(step: int | None, factor: Fraction) -> int | None:
     return None if step is None else _scaled(step, factor)
 
 
@@ -336,7 +353,14 @@ def _describe_term(term: LossTerm) -> dict[str, Any]:
 
 
 def _described(fields: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: sorted(value) if isinstance(value, frozenset) else value for name, value in fields.items()}
+    return {name: _plain(value) for name, value in fields.items()}
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON can hold it."""
+    if isinstance(value, frozenset):
+        return sorted(value)
+    return str(value) if isinstance(value, Fraction) else value
 
 
 def _describe_function(function: Callable[..., Any], role: str) -> dict[str, Any]:

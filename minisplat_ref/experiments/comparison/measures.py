@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -144,8 +145,9 @@ def densification_end(recipe: Mapping[str, Any]) -> float:
 
     Mini-Splatting simplifies in this iteration; 3DGS goes on with what it has. Infinite where there is no such end.
     """
-    stops = [event["stop"] for event in recipe["events"] if event["action"] == "clone_and_split"]
-    return max((math.inf if stop is None else stop for stop in stops), default=math.inf)
+    events = [event for event in recipe["events"] if event["action"] == "clone_and_split"]
+    stops = [math.inf if event["stop"] is None else event["stop"] * Fraction(event["factor"]) for event in events]
+    return max(map(float, stops), default=math.inf)
 
 
 def relation(measure: Measure, value: Spread, first: Spread) -> float | None:
