@@ -8,7 +8,7 @@ from tolerances import CLOSED_FORM, ROUNDED_TO_FLOAT32
 
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.rendering import render
-from minisplat_ref.strategy.blur_split import LEAST_BLURRED_AREA, is_blurred, principal_axis_children
+from minisplat_ref.strategy.blur_split import is_blurred, principal_axis_children
 from minisplat_ref.strategy.clone_split import clone_and_split, random_children
 from minisplat_ref.strategy.ops import take
 
@@ -91,8 +91,9 @@ def test_the_mask_is_not_edited(gaussians, rng):
 
 def test_tiny_image_does_not_split_everybody():
     """2e-4 of 40 x 30 pixels is a quarter of a pixel."""
-    counts = np.array([0, 1, LEAST_BLURRED_AREA, LEAST_BLURRED_AREA + 1])
-    assert_array_equal(is_blurred(counts, 40, 30, area_fraction=AREA_FRACTION), [0, 0, 0, 1])
+    counts = np.array([0, 1, 64, 65])
+    assert_array_equal(is_blurred(counts, 40, 30, area_fraction=AREA_FRACTION, least_area=64), [0, 0, 0, 1])
+    assert_array_equal(is_blurred(counts, 40, 30, area_fraction=AREA_FRACTION), [0, 1, 1, 1])
 
 
 def test_splitting_stops(rng):

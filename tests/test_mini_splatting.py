@@ -17,7 +17,7 @@ from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.strategy import importance, simplify
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.loop import initial_state, load_state, save_state, train
-from minisplat_ref.training.schedule import At, During, Every, configured, scaled
+from minisplat_ref.training.schedule import At, Every, configured, scaled
 from minisplat_ref.training.state import Iteration, n_pixels
 from minisplat_ref.types import Scene, View
 
@@ -57,23 +57,16 @@ def compressed(name):
     has no time to be undone, would leave nothing.
     """
     recipe = RECIPES[name]
-    events = [e if isinstance(e, During) else e._replace(least_step=0) for e in recipe.events]
-    if name.startswith("mini-splatting2"):
-        events = [e._replace(least_period=2) if isinstance(e, Every) else e for e in events]
-    return scaled(recipe._replace(events=tuple(events)), ITERATIONS)
-
-
-@pytest.fixture
-def small_warm_up(monkeypatch):
-    """Views of 72 x 64 pixels are halved."""
-    monkeypatch.setattr("minisplat_ref.training.loop.LEAST_HALF_SIZE", 32)
+    least_gap = 2 if name.startswith("mini-splatting2") else 5
+    events = [e._replace(least_gap=least_gap) if isinstance(e, Every) else e for e in recipe.events]
+    return scaled(recipe._replace(events=tuple(events), least_half_size=32), ITERATIONS)
 
 
 # Whole recipes --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", NEW_RECIPES)
-def test_recipe_runs_to_the_end(scene, name, small_warm_up):
+def test_recipe_runs_to_the_end(scene, name):
     """Every event happens, what they upset is learnt again, and view-dependent colour exists after simplification."""
     recipe = compressed(name)
     losses, degrees, sizes = [], [], []
@@ -225,14 +218,15 @@ def test_densification_pauses_above_the_most(state, iteration):
     for most, expected in ((n - 1, n), (n + 1, 2 * n)):
         state.stats = {"gradient_sum": np.ones(n), "view_count": np.ones(n), "is_blurred": np.zeros(n, bool)}
         act(state, iteration, most_per_pixel=most / n_pixels(iteration.scene))
-        assert n_rows(state.gaussians) == expected and state.stats == {}
+        assert n_rows(state.gaussians) == expected and (state.stats == {}) == (expected == 2 * n)
 
 
 def test_depth_gives_as_many_points_as_asked_for(state, iteration):
     recipe = RECIPES["mini-splatting"]
     act = next(event.action for event in recipe.events if "reinitialise_from_depth" in repr(event.action))
-    act(state, iteration, points_per_pixel=0.01)
-    assert n_rows(state.gaussians) == N_VIEWS * round(0.01 * n_pixels(iteration.scene)) // N_VIEWS
+    n = n_rows(state.gaussians)
+    act(state, iteration, points_per_gaussian=5.0)
+    assert n_rows(state.gaussians) == 5 * n // N_VIEWS * N_VIEWS
     assert state.gaussians.sh_rest.shape[1] == 0 and state.adam.step == 0
 
 
@@ -245,13 +239,13 @@ def test_too_few_views(scene, name):
         initial_state(scene._replace(train_views=scene.train_views[:2]), RECIPES[name], 0)
 
 
-def test_tiny_images_are_not_halved(scene, small_warm_up):
+def test_tiny_images_are_not_halved(scene):
     """Half of 63 pixels would be fewer than 32."""
     views = tuple(
         view._replace(camera=view.camera._replace(width=63), image=view.image[:, :63]) for view in scene.train_views
     )
     sizes = []
-    recipe = RECIPES["3dgs"]._replace(iterations=2, events=(), half_size_until=2)
+    recipe = RECIPES["3dgs"]._replace(iterations=2, events=(), half_size_until=2, least_half_size=32)
     train(scene._replace(train_views=views), recipe, seed=0, on_step=lambda r: sizes.append(r.view.camera.width))
     assert sizes == [63, 63]
 

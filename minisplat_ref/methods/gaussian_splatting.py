@@ -50,13 +50,13 @@ def clone_and_split(
     """Densify where the mean of the collected gradients reaches ``threshold``, and start collecting anew.
 
     Gaussians larger than ``size_fraction`` of the scene's extent are split, the others cloned; those that
-    ``stats["is_blurred"]`` marks are split whatever their size and gradient (Mini-Splatting). Nothing is done while
-    there are ``most_per_pixel`` Gaussians or more for each pixel of the training views.
+    ``stats["is_blurred"]`` marks are split whatever their size and gradient (Mini-Splatting). While there are
+    ``most_per_pixel`` Gaussians or more for each pixel of the training views, collecting goes on instead.
     """
-    means = state.stats.pop("gradient_sum") / np.maximum(state.stats.pop("view_count"), 1)
-    is_blurred = state.stats.pop("is_blurred", None)
     if n_rows(state.gaussians) >= most_per_pixel * n_pixels(iteration.scene):
         return
+    means = state.stats.pop("gradient_sum") / np.maximum(state.stats.pop("view_count"), 1)
+    is_blurred = state.stats.pop("is_blurred", None)
     edit = clone_split.clone_and_split(
         state.gaussians,
         means,
@@ -97,8 +97,8 @@ def reset_opacity_on_white(state: TrainState, iteration: Iteration, *, ceiling: 
 # Densification needs the mean gradient over about all views, and time to settle: each event multiplies the Gaussians
 # by up to two, so that events compressed to every few iterations let their number explode. What an opacity reset fades
 # needs some hundred iterations to come back.
-DENSIFY_LEAST_PERIOD = 100
-_densifying = partial(Every, 100, stop=15_000, least_period=DENSIFY_LEAST_PERIOD)
+DENSIFY_LEAST_GAP = 100
+_densifying = partial(Every, 100, stop=15_000, least_gap=DENSIFY_LEAST_GAP)
 
 GS = Recipe(
     name="3dgs",
@@ -123,7 +123,7 @@ GS = Recipe(
         _densifying(partial(clone_and_split, threshold=2e-4, size_fraction=0.01), start=500),
         _densifying(partial(prune_faint, least_opacity=0.005), start=500),
         _densifying(partial(prune_large, size_fraction=0.1), start=3_000),
-        Every(3_000, partial(reset_opacity, ceiling=0.01), stop=15_000, least_period=300),
+        Every(3_000, partial(reset_opacity, ceiling=0.01), stop=15_000, least_gap=300),
         At(500, partial(reset_opacity_on_white, ceiling=0.01)),
     ),
 )

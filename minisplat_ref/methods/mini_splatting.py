@@ -11,14 +11,13 @@ import numpy as np
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods.gaussian_splatting import (
-    DENSIFY_LEAST_PERIOD,
+    DENSIFY_LEAST_GAP,
     GS,
     clone_and_split,
     collect_gradients,
     prune_faint,
-    prune_large,
 )
-from minisplat_ref.strategy import blur_split, depth_reinit, importance, visibility
+from minisplat_ref.strategy import blur_split, clone_split, depth_reinit, importance, visibility
 from minisplat_ref.strategy import simplify as simplification
 from minisplat_ref.strategy.depth_reinit import PixelPoints, reinitial_points
 from minisplat_ref.strategy.importance import ImportanceStats, collect_importance
@@ -27,21 +26,29 @@ from minisplat_ref.strategy.ops import Edit, keep, n_rows
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.rates import LogLinear, Rewind
 from minisplat_ref.training.schedule import BLEND_STATS, At, During, Every
-from minisplat_ref.training.state import Iteration, TrainState, apply_edit, n_pixels, start_anew
+from minisplat_ref.training.state import Iteration, TrainState, apply_edit, start_anew
 from minisplat_ref.types import Floats
 
 Metric = Callable[[ImportanceStats], Floats]
 """Importance [N] of what all training views see: ``importance.indoor`` or ``importance.outdoor``."""
 
+VISIBILITY_MASS = 0.99  # of a view's blend weight is carried by what is called visible in it (Mini-Splatting2)
 
-def measure_importance(state: TrainState, iteration: Iteration) -> ImportanceStats:
-    """Render all training views for their blend statistics, without culling."""
+
+def measure_importance(
+    state: TrainState, iteration: Iteration, visibility_mass: float = VISIBILITY_MASS
+) -> ImportanceStats:
+    """Render all training views for their blend statistics, without culling.
+
+    ``visibility_mass`` is the part of a view's blend weight that its visible Gaussians carry.
+    """
     return collect_importance(
         state.model,
         iteration.scene.train_views,
         renderer=iteration.renderer,
         conventions=iteration.conventions,
         backend=iteration.backend,
+        visibility_mass=visibility_mass,
     )
 
 
@@ -83,11 +90,16 @@ def is_culling(state: TrainState) -> bool:
     return "is_visible" in state.stats
 
 
-def collect_blur(state: TrainState, iteration: Iteration, *, area_fraction: float) -> None:
-    """Mark in ``stats["is_blurred"]`` what dominates more than ``area_fraction`` of the view's pixels."""
+def collect_blur(state: TrainState, iteration: Iteration, *, area_fraction: float, least_area: int = 0) -> None:
+    """Mark in ``stats["is_blurred"]`` what dominates more than ``area_fraction`` of the view's pixels.
+
+    Up to ``least_area`` pixels are not blurred in any view.
+    """
     stats, camera = iteration.output.stats, iteration.view.camera
     assert stats is not None, "listed in the recipe without BLEND_STATS"
-    is_blurred = blur_split.is_blurred(stats.dominant_count, camera.width, camera.height, area_fraction=area_fraction)
+    is_blurred = blur_split.is_blurred(
+        stats.dominant_count, camera.width, camera.height, area_fraction=area_fraction, least_area=least_area
+    )
     marked = state.stats.get("is_blurred")
     state.stats["is_blurred"] = is_blurred if marked is None else marked | is_blurred
 
@@ -100,15 +112,18 @@ def reinitialise_from_depth(
     least_alpha: float,
     depth_tolerance: float | None,
     backdrop_extents: float | None,
-    points_per_pixel: float = 0.0,
-    points_per_gaussian: float = 0.0,
+    points_per_gaussian: float,
+    drawn_mass: float | None = None,
 ) -> None:
     """Begin again with points that the views' depths give, without view-dependent colour.
 
-    Their number is ``points_per_pixel`` of the training views' pixels and ``points_per_gaussian`` of the population.
-    Points that no other view confirms to ``depth_tolerance`` move out to ``backdrop_extents`` times the scene's extent.
+    Their number is ``points_per_gaussian`` times that of the population. Points through which other views see, to
+    ``depth_tolerance``, move out to ``backdrop_extents`` times the scene's extent. With ``drawn_mass`` depths are those
+    of the Gaussians that carry this part of the importance (Mini-Splatting2); they are counted before.
     """
-    n_points = round(points_per_pixel * n_pixels(iteration.scene) + points_per_gaussian * n_rows(state.gaussians))
+    n_points = round(points_per_gaussian * n_rows(state.gaussians))
+    if drawn_mass is not None:
+        prune_tail(state, iteration, metric=importance.indoor, mass=drawn_mass)
     points, colors = reinitial_points(
         state.model,
         iteration.scene.train_views,
@@ -125,6 +140,18 @@ def reinitialise_from_depth(
     start_anew(state, iteration, from_points(points, colors, sh_degree=0))
 
 
+def prune_large_by_distance(state: TrainState, iteration: Iteration, *, size_fraction: float) -> None:
+    """Remove Gaussians larger than ``size_fraction`` of the scene's extent, or of their distance where that is larger.
+
+    The distance is from the middle of the cameras. In 3DGS the limit is the same everywhere, and whatever is far, such
+    as the sky, could not be covered.
+    """
+    center = np.mean([view.camera.center for view in iteration.scene.train_views], axis=0)  # [3]
+    distances = np.linalg.norm(state.gaussians.means - center, axis=1)  # [N]
+    size_limits = size_fraction * np.maximum(iteration.scene.extent, distances)
+    apply_edit(state, clone_split.prune_large(state.gaussians, size_limit=size_limits))
+
+
 def simplify(
     state: TrainState,
     iteration: Iteration,
@@ -134,8 +161,10 @@ def simplify(
     keep_fraction: float,
     budget: int | None = None,
     least_views: int = 0,
+    is_intersecting: bool = True,
+    visibility_mass: float = VISIBILITY_MASS,
 ) -> None:
-    """Keep ``budget`` Gaussians, or ``keep_fraction`` of those that dominate some pixel of a training view.
+    """Keep ``budget`` Gaussians, or ``keep_fraction`` of the candidates.
 
     Parameters
     ----------
@@ -151,11 +180,15 @@ def simplify(
         Number of Gaussians to keep.
     least_views : int
         Those that belong to the visible part of fewer views are no candidates.
+    is_intersecting : bool
+        Nor are those that dominate no pixel of any training view.
+    visibility_mass : float
+        Part of a view's blend weight that its visible Gaussians carry.
     """
-    stats = measure_importance(state, iteration)
+    stats = measure_importance(state, iteration, visibility_mass)
     if is_culling(state):
         cull(state, stats)
-    importance = candidates(stats, metric, least_views, is_intersecting=True)
+    importance = candidates(stats, metric, least_views, is_intersecting=is_intersecting)
     n_candidates = int(np.count_nonzero(importance))
     n = round(keep_fraction * n_candidates) if budget is None else budget
     apply_edit(state, choose(state.gaussians, importance, n, state.rng))
@@ -169,12 +202,14 @@ def prune_tail(
     mass: float,
     least_views: int = 0,
     is_intersecting: bool = True,
+    visibility_mass: float = VISIBILITY_MASS,
 ) -> None:
     """Keep the most important Gaussians that together carry ``mass`` of the importance.
 
-    With ``is_intersecting`` only those count that dominate some pixel of a training view.
+    With ``is_intersecting`` only those count that dominate some pixel of a training view; ``least_views`` and
+    ``visibility_mass`` as for :func:`simplify`.
     """
-    stats = measure_importance(state, iteration)
+    stats = measure_importance(state, iteration, visibility_mass)
     if is_culling(state):
         cull(state, stats)
     importance = candidates(stats, metric, least_views, is_intersecting=is_intersecting)
@@ -199,51 +234,43 @@ def restart_adam(state: TrainState, iteration: Iteration) -> None:
     state.adam = zero_moments(state.gaussians)
 
 
-POINTS_PER_PIXEL = 0.014  # 3.5 million points for some 200 photographs of 1.2 megapixels
-MOST_PER_PIXEL = 0.05  # densification pauses above it; released: 0.018, which is too few where pixels are few
-# Of the Gaussians that dominate some pixel; released: 0.5, and 0.6 in Mini-Splatting2. Where pixels are few, so are
-# they, and hardly any can be spared.
-KEEP_FRACTION = 0.9
+KEEP_FRACTION = 0.5  # of the Gaussians that dominate some pixel
 BLUR_AREA = 2e-4  # paper, equation 2: what dominates more of an image than this is too large
+# Pixels. The low-pass filter makes the smallest Gaussian some 2 pixels wide: where the paper's fraction is only a few
+# pixels, as in photographs of less than a megapixel, splitting would never end.
+LEAST_BLURRED_AREA = 64
 
-# To begin anew, from depth or from the centres alone, takes a scene that is known by then and time to learn it again:
-# in runs of a few thousand iterations it costs more than it gives.
-REINITIALISE_LEAST_STEP = 2_000
-RESTART_LEAST_STEP = 3_000
 # Sky and bare walls have no depth that photographs settle. The paper takes the points as they come, which leaves veils
-# in the air; here what other views do not confirm goes far behind the scene.
+# in the air; here what other views see through goes far behind the scene.
 DEPTH_TOLERANCE = 0.05
 BACKDROP_EXTENTS = 30.0
-SHORT_RUN_EXPONENT = 0.3  # simplified Gaussians are few and change much: compressed runs raise their rates
 
-_densifying = partial(Every, 100, stop=15_000, skip=5_000, least_period=DENSIFY_LEAST_PERIOD)
+SHORT_RUN_EXPONENT = 0.3  # what is begun anew has to be learned again: compressed runs raise their rates
 
-_densify = partial(
-    clone_and_split,
-    threshold=2e-4,
-    size_fraction=0.01,
-    draw_children=blur_split.principal_axis_children,
-    most_per_pixel=MOST_PER_PIXEL,
-)
+_densifying = partial(Every, 100, stop=15_000, skip=5_000, least_gap=DENSIFY_LEAST_GAP)
+
+_densify = partial(clone_and_split, threshold=2e-4, size_fraction=0.01, draw_children=clone_split.random_children)
 _reinitialise = partial(
     reinitialise_from_depth,
     points_of=depth_reinit.midpoint_points,
-    points_per_pixel=POINTS_PER_PIXEL,
+    points_per_gaussian=1.0,
     least_alpha=0.0,
     depth_tolerance=DEPTH_TOLERANCE,
     backdrop_extents=BACKDROP_EXTENTS,
 )
 _DENSIFICATION = (
     During(collect_gradients, stop=15_000),
-    During(partial(collect_blur, area_fraction=BLUR_AREA), stop=15_000, wants=BLEND_STATS),
+    During(
+        partial(collect_blur, area_fraction=BLUR_AREA, least_area=LEAST_BLURRED_AREA), stop=15_000, wants=BLEND_STATS
+    ),
     _densifying(_densify, start=500),
     _densifying(partial(prune_faint, least_opacity=0.005), start=500),
-    _densifying(partial(prune_large, size_fraction=0.1), start=3_000),
-    Every(5_000, _reinitialise, stop=15_000, least_step=REINITIALISE_LEAST_STEP),
+    _densifying(partial(prune_large_by_distance, size_fraction=0.1), start=3_000),
+    Every(5_000, _reinitialise, stop=15_000),
 )
 _AFTER_SIMPLIFICATION = (
     At(15_000, partial(store_sh, sh_degree=3)),
-    At(15_000, partial(restart_from_means, sh_degree=3), least_step=RESTART_LEAST_STEP),
+    At(15_000, partial(restart_from_means, sh_degree=3)),
 )
 
 MINI_SPLATTING = GS._replace(
@@ -261,10 +288,11 @@ MINI_SPLATTING = GS._replace(
                 choose=simplification.by_sampling,
                 keep_fraction=KEEP_FRACTION,
                 budget=None,
+                is_intersecting=True,
             ),
         ),
         *_AFTER_SIMPLIFICATION,
-        At(20_000, partial(prune_tail, metric=importance.indoor, mass=0.99)),
+        At(20_000, partial(prune_tail, metric=importance.indoor, mass=0.99, is_intersecting=True)),
         At(20_000, restart_adam),
     ),
     least_views=3,

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from functools import partial
 
 from minisplat_ref.methods.gaussian_splatting import (
-    DENSIFY_LEAST_PERIOD,
+    DENSIFY_LEAST_GAP,
     GS,
     clone_and_split,
     collect_gradients,
@@ -15,9 +15,9 @@ from minisplat_ref.methods.mini_splatting import (
     BACKDROP_EXTENTS,
     BLUR_AREA,
     DEPTH_TOLERANCE,
-    KEEP_FRACTION,
-    REINITIALISE_LEAST_STEP,
+    LEAST_BLURRED_AREA,
     SHORT_RUN_EXPONENT,
+    VISIBILITY_MASS,
     collect_blur,
     cull,
     measure_importance,
@@ -27,7 +27,7 @@ from minisplat_ref.methods.mini_splatting import (
     store_sh,
 )
 from minisplat_ref.strategy import aggressive_clone as cloning
-from minisplat_ref.strategy import blur_split, depth_reinit, importance, visibility
+from minisplat_ref.strategy import clone_split, depth_reinit, importance, visibility
 from minisplat_ref.strategy import simplify as simplification
 from minisplat_ref.strategy.importance import ImportanceStats, indoor, mass_mask
 from minisplat_ref.strategy.ops import keep, n_rows, take
@@ -47,6 +47,7 @@ def aggressive_clone(
     factor: int,
     tail_mass: float,
     least_views: int,
+    visibility_mass: float = VISIBILITY_MASS,
     most_per_pixel: float = math.inf,
 ) -> None:
     """Clone the critical Gaussians, after dropping those that hardly any view sees, and cull views from now on.
@@ -63,10 +64,12 @@ def aggressive_clone(
         Only the most important Gaussians that carry this part of the importance stay.
     least_views : int
         Those that belong to the visible part of fewer views go.
+    visibility_mass : float
+        Part of a view's blend weight that its visible Gaussians carry.
     most_per_pixel : float
         Nothing is cloned while there are this many Gaussians or more for each pixel of the training views.
     """
-    stats = measure_importance(state, iteration)
+    stats = measure_importance(state, iteration, visibility_mass)
     stays = mass_mask(indoor(stats), tail_mass) & ~visibility.seen_by_few(stats.is_visible, least_views)  # [N]
     apply_edit(state, keep(state.gaussians, stays))
     stats = take(stats, stays)
@@ -83,8 +86,9 @@ def stop_culling(state: TrainState, iteration: Iteration) -> None:
         state.stats.pop(name, None)
 
 
-MOST_PER_PIXEL = 0.025  # densification pauses above it; cloning may go beyond once, to twice as many
-CLONE_LEAST_PERIOD = 50  # copies start in one place and need some steps to part
+KEEP_FRACTION = 0.6  # of the Gaussians that dominate some pixel
+MOST_PER_PIXEL = 0.1
+CLONE_LEAST_GAP = 50  # copies start in one place and need some steps to part
 _LEAST_VIEWS = 2  # what only one view sees is as likely a floater as a surface
 _cloning = partial(
     aggressive_clone,
@@ -92,33 +96,36 @@ _cloning = partial(
     factor=2,
     tail_mass=0.999,
     least_views=_LEAST_VIEWS,
+    visibility_mass=VISIBILITY_MASS,
     most_per_pixel=MOST_PER_PIXEL,
 )
 _densify = partial(
     clone_and_split,
     threshold=2e-4,
     size_fraction=0.01,
-    draw_children=blur_split.principal_axis_children,
+    draw_children=clone_split.random_children,
     most_per_pixel=MOST_PER_PIXEL,
 )
 _reinitialise = partial(
     reinitialise_from_depth,
     points_of=depth_reinit.midpoint_points,
     points_per_gaussian=1.0,
+    drawn_mass=0.99,
     least_alpha=0.0,
     depth_tolerance=DEPTH_TOLERANCE,
     backdrop_extents=BACKDROP_EXTENTS,
 )
-_densifying = partial(Every, 100, start=500, stop=3_000, skip=2_000, least_period=DENSIFY_LEAST_PERIOD)
+_densifying = partial(Every, 100, start=500, stop=3_000, skip=2_000, least_gap=DENSIFY_LEAST_GAP)
 
 _DENSIFICATION = (
     During(collect_gradients, stop=3_000),
-    During(partial(collect_blur, area_fraction=BLUR_AREA), stop=3_000, wants=BLEND_STATS),
+    During(
+        partial(collect_blur, area_fraction=BLUR_AREA, least_area=LEAST_BLURRED_AREA), stop=3_000, wants=BLEND_STATS
+    ),
     _densifying(_densify),
     _densifying(partial(prune_faint, least_opacity=0.005)),
-    At(2_000, partial(prune_tail, metric=importance.indoor, mass=0.99)),
-    At(2_000, _reinitialise, least_step=REINITIALISE_LEAST_STEP),
-    Every(250, _cloning, start=499, stop=3_000, skip=2_000, least_period=CLONE_LEAST_PERIOD),
+    At(2_000, _reinitialise),
+    Every(250, _cloning, start=499, stop=3_000, skip=2_000, least_gap=CLONE_LEAST_GAP),
 )
 
 MINI_SPLATTING2 = GS._replace(
@@ -139,12 +146,14 @@ MINI_SPLATTING2 = GS._replace(
                 keep_fraction=KEEP_FRACTION,
                 budget=None,
                 least_views=_LEAST_VIEWS,
+                is_intersecting=True,
+                visibility_mass=VISIBILITY_MASS,
             ),
         ),
         At(3_000, partial(store_sh, sh_degree=3)),
         At(
             8_000,
-            partial(prune_tail, metric=importance.indoor, mass=0.99, least_views=_LEAST_VIEWS),
+            partial(prune_tail, metric=importance.indoor, mass=0.99, least_views=_LEAST_VIEWS, is_intersecting=True),
         ),
         At(13_000, stop_culling),
     ),
@@ -155,7 +164,12 @@ MINI_SPLATTING2 = GS._replace(
 """``mini-splatting2``: few Gaussians, fast."""
 
 _prune_unimportant = partial(
-    prune_tail, metric=importance.indoor, mass=0.99, least_views=_LEAST_VIEWS, is_intersecting=False
+    prune_tail,
+    metric=importance.indoor,
+    mass=0.99,
+    least_views=_LEAST_VIEWS,
+    is_intersecting=False,
+    visibility_mass=VISIBILITY_MASS,
 )
 MINI_SPLATTING2_D = MINI_SPLATTING2._replace(
     name="mini-splatting2-d",

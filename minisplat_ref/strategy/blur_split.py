@@ -18,16 +18,11 @@ from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.strategy.ops import concat, take
 from minisplat_ref.types import Bools, Gaussians, Ints
 
-LEAST_BLURRED_AREA = 64
-"""Pixels. Who leads at no more than 8 x 8 of them is small enough, whatever the size of the image. The paper's fraction
-of 2e-4 falls below this under 320,000 pixels, and below one pixel under 5000, where everybody who leads anywhere would
-be split."""
-
 HALF_MEAN = math.sqrt(2 / math.pi)  # mean of |x| for x ~ N(0, 1): the centre of mass of the right half
 HALF_SCALE = math.sqrt(1 - 2 / math.pi)  # its standard deviation; 1 / 1.66
 
 
-def is_blurred(dominant_count: Ints, width: int, height: int, *, area_fraction: float) -> Bools:
+def is_blurred(dominant_count: Ints, width: int, height: int, *, area_fraction: float, least_area: int = 0) -> Bools:
     """Tell which Gaussians lead at too large a part of one view.
 
     Parameters
@@ -37,14 +32,15 @@ def is_blurred(dominant_count: Ints, width: int, height: int, *, area_fraction: 
     width, height : int
         Image size, pixels.
     area_fraction : float
-        Largest part of the image that is not blurred; 2e-4 in the paper. At least :data:`LEAST_BLURRED_AREA` is
-        allowed, however small the image.
+        Largest part of the image that is not blurred; 2e-4 in the paper.
+    least_area : int
+        Pixels that are never called blurred, however small the image.
 
     Returns
     -------
     mask : ndarray of shape (N,) of booleans
     """
-    return dominant_count > max(area_fraction * width * height, LEAST_BLURRED_AREA)
+    return dominant_count > max(area_fraction * width * height, least_area)
 
 
 def principal_axis_children(gaussians: Gaussians, parent_ids: Ints, rng: np.random.Generator) -> Gaussians:

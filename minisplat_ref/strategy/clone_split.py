@@ -127,9 +127,9 @@ def prune_faint(gaussians: Gaussians, *, least_opacity: float) -> Edit:
     return keep(gaussians, gaussians.opacity_logits >= logit(least_opacity))
 
 
-def prune_large(gaussians: Gaussians, *, size_limit: float) -> Edit:
-    """Remove what is larger than ``size_limit`` (world units) along any axis."""
-    return keep(gaussians, gaussians.log_scales.max(axis=1, initial=-np.inf) <= math.log(size_limit))
+def prune_large(gaussians: Gaussians, *, size_limit: float | Floats) -> Edit:
+    """Remove what is larger than ``size_limit`` (world units, for all or [N] for each) along any axis."""
+    return keep(gaussians, gaussians.log_scales.max(axis=1, initial=-np.inf) <= np.log(size_limit))
 
 
 def capped_opacity_logits(opacity_logits: Floats, *, ceiling: float) -> Floats:

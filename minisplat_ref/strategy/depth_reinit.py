@@ -152,11 +152,11 @@ def reinitial_points(
         Pixels of lower accumulated opacity are not drawn; 0 for the paper's rule.
     depth_tolerance : float or None
         Up to this relative difference between its depth and another view's, a point is on that view's surface. It is
-        confirmed if more of up to 8 other views have it on their surface than see through it. None for the paper's
-        rule, which does not ask. A view that no other one overlaps from another side has nobody to ask.
+        refuted if of up to 8 other views as many see through it as have it on their surface, or more. None for the
+        paper's rule, which does not ask. What no other view can judge is not refuted.
     backdrop_distance : float or None
-        A point that is not confirmed moves along its ray to this distance from the camera, world units: behind the
-        scene. None: it is not drawn.
+        A point that is refuted moves along its ray to this distance from the camera, world units: behind the scene.
+        None: it is not drawn.
     rng : numpy.random.Generator
         Draws the pixels.
     renderer : Renderer
@@ -193,8 +193,8 @@ def reinitial_points(
         view_points, weights = unprojected(depth_maps[i], cameras[i]).reshape(-1, 3), weight_maps[i].ravel()
         if depth_tolerance is not None:
             candidates = np.flatnonzero(weights)
-            is_confirmed = _confirmed(view_points[candidates], i, cameras, depth_maps, depth_tolerance)
-            unsure = candidates[~is_confirmed]
+            is_refuted = _refuted(view_points[candidates], i, cameras, depth_maps, depth_tolerance)
+            unsure = candidates[is_refuted]
             if backdrop_distance is None:
                 weights[unsure] = 0
             else:
@@ -234,25 +234,24 @@ def _on_rays(depths: Floats, alpha: Floats, camera: Camera, conventions: Convent
     return PixelPoints(np.where(depths[:, :, None] > 0, points, 0).astype(depths.dtype), depths, alpha)
 
 
-def _confirmed(
+def _refuted(
     points: Floats, own_id: int, cameras: Sequence[Camera], depth_maps: Sequence[Floats], tolerance: float
 ) -> Bools:
-    """Return which points [P, 3] of a view are on the surface of more of its partners than see through them.
+    """Return through which points [P, 3] of a view as many of its partners see as have them on their surface, or more.
 
-    A partner that sees something nearer in that place, or whose image does not contain the point, has no vote. Without
-    partners all points are confirmed: a single photograph, or a camera that only turned on its tripod.
+    A partner that sees something nearer in that place, or whose image does not contain the point, has no vote. What
+    none can judge is taken as it comes: a corner that one photograph shows, a single photograph, a camera that only
+    turned on its tripod.
     """
     partner_ids = _partners(points, own_id, cameras)
-    if len(partner_ids) == 0:
-        return np.ones(len(points), bool)
-    votes = np.zeros(len(points), np.int32)
+    n_agreeing, n_seeing_through = np.zeros((2, len(points)), np.int32)
     for j in partner_ids:
         z, pixels = _project(points, cameras[j])
         depths = np.where(pixels >= 0, depth_maps[j].ravel()[pixels], 0)  # [P], 0 where the partner sees nothing
         is_near = np.abs(depths - z) <= tolerance * z
-        votes += is_near
-        votes -= ~is_near & (depths > z)
-    return votes > 0
+        n_agreeing += is_near
+        n_seeing_through += ~is_near & (depths > z)
+    return (n_seeing_through > 0) & (n_seeing_through >= n_agreeing)
 
 
 def _partners(points: Floats, own_id: int, cameras: Sequence[Camera]) -> Ints:
