@@ -50,7 +50,7 @@ from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import render
 from minisplat_ref.strategy import clone_split
 from minisplat_ref.training.loop import _iterate, initial_state, train
-from minisplat_ref.training.schedule import Every
+from minisplat_ref.training.schedule import Every, scaled
 
 plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
 RED, BLUE, YELLOW, GREEN, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#8a8580"
@@ -110,9 +110,10 @@ def print_events(recipe):
     print(f"{recipe.name}, {recipe.iterations} iterations")
     for event in recipe.events:
         action = event.action if isinstance(event.action, partial) else partial(event.action)
-        numbers = ", ".join(f"{k} {v}" for k, v in event._asdict().items() if k != "action" and v not in (None, False))
+        steps = [step for step in range(1, recipe.iterations + 1) if event.is_due(step)]
+        dates = ", ".join(map(str, steps)) if len(steps) < 6 else f"{steps[0]}, {steps[1]}, ... {steps[-1]}"
         settings = ", ".join(f"{k} {v}" for k, v in action.keywords.items())
-        print(f"  {type(event).__name__:<7}{action.func.__name__:<24}{numbers:<56}{settings}")
+        print(f"  {type(event).__name__:<7}{action.func.__name__:<24}{dates or 'never':<24}{settings}")
 
 
 print_events(RECIPES["3dgs-accel"])
@@ -120,21 +121,21 @@ print_events(get_recipe("3dgs-accel", ITERATIONS))
 
 # %% [markdown]
 # An event needs gradients from most views, so `scaled` never lets Gaussians be added more often than every 100
-# iterations (`least_period`). In a run as short as ours that leaves a single event. With 24 views 40 iterations are
-# enough, and an opacity reset needs time to heal: we set the periods to 40 and 120. That is one line, because events
-# are tuples.
+# iterations (`least_gap`). In a run as short as ours that leaves a single event. With 24 views 40 iterations are
+# enough, and an opacity reset needs time to heal: we ask for gaps of 40 and 60. That is one line, because events are
+# tuples.
 
 # %%
-PERIODS = {"clone_and_split": 40, "prune_faint": 40, "prune_large": 40, "reset_opacity": 120}
+LEAST_GAPS = {"clone_and_split": 40, "prune_faint": 40, "prune_large": 40, "reset_opacity": 60}
 
 
 def retimed(event):
-    """Return the event with a period that suits a short run."""
-    return event._replace(period=PERIODS[event.action.func.__name__]) if isinstance(event, Every) else event
+    """Return the event with a gap that suits a short run."""
+    return event._replace(least_gap=LEAST_GAPS[event.action.func.__name__]) if isinstance(event, Every) else event
 
 
-recipe = get_recipe("3dgs-accel", ITERATIONS)
-recipe = recipe._replace(events=tuple(map(retimed, recipe.events)))
+recipe = RECIPES["3dgs-accel"]
+recipe = scaled(recipe._replace(events=tuple(map(retimed, recipe.events))), ITERATIONS)
 print_events(recipe)
 
 # %% [markdown]

@@ -136,9 +136,10 @@ for name, pull in pulls.items():
 show_code(is_blurred)
 
 # %% [markdown]
-# In our photographs of 128 x 96 pixels a fraction of $2 \cdot 10^{-4}$ is 2.5 pixels, less than anybody could use;
-# `LEAST_BLURRED_AREA` holds there. We take $\theta = 6 \cdot 10^{-3}$, 74 pixels. The threshold of the gradient is
-# raised to $10^{-3}$ for a like reason: in a small image every Gaussian covers a larger part, and gradients are larger.
+# In our photographs of 128 x 96 pixels a fraction of $2 \cdot 10^{-4}$ is 2.5 pixels, less than any Gaussian can be
+# made to cover; the recipes never call 64 pixels blurred (`least_area`). We take $\theta = 6 \cdot 10^{-3}$, 74
+# pixels. The threshold of the gradient is raised to $10^{-3}$ for a like reason: in a small image every Gaussian covers
+# a larger part, and gradients are larger.
 #
 # Now a room with 300 points, trained for 350 iterations with the density control of 3DGS alone:
 

@@ -53,20 +53,21 @@ from minisplat_ref.experiments.studies.depth_types import (
     depth_errors,
     drawn_points,
     errors,
-    train_from,
 )
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import render
 from minisplat_ref.strategy.depth_reinit import (
-    _confirmed,
+    _refuted,
     blended_points,
     centre_points,
     midpoint_points,
     reinitial_points,
 )
 from minisplat_ref.strategy.initialization import from_points
+from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import train
+from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Camera, Gaussians, view_from
 
 plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
@@ -195,12 +196,14 @@ show_code(reinitial_points)
 
 # %%
 PAPER = Choice(midpoint_points)
+POINTS_PER_PIXEL = 0.03
 
 
 def drawn(name, choice):
     """Draw points with a fixed generator: points [P, 3], the pixels [P] they are of, colours [P, 3] in 0 .. 1."""
     scene = truths[name].scene
-    points, pixels = drawn_points(trained[name], scene, choice, np.random.default_rng(0))
+    n_points = round(POINTS_PER_PIXEL * sum(view.camera.width * view.camera.height for view in scene.train_views))
+    points, pixels = drawn_points(trained[name], scene, choice, np.random.default_rng(0), n_points)
     return points, pixels, np.concatenate([v.image.reshape(-1, 3) for v in scene.train_views])[pixels] / 255
 
 
@@ -208,6 +211,12 @@ def plan(axes, points, colors, title, size=3):
     """Draw points from above."""
     axes.scatter(points[:, 0], points[:, 1], s=size, c=colors, linewidths=0)
     axes.set(title=title, aspect="equal", xlabel="x (m)")
+
+
+def train_from(gaussians, scene, iterations, rng):
+    """Train in place, without events and without view-dependent colour."""
+    recipe = get_recipe("3dgs-accel", iterations)._replace(events=(), sh_milestones=())
+    train(scene, recipe, seed=0, state=TrainState(gaussians, zero_moments(gaussians), 0, [], rng, {}))
 
 
 def scored(gaussians, name):
@@ -287,17 +296,17 @@ plt.show()
 # %% [markdown]
 # ## Guards
 #
-# Three, all off in the recipes, which follow the paper:
+# Three. The recipes have the second together with the third; the paper has none:
 #
 # - **a floor of the accumulated opacity** (`least_alpha`): rays that are nearly empty are not drawn. It costs nothing,
 #   and helps only while the sky is *not* yet painted;
-# - **a vote of the other views** (`depth_tolerance`): a point counts only if more of up to 8 other views have it on
-#   their own surface than see through it. A view that sees something nearer in that place has no vote;
-# - **a backdrop** (`backdrop_distance`): a point that is not confirmed goes behind the scene along its ray, so that
-#   something is left to paint the sky on.
+# - **a vote of the other views** (`depth_tolerance`): a point is refuted if of up to 8 other views at least as many see
+#   through it as have it on their own surface. A view that sees something nearer in that place has no vote;
+# - **a backdrop** (`backdrop_distance`): a refuted point goes behind the scene along its ray, so that something is left
+#   to paint the sky on.
 
 # %%
-show_code(_confirmed)
+show_code(_refuted)
 
 # %%
 GUARDED = {

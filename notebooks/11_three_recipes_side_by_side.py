@@ -67,10 +67,9 @@ def show(axes, image, title="", **style):
 # %% [markdown]
 # ## The recipes
 #
-# A recipe is data, and scales with the number of iterations. `least_period` keeps density control from coming so often
-# that the gradients of most views are not in, or that the last event has not healed. With 24 views half of it will do.
-# What is due *never* is left out of short runs: to begin anew, from depth (notebook 08) or from the centres alone
-# (notebook 09), takes time to learn everything again.
+# A recipe is data, and scales with the number of iterations: every published date is multiplied by the same factor.
+# `least_gap` keeps density control from coming so often that the gradients of most views are not in, or that the last
+# event has not healed; then only every second published date stays, or every third. With 24 views half of it will do.
 
 # %%
 ITERATIONS = 600
@@ -86,7 +85,7 @@ def named(action):
 
 def shortened(recipe):
     """Return the recipe for our few views and iterations."""
-    halved = [e._replace(least_period=e.least_period // 2) if isinstance(e, Every) else e for e in recipe.events]
+    halved = [e._replace(least_gap=-(-e.least_gap // 2)) if isinstance(e, Every) else e for e in recipe.events]
     return scaled(recipe._replace(events=tuple(halved)), ITERATIONS)
 
 

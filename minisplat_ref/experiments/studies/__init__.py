@@ -1,6 +1,7 @@
 """The studies of this package: smaller claims of the papers, measured. ``minisplat-ref study NAME --help``.
 
 ==========================  =====================================================================
+:data:`ABLATION`            :mod:`.ablation`: what each mechanism of Mini-Splatting is worth
 :data:`SPLIT`               :mod:`.split_forms`: which children blur split has, and whether any
 :data:`CULLING`             :mod:`.culling`: what visibility culling removes, saves and costs
 :data:`SIMPLIFY`            :mod:`.simplify`: sampling, rank and mass, and merging at equal counts
@@ -27,7 +28,7 @@ RECIPE_HELP = "name as in train --recipe"
 
 def all_studies() -> dict[str, Study]:
     """Return the studies of this package by the name that is typed; an extension's are EXTENSION/NAME."""
-    return {study.name: study for study in (SPLIT, CULLING, SIMPLIFY, DEPTH, EXPOSURE, POSE)}
+    return {study.name: study for study in (ABLATION, SPLIT, CULLING, SIMPLIFY, DEPTH, EXPOSURE, POSE)}
 
 
 def _run_of(module: str) -> Callable[[argparse.Namespace], None]:
@@ -62,6 +63,21 @@ def _add_seeds(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seeds", type=listed(integer(0)), default=(0, 1, 2), metavar="S,T", help="of the trainings (default 0,1,2)"
     )
+
+
+def _add_ablation_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Train a scene by a recipe, and by the recipe without each of its mechanisms. The\nsame command with the same "
+        "folder goes on where it was interrupted."
+    )
+    _add_scene_arguments(parser, iterations=6000)
+    parser.add_argument(
+        "--recipe", type=name, default="mini-splatting2", metavar="R", help=f"{RECIPE_HELP} (default %(default)s)"
+    )
+    parser.add_argument(
+        "--deviations", action="store_true", help="take back what deviates from the published method instead"
+    )
+    _add_seeds(parser)
 
 
 def _add_split_arguments(parser: argparse.ArgumentParser) -> None:
@@ -112,12 +128,13 @@ def _add_simplify_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _add_depth_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
-        "Reinitialise a synthetic scene from depth in several ways, compare with the\ntruth, and train on."
+        "Train a synthetic scene by a recipe that reinitialises from depth, which is done\n"
+        "in several ways, and compare with the truth."
     )
     parser.add_argument("scene", metavar="SCENE", help=f"a synthetic scene: {', '.join(SYNTHETIC_SCENES)}")
-    _add_folder_arguments(parser, 1500, "before reinitialisation")
+    _add_folder_arguments(parser, 3000, "of a training")
     parser.add_argument(
-        "--train-on", type=integer(1), default=500, metavar="M", help="iterations after it (default 500)"
+        "--recipe", type=name, default="mini-splatting", metavar="R", help=f"{RECIPE_HELP} (default %(default)s)"
     )
     _add_seeds(parser)
 
@@ -145,6 +162,12 @@ def _add_pose_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+ABLATION = Study(
+    name="ablation",
+    summary="Mini-Splatting without each of its mechanisms",
+    add_arguments=_add_ablation_arguments,
+    run=_run_of("ablation"),
+)
 SPLIT = Study(
     name="split",
     summary="blur split: random children, children on the longest axis, and none",

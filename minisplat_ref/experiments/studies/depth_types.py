@@ -1,8 +1,9 @@
 """Depth reinitialisation, the paper's comparison (Table 4): mid-point, centre or blended depth, and with our guards.
 
-A synthetic scene, whose true depths are known, is trained once for each seed. Then each choice draws the same number of
-points, and all begin anew from theirs and train for the same number of iterations, without any event. A seed decides
-the order of views and which pixels are drawn.
+A synthetic scene, whose true depths are known, is trained by the recipe itself, with all its events, once for each
+choice and seed; only what reinitialisation draws differs. Just before the first of them, up to which all choices of a
+seed are the same training, the points that it is about to draw are compared with the truth. How many of the points that
+were sent behind the scene are still there when simplification comes says whether density control leaves them alone.
 
 A point's error is its camera z against the true depth at its pixel, relative to the latter. A point of the sky has no
 true depth: it hangs in front of the sky if it is nearer than the depth within which most of the surfaces are.
@@ -29,8 +30,17 @@ from minisplat_ref.experiments.studies.front import (
     write,
 )
 from minisplat_ref.io.atomic import making_folder
-from minisplat_ref.methods import get_recipe
+from minisplat_ref.methods import RECIPES, get_recipe
+from minisplat_ref.methods.mini_splatting import (
+    BACKDROP_EXTENTS,
+    DEPTH_TOLERANCE,
+    reinitialise_from_depth,
+    restart_from_means,
+    simplify,
+    store_sh,
+)
 from minisplat_ref.metrics import evaluate
+from minisplat_ref.rendering import as_model
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.strategy.depth_reinit import (
     PixelPoints,
@@ -39,16 +49,12 @@ from minisplat_ref.strategy.depth_reinit import (
     midpoint_points,
     reinitial_points,
 )
-from minisplat_ref.strategy.initialization import from_points
-from minisplat_ref.training.adam import zero_moments
-from minisplat_ref.training.loop import train
-from minisplat_ref.training.state import TrainState
-from minisplat_ref.types import Bools, Floats, Gaussians, Scene
+from minisplat_ref.training.loop import StepReport, train
+from minisplat_ref.training.schedule import Recipe, configured
+from minisplat_ref.types import Bools, Floats, Model, Scene
 
-RECIPE = "3dgs-accel"
-POINTS_PER_PIXEL = 0.03  # twice the recipes' number, as nothing is added afterwards
-LEAST_ALPHA, DEPTH_TOLERANCE = 0.9, 0.05  # of the guards
-BACKDROP = 10.0  # distance of what is not confirmed, in extents of the scene
+LEAST_ALPHA = 0.9  # of the guard that asks for opacity
+FAR = 0.5 * BACKDROP_EXTENTS  # extents from the origin beyond which there is nothing but the backdrop
 OFF_SURFACE = 0.05  # relative error above which a point is not on its surface
 SKY_BEHIND = 0.95  # share of the surfaces that a point of the sky has to be behind
 
@@ -60,6 +66,16 @@ class Choice(NamedTuple):
     least_alpha: float = 0.0
     depth_tolerance: float | None = None
     has_backdrop: bool = False
+
+    def applied_to(self, recipe: Recipe) -> Recipe:
+        """Return the recipe with its reinitialisation drawing like this."""
+        return configured(
+            recipe,
+            points_of=self.points_of,
+            least_alpha=self.least_alpha,
+            depth_tolerance=self.depth_tolerance,
+            backdrop_extents=BACKDROP_EXTENTS if self.has_backdrop else None,
+        )
 
 
 CHOICES = {
@@ -78,101 +94,117 @@ MEASURES = {
     "off_surface": "off the surface",
     "in_front_of_sky": "in front of the sky",
     "n_points": "points",
+    "backdrop_left": "backdrop left",
     "psnr": "PSNR (dB)",
 }
+SHARES = ("median_error", "high_error", "off_surface", "in_front_of_sky")
 
 
 def run(args: argparse.Namespace) -> None:
-    """Train, reinitialise, measure, write, print the table.
+    """Train, measure, write, print the table.
 
     Raises
     ------
     InputError
-        There is no such scene, or the output folder cannot be used.
+        There is no such scene, the recipe does not reinitialise, or the output folder cannot be used.
     """
     if args.scene not in SCENE_NAMES:
         raise InputError(f"{args.scene}: true depths are known of {', '.join(SCENE_NAMES)} alone; give one of these")
+    recipe = get_recipe(args.recipe, args.iterations)
+    if not steps_of(recipe, reinitialise_from_depth):
+        names = ", ".join(name for name, other in RECIPES.items() if steps_of(other, reinitialise_from_depth))
+        raise InputError(f"recipe {args.recipe} does not reinitialise from depth: choose from {names}")
     with making_folder(args.out) as folder:
         truth = make_scene(args.scene)
-        runs = list(measure(truth, args.iterations, args.train_on, args.seeds))
+        runs = list(measure(truth, recipe, args.seeds))
         settings = {
-            "recipe": RECIPE,
+            "recipe": recipe.name,
             "iterations": args.iterations,
-            "train_on": args.train_on,
             "seeds": list(args.seeds),
             "least_alpha": LEAST_ALPHA,
             "depth_tolerance": DEPTH_TOLERANCE,
-            "backdrop": BACKDROP,
+            "backdrop_extents": BACKDROP_EXTENTS,
         }
         summary = summarise(runs)
         result = {**describe_scene(truth.scene), **settings, "summary": summary, "runs": runs}
         write(folder, result, draw(summary))
     print(title(result))
+    steps = " and ".join(map(str, steps_of(recipe, reinitialise_from_depth)))
     seeds = ", ".join(map(str, args.seeds))
-    print(f"{RECIPE}, {args.iterations} iterations, then {args.train_on} from the new points; seeds {seeds}\n")
+    print(f"{recipe.name}, {args.iterations} iterations, reinitialised at {steps}; seeds {seeds}\n")
     print(markdown_table(["points", *MEASURES.values()], to_rows(summary)))
 
 
-def measure(truth: SyntheticScene, iterations: int, train_on: int, seeds: tuple[int, ...]) -> Iterator[dict[str, Any]]:
-    """Train with every seed, and reinitialise in every way.
+def steps_of(recipe: Recipe, *actions: Callable[..., None]) -> list[int]:
+    """Return the iterations at which a recipe does one of the actions, settings aside."""
+    events = [event for event in recipe.events if getattr(event.action, "func", event.action) in actions]
+    return [step for step in range(1, recipe.iterations + 1) if any(event.is_due(step) for event in events)]
 
-    Parameters
-    ----------
-    truth : SyntheticScene
-    iterations : int
-        Before reinitialisation.
-    train_on : int
-        Iterations after it.
-    seeds : sequence of int
+
+def measure(truth: SyntheticScene, recipe: Recipe, seeds: tuple[int, ...]) -> Iterator[dict[str, Any]]:
+    """Train with every seed and every choice.
 
     Yields
     ------
     run : dict
-        The :data:`MEASURES`; ``psnr`` is that of the test views in the end, ``psnr_before`` that of the Gaussians
-        which gave way.
+        The :data:`MEASURES`, ``psnr`` of the test views in the end. ``backdrop_left`` is the part of the points sent
+        behind the scene that densification has left, None where none were sent.
     """
-    scene = truth.scene
-    with tqdm(total=len(seeds) * len(CHOICES), desc="reinitialisations", leave=False) as bar:
+    with tqdm(total=len(seeds) * len(CHOICES), desc="trainings", leave=False) as bar:
         for seed in seeds:
-            trained = train(scene, get_recipe(RECIPE, iterations), seed=seed).gaussians
-            before = evaluate(trained, scene.test_views, background=scene.background).psnr
             for name, choice in CHOICES.items():
-                rng = np.random.default_rng(seed)
-                points, pixels = drawn_points(trained, scene, choice, rng)
-                colors = np.concatenate([view.image.reshape(-1, 3) for view in scene.train_views])[pixels]
-                learned = train_from(from_points(points, colors, sh_degree=0), scene, train_on, rng)
-                psnr = evaluate(learned, scene.test_views, background=scene.background).psnr
-                yield {
-                    "choice": name,
-                    "seed": seed,
-                    "n_points": len(points),
-                    **errors(points, pixels, truth),
-                    "psnr_before": before,
-                    "psnr": psnr,
-                }
+                yield {"choice": name, "seed": seed, **measure_one(truth, recipe, choice, seed)}
                 bar.update()
 
 
+def measure_one(truth: SyntheticScene, recipe: Recipe, choice: Choice, seed: int) -> dict[str, float | None]:
+    """Train once; return the :data:`MEASURES`."""
+    scene = truth.scene
+    reinitialised = steps_of(recipe, reinitialise_from_depth)
+    densified = min(s for s in steps_of(recipe, simplify, store_sh, restart_from_means) if s > reinitialised[-1])
+    drawn: dict[str, float] = {}
+    counts: dict[int, int] = {}  # of what is far out, by iteration
+
+    def look(report: StepReport) -> None:
+        model = report.state.model
+        if report.step == reinitialised[0] - 1:
+            points, pixels = drawn_points(model, scene, choice, np.random.default_rng(seed))
+            drawn.update(n_points=len(points), **errors(points, pixels, truth))
+        if report.step in (reinitialised[-1], densified - 1):
+            counts[report.step] = n_far(model, scene)
+
+    model = train(scene, choice.applied_to(recipe), seed=seed, on_step=look).model
+    n_sent, n_left = counts[reinitialised[-1]], counts[densified - 1]
+    psnr = evaluate(model, scene.test_views, background=scene.background).psnr
+    return {**drawn, "backdrop_left": n_left / n_sent if n_sent else None, "psnr": psnr}
+
+
+def n_far(model: Model, scene: Scene) -> int:
+    """Return how many Gaussians are farther out than :data:`FAR` extents of the scene."""
+    return int(np.count_nonzero(np.linalg.norm(model.gaussians.means, axis=1) > FAR * scene.extent))
+
+
 def drawn_points(
-    gaussians: Gaussians, scene: Scene, choice: Choice, rng: np.random.Generator
+    model: Any, scene: Scene, choice: Choice, rng: np.random.Generator, n_points: int | None = None
 ) -> tuple[Floats, NDArray[np.int64]]:
     """Return points [P, 3] and the pixels [P] they are of, counted through all training views.
 
-    Points come with their pixels' colours. In photographs in which the colour is the number of the pixel, that tells
-    which pixel it is.
+    There are ``n_points`` at most, or as many as there are Gaussians. Points come with their pixels' colours. In
+    photographs in which the colour is the number of the pixel, that tells which pixel it is.
     """
+    model = as_model(model)
     shape = (len(scene.train_views), *scene.train_views[0].image.shape[:2])
     numbers = np.arange(np.prod(shape)).reshape(shape)
     coded = np.stack([numbers >> 16, numbers >> 8, numbers], axis=-1).astype(np.uint8)  # [V, H, W, 3], low bytes
     views = [view._replace(image=image) for view, image in zip(scene.train_views, coded, strict=True)]
     points, colors = reinitial_points(
-        gaussians,
+        model,
         views,
-        round(POINTS_PER_PIXEL * numbers.size),
+        len(model.gaussians.means) if n_points is None else n_points,
         points_of=choice.points_of,
         least_alpha=choice.least_alpha,
         depth_tolerance=choice.depth_tolerance,
-        backdrop_distance=BACKDROP * scene.extent if choice.has_backdrop else None,
+        backdrop_distance=BACKDROP_EXTENTS * scene.extent if choice.has_backdrop else None,
         rng=rng,
     )
     return points, colors.astype(np.int64) @ np.array([65536, 256, 1])
@@ -205,17 +237,14 @@ def errors(points: Floats, pixels: NDArray[np.int64], truth: SyntheticScene) -> 
     }
 
 
-def train_from(gaussians: Gaussians, scene: Scene, iterations: int, rng: np.random.Generator) -> Gaussians:
-    """Train without events and without view-dependent colour; ``gaussians`` are changed in place."""
-    recipe = get_recipe(RECIPE, iterations)._replace(events=(), sh_milestones=())
-    state = TrainState(gaussians, zero_moments(gaussians), step=0, view_order=[], rng=rng, stats={})
-    return train(scene, recipe, seed=0, state=state).gaussians
-
-
 def summarise(runs: list[dict[str, Any]]) -> dict[str, dict[str, tuple[float, float]]]:
     """Return mean and standard deviation over the seeds, for each choice and measure."""
     return {
-        choice: {name: mean_and_deviation([row[name] for row in runs if row["choice"] == choice]) for name in MEASURES}
+        choice: {
+            name: mean_and_deviation([row[name] for row in runs if row["choice"] == choice and row[name] is not None])
+            for name in MEASURES
+            if any(row[name] is not None for row in runs if row["choice"] == choice)
+        }
         for choice in CHOICES
     }
 
@@ -225,14 +254,15 @@ def to_rows(summary: dict[str, dict[str, tuple[float, float]]]) -> list[list[str
     rows = []
     for choice, row in summary.items():
         mean, deviation = row["psnr"]
-        shares = [f"{row[name][0]:.1%}" for name in MEASURES if name not in ("n_points", "psnr")]
-        rows.append([choice, *shares, f"{row['n_points'][0]:,.0f}", f"{mean:.2f} ± {deviation:.2f}"])
+        shares = [f"{row[name][0]:.1%}" for name in SHARES]
+        left = f"{row['backdrop_left'][0]:.1%}" if "backdrop_left" in row else ""
+        rows.append([choice, *shares, f"{row['n_points'][0]:,.0f}", left, f"{mean:.2f} ± {deviation:.2f}"])
     return rows
 
 
 def draw(summary: dict[str, dict[str, tuple[float, float]]]) -> Figure:
     """Draw mean and deviation of the errors, the shares and PSNR for each choice."""
-    names = [name for name in MEASURES if name != "n_points"]
+    names = [*SHARES, "psnr"]
     figure = Figure(figsize=(2.4 * len(names) + 1.6, 3.0), layout="constrained")
     for axes, name in zip(figure.subplots(1, len(names), sharey=True), names, strict=True):
         scale = 1.0 if name == "psnr" else 100.0

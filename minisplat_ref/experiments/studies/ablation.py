@@ -1,0 +1,269 @@
+"""What each mechanism of Mini-Splatting is worth: the recipe, and the recipe without one of them, seed by seed.
+
+A mechanism is taken out by a setting or by leaving out its event; everything else, the dates included, stays. Only what
+happens at this length is taken out: a row about a mechanism that never acts would say nothing, so there is none. The
+same can be asked of our own deviations from the published method (``docs/FIDELITY.md``).
+
+Trainings take long. Each leaves its record in ``runs.jsonl`` as soon as it ends, and the same command with the same
+folder goes on with those that are missing.
+"""
+
+import argparse
+import json
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+from tqdm import tqdm
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.experiments.studies.front import (
+    BLUE,
+    RED,
+    describe_scene,
+    mean_and_deviation,
+    read_scene,
+    tidy,
+    title,
+    write,
+)
+from minisplat_ref.methods import RECIPES, gaussian_splatting, get_recipe, mini_splatting, mini_splatting2
+from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
+from minisplat_ref.metrics import evaluate
+from minisplat_ref.reporting import markdown_table
+from minisplat_ref.strategy import simplify as simplification
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.schedule import Event, Every, Recipe, configured, scaled, settings_of
+from minisplat_ref.types import Scene
+
+RUNS = "runs.jsonl"
+FULL = "everything"
+MEASURES = ("psnr", "ssim", "n_gaussians", "seconds")
+
+
+def without_event(action: Callable[..., None]) -> Callable[[Recipe], Recipe]:
+    """Return what leaves out the events that do ``action``, settings aside."""
+
+    def changed(recipe: Recipe) -> Recipe:
+        events = recipe.events
+        return recipe._replace(events=tuple(e for e in events if getattr(e.action, "func", e.action) is not action))
+
+    return changed
+
+
+def without_gap(action: Callable[..., None]) -> Callable[[Recipe], Recipe]:
+    """Return what lets ``action`` come at all its published dates, however close compression brings them."""
+
+    def changed(event: Event) -> Event:
+        if isinstance(event, Every) and getattr(event.action, "func", event.action) is action:
+            return event._replace(least_gap=1)
+        return event
+
+    return lambda recipe: recipe._replace(events=tuple(map(changed, recipe.events)))
+
+
+def without_bias_correction(recipe: Recipe) -> Recipe:
+    """Return 3dgs-accel as in its own code; other recipes are published with the correction."""
+    is_accel = recipe.name == GS_ACCEL.name
+    return recipe._replace(adam=recipe.adam._replace(has_bias_correction=False)) if is_accel else recipe
+
+
+def with_settings(**settings: Any) -> Callable[[Recipe], Recipe]:
+    """Return what replaces settings of a recipe, and leaves one as it is that has not all of them."""
+    return lambda recipe: configured(recipe, **settings) if settings.keys() <= settings_of(recipe).keys() else recipe
+
+
+def as_3dgs_prunes(recipe: Recipe) -> Recipe:
+    """Return the recipe with the size limit of 3DGS, which is the same near and far."""
+
+    def changed(event: Event) -> Event:
+        if getattr(event.action, "func", None) is not mini_splatting.prune_large_by_distance:
+            return event
+        return event._replace(action=partial(gaussian_splatting.prune_large, size_fraction=0.1))
+
+    return recipe._replace(events=tuple(map(changed, recipe.events)))
+
+
+MECHANISMS: Mapping[str, Callable[[Recipe], Recipe]] = {
+    "blur split": without_event(mini_splatting.collect_blur),
+    "reinitialisation": without_event(mini_splatting.reinitialise_from_depth),
+    "sky guard": with_settings(depth_tolerance=None),
+    "intersection preservation": with_settings(is_intersecting=False),
+    "sampling": with_settings(choose=simplification.by_rank),  # the most important ones are kept instead
+    "restart": without_event(mini_splatting.restart_from_means),
+    "culling": with_settings(visibility_mass=1.0),  # whatever a view shows at all is visible in it
+    "clone": with_settings(factor=1),
+    "half-size warm-up": lambda recipe: recipe._replace(half_size_until=0),
+    "last prune": without_event(mini_splatting.prune_tail),
+}
+"""The published recipe without each mechanism; one that has not got it, unchanged."""
+
+DEVIATIONS: Mapping[str, Callable[[Recipe], Recipe]] = {
+    "least blurred area": with_settings(least_area=0),
+    "cap of the population": with_settings(most_per_pixel=math.inf),
+    "sky guard": with_settings(depth_tolerance=None),
+    "size limit by distance": as_3dgs_prunes,
+    "least size to halve": lambda recipe: recipe._replace(least_half_size=1) if recipe.half_size_until else recipe,
+    "raised rates": lambda recipe: recipe._replace(short_run_exponent=0.0),
+    "gap between clones": without_gap(mini_splatting2.aggressive_clone),
+    "Adam's bias correction": without_bias_correction,
+}
+"""A recipe with the published rule in place of each of ours."""
+
+ACTIONS: Mapping[str, Callable[..., None]] = {
+    "blur split": mini_splatting.collect_blur,
+    "reinitialisation": mini_splatting.reinitialise_from_depth,
+    "sky guard": mini_splatting.reinitialise_from_depth,
+    "intersection preservation": mini_splatting.simplify,
+    "sampling": mini_splatting.simplify,
+    "restart": mini_splatting.restart_from_means,
+    "culling": mini_splatting2.aggressive_clone,
+    "clone": mini_splatting2.aggressive_clone,
+    "last prune": mini_splatting.prune_tail,
+}
+"""The action through which a mechanism acts."""
+
+
+def run(args: argparse.Namespace) -> None:
+    """Train, measure, write, print the table.
+
+    Raises
+    ------
+    InputError
+        The scene, a recipe or the output folder cannot be used.
+    """
+    scene = read_scene(args.scene, args.downscale)
+    if not scene.test_views:
+        raise InputError(f"scene {scene.name} has no test views to compare by: add photographs")
+    published, without = get_recipe(args.recipe), DEVIATIONS if args.deviations else MECHANISMS
+    recipe = scaled(published, args.iterations)
+    variants = variants_of(published, args.iterations, without)
+    if len(variants) == 1:
+        names = [r.name for r in RECIPES.values() if len(variants_of(r, args.iterations, without)) > 1]
+        raise InputError(f"recipe {args.recipe} has nothing to take out: choose from {', '.join(names)}")
+    description = describe_scene(scene)
+    settings = {"recipe": recipe.name, "iterations": recipe.iterations, "downscale": args.downscale}
+    records = read_records(args.out, {**settings, "deviations": args.deviations, "scene": description["scene"]})
+    done = {(record["without"], record["seed"]) for record in records}
+    missing = [(name, seed) for seed in args.seeds for name in variants if (name, seed) not in done]
+    for name, seed in tqdm(missing, desc="trainings", leave=False):
+        record = {"without": name, "seed": seed, **measure(scene, variants[name], seed)}
+        append(args.out, record)
+        records.append(record)
+    records = [record for record in records if record["seed"] in args.seeds]
+    summary = summarise(records, list(variants))
+    acts = {name: n_actions(recipe, name) for name in variants if name in MECHANISMS}
+    result = {**description, **settings, "seeds": list(args.seeds), "acts": acts, "summary": summary, "runs": records}
+    write(args.out, result, draw(summary))
+    print(title(description))
+    print(f"{recipe.name}, {recipe.iterations} iterations, seeds {', '.join(map(str, args.seeds))}\n")
+    print(markdown_table(["without", "acts", "PSNR (dB)", "difference (dB)", "Gaussians", "seconds"], to_rows(result)))
+
+
+def variants_of(
+    published: Recipe, iterations: int, without: Mapping[str, Callable[[Recipe], Recipe]] = MECHANISMS
+) -> dict[str, Recipe]:
+    """Return the recipe of so many iterations, and without each thing that it has, if that acts in as many."""
+
+    def of_length(recipe: Recipe) -> Recipe:
+        return scaled(recipe, iterations)._replace(short_run_exponent=0.0)  # its work is done
+
+    full = of_length(published)
+    variants = {name: of_length(take_out(published)) for name, take_out in without.items()}
+    differ = {name: variant for name, variant in variants.items() if variant != full}
+    return {FULL: full, **{name: v for name, v in differ.items() if name not in MECHANISMS or n_actions(full, name)}}
+
+
+def n_actions(recipe: Recipe, mechanism: str) -> int:
+    """Return in how many iterations of the recipe a mechanism acts."""
+    if mechanism not in ACTIONS:
+        return recipe.half_size_until
+    events = [e for e in recipe.events if getattr(e.action, "func", e.action) is ACTIONS[mechanism]]
+    return sum(any(event.is_due(step) for event in events) for step in range(1, recipe.iterations + 1))
+
+
+def read_records(folder: Path, settings: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Make the folder, or return what it holds from an earlier call with the same settings.
+
+    Raises
+    ------
+    InputError
+        The folder is of other settings, or holds something else.
+    """
+    path = folder / RUNS
+    if not folder.exists():
+        folder.mkdir(parents=True)
+        path.write_text(json.dumps(settings) + "\n", encoding="utf-8")
+        return []
+    if not path.is_file():
+        raise InputError(f"{folder} exists and is not of this study: give another --out")
+    first, *lines = path.read_text(encoding="utf-8").splitlines()
+    if json.loads(first) != settings:
+        raise InputError(f"{folder} holds trainings of {first}: give another --out, or the same settings")
+    return [json.loads(line) for line in lines]
+
+
+def append(folder: Path, record: Mapping[str, Any]) -> None:
+    """Keep the record of a training that has ended."""
+    with open(folder / RUNS, "a", encoding="utf-8") as file:
+        file.write(json.dumps(record) + "\n")
+
+
+def measure(scene: Scene, recipe: Recipe, seed: int) -> dict[str, Any]:
+    """Train once and return the test views' measures; the seconds are those of the training alone."""
+    start = time.perf_counter()
+    state = train(scene, recipe, seed=seed)
+    seconds = time.perf_counter() - start
+    result = evaluate(state.model, scene.test_views, background=scene.background)
+    return dict(zip(MEASURES, (result.psnr, result.ssim, len(state.gaussians.means), seconds), strict=True))
+
+
+def summarise(
+    records: Sequence[Mapping[str, Any]], variants: Sequence[str]
+) -> dict[str, dict[str, tuple[float, float]]]:
+    """Return mean and deviation over the seeds, for each variant and measure.
+
+    ``difference`` is that of the PSNR from the full recipe's of the same seed: what seeds have in common is not in its
+    deviation.
+    """
+    full = {record["seed"]: record["psnr"] for record in records if record["without"] == FULL}
+    summary = {}
+    for variant in variants:
+        own = [record for record in records if record["without"] == variant]
+        summary[variant] = {name: mean_and_deviation([record[name] for record in own]) for name in MEASURES}
+        summary[variant]["difference"] = mean_and_deviation([r["psnr"] - full[r["seed"]] for r in own])
+    return summary
+
+
+def to_rows(result: Mapping[str, Any]) -> list[list[str]]:
+    """Return the lines of the table."""
+    rows = []
+    for variant, row in result["summary"].items():
+        difference = "" if variant == FULL else "{:+.2f} ± {:.2f}".format(*row["difference"])
+        acts = str(result["acts"].get(variant, ""))
+        psnr = "{:.2f} ± {:.2f}".format(*row["psnr"])
+        counts = (f"{row['n_gaussians'][0]:,.0f}", f"{row['seconds'][0]:.0f}")
+        rows.append([variant if variant == FULL else f"- {variant}", acts, psnr, difference, *counts])
+    return rows
+
+
+def draw(summary: Mapping[str, Mapping[str, tuple[float, float]]]) -> Figure:
+    """Draw for each variant the difference of the PSNR, and the number of Gaussians."""
+    figure = Figure(figsize=(10, 0.34 * len(summary) + 1.2), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    names = [name if name == FULL else f"without {name}" for name in summary]
+    for line, row in enumerate(summary.values()):
+        mean, deviation = row["difference"]
+        left.errorbar(mean, line, xerr=deviation, color=RED if mean < -deviation else BLUE, marker="o", capsize=4)
+        right.barh(line, row["n_gaussians"][0], color=BLUE, height=0.6)
+    left.axvline(0, color="black", linewidth=0.8)
+    left.set(xlabel="PSNR, difference from everything (dB)", yticks=range(len(names)), yticklabels=names)
+    right.set_xlabel("Gaussians")
+    left.invert_yaxis()
+    for axes in (left, right):
+        tidy(axes, grid="x")
+    return figure

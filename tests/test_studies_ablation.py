@@ -1,0 +1,102 @@
+"""The study of ablations: what each variant lacks, and a study that was interrupted."""
+
+import json
+
+import numpy as np
+import pytest
+
+from minisplat_ref.cli import main
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.experiments.studies import FIGURE, RESULT, ablation, front
+from minisplat_ref.experiments.studies.ablation import FULL, RUNS, variants_of
+from minisplat_ref.io.images import read_image
+from minisplat_ref.methods import RECIPES
+from minisplat_ref.training.schedule import configured, settings_of
+
+
+def names_of(recipe):
+    return [getattr(event.action, "func", event.action).__name__ for event in recipe.events]
+
+
+def test_each_variant_lacks_one_thing():
+    recipe = RECIPES["mini-splatting2"]
+    variants = variants_of(recipe, 18_000)
+    assert variants[FULL] == recipe._replace(short_run_exponent=0.0)
+    assert set(variants) == set(ablation.MECHANISMS) - {"restart"} | {FULL}
+    assert "collect_blur" in names_of(recipe) and "collect_blur" not in names_of(variants["blur split"])
+    assert "reinitialise_from_depth" not in names_of(variants["reinitialisation"])
+    assert settings_of(variants["culling"])["visibility_mass"] == 1.0 and settings_of(variants["clone"])["factor"] == 1
+    assert not settings_of(variants["intersection preservation"])["is_intersecting"]
+    assert (recipe.half_size_until, variants["half-size warm-up"].half_size_until) == (3_000, 0)
+    for name, variant in variants.items():
+        changed = [f for f in recipe._fields if getattr(variants[FULL], f) != getattr(variant, f)]
+        assert changed == {FULL: [], "half-size warm-up": ["half_size_until"]}.get(name, ["events"])
+    assert {"restart", "sampling"} < set(variants_of(RECIPES["mini-splatting"], 30_000))
+    assert "clone" not in variants_of(RECIPES["mini-splatting"], 30_000)
+
+
+def test_deviations_are_taken_back():
+    variants = variants_of(RECIPES["mini-splatting2"], 3_000, ablation.DEVIATIONS)
+    assert set(variants) == set(ablation.DEVIATIONS) - {"size limit by distance", "Adam's bias correction"} | {FULL}
+    assert settings_of(variants["cap of the population"])["most_per_pixel"] == np.inf
+    rates = [variants[name].learning_rates.of["sh_dc"] for name in ("raised rates", FULL)]
+    assert rates[0] == RECIPES["3dgs"].learning_rates.of["sh_dc"] < rates[1]
+    published = variants_of(RECIPES["mini-splatting"], 30_000, ablation.DEVIATIONS)
+    assert "raised rates" not in published and "prune_large" in names_of(published["size limit by distance"])
+    assert set(variants_of(RECIPES["3dgs-accel"], 3_000, ablation.DEVIATIONS)) == {FULL, "Adam's bias correction"}
+
+
+def test_what_never_acts_has_no_row():
+    """In 100 iterations Mini-Splatting2's clones, 50 iterations apart at least, have no room before simplification."""
+    assert "clone" not in variants_of(RECIPES["mini-splatting2"], 100)
+
+
+@pytest.fixture
+def small(monkeypatch):
+    scene = make_scene("room", n_views=8, width=48, height=36, supersampling=1, n_points=150)
+    monkeypatch.setattr(front, "make_scene", lambda name: scene)
+
+
+def test_study_and_its_continuation(tmp_path, capsys, small, monkeypatch):
+    kept = {name: ablation.MECHANISMS[name] for name in ("blur split", "sampling")}
+    monkeypatch.setattr(ablation, "MECHANISMS", kept)
+    out = tmp_path / "out"
+    command = ["study", "ablation", "room", "--out", str(out), "--iterations", "60", "--recipe", "mini-splatting"]
+    assert main([*command, "--seeds", "0,1"]) == 0
+    assert sorted(path.name for path in out.iterdir()) == sorted([FIGURE, RESULT, RUNS])
+    assert read_image(out / FIGURE).std() > 1
+    result = json.loads((out / RESULT).read_text())
+    assert len(result["runs"]) == 6 and result["acts"]["sampling"] == 1 and result["acts"]["blur split"] == 29
+    assert result["summary"][FULL]["difference"] == [0, 0]
+    by_run = {(run["without"], run["seed"]): run for run in result["runs"]}
+    differences = [by_run["sampling", seed]["psnr"] - by_run[FULL, seed]["psnr"] for seed in (0, 1)]
+    assert result["summary"]["sampling"]["difference"][0] == pytest.approx(sum(differences) / 2)
+
+    lines = (out / RUNS).read_text().splitlines()
+    (out / RUNS).write_text("\n".join(lines[:-2]) + "\n")  # as if it had been interrupted
+    trained = []
+    measure = ablation.measure
+    monkeypatch.setattr(ablation, "measure", lambda *a: trained.append(a[2]) or measure(*a))
+    capsys.readouterr()
+    assert main([*command, "--seeds", "0,1"]) == 0
+    assert trained == [1, 1] and "- sampling" in capsys.readouterr().out
+    again = json.loads((out / RESULT).read_text())["runs"]
+    assert [{**run, "seconds": 0} for run in again] == [{**run, "seconds": 0} for run in result["runs"]]
+
+    assert main([*command, "--seeds", "0", "--downscale", "1", "--iterations", "61"]) == 2
+    assert "holds trainings of" in capsys.readouterr().err
+
+
+def test_bad_input_is_one_line(tmp_path, capsys, small):
+    out = tmp_path / "out"
+    assert main(["study", "ablation", "room", "--out", str(out), "--recipe", "3dgs", "--iterations", "60"]) == 2
+    assert "recipe 3dgs has nothing to take out: choose from mini-splatting, " in capsys.readouterr().err
+    assert not out.exists()
+    out.mkdir()
+    assert main(["study", "ablation", "room", "--out", str(out), "--iterations", "60"]) == 2
+    assert "is not of this study" in capsys.readouterr().err
+
+
+def test_settings_that_a_recipe_lacks_change_nothing():
+    assert ablation.with_settings(factor=1)(RECIPES["3dgs"]) is RECIPES["3dgs"]
+    assert configured(RECIPES["mini-splatting2"], factor=1) != RECIPES["mini-splatting2"]
