@@ -133,7 +133,7 @@ def test_events_keep_their_order_and_gaps_at_every_length(name):
         steps = [round(step * factor) for step, _ in published]
         for (_, number), step in zip(published, steps, strict=True):
             event = events[number].scaled(factor)
-            assert step == 0 or getattr(event, "stride", 0) > 250 or event.is_due(step), (n, step)
+            assert event.is_due(step), (n, step)
         assert steps == sorted(steps), n
         gaps = np.diff(steps) - np.diff([step for step, _ in published]) * (n / recipe.iterations)
         assert np.abs(gaps).max() <= 1 + 1e-9, n
@@ -162,7 +162,7 @@ def test_the_last_density_event_is_as_far_from_simplification_as_published():
         recipe = get_recipe("mini-splatting2", n)
         fired = firings(recipe)
         gap = fired["simplify"][0] - fired["aggressive_clone"][-1]
-        assert gap == pytest.approx(max(250 * n / 18_000, 83 if n == 3_000 else 0), abs=1)
+        assert gap == pytest.approx(250 * n / 18_000, abs=1)
 
 
 def test_what_must_not_come_too_early_is_left_out():
@@ -222,7 +222,7 @@ def test_what_tells_the_two_recipes_apart():
     dense, accelerated = RECIPES["3dgs"], RECIPES["3dgs-accel"]
     assert (dense.learning_rates.of["opacity_logits"], accelerated.learning_rates.of["opacity_logits"]) == (0.05, 0.025)
     assert not dense.adam.is_visible_only and dense.adam.has_bias_correction
-    assert accelerated.adam.is_visible_only and accelerated.adam.has_bias_correction
+    assert accelerated.adam.is_visible_only and not accelerated.adam.has_bias_correction
     assert dense.adam.eps == accelerated.adam.eps == 1e-15
     assert dense.events == accelerated.events
 

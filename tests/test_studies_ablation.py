@@ -37,13 +37,13 @@ def test_each_variant_lacks_one_thing():
 
 def test_deviations_are_taken_back():
     variants = variants_of(RECIPES["mini-splatting2"], 3_000, ablation.DEVIATIONS)
-    assert set(variants) == set(ablation.DEVIATIONS) - {"size limit by distance", "Adam's bias correction"} | {FULL}
+    assert set(variants) == set(ablation.DEVIATIONS) - {"size limit by distance", "no bias correction"} | {FULL}
     assert settings_of(variants["cap of the population"])["most_per_pixel"] == np.inf
     rates = [variants[name].learning_rates.of["sh_dc"] for name in ("raised rates", FULL)]
     assert rates[0] == RECIPES["3dgs"].learning_rates.of["sh_dc"] < rates[1]
     published = variants_of(RECIPES["mini-splatting"], 30_000, ablation.DEVIATIONS)
     assert "raised rates" not in published and "prune_large" in names_of(published["size limit by distance"])
-    assert set(variants_of(RECIPES["3dgs-accel"], 3_000, ablation.DEVIATIONS)) == {FULL, "Adam's bias correction"}
+    assert set(variants_of(RECIPES["3dgs-accel"], 3_000, ablation.DEVIATIONS)) == {FULL, "no bias correction"}
 
 
 def test_what_never_acts_has_no_row():

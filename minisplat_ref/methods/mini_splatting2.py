@@ -88,7 +88,6 @@ def stop_culling(state: TrainState, iteration: Iteration) -> None:
 
 KEEP_FRACTION = 0.6  # of the Gaussians that dominate some pixel
 MOST_PER_PIXEL = 0.1
-CLONE_LEAST_GAP = 50  # copies start in one place and need some steps to part
 _LEAST_VIEWS = 2  # what only one view sees is as likely a floater as a surface
 _cloning = partial(
     aggressive_clone,
@@ -125,7 +124,7 @@ _DENSIFICATION = (
     _densifying(_densify),
     _densifying(partial(prune_faint, least_opacity=0.005)),
     At(2_000, _reinitialise),
-    Every(250, _cloning, start=499, stop=3_000, skip=2_000, least_gap=CLONE_LEAST_GAP),
+    Every(250, _cloning, start=499, stop=3_000, skip=2_000),
 )
 
 MINI_SPLATTING2 = GS._replace(
