@@ -107,6 +107,7 @@ def test_train_leaves_a_complete_folder(run_folder, scene_folder):
         "budget": None,
         "scene_type": None,
         "eval_every": 0,
+        "lpips_weights": None,
     }
     assert config["recipe"]["iterations"] == ITERATIONS and config["versions"]["numba"]
 
