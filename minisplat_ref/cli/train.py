@@ -29,6 +29,7 @@ DEFAULTS = {
     "set": {},
     "eval_every": 0,
     "lpips_weights": None,
+    "init": None,
     "seed": 0,
     "profile": GSPLAT_MAIN.name,
     "backend": "cpu",
@@ -83,6 +84,7 @@ def add_parser(commands: Commands) -> None:
         help="3dgs-accel, which is the default, 3dgs, mini-splatting, mini-splatting2, mini-splatting-d or"
         " mini-splatting2-d",
     )
+    training.add_argument("--init", type=Path, metavar="PLY", help="points to start from (default: the scene's)")
     training.add_argument("--iterations", type=integer(1), metavar="N", help="one view each (default 3000)")
     training.add_argument(
         "--budget", type=integer(1), metavar="N", help="Gaussians that simplification keeps (default: a part)"
@@ -132,7 +134,8 @@ def _start(given: dict[str, Any]) -> int:
         raise InputError("give a SCENE to train on, or --resume DIR to continue a run")
     options = {name: given.get(name, default) for name, default in DEFAULTS.items()}
     options["set"] = dict(options["set"])  # of equal names the last
-    options["lpips_weights"] = _absolute(options["lpips_weights"])
+    for name in ("lpips_weights", "init"):
+        options[name] = _absolute(options[name])
     scene_path = Path(given["scene"])
     scene_folder = scene_path.parent if scene_path.is_file() else scene_path
     folder: Path = given.get("out", Path("runs") / f"{scene_folder.resolve().name}-{options['recipe']}")
@@ -140,6 +143,7 @@ def _start(given: dict[str, Any]) -> int:
     from minisplat_ref.experiments import curve, run_folder
     from minisplat_ref.experiments.first_use import compile_kernels
     from minisplat_ref.experiments.settings import Settings, load_lpips, load_photographs, recipe_of
+    from minisplat_ref.experiments.start import load_start
     from minisplat_ref.training.loop import initial_state
 
     run_folder.check_free(folder)
@@ -149,7 +153,12 @@ def _start(given: dict[str, Any]) -> int:
     if settings.eval_every:
         curve.check_views(scene)
     network = load_lpips(settings, scene)
-    state = initial_state(scene, recipe, settings.seed)
+    start, notices = (scene, []) if settings.init is None else load_start(settings.init, scene)
+    state = initial_state(start, recipe, settings.seed)
+    for notice in notices:
+        print(f"minisplat-ref: {notice}", file=sys.stderr)
+    if settings.init is not None:
+        print(f"starts from {len(start.points):,} points of {settings.init}")
     compile_kernels(settings.backend)
     run_folder.create(folder)
     try:

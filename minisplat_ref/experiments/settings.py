@@ -61,6 +61,8 @@ class Settings(NamedTuple):
     """Iterations after which the test views are measured again; 0: only in the end. Does not change the result."""
     lpips_weights: str | None = None
     """Absolute path of the weights of LPIPS; None: it is not measured. Does not change the result."""
+    init: str | None = None
+    """Absolute path of the PLY whose points the training starts from, not read again; None for the scene's points."""
 
 
 def recipe_of(settings: Settings) -> Recipe:

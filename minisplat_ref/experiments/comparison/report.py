@@ -93,6 +93,7 @@ def _settings(plan: Plan, scene: Scene, results: Results) -> list[tuple[str, str
         ("Iterations", ", ".join(f"{recipe} {iterations:,}" for recipe, iterations in lengths)),
         ("Seeds", ", ".join(map(str, plan.seeds))),
         *((name.replace("_", " ").capitalize(), str(value)) for name, value in plan.options.items()),
+        *([] if plan.init is None else [("Starts from", str(plan.init.resolve()))]),
         ("Machine", f"{results.machine}, {os.cpu_count()} cores"),
         ("Program", f"minisplat_ref {__version__}"),
         ("Files", f"{plan.folder.resolve()}: a folder per run, compare.json, the figures as PNG"),

@@ -78,7 +78,7 @@ def to_json(plan: Plan, scene: Scene, results: Results) -> dict[str, Any]:
             **plan._asdict(),
             "scene": str(plan.scene.resolve()),
             "folder": str(plan.folder.resolve()),
-            "lpips_weights": None if plan.lpips_weights is None else str(plan.lpips_weights.resolve()),
+            **{name: None if file is None else str(file.resolve()) for name, file in plan.files.items()},
             "eval_every": [eval_every(iterations) for iterations in plan.iterations],
         },
         "scene": {
