@@ -165,6 +165,15 @@ def test_resumed_and_measured_without_the_file(scene_folder, dense, tmp_path, ca
     assert "leave out --init" in capfd.readouterr().err
 
 
+def test_the_scene_s_own_points_give_the_same_bytes(scene_folder, tmp_path):
+    scene = load_scene(scene_folder)
+    cloud = write_cloud(tmp_path / "own.ply", scene.points, scene.point_colors)
+    assert train(scene_folder, tmp_path / "own", "--iterations", "6", "--init", str(cloud)) == 0
+    assert train(scene_folder, tmp_path / "plain", "--iterations", "6") == 0
+    contents = [(tmp_path / name / "point_cloud.ply").read_bytes() for name in ("own", "plain")]
+    assert contents[0] == contents[1]
+
+
 def test_losses_on_sparse_points_keep_the_scene_s_own(scene_folder, tmp_path):
     """Views know rows of the scene's 60 points, which the cloud of ten does not have."""
     cloud = write_cloud(tmp_path / "few.ply", load_scene(scene_folder).points[:10])
