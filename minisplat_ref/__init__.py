@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from minisplat_ref.errors import InputError
     from minisplat_ref.gsplat_compat import rasterization, rasterization_vjp
     from minisplat_ref.io import load_scene
-    from minisplat_ref.io.ply import load_ply, save_ply
+    from minisplat_ref.io.ply import load_ply, load_points, save_ply
     from minisplat_ref.rendering import render, render_vjp
     from minisplat_ref.types import Camera, Gaussians, RenderOutput, Scene, View
 
@@ -25,7 +25,7 @@ _MODULES = {
     "minisplat_ref.constants": ("GSPLAT_1_5", "GSPLAT_MAIN", "INRIA", "MINI_SPLATTING2", "PROFILES", "Conventions"),
     "minisplat_ref.errors": ("InputError",),
     "minisplat_ref.io": ("load_scene",),
-    "minisplat_ref.io.ply": ("load_ply", "save_ply"),
+    "minisplat_ref.io.ply": ("load_ply", "load_points", "save_ply"),
     "minisplat_ref.gsplat_compat": ("rasterization", "rasterization_vjp"),
     "minisplat_ref.rendering": ("render", "render_vjp"),
     "minisplat_ref.types": ("Camera", "Gaussians", "RenderOutput", "Scene", "View"),
@@ -50,6 +50,7 @@ __all__ = [
     "View",
     "get_backend",
     "load_ply",
+    "load_points",
     "load_scene",
     "rasterization",
     "rasterization_vjp",

@@ -1,10 +1,10 @@
-"""How close renderings are to photographs: PSNR, SSIM, and the evaluation of a set of views.
+"""How close renderings are to photographs: PSNR, SSIM, LPIPS, and the evaluation of a set of views.
 
 Renderings are clipped to [0, 1] but not rounded to 8 bits, which would add 1.3e-6 to the mean squared error: 0.006 dB
 at 30 dB. PSNR is that of the mean squared error over all pixels and channels of an image; the released 3DGS script
 averages a PSNR per channel instead, which is never lower. Means over views are means of the views' values.
 
-Left out: LPIPS, whose network weights are not ours to ship; an :class:`Evaluation` says so.
+LPIPS needs the weights of a network, which are not ours to ship: without them an :class:`Evaluation` says so.
 """
 
 import math
@@ -16,10 +16,15 @@ import numpy as np
 from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
+from minisplat_ref.lpips import HOW_TO_MAKE, Network, check_views, lpips
 from minisplat_ref.rendering import SPLATTING, Renderer, Request, as_model
 from minisplat_ref.types import Bools, Floats, Ints, View
 
-LPIPS_UNAVAILABLE = (None, "LPIPS needs the weights of a trained network, which are not part of minisplat_ref")
+NO_WEIGHTS = (
+    "it needs the weights of a trained network, which are not part of minisplat_ref: give --lpips-weights vgg.npz, a"
+    f" file that this makes: {HOW_TO_MAKE}"
+)
+NO_VIEWS = "there are no views to evaluate"
 
 
 class ViewMetrics(NamedTuple):
@@ -29,6 +34,8 @@ class ViewMetrics(NamedTuple):
     psnr: float
     """dB."""
     ssim: float
+    lpips: float | None = None
+    """None when it was not measured."""
 
 
 class Evaluation(NamedTuple):
@@ -39,10 +46,12 @@ class Evaluation(NamedTuple):
     ssim: float | None
     """Mean of the views; None without views."""
     lpips: float | None
-    """None when it was not measured."""
+    """Mean of the views; None when it was not measured."""
     lpips_reason: str | None
     """Why it was not measured."""
     per_view: list[ViewMetrics]
+    lpips_network: str | None = None
+    """VGG16 or AlexNet, whose distances cannot be compared with each other; None when LPIPS was not measured."""
 
 
 def psnr(image: Floats, target: Floats, mask: Bools | None = None) -> float:
@@ -93,6 +102,7 @@ def evaluate(
     *,
     background: Floats,
     on_view: Callable[[View, Floats, ViewMetrics], None] | None = None,
+    network: Network | None = None,
     renderer: Renderer = SPLATTING,
     backend: Backend = CPU,
     conventions: Conventions = GSPLAT_MAIN,
@@ -108,11 +118,20 @@ def evaluate(
         ``scene.background``.
     on_view : callable, optional
         Called after each view with the view, its rendering [H, W, 3] clipped to [0, 1], and its metrics.
+    network : Network, optional
+        Of :func:`minisplat_ref.lpips.load_network`; without it LPIPS is not measured.
     renderer : Renderer
         How the model is drawn.
     backend : Backend
     conventions : Conventions
+
+    Raises
+    ------
+    InputError
+        A view is too small for the network; nothing has been rendered then.
     """
+    if network is not None:
+        check_views(network, views)
     per_view = []
     request = Request(background, conventions=conventions, backend=backend)
     for view in views:
@@ -122,15 +141,19 @@ def evaluate(
             view.name,
             psnr(image, view.image.astype(image.dtype) / 255, view.mask),
             ssim(image, view.image, view.mask, backend=backend),
+            None if network is None else lpips(image, view.image, network, view.mask),
         )
         per_view.append(metrics)
         if on_view is not None:
             on_view(view, image, metrics)
     if not per_view:
-        return Evaluation(None, None, None, "there are no views to evaluate", per_view)
+        return Evaluation(None, None, None, NO_VIEWS, per_view)
+    distances = [view.lpips for view in per_view if view.lpips is not None]
     return Evaluation(
         float(np.mean([view.psnr for view in per_view])),
         float(np.mean([view.ssim for view in per_view])),
-        *LPIPS_UNAVAILABLE,
+        float(np.mean(distances)) if distances else None,
+        None if distances else NO_WEIGHTS,
         per_view,
+        None if network is None else network.backbone.name,
     )

@@ -107,6 +107,8 @@ def test_train_leaves_a_complete_folder(run_folder, scene_folder):
         "budget": None,
         "scene_type": None,
         "eval_every": 0,
+        "lpips_weights": None,
+        "init": None,
     }
     assert config["recipe"]["iterations"] == ITERATIONS and config["versions"]["numba"]
 

@@ -5,7 +5,7 @@ import pytest
 from tolerances import SPLAT_BYTE, SPLAT_SCALE
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.io.ply import load_ply, read_point_cloud, read_vertices, save_ply, write_vertices
+from minisplat_ref.io.ply import COLORS, load_ply, load_points, read_vertices, save_ply, write_vertices
 from minisplat_ref.types import Gaussians
 
 N_REST = (0, 3, 8, 15)
@@ -177,19 +177,142 @@ def test_real_file_agrees_with_its_splat(shared_data):
 # Point clouds
 
 
-def test_point_cloud(tmp_path, rng):
-    points = rng.normal(size=(6, 3)).astype(np.float32)
-    colors = rng.integers(0, 256, (6, 3), dtype=np.uint8)
-    columns = dict(zip("xyz", points.T, strict=True)) | dict(zip(("red", "green", "blue"), colors.T, strict=True))
+def cloud_columns(points, colors):
+    return dict(zip("xyz", points.T, strict=True)) | dict(zip(COLORS, colors.T, strict=True))
+
+
+@pytest.fixture
+def cloud(rng):
+    return rng.normal(size=(6, 3)).astype(np.float32), rng.integers(0, 256, (6, 3), dtype=np.uint8)
+
+
+def test_point_cloud(tmp_path, cloud):
+    points, colors = cloud
+    columns = cloud_columns(points, colors)
     write_vertices(tmp_path / "p.ply", columns)
-    read_points, read_colors = read_point_cloud(tmp_path / "p.ply")
-    assert read_points.dtype == np.float64
-    np.testing.assert_array_equal(read_points, points)
-    np.testing.assert_array_equal(read_colors, colors)
-    write_vertices(tmp_path / "f.ply", columns | {c: columns[c] / np.float32(255) for c in ("red", "green", "blue")})
-    np.testing.assert_array_equal(read_point_cloud(tmp_path / "f.ply")[1], colors)
-    write_vertices(tmp_path / "n.ply", dict(zip("xyz", points.T, strict=True)))
-    assert (read_point_cloud(tmp_path / "n.ply")[1] == 128).all()
+    read = load_points(tmp_path / "p.ply")
+    assert read.points.dtype == np.float64 and read.colors.dtype == np.uint8
+    np.testing.assert_array_equal(read.points, points)
+    np.testing.assert_array_equal(read.colors, colors)
+    assert (read.has_colors, read.n_dropped) == (True, 0)
+    for dtype in (np.float32, np.float64):
+        write_vertices(tmp_path / "f.ply", columns | {c: columns[c] / dtype(255) for c in COLORS})
+        np.testing.assert_array_equal(load_points(tmp_path / "f.ply").colors, colors)
+    write_vertices(tmp_path / "i.ply", columns | {c: columns[c].astype(np.int32) for c in COLORS})
+    np.testing.assert_array_equal(load_points(tmp_path / "i.ply").colors, colors)
+
+
+def test_point_cloud_without_colors(tmp_path, cloud):
+    """Two of three channels are no colour either."""
+    columns = cloud_columns(*cloud)
+    for missing in (COLORS, ("green",)):
+        write_vertices(tmp_path / "a.ply", {name: c for name, c in columns.items() if name not in missing})
+        read = load_points(tmp_path / "a.ply")
+        assert not read.has_colors and (read.colors == 128).all() and read.colors.shape == (6, 3)
+
+
+def test_points_that_are_not_finite_are_left_out(tmp_path, rng):
+    """Of coordinates and colours, and what would be infinite in float32; other properties do not matter."""
+    columns = {name: rng.random(7) for name in (*"xyz", *COLORS, "quality")}
+    columns["x"][1], columns["z"][2], columns["blue"][4], columns["y"][5] = np.nan, -np.inf, np.nan, 1e39
+    columns["quality"][:] = np.nan
+    write_vertices(tmp_path / "a.ply", columns)
+    read = load_points(tmp_path / "a.ply")
+    assert read.n_dropped == 4
+    np.testing.assert_array_equal(read.points, np.stack([columns[name][[0, 3, 6]] for name in "xyz"], axis=1))
+    expected = np.stack([np.rint(255 * columns[name][[0, 3, 6]]) for name in COLORS], axis=1)
+    np.testing.assert_array_equal(read.colors, expected)
+
+
+@pytest.mark.parametrize(
+    ("column", "message"),
+    [
+        (
+            np.array([0.5, 1.01]),
+            "green is 1.01; colours are integers from 0 to 255 or floats .*: export them as floats",
+        ),
+        (np.array([0.5, -0.1]), "green is -0.1;"),
+        (np.array([0, 256], np.uint16), "green is 256; .*: export them as uchar"),
+        (np.array([0, -1], np.int32), "green is -1;"),
+    ],
+)
+def test_colors_out_of_range(tmp_path, column, message):
+    columns = {name: np.zeros(2) for name in "xyz"} | {name: np.zeros(2, np.uint8) for name in COLORS}
+    write_vertices(tmp_path / "a.ply", columns | {"green": column})
+    with pytest.raises(InputError, match=rf"a\.ply: {message}"):
+        load_points(tmp_path / "a.ply")
+
+
+def test_no_coordinates(tmp_path):
+    write_vertices(tmp_path / "a.ply", {"x": np.zeros(2), "y": np.zeros(2)})
+    with pytest.raises(InputError, match=r"a\.ply: not a point cloud, it has no property z"):
+        load_points(tmp_path / "a.ply")
+
+
+EDGES = [(0, 1), (5, 2), (3, 3)]
+FACES = [[0, 1, 2], [], [2, 3, 4, 5]]
+
+
+def write_mesh(path, points, colors, encoding):
+    """A mesh as few write it: edges and faces before the vertices, lists among the properties of each vertex."""
+    header = ["ply", f"format {encoding} 1.0", "element edge 3", "property int vertex1", "property int vertex2"]
+    header += ["element face 3", "property uchar flag", "property list uchar uint vertex_indices"]
+    header += [f"element vertex {len(points)}", "property list ushort short seen", "property uchar blue"]
+    header += ["property double z", "property float nx", "property float x", "property list int8 double weights"]
+    header += ["property uchar green", "property float y", "property uchar red", "element end 1", "property float rest"]
+    records = [[("i4", end) for end in edge] for edge in EDGES]
+    records += [[("u1", 7), ("u1", len(face)), *(("u4", i) for i in face)] for face in FACES]
+    for i, ((x, y, z), (red, green, blue)) in enumerate(zip(points, colors, strict=True)):
+        seen = [("u2", i), *(("i2", -k) for k in range(i))]
+        weights = [("i1", 1), ("f8", 0.5)] if i % 2 else [("i1", 0)]
+        scalars = [("u1", blue), ("f8", z), ("f4", 0.0), ("f4", x)]
+        records.append([*seen, *scalars, *weights, ("u1", green), ("f4", y), ("u1", red)])
+    records.append([("f4", 1.0)])
+    order = ">" if encoding == "binary_big_endian" else "<"
+    if encoding == "ascii":
+        body = "".join(
+            " ".join(str(np.asarray(value).item()) for _, value in record) + "\n" for record in records
+        ).encode()
+    else:
+        body = b"".join(np.array(value, order + code).tobytes() for record in records for code, value in record)
+    path.write_bytes("\n".join([*header, "end_header\n"]).encode() + body)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_any_elements_in_any_order(tmp_path, cloud, encoding):
+    write_mesh(tmp_path / "a.ply", *cloud, encoding)
+    read = load_points(tmp_path / "a.ply")
+    np.testing.assert_array_equal(read.points, cloud[0])
+    np.testing.assert_array_equal(read.colors, cloud[1])
+    assert list(read_vertices(tmp_path / "a.ply")) == ["blue", "z", "nx", "x", "green", "y", "red"]
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
+def test_truncated_anywhere(tmp_path, cloud, encoding):
+    """Among the faces, in a list of a vertex, in a number."""
+    write_mesh(tmp_path / "a.ply", *cloud, encoding)
+    content = (tmp_path / "a.ply").read_bytes()
+    start = content.index(b"end_header\n") + len(b"end_header\n")
+    for end in range(start, len(content) - 5, 7):
+        (tmp_path / "a.ply").write_bytes(content[:end])
+        with pytest.raises(InputError, match=r"a\.ply: (truncated|row \d is)"):
+            load_points(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize(
+    ("header", "body", "message"),
+    [
+        ("ascii 1.0|element vertex 1|property list char int i|property int x", b"-1 5", "row 0 is '-1 5'"),
+        ("ascii 1.0|element vertex 1|property list char int i|property int x", b"1 5 7 9", "row 0 is '1 5 7 9'"),
+        ("ascii 1.0|element vertex 1|property int x|property list char int i", b"7 2 5", "row 0 is '7 2 5'"),
+        ("binary_little_endian 1.0|element vertex 1|property list char int i|property int x", b"\xff", "has -1 values"),
+        ("ascii 1.0|element vertex 1|property list float int i|property int x", b"", "cannot read the header line"),
+    ],
+)
+def test_bad_lists(tmp_path, header, body, message):
+    (tmp_path / "a.ply").write_bytes(f"ply|format {header}|end_header|".replace("|", "\n").encode() + body)
+    with pytest.raises(InputError, match=message):
+        read_vertices(tmp_path / "a.ply")
 
 
 def test_every_scalar_type(tmp_path):
@@ -264,14 +387,17 @@ def test_missing_properties(tmp_path, rng, drop, message):
         ("ply|format ascii 1.0|element vertex 1|property float x|", "header has no end_header"),
         ("ply|format ascii 2.0 1.0|end_header|", "cannot read the header line 'format ascii 2.0 1.0'"),
         ("ply|format ascii 1.0|element vertex -1|end_header|", "cannot read the header line 'element vertex -1'"),
-        ("ply|format ascii 1.0|element vertex 1|property list uchar int i|end_header|", "'property list uchar int i'"),
+        (
+            "ply|format ascii 1.0|element vertex 1|property list uchar int i|end_header|",
+            "lacks its format, vertices or",
+        ),
         ("ply|format ascii 1.0|element vertex 1|property half x|end_header|", "'property half x'"),
         ("ply|format ascii 1.0|element face 1|property int i|end_header|", "lacks its format, vertices or properties"),
         ("ply|element vertex 1|property int i|end_header|", "lacks its format, vertices or properties"),
         ("ply|format ascii 1.0|element vertex 1|property int i|property int i|end_header|1 2|", "or repeats one"),
         (
             "ply|format binary_big_endian 1.0|element a 1|property int i|element vertex 1|property int i|end_header|",
-            "elements stand before the vertices",
+            "truncated, 1 vertices of 4 bytes need 4 bytes but there are 0",
         ),
         ("ply|format ascii 1.0|element vertex 1|property uchar i|end_header|300|", "row 0 is '300', not 1 numbers"),
     ],

@@ -93,6 +93,15 @@ def test_blender_points(tmp_path, rng):
     np.testing.assert_array_equal(load_transforms(tmp_path).points, [[1, 2, 3]])
 
 
+def test_points_that_are_not_finite(tmp_path):
+    write_transforms(tmp_path, name="transforms_train.json", camera_angle_x=0.7)
+    write_vertices(tmp_path / "points3d.ply", {name: np.array([np.nan, 2.0, 3.0]) for name in "xyz"})
+    with pytest.warns(UserWarning, match=r"points3d\.ply: 1 of 3 points are not finite and left out"):
+        scene = load_transforms(tmp_path)
+    np.testing.assert_array_equal(scene.points, [[2, 2, 2], [3, 3, 3]])
+    assert (scene.point_colors == 128).all()
+
+
 def test_real_blender_scene(shared_data):
     scene = load_scene(shared_data / "banana_blender", background=(1, 1, 1))
     assert (len(scene.train_views), len(scene.test_views)) == (12, 3)

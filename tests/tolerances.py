@@ -116,3 +116,7 @@ BENCH_ROOM_FOR_EXPONENTIAL = 0.5
 # The least quotient of two densities on a grid of spacing 0.025 against the true one, relative: half the curvature, 3
 # at most, times the squared distance to the nearest node, 3e-4; and their integral over 4.5 standard deviations, 1e-5.
 DENSITY_GRID = 1e-3
+
+# LPIPS in float32, relative: 1e-7 of each of up to 13 layers' sums of thousands of products, which add up as a random
+# walk does, and twice that for the square of a difference of unit vectors that is not small.
+LPIPS_FLOAT32 = 1e-5

@@ -57,6 +57,8 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--test-every", type=integer(0), default=8, metavar="K", help="hold out every K-th for testing (default 8)"
     )
+    parser.add_argument("--init", type=Path, metavar="PLY", help="as for train: points to start from")
+    parser.add_argument("--lpips-weights", type=Path, metavar="NPZ", help="as for train, which measures LPIPS by it")
     parser.set_defaults(run=run)
 
 
@@ -77,6 +79,8 @@ def run(args: argparse.Namespace) -> int:
         budget=args.budget,
         simplify=args.simplify,
         scene_type=args.scene_type,
+        lpips_weights=args.lpips_weights,
+        init=args.init,
     )
     scene = check(plan)
     warm_up(plan, scene)

@@ -11,6 +11,7 @@ from minisplat_ref.experiments.arguments import Commands, HelpFormatter, add_ren
 
 if TYPE_CHECKING:
     from minisplat_ref.experiments.settings import Settings
+    from minisplat_ref.lpips import Network
     from minisplat_ref.training.loop import TrainState
     from minisplat_ref.training.schedule import Recipe
     from minisplat_ref.types import Scene
@@ -27,17 +28,18 @@ DEFAULTS = {
     "extension": None,
     "set": {},
     "eval_every": 0,
+    "lpips_weights": None,
+    "init": None,
     "seed": 0,
     "profile": GSPLAT_MAIN.name,
     "backend": "cpu",
 }
+RESUMABLE = ("iterations", "lpips_weights")  # what may be new when a run is continued
 
 DESCRIPTION = """\
 Train Gaussians on photographs with cameras. DIR will hold point_cloud.ply,
-metrics.json, renders/ (truth | render | error of each test view), config.json,
-log.jsonl, cameras.json and checkpoint.npz. Ctrl-C saves what there is; --resume
-continues with the run's own settings, --iterations then says where to stop, and
-all schedules stay as they were.
+metrics.json and renders/ (truth | render | error of each test view). --resume
+goes on after Ctrl-C, or with more --iterations on the schedules as they were.
 """
 EPILOG = """\
 examples:
@@ -79,11 +81,13 @@ def add_parser(commands: Commands) -> None:
     training.add_argument(
         "--recipe",
         metavar="R",
-        help="3dgs, 3dgs-accel (default), mini-splatting, mini-splatting2, mini-splatting-d or mini-splatting2-d",
+        help="3dgs-accel, which is the default, 3dgs, mini-splatting, mini-splatting2, mini-splatting-d or"
+        " mini-splatting2-d",
     )
+    training.add_argument("--init", type=Path, metavar="PLY", help="points to start from (default: the scene's)")
     training.add_argument("--iterations", type=integer(1), metavar="N", help="one view each (default 3000)")
     training.add_argument(
-        "--budget", type=integer(1), metavar="N", help="Gaussians that simplification keeps (default: a fixed part)"
+        "--budget", type=integer(1), metavar="N", help="Gaussians that simplification keeps (default: a part)"
     )
     training.add_argument(
         "--simplify",
@@ -109,7 +113,10 @@ def add_parser(commands: Commands) -> None:
         "--eval-every",
         type=integer(0),
         metavar="K",
-        help="measure test views each K-th, into curve.jsonl (default 0)",
+        help="measure every K iterations, into curve.jsonl (default 0)",
+    )
+    training.add_argument(
+        "--lpips-weights", type=Path, metavar="NPZ", help="measure LPIPS in the end; eval --help tells how"
     )
     training.add_argument("--seed", type=integer(0), metavar="S", help="of all random draws (default 0)")
     add_renderer_arguments(training, argparse.SUPPRESS)
@@ -127,13 +134,16 @@ def _start(given: dict[str, Any]) -> int:
         raise InputError("give a SCENE to train on, or --resume DIR to continue a run")
     options = {name: given.get(name, default) for name, default in DEFAULTS.items()}
     options["set"] = dict(options["set"])  # of equal names the last
+    for name in ("lpips_weights", "init"):
+        options[name] = _absolute(options[name])
     scene_path = Path(given["scene"])
     scene_folder = scene_path.parent if scene_path.is_file() else scene_path
     folder: Path = given.get("out", Path("runs") / f"{scene_folder.resolve().name}-{options['recipe']}")
 
     from minisplat_ref.experiments import curve, run_folder
     from minisplat_ref.experiments.first_use import compile_kernels
-    from minisplat_ref.experiments.settings import Settings, load_photographs, recipe_of
+    from minisplat_ref.experiments.settings import Settings, load_lpips, load_photographs, recipe_of
+    from minisplat_ref.experiments.start import load_start
     from minisplat_ref.training.loop import initial_state
 
     run_folder.check_free(folder)
@@ -142,18 +152,24 @@ def _start(given: dict[str, Any]) -> int:
     scene = load_photographs(settings)
     if settings.eval_every:
         curve.check_views(scene)
-    state = initial_state(scene, recipe, settings.seed)
+    network = load_lpips(settings, scene)
+    start, notices = (scene, []) if settings.init is None else load_start(settings.init, scene)
+    state = initial_state(start, recipe, settings.seed)
+    for notice in notices:
+        print(f"minisplat-ref: {notice}", file=sys.stderr)
+    if settings.init is not None:
+        print(f"starts from {len(start.points):,} points of {settings.init}")
     compile_kernels(settings.backend)
     run_folder.create(folder)
     try:
-        return _train(folder, scene, settings, recipe, state)
+        return _train(folder, scene, settings, recipe, state, network)
     except InputError:  # a budget, for one, can only be found too large when there is something to choose from
         run_folder.remove(folder)
         raise
 
 
 def _resume(folder: Path, given: dict[str, Any]) -> int:
-    surplus = [name for name in ("scene", "out", *DEFAULTS) if name in given and name != "iterations"]
+    surplus = [name for name in ("scene", "out", *DEFAULTS) if name in given and name not in RESUMABLE]
     if surplus:
         raise InputError(
             f"--resume takes the run's own settings: leave out {', '.join(_option(name) for name in surplus)}"
@@ -165,6 +181,8 @@ def _resume(folder: Path, given: dict[str, Any]) -> int:
 
     ours = settings.load(folder)
     ours = ours._replace(iterations=given.get("iterations", ours.iterations))
+    if "lpips_weights" in given:
+        ours = ours._replace(lpips_weights=_absolute(given["lpips_weights"]))
     recipe = settings.recipe_of(ours)
     state = load_state(folder / run_folder.CHECKPOINT, recipe)
     if state.step >= ours.iterations:
@@ -172,11 +190,19 @@ def _resume(folder: Path, given: dict[str, Any]) -> int:
             f"{folder} has done {state.step} iterations: give --iterations above {state.step} to train further"
         )
     scene = settings.load_photographs(ours)
+    network = settings.load_lpips(ours, scene)
     compile_kernels(ours.backend)
-    return _train(folder, scene, ours, recipe, state)
+    return _train(folder, scene, ours, recipe, state, network)
 
 
-def _train(folder: Path, scene: "Scene", settings: "Settings", recipe: "Recipe", state: "TrainState") -> int:
+def _train(
+    folder: Path,
+    scene: "Scene",
+    settings: "Settings",
+    recipe: "Recipe",
+    state: "TrainState",
+    network: "Network | None",
+) -> int:
     from minisplat_ref.experiments.run import run_training
     from minisplat_ref.experiments.scoring import summary
 
@@ -185,7 +211,7 @@ def _train(folder: Path, scene: "Scene", settings: "Settings", recipe: "Recipe",
         f"{scene.name}: {len(scene.train_views)} training and {len(scene.test_views)} test views of"
         f" {size.width} x {size.height}, {len(scene.points):,} points"
     )
-    outcome = run_training(folder, scene, settings, recipe, state)
+    outcome = run_training(folder, scene, settings, recipe, state, network)
     if not outcome.is_complete:
         print(
             f"minisplat-ref: stopped after {state.step} of {settings.iterations} iterations, all saved;"
@@ -198,6 +224,11 @@ def _train(folder: Path, scene: "Scene", settings: "Settings", recipe: "Recipe",
     )
     print(f"results in {folder}: point_cloud.ply, metrics.json, renders/")
     return 0
+
+
+def _absolute(path: Path | None) -> str | None:
+    """Return a path as the settings of a run keep it: they are read from other folders, too."""
+    return None if path is None else str(path.resolve())
 
 
 def _option(name: str) -> str:

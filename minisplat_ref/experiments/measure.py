@@ -23,13 +23,18 @@ from minisplat_ref.training.loop import train
 WARM_UP = 20  # iterations that compile and are not timed
 
 
-def measure_scenes(scenes: list[Path], out: Path, recipe: str, iterations: int) -> None:
+def measure_scenes(
+    scenes: list[Path], out: Path, recipe: str, iterations: int, lpips_weights: Path | None = None
+) -> None:
     """Train each scene through the command line into ``out/NAME`` and print a table of their ``metrics.json``."""
     rows = []
+    options = ["--recipe", recipe, "--iterations", str(iterations)]
+    if lpips_weights is not None:
+        options += ["--lpips-weights", str(lpips_weights)]
     for scene in scenes:
         folder = out / scene.name
         command = [sys.executable, "-m", "minisplat_ref", "train", str(scene), "--out", str(folder)]
-        subprocess.run([*command, "--recipe", recipe, "--iterations", str(iterations)], check=True)
+        subprocess.run([*command, *options], check=True)
         metrics = json.loads((folder / "metrics.json").read_text())
         rate = metrics["iterations"] / metrics["train_seconds"]
         rows.append(
@@ -37,6 +42,7 @@ def measure_scenes(scenes: list[Path], out: Path, recipe: str, iterations: int) 
                 scene.name,
                 f"{metrics['psnr']:.2f}",
                 f"{metrics['ssim']:.3f}",
+                *([] if lpips_weights is None else [f"{metrics['lpips']:.3f}"]),
                 f"{metrics['n_gaussians']:,}",
                 f"{metrics['train_seconds']:.0f}",
                 f"{rate:.1f}",
@@ -44,7 +50,8 @@ def measure_scenes(scenes: list[Path], out: Path, recipe: str, iterations: int) 
             ]
         )
     print(f"\n{recipe}, {iterations} iterations, seed 0, full size; {describe_machine()}\n")
-    heading = ("scene", "PSNR (dB)", "SSIM", "Gaussians", "seconds", "iterations/s", "peak memory (MB)")
+    lpips = () if lpips_weights is None else ("LPIPS",)
+    heading = ("scene", "PSNR (dB)", "SSIM", *lpips, "Gaussians", "seconds", "iterations/s", "peak memory (MB)")
     print(markdown_table(heading, rows))
 
 
@@ -73,6 +80,7 @@ def main() -> None:
     scenes.add_argument("--out", type=Path, required=True, help="new folder for the runs")
     scenes.add_argument("--recipe", default="3dgs-accel")
     scenes.add_argument("--iterations", type=int, default=3_000)
+    scenes.add_argument("--lpips-weights", type=Path, help="measure LPIPS, too: see minisplat-ref eval --help")
     rate = commands.add_parser("rate", help="training iterations per second at a constant number of Gaussians")
     rate.add_argument("scene", type=Path)
     rate.add_argument("--gaussians", type=int, default=10_000)
@@ -81,4 +89,4 @@ def main() -> None:
     if arguments.command == "rate":
         measure_rate(arguments.scene, arguments.gaussians, arguments.iterations)
     else:
-        measure_scenes(arguments.scene, arguments.out, arguments.recipe, arguments.iterations)
+        measure_scenes(arguments.scene, arguments.out, arguments.recipe, arguments.iterations, arguments.lpips_weights)

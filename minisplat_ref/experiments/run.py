@@ -13,6 +13,7 @@ from minisplat_ref.experiments.progress import Progress
 from minisplat_ref.experiments.scoring import measure, score, to_metrics
 from minisplat_ref.experiments.settings import Settings, save_model, to_config
 from minisplat_ref.io import viewpoints
+from minisplat_ref.lpips import Network
 from minisplat_ref.metrics import Evaluation
 from minisplat_ref.training.loop import StepReport, save_state, train
 from minisplat_ref.training.schedule import Recipe
@@ -33,7 +34,14 @@ class Outcome(NamedTuple):
     """False when Ctrl-C ended it; everything has been saved then, too."""
 
 
-def run_training(folder: Path, scene: Scene, settings: Settings, recipe: Recipe, state: TrainState) -> Outcome:
+def run_training(
+    folder: Path,
+    scene: Scene,
+    settings: Settings,
+    recipe: Recipe,
+    state: TrainState,
+    network: Network | None = None,
+) -> Outcome:
     """Train, save and measure.
 
     Parameters
@@ -48,6 +56,8 @@ def run_training(folder: Path, scene: Scene, settings: Settings, recipe: Recipe,
         The recipe of the settings, scaled to ``settings.schedule_iterations``.
     state : TrainState
         Where to start; changed in place.
+    network : Network, optional
+        Of the settings, to measure LPIPS with: read before the training, so that nothing can be wrong with it after.
 
     Returns
     -------
@@ -82,7 +92,8 @@ def run_training(folder: Path, scene: Scene, settings: Settings, recipe: Recipe,
         seconds = progress.seconds
     save_state(folder / run_folder.CHECKPOINT, state, recipe)
     save_model(folder, settings, state.model)
-    evaluation = score(folder, scene, state.model, settings)
+    peak_mb = peak_rss_mb()  # before the network of LPIPS takes more than the training did
+    evaluation = score(folder, scene, state.model, settings, network)
     n_gaussians = len(state.gaussians.means)
     if settings.eval_every:
         curve.append(folder / run_folder.CURVE, state.step, seconds, evaluation, n_gaussians)
@@ -90,7 +101,7 @@ def run_training(folder: Path, scene: Scene, settings: Settings, recipe: Recipe,
         "n_gaussians": n_gaussians,
         "iterations": state.step,
         "train_seconds": seconds,
-        "peak_rss_mb": peak_rss_mb(),
+        "peak_rss_mb": peak_mb,
         **to_metrics(evaluation),
     }
     run_folder.write_json(folder / run_folder.METRICS, metrics)

@@ -11,6 +11,7 @@ from minisplat_ref.experiments.pictures import error_picture, side_by_side, to_p
 from minisplat_ref.experiments.run_folder import RENDERS
 from minisplat_ref.experiments.settings import Settings, load, load_background, load_model, recipe_of
 from minisplat_ref.io import write_image
+from minisplat_ref.lpips import Network
 from minisplat_ref.metrics import Evaluation, ViewMetrics, evaluate
 from minisplat_ref.rendering import Renderer, Request
 from minisplat_ref.types import Floats, Model, RenderOutput, Scene, View
@@ -52,6 +53,7 @@ def measure(
     model: Model,
     settings: Settings,
     on_view: Callable[[View, Floats, ViewMetrics], None] | None = None,
+    network: Network | None = None,
 ) -> Evaluation:
     """Evaluate the test views with renderer, profile and backend of a run: :func:`minisplat_ref.metrics.evaluate`."""
     return evaluate(
@@ -59,13 +61,14 @@ def measure(
         scene.test_views,
         background=scene.background,
         on_view=on_view,
+        network=network,
         renderer=recipe_of(settings).renderer,
         backend=get_backend(settings.backend),
         conventions=PROFILES[settings.profile],
     )
 
 
-def score(folder: Path, scene: Scene, model: Model, settings: Settings) -> Evaluation:
+def score(folder: Path, scene: Scene, model: Model, settings: Settings, network: Network | None = None) -> Evaluation:
     """Evaluate the test views and write ``renders/NAME.png``: truth, render and error side by side.
 
     Parameters
@@ -78,6 +81,8 @@ def score(folder: Path, scene: Scene, model: Model, settings: Settings) -> Evalu
         What was trained.
     settings : Settings
         Of the run: renderer, profile and backend.
+    network : Network, optional
+        For LPIPS, see :func:`minisplat_ref.experiments.settings.load_lpips`.
 
     Returns
     -------
@@ -90,7 +95,7 @@ def score(folder: Path, scene: Scene, model: Model, settings: Settings) -> Evalu
         render = to_picture(image)
         write_image(renders / f"{view.name}.png", side_by_side([view.image, render, error_picture(view.image, render)]))
 
-    return measure(scene, model, settings, on_view=save)
+    return measure(scene, model, settings, on_view=save, network=network)
 
 
 def to_metrics(evaluation: Evaluation) -> dict[str, Any]:
@@ -110,6 +115,8 @@ def summary(evaluation: Evaluation) -> str:
     if evaluation.psnr is None or evaluation.ssim is None:
         return "no test views to measure"
     n_views = len(evaluation.per_view)
+    lpips = "" if evaluation.lpips is None else f", LPIPS {evaluation.lpips:.4f} by {evaluation.lpips_network}"
     return (
-        f"PSNR {evaluation.psnr:.2f} dB, SSIM {evaluation.ssim:.4f} (mean of {n_views} test view{'s'[: n_views > 1]})"
+        f"PSNR {evaluation.psnr:.2f} dB, SSIM {evaluation.ssim:.4f}{lpips}"
+        f" (mean of {n_views} test view{'s'[: n_views > 1]})"
     )

@@ -14,6 +14,7 @@ from minisplat_ref.experiments.run_folder import CONFIG, POINT_CLOUD, SHARED, re
 from minisplat_ref.extensions.extension import CORE, find_recipe, owner_of
 from minisplat_ref.io import load_scene
 from minisplat_ref.io.atomic import replacing
+from minisplat_ref.lpips import Network, check_views, load_network
 from minisplat_ref.strategy import importance, simplify
 from minisplat_ref.training.schedule import Recipe, configured, describe, parsed_settings
 from minisplat_ref.types import Floats, Model, Scene
@@ -58,6 +59,10 @@ class Settings(NamedTuple):
     """Settings of the recipe's events, losses and calibrations, as text: ``--set NAME=VALUE``."""
     eval_every: int = 0
     """Iterations after which the test views are measured again; 0: only in the end. Does not change the result."""
+    lpips_weights: str | None = None
+    """Absolute path of the weights of LPIPS; None: it is not measured. Does not change the result."""
+    init: str | None = None
+    """Absolute path of the PLY whose points the training starts from, not read again; None for the scene's points."""
 
 
 def recipe_of(settings: Settings) -> Recipe:
@@ -172,3 +177,18 @@ def load_photographs(settings: Settings) -> Scene:
         test_every=settings.test_every,
         undistort=settings.undistort,
     )
+
+
+def load_lpips(settings: Settings, scene: Scene) -> Network | None:
+    """Read the network that a run's LPIPS is measured with, None where it has none, and see that it fits the views.
+
+    Raises
+    ------
+    InputError
+        The file is missing or not what it should be, or a test view is too small for the network.
+    """
+    if settings.lpips_weights is None:
+        return None
+    network = load_network(settings.lpips_weights)
+    check_views(network, scene.test_views)
+    return network

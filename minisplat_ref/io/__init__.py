@@ -6,11 +6,20 @@ from pathlib import Path
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.colmap import MODEL_FOLDERS, find_model, load_colmap
 from minisplat_ref.io.images import read_image, write_image
-from minisplat_ref.io.ply import load_ply, save_ply
+from minisplat_ref.io.ply import load_ply, load_points, save_ply
 from minisplat_ref.io.transforms import BLENDER_FILES, SINGLE_FILE, find_transforms, load_transforms
 from minisplat_ref.types import Floats, Scene
 
-__all__ = ["load_colmap", "load_ply", "load_scene", "load_transforms", "read_image", "save_ply", "write_image"]
+__all__ = [
+    "load_colmap",
+    "load_ply",
+    "load_points",
+    "load_scene",
+    "load_transforms",
+    "read_image",
+    "save_ply",
+    "write_image",
+]
 
 
 def load_scene(

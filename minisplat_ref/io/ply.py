@@ -1,25 +1,25 @@
-"""PLY files: trained Gaussians in the 3DGS layout, and the vertices of any point cloud.
+"""PLY files: trained Gaussians in the 3DGS layout, and point clouds.
 
 The 3DGS layout holds one vertex per Gaussian: ``x y z``, normals (unused, zero), ``f_dc_0..2``, ``f_rest_*``,
 ``opacity``, ``scale_0..2``, ``rot_0..3``, all before their activations. The higher spherical harmonics are
 channel-major: all red coefficients, then all green, then all blue, whereas :class:`Gaussians` keeps RGB last. Rotations
 are wxyz, the frame is COLMAP's (x right, y down, z forward).
 
-Files are read by property name, so order, normals and extra properties do not matter; ASCII, little- and big-endian,
-any scalar type. Left out: faces and other elements, lists, compressed variants.
+Files are read by property name, so order, normals and extra properties do not matter; :mod:`.ply_file` reads the bytes.
+Left out: compressed variants.
 """
 
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from minisplat_ref.constants import SH_DEGREE_MAX
 from minisplat_ref.errors import InputError
-from minisplat_ref.io.atomic import replacing
+from minisplat_ref.io.ply_file import property_names, read_vertices, write_vertices
 from minisplat_ref.types import Floats, Gaussians
 from minisplat_ref.validation import check_quats
 
@@ -29,20 +29,7 @@ SH_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALES = ("scale_0", "scale_1", "scale_2")
 QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 COLORS = ("red", "green", "blue")
-
-SCALAR_TYPES = {
-    **{name: "i1" for name in ("char", "int8")},
-    **{name: "u1" for name in ("uchar", "uint8")},
-    **{name: "i2" for name in ("short", "int16")},
-    **{name: "u2" for name in ("ushort", "uint16")},
-    **{name: "i4" for name in ("int", "int32")},
-    **{name: "u4" for name in ("uint", "uint32")},
-    **{name: "f4" for name in ("float", "float32")},
-    **{name: "f8" for name in ("double", "float64")},
-}
-BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 GRAY = 128  # colour of a point cloud that has none
-HEADER_LINE_MAX = 4096  # bytes; no header line is longer, and a file without line breaks must not be read whole
 
 
 def load_ply(path: str | Path, population: Any = Gaussians) -> Any:
@@ -118,14 +105,8 @@ def further_properties(path: str | Path) -> tuple[str, ...]:
     InputError
         If the file cannot be opened or its header is malformed.
     """
-    path = Path(path)
-    try:
-        with path.open("rb") as file:
-            *_, dtype = _read_header(file, path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be opened ({error.strerror})") from None
     usual = {*MEANS, *NORMALS, *SH_DC, "opacity", *SCALES, *QUATS}
-    return tuple(name for name in dtype.names or () if name not in usual and not name.startswith("f_rest_"))
+    return tuple(name for name in property_names(path) if name not in usual and not name.startswith("f_rest_"))
 
 
 def save_ply(path: str | Path, gaussians: Any) -> None:
@@ -174,71 +155,78 @@ def _further_properties(name: str, field: NDArray) -> tuple[tuple[str, ...], NDA
     raise TypeError(f"field {name} has {field.ndim} axes, a PLY holds two: give the extension save and load of its own")
 
 
-def read_point_cloud(path: str | Path) -> tuple[Floats, NDArray[np.uint8]]:
-    """Read the points of a PLY, with their colours.
+class PointCloud(NamedTuple):
+    """Points with colours."""
+
+    points: Floats
+    """[P, 3] float64, the file's frame and unit."""
+    colors: NDArray[np.uint8]
+    """[P, 3] RGB."""
+    has_colors: bool
+    """Whether the colours are the file's; they are middle gray if it has none."""
+    n_dropped: int
+    """Points of the file that were left out because a coordinate or colour is not finite, or beyond float32."""
+
+    @property
+    def dropped(self) -> str:
+        """Half a sentence on the points that were left out, empty if there are none."""
+        n = len(self.points) + self.n_dropped
+        return f"{self.n_dropped:,} of {n:,} points are not finite" if self.n_dropped else ""
+
+
+NO_POINTS = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), False, 0)
+
+
+def load_points(path: str | Path) -> PointCloud:
+    """Read the points of any PLY, with their colours.
+
+    To train from them, they take the place of the scene's own points at the start, in the scene's world frame::
+
+        start = scene._replace(points=cloud.points, point_colors=cloud.colors)
+        train(scene, recipe, seed=0, state=initial_state(start, recipe, seed=0))
+
+    Parameters
+    ----------
+    path : str or Path
+        The file, with the properties ``x``, ``y``, ``z`` and, for colours, ``red``, ``green``, ``blue``: integers from
+        0 to 255 or floats from 0 to 1. All else in it is passed over.
 
     Returns
     -------
-    points : ndarray of shape (P, 3)
-        float64, the file's frame and unit.
-    colors : ndarray of shape (P, 3)
-        uint8; floating colours of the file count as [0, 1]; middle gray if it has none.
+    PointCloud
+        P may be 0.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, has no coordinates, or its colours are out of range.
     """
     columns = read_vertices(path)
     missing = [name for name in MEANS if name not in columns]
     if missing:
         raise InputError(f"{path}: not a point cloud, it has no property {', '.join(missing)}")
-    check_finite(path, {name: columns[name] for name in (*MEANS, *COLORS) if name in columns})
-    points = np.stack([columns[name].astype(np.float64) for name in MEANS], axis=1)  # [P, 3]
-    if not all(name in columns for name in COLORS):
-        return points, np.full(points.shape, GRAY, np.uint8)
-    colors = np.stack([columns[name] for name in COLORS], axis=1)  # [P, 3]
-    if colors.dtype.kind == "f":
-        colors = np.rint(colors * 255.0)
-    return points, colors.clip(0, 255).astype(np.uint8)
+    has_colors = all(name in columns for name in COLORS)
+    used = np.stack([columns[name] for name in (*MEANS, *COLORS[: 3 * has_colors])], axis=1, dtype=np.float64)
+    with np.errstate(over="ignore"):
+        is_finite = np.isfinite(used.astype(np.float32)).all(axis=1)  # [P]
+    used = used[is_finite]  # [P, 3 or 6]
+    points = np.ascontiguousarray(used[:, :3])
+    colors = _as_bytes(path, columns, used[:, 3:]) if has_colors else np.full(points.shape, GRAY, np.uint8)
+    return PointCloud(points, colors, has_colors, int(np.count_nonzero(~is_finite)))
 
 
-def read_vertices(path: str | Path) -> dict[str, NDArray]:
-    """Read every property of the vertices of a PLY file.
-
-    Returns
-    -------
-    dict of ndarray of shape (P,)
-        One column per property, in the file's order and scalar type, native byte order.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, malformed or ends before its last declared vertex.
-    """
-    path = Path(path)
-    try:
-        file = path.open("rb")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be opened ({error.strerror})") from None
-    with file:
-        encoding, n_skipped, n, dtype = _read_header(file, path)
-        if encoding == "ascii":
-            rows = _read_ascii(file, path, n_skipped, n, dtype)
-        else:
-            rows = _read_binary(file, path, n, dtype)
-    return {name: rows[name].astype(rows[name].dtype.newbyteorder("=")) for name in rows.dtype.names or ()}
-
-
-def write_vertices(path: str | Path, columns: Mapping[str, NDArray]) -> None:
-    """Write columns of equal length P as the vertices of a little-endian PLY, complete or not at all.
-
-    Each property has the scalar type of its column: uint8, int32, float32 and so on.
-    """
-    type_names = {code: name for name, code in reversed(SCALAR_TYPES.items()) if not name[-1].isdigit()}
-    dtype = np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
-    rows = np.empty(len(next(iter(columns.values()))), dtype)  # [P]
-    for name, column in columns.items():
-        rows[name] = column
-    properties = "".join(f"property {type_names[c.dtype.str[1:]]} {name}\n" for name, c in columns.items())
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
-    with replacing(path) as temporary:
-        temporary.write_bytes(header.encode("ascii") + rows.tobytes())
+def _as_bytes(path: str | Path, columns: Mapping[str, NDArray], colors: Floats) -> NDArray[np.uint8]:
+    """Colours [P, 3] as bytes, by the type that each has in the file."""
+    is_float = [columns[name].dtype.kind == "f" for name in COLORS]
+    levels = np.rint(colors * np.where(is_float, 255.0, 1.0))  # [P, 3]
+    for name, column, values, floats in zip(COLORS, levels.T, colors.T, is_float, strict=True):
+        is_bad = (column < 0) | (column > 255)
+        if is_bad.any():
+            raise InputError(
+                f"{path}: {name} is {values[is_bad][0]:g}; colours are integers from 0 to 255 or floats from 0 to 1:"
+                f" export them as {'floats in this range, or ' if floats else ''}uchar"
+            )
+    return levels.astype(np.uint8)
 
 
 def check_finite(path: str | Path, columns: Mapping[str, NDArray]) -> None:
@@ -271,71 +259,3 @@ def _way_out(columns: Mapping[str, NDArray]) -> str:
     if all(name in columns for name in MEANS):
         return "it is a point cloud: give it as a scene's points, or give a trained point_cloud.ply"
     return "give a trained point_cloud.ply"
-
-
-def _read_header(file: BinaryIO, path: Path) -> tuple[str, int, int, np.dtype]:
-    """Encoding, rows of elements before the vertices (ASCII only), number of vertices, and their structured dtype."""
-    if file.readline(8).strip() != b"ply":
-        raise InputError(f"{path}: not a PLY file, it does not begin with 'ply'")
-    encoding, element, n_skipped, n = "", "", 0, -1
-    properties: list[tuple[str, str]] = []
-    words: list[str] = []
-    while words != ["end_header"]:
-        words = file.readline(HEADER_LINE_MAX).decode("ascii", errors="replace").split()
-        match words:
-            case ["end_header"]:
-                pass
-            case []:
-                raise InputError(f"{path}: truncated, the PLY header has no end_header; copy or export the file again")
-            case ["format", name, _] if name in BYTE_ORDERS:
-                encoding = name
-            case ["element", element, count] if count.isdecimal():
-                if element == "vertex":
-                    n = int(count)
-                elif n < 0:
-                    n_skipped += int(count)
-            case ["property", kind, name] if kind in SCALAR_TYPES:
-                if element == "vertex":
-                    properties.append((name, SCALAR_TYPES[kind]))
-            case ["property", "list", *_] if element != "vertex":
-                pass
-            case ["comment" | "obj_info", *_]:
-                pass
-            case _:
-                raise InputError(f"{path}: cannot read the header line '{' '.join(words)}'; export the PLY again")
-    names = [name for name, _ in properties]
-    if not encoding or n < 0 or not names or len(set(names)) < len(names):
-        raise InputError(
-            f"{path}: the PLY header lacks its format, vertices or properties, or repeats one; export it again"
-        )
-    if n_skipped and encoding != "ascii":
-        raise InputError(f"{path}: elements stand before the vertices; export the PLY with its vertices first")
-    return encoding, n_skipped, n, np.dtype([(name, BYTE_ORDERS[encoding] + code) for name, code in properties])
-
-
-def _read_binary(file: BinaryIO, path: Path, n: int, dtype: np.dtype) -> NDArray:
-    """Read the n declared vertices; what follows them is not looked at."""
-    found = path.stat().st_size - file.tell()
-    expected = n * dtype.itemsize
-    if found < expected:
-        raise InputError(
-            f"{path}: truncated, {n} vertices of {dtype.itemsize} bytes need {expected} bytes after the header"
-            f" but there are {found}; copy or export the file again"
-        )
-    return np.frombuffer(file.read(expected), dtype)
-
-
-def _read_ascii(file: BinaryIO, path: Path, n_skipped: int, n: int, dtype: np.dtype) -> NDArray:
-    """Read the n declared vertices, one a line."""
-    lines = file.read().decode("ascii", errors="replace").splitlines()[n_skipped : n_skipped + n]
-    if len(lines) < n:
-        raise InputError(f"{path}: truncated, {n} vertices expected, {len(lines)} lines found; copy or export it again")
-    rows = np.empty(n, dtype)
-    for row, line in enumerate(lines):
-        try:
-            rows[row] = tuple(float(word) for word in line.split())
-        except (ValueError, OverflowError):
-            raise InputError(
-                f"{path}: row {row} is '{line[:60]}', not {len(dtype.names or ())} numbers; copy or export it again"
-            ) from None
-    return rows

@@ -24,7 +24,7 @@ import numpy as np
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.images import IMAGE_SUFFIXES, image_size
 from minisplat_ref.io.lens import PINHOLE_MODELS, POLYNOMIAL_MODELS, Lens
-from minisplat_ref.io.ply import read_point_cloud
+from minisplat_ref.io.ply import NO_POINTS, load_points
 from minisplat_ref.io.scene import Photo, build_reading, build_scene, split_photos
 from minisplat_ref.types import Camera, Floats, Scene
 
@@ -80,9 +80,10 @@ def load_transforms(
     if len(photos) == 2:
         test_photos, _ = split_photos(photos[1], 0)
     points_file = find_points(files[0], sets[0])
-    no_points = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-    points, colors = no_points if points_file is None else read_point_cloud(points_file)
-    return build_scene(path, train_photos, test_photos, points, colors, reading)
+    cloud = NO_POINTS if points_file is None else load_points(points_file)
+    if cloud.dropped:
+        warnings.warn(f"{points_file}: {cloud.dropped} and left out", stacklevel=2)
+    return build_scene(path, train_photos, test_photos, cloud.points, cloud.colors, reading)
 
 
 def find_transforms(path: Path) -> tuple[Path, ...]:

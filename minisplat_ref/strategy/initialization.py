@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.errors import InputError
 from minisplat_ref.strategy.clone_split import logit
-from minisplat_ref.types import Camera, Floats, Gaussians, Scene
+from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Scene
 
 N_NEIGHBOURS = 3
 LEAST_SQUARED_DISTANCE = 1e-7  # world units^2; points in the same place would get a scale of zero, whose log is -inf
@@ -125,13 +125,18 @@ def random_points(cameras: Sequence[Camera], extent: float, n: int, rng: np.rand
     """
     centres = np.array([camera.center for camera in cameras])  # [C, 3]
     points = centres.mean(axis=0) + rng.uniform(-extent, extent, (n, 3))  # [n, 3]
-    is_seen = np.zeros(n, bool)
+    return points[are_seen(points, cameras)]
+
+
+def are_seen(points: Floats, cameras: Sequence[Camera]) -> Bools:
+    """Return for each point [P, 3] whether it is inside the image of any camera, [P]."""
+    is_seen = np.zeros(len(points), bool)
     for camera in cameras:
         is_seen |= _is_inside_image(points, camera)
-    return points[is_seen]
+    return is_seen
 
 
-def _is_inside_image(points: Floats, camera: Camera) -> NDArray[np.bool_]:
+def _is_inside_image(points: Floats, camera: Camera) -> Bools:
     x, y, z = (points @ camera.cam_from_world_R.T + camera.cam_from_world_t).T
     is_in_front = z > 0
     z = np.where(is_in_front, z, 1.0)

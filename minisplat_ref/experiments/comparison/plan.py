@@ -6,8 +6,10 @@ from typing import NamedTuple
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.run_folder import check_free
+from minisplat_ref.experiments.start import load_start
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.io import load_scene
+from minisplat_ref.lpips import check_views, load_network
 from minisplat_ref.training.loop import initial_state
 from minisplat_ref.training.schedule import describe
 from minisplat_ref.types import Scene
@@ -57,6 +59,15 @@ class Plan(NamedTuple):
     """How the recipes with a simplification choose; None for their own way."""
     scene_type: str | None
     """``indoor`` or ``outdoor``, for the recipes that weigh importance; None for their own choice."""
+    lpips_weights: Path | None = None
+    """File of the weights of LPIPS; None: it is not measured."""
+    init: Path | None = None
+    """PLY of the points that every training starts from; None for the scene's own."""
+
+    @property
+    def files(self) -> dict[str, Path | None]:
+        """Files that options of ``train`` name, None where they are not given."""
+        return {"lpips_weights": self.lpips_weights, "init": self.init}
 
     def runs_of(self, recipe: str) -> list[Run]:
         """Return the trainings of one recipe, in the order of the seeds."""
@@ -88,7 +99,8 @@ def check(plan: Plan) -> Scene:
     ------
     InputError
         A recipe is unknown or named twice, there is no length for each, the folder is occupied, no recipe takes
-        an option, the scene cannot be loaded, has no test views or too few to train on.
+        an option, the scene cannot be loaded, has no test views or too few to train on, or the weights of LPIPS or the
+        points to start from are not what they should be.
     """
     for name, values in (("--recipes", plan.recipes), ("--seeds", plan.seeds)):
         _refuse_repetition(name, values)
@@ -104,8 +116,11 @@ def check(plan: Plan) -> Scene:
     scene = load_scene(plan.scene, downscale=plan.downscale, test_every=plan.test_every)
     if not scene.test_views:
         raise InputError(f"scene {scene.name} was split without test views to compare on: give --test-every above 0")
+    if plan.lpips_weights is not None:
+        check_views(load_network(plan.lpips_weights), scene.test_views)
+    start = scene if plan.init is None else load_start(plan.init, scene)[0]
     for recipe in recipes:
-        initial_state(scene, recipe, seed=0)
+        initial_state(start, recipe, seed=0)
     return scene
 
 

@@ -31,10 +31,12 @@ def notes(plan: Plan, results: Results) -> list[str]:
         f" {steps} iterations, with the clock stopped.",
         "Model, gradients and moments: their arrays, at most; while densifying is until cloning and splitting ends,"
         " which is when Mini-Splatting simplifies.",
-        "Peak memory of the process: photographs, compiler and measuring included.",
+        "Peak memory of the process: photographs, compiler and measuring included, LPIPS not.",
         "Rendering: all models in one process by turns, the median of several rounds.",
     ]
-    return sentences if results.lpips_reason is None else [*sentences, f"LPIPS null: {results.lpips_reason}."]
+    if results.lpips_network is None:
+        return [*sentences, f"LPIPS null: {results.lpips_reason}."]
+    return [*sentences, f"LPIPS by {results.lpips_network}, colours from -1 to 1; 0 is equal."]
 
 
 def report_html(plan: Plan, scene: Scene, results: Results) -> str:
@@ -91,6 +93,7 @@ def _settings(plan: Plan, scene: Scene, results: Results) -> list[tuple[str, str
         ("Iterations", ", ".join(f"{recipe} {iterations:,}" for recipe, iterations in lengths)),
         ("Seeds", ", ".join(map(str, plan.seeds))),
         *((name.replace("_", " ").capitalize(), str(value)) for name, value in plan.options.items()),
+        *([] if plan.init is None else [("Starts from", str(plan.init.resolve()))]),
         ("Machine", f"{results.machine}, {os.cpu_count()} cores"),
         ("Program", f"minisplat_ref {__version__}"),
         ("Files", f"{plan.folder.resolve()}: a folder per run, compare.json, the figures as PNG"),

@@ -32,6 +32,8 @@ class Results(NamedTuple):
     """Parts of test views, rendered with the first seed of each recipe."""
     lpips_reason: str | None
     """Why LPIPS is missing."""
+    lpips_network: str | None
+    """By which network LPIPS was measured."""
     machine: str
     """What times and memory depend on."""
 
@@ -57,11 +59,13 @@ def collect(plan: Plan, scene: Scene) -> Results:
         for recipe in plan.recipes
     ]
     shown = [model for run, model in zip(runs, models, strict=True) if run.seed == plan.seeds[0]]
+    metrics = run_folder.read_json_object(runs[0].folder / run_folder.METRICS)
     return Results(
         recipes=recipes,
         curves={recipe: [read_curve(run.folder) for run in plan.runs_of(recipe)] for recipe in plan.recipes},
         crops=choose_crops(shown, scene),
-        lpips_reason=run_folder.read_json_object(runs[0].folder / run_folder.METRICS)["lpips_reason"],
+        lpips_reason=metrics["lpips_reason"],
+        lpips_network=metrics["lpips_network"],
         machine=f"{describe_machine()}, {platform.platform()}",
     )
 
@@ -74,6 +78,7 @@ def to_json(plan: Plan, scene: Scene, results: Results) -> dict[str, Any]:
             **plan._asdict(),
             "scene": str(plan.scene.resolve()),
             "folder": str(plan.folder.resolve()),
+            **{name: None if file is None else str(file.resolve()) for name, file in plan.files.items()},
             "eval_every": [eval_every(iterations) for iterations in plan.iterations],
         },
         "scene": {
@@ -86,6 +91,7 @@ def to_json(plan: Plan, scene: Scene, results: Results) -> dict[str, Any]:
         },
         "machine": results.machine,
         "lpips_reason": results.lpips_reason,
+        "lpips_network": results.lpips_network,
         "measures": [measure._asdict() for measure in MEASURES],
         "recipes": [_recipe_to_json(plan, recipe, results.recipes[0]) for recipe in results.recipes],
     }

@@ -61,6 +61,7 @@ def _command(plan: Plan, run: Run) -> list[str]:
         "test_every": plan.test_every,
         "eval_every": eval_every(run.iterations),
         "out": run.folder,
+        **{name: file for name, file in plan.files.items() if file is not None},
         **run.options,
     }
     texts = [part for name, value in options.items() for part in (f"--{name.replace('_', '-')}", str(value))]

@@ -1,0 +1,251 @@
+"""The container PLY: a header that names elements and their properties, then the rows; its vertices as columns.
+
+Read: ASCII, little- and big-endian, any scalar type, elements and properties in any order. Other elements, such as
+faces, and properties that are lists are passed over. Written: little-endian vertices.
+"""
+
+from collections.abc import Mapping, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.io.atomic import replacing
+
+SCALAR_TYPES = {
+    **{name: "i1" for name in ("char", "int8")},
+    **{name: "u1" for name in ("uchar", "uint8")},
+    **{name: "i2" for name in ("short", "int16")},
+    **{name: "u2" for name in ("ushort", "uint16")},
+    **{name: "i4" for name in ("int", "int32")},
+    **{name: "u4" for name in ("uint", "uint32")},
+    **{name: "f4" for name in ("float", "float32")},
+    **{name: "f8" for name in ("double", "float64")},
+}
+COUNT_TYPES = [name for name, code in SCALAR_TYPES.items() if code[0] != "f"]
+BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+HEADER_LINE_MAX = 4096  # bytes; no header line is longer, and a file without line breaks must not be read whole
+
+
+class Property(NamedTuple):
+    """A column, or a list in every row."""
+
+    name: str
+    dtype: np.dtype
+    """Of the value, or of every value of the list, in the file's byte order."""
+    count_dtype: np.dtype | None
+    """Of the number of values that stands before a list; None for a single value."""
+
+
+class Element(NamedTuple):
+    """Rows of one kind."""
+
+    name: str
+    n: int
+    """Number of rows."""
+    properties: Sequence[Property]
+    """What each row holds, in its order."""
+
+    @property
+    def scalars(self) -> list[Property]:
+        """Properties that are no lists."""
+        return [p for p in self.properties if p.count_dtype is None]
+
+    @property
+    def has_lists(self) -> bool:
+        """Whether rows differ in length."""
+        return len(self.scalars) < len(self.properties)
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Structured dtype of a row, without its lists; no two of the names may be equal."""
+        return np.dtype([(p.name, p.dtype) for p in self.scalars])
+
+
+def property_names(path: str | Path) -> tuple[str, ...]:
+    """Return the names of the scalar properties of the vertices.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be opened or its header is malformed.
+    """
+    path = Path(path)
+    with _open(path) as file:
+        *_, vertices = _read_header(file, path)
+    return vertices.dtype.names or ()
+
+
+def read_vertices(path: str | Path) -> dict[str, NDArray]:
+    """Read every property of the vertices of a PLY file; lists are left out.
+
+    Returns
+    -------
+    dict of ndarray of shape (P,)
+        One column per property, in the file's order and scalar type, native byte order.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, malformed or ends before its last declared vertex.
+    """
+    path = Path(path)
+    with _open(path) as file:
+        encoding, before, vertices = _read_header(file, path)
+        if encoding == "ascii":
+            rows = _read_ascii(file, path, sum(element.n for element in before), vertices)
+        else:
+            for element in before:
+                _pass_over(file, path, element)
+            rows = _read_binary(file, path, vertices)
+    return {name: rows[name].astype(rows[name].dtype.newbyteorder("=")) for name in rows.dtype.names or ()}
+
+
+def write_vertices(path: str | Path, columns: Mapping[str, NDArray]) -> None:
+    """Write columns of equal length P as the vertices of a little-endian PLY, complete or not at all.
+
+    Each property has the scalar type of its column: uint8, int32, float32 and so on.
+    """
+    type_names = {code: name for name, code in reversed(SCALAR_TYPES.items()) if not name[-1].isdigit()}
+    dtype = np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
+    rows = np.empty(len(next(iter(columns.values()))), dtype)  # [P]
+    for name, column in columns.items():
+        rows[name] = column
+    properties = "".join(f"property {type_names[c.dtype.str[1:]]} {name}\n" for name, c in columns.items())
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
+    with replacing(path) as temporary:
+        temporary.write_bytes(header.encode("ascii") + rows.tobytes())
+
+
+def _open(path: Path) -> BinaryIO:
+    try:
+        return path.open("rb")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be opened ({error.strerror})") from None
+
+
+def _read_header(file: BinaryIO, path: Path) -> tuple[str, Sequence[Element], Element]:
+    """Encoding, the elements before the vertices, and the vertices."""
+    if file.readline(8).strip() != b"ply":
+        raise InputError(f"{path}: not a PLY file, it does not begin with 'ply'")
+    encoding = ""
+    declared: list[tuple[str, int, list[tuple[str, str, str | None]]]] = []  # (name, n, [(name, type, list's count)])
+    words: list[str] = []
+    while words != ["end_header"]:
+        words = file.readline(HEADER_LINE_MAX).decode("ascii", errors="replace").split()
+        match words:
+            case ["end_header"]:
+                pass
+            case []:
+                raise InputError(f"{path}: truncated, the PLY header has no end_header; copy or export the file again")
+            case ["format", name, _] if name in BYTE_ORDERS:
+                encoding = name
+            case ["element", name, count] if count.isdecimal():
+                declared.append((name, int(count), []))
+            case ["property", kind, name] if kind in SCALAR_TYPES and declared:
+                declared[-1][2].append((name, kind, None))
+            case ["property", "list", count, kind, name] if count in COUNT_TYPES and kind in SCALAR_TYPES and declared:
+                declared[-1][2].append((name, kind, count))
+            case ["comment" | "obj_info", *_]:
+                pass
+            case _:
+                raise InputError(f"{path}: cannot read the header line '{' '.join(words)}'; export the PLY again")
+    order = BYTE_ORDERS.get(encoding, "=")
+    elements = [
+        Element(name, n, [_property(name, kind, count, order) for name, kind, count in properties])
+        for name, n, properties in declared
+    ]
+    i = next((i for i, element in enumerate(elements) if element.name == "vertex"), -1)
+    names = [p.name for p in elements[i].scalars] if i >= 0 else []
+    if not encoding or not names or len(set(names)) < len(names):
+        raise InputError(
+            f"{path}: the PLY header lacks its format, vertices or properties, or repeats one; export it again"
+        )
+    return encoding, elements[:i], elements[i]
+
+
+def _property(name: str, kind: str, count: str | None, order: str) -> Property:
+    count_dtype = None if count is None else np.dtype(order + SCALAR_TYPES[count])
+    return Property(name, np.dtype(order + SCALAR_TYPES[kind]), count_dtype)
+
+
+def _pass_over(file: BinaryIO, path: Path, element: Element) -> None:
+    """Move the file behind an element, in a binary file."""
+    if element.has_lists:
+        for _ in range(element.n):
+            _read_row(file, path, element)
+    else:
+        file.seek(element.n * sum(p.dtype.itemsize for p in element.properties), 1)
+
+
+def _read_binary(file: BinaryIO, path: Path, vertices: Element) -> NDArray:
+    """Read the declared vertices; what follows them is not looked at."""
+    n, dtype = vertices.n, vertices.dtype
+    if vertices.has_lists:
+        return np.frombuffer(b"".join(_read_row(file, path, vertices) for _ in range(n)), dtype)
+    found = max(0, path.stat().st_size - file.tell())
+    expected = n * dtype.itemsize
+    if found < expected:
+        raise InputError(
+            f"{path}: truncated, {n} vertices of {dtype.itemsize} bytes need {expected} bytes but there are {found};"
+            " copy or export the file again"
+        )
+    return np.frombuffer(file.read(expected), dtype)
+
+
+def _read_row(file: BinaryIO, path: Path, element: Element) -> bytes:
+    """Read the scalars of a row that also has lists."""
+    scalars = b""
+    for name, dtype, count_dtype in element.properties:
+        if count_dtype is None:
+            scalars += _read(file, path, dtype.itemsize)
+            continue
+        count = int(np.frombuffer(_read(file, path, count_dtype.itemsize), count_dtype)[0])
+        if count < 0:
+            raise InputError(f"{path}: a list {name} has {count} values; export the PLY again")
+        file.seek(count * dtype.itemsize, 1)
+    return scalars
+
+
+def _read(file: BinaryIO, path: Path, n: int) -> bytes:
+    data = file.read(n)
+    if len(data) < n:
+        raise InputError(f"{path}: truncated, it ends before its last vertex; copy or export the file again")
+    return data
+
+
+def _read_ascii(file: BinaryIO, path: Path, n_before: int, vertices: Element) -> NDArray:
+    """Read the declared vertices, one a line, behind the lines of other elements."""
+    n, dtype = vertices.n, vertices.dtype
+    lines = file.read().decode("ascii", errors="replace").splitlines()[n_before : n_before + n]
+    if len(lines) < n:
+        raise InputError(f"{path}: truncated, {n} vertices expected, {len(lines)} lines found; copy or export it again")
+    rows = np.empty(n, dtype)
+    for row, line in enumerate(lines):
+        words = line.split()
+        try:
+            rows[row] = tuple(map(float, _scalars(words, vertices) if vertices.has_lists else words))
+        except (ValueError, OverflowError):
+            raise InputError(
+                f"{path}: row {row} is '{line[:60]}', not {len(dtype.names or ())} numbers; copy or export it again"
+            ) from None
+    return rows
+
+
+def _scalars(words: Sequence[str], element: Element) -> list[str]:
+    """Those words of a line that are no lists."""
+    scalars, rest = [], iter(words)
+    for _, _, count_dtype in element.properties:
+        word = next(rest, "")  # of which there is no number
+        if count_dtype is None:
+            scalars.append(word)
+        else:
+            values = list(islice(rest, int(word)))
+            if len(values) < int(word):
+                raise ValueError("a list is too short")
+    if next(rest, None) is not None:
+        raise ValueError("there are more words than properties")
+    return scalars
