@@ -122,11 +122,11 @@ print_events(get_recipe("3dgs-accel", ITERATIONS))
 # %% [markdown]
 # An event needs gradients from most views, so `scaled` never lets Gaussians be added more often than every 100
 # iterations (`least_gap`). In a run as short as ours that leaves a single event. With 24 views 40 iterations are
-# enough, and an opacity reset needs time to heal: we ask for gaps of 40 and 60. That is one line, because events are
+# enough, and an opacity reset needs time to heal: we ask for gaps of 40 and 120. That is one line, because events are
 # tuples.
 
 # %%
-LEAST_GAPS = {"clone_and_split": 40, "prune_faint": 40, "prune_large": 40, "reset_opacity": 60}
+LEAST_GAPS = {"clone_and_split": 40, "prune_faint": 40, "prune_large": 40, "reset_opacity": 120}
 
 
 def retimed(event):

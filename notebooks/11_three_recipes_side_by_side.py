@@ -72,7 +72,7 @@ def show(axes, image, title="", **style):
 # event has not healed; then only every second published date stays, or every third. With 24 views half of it will do.
 
 # %%
-ITERATIONS = 600
+ITERATIONS = 900
 NAMES = ("3dgs-accel", "mini-splatting", "mini-splatting2")
 COLORS = dict(zip(NAMES, (RED, BLUE, GREEN), strict=True))
 
