@@ -34,6 +34,7 @@ def test_every_is_open_at_both_ends():
     assert firing(Every(3, nothing, start=3, stop=12), 20) == [6, 9]
     assert firing(Every(3, nothing), 10) == [3, 6, 9]
     assert firing(Every(3, nothing, skip=6), 20) == [3, 9, 15]
+    assert firing(Every(3, nothing, stop=11), 20) == [3, 6, 9]
 
 
 def test_at_and_during():

@@ -81,7 +81,8 @@ class Every(NamedTuple):
         if step <= self.start or (self.stop is not None and step >= self.stop):
             return False
         is_skipped = self.skip is not None and step % self.skip == 0
-        return not is_skipped and (step - (self.stop or 0)) % self.stride == 0
+        end = 0 if self.stop is None else -(-self.stop // self.period) * self.period  # the first multiple that is too late
+        return not is_skipped and (end - step) % self.stride == 0
 
     def scaled(self, factor: Fraction) -> "Every":
         """Return the event for a run of ``factor`` times the length."""
