@@ -81,7 +81,7 @@ class Every(NamedTuple):
         if step <= self.start or (self.stop is not None and step >= self.stop):
             return False
         is_skipped = self.skip is not None and step % self.skip == 0
-        end = 0 if self.stop is None else -(-self.stop // self.period) * self.period  # the first multiple that is too late
+        end = 0 if self.stop is None else -(-self.stop // self.period) * self.period  # the first multiple too late
         return not is_skipped and (end - step) % self.stride == 0
 
     def scaled(self, factor: Fraction) -> "Every":
