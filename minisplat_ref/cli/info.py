@@ -10,6 +10,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.arguments import Commands, HelpFormatter
 
 if TYPE_CHECKING:
+    from minisplat_ref.experiments.settings import Settings
     from minisplat_ref.types import Floats
 
 NOT_SHOWN = ("per_view", "n_gaussians", "iterations")  # of metrics.json: too long, or said by the PLY or checkpoint
@@ -21,7 +22,7 @@ Say what is in a file or folder: counts, SH degree, bounds, sizes.
 
   point_cloud.ply   Gaussians in the 3DGS layout, whoever wrote them
   checkpoint.npz    a training that can be continued
-  run folder        the --out of a training: settings, measures and Gaussians
+  run folder        the --out of a training: settings, measures, what fired, Gaussians
   scene folder      COLMAP (images/, sparse/0/) or transforms.json
 
 Everything is read and checked; of damaged input it says what is wrong.
@@ -105,16 +106,28 @@ def _shape(array: "Floats") -> str:
 
 
 def _run_rows(folder: Path) -> Rows:
-    from minisplat_ref.experiments.run_folder import CHECKPOINT, METRICS, read_json_object
+    from minisplat_ref.experiments.run_folder import CHECKPOINT, EVENTS, METRICS, read_json_object
     from minisplat_ref.experiments.settings import load
 
-    rows = [(name.replace("_", " "), str(value)) for name, value in load(folder)._asdict().items()]
+    settings = load(folder)
+    rows = [(name.replace("_", " "), str(value)) for name, value in settings._asdict().items()]
     if (folder / METRICS).exists():
         metrics = read_json_object(folder / METRICS)
         rows += [(name.replace("_", " "), _short(metrics[name])) for name in metrics if name not in NOT_SHOWN]
+    if (folder / EVENTS).exists():
+        rows += _event_rows(folder, settings)
     if (folder / CHECKPOINT).exists():
         rows += _checkpoint_rows(folder / CHECKPOINT)
     return rows
+
+
+def _event_rows(folder: Path, settings: "Settings") -> Rows:
+    """Say which mechanisms of the recipe were active, and which never."""
+    from minisplat_ref.experiments.events import describe, read_mechanisms
+
+    found, never = read_mechanisms(folder, settings)
+    rows = [(f"fired: {mechanism.action}", describe(mechanism)) for mechanism in found]
+    return [*rows, *([("never fired", ", ".join(never))] if never else [])]
 
 
 def _scene_rows(path: Path) -> Rows:

@@ -15,6 +15,7 @@ SHARED = "shared.npz"  # parameters that belong to no Gaussian, if there are any
 METRICS = "metrics.json"  # what was measured on the test views
 LOG = "log.jsonl"  # one record every few steps
 CURVE = "curve.jsonl"  # the test views measured every --eval-every steps, if that was asked for
+EVENTS = "events.jsonl"  # one record each time that an event of the recipe acted
 CHECKPOINT = "checkpoint.npz"  # what `--resume` continues from
 CAMERAS = "cameras.json"  # cameras of all views, so that they can be rendered without the photographs
 RENDERS = "renders"  # truth | render | error of each test view
