@@ -1,7 +1,7 @@
 """What fired in a training, and when: ``events.jsonl``, and what it says of each mechanism of the recipe.
 
 A mechanism is an action that the recipe has at some iterations, not at every one: densification, pruning, a reset. In
-short or small runs some never act. No claim about a mechanism can rest on a run in which it was off, so those are named.
+short or small runs some never act. Nothing can be said of a mechanism from a run in which it was off, so it is named.
 """
 
 import json
@@ -11,10 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments import run_folder
 from minisplat_ref.experiments.progress import read_log
-from minisplat_ref.experiments.settings import Settings
-from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.training.loop import HALF_SIZE
 from minisplat_ref.training.schedule import During, Recipe, action_name
 from minisplat_ref.training.state import FiredEvent
@@ -66,21 +63,20 @@ def published_times(recipe: Recipe) -> dict[str, int]:
     return dict(times)
 
 
-def read_mechanisms(folder: Path, settings: Settings) -> tuple[list[Mechanism], list[str]]:
-    """Return what a run's mechanisms have done, and which of its recipe have never acted; see :func:`mechanisms`.
+def read_mechanisms(path: Path, published: Mapping[str, int]) -> list[Mechanism]:
+    """Return what the mechanisms of a run have done; see :func:`mechanisms`.
 
     Raises
     ------
     InputError
-        The record is damaged, or there is no such recipe any more.
+        There is no record of it, or it is damaged.
     """
-    published = published_times(find_recipe(settings.recipe, extension=settings.extension))
-    path = folder / run_folder.EVENTS
+    if not path.exists():
+        raise InputError(f"{path} is missing, which says what fired in the run: train anew")
     try:
-        found = mechanisms(read_log(path), published)
+        return mechanisms(read_log(path), published)
     except (KeyError, TypeError) as error:
-        raise InputError(f"{path} is not the record of a training's events: remove it") from error
-    return found, never_fired(found, published)
+        raise InputError(f"{path} is not the record of what fired in a training: remove the run") from error
 
 
 def mechanisms(records: Records, published: Mapping[str, int]) -> list[Mechanism]:

@@ -51,6 +51,11 @@ def create(folder: Path) -> None:
         raise InputError(f"{folder} cannot be created ({error.strerror}): give another --out") from error
 
 
+def is_finished(folder: Path, iterations: int) -> bool:
+    """Return whether a run has been measured after its last iteration: that is what it does in the end."""
+    return (folder / METRICS).exists() and read_json_object(folder / METRICS).get("iterations") == iterations
+
+
 def remove(folder: Path) -> None:
     """Take back a folder that :func:`create` made and a training that cannot go on has begun to fill."""
     shutil.rmtree(folder)

@@ -17,8 +17,8 @@ from minisplat_ref.io.scene import rescale_camera
 from minisplat_ref.types import Camera, Floats, Scene
 
 MOST_POINTS = 200_000  # of the true surface; a few centimetres apart in a room, and searched in a fraction of a second
-# A Gaussian of less than this opacity lets nine tenths of the light by even at its centre: it hardly is a surface. After
-# an opacity reset (to 0.01) there is none above it for a while, and no distance.
+# A Gaussian of less than this opacity lets nine tenths of the light by even at its centre: it is hardly a surface.
+# Right after an opacity reset (to 0.01) there is none above it, and no distance.
 LEAST_OPACITY = 0.1
 # Extents around the cameras. Beyond, points are sparse on either side and the sky has no surface, so that a few
 # distances would outweigh all others.
