@@ -1,5 +1,6 @@
 """The figures of a comparison: PSNR over time, iterations and number of Gaussians, the surface, and the gallery."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -55,10 +56,9 @@ def _over(curves: Curves, x: str, y: str, title: str, x_label: str) -> Figure:
     with plot(title, x_label, SIZE) as (figure, axes):
         for index, (recipe, runs) in enumerate(curves.items()):
             for number, records in enumerate(runs):
-                known = [record for record in records if record[y] is not None]
                 axes.plot(
-                    [record[x] for record in known],
-                    [record[y] for record in known],
+                    [record[x] for record in records],
+                    [math.nan if record[y] is None else record[y] for record in records],  # a gap
                     color=color(index),
                     linewidth=1.6,
                     marker="o",
@@ -66,7 +66,7 @@ def _over(curves: Curves, x: str, y: str, title: str, x_label: str) -> Figure:
                     label=recipe if number == 0 else None,
                 )
                 if y == "psnr":
-                    best = best_record(known)
+                    best = best_record(records)
                     axes.plot(best[x], best[y], **BEST_MARK, color=color(index))
         if y == "psnr":
             axes.plot([], [], **BEST_MARK, color=TITLE_COLOR, label="best of a run")
