@@ -3,6 +3,7 @@
 import json
 import signal
 from functools import partial
+from itertools import pairwise
 
 import pytest
 
@@ -77,7 +78,7 @@ def test_records(run_folder):
     records = read_log(run_folder / "events.jsonl")
     assert [(record["step"], record["action"]) for record in records] == FIRED
     counts = [(record["n_before"], record["n_after"]) for record in records]
-    assert all(after == before for (_, after), (before, _) in zip(counts, counts[1:], strict=False))
+    assert all(after == before for (_, after), (before, _) in pairwise(counts))
     assert counts[0][1] > counts[0][0] > 0  # it densifies
     assert counts[-1][1] == json.loads((run_folder / "metrics.json").read_text())["n_gaussians"]
     assert [record["note"] for record in records] == [None, None, "nothing to do", None, None, None, None]

@@ -43,7 +43,7 @@ def test_two_planes():
 
 def test_shifted_grid():
     """Half a spacing to the neighbour, there and back."""
-    shifted = plane(0.0) + [SPACING / 2, 0, 0]
+    shifted = plane(0.0) + np.array([SPACING / 2, 0, 0])
     assert chamfer(shifted, cKDTree(plane(0.0))) == pytest.approx(SPACING, rel=CLOSED_FORM)
 
 

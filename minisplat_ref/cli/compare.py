@@ -57,7 +57,7 @@ def add_parser(commands: Commands) -> None:
         formatter_class=HelpFormatter,
         argument_default=argparse.SUPPRESS,
     )
-    parser.add_argument("scene", nargs="?", type=Path, metavar="SCENE", help="folder of a scene, as for train")
+    parser.add_argument("scene", nargs="?", metavar="SCENE", help="folder of a scene, as for train")
     parser.add_argument("--recipes", type=listed(name), metavar="A,B", help="names as in train --recipe")
     parser.add_argument("--out", type=Path, metavar="DIR", help="new folder for the results")
     parser.add_argument("--resume", type=Path, metavar="DIR", help="continue the comparison in DIR")
@@ -124,7 +124,7 @@ def _new(given: dict[str, Any]) -> "Plan":
     options = {name: given.get(name, default) for name, default in DEFAULTS.items()}
     n_lengths = len(options["iterations"])
     options["iterations"] *= len(given["recipes"]) if n_lengths == 1 else 1  # a single number is for all
-    return Plan(scene=given["scene"], folder=given["out"], recipes=given["recipes"], **options)
+    return Plan(scene=Path(given["scene"]), folder=given["out"], recipes=given["recipes"], **options)
 
 
 def _resumed(given: dict[str, Any]) -> "Plan":

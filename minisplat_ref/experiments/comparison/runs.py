@@ -13,6 +13,7 @@ from typing import Any, Literal
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.experiments import run_folder
+from minisplat_ref.experiments.arguments import option_name
 from minisplat_ref.experiments.comparison.plan import Plan, Run
 from minisplat_ref.experiments.settings import Settings
 from minisplat_ref.experiments.settings import load as load_settings
@@ -137,7 +138,7 @@ def _options(plan: Plan, run: Run) -> dict[str, Any]:
 
 def _command(plan: Plan, run: Run) -> list[str]:
     options = {**_options(plan, run), "out": run.folder}
-    texts = [part for name, value in options.items() for part in (f"--{name.replace('_', '-')}", str(value))]
+    texts = [part for name, value in options.items() for part in (option_name(name), str(value))]
     return [*TRAIN, str(plan.scene), *texts]
 
 
