@@ -22,7 +22,7 @@ Say what is in a file or folder: counts, SH degree, bounds, sizes.
 
   point_cloud.ply   Gaussians in the 3DGS layout, whoever wrote them
   checkpoint.npz    a training that can be continued
-  run folder        the --out of a training: settings, measures, what fired, Gaussians
+  run folder        the --out of a training: settings, measures, what fired
   scene folder      COLMAP (images/, sparse/0/) or transforms.json
 
 Everything is read and checked; of damaged input it says what is wrong.

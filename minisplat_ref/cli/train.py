@@ -42,9 +42,9 @@ DEFAULTS = {
 DESCRIPTION = """\
 Train Gaussians on photographs with cameras. DIR will hold point_cloud.ply,
 metrics.json, renders/ (truth | render | error of each test view), config.json,
-log.jsonl, cameras.json and checkpoint.npz. Ctrl-C saves what there is; --resume
-continues with the run's own settings, --iterations then says where to stop, and
-all schedules stay as they were.
+log.jsonl, events.jsonl, cameras.json and checkpoint.npz. Ctrl-C saves what is
+there; --resume continues with the run's own settings, --iterations then says
+where to stop, and all schedules stay as they were.
 """
 EPILOG = """\
 examples:

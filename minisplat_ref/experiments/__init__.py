@@ -2,7 +2,8 @@
 
 A run and its folder: what ``train`` does
     :mod:`.settings` (what was asked for, ``config.json``), :mod:`.run_folder` (which file is called what), :mod:`.run`
-    (the training, with checkpoints), :mod:`.progress` (bar and ``log.jsonl``), :mod:`.curve` (``curve.jsonl``),
+    (the training, with checkpoints), :mod:`.progress` (bar and ``log.jsonl``), :mod:`.events` (what fired,
+    ``events.jsonl``), :mod:`.curve` (``curve.jsonl``) and :mod:`.surface` (the true one, where it is known),
     :mod:`.scoring` (``metrics.json`` and ``renders/``), :mod:`.first_use` (compiles the kernels ahead).
 
 More than one run
