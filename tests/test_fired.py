@@ -1,6 +1,7 @@
 """What fired in a training: the record in the run folder, what it says of each mechanism, and how it is told."""
 
 import json
+import re
 import signal
 from functools import partial
 from itertools import pairwise
@@ -98,6 +99,8 @@ def test_interrupted_and_resumed(run_folder, scene_folder, tmp_path, monkeypatch
     with monkeypatch.context() as patch:
         patch.setattr(Progress, "__call__", press_ctrl_c)
         assert train(scene_folder, tmp_path / "run") == 130
+    assert main(["info", str(tmp_path / "run")]) == 0
+    assert re.search("^not fired yet +reset_opacity$", capsys.readouterr().out, re.MULTILINE)
     path = tmp_path / "run" / "events.jsonl"
     assert without_times(tmp_path / "run") == without_times(run_folder)[:5]
     events.append(path, 13, [FiredEvent("lost", 1, 2, 0.5)])

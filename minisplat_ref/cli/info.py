@@ -124,14 +124,15 @@ def _run_rows(folder: Path) -> Rows:
 def _event_rows(folder: Path, settings: "Settings") -> Rows:
     """Say which mechanisms of the recipe were active, and which never."""
     from minisplat_ref.experiments.events import describe, never_fired, published_times, read_mechanisms
-    from minisplat_ref.experiments.run_folder import EVENTS
+    from minisplat_ref.experiments.run_folder import EVENTS, is_finished
     from minisplat_ref.extensions.extension import find_recipe
 
     published = published_times(find_recipe(settings.recipe, extension=settings.extension))
     found = read_mechanisms(folder / EVENTS, published)
     never = never_fired(found, published)
     rows = [(f"fired: {mechanism.action}", describe(mechanism)) for mechanism in found]
-    return [*rows, *([("never fired", ", ".join(never))] if never else [])]
+    name = "never fired" if is_finished(folder, settings.iterations) else "not fired yet"
+    return [*rows, *([(name, ", ".join(never))] if never else [])]
 
 
 def _scene_rows(path: Path) -> Rows:

@@ -76,7 +76,7 @@ def report_html(plan: Plan, scene: Scene, results: Results) -> str:
     sections = [
         cards(map(_card, results.recipes)),
         section("Measures", table(cells, heading), paragraph(" ".join(notes(plan, results)))),
-        section("On the way", paragraph(CURVES_TEXT), *_curves(results)),
+        section("On the way", paragraph(CURVES_TEXT), _curves(results)),
         section("What fired, and when", paragraph(FIRED_TEXT), *(_fired_table(fired) for fired in results.fired)),
         section(
             "Parts of held-out views",
@@ -100,13 +100,11 @@ def _card(recipe: RecipeMeasures) -> tuple[str, str]:
     return f"{psnr} dB", f"{recipe.recipe}: {count} Gaussians, trained in {seconds} s, {rate} views/s"
 
 
-def _curves(results: Results) -> list[str]:
-    """Return the curves, two in a row."""
+def _curves(results: Results) -> str:
     figures = [psnr_over_time(results.curves), psnr_over_iterations(results.curves), psnr_over_count(results.curves)]
     if is_chamfer_known(results.curves):
         figures.append(chamfer_over_iterations(results.curves))
-    svgs = [to_svg(figure) for figure in figures]
-    return [curves(svgs[:2]), curves(svgs[2:])]
+    return curves([to_svg(figure) for figure in figures], n_columns=2)
 
 
 def _fired_table(fired: Fired) -> str:
