@@ -59,7 +59,7 @@ def notes(plan: Plan, results: Results) -> list[str]:
         sentences.append(
             "Chamfer distance: mean distance of the Gaussians' centres to the nearest point that the training views"
             f" truly show, and of these points to the nearest centre, added; centres of opacity {LEAST_OPACITY} and"
-            f" more, within {NEAR:g} extents of the cameras."
+            f" more, within {NEAR:g} extents of the cameras; right after an opacity reset there are none."
         )
     return sentences if results.lpips_reason is None else [*sentences, f"LPIPS null: {results.lpips_reason}."]
 
