@@ -37,6 +37,7 @@ RUN_FILES = {
     "checkpoint.npz",
     "config.json",
     "log.jsonl",
+    "events.jsonl",
     "metrics.json",
     "point_cloud.ply",
     "renders",

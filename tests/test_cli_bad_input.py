@@ -275,6 +275,27 @@ def test_comparison_of_a_missing_scene(refused, tmp_path):
     assert str(tmp_path / "nowhere") in refused("compare", tmp_path / "nowhere", *options)
 
 
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (["--recipes", "3dgs", "--out", "there"], "give a SCENE to train on, or --resume DIR"),
+        (["scene", "--out", "there"], "give --recipes A,B, or --resume DIR"),
+        (["scene", "--recipes", "3dgs"], "give --out DIR, or --resume DIR"),
+        (["--resume", "there", "--seeds", "1"], "leave out --seeds"),
+        (["scene", "--resume", "there", "--test-every", "4"], "leave out SCENE, --test-every"),
+        (["--resume", "there"], "there holds no comparison, plan.json is missing"),
+    ],
+)
+def test_comparison_without_what_it_needs(refused, options, reason):
+    assert reason in refused("compare", *options)
+
+
+@pytest.mark.parametrize("plan", ["{}", '{"scene": "scene"}', "[]", "{"])
+def test_comparison_with_a_damaged_plan(refused, tmp_path, plan):
+    (tmp_path / "plan.json").write_text(plan)
+    assert str(tmp_path / "plan.json") in refused("compare", "--resume", tmp_path)
+
+
 def test_comparison_into_an_occupied_folder(compare_refused, tmp_path):
     write_run(tmp_path / "out", tmp_path / "scene")
     assert str(tmp_path / "out") in compare_refused()
@@ -285,8 +306,6 @@ def test_comparison_into_an_occupied_folder(compare_refused, tmp_path):
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        (["--out", "there"], "--recipes"),
-        (["--recipes", "3dgs"], "--out"),
         (["--recipes", "3dgs,,3dgs-accel", "--out", "there"], "a name is missing"),
         (["--recipes", "", "--out", "there"], "a name is missing"),
         (["--recipes", "3dgs", "--iterations", "10,x", "--out", "there"], "'x' is not a whole number"),

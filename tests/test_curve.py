@@ -1,6 +1,7 @@
 """``train --eval-every``: which records there are; that measuring takes no training time and changes nothing."""
 
 import json
+import shutil
 import signal
 import time
 
@@ -13,6 +14,8 @@ from minisplat_ref.experiments import curve
 from minisplat_ref.experiments import progress as progress_module
 from minisplat_ref.experiments import run as training
 from minisplat_ref.experiments.progress import Progress, read_log
+from minisplat_ref.experiments.surface import surface_distance, true_surface
+from minisplat_ref.io import load_ply, load_scene
 from minisplat_ref.metrics import Evaluation
 
 SCENE = {"n_views": 6, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
@@ -44,12 +47,23 @@ def qualities(folder):
     return [{**record, "seconds": None} for record in read_log(folder / "curve.jsonl")]
 
 
-def test_records(measured):
+def chamfer_of(run_folder, scene_folder):
+    surface = true_surface(scene_folder, load_scene(scene_folder, test_every=4))
+    return surface_distance(load_ply(run_folder / "point_cloud.ply"), surface)
+
+
+def test_records(measured, scene_folder):
     records = read_log(measured / "curve.jsonl")
     assert [record["step"] for record in records] == MEASURED
     metrics = json.loads((measured / "metrics.json").read_text())
     of_the_end = {name: metrics[name] for name in ("psnr", "ssim", "n_gaussians")}
-    assert records[-1] == {"step": ITERATIONS, "seconds": metrics["train_seconds"], **of_the_end}
+    assert records[-1] == {
+        "step": ITERATIONS,
+        "seconds": metrics["train_seconds"],
+        **of_the_end,
+        "chamfer": chamfer_of(measured, scene_folder),
+    }
+    assert len({record["chamfer"] for record in records}) == len(MEASURED)
     assert 0 < records[0]["seconds"] < records[1]["seconds"] < records[2]["seconds"]
     assert records[0]["psnr"] != records[1]["psnr"]
 
@@ -92,6 +106,13 @@ def test_the_clock_stands_while_views_are_measured(scene_folder, tmp_path, monke
     assert len(put_forward) == 3
     for name in ("curve.jsonl", "log.jsonl"):
         assert read_log(tmp_path / "run" / name)[-1]["seconds"] < 1000
+
+
+def test_no_distance_where_the_surface_is_not_known(scene_folder, tmp_path):
+    folder = tmp_path / "photographs"
+    shutil.copytree(scene_folder, folder, ignore=shutil.ignore_patterns("depths"))
+    assert train(folder, tmp_path / "run", "--eval-every", str(EVAL_EVERY)) == 0
+    assert all("chamfer" not in record for record in read_log(tmp_path / "run" / "curve.jsonl"))
 
 
 def test_records_after_the_checkpoint_are_dropped(tmp_path):

@@ -92,5 +92,6 @@ def test_opacity_reset_forgets_only_the_moments_of_opacity(state):
 @pytest.mark.parametrize(("background", "is_reset"), [(0.0, False), (1.0, True)])
 def test_early_reset_is_for_white_backgrounds(state, background, is_reset):
     before = state.gaussians.opacity_logits.copy()
-    gaussian_splatting.reset_opacity_on_white(state, make_iteration(background=background), ceiling=0.01)
+    note = gaussian_splatting.reset_opacity_on_white(state, make_iteration(background=background), ceiling=0.01)
+    assert note == (None if is_reset else "nothing done: the background is not white")
     assert np.any(state.gaussians.opacity_logits != before) == is_reset

@@ -215,9 +215,10 @@ def test_blur_is_remembered_from_view_to_view(state, scene):
 def test_densification_pauses_above_the_most(state, iteration):
     n = n_rows(state.gaussians)
     act = partial(gaussian_splatting.clone_and_split, threshold=0.0, size_fraction=10.0)
-    for most, expected in ((n - 1, n), (n + 1, 2 * n)):
+    note = "paused: as many Gaussians as most_per_pixel allows"
+    for most, expected, expected_note in ((n - 1, n, note), (n + 1, 2 * n, None)):
         state.stats = {"gradient_sum": np.ones(n), "view_count": np.ones(n), "is_blurred": np.zeros(n, bool)}
-        act(state, iteration, most_per_pixel=most / n_pixels(iteration.scene))
+        assert act(state, iteration, most_per_pixel=most / n_pixels(iteration.scene)) == expected_note
         assert n_rows(state.gaussians) == expected and (state.stats == {}) == (expected == 2 * n)
 
 

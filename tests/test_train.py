@@ -2,6 +2,7 @@
 
 import os
 import signal
+import time
 import weakref
 from dataclasses import replace
 from functools import partial
@@ -19,8 +20,10 @@ from minisplat_ref.extensions.geometry.weights import GeometricWeights
 from minisplat_ref.methods import RECIPES, gaussian_splatting
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import render
+from minisplat_ref.training import loop
 from minisplat_ref.training.loop import initial_state, load_state, save_state, train
 from minisplat_ref.training.schedule import BLEND_STATS, At, During, Every, configured
+from minisplat_ref.training.state import FiredEvent
 from minisplat_ref.types import Scene, View
 
 N_VIEWS, N_GAUSSIANS = 4, 30
@@ -125,6 +128,43 @@ def test_every_event_happens(scene):
     assert len(counts) == 40 and counts[-1] == len(state.gaussians.means)
     assert all(len(array) == counts[-1] for array in all_arrays(state).values())
     assert state.gaussians.sh_rest.any()  # degree 1 from iteration 10 on
+
+
+def test_the_loop_tells_what_fired(scene):
+    """Each event but those of every iteration, with the counts that it found and left."""
+    fired, counts = [], [N_GAUSSIANS]
+
+    def slowly(state, iteration):
+        time.sleep(0.05)
+        return "slept"
+
+    def on_step(report):
+        fired.extend((report.step, event) for event in report.fired)
+        counts.append(len(report.state.gaussians.means))
+
+    train(scene, RECIPE._replace(events=(*EVENTS, At(33, slowly))), seed=0, on_step=on_step)
+    of_ten = [(10, "clone_and_split"), (10, "prune_faint"), (20, "clone_and_split"), (20, "prune_faint")]
+    expected = [*of_ten, (20, "prune_large"), (25, "reset_opacity"), (33, "slowly")]
+    assert [(step, event.action) for step, event in fired] == expected
+    for step in (10, 20, 25, 33):
+        n = counts[step - 1]
+        for event in (event for at, event in fired if at == step):
+            assert event.n_before == n
+            n = event.n_after
+        assert n == counts[step]
+    assert fired[0][1].n_after > fired[0][1].n_before
+    assert [event.note for _, event in fired] == [None] * 6 + ["slept"]
+    assert fired[-1][1].seconds >= 0.05
+
+
+def test_the_loop_tells_whether_views_were_halved(scene, monkeypatch):
+    recipe, told = PLAIN._replace(iterations=4, half_size_until=3), []
+    train(scene, recipe, seed=0, on_step=lambda report: told.extend((report.step, event) for event in report.fired))
+    assert told == []  # the views are too small for it
+    monkeypatch.setattr(loop, "LEAST_HALF_SIZE", 8)
+    train(scene, recipe, seed=0, on_step=lambda report: told.extend((report.step, event) for event in report.fired))
+    n = N_GAUSSIANS
+    assert told == [(1, FiredEvent("half_size_views", n, n, 0.0, "until iteration 3"))]
 
 
 def test_mask_and_random_background(scene):

@@ -1,48 +1,77 @@
 """``compare``: trains a scene by several recipes, and sets their results side by side."""
 
 import argparse
-from collections.abc import Sequence
+import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter, integer, listed, name
+from minisplat_ref.errors import InputError
+from minisplat_ref.experiments.arguments import Commands, HelpFormatter, integer, listed, name, option_name
+
+if TYPE_CHECKING:
+    from minisplat_ref.experiments.comparison.plan import Plan
+    from minisplat_ref.types import Scene
+
+DEFAULTS: dict[str, Any] = {
+    "iterations": (3000,),
+    "seeds": (0,),
+    "downscale": 1,
+    "test_every": 8,
+    "eval_every": None,
+    "budget": None,
+    "simplify": None,
+    "scene_type": None,
+    "lpips_weights": None,
+    "init": None,
+}
 
 DESCRIPTION = """\
 Train a scene by several recipes, one training after the other, and set the
 results side by side. DIR will hold a run folder RECIPE-seedS for each training,
 compare.json, the figures as PNG, and report.html with all of it.
 
-The first recipe is what the others are compared with.
+The first recipe is what the others are compared with. After Ctrl-C or a crash
+--resume goes on: finished trainings are kept, one that was cut off continues.
 """
 EPILOG = """\
-example:
+examples:
   minisplat-ref compare photos/fox --recipes 3dgs-accel,mini-splatting2 \\
-      --iterations 3000,1800 --seeds 0,1,2 --out runs/fox-compared"""
+      --iterations 3000,1800 --seeds 0,1,2 --out runs/fox-compared
+  minisplat-ref compare --resume runs/fox-compared"""
+
+INTERRUPTED = 130  # exit code, of a training too
 
 COMPARE, REPORT = "compare.json", "report.html"
-PSNR_OVER_TIME, PSNR_OVER_COUNT, GALLERY = "psnr_over_time.png", "psnr_over_count.png", "gallery.png"
+PSNR_OVER_TIME, PSNR_OVER_ITERATIONS = "psnr_over_time.png", "psnr_over_iterations.png"
+PSNR_OVER_COUNT, CHAMFER_OVER_ITERATIONS = "psnr_over_count.png", "chamfer_over_iterations.png"
+GALLERY = "gallery.png"
 
 
 def add_parser(commands: Commands) -> None:
-    """Add the command."""
+    """Add the command. Options that are not given are absent, so that ``--resume`` can tell."""
     parser = commands.add_parser(
         "compare",
         help="train a scene by several recipes and compare them",
+        usage="minisplat-ref compare [-h] SCENE --recipes A,B --out DIR [options]\n"
+        "       minisplat-ref compare --resume DIR",
         description=DESCRIPTION,
         epilog=EPILOG,
         formatter_class=HelpFormatter,
+        argument_default=argparse.SUPPRESS,
     )
-    parser.add_argument("scene", type=Path, metavar="SCENE", help="folder of a scene, as for train")
-    parser.add_argument("--recipes", type=listed(name), required=True, metavar="A,B", help="names as in train --recipe")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for the results")
+    parser.add_argument("scene", nargs="?", metavar="SCENE", help="folder of a scene, as for train")
+    parser.add_argument("--recipes", type=listed(name), metavar="A,B", help="names as in train --recipe")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="new folder for the results")
+    parser.add_argument("--resume", type=Path, metavar="DIR", help="continue the comparison in DIR")
     parser.add_argument(
         "--iterations",
         type=listed(integer(1)),
-        default=(3000,),
         metavar="N",
         help="of every training, or N,M with a number for each recipe (default 3000)",
     )
+    parser.add_argument("--seeds", type=listed(integer(0)), metavar="S,T", help="of the trainings (default 0)")
     parser.add_argument(
-        "--seeds", type=listed(integer(0)), default=(0,), metavar="S,T", help="of the trainings (default 0)"
+        "--eval-every", type=integer(1), metavar="K", help="measure test views each K-th (default 24 times in all)"
     )
     parser.add_argument(
         "--budget", type=integer(1), metavar="N", help="as for train, for the recipes that simplify to one"
@@ -52,10 +81,10 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument("--scene-type", choices=("indoor", "outdoor"), metavar="T", help="likewise: indoor or outdoor")
     parser.add_argument(
-        "--downscale", type=integer(1), default=1, metavar="D", help="make the photographs D times smaller (default 1)"
+        "--downscale", type=integer(1), metavar="D", help="make the photographs D times smaller (default 1)"
     )
     parser.add_argument(
-        "--test-every", type=integer(0), default=8, metavar="K", help="hold out every K-th for testing (default 8)"
+        "--test-every", type=integer(0), metavar="K", help="hold out every K-th for testing (default 8)"
     )
     parser.add_argument("--init", type=Path, metavar="PLY", help="as for train: points to start from")
     parser.add_argument("--lpips-weights", type=Path, metavar="NPZ", help="as for train, which measures LPIPS by it")
@@ -65,34 +94,57 @@ def add_parser(commands: Commands) -> None:
 def run(args: argparse.Namespace) -> int:
     """Train, measure, write the files, print the table."""
     from minisplat_ref.experiments import run_folder
-    from minisplat_ref.experiments.comparison.plan import Plan, check
-    from minisplat_ref.experiments.comparison.runs import train_all, warm_up
+    from minisplat_ref.experiments.comparison.plan import check, remove_if_unused, save_plan
+    from minisplat_ref.experiments.comparison.runs import statuses, train_all, warm_up
 
-    plan = Plan(
-        scene=args.scene,
-        folder=args.out,
-        recipes=args.recipes,
-        iterations=_for_each(args.iterations, len(args.recipes)),
-        seeds=args.seeds,
-        downscale=args.downscale,
-        test_every=args.test_every,
-        budget=args.budget,
-        simplify=args.simplify,
-        scene_type=args.scene_type,
-        lpips_weights=args.lpips_weights,
-        init=args.init,
-    )
+    given = vars(args)
+    plan = _resumed(given) if "resume" in given else _new(given)
     scene = check(plan)
-    warm_up(plan, scene)
+    stages = statuses(plan)
+    if any(stage != "finished" for stage in stages):
+        warm_up(plan, scene)
     run_folder.create(plan.folder)
-    code = train_all(plan)
-    if code != 0:
-        if not any(plan.folder.iterdir()):  # the first training was refused
-            plan.folder.rmdir()
-        return code
+    save_plan(plan)
+    try:
+        code = train_all(plan, stages)
+        if code == 0:
+            _report(plan, scene)
+    except KeyboardInterrupt:
+        code = INTERRUPTED
+    if code == INTERRUPTED:
+        print(f"minisplat-ref: interrupted; to continue: minisplat-ref compare --resume {plan.folder}", file=sys.stderr)
+    elif code != 0:
+        remove_if_unused(plan.folder)
+    return code
 
-    from minisplat_ref.experiments.comparison import figures
-    from minisplat_ref.experiments.comparison.report import notes, report_html
+
+def _new(given: dict[str, Any]) -> "Plan":
+    from minisplat_ref.experiments.comparison.plan import Plan, check_free
+
+    for needed, example in (("scene", "a SCENE to train on"), ("recipes", "--recipes A,B"), ("out", "--out DIR")):
+        if needed not in given:
+            raise InputError(f"give {example}, or --resume DIR to continue a comparison")
+    check_free(given["out"])
+    options = {name: given.get(name, default) for name, default in DEFAULTS.items()}
+    n_lengths = len(options["iterations"])
+    options["iterations"] *= len(given["recipes"]) if n_lengths == 1 else 1  # a single number is for all
+    return Plan(scene=Path(given["scene"]), folder=given["out"], recipes=given["recipes"], **options)
+
+
+def _resumed(given: dict[str, Any]) -> "Plan":
+    from minisplat_ref.experiments.comparison.plan import load_plan
+
+    surplus = [option_name(name) for name in ("scene", "recipes", "out", *DEFAULTS) if name in given]
+    if surplus:
+        raise InputError(f"--resume takes the comparison's own settings: leave out {', '.join(surplus)}")
+    return load_plan(given["resume"])
+
+
+def _report(plan: "Plan", scene: "Scene") -> None:
+    """Write the figures, the page and compare.json, and print the tables."""
+    from minisplat_ref.experiments import run_folder
+    from minisplat_ref.experiments.comparison import figures, mechanisms
+    from minisplat_ref.experiments.comparison.report import fired_title, notes, report_html
     from minisplat_ref.experiments.comparison.results import collect, to_json
     from minisplat_ref.experiments.comparison.table import table_cells
     from minisplat_ref.experiments.plots import save_png
@@ -100,17 +152,17 @@ def run(args: argparse.Namespace) -> int:
 
     results = collect(plan, scene)
     save_png(figures.psnr_over_time(results.curves), plan.folder / PSNR_OVER_TIME)
+    save_png(figures.psnr_over_iterations(results.curves), plan.folder / PSNR_OVER_ITERATIONS)
     save_png(figures.psnr_over_count(results.curves), plan.folder / PSNR_OVER_COUNT)
+    if figures.is_chamfer_known(results.curves):
+        save_png(figures.chamfer_over_iterations(results.curves), plan.folder / CHAMFER_OVER_ITERATIONS)
     save_png(figures.gallery(results.crops, plan.recipes), plan.folder / GALLERY)
     (plan.folder / REPORT).write_text(report_html(plan, scene, results), encoding="utf-8")
     run_folder.write_json(plan.folder / COMPARE, to_json(plan, scene, results))
     heading, *rows = table_cells(results.recipes)
     print(f"\n{scene.name}; {results.machine}\n\n{markdown_table(heading, rows)}\n")
     print("\n".join(notes(plan, results)))
-    print(f"open {(plan.folder / REPORT).resolve()}")
-    return 0
-
-
-def _for_each(iterations: Sequence[int], n_recipes: int) -> tuple[int, ...]:
-    """Repeat a single number for all recipes."""
-    return tuple(iterations) * (n_recipes if len(iterations) == 1 else 1)
+    for fired in results.fired:
+        print(f"\n{fired_title(fired)}\n\n{markdown_table(mechanisms.HEADING, mechanisms.rows(fired))}")
+        print("\n".join(mechanisms.remarks(fired)))
+    print(f"\nopen {(plan.folder / REPORT).resolve()}")

@@ -10,6 +10,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.arguments import Commands, HelpFormatter
 
 if TYPE_CHECKING:
+    from minisplat_ref.experiments.settings import Settings
     from minisplat_ref.types import Floats
 
 NOT_SHOWN = ("per_view", "n_gaussians", "iterations")  # of metrics.json: too long, or said by the PLY or checkpoint
@@ -21,7 +22,7 @@ Say what is in a file or folder: counts, SH degree, bounds, sizes.
 
   point_cloud.ply   Gaussians in the 3DGS layout, whoever wrote them
   checkpoint.npz    a training that can be continued
-  run folder        the --out of a training: settings, measures and Gaussians
+  run folder        the --out of a training: settings, measures, what fired
   scene folder      COLMAP (images/, sparse/0/) or transforms.json
 
 Everything is read and checked; of damaged input it says what is wrong.
@@ -105,16 +106,33 @@ def _shape(array: "Floats") -> str:
 
 
 def _run_rows(folder: Path) -> Rows:
-    from minisplat_ref.experiments.run_folder import CHECKPOINT, METRICS, read_json_object
+    from minisplat_ref.experiments.run_folder import CHECKPOINT, EVENTS, METRICS, read_json_object
     from minisplat_ref.experiments.settings import load
 
-    rows = [(name.replace("_", " "), str(value)) for name, value in load(folder)._asdict().items()]
+    settings = load(folder)
+    rows = [(name.replace("_", " "), str(value)) for name, value in settings._asdict().items()]
     if (folder / METRICS).exists():
         metrics = read_json_object(folder / METRICS)
         rows += [(name.replace("_", " "), _short(metrics[name])) for name in metrics if name not in NOT_SHOWN]
+    if (folder / EVENTS).exists():
+        rows += _event_rows(folder, settings)
     if (folder / CHECKPOINT).exists():
         rows += _checkpoint_rows(folder / CHECKPOINT)
     return rows
+
+
+def _event_rows(folder: Path, settings: "Settings") -> Rows:
+    """Say which mechanisms of the recipe were active, and which never."""
+    from minisplat_ref.experiments.events import describe, never_fired, published_times, read_mechanisms
+    from minisplat_ref.experiments.run_folder import EVENTS, is_finished
+    from minisplat_ref.extensions.extension import find_recipe
+
+    published = published_times(find_recipe(settings.recipe, extension=settings.extension))
+    found = read_mechanisms(folder / EVENTS, published)
+    never = never_fired(found, published)
+    rows = [(f"fired: {mechanism.action}", describe(mechanism)) for mechanism in found]
+    name = "never fired" if is_finished(folder, settings.iterations) else "not fired yet"
+    return [*rows, *([(name, ", ".join(never))] if never else [])]
 
 
 def _scene_rows(path: Path) -> Rows:

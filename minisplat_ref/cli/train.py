@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter, add_renderer_arguments, assignment, integer
+from minisplat_ref.experiments.arguments import (
+    Commands,
+    HelpFormatter,
+    add_renderer_arguments,
+    assignment,
+    integer,
+    option_name,
+)
 
 if TYPE_CHECKING:
     from minisplat_ref.experiments.settings import Settings
@@ -172,7 +179,7 @@ def _resume(folder: Path, given: dict[str, Any]) -> int:
     surplus = [name for name in ("scene", "out", *DEFAULTS) if name in given and name not in RESUMABLE]
     if surplus:
         raise InputError(
-            f"--resume takes the run's own settings: leave out {', '.join(_option(name) for name in surplus)}"
+            f"--resume takes the run's own settings: leave out {', '.join(option_name(name) for name in surplus)}"
         )
 
     from minisplat_ref.experiments import run_folder, settings
@@ -185,7 +192,8 @@ def _resume(folder: Path, given: dict[str, Any]) -> int:
         ours = ours._replace(lpips_weights=_absolute(given["lpips_weights"]))
     recipe = settings.recipe_of(ours)
     state = load_state(folder / run_folder.CHECKPOINT, recipe)
-    if state.step >= ours.iterations:
+    is_done = state.step == ours.iterations and run_folder.is_finished(folder, ours.iterations)
+    if state.step > ours.iterations or is_done:  # one that was killed while it was measured goes on with that
         raise InputError(
             f"{folder} has done {state.step} iterations: give --iterations above {state.step} to train further"
         )
@@ -229,8 +237,3 @@ def _train(
 def _absolute(path: Path | None) -> str | None:
     """Return a path as the settings of a run keep it: they are read from other folders, too."""
     return None if path is None else str(path.resolve())
-
-
-def _option(name: str) -> str:
-    """How a setting is called on the command line."""
-    return name.upper() if name == "scene" else f"--{name.replace('_', '-')}"

@@ -3,8 +3,9 @@
 A run and its folder: what ``train`` does
     :mod:`.settings` (what was asked for, ``config.json``), :mod:`.start` (points to start from), :mod:`.run_folder`
     (which file is called what), :mod:`.run` (the training, with checkpoints), :mod:`.progress` (bar and ``log.jsonl``),
-    :mod:`.curve` (``curve.jsonl``), :mod:`.scoring` (``metrics.json`` and ``renders/``), :mod:`.first_use` (compiles
-    the kernels ahead).
+    :mod:`.events` (what fired, ``events.jsonl``), :mod:`.curve` (``curve.jsonl``) and :mod:`.surface` (the true one,
+    where it is known), :mod:`.scoring` (``metrics.json`` and ``renders/``), :mod:`.first_use` (compiles the kernels
+    ahead).
 
 More than one run
     :mod:`.comparison` (several recipes side by side: ``compare``), :mod:`.studies` (what a choice in a method does:

@@ -74,6 +74,11 @@ def assignment(text: str) -> tuple[str, str]:
     return name.strip(), value.strip()
 
 
+def option_name(name: str) -> str:
+    """Return how a setting is called on the command line."""
+    return name.upper() if name == "scene" else f"--{name.replace('_', '-')}"
+
+
 def add_renderer_arguments(parser: argparse._ActionsContainer, default: str | None, whose: str = "") -> None:
     """Add ``--profile``, a key of ``PROFILES``, and ``--backend``.
 

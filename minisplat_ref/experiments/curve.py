@@ -1,4 +1,7 @@
-"""How good a training was when: ``curve.jsonl``, a record for each time that the test views were measured."""
+"""How good a training was when: ``curve.jsonl``, a record for each time that the test views were measured.
+
+Where the scene folder holds true depths, a record also has ``chamfer``: see :mod:`.surface`.
+"""
 
 import json
 from pathlib import Path
@@ -27,7 +30,9 @@ def keep_until(path: Path, step: int) -> None:
     path.write_text("".join(json.dumps(record) + "\n" for record in records), encoding="utf-8")
 
 
-def append(path: Path, step: int, seconds: float, evaluation: Evaluation, n_gaussians: int) -> None:
+def append(
+    path: Path, step: int, seconds: float, evaluation: Evaluation, n_gaussians: int, **further: float | None
+) -> None:
     """Add a record; a step that is there already, where a training was interrupted, is not measured twice.
 
     Parameters
@@ -41,6 +46,8 @@ def append(path: Path, step: int, seconds: float, evaluation: Evaluation, n_gaus
     evaluation : Evaluation
         Of at least one view.
     n_gaussians : int
+    further : float or None
+        What else was measured, by name.
     """
     assert evaluation.psnr is not None, "check_views has found views"
     if any(record["step"] == step for record in read_log(path)):
@@ -51,6 +58,7 @@ def append(path: Path, step: int, seconds: float, evaluation: Evaluation, n_gaus
         "psnr": min(evaluation.psnr, PSNR_MAX),
         "ssim": evaluation.ssim,
         "n_gaussians": n_gaussians,
+        **further,
     }
     with open(path, "a", encoding="utf-8") as file:
         file.write(json.dumps(record) + "\n")

@@ -120,9 +120,9 @@ def panel(label: str, figures: Sequence[str], n_columns: int = 3) -> str:
     )
 
 
-def curves(svgs: Sequence[str]) -> str:
-    """Return curves side by side."""
-    return f'<div class="panel row" style="--columns: {len(svgs)}">{"".join(svgs)}</div>'
+def curves(svgs: Sequence[str], n_columns: int = 3) -> str:
+    """Return curves side by side, in as many rows as it takes."""
+    return f'<div class="panel row" style="--columns: {min(n_columns, len(svgs))}">{"".join(svgs)}</div>'
 
 
 def captioned(picture: Picture, caption: str) -> str:

@@ -4,14 +4,15 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from minisplat_ref.backends import get_backend
 from minisplat_ref.constants import PROFILES
-from minisplat_ref.experiments import curve, run_folder
+from minisplat_ref.experiments import curve, events, run_folder
 from minisplat_ref.experiments.progress import Progress
 from minisplat_ref.experiments.scoring import measure, score, to_metrics
 from minisplat_ref.experiments.settings import Settings, save_model, to_config
+from minisplat_ref.experiments.surface import Surface, surface_distance, true_surface
 from minisplat_ref.io import viewpoints
 from minisplat_ref.lpips import Network
 from minisplat_ref.metrics import Evaluation
@@ -66,10 +67,16 @@ def run_training(
     run_folder.write_json(folder / run_folder.CONFIG, to_config(settings, recipe, scene))
     run_folder.write_json(folder / run_folder.CAMERAS, viewpoints.to_json(viewpoints.scene_viewpoints(scene)))
     progress = Progress(folder / run_folder.LOG, state.step, settings.iterations)
-    callbacks: list[Callable[[StepReport], None]] = [progress, _checkpoints(folder, recipe)]
+    callbacks: list[Callable[[StepReport], None]] = [progress]
+    if state.step == 0 or (folder / run_folder.EVENTS).exists():  # else half a record would hide what fired before
+        curve.keep_until(folder / run_folder.EVENTS, state.step)
+        callbacks.append(_events(folder / run_folder.EVENTS))
+    surface = None
     if settings.eval_every:
+        surface = true_surface(Path(settings.scene), scene)
         curve.keep_until(folder / run_folder.CURVE, state.step)
-        callbacks.append(_curve(folder / run_folder.CURVE, scene, settings, progress))
+        callbacks.append(_curve(folder / run_folder.CURVE, scene, settings, progress, surface))
+    callbacks.append(_checkpoints(folder, recipe))  # after the records: what it continues from is in them
 
     def on_step(report: StepReport) -> None:
         for callback in callbacks:
@@ -96,7 +103,8 @@ def run_training(
     evaluation = score(folder, scene, state.model, settings, network)
     n_gaussians = len(state.gaussians.means)
     if settings.eval_every:
-        curve.append(folder / run_folder.CURVE, state.step, seconds, evaluation, n_gaussians)
+        further = _chamfer(state.gaussians, surface)
+        curve.append(folder / run_folder.CURVE, state.step, seconds, evaluation, n_gaussians, **further)
     metrics = {
         "n_gaussians": n_gaussians,
         "iterations": state.step,
@@ -121,7 +129,14 @@ def _checkpoints(folder: Path, recipe: Recipe) -> Callable[[StepReport], None]:
     return on_step
 
 
-def _curve(path: Path, scene: Scene, settings: Settings, progress: Progress) -> Callable[[StepReport], None]:
+def _events(path: Path) -> Callable[[StepReport], None]:
+    """Return a callback of the loop that records what fired."""
+    return lambda report: events.append(path, report.step, report.fired)
+
+
+def _curve(
+    path: Path, scene: Scene, settings: Settings, progress: Progress, surface: Surface | None
+) -> Callable[[StepReport], None]:
     """Return a callback of the loop that measures the test views on the way, off the training's clock."""
 
     def on_step(report: StepReport) -> None:
@@ -129,9 +144,14 @@ def _curve(path: Path, scene: Scene, settings: Settings, progress: Progress) -> 
             return
         seconds, model = progress.seconds, report.state.model
         with progress.paused():
-            curve.append(path, report.step, seconds, measure(scene, model, settings), len(model.gaussians.means))
+            evaluation, further = measure(scene, model, settings), _chamfer(model.gaussians, surface)
+            curve.append(path, report.step, seconds, evaluation, len(model.gaussians.means), **further)
 
     return on_step
+
+
+def _chamfer(gaussians: Any, surface: Surface | None) -> dict[str, float | None]:
+    return {} if surface is None else {"chamfer": surface_distance(gaussians, surface)}
 
 
 def peak_rss_mb() -> float | None:

@@ -15,6 +15,7 @@ SHARED = "shared.npz"  # parameters that belong to no Gaussian, if there are any
 METRICS = "metrics.json"  # what was measured on the test views
 LOG = "log.jsonl"  # one record every few steps
 CURVE = "curve.jsonl"  # the test views measured every --eval-every steps, if that was asked for
+EVENTS = "events.jsonl"  # one record each time that an event of the recipe acted
 CHECKPOINT = "checkpoint.npz"  # what `--resume` continues from
 CAMERAS = "cameras.json"  # cameras of all views, so that they can be rendered without the photographs
 RENDERS = "renders"  # truth | render | error of each test view
@@ -48,6 +49,11 @@ def create(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder} cannot be created ({error.strerror}): give another --out") from error
+
+
+def is_finished(folder: Path, iterations: int) -> bool:
+    """Return whether a run has been measured after its last iteration: that is what it does in the end."""
+    return (folder / METRICS).exists() and read_json_object(folder / METRICS).get("iterations") == iterations
 
 
 def remove(folder: Path) -> None:

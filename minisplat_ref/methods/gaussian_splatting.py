@@ -46,7 +46,7 @@ def clone_and_split(
     size_fraction: float,
     draw_children: Callable[..., Gaussians] = clone_split.random_children,
     most_per_pixel: float = math.inf,
-) -> None:
+) -> str | None:
     """Densify where the mean of the collected gradients reaches ``threshold``, and start collecting anew.
 
     Gaussians larger than ``size_fraction`` of the scene's extent are split, the others cloned; those that
@@ -54,7 +54,7 @@ def clone_and_split(
     ``most_per_pixel`` Gaussians or more for each pixel of the training views, collecting goes on instead.
     """
     if n_rows(state.gaussians) >= most_per_pixel * n_pixels(iteration.scene):
-        return
+        return "paused: as many Gaussians as most_per_pixel allows"
     means = state.stats.pop("gradient_sum") / np.maximum(state.stats.pop("view_count"), 1)
     is_blurred = state.stats.pop("is_blurred", None)
     edit = clone_split.clone_and_split(
@@ -67,6 +67,7 @@ def clone_and_split(
         rng=state.rng,
     )
     apply_edit(state, edit)
+    return None
 
 
 def prune_faint(state: TrainState, iteration: Iteration, *, least_opacity: float) -> None:
@@ -88,10 +89,12 @@ def reset_opacity(state: TrainState, iteration: Iteration, *, ceiling: float) ->
         moment.opacity_logits[:] = 0
 
 
-def reset_opacity_on_white(state: TrainState, iteration: Iteration, *, ceiling: float) -> None:
+def reset_opacity_on_white(state: TrainState, iteration: Iteration, *, ceiling: float) -> str | None:
     """As :func:`reset_opacity`, if the scene is in front of white, where early floaters hide best."""
-    if np.all(iteration.scene.background == 1.0):
-        reset_opacity(state, iteration, ceiling=ceiling)
+    if not np.all(iteration.scene.background == 1.0):
+        return "nothing done: the background is not white"
+    reset_opacity(state, iteration, ceiling=ceiling)
+    return None
 
 
 # Densification needs the mean gradient over about all views, and time to settle: each event multiplies the Gaussians

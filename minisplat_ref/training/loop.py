@@ -11,6 +11,7 @@ of Mini-Splatting2, if an event has made one, says which Gaussians take part in 
 import json
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,14 +27,15 @@ from minisplat_ref.io.checkpoint import load_checkpoint, save_checkpoint
 from minisplat_ref.io.scene import half_size
 from minisplat_ref.rendering import Request
 from minisplat_ref.strategy.initialization import initial_gaussians
-from minisplat_ref.strategy.ops import contiguous
+from minisplat_ref.strategy.ops import contiguous, n_rows
 from minisplat_ref.training.adam import AdamRule, AdamState, adam_step, fields_of, zero_moments
 from minisplat_ref.training.losses import Rendered, total_loss
 from minisplat_ref.training.rates import active_sh_degree
-from minisplat_ref.training.schedule import During, Recipe, describe
-from minisplat_ref.training.state import Iteration, StepReport, TrainState
+from minisplat_ref.training.schedule import During, Event, Recipe, action_name, describe
+from minisplat_ref.training.state import FiredEvent, Iteration, StepReport, TrainState
 from minisplat_ref.types import Floats, Scene, numbered
 
+HALF_SIZE = "half_size_views"  # what training on views of half the size is called in the record of what fired
 SHARED_RULE = AdamRule(is_visible_only=False, has_bias_correction=True)  # shared parameters have no visible rows
 
 __all__ = ["StepReport", "TrainState", "initial_state", "load_state", "save_state", "train"]
@@ -128,6 +130,8 @@ def train(
         while state.step < recipe.iterations:
             seen = small_scene if state.step < recipe.half_size_until else scene
             report = _iterate(state, seen, recipe, backend, conventions)
+            if report.step == 1 and seen is not scene:
+                report = report._replace(fired=(_half_size_event(report, recipe), *report.fired))
             if on_step is not None:
                 on_step(report)
             del report  # and with it the image, before the next is made
@@ -181,10 +185,22 @@ def _iterate(state: TrainState, scene: Scene, recipe: Recipe, backend: Backend, 
         renderer,
         recipe.representation,
     )
-    for event in due:
-        event.action(state, iteration)
+    fired = [(event, _act(event, state, iteration)) for event in due]
     state.step = step
-    return StepReport(step, loss.value, view, output, state)
+    told = tuple(record for event, record in fired if not isinstance(event, During))
+    return StepReport(step, loss.value, view, output, state, told)
+
+
+def _act(event: Event, state: TrainState, iteration: Iteration) -> FiredEvent:
+    n_before, start = n_rows(state.gaussians), time.perf_counter()
+    note = event.action(state, iteration)
+    return FiredEvent(action_name(event), n_before, n_rows(state.gaussians), time.perf_counter() - start, note)
+
+
+def _half_size_event(report: StepReport, recipe: Recipe) -> FiredEvent:
+    """Return the record of what is no event, but can be off where views are small: the first iteration tells it."""
+    n = n_rows(report.state.gaussians)
+    return FiredEvent(HALF_SIZE, n, n, 0.0, f"until iteration {recipe.half_size_until}")
 
 
 def _with_direct(gradient: Any, direct: Mapping[str, Floats]) -> Any:

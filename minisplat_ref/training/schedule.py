@@ -20,7 +20,7 @@ from minisplat_ref.training.losses import LossTerm
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.representation import GAUSSIANS, Representation
 
-Action = Callable[..., None]
+Action = Callable[..., str | None]
 """``action(state, iteration)``; see :mod:`minisplat_ref.training.state`. Its settings are bound with ``partial``."""
 
 BLEND_STATS = frozenset({"stats"})
@@ -343,6 +343,11 @@ def describe(recipe: Recipe) -> dict[str, Any]:
             **_describe_function(recipe.representation.extend, "extend"),
         },
     }
+
+
+def action_name(event: Event) -> str:
+    """Return what the action of an event is called, in :func:`describe` and in the record of what fired."""
+    return _name(event.action)
 
 
 def _describe_event(event: Event) -> dict[str, Any]:

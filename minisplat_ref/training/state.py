@@ -1,8 +1,9 @@
 """The training state, what an action may look at, and how rows come and go.
 
 An action is a function ``action(state, iteration, **settings)`` that changes the :class:`TrainState` it is given; a
-recipe names it, its settings and the iterations at which it acts. :func:`apply_edit` and :func:`start_anew` are the two
-places where rows come and go.
+recipe names it, its settings and the iterations at which it acts. It returns None, or a note of a few words for the
+record: why it has changed nothing, for one. :func:`apply_edit` and :func:`start_anew` are the two places where rows
+come and go.
 """
 
 from dataclasses import dataclass, field
@@ -70,6 +71,21 @@ class Iteration(NamedTuple):
     """What the model is made of."""
 
 
+class FiredEvent(NamedTuple):
+    """What one event of the recipe has done in an iteration; events of every iteration (``During``) are not told."""
+
+    action: str
+    """Name of the action, as ``describe`` has it."""
+    n_before: int
+    """Gaussians when it began."""
+    n_after: int
+    """Gaussians when it was done."""
+    seconds: float
+    """How long it took."""
+    note: str | None = None
+    """What the action says of it, such as why it has changed nothing."""
+
+
 class StepReport(NamedTuple):
     """What ``train(on_step=...)`` is told after every iteration."""
 
@@ -82,6 +98,8 @@ class StepReport(NamedTuple):
     """The rendering that ``loss`` measures, float32, not clipped."""
     state: TrainState
     """The state after the iteration; it is safe to save."""
+    fired: tuple[FiredEvent, ...] = ()
+    """Events that acted after the gradient step, in their order."""
 
 
 def n_pixels(scene: Scene) -> int:

@@ -21,6 +21,11 @@ from minisplat_ref.io.images import write_image
 from minisplat_ref.types import Camera, Floats, Ints, View
 
 CAMERA_ID = 1  # one camera takes all pictures; COLMAP counts from 1
+INFO = "scene_info.json"
+UNITS = (
+    "metres, world z up; depths are camera z at pixel centres, 0 at the sky; normals are in the world frame, towards "
+    "the camera, 0 at the sky"
+)
 
 
 def check_free(folder: Path) -> None:
@@ -66,6 +71,47 @@ def write_scene(synthetic: SyntheticScene, folder: Path, settings: Mapping[str, 
         raise InputError(f"{folder}: cannot be written ({error}); choose another place") from error
 
 
+def load_depths(folder: Path, names: Sequence[str]) -> list[Floats] | None:
+    """Return the true depths [H, W] of views; None where :func:`write_scene` has not written them.
+
+    Parameters
+    ----------
+    folder : Path
+        Of any scene.
+    names : sequence of str
+        Of the views, without suffix.
+
+    Returns
+    -------
+    list of ndarrays of shape (H, W) or None
+        float32 camera z at pixel centres, world units; 0 at the sky.
+
+    Raises
+    ------
+    InputError
+        A file is damaged.
+    """
+    paths = [folder / "depths" / f"{name}.npy" for name in names]
+    try:
+        info = json.loads((folder / INFO).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    # Other programs leave depths/ and other notes: the sentence on units is what says that these are the truth.
+    if not isinstance(info, dict) or info.get("units") != UNITS or not all(path.is_file() for path in paths):
+        return None
+    return [_load_depth(path) for path in paths]
+
+
+def _load_depth(path: Path) -> Floats:
+    try:
+        depth = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"{path} cannot be read ({error}): write the scene anew, or remove depths/") from error
+    if depth.ndim != 2 or depth.dtype != np.float32:
+        raise InputError(f"{path} holds no depth [H, W] of float32: write the scene anew, or remove depths/")
+    return depth
+
+
 def _write_files(synthetic: SyntheticScene, folder: Path, settings: Mapping[str, Any]) -> None:
     """Everything that the folder holds."""
     scene = synthetic.scene
@@ -95,10 +141,9 @@ def _write_files(synthetic: SyntheticScene, folder: Path, settings: Mapping[str,
         "train_views": [view.name for view in scene.train_views],
         "test_views": [view.name for view in scene.test_views],
         "n_points": len(scene.points),
-        "units": "metres, world z up; depths are camera z at pixel centres, 0 at the sky; normals are in the world "
-        "frame, towards the camera, 0 at the sky",
+        "units": UNITS,
     }
-    (folder / "scene_info.json").write_text(json.dumps(info, indent=2) + "\n")
+    (folder / INFO).write_text(json.dumps(info, indent=2) + "\n")
 
 
 def _camera_line(camera: Camera) -> str:

@@ -1,5 +1,6 @@
-"""The figures of a comparison: PSNR over time, PSNR over the number of Gaussians, and the gallery."""
+"""The figures of a comparison: PSNR over time, iterations and number of Gaussians, the surface, and the gallery."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -8,11 +9,19 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from minisplat_ref.experiments.comparison.crops import Crop
+from minisplat_ref.experiments.comparison.measures import best_record
 from minisplat_ref.experiments.plots import PLOT_STYLE, TITLE_COLOR, plot
 
 COLORS = ("#b4553d", "#2d6a8e", "#4b7f52", "#8a5a9e", "#b08a2e", "#5a6570")  # of the recipes, in their order
 SIZE = (5.6, 4.0)  # inches, of a plot
 CROP_WIDTH = 2.2  # inches, in the gallery
+BEST_MARK: dict[str, Any] = {
+    "marker": "*",
+    "markersize": 13,
+    "markeredgecolor": "white",
+    "linestyle": "none",
+    "zorder": 5,  # over the lines of all recipes
+}
 
 Curves = Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]
 """For every recipe the records of ``curve.jsonl`` of each seed."""
@@ -24,19 +33,46 @@ def color(index: int) -> str:
 
 
 def psnr_over_time(curves: Curves) -> Figure:
-    """Draw the PSNR of the test views over the training time: a line per run, a colour per recipe."""
-    with plot("PSNR of the test views (dB)", "training time (s)", SIZE) as (figure, axes):
+    """Draw the PSNR of the test views over the training time: a line per run, a colour per recipe, a star its best."""
+    return _over(curves, "seconds", "psnr", "PSNR of the test views (dB)", "training time (s)")
+
+
+def psnr_over_iterations(curves: Curves) -> Figure:
+    """Draw the same over the iterations."""
+    return _over(curves, "step", "psnr", "PSNR of the test views (dB)", "iterations")
+
+
+def chamfer_over_iterations(curves: Curves) -> Figure:
+    """Draw the distance to the true surface over the iterations, where it is known."""
+    return _over(curves, "step", "chamfer", "Chamfer distance to the true surface (extents)", "iterations")
+
+
+def is_chamfer_known(curves: Curves) -> bool:
+    """Return whether some record has a distance to a true surface."""
+    return any(record.get("chamfer") is not None for runs in curves.values() for records in runs for record in records)
+
+
+def _over(curves: Curves, x: str, y: str, title: str, x_label: str) -> Figure:
+    with plot(title, x_label, SIZE) as (figure, axes):
         for index, (recipe, runs) in enumerate(curves.items()):
             for number, records in enumerate(runs):
                 axes.plot(
-                    [record["seconds"] for record in records],
-                    [record["psnr"] for record in records],
+                    [record[x] for record in records],
+                    [math.nan if record[y] is None else record[y] for record in records],  # a gap
                     color=color(index),
-                    linewidth=1.8,
+                    linewidth=1.6,
                     marker="o",
-                    markersize=3,
+                    markersize=2.5,
                     label=recipe if number == 0 else None,
                 )
+                if y == "psnr":
+                    best = best_record(records)
+                    axes.plot(best[x], best[y], **BEST_MARK, color=color(index))
+        if y == "psnr":
+            axes.plot([], [], **BEST_MARK, color=TITLE_COLOR, label="best of a run")
+        axes.margins(x=0.03)  # room for a star at the end
+        axes.set_xlim(left=0)
+        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
         axes.legend(loc="best", frameon=False)
     return figure
 

@@ -23,7 +23,7 @@ class Measure(NamedTuple):
     """What it is, with its unit."""
     format: str
     """Of a value."""
-    relation: Literal["ratio", "difference"]
+    relation: Literal["ratio", "difference"] | None
     """How a recipe is set against the first; decibels and SSIM have no meaningful ratio."""
 
 
@@ -31,9 +31,13 @@ MEASURES = (
     Measure("psnr", "PSNR (dB)", ".2f", "difference"),
     Measure("ssim", "SSIM", ".4f", "difference"),
     Measure("lpips", "LPIPS", ".4f", "difference"),
+    Measure("best_psnr", "best PSNR on the way (dB)", ".2f", "difference"),
+    Measure("best_iteration", "reached at iteration", ",.0f", None),
+    Measure("chamfer", "Chamfer distance to the true surface (extents)", ".4f", "ratio"),
     Measure("n_gaussians", "Gaussians", ",.0f", "ratio"),
     Measure("train_seconds", "training (s)", ".1f", "ratio"),
     Measure("seconds_to_first", "until the first's final PSNR (s)", ".1f", "ratio"),
+    Measure("iterations_to_first", "the same (iterations)", ",.0f", "ratio"),
     Measure("iterations_per_second", "iterations/s", ".1f", "ratio"),
     Measure("peak_rss_mb", "peak memory of the process (MB)", ".0f", "ratio"),
     Measure("densifying_mb", "model, gradients, moments while densifying (MB)", ".1f", "ratio"),
@@ -76,9 +80,21 @@ class RecipeMeasures(NamedTuple):
         """Return mean and standard deviation of a measure over the seeds."""
         return spread([run[measure.key] for run in self.runs])
 
+    def error_of_difference(self, measure: Measure, first: "RecipeMeasures") -> float | None:
+        """Return the standard error of the mean difference to the first recipe, paired by seed.
+
+        Recipes that are trained with one seed see the same views in the same order; what such a seed does to both is no
+        part of the difference. None of a single seed, or where a value lacks.
+        """
+        pairs = zip((run[measure.key] for run in self.runs), (run[measure.key] for run in first.runs), strict=True)
+        differences = [ours - theirs for ours, theirs in pairs if ours is not None and theirs is not None]
+        if len(differences) < max(2, len(self.runs)):
+            return None
+        return float(np.std(differences, ddof=1) / math.sqrt(len(differences)))
+
 
 def read_curve(folder: Path) -> list[dict[str, Any]]:
-    """Return the records of a run's test views on the way: step, seconds, psnr, ssim, n_gaussians."""
+    """Return the records of a run's test views on the way: step, seconds, psnr, ssim, n_gaussians, perhaps chamfer."""
     return read_log(folder / run_folder.CURVE)
 
 
@@ -96,14 +112,21 @@ def read_measures(folder: Path, target_psnr: float, render_fps: float) -> dict[s
     """
     metrics = run_folder.read_json_object(folder / run_folder.METRICS)
     end = densification_end(run_folder.read_json_object(folder / run_folder.CONFIG)["recipe"])
+    curve = read_curve(folder)
+    best = best_record(curve)
+    reached = first_to_reach(curve, target_psnr)
     densifying, densified = peak_training_mb(read_log(folder / run_folder.LOG), end)
     return {
         "psnr": metrics["psnr"],
         "ssim": metrics["ssim"],
         "lpips": metrics["lpips"],
+        "best_psnr": best["psnr"],
+        "best_iteration": best["step"],
+        "chamfer": curve[-1].get("chamfer"),
         "n_gaussians": metrics["n_gaussians"],
         "train_seconds": metrics["train_seconds"],
-        "seconds_to_first": seconds_to_reach(read_curve(folder), target_psnr),
+        "seconds_to_first": None if reached is None else reached["seconds"],
+        "iterations_to_first": None if reached is None else reached["step"],
         "iterations_per_second": metrics["iterations"] / metrics["train_seconds"],
         "peak_rss_mb": metrics["peak_rss_mb"],
         "densifying_mb": densifying,
@@ -118,12 +141,17 @@ def final_psnr(folder: Path) -> float:
     return float(read_curve(folder)[-1]["psnr"])
 
 
-def seconds_to_reach(curve: Sequence[Mapping[str, Any]], psnr: float) -> float | None:
-    """Return the training time of the first record of at least this PSNR; None where there is none.
+def best_record(curve: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+    """Return the record of the highest PSNR; of equal ones the first."""
+    return max(curve, key=lambda record: record["psnr"])
+
+
+def first_to_reach(curve: Sequence[Mapping[str, Any]], psnr: float) -> Mapping[str, Any] | None:
+    """Return the first record of at least this PSNR; None where there is none.
 
     The PSNR may have been reached at any time since the record before: this is the latest it can have been.
     """
-    return next((float(record["seconds"]) for record in curve if record["psnr"] >= psnr), None)
+    return next((record for record in curve if record["psnr"] >= psnr), None)
 
 
 def peak_training_mb(log: Sequence[Mapping[str, Any]], end: float) -> tuple[float | None, float | None]:
@@ -152,6 +180,8 @@ def densification_end(recipe: Mapping[str, Any]) -> float:
 
 def relation(measure: Measure, value: Spread, first: Spread) -> float | None:
     """Return how a recipe's mean stands to that of the first recipe: its ratio or difference; None where one lacks."""
-    if value.mean is None or first.mean is None or (measure.relation == "ratio" and first.mean == 0):
+    if measure.relation is None or value.mean is None or first.mean is None:
+        return None
+    if measure.relation == "ratio" and first.mean == 0:
         return None
     return value.mean - first.mean if measure.relation == "difference" else value.mean / first.mean

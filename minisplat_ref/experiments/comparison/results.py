@@ -14,7 +14,8 @@ from minisplat_ref.experiments.comparison.measures import (
     read_measures,
     relation,
 )
-from minisplat_ref.experiments.comparison.plan import Plan, eval_every
+from minisplat_ref.experiments.comparison.mechanisms import Fired, read_fired
+from minisplat_ref.experiments.comparison.plan import Plan
 from minisplat_ref.experiments.comparison.speed import render_rates
 from minisplat_ref.experiments.scoring import load_trained
 from minisplat_ref.reporting import describe_machine
@@ -28,6 +29,8 @@ class Results(NamedTuple):
     """Measures, in the order of the plan."""
     curves: dict[str, list[list[dict[str, Any]]]]
     """For every recipe the records of ``curve.jsonl`` of each seed."""
+    fired: Sequence[Fired]
+    """Which mechanisms acted, in the order of the plan."""
     crops: Sequence[Crop]
     """Parts of test views, rendered with the first seed of each recipe."""
     lpips_reason: str | None
@@ -63,6 +66,7 @@ def collect(plan: Plan, scene: Scene) -> Results:
     return Results(
         recipes=recipes,
         curves={recipe: [read_curve(run.folder) for run in plan.runs_of(recipe)] for recipe in plan.recipes},
+        fired=read_fired(plan),
         crops=choose_crops(shown, scene),
         lpips_reason=metrics["lpips_reason"],
         lpips_network=metrics["lpips_network"],
@@ -78,8 +82,8 @@ def to_json(plan: Plan, scene: Scene, results: Results) -> dict[str, Any]:
             **plan._asdict(),
             "scene": str(plan.scene.resolve()),
             "folder": str(plan.folder.resolve()),
-            **{name: None if file is None else str(file.resolve()) for name, file in plan.files.items()},
-            "eval_every": [eval_every(iterations) for iterations in plan.iterations],
+            **plan.files,
+            "eval_every": [plan.runs_of(recipe)[0].eval_every for recipe in plan.recipes],
         },
         "scene": {
             "name": scene.name,
@@ -93,13 +97,16 @@ def to_json(plan: Plan, scene: Scene, results: Results) -> dict[str, Any]:
         "lpips_reason": results.lpips_reason,
         "lpips_network": results.lpips_network,
         "measures": [measure._asdict() for measure in MEASURES],
-        "recipes": [_recipe_to_json(plan, recipe, results.recipes[0]) for recipe in results.recipes],
+        "recipes": [
+            _recipe_to_json(plan, recipe, results.recipes[0], fired)
+            for recipe, fired in zip(results.recipes, results.fired, strict=True)
+        ],
     }
 
 
-def _recipe_to_json(plan: Plan, recipe: RecipeMeasures, first: RecipeMeasures) -> dict[str, Any]:
+def _recipe_to_json(plan: Plan, recipe: RecipeMeasures, first: RecipeMeasures, fired: Fired) -> dict[str, Any]:
     spreads = {measure: recipe.spread_of(measure) for measure in MEASURES}
-    runs = zip(plan.runs_of(recipe.recipe), recipe.runs, strict=True)
+    runs = zip(plan.runs_of(recipe.recipe), recipe.runs, fired.runs, strict=True)
     return {
         "recipe": recipe.recipe,
         "mean": {measure.key: value.mean for measure, value in spreads.items()},
@@ -107,5 +114,19 @@ def _recipe_to_json(plan: Plan, recipe: RecipeMeasures, first: RecipeMeasures) -
         "relative_to_first": {
             measure.key: relation(measure, value, first.spread_of(measure)) for measure, value in spreads.items()
         },
-        "runs": [{"seed": run.seed, "folder": run.folder.name, **measures} for run, measures in runs],
+        "error_of_difference": {
+            measure.key: recipe.error_of_difference(measure, first)
+            for measure in MEASURES
+            if measure.relation == "difference"
+        },
+        "never_fired": fired.never,
+        "runs": [
+            {
+                "seed": run.seed,
+                "folder": run.folder.name,
+                **measures,
+                "mechanisms": [mechanism._asdict() for mechanism in mechanisms],
+            }
+            for run, measures, mechanisms in runs
+        ],
     }

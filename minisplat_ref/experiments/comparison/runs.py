@@ -1,12 +1,22 @@
-"""The trainings of a comparison: one after the other, each in a process of its own, whose peak memory is its own."""
+"""The trainings of a comparison: one after the other, each in a process of its own, whose peak memory is its own.
+
+A comparison that was cut off goes on where it was: finished runs stay, one with a checkpoint continues from it.
+"""
 
 import contextlib
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
+from typing import Any, Literal
 
+from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.comparison.plan import Plan, Run, eval_every
+from minisplat_ref.experiments import run_folder
+from minisplat_ref.experiments.arguments import option_name
+from minisplat_ref.experiments.comparison.plan import Plan, Run
+from minisplat_ref.experiments.settings import Settings
+from minisplat_ref.experiments.settings import load as load_settings
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.training.loop import train
 from minisplat_ref.types import Scene
@@ -14,6 +24,18 @@ from minisplat_ref.types import Scene
 WARM_UP = 20  # iterations, to which each recipe is scaled, so that all its events happen
 WARM_UP_VIEWS = 4
 SAVING_SECONDS = 5.0  # after Ctrl-C; a training that goes on for longer has not been told
+
+TRAIN = (sys.executable, "-m", "minisplat_ref", "train")
+
+Status = Literal["finished", "cut off", "lost", "new"]
+"""How far a training has come: to its end, to a checkpoint, not as far, or not begun."""
+
+HEADINGS: dict[Status, str] = {
+    "finished": ": finished, kept",
+    "cut off": ": continued from its checkpoint",
+    "lost": ": has no checkpoint, started again",
+    "new": ": started",
+}
 
 REPORTED_CODES = (0, 2, 130)  # after which the training has said all there is to say
 
@@ -27,8 +49,42 @@ def warm_up(plan: Plan, scene: Scene) -> None:
             train(scene, find_recipe(recipe, WARM_UP), seed=0)
 
 
-def train_all(plan: Plan) -> int:
+def statuses(plan: Plan) -> list[Status]:
+    """Return how far each of the plan's trainings has come.
+
+    Raises
+    ------
+    InputError
+        In the place of a run folder is a run of other settings, or something else.
+    """
+    return [_status(plan, run) for run in plan.runs]
+
+
+def _status(plan: Plan, run: Run) -> Status:
+    if not (run.folder / run_folder.CONFIG).exists():
+        run_folder.check_free(run.folder)
+        return "new"
+    ours, asked = load_settings(run.folder), settings_of(plan, run)
+    for name in Settings._fields:
+        is_, should = getattr(ours, name), getattr(asked, name)
+        if is_ != should:
+            raise InputError(
+                f"{run.folder} holds a run of other settings, {name} is {is_} and not {should}: move it away, or give"
+                " another --out"
+            )
+    if run_folder.is_finished(run.folder, run.iterations):
+        return "finished"
+    return "cut off" if (run.folder / run_folder.CHECKPOINT).exists() else "lost"
+
+
+def train_all(plan: Plan, statuses: Sequence[Status]) -> int:
     """Train every recipe with every seed, as far as it goes.
+
+    Parameters
+    ----------
+    plan : Plan
+    statuses : sequence of Status
+        How far each of its trainings has come; see :func:`statuses`.
 
     Returns
     -------
@@ -42,30 +98,53 @@ def train_all(plan: Plan) -> int:
     CalledProcessError
         A training has been killed or has a programming error.
     """
-    runs = plan.runs
-    for number, run in enumerate(runs, start=1):
-        heading = f"run {number} of {len(runs)}: {run.recipe}, seed {run.seed}, {run.iterations} iterations"
-        print(heading, flush=True)  # before the lines of the other process
-        code = _train(_command(plan, run))
+    for number, (run, status) in enumerate(zip(plan.runs, statuses, strict=True), start=1):
+        heading = f"run {number} of {len(statuses)}: {run.recipe}, seed {run.seed}, {run.iterations} iterations"
+        print(heading + HEADINGS[status], flush=True)  # before the lines of the other process
+        if status == "finished":
+            continue
+        if status == "lost":
+            run_folder.remove(run.folder)
+        code = _train(_resume_command(run) if status == "cut off" else _command(plan, run))
         if code != 0:
             return code
     return 0
 
 
-def _command(plan: Plan, run: Run) -> list[str]:
-    options = {
+def settings_of(plan: Plan, run: Run) -> Settings:
+    """Return the settings with which ``train`` is called for a run, as its config.json has them."""
+    return Settings(
+        scene=str(plan.scene.resolve()),
+        schedule_iterations=run.iterations,
+        undistort=False,
+        profile=GSPLAT_MAIN.name,
+        backend="cpu",
+        **_options(plan, run),
+    )
+
+
+def _options(plan: Plan, run: Run) -> dict[str, Any]:
+    """Return the options of ``train`` for a run, by the names that they have in Settings."""
+    return {
         "recipe": run.recipe,
         "iterations": run.iterations,
         "seed": run.seed,
         "downscale": plan.downscale,
         "test_every": plan.test_every,
-        "eval_every": eval_every(run.iterations),
-        "out": run.folder,
-        **{name: file for name, file in plan.files.items() if file is not None},
+        "eval_every": run.eval_every,
+        **plan.files,
         **run.options,
     }
-    texts = [part for name, value in options.items() for part in (f"--{name.replace('_', '-')}", str(value))]
-    return [sys.executable, "-m", "minisplat_ref", "train", str(plan.scene), *texts]
+
+
+def _command(plan: Plan, run: Run) -> list[str]:
+    options = {**_options(plan, run), "out": run.folder}
+    texts = [part for name, value in options.items() for part in (option_name(name), str(value))]
+    return [*TRAIN, str(plan.scene), *texts]
+
+
+def _resume_command(run: Run) -> list[str]:
+    return [*TRAIN, "--resume", str(run.folder)]
 
 
 def _train(command: list[str]) -> int:

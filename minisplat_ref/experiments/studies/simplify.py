@@ -21,7 +21,6 @@ from scipy.spatial import cKDTree
 from tqdm import tqdm
 
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
-from minisplat_ref.datasets.synthetic.tracer import pixel_rays
 from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.studies.front import (
     BLUE,
@@ -33,6 +32,7 @@ from minisplat_ref.experiments.studies.front import (
     title,
     write,
 )
+from minisplat_ref.experiments.surface import chamfer, shown_points
 from minisplat_ref.io import load_ply
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.methods import get_recipe
@@ -107,12 +107,8 @@ def true_surface(source: str) -> dict[str, Floats]:
     if Path(source).exists() or source not in SCENE_NAMES:
         return {}
     synthetic = make_scene(source, supersampling=1, n_points=0)  # its depths do not depend on these two
-    points = []
-    for view, depth in zip(synthetic.scene.train_views, synthetic.train_depths, strict=True):
-        rays = pixel_rays(view.camera, 0.5, 0.5, np.arange(view.camera.height))  # [H * W, 3] of camera z = 1
-        depths = depth.ravel()[:, None]
-        points.append((view.camera.center + depths * rays)[depths[:, 0] > 0])
-    return {"surface": np.concatenate(points)}
+    cameras = [view.camera for view in synthetic.scene.train_views]
+    return {"surface": shown_points(cameras, list(synthetic.train_depths))}
 
 
 def counts_to_keep(importance: Floats, fractions: tuple[float, ...]) -> dict[str, int]:
@@ -174,12 +170,6 @@ def measure(
         begun = simplify.reinitialised(gaussians, SH_DEGREE) if is_restart else gaussians
         tuned = fine_tune(begun, scene, iterations, rng)
         yield {**row, "psnr_tuned": evaluate(tuned, scene.test_views, background=scene.background).psnr}
-
-
-def chamfer(points: Floats, cloud: cKDTree) -> float:
-    """Return the mean distance of points [P, 3] to the cloud plus that of the cloud to the points, world units."""
-    there, back = cloud.query(points)[0], cKDTree(points).query(cloud.data)[0]
-    return float(there.mean() + back.mean())
 
 
 def fine_tune(gaussians: Gaussians, scene: Scene, iterations: int, rng: np.random.Generator) -> Gaussians:

@@ -1,0 +1,79 @@
+"""Which mechanisms of each recipe were active in a comparison, and which never."""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+from minisplat_ref.experiments import run_folder
+from minisplat_ref.experiments.comparison.plan import Plan
+from minisplat_ref.experiments.events import Mechanism, describe_notes, never_fired, published_times, read_mechanisms
+from minisplat_ref.extensions.extension import find_recipe
+
+HEADING = ("mechanism", "times", "published", "first step", "last step", "added", "removed")
+
+
+class Fired(NamedTuple):
+    """What a recipe has done, in the runs of all seeds."""
+
+    recipe: str
+    iterations: int
+    """Of each run."""
+    published_iterations: int
+    """Of the recipe as published."""
+    published: dict[str, int]
+    """How often each mechanism acts in the recipe as published."""
+    runs: Sequence[Sequence[Mechanism]]
+    """Per seed, what its mechanisms have done."""
+
+    @property
+    def never(self) -> list[str]:
+        """Mechanisms of the published recipe that were off in every run."""
+        return never_fired((mechanism for run in self.runs for mechanism in run), self.published)
+
+
+def read_fired(plan: Plan) -> list[Fired]:
+    """Return what fired in the finished runs of a plan, recipe by recipe."""
+    found = []
+    for name, iterations in zip(plan.recipes, plan.iterations, strict=True):
+        recipe = find_recipe(name)
+        published = published_times(recipe)
+        runs = [read_mechanisms(run.folder / run_folder.EVENTS, published) for run in plan.runs_of(name)]
+        found.append(Fired(name, iterations, recipe.iterations, published, runs))
+    return found
+
+
+def rows(fired: Fired) -> list[list[str]]:
+    """Return the table under HEADING: a row per mechanism that has acted, the range where the seeds differ."""
+    table = []
+    for action in dict.fromkeys(mechanism.action for run in fired.runs for mechanism in run):
+        own = [mechanism for run in fired.runs for mechanism in run if mechanism.action == action]
+        times = [sum(mechanism.times for mechanism in run if mechanism.action == action) for run in fired.runs]
+        table.append(
+            [
+                action,
+                _range(times),
+                f"{fired.published.get(action, 0):,}",
+                _range(mechanism.first for mechanism in own),
+                _range(mechanism.last for mechanism in own),
+                _range(mechanism.added for mechanism in own),
+                _range(mechanism.removed for mechanism in own),
+            ]
+        )
+    return table
+
+
+def remarks(fired: Fired) -> list[str]:
+    """Return what the table does not say: notes of the mechanisms, and those that never acted."""
+    notes = dict.fromkeys(
+        f"{mechanism.action}: {note}"
+        for run in fired.runs
+        for mechanism in run
+        for note in describe_notes(mechanism.notes)
+    )
+    return [*notes, *([f"never: {', '.join(fired.never)}"] if fired.never else [])]
+
+
+def _range(values: Iterable[int]) -> str:
+    """Return the value on which the seeds agree, or the least and the largest."""
+    values = list(values)
+    low, high = min(values), max(values)
+    return f"{low:,}" if low == high else f"{low:,} to {high:,}"
