@@ -43,7 +43,7 @@ def test_deviations_are_taken_back():
     assert rates[0] == RECIPES["3dgs"].learning_rates.of["sh_dc"] < rates[1]
     published = variants_of(RECIPES["mini-splatting"], 30_000, ablation.DEVIATIONS)
     assert "raised rates" not in published and "prune_large" in names_of(published["size limit by distance"])
-    assert set(variants_of(RECIPES["3dgs-accel"], 3_000, ablation.DEVIATIONS)) == {FULL, "no bias correction"}
+    assert set(variants_of(RECIPES["3dgs-accel"], 30_000, ablation.DEVIATIONS)) == {FULL, "no bias correction"}
 
 
 def test_what_never_acts_has_no_row():

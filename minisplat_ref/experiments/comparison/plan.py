@@ -15,6 +15,7 @@ from minisplat_ref.training.schedule import describe
 from minisplat_ref.types import Scene
 
 PLAN = "plan.json"  # what `--resume` continues from
+PATHS = ("scene", "lpips_weights", "init")  # of a plan
 POINTS_PER_RUN = 24  # of each curve: enough to see when a quality is reached, and where it falls again
 
 
@@ -188,9 +189,7 @@ def load_plan(folder: Path) -> Plan:
     content = run_folder.read_json_object(path)
     content = {name: tuple(value) if isinstance(value, list) else value for name, value in content.items()}
     try:
-        files: dict[str, Any] = {
-            name: Path(content[name]) for name in ("lpips_weights", "init") if content.get(name) is not None
-        }
-        return Plan(**{**content, **files, "scene": Path(content["scene"]), "folder": folder})
+        paths: dict[str, Any] = {name: Path(content[name]) for name in PATHS if content.get(name) is not None}
+        return Plan(**{**content, **paths, "folder": folder})
     except (KeyError, TypeError) as error:
         raise InputError(f"{path} is not the plan of a comparison of this version: {error}") from error

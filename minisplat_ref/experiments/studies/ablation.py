@@ -36,7 +36,7 @@ from minisplat_ref.metrics import evaluate
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.strategy import simplify as simplification
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import Event, Every, Recipe, configured, scaled, settings_of
+from minisplat_ref.training.schedule import Action, Event, Every, Recipe, configured, scaled, settings_of
 from minisplat_ref.types import Scene
 
 RUNS = "runs.jsonl"
@@ -44,7 +44,7 @@ FULL = "everything"
 MEASURES = ("psnr", "ssim", "n_gaussians", "seconds")
 
 
-def without_event(action: Callable[..., None]) -> Callable[[Recipe], Recipe]:
+def without_event(action: Action) -> Callable[[Recipe], Recipe]:
     """Return what leaves out the events that do ``action``, settings aside."""
 
     def changed(recipe: Recipe) -> Recipe:
@@ -54,7 +54,7 @@ def without_event(action: Callable[..., None]) -> Callable[[Recipe], Recipe]:
     return changed
 
 
-def without_gap(action: Callable[..., None]) -> Callable[[Recipe], Recipe]:
+def without_gap(action: Action) -> Callable[[Recipe], Recipe]:
     """Return what lets ``action`` come at all its published dates, however close compression brings them."""
 
     def changed(event: Event) -> Event:
@@ -112,7 +112,7 @@ DEVIATIONS: Mapping[str, Callable[[Recipe], Recipe]] = {
 }
 """A recipe with the published rule in place of each of ours."""
 
-ACTIONS: Mapping[str, Callable[..., None]] = {
+ACTIONS: Mapping[str, Action] = {
     "blur split": mini_splatting.collect_blur,
     "reinitialisation": mini_splatting.reinitialise_from_depth,
     "sky guard": mini_splatting.reinitialise_from_depth,

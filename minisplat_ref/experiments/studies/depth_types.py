@@ -50,7 +50,7 @@ from minisplat_ref.strategy.depth_reinit import (
     reinitial_points,
 )
 from minisplat_ref.training.loop import StepReport, train
-from minisplat_ref.training.schedule import Recipe, configured
+from minisplat_ref.training.schedule import Action, Recipe, configured
 from minisplat_ref.types import Bools, Floats, Model, Scene
 
 LEAST_ALPHA = 0.9  # of the guard that asks for opacity
@@ -135,7 +135,7 @@ def run(args: argparse.Namespace) -> None:
     print(markdown_table(["points", *MEASURES.values()], to_rows(summary)))
 
 
-def steps_of(recipe: Recipe, *actions: Callable[..., None]) -> list[int]:
+def steps_of(recipe: Recipe, *actions: Action) -> list[int]:
     """Return the iterations at which a recipe does one of the actions, settings aside."""
     events = [event for event in recipe.events if getattr(event.action, "func", event.action) in actions]
     return [step for step in range(1, recipe.iterations + 1) if any(event.is_due(step) for event in events)]
