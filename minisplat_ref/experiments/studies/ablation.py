@@ -36,7 +36,7 @@ from minisplat_ref.metrics import evaluate
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.strategy import simplify as simplification
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import Action, Event, Every, Recipe, configured, scaled, settings_of
+from minisplat_ref.training.schedule import Action, Event, Recipe, configured, scaled, settings_of
 from minisplat_ref.types import Scene
 
 RUNS = "runs.jsonl"
@@ -52,17 +52,6 @@ def without_event(action: Action) -> Callable[[Recipe], Recipe]:
         return recipe._replace(events=tuple(e for e in events if getattr(e.action, "func", e.action) is not action))
 
     return changed
-
-
-def without_gap(action: Action) -> Callable[[Recipe], Recipe]:
-    """Return what lets ``action`` come at all its published dates, however close compression brings them."""
-
-    def changed(event: Event) -> Event:
-        if isinstance(event, Every) and getattr(event.action, "func", event.action) is action:
-            return event._replace(least_gap=1)
-        return event
-
-    return lambda recipe: recipe._replace(events=tuple(map(changed, recipe.events)))
 
 
 def with_bias_correction(recipe: Recipe) -> Recipe:
@@ -107,7 +96,6 @@ DEVIATIONS: Mapping[str, Callable[[Recipe], Recipe]] = {
     "size limit by distance": as_3dgs_prunes,
     "least size to halve": lambda recipe: recipe._replace(least_half_size=1) if recipe.half_size_until else recipe,
     "raised rates": lambda recipe: recipe._replace(short_run_exponent=0.0),
-    "gap between density events": without_gap(gaussian_splatting.clone_and_split),
     "no bias correction": with_bias_correction,
 }
 """A recipe with the published rule in place of each of ours."""
