@@ -245,7 +245,7 @@ LEAST_BLURRED_AREA = 64
 DEPTH_TOLERANCE = 0.05
 BACKDROP_EXTENTS = 30.0
 
-SHORT_RUN_EXPONENT = 0.3  # what is begun anew has to be learned again: compressed runs raise their rates
+SHORT_RUN_EXPONENT = 0.45  # what is begun anew has to be learned again: compressed runs raise their rates
 
 _densifying = partial(Every, 100, stop=15_000, skip=5_000, least_gap=DENSIFY_LEAST_GAP)
 
