@@ -303,6 +303,22 @@ def test_nan_quaternion_is_culled(backend):
     assert not project_one(backend, [0, 0, 2], [0.1] * 3, 0.5, quat=np.full((1, 4), np.nan)).radii.any()
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_quaternions_have_any_length(backend, dtype, rng):
+    means, quats, scales, opacities = (array.astype(dtype) for array in activated(make_gaussians(rng, 20)))
+    largest = 1e36 if dtype == np.float32 else 1e300
+    found = []
+    for length in (1, 1 / largest, largest):
+        inputs = means, quats * dtype(length), scales, opacities, CAMERA, GSPLAT_MAIN
+        projection = backend.project(*inputs)
+        v = ProjectionGradient(*(np.ones_like(field) for field in projection[:4]))
+        found.append((projection.conics, backend.project_vjp(*inputs, projection, v).quats * dtype(length)))
+    tolerance = PARITY_FLOAT64 if dtype == np.float64 else PARITY_FLOAT32_PROJECTION
+    for conics, v_quats in found[1:]:
+        assert_allclose(conics, found[0][0], rtol=tolerance, atol=tolerance * np.abs(conics).max())
+        assert_allclose(v_quats, found[0][1], rtol=0, atol=tolerance * np.abs(v_quats).max())
+
+
 def test_huge_gaussian_covers_the_image(backend):
     projection = project_one(backend, [0, 0, 2], [1e20, 1e20, 1e-3], 0.5)
     assert_array_equal(projection.boxes, [[0, 0, 64, 48]])
