@@ -191,7 +191,7 @@ class Margins(NamedTuple):
     median: float
     """Of the same from one half."""
     order: float
-    """Of the depth of a hit from that of the next."""
+    """Of the depth of a hit from that of the one before; those that are one float32 are always near enough."""
 
 
 FLOAT32_RENDERER = Margins(
@@ -206,8 +206,9 @@ FLOAT32_RENDERER = Margins(
 """Of any correct renderer in float32, whose own projection is compared."""
 
 OWN_KERNELS = Margins(
-    "footprints come from float64 and depths are the same numbers, in images of a few pixels: what is left is rounding"
-    " of 6e-8 in exponent and exponential; but 1 - 0.99 is off by 1e-6, and a pixel can take several such hits",
+    "footprints and depths come from float64, in images of a few pixels: what is left is rounding of 6e-8 in exponent"
+    " and exponential, and of a depth to its float32; but 1 - 0.99 is off by 1e-6, and a pixel can take several such"
+    " hits",
     skip=1e-6,
     clamp=1e-6,
     stop=1e-5,
