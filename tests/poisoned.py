@@ -9,7 +9,6 @@ Prints the name of every case, and of every output that changes.
 """
 
 import ctypes
-import sys
 
 import numpy as np
 

@@ -56,7 +56,10 @@ def test_dtype_is_kept(dtype):
     assert [result.dtype for result in results] == [dtype] * 4
 
 
-LENGTHS = {np.float32: (1e-30, 1e-21, 1e19, 1e37), np.float64: (1e-200, 1e-160, 1e155, 1e300)}  # squares leave the range
+LENGTHS = {
+    np.float32: (1e-30, 1e-21, 1e19, 1e37),
+    np.float64: (1e-200, 1e-160, 1e155, 1e300),
+}  # squares leave the range
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -134,9 +134,14 @@ def thresholds_of_view(tape: SplatTape, slack: float = 0.0) -> Thresholds:
     projection = CPU.project(*tape.primitives, camera, lenient)
     grid = TileGrid(camera.width, camera.height, CPU.tile_width, CPU.tile_height)
     bins = CPU.bin_gaussians(projection, grid, lenient)
+    return thresholds(projection, bins, conventions, slack=slack, span=span_of(tape))
+
+
+def span_of(tape: SplatTape) -> float:
+    """Return the largest difference of two colours of a view, of its background and of 0."""
     highest = max(tape.channels.max(initial=0), tape.background.max(initial=0))
     lowest = min(tape.channels.min(initial=0), tape.background.min(initial=0))
-    return thresholds(projection, bins, conventions, slack=slack, span=highest - lowest)
+    return float(highest - lowest)
 
 
 def lenient_conventions(conventions: Conventions, margins: Margins, slack: float = 0.0) -> Conventions:

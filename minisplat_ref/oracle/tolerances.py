@@ -120,6 +120,14 @@ LONG = HardCaseTolerance(
     gradient32=1e-3,
 )
 
+BESIDE = HardCaseTolerance(
+    "x / z is 1,000 and more: gradients by z and by the camera are differences of float32 sums (x / z)^2 times larger",
+    1e-6,
+    1e-4,
+    image32=2e-5,
+    gradient32=1.0,  # finite, and no larger than it should be; image, opacity and colour are as exact as elsewhere
+)
+
 BEHIND = HardCaseTolerance(
     "behind an opaque hit what is left is a difference from the whole pixel: 6e-8 of the whole, divided by 1 - alpha",
     1e-12,
