@@ -30,8 +30,9 @@ SH_DEGREE_MAX = 3
 INRIA_TILE = 16  # pixels; INRIA's rule of extent is stated in tiles of this size
 # px^4: floor of (lambda_1 - lambda_2)^2 / 4 in INRIA's largest eigenvalue: that of a disc is 0.3 px^2 too large.
 INRIA_ROOT_MIN = 0.1
-# Pixels. The largest power of two that fits int32; float32 and float64 hold it exactly. A lower bound would cull: the
-# box of a Gaussian whose centre lies further beside the image than this, and which covers it still, would miss it.
+# Pixels. The largest power of two that fits int32; float32 and float64 hold it exactly. Radii are clamped when they are
+# stored; boxes are made of what they were before, or a Gaussian further beside the image than this, and which covers it
+# still, would miss it.
 RADIUS_MAX = 2.0**30
 
 JACOBIAN_CLAMP = 1.3  # the EWA Jacobian is frozen beyond 1.3 x the half field of view: it explodes as 1/z^2 outside

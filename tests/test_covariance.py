@@ -56,6 +56,24 @@ def test_dtype_is_kept(dtype):
     assert [result.dtype for result in results] == [dtype] * 4
 
 
+LENGTHS = {
+    np.float32: (1e-30, 1e-21, 1e19, 1e37),
+    np.float64: (1e-200, 1e-160, 1e155, 1e300),
+}  # squares leave the range
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_quaternions_have_any_length(dtype, rng):
+    quats, v = rng.normal(size=(20, 4)).astype(dtype), rng.normal(size=(20, 3, 3)).astype(dtype)
+    rotations, v_quats = rotation_matrices(quats), rotation_matrices_vjp(quats, v)
+    tolerance = 50 * np.finfo(dtype).eps  # a few roundings of entries up to 10
+    for length in LENGTHS[dtype]:
+        scaled = quats * dtype(length)
+        assert_allclose(rotation_matrices(scaled), rotations, rtol=0, atol=tolerance)
+        by_length = rotation_matrices_vjp(scaled, v) * dtype(length)  # the gradient is that much smaller, or larger
+        assert_allclose(by_length, v_quats, rtol=0, atol=tolerance * np.abs(v_quats).max())
+
+
 # --- gradient ---
 
 

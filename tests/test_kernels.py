@@ -21,11 +21,13 @@ from tolerances import COVERAGE_MIN, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT32_IMA
 import minisplat_ref
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.extensions.geometry import kernels as geometry_kernels
 from minisplat_ref.extensions.geometry.weights import GeometricWeights
 from minisplat_ref.jit import compile as _jit
 from minisplat_ref.rendering import render, render_vjp
-from minisplat_ref.types import ProjectionGradient, TileGrid
+from minisplat_ref.types import AdamStep, ProjectionGradient, TileGrid
 
 PACKAGE = Path(minisplat_ref.__file__).parent
 
@@ -33,40 +35,57 @@ PACKAGE = Path(minisplat_ref.__file__).parent
 # --- dtype ---
 
 
-def test_stages_keep_float32_but_for_conics(rng):
-    gaussians, camera = as_dtype(make_gaussians(rng, 20, size=0.25), np.float32), make_camera(rng=rng)
+def every_stage(dtype, size=(24, 18), n=20):
+    """Everything that the stages return for a scene, and what they write beside it, by the stage's name."""
+    rng, (width, height) = np.random.default_rng(20240229), size
+    gaussians = as_dtype(make_gaussians(rng, n, size=0.25), dtype)
+    camera = make_camera(width, height, fx=1.25 * width, fy=1.2 * width, rng=rng)
     means, quats, scales, opacities = activated(gaussians)
     primitives = (means, quats, scales, opacities, camera, GSPLAT_MAIN)
     projection = CPU.project(*primitives)
     sh = (means, gaussians.sh_dc, gaussians.sh_rest, camera, 3, projection.radii)
-    colors, background = CPU.sh_colors(*sh), np.zeros(3, np.float32)
-    bins = CPU.bin_gaussians(projection, TileGrid(24, 18, CPU.tile_width, CPU.tile_height), GSPLAT_MAIN)
+    colors, background = CPU.sh_colors(*sh), np.zeros(3, dtype)
+    bins = CPU.bin_gaussians(projection, TileGrid(width, height, CPU.tile_width, CPU.tile_height), GSPLAT_MAIN)
     composited = (projection, colors, background, bins, GSPLAT_MAIN)
     output = CPU.composite(*composited, with_stats=True, with_median_depth=True)
     v = CPU.composite_vjp(*composited, output, output.image, output.alpha)
     v_projection = ProjectionGradient(v.means2d, v.opacities, v.conics, v.opacities)
     ids = output.stats.dominant_ids
     points = CPU.surface_points(means, quats, scales, camera, ids)
-    _, tape = CPU.photometric_loss(output.image, output.image[::-1].copy(), 0.2)
+    loss, tape = CPU.photometric_loss(output.image, output.image[::-1].copy(), 0.2)
     geometry = (output.image[..., 0] + 1, output.alpha, output.image, camera, means.astype(float))
     _, geometric_tape = geometry_kernels.geometric_loss(*geometry, GeometricWeights(1.0, 1.0, 1.0))
-    assert projection.conics.dtype == v.conics.dtype == np.float64  # and nothing else
-    results = {
-        "project": projection._replace(conics=projection.depths),
+    values = means.copy(), np.ones_like(means), np.zeros_like(means), np.ones_like(means)
+    CPU.adam_update(*values, None, AdamStep(0.1, 0.9, 0.999, 1e-15))
+    CPU.adam_update(*values, np.arange(0, n, 2), AdamStep(0.1, 0.9, 0.999, 1e-15))
+    return {
+        "project": projection,
         "project_vjp": CPU.project_vjp(*primitives, projection, v_projection),
         "sh_colors": (colors,),
         "sh_colors_vjp": CPU.sh_colors_vjp(*sh, v.colors),
-        "composite": (output.image, output.alpha, output.median_depth, *output.stats[:2]),
-        "composite_vjp": v._replace(conics=v.opacities),
+        "bin_gaussians": bins[:4],
+        "composite": (output.image, output.alpha, output.median_depth, *output.stats),
+        "composite without statistics": CPU.composite(*composited)[:2],
+        "composite_vjp": v,
         "surface_points": points,
         "surface_points_vjp": CPU.surface_points_vjp(means, quats, scales, camera, ids, points.points, points.depths),
+        "photometric_loss": (np.array(loss),),
         "photometric_loss_vjp": (CPU.photometric_loss_vjp(tape),),
         "geometric_loss_vjp": geometry_kernels.geometric_loss_vjp(geometric_tape),
+        "adam_update": values,
     }
+
+
+def test_stages_keep_float32_but_for_conics():
+    results = every_stage(np.float32)
+    wide = {stage: results[stage].conics for stage in ("project", "composite_vjp")} | {
+        "photometric_loss": results["photometric_loss"][0]
+    }
+    assert all(array.dtype == np.float64 for array in wide.values())  # and nothing else
     for stage, arrays in results.items():
-        floats = [array for array in arrays if array.dtype.kind == "f"]
-        assert floats and {array.dtype for array in floats} == {np.dtype(np.float32)}, stage
-        assert any(array.any() for array in floats), stage
+        floats = [array for array in arrays if array.dtype.kind == "f" and array is not wide.get(stage)]
+        assert {array.dtype for array in floats} <= {np.dtype(np.float32)}, stage
+        assert any(array.any() for array in arrays), stage
 
 
 # --- the same result however it is run ---
@@ -266,29 +285,43 @@ def test_kernels_of_functions_of_one_name_are_not_mixed_up(tmp_path):
 FROM_CACHE = """
 import sys
 import numpy as np
-from scenes import as_dtype, make_camera, make_gaussians
-from test_kernels import drawn
-from minisplat_ref.backends import CPU
-gaussians = as_dtype(make_gaussians(np.random.default_rng(5), 150), np.float32)
-np.savez(sys.argv[1], *drawn(gaussians, make_camera(64, 48, fx=80, fy=75), CPU))
+from test_kernels import every_stage
+from minisplat_ref.io import load_scene
+from minisplat_ref.methods import get_recipe
+from minisplat_ref.training.loop import train
+arrays = {}
+for dtype in (np.float32, np.float64):
+    for stage, results in every_stage(dtype, (101, 67), 150).items():
+        arrays |= {f"{stage} {np.dtype(dtype)} {i}": array for i, array in enumerate(results)}
+state = train(load_scene(sys.argv[2]), get_recipe("3dgs-accel")._replace(iterations=50), seed=0)
+arrays |= {f"trained {name}": array for name, array in state.gaussians._asdict().items()}
+np.savez(sys.argv[1], **arrays)
 """
 
 
 def test_compiled_and_cached_kernels_give_the_same_bytes(tmp_path):
-    """Blending must agree in both, and the second process must not compile anything anew.
+    """Every stage, in both precisions, and a training; and the second process must not compile anything anew.
 
-    Projection can differ in the last digit, a known limit in the README; this view is one in which it does not.
+    The body of a parallel loop is compiled two or three times, each time within other code, and a process that loads it
+    may run another copy than the one that compiled it. The copies round alike if the same products are contracted in
+    each, which nothing but this test makes sure of. Seen on Intel Xeon processors with AVX-512 (family 6, model 207,
+    stepping 2): no difference, nor in the 10,492 arrays of all hard cases, of 1 to 13 channels and of 200 iterations.
     """
+    scene, kernels = tmp_path / "room", tmp_path / "kernels"
+    settings = {"n_views": 3, "width": 50, "height": 39, "n_points": 200}
+    write_scene(make_scene("room", supersampling=1, **settings), scene, settings)
     folders = os.pathsep.join([str(Path(__file__).parent), str(PACKAGE.parent)])
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels"), "PYTHONPATH": folders}
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(kernels), "PYTHONPATH": folders}
     results, cached = [], []
     for name in ("compiled.npz", "cached.npz"):
-        subprocess.run([sys.executable, "-c", FROM_CACHE, str(tmp_path / name)], env=environment, check=True)
+        command = [sys.executable, "-c", FROM_CACHE, str(tmp_path / name), str(scene)]
+        subprocess.run(command, env=environment, check=True)
         with np.load(tmp_path / name) as arrays:
-            results.append([arrays[key].tobytes() for key in arrays.files])
-        cached.append(sorted(path.name for path in (tmp_path / "kernels").rglob("*.nbc")))
-    assert results[0] == results[1]
-    assert len(cached[0]) > 5 and cached[0] == cached[1]
+            results.append({key: arrays[key].tobytes() for key in arrays.files})
+        cached.append(sorted(path.name for path in kernels.rglob("*.nbc")))
+    assert len(results[0]) > 90
+    assert [key for key in results[0] if results[0][key] != results[1][key]] == []
+    assert len(cached[0]) > 30 and cached[0] == cached[1]
 
 
 @pytest.mark.parametrize(

@@ -1,3 +1,8 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from gradcheck import check_inner_products, check_jacobian
@@ -8,6 +13,8 @@ from tolerances import CLOSED_FORM, GRADIENT_FLOOR, PARITY_FLOAT32_LOSS, PARITY_
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import SSIM_C1, SSIM_C2
 from minisplat_ref.reference.loss import ssim_map, ssim_map_vjp
+
+ROOT = Path(__file__).parent.parent
 
 
 def two_images(rng, height=20, width=17):
@@ -167,3 +174,33 @@ def test_backends_agree(fast_backend, dtype, is_masked, rng):
     assert v_actual.dtype == dtype and np.abs(v_expected).max() > GRADIENT_FLOOR
     assert_allclose(actual, expected, rtol=tolerance)
     assert_allclose(v_actual, v_expected, rtol=0, atol=tolerance * np.abs(v_expected).max())
+
+
+# --- bytes ---
+
+AT_ANY_NUMBER_OF_THREADS = """
+import hashlib
+import numba
+import numpy as np
+from minisplat_ref.backends import CPU
+
+rng = np.random.default_rng(0)
+for dtype in (np.float32, np.float64):
+    for height in range(1, 65):
+        image, target = rng.uniform(size=(2, height, 9, 3)).astype(dtype)
+        found = set()
+        for n_threads in range(1, 6):
+            numba.set_num_threads(n_threads)
+            loss, tape = CPU.photometric_loss(image, target, 0.2)
+            found.add((loss, hashlib.sha256(tape.v_image.tobytes()).hexdigest()))
+        print(np.dtype(dtype), height, len(found))
+"""
+
+
+def test_same_bytes_at_any_height_and_number_of_threads():
+    """Rows are filtered two at a time, and a row's arithmetic must not depend on where the bands of threads begin."""
+    environment = os.environ | {"NUMBA_NUM_THREADS": "5", "PYTHONPATH": str(ROOT)}  # five threads on any machine
+    command = [sys.executable, "-c", AT_ANY_NUMBER_OF_THREADS]
+    lines = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert len(lines) == 2 * 64
+    assert [line for line in lines if not line.endswith(" 1")] == []

@@ -23,6 +23,10 @@ ASKED_FOR = (
     *("on-the-near-plane", "behind", "beside", "at-the-camera-centre", "clamp-active", "principal-point-off-centre"),
     *("1x1", "3x1000", "no-tile-divides", "world-at-1e6", "singular-without-low-pass", "ssim-flat-equal", "ssim-equal"),
     *("sh-3-at-plus-z", "sh-3-at-minus-z", "empty-scene", "nan-in-means", "inf-in-means"),
+    *("opacity-at-alpha-min", "opacity-of-one-byte", "radius-beyond-int32", "wall-facing-a-turned-camera"),
+    *("needles-many", "sub-pixel-many", "enormous-many", "of-all-scales-many", "around-the-camera-many", "strip-wide"),
+    *("coincident-means", "one-depth", "faint-layers", "focal-huge", "focal-tiny", "focal-unequal", "world-many"),
+    *("harmonics", "quaternion-lengths", "log-scales-plus-minus-40", "channels-1", "tile-edges", "everything-many"),
 )
 
 

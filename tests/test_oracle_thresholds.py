@@ -3,12 +3,17 @@
 import numpy as np
 import pytest
 
-from minisplat_ref.backends import REFERENCE
+from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
-from minisplat_ref.oracle.thresholds import thresholds
-from minisplat_ref.oracle.tolerances import FLOAT32_RENDERER, OWN_KERNELS
+from minisplat_ref.oracle.hard_cases.scenes import camera, gaussians, turn
+from minisplat_ref.oracle.hard_cases.subjects import cast
+from minisplat_ref.oracle.thresholds import thresholds, thresholds_of_view
+from minisplat_ref.oracle.tolerances import FLOAT32_RENDERER, IMAGE, OWN_KERNELS
+from minisplat_ref.reference.covariance import rotation_matrices
+from minisplat_ref.rendering import render
 from minisplat_ref.types import Projection, TileGrid
 
+ULP = float(np.spacing(np.float32(3)))
 FAR = 0.01  # relative distance from a threshold that no margin bridges
 
 
@@ -53,7 +58,8 @@ def test_neighbours_in_depth_are_found_unless_they_are_equal_or_nothing():
     near = 1 + FLOAT32_RENDERER.order / 2
     assert found([0.3, 0.4], [2.0, 2.0 * near]) == (True, False, False)
     assert found([0.3, 0.4], [2.0, 2.0]) == (False, False, False), "the lower row comes first in every renderer"
-    assert found([0.3, 0.4], [2.0, 2.0 * near], OWN_KERNELS) == (False, False, False), "they sort the same numbers"
+    assert found([0.3, 0.4], [3.0, 3.0 + ULP], OWN_KERNELS) == (False, False, False), "they sort by float32 numbers"
+    assert found([0.3, 0.4], [3.0, 3.0 + 0.1 * ULP], OWN_KERNELS) == (True, False, False), "these are one float32"
     assert found([0.3, 0.4], [2.0, 2.0 * (1 + FAR)]) == (False, False, False)
 
 
@@ -72,6 +78,43 @@ def test_allowance_is_what_the_hit_can_change():
     assert np.allclose(swapped.allowance, 0.3 * 0.4, rtol=1e-12), (
         "0.3 + 0.7 * 0.4 or 0.4 + 0.6 * 0.3: each moves by 0.12"
     )
+
+
+def test_all_hits_of_one_depth_may_change_places():
+    """Not neighbours in the list alone: what does not hit the pixel stands between, and each may pass any other."""
+    depths = [2.0, 2.0 + 1e-7, 2.0 + 2e-7]
+    one_between = thresholds(*flat_layers([0.3, 0.001, 0.4], depths), GSPLAT_MAIN)
+    assert np.allclose(one_between.allowance, 0.3 * 0.4, rtol=1e-12)
+    three = thresholds(*flat_layers([0.3, 0.2, 0.4], depths), GSPLAT_MAIN)
+    assert np.allclose(three.allowance, 0.3 * 0.2 + 0.3 * 0.4 + 0.2 * 0.4, rtol=1e-12)
+    behind = thresholds(*flat_layers([0.5, 0.3, 0.2, 0.4], [1.0, *depths]), GSPLAT_MAIN)
+    assert np.allclose(behind.allowance, 0.5 * three.allowance, rtol=1e-12)
+    two_groups = thresholds(*flat_layers([0.3, 0.4, 0.2, 0.1], [2.0, 2.0 + 1e-7, 3.0, 3.0 + 1e-7]), GSPLAT_MAIN)
+    assert np.allclose(two_groups.allowance, 0.3 * 0.4 + 0.42 * 0.2 * 0.1, rtol=1e-12)
+    many = thresholds(*flat_layers([0.2] * 9, list(2 + 1e-7 * np.arange(9))), GSPLAT_MAIN)
+    assert np.allclose(many.allowance, 1, rtol=1e-12), "never more than all the light"
+
+
+def test_a_tie_at_the_stop_moves_all_that_is_left():
+    """Which of two opaque hits ends the pixel, and is left out, depends on their order."""
+    at = thresholds(*flat_layers([0.9, 0.99, 0.98], [1.0, 2.0, 2.0 + 1e-7]), GSPLAT_MAIN)
+    assert np.allclose(at.allowance, 0.1, rtol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_wall_before_a_turned_camera_is_explained(dtype):
+    """Its depths differ by less than float32 can tell: order by float32 depths is that of the rows."""
+    rng, R = np.random.default_rng(0), rotation_matrices(turn(0.7, (1, 2, 3))[None])[0]
+    on_wall = np.column_stack([rng.uniform((-1.6, -1.2), (1.6, 1.2), size=(100, 2)), np.full(100, 4.0)])
+    wall = gaussians(on_wall @ R, 0.05, logits=rng.normal(1, 1, 100))
+    view = camera(80, 58, fx=100.0, fy=100.0, cam_from_world_R=R)
+    expected, tape = render(wall, view, backend=REFERENCE)
+    at = thresholds_of_view(tape.splats)
+    assert np.ptp(tape.splats.projection.depths) < 1e-6 and (at.allowance == 0).any()
+    output, _ = render(cast(wall, np.dtype(dtype)), view, backend=CPU)
+    error = np.abs(output.image - expected.image).max(axis=2)
+    assert (error > 0.1).any() == (dtype == np.float32), "by float32 depths the image is another"
+    assert (error <= IMAGE.of(dtype) + at.allowance).all()
 
 
 def test_slack_widens_skip_and_stop():

@@ -5,6 +5,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import ALL_CONVENTIONS, ANTIALIASED, activated, as_dtype, make_camera, make_gaussians
 from tolerances import CLOSED_FORM, GRADIENT_FLOOR, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT32_PROJECTION, PARITY_FLOAT64
 
+from minisplat_ref import constants
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import COMPENSATION_FLOOR, GSPLAT_MAIN, INRIA
 from minisplat_ref.reference.pinhole import (
@@ -15,7 +16,7 @@ from minisplat_ref.reference.pinhole import (
     pinhole_vjp,
     slope_limits,
 )
-from minisplat_ref.types import Camera, ProjectionGradient
+from minisplat_ref.types import Camera, ProjectionGradient, TileGrid
 
 CAMERA = Camera(np.eye(3), np.zeros(3), 100.0, 50.0, 32.0, 24.0, 64, 48)
 IDENTITY = np.array([[1.0, 0, 0, 0]])
@@ -302,10 +303,51 @@ def test_nan_quaternion_is_culled(backend):
     assert not project_one(backend, [0, 0, 2], [0.1] * 3, 0.5, quat=np.full((1, 4), np.nan)).radii.any()
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_quaternions_have_any_length(backend, dtype, rng):
+    means, quats, scales, opacities = (array.astype(dtype) for array in activated(make_gaussians(rng, 20)))
+    largest = 1e36 if dtype == np.float32 else 1e300
+    found = []
+    for length in (1, 1 / largest, largest):
+        inputs = means, quats * dtype(length), scales, opacities, CAMERA, GSPLAT_MAIN
+        projection = backend.project(*inputs)
+        v = ProjectionGradient(*(np.ones_like(field) for field in projection[:4]))
+        found.append((projection.conics, backend.project_vjp(*inputs, projection, v).quats * dtype(length)))
+    tolerance = PARITY_FLOAT64 if dtype == np.float64 else PARITY_FLOAT32_PROJECTION
+    for conics, v_quats in found[1:]:
+        assert_allclose(conics, found[0][0], rtol=tolerance, atol=tolerance * np.abs(conics).max())
+        assert_allclose(v_quats, found[0][1], rtol=0, atol=tolerance * np.abs(v_quats).max())
+
+
 def test_huge_gaussian_covers_the_image(backend):
     projection = project_one(backend, [0, 0, 2], [1e20, 1e20, 1e-3], 0.5)
     assert_array_equal(projection.boxes, [[0, 0, 64, 48]])
     assert (projection.radii > 64).all()
+
+
+@pytest.mark.parametrize("conventions", [GSPLAT_MAIN, INRIA], ids=lambda c: c.name)
+@pytest.mark.parametrize("place", [1e3, 1e12])
+def test_what_covers_the_image_from_far_beside_is_seen(backend, conventions, place):
+    """A footprint whose radius no int32 holds: it is clamped when it is stored, and not before its box is made."""
+    camera = Camera(np.eye(3), np.zeros(3), 400.0, 400.0, 16.0, 16.0, 32, 32)
+    projection = project_one(backend, [place, 0, 0.25], [place] * 3, 0.9, camera=camera, conventions=conventions)
+    assert (projection.means2d[0, 0] > constants.RADIUS_MAX) == (place > 1e6)
+    assert_array_equal(projection.boxes, [[0, 0, 32, 32]])
+    assert (projection.radii > 1e6).all() and (projection.radii <= constants.RADIUS_MAX).all()
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_gaussian_at_alpha_min_reaches_no_pixel(backend, dtype):
+    """At alpha_min its extent is nothing; one digit above, it is one pixel and is seen."""
+    least = dtype(GSPLAT_MAIN.alpha_min)
+    opacities = np.array([np.nextafter(least, dtype(0)), least, np.nextafter(least, dtype(1))])
+    inputs = np.tile([0.103, 0.107, 2.0], (3, 1)), np.repeat(IDENTITY, 3, axis=0), np.full((3, 3), 0.1), opacities
+    projection = backend.project(*(array.astype(dtype) for array in inputs), CAMERA, GSPLAT_MAIN)
+    assert_array_equal(projection.radii, [[0, 0], [0, 0], [1, 1]])
+    for field in projection:
+        assert not field[:2].any() and field[2].any()
+    grid = TileGrid(CAMERA.width, CAMERA.height, backend.tile_width, backend.tile_height)
+    assert set(backend.bin_gaussians(projection, grid, GSPLAT_MAIN).gaussian_ids) == {2}
 
 
 def test_gaussian_at_the_corner_keeps_its_part_inside(backend):

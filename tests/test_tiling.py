@@ -3,8 +3,9 @@ from itertools import pairwise
 import numba
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 from scenes import activated, make_camera, make_gaussians
+from tolerances import PARITY_FLOAT32_IMAGE
 
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN, INRIA
@@ -207,6 +208,20 @@ def test_a_gaussian_over_all_tiles(fast_backend):
     bins = fast_backend.bin_gaussians(projection, grid, GSPLAT_MAIN)
     assert lists(bins) == [[2, 0, 1]] * (grid.n_tiles_x * grid.n_tiles_y)
     assert_array_equal(np.diff(bins.gaussian_offsets), [grid.n_tiles_x * grid.n_tiles_y] * 3)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("reach", [1e14, 1e17])
+def test_the_flattest_conics_reach_the_image_from_far_away(fast_backend, reach, dtype):
+    """One standard deviation beside the image, which is alpha 0.9 exp(-1/2) in every pixel."""
+    p = footprints([[0, 0, 64, 32]], [2.0])
+    p = p._replace(means2d=np.array([[reach, 16.0]]), conics=np.array([[reach**-2.0, 0, reach**-2.0]]))
+    p = Projection(*(field.astype(dtype) for field in p[:2]), p.conics, p.opacities.astype(dtype), *p[4:])
+    grid = TileGrid(64, 32, fast_backend.tile_width, fast_backend.tile_height)
+    bins = fast_backend.bin_gaussians(p, grid, GSPLAT_MAIN)
+    assert_array_equal(np.diff(bins.tile_offsets), 1)
+    alpha = fast_backend.composite(p, np.ones((1, 3), dtype), np.zeros(3, dtype), bins, GSPLAT_MAIN).alpha
+    assert_allclose(alpha, 0.9 * np.exp(-0.5), rtol=PARITY_FLOAT32_IMAGE)
 
 
 def test_a_row_under_the_box_that_the_ellipse_does_not_reach(fast_backend):

@@ -101,7 +101,7 @@ def _project_eight(rows, primitives, pose, lens, extent, out):
         rx, ry, x0, y0, x1, y1 = inria_box(footprint, extent.width, extent.height)
     is_seen = (p[2] > lens.near) & (p[2] < lens.far) & (opacity >= extent.alpha_min) & (footprint.det > ZERO)
     size = footprint.det + abs(a) + abs(c) + abs(footprint.x) + abs(footprint.y)  # finite if all of them are
-    is_seen = is_seen & (size < np.inf) & (x1 > x0) & (y1 > y0)
+    is_seen = is_seen & (size < np.inf) & (rx > ZERO) & (ry > ZERO) & (x1 > x0) & (y1 > y0)
     _scatter_seen(is_seen, out.means2d, rows, 0, footprint.x)
     _scatter_seen(is_seen, out.means2d, rows, 1, footprint.y)
     _scatter_seen(is_seen, out.depths, rows, 0, p[2])

@@ -21,8 +21,8 @@ kernels that call it. ``kernel`` compiles a parallel loop. Six facts shape this 
   contract ``a * b + c`` to one rounding.
 * What stands in the cache has been optimised twice, and a compiler that may change the order of a sum gives other last
   digits the second time. Where eight numbers are computed at once, :mod:`minisplat_ref.jit.lanes` says so and fixes
-  the order. Known and open: kernels can still differ in the last digit between just compiled and loaded from the
-  cache.
+  the order. What is left free, which products are contracted, has given the same bytes just compiled and loaded from
+  the cache wherever that was tried; ``tests/test_kernels.py`` tries it on the processor that it runs on.
 """
 
 import functools

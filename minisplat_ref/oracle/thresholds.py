@@ -8,8 +8,7 @@ threshold  what is compared                                                    w
 skip       a hit's alpha with ``alpha_min``: below, the hit does not count     image, gradient
 stop       the transmittance behind a hit with ``transmittance_min``: the      image, gradient
            hit and all behind it do not count
-order      the depths of two neighbours in a tile's list: which is blended     image, gradient
-           first
+order      the depths of two hits of a pixel: which is blended first           image, gradient
 clamp      a hit's alpha with ``alpha_max``: above, it has no gradient         gradient
 median     the transmittance behind a hit with one half: whose depth is the    median depth
            median depth
@@ -19,6 +18,11 @@ Two correct renderers that round differently disagree at such pixels by a whole 
 one's own mends that. The pixels are found here, in float64, and set aside by whoever compares: counted, not averaged
 into an error of arithmetic, and not excused beyond what the hits at their thresholds can change. How near is near
 enough depends on what rounds: see :class:`Margins`.
+
+Order is the threshold that can flip a whole image. All Gaussians of a wall that a camera faces squarely have one depth;
+if the camera is turned against the world's axes, rounding the means spreads these depths by some 1e-8 of themselves,
+and float64 sorts by that noise. In float32 they are equal, and the rows of the table decide: neither order is wrong.
+Our float32 kernels compute depths in float64 and sort them rounded, as other float32 renderers do.
 
 Left out: the border of a footprint's box. A hit near ``alpha_min`` counts as one inside and outside of it, since
 another renderer's box may hold it.
@@ -130,9 +134,14 @@ def thresholds_of_view(tape: SplatTape, slack: float = 0.0) -> Thresholds:
     projection = CPU.project(*tape.primitives, camera, lenient)
     grid = TileGrid(camera.width, camera.height, CPU.tile_width, CPU.tile_height)
     bins = CPU.bin_gaussians(projection, grid, lenient)
+    return thresholds(projection, bins, conventions, slack=slack, span=span_of(tape))
+
+
+def span_of(tape: SplatTape) -> float:
+    """Return the largest difference of two colours of a view, of its background and of 0."""
     highest = max(tape.channels.max(initial=0), tape.background.max(initial=0))
     lowest = min(tape.channels.min(initial=0), tape.background.min(initial=0))
-    return thresholds(projection, bins, conventions, slack=slack, span=highest - lowest)
+    return float(highest - lowest)
 
 
 def lenient_conventions(conventions: Conventions, margins: Margins, slack: float = 0.0) -> Conventions:
@@ -148,7 +157,6 @@ def _of_tile(
     alpha_min, stop = conventions.alpha_min, conventions.transmittance_min
     margin = (margins.skip + slack) * alpha_min
     unclamped = tile.hit.unclamped  # [G, P] whether they count or not
-    depths = projection.depths[tile.ids, None]  # [G, 1]
     is_skip = np.abs(np.minimum(unclamped, conventions.alpha_max) - alpha_min) <= margin
     alphas = np.where(tile.alphas < alpha_min, 0, tile.alphas)
     T = np.cumprod(np.concatenate([np.ones((1, alphas.shape[1])), 1 - alphas]), axis=0)  # [G + 1, P]
@@ -157,12 +165,45 @@ def _of_tile(
     doubt = margins.stop + np.cumsum(2 * alpha_min * is_skip + slack * alphas / (1 - alphas), axis=0)
     is_open = before > stop * (1 - doubt)  # behind what surely stops, nothing is looked at any more
     is_stop = is_open & (tile.alphas > 0) & (np.abs(after - stop) <= stop * doubt)
-    gaps = np.diff(depths, axis=0, append=np.inf)
-    is_tie = (gaps > 0) & (gaps < margins.order * depths)  # of exactly equal ones the lower row is first
-    behind = np.concatenate([alphas[1:], np.zeros_like(alphas[:1])])  # alpha of the next in the list
     is_clamp = is_open & (np.abs(unclamped - conventions.alpha_max) <= margins.clamp * conventions.alpha_max)
     is_median = is_open & (np.abs(after - MEDIAN_TRANSMITTANCE) <= margins.median * MEDIAN_TRANSMITTANCE)
     change = np.where(is_skip & is_open, before * (alpha_min + margin), 0).sum(axis=0)
-    change += np.where(is_tie & is_open, before * alphas * behind, 0).sum(axis=0)
+    change += _change_by_order(projection.depths[tile.ids, None], tile.alphas, before, stop * (1 + doubt), margins)
     change += np.where(is_stop, before, 0).max(axis=0)  # all that lies at and behind the hit that may stop
     return _OfTile(change, change > 0, np.logical_or.reduce(is_clamp, axis=0), np.logical_or.reduce(is_median, axis=0))
+
+
+def _change_by_order(depths: Floats, alphas: Floats, before: Floats, stop: Floats, margins: Margins) -> Floats:
+    """Weight [P] that changes places where hits are blended in another order.
+
+    Hits of a pixel that rounding may exchange are a group: each is so near behind the one before it. With T in front of
+    the group, exchanging two neighbours moves at most ``T alpha_i alpha_j``, and any order is reached by exchanging
+    each pair once at most; exactly equal depths are no pair, since then the lower row is first. What a group moves is
+    never more than T, and all of T where the pixel may end within the group, at another of its hits.
+
+    Parameters
+    ----------
+    depths : ndarray of shape (G, 1)
+        Front to back.
+    alphas : ndarray of shape (G, P)
+        0 where there is no hit.
+    before : ndarray of shape (G, P)
+        Transmittance in front of each hit, as if no pixel ended.
+    stop : ndarray of shape (G, P)
+        The transmittance at which a pixel may have ended.
+    margins : Margins
+    """
+    is_hit = alphas > 0
+    last = np.maximum.accumulate(np.where(is_hit, depths, -np.inf), axis=0)
+    previous = np.concatenate([np.full_like(last[:1], -np.inf), last[:-1]])  # [G, P] depth of the hit before
+    is_one = depths.astype(np.float32) == previous.astype(np.float32)
+    is_near = is_hit & ((depths - previous < margins.order * depths) | is_one)
+    is_first = is_hit & ~is_near  # of its group
+    in_front = np.minimum.accumulate(np.where(is_first, before, 1), axis=0)  # of the group
+    nearest = np.maximum.accumulate(np.where(is_first, depths, -np.inf), axis=0)
+    total = np.cumsum(alphas, axis=0)
+    of_group = total - alphas - np.maximum.accumulate(np.where(is_first, total - alphas, 0), axis=0)  # before this hit
+    may_pass = is_near & (depths > nearest) & (in_front > stop)
+    most = np.where(may_pass, in_front, 0).max(axis=0)
+    ends = (may_pass & (before * (1 - alphas) <= stop)).any(axis=0)
+    return np.where(ends, most, np.minimum(np.where(may_pass, in_front * alphas * of_group, 0).sum(axis=0), most))

@@ -120,6 +120,14 @@ LONG = HardCaseTolerance(
     gradient32=1e-3,
 )
 
+BESIDE = HardCaseTolerance(
+    "x / z is 1,000 and more: gradients by z and by the camera are differences of float32 sums (x / z)^2 times larger",
+    1e-6,
+    1e-4,
+    image32=2e-5,
+    gradient32=1.0,  # finite, and no larger than it should be; image, opacity and colour are as exact as elsewhere
+)
+
 BEHIND = HardCaseTolerance(
     "behind an opaque hit what is left is a difference from the whole pixel: 6e-8 of the whole, divided by 1 - alpha",
     1e-12,
@@ -191,7 +199,7 @@ class Margins(NamedTuple):
     median: float
     """Of the same from one half."""
     order: float
-    """Of the depth of a hit from that of the next."""
+    """Of the depth of a hit from that of the one before; those that are one float32 are always near enough."""
 
 
 FLOAT32_RENDERER = Margins(
@@ -206,8 +214,9 @@ FLOAT32_RENDERER = Margins(
 """Of any correct renderer in float32, whose own projection is compared."""
 
 OWN_KERNELS = Margins(
-    "footprints come from float64 and depths are the same numbers, in images of a few pixels: what is left is rounding"
-    " of 6e-8 in exponent and exponential; but 1 - 0.99 is off by 1e-6, and a pixel can take several such hits",
+    "footprints and depths come from float64, in images of a few pixels: what is left is rounding of 6e-8 in exponent"
+    " and exponential, and of a depth to its float32; but 1 - 0.99 is off by 1e-6, and a pixel can take several such"
+    " hits",
     skip=1e-6,
     clamp=1e-6,
     stop=1e-5,

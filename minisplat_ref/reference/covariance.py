@@ -6,7 +6,7 @@ them. Left out: activations (``scales`` are standard deviations, not logarithms)
 
 import numpy as np
 
-from minisplat_ref.types import Floats
+from minisplat_ref.types import Floats, Ints
 
 LEVI_CIVITA = np.zeros((3, 3, 3), dtype=np.int8)  # e_ijk = +1 for even, -1 for odd permutations of (0, 1, 2)
 LEVI_CIVITA[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = 1
@@ -30,7 +30,8 @@ def rotation_matrices(quats: Floats) -> Floats:
     ndarray of shape (N, 3, 3)
         world_from_gaussian.
     """
-    w, K = _cross_product_matrices(_normalized(quats)[0])
+    u, *_ = _normalized(quats)
+    w, K = _cross_product_matrices(u)
     return np.eye(3, dtype=quats.dtype) + 2 * w * K + 2 * K @ K
 
 
@@ -56,14 +57,14 @@ def rotation_matrices_vjp(quats: Floats, v_rotations: Floats) -> Floats:
     ndarray of shape (N, 4)
         Derivative by ``quats``; orthogonal to each, because their length does not matter.
     """
-    u, norm = _normalized(quats)
+    u, length, exponent = _normalized(quats)
     w, K = _cross_product_matrices(u)
     K_transposed = np.swapaxes(K, 1, 2)
     v_w = 2 * np.einsum("nij,nij->n", K, v_rotations)
     v_K = 2 * w * v_rotations + 2 * (v_rotations @ K_transposed + K_transposed @ v_rotations)
     v_v = -np.einsum("ijk,nij->nk", LEVI_CIVITA.astype(quats.dtype), v_K)
     v_u = np.column_stack([v_w, v_v])  # [N, 4]
-    return (v_u - u * np.sum(u * v_u, axis=1, keepdims=True)) / norm
+    return np.ldexp((v_u - u * np.sum(u * v_u, axis=1, keepdims=True)) / length, -exponent)
 
 
 def covariances(quats: Floats, scales: Floats) -> Floats:
@@ -118,11 +119,17 @@ def covariances_vjp(quats: Floats, scales: Floats, v_covariances: Floats) -> tup
     return rotation_matrices_vjp(quats, v_R), v_scales
 
 
-def _normalized(quats: Floats) -> tuple[Floats, Floats]:
-    """Return ``q / |q|`` [N, 4] and ``|q|`` [N, 1], with 0 / 1 for the zero quaternion."""
-    norm = np.linalg.norm(quats, axis=1, keepdims=True)
-    norm = np.where(norm == 0, np.ones_like(norm), norm)
-    return quats / norm, norm
+def _normalized(quats: Floats) -> tuple[Floats, Floats, Ints]:
+    """Return ``u = q / |q|`` [N, 4], and l and k [N, 1] with ``|q| = l 2^k``; for the zero quaternion 0, 1 and 0.
+
+    Squares of entries above 1e19 or below 1e-23 are beyond float32. So q is first divided by a power of two, which
+    rounds nothing, so that its largest entry lies between 1/2 and 1.
+    """
+    _, exponent = np.frexp(np.abs(quats).max(axis=1, keepdims=True))
+    scaled = np.ldexp(quats, -exponent)
+    length = np.linalg.norm(scaled, axis=1, keepdims=True)
+    length = np.where(length == 0, np.ones_like(length), length)
+    return scaled / length, length, exponent
 
 
 def _cross_product_matrices(unit_quats: Floats) -> tuple[Floats, Floats]:

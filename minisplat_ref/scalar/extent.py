@@ -1,6 +1,7 @@
 """Which pixels one projected Gaussian may touch: radii and a half-open box of pixels inside the image.
 
-The numbers are whole but floats. They are clamped to the image, so that a cast to integers is defined.
+The numbers are whole but floats. Boxes are clamped to the image, and radii, when the boxes are made, to what int32
+holds, so that a cast to integers is defined.
 """
 
 from typing import NamedTuple
@@ -32,13 +33,13 @@ class Extent(NamedTuple):
 def support_box(footprint, opacity, alpha_min, width, height):
     """Extent at which alpha falls to alpha_min: sqrt(2 ln(opacity / alpha_min)) standard deviations along x and y."""
     squared = TWO * log_of(larger(opacity / alpha_min, ONE))
-    rx = ceil(smaller(sqrt(squared * footprint.cov_xx), RADIUS_MAX))
-    ry = ceil(smaller(sqrt(squared * footprint.cov_yy), RADIUS_MAX))
+    rx = ceil(sqrt(squared * footprint.cov_xx))
+    ry = ceil(sqrt(squared * footprint.cov_yy))
     x0 = floor(smaller(larger(footprint.x - rx, ZERO), width))
     y0 = floor(smaller(larger(footprint.y - ry, ZERO), height))
     x1 = ceil(smaller(larger(footprint.x + rx, ZERO), width))
     y1 = ceil(smaller(larger(footprint.y + ry, ZERO), height))
-    return rx, ry, x0, y0, x1, y1
+    return smaller(rx, RADIUS_MAX), smaller(ry, RADIUS_MAX), x0, y0, x1, y1
 
 
 @scalar
@@ -57,7 +58,8 @@ def inria_box(footprint, width, height):
     half_difference = HALF * (footprint.cov_xx - footprint.cov_yy)  # middle^2 - det, without its cancellation
     root = half_difference * half_difference + footprint.cov_xy * footprint.cov_xy
     largest = middle + sqrt(larger(root, INRIA_ROOT_MIN))
-    r = ceil(smaller(THREE * sqrt(largest), RADIUS_MAX))
+    r = ceil(THREE * sqrt(largest))
     x0, x1 = inria_tiles(footprint.x - HALF, r, width)
     y0, y1 = inria_tiles(footprint.y - HALF, r, height)
+    r = smaller(r, RADIUS_MAX)
     return r, r, x0, y0, x1, y1

@@ -14,7 +14,7 @@ from minisplat_ref.jit.lanes import larger, log_of, select, smaller, sqrt
 from minisplat_ref.jit.literals import ONE, TWO, ZERO
 
 FAR = np.float32(1e9)  # px
-FLAT = np.float32(1e-30)  # px^-2: a conic that is no ellipse reaches over any image
+FLAT = np.float32(1e-37)  # px^-2, the least whose reciprocal float32 holds: flatter ones reach over any image
 
 
 class Outline(NamedTuple):

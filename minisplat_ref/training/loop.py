@@ -110,8 +110,7 @@ def train(
     Returns
     -------
     state : TrainState
-        The same seed gives the same bytes, and so does a state that was saved, loaded and continued, once the kernels
-        are in the cache: a process that compiles them itself can differ in the last digit.
+        The same seed gives the same bytes, and so does a state that was saved, loaded and continued.
 
     Raises
     ------

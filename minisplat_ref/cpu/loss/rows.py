@@ -8,7 +8,8 @@ A window needs eleven rows of both images, and the gradient of a row the derivat
 it. Both are kept in rings of rows, which stay in the cache, instead of five more images in memory: so the gradient, but
 for a factor, is made together with the loss. Rows are filtered vertically two at a time, for what two windows share is
 read once; a ring has twelve rows. Each thread goes down a band of rows, and the rows beyond its edges are computed once
-more.
+more. The first of two rows is not rounded as the second is, since the compiler contracts other products. So a band
+begins at an even row, and with it every pair for the gradient; pairs for the similarity begin at odd rows.
 
 Rows of the images get margins as black as zeros, wide enough for the window and for the last eight numbers of a row, so
 that no number is a special case. They are kept less one half, and moments are those of I - 1/2 and T - 1/2: variances
@@ -214,9 +215,9 @@ def loss_kernel(dtype: np.dtype) -> Callable:
         sums,  # [H, 2] of |I - T| and of SSIM
         v_image,  # [H, 3 W]
     ):
-        n_rows = len(sums)
+        n_rows, n_pairs = len(sums), (len(sums) + 1) // 2
         for band in prange(n_bands):
-            start, end = n_rows * band // n_bands, n_rows * (band + 1) // n_bands
-            loss_band(start, end, pictures, v_l1, v_ssim, sums, v_image)
+            start, end = 2 * (n_pairs * band // n_bands), 2 * (n_pairs * (band + 1) // n_bands)
+            loss_band(start, min(end, n_rows), pictures, v_l1, v_ssim, sums, v_image)
 
     return loss_rows

@@ -5,10 +5,11 @@ import numpy as np
 from minisplat_ref.constants import INRIA
 from minisplat_ref.oracle.hard_cases.scenes import call, camera, cloud, gaussians, intrinsics, moved_world
 from minisplat_ref.oracle.hard_cases.subjects import Call, HardCase, Parameters
-from minisplat_ref.oracle.tolerances import LONG, ORDINARY, WORLD
+from minisplat_ref.oracle.tolerances import BESIDE, LONG, ORDINARY, WORLD
 
+COVERS = "it covers the image with half of its opacity"
 CULLED = "culled: the background, and no gradient"
-BESIDE = [[1.2, 0.1, 1.0], [-1.4, -0.3, 1.0], [0.2, 1.1, 1.0], [0.1, 0.2, 3.0]]  # slopes beyond 1.3 tan(fov / 2)
+BEYOND_CLAMP = [[1.2, 0.1, 1.0], [-1.4, -0.3, 1.0], [0.2, 1.1, 1.0], [0.1, 0.2, 3.0]]  # slopes beyond 1.3 tan(fov / 2)
 
 
 CAMERAS = (
@@ -91,19 +92,19 @@ CAMERAS = (
         "clamp-active",
         "means beside the view whose footprints reach in: the Jacobian is frozen at 1.3 tan(fov / 2)",
         "no gradient through the frozen slope",
-        lambda: call(BESIDE, 0.4, size=(24, 18)),
+        lambda: call(BEYOND_CLAMP, 0.4, size=(24, 18)),
     ),
     HardCase(
         "clamp-active-inria",
         "the same, counted from the axis",
         "as above",
-        lambda: call(BESIDE, 0.4, size=(24, 18), profile="INRIA"),
+        lambda: call(BEYOND_CLAMP, 0.4, size=(24, 18), profile="INRIA"),
     ),
     HardCase(
         "clamp-off-centre",
         "the clamp counts from a principal point at the edge",
         "limits that are not symmetric",
-        lambda: call(BESIDE, 0.4, size=(24, 18), Ks=intrinsics(30, 28, 2.0, 16.0)),
+        lambda: call(BEYOND_CLAMP, 0.4, size=(24, 18), Ks=intrinsics(30, 28, 2.0, 16.0)),
     ),
     HardCase(
         "principal-point-off-centre",
@@ -185,6 +186,25 @@ CAMERAS = (
         "a gentle slope of alpha",
         lambda: Parameters(gaussians([[3e3, 0, 1]], 1e5), camera()),
         LONG,
+    ),
+    HardCase(
+        "radius-of-7e7",
+        "just before the near plane and 1,000 units beside: its centre is 2e7 pixels away",
+        COVERS,
+        lambda: call([[1e3, 0, 0.02]], 1e3, 0.9, size=(32, 32), Ks=intrinsics(400, 400, 16, 16)),
+        BESIDE,
+    ),
+    *(
+        HardCase(
+            f"radius-beyond-int32{name}",
+            "centre and radius are 1e10 pixels and more: a radius that is clamped before the box is made culls it",
+            COVERS,
+            lambda options=options: call(  # type: ignore[misc]
+                [[1e3, 0, 1]], 1e3, 0.9, size=(32, 32), Ks=intrinsics(1e7, 1e7, 16, 16), **options
+            ),
+            BESIDE,
+        )
+        for name, options in (("", {}), ("-inria", {"profile": "INRIA"}))
     ),
 )
 

@@ -3,17 +3,34 @@
 import numpy as np
 
 from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN, INRIA, MINI_SPLATTING2
-from minisplat_ref.oracle.hard_cases.scenes import call, camera, cloud, gaussians, rounded
+from minisplat_ref.oracle.hard_cases.scenes import call, camera, cloud, gaussians, rounded, turn
 from minisplat_ref.oracle.hard_cases.subjects import HardCase, Parameters
 from minisplat_ref.oracle.tolerances import BEHIND, DEEP
+from minisplat_ref.reference.covariance import rotation_matrices
 
 ALPHA_MIN = float(np.float32(1 / 255))
+AT_1_OF_256 = GSPLAT_MAIN._replace(name="AT_1_OF_256", alpha_min=1 / 256)
 
 
 def _stack(n: int, logit: float, **changes: object) -> Parameters:
     """One Gaussian behind the other, all over the image."""
     means = np.column_stack([np.zeros((n, 2)), np.linspace(2, 4, n)])
     return Parameters(gaussians(means, 1.0, logits=logit), camera(6, 5), **changes)  # type: ignore[arg-type]
+
+
+def _wall() -> Parameters:
+    rng, R = np.random.default_rng(8), rotation_matrices(turn(0.7, (1, 2, 3))[None])[0]
+    on_wall = np.column_stack([rng.uniform((-1.6, -1.2), (1.6, 1.2), size=(100, 2)), np.full(100, 4.0)])
+    wall = gaussians(on_wall @ R, 0.05, logits=rng.normal(1, 1, 100))
+    return Parameters(wall, camera(48, 36, fx=60.0, fy=60.0, cam_from_world_R=R))
+
+
+def _seen_through_a_thousandth() -> Parameters:
+    """A faint needle behind three layers that let 0.05 % through; its short quaternion has the longest gradient."""
+    population = gaussians([[0, 0, 2], [0, 0, 2.5], [0, 0, 3], [0.1, 0.05, 4]], [[1.0] * 3] * 3 + [[0.05, 0.02, 0.02]])
+    quats, logits = population.quats.copy(), np.array([2.5, 2.5, 2.5, -3.0])
+    quats[3] *= 2.0**-20
+    return Parameters(population._replace(quats=quats, opacity_logits=rounded(logits)), camera())
 
 
 LAYERS = (
@@ -77,6 +94,39 @@ LAYERS = (
         "the peak's alpha is alpha_min itself, where a hit begins to count",
         "a hit or none, counted as a flip; never more than 1/255",
         lambda: call([[0, 0, 3.0], [0.3, 0.2, 4]], opacities=[ALPHA_MIN, 0.5]),
+    ),
+    HardCase(
+        "opacities-around-alpha-min",
+        "alpha_min itself, which 1/256 is in every precision, one rounding below and one above",
+        "below and at it culled: the extent is nothing; above it one pixel, which a centre on the mean's place may hit",
+        lambda: call(
+            [[0.013, 0.007, 3], [0.11, 0.17, 3], [0, 0, 3.0], [0.3, 0.2, 4]],
+            opacities=[float(opacity) for opacity in (*_around(np.float32(1 / 256)), 0.5)],
+            profile=AT_1_OF_256,
+        ),
+    ),
+    HardCase(
+        "opacities-around-alpha-min-inria",
+        "the same where the extent does not depend on the opacity",
+        "below it culled; at it and above drawn, as far as alpha reaches",
+        lambda: call(
+            [[0.013, 0.007, 3], [0.11, 0.17, 3], [0, 0, 3.0], [0.3, 0.2, 4]],
+            opacities=[float(opacity) for opacity in (*_around(np.float32(1 / 256)), 0.5)],
+            profile=AT_1_OF_256._replace(has_full_support=False),
+        ),
+    ),
+    HardCase(
+        "opacity-at-alpha-min",
+        "a Gaussian of radius 0 whose box holds a pixel: it must be in no list, for nobody writes its record",
+        "culled: the background",
+        lambda: call([[0.013, 0.007, 3]], opacities=1 / 256, profile=AT_1_OF_256),
+        is_background=True,
+    ),
+    HardCase(
+        "opacity-of-one-byte",
+        "1 / 255 as a .splat file gives it: in float32 alpha_min itself, and by a rounding more than float64's",
+        "one dot at most, fainter than any image shows",
+        lambda: call([[0.013, 0.007, 3], [0.3, 0.2, 4]], opacities=[ALPHA_MIN, 0.5]),
     ),
     HardCase(
         "opacity-below-1-of-255",
@@ -180,6 +230,19 @@ LAYERS = (
         lambda: Parameters(gaussians([[0, 0, 2], [0, 0, 3]], 0.5, logits=0.0), camera(9, 9), with_median_depth=True),
     ),
     HardCase(
+        "wall-facing-a-turned-camera",
+        "a wall of depth 4: rounding its means spreads their depths by 1e-7, which float32 cannot tell apart",
+        "blended in the order of that noise, or of the rows; pixels with two of them are flips",
+        _wall,
+    ),
+    HardCase(
+        "alone-behind-a-thousandth",
+        "what is left behind three opaque hits is a difference from the whole pixel, and here the whole gradient",
+        "the gradient by a short quaternion, to three digits less than others",
+        _seen_through_a_thousandth,
+        BEHIND,
+    ),
+    HardCase(
         "subnormal-gradients",
         "derivatives by the image of 1e-40: subnormal in float32, their products are 0",
         "finite gradients, as good as zero",
@@ -199,6 +262,11 @@ LAYERS = (
         BEHIND,
     ),
 )
+
+
+def _around(number: np.float32) -> tuple[np.float32, np.float32, np.float32]:
+    """Return a number between its neighbours."""
+    return np.nextafter(number, np.float32(0)), number, np.nextafter(number, np.float32(1))
 
 
 def _ulp_depths() -> np.ndarray:

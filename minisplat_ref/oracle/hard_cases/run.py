@@ -17,7 +17,7 @@ from minisplat_ref.backends import CPU, CPU_EXACT, REFERENCE, Backend
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.cases import Case, Figure, Report
 from minisplat_ref.oracle.hard_cases.subjects import Arrays, Drawing, HardCase, Subject, drawing, splat_tapes
-from minisplat_ref.oracle.thresholds import Thresholds, thresholds
+from minisplat_ref.oracle.thresholds import Thresholds, span_of, thresholds
 from minisplat_ref.oracle.tolerances import BLOCK_FLOOR, OWN_KERNELS
 from minisplat_ref.splatting import SplatTape
 from minisplat_ref.types import Bools
@@ -141,7 +141,9 @@ def _comparison(case: HardCase, subject: Subject, precisions: Sequence[Precision
 
 
 def _thresholds(tape: SplatTape, size: float) -> Thresholds:
-    return thresholds(tape.projection, tape.bins, tape.conventions, OWN_KERNELS, span=size)
+    """Find the pixels at thresholds; errors are relative to the size of the image, and those of alpha to 1."""
+    span = max(1.0, span_of(tape) / size)
+    return thresholds(tape.projection, tape.bins, tape.conventions, OWN_KERNELS, span=span)
 
 
 def _outcome(drawn: Drawing, cotangents: Arrays, dtype: type) -> Outcome:

@@ -4,10 +4,12 @@ from typing import Any
 
 import numpy as np
 
+from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.oracle.hard_cases.subjects import Call, Parameters
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.types import Camera, Floats, Gaussians
 
+ANTIALIASED = GSPLAT_MAIN._replace(name="ANTIALIASED", is_antialiased=True)
 BACKGROUND = np.array([[0.25, 0.5, 0.75]])
 
 

@@ -2,12 +2,11 @@
 
 import numpy as np
 
-from minisplat_ref.constants import GSPLAT_MAIN, INRIA
-from minisplat_ref.oracle.hard_cases.scenes import call, camera, cloud, gaussians, needle, rounded, turn
+from minisplat_ref.constants import INRIA
+from minisplat_ref.oracle.hard_cases.scenes import ANTIALIASED, call, camera, cloud, gaussians, needle, rounded, turn
 from minisplat_ref.oracle.hard_cases.subjects import HardCase, Parameters, Surface
 from minisplat_ref.oracle.tolerances import LONG, ORDINARY
 
-ANTIALIASED = GSPLAT_MAIN._replace(name="ANTIALIASED", is_antialiased=True)
 RIDGE = "a ridge without holes; the gradient that the float64 formula has"
 DIAGONAL, TILTED = turn(np.pi / 4), turn(0.3)
 

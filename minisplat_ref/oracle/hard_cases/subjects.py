@@ -133,8 +133,14 @@ def drawing(subject: Subject, backend: Backend, dtype: np.dtype) -> Drawing:
 def splat_tapes(subject: Subject, backend: Backend) -> list[SplatTape]:
     """Return what was splatted in float64, view by view, to look for pixels at thresholds; nothing of a loss."""
     if isinstance(subject, Parameters):
-        gaussians, camera = subject.gaussians, subject.camera
-        _, tape = render(gaussians, camera, conventions=subject.conventions, backend=backend)
+        _, tape = render(
+            subject.gaussians,
+            subject.camera,
+            background=np.array(subject.background),
+            conventions=subject.conventions,
+            backend=backend,
+            with_depth=subject.with_depth,
+        )
         return [tape.splats]
     if not isinstance(subject, Call):
         return []
