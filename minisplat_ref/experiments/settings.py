@@ -1,7 +1,6 @@
 """What a training is asked to do, as it stands in ``config.json``."""
 
 import platform
-import zipfile
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +13,7 @@ from minisplat_ref.experiments.run_folder import CONFIG, POINT_CLOUD, SHARED, re
 from minisplat_ref.extensions.extension import CORE, find_recipe, owner_of
 from minisplat_ref.io import load_scene
 from minisplat_ref.io.atomic import replacing
+from minisplat_ref.io.npz import read_npz
 from minisplat_ref.strategy import importance, simplify
 from minisplat_ref.training.schedule import Recipe, configured, describe, parsed_settings
 from minisplat_ref.types import Floats, Model, Scene
@@ -100,11 +100,7 @@ def load_model(folder: Path, settings: Settings) -> Model:
     gaussians = owner.load(folder / POINT_CLOUD, owner.representation.population)
     if not (folder / SHARED).exists():
         return Model(gaussians)
-    try:
-        with np.load(folder / SHARED, allow_pickle=False) as archive:
-            return Model(gaussians, dict(archive))
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise InputError(f"{folder / SHARED} cannot be read ({error}): train anew") from error
+    return Model(gaussians, read_npz(folder / SHARED, "train anew"))
 
 
 def to_config(settings: Settings, recipe: Recipe, scene: Scene) -> dict[str, Any]:

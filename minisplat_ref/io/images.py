@@ -6,6 +6,10 @@ Pixels come as the file stores them: an EXIF orientation is not applied, because
 alias, and area means for masks. Left out: colour profiles, raw formats, high dynamic range.
 """
 
+import struct
+import threading
+import warnings
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import ExifTags, Image, UnidentifiedImageError
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import replacing
@@ -23,27 +27,79 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 """Files that count as photographs."""
 
 SAVE_OPTIONS: dict[str, dict[str, Any]] = {"JPEG": {"quality": 95, "subsampling": 0}}
+PIXELS_MAX = 2**29  # of an image: more than cameras have, and 1.6 GB in memory
+PLAUSIBLE_PIXELS = 100_000_000  # up to here a flat image may be packed into any number of bytes
+PIXELS_PER_BYTE = 1000  # beyond, an image that is a photograph has at least a byte for so many
+DAMAGE_ERRORS = (  # what Pillow's decoders raise for damaged files
+    *(OSError, SyntaxError, ValueError, TypeError, LookupError, ArithmeticError, AttributeError, EOFError),
+    *(RuntimeError, struct.error, zlib.error),
+)
+_LIMIT_LOCK = threading.Lock()
 MASK_THRESHOLD = 128  # a mask pixel counts from half white on; masks saved as JPEG are not exactly 0 and 255
 
 
 @contextmanager
 def open_image(path: Path) -> Iterator[Image.Image]:
-    """Open an image file with Pillow; whatever goes wrong while it is decoded becomes an InputError naming the file."""
+    """Open an image file with Pillow; whatever goes wrong while it is decoded becomes an InputError naming the file.
+
+    Pillow's limit of pixels, beyond which it speaks of a bomb, is below what telephones take; ours is
+    :data:`PIXELS_MAX`. What Pillow warns of, such as damaged EXIF data, does not matter here.
+    """
     try:
-        with Image.open(path) as image:
-            yield image
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with _without_limit():
+                opened = Image.open(path)
+            with opened as image:
+                check_n_pixels(path, *image.size)
+                n_bytes = path.stat().st_size
+                if image.width * image.height > max(PLAUSIBLE_PIXELS, PIXELS_PER_BYTE * n_bytes):
+                    raise InputError(
+                        f"{path}: {image.width} x {image.height} pixels cannot be in {n_bytes} bytes; copy or export"
+                        " the file again"
+                    )
+                yield image
+    except InputError:
+        raise
     except FileNotFoundError:
         raise InputError(f"{path}: no such image") from None
     except UnidentifiedImageError:
         raise InputError(f"{path}: not an image that Pillow can read; convert it to PNG or JPEG") from None
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except MemoryError:
+        raise InputError(f"{path}: its pixels do not fit in memory; make the image smaller") from None
+    except DAMAGE_ERRORS as error:
         raise InputError(f"{path}: cannot be decoded ({error}); copy or export the file again") from error
+
+
+@contextmanager
+def _without_limit() -> Iterator[None]:
+    """Set Pillow's limit of pixels aside while a file is opened, which reads no pixels."""
+    with _LIMIT_LOCK:
+        limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+        try:
+            yield
+        finally:
+            Image.MAX_IMAGE_PIXELS = limit
+
+
+def check_n_pixels(what: str | Path, width: int, height: int) -> None:
+    """Refuse an image that is larger than any photograph."""
+    if width * height > PIXELS_MAX:
+        raise InputError(
+            f"{what}: {width} x {height} pixels, more than the {PIXELS_MAX:,} that are read; make it smaller"
+        )
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
     """Width and height in pixels, from the file's header alone."""
     with open_image(Path(path)) as image:
         return image.size
+
+
+def is_turned(path: str | Path) -> bool:
+    """Return whether the file's EXIF data ask to show it with width and height exchanged."""
+    with open_image(Path(path)) as image:
+        return image.getexif().get(ExifTags.Base.Orientation, 1) in (5, 6, 7, 8)
 
 
 def read_image(path: str | Path) -> NDArray[np.uint8]:

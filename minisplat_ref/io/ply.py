@@ -9,10 +9,11 @@ Files are read by property name, so order, normals and extra properties do not m
 any scalar type. Left out: faces and other elements, lists, compressed variants.
 """
 
+import itertools
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,13 +68,13 @@ def load_ply(path: str | Path, population: Any = Gaussians) -> Any:
     InputError
         If the file is missing, truncated, not a PLY of Gaussians, or holds NaN, infinity or a zero quaternion.
     """
-    columns = read_vertices(path)
+    header, columns = _read(path)
     rest_names = _sh_rest_names(columns, path)
     further = {field: _further_names(columns, field) for field in population._fields if field not in Gaussians._fields}
     names = (*MEANS, *SH_DC, *rest_names, "opacity", *SCALES, *QUATS)
     missing = [name for name in names if name not in columns]
     if missing:
-        raise InputError(f"{path}: not a PLY of Gaussians, no property {', '.join(missing)}; {_way_out(columns)}")
+        raise InputError(f"{path}: not a PLY of Gaussians, no property {', '.join(missing)}; {_way_out(header)}")
     missing = [field for field, properties in further.items() if not properties]
     if missing:
         raise InputError(
@@ -121,7 +122,7 @@ def further_properties(path: str | Path) -> tuple[str, ...]:
     path = Path(path)
     try:
         with path.open("rb") as file:
-            *_, dtype = _read_header(file, path)
+            dtype = _read_header(file, path).dtype
     except OSError as error:
         raise InputError(f"{path}: cannot be opened ({error.strerror})") from None
     usual = {*MEANS, *NORMALS, *SH_DC, "opacity", *SCALES, *QUATS}
@@ -211,18 +212,33 @@ def read_vertices(path: str | Path) -> dict[str, NDArray]:
     InputError
         If the file is missing, malformed or ends before its last declared vertex.
     """
+    return _read(path)[1]
+
+
+class _Header(NamedTuple):
+    encoding: str
+    n_skipped: int
+    """Rows of elements before the vertices, ASCII only."""
+    n: int
+    """Number of vertices."""
+    dtype: np.dtype
+    """Of a vertex, structured."""
+    n_faces: int
+
+
+def _read(path: str | Path) -> tuple[_Header, dict[str, NDArray]]:
+    """Header and vertices of a file."""
     path = Path(path)
     try:
         file = path.open("rb")
     except OSError as error:
         raise InputError(f"{path}: cannot be opened ({error.strerror})") from None
     with file:
-        encoding, n_skipped, n, dtype = _read_header(file, path)
-        if encoding == "ascii":
-            rows = _read_ascii(file, path, n_skipped, n, dtype)
-        else:
-            rows = _read_binary(file, path, n, dtype)
-    return {name: rows[name].astype(rows[name].dtype.newbyteorder("=")) for name in rows.dtype.names or ()}
+        header = _read_header(file, path)
+        with np.errstate(over="ignore"):  # text beyond float32 becomes infinite, which check_finite names
+            rows = (_read_ascii if header.encoding == "ascii" else _read_binary)(file, path, header)
+    names = rows.dtype.names or ()
+    return header, {name: rows[name].astype(rows[name].dtype.newbyteorder("=")) for name in names}
 
 
 def write_vertices(path: str | Path, columns: Mapping[str, NDArray]) -> None:
@@ -264,20 +280,23 @@ def _sh_rest_names(columns: Mapping[str, NDArray], path: str | Path) -> tuple[st
     return tuple(f"f_rest_{i}" for i in range(n_rest))
 
 
-def _way_out(columns: Mapping[str, NDArray]) -> str:
+def _way_out(header: _Header) -> str:
     """What to do with a PLY that does not hold Gaussians."""
-    if "packed_position" in columns:
+    names = header.dtype.names or ()
+    if "packed_position" in names:
         return "it is a compressed splat: export it as a plain PLY"
-    if all(name in columns for name in MEANS):
+    if header.n_faces:
+        return f"it is a mesh of {header.n_faces:,} faces, which is not rendered: give a trained point_cloud.ply"
+    if all(name in names for name in MEANS):
         return "it is a point cloud: give it as a scene's points, or give a trained point_cloud.ply"
     return "give a trained point_cloud.ply"
 
 
-def _read_header(file: BinaryIO, path: Path) -> tuple[str, int, int, np.dtype]:
-    """Encoding, rows of elements before the vertices (ASCII only), number of vertices, and their structured dtype."""
+def _read_header(file: BinaryIO, path: Path) -> _Header:
+    """Read up to the line end_header."""
     if file.readline(8).strip() != b"ply":
         raise InputError(f"{path}: not a PLY file, it does not begin with 'ply'")
-    encoding, element, n_skipped, n = "", "", 0, -1
+    encoding, element, n_skipped, n, n_faces = "", "", 0, -1, 0
     properties: list[tuple[str, str]] = []
     words: list[str] = []
     while words != ["end_header"]:
@@ -292,8 +311,9 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, int, int, np.dtype]:
             case ["element", element, count] if count.isdecimal():
                 if element == "vertex":
                     n = int(count)
-                elif n < 0:
-                    n_skipped += int(count)
+                    continue
+                n_skipped += int(count) if n < 0 else 0
+                n_faces += int(count) if element == "face" else 0
             case ["property", kind, name] if kind in SCALAR_TYPES:
                 if element == "vertex":
                     properties.append((name, SCALAR_TYPES[kind]))
@@ -310,11 +330,13 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, int, int, np.dtype]:
         )
     if n_skipped and encoding != "ascii":
         raise InputError(f"{path}: elements stand before the vertices; export the PLY with its vertices first")
-    return encoding, n_skipped, n, np.dtype([(name, BYTE_ORDERS[encoding] + code) for name, code in properties])
+    dtype = np.dtype([(name, BYTE_ORDERS[encoding] + code) for name, code in properties])
+    return _Header(encoding, n_skipped, n, dtype, n_faces)
 
 
-def _read_binary(file: BinaryIO, path: Path, n: int, dtype: np.dtype) -> NDArray:
+def _read_binary(file: BinaryIO, path: Path, header: _Header) -> NDArray:
     """Read the n declared vertices; what follows them is not looked at."""
+    n, dtype = header.n, header.dtype
     found = path.stat().st_size - file.tell()
     expected = n * dtype.itemsize
     if found < expected:
@@ -325,17 +347,23 @@ def _read_binary(file: BinaryIO, path: Path, n: int, dtype: np.dtype) -> NDArray
     return np.frombuffer(file.read(expected), dtype)
 
 
-def _read_ascii(file: BinaryIO, path: Path, n_skipped: int, n: int, dtype: np.dtype) -> NDArray:
+def _read_ascii(file: BinaryIO, path: Path, header: _Header) -> NDArray:
     """Read the n declared vertices, one a line."""
-    lines = file.read().decode("ascii", errors="replace").splitlines()[n_skipped : n_skipped + n]
-    if len(lines) < n:
-        raise InputError(f"{path}: truncated, {n} vertices expected, {len(lines)} lines found; copy or export it again")
-    rows = np.empty(n, dtype)
+    n, n_properties = header.n, len(header.dtype.names or ())
+    found = path.stat().st_size - file.tell()
+    if found + 1 < header.n_skipped + 2 * n * n_properties:  # a line, or a character and a gap for each number
+        raise InputError(f"{path}: truncated, {n} vertices expected, {found} bytes found; copy or export it again")
+    rows = np.empty(n, header.dtype)
+    lines = itertools.islice(file, header.n_skipped, header.n_skipped + n)
+    row = -1
     for row, line in enumerate(lines):
         try:
             rows[row] = tuple(float(word) for word in line.split())
         except (ValueError, OverflowError):
+            text = line[:60].decode("ascii", errors="replace").strip()
             raise InputError(
-                f"{path}: row {row} is '{line[:60]}', not {len(dtype.names or ())} numbers; copy or export it again"
+                f"{path}: row {row} is '{text}', not {n_properties} numbers; copy or export it again"
             ) from None
+    if row + 1 < n:
+        raise InputError(f"{path}: truncated, {n} vertices expected, {row + 1} lines found; copy or export it again")
     return rows
