@@ -62,6 +62,8 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from minisplat_ref.experiments import run_folder
+    from minisplat_ref.experiments.first_use import warn_if_not_kept
+    from minisplat_ref.experiments.notices import warn_of_model
     from minisplat_ref.experiments.pictures import depth_picture, depth_range
     from minisplat_ref.io import write_image
     from minisplat_ref.io.names import file_names
@@ -69,6 +71,8 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.types import view_from
 
     source = _open(args)
+    warn_of_model(source.trained.model, args.input)
+    warn_if_not_kept(source.trained.backend)
     views = _choose_views(args, source)
     out: Path = args.out or source.default_out
     run_folder.create(out)

@@ -133,6 +133,7 @@ def _start(given: dict[str, Any]) -> int:
 
     from minisplat_ref.experiments import curve, run_folder
     from minisplat_ref.experiments.first_use import compile_kernels
+    from minisplat_ref.experiments.notices import warn_of_scene
     from minisplat_ref.experiments.settings import Settings, load_photographs, recipe_of
     from minisplat_ref.training.loop import initial_state
 
@@ -143,6 +144,7 @@ def _start(given: dict[str, Any]) -> int:
     if settings.eval_every:
         curve.check_views(scene)
     state = initial_state(scene, recipe, settings.seed)
+    warn_of_scene(scene, settings.downscale)
     compile_kernels(settings.backend)
     run_folder.create(folder)
     try:

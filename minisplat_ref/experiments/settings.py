@@ -1,6 +1,7 @@
 """What a training is asked to do, as it stands in ``config.json``."""
 
 import platform
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,8 +15,9 @@ from minisplat_ref.extensions.extension import CORE, find_recipe, owner_of
 from minisplat_ref.io import load_scene
 from minisplat_ref.io.atomic import replacing
 from minisplat_ref.io.npz import read_npz
+from minisplat_ref.methods import RECIPES
 from minisplat_ref.strategy import importance, simplify
-from minisplat_ref.training.schedule import Recipe, configured, describe, parsed_settings
+from minisplat_ref.training.schedule import Recipe, configured, describe, parsed_settings, settings_of
 from minisplat_ref.types import Floats, Model, Scene
 
 CHOICES = {"sampling": simplify.by_sampling, "rank": simplify.by_rank, "merging": simplify.by_merging}
@@ -70,13 +72,26 @@ def recipe_of(settings: Settings) -> Recipe:
     """
     recipe = find_recipe(settings.recipe, settings.schedule_iterations, extension=settings.extension)
     recipe = configured(recipe, **parsed_settings(recipe, settings.set))
-    if settings.budget is not None:
-        recipe = configured(recipe, budget=settings.budget)
-    if settings.simplify is not None:
-        recipe = configured(recipe, choose=CHOICES[settings.simplify])
-    if settings.scene_type is not None:
-        recipe = configured(recipe, metric=METRICS[settings.scene_type])
+    options = {
+        "--budget": ("budget", settings.budget),
+        "--simplify": ("choose", _chosen("simplify", CHOICES, settings.simplify)),
+        "--scene-type": ("metric", _chosen("scene_type", METRICS, settings.scene_type)),
+    }
+    for option, (name, value) in options.items():
+        if value is None:
+            continue
+        if name not in settings_of(recipe):
+            others = ", ".join(other.name for other in RECIPES.values() if name in settings_of(other))
+            raise InputError(f"{option} means nothing to recipe {recipe.name}: leave it out, or take one of {others}")
+        recipe = configured(recipe, **{name: value})
     return recipe
+
+
+def _chosen(name: str, choices: Mapping[str, Any], key: str | None) -> Any:
+    """Return the choice of a name, None where none was made."""
+    if key is not None and str(key) not in choices:
+        raise InputError(f"{name} {key!r} is unknown; choose one of {', '.join(choices)}")
+    return None if key is None else choices[key]
 
 
 def save_model(folder: Path, settings: Settings, model: Model) -> None:
