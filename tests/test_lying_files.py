@@ -14,6 +14,7 @@ from numpy.testing import assert_array_equal
 from photo_scenes import edit_transforms, write_colmap, write_transforms
 from PIL import Image
 
+from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import LINE_MAX, InputError
 from minisplat_ref.io import load_ply, load_scene, viewpoints
@@ -236,12 +237,12 @@ def with_nan(array):
     [
         ("gaussians.quats", lambda a: None, "fields of the Gaussians are not those of the recipe (quats)"),
         ("gaussians.colour", lambda a: np.zeros((40, 3), np.float32), "not those of the recipe (colour)"),
-        ("gaussians.means", lambda a: a[:-1], "which does not fit"),
+        ("gaussians.means", lambda a: a[:-1], "gaussians.quats has shape [40, 4], which does not fit"),
         ("gaussians.means", lambda a: a[:, :2], "gaussians.means has shape [40, 2], which does not fit"),
-        ("gaussians.means", lambda a: np.float32(1), "gaussians.means has shape [], which does not fit"),
+        ("gaussians.means", lambda a: np.float32(1), "gaussians.means is missing or has no rows"),
         ("gaussians.sh_rest", lambda a: a[:, :7], "gaussians.sh_rest has shape [40, 7, 3], which does not fit"),
         ("gaussians.means", with_nan, "gaussians.means holds NaN"),
-        ("gaussians.opacity_logits", lambda a: np.full_like(a, -np.inf), "opacity_logits holds NaN or infinity"),
+        ("gaussians.opacity_logits", lambda a: np.full_like(a, -np.inf), "opacity_logits holds infinity"),
         ("gaussians.sh_dc", lambda a: a.astype(np.float16), "gaussians.sh_dc has dtype float16"),
         ("gaussians.sh_dc", lambda a: a.astype(np.int32), "gaussians.sh_dc has dtype int32"),
         ("first.means", lambda a: a[:-1], "first.means does not fit the parameters"),
@@ -258,6 +259,24 @@ def with_nan(array):
 def test_checkpoint_with_wrong_arrays(saved, refused, name, change, reason):
     arrays, _ = load_checkpoint(saved())
     assert reason in refused(load_state, saved({name: change(arrays.get(name))}), RECIPE)
+
+
+def test_info_of_a_checkpoint_that_lies(saved, capsys):
+    """What info shows is checked; what it does not show may be wrong."""
+    assert main(["info", str(saved())]) == 0
+    assert "3dgs-accel for 2 iterations" in capsys.readouterr().out
+    arrays, _ = load_checkpoint(saved())
+    wrong = [{"gaussians.means": None}, {"gaussians.means": np.zeros(3)}, {"gaussians.quats": np.zeros((2, 4))}]
+    wrong += [{"gaussians.log_scales": with_nan(arrays["gaussians.log_scales"])}]
+    for path in (saved, *(lambda a=a: saved(a) for a in wrong), lambda: saved(step="3"), lambda: saved(step=...)):
+        code = main(["info", str(path())])
+        error = capsys.readouterr().err
+        assert code == (0 if path is saved else 2) and len(error.splitlines()) == (0 if path is saved else 1)
+    huge = np.full_like(arrays["gaussians.log_scales"], 1e30)
+    for changes in ({"gaussians.log_scales": huge}, {"gaussians.sh_rest": np.zeros(40, np.float32)}):
+        assert main(["info", str(saved(changes))]) == 0
+    assert main(["info", str(saved(recipe=[1]))]) == 0
+    assert "without a name" in capsys.readouterr().out
 
 
 def test_checkpoint_with_parameters_that_the_recipe_does_not_train(saved, refused):

@@ -144,9 +144,9 @@ def _start(given: dict[str, Any]) -> int:
     if settings.eval_every:
         curve.check_views(scene)
     state = initial_state(scene, recipe, settings.seed)
-    warn_of_scene(scene, settings.downscale)
     compile_kernels(settings.backend)
     run_folder.create(folder)
+    warn_of_scene(scene, settings.downscale)
     try:
         return _train(folder, scene, settings, recipe, state)
     except InputError:  # a budget, for one, can only be found too large when there is something to choose from

@@ -278,8 +278,9 @@ def load_state(path: str | Path, recipe: Recipe) -> TrainState:
     arrays, metadata = load_checkpoint(path)
     counters = read_counters(path, metadata)
     if metadata.get("recipe") != json.loads(json.dumps(describe(recipe))):
+        name, length = written_by(metadata)
         raise InputError(
-            f"{path} was written by recipe {written_by(metadata)} with other settings than"
+            f"{path} was written by recipe {name} of {length} iterations with other settings than"
             f" {recipe.name} of {recipe.iterations} iterations: continue with the recipe of the run"
         )
     bundles = read_bundles(path, arrays, recipe.representation.population)

@@ -18,7 +18,7 @@ from minisplat_ref.types import Floats, Gaussians
 WAY_OUT = "give another checkpoint or train anew"
 N_STATE_BITS = 128  # of the generator PCG64
 MOMENTS = {"first": "gaussians", "second": "gaussians", "shared_first": "shared", "shared_second": "shared"}
-GAUSSIAN_WIDTHS: Mapping[str, tuple[tuple[int, ...], ...]] = {
+GAUSSIAN_SHAPES: Mapping[str, tuple[tuple[int, ...], ...]] = {
     **{"means": ((3,),), "quats": ((4,),), "log_scales": ((3,),), "opacity_logits": ((),), "sh_dc": ((3,),)},
     "sh_rest": tuple(((degree + 1) ** 2 - 1, 3) for degree in range(SH_DEGREE_MAX + 1)),
 }
@@ -46,11 +46,12 @@ class Bundles(NamedTuple):
     stats: dict[str, NDArray[Any]]
 
 
-def written_by(metadata: Mapping[str, Any]) -> str:
-    """Return name and length of the recipe that a checkpoint says it was written by."""
+def written_by(metadata: Mapping[str, Any]) -> tuple[str, str]:
+    """Return name and length, in iterations, of the recipe that a checkpoint says it was written by."""
     recipe = metadata.get("recipe")
     recipe = recipe if isinstance(recipe, dict) else {}
-    return f"{recipe.get('name', 'without a name')} of {recipe.get('iterations', 'unknown')} iterations"
+    n_iterations = recipe.get("iterations")
+    return str(recipe.get("name", "without a name")), f"{n_iterations:,}" if type(n_iterations) is int else "unknown"
 
 
 def read_counters(path: str | Path, metadata: Mapping[str, Any]) -> Counters:
@@ -135,19 +136,32 @@ def read_bundles(path: str | Path, arrays: Mapping[str, NDArray[Any]], populatio
     return Bundles(gaussians, first, second, *(groups[name] for name in Bundles._fields[3:]))
 
 
+def check_fields(path: str | Path, fields: Mapping[str, NDArray[Any]]) -> None:
+    """Refuse fields of a population, whatever it is, that have no rows in common or are not finite numbers."""
+    if "means" not in fields or fields["means"].ndim != 2:
+        raise InputError(f"{path}: gaussians.means is missing or has no rows of coordinates; {WAY_OUT}")
+    n = len(fields["means"])
+    for name, array in fields.items():
+        if array.shape[:1] != (n,):
+            raise _misfit(path, name, array)
+        _check_numbers(path, f"gaussians.{name}", array)
+        if not np.isfinite(array).all():
+            raise InputError(f"{path}: gaussians.{name} holds infinity; {WAY_OUT}")
+
+
 def _check_population(path: str | Path, fields: Mapping[str, NDArray[Any]], population: Any) -> None:
     """Refuse a population that lacks a field, or whose fields do not belong together."""
     if set(fields) != set(population._fields):
         differing = ", ".join(sorted(set(fields) ^ set(population._fields)))
         raise InputError(f"{path}: the fields of the Gaussians are not those of the recipe ({differing}); {WAY_OUT}")
-    n = fields["means"].shape[:1]
-    widths = GAUSSIAN_WIDTHS if population is Gaussians else {}  # another population's are its own affair
-    for name, array in fields.items():
-        if array.shape[:1] != n or not n or array.shape[1:] not in widths.get(name, (array.shape[1:],)):
-            raise InputError(f"{path}: gaussians.{name} has shape {list(array.shape)}, which does not fit; {WAY_OUT}")
-        _check_numbers(path, f"gaussians.{name}", array)
-        if not np.isfinite(array).all():
-            raise InputError(f"{path}: gaussians.{name} holds NaN or infinity; {WAY_OUT}")
+    check_fields(path, fields)
+    for name, shapes in GAUSSIAN_SHAPES.items():
+        if population is Gaussians and fields[name].shape[1:] not in shapes:  # another's are its own affair
+            raise _misfit(path, name, fields[name])
+
+
+def _misfit(path: str | Path, name: str, array: NDArray[Any]) -> InputError:
+    return InputError(f"{path}: gaussians.{name} has shape {list(array.shape)}, which does not fit; {WAY_OUT}")
 
 
 def _check_moments(
