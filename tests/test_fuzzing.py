@@ -15,7 +15,7 @@ from minisplat_ref.experiments.fuzzing.readers import READERS, mutant
 from minisplat_ref.experiments.fuzzing.run import chooser, fuzz, keep
 
 ROOT = Path(__file__).parents[1]
-IN_PROCESS = ("ply", "cameras", "checkpoint", "golden")  # whatever Python raises can be caught
+IN_PROCESS = ("ply", "cameras", "config", "checkpoint", "golden")  # whatever Python raises can be caught
 N_EXAMPLES = 100
 N_FILES = 200
 

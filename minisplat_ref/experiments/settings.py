@@ -1,6 +1,7 @@
 """What a training is asked to do, as it stands in ``config.json``."""
 
 import platform
+import reprlib
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -9,11 +10,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref import __version__
+from minisplat_ref.backends import BACKENDS
+from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.run_folder import CONFIG, POINT_CLOUD, SHARED, read_json_object
 from minisplat_ref.extensions.extension import CORE, find_recipe, owner_of
 from minisplat_ref.io import load_scene
 from minisplat_ref.io.atomic import replacing
+from minisplat_ref.io.json_file import as_array
 from minisplat_ref.io.npz import read_npz
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.strategy import importance, simplify
@@ -140,11 +144,24 @@ def load(folder: Path) -> Settings:
     """
     config = _read_config(folder)
     try:
-        return Settings(**config["settings"])
+        settings = Settings(**config["settings"])
     except (KeyError, TypeError) as error:
         raise InputError(
             f"{folder / CONFIG} is not the configuration of a training of this version: {error}"
         ) from error
+    kinds = {**Settings.__annotations__, "set": dict}  # of which isinstance cannot tell what it maps to what
+    wrong = [name for name, value in settings._asdict().items() if not isinstance(value, kinds[name])]
+    if not wrong:
+        texts_are_wrong = any(not isinstance(text, str) for text in settings.set.values())
+        wrong = ["set"] * texts_are_wrong + ["profile"] * (settings.profile not in PROFILES)
+        wrong += ["backend"] * (settings.backend not in BACKENDS)
+    if wrong:
+        name = wrong[0]
+        raise InputError(
+            f"{folder / CONFIG}: the setting {name} is {reprlib.repr(getattr(settings, name))}, which no training of"
+            " this version has written"
+        )
+    return settings
 
 
 def load_background(folder: Path) -> Floats:
@@ -155,9 +172,9 @@ def load_background(folder: Path) -> Floats:
     InputError
         As for :func:`load`.
     """
-    background = np.array(_read_config(folder).get("background"), dtype=np.float64)
-    if background.shape != (3,):
-        raise InputError(f"{folder / CONFIG} has no background of three numbers")
+    background = as_array(_read_config(folder).get("background"), (3,))
+    if background is None or not ((background >= 0) & (background <= 1)).all():
+        raise InputError(f"{folder / CONFIG} has no background of three numbers from 0 to 1")
     return background
 
 

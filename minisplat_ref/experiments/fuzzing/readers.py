@@ -9,9 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import SyntheticScene, make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
+from minisplat_ref.experiments import settings
 from minisplat_ref.experiments.fuzzing.mutations import Choose, damage
+from minisplat_ref.experiments.run_folder import CONFIG
 from minisplat_ref.io import load_ply, load_scene, save_ply, viewpoints, write_image
 from minisplat_ref.io.images import read_image
 from minisplat_ref.io.lens import import_pycolmap
@@ -110,6 +113,18 @@ def _read_cameras(_: Path, file: Path) -> object:
     return viewpoints.read(file)
 
 
+def _write_config(folder: Path) -> None:
+    scene = _scene().scene
+    own = settings.Settings(
+        "scene", 1, 8, False, RECIPE.name, 10, 10, 0, GSPLAT_MAIN.name, "cpu", set={"exposure": "true"}
+    )
+    (folder / CONFIG).write_text(json.dumps(settings.to_config(own, RECIPE, scene)))
+
+
+def _read_config(folder: Path, _: Path) -> object:
+    return settings.load(folder), settings.load_background(folder)
+
+
 def _write_plys(folder: Path) -> None:
     """Write Gaussians of degree 1 in little- and big-endian bytes and as text, the last two with a colour."""
     rng = np.random.default_rng(0)
@@ -181,6 +196,7 @@ READERS = {
     "colmap-text": Reader(_write_colmap_text, _read_scene, ("sparse/0/*.txt",)),
     "transforms": Reader(_write_transforms, _read_scene, ("transforms.json",)),
     "cameras": Reader(_write_cameras, _read_cameras, ("cameras.json",)),
+    "config": Reader(_write_config, _read_config, (CONFIG,)),
     "checkpoint": Reader(_write_checkpoint, _read_checkpoint, ("checkpoint.npz",)),
     "golden": Reader(_write_golden, _read_golden, ("golden/*.json", "golden/*/*.npz")),
     "images": Reader(_write_images, _read_image, ("image.*",), free_memory=1_000_000_000),  # pixels are packed
