@@ -17,7 +17,7 @@ from PIL import Image
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import LINE_MAX, InputError
-from minisplat_ref.io import load_ply, load_scene, viewpoints
+from minisplat_ref.io import load_ply, load_scene, read_image, viewpoints
 from minisplat_ref.io.checkpoint import load_checkpoint, save_checkpoint
 from minisplat_ref.io.lens import import_pycolmap
 from minisplat_ref.io.npz import read_npz
@@ -418,6 +418,20 @@ def test_image_larger_than_its_camera_is_not_decoded(tmp_path, refused):
     write_colmap(tmp_path)
     Image.new("L", (6000, 6000)).save(tmp_path / "images" / "0002.png")
     assert "the image is 6000x6000 but its camera is 32x24" in refused(load_scene, tmp_path)
+
+
+def test_png_that_claims_a_chunk_of_two_gigabytes(tmp_path):
+    """After its pixels Pillow asks for what is left of the chunk, as many bytes as its length says."""
+    path = tmp_path / "a.png"
+    Image.fromarray(np.zeros((6, 8, 4), np.uint8)).save(path)
+    content = path.read_bytes()
+    start = content.index(b"IDAT") - 4
+    path.write_bytes(content[:start] + struct.pack(">I", 2**31 - 1) + content[start + 4 :])
+    tracemalloc.start()
+    assert not read_image(path).any()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < FEW_BYTES
 
 
 def test_nothing_is_unpickled(tmp_path, refused):

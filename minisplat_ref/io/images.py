@@ -6,6 +6,8 @@ Pixels come as the file stores them: an EXIF orientation is not applied, because
 alias, and area means for masks. Left out: colour profiles, raw formats, high dynamic range.
 """
 
+import io
+import os
 import struct
 import threading
 import warnings
@@ -29,7 +31,7 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 SAVE_OPTIONS: dict[str, dict[str, Any]] = {"JPEG": {"quality": 95, "subsampling": 0}}
 PIXELS_MAX = 2**29  # of an image: more than cameras have, and 1.6 GB in memory
 PLAUSIBLE_PIXELS = 100_000_000  # up to here a flat image may be packed into any number of bytes
-PIXELS_PER_BYTE = 1000  # beyond, an image that is a photograph has at least a byte for so many
+PIXELS_PER_BYTE = 10_000  # beyond, a byte holds no more: a white PNG of one bit has one for 8256
 DAMAGE_ERRORS = (  # what Pillow's decoders raise for damaged files
     *(OSError, SyntaxError, ValueError, TypeError, LookupError, ArithmeticError, AttributeError, EOFError),
     *(RuntimeError, struct.error, zlib.error),
@@ -46,17 +48,16 @@ def open_image(path: Path) -> Iterator[Image.Image]:
     :data:`PIXELS_MAX`. What Pillow warns of, such as damaged EXIF data, does not matter here.
     """
     try:
-        with warnings.catch_warnings():
+        with _File(path) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")
             with _without_limit():
-                opened = Image.open(path)
+                opened = Image.open(file)
             with opened as image:
                 check_n_pixels(path, *image.size)
-                n_bytes = path.stat().st_size
-                if image.width * image.height > max(PLAUSIBLE_PIXELS, PIXELS_PER_BYTE * n_bytes):
+                if image.width * image.height > max(PLAUSIBLE_PIXELS, PIXELS_PER_BYTE * file.n_bytes):
                     raise InputError(
-                        f"{path}: {image.width} x {image.height} pixels cannot be in {n_bytes} bytes; copy or export"
-                        " the file again"
+                        f"{path}: {image.width} x {image.height} pixels cannot be in {file.n_bytes} bytes; copy or"
+                        " export the file again"
                     )
                 yield image
     except InputError:
@@ -69,6 +70,18 @@ def open_image(path: Path) -> Iterator[Image.Image]:
         raise InputError(f"{path}: its pixels do not fit in memory; make the image smaller") from None
     except DAMAGE_ERRORS as error:
         raise InputError(f"{path}: cannot be decoded ({error}); copy or export the file again") from error
+
+
+class _File(io.BufferedReader):
+    """A file that is asked for no more bytes than it has: Pillow asks for as many as a damaged PNG claims."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path))
+        self.n_bytes = os.fstat(self.fileno()).st_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Read at most the whole file."""
+        return super().read(size if size is None or size < 0 else min(size, self.n_bytes))
 
 
 @contextmanager
@@ -122,7 +135,7 @@ def read_image(path: str | Path) -> NDArray[np.uint8]:
     """
     with open_image(Path(path)) as image:
         if image.mode.startswith("I"):  # gray of 16 bits; Pillow itself keeps the upper byte of 16-bit colour files
-            gray = (np.asarray(image).astype(np.int64) >> 8).clip(0, 255).astype(np.uint8)  # [H, W]
+            gray = (np.asarray(image) >> 8).clip(0, 255).astype(np.uint8)  # [H, W]
             return np.repeat(gray[..., None], 3, axis=2)  # [H, W, 3]
         return np.array(image.convert("RGBA" if image.has_transparency_data else "RGB"))
 

@@ -14,8 +14,10 @@ from typing import NamedTuple
 
 from minisplat_ref.errors import LINE_MAX, InputError, InputWarning
 from minisplat_ref.experiments.fuzzing.readers import Mutant, Reader
+from minisplat_ref.experiments.run import peak_rss_mb
 
 MEMORY_FACTOR = 64  # times the bytes of all files: JSON and text become Python objects, of some fifty bytes for a digit
+NATIVE_FREE = 100_000_000  # bytes by which the process may grow besides: threads, and libraries on first use
 SECONDS_MAX = 5.0  # a reader of files of some kilobytes that takes as long as this on a busy machine has gone astray
 
 
@@ -43,7 +45,7 @@ def judge(reader: Reader, folder: Path, mutant: Mutant) -> Verdict:
     mutant.path.write_bytes(mutant.content)
     is_tracing = tracemalloc.is_tracing()
     tracemalloc.start()
-    start = time.perf_counter()
+    start, resident = time.perf_counter(), peak_rss_mb() or 0.0
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -56,6 +58,8 @@ def judge(reader: Reader, folder: Path, mutant: Mutant) -> Verdict:
         mutant.path.write_bytes(original)
     if verdict.finding:
         return verdict
+    grown = int(1e6 * ((peak_rss_mb() or 0.0) - resident))
+    peak = max(peak, grown - NATIVE_FREE)  # what C++ allocates is seen in the process alone
     if peak > reader.free_memory + MEMORY_FACTOR * n_bytes:
         return verdict._replace(finding=f"takes {peak / 1e6:.0f} MB for files of {n_bytes / 1e6:.2f} MB")
     if seconds > SECONDS_MAX:

@@ -199,6 +199,6 @@ READERS = {
     "config": Reader(_write_config, _read_config, (CONFIG,)),
     "checkpoint": Reader(_write_checkpoint, _read_checkpoint, ("checkpoint.npz",)),
     "golden": Reader(_write_golden, _read_golden, ("golden/*.json", "golden/*/*.npz")),
-    "images": Reader(_write_images, _read_image, ("image.*",), free_memory=1_000_000_000),  # pixels are packed
+    "images": Reader(_write_images, _read_image, ("image.*",), free_memory=1_500_000_000),  # pixels are packed
 }
 """By the name that the command takes."""
