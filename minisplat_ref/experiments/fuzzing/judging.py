@@ -16,7 +16,7 @@ from minisplat_ref.errors import LINE_MAX, InputError, InputWarning
 from minisplat_ref.experiments.fuzzing.readers import Mutant, Reader
 from minisplat_ref.experiments.run import peak_rss_mb
 
-MEMORY_FACTOR = 64  # times the bytes of all files: JSON and text become Python objects, of some fifty bytes for a digit
+MEMORY_FACTOR = 32  # times the bytes of all files: the three characters `[],` of JSON become an object of 64 bytes
 NATIVE_FREE = 100_000_000  # bytes by which the process may grow besides: threads, and libraries on first use
 SECONDS_MAX = 5.0  # a reader of files of some kilobytes that takes as long as this on a busy machine has gone astray
 
