@@ -269,7 +269,7 @@ def test_unconfirmed_points_go_behind_the_scene(rng):
 def test_true_depths_are_confirmed_and_wrong_ones_are_not(name, rng):
     """Exact depths of a ring of views, one in five replaced by 0.3 to 0.8 of it, the sky by 2 m.
 
-    Of the sky's points a part is in the air where no other view looks; nothing can be said of those.
+    Outdoors a part of what is wrong hangs in the air where no other view looks; nothing can be said of that.
     """
     truth = make_scene(name, n_views=16, width=80, height=60, supersampling=1, n_points=0, test_every=0)
     is_wrong = rng.random(truth.train_depths.shape) < 0.2
@@ -286,7 +286,7 @@ def test_true_depths_are_confirmed_and_wrong_ones_are_not(name, rng):
     is_kept = is_kept.reshape(is_wrong.shape)
     assert is_kept[~is_wrong].mean() > 0.8
     is_sky = truth.train_depths == 0
-    assert is_kept[is_wrong & ~is_sky].mean() < 0.1
+    assert is_kept[is_wrong & ~is_sky].mean() < (0.2 if name == "outdoor" else 0.1)
     assert is_kept[is_sky].sum() <= 0.5 * is_sky.sum()
 
 

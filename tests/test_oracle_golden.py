@@ -205,7 +205,7 @@ DAMAGE = {
     "a changed byte": (change_byte, "SHA-256 differs"),
     "a missing file": (lambda f: (f / "sh3" / "loss.npz").unlink(), "loss.npz is missing"),
     "no manifest": (lambda f: (f / MANIFEST).unlink(), "does not exist"),
-    "half a manifest": (lambda f: (f / MANIFEST).write_text('{"format"'), "not a manifest"),
+    "half a manifest": (lambda f: (f / MANIFEST).write_text('{"format"'), "not valid JSON"),
     "another version": (lambda f: change_manifest(f, lambda m: m.update(version=2)), "version 2, this reads"),
     "another format": (lambda f: change_manifest(f, lambda m: m.update(format="x")), "is 'x'"),
     "no conventions": (lambda f: change_manifest(f, lambda m: m["scenes"]["sh3"].pop("conventions")), "lacks"),

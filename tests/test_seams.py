@@ -592,4 +592,4 @@ def test_damaged_shared_parameters_are_named(scene_folder, tmp_path, capsys):
     capsys.readouterr()
     assert main(["eval", str(out)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "shared.npz cannot be read" in line
+    assert "shared.npz is not an .npz of plain arrays, or is damaged" in line

@@ -20,7 +20,6 @@ from minisplat_ref.extensions.geometry.weights import GeometricWeights
 from minisplat_ref.methods import RECIPES, gaussian_splatting
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import render
-from minisplat_ref.training import loop
 from minisplat_ref.training.loop import initial_state, load_state, save_state, train
 from minisplat_ref.training.schedule import BLEND_STATS, At, During, Every, configured
 from minisplat_ref.training.state import FiredEvent
@@ -157,11 +156,11 @@ def test_the_loop_tells_what_fired(scene):
     assert fired[-1][1].seconds >= 0.05
 
 
-def test_the_loop_tells_whether_views_were_halved(scene, monkeypatch):
+def test_the_loop_tells_whether_views_were_halved(scene):
     recipe, told = PLAIN._replace(iterations=4, half_size_until=3), []
     train(scene, recipe, seed=0, on_step=lambda report: told.extend((report.step, event) for event in report.fired))
     assert told == []  # the views are too small for it
-    monkeypatch.setattr(loop, "LEAST_HALF_SIZE", 8)
+    recipe = recipe._replace(least_half_size=8)
     train(scene, recipe, seed=0, on_step=lambda report: told.extend((report.step, event) for event in report.fired))
     n = N_GAUSSIANS
     assert told == [(1, FiredEvent("half_size_views", n, n, 0.0, "until iteration 3"))]

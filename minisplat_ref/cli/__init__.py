@@ -11,9 +11,11 @@ which and what to do), 130 interrupted. A programming error keeps its traceback.
 import argparse
 import os
 import sys
+import warnings
 from collections.abc import Sequence
+from typing import TextIO
 
-from minisplat_ref.errors import InputError
+from minisplat_ref.errors import InputError, InputWarning
 from minisplat_ref.experiments.arguments import HelpFormatter, Parser
 
 from . import (
@@ -124,6 +126,34 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit code: 0, 2 for bad input, 130 when interrupted.
     """
     argv = sys.argv[1:] if argv is None else argv
+    with warnings.catch_warnings():
+        _print_warnings_in_one_line()
+        return _run(argv)
+
+
+def _print_warnings_in_one_line() -> None:
+    """Have warnings about the input printed like errors, without the line of our source that gave them."""
+    show = warnings.showwarning
+
+    def show_input_warning(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
+        if issubclass(category, InputWarning):
+            print(f"minisplat-ref: warning: {message}", file=sys.stderr)
+        else:
+            show(message, category, filename, lineno, file, line)
+
+    warnings.simplefilter("always", InputWarning)
+    warnings.showwarning = show_input_warning
+
+
+def _run(argv: Sequence[str]) -> int:
+    """Run one command and return its exit code."""
     try:
         parser = _parser_of(argv)
         args = parser.parse_args(argv)

@@ -55,6 +55,8 @@ def add_parser(commands: Commands) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, print a table, rewrite the files."""
     from minisplat_ref.experiments import run_folder
+    from minisplat_ref.experiments.first_use import warn_if_not_kept
+    from minisplat_ref.experiments.notices import warn_of_model
     from minisplat_ref.experiments.scoring import score, summary, to_metrics
     from minisplat_ref.experiments.settings import load, load_lpips, load_model, load_photographs
 
@@ -64,6 +66,8 @@ def run(args: argparse.Namespace) -> int:
     if args.lpips_weights is not None:
         settings = settings._replace(lpips_weights=str(args.lpips_weights))
     model = load_model(args.folder, settings)
+    warn_of_model(model, args.folder)
+    warn_if_not_kept(settings.backend)
     scene = load_photographs(settings)
     if not scene.test_views:
         raise InputError(f"{settings.scene} was split without test views (--test-every 0): nothing to measure")

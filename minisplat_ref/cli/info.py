@@ -80,18 +80,16 @@ def _ply_rows(path: Path) -> Rows:
 
 def _checkpoint_rows(path: Path) -> Rows:
     from minisplat_ref.io.checkpoint import load_checkpoint
+    from minisplat_ref.training.saved_state import check_fields, read_counters, written_by
 
     arrays, metadata = load_checkpoint(path)
     fields = _group(arrays, "gaussians")
-    try:
-        recipe = metadata["recipe"]
-        rows = [
-            ("iteration", f"{metadata['step']:,}"),
-            ("recipe", f"{recipe['name']} for {recipe['iterations']:,} iterations"),
-            *_field_rows(fields),
-        ]
-    except (KeyError, TypeError) as error:
-        raise InputError(f"{path} is not the checkpoint of a training: it lacks {error}") from error
+    check_fields(path, fields)
+    rows = [
+        ("iteration", f"{read_counters(path, metadata).step:,}"),
+        ("recipe", "{} for {} iterations".format(*written_by(metadata))),
+        *_field_rows(fields),
+    ]
     shared = ", ".join(f"{name} {_shape(array)}" for name, array in _group(arrays, "shared").items())
     return [("checkpoint", _size(path)), *rows, *([("shared", shared)] if shared else [])]
 
@@ -163,11 +161,12 @@ def _field_rows(fields: "Mapping[str, Floats]") -> Rows:
 
     means = fields["means"]
     rows = [("Gaussians", f"{len(means):,}")]
-    if "sh_rest" in fields:
+    if "sh_rest" in fields and fields["sh_rest"].ndim == 3:
         rows.append(("SH degree", str(math.isqrt(fields["sh_rest"].shape[1] + 1) - 1)))
     rows += _bounds_rows(means)
     if len(means) and "log_scales" in fields:
-        rows.append(("scales", _quantiles(np.exp(fields["log_scales"])) + " world units"))
+        with np.errstate(over="ignore", invalid="ignore"):
+            rows.append(("scales", _quantiles(np.exp(fields["log_scales"])) + " world units"))
     if len(means) and "opacity_logits" in fields:
         opacities = 0.5 * (1 + np.tanh(0.5 * fields["opacity_logits"]))  # [N]
         rows.append(("opacities", _quantiles(opacities)))

@@ -2,7 +2,6 @@
 
 import argparse
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -63,17 +62,24 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from minisplat_ref.experiments import run_folder
+    from minisplat_ref.experiments.first_use import warn_if_not_kept
+    from minisplat_ref.experiments.notices import warn_of_model
     from minisplat_ref.experiments.pictures import depth_picture, depth_range
     from minisplat_ref.io import write_image
+    from minisplat_ref.io.names import file_names
     from minisplat_ref.reference.depth import expected_depth
     from minisplat_ref.types import view_from
 
     source = _open(args)
+    warn_of_model(source.trained.model, args.input)
+    warn_if_not_kept(source.trained.backend)
     views = _choose_views(args, source)
     out: Path = args.out or source.default_out
     run_folder.create(out)
     wants = frozenset({"depth"} if args.depth else ())
-    for name, view in zip(_file_names(views), tqdm(views, desc="rendering", unit="view"), strict=True):
+    for name, view in zip(
+        file_names([view.name for view in views]), tqdm(views, desc="rendering", unit="view"), strict=True
+    ):
         output = source.trained.render(view_from(view.camera, time=view.time), wants)
         write_image(out / f"{name}.png", output.image[..., :3])
         if args.depth:
@@ -142,13 +148,6 @@ def _choose_views(args: argparse.Namespace, source: _Source) -> "list[Viewpoint]
     if not views:
         raise InputError(f"{args.input} has no {which} views: give --cameras train, orbit or a JSON file")
     return views
-
-
-def _file_names(views: "Sequence[Viewpoint]") -> list[str]:
-    """File names without suffix: the views' own, with their number where those cannot name files or are not unique."""
-    names = [re.sub(r"[^\w.-]", "_", view.name) for view in views]
-    is_usable = len(set(names)) == len(names) and all(name.strip("._") for name in names)
-    return names if is_usable else [f"{index:04d}_{name}" for index, name in enumerate(names)]
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -12,7 +12,7 @@ DESCRIPTION = """\
 Estimate cameras and sparse points from photographs (structure from motion, by
 COLMAP, on the CPU). SCENE will be a COLMAP scene: images/, upright, shrunk and
 without lens distortion, and sparse/0/. Photographs that found no place in it
-are named and left out.
+are named and left out; if hardly any found one, there is no scene.
 
 It needs at least two photographs that overlap, of something with texture.
 """
@@ -55,14 +55,18 @@ def add_parser(commands: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Make the scene, and say how many photographs have found a place."""
-    from minisplat_ref.datasets.sfm import run_sfm
+    from minisplat_ref.datasets.sfm import advice, run_sfm
 
     result = run_sfm(
         args.photos, args.out, long_side=args.long_side, matching=args.matching, camera_model=args.camera_model
     )
     n_placed = result.n_photos - len(result.left_out)
-    counts = f"{n_placed} of {result.n_photos} photographs, {result.n_points} points"
-    print(f"{args.out}: {counts}, reprojection error {result.error:.2f} px")
+    placed = f"{n_placed} of {result.n_photos} photographs ({n_placed / result.n_photos:.0%})"
+    print(f"{args.out}: {placed}, {result.n_points} points, reprojection error {result.error:.2f} px")
     if result.left_out:
         print(f"without a place: {', '.join(result.left_out)}")
+        if result.other_groups:
+            groups = " and of ".join(map(str, result.other_groups))
+            print(f"groups that fit together, but not with the scene: of {groups} photographs")
+        print(advice(args.matching))
     return 0

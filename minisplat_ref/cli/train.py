@@ -149,6 +149,7 @@ def _start(given: dict[str, Any]) -> int:
 
     from minisplat_ref.experiments import curve, run_folder
     from minisplat_ref.experiments.first_use import compile_kernels
+    from minisplat_ref.experiments.notices import warn_of_scene
     from minisplat_ref.experiments.settings import Settings, load_lpips, load_photographs, recipe_of
     from minisplat_ref.experiments.start import load_start
     from minisplat_ref.training.loop import initial_state
@@ -168,6 +169,7 @@ def _start(given: dict[str, Any]) -> int:
         print(f"starts from {len(start.points):,} points of {settings.init}")
     compile_kernels(settings.backend)
     run_folder.create(folder)
+    warn_of_scene(scene, settings.downscale)
     try:
         return _train(folder, scene, settings, recipe, state, network)
     except InputError:  # a budget, for one, can only be found too large when there is something to choose from

@@ -23,6 +23,7 @@ from minisplat_ref.io.lens import import_quiet_pycolmap
 
 CAMERA_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model)
 FOCAL_TAGS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
+LEAST_PHOTOS, LEAST_SHARE = 3, 0.25  # of those given, below which what comes out is no scene of them
 SEED = 0  # of RANSAC: the same photographs give the same cameras, up to the order in which threads finish
 
 
@@ -32,7 +33,9 @@ class SfmResult(NamedTuple):
     n_photos: int
     """Photographs that were given."""
     left_out: tuple[str, ...]
-    """Those that found no place."""
+    """Names of those that found no place, in the folder of photographs."""
+    other_groups: tuple[int, ...]
+    """Sizes of the groups that fit together, but not with the scene."""
     n_points: int
     """Sparse points."""
     error: float
@@ -64,7 +67,7 @@ def run_sfm(
     Raises
     ------
     InputError
-        If there are fewer than two photographs, one cannot be read, or no scene comes out of them.
+        If there are fewer than two photographs, one cannot be read, or hardly any finds a place.
     """
     files = list_images(photos)
     if len(files) < 2:
@@ -74,14 +77,35 @@ def run_sfm(
     with making_folder(out) as folder, TemporaryDirectory(dir=folder) as temporary:
         work = Path(temporary)
         names = prepare_photos(files, photos, work / "images", long_side)
-        reconstruction = _reconstruct(work, names, matching, camera_model, photos)
+        reconstruction, *others = _reconstruct(work, names, matching, camera_model, photos)
+        n_placed = reconstruction.num_reg_images()
+        if n_placed < max(min(len(files), LEAST_PHOTOS), LEAST_SHARE * len(files)):
+            raise InputError(
+                f"{photos}: {n_placed} of {len(files)} photographs ({n_placed / len(files):.0%}) found a place, too few"
+                f" for a scene; {advice(matching)}"
+            )
         (work / "model").mkdir()
         reconstruction.write(work / "model")
         undistort_model(work / "model", work / "images", folder)
     registered = {image.name for image in reconstruction.images.values() if image.has_pose}
-    left_out = tuple(sorted(set(names) - registered))
+    originals = zip(names, files, strict=True)
+    left_out = tuple(str(file.relative_to(photos)) for name, file in originals if name not in registered)
     error = reconstruction.compute_mean_reprojection_error()
-    return SfmResult(len(files), left_out, reconstruction.num_points3D(), error)
+    groups = tuple(model.num_reg_images() for model in others)
+    return SfmResult(len(files), left_out, groups, reconstruction.num_points3D(), error)
+
+
+def advice(matching: str) -> str:
+    """What usually helps photographs that found no place, after they were matched in this way."""
+    if matching == "sequential":
+        return (
+            "--matching sequential compares neighbours in the order of file names, which suits frames of a video; for"
+            " other photographs use --matching exhaustive"
+        )
+    return (
+        "what usually helps: more photographs between those that do not join, so that each shares most of its view with"
+        " two others; sharp ones, with a step to the side between shots; a subject with texture that does not move"
+    )
 
 
 def prepare_photos(files: Sequence[Path], photos: Path, target: Path, long_side: int) -> dict[str, tuple[int, int]]:
@@ -111,8 +135,10 @@ def _focal_exif(image: Image.Image) -> Image.Exif:
     return focal
 
 
-def _reconstruct(work: Path, sizes: dict[str, tuple[int, int]], matching: str, camera_model: str, photos: Path) -> Any:
-    """Features, matches, and the largest model of incremental mapping, a ``pycolmap.Reconstruction``."""
+def _reconstruct(
+    work: Path, sizes: dict[str, tuple[int, int]], matching: str, camera_model: str, photos: Path
+) -> list[Any]:
+    """Features, matches, and the models of incremental mapping, each a ``pycolmap.Reconstruction``, largest first."""
     pycolmap = import_quiet_pycolmap()
     pycolmap.set_random_seed(SEED)
     database, images = work / "database.db", work / "images"
@@ -133,4 +159,4 @@ def _reconstruct(work: Path, sizes: dict[str, tuple[int, int]], matching: str, c
         raise InputError(
             f"{photos}: no two photographs could be placed; take them with more overlap, of something with texture"
         )
-    return max(models.values(), key=lambda model: model.num_reg_images())
+    return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)

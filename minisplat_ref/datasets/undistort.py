@@ -6,9 +6,11 @@ an alpha channel is composited onto black in the latter, where it is no mask.
 """
 
 import json
+import os
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.colmap import colmap_photos, find_model, read_model
 from minisplat_ref.io.images import SAVE_OPTIONS, write_image
 from minisplat_ref.io.lens import import_quiet_pycolmap
+from minisplat_ref.io.names import file_names
 from minisplat_ref.io.scene import Photo, build_reading, check_photo, read_view
 from minisplat_ref.io.transforms import existing_frames, find_points, find_transforms, read_transforms
 from minisplat_ref.types import Camera
@@ -30,6 +33,7 @@ LENS_KEYS = (
     *("camera_angle_x", "camera_angle_y", "fl_x", "fl_y", "cx", "cy", "w", "h"),
 )
 POINTS_FILE = "points3d.ply"
+OUTSIDE = "outside"  # folder for copies of photographs that lie beside the scene's folder
 
 
 def undistort_scene(scene: Path, out: Path) -> None:
@@ -54,8 +58,7 @@ def undistort_scene(scene: Path, out: Path) -> None:
         if model is not None:
             _undistort_colmap(scene, model, folder)
         else:
-            for file in files:
-                _undistort_transforms(file, folder)
+            _undistort_transforms(files, folder)
 
 
 def undistort_model(model: Path, images: Path, out: Path) -> None:
@@ -81,29 +84,56 @@ def _undistort_colmap(scene: Path, model: Path, folder: Path) -> None:
             _write(folder / "masks" / f"{photo.file}.png", mask)
 
 
-def _undistort_transforms(file: Path, folder: Path) -> None:
-    """Write images, masks, points and a transforms.json with intrinsics per frame."""
-    transforms = read_transforms(file)
-    pairs = existing_frames(file, transforms)
-    _check_distorted(file, [photo for _, photo in pairs])
+def _undistort_transforms(files: Sequence[Path], folder: Path) -> None:
+    """Write images, masks, points and each file anew, with intrinsics per frame."""
+    contents = [read_transforms(file) for file in files]
+    pairs = [existing_frames(file, content) for file, content in zip(files, contents, strict=True)]
+    photos = [photo for of_file in pairs for _, photo in of_file]
+    _check_distorted(files[0], photos)
+    names = iter(_names_of_copies(files[0], photos))
+    for file, content, of_file in zip(files, contents, pairs, strict=True):
+        _undistort_frames(file, content, [(frame, photo, next(names)) for frame, photo in of_file], folder)
+
+
+def _names_of_copies(file: Path, photos: Sequence[Photo]) -> list[Path]:
+    """Where the copies of photographs go: as they lie in the folder of the file, or into OUTSIDE from beside it."""
+    scene = os.path.abspath(file.parent)
+    paths = [Path(os.path.relpath(os.path.abspath(photo.path), scene)) for photo in photos]
+    is_outside = [path.parts[0] == ".." for path in paths]
+    stems = [
+        path.relative_to("..").with_suffix("").as_posix() for path, out in zip(paths, is_outside, strict=True) if out
+    ]
+    outside = iter(file_names(stems))
+    names = [
+        Path(OUTSIDE, f"{next(outside)}{path.suffix}") if out else path
+        for path, out in zip(paths, is_outside, strict=True)
+    ]
+    name, count = Counter(names).most_common(1)[0]
+    if count > 1:
+        raise InputError(f"{file}: {count} frames would be written to {name.as_posix()}; remove or rename all but one")
+    return names
+
+
+def _undistort_frames(
+    file: Path, content: Mapping[str, Any], frames: Sequence[tuple[dict[str, Any], Photo, Path]], folder: Path
+) -> None:
+    """Write the images and masks of one file's frames under their names, its points, and the file."""
     reading = build_reading(1, None, undistort=True, alpha_is_mask=False)
-    frames = []
-    for frame, photo in tqdm(pairs, desc="images", unit=" images", leave=False, disable=None):
-        is_below = photo.path.is_relative_to(file.parent)
-        name = photo.path.relative_to(file.parent) if is_below else Path("images", photo.file)
+    copies = []
+    for frame, photo, name in tqdm(frames, desc="images", unit=" images", leave=False, disable=None):
         view = read_view(photo, photo.file, reading)
-        changes = {"file_path": name.as_posix(), **_intrinsics(view.camera)}
+        entries = {"file_path": name.as_posix(), **_intrinsics(view.camera)}
         _write(folder / name, view.image)
         if view.mask is not None:
-            changes["mask_path"] = Path("masks", f"{name.name}.png").as_posix()
-            _write(folder / changes["mask_path"], view.mask)
-        frames.append({key: value for key, value in frame.items() if key not in LENS_KEYS} | changes)
-    changes = {"frames": frames}
-    points = find_points(file, transforms)
+            entries["mask_path"] = Path("masks", f"{name.as_posix()}.png").as_posix()
+            _write(folder / entries["mask_path"], view.mask)
+        copies.append({key: value for key, value in frame.items() if key not in LENS_KEYS} | entries)
+    changes: dict[str, Any] = {"frames": copies}
+    points = find_points(file, content)
     if points is not None:
         shutil.copyfile(points, folder / POINTS_FILE)
         changes["ply_file_path"] = POINTS_FILE
-    rest = {key: value for key, value in transforms.items() if key not in LENS_KEYS}
+    rest = {key: value for key, value in content.items() if key not in LENS_KEYS}
     (folder / file.name).write_text(json.dumps(rest | changes, indent=1), encoding="utf-8")
 
 

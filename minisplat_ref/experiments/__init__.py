@@ -5,7 +5,7 @@ A run and its folder: what ``train`` does
     (which file is called what), :mod:`.run` (the training, with checkpoints), :mod:`.progress` (bar and ``log.jsonl``),
     :mod:`.events` (what fired, ``events.jsonl``), :mod:`.curve` (``curve.jsonl``) and :mod:`.surface` (the true one,
     where it is known), :mod:`.scoring` (``metrics.json`` and ``renders/``), :mod:`.first_use` (compiles the kernels
-    ahead).
+    ahead), :mod:`.notices` (warns of what a run can do without, but should be told of).
 
 More than one run
     :mod:`.comparison` (several recipes side by side: ``compare``), :mod:`.studies` (what a choice in a method does:
@@ -16,5 +16,6 @@ The report kit
     (renders, errors and depths for the eye); :mod:`minisplat_ref.reporting` has tables in Markdown and the machine.
     Two reports are made of it: :mod:`.demo_report` and :mod:`.comparison.report`.
 
-:mod:`.arguments` is what the command line's parsers share.
+:mod:`.arguments` is what the command line's parsers share. :mod:`.fuzzing` has every reader of files read damaged ones:
+``python -m data_tools.fuzz``.
 """

@@ -1,14 +1,27 @@
 """The first training after an installation: its kernels are compiled beforehand, several at a time."""
 
 import sys
+import warnings
 from concurrent.futures.process import BrokenProcessPool
 
 import numba
 
-from minisplat_ref.backends import CPU
-from minisplat_ref.jit.compile import cache_folder
+from minisplat_ref.backends import CPU, REFERENCE
+from minisplat_ref.errors import InputWarning, one_line
+from minisplat_ref.jit.compile import cache_folder, cache_root
 from minisplat_ref.jit.kernel_cache import kernel_folders
 from minisplat_ref.warm_up import FIRST_ITERATION, warm_up
+
+
+def warn_if_not_kept(backend: str) -> None:
+    """Warn where compiled kernels cannot be kept on disk, if the backend of this name has any."""
+    if backend == REFERENCE.name or numba.config.DISABLE_JIT or cache_folder() is not None:  # type: ignore[attr-defined]
+        return
+    message = (
+        f"{cache_root()} cannot be written: compiled kernels are not kept, and every start compiles them anew before it"
+        " begins; set NUMBA_CACHE_DIR to a folder that can be written"
+    )
+    warnings.warn(one_line(message), InputWarning, stacklevel=2)
 
 
 def compile_kernels(backend: str) -> None:
@@ -19,6 +32,7 @@ def compile_kernels(backend: str) -> None:
     backend : str
         Name of the one that will be used; only the default's kernels are compiled ahead.
     """
+    warn_if_not_kept(backend)
     keeps_kernels = cache_folder() is not None and not numba.config.DISABLE_JIT  # type: ignore[attr-defined]
     if backend != CPU.name or not keeps_kernels or any(f.is_current and f.n_kernels for f in kernel_folders()):
         return

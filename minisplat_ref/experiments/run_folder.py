@@ -8,6 +8,7 @@ from typing import Any
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import replacing
+from minisplat_ref.io.json_file import read_json
 
 CONFIG = "config.json"  # everything needed to run it again
 POINT_CLOUD = "point_cloud.ply"  # the Gaussians
@@ -75,10 +76,7 @@ def read_json_object(path: Path) -> dict[str, Any]:
     InputError
         The file is not JSON or holds something else.
     """
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read as JSON: {error}") from error
+    value = read_json(path, "give another folder or train anew")
     if not isinstance(value, Mapping):
         raise InputError(f"{path} does not hold a JSON object")
     return dict(value)

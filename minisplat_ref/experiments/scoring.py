@@ -11,6 +11,7 @@ from minisplat_ref.experiments.pictures import error_picture, side_by_side, to_p
 from minisplat_ref.experiments.run_folder import RENDERS
 from minisplat_ref.experiments.settings import Settings, load, load_background, load_model, recipe_of
 from minisplat_ref.io import write_image
+from minisplat_ref.io.names import file_names
 from minisplat_ref.lpips import Network
 from minisplat_ref.metrics import Evaluation, ViewMetrics, evaluate
 from minisplat_ref.rendering import Renderer, Request
@@ -90,10 +91,13 @@ def score(folder: Path, scene: Scene, model: Model, settings: Settings, network:
     """
     renders = folder / RENDERS
     renders.mkdir(exist_ok=True)
+    names = [view.name for view in scene.test_views]
+    stems = dict(zip(names, file_names(names), strict=True))
 
     def save(view: View, image: Floats, _: ViewMetrics) -> None:
         render = to_picture(image)
-        write_image(renders / f"{view.name}.png", side_by_side([view.image, render, error_picture(view.image, render)]))
+        pictures = [view.image, render, error_picture(view.image, render)]
+        write_image(renders / f"{stems[view.name]}.png", side_by_side(pictures))
 
     return measure(scene, model, settings, on_view=save, network=network)
 

@@ -1,7 +1,8 @@
 """What a training is asked to do, as it stands in ``config.json``."""
 
 import platform
-import zipfile
+import reprlib
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,14 +10,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref import __version__
+from minisplat_ref.backends import BACKENDS
+from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.run_folder import CONFIG, POINT_CLOUD, SHARED, read_json_object
 from minisplat_ref.extensions.extension import CORE, find_recipe, owner_of
 from minisplat_ref.io import load_scene
 from minisplat_ref.io.atomic import replacing
+from minisplat_ref.io.json_file import as_array
+from minisplat_ref.io.npz import read_npz
 from minisplat_ref.lpips import Network, check_views, load_network
+from minisplat_ref.methods import RECIPES
 from minisplat_ref.strategy import importance, simplify
-from minisplat_ref.training.schedule import Recipe, configured, describe, parsed_settings
+from minisplat_ref.training.schedule import Recipe, configured, describe, parsed_settings, settings_of
 from minisplat_ref.types import Floats, Model, Scene
 
 CHOICES = {"sampling": simplify.by_sampling, "rank": simplify.by_rank, "merging": simplify.by_merging}
@@ -75,13 +81,26 @@ def recipe_of(settings: Settings) -> Recipe:
     """
     recipe = find_recipe(settings.recipe, settings.schedule_iterations, extension=settings.extension)
     recipe = configured(recipe, **parsed_settings(recipe, settings.set))
-    if settings.budget is not None:
-        recipe = configured(recipe, budget=settings.budget)
-    if settings.simplify is not None:
-        recipe = configured(recipe, choose=CHOICES[settings.simplify])
-    if settings.scene_type is not None:
-        recipe = configured(recipe, metric=METRICS[settings.scene_type])
+    options = {
+        "--budget": ("budget", settings.budget),
+        "--simplify": ("choose", _chosen("simplify", CHOICES, settings.simplify)),
+        "--scene-type": ("metric", _chosen("scene_type", METRICS, settings.scene_type)),
+    }
+    for option, (name, value) in options.items():
+        if value is None:
+            continue
+        if name not in settings_of(recipe):
+            others = ", ".join(other.name for other in RECIPES.values() if name in settings_of(other))
+            raise InputError(f"{option} means nothing to recipe {recipe.name}: leave it out, or take one of {others}")
+        recipe = configured(recipe, **{name: value})
     return recipe
+
+
+def _chosen(name: str, choices: Mapping[str, Any], key: str | None) -> Any:
+    """Return the choice of a name, None where none was made."""
+    if key is not None and str(key) not in choices:
+        raise InputError(f"{name} {key!r} is unknown; choose one of {', '.join(choices)}")
+    return None if key is None else choices[key]
 
 
 def save_model(folder: Path, settings: Settings, model: Model) -> None:
@@ -105,11 +124,7 @@ def load_model(folder: Path, settings: Settings) -> Model:
     gaussians = owner.load(folder / POINT_CLOUD, owner.representation.population)
     if not (folder / SHARED).exists():
         return Model(gaussians)
-    try:
-        with np.load(folder / SHARED, allow_pickle=False) as archive:
-            return Model(gaussians, dict(archive))
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise InputError(f"{folder / SHARED} cannot be read ({error}): train anew") from error
+    return Model(gaussians, read_npz(folder / SHARED, "train anew"))
 
 
 def to_config(settings: Settings, recipe: Recipe, scene: Scene) -> dict[str, Any]:
@@ -134,11 +149,24 @@ def load(folder: Path) -> Settings:
     """
     config = _read_config(folder)
     try:
-        return Settings(**config["settings"])
+        settings = Settings(**config["settings"])
     except (KeyError, TypeError) as error:
         raise InputError(
             f"{folder / CONFIG} is not the configuration of a training of this version: {error}"
         ) from error
+    kinds = {**Settings.__annotations__, "set": dict}  # of which isinstance cannot tell what it maps to what
+    wrong = [name for name, value in settings._asdict().items() if not isinstance(value, kinds[name])]
+    if not wrong:
+        texts_are_wrong = any(not isinstance(text, str) for text in settings.set.values())
+        wrong = ["set"] * texts_are_wrong + ["profile"] * (settings.profile not in PROFILES)
+        wrong += ["backend"] * (settings.backend not in BACKENDS)
+    if wrong:
+        name = wrong[0]
+        raise InputError(
+            f"{folder / CONFIG}: the setting {name} is {reprlib.repr(getattr(settings, name))}, which no training of"
+            " this version has written"
+        )
+    return settings
 
 
 def load_background(folder: Path) -> Floats:
@@ -149,9 +177,9 @@ def load_background(folder: Path) -> Floats:
     InputError
         As for :func:`load`.
     """
-    background = np.array(_read_config(folder).get("background"), dtype=np.float64)
-    if background.shape != (3,):
-        raise InputError(f"{folder / CONFIG} has no background of three numbers")
+    background = as_array(_read_config(folder).get("background"), (3,))
+    if background is None or not ((background >= 0) & (background <= 1)).all():
+        raise InputError(f"{folder / CONFIG} has no background of three numbers from 0 to 1")
     return background
 
 

@@ -2,7 +2,6 @@
 
 import json
 import os
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,11 @@ from numpy.typing import NDArray
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import replacing
+from minisplat_ref.io.json_file import parse_json
+from minisplat_ref.io.npz import read_npz
 
 FORMAT = "minisplat_ref checkpoint 2"  # changes when an older file can no longer be continued
+WAY_OUT = "delete it and train anew"
 _HEADER = "header"
 
 
@@ -49,16 +51,14 @@ def load_checkpoint(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str
     InputError
         The file is missing, damaged, or not a checkpoint of this version.
     """
-    try:
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-        header = json.loads(arrays.pop(_HEADER).tobytes())
-        if header["format"] != FORMAT:
-            raise InputError(f"{path} is {header['format']!r}, this version reads {FORMAT!r}: train anew")
-        return arrays, header["metadata"]
-    except FileNotFoundError as error:
-        raise InputError(f"{path} does not exist: give a checkpoint that a training has written") from error
-    except InputError:
-        raise
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path} is not a checkpoint or is damaged ({error}): delete it and train anew") from error
+    if not Path(path).exists():
+        raise InputError(f"{path} does not exist: give a checkpoint that a training has written")
+    arrays = read_npz(path, WAY_OUT)
+    if _HEADER not in arrays:
+        raise InputError(f"{path} is an .npz of arrays, but not a checkpoint; {WAY_OUT}")
+    header = parse_json(arrays.pop(_HEADER).tobytes(), path, WAY_OUT)
+    if not isinstance(header, dict) or not isinstance(header.get("metadata"), dict):
+        raise InputError(f"{path} is not a checkpoint, its header holds no metadata; {WAY_OUT}")
+    if header.get("format") != FORMAT:
+        raise InputError(f"{path} is {header.get('format')!r}, this version reads {FORMAT!r}: train anew")
+    return arrays, header["metadata"]

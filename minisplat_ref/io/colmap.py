@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.lens import PINHOLE_MODELS, POLYNOMIAL_MODELS, Lens, import_pycolmap
+from minisplat_ref.io.names import is_file, name_inside
 from minisplat_ref.io.scene import Photo, build_reading, build_scene, split_photos
 from minisplat_ref.types import Camera, Floats, Ints, Scene
 
@@ -124,18 +125,30 @@ def colmap_photos(path: Path, reconstruction: Any) -> list[Photo]:
     if not folder.is_dir():
         raise InputError(f"{path}: no folder images/; put the photographs there, named as in the model")
     seen = _point_ids(reconstruction)
-    return [_photo(path, folder, image, seen) for image in reconstruction.images.values() if image.has_pose]
+    names = {image_id: _name(path, image) for image_id, image in reconstruction.images.items()}
+    registered = [(names[image_id], image) for image_id, image in reconstruction.images.items() if image.has_pose]
+    return [_photo(path, folder, name, image, seen) for name, image in registered]
 
 
-def _photo(path: Path, folder: Path, image: Any, seen: Mapping[int, Ints] | None) -> Photo:
+def _name(path: Path, image: Any) -> str:
+    """Name of an image, which must be text and stay in ``images/``."""
+    try:
+        return name_inside(image.name, path)
+    except UnicodeDecodeError:
+        raise InputError(
+            f"{path}: the name of image {image.image_id} is not UTF-8; rename the file and export the model again"
+        ) from None
+
+
+def _photo(path: Path, folder: Path, name: str, image: Any, seen: Mapping[int, Ints] | None) -> Photo:
     """One registered image of the model, and what it sees of the points where there are tracks."""
     masks = path / "masks"
-    candidates = (masks / f"{image.name}.png", (masks / image.name).with_suffix(".png"))
+    candidates = (masks / f"{name}.png", (masks / name).with_suffix(".png"))
     pose = image.cam_from_world().matrix()  # [3, 4]
     model = image.camera
     if len(model.focal_length_idxs()) == 0:  # asking it for a focal length would abort the process
         raise InputError(
-            f"{path}: {image.name} has camera model {model.model.name}, a panorama, of which there is no pinhole view;"
+            f"{path}: {name} has camera model {model.model.name}, a panorama, of which there is no pinhole view;"
             " cut pinhole views out of it and run COLMAP on those"
         )
     camera = Camera(
@@ -148,9 +161,9 @@ def _photo(path: Path, folder: Path, image: Any, seen: Mapping[int, Ints] | None
         width=model.width,
         height=model.height,
     )
-    mask_path = next((c for c in candidates if c.is_file()), None)
+    mask_path = next((c for c in candidates if is_file(c)), None)
     point_ids = None if seen is None else seen.get(image.image_id, np.zeros(0, np.int64))
-    return Photo(folder, image.name, mask_path, camera, _lens(model), point_ids)
+    return Photo(folder, name, mask_path, camera, _lens(model), point_ids)
 
 
 def _lens(camera: Any) -> Lens | None:
@@ -193,7 +206,7 @@ def _check_records(file: Path, layout: Records) -> None:
                 offset = content.index(b"\0", offset) + 1
             (n_items,) = struct.unpack_from(layout.count_format, content, offset)
             offset += struct.calcsize(layout.count_format) + n_items * layout.n_item
-    except (struct.error, ValueError):
+    except (struct.error, ValueError, OverflowError):  # the last of an offset that is no index
         offset = len(content) + 1
     if offset > len(content):
         raise InputError(f"{file}: truncated at {len(content)} bytes; copy or export it again")

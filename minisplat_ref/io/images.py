@@ -6,6 +6,12 @@ Pixels come as the file stores them: an EXIF orientation is not applied, because
 alias, and area means for masks. Left out: colour profiles, raw formats, high dynamic range.
 """
 
+import io
+import os
+import struct
+import threading
+import warnings
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,7 +19,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import ExifTags, Image, UnidentifiedImageError
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import replacing
@@ -23,27 +29,90 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 """Files that count as photographs."""
 
 SAVE_OPTIONS: dict[str, dict[str, Any]] = {"JPEG": {"quality": 95, "subsampling": 0}}
+PIXELS_MAX = 2**29  # of an image: more than cameras have, and 1.6 GB in memory
+PLAUSIBLE_PIXELS = 100_000_000  # up to here a flat image may be packed into any number of bytes
+PIXELS_PER_BYTE = 10_000  # beyond, a byte holds no more: a white PNG of one bit has one for 8256
+DAMAGE_ERRORS = (  # what Pillow's decoders raise for damaged files
+    *(OSError, SyntaxError, ValueError, TypeError, LookupError, ArithmeticError, AttributeError, EOFError),
+    *(RuntimeError, struct.error, zlib.error),
+)
+_LIMIT_LOCK = threading.Lock()
 MASK_THRESHOLD = 128  # a mask pixel counts from half white on; masks saved as JPEG are not exactly 0 and 255
 
 
 @contextmanager
 def open_image(path: Path) -> Iterator[Image.Image]:
-    """Open an image file with Pillow; whatever goes wrong while it is decoded becomes an InputError naming the file."""
+    """Open an image file with Pillow; whatever goes wrong while it is decoded becomes an InputError naming the file.
+
+    Pillow's limit of pixels, beyond which it speaks of a bomb, is below what telephones take; ours is
+    :data:`PIXELS_MAX`. What Pillow warns of, such as damaged EXIF data, does not matter here.
+    """
     try:
-        with Image.open(path) as image:
-            yield image
+        with _File(path) as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with _without_limit():
+                opened = Image.open(file)
+            with opened as image:
+                check_n_pixels(path, *image.size)
+                if image.width * image.height > max(PLAUSIBLE_PIXELS, PIXELS_PER_BYTE * file.n_bytes):
+                    raise InputError(
+                        f"{path}: {image.width} x {image.height} pixels cannot be in {file.n_bytes} bytes; copy or"
+                        " export the file again"
+                    )
+                yield image
+    except InputError:
+        raise
     except FileNotFoundError:
         raise InputError(f"{path}: no such image") from None
     except UnidentifiedImageError:
         raise InputError(f"{path}: not an image that Pillow can read; convert it to PNG or JPEG") from None
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except MemoryError:
+        raise InputError(f"{path}: its pixels do not fit in memory; make the image smaller") from None
+    except DAMAGE_ERRORS as error:
         raise InputError(f"{path}: cannot be decoded ({error}); copy or export the file again") from error
+
+
+class _File(io.BufferedReader):
+    """A file that is asked for no more bytes than it has: Pillow asks for as many as a damaged PNG claims."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path))
+        self.n_bytes = os.fstat(self.fileno()).st_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Read at most the whole file."""
+        return super().read(size if size is None or size < 0 else min(size, self.n_bytes))
+
+
+@contextmanager
+def _without_limit() -> Iterator[None]:
+    """Set Pillow's limit of pixels aside while a file is opened, which reads no pixels."""
+    with _LIMIT_LOCK:
+        limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+        try:
+            yield
+        finally:
+            Image.MAX_IMAGE_PIXELS = limit
+
+
+def check_n_pixels(what: str | Path, width: int, height: int) -> None:
+    """Refuse an image that is larger than any photograph."""
+    if width * height > PIXELS_MAX:
+        raise InputError(
+            f"{what}: {width} x {height} pixels, more than the {PIXELS_MAX:,} that are read; make it smaller"
+        )
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
     """Width and height in pixels, from the file's header alone."""
     with open_image(Path(path)) as image:
         return image.size
+
+
+def is_turned(path: str | Path) -> bool:
+    """Return whether the file's EXIF data ask to show it with width and height exchanged."""
+    with open_image(Path(path)) as image:
+        return image.getexif().get(ExifTags.Base.Orientation, 1) in (5, 6, 7, 8)
 
 
 def read_image(path: str | Path) -> NDArray[np.uint8]:
@@ -66,7 +135,7 @@ def read_image(path: str | Path) -> NDArray[np.uint8]:
     """
     with open_image(Path(path)) as image:
         if image.mode.startswith("I"):  # gray of 16 bits; Pillow itself keeps the upper byte of 16-bit colour files
-            gray = (np.asarray(image).astype(np.int64) >> 8).clip(0, 255).astype(np.uint8)  # [H, W]
+            gray = (np.asarray(image) >> 8).clip(0, 255).astype(np.uint8)  # [H, W]
             return np.repeat(gray[..., None], 3, axis=2)  # [H, W, 3]
         return np.array(image.convert("RGBA" if image.has_transparency_data else "RGB"))
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from minisplat_ref.constants import SH_DEGREE_MAX
 from minisplat_ref.errors import InputError
-from minisplat_ref.io.ply_file import property_names, read_vertices, write_vertices
+from minisplat_ref.io.ply_file import n_rows_of, property_names, read_vertices, write_vertices
 from minisplat_ref.types import Floats, Gaussians
 from minisplat_ref.validation import check_quats
 
@@ -60,7 +60,7 @@ def load_ply(path: str | Path, population: Any = Gaussians) -> Any:
     names = (*MEANS, *SH_DC, *rest_names, "opacity", *SCALES, *QUATS)
     missing = [name for name in names if name not in columns]
     if missing:
-        raise InputError(f"{path}: not a PLY of Gaussians, no property {', '.join(missing)}; {_way_out(columns)}")
+        raise InputError(f"{path}: not a PLY of Gaussians, no property {', '.join(missing)}; {_way_out(path, columns)}")
     missing = [field for field, properties in further.items() if not properties]
     if missing:
         raise InputError(
@@ -252,10 +252,13 @@ def _sh_rest_names(columns: Mapping[str, NDArray], path: str | Path) -> tuple[st
     return tuple(f"f_rest_{i}" for i in range(n_rest))
 
 
-def _way_out(columns: Mapping[str, NDArray]) -> str:
+def _way_out(path: str | Path, columns: Mapping[str, NDArray]) -> str:
     """What to do with a PLY that does not hold Gaussians."""
     if "packed_position" in columns:
         return "it is a compressed splat: export it as a plain PLY"
+    n_faces = n_rows_of(path, "face")
+    if n_faces:
+        return f"it is a mesh of {n_faces:,} faces, which is not rendered: give a trained point_cloud.ply"
     if all(name in columns for name in MEANS):
         return "it is a point cloud: give it as a scene's points, or give a trained point_cloud.ply"
     return "give a trained point_cloud.ply"

@@ -65,6 +65,37 @@ class Element(NamedTuple):
         return np.dtype([(p.name, p.dtype) for p in self.scalars])
 
 
+class Header(NamedTuple):
+    """What stands before the rows."""
+
+    encoding: str
+    elements: Sequence[Element]
+    """All of them, in the file's order."""
+
+    @property
+    def before(self) -> Sequence[Element]:
+        """Elements whose rows stand before the vertices."""
+        return self.elements[: [element.name for element in self.elements].index("vertex")]
+
+    @property
+    def vertices(self) -> Element:
+        """What is read."""
+        return self.elements[len(self.before)]
+
+
+def n_rows_of(path: str | Path, name: str) -> int:
+    """Return how many rows the elements of a name have together, 0 if there are none, such as ``face``.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be opened or its header is malformed.
+    """
+    path = Path(path)
+    with _open(path) as file:
+        return sum(element.n for element in _read_header(file, path).elements if element.name == name)
+
+
 def property_names(path: str | Path) -> tuple[str, ...]:
     """Return the names of the scalar properties of the vertices.
 
@@ -75,8 +106,7 @@ def property_names(path: str | Path) -> tuple[str, ...]:
     """
     path = Path(path)
     with _open(path) as file:
-        *_, vertices = _read_header(file, path)
-    return vertices.dtype.names or ()
+        return _read_header(file, path).vertices.dtype.names or ()
 
 
 def read_vertices(path: str | Path) -> dict[str, NDArray]:
@@ -94,13 +124,14 @@ def read_vertices(path: str | Path) -> dict[str, NDArray]:
     """
     path = Path(path)
     with _open(path) as file:
-        encoding, before, vertices = _read_header(file, path)
-        if encoding == "ascii":
-            rows = _read_ascii(file, path, sum(element.n for element in before), vertices)
+        header = _read_header(file, path)
+        if header.encoding == "ascii":
+            with np.errstate(over="ignore"):  # what exceeds its type becomes infinite, which readers look for
+                rows = _read_ascii(file, path, sum(element.n for element in header.before), header.vertices)
         else:
-            for element in before:
+            for element in header.before:
                 _pass_over(file, path, element)
-            rows = _read_binary(file, path, vertices)
+            rows = _read_binary(file, path, header.vertices)
     return {name: rows[name].astype(rows[name].dtype.newbyteorder("=")) for name in rows.dtype.names or ()}
 
 
@@ -127,8 +158,8 @@ def _open(path: Path) -> BinaryIO:
         raise InputError(f"{path}: cannot be opened ({error.strerror})") from None
 
 
-def _read_header(file: BinaryIO, path: Path) -> tuple[str, Sequence[Element], Element]:
-    """Encoding, the elements before the vertices, and the vertices."""
+def _read_header(file: BinaryIO, path: Path) -> Header:
+    """Read up to the line end_header; there are vertices, and no two of their columns have one name."""
     if file.readline(8).strip() != b"ply":
         raise InputError(f"{path}: not a PLY file, it does not begin with 'ply'")
     encoding = ""
@@ -164,7 +195,7 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, Sequence[Element], El
         raise InputError(
             f"{path}: the PLY header lacks its format, vertices or properties, or repeats one; export it again"
         )
-    return encoding, elements[:i], elements[i]
+    return Header(encoding, elements)
 
 
 def _property(name: str, kind: str, count: str | None, order: str) -> Property:
@@ -178,7 +209,10 @@ def _pass_over(file: BinaryIO, path: Path, element: Element) -> None:
         for _ in range(element.n):
             _read_row(file, path, element)
     else:
-        file.seek(element.n * sum(p.dtype.itemsize for p in element.properties), 1)
+        n_bytes = element.n * sum(p.dtype.itemsize for p in element.properties)
+        if n_bytes > path.stat().st_size:
+            raise InputError(f"{path}: truncated, its elements {element.name} end behind it; copy or export it again")
+        file.seek(n_bytes, 1)
 
 
 def _read_binary(file: BinaryIO, path: Path, vertices: Element) -> NDArray:
@@ -219,19 +253,23 @@ def _read(file: BinaryIO, path: Path, n: int) -> bytes:
 
 def _read_ascii(file: BinaryIO, path: Path, n_before: int, vertices: Element) -> NDArray:
     """Read the declared vertices, one a line, behind the lines of other elements."""
-    n, dtype = vertices.n, vertices.dtype
-    lines = file.read().decode("ascii", errors="replace").splitlines()[n_before : n_before + n]
-    if len(lines) < n:
-        raise InputError(f"{path}: truncated, {n} vertices expected, {len(lines)} lines found; copy or export it again")
-    rows = np.empty(n, dtype)
-    for row, line in enumerate(lines):
-        words = line.split()
+    n, n_scalars = vertices.n, len(vertices.scalars)
+    found = path.stat().st_size - file.tell()
+    if found + 1 < n_before + 2 * n * n_scalars:  # a line, or a character and a gap for each number
+        raise InputError(f"{path}: truncated, {n} vertices expected, {found} bytes found; copy or export it again")
+    rows = np.empty(n, vertices.dtype)
+    row = -1
+    for row, line in enumerate(islice(file, n_before, n_before + n)):
+        text = line.decode("ascii", errors="replace")
+        words = text.split()
         try:
             rows[row] = tuple(map(float, _scalars(words, vertices) if vertices.has_lists else words))
         except (ValueError, OverflowError):
             raise InputError(
-                f"{path}: row {row} is '{line[:60]}', not {len(dtype.names or ())} numbers; copy or export it again"
+                f"{path}: row {row} is '{text[:60].strip()}', not {n_scalars} numbers; copy or export it again"
             ) from None
+    if row + 1 < n:
+        raise InputError(f"{path}: truncated, {n} vertices expected, {row + 1} lines found; copy or export it again")
     return rows
 
 

@@ -15,17 +15,22 @@ from numpy.typing import NDArray
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.images import (
     MASK_THRESHOLD,
+    check_n_pixels,
     composite_alpha,
     downscaled_size,
+    image_size,
+    is_turned,
     read_image,
     read_mask,
     resize_image,
     resize_mask,
 )
 from minisplat_ref.io.lens import Lens, undistort
+from minisplat_ref.io.names import is_file
 from minisplat_ref.types import Bools, Camera, Floats, Ints, Scene, View, numbered
 
 EXTENT_MARGIN = 1.1  # the 3DGS code's factor on the radius of the cameras; the learning rates were tuned with it
+COORDINATE_MAX = 1e18  # world units or pixels; a square of more is no float32
 ROTATION_TOLERANCE = 1e-3  # greatest error of R R^T = I: poses written with four digits pass, scaled ones do not
 
 
@@ -128,6 +133,7 @@ def build_scene(
     photos = (*train_photos, *test_photos)
     for photo in photos:
         check_photo(photo, source, reading.undistort)
+    _check_points(points, source)
     extent = camera_extent([photo.camera for photo in train_photos])
     if extent == 0.0:
         raise InputError(f"{source}: all training cameras stand at one point, which shows no depth; move between shots")
@@ -148,23 +154,40 @@ def build_scene(
 def check_photo(photo: Photo, source: Path, undistort: bool) -> None:
     """Raise an InputError for a photograph that cannot become a view."""
     camera = photo.camera
-    intrinsics = camera[2:]
-    if not np.isfinite(intrinsics).all() or min(camera.fx, camera.fy, camera.width, camera.height) <= 0:
+    intrinsics = np.array(camera[2:], np.float64)
+    is_small = np.abs(intrinsics).max() <= COORDINATE_MAX  # False for NaN
+    if not is_small or min(camera.fx, camera.fy, camera.width, camera.height) <= 0:
         raise InputError(
             f"{source}: the camera of {photo.file} is not usable (fx, fy, cx, cy, width, height are"
             f" {', '.join(f'{value:g}' for value in intrinsics)}); repair or remove that image"
         )
+    check_n_pixels(f"{source}: the camera of {photo.file}", camera.width, camera.height)
     R, t = camera.cam_from_world_R, camera.cam_from_world_t
-    is_rotation = np.abs(R @ R.T - np.eye(3)).max() <= ROTATION_TOLERANCE and np.linalg.det(R) > 0  # False for NaN
-    if not is_rotation or not np.isfinite(t).all():
+    with np.errstate(over="ignore", invalid="ignore"):
+        is_rotation = np.abs(R @ R.T - np.eye(3)).max() <= ROTATION_TOLERANCE and np.linalg.det(R) > 0  # False for NaN
+    if not is_rotation or not np.abs(t).max() <= COORDINATE_MAX:
         raise InputError(f"{source}: the pose of {photo.file} is not a rotation and a translation; repair or remove it")
     if photo.lens is not None and not undistort:
         raise InputError(
             f"{source}: {photo.file} has lens distortion (camera model {photo.lens.model}), only pinholes are rendered;"
-            f" run `minisplat-ref undistort {source} --out DIR`, or load with undistort=True"
+            f" run `minisplat-ref undistort {source} --out DIR`, or train with --undistort (undistort=True in Python)"
         )
-    if not photo.path.is_file():
+    if photo.lens is not None and not np.isfinite(photo.lens.params).all():
+        raise InputError(
+            f"{source}: the lens of {photo.file} has coefficients that are not finite; repair or remove it"
+        )
+    if not is_file(photo.path):
         raise InputError(f"{photo.path}: missing, but {source} has a camera for it; add the image or remove its camera")
+
+
+def _check_points(points: Floats, source: Path) -> None:
+    """Refuse sparse points that are not finite, or so far away that float32 cannot hold their distances."""
+    is_bad = ~(np.abs(points) <= COORDINATE_MAX).all(axis=1)  # [P], True for NaN
+    if is_bad.any():
+        raise InputError(
+            f"{source}: {is_bad.sum()} of {len(points)} sparse points are not finite or beyond {COORDINATE_MAX:g},"
+            f" first {points[is_bad][0].tolist()}; remove them or export the scene again"
+        )
 
 
 def camera_extent(cameras: Sequence[Camera]) -> float:
@@ -180,15 +203,12 @@ def read_view(photo: Photo, name: str, reading: Reading) -> View:
     is_small = reading.downscale > 1 and photo.lens is None and small_folder.is_dir()
     if is_small:
         path = small_folder / photo.file
-    image = read_image(path)  # [H, W, 3 or 4]
-    height, width = image.shape[:2]
+    width, height = image_size(path)  # before the pixels are read, of which a damaged file can claim any number
     if is_small:
         _check_downscaled(photo, width, height, reading.downscale)
     elif (width, height) != (camera.width, camera.height):
-        raise InputError(
-            f"{path}: the image is {width}x{height} but its camera is {camera.width}x{camera.height};"
-            f" put the full-size image there (smaller ones belong in {photo.folder.name}_D, loaded with downscale=D)"
-        )
+        raise InputError(_wrong_size(photo, path, width, height))
+    image = read_image(path)  # [H, W, 3 or 4]
     image, mask = _apply_alpha_and_mask(image, photo, reading)
     if photo.lens is not None:
         image, mask, camera = undistort(image, mask, camera, photo.lens)
@@ -242,6 +262,22 @@ def _apply_alpha_and_mask(
         return composite_alpha(image, reading.background), mask
     opaque = image[..., 3] >= MASK_THRESHOLD
     return np.ascontiguousarray(image[..., :3]), opaque if mask is None else opaque & mask
+
+
+def _wrong_size(photo: Photo, path: Path, width: int, height: int) -> str:
+    """What to do about an image [height, width] that is not of its camera's size."""
+    camera = photo.camera
+    problem = f"{path}: the image is {width}x{height} but its camera is {camera.width}x{camera.height}"
+    if (height, width) == (camera.width, camera.height) and is_turned(path):
+        return (
+            f"{problem}, because its EXIF data ask to turn it and the camera is of the turned image; turn the pixels"
+            " themselves, for example with `mogrify -auto-orient` of ImageMagick, or make the scene with"
+            " `minisplat-ref sfm`, which does"
+        )
+    return (
+        f"{problem}; put the full-size image there (smaller ones belong in {photo.folder.name}_D and are read with"
+        " --downscale D, downscale=D in Python)"
+    )
 
 
 def _check_downscaled(photo: Photo, width: int, height: int, downscale: int) -> None:

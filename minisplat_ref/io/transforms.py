@@ -9,11 +9,12 @@
 
 Poses are world_from_camera in OpenGL axes (x right, y up, z backward); flipping the y and z columns gives OpenCV axes,
 and the inverse gives cam_from_world. The world frame stays the file's. An alpha channel is composited onto the
-background. Left out: ``depth_file_path``, file lists of splits, per-frame exposure, rolling shutter.
+background. Which paths are read says :mod:`.names`. Left out: ``depth_file_path``, file lists of splits, per-frame
+exposure, rolling shutter.
 """
 
-import json
 import math
+import reprlib
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,9 +22,11 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.errors import InputError
-from minisplat_ref.io.images import IMAGE_SUFFIXES, image_size
+from minisplat_ref.errors import InputError, InputWarning, one_line
+from minisplat_ref.io.images import IMAGE_SUFFIXES, PIXELS_MAX, image_size
+from minisplat_ref.io.json_file import as_array, as_number, read_json
 from minisplat_ref.io.lens import PINHOLE_MODELS, POLYNOMIAL_MODELS, Lens
+from minisplat_ref.io.names import is_file, path_beside
 from minisplat_ref.io.ply import NO_POINTS, load_points
 from minisplat_ref.io.scene import Photo, build_reading, build_scene, split_photos
 from minisplat_ref.types import Camera, Floats, Scene
@@ -98,21 +101,14 @@ def find_transforms(path: Path) -> tuple[Path, ...]:
 
 def read_transforms(file: Path) -> dict[str, Any]:
     """Parse the JSON and check that it has frames, each with an image and a 4x4 or 3x4 matrix."""
-    try:
-        transforms: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: not valid JSON ({error}); copy or export it again") from None
+    transforms = read_json(file, "copy or export it again")
     frames = transforms.get("frames") if isinstance(transforms, dict) else None
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{file}: no list 'frames', so this is not a transforms.json with cameras")
     for i, frame in enumerate(frames):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise InputError(f"{file}: frame {i} has no file_path; add it or remove the frame")
-        try:
-            matrix = np.array(frame.get("transform_matrix"), np.float64)
-        except (TypeError, ValueError):
-            matrix = np.zeros(0)
-        if matrix.shape not in ((4, 4), (3, 4)):
+        if as_array(frame.get("transform_matrix"), (4, 4), (3, 4)) is None:
             raise InputError(f"{file}: transform_matrix of {frame['file_path']} is not 4x4; repair or remove the frame")
     return transforms
 
@@ -125,15 +121,16 @@ def existing_frames(file: Path, transforms: Mapping[str, Any]) -> list[tuple[dic
         raise InputError(f"{file}: none of its {len(frames)} images exists, first {missing[0]}; put them beside it")
     if missing:
         names = ", ".join(missing[:NAMED_MISSING_MAX]) + (" and more" if len(missing) > NAMED_MISSING_MAX else "")
-        warnings.warn(f"{file}: {len(missing)} of {len(frames)} images are missing and skipped: {names}", stacklevel=2)
+        message = f"{file}: {len(missing)} of {len(frames)} images are missing and skipped: {names}"
+        warnings.warn(one_line(message), InputWarning, stacklevel=2)
     return [(frame, _photo(file, {**transforms, **frame}, image)) for frame, image in frames if image is not None]
 
 
 def find_points(file: Path, transforms: Mapping[str, Any]) -> Path | None:
     """Find the point cloud that a file names, or the Blender scene's; None if there is none."""
     if "ply_file_path" in transforms:
-        points_file = Path(file.parent, transforms["ply_file_path"])
-        if not points_file.is_file():
+        points_file = _named_file(file, transforms, "ply_file_path")
+        if not is_file(points_file):
             raise InputError(f"{points_file}: missing, but {file} names it; add it or remove ply_file_path")
         return points_file
     candidates = (file.parent / name for name in BLENDER_POINTS) if file.name == BLENDER_FILES[0] else ()
@@ -142,25 +139,29 @@ def find_points(file: Path, transforms: Mapping[str, Any]) -> Path | None:
 
 def _image_file(file: Path, file_path: str) -> Path | None:
     """Image of a frame: the path relative to the JSON file, with a suffix tried where it has none; None if missing."""
-    path = file.parent / file_path.replace("\\", "/")  # some exporters run on Windows
-    candidates = (path, *(path.with_name(path.name + suffix) for suffix in IMAGE_SUFFIXES))
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
+    path = path_beside(file, file_path)
+    candidates = (path, *(path.parent / (path.name + suffix) for suffix in IMAGE_SUFFIXES))
+    return next((candidate for candidate in candidates if is_file(candidate)), None)
+
+
+def _named_file(file: Path, entries: Mapping[str, Any], key: str) -> Path:
+    """Path that an entry gives."""
+    if not isinstance(entries[key], str):
+        raise InputError(f"{file}: {key} is {reprlib.repr(entries[key])}, not the path of a file; repair or remove it")
+    return path_beside(file, entries[key])
 
 
 def _time(file: Path, frame: Mapping[str, Any]) -> float:
     """When the photograph was taken, the entry ``time`` of scenes that move; 0 where there is none."""
-    try:
-        time = float(frame.get("time", 0.0))
-    except (TypeError, ValueError):
-        time = math.nan
+    time = as_number(frame.get("time", 0.0))
     if not math.isfinite(time):
-        raise InputError(f"{file}: {frame.get('file_path')} has the time {frame['time']!r}: give a number")
+        raise InputError(f"{file}: {frame.get('file_path')} has the time {reprlib.repr(frame['time'])}: give a number")
     return time
 
 
 def _photo(file: Path, frame: Mapping[str, Any], image_file: Path) -> Photo:
     """One frame; ``frame`` already holds the top level's entries that it does not override."""
-    mask_path = file.parent / frame["mask_path"] if frame.get("mask_path") else None
+    mask_path = _named_file(file, frame, "mask_path") if frame.get("mask_path") else None
     camera, lens = _camera(file, frame, image_file)
     return Photo(image_file.parent, image_file.name, mask_path, camera, lens, time=_time(file, frame))
 
@@ -169,16 +170,22 @@ def _camera(file: Path, frame: Mapping[str, Any], image_file: Path) -> tuple[Cam
     """Camera and lens of a frame, whichever dialect describes its focal length."""
 
     def number(key: str, default: float = 0.0) -> float:
-        try:
-            return float(frame.get(key, default))
-        except (TypeError, ValueError):
-            raise InputError(f"{file}: {key} of {frame['file_path']} is {frame[key]!r}, not a number") from None
+        value = frame.get(key, default)
+        if math.isnan(as_number(value)) and not isinstance(value, float):  # NaN itself is shown with the camera
+            raise InputError(f"{file}: {key} of {frame['file_path']} is {reprlib.repr(value)}, not a number")
+        return as_number(value)
+
+    def n_pixels(key: str) -> int:
+        value = number(key)
+        if not abs(value) <= PIXELS_MAX:
+            raise InputError(f"{file}: {key} of {frame['file_path']} is {value:g}, not a number of pixels; repair it")
+        return int(value)
 
     def focal(key: str, angle_key: str, size: int, default: float) -> float:
         angle = number(angle_key)
         return number(key) if key in frame else size / (2.0 * math.tan(angle / 2.0)) if 0 < angle < math.pi else default
 
-    width, height = int(number("w")), int(number("h"))
+    width, height = n_pixels("w"), n_pixels("h")
     if width <= 0 or height <= 0:
         width, height = image_size(image_file)
     fx = focal("fl_x", "camera_angle_x", width, 0.0)
@@ -186,9 +193,11 @@ def _camera(file: Path, frame: Mapping[str, Any], image_file: Path) -> tuple[Cam
         raise InputError(f"{file}: {frame['file_path']} has neither fl_x nor camera_angle_x; add one of them")
     matrix = np.array(frame["transform_matrix"], np.float64)
     R = (matrix[:3, :3] * OPENCV_FROM_OPENGL).T
+    with np.errstate(over="ignore", invalid="ignore"):  # check_photo refuses what comes of it
+        t = -R @ matrix[:3, 3]
     camera = Camera(
         cam_from_world_R=np.ascontiguousarray(R),
-        cam_from_world_t=-R @ matrix[:3, 3],
+        cam_from_world_t=t,
         fx=fx,
         fy=focal("fl_y", "camera_angle_y", height, fx),
         cx=number("cx", width / 2),

@@ -5,7 +5,6 @@ The JSON file is the ``cameras.json`` of 3DGS training folders: a list of object
 ``cx, cy`` (the image's centre where absent), ``split`` (``train`` or ``test``) and ``time`` (0 where absent).
 """
 
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,10 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.io.scene import ROTATION_TOLERANCE
+from minisplat_ref.io.images import check_n_pixels
+from minisplat_ref.io.json_file import as_array, as_number, read_json
+from minisplat_ref.io.scene import COORDINATE_MAX, ROTATION_TOLERANCE
 from minisplat_ref.types import Camera, Floats, Scene
 
 ORBIT_FOV = math.radians(50.0)  # horizontal, of an orbit that has no run's cameras to take it from
+NEEDED = "needed are position, rotation, width, height, fx, fy"
 ORBIT_ELEVATION = math.radians(20.0)  # likewise
 
 
@@ -69,41 +71,43 @@ def read(path: Path) -> list[Viewpoint]:
     InputError
         The file cannot be read, or a camera lacks a value or has one that makes no sense.
     """
-    try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read as JSON: {error}") from error
+    entries = read_json(path, "give the cameras as 3DGS's cameras.json does")
     if not isinstance(entries, list) or not entries:
         raise InputError(f"{path} does not hold a list of cameras (the layout of 3DGS's cameras.json)")
     return [_viewpoint(entry, f"{path}, camera {index}") for index, entry in enumerate(entries)]
 
 
 def _viewpoint(entry: Any, where: str) -> Viewpoint:
-    try:
-        position = np.array(entry["position"], dtype=np.float64)
-        rotation = np.array(entry["rotation"], dtype=np.float64)
-        width, height = int(entry["width"]), int(entry["height"])
-        fx, fy = float(entry["fx"]), float(entry["fy"])
-        cx, cy = float(entry.get("cx", 0.5 * width)), float(entry.get("cy", 0.5 * height))
-        time = float(entry.get("time", 0.0))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(
-            f"{where}: {type(error).__name__} {error}; needed are position, rotation, width, height, fx, fy"
-        ) from error
-    numbers = np.array([fx, fy, cx, cy, time])
+    if not isinstance(entry, dict):
+        raise InputError(f"{where} is not an object; {NEEDED}")
+    missing = [key for key in ("position", "rotation", "width", "height", "fx", "fy") if key not in entry]
+    if missing:
+        raise InputError(f"{where} lacks {', '.join(missing)}; {NEEDED}")
+    position, rotation = as_array(entry["position"], (3,)), as_array(entry["rotation"], (3, 3))
+    width, height, fx, fy = (as_number(entry[key]) for key in ("width", "height", "fx", "fy"))
+    cx, cy = as_number(entry.get("cx", 0.5 * width)), as_number(entry.get("cy", 0.5 * height))
+    time = as_number(entry.get("time", 0.0))
+    numbers = (width, height, fx, fy, cx, cy, time)
     if (
-        position.shape != (3,)
-        or rotation.shape != (3, 3)
-        or not np.isfinite([*position, *rotation.flat, *numbers]).all()
+        position is None
+        or rotation is None
+        or not np.abs([*position, *rotation.flat, *numbers]).max() <= COORDINATE_MAX  # False for NaN
     ):
-        raise InputError(f"{where}: position must be 3 and rotation 3 x 3 finite numbers, like fx, fy, cx, cy, time")
+        raise InputError(
+            f"{where}: position must be 3 and rotation 3 x 3 finite numbers, like width, height, fx, fy, cx, cy, time,"
+            f" none above {COORDINATE_MAX:g}"
+        )
     if min(width, height) < 1 or min(fx, fy) <= 0:
         raise InputError(f"{where}: width, height, fx, fy must be positive")
+    check_n_pixels(where, int(width), int(height))
     is_rotation = np.abs(rotation @ rotation.T - np.eye(3)).max() <= ROTATION_TOLERANCE and np.linalg.det(rotation) > 0
     if not is_rotation:
         raise InputError(f"{where}: rotation is not a rotation matrix")
-    camera = Camera(rotation.T.copy(), -rotation.T @ position, fx, fy, cx, cy, width, height)
-    return Viewpoint(str(entry.get("img_name", "")), camera, str(entry.get("split", "")), time)
+    camera = Camera(rotation.T.copy(), -rotation.T @ position, fx, fy, cx, cy, int(width), int(height))
+    name, split = (entry.get(key, "") for key in ("img_name", "split"))
+    if not (isinstance(name, str | int | float) and isinstance(split, str)):
+        raise InputError(f"{where}: img_name and split must be text")
+    return Viewpoint(str(name), camera, split, time)
 
 
 def orbit(means: Floats, like: Sequence[Viewpoint], n_frames: int, width: int, height: int) -> list[Viewpoint]:

@@ -31,6 +31,7 @@ from minisplat_ref.strategy.ops import contiguous, n_rows
 from minisplat_ref.training.adam import AdamRule, AdamState, adam_step, fields_of, zero_moments
 from minisplat_ref.training.losses import Rendered, total_loss
 from minisplat_ref.training.rates import active_sh_degree
+from minisplat_ref.training.saved_state import read_bundles, read_counters, read_generator, written_by
 from minisplat_ref.training.schedule import During, Event, Recipe, action_name, describe
 from minisplat_ref.training.state import FiredEvent, Iteration, StepReport, TrainState
 from minisplat_ref.types import Floats, Scene, numbered
@@ -122,8 +123,7 @@ def train(
     """
     state = initial_state(scene, recipe, seed) if state is None else state
     scene = scene._replace(train_views=numbered(scene.train_views))
-    if max(state.view_order, default=0) >= len(scene.train_views):
-        raise InputError(f"scene {scene.name} has fewer training views than the run to continue: give the same scene")
+    _check_fits(state, scene, recipe)
     small_scene = _half_size(scene, recipe.least_half_size) if state.step < recipe.half_size_until else scene
     with _interrupts_held_back() as raise_if_interrupted:
         while state.step < recipe.iterations:
@@ -136,6 +136,22 @@ def train(
             del report  # and with it the image, before the next is made
             raise_if_interrupted()
     return state
+
+
+def _check_fits(state: TrainState, scene: Scene, recipe: Recipe) -> None:
+    """Refuse a state of another scene: its views, and what it holds of each of them, must be those of the scene."""
+    n_views = len(scene.train_views)
+    if max(state.view_order, default=0) >= n_views:
+        raise InputError(f"scene {scene.name} has fewer training views than the run to continue: give the same scene")
+    expected = {name: a.shape for c in recipe.active_calibrations for name, a in c.initial(n_views).items()}
+    differing = [name for name, shape in expected.items() if getattr(state.shared.get(name), "shape", None) != shape]
+    if state.stats.get("is_visible", np.zeros((0, n_views))).shape[1:] != (n_views,):
+        differing.append("is_visible")
+    if differing:
+        raise InputError(
+            f"scene {scene.name} has {n_views} training views, for which the run to continue holds no"
+            f" {', '.join(differing)}: give the same scene"
+        )
 
 
 def _iterate(state: TrainState, scene: Scene, recipe: Recipe, backend: Backend, conventions: Conventions) -> StepReport:
@@ -274,26 +290,24 @@ def load_state(path: str | Path, recipe: Recipe) -> TrainState:
         The file is missing or damaged, or was written under another recipe.
     """
     arrays, metadata = load_checkpoint(path)
-    if metadata["recipe"] != json.loads(json.dumps(describe(recipe))):
-        was = metadata["recipe"]
+    counters = read_counters(path, metadata)
+    if metadata.get("recipe") != json.loads(json.dumps(describe(recipe))):
+        name, length = written_by(metadata)
         raise InputError(
-            f"{path} was written by recipe {was['name']} of {was['iterations']} iterations with other settings than "
-            f"{recipe.name} of {recipe.iterations} iterations: continue with the recipe of the run"
+            f"{path} was written by recipe {name} of {length} iterations with other settings than"
+            f" {recipe.name} of {recipe.iterations} iterations: continue with the recipe of the run"
         )
-    rng = np.random.default_rng()
-    rng.bit_generator.state = metadata["rng"]
-
-    def group(name: str) -> dict[str, Any]:
-        return {key.removeprefix(f"{name}."): array for key, array in arrays.items() if key.startswith(f"{name}.")}
-
-    population = recipe.representation.population
+    bundles = read_bundles(path, arrays, recipe.representation.population)
+    without_rate = [name for name in bundles.shared if name not in recipe.rates.of]
+    if without_rate:
+        raise InputError(f"{path}: holds {', '.join(without_rate)}, which recipe {recipe.name} does not train")
     return TrainState(
-        population(**group("gaussians")),
-        AdamState(population(**group("first")), population(**group("second")), metadata["adam_step"]),
-        metadata["step"],
-        metadata["view_order"],
-        rng,
-        group("stats"),
-        group("shared"),
-        AdamState(group("shared_first"), group("shared_second"), metadata["shared_adam_step"]),
+        bundles.gaussians,
+        AdamState(bundles.first, bundles.second, counters.adam_step),
+        counters.step,
+        counters.view_order,
+        read_generator(path, metadata.get("rng")),
+        bundles.stats,
+        bundles.shared,
+        AdamState(bundles.shared_first, bundles.shared_second, counters.shared_adam_step),
     )

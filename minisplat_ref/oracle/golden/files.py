@@ -2,16 +2,20 @@
 
 import hashlib
 import json
-import zipfile
+import reprlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from minisplat_ref.constants import Conventions
+from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import making_folder
+from minisplat_ref.io.json_file import read_json
+from minisplat_ref.io.names import file_names, is_file
+from minisplat_ref.io.npz import read_npz as read_arrays
+from minisplat_ref.oracle.golden.checking import check_arrays
 from minisplat_ref.oracle.golden.format import (
     DIFFERENTIATED,
     FRAMES,
@@ -92,21 +96,28 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
     path = folder / MANIFEST
     if not path.exists():
         return None
+    manifest = read_json(path, AGAIN)
     try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
         found = manifest["format"], manifest["version"]
-        files = {
-            f"{scene}/{file}": entry for scene, s in manifest["scenes"].items() for file, entry in s["files"].items()
-        }
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        listed = [
+            (scene, file, about)
+            for scene, entry in manifest["scenes"].items()
+            for file, about in entry["files"].items()
+        ]
+        hashes = [str(about["sha256"]) for *_, about in listed]
+    except (KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path} is not a manifest of golden vectors ({error}); {AGAIN}") from error
     if found != (FORMAT, VERSION):
         raise InputError(f"{path} is {found[0]!r} version {found[1]}, this reads {FORMAT!r} version {VERSION}; {AGAIN}")
-    for file, entry in files.items():
-        if not (folder / file).is_file():
-            raise InputError(f"{folder / file} is missing, though {MANIFEST} lists it; {AGAIN}")
-        if _sha256(folder / file) != entry["sha256"]:
-            raise InputError(f"{folder / file} is not the file that {MANIFEST} lists (SHA-256 differs); {AGAIN}")
+    for (scene, file, _), sha256 in zip(listed, hashes, strict=True):
+        if [scene, file] != file_names([scene, file]):
+            raise InputError(f"{path} lists '{scene}/{file}', which is no name of a file below it; {AGAIN}")
+        if not is_file(folder / scene / file):
+            raise InputError(f"{folder / scene / file} is missing, though {MANIFEST} lists it; {AGAIN}")
+        if _sha256(folder / scene / file) != sha256:
+            raise InputError(
+                f"{folder / scene / file} is not the file that {MANIFEST} lists (SHA-256 differs); {AGAIN}"
+            )
     return manifest
 
 
@@ -118,11 +129,7 @@ def read_npz(path: Path) -> Arrays:
     InputError
         If it cannot be read, or holds anything but arrays of numbers.
     """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path} is not an .npz of plain arrays, or is damaged ({error}); write it anew") from error
+    arrays = read_arrays(path, "write it anew")
     for name, array in arrays.items():
         if array.dtype.kind not in "fiu":
             raise InputError(f"{path}: {name} has dtype {array.dtype}; only floating point and integers are read")
@@ -199,7 +206,18 @@ def _read_scene(folder: Path, name: str, entry: Mapping[str, Any]) -> Golden:
     missing = [key for key in SPECS if key not in arrays]
     if missing:
         raise InputError(f"{folder / name} lacks {', '.join(missing)}; {AGAIN}")
-    return Golden(name, entry["what"], Conventions(**entry["conventions"]), arrays)
+    check_arrays(folder / name, arrays, AGAIN)
+    return Golden(name, str(entry["what"]), _conventions(folder, name, entry["conventions"]), arrays)
+
+
+def _conventions(folder: Path, name: str, values: Mapping[str, Any]) -> Conventions:
+    """Conventions of a scene, each of the type that the profiles have."""
+    conventions = Conventions(**values)
+    for field, value, usual in zip(Conventions._fields, conventions, GSPLAT_MAIN, strict=True):
+        is_number = isinstance(usual, float) and isinstance(value, int | float) and not isinstance(value, bool)
+        if not is_number and type(value) is not type(usual):
+            raise InputError(f"{folder / MANIFEST}: {field} of {name} is {reprlib.repr(value)}; {AGAIN}")
+    return conventions
 
 
 def _sha256(path: Path) -> str:

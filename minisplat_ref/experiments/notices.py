@@ -1,0 +1,47 @@
+"""What a run can do without, but should be told of: a scene without points, photographs of a few pixels, no Gaussians.
+
+Each is a warning of one line, which the command line prints before it goes on.
+"""
+
+import warnings
+
+from minisplat_ref.errors import InputWarning, one_line
+from minisplat_ref.strategy.initialization import N_NEIGHBOURS, N_RANDOM_POINTS
+from minisplat_ref.types import Model, Scene
+
+LEAST_SIDE = 16  # pixels; SSIM compares windows of 11 x 11, and 3DGS cuts an image into tiles of 16 x 16
+
+
+def warn_of_scene(scene: Scene, downscale: int) -> None:
+    """Warn of what a scene lacks for a good training.
+
+    Parameters
+    ----------
+    scene : Scene
+    downscale : int
+        The factor by which its photographs were made smaller.
+    """
+    if len(scene.points) <= N_NEIGHBOURS:
+        _warn(
+            f"scene {scene.name} has {len(scene.points)} sparse points: training begins with {N_RANDOM_POINTS:,} random"
+            " ones in the space of the cameras and has to find the surfaces by itself; `minisplat-ref sfm PHOTOS` makes"
+            " points, and a transforms.json names a file of them as ply_file_path"
+        )
+    sizes = [(view.camera.width, view.camera.height) for view in scene.train_views]
+    width, height = min(sizes, key=min)
+    if min(width, height) < LEAST_SIDE:
+        cause = f" after --downscale {downscale}: give a smaller number" if downscale > 1 else ": give larger ones"
+        _warn(
+            f"photographs of scene {scene.name} are {width} x {height} pixels{cause}; from fewer than {LEAST_SIDE} x"
+            f" {LEAST_SIDE} hardly any structure can be learned, and measures of them say little"
+        )
+
+
+def warn_of_model(model: Model, source: object) -> None:
+    """Warn of a model of nothing; ``source`` is the file or folder that it comes from."""
+    if len(model.gaussians.means) == 0:
+        _warn(f"{source} holds no Gaussians: every picture shows the background alone; give another file or train anew")
+
+
+def _warn(message: str) -> None:
+    warnings.warn(one_line(message), InputWarning, stacklevel=3)

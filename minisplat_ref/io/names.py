@@ -1,0 +1,96 @@
+"""Names of files: those that a scene's files give must stay with the scene, and those that we give must be names.
+
+What is read. COLMAP names its images relative to ``images/`` and never climbs out of it, so there is nothing to allow.
+A transforms.json names files relative to itself: nerfstudio's lie below it, instant-ngp's sometimes in the folder next
+to it (``../images/0001.jpg``), some exporters write absolute paths of the same places. Those are read, and nothing
+further away. The check is of the name, before any link is followed: a link inside the scene may lead anywhere, because
+whoever owns the disk has put it there.
+
+What is written. A name from a file never becomes a path: :func:`file_names` makes one file name of each.
+"""
+
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from minisplat_ref.errors import InputError
+
+CHARACTERS_MAX = 100  # of a file name without suffix; of four bytes each at most, so that 255 may be too few for more
+BYTES_MAX = 200
+RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)  # devices, not files, on Windows
+
+
+def is_file(path: Path) -> bool:
+    """Return whether a file is there; a name that no file can have is none."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # too long, or with a zero byte
+        return False
+
+
+def name_inside(name: str, source: str | Path) -> str:
+    """Return a name that a file gives relative to a folder, if it stays inside.
+
+    Raises
+    ------
+    InputError
+        If it is absolute, empty or climbs with ``..``; the message begins with ``source``.
+    """
+    path = Path(name)
+    if not path.parts or path.is_absolute() or path.drive or ".." in path.parts or "\0" in name:
+        raise InputError(
+            f"{source}: the image name '{name}' leads out of images/; put the image there and name it relative to it"
+        )
+    return name
+
+
+def path_beside(file: Path, name: str) -> Path:
+    """Return the path that a file gives relative to itself, if it stays in the file's folder or a folder next to it.
+
+    Parameters
+    ----------
+    file : Path
+        File that holds the name.
+    name : str
+        Relative, with slashes or backslashes; or absolute.
+
+    Returns
+    -------
+    Path
+        Without ``..`` but for one at its beginning, so that it means the same whether links are followed or not.
+
+    Raises
+    ------
+    InputError
+        If it leads elsewhere; the way out is a link.
+    """
+    folder = file.parent
+    path = os.path.normpath(name.replace("\\", "/"))  # some exporters run on Windows
+    if os.path.isabs(path):
+        for form in (os.path.abspath, os.path.realpath):  # the folder as it was called, and as it is
+            if Path(path).is_relative_to(Path(form(folder)).parent):
+                return Path(path)
+    elif Path(path).parts[:2] != ("..", "..") and not Path(path).drive:
+        return folder / path
+    raise InputError(
+        f"{file}: '{name}' lies neither in the folder of this file nor in one next to it; move it there, or make a"
+        " link there to its folder and name it through that link"
+    )
+
+
+def file_names(names: Sequence[str]) -> list[str]:
+    """Return one file name, without suffix, for each name, whatever characters it holds.
+
+    Letters, digits, ``.``, ``-`` and ``_`` stay, others become ``_``. Where such names would not be different, on
+    file systems that ignore case, too, or one of them would be no name, all have their number in front.
+    """
+    stems = [_shortened(re.sub(r"[^\w.-]", "_", name)) for name in names]
+    is_unique = len({stem.casefold() for stem in stems}) == len(stems)
+    is_usable = all(stem.strip("._") and not RESERVED.fullmatch(stem) for stem in stems)
+    return stems if is_unique and is_usable else [f"{index:04d}_{stem}" for index, stem in enumerate(stems)]
+
+
+def _shortened(stem: str) -> str:
+    """Return the last characters of a name that is too long: numbers stand at the end."""
+    return stem[-CHARACTERS_MAX:].encode()[-BYTES_MAX:].decode(errors="ignore")

@@ -1,0 +1,183 @@
+"""What a checkpoint must hold to be continued: each part is checked before the training sees it.
+
+A checkpoint that has been cut, mixed with another or edited by hand would otherwise fail in the middle of an iteration,
+or be continued with numbers that belong to nothing.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from minisplat_ref.constants import SH_DEGREE_MAX
+from minisplat_ref.errors import InputError
+from minisplat_ref.types import Floats, Gaussians
+
+WAY_OUT = "give another checkpoint or train anew"
+N_STATE_BITS = 128  # of the generator PCG64
+MOMENTS = {"first": "gaussians", "second": "gaussians", "shared_first": "shared", "shared_second": "shared"}
+GAUSSIAN_SHAPES: Mapping[str, tuple[tuple[int, ...], ...]] = {
+    **{"means": ((3,),), "quats": ((4,),), "log_scales": ((3,),), "opacity_logits": ((),), "sh_dc": ((3,),)},
+    "sh_rest": tuple(((degree + 1) ** 2 - 1, 3) for degree in range(SH_DEGREE_MAX + 1)),
+}
+"""Shapes that the fields of :class:`Gaussians` may have beside their rows."""
+
+
+class Counters(NamedTuple):
+    """How far a training is."""
+
+    step: int
+    adam_step: int
+    shared_adam_step: int
+    view_order: list[int]
+
+
+class Bundles(NamedTuple):
+    """The arrays of a training."""
+
+    gaussians: Any
+    first: Any
+    second: Any
+    shared: dict[str, Floats]
+    shared_first: dict[str, Floats]
+    shared_second: dict[str, Floats]
+    stats: dict[str, NDArray[Any]]
+
+
+def written_by(metadata: Mapping[str, Any]) -> tuple[str, str]:
+    """Return name and length, in iterations, of the recipe that a checkpoint says it was written by."""
+    recipe = metadata.get("recipe")
+    recipe = recipe if isinstance(recipe, dict) else {}
+    n_iterations = recipe.get("iterations")
+    return str(recipe.get("name", "without a name")), f"{n_iterations:,}" if type(n_iterations) is int else "unknown"
+
+
+def read_counters(path: str | Path, metadata: Mapping[str, Any]) -> Counters:
+    """Return the counters of a checkpoint, which are whole numbers of at least 0.
+
+    Raises
+    ------
+    InputError
+        One is missing or something else.
+    """
+
+    def check(name: str, value: Any) -> int:
+        if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 2**63:
+            raise InputError(f"{path}: {name} is no whole number of at least 0; {WAY_OUT}")
+        return value
+
+    step, adam_step, shared_step = (check(f, metadata.get(f)) for f in ("step", "adam_step", "shared_adam_step"))
+    order = metadata.get("view_order")
+    if not isinstance(order, list):
+        raise InputError(f"{path}: view_order is no list of views; {WAY_OUT}")
+    return Counters(step, adam_step, shared_step, [check("a number in view_order", view) for view in order])
+
+
+def read_generator(path: str | Path, state: Any) -> np.random.Generator:
+    """Return the random generator of a checkpoint.
+
+    Parameters
+    ----------
+    path : str or Path
+    state : any
+        What ``bit_generator.state`` of NumPy's PCG64 was.
+
+    Raises
+    ------
+    InputError
+        It is not such a state.
+    """
+    rng = np.random.default_rng()
+    limits = {"state": 2**N_STATE_BITS, "inc": 2**N_STATE_BITS, "has_uint32": 2, "uinteger": 2**32}
+    inner = state.get("state") if isinstance(state, dict) else None
+    numbers = {**state, **inner} if isinstance(inner, dict) else {}
+    is_valid = all(type(numbers.get(name)) is int and 0 <= numbers[name] < limit for name, limit in limits.items())
+    if not is_valid or state.get("bit_generator") != "PCG64" or numbers["inc"] % 2 == 0:
+        raise InputError(f"{path}: rng is no state of the random generator PCG64; {WAY_OUT}")
+    rng.bit_generator.state = state
+    return rng
+
+
+def read_bundles(path: str | Path, arrays: Mapping[str, NDArray[Any]], population: Any) -> Bundles:
+    """Return the arrays of a checkpoint in their groups.
+
+    Parameters
+    ----------
+    path : str or Path
+    arrays : mapping of str to ndarray
+        Named ``GROUP.FIELD``.
+    population : type
+        NamedTuple of the population's fields.
+
+    Raises
+    ------
+    InputError
+        A field is missing or surplus, has another number of rows than ``means``, is no floating-point array, or holds
+        NaN or infinity; or moments do not fit what they are moments of.
+    """
+    groups: dict[str, dict[str, NDArray[Any]]] = {name: {} for name in Bundles._fields}
+    for name, array in arrays.items():
+        group, _, field = name.partition(".")
+        if group not in groups or not field:
+            raise InputError(f"{path}: an array {name!r} belongs to no checkpoint of this version; {WAY_OUT}")
+        groups[group][field] = np.ascontiguousarray(array).reshape(array.shape)  # Adam writes through views
+    _check_population(path, groups["gaussians"], population)
+    for name, of in MOMENTS.items():
+        _check_moments(path, name, groups[name], groups[of])
+    n = len(groups["gaussians"]["means"])
+    for name, array in groups["stats"].items():
+        if array.shape[:1] != (n,):
+            raise InputError(f"{path}: stats.{name} has shape {list(array.shape)} for {n} Gaussians; {WAY_OUT}")
+    for name, array in groups["shared"].items():
+        _check_numbers(path, f"shared.{name}", array)
+    gaussians, first, second = (population(**groups[name]) for name in ("gaussians", "first", "second"))
+    return Bundles(gaussians, first, second, *(groups[name] for name in Bundles._fields[3:]))
+
+
+def check_fields(path: str | Path, fields: Mapping[str, NDArray[Any]]) -> None:
+    """Refuse fields of a population, whatever it is, that have no rows in common or are not finite numbers."""
+    if "means" not in fields or fields["means"].ndim != 2:
+        raise InputError(f"{path}: gaussians.means is missing or has no rows of coordinates; {WAY_OUT}")
+    n = len(fields["means"])
+    for name, array in fields.items():
+        if array.shape[:1] != (n,):
+            raise _misfit(path, name, array)
+        _check_numbers(path, f"gaussians.{name}", array)
+        if not np.isfinite(array).all():
+            raise InputError(f"{path}: gaussians.{name} holds infinity; {WAY_OUT}")
+
+
+def _check_population(path: str | Path, fields: Mapping[str, NDArray[Any]], population: Any) -> None:
+    """Refuse a population that lacks a field, or whose fields do not belong together."""
+    if set(fields) != set(population._fields):
+        differing = ", ".join(sorted(set(fields) ^ set(population._fields)))
+        raise InputError(f"{path}: the fields of the Gaussians are not those of the recipe ({differing}); {WAY_OUT}")
+    check_fields(path, fields)
+    for name, shapes in GAUSSIAN_SHAPES.items():
+        if population is Gaussians and fields[name].shape[1:] not in shapes:  # another's are its own affair
+            raise _misfit(path, name, fields[name])
+
+
+def _misfit(path: str | Path, name: str, array: NDArray[Any]) -> InputError:
+    return InputError(f"{path}: gaussians.{name} has shape {list(array.shape)}, which does not fit; {WAY_OUT}")
+
+
+def _check_moments(
+    path: str | Path, group: str, moments: Mapping[str, NDArray[Any]], fields: Mapping[str, NDArray[Any]]
+) -> None:
+    """Refuse moments of Adam that are not of the same shapes and types as the parameters."""
+    for name in sorted(moments.keys() | fields.keys()):
+        moment, field = moments.get(name), fields.get(name)
+        if moment is None or field is None or moment.shape != field.shape or moment.dtype != field.dtype:
+            raise InputError(f"{path}: {group}.{name} does not fit the parameters that it belongs to; {WAY_OUT}")
+        _check_numbers(path, f"{group}.{name}", moment)
+
+
+def _check_numbers(path: str | Path, name: str, array: NDArray[Any]) -> None:
+    """Refuse what is not float32 or float64, and NaN."""
+    if array.dtype not in (np.float32, np.float64):
+        raise InputError(f"{path}: {name} has dtype {array.dtype}, not float32 or float64; {WAY_OUT}")
+    if np.isnan(array).any():
+        raise InputError(f"{path}: {name} holds NaN; {WAY_OUT}")
