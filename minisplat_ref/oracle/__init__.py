@@ -7,7 +7,7 @@ module           what a reader finds there                                      
 ===============  ============================================================================  =============
 ``cases``        what every check reports: named cases that passed or not, as table and JSON
 ``tolerances``   every tolerance and every margin, with its reason
-``thresholds``   pixels at which rounding decides whether a hit counts
+``thresholds``   pixels at which rounding decides whether a hit counts, or which is in front
 ``setting``      a small scene on which every branch of every gradient is taken
 ``stages``       each stage of a backend as a function with its gradient
 ``pieces``       the same for the reference's formulas below the stages

@@ -12,8 +12,8 @@ float32, forward and backward, against the reference in float64.
 Each must be finite and within its tolerance, or refused in one clear line.
 Image errors are relative to the largest value where that is above 1; gradient
 errors are relative, of the worst block of parameters. Pixels on a threshold,
-where a rounding decides whether a hit counts, are counted by themselves; a
-flip is one that decided otherwise.
+where a rounding decides whether a hit counts or which of two is in front, are
+counted by themselves; a flip is one that decided otherwise.
 """
 EPILOG = """\
 examples:
