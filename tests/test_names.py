@@ -144,7 +144,7 @@ def test_scores_stay_in_their_folder(tmp_path, nothing_outside, monkeypatch):
     view = scene.train_views[0]
     views = tuple(view._replace(name=name) for name in (str(tmp_path / "deep" / "picture"), *NASTY))
 
-    def measure(scene, model, settings, on_view):
+    def measure(scene, model, settings, on_view, network):
         for view in scene.test_views:
             on_view(view, np.zeros(view.image.shape), ViewMetrics(view.name, 0.0, 0.0))
 

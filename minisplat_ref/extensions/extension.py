@@ -58,8 +58,9 @@ def load_extension(name: str) -> Extension:
     try:
         module = import_module(module_of(name))
     except (Exception, SystemExit) as error:  # whatever the file of somebody else does
+        reason = " ".join(str(error).split())
         raise InputError(
-            f"extension {name} in {found[name]} cannot be loaded, {type(error).__name__}: {error}; mend or remove it"
+            f"extension {name} in {found[name]} cannot be loaded, {type(error).__name__}: {reason}; mend or remove it"
         ) from error
     extension = getattr(module, "EXTENSION", None)
     if not isinstance(extension, Extension):
