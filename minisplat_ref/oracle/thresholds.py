@@ -23,8 +23,8 @@ Order is the threshold that can flip a whole image. All Gaussians of a wall that
 if the camera is turned against the world's axes, rounding the means spreads these depths by some 1e-8 of themselves,
 and float64 sorts by that noise. In float32 they are equal, and the rows of the table decide: neither order is wrong.
 Our float32 kernels compute depths in float64 and sort them rounded, as other float32 renderers do. To sort them as they
-are would agree with the reference here, and with no other renderer; it takes the tile lists 19 to 36 % longer (13,000
-to 200,000 Gaussians, processor time of one thread), 1.3 % of a training iteration, for an order that is noise.
+are would agree with the reference here, and with no other renderer, for an order that is noise; tile lists would take
+18 to 31 % longer (processor time of one thread, 13,000 to 200,000 Gaussians).
 
 Left out: the border of a footprint's box. A hit near ``alpha_min`` counts as one inside and outside of it, since
 another renderer's box may hold it.
