@@ -63,6 +63,18 @@ def test_neighbours_in_depth_are_found_unless_they_are_equal_or_nothing():
     assert found([0.3, 0.4], [2.0, 2.0 * (1 + FAR)]) == (False, False, False)
 
 
+def test_where_a_gaussian_is_steep_the_rounding_of_its_place_decides():
+    """At 3.5 px alpha is 2e-6 of itself beside alpha_min: it falls by 2.5 of itself a pixel, 2.5 px from the mean."""
+    projection, bins = flat_layers([(1 + 2e-6) * GSPLAT_MAIN.alpha_min * np.exp(2.5**2 / 2)])
+    at = {}
+    for conic in (1, 0):  # falling off along x, and flat
+        p = projection._replace(means2d=np.array([[6.0, 1.5]]), conics=np.array([[conic, 0, 1e-30]]))
+        at[conic] = thresholds(p, bins, GSPLAT_MAIN, OWN_KERNELS).jumps
+    assert at[1][:, 3].all() and not at[1][:, :3].any() and not at[0].any()
+    still = OWN_KERNELS._replace(place=0.0)
+    assert not thresholds(p._replace(conics=np.array([[1.0, 0, 1e-30]])), bins, GSPLAT_MAIN, still).jumps.any()
+
+
 def test_behind_the_stop_nothing_is_found():
     at_skip = GSPLAT_MAIN.alpha_min
     assert found([0.9, 0.9, at_skip]) == (True, False, False)

@@ -23,8 +23,8 @@ Order is the threshold that can flip a whole image. All Gaussians of a wall that
 if the camera is turned against the world's axes, rounding the means spreads these depths by some 1e-8 of themselves,
 and float64 sorts by that noise. In float32 they are equal, and the rows of the table decide: neither order is wrong.
 Our float32 kernels compute depths in float64 and sort them rounded, as other float32 renderers do. To sort them as they
-are would agree with the reference here, and with no other renderer; it takes the tile lists 19 to 36 % longer (13,000
-to 200,000 Gaussians, processor time of one thread), 1.3 % of a training iteration, for an order that is noise.
+are would agree with the reference here, and with no other renderer, for an order that is noise; tile lists would take
+18 to 31 % longer (processor time of one thread, 13,000 to 200,000 Gaussians).
 
 Left out: the border of a footprint's box. A hit near ``alpha_min`` counts as one inside and outside of it, since
 another renderer's box may hold it.
@@ -37,7 +37,7 @@ import numpy as np
 from minisplat_ref.backends import CPU
 from minisplat_ref.constants import MEDIAN_TRANSMITTANCE, Conventions
 from minisplat_ref.oracle.tolerances import FLOAT32_RENDERER, Margins
-from minisplat_ref.reference.hits import TileHits, tile_hits
+from minisplat_ref.reference.hits import TileHits, conic_matrices, tile_hits
 from minisplat_ref.splatting import SplatTape
 from minisplat_ref.types import Bools, Floats, Projection, TileBins, TileGrid
 
@@ -148,7 +148,8 @@ def span_of(tape: SplatTape) -> float:
 
 def lenient_conventions(conventions: Conventions, margins: Margins, slack: float = 0.0) -> Conventions:
     """Conventions under which every hit that may count does: skipped a little later, and never stopped."""
-    alpha_min = conventions.alpha_min - (margins.skip + slack) * conventions.alpha_min
+    of_places = 1e5 * margins.place  # at 17,000 pixels, where alpha changes by up to 6 of itself a pixel
+    alpha_min = conventions.alpha_min - (margins.skip + slack + of_places) * conventions.alpha_min
     return conventions._replace(alpha_min=alpha_min, transmittance_min=0.0)
 
 
@@ -157,22 +158,36 @@ def _of_tile(
 ) -> _OfTile:
     """Look at every hit of a tile; the rows of the arrays are its G hits, front to back, the columns its P pixels."""
     alpha_min, stop = conventions.alpha_min, conventions.transmittance_min
-    margin = (margins.skip + slack) * alpha_min
     unclamped = tile.hit.unclamped  # [G, P] whether they count or not
+    rough = slack + margins.place * _change_by_place(tile, projection)  # [G, P] relative doubt about alphas
+    margin = (margins.skip + rough) * alpha_min
     is_skip = np.abs(np.minimum(unclamped, conventions.alpha_max) - alpha_min) <= margin
     alphas = np.where(tile.alphas < alpha_min, 0, tile.alphas)
     T = np.cumprod(np.concatenate([np.ones((1, alphas.shape[1])), 1 - alphas]), axis=0)  # [G + 1, P]
     before, after = T[:-1], T[1:]
     # Relative doubt about the transmittance: d ln(1 - alpha) = alpha / (1 - alpha) times the relative error of alpha.
-    doubt = margins.stop + np.cumsum(2 * alpha_min * is_skip + slack * alphas / (1 - alphas), axis=0)
+    doubt = margins.stop + np.cumsum(2 * alpha_min * is_skip + rough * alphas / (1 - alphas), axis=0)
     is_open = before > stop * (1 - doubt)  # behind what surely stops, nothing is looked at any more
-    is_stop = is_open & (tile.alphas > 0) & (np.abs(after - stop) <= stop * doubt)
+    hits = np.where((alphas > 0) | is_skip, tile.alphas, 0)  # those that count, or may
+    is_stop = is_open & (hits > 0) & (np.abs(after - stop) <= stop * doubt)
     is_clamp = is_open & (np.abs(unclamped - conventions.alpha_max) <= margins.clamp * conventions.alpha_max)
     is_median = is_open & (np.abs(after - MEDIAN_TRANSMITTANCE) <= margins.median * MEDIAN_TRANSMITTANCE)
     change = np.where(is_skip & is_open, before * (alpha_min + margin), 0).sum(axis=0)
-    change += _change_by_order(projection.depths[tile.ids, None], tile.alphas, before, stop * (1 + doubt), margins)
+    change += _change_by_order(projection.depths[tile.ids, None], hits, before, stop * (1 + doubt), margins)
     change += np.where(is_stop, before, 0).max(axis=0)  # all that lies at and behind the hit that may stop
     return _OfTile(change, change > 0, np.logical_or.reduce(is_clamp, axis=0), np.logical_or.reduce(is_median, axis=0))
+
+
+def _change_by_place(tile: TileHits, projection: Projection) -> Floats:
+    """Relative change [G, P] of each alpha, in parts of the relative rounding of coordinates.
+
+    It is sum_k |(Q d)_k| (|p_k| + |d_k|): the logarithm of alpha changes by Q d with the centre p, and what is rounded
+    are the centre and its offset d from the pixel.
+    """
+    offsets: Floats = tile.hit.place.offsets  # [G, P, 2]
+    slopes = np.einsum("gij,gpj->gpi", conic_matrices(projection.conics[tile.ids]), offsets)
+    change = np.sum(np.abs(slopes) * (np.abs(projection.means2d[tile.ids, None]) + np.abs(offsets)), axis=2)
+    return np.where(tile.hit.unclamped > 0, change, 0)
 
 
 def _change_by_order(depths: Floats, alphas: Floats, before: Floats, stop: Floats, margins: Margins) -> Floats:

@@ -198,6 +198,8 @@ class Margins(NamedTuple):
     """Of the transmittance behind a hit from ``transmittance_min``."""
     median: float
     """Of the same from one half."""
+    place: float
+    """Of a pixel coordinate, how far it may be off; a hit's alpha changes with it as its Gaussian is steep there."""
     order: float
     """Of the depth of a hit from that of the one before; those that are one float32 are always near enough."""
 
@@ -209,18 +211,19 @@ FLOAT32_RENDERER = Margins(
     clamp=1e-5,
     stop=255e-6,
     median=255e-6,
+    place=0.0,  # it is in the others
     order=5e-7,
 )
 """Of any correct renderer in float32, whose own projection is compared."""
 
 OWN_KERNELS = Margins(
-    "footprints and depths come from float64, in images of a few pixels: what is left is rounding of 6e-8 in exponent"
-    " and exponential, and of a depth to its float32; but 1 - 0.99 is off by 1e-6, and a pixel can take several such"
-    " hits",
+    "footprints and depths come from float64: what is left is rounding of 6e-8 in exponent and exponential, twice in"
+    " coordinates, and of a depth to its float32; but 1 - 0.99 is off by 1e-6, and a pixel can take several such hits",
     skip=1e-6,
     clamp=1e-6,
     stop=1e-5,
     median=1e-6,
+    place=1.2e-7,
     order=0.0,
 )
 """Of our float32 kernels in the hard cases.

@@ -25,10 +25,10 @@ def _wall() -> Parameters:
     return Parameters(wall, camera(48, 36, fx=60.0, fy=60.0, cam_from_world_R=R))
 
 
-def _seen_through_a_thousandth() -> Parameters:
-    """A faint needle behind three layers that let 0.05 % through; its short quaternion has the longest gradient."""
+def _seen_through_layers() -> Parameters:
+    """A faint needle behind three layers that let 0.02 % through; its short quaternion has the longest gradient."""
     population = gaussians([[0, 0, 2], [0, 0, 2.5], [0, 0, 3], [0.1, 0.05, 4]], [[1.0] * 3] * 3 + [[0.05, 0.02, 0.02]])
-    quats, logits = population.quats.copy(), np.array([2.5, 2.5, 2.5, -3.0])
+    quats, logits = population.quats.copy(), np.array([2.9, 2.9, 2.9, -3.0])
     quats[3] *= 2.0**-20
     return Parameters(population._replace(quats=quats, opacity_logits=rounded(logits)), camera())
 
@@ -236,10 +236,10 @@ LAYERS = (
         _wall,
     ),
     HardCase(
-        "alone-behind-a-thousandth",
+        "alone-behind-opaque-layers",
         "what is left behind three opaque hits is a difference from the whole pixel, and here the whole gradient",
         "the gradient by a short quaternion, to three digits less than others",
-        _seen_through_a_thousandth,
+        _seen_through_layers,
         BEHIND,
     ),
     HardCase(

@@ -332,7 +332,7 @@ KINDS = (
     Kind("gsplat-1.5", "alpha up to 0.999", "its image and gradient", _by(GSPLAT_1_5)),
     Kind("mini-splatting2", "tight boxes, INRIA's stop", "its image and gradient", _by(MINI_SPLATTING2)),
     Kind("antialiased", "compensations from their floor to one", "dimmed dots", _by(ANTIALIASED)),
-    Kind("everything", "all of it at once", SHARP, _everything, BEHIND),
+    Kind("everything", "all of it at once", SHARP, _everything, LONG),
 )
 
 
