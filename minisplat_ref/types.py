@@ -233,6 +233,8 @@ class RenderOutput(NamedTuple):
     """[V] rows of the population that the view does not cull, ascending; None from a compositor alone."""
     extras: Mapping[str, Any] = NOTHING
     """What was asked for by name and is no channel, such as ``surface``, a :class:`SurfacePoints`."""
+    n_pairs: int = 0
+    """Pairs (tile, Gaussian) of the view, which memory grows with; 0 where the renderer does not say."""
 
 
 class CompositeGradient(NamedTuple):

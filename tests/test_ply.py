@@ -89,7 +89,7 @@ def test_file_is_replaced_whole_or_not_at_all(tmp_path, rng, monkeypatch):
         raise OSError("disk full")
 
     monkeypatch.setattr(type(path), "write_bytes", fail)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(InputError, match=r"a\.ply cannot be written \(disk full\)"):
         save_ply(path, random_gaussians(rng))
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]

@@ -1,6 +1,11 @@
-"""A file or folder is there complete or not at all: written beside its place, then renamed onto it."""
+"""A file or folder is there complete or not at all: written beside its place, then renamed onto it.
 
+A process that is killed leaves its unfinished part behind, under a name by which :func:`remove_parts` knows it.
+"""
+
+import contextlib
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,7 +31,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
     Raises
     ------
     InputError
-        If the folder does not exist.
+        If the folder does not exist, or the file cannot be written: the disk is full or read-only, or there is a limit
+        to the size of files. What was at ``path`` is as it was.
     """
     path = Path(path)
     if not path.absolute().parent.is_dir():
@@ -34,9 +40,21 @@ def replacing(path: str | Path) -> Iterator[Path]:
     temporary = _part_of(path)
     try:
         yield temporary
+        with open(temporary, "r+b") as file:
+            os.fsync(file.fileno())  # the rename must not overtake the content; a disk may say only now that it is full
         os.replace(temporary, path)
+    except OSError as error:
+        if error.filename is not None and Path(os.fsdecode(error.filename)) != temporary:
+            raise
+        raise unwritable(path, error) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def unwritable(path: str | Path, error: OSError) -> InputError:
+    """Return the error that says in one line that a file cannot be written."""
+    return InputError(f"{path} cannot be written ({error.strerror or error}): make room there or choose another place")
 
 
 @contextmanager
@@ -63,6 +81,46 @@ def making_folder(path: str | Path) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextmanager
+def replacing_folder(path: str | Path) -> Iterator[Path]:
+    """Give a new temporary folder beside ``path``; when the block ends it replaces ``path`` and all that it held.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be made.
+    """
+    path = Path(path)
+    temporary = _part_of(path)
+    old = temporary.with_name(f"{temporary.name}.old.{os.getpid()}.part")
+    try:
+        temporary.mkdir(parents=True)
+    except OSError as error:
+        raise unwritable(path, error) from None
+    try:
+        yield temporary
+        if path.exists():
+            os.replace(path, old)
+        os.replace(temporary, path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def is_part(path: Path) -> bool:
+    """Return whether a file or folder is what a process was writing when it was killed."""
+    return re.fullmatch(r"\..+\.\d+\.part", path.name) is not None
+
+
+def remove_parts(folder: Path) -> None:
+    """Remove what killed processes were writing in a folder. No other process may be writing there now."""
+    for path in filter(is_part, folder.iterdir()):
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def _part_of(path: Path) -> Path:

@@ -1,8 +1,14 @@
-"""Checkpoints: named arrays and one JSON description in a .npz file that is either whole or absent."""
+"""Checkpoints: named arrays and one JSON description in a .npz file that is either whole or absent.
 
+The file says the SHA-256 of what it holds. Zip's own check sums see a damaged array, but neither one that is missing
+nor one that belongs to another checkpoint.
+"""
+
+import hashlib
 import json
 import os
-from collections.abc import Mapping
+import shutil
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +25,17 @@ WAY_OUT = "delete it and train anew"
 _HEADER = "header"
 
 
-def save_checkpoint(path: str | Path, arrays: Mapping[str, NDArray[Any]], metadata: Mapping[str, Any]) -> None:
+class DamagedCheckpoint(InputError):
+    """The file is missing, cannot be read, or does not hold what was written: an older one may do."""
+
+
+def save_checkpoint(
+    path: str | Path,
+    arrays: Mapping[str, NDArray[Any]],
+    metadata: Mapping[str, Any],
+    *,
+    previous: str | Path | None = None,
+) -> None:
     """Write a checkpoint; whoever opens ``path`` meanwhile, or after a crash, finds the old one or the new one.
 
     Parameters
@@ -30,12 +46,39 @@ def save_checkpoint(path: str | Path, arrays: Mapping[str, NDArray[Any]], metada
         Stored bit by bit.
     metadata : mapping
         Anything that JSON can hold; integers of any size and floats come back exactly.
+    previous : path, optional
+        Where the file that is replaced is kept, once the new one has been written.
+
+    Raises
+    ------
+    InputError
+        The file cannot be written; the old one is as it was.
     """
-    header = json.dumps({"format": FORMAT, "metadata": dict(metadata)}).encode()
-    with replacing(path) as temporary, open(temporary, "wb") as file:
-        np.savez(file, allow_pickle=False, **{_HEADER: np.frombuffer(header, np.uint8)}, **arrays)
-        file.flush()
-        os.fsync(file.fileno())  # the rename must not overtake the content
+    content = {"format": FORMAT, "metadata": dict(metadata), "sha256": _digest(arrays, metadata)}
+    header = np.frombuffer(json.dumps(content).encode(), np.uint8)
+    with replacing(path) as temporary:
+        with open(temporary, "wb") as file:
+            np.savez(file, allow_pickle=False, **{_HEADER: header}, **arrays)
+        if previous is not None and Path(path).exists():
+            _keep(Path(path), Path(previous))
+
+
+def _keep(path: Path, name: Path) -> None:
+    """Give a file a second name, at which it stays when the first is replaced."""
+    with replacing(name) as temporary:
+        try:
+            os.link(path, temporary)
+        except OSError:  # a file system without links
+            shutil.copyfile(path, temporary)
+
+
+def _digest(arrays: Mapping[str, NDArray[Any]], metadata: Mapping[str, Any]) -> str:
+    """SHA-256 of the description, and of the names, types, shapes and bytes of all arrays."""
+    digest = hashlib.sha256(json.dumps(dict(metadata)).encode())
+    for name, array in sorted(arrays.items()):
+        digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
+    return digest.hexdigest()
 
 
 def load_checkpoint(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
@@ -48,17 +91,42 @@ def load_checkpoint(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str
 
     Raises
     ------
+    DamagedCheckpoint
+        The file is missing, damaged or no checkpoint.
     InputError
-        The file is missing, damaged, or not a checkpoint of this version.
+        It is a checkpoint of another version.
     """
+    arrays, header = _read(path)
+    metadata = header["metadata"]
+    if "sha256" in header and header["sha256"] != _digest(arrays, metadata):  # older files do not say
+        raise DamagedCheckpoint(f"{path} is damaged, its content does not have the hash that it names; {WAY_OUT}")
+    return arrays, metadata
+
+
+def load_metadata(path: str | Path) -> dict[str, Any]:
+    """Read the description alone. The arrays are not looked at: they, or the description, may be damaged.
+
+    Raises
+    ------
+    DamagedCheckpoint, InputError
+        As for :func:`load_checkpoint`.
+    """
+    return _read(path, (_HEADER,))[1]["metadata"]
+
+
+def _read(path: str | Path, names: Collection[str] | None = None) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """Read the arrays, or those of some names, and the header."""
     if not Path(path).exists():
-        raise InputError(f"{path} does not exist: give a checkpoint that a training has written")
-    arrays = read_npz(path, WAY_OUT)
-    if _HEADER not in arrays:
-        raise InputError(f"{path} is an .npz of arrays, but not a checkpoint; {WAY_OUT}")
-    header = parse_json(arrays.pop(_HEADER).tobytes(), path, WAY_OUT)
-    if not isinstance(header, dict) or not isinstance(header.get("metadata"), dict):
-        raise InputError(f"{path} is not a checkpoint, its header holds no metadata; {WAY_OUT}")
+        raise DamagedCheckpoint(f"{path} does not exist: give a checkpoint that a training has written")
+    try:
+        arrays = read_npz(path, WAY_OUT, names)
+        if _HEADER not in arrays:
+            raise InputError(f"{path} is an .npz of arrays, but not a checkpoint; {WAY_OUT}")
+        header = parse_json(arrays.pop(_HEADER).tobytes(), path, WAY_OUT)
+        if not isinstance(header, dict) or not isinstance(header.get("metadata"), dict):
+            raise InputError(f"{path} is not a checkpoint, its header holds no metadata; {WAY_OUT}")
+    except InputError as error:
+        raise DamagedCheckpoint(str(error)) from error
     if header.get("format") != FORMAT:
         raise InputError(f"{path} is {header.get('format')!r}, this version reads {FORMAT!r}: train anew")
-    return arrays, header["metadata"]
+    return arrays, header

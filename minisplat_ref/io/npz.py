@@ -9,6 +9,7 @@ import math
 import os
 import re
 import zipfile
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -26,14 +27,16 @@ _HEADER = re.compile(
 _NUMBERS = "biufc"  # kinds of dtypes: bool, integers, floating point, complex
 
 
-def read_npz(path: str | Path, way_out: str) -> dict[str, NDArray[Any]]:
-    """Read all arrays of an .npz file.
+def read_npz(path: str | Path, way_out: str, names: Collection[str] | None = None) -> dict[str, NDArray[Any]]:
+    """Read all arrays of an .npz file, or some.
 
     Parameters
     ----------
     path : str or Path
     way_out : str
         What to do about a bad file, for the end of the message.
+    names : collection of str, optional
+        The arrays that are read; all by default.
 
     Returns
     -------
@@ -59,6 +62,8 @@ def read_npz(path: str | Path, way_out: str) -> dict[str, NDArray[Any]]:
                 name = info.filename.removesuffix(".npy")
                 if name in arrays:
                     raise InputError(f"{path}: holds {name} twice; {way_out}")
+                if names is not None and name not in names:
+                    continue
                 arrays[name] = _read_array(archive, info, path, way_out)
             return arrays
     except InputError:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from minisplat_ref import memory
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.images import (
     MASK_THRESHOLD,
@@ -134,6 +135,9 @@ def build_scene(
     for photo in photos:
         check_photo(photo, source, reading.undistort)
     _check_points(points, source)
+    memory.check_photographs(
+        source, sum(photo.camera.width * photo.camera.height for photo in photos), reading.downscale
+    )
     extent = camera_extent([photo.camera for photo in train_photos])
     if extent == 0.0:
         raise InputError(f"{source}: all training cameras stand at one point, which shows no depth; move between shots")
