@@ -131,7 +131,8 @@ def render(
         with_median_depth=with_median_depth,
     )
     visible_ids = np.flatnonzero(splats.projection.radii[:, 0] > 0)
-    return splats.output._replace(visible_ids=visible_ids), RenderTape(gaussians, sh_degree, splats)
+    output = splats.output._replace(visible_ids=visible_ids, n_pairs=len(splats.bins.gaussian_ids))
+    return output, RenderTape(gaussians, sh_degree, splats)
 
 
 def render_vjp(tape: RenderTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:

@@ -165,9 +165,23 @@ def test_each_choice_leaves_the_budget(state, iteration, choose):
 
 
 def test_budget_above_the_candidates(state, iteration):
+    """A budget is a ceiling: all candidates stay, in their order, and somebody is told."""
     act = partial(mini_splatting.simplify, metric=importance.indoor, choose=simplify.by_sampling, keep_fraction=0.5)
-    with pytest.raises(InputError, match=r"budget is 1,000.*lower the budget"):
-        act(state, iteration, budget=1_000)
+    stats, said = measure_importance(state, iteration), []
+    candidates = stats.dominant_count > 0
+    expected = state.gaussians.means[candidates]
+    act(state, iteration._replace(say=said.append), budget=1_000)
+    np.testing.assert_array_equal(state.gaussians.means, expected)
+    n = np.count_nonzero(candidates)
+    assert 0 < n < N_GAUSSIANS
+    assert said == [f"simplification keeps all {n} Gaussians that matter, fewer than the budget of 1,000"]
+
+
+def test_budget_below_the_candidates_says_nothing(state, iteration):
+    said = []
+    act = partial(mini_splatting.simplify, metric=importance.indoor, choose=simplify.by_rank, keep_fraction=0.5)
+    act(state, iteration._replace(say=said.append), budget=3)
+    assert len(state.gaussians.means) == 3 and said == []
 
 
 def test_nothing_is_important(state, iteration):

@@ -2,9 +2,8 @@
 
 Several, because the first does without the moments, which are only then written, and without what one iteration leaves
 to the next. Counted is what that process holds at its peak beyond what it held before the Gaussians were there, with
-all kernels loaded. The bound is what no training can do without: the model, Adam's two moments, the gradients, the
-images of an iteration, and 48 bytes for every pair (tile, Gaussian): the 9 sums of its gradient, its places in the
-tile's list and in the Gaussian's, and one number to spare.
+all kernels loaded. The bound is what no training can do without (:mod:`minisplat_ref.memory`): the model, Adam's two
+moments, the gradients, the images of an iteration, and 48 bytes for every pair (tile, Gaussian).
 """
 
 import json
@@ -17,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from minisplat_ref import memory
 from minisplat_ref.backends import CPU
 from minisplat_ref.bench.slopes import FOCAL_OF_WIDTH, LARGE, flipped_pixels
 from minisplat_ref.bench.workloads import synth
@@ -29,7 +29,6 @@ from minisplat_ref.types import Camera, Gaussians
 N, SIZE = 200_000, LARGE
 N_ITERATIONS = 4
 N_REST = 15  # coefficients of degree 3 beyond the constant
-BYTES_PER_PAIR = 48
 INPUTS, IMAGE, RESULT = "inputs.npz", "image.npy", "result.json"
 CHILD = "import sys; from minisplat_ref.bench.peak_memory import measure; measure(sys.argv[1])"
 MEGA = 1e6
@@ -65,8 +64,8 @@ def memory_case() -> Case:
         "model": model,
         "moments": 2 * model,
         "gradients": model,
-        "images": _image_bytes(width, height),
-        "pairs": BYTES_PER_PAIR * n_pairs,
+        "images": memory.image_bytes(width, height),
+        "pairs": memory.BYTES_PER_PAIR * n_pairs,
     }
     bound = sum(terms.values())
     figures: dict[str, Figure] = {
@@ -79,12 +78,6 @@ def memory_case() -> Case:
     passed = flipped_pixels(image, output.image) <= BENCH_FLIPPED_PIXELS
     note = result["note"] if passed else "the image is not that of float64"
     return Case(f"memory/{N:,} Gaussians, {width} x {height}", passed, figures, note)
-
-
-def _image_bytes(width: int, height: int) -> int:
-    """Bytes of the photograph as it is kept and in float32, the image, its opacity, and the derivative by the image."""
-    bytes_, floats = 3, 3 + 3 + 1 + 3
-    return (bytes_ + 4 * floats) * width * height
 
 
 def measure(folder: str) -> None:

@@ -163,8 +163,8 @@ def simplify(
     least_views: int = 0,
     is_intersecting: bool = True,
     visibility_mass: float = VISIBILITY_MASS,
-) -> None:
-    """Keep ``budget`` Gaussians, or ``keep_fraction`` of the candidates.
+) -> str | None:
+    """Keep at most ``budget`` Gaussians, or ``keep_fraction`` of the candidates.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def simplify(
     keep_fraction : float
         Of the candidates, when there is no budget.
     budget : int, optional
-        Number of Gaussians to keep.
+        Number of Gaussians to keep; all candidates, where there are no more.
     least_views : int
         Those that belong to the visible part of fewer views are no candidates.
     is_intersecting : bool
@@ -190,8 +190,13 @@ def simplify(
         cull(state, stats)
     importance = candidates(stats, metric, least_views, is_intersecting=is_intersecting)
     n_candidates = int(np.count_nonzero(importance))
-    n = round(keep_fraction * n_candidates) if budget is None else budget
+    n = round(keep_fraction * n_candidates) if budget is None else min(budget, n_candidates)
     apply_edit(state, choose(state.gaussians, importance, n, state.rng))
+    if budget is None or budget == n:
+        return None
+    note = f"keeps all {n:,} Gaussians that matter, fewer than the budget of {budget:,}"
+    iteration.say(f"simplification {note}")
+    return note
 
 
 def prune_tail(

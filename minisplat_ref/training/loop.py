@@ -9,32 +9,32 @@ of Mini-Splatting2, if an event has made one, says which Gaussians take part in 
 """
 
 import json
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import FrameType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from minisplat_ref import memory
 from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.checkpoint import load_checkpoint, save_checkpoint
 from minisplat_ref.io.scene import half_size
-from minisplat_ref.rendering import Request
+from minisplat_ref.rendering import RenderGradient, Request
 from minisplat_ref.strategy.initialization import initial_gaussians
 from minisplat_ref.strategy.ops import contiguous, n_rows
 from minisplat_ref.training.adam import AdamRule, AdamState, adam_step, fields_of, zero_moments
-from minisplat_ref.training.losses import Rendered, total_loss
+from minisplat_ref.training.case import Case
+from minisplat_ref.training.guard import Guard, Wrong
+from minisplat_ref.training.interruption import Interruptions
+from minisplat_ref.training.losses import Loss, Rendered, total_loss
 from minisplat_ref.training.rates import active_sh_degree
 from minisplat_ref.training.saved_state import read_bundles, read_counters, read_generator, written_by
 from minisplat_ref.training.schedule import During, Event, Recipe, action_name, describe
 from minisplat_ref.training.state import FiredEvent, Iteration, StepReport, TrainState
-from minisplat_ref.types import Floats, Scene, numbered
+from minisplat_ref.types import Floats, Ints, Scene, numbered
 
 HALF_SIZE = "half_size_views"  # what training on views of half the size is called in the record of what fired
 SHARED_RULE = AdamRule(is_visible_only=False, has_bias_correction=True)  # shared parameters have no visible rows
@@ -92,6 +92,7 @@ def train(
     on_step: Callable[[StepReport], None] | None = None,
     backend: Backend = CPU,
     conventions: Conventions = GSPLAT_MAIN,
+    guard: Guard = Guard(),  # noqa: B008  (a constant)
 ) -> TrainState:
     """Train until ``recipe.iterations``.
 
@@ -107,6 +108,8 @@ def train(
         Called with a :class:`StepReport` after every iteration.
     backend : Backend
     conventions : Conventions
+    guard : Guard
+        How closely numbers are watched, and what happens when one is not finite.
 
     Returns
     -------
@@ -116,25 +119,29 @@ def train(
     Raises
     ------
     InputError
-        The scene has no training views or is not the one that ``state`` was trained on; or a loss term says that the
-        scene lacks what it needs.
+        The scene has no training views or is not the one that ``state`` was trained on; a loss term says that the
+        scene lacks what it needs; a number is not finite; or memory has no room for more Gaussians.
     KeyboardInterrupt
-        After Ctrl-C, at the end of the running iteration: the ``state`` that was passed in is whole and can be saved.
+        After Ctrl-C, at once, or at the end of the iteration where that has begun to change the state: the ``state``
+        that was passed in is whole and can be saved. Whoever presses again during it does not want to wait.
+
+    After any of these ``state.is_whole`` says whether the state stands between two iterations and can be saved.
     """
     state = initial_state(scene, recipe, seed) if state is None else state
     scene = scene._replace(train_views=numbered(scene.train_views))
     _check_fits(state, scene, recipe)
     small_scene = _half_size(scene, recipe.least_half_size) if state.step < recipe.half_size_until else scene
-    with _interrupts_held_back() as raise_if_interrupted:
+    around = _Surroundings(recipe, backend, conventions, guard)
+    with Interruptions() as interruptions:
         while state.step < recipe.iterations:
             seen = small_scene if state.step < recipe.half_size_until else scene
-            report = _iterate(state, seen, recipe, backend, conventions)
+            report = _iterate(state, seen, around, interruptions)
             if report.step == 1 and seen is not scene:
                 report = report._replace(fired=(_half_size_event(report, recipe), *report.fired))
             if on_step is not None:
                 on_step(report)
             del report  # and with it the image, before the next is made
-            raise_if_interrupted()
+            interruptions.release()
     return state
 
 
@@ -154,41 +161,90 @@ def _check_fits(state: TrainState, scene: Scene, recipe: Recipe) -> None:
         )
 
 
-def _iterate(state: TrainState, scene: Scene, recipe: Recipe, backend: Backend, conventions: Conventions) -> StepReport:
-    step, renderer = state.step + 1, recipe.renderer
+def _iterate(state: TrainState, scene: Scene, around: "_Surroundings", interruptions: Interruptions) -> StepReport:
+    """Do one iteration; what fails before the step leaves the state as if the iteration had not begun."""
+    view_order, draws = list(state.view_order), state.rng.bit_generator.state
+    try:
+        differentiated = _differentiate(state, scene, around)
+        interruptions.hold()
+    except BaseException:
+        state.view_order, state.rng.bit_generator.state = view_order, draws
+        raise
+    state.is_whole = False
+    report = _change(state, scene, around, differentiated)
+    state.is_whole = True
+    return report
+
+
+class _Surroundings(NamedTuple):
+    """What stays the same from iteration to iteration."""
+
+    recipe: Recipe
+    backend: Backend
+    conventions: Conventions
+    guard: Guard
+
+
+class _Differentiated(NamedTuple):
+    """One training view, rendered and differentiated."""
+
+    case: Case
+    rendered: Rendered
+    loss: Loss
+    gradient: RenderGradient
+    visible_ids: Ints
+    """[V] rows that the view sees, ascending."""
+    wrong: Wrong | None
+    """Why the step is to be left out, if it is."""
+
+
+def _differentiate(state: TrainState, scene: Scene, around: _Surroundings) -> _Differentiated:
+    """Draw a view and render it, and the gradient of its loss; of the state only the draws are changed."""
+    recipe, step = around.recipe, state.step + 1
+    renderer = recipe.renderer
     view_id = _next_view(state, len(scene.train_views))
     view = scene.train_views[view_id]
-    due = [event for event in recipe.events if event.is_due(step)]
     terms = [term for term in recipe.losses if term.is_due(step)]
     background = state.rng.random(3) if recipe.has_random_background else scene.background
     request = Request(
         background.astype(np.float32),
         sh_degree=active_sh_degree(step, recipe.sh_milestones),
-        conventions=conventions,
-        backend=backend,
+        conventions=around.conventions,
+        backend=around.backend,
         is_visible=state.stats["is_visible"][:, view_id] if "is_visible" in state.stats else None,
         wants=frozenset().union(
-            *(term.wants for term in terms), *(event.wants for event in due if isinstance(event, During))
+            *(term.wants for term in terms),
+            *(event.wants for event in _due(recipe, step) if isinstance(event, During)),
         ),
     )
-    output, tape = renderer.render(state.model, view, request)
-    rendered = Rendered(output, renderer.channels(request.wants), view, scene, state.model, step, request)
+    case = Case(step, state.model, view, scene, request, recipe)
+    output, tape = renderer.render(case.model, view, request)
+    rendered = Rendered(output, renderer.channels(request.wants), view, scene, case.model, step, request)
     loss = total_loss(terms, rendered)
     gradient = renderer.render_vjp(tape, loss.v_image, loss.v_alpha)
+    assert output.visible_ids is not None, "a renderer says which rows a view sees"
+    wrong = around.guard.wrong_in(case, loss, gradient)
+    return _Differentiated(case, rendered, loss, gradient, output.visible_ids, wrong)
 
-    visible_ids = output.visible_ids
-    assert visible_ids is not None, "a renderer says which rows a view sees"
-    rates = recipe.rates.at(step, scene.extent)
-    v_gaussians = _with_direct(gradient.gaussians, loss.v_gaussians)
-    state.adam = adam_step(state.gaussians, v_gaussians, state.adam, rates, recipe.adam, visible_ids, backend)
-    if state.shared:
-        v_shared = {name: np.zeros_like(array) for name, array in state.shared.items()}
-        v_shared = _with_direct({**v_shared, **gradient.shared}, loss.v_shared)
-        state.shared_adam = adam_step(
-            state.shared, v_shared, state.shared_adam, rates, SHARED_RULE, visible_ids, backend
-        )
 
-    output = output._replace(image=rendered.channel("rgb"))
+def _change(state: TrainState, scene: Scene, around: _Surroundings, differentiated: _Differentiated) -> StepReport:
+    """Take the step, and do what is due."""
+    case, rendered, loss, gradient, visible_ids, wrong = differentiated
+    recipe, backend, guard, view = around.recipe, around.backend, around.guard, case.view
+    notes: list[str] = []
+    due = _due(recipe, case.step)
+    if wrong is None:
+        _step(state, recipe.rates.at(case.step, scene.extent), around, differentiated)
+    else:
+        notes.append(f"iteration {case.step}, view {view.name}, {wrong}; step left out")
+        due = [event for event in due if not isinstance(event, During)]  # which would collect it
+    is_editing = any(not isinstance(event, During) for event in due)
+    if is_editing or guard.is_due(case.step):
+        guard.check_parameters(case, "Adam")
+    if is_editing:
+        n_bytes, n_pairs = sum(field.nbytes for field in state.gaussians), rendered.output.n_pairs
+        state.most_rows = memory.rows_that_fit(len(state.gaussians.means), n_bytes, n_pairs, memory.free_bytes())
+    output = rendered.output._replace(image=rendered.channel("rgb"))
     iteration = Iteration(
         scene,
         view,
@@ -196,14 +252,19 @@ def _iterate(state: TrainState, scene: Scene, recipe: Recipe, backend: Backend, 
         visible_ids,
         gradient.means2d,
         backend,
-        conventions,
-        renderer,
+        around.conventions,
+        recipe.renderer,
         recipe.representation,
+        notes.append,
     )
-    fired = [(event, _act(event, state, iteration)) for event in due]
-    state.step = step
-    told = tuple(record for event, record in fired if not isinstance(event, During))
-    return StepReport(step, loss.value, view, output, state, told)
+    fired: list[FiredEvent] = []
+    for event in due:
+        record = _act(event, state, iteration)
+        if not isinstance(event, During):
+            guard.check_parameters(case._replace(model=state.model), f"event {record.action}")
+            fired.append(record)
+    state.step = case.step
+    return StepReport(case.step, loss.value, view, output, state, tuple(fired), tuple(notes))
 
 
 def _act(event: Event, state: TrainState, iteration: Iteration) -> FiredEvent:
@@ -216,6 +277,27 @@ def _half_size_event(report: StepReport, recipe: Recipe) -> FiredEvent:
     """Return the record of what is no event, but can be off where views are small: the first iteration tells it."""
     n = n_rows(report.state.gaussians)
     return FiredEvent(HALF_SIZE, n, n, 0.0, f"until iteration {recipe.half_size_until}")
+
+
+def _step(
+    state: TrainState, rates: Mapping[str, float], around: _Surroundings, differentiated: _Differentiated
+) -> None:
+    """Move all parameters by one step of Adam."""
+    _, _, loss, gradient, visible_ids, _ = differentiated
+    backend = around.backend
+    v_gaussians = _with_direct(gradient.gaussians, loss.v_gaussians)
+    state.adam = adam_step(state.gaussians, v_gaussians, state.adam, rates, around.recipe.adam, visible_ids, backend)
+    if state.shared:
+        v_shared = {name: np.zeros_like(array) for name, array in state.shared.items()}
+        v_shared = _with_direct({**v_shared, **gradient.shared}, loss.v_shared)
+        state.shared_adam = adam_step(
+            state.shared, v_shared, state.shared_adam, rates, SHARED_RULE, visible_ids, backend
+        )
+
+
+def _due(recipe: Recipe, step: int) -> list[Event]:
+    """Return the events of an iteration, in their order."""
+    return [event for event in recipe.events if event.is_due(step)]
 
 
 def _with_direct(gradient: Any, direct: Mapping[str, Floats]) -> Any:
@@ -239,31 +321,20 @@ def _half_size(scene: Scene, least: int) -> Scene:
     return scene._replace(train_views=tuple(half_size(view) for view in scene.train_views))
 
 
-@contextmanager
-def _interrupts_held_back() -> Iterator[Callable[[], None]]:
-    """Hold Ctrl-C back until the yielded function is called: half an Adam step must not be saved."""
-    is_interrupted = False
+def save_state(path: str | Path, state: TrainState, recipe: Recipe, *, previous: str | Path | None = None) -> None:
+    """Write a checkpoint from which :func:`load_state` continues bit by bit.
 
-    def note(signal_number: int, frame: FrameType | None) -> None:
-        nonlocal is_interrupted
-        is_interrupted = True
-
-    def raise_if_interrupted() -> None:
-        if is_interrupted:
-            raise KeyboardInterrupt
-
-    if threading.current_thread() is not threading.main_thread():  # where Python delivers no signals
-        yield raise_if_interrupted
-        return
-    previous = signal.signal(signal.SIGINT, note)
-    try:
-        yield raise_if_interrupted
-    finally:
-        signal.signal(signal.SIGINT, previous)
-
-
-def save_state(path: str | Path, state: TrainState, recipe: Recipe) -> None:
-    """Write a checkpoint from which :func:`load_state` continues bit by bit."""
+    Parameters
+    ----------
+    path : str or Path
+    state : TrainState
+        Whole.
+    recipe : Recipe
+        By which it is trained.
+    previous : str or Path, optional
+        Where the checkpoint that stood at ``path`` is kept.
+    """
+    assert state.is_whole, "half an iteration must not be saved"
     groups = {
         **{"gaussians": state.gaussians, "first": state.adam.first, "second": state.adam.second},
         **{"shared": state.shared, "shared_first": state.shared_adam.first, "shared_second": state.shared_adam.second},
@@ -278,7 +349,7 @@ def save_state(path: str | Path, state: TrainState, recipe: Recipe) -> None:
         "rng": state.rng.bit_generator.state,
         "recipe": describe(recipe),
     }
-    save_checkpoint(path, arrays, metadata)
+    save_checkpoint(path, arrays, metadata, previous=previous)
 
 
 def load_state(path: str | Path, recipe: Recipe) -> TrainState:

@@ -6,6 +6,8 @@ record: why it has changed nothing, for one. :func:`apply_edit` and :func:`start
 come and go.
 """
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -14,6 +16,7 @@ from numpy.typing import NDArray
 
 from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
+from minisplat_ref.errors import InputError
 from minisplat_ref.rendering import SPLATTING, Renderer
 from minisplat_ref.strategy.ops import Edit, contiguous, inherit, inherit_fields
 from minisplat_ref.training.adam import AdamState, zero_moments
@@ -41,11 +44,19 @@ class TrainState:
     """Parameters without rows, by name; their arrays are updated in place."""
     shared_adam: AdamState[Any] = field(default_factory=lambda: AdamState({}, {}, 0))
     """Moments of the shared parameters."""
+    is_whole: bool = True
+    """False while an iteration is changing it; if it stays so, the iteration failed half-way: not to be saved."""
+    most_rows: float = math.inf
+    """Rows that memory has room for, as far as is known."""
 
     @property
     def model(self) -> Model:
         """The parameters, as they are rendered."""
         return Model(self.gaussians, self.shared)
+
+
+def unheard(text: str) -> None:
+    """Say something to nobody."""
 
 
 class Iteration(NamedTuple):
@@ -69,6 +80,8 @@ class Iteration(NamedTuple):
     """How the model is drawn."""
     representation: Representation = GAUSSIANS
     """What the model is made of."""
+    say: Callable[[str], None] = unheard
+    """Tells the user something in one line, at once; what only the record needs is returned."""
 
 
 class FiredEvent(NamedTuple):
@@ -100,6 +113,8 @@ class StepReport(NamedTuple):
     """The state after the iteration; it is safe to save."""
     fired: tuple[FiredEvent, ...] = ()
     """Events that acted after the gradient step, in their order."""
+    notes: tuple[str, ...] = ()
+    """What the user is to be told at once, a line each."""
 
 
 def n_pixels(scene: Scene) -> int:
@@ -108,7 +123,14 @@ def n_pixels(scene: Scene) -> int:
 
 
 def apply_edit(state: TrainState, edit: Edit) -> None:
-    """Replace the population; new rows get zero moments, statistics follow the parents."""
+    """Replace the population; new rows get zero moments, statistics follow the parents.
+
+    Raises
+    ------
+    InputError
+        There is no memory for so many rows.
+    """
+    _check_room(state, len(edit.parent_ids))
     no_reset = np.zeros(len(edit.parent_ids), bool)
     state.gaussians = contiguous(edit.gaussians)  # Adam writes through views
     state.adam = state.adam._replace(
@@ -123,8 +145,22 @@ def start_anew(state: TrainState, iteration: Iteration, gaussians: Gaussians) ->
 
     Fields that the representation has besides those of ``gaussians`` begin as at the start of training. Shared
     parameters stay.
+
+    Raises
+    ------
+    InputError
+        There is no memory for so many rows.
     """
+    _check_room(state, len(gaussians.means))
     state.gaussians = contiguous(iteration.representation.extend(gaussians, state.rng))
     state.adam = zero_moments(state.gaussians)
     state.stats = {}
     state.view_order = []
+
+
+def _check_room(state: TrainState, n: int) -> None:
+    if n > max(state.most_rows, len(state.gaussians.means)):
+        raise InputError(
+            f"there is no memory for {n:,} Gaussians, only for some {state.most_rows:,.0f}: train on smaller"
+            " photographs (--downscale), or by a recipe that keeps to a --budget"
+        )

@@ -1,0 +1,137 @@
+"""One view of one iteration as a file: what its numbers depend on, to be computed again elsewhere."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref.constants import Conventions
+from minisplat_ref.errors import InputError
+from minisplat_ref.io.checkpoint import load_checkpoint, save_checkpoint
+from minisplat_ref.rendering import Request
+from minisplat_ref.training.adam import fields_of
+from minisplat_ref.training.losses import LossTerm
+from minisplat_ref.training.schedule import Recipe
+from minisplat_ref.types import Camera, Floats, Model, Scene, View
+
+_KIND = "case"  # tells the file from a checkpoint
+
+
+class Case(NamedTuple):
+    """One view of one iteration."""
+
+    step: int
+    model: Model
+    view: View
+    scene: Scene
+    """A loss term may look at its points and its extent."""
+    request: Request
+    recipe: Recipe
+    """Its renderer and loss terms."""
+
+    @property
+    def terms(self) -> Sequence[LossTerm]:
+        """The loss terms that are due."""
+        return [term for term in self.recipe.losses if term.is_due(self.step)]
+
+
+def save_case(path: Path, case: Case, wrong: str, settings: Mapping[str, Any]) -> None:
+    """Write a case.
+
+    Parameters
+    ----------
+    path : Path
+    case : Case
+    wrong : str
+        What was found in it.
+    settings : mapping
+        Of the run; anything that JSON can hold. Empty where it was none of the command line.
+    """
+    view, request, camera = case.view, case.request, case.view.camera
+    optional = {
+        "view.mask": view.mask,
+        "view.point_ids": view.point_ids,
+        "request.background": request.background,
+        "request.is_visible": request.is_visible,
+    }
+    arrays = {
+        **{f"gaussians.{name}": array for name, array in fields_of(case.model.gaussians).items()},
+        **{f"shared.{name}": array for name, array in case.model.shared.items()},
+        "view.image": view.image,
+        "view.R": camera.cam_from_world_R,
+        "view.t": camera.cam_from_world_t,
+        "scene.points": case.scene.points,
+        "scene.background": case.scene.background,
+        **{name: array for name, array in optional.items() if array is not None},
+    }
+    metadata = {
+        "kind": _KIND,
+        "step": case.step,
+        "wrong": wrong,
+        "settings": dict(settings),
+        "recipe": [case.recipe.name, case.recipe.iterations],
+        "view": {"name": view.name, "view_id": view.view_id, "time": view.time},
+        "intrinsics": [float(value) for value in camera[2:]],
+        "extent": float(case.scene.extent),
+        "request": {
+            "sh_degree": request.sh_degree,
+            "conventions": request.conventions._asdict(),
+            "wants": sorted(request.wants),
+        },
+    }
+    save_checkpoint(path, arrays, metadata)
+
+
+class SavedCase(NamedTuple):
+    """What a file holds; the recipe is found by whoever knows where recipes are."""
+
+    arrays: Mapping[str, Any]
+    metadata: Mapping[str, Any]
+
+    @property
+    def wrong(self) -> str:
+        """What was found."""
+        return self.metadata["wrong"]
+
+    def of(self, recipe: Recipe) -> Case:
+        """Return the case, of the recipe's population."""
+        arrays, about, request = self.arrays, self.metadata["view"], self.metadata["request"]
+        fx, fy, cx, cy, width, height = self.metadata["intrinsics"]
+        camera = Camera(arrays["view.R"], arrays["view.t"], fx, fy, cx, cy, int(width), int(height))
+        view = View(image=arrays["view.image"], camera=camera, mask=None, **about)
+        view = view._replace(mask=arrays.get("view.mask"), point_ids=arrays.get("view.point_ids"))
+        points = arrays["scene.points"]
+        colors = np.zeros(points.shape, np.uint8)
+        scene = Scene(view.name, (view,), (), points, colors, arrays["scene.background"], self.metadata["extent"])
+        return Case(
+            self.metadata["step"],
+            Model(recipe.representation.population(**self._group("gaussians")), self._group("shared")),
+            view,
+            scene,
+            Request(
+                arrays.get("request.background"),
+                request["sh_degree"],
+                Conventions(**request["conventions"]),
+                is_visible=arrays.get("request.is_visible"),
+                wants=frozenset(request["wants"]),
+            ),
+            recipe,
+        )
+
+    def _group(self, name: str) -> dict[str, Floats]:
+        return {key.removeprefix(f"{name}."): a for key, a in self.arrays.items() if key.startswith(f"{name}.")}
+
+
+def load_case(path: str | Path) -> SavedCase:
+    """Read what :func:`save_case` wrote.
+
+    Raises
+    ------
+    InputError
+        The file is missing, damaged, or something else.
+    """
+    arrays, metadata = load_checkpoint(path)
+    if metadata.get("kind") != _KIND:
+        raise InputError(f"{path} is no case of bad numbers: give a file that a training has written when it stopped")
+    return SavedCase(arrays, metadata)
