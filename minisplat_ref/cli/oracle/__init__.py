@@ -18,7 +18,7 @@ Exit codes: 0 all passed, 1 a case failed, 2 bad input."""
 
 def add_parser(commands: Commands) -> None:
     """Add the command and its checks."""
-    from . import compare, export, gradients, hard_cases, truth
+    from . import compare, export, gradients, hard_cases, replay, truth
 
     parser = commands.add_parser(
         "oracle",
@@ -28,7 +28,7 @@ def add_parser(commands: Commands) -> None:
         formatter_class=HelpFormatter,
     )
     checks = parser.add_subparsers(title="checks", metavar="CHECK", required=True)
-    for check in (gradients, truth, hard_cases, compare, export):
+    for check in (gradients, truth, hard_cases, compare, export, replay):
         check.add_parser(checks)
 
 

@@ -1,0 +1,75 @@
+"""A view in which a training found a number that is not finite, computed again by every backend.
+
+If the reference in float64 is finite where another is not, the error is in that one; if all are not, it is in the
+parameters, the formula or the data. Where nothing is wrong with any of them it has been mended, or did not come from
+what the view depends on.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from minisplat_ref.backends import BACKENDS, REFERENCE, Backend
+from minisplat_ref.oracle.cases import Case, Figure, Report
+from minisplat_ref.training.adam import fields_of
+from minisplat_ref.training.case import Case as View
+from minisplat_ref.training.guard import Examination, examine
+from minisplat_ref.types import Floats, Model
+
+DTYPES = (np.float64, np.float32)
+
+
+def replay(case: View, wrong: str) -> Report:
+    """Draw and differentiate the view with every backend in both precisions.
+
+    Parameters
+    ----------
+    case : minisplat_ref.training.case.Case
+    wrong : str
+        What the training had found.
+
+    Returns
+    -------
+    Report
+        A case for each backend and precision, which fails where a number is not finite. Errors are relative to the
+        largest value of the float64 reference; of the gradient, the worst parameter's.
+    """
+    truth = examine(_by(case, REFERENCE, np.float64))
+    cases = []
+    for dtype in DTYPES:
+        for backend in BACKENDS.values():
+            is_truth = backend is REFERENCE and dtype is np.float64
+            found = truth if is_truth else examine(_by(case, backend, dtype))
+            figures: dict[str, Figure] = {"loss": float(found.loss.value)}
+            if not is_truth:
+                figures |= {
+                    "image error": _error(found.output.image, truth.output.image),
+                    **_gradient_error(found, truth),
+                }
+            name = f"{backend.name} {np.dtype(dtype).name}"
+            cases.append(Case(name, found.wrong is None, figures, "" if found.wrong is None else str(found.wrong)))
+    title = f"iteration {case.step}, view {case.view.name}; the training found {wrong}"
+    return Report(title, tuple(cases), {"step": case.step, "view": case.view.name, "found": wrong})
+
+
+def _by(case: View, backend: Backend, dtype: type[np.floating]) -> View:
+    def cast(array: Any) -> Any:
+        return array.astype(dtype) if array is not None and array.dtype.kind == "f" else array
+
+    population = type(case.model.gaussians)._make(map(cast, case.model.gaussians))
+    request = case.request._replace(backend=backend, background=cast(case.request.background))
+    return case._replace(model=Model(population, case.model.shared), request=request)
+
+
+def _gradient_error(found: Examination, truth: Examination) -> dict[str, Figure]:
+    expected = fields_of(truth.gradient.gaussians)
+    errors = {name: _error(v, expected[name]) for name, v in fields_of(found.gradient.gaussians).items()}
+    worst = max(errors, key=lambda name: (np.isnan(errors[name]), errors[name]))
+    return {"gradient error": errors[worst], "of": worst}
+
+
+def _error(values: Floats, expected: Floats) -> float:
+    with np.errstate(all="ignore"):
+        largest = np.abs(expected).max(initial=0.0)
+        error = np.abs(values - expected).max(initial=0.0)
+        return float(error / largest) if largest > 0 else float(error)
