@@ -13,11 +13,12 @@ signature allows, the kernels of ``bench``, and those of an extension's actions.
 import gc
 import os
 import signal
+import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context, parent_process
 from typing import NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
@@ -121,8 +122,8 @@ def warm_up(
     dtype: Dtype = np.float32,
     n_processes: int | None = None,
     extensions: Iterable[str] = (),
-) -> Iterator[Compiled]:
-    """Compile stages in processes of their own, and yield each when it is ready.
+) -> Generator[Compiled, None, None]:
+    """Compile stages in processes of their own, and yield each when it is ready; closed early, it ends them.
 
     The main module of the program is imported by each of those processes: a script must call this under
     ``if __name__ == "__main__"``.
@@ -141,12 +142,18 @@ def warm_up(
     names, extension_names = tuple(STAGES if stages is None else stages), tuple(extensions)
     n_processes = min(n_processes or os.cpu_count() or 1, max(len(names), len(extension_names)))
     # Fresh interpreters: a fork of a process in which kernels have run could not run any.
-    pool = ProcessPoolExecutor(n_processes, get_context("spawn"), initializer=_prepare_process)
+    context = get_context("spawn")
+    pool, others = ProcessPoolExecutor(n_processes, context, initializer=_prepare_process), active_children()
     try:
         for task, batch in ((_compile, names), (_compile_extension, extension_names)):
             futures = [pool.submit(task, name, dtype) for name in batch]
             for future in as_completed(futures):
                 yield future.result()
+    except BaseException:  # nobody waits for the rest: Ctrl-C, which they do not see, or an error
+        for process in active_children():
+            if process not in others:
+                process.kill()
+        raise
     finally:
         pool.shutdown(cancel_futures=True)
 
@@ -154,6 +161,15 @@ def warm_up(
 def _prepare_process() -> None:
     gc.disable()  # what the compiler makes is many small objects, of which few can go
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End this process when the parent is killed: it would wait for work for ever."""
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _compile(name: str, dtype: Dtype) -> Compiled:

@@ -49,7 +49,7 @@ from minisplat_ref.methods import RECIPES, get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import render
 from minisplat_ref.strategy import clone_split
-from minisplat_ref.training.loop import _iterate, initial_state, train
+from minisplat_ref.training.loop import _change, _differentiate, initial_state, train
 from minisplat_ref.training.schedule import Every, scaled
 
 plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
@@ -141,11 +141,17 @@ print_events(recipe)
 # %% [markdown]
 # ## One iteration
 #
-# The next view from a shuffled list; render; loss; gradient; Adam on the Gaussians that the view saw; then whatever the
-# recipe says is due:
+# The next view from a shuffled list; render; loss; gradient. Until here the state has not changed, and an interruption
+# loses nothing:
 
 # %%
-show_code(_iterate)
+show_code(_differentiate)
+
+# %% [markdown]
+# Then Adam on the Gaussians that the view saw, and whatever the recipe says is due:
+
+# %%
+show_code(_change)
 
 # %% [markdown]
 # ## Who is added, who is removed

@@ -277,7 +277,7 @@ def test_only_a_first_training_compiles_ahead(kernels, backend, expected, tmp_pa
     for i in range(kernels):
         (folder / f"f.{i}.nbc").touch()
     asked = []
-    monkeypatch.setattr(first_use, "warm_up", lambda stages: asked.append(stages) or iter(stages))
+    monkeypatch.setattr(first_use, "warm_up", lambda stages: asked.append(stages) or (stage for stage in stages))
     first_use.compile_kernels(backend)
     assert asked == ([FIRST_ITERATION] if expected else [])
     assert ("compiling" in capsys.readouterr().err) == expected

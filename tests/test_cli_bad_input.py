@@ -8,8 +8,6 @@ from photo_scenes import PINHOLE, edit_transforms, write_colmap, write_transform
 
 from minisplat_ref import Gaussians, save_ply
 from minisplat_ref.cli import main
-from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.io.images import write_image
 from minisplat_ref.io.ply import load_ply
 
@@ -211,18 +209,6 @@ def test_two_views_for_a_recipe_that_compares_views(train_refused, tmp_path, rec
     scene = write_colmap(tmp_path / "scene", n=3)
     line = train_refused(scene, "--recipe", recipe, "--test-every", "3")
     assert "2 training views" in line and "use 3dgs-accel" in line
-
-
-def test_budget_above_the_candidates(tmp_path, capfd):
-    """How many there are is known only when it comes to choosing; nothing remains of the run."""
-    write_scene(
-        make_scene("room", supersampling=1, n_views=4, width=24, height=18, n_points=60), tmp_path / "scene", {}
-    )
-    options = ["--recipe", "mini-splatting", "--iterations", "8", "--budget", "100000", "--out", str(tmp_path / "out")]
-    assert main(["train", str(tmp_path / "scene"), *options]) == 2
-    (line,) = [line for line in capfd.readouterr().err.splitlines() if "error" in line]
-    assert "budget is 100,000 but only" in line and "lower the budget" in line
-    assert not (tmp_path / "out").exists()
 
 
 def test_depth_of_points_without_tracks(tmp_path, capfd):

@@ -128,7 +128,7 @@ def test_a_run_that_was_killed_while_it_was_measured(scene_folder, folder):
 
 def test_a_run_without_a_checkpoint_is_started_again(scene_folder, folder):
     assert train_second(scene_folder, folder) == 0
-    for name in ("metrics.json", "checkpoint.npz"):
+    for name in ("metrics.json", "checkpoint.npz", "checkpoint-previous.npz"):
         (folder / SECOND / name).unlink()
     (folder / SECOND / "of_before").touch()
     assert resume(folder)[1].endswith("has no checkpoint, started again")

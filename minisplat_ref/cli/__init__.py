@@ -22,6 +22,7 @@ from . import (
     bench,
     cache,
     compare,
+    convert,
     demo,
     downscale,
     evaluate,
@@ -39,7 +40,7 @@ from . import (
 GROUPS = {
     "start here": (demo,),
     "preparing scenes": (sfm, undistort, downscale, synthetic),
-    "training and its results": (train, render, evaluate, compare, info),
+    "training and its results": (train, render, evaluate, convert, compare, info),
     "checks and measurements": (oracle, bench, study),
     "the program itself": (extensions, cache),
 }
@@ -164,6 +165,9 @@ def _run(argv: Sequence[str]) -> int:
         sys.stdout.flush()
     except InputError as error:
         print(f"minisplat-ref: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except MemoryError:
+        print("minisplat-ref: error: memory is full: give less at a time (--downscale, --size)", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("minisplat-ref: interrupted", file=sys.stderr)

@@ -55,6 +55,7 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.experiments.run import run_training
     from minisplat_ref.experiments.scoring import summary
     from minisplat_ref.experiments.settings import Settings, load_photographs, recipe_of
+    from minisplat_ref.training.interruption import terminated_like_interrupted
     from minisplat_ref.training.loop import initial_state
 
     start = time.perf_counter()
@@ -78,8 +79,12 @@ def run(args: argparse.Namespace) -> int:
     recipe = recipe_of(settings)
     state = initial_state(scene, recipe, settings.seed)
     compile_kernels(settings.backend)
-    outcome = run_training(folder, scene, settings, recipe, state)
-    pictures = view_pictures(folder, synthetic, scene, outcome)
+    with terminated_like_interrupted(), run_folder.held(folder):
+        outcome = run_training(folder, scene, settings, recipe, state)
+    if outcome.evaluation is None:
+        print(f"minisplat-ref: stopped; to continue: minisplat-ref train --resume {folder}", file=sys.stderr)
+        return 130
+    pictures = view_pictures(folder, synthetic, scene, outcome.evaluation)
     page = report_html(folder, scene, settings, outcome, pictures, time.perf_counter() - start)
     (folder / REPORT).write_text(page, encoding="utf-8")
     if not outcome.is_complete:

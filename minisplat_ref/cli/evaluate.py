@@ -1,18 +1,21 @@
 """``eval``: measures a run on its test views again."""
 
 import argparse
+import sys
 from pathlib import Path
 
-from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter
+from minisplat_ref.experiments.arguments import Commands, HelpFormatter, integer
 
 DESCRIPTION = """\
 Measure a run on its test views: PSNR, SSIM and, given the weights of its
 network, LPIPS of point_cloud.ply, view by view.
 
-Rewrites DIR/metrics.json and DIR/renders/ (truth | render | error). Renders
-are clipped to [0, 1] and not rounded; SSIM has an 11 x 11 window and zero
-padding; what stands for all views is the mean of theirs.
+Rewrites DIR/metrics.json and DIR/renders/ (truth | render | error). What is not
+the run's result on its own test views has a folder of its own: other views of
+its photographs (--test-every) or a run that has not ended DIR/eval-..., another
+scene --out, without which it is refused. Renders are clipped to [0, 1] and not
+rounded; SSIM has an 11 x 11 window and zero padding; what stands for all views
+is the mean of theirs.
 """
 EPILOG = """\
 LPIPS is null without the weights of VGG16 or AlexNet (net='alex'), which are
@@ -43,6 +46,8 @@ def add_parser(commands: Commands) -> None:
         metavar="PATH",
         help="where the photographs are now, if they have moved since the training",
     )
+    parser.add_argument("--test-every", type=integer(1), metavar="K", help="measure every K-th view instead")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="where to write (default: see above)")
     parser.add_argument(
         "--lpips-weights",
         type=Path,
@@ -53,33 +58,21 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, print a table, rewrite the files."""
-    from minisplat_ref.experiments import run_folder
-    from minisplat_ref.experiments.first_use import warn_if_not_kept
-    from minisplat_ref.experiments.notices import warn_of_model
-    from minisplat_ref.experiments.scoring import score, summary, to_metrics
-    from minisplat_ref.experiments.settings import load, load_lpips, load_model, load_photographs
+    """Measure, print a table, write the files."""
+    from minisplat_ref.experiments.evaluation import evaluate_run
+    from minisplat_ref.experiments.scoring import summary
 
-    settings = load(args.folder)
-    if args.scene is not None:
-        settings = settings._replace(scene=str(args.scene))
-    if args.lpips_weights is not None:
-        settings = settings._replace(lpips_weights=str(args.lpips_weights))
-    model = load_model(args.folder, settings)
-    warn_of_model(model, args.folder)
-    warn_if_not_kept(settings.backend)
-    scene = load_photographs(settings)
-    if not scene.test_views:
-        raise InputError(f"{settings.scene} was split without test views (--test-every 0): nothing to measure")
-    evaluation = score(args.folder, scene, model, settings, load_lpips(settings, scene))
-
-    path = args.folder / run_folder.METRICS
-    metrics = run_folder.read_json_object(path) if path.exists() else {}
-    run_folder.write_json(path, {**metrics, **to_metrics(evaluation), "n_gaussians": len(model.gaussians.means)})
+    evaluation, folder, notes = evaluate_run(
+        args.folder, scene=args.scene, test_every=args.test_every, out=args.out, lpips_weights=args.lpips_weights
+    )
     width = max(len(view.name) for view in evaluation.per_view)
     print(f"{'view':<{width}}  PSNR dB    SSIM{'' if evaluation.lpips is None else '   LPIPS'}")
     for view in evaluation.per_view:
         lpips = "" if view.lpips is None else f"  {view.lpips:.4f}"
         print(f"{view.name:<{width}}  {view.psnr:7.2f}  {view.ssim:.4f}{lpips}")
     print(summary(evaluation))
+    for note in notes:
+        print(f"minisplat-ref: warning: {note}", file=sys.stderr)
+    if folder != args.folder:
+        print(f"measures and renders in {folder}")
     return 0

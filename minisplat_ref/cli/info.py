@@ -104,19 +104,34 @@ def _shape(array: "Floats") -> str:
 
 
 def _run_rows(folder: Path) -> Rows:
-    from minisplat_ref.experiments.run_folder import CHECKPOINT, EVENTS, METRICS, read_json_object
+    from minisplat_ref.experiments.checkpoints import newest
+    from minisplat_ref.experiments.run_folder import CHECKPOINT, EVENTS, METRICS, PREVIOUS, read_json_object
     from minisplat_ref.experiments.settings import load
 
     settings = load(folder)
-    rows = [(name.replace("_", " "), str(value)) for name, value in settings._asdict().items()]
+    rows = [("state", _state_of_run(folder, settings.iterations))]
+    rows += [(name.replace("_", " "), str(value)) for name, value in settings._asdict().items()]
     if (folder / METRICS).exists():
         metrics = read_json_object(folder / METRICS)
         rows += [(name.replace("_", " "), _short(metrics[name])) for name in metrics if name not in NOT_SHOWN]
     if (folder / EVENTS).exists():
         rows += _event_rows(folder, settings)
-    if (folder / CHECKPOINT).exists():
-        rows += _checkpoint_rows(folder / CHECKPOINT)
+    if (folder / CHECKPOINT).exists() or (folder / PREVIOUS).exists():
+        rows += newest(folder, _checkpoint_rows)
     return rows
+
+
+def _state_of_run(folder: Path, iterations: int) -> str:
+    from minisplat_ref.experiments.checkpoints import step_of
+    from minisplat_ref.experiments.run_folder import has_begun, is_finished
+
+    going_on = f"minisplat-ref train --resume {folder}"
+    step = step_of(folder)
+    if step is None:
+        return "complete, without a checkpoint" if has_begun(folder) else f"has not begun: {going_on}"
+    if step < iterations:
+        return f"incomplete, {step:,} of {iterations:,} iterations are saved: {going_on}"
+    return "complete" if is_finished(folder, step) else f"trained, but not measured: {going_on}"
 
 
 def _event_rows(folder: Path, settings: "Settings") -> Rows:

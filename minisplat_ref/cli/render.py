@@ -2,6 +2,7 @@
 
 import argparse
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -30,6 +31,8 @@ examples:
   minisplat-ref render point_cloud.ply --size 640x360 --profile INRIA
 """
 RUN_CAMERAS = ("test", "train", "all")
+LIST = "pictures.json"  # what a rendering has left in its folder, so that the next one can take it away
+ENDS = (".png", "_depth.png", "_depth.npy")
 ORBIT_SIZE = (640, 480)  # pixels, where no run says otherwise
 
 
@@ -57,11 +60,11 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Render every camera to a PNG; pictures of the same names are replaced."""
+    """Render every camera to a PNG; what an earlier rendering has left in the folder goes."""
     import numpy as np
     from tqdm import tqdm
 
-    from minisplat_ref.experiments import run_folder
+    from minisplat_ref import memory
     from minisplat_ref.experiments.first_use import warn_if_not_kept
     from minisplat_ref.experiments.notices import warn_of_model
     from minisplat_ref.experiments.pictures import depth_picture, depth_range
@@ -75,11 +78,12 @@ def run(args: argparse.Namespace) -> int:
     warn_if_not_kept(source.trained.backend)
     views = _choose_views(args, source)
     out: Path = args.out or source.default_out
-    run_folder.create(out)
+    largest = max((view.camera for view in views), key=lambda camera: camera.width * camera.height)
+    memory.check_picture(largest.width, largest.height, args.depth)
+    names = file_names([view.name for view in views])
+    _make_room(out, names)
     wants = frozenset({"depth"} if args.depth else ())
-    for name, view in zip(
-        file_names([view.name for view in views]), tqdm(views, desc="rendering", unit="view"), strict=True
-    ):
+    for name, view in zip(names, tqdm(views, desc="rendering", unit="view"), strict=True):
         output = source.trained.render(view_from(view.camera, time=view.time), wants)
         write_image(out / f"{name}.png", output.image[..., :3])
         if args.depth:
@@ -88,6 +92,33 @@ def run(args: argparse.Namespace) -> int:
             write_image(out / f"{name}_depth.png", depth_picture(depth, *depth_range(depth)))
     print(f"{len(views)} pictures in {out}")
     return 0
+
+
+def _make_room(out: Path, names: Sequence[str]) -> None:
+    """Make the folder, and remove the pictures of an earlier rendering, which it lists; others are not touched.
+
+    Raises
+    ------
+    InputError
+        There are pictures that no rendering has listed and this one would not replace.
+    """
+    from minisplat_ref.experiments import run_folder
+
+    listed = run_folder.read_json_object(out / LIST).get("pictures") if (out / LIST).exists() else []
+    if not isinstance(listed, list):
+        raise InputError(f"{out / LIST} does not list the pictures of a rendering: give another --out")
+    found = {path.name for path in out.glob("*.png")} if out.is_dir() else set()
+    strange = sorted(found - {f"{name}{end}" for name in (*listed, *names) for end in ENDS})
+    if strange:
+        raise InputError(
+            f"{out} holds other pictures than those of a rendering, such as {strange[0]}: give another --out, or remove"
+            " them"
+        )
+    run_folder.create(out)
+    for path in (out / f"{name}{end}" for name in listed for end in ENDS):
+        if path.parent == out:
+            path.unlink(missing_ok=True)
+    run_folder.write_json(out / LIST, {"pictures": list(names)})
 
 
 class _Source(NamedTuple):

@@ -40,18 +40,14 @@ DEFAULTS = {
     "seed": 0,
     "profile": GSPLAT_MAIN.name,
     "backend": "cpu",
+    "drop_bad_steps": False,
 }
-RESUMABLE = ("iterations", "lpips_weights")  # what may be new when a run is continued
+AFRESH = ("iterations", "lpips_weights", "drop_bad_steps")  # what may be new when a run is continued
 
 DESCRIPTION = """\
-Train Gaussians on photographs with cameras. DIR will hold point_cloud.ply,
-metrics.json and renders/ (truth | render | error of each test view). --resume
-goes on after Ctrl-C, or with more --iterations on the schedules as they were.
-"""
-EPILOG = """\
-examples:
-  minisplat-ref train photos/fox --out runs/fox
-  minisplat-ref train --resume runs/fox --iterations 4000
+Train Gaussians on SCENE, the folder of a COLMAP scene or of a transforms.json.
+DIR will hold point_cloud.ply, metrics.json, renders/ (truth | render | error of
+each test view) and checkpoints. Ctrl-C saves what there is; --resume goes on.
 """
 
 
@@ -62,20 +58,16 @@ def add_parser(commands: Commands) -> None:
         help="train Gaussians on photographs with cameras",
         usage="minisplat-ref train [-h] SCENE [options]\n       minisplat-ref train --resume DIR [--iterations N]",
         description=DESCRIPTION,
-        epilog=EPILOG,
         formatter_class=HelpFormatter,
         argument_default=argparse.SUPPRESS,
     )
-    parser.add_argument(
-        "scene",
-        nargs="?",
-        metavar="SCENE",
-        help="folder of a COLMAP scene or of a transforms.json",
-    )
+    parser.add_argument("scene", nargs="?", metavar="SCENE", help=argparse.SUPPRESS)
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="new folder for the results (default runs/SCENE-RECIPE)"
     )
     parser.add_argument("--resume", type=Path, metavar="DIR", help="continue the run in DIR from its last checkpoint")
+    parser.add_argument("--scene", dest="moved", metavar="PATH", help="with --resume: where its photographs are now")
+    parser.add_argument("--rescale", action="store_true", help="with --resume: stretch its schedule to --iterations")
 
     data = parser.add_argument_group("photographs")
     data.add_argument("--downscale", type=integer(1), metavar="D", help="make them D times smaller (default 1)")
@@ -94,7 +86,7 @@ def add_parser(commands: Commands) -> None:
     training.add_argument("--init", type=Path, metavar="PLY", help="points to start from (default: the scene's)")
     training.add_argument("--iterations", type=integer(1), metavar="N", help="one view each (default 3000)")
     training.add_argument(
-        "--budget", type=integer(1), metavar="N", help="Gaussians that simplification keeps (default: a part)"
+        "--budget", type=integer(1), metavar="N", help="most Gaussians that simplification keeps (default: a part)"
     )
     training.add_argument(
         "--simplify",
@@ -126,19 +118,29 @@ def add_parser(commands: Commands) -> None:
         "--lpips-weights", type=Path, metavar="NPZ", help="measure LPIPS in the end; eval --help tells how"
     )
     training.add_argument("--seed", type=integer(0), metavar="S", help="of all random draws (default 0)")
+    training.add_argument(
+        "--check-every", type=integer(1), metavar="K", help="look for NaN in each K-th iteration (default 10)"
+    )
+    training.add_argument("--drop-bad-steps", action="store_true", help="leave out steps with NaN instead of stopping")
     add_renderer_arguments(training, argparse.SUPPRESS)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Train, or continue a training; nothing is written before the input has been read and found good."""
+    from minisplat_ref.training.interruption import terminated_like_interrupted
+
     given = vars(args)
-    return _resume(args.resume, given) if "resume" in given else _start(given)
+    with terminated_like_interrupted():
+        return _resume(args.resume, given) if "resume" in given else _start(given)
 
 
 def _start(given: dict[str, Any]) -> int:
     if "scene" not in given:
         raise InputError("give a SCENE to train on, or --resume DIR to continue a run")
+    surplus = [option for name, option in (("moved", "--scene"), ("rescale", "--rescale")) if name in given]
+    if surplus:
+        raise InputError(f"{surplus[0]} is for a run that is continued: leave it out, or give --resume DIR")
     options = {name: given.get(name, default) for name, default in DEFAULTS.items()}
     options["set"] = dict(options["set"])  # of equal names the last
     for name in ("lpips_weights", "init"):
@@ -151,8 +153,6 @@ def _start(given: dict[str, Any]) -> int:
     from minisplat_ref.experiments.first_use import compile_kernels
     from minisplat_ref.experiments.notices import warn_of_scene
     from minisplat_ref.experiments.settings import Settings, load_lpips, load_photographs, recipe_of
-    from minisplat_ref.experiments.start import load_start
-    from minisplat_ref.training.loop import initial_state
 
     run_folder.check_free(folder)
     settings = Settings(scene=str(scene_path.resolve()), schedule_iterations=options["iterations"], **options)
@@ -161,48 +161,90 @@ def _start(given: dict[str, Any]) -> int:
     if settings.eval_every:
         curve.check_views(scene)
     network = load_lpips(settings, scene)
+    state = _first_state(settings, scene, recipe)
+    room = _check_room(scene, state)
+    compile_kernels(settings.backend)
+    run_folder.create(folder)
+    warn_of_scene(scene, settings.downscale)
+    with run_folder.held(folder):
+        run_folder.check_free(folder)  # another process may have trained there meanwhile
+        try:
+            return _train(folder, scene, settings, recipe, state, network, given, room)
+        except InputError:
+            if state.step == 0:
+                run_folder.remove(folder)
+            raise
+
+
+def _first_state(settings: "Settings", scene: "Scene", recipe: "Recipe") -> "TrainState":
+    """Return the state before the first iteration, from the scene's points or from those of --init."""
+    from minisplat_ref.experiments.start import load_start
+    from minisplat_ref.training.loop import initial_state
+
     start, notices = (scene, []) if settings.init is None else load_start(settings.init, scene)
-    state = initial_state(start, recipe, settings.seed)
     for notice in notices:
         print(f"minisplat-ref: {notice}", file=sys.stderr)
     if settings.init is not None:
         print(f"starts from {len(start.points):,} points of {settings.init}")
-    compile_kernels(settings.backend)
-    run_folder.create(folder)
-    warn_of_scene(scene, settings.downscale)
-    try:
-        return _train(folder, scene, settings, recipe, state, network)
-    except InputError:  # a budget, for one, can only be found too large when there is something to choose from
-        run_folder.remove(folder)
-        raise
+    return initial_state(start, recipe, settings.seed)
 
 
 def _resume(folder: Path, given: dict[str, Any]) -> int:
-    surplus = [name for name in ("scene", "out", *DEFAULTS) if name in given and name not in RESUMABLE]
+    surplus = [name for name in ("scene", "out", *DEFAULTS) if name in given and name not in AFRESH]
     if surplus:
         raise InputError(
             f"--resume takes the run's own settings: leave out {', '.join(option_name(name) for name in surplus)}"
         )
 
-    from minisplat_ref.experiments import run_folder, settings
+    from minisplat_ref.experiments import checkpoints, fingerprint, run_folder, settings
     from minisplat_ref.experiments.first_use import compile_kernels
-    from minisplat_ref.training.loop import load_state
 
     ours = settings.load(folder)
-    ours = ours._replace(iterations=given.get("iterations", ours.iterations))
-    if "lpips_weights" in given:
-        ours = ours._replace(lpips_weights=_absolute(given["lpips_weights"]))
-    recipe = settings.recipe_of(ours)
-    state = load_state(folder / run_folder.CHECKPOINT, recipe)
-    is_done = state.step == ours.iterations and run_folder.is_finished(folder, ours.iterations)
-    if state.step > ours.iterations or is_done:  # one that was killed while it was measured goes on with that
-        raise InputError(
-            f"{folder} has done {state.step} iterations: give --iterations above {state.step} to train further"
-        )
-    scene = settings.load_photographs(ours)
-    network = settings.load_lpips(ours, scene)
-    compile_kernels(ours.backend)
-    return _train(folder, scene, ours, recipe, state, network)
+    with run_folder.held(folder):
+        ours = ours._replace(**{name: given[name] for name in AFRESH if name in given})
+        if "lpips_weights" in given:
+            ours = ours._replace(lpips_weights=_absolute(given["lpips_weights"]))
+        if "moved" in given:
+            ours = ours._replace(scene=str(Path(given["moved"]).resolve()))
+        state = checkpoints.load(folder, ours) if run_folder.has_begun(folder) else None
+        is_done = state is not None and state.step == ours.iterations and run_folder.is_finished(folder, state.step)
+        if state is not None and (is_done or state.step > ours.iterations):
+            raise InputError(
+                f"{folder} has done {state.step} iterations: give --iterations above {state.step} to train further"
+            )
+        if "rescale" in given:
+            ours = ours._replace(schedule_iterations=ours.iterations)
+        recipe = settings.recipe_of(ours)
+        scene = settings.load_photographs(ours)
+        fingerprint.check(folder, scene, ours.scene)
+        network = settings.load_lpips(ours, scene)
+        state = _first_state(ours, scene, recipe) if state is None else state
+        room = _check_room(scene, state)
+        compile_kernels(ours.backend)
+        print(_how_it_goes_on(state, ours, is_rescaled="rescale" in given))
+        return _train(folder, scene, ours, recipe, state, network, given, room)
+
+
+def _check_room(scene: "Scene", state: "TrainState") -> str:
+    """Say what the training takes of memory; refuse one that does not fit."""
+    from minisplat_ref import memory
+
+    camera = max((view.camera for view in scene.train_views), key=lambda camera: camera.width * camera.height)
+    n_bytes = sum(field.nbytes for field in state.gaussians)
+    return memory.check_start(len(state.gaussians.means), n_bytes, camera.width, camera.height)
+
+
+def _how_it_goes_on(state: "TrainState", settings: "Settings", is_rescaled: bool) -> str:
+    """Say by which schedule a run goes on."""
+    if state.step >= settings.iterations:
+        return f"all {state.step} iterations are done: measuring"
+    length = settings.schedule_iterations
+    how = f"going on from iteration {state.step} to {settings.iterations} by the schedule of {length}"
+    if is_rescaled:
+        return f"{how}, to which it has been stretched: what was done before stays"
+    if state.step >= length:
+        return f"{how}, which is over: rates stay at their last; --rescale would stretch it"
+    return how
 
 
 def _train(
@@ -212,22 +254,30 @@ def _train(
     recipe: "Recipe",
     state: "TrainState",
     network: "Network | None",
+    given: dict[str, Any],
+    room: str,
 ) -> int:
+    from minisplat_ref.experiments import checkpoints
     from minisplat_ref.experiments.run import run_training
     from minisplat_ref.experiments.scoring import summary
+    from minisplat_ref.training.guard import Guard
 
     size = scene.train_views[0].camera
     print(
         f"{scene.name}: {len(scene.train_views)} training and {len(scene.test_views)} test views of"
         f" {size.width} x {size.height}, {len(scene.points):,} points"
     )
-    outcome = run_training(folder, scene, settings, recipe, state, network)
-    if not outcome.is_complete:
-        print(
-            f"minisplat-ref: stopped after {state.step} of {settings.iterations} iterations, all saved;"
-            f" to continue: minisplat-ref train --resume {folder}",
-            file=sys.stderr,
-        )
+    if room:
+        print(room)
+    check_every = given.get("check_every", Guard().every)
+    outcome = run_training(folder, scene, settings, recipe, state, network, check_every)
+    if outcome.evaluation is None or not outcome.is_complete:
+        if state.is_whole:
+            measured = "" if outcome.evaluation else " but not measured"
+            how = f"stopped after {state.step} of {settings.iterations} iterations, all saved{measured}"
+        else:
+            how = f"stopped in the middle of iteration {state.step + 1}, saved is {checkpoints.step_of(folder)}"
+        print(f"minisplat-ref: {how}; to continue: minisplat-ref train --resume {folder}", file=sys.stderr)
         return 130
     print(
         f"{summary(outcome.evaluation)}, {len(state.gaussians.means):,} Gaussians, {outcome.seconds:.0f} s of training"

@@ -2,10 +2,13 @@
 
 A run and its folder: what ``train`` does
     :mod:`.settings` (what was asked for, ``config.json``), :mod:`.start` (points to start from), :mod:`.run_folder`
-    (which file is called what), :mod:`.run` (the training, with checkpoints), :mod:`.progress` (bar and ``log.jsonl``),
-    :mod:`.events` (what fired, ``events.jsonl``), :mod:`.curve` (``curve.jsonl``) and :mod:`.surface` (the true one,
-    where it is known), :mod:`.scoring` (``metrics.json`` and ``renders/``), :mod:`.first_use` (compiles the kernels
-    ahead), :mod:`.notices` (warns of what a run can do without, but should be told of).
+    (which file is called what), :mod:`.run` (the training), :mod:`.checkpoints` (the last two, and the newest model),
+    :mod:`.fingerprint` (which scene the run belongs to), :mod:`.progress` (bar and ``log.jsonl``), :mod:`.events` (what
+    fired, ``events.jsonl``), :mod:`.curve` (``curve.jsonl``) and :mod:`.surface` (the true one, where it is known),
+    :mod:`.scoring` (``metrics.json`` and ``renders/``), :mod:`.evaluation` (measuring again), :mod:`.first_use`
+    (compiles the kernels ahead), :mod:`.notices` (warns of what a run can do without, but should be told of).
+    :mod:`.kill_points` and :mod:`.survival` kill a training wherever it could hurt (``python -m
+    data_tools.kill_points``).
 
 More than one run
     :mod:`.comparison` (several recipes side by side: ``compare``), :mod:`.studies` (what a choice in a method does:

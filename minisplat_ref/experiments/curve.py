@@ -3,11 +3,10 @@
 Where the scene folder holds true depths, a record also has ``chamfer``: see :mod:`.surface`.
 """
 
-import json
 from pathlib import Path
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.progress import PSNR_MAX, read_log
+from minisplat_ref.experiments.progress import PSNR_MAX, append_log, read_log, write_log
 from minisplat_ref.metrics import Evaluation
 from minisplat_ref.types import Scene
 
@@ -26,8 +25,7 @@ def check_views(scene: Scene) -> None:
 
 def keep_until(path: Path, step: int) -> None:
     """Make the file, or drop the records after ``step``: they are of a part of the training that was lost."""
-    records = [record for record in read_log(path) if record["step"] <= step]
-    path.write_text("".join(json.dumps(record) + "\n" for record in records), encoding="utf-8")
+    write_log(path, [record for record in read_log(path) if record["step"] <= step])
 
 
 def append(
@@ -60,5 +58,4 @@ def append(
         "n_gaussians": n_gaussians,
         **further,
     }
-    with open(path, "a", encoding="utf-8") as file:
-        file.write(json.dumps(record) + "\n")
+    append_log(path, record)

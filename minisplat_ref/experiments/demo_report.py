@@ -27,6 +27,7 @@ from minisplat_ref.experiments.progress import read_log
 from minisplat_ref.experiments.run import Outcome
 from minisplat_ref.experiments.scoring import load_trained
 from minisplat_ref.experiments.settings import Settings
+from minisplat_ref.metrics import Evaluation
 from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.types import Floats, Scene
 
@@ -63,11 +64,11 @@ class ViewPictures(NamedTuple):
     """[H, W] rendered camera z, world units; 0 where nothing was hit."""
 
 
-def view_pictures(folder: Path, synthetic: SyntheticScene, scene: Scene, outcome: Outcome) -> list[ViewPictures]:
+def view_pictures(folder: Path, synthetic: SyntheticScene, scene: Scene, evaluation: Evaluation) -> list[ViewPictures]:
     """Render the first test views with depth."""
     true_depths = {view.name: synthetic.test_depths[i] for i, view in enumerate(synthetic.scene.test_views)}
     trained, pictures = load_trained(folder), []
-    for view, metrics in zip(scene.test_views[:N_SHOWN], outcome.evaluation.per_view, strict=False):
+    for view, metrics in zip(scene.test_views[:N_SHOWN], evaluation.per_view, strict=False):
         output = trained.render(view, frozenset({"depth"}))
         image = to_picture(output.image[..., :3])
         pictures.append(
@@ -96,6 +97,7 @@ def report_html(
     log = read_log(folder / run_folder.LOG)
     metrics = run_folder.read_json_object(folder / run_folder.METRICS)
     evaluation, n_gaussians = outcome.evaluation, metrics["n_gaussians"]
+    assert evaluation is not None, "there is a report of what was measured only"
     n_train, n_test, n_points = len(scene.train_views), len(scene.test_views), len(scene.points)
     size = f"{scene.train_views[0].camera.width} x {scene.train_views[0].camera.height}"
     introduction = (

@@ -4,14 +4,13 @@ A mechanism is an action that the recipe has at some iterations, not at every on
 short or small runs some never act. Nothing can be said of a mechanism from a run in which it was off, so it is named.
 """
 
-import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.progress import read_log
+from minisplat_ref.experiments.progress import append_log, read_log
 from minisplat_ref.training.loop import HALF_SIZE
 from minisplat_ref.training.schedule import During, Recipe, action_name
 from minisplat_ref.training.state import FiredEvent
@@ -48,10 +47,8 @@ class Mechanism(NamedTuple):
 
 def append(path: Path, step: int, fired: Iterable[FiredEvent]) -> None:
     """Add a record for each event of an iteration."""
-    lines = [json.dumps({"step": step, **event._asdict()}) + "\n" for event in fired]
-    if lines:
-        with open(path, "a", encoding="utf-8") as file:
-            file.write("".join(lines))
+    for event in fired:
+        append_log(path, {"step": step, **event._asdict()})
 
 
 def published_times(recipe: Recipe) -> dict[str, int]:

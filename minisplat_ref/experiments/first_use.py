@@ -3,6 +3,7 @@
 import sys
 import warnings
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
 
 import numba
 
@@ -38,8 +39,10 @@ def compile_kernels(backend: str) -> None:
         return
     print("minisplat-ref: compiling for this processor, once", end="", file=sys.stderr, flush=True)
     try:
-        for _ in warm_up(FIRST_ITERATION):
-            print(".", end="", file=sys.stderr, flush=True)
+        with closing(warm_up(FIRST_ITERATION)) as stages:  # closed at once when Ctrl-C comes, which ends the processes
+            for _ in stages:
+                print(".", end="", file=sys.stderr, flush=True)
     except BrokenProcessPool:  # no memory for several processes: the training compiles one kernel after the other
         pass
-    print(file=sys.stderr)
+    finally:
+        print(file=sys.stderr)

@@ -4,7 +4,7 @@ import json
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any, Self
@@ -13,6 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.io.atomic import replacing, unwritable
 from minisplat_ref.metrics import psnr
 from minisplat_ref.training.loop import StepReport
 
@@ -36,9 +37,7 @@ class Progress(AbstractContextManager["Progress"]):
 
     def __enter__(self) -> Self:
         """Start the clock; records after ``first_step``, of a part that was lost, leave the log."""
-        self._log = open(self._log_path, "w", encoding="utf-8", buffering=1)  # a line at a time, to be followed
-        for record in self._old_records:
-            self._write(record)
+        write_log(self._log_path, self._old_records)
         self._bar = tqdm(
             total=self._last_step,
             initial=self._first_step,
@@ -51,9 +50,8 @@ class Progress(AbstractContextManager["Progress"]):
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close bar and log."""
+        """Close the bar."""
         self._bar.close()
-        self._log.close()
 
     @property
     def seconds(self) -> float:
@@ -78,6 +76,8 @@ class Progress(AbstractContextManager["Progress"]):
         if self._bar.n == self._first_step:
             self._bar.set_description_str("training", refresh=False)
         self._bar.update()
+        for note in report.notes:
+            self._bar.write(f"minisplat-ref: {note}", file=sys.stderr)
         self._losses.append(report.loss)
         if report.step % LOG_EVERY and report.step != self._last_step:
             return
@@ -88,7 +88,8 @@ class Progress(AbstractContextManager["Progress"]):
         gaussians = report.state.gaussians
         n_gaussians = len(gaussians.means)
         seconds = self.seconds
-        self._write(
+        append_log(
+            self._log_path,
             {
                 "step": report.step,
                 "loss": loss,
@@ -97,17 +98,41 @@ class Progress(AbstractContextManager["Progress"]):
                 "model_mb": sum(field.nbytes for field in gaussians) / 1e6,
                 "seconds": seconds,
                 "its/s": report.step / seconds,
-            }
+            },
         )
         self._bar.set_postfix_str(f"loss {loss:.4f}, {mean_psnr:.2f} dB, {n_gaussians:,} Gaussians", refresh=False)
         self._losses.clear()
 
-    def _write(self, record: dict[str, Any]) -> None:
-        self._log.write(json.dumps(record) + "\n")
+
+def write_log(path: Path, records: Iterable[dict[str, Any]]) -> None:
+    """Write a log anew; a reader sees the old one or this."""
+    with replacing(path) as temporary:
+        temporary.write_text("".join(map(_line, records)), encoding="utf-8")
+
+
+def append_log(path: Path, record: dict[str, Any]) -> None:
+    """Add a record, which can be read at once.
+
+    Raises
+    ------
+    InputError
+        The file cannot be written.
+    """
+    try:
+        with open(path, "a", encoding="utf-8") as file:
+            file.write(_line(record))
+    except OSError as error:
+        raise unwritable(path, error) from error
+
+
+def _line(record: dict[str, Any]) -> str:
+    return json.dumps(record) + "\n"
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:
     """Read the records of a ``log.jsonl``; none where there is no file.
+
+    A last line without an end was being written when the disk was full or the process was killed, and does not count.
 
     Raises
     ------
@@ -117,7 +142,8 @@ def read_log(path: Path) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     records = []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+    text = path.read_text(encoding="utf-8", errors="replace")
+    for number, line in enumerate(text[: text.rfind("\n") + 1].splitlines(), start=1):
         try:
             record = json.loads(line)
             records.append({**record, "step": int(record["step"]), "seconds": float(record["seconds"])})

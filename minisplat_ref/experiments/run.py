@@ -1,34 +1,41 @@
-"""Runs a training into its folder: progress, checkpoints, and everything that the folder holds in the end."""
+"""Runs a training into its folder: progress, checkpoints, and everything that the folder holds in the end.
 
+Nothing that has taken time is ever deleted. The first checkpoint stands before the first iteration; Ctrl-C, SIGTERM, a
+full disk, a number that is not finite or an error of the program end the training with the last whole state saved, or
+with the checkpoint of at most a minute ago where the state is half changed. ``metrics.json`` comes last: a folder whose
+measures are not of its checkpoint's iteration has not ended.
+"""
+
+import contextlib
 import sys
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from minisplat_ref.backends import get_backend
 from minisplat_ref.constants import PROFILES
-from minisplat_ref.experiments import curve, events, run_folder
+from minisplat_ref.errors import InputError
+from minisplat_ref.experiments import checkpoints, curve, events, fingerprint, run_folder
 from minisplat_ref.experiments.progress import Progress
 from minisplat_ref.experiments.scoring import measure, score, to_metrics
 from minisplat_ref.experiments.settings import Settings, save_model, to_config
 from minisplat_ref.experiments.surface import Surface, surface_distance, true_surface
-from minisplat_ref.io import viewpoints
 from minisplat_ref.lpips import Network
 from minisplat_ref.metrics import Evaluation
-from minisplat_ref.training.loop import StepReport, save_state, train
+from minisplat_ref.training.guard import Guard
+from minisplat_ref.training.interruption import Interruptions
+from minisplat_ref.training.loop import StepReport, train
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Scene
-
-CHECKPOINT_SECONDS = 60.0  # a crash loses at most this much work
 
 
 class Outcome(NamedTuple):
     """How a training ended."""
 
-    evaluation: Evaluation
-    """Of the test views."""
+    evaluation: Evaluation | None
+    """Of the test views; None when Ctrl-C came before they were measured."""
     seconds: float
     """Time in the training loop, compilation and the earlier parts of a continued run included."""
     is_complete: bool
@@ -42,13 +49,14 @@ def run_training(
     recipe: Recipe,
     state: TrainState,
     network: Network | None = None,
+    check_every: int = Guard().every,
 ) -> Outcome:
     """Train, save and measure.
 
     Parameters
     ----------
     folder : Path
-        The run; exists.
+        The run; exists, and no other process writes there.
     scene : Scene
         The loaded scene.
     settings : Settings
@@ -59,32 +67,75 @@ def run_training(
         Where to start; changed in place.
     network : Network, optional
         Of the settings, to measure LPIPS with: read before the training, so that nothing can be wrong with it after.
+    check_every : int
+        Iterations after which parameters and gradients are looked at for numbers that are not finite.
 
     Returns
     -------
     Outcome
+
+    Raises
+    ------
+    InputError
+        A file cannot be written, memory has no room, or a number is not finite: says what has been saved.
     """
-    run_folder.write_json(folder / run_folder.CONFIG, to_config(settings, recipe, scene))
-    run_folder.write_json(folder / run_folder.CAMERAS, viewpoints.to_json(viewpoints.scene_viewpoints(scene)))
+    with _telling_what_is_saved(folder, recipe, state):
+        run_folder.write_json(folder / run_folder.CONFIG, to_config(settings, recipe, scene))
+        run_folder.write_json(folder / run_folder.CAMERAS, fingerprint.of_scene(scene))
+        if state.step == 0:
+            checkpoints.save(folder, state, recipe)
+        surface = true_surface(Path(settings.scene), scene) if settings.eval_every else None
+        seconds = _train(folder, scene, settings, recipe, state, surface, check_every)
+        is_saved = _save(folder, settings, recipe, state)
+        evaluation = _measure(folder, scene, settings, state, seconds, surface, network) if is_saved else None
+        return Outcome(evaluation, seconds, state.step >= settings.iterations)
+
+
+@contextmanager
+def _telling_what_is_saved(folder: Path, recipe: Recipe, state: TrainState) -> Iterator[None]:
+    """Save the state if an error leaves it whole, and let the error say from where the run can go on."""
+    try:
+        yield
+    except Exception as error:
+        if state.is_whole and checkpoints.step_of(folder) != state.step:
+            with contextlib.suppress(InputError):  # a full disk, perhaps, which is what the error says already
+                checkpoints.save(folder, state, recipe)
+        step = checkpoints.step_of(folder)
+        saved = f"; iteration {step} is saved; to go on: minisplat-ref train --resume {folder}" if step else ""
+        if isinstance(error, MemoryError):
+            raise InputError(f"memory is full: train on smaller photographs (--downscale){saved}") from error
+        if isinstance(error, InputError):
+            raise InputError(f"{error}{saved}") from error
+        error.add_note(f"minisplat-ref: stopped{saved}")
+        raise
+
+
+def _train(
+    folder: Path,
+    scene: Scene,
+    settings: Settings,
+    recipe: Recipe,
+    state: TrainState,
+    surface: Surface | None,
+    check_every: int,
+) -> float:
+    """Train to the end or to Ctrl-C; return the seconds."""
     progress = Progress(folder / run_folder.LOG, state.step, settings.iterations)
     callbacks: list[Callable[[StepReport], None]] = [progress]
     if state.step == 0 or (folder / run_folder.EVENTS).exists():  # else half a record would hide what fired before
         curve.keep_until(folder / run_folder.EVENTS, state.step)
         callbacks.append(_events(folder / run_folder.EVENTS))
-    surface = None
     if settings.eval_every:
-        surface = true_surface(Path(settings.scene), scene)
         curve.keep_until(folder / run_folder.CURVE, state.step)
         callbacks.append(_curve(folder / run_folder.CURVE, scene, settings, progress, surface))
-    callbacks.append(_checkpoints(folder, recipe))  # after the records: what it continues from is in them
+    callbacks.append(checkpoints.saving(folder, recipe))  # after the records: what it continues from is in them
 
     def on_step(report: StepReport) -> None:
         for callback in callbacks:
             callback(report)
 
-    is_complete = True
     with progress:
-        try:
+        with contextlib.suppress(KeyboardInterrupt):
             train(
                 scene,
                 recipe._replace(iterations=settings.iterations),
@@ -93,14 +144,40 @@ def run_training(
                 on_step=on_step,
                 backend=get_backend(settings.backend),
                 conventions=PROFILES[settings.profile],
+                guard=Guard(check_every, settings.drop_bad_steps, folder, settings._asdict()),
             )
-        except KeyboardInterrupt:
-            is_complete = False
-        seconds = progress.seconds
-    save_state(folder / run_folder.CHECKPOINT, state, recipe)
-    save_model(folder, settings, state.model)
+        return progress.seconds
+
+
+def _save(folder: Path, settings: Settings, recipe: Recipe, state: TrainState) -> bool:
+    """Save the state and the model; return whether there is something to measure, and time."""
+    if not state.is_whole or state.step == 0:  # Ctrl-C twice, or before anything was learned
+        return False
+    try:
+        with Interruptions() as interruptions:
+            interruptions.hold()
+            checkpoints.save(folder, state, recipe)
+            save_model(folder, settings, state.model)
+    except KeyboardInterrupt:
+        return False
+    return True
+
+
+def _measure(
+    folder: Path,
+    scene: Scene,
+    settings: Settings,
+    state: TrainState,
+    seconds: float,
+    surface: Surface | None,
+    network: Network | None,
+) -> Evaluation | None:
+    """Measure the model and write the measures, the last that a run does; None when Ctrl-C comes meanwhile."""
     peak_mb = peak_rss_mb()  # before the network of LPIPS takes more than the training did
-    evaluation = score(folder, scene, state.model, settings, network)
+    try:
+        evaluation = score(folder, scene, state.model, settings, network)
+    except KeyboardInterrupt:
+        return None
     n_gaussians = len(state.gaussians.means)
     if settings.eval_every:
         further = _chamfer(state.gaussians, surface)
@@ -113,20 +190,7 @@ def run_training(
         **to_metrics(evaluation),
     }
     run_folder.write_json(folder / run_folder.METRICS, metrics)
-    return Outcome(evaluation, seconds, is_complete)
-
-
-def _checkpoints(folder: Path, recipe: Recipe) -> Callable[[StepReport], None]:
-    """Return a callback of the loop that saves the state every CHECKPOINT_SECONDS."""
-    last_saved = time.monotonic()
-
-    def on_step(report: StepReport) -> None:
-        nonlocal last_saved
-        if time.monotonic() - last_saved > CHECKPOINT_SECONDS:
-            save_state(folder / run_folder.CHECKPOINT, report.state, recipe)
-            last_saved = time.monotonic()
-
-    return on_step
+    return evaluation
 
 
 def _events(path: Path) -> Callable[[StepReport], None]:

@@ -1,13 +1,14 @@
 """The folder that ``train`` leaves: which file is called what, and how each is read and written."""
 
 import json
-import shutil
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.io.atomic import replacing
+from minisplat_ref.io.atomic import is_part, remove_parts, replacing
 from minisplat_ref.io.json_file import read_json
 
 CONFIG = "config.json"  # everything needed to run it again
@@ -18,24 +19,66 @@ LOG = "log.jsonl"  # one record every few steps
 CURVE = "curve.jsonl"  # the test views measured every --eval-every steps, if that was asked for
 EVENTS = "events.jsonl"  # one record each time that an event of the recipe acted
 CHECKPOINT = "checkpoint.npz"  # what `--resume` continues from
-CAMERAS = "cameras.json"  # cameras of all views, so that they can be rendered without the photographs
+PREVIOUS = "checkpoint-previous.npz"  # the one before, should that be damaged
+CAMERAS = "cameras.json"  # cameras of all views and hashes of their photographs: to render without them, to know them
 RENDERS = "renders"  # truth | render | error of each test view
+
+WORK = {CHECKPOINT, PREVIOUS, POINT_CLOUD, METRICS}  # what has taken time; a run without any has not begun
 
 
 def check_free(folder: Path) -> None:
-    """Refuse a folder for new output that already holds something.
+    """Refuse a folder for new output that already holds something; a run that has not begun is nothing.
 
     Raises
     ------
     InputError
         ``folder`` is a file or a folder with anything in it.
     """
-    if (folder / CONFIG).exists():
+    if not folder.exists():
+        return
+    names = {path.name for path in folder.iterdir() if not is_part(path)} if folder.is_dir() else {folder.name}
+    if CONFIG in names and names & WORK:
         raise InputError(
             f"{folder} already holds a run: give another --out, or continue it with train --resume {folder}"
         )
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    if names and CONFIG not in names:
         raise InputError(f"{folder} is not an empty folder: give another --out")
+
+
+def has_begun(folder: Path) -> bool:
+    """Return whether a run has anything that took time; if not, it can begin again."""
+    return any((folder / name).exists() for name in WORK)
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Keep other processes from writing into a run, and clear away what killed ones were writing.
+
+    The lock is the system's, on the folder itself, and ends with the process. Windows and some network disks have none.
+
+    Raises
+    ------
+    InputError
+        Another process holds the folder.
+    """
+    try:
+        import fcntl
+    except ImportError:
+        yield
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"another process is writing into {folder}: wait until it ends, or end it") from None
+        except OSError:  # a disk without locks
+            pass
+        else:
+            remove_parts(folder)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def create(folder: Path) -> None:
@@ -52,14 +95,22 @@ def create(folder: Path) -> None:
         raise InputError(f"{folder} cannot be created ({error.strerror}): give another --out") from error
 
 
+def measured_step(folder: Path) -> int | None:
+    """Return the iteration that ``point_cloud.ply`` and ``metrics.json`` are of, None where nothing was measured."""
+    return read_json_object(folder / METRICS).get("iterations") if (folder / METRICS).exists() else None
+
+
 def is_finished(folder: Path, iterations: int) -> bool:
     """Return whether a run has been measured after its last iteration: that is what it does in the end."""
-    return (folder / METRICS).exists() and read_json_object(folder / METRICS).get("iterations") == iterations
+    return measured_step(folder) == iterations
 
 
 def remove(folder: Path) -> None:
-    """Take back a folder that :func:`create` made and a training that cannot go on has begun to fill."""
-    shutil.rmtree(folder)
+    """Take back what a training that could not begin has written, and the folder if nothing else is in it."""
+    for name in (CONFIG, CAMERAS, LOG, CURVE, EVENTS, CHECKPOINT, PREVIOUS):
+        (folder / name).unlink(missing_ok=True)
+    if not any(folder.iterdir()):
+        folder.rmdir()
 
 
 def write_json(path: Path, value: Any) -> None:

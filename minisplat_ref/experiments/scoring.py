@@ -1,16 +1,20 @@
 """Measures a trained scene on its test views, and keeps the pictures: ``metrics.json`` and ``renders/``."""
 
 import math
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from minisplat_ref.backends import get_backend
 from minisplat_ref.constants import PROFILES
+from minisplat_ref.errors import InputWarning, one_line
+from minisplat_ref.experiments.checkpoints import newest_model
 from minisplat_ref.experiments.pictures import error_picture, side_by_side, to_picture
 from minisplat_ref.experiments.run_folder import RENDERS
-from minisplat_ref.experiments.settings import Settings, load, load_background, load_model, recipe_of
+from minisplat_ref.experiments.settings import Settings, load, load_background, recipe_of
 from minisplat_ref.io import write_image
+from minisplat_ref.io.atomic import replacing_folder
 from minisplat_ref.io.names import file_names
 from minisplat_ref.lpips import Network
 from minisplat_ref.metrics import Evaluation, ViewMetrics, evaluate
@@ -37,16 +41,20 @@ class Trained(NamedTuple):
 
 
 def load_trained(folder: Path) -> Trained:
-    """Read the model of a run.
+    """Read the newest model of a run; of one that has not ended, the checkpoint's, with a warning.
 
     Raises
     ------
     InputError
-        The folder holds no run of this version, or a file of it is damaged.
+        The folder holds no run of this version, no Gaussians yet, or a file of it is damaged.
     """
     settings = load(folder)
+    saved = newest_model(folder, settings)
+    if saved.unfinished is not None:
+        message = f"{folder} has not ended: this is its checkpoint of iteration {saved.unfinished}"
+        warnings.warn(one_line(message), InputWarning, stacklevel=2)
     renderer, background = recipe_of(settings).renderer, load_background(folder)
-    return Trained(load_model(folder, settings), renderer, background, settings.profile, settings.backend)
+    return Trained(saved.model, renderer, background, settings.profile, settings.backend)
 
 
 def measure(
@@ -72,10 +80,12 @@ def measure(
 def score(folder: Path, scene: Scene, model: Model, settings: Settings, network: Network | None = None) -> Evaluation:
     """Evaluate the test views and write ``renders/NAME.png``: truth, render and error side by side.
 
+    What ``renders`` held before is gone when all views have been measured, and not earlier.
+
     Parameters
     ----------
     folder : Path
-        The run.
+        Of the run, or of another evaluation.
     scene : Scene
         Its test views are measured.
     model : Model
@@ -89,17 +99,16 @@ def score(folder: Path, scene: Scene, model: Model, settings: Settings, network:
     -------
     Evaluation
     """
-    renders = folder / RENDERS
-    renders.mkdir(exist_ok=True)
     names = [view.name for view in scene.test_views]
     stems = dict(zip(names, file_names(names), strict=True))
+    with replacing_folder(folder / RENDERS) as renders:
 
-    def save(view: View, image: Floats, _: ViewMetrics) -> None:
-        render = to_picture(image)
-        pictures = [view.image, render, error_picture(view.image, render)]
-        write_image(renders / f"{stems[view.name]}.png", side_by_side(pictures))
+        def save(view: View, image: Floats, _: ViewMetrics) -> None:
+            picture = to_picture(image)
+            panels = [view.image, picture, error_picture(view.image, picture)]
+            write_image(renders / f"{stems[view.name]}.png", side_by_side(panels))
 
-    return measure(scene, model, settings, on_view=save, network=network)
+        return measure(scene, model, settings, on_view=save, network=network)
 
 
 def to_metrics(evaluation: Evaluation) -> dict[str, Any]:

@@ -54,7 +54,7 @@ class Settings(NamedTuple):
     backend: str
     """Name of the backend."""
     budget: int | None = None
-    """Gaussians that a simplification keeps; None for the recipe's own part of the candidates."""
+    """Gaussians that a simplification keeps at most; None for the recipe's own part of the candidates."""
     simplify: str | None = None
     """How simplification chooses, a key of ``CHOICES``; None for the recipe's own way."""
     scene_type: str | None = None
@@ -65,6 +65,8 @@ class Settings(NamedTuple):
     """Settings of the recipe's events, losses and calibrations, as text: ``--set NAME=VALUE``."""
     eval_every: int = 0
     """Iterations after which the test views are measured again; 0: only in the end. Does not change the result."""
+    drop_bad_steps: bool = False
+    """Whether a step whose gradient is not finite is left out; otherwise it ends the training."""
     lpips_weights: str | None = None
     """Absolute path of the weights of LPIPS; None: it is not measured. Does not change the result."""
     init: str | None = None

@@ -172,7 +172,8 @@ def save_plan(plan: Plan) -> None:
 def remove_if_unused(folder: Path) -> None:
     """Take back the folder of a comparison whose first training was refused: there is nothing to continue."""
     if [path.name for path in folder.iterdir()] == [PLAN]:
-        run_folder.remove(folder)
+        (folder / PLAN).unlink()
+        folder.rmdir()
 
 
 def load_plan(folder: Path) -> Plan:

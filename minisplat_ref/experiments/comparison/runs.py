@@ -4,6 +4,7 @@ A comparison that was cut off goes on where it was: finished runs stay, one with
 """
 
 import contextlib
+import shutil
 import signal
 import subprocess
 import sys
@@ -74,7 +75,8 @@ def _status(plan: Plan, run: Run) -> Status:
             )
     if run_folder.is_finished(run.folder, run.iterations):
         return "finished"
-    return "cut off" if (run.folder / run_folder.CHECKPOINT).exists() else "lost"
+    has_checkpoint = any((run.folder / name).exists() for name in (run_folder.CHECKPOINT, run_folder.PREVIOUS))
+    return "cut off" if has_checkpoint else "lost"
 
 
 def train_all(plan: Plan, statuses: Sequence[Status]) -> int:
@@ -104,7 +106,7 @@ def train_all(plan: Plan, statuses: Sequence[Status]) -> int:
         if status == "finished":
             continue
         if status == "lost":
-            run_folder.remove(run.folder)
+            shutil.rmtree(run.folder)
         code = _train(_resume_command(run) if status == "cut off" else _command(plan, run))
         if code != 0:
             return code
