@@ -361,11 +361,10 @@ for name in ("outdoor", "plain-wall"):
 # %% [markdown]
 # Not by themselves. Where the vote takes points away, the sky and the wall still have to be painted, and less is left
 # there to paint them on: wrong points are of use. With the backdrop there is something again, this time behind the
-# scene and not in the middle of it. In runs as short and small as these, one seed says little about a decibel or two.
-# At 160 x 120, over three seeds, the outdoor scene ends at 19.1 dB from the paper's points, at 18.7 dB with the vote
-# and at 24.2 dB with vote and backdrop (the study below), which is what the recipes take.
+# scene and not in the middle of it. In runs as short and small as these, one seed says little about a decibel or two;
+# the study below trains the whole recipe, over three seeds. Vote and backdrop are what the recipes take.
 #
-# **To try:** `minisplat-ref study depth outdoor --out DIR` does the same at 160 x 120, over three seeds; set
+# **To try:** `minisplat-ref study depth outdoor --out DIR` compares the choices at 160 x 120; set
 # `depth_tolerance` to 0.01 and to 0.3; train for longer before reinitialisation, and see whether the sky settles.
 #
 # ## What was shown

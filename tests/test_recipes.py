@@ -10,7 +10,7 @@ import pytest
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods import RECIPES, gaussian_splatting, get_recipe
 from minisplat_ref.strategy.importance import outdoor
-from minisplat_ref.training.schedule import At, During, Every, configured, describe, scaled
+from minisplat_ref.training.schedule import At, During, Every, action_name, configured, describe, scaled
 
 
 def nothing(state, iteration, **settings):
@@ -21,13 +21,9 @@ def firing(event, n=30_000):
     return [step for step in range(1, n + 1) if event.is_due(step)]
 
 
-def name_of(event):
-    return getattr(event.action, "func", event.action).__name__
-
-
 def firings(recipe):
     """Iterations of each event by the name of its action."""
-    return {name_of(event): firing(event, recipe.iterations) for event in recipe.events}
+    return {action_name(event): firing(event, recipe.iterations) for event in recipe.events}
 
 
 def test_every_is_open_at_both_ends():

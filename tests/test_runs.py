@@ -22,7 +22,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.experiments import checkpoints, fingerprint, run, run_folder
 from minisplat_ref.experiments.progress import Progress, read_log
 from minisplat_ref.io import load_scene, read_image, write_image
-from minisplat_ref.io.checkpoint import load_checkpoint
+from minisplat_ref.io.checkpoint import load_checkpoint, save_checkpoint
 from minisplat_ref.io.viewpoints import scene_viewpoints, to_json
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.training import interruption
@@ -504,7 +504,7 @@ def test_a_line_of_the_log_that_was_cut_off_does_not_count(tmp_path):
         read_log(path)
 
 
-@pytest.mark.parametrize("damage", ["torn", "gone", "another's"])
+@pytest.mark.parametrize("damage", ["torn", "gone", "another's", "whole but wrong"])
 def test_a_damaged_checkpoint_is_passed_over_and_a_line_says_so(original, finished, tmp_path, damage, capfd):
     folder = stopped_run(original, tmp_path / "run")
     path = folder / "checkpoint.npz"
@@ -513,6 +513,9 @@ def test_a_damaged_checkpoint_is_passed_over_and_a_line_says_so(original, finish
         path.write_bytes(content[: len(content) // 2])
     elif damage == "gone":
         path.unlink()
+    elif damage == "whole but wrong":
+        arrays, metadata = load_checkpoint(path)
+        save_checkpoint(path, {**arrays, "first.means": arrays["first.means"][1:]}, metadata)
     else:
         with np.load(path) as mine, np.load(finished / "checkpoint.npz") as other:
             np.savez(path, **{**mine, "gaussians.means": other["gaussians.means"]})

@@ -14,6 +14,7 @@ from minisplat_ref.methods import gaussian_splatting, get_recipe, mini_splatting
 from minisplat_ref.strategy.blur_split import principal_axis_children
 from minisplat_ref.strategy.clone_split import random_children
 from minisplat_ref.training.loop import initial_state
+from minisplat_ref.training.schedule import does
 
 TINY = ("--views", "6", "--width", "32", "--height", "24", "--supersampling", "1", "--points", "150")
 
@@ -68,14 +69,9 @@ def test_split_variants_differ_in_blur_split_and_children_alone(name):
     recipe = get_recipe(name)
     for form, (has_blur_split, children) in split_forms.FORMS.items():
         variant = split_forms.variant(recipe, form)
-        actions = [getattr(event.action, "func", event.action) for event in variant.events]
-        assert (mini_splatting.collect_blur in actions) == has_blur_split
+        assert any(does(event, mini_splatting.collect_blur) for event in variant.events) == has_blur_split
         assert len(recipe.events) - len(variant.events) == (not has_blur_split)
-        (split,) = [
-            event
-            for event in variant.events
-            if getattr(event.action, "func", None) is gaussian_splatting.clone_and_split
-        ]
+        (split,) = [event for event in variant.events if does(event, gaussian_splatting.clone_and_split)]
         assert split.action.keywords["draw_children"] is children
     assert {children for _, children in split_forms.FORMS.values()} == {random_children, principal_axis_children}
 

@@ -11,11 +11,11 @@ from minisplat_ref.experiments.studies import FIGURE, RESULT, ablation, front
 from minisplat_ref.experiments.studies.ablation import FULL, RUNS, variants_of
 from minisplat_ref.io.images import read_image
 from minisplat_ref.methods import RECIPES
-from minisplat_ref.training.schedule import configured, settings_of
+from minisplat_ref.training.schedule import action_name, configured, settings_of
 
 
 def names_of(recipe):
-    return [getattr(event.action, "func", event.action).__name__ for event in recipe.events]
+    return [action_name(event) for event in recipe.events]
 
 
 def test_each_variant_lacks_one_thing():
@@ -60,7 +60,7 @@ def small(monkeypatch):
 
 
 def test_study_and_its_continuation(tmp_path, capsys, small, monkeypatch):
-    kept = {name: ablation.MECHANISMS[name] for name in ("blur split", "sampling")}
+    kept = {name: ablation.MECHANISMS[name] for name in ("restart", "sampling")}
     monkeypatch.setattr(ablation, "MECHANISMS", kept)
     out = tmp_path / "out"
     command = ["study", "ablation", "room", "--out", str(out), "--iterations", "60", "--recipe", "mini-splatting"]
@@ -68,7 +68,7 @@ def test_study_and_its_continuation(tmp_path, capsys, small, monkeypatch):
     assert sorted(path.name for path in out.iterdir()) == sorted([FIGURE, RESULT, RUNS])
     assert read_image(out / FIGURE).std() > 1
     result = json.loads((out / RESULT).read_text())
-    assert len(result["runs"]) == 6 and result["acts"]["sampling"] == 1 and result["acts"]["blur split"] == 29
+    assert len(result["runs"]) == 6 and result["acts"]["sampling"] == 1 and result["acts"]["restart"] == 1
     assert result["summary"][FULL]["difference"] == [0, 0]
     by_run = {(run["without"], run["seed"]): run for run in result["runs"]}
     differences = [by_run["sampling", seed]["psnr"] - by_run[FULL, seed]["psnr"] for seed in (0, 1)]
@@ -87,6 +87,19 @@ def test_study_and_its_continuation(tmp_path, capsys, small, monkeypatch):
 
     assert main([*command, "--seeds", "0", "--downscale", "1", "--iterations", "61"]) == 2
     assert "holds trainings of" in capsys.readouterr().err
+
+
+def test_what_has_not_fired_has_no_row(tmp_path, capsys, small, monkeypatch):
+    """Photographs of 48 x 36 pixels are never halved, though the recipe has a date until which they should be."""
+    name = "half-size warm-up"
+    monkeypatch.setattr(ablation, "MECHANISMS", {name: ablation.MECHANISMS[name]})
+    out = tmp_path / "out"
+    command = ["study", "ablation", "room", "--out", str(out), "--recipe", "mini-splatting2"]
+    assert main([*command, "--iterations", "12", "--seeds", "0"]) == 0
+    printed = capsys.readouterr().out
+    assert f"never acted, so that nothing can be said of it: {name}" in printed and f"- {name}" not in printed
+    result = json.loads((out / RESULT).read_text())
+    assert set(result["summary"]) == {FULL} and result["acts"] == {name: 0}
 
 
 def test_bad_input_is_one_line(tmp_path, capsys, small):

@@ -1,7 +1,8 @@
 """Mini-Splatting (Fang and Wang 2024): densify by blur split and depth, then keep few Gaussians, chosen by importance.
 
-As released, without opacity resets. The released code counts in Gaussians for photographs of a megapixel; here a scene
-is measured in the pixels of its training views, of which 3.5 million points are about one in seventy.
+As released, without opacity resets. Where the released code has numbers for photographs of a megapixel, ours depend on
+the scene: as many points are drawn as there were Gaussians, and what is blurred covers at least a few pixels. Each
+difference stands in ``docs/FIDELITY.md``.
 """
 
 from collections.abc import Callable

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from minisplat_ref.constants import SH_DEGREE_MAX
-from minisplat_ref.errors import InputError
+from minisplat_ref.io.checkpoint import DamagedCheckpoint
 from minisplat_ref.types import Floats, Gaussians
 
 WAY_OUT = "give another checkpoint or train anew"
@@ -59,19 +59,19 @@ def read_counters(path: str | Path, metadata: Mapping[str, Any]) -> Counters:
 
     Raises
     ------
-    InputError
+    DamagedCheckpoint
         One is missing or something else.
     """
 
     def check(name: str, value: Any) -> int:
         if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 2**63:
-            raise InputError(f"{path}: {name} is no whole number of at least 0; {WAY_OUT}")
+            raise DamagedCheckpoint(f"{path}: {name} is no whole number of at least 0; {WAY_OUT}")
         return value
 
     step, adam_step, shared_step = (check(f, metadata.get(f)) for f in ("step", "adam_step", "shared_adam_step"))
     order = metadata.get("view_order")
     if not isinstance(order, list):
-        raise InputError(f"{path}: view_order is no list of views; {WAY_OUT}")
+        raise DamagedCheckpoint(f"{path}: view_order is no list of views; {WAY_OUT}")
     return Counters(step, adam_step, shared_step, [check("a number in view_order", view) for view in order])
 
 
@@ -86,7 +86,7 @@ def read_generator(path: str | Path, state: Any) -> np.random.Generator:
 
     Raises
     ------
-    InputError
+    DamagedCheckpoint
         It is not such a state.
     """
     rng = np.random.default_rng()
@@ -95,7 +95,7 @@ def read_generator(path: str | Path, state: Any) -> np.random.Generator:
     numbers = {**state, **inner} if isinstance(inner, dict) else {}
     is_valid = all(type(numbers.get(name)) is int and 0 <= numbers[name] < limit for name, limit in limits.items())
     if not is_valid or state.get("bit_generator") != "PCG64" or numbers["inc"] % 2 == 0:
-        raise InputError(f"{path}: rng is no state of the random generator PCG64; {WAY_OUT}")
+        raise DamagedCheckpoint(f"{path}: rng is no state of the random generator PCG64; {WAY_OUT}")
     rng.bit_generator.state = state
     return rng
 
@@ -113,7 +113,7 @@ def read_bundles(path: str | Path, arrays: Mapping[str, NDArray[Any]], populatio
 
     Raises
     ------
-    InputError
+    DamagedCheckpoint
         A field is missing or surplus, has another number of rows than ``means``, is no floating-point array, or holds
         NaN or infinity; or moments do not fit what they are moments of.
     """
@@ -121,7 +121,7 @@ def read_bundles(path: str | Path, arrays: Mapping[str, NDArray[Any]], populatio
     for name, array in arrays.items():
         group, _, field = name.partition(".")
         if group not in groups or not field:
-            raise InputError(f"{path}: an array {name!r} belongs to no checkpoint of this version; {WAY_OUT}")
+            raise DamagedCheckpoint(f"{path}: an array {name!r} belongs to no checkpoint of this version; {WAY_OUT}")
         groups[group][field] = np.ascontiguousarray(array).reshape(array.shape)  # Adam writes through views
     _check_population(path, groups["gaussians"], population)
     for name, of in MOMENTS.items():
@@ -129,7 +129,7 @@ def read_bundles(path: str | Path, arrays: Mapping[str, NDArray[Any]], populatio
     n = len(groups["gaussians"]["means"])
     for name, array in groups["stats"].items():
         if array.shape[:1] != (n,):
-            raise InputError(f"{path}: stats.{name} has shape {list(array.shape)} for {n} Gaussians; {WAY_OUT}")
+            raise DamagedCheckpoint(f"{path}: stats.{name} has shape {list(array.shape)} for {n} Gaussians; {WAY_OUT}")
     for name, array in groups["shared"].items():
         _check_numbers(path, f"shared.{name}", array)
     gaussians, first, second = (population(**groups[name]) for name in ("gaussians", "first", "second"))
@@ -139,29 +139,31 @@ def read_bundles(path: str | Path, arrays: Mapping[str, NDArray[Any]], populatio
 def check_fields(path: str | Path, fields: Mapping[str, NDArray[Any]]) -> None:
     """Refuse fields of a population, whatever it is, that have no rows in common or are not finite numbers."""
     if "means" not in fields or fields["means"].ndim != 2:
-        raise InputError(f"{path}: gaussians.means is missing or has no rows of coordinates; {WAY_OUT}")
+        raise DamagedCheckpoint(f"{path}: gaussians.means is missing or has no rows of coordinates; {WAY_OUT}")
     n = len(fields["means"])
     for name, array in fields.items():
         if array.shape[:1] != (n,):
             raise _misfit(path, name, array)
         _check_numbers(path, f"gaussians.{name}", array)
         if not np.isfinite(array).all():
-            raise InputError(f"{path}: gaussians.{name} holds infinity; {WAY_OUT}")
+            raise DamagedCheckpoint(f"{path}: gaussians.{name} holds infinity; {WAY_OUT}")
 
 
 def _check_population(path: str | Path, fields: Mapping[str, NDArray[Any]], population: Any) -> None:
     """Refuse a population that lacks a field, or whose fields do not belong together."""
     if set(fields) != set(population._fields):
         differing = ", ".join(sorted(set(fields) ^ set(population._fields)))
-        raise InputError(f"{path}: the fields of the Gaussians are not those of the recipe ({differing}); {WAY_OUT}")
+        raise DamagedCheckpoint(
+            f"{path}: the fields of the Gaussians are not those of the recipe ({differing}); {WAY_OUT}"
+        )
     check_fields(path, fields)
     for name, shapes in GAUSSIAN_SHAPES.items():
         if population is Gaussians and fields[name].shape[1:] not in shapes:  # another's are its own affair
             raise _misfit(path, name, fields[name])
 
 
-def _misfit(path: str | Path, name: str, array: NDArray[Any]) -> InputError:
-    return InputError(f"{path}: gaussians.{name} has shape {list(array.shape)}, which does not fit; {WAY_OUT}")
+def _misfit(path: str | Path, name: str, array: NDArray[Any]) -> DamagedCheckpoint:
+    return DamagedCheckpoint(f"{path}: gaussians.{name} has shape {list(array.shape)}, which does not fit; {WAY_OUT}")
 
 
 def _check_moments(
@@ -171,13 +173,13 @@ def _check_moments(
     for name in sorted(moments.keys() | fields.keys()):
         moment, field = moments.get(name), fields.get(name)
         if moment is None or field is None or moment.shape != field.shape or moment.dtype != field.dtype:
-            raise InputError(f"{path}: {group}.{name} does not fit the parameters that it belongs to; {WAY_OUT}")
+            raise DamagedCheckpoint(f"{path}: {group}.{name} does not fit the parameters that it belongs to; {WAY_OUT}")
         _check_numbers(path, f"{group}.{name}", moment)
 
 
 def _check_numbers(path: str | Path, name: str, array: NDArray[Any]) -> None:
     """Refuse what is not float32 or float64, and NaN."""
     if array.dtype not in (np.float32, np.float64):
-        raise InputError(f"{path}: {name} has dtype {array.dtype}, not float32 or float64; {WAY_OUT}")
+        raise DamagedCheckpoint(f"{path}: {name} has dtype {array.dtype}, not float32 or float64; {WAY_OUT}")
     if np.isnan(array).any():
-        raise InputError(f"{path}: {name} holds NaN; {WAY_OUT}")
+        raise DamagedCheckpoint(f"{path}: {name} holds NaN; {WAY_OUT}")

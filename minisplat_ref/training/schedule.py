@@ -162,6 +162,23 @@ class Recipe(NamedTuple):
         return functools.reduce(Rates.joined, (calibration.rates for calibration in self.active_calibrations), rates)
 
 
+def does(event: Event, *actions: Action) -> bool:
+    """Return whether an event does one of the actions, whatever settings are bound to it."""
+    action = event.action
+    return (action.func if isinstance(action, partial) else action) in actions
+
+
+def firing_steps(recipe: Recipe, *actions: Action) -> list[int]:
+    """Return the iterations in which a recipe does one of the actions."""
+    events = [event for event in recipe.events if does(event, *actions)]
+    return [step for step in range(1, recipe.iterations + 1) if any(event.is_due(step) for event in events)]
+
+
+def without(recipe: Recipe, action: Action) -> Recipe:
+    """Return the recipe without the events that do ``action``."""
+    return recipe._replace(events=tuple(event for event in recipe.events if not does(event, action)))
+
+
 def scaled(recipe: Recipe, iterations: int) -> Recipe:
     """Return the recipe for another number of iterations, all milestones moved in proportion.
 

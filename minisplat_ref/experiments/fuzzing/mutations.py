@@ -20,7 +20,18 @@ Choose = Callable[[int], int]
 DEEP = "@deep@"  # stands for lists in lists, which json.dumps cannot write
 N_DEEP = 100_000
 NAMES = (
-    *("", " ", ".", "..", "/", "../../outside.png", "/tmp/outside.png", "a/../../../b.png", "C:\\a.png", "\\\\a\\b"),
+    *(
+        "",
+        " ",
+        ".",
+        "..",
+        "/",
+        "../../outside.png",
+        "/nowhere/out.png",
+        "a/../../../b.png",
+        "C:\\a.png",
+        "\\\\a\\b",
+    ),
     *("x" * 300, "x/" * 3000, "a\0b", "\ud800", "é.png", "con", "images", "a\nb", "%s{0}"),
 )
 VALUES: tuple[Any, ...] = (

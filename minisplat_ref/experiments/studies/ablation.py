@@ -1,8 +1,9 @@
 """What each mechanism of Mini-Splatting is worth: the recipe, and the recipe without one of them, seed by seed.
 
-A mechanism is taken out by a setting or by leaving out its event; everything else, the dates included, stays. Only what
-happens at this length is taken out: a row about a mechanism that never acts would say nothing, so there is none. The
-same can be asked of our own deviations from the published method (``docs/FIDELITY.md``).
+A mechanism is taken out by a setting or by leaving out its event; everything else, the dates included, stays. A row
+about a mechanism that never acts would say nothing. So there is none where it has no date at this length, or has not
+fired in the full training, whose record of events tells: small photographs, for example, are never halved. The same can
+be asked of our own deviations from the published method (``docs/FIDELITY.md``).
 
 Trainings take long. Each leaves its record in ``runs.jsonl`` as soon as it ends, and the same command with the same
 folder goes on with those that are missing.
@@ -12,7 +13,8 @@ import argparse
 import json
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -35,23 +37,23 @@ from minisplat_ref.methods import RECIPES, gaussian_splatting, get_recipe, mini_
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.strategy import simplify as simplification
-from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import Action, Event, Recipe, configured, scaled, settings_of
+from minisplat_ref.training.loop import HALF_SIZE, train
+from minisplat_ref.training.schedule import (
+    Action,
+    Event,
+    Recipe,
+    configured,
+    does,
+    firing_steps,
+    scaled,
+    settings_of,
+    without,
+)
 from minisplat_ref.types import Scene
 
 RUNS = "runs.jsonl"
 FULL = "everything"
 MEASURES = ("psnr", "ssim", "n_gaussians", "seconds")
-
-
-def without_event(action: Action) -> Callable[[Recipe], Recipe]:
-    """Return what leaves out the events that do ``action``, settings aside."""
-
-    def changed(recipe: Recipe) -> Recipe:
-        events = recipe.events
-        return recipe._replace(events=tuple(e for e in events if getattr(e.action, "func", e.action) is not action))
-
-    return changed
 
 
 def with_bias_correction(recipe: Recipe) -> Recipe:
@@ -68,7 +70,7 @@ def as_3dgs_prunes(recipe: Recipe) -> Recipe:
     """Return the recipe with the size limit of 3DGS, which is the same near and far."""
 
     def changed(event: Event) -> Event:
-        if getattr(event.action, "func", None) is not mini_splatting.prune_large_by_distance:
+        if not does(event, mini_splatting.prune_large_by_distance):
             return event
         return event._replace(action=partial(gaussian_splatting.prune_large, size_fraction=0.1))
 
@@ -76,16 +78,16 @@ def as_3dgs_prunes(recipe: Recipe) -> Recipe:
 
 
 MECHANISMS: Mapping[str, Callable[[Recipe], Recipe]] = {
-    "blur split": without_event(mini_splatting.collect_blur),
-    "reinitialisation": without_event(mini_splatting.reinitialise_from_depth),
+    "blur split": partial(without, action=mini_splatting.collect_blur),
+    "reinitialisation": partial(without, action=mini_splatting.reinitialise_from_depth),
     "sky guard": with_settings(depth_tolerance=None),
     "intersection preservation": with_settings(is_intersecting=False),
     "sampling": with_settings(choose=simplification.by_rank),  # the most important ones are kept instead
-    "restart": without_event(mini_splatting.restart_from_means),
+    "restart": partial(without, action=mini_splatting.restart_from_means),
     "culling": with_settings(visibility_mass=1.0),  # whatever a view shows at all is visible in it
     "clone": with_settings(factor=1),
     "half-size warm-up": lambda recipe: recipe._replace(half_size_until=0),
-    "last prune": without_event(mini_splatting.prune_tail),
+    "last prune": partial(without, action=mini_splatting.prune_tail),
 }
 """The published recipe without each mechanism; one that has not got it, unchanged."""
 
@@ -101,7 +103,7 @@ DEVIATIONS: Mapping[str, Callable[[Recipe], Recipe]] = {
 """A recipe with the published rule in place of each of ours."""
 
 ACTIONS: Mapping[str, Action] = {
-    "blur split": mini_splatting.collect_blur,
+    "blur split": gaussian_splatting.clone_and_split,
     "reinitialisation": mini_splatting.reinitialise_from_depth,
     "sky guard": mini_splatting.reinitialise_from_depth,
     "intersection preservation": mini_splatting.simplify,
@@ -111,7 +113,7 @@ ACTIONS: Mapping[str, Action] = {
     "clone": mini_splatting2.aggressive_clone,
     "last prune": mini_splatting.prune_tail,
 }
-"""The action through which a mechanism acts."""
+"""The action through which a mechanism acts; half-size views are no action."""
 
 
 def run(args: argparse.Namespace) -> None:
@@ -125,11 +127,11 @@ def run(args: argparse.Namespace) -> None:
     scene = read_scene(args.scene, args.downscale)
     if not scene.test_views:
         raise InputError(f"scene {scene.name} has no test views to compare by: add photographs")
-    published, without = get_recipe(args.recipe), DEVIATIONS if args.deviations else MECHANISMS
+    published, rules = get_recipe(args.recipe), DEVIATIONS if args.deviations else MECHANISMS
     recipe = scaled(published, args.iterations)
-    variants = variants_of(published, args.iterations, without)
+    variants = variants_of(published, args.iterations, rules)
     if len(variants) == 1:
-        names = [r.name for r in RECIPES.values() if len(variants_of(r, args.iterations, without)) > 1]
+        names = [r.name for r in RECIPES.values() if len(variants_of(r, args.iterations, rules)) > 1]
         raise InputError(f"recipe {args.recipe} has nothing to take out: choose from {', '.join(names)}")
     description = describe_scene(scene)
     settings = {"recipe": recipe.name, "iterations": recipe.iterations, "downscale": args.downscale}
@@ -141,17 +143,20 @@ def run(args: argparse.Namespace) -> None:
         append(args.out, record)
         records.append(record)
     records = [record for record in records if record["seed"] in args.seeds]
-    summary = summarise(records, list(variants))
-    acts = {name: n_actions(recipe, name) for name in variants if name in MECHANISMS}
+    acts = count_actions(records, variants)
+    idle = [name for name, n in acts.items() if n == 0]
+    summary = summarise(records, [name for name in variants if name not in idle])
     result = {**description, **settings, "seeds": list(args.seeds), "acts": acts, "summary": summary, "runs": records}
     write(args.out, result, draw(summary))
     print(title(description))
     print(f"{recipe.name}, {recipe.iterations} iterations, seeds {', '.join(map(str, args.seeds))}\n")
     print(markdown_table(["without", "acts", "PSNR (dB)", "difference (dB)", "Gaussians", "seconds"], to_rows(result)))
+    if idle:
+        print(f"\nnever acted, so that nothing can be said of it: {', '.join(idle)}")
 
 
 def variants_of(
-    published: Recipe, iterations: int, without: Mapping[str, Callable[[Recipe], Recipe]] = MECHANISMS
+    published: Recipe, iterations: int, rules: Mapping[str, Callable[[Recipe], Recipe]] = MECHANISMS
 ) -> dict[str, Recipe]:
     """Return the recipe of so many iterations, and without each thing that it has, if that acts in as many."""
 
@@ -159,17 +164,23 @@ def variants_of(
         return scaled(recipe, iterations)._replace(short_run_exponent=0.0)  # its work is done
 
     full = of_length(published)
-    variants = {name: of_length(take_out(published)) for name, take_out in without.items()}
+    variants = {name: of_length(take_out(published)) for name, take_out in rules.items()}
     differ = {name: variant for name, variant in variants.items() if variant != full}
-    return {FULL: full, **{name: v for name, v in differ.items() if name not in MECHANISMS or n_actions(full, name)}}
+    return {FULL: full, **{name: v for name, v in differ.items() if name not in MECHANISMS or has_date(full, name)}}
 
 
-def n_actions(recipe: Recipe, mechanism: str) -> int:
-    """Return in how many iterations of the recipe a mechanism acts."""
+def has_date(recipe: Recipe, mechanism: str) -> bool:
+    """Return whether a mechanism acts in some iteration of the recipe."""
     if mechanism not in ACTIONS:
-        return recipe.half_size_until
-    events = [e for e in recipe.events if getattr(e.action, "func", e.action) is ACTIONS[mechanism]]
-    return sum(any(event.is_due(step) for event in events) for step in range(1, recipe.iterations + 1))
+        return recipe.half_size_until > 0
+    return bool(firing_steps(recipe, ACTIONS[mechanism]))
+
+
+def count_actions(records: Sequence[Mapping[str, Any]], variants: Iterable[str]) -> dict[str, int]:
+    """Return how often each mechanism has fired in a full training, in the one where it did so least."""
+    fired = [record["fired"] for record in records if record["without"] == FULL]
+    names = {name: ACTIONS[name].__name__ if name in ACTIONS else HALF_SIZE for name in variants if name in MECHANISMS}
+    return {name: min(times.get(action, 0) for times in fired) for name, action in names.items()}
 
 
 def read_records(folder: Path, settings: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -200,12 +211,14 @@ def append(folder: Path, record: Mapping[str, Any]) -> None:
 
 
 def measure(scene: Scene, recipe: Recipe, seed: int) -> dict[str, Any]:
-    """Train once and return the test views' measures; the seconds are those of the training alone."""
+    """Train once; return the test views' measures, the seconds of the training alone, and how often what has fired."""
+    fired: Counter[str] = Counter()
     start = time.perf_counter()
-    state = train(scene, recipe, seed=seed)
+    state = train(scene, recipe, seed=seed, on_step=lambda report: fired.update(e.action for e in report.fired))
     seconds = time.perf_counter() - start
     result = evaluate(state.model, scene.test_views, background=scene.background)
-    return dict(zip(MEASURES, (result.psnr, result.ssim, len(state.gaussians.means), seconds), strict=True))
+    measures = (result.psnr, result.ssim, len(state.gaussians.means), seconds)
+    return {**dict(zip(MEASURES, measures, strict=True)), "fired": dict(fired)}
 
 
 def summarise(

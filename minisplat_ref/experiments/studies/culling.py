@@ -37,7 +37,7 @@ from minisplat_ref.strategy.ops import contiguous
 from minisplat_ref.strategy.visibility import culled_fraction
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import initial_state, train
-from minisplat_ref.training.schedule import At, Recipe
+from minisplat_ref.training.schedule import Action, Recipe, firing_steps
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Bools, Gaussians, Scene
 
@@ -57,8 +57,11 @@ def run(args: argparse.Namespace) -> None:
     recipe = get_recipe(RECIPE, args.iterations)._replace(half_size_until=0)
     state = initial_state(scene, recipe, args.seed)
     if args.ply is None:
-        places = {"before simplification": mini_splatting.simplify, "before culling ends": mini_splatting2.stop_culling}
-        last_steps = {name: step_of(recipe, action) - 1 for name, action in places.items()}
+        places: dict[str, Action] = {
+            "before simplification": mini_splatting.simplify,
+            "before culling ends": mini_splatting2.stop_culling,
+        }
+        last_steps = {name: firing_steps(recipe, action)[0] - 1 for name, action in places.items()}
     else:
         last_steps = {args.ply.name: recipe.iterations}
         resume_from(state, load_ply(args.ply), recipe.iterations)
@@ -76,12 +79,6 @@ def run(args: argparse.Namespace) -> None:
     print(
         markdown_table([*header, "ms without", "ms with", "ratio", "PSNR without (dB)", "with (dB)"], to_rows(result))
     )
-
-
-def step_of(recipe: Recipe, action: object) -> int:
-    """Return the iteration of the event that does ``action``, bound settings aside."""
-    steps = [e.step for e in recipe.events if isinstance(e, At) and getattr(e.action, "func", e.action) is action]
-    return steps[0]
 
 
 def resume_from(state: TrainState, gaussians: Gaussians, step: int) -> None:

@@ -50,7 +50,7 @@ from minisplat_ref.strategy.depth_reinit import (
     reinitial_points,
 )
 from minisplat_ref.training.loop import StepReport, train
-from minisplat_ref.training.schedule import Action, Recipe, configured
+from minisplat_ref.training.schedule import Recipe, configured, firing_steps
 from minisplat_ref.types import Bools, Floats, Model, Scene
 
 LEAST_ALPHA = 0.9  # of the guard that asks for opacity
@@ -111,8 +111,8 @@ def run(args: argparse.Namespace) -> None:
     if args.scene not in SCENE_NAMES:
         raise InputError(f"{args.scene}: true depths are known of {', '.join(SCENE_NAMES)} alone; give one of these")
     recipe = get_recipe(args.recipe, args.iterations)
-    if not steps_of(recipe, reinitialise_from_depth):
-        names = ", ".join(name for name, other in RECIPES.items() if steps_of(other, reinitialise_from_depth))
+    if not firing_steps(recipe, reinitialise_from_depth):
+        names = ", ".join(name for name, other in RECIPES.items() if firing_steps(other, reinitialise_from_depth))
         raise InputError(f"recipe {args.recipe} does not reinitialise from depth: choose from {names}")
     with making_folder(args.out) as folder:
         truth = make_scene(args.scene)
@@ -129,16 +129,10 @@ def run(args: argparse.Namespace) -> None:
         result = {**describe_scene(truth.scene), **settings, "summary": summary, "runs": runs}
         write(folder, result, draw(summary))
     print(title(result))
-    steps = " and ".join(map(str, steps_of(recipe, reinitialise_from_depth)))
+    steps = " and ".join(map(str, firing_steps(recipe, reinitialise_from_depth)))
     seeds = ", ".join(map(str, args.seeds))
     print(f"{recipe.name}, {args.iterations} iterations, reinitialised at {steps}; seeds {seeds}\n")
     print(markdown_table(["points", *MEASURES.values()], to_rows(summary)))
-
-
-def steps_of(recipe: Recipe, *actions: Action) -> list[int]:
-    """Return the iterations at which a recipe does one of the actions, settings aside."""
-    events = [event for event in recipe.events if getattr(event.action, "func", event.action) in actions]
-    return [step for step in range(1, recipe.iterations + 1) if any(event.is_due(step) for event in events)]
 
 
 def measure(truth: SyntheticScene, recipe: Recipe, seeds: tuple[int, ...]) -> Iterator[dict[str, Any]]:
@@ -160,8 +154,8 @@ def measure(truth: SyntheticScene, recipe: Recipe, seeds: tuple[int, ...]) -> It
 def measure_one(truth: SyntheticScene, recipe: Recipe, choice: Choice, seed: int) -> dict[str, float | None]:
     """Train once; return the :data:`MEASURES`."""
     scene = truth.scene
-    reinitialised = steps_of(recipe, reinitialise_from_depth)
-    densified = min(s for s in steps_of(recipe, simplify, store_sh, restart_from_means) if s > reinitialised[-1])
+    reinitialised = firing_steps(recipe, reinitialise_from_depth)
+    densified = min(s for s in firing_steps(recipe, simplify, store_sh, restart_from_means) if s > reinitialised[-1])
     drawn: dict[str, float] = {}
     counts: dict[int, int] = {}  # of what is far out, by iteration
 

@@ -68,6 +68,7 @@ def tidy(axes: Axes, grid: Literal["x", "both"] = "both") -> None:
     """Take away the frame above and on the right, and draw a pale grid across the named axes."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(axis=grid, color=GRID_COLOR)
+    axes.set_axisbelow(True)
 
 
 def write(folder: Path, result: dict[str, Any], figure: Figure) -> None:

@@ -8,7 +8,6 @@ seed decides the order of views, random children and, in depth reinitialisation,
 import argparse
 import time
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 from matplotlib.figure import Figure
@@ -32,7 +31,7 @@ from minisplat_ref.reporting import markdown_table
 from minisplat_ref.strategy.blur_split import principal_axis_children
 from minisplat_ref.strategy.clone_split import random_children
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import Event, Recipe, configured
+from minisplat_ref.training.schedule import Recipe, configured, does, without
 from minisplat_ref.types import Gaussians, Scene
 
 FORMS: dict[str, tuple[bool, Callable[..., Gaussians]]] = {
@@ -77,17 +76,11 @@ def variant(recipe: Recipe, form: str) -> Recipe:
     """Return the recipe with blur split in one of the :data:`FORMS`."""
     has_blur_split, children = FORMS[form]
     recipe = configured(recipe, draw_children=children)
-    if has_blur_split:
-        return recipe
-    return recipe._replace(events=tuple(event for event in recipe.events if not _collects_blur(event)))
+    return recipe if has_blur_split else without(recipe, mini_splatting.collect_blur)
 
 
 def _has_blur_split(recipe: Recipe) -> bool:
-    return any(map(_collects_blur, recipe.events))
-
-
-def _collects_blur(event: Event) -> bool:
-    return isinstance(event.action, partial) and event.action.func is mini_splatting.collect_blur
+    return any(does(event, mini_splatting.collect_blur) for event in recipe.events)
 
 
 def measure(scene: Scene, recipe: Recipe, form: str, seed: int) -> dict[str, Any]:
