@@ -1,5 +1,6 @@
 """Fixtures for all test files."""
 
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,14 @@ import pytest
 from minisplat_ref.backends import BACKENDS, CPU, REFERENCE
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def ctrl_c_is_heard():
+    """Have Ctrl-C interrupt, here and in processes that tests start: a shell starts what runs behind it deaf to it."""
+    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, previous)
 
 
 @pytest.fixture

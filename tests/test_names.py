@@ -218,4 +218,4 @@ def test_cameras_of_a_file_are_rendered_into_their_folder(tmp_path, nothing_outs
     nothing_outside()
     assert main(["render", str(tmp_path / "a.ply"), "--cameras", str(cameras), "--out", str(out)]) == 0
     assert [view.name for view in viewpoints.read(cameras)] == names
-    assert sorted(path.stem for path in out.iterdir()) == sorted(file_names(names))
+    assert sorted(path.stem for path in out.glob("*.png")) == sorted(file_names(names))
