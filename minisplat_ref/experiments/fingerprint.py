@@ -2,7 +2,8 @@
 
 Hashed are the pixels as they were loaded (downscaled, undistorted, composited, with their mask), not the files: they
 are what was trained on. A photograph that is saved again without loss, or a scene that is converted from COLMAP to
-transforms.json, is the same; another ``--downscale`` is not. It takes as long as reading the pixels once from memory.
+transforms.json, is the same; another ``--downscale`` is not. It takes as long as reading the pixels once: from memory,
+or from disk where memory cannot hold them.
 A decoder that gives other pixels for the same JPEG makes another scene, and a training continued on it would indeed not
 end with the same bytes.
 
@@ -34,7 +35,7 @@ def of_scene(scene: Scene) -> list[dict[str, Any]]:
     """Return what ``cameras.json`` holds: every view with its camera and the hash of its photograph."""
     views = (*scene.train_views, *scene.test_views)
     cameras = viewpoints.to_json(viewpoints.scene_viewpoints(scene))
-    return [{**camera, PHOTOGRAPH: _hash(view)} for camera, view in zip(cameras, views, strict=True)]
+    return [{**camera, PHOTOGRAPH: _hash(view.loaded())} for camera, view in zip(cameras, views, strict=True)]
 
 
 def _hash(view: View) -> str:
