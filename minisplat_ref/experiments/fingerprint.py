@@ -16,12 +16,14 @@ import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.experiments.run_folder import CAMERAS
 from minisplat_ref.io import viewpoints
+from minisplat_ref.io.stored_views import Photograph, StoredView
 from minisplat_ref.types import Scene, View
 
 PHOTOGRAPH = "photograph"  # key of the hash
@@ -35,11 +37,22 @@ def of_scene(scene: Scene) -> list[dict[str, Any]]:
     """Return what ``cameras.json`` holds: every view with its camera and the hash of its photograph."""
     views = (*scene.train_views, *scene.test_views)
     cameras = viewpoints.to_json(viewpoints.scene_viewpoints(scene))
-    return [{**camera, PHOTOGRAPH: _hash(view.loaded())} for camera, view in zip(cameras, views, strict=True)]
+    return [{**camera, PHOTOGRAPH: _hash(view)} for camera, view in zip(cameras, views, strict=True)]
+
+
+_HASHES: WeakKeyDictionary[Photograph, str] = WeakKeyDictionary()  # of photographs on disk, each is read once
 
 
 def _hash(view: View) -> str:
     """Hash of the pixels and the mask, with their sizes."""
+    if not isinstance(view, StoredView):
+        return _hash_of_pixels(view)
+    if view.photograph not in _HASHES:
+        _HASHES[view.photograph] = _hash_of_pixels(view.loaded())
+    return _HASHES[view.photograph]
+
+
+def _hash_of_pixels(view: View) -> str:
     digest = hashlib.sha256()
     for array in (view.image, view.mask):
         if array is not None:

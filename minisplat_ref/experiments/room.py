@@ -65,4 +65,5 @@ def _n_pairs(gaussians: Any, camera: Camera, conventions: Conventions, backend: 
     area = np.minimum(area, width * height)  # of what the image cuts off there is no tile
     tile_width, tile_height = backend.tile_width, backend.tile_height
     n_tiles = 1 + width / tile_width + height / tile_height + area / (tile_width * tile_height)
+    n_tiles = np.minimum(n_tiles, -(-camera.width // tile_width) * -(-camera.height // tile_height))
     return float(n_tiles.sum()) * n / len(means)
