@@ -1,7 +1,8 @@
 """What a training and a picture take of memory, and what there is: to say no in time, before the system kills.
 
-The model of a training is the one that ``bench --memory`` measures against (README: 0.96 of it at the peak): the
-parameters, their gradient and Adam's two moments; the images of an iteration; 48 bytes for every pair (tile, Gaussian).
+The model of a training is the one that ``bench --memory`` measures against: the parameters, their gradient and Adam's
+two moments; what a view makes of each Gaussian; the images of an iteration, or of a measurement where this is more; 48
+bytes for every pair (tile, Gaussian).
 What the program, its compiled kernels and the photographs take is there before and is not counted; photographs that are
 read when they are needed, because they would take too much, count as far as they will stay in memory.
 
@@ -19,6 +20,9 @@ IMAGE_BYTES = 4 * (3 + 1 + 3)  # a pixel in an iteration: image, alpha, and the 
 # A pixel while it is measured: image, alpha and the clipped image in float32, their differences in float64.
 MEASURING_BYTES = 4 * (3 + 1 + 3) + 8 * 3
 N_COPIES = 4  # of the population: parameters, gradient, two moments
+# What a view makes of each: activations, footprint, colour, and derivatives with respect to them. Measured: 75 of
+# 200,000 in two megapixels, 210 of 1,500,000 in twelve.
+BYTES_PER_GAUSSIAN = 150
 # The 9 sums of its gradient, its places in the tile's list and in the Gaussian's, and one number to spare.
 BYTES_PER_PAIR = 48
 PAIRS_PER_GAUSSIAN = 3.0  # where no view has been rendered yet; in three small scenes 0.7 to 3.3
@@ -49,7 +53,7 @@ class Needs(NamedTuple):
     @property
     def at_the_peak(self) -> float:
         """Bytes, of an iteration or of a measurement, which has no gradient and no pairs, but more of the image."""
-        iteration = IMAGE_BYTES * self.n_pixels + training_bytes(self.population_bytes, self.n_pairs)
+        iteration = IMAGE_BYTES * self.n_pixels + training_bytes(self.n_rows, self.population_bytes, self.n_pairs)
         measurement = MEASURING_BYTES * self.n_pixels + (N_COPIES - 1) * self.population_bytes
         return max(iteration, measurement) + self.reading_bytes + self.kept_bytes
 
@@ -72,17 +76,19 @@ def reading_bytes(n_pixels: int, n_file_pixels: int) -> float:
     return 2 * PHOTOGRAPH_BYTES * n_pixels + READING_BYTES * n_file_pixels
 
 
-def training_bytes(population_bytes: int, n_pairs: float) -> float:
+def training_bytes(n_rows: float, population_bytes: int, n_pairs: float) -> float:
     """Bytes of a training that grow with its population.
 
     Parameters
     ----------
+    n_rows : float
+        Of the population.
     population_bytes : int
         Of the parameters.
     n_pairs : float
         Pairs (tile, Gaussian) of a view.
     """
-    return N_COPIES * population_bytes + BYTES_PER_PAIR * n_pairs
+    return N_COPIES * population_bytes + BYTES_PER_GAUSSIAN * n_rows + BYTES_PER_PAIR * n_pairs
 
 
 def rows_that_fit(n_rows: int, population_bytes: int, n_pairs: float, free: float) -> float:
@@ -104,13 +110,13 @@ def rows_that_fit(n_rows: int, population_bytes: int, n_pairs: float, free: floa
     """
     if n_rows == 0:
         return math.inf
-    now, row_bytes = training_bytes(population_bytes, n_pairs), population_bytes / n_rows
+    now, row_bytes = training_bytes(n_rows, population_bytes, n_pairs), population_bytes / n_rows
     return min(n_rows * (1 + free / now), free / ((N_COPIES - 1) * row_bytes))
 
 
-def bytes_to_double(population_bytes: int, n_pairs: float) -> float:
+def bytes_to_double(n_rows: int, population_bytes: int, n_pairs: float) -> float:
     """Return the free memory with which a population may become twice as large: see :func:`rows_that_fit`."""
-    return max(training_bytes(population_bytes, n_pairs), 2 * (N_COPIES - 1) * population_bytes)
+    return max(training_bytes(n_rows, population_bytes, n_pairs), 2 * (N_COPIES - 1) * population_bytes)
 
 
 def free_bytes() -> float:

@@ -476,12 +476,14 @@ def test_a_wrong_image_has_no_peak(monkeypatch):
 def test_a_large_training_takes_what_was_foreseen(monkeypatch):
     """The case is real, on photographs so small that the program itself takes more."""
     monkeypatch.setattr(large_scene, "SIZE", (640, 480))
+    monkeypatch.setattr(large_scene, "N_TRACED", 4)
+    monkeypatch.setattr(large_scene, "N_POINTS", 200)
     monkeypatch.setattr(large_scene, "TOLERANCE", 100)
-    moderate = large_scene.Large("small", large_scene.N_TRACED, 300, None)
+    moderate = large_scene.Large("small", 6, 300, None)
     case = large_scene.large_case(moderate)
     figures = case.figures
     assert case.passed, case
-    assert figures["Gaussians"] == 300 and figures["GB if all in memory"] == pytest.approx(8 * 640 * 480 * 3 / 1e9)
+    assert figures["Gaussians"] == 300 and figures["GB if all in memory"] == pytest.approx(6 * 640 * 480 * 3 / 1e9)
     assert figures["foreseen MB"] == pytest.approx(640 * 480 * 52 / 1e6, rel=0.1)
     assert figures["x foreseen"] == pytest.approx(figures["peak MB"] / figures["foreseen MB"])
     assert figures["whole process MB"] > figures["peak MB"] > figures["foreseen MB"] / 2

@@ -3,7 +3,8 @@
 Several, because the first does without the moments, which are only then written, and without what one iteration leaves
 to the next. Counted is what that process holds at its peak beyond what it held before the Gaussians were there, with
 all kernels loaded. The bound is what no training can do without (:mod:`minisplat_ref.memory`): the model, Adam's two
-moments, the gradients, the images of an iteration, and 48 bytes for every pair (tile, Gaussian).
+moments, the gradients, the images of an iteration, 150 bytes for what a view makes of every Gaussian, and 48 for every
+pair (tile, Gaussian).
 """
 
 import json
@@ -65,6 +66,7 @@ def memory_case() -> Case:
         "moments": 2 * model,
         "gradients": model,
         "images": (memory.PHOTOGRAPH_BYTES + memory.IMAGE_BYTES) * width * height,
+        "Gaussians": memory.BYTES_PER_GAUSSIAN * N,
         "pairs": memory.BYTES_PER_PAIR * n_pairs,
     }
     bound = sum(terms.values())

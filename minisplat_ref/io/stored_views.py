@@ -177,7 +177,8 @@ def make_room(views: Sequence[View], needed: float) -> float:
 class ReadingAhead(AbstractContextManager["ReadingAhead"]):
     """Reads, in a thread, the photograph that is needed next; the thread ends with the context.
 
-    There is no thread where photographs are in memory anyway.
+    There is no thread where photographs are in memory anyway. Kernels whose loops run in parallel let go of Python's
+    lock, as decoders do: one goes on while the other works.
     """
 
     def __init__(self) -> None:

@@ -16,8 +16,7 @@ kernels that call it. ``kernel`` compiles a parallel loop. Six facts shape this 
 * Two processes that save to Numba's cache at the same moment take the same file name, and later processes load the
   wrong kernel. Saving is therefore one process at a time.
 * Numba's ``workqueue`` threading layer aborts the process when two Python threads enter parallel regions, so all
-  kernels share one lock. A thread that runs none, such as the one that reads the next photograph, goes on meanwhile:
-  kernels let go of Python's own lock.
+  kernels share one lock.
 * ``fastmath=True`` would let the compiler assume that no NaN exists and ``isnan`` return False. Kernels may only
   contract ``a * b + c`` to one rounding.
 * What stands in the cache has been optimised twice, and a compiler that may change the order of a sum gives other last
@@ -258,7 +257,6 @@ def kernel(parallel: bool = True) -> Callable[[Callable], Callable]:
             compiled = numba.njit(
                 parallel=_PARALLEL if parallel else False,
                 cache=folder is not None,
-                nogil=True,
                 error_model="numpy",
                 fastmath={"contract"},
                 no_cfunc_wrapper=True,

@@ -245,10 +245,10 @@ def _change(state: TrainState, scene: Scene, around: _Surroundings, differentiat
     if is_editing or guard.is_due(case.step):
         guard.check_parameters(case, "Adam")
     if is_editing:
-        n_bytes, n_pairs = sum(field.nbytes for field in state.gaussians), rendered.output.n_pairs
-        to_be_kept = make_room(scene.train_views, memory.bytes_to_double(n_bytes, n_pairs))
-        free = memory.free_bytes() - to_be_kept
-        state.most_rows = memory.rows_that_fit(len(state.gaussians.means), n_bytes, n_pairs, free)
+        n, n_pairs = len(state.gaussians.means), rendered.output.n_pairs
+        n_bytes = sum(field.nbytes for field in state.gaussians)
+        to_be_kept = make_room(scene.train_views, memory.bytes_to_double(n, n_bytes, n_pairs))
+        state.most_rows = memory.rows_that_fit(n, n_bytes, n_pairs, memory.free_bytes() - to_be_kept)
     output = rendered.output._replace(image=rendered.channel("rgb"))
     iteration = Iteration(
         scene,
