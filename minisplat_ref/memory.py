@@ -1,44 +1,94 @@
 """What a training and a picture take of memory, and what there is: to say no in time, before the system kills.
 
-The model of a training is the one that ``bench --memory`` measures against (README: 0.96 of it at the peak): the
-parameters, their gradient and Adam's two moments; the images of an iteration; 48 bytes for every pair (tile, Gaussian).
-What the program, its compiled kernels and the photographs take is there before and is not counted.
+The model of a training is the one that ``bench --memory`` measures against: the parameters, their gradient and Adam's
+two moments; what a view makes of each Gaussian; the images of an iteration, or of a measurement where this is more; 48
+bytes for every pair (tile, Gaussian).
+What the program, its compiled kernels and the photographs take is there before and is not counted; photographs that are
+read when they are needed, because they would take too much, count as far as they will stay in memory.
 
 What is free is asked of Linux. Other systems do not say it in a file; nothing is refused there.
 """
 
 import math
 from pathlib import Path
+from typing import NamedTuple
 
 from minisplat_ref.errors import InputError
 
+PHOTOGRAPH_BYTES = 3  # a pixel
+IMAGE_BYTES = 4 * (3 + 1 + 3)  # a pixel in an iteration: image, alpha, and the derivative with respect to the image
+# A pixel while it is measured: image, alpha and the clipped image in float32, their differences in float64.
+MEASURING_BYTES = 4 * (3 + 1 + 3) + 8 * 3
 N_COPIES = 4  # of the population: parameters, gradient, two moments
+# What a view makes of each: activations, footprint, colour, and derivatives with respect to them. Measured: 75 of
+# 200,000 in two megapixels, 210 of 1,500,000 in twelve.
+BYTES_PER_GAUSSIAN = 150
 # The 9 sums of its gradient, its places in the tile's list and in the Gaussian's, and one number to spare.
 BYTES_PER_PAIR = 48
 PAIRS_PER_GAUSSIAN = 3.0  # where no view has been rendered yet; in three small scenes 0.7 to 3.3
 # A pixel, at the peak of rendering a picture and writing it; measured at 12 and 48 megapixels: 64.2 and 64.1, with
 # depth 68.2 and 68.1.
 PICTURE_BYTES, DEPTH_PICTURE_BYTES = 65, 69
+SHELF_SHARE = 0.5  # part of the free memory that photographs may keep; Gaussians need the other
+READING_BYTES = 10  # a pixel of the file, while it is decoded; measured with JPEG and PNG of 12 megapixels: 10.0
 RESERVE = 0.95  # part of the free memory that may be planned with
 
 
-def image_bytes(width: int, height: int) -> int:
-    """Bytes of the photograph as it is kept and in float32, the image, its opacity, and the derivative by the image."""
-    bytes_, floats = 3, 3 + 3 + 1 + 3
-    return (bytes_ + 4 * floats) * width * height
+class Needs(NamedTuple):
+    """What a training takes of memory, besides what the program and the photographs take already."""
+
+    n_rows: int
+    """Of the population."""
+    population_bytes: int
+    """Of the parameters."""
+    n_pairs: float
+    """Pairs (tile, Gaussian) of a view."""
+    n_pixels: int
+    """Of the largest photograph."""
+    reading_bytes: float
+    """For photographs that are read when they are needed; 0 where all are in memory."""
+    kept_bytes: float = 0.0
+    """For those of them that will stay in memory when they have been read."""
+
+    @property
+    def at_the_peak(self) -> float:
+        """Bytes, of an iteration or of a measurement, which has no gradient and no pairs, but more of the image."""
+        iteration = IMAGE_BYTES * self.n_pixels + training_bytes(self.n_rows, self.population_bytes, self.n_pairs)
+        measurement = MEASURING_BYTES * self.n_pixels + (N_COPIES - 1) * self.population_bytes
+        return max(iteration, measurement) + self.reading_bytes + self.kept_bytes
+
+    @property
+    def to_come(self) -> float:
+        """The same without the parameters and their moments, which are there already."""
+        return self.at_the_peak - (N_COPIES - 1) * self.population_bytes
 
 
-def training_bytes(population_bytes: int, n_pairs: float) -> float:
+def reading_bytes(n_pixels: int, n_file_pixels: int) -> float:
+    """Return what photographs take that are read one by one: this one, the next one, and decoding it.
+
+    Parameters
+    ----------
+    n_pixels : int
+        Of the largest one, as it is trained on.
+    n_file_pixels : int
+        Of the largest one in its file.
+    """
+    return 2 * PHOTOGRAPH_BYTES * n_pixels + READING_BYTES * n_file_pixels
+
+
+def training_bytes(n_rows: float, population_bytes: int, n_pairs: float) -> float:
     """Bytes of a training that grow with its population.
 
     Parameters
     ----------
+    n_rows : float
+        Of the population.
     population_bytes : int
         Of the parameters.
     n_pairs : float
         Pairs (tile, Gaussian) of a view.
     """
-    return N_COPIES * population_bytes + BYTES_PER_PAIR * n_pairs
+    return N_COPIES * population_bytes + BYTES_PER_GAUSSIAN * n_rows + BYTES_PER_PAIR * n_pairs
 
 
 def rows_that_fit(n_rows: int, population_bytes: int, n_pairs: float, free: float) -> float:
@@ -60,8 +110,13 @@ def rows_that_fit(n_rows: int, population_bytes: int, n_pairs: float, free: floa
     """
     if n_rows == 0:
         return math.inf
-    now, row_bytes = training_bytes(population_bytes, n_pairs), population_bytes / n_rows
+    now, row_bytes = training_bytes(n_rows, population_bytes, n_pairs), population_bytes / n_rows
     return min(n_rows * (1 + free / now), free / ((N_COPIES - 1) * row_bytes))
+
+
+def bytes_to_double(n_rows: int, population_bytes: int, n_pairs: float) -> float:
+    """Return the free memory with which a population may become twice as large: see :func:`rows_that_fit`."""
+    return max(training_bytes(n_rows, population_bytes, n_pairs), 2 * (N_COPIES - 1) * population_bytes)
 
 
 def free_bytes() -> float:
@@ -115,37 +170,29 @@ def _lines(path: str) -> list[str]:
         return []
 
 
-def check_start(n_rows: int, population_bytes: int, width: int, height: int) -> str:
+def check_start(needs: Needs) -> str:
     """Say what a training begins with and how far it may grow, in a line; nothing where the system does not say.
 
-    Parameters
-    ----------
-    n_rows : int
-        Of the population, whose parameters and moments are there already.
-    population_bytes : int
-        Of its parameters.
-    width, height : int
-        Of the largest photograph, pixels.
+    The parameters and their moments are there already.
 
     Raises
     ------
     InputError
         It does not fit into memory.
     """
-    free, n_pairs = free_bytes(), PAIRS_PER_GAUSSIAN * n_rows
+    free, needed, has = free_bytes(), needs.at_the_peak, needs.at_the_peak - needs.to_come
     if math.isinf(free):
         return ""
-    images, population = image_bytes(width, height), training_bytes(population_bytes, n_pairs)
-    needed, has = images + population, (N_COPIES - 1) * population_bytes
-    if needed - has > free:
+    if needs.to_come > free:
         raise InputError(
             f"training begins with about {as_text(needed)} of memory, {as_text(free + has)} are free: give a larger"
             " --downscale"
         )
-    rows = rows_that_fit(n_rows, population_bytes, n_pairs, free + has - needed)
+    rows = rows_that_fit(needs.n_rows, needs.population_bytes, needs.n_pairs, free - needs.to_come)
+    reading = "; photographs are read from disk again and again" if needs.reading_bytes else ""
     return (
-        f"memory: about {as_text(needed)} for the first {n_rows:,} Gaussians, {as_text(free + has)} are free: room for"
-        f" some {float(f'{max(rows, n_rows):.1g}'):,.0f}"
+        f"memory: about {as_text(needed)} for the first {needs.n_rows:,} Gaussians, {as_text(free + has)} are free:"
+        f" room for some {float(f'{max(rows, needs.n_rows):.1g}'):,.0f}{reading}"
     )
 
 
@@ -166,29 +213,40 @@ def check_picture(width: int, height: int, with_depth: bool) -> None:
         )
 
 
-def check_photographs(source: str | Path, n_pixels: int, downscale: int) -> None:
-    """Refuse photographs that do not fit into memory, which holds all of them.
+def shelf_bytes(n_bytes: float) -> float | None:
+    """Return how much of the photographs of a scene may stay in memory; None if all of them may.
+
+    Parameters
+    ----------
+    n_bytes : float
+        What all of them take.
+    """
+    most = SHELF_SHARE * free_bytes()
+    return None if n_bytes <= most else most
+
+
+def check_photograph(source: str | Path, n_pixels: int, downscale: int) -> None:
+    """Refuse a photograph that is too large to be read.
 
     Parameters
     ----------
     source : str or Path
         The scene, for the message.
     n_pixels : int
-        Of all photographs at full size.
+        Of the largest photograph at full size.
     downscale : int
-        Factor by which they are made smaller.
+        Factor by which it is made smaller when it has been read.
 
     Raises
     ------
     InputError
-        Names a factor that would do.
+        It does not fit into memory.
     """
-    needed, free = 3 * n_pixels / downscale**2, free_bytes()
+    needed, free = reading_bytes(n_pixels // downscale**2, n_pixels), free_bytes()
     if needed > free:
-        enough = math.ceil(math.sqrt(3 * n_pixels / free))
         raise InputError(
-            f"{source}: its photographs take {as_text(needed)} of memory, {as_text(free)} are free: give --downscale"
-            f" {max(enough, downscale + 1)}, or leave some out"
+            f"{source}: to read a photograph of {n_pixels / 1e6:.1f} megapixels takes {as_text(needed)} of memory,"
+            f" {as_text(free)} are free: make the photographs smaller with `minisplat-ref downscale`"
         )
 
 

@@ -306,6 +306,13 @@ class View(NamedTuple):
     time: float = 0.0
     """When it was taken, in the scene's own unit, from 0 to 1 as a rule; for scenes that move."""
 
+    def loaded(self) -> "View":
+        """Return a view that holds its pixels: itself, but of a view that reads them when they are needed a copy.
+
+        Scenes whose photographs memory cannot hold have such views: :class:`minisplat_ref.io.stored_views.StoredView`.
+        """
+        return self
+
 
 def numbered(views: Iterable[View]) -> tuple[View, ...]:
     """Return training views with their places among themselves as ``view_id``."""

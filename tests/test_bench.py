@@ -2,6 +2,7 @@
 
 import json
 import os
+import subprocess
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,6 +16,7 @@ from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.bench import (
     by_turns,
     contenders,
+    large_scene,
     limits,
     peak_memory,
     profiling,
@@ -456,7 +458,7 @@ def test_peak_memory_is_that_of_the_arrays(monkeypatch):
     figures = case.figures
     assert case.passed, case
     assert figures["moments MB"] == 2 * figures["model MB"] == pytest.approx(2 * 2000 * 59 * 4 / 1e6)
-    assert figures["images MB"] == pytest.approx(640 * 480 * (3 + 4 * 10) / 1e6)
+    assert figures["images MB"] == pytest.approx(640 * 480 * (3 + 4 * 7) / 1e6)
     assert figures["pairs MB"] == pytest.approx(48 * figures["pairs"] / 1e6) and figures["pairs"] > 1000
     terms = sum(value for name, value in figures.items() if name.endswith("MB") and name.split()[0] not in PEAK)
     assert figures["bound MB"] == pytest.approx(terms)
@@ -469,6 +471,36 @@ def test_a_wrong_image_has_no_peak(monkeypatch):
     monkeypatch.setattr(peak_memory, "CPU", with_pixel(1.1))
     case = peak_memory.memory_case()
     assert not case.passed and "float64" in case.note
+
+
+def test_a_large_training_takes_what_was_foreseen(monkeypatch):
+    """The case is real, on photographs so small that the program itself takes more."""
+    monkeypatch.setattr(large_scene, "SIZE", (640, 480))
+    monkeypatch.setattr(large_scene, "N_TRACED", 4)
+    monkeypatch.setattr(large_scene, "N_POINTS", 200)
+    monkeypatch.setattr(large_scene, "TOLERANCE", 100)
+    moderate = large_scene.Large("small", 6, 300, None)
+    case = large_scene.large_case(moderate)
+    figures = case.figures
+    assert case.passed, case
+    assert figures["Gaussians"] == 300 and figures["GB if all in memory"] == pytest.approx(6 * 640 * 480 * 3 / 1e9)
+    assert figures["foreseen MB"] == pytest.approx(640 * 480 * 52 / 1e6, rel=0.1)
+    assert figures["x foreseen"] == pytest.approx(figures["peak MB"] / figures["foreseen MB"])
+    assert figures["whole process MB"] > figures["peak MB"] > figures["foreseen MB"] / 2
+
+
+def test_a_large_training_that_takes_too_much_has_failed(monkeypatch):
+    def run(command, **_):
+        results = {"foreseen": 100.0, "peak": 121.0, "process": 500.0, "n_gaussians": 5, "note": ""}
+        (Path(command[3]) / large_scene.RESULT).write_text(json.dumps(results))
+        return subprocess.CompletedProcess(command, 0, "", "")
+
+    monkeypatch.setattr(large_scene, "write_photographs", lambda *_: None)
+    monkeypatch.setattr(large_scene.subprocess, "run", run)
+    case = large_scene.large_case(large_scene.Large("small", 8, None, 499.0))
+    assert not case.passed and "not within 20%" in case.note and "more than 0 kB" in case.note
+    monkeypatch.setattr(large_scene, "TOLERANCE", 0.22)
+    assert large_scene.large_case(large_scene.Large("small", 8, None, 500.0)).passed
 
 
 def test_start_is_timed_by_the_command(monkeypatch):

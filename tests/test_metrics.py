@@ -36,6 +36,14 @@ def test_masked_pixels_do_not_count(rng):
         psnr(image, target, np.zeros((8, 9), bool))
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_target_of_bytes_is_that_of_numbers(rng, dtype):
+    image, target = rng.random((8, 9, 3)).astype(dtype), rng.integers(0, 256, (8, 9, 3), np.uint8)
+    mask = rng.random((8, 9)) < 0.5
+    for pixels in (None, mask):
+        assert psnr(image, target, pixels) == psnr(image, target.astype(dtype) / 255, pixels)
+
+
 def test_ssim_is_the_mean_of_the_map(rng, backend):
     image, target = rng.random((15, 13, 3)), rng.random((15, 13, 3))
     assert ssim(image, image, backend=backend) == pytest.approx(1.0, abs=CLOSED_FORM)

@@ -1,10 +1,13 @@
 """PLY: the 3DGS layout and point clouds."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from tolerances import SPLAT_BYTE, SPLAT_SCALE
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.io import ply_file
 from minisplat_ref.io.ply import COLORS, load_ply, load_points, read_vertices, save_ply, write_vertices
 from minisplat_ref.types import Gaussians
 
@@ -84,15 +87,27 @@ def test_file_is_replaced_whole_or_not_at_all(tmp_path, rng, monkeypatch):
     save_ply(path, random_gaussians(rng))
     before = path.read_bytes()
 
-    def fail(self, data):
-        self.open("wb").close()
+    def fail(descriptor):
         raise OSError("disk full")
 
-    monkeypatch.setattr(type(path), "write_bytes", fail)
+    monkeypatch.setattr("os.fsync", fail)
     with pytest.raises(InputError, match=r"a\.ply cannot be written \(disk full\)"):
         save_ply(path, random_gaussians(rng))
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_many_rows_are_written_in_parts_without_copies(tmp_path, rng, monkeypatch):
+    """The same bytes as at once, and memory for no more than some of the rows."""
+    gaussians = random_gaussians(rng, 50_000)
+    save_ply(tmp_path / "whole.ply", gaussians)
+    monkeypatch.setattr(ply_file, "ROWS_AT_ONCE", 700)
+    tracemalloc.start()
+    save_ply(tmp_path / "parts.ply", gaussians)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert (tmp_path / "parts.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
+    assert peak < sum(field.nbytes for field in gaussians) / 4
 
 
 def test_missing_folder(tmp_path, rng):

@@ -608,8 +608,8 @@ def test_a_picture_that_does_not_fit_into_memory_is_foreseen(done, refused):
 def test_a_training_that_does_not_fit_into_memory_is_foreseen(original, tmp_path, monkeypatch, refused, capfd):
     out = tmp_path / "run"
     monkeypatch.setattr(memory, "free_bytes", lambda: 10_000.0)
-    assert "its photographs take" in refused("train", original, *OPTIONS, "--out", out)
-    monkeypatch.setattr(memory, "check_photographs", lambda *_: None)
+    assert "to read a photograph of 0.0 megapixels takes" in refused("train", original, *OPTIONS, "--out", out)
+    monkeypatch.setattr(memory, "check_photograph", lambda *_: None)
     assert "training begins with about" in refused("train", original, *OPTIONS, "--out", out)
     assert not out.exists()
     monkeypatch.setattr(memory, "free_bytes", lambda: 1e9)
@@ -623,7 +623,7 @@ def test_densification_that_does_not_fit_stops_with_all_saved(original, tmp_path
     options = ["--iterations", "240", "--test-every", "4"]
     monkeypatch.setattr(memory, "free_bytes", lambda: 1.5 * 60 * 236 * 3)  # room for the new arrays of 90 Gaussians
     monkeypatch.setattr(memory, "check_start", lambda *_: "")
-    monkeypatch.setattr(memory, "check_photographs", lambda *_: None)
+    monkeypatch.setattr(memory, "check_photograph", lambda *_: None)
     out = tmp_path / "run"
     line = refused("train", original, *options, "--set", "threshold=0", "--out", out)
     assert "there is no memory for 120 Gaussians, only for some 90: train on smaller photographs" in line

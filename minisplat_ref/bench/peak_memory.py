@@ -3,11 +3,11 @@
 Several, because the first does without the moments, which are only then written, and without what one iteration leaves
 to the next. Counted is what that process holds at its peak beyond what it held before the Gaussians were there, with
 all kernels loaded. The bound is what no training can do without (:mod:`minisplat_ref.memory`): the model, Adam's two
-moments, the gradients, the images of an iteration, and 48 bytes for every pair (tile, Gaussian).
+moments, the gradients, the images of an iteration, 150 bytes for what a view makes of every Gaussian, and 48 for every
+pair (tile, Gaussian).
 """
 
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -18,6 +18,7 @@ import numpy as np
 
 from minisplat_ref import memory
 from minisplat_ref.backends import CPU
+from minisplat_ref.bench.process_memory import forget_peak, held, peak
 from minisplat_ref.bench.slopes import FOCAL_OF_WIDTH, LARGE, flipped_pixels
 from minisplat_ref.bench.workloads import synth
 from minisplat_ref.errors import InputError
@@ -64,7 +65,8 @@ def memory_case() -> Case:
         "model": model,
         "moments": 2 * model,
         "gradients": model,
-        "images": memory.image_bytes(width, height),
+        "images": (memory.PHOTOGRAPH_BYTES + memory.IMAGE_BYTES) * width * height,
+        "Gaussians": memory.BYTES_PER_GAUSSIAN * N,
         "pairs": memory.BYTES_PER_PAIR * n_pairs,
     }
     bound = sum(terms.values())
@@ -105,51 +107,15 @@ def measure(folder: str) -> None:
 
     small = synth(500, 64, 48, 50.0)
     iterate(Gaussians._make(field.astype(np.float32) for field in small.gaussians), small.camera)  # loads the kernels
-    note = _forget_peak()
-    before = _peak() if note else _held()
+    note = forget_peak()
+    before = peak() if note else held()
     with np.load(path / INPUTS) as inputs:
         gaussians = Gaussians._make(inputs[name] for name in Gaussians._fields)
         camera = Camera._make(_plain(inputs[f"camera_{name}"]) for name in Camera._fields)
     iterate(gaussians, camera)
-    n_bytes = _peak() - before
+    n_bytes = peak() - before
     (path / RESULT).write_text(json.dumps({"bytes": n_bytes, "note": note}))
 
 
 def _plain(value: np.ndarray) -> Any:
     return value.item() if value.ndim == 0 else value
-
-
-def _forget_peak() -> str:
-    """Make the system count the peak anew; return what a reader must know where it cannot."""
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        return "at least: counted beyond the peak of loading the kernels"
-    return ""
-
-
-def _held() -> int:
-    """Bytes of memory in use now; Linux only, like :func:`_forget_peak`."""
-    return _from_status("VmRSS") or 0
-
-
-def _peak() -> int:
-    """Most bytes in use since :func:`_forget_peak`, or ever where that does not work."""
-    return _from_status("VmHWM") or _most_so_far()
-
-
-def _from_status(key: str) -> int | None:
-    """Read a line of what Linux says of this process."""
-    if not os.path.exists("/proc/self/status"):
-        return None
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(f"{key}:")), None)
-
-
-def _most_so_far() -> int:
-    from minisplat_ref.experiments.run import peak_rss_mb
-
-    peak = peak_rss_mb()
-    if peak is None:
-        raise InputError("this system does not say how much memory a process holds")
-    return int(MEGA * peak)

@@ -73,7 +73,10 @@ def add_parser(commands: Commands) -> None:
         "--stages", action="store_true", help="instead: a training iteration, and how far from the limits"
     )
     others.add_argument("--slopes", action="store_true", help="instead: time against hits, 12,500 to 200,000 Gaussians")
-    others.add_argument("--memory", action="store_true", help="instead: peak of training, 200,000 in 1920 x 1080")
+    others.add_argument(
+        "--memory", action="store_true", help="instead: peak of training in 1920 x 1080 and 12 megapixels"
+    )
+    others.add_argument("--large", action="store_true", help="instead: 2,000 photographs of 12 megapixels within 8 GB")
     others.add_argument("--start", action="store_true", help="instead: seconds to the first iteration, cold and warm")
     parser.add_argument(
         "--scene", type=Path, metavar="SCENE", help="photographs for --stages (default a made room) and opensplat"
@@ -110,10 +113,16 @@ def _measure(args: argparse.Namespace) -> "Report":
         cases = slope_cases(args.repeats, progress)
         return Report("What time grows with: forward and backward, float32", tuple(cases), {"repeats": args.repeats})
     if args.memory:
+        from minisplat_ref.bench.large_scene import MODERATE, large_case
         from minisplat_ref.bench.peak_memory import memory_case
 
-        progress("memory: a few iterations in a process of its own")
-        return Report("Peak memory of training", (memory_case(),), {})
+        progress("memory: a few iterations in processes of their own")
+        return Report("Peak memory of training", (memory_case(), large_case(MODERATE)), {})
+    if args.large:
+        from minisplat_ref.bench.large_scene import LARGEST, large_case
+
+        progress("large: reads thousands of photographs, which takes a quarter of an hour")
+        return Report("Photographs beyond memory", (large_case(LARGEST),), {})
     if args.start:
         from minisplat_ref.bench.start_time import start_cases
 

@@ -162,7 +162,7 @@ def _start(given: dict[str, Any]) -> int:
         curve.check_views(scene)
     network = load_lpips(settings, scene)
     state = _first_state(settings, scene, recipe)
-    room = _check_room(scene, state)
+    room = _check_room(scene, state, settings)
     compile_kernels(settings.backend)
     run_folder.create(folder)
     warn_of_scene(scene, settings.downscale)
@@ -219,19 +219,20 @@ def _resume(folder: Path, given: dict[str, Any]) -> int:
         fingerprint.check(folder, scene, ours.scene)
         network = settings.load_lpips(ours, scene)
         state = _first_state(ours, scene, recipe) if state is None else state
-        room = _check_room(scene, state)
+        room = _check_room(scene, state, ours)
         compile_kernels(ours.backend)
         print(_how_it_goes_on(state, ours, is_rescaled="rescale" in given))
         return _train(folder, scene, ours, recipe, state, network, given, room)
 
 
-def _check_room(scene: "Scene", state: "TrainState") -> str:
+def _check_room(scene: "Scene", state: "TrainState", settings: "Settings") -> str:
     """Say what the training takes of memory; refuse one that does not fit."""
     from minisplat_ref import memory
+    from minisplat_ref.backends import get_backend
+    from minisplat_ref.constants import PROFILES
+    from minisplat_ref.experiments import room
 
-    camera = max((view.camera for view in scene.train_views), key=lambda camera: camera.width * camera.height)
-    n_bytes = sum(field.nbytes for field in state.gaussians)
-    return memory.check_start(len(state.gaussians.means), n_bytes, camera.width, camera.height)
+    return memory.check_start(room.foresee(scene, state, PROFILES[settings.profile], get_backend(settings.backend)))
 
 
 def _how_it_goes_on(state: "TrainState", settings: "Settings", is_rescaled: bool) -> str:

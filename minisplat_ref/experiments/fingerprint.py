@@ -2,7 +2,8 @@
 
 Hashed are the pixels as they were loaded (downscaled, undistorted, composited, with their mask), not the files: they
 are what was trained on. A photograph that is saved again without loss, or a scene that is converted from COLMAP to
-transforms.json, is the same; another ``--downscale`` is not. It takes as long as reading the pixels once from memory.
+transforms.json, is the same; another ``--downscale`` is not. It takes as long as reading the pixels once: from memory,
+or from disk where memory cannot hold them.
 A decoder that gives other pixels for the same JPEG makes another scene, and a training continued on it would indeed not
 end with the same bytes.
 
@@ -15,12 +16,14 @@ import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.experiments.run_folder import CAMERAS
 from minisplat_ref.io import viewpoints
+from minisplat_ref.io.stored_views import Photograph, StoredView
 from minisplat_ref.types import Scene, View
 
 PHOTOGRAPH = "photograph"  # key of the hash
@@ -37,8 +40,19 @@ def of_scene(scene: Scene) -> list[dict[str, Any]]:
     return [{**camera, PHOTOGRAPH: _hash(view)} for camera, view in zip(cameras, views, strict=True)]
 
 
+_HASHES: WeakKeyDictionary[Photograph, str] = WeakKeyDictionary()  # of photographs on disk, each is read once
+
+
 def _hash(view: View) -> str:
     """Hash of the pixels and the mask, with their sizes."""
+    if not isinstance(view, StoredView):
+        return _hash_of_pixels(view)
+    if view.photograph not in _HASHES:
+        _HASHES[view.photograph] = _hash_of_pixels(view.loaded())
+    return _HASHES[view.photograph]
+
+
+def _hash_of_pixels(view: View) -> str:
     digest = hashlib.sha256()
     for array in (view.image, view.mask):
         if array is not None:

@@ -18,7 +18,9 @@ def to_picture(image: Floats) -> Picture:
 
 def error_picture(truth: Picture, render: Picture) -> Picture:
     """Colour the mean absolute difference of the three channels: dark is none, bright is ERROR_RANGE or more."""
-    difference = np.abs(truth.astype(np.float32) - render.astype(np.float32)).mean(axis=2) / 255.0  # [H, W]
+    levels = truth.astype(np.int16)  # [H, W, 3]
+    levels -= render
+    difference = np.abs(levels, out=levels).mean(axis=2, dtype=np.float32) / 255.0  # [H, W]
     return colored(difference, 0.0, ERROR_RANGE, "magma")
 
 

@@ -82,7 +82,7 @@ class Progress(AbstractContextManager["Progress"]):
         if report.step % LOG_EVERY and report.step != self._last_step:
             return
         image = np.clip(report.output.image, 0.0, 1.0)  # [H, W, 3]
-        view_psnr = psnr(image, report.view.image.astype(image.dtype) / 255, report.view.mask)
+        view_psnr = psnr(image, report.view.image, report.view.mask)
         self._psnrs.append(min(view_psnr, PSNR_MAX))
         loss, mean_psnr = float(np.mean(self._losses)), float(np.mean(self._psnrs))
         gaussians = report.state.gaussians

@@ -36,7 +36,7 @@ DAMAGE_ERRORS = (  # what Pillow's decoders raise for damaged files
     *(OSError, SyntaxError, ValueError, TypeError, LookupError, ArithmeticError, AttributeError, EOFError),
     *(RuntimeError, struct.error, zlib.error),
 )
-_LIMIT_LOCK = threading.Lock()
+_LOCK = threading.Lock()  # Pillow's limit and Python's filters of warnings are those of all threads
 MASK_THRESHOLD = 128  # a mask pixel counts from half white on; masks saved as JPEG are not exactly 0 and 255
 
 
@@ -45,10 +45,10 @@ def open_image(path: Path) -> Iterator[Image.Image]:
     """Open an image file with Pillow; whatever goes wrong while it is decoded becomes an InputError naming the file.
 
     Pillow's limit of pixels, beyond which it speaks of a bomb, is below what telephones take; ours is
-    :data:`PIXELS_MAX`. What Pillow warns of, such as damaged EXIF data, does not matter here.
+    :data:`PIXELS_MAX`. What Pillow warns of, such as damaged EXIF data, does not matter here. One thread at a time.
     """
     try:
-        with _File(path) as file, warnings.catch_warnings():
+        with _LOCK, _File(path) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")
             with _without_limit():
                 opened = Image.open(file)
@@ -87,12 +87,11 @@ class _File(io.BufferedReader):
 @contextmanager
 def _without_limit() -> Iterator[None]:
     """Set Pillow's limit of pixels aside while a file is opened, which reads no pixels."""
-    with _LIMIT_LOCK:
-        limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
-        try:
-            yield
-        finally:
-            Image.MAX_IMAGE_PIXELS = limit
+    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+    try:
+        yield
+    finally:
+        Image.MAX_IMAGE_PIXELS = limit
 
 
 def check_n_pixels(what: str | Path, width: int, height: int) -> None:
@@ -137,7 +136,8 @@ def read_image(path: str | Path) -> NDArray[np.uint8]:
         if image.mode.startswith("I"):  # gray of 16 bits; Pillow itself keeps the upper byte of 16-bit colour files
             gray = (np.asarray(image) >> 8).clip(0, 255).astype(np.uint8)  # [H, W]
             return np.repeat(gray[..., None], 3, axis=2)  # [H, W, 3]
-        return np.array(image.convert("RGBA" if image.has_transparency_data else "RGB"))
+        mode = "RGBA" if image.has_transparency_data else "RGB"
+        return np.array(image if image.mode == mode else image.convert(mode))  # converting would copy it in any case
 
 
 def read_mask(path: str | Path) -> Bools:

@@ -4,7 +4,7 @@ COLMAP chooses the pinhole: the same focal length, and the largest image without
 """
 
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +51,13 @@ def import_quiet_pycolmap() -> ModuleType:
     return pycolmap
 
 
+def pinhole_of(camera: Camera, lens: Lens) -> Camera:
+    """Return the pinhole camera that :func:`undistort` gives, which does not depend on the photograph."""
+    pycolmap = import_pycolmap()
+    distorted = pycolmap.Camera(model=lens.model, width=camera.width, height=camera.height, params=lens.params)
+    return _as_pinhole(camera, lens, pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), distorted))
+
+
 def undistort(
     image: NDArray[np.uint8], mask: Bools | None, camera: Camera, lens: Lens
 ) -> tuple[NDArray[np.uint8], Bools | None, Camera]:
@@ -76,14 +83,20 @@ def undistort(
     distorted = pycolmap.Camera(model=lens.model, width=camera.width, height=camera.height, params=lens.params)
     options = pycolmap.UndistortCameraOptions()
     bitmap, pinhole = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(image), distorted)
+    undistorted = _as_pinhole(camera, lens, pinhole)
+    if mask is not None:
+        white = pycolmap.Bitmap.from_array(mask.astype(np.uint8) * np.uint8(255))
+        mask = pycolmap.undistort_image(options, white, distorted)[0].to_array() >= MASK_THRESHOLD
+    return bitmap.to_array(), mask, undistorted
+
+
+def _as_pinhole(camera: Camera, lens: Lens, pinhole: Any) -> Camera:
+    """Return the camera with the intrinsics and the size of a ``pycolmap.Camera`` without distortion."""
     if pinhole.model.name not in PINHOLE_MODELS:
         raise InputError(
             f"camera model {lens.model} has no undistorted pinhole; cut pinhole views out of its images first"
         )
-    if mask is not None:
-        white = pycolmap.Bitmap.from_array(mask.astype(np.uint8) * np.uint8(255))
-        mask = pycolmap.undistort_image(options, white, distorted)[0].to_array() >= MASK_THRESHOLD
-    camera = camera._replace(
+    return camera._replace(
         fx=pinhole.focal_length_x,
         fy=pinhole.focal_length_y,
         cx=pinhole.principal_point_x,
@@ -91,4 +104,3 @@ def undistort(
         width=pinhole.width,
         height=pinhole.height,
     )
-    return bitmap.to_array(), mask, camera

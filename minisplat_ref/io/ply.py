@@ -129,29 +129,29 @@ def save_ply(path: str | Path, gaussians: Any) -> None:
     rest_names = tuple(f"f_rest_{i}" for i in range(3 * n_rest))
     further = {name: field for name, field in gaussians._asdict().items() if name not in Gaussians._fields}
     fields = (
-        (MEANS, gaussians.means),
-        (NORMALS, np.zeros((n, 3))),
-        (SH_DC, gaussians.sh_dc),
-        (rest_names, gaussians.sh_rest.transpose(0, 2, 1).reshape(n, 3 * n_rest)),
-        (("opacity",), gaussians.opacity_logits[:, None]),
-        (SCALES, gaussians.log_scales),
-        (QUATS, gaussians.quats),
+        (MEANS, gaussians.means.T),
+        (NORMALS, np.zeros((3, n), np.float32)),
+        (SH_DC, gaussians.sh_dc.T),
+        (rest_names, [gaussians.sh_rest[:, k, c] for c in range(3) for k in range(n_rest)]),
+        (("opacity",), gaussians.opacity_logits[None]),
+        (SCALES, gaussians.log_scales.T),
+        (QUATS, gaussians.quats.T),
         *(_further_properties(name, field) for name, field in further.items()),
     )
-    columns: dict[str, NDArray] = {}
+    columns: dict[str, NDArray] = {}  # where they are float32, views: a large population is not copied
     with np.errstate(over="ignore"):  # becomes infinite, which check_finite names
         for names, values in fields:
-            columns |= zip(names, values.astype(np.float32).T, strict=True)
+            columns |= zip(names, (column.astype(np.float32, copy=False) for column in values), strict=True)
     check_finite(path, columns)
     write_vertices(path, columns)
 
 
 def _further_properties(name: str, field: NDArray) -> tuple[tuple[str, ...], NDArray]:
-    """Names of the properties of a further field, and their values [N, k]."""
+    """Names of the properties of a further field, and their values [k, N]."""
     if field.ndim == 1:
-        return (name,), field[:, None]
+        return (name,), field[None]
     if field.ndim == 2:
-        return tuple(f"{name}_{i}" for i in range(field.shape[1])), field
+        return tuple(f"{name}_{i}" for i in range(field.shape[1])), field.T
     raise TypeError(f"field {name} has {field.ndim} axes, a PLY holds two: give the extension save and load of its own")
 
 

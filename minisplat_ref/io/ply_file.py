@@ -27,6 +27,7 @@ SCALAR_TYPES = {
 }
 COUNT_TYPES = [name for name, code in SCALAR_TYPES.items() if code[0] != "f"]
 BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+ROWS_AT_ONCE = 1 << 16  # that are put together for writing
 HEADER_LINE_MAX = 4096  # bytes; no header line is longer, and a file without line breaks must not be read whole
 
 
@@ -142,13 +143,17 @@ def write_vertices(path: str | Path, columns: Mapping[str, NDArray]) -> None:
     """
     type_names = {code: name for name, code in reversed(SCALAR_TYPES.items()) if not name[-1].isdigit()}
     dtype = np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
-    rows = np.empty(len(next(iter(columns.values()))), dtype)  # [P]
-    for name, column in columns.items():
-        rows[name] = column
+    n = len(next(iter(columns.values())))
     properties = "".join(f"property {type_names[c.dtype.str[1:]]} {name}\n" for name, c in columns.items())
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
-    with replacing(path) as temporary:
-        temporary.write_bytes(header.encode("ascii") + rows.tobytes())
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {n}\n{properties}end_header\n"
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        file.write(header.encode("ascii"))
+        for start in range(0, n, ROWS_AT_ONCE):  # so that memory never holds all of them twice
+            part = slice(start, start + ROWS_AT_ONCE)
+            rows = np.empty(len(range(n)[part]), dtype)
+            for name, column in columns.items():
+                rows[name] = column[part]
+            file.write(rows.data)
 
 
 def _open(path: Path) -> BinaryIO:

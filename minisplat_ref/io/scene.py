@@ -1,13 +1,16 @@
 """From photographs with cameras to a :class:`Scene`: what the COLMAP and transforms.json readers have in common.
 
 Pixels are read, masked, composited, undistorted and downscaled here, and everything that makes a scene unusable is
-found here. Left out: lazy loading, all pictures are held in memory as uint8.
+found here. All photographs are held in memory as uint8 if they take a moderate part of it; of a scene whose photographs
+would take more, only sizes are checked here, and pixels are read whenever they are needed
+(:mod:`minisplat_ref.io.stored_views`).
 """
 
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +29,9 @@ from minisplat_ref.io.images import (
     resize_image,
     resize_mask,
 )
-from minisplat_ref.io.lens import Lens, undistort
+from minisplat_ref.io.lens import Lens, pinhole_of, undistort
 from minisplat_ref.io.names import is_file
+from minisplat_ref.io.stored_views import Photograph, Pixels, Shelf, StoredView
 from minisplat_ref.types import Bools, Camera, Floats, Ints, Scene, View, numbered
 
 EXTENT_MARGIN = 1.1  # the 3DGS code's factor on the radius of the cameras; the learning rates were tuned with it
@@ -102,7 +106,7 @@ def build_scene(
     point_colors: NDArray[np.uint8],
     reading: Reading,
 ) -> Scene:
-    """Read all pixels and put the scene together.
+    """Put the scene together, with all pixels in memory if they take a moderate part of it.
 
     Parameters
     ----------
@@ -135,14 +139,17 @@ def build_scene(
     for photo in photos:
         check_photo(photo, source, reading.undistort)
     _check_points(points, source)
-    memory.check_photographs(
-        source, sum(photo.camera.width * photo.camera.height for photo in photos), reading.downscale
-    )
+    memory.check_photograph(source, max(_n_pixels(photo) for photo in photos), reading.downscale)
     extent = camera_extent([photo.camera for photo in train_photos])
     if extent == 0.0:
         raise InputError(f"{source}: all training cameras stand at one point, which shows no depth; move between shots")
     names = _view_names(photos, source)
-    views = tuple(read_view(photo, name, reading) for photo, name in zip(photos, names, strict=True))
+    shelf_bytes = memory.shelf_bytes(sum(map(_n_bytes, photos)) / reading.downscale**2)
+    if shelf_bytes is None:
+        views = tuple(read_view(photo, name, reading) for photo, name in zip(photos, names, strict=True))
+    else:
+        shelf = Shelf(shelf_bytes)
+        views = tuple(stored_view(photo, name, reading, shelf) for photo, name in zip(photos, names, strict=True))
     folder = source if source.is_dir() else source.parent
     return Scene(
         name=folder.resolve().name,
@@ -153,6 +160,15 @@ def build_scene(
         background=reading.background,
         extent=extent,
     )
+
+
+def _n_pixels(photo: Photo) -> int:
+    return photo.camera.width * photo.camera.height
+
+
+def _n_bytes(photo: Photo) -> int:
+    """Bytes of its pixels and its mask at full resolution."""
+    return (3 + (photo.mask_path is not None)) * _n_pixels(photo)
 
 
 def check_photo(photo: Photo, source: Path, undistort: bool) -> None:
@@ -201,37 +217,87 @@ def camera_extent(cameras: Sequence[Camera]) -> float:
 
 
 def read_view(photo: Photo, name: str, reading: Reading) -> View:
-    """Read one photograph: alpha, mask, undistortion, downscaling, in this order."""
-    camera, path = photo.camera, photo.path
+    """Return the view of a photograph with its pixels."""
+    camera = _camera(photo, reading)  # before the pixels are read, of which a damaged file can claim any number
+    image, mask = _read_pixels(photo, reading, camera)
+    return View(name, camera, image, mask, photo.point_ids, time=photo.time)
+
+
+def stored_view(photo: Photo, name: str, reading: Reading, shelf: Shelf) -> View:
+    """Return the view of a photograph whose pixels are read when they are needed; of the file only the size is read."""
+    camera = _camera(photo, reading)
+    read = partial(_read_again, photo, reading, camera, _signature(photo, reading))
+    n_pixels = _n_pixels(photo) if _path(photo, reading) == photo.path else camera.width * camera.height
+    photograph: Any = Photograph(read, n_pixels, shelf)
+    return StoredView(name, camera, photograph, None, photo.point_ids, time=photo.time)
+
+
+def _path(photo: Photo, reading: Reading) -> Path:
+    """File to read: in the folder of downscaled images where there is one; lenses are of the full size."""
     small_folder = photo.folder.with_name(f"{photo.folder.name}_{reading.downscale}")
     is_small = reading.downscale > 1 and photo.lens is None and small_folder.is_dir()
-    if is_small:
-        path = small_folder / photo.file
-    width, height = image_size(path)  # before the pixels are read, of which a damaged file can claim any number
-    if is_small:
+    return small_folder / photo.file if is_small else photo.path
+
+
+def _camera(photo: Photo, reading: Reading) -> Camera:
+    """Camera of the view, undistorted and downscaled; refuses a file whose size is not that of its camera."""
+    camera, path = photo.camera, _path(photo, reading)
+    width, height = image_size(path)
+    if path != photo.path:
         _check_downscaled(photo, width, height, reading.downscale)
-    elif (width, height) != (camera.width, camera.height):
+        return rescale_camera(camera, width, height)
+    if (width, height) != (camera.width, camera.height):
         raise InputError(_wrong_size(photo, path, width, height))
-    image = read_image(path)  # [H, W, 3 or 4]
+    if photo.lens is not None:
+        camera = pinhole_of(camera, photo.lens)
+    return rescale_camera(camera, *downscaled_size(camera.width, camera.height, reading.downscale))
+
+
+def _read_pixels(photo: Photo, reading: Reading, camera: Camera) -> Pixels:
+    """Read one photograph for the camera of its view: alpha, mask, undistortion, downscaling, in this order."""
+    image = read_image(_path(photo, reading))  # [H, W, 3 or 4]
     image, mask = _apply_alpha_and_mask(image, photo, reading)
     if photo.lens is not None:
-        image, mask, camera = undistort(image, mask, camera, photo.lens)
-    if not is_small:
-        width, height = downscaled_size(camera.width, camera.height, reading.downscale)
-    if (width, height) != (image.shape[1], image.shape[0]):
-        image = resize_image(image, width, height)
-        mask = None if mask is None else resize_mask(mask, width, height)
-    return View(name, rescale_camera(camera, width, height), image, mask, photo.point_ids, time=photo.time)
+        image, mask, _ = undistort(image, mask, photo.camera, photo.lens)
+    return _resized(Pixels(image, mask), camera.width, camera.height)
+
+
+def _read_again(photo: Photo, reading: Reading, camera: Camera, signature: list[tuple[int, int] | None]) -> Pixels:
+    """Read one photograph, which may be long after its scene was loaded, from files that are still the same."""
+    now = _signature(photo, reading)
+    try:
+        if None not in now and now != signature:
+            raise InputError(f"{_path(photo, reading)}: has changed since its scene was loaded")
+        return _read_pixels(photo, reading, camera)
+    except InputError as error:
+        raise InputError(
+            f"{error} (photographs that do not all fit into memory are read again and again: leave them as they are)"
+        ) from error
+
+
+def _signature(photo: Photo, reading: Reading) -> list[tuple[int, int] | None]:
+    """Time of the last change and size of the files of a photograph, None for one that is missing."""
+    paths = [_path(photo, reading), *([] if photo.mask_path is None else [photo.mask_path])]
+    stats = [path.stat() if is_file(path) else None for path in paths]
+    return [None if stat is None else (stat.st_mtime_ns, stat.st_size) for stat in stats]
 
 
 def half_size(view: View) -> View:
     """Return the view with half as many pixels a side, rounded, and its camera's intrinsics to match."""
     width, height = downscaled_size(view.camera.width, view.camera.height, 2)
-    return view._replace(
-        camera=rescale_camera(view.camera, width, height),
-        image=resize_image(view.image, width, height),
-        mask=None if view.mask is None else resize_mask(view.mask, width, height),
-    )
+    camera = rescale_camera(view.camera, width, height)
+    if isinstance(view, StoredView):
+        return view.changed(partial(_resized, width=width, height=height))._replace(camera=camera)
+    image, mask = _resized(Pixels(view.image, view.mask), width, height)
+    return view._replace(camera=camera, image=image, mask=mask)
+
+
+def _resized(pixels: Pixels, width: int, height: int) -> Pixels:
+    """Return a photograph and its mask at another size."""
+    image, mask = pixels
+    if image.shape[:2] == (height, width):
+        return pixels
+    return Pixels(resize_image(image, width, height), None if mask is None else resize_mask(mask, width, height))
 
 
 def rescale_camera(camera: Camera, width: int, height: int) -> Camera:

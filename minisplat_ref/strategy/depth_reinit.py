@@ -182,8 +182,8 @@ def reinitial_points(
     for view in views:
         _, depths, alpha = points_of(model, view, conventions, backend, renderer)
         is_drawable = (depths > 0) & (alpha >= least_alpha)
-        if view.mask is not None:
-            is_drawable &= view.mask
+        if (mask := view.mask) is not None:
+            is_drawable &= mask
         depth_maps.append(depths)
         weight_maps.append(np.where(is_drawable, alpha, 0))
 

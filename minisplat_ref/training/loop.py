@@ -22,6 +22,7 @@ from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.checkpoint import load_checkpoint, save_checkpoint
 from minisplat_ref.io.scene import half_size
+from minisplat_ref.io.stored_views import ReadingAhead, make_room
 from minisplat_ref.rendering import RenderGradient, Request
 from minisplat_ref.strategy.initialization import initial_gaussians
 from minisplat_ref.strategy.ops import contiguous, n_rows
@@ -34,7 +35,7 @@ from minisplat_ref.training.rates import active_sh_degree
 from minisplat_ref.training.saved_state import read_bundles, read_counters, read_generator, written_by
 from minisplat_ref.training.schedule import During, Event, Recipe, action_name, describe
 from minisplat_ref.training.state import FiredEvent, Iteration, StepReport, TrainState
-from minisplat_ref.types import Floats, Ints, Scene, numbered
+from minisplat_ref.types import Floats, Ints, Scene, View, numbered
 
 HALF_SIZE = "half_size_views"  # what training on views of half the size is called in the record of what fired
 SHARED_RULE = AdamRule(is_visible_only=False, has_bias_correction=True)  # shared parameters have no visible rows
@@ -120,7 +121,8 @@ def train(
     ------
     InputError
         The scene has no training views or is not the one that ``state`` was trained on; a loss term says that the
-        scene lacks what it needs; a number is not finite; or memory has no room for more Gaussians.
+        scene lacks what it needs; a number is not finite; memory has no room for more Gaussians; or a photograph that
+        has to be read again is gone or has changed.
     KeyboardInterrupt
         After Ctrl-C, at once, or at the end of the iteration where that has begun to change the state: the ``state``
         that was passed in is whole and can be saved. Whoever presses again during it does not want to wait.
@@ -131,8 +133,8 @@ def train(
     scene = scene._replace(train_views=numbered(scene.train_views))
     _check_fits(state, scene, recipe)
     small_scene = _half_size(scene, recipe.least_half_size) if state.step < recipe.half_size_until else scene
-    around = _Surroundings(recipe, backend, conventions, guard)
-    with Interruptions() as interruptions:
+    with ReadingAhead() as ahead, Interruptions() as interruptions:
+        around = _Surroundings(recipe, backend, conventions, guard, ahead)
         while state.step < recipe.iterations:
             seen = small_scene if state.step < recipe.half_size_until else scene
             report = _iterate(state, seen, around, interruptions)
@@ -183,6 +185,7 @@ class _Surroundings(NamedTuple):
     backend: Backend
     conventions: Conventions
     guard: Guard
+    ahead: ReadingAhead
 
 
 class _Differentiated(NamedTuple):
@@ -203,7 +206,7 @@ def _differentiate(state: TrainState, scene: Scene, around: _Surroundings) -> _D
     recipe, step = around.recipe, state.step + 1
     renderer = recipe.renderer
     view_id = _next_view(state, len(scene.train_views))
-    view = scene.train_views[view_id]
+    view = around.ahead.load(scene.train_views[view_id], _following_view(state, scene))
     terms = [term for term in recipe.losses if term.is_due(step)]
     background = state.rng.random(3) if recipe.has_random_background else scene.background
     request = Request(
@@ -242,8 +245,10 @@ def _change(state: TrainState, scene: Scene, around: _Surroundings, differentiat
     if is_editing or guard.is_due(case.step):
         guard.check_parameters(case, "Adam")
     if is_editing:
-        n_bytes, n_pairs = sum(field.nbytes for field in state.gaussians), rendered.output.n_pairs
-        state.most_rows = memory.rows_that_fit(len(state.gaussians.means), n_bytes, n_pairs, memory.free_bytes())
+        n, n_pairs = len(state.gaussians.means), rendered.output.n_pairs
+        n_bytes = sum(field.nbytes for field in state.gaussians)
+        to_be_kept = make_room(scene.train_views, memory.bytes_to_double(n, n_bytes, n_pairs))
+        state.most_rows = memory.rows_that_fit(n, n_bytes, n_pairs, memory.free_bytes() - to_be_kept)
     output = rendered.output._replace(image=rendered.channel("rgb"))
     iteration = Iteration(
         scene,
@@ -311,6 +316,11 @@ def _next_view(state: TrainState, n_views: int) -> int:
     if not state.view_order:
         state.view_order = state.rng.permutation(n_views).tolist()
     return state.view_order.pop()
+
+
+def _following_view(state: TrainState, scene: Scene) -> View | None:
+    """Return the view of the next iteration; None at the end of a round, where it has not been drawn yet."""
+    return scene.train_views[state.view_order[-1]] if state.view_order else None
 
 
 def _half_size(scene: Scene, least: int) -> Scene:

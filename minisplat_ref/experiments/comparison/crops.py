@@ -43,7 +43,7 @@ def choose_crops(models: Sequence[Trained], scene: Scene) -> list[Crop]:
     scene : Scene
         Its test views are shown.
     """
-    pairs = [_best_crops(models, view) for view in scene.test_views]
+    pairs = [_best_crops(models, view.loaded()) for view in scene.test_views]
     n_different = (min(N_CROPS, len(pairs)) + 1) // 2 if len(models) > 1 else 0
     pairs.sort(key=lambda pair: pair[0].score, reverse=True)
     different, others = pairs[:n_different], pairs[n_different:]
@@ -64,7 +64,9 @@ def _best_crop(view: View, renders: Sequence[Picture], values: Floats, reason: s
     height, width = (max(1, round(CROP_FRACTION * length)) for length in values.shape)
     row, column, score = best_window(values, height, width)
     window = np.s_[row : row + height, column : column + width]
-    return Scored(score, Crop(view.name, reason, view.image[window], tuple(image[window] for image in renders)))
+    return Scored(
+        score, Crop(view.name, reason, view.image[window].copy(), tuple(image[window].copy() for image in renders))
+    )
 
 
 def difference(truth: Picture, renders: Sequence[Picture]) -> Floats:
