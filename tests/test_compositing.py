@@ -430,6 +430,60 @@ def test_backends_agree(fast_backend, conventions, dtype, rng):
         assert_allclose(a, e, rtol=0, atol=(PARITY_FLOAT64 if is_exact else PARITY_FLOAT32_GRADIENT) * np.abs(e).max())
 
 
+# --- bounds of the kernels, which know what they leave out ---
+
+
+@pytest.mark.parametrize("direction", ["up and down", "left and right"])
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_no_hit_at_the_rim_is_lost(fast_backend, dtype, direction, rng):
+    """Where the ellipse is widest stands a pixel whose alpha is alpha_min and a few roundings: it is to be blended.
+
+    The kernels look for such a pixel in the rows, columns and tiles that they computed the ellipse to reach, with
+    roundings of their own.
+    """
+    width, height, n_across = 4 * fast_backend.tile_width, 8 * fast_backend.tile_height, 8
+    n = n_across**2  # each in a part of the image of its own
+    corners = np.stack(np.divmod(np.arange(n), n_across)[::-1], axis=1) * [width, height]  # [N, 2]
+    a, c = rng.uniform(0.02, 0.1, (2, n))
+    conics = np.column_stack([a, rng.uniform(-0.8, 0.8, n) * np.sqrt(a * c), c])  # [N, 3]
+    rims = corners + np.array([width // 2, height // 2])  # first pixel of a tile
+    rims[::2] -= 1  # or the last of the one before
+    sides = np.where(np.arange(n) % 2, 1, -1)  # the mean lies in the tile of the pixel or beyond
+    distances = sides * rng.uniform(3, 9, n)
+    if direction == "up and down":
+        offsets = np.column_stack([-conics[:, 1] / a * distances, distances])
+    else:
+        offsets = np.column_stack([distances, -conics[:, 1] / c * distances])
+    means2d = (rims + 0.5 + offsets).astype(dtype)
+    dx, dy = (means2d.astype(float) - (rims + 0.5)).T
+    sigmas = 0.5 * (a * dx * dx + c * dy * dy) + conics[:, 1] * dx * dy
+    alphas = dtype(GSPLAT_MAIN.alpha_min) * (1 + 20 * np.finfo(dtype).eps)
+    projection = splats(means2d, conics, alphas * np.exp(sigmas), np.ones(n), boxes=np.hstack([corners, corners]))
+    projection.boxes[:, 2:] += [width, height]
+    projection = projection._replace(
+        means2d=means2d, depths=np.ones(n, dtype), opacities=projection.opacities.astype(dtype)
+    )
+    assert projection.opacities.max() < 1
+    size = n_across * width, n_across * height
+    output = blend(fast_backend, projection, np.ones((n, 1)), [0], size=size, dtype=dtype)
+    assert_array_equal(output.alpha[rims[:, 1], rims[:, 0]] > 0, True)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("conic", [(4, 2, 1), (4, -2, 1), (1e-6, 1e-3, 1), (1, -1e-3, 1e-6), (1, 1 + 1e-12, 1)])
+def test_a_needle_without_end(fast_backend, conic, dtype):
+    """a c - b^2 has no digit left, or is below zero: sigma = a (dx + b dy / a)^2 / 2, and no bound becomes NaN."""
+    size = 4 * fast_backend.tile_width, 4 * fast_backend.tile_height
+    projection = as_dtype(splats([[50.5, 30.5]], [conic], [0.9], [1], size=size), dtype)
+    projection = projection._replace(conics=np.array([conic], dtype=float))
+    xs, ys = np.meshgrid(np.arange(size[0]) - 50, np.arange(size[1]) - 30)
+    unclamped = 0.9 * np.exp(-0.5 * conic[0] * (xs + conic[1] / conic[0] * ys) ** 2)
+    expected = np.where(unclamped >= GSPLAT_MAIN.alpha_min, unclamped, 0)
+    assert np.abs(unclamped - GSPLAT_MAIN.alpha_min).min() > 1e-6  # none is at the threshold
+    output = blend(fast_backend, projection, np.ones((1, 1)), [0], size=size, dtype=dtype)
+    assert_allclose(output.alpha, expected, rtol=0, atol=PARITY_FLOAT32_IMAGE)
+
+
 def test_inria_is_not_gsplat(backend, rng):
     # The profiles differ where they say so: INRIA's boxes cut what gsplat's show.
     camera = make_camera(37, 29)

@@ -21,9 +21,10 @@ from minisplat_ref.methods import RECIPES, gaussian_splatting
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import render
 from minisplat_ref.training.loop import initial_state, load_state, save_state, train
+from minisplat_ref.training.rates import LogLinear
 from minisplat_ref.training.schedule import BLEND_STATS, At, During, Every, configured
 from minisplat_ref.training.state import FiredEvent
-from minisplat_ref.types import Scene, View
+from minisplat_ref.types import Gaussians, Scene, View
 
 N_VIEWS, N_GAUSSIANS = 4, 30
 
@@ -164,6 +165,19 @@ def test_the_loop_tells_whether_views_were_halved(scene):
     train(scene, recipe, seed=0, on_step=lambda report: told.extend((report.step, event) for event in report.fired))
     n = N_GAUSSIANS
     assert told == [(1, FiredEvent("half_size_views", n, n, 0.0, "until iteration 3"))]
+
+
+def test_rates_are_those_of_the_iteration_that_is_done(scene):
+    """Counted from 1. Adam without bias corrections hands the rate on as it is; means are the first field."""
+    schedule, taken = LogLinear(1e-3, 1e-5, 3), []
+
+    def adam_update(*arrays_and_step):
+        taken.append(arrays_and_step[-1].rate)
+        return CPU.adam_update(*arrays_and_step)
+
+    recipe = PLAIN._replace(iterations=3, learning_rates=PLAIN.learning_rates.changed(means=schedule))
+    train(scene._replace(extent=2.0), recipe, seed=0, backend=replace(CPU, adam_update=adam_update))
+    assert taken[:: len(Gaussians._fields)] == [2.0 * schedule.at(step) for step in (1, 2, 3)]
 
 
 def test_mask_and_random_background(scene):

@@ -1,0 +1,258 @@
+"""``python -m data_tools.mutation``: change the code in one place at a time, and see whether a test fails.
+
+A change that no test notices, a *survivor*, is a line that could be wrong without anybody knowing; or the change makes
+no difference, which only a reader can tell. cosmic-ray makes the changes, and keeps them with what came of them in a
+session, which its own commands (``cr-report``, ``cr-html``) read, too. Which code is changed, and how, is in
+``mutation.toml``. Compiled kernels are left out: their proof is the parity with the book and the planted errors of the
+tests.
+
+All changes would take days, so a part of them is drawn: first places, so that no operator with many alternatives comes
+first, then one change for each. Each is tested by the test files that import the module, the nearest first, for a
+bounded time. So a score is a lower bound: a survivor may be noticed by a test that was not run.
+
+Changes are made in a copy of the working tree. It needs ``pip install '.[mutation]'``.
+"""
+
+import ast
+import math
+import os
+import random
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from cosmic_ray.commands import init
+from cosmic_ray.config import load_config
+from cosmic_ray.modules import filter_paths, find_modules
+from cosmic_ray.mutating import mutate_and_test
+from cosmic_ray.work_db import WorkDB, use_db
+
+from minisplat_ref.experiments.arguments import HelpFormatter, Parser, integer
+from minisplat_ref.reporting import markdown_table
+
+ROOT = Path(__file__).resolve().parents[1]
+SETTINGS = "data_tools/mutation.toml"
+TESTS = Path("tests")
+
+
+class Imports:
+    """Which module of the package imports which, and which test file."""
+
+    def __init__(self, modules: Iterable[Path], tests: Iterable[Path]) -> None:
+        self._re_exports = {
+            (dotted(path), alias.asname or alias.name): node.module or ""
+            for path in modules
+            if path.name == "__init__.py"
+            for node in ast.walk(ast.parse(path.read_text()))
+            if isinstance(node, ast.ImportFrom)
+            for alias in node.names
+        }
+        self._of_modules = {dotted(path): self._of(path) for path in modules}
+        self._of_tests = {path: self._of(path) for path in tests}
+
+    def tests_of(self, module: Path) -> list[Path]:
+        """Return the test files that import a module, or what imports it if none does, and those of its command.
+
+        Named like the module come first, then those that import most of its names and least besides.
+        """
+        name, wanted = dotted(module), {dotted(module)}
+        stem = name.rpartition(".")[2]
+        found = [path for path in self._of_tests if f'"{stem}"' in path.read_text()]
+        n_before = 0
+        while not (imported := [path for path, names in self._of_tests.items() if names.keys() & wanted]):
+            if len(wanted) == n_before:
+                break
+            n_before = len(wanted)
+            wanted |= {importer for importer, names in self._of_modules.items() if names.keys() & wanted}
+
+        def rank(path: Path) -> tuple[bool, int, int, Path]:
+            return stem not in path.stem, -self._of_tests[path][name], len(self._of_tests[path]), path
+
+        return sorted({*found, *imported}, key=rank)
+
+    def _of(self, path: Path) -> Counter[str]:
+        """Return the modules that a file imports, each with the number of names that it takes from it."""
+        names: Counter[str] = Counter()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                names.update(alias.name for alias in node.names)
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                names[node.module] += 1
+                names.update(f"{node.module}.{alias.name}" for alias in node.names)  # which may be a module
+                names.update(self._re_exports.get((node.module, alias.name), node.module) for alias in node.names)
+        return names
+
+
+def dotted(path: Path) -> str:
+    """Return the name by which a file is imported."""
+    return ".".join(path.with_suffix("").parts).removesuffix(".__init__")
+
+
+def annotations(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+    """Return from where to where type annotations reach, as (line, column); to change them changes nothing."""
+    found: list[ast.expr | None] = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.arg | ast.AnnAssign):
+            found.append(node.annotation)
+        elif isinstance(node, ast.FunctionDef):
+            found.append(node.returns)
+    return [
+        ((node.lineno, node.col_offset), (node.end_lineno or 0, node.end_col_offset or 0)) for node in found if node
+    ]
+
+
+def drawn_changes(modules: Sequence[Path], settings: Mapping[str, Any], n: int, rng: random.Random) -> list[Any]:
+    """Return the work items of cosmic-ray for ``n`` changes, no two of them in one place."""
+    unwanted = re.compile("|".join(settings["filters"]["operators-filter"]["exclude-operators"]))
+    with TemporaryDirectory() as folder, use_db(Path(folder, "all.sqlite")) as db:
+        init(modules, db, {})
+        items = db.work_items
+    types = {module: annotations(module.read_text()) for module in modules}
+    places = defaultdict(list)
+    for item in items:
+        (change,) = item.mutations
+        is_type = any(first <= change.start_pos < end for first, end in types[change.module_path])
+        if not is_type and not unwanted.fullmatch(change.operator_name):
+            places[str(change.module_path), change.start_pos, change.end_pos].append(item)
+    chosen = rng.sample(sorted(places), min(n, len(places)))
+    by_name = {place: sorted(places[place], key=lambda item: _order(item.mutations[0])) for place in chosen}
+    print(f"{len(chosen):,} of {len(places):,} places where the code can be changed", flush=True)
+    return [rng.choice(by_name[place]) for place in chosen]
+
+
+def _order(change: Any) -> tuple[str, int]:
+    return change.operator_name, change.occurrence
+
+
+class Clock:
+    """Runs test files on the unchanged code, for how long they take."""
+
+    def __init__(self, command: Sequence[str], seconds: float) -> None:
+        self._command, self._limit = command, seconds
+        self._seconds: dict[Path, float] = {}
+
+    def within(self, tests: Iterable[Path]) -> tuple[list[Path], float]:
+        """Return the first test files that take no longer than the limit, and how long they take.
+
+        Those that take longer by themselves are passed over. The fastest comes first.
+        """
+        chosen: list[Path] = []
+        for path in tests:
+            if sum(map(self._of, chosen)) + self._of(path) <= self._limit:
+                chosen.append(path)
+            elif chosen:
+                break
+        return sorted(chosen, key=self._of), sum(map(self._of, chosen))
+
+    def _of(self, path: Path) -> float:
+        if path not in self._seconds:
+            self._seconds[path] = self._measured(path)
+            if self._limit < self._seconds[path]:  # if that was for kernels to be compiled, it is not so again
+                self._seconds[path] = self._measured(path)
+        return self._seconds[path]
+
+    def _measured(self, path: Path) -> float:
+        start = time.perf_counter()
+        try:
+            code = subprocess.run(
+                [*self._command, str(path)], capture_output=True, timeout=self._limit + 300
+            ).returncode
+        except subprocess.TimeoutExpired:
+            return math.inf
+        if code != 0:
+            sys.exit(f"{path} fails, or has no test, without a change: mend that first")
+        return time.perf_counter() - start
+
+
+def run(db: WorkDB, imports: Imports, settings: Mapping[str, Any], seconds: float) -> None:
+    """Test all changes of a session that have not been tested."""
+    command = shlex.split(settings["test-command"].replace("python", sys.executable, 1))
+    clock = Clock(command, seconds)
+    pending = sorted(db.pending_work_items, key=lambda item: (str(item.mutations[0].module_path), item.job_id))
+    for number, item in enumerate(pending, 1):
+        module = item.mutations[0].module_path
+        tests, expected = clock.within(imports.tests_of(module))
+        if not tests:
+            print(f"{module}: no test file within {seconds:.0f} s imports it", flush=True)
+            continue
+        line = shlex.join([*command, *map(str, tests)])
+        result = mutate_and_test(item.mutations, line, min(settings["timeout"], 60 + 5 * expected))
+        db.set_result(item.job_id, result)
+        place = f"{module}:{item.mutations[0].start_pos[0]}"
+        print(f"{number}/{len(pending)} {result.test_outcome} {place} {item.mutations[0].operator_name}", flush=True)
+
+
+def report(db: WorkDB) -> Iterator[str]:
+    """Yield the survivors as differences, then the score of every module."""
+    outcomes: dict[str, Counter[bool]] = defaultdict(Counter)
+    for item, result in sorted(db.completed_work_items, key=lambda pair: str(pair[0].mutations[0].module_path)):
+        outcomes[str(item.mutations[0].module_path)][result.is_killed] += 1
+        if not result.is_killed:
+            yield result.diff.split("\n", 1)[1]
+    rows = [(module, *_score(counts)) for module, counts in sorted(outcomes.items())]
+    total: Counter[bool] = sum(outcomes.values(), Counter())
+    if total:
+        yield markdown_table(("module", "noticed", "survived", "score"), [*rows, ("all", *_score(total))])
+
+
+def _score(counts: Counter[bool]) -> tuple[str, str, str]:
+    return str(counts[True]), str(counts[False]), f"{counts[True] / counts.total():.0%}"
+
+
+def copied(folder: Path) -> Path:
+    """Return a copy of the working tree as git sees it, beside the real scenes if they are there."""
+    names = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT,
+        capture_output=True,
+        check=True,
+    )
+    for name in filter(None, names.stdout.decode().split("\0")):
+        if (ROOT / name).is_file():
+            (folder / "repo" / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, folder / "repo" / name)
+    if (ROOT.parent / "shared").is_dir():
+        (folder / "shared").symlink_to(ROOT.parent / "shared")
+    return folder / "repo"
+
+
+def main() -> None:
+    """Draw, or continue a session; print what survived and the scores."""
+    parser = Parser(
+        prog="python -m data_tools.mutation",
+        description="Change the code in one place at a time, and see whether a test fails.",
+        formatter_class=HelpFormatter,
+    )
+    parser.add_argument("session", type=Path, help="file of the session; one that exists is continued")
+    parser.add_argument("paths", nargs="*", metavar="PATH", help="modules or folders (default: as mutation.toml says)")
+    parser.add_argument("--sample", type=integer(1), default=150, metavar="N", help="changes to draw (default 150)")
+    parser.add_argument("--seed", type=integer(0), default=0, metavar="S", help="of the draw (default 0)")
+    parser.add_argument(
+        "--seconds", type=integer(1), default=120, metavar="T", help="of tests for a change that survives (default 120)"
+    )
+    args = parser.parse_args()
+    session = args.session.resolve()
+    with TemporaryDirectory() as folder, use_db(session) as db:
+        os.chdir(copied(Path(folder)))
+        os.environ["PYTHONPATH"] = os.getcwd()
+        settings = load_config(SETTINGS)
+        every = sorted(find_modules(map(Path, settings["module-path"])))
+        if db.num_work_items == 0:
+            paths = find_modules(map(Path, args.paths or settings["module-path"]))
+            modules = sorted(filter_paths(paths, settings["excluded-modules"]))
+            db.add_work_items(drawn_changes(modules, settings, args.sample, random.Random(args.seed)))
+        run(db, Imports(every, sorted(TESTS.rglob("test_*.py"))), settings, args.seconds)
+        print("\n".join(report(db)))
+        os.chdir(ROOT)
+
+
+if __name__ == "__main__":
+    main()
