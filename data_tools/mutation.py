@@ -13,7 +13,6 @@ bounded time. So a score is a lower bound: a survivor may be noticed by a test t
 Changes are made in a copy of the working tree. It needs ``pip install '.[mutation]'``.
 """
 
-import ast
 import math
 import os
 import random
@@ -35,78 +34,13 @@ from cosmic_ray.modules import filter_paths, find_modules
 from cosmic_ray.mutating import mutate_and_test
 from cosmic_ray.work_db import WorkDB, use_db
 
+from data_tools.sources import Imports, annotations
 from minisplat_ref.experiments.arguments import HelpFormatter, Parser, integer
 from minisplat_ref.reporting import markdown_table
 
 ROOT = Path(__file__).resolve().parents[1]
 SETTINGS = "data_tools/mutation.toml"
 TESTS = Path("tests")
-
-
-class Imports:
-    """Which module of the package imports which, and which test file."""
-
-    def __init__(self, modules: Iterable[Path], tests: Iterable[Path]) -> None:
-        self._re_exports = {
-            (dotted(path), alias.asname or alias.name): node.module or ""
-            for path in modules
-            if path.name == "__init__.py"
-            for node in ast.walk(ast.parse(path.read_text()))
-            if isinstance(node, ast.ImportFrom)
-            for alias in node.names
-        }
-        self._of_modules = {dotted(path): self._of(path) for path in modules}
-        self._of_tests = {path: self._of(path) for path in tests}
-
-    def tests_of(self, module: Path) -> list[Path]:
-        """Return the test files that import a module, or what imports it if none does, and those of its command.
-
-        Named like the module come first, then those that import most of its names and least besides.
-        """
-        name, wanted = dotted(module), {dotted(module)}
-        stem = name.rpartition(".")[2]
-        found = [path for path in self._of_tests if f'"{stem}"' in path.read_text()]
-        n_before = 0
-        while not (imported := [path for path, names in self._of_tests.items() if names.keys() & wanted]):
-            if len(wanted) == n_before:
-                break
-            n_before = len(wanted)
-            wanted |= {importer for importer, names in self._of_modules.items() if names.keys() & wanted}
-
-        def rank(path: Path) -> tuple[bool, int, int, Path]:
-            return stem not in path.stem, -self._of_tests[path][name], len(self._of_tests[path]), path
-
-        return sorted({*found, *imported}, key=rank)
-
-    def _of(self, path: Path) -> Counter[str]:
-        """Return the modules that a file imports, each with the number of names that it takes from it."""
-        names: Counter[str] = Counter()
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Import):
-                names.update(alias.name for alias in node.names)
-            elif isinstance(node, ast.ImportFrom) and node.module:
-                names[node.module] += 1
-                names.update(f"{node.module}.{alias.name}" for alias in node.names)  # which may be a module
-                names.update(self._re_exports.get((node.module, alias.name), node.module) for alias in node.names)
-        return names
-
-
-def dotted(path: Path) -> str:
-    """Return the name by which a file is imported."""
-    return ".".join(path.with_suffix("").parts).removesuffix(".__init__")
-
-
-def annotations(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
-    """Return from where to where type annotations reach, as (line, column); to change them changes nothing."""
-    found: list[ast.expr | None] = []
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.arg | ast.AnnAssign):
-            found.append(node.annotation)
-        elif isinstance(node, ast.FunctionDef):
-            found.append(node.returns)
-    return [
-        ((node.lineno, node.col_offset), (node.end_lineno or 0, node.end_col_offset or 0)) for node in found if node
-    ]
 
 
 def drawn_changes(modules: Sequence[Path], settings: Mapping[str, Any], n: int, rng: random.Random) -> list[Any]:

@@ -1,0 +1,54 @@
+"""Which tests are run for a change, and which places are not worth one."""
+
+from pathlib import Path
+
+import pytest
+
+from data_tools.sources import Imports, annotations, dotted
+
+SOURCES = {
+    "package/__init__.py": "from package.shapes import area\nfrom package.deep.inner import core",
+    "package/shapes.py": "",
+    "package/deep/__init__.py": "",
+    "package/deep/inner.py": "",
+    "package/user.py": "from package.deep import inner",
+    "package/lonely.py": "",
+    "tests/test_area.py": "from package import area",
+    "tests/test_shapes.py": "import package.shapes",
+    "tests/test_much.py": "from package.shapes import area, volume, width",
+    "tests/test_user.py": "from package.user import use",
+    "tests/test_cli.py": 'main(["inner", "--help"])',
+}
+
+
+@pytest.fixture
+def imports(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, source in SOURCES.items():
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        Path(name).write_text(source)
+    return Imports(*(sorted(Path(folder).rglob("*.py")) for folder in ("package", "tests")))
+
+
+@pytest.mark.parametrize(
+    ("module", "tests"),
+    [
+        # Named like it; then by how much is imported from it; also through the package that exports its names.
+        ("package/shapes.py", ["test_shapes", "test_much", "test_area"]),
+        # No test imports it: those that import what does, and what names it as a command.
+        ("package/deep/inner.py", ["test_cli", "test_user", "test_area"]),
+        ("package/lonely.py", []),
+        ("package/__init__.py", ["test_area"]),
+    ],
+)
+def test_tests_of_a_module(imports, module, tests):
+    assert [path.stem for path in imports.tests_of(Path(module))] == tests
+
+
+def test_modules_are_named_as_they_are_imported():
+    assert dotted(Path("a/b/c.py")) == "a.b.c" and dotted(Path("a/b/__init__.py")) == "a.b"
+
+
+def test_types_are_found_where_they_stand():
+    source = "x: int | None = 1 | 2\n\ndef f(a: 'A', b=3) -> list[int]:\n    return a | b\n"
+    assert annotations(source) == [((1, 3), (1, 13)), ((3, 22), (3, 31)), ((3, 9), (3, 12))]
