@@ -42,7 +42,10 @@ class Imports:
         return sorted({*found, *imported}, key=rank)
 
     def _of(self, path: Path) -> Counter[str]:
-        """Return the modules that a file imports, each with the number of names that it takes from it."""
+        """Return the modules that a file imports, each with the number of names that it takes from it.
+
+        Of a package that is imported, those that its ``__init__`` imports are there with 0.
+        """
         names: Counter[str] = Counter()
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Import):
@@ -51,6 +54,7 @@ class Imports:
                 names[node.module] += 1
                 names.update(f"{node.module}.{alias.name}" for alias in node.names)  # which may be a module
                 names.update(self._re_exports.get((node.module, alias.name), node.module) for alias in node.names)
+                names.update({module: 0 for (package, _), module in self._re_exports.items() if package == node.module})
         return names
 
 

@@ -441,32 +441,32 @@ def test_no_hit_at_the_rim_is_lost(fast_backend, dtype, direction, rng):
     The kernels look for such a pixel in the rows, columns and tiles that they computed the ellipse to reach, with
     roundings of their own.
     """
-    width, height, n_across = 4 * fast_backend.tile_width, 8 * fast_backend.tile_height, 8
+    width, height, n_across = 2 * fast_backend.tile_width, 4 * fast_backend.tile_height, 32
     n = n_across**2  # each in a part of the image of its own
     corners = np.stack(np.divmod(np.arange(n), n_across)[::-1], axis=1) * [width, height]  # [N, 2]
-    a, c = rng.uniform(0.02, 0.1, (2, n))
-    conics = np.column_stack([a, rng.uniform(-0.8, 0.8, n) * np.sqrt(a * c), c])  # [N, 3]
     rims = corners + np.array([width // 2, height // 2])  # first pixel of a tile
     rims[::2] -= 1  # or the last of the one before
-    sides = np.where(np.arange(n) % 2, 1, -1)  # the mean lies in the tile of the pixel or beyond
-    distances = sides * rng.uniform(3, 9, n)
-    if direction == "up and down":
-        offsets = np.column_stack([-conics[:, 1] / a * distances, distances])
-    else:
-        offsets = np.column_stack([distances, -conics[:, 1] / c * distances])
-    means2d = (rims + 0.5 + offsets).astype(dtype)
-    dx, dy = (means2d.astype(float) - (rims + 0.5)).T
-    sigmas = 0.5 * (a * dx * dx + c * dy * dy) + conics[:, 1] * dx * dy
-    alphas = dtype(GSPLAT_MAIN.alpha_min) * (1 + 20 * np.finfo(dtype).eps)
-    projection = splats(means2d, conics, alphas * np.exp(sigmas), np.ones(n), boxes=np.hstack([corners, corners]))
-    projection.boxes[:, 2:] += [width, height]
-    projection = projection._replace(
-        means2d=means2d, depths=np.ones(n, dtype), opacities=projection.opacities.astype(dtype)
-    )
+    distances = np.where(np.arange(n) % 2, 1, -1) * rng.uniform(3, 9, n)  # to the mean, the tile's way
+    a, c = rng.uniform(0.02, 0.1, (2, n))
+    b = rng.uniform(-0.8, 0.8, n) * np.sqrt(a * c)
+    along = [-b / a * distances, distances] if direction == "up and down" else [distances, -b / c * distances]
+    means2d = (rims + 0.5 + np.stack(along, axis=1)).astype(dtype)
+
+    def sigmas():
+        dx, dy = (means2d.astype(np.longdouble) - (rims + 0.5)).T
+        return (0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy).astype(float)
+
+    a, b, c = np.array([a, b, c]) * rng.uniform(4.5, 5.4, n) / sigmas()  # the fainter the more rounding of sigma
+    # The kernels' own alpha is rounded, too: sigma of 5 to some 2 units in the last place, which are 8 of alpha. To the
+    # left and right, where sigma is that of dx, it is more: dx of 4 is a difference of places in the tile, up to 32.
+    alpha = GSPLAT_MAIN.alpha_min * (1 + (16 if direction == "up and down" else 64) * np.finfo(dtype).eps)
+    boxes = np.hstack([corners, corners + np.array([width, height])])
+    projection = splats(means2d, np.stack([a, b, c], axis=1), alpha * np.exp(sigmas()), np.ones(n), boxes=boxes)
     assert projection.opacities.max() < 1
+    projection = as_dtype(projection, dtype)._replace(conics=projection.conics)
     size = n_across * width, n_across * height
     output = blend(fast_backend, projection, np.ones((n, 1)), [0], size=size, dtype=dtype)
-    assert_array_equal(output.alpha[rims[:, 1], rims[:, 0]] > 0, True)
+    assert np.count_nonzero(output.alpha[rims[:, 1], rims[:, 0]]) == n
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])

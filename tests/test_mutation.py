@@ -11,7 +11,8 @@ SOURCES = {
     "package/shapes.py": "",
     "package/deep/__init__.py": "",
     "package/deep/inner.py": "",
-    "package/user.py": "from package.deep import inner",
+    "package/deep/helper.py": "",
+    "package/user.py": "from package.deep import helper",
     "package/lonely.py": "",
     "tests/test_area.py": "from package import area",
     "tests/test_shapes.py": "import package.shapes",
@@ -35,8 +36,10 @@ def imports(tmp_path, monkeypatch):
     [
         # Named like it; then by how much is imported from it; also through the package that exports its names.
         ("package/shapes.py", ["test_shapes", "test_much", "test_area"]),
-        # No test imports it: those that import what does, and what names it as a command.
-        ("package/deep/inner.py", ["test_cli", "test_user", "test_area"]),
+        # The package imports it, and is imported; and there is a command of that name.
+        ("package/deep/inner.py", ["test_cli", "test_area"]),
+        # No test imports it: those that import what does.
+        ("package/deep/helper.py", ["test_user"]),
         ("package/lonely.py", []),
         ("package/__init__.py", ["test_area"]),
     ],
