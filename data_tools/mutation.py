@@ -67,36 +67,40 @@ def _order(change: Any) -> tuple[str, int]:
 
 
 class Tests:
-    """Commands that run tests."""
+    """Test files, and whether a change is noticed by any."""
 
-    def __init__(self, command: str, seconds: float) -> None:
+    def __init__(self, command: str, seconds: float, timeout: float) -> None:
         limit = f"-p data_tools.deadline --seconds {seconds}"
         self._command = shlex.split(f"{command.replace('python', sys.executable, 1)} {limit}")
-        self._sound: set[str] = set()
+        self._timeout = timeout
+        self._is_sound: dict[str, bool] = {}
 
-    def command(self, paths: Iterable[Path | str]) -> str:
-        """Return the command that runs test files in this order."""
-        return shlex.join([*self._command, *map(str, paths)])
+    def result_of(self, changes: Sequence[Any], paths: Iterable[Path]) -> Any:
+        """Return cosmic-ray's result; test files that fail without a change have no say."""
+        names = [str(path) for path in paths if self._is_sound.get(str(path), True)][:MOST_FILES]
+        result = mutate_and_test(changes, shlex.join([*self._command, *names]), self._timeout)
+        failed = re.findall(r"^(?:FAILED|ERROR) (\S+?\.py)", result.output or "", re.MULTILINE)
+        for name in failed:
+            if name not in self._is_sound:
+                code = subprocess.run([*self._command, name], capture_output=True).returncode
+                self._is_sound[name] = code == 0
+                if code != 0:
+                    print(f"{name} fails without a change and is left out", flush=True)
+        return result if all(self._is_sound[name] for name in failed) else self.result_of(changes, paths)
 
-    def check(self, output: str) -> None:
-        """Exit if a test file that failed does so without a change."""
-        for path in set(re.findall(r"^(?:FAILED|ERROR) (\S+?\.py)", output, re.MULTILINE)) - self._sound:
-            if subprocess.run(shlex.split(self.command([path])), capture_output=True).returncode != 0:
-                sys.exit(f"{path} fails without a change: mend that first")
-            self._sound.add(path)
 
-
-def run(db: WorkDB, imports: Imports, settings: Mapping[str, Any], seconds: float) -> None:
-    """Test all changes of a session that have not been tested."""
-    tests = Tests(settings["test-command"], seconds)
-    pending = sorted(db.pending_work_items, key=lambda item: (str(item.mutations[0].module_path), item.job_id))
+def run(db: WorkDB, imports: Imports, settings: Mapping[str, Any], seconds: float, again: bool) -> None:
+    """Test all changes of a session that have not been tested; ``again`` also those that survived."""
+    tests = Tests(settings["test-command"], seconds, settings["timeout"])
+    survivors = [item for item, result in db.completed_work_items if again and not result.is_killed]
+    changes = [*db.pending_work_items, *survivors]
+    pending = sorted(changes, key=lambda item: (str(item.mutations[0].module_path), item.job_id))
     for number, item in enumerate(pending, 1):
         (change,) = item.mutations
-        paths = imports.tests_of(change.module_path)[:MOST_FILES]
+        paths = imports.tests_of(change.module_path)
         if not paths:
             sys.exit(f"{change.module_path}: no test imports it: leave it out in {SETTINGS}, or test it")
-        result = mutate_and_test(item.mutations, tests.command(paths), settings["timeout"])
-        tests.check(result.output or "")
+        result = tests.result_of(item.mutations, paths)
         db.set_result(item.job_id, result)
         outcome = "noticed" if result.is_killed else "survived"
         line = f"{number}/{len(pending)} {outcome} {change.module_path}:{change.start_pos[0]} {change.operator_name}"
@@ -151,6 +155,7 @@ def main() -> None:
     parser.add_argument(
         "--seconds", type=integer(1), default=120, metavar="T", help="of tests for a change (default 120)"
     )
+    parser.add_argument("--again", action="store_true", help="test what survived once more, for a longer time perhaps")
     args = parser.parse_args()
     session = args.session.resolve()
     with TemporaryDirectory() as folder, use_db(session) as db:
@@ -162,7 +167,7 @@ def main() -> None:
             paths = find_modules(map(Path, args.paths or settings["module-path"]))
             modules = sorted(filter_paths(paths, settings["excluded-modules"]))
             db.add_work_items(drawn_changes(modules, settings, args.sample, random.Random(args.seed)))
-        run(db, Imports(every, sorted(TESTS.rglob("test_*.py"))), settings, args.seconds)
+        run(db, Imports(every, sorted(TESTS.rglob("test_*.py"))), settings, args.seconds, args.again)
         print("\n".join(report(db)))
         os.chdir(ROOT)
 

@@ -117,7 +117,7 @@ OF_MINI_SPLATTING = {
     "prune_faint": OF_3DGS["prune_faint"],
     "prune_large_by_distance": {"size_fraction": 0.1},
     "collect_blur": {"area_fraction": 2e-4},
-    "reinitialise_from_depth": {"points_of": "midpoint_points"},
+    "reinitialise_from_depth": {"points_of": "midpoint_points", "least_alpha": 0.0},
     "simplify": {"choose": "by_sampling", "keep_fraction": 0.5, "least_views": 0, "is_intersecting": True},
     "store_sh": {"sh_degree": 3},
     "restart_from_means": {"sh_degree": 3},
@@ -126,7 +126,10 @@ OF_MINI_SPLATTING = {
 _FEW_SEE = {"least_views": 2, "visibility_mass": 0.99}
 OF_MINI_SPLATTING2 = {
     **{action: OF_MINI_SPLATTING[action] for action in ("clone_and_split", "prune_faint", "collect_blur", "store_sh")},
-    "reinitialise_from_depth": {"points_of": "midpoint_points", "points_per_gaussian": 1.0, "drawn_mass": 0.99},
+    "reinitialise_from_depth": {
+        **OF_MINI_SPLATTING["reinitialise_from_depth"],
+        **{"points_per_gaussian": 1.0, "drawn_mass": 0.99},
+    },
     "aggressive_clone": {"critical": "critical_by_mass", "factor": 2, "tail_mass": 0.999, **_FEW_SEE},
     "simplify": {"choose": "by_sampling", "keep_fraction": 0.6, "is_intersecting": True, **_FEW_SEE},
     "prune_tail": {"mass": 0.99, "is_intersecting": True, **_FEW_SEE},
