@@ -14,7 +14,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.methods import RECIPES, gaussian_splatting, mini_splatting, mini_splatting2
 from minisplat_ref.methods.mini_splatting import is_culling, measure_importance
 from minisplat_ref.rendering import render, render_vjp
-from minisplat_ref.strategy import importance, simplify, visibility
+from minisplat_ref.strategy import depth_reinit, importance, simplify, visibility
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.loop import initial_state, load_state, save_state, train
 from minisplat_ref.training.schedule import At, Every, configured, scaled
@@ -278,6 +278,33 @@ def test_depth_gives_as_many_points_as_asked_for(state, iteration):
     act(state, iteration, points_per_gaussian=5.0)
     assert n_rows(state.gaussians) == 5 * n // N_VIEWS * N_VIEWS
     assert state.gaussians.sh_rest.shape[1] == 0 and state.adam.step == 0
+
+
+@pytest.mark.parametrize(("extents", "distance"), [(30.0, 75.0), (None, None)])
+def test_depth_is_given_the_settings_in_world_units(state, iteration, monkeypatch, extents, distance):
+    """The backdrop is a number of extents away, and the number of points is counted before the tail is pruned."""
+    given = {}
+
+    def reinitial_points(model, views, n_points, **settings):
+        given.update(settings, n_points=n_points, n_left=n_rows(model.gaussians))
+        return np.eye(4, 3), np.zeros((4, 3), np.uint8)
+
+    monkeypatch.setattr(mini_splatting, "reinitial_points", reinitial_points)
+    n = n_rows(state.gaussians)
+    mini_splatting.reinitialise_from_depth(
+        state,
+        iteration._replace(scene=iteration.scene._replace(extent=2.5)),
+        points_of=depth_reinit.centre_points,
+        least_alpha=0.3,
+        depth_tolerance=0.07,
+        backdrop_extents=extents,
+        points_per_gaussian=2.0,
+        drawn_mass=0.9,
+    )
+    assert (given["backdrop_distance"], given["least_alpha"], given["depth_tolerance"]) == (distance, 0.3, 0.07)
+    assert given["points_of"] is depth_reinit.centre_points and given["rng"] is state.rng
+    assert given["n_points"] == 2 * n and 0 < given["n_left"] < n
+    assert_array_equal(state.gaussians.means, np.eye(4, 3))
 
 
 # Bad input ------------------------------------------------------------------------------------------------------------

@@ -1,5 +1,8 @@
 """Which tests are run for a change, and which places are not worth one."""
 
+import random
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -55,3 +58,27 @@ def test_modules_are_named_as_they_are_imported():
 def test_types_are_found_where_they_stand():
     source = "x: int | None = 1 | 2\n\ndef f(a: 'A', b=3) -> list[int]:\n    return a | b\n"
     assert annotations(source) == [((1, 3), (1, 13)), ((3, 22), (3, 31)), ((3, 9), (3, 12))]
+
+
+@pytest.mark.parametrize(("seconds", "code"), [(0, 0), (60, 1)])
+def test_what_comes_too_late_has_no_say(tmp_path, seconds, code):
+    (tmp_path / "test_late.py").write_text("def test():\n    assert False\n")
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "data_tools.deadline"]
+    command += ["--seconds", str(seconds), "--rootdir", str(tmp_path), str(tmp_path)]
+    assert subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True).returncode == code
+
+
+def test_the_same_changes_are_drawn_again(imports, monkeypatch):
+    pytest.importorskip("cosmic_ray", reason="of the extra [mutation]")
+    from data_tools.mutation import SETTINGS, drawn_changes, load_config
+
+    module = Path("package/shapes.py")
+    module.write_text("def f(a: int | None, b=2) -> int | None:\n    return a + b if a > 0 and not b < 7 else None\n")
+    settings = load_config(Path(__file__).parents[1] / SETTINGS)
+    draws = [drawn_changes([module], settings, n, random.Random(3)) for n in (3, 3, 100)]
+    first, second, every = (
+        [(change.start_pos, change.operator_name) for item in draw for change in item.mutations] for draw in draws
+    )
+    assert first == second and len(set(first)) == 3
+    places = [start for start, _ in every]
+    assert len(places) >= 8 and len({start for start in places if start[0] == 1}) == 1  # b=2, but no type
