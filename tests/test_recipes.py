@@ -11,6 +11,7 @@ import pytest
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods import RECIPES, gaussian_splatting, get_recipe
 from minisplat_ref.strategy.importance import outdoor
+from minisplat_ref.training.losses import LossTerm
 from minisplat_ref.training.schedule import At, During, Every, configured, describe, scaled
 
 
@@ -325,6 +326,11 @@ def test_bad_input():
         get_recipe("4dgs")
     with pytest.raises(InputError, match="iterations is 0"):
         get_recipe("3dgs", 0)
+
+
+def test_every_term_that_counts_is_described():
+    losses = tuple(LossTerm(str(weight), nothing, weight) for weight in (-0.5, 0.0, 2.0))
+    assert [loss["name"] for loss in describe(RECIPES["3dgs"]._replace(losses=losses))["losses"]] == ["-0.5", "2.0"]
 
 
 def test_description_is_json_and_tells_settings_apart():
