@@ -311,6 +311,13 @@ def test_scene_without_views(scene):
         train(scene._replace(train_views=()), RECIPE, seed=0)
 
 
+@pytest.mark.parametrize("name", ["3dgs", "3dgs-accel"])
+def test_one_view_is_enough(scene, name):
+    """3DGS compares nothing between views."""
+    state = initial_state(scene._replace(train_views=scene.train_views[:1]), RECIPES[name], 0)
+    assert len(state.gaussians.means) == N_GAUSSIANS
+
+
 def test_resuming_another_scene(scene):
     state = initial_state(scene, RECIPE, 0)
     state.view_order = [3, 0]
