@@ -430,6 +430,62 @@ def test_backends_agree(fast_backend, conventions, dtype, rng):
         assert_allclose(a, e, rtol=0, atol=(PARITY_FLOAT64 if is_exact else PARITY_FLOAT32_GRADIENT) * np.abs(e).max())
 
 
+# --- bounds of the kernels, which know what they leave out ---
+
+
+@pytest.mark.parametrize("direction", ["up and down", "left and right"])
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_no_hit_at_the_rim_is_lost(fast_backend, dtype, direction, rng):
+    """Where the ellipse is widest stands a pixel whose alpha is alpha_min, or a rounding more or less.
+
+    The kernels look for such a pixel in the rows, columns and tiles that they computed the ellipse to reach, with
+    roundings of their own. Which alpha they have for it is seen where alpha_min is lower and the ellipse reaches on.
+    """
+    width, height, n_across = 2 * fast_backend.tile_width, 4 * fast_backend.tile_height, 32
+    n = n_across**2  # each in a part of the image of its own
+    corners = np.stack(np.divmod(np.arange(n), n_across)[::-1], axis=1) * [width, height]  # [N, 2]
+    rims = corners + np.array([width // 2, height // 2])  # first pixel of a tile
+    rims[::2] -= 1  # or the last of the one before
+    distances = np.where(np.arange(n) % 2, 1, -1) * rng.uniform(3, 9, n)  # to the mean, the tile's way
+    a, c = rng.uniform(0.02, 0.1, (2, n))
+    b = rng.uniform(-0.8, 0.8, n) * np.sqrt(a * c)
+    along = [-b / a * distances, distances] if direction == "up and down" else [distances, -b / c * distances]
+    means2d = (rims + 0.5 + np.stack(along, axis=1)).astype(dtype)
+
+    def sigmas():
+        dx, dy = (means2d.astype(np.longdouble) - (rims + 0.5)).T
+        return (0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy).astype(float)
+
+    a, b, c = np.array([a, b, c]) * rng.uniform(4.5, 5.4, n) / sigmas()  # the fainter the more roundings
+    boxes = np.hstack([corners, corners + np.array([width, height])])
+    opacities = GSPLAT_MAIN.alpha_min * np.exp(sigmas())
+    projection = splats(means2d, np.stack([a, b, c], axis=1), opacities, np.ones(n), boxes=boxes)
+    projection = as_dtype(projection, dtype)._replace(conics=projection.conics)
+    alphas = []
+    for conventions in (GSPLAT_MAIN, GSPLAT_MAIN._replace(alpha_min=GSPLAT_MAIN.alpha_min / 2)):
+        size, colors = (n_across * width, n_across * height), np.ones((n, 1))
+        output = blend(fast_backend, projection, colors, [0], size=size, dtype=dtype, conventions=conventions)
+        alphas.append(output.image[rims[:, 1], rims[:, 0], 0])
+    is_hit = alphas[1] >= dtype(GSPLAT_MAIN.alpha_min)
+    assert 0.2 < is_hit.mean() < 0.8
+    assert_array_equal(alphas[0], np.where(is_hit, alphas[1], 0))
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("conic", [(4, 2, 1), (4, -2, 1), (1e-6, 1e-3, 1), (1, -1e-3, 1e-6), (1, 1 + 1e-12, 1)])
+def test_a_needle_without_end(fast_backend, conic, dtype):
+    """a c - b^2 has no digit left, or is below zero: sigma = a (dx + b dy / a)^2 / 2, and no bound becomes NaN."""
+    size = 4 * fast_backend.tile_width, 4 * fast_backend.tile_height
+    projection = as_dtype(splats([[50.5, 30.5]], [conic], [0.9], [1], size=size), dtype)
+    projection = projection._replace(conics=np.array([conic], dtype=float))
+    xs, ys = np.meshgrid(np.arange(size[0]) - 50, np.arange(size[1]) - 30)
+    unclamped = 0.9 * np.exp(-0.5 * conic[0] * (xs + conic[1] / conic[0] * ys) ** 2)
+    expected = np.where(unclamped >= GSPLAT_MAIN.alpha_min, unclamped, 0)
+    assert np.abs(unclamped - GSPLAT_MAIN.alpha_min).min() > 1e-6  # none is at the threshold
+    output = blend(fast_backend, projection, np.ones((1, 1)), [0], size=size, dtype=dtype)
+    assert_allclose(output.alpha, expected, rtol=0, atol=PARITY_FLOAT32_IMAGE)
+
+
 def test_inria_is_not_gsplat(backend, rng):
     # The profiles differ where they say so: INRIA's boxes cut what gsplat's show.
     camera = make_camera(37, 29)

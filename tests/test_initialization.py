@@ -9,7 +9,7 @@ from tolerances import ROUNDED_TO_FLOAT32
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.errors import InputError
 from minisplat_ref.strategy import initialization
-from minisplat_ref.strategy.initialization import from_points, initial_gaussians, random_points
+from minisplat_ref.strategy.initialization import are_seen, from_points, initial_gaussians, random_points
 from minisplat_ref.types import Scene, View
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
@@ -71,6 +71,16 @@ def test_random_points_are_inside_the_cube_and_seen(rng):
     in_second = (z > 1) & (u > 0) & (u < 24) & (v > 0) & (v < 18)
     assert np.all(in_first | in_second)
     assert points[:, 2].max() > 3.0  # to the far side of the cube, 3.5
+
+
+def test_a_camera_sees_up_to_the_edges_of_its_image():
+    """Points a quarter of a pixel inside and outside each edge of 24 x 18 pixels, at a depth of 2; and one behind."""
+    inside = np.array([[0.25, 9], [23.75, 9], [12, 0.25], [12, 17.75]])
+    outside = np.array([[-0.25, 9], [24.25, 9], [12, -0.25], [12, 18.25]])
+    pixels = np.concatenate([inside, outside, [[12, 9]]])
+    points = 2.0 * np.column_stack([(pixels - [12, 9]) / [30, 28], np.ones(9)])
+    points[8] *= -1
+    assert_array_equal(are_seen(points, [make_camera()]), [True] * 4 + [False] * 5)
 
 
 def test_scene_decides_where_points_come_from(rng, monkeypatch):

@@ -263,6 +263,17 @@ def test_checkpoint_with_wrong_arrays(saved, refused, name, change, reason):
     assert reason in refused(load_state, saved({name: change(arrays.get(name))}), RECIPE)
 
 
+@pytest.mark.parametrize("n_rest", [0, 3, 8, 15, 24])
+def test_coefficients_of_each_degree_are_read(saved, refused, n_rest):
+    """Those of the degrees 0 to 3; 24 would be degree 4."""
+    sh_rest = np.zeros((40, n_rest, 3), np.float32)
+    path = saved({f"{group}.sh_rest": sh_rest for group in ("gaussians", "first", "second")})
+    if n_rest == 24:
+        assert "gaussians.sh_rest has shape [40, 24, 3], which does not fit" in refused(load_state, path, RECIPE)
+    else:
+        assert load_state(path, RECIPE).gaussians.sh_rest.shape == (40, n_rest, 3)
+
+
 def test_info_of_a_checkpoint_that_lies(saved, capsys):
     """What info shows is checked; what it does not show may be wrong."""
     assert main(["info", str(saved())]) == 0

@@ -50,6 +50,20 @@ def test_ssim_is_the_mean_of_the_map(rng, backend):
     assert ssim(image, target, backend=backend) == pytest.approx(ssim_map(image, target).mean(), rel=PARITY_FLOAT64)
 
 
+def test_ssim_has_the_published_window(backend):
+    """11 pixels and sigma 1.5, K1 = 0.01, K2 = 0.03 (Wang et al. 2004), of one bright pixel in front of black.
+
+    The window moved over the image weighs the pixel by w, its square too: mu = w v, variance = w v^2 - mu^2.
+    """
+    image, v = np.zeros((21, 21, 3)), 0.7
+    image[10, 10] = v
+    g = np.exp(-0.5 * (np.arange(-10, 11) / 1.5) ** 2) * (np.abs(np.arange(-10, 11)) <= 5)
+    w = np.outer(g, g) / g.sum() ** 2
+    mean, c1, c2 = w * v, 1e-4, 9e-4
+    expected = c1 * c2 / ((mean**2 + c1) * (w * v * v - mean**2 + c2))
+    assert ssim(image, np.zeros_like(image), backend=backend) == pytest.approx(expected.mean(), rel=PARITY_FLOAT64)
+
+
 def test_evaluation(rng, backend):
     gaussians = as_dtype(make_gaussians(rng, 30), np.float32)
     background = np.array([0.2, 0.4, 0.6])

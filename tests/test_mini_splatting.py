@@ -14,7 +14,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.methods import RECIPES, gaussian_splatting, mini_splatting, mini_splatting2
 from minisplat_ref.methods.mini_splatting import is_culling, measure_importance
 from minisplat_ref.rendering import render, render_vjp
-from minisplat_ref.strategy import importance, simplify
+from minisplat_ref.strategy import depth_reinit, importance, simplify, visibility
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.loop import initial_state, load_state, save_state, train
 from minisplat_ref.training.schedule import At, Every, configured, scaled
@@ -143,6 +143,8 @@ def test_gradients_are_lowered_while_views_are_culled(state, scene):
 
 
 def test_clone_culls_and_forgets_what_was_collected(state, iteration):
+    n = n_rows(state.gaussians)
+    state.stats = {"gradient_sum": np.ones(n), "view_count": np.ones(n, int), "is_blurred": np.ones(n, bool)}
     mini_splatting2.aggressive_clone(
         state, iteration, critical=lambda stats: stats.dominant_count > 0, factor=2, tail_mass=0.999, least_views=0
     )
@@ -154,6 +156,38 @@ def test_clone_culls_and_forgets_what_was_collected(state, iteration):
 
 
 # Simplification -------------------------------------------------------------------------------------------------------
+
+HALF = partial(mini_splatting.simplify, metric=importance.indoor, choose=simplify.by_rank, keep_fraction=0.5)
+TAIL = partial(mini_splatting.prune_tail, metric=importance.indoor, mass=0.9)
+WHERE_ROWS_GO = pytest.mark.parametrize("act", [HALF, TAIL], ids=["simplify", "prune_tail"])
+
+
+@WHERE_ROWS_GO
+def test_the_culling_table_is_measured_anew_where_rows_go(state, iteration, act):
+    """An old table, by which everything is visible everywhere, gives way to that of the Gaussians of today."""
+    n = n_rows(state.gaussians)
+    measured = measure_importance(state, iteration)
+    factors = visibility.gradient_factors(measured.is_visible, measured.frustum_count).astype(np.float32)
+    old = {"is_visible": np.ones((n, N_VIEWS), bool), "gradient_factor": np.ones(n, np.float32)}
+    state.stats = {**old, "row": np.arange(n)}
+    act(state, iteration)
+    rows = state.stats["row"]
+    assert 0 < len(rows) < n and not measured.is_visible[rows].all()
+    assert_array_equal(state.stats["is_visible"], measured.is_visible[rows])
+    assert_array_equal(state.stats["gradient_factor"], factors[rows])
+
+
+@WHERE_ROWS_GO
+def test_where_rows_go_no_culling_begins(state, iteration, act):
+    act(state, iteration)
+    assert not is_culling(state) and state.stats == {}
+
+
+def test_the_share_kept_is_one_of_the_candidates(state, iteration):
+    n, n_candidates = n_rows(state.gaussians), np.count_nonzero(measure_importance(state, iteration).dominant_count)
+    assert round(0.5 * n_candidates) < round(0.5 * n)  # some are no candidates
+    assert HALF(state, iteration) is None
+    assert n_rows(state.gaussians) == round(0.5 * n_candidates)
 
 
 @pytest.mark.parametrize("choose", [simplify.by_sampling, simplify.by_rank, simplify.by_merging])
@@ -201,6 +235,7 @@ def test_tail_is_pruned_and_moments_stay(state, iteration):
 
 def test_start_anew_has_no_past(state, iteration):
     state.stats["is_blurred"] = np.zeros(n_rows(state.gaussians), bool)
+    state.view_order = [2, 0]  # in the middle of a round
     means = state.gaussians.means.copy()
     mini_splatting.restart_from_means(state, iteration, sh_degree=2)
     assert_array_equal(state.gaussians.means, means)
@@ -243,6 +278,33 @@ def test_depth_gives_as_many_points_as_asked_for(state, iteration):
     act(state, iteration, points_per_gaussian=5.0)
     assert n_rows(state.gaussians) == 5 * n // N_VIEWS * N_VIEWS
     assert state.gaussians.sh_rest.shape[1] == 0 and state.adam.step == 0
+
+
+@pytest.mark.parametrize(("extents", "distance"), [(30.0, 75.0), (None, None)])
+def test_depth_is_given_the_settings_in_world_units(state, iteration, monkeypatch, extents, distance):
+    """The backdrop is a number of extents away, and the number of points is counted before the tail is pruned."""
+    given = {}
+
+    def reinitial_points(model, views, n_points, **settings):
+        given.update(settings, n_points=n_points, n_left=n_rows(model.gaussians))
+        return np.eye(4, 3), np.zeros((4, 3), np.uint8)
+
+    monkeypatch.setattr(mini_splatting, "reinitial_points", reinitial_points)
+    n = n_rows(state.gaussians)
+    mini_splatting.reinitialise_from_depth(
+        state,
+        iteration._replace(scene=iteration.scene._replace(extent=2.5)),
+        points_of=depth_reinit.centre_points,
+        least_alpha=0.3,
+        depth_tolerance=0.07,
+        backdrop_extents=extents,
+        points_per_gaussian=2.0,
+        drawn_mass=0.9,
+    )
+    assert (given["backdrop_distance"], given["least_alpha"], given["depth_tolerance"]) == (distance, 0.3, 0.07)
+    assert given["points_of"] is depth_reinit.centre_points and given["rng"] is state.rng
+    assert given["n_points"] == 2 * n and 0 < given["n_left"] < n
+    assert_array_equal(state.gaussians.means, np.eye(4, 3))
 
 
 # Bad input ------------------------------------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """Recipes: events at exactly the right iterations, also when scaled."""
 
+import inspect
 import json
 from fractions import Fraction
 from functools import partial
@@ -10,6 +11,7 @@ import pytest
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods import RECIPES, gaussian_splatting, get_recipe
 from minisplat_ref.strategy.importance import outdoor
+from minisplat_ref.training.losses import LossTerm
 from minisplat_ref.training.schedule import At, During, Every, action_name, configured, describe, scaled
 
 
@@ -85,7 +87,98 @@ def test_mini_splatting2_schedule():
 
 @pytest.mark.parametrize("name", ["mini-splatting-d", "mini-splatting2-d"])
 def test_dense_recipes_do_not_sample(name):
-    assert not {"simplify"} & firings(RECIPES[name]).keys()
+    """Their densification is that of the recipe that is named after."""
+    fired, other = firings(RECIPES[name]), firings(RECIPES[name.removesuffix("-d")])
+    assert fired.keys() == other.keys() - {"simplify", *(["prune_tail", "restart_adam"] if "2" not in name else [])}
+    assert all(fired[action] == other[action] for action in fired.keys() - {"prune_tail"})
+    prunings = [event.step for event in RECIPES[name].events if name_of(event) == "prune_tail"]
+    assert prunings == ([3_000, 8_000] if "2" in name else [])
+
+
+# Published values: those of the released code of 3DGS (2023), of its later optimiser (``-accel``), of Mini-Splatting
+# and of Mini-Splatting2. What is our own (``most_per_pixel``, ``least_area``, the vote on depths) is not among them.
+OPACITY_RATES = {"3dgs": 0.05, "mini-splatting": 0.05, "mini-splatting-d": 0.05}  # the others: half of it
+SH_MILESTONES = {"3dgs": (1_000, 2_000, 3_000), "mini-splatting": (16_000, 17_000, 18_000)}
+SH_MILESTONES |= {"3dgs-accel": SH_MILESTONES["3dgs"], "mini-splatting-d": SH_MILESTONES["mini-splatting"]}
+ADAMS = {"3dgs": (False, True), "3dgs-accel": (True, False)}  # is_visible_only, has_bias_correction
+ADAMS |= {"mini-splatting": (False, True), "mini-splatting-d": (False, True)}
+OF_3DGS = {
+    "clone_and_split": {"threshold": 2e-4, "size_fraction": 0.01},
+    "prune_faint": {"least_opacity": 0.005},
+    "prune_large": {"size_fraction": 0.1},
+    "reset_opacity": {"ceiling": 0.01},
+    "reset_opacity_on_white": {"ceiling": 0.01},
+}
+OF_MINI_SPLATTING = {
+    "clone_and_split": OF_3DGS["clone_and_split"] | {"draw_children": "random_children"},
+    "prune_faint": OF_3DGS["prune_faint"],
+    "prune_large_by_distance": {"size_fraction": 0.1},
+    "collect_blur": {"area_fraction": 2e-4},
+    "reinitialise_from_depth": {"points_of": "midpoint_points", "least_alpha": 0.0},
+    "simplify": {"choose": "by_sampling", "keep_fraction": 0.5, "least_views": 0, "is_intersecting": True},
+    "store_sh": {"sh_degree": 3},
+    "restart_from_means": {"sh_degree": 3},
+    "prune_tail": {"mass": 0.99, "least_views": 0, "is_intersecting": True},
+}
+_FEW_SEE = {"least_views": 2, "visibility_mass": 0.99}
+OF_MINI_SPLATTING2 = {
+    **{action: OF_MINI_SPLATTING[action] for action in ("clone_and_split", "prune_faint", "collect_blur", "store_sh")},
+    "reinitialise_from_depth": {
+        **OF_MINI_SPLATTING["reinitialise_from_depth"],
+        **{"points_per_gaussian": 1.0, "drawn_mass": 0.99},
+    },
+    "aggressive_clone": {"critical": "critical_by_mass", "factor": 2, "tail_mass": 0.999, **_FEW_SEE},
+    "simplify": {"choose": "by_sampling", "keep_fraction": 0.6, "is_intersecting": True, **_FEW_SEE},
+    "prune_tail": {"mass": 0.99, "is_intersecting": True, **_FEW_SEE},
+}
+DENSE = {action: settings for action, settings in OF_MINI_SPLATTING.items() if action not in ("simplify", "prune_tail")}
+DENSE2 = {action: settings for action, settings in OF_MINI_SPLATTING2.items() if action != "simplify"}
+SETTINGS = {
+    "3dgs": OF_3DGS,
+    "3dgs-accel": OF_3DGS,
+    "mini-splatting": OF_MINI_SPLATTING,
+    "mini-splatting-d": DENSE,
+    "mini-splatting2": OF_MINI_SPLATTING2,
+    "mini-splatting2-d": DENSE2 | {"prune_tail": {"mass": 0.99, "is_intersecting": False, **_FEW_SEE}},
+}
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_rates_and_losses_are_the_published_ones(name):
+    recipe = describe(RECIPES[name])
+    rates = dict(recipe["learning_rates"]["of"])
+    rewind = {"at": 15_000, "to": 5_000} if name in ("mini-splatting", "mini-splatting-d") else None
+    assert rates.pop("means") == {"first": 1.6e-4, "last": 1.6e-6, "steps": 30_000, "rewind": rewind}
+    assert rates == {
+        "quats": 1e-3,
+        "log_scales": 5e-3,
+        "opacity_logits": OPACITY_RATES.get(name, 0.025),
+        "sh_dc": 2.5e-3,
+        "sh_rest": 1.25e-4,
+    }
+    assert recipe["learning_rates"]["per_extent"] == ["means"]
+    assert recipe["adam"] == {
+        **dict(zip(("is_visible_only", "has_bias_correction"), ADAMS.get(name, (True, True)), strict=True)),
+        **{"beta1": 0.9, "beta2": 0.999, "eps": 1e-15},
+    }
+    assert tuple(recipe["sh_milestones"]) == SH_MILESTONES.get(name, (4_000, 5_000, 6_000))
+    assert recipe["sh_degree"] == (3 if name.startswith("3dgs") else 0) and not recipe["has_random_background"]
+    assert recipe["iterations"] == (18_000 if "2" in name else 30_000)
+    assert [(loss["name"], loss["weight"], loss["settings"]) for loss in recipe["losses"]] == [
+        ("photometric", 1.0, {"dssim_weight": 0.2})
+    ]
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_settings_are_the_published_ones(name):
+    """Every action of the table is in the recipe, every one with settings in the table."""
+    actions = [event.action for event in RECIPES[name].events if isinstance(event.action, partial)]
+    assert {action.func.__name__ for action in actions} == SETTINGS[name].keys()
+    for action in actions:
+        parameters = inspect.signature(action).parameters  # with the recipe's settings as the defaults
+        for key, value in SETTINGS[name][action.func.__name__].items():
+            actual = parameters[key].default
+            assert getattr(actual, "__name__", actual) == value, (action, key)
 
 
 def test_settings_are_replaced_in_every_event_that_has_them():
@@ -229,6 +322,11 @@ def test_bad_input():
         get_recipe("4dgs")
     with pytest.raises(InputError, match="iterations is 0"):
         get_recipe("3dgs", 0)
+
+
+def test_every_term_that_counts_is_described():
+    losses = tuple(LossTerm(str(weight), nothing, weight) for weight in (-0.5, 0.0, 2.0))
+    assert [loss["name"] for loss in describe(RECIPES["3dgs"]._replace(losses=losses))["losses"]] == ["-0.5", "2.0"]
 
 
 def test_description_is_json_and_tells_settings_apart():

@@ -200,6 +200,17 @@ def test_colours_that_differ_are_far_apart():
     assert_array_equal(edit.is_new, [False, False, True])
 
 
+@pytest.mark.parametrize(("gap", "merged"), [(1.66, [0, 0, 1]), (1.68, [1, 0, 0])])
+def test_how_far_apart_colours_are(gap, merged):
+    """Two of different colour at a distance of 1, two of the same colour at one of 5/3: they are equally near.
+
+    The median distance to the nearest is 4/3, so 0.1 of colour is as far as 10 * 4/3 * 0.1, and 1 + (4/3)^2 = (5/3)^2.
+    """
+    gaussians = on_a_line(np.array([0.0, 1, 20, 20 + gap]))
+    gaussians.sh_dc[0] = 0.1 / np.sqrt(3) / SH_C0
+    assert_array_equal(merge_neighbours(gaussians, np.ones(4), 3).is_new, merged)
+
+
 # Hard cases -----------------------------------------------------------------------------------------------------------
 
 

@@ -170,6 +170,23 @@ def test_constant_color_has_no_gradient_but_its_own(backend, rng):
     assert not any(gradient[k].any() for k in (0, 2, 3, 4))
 
 
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_a_colour_of_exactly_zero_has_no_gradient(backend, dtype):
+    """The clamp's derivative at zero is that of the clamped side.
+
+    A coefficient so near to zero hits any number near 0.5: here C1, from which the basis function along z takes C1.
+    """
+    camera, means = make_camera(), np.array([[0.0, 0, 4]], dtype)
+    c0, c1 = dtype(SH_C0), dtype(SH_C1)
+    sh_dc, sh_rest = np.full((1, 3), (c1 - dtype(0.5)) / c0, dtype), np.zeros((1, 3, 3), dtype)
+    sh_rest[0, 1] = -1
+    inputs = means, sh_dc, sh_rest
+    above = backend.sh_colors(means, sh_dc + dtype(1e-3), sh_rest, camera, 1, VISIBLE)
+    assert_allclose(above, 1e-3 * SH_C0, rtol=1e-3)  # float32: a difference of two numbers near 0.5
+    assert_array_equal(backend.sh_colors(*inputs, camera, 1, VISIBLE), 0)
+    assert not any(v.any() for v in backend.sh_colors_vjp(*inputs, camera, 1, VISIBLE, np.ones((1, 3), dtype)))
+
+
 # --- parity ---
 
 

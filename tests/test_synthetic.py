@@ -69,6 +69,7 @@ def rays_of(camera):
         (Cylinder(1.0, 2.0), [-5, 0, 2.1], [1, 0, 0], np.inf, None),  # above the cap
         (Rectangle(1.0, 2.0), [0.9, 1.9, 4], [0, 0, -1], 4.0, [0, 0, 1]),
         (Rectangle(1.0, 2.0), [1.1, 0, 4], [0, 0, -1], np.inf, None),
+        (Rectangle(1.0, 2.0), [0, 2.1, 4], [0, 0, -1], np.inf, None),
         (Rectangle(1.0, 2.0), [0, 0, 4], [1, 0, 0], np.inf, None),  # parallel
     ],
 )

@@ -21,9 +21,10 @@ from minisplat_ref.methods import RECIPES, gaussian_splatting
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import render
 from minisplat_ref.training.loop import initial_state, load_state, save_state, train
+from minisplat_ref.training.rates import LogLinear
 from minisplat_ref.training.schedule import BLEND_STATS, At, During, Every, configured
 from minisplat_ref.training.state import FiredEvent
-from minisplat_ref.types import Scene, View
+from minisplat_ref.types import Gaussians, Scene, View
 
 N_VIEWS, N_GAUSSIANS = 4, 30
 
@@ -166,6 +167,19 @@ def test_the_loop_tells_whether_views_were_halved(scene):
     assert told == [(1, FiredEvent("half_size_views", n, n, 0.0, "until iteration 3"))]
 
 
+def test_rates_are_those_of_the_iteration_that_is_done(scene):
+    """Counted from 1. Adam without bias corrections hands the rate on as it is; means are the first field."""
+    schedule, taken = LogLinear(1e-3, 1e-5, 3), []
+
+    def adam_update(*arrays_and_step):
+        taken.append(arrays_and_step[-1].rate)
+        return CPU.adam_update(*arrays_and_step)
+
+    recipe = PLAIN._replace(iterations=3, learning_rates=PLAIN.learning_rates.changed(means=schedule))
+    train(scene._replace(extent=2.0), recipe, seed=0, backend=replace(CPU, adam_update=adam_update))
+    assert taken[:: len(Gaussians._fields)] == [2.0 * schedule.at(step) for step in (1, 2, 3)]
+
+
 def test_mask_and_random_background(scene):
     masked = tuple(view._replace(mask=np.zeros((16, 24), bool)) for view in scene.train_views)
     state = initial_state(scene, PLAIN, 0)
@@ -295,6 +309,13 @@ def test_ctrl_c_waits_for_the_end_of_the_iteration(scene, uninterrupted):
 def test_scene_without_views(scene):
     with pytest.raises(InputError, match="tiny has no training views"):
         train(scene._replace(train_views=()), RECIPE, seed=0)
+
+
+@pytest.mark.parametrize("name", ["3dgs", "3dgs-accel"])
+def test_one_view_is_enough(scene, name):
+    """3DGS compares nothing between views."""
+    state = initial_state(scene._replace(train_views=scene.train_views[:1]), RECIPES[name], 0)
+    assert len(state.gaussians.means) == N_GAUSSIANS
 
 
 def test_resuming_another_scene(scene):

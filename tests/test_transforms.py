@@ -229,6 +229,7 @@ def test_distorted_fox_agrees_up_to_a_similarity(shared_data):
         ({"k1": 0.01}, "OPENCV"),
         ({"p2": 1e-4}, "OPENCV"),
         ({"k3": 0.01}, "FULL_OPENCV"),
+        ({"k3": -0.01}, "FULL_OPENCV"),
         ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"),
         ({"is_fisheye": True, "k1": 0.01}, "OPENCV_FISHEYE"),
     ],

@@ -81,6 +81,13 @@ def test_orbit_repeats_a_ring_of_cameras():
         assert camera.cam_from_world_R[1] @ [0, 1, 0] > 0.5  # down stays down
 
 
+def test_orbit_has_the_field_of_view_of_the_first_camera():
+    views = ring_of_cameras(np.zeros(3), radius=2.0, height=0.7)
+    other = views[-1].camera
+    views = [*views[:-1], views[-1]._replace(camera=other._replace(fx=2 * other.fx, width=3 * other.width))]
+    assert orbit(np.zeros((0, 3)), views, 1, 2 * WIDTH, 2 * HEIGHT)[0].camera.fx == 2 * views[0].camera.fx
+
+
 def test_orbit_of_a_cloud_shows_nine_tenths_of_it(rng):
     means = np.array([3.0, 1.0, -2.0]) + rng.normal(size=(500, 3))
     for frame in orbit(means, [], 5, WIDTH, HEIGHT):

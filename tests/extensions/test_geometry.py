@@ -21,8 +21,9 @@ from minisplat_ref.extensions.geometry.reference import edge_weights, normal_smo
 from minisplat_ref.extensions.geometry.weights import EDGE_SHARPNESS, SFM_DEPTH_TOLERANCE, GeometricWeights
 from minisplat_ref.oracle.gradients import jacobian_case
 from minisplat_ref.oracle.pieces import tiny_setting
-from minisplat_ref.rendering import render, render_vjp
-from minisplat_ref.types import Gaussians
+from minisplat_ref.rendering import Request, render, render_vjp
+from minisplat_ref.training.losses import Rendered
+from minisplat_ref.types import Gaussians, Model, RenderOutput, Scene, View
 
 NO_POINTS = np.zeros((0, 3))
 
@@ -290,6 +291,32 @@ def test_gradient_through_the_renderer(backend, term, rng):
         rng,
         names=names,
     )
+
+
+# --- as terms of the loss of a training ---
+
+
+@pytest.mark.parametrize("is_masked", [False, True])
+@pytest.mark.parametrize("term", EXTENSION.losses, ids=lambda term: term.name)
+def test_each_term_is_given_what_its_view_holds(backend, term, is_masked, rng):
+    """Photograph, mask, the points that the view sees; and depth and alpha get their derivatives."""
+    camera = make_camera(rng=rng)
+    sums, alpha, photograph, points = rough_view(rng, camera)
+    image = np.concatenate([rng.uniform(size=(18, 24, 3)), sums[..., None]], axis=-1)
+    stored, mask = np.round(255 * photograph).astype(np.uint8), rng.uniform(size=(18, 24)) < 0.7 if is_masked else None
+    view = View("view", camera, stored, mask, point_ids=np.arange(5, 60))
+    scene = Scene("tiny", (view,), (), points, np.zeros((60, 3), np.uint8), np.zeros(3), 1.0)
+    output = RenderOutput(image, alpha, None, None)
+    channels = {"rgb": slice(0, 3), "depth": slice(3, 4)}
+    loss, v = term.function(Rendered(output, channels, view, scene, Model(None), 1, Request(backend=backend)))
+    weights = {"sfm_depth": SFM, "depth_smoothness": DEPTH, "normal_smoothness": NORMALS}[term.name]
+    photograph = stored * np.float32(1 / 255)
+    expected, tape = functions_of(backend).geometric_loss(sums, alpha, photograph, camera, points[5:], weights, mask)
+    v_sums, v_alpha = functions_of(backend).geometric_loss_vjp(tape)
+    assert loss == expected > 0 and set(v.channels) == {"depth"}
+    assert_array_equal(v.channels["depth"], v_sums[..., None])
+    assert_array_equal(v.alpha, v_alpha)
+    assert min(np.abs(v_sums).max(), np.abs(v_alpha).max()) > GRADIENT_FLOOR
 
 
 # --- hard cases ---
