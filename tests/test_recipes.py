@@ -91,7 +91,7 @@ def test_dense_recipes_do_not_sample(name):
     fired, other = firings(RECIPES[name]), firings(RECIPES[name.removesuffix("-d")])
     assert fired.keys() == other.keys() - {"simplify", *(["prune_tail", "restart_adam"] if "2" not in name else [])}
     assert all(fired[action] == other[action] for action in fired.keys() - {"prune_tail"})
-    prunings = [event.step for event in RECIPES[name].events if name_of(event) == "prune_tail"]
+    prunings = [event.step for event in RECIPES[name].events if action_name(event) == "prune_tail"]
     assert prunings == ([3_000, 8_000] if "2" in name else [])
 
 
