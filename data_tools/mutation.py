@@ -91,7 +91,7 @@ class Tests:
 
 def run(db: WorkDB, imports: Imports, settings: Mapping[str, Any], seconds: float, again: bool) -> None:
     """Test all changes of a session that have not been tested; ``again`` also those that survived."""
-    tests = Tests(settings["test-command"], seconds, settings["timeout"])
+    tests = Tests(settings["test-command"], seconds, seconds + settings["timeout"])
     survivors = [item for item, result in db.completed_work_items if again and not result.is_killed]
     changes = [*db.pending_work_items, *survivors]
     pending = sorted(changes, key=lambda item: (str(item.mutations[0].module_path), item.job_id))
