@@ -6,6 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import as_dtype, make_camera, make_gaussians
 from tolerances import CLOSED_FORM, PARITY_FLOAT64, SAMPLED_SHARE
 
+from minisplat_ref import memory
 from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN, INRIA
 from minisplat_ref.datasets.synthetic import make_scene
@@ -393,3 +394,13 @@ def test_nothing_to_draw_is_one_clear_line(points_of, depth_tolerance, rng):
 def test_fewer_points_than_views_is_one_clear_line(rng):
     with pytest.raises(InputError, match="2 points from 3 views"):
         draw(views_of([make_camera()] * 3, rng), 2, given(), rng)
+
+
+def test_depths_that_do_not_fit_into_memory_are_one_clear_line(rng, monkeypatch):
+    views = views_of([make_camera(24, 18)] * 3, rng)
+    monkeypatch.setattr(memory, "free_bytes", lambda: 8.0 * 3 * 24 * 18 - 1)
+    with pytest.raises(InputError, match=r"depths of all 3 views take 10 kB of memory, 10 kB are free: .*3dgs-accel"):
+        draw(views, 100, given(), rng)
+    monkeypatch.setattr(memory, "free_bytes", lambda: 8.0 * 3 * 24 * 18)
+    with pytest.raises(InputError, match="lower least_alpha"):  # it went on
+        draw(views, 100, midpoint_points, rng, gaussians=make_gaussians(rng, 0))

@@ -29,7 +29,6 @@ EPILOG = """\
 examples:
   minisplat-ref bench --out bench
   minisplat-ref bench --workloads synth5k --backends cpu-f32,textbook-f32
-  minisplat-ref bench --stages
   minisplat-ref bench --scene photos/fox --against opensplat=build/opensplat
 
 Exit codes: 0 all within their bounds, 1 something failed, 2 bad input."""

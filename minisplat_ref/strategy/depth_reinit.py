@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from minisplat_ref import memory
 from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
@@ -36,6 +37,7 @@ BEST_PARALLAX = np.radians(
     20.0
 )  # of partners: from a nearer one a floater looks the same, from a farther one less is seen
 LEAST_SCORE = 0.05  # of a partner: 1 degree of parallax on all points, or the best on a twentieth of them
+MAP_BYTES = 8  # a pixel: depth and weight in float32
 N_PROBES = 256  # points of a view by which its partners are chosen
 
 
@@ -173,12 +175,13 @@ def reinitial_points(
     Raises
     ------
     InputError
-        There are fewer points than views, or no pixel of any view can be drawn.
+        There are fewer points than views, no pixel of any view can be drawn, or memory does not hold all depths.
     """
     if n_points < len(views):
         raise InputError(f"{n_points} points from {len(views)} views are none from each: ask for more points")
     cameras = [with_principal_point(view.camera, conventions) for view in views]
-    depth_maps, weight_maps = [], []  # 8 bytes a pixel of all views; points would be 12 more
+    _check_room(cameras)
+    depth_maps, weight_maps = [], []  # MAP_BYTES a pixel of all views; points would be 12 more
     for view in views:
         _, depths, alpha = points_of(model, view, conventions, backend, renderer)
         is_drawable = (depths > 0) & (alpha >= least_alpha)
@@ -207,6 +210,18 @@ def reinitial_points(
     if sum(map(len, points)) == 0:
         raise InputError("no pixel of any view shows a surface: lower least_alpha or raise depth_tolerance")
     return np.concatenate(points), np.concatenate(colors)
+
+
+def _check_room(cameras: Sequence[Camera]) -> None:
+    """Refuse views whose depths, which are all needed at once, do not fit into memory."""
+    needed = MAP_BYTES * sum(camera.width * camera.height for camera in cameras)
+    free = memory.free_bytes()
+    if needed > free:
+        raise InputError(
+            f"the depths of all {len(cameras)} views take {memory.as_text(needed)} of memory,"
+            f" {memory.as_text(free)} are free: train on smaller photographs (--downscale), or by a recipe that does"
+            " not begin again from depth, such as 3dgs-accel"
+        )
 
 
 def unprojected(depths: Floats, camera: Camera) -> Floats:
