@@ -57,7 +57,8 @@ from minisplat_ref.oracle.comparison.renderers import (
 )
 from minisplat_ref.oracle.comparison.staged import compare_scene, first_divergence
 from minisplat_ref.oracle.golden.files import export
-from minisplat_ref.oracle.golden.scenes import Recipe, inputs, run_stages, truth
+from minisplat_ref.oracle.golden.running import run_stages
+from minisplat_ref.oracle.golden.scenes import Recipe, inputs, truth
 from minisplat_ref.oracle.planted import planted
 
 plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})

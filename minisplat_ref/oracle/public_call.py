@@ -6,7 +6,7 @@ reach the view matrices through the camera's centre. Checks of the stages see no
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -77,7 +77,7 @@ def rasterization_stage(
         1 or 2; the second is turned, moved and of another focal length.
     """
     camera = setting.camera
-    fixed = {
+    fixed: dict[str, Any] = {
         "Ks": _intrinsics(setting)[:n_cameras],
         "width": camera.width,
         "height": camera.height,
