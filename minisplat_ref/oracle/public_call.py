@@ -92,7 +92,7 @@ def rasterization_stage(
     if call.has_colors:
         inputs |= {"colors": colors, "backgrounds": backgrounds}
 
-    def arguments(args: tuple[Floats, ...]) -> dict[str, Floats]:
+    def arguments(args: tuple[Floats, ...]) -> dict[str, Any]:
         given = {"colors": colors, "backgrounds": backgrounds, **dict(zip(inputs, args, strict=True))}
         last_rows = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (n_cameras, 1, 4))
         return {**given, "viewmats": np.concatenate([given["viewmats"], last_rows], axis=1)}

@@ -167,7 +167,7 @@ def _statistics(backend: Backend, blending: tuple[Projection, Floats, Floats, Ti
 
 
 def _surface(backend: Backend, take: Take, scene: Golden) -> Arrays:
-    rays = (take("means"), take("quats"), take("scales"), scene.camera, take("surface_ids"))
+    rays = (take("means"), take("quats"), take("scales"), scene.camera, scene.arrays["surface_ids"])
     points, depths = backend.surface_points(*rays)
     v = backend.surface_points_vjp(*rays, take("v_surface_points"), take("v_surface_depths"))
     return {"surface_points": points, "surface_depths": depths, **dict(zip(SURFACE_GRADIENT, v, strict=True))}
