@@ -1,219 +1,258 @@
-"""Errors to plant into a copy of the package: one line of the renderer, of a loss or of Adam, changed.
+"""Errors to plant, one at a time: one line of the renderer, of a loss or of Adam, changed.
 
 Most were found to pass every check of an earlier oracle. An error in the reference is as good as one in the kernels:
-what compares the two cannot tell who is wrong, but must notice.
+what compares the two cannot tell which of them is wrong, but must notice.
 """
 
 from typing import NamedTuple
 
 
-class TextError(NamedTuple):
+class PlantedLine(NamedTuple):
     """One change of the source."""
 
     what: str
     """The error, in a few words; unique."""
-    file: str
-    """Below the package."""
+    where: str
+    """``module:function`` below the package."""
     right: str
-    """What stands there, once."""
+    """What stands in the function, once."""
     wrong: str
     """What stands there instead."""
-
-    @property
-    def is_compiled(self) -> bool:
-        """Whether kernels are made of the file."""
-        return self.file.startswith(("jit/", "scalar/", "cpu/"))
+    is_compiled: bool = False
+    """Whether the function becomes part of a kernel; such an error stands once in its whole module."""
 
 
-_CALL = "gsplat_compat.py"
-_CALL_ERRORS = (
-    TextError(
+_CALL = (
+    PlantedLine(
         "expected depth: sign of alpha's gradient",
-        _CALL,
-        "v_alpha = v_alpha + v_alpha_of_depth",
-        "v_alpha = v_alpha - v_alpha_of_depth",
+        "gsplat_compat:rasterization_vjp",
+        "v_alpha + v_alpha_of_depth",
+        "v_alpha - v_alpha_of_depth",
     ),
-    TextError(
+    PlantedLine(
         "view matrix without the harmonics' share",
-        _CALL,
+        "gsplat_compat:draw_vjp",
         "v_R, v_t = v_R + np.outer(w, lookout.cam_from_world_t), v_t - w",
         "pass",
     ),
-    TextError("expected depth not divided", _CALL, "expected_depth(images[..., -1], alphas)", "images[..., -1]"),
-    TextError(
-        "all cameras' colours to the first",
-        _CALL,
-        "v_own_colors = v_colors[c] if",
-        "v_own_colors = v_colors[0] if",
+    PlantedLine(
+        "means without the harmonics' share", "gsplat_compat:draw_vjp", "v_means = v_means + v_sh.means", "pass"
     ),
-    TextError("camera's centre by the transpose", _CALL, "np.linalg.solve(R, t))", "R.T @ t)"),
-    TextError("means without the harmonics' share", _CALL, "v_means = v_means + v_sh.means", "pass"),
+    PlantedLine(
+        "expected depth not divided",
+        "gsplat_compat:rasterization",
+        "expected_depth(images[..., -1], alphas)",
+        "images[..., -1]",
+    ),
+    PlantedLine(
+        "colours of all cameras to the first", "gsplat_compat:rasterization_vjp", "v_colors[c] if", "v_colors[0] if"
+    ),
+    PlantedLine("camera's centre by the transpose", "gsplat_compat:_lookout", "np.linalg.solve(R, t)", "R.T @ t"),
+    PlantedLine("depths over white", "splatting:splat", "background.dtype.type(0)", "background.dtype.type(1)"),
+    PlantedLine(
+        "gradient of depths lost", "splatting:splat_vjp", "v.colors[:, -1].copy()", "np.zeros_like(projection.depths)"
+    ),
+    PlantedLine("1 - opacity rounded", "rendering:render_vjp", "1 / (1 + np.exp(g.opacity_logits))", "1 - opacities"),
 )
-_SPLATTING_ERRORS = (
-    TextError(
-        "depth channel over white",
-        "splatting.py",
-        "np.append(background, background.dtype.type(0))",
-        "np.append(background, background.dtype.type(1))",
+_EQUALITY = (
+    PlantedLine(
+        "goes on where T equals the stop",
+        "reference.hits:goes_on",
+        "transmittances > conventions",
+        "transmittances >= conventions",
     ),
-    TextError("depth channel's gradient lost", "splatting.py", "v.colors[:, -1].copy()", "np.zeros_like(v_depths)"),
-    TextError("1 - opacity rounded", "rendering.py", "1 / (1 + np.exp(g.opacity_logits))", "1 - opacities"),
-)
-_HITS, _PROJECTION = "reference/hits.py", "reference/projection.py"
-_REFERENCE_ERRORS = (
-    TextError(
-        "goes on at equality",
-        _HITS,
-        "transmittances > conventions.transmittance_min",
-        "transmittances >= conventions.transmittance_min",
+    PlantedLine(
+        "stops where T equals the stop, 3DGS's rule",
+        "reference.hits:goes_on",
+        "transmittances >= conventions",
+        "transmittances > conventions",
     ),
-    TextError(
-        "stops at equality (3DGS)",
-        _HITS,
-        "return transmittances >= conventions.transmittance_min",
-        "return transmittances > conventions.transmittance_min",
+    PlantedLine(
+        "skips at alpha_min",
+        "reference.hits:tile_hits",
+        "alphas >= conventions.alpha_min",
+        "alphas > conventions.alpha_min",
     ),
-    TextError("skips at equality", _HITS, "alphas >= conventions.alpha_min", "alphas > conventions.alpha_min"),
-    TextError("clamps at equality", _HITS, "unclamped > conventions.alpha_max", "unclamped >= conventions.alpha_max"),
-    TextError(
-        "drawn on the near plane", _PROJECTION, "conventions.near_plane < depths", "conventions.near_plane <= depths"
+    PlantedLine(
+        "clamps at alpha_max",
+        "reference.hits:tile_hits",
+        "hit.unclamped > conventions.alpha_max",
+        "hit.unclamped >= conventions.alpha_max",
     ),
-    TextError(
-        "drawn on the far plane", _PROJECTION, "depths < conventions.far_plane", "depths <= conventions.far_plane"
+    PlantedLine(
+        "median where T equals one half",
+        "reference.compositing:composite_hits",
+        "[1:] < MEDIAN_TRANSMITTANCE",
+        "[1:] <= MEDIAN_TRANSMITTANCE",
     ),
-    TextError("near plane at 0", _PROJECTION, "conventions.near_plane < depths", "0 < depths"),
-    TextError(
-        "drawn behind the camera",
-        _PROJECTION,
+    PlantedLine(
+        "drawn on the near plane",
+        "reference.projection:project",
         "conventions.near_plane < depths",
-        "conventions.near_plane < np.abs(depths)",
+        "conventions.near_plane <= depths",
     ),
-    TextError("no far plane", _PROJECTION, "(depths < conventions.far_plane)", "(depths < np.inf)"),
-    TextError(
-        "y clamped by the limits of x, backward",
-        "reference/pinhole.py",
-        "v_slopes = np.where((low < slopes) & (slopes < high)",
-        "v_slopes = np.where((low[0] < slopes) & (slopes < high[0])",
+    PlantedLine(
+        "drawn on the far plane",
+        "reference.projection:project",
+        "depths < conventions.far_plane",
+        "depths <= conventions.far_plane",
     ),
-    TextError(
-        "a clamped colour has a gradient",
-        "reference/spherical_harmonics.py",
-        "np.where(_unclamped(basis, coefficients) > 0, v_colors[rows], 0)",
-        "v_colors[rows]",
-    ),
-    TextError(
-        "median at equality",
-        "reference/compositing.py",
-        "tile.transmittances[1:] < MEDIAN_TRANSMITTANCE",
-        "tile.transmittances[1:] <= MEDIAN_TRANSMITTANCE",
-    ),
-    TextError(
-        "largest weight summed",
-        "reference/compositing.py",
-        "np.maximum(stats.blend_weight_max[ids], weights.max(axis=1))",
-        "stats.blend_weight_max[ids] + weights.max(axis=1)",
-    ),
-    TextError(
-        "hits counted by the clamp",
-        "reference/compositing.py",
-        "(weights > 0).sum",
-        "(weights > 0.01).sum",
-    ),
-    TextError(
-        "expected depth's gradient, reference",
-        "reference/depth.py",
-        "-v_accumulated_depth * expected_depth",
-        "v_accumulated_depth * expected_depth",
-    ),
-    TextError(
-        "surface at half the chord",
-        "reference/depth.py",
-        'np.einsum("pi,pi->p", a, b) / np.einsum("pi,pi->p", b, b)  # [P]',
-        'np.einsum("pi,pi->p", a, b) / np.einsum("pi,pi->p", b, b) / 2  # [P]',
-    ),
-)
-_LOSS_AND_ADAM_ERRORS = (
-    TextError(
-        "masked pixels leak into windows",
-        "reference/loss.py",
-        "    image = np.where(mask[:, :, None], image, target)\n",
-        "",
-    ),
-    TextError(
-        "mean over all pixels, not the mask",
-        "reference/loss.py",
-        "np.abs(image - target)[mask]",
-        "np.abs(image - target)",
-    ),
-    TextError("bytes divided by 256", "reference/loss.py", "255 if target.dtype", "256 if target.dtype"),
-    TextError(
-        "eps inside the root",
-        "reference/adam.py",
-        "(np.sqrt(v) + step.eps)",
-        "np.sqrt(v + step.eps)",
-    ),
-    TextError("beta2 for the mean", "reference/adam.py", "(1 - step.beta1) * (g - m)", "(1 - step.beta2) * (g - m)"),
-    TextError("all rows stepped", "reference/adam.py", "slice(None) if rows is None else rows", "slice(None)"),
-    TextError(
-        "correction of the step before", "training/adam.py", "step = state.step + 1\n", "step = max(1, state.step)\n"
-    ),
-    TextError(
-        "eps not corrected", "training/adam.py", "eps = rule.eps * (math.sqrt", "eps = rule.eps * max(1.0, math.sqrt"
-    ),
-)
-_KERNEL_ERRORS = (
-    TextError(
-        "kernel: y clamped by the limits of x, forward",
-        "scalar/projection.py",
-        "smaller(larger(y, lens.y_min), lens.y_max), V[1], V[2])",
-        "smaller(larger(y, lens.x_min), lens.x_max), V[1], V[2])",
-    ),
-    TextError(
-        "kernel: y clamped by the limits of x, backward",
-        "scalar/projection.py",
-        "(y > lens.y_min) & (y < lens.y_max)",
-        "(y > lens.x_min) & (y < lens.x_max)",
-    ),
-    TextError(
-        "kernel: stops by the other rule",
-        "cpu/compositing/tile_state.py",
+    PlantedLine(
+        "kernels: the other rule of stopping",
+        "cpu.compositing.tile_state:frame_of",
         "if conventions.stops_at_equality",
         "if not conventions.stops_at_equality",
     ),
-    TextError(
-        "kernel: skips at equality", "scalar/compositing.py", "is_hit = alpha >= frame", "is_hit = alpha > frame"
+    PlantedLine(
+        "kernels: skip at alpha_min",
+        "cpu.compositing.tile_state:frame_of",
+        "conventions.alpha_min,",
+        "np.nextafter(conventions.alpha_min, 1.0),",
     ),
-    TextError(
-        "kernel: clamps at equality",
-        "cpu/compositing/backward.py",
-        "q_shape = select(unclamped <= frame",
-        "q_shape = select(unclamped < frame",
+    PlantedLine(
+        "kernels: clamp at alpha_max",
+        "cpu.compositing.tile_state:frame_of",
+        "conventions.alpha_max if conventions.clamp_stops_shape_gradient",
+        "np.nextafter(conventions.alpha_max, 0.0) if conventions.clamp_stops_shape_gradient",
     ),
-    TextError("kernel: drawn on the near plane", "cpu/projection.py", "p[2] > lens.near", "p[2] >= lens.near"),
-    TextError("kernel: eps inside the root", "scalar/adam.py", "(sqrt(second) + step.eps)", "sqrt(second + step.eps)"),
-    TextError(
-        "kernel: fourth channel without its shade",
-        "cpu/compositing/backward.py",
+    PlantedLine(
+        "kernels: drawn on the near plane",
+        "cpu.projection:lens_of",
+        "conventions.near_plane, conv",
+        "np.nextafter(conventions.near_plane, 0.0), conv",
+    ),
+)
+_PROJECTION = (
+    PlantedLine(
+        "near plane at the camera", "reference.projection:project", "conventions.near_plane < depths", "0 < depths"
+    ),
+    PlantedLine(
+        "drawn behind the camera",
+        "reference.projection:project",
+        "conventions.near_plane < depths",
+        "conventions.near_plane < np.abs(depths)",
+    ),
+    PlantedLine("no far plane", "reference.projection:project", "depths < conventions.far_plane", "depths < np.inf"),
+    PlantedLine(
+        "gradient of y by the limits of x",
+        "reference.pinhole:pinhole_jacobians_vjp",
+        "(low < slopes) & (slopes < high)",
+        "(low[0] < slopes) & (slopes < high[0])",
+    ),
+    PlantedLine(
+        "kernels: y clamped by the limit of x",
+        "cpu.projection:lens_of",
+        "(camera.height - cy) / camera.fy + margin * tan_y",
+        "(camera.width - cx) / camera.fx + margin * tan_x",
+    ),
+    PlantedLine(
+        "kernels: gradient of y by the limits of x",
+        "scalar.projection:project_gaussian_vjp",
+        "(y > lens.y_min) & (y < lens.y_max)",
+        "(y > lens.x_min) & (y < lens.x_max)",
+        is_compiled=True,
+    ),
+)
+_BLENDING = (
+    PlantedLine(
+        "colour clamped at 0 has a gradient",
+        "reference.spherical_harmonics:sh_colors_vjp",
+        "np.where(_unclamped(basis, coefficients) > 0, v_colors[rows], 0)",
+        "v_colors[rows]",
+    ),
+    PlantedLine(
+        "largest weight summed over tiles",
+        "reference.compositing:composite_hits",
+        "np.maximum(stats.blend_weight_max[ids], weights.max(axis=1))",
+        "stats.blend_weight_max[ids] + weights.max(axis=1)",
+    ),
+    PlantedLine(
+        "faint hits not counted", "reference.compositing:composite_hits", "(weights > 0).sum", "(weights > 1e-4).sum"
+    ),
+    PlantedLine(
+        "last of the largest weights dominates",
+        "reference.compositing:composite_hits",
+        "np.argmax(sorted_by(order, weights), axis=0)",
+        "len(ids) - 1 - np.argmin(sorted_by(order, weights)[::-1], axis=0)",
+    ),
+    PlantedLine(
+        "expected depth's gradient",
+        "reference.depth:expected_depth_vjp",
+        "-v_accumulated_depth * expected_depth",
+        "v_accumulated_depth * expected_depth",
+    ),
+    PlantedLine(
+        "surface at the chord's end",
+        "reference.depth:surface_points",
+        'np.einsum("pi,pi->p", a, b) /',
+        '(np.einsum("pi,pi->p", a, b) - 1) /',
+    ),
+    PlantedLine(
+        "kernels: fourth channel without its share of alpha's gradient",
+        "cpu.compositing.backward:backward_kernel",
         "shade = shade + v * records[n, COLOR + k]",
         "pass",
+        is_compiled=True,
     ),
-    TextError(
-        "kernel: median at equality",
-        "cpu/compositing/forward.py",
-        "is_crossing = (after < MEDIAN) & (after + weight >= MEDIAN)",
-        "is_crossing = (after <= MEDIAN) & (after + weight > MEDIAN)",
+    PlantedLine(
+        "kernels: median where T equals one half",
+        "cpu.compositing.forward:forward_kernel",
+        "(after < MEDIAN) & (after + weight >= MEDIAN)",
+        "(after <= MEDIAN) & (after + weight > MEDIAN)",
+        is_compiled=True,
     ),
-    TextError(
-        "kernel: a clamped colour has a gradient",
-        "cpu/spherical_harmonics.py",
-        "select(green > ZERO, gather(v_colors, rows, 1), ZERO)",
-        "gather(v_colors, rows, 1)",
+)
+_LOSS_AND_ADAM = (
+    PlantedLine(
+        "masked pixels leak into windows",
+        "reference.loss:photometric_loss",
+        "image = np.where(mask[:, :, None], image, target)",
+        "pass",
     ),
-    TextError("kernel: masked pixels have a gradient", "cpu/loss/__init__.py", "v_image[~mask] = 0", "pass"),
-    TextError(
-        "kernel: pivot of needles kept too large", "scalar/compositing.py", "np.float32(1e-14)", "np.float32(1e-4)"
+    PlantedLine(
+        "mean over all pixels, not the mask",
+        "reference.loss:photometric_loss",
+        "np.abs(image - target)[mask]",
+        "np.abs(image - target)",
+    ),
+    PlantedLine(
+        "bytes divided by 256", "reference.loss:photometric_loss", "255 if target.dtype", "256 if target.dtype"
+    ),
+    PlantedLine(
+        "kernels: masked pixels have a gradient",
+        "cpu.loss:photometric_loss",
+        "v_image[~mask] = 0",
+        "v_image[~mask] = 1e-6",
+    ),
+    PlantedLine(
+        "eps inside the root", "reference.adam:adam_update", "(np.sqrt(v) + step.eps)", "np.sqrt(v + step.eps)"
+    ),
+    PlantedLine(
+        "beta2 for the mean", "reference.adam:adam_update", "(1 - step.beta1) * (g - m)", "(1 - step.beta2) * (g - m)"
+    ),
+    PlantedLine(
+        "all rows stepped", "reference.adam:adam_update", "slice(None) if rows is None else rows", "slice(None)"
+    ),
+    PlantedLine(
+        "corrections of the step before",
+        "training.adam:adam_step",
+        "step = state.step + 1",
+        "step = max(1, state.step)",
+    ),
+    PlantedLine(
+        "eps without its correction",
+        "training.adam:adam_step",
+        "rule.eps * (math.sqrt(1 - rule.beta2**step) if",
+        "rule.eps * (1.0 if",
+    ),
+    PlantedLine(
+        "kernels: eps inside the root",
+        "scalar.adam:adam_value",
+        "(sqrt(second) + step.eps)",
+        "sqrt(second + step.eps)",
+        is_compiled=True,
     ),
 )
 
-ERRORS = (*_CALL_ERRORS, *_SPLATTING_ERRORS, *_REFERENCE_ERRORS, *_LOSS_AND_ADAM_ERRORS, *_KERNEL_ERRORS)
+ERRORS = (*_CALL, *_EQUALITY, *_PROJECTION, *_BLENDING, *_LOSS_AND_ADAM)
 """In the order of the table."""

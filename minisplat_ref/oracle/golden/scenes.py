@@ -29,7 +29,7 @@ class Recipe(NamedTuple):
     sh_degree: int = 2
     scales: tuple[float, float] = (0.05, 0.5)  # world units, drawn uniformly in their logarithm
     spread: float = 1.0  # of the centres, in half images around the image's middle
-    n: int = 90
+    n: int = 70
     depths: tuple[float, float] = (1.5, 6.0)  # world units, drawn uniformly
     n_features: int = 1
     has_all_adam_rows: bool = False
@@ -49,7 +49,7 @@ RECIPES = (
         "dense, opaque in places: clamped alpha and finished pixels",
         GSPLAT_MAIN,
         (48, 32),
-        n=120,
+        n=150,
         n_features=4,
     ),
     Recipe(
@@ -57,7 +57,7 @@ RECIPES = (
         "Gaussians thinner than a pixel, opacities compensated",
         GSPLAT_MAIN._replace(name="ANTIALIASED", is_antialiased=True),
         scales=(0.004, 0.12),
-        n=110,
+        n=90,
     ),
     Recipe(
         "inria",
@@ -77,7 +77,7 @@ RECIPES = (
         (0.35, 0.6),
         scales=(0.1, 1.2),
         spread=2.2,
-        n=110,
+        n=150,
     ),
     Recipe(
         "planes",
@@ -128,12 +128,11 @@ def inputs(recipe: Recipe, seed: int = 0) -> Golden:
     """
     rng = np.random.default_rng((seed, *recipe.name.encode()))
     size, center = np.array(recipe.size), np.multiply(recipe.size, recipe.principal_point)
-    placed = _at_thresholds(recipe) if recipe.is_exact else _scattered(recipe, rng)
+    placed = _at_thresholds(recipe, rng) if recipe.is_exact else _scattered(recipe, rng)
     n = len(placed["means"])
     n_rest = (recipe.sh_degree + 1) ** 2 - 1
     image_shape = (size[1], size[0])
     arrays: dict[str, Floats] = {
-        "quats": rng.normal(size=(n, 4)),
         "sh_dc": rng.normal(size=(n, 3)),
         "sh_rest": 0.3 * rng.normal(size=(n, n_rest, 3)),
         "background": np.array([0.1, 0.4, 0.7]),
@@ -170,6 +169,7 @@ def _scattered(recipe: Recipe, rng: np.random.Generator) -> Arrays:
     smallest, largest = np.log(recipe.scales)
     return {
         "means": np.linalg.solve(R, (means_cam - t).T).T,
+        "quats": rng.normal(size=(n, 4)),
         "scales": np.exp(rng.uniform(smallest, largest, (n, 3))),
         "opacities": np.minimum(1, rng.uniform(0.05, 1.3, n)),
         "cam_from_world_R": R,
@@ -177,7 +177,7 @@ def _scattered(recipe: Recipe, rng: np.random.Generator) -> Arrays:
     }
 
 
-def _at_thresholds(recipe: Recipe) -> Arrays:
+def _at_thresholds(recipe: Recipe, rng: np.random.Generator) -> Arrays:
     """Piles of Gaussians on the centres of five pixels, where their alphas are their opacities, in whole 256ths.
 
     The camera looks along z from a place in whole eighths; all depths that matter are powers of two, so that a
@@ -199,6 +199,7 @@ def _at_thresholds(recipe: Recipe) -> Arrays:
     sizes = np.abs(depths) * np.array([1.25, 1.0, 0.75]) / focal  # about a pixel
     return {
         "means": means - t,
+        "quats": rng.normal(size=(len(rows), 4)),
         "scales": sizes,
         "opacities": rows[:, 3],
         "intrinsics": np.array([focal, focal, *center]),
