@@ -113,7 +113,7 @@ def run_stages(
     if fed is None:
         for name in ("v_means", "v_R", "v_t"):
             out[name] = out[f"{name}_projection"] + out[f"{name}_colors"]
-    further = {
+    further: dict[str, Callable[[], Arrays]] = {
         "loss": lambda: _loss(backend, take),
         "features": lambda: _features(backend, take, projection, bins, c),
         "statistics": lambda: _statistics(backend, blending),

@@ -78,6 +78,7 @@ RECIPES = (
         scales=(0.1, 1.2),
         spread=2.2,
         n=150,
+        n_features=2,
     ),
     Recipe(
         "planes",
