@@ -1,15 +1,18 @@
 """Planted errors: each line is where the list says, a planted function is restored, a command's verdict is told."""
 
+import inspect
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from data_tools import survey as module
+from data_tools.survey import as_markdown, planted_copy, planted_function, survey
+from data_tools.survey_errors import ERRORS
+from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments import survey as module
-from minisplat_ref.experiments.survey import as_markdown, planted_copy, planted_function, survey
-from minisplat_ref.experiments.survey_errors import ERRORS
 from minisplat_ref.reference import adam, hits
 from minisplat_ref.reference.adam import adam_update
 
@@ -61,7 +64,8 @@ def test_a_command_notices_or_not(monkeypatch, capsys):
 
 def test_an_exception_is_noticed():
     broken = BY_NAME["goes on where T equals the stop"]._replace(wrong="1 / 0 + conventions")
-    assert hits.goes_on.__code__ is not None and survey(broken, ["compare"]).notices == {"compare": True}
+    assert survey(broken, ["compare reference"]).notices == {"compare reference": True}
+    assert "/ 0" not in inspect.getsource(hits.goes_on) and hits.goes_on(np.ones(1), GSPLAT_MAIN)
 
 
 def test_the_script_names_its_commands():
