@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from tolerances import CLOSED_FORM
 
-from minisplat_ref.backends import CPU, REFERENCE
+from minisplat_ref import gsplat_compat
+from minisplat_ref.backends import BACKENDS, CPU, REFERENCE
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN, PROFILES
+from minisplat_ref.gsplat_compat import RENDER_MODES
 from minisplat_ref.oracle import gradients
 from minisplat_ref.oracle.differences import (
     CENTRAL,
@@ -22,10 +24,15 @@ from minisplat_ref.oracle.differences import (
 )
 from minisplat_ref.oracle.gradients import inner_product_case, jacobian_case
 from minisplat_ref.oracle.pieces import PIECES, tiny_setting
+from minisplat_ref.oracle.public_call import CALLS, Call, rasterization_stage
 from minisplat_ref.oracle.setting import make_setting
 from minisplat_ref.oracle.stages import Stage, backend_stages, composite_stage, project_stage, render_stage, sh_stage
 from minisplat_ref.oracle.tolerances import GRADIENT_REL
+from minisplat_ref.reference import projection as reference_projection
+from minisplat_ref.reference.depth import expected_depth_vjp
 from minisplat_ref.reference.hits import tile_hits
+from minisplat_ref.reference.pinhole import pinhole_jacobians_vjp, slope_limits
+from minisplat_ref.splatting import splat_vjp
 from minisplat_ref.types import TileGrid
 
 ONE = np.ones(1)
@@ -134,6 +141,10 @@ def test_the_tiny_scene_takes_every_branch():
     sides = project_stage(REFERENCE, setting)
     _, follows = sides.function(*sides.inputs.values()).sides
     assert not follows.all()  # the Jacobian's clamp
+    low, high = slope_limits(camera, conventions, np.dtype(float))
+    R, t = setting.pose.values()
+    x, y = np.split((setting.primitives.means @ R.T + t)[:, :2] / projection.depths[:, None], 2, axis=1)
+    assert ((y > high[1]) & (low[0] < y) & (y < high[0]) & (low[0] < x) & (x < high[0])).any()  # between the limits
     colors = sh_stage(REFERENCE, setting)
     assert (colors.function(*colors.inputs.values()).outputs[0] == 0).any()
 
@@ -150,12 +161,59 @@ def test_every_formula_of_the_reference():
             assert case.passed, case
 
 
+# --- the public call ---
+
+
+def public_case(call, rng):
+    return inner_product_case(rasterization_stage(CPU, tiny_setting(), call, rng), rng)
+
+
+def test_the_public_call_is_checked_in_every_mode(rng):
+    assert {call.render_mode for call in CALLS} == set(RENDER_MODES)
+    assert {call.n_channels for call in CALLS} >= {0, 1, 5} and any(call.is_antialiased for call in CALLS)
+    for call in CALLS:
+        case = public_case(call, rng)
+        assert case.passed and case.figures["limit"] == GRADIENT_REL, case
+
+
+def test_a_wrong_gradient_of_the_expected_depth_is_found(monkeypatch, rng):
+    def wrong(accumulated, alpha, v):
+        v_accumulated, v_alpha = expected_depth_vjp(accumulated, alpha, v)
+        return v_accumulated, -v_alpha
+
+    monkeypatch.setattr(gsplat_compat, "expected_depth_vjp", wrong)
+    assert not jacobian_case(rasterization_stage(CPU, tiny_setting(), Call("ED"), rng, n_cameras=1)).passed
+    assert [public_case(Call(mode), rng).passed for mode in ("RGB+D", "RGB+ED")] == [True, False]
+
+
+def test_harmonics_missing_from_the_view_matrix_are_found(monkeypatch, rng):
+    right = gsplat_compat.draw_vjp
+
+    def wrong(batch, c, tape, v_image, v_alpha):
+        p = splat_vjp(tape, v_image, v_alpha).primitives
+        v_viewmat = np.vstack([np.column_stack([p.cam_from_world_R, p.cam_from_world_t]), np.zeros(4)])
+        return right(batch, c, tape, v_image, v_alpha)._replace(viewmat=v_viewmat)
+
+    monkeypatch.setattr(gsplat_compat, "draw_vjp", wrong)
+    assert public_case(Call("RGB", n_channels=5), rng).passed
+    assert public_case(Call("RGB"), rng).note == "gradient by viewmats is wrong"
+
+
+def test_y_clamped_by_the_limit_of_x_is_found(monkeypatch):
+    def wrong(means_cam, camera, low, high, v_jacobians):
+        return pinhole_jacobians_vjp(means_cam, camera, low[[0, 0]], high[[0, 0]], v_jacobians)
+
+    monkeypatch.setattr(reference_projection, "pinhole_jacobians_vjp", wrong)
+    assert not jacobian_case(project_stage(REFERENCE, tiny_setting())).passed
+
+
 def test_the_report_says_what_was_not_run(monkeypatch):
     def missing(backend):
         raise gradients.InputError("torch is missing")
 
     monkeypatch.setattr(gradients, "autograd_cases", missing)
     monkeypatch.setattr(gradients, "backend_stages", lambda *args: ())
+    monkeypatch.setattr(gradients, "public_call_cases", lambda *args: [])
     report = gradients.check_gradients(CPU, GSPLAT_MAIN)
     assert report.settings[gradients.AUTOGRAD] == "not run: torch is missing" and report.n_failed == 0
 
@@ -172,6 +230,7 @@ def test_the_command(tmp_path, capsys, monkeypatch):
 
     monkeypatch.setattr(gradients, "backend_stages", stages)
     monkeypatch.setattr(gradients, "autograd_cases", lambda backend: [])
+    monkeypatch.setattr(gradients, "public_call_cases", lambda *args: [])
     arguments = ["oracle", "gradients", "--backend", "cpu", "--profile", "inria", "--json", str(tmp_path / "g.json")]
     assert main(arguments) == 0
     report = json.loads((tmp_path / "g.json").read_text())
@@ -181,6 +240,16 @@ def test_the_command(tmp_path, capsys, monkeypatch):
     assert "torch autograd: " in output and "passed" in output
 
 
+def test_the_command_checks_every_backend(capsys, monkeypatch):
+    monkeypatch.setattr(gradients, "backend_stages", lambda backend, *args: (project_stage(backend, tiny_setting()),))
+    monkeypatch.setattr(gradients, "autograd_cases", lambda backend: [])
+    monkeypatch.setattr(gradients, "public_call_cases", lambda *args: [])
+    monkeypatch.setattr(gradients, "PIECES", {})
+    assert main(["oracle", "gradients"]) == 0
+    output = capsys.readouterr().out
+    assert all(f"| {name}: project: Jacobian" in output for name in BACKENDS) and len(BACKENDS) == 3
+
+
 def test_the_command_fails_when_a_gradient_is_wrong(monkeypatch, capsys):
     def stages(*args):
         stage = project_stage(CPU, tiny_setting())
@@ -188,5 +257,6 @@ def test_the_command_fails_when_a_gradient_is_wrong(monkeypatch, capsys):
 
     monkeypatch.setattr(gradients, "backend_stages", stages)
     monkeypatch.setattr(gradients, "autograd_cases", lambda backend: [])
+    monkeypatch.setattr(gradients, "public_call_cases", lambda *args: [])
     assert main(["oracle", "gradients", "--backend", "cpu"]) == 1
     assert "is wrong" in capsys.readouterr().out

@@ -9,10 +9,11 @@ from minisplat_ref.cli import main
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle import hard_cases
-from minisplat_ref.oracle.hard_cases import GROUPS, HARD_CASES
+from minisplat_ref.oracle.hard_cases import GROUPS, HARD_CASES, subjects
 from minisplat_ref.oracle.hard_cases.run import PRECISIONS, Precision, by_group, matching, run_hard_case, run_hard_cases
 from minisplat_ref.oracle.hard_cases.subjects import Call, Parameters, drawing
 from minisplat_ref.oracle.tolerances import ORDINARY
+from minisplat_ref.rendering import render_vjp
 
 BY_NAME = {case.name: case for case in HARD_CASES}
 
@@ -34,6 +35,18 @@ ASKED_FOR = (
 def test_hard_case(case):
     result = run_hard_case(case)
     assert result.passed, result.note
+
+
+def test_digits_lost_in_the_gradient_of_a_logit_are_noticed(monkeypatch):
+    """1 - o where 1 / (1 + exp(logit)) is meant: too small to be seen beside other blocks, unless by the opacity."""
+
+    def wrong(tape, v_image, v_alpha):
+        v, o = render_vjp(tape, v_image, v_alpha), tape.splats.primitives.opacities
+        right = 1 / (1 + np.exp(tape.gaussians.opacity_logits))
+        return v._replace(gaussians=v.gaussians._replace(opacity_logits=v.gaussians.opacity_logits * (1 - o) / right))
+
+    monkeypatch.setattr(subjects, "render_vjp", wrong)
+    assert "v_opacity_logits" in run_hard_case(BY_NAME["logit-plus-30"]).note
 
 
 # --- the catalogue ---

@@ -10,6 +10,7 @@ module           what a reader finds there                                      
 ``thresholds``   pixels at which rounding decides whether a hit counts, or which is in front
 ``setting``      a small scene on which every branch of every gradient is taken
 ``stages``       each stage of a backend as a function with its gradient
+``public_call``  the same for ``rasterization``, in every mode
 ``pieces``       the same for the reference's formulas below the stages
 ``differences``  sixth-order differences that refuse to cross a threshold
 ``gradients``    are the gradients derivatives?                                                ``gradients``

@@ -1,5 +1,7 @@
 """The gradient proof: each stage of a backend by full Jacobians, by inner products and against automatic derivatives.
 
+Beside the stages, the public call ``rasterization`` in every mode, with what it adds to the stages.
+
 Full Jacobians on a tiny scene see every entry of every gradient, also those that a random direction would cancel; inner
 products on a larger one see many tiles and long lists. A check that could not fail is a failure: nothing in the image,
 a gradient of zero, a column that no step could reach without crossing a threshold.
@@ -15,6 +17,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.cases import Case, Report
 from minisplat_ref.oracle.differences import STEPS, check_inner_products, check_jacobians
 from minisplat_ref.oracle.pieces import PIECES, SEED, tiny_setting
+from minisplat_ref.oracle.public_call import CALLS, Call, rasterization_stage
 from minisplat_ref.oracle.setting import make_setting
 from minisplat_ref.oracle.stages import Stage, backend_stages, composite_stage, project_stage, sh_stage
 from minisplat_ref.oracle.tolerances import (
@@ -30,6 +33,34 @@ AUTOGRAD = "torch autograd"
 """Setting of the report: what was compared with, or why nothing was."""
 
 MANY_STEPS = STEPS[1:]  # among thousands of hits some cross a threshold at any larger step
+
+
+def check_all_gradients(backends: Sequence[Backend], conventions: Conventions) -> Report:
+    """Check several backends.
+
+    Parameters
+    ----------
+    backends : sequence of Backend
+        One after the other.
+    conventions : Conventions
+        As for :func:`check_gradients`.
+
+    Returns
+    -------
+    Report
+        The cases of all; their names begin with the backend's where there are several.
+    """
+    reports = [check_gradients(backend, conventions) for backend in backends]
+    if len(reports) == 1:
+        return reports[0]
+    names = ", ".join(backend.name for backend in backends)
+    cases = tuple(
+        case._replace(name=f"{backend.name}: {case.name}")
+        for backend, report in zip(backends, reports, strict=True)
+        for case in report.cases
+    )
+    settings = {**reports[0].settings, "backend": names}
+    return Report(f"gradients of {names}, profile {conventions.name}, float64", cases, settings)
 
 
 def check_gradients(backend: Backend, conventions: Conventions) -> Report:
@@ -55,6 +86,7 @@ def check_gradients(backend: Backend, conventions: Conventions) -> Report:
         pieces = [stage for module, pieces_of in PIECES.items() for stage in pieces_of(module)]
         cases += [jacobian_case(stage) for stage in pieces if f"{stage.name}: Jacobian" not in done]
     cases += [inner_product_case(stage, rng) for stage in backend_stages(backend, larger, rng)]
+    cases += public_call_cases(backend, conventions)
     settings = {"backend": backend.name, "profile": conventions.name, "dtype": "float64", "seed": SEED}
     try:
         cases += autograd_cases(backend)
@@ -62,6 +94,15 @@ def check_gradients(backend: Backend, conventions: Conventions) -> Report:
     except InputError as error:
         settings[AUTOGRAD] = f"not run: {error}"
     return Report(f"gradients of {backend.name}, profile {conventions.name}, float64", tuple(cases), settings)
+
+
+def public_call_cases(backend: Backend, conventions: Conventions) -> list[Case]:
+    """Check ``rasterization``: the expected depth of a view entry by entry, every mode along random directions."""
+    rng = np.random.default_rng(SEED)
+    tiny, larger = tiny_setting(conventions), make_setting(rng, 20, 20, 15, conventions, sh_degree=3)
+    cases = [jacobian_case(rasterization_stage(backend, tiny, Call("ED"), rng, n_cameras=1))]
+    cases += [inner_product_case(rasterization_stage(backend, larger, call, rng), rng) for call in CALLS]
+    return cases
 
 
 def jacobian_case(stage: Stage) -> Case:

@@ -9,7 +9,6 @@ threshold of the renderer's own, a gate or a ReLU, is not seen: its stage belong
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,10 +20,10 @@ from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.gradients import inner_product_case, jacobian_case
 from minisplat_ref.oracle.pieces import SEED, tiny_setting
 from minisplat_ref.oracle.setting import POSE, Setting, make_setting
-from minisplat_ref.oracle.stages import Stage, hit_sides, slope_sides
+from minisplat_ref.oracle.stages import Stage, watched
 from minisplat_ref.rendering import Request
 from minisplat_ref.training.representation import Representation
-from minisplat_ref.types import Camera, Floats, Gaussians, Ints, Model, Projection, RenderOutput, Scene, TileBins, View
+from minisplat_ref.types import Camera, Floats, Gaussians, Model, RenderOutput, Scene, View
 
 TIME = 0.7
 NOISE = 0.1  # standard deviation: the Gaussians lie at depth 3 and are 0.1 to 0.5 large
@@ -106,8 +105,8 @@ def model_stage(backend: Backend, setting: Setting, representation: Representati
         return {"background": setting.background, **dict(zip(inputs, args, strict=True))}
 
     def function(*args: Floats) -> Point:
-        watched, sides = _watched(backend)
-        output, _ = draw(arrays_of(args), watched)
+        on_watch, sides = watched(backend)
+        output, _ = draw(arrays_of(args), on_watch)
         return Point((output.image, output.alpha), tuple(sides))
 
     def vjp(v_image: Floats, v_alpha: Floats) -> tuple[Floats, ...]:
@@ -146,33 +145,3 @@ def _scene(setting: Setting, view: View) -> Scene:
     """Return a scene of one view, from which shared parameters can begin."""
     points = setting.gaussians.means[:N_POINTS]
     return Scene("tiny", (view,), (), points, np.full(points.shape, 128, np.uint8), setting.background, extent=1.0)
-
-
-def _watched(backend: Backend) -> tuple[Backend, list[np.ndarray]]:
-    """Return the backend, and a list to which its stages append on which side of their thresholds they were."""
-    sides: list[np.ndarray] = []
-
-    def project(
-        means: Floats, quats: Floats, scales: Floats, opacities: Floats, camera: Camera, conventions: Conventions
-    ) -> Projection:
-        projection = backend.project(means, quats, scales, opacities, camera, conventions)
-        sides.extend((projection.radii > 0, slope_sides(means, camera, conventions)))
-        return projection
-
-    def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int, radii: Ints) -> Floats:
-        colors = backend.sh_colors(means, sh_dc, sh_rest, camera, degree, radii)
-        sides.append(colors > 0)
-        return colors
-
-    def composite(
-        projection: Projection,
-        colors: Floats,
-        background: Floats,
-        bins: TileBins,
-        conventions: Conventions,
-        **asked: bool,
-    ) -> RenderOutput:
-        sides.extend(hit_sides(projection, bins, conventions))
-        return backend.composite(projection, colors, background, bins, conventions, **asked)
-
-    return replace(backend, project=project, sh_colors=sh_colors, composite=composite), sides

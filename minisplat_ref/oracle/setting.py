@@ -1,7 +1,8 @@
 """A scene to test gradients on: small, and drawn by hand where it matters.
 
-A hit that is clamped, a pixel that stops early, a mean outside the clamp of the Jacobian, a colour below zero, a
-principal point off centre and a turned camera: every branch of every gradient is taken.
+A hit that is clamped, a pixel that stops early, a mean outside the clamp of the Jacobian on either axis, a colour below
+zero, a principal point off centre and a turned camera: every branch of every gradient is taken. The Jacobian's limits
+differ along x and y, and one mean lies between them: whoever clamps y by the limit of x is found out.
 """
 
 from typing import NamedTuple
@@ -45,7 +46,7 @@ def make_setting(
     ----------
     rng : Generator
         For all but the Gaussians that are placed on purpose: row 0 is opaque and on a pixel's centre, rows 1 and 2 lie
-        behind it, row 3 is beyond the clamp of the Jacobian.
+        behind it, row 3 is beyond the Jacobian's clamp along x, row 4 along y, where x would not be clamped yet.
     n : int
         Gaussians, at least 5.
     width, height : int
@@ -71,12 +72,13 @@ def make_setting(
     center = pinhole_rays(width // 2 + 0.54, height // 2 + 0.47, seen)[:2]
     slopes[:3] = center + rng.uniform(-0.02, 0.02, size=(3, 2)) * [[0], [1], [1]]
     z[:3] = 2.0, 2.3, 2.6
-    _, beyond = slope_limits(seen, conventions, np.dtype(float))
+    below, beyond = slope_limits(seen, conventions, np.dtype(float))
     slopes[3] = beyond[0] + 0.03, 0.1 * beyond[1]
+    slopes[4] = 0.75 * below[0], beyond.mean()
     in_camera = np.column_stack([slopes * z[:, None], z])
 
     log_scales = np.log(0.15 if n > 20 else 0.3) + rng.uniform(-0.5, 0.5, size=(n, 3))
-    log_scales[:4] += np.log([1.5, 1.5, 1.5, 2.5])[:, None]
+    log_scales[:5] += np.log([1.5, 1.5, 1.5, 2.5, 2.5])[:, None]
     logits = rng.normal(size=n)
     has_derivative = conventions.clamp_stops_mean_gradient and conventions.clamp_stops_shape_gradient
     logits[:3] = 6.0 if has_derivative else 4.0, 4.0, 4.0  # opacities 0.998 or 0.982, then 0.982

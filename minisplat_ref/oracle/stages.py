@@ -19,9 +19,11 @@ from minisplat_ref.types import (
     Camera,
     Floats,
     Gaussians,
+    Ints,
     Primitives,
     Projection,
     ProjectionGradient,
+    RenderOutput,
     TileBins,
     TileGrid,
 )
@@ -259,3 +261,33 @@ def slope_sides(means: Floats, camera: Camera, conventions: Conventions) -> np.n
     in_camera, limits = means @ R.T + t, np.full(2, np.inf)
     free = pinhole_jacobians(in_camera, camera, -limits, limits)
     return pinhole_jacobians(in_camera, camera, *slope_limits(camera, conventions, means.dtype)) == free
+
+
+def watched(backend: Backend) -> tuple[Backend, list[np.ndarray]]:
+    """Return the backend, and a list to which its stages append on which side of their thresholds they were."""
+    sides: list[np.ndarray] = []
+
+    def project(
+        means: Floats, quats: Floats, scales: Floats, opacities: Floats, camera: Camera, conventions: Conventions
+    ) -> Projection:
+        projection = backend.project(means, quats, scales, opacities, camera, conventions)
+        sides.extend((projection.radii > 0, slope_sides(means, camera, conventions)))
+        return projection
+
+    def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int, radii: Ints) -> Floats:
+        colors = backend.sh_colors(means, sh_dc, sh_rest, camera, degree, radii)
+        sides.append(colors > 0)
+        return colors
+
+    def composite(
+        projection: Projection,
+        colors: Floats,
+        background: Floats,
+        bins: TileBins,
+        conventions: Conventions,
+        **asked: bool,
+    ) -> RenderOutput:
+        sides.extend(hit_sides(projection, bins, conventions))
+        return backend.composite(projection, colors, background, bins, conventions, **asked)
+
+    return dataclasses.replace(backend, project=project, sh_colors=sh_colors, composite=composite), sides

@@ -70,6 +70,16 @@ LOSS = StageTolerance(COMPARE_FLOAT64, 5e-5, "variances are differences of means
 GRADIENT = StageTolerance(
     COMPARE_FLOAT64, 1e-4, "sums over pixels of either sign, divided by 1 - alpha >= 0.01 and by z^2"
 )
+# ... an accumulated depth divided by an alpha that may be 1/255, both off by their last digits ...
+EXPECTED_DEPTH = StageTolerance(COMPARE_FLOAT64, 1e-4, "a depth is divided by alpha, of which 1/255 may be drawn")
+# ... two products with Sigma^-1, of which the ratio of the axes is the condition number, up to 1e2 here ...
+SURFACE = StageTolerance(COMPARE_FLOAT64, 1e-4, "Sigma^-1 multiplies rounding by its condition number")
+# ... and a few roundings of values of order 1.
+ADAM = StageTolerance(COMPARE_FLOAT64, 2e-6, "a few roundings of each value")
+
+# Of two weights in a pixel that are as near as this part of the larger, rounding decides which is the largest: they are
+# products of hundreds of factors, each rounded to 6e-8.
+TIE = 1e-4
 
 # --- the benchmark's contenders ---
 

@@ -15,7 +15,7 @@ conventions of each scene, the tolerances and a hash of each file.
 """
 EPILOG = """\
 example:
-  minisplat-ref oracle export golden    # 6 scenes, 2 MB
+  minisplat-ref oracle export golden    # 9 scenes, 3 MB
   YOUR_PROGRAM golden mine              # reads golden/SCENE/*.npz, writes mine
   minisplat-ref oracle compare mine     # names the first stage that differs"""
 

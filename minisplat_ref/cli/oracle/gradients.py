@@ -4,10 +4,12 @@ import argparse
 
 from minisplat_ref.cli.oracle import add_json_argument, publish
 from minisplat_ref.constants import GSPLAT_MAIN, PROFILES
-from minisplat_ref.experiments.arguments import BACKENDS, Commands, HelpFormatter
+from minisplat_ref.experiments.arguments import BACKENDS as NAMES
+from minisplat_ref.experiments.arguments import Commands, HelpFormatter
 
 DESCRIPTION = """\
-Check every stage's gradient, and the whole render's, in float64:
+Check the gradient of every stage, of the whole render and of rasterization in
+every mode, for every backend, in float64:
 
   Jacobian         every entry, on a tiny scene, against differences
   inner products   a random direction for each input, on a larger one
@@ -16,7 +18,8 @@ Check every stage's gradient, and the whole render's, in float64:
 A difference across a threshold is refused, and a check of nothing fails.
 
 With --extension NAME: the extension's renderer as a whole, by every field of its
-population and every shared parameter, at time 0.7, and what stages it has.
+population and every shared parameter, at time 0.7, and what stages it has; with
+the reference unless --backend names another.
 """
 EPILOG = """\
 examples:
@@ -36,7 +39,7 @@ def add_parser(checks: Commands) -> None:
         formatter_class=HelpFormatter,
     )
     parser.add_argument(
-        "--backend", choices=BACKENDS, default="reference", metavar="NAME", help="reference (default), cpu or cpu-exact"
+        "--backend", choices=NAMES, metavar="NAME", help="reference, cpu or cpu-exact alone (default: all of them)"
     )
     parser.add_argument(
         "--profile",
@@ -53,13 +56,14 @@ def add_parser(checks: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Check, print the table."""
-    from minisplat_ref.backends import get_backend
+    from minisplat_ref.backends import BACKENDS, get_backend
 
     if args.extension is not None:
         return _check_extension(args)
-    from minisplat_ref.oracle.gradients import AUTOGRAD, check_gradients
+    from minisplat_ref.oracle.gradients import AUTOGRAD, check_all_gradients
 
-    report = check_gradients(get_backend(args.backend), PROFILES[args.profile])
+    backends = tuple(BACKENDS.values()) if args.backend is None else (get_backend(args.backend),)
+    report = check_all_gradients(backends, PROFILES[args.profile])
     print(f"{AUTOGRAD}: {report.settings[AUTOGRAD]}")
     return publish(report, args.json)
 
@@ -71,6 +75,6 @@ def _check_extension(args: argparse.Namespace) -> int:
 
     extension = load_extension(args.extension)
     report = check_model_gradients(
-        get_backend(args.backend), PROFILES[args.profile], extension.representation, extension.stages
+        get_backend(args.backend or "reference"), PROFILES[args.profile], extension.representation, extension.stages
     )
     return publish(report, args.json)

@@ -17,7 +17,8 @@ from minisplat_ref.constants import GSPLAT_1_5, PROFILES, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.golden.files import load, read_manifest, read_npz
 from minisplat_ref.oracle.golden.format import SPECS, Arrays, Golden
-from minisplat_ref.oracle.golden.scenes import RECIPES, inputs, run_stages, truth
+from minisplat_ref.oracle.golden.running import run_stages
+from minisplat_ref.oracle.golden.scenes import RECIPES, inputs, truth
 from minisplat_ref.oracle.planted import PLANTED, planted
 
 
@@ -135,16 +136,19 @@ def _check_kind(file: Path, name: str, array: NDArray[Any]) -> None:
         raise InputError(f"{file}: {name} has dtype {array.dtype}; write {allowed}")
 
 
+NOT_OF_GSPLAT = ("loss", "statistics", "surface", "adam")  # stages that gsplat's functions in torch do not have
+
+
 def _gsplat_torch(dtype: str) -> Renderer:
     from minisplat_ref.oracle.peers.cuda import rules_of
     from minisplat_ref.oracle.peers.gsplat_torch import gsplat_torch
 
-    renderer = from_backend(gsplat_torch(), dtype)
+    backend = gsplat_torch()
 
     def arrays(scene: Golden) -> Arrays:
-        return {name: a for name, a in renderer.arrays(scene).items() if SPECS[name].stage != "loss"}  # not gsplat's
+        return run_stages(backend, scene, dtype, fed=scene.arrays, without=NOT_OF_GSPLAT)
 
-    return renderer._replace(arrays=arrays, rules=rules_of(GSPLAT_1_5))
+    return from_backend(backend, dtype)._replace(arrays=arrays, rules=rules_of(GSPLAT_1_5))
 
 
 def _gsplat() -> Renderer:
@@ -224,7 +228,8 @@ def choose_scenes(
     scenes : dict of Golden
         With all arrays, by name.
     left_out : tuple of str
-        Names of the scenes that the renderer cannot draw, by their conventions.
+        Names of the scenes that the renderer cannot draw, by their conventions; and exact scenes, where ours would
+        round, in float32, or other thresholds are asked for than the scene's own.
 
     Raises
     ------
@@ -247,7 +252,8 @@ def choose_scenes(
     for scene in wanted:
         golden = known[scene] or inputs(next(recipe for recipe in RECIPES if recipe.name == scene))
         rules = renderer.rules(golden.conventions) if profile is None else PROFILES[profile]
-        if rules is None:
+        rounds = golden.is_exact and renderer.is_staged and renderer.dtype == "float32"
+        if rules is None or rounds or (golden.is_exact and profile is not None):
             left_out.append(scene)
         else:
             chosen[scene] = _with_truth(golden, rules, renderer.ignores)

@@ -11,11 +11,10 @@ import numpy as np
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.cases import Case, Figure, Report
+from minisplat_ref.oracle.comparison.doubts import doubts
 from minisplat_ref.oracle.comparison.measures import Bounds, Difference, compare_bounds, compare_lists, difference
 from minisplat_ref.oracle.comparison.renderers import Renderer
-from minisplat_ref.oracle.golden.format import SPECS, Arrays, Golden
-from minisplat_ref.oracle.golden.scenes import projection_of, reference_bins
-from minisplat_ref.oracle.thresholds import thresholds
+from minisplat_ref.oracle.golden.format import SPECS, STAGE_COTANGENTS, STAGE_INPUTS, Arrays, Golden, names_of
 from minisplat_ref.types import Bools
 
 Status = Literal["agrees", "diverges", "harmless", "not given"]
@@ -30,8 +29,13 @@ STAGES: dict[str, tuple[str, ...]] = {
     "colors": ("colors",),
     "T": ("alpha",),
     "image": ("image",),
-    "loss": ("loss",),
-    "v_image_of_loss": ("v_image_of_loss",),
+    "loss": ("loss", "masked_loss"),
+    "features": ("feature_image", "accumulated_depth"),
+    "statistics": ("blend_weight_sum", "blend_weight_max", "hit_count", "dominant_count", "dominant_ids"),
+    "median depth": ("median_depth",),
+    "surface": ("surface_points", "surface_depths"),
+    "Adam": ("adam_values_after", "adam_first_after", "adam_second_after"),
+    "v_image_of_loss": ("v_image_of_loss", "v_image_of_masked_loss"),
     "v_colors": ("v_colors",),
     "v_background": ("v_background",),
     "v_means2d": ("v_means2d",),
@@ -44,8 +48,21 @@ STAGES: dict[str, tuple[str, ...]] = {
     "v_sh": ("v_sh_dc", "v_sh_rest"),
     "v_R": ("v_R_projection", "v_R_colors", "v_R"),
     "v_t": ("v_t_projection", "v_t_colors", "v_t"),
+    "v_features": (
+        *("v_features", "v_feature_background", "v_depths_features"),
+        *("v_means2d_features", "v_conics_features", "v_opacities2d_features"),
+    ),
+    "v_surface": ("v_means_surface", "v_quats_surface", "v_scales_surface"),
+    "view": ("view", "view_alpha"),
+    "v_view": (
+        *("v_means_view", "v_quats_view", "v_scales_view", "v_opacities_view"),
+        *("v_sh_dc_view", "v_sh_rest_view", "v_viewmat", "v_background_view"),
+    ),
 }
-"""Arrays of each stage; T is compared by alpha = 1 - T."""
+"""Arrays of each stage; T is compared by alpha = 1 - T. The view comes last: it is the whole renderer in one call."""
+ONE_FUNCTION = {"features": "composite", "statistics": "composite"}
+"""Stages of the golden format that a function of another stage computes."""
+FLIPPING = ("T", "image", "features", "statistics", "median depth", "view")  # flips are counted
 BY_ROW = ("means2d", "depths", "conics", "opacities2d", "colors")  # compared where both show the Gaussian
 
 
@@ -60,7 +77,9 @@ class Row(NamedTuple):
     bounds: Bounds | None = None
     """For radii and tile lists."""
     n_candidates: int = 0
-    """Pixels that rounding decides, for T and image."""
+    """Pixels that rounding decides, or Gaussians, where flips are counted."""
+    arrays: tuple[str, ...] = ()
+    """Names of those that diverge."""
     note: str = ""
     """One line."""
 
@@ -87,9 +106,7 @@ def compare_scene(renderer: Renderer, truth: Golden) -> list[Row]:
     """
     given = renderer.arrays(truth)
     _check_shapes(renderer, given, truth)
-    tile_size = tuple(map(int, truth.arrays["tile_size"]))
-    bins = reference_bins(truth.arrays, truth.conventions, (tile_size[0], tile_size[1]))
-    may_flip = thresholds(projection_of(truth.arrays), bins, truth.conventions).jumps
+    may_flip = doubts(truth)
     rows: list[Row] = []
     for stage, names in STAGES.items():
         if stage == "radii":
@@ -98,9 +115,9 @@ def compare_scene(renderer: Renderer, truth: Golden) -> list[Row]:
             row = _row_of_bounds(truth.name, stage, compare_lists(given, truth))
         else:
             row = _row_of_arrays(renderer, given, truth, stage, names, may_flip)
-        first = next((r.stage for r in rows if r.status == "diverges"), None)
-        if row.status == "diverges" and first is not None and _may_follow(renderer, stage, first):
-            row = row._replace(note=", ".join(filter(None, [row.note, f"may follow from {first}"])))
+        first = next((r for r in rows if r.status == "diverges"), None)
+        if row.status == "diverges" and first is not None:
+            row = row._replace(note=", ".join(filter(None, [row.note, _relation(renderer, row, first)])))
         rows.append(row)
     if all(row.status == "not given" for row in rows):
         raise InputError(f"{renderer.name} gives no array of scene {truth.name}: there is nothing to compare")
@@ -119,10 +136,42 @@ def excess(row: Row) -> float:
     return row.difference.excess if row.difference is not None else 0.0
 
 
-def _may_follow(renderer: Renderer, stage: str, first: str) -> bool:
-    """Whether a difference may come from an earlier one: always end to end, else within one function."""
-    functions = {SPECS[name].stage for name in STAGES[stage]} & {SPECS[name].stage for name in STAGES[first]}
-    return not renderer.is_staged or bool(functions)
+def _relation(renderer: Renderer, row: Row, first: Row) -> str:
+    """Say what a difference has to do with the first one; nothing where neither can be the other's cause.
+
+    It may follow from the first if it is computed from what is wrong there: of a renderer whose stages were each fed
+    with the truth, only in the view. Two results of one stage are wrong beside each other.
+    """
+    is_fed = renderer.is_staged and not any(SPECS[name].stage == "view" for name in row.arrays)
+    if not is_fed and any(set(first.arrays) & _sources(name) for name in row.arrays):
+        return f"may follow from {first.stage}"
+    functions = [{ONE_FUNCTION.get(s, s) for s in (SPECS[name].stage for name in r.arrays)} for r in (row, first)]
+    return f"of one stage with {first.stage}" if functions[0] & functions[1] else ""
+
+
+def _sources(name: str) -> set[str]:
+    """Return the names of all arrays that one is computed from, directly or not."""
+    found, new = set[str](), {name}
+    while new:
+        found |= new
+        new = {source for known in new for source in _direct_sources(known)} - found
+    return found - {name}
+
+
+def _direct_sources(name: str) -> tuple[str, ...]:
+    """Return what the function reads that computes an array; for the view, what its parts give."""
+    spec = SPECS[name]
+    if spec.role in ("input", "cotangent"):
+        return ()
+    of_outputs = (*STAGE_INPUTS[spec.stage], *(_PARTS_OF_VIEW if spec.stage == "view" else ()))
+    if spec.role == "output":
+        return of_outputs
+    of_gradients = _PARTS_OF_V_VIEW if spec.stage == "view" else ()
+    return (*of_outputs, *names_of(spec.stage, "output"), *STAGE_COTANGENTS[spec.stage], *of_gradients)
+
+
+_PARTS_OF_VIEW = (*names_of("composite", "output"), "accumulated_depth")
+_PARTS_OF_V_VIEW = tuple(name for stage in ("composite", "project", "colors") for name in names_of(stage, "gradient"))
 
 
 def _check_shapes(renderer: Renderer, given: Arrays, truth: Golden) -> None:
@@ -147,17 +196,22 @@ def _row_of_bounds(scene: str, stage: str, bounds: Bounds | None) -> Row:
     if bounds.n_different == 0:
         return Row(scene, stage, "agrees", None, bounds)
     if bounds.changes_image:
-        return Row(scene, stage, "diverges", None, bounds, note=f"{bounds.note}; the image changes")
+        note = f"{bounds.note}; the image changes"
+        return Row(scene, stage, "diverges", None, bounds, note=note, arrays=STAGES[stage])
     return Row(scene, stage, "harmless", None, bounds, note=f"{bounds.note}; same image")
 
 
 def _row_of_arrays(
-    renderer: Renderer, given: Arrays, truth: Golden, stage: str, names: tuple[str, ...], may_flip: Bools
+    renderer: Renderer,
+    given: Arrays,
+    truth: Golden,
+    stage: str,
+    names: tuple[str, ...],
+    may_flip: Mapping[str, Bools],
 ) -> Row:
     found = [name for name in names if name in given]
     if not found:
         return Row(truth.name, stage, "not given", None)
-    is_pixelwise = stage in ("T", "image")
     differences = {}
     for name in found:
         a, b = given[name], truth.arrays[name]
@@ -167,17 +221,19 @@ def _row_of_arrays(
                 rows = rows & (given["radii"].reshape(len(rows), -1)[:, 0] > 0)
             a, b = a[rows], b[rows]
         tolerance = SPECS[name].tolerance.of(renderer.dtype or given[name].dtype)
-        differences[name] = difference(a, b, tolerance, may_flip if is_pixelwise else None)
+        differences[name] = difference(a, b, tolerance, may_flip.get(name))
     worst = max(differences, key=lambda name: differences[name].excess)
     d = differences[worst]
     notes = [worst if len(names) > 1 and d.n_over else "", _shape_of_error(given[worst], truth.arrays[worst], d)]
+    wrong = tuple(name for name, of_array in differences.items() if of_array.n_over)
     return Row(
         truth.name,
         stage,
-        "diverges" if any(d.n_over for d in differences.values()) else "agrees",
+        "diverges" if wrong else "agrees",
         d,
-        n_candidates=int(may_flip.sum()) if is_pixelwise else 0,
+        n_candidates=int(may_flip[names[0]].sum()) if stage in FLIPPING else 0,
         note=", ".join(filter(None, notes)),
+        arrays=wrong,
     )
 
 
@@ -255,7 +311,7 @@ def _figures(rows: list[Row]) -> dict[str, Figure]:
         }
     if bounds:
         figures = {"over": sum(b.n_different for b in bounds), "of": sum(b.n for b in bounds)}
-    if any(row.stage in ("T", "image") for row in rows) and differences:
+    if any(row.stage in FLIPPING for row in rows) and differences:
         figures["flips"] = sum(d.n_flips for d in differences)
         figures["candidates"] = sum(row.n_candidates for row in rows)
     return figures

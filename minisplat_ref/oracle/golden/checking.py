@@ -6,6 +6,7 @@ import numpy as np
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.golden.format import SPECS, Arrays
+from minisplat_ref.types import Ints
 
 
 def check_arrays(source: Path, arrays: Arrays, way_out: str) -> None:
@@ -45,8 +46,10 @@ def check_arrays(source: Path, arrays: Arrays, way_out: str) -> None:
     fits = {
         "image_size": (sizes["W"], sizes["H"]) == (width, height),
         "tile_size": min(tile_width, tile_height) > 0,
-        "gaussian_ids": not ids.size or (ids.min() >= 0 and ids.max() < sizes["N"]),
+        "gaussian_ids": _are_rows(ids, 0, sizes["N"]),
         "tile_offsets": offsets[:1].tolist() == [0] and offsets[-1] == len(ids) and (np.diff(offsets) >= 0).all(),
+        "adam_rows": _are_rows(arrays["adam_rows"], 0, sizes["A"]),
+        "surface_ids": _are_rows(arrays["surface_ids"], -1, sizes["N"]),
         "boxes": not boxes.size or (boxes.min() >= 0 and (boxes <= [width, height, width, height]).all()),
     }
     wrong = [name for name, is_right in fits.items() if not is_right]
@@ -55,3 +58,8 @@ def check_arrays(source: Path, arrays: Arrays, way_out: str) -> None:
         wrong = ["tile_offsets"]
     if wrong:
         raise InputError(f"{source}: {', '.join(wrong)} do not fit the other arrays; {way_out}")
+
+
+def _are_rows(ids: Ints, lowest: int, n: int) -> bool:
+    """Whether ids lie in [lowest, n)."""
+    return not ids.size or bool(ids.min() >= lowest and ids.max() < n)

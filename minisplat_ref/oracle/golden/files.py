@@ -30,7 +30,7 @@ from minisplat_ref.oracle.golden.format import (
 )
 
 FORMAT = "minisplat_ref golden vectors"
-VERSION = 1  # changes when an older folder can no longer be read
+VERSION = 2  # changes when an older folder can no longer be read
 MANIFEST, README = "manifest.json", "README.md"
 AGAIN = "write it anew with: minisplat-ref oracle export DIR"
 
@@ -149,6 +149,7 @@ def _write_scene(folder: Path, scene: Golden) -> dict[str, Any]:
         files[path.name] = {"sha256": _sha256(path), "arrays": shapes}
     return {
         "what": scene.what,
+        "is_exact": scene.is_exact,
         "sh_degree": scene.sh_degree,
         "conventions": scene.conventions._asdict(),
         "files": files,
@@ -207,7 +208,8 @@ def _read_scene(folder: Path, name: str, entry: Mapping[str, Any]) -> Golden:
     if missing:
         raise InputError(f"{folder / name} lacks {', '.join(missing)}; {AGAIN}")
     check_arrays(folder / name, arrays, AGAIN)
-    return Golden(name, str(entry["what"]), _conventions(folder, name, entry["conventions"]), arrays)
+    conventions = _conventions(folder, name, entry["conventions"])
+    return Golden(name, str(entry["what"]), conventions, arrays, is_exact=entry["is_exact"] is True)
 
 
 def _conventions(folder: Path, name: str, values: Mapping[str, Any]) -> Conventions:

@@ -12,7 +12,18 @@ from typing import Any, Literal, NamedTuple
 from numpy.typing import NDArray
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.oracle.tolerances import EXACT, GRADIENT, IMAGE, LOSS, POSITION, SHAPE, StageTolerance
+from minisplat_ref.oracle.tolerances import (
+    ADAM,
+    EXACT,
+    EXPECTED_DEPTH,
+    GRADIENT,
+    IMAGE,
+    LOSS,
+    POSITION,
+    SHAPE,
+    SURFACE,
+    StageTolerance,
+)
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.types import Camera
 
@@ -30,7 +41,8 @@ class ArraySpec(NamedTuple):
     role: Role
     """What it is for that stage."""
     shape: tuple[str | int, ...]
-    """N Gaussians, R = K - 1 higher SH coefficients, M pairs, T1 = tiles + 1, H x W pixels."""
+    """N Gaussians, R = K - 1 higher SH coefficients, M pairs, T1 = tiles + 1, H x W pixels, F channels, I x J rays,
+    A x P parameters, V rows of them."""
     kind: Literal["float64", "int32", "int64"]
     """As exported; other integers and float32 are accepted from others."""
     unit: str
@@ -41,6 +53,7 @@ class ArraySpec(NamedTuple):
 
 
 _WORLD, _PX = "world units, world frame", "px"
+_MEDIAN = "depth of the hit that takes T below 1/2; 0 where none"
 _SPECS: tuple[tuple[Any, ...], ...] = (
     ("means", "scene", "input", ("N", 3), "float64", _WORLD, "centres", EXACT),
     ("quats", "scene", "input", ("N", 4), "float64", "1", "rotations world_from_gaussian, wxyz, any length", EXACT),
@@ -89,8 +102,67 @@ _SPECS: tuple[tuple[Any, ...], ...] = (
     ("v_t", "total", "gradient", (3,), "float64", "1", "dL/d cam_from_world_t: both shares", GRADIENT),
     ("target", "loss", "input", ("H", "W", 3), "float64", "1", "photograph that image is compared with", EXACT),
     ("dssim_weight", "loss", "input", (), "float64", "1", "w of (1 - w) L1 + w (1 - SSIM)", EXACT),
+    ("mask", "loss", "input", ("H", "W"), "int32", "1", "1 where a pixel of the masked loss counts, else 0", EXACT),
+    ("target_bytes", "loss", "input", ("H", "W", 3), "int32", "1/255", "photograph of the masked loss, bytes", EXACT),
     ("loss", "loss", "output", (), "float64", "1", "that loss of image", LOSS),
+    ("masked_loss", "loss", "output", (), "float64", "1", "that of image and target_bytes / 255 in the mask", LOSS),
     ("v_image_of_loss", "loss", "gradient", ("H", "W", 3), "float64", "1", "d loss/d image", GRADIENT),
+    ("v_image_of_masked_loss", "loss", "gradient", ("H", "W", 3), "float64", "1", "d masked_loss/d image", GRADIENT),
+    ("features", "features", "input", ("N", "F"), "float64", "1", "further channels, blended as colours are", EXACT),
+    ("feature_background", "features", "input", ("F",), "float64", "1", "what is behind them", EXACT),
+    ("feature_image", "features", "output", ("H", "W", "F"), "float64", "1", "features blended, background in", IMAGE),
+    ("accumulated_depth", "features", "output", ("H", "W"), "float64", "world units", "sum of w depths", IMAGE),
+    ("v_feature_image", "features", "cotangent", ("H", "W", "F"), "float64", "1", "dF/d feature_image, random", EXACT),
+    ("v_accumulated_depth", "features", "cotangent", ("H", "W"), "float64", "1", "dF/d accumulated_depth", EXACT),
+    ("v_features", "features", "gradient", ("N", "F"), "float64", "1", "dF/d features", GRADIENT),
+    ("v_feature_background", "features", "gradient", ("F",), "float64", "1", "dF/d feature_background", GRADIENT),
+    ("v_depths_features", "features", "gradient", ("N",), "float64", "1", "dF/d depths", GRADIENT),
+    ("v_means2d_features", "features", "gradient", ("N", 2), "float64", "px^-1", "dF/d means2d", GRADIENT),
+    ("v_conics_features", "features", "gradient", ("N", 3), "float64", "px^2", "dF/d (a, b, c)", GRADIENT),
+    ("v_opacities2d_features", "features", "gradient", ("N",), "float64", "1", "dF/d opacities2d", GRADIENT),
+    ("blend_weight_sum", "statistics", "output", ("N",), "float64", "1", "sum of w over the pixels", IMAGE),
+    ("blend_weight_max", "statistics", "output", ("N",), "float64", "1", "largest w of a pixel", IMAGE),
+    ("hit_count", "statistics", "output", ("N",), "int32", "1", "pixels with a blended hit", EXACT),
+    ("dominant_count", "statistics", "output", ("N",), "int32", "1", "pixels in which its w is the largest", EXACT),
+    ("dominant_ids", "statistics", "output", ("H", "W"), "int32", "row", "of the largest w; -1 where no hit", EXACT),
+    ("median_depth", "statistics", "output", ("H", "W"), "float64", "world units", _MEDIAN, POSITION),
+    (
+        "surface_ids",
+        "surface",
+        "input",
+        ("I", "J"),
+        "int32",
+        "row",
+        "Gaussian of the ray of pixel (i, j), or -1",
+        EXACT,
+    ),
+    ("surface_points", "surface", "output", ("I", "J", 3), "float64", _WORLD, "densest point on the ray", SURFACE),
+    ("surface_depths", "surface", "output", ("I", "J"), "float64", "world units", "camera z of it", SURFACE),
+    ("v_surface_points", "surface", "cotangent", ("I", "J", 3), "float64", "1", "dS/d surface_points, random", EXACT),
+    ("v_surface_depths", "surface", "cotangent", ("I", "J"), "float64", "1", "dS/d surface_depths, random", EXACT),
+    ("v_means_surface", "surface", "gradient", ("N", 3), "float64", "1", "dS/d means", GRADIENT),
+    ("v_quats_surface", "surface", "gradient", ("N", 4), "float64", "1", "dS/d quats", GRADIENT),
+    ("v_scales_surface", "surface", "gradient", ("N", 3), "float64", "1", "dS/d scales", GRADIENT),
+    ("view", "view", "output", ("H", "W", 4), "float64", "1", "image; expected depth, 0 where no hit", EXPECTED_DEPTH),
+    ("view_alpha", "view", "output", ("H", "W"), "float64", "1", "alpha of the same call", IMAGE),
+    ("v_expected_depth", "view", "cotangent", ("H", "W"), "float64", "1", "dV/d expected depth, random", EXACT),
+    ("v_means_view", "view", "gradient", ("N", 3), "float64", "1", "dV/d means", GRADIENT),
+    ("v_quats_view", "view", "gradient", ("N", 4), "float64", "1", "dV/d quats", GRADIENT),
+    ("v_scales_view", "view", "gradient", ("N", 3), "float64", "1", "dV/d scales", GRADIENT),
+    ("v_opacities_view", "view", "gradient", ("N",), "float64", "1", "dV/d opacities", GRADIENT),
+    ("v_sh_dc_view", "view", "gradient", ("N", 3), "float64", "1", "dV/d sh_dc", GRADIENT),
+    ("v_sh_rest_view", "view", "gradient", ("N", "R", 3), "float64", "1", "dV/d sh_rest", GRADIENT),
+    ("v_viewmat", "view", "gradient", (3, 4), "float64", "1", "dV/d (R, t), twelve free entries", GRADIENT),
+    ("v_background_view", "view", "gradient", (3,), "float64", "1", "dV/d background", GRADIENT),
+    ("adam_values", "adam", "input", ("A", "P"), "float64", "1", "parameters", EXACT),
+    ("adam_gradient", "adam", "input", ("A", "P"), "float64", "1", "g, their gradient", EXACT),
+    ("adam_first", "adam", "input", ("A", "P"), "float64", "1", "m, decaying mean of g", EXACT),
+    ("adam_second", "adam", "input", ("A", "P"), "float64", "1", "v, decaying mean of g^2", EXACT),
+    ("adam_rows", "adam", "input", ("V",), "int32", "row", "to update; the others stay as they are", EXACT),
+    ("adam_settings", "adam", "input", (5,), "float64", "1", "rate, beta1, beta2, eps, number of the step k", EXACT),
+    ("adam_values_after", "adam", "output", ("A", "P"), "float64", "1", "parameters after the step", ADAM),
+    ("adam_first_after", "adam", "output", ("A", "P"), "float64", "1", "m after the step", ADAM),
+    ("adam_second_after", "adam", "output", ("A", "P"), "float64", "1", "v after the step", ADAM),
 )
 
 SPECS = {row[0]: ArraySpec(*row) for row in _SPECS}
@@ -107,8 +179,25 @@ STAGE_INPUTS = {
         *("means2d", "conics", "opacities2d", "boxes", "colors", "background"),
         *("gaussian_ids", "tile_offsets", "tile_size", "image_size"),
     ),
-    "loss": ("image", "target", "dssim_weight"),
     "total": (),
+    "loss": ("image", "target", "dssim_weight", "mask", "target_bytes"),
+    "features": (
+        *("means2d", "conics", "opacities2d", "boxes", "depths", "features", "feature_background"),
+        *("gaussian_ids", "tile_offsets", "tile_size", "image_size"),
+    ),
+    "statistics": (
+        *("means2d", "conics", "opacities2d", "boxes", "depths"),
+        *("gaussian_ids", "tile_offsets", "tile_size", "image_size"),
+    ),
+    "surface": (
+        *("means", "quats", "scales", "cam_from_world_R", "cam_from_world_t", "intrinsics"),
+        "surface_ids",
+    ),
+    "view": (
+        *("means", "quats", "scales", "opacities", "sh_dc", "sh_rest", "background"),
+        *("cam_from_world_R", "cam_from_world_t", "intrinsics", "image_size"),
+    ),
+    "adam": ("adam_values", "adam_gradient", "adam_first", "adam_second", "adam_rows", "adam_settings"),
 }
 """What each stage reads."""
 
@@ -117,8 +206,13 @@ STAGE_COTANGENTS = {
     "tiles": (),
     "colors": ("v_colors",),
     "composite": ("v_image", "v_alpha"),
-    "loss": (),
     "total": ("v_means_projection", "v_means_colors", "v_R_projection", "v_R_colors", "v_t_projection", "v_t_colors"),
+    "loss": (),
+    "features": ("v_feature_image", "v_accumulated_depth"),
+    "statistics": (),
+    "surface": ("v_surface_points", "v_surface_depths"),
+    "view": ("v_image", "v_alpha", "v_expected_depth"),
+    "adam": (),
 }
 """What each stage's gradient reads beside that; the loss's starts from dL/d loss = 1, and ``total`` adds shares."""
 
@@ -135,6 +229,8 @@ class Golden(NamedTuple):
     what: str
     conventions: Conventions
     arrays: Arrays
+    is_exact: bool = False
+    """Whether values equal their thresholds in binary, so that nothing is left to rounding in float64."""
 
     @property
     def camera(self) -> Camera:
@@ -194,9 +290,27 @@ little-endian), then the numbers. https://numpy.org/doc/stable/reference/generat
     {loss}
 
 `v_x` is dL/dx and has the shape of x. So `v_image`, `v_alpha` and `v_depths` are given, and every other `v_` follows
-by the chain rule. `v_image` and `v_alpha` are 0 at pixels whose alpha or transmittance is so near a threshold that
-rounding decides, and `v_depths` is 0 at culled Gaussians. The loss stage is by itself: its gradient `v_image_of_loss`
-is that of `loss`, not of L.
+by the chain rule. The cotangents of images are 0 at pixels whose alpha or transmittance is so near a threshold that
+rounding decides, and `v_depths` is 0 at culled Gaussians.
+
+The other stages are each by itself; nothing of L depends on them:
+
+- `loss`: `v_image_of_loss` and `v_image_of_masked_loss` are the gradients of `loss` and of `masked_loss`. Outside the
+  mask the image is replaced by the photograph before anything is computed, and the means run over the mask.
+- `features`: other channels than three, and depths blended as one more with the background 0. Its gradients are those
+  of F = sum(v_feature_image * feature_image) + sum(v_accumulated_depth * accumulated_depth).
+- `statistics`: of the weights w = alpha T with which hits are blended. Of equal weights the front-most dominates.
+- `surface`: where the ray of pixel (i, j), of camera z 1, meets the Gaussian `surface_ids[i, j]`: the point of least
+  Mahalanobis distance from its mean; 0 where there is none or it lies behind the camera. The gradients are those of
+  S = sum(v_surface_points * surface_points) + sum(v_surface_depths * surface_depths).
+- `view`: the whole renderer in one call. Its last channel is the expected depth, accumulated depth / alpha. Its
+  gradients are those of V = sum(v_image * image) + sum(v_alpha * alpha) + sum(v_expected_depth * expected depth). With
+  the camera's centre taken as -R^-1 t, the twelve entries of (R, t) are free.
+- `adam`: one step, m <- beta1 m + (1 - beta1) g and v <- beta2 v + (1 - beta2) g^2, then
+  p <- p - rate m' / (sqrt(v') + eps) with m' = m / (1 - beta1^k) and v' = v / (1 - beta2^k).
+
+In a scene that is called exact, some values equal their thresholds in binary (a transmittance, an alpha, a depth). In
+float64 no rounding is an excuse there: it shows what a renderer does at equality.
 
 `b` of a conic stands twice in its matrix; `v_conics[:, 1]` is the derivative by b itself, so it holds both. Pose
 gradients are by the nine entries of R as if they were free. Skips, stops, boxes and the order of the Gaussians count as
@@ -208,7 +322,8 @@ fixed.
 
 ## Arrays
 
-N Gaussians, R higher coefficients of the spherical harmonics, M (tile, Gaussian) pairs, T1 tiles + 1, H x W pixels.
+N Gaussians, R higher coefficients of the spherical harmonics, M (tile, Gaussian) pairs, T1 tiles + 1, H x W pixels, F
+further channels, I x J rays, A x P parameters of Adam, V rows of them that a step updates.
 Rows of culled Gaussians are 0 in the outputs and gradients of every stage. Tolerances are parts of the largest
 magnitude in the array.
 
@@ -291,8 +406,8 @@ def _scene(scene: Golden) -> str:
         f" {'symmetric' if c.clamp_is_symmetric else 'asymmetric'} clamp of the Jacobian"
         f"{', antialiased' if c.is_antialiased else ''}"
     )
-    n = len(scene.arrays["means"])
-    return f"- `{scene.name}`: {scene.what}. {n} Gaussians, {width} x {height} px; {c.name}: {rules}."
+    n, exact = len(scene.arrays["means"]), "exact, " if scene.is_exact else ""
+    return f"- `{scene.name}`: {scene.what}. {n} Gaussians, {exact}{width} x {height} px; {c.name}: {rules}."
 
 
 def _listed(names: tuple[str, ...]) -> str:

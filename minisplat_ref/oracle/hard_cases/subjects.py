@@ -22,6 +22,8 @@ from minisplat_ref.validation import check_gaussians, chosen_conventions
 
 Arrays = dict[str, Floats]
 
+LEAST_SLOPE = 1e-30  # of a sigmoid: float32 holds its product with a gradient still
+
 
 class Parameters(NamedTuple):
     """Trained parameters and a camera: through :func:`check_gaussians` and :func:`render`."""
@@ -179,9 +181,16 @@ def _draw_parameters(subject: Parameters, backend: Backend, dtype: np.dtype) -> 
         gradient = render_vjp(tape, v["image"], v["alpha"])
         blocks = {**gradient.gaussians._asdict(), **gradient._asdict()}
         del blocks["gaussians"], blocks["means2d"], blocks["shared"]
-        return blocks
+        return blocks | {"opacity_logits": _by_opacity(subject.gaussians.opacity_logits, blocks["opacity_logits"])}
 
     return Drawing(outputs, vjp, ("image", "alpha"))
+
+
+def _by_opacity(logits: Floats, v_logits: Floats) -> Floats:
+    """Divide gradients by the logits' o (1 - o): near the ends they are too small to be judged beside other blocks."""
+    small = np.exp(-np.abs(logits))  # float64, all digits
+    slopes = small / (1 + small) ** 2
+    return np.where(slopes > LEAST_SLOPE, v_logits / np.maximum(slopes, LEAST_SLOPE), 0)
 
 
 def _draw_call(subject: Call, backend: Backend, dtype: np.dtype) -> Drawing:

@@ -18,7 +18,7 @@ from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN, INRIA, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.comparison.renderers import Renderer
 from minisplat_ref.oracle.golden.format import Arrays, Golden
-from minisplat_ref.oracle.golden.scenes import COLORS_GRADIENT, PROJECT_GRADIENT, grid_of, reference_bins
+from minisplat_ref.oracle.golden.running import COLORS_GRADIENT, PROJECT_GRADIENT, grid_of, reference_bins
 from minisplat_ref.types import Floats
 
 TILE = 16  # pixels
