@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -193,3 +194,22 @@ def test_killed_with_its_training(scene_folder, tmp_path):
     first, second = resume(out)
     assert first.endswith("finished, kept") and not second.endswith("finished, kept")
     assert steps(out / SECOND) == [3, 6, 9, 12] and (out / "report.html").exists()
+
+
+def test_sigterm_is_handed_on_to_the_training(scene_folder, tmp_path):
+    """`docker stop` tells the first process only; its training has to save, too, and not to go on alone."""
+    out = tmp_path / "out"
+    options = ["--recipes", "3dgs-accel", "--iterations", "20000", "--test-every", "4", "--eval-every", "20000"]
+    command = [sys.executable, "-m", "minisplat_ref", "compare", str(scene_folder), *options, "--out", str(out)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        for line in process.stdout:
+            if line.startswith("run 1 of 1"):
+                break
+        while not (out / SECOND / "checkpoint.npz").exists():  # of the start
+            assert process.poll() is None
+            time.sleep(0.05)
+        process.terminate()
+        _, errors = process.communicate()  # ends when nobody, the training included, holds the pipe
+    assert process.returncode == 130
+    assert "all saved" in errors and errors.count("compare --resume") == 1
+    assert statuses(load_plan(out)) == ["cut off"]

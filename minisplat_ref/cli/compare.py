@@ -96,6 +96,7 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.experiments import run_folder
     from minisplat_ref.experiments.comparison.plan import check, remove_if_unused, save_plan
     from minisplat_ref.experiments.comparison.runs import statuses, train_all, warm_up
+    from minisplat_ref.training.interruption import terminated_like_interrupted
 
     given = vars(args)
     plan = _resumed(given) if "resume" in given else _new(given)
@@ -106,9 +107,10 @@ def run(args: argparse.Namespace) -> int:
     run_folder.create(plan.folder)
     save_plan(plan)
     try:
-        code = train_all(plan, stages)
-        if code == 0:
-            _report(plan, scene)
+        with terminated_like_interrupted():
+            code = train_all(plan, stages)
+            if code == 0:
+                _report(plan, scene)
     except KeyboardInterrupt:
         code = INTERRUPTED
     if code == INTERRUPTED:

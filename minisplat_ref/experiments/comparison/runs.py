@@ -8,7 +8,9 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from types import FrameType
 from typing import Any, Literal
 
 from minisplat_ref.constants import GSPLAT_MAIN
@@ -96,7 +98,7 @@ def train_all(plan: Plan, statuses: Sequence[Status]) -> int:
     Raises
     ------
     KeyboardInterrupt
-        After Ctrl-C, when the running training has saved what there is.
+        After Ctrl-C or SIGTERM, when the running training has saved what there is.
     CalledProcessError
         A training has been killed or has a programming error.
     """
@@ -149,10 +151,35 @@ def _resume_command(run: Run) -> list[str]:
     return [*TRAIN, "--resume", str(run.folder)]
 
 
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM, which the system sends to this process alone, while Ctrl-C reaches its trainings too."""
+
+
+@contextlib.contextmanager
+def _raising_terminated() -> Iterator[None]:
+    """Make SIGTERM raise :class:`_Terminated`, in the main thread."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def raise_terminated(number: int, frame: FrameType | None) -> None:
+        raise _Terminated
+
+    previous = signal.signal(signal.SIGTERM, raise_terminated)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+
+
 def _train(command: list[str]) -> int:
-    with subprocess.Popen(command) as process:
+    with subprocess.Popen(command) as process, _raising_terminated():
         try:
             code = process.wait()
+        except _Terminated:
+            process.terminate()  # it saves now, as after Ctrl-C, however long that takes
+            process.wait()
+            raise
         except KeyboardInterrupt:
             # A terminal's Ctrl-C has reached the training, too, which saves now and is better left alone.
             with contextlib.suppress(subprocess.TimeoutExpired):
