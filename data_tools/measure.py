@@ -1,4 +1,4 @@
-"""``python -m data_tools.measure``: the measurements of whole training runs that the README reports."""
+"""``python -m data_tools.measure``: the measurements of whole training runs in docs/measured."""
 
 from minisplat_ref.experiments.measure import main
 

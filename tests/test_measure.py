@@ -1,4 +1,4 @@
-"""The README's measurements: a table of whole runs, and a rate at a number of Gaussians that stays what was asked."""
+"""The measurements of docs/measured: a table of whole runs, and a rate at a number of Gaussians that stays what was asked."""
 
 import json
 import re

@@ -17,7 +17,7 @@ GRADIENT_STEP_IMAGE = 1e-8
 # Two derivations of the same sums in float64, in another order: sums of up to a few thousand terms of 1e-16 each.
 PARITY_FLOAT64 = 1e-12
 
-# One image in float32: hundreds of hits, each with an exponential of 1e-7 relative error; promised in the README.
+# One image in float32: hundreds of hits, each with an exponential of 1e-7 relative error; promised in docs/measured.
 PARITY_FLOAT32_IMAGE = 2e-5
 
 # Gradients in float32, relative to the largest: 1e-7 a hundredfold, by divisions by 1 - alpha <= 0.99 and by z^2.

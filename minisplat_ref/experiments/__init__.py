@@ -12,7 +12,7 @@ A run and its folder: what ``train`` does
 
 More than one run
     :mod:`.comparison` (several recipes side by side: ``compare``), :mod:`.studies` (what a choice in a method does:
-    ``study``), :mod:`.measure` (the README's runs: ``python -m data_tools.measure``).
+    ``study``), :mod:`.measure` (the runs of docs/measured: ``python -m data_tools.measure``).
 
 The report kit
     :mod:`.page` (a page of HTML, from cards, tables, panels), :mod:`.plots` (curves as SVG and PNG), :mod:`.pictures`

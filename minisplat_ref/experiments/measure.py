@@ -1,4 +1,4 @@
-"""The measurements that the README reports of whole training runs on real scenes.
+"""The measurements that docs/measured reports of whole training runs on real scenes.
 
 ``python -m data_tools.measure scenes SCENE... --out DIR`` trains every scene through the command line, as a user would,
 and prints a table. ``python -m data_tools.measure rate SCENE`` times training iterations while the number of Gaussians
