@@ -1,4 +1,4 @@
-"""The measurements of docs/measured: a table of whole runs, and a rate at a number of Gaussians that stays what was asked."""
+"""The measurements of docs/measured: a table of whole runs, and a rate at a number of Gaussians that stays."""
 
 import json
 import re

@@ -131,7 +131,7 @@ LONG = HardCaseTolerance(
 )
 
 BESIDE = HardCaseTolerance(
-    "x / z is 1,000 and more: gradients with respect to z and the camera are differences of float32 sums 1e6 times larger",
+    "x / z is 1,000 and more: gradients with respect to z and the camera are differences of sums 1e6 times larger",
     1e-6,
     1e-4,
     image32=2e-5,
