@@ -129,9 +129,13 @@ def _state_of_run(folder: Path, iterations: int) -> str:
     step = step_of(folder)
     if step is None:
         return "complete, without a checkpoint" if has_begun(folder) else f"has not begun: {going_on}"
-    if step < iterations:
+    if step < iterations and not is_finished(folder, iterations):
         return f"incomplete, {step:,} of {iterations:,} iterations are saved: {going_on}"
-    return "complete" if is_finished(folder, step) else f"trained, but not measured: {going_on}"
+    return (
+        "complete"
+        if is_finished(folder, iterations) or is_finished(folder, step)
+        else f"trained, but not measured: {going_on}"
+    )
 
 
 def _event_rows(folder: Path, settings: "Settings") -> Rows:

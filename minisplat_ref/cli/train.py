@@ -23,12 +23,14 @@ if TYPE_CHECKING:
     from minisplat_ref.training.schedule import Recipe
     from minisplat_ref.types import Scene
 
+N_ITERATIONS = 3000  # of recipes with a schedule
+
 DEFAULTS = {
     "downscale": 1,
     "test_every": 8,
     "undistort": False,
     "recipe": "3dgs-accel",
-    "iterations": 3000,
+    "iterations": None,
     "budget": None,
     "simplify": None,
     "scene_type": None,
@@ -80,11 +82,13 @@ def add_parser(commands: Commands) -> None:
     training.add_argument(
         "--recipe",
         metavar="R",
-        help="3dgs-accel, which is the default, 3dgs, mini-splatting, mini-splatting2, mini-splatting-d or"
+        help="3dgs-accel, which is the default, adaptive, 3dgs, mini-splatting, mini-splatting2, mini-splatting-d or"
         " mini-splatting2-d",
     )
     training.add_argument("--init", type=Path, metavar="PLY", help="points to start from (default: the scene's)")
-    training.add_argument("--iterations", type=integer(1), metavar="N", help="one view each (default 3000)")
+    training.add_argument(
+        "--iterations", type=integer(1), metavar="N", help="one view each (default 3000; adaptive: at most)"
+    )
     training.add_argument(
         "--budget", type=integer(1), metavar="N", help="most Gaussians that simplification keeps (default: a part)"
     )
@@ -142,6 +146,8 @@ def _start(given: dict[str, Any]) -> int:
     if surplus:
         raise InputError(f"{surplus[0]} is for a run that is continued: leave it out, or give --resume DIR")
     options = {name: given.get(name, default) for name, default in DEFAULTS.items()}
+    if options["iterations"] is None:
+        options["iterations"] = _default_iterations(options["recipe"])
     options["set"] = dict(options["set"])  # of equal names the last
     for name in ("lpips_weights", "init"):
         options[name] = _absolute(options[name])
@@ -176,6 +182,14 @@ def _start(given: dict[str, Any]) -> int:
             raise
 
 
+def _default_iterations(name: str) -> int:
+    """Return how long a recipe is trained unless told otherwise: one that decides it itself, as long as it takes."""
+    from minisplat_ref.extensions.extension import find_recipe
+
+    recipe = find_recipe(name)
+    return N_ITERATIONS if recipe.cooling is None else recipe.iterations
+
+
 def _first_state(settings: "Settings", scene: "Scene", recipe: "Recipe") -> "TrainState":
     """Return the state before the first iteration, from the scene's points or from those of --init."""
     from minisplat_ref.experiments.start import load_start
@@ -207,6 +221,8 @@ def _resume(folder: Path, given: dict[str, Any]) -> int:
         if "moved" in given:
             ours = ours._replace(scene=str(Path(given["moved"]).resolve()))
         state = checkpoints.load(folder, ours) if run_folder.has_begun(folder) else None
+        if state is not None and state.pace.last_step == state.step and run_folder.is_finished(folder, state.step):
+            raise InputError(f"{folder} has decided to end after {state.step} iterations, and has: train anew")
         is_done = state is not None and state.step == ours.iterations and run_folder.is_finished(folder, state.step)
         if state is not None and (is_done or state.step > ours.iterations):
             raise InputError(

@@ -27,7 +27,7 @@ PLAIN_SECONDS = 30.0  # likewise where stderr is a file, in which every redraw i
 class Progress(AbstractContextManager["Progress"]):
     """Bar and log of one training: a context manager that is called with every :class:`StepReport`."""
 
-    def __init__(self, log_path: Path, first_step: int, last_step: int) -> None:
+    def __init__(self, log_path: Path, first_step: int, last_step: int | None) -> None:
         records = [record for record in read_log(log_path) if record["step"] <= first_step]
         self._log_path, self._old_records = log_path, records
         self._first_step, self._last_step = first_step, last_step
@@ -73,13 +73,14 @@ class Progress(AbstractContextManager["Progress"]):
         ``model_mb`` of a record is what the arrays of the Gaussians take. During an iteration their gradients take as
         much again, and Adam's two moments twice as much all the time.
         """
+        self._bar.total = report.last_step  # None while the recipe has not decided it
         if self._bar.n == self._first_step:
             self._bar.set_description_str("training", refresh=False)
         self._bar.update()
         for note in report.notes:
             self._bar.write(f"minisplat-ref: {note}", file=sys.stderr)
         self._losses.append(report.loss)
-        if report.step % LOG_EVERY and report.step != self._last_step:
+        if report.step % LOG_EVERY and report.step != report.last_step:
             return
         image = np.clip(report.output.image, 0.0, 1.0)  # [H, W, 3]
         view_psnr = psnr(image, report.view.image, report.view.mask)

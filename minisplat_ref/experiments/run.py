@@ -25,7 +25,8 @@ from minisplat_ref.lpips import Network
 from minisplat_ref.metrics import Evaluation
 from minisplat_ref.training.guard import Guard
 from minisplat_ref.training.interruption import Interruptions
-from minisplat_ref.training.loop import StepReport, train
+from minisplat_ref.training.loop import StepReport, last_step, train
+from minisplat_ref.training.pace import to_metadata
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Scene
@@ -88,7 +89,7 @@ def run_training(
         seconds = _train(folder, scene, settings, recipe, state, surface, check_every)
         is_saved = _save(folder, settings, recipe, state)
         evaluation = _measure(folder, scene, settings, state, seconds, surface, network) if is_saved else None
-        return Outcome(evaluation, seconds, state.step >= settings.iterations)
+        return Outcome(evaluation, seconds, state.step >= last_step(state, recipe, settings.iterations))
 
 
 @contextmanager
@@ -120,7 +121,8 @@ def _train(
     check_every: int,
 ) -> float:
     """Train to the end or to Ctrl-C; return the seconds."""
-    progress = Progress(folder / run_folder.LOG, state.step, settings.iterations)
+    total = settings.iterations if recipe.cooling is None else state.pace.last_step
+    progress = Progress(folder / run_folder.LOG, state.step, total)
     callbacks: list[Callable[[StepReport], None]] = [progress]
     if state.step == 0 or (folder / run_folder.EVENTS).exists():  # else half a record would hide what fired before
         curve.keep_until(folder / run_folder.EVENTS, state.step)
@@ -158,6 +160,8 @@ def _save(folder: Path, settings: Settings, recipe: Recipe, state: TrainState) -
             interruptions.hold()
             checkpoints.save(folder, state, recipe)
             save_model(folder, settings, state.model)
+            if recipe.cooling is not None:
+                run_folder.write_json(folder / run_folder.DECISIONS, to_metadata(state.pace))
     except KeyboardInterrupt:
         return False
     return True
@@ -185,6 +189,7 @@ def _measure(
     metrics = {
         "n_gaussians": n_gaussians,
         "iterations": state.step,
+        "has_ended_early": state.pace.last_step == state.step,
         "train_seconds": seconds,
         "peak_rss_mb": peak_mb,
         **to_metrics(evaluation),
@@ -204,7 +209,7 @@ def _curve(
     """Return a callback of the loop that measures the test views on the way, off the training's clock."""
 
     def on_step(report: StepReport) -> None:
-        if report.step % settings.eval_every or report.step == settings.iterations:  # the end is measured anyway
+        if report.step % settings.eval_every or report.step == report.last_step:  # the end is measured anyway
             return
         seconds, model = progress.seconds, report.state.model
         with progress.paused():

@@ -21,6 +21,7 @@ EVENTS = "events.jsonl"  # one record each time that an event of the recipe acte
 CHECKPOINT = "checkpoint.npz"  # what `--resume` continues from
 PREVIOUS = "checkpoint-previous.npz"  # the one before, should that be damaged
 CAMERAS = "cameras.json"  # cameras of all views and hashes of their photographs: to render without them, to know them
+DECISIONS = "decisions.json"  # what a recipe that decides its own length has measured and decided
 RENDERS = "renders"  # truth | render | error of each test view
 
 WORK = {CHECKPOINT, PREVIOUS, POINT_CLOUD, METRICS}  # what has taken time; a run without any has not begun
@@ -101,13 +102,23 @@ def measured_step(folder: Path) -> int | None:
 
 
 def is_finished(folder: Path, iterations: int) -> bool:
-    """Return whether a run has been measured after its last iteration: that is what it does in the end."""
-    return measured_step(folder) == iterations
+    """Return whether a run has been measured after its last iteration: that is what it does in the end.
+
+    Parameters
+    ----------
+    folder : Path
+    iterations : int
+        That it was asked for; a recipe that decides its own length may have ended before.
+    """
+    if not (folder / METRICS).exists():
+        return False
+    metrics = read_json_object(folder / METRICS)
+    return metrics.get("iterations") == iterations or metrics.get("has_ended_early") is True
 
 
 def remove(folder: Path) -> None:
     """Take back what a training that could not begin has written, and the folder if nothing else is in it."""
-    for name in (CONFIG, CAMERAS, LOG, CURVE, EVENTS, CHECKPOINT, PREVIOUS):
+    for name in (CONFIG, CAMERAS, LOG, CURVE, EVENTS, DECISIONS, CHECKPOINT, PREVIOUS):
         (folder / name).unlink(missing_ok=True)
     if not any(folder.iterdir()):
         folder.rmdir()

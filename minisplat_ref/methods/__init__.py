@@ -4,6 +4,7 @@ A recipe is data (:mod:`minisplat_ref.training.schedule`), written for its publi
 """
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.methods.adaptive import ADAPTIVE
 from minisplat_ref.methods.gaussian_splatting import GS, GS_ACCEL
 from minisplat_ref.methods.mini_splatting import MINI_SPLATTING, MINI_SPLATTING_D
 from minisplat_ref.methods.mini_splatting2 import MINI_SPLATTING2, MINI_SPLATTING2_D
@@ -13,7 +14,7 @@ __all__ = ["RECIPES", "get_recipe"]
 
 RECIPES = {
     recipe.name: recipe
-    for recipe in (GS, GS_ACCEL, MINI_SPLATTING, MINI_SPLATTING_D, MINI_SPLATTING2, MINI_SPLATTING2_D)
+    for recipe in (GS, GS_ACCEL, MINI_SPLATTING, MINI_SPLATTING_D, MINI_SPLATTING2, MINI_SPLATTING2_D, ADAPTIVE)
 }
 """All recipes by name."""
 

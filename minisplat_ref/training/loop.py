@@ -31,10 +31,11 @@ from minisplat_ref.training.case import Case
 from minisplat_ref.training.guard import Guard, Wrong
 from minisplat_ref.training.interruption import Interruptions
 from minisplat_ref.training.losses import Loss, Rendered, total_loss
+from minisplat_ref.training.pace import Decision, Pace, to_metadata, trained_ids
 from minisplat_ref.training.rates import active_sh_degree
-from minisplat_ref.training.saved_state import read_bundles, read_counters, read_generator, written_by
+from minisplat_ref.training.saved_state import read_bundles, read_counters, read_generator, read_pace, written_by
 from minisplat_ref.training.schedule import During, Event, Recipe, action_name, describe
-from minisplat_ref.training.state import FiredEvent, Iteration, StepReport, TrainState
+from minisplat_ref.training.state import FiredEvent, Iteration, StepReport, TrainState, begin_cooling
 from minisplat_ref.types import Floats, Ints, Scene, View, numbered
 
 HALF_SIZE = "half_size_views"  # what training on views of half the size is called in the record of what fired
@@ -95,7 +96,7 @@ def train(
     conventions: Conventions = GSPLAT_MAIN,
     guard: Guard = Guard(),  # noqa: B008  (a constant)
 ) -> TrainState:
-    """Train until ``recipe.iterations``.
+    """Train until ``recipe.iterations``, or until the recipe decides that it is enough.
 
     Parameters
     ----------
@@ -135,7 +136,8 @@ def train(
     small_scene = _half_size(scene, recipe.least_half_size) if state.step < recipe.half_size_until else scene
     with ReadingAhead() as ahead, Interruptions() as interruptions:
         around = _Surroundings(recipe, backend, conventions, guard, ahead)
-        while state.step < recipe.iterations:
+        while state.step < last_step(state, recipe):
+            _cool_in_time(state, recipe)
             seen = small_scene if state.step < recipe.half_size_until else scene
             report = _iterate(state, seen, around, interruptions)
             if report.step == 1 and seen is not scene:
@@ -145,6 +147,29 @@ def train(
             del report  # and with it the image, before the next is made
             interruptions.release()
     return state
+
+
+def last_step(state: TrainState, recipe: Recipe, iterations: int | None = None) -> int:
+    """Return the iteration at which the training ends, as far as is known.
+
+    Parameters
+    ----------
+    state : TrainState
+    recipe : Recipe
+    iterations : int, optional
+        At most so many; those of the recipe by default.
+    """
+    most = recipe.iterations if iterations is None else iterations
+    return most if recipe.cooling is None or state.pace.last_step is None else min(state.pace.last_step, most)
+
+
+def _cool_in_time(state: TrainState, recipe: Recipe) -> None:
+    """Let the rates fall from now on, if otherwise the given iterations would end before they have."""
+    if recipe.cooling is None or state.pace.cooling_from is not None:
+        return
+    if state.step >= recipe.cooling.latest_start(recipe.iterations):
+        why = f"the limit of {recipe.iterations} iterations leaves no more time"
+        begin_cooling(state, recipe.cooling, recipe.iterations, Decision(state.step, "cool down", why, None, None))
 
 
 def _check_fits(state: TrainState, scene: Scene, recipe: Recipe) -> None:
@@ -205,7 +230,7 @@ def _differentiate(state: TrainState, scene: Scene, around: _Surroundings) -> _D
     """Draw a view and render it, and the gradient of its loss; of the state only the draws are changed."""
     recipe, step = around.recipe, state.step + 1
     renderer = recipe.renderer
-    view_id = _next_view(state, len(scene.train_views))
+    view_id = _next_view(state, trained_ids(len(scene.train_views), recipe.cooling, state.pace))
     view = around.ahead.load(scene.train_views[view_id], _following_view(state, scene))
     terms = [term for term in recipe.losses if term.is_due(step)]
     background = state.rng.random(3) if recipe.has_random_background else scene.background
@@ -237,7 +262,7 @@ def _change(state: TrainState, scene: Scene, around: _Surroundings, differentiat
     notes: list[str] = []
     due = _due(recipe, case.step)
     if wrong is None:
-        _step(state, recipe.rates.at(case.step, scene.extent), around, differentiated)
+        _step(state, _rates(state, recipe, case.step, scene.extent), around, differentiated)
     else:
         notes.append(f"iteration {case.step}, view {view.name}, {wrong}; step left out")
         due = [event for event in due if not isinstance(event, During)]  # which would collect it
@@ -260,6 +285,9 @@ def _change(state: TrainState, scene: Scene, around: _Surroundings, differentiat
         around.conventions,
         recipe.renderer,
         recipe.representation,
+        case.step,
+        recipe.iterations,
+        recipe.cooling,
         notes.append,
     )
     fired: list[FiredEvent] = []
@@ -269,7 +297,9 @@ def _change(state: TrainState, scene: Scene, around: _Surroundings, differentiat
             guard.check_parameters(case._replace(model=state.model), f"event {record.action}")
             fired.append(record)
     state.step = case.step
-    return StepReport(case.step, loss.value, view, output, state, tuple(fired), tuple(notes))
+    is_open = recipe.cooling is not None and state.pace.last_step is None
+    last = None if is_open else last_step(state, recipe)
+    return StepReport(case.step, loss.value, view, output, state, last, tuple(fired), tuple(notes))
 
 
 def _act(event: Event, state: TrainState, iteration: Iteration) -> FiredEvent:
@@ -300,6 +330,16 @@ def _step(
         )
 
 
+def _rates(state: TrainState, recipe: Recipe, step: int, extent: float) -> dict[str, float]:
+    """Return the learning rates of an iteration."""
+    rates = recipe.rates.at(step, extent)
+    if recipe.cooling is None or state.pace.cooling_from is None:
+        return rates
+    factor, factor_per_extent = recipe.cooling.factors(step, state.pace)
+    per_extent = recipe.rates.per_extent
+    return {name: rate * (factor_per_extent if name in per_extent else factor) for name, rate in rates.items()}
+
+
 def _due(recipe: Recipe, step: int) -> list[Event]:
     """Return the events of an iteration, in their order."""
     return [event for event in recipe.events if event.is_due(step)]
@@ -311,10 +351,10 @@ def _with_direct(gradient: Any, direct: Mapping[str, Floats]) -> Any:
     return {**gradient, **sums} if isinstance(gradient, Mapping) else gradient._replace(**sums)
 
 
-def _next_view(state: TrainState, n_views: int) -> int:
+def _next_view(state: TrainState, view_ids: list[int]) -> int:
     """Draw without replacement; when all views have been seen, shuffle them anew."""
     if not state.view_order:
-        state.view_order = state.rng.permutation(n_views).tolist()
+        state.view_order = state.rng.permutation(view_ids).tolist()
     return state.view_order.pop()
 
 
@@ -359,6 +399,8 @@ def save_state(path: str | Path, state: TrainState, recipe: Recipe, *, previous:
         "rng": state.rng.bit_generator.state,
         "recipe": describe(recipe),
     }
+    if recipe.cooling is not None:
+        metadata["pace"] = to_metadata(state.pace)
     save_checkpoint(path, arrays, metadata, previous=previous)
 
 
@@ -391,4 +433,5 @@ def load_state(path: str | Path, recipe: Recipe) -> TrainState:
         bundles.stats,
         bundles.shared,
         AdamState(bundles.shared_first, bundles.shared_second, counters.shared_adam_step),
+        pace=Pace() if recipe.cooling is None else read_pace(path, metadata.get("pace")),
     )

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from minisplat_ref.constants import SH_DEGREE_MAX
 from minisplat_ref.io.checkpoint import DamagedCheckpoint
+from minisplat_ref.training.pace import Pace, from_metadata
 from minisplat_ref.types import Floats, Gaussians
 
 WAY_OUT = "give another checkpoint or train anew"
@@ -73,6 +74,20 @@ def read_counters(path: str | Path, metadata: Mapping[str, Any]) -> Counters:
     if not isinstance(order, list):
         raise DamagedCheckpoint(f"{path}: view_order is no list of views; {WAY_OUT}")
     return Counters(step, adam_step, shared_step, [check("a number in view_order", view) for view in order])
+
+
+def read_pace(path: str | Path, value: Any) -> Pace:
+    """Return what a training that decides its own length had measured and decided.
+
+    Raises
+    ------
+    DamagedCheckpoint
+        It is missing or something else.
+    """
+    try:
+        return from_metadata(value)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise DamagedCheckpoint(f"{path}: pace is no record of measurements and decisions; {WAY_OUT}") from error
 
 
 def read_generator(path: str | Path, state: Any) -> np.random.Generator:

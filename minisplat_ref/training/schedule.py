@@ -17,6 +17,7 @@ from minisplat_ref.rendering import Renderer
 from minisplat_ref.training.adam import AdamRule
 from minisplat_ref.training.calibration import EXPOSURE, POSE, Calibration
 from minisplat_ref.training.losses import LossTerm
+from minisplat_ref.training.pace import Cooling
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.representation import GAUSSIANS, Representation
 
@@ -140,6 +141,9 @@ class Recipe(NamedTuple):
     """Parameters of each photograph; both are off unless asked for."""
     representation: Representation = GAUSSIANS
     """What is trained and how it is drawn."""
+    cooling: Cooling | None = None
+    """How a method without a schedule ends: its milestones are iterations whatever the length, and ``iterations`` is a
+    limit; None for methods with a schedule."""
 
     @property
     def active_calibrations(self) -> tuple[Calibration, ...]:
@@ -187,7 +191,7 @@ def scaled(recipe: Recipe, iterations: int) -> Recipe:
     So the order of events is that of the recipe, whatever the length. A one-time event happens at iteration 1 at the
     earliest; of periodic ones fewer may stay, see :attr:`Every.least_gap`. What must not come before its ``least_step``
     is left out of runs that are too short for it. Thresholds stay; so do learning rates, unless the recipe or the
-    calibration has a ``short_run_exponent``.
+    calibration has a ``short_run_exponent``. A recipe that decides its own length keeps everything but the limit.
 
     Raises
     ------
@@ -196,6 +200,8 @@ def scaled(recipe: Recipe, iterations: int) -> Recipe:
     """
     if iterations < 1:
         raise InputError(f"iterations is {iterations}: give at least 1")
+    if recipe.cooling is not None:
+        return recipe._replace(iterations=iterations)
     factor = Fraction(iterations, recipe.iterations)
     shortening = max(1.0, float(1 / factor))
     raised = shortening**recipe.short_run_exponent
@@ -347,8 +353,11 @@ def _with(function: Callable[..., Any], name: str, value: Any) -> Callable[..., 
 
 def describe(recipe: Recipe) -> dict[str, Any]:
     """Return the recipe in numbers, strings, lists and dicts, for ``config.json`` and to compare two recipes."""
+    cooling = {"cooling": recipe.cooling._asdict()} if recipe.cooling is not None else {}
+    fields = {name: value for name, value in recipe._asdict().items() if name != "cooling"}
     return {
-        **recipe._asdict(),
+        **fields,
+        **cooling,
         "learning_rates": recipe.rates.described(),
         "adam": recipe.adam._asdict(),
         "sh_milestones": list(recipe.sh_milestones),

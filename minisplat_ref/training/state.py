@@ -20,6 +20,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.rendering import SPLATTING, Renderer
 from minisplat_ref.strategy.ops import Edit, contiguous, inherit, inherit_fields
 from minisplat_ref.training.adam import AdamState, zero_moments
+from minisplat_ref.training.pace import Cooling, Decision, Pace
 from minisplat_ref.training.representation import GAUSSIANS, Representation
 from minisplat_ref.types import Floats, Gaussians, Ints, Model, RenderOutput, Scene, View
 
@@ -44,6 +45,8 @@ class TrainState:
     """Parameters without rows, by name; their arrays are updated in place."""
     shared_adam: AdamState[Any] = field(default_factory=lambda: AdamState({}, {}, 0))
     """Moments of the shared parameters."""
+    pace: Pace = field(default_factory=Pace)
+    """What a recipe that decides its own length has measured and decided."""
     is_whole: bool = True
     """False while an iteration is changing it; if it stays so, the iteration failed half-way: not to be saved."""
     most_rows: float = math.inf
@@ -80,6 +83,12 @@ class Iteration(NamedTuple):
     """How the model is drawn."""
     representation: Representation = GAUSSIANS
     """What the model is made of."""
+    step: int = 0
+    """Its number, from 1."""
+    iterations: int = 0
+    """Of the training, at most."""
+    cooling: Cooling | None = None
+    """How it ends, if it has no schedule."""
     say: Callable[[str], None] = unheard
     """Tells the user something in one line, at once; what only the record needs is returned."""
 
@@ -111,6 +120,8 @@ class StepReport(NamedTuple):
     """The rendering that ``loss`` measures, float32, not clipped."""
     state: TrainState
     """The state after the iteration; it is safe to save."""
+    last_step: int | None = None
+    """Iteration at which the training ends; None while a recipe that decides it has not."""
     fired: tuple[FiredEvent, ...] = ()
     """Events that acted after the gradient step, in their order."""
     notes: tuple[str, ...] = ()
@@ -120,6 +131,26 @@ class StepReport(NamedTuple):
 def n_pixels(scene: Scene) -> int:
     """Return the number of pixels of all training views: the size of a scene, as far as learning from it goes."""
     return sum(view.camera.width * view.camera.height for view in scene.train_views)
+
+
+def begin_cooling(state: TrainState, cooling: Cooling, iterations: int, decision: Decision) -> None:
+    """Let the rates fall from the next iteration on, and all training views be trained on.
+
+    Parameters
+    ----------
+    state : TrainState
+    cooling : Cooling
+        Of the recipe.
+    iterations : int
+        Iteration at which the training ends at the latest.
+    decision : Decision
+        That has brought it about; its ``step`` is the last at constant rates.
+    """
+    length = max(1, math.ceil(cooling.part * decision.step))
+    state.pace = state.pace.decided(decision)._replace(
+        cooling_from=decision.step, last_step=min(decision.step + length, iterations)
+    )
+    state.view_order = []
 
 
 def apply_edit(state: TrainState, edit: Edit) -> None:

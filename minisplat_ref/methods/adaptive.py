@@ -1,0 +1,150 @@
+"""``adaptive``: the scene decides how many Gaussians it needs, and when it has been learned.
+
+No paper has published the whole; ``docs/measured/adaptive.md`` has the evidence for each rule, and what was tried and
+did not pay. There is no schedule and no setting that depends on the scene:
+
+*Grow.* Every 100 iterations the Gaussians whose mean screen gradient reaches a threshold are halved
+(:mod:`minisplat_ref.strategy.halving`), the strongest first, and at most a fifth of all at a time. A Gaussian that fits
+what it covers has a small gradient, so growth fades where a scene has enough.
+
+*Measure.* Every 100 iterations the held-out training views are rendered. What their PSNR gains for each doubling of the
+work, in pairs (tile, Gaussian), is the slope of a line through the measurements since half of the work.
+
+*Cool down.* When the slope falls below a threshold, rates fall and all training views are trained on
+(:mod:`minisplat_ref.training.pace`).
+"""
+
+from functools import partial
+
+import numpy as np
+
+from minisplat_ref.methods.gaussian_splatting import GS, collect_gradients, prune_faint
+from minisplat_ref.metrics import psnr
+from minisplat_ref.rendering import Request
+from minisplat_ref.strategy.halving import OFFSET, halves
+from minisplat_ref.strategy.ops import n_rows
+from minisplat_ref.training.adam import AdamRule
+from minisplat_ref.training.pace import Cooling, Decision, Measurement, held_out_ids
+from minisplat_ref.training.rates import Rates
+from minisplat_ref.training.schedule import During, Every
+from minisplat_ref.training.state import Iteration, TrainState, apply_edit, begin_cooling
+
+MOST_ITERATIONS = 30_000
+LEAST_MEASUREMENTS = 4  # through which a line is drawn
+
+
+def collect_while_growing(state: TrainState, iteration: Iteration) -> None:
+    """Count the work of the iteration and, until the rates fall, collect gradients."""
+    state.pace = state.pace._replace(n_pairs=state.pace.n_pairs + iteration.output.n_pairs)
+    if state.pace.cooling_from is None:
+        collect_gradients(state, iteration)
+    else:
+        state.stats.pop("gradient_sum", None)
+        state.stats.pop("view_count", None)
+
+
+def grow(
+    state: TrainState, iteration: Iteration, *, threshold: float, most_at_once: float, offset: float
+) -> str | None:
+    """Halve the Gaussians whose mean gradient reaches ``threshold``, and start collecting anew.
+
+    Parameters
+    ----------
+    state, iteration
+        As for every action.
+    threshold : float
+        Of the mean length of the screen gradient, in normalised device coordinates.
+    most_at_once : float
+        Part of the Gaussians that are halved at most, those with the largest gradients.
+    offset : float
+        How far apart the halves are, see :func:`minisplat_ref.strategy.halving.halves`.
+    """
+    if state.pace.cooling_from is not None:
+        return "nothing done: the rates are falling"
+    means = state.stats.pop("gradient_sum") / np.maximum(state.stats.pop("view_count"), 1)
+    n = n_rows(state.gaussians)
+    candidates = np.flatnonzero(means >= threshold)
+    most = int(most_at_once * n)
+    if len(candidates) > most:
+        candidates = np.sort(candidates[np.argsort(-means[candidates], kind="stable")[:most]])
+    share = np.count_nonzero(means >= threshold) / max(n, 1)
+    apply_edit(state, halves(state.gaussians, candidates, offset=offset))
+    return f"{share:.1%} above the threshold"
+
+
+def measure_held_out(state: TrainState, iteration: Iteration) -> str | None:
+    """Render the held-out training views and note their PSNR."""
+    if iteration.cooling is None or state.pace.cooling_from is not None:
+        return "nothing done: all training views are trained on"
+    views = iteration.scene.train_views
+    psnrs = []
+    for index in held_out_ids(len(views), iteration.cooling.hold_out_every):
+        view = views[index].loaded()
+        request = Request(iteration.scene.background, conventions=iteration.conventions, backend=iteration.backend)
+        output, _ = iteration.renderer.render(state.model, view, request)
+        psnrs.append(psnr(np.clip(output.image, 0.0, 1.0), view.image, view.mask))
+    measurement = Measurement(iteration.step, tuple(psnrs), n_rows(state.gaussians), state.pace.n_pairs)
+    state.pace = state.pace._replace(measurements=(*state.pace.measurements, measurement))
+    return f"{measurement.psnr:.2f} dB"
+
+
+def cool_when_little_is_gained(
+    state: TrainState, iteration: Iteration, *, least_gain: float, least_step: int
+) -> str | None:
+    """Let the rates fall when the held-out views gain less than ``least_gain`` for each doubling of the work.
+
+    Parameters
+    ----------
+    state, iteration
+        As for every action.
+    least_gain : float
+        dB for each doubling of the work.
+    least_step : int
+        Iterations before which nothing is decided: all degrees of the spherical harmonics should take part.
+    """
+    pace = state.pace
+    if iteration.cooling is None or pace.cooling_from is not None or iteration.step < least_step:
+        return None
+    recent = [m for m in pace.measurements if 2 * m.n_pairs >= pace.n_pairs]
+    if len(recent) < LEAST_MEASUREMENTS:
+        return None
+    doublings = np.log2([m.n_pairs for m in recent])
+    slopes = np.polyfit(doublings, np.array([m.psnrs for m in recent]), 1)[0]  # [V] dB a doubling
+    gain, error = float(slopes.mean()), float(slopes.std(ddof=1) / np.sqrt(len(slopes)))
+    if gain >= least_gain:
+        return f"{gain:.2f} dB for each doubling of the work"
+    why = f"held-out views gain {gain:.2f} dB for each doubling of the work, less than {least_gain}"
+    decision = Decision(iteration.step, "cool down", why, gain, error)
+    begin_cooling(state, iteration.cooling, iteration.iterations, decision)
+    return why
+
+
+RAISED = 2.24  # Mini-Splatting2's rates in 3,000 iterations: 6^0.45 times those of 18,000, the square for the means
+_RATES = GS.learning_rates.of
+
+ADAPTIVE = GS._replace(
+    name="adaptive",
+    iterations=MOST_ITERATIONS,
+    learning_rates=Rates(
+        {
+            "means": 1.6e-4 * RAISED**2,
+            "quats": 1e-3 * RAISED,
+            "log_scales": 5e-3 * RAISED,
+            "opacity_logits": 2.5e-2 * RAISED,
+            "sh_dc": 2.5e-3 * RAISED,
+            "sh_rest": 2.5e-3 / 20 * RAISED,
+        }
+    ),
+    adam=AdamRule(is_visible_only=True, has_bias_correction=True),
+    sh_milestones=(200, 400, 600),
+    events=(
+        During(collect_while_growing),
+        Every(100, measure_held_out, start=100),
+        Every(100, partial(cool_when_little_is_gained, least_gain=0.3, least_step=800), start=100),
+        Every(100, partial(grow, threshold=4e-4, most_at_once=0.2, offset=OFFSET), start=100),
+        Every(100, partial(prune_faint, least_opacity=0.005), start=100),
+    ),
+    least_views=5,
+    cooling=Cooling(part=0.6, last=0.1, last_per_extent=0.01, hold_out_every=8),
+)
+"""``adaptive``."""

@@ -1,0 +1,134 @@
+"""When a training ends that decides it for itself: what it has measured, what it has decided, and why.
+
+A recipe with a :class:`Cooling` has no schedule. It trains at constant rates, and holds some *training* views back to
+measure what more iterations bring; test views stay sealed. When an action of the recipe decides that they bring little
+(:func:`begin_cooling`), or when the given number of iterations leaves no more time, the rates fall, on all training
+views, and the training is over. So a plateau is one of the scene, and not one that falling rates have made.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+
+class Measurement(NamedTuple):
+    """What the held-out training views said."""
+
+    step: int
+    psnrs: tuple[float, ...]
+    """dB, of each view."""
+    n_gaussians: int
+    n_pairs: int
+    """Pairs (tile, Gaussian) of all iterations so far: the work."""
+
+    @property
+    def psnr(self) -> float:
+        """Mean of the views, dB."""
+        return sum(self.psnrs) / len(self.psnrs)
+
+
+class Decision(NamedTuple):
+    """One decision, and its evidence."""
+
+    step: int
+    what: str
+    why: str
+    gain: float | None
+    """dB of the held-out views by which it was decided; None where something else decided."""
+    standard_error: float | None
+    """dB, of the gain, over the views."""
+
+
+class Pace(NamedTuple):
+    """How far a training that decides its own length has come."""
+
+    measurements: tuple[Measurement, ...] = ()
+    decisions: tuple[Decision, ...] = ()
+    n_pairs: int = 0
+    """Pairs (tile, Gaussian) of all iterations so far."""
+    cooling_from: int | None = None
+    """Iteration after which the rates fall; None while they are constant."""
+    last_step: int | None = None
+    """Iteration at which the training ends; None while that is open."""
+
+    def decided(self, decision: Decision) -> "Pace":
+        """Return the pace with one more decision."""
+        return self._replace(decisions=(*self.decisions, decision))
+
+
+class Cooling(NamedTuple):
+    """How a training without a schedule ends."""
+
+    part: float
+    """Length of the cool-down, as a part of the iterations before it."""
+    last: float
+    """Factor of the rates at its end,"""
+    last_per_extent: float
+    """and of those that are per unit of the scene's extent; in between their logarithms fall linearly."""
+    hold_out_every: int
+    """Before it, one training view of so many is held back for decisions."""
+
+    def factors(self, step: int, pace: Pace) -> tuple[float, float]:
+        """Return the factors of the rates, and of those per unit of the extent, at an iteration."""
+        if pace.cooling_from is None or pace.last_step is None:
+            return 1.0, 1.0
+        progress = min((step - pace.cooling_from) / max(pace.last_step - pace.cooling_from, 1), 1.0)
+        return self.last**progress, self.last_per_extent**progress
+
+    def latest_start(self, iterations: int) -> int:
+        """Return the iteration after which it has to begin, to end at ``iterations``."""
+        return max(1, int(iterations / (1.0 + self.part)))
+
+
+def held_out_ids(n_views: int, every: int) -> list[int]:
+    """Return which training views are held back: every ``every``-th, at least two, spread over the list.
+
+    Parameters
+    ----------
+    n_views : int
+        Training views.
+    every : int
+        At least 2.
+    """
+    n = min(max(2, n_views // every), n_views // 2)
+    return [(2 * k + 1) * n_views // (2 * n) for k in range(n)]
+
+
+def trained_ids(n_views: int, cooling: Cooling | None, pace: Pace) -> list[int]:
+    """Return the training views that gradient steps may use now."""
+    if cooling is None or pace.cooling_from is not None:
+        return list(range(n_views))
+    held = set(held_out_ids(n_views, cooling.hold_out_every))
+    return [k for k in range(n_views) if k not in held]
+
+
+def to_metadata(pace: Pace) -> dict[str, Any]:
+    """Return the pace as a checkpoint holds it."""
+    return {
+        **pace._asdict(),
+        "measurements": [m._asdict() for m in pace.measurements],
+        "decisions": [d._asdict() for d in pace.decisions],
+    }
+
+
+def from_metadata(value: Mapping[str, Any]) -> Pace:
+    """Read what :func:`to_metadata` wrote.
+
+    Raises
+    ------
+    ValueError, TypeError, KeyError
+        It is something else.
+    """
+    measurements = tuple(
+        Measurement(int(m["step"]), tuple(map(float, m["psnrs"])), int(m["n_gaussians"]), int(m["n_pairs"]))
+        for m in value["measurements"]
+    )
+    decisions = tuple(
+        Decision(int(d["step"]), str(d["what"]), str(d["why"]), _optional(d["gain"]), _optional(d["standard_error"]))
+        for d in value["decisions"]
+    )
+    ends = [None if value[name] is None else int(value[name]) for name in ("cooling_from", "last_step")]
+    return Pace(measurements, decisions, int(value["n_pairs"]), *ends)
+
+
+def _optional(number: Any) -> float | None:
+    return None if number is None else float(number)

@@ -1,0 +1,250 @@
+"""``adaptive``: which views it trains on, how it grows, when it ends, and that it continues byte for byte."""
+
+import json
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from minisplat_ref.cli import main
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.datasets.synthetic.files import write_scene
+from minisplat_ref.errors import InputError
+from minisplat_ref.io.checkpoint import DamagedCheckpoint, load_checkpoint, save_checkpoint
+from minisplat_ref.methods import get_recipe
+from minisplat_ref.methods.adaptive import ADAPTIVE, cool_when_little_is_gained, grow
+from minisplat_ref.strategy.halving import halves
+from minisplat_ref.training.loop import initial_state, load_state, save_state, train
+from minisplat_ref.training.pace import (
+    Cooling,
+    Measurement,
+    Pace,
+    from_metadata,
+    held_out_ids,
+    to_metadata,
+    trained_ids,
+)
+from minisplat_ref.training.schedule import configured
+from minisplat_ref.training.state import Iteration
+
+OPTIONS = {"n_views": 12, "width": 48, "height": 36, "n_points": 200, "test_every": 6}
+COOLING = ADAPTIVE.cooling
+FAST = configured(ADAPTIVE._replace(iterations=700), least_gain=1e9, least_step=300)  # ends as soon as it may
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene("room", supersampling=1, **OPTIONS).scene
+
+
+@pytest.fixture(scope="module")
+def reports(scene):
+    """Of a whole training, without the pictures: iteration, view, end, population, pace."""
+    seen = []
+    state = train(
+        scene,
+        FAST,
+        seed=0,
+        on_step=lambda r: seen.append((r.step, r.view.name, r.last_step, len(r.state.gaussians.means))),
+    )
+    return seen, state
+
+
+# Which views ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [*range(5, 40), 200])
+def test_held_out_views_are_spread_and_leave_most(n):
+    ids = held_out_ids(n, 8)
+    assert len(ids) == len(set(ids)) == max(2, n // 8) and 0 <= min(ids) and max(ids) < n
+    gaps = np.diff(ids)
+    assert len(gaps) == 0 or gaps.max() - gaps.min() <= 1
+    assert sorted(ids + trained_ids(n, COOLING, Pace())) == list(range(n))
+    assert trained_ids(n, COOLING, Pace(cooling_from=3)) == trained_ids(n, None, Pace()) == list(range(n))
+
+
+def test_no_step_is_taken_on_held_out_views_before_the_cool_down(scene, reports):
+    seen, state = reports
+    held = {scene.train_views[k].name for k in held_out_ids(len(scene.train_views), COOLING.hold_out_every)}
+    constant = {view for step, view, _, _ in seen if step <= state.pace.cooling_from}
+    cooling = {view for step, view, _, _ in seen if step > state.pace.cooling_from}
+    assert not constant & held and held <= cooling
+    assert len(constant) == len(scene.train_views) - len(held)
+
+
+# When it ends ---------------------------------------------------------------------------------------------------------
+
+
+def test_it_ends_after_the_cool_down(reports):
+    seen, state = reports
+    (decision,) = state.pace.decisions
+    assert decision.what == "cool down" and decision.step == state.pace.cooling_from
+    assert state.step == state.pace.last_step == min(700, decision.step + -(-6 * decision.step // 10))
+    assert seen[0][2] is None and seen[-1][2] == state.step
+    assert [m.step for m in state.pace.measurements] == list(range(200, decision.step + 1, 100))
+
+
+def test_the_limit_leaves_time_to_cool(scene):
+    state = train(scene, configured(ADAPTIVE._replace(iterations=160), least_step=10_000), seed=0)
+    assert state.step == 160 and state.pace.cooling_from == 100
+    assert "limit of 160 iterations" in state.pace.decisions[0].why
+
+
+def measured(psnrs_of_steps, **changes):
+    """A state that has measured; the work is 1,000 pairs an iteration."""
+    pace = Pace(tuple(Measurement(s, p, 10, 1000 * s) for s, p in psnrs_of_steps), n_pairs=1000 * psnrs_of_steps[-1][0])
+
+    class State:
+        view_order = (1, 2)
+
+    state = State()
+    state.pace = pace._replace(**changes)
+    return state
+
+
+def iteration(step):
+    return Iteration(*[None] * 7, step=step, iterations=30_000, cooling=COOLING)
+
+
+def decide(state, step):
+    return cool_when_little_is_gained(state, iteration(step), least_gain=0.3, least_step=800)
+
+
+def test_a_slope_by_hand():
+    """The views gain 1 and 0.2 dB a doubling of the work: 0.6 on the mean, with a standard error of 0.4."""
+    steps = [800, 1000, 1200, 1400, 1600]
+    gains = [(20 + np.log2(s), 25 + 0.2 * np.log2(s)) for s in steps]
+    state = measured(list(zip(steps, gains, strict=True)))
+    assert decide(state, 1600) == "0.60 dB for each doubling of the work" and state.pace.cooling_from is None
+    flat = [(20 + 0.5 * np.log2(s), 25 - 0.1 * np.log2(s)) for s in steps]
+    state = measured(list(zip(steps, flat, strict=True)))
+    assert "gain 0.20 dB" in decide(state, 1600)
+    (decision,) = state.pace.decisions
+    assert decision.gain == pytest.approx(0.2) and decision.standard_error == pytest.approx(0.3)
+    assert (state.pace.cooling_from, state.pace.last_step, state.view_order) == (1600, 2560, [])
+
+
+def test_no_decision_without_evidence():
+    flat = [(s, (20.0, 20.0)) for s in (500, 600, 700)]
+    assert decide(measured(flat), 700) is None  # too early
+    assert decide(measured([(s + 500, p) for s, p in flat]), 1200) is None  # too few measurements
+
+
+def test_factors_fall_on_a_line_of_logarithms():
+    cooling, pace = Cooling(0.5, 0.1, 0.01, 8), Pace(cooling_from=100, last_step=200)
+    assert cooling.factors(80, Pace()) == (1.0, 1.0)
+    assert cooling.factors(150, pace) == pytest.approx((0.1**0.5, 0.1))
+    assert cooling.factors(200, pace) == pytest.approx((0.1, 0.01))
+
+
+# How it grows ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_strongest_are_halved_and_not_too_many(scene):
+    state = initial_state(scene, ADAPTIVE, 0)
+    n = len(state.gaussians.means)
+    means = np.zeros(n, np.float32)
+    means[[3, 5, 9]] = (1e-3, 3e-3, 2e-3)
+    before, views = state.gaussians, np.full(n, 2, np.int32)
+    state.stats = {"gradient_sum": 2 * means, "view_count": views}
+    settings = {"threshold": 4e-4, "offset": 0.5}
+    grow(state, iteration(100), most_at_once=2 / n, **settings)
+    expected = halves(before, np.array([5, 9]), offset=0.5).gaussians
+    for field, other in zip(state.gaussians, expected, strict=True):
+        assert_array_equal(field, other)
+    assert state.stats == {}
+    state.pace = state.pace._replace(cooling_from=100)
+    assert "falling" in grow(state, iteration(200), most_at_once=1.0, **settings)
+
+
+def test_it_grows_until_it_cools(reports):
+    seen, state = reports
+    counts = dict((step, n) for step, _, _, n in seen)
+    assert counts[199] == 200 < counts[200] < counts[state.pace.cooling_from]
+    after = [n for step, _, _, n in seen if step > state.pace.cooling_from]
+    assert sorted(after, reverse=True) == after  # pruned at most
+
+
+# It continues ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("at", [250, 350])
+def test_continued_byte_for_byte(scene, reports, tmp_path, at):
+    """From before and from within the cool-down."""
+    straight = reports[1]
+    state = initial_state(scene, FAST, 0)
+
+    class Stop(Exception):
+        pass
+
+    def stop(report):
+        if report.step == at:
+            raise Stop
+
+    with pytest.raises(Stop):
+        train(scene, FAST, seed=0, state=state, on_step=stop)
+    save_state(tmp_path / "state.npz", state, FAST)
+    state = load_state(tmp_path / "state.npz", FAST)
+    train(scene, FAST, seed=0, state=state)
+    assert state.pace == straight.pace
+    for field, other in zip(state.gaussians, straight.gaussians, strict=True):
+        assert_array_equal(field, other)
+
+
+def test_the_pace_comes_back_from_json(reports):
+    pace = reports[1].pace
+    assert from_metadata(json.loads(json.dumps(to_metadata(pace)))) == pace and pace.measurements
+
+
+@pytest.mark.parametrize("pace", [None, {}, {"measurements": [{}]}, 3, {"measurements": [], "decisions": 5}])
+def test_a_damaged_pace_is_refused(reports, tmp_path, pace):
+    save_state(tmp_path / "state.npz", reports[1], FAST)
+    arrays, metadata = load_checkpoint(tmp_path / "state.npz")
+    save_checkpoint(tmp_path / "state.npz", arrays, {**metadata, "pace": pace})
+    with pytest.raises(DamagedCheckpoint, match="no record of measurements"):
+        load_state(tmp_path / "state.npz", FAST)
+
+
+# From the command line ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def scene_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scenes") / "nook"
+    write_scene(make_scene("room", supersampling=1, **OPTIONS), folder, OPTIONS)
+    return folder
+
+
+SETTINGS = ["--set", "least_gain=1e9", "--set", "least_step=300"]
+
+
+def test_train_ends_by_itself_and_says_why(scene_folder, tmp_path, capsys):
+    run = tmp_path / "run"
+    assert (
+        main(["train", str(scene_folder), "--recipe", "adaptive", "--test-every", "6", *SETTINGS, "--out", str(run)])
+        == 0
+    )
+    metrics, decisions = (json.loads((run / f"{name}.json").read_text()) for name in ("metrics", "decisions"))
+    assert metrics["has_ended_early"] and metrics["iterations"] == decisions["last_step"] == 1280
+    assert len(decisions["measurements"]) and decisions["decisions"][0]["what"] == "cool down"
+    assert json.loads((run / "config.json").read_text())["settings"]["iterations"] == 30_000
+    capsys.readouterr()
+    assert main(["info", str(run)]) == 0
+    assert "complete" in capsys.readouterr().out
+    assert main(["train", "--resume", str(run)]) == 2
+    assert "has decided to end" in capsys.readouterr().err
+
+
+def test_too_few_views_are_refused(tmp_path, capsys):
+    few = {**OPTIONS, "n_views": 4}
+    write_scene(make_scene("room", supersampling=1, **few), tmp_path / "few", few)
+    assert main(["train", str(tmp_path / "few"), "--recipe", "adaptive", "--out", str(tmp_path / "run")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "4 training views" in line and "adaptive" in line
+
+
+def test_its_length_is_a_limit():
+    recipe = get_recipe("adaptive", 500)
+    assert recipe.iterations == 500 and recipe._replace(iterations=30_000) == ADAPTIVE
+    with pytest.raises(InputError, match="at least 1"):
+        get_recipe("adaptive", 0)
