@@ -82,8 +82,8 @@ def add_parser(commands: Commands) -> None:
     training.add_argument(
         "--recipe",
         metavar="R",
-        help="3dgs-accel, which is the default, adaptive, 3dgs, mini-splatting, mini-splatting2, mini-splatting-d or"
-        " mini-splatting2-d",
+        help="3dgs-accel, which is the default, 3dgs, mini-splatting, mini-splatting2, mini-splatting-d,"
+        " mini-splatting2-d or adaptive",
     )
     training.add_argument("--init", type=Path, metavar="PLY", help="points to start from (default: the scene's)")
     training.add_argument(

@@ -1,8 +1,8 @@
 """Growth that nearly leaves the picture as it is: a Gaussian becomes two halves, side by side on its longest axis.
 
 A clone of 3DGS doubles the opacity where it is put, and a child of its split lands at random: both spoil the picture,
-and the next iterations repair it. Here the two halves have together the mean, the covariance and the optical depth of the
-Gaussian that they replace. With the offset d from its centre, in standard deviations along the longest axis k,
+and the next iterations repair it. Here the two halves have together the mean, the covariance and the optical depth of
+the Gaussian that they replace. With the offset d from its centre, in standard deviations along the longest axis k,
 
     mu' = mu +- d s_k R_k        s_k' = sqrt(1 - d^2) s_k              mean and covariance of the even mixture stay
     tau = -ln(1 - o)             tau' = tau / (2 sqrt(1 - d^2))        so does the integral of tau exp(-x^2 / 2)
