@@ -1,6 +1,7 @@
 """The studies of this package: smaller claims of the papers, measured. ``minisplat-ref study NAME --help``.
 
 ==========================  =====================================================================
+:data:`ADAPTIVE`            :mod:`.adaptive`: the recipe that decides for itself, beside those with a schedule
 :data:`ABLATION`            :mod:`.ablation`: what each mechanism of Mini-Splatting is worth
 :data:`SPLIT`               :mod:`.split_forms`: which children blur split has, and whether any
 :data:`CULLING`             :mod:`.culling`: what visibility culling removes, saves and costs
@@ -28,7 +29,7 @@ RECIPE_HELP = "name as in train --recipe"
 
 def all_studies() -> dict[str, Study]:
     """Return the studies of this package by the name that is typed; an extension's are EXTENSION/NAME."""
-    return {study.name: study for study in (ABLATION, SPLIT, CULLING, SIMPLIFY, DEPTH, EXPOSURE, POSE)}
+    return {study.name: study for study in (ADAPTIVE, ABLATION, SPLIT, CULLING, SIMPLIFY, DEPTH, EXPOSURE, POSE)}
 
 
 def _run_of(module: str) -> Callable[[argparse.Namespace], None]:
@@ -63,6 +64,35 @@ def _add_seeds(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seeds", type=listed(integer(0)), default=(0, 1, 2), metavar="S,T", help="of the trainings (default 0,1,2)"
     )
+
+
+def _add_adaptive_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Train a scene by adaptive and by recipes with a schedule, as it is and disturbed. The\nsame command with the "
+        "same folder goes on where it was interrupted."
+    )
+    names = ", ".join(SYNTHETIC_SCENES)
+    parser.add_argument("scene", metavar="SCENE", help=f"folder of a scene, or a synthetic one: {names}")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=f"folder for {RESULT} and {FIGURE}")
+    parser.add_argument(
+        "--downscale", type=integer(1), default=1, metavar="D", help="make a folder's photographs D times smaller"
+    )
+    parser.add_argument(
+        "--recipes",
+        type=listed(name),
+        default=("3dgs-accel", "mini-splatting", "mini-splatting2", "adaptive"),
+        metavar="R,Q",
+        help="the first is what the others are compared with (default: three of 3000 iterations, and adaptive)",
+    )
+    parser.add_argument("--rules", action="store_true", help="adaptive beside itself without each of its rules")
+    parser.add_argument(
+        "--conditions",
+        type=listed(name),
+        default=("whole", "few", "gains"),
+        metavar="C,D",
+        help="all photographs, every fifth, all with wrong exposures (default whole,few,gains)",
+    )
+    _add_seeds(parser)
 
 
 def _add_ablation_arguments(parser: argparse.ArgumentParser) -> None:
@@ -162,6 +192,12 @@ def _add_pose_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+ADAPTIVE = Study(
+    name="adaptive",
+    summary="the recipe that decides for itself, beside those with a schedule",
+    add_arguments=_add_adaptive_arguments,
+    run=_run_of("adaptive"),
+)
 ABLATION = Study(
     name="ablation",
     summary="Mini-Splatting without each of its mechanisms",

@@ -1,0 +1,249 @@
+"""``adaptive`` beside the recipes with a schedule: on a scene as it is, with few photographs, and with wrong exposures.
+
+Every recipe is trained with every seed under every condition. On the way the test views are measured, off the clock,
+which only this study sees: nothing of it reaches the training. So there is, besides the final PSNR and the count, the
+time until a recipe has the final PSNR of the first recipe less 0.1 dB, and how far the PSNR has fallen since its best
+moment. Times are those of the processor (all threads of the process together), which other programs disturb less than
+the clock on the wall.
+
+With ``--rules`` it is ``adaptive`` beside itself without one of its rules.
+
+Trainings take long. Each leaves its record in ``runs.jsonl``, and the same command with the same folder goes on.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from tqdm import tqdm
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.experiments.studies.ablation import append, read_records
+from minisplat_ref.experiments.studies.front import BLUE, RED, describe_scene, read_scene, tidy, title, write
+from minisplat_ref.methods import adaptive, gaussian_splatting, get_recipe
+from minisplat_ref.metrics import evaluate
+from minisplat_ref.reporting import markdown_table
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.rates import Rates
+from minisplat_ref.training.schedule import Recipe, does
+from minisplat_ref.training.state import Iteration, StepReport, TrainState
+from minisplat_ref.types import Scene, View
+
+ITERATIONS = 3000  # of recipes with a schedule
+N_MEASUREMENTS = 24  # of those; of adaptive as often
+FEW = 5  # every so many-th training photograph is left
+GAINS = (0.7, 1.4)  # of a photograph, uniform in the logarithm
+NEAR = 0.1  # dB
+COLORS = (BLUE, "#7a9a3a", "#c98a2b", RED, "#6f5b9a")
+
+
+def whole(scene: Scene) -> Scene:
+    """Return the scene."""
+    return scene
+
+
+def few_photographs(scene: Scene) -> Scene:
+    """Return the scene with every fifth training photograph."""
+    return scene._replace(train_views=scene.train_views[::FEW])
+
+
+def random_gains(scene: Scene) -> Scene:
+    """Return the scene with every training photograph multiplied by a gain of its own; test views stay."""
+    low, high = np.log(GAINS)
+    gains = np.exp(np.random.default_rng(0).uniform(low, high, len(scene.train_views)))
+
+    def multiplied(view: View, gain: float) -> View:
+        view = view.loaded()
+        return view._replace(image=np.clip(np.round(view.image * gain), 0, 255).astype(np.uint8))
+
+    views = tuple(multiplied(view, gain) for view, gain in zip(scene.train_views, gains, strict=True))
+    return scene._replace(train_views=views)
+
+
+CONDITIONS: Mapping[str, Callable[[Scene], Scene]] = {
+    "whole": whole,
+    "few": few_photographs,
+    "gains": random_gains,
+}
+
+
+def with_clones(recipe: Recipe) -> Recipe:
+    """Return the recipe with the clones and splits of 3DGS in place of halves."""
+    action = partial(clones_while_growing, threshold=2e-4, size_fraction=0.01)
+    events = (event._replace(action=action) if does(event, adaptive.grow) else event for event in recipe.events)
+    return recipe._replace(events=tuple(events))
+
+
+def clones_while_growing(
+    state: TrainState, iteration: Iteration, *, threshold: float, size_fraction: float
+) -> str | None:
+    """Clone and split as 3DGS does, until the rates fall."""
+    if state.pace.cooling_from is not None:
+        return "nothing done: the rates are falling"
+    return gaussian_splatting.clone_and_split(state, iteration, threshold=threshold, size_fraction=size_fraction)
+
+
+def with_published_rates(recipe: Recipe) -> Recipe:
+    """Return the recipe with the rates of 3dgs-accel as they begin."""
+    rates = gaussian_splatting.GS_ACCEL.learning_rates
+    return recipe._replace(learning_rates=Rates(rates.at(0, 1.0), rates.per_extent))
+
+
+def without_cool_down(recipe: Recipe) -> Recipe:
+    """Return the recipe with constant rates to the end."""
+    assert recipe.cooling is not None
+    return recipe._replace(cooling=recipe.cooling._replace(last=1.0, last_per_extent=1.0))
+
+
+def without_growth(recipe: Recipe) -> Recipe:
+    """Return the recipe with as many Gaussians as there are points."""
+    return recipe._replace(events=tuple(event for event in recipe.events if not does(event, adaptive.grow)))
+
+
+RULES: Mapping[str, Callable[[Recipe], Recipe]] = {
+    "adaptive": lambda recipe: recipe,
+    "no growth": without_growth,
+    "clones of 3DGS": with_clones,
+    "rates of 3DGS": with_published_rates,
+    "no cool-down": without_cool_down,
+}
+
+
+def run(args: argparse.Namespace) -> None:
+    """Train, measure, write, print the table.
+
+    Raises
+    ------
+    InputError
+        The scene, a recipe or the output folder cannot be used.
+    """
+    scene = read_scene(args.scene, args.downscale)
+    if not scene.test_views:
+        raise InputError(f"scene {scene.name} has no test views to compare by: add photographs")
+    unknown = [name for name in args.conditions if name not in CONDITIONS]
+    if unknown:
+        raise InputError(f"condition {unknown[0]!r} does not exist: choose from {', '.join(CONDITIONS)}")
+    recipes = (
+        {name: change(adaptive.ADAPTIVE) for name, change in RULES.items()} if args.rules else _named(args.recipes)
+    )
+    description = describe_scene(scene)
+    settings = {"scene": description["scene"], "downscale": args.downscale, "recipes": list(recipes)}
+    records = read_records(args.out, settings)
+    done = {(record["condition"], record["recipe"], record["seed"]) for record in records}
+    todo = [(c, r, s) for c in args.conditions for s in args.seeds for r in recipes if (c, r, s) not in done]
+    for condition, name, seed in tqdm(todo, desc="trainings", leave=False):
+        measured = measure(CONDITIONS[condition](scene), recipes[name], seed)
+        record = {"condition": condition, "recipe": name, "seed": seed, **measured}
+        append(args.out, record)
+        records.append(record)
+    records = [r for r in records if r["seed"] in args.seeds and r["condition"] in args.conditions]
+    rows = summarise(records)
+    result = {**description, **settings, "seeds": list(args.seeds), "summary": rows, "runs": records}
+    write(args.out, result, draw(records))
+    print(title(description))
+    print(f"seeds {', '.join(map(str, args.seeds))}; seconds of the processor\n")
+    heading = ["condition", "recipe", "PSNR (dB)", "fall since its best", "Gaussians", "iterations", "seconds"]
+    print(markdown_table([*heading, f"until {next(iter(recipes))} - {NEAR} dB"], [_cells(row) for row in rows]))
+
+
+def _named(names: Sequence[str]) -> dict[str, Recipe]:
+    return {name: adaptive.ADAPTIVE if name == "adaptive" else get_recipe(name, ITERATIONS) for name in names}
+
+
+def measure(scene: Scene, recipe: Recipe, seed: int) -> dict[str, Any]:
+    """Train once; return the last measures of the test views, the seconds of the training alone, and its curve."""
+    curve: list[dict[str, float | None]] = []
+    paused, every = 0.0, ITERATIONS // N_MEASUREMENTS
+    start = time.process_time()
+
+    def on_step(report: StepReport) -> None:
+        nonlocal paused
+        if report.step % every and report.step != report.last_step:
+            return
+        now = time.process_time()
+        value = evaluate(report.state.model, scene.test_views, background=scene.background, renderer=recipe.renderer)
+        n = len(report.state.gaussians.means)
+        curve.append({"step": report.step, "seconds": now - start - paused, "psnr": value.psnr, "n_gaussians": n})
+        curve[-1]["ssim"] = value.ssim
+        paused += time.process_time() - now
+
+    state = train(scene, recipe, seed=seed, on_step=on_step)
+    decisions = [decision._asdict() for decision in state.pace.decisions]
+    return {**curve[-1], "curve": curve, "decisions": decisions}
+
+
+def summarise(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return a row for each condition and recipe: means over the seeds, the standard error of the PSNR's difference.
+
+    The first recipe is the one that the others are compared with, seed by seed.
+    """
+    rows = []
+    for condition in dict.fromkeys(record["condition"] for record in records):
+        own = [record for record in records if record["condition"] == condition]
+        names = list(dict.fromkeys(record["recipe"] for record in own))
+        first = {record["seed"]: record for record in own if record["recipe"] == names[0]}
+        for name in names:
+            runs = [record for record in own if record["recipe"] == name]
+            differences = [run["psnr"] - first[run["seed"]]["psnr"] for run in runs]
+            until = [seconds_until(run["curve"], first[run["seed"]]["psnr"] - NEAR) for run in runs]
+            rows.append(
+                {
+                    "condition": condition,
+                    "recipe": name,
+                    **{k: float(np.mean([run[k] for run in runs])) for k in ("psnr", "n_gaussians", "step", "seconds")},
+                    "difference": float(np.mean(differences)),
+                    "standard_error": standard_error(differences),
+                    "fall": float(np.mean([max(p["psnr"] for p in run["curve"]) - run["psnr"] for run in runs])),
+                    "until": None if None in until else float(np.mean([s for s in until if s is not None])),
+                }
+            )
+    return rows
+
+
+def standard_error(values: Sequence[float]) -> float | None:
+    """Return that of the mean; None for one value."""
+    return float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None
+
+
+def seconds_until(curve: Sequence[Mapping[str, float]], psnr: float) -> float | None:
+    """Return when a training first had a PSNR, None if it never did."""
+    return next((point["seconds"] for point in curve if point["psnr"] >= psnr), None)
+
+
+def _cells(row: Mapping[str, Any]) -> list[str]:
+    error = "" if row["standard_error"] is None else f" ± {row['standard_error']:.2f}"
+    return [
+        row["condition"],
+        row["recipe"],
+        f"{row['psnr']:.2f} ({row['difference']:+.2f}{error})",
+        f"{row['fall']:.2f}",
+        f"{row['n_gaussians']:,.0f}",
+        f"{row['step']:,.0f}",
+        f"{row['seconds']:.0f}",
+        "never" if row["until"] is None else f"{row['until']:.0f}",
+    ]
+
+
+def draw(records: Sequence[Mapping[str, Any]]) -> Figure:
+    """Draw PSNR over seconds, a panel for each condition, a line for each training."""
+    conditions = list(dict.fromkeys(record["condition"] for record in records))
+    names = list(dict.fromkeys(record["recipe"] for record in records))
+    figure = Figure(figsize=(4.2 * len(conditions), 3.6), layout="constrained")
+    for axes, condition in zip(np.atleast_1d(figure.subplots(1, len(conditions))), conditions, strict=True):
+        for record in (record for record in records if record["condition"] == condition):
+            color = COLORS[names.index(record["recipe"]) % len(COLORS)]
+            is_first = record["seed"] == records[0]["seed"]
+            points = [(point["seconds"], point["psnr"]) for point in record["curve"]]
+            label = record["recipe"] if is_first else None
+            axes.plot(*zip(*points, strict=True), color=color, label=label, linewidth=1.2)
+            axes.plot(*points[-1], "o", color=color, markersize=4)
+        axes.set(title=condition, xlabel="seconds of the processor", ylabel="held-out PSNR (dB)")
+        highest = max(point["psnr"] for r in records if r["condition"] == condition for point in r["curve"])
+        axes.set_ylim(highest - 8, highest + 0.5)
+        tidy(axes)
+    figure.axes[0].legend(frameon=False, fontsize=8)
+    return figure
