@@ -1,18 +1,22 @@
 """``adaptive``: which views it trains on, how it grows, when it ends, and that it continues byte for byte."""
 
 import json
+import time
 
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from minisplat_ref.backends import CPU
 from minisplat_ref.cli import main
+from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.checkpoint import DamagedCheckpoint, load_checkpoint, save_checkpoint
 from minisplat_ref.methods import get_recipe
-from minisplat_ref.methods.adaptive import ADAPTIVE, cool_when_little_is_gained, grow
+from minisplat_ref.methods.adaptive import ADAPTIVE, cool_when_little_is_gained, grow, prune_when_cooling
+from minisplat_ref.methods.mini_splatting import measure_importance
 from minisplat_ref.strategy.halving import halves
 from minisplat_ref.training.loop import initial_state, load_state, save_state, train
 from minisplat_ref.training.pace import (
@@ -77,8 +81,8 @@ def test_no_step_is_taken_on_held_out_views_before_the_cool_down(scene, reports)
 
 def test_it_ends_after_the_cool_down(reports):
     seen, state = reports
-    (decision,) = state.pace.decisions
-    assert decision.what == "cool down" and decision.step == state.pace.cooling_from
+    decision, pruned = state.pace.decisions
+    assert decision.what == "cool down" and decision.step == state.pace.cooling_from == pruned.step - 1
     assert state.step == state.pace.last_step == min(700, decision.step + -(-6 * decision.step // 10))
     assert seen[0][2] is None and seen[-1][2] == state.step
     assert [m.step for m in state.pace.measurements] == list(range(200, decision.step + 1, 100))
@@ -157,6 +161,35 @@ def test_the_strongest_are_halved_and_not_too_many(scene):
     assert "falling" in grow(state, iteration(200), most_at_once=1.0, **settings)
 
 
+def test_a_budget_is_a_ceiling(scene):
+    """Also where it is below what the training begins with."""
+    for budget in (230, 100):
+        counts = []
+        recipe = configured(ADAPTIVE._replace(iterations=500), budget=budget, threshold=0.0)
+        train(scene, recipe, seed=0, on_step=lambda report, own=counts: own.append(len(report.state.gaussians.means)))
+        assert max(counts) == max(budget, 200)
+
+
+def test_what_carries_little_goes_when_the_rates_begin_to_fall(scene):
+    """A Gaussian far behind a camera carries nothing; a second one is seen by a single view."""
+    state = initial_state(scene, ADAPTIVE, 0)
+    centres = np.array([view.camera.center for view in scene.train_views])
+    state.gaussians.means[0] = 100 * (centres.mean(axis=0) - scene.points.mean(axis=0))
+    state.pace = Pace(cooling_from=10, last_step=20)
+    here = Iteration(scene, scene.train_views[0], None, np.zeros(0, int), None, CPU, GSPLAT_MAIN)
+    untouched = state.gaussians
+    prune_when_cooling(state, here._replace(step=10), mass=0.98, least_views=2)
+    prune_when_cooling(state, here._replace(step=12), mass=0.98, least_views=2)
+    assert state.gaussians is untouched
+    stats = measure_importance(state, here)
+    carried = np.where(stats.is_visible.sum(axis=1) >= 2, stats.blend_weight_sum, 0)
+    prune_when_cooling(state, here._replace(step=11), mass=0.98, least_views=2)
+    kept = np.isin(untouched.means[:, 0], state.gaussians.means[:, 0])
+    assert not kept[0] and 0 < kept.sum() < 200
+    assert 0.98 <= carried[kept].sum() / carried.sum() < 1 and carried[kept].min() >= carried[~kept].max()
+    assert state.pace.decisions[-1].what == "prune"
+
+
 def test_it_grows_until_it_cools(reports):
     seen, state = reports
     counts = dict((step, n) for step, _, _, n in seen)
@@ -233,6 +266,28 @@ def test_train_ends_by_itself_and_says_why(scene_folder, tmp_path, capsys):
     assert "complete" in capsys.readouterr().out
     assert main(["train", "--resume", str(run)]) == 2
     assert "has decided to end" in capsys.readouterr().err
+
+
+def test_minutes_are_a_limit(scene_folder, tmp_path, capsys):
+    run = tmp_path / "run"
+    options = ["--recipe", "adaptive", "--test-every", "6", "--set", "least_step=100000"]
+    start = time.perf_counter()
+    assert main(["train", str(scene_folder), *options, "--minutes", "0.1", "--out", str(run)]) == 0
+    assert time.perf_counter() - start < 60  # 6 s and the evaluation, on a machine that does other things too
+    decisions = json.loads((run / "decisions.json").read_text())
+    assert "0.1 minutes" in decisions["decisions"][0]["why"]
+    assert (
+        decisions["cooling_from"]
+        < decisions["last_step"]
+        == json.loads((run / "metrics.json").read_text())["iterations"]
+    )
+    out = ["--out", str(tmp_path / "other")]
+    capsys.readouterr()
+    assert main(["train", str(scene_folder), *options, "--minutes", "0.01", *out]) == 2
+    assert main(["train", str(scene_folder), "--recipe", "3dgs", "--minutes", "1", *out]) == 2
+    short, meaningless = capsys.readouterr().err.splitlines()
+    assert "at least 0.1" in short and "means nothing to recipe 3dgs" in meaningless
+    assert not (tmp_path / "other").exists()
 
 
 def test_too_few_views_are_refused(tmp_path, capsys):

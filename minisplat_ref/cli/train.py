@@ -14,6 +14,7 @@ from minisplat_ref.experiments.arguments import (
     assignment,
     integer,
     option_name,
+    positive,
 )
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from minisplat_ref.types import Scene
 
 N_ITERATIONS = 3000  # of recipes with a schedule
+LEAST_MINUTES = 0.1  # the first iterations take seconds, to compile what has not been
 
 DEFAULTS = {
     "downscale": 1,
@@ -43,6 +45,7 @@ DEFAULTS = {
     "profile": GSPLAT_MAIN.name,
     "backend": "cpu",
     "drop_bad_steps": False,
+    "minutes": None,
 }
 AFRESH = ("iterations", "lpips_weights", "drop_bad_steps")  # what may be new when a run is continued
 
@@ -89,8 +92,9 @@ def add_parser(commands: Commands) -> None:
     training.add_argument(
         "--iterations", type=integer(1), metavar="N", help="one view each (default 3000; adaptive: at most)"
     )
+    training.add_argument("--minutes", type=positive, metavar="T", help="with adaptive: end after so many at most")
     training.add_argument(
-        "--budget", type=integer(1), metavar="N", help="most Gaussians that simplification keeps (default: a part)"
+        "--budget", type=integer(1), metavar="N", help="most Gaussians, for recipes that choose their number"
     )
     training.add_argument(
         "--simplify",
@@ -163,6 +167,7 @@ def _start(given: dict[str, Any]) -> int:
     run_folder.check_free(folder)
     settings = Settings(scene=str(scene_path.resolve()), schedule_iterations=options["iterations"], **options)
     recipe = recipe_of(settings)
+    _check_time(settings, recipe)
     scene = load_photographs(settings)
     if settings.eval_every:
         curve.check_views(scene)
@@ -180,6 +185,18 @@ def _start(given: dict[str, Any]) -> int:
             if state.step == 0:
                 run_folder.remove(folder)
             raise
+
+
+def _check_time(settings: "Settings", recipe: "Recipe") -> None:
+    """Refuse a time limit that means nothing to the recipe, or is over before the training begins."""
+    if settings.minutes is None:
+        return
+    if recipe.cooling is None:
+        raise InputError(f"--minutes means nothing to recipe {recipe.name}: give --iterations, or --recipe adaptive")
+    if settings.minutes < LEAST_MINUTES:
+        raise InputError(
+            f"--minutes {settings.minutes:g} is too short to learn anything: give at least {LEAST_MINUTES:g}"
+        )
 
 
 def _default_iterations(name: str) -> int:

@@ -1,6 +1,7 @@
 """What the commands' arguments share: the look of help and errors, and the types of values."""
 
 import argparse
+import math
 import shutil
 from collections.abc import Callable
 from typing import Any, NoReturn
@@ -63,6 +64,17 @@ def fraction(text: str) -> float:
         value = 0.0
     if not 0.0 < value <= 1.0:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0 and at most 1")
+    return value
+
+
+def positive(text: str) -> float:
+    """Parse a number above 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
     return value
 
 

@@ -7,7 +7,9 @@ measures are not of its checkpoint's iteration has not ended.
 """
 
 import contextlib
+import math
 import sys
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,10 +28,12 @@ from minisplat_ref.metrics import Evaluation
 from minisplat_ref.training.guard import Guard
 from minisplat_ref.training.interruption import Interruptions
 from minisplat_ref.training.loop import StepReport, last_step, train
-from minisplat_ref.training.pace import to_metadata
+from minisplat_ref.training.pace import Decision, to_metadata
 from minisplat_ref.training.schedule import Recipe
-from minisplat_ref.training.state import TrainState
+from minisplat_ref.training.state import TrainState, begin_cooling
 from minisplat_ref.types import Scene
+
+RECENT = 100  # iterations by which the time of the next ones is foreseen
 
 
 class Outcome(NamedTuple):
@@ -130,6 +134,8 @@ def _train(
     if settings.eval_every:
         curve.keep_until(folder / run_folder.CURVE, state.step)
         callbacks.append(_curve(folder / run_folder.CURVE, scene, settings, progress, surface))
+    if settings.minutes is not None:
+        callbacks.append(_in_time(settings, recipe, progress))
     callbacks.append(checkpoints.saving(folder, recipe))  # after the records: what it continues from is in them
 
     def on_step(report: StepReport) -> None:
@@ -149,6 +155,28 @@ def _train(
                 guard=Guard(check_every, settings.drop_bad_steps, folder, settings._asdict()),
             )
         return progress.seconds
+
+
+def _in_time(settings: Settings, recipe: Recipe, progress: Progress) -> Callable[[StepReport], None]:
+    """Return a callback of the loop that begins the cool-down in time to end after ``settings.minutes``."""
+    cooling, minutes = recipe.cooling, settings.minutes
+    assert cooling is not None and minutes is not None
+    clock: deque[float] = deque(maxlen=RECENT)
+
+    def on_step(report: StepReport) -> None:
+        clock.append(progress.seconds)
+        left = 60 * minutes - clock[-1]
+        if report.state.pace.cooling_from is not None or len(clock) < 2:
+            return
+        length = math.ceil(cooling.part * report.step)
+        pace = (clock[-1] - clock[0]) / (len(clock) - 1)  # seconds an iteration
+        if left <= length * pace:
+            why = f"{minutes:g} minutes leave no more time"
+            length = max(1, min(length, round(left / pace)))
+            decision = Decision(report.step, "cool down", why, None, None)
+            begin_cooling(report.state, cooling, settings.iterations, decision, length)
+
+    return on_step
 
 
 def _save(folder: Path, settings: Settings, recipe: Recipe, state: TrainState) -> bool:

@@ -69,6 +69,8 @@ class Settings(NamedTuple):
     """Whether a step whose gradient is not finite is left out; otherwise it ends the training."""
     lpips_weights: str | None = None
     """Absolute path of the weights of LPIPS; None: it is not measured. Does not change the result."""
+    minutes: float | None = None
+    """Time that the training may take, for a recipe that decides its own length; the result depends on the machine."""
     init: str | None = None
     """Absolute path of the PLY whose points the training starts from, not read again; None for the scene's points."""
 

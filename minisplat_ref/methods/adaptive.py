@@ -19,10 +19,13 @@ from functools import partial
 import numpy as np
 
 from minisplat_ref.methods.gaussian_splatting import GS, collect_gradients, prune_faint
+from minisplat_ref.methods.mini_splatting import candidates, measure_importance
 from minisplat_ref.metrics import psnr
 from minisplat_ref.rendering import Request
 from minisplat_ref.strategy.halving import OFFSET, halves
-from minisplat_ref.strategy.ops import n_rows
+from minisplat_ref.strategy.importance import indoor
+from minisplat_ref.strategy.ops import keep, n_rows
+from minisplat_ref.strategy.simplify import carrying_mass
 from minisplat_ref.training.adam import AdamRule
 from minisplat_ref.training.pace import Cooling, Decision, Measurement, held_out_ids
 from minisplat_ref.training.rates import Rates
@@ -44,7 +47,13 @@ def collect_while_growing(state: TrainState, iteration: Iteration) -> None:
 
 
 def grow(
-    state: TrainState, iteration: Iteration, *, threshold: float, most_at_once: float, offset: float
+    state: TrainState,
+    iteration: Iteration,
+    *,
+    threshold: float,
+    most_at_once: float,
+    offset: float,
+    budget: int | None = None,
 ) -> str | None:
     """Halve the Gaussians whose mean gradient reaches ``threshold``, and start collecting anew.
 
@@ -58,13 +67,15 @@ def grow(
         Part of the Gaussians that are halved at most, those with the largest gradients.
     offset : float
         How far apart the halves are, see :func:`minisplat_ref.strategy.halving.halves`.
+    budget : int, optional
+        Gaussians that there may be at most; those that the training begins with may be more.
     """
     if state.pace.cooling_from is not None:
         return "nothing done: the rates are falling"
     means = state.stats.pop("gradient_sum") / np.maximum(state.stats.pop("view_count"), 1)
     n = n_rows(state.gaussians)
     candidates = np.flatnonzero(means >= threshold)
-    most = int(most_at_once * n)
+    most = int(most_at_once * n) if budget is None else min(int(most_at_once * n), max(budget - n, 0))
     if len(candidates) > most:
         candidates = np.sort(candidates[np.argsort(-means[candidates], kind="stable")[:most]])
     share = np.count_nonzero(means >= threshold) / max(n, 1)
@@ -119,6 +130,29 @@ def cool_when_little_is_gained(
     return why
 
 
+def prune_when_cooling(state: TrainState, iteration: Iteration, *, mass: float, least_views: int) -> None:
+    """Remove what carries little of the training views, in the first iteration of the cool-down.
+
+    Parameters
+    ----------
+    state, iteration
+        As for every action.
+    mass : float
+        Part of the blend weight of all training views that the Gaussians that stay carry: the most important ones.
+    least_views : int
+        Those that belong to the visible part of fewer views go, however much they carry there.
+    """
+    if state.pace.cooling_from is None or iteration.step != state.pace.cooling_from + 1:
+        return
+    n = n_rows(state.gaussians)
+    stats = measure_importance(state, iteration)
+    importance = candidates(stats, indoor, least_views, is_intersecting=False)
+    apply_edit(state, keep(state.gaussians, carrying_mass(importance, mass)))
+    left = n_rows(state.gaussians)
+    why = f"{left:,} of {n:,} Gaussians carry {mass} of all blend weight"
+    state.pace = state.pace.decided(Decision(iteration.step, "prune", why, None, None))
+
+
 RAISED = 2.24  # Mini-Splatting2's rates in 3,000 iterations: 6^0.45 times those of 18,000, the square for the means
 _RATES = GS.learning_rates.of
 
@@ -141,8 +175,9 @@ ADAPTIVE = GS._replace(
         During(collect_while_growing),
         Every(100, measure_held_out, start=100),
         Every(100, partial(cool_when_little_is_gained, least_gain=0.3, least_step=800), start=100),
-        Every(100, partial(grow, threshold=4e-4, most_at_once=0.2, offset=OFFSET), start=100),
+        Every(100, partial(grow, threshold=4e-4, most_at_once=0.2, offset=OFFSET, budget=None), start=100),
         Every(100, partial(prune_faint, least_opacity=0.005), start=100),
+        During(partial(prune_when_cooling, mass=0.98, least_views=2)),
     ),
     least_views=5,
     cooling=Cooling(part=0.6, last=0.1, last_per_extent=0.01, hold_out_every=8),

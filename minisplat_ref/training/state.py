@@ -133,7 +133,9 @@ def n_pixels(scene: Scene) -> int:
     return sum(view.camera.width * view.camera.height for view in scene.train_views)
 
 
-def begin_cooling(state: TrainState, cooling: Cooling, iterations: int, decision: Decision) -> None:
+def begin_cooling(
+    state: TrainState, cooling: Cooling, iterations: int, decision: Decision, length: int | None = None
+) -> None:
     """Let the rates fall from the next iteration on, and all training views be trained on.
 
     Parameters
@@ -145,8 +147,10 @@ def begin_cooling(state: TrainState, cooling: Cooling, iterations: int, decision
         Iteration at which the training ends at the latest.
     decision : Decision
         That has brought it about; its ``step`` is the last at constant rates.
+    length : int, optional
+        Iterations that the cool-down takes; by default its part of those before it.
     """
-    length = max(1, math.ceil(cooling.part * decision.step))
+    length = max(1, math.ceil(cooling.part * decision.step)) if length is None else length
     state.pace = state.pace.decided(decision)._replace(
         cooling_from=decision.step, last_step=min(decision.step + length, iterations)
     )
