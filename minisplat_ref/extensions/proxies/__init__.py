@@ -22,5 +22,6 @@ Gaussian. Left out: training with a mesh, collisions of a sheet with itself, sol
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.proxies import cage, edit, fall, follow
+from minisplat_ref.extensions.proxies.study import STUDIES
 
-EXTENSION = Extension("proxies", commands=(edit, cage, follow, fall))
+EXTENSION = Extension("proxies", commands=(edit, cage, follow, fall), studies=STUDIES)
