@@ -120,3 +120,17 @@ DENSITY_GRID = 1e-3
 # LPIPS in float32, relative: 1e-7 of each of up to 13 layers' sums of thousands of products, which add up as a random
 # walk does, and twice that for the square of a difference of unit vectors that is not small.
 LPIPS_FLOAT32 = 1e-5
+
+# Products, singular vectors and logarithms of 3 x 3 matrices with entries and inverses up to 5, in float64; promised in
+# the README.
+AFFINE_EDIT = 1e-12
+
+# A whole image in float64 of Gaussians that were refactored: 1e-15 of footprints, through exponentials and quotients.
+EDITED_IMAGE = 1e-10
+
+# A damped chain of a few units after 40 of its slowest swings: what is left has decayed below rounding.
+SETTLED = 1e-10
+
+# The order of Verlet's error between two steps that differ by a factor of two: 2, and terms of the fourth power of the
+# step, which at eight tenths of the longest stable one are 0.1 of it.
+VERLET_SLOPE = 0.25

@@ -1,7 +1,8 @@
 """The container PLY: a header that names elements and their properties, then the rows; its vertices as columns.
 
-Read: ASCII, little- and big-endian, any scalar type, elements and properties in any order. Other elements, such as
-faces, and properties that are lists are passed over. Written: little-endian vertices.
+Read: ASCII, little- and big-endian, any scalar type, elements and properties in any order. Other elements and
+properties that are lists are passed over; :mod:`.ply_faces` reads faces. Written: little-endian vertices, and
+triangles.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,6 +28,7 @@ SCALAR_TYPES = {
 }
 COUNT_TYPES = [name for name, code in SCALAR_TYPES.items() if code[0] != "f"]
 BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+CORNERS = ("vertex_indices", "vertex_index")  # the list of a face, as different programs call it; ours is the first
 ROWS_AT_ONCE = 1 << 16  # that are put together for writing
 HEADER_LINE_MAX = 4096  # bytes; no header line is longer, and a file without line breaks must not be read whole
 
@@ -93,8 +95,8 @@ def n_rows_of(path: str | Path, name: str) -> int:
         If the file cannot be opened or its header is malformed.
     """
     path = Path(path)
-    with _open(path) as file:
-        return sum(element.n for element in _read_header(file, path).elements if element.name == name)
+    with open_ply(path) as file:
+        return sum(element.n for element in read_header(file, path).elements if element.name == name)
 
 
 def property_names(path: str | Path) -> tuple[str, ...]:
@@ -106,8 +108,8 @@ def property_names(path: str | Path) -> tuple[str, ...]:
         If the file cannot be opened or its header is malformed.
     """
     path = Path(path)
-    with _open(path) as file:
-        return _read_header(file, path).vertices.dtype.names or ()
+    with open_ply(path) as file:
+        return read_header(file, path).vertices.dtype.names or ()
 
 
 def read_vertices(path: str | Path) -> dict[str, NDArray]:
@@ -124,27 +126,30 @@ def read_vertices(path: str | Path) -> dict[str, NDArray]:
         If the file is missing, malformed or ends before its last declared vertex.
     """
     path = Path(path)
-    with _open(path) as file:
-        header = _read_header(file, path)
+    with open_ply(path) as file:
+        header = read_header(file, path)
         if header.encoding == "ascii":
             with np.errstate(over="ignore"):  # what exceeds its type becomes infinite, which readers look for
                 rows = _read_ascii(file, path, sum(element.n for element in header.before), header.vertices)
         else:
             for element in header.before:
-                _pass_over(file, path, element)
+                pass_over(file, path, element)
             rows = _read_binary(file, path, header.vertices)
     return {name: rows[name].astype(rows[name].dtype.newbyteorder("=")) for name in rows.dtype.names or ()}
 
 
-def write_vertices(path: str | Path, columns: Mapping[str, NDArray]) -> None:
+def write_vertices(path: str | Path, columns: Mapping[str, NDArray], triangles: NDArray | None = None) -> None:
     """Write columns of equal length P as the vertices of a little-endian PLY, complete or not at all.
 
-    Each property has the scalar type of its column: uint8, int32, float32 and so on.
+    Each property has the scalar type of its column: uint8, int32, float32 and so on. Triangles [T, 3], rows of
+    vertices, become its faces.
     """
     type_names = {code: name for name, code in reversed(SCALAR_TYPES.items()) if not name[-1].isdigit()}
     dtype = np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
     n = len(next(iter(columns.values())))
     properties = "".join(f"property {type_names[c.dtype.str[1:]]} {name}\n" for name, c in columns.items())
+    if triangles is not None:
+        properties += f"element face {len(triangles)}\nproperty list uchar int {CORNERS[0]}\n"
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {n}\n{properties}end_header\n"
     with replacing(path) as temporary, open(temporary, "wb") as file:
         file.write(header.encode("ascii"))
@@ -154,16 +159,21 @@ def write_vertices(path: str | Path, columns: Mapping[str, NDArray]) -> None:
             for name, column in columns.items():
                 rows[name] = column[part]
             file.write(rows.data)
+        if triangles is not None:
+            faces = np.empty(len(triangles), [("n", "u1"), ("corners", "<i4", 3)])
+            faces["n"], faces["corners"] = 3, triangles
+            file.write(faces.tobytes())
 
 
-def _open(path: Path) -> BinaryIO:
+def open_ply(path: Path) -> BinaryIO:
+    """Open a file, or raise an InputError that says why that is impossible."""
     try:
         return path.open("rb")
     except OSError as error:
         raise InputError(f"{path}: cannot be opened ({error.strerror})") from None
 
 
-def _read_header(file: BinaryIO, path: Path) -> Header:
+def read_header(file: BinaryIO, path: Path) -> Header:
     """Read up to the line end_header; there are vertices, and no two of their columns have one name."""
     if file.readline(8).strip() != b"ply":
         raise InputError(f"{path}: not a PLY file, it does not begin with 'ply'")
@@ -208,7 +218,7 @@ def _property(name: str, kind: str, count: str | None, order: str) -> Property:
     return Property(name, np.dtype(order + SCALAR_TYPES[kind]), count_dtype)
 
 
-def _pass_over(file: BinaryIO, path: Path, element: Element) -> None:
+def pass_over(file: BinaryIO, path: Path, element: Element) -> None:
     """Move the file behind an element, in a binary file."""
     if element.has_lists:
         for _ in range(element.n):
@@ -240,19 +250,20 @@ def _read_row(file: BinaryIO, path: Path, element: Element) -> bytes:
     scalars = b""
     for name, dtype, count_dtype in element.properties:
         if count_dtype is None:
-            scalars += _read(file, path, dtype.itemsize)
+            scalars += read_exactly(file, path, dtype.itemsize)
             continue
-        count = int(np.frombuffer(_read(file, path, count_dtype.itemsize), count_dtype)[0])
+        count = int(np.frombuffer(read_exactly(file, path, count_dtype.itemsize), count_dtype)[0])
         if count < 0:
             raise InputError(f"{path}: a list {name} has {count} values; export the PLY again")
         file.seek(count * dtype.itemsize, 1)
     return scalars
 
 
-def _read(file: BinaryIO, path: Path, n: int) -> bytes:
+def read_exactly(file: BinaryIO, path: Path, n: int) -> bytes:
+    """Read n bytes, which must be there."""
     data = file.read(n)
     if len(data) < n:
-        raise InputError(f"{path}: truncated, it ends before its last vertex; copy or export the file again")
+        raise InputError(f"{path}: truncated, it ends before its last declared row; copy or export the file again")
     return data
 
 

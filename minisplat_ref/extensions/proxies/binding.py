@@ -1,0 +1,147 @@
+"""Gaussians bound to the triangles of a mesh: the mesh is moved, and they follow.
+
+After GaMeS (Waczynska et al. 2024, arXiv 2402.01459), which puts Gaussians onto the faces of a mesh by barycentric
+coordinates and derives rotation and scales from the corners, so that whatever moves the mesh moves the scene. Each
+Gaussian is bound to the nearest triangle. With the frame E of that triangle (:mod:`.mesh`) it is
+
+    mu = p0 + E (b1, b2, w)       barycentric coordinates (1 - b1 - b2, b1, b2) and signed offset w along the normal
+    R diag(s) = E L               L: rotation and scales in the frame of the triangle
+
+and after the mesh has moved, with the corners p' and the frame E',
+
+    mu' = p0' + E' (b1, b2, w),   R' diag(s') V^T = E' L          that is Sigma' = F Sigma F^T,  F = E' E^-1
+
+F is the whole deformation gradient, stretch and shear included, refactored by singular values; colours turn by its
+rotation (:mod:`.deformation`).
+
+Exact: when the mesh is moved, turned and scaled, so are the Gaussians; and so is every affine map within the plane of a
+triangle. Triangles whose corners have not moved leave their Gaussians as they are, to the byte. Approximate: a bent
+surface becomes flat pieces, and a Gaussian that crosses a side of its triangle follows only the one that it is bound
+to. Corners say nothing of a stretch across their plane; there a Gaussian grows as h does, with the root of the area.
+Beyond the border of the mesh and far from its surface the map of the nearest triangle is continued, which magnifies
+its turn; ``reach`` leaves Gaussians alone that are farther away.
+
+Where this deviates from GaMeS: Gaussians are not trained on the faces but bound as they are, so they may be off the
+surface and of any shape; there, the scales of a flat Gaussian are two lengths of a Gram-Schmidt frame of the triangle,
+which takes no notice of shear.
+"""
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.proxies.deformation import Deformation, deformed
+from minisplat_ref.extensions.proxies.mesh import Mesh, frames
+from minisplat_ref.extensions.proxies.nearest import nearest_triangles
+from minisplat_ref.types import Floats, Gaussians, Ints
+
+UNBOUND = -1
+
+
+class Binding(NamedTuple):
+    """Gaussians, and where each sits in the frame of its triangle."""
+
+    gaussians: Gaussians
+    """N rows, as they are while the mesh is at rest."""
+    mesh: Mesh
+    """At rest."""
+    faces: Ints
+    """[N] triangle of each Gaussian, or ``UNBOUND``."""
+    barycentric: Floats
+    """[N, 3] of the projection onto the plane of the triangle; sums to 1, not clipped to the triangle."""
+    offsets: Floats
+    """[N] signed distance from that plane over h; positive on the side of the normal."""
+
+    @property
+    def n_bound(self) -> int:
+        """Number of Gaussians that follow the mesh."""
+        return int(np.count_nonzero(self.faces != UNBOUND))
+
+
+def bind(
+    gaussians: Gaussians,
+    mesh: Mesh,
+    reach: float = np.inf,
+    progress: Callable[[Iterable[Ints]], Iterable[Ints]] = iter,
+) -> Binding:
+    """Bind Gaussians to the nearest triangles of a mesh at rest.
+
+    ::
+
+        (b1, b2, w) = E^-1 (mu - p0)
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        To be bound.
+    mesh : Mesh
+        At rest; in the world frame of the Gaussians, and every triangle with an area.
+    reach : float
+        Gaussians whose centre is farther than this from the surface, world units, are not bound and stay.
+    progress : callable
+        As for :func:`~minisplat_ref.extensions.proxies.nearest.nearest_triangles`.
+    """
+    means = gaussians.means.astype(np.float64)
+    nearest = nearest_triangles(means, mesh, progress)
+    from_p0 = means - mesh.corners[nearest.faces, 0]  # [N, 3]
+    b1, b2, w = np.einsum("nij,nj->in", np.linalg.inv(frames(mesh))[nearest.faces], from_p0)
+    return Binding(
+        gaussians,
+        mesh,
+        np.where(nearest.distances <= reach, nearest.faces, UNBOUND),
+        np.stack([1 - b1 - b2, b1, b2], axis=1),
+        w,
+    )
+
+
+def rebuild(deformed_mesh: Mesh, binding: Binding) -> Gaussians:
+    """Return the Gaussians as the deformed mesh carries them.
+
+    ::
+
+        mu' = b0 p0' + b1 p1' + b2 p2' + w h' n',   Sigma' = F Sigma F^T,   F = E' E^-1
+
+    Parameters
+    ----------
+    deformed_mesh : Mesh
+        With the faces of the mesh at rest, and every triangle with an area.
+    binding : Binding
+        From :func:`bind`.
+
+    Returns
+    -------
+    Gaussians
+        N rows in the dtype and order of the bound ones. Those of triangles that have not moved, and those that are not
+        bound, keep their bytes.
+    """
+    rest, gaussians = binding.mesh, binding.gaussians
+    E_rest, E = frames(rest), frames(deformed_mesh)  # [T, 3, 3]
+    is_still = (deformed_mesh.corners == rest.corners).all(axis=(1, 2))  # [T]
+    F = np.where(is_still[:, None, None], np.eye(3), E @ np.linalg.inv(E_rest))
+    F = np.concatenate([F, np.eye(3)[None]])  # the last, row -1, is that of what is not bound
+    faces = binding.faces
+    is_carried = (faces != UNBOUND) & ~is_still[faces]  # [N]
+    carried = (
+        np.einsum("nk,nki->ni", binding.barycentric, deformed_mesh.corners[faces])
+        + binding.offsets[:, None] * E[faces, :, 2]
+    )  # [N, 3]
+    means = np.where(is_carried[:, None], carried, gaussians.means.astype(np.float64))
+    return deformed(gaussians, means, Deformation(F, faces))
+
+
+def check_bound(binding: Binding, reach: float, source: str | Path) -> None:
+    """Refuse a binding of nothing; ``source`` is the model's file.
+
+    Raises
+    ------
+    InputError
+        One line that names model and reach.
+    """
+    if binding.n_bound == 0:
+        raise InputError(
+            f"{source}: none of its {len(binding.faces):,} Gaussians is within {reach:g} of the mesh; give a larger"
+            " --reach, or a mesh in the frame of the model"
+        )

@@ -1,0 +1,229 @@
+"""What the study ``proxies/affine`` measures: how exact edits are, and what bending a sheet of Gaussians costs.
+
+Affine edits are compared with the affine map itself: of centres, covariances, colours towards turned directions and,
+where the map is a similarity, of the picture with that from a camera which was moved the other way. All in float64.
+
+Bending is not affine. A flat sheet of flat Gaussians is sheared and rolled onto a cylinder of radius r,
+
+    phi(x, y, 0) = (r sin(u / r), y, r - r cos(u / r)),   u = x + y / 2
+
+by a mesh of n x n cells whose vertices are moved exactly. The truth for a Gaussian is phi at its centre, and Sigma
+deformed by phi's derivative there. It is compared with what the binding makes of it, once with the whole gradient F of
+the triangle, and once with the frame of GaMeS, which is the normal, the direction from the centroid to the first
+corner, and the Gram-Schmidt remainder of the second, with two lengths.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from minisplat_ref.backends import CPU
+from minisplat_ref.constants import SH_C0
+from minisplat_ref.extensions.proxies.affine import Affine, about, edited, in_ball, rotation_about
+from minisplat_ref.extensions.proxies.binding import Binding, bind, rebuild
+from minisplat_ref.extensions.proxies.cage import grid
+from minisplat_ref.extensions.proxies.deformation import Deformation, deformed, polar_rotations
+from minisplat_ref.extensions.proxies.mesh import Mesh
+from minisplat_ref.reference.covariance import covariances
+from minisplat_ref.reference.spherical_harmonics import sh_basis
+from minisplat_ref.rendering import render
+from minisplat_ref.types import Camera, Floats, Gaussians
+
+MAPS = {
+    "turn": rotation_about((20.0, -50.0, 70.0)),
+    "turn and scale": 1.7 * rotation_about((20.0, -50.0, 70.0)),
+    "mirror": np.diag([1.0, -1.0, 1.0]) @ rotation_about((5.0, 6.0, 7.0)),
+    "stretch": np.diag([0.3, 1.0, 4.0]),
+    "shear": np.array([[1.0, 0.8, -0.3], [0.0, 1.0, 0.5], [0.2, 0.0, 1.0]]),
+}
+SIMILAR = ("turn", "turn and scale", "mirror")
+SHIFT = np.array([0.3, -0.2, 0.1])
+N = 200  # Gaussians
+CELLS = (2, 4, 8, 16, 32, 64)
+RADIUS = 0.8  # of the cylinder; the sheet is 2 wide
+SIZE = 160  # pixels a side
+FRAMES = {"whole gradient": True, "two lengths": False}
+
+
+class EditErrors(NamedTuple):
+    """Largest errors of one map, over all Gaussians and seeds."""
+
+    centre: float
+    """World units, of a scene of about 2."""
+    covariance: float
+    """Relative to the largest entry of each."""
+    color: float
+    """Of [0, 1]."""
+    picture: float | None
+    """Of [0, 1]; None where no camera sees the same."""
+
+
+def cloud(rng: np.random.Generator) -> Gaussians:
+    """Return Gaussians of all shapes and colours of degree 3 around (0, 0, 4), in float64."""
+    return Gaussians(
+        means=np.array([0.0, 0, 4]) + 0.5 * rng.normal(size=(N, 3)),
+        quats=rng.normal(size=(N, 4)),
+        log_scales=np.log(0.12) + rng.uniform(-1.5, 0.5, size=(N, 3)),
+        opacity_logits=1 + rng.normal(size=N),
+        sh_dc=rng.normal(size=(N, 3)),
+        sh_rest=0.3 * rng.normal(size=(N, 15, 3)),
+    )
+
+
+def camera() -> Camera:
+    """Return a camera at the origin that looks along z."""
+    return Camera(np.eye(3), np.zeros(3), SIZE, SIZE, SIZE / 2, SIZE / 2, SIZE, SIZE)
+
+
+def edit_errors(name: str, seed: int) -> EditErrors:
+    """Return the errors of a map for one cloud."""
+    A = MAPS[name]
+    before = cloud(np.random.default_rng(seed))
+    after = edited(before, Affine(A, SHIFT), np.ones(N, bool))
+    long_A = A.astype(np.longdouble)  # so that the truth is not rounded as the edit is
+    expected = long_A @ _sigma(before) @ long_A.T  # [N, 3, 3]
+    relative = np.abs(_sigma(after) - expected).max(axis=(1, 2)) / np.abs(expected).max(axis=(1, 2))
+    d = np.random.default_rng(seed).normal(size=(N, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    Q = polar_rotations(A[None])[0]
+    color = np.abs(_colors(after, d @ Q.T) - _colors(before, d)).max()
+    picture = None
+    if name in SIMILAR:
+        difference = _picture(after, _moved_back(A, Q)) - _picture(before, camera())
+        picture = float(np.abs(difference).max())
+    centre = np.abs(after.means - (before.means @ long_A.T + SHIFT)).max()
+    return EditErrors(float(centre), float(relative.max()), float(color), picture)
+
+
+def _moved_back(A: Floats, Q: Floats) -> Camera:
+    """Return the camera that sees ``A x + b`` as :func:`camera` sees x, for ``A = s Q``: R' = R Q^T, t' = s t - R' b.
+
+    Of a mirror, its first axis is mirrored as well, and so is the picture: not a rotation, but the same formulas.
+    """
+    s = np.linalg.norm(A[:, 0])
+    R = camera().cam_from_world_R @ Q.T
+    return camera()._replace(cam_from_world_R=R, cam_from_world_t=s * camera().cam_from_world_t - R @ SHIFT)
+
+
+def _sigma(gaussians: Gaussians) -> Floats:
+    return covariances(gaussians.quats, np.exp(gaussians.log_scales))
+
+
+def _colors(gaussians: Gaussians, directions: Floats) -> Floats:
+    coefficients = np.concatenate([gaussians.sh_dc[:, None], gaussians.sh_rest], axis=1)
+    return 0.5 + np.einsum("nk,nkc->nc", sh_basis(directions, 3), coefficients)
+
+
+def _picture(gaussians: Gaussians, view: Camera) -> Floats:
+    return render(gaussians, view, backend=CPU)[0].image
+
+
+def flat_gaussians(rng: np.random.Generator) -> Gaussians:
+    """Return flat Gaussians of random axes in the plane z = 0, in the square from -1 to 1; checkered."""
+    n = 40
+    axis = (np.arange(n) + 0.5) / n * 2 - 1
+    x, y = (values.ravel() for values in np.meshgrid(axis, axis))
+    angle = rng.uniform(0, np.pi, n * n)
+    is_dark = (np.floor(3 * x) + np.floor(3 * y)) % 2 == 0
+    colors = np.where(is_dark[:, None], [0.1, 0.25, 0.6], [0.95, 0.8, 0.35])
+    return Gaussians(
+        means=np.column_stack([x, y, np.zeros(n * n)]),
+        quats=np.column_stack([np.cos(angle / 2), np.zeros((n * n, 2)), np.sin(angle / 2)]),
+        log_scales=np.log(np.column_stack([rng.uniform(0.015, 0.03, (n * n, 2)), np.full(n * n, 1e-3)])),
+        opacity_logits=np.full(n * n, 3.0),
+        sh_dc=(colors - 0.5) / SH_C0,
+        sh_rest=np.zeros((n * n, 0, 3)),
+    )
+
+
+def rolled(points: Floats) -> Floats:
+    """Return phi of points [N, 3] in the plane z = 0."""
+    u = (points[:, 0] + points[:, 1] / 2) / RADIUS
+    return np.column_stack([RADIUS * np.sin(u), points[:, 1], RADIUS - RADIUS * np.cos(u)])
+
+
+def rolled_jacobian(points: Floats) -> Floats:
+    """Return the derivative of phi [N, 3, 3], with the normal of the cylinder as its third column."""
+    u = (points[:, 0] + points[:, 1] / 2) / RADIUS
+    cos, sin, zero, one = np.cos(u), np.sin(u), np.zeros(len(u)), np.ones(len(u))
+    columns = [(cos, zero, sin), (cos / 2, one, sin / 2), (-sin, zero, cos)]
+    return np.moveaxis(np.array(columns), (0, 1, 2), (2, 1, 0))
+
+
+def bent_by(cells: int, gaussians: Gaussians, is_whole: bool) -> Gaussians:
+    """Return the sheet as a mesh of n x n cells rolls it, by the whole gradient or by GaMeS's frame."""
+    mesh = grid(np.array([-1.0, -1.0, 0.0]), np.array([2.0, 0.0, 0.0]), np.array([0.0, 2.0, 0.0]), (cells, cells))
+    binding, moved = bind(gaussians, mesh), Mesh(rolled(mesh.vertices), mesh.faces)
+    carried = rebuild(moved, binding)
+    return carried if is_whole else _by_two_lengths(binding, moved, carried.means)
+
+
+def _by_two_lengths(binding: Binding, moved: Mesh, means: Floats) -> Gaussians:
+    """Return the Gaussians with ``F = Q' diag(1, s2' / s2, s3' / s3) Q^T`` of the frames Q and lengths of GaMeS."""
+    (Q, lengths), (moved_Q, moved_lengths) = _gram_schmidt(binding.mesh), _gram_schmidt(moved)
+    F = (moved_Q * (moved_lengths / lengths)[:, None, :]) @ np.swapaxes(Q, 1, 2)
+    return deformed(binding.gaussians, means, Deformation(F, binding.faces))
+
+
+def _gram_schmidt(mesh: Mesh) -> tuple[Floats, Floats]:
+    """Return the axes [T, 3, 3] of triangles, as columns, and their lengths [T, 3], of which the first is 1."""
+    corners = mesh.corners
+    a, b = corners[:, 0] - corners.mean(axis=1), corners[:, 1] - corners.mean(axis=1)  # [T, 3]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    s2 = np.linalg.norm(a, axis=1)
+    r2 = a / s2[:, None]
+    rest = b - np.sum(b * r2, axis=1, keepdims=True) * r2
+    s3 = np.linalg.norm(rest, axis=1)
+    return np.stack([normal, r2, rest / s3[:, None]], axis=2), np.column_stack([np.ones(len(s2)), s2, s3])
+
+
+def bend_errors(gaussians: Gaussians) -> dict[str, Any]:
+    """Return for each number of cells the largest errors of centres and, by frame, of covariances."""
+    J = rolled_jacobian(gaussians.means)
+    truth = J @ _sigma(gaussians) @ np.swapaxes(J, 1, 2)
+    size = np.abs(truth).max(axis=(1, 2))
+    result: dict[str, Any] = {"cells": list(CELLS), "centre": [], "covariance": {name: [] for name in FRAMES}}
+    for cells in CELLS:
+        for name, is_whole in FRAMES.items():
+            carried = bent_by(cells, gaussians, is_whole)
+            relative = np.abs(_sigma(carried) - truth).max(axis=(1, 2)) / size
+            result["covariance"][name].append(float(relative.max()))
+        result["centre"].append(float(np.linalg.norm(carried.means - rolled(gaussians.means), axis=1).max()))
+    return result
+
+
+def draw(bend: dict[str, Any], seed: int) -> Figure:
+    """Draw a sheet, an edit of its middle, the sheet when it is rolled, and the errors of that."""
+    figure = Figure(figsize=(9.0, 2.6), layout="constrained")
+    panels = figure.subplots(1, 4, gridspec_kw={"width_ratios": [1, 1, 1, 1.5]})
+    sheet, centre = flat_gaussians(np.random.default_rng(seed)), np.zeros(3)
+    raised = about(rotation_about((0.0, 0.0, 45.0)), centre, np.array([0.0, 0.0, -0.4]))
+    pictures = {
+        "a sheet": sheet,
+        "its middle turned\nby 45° and raised": edited(sheet, raised, in_ball(sheet.means, centre, 0.6)),
+        f"sheared and rolled\nby {CELLS[3]} x {CELLS[3]} cells": bent_by(CELLS[3], sheet, True),
+    }
+    for axes, (title, gaussians) in zip(panels, pictures.items(), strict=False):
+        image = render(_before_the_camera(gaussians), camera(), background=np.ones(3))[0].image
+        axes.imshow(np.clip(image, 0, 1))
+        axes.set_title(title, fontsize=8)
+        axes.set(xticks=[], yticks=[])
+    axes = panels[3]
+    axes.loglog(bend["cells"], bend["centre"], "o-", color="0.5", label="centre (of a sheet 2 wide)")
+    for (name, errors), color in zip(bend["covariance"].items(), ("tab:blue", "tab:red"), strict=True):
+        axes.loglog(bend["cells"], errors, "o-", color=color, label=f"covariance, {name}")
+    axes.set_xticks(bend["cells"], [str(n) for n in bend["cells"]])
+    axes.minorticks_off()
+    axes.set_xlabel("cells a side", fontsize=8)
+    axes.set_title("largest error of the rolled sheet", fontsize=8)
+    axes.tick_params(labelsize=7)
+    axes.legend(fontsize=7)
+    return figure
+
+
+def _before_the_camera(sheet: Gaussians) -> Gaussians:
+    """Return the sheet as it is seen obliquely from above."""
+    tilted = Affine(rotation_about((-50.0, 0.0, 0.0)), np.array([0.0, -0.1, 3.2]))
+    return edited(sheet, tilted, np.ones(len(sheet.means), bool))

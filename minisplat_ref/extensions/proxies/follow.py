@@ -1,0 +1,58 @@
+"""The command ``minisplat-ref proxies follow``: a scene that follows a mesh which was deformed elsewhere."""
+
+import argparse
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from minisplat_ref.extensions.proxies.binding import bind, check_bound, rebuild
+from minisplat_ref.extensions.proxies.mesh import check_same_faces, load_mesh
+from minisplat_ref.extensions.proxies.model_file import load_model
+from minisplat_ref.io.ply import save_ply
+
+DESCRIPTION = """\
+Bind the Gaussians of a model to a mesh, and write them as they are after the
+mesh has been deformed: in a modelling program, or by a script that moves its
+vertices. Both meshes have the same faces.
+"""
+
+
+def add_parser(commands: Any) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "follow",
+        help="deform a scene as a mesh was deformed",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("model", type=Path, metavar="MODEL", help="PLY of Gaussians, or a run's folder")
+    parser.add_argument("rest", type=Path, metavar="REST", help="PLY of the mesh as it fits the model")
+    parser.add_argument("deformed", type=Path, metavar="DEFORMED", help="PLY of the same mesh with moved vertices")
+    parser.add_argument("out", type=Path, metavar="OUT", help="PLY to write")
+    add_reach(parser)
+    parser.set_defaults(run=run)
+
+
+def add_reach(parser: argparse.ArgumentParser) -> None:
+    """Add ``--reach``."""
+    parser.add_argument(
+        "--reach",
+        type=float,
+        default=float("inf"),
+        metavar="D",
+        help="bind only what is nearer to the mesh than D, world units (default: all)",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Bind, rebuild, write."""
+    from tqdm import tqdm
+
+    gaussians, rest, deformed = load_model(args.model), load_mesh(args.rest), load_mesh(args.deformed)
+    check_same_faces(rest, deformed, args.deformed)
+    bar = partial(tqdm, desc="nearest triangles", leave=False, disable=None)
+    binding = bind(gaussians, rest, args.reach, bar)
+    check_bound(binding, args.reach, args.model)
+    save_ply(args.out, rebuild(deformed, binding))
+    print(f"{binding.n_bound:,} of {len(gaussians.means):,} Gaussians follow the mesh, in {args.out}")
+    return 0

@@ -1,0 +1,133 @@
+"""A triangle mesh: its files, the frame of a triangle, and the coordinates of a point in it.
+
+A triangle with the corners p0, p1, p2 has the frame
+
+    E = [e1, e2, h n],   e1 = p1 - p0,   e2 = p2 - p0,   n = e1 x e2 / |e1 x e2|,   h = sqrt(|e1 x e2|)
+
+in which a point is ``x = p0 + E (b1, b2, w)``: (1 - b1 - b2, b1, b2) are the barycentric coordinates of its projection
+onto the plane of the triangle, and w is its signed distance from that plane in units of h. As h grows like the
+triangle, a mesh that is turned, moved and scaled takes its points along exactly.
+
+Left out: textures, normals and colours of a mesh; formats other than PLY.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.io.ply import MEANS, check_finite
+from minisplat_ref.io.ply_faces import read_faces
+from minisplat_ref.io.ply_file import read_vertices, write_vertices
+from minisplat_ref.types import Floats, Ints
+
+LEAST_HEIGHT = 1e-6  # of a triangle over its longest side; below, its frame loses more than half of float64's digits
+
+
+class Mesh(NamedTuple):
+    """A triangle mesh."""
+
+    vertices: Floats
+    """[P, 3] float64, world frame."""
+    faces: Ints
+    """[T, 3] rows of the vertices that are the corners of each triangle."""
+
+    @property
+    def corners(self) -> Floats:
+        """[T, 3, 3] world frame: triangle, corner, axis."""
+        return self.vertices[self.faces]
+
+
+def frames(mesh: Mesh) -> Floats:
+    """Return the frames E of the triangles, as matrices whose columns are ``e1, e2, h n``.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Every triangle has an area.
+
+    Returns
+    -------
+    ndarray of shape (T, 3, 3)
+        world_from_triangle, world units.
+    """
+    p0, p1, p2 = np.moveaxis(mesh.corners, 1, 0)  # [T, 3] each
+    e1, e2 = p1 - p0, p2 - p0
+    across = np.cross(e1, e2)  # h^2 n
+    h = np.sqrt(np.linalg.norm(across, axis=1, keepdims=True))  # [T, 1]
+    return np.stack([e1, e2, across / h], axis=2)
+
+
+def load_mesh(path: str | Path) -> Mesh:
+    """Read a triangle mesh from a PLY file; faces of more than three corners are cut into triangles, like a fan.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, has no faces, or :func:`check_mesh` refuses what it holds.
+    """
+    columns = read_vertices(path)
+    missing = [name for name in MEANS if name not in columns]
+    if missing:
+        raise InputError(f"{path}: not a mesh, its vertices have no property {', '.join(missing)}; export it again")
+    coordinates = {name: columns[name].astype(np.float64) for name in MEANS}
+    check_finite(path, coordinates)
+    polygons = read_faces(path)
+    if not polygons:
+        raise InputError(f"{path}: a mesh of no faces; give a triangle mesh, or make one with: proxies cage MODEL MESH")
+    triangles = [np.stack([np.repeat(p[:1], len(p) - 2), p[1:-1], p[2:]], axis=1) for p in polygons if len(p) > 2]
+    if len(triangles) < len(polygons):
+        first = next(i for i, p in enumerate(polygons) if len(p) < 3)
+        raise InputError(f"{path}: face {first} has {len(polygons[first])} corners, not 3 or more; remove that face")
+    mesh = Mesh(np.stack(list(coordinates.values()), axis=1), np.concatenate(triangles))
+    check_mesh(mesh, path)
+    return mesh
+
+
+def save_mesh(path: str | Path, mesh: Mesh) -> None:
+    """Write a mesh as a PLY in float64, complete or not at all."""
+    write_vertices(path, dict(zip(MEANS, mesh.vertices.T, strict=True)), mesh.faces)
+
+
+def check_mesh(mesh: Mesh, source: str | Path) -> None:
+    """Refuse corners that do not exist and triangles without an area; ``source`` is what messages begin with.
+
+    Raises
+    ------
+    InputError
+        One line that names the first bad face.
+    """
+    is_absent = (mesh.faces < 0) | (mesh.faces >= len(mesh.vertices))  # [T, 3]
+    if is_absent.any():
+        face, corner = np.argwhere(is_absent)[0]
+        raise InputError(
+            f"{source}: face {face} has the corner {mesh.faces[face, corner]}, but there are {len(mesh.vertices)}"
+            " vertices, counted from 0; export the mesh again"
+        )
+    corners = mesh.corners
+    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)  # [T, 3]
+    longest = sides.max(axis=1)  # [T]
+    doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)  # 2 area
+    is_flat = ~(doubled > LEAST_HEIGHT * longest**2)
+    if is_flat.any():
+        raise InputError(
+            f"{source}: triangle {np.argmax(is_flat)} has no area ({is_flat.sum()} of {len(is_flat)} have none): its"
+            " corners coincide or lie on one line; merge vertices that coincide, or remove those faces"
+        )
+
+
+def check_same_faces(rest: Mesh, deformed: Mesh, source: str | Path) -> None:
+    """Refuse a deformed mesh whose vertices or faces are not those of the mesh at rest, one for one.
+
+    Raises
+    ------
+    InputError
+        One line that says what differs.
+    """
+    if len(deformed.vertices) != len(rest.vertices) or not np.array_equal(deformed.faces, rest.faces):
+        raise InputError(
+            f"{source}: {len(deformed.vertices)} vertices and {len(deformed.faces)} triangles, not the"
+            f" {len(rest.vertices)} and {len(rest.faces)} of the mesh at rest in the same order; move vertices only,"
+            " and export without merging or sorting them"
+        )

@@ -1,0 +1,25 @@
+"""Reading the model that a command of this extension works on."""
+
+import warnings
+from pathlib import Path
+
+from minisplat_ref.errors import InputWarning, one_line
+from minisplat_ref.io.ply import further_properties, load_ply
+from minisplat_ref.types import Gaussians
+
+
+def load_model(path: Path) -> Gaussians:
+    """Read the Gaussians of a PLY, of a run's folder the one in it; warn of properties that are left out.
+
+    Raises
+    ------
+    InputError
+        If there is no PLY of Gaussians.
+    """
+    file = path / "point_cloud.ply" if path.is_dir() else path
+    gaussians: Gaussians = load_ply(file)
+    further = further_properties(file)
+    if further:
+        message = f"{file}: {', '.join(further)} are left out: only the fields of 3DGS are known to move"
+        warnings.warn(one_line(message), InputWarning, stacklevel=2)
+    return gaussians

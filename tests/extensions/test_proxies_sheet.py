@@ -1,0 +1,357 @@
+"""A sheet of masses and springs: forces, exact falls, rest in closed form, the energy balance; ``fall`` and studies."""
+
+import json
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scenes import as_dtype, make_gaussians
+from tolerances import CLOSED_FORM, GRADIENT_REL, GRADIENT_STEP, SETTLED, VERLET_SLOPE
+
+from minisplat_ref.cli import main
+from minisplat_ref.extensions.proxies import edit_claims, sheet_claims
+from minisplat_ref.extensions.proxies.binding import bind, rebuild
+from minisplat_ref.extensions.proxies.cage import grid
+from minisplat_ref.extensions.proxies.edit_claims import rolled, rolled_jacobian
+from minisplat_ref.extensions.proxies.fall import Setting, sheet_of
+from minisplat_ref.extensions.proxies.mass_spring import (
+    Floor,
+    Sheet,
+    State,
+    advanced,
+    energies,
+    forces,
+    longest_step,
+)
+from minisplat_ref.extensions.proxies.mesh import Mesh, load_mesh, save_mesh
+from minisplat_ref.extensions.proxies.springs import (
+    Stiffness,
+    spring_ends,
+    springs_between,
+    springs_of,
+    stiffness_for_stretch,
+    vertex_masses,
+)
+from minisplat_ref.io.images import read_image
+from minisplat_ref.io.ply import load_ply, save_ply
+
+G = np.array([0.0, 9.81, 0.0])
+
+
+def flat_sheet(n=3, z=3.0):
+    """Two by two units across z."""
+    return grid(np.array([-1.0, -1.0, z]), np.array([2.0, 0, 0]), np.array([0, 2.0, 0]), (n, n))
+
+
+def noisy_sheet(rng, **changes):
+    """A crumpled sheet with everything that a sheet may have, and where it is."""
+    mesh = flat_sheet()
+    setting = Setting(G, mesh.vertices[:, 1] < -0.9, 0.05, 0.7, 0.1)
+    sheet = sheet_of(mesh, setting)._replace(**changes)
+    return mesh, sheet, mesh.vertices + 0.3 * rng.normal(size=mesh.vertices.shape)
+
+
+def hanging_chain(n, k, drag):
+    """n equal masses of weight 1 below a pin, one spring of length 1 between neighbours."""
+    vertices = np.column_stack([np.zeros(n + 1), np.arange(n + 1.0), np.zeros(n + 1)])
+    ends = np.column_stack([np.arange(n), np.arange(1, n + 1)])
+    springs = springs_between(ends, vertices, np.full(n, k))
+    return vertices, Sheet(np.full(n + 1, 1 / 9.81), springs, np.arange(n + 1) == 0, G, drag)
+
+
+# Springs and masses
+
+
+def test_the_springs_of_two_triangles_and_of_a_strip():
+    """One cell: four sides and a diagonal, and the other diagonal; two cells also bend across the edge between them."""
+    edges, shear, bend = spring_ends(grid(np.zeros(3), np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), (1, 1)))
+    assert edges.tolist() == [[0, 1], [0, 2], [0, 3], [1, 3], [2, 3]]
+    assert [sorted(pair) for pair in shear.tolist()] == [[1, 2]] and len(bend) == 0
+    edges, shear, bend = spring_ends(grid(np.zeros(3), np.array([2.0, 0, 0]), np.array([0, 1.0, 0]), (2, 1)))
+    assert len(edges) == 9 and sorted(sorted(pair) for pair in shear.tolist()) == [[1, 3], [2, 4]]
+    assert [sorted(pair) for pair in bend.tolist()] == [[0, 5]]
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_the_numbers_of_springs_of_a_grid(n):
+    edges, shear, bend = spring_ends(flat_sheet(n))
+    assert len(edges) == 2 * n * (n + 1) + n * n and len(shear) == n * n and len(bend) == 2 * n * (n - 1)
+
+
+def test_faces_that_share_an_edge_three_times_are_no_trouble():
+    mesh = Mesh(
+        np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0]]), np.array([[0, 1, i] for i in (2, 3, 4)])
+    )
+    edges, shear, bend = spring_ends(mesh)
+    assert len(edges) == 7 and len(shear) + len(bend) == 1
+
+
+def test_masses_are_the_area(rng):
+    mesh = flat_sheet(4)
+    masses = vertex_masses(Mesh(np.concatenate([mesh.vertices, [[9.0, 9, 9]]]), mesh.faces), 2.5)
+    assert_allclose(masses[:-1].sum(), 2.5 * 4, rtol=CLOSED_FORM)
+    assert masses[-1] > 0  # of a vertex without triangles
+
+
+# Forces
+
+
+def test_forces_are_minus_the_gradient_of_the_energies(rng):
+    _, sheet, x = noisy_sheet(rng)
+
+    def potential(positions):
+        e = energies(State(positions, np.zeros_like(positions)), sheet)
+        return e.elastic + e.floor + e.gravity
+
+    found, numeric = forces(x, sheet), np.zeros_like(x)
+    for index in np.ndindex(x.shape):
+        moved = np.zeros_like(x)
+        moved[index] = GRADIENT_STEP
+        numeric[index] = -(potential(x + moved) - potential(x - moved)) / (2 * GRADIENT_STEP)
+    e = energies(State(x, np.zeros_like(x)), sheet)
+    assert e.elastic > 1 and e.floor > 0.1  # else there is nothing to check
+    free = ~sheet.is_pinned
+    assert np.abs(found - numeric)[free].max() <= GRADIENT_REL * np.abs(numeric).max()
+    assert not found[~free].any()
+
+
+def test_springs_neither_push_nor_turn_the_whole(rng):
+    _, sheet, x = noisy_sheet(rng, gravity=np.zeros(3), floor=None)
+    f = forces(x, sheet._replace(is_pinned=np.zeros(len(x), bool)))
+    assert np.abs(f).max() > 1
+    assert_allclose(f.sum(axis=0), 0, atol=CLOSED_FORM * np.abs(f).max())
+    assert_allclose(np.cross(x, f).sum(axis=0), 0, atol=1e2 * CLOSED_FORM * np.abs(f).max())
+
+
+def test_a_spring_of_no_length_has_no_force():
+    springs = springs_between(np.array([[0, 1]]), np.array([[0.0, 0, 0], [1, 0, 0]]), np.ones(1))
+    sheet = Sheet(np.ones(2), springs, np.zeros(2, bool), np.zeros(3))
+    assert not forces(np.zeros((2, 3)), sheet).any()
+
+
+# Motion in closed form
+
+
+def test_free_fall_is_exact_and_carries_the_gaussians(rng):
+    mesh = flat_sheet()
+    sheet = sheet_of(mesh, Setting(G, np.zeros(len(mesh.vertices), bool), 0.01, 0.0, None))
+    v = np.array([0.2, -1.0, 0.4])
+    state = advanced(State(mesh.vertices, np.broadcast_to(v, mesh.vertices.shape)), sheet, 0.5 / 400, 400)
+    way = 0.5 * v + 0.125 * G
+    assert 0.5 / 400 < longest_step(sheet)
+    assert_allclose(state.positions, mesh.vertices + way, atol=CLOSED_FORM)
+    gaussians = make_gaussians(rng, 40)
+    fallen = rebuild(Mesh(state.positions, mesh.faces), bind(gaussians, mesh))
+    assert_allclose(fallen.means, gaussians.means + way, atol=10 * CLOSED_FORM)
+    assert_allclose(fallen.log_scales, gaussians.log_scales, atol=10 * CLOSED_FORM)
+
+
+def test_drag_alone_slows_down_exactly():
+    sheet = hanging_chain(3, 1.0, 1.3)[1]._replace(gravity=np.zeros(3), is_pinned=np.zeros(4, bool))
+    v = np.array([1.0, 2.0, 3.0])
+    x = hanging_chain(3, 1.0, 1.3)[0]
+    state = advanced(State(x, np.broadcast_to(v, x.shape)), sheet, 0.01, 50)
+    assert_allclose(state.velocities, np.broadcast_to(v * np.exp(-1.3 * 0.5), x.shape), rtol=CLOSED_FORM)
+    lost = (1 - np.exp(-1.3)) * sheet.masses.sum() * v @ v / 2
+    assert_allclose(state.dissipated, lost, rtol=CLOSED_FORM)
+
+
+def test_one_mass_on_a_spring_swings_at_its_frequency():
+    """Verlet's own frequency: ``sin(w' h / 2) = w h / 2``."""
+    k, h, n = 7.0, 0.05, 123
+    vertices, sheet = hanging_chain(1, k, 0.0)
+    sheet = sheet._replace(masses=np.ones(2), gravity=np.zeros(3))
+    state = advanced(State(vertices + np.diag([0, 0.1, 0])[:2], np.zeros((2, 3))), sheet, h, n)
+    w = 2 / h * np.arcsin(np.sqrt(k) * h / 2)
+    assert_allclose(state.positions[1, 1] - 1, 0.1 * np.cos(w * h * n), atol=1e-12)
+
+
+def test_a_chain_comes_to_rest_where_it_should():
+    """Spring j of n carries the n - j masses below it, each of weight 1: it is longer by (n - j) / k."""
+    n, k = 6, 40.0
+    vertices, sheet = hanging_chain(n, k, 3.0)
+    state = advanced(State(vertices, np.zeros_like(vertices)), sheet, 0.5 * longest_step(sheet), 4000)
+    expected = np.concatenate([[0], np.cumsum(1 + (n - np.arange(n)) / k)])
+    assert_allclose(state.positions[:, 1], expected, atol=SETTLED)
+    assert not state.positions[0].any() and not state.velocities[0].any()
+
+
+def test_a_sheet_lies_on_the_floor():
+    mesh = grid(np.zeros(3), np.array([0, 0, 1.0]), np.array([1.0, 0, 0]), (3, 3))
+    sheet = sheet_of(mesh, Setting(G, np.zeros(16, bool), 0.01, 1.0, 0.2))
+    state = advanced(State(mesh.vertices, np.zeros((16, 3))), sheet, 0.5 * longest_step(sheet), 4000)
+    sunk = state.positions[:, 1] - 0.2
+    assert_allclose(np.sum(sunk * sheet.floor.stiffness), sheet.masses.sum() * 9.81, rtol=1e-3)
+    assert (sunk > 0).all() and sunk.max() < 0.05
+
+
+def test_the_hanging_sheet_nears_the_catenary():
+    errors = [np.linalg.norm(np.subtract(*sheet_claims.hung(n, 1e-3)), axis=1).max() for n in (4, 8)]
+    assert errors[1] < 4e-3 and errors[0] > 3 * errors[1]
+
+
+# Energy and steps
+
+
+@pytest.mark.parametrize("name", ["no drag", "drag"])
+def test_the_energy_balance_closes_with_the_square_of_the_step(name):
+    errors = [sheet_claims.energy_error(sheet_claims.swung(sheet_claims.SWINGS[name], f)) for f in (0.8, 0.4, 0.2)]
+    assert errors[0] > 1e-6  # else there is no slope to see
+    slopes = np.log2(np.divide(errors[:-1], errors[1:]))
+    assert_allclose(slopes, 2, atol=VERLET_SLOPE)
+
+
+def test_without_drag_nothing_is_dissipated_and_with_it_everything_is(rng):
+    vertices, sheet = hanging_chain(3, 40.0, 0.0)
+    state = State(vertices, np.zeros_like(vertices))
+    assert advanced(state, sheet, 0.01, 500).dissipated == 0
+    damped = sheet._replace(drag=2.0)
+    end = advanced(state, damped, 0.005, 8000)
+    rest = energies(end, damped)
+    assert rest.kinetic < 1e-12 and rest.dissipated > 0.1
+    # A load that is let go stores half of what it gives: the other half is dissipated.
+    assert_allclose(rest.dissipated, rest.elastic, rtol=1e-3)
+
+
+def test_the_longest_step_is_that_of_stability(rng):
+    """Just below it the sheet stays, and not far above it explodes."""
+    mesh = flat_sheet()
+    sheet = sheet_of(mesh, Setting(G, mesh.vertices[:, 1] < -0.9, 0.05, 0.0, None))
+    start = State(mesh.vertices + 1e-3 * rng.normal(size=mesh.vertices.shape), np.zeros_like(mesh.vertices))
+    with np.errstate(all="ignore"):
+        sizes = [np.abs(advanced(start, sheet, f * longest_step(sheet), 300).velocities).max() for f in (0.99, 2.0)]
+    assert sizes[0] < 20 and not sizes[1] < 1e3
+    assert longest_step(sheet._replace(is_pinned=np.ones(16, bool))) == np.inf
+
+
+def test_the_bound_of_the_step_holds_and_is_met(rng):
+    """No eigenvalue of ``M^-1 K`` exceeds ``(2 / longest step)^2``; two equal masses on a spring reach it."""
+    _, sheet, _ = noisy_sheet(rng, is_pinned=np.zeros(16, bool), floor=None, gravity=np.zeros(3))
+    rest = flat_sheet().vertices
+    columns = [forces(rest + move, sheet) - forces(rest - move, sheet) for move in 1e-6 * np.eye(48).reshape(48, 16, 3)]
+    K = -np.reshape(columns, (48, 48)) / 2e-6
+    largest = np.linalg.eigvals(K / np.repeat(sheet.masses, 3)).real.max()
+    assert 0.3 < largest / (2 / longest_step(sheet)) ** 2 < 1
+    _, pair = hanging_chain(1, 7.0, 0.0)
+    pair = pair._replace(masses=np.ones(2), is_pinned=np.zeros(2, bool))
+    assert_allclose((2 / longest_step(pair)) ** 2, 2 * 7.0, rtol=CLOSED_FORM)  # k over the reduced mass 1 / 2
+    assert_allclose((2 / longest_step(pair._replace(floor=Floor(0.0, 3.0, 0.0)))) ** 2, 17.0, rtol=CLOSED_FORM)
+
+
+def test_a_sheet_stretches_as_much_as_was_asked(rng):
+    mesh = grid(np.zeros(3), np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), (6, 6))
+    masses = vertex_masses(mesh, 1.0)
+    stiffness = stiffness_for_stretch(mesh, float(masses.sum()) * 9.81, 0.02)
+    sheet = Sheet(masses, springs_of(mesh, stiffness), mesh.vertices[:, 1] < 1e-9, G, 10.0)
+    end = advanced(State(mesh.vertices, np.zeros_like(mesh.vertices)), sheet, 0.5 * longest_step(sheet), 3000)
+    assert 0.005 < end.positions[:, 1].max() - 1 < 0.04  # "about": diagonals help, corners pull
+    assert isinstance(stiffness, Stiffness) and stiffness.bend < stiffness.shear
+    assert len(springs_of(mesh, stiffness._replace(bend=0.0)).stiffness) < len(sheet.springs.stiffness)
+
+
+# The command
+
+
+@pytest.fixture
+def model(tmp_path, rng):
+    save_ply(tmp_path / "model.ply", as_dtype(make_gaussians(rng, 60), np.float32))
+    save_mesh(tmp_path / "mesh.ply", flat_sheet())
+    return tmp_path / "model.ply"
+
+
+def fall(model, *options):
+    return main(["proxies", "fall", str(model), str(model.with_name("mesh.ply")), *map(str, options)])
+
+
+def test_fall_from_the_command_line(model, tmp_path, capsys):
+    out = tmp_path / "fallen"
+    assert fall(model, "--out", out, "--frames", 3, "--seconds", 0.2, "--drag", 0, "--stretch", 0.1) == 0
+    assert "60 Gaussians that fall" in capsys.readouterr().out
+    names = ["energy.json", *(f"frame_00{i}.{kind}" for i in range(3) for kind in ("ply", "png")), "mesh.ply"]
+    assert sorted(path.name for path in out.iterdir()) == names
+    assert (out / "frame_000.ply").read_bytes() == model.read_bytes()
+    first, last = load_ply(model), load_ply(out / "frame_002.ply")
+    assert_allclose(last.means, first.means + 0.02 * G, atol=1e-5)  # freely, in float32
+    assert_allclose(load_mesh(out / "mesh.ply").vertices, flat_sheet().vertices + 0.02 * G, atol=CLOSED_FORM)
+    pictures = [read_image(out / f"frame_00{i}.png").astype(int) for i in range(3)]
+    assert pictures[0].max() > 50 and np.abs(pictures[0] - pictures[2]).max() > 20
+    records = json.loads((out / "energy.json").read_text())["frames"]
+    assert [round(record["time"], 9) for record in records] == [0, 0.1, 0.2]
+    assert_allclose([record["total"] for record in records], records[0]["total"], atol=1e-9)
+
+
+def test_what_is_pinned_stays(model, tmp_path, capsys):
+    out = tmp_path / "fallen"
+    options = ("--pin-top", 0.4, "--pin-box", -2, 0.9, 0, -0.9, 2, 9, "--floor", 0.5, "--reach", 0.5)
+    assert fall(model, "--out", out, "--frames", 2, "--seconds", 0.3, *options) == 0
+    before, after = flat_sheet().vertices, load_mesh(out / "mesh.ply").vertices
+    is_pinned = (before[:, 1] < 0) | ((before[:, 0] < -0.9) & (before[:, 1] > 0.9))
+    assert is_pinned.sum() == 9
+    assert_array_equal((before == after).all(axis=1), is_pinned)
+    first, last = load_ply(model), load_ply(out / "frame_001.ply")
+    moved = (first.means != last.means).any(axis=1)
+    assert f"{moved.sum()} Gaussians that fall" in capsys.readouterr().out and 0 < moved.sum() < 60
+
+
+def test_bad_input_of_fall_is_one_line_and_writes_nothing(model, tmp_path, capsys):
+    save_mesh(tmp_path / "degenerate.ply", Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]])))
+    before = sorted(tmp_path.iterdir())
+    cases = {
+        ("--frames", 1): "--frames is 1",
+        ("--seconds", 0): "--seconds is 0",
+        ("--gravity", 0, 0, 0): "nothing falls",
+        ("--stretch", 0): "--stretch is 0",
+        ("--drag", -1): "--drag is -1",
+        ("--pin-box", 8, 8, 8, 9, 9, 9): "holds no vertex",
+        ("--reach", 0): "is within 0 of the mesh",
+        ("--cameras", tmp_path / "absent.json"): "absent.json",
+    }
+    for options, message in cases.items():
+        assert fall(model, "--out", tmp_path / "out", *options) == 2
+        error = capsys.readouterr().err
+        assert message in error and error.count("\n") == 1, (options, error)
+        assert sorted(tmp_path.iterdir()) == before
+    words = ["proxies", "fall", model, tmp_path / "degenerate.ply", "--out", tmp_path / "out"]
+    assert main([str(word) for word in words]) == 2
+    assert "triangle 0 has no area" in capsys.readouterr().err and sorted(tmp_path.iterdir()) == before
+
+
+# Studies
+
+
+def test_the_derivative_of_the_cylinder(rng):
+    points = np.column_stack([rng.uniform(-1, 1, (20, 2)), np.zeros(20)])
+    J = rolled_jacobian(points)
+    for axis in range(2):
+        moved = GRADIENT_STEP * np.eye(3)[axis]
+        numeric = (rolled(points + moved) - rolled(points - moved)) / (2 * GRADIENT_STEP)
+        assert_allclose(J[:, :, axis], numeric, atol=GRADIENT_REL)
+    assert_allclose(np.linalg.det(J), 1, atol=CLOSED_FORM)
+
+
+def test_the_study_of_edits(tmp_path, capsys):
+    assert main(["study", "proxies/affine", "--seeds", "1", "--out", str(tmp_path / "out")]) == 0
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    for errors in result["edits"].values():
+        assert 0 < errors["centre"] < 1e-12 and 0 < errors["covariance"] < 1e-12 and 0 < errors["color"] < 1e-12
+    assert 0 < result["edits"]["turn"]["picture"] < 1e-10 and result["edits"]["shear"]["picture"] is None
+    bend = result["bend"]
+    assert bend["centre"][-1] < bend["centre"][0] / 500  # second order over five halvings
+    whole, lengths = bend["covariance"].values()
+    assert whole[-1] < whole[0] / 10 and lengths[-1] > 4 * whole[-1]  # first order, and none
+    assert read_image(tmp_path / "out" / "figure.png").shape[0] > 100
+    assert "two lengths" in capsys.readouterr().out
+
+
+def test_the_study_of_sheets(tmp_path, capsys, monkeypatch):
+    small = {"STRETCHES": (1e-2, 1e-3), "CELLS": (4,), "STEPS": (0.8, 0.4, 0.2), "FRAMES": (0.0, 0.02)}
+    small |= {"SETTLING": 0.5, "SWING_CELLS": 4, "SAMPLES": 8}
+    for name, value in small.items():
+        monkeypatch.setattr(sheet_claims, name, value)
+    assert main(["study", "proxies/sheet", "--out", str(tmp_path / "out")]) == 0
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert 0 < result["free_fall"]["centre"] < 1e-12 and result["free_fall"]["covariance"] < 1e-12
+    assert set(result["hanging"]) == {"0.01", "0.001"} and set(result["energy"]) == set(sheet_claims.SWINGS)
+    assert "free fall for 1 s" in capsys.readouterr().out
+    assert main(["study", "proxies/affine", "--seeds", "0", "--out", str(tmp_path / "no")]) == 2
+    assert not (tmp_path / "no").exists() and edit_claims.CELLS
