@@ -120,3 +120,7 @@ DENSITY_GRID = 1e-3
 # LPIPS in float32, relative: 1e-7 of each of up to 13 layers' sums of thousands of products, which add up as a random
 # walk does, and twice that for the square of a difference of unit vectors that is not small.
 LPIPS_FLOAT32 = 1e-5
+
+# The angle between two rotations, radians, of quaternions in float32: their components are rounded by 6e-8, and the
+# angle is four times the arc sine of half a chord.
+QUATERNION_FLOAT32 = 5e-7
