@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import make_gaussians
-from tolerances import CLOSED_FORM, QUATERNION_FLOAT32, ROUNDED_TO_FLOAT32
+from tolerances import CLOSED_FORM, PARITY_FLOAT32_IMAGE, QUATERNION_FLOAT32, ROUNDED_TO_FLOAT32
 
 from minisplat_ref import load_ply, save_ply
 from minisplat_ref.cli import main
+from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
@@ -24,11 +25,14 @@ from minisplat_ref.experiments import conversion
 from minisplat_ref.extensions import extension as extension_module
 from minisplat_ref.extensions import shared_container as container
 from minisplat_ref.extensions.compression import lattice, levels, msz, spz
+from minisplat_ref.extensions.compression import study as rate_distortion
 from minisplat_ref.extensions.extension import Extension, find_format, load_extension
 from minisplat_ref.extensions.shared_morton import morton_codes, morton_order
 from minisplat_ref.extensions.shared_planes import from_planes, to_planes, unzigzag, zigzag
+from minisplat_ref.io import load_scene
 from minisplat_ref.reference.spherical_harmonics import sh_basis
-from minisplat_ref.types import Gaussians
+from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.types import Gaussians, Model, view_from
 
 LEVELS = range(levels.N_LEVELS)
 FEW_BYTES = 2_000_000  # that a refusal may take, whatever the file claims
@@ -513,7 +517,7 @@ def test_there_and_back_on_the_command_line(run, tmp_path, capsys):
     assert "60 Gaussians of a.ply in" in out and "SPZ version: 3" in out
     convert(tmp_path / "c.spz", tmp_path / "d.msz")
     out = capsys.readouterr().out
-    assert "level: 5 of 12" in out and "scales: within 0.39 %" in out and "world units along each axis" in out
+    assert "level: 5 of 12" in out and "scales: within 0.78 %" in out and "world units along each axis" in out
     assert f"{(tmp_path / 'd.msz').stat().st_size:,} bytes" in out
 
 
@@ -581,3 +585,71 @@ def test_compact_files_are_drawn_and_measured_and_described(run, tmp_path, capsy
     assert "0: every float32" in out and "Gaussians" in out and "60" in out
     assert main(["extensions", "compression"]) == 0
     assert ".msz (lattices of 13 precisions, zstandard), .spz" in capsys.readouterr().out
+
+
+# The study
+
+
+def study(run, out, *options):
+    ply = str(run / "point_cloud.ply")
+    return main(
+        ["study", "compression/rate-distortion", str(run.parent / "nook"), "--ply", ply, "--out", out, *options]
+    )
+
+
+def test_study_of_a_ply(run, tmp_path, capsys):
+    """What keeps every float loses nothing, and the finest lattice is nearer than the coarsest."""
+    copier = tmp_path / "copier"
+    copier.write_text('#!/bin/sh\n[ "$1 $2" = "-g cpu" ] && cp "$3" "$4"\n')
+    copier.chmod(0o755)
+    assert study(run, str(tmp_path / "out"), "--splat-transform", str(copier)) == 0
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    drops = {point["name"]: point["drop"] for point in result["runs"][0]}
+    sizes = {point["name"]: point["n_bytes"] for point in result["runs"][0]}
+    assert list(drops) == ["ply", "sog", "spz version 3", "spz version 2", *(f"msz {level}" for level in LEVELS)]
+    assert drops["ply"] == drops["sog"] == drops["msz 0"] == 0.0
+    assert abs(drops["msz 1"]) < 0.2 * abs(drops["msz 12"])
+    assert sizes["ply"] == sizes["sog"] == (run / "point_cloud.ply").stat().st_size
+    assert sizes["msz 5"] == len(msz.encode(load_ply(run / "point_cloud.ply"), 5))
+    assert (tmp_path / "out" / "figure.png").stat().st_size > 10_000
+    assert "bytes a Gaussian" in capsys.readouterr().out
+
+
+def test_a_smaller_scene_is_the_same_picture_and_only_spz_suffers(run):
+    """At 1/512 the step of SPZ, 2^-12, is as large as an eighth of a unit was."""
+    views, gaussians = load_scene(run.parent / "nook").test_views, load_ply(run / "point_cloud.ply")
+    pictures = []
+    for factor in (1.0, 1 / 512):
+        small, camera = rate_distortion.shrink(gaussians, factor), rate_distortion.shrunk_camera(views[0], factor)
+        conventions = GSPLAT_MAIN._replace(near_plane=factor * GSPLAT_MAIN.near_plane)
+        files = [format_.decode(format_.encode(small, level), "") for format_, level in ((msz.MSZ, 5), (spz.SPZ, 0))]
+        request = Request(conventions=conventions)
+        pictures.append([SPLATTING.render(Model(g), view_from(camera), request)[0].image for g in (small, *files)])
+    (large, large_msz, large_spz), (small, small_msz, small_spz) = pictures
+    assert np.abs(small - large).max() < 20 * PARITY_FLOAT32_IMAGE
+    assert rms(small_msz - small) < 2 * rms(large_msz - large)
+    assert rms(small_spz - small) > 2 * rms(large_spz - large)
+
+
+def rms(image):
+    return np.sqrt(np.mean(image**2))
+
+
+def test_study_trains(run, tmp_path, capsys):
+    nook = str(run.parent / "nook")
+    options = ["--recipe", "3dgs-accel", "--iterations", "3", "--seeds", "2", "--out", str(tmp_path / "out")]
+    assert main(["study", "compression/rate-distortion", nook, *options]) == 0
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert len(result["runs"]) == len(result["psnr"]) == 2 and result["iterations"] == 3
+    assert "nook" in capsys.readouterr().out
+
+
+def test_study_that_cannot_be(run, tmp_path, one_line):
+    out = str(tmp_path / "out")
+    program = ["--splat-transform", "not-there"]
+    ply = str(run / "point_cloud.ply")
+    name = "compression/rate-distortion"
+    nook = str(run.parent / "nook")
+    assert "not-there does not work" in one_line("study", name, nook, "--ply", ply, "--out", out, *program)
+    assert "neither a folder" in one_line("study", name, "nowhere", "--out", out)
+    assert "--seeds is 0" in one_line("study", name, nook, "--out", out, "--seeds", "0")

@@ -16,6 +16,7 @@ together, and zstandard packs them. There are 13 levels; level 0 keeps each floa
 
     minisplat-ref convert runs/fox fox.msz --max-drop 0.1
     minisplat-ref convert fox.msz fox.ply
+    minisplat-ref study compression/rate-distortion SCENE --out DIR
 
 What to know: the order of the Gaussians is not kept, and nothing depends on it but ties in depth. Quaternions come back
 with another length, which means nothing. Files keep the six fields of 3DGS; the fields of an extension need a PLY.
@@ -26,7 +27,8 @@ quantisation, which ``.omg`` does; arithmetic coding.
 
 from minisplat_ref.extensions.compression.msz import MSZ
 from minisplat_ref.extensions.compression.spz import SPZ
+from minisplat_ref.extensions.compression.study import RATE_DISTORTION
 from minisplat_ref.extensions.extension import Extension
 
-EXTENSION = Extension("compression", formats=(MSZ, SPZ))
-"""Two formats."""
+EXTENSION = Extension("compression", formats=(MSZ, SPZ), studies=(RATE_DISTORTION,))
+"""Two formats, and a study."""

@@ -32,7 +32,9 @@ class Exponents(NamedTuple):
     sh_rest: int
 
 
-FINEST = Exponents(means=-6, quats=-12, log_scales=-9, opacity_logits=-7, sh_dc=-9, sh_rest=-8)
+# Chosen so that at level 8 each field by itself costs less than 0.03 dB in a short training of a phone video. Higher
+# harmonics need the finest step: there are 45 of them, and all their errors meet in one colour.
+FINEST = Exponents(means=-7, quats=-10, log_scales=-8, opacity_logits=-6, sh_dc=-8, sh_rest=-9)
 """Of level 1."""
 
 
