@@ -211,6 +211,18 @@ def test_msz_step_of_centres_follows_the_scene():
     assert steps[0].means < np.log2(np.exp(gaussians.log_scales).min())
 
 
+def test_small_gaussians_decide_and_thin_ones_do_not():
+    """Middle axes of e^-3 (a tenth and more) and of 1: 2^-5 is the last power of two below e^-3 = 0.0498."""
+    log_scales = np.full((40, 3), 0.0)
+    log_scales[:6] = [-9.0, -3.0, 2.0]
+    integers = lattice.to_lattice(log_scales, -8, "log_scales")
+    assert levels.size_exponent(integers, -8) == -5
+    log_scales[:6] = 0.0
+    log_scales[:, 1] = -9.0
+    assert levels.size_exponent(lattice.to_lattice(log_scales, -8, "log_scales"), -8) == 0
+    assert levels.size_exponent(np.full((3, 3), -(10**6)), 0) == -100
+
+
 def test_msz_of_float64_is_that_of_float32():
     doubled = Gaussians(*(field.astype(np.float64) for field in population()))
     assert msz.encode(doubled, 3) == msz.encode(population(), 3)
