@@ -189,7 +189,7 @@ def test_out_below_a_file(refused, tmp_path):
         (["--set", "exposure=yes"], "exposure=yes is neither true nor false"),
         (["--set", "threshold=x"], "threshold=x is not a number"),
         (["--set", "thresholds=1"], "no thresholds to set: choose from ceiling, "),
-        (["--extension", "none"], "extension 'none' does not exist: choose from geometry"),
+        (["--extension", "none"], "extension 'none' does not exist: choose from "),
     ],
 )
 def test_bad_options(options, culprit, tmp_path, capfd):

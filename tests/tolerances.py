@@ -134,3 +134,7 @@ SETTLED = 1e-10
 # The order of Verlet's error between two steps that differ by a factor of two: 2, and terms of the fourth power of the
 # step, which at eight tenths of the longest stable one are 0.1 of it.
 VERLET_SLOPE = 0.25
+
+# The angle between two rotations, radians, of quaternions in float32: their components are rounded by 6e-8, and the
+# angle is four times the arc sine of half a chord.
+QUATERNION_FLOAT32 = 5e-7

@@ -1,23 +1,35 @@
-"""``convert``: the Gaussians of a run or of a checkpoint as a PLY."""
+"""``convert``: a model from any file into a PLY or a compact format."""
 
 import argparse
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter
+from minisplat_ref.experiments.arguments import Commands, HelpFormatter, integer
 
 if TYPE_CHECKING:
-    from minisplat_ref.extensions.extension import Extension
-    from minisplat_ref.types import Model
+    from minisplat_ref.experiments.conversion import Choice, Source
+    from minisplat_ref.io.formats import Format
 
 DESCRIPTION = """\
-Write the Gaussians of a run, or of a checkpoint.npz by itself, as a PLY in the
-3DGS layout: those of the newest whole checkpoint if the run has not ended.
+Write the Gaussians of a run, of a checkpoint.npz by itself, of a PLY or of a
+compact file. What OUT is goes by its suffix: .ply is the 3DGS layout with every
+float, the compact formats come with extensions (minisplat-ref extensions
+compression), and so do their levels of precision, 0 being the finest.
+
+  --max-bytes B   the finest level whose file has at most B bytes
+  --max-drop dB   the coarsest level that loses at most so much PSNR, measured
+                  on at most 24 training views of the run, or of --scene
 """
 EPILOG = """\
-example: minisplat-ref convert runs/fox fox.ply
+Of a run that has not ended, the newest whole checkpoint is taken.
+
+examples:
+  minisplat-ref convert runs/fox fox.ply
+  minisplat-ref convert runs/fox fox.msz --max-drop 0.1
+  minisplat-ref convert fox.msz fox.spz
 """
 
 
@@ -25,50 +37,80 @@ def add_parser(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "convert",
-        help="write the Gaussians of a run or checkpoint as a PLY",
+        help="write a model as a PLY or in a compact format",
         description=DESCRIPTION,
         epilog=EPILOG,
         formatter_class=HelpFormatter,
     )
-    parser.add_argument("input", type=Path, metavar="DIR|NPZ", help="run folder or checkpoint")
-    parser.add_argument("output", type=Path, metavar="PLY", help="file to make or replace")
+    parser.add_argument("input", type=Path, metavar="MODEL", help="run folder, checkpoint, PLY or compact file")
+    parser.add_argument("output", type=Path, metavar="OUT", help="file to make or replace")
+    how = parser.add_mutually_exclusive_group()
+    how.add_argument("--max-bytes", type=integer(1), metavar="B", help="size that the file may have")
+    how.add_argument("--max-drop", type=_drop, metavar="dB", help="PSNR that the file may lose")
+    how.add_argument("--level", type=integer(0), metavar="N", help="precision (default: the format's own)")
+    parser.add_argument("--scene", type=Path, metavar="PATH", help="photographs for --max-drop (default: the run's)")
+    parser.add_argument(
+        "--downscale", type=integer(1), metavar="D", help="how much smaller they are made (default: the run's, or 1)"
+    )
+    parser.add_argument("--extension", metavar="E", help="that a PLY was trained with (a run knows its own)")
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Write the file, and say what is in it."""
-    path: Path = args.input
-    if args.output.suffix != ".ply":
-        raise InputError(f"{args.output} is not named like a PLY: give a name that ends in .ply")
-    model, owner, what = _of_run(path) if path.is_dir() else _of_checkpoint(path)
-    owner.save(args.output, model.gaussians)
-    print(f"{len(model.gaussians.means):,} Gaussians of {what} in {args.output}")
-    if model.shared:
-        print(f"minisplat-ref: a PLY does not hold {', '.join(model.shared)}, which belong to no row", file=sys.stderr)
+    from minisplat_ref.experiments.conversion import check_population, chosen_format, open_source
+    from minisplat_ref.io.formats import write_content
+
+    out: Path = args.output
+    format_ = chosen_format(out)
+    if args.max_drop is None and (args.scene is not None or args.downscale is not None):
+        raise InputError("--scene and --downscale are for --max-drop, which is not given: leave them out")
+    source = open_source(args.input, args.extension)
+    if format_ is None:
+        options = ("max_bytes", "max_drop", "level")
+        if given := [name for name in options if getattr(args, name) is not None]:
+            raise InputError(
+                f"a PLY has one precision, so --{given[0].replace('_', '-')} means nothing: leave it out, or choose a"
+                " compact format"
+            )
+        source.owner.save(out, source.model.gaussians)
+        lines = []
+    else:
+        check_population(source.model.gaussians, format_, source.what)
+        choice, measured = _choose(args, source, format_)
+        write_content(out, choice.content)
+        rows = [*format_.describe(choice.content, out), *measured]
+        lines = [f"  {name}: {value}" for name, value in rows]
+    size = f"{out.stat().st_size:,} bytes"
+    print(f"{len(source.model.gaussians.means):,} Gaussians of {source.what} in {out}, {size}", *lines, sep="\n")
+    if source.model.shared:
+        names = ", ".join(source.model.shared)
+        print(f"minisplat-ref: a {out.suffix} does not hold {names}, which belong to no row", file=sys.stderr)
     return 0
 
 
-def _of_run(folder: Path) -> "tuple[Model, Extension, str]":
-    from minisplat_ref.experiments.checkpoints import newest_model
-    from minisplat_ref.experiments.settings import load
-    from minisplat_ref.extensions.extension import CORE, owner_of
+def _choose(args: argparse.Namespace, source: "Source", format_: "Format") -> "tuple[Choice, list[tuple[str, str]]]":
+    """Return the level that the command line asks for, and what was measured for it."""
+    from minisplat_ref.experiments import conversion
 
-    settings = load(folder)
-    saved = newest_model(folder, settings)
-    what = "the run's result" if saved.unfinished is None else f"iteration {saved.unfinished}"
-    return saved.model, owner_of(settings.recipe, settings.extension) or CORE, what
+    gaussians = source.model.gaussians
+    if args.max_bytes is not None:
+        return conversion.finest_within(gaussians, format_, args.max_bytes), []
+    if args.max_drop is not None:
+        judge = conversion.judge_of(source, args.input, args.scene, args.downscale)
+        choice = conversion.coarsest_within(gaussians, format_, args.max_drop, judge.psnr_of)
+        return choice, [("PSNR", f"{choice.drop:.3f} dB lost on {judge.views}")]
+    level = format_.default_level if args.level is None else args.level
+    if level >= len(format_.levels):
+        raise InputError(f"--level {level} is too high: {format_.suffix} has levels 0 to {len(format_.levels) - 1}")
+    return conversion.Choice(level, format_.encode(gaussians, level)), []
 
 
-def _of_checkpoint(path: Path) -> "tuple[Model, Extension, str]":
-    """Read a checkpoint without its run: the population is that of its recipe, which an extension may own."""
-    from minisplat_ref.extensions.extension import CORE, owner_of
-    from minisplat_ref.io.checkpoint import load_checkpoint
-    from minisplat_ref.training.saved_state import read_bundles, read_counters, written_by
-    from minisplat_ref.types import Gaussians, Model
-
-    arrays, metadata = load_checkpoint(path)
-    step = read_counters(path, metadata).step
-    fields = {name.removeprefix("gaussians.") for name in arrays if name.startswith("gaussians.")}
-    owner = CORE if fields == set(Gaussians._fields) else owner_of(written_by(metadata)[0]) or CORE
-    bundles = read_bundles(path, arrays, owner.representation.population)
-    return Model(bundles.gaussians, bundles.shared), owner, f"iteration {step}"
+def _drop(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of dB of at least 0")
+    return value

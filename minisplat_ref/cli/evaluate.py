@@ -12,10 +12,10 @@ network, LPIPS of point_cloud.ply, view by view.
 
 Rewrites DIR/metrics.json and DIR/renders/ (truth | render | error). What is not
 the run's result on its own test views has a folder of its own: other views of
-its photographs (--test-every) or a run that has not ended DIR/eval-..., another
-scene --out, without which it is refused. Renders are clipped to [0, 1] and not
-rounded; SSIM has an 11 x 11 window and zero padding; what stands for all views
-is the mean of theirs.
+its photographs (--test-every), other Gaussians such as those that convert has
+written (--model) or a run that has not ended DIR/eval-..., another scene --out,
+without which it is refused. Renders are clipped to [0, 1] and not rounded; SSIM
+has an 11 x 11 window and zero padding; the mean of the views stands for all.
 """
 EPILOG = """\
 LPIPS is null without the weights of VGG16 or AlexNet (net='alex'), which are
@@ -27,7 +27,8 @@ Colours go in from -1 to 1, as its authors say; the evaluation published with
 
 examples:
   minisplat-ref eval runs/fox
-  minisplat-ref eval runs/fox --lpips-weights vgg.npz"""
+  minisplat-ref eval runs/fox --lpips-weights vgg.npz
+  minisplat-ref eval runs/fox --model fox.msz"""
 
 
 def add_parser(commands: Commands) -> None:
@@ -44,8 +45,9 @@ def add_parser(commands: Commands) -> None:
         "--scene",
         type=Path,
         metavar="PATH",
-        help="where the photographs are now, if they have moved since the training",
+        help="where the photographs are now, if they have moved",
     )
+    parser.add_argument("--model", type=Path, metavar="FILE", help="measure these Gaussians: a PLY or a compact file")
     parser.add_argument("--test-every", type=integer(1), metavar="K", help="measure every K-th view instead")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where to write (default: see above)")
     parser.add_argument(
@@ -63,7 +65,12 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.experiments.scoring import summary
 
     evaluation, folder, notes = evaluate_run(
-        args.folder, scene=args.scene, test_every=args.test_every, out=args.out, lpips_weights=args.lpips_weights
+        args.folder,
+        scene=args.scene,
+        model=args.model,
+        test_every=args.test_every,
+        out=args.out,
+        lpips_weights=args.lpips_weights,
     )
     width = max(len(view.name) for view in evaluation.per_view)
     print(f"{'view':<{width}}  PSNR dB    SSIM{'' if evaluation.lpips is None else '   LPIPS'}")

@@ -61,6 +61,7 @@ def _describe(name: str) -> None:
         "trains": extension.representation.name,
         "losses": ", ".join(term.name for term in extension.losses),
         "commands": ", ".join(f"minisplat-ref {name} {_command_name(module)}" for module in extension.commands),
+        "formats": ", ".join(f"{format_.suffix} ({format_.summary})" for format_ in extension.formats),
         "studies": ", ".join(f"{name}/{study.name}" for study in extension.studies),
     }
     print()

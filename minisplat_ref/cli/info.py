@@ -24,6 +24,7 @@ Say what is in a file or folder: counts, SH degree, bounds, sizes.
   checkpoint.npz    a training that can be continued
   run folder        the --out of a training: settings, measures, what fired
   scene folder      COLMAP (images/, sparse/0/) or transforms.json
+  .spz and others   compact files of Gaussians, see minisplat-ref convert
 
 Everything is read and checked; of damaged input it says what is wrong.
 """
@@ -63,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     elif path.is_dir() or path.suffix == ".json":
         rows = _scene_rows(path)
     else:
-        raise InputError(f"{path} is none of .ply, checkpoint .npz, run folder, scene folder, transforms.json")
+        rows = _compact_rows(path)
     width = max(len(name) for name, _ in rows)
     for name, value in rows:
         print(f"{name:<{width}}  {value}")
@@ -76,6 +77,21 @@ def _ply_rows(path: Path) -> Rows:
     rows = [("PLY", _size(path)), *_field_rows(load_ply(path)._asdict())]
     further = ", ".join(further_properties(path))
     return [*rows, *([("further properties", further)] if further else [])]
+
+
+def _compact_rows(path: Path) -> Rows:
+    from minisplat_ref.extensions.extension import all_formats, find_format
+    from minisplat_ref.io.formats import read_content
+
+    format_ = find_format(path)
+    if format_ is None:
+        suffixes = ", ".join(known.suffix for _, known in all_formats())
+        raise InputError(
+            f"{path} is none of .ply, checkpoint .npz, run folder, scene folder, transforms.json, {suffixes}"
+        )
+    content = read_content(path)
+    fields = format_.decode(content, path)._asdict()
+    return [(format_.suffix, _size(path)), *format_.describe(content, path), *_field_rows(fields)]
 
 
 def _checkpoint_rows(path: Path) -> Rows:

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from minisplat_ref.io.viewpoints import Viewpoint
 
 DESCRIPTION = """\
-Render a run (its --out folder), or a PLY of Gaussians from whoever wrote it.
+Render a run (its --out folder), or Gaussians from whoever wrote them: a PLY or
+a compact file (.spz and others, see minisplat-ref convert).
 
 Cameras, by --cameras:
   test, train, all   those of the run (default test)
@@ -45,7 +46,7 @@ def add_parser(commands: Commands) -> None:
         epilog=EPILOG,
         formatter_class=HelpFormatter,
     )
-    parser.add_argument("input", type=Path, metavar="DIR|PLY", help="run folder or PLY file")
+    parser.add_argument("input", type=Path, metavar="DIR|PLY", help="run folder, PLY or compact file")
     parser.add_argument("--cameras", metavar="WHICH", help="see above")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where to write (default: beside the input)")
     parser.add_argument("--depth", action="store_true", help="also NAME_depth.npy (camera z) and its picture")
@@ -133,7 +134,7 @@ def _open(args: argparse.Namespace) -> _Source:
     path: Path = args.input
     if not path.exists():
         raise InputError(f"{path} does not exist: give the --out folder of a training or a PLY file")
-    source = _open_run(path, args) if path.is_dir() else _open_ply(path, args)
+    source = _open_run(path, args) if path.is_dir() else _open_file(path, args)
     given = {name: getattr(args, name) for name in ("background", "profile", "backend")}
     given = {name: value for name, value in given.items() if value is not None}
     return source._replace(trained=source.trained._replace(**given))
@@ -149,16 +150,17 @@ def _open_run(folder: Path, args: argparse.Namespace) -> _Source:
     return _Source(load_trained(folder), viewpoints.read(folder / run_folder.CAMERAS), folder / "views")
 
 
-def _open_ply(path: Path, args: argparse.Namespace) -> _Source:
+def _open_file(path: Path, args: argparse.Namespace) -> _Source:
     import numpy as np
 
+    from minisplat_ref.experiments.conversion import read_population
     from minisplat_ref.experiments.scoring import Trained
     from minisplat_ref.extensions.extension import CORE, load_extension
     from minisplat_ref.types import Model
 
     owner = CORE if args.extension is None else load_extension(args.extension)
     representation = owner.representation
-    model = Model(owner.load(path, representation.population))
+    model = Model(read_population(path, owner))
     trained = Trained(model, representation.renderer, np.zeros(3), GSPLAT_MAIN.name, "cpu")
     return _Source(trained, [], path.with_name(f"{path.stem}-views"))
 

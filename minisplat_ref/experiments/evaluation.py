@@ -9,11 +9,13 @@ from typing import Any, NamedTuple
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.experiments import fingerprint, run_folder
-from minisplat_ref.experiments.checkpoints import newest_model
+from minisplat_ref.experiments.checkpoints import Saved, newest_model
+from minisplat_ref.experiments.conversion import read_population
 from minisplat_ref.experiments.first_use import warn_if_not_kept
 from minisplat_ref.experiments.notices import warn_of_model
 from minisplat_ref.experiments.scoring import score, to_metrics
 from minisplat_ref.experiments.settings import Settings, load, load_lpips, load_photographs
+from minisplat_ref.extensions.extension import CORE, owner_of
 from minisplat_ref.metrics import Evaluation
 from minisplat_ref.types import Scene
 
@@ -31,6 +33,7 @@ def evaluate_run(
     folder: Path,
     *,
     scene: Path | None = None,
+    model: Path | None = None,
     test_every: int | None = None,
     out: Path | None = None,
     lpips_weights: Path | None = None,
@@ -43,6 +46,8 @@ def evaluate_run(
         The run.
     scene : Path, optional
         Where the photographs are now, or others; where they were by default.
+    model : Path, optional
+        Gaussians that stand in for those of the run: a PLY or a compact file.
     test_every : int, optional
         Measure every K-th view; those that the run held out by default.
     out : Path, optional
@@ -62,6 +67,9 @@ def evaluate_run(
         lpips_weights=settings.lpips_weights if lpips_weights is None else str(lpips_weights),
     )
     saved = newest_model(folder, settings)
+    if model is not None:
+        owner = owner_of(settings.recipe, settings.extension) or CORE
+        saved = Saved(saved.model._replace(gaussians=read_population(model, owner)), None)
     warn_of_model(saved.model, folder)
     warn_if_not_kept(settings.backend)
     photographs = load_photographs(asked)
@@ -72,6 +80,7 @@ def evaluate_run(
     fingerprint.warn_of_unchecked(folder, entries)
     notes = []
     parts = [] if saved.unfinished is None else [f"iteration-{saved.unfinished}"]
+    parts += [] if model is None else [model.name]
     if entries is not None:
         others = fingerprint.of_scene(photographs)
         if differs := fingerprint.difference(entries, others):
@@ -97,6 +106,7 @@ def evaluate_run(
     run_folder.create(target)
     evaluation = score(target, photographs, saved.model, settings, network)
     about = _about(folder, asked, saved.unfinished, notes)
+    about |= {} if model is None else {"model": str(model.resolve())}
     run_folder.write_json(
         target / run_folder.METRICS,
         {**about, "n_gaussians": len(saved.model.gaussians.means), **to_metrics(evaluation)},

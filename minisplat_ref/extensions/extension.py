@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions import folders, module_of
+from minisplat_ref.io.formats import Format
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.study import Study
@@ -38,6 +39,8 @@ class Extension(NamedTuple):
     """``stages(backend, setting, rng)``: what ``oracle gradients --extension NAME`` checks."""
     studies: tuple[Study, ...] = ()
     """Its measured claims: ``minisplat-ref study NAME/...``."""
+    formats: tuple[Format, ...] = ()
+    """File formats of the six fields of 3DGS, which ``convert`` writes, and every command reads that reads a PLY."""
 
 
 CORE = Extension("core")
@@ -72,7 +75,13 @@ def load_extension(name: str) -> Extension:
     return extension
 
 
-_PARTS: dict[str, type] = {"recipes": Recipe, "losses": LossTerm, "commands": ModuleType, "studies": Study}
+_PARTS: dict[str, type] = {
+    "recipes": Recipe,
+    "losses": LossTerm,
+    "commands": ModuleType,
+    "studies": Study,
+    "formats": Format,
+}
 
 
 def _check_parts(extension: Extension, name: str, folder: Path) -> None:
@@ -161,3 +170,26 @@ def _of_extensions(name: str) -> tuple[Recipe, Extension]:
         owners = " and ".join(extension.name for _, extension in found)
         raise InputError(f"recipe {name} is in the extensions {owners}: rename one")
     return found[0]
+
+
+def find_format(path: str | Path) -> Format | None:
+    """Return the format of a file by its suffix; None for a PLY, and where no extension knows the suffix.
+
+    Raises
+    ------
+    InputError
+        Two extensions have a format of that suffix.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix in ("", ".ply"):  # which need no extension to be loaded
+        return None
+    found = [(format_, owner) for owner, format_ in all_formats() if format_.suffix == suffix]
+    if len(found) > 1:
+        owners = " and ".join(owner for _, owner in found)
+        raise InputError(f"{suffix} is a format of the extensions {owners}: rename one")
+    return found[0][0] if found else None
+
+
+def all_formats() -> list[tuple[str, Format]]:
+    """Return every format behind the name of its extension."""
+    return [(extension.name, format_) for extension in load_extensions() for format_ in extension.formats]

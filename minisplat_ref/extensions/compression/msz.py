@@ -1,0 +1,211 @@
+"""``.msz``: Gaussians in Morton order, each field on its lattice, in planes of bytes packed by zstandard.
+
+The header holds the number of Gaussians, the degree of their spherical harmonics, the level, and for each field the
+exponent of its step and the number of its planes; half a step is the bound of the error. Streams:
+
+- ``means``: differences of each row to the one before, which Morton order makes small;
+- ``largest`` and ``quats``: see :mod:`minisplat_ref.extensions.compression.lattice`;
+- ``log_scales``, ``opacity_logits``, ``sh_dc``, ``sh_rest``: one column for each number.
+
+At level 0 each field is a stream of the bit patterns of its float32. Encoding what was decoded gives the same file,
+byte for byte: the order, too, depends on lattice points alone, and what shares a cell stays as it is.
+"""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref.constants import SH_DEGREE_MAX
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.compression import lattice, levels
+from minisplat_ref.extensions.compression.levels import Exponents
+from minisplat_ref.extensions.shared_container import WAY_OUT, Container, Packed, is_count, pack, take_apart, unpack
+from minisplat_ref.extensions.shared_morton import morton_order
+from minisplat_ref.extensions.shared_planes import MOST_PLANES, from_planes, to_planes, unzigzag, zigzag
+from minisplat_ref.io.formats import Format
+from minisplat_ref.types import Floats, Gaussians, Ints
+from minisplat_ref.validation import check_gaussians
+
+CONTAINER = Container(b"MSZ\n", version=1)
+MOST_GAUSSIANS = 2**31 - 1
+EXPONENT_MAX = 200  # of a step, either way: beyond the range of float32
+
+
+class _Header(NamedTuple):
+    """What a header says, checked."""
+
+    n: int
+    sh_degree: int
+    level: int
+    steps: Exponents | None
+    """None at level 0."""
+    planes: Mapping[str, int]
+
+    @property
+    def widths(self) -> dict[str, int]:
+        """Numbers of a row of each field."""
+        n_rest = (self.sh_degree + 1) ** 2 - 1
+        return {"means": 3, "quats": 4, "log_scales": 3, "opacity_logits": 1, "sh_dc": 3, "sh_rest": 3 * n_rest}
+
+    @property
+    def stream_widths(self) -> dict[str, int]:
+        """Numbers of a row of each stream."""
+        return self.widths if self.level == 0 else {**self.widths, "quats": 3, "largest": 1}
+
+
+def encode(gaussians: Gaussians, level: int) -> bytes:
+    """Return the Gaussians as a file.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        Rounded to float32.
+    level : int
+        0 to 12, see :mod:`minisplat_ref.extensions.compression.levels`.
+
+    Raises
+    ------
+    InputError
+        A value is not finite, or too far out for its lattice, or zstandard is missing.
+    """
+    with np.errstate(over="ignore"):  # becomes infinite, which is named
+        gaussians = Gaussians(*(np.ascontiguousarray(field, np.float32) for field in gaussians))
+    check_gaussians(gaussians, "Gaussians")
+    n, n_rest = gaussians.sh_rest.shape[:2]
+    rows = gaussians._replace(
+        opacity_logits=gaussians.opacity_logits[:, None], sh_rest=gaussians.sh_rest.reshape(n, 3 * n_rest)
+    )
+    steps, streams = (None, _exact_streams(rows)) if level == 0 else _lattice_streams(rows, level)
+    packed = {name: to_planes(stream) for name, stream in streams.items()}
+    header = {
+        "n": n,
+        "sh_degree": math.isqrt(n_rest + 1) - 1,
+        "level": level,
+        "steps": steps and steps._asdict(),
+        "planes": {name: n_planes for name, (_, n_planes) in packed.items()},
+    }
+    return pack(CONTAINER, header, {name: raw for name, (raw, _) in packed.items()})
+
+
+def _exact_streams(rows: Gaussians) -> dict[str, Any]:
+    order = morton_order(rows.means)
+    return {name: field[order].view(np.uint32).astype(np.uint64) for name, field in rows._asdict().items()}
+
+
+def _lattice_streams(rows: Gaussians, level: int) -> tuple[Exponents, dict[str, Any]]:
+    steps = levels.exponents(level)
+    log_scales = lattice.to_lattice(rows.log_scales, steps.log_scales, "log_scales")
+    steps = steps._replace(means=steps.means + levels.size_exponent(log_scales, steps.log_scales))
+    means = lattice.to_lattice(rows.means, steps.means, "means")
+    order = morton_order(means)
+    rotations = lattice.to_rotations(rows.quats[order], steps.quats)
+    integers = {
+        "means": np.diff(means[order], axis=0, prepend=0),
+        "largest": rotations.largest[:, None],
+        "quats": rotations.others,
+        "log_scales": log_scales[order],
+        **{
+            name: lattice.to_lattice(getattr(rows, name)[order], getattr(steps, name), name)
+            for name in ("opacity_logits", "sh_dc", "sh_rest")
+        },
+    }
+    return steps, {name: zigzag(stream) for name, stream in integers.items()}
+
+
+def decode(content: bytes, source: str | Path) -> Gaussians:
+    """Return the Gaussians of a file, in float32; the inverse of :func:`encode` within half a step.
+
+    Raises
+    ------
+    InputError
+        The file is damaged, of another kind or version, or holds no Gaussians of 3DGS.
+    """
+    packed = take_apart(CONTAINER, content, source)
+    header = _checked(packed)
+    streams = {}
+    for name, width in header.stream_widths.items():
+        n_planes = header.planes[name]
+        streams[name] = from_planes(unpack(packed, name, n_planes * width * header.n), n_planes, width, header.n)
+    rows = _from_exact(streams) if header.steps is None else _from_lattices(streams, header.steps, source)
+    gaussians = Gaussians(**rows)._replace(
+        opacity_logits=rows["opacity_logits"][:, 0],
+        sh_rest=rows["sh_rest"].reshape(header.n, header.widths["sh_rest"] // 3, 3),
+    )
+    check_gaussians(gaussians, source)
+    return gaussians
+
+
+def _from_exact(streams: Mapping[str, Any]) -> dict[str, Floats]:
+    return {name: stream.astype(np.uint32).view(np.float32) for name, stream in streams.items()}
+
+
+def _from_lattices(streams: Mapping[str, Any], steps: Exponents, source: str | Path) -> dict[str, Floats]:
+    integers: dict[str, Ints] = {name: unzigzag(stream) for name, stream in streams.items()}
+    integers["means"] = np.cumsum(integers["means"], axis=0)
+    largest = integers.pop("largest")[:, 0]
+    if not ((largest >= 0) & (largest < 4)).all():
+        raise InputError(f"{source}: damaged, a quaternion has four components; {WAY_OUT}")
+    quats = lattice.from_rotations(lattice.Rotations(largest, integers.pop("quats")), steps.quats)
+    fields = {name: lattice.from_lattice(values, getattr(steps, name)) for name, values in integers.items()}
+    return {**fields, "quats": quats}
+
+
+def _checked(packed: Packed) -> _Header:
+    """Return the header, of which everything that is read has been looked at."""
+    values, source = packed.header, packed.source
+    n, degree, level, steps, planes = (values.get(name) for name in ("n", "sh_degree", "level", "steps", "planes"))
+    if not is_count(n, MOST_GAUSSIANS) or not is_count(degree, SH_DEGREE_MAX) or not is_count(level):
+        raise InputError(
+            f"{source}: damaged, its header says n {n}, sh_degree {degree}, level {level}, which cannot be; {WAY_OUT}"
+        )
+    assert isinstance(n, int) and isinstance(degree, int) and isinstance(level, int)
+    header = _Header(n, degree, level, None, planes if isinstance(planes, dict) else {})
+    for name in header.stream_widths:
+        if not is_count(header.planes.get(name), MOST_PLANES) or header.planes[name] == 0:
+            raise InputError(f"{source}: damaged, its header does not say how many planes {name} has; {WAY_OUT}")
+    if level == 0:
+        return header
+    given = steps if isinstance(steps, dict) else {}
+    if set(given) != set(Exponents._fields) or not all(
+        type(step) is int and abs(step) <= EXPONENT_MAX for step in given.values()
+    ):
+        raise InputError(f"{source}: damaged, its header does not say which steps its fields have; {WAY_OUT}")
+    return header._replace(steps=Exponents(**given))
+
+
+def describe(content: bytes, source: str | Path) -> list[tuple[str, str]]:
+    """Return the level of a file and how far its values may be off.
+
+    Raises
+    ------
+    InputError
+        As for :func:`decode`, of the header.
+    """
+    header = _checked(take_apart(CONTAINER, content, source))
+    if header.steps is None:
+        return [("level", "0: every float32 as it was, in Morton order")]
+    half = {name: 2.0 ** (exponent - 1) for name, exponent in header.steps._asdict().items()}
+    degrees = math.degrees(lattice.rotation_bound(header.steps.quats))
+    return [
+        ("level", f"{header.level} of {levels.N_LEVELS - 1}"),
+        ("centres", f"within {half['means']:.3g} world units along each axis"),
+        ("rotations", f"within {degrees:.2g} degrees"),
+        ("scales", f"within {100 * math.expm1(half['log_scales']):.2g} %"),
+        ("opacities", f"within {half['opacity_logits'] / 4:.2g}"),  # the sigmoid is nowhere steeper than 1/4
+        ("SH coefficients", f"within {half['sh_dc']:.2g} (degree 0) and {half['sh_rest']:.2g}"),
+    ]
+
+
+MSZ = Format(
+    suffix=".msz",
+    summary="lattices of 13 precisions, zstandard",
+    levels=levels.describe_levels(),
+    default_level=levels.DEFAULT,
+    encode=encode,
+    decode=decode,
+    describe=describe,
+)
+"""The format of this project."""

@@ -1,0 +1,262 @@
+"""``.spz``: Niantic's format, versions 2 and 3, read and written.
+
+A gzip stream of a header of 16 bytes (magic, version, number N, degree of the spherical harmonics, fractional bits,
+flags) and then, each for all Gaussians: centres, opacities, colours, scales, rotations, higher harmonics.
+
+===========  ==========================================================================================
+centres      3 x 24 bits, two's complement, in steps of ``2^-12`` (the fractional bits of the header)
+opacity      ``255 o``
+colour       ``255 (0.15 c + 0.5)`` of the coefficient c of degree 0, which is not its colour
+scales       ``16 (ln s + 10)``, 8 bits, so from e^-10 to e^5.94
+rotation     version 2: x, y, z as ``127.5 (q + 1)`` with w >= 0; version 3: 2 bits say which of x, y, z, w is largest,
+             and of the others each has its sign and 9 bits of ``511 sqrt(2) |q|``, the first in the highest bits
+harmonics    ``128 c + 128``, to a multiple of 8 for degree 1 and of 16 above; RGB last
+===========  ==========================================================================================
+
+Colours, scales and harmonics outside of their ranges become the ends of these; centres outside are refused, since they
+would be somewhere else.
+
+**Axes.** The file's frame is RUB (x right, y up, z backward), as in OpenGL. That of a PLY of 3DGS is RDF (x right, y
+down, z forward). Niantic's library turns one into the other when its caller asks for it; we always do, as the sample
+of three Gaussians in both formats has it: y and z change sign, which is half a turn around x. So of a quaternion y and
+z change sign, and of the harmonics those that are odd in y z, which :data:`SIGNS` has from their polynomials.
+
+Opacities 0 and 1 have no logit. They are read as a quarter of a level away from the end.
+
+Left out: version 1 (half floats) and 4 (zstandard, extensions); the flag that a scene was trained with antialiasing,
+which is read over, and written as 0.
+"""
+
+import math
+import struct
+import zlib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from minisplat_ref import memory
+from minisplat_ref.errors import InputError
+from minisplat_ref.io.formats import Format
+from minisplat_ref.types import Floats, Gaussians, Ints
+from minisplat_ref.validation import check_gaussians
+
+MAGIC = 0x5053474E  # "NGSP"
+VERSIONS = (3, 2)  # as levels: the finest first
+FRACTIONAL_BITS = 12
+REACH = 2.0 ** (23 - FRACTIONAL_BITS)  # 2048
+COLOR_SCALE = 0.15
+SH_BITS = {1: 5, 2: 4, 3: 4}  # by degree
+GZIP_RATIO_MAX = 1032  # bytes made of one, by deflate
+HEADER = struct.Struct("<IIIBBBB")
+WAY_OUT = "copy or export the file again"
+BYTES_OF_REST = (0, 9, 24, 45)  # by degree
+
+# Signs of the harmonics of degree 1 to 3 under (x, y, z) -> (x, -y, -z), by whether their polynomials are odd in y and
+# z together: y, z, x; xy, yz, 2zz-xx-yy, xz, xx-yy; y(3xx-yy), xyz, y(4zz-xx-yy), z(..), x(..), z(xx-yy), x(xx-3yy).
+SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
+_AXES = np.array([1, -1, -1], np.float32)
+
+
+class _Header(NamedTuple):
+    version: int
+    n: int
+    sh_degree: int
+    fractional_bits: int
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Bytes of a Gaussian, by attribute, in the order of the file."""
+        rotation = 4 if self.version == 3 else 3
+        rest = BYTES_OF_REST[self.sh_degree]
+        return {"means": 9, "opacities": 1, "colors": 3, "scales": 3, "rotations": rotation, "sh_rest": rest}
+
+
+def encode(gaussians: Gaussians, level: int) -> bytes:
+    """Return the Gaussians, of the world frame of a PLY, as a file; level 0 is version 3, level 1 version 2.
+
+    Raises
+    ------
+    InputError
+        A value is not finite, or a centre is out of reach.
+    """
+    check_gaussians(gaussians, "Gaussians")
+    n, n_rest = gaussians.sh_rest.shape[:2]
+    means = gaussians.means.astype(np.float64) * _AXES
+    steps = np.floor(means * 2.0**FRACTIONAL_BITS + 0.5)  # [N, 3]
+    out = (steps < -(2**23)) | (steps >= 2**23)
+    if out.any():
+        row = int(np.flatnonzero(out.any(axis=1))[0])
+        raise InputError(
+            f"the centre of row {row} is {np.abs(means[row]).max():.6g} away, and SPZ reaches {REACH:g}"
+            f" ({int(out.any(axis=1).sum()):,} of {n:,} are too far): scale the scene down, or choose another format"
+        )
+    opacities = 0.5 * (1.0 + np.tanh(0.5 * gaussians.opacity_logits.astype(np.float64)))  # the sigmoid
+    quats = gaussians.quats.astype(np.float64) * np.concatenate([[1.0], _AXES])
+    sh_rest = 128.0 * gaussians.sh_rest * SIGNS[:n_rest, None]  # [N, K-1, 3]
+    version = VERSIONS[level]
+    parts = (
+        steps.astype("<i4").reshape(-1, 1).view(np.uint8)[:, :3],
+        _to_bytes(255.0 * opacities),
+        _to_bytes(255.0 * (COLOR_SCALE * gaussians.sh_dc.astype(np.float64) + 0.5)),
+        _to_bytes(16.0 * (gaussians.log_scales.astype(np.float64) + 10.0)),
+        _to_smallest_three(quats) if version == 3 else _to_vector(quats),
+        _to_buckets(sh_rest),
+    )
+    sh_degree = math.isqrt(n_rest + 1) - 1
+    header = HEADER.pack(MAGIC, version, n, sh_degree, FRACTIONAL_BITS, 0, 0)
+    compressor = zlib.compressobj(9, zlib.DEFLATED, 31)  # gzip, without a name and a time
+    return compressor.compress(header + b"".join(part.tobytes() for part in parts)) + compressor.flush()
+
+
+def _to_bytes(values: Floats) -> NDArray[np.uint8]:
+    return np.clip(np.floor(values + 0.5), 0, 255).astype(np.uint8)
+
+
+def _to_buckets(values: Floats) -> NDArray[np.uint8]:
+    """Round ``128 c`` [N, K-1, 3] to multiples of a bucket, and move it up by 128."""
+    n_rest = values.shape[1]
+    degrees = np.repeat([1, 2, 3], [3, 5, 7])[:n_rest]
+    bucket = np.array([2.0 ** (8 - SH_BITS[int(degree)]) for degree in degrees])[:, None]  # [K-1, 1]
+    return _to_bytes(bucket * np.floor((np.floor(values + 0.5) + 128.0 + bucket / 2) / bucket))
+
+
+def _to_vector(quats: Floats) -> NDArray[np.uint8]:
+    """Return x, y, z of unit quaternions whose w is not negative, a byte each."""
+    quats = quats / np.linalg.norm(quats, axis=1, keepdims=True) * np.where(quats[:, :1] < 0, -1.0, 1.0)
+    return _to_bytes(127.5 * (quats[:, 1:] + 1.0))
+
+
+def _from_vector(raw: NDArray[np.uint8]) -> Floats:
+    xyz = raw.astype(np.float64) / 127.5 - 1.0  # [N, 3]
+    w = np.sqrt(np.maximum(0.0, 1.0 - (xyz**2).sum(axis=1, keepdims=True)))
+    return np.concatenate([w, xyz], axis=1)
+
+
+def _to_smallest_three(quats: Floats) -> NDArray[np.uint32]:
+    """Return unit quaternions without their largest component, which is made positive, in 32 bits."""
+    xyzw = np.roll(quats / np.linalg.norm(quats, axis=1, keepdims=True), -1, axis=1)  # [N, 4]
+    largest = np.argmax(np.abs(xyzw), axis=1)  # [N]
+    xyzw *= np.where(np.take_along_axis(xyzw, largest[:, None], axis=1) < 0, -1.0, 1.0)
+    others = xyzw[np.arange(4) != largest[:, None]].reshape(-1, 3)
+    magnitudes = np.minimum(511, np.floor(511.0 * math.sqrt(2.0) * np.abs(others) + 0.5)).astype(np.uint32)
+    words = magnitudes | (others < 0).astype(np.uint32) << np.uint32(9)  # [N, 3]
+    packed = words[:, 0] << np.uint32(20) | words[:, 1] << np.uint32(10) | words[:, 2]
+    return (packed | largest.astype(np.uint32) << np.uint32(30)).astype("<u4")
+
+
+def _from_smallest_three(raw: NDArray[np.uint8]) -> Floats:
+    packed = raw.reshape(-1).view("<u4").astype(np.int64)  # [N]
+    words = np.stack([packed >> 20, packed >> 10, packed], axis=1) & 1023  # [N, 3]
+    others = (words & 511) / (511.0 * math.sqrt(2.0)) * np.where(words & 512, -1.0, 1.0)
+    xyzw = np.empty((len(packed), 4))
+    is_largest = np.arange(4) == (packed >> 30)[:, None]
+    xyzw[is_largest] = np.sqrt(np.maximum(0.0, 1.0 - (others**2).sum(axis=1)))
+    xyzw[~is_largest] = others.reshape(-1)
+    return np.roll(xyzw, 1, axis=1)
+
+
+def decode(content: bytes, source: str | Path) -> Gaussians:
+    """Return the Gaussians of a file, float32, in the world frame of a PLY.
+
+    Raises
+    ------
+    InputError
+        The file is damaged, of another kind or version, or claims more than it holds.
+    """
+    header, body = _take_apart(content, source)
+    raw, begin = {}, 0
+    for name, size in header.sizes.items():
+        part = np.frombuffer(body, np.uint8, header.n * size, begin)
+        raw[name] = part.reshape(header.n, size)
+        begin += header.n * size
+    # Three bytes as the upper ones of four: an arithmetic shift carries the sign down.
+    words = np.zeros((header.n, 3, 4), np.uint8)
+    words[..., 1:] = raw["means"].reshape(header.n, 3, 3)
+    steps: Ints = words.view("<i4")[..., 0] >> 8  # [N, 3]
+    levels = np.clip(raw["opacities"][:, 0].astype(np.float64), 0.25, 254.75)  # [N]
+    unpack_rotations: Any = _from_smallest_three if header.version == 3 else _from_vector
+    n_rest = header.sizes["sh_rest"] // 3
+    sh_rest = (raw["sh_rest"].reshape(header.n, n_rest, 3).astype(np.float32) - 128) / 128
+    fields = (
+        steps * 2.0**-header.fractional_bits * _AXES,
+        unpack_rotations(raw["rotations"]) * np.concatenate([[1.0], _AXES]),
+        raw["scales"] / 16.0 - 10.0,
+        np.log(levels / (255.0 - levels)),
+        (raw["colors"] / 255.0 - 0.5) / COLOR_SCALE,
+        sh_rest * SIGNS[:n_rest, None],
+    )
+    gaussians = Gaussians(*(field.astype(np.float32) for field in fields))
+    check_gaussians(gaussians, source)
+    return gaussians
+
+
+def _take_apart(content: bytes, source: str | Path) -> tuple[_Header, bytes]:
+    """Return the header and all that follows it, once the header is known to be possible."""
+    if content[:4] == struct.pack("<I", MAGIC):
+        raise InputError(f"{source}: SPZ of version 4 or later, which is not read: export it as version 2 or 3")
+    if content[:2] != b"\x1f\x8b":
+        raise InputError(f"{source}: not an SPZ file, it is not packed by gzip; give one that ends in .spz")
+    head, _ = _inflate(content, HEADER.size, source)
+    if len(head) < HEADER.size or HEADER.unpack(head)[0] != MAGIC:
+        raise InputError(f"{source}: not an SPZ file, what gzip packed does not begin with NGSP; {WAY_OUT}")
+    _, version, n, degree, fractional_bits, _, _ = HEADER.unpack(head)
+    if version not in VERSIONS:
+        raise InputError(f"{source}: SPZ of version {version}, which is not read: export it as version 2 or 3")
+    if degree >= len(BYTES_OF_REST) or fractional_bits > 23:
+        raise InputError(
+            f"{source}: damaged, spherical harmonics of degree {degree} and {fractional_bits} fractional bits;"
+            f" {WAY_OUT}"
+        )
+    header = _Header(version, n, degree, fractional_bits)
+    n_bytes = HEADER.size + n * sum(header.sizes.values())
+    if n_bytes > min(GZIP_RATIO_MAX * len(content), memory.free_bytes()):
+        raise InputError(f"{source}: {n:,} Gaussians cannot be in {len(content):,} packed bytes; {WAY_OUT}")
+    body, is_whole = _inflate(content, n_bytes, source)
+    if len(body) < n_bytes or not is_whole:
+        raise InputError(
+            f"{source}: truncated, {n_bytes:,} bytes and their end expected, {len(body):,} found; {WAY_OUT}"
+        )
+    return header, body[HEADER.size :]
+
+
+def _inflate(content: bytes, n_bytes: int, source: str | Path) -> tuple[bytes, bool]:
+    """Return the first bytes that gzip has packed, and whether more follow or they end with the right checksum."""
+    try:
+        gzip = zlib.decompressobj(31)
+        head = gzip.decompress(content, n_bytes)
+        more = gzip.decompress(gzip.unconsumed_tail, 1)
+        return head, bool(more) or gzip.eof
+    except zlib.error as error:
+        raise InputError(f"{source}: damaged, it cannot be unpacked ({error}); {WAY_OUT}") from None
+
+
+def describe(content: bytes, source: str | Path) -> list[tuple[str, str]]:
+    """Return the version of a file and how far its values may be off.
+
+    Raises
+    ------
+    InputError
+        As for :func:`decode`.
+    """
+    header, _ = _take_apart(content, source)
+    return [
+        ("SPZ version", str(header.version)),
+        ("centres", f"within {2.0 ** (-header.fractional_bits - 1):.3g} world units along each axis"),
+        ("scales", f"within {100 * math.expm1(1 / 32):.2g} %, between e^-10 and e^5.94"),
+        ("opacities", f"within {0.5 / 255:.2g}"),
+        ("SH coefficients", f"within {0.5 / 255 / COLOR_SCALE:.2g} (degree 0), {4 / 128:.2g} and {8 / 128:.2g}"),
+    ]
+
+
+SPZ = Format(
+    suffix=".spz",
+    summary="Niantic's, versions 3 and 2",
+    levels=tuple(f"version {version}" for version in VERSIONS),
+    default_level=0,
+    encode=encode,
+    decode=decode,
+    describe=describe,
+)
+"""The format that other programs read, too."""

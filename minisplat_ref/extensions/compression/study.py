@@ -1,0 +1,230 @@
+"""The study ``compression/rate-distortion``: what bytes cost in quality, and what a fixed step costs in a small scene.
+
+A scene is trained, or a PLY given. Every level of every format of this extension is written, read again and measured on
+the test views; beside them the PLY itself and, where the program ``splat-transform`` of PlayCanvas is named, its SOG.
+Sizes are those of whole files.
+
+The second question: SPZ has a fixed step of 2^-12 world units for centres and a fixed range for scales, ``.msz`` a step
+that follows the small Gaussians. The scene, Gaussians, cameras and near plane together, is made smaller and smaller;
+every picture stays the same, and what a file loses should, too.
+"""
+
+import argparse
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref.constants import GSPLAT_MAIN, Conventions
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions import shared_study as shared
+from minisplat_ref.extensions.compression.msz import MSZ
+from minisplat_ref.extensions.compression.spz import SPZ
+from minisplat_ref.io.atomic import making_folder
+from minisplat_ref.io.formats import Format
+from minisplat_ref.io.ply import load_ply, save_ply
+from minisplat_ref.study import Study
+from minisplat_ref.types import Floats, Gaussians, View
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SHRUNK = (1.0, 1 / 8, 1 / 64, 1 / 512)  # by which a scene is made smaller
+SHRUNK_LEVEL = 5  # of .msz
+COLORS = {"ply": shared.GREY, "msz": shared.BLUE, "spz": shared.RED, "sog": shared.YELLOW}
+
+
+class Point(NamedTuple):
+    """A file and what it shows."""
+
+    name: str
+    """Format and level."""
+    n_bytes: int
+    bytes_per_gaussian: float
+    drop: float
+    """dB of PSNR that are lost, on the test views."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the study."""
+    shared.add_scene_arguments(parser, iterations=1000, recipe="mini-splatting2")
+    parser.add_argument("--splat-transform", metavar="PROGRAM", help="measure SOG, too, as this program writes it")
+
+
+def run(args: argparse.Namespace) -> None:
+    """Train, measure, write, print the tables.
+
+    Raises
+    ------
+    InputError
+        The scene, the recipe, the PLY, the program or the output folder cannot be used.
+    """
+    from minisplat_ref.reporting import markdown_table
+
+    scene = shared.read_scene(args)
+    with making_folder(args.out) as folder:
+        runs, shrunk, psnrs, counts = [], [], [], []
+        for gaussians in shared.populations(args, scene):
+            psnr = measured(gaussians, scene.test_views, scene.background)
+            psnrs.append(psnr)
+            counts.append(len(gaussians.means))
+            judge = (scene.test_views, scene.background, psnr)
+            runs.append([point._asdict() for point in points(gaussians, *judge, args.splat_transform)])
+            shrunk.append(drops_when_shrunk(gaussians, scene.test_views, scene.background))
+        result = {
+            **shared.describe(args, scene),
+            "psnr": psnrs,
+            "gaussians": counts,
+            "runs": runs,
+            "shrunk": {name: [of_seed[name] for of_seed in shrunk] for name in shrunk[0]},
+        }
+        shared.write(folder, result, draw(result))
+    print(f"{scene.name}: {shared.with_deviation(psnrs, 2)} dB, {np.mean(counts):,.0f} Gaussians\n")
+    print(markdown_table(["file", "bytes", "bytes a Gaussian", "dB lost"], to_rows(runs)))
+    print("\ndB lost when the scene is smaller\n")
+    rows = [
+        [name, *(shared.with_deviation(list(of_seeds), 3) for of_seeds in zip(*drops, strict=True))]
+        for name, drops in result["shrunk"].items()
+    ]
+    print(markdown_table(["file", *(f"1/{1 / factor:.0f}" for factor in SHRUNK)], rows))
+
+
+def measured(
+    gaussians: Gaussians, views: tuple[View, ...], background: Floats, conventions: Conventions = GSPLAT_MAIN
+) -> float:
+    """Return the PSNR, dB."""
+    from minisplat_ref.metrics import evaluate
+
+    psnr = evaluate(gaussians, views, background=background, conventions=conventions).psnr
+    assert psnr is not None
+    return psnr
+
+
+def points(
+    gaussians: Gaussians, views: tuple[View, ...], background: Floats, psnr: float, program: str | None
+) -> Iterator[Point]:
+    """Yield every file that there is of the Gaussians, whose own PSNR is given."""
+    n = max(1, len(gaussians.means))
+    with tempfile.TemporaryDirectory() as folder:
+        ply = Path(folder, "a.ply")
+        save_ply(ply, gaussians)
+        size = ply.stat().st_size
+        yield Point("ply", size, size / n, psnr - measured(load_ply(ply), views, background))
+        if program is not None:
+            size, back = through_sog(program, ply)
+            yield Point("sog", size, size / n, psnr - measured(back, views, background))
+    for format_ in (SPZ, MSZ):
+        for level, name in enumerate(format_.levels):
+            content, back = there_and_back(gaussians, format_, level)
+            label = f"{format_.suffix[1:]} {name if format_ is SPZ else level}"
+            yield Point(label, len(content), len(content) / n, psnr - measured(back, views, background))
+
+
+def there_and_back(gaussians: Gaussians, format_: Format, level: int) -> tuple[bytes, Gaussians]:
+    """Return a file's bytes, and what is read from them."""
+    content = format_.encode(gaussians, level)
+    return content, format_.decode(content, format_.suffix)
+
+
+def through_sog(program: str, ply: Path) -> tuple[int, Gaussians]:
+    """Return the size of the SOG that the program makes of a PLY, and the Gaussians that it makes of that.
+
+    Raises
+    ------
+    InputError
+        The program cannot be started, or fails.
+    """
+    sog, back = ply.with_name("a.sog"), ply.with_name("back.ply")
+    for given, made in ((ply, sog), (sog, back)):
+        try:
+            subprocess.run([program, "-g", "cpu", given, made], check=True, capture_output=True, timeout=600)
+        except (OSError, subprocess.SubprocessError) as error:
+            raise InputError(f"--splat-transform {program} does not work: {error}") from error
+    return sog.stat().st_size, load_ply(back)
+
+
+def drops_when_shrunk(gaussians: Gaussians, views: tuple[View, ...], background: Floats) -> dict[str, list[float]]:
+    """Return the dB that are lost by each format when the scene, cameras too, is made smaller by each of SHRUNK."""
+    drops: dict[str, list[float]] = {"msz 5": [], "spz version 3": []}
+    for factor in SHRUNK:
+        small = shrink(gaussians, factor)
+        near = tuple(view.loaded()._replace(camera=shrunk_camera(view, factor)) for view in views)
+        conventions = GSPLAT_MAIN._replace(near_plane=factor * GSPLAT_MAIN.near_plane)
+        before = measured(small, near, background, conventions)
+        for name, (format_, level) in zip(drops, ((MSZ, SHRUNK_LEVEL), (SPZ, 0)), strict=True):
+            back = there_and_back(small, format_, level)[1]
+            drops[name].append(before - measured(back, near, background, conventions))
+    return drops
+
+
+def shrink(gaussians: Gaussians, factor: float) -> Gaussians:
+    """Return the Gaussians of a scene that is ``factor`` times as large."""
+    return gaussians._replace(
+        means=gaussians.means * np.float32(factor), log_scales=gaussians.log_scales + np.float32(np.log(factor))
+    )
+
+
+def shrunk_camera(view: View, factor: float) -> Any:
+    """Return the camera of a view in a scene that is ``factor`` times as large."""
+    return view.camera._replace(cam_from_world_t=view.camera.cam_from_world_t * factor)
+
+
+def to_rows(runs: list[list[dict[str, Any]]]) -> list[list[str]]:
+    """Return the lines of the table: means and deviations over the seeds."""
+    rows = []
+    for of_seeds in zip(*runs, strict=True):
+        sizes = [f"{np.mean([point[name] for point in of_seeds]):,.{digits}f}" for name, digits in _SIZES.items()]
+        rows.append([of_seeds[0]["name"], *sizes, shared.with_deviation([point["drop"] for point in of_seeds], 3)])
+    return rows
+
+
+_SIZES = {"n_bytes": 0, "bytes_per_gaussian": 1}  # digits in the table
+
+
+def draw(result: dict[str, Any]) -> "Figure":
+    """Draw loss against bytes, and loss against the size of the scene."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.6, 3.6), layout="constrained")
+    rate, small = figure.subplots(1, 2, width_ratios=(3, 2))
+    for kind in COLORS:
+        _draw_kind(rate, kind, result["runs"])
+    rate.axhline(0, color=shared.GREY, linewidth=0.8)
+    rate.set(
+        xscale="log", xlabel="bytes a Gaussian", ylabel="PSNR lost (dB)", title=f"{result['scene']}: bytes and loss"
+    )
+    ticks = (8, 16, 32, 64, 128, 256)
+    rate.set_xticks(ticks, [str(tick) for tick in ticks])
+    rate.minorticks_off()
+    for name, drops in result["shrunk"].items():
+        color = COLORS[name.split()[0]]
+        means, deviations = np.transpose([shared.mean_and_deviation(d) for d in zip(*drops, strict=True)])
+        small.errorbar(SHRUNK, means, yerr=deviations, color=color, marker="o", ms=4, capsize=3, label=f".{name}")
+    small.set(xscale="log", xlabel="size of the scene", ylabel="PSNR lost (dB)", title="the same scene, smaller")
+    small.set_xticks(SHRUNK, ["1", *(f"1/{1 / factor:.0f}" for factor in SHRUNK[1:])])
+    small.minorticks_off()
+    small.invert_xaxis()
+    for axes in (rate, small):
+        shared.tidy(axes)
+        axes.legend(frameon=False, fontsize=9)
+    return figure
+
+
+def _draw_kind(axes: "Axes", kind: str, runs: list[list[dict[str, Any]]]) -> None:
+    """Draw the files of one format: a line through its levels."""
+    of_levels = [of_seeds for of_seeds in zip(*runs, strict=True) if of_seeds[0]["name"].split()[0] == kind]
+    if not of_levels:
+        return
+    sizes = [np.mean([point["bytes_per_gaussian"] for point in of_seeds]) for of_seeds in of_levels]
+    losses = [shared.mean_and_deviation([point["drop"] for point in of_seeds]) for of_seeds in of_levels]
+    means, deviations = np.transpose(losses)
+    style = "-o" if kind == "msz" else "s"
+    axes.errorbar(sizes, means, yerr=deviations, fmt=style, color=COLORS[kind], ms=4, capsize=3, label=f".{kind}")
+
+
+RATE_DISTORTION = Study("rate-distortion", "bytes against quality: .msz beside PLY, SPZ and SOG", add_arguments, run)
+"""``compression/rate-distortion``."""

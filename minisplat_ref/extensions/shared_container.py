@@ -1,0 +1,156 @@
+"""A container of packed bytes: magic, version, a header in JSON, then one zstandard frame for each stream.
+
+::
+
+    magic      4 bytes
+    version    uint16, little-endian
+    length     uint32, of the header in bytes
+    header     JSON; "streams" lists [name, bytes packed] in the order of the frames
+    frames     back to back, to the end of the file
+
+A frame holds its own checksum. Nothing is allocated for what the file claims before the claim is found possible: a
+frame of zstandard has blocks of at least 4 bytes (3 of header, 1 of content), each of which makes at most 2^17 bytes.
+"""
+
+import json
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from minisplat_ref import memory
+from minisplat_ref.errors import InputError
+from minisplat_ref.io.json_file import parse_json
+
+LEVEL = 19  # of zstandard: the strongest that needs no special window
+HEADER_MAX = 1 << 16  # bytes
+RATIO_MAX = 1 << 15  # bytes made of one packed byte: 2^17 of 4
+WAY_OUT = "copy or export the file again"
+_PREFIX = struct.Struct("<4sHI")
+
+
+class Container(NamedTuple):
+    """What a format begins with."""
+
+    magic: bytes
+    """Four bytes."""
+    version: int
+    """That is written, and the only one that is read."""
+
+
+class Packed(NamedTuple):
+    """A file that has been taken apart, but not unpacked."""
+
+    header: Mapping[str, Any]
+    frames: Mapping[str, bytes]
+    """By the names of the streams."""
+    source: str | Path
+    """The file, for messages."""
+
+
+def _zstandard() -> Any:
+    try:
+        import zstandard
+    except ImportError:
+        raise InputError(
+            "this format is packed by zstandard, which is not installed: pip install 'minisplat_ref[compression]'"
+        ) from None
+    return zstandard
+
+
+def pack(container: Container, header: Mapping[str, Any], streams: Mapping[str, bytes]) -> bytes:
+    """Return a file.
+
+    Parameters
+    ----------
+    container : Container
+    header : mapping
+        JSON values; less than 64 KiB of text.
+    streams : mapping of str to bytes
+        Unpacked.
+
+    Raises
+    ------
+    InputError
+        zstandard is not installed.
+    """
+    compressor = _zstandard().ZstdCompressor(level=LEVEL, write_checksum=True, write_content_size=True)
+    frames = {name: compressor.compress(raw) for name, raw in streams.items()}
+    sizes = [[name, len(frame)] for name, frame in frames.items()]
+    text = json.dumps({**header, "streams": sizes}, separators=(",", ":")).encode()
+    assert len(text) <= HEADER_MAX
+    prefix = _PREFIX.pack(container.magic, container.version, len(text))
+    return b"".join([prefix, text, *frames.values()])
+
+
+def take_apart(container: Container, content: bytes, source: str | Path) -> Packed:
+    """Check magic, version and sizes of a file, and return its header and its frames, still packed.
+
+    Raises
+    ------
+    InputError
+        It is another kind of file, of another version, or its sizes do not add up.
+    """
+    if len(content) < _PREFIX.size or content[:4] != container.magic:
+        raise InputError(f"{source}: not a {_name(container)} file, it does not begin with {_name(container)}")
+    _, version, length = _PREFIX.unpack_from(content)
+    if version != container.version:
+        raise InputError(
+            f"{source}: {_name(container)} of version {version}, but this program reads version {container.version};"
+            " convert it with the program that wrote it"
+        )
+    if length > min(HEADER_MAX, len(content) - _PREFIX.size):
+        raise InputError(f"{source}: truncated or damaged, its header would have {length:,} bytes; {WAY_OUT}")
+    begin = _PREFIX.size + length
+    header = parse_json(content[_PREFIX.size : begin], source, WAY_OUT)
+    sizes = header.get("streams") if isinstance(header, dict) else None
+    if not isinstance(sizes, list) or not all(map(_is_size, sizes)) or len(dict(sizes)) < len(sizes):
+        raise InputError(f"{source}: its header does not list its streams; {WAY_OUT}")
+    claimed, found = sum(size for _, size in sizes), len(content) - begin
+    if claimed != found:
+        raise InputError(f"{source}: truncated or damaged, {claimed:,} bytes expected, {found:,} found; {WAY_OUT}")
+    frames = {}
+    for name, size in sizes:
+        frames[name] = content[begin : begin + size]
+        begin += size
+    return Packed(header, frames, source)
+
+
+def _is_size(entry: Any) -> bool:
+    return isinstance(entry, list) and len(entry) == 2 and isinstance(entry[0], str) and is_count(entry[1])
+
+
+def _name(container: Container) -> str:
+    return container.magic.decode("ascii").strip()
+
+
+def is_count(value: Any, largest: int = 2**53) -> bool:
+    """Return whether a value of a header is a whole number from 0 to ``largest``; true and false are none."""
+    return type(value) is int and 0 <= value <= largest
+
+
+def unpack(packed: Packed, name: str, n_bytes: int) -> bytes:
+    """Unpack a stream, of which the header says how large it is.
+
+    Raises
+    ------
+    InputError
+        There is no such stream, it holds another number of bytes, it is damaged, or it does not fit into memory.
+    """
+    source, frame = packed.source, packed.frames.get(name)
+    if frame is None:
+        raise InputError(f"{source}: damaged, it has no stream {name}; {WAY_OUT}")
+    if n_bytes > RATIO_MAX * len(frame) or n_bytes > memory.free_bytes():
+        raise InputError(
+            f"{source}: its {name} would take {memory.as_text(n_bytes)}, made of {len(frame):,} bytes; {WAY_OUT}"
+        )
+    zstandard = _zstandard()
+    try:
+        if zstandard.frame_content_size(frame) != n_bytes:
+            raise InputError(f"{source}: damaged, its {name} do not have {n_bytes:,} bytes; {WAY_OUT}")
+        raw = bytes(zstandard.ZstdDecompressor().decompress(frame, max_output_size=n_bytes))
+    except zstandard.ZstdError as error:
+        raise InputError(f"{source}: damaged, its {name} cannot be unpacked ({error}); {WAY_OUT}") from None
+    if len(raw) != n_bytes:
+        raise InputError(f"{source}: damaged, its {name} have {len(raw):,} bytes, not {n_bytes:,}; {WAY_OUT}")
+    return raw

@@ -1,0 +1,56 @@
+"""Morton order: points that are near each other in space become near each other in a list.
+
+The code of a cell ``(x, y, z)`` is its bits taken in turn, ``... z1 y1 x1 z0 y0 x0``. Sorting by it walks the leaves of
+an octree, so what follows each other is alike and packs well.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from minisplat_ref.types import Floats, Ints
+
+BITS = 21  # of a coordinate: three of them fill 63 bits
+# How 21 bits are spread to every third place: each step moves the upper half of every group by its distance.
+_SPREAD = (
+    (32, 0x001F00000000FFFF),
+    (16, 0x001F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
+
+
+def cells_of(points: Floats | Ints) -> NDArray[np.uint64]:
+    """Return the cell of each point in a cube of 2^21 cells a side, which just holds them all.
+
+    Parameters
+    ----------
+    points : ndarray of shape (N, 3)
+        Finite.
+
+    Returns
+    -------
+    ndarray of shape (N, 3) of uint64
+        Below 2^21.
+    """
+    if len(points) == 0:
+        return np.zeros((0, 3), np.uint64)
+    points = points.astype(np.float64)
+    low = points.min(axis=0)  # [3]
+    side = float((points.max(axis=0) - low).max())
+    if side == 0.0:
+        return np.zeros(points.shape, np.uint64)
+    return np.minimum((points - low) / side * 2.0**BITS, 2.0**BITS - 1).astype(np.uint64)
+
+
+def morton_codes(cells: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Return the codes [N] of cells [N, 3], each below 2^21: bit b of axis a becomes bit 3 b + a."""
+    spread = cells.astype(np.uint64)  # [N, 3], a copy
+    for distance, mask in _SPREAD:
+        spread = (spread | (spread << np.uint64(distance))) & np.uint64(mask)
+    return spread[:, 0] | (spread[:, 1] << np.uint64(1)) | (spread[:, 2] << np.uint64(2))
+
+
+def morton_order(points: Floats | Ints) -> Ints:
+    """Return the rows [N] of points [N, 3] in Morton order; points of one cell stay as they follow each other."""
+    return np.argsort(morton_codes(cells_of(points)), kind="stable")

@@ -1,0 +1,122 @@
+"""What the studies of extensions share that train a scene: its arguments, the scene, and a folder with the results."""
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.types import Gaussians, Scene
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+RESULT, FIGURE = "result.json", "figure.png"
+PNG_DPI = 150
+BLUE, RED, YELLOW, GREY = "#35608c", "#d2493f", "#e0a526", "#8a8580"
+
+
+def add_scene_arguments(parser: argparse.ArgumentParser, iterations: int, recipe: str) -> None:
+    """Add a scene of any kind, what it is trained by, and ``--out``."""
+    parser.add_argument("scene", metavar="SCENE", help="folder of a scene, or a synthetic one such as room")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=f"new folder for {RESULT} and {FIGURE}")
+    parser.add_argument("--downscale", type=int, default=1, metavar="D", help="make photographs D times smaller")
+    parser.add_argument("--recipe", default=recipe, metavar="R", help="of the trainings (default %(default)s)")
+    parser.add_argument(
+        "--iterations", type=int, default=iterations, metavar="N", help="of each training (default %(default)s)"
+    )
+    parser.add_argument("--ply", type=Path, metavar="FILE", help="take these Gaussians, and train none")
+    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="trainings, seeds from 0 on (default 3)")
+
+
+def read_scene(args: argparse.Namespace) -> Scene:
+    """Load a folder, or make the synthetic scene of that name.
+
+    Raises
+    ------
+    InputError
+        It is neither, it has no test views, or a number that was given makes no sense.
+    """
+    from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
+    from minisplat_ref.io import load_scene
+
+    for name in ("downscale", "iterations", "seeds"):
+        if getattr(args, name) < 1:
+            raise InputError(f"--{name} is {getattr(args, name)}: give at least 1")
+    if Path(args.scene).exists():
+        scene = load_scene(args.scene, downscale=args.downscale)
+    elif args.scene in SCENE_NAMES:
+        scene = make_scene(args.scene).scene
+    else:
+        raise InputError(f"{args.scene}: neither a folder nor one of {', '.join(SCENE_NAMES)}; give a scene")
+    if not scene.test_views:
+        raise InputError(f"scene {scene.name} has no test views to compare by: add photographs")
+    return scene
+
+
+def populations(args: argparse.Namespace, scene: Scene) -> list[Gaussians]:
+    """Return what is studied: the given Gaussians, or those of a training for each seed.
+
+    Raises
+    ------
+    InputError
+        There is no such recipe, or the PLY cannot be read.
+    """
+    from tqdm import tqdm
+
+    from minisplat_ref.io import load_ply
+    from minisplat_ref.methods import get_recipe
+    from minisplat_ref.training.loop import train
+
+    if args.ply is not None:
+        return [load_ply(args.ply)]
+    recipe = get_recipe(args.recipe, args.iterations)
+    trained = []
+    for seed in range(args.seeds):
+        with tqdm(total=recipe.iterations, desc=f"{recipe.name}, seed {seed}", leave=False) as bar:
+            trained.append(train(scene, recipe, seed=seed, on_step=lambda _: bar.update()).gaussians)
+    return trained
+
+
+def describe(args: argparse.Namespace, scene: Scene) -> dict[str, Any]:
+    """Return what the figures depend on."""
+    from minisplat_ref.reporting import describe_machine
+
+    camera = scene.train_views[0].camera
+    origin = {"ply": str(args.ply)} if args.ply else {"recipe": args.recipe, "iterations": args.iterations}
+    return {
+        "scene": scene.name,
+        "size": [camera.width, camera.height],
+        "test_views": len(scene.test_views),
+        **origin,
+        "seeds": 1 if args.ply else args.seeds,
+        "machine": describe_machine(),
+    }
+
+
+def mean_and_deviation(values: Sequence[float]) -> tuple[float, float]:
+    """Return mean and sample standard deviation; the latter is 0 for one value."""
+    return float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
+
+
+def with_deviation(values: Sequence[float], digits: int) -> str:
+    """Return mean and deviation as a table has them."""
+    mean, deviation = mean_and_deviation(values)
+    return f"{mean:.{digits}f} ± {deviation:.{digits}f}"
+
+
+def tidy(axes: "Axes") -> None:
+    """Take away the frame above and on the right, and draw a pale grid."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(color="#e6eaee")
+    axes.set_axisbelow(True)
+
+
+def write(folder: Path, result: dict[str, Any], figure: "Figure") -> None:
+    """Write the results and the figure into a folder that exists."""
+    (folder / RESULT).write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    figure.savefig(folder / FIGURE, dpi=PNG_DPI, facecolor="white")

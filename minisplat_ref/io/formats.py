@@ -1,0 +1,58 @@
+"""What a compact file format of Gaussians is: a suffix, levels of precision, and a pair of functions.
+
+A PLY keeps every float. A format keeps less, at one of several levels, and says how much may be lost. Formats belong to
+extensions: ``minisplat_ref.extensions.extension.find_format`` finds them by the suffix of a file.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.io.atomic import replacing
+from minisplat_ref.types import Gaussians
+
+
+class Format(NamedTuple):
+    """A compact file format of the six fields of 3DGS."""
+
+    suffix: str
+    """What names of such files end in, with its dot."""
+    summary: str
+    """What it is, in half a line."""
+    levels: tuple[str, ...]
+    """What each level of precision is; the finest, and as a rule largest, first."""
+    default_level: int
+    """The level that is written when nobody says which."""
+    encode: Callable[[Gaussians, int], bytes]
+    """``encode(gaussians, level)``: a whole file. Raises InputError where a value does not fit the format."""
+    decode: Callable[[bytes, str | Path], Gaussians]
+    """``decode(content, source)`` of a whole file; float32, finite. Raises InputError, which names ``source``."""
+    describe: Callable[[bytes, str | Path], list[tuple[str, str]]]
+    """``describe(content, source)``: names and values that say what the file keeps, and how precisely."""
+
+
+def read_content(path: str | Path) -> bytes:
+    """Return the bytes of a file.
+
+    Raises
+    ------
+    InputError
+        It cannot be read.
+    """
+    try:
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be opened ({error.strerror})") from None
+
+
+def write_content(path: str | Path, content: bytes) -> None:
+    """Write a file, complete or not at all.
+
+    Raises
+    ------
+    InputError
+        As for :func:`minisplat_ref.io.atomic.replacing`.
+    """
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
