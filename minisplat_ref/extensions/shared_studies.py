@@ -31,7 +31,7 @@ def add_out(parser: argparse.ArgumentParser) -> None:
 
 
 def add_scene(parser: argparse.ArgumentParser, downscale: int, iterations: int) -> None:
-    """Add a scene of any kind, ``--downscale``, ``--iterations``, ``--seed`` and ``--out``."""
+    """Add a scene of any kind, ``--downscale``, ``--iterations``, ``--seeds`` and ``--out``."""
     parser.add_argument(
         "scene",
         nargs="?",
@@ -43,7 +43,7 @@ def add_scene(parser: argparse.ArgumentParser, downscale: int, iterations: int) 
         "--downscale", type=int, default=downscale, metavar="D", help=f"train at 1/D of its size (default {downscale})"
     )
     parser.add_argument("--iterations", type=int, default=iterations, metavar="N", help=f"default {iterations}")
-    parser.add_argument("--seed", type=int, default=0, metavar="S", help="of the trainings (default 0)")
+    parser.add_argument("--seeds", type=int, default=2, metavar="N", help="from 0 on, of the trainings (default 2)")
     add_out(parser)
 
 
