@@ -15,8 +15,9 @@ from minisplat_ref.oracle.models import check_model_gradients, model_stage
 from minisplat_ref.oracle.pieces import tiny_setting
 from minisplat_ref.oracle.stages import project_stage
 from minisplat_ref.rendering import SPLATTING, Renderer
-from minisplat_ref.training.representation import GAUSSIANS
-from minisplat_ref.types import Model
+from minisplat_ref.training.rates import Rates
+from minisplat_ref.training.representation import GAUSSIANS, Representation
+from minisplat_ref.types import Gaussians, Model
 
 
 class Tape(NamedTuple):
@@ -117,3 +118,27 @@ def test_the_command_fails_when_a_gradient_is_wrong(monkeypatch, capsys):
     monkeypatch.setattr(extension, "load_extension", lambda name: wrong)
     assert main(["oracle", "gradients", "--extension", "velocity"]) == 1
     assert "gain is wrong" in capsys.readouterr().out
+
+
+def test_a_field_of_learning_rate_zero_is_held():
+    """A bound that only selects has no derivative: without a rate of 0 it is said that nothing was checked about it."""
+
+    fields = {name: np.ndarray for name in (*Gaussians._fields, "bounds")}
+    Bounded = NamedTuple("Bounded", fields.items())
+
+    def extend(gaussians, rng):
+        return Bounded(*gaussians, np.zeros(len(gaussians.means)))
+
+    representation = Representation("bounded", population=Bounded, extend=extend)
+    report = check_model_gradients(REFERENCE, GSPLAT_MAIN, representation)
+    assert "nothing was checked about bounds" in report.cases[0].note
+    held = representation._replace(rates=Rates({"bounds": 0.0}, frozenset()))
+    assert check_model_gradients(REFERENCE, GSPLAT_MAIN, held).n_failed == 0
+
+
+def test_a_stage_with_the_renderers_name_takes_its_place():
+    def stages(backend, setting, rng):
+        return (model_stage(backend, setting, GAUSSIANS, rng)._replace(vjp=lambda *v: 1 / 0),)
+
+    with pytest.raises(ZeroDivisionError):
+        check_model_gradients(REFERENCE, GSPLAT_MAIN, GAUSSIANS, stages)

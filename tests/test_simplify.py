@@ -19,8 +19,10 @@ from minisplat_ref.strategy.simplify import (
     by_sampling,
     carrying_mass,
     intersection_preserving,
+    merge_clusters,
     merge_neighbours,
     most_important,
+    optical_masses,
     reinitialised,
     sample,
 )
@@ -142,6 +144,28 @@ def test_discs_side_by_side_keep_about_their_opacity():
     merged = merge_neighbours(gaussians, np.ones(2), 1).gaussians
     assert_allclose(np.exp(np.sort(merged.log_scales[0])), [1e-3, 1, 2], rtol=ROUNDED_TO_FLOAT32)
     assert_allclose(opacities_of(merged), 0.7, atol=ROUNDED_TO_FLOAT32)
+
+
+def test_given_clusters_keep_their_moments_and_stop_as_much_light(rng):
+    gaussians = make_gaussians(rng, 30, opacity_logit=-3.0)  # so faint that no merged one is clamped
+    labels = np.append(rng.permutation(np.repeat(np.arange(5), 5)), np.arange(5, 10))
+    masses = optical_masses(gaussians)
+    edit = merge_clusters(gaussians, masses, labels)
+    assert_array_equal(edit.is_new, np.arange(10) < 5)
+    assert_allclose(optical_masses(edit.gaussians)[:5], np.bincount(labels, masses)[:5], rtol=MERGED_MOMENTS)
+    for label in range(10):
+        members, row = labels == label, np.arange(10) == label
+        expected = moments(take(gaussians, members), masses[members])
+        for found, value in zip(moments(take(edit.gaussians, row), np.ones(1)), expected, strict=True):
+            assert_allclose(found, value, atol=MERGED_MOMENTS)
+
+
+def test_clusters_of_one_stay_as_they_are(rng):
+    gaussians = make_gaussians(rng, 4)
+    edit = merge_clusters(gaussians, np.ones(4), np.array([2, 0, 3, 1]))
+    assert not edit.is_new.any()
+    assert_array_equal(edit.parent_ids, [1, 3, 0, 2])
+    assert_array_equal(edit.gaussians.means, gaussians.means[[1, 3, 0, 2]])
 
 
 def test_opaque_stacks_stay_trainable():

@@ -2,10 +2,13 @@
 
 The Gaussians of the tiny scene become the representation's population. Fields that they did not have, and shared
 parameters, begin as training begins them, often at zero or at the identity, where much of a gradient vanishes: here
-they are moved by random noise. The view is at time 0.7, so that what depends on time does.
+they are moved by random noise. A field whose learning rate is 0, which an event sets and no gradient, is moved, too,
+but not differentiated: a bound or a number of samples has no derivative. The view is at time 0.7, so that what depends
+on time does.
 
 Which hits are blended and which of them are clamped is noted as the renderer calls the stages of its backend. A
-threshold of the renderer's own, a gate or a ReLU, is not seen: its stage belongs into the extension's ``stages``.
+threshold of the renderer's own, a gate or a ReLU, is not seen: its stage belongs into the extension's ``stages``. One
+with the name that the whole renderer has here takes its place.
 """
 
 from collections.abc import Callable, Sequence
@@ -57,8 +60,9 @@ def check_model_gradients(
     tiny, larger = tiny_setting(conventions), make_setting(rng, 60, 40, 30, conventions, sh_degree=3)
 
     def all_stages(setting: Setting) -> tuple[Stage, ...]:
-        further = () if stages is None else stages(backend, setting, rng)
-        return (model_stage(backend, setting, representation, rng), *further)
+        whole = model_stage(backend, setting, representation, rng)
+        further = () if stages is None else tuple(stages(backend, setting, rng))
+        return further if whole.name in {stage.name for stage in further} else (whole, *further)
 
     cases: list[Case] = [jacobian_case(stage) for stage in all_stages(tiny)]
     cases += [inner_product_case(stage, rng) for stage in all_stages(larger)]
@@ -70,7 +74,8 @@ def check_model_gradients(
 def model_stage(backend: Backend, setting: Setting, representation: Representation, rng: np.random.Generator) -> Stage:
     """Return a renderer as a function of every field, every shared parameter, the background and the pose.
 
-    The background is left out where the image does not depend on it, as behind a sky of the renderer's own.
+    The background is left out where the image does not depend on it, as behind a sky of the renderer's own, and so are
+    fields of learning rate 0.
 
     Parameters
     ----------
@@ -88,7 +93,9 @@ def model_stage(backend: Backend, setting: Setting, representation: Representati
     shared = {name: _noisy(array, rng) for name, array in representation.shared(_scene(setting, view), rng).items()}
     fields = population._asdict()
     wants = frozenset({"depth"} & renderer.channels(frozenset({"depth"})).keys())
-    inputs = {**fields, **shared, "background": setting.background, **setting.pose}
+    held = {name: fields[name] for name, rate in representation.rates.of.items() if rate == 0 and name in fields}
+    free = {name: field for name, field in fields.items() if name not in held}
+    inputs = {**free, **shared, "background": setting.background, **setting.pose}
 
     def draw(arrays: dict[str, Floats], used: Backend) -> tuple[RenderOutput, Any]:
         model = Model(population._make(arrays[name] for name in fields), {name: arrays[name] for name in shared})
@@ -97,12 +104,12 @@ def model_stage(backend: Backend, setting: Setting, representation: Representati
         request = Request(arrays["background"], conventions=setting.conventions, backend=used, wants=wants)
         return renderer.render(model, view._replace(camera=moved), request)
 
-    over_black = draw({**inputs, "background": np.zeros(3)}, backend)[0].image
-    if np.array_equal(draw(inputs, backend)[0].image, over_black):
+    over_black = draw({**held, **inputs, "background": np.zeros(3)}, backend)[0].image
+    if np.array_equal(draw({**held, **inputs}, backend)[0].image, over_black):
         del inputs["background"]
 
     def arrays_of(args: Sequence[Floats]) -> dict[str, Floats]:
-        return {"background": setting.background, **dict(zip(inputs, args, strict=True))}
+        return {"background": setting.background, **held, **dict(zip(inputs, args, strict=True))}
 
     def function(*args: Floats) -> Point:
         on_watch, sides = watched(backend)

@@ -155,18 +155,44 @@ def merge_neighbours(gaussians: Gaussians, importance: Floats, n: int) -> Edit:
     ids = _candidates(importance, n)
     if len(ids) == n:
         return keep(gaussians, ids)
-    weights = importance[ids].astype(np.float64)
-    labels = _clusters(_places(take(gaussians, ids)), weights, n)  # [C] in [0, n)
+    candidates, weights = take(gaussians, ids), importance[ids].astype(np.float64)
+    edit = merge_clusters(candidates, weights, _clusters(_places(candidates), weights, n))
+    return edit._replace(parent_ids=ids[edit.parent_ids])
+
+
+def merge_clusters(gaussians: Any, weights: Floats, labels: Ints) -> Edit:
+    """Merge each cluster into one Gaussian that has its moments: the equations of :func:`merge_neighbours`.
+
+    Parameters
+    ----------
+    gaussians : Gaussians, or another population with its fields
+        N rows; of a further field the weighted mean is taken.
+    weights : ndarray of shape (N,), float64
+        Above 0; only their ratios inside of a cluster count.
+    labels : ndarray of shape (N,) of ids
+        Number of each row's cluster, from 0 on without gaps.
+
+    Returns
+    -------
+    edit : Edit
+        One row for each cluster, in the order of their numbers; see :func:`merge_neighbours`.
+    """
     order = np.lexsort([-weights, labels])  # by cluster, its most important member first
-    ids, weights, labels = ids[order], weights[order], labels[order]
-    parent_ids = ids[np.flatnonzero(np.diff(labels, prepend=-1))]  # [n]
+    weights, labels = weights[order], labels[order]
+    parent_ids = order[np.flatnonzero(np.diff(labels, prepend=-1))]  # [n]
     is_merged = np.bincount(labels) > 1  # [n]
-    is_member = is_merged[labels]  # [C]
+    is_member = is_merged[labels]  # [N]
     left = take(gaussians, parent_ids)
-    members = type(gaussians)._make(field.astype(np.float64) for field in take(gaussians, ids[is_member]))
+    members = type(gaussians)._make(field.astype(np.float64) for field in take(gaussians, order[is_member]))
     for field, merged in zip(left, _merged(members, weights[is_member], labels[is_member]), strict=True):
         field[is_merged] = merged
     return Edit(left, parent_ids, is_merged)
+
+
+def optical_masses(gaussians: Any) -> Floats:
+    """Return ``tau A`` [N] of each Gaussian, float64: the light that it stops, which merging conserves."""
+    scales = np.exp(gaussians.log_scales.astype(np.float64))
+    return np.logaddexp(0.0, gaussians.opacity_logits.astype(np.float64)) * _cross_sections(scales**2)
 
 
 def _places(gaussians: Gaussians) -> Floats:
@@ -182,7 +208,7 @@ def _clusters(places: Floats, weights: Floats, n: int) -> Ints:
     sums = np.column_stack([weights[:, None] * places, weights])  # [C, 7]
     while len(sums) > n:
         places, weights = sums[:, :-1] / sums[:, -1:], sums[:, -1]
-        first, second = _mutual_neighbours(places).T  # [P]
+        first, second = mutual_neighbours(places).T  # [P]
         squared = np.sum((places[first] - places[second]) ** 2, axis=1)
         costs = squared * weights[first] * weights[second] / (weights[first] + weights[second])
         chosen = np.argsort(costs, kind="stable")[: min(len(sums) - n, -(-len(costs) // 2))]
@@ -194,7 +220,7 @@ def _clusters(places: Floats, weights: Floats, n: int) -> Ints:
     return labels
 
 
-def _mutual_neighbours(places: Floats) -> Ints:
+def mutual_neighbours(places: Floats) -> Ints:
     """Return pairs [P, 2] of rows that are nearest to each other, the lower row first.
 
     Where distances are equal, neighbours may go round in a circle (points in one place, grids). All pairs of a row and

@@ -1,0 +1,108 @@
+"""How scenes are drawn by integrals over pixels, and the recipe that trains them."""
+
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+from minisplat_ref.backends import REFERENCE, Backend
+from minisplat_ref.constants import Conventions
+from minisplat_ref.cpu.compositing import hits as kernel_hits
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.analytic.kernels import response_for
+from minisplat_ref.extensions.analytic.reference import RESPONSE
+from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
+from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
+from minisplat_ref.rendering import SPLATTING, Renderer, Request
+from minisplat_ref.training.representation import Representation
+from minisplat_ref.types import CompositeGradient, Floats, Model, Projection, RenderOutput, TileBins, View
+
+
+def composite(
+    projection: Projection,
+    colors: Floats,
+    background: Floats,
+    bins: TileBins,
+    conventions: Conventions,
+    *,
+    with_stats: bool = False,
+    with_median_depth: bool = False,
+) -> RenderOutput:
+    """Blend with the plain kernels; as ``reference.compositing.composite`` with integrals.
+
+    Raises
+    ------
+    InputError
+        Statistics are asked for, which the plain kernels do not collect.
+    """
+    if with_stats or with_median_depth:
+        raise InputError("the kernels of analytic collect no statistics: use --backend reference")
+    return kernel_hits.composite_hits(response_for(colors.dtype), projection, colors, background, bins, conventions)
+
+
+def composite_vjp(
+    projection: Projection,
+    colors: Floats,
+    background: Floats,
+    bins: TileBins,
+    conventions: Conventions,
+    output: RenderOutput,
+    v_image: Floats,
+    v_alpha: Floats,
+) -> CompositeGradient:
+    """Gradient of :func:`composite`."""
+    v = kernel_hits.composite_hits_vjp(
+        response_for(colors.dtype), projection, colors, background, bins, conventions, output, (v_image, v_alpha)
+    )
+    v_means2d, v_conics, v_opacities = v.primitives
+    return CompositeGradient(v_means2d, v_conics, v_opacities, v.colors, v.background)
+
+
+def reference_composite_vjp(
+    projection: Projection,
+    colors: Floats,
+    background: Floats,
+    bins: TileBins,
+    conventions: Conventions,
+    output: RenderOutput,
+    v_image: Floats,
+    v_alpha: Floats,
+) -> CompositeGradient:
+    """Gradient of compositing by the reference with integrals."""
+    v = composite_hits_vjp(RESPONSE, projection, colors, background, bins, conventions, output, (v_image, v_alpha))
+    v_means2d, v_conics, v_opacities = v.primitives
+    return CompositeGradient(v_means2d, v_conics, v_opacities, v.colors, v.background)
+
+
+def integrating(backend: Backend) -> Backend:
+    """Return the backend with integrals over pixels in the place of samples at their centres.
+
+    Lists of tiles are the reference's: those of the kernels leave out what reaches no pixel's centre.
+    """
+    name = f"{backend.name} with integrals"
+    if backend.is_compiled:
+        return replace(
+            backend,
+            name=name,
+            bin_gaussians=REFERENCE.bin_gaussians,
+            composite=composite,
+            composite_vjp=composite_vjp,
+        )
+    return replace(
+        backend, name=name, composite=partial(composite_hits, RESPONSE), composite_vjp=reference_composite_vjp
+    )
+
+
+def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
+    """Draw the view as 3DGS does, without a low-pass and with integrals; the tape keeps the backend."""
+    conventions = request.conventions._replace(eps2d=0.0, is_antialiased=False)
+    backend = integrating(request.backend)
+    return SPLATTING.render(model, view, request._replace(backend=backend, conventions=conventions))
+
+
+INTEGRATED = Representation(
+    "gaussians integrated over pixels",
+    renderer=Renderer("analytic", render, SPLATTING.render_vjp, SPLATTING.channels),
+)
+
+ANALYTIC = GS_ACCEL._replace(name="analytic")
+"""``analytic``: 3DGS whose alphas are means over pixels."""

@@ -1,0 +1,39 @@
+"""What the gradient proof checks: the renderer, with the thresholds that its integrals cross."""
+
+import numpy as np
+
+from minisplat_ref.backends import REFERENCE, Backend
+from minisplat_ref.extensions.analytic.method import INTEGRATED
+from minisplat_ref.extensions.analytic.reference import RESPONSE
+from minisplat_ref.oracle.differences import Point
+from minisplat_ref.oracle.models import model_stage
+from minisplat_ref.oracle.setting import POSE, Setting
+from minisplat_ref.oracle.stages import Stage
+from minisplat_ref.reference.hits import tile_hits
+from minisplat_ref.types import Floats, TileGrid
+
+
+def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
+    """Return the renderer; which integrals are blended and which are clamped is found out once more, by the reference.
+
+    What the backend's own compositing would tell of its thresholds is about values at centres.
+    """
+    stage = model_stage(backend, setting, INTEGRATED, rng)
+    conventions = setting.conventions._replace(eps2d=0.0)
+    camera = setting.camera
+    grid = TileGrid(camera.width, camera.height, REFERENCE.tile_width, REFERENCE.tile_height)
+
+    def function(*args: Floats) -> Point:
+        point, named = stage.function(*args), dict(zip(stage.inputs, args, strict=True))
+        R, t = (named[name] for name in POSE)
+        moved = camera._replace(cam_from_world_R=R, cam_from_world_t=t)
+        opacities = 1 / (1 + np.exp(-named["opacity_logits"]))
+        scales = np.exp(named["log_scales"])
+        projection = REFERENCE.project(named["means"], named["quats"], scales, opacities, moved, conventions)
+        bins = REFERENCE.bin_gaussians(projection, grid, conventions)
+        tiles = list(tile_hits(projection, bins, conventions, RESPONSE))
+        blended = np.concatenate([np.ravel(tile.alphas > 0) for tile in tiles])
+        clamped = np.concatenate([np.ravel(tile.is_clamped) for tile in tiles])
+        return Point(point.outputs, (*point.sides, bins.gaussian_ids, blended, clamped))
+
+    return (stage._replace(function=function),)

@@ -1,0 +1,102 @@
+"""The population with a filter for each Gaussian, how it is drawn, and the recipe that measures and trains it."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref.extensions.antialiasing.reference import VARIANCE, sampling_intervals, smoothed, smoothed_vjp
+from minisplat_ref.methods.gaussian_splatting import DENSIFY_LEAST_GAP, GS_ACCEL
+from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, Request
+from minisplat_ref.training.rates import Rates
+from minisplat_ref.training.representation import Representation
+from minisplat_ref.training.schedule import At, Every
+from minisplat_ref.training.state import Iteration, TrainState
+from minisplat_ref.types import Floats, Gaussians, Model, RenderOutput, View
+
+EPS2D = 0.1  # px^2: variance of Mip-Splatting's 2D filter, a pixel's own being 1/12
+
+
+class FilteredGaussians(NamedTuple):
+    """Gaussians with 3D filters: the fields of :class:`Gaussians`, and one more."""
+
+    means: Floats
+    quats: Floats
+    log_scales: Floats
+    opacity_logits: Floats
+    sh_dc: Floats
+    sh_rest: Floats
+    filter_sigmas: Floats
+    """[N] standard deviation of the 3D filter, world units; 0 filters nothing. An event sets it, no gradient does."""
+
+
+class _Tape(NamedTuple):
+    inner: Any  # of the renderer that drew
+    gaussians: FilteredGaussians
+
+
+def unfiltered(gaussians: Gaussians, rng: np.random.Generator) -> FilteredGaussians:
+    """Return the Gaussians with filters of size zero, until they are measured."""
+    return FilteredGaussians(**gaussians._asdict(), filter_sigmas=np.zeros_like(gaussians.opacity_logits))
+
+
+def filtered(g: FilteredGaussians) -> Gaussians:
+    """Return the Gaussians of 3DGS that are drawn."""
+    log_scales, opacity_logits = smoothed(g.log_scales, g.opacity_logits, g.filter_sigmas)
+    return Gaussians(g.means, g.quats, log_scales, opacity_logits, g.sh_dc, g.sh_rest)
+
+
+def with_3d_filter(inner: Renderer) -> Renderer:
+    """Return a renderer that filters the Gaussians in space before ``inner`` draws them."""
+
+    def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, _Tape]:
+        output, tape = inner.render(model._replace(gaussians=filtered(model.gaussians)), view, request)
+        return output, _Tape(tape, model.gaussians)
+
+    def render_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None) -> RenderGradient:
+        v, g = inner.render_vjp(tape.inner, v_image, v_alpha), tape.gaussians
+        v_log_scales, v_logits, v_sigmas = smoothed_vjp(
+            g.log_scales, g.opacity_logits, g.filter_sigmas, v.gaussians.log_scales, v.gaussians.opacity_logits
+        )
+        v_drawn = v.gaussians._replace(log_scales=v_log_scales, opacity_logits=v_logits)
+        return v._replace(gaussians=FilteredGaussians(**v_drawn._asdict(), filter_sigmas=v_sigmas))
+
+    return Renderer(f"{inner.name} with 3D filter", render, render_vjp, inner.channels)
+
+
+def with_2d_filter(inner: Renderer) -> Renderer:
+    """Return a renderer that blurs footprints by ``EPS2D`` and keeps their integrals, where 3DGS dilates by 0.3."""
+
+    def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
+        conventions = request.conventions._replace(eps2d=EPS2D, is_antialiased=True)
+        return inner.render(model, view, request._replace(conventions=conventions))
+
+    return Renderer(f"{inner.name} with 2D filter", render, inner.render_vjp, inner.channels)
+
+
+def measure_filters(state: TrainState, iteration: Iteration, *, variance: float) -> None:
+    """Set each filter's variance to ``variance`` times the squared least sampling interval of the training views."""
+    cameras = [view.camera for view in iteration.scene.train_views]
+    g = state.gaussians
+    sigmas = np.sqrt(variance) * sampling_intervals(g.means, cameras)
+    state.gaussians = g._replace(filter_sigmas=sigmas.astype(g.filter_sigmas.dtype))
+
+
+MIP = with_3d_filter(with_2d_filter(SPLATTING))
+"""Mip-Splatting's renderer."""
+
+FILTERED = Representation(
+    "filtered Gaussians",
+    population=FilteredGaussians,
+    extend=unfiltered,
+    renderer=MIP,
+    rates=Rates({"filter_sigmas": 0.0}, frozenset()),
+)
+
+_measure = partial(measure_filters, variance=VARIANCE)
+
+ANTIALIASING = GS_ACCEL._replace(
+    name="antialiasing",
+    events=(*GS_ACCEL.events, At(1, _measure), Every(100, _measure, least_gap=DENSIFY_LEAST_GAP // 2)),
+)
+"""``antialiasing``: 3DGS with Mip-Splatting's two filters."""

@@ -1,0 +1,216 @@
+"""The work of the study ``micro/checker``: a card that is half a fine checker and half a smooth ramp.
+
+Several cameras look straight at the card. Every variant starts from the same points and gets the same number of new
+Gaussians at each densification, those with the largest scaled gradients; so all end with the same count, and differ in
+where their Gaussians are and which shape they have.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from minisplat_ref.backends import CPU
+from minisplat_ref.extensions.micro.method import collect_detail, trace
+from minisplat_ref.extensions.micro.reference import detail_map
+from minisplat_ref.extensions.shared_studies import psnr_of
+from minisplat_ref.methods.gaussian_splatting import GS_ACCEL, collect_gradients
+from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.strategy import clone_split
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.losses import LossTerm
+from minisplat_ref.training.schedule import During, Every, scaled
+from minisplat_ref.training.state import Iteration, TrainState, apply_edit
+from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Model, Scene, View, numbered
+
+WIDTH, HEIGHT, FOCAL, DISTANCE = 96, 64, 96.0, 4.0  # pixels, world units
+CELL = 4.5 * DISTANCE / FOCAL  # side of a square of the checker, world units: no whole number of pixels
+N_VIEWS, N_TEST, SHIFT = 12, 4, 0.3  # cameras, and how far they stand from the middle
+N_POINTS, N_STEPS, N_NEW = 120, 12, 60  # Gaussians at first, densifications, new ones in each
+EXTENT = 2.0
+BORDER = 4  # pixels beside the border of the halves that count to neither
+SAMPLES = 8  # a side and pixel of the photographs
+
+
+class Variant(NamedTuple):
+    """What is changed with respect to 3DGS."""
+
+    beta: float
+    weight: float
+    """Of the trace penalty."""
+    color: str
+
+
+class Outcome(NamedTuple):
+    """One training."""
+
+    n: int
+    psnr_edges: float
+    """Where the photographs of the checker have more edges than on average, dB."""
+    psnr_smooth: float
+    """On the ramp, dB."""
+    psnr: float
+    anisotropy: float
+    """Median of the largest scale over the middle one: the thickness across the card is not seen."""
+    n_smooth: int
+    """Gaussians on the ramp."""
+    picture: Floats
+    gaussians: Gaussians
+
+
+def variants(beta: float, weight: float) -> dict[str, Variant]:
+    """Return what is compared, by name."""
+    return {
+        "3dgs": Variant(0.0, 0.0, "#8a8580"),
+        "detail": Variant(beta, 0.0, "#35608c"),
+        "trace": Variant(0.0, weight, "#e0a526"),
+        "both": Variant(beta, weight, "#d2493f"),
+    }
+
+
+def card(x: Floats, y: Floats) -> Floats:
+    """Return the colour [..., 3] of the card: checkers at x < 0, a ramp at x >= 0."""
+    dark = (np.floor(x / CELL) + np.floor(y / CELL)) % 2
+    checker = np.stack([0.1 + 0.8 * dark, 0.15 + 0.6 * dark, 0.8 - 0.6 * dark], axis=-1)
+    ramp = np.stack([0.35 + 0.2 * x, 0.5 + 0.15 * y, 0.6 - 0.15 * x], axis=-1)
+    return np.clip(np.where(x[..., None] < 0, checker, ramp), 0, 1)
+
+
+def photograph(camera: Camera) -> Floats:
+    """Return what the camera sees of the card at z = 0, [H, W, 3] in [0, 1]: means over its pixels."""
+    steps = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    u = (np.arange(WIDTH)[:, None] + steps).ravel()
+    v = (np.arange(HEIGHT)[:, None] + steps).ravel()
+    x, y = ((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
+    center = camera.center
+    grid_x, grid_y = np.meshgrid(center[0] + DISTANCE * x, center[1] + DISTANCE * y)
+    colors = card(grid_x, grid_y).reshape(HEIGHT, SAMPLES, WIDTH, SAMPLES, 3)
+    means: Floats = colors.mean(axis=(1, 3))
+    return means
+
+
+def checker_scene(seed: int) -> Scene:
+    """Return photographs of the card, and gray points on it."""
+    rng = np.random.default_rng(seed)
+    views = []
+    for i in range(N_VIEWS + N_TEST):
+        x, y = rng.uniform(-SHIFT, SHIFT, 2)
+        t = np.array([-x, -y, DISTANCE])
+        camera = Camera(np.eye(3), t, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
+        views.append(View(f"{i:02d}", camera, np.rint(255 * photograph(camera)).astype(np.uint8), None))
+    half = DISTANCE / FOCAL * np.array([WIDTH / 2, HEIGHT / 2]) + SHIFT
+    points = np.column_stack([rng.uniform(-half, half, (N_POINTS, 2)), np.zeros(N_POINTS)])
+    gray = np.full(points.shape, 128, np.uint8)
+    return Scene("card", numbered(views[:N_VIEWS]), tuple(views[N_VIEWS:]), points, gray, np.zeros(3), EXTENT)
+
+
+def grow(state: TrainState, iteration: Iteration, *, beta: float) -> None:
+    """Clone or split the ``N_NEW`` Gaussians of the largest gradient, scaled as in the method."""
+    views = np.maximum(state.stats.pop("view_count"), 1)
+    detail = state.stats.pop("detail_sum") / views
+    gradients = state.stats.pop("gradient_sum") / views * (1 + beta * detail)
+    edit = clone_split.clone_and_split(
+        state.gaussians,
+        gradients,
+        threshold=float(np.sort(gradients)[-N_NEW]),
+        size_limit=1.5 * DISTANCE / FOCAL,  # of a pixel and a half
+        rng=state.rng,
+    )
+    apply_edit(state, edit)
+
+
+def trained(variant: Variant, scene: Scene, iterations: int, seed: int) -> Gaussians:
+    """Train the card by a variant; densification ends at three quarters."""
+    base = scaled(GS_ACCEL, iterations)
+    period = iterations * 3 // 4 // (N_STEPS + 1)
+    stop = period * (N_STEPS + 1)
+    recipe = base._replace(
+        sh_degree=0,
+        losses=(*base.losses, LossTerm("trace", partial(trace, trace_limit=0.03), weight=variant.weight)),
+        events=(
+            During(collect_gradients, stop=stop),
+            During(collect_detail, stop=stop),
+            Every(period, partial(grow, beta=variant.beta), stop=stop),
+        ),
+    )
+    gaussians: Gaussians = train(scene, recipe, seed=seed, backend=CPU).gaussians
+    return gaussians
+
+
+def halves(view: View) -> tuple[Bools, Bools]:
+    """Return the pixels [H, W] at edges of the checker, and those of the ramp."""
+    camera = view.camera
+    border = camera.cx - camera.fx * camera.center[0] / DISTANCE  # pixels: where x = 0 is seen
+    columns = np.arange(WIDTH) + 0.5
+    is_checker = np.broadcast_to(columns < border - BORDER, (HEIGHT, WIDTH))
+    is_ramp = np.broadcast_to(columns > border + BORDER, (HEIGHT, WIDTH))
+    return is_checker & (detail_map(view.image) > 1), is_ramp
+
+
+def outcome(gaussians: Gaussians, scene: Scene) -> Outcome:
+    """Measure the held-out views; errors are pooled over them."""
+    squares: dict[str, list[Floats]] = {"edges": [], "smooth": [], "all": []}
+    image = np.zeros((HEIGHT, WIDTH, 3))
+    for view in scene.test_views:
+        image = np.clip(SPLATTING.render(Model(gaussians), view, Request(backend=CPU))[0].image, 0, 1)
+        square = np.mean((image - view.image / 255) ** 2, axis=2)  # [H, W]
+        edges, ramp = halves(view)
+        for name, part in (("edges", square[edges]), ("smooth", square[ramp]), ("all", square.ravel())):
+            squares[name].append(part)
+    psnrs = {name: float(-10 * np.log10(np.concatenate(parts).mean())) for name, parts in squares.items()}
+    scales = np.sort(np.exp(gaussians.log_scales.astype(np.float64)), axis=1)  # [N, 3]
+    return Outcome(
+        len(gaussians.means),
+        psnrs["edges"],
+        psnrs["smooth"],
+        psnrs["all"],
+        float(np.median(scales[:, 2] / scales[:, 1])),
+        int(np.count_nonzero(gaussians.means[:, 0] > 0)),
+        image,
+        gaussians,
+    )
+
+
+def measure(iterations: int, seeds: int, beta: float, weight: float) -> dict[str, list[Outcome]]:
+    """Return the outcomes of each variant, one for each seed."""
+    outcomes: dict[str, list[Outcome]] = {name: [] for name in variants(beta, weight)}
+    for seed in range(seeds):
+        scene = checker_scene(seed)
+        for name, variant in variants(beta, weight).items():
+            outcomes[name].append(outcome(trained(variant, scene, iterations, seed), scene))
+    return outcomes
+
+
+NUMBERS = ("n", "psnr_edges", "psnr_smooth", "psnr", "anisotropy", "n_smooth")
+
+
+def summarise(outcomes: dict[str, list[Outcome]]) -> dict[str, Any]:
+    """Return the numbers of every training, by variant."""
+    return {
+        name: {key: [getattr(outcome, key) for outcome in found] for key in NUMBERS} for name, found in outcomes.items()
+    }
+
+
+def draw(outcomes: dict[str, list[Outcome]], beta: float, weight: float) -> Figure:
+    """Draw the photograph and, of each variant, its picture and its Gaussians on the card."""
+    figure = Figure(figsize=(12, 3.7), layout="constrained")
+    names = list(outcomes)
+    target = checker_scene(0).test_views[-1].image / 255
+    rows = figure.subplots(2, len(names) + 1)
+    rows[0, 0].imshow(target)
+    rows[0, 0].set_title("held-out photograph", fontsize=9)
+    rows[1, 0].axis("off")
+    for column, name in enumerate(names, 1):
+        result, color = outcomes[name][0], variants(beta, weight)[name].color
+        upper, lower = rows[:, column]
+        upper.imshow(result.picture)
+        edges, smooth = psnr_of(result.picture[:, : WIDTH // 2], target[:, : WIDTH // 2]), result.psnr_smooth
+        upper.set_title(f"{name}: checker {edges:.1f}, ramp {smooth:.1f} dB", fontsize=9)
+        lower.scatter(*result.gaussians.means[:, :2].T, s=3, color=color, lw=0)
+        lower.axvline(0, color="#4a5560", lw=0.8)
+        lower.set(xlim=(-2.2, 2.2), ylim=(1.6, -1.6), aspect="equal")
+        lower.set_title(f"{result.n} Gaussians, {result.n_smooth} on the ramp", fontsize=9)
+    for axes in rows.ravel():
+        axes.set(xticks=[], yticks=[])
+    return figure

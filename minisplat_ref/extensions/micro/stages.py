@@ -1,0 +1,25 @@
+"""What the gradient proof checks of Micro-splatting: the trace penalty."""
+
+import numpy as np
+
+from minisplat_ref.backends import Backend
+from minisplat_ref.extensions.micro.reference import trace_penalty, trace_penalty_vjp, traces
+from minisplat_ref.oracle.differences import Point
+from minisplat_ref.oracle.setting import Setting
+from minisplat_ref.oracle.stages import Stage
+from minisplat_ref.types import Floats
+
+
+def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
+    """Return the penalty with a limit that half of the Gaussians exceed; no backend has a form of its own."""
+    log_scales = setting.gaussians.log_scales
+    ordered, middle = np.sort(traces(log_scales)), len(log_scales) // 2
+    limit = float(ordered[middle - 1 : middle + 1].mean())  # at none of them, or it would have no derivative
+
+    def function(log_scales: Floats) -> Point:
+        return Point((np.asarray(trace_penalty(log_scales, limit)),), (traces(log_scales) > limit,))
+
+    def vjp(v_penalty: Floats) -> tuple[Floats, ...]:
+        return (trace_penalty_vjp(log_scales, limit, float(v_penalty)),)
+
+    return (Stage("trace_penalty", {"log_scales": log_scales}, ("penalty",), function, vjp),)

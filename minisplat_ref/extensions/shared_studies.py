@@ -1,0 +1,144 @@
+"""What studies of several extensions share: their folder, the scene that they train on, and pictures at other scales.
+
+At scale z a picture has z times as many pixels a side. A smaller photograph is the mean over blocks of pixels, which is
+what a sensor with larger pixels would have measured.
+"""
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
+from minisplat_ref.errors import InputError
+from minisplat_ref.types import Camera, Floats, Scene
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+PNG_DPI = 150
+GRID_COLOR = "#e6eaee"
+
+
+def add_out(parser: argparse.ArgumentParser) -> None:
+    """Add ``--out``."""
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="new folder for result.json and figure.png"
+    )
+
+
+def add_scene(parser: argparse.ArgumentParser, downscale: int, iterations: int) -> None:
+    """Add a scene of any kind, ``--downscale``, ``--iterations``, ``--seeds`` and ``--out``."""
+    parser.add_argument(
+        "scene",
+        nargs="?",
+        default="room",
+        metavar="SCENE",
+        help=f"folder of a scene, or a synthetic one: {', '.join(SCENE_NAMES)} (default room)",
+    )
+    parser.add_argument(
+        "--downscale", type=int, default=downscale, metavar="D", help=f"train at 1/D of its size (default {downscale})"
+    )
+    parser.add_argument("--iterations", type=int, default=iterations, metavar="N", help=f"default {iterations}")
+    parser.add_argument("--seeds", type=int, default=2, metavar="N", help="from 0 on, of the trainings (default 2)")
+    add_out(parser)
+
+
+def check_at_least(least: int, **numbers: int) -> None:
+    """Refuse arguments that are too small, one line.
+
+    Raises
+    ------
+    InputError
+        One of them is below ``least``.
+    """
+    for name, number in numbers.items():
+        if number < least:
+            raise InputError(f"--{name} is {number}: give at least {least}")
+
+
+def read_scene(source: str) -> Scene:
+    """Load a folder at its full size, or make the synthetic scene of that name.
+
+    Raises
+    ------
+    InputError
+        It is neither, or has no test views to measure.
+    """
+    from minisplat_ref.io import load_scene
+
+    if Path(source).exists():
+        scene = load_scene(source)
+    elif source in SCENE_NAMES:
+        scene = make_scene(source).scene
+    else:
+        raise InputError(f"{source}: neither a folder nor one of {', '.join(SCENE_NAMES)}; give a scene")
+    if not scene.test_views:
+        raise InputError(f"scene {scene.name} has no test views to measure: add photographs")
+    return scene
+
+
+def zoomed(camera: Camera, scale: float) -> Camera:
+    """Return the camera with ``scale`` times as many pixels a side, rounded down; the edge pixels are cut off.
+
+    The focal length is exactly ``scale`` times the old one, so that a block of old pixels is exactly one new pixel.
+    """
+    width, height = int(camera.width * scale), int(camera.height * scale)
+    return camera._replace(
+        fx=camera.fx * scale,
+        fy=camera.fy * scale,
+        cx=camera.cx * scale,
+        cy=camera.cy * scale,
+        width=width,
+        height=height,
+    )
+
+
+def block_means(image: Floats, n: int) -> Floats:
+    """Return the means [H // n, W // n, D] over blocks of n x n pixels; what is left at the edges is cut off."""
+    height, width = image.shape[0] // n, image.shape[1] // n
+    blocks = image[: height * n, : width * n].reshape(height, n, width, n, -1)
+    means: Floats = blocks.mean(axis=(1, 3))
+    return means
+
+
+def shrunk(scene: Scene, n: int) -> Scene:
+    """Return the scene with photographs of 1/n of the size, by :func:`block_means`.
+
+    Raises
+    ------
+    InputError
+        A photograph has fewer than 16 n pixels a side.
+    """
+    if n == 1:
+        return scene
+    views = []
+    for view in scene.train_views:
+        photograph = view.loaded()
+        camera = zoomed(photograph.camera, 1 / n)
+        if min(camera.width, camera.height) < 16:
+            raise InputError(f"photograph {view.name} at 1/{n} of its size has fewer than 16 pixels: lower --downscale")
+        image = np.rint(block_means(photograph.image.astype(np.float64), n)).astype(np.uint8)
+        views.append(photograph._replace(camera=camera, image=image, mask=None))
+    return scene._replace(train_views=tuple(views))
+
+
+def psnr_of(image: Floats, target: Floats) -> float:
+    """Return the PSNR of a picture that is clipped to [0, 1], dB."""
+    return float(-10 * np.log10(np.mean((np.clip(image, 0, 1).astype(np.float64) - target) ** 2)))
+
+
+def tidy(axes: "Axes") -> None:
+    """Take away the frame above and on the right, and draw a pale grid."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(color=GRID_COLOR)
+    axes.set_axisbelow(True)
+
+
+def write(folder: Path, result: dict[str, Any], figure: "Figure") -> None:
+    """Write the results and the figure into a folder that exists."""
+    (folder / "result.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    figure.savefig(folder / "figure.png", dpi=PNG_DPI, facecolor="white")

@@ -1,0 +1,261 @@
+"""Anti-aliasing: sampling intervals, the 3D filter and its gradient, where it is 3DGS, training end to end."""
+
+import json
+
+import numpy as np
+import pytest
+from gradcheck import check_jacobian
+from numpy.testing import assert_allclose, assert_array_equal
+from scenes import as_dtype, make_camera, make_gaussians
+from tolerances import CLOSED_FORM, COVERAGE_MIN, PARITY_FLOAT64, ROUNDED_TO_FLOAT32
+
+from minisplat_ref import load_ply, save_ply
+from minisplat_ref.backends import REFERENCE
+from minisplat_ref.cli import main
+from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.datasets.synthetic.files import write_scene
+from minisplat_ref.experiments.progress import Progress
+from minisplat_ref.extensions import shared_studies
+from minisplat_ref.extensions.antialiasing.method import (
+    EPS2D,
+    FILTERED,
+    MIP,
+    FilteredGaussians,
+    unfiltered,
+    with_3d_filter,
+)
+from minisplat_ref.extensions.antialiasing.reference import sampling_intervals, smoothed, smoothed_vjp
+from minisplat_ref.oracle.models import check_model_gradients
+from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.types import Gaussians, Model, View, view_from
+
+
+def with_filters(gaussians, sigmas):
+    return FilteredGaussians(**gaussians._asdict(), filter_sigmas=np.asarray(sigmas, gaussians.means.dtype))
+
+
+# --- how finely a Gaussian was seen ---
+
+
+def test_the_nearest_camera_that_sees_it_counts():
+    near, far = make_camera(fx=30.0, fy=28.0), make_camera(fx=30.0, fy=45.0)
+    far = far._replace(cam_from_world_t=np.array([0.0, 0.0, 6.0]))
+    means = np.array([[0.0, 0, 3], [0, 0, -3], [5, 0, 3], [0, 0, 0.1], [100, 0, 3]])
+    found = sampling_intervals(means, [near, far])
+    assert_allclose(found[0], 3 / 30, rtol=CLOSED_FORM)
+    assert_allclose(found[1], 3 / 45, rtol=CLOSED_FORM)  # behind the near one
+    # The third is outside of the near image, and of the far one beyond the margin: 30 * 5 / 9 = 16.7 > 0.65 * 24.
+    assert_allclose(found[[2, 4]], found[[0, 1, 3]].max(), rtol=CLOSED_FORM)
+    assert_allclose(found[3], 6.1 / 45, rtol=CLOSED_FORM)  # nearer to the near one than 0.2
+    assert_array_equal(sampling_intervals(means[4:], [near]), 0)
+    assert sampling_intervals(np.zeros((0, 3)), [near]).shape == (0,)
+
+
+# --- the filter ---
+
+
+def test_a_filtered_gaussian_by_hand():
+    """Deviations 3, 4 and 12 with a filter of 4: 5, sqrt(32) and sqrt(160); the opacity keeps the integral."""
+    scales, opacity = np.array([[3.0, 4, 12]]), 0.7
+    found, logits = smoothed(np.log(scales), np.log([opacity / (1 - opacity)]), np.array([4.0]))
+    expected = np.sqrt([[25.0, 32, 160]])
+    assert_allclose(np.exp(found), expected, rtol=CLOSED_FORM)
+    assert_allclose(1 / (1 + np.exp(-logits)), opacity * scales.prod() / expected.prod(), rtol=CLOSED_FORM)
+
+
+def test_the_gradient_of_the_filter(rng):
+    inputs = [rng.normal(size=(5, 3)), 2 * rng.normal(size=5), rng.uniform(0.3, 2, 5)]
+    check_jacobian(smoothed, lambda *v: smoothed_vjp(*inputs, *v), inputs, names=["log_scales", "logits", "sigmas"])
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_filters_of_zero_change_no_bit(dtype, rng):
+    log_scales, logits = rng.normal(size=(50, 3)).astype(dtype), (9 * rng.normal(size=50)).astype(dtype)
+    v = rng.normal(size=(50, 3)).astype(dtype), rng.normal(size=50).astype(dtype)
+    zeros = np.zeros(50, dtype)
+    for found, expected in zip(smoothed(log_scales, logits, zeros), (log_scales, logits), strict=True):
+        assert found.tobytes() == expected.tobytes()
+    for found, expected in zip(smoothed_vjp(log_scales, logits, zeros, *v), v, strict=False):
+        assert found.tobytes() == expected.tobytes()
+
+
+@pytest.mark.parametrize("log_scale", [-80.0, 0.0, 80.0])
+@pytest.mark.parametrize("logit", [-200.0, 0.0, 200.0])
+def test_extremes_stay_finite(log_scale, logit):
+    arrays = np.full((1, 3), log_scale, np.float32), np.array([logit], np.float32), np.ones(1, np.float32)
+    with np.errstate(over="raise", invalid="raise"):
+        found = smoothed(*arrays)
+        v = smoothed_vjp(*arrays, np.ones((1, 3), np.float32), np.ones(1, np.float32))
+    assert all(np.isfinite(array).all() for array in (*found, *v))
+    assert all(array.dtype == np.float32 for array in (*found, *v))
+
+
+def test_the_image_keeps_its_mass_when_a_gaussian_is_filtered():
+    """A faint sphere far away and a filter of its size: four times the area, and as much light in the image."""
+    still = as_dtype(make_gaussians(np.random.default_rng(0), 1, sh_degree=0), np.float64)._replace(
+        means=np.array([[0.0, 0, 10]]),
+        quats=np.array([[1.0, 0, 0, 0]]),
+        log_scales=np.log(np.full((1, 3), 1.5)),
+        opacity_logits=np.array([2.0]),
+        sh_dc=np.ones((1, 3)),
+    )
+    camera, sums = make_camera(96, 96, fx=40.0, fy=40.0), []
+    for sigma in (0.0, 1.5):
+        request = Request(backend=REFERENCE, conventions=GSPLAT_MAIN._replace(alpha_min=1e-6))
+        image = MIP.render(Model(with_filters(still, [sigma])), view_from(camera), request)[0].image
+        sums.append(image.sum())
+    # The 3D integral is kept, so what a ray collects sinks as the depth grows: by s / s' = 1 / sqrt(2).
+    assert sums[1] / sums[0] == pytest.approx(np.sqrt(0.5), rel=1e-3)  # truncated at three and a half deviations
+
+
+# --- where it is 3DGS ---
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_without_filters_it_is_3dgs_exactly(backend, dtype, rng):
+    """The 3D filter alone around 3DGS's renderer; and the 2D filter is 3DGS's compensation with another variance."""
+    gaussians, view = as_dtype(make_gaussians(rng, 40), dtype), view_from(make_camera(rng=rng))
+    zero = unfiltered(gaussians, rng)
+    mip = GSPLAT_MAIN._replace(eps2d=EPS2D, is_antialiased=True)
+    for renderer, conventions in ((with_3d_filter(SPLATTING), GSPLAT_MAIN), (MIP, mip)):
+        ours, tape = renderer.render(Model(zero), view, Request(backend=backend))
+        theirs, other = SPLATTING.render(Model(gaussians), view, Request(backend=backend, conventions=conventions))
+        assert ours.alpha.mean() > COVERAGE_MIN
+        assert_array_equal(ours.image, theirs.image)
+        v_image = rng.normal(size=ours.image.shape).astype(dtype)
+        v, v_other = renderer.render_vjp(tape, v_image, None), SPLATTING.render_vjp(other, v_image, None)
+        for name in Gaussians._fields:
+            assert getattr(v.gaussians, name).tobytes() == getattr(v_other.gaussians, name).tobytes(), name
+
+
+def test_filters_change_the_picture(backend, rng):
+    gaussians, view = make_gaussians(rng, 40), view_from(make_camera(rng=rng))
+    images = [
+        MIP.render(Model(with_filters(gaussians, np.full(40, sigma))), view, Request(backend=backend))[0].image
+        for sigma in (0.0, 0.1)
+    ]
+    assert np.abs(images[1] - images[0]).max() > 0.05
+
+
+def test_the_gradient_of_the_whole_model(backend):
+    report = check_model_gradients(backend, GSPLAT_MAIN, FILTERED)
+    assert len(report.cases) == 2 and report.n_failed == 0, report.cases
+
+
+def test_a_wrong_gradient_is_found():
+    def wrong(tape, v_image, v_alpha):
+        v = MIP.render_vjp(tape, v_image, v_alpha)
+        return v._replace(gaussians=v.gaussians._replace(log_scales=(1 + 1e-6) * v.gaussians.log_scales))
+
+    spoilt = FILTERED._replace(renderer=MIP._replace(render_vjp=wrong))
+    report = check_model_gradients(REFERENCE, GSPLAT_MAIN, spoilt)
+    assert report.n_failed == 2 and "log_scales is wrong" in report.cases[0].note
+
+
+# --- what the studies measure with ---
+
+
+def test_blocks_and_cameras_fit():
+    """A picture at a third of the size is the mean over blocks of what the camera with a third of the pixels sees."""
+    image = np.arange(7 * 10 * 3, dtype=float).reshape(7, 10, 3)
+    small = shared_studies.block_means(image, 3)
+    assert small.shape == (2, 3, 3)
+    assert_allclose(small[1, 2], image[3:6, 6:9].mean(axis=(0, 1)), rtol=PARITY_FLOAT64)
+    camera = shared_studies.zoomed(make_camera(10, 7, fx=30.0, fy=28.0), 1 / 3)
+    assert (camera.width, camera.height) == (3, 2)
+    assert_allclose([camera.fx, camera.cx], [10, 5 / 3], rtol=CLOSED_FORM)
+
+
+def test_a_photograph_cannot_shrink_to_nothing():
+    scene = make_scene("room", n_views=2, width=32, height=24, supersampling=1, n_points=10).scene
+    with pytest.raises(shared_studies.InputError, match="lower --downscale"):
+        shared_studies.shrunk(scene, 2)
+    bigger = shared_studies.shrunk(scene._replace(train_views=(View("a", make_camera(64, 48), BLACK, None),)), 3)
+    assert bigger.train_views[0].image.shape == (16, 21, 3)
+
+
+BLACK = np.zeros((48, 64, 3), np.uint8)
+
+# --- from end to end ---
+
+SCENE = {"n_views": 6, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
+TRAIN = ["--recipe", "antialiasing", "--test-every", "4", "--seed", "3", "--iterations", "30"]
+
+
+@pytest.fixture(scope="module")
+def scene_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scenes") / "nook"
+    write_scene(make_scene("room", supersampling=1, **SCENE), folder, SCENE)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run_folder(scene_folder, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "finished"
+    assert main(["train", str(scene_folder), *TRAIN, "--out", str(folder)]) == 0
+    return folder
+
+
+def test_training_measures_filters_and_the_ply_keeps_them(run_folder, tmp_path, capsys):
+    gaussians = load_ply(run_folder / "point_cloud.ply", FilteredGaussians)
+    assert (gaussians.filter_sigmas > 0).all()
+    save_ply(tmp_path / "again.ply", gaussians)
+    assert (tmp_path / "again.ply").read_bytes() == (run_folder / "point_cloud.ply").read_bytes()
+    assert main(["info", str(run_folder / "point_cloud.ply")]) == 0
+    assert "filter_sigmas" in capsys.readouterr().out
+
+
+def test_interrupted_then_resumed_gives_the_same_bytes(scene_folder, run_folder, tmp_path, monkeypatch):
+    report_step = Progress.__call__
+
+    def interrupt(progress, report):
+        report_step(progress, report)
+        if report.step == 17:
+            raise KeyboardInterrupt
+
+    folder = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(Progress, "__call__", interrupt)
+        assert main(["train", str(scene_folder), *TRAIN, "--out", str(folder)]) == 130
+    assert main(["train", "--resume", str(folder)]) == 0
+    assert (folder / "point_cloud.ply").read_bytes() == (run_folder / "point_cloud.ply").read_bytes()
+
+
+def test_a_ply_is_drawn_with_its_filters_and_one_without_is_refused(run_folder, tmp_path, capsys):
+    ply, options = str(run_folder / "point_cloud.ply"), ["--cameras", str(run_folder / "cameras.json")]
+    for name, extension in (("ours", ["--extension", "antialiasing"]), ("theirs", [])):
+        assert main(["render", ply, *options, *extension, "--out", str(tmp_path / name)]) == 0
+    pictures = [{p.name: p.read_bytes() for p in (tmp_path / name).glob("*.png")} for name in ("ours", "theirs")]
+    assert pictures[0].keys() == pictures[1].keys() and pictures[0] != pictures[1]
+    save_ply(tmp_path / "plain.ply", load_ply(ply))
+    assert main(["render", str(tmp_path / "plain.ply"), "--extension", "antialiasing"]) == 2
+    assert "no property filter_sigmas" in capsys.readouterr().err
+
+
+def test_a_recipe_of_the_core_is_filtered_too(scene_folder, tmp_path):
+    """With the representation alone nothing measures filters: zero, and a column in the PLY."""
+    options = ["--extension", "antialiasing", "--test-every", "4", "--iterations", "5", "--out", str(tmp_path / "run")]
+    assert main(["train", str(scene_folder), *options]) == 0
+    assert_array_equal(load_ply(tmp_path / "run" / "point_cloud.ply", FilteredGaussians).filter_sigmas, 0)
+
+
+def test_it_trains_on_photographs(shared_data, tmp_path):
+    fox = str(shared_data / "fox")
+    options = ["--downscale", "4", "--recipe", "antialiasing", "--iterations", "20", "--out", str(tmp_path / "fox")]
+    assert main(["train", fox, *options]) == 0
+    sigmas = load_ply(tmp_path / "fox" / "point_cloud.ply", FilteredGaussians).filter_sigmas
+    assert sigmas.min() > 0 and np.ptp(sigmas) > ROUNDED_TO_FLOAT32
+
+
+def test_the_study_measures_all_recipes(tmp_path, capsys):
+    out, larger = tmp_path / "study", {**SCENE, "width": 64, "height": 48}
+    write_scene(make_scene("room", supersampling=1, **larger), tmp_path / "scene", larger)
+    options = [str(tmp_path / "scene"), "--downscale", "2", "--iterations", "30", "--seeds", "1", "--out", str(out)]
+    assert main(["study", "antialiasing/zoom", *options]) == 0
+    result = json.loads((out / "result.json").read_text())
+    assert result["zooms"] == [0.25, 0.5, 1.0, 2.0]
+    assert result["psnr"]["antialiasing"][0][0] > result["psnr"]["3dgs-accel"][0][0]  # from far
+    assert (out / "figure.png").stat().st_size > 10_000 and "| analytic " in capsys.readouterr().out
+    assert main(["study", "antialiasing/zoom", "nowhere", "--out", str(tmp_path / "none")]) == 2
+    assert "neither a folder nor one of" in capsys.readouterr().err and not (tmp_path / "none").exists()
