@@ -31,13 +31,11 @@
 # pixels, x right, y down, and the centre of the top-left pixel is (0.5, 0.5).
 
 # %%
-import ast
-import inspect
-
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.patches import Ellipse, Rectangle
+from matplotlib.patches import Rectangle
 
+from figures import BLUE, GREEN, GREY, RED, YELLOW, draw_ellipses, show_code, show_pixels
 from minisplat_ref.constants import GSPLAT_MAIN, INRIA
 from minisplat_ref.datasets.synthetic.cameras import look_at
 from minisplat_ref.reference.compositing import composite
@@ -47,16 +45,6 @@ from minisplat_ref.reference.projection import project
 from minisplat_ref.reference.tiling import bin_gaussians
 from minisplat_ref.types import Camera, TileGrid
 
-plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
-RED, BLUE, YELLOW, GREEN, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#8a8580"
-
-
-def show_code(function):
-    """Print a function of the package without its docstring."""
-    source = inspect.getsource(function)
-    lines, body = source.splitlines(), ast.parse(source).body[0].body
-    print(*lines[: body[0].lineno - 1], *lines[body[1].lineno - 1 :], sep="\n")
-
 
 def ellipsoid(mean, covariance, n_sigmas=1.0, n=40):
     """Surface points of an ellipsoid: any square root of the covariance maps the unit sphere onto it."""
@@ -65,14 +53,6 @@ def ellipsoid(mean, covariance, n_sigmas=1.0, n=40):
         [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1
     )  # [n, n, 3]
     return np.moveaxis(mean + n_sigmas * sphere @ np.linalg.cholesky(covariance).T, -1, 0)
-
-
-def draw_ellipse(axes, mean, covariance, n_sigmas, **style):
-    """Draw the contour of a 2D Gaussian."""
-    variances, directions = np.linalg.eigh(covariance)
-    width, height = 2 * n_sigmas * np.sqrt(np.maximum(variances, 0))
-    angle = np.degrees(np.arctan2(directions[1, 0], directions[0, 0]))
-    axes.add_patch(Ellipse(mean, width, height, angle=angle, fill=False, **style))
 
 
 def covariance2d(projection, n=0):
@@ -85,13 +65,6 @@ def splat(projection, colors, camera, conventions=GSPLAT_MAIN, background=(0.97,
     """Image of projected Gaussians: the stages of notebook 03."""
     bins = bin_gaussians(projection, TileGrid(camera.width, camera.height, 16, 16), conventions)
     return composite(projection, np.array(colors, float), np.array(background), bins, conventions)
-
-
-def show_image(axes, image, title=""):
-    """Show an image in pixel coordinates, the top-left corner at (0, 0)."""
-    height, width = image.shape[:2]
-    axes.imshow(np.clip(image, 0, 1), extent=(0, width, height, 0), interpolation="nearest")
-    axes.set(title=title, xlabel="x [px]", ylabel="y [px]")
 
 
 # %% [markdown]
@@ -124,9 +97,9 @@ space.set(xlabel="x [m]", ylabel="y [m]", title="world frame, z up: ellipsoid at
 space.set(xlim=(-0.6, 1.7), ylim=(-1.7, 0.6), zlim=(0, 1.6), xticks=(0, 1), yticks=(-1, 0), zticks=(0, 1))
 space.set_box_aspect((2.3, 2.3, 1.6), zoom=1.25)
 space.view_init(elev=18, azim=25)
-show_image(image, splat(projection, [[0.82, 0.29, 0.25]], camera).image, "image: the splat and its ellipses")
+show_pixels(image, splat(projection, [[0.82, 0.29, 0.25]], camera).image, "image: the splat and its ellipses")
 for n_sigmas in (1, 2, 3):
-    draw_ellipse(image, projection.means2d[0], covariance2d(projection), n_sigmas, color=BLUE, linewidth=1)
+    draw_ellipses(image, projection.means2d[0], covariance2d(projection), n_sigmas, color=BLUE, linewidth=1)
 image.plot(*projection.means2d[0], "+", color=BLUE)
 plt.show()
 
@@ -194,7 +167,7 @@ for axes, title, position, scales in (
     sharp = GSPLAT_MAIN._replace(eps2d=0.0)  # without the low-pass of the next section
     footprint = project(means, unrotated, scales, opacity, axis_camera, sharp)
     axes.plot(*pixels.T, ".", markersize=1.2, color=YELLOW, label="exact: samples through the pinhole")
-    draw_ellipse(axes, footprint.means2d[0], covariance2d(footprint), 2, color=BLUE, linewidth=1.8)
+    draw_ellipses(axes, footprint.means2d[0], covariance2d(footprint), 2, color=BLUE, linewidth=1.8)
     axes.plot([], [], color=BLUE, label="first order, two standard deviations")
     axes.set(xlim=(0, 120), ylim=(90, 0), aspect="equal", title=title, xlabel="x [px]", ylabel="y [px]")
     axes.legend(loc="upper left", fontsize=8, markerscale=6)
@@ -229,8 +202,8 @@ figure, panels = plt.subplots(2, 2, figsize=(10, 5.6))
 panels = panels.ravel()
 for axes, (title, conventions) in zip(panels, choices.items(), strict=False):
     footprint = project(needle_mean, needle_quat, needle_scale, opacity, small_camera, conventions)
-    show_image(axes, splat(footprint, [[0.82, 0.29, 0.25]], small_camera, conventions).image, title)
-    draw_ellipse(axes, footprint.means2d[0], covariance2d(footprint), 2, color=BLUE, linewidth=0.8)
+    show_pixels(axes, splat(footprint, [[0.82, 0.29, 0.25]], small_camera, conventions).image, title)
+    draw_ellipses(axes, footprint.means2d[0], covariance2d(footprint), 2, color=BLUE, linewidth=0.8)
 
 widths_px = np.geomspace(0.03, 3, 25)  # standard deviation across the needle
 drawn = {}
@@ -287,7 +260,7 @@ for label, (low, high), style, color in (
     ("frozen as in gsplat", limits["gsplat"], "-", BLUE),
 ):
     J = pinhole_jacobians(aside, off_center, low, high)[0]
-    draw_ellipse(right, pinhole(aside, off_center)[0], J @ ball @ J.T, 3, color=color, linestyle=style, label=label)
+    draw_ellipses(right, pinhole(aside, off_center)[0], J @ ball @ J.T, 3, color=color, linestyle=style, label=label)
     reach[label] = pinhole(aside, off_center)[0, 0] - 3 * np.sqrt((J @ ball @ J.T)[0, 0])
 right.set(xlim=(-40, 800), ylim=(290, -200), aspect="equal", xlabel="x [px]", ylabel="y [px]")
 right.set(title="a ball beside the image, three st. dev.")
@@ -319,8 +292,8 @@ for axes, o in zip(panels, (0.95, 0.03), strict=True):
         label = f"{name}: {(x1 - x0) * (y1 - y0)} pixels"
         axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, color=color, linewidth=1.8, label=label))
     n_sigmas = np.sqrt(2 * np.log(255 * o))
-    draw_ellipse(axes, footprint.means2d[0], covariance2d(footprint), n_sigmas, color=BLUE, label="alpha = 1/255")
-    show_image(axes, output.image, f"opacity {o}: visible up to {n_sigmas:.2f} st. dev.")
+    draw_ellipses(axes, footprint.means2d[0], covariance2d(footprint), n_sigmas, color=BLUE, label="alpha = 1/255")
+    show_pixels(axes, output.image, f"opacity {o}: visible up to {n_sigmas:.2f} st. dev.")
     axes.set(xticks=range(0, 121, 16), yticks=range(0, 91, 16))
     axes.grid(color=GREY, linewidth=0.4)
     axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3)
@@ -341,9 +314,9 @@ distance, sideways = 3.0, 0.5
 
 mine = project(np.array([[sideways, 0.0, distance]]), my_quat, my_scale, np.array([0.9]), axis_camera, GSPLAT_MAIN)
 figure, axes = plt.subplots(figsize=(5, 3.6))
-show_image(axes, splat(mine, [[0.21, 0.38, 0.55]], axis_camera).image, "yours")
+show_pixels(axes, splat(mine, [[0.21, 0.38, 0.55]], axis_camera).image, "yours")
 if mine.radii[0, 0] > 0:  # zero when culled
-    draw_ellipse(axes, mine.means2d[0], covariance2d(mine), 2, color=RED)
+    draw_ellipses(axes, mine.means2d[0], covariance2d(mine), 2, color=RED)
 plt.show()
 print(f"depth {mine.depths[0]:.2f} m, radii {mine.radii[0]} px, box {mine.boxes[0]}")
 

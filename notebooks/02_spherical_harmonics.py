@@ -25,12 +25,10 @@
 # the Gaussian*. Colours are sRGB values in [0, 1], blended as they are, without conversion to linear light.
 
 # %%
-import ast
-import inspect
-
 import matplotlib.pyplot as plt
 import numpy as np
 
+from figures import show_code
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic.cameras import look_at
@@ -38,15 +36,6 @@ from minisplat_ref.reference.compositing import composite
 from minisplat_ref.reference.spherical_harmonics import sh_basis, sh_colors
 from minisplat_ref.rendering import render
 from minisplat_ref.types import Gaussians, TileGrid
-
-plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
-
-
-def show_code(function):
-    """Print a function of the package without its docstring."""
-    source = inspect.getsource(function)
-    lines, body = source.splitlines(), ast.parse(source).body[0].body
-    print(*lines[: body[0].lineno - 1], *lines[body[1].lineno - 1 :], sep="\n")
 
 
 def globe(n=90, azimuth=-50.0, elevation=25.0):

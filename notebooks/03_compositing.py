@@ -30,12 +30,12 @@
 # top-left pixel is (0.5, 0.5). Depth is camera z, here in metres.
 
 # %%
-import ast
 import inspect
 
 import matplotlib.pyplot as plt
 import numpy as np
 
+from figures import BLUE, GREEN, GREY, PLUM, RED, YELLOW, show_code, show_pixels
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
@@ -47,25 +47,6 @@ from minisplat_ref.reference.projection import project
 from minisplat_ref.reference.tiling import bin_gaussians
 from minisplat_ref.rendering import render
 from minisplat_ref.types import Camera, Gaussians, TileGrid
-
-plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
-RED, BLUE, YELLOW, GREEN, PLUM, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#7a2848", "#8a8580"
-
-
-def show_code(function):
-    """Print a function of the package without its docstring."""
-    source = inspect.getsource(function)
-    lines, body = source.splitlines(), ast.parse(source).body[0].body
-    print(*lines[: body[0].lineno - 1], *lines[body[1].lineno - 1 :], sep="\n")
-
-
-def show_image(axes, image, title="", **style):
-    """Show an image in pixel coordinates, the top-left corner at (0, 0)."""
-    height, width = image.shape[:2]
-    shown = axes.imshow(image, extent=(0, width, height, 0), interpolation="nearest", **style)
-    axes.set(title=title, xlabel="x [px]", ylabel="y [px]")
-    return shown
-
 
 # %% [markdown]
 # ## The stack behind one pixel
@@ -107,7 +88,7 @@ weights = alphas * transmittances[:-1]
 
 figure = plt.figure(figsize=(10.5, 3.4))
 panels = figure.subplots(1, 4, width_ratios=(1.7, 1, 1, 1))
-show_image(panels[0], output.image, "five Gaussians and one pixel")
+show_pixels(panels[0], output.image, "five Gaussians and one pixel")
 panels[0].plot(pixel_x + 0.5, pixel_y + 0.5, "s", color="black", fillstyle="none", markersize=6)
 labels = [f"{projection.depths[i]:.1f}" for i in ids] + ["bg"]
 hit_colors = [*colors[ids], background]
@@ -214,8 +195,8 @@ seen = room.scene.test_views[1]
 fine_output, fine_tape = render(fine, seen.camera, backend=REFERENCE)
 fine_image = np.clip(fine_output.image, 0, 1)
 figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.5))
-show_image(left, seen.image, "ray-traced photograph, not used")
-show_image(right, fine_image, f"{len(fine.means):,} lifted Gaussians, from the same viewpoint")
+show_pixels(left, seen.image, "ray-traced photograph, not used")
+show_pixels(right, fine_image, f"{len(fine.means):,} lifted Gaussians, from the same viewpoint")
 plt.show()
 
 # %% [markdown]
@@ -230,7 +211,7 @@ room_grid = TileGrid(96, 72, 16, 16)
 room_bins = bin_gaussians(fine_tape.projection, room_grid, GSPLAT_MAIN)
 n_pairs = np.diff(room_bins.tile_offsets).reshape(room_grid.n_tiles_y, room_grid.n_tiles_x)
 figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.5))
-show_image(left, fine_image, "Gaussians listed in each tile")
+show_pixels(left, fine_image, "Gaussians listed in each tile")
 left.imshow(n_pairs, extent=(0, 96, 80, 0), cmap="inferno", alpha=0.45)
 for row in range(room_grid.n_tiles_y):
     for tile_column in range(room_grid.n_tiles_x):
@@ -284,7 +265,7 @@ for axes, degrees in zip(panels, (-0.5, 0.5), strict=True):
     overlap_colors[degrees] = turned_output.image[30, 40]
     near, far = turned_tape.projection.depths[[0, 1]]
     title = f"turned by {degrees:+}°\nyellow at {near:.4f} m, blue at {far:.4f} m"
-    show_image(axes, np.clip(turned_output.image, 0, 1), title)
+    show_pixels(axes, np.clip(turned_output.image, 0, 1), title)
 plt.show()
 
 # %% [markdown]
@@ -313,9 +294,9 @@ layer_output, _ = render(layers, camera, backend=REFERENCE, with_depth=True, wit
 expected = expected_depth(layer_output.image[..., 3], layer_output.alpha)
 median = layer_output.median_depth
 figure, panels = plt.subplots(1, 4, figsize=(11.5, 2.6))
-show_image(panels[0], np.clip(layer_output.image[..., :3], 0, 1), "image")
-show_image(panels[1], expected, "expected depth", cmap="viridis", vmin=2, vmax=4)
-drawn = show_image(panels[2], median, "median depth", cmap="viridis", vmin=2, vmax=4)
+show_pixels(panels[0], np.clip(layer_output.image[..., :3], 0, 1), "image")
+show_pixels(panels[1], expected, "expected depth", cmap="viridis", vmin=2, vmax=4)
+drawn = show_pixels(panels[2], median, "median depth", cmap="viridis", vmin=2, vmax=4)
 figure.colorbar(drawn, ax=panels[2], label="m", shrink=0.7, location="left", pad=0.02)
 panels[3].plot(np.arange(80) + 0.5, expected[30], color=RED, label="expected")
 panels[3].plot(np.arange(80) + 0.5, median[30], color=BLUE, label="median")
@@ -336,8 +317,8 @@ coarse_output, _ = render(coarse, seen.camera, backend=REFERENCE, with_stats=Tru
 stats = coarse_output.stats
 palette = np.vstack([[0.1, 0.1, 0.1], 0.25 + 0.75 * np.random.default_rng(3).random((len(coarse.means), 3))])
 figure, panels = plt.subplots(1, 3, figsize=(11.5, 3))
-show_image(panels[0], np.clip(coarse_output.image, 0, 1), f"{len(coarse.means)} coarse Gaussians")
-show_image(panels[1], palette[stats.dominant_ids + 1], "one colour for each dominant Gaussian")
+show_pixels(panels[0], np.clip(coarse_output.image, 0, 1), f"{len(coarse.means)} coarse Gaussians")
+show_pixels(panels[1], palette[stats.dominant_ids + 1], "one colour for each dominant Gaussian")
 is_drawn, wins = stats.hit_count > 0, stats.dominant_count > 0
 edges = np.linspace(0, stats.blend_weight_sum.max(), 40)
 heights = [stats.blend_weight_sum[is_drawn & ~wins], stats.blend_weight_sum[wins]]
@@ -362,7 +343,7 @@ my_means[0, 2] = 4.5  # the red one goes to the back
 mine = project(my_means, quats, scales, my_opacities, camera, GSPLAT_MAIN)
 my_output = composite(mine, colors, background, bin_gaussians(mine, grid, GSPLAT_MAIN), GSPLAT_MAIN, with_stats=True)
 figure, (left, right) = plt.subplots(1, 2, figsize=(8.5, 3.2))
-show_image(left, my_output.image, "yours")
+show_pixels(left, my_output.image, "yours")
 right.bar(names, my_output.stats.blend_weight_sum, color=colors)
 right.set(title="sum of weights over the image", ylabel="pixels")
 plt.show()

@@ -30,17 +30,16 @@
 # means $\partial L / \partial x$ and has the shape of $x$.
 
 # %%
-import ast
-import inspect
 import math
 from dataclasses import replace
 from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.patches import Ellipse, Rectangle
+from matplotlib.patches import Rectangle
 from scipy.optimize import brentq
 
+from figures import BLUE, GREY, RED, draw_ellipses, show_code, show_pixels
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.reference.compositing import composite, composite_vjp
@@ -49,32 +48,6 @@ from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.reference.tiling import bin_gaussians
 from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.types import Camera, Gaussians, Projection, TileGrid
-
-plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
-RED, BLUE, YELLOW, GREEN, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#8a8580"
-
-
-def show_code(function):
-    """Print a function of the package without its docstring."""
-    source = inspect.getsource(function)
-    lines, body = source.splitlines(), ast.parse(source).body[0].body
-    print(*lines[: body[0].lineno - 1], *lines[body[1].lineno - 1 :], sep="\n")
-
-
-def show_image(axes, image, title="", **style):
-    """Show an image in pixel coordinates, the top-left corner at (0, 0)."""
-    height, width = image.shape[:2]
-    image = np.clip(image, 0, 1) if image.ndim == 3 else image
-    axes.imshow(image, extent=(0, width, height, 0), interpolation="nearest", **style)
-    axes.set(title=title, xlabel="x [px]", ylabel="y [px]")
-
-
-def draw_ellipse(axes, mean, covariance, **style):
-    """Draw the contour of a 2D Gaussian at one standard deviation."""
-    variances, directions = np.linalg.eigh(covariance)
-    angle = np.degrees(np.arctan2(directions[1, 0], directions[0, 0]))
-    axes.add_patch(Ellipse(mean, *(2 * np.sqrt(variances)), angle=angle, fill=False, **style))
-
 
 # %% [markdown]
 # ## One pixel, three hits
@@ -131,9 +104,9 @@ p = Y * WIDTH + X  # the pixel's column in the arrays of a tile
 alphas, T = hits.alphas[:, p], hits.transmittances[:, p]  # [3], [4]
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6), width_ratios=[1.25, 1])
-show_image(left, output.image, "three Gaussians, one standard deviation drawn")
+show_pixels(left, output.image, "three Gaussians, one standard deviation drawn")
 for n, name in enumerate(("near", "middle", "far")):
-    draw_ellipse(left, inputs.means2d[n], covariances2d[n], edgecolor="black", linewidth=1)
+    draw_ellipses(left, inputs.means2d[n], covariances2d[n], edgecolor="black", linewidth=1)
     left.annotate(name, inputs.means2d[n], ha="center", va="center", fontsize=8)
 left.add_patch(Rectangle((X, Y), 1, 1, fill=False, edgecolor="black", linewidth=2))
 lights = [*(alphas * T[:3]), T[3]]
@@ -396,10 +369,10 @@ units = dict(zip(maps, ("", " / px", " / px", " px$^2$", " px$^2$", " px$^2$"), 
 figure, axes = plt.subplots(2, 3, figsize=(10, 5.2), sharex=True, sharey=True)
 for panel, (name, values) in zip(axes.ravel(), maps.items(), strict=True):
     reach = np.abs(values).max()
-    show_image(
+    show_pixels(
         panel, values, f"d image / d {name}   (±{reach:.2g}{units[name]})", cmap="RdBu_r", vmin=-reach, vmax=reach
     )
-    draw_ellipse(panel, inputs.means2d[0], covariances2d[0], edgecolor="black", linewidth=0.8)
+    draw_ellipses(panel, inputs.means2d[0], covariances2d[0], edgecolor="black", linewidth=0.8)
     panel.set(xticks=range(0, 25, 6), yticks=range(0, 19, 6))
     panel.add_patch(Rectangle((X, Y), 1, 1, fill=False, edgecolor="black", linewidth=1))
     panel.label_outer()

@@ -28,40 +28,16 @@
 # 1], pixel indices count from 0 at the top left. The loss has no unit.
 
 # %%
-import ast
-import inspect
-import os
-
-# Read when NumPy loads: the matrices here are small, and on a busy machine waiting threads cost more than they help.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Rectangle
 from scipy.ndimage import gaussian_filter
 
+from figures import BLUE, GREY, RED, YELLOW, show, show_code
 from minisplat_ref.constants import SSIM_SIGMA, SSIM_WINDOW
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.metrics import psnr
 from minisplat_ref.reference.loss import photometric_loss, photometric_loss_vjp, ssim_map, ssim_map_vjp
-
-plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
-RED, BLUE, YELLOW, GREEN, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#8a8580"
-
-
-def show_code(function):
-    """Print a function of the package without its docstring."""
-    source = inspect.getsource(function)
-    lines, body = source.splitlines(), ast.parse(source).body[0].body
-    print(*lines[: body[0].lineno - 1], *lines[body[1].lineno - 1 :], sep="\n")
-
-
-def show(axes, image, title="", **style):
-    """Show an image or a map without ticks."""
-    shown = axes.imshow(np.clip(image, 0, 1) if image.ndim == 3 else image, interpolation="nearest", **style)
-    axes.set(title=title, xticks=[], yticks=[])
-    return shown
-
 
 # %% [markdown]
 # ## Five errors of the same size

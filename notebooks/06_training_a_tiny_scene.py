@@ -32,18 +32,13 @@
 # which takes some twenty seconds once.
 
 # %%
-import ast
-import inspect
-import os
 from functools import partial
-
-# Read when NumPy loads: the matrices here are small, and on a busy machine waiting threads cost more than they help.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.collections import EllipseCollection
 
+from figures import BLUE, GREY, RED, YELLOW, show, show_code
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods import RECIPES, get_recipe
 from minisplat_ref.metrics import evaluate
@@ -51,26 +46,6 @@ from minisplat_ref.rendering import render
 from minisplat_ref.strategy import clone_split
 from minisplat_ref.training.loop import _change, _differentiate, initial_state, train
 from minisplat_ref.training.schedule import Every, scaled
-
-plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
-RED, BLUE, YELLOW, GREEN, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#8a8580"
-
-
-def show_code(function):
-    """Print a function of the package without its docstring."""
-    source = inspect.getsource(function)
-    lines, body = source.splitlines(), ast.parse(source).body[0].body
-    has_docstring = isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant)
-    first = body[1].lineno - 1 if has_docstring else body[0].lineno - 1
-    print(*lines[: body[0].lineno - 1], *lines[first:], sep="\n")
-
-
-def show(axes, image, title="", **style):
-    """Show an image or a map without ticks."""
-    shown = axes.imshow(np.clip(image, 0, 1) if image.ndim == 3 else image, interpolation="nearest", **style)
-    axes.set(title=title, xticks=[], yticks=[])
-    return shown
-
 
 # %% [markdown]
 # ## What goes in

@@ -32,21 +32,14 @@
 # wide and 2 high.
 
 # %%
-import ast
 import copy
-import inspect
-import os
 from functools import partial
-
-# Read when NumPy and Numba load: matrices and pictures are small here, and on a busy machine threads that wait for each
-# other cost more than they help.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.collections import EllipseCollection
 
+from figures import BLUE, GREY, RED, YELLOW, show, show_code
 from minisplat_ref.backends import CPU
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
@@ -58,24 +51,6 @@ from minisplat_ref.strategy.clone_split import clone_and_split, logit, random_ch
 from minisplat_ref.training.loop import initial_state, train
 from minisplat_ref.training.schedule import BLEND_STATS, During, Every
 from minisplat_ref.types import Camera, Gaussians
-
-plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
-RED, BLUE, YELLOW, GREEN, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#8a8580"
-
-
-def show_code(function):
-    """Print a function of the package without its docstring."""
-    source = inspect.getsource(function)
-    lines, body = source.splitlines(), ast.parse(source).body[0].body
-    print(*lines[: body[0].lineno - 1], *lines[body[1].lineno - 1 :], sep="\n")
-
-
-def show(axes, image, title="", **style):
-    """Show an image or a map without ticks."""
-    shown = axes.imshow(np.clip(image, 0, 1) if image.ndim == 3 else image, interpolation="nearest", **style)
-    axes.set(title=title, xticks=[], yticks=[])
-    return shown
-
 
 # %% [markdown]
 # ## One Gaussian, two photographs

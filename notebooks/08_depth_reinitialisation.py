@@ -32,18 +32,13 @@
 # metres, z up; camera axes are x right, y down, z forward; a depth is the camera z.
 
 # %%
-import ast
-import inspect
-import os
 from functools import partial
-
-# Read when NumPy loads: the matrices here are small, and on a busy machine waiting threads cost more than they help.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Ellipse
 
+from figures import BLUE, GREEN, GREY, RED, show, show_code
 from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
@@ -70,23 +65,7 @@ from minisplat_ref.training.loop import train
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Camera, Gaussians, view_from
 
-plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
-RED, BLUE, YELLOW, GREEN, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#8a8580"
 KINDS = {"mid-point": (midpoint_points, BLUE), "centre": (centre_points, GREEN), "blended": (blended_points, RED)}
-
-
-def show_code(function):
-    """Print a function of the package without its docstring."""
-    source = inspect.getsource(function)
-    lines, body = source.splitlines(), ast.parse(source).body[0].body
-    print(*lines[: body[0].lineno - 1], *lines[body[1].lineno - 1 :], sep="\n")
-
-
-def show(axes, image, title="", **style):
-    """Show an image or a map without ticks."""
-    shown = axes.imshow(np.clip(image, 0, 1) if image.ndim == 3 else image, interpolation="nearest", **style)
-    axes.set(title=title, xticks=[], yticks=[])
-    return shown
 
 
 # %% [markdown]

@@ -31,21 +31,14 @@
 # once.
 
 # %%
-import ast
-import inspect
 import itertools
-import os
-
-# Read when NumPy and Numba load: matrices and pictures are small here, and on a busy machine threads that wait for each
-# other cost more than they help.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Ellipse
 from scipy.spatial import cKDTree
 
+from figures import BLUE, GREEN, GREY, RED, YELLOW, show, show_code
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods import get_recipe
@@ -58,26 +51,6 @@ from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Gaussians
-
-plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
-RED, BLUE, YELLOW, GREEN, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#8a8580"
-
-
-def show_code(function):
-    """Print a function of the package without its docstring."""
-    source = inspect.getsource(function)
-    lines, body = source.splitlines(), ast.parse(source).body[0].body
-    has_docstring = isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant)
-    first = body[1].lineno - 1 if has_docstring else body[0].lineno - 1
-    print(*lines[: body[0].lineno - 1], *lines[first:], sep="\n")
-
-
-def show(axes, image, title="", **style):
-    """Show an image or a map without ticks."""
-    shown = axes.imshow(np.clip(image, 0, 1) if image.ndim == 3 else image, interpolation="nearest", **style)
-    axes.set(title=title, xticks=[], yticks=[])
-    return shown
-
 
 # %% [markdown]
 # ## A dense population

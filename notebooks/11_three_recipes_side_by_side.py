@@ -34,35 +34,19 @@
 
 # %%
 import itertools
-import os
 import time
 from functools import partial
-
-# Read when NumPy and Numba load: matrices and pictures are small here, and on a busy machine threads that wait for each
-# other cost more than they help.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 
 import matplotlib.pyplot as plt
 import numpy as np
 
+from figures import BLUE, GREEN, RED, show
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import render
 from minisplat_ref.training.loop import initial_state, train
 from minisplat_ref.training.schedule import During, Every, scaled
-
-plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
-RED, BLUE, YELLOW, GREEN, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#8a8580"
-
-
-def show(axes, image, title="", **style):
-    """Show an image or a map without ticks."""
-    shown = axes.imshow(np.clip(image, 0, 1) if image.ndim == 3 else image, interpolation="nearest", **style)
-    axes.set(title=title, xticks=[], yticks=[])
-    return shown
-
 
 # %% [markdown]
 # ## The recipes

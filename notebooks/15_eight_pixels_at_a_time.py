@@ -31,11 +31,6 @@
 # **Frames and units:** pixels; x to the right, y down, the first pixel's centre at (0.5, 0.5).
 
 # %%
-import os
-
-# Read when NumPy loads: the matrices here are small, and on a busy machine waiting threads cost more than they help.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
 import time
 
 import matplotlib.pyplot as plt
@@ -43,6 +38,7 @@ import numba
 import numpy as np
 from matplotlib.patches import Rectangle
 
+from figures import BLUE, GREY, RED, YELLOW
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.bench.roofs import rows_worked_on
 from minisplat_ref.bench.workloads import synth
@@ -56,9 +52,6 @@ from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.rendering import render
 from minisplat_ref.scalar.compositing import Frame, blend
 from minisplat_ref.types import Projection, TileGrid
-
-plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
-RED, BLUE, YELLOW, GREEN, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#8a8580"
 
 # %% [markdown]
 # ## A tile is 64 rows, a set of rows is one integer
