@@ -128,15 +128,24 @@ def _stripped_output(out: Cell) -> Cell:
     if "execution_count" in out:
         out.execution_count = None
     if _png(out):
-        compact = io.BytesIO()
-        with Image.open(io.BytesIO(_png(out))) as picture:
-            picture.convert("RGB").save(compact, "PNG", optimize=True)
-        out.data = {"image/png": base64.b64encode(compact.getvalue()).decode()}
+        out.data = {"image/png": base64.b64encode(_compact(_png(out))).decode()}
     else:
         out.data = {kind: _without_paths(content) for kind, content in out.data.items() if kind != "text/html"}
         if "text/markdown" in out.data:
             out.data.pop("text/plain", None)
     return out
+
+
+def _compact(png: bytes) -> bytes:
+    """Return a picture in fewer bytes: the same, or with 256 colours if it would be larger than allowed."""
+    with Image.open(io.BytesIO(png)) as picture:
+        whole = picture.convert("RGB")
+    for candidate in (whole, whole.quantize(256, dither=Image.Dither.NONE)):
+        file = io.BytesIO()
+        candidate.save(file, "PNG", optimize=True)
+        if file.tell() <= PNG_MAX:
+            break
+    return file.getvalue()
 
 
 def _plain(text: str) -> str:
