@@ -57,7 +57,7 @@ dssim = {name: photometric_loss(image, photo, 1.0)[0] for name, image in images.
 
 figure, axes = plt.subplots(3, 5, figsize=(10, 4.9))
 for column, (name, image) in zip(axes.T, images.items(), strict=True):
-    show(column[0], image[DETAIL], f"{name}, PSNR {psnr(image, photo):.1f} dB")
+    show(column[0], image[DETAIL], f"{name}\nPSNR {psnr(image, photo):.1f} dB")
     l1_map = np.abs(image - photo).mean(axis=2)[DETAIL]
     dssim_map = 1 - ssim_map(image, photo).mean(axis=2)[DETAIL]
     difference = show(column[1], l1_map, f"L1 {l1[name]:.3f}", cmap="magma", vmin=0, vmax=0.15)
@@ -121,7 +121,7 @@ footprint = np.abs(ssim_map(changed, photo) - 1).max(axis=2) > 1e-12
 figure, axes = plt.subplots(1, 3, figsize=(11, 3.1), width_ratios=[1, 1.2, 1.2])
 shown = axes[0].imshow(window[8:23, 8:23], cmap="magma", extent=(7.5, 22.5, 22.5, 7.5))
 axes[0].add_patch(Rectangle((9.5, 9.5), 11, 11, fill=False, edgecolor="white"))
-axes[0].set(title="the window, measured; frame: 11 x 11 px", xlabel="column", ylabel="row")
+axes[0].set(title="the window, measured; frame: 11 x 11", xlabel="column", ylabel="row")
 figure.colorbar(shown, ax=axes[0], shrink=0.85)
 offsets = np.arange(-7, 8)
 axes[1].bar(offsets, window.sum(axis=0)[8:23], color=BLUE, label="measured")
