@@ -376,7 +376,7 @@ plt.show()
 #
 # Choose the fraction, the kind of importance and the way of choosing. What to look for:
 #
-# * `fraction`: at which fraction does rank catch up with sampling, right after the cut?
+# * `fraction`: at which fraction does the picture have no holes, right after the cut?
 # * `metric`: with `"outdoor"`, which parts of the room become sparser?
 # * `choose`: `simplify.by_sampling`, `simplify.by_rank` or `simplify.by_merging`.
 #
