@@ -214,11 +214,12 @@ def comparable(text: str, is_rounded: bool) -> list[str]:
     text : str
         What a cell printed.
     is_rounded : bool
-        Leave out all numbers, and the width of columns; otherwise only errors below 1e-5, which are those of rounding.
+        Leave out all numbers, the width of columns, and how often a line comes; otherwise only errors below 1e-5,
+        which are those of rounding.
     """
-    if is_rounded:
-        text = re.sub(r"[ \t]+", " ", _NUMBER.sub("#", text))
-    return _ROUNDING_ERROR.sub("#", text).splitlines()
+    if not is_rounded:
+        return _ROUNDING_ERROR.sub("#", text).splitlines()
+    return sorted(set(re.sub(r"[ \t]+", " ", _NUMBER.sub("#", text)).splitlines()))
 
 
 def _paths(names: Sequence[str]) -> list[Path]:
