@@ -34,6 +34,7 @@ from IPython.display import Markdown, display
 from matplotlib.patches import Ellipse, FancyBboxPatch
 
 import minisplat_ref
+from figures import BLUE, GREEN, GREY
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN, PROFILES
 from minisplat_ref.datasets.synthetic import make_scene
@@ -43,9 +44,6 @@ from minisplat_ref.reference.tiling import bin_gaussians
 from minisplat_ref.rendering import render
 from minisplat_ref.training.loop import initial_state, train
 from minisplat_ref.types import TileGrid
-
-plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
-RED, BLUE, YELLOW, GREEN, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#8a8580"
 
 # %% [markdown]
 # ## From photographs to a rendered view in ten lines

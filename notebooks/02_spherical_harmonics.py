@@ -16,21 +16,19 @@
 # %% [markdown]
 # # 02 Spherical harmonics
 #
-# A polished ball shows a highlight that moves when you move. A Gaussian imitates this with a colour that depends on the
-# direction from which it is seen: a sum of at most 16 fixed functions on the sphere, each with its own RGB coefficient.
+# A polished ball has a highlight that moves when you move. A Gaussian imitates it with a colour that depends on the
+# direction from which it is seen: a sum of at most 16 fixed functions on the sphere, each with an RGB coefficient of
+# its own.
 #
-# Read alongside: `minisplat_ref/reference/spherical_harmonics.py`, after section 3 of 3DGS (Kerbl et al. 2023).
-#
-# **Frames and units:** directions are unit vectors in the world frame, here with z up. They point *from the camera to
-# the Gaussian*. Colours are sRGB values in [0, 1], blended as they are, without conversion to linear light.
+# Here are the sixteen functions. Each row is one degree $l$; red is positive and blue is negative. Degree 0 is a
+# constant, degree 1 tells one side from the other, and each further degree adds finer detail and $2l+1$ coefficients
+# per channel. The spheres are seen from slightly above, and z points up.
 
 # %%
-import ast
-import inspect
-
 import matplotlib.pyplot as plt
 import numpy as np
 
+from figures import BLUE, GREEN, GREY, RED, YELLOW, show, show_code
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic.cameras import look_at
@@ -38,15 +36,6 @@ from minisplat_ref.reference.compositing import composite
 from minisplat_ref.reference.spherical_harmonics import sh_basis, sh_colors
 from minisplat_ref.rendering import render
 from minisplat_ref.types import Gaussians, TileGrid
-
-plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
-
-
-def show_code(function):
-    """Print a function of the package without its docstring."""
-    source = inspect.getsource(function)
-    lines, body = source.splitlines(), ast.parse(source).body[0].body
-    print(*lines[: body[0].lineno - 1], *lines[body[1].lineno - 1 :], sep="\n")
 
 
 def globe(n=90, azimuth=-50.0, elevation=25.0):
@@ -61,19 +50,10 @@ def globe(n=90, azimuth=-50.0, elevation=25.0):
     return points, is_disc
 
 
-# %% [markdown]
-# ## The sixteen functions
-#
-# Each row is one degree $l$. Red is positive, blue negative. Degree 0 is a constant, degree 1 tells one side from the
-# other, and each further degree adds finer detail and $2l+1$ coefficients per channel. The spheres are seen from a
-# little above, with z upwards.
-#
-# $$c(d) = \tfrac12 + \sum_{l=0}^{L} \sum_{m=-l}^{l} k_{lm}\,Y_{lm}(d), \qquad L \le 3 \qquad \text{3DGS sec. 3}$$
-
 # %%
-points, is_disc = globe()
+points, is_disc = globe(n=56)
 values = sh_basis(points[is_disc], degree=3)  # [P, 16]
-figure, panels = plt.subplots(4, 7, figsize=(9.5, 5.4))
+figure, panels = plt.subplots(4, 7, figsize=(9, 5.2))
 for axes in panels.flat:
     axes.axis("off")
 for k in range(16):
@@ -88,8 +68,16 @@ figure.colorbar(drawn, ax=panels, shrink=0.6, label="value")
 plt.show()
 
 # %% [markdown]
-# The functions are polynomials in the three components of the direction. Their order and signs are those of the 3DGS
-# PLY files, so that a file can be read without shuffling.
+# The colour of a Gaussian, seen in direction $d$, is their sum with coefficients $k_{lm}$, one for each channel:
+#
+# $$c(d) = \tfrac12 + \sum_{l=0}^{L} \sum_{m=-l}^{l} k_{lm}\,Y_{lm}(d), \qquad L \le 3 \qquad \text{3DGS sec. 3}$$
+#
+# Read alongside: `minisplat_ref/reference/spherical_harmonics.py`, after section 3 of 3DGS (Kerbl et al. 2023).
+# **Frames and units:** directions are unit vectors in the world frame. They point *from the camera to the Gaussian*.
+# Colours are sRGB values in [0, 1] and are blended as they are, without a conversion to linear light.
+#
+# The functions are polynomials in the three components of the direction. Their order and signs are those of
+# 3DGS's PLY files, so a file can be read without a permutation.
 
 # %%
 show_code(sh_basis)
@@ -97,10 +85,10 @@ show_code(sh_basis)
 # %% [markdown]
 # ## They are orthonormal
 #
-# Integrated over the sphere, the product of two different functions is 0 and the square of each is 1. So a coefficient
-# can be read off a colour function by one integral, and leaving out high degrees leaves the best fit that the lower
-# degrees can give. A product of two functions has degree 6 at most; Gauss-Legendre nodes in z with equal steps in
-# azimuth integrate that exactly, and the picture below holds no approximation.
+# The integral over the sphere of the product of two different functions is 0, and that of the square of each is 1. So
+# one integral extracts a coefficient from a colour function, and what remains without the high degrees is the best fit
+# that the lower degrees can give. A product of two functions has at most degree 6; Gauss-Legendre nodes in z with equal
+# steps in azimuth integrate it exactly, so the picture below contains no approximation.
 
 # %%
 nodes, node_weights = np.polynomial.legendre.leggauss(8)
@@ -124,8 +112,6 @@ print(f"largest deviation from the identity: {np.abs(gram - np.eye(16)).max():.1
 # One Gaussian at the origin and twelve cameras in a circle around it. It stores a grey constant and one coefficient of
 # degree 1, that of $Y_{1,1} = -\sqrt{3/4\pi}\,x$, with opposite signs for red and blue. A camera at +x looks along -x,
 # so there $Y_{1,1}$ is positive.
-#
-# $$d = \frac{\mu - o}{|\mu - o|}, \qquad o = -R^\top t, \qquad \text{colour} = \max\bigl(0,\; c(d)\bigr)$$
 
 # %%
 dc = (np.array([[0.55, 0.5, 0.45]]) - 0.5) / SH_C0  # [1, 3]
@@ -159,17 +145,21 @@ for axes, strength in ((left, 0.9), (right, 1.8)):
     seen[strength] = np.concatenate(
         [sh_colors(turning.means, dc, coefficients, camera, 3, is_visible) for camera in ring]
     )  # [73, 3]
-    for channel, color in enumerate(("#d2493f", "#3f8f6b", "#35608c")):
+    for channel, color in enumerate((RED, GREEN, BLUE)):
         axes.plot(np.degrees(fine), seen[strength][:, channel], color=color, label=("red", "green", "blue")[channel])
-    axes.axhspan(1, 1.6, color="#8a8580", alpha=0.15)
+    axes.axhspan(1, 1.6, color=GREY, alpha=0.15, linewidth=0)
     axes.set(xlabel="camera azimuth [degrees]", ylabel="colour", xticks=range(0, 361, 60), ylim=(-0.1, 1.6))
-    axes.set_title(f"coefficient {strength}" + (": the sum goes below 0 and is cut" if strength > 1 else ""))
-    axes.legend(loc="upper center", ncols=3, fontsize=8)
+    axes.set_title(f"coefficient {strength}" + (": the sum falls below 0 and is clipped" if strength > 1 else ""))
+    axes.legend(loc="upper center", ncols=3)
 plt.show()
 
 # %% [markdown]
-# Below zero a colour is cut, and a cut channel passes no gradient. Above one it is not: in the grey band a display
-# clips it, but the loss still sees it.
+# With the centre $o$ of a camera of rotation $R$ and translation $t$, and the mean $\mu$ of the Gaussian, the colour is
+#
+# $$d = \frac{\mu - o}{|\mu - o|}, \qquad o = -R^\top t, \qquad \text{colour} = \max\bigl(0,\; c(d)\bigr)$$
+#
+# A colour is clipped below zero, and a clipped channel passes no gradient. It is not clipped above one: in the grey
+# band a display clips it, but the loss still sees it.
 
 # %%
 show_code(sh_colors)
@@ -177,13 +167,13 @@ show_code(sh_colors)
 # %% [markdown]
 # ## A glossy ball
 #
-# A red ball of 1,500 flat Gaussians under one lamp. Its true colour is matte shading plus a highlight,
-# $0.6\,(n\cdot h)^{p}$ with the normal $n$, the direction $h$ halfway between lamp and viewer, and the shininess $p$.
-# For each Gaussian the coefficients are fitted by least squares to 100 random directions from which it can be seen.
-# Then the ball is rendered from one viewpoint.
+# A red ball of 1,500 flat Gaussians under one lamp. Its true colour is a matte shading plus a highlight,
+# $0.6\,(n\cdot h)^{p}$, with the normal $n$, the direction $h$ halfway between lamp and viewer, and the shininess $p$.
+# The coefficients of each Gaussian are fitted by least squares to 100 random directions from which it can be seen. Then
+# the ball is rendered from one viewpoint.
 
 # %%
-shininess = 40.0  # play: 5 is satin, 200 is lacquer
+shininess = 40.0  # to play with: 5 is satin, 200 is lacquer
 n_gaussians, n_views = 1500, 100
 
 turn = np.pi * (3 - np.sqrt(5)) * np.arange(n_gaussians)  # the golden angle spreads points evenly
@@ -237,7 +227,7 @@ exact = glossy_color(normals, (center - normals) / np.linalg.norm(center - norma
 bins = REFERENCE.bin_gaussians(tape.projection, TileGrid(96, 96, 16, 16), GSPLAT_MAIN)
 truth = composite(tape.projection, exact, np.ones(3), bins, GSPLAT_MAIN).image
 
-figure, panels = plt.subplots(1, 5, figsize=(10.5, 2.5))
+figure, panels = plt.subplots(1, 5, figsize=(10.5, 2.6))
 error = {degree: np.sqrt(np.mean((picture - truth) ** 2)) for degree, picture in pictures.items()}
 for axes, (title, picture) in zip(
     panels,
@@ -245,14 +235,12 @@ for axes, (title, picture) in zip(
     + [(f"degree {d}: {(d + 1) ** 2} per channel\nRMS error {error[d]:.3f}", p) for d, p in pictures.items()],
     strict=True,
 ):
-    axes.imshow(np.clip(picture, 0, 1))
-    axes.set_title(title, fontsize=9)
-    axes.axis("off")
+    show(axes, picture, title)
 plt.show()
 
 # %% [markdown]
-# The highlight sharpens with each degree. What one Gaussian near it has learnt, as the camera passes the mirror
-# direction:
+# The highlight becomes sharper with each degree. Below is what one Gaussian in the highlight has learnt: its colour as
+# the camera passes the mirror direction.
 
 # %%
 n_bright = np.argmax(exact[:, 1])  # the one whose highlight is brightest in the picture above
@@ -262,7 +250,7 @@ sweep = np.radians(np.linspace(-50, 50, 101))
 towards = np.cos(sweep)[:, None] * mirror + np.sin(sweep)[:, None] * side  # unit vectors
 figure, axes = plt.subplots(figsize=(6.5, 3))
 axes.plot(np.degrees(sweep), glossy_color(normals[n_bright], towards)[:, 1], "k", linewidth=2, label="exact")
-for degree, color in zip(range(4), ("#d9d2c7", "#e0a526", "#d2493f", "#35608c"), strict=True):
+for degree, color in zip(range(4), ("#c9c2b7", YELLOW, RED, BLUE), strict=True):
     curve = 0.5 + sh_basis(-towards, degree) @ coefficients[degree][n_bright, : (degree + 1) ** 2, 1]
     axes.plot(np.degrees(sweep), curve, color=color, label=f"degree {degree}")
 axes.set(xlabel="angle from the mirror direction [degrees]", ylabel="green channel", title="one Gaussian of the ball")
@@ -272,10 +260,76 @@ plt.show()
 # %% [markdown]
 # ## Play
 #
-# Set `shininess` to 5 or to 200 and run the two cells above again. The finest bumps of degree 3 are about 60 degrees
-# wide, so a lacquered highlight stays out of its reach. Training then blurs it, or puts Gaussians behind the surface
-# that imitate the mirror image.
+# One Gaussian with coefficients of your choice, drawn as the colour that it shows to viewers all around it. What to
+# look for:
 #
+# * Move a number from one row of `mine` to another: which functions differ only by a turn of the sphere?
+# * Put a number into the first row. It shifts the colour and changes nothing else.
+# * Make a number so large that the sum falls below 0: the clipped area becomes flat.
+#
+# Then set `shininess`, two cells further up, to 5 or to 200 and run both cells again. The finest bumps of degree 3 are
+# about 60 degrees wide, so a lacquered highlight is out of their reach. Training then blurs it, or puts Gaussians
+# behind the surface that imitate the mirror image.
+
+# %%
+mine = np.zeros((16, 3))  # [coefficient, channel]
+mine[2] = [0.8, 0.8, 0.0]  # Y_1,0: yellow from above and dark from below, or the other way round?
+mine[6] = [0.0, 0.0, 0.6]  # Y_2,0
+
+picture = np.ones((*is_disc.shape, 3))
+picture[is_disc] = np.maximum(0.5 + values @ mine, 0)
+figure, axes = plt.subplots(figsize=(3.2, 3.2))
+show(axes, picture, "colour as a function of d")
+plt.show()
+
+# %% [markdown]
+# ## Exercises
+#
+# **1.** A Gaussian is to look red from above and blue from below, and purple from the side. Which coefficients does it
+# need? Mind the direction of $d$.
+#
+# <details>
+# <summary>Solution</summary>
+#
+# Purple is the constant: $k_{00} = (\text{purple} - \tfrac12) / 0.2821$. The change from top to bottom is $Y_{1,0} =
+# \sqrt{3/4\pi}\,z$. Seen from above, $d$ points *down*, so $Y_{1,0}$ is negative there and red needs a negative
+# coefficient.
+#
+# ```python
+# k = np.zeros((1, 4, 3))
+# k[0, 0] = (np.array([0.5, 0.0, 0.5]) - 0.5) / SH_C0
+# k[0, 2] = np.array([-0.5, 0.0, 0.5]) / np.sqrt(3 / (4 * np.pi))
+# from_above, from_below = 0.5 + sh_basis(np.array([[0, 0, -1.0], [0, 0, 1.0]]), 1) @ k[0]
+# assert np.allclose(from_above, [1, 0, 0]) and np.allclose(from_below, [0, 0, 1])
+# ```
+#
+# </details>
+#
+# **2.** Degree 3 leaves an RMS error of the glossy ball at `shininess = 40`. How large is the part of the highlight
+# alone, as a function on the sphere, that no function of degree 3 or less can represent? (Hint: the functions are
+# orthonormal, so the energy of a function is the sum of its squared coefficients plus the energy of the rest.)
+#
+# <details>
+# <summary>Solution</summary>
+#
+# Take $f = (\cos\theta)^{p}$ on the upper half of the sphere, the highlight around its own axis. Its energy is
+# $2\pi / (2p + 1)$. Around the axis only the four functions with $m = 0$ contribute. For $p = 40$ they hold about a
+# third of the energy.
+#
+# ```python
+# p = 40
+# cosines, weights_1d = np.polynomial.legendre.leggauss(100)
+# highlight = np.maximum(cosines, 0) ** p
+# axis = np.stack([np.sqrt(1 - cosines**2), 0 * cosines, cosines], axis=1)
+# k = 2 * np.pi * (weights_1d * highlight) @ sh_basis(axis, 3)[:, [0, 2, 6, 12]]
+# share = (k**2).sum() / (2 * np.pi / (2 * p + 1))
+# print(f"degree 3 holds {share:.0%} of the energy of the highlight")
+# assert 0.25 < share < 0.4
+# ```
+#
+# </details>
+
+# %% [markdown]
 # ## What was shown, checked
 
 # %%
@@ -296,6 +350,6 @@ assert seen[1.8].min() == 0.0 and seen[1.8].max() > 1.0
 by_hand = 0.55 + 0.9 * np.sqrt(3 / (4 * np.pi)) / np.sqrt(1.09)
 assert np.isclose(red[0], by_hand, rtol=1e-12)
 
-# Each degree comes closer to the glossy ball, and even the last is not there.
+# Each degree comes closer to the glossy ball, and the last one still misses it.
 assert error[0] > error[1] > error[2] > error[3] > 0.002
 assert error[3] < 0.5 * error[0]

@@ -16,70 +16,31 @@
 # %% [markdown]
 # # 03 Compositing
 #
-# Every pixel looks through a stack of translucent ellipses, nearest first. Each one takes its share of the light that
-# the ones in front of it have let through. This notebook follows that stack through one pixel, then a whole image:
-# tiles, depth order, depth maps, and the statistics that Mini-Splatting lives on.
+# Every pixel looks through a stack of translucent ellipses, the nearest first. Each of them contributes its colour to
+# the light that those in front of it let through. This notebook follows that stack through one pixel, then through a
+# whole image: tiles, depth order, depth maps, and the statistics on which Mini-Splatting is built.
 #
-# | file | what it holds | equation |
-# |---|---|---|
-# | `minisplat_ref/reference/tiling.py` | which ellipses a tile has to look at, in which order | 3DGS sec. 6 |
-# | `minisplat_ref/reference/hits.py` | alpha of a hit, transmittance in front of it | 3DGS (3), (4) |
-# | `minisplat_ref/reference/compositing.py` | image, alpha, median depth, blend statistics | 3DGS (3) |
-#
-# *3DGS* is Kerbl et al. 2023. **Frames and units:** image coordinates are pixels, x right, y down; the centre of the
-# top-left pixel is (0.5, 0.5). Depth is camera z, here in metres.
+# Below are five long Gaussians, 2 m to 4 m away, which all cross the marked pixel. The first bar chart shows how opaque
+# each is in that pixel, the second how much light reaches it, and the third, the product, how much of it is seen.
 
 # %%
-import ast
 import inspect
 
 import matplotlib.pyplot as plt
 import numpy as np
 
+from figures import BLUE, GREEN, GREY, PLUM, RED, YELLOW, show_code, show_pixels
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.tracer import pixel_rays
-from minisplat_ref.reference.compositing import composite, composite_all_pairs
+from minisplat_ref.reference.compositing import composite, composite_all_pairs, composite_hits
 from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.reference.projection import project
 from minisplat_ref.reference.tiling import bin_gaussians
 from minisplat_ref.rendering import render
 from minisplat_ref.types import Camera, Gaussians, TileGrid
-
-plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
-RED, BLUE, YELLOW, GREEN, PLUM, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#7a2848", "#8a8580"
-
-
-def show_code(function):
-    """Print a function of the package without its docstring."""
-    source = inspect.getsource(function)
-    lines, body = source.splitlines(), ast.parse(source).body[0].body
-    print(*lines[: body[0].lineno - 1], *lines[body[1].lineno - 1 :], sep="\n")
-
-
-def show_image(axes, image, title="", **style):
-    """Show an image in pixel coordinates, the top-left corner at (0, 0)."""
-    height, width = image.shape[:2]
-    shown = axes.imshow(image, extent=(0, width, height, 0), interpolation="nearest", **style)
-    axes.set(title=title, xlabel="x [px]", ylabel="y [px]")
-    return shown
-
-
-# %% [markdown]
-# ## The stack behind one pixel
-#
-# Five long Gaussians between 2 m and 4 m, all across the marked pixel. With the alphas $\alpha_i$ of the hits from
-# front to back,
-#
-# $$C = \sum_i c_i\,\alpha_i\,T_i + T_\text{end}\,c_\text{background}, \qquad
-# T_i = \prod_{j<i} (1 - \alpha_j) \qquad \text{3DGS (3)}$$
-#
-# $$\alpha_i = \min\bigl(0.99,\; o_i\,e^{-\frac12 d^\top \Sigma'^{-1} d}\bigr) \qquad \text{3DGS (4), on the image}$$
-#
-# $T_i$ is the *transmittance*: the share of the background's light that the hits in front still let through. $\alpha_i
-# T_i$ is the *weight* of hit $i$.
 
 # %%
 camera = Camera(np.eye(3), np.zeros(3), 80.0, 80.0, 40.0, 30.0, 80, 60)
@@ -107,7 +68,7 @@ weights = alphas * transmittances[:-1]
 
 figure = plt.figure(figsize=(10.5, 3.4))
 panels = figure.subplots(1, 4, width_ratios=(1.7, 1, 1, 1))
-show_image(panels[0], output.image, "five Gaussians and one pixel")
+show_pixels(panels[0], output.image, "five Gaussians and one pixel")
 panels[0].plot(pixel_x + 0.5, pixel_y + 0.5, "s", color="black", fillstyle="none", markersize=6)
 labels = [f"{projection.depths[i]:.1f}" for i in ids] + ["bg"]
 hit_colors = [*colors[ids], background]
@@ -123,21 +84,41 @@ for axes, values, title in (
 plt.show()
 
 # %% [markdown]
-# The weights and what is left for the background add up to one, so the pixel's colour is a weighted mean. In
-# `composite`, with hits along the rows and the pixels of a tile along the columns, that is three lines:
+# ## The stack behind one pixel
+#
+# With the alphas $\alpha_i$ of the hits from front to back,
+#
+# $$C = \sum_i c_i\,\alpha_i\,T_i + T_\text{end}\,c_\text{background}, \qquad
+# T_i = \prod_{j<i} (1 - \alpha_j) \qquad \text{3DGS (3)}$$
+#
+# $$\alpha_i = \min\bigl(0.99,\; o_i\,e^{-\frac12 d^\top \Sigma'^{-1} d}\bigr) \qquad \text{3DGS (4), on the image}$$
+#
+# $T_i$ is the *transmittance*: the share of the background's light that the hits in front let through. $\alpha_i T_i$
+# is the *weight* of hit $i$. The weights and what is left for the background add up to one, so the pixel's colour is a
+# weighted mean. In the package, with hits along the rows and the pixels of a tile along the columns, these are four
+# lines (`unsorted_by` matters only to relatives of 3DGS whose hits have another order in every pixel):
 
 # %%
-for line in inspect.getsource(composite).splitlines():
-    if line.strip().startswith(("weights, ", "image[", "alpha[")):
-        print(line.strip())
+lines = [line.strip() for line in inspect.getsource(composite_hits).splitlines()]
+blending = [line for line in lines if line.startswith(("weights =", "light = weights", "image[", "alpha["))]
+print(*blending, sep="\n")
 
 # %% [markdown]
+# | file | what it holds | equation |
+# |---|---|---|
+# | `minisplat_ref/reference/tiling.py` | which ellipses a tile has to look at, in which order | 3DGS sec. 6 |
+# | `minisplat_ref/reference/hits.py` | alpha of a hit, transmittance in front of it | 3DGS (3), (4) |
+# | `minisplat_ref/reference/compositing.py` | image, alpha, median depth, blend statistics | 3DGS (3) |
+#
+# *3DGS* is Kerbl et al. 2023. **Frames and units:** image coordinates are pixels, x right, y down; the centre of the
+# top-left pixel is (0.5, 0.5). Depth is camera z, here in metres.
+#
 # ## Three thresholds
 #
-# Alpha is clamped at 0.99, so that one Gaussian can never make the transmittance exactly zero. A hit below 1/255 is
-# skipped: it would not change an 8-bit image. And a pixel is finished when the next hit would leave no more than
-# $10^{-4}$ of the light; that hit is not drawn. Left: alpha along a row of pixels through a single Gaussian, for
-# three opacities. Right: a pixel in the middle of thirty equal Gaussians, one behind the other.
+# Alpha is clamped at 0.99, so one Gaussian can never make the transmittance exactly zero. A hit below 1/255 is skipped,
+# because it would not change an 8-bit image. And a pixel is finished when the next hit would leave no more than
+# $10^{-4}$ of the light; that hit is not drawn. Left: alpha along a row of pixels through a single Gaussian, for three
+# opacities. Right: the transmittance in the middle of thirty equal Gaussians, one behind the other.
 
 # %%
 row_camera = Camera(np.eye(3), np.zeros(3), 80.0, 80.0, 40.0, 0.5, 80, 1)
@@ -181,9 +162,9 @@ plt.show()
 # %% [markdown]
 # ## A picture made of surface points
 #
-# For the rest of the notebook we need a picture. The ray tracer of `datasets` gives exact depth, so every pixel of
-# six views of a room becomes one small round Gaussian on the surface that it sees. Nothing is trained. A seventh
-# viewpoint, which was not used, shows what comes out: thin things too fat, and black where none of the six looked.
+# The rest of the notebook needs a picture. The ray tracer of `datasets` gives exact depths, so every pixel of six views
+# of a room becomes one small round Gaussian on the surface that it sees. Nothing is trained. A seventh viewpoint, which
+# was not used, shows the result: thin things are too fat, and what none of the six cameras saw is black.
 
 # %%
 room = make_scene("room", n_views=21, width=96, height=72, n_points=100, test_every=8, supersampling=2)
@@ -214,8 +195,8 @@ seen = room.scene.test_views[1]
 fine_output, fine_tape = render(fine, seen.camera, backend=REFERENCE)
 fine_image = np.clip(fine_output.image, 0, 1)
 figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.5))
-show_image(left, seen.image, "ray-traced photograph, not used")
-show_image(right, fine_image, f"{len(fine.means):,} lifted Gaussians, from the same viewpoint")
+show_pixels(left, seen.image, "ray-traced photograph, not used")
+show_pixels(right, fine_image, f"{len(fine.means):,} lifted Gaussians, from the same viewpoint")
 plt.show()
 
 # %% [markdown]
@@ -230,7 +211,7 @@ room_grid = TileGrid(96, 72, 16, 16)
 room_bins = bin_gaussians(fine_tape.projection, room_grid, GSPLAT_MAIN)
 n_pairs = np.diff(room_bins.tile_offsets).reshape(room_grid.n_tiles_y, room_grid.n_tiles_x)
 figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.5))
-show_image(left, fine_image, "Gaussians listed in each tile")
+show_pixels(left, fine_image, "Gaussians listed in each tile")
 left.imshow(n_pairs, extent=(0, 96, 80, 0), cmap="inferno", alpha=0.45)
 for row in range(room_grid.n_tiles_y):
     for tile_column in range(room_grid.n_tiles_x):
@@ -262,9 +243,9 @@ show_code(bin_gaussians)
 # %% [markdown]
 # ## One order for all pixels
 #
-# The list is sorted by the depth of the *means*, for all pixels alike. Where two Gaussians overlap, that is an
-# approximation, and it has a price: below, the camera turns by one degree, the two means swap their order, and the
-# overlap changes colour at once. This is called popping.
+# The list is sorted by the depth of the *means*, in one order for all pixels. Where two Gaussians overlap, that is an
+# approximation, and it has a price. Below, the camera turns by one degree, the two means swap their order, and the
+# overlap suddenly changes its colour. This is called popping.
 
 # %%
 overlapping = Gaussians(
@@ -284,16 +265,16 @@ for axes, degrees in zip(panels, (-0.5, 0.5), strict=True):
     overlap_colors[degrees] = turned_output.image[30, 40]
     near, far = turned_tape.projection.depths[[0, 1]]
     title = f"turned by {degrees:+}°\nyellow at {near:.4f} m, blue at {far:.4f} m"
-    show_image(axes, np.clip(turned_output.image, 0, 1), title)
+    show_pixels(axes, np.clip(turned_output.image, 0, 1), title)
 plt.show()
 
 # %% [markdown]
 # ## Expected or median depth
 #
-# Depth is blended like a colour. The *expected* depth $\sum_i w_i z_i / \sum_i w_i$ is smooth and differentiable, but
-# at the edge of an object it lies in the empty space between front and back. The *median* depth, that of the hit which
-# takes the transmittance below one half, jumps from one surface to the other. Below: a front layer at 2 m over the left
-# part of a back layer at 4 m.
+# Depth can be blended like a colour. Below, a front layer at 2 m covers the left part of a back layer at 4 m. The
+# *expected* depth $\sum_i w_i z_i / \sum_i w_i$ is smooth and differentiable, but at the edge of an object it lies in
+# the empty space between front and back. The *median* depth, that of the hit which takes the transmittance below one
+# half, jumps from one surface to the other.
 
 # %%
 y, x = np.meshgrid(np.linspace(-1.8, 1.8, 37), np.linspace(-2.3, 2.3, 47), indexing="ij")
@@ -313,10 +294,10 @@ layer_output, _ = render(layers, camera, backend=REFERENCE, with_depth=True, wit
 expected = expected_depth(layer_output.image[..., 3], layer_output.alpha)
 median = layer_output.median_depth
 figure, panels = plt.subplots(1, 4, figsize=(11.5, 2.6))
-show_image(panels[0], np.clip(layer_output.image[..., :3], 0, 1), "image")
-show_image(panels[1], expected, "expected depth", cmap="viridis", vmin=2, vmax=4)
-drawn = show_image(panels[2], median, "median depth", cmap="viridis", vmin=2, vmax=4)
-figure.colorbar(drawn, ax=panels[2], label="m", shrink=0.7, location="left", pad=0.02)
+show_pixels(panels[0], np.clip(layer_output.image[..., :3], 0, 1), "image")
+show_pixels(panels[1], expected, "expected depth", cmap="viridis", vmin=2, vmax=4)
+drawn = show_pixels(panels[2], median, "median depth", cmap="viridis", vmin=2, vmax=4)
+figure.colorbar(drawn, ax=panels[2], label="m", shrink=0.9)
 panels[3].plot(np.arange(80) + 0.5, expected[30], color=RED, label="expected")
 panels[3].plot(np.arange(80) + 0.5, median[30], color=BLUE, label="median")
 panels[3].set(xlabel="x [px]", ylabel="depth [m]", title="row 30", xlim=(25, 60), ylim=(1.8, 4.2))
@@ -324,11 +305,12 @@ panels[3].legend(fontsize=8)
 plt.show()
 
 # %% [markdown]
-# ## Who owns a pixel
+# ## Which Gaussian dominates a pixel
 #
-# Mini-Splatting asks three things of each view: how much a Gaussian contributes in all ($\sum w$), how many pixels it
-# touches, and in how many it has the largest weight of all. From these it decides whom to split (one Gaussian that wins
-# many pixels is a blur) and whom to drop. They come out of the same pass as the image.
+# Mini-Splatting takes three numbers per Gaussian from each view: the sum of its weights $\sum w$, how many pixels it
+# touches, and in how many pixels it *dominates*, that is, has the largest weight of all. From these it decides which
+# Gaussians to split (one that dominates many pixels is a blur) and which to drop. They come from the same pass as the
+# image.
 
 # %%
 coarse = lift(step=8, scale_px=4.0)
@@ -336,12 +318,12 @@ coarse_output, _ = render(coarse, seen.camera, backend=REFERENCE, with_stats=Tru
 stats = coarse_output.stats
 palette = np.vstack([[0.1, 0.1, 0.1], 0.25 + 0.75 * np.random.default_rng(3).random((len(coarse.means), 3))])
 figure, panels = plt.subplots(1, 3, figsize=(11.5, 3))
-show_image(panels[0], np.clip(coarse_output.image, 0, 1), f"{len(coarse.means)} coarse Gaussians")
-show_image(panels[1], palette[stats.dominant_ids + 1], "one colour for each dominant Gaussian")
-is_drawn, wins = stats.hit_count > 0, stats.dominant_count > 0
+show_pixels(panels[0], np.clip(coarse_output.image, 0, 1), f"{len(coarse.means)} coarse Gaussians")
+show_pixels(panels[1], palette[stats.dominant_ids + 1], "one colour for each dominant Gaussian")
+is_drawn, dominates = stats.hit_count > 0, stats.dominant_count > 0
 edges = np.linspace(0, stats.blend_weight_sum.max(), 40)
-heights = [stats.blend_weight_sum[is_drawn & ~wins], stats.blend_weight_sum[wins]]
-labels = [f"wins no pixel: {np.sum(is_drawn & ~wins)}", f"wins a pixel: {np.sum(wins)}"]
+heights = [stats.blend_weight_sum[is_drawn & ~dominates], stats.blend_weight_sum[dominates]]
+labels = [f"dominates no pixel: {np.sum(is_drawn & ~dominates)}", f"dominates a pixel: {np.sum(dominates)}"]
 panels[2].hist(heights, edges, histtype="stepfilled", alpha=0.6, color=(RED, BLUE), label=labels)
 panels[2].set(yscale="log", xlabel="sum of a Gaussian's weights in this view [px]", ylabel="Gaussians")
 panels[2].set_title(f"{is_drawn.sum()} of {len(coarse.means)} are drawn")
@@ -351,21 +333,64 @@ plt.show()
 # %% [markdown]
 # ## Play
 #
-# Draw the five Gaussians again with other opacities, or give the nearest one a larger depth so that the order changes.
-# When does the colour of the pixel stop depending on what lies behind?
+# Draw the five Gaussians again with other opacities or in another order, and run the cell. What to look for:
+#
+# * `my_opacities`: raise the first to 0.99. From which value on does the pixel no longer depend on what lies behind?
+# * `my_means`: the red Gaussian has gone to the back. Bring it forward in steps of 0.5 m; the picture changes only when
+#   it passes another one.
 
 # %%
 my_opacities = np.array([0.10, 0.60, 0.70, 0.80, 0.95])
 my_means = means.copy()
-my_means[0, 2] = 4.5  # the red one goes to the back
+my_means[0, 2] = 4.5  # the red one is now at the back
 
 mine = project(my_means, quats, scales, my_opacities, camera, GSPLAT_MAIN)
 my_output = composite(mine, colors, background, bin_gaussians(mine, grid, GSPLAT_MAIN), GSPLAT_MAIN, with_stats=True)
 figure, (left, right) = plt.subplots(1, 2, figsize=(8.5, 3.2))
-show_image(left, my_output.image, "yours")
+show_pixels(left, my_output.image, "yours")
 right.bar(names, my_output.stats.blend_weight_sum, color=colors)
 right.set(title="sum of weights over the image", ylabel="pixels")
 plt.show()
+
+# %% [markdown]
+# ## Exercises
+#
+# **1.** How many Gaussians of opacity 0.5, one behind the other, does a pixel draw before it is finished? And how many
+# of opacity 0.99? Compare with the second figure.
+#
+# <details>
+# <summary>Solution</summary>
+#
+# After $n$ hits of alpha $\alpha$ the transmittance is $(1 - \alpha)^n$, and the last hit drawn is the last that leaves
+# more than $10^{-4}$: $n = \lceil \ln 10^{-4} / \ln(1 - \alpha) \rceil - 1$. That is 13 for 0.5. For 0.99 two hits
+# would leave exactly $10^{-4}$, which is not more, so a single one is drawn. (In binary digits $(1 - 0.99)^2$ is a
+# little more than $10^{-4}$; a renderer may draw two.)
+#
+# ```python
+# n = np.ceil(np.log(1e-4) / np.log(1 - 0.5)) - 1
+# assert n == n_blended[0.5] == 13
+# ```
+#
+# </details>
+#
+# **2.** The order of two hits matters. Two Gaussians of alphas $a$ and $b$ and of colours $c_a$ and $c_b$ swap their
+# order: by how much does the pixel change? When does popping not show?
+#
+# <details>
+# <summary>Solution</summary>
+#
+# $a\,c_a + (1 - a)\,b\,c_b - b\,c_b - (1 - b)\,a\,c_a = ab\,(c_a - c_b)$. It shows only where both are opaque, and only
+# as far as their colours differ.
+#
+# ```python
+# rng = np.random.default_rng(0)
+# alpha_a, alpha_b, color_a, color_b = rng.random(), rng.random(), rng.random(3), rng.random(3)
+# one_order = alpha_a * color_a + (1 - alpha_a) * alpha_b * color_b
+# other_order = alpha_b * color_b + (1 - alpha_b) * alpha_a * color_a
+# assert np.allclose(one_order - other_order, alpha_a * alpha_b * (color_a - color_b))
+# ```
+#
+# </details>
 
 # %% [markdown]
 # ## What was shown, checked
@@ -374,9 +399,11 @@ plt.show()
 # The weights and the background's share add up to one, and they blend to the pixel of the image.
 assert np.isclose(weights.sum() + transmittances[-1], 1.0) and np.count_nonzero(weights) == 5
 assert np.allclose(weights @ colors[ids] + transmittances[-1] * background, output.image[pixel_y, pixel_x], rtol=1e-12)
-# Not the most opaque hit wins the pixel, because others stand in front of it.
+# The most opaque hit does not dominate the pixel, because others stand in front of it.
 assert ids[np.argmax(weights)] != ids[np.argmax(alphas)]
 assert output.stats.dominant_ids[pixel_y, pixel_x] == ids[np.argmax(weights)]
+
+assert len(blending) == 4  # the lines that are shown are still there
 
 # Tiles change no image: the same recursion over all Gaussians and all pixels gives the same.
 everything, alpha = composite_all_pairs(projection, colors, background, 80, 60, GSPLAT_MAIN)
@@ -389,17 +416,17 @@ assert all(values[values > 0].min() >= 1 / 255 for values in profile.values())
 assert n_blended[0.2] == 30 and n_blended[0.85] < n_blended[0.5] < 30
 assert all(T > 1e-4 for T in T_end.values()) and 0.5 * T_end[0.5] < 1e-4  # stopped where the next would cross
 
-# Small tiles cost pairs, large tiles cost exponentials.
+# Small tiles cost pairs, and large tiles cost exponentials.
 assert pairs == sorted(pairs, reverse=True) and evaluations == sorted(evaluations)
 
 # Median depths are depths of layers; expected ones also take values in between.
 assert set(np.unique(median)) == {2.0, 4.0}
 assert np.any((expected > 2.5) & (expected < 3.5))
 
-# Statistics: each pixel that was hit has one winner; the weights of all Gaussians add up to the alpha of all pixels.
+# Statistics: one Gaussian dominates each pixel that was hit; all weights add up to the alpha of all pixels.
 assert stats.dominant_count.sum() == np.sum(stats.dominant_ids >= 0) > 0.9 * 96 * 72
 assert np.isclose(stats.blend_weight_sum.sum(), coarse_output.alpha.sum(), rtol=1e-9)
-assert 0 < np.sum(wins) < np.sum(is_drawn) < len(coarse.means)
+assert 0 < np.sum(dominates) < np.sum(is_drawn) < len(coarse.means)
 
 # A turn by one degree swaps the two means, and the overlap turns from mostly yellow to mostly blue.
 before, after = overlap_colors.values()

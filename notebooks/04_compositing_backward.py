@@ -16,72 +16,33 @@
 # %% [markdown]
 # # 04 Compositing, backward
 #
-# Notebook 03 blended sorted Gaussians into a pixel. Here a pixel's error travels back to the Gaussians that made it.
-# One pixel with three hits is enough to derive every line, and every line is checked at once in two ways: against
+# Notebook 03 blended sorted Gaussians into a pixel. Here the error of a pixel travels back to the Gaussians that made
+# it. One pixel with three hits is enough to derive every line, and every line is checked at once in two ways: against
 # central differences of the renderer, and against `composite_vjp` of the package.
 #
-# | file | what it holds | equation |
-# |---|---|---|
-# | `minisplat_ref/reference/hits.py` | alpha of each hit, transmittance before it | 3DGS (3), (4) |
-# | `minisplat_ref/reference/compositing.py` | `composite` and `composite_vjp` | 3DGS (3) |
-#
-# *3DGS* is Kerbl et al. 2023. **Frames and units:** everything is in the image, in pixels, x right, y down, the centre
-# of the top-left pixel at (0.5, 0.5). Conics are in 1/px². Colours, opacities and the loss have no unit. $v_x$ always
-# means $\partial L / \partial x$ and has the shape of $x$.
+# The picture shows three Gaussians, one behind the other, over a light background. The marked pixel sees all of them.
+# Its colour is a sum of four lights: the colour of each Gaussian with the weight $w_i = \alpha_i T_i$, and the
+# background with the transmittance that is left.
 
 # %%
-import ast
-import inspect
 import math
 from dataclasses import replace
 from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.patches import Ellipse, Rectangle
+from matplotlib.patches import Rectangle
 from scipy.optimize import brentq
 
+from figures import BLUE, GREY, RED, draw_ellipses, show_code, show_pixels
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
-from minisplat_ref.reference.compositing import composite, composite_vjp
+from minisplat_ref.reference.compositing import composite, composite_hits_vjp, composite_vjp
 from minisplat_ref.reference.extent import extents
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.reference.tiling import bin_gaussians
 from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.types import Camera, Gaussians, Projection, TileGrid
-
-plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
-RED, BLUE, YELLOW, GREEN, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#8a8580"
-
-
-def show_code(function):
-    """Print a function of the package without its docstring."""
-    source = inspect.getsource(function)
-    lines, body = source.splitlines(), ast.parse(source).body[0].body
-    print(*lines[: body[0].lineno - 1], *lines[body[1].lineno - 1 :], sep="\n")
-
-
-def show_image(axes, image, title="", **style):
-    """Show an image in pixel coordinates, the top-left corner at (0, 0)."""
-    height, width = image.shape[:2]
-    image = np.clip(image, 0, 1) if image.ndim == 3 else image
-    axes.imshow(image, extent=(0, width, height, 0), interpolation="nearest", **style)
-    axes.set(title=title, xlabel="x [px]", ylabel="y [px]")
-
-
-def draw_ellipse(axes, mean, covariance, **style):
-    """Draw the contour of a 2D Gaussian at one standard deviation."""
-    variances, directions = np.linalg.eigh(covariance)
-    angle = np.degrees(np.arctan2(directions[1, 0], directions[0, 0]))
-    axes.add_patch(Ellipse(mean, *(2 * np.sqrt(variances)), angle=angle, fill=False, **style))
-
-
-# %% [markdown]
-# ## One pixel, three hits
-#
-# Three Gaussians lie one behind the other over a light background. The marked pixel sees all three. What it shows is a
-# sum of four lights: each Gaussian's colour with the weight $w_i = \alpha_i T_i$, and the background with what
-# transmittance is left.
 
 # %%
 WIDTH, HEIGHT = 24, 18
@@ -90,7 +51,7 @@ STEP = 1e-6  # of central differences; the last section says why
 
 
 class Inputs(NamedTuple):
-    """What composite depends on and has a derivative by."""
+    """What composite depends on, and has a derivative with respect to."""
 
     means2d: np.ndarray  # [N, 2] px
     conics: np.ndarray  # [N, 3] px^-2
@@ -131,9 +92,9 @@ p = Y * WIDTH + X  # the pixel's column in the arrays of a tile
 alphas, T = hits.alphas[:, p], hits.transmittances[:, p]  # [3], [4]
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6), width_ratios=[1.25, 1])
-show_image(left, output.image, "three Gaussians, one standard deviation drawn")
+show_pixels(left, output.image, "three Gaussians, one standard deviation drawn")
 for n, name in enumerate(("near", "middle", "far")):
-    draw_ellipse(left, inputs.means2d[n], covariances2d[n], edgecolor="black", linewidth=1)
+    draw_ellipses(left, inputs.means2d[n], covariances2d[n], edgecolor="black", linewidth=1)
     left.annotate(name, inputs.means2d[n], ha="center", va="center", fontsize=8)
 left.add_patch(Rectangle((X, Y), 1, 1, fill=False, edgecolor="black", linewidth=2))
 lights = [*(alphas * T[:3]), T[3]]
@@ -148,6 +109,17 @@ right.legend(frameon=False)
 plt.show()
 
 # %% [markdown]
+# | file | what it holds | equation |
+# |---|---|---|
+# | `minisplat_ref/reference/hits.py` | alpha of each hit, transmittance before it | 3DGS (3), (4) |
+# | `minisplat_ref/reference/compositing.py` | `composite` and `composite_vjp` | 3DGS (3) |
+#
+# *3DGS* is Kerbl et al. 2023. **Frames and units:** everything is in the image, in pixels, x right, y down, the centre
+# of the top-left pixel at (0.5, 0.5). Conics are in 1/px². Colours, opacities and the loss have no unit. $v_x$ always
+# means $\partial L / \partial x$ and has the shape of $x$.
+#
+# ## One pixel, three hits
+#
 # With $d_i = p_i - (11.5, 8.5)$ from the pixel's centre to the Gaussian's, the conic $Q_i = \begin{pmatrix} a & b \\ b
 # & c \end{pmatrix}$, and $i$ counted from the nearest:
 #
@@ -156,15 +128,15 @@ plt.show()
 #
 # $$ C = \sum_i \alpha_i T_i c_i + T_{\rm end}\, b, \qquad A = 1 - T_{\rm end} \tag{3DGS 3} $$
 #
-# $C$ is the pixel's colour, $A$ its alpha channel, $b$ in the second line the background. A loss looks at both. To
-# first order any loss is linear in them, so we may as well take the linear one,
+# $C$ is the pixel's colour and $A$ its alpha channel; $b$ in the second line is the background. A loss depends on both.
+# To first order any loss is linear in them, so we may as well take a linear one,
 #
 # $$ L = \langle v, C \rangle + v_A A . $$
 #
-# These few scalar lines are the subject of this notebook, so they stand here once more, for this pixel only:
+# These few scalar lines are the subject of this notebook. Here they are once more as code, for this pixel only:
 
 # %%
-v, v_A = np.array([0.9, 0.5, 0.7]), 0.3  # some derivative of a loss by the pixel's colour and by its alpha
+v, v_A = np.array([0.9, 0.5, 0.7]), 0.3  # derivatives of some loss with respect to the pixel's colour and its alpha
 
 
 def hit(mean, conic, opacity):
@@ -191,7 +163,7 @@ def loss(inputs):
 
 
 def gradient(inputs, v_image=None, v_alpha=None):
-    """Gradient by the package; without arguments that of this pixel's loss."""
+    """Return the gradient as the package computes it; by default that of this pixel's loss."""
     if v_image is None:
         v_image, v_alpha = np.zeros((HEIGHT, WIDTH, 3)), np.zeros((HEIGHT, WIDTH))
         v_image[Y, X], v_alpha[Y, X] = v, v_A
@@ -200,7 +172,7 @@ def gradient(inputs, v_image=None, v_alpha=None):
 
 
 def differences(function, values, step=STEP):
-    """Central differences of a scalar function by every entry of an array."""
+    """Central differences of a scalar function with respect to every entry of an array."""
     numeric = np.zeros_like(values)
     for k in range(values.size):
         up, down = values.copy(), values.copy()
@@ -211,7 +183,7 @@ def differences(function, values, step=STEP):
 
 
 def by_differences(name):
-    """Central differences of the package's renderer by one of the inputs."""
+    """Central differences of the package's renderer with respect to one of the inputs."""
     return differences(lambda values: loss(inputs._replace(**{name: values})), getattr(inputs, name))
 
 
@@ -219,18 +191,18 @@ errors = {}  # of every line below, for the last cell
 
 
 def check(name, by_hand, numeric, by_package=None):
-    """Print the columns side by side and note the greatest error, relative to the largest entry."""
+    """Print the columns side by side and note the largest error, relative to the largest entry."""
     by_hand, columns = np.asarray(by_hand), [numeric] + ([] if by_package is None else [by_package])
     print(f"{name:<14}{'by hand':>14}{'differences':>14}" + ("" if by_package is None else f"{'composite_vjp':>15}"))
     for index in np.ndindex(by_hand.shape):
-        print(f"  {list(index)!s:<12}{by_hand[index]:14.9f}" + "".join(f"{x[index]:14.9f}" for x in columns))
+        print(f"  {list(index)!s:<12}{by_hand[index]:14.6f}" + "".join(f"{x[index]:14.6f}" for x in columns))
     size = np.abs(numeric).max()
     errors[name] = [np.abs(by_hand - x).max() / size for x in columns]
     print("  largest error  " + "  ".join(f"{error:.1e}" for error in errors[name]))
 
 
-print(f"pixel by the scalar lines {pixel_loss(alphas, inputs.colors, inputs.background):.15f}")
-print(f"pixel by composite        {loss(inputs):.15f}")
+print(f"pixel by the scalar lines {pixel_loss(alphas, inputs.colors, inputs.background):.12f}")
+print(f"pixel by composite        {loss(inputs):.12f}")
 
 # %% [markdown]
 # ## 1 Colours and background
@@ -250,13 +222,13 @@ check("v_background", T_end * v, by_differences("background"), package.backgroun
 # %% [markdown]
 # ## 2 Alpha of a hit
 #
-# $\alpha_i$ does two things: it brings in its own light, and it dims all that lies behind. Dimming is one factor $1 -
-# \alpha_i$ in every later transmittance, $T_{\rm end}$ included, so
+# $\alpha_i$ does two things: it adds the Gaussian's own light, and it dims everything behind. Dimming is one factor
+# $1 - \alpha_i$ in every later transmittance, including $T_{\rm end}$, so
 #
 # $$ \frac{\partial T_j}{\partial \alpha_i} = -\frac{T_j}{1 - \alpha_i} \;\; (j > i), \qquad
 #    \frac{\partial A}{\partial \alpha_i} = +\frac{T_{\rm end}}{1 - \alpha_i} . $$
 #
-# Collect what lies behind in one number, and the derivative has two terms:
+# Collect everything behind in one number, and the derivative has two terms:
 #
 # $$ S_i = \sum_{j>i} w_j \langle v, c_j \rangle + T_{\rm end} \left( \langle v, b \rangle - v_A \right), \qquad
 #    v_{\alpha_i} = T_i \langle v, c_i \rangle - \frac{S_i}{1 - \alpha_i} . $$
@@ -270,10 +242,13 @@ numeric = differences(lambda values: pixel_loss(values, inputs.colors, inputs.ba
 check("v_alpha", v_alphas, numeric)
 
 # %% [markdown]
-# The picture shows the two terms and their sum. They largely cancel: what counts is the *difference* between a
-# Gaussian's colour and the colour $R_i$ of what it hides. Indeed $S_i = (1 - \alpha_i) T_i \left(\langle v, R_i \rangle
-# - v_A t_i\right)$, where $t_i = T_{\rm end} / T_{i+1}$ is how much of the background passes through all that is
-#   behind. A Gaussian in front of others of its own colour gets no gradient to its opacity from the image.
+# The picture shows the two terms and their sum. They largely cancel: what counts is the *difference* between the colour
+# of a Gaussian and the colour $R_i$ of what it hides. Indeed
+#
+# $$ S_i = (1 - \alpha_i)\, T_i \left(\langle v, R_i \rangle - v_A t_i\right), \qquad t_i = T_{\rm end} / T_{i+1}, $$
+#
+# where $t_i$ is the share of the background's light that passes through everything behind hit $i$. The image gives no
+# gradient to the opacity of a Gaussian in front of others of the same colour.
 
 # %%
 behind = [
@@ -300,9 +275,10 @@ right.legend(frameon=False, fontsize=8)
 plt.show()
 
 # %% [markdown]
-# **In one sweep.** A kernel does not store $T_i$ and $S_i$ for every hit. It walks from the last hit to the first and
-# carries two scalars: $T$ starts at $T_{\rm end}$ and is divided by $1 - \alpha_i$, and $S$ starts at the background's
-# share and collects $w_i \langle v, c_i \rangle$. The division is why alpha is clamped at 0.99: at 1 it would be 0/0.
+# **In one sweep.** A kernel does not store $T_i$ and $S_i$ for every hit. It goes from the last hit to the first and
+# carries two scalars: $T$ starts at $T_{\rm end}$ and is divided by $1 - \alpha_i$, and $S$ starts with the
+# background's share and accumulates $w_i \langle v, c_i \rangle$. The division is the reason why alpha is clamped at
+# 0.99: at 1 it would be 0/0.
 
 # %%
 T_running, S_running = T_end, T_end * (v @ inputs.background - v_A)
@@ -311,7 +287,7 @@ for i in reversed(range(3)):
     T_running /= 1 - alphas[i]  # now T before hit i
     swept[i] = T_running * light[i] - S_running / (1 - alphas[i])
     S_running += alphas[i] * T_running * light[i]
-print("v_alpha, back to front:", swept, f" T before the first hit: {T_running:.15f}")
+print("v_alpha, back to front:", swept, f" T before the first hit: {T_running:.12f}")
 
 # %% [markdown]
 # ## 3 Opacity
@@ -320,8 +296,8 @@ print("v_alpha, back to front:", swept, f" T before the first hit: {T_running:.1
 #
 # $$ v_o = E\, v_\alpha, \qquad v_E = o\, v_\alpha . $$
 #
-# Where $o E$ exceeds 0.99 the clamp answers, and both are zero: the derivative of what is computed. (The profile
-# `INRIA` lets the gradient through there, as that code does: `clamp_stops_mean_gradient`,
+# Where $o E$ exceeds 0.99, alpha is constant and both are zero: that is the derivative of what is computed. (The
+# profile `INRIA` lets the gradient pass there, as that code does: `clamp_stops_mean_gradient`,
 # `clamp_stops_shape_gradient`.)
 
 # %%
@@ -331,8 +307,8 @@ check("v_opacity", E * v_alphas, by_differences("opacities"), package.opacities)
 # %% [markdown]
 # ## 4 The exponent
 #
-# $E = e^{-\sigma}$ is its own derivative, with a minus sign. So everything about the shape goes through one number for
-# each hit:
+# $E = e^{-\sigma}$ is its own derivative, with a minus sign. So everything that concerns the shape passes through one
+# number per hit:
 #
 # $$ v_\sigma = -o E\, v_\alpha = -\alpha\, v_\alpha . $$
 
@@ -351,7 +327,7 @@ check("v_sigma", v_sigma, numeric)
 #
 # $$ v_p = v_\sigma\, Q d = v_\sigma \begin{pmatrix} a\,dx + b\,dy \\ b\,dx + c\,dy \end{pmatrix} . $$
 #
-# The sign depends on the direction of $d$: renderers that take $d = \text{pixel centre} - p$ have a minus here.
+# The sign depends on the direction of $d$: a renderer with $d = \text{pixel centre} - p$ has a minus here.
 
 # %%
 a, b, c = inputs.conics.T
@@ -361,8 +337,8 @@ check("v_mean2d", v_means2d, by_differences("means2d"), package.means2d)
 # %% [markdown]
 # ## 6 Conic
 #
-# Written out, $\sigma = \tfrac12 a\,dx^2 + b\,dx\,dy + \tfrac12 c\,dy^2$. The number $b$ stands *twice* in the matrix
-# $Q$, so its two halves add up and its derivative has no $\tfrac12$:
+# Written out, $\sigma = \tfrac12 a\,dx^2 + b\,dx\,dy + \tfrac12 c\,dy^2$. The number $b$ occurs *twice* in the
+# matrix $Q$, so its two halves add up and its derivative has no $\tfrac12$:
 #
 # $$ v_a = \tfrac12 dx^2\, v_\sigma, \qquad v_b = dx\,dy\, v_\sigma, \qquad v_c = \tfrac12 dy^2\, v_\sigma . $$
 
@@ -371,17 +347,19 @@ v_conics = v_sigma[:, None] * np.column_stack([0.5 * dx * dx, dx * dy, 0.5 * dy 
 check("v_conic", v_conics, by_differences("conics"), package.conics)
 
 # %% [markdown]
-# That is all. The package does the same for a whole tile at a time, hits along the rows and pixels along the columns:
+# That is all. The package does the same for a whole tile at once, with hits along the rows and pixels along the
+# columns. What an ellipse does to a pixel, sections 3 to 6, is `response.hit_vjp`; `shade` and `order` serve relatives
+# of 3DGS:
 
 # %%
-show_code(composite_vjp)
+show_code(composite_hits_vjp)
 
 # %% [markdown]
 # ## What each parameter does to the picture
 #
-# A gradient sums over pixels. Before the sum, every pixel has its own derivative, and these make pictures: how the
-# image changes when one parameter of the near Gaussian grows a little. Red gets brighter, blue gets darker. Here is
-# `composite_vjp` with one pixel after the other switched on, all three channels weighted equally.
+# A gradient is a sum over pixels. Before the sum, every pixel has its own derivative, and these make pictures: how the
+# image changes when one parameter of the near Gaussian grows a little. Red pixels become brighter and blue ones darker.
+# They come from `composite_vjp` with one pixel after the other switched on and all three channels weighted equally.
 
 # %%
 maps = {name: np.zeros((HEIGHT, WIDTH)) for name in ("opacity", "x", "y", "a", "b", "c")}
@@ -396,28 +374,28 @@ units = dict(zip(maps, ("", " / px", " / px", " px$^2$", " px$^2$", " px$^2$"), 
 figure, axes = plt.subplots(2, 3, figsize=(10, 5.2), sharex=True, sharey=True)
 for panel, (name, values) in zip(axes.ravel(), maps.items(), strict=True):
     reach = np.abs(values).max()
-    show_image(
+    show_pixels(
         panel, values, f"d image / d {name}   (±{reach:.2g}{units[name]})", cmap="RdBu_r", vmin=-reach, vmax=reach
     )
-    draw_ellipse(panel, inputs.means2d[0], covariances2d[0], edgecolor="black", linewidth=0.8)
+    draw_ellipses(panel, inputs.means2d[0], covariances2d[0], edgecolor="black", linewidth=0.8)
     panel.set(xticks=range(0, 25, 6), yticks=range(0, 19, 6))
     panel.add_patch(Rectangle((X, Y), 1, 1, fill=False, edgecolor="black", linewidth=1))
     panel.label_outer()
 plt.show()
 
 # %% [markdown]
-# The near Gaussian is darker than most of what lies behind it, so more opacity darkens the image. The maps of $x$ and
-# $y$ have two lobes, one on either side. The conic is an *inverse* covariance, so more $a$ or $c$ makes the ellipse
-# narrower and lets the light behind it through. The map of $b$ changes sign from quadrant to quadrant, as $dx\,dy$
-# does: parts of it cancel in the sum over the pixels.
+# The near Gaussian is darker than most of what lies behind it, so a higher opacity darkens the image. The maps of $x$
+# and $y$ have two lobes, one on either side. The conic is an *inverse* covariance, so a larger $a$ or $c$ makes the
+# ellipse narrower and lets the light from behind through. The map of $b$ changes its sign from quadrant to quadrant, as
+# $dx\,dy$ does, so parts of it cancel in the sum over the pixels.
 #
 # ## A wrong factor, and the check that finds it
 #
-# A mistake that exists in released code: $v_b$ with the factor $\tfrac12$ of its neighbours $v_a$ and $v_c$. It comes
-# easily. The 3DGS code stores half of $v_b$ on purpose, meaning *one* of the two equal entries of the matrix, and
-# doubles it in the next stage. A port that takes the one half without the other is wrong from there on.
+# This mistake exists in released code: $v_b$ with the factor $\tfrac12$ of its neighbours $v_a$ and $v_c$. It is easily
+# made. The 3DGS code stores half of $v_b$ on purpose, meaning *one* of the two equal entries of the matrix, and doubles
+# it in the next stage. A port that copies the first step without the second is wrong from there on.
 #
-# We plant it, and look at it in four ways.
+# We plant the error and look at it in four ways.
 
 # %%
 rng = np.random.default_rng(0)
@@ -440,7 +418,7 @@ def error_by_differences(vjp, inputs, v_image, v_alpha, name):
     analytic = getattr(vjp(*arguments, composite(*arguments), v_image, v_alpha), name)
     direction = np.random.default_rng(1).uniform(-1, 1, analytic.shape)
     up, down = (image_loss(inputs._replace(**{name: getattr(inputs, name) + s * 1e-7 * direction})) for s in (1, -1))
-    # The yardstick is the sum of the terms' sizes: a direction whose terms happen to cancel is not judged by the rest.
+    # Relative to the sum of the terms' sizes, so that a direction whose terms happen to cancel does not look wrong.
     return abs((up - down) / 2e-7 - np.vdot(analytic, direction)) / np.abs(analytic * direction).sum()
 
 
@@ -454,10 +432,10 @@ v_image, v_alpha = rng.normal(size=(HEIGHT, WIDTH, 3)), rng.normal(size=(HEIGHT,
 numeric = by_differences("conics")
 halved = package.conics * np.array([1, 0.5, 1])
 pixel_error = np.abs(halved - numeric)[:, 1] / np.abs(numeric)[:, 1]
-print("1  v_b of the three hits in our pixel, relative error:", pixel_error)
+print("1  v_b of the three hits in our pixel, relative error:", pixel_error.round(6))
 
 on_axis = inputs._replace(means2d=inputs.means2d * [1, 0] + [0, Y + 0.5])  # dy = 0 for all three hits
-print("2  the same where the pixel is on a level with the Gaussians: v_b =", gradient(on_axis).conics[:, 1])
+print("2  the same with the pixel at the height of the Gaussians: v_b =", gradient(on_axis).conics[:, 1])
 
 flat = [
     np.concatenate([np.ravel(x) for x in (g.means2d, conics, g.opacities, g.colors)])
@@ -477,16 +455,16 @@ for name in Inputs._fields:
     print(f"     {name:<12} as derived {inner_errors[name, 'right']:.1e}   halved {inner_errors[name, 'halved']:.1e}")
 
 # %% [markdown]
-# 1. Entry by entry the error is exactly one half. The check catches it.
-# 2. Where $dx\,dy = 0$ it catches nothing: zero equals half of zero. A test must first show that what it compares is
-#    not zero.
-# 3. A cosine over everything is close to 1: of a long vector, only the entries $v_b$ are wrong. Compare input by input.
+# 1. Entry by entry the error is exactly one half. This check finds it.
+# 2. Where $dx\,dy = 0$ the check finds nothing, because zero equals half of zero. A test must first show that what it
+#    compares is not zero.
+# 3. A cosine over everything is close to 1: only the entries $v_b$ of a long vector are wrong. Compare input by input.
 # 4. An inner product $\langle v, \mathrm{d}f(u) \rangle = \langle f^{\ast} v, u \rangle$ with a random direction $u$
-#    needs two renderings for each input, whatever its size, and finds it too.
+#    needs two renderings per input, whatever its size, and finds the error, too.
 #
-# Further down, the conic's gradient becomes that of scales and rotations. A backend is a value, so the wrong stage can
-# be swapped into the whole renderer. Twelve Gaussians in space, all stages in NumPy, every parameter by central
-# differences:
+# Further back, the gradient of the conic becomes that of scales and rotations. A backend is a value, so the wrong stage
+# can be swapped into the whole renderer. Here are twelve Gaussians in space, all stages in NumPy, every parameter
+# against central differences:
 
 # %%
 camera = Camera(np.eye(3), np.zeros(3), 30.0, 30.0, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
@@ -538,15 +516,15 @@ axes.legend(frameon=False, ncols=2, loc="upper left")
 plt.show()
 
 # %% [markdown]
-# Opacities and colours are untouched, means are slightly off, scales and rotations by tens of per cent. Training still
-# goes down, only worse: it takes a gradient check, not a loss curve, to see it.
+# Opacities and colours are right, means are slightly off, scales and rotations are off by tens of per cent. The loss of
+# a training still goes down, only less: a gradient check shows the error, a loss curve does not.
 #
 # ## Where there is no derivative
 #
 # A hit with $\alpha < 1/255$ is skipped. At that threshold the image *jumps*: $L$ is linear in $\alpha_i$, so the step
-# is exactly $v_{\alpha_i} / 255$. The derivative treats the set of hits as fixed, and that is right on both sides of
-# the jump. Central differences that straddle it are not: they divide the jump by $2h$. Below, the near Gaussian moves
-# to the left, away from the pixel, until it stops counting.
+# is exactly $v_{\alpha_i} / 255$. The derivative treats the set of hits as fixed, which is right on both sides
+# of the jump. Central differences that straddle the jump are wrong: they divide it by $2h$. Below, the near Gaussian
+# moves to the left, away from the pixel, until its hit is skipped.
 
 # %%
 steps = np.logspace(-11, 0, 45)  # px
@@ -576,7 +554,7 @@ jump = loss_at(threshold + 1e-9) - loss_at(threshold - 1e-9)
 
 
 def step_errors(x, dtype=np.float64):
-    """Relative error of central differences by x, for all steps; float32 renders, but the quotient is exact."""
+    """Relative error of central differences with respect to x; float32 renders, but the quotient is exact."""
     exact = gradient(at(x)).means2d[0, 0]
     slopes = [(float(loss_at(x + h, dtype)) - float(loss_at(x - h, dtype))) / (2 * h) for h in steps]
     return np.abs(np.array(slopes) - exact) / abs(exact)
@@ -613,15 +591,90 @@ error.legend(frameon=False, fontsize=8, loc="upper center")
 plt.show()
 
 # %% [markdown]
-# Each curve has three parts. On the left, rounding: the loss is known to about $10^{-16}$ and the quotient to $10^{-16}
-# / h$. On the right, curvature: the error grows as $h^2$. In between lies the best step, $10^{-6}$ to $10^{-4}$ px in
-# float64. The red curve leaves the others as soon as the step reaches over the threshold, and from there its error is
-# not a few per cent but up to hundreds of times the gradient: it looks like a wrong derivative. In float32 the best
-# step leaves an error of $10^{-4}$, and a step of $10^{-6}$ px means nothing. So: **check gradients in float64, with a
-# small step, on scenes with no hit near a threshold**, and check the float32 kernel against the float64 one instead.
-# The same holds for the stop at $T \le 10^{-4}$ and for two Gaussians of equal depth, whose order flips.
+# Each curve has three parts. On the left is rounding: the loss is known to about $10^{-16}$ and the quotient to
+# $10^{-16} / h$. On the right is curvature: the error grows as $h^2$. The best step lies in between, at $10^{-6}$ to
+# $10^{-4}$ px in float64. The red curve leaves the others as soon as the step crosses the threshold, and from there its
+# error is not a few per cent but up to hundreds of times the gradient, so that a right derivative looks wrong. In
+# float32 the best step leaves an error of $10^{-4}$, and a step of $10^{-6}$ px says nothing. Therefore: **check
+# gradients in float64, with a small step, on scenes with no hit near a threshold**, and check the float32 kernel
+# against the float64 one. The same is true of the stop at $T \le 10^{-4}$ and of two Gaussians of equal depth, whose
+# order flips.
 #
-# ## What was shown
+# ## Play
+#
+# What decides whether a Gaussian becomes more opaque or less? Change the near Gaussian or the loss, and run the cell.
+# What to look for:
+#
+# * `near_color`: give it the colour of what it hides, the swatch `behind it` further up. Its bar of $v_\alpha$
+#   vanishes.
+# * `my_v`: the sign of the loss. With `-v` every bar flips.
+# * `near_opacity`: raise it to 0.95. The bars of the others shrink, since less light reaches them.
+
+# %%
+near_color, near_opacity = np.array([0.82, 0.29, 0.25]), 0.6
+my_v = v
+
+mine = inputs._replace(
+    colors=np.vstack([near_color, inputs.colors[1:]]), opacities=np.array([near_opacity, *inputs.opacities[1:]])
+)
+v_image_mine = np.zeros((HEIGHT, WIDTH, 3))
+v_image_mine[Y, X] = my_v
+v_opacities = gradient(mine, v_image_mine, np.zeros((HEIGHT, WIDTH))).opacities
+figure, (left, right) = plt.subplots(1, 2, figsize=(8.5, 2.8))
+show_pixels(left, composite(*prepare(mine)).image, "yours")
+left.add_patch(Rectangle((X, Y), 1, 1, fill=False, edgecolor="black", linewidth=2))
+right.bar(["near", "middle", "far"], v_opacities, color=mine.colors, edgecolor="black", linewidth=0.5)
+right.axhline(0, color="black", linewidth=0.8)
+right.set(title="gradient with respect to the opacities")
+plt.show()
+
+# %% [markdown]
+# ## Exercises
+#
+# **1.** Derive the gradient with respect to the *logit* $\ell$ of an opacity, $o = 1 / (1 + e^{-\ell})$, which is what
+# training changes. Where does a Gaussian learn fastest?
+#
+# <details>
+# <summary>Solution</summary>
+#
+# $\mathrm{d}o / \mathrm{d}\ell = o\,(1 - o)$, so $v_\ell = o\,(1 - o)\,v_o$. It is largest at $o = \tfrac12$; a
+# Gaussian that is nearly opaque, or nearly gone, hardly moves.
+#
+# ```python
+# logits = np.log(inputs.opacities / (1 - inputs.opacities))
+# v_logits = inputs.opacities * (1 - inputs.opacities) * package.opacities
+# of_logits = differences(lambda l: loss(inputs._replace(opacities=1 / (1 + np.exp(-l)))), logits)
+# assert np.allclose(v_logits, of_logits, rtol=1e-6)
+# ```
+#
+# </details>
+#
+# **2.** The conic is the inverse of the covariance, $Q = \Sigma'^{-1}$. Turn $v_Q$ into $v_{\Sigma'}$. Use a symmetric
+# matrix for $v_Q$; what stands off its diagonal?
+#
+# <details>
+# <summary>Solution</summary>
+#
+# From $\mathrm{d}Q = -Q\,\mathrm{d}\Sigma'\,Q$ follows $v_{\Sigma'} = -Q\,v_Q\,Q$ for symmetric matrices. The number
+# $b$ occurs twice, so *half* of $v_b$ stands at each of its two places. That is the half which the planted error forgot
+# to double.
+#
+# ```python
+# v_Q = matrices(package.conics * [1, 0.5, 1])
+# Q = matrices(inputs.conics)
+# v_Sigma = -Q @ v_Q @ Q
+# upper = covariances2d[:, [0, 0, 1], [0, 1, 1]]  # a, b, c of the covariances
+# of_upper = differences(
+#     lambda s: loss(inputs._replace(conics=np.linalg.inv(matrices(s)).reshape(3, 4)[:, [0, 1, 3]])), upper
+# )
+# expected = v_Sigma[:, [0, 0, 1], [0, 1, 1]] * [1, 2, 1]
+# assert np.allclose(expected, of_upper, rtol=1e-4, atol=1e-9)
+# ```
+#
+# </details>
+
+# %% [markdown]
+# ## What was shown, checked
 
 # %%
 assert set(errors) == {"v_color", "v_background", "v_alpha", "v_opacity", "v_sigma", "v_mean2d", "v_conic"}
@@ -639,7 +692,7 @@ assert all(inner_errors[name, "right"] < 1e-6 for name in Inputs._fields)
 assert inner_errors["conics", "halved"] > 0.05
 assert all(inner_errors[name, "halved"] < 1e-6 for name in Inputs._fields if name != "conics")
 assert np.all(gradient(on_axis).conics[:, 1] == 0) and np.all(gradient(on_axis).conics[:, 0] != 0)
-assert similarity > 0.95, "a cosine over everything does not see it"
+assert similarity > 0.95, "a cosine over everything misses it"
 assert scene_errors[0].max() < 1e-6 and scene_errors[1, 1:3].min() > 0.1 and scene_errors[1, 3:].max() < 1e-6
 
 # The jump at 1/255 and the step of the differences.

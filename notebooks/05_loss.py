@@ -20,59 +20,26 @@
 # one pixel at a time, and structural similarity, which looks at neighbourhoods. This notebook shows what each of them
 # sees, and the gradient image that they send back to the renderer.
 #
-# | file | what it holds | equation |
-# |---|---|---|
-# | `minisplat_ref/reference/loss.py` | `photometric_loss`, `ssim_map` and their gradients | 3DGS (7), SSIM (13) |
-#
-# *3DGS* is Kerbl et al. 2023, *SSIM* is Wang et al. 2004. **Frames and units:** images are [H, W, 3] with values in [0,
-# 1], pixel indices count from 0 at the top left. The loss has no unit.
+# Below is a ray-traced photograph of a small room with five kinds of error: too bright everywhere, low contrast,
+# shifted by a fraction of a pixel, blurred, noisy. Each is scaled so that the mean absolute difference is **the same**,
+# 0.03. The first row is what you see, the second what L1 sees, and the third what SSIM sees.
 
 # %%
-import ast
-import inspect
-import os
-
-# Read when NumPy loads: the matrices here are small, and on a busy machine waiting threads cost more than they help.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Rectangle
 from scipy.ndimage import gaussian_filter
 
+from figures import BLUE, GREY, RED, YELLOW, show, show_code
 from minisplat_ref.constants import SSIM_SIGMA, SSIM_WINDOW
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.metrics import psnr
 from minisplat_ref.reference.loss import photometric_loss, photometric_loss_vjp, ssim_map, ssim_map_vjp
 
-plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
-RED, BLUE, YELLOW, GREEN, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#8a8580"
-
-
-def show_code(function):
-    """Print a function of the package without its docstring."""
-    source = inspect.getsource(function)
-    lines, body = source.splitlines(), ast.parse(source).body[0].body
-    print(*lines[: body[0].lineno - 1], *lines[body[1].lineno - 1 :], sep="\n")
-
-
-def show(axes, image, title="", **style):
-    """Show an image or a map without ticks."""
-    shown = axes.imshow(np.clip(image, 0, 1) if image.ndim == 3 else image, interpolation="nearest", **style)
-    axes.set(title=title, xticks=[], yticks=[])
-    return shown
-
-
-# %% [markdown]
-# ## Five errors of the same size
-#
-# A ray-traced photograph of a small room, and five ways to get it wrong: too bright everywhere, low contrast, shifted
-# by a fraction of a pixel, blurred, noisy. Each is scaled so that the mean absolute difference is **the same**, 0.03.
-# The first row is what one sees, the second what L1 sees, the third what SSIM sees.
-
 # %%
 photo = make_scene("room", n_views=2, width=120, height=90, n_points=0, seed=3).scene.train_views[0].image / 255.0
 MEAN_DIFFERENCE = 0.03
+DETAIL = np.s_[10:70, 20:100]  # the part that is shown
 rng = np.random.default_rng(0)
 shifted = np.roll(photo, (1, 1), axis=(0, 1))
 shifted[0], shifted[:, 0] = photo[0], photo[:, 0]  # what rolls in from the other side is no shift
@@ -88,28 +55,28 @@ images = {name: photo + MEAN_DIFFERENCE * d / np.abs(d).mean() for name, d in di
 l1 = {name: photometric_loss(image, photo, 0.0)[0] for name, image in images.items()}  # weight 0: L1 alone
 dssim = {name: photometric_loss(image, photo, 1.0)[0] for name, image in images.items()}  # weight 1: 1 - SSIM alone
 
-figure, axes = plt.subplots(3, 5, figsize=(12, 5.9))
+figure, axes = plt.subplots(3, 5, figsize=(10, 4.9))
 for column, (name, image) in zip(axes.T, images.items(), strict=True):
-    show(column[0], image, f"{name}, PSNR {psnr(image, photo):.1f} dB")
-    difference = show(
-        column[1], np.abs(image - photo).mean(axis=2), f"L1 {l1[name]:.3f}", cmap="magma", vmin=0, vmax=0.15
-    )
-    dissimilarity = show(
-        column[2],
-        1 - ssim_map(image, photo).mean(axis=2),
-        f"1 - SSIM {dssim[name]:.3f}",
-        cmap="magma",
-        vmin=0,
-        vmax=0.5,
-    )
+    show(column[0], image[DETAIL], f"{name}\nPSNR {psnr(image, photo):.1f} dB")
+    l1_map = np.abs(image - photo).mean(axis=2)[DETAIL]
+    dssim_map = 1 - ssim_map(image, photo).mean(axis=2)[DETAIL]
+    difference = show(column[1], l1_map, f"L1 {l1[name]:.3f}", cmap="magma", vmin=0, vmax=0.15)
+    dissimilarity = show(column[2], dssim_map, f"1 - SSIM {dssim[name]:.3f}", cmap="magma", vmin=0, vmax=0.5)
 figure.colorbar(difference, ax=axes[1], label="|I - T|", shrink=0.9)
 figure.colorbar(dissimilarity, ax=axes[2], label="1 - SSIM", shrink=0.9)
 figure.colorbar(difference, ax=axes[0]).ax.set_visible(False)
 plt.show()
 
 # %% [markdown]
-# For L1 the five are equal. For SSIM they are not: a change of brightness hardly counts, blur does, and noise on the
-# plain walls most of all, where the photograph has no structure that it could drown in.
+# For L1 the five are equal. For SSIM they are not: a change of brightness hardly counts, and blur does. What counts
+# most is noise on the plain walls, where the photograph has no structure to hide it.
+#
+# | file | what it holds | equation |
+# |---|---|---|
+# | `minisplat_ref/reference/loss.py` | `photometric_loss`, `ssim_map` and their gradients | 3DGS (7), SSIM (13) |
+#
+# *3DGS* is Kerbl et al. 2023, *SSIM* is Wang et al. 2004. **Frames and units:** images are [H, W, 3] with values in
+# [0, 1]; pixel indices count from 0 at the top left. The loss has no unit.
 #
 # ## The two terms
 #
@@ -123,9 +90,9 @@ plt.show()
 #                         {(\mu_x^2 + \mu_y^2 + C_1)(\sigma_x^2 + \sigma_y^2 + C_2)}, \qquad
 #    C_1 = 0.01^2,\; C_2 = 0.03^2 . \tag{SSIM 13} $$
 #
-# The first fraction compares brightness and the second structure; both are at most 1. $C_2$ decides what "flat" means:
-# a standard deviation well below 0.03 counts as no structure. Some texts halve the second term, $(1 -
-# \mathrm{SSIM})/2$; the code that the published numbers come from does not, and neither do we.
+# The left factors compare brightness and the right ones structure; neither fraction exceeds 1. $C_2$ decides what
+# "flat" means: a standard deviation well below 0.03 counts as no structure. Some texts halve the second term,
+# $(1 - \mathrm{SSIM})/2$. The code that the published numbers come from does not, and neither does this package.
 
 # %%
 show_code(ssim_map)
@@ -134,9 +101,9 @@ show_code(photometric_loss)
 # %% [markdown]
 # ## The window
 #
-# The weights are a Gaussian of $\sigma = 1.5$ px, cut to $11 \times 11$ pixels and normalised. They need not be copied
-# from the code, they can be *measured*: for two constant images the variances vanish, SSIM depends on the window mean
-# alone, and the gradient of one SSIM value by the image is the window.
+# The weights are a Gaussian of $\sigma = 1.5$ px, cut to $11 \times 11$ pixels and normalised. They can be *measured*:
+# for two constant images the variances vanish, SSIM depends on the window mean alone, and the gradient of one SSIM
+# value with respect to the image is the window.
 
 # %%
 size = 31
@@ -151,10 +118,10 @@ changed = photo.copy()
 changed[45, 60] = 1 - changed[45, 60]  # one pixel
 footprint = np.abs(ssim_map(changed, photo) - 1).max(axis=2) > 1e-12
 
-figure, axes = plt.subplots(1, 3, figsize=(12, 3.4), width_ratios=[1, 1.2, 1.2])
+figure, axes = plt.subplots(1, 3, figsize=(11, 3.1), width_ratios=[1, 1.2, 1.2])
 shown = axes[0].imshow(window[8:23, 8:23], cmap="magma", extent=(7.5, 22.5, 22.5, 7.5))
 axes[0].add_patch(Rectangle((9.5, 9.5), 11, 11, fill=False, edgecolor="white"))
-axes[0].set(title="the window, measured; frame: 11 x 11 px", xlabel="column", ylabel="row")
+axes[0].set(title="the window, measured; frame: 11 x 11", xlabel="column", ylabel="row")
 figure.colorbar(shown, ax=axes[0], shrink=0.85)
 offsets = np.arange(-7, 8)
 axes[1].bar(offsets, window.sum(axis=0)[8:23], color=BLUE, label="measured")
@@ -170,25 +137,25 @@ figure.colorbar(shown, ax=axes[2], shrink=0.85)
 plt.show()
 
 # %% [markdown]
-# One wrong pixel spoils 121 SSIM values, and one SSIM value pulls at 121 pixels.
+# One wrong pixel changes 121 SSIM values, and one SSIM value has a gradient at 121 pixels.
 #
-# **At the border** the window hangs over the edge. As in the 3DGS code, zeros are beyond it, in both images alike, and
-# weights still add up to 1 with those zeros. So near the border both images appear to end in a black frame, and that is
-# structure: a difference in brightness becomes a difference in contrast, which SSIM punishes more. Two constant images,
-# 0.4 and 0.6, show it best; away from the border their SSIM is $(2 \mu_x \mu_y + C_1) / (\mu_x^2 + \mu_y^2 + C_1)$.
+# **At the border** the window extends beyond the image. As in the 3DGS code, both images are padded with zeros, which
+# keep their share of the weights. So both images appear to end in a black frame, and a frame is structure: a difference
+# in brightness becomes a difference in contrast, which SSIM punishes more. Two constant images, 0.4 and 0.6, show it
+# best; away from the border their SSIM is $(2 \mu_x \mu_y + C_1) / (\mu_x^2 + \mu_y^2 + C_1)$.
 
 # %%
 similarity = ssim_map(dark, bright)[:, :, 0]
 inside = (2 * 0.4 * 0.6 + 0.01**2) / (0.4**2 + 0.6**2 + 0.01**2)
 
-figure, (left, middle, right) = plt.subplots(1, 3, figsize=(12, 3.2), width_ratios=[1, 1.4, 1.4])
+figure, (left, middle, right) = plt.subplots(1, 3, figsize=(11, 3.1), width_ratios=[1, 1.4, 1.4])
 figure.colorbar(show(left, similarity, "SSIM of constant 0.4 and 0.6", cmap="magma", vmin=0.7, vmax=0.95), ax=left)
 middle.plot(similarity[15], "o-", color=BLUE, markersize=3, label="middle row")
 middle.axhline(inside, color=GREY, linewidth=0.8, label="closed form, away from the border")
 for x in (4.5, 25.5):
     middle.axvline(x, color=GREY, linewidth=0.8, linestyle=":")
 middle.set(title="one row: 5 pixels at each end are affected", xlabel="column", ylabel="SSIM")
-middle.legend(frameon=False, fontsize=8)
+middle.legend(loc="center")
 means = np.linspace(0, 1, 101)
 flat = [ssim_map(np.full((11, 11, 3), m), np.full((11, 11, 3), 0.6))[5, 5, 0] for m in means]
 right.plot(means, flat, color=BLUE, label="brightness: constant m against constant 0.6")
@@ -202,16 +169,35 @@ right.legend(frameon=False, fontsize=8, loc="upper right")
 plt.show()
 
 # %% [markdown]
-# (On the right the image is as small as the window, so its middle is the only pixel that sees no border.) A wrong
-# brightness is forgiven for long. Structure that is not in the photograph is not: at an amplitude of 0.03, the dotted
-# line, half of the similarity is gone.
+# (On the right the image is as small as the window, so its middle is the only pixel whose window stays inside.) SSIM
+# tolerates a wrong brightness over a wide range. It does not tolerate structure that is not in the photograph: at an
+# amplitude of 0.03, the dotted line, half of the similarity is gone.
 #
 # ## The gradient image
 #
-# What the renderer gets is $v_I = \partial \mathcal L / \partial I$, one number for each pixel and channel. L1 sends a
-# sign: $\pm 1/n$ whatever the size of the error. For SSIM, call its four factors $S = PQ / (AB)$. They depend on the
-# image through three blurred images, and a blur with a symmetric window is its own transpose, so the way back is three
-# blurs:
+# What the renderer receives is $v_I = \partial \mathcal L / \partial I$, one number for each pixel and channel. Here is
+# the red channel for two of the five errors. Red pixels are to become darker, blue ones brighter.
+
+# %%
+figure, axes = plt.subplots(2, 4, figsize=(11, 4.3))
+for line, name in zip(axes, ("blurred", "noisy"), strict=True):
+    show(line[0], images[name], name)
+    for panel, weight, title in zip(line[1:], (0.0, 1.0, 0.2), ("L1", "1 - SSIM", "loss, w = 0.2"), strict=True):
+        tape = photometric_loss(images[name], photo, weight)[1]
+        v_red = photometric_loss_vjp(tape)[:, :, 0] * photo.size  # in units of 1 / n
+        reach = 1.0 if weight == 0 else float(np.quantile(np.abs(v_red), 0.99))
+        shown = show(panel, v_red, f"gradient of {title}", cmap="RdBu_r", vmin=-reach, vmax=reach)
+        figure.colorbar(shown, ax=panel, shrink=0.85, label="units of 1/n" if panel is line[-1] else "")
+plt.show()
+
+# %% [markdown]
+# In the blurred image both terms ask for sharper edges. In the noisy one, L1 responds to the noise everywhere alike,
+# and SSIM pulls hardest on the plain walls. A gradient of the SSIM term can be tens of times $1/n$: with $w = 0.2$ it
+# often outweighs L1.
+#
+# L1 sends a sign: $\pm 1/n$ whatever the size of the error. For SSIM, call its four factors $S = PQ / (AB)$. They
+# depend on the image through three blurred images, and a blur with a symmetric window is its own transpose, so the
+# backward pass consists of three blurs:
 #
 # $$ v_x = \mathrm{blur}(v_\mu) + 2x \odot \mathrm{blur}(v_m) + y \odot \mathrm{blur}(v_k), \qquad
 #    \mu = \mathrm{blur}(x),\; m = \mathrm{blur}(x^2),\; k = \mathrm{blur}(xy) . $$
@@ -220,26 +206,10 @@ plt.show()
 show_code(ssim_map_vjp)
 show_code(photometric_loss_vjp)
 
-# %%
-figure, axes = plt.subplots(2, 4, figsize=(12, 4.6))
-for line, name in zip(axes, ("blurred", "noisy"), strict=True):
-    show(line[0], images[name], name)
-    for panel, weight, title in zip(line[1:], (0.0, 1.0, 0.2), ("L1", "1 - SSIM", "loss, w = 0.2"), strict=True):
-        tape = photometric_loss(images[name], photo, weight)[1]
-        v_red = photometric_loss_vjp(tape)[:, :, 0] * photo.size  # in units of 1 / n
-        reach = 1.0 if weight == 0 else float(np.quantile(np.abs(v_red), 0.99))
-        shown = show(panel, v_red, f"gradient of {title}, red channel", cmap="RdBu_r", vmin=-reach, vmax=reach)
-        figure.colorbar(shown, ax=panel, shrink=0.85, label="units of 1/n")
-plt.show()
-
 # %% [markdown]
-# Red pixels are to become darker, blue ones brighter. In the blurred image both terms ask for sharper edges. In the
-# noisy one, L1 sees noise everywhere alike, and SSIM pulls hardest on the plain walls. In the SSIM term a gradient can
-# be tens of times $1/n$: with $w = 0.2$ it often outweighs L1.
-#
 # **Checked at once** against central differences along a random direction $u$, which moves all pixels together:
 # $\langle v_I, u \rangle$ against $(\mathcal L(I + hu) - \mathcal L(I - hu)) / 2h$. L1 has a kink at $I = T$, where the
-# gradient is 0 by definition of the sign; pixels that close stay where they are.
+# gradient is 0 because $\operatorname{sign}(0) = 0$; pixels as close to the kink as the step are not moved.
 
 # %%
 STEP = 1e-7
@@ -262,9 +232,9 @@ for name in images:
 # %% [markdown]
 # ## A mask
 #
-# A passer-by, a reflection of the photographer: pixels that must not count. Leaving them out of the two means is not
-# enough. The windows of their neighbours still look at them, up to 5 pixels away. So the rendering is first replaced by
-# the photograph under the mask, and what is masked neither counts nor leaks.
+# A passer-by, or a reflection of the photographer: some pixels must not count. Leaving them out of the two means is not
+# enough, because the windows of their neighbours still contain them, up to 5 pixels away. So the rendering is first
+# replaced by the photograph under the mask. What is masked then neither counts nor affects its neighbours.
 
 # %%
 mask = np.ones(photo.shape[:2], dtype=bool)
@@ -277,8 +247,8 @@ gradients = {
 }
 clean = photometric_loss_vjp(photometric_loss(images["blurred"], photo, 0.2, mask)[1])
 
-figure, axes = plt.subplots(1, 3, figsize=(12, 2.9))
-show(axes[0], rendered, "rendering, with a thing in it")
+figure, axes = plt.subplots(1, 3, figsize=(11, 2.8))
+show(axes[0], rendered, "rendering, with an intruder")
 reach = 5.0
 for panel, (name, v_image) in zip(axes[1:], gradients.items(), strict=True):
     shown = show(
@@ -292,23 +262,88 @@ outside = np.abs(gradients["without mask"] * photo.size - gradients["with mask"]
 outside &= mask
 reach_rows = np.flatnonzero(outside.any(axis=1))
 print(
-    f"without the mask the thing changes the gradient of rows {reach_rows[0]} to {reach_rows[-1]}; it covers 30 to 61"
+    f"without the mask the gradient changes in rows {reach_rows[0]} to {reach_rows[-1]}; the intruder covers 30 to 61"
 )
 
 # %% [markdown]
-# The thing reaches 10 pixels far without a mask: 5 from it to the SSIM values that see it, and 5 more from those to the
-# pixels that they pull at.
+# Without a mask the intruder affects pixels up to 10 away: it is 5 to the SSIM values whose windows contain it, and 5
+# more from those to the pixels on which they depend.
 #
-# ## What was shown
+# ## Play
+#
+# Make an error of your own and compare. What to look for:
+#
+# * `my_image`: try `photo**1.2`, `np.flipud(photo)`, `np.round(photo * 4) / 4`, or `photo + 0.03 * np.sin(x)`.
+# * `w`: at which weight do the two terms pull equally hard, that is, when are the two printed sizes equal?
+
+# %%
+x = np.arange(photo.shape[1])[None, :, None]
+my_image = np.clip(photo + 0.03 * np.sin(x), 0, 1)
+w = 0.2
+
+sizes = [
+    part * np.abs(photometric_loss_vjp(photometric_loss(my_image, photo, weight)[1])).sum()
+    for part, weight in ((1 - w, 0.0), (w, 1.0))
+]
+figure, axes = plt.subplots(1, 3, figsize=(11, 2.6))
+show(axes[0], my_image, f"yours, PSNR {psnr(my_image, photo):.1f} dB")
+my_l1, my_dssim = (photometric_loss(my_image, photo, weight)[0] for weight in (0.0, 1.0))
+show(axes[1], np.abs(my_image - photo).mean(axis=2), f"L1 {my_l1:.3f}", cmap="magma", vmin=0, vmax=0.15)
+show(axes[2], 1 - ssim_map(my_image, photo).mean(axis=2), f"1 - SSIM {my_dssim:.3f}", cmap="magma", vmin=0, vmax=0.5)
+plt.show()
+print(f"size of the gradient: (1 - w) L1 {sizes[0]:.2f}, w (1 - SSIM) {sizes[1]:.2f}")
+
+# %% [markdown]
+# ## Exercises
+#
+# **1.** Two constant images differ by 0.2 in brightness, 0.1 against 0.3 and 0.7 against 0.9. L1 sees no difference
+# between the two pairs. What does SSIM see, away from the border?
+#
+# <details>
+# <summary>Solution</summary>
+#
+# All variances vanish, so SSIM is $(2 \mu_x \mu_y + C_1) / (\mu_x^2 + \mu_y^2 + C_1)$: 0.60 in the dark and 0.97
+# in the light. SSIM compares brightness by its ratio, as the eye does.
+#
+# ```python
+# pairs = {}
+# for m, n in ((0.1, 0.3), (0.7, 0.9)):
+#     pairs[m] = ssim_map(np.full((31, 31, 3), m), np.full((31, 31, 3), n))[15, 15, 0]
+#     assert np.isclose(pairs[m], (2 * m * n + 1e-4) / (m * m + n * n + 1e-4))
+# assert pairs[0.1] < 0.61 and pairs[0.7] > 0.96
+# ```
+#
+# </details>
+#
+# **2.** Which constant grey image has the smallest L1 against the photograph, and which the smallest mean squared
+# error? What does that say about a Gaussian that is too large for the texture behind it?
+#
+# <details>
+# <summary>Solution</summary>
+#
+# The median of the values minimises the sum of absolute differences, the mean that of squares. A Gaussian that
+# can only be grey takes the *median* colour under L1: on a checkerboard of unequal shares it takes the colour of the
+# majority, and its gradient is then small although half of the picture is wrong.
+#
+# ```python
+# greys = np.linspace(0, 1, 201)
+# best_l1 = greys[np.argmin([np.abs(photo - grey).mean() for grey in greys])]
+# best_l2 = greys[np.argmin([((photo - grey) ** 2).mean() for grey in greys])]
+# assert abs(best_l1 - np.median(photo)) < 0.006 and abs(best_l2 - photo.mean()) < 0.006
+# ```
+#
+# </details>
+
+# %% [markdown]
+# ## What was shown, checked
 
 # %%
 # Five errors that L1 cannot tell apart and SSIM can.
 assert all(abs(value - MEAN_DIFFERENCE) < 1e-12 for value in l1.values())
 assert dssim["brighter"] < dssim["less contrast"] < min(dssim["shifted"], dssim["blurred"]) < dssim["noisy"]
 assert dssim["noisy"] > 10 * dssim["brighter"]
-w = 0.2
-combined = photometric_loss(images["blurred"], photo, w)[0]
-assert np.isclose(combined, (1 - w) * l1["blurred"] + w * dssim["blurred"], rtol=1e-12)
+combined = photometric_loss(images["blurred"], photo, 0.2)[0]
+assert np.isclose(combined, 0.8 * l1["blurred"] + 0.2 * dssim["blurred"], rtol=1e-12)
 
 # The window: 11 x 11, a Gaussian, normalised; zeros beyond the border.
 assert (rows.min(), rows.max(), columns.min(), columns.max()) == (10, 20, 10, 20) and len(rows) == SSIM_WINDOW**2
@@ -322,7 +357,7 @@ assert len(gradient_errors) == 15
 for (name, weight), (error, size) in gradient_errors.items():
     assert error < 1e-6 and size > 0.01, f"{name}, w = {weight}: relative error {error:.1e}"
 
-# The mask: nothing under it counts, nothing leaks from it, and an empty one is no error.
+# The mask: nothing under it counts or affects its neighbours, and an empty one is no error.
 assert np.all(gradients["with mask"][~mask] == 0) and np.array_equal(gradients["with mask"], clean)
 assert np.abs(gradients["without mask"][~mask]).max() * photo.size > 0.5
 assert (reach_rows[0], reach_rows[-1]) == (20, 71)

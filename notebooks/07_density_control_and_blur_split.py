@@ -16,37 +16,23 @@
 # %% [markdown]
 # # 07 Density control and blur split
 #
-# Training starts with a few hundred Gaussians and needs many thousands. Which ones should become two? 3DGS looks at
-# the gradient by the position: where it is large, the photographs pull one Gaussian to two places. There is a spot
-# that this sign does not see. A large Gaussian in front of a fine texture is pulled to all sides at once, the pulls
-# cancel, and the texture stays blurred. Mini-Splatting adds a second sign, an area, and calls the event *blur split*.
+# Training starts with a few hundred Gaussians and needs many thousands. Which ones should become two? 3DGS looks at the
+# gradient with respect to the position: where it is large, the photographs pull one Gaussian to two places. This sign
+# has a blind spot. A large Gaussian in front of a fine texture is pulled to all sides at once, the pulls cancel, and
+# the texture stays blurred. Mini-Splatting adds a second sign, an area, and calls the event *blur split*.
 #
-# | file | what it holds | where in the paper |
-# |---|---|---|
-# | `minisplat_ref/strategy/clone_split.py` | the gradient's sign; clone, split, prune | 3DGS sec. 5.2 |
-# | `minisplat_ref/strategy/blur_split.py` | the area's sign; children on the longest axis | MS sec. 4.1, eq. 2 |
-# | `minisplat_ref/methods/` | the same as events of a recipe | |
-#
-# *3DGS* is Kerbl et al. 2023, *MS* is Mini-Splatting, Fang and Wang 2024. **Frames and units:** the world is in metres;
-# image coordinates are pixels, x right, y down. Gradients by the position are taken in units in which the image is 2
-# wide and 2 high.
+# Here is the blind spot with a single grey Gaussian and two photographs: one is dark on the left and bright on the
+# right, the other is a fine checkerboard. The arrow is the step that gradient descent would take. The texture needs a
+# split just as badly as the edge, and the gradient is next to nothing.
 
 # %%
-import ast
 import copy
-import inspect
-import os
 from functools import partial
-
-# Read when NumPy and Numba load: matrices and pictures are small here, and on a busy machine threads that wait for each
-# other cost more than they help.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.collections import EllipseCollection
 
+from figures import BLUE, GREY, RED, YELLOW, covariances2d, draw_ellipses, show, show_code
 from minisplat_ref.backends import CPU
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
@@ -58,30 +44,6 @@ from minisplat_ref.strategy.clone_split import clone_and_split, logit, random_ch
 from minisplat_ref.training.loop import initial_state, train
 from minisplat_ref.training.schedule import BLEND_STATS, During, Every
 from minisplat_ref.types import Camera, Gaussians
-
-plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
-RED, BLUE, YELLOW, GREEN, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#8a8580"
-
-
-def show_code(function):
-    """Print a function of the package without its docstring."""
-    source = inspect.getsource(function)
-    lines, body = source.splitlines(), ast.parse(source).body[0].body
-    print(*lines[: body[0].lineno - 1], *lines[body[1].lineno - 1 :], sep="\n")
-
-
-def show(axes, image, title="", **style):
-    """Show an image or a map without ticks."""
-    shown = axes.imshow(np.clip(image, 0, 1) if image.ndim == 3 else image, interpolation="nearest", **style)
-    axes.set(title=title, xticks=[], yticks=[])
-    return shown
-
-
-# %% [markdown]
-# ## One Gaussian, two photographs
-#
-# A grey Gaussian in front of a camera. One photograph is dark on the left and bright on the right; the other is a fine
-# checkerboard. In both the Gaussian is the only one, so it has the largest weight at the same pixels.
 
 # %%
 SIZE = 48
@@ -101,7 +63,7 @@ photographs = {
     "a fine texture": np.where((xs // 3 + ys // 3) % 2, 0.15, 0.85),
 }
 
-figure, axes = plt.subplots(1, 5, figsize=(12, 2.6))
+figure, axes = plt.subplots(1, 5, figsize=(11, 2.4))
 show(axes[0], output.image, "the Gaussian")
 pulls = {}
 for k, (name, photograph) in enumerate(photographs.items()):
@@ -120,30 +82,38 @@ for k, (name, photograph) in enumerate(photographs.items()):
 plt.show()
 n_led = int(output.stats.dominant_count[0])
 for name, pull in pulls.items():
-    print(f"{name:<15} gradient by the position {pull:.1e}, largest weight at {n_led} pixels")
+    print(f"{name:<15} gradient with respect to the position {pull:.1e}, {n_led} pixels dominated")
 
 # %% [markdown]
-# The arrow is the step that gradient descent would take. The texture needs a split as badly, and the gradient is next
-# to nothing.
+# | file | what it holds | where in the paper |
+# |---|---|---|
+# | `minisplat_ref/strategy/clone_split.py` | the gradient's sign; clone, split, prune | 3DGS sec. 5.2 |
+# | `minisplat_ref/strategy/blur_split.py` | the area's sign; children on the longest axis | MS sec. 4.1, eq. 2 |
+# | `minisplat_ref/methods/` | the same as events of a recipe | |
 #
-# ## The second sign: who leads where
+# *3DGS* is Kerbl et al. 2023, *MS* is Mini-Splatting, Fang and Wang 2024. **Frames and units:** the world is in metres;
+# image coordinates are pixels, x right, y down. Gradients with respect to the position are in units in which the image
+# is 2 wide and 2 high.
 #
-# The compositor counts at how many pixels each Gaussian has the largest blending weight $w = \alpha T$. Whoever leads
-# at more than a fraction $\theta = 2 \cdot 10^{-4}$ of an image since the last event is split, whatever its gradient
-# and size (MS eq. 2). In a photograph of a megapixel that is a patch of 15 x 15 pixels.
+# ## The second sign: how many pixels a Gaussian dominates
+#
+# The compositor counts at how many pixels each Gaussian *dominates*, that is, has the largest blending weight
+# $w = \alpha T$. A Gaussian that dominates more than a fraction $\theta = 2 \cdot 10^{-4}$ of an image since the last
+# event is split, whatever its gradient and its size (MS eq. 2). In a photograph of a megapixel that is a patch of 15 x
+# 15 pixels.
 
 # %%
 show_code(is_blurred)
 
 # %% [markdown]
-# In our photographs of 128 x 96 pixels a fraction of $2 \cdot 10^{-4}$ is 2.5 pixels, less than any Gaussian can be
-# made to cover; the recipes never call 64 pixels blurred (`least_area`). We take $\theta = 6 \cdot 10^{-3}$, 74
-# pixels. The threshold of the gradient is raised to $10^{-3}$ for a like reason: in a small image every Gaussian covers
-# a larger part, and gradients are larger.
+# In photographs of 128 x 96 pixels a fraction of $2 \cdot 10^{-4}$ is 2.5 pixels, less than any Gaussian can be made to
+# cover; the recipes never call 64 pixels blurred (`least_area`). We take $\theta = 6 \cdot 10^{-3}$, which is 74
+# pixels. The threshold of the gradient is raised to $10^{-3}$ for a similar reason: in a small image every Gaussian
+# covers a larger part, and gradients are larger.
 #
-# Now a room with 300 points, trained for 350 iterations with the density control of 3DGS alone:
+# Next is a room with 300 points, trained for 350 iterations with the density control of 3DGS alone:
 
-# %%
+# %% tags=["rounding"]
 THRESHOLD, AREA_FRACTION, SIZE_FRACTION = 1e-3, 6e-3, 0.01
 FIRST_STOP, STOP, ITERATIONS = 350, 550, 750  # end of the first part; end of density control; end
 scene = make_scene("room", n_views=16, width=128, height=96, n_points=300, seed=0).scene
@@ -174,18 +144,18 @@ mean_norms = state.stats["gradient_sum"] / np.maximum(state.stats["view_count"],
 n_start = len(initial_state(scene, base, seed=0).gaussians.means)
 print(f"{n_start} Gaussians at first, {len(before.means)} after {state.step} iterations")
 
-# %%
+# %% tags=["rounding"]
 view, held_out = scene.train_views[3], scene.test_views[1]
 camera = view.camera
 in_views = [render(before, v.camera, with_stats=True)[0].stats.dominant_count for v in scene.train_views]
-areas = np.max(in_views, axis=0)  # [N] pixels, in the view where it leads most
+areas = np.max(in_views, axis=0)  # [N] pixels, in the view where it dominates most
 marked = is_blurred(areas, camera.width, camera.height, area_fraction=AREA_FRACTION)
 is_pulled = mean_norms >= THRESHOLD
 is_missed = marked & ~is_pulled
 
 
 def leaders(gaussians, camera, shade):
-    """Colour every pixel by the Gaussian that leads there: shade [N, 3]; black where there is none."""
+    """Colour every pixel by the Gaussian that dominates it: shade [N, 3]; black where there is none."""
     stats = render(gaussians, camera, with_stats=True)[0].stats
     return np.vstack([shade, [0, 0, 0]])[stats.dominant_ids], stats
 
@@ -197,10 +167,10 @@ tints[is_missed] = warm[is_missed]
 picture, _ = leaders(before, camera, tints)
 output, _ = render(before, camera, background=scene.background)
 
-figure, axes = plt.subplots(1, 4, figsize=(13, 2.9), width_ratios=(1, 1, 1, 1.1))
+figure, axes = plt.subplots(1, 4, figsize=(11, 2.5), width_ratios=(1, 1, 1, 1.1))
 show(axes[0], view.image / 255, "photograph")
 show(axes[1], output.image, "render")
-show(axes[2], picture, "who leads; red: large area, small gradient")
+show(axes[2], picture, "dominant; red: area alone")
 for mask, color, label in (
     (~marked & ~is_pulled, GREY, "neither"),
     (is_pulled & ~marked, BLUE, "gradient"),
@@ -212,23 +182,24 @@ for mask, color, label in (
     )
 axes[3].axvline(THRESHOLD, color="black", linewidth=0.8)
 axes[3].axhline(AREA_FRACTION * camera.width * camera.height, color="black", linewidth=0.8)
-axes[3].set(xlabel="mean gradient by the position", ylabel="pixels led", title="the two signs")
+axes[3].set(xlabel="mean gradient, position", ylabel="pixels dominated", title="the two signs")
 axes[3].set(xlim=(1e-5, None), ylim=(0.4, 2e5))
 axes[3].legend(frameon=False, fontsize=7, loc="upper left")
 plt.show()
 
 # %% [markdown]
-# The walls are red. Bricks and stripes have not been drawn there, and by the gradient nothing is wrong.
+# In the third picture each patch is one dominant Gaussian, and it is red where the area is large and the gradient
+# small. The walls are red. Their bricks and stripes are missing, and the gradient says that nothing is wrong.
 #
 # ## Two ways to split
 #
-# The released code of Mini-Splatting splits as 3DGS does: two children drawn at random from the Gaussian, with 1/1.6 of
-# its scales. The other rule cuts it in two across its longest axis, and gives each half its centre of mass and its
-# variance:
+# The released code of Mini-Splatting splits as 3DGS does: it draws two children at random from the Gaussian and divides
+# its scales by 1.6. The other rule cuts the Gaussian in two across its longest axis, and gives each half the centre of
+# mass and the variance of that half:
 #
-# $$\mu' = \mu \pm \sqrt{2/\pi}\; s_k R_k, \qquad s'_k = \sqrt{1 - 2/\pi}\; s_k, \qquad \text{the others as they were}$$
+# $$\mu' = \mu \pm \sqrt{2/\pi}\; s_k R_k, \qquad s'_k = \sqrt{1 - 2/\pi}\; s_k, \qquad \text{other axes unchanged}$$
 #
-# The even mixture of both then has the parent's mean and covariance, since $2/\pi + (1 - 2/\pi) = 1$.
+# The equal mixture of both has the mean and the covariance of the parent, since $2/\pi + (1 - 2/\pi) = 1$.
 
 # %%
 show_code(principal_axis_children)
@@ -252,18 +223,12 @@ close_up = Camera(np.eye(3), np.zeros(3), 90.0, 90.0, 48.0, 36.0, 96, 72)
 def draw_outlines(axes, tape):
     """Draw the visible Gaussians' ellipses of one standard deviation."""
     projection = tape.projection
-    covariances2d = np.linalg.inv(projection.conics[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
-    variances, directions = np.linalg.eigh(covariances2d)  # [N, 2], [N, 2, 2]
-    angles = np.degrees(np.arctan2(directions[:, 1, 0], directions[:, 0, 0]))
-    sizes = 2 * np.sqrt(variances)
-    outline = EllipseCollection(
-        sizes[:, 0], sizes[:, 1], angles, units="xy", offsets=projection.means2d - 0.5, offset_transform=axes.transData
-    )
-    outline.set(facecolor="none", edgecolor="white", linewidth=1)
-    axes.add_collection(outline)
+    is_drawn = projection.radii[:, 0] > 0
+    style = {"edgecolor": "white", "linewidth": 1}
+    draw_ellipses(axes, projection.means2d[is_drawn] - 0.5, covariances2d(projection)[is_drawn], **style)
 
 
-figure, axes = plt.subplots(2, 4, figsize=(12, 4.6))
+figure, axes = plt.subplots(2, 4, figsize=(10.5, 4.3))
 errors = {}
 for column, (title, gaussians) in enumerate(forms.items()):
     output, tape = render(gaussians, close_up)
@@ -298,9 +263,9 @@ axes[1, 0].legend(frameon=False, fontsize=7, loc="upper left")
 plt.show()
 
 # %% [markdown]
-# Mean and variance along the longest axis, in units of the parent's standard deviation and variance. A random pair has
-# its centre 0.7 standard deviations off, and on average 0.89 of the variance: $1/1.6^2 = 0.39$ in each child and 0.5
-# between the two.
+# Measured along the longest axis, in units of the parent's standard deviation and variance: the centre of a random pair
+# is off by 0.7 standard deviations (root mean square), and the pair has on average 0.89 of the variance,
+# $1/1.6^2 = 0.39$ within each child and 0.5 between the two.
 
 # %%
 many = Gaussians(*(np.repeat(field, 20_000, axis=0) for field in parent))
@@ -324,12 +289,12 @@ for name, (shift, variance) in {"random": of_random, "longest axis": of_longest}
 # %% [markdown]
 # ## One event, before and after
 #
-# `clone_and_split` takes the marked Gaussians as one more reason for a split. Here is the event on the trained room:
+# For `clone_and_split` the marks are one more reason to split. Here is the event on the trained room:
 
 # %%
 show_code(clone_and_split)
 
-# %%
+# %% tags=["rounding"]
 afterwards = {}
 for name, draw_children in {"random": random_children, "longest axis": principal_axis_children}.items():
     edit = clone_and_split(
@@ -353,21 +318,21 @@ for column, (title, gaussians) in enumerate({"before": before, **afterwards}.ite
     n_leaders[title] = np.count_nonzero(stats.dominant_count)
     agreement[title] = psnr(np.clip(image, 0, 1), np.clip(image_before, 0, 1))
     show(axes[0, column], image, "render before" if not column else f"{title}: {agreement[title]:.1f} dB from before")
-    show(axes[1, column], picture, f"{n_leaders[title]} of {len(gaussians.means)} Gaussians lead somewhere here")
+    show(axes[1, column], picture, f"{n_leaders[title]} of {len(gaussians.means)} dominate some pixel")
 plt.show()
 
 # %% [markdown]
-# More Gaussians lead, so that patches are smaller on average. A single one can grow: where the split was along the line
-# of sight, or has uncovered somebody else. Halves on the longest axis change the picture less than random children do,
-# which leaves training less to repair.
+# More Gaussians dominate some pixel, so the patches are smaller on average. A single patch can grow, where the split
+# was along the line of sight or has uncovered another Gaussian. Halves on the longest axis change the picture less than
+# random children do, and leave less for training to repair.
 #
 # ## Train on, four ways
 #
-# From the same state: with and without blur split, and with either rule for children, which the split by gradients
-# uses, too. `inside` is the PSNR of the held-out views at those pixels that were red above: where one Gaussian led at
-# a large area and no gradient told.
+# Training continues from the same state, with and without blur split, and with either rule for children, also in the
+# split by gradients. `inside` is the PSNR of the held-out views at the pixels that were red above: where one Gaussian
+# dominated a large area and the gradient was small.
 
-# %%
+# %% tags=["rounding"]
 ids = [render(before, v.camera, with_stats=True)[0].stats.dominant_ids for v in scene.test_views]
 red_masks = [np.append(is_missed, False)[leader] for leader in ids]
 
@@ -411,8 +376,8 @@ for name, (quality, similarity, within, count) in results.items():
 values = f"{result_before.psnr:>9.2f}{result_before.ssim:>7.3f}{inside_before:>14.2f}{len(before.means):>12}"
 print(f"{'before':<26}{values}")
 
-# %%
-figure, axes = plt.subplots(1, 3, figsize=(12, 3))
+# %% tags=["rounding"]
+figure, axes = plt.subplots(1, 3, figsize=(11, 2.9))
 styles = dict(zip(ways, ((RED, ":"), (BLUE, ":"), (RED, "-"), (BLUE, "-")), strict=True))
 for name, (color, style) in styles.items():
     steps, counts, psnrs = np.array(curves[name]).T
@@ -429,11 +394,11 @@ axes[2].set(title="PSNR inside the red area (line: before)", xlabel="dB", xlim=(
 axes[2].invert_yaxis()
 plt.show()
 
-# %%
+# %% tags=["rounding"]
 truth = held_out.image / 255
 shown_ways = ("gradient; random", "and blur; random", "and blur; longest axis")
 chosen = {"before": before, **{name: ends[name] for name in shown_ways}}
-figure, axes = plt.subplots(2, 5, figsize=(13, 4.3))
+figure, axes = plt.subplots(2, 5, figsize=(10, 3.4))
 show(axes[0, 0], truth, "photograph, held out")
 show(axes[1, 0], np.where(red_masks[1][:, :, None], truth, 0.25 * truth), "the red area")
 for column, (title, gaussians) in enumerate(chosen.items(), start=1):
@@ -444,37 +409,94 @@ figure.colorbar(error, ax=axes[1, 1:], shrink=0.9)
 plt.show()
 
 # %% [markdown]
-# With halves on the longest axis, blur split draws what was blurred, and the walls gain most. With random children it
-# gains less in a run as short as this. The Gaussians that it takes are the largest of all; a child that lands a metre
-# off hangs somewhere in the room, the wall behind it has a hole, and every event comes before the last one has healed.
-# The released code draws at random and has thousands of iterations for the repair. The recipes of this package cut.
+# With halves on the longest axis, blur split renders what was blurred, and the walls gain most. With random children,
+# in a run as short as this, SSIM gains a little and PSNR is lower than without it. The Gaussians that it splits are the
+# largest of all: a child that is drawn a metre away hangs somewhere in the room, the wall behind has a hole, and every
+# event comes before the last one is repaired. The released code draws at random and has thousands of iterations for the
+# repair. The recipes of this package use halves.
 #
-# It is a matter of thresholds, too. `minisplat-ref study split SCENE --out DIR` trains a whole recipe all four
-# ways: on this room at 160 x 120 pixels, in 1500 iterations of `mini-splatting-d`, they end within 0.1 dB of each
-# other. There the gradient's threshold is the published one, which in small images asks for a split nearly everywhere,
-# and the area's adds hardly anybody.
+# The thresholds matter, too. `minisplat-ref study split SCENE --out DIR` trains a whole recipe in all four ways: on
+# this room at 160 x 120 pixels, in 1500 iterations of `mini-splatting-d`, they end within 0.1 dB of each other. There
+# the gradient's threshold is the published one, which asks for a split nearly everywhere in small images, and the area
+# adds hardly any.
 #
-# **To try:** lower `THRESHOLD` instead of adding blur split, until the counts are equal; set `AREA_FRACTION` to 2e-4;
-# the scene `outdoor`, where the largest patch is the sky and no split helps it.
+# ## Play
 #
-# ## What was shown
+# Mark Gaussians with thresholds of your own. What to look for:
+#
+# * `my_area`: at 2e-4, the published value, nearly everything that dominates a pixel is marked.
+# * `my_threshold`: at 2e-4, also published, hardly anything is left for the area alone.
+# * Is there a pair for which red covers the walls and nothing else?
+
+# %% tags=["rounding"]
+my_threshold, my_area = 5e-4, 3e-3
+
+my_marked = is_blurred(areas, camera.width, camera.height, area_fraction=my_area)
+my_pulled = mean_norms >= my_threshold
+my_shades = 0.45 + 0.5 * np.random.default_rng(1).random((len(before.means), 1)) * np.ones(3)
+my_shades[my_pulled] = [0.21, 0.38, 0.55]
+my_shades[my_marked & ~my_pulled] = [0.82, 0.29, 0.25]
+figure, axes = plt.subplots(figsize=(4.4, 3.4))
+counts = f"gradient {my_pulled.sum()} (blue), area alone {np.sum(my_marked & ~my_pulled)} (red)"
+show(axes, leaders(before, camera, my_shades)[0], counts)
+plt.show()
+
+# %% [markdown]
+# ## Exercises
+#
+# **1.** Why $\sqrt{2/\pi}$? Work out the mean and the variance of one half of a standard normal distribution.
+#
+# <details>
+# <summary>Solution</summary>
+#
+# The half $x > 0$ has the density $2\,\varphi(x)$. Its mean is $\int_0^\infty 2x\,\varphi(x)\,dx = 2\,\varphi(0) =
+# \sqrt{2/\pi} = 0.80$. Its second moment is 1 by symmetry, so its variance is $1 - 2/\pi = 0.36$.
+#
+# ```python
+# half = np.abs(np.random.default_rng(0).standard_normal(200_000))
+# assert np.isclose(half.mean(), np.sqrt(2 / np.pi), atol=5e-3) and np.isclose(half.var(), 1 - 2 / np.pi, atol=5e-3)
+# ```
+#
+# </details>
+#
+# **2.** Both halves keep the opacity of the parent. Is the picture of a split the same as before, at the centre of the
+# parent? Compute alpha there for a parent of opacity 0.9.
+#
+# <details>
+# <summary>Solution</summary>
+#
+# The centre is $\sqrt{2/\pi} / \sqrt{1 - 2/\pi} = 1.32$ standard deviations of a half away from either half, so
+# each has alpha $0.9\,e^{-1.32^2/2} = 0.375$, and two of them compose to $1 - (1 - 0.375)^2 = 0.61$. The middle becomes
+# lighter than 0.9, and the flanks darker: this is the blue and red in the picture of the change.
+#
+# ```python
+# z = np.sqrt(2 / np.pi) / np.sqrt(1 - 2 / np.pi)
+# one_half = 0.9 * np.exp(-(z**2) / 2)
+# both = 1 - (1 - one_half) ** 2
+# assert abs(both - 0.61) < 0.005
+# ```
+#
+# </details>
+
+# %% [markdown]
+# ## What was shown, checked
 
 # %%
 # The gradient sees the edge and hardly the texture.
 assert pulls["an edge"] > 20 * pulls["a fine texture"]
 
-# Some lead at large areas though no gradient asks for a split; each is replaced by two.
+# Some dominate large areas although no gradient asks for a split; each is replaced by two.
 assert is_missed.sum() > 20
 assert n_leaders["longest axis"] > n_leaders["before"]
 assert all(len(gaussians.means) == len(before.means) + marked.sum() for gaussians in afterwards.values())
 
-# Halves on the longest axis keep mean and variance; random pairs lose a tenth of it, and shift.
+# Halves on the longest axis keep mean and variance; random pairs shift, and lose a tenth of the variance.
 assert np.allclose(of_longest, (0.0, 1.0), atol=1e-12)
 assert np.allclose(of_random, (np.sqrt(1 / 2), 1 / 1.6**2 + 1 / 2), atol=0.02)
 assert errors["longest axis"] < min(errors["random, one draw"], errors["random, another"])
 assert agreement["longest axis"] > agreement["random"]
 
-# After training, blur split draws what was blurred, and with halves on the longest axis best.
+# After training, blur split renders what was blurred, and best with halves on the longest axis.
 for measure in (0, 1, 2):  # PSNR, SSIM, PSNR inside
     assert results["and blur; longest axis"][measure] > results["and blur; random"][measure]
     assert results["and blur; longest axis"][measure] > results["gradient; longest axis"][measure]

@@ -16,36 +16,23 @@
 # %% [markdown]
 # # 09 Importance and simplification
 #
-# A trained scene holds more Gaussians than its photographs need. Mini-Splatting asks what each of them contributes,
-# drops those that are never the main thing in any pixel, and draws a few of the others at random, the important ones
-# more often. This notebook follows one population from many to few, and compares drawing with plainer ways.
+# A trained scene holds more Gaussians than its photographs need. Mini-Splatting asks how much each of them contributes,
+# drops those that never dominate a pixel, and draws a few of the others at random, the important ones more often. This
+# notebook follows one population from many to few, and compares sampling with plainer ways.
 #
-# | file | what it holds | where in the paper |
-# |---|---|---|
-# | `minisplat_ref/strategy/importance.py` | the weights of all views, added up | MS sec. 3.2, app. E |
-# | `minisplat_ref/strategy/simplify.py` | sampling, rank, mass, merging; a new start | MS eq. 3 |
-# | `minisplat_ref/methods/mini_splatting.py` | the same as events of a recipe | MS sec. 3.2 |
-#
-# *MS* is Mini-Splatting, Fang and Wang 2024. **Frames and units:** the world is in metres, z up; images are in pixels,
-# the centre of the top-left one at (0.5, 0.5). The kernels are compiled on first use, which takes some twenty seconds
-# once.
+# We start with a dense population: four thousand points of a small room, with errors of 4 cm as those from structure
+# from motion may have, trained for 250 iterations on 24 photographs. In the third picture each pixel has the colour of
+# the Gaussian that dominates it; in the fourth it says how many pixels that Gaussian touches.
 
 # %%
-import ast
-import inspect
 import itertools
-import os
-
-# Read when NumPy and Numba load: matrices and pictures are small here, and on a busy machine threads that wait for each
-# other cost more than they help.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Ellipse
 from scipy.spatial import cKDTree
 
+from figures import BLUE, GREEN, GREY, RED, YELLOW, show, show_code
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods import get_recipe
@@ -59,34 +46,7 @@ from minisplat_ref.training.loop import train
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Gaussians
 
-plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
-RED, BLUE, YELLOW, GREEN, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#8a8580"
-
-
-def show_code(function):
-    """Print a function of the package without its docstring."""
-    source = inspect.getsource(function)
-    lines, body = source.splitlines(), ast.parse(source).body[0].body
-    has_docstring = isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant)
-    first = body[1].lineno - 1 if has_docstring else body[0].lineno - 1
-    print(*lines[: body[0].lineno - 1], *lines[first:], sep="\n")
-
-
-def show(axes, image, title="", **style):
-    """Show an image or a map without ticks."""
-    shown = axes.imshow(np.clip(image, 0, 1) if image.ndim == 3 else image, interpolation="nearest", **style)
-    axes.set(title=title, xticks=[], yticks=[])
-    return shown
-
-
-# %% [markdown]
-# ## A dense population
-#
-# Four thousand points of a small room, 4 cm off as those from structure from motion may be, trained for 250 iterations
-# on 24 photographs. How a population becomes dense is the subject of notebooks 07, 08 and 10; here its size stays as it
-# is (`events=()`).
-
-# %%
+# %% tags=["rounding"]
 scene = make_scene("room", n_views=24, width=80, height=60, n_points=4000, point_noise=0.04, seed=0).scene
 held_out = scene.test_views[1]
 dense = train(scene, get_recipe("3dgs-accel", 250)._replace(events=()), seed=0).gaussians
@@ -101,16 +61,27 @@ output, tape = render(dense, held_out.camera, background=scene.background, with_
 shuffled = np.random.default_rng(0).uniform(0.15, 1, (len(dense.means), 3))  # a colour for each Gaussian
 n_dominant_here = int(np.count_nonzero(output.stats.dominant_count))
 
-figure, axes = plt.subplots(1, 4, figsize=(12, 2.6))
+figure, axes = plt.subplots(1, 4, figsize=(11, 2.4))
 show(axes[0], held_out.image / 255, "photograph, held out")
 show(axes[1], output.image, f"{len(dense.means):,} Gaussians: {quality(dense):.1f} dB")
-show(axes[2], shuffled[output.stats.dominant_ids], f"who dominates each pixel: {n_dominant_here:,} of them")
-shown = show(axes[3], np.log10(1 + output.stats.hit_count[output.stats.dominant_ids]), "pixels that each one touches")
+show(axes[2], shuffled[output.stats.dominant_ids], f"dominant: {n_dominant_here:,} of them")
+shown = show(axes[3], np.log10(1 + output.stats.hit_count[output.stats.dominant_ids]), "pixels that it touches")
 bar = figure.colorbar(shown, ax=axes[3], shrink=0.9, ticks=np.log10([1, 10, 100, 1000]))
 bar.ax.set_yticklabels([1, 10, 100, 1000])
 plt.show()
 
 # %% [markdown]
+# | file | what it holds | where in the paper |
+# |---|---|---|
+# | `minisplat_ref/strategy/importance.py` | the weights of all views, added up | MS sec. 3.2, app. E |
+# | `minisplat_ref/strategy/simplify.py` | sampling, rank, mass, merging; a new start | MS eq. 3 |
+# | `minisplat_ref/methods/mini_splatting.py` | the same as events of a recipe | MS sec. 3.2 |
+#
+# *MS* is Mini-Splatting, Fang and Wang 2024. **Frames and units:** the world is in metres, z up; images are in pixels,
+# the centre of the top-left one at (0.5, 0.5). The kernels are compiled on first use, which takes some twenty seconds
+# once. How a population becomes dense is the subject of notebooks 07, 08 and 10; here its size stays as it is
+# (`events=()`).
+#
 # ## Importance
 #
 # The compositor of notebook 03 blends a pixel from hits of weight $w = \alpha T$. Added up over the pixels $p$ of all
@@ -120,14 +91,14 @@ plt.show()
 # I_i = \sum_{v:\, i \text{ dominates a pixel}} \frac{\sum_{p \in v} w_{ip}}{\#\{p \in v: i \text{ is hit}\}}
 # \quad\text{(outdoor)},$$
 #
-# where *dominates* means: has the largest weight at that pixel. The second form divides by the pixels that it touches:
-# outdoors a large Gaussian in the sky would otherwise count for more than all the leaves. Both come from one rendering
-# of all training views, without gradients:
+# where *dominates* means: has the largest weight at that pixel. The second form divides by the number of pixels that
+# the Gaussian touches: outdoors, a large Gaussian in the sky would otherwise count for more than all the leaves. Both
+# come from one rendering of all training views, without gradients:
 
 # %%
 show_code(importance.collect_importance)
 
-# %%
+# %% tags=["rounding"]
 stats = importance.collect_importance(dense, scene.train_views)
 metrics = {"indoor": importance.indoor(stats), "outdoor": importance.outdoor(stats)}
 
@@ -140,25 +111,26 @@ def paint(colors):
 
 
 def on_log_scale(values):
-    """Colours [N, 3] from dark to light between the 5th and 95th percentile of what is not 0."""
+    """Colours [N, 3] from dark to light between the 5th and 95th percentile of the values above 0."""
     logs = np.log(np.maximum(values, values[values > 0].min()))
     low, high = np.percentile(logs[values > 0], [5, 95])
     return plt.get_cmap("magma")(np.clip((logs - low) / (high - low), 0, 1))
 
 
 is_dominant = stats.dominant_count > 0
-figure, axes = plt.subplots(1, 4, figsize=(12, 2.6))
+figure, axes = plt.subplots(1, 4, figsize=(11, 2.4))
 show(axes[0], output.image, "render")
 for panel, (name, values) in zip(axes[1:], metrics.items(), strict=False):
-    show(panel, paint(on_log_scale(values)), f"importance, {name} (light: high)")
+    show(panel, paint(on_log_scale(values)), f"importance, {name}")
 show(axes[3], paint(np.where(is_dominant[:, None], (0.85, 0.85, 0.85), (0.82, 0.2, 0.15))), "red: never dominant")
 plt.show()
 
 # %% [markdown]
-# Importance is spread unevenly: sort the Gaussians by it, and a part of them carries nearly all. *Mass* is what the
-# most important ones carry together. A threshold of 0.99 keeps many more than one in a hundred.
+# (Light is high.) Importance is distributed unevenly: sorted by it, a part of the Gaussians carries nearly all of it.
+# *Mass* is the share that the most important ones carry together. A threshold of 0.99 keeps many more Gaussians than
+# one in a hundred.
 
-# %%
+# %% tags=["rounding"]
 MASS = 0.99
 indoor = metrics["indoor"]
 figure, axes = plt.subplots(1, 2, figsize=(10, 3))
@@ -179,14 +151,14 @@ axes[1].legend(frameon=False, loc="lower right")
 plt.show()
 
 # %% [markdown]
-# ## Intersection preserving: drop who never dominates
+# ## Intersection preserving: drop what never dominates
 #
-# The ray through a pixel meets the surface at the Gaussian of the largest weight. Whoever never is that one, in any
-# pixel of any training view, lies buried or is smeared thinly over many pixels; its importance is set to 0 (MS eq. 3).
-# From above, in a slice between ankle and head, the dominant ones draw walls and furniture. The others stand between
-# them and crowd inside the furniture; they are missed a little.
+# The ray through a pixel meets the surface at the Gaussian with the largest weight. A Gaussian that never has the
+# largest weight, in any pixel of any training view, is buried or is spread thinly over many pixels; its importance is
+# set to 0 (MS eq. 3). Seen from above, in a slice between ankle and head, the dominant ones outline walls and
+# furniture. The others lie between them and crowd inside the furniture. Without them the picture is slightly worse.
 
-# %%
+# %% tags=["rounding"]
 candidates = simplify.intersection_preserving(indoor, stats.dominant_count)
 preserved = take(dense, candidates > 0)
 
@@ -195,13 +167,13 @@ def show_above(axes, means, color, title, size=3):
     """Scatter the centres between 0.2 and 1.8 m, seen from above."""
     is_inside = (means[:, 2] > 0.2) & (means[:, 2] < 1.8)
     axes.scatter(*means[is_inside, :2].T, s=size, color=color, linewidths=0)
-    axes.set(title=title, aspect="equal", xlim=(-3.2, 3.2), ylim=(-3.2, 3.2), xlabel="x (m)")
+    axes.set(title=title, aspect="equal", xlim=(-3.2, 3.2), ylim=(-3.2, 3.2), xlabel="x [m]")
 
 
-figure, axes = plt.subplots(1, 4, figsize=(12, 3))
+figure, axes = plt.subplots(1, 4, figsize=(11, 2.8))
 show_above(axes[0], dense.means[is_dominant], BLUE, f"{is_dominant.sum():,} dominate")
 show_above(axes[1], dense.means[~is_dominant], RED, f"{(~is_dominant).sum():,} never do")
-axes[0].set_ylabel("y (m)")
+axes[0].set_ylabel("y [m]")
 for panel, gaussians, label in ((axes[2], dense, "before"), (axes[3], preserved, "after")):
     image = render(gaussians, held_out.camera, background=scene.background)[0].image
     show(panel, image, f"{label}: {len(gaussians.means):,}, {quality(gaussians):.2f} dB")
@@ -211,18 +183,18 @@ plt.show()
 # ## Sampling
 #
 # $n$ Gaussians are drawn without replacement, with $P_i = I_i / \sum_j I_j$. Drawing one after the other is slow for a
-# million; adding Gumbel noise to $\log I_i$ and taking the $n$ largest has the same law.
+# million. Adding Gumbel noise to $\log I_i$ and taking the $n$ largest has the same distribution.
 
 # %%
 show_code(simplify.sample)
 
 # %% [markdown]
-# Four rows of importance 4, 3, 2, 1, of which two are drawn: sequential drawing gives a pair $\{a, b\}$ the
-# probability $P_a P_b / (1 - P_a) + P_b P_a / (1 - P_b)$. Rank would take the first pair, always. On the right our
-# population: which part of the Gaussians is kept, from the least important to the most. Rank cuts; sampling leaves
-# everything a chance, and does not take all that is important.
+# To see it, take four rows of importance 4, 3, 2 and 1, of which two are drawn. Drawing one after the other gives a
+# pair $\{a, b\}$ the probability $P_a P_b / (1 - P_a) + P_b P_a / (1 - P_b)$. Rank would always take the first pair. On
+# the right is our population: the part of the Gaussians that is kept, from the least important to the most. Rank cuts.
+# Sampling gives every candidate a chance, and does not keep all that are important.
 
-# %%
+# %% tags=["rounding"]
 N_DRAWS, FRACTION = 4000, 0.2
 rng = np.random.default_rng(0)
 weights = np.array([4.0, 3.0, 2.0, 1.0])
@@ -255,9 +227,9 @@ plt.show()
 # %% [markdown]
 # ## Merging
 #
-# Instead of keeping one of two neighbours, both can become one. Its centre is their mean, weighted by importance, its
-# covariance that of the two together: the mean of their covariances, and of the outer products of their offsets. Here
-# two discs of standard deviation 1, three units apart, of importance 2 and 1.
+# Instead of keeping one of two neighbours, both can be merged. The centre is their mean, weighted by importance, and
+# the covariance is that of the two together: the weighted mean of their covariances plus that of the outer products of
+# their offsets. Here are two discs of standard deviation 1, three units apart, of importance 2 and 1.
 
 # %%
 pair = Gaussians(
@@ -285,12 +257,12 @@ print(f"mean {merged.means[0]}, covariance along x {sigma[0, 0]:.3f} = 1 + 2/3 *
 # %% [markdown]
 # ## A fifth of them, chosen in three ways
 #
-# All three leave the same number. *Mass* is not a fourth way: it keeps what rank keeps, and sets the number by itself.
-# Right after the cut the picture has holes where neighbours were counted on. Further training, the same for all, closes
-# those that have a Gaussian near. Rank keeps crowds where importance is high, and leaves gaps that it cannot close;
-# sampling thins out evenly; merging leaves no hole in the first place.
+# All three keep the same number. (*Mass* is not a fourth way: it keeps what rank keeps, and only chooses the number.)
+# Right after the cut the picture has holes where Gaussians are missing. Further training, the same for all three,
+# closes the holes that have a Gaussian nearby. Rank keeps crowds where importance is high and leaves gaps that training
+# cannot close. Sampling thins out evenly. Merging leaves no holes in the first place.
 
-# %%
+# %% tags=["rounding"]
 FINE_TUNING = 120
 
 
@@ -307,7 +279,7 @@ COLORS = dict(zip(CHOICES, (BLUE, RED, YELLOW), strict=True))
 at_once = {name: choose(dense, candidates, n_kept, rng).gaussians for name, choose in CHOICES.items()}
 after = {name: fine_tuned(gaussians) for name, gaussians in at_once.items()}
 
-figure, axes = plt.subplots(3, 4, figsize=(12, 8))
+figure, axes = plt.subplots(3, 4, figsize=(9.5, 6.4))
 images = {}
 for column, (name, color) in enumerate(COLORS.items()):
     show_above(axes[0, column], at_once[name].means, color, f"{name}: {len(at_once[name].means):,}")
@@ -320,11 +292,11 @@ show(axes[2, 3], held_out.image / 255, "photograph, held out")
 plt.show()
 
 # %% [markdown]
-# Quality against the number that is kept, and how well the kept centres cover the dense ones: the mean distance from
-# each of the 4000 to the nearest that was kept. That is one half of the Chamfer distance; from the kept to the dense it
-# is 0, unless they were merged.
+# Below is the quality against the number that is kept, and how well the kept centres cover the dense ones: the mean
+# distance from each of the 4000 to the nearest kept one. That is one half of the Chamfer distance; the other half, from
+# the kept to the dense, is 0 except for merging.
 
-# %%
+# %% tags=["rounding"]
 fractions = np.array([0.05, 0.1, 0.2, 0.4, 0.7])
 curves = {name: [] for name in CHOICES}
 for name, choose in CHOICES.items():
@@ -333,7 +305,7 @@ for name, choose in CHOICES.items():
         gap = cKDTree(kept.means).query(dense.means)[0].mean()
         curves[name].append((len(kept.means), quality(kept), gap))
 
-figure, axes = plt.subplots(1, 3, figsize=(12, 3), width_ratios=(1, 1, 0.9))
+figure, axes = plt.subplots(1, 3, figsize=(11, 2.8), width_ratios=(1, 1, 0.9))
 for name, color in COLORS.items():
     counts, psnrs, gaps = np.transpose(curves[name])
     axes[0].plot(counts, psnrs, "o-", color=color, ms=4, label=name)
@@ -350,18 +322,19 @@ for column, name in enumerate(CHOICES):
     values = quality(at_once[name]), quality(after[name])
     axes[2].bar([column - 0.2, column + 0.2], values, 0.38, color=(COLORS[name] + "70", COLORS[name]))
     axes[2].annotate(f"{values[1]:.2f}", (column + 0.2, values[1]), ha="center", va="bottom", fontsize=8)
-axes[2].set(title=f"{n_kept:,}: at once (pale), fine-tuned", xticks=range(3), xticklabels=CHOICES, ylabel="PSNR (dB)")
+axes[2].set(title="at once (pale), fine-tuned", xticks=range(3), xticklabels=CHOICES, ylabel="PSNR (dB)")
 axes[2].set(ylim=(0, 1.15 * quality(dense)))
 plt.show()
 
 # %% [markdown]
 # ## A new start
 #
-# Mini-Splatting keeps only centres and colours of those that it draws. Sizes and opacities were made for a crowd; with
-# four of five gone they are set as at the start of training, from the distance to the nearest three. It then has 15,000
-# iterations to learn them again. With as few as here, that costs more than it gives.
+# Mini-Splatting keeps only the centres and the colours of those that it draws. Sizes and opacities were learned in a
+# crowd. With four of five gone they are set as at the start of training, from the distance to the nearest three, and
+# 15,000 iterations follow in which they are learned again. With as few iterations as here, the new start costs more
+# than it gives.
 
-# %%
+# %% tags=["rounding"]
 show_code(simplify.reinitialised)
 
 restarted = simplify.reinitialised(at_once["sampling"], 3)
@@ -371,7 +344,7 @@ rows = {
     "drawn, fine-tuned": after["sampling"],
     "drawn, new start, fine-tuned": fine_tuned(restarted),
 }
-figure, axes = plt.subplots(1, 4, figsize=(12, 2.7))
+figure, axes = plt.subplots(1, 4, figsize=(11, 2.4))
 for panel, (label, gaussians) in zip(axes, rows.items(), strict=True):
     image = render(gaussians, held_out.camera, background=scene.background)[0].image
     show(panel, image, f"{label}: {quality(gaussians):.2f} dB")
@@ -380,10 +353,10 @@ plt.show()
 # %% [markdown]
 # ## The tail
 #
-# Later in training a recipe prunes once more, to a mass of 0.99: the least important, who together carry one part in a
-# hundred, go, and are hardly missed.
+# Later in training a recipe prunes once more, to a mass of 0.99: it removes the least important, which together carry
+# one part in a hundred. The picture hardly changes.
 
-# %%
+# %% tags=["rounding"]
 few = after["sampling"]
 few_stats = importance.collect_importance(few, scene.train_views)
 few_candidates = simplify.intersection_preserving(importance.indoor(few_stats), few_stats.dominant_count)
@@ -399,14 +372,73 @@ figure.colorbar(shown, ax=axes[2], shrink=0.9)
 plt.show()
 
 # %% [markdown]
-# **To try:** take `outdoor` for the candidates, and see which parts of the room thin out; set `FRACTION` to 0.05;
-# run `minisplat-ref study simplify --help`, which draws the curves on any scene, over several seeds and after
-# fine-tuning.
+# ## Play
 #
-# ## What was shown
+# Choose the fraction, the kind of importance and the way of choosing. What to look for:
+#
+# * `fraction`: at which fraction does the picture have no holes, right after the cut?
+# * `metric`: with `"outdoor"`, which parts of the room become sparser?
+# * `choose`: `simplify.by_sampling`, `simplify.by_rank` or `simplify.by_merging`.
+#
+# `minisplat-ref study simplify --help` draws the curves on any scene, with several seeds and after fine-tuning.
+
+# %% tags=["rounding"]
+fraction, metric, choose = 0.4, "outdoor", simplify.by_sampling
+
+my_candidates = simplify.intersection_preserving(metrics[metric], stats.dominant_count)
+n_mine = round(fraction * np.count_nonzero(my_candidates))
+mine = choose(dense, my_candidates, n_mine, np.random.default_rng(0)).gaussians
+figure, axes = plt.subplots(1, 3, figsize=(10, 2.7))
+show_above(axes[0], mine.means, BLUE, f"{len(mine.means):,} kept")
+show(axes[1], output.image, f"dense: {quality(dense):.2f} dB")
+show(axes[2], render(mine, held_out.camera, background=scene.background)[0].image, f"yours: {quality(mine):.2f} dB")
+plt.show()
+
+# %% [markdown]
+# ## Exercises
+#
+# **1.** Gumbel noise is $g = -\ln(-\ln u)$ with $u$ uniform in (0, 1). Show that the largest of $\ln I_i + g_i$ is row
+# $i$ with probability $I_i / \sum_j I_j$. (Hint: $e^{-(\ln I_i + g_i)}$ has an exponential distribution.)
+#
+# <details>
+# <summary>Solution</summary>
+#
+# $e^{-(\ln I_i + g_i)} = -\ln u_i / I_i$ is exponentially distributed with rate $I_i$. The largest of the sums is the
+# smallest of these times, and of independent exponential clocks, clock $i$ rings first with probability
+# $I_i / \sum_j I_j$.
+#
+# ```python
+# u = np.random.default_rng(0).random((20_000, 4))
+# first = np.argmax(np.log(weights) - np.log(-np.log(u)), axis=1)
+# assert np.allclose(np.bincount(first) / 20_000, p, atol=0.015)
+# ```
+#
+# </details>
+#
+# **2.** Two Gaussians of equal importance are merged. How far apart may two round ones of standard deviation $s$ be
+# until the merged one is twice as long as wide?
+#
+# <details>
+# <summary>Solution</summary>
+#
+# Along the line between them the variance is $s^2 + (d/2)^2$, across it $s^2$. Twice as long means
+# $s^2 + d^2/4 = 4 s^2$, so $d = 2\sqrt3\,s = 3.5\,s$.
+#
+# ```python
+# d = 2 * np.sqrt(3)
+# apart = pair._replace(means=np.array([[0, 0, 0], [d, 0, 0.0]]), log_scales=np.zeros((2, 3)))
+# joined = simplify.merge_neighbours(apart, np.ones(2), 1).gaussians
+# lengths = np.sort(np.exp(joined.log_scales[0]))
+# assert np.allclose(lengths, [1, 1, 2])
+# ```
+#
+# </details>
+
+# %% [markdown]
+# ## What was shown, checked
 
 # %%
-# Who never dominates is many, and carries little; the picture changes little without them.
+# Many Gaussians never dominate a pixel. They carry little, and the picture changes little without them.
 assert 0.2 < np.mean(~is_dominant) < 0.8
 assert indoor[~is_dominant].sum() < 0.3 * indoor.sum()
 assert quality(preserved) > quality(dense) - 2
@@ -414,11 +446,11 @@ assert quality(preserved) > quality(dense) - 2
 # Both metrics are 0 for what no pixel sees; the outdoor one also for what never dominates.
 assert np.array_equal(metrics["outdoor"] > 0, is_dominant) and (indoor[is_dominant] > 0).all()
 
-# Drawing all at once has the law of drawing one after the other: within 4 standard deviations of the counts.
+# Drawing all at once has the distribution of drawing one after the other: within 4 standard deviations of the counts.
 assert abs(expected.sum() - 1) < 1e-12
 assert (np.abs(shares - expected) < 4 * np.sqrt(expected * (1 - expected) / N_DRAWS)).all()
 
-# A mass keeps what rank keeps of its number, and far more than one part in a hundred.
+# A mass keeps what rank keeps at the same number, and far more than one part in a hundred.
 heaviest = simplify.carrying_mass(candidates, MASS)
 assert np.array_equal(heaviest, simplify.most_important(candidates, len(heaviest)))
 assert len(heaviest) > 0.5 * np.count_nonzero(candidates)
@@ -440,6 +472,6 @@ assert np.array_equal(restarted.means, at_once["sampling"].means)
 assert np.array_equal(restarted.sh_dc, at_once["sampling"].sh_dc)
 assert np.ptp(restarted.opacity_logits) == 0 and not restarted.sh_rest.any()
 
-# The tail is not missed.
+# Without the tail the picture is as good.
 assert len(trimmed.means) < len(few.means) and quality(trimmed) > quality(few) - 0.5
 print("all of the above holds")

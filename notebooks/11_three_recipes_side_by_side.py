@@ -20,56 +20,23 @@
 # `mini-splatting` adds more, then draws a few by importance; `mini-splatting2` does the same much sooner, so that most
 # of the time is spent on few. The stages are those of notebooks 06 to 10; here is what they are worth together.
 #
-# | file | what it holds | where in the paper |
-# |---|---|---|
-# | `minisplat_ref/training/schedule.py` | what a recipe is made of: what is due when, as data | |
-# | `minisplat_ref/methods/gaussian_splatting.py` | `3dgs`, `3dgs-accel` | 3DGS sec. 7.1 |
-# | `minisplat_ref/methods/mini_splatting.py` | `mini-splatting`, and `-d` without simplification | MS sec. 3 |
-# | `minisplat_ref/methods/mini_splatting2.py` | `mini-splatting2`, and `-d` | MS2 sec. 3 |
-# | `minisplat_ref/training/state.py` | what the actions in these files change: the training state | |
-#
-# *3DGS* is Kerbl et al. 2023, *MS* and *MS2* are Mini-Splatting and Mini-Splatting2, both Fang and Wang 2024.
-# **Frames and units:** the world is in metres; images are in pixels, the centre of the top-left one at (0.5, 0.5). The
-# kernels are compiled on first use, which takes some twenty seconds once.
+# First the result, on a view that training never saw. How each recipe got there, event by event, follows below.
 
 # %%
 import itertools
-import os
 import time
 from functools import partial
-
-# Read when NumPy and Numba load: matrices and pictures are small here, and on a busy machine threads that wait for each
-# other cost more than they help.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 
 import matplotlib.pyplot as plt
 import numpy as np
 
+from figures import BLUE, GREEN, RED, show
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import render
 from minisplat_ref.training.loop import initial_state, train
-from minisplat_ref.training.schedule import During, Every, scaled
-
-plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
-RED, BLUE, YELLOW, GREEN, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#8a8580"
-
-
-def show(axes, image, title="", **style):
-    """Show an image or a map without ticks."""
-    shown = axes.imshow(np.clip(image, 0, 1) if image.ndim == 3 else image, interpolation="nearest", **style)
-    axes.set(title=title, xticks=[], yticks=[])
-    return shown
-
-
-# %% [markdown]
-# ## The recipes
-#
-# A recipe is data, and scales with the number of iterations: every published date is multiplied by the same factor.
-# `least_gap` keeps density control from coming so often that the gradients of most views are not in, or that the last
-# event has not healed; then only every second published date stays, or every third. With 24 views half of it will do.
+from minisplat_ref.training.schedule import During, Every, configured, scaled
 
 # %%
 ITERATIONS = 900
@@ -83,10 +50,10 @@ def named(action):
     return action.func.__name__, action.keywords
 
 
-def shortened(recipe):
-    """Return the recipe for our few views and iterations."""
+def shortened(recipe, iterations=ITERATIONS):
+    """Return the recipe for few views and iterations."""
     halved = [e._replace(least_gap=-(-e.least_gap // 2)) if isinstance(e, Every) else e for e in recipe.events]
-    return scaled(recipe._replace(events=tuple(halved)), ITERATIONS)
+    return scaled(recipe._replace(events=tuple(halved)), iterations)
 
 
 def due_steps(event):
@@ -95,20 +62,8 @@ def due_steps(event):
 
 
 recipes = {name: shortened(RECIPES[name]) for name in NAMES}
-for recipe in recipes.values():
-    print(f"{recipe.name}: half size until {recipe.half_size_until}, colour degrees at {recipe.sh_milestones}")
-    for event in recipe.events:
-        steps = due_steps(event)
-        when = f"{steps[0]} to {steps[-1]}" if isinstance(event, During) else ", ".join(map(str, steps)) or "never"
-        print(f"    {named(event.action)[0]:<26}{when}")
 
-# %% [markdown]
-# ## Train, and keep a log
-#
-# Each event is wrapped by a function that notes count and quality before and after it. Measuring takes time, which is
-# subtracted from the clock.
-
-# %%
+# %% tags=["rounding"]
 scene = make_scene("room", n_views=24, width=88, height=66, n_points=800, seed=0).scene
 held_out = scene.test_views[1]
 spent = [0.0]  # seconds of measuring, of the current run
@@ -163,19 +118,16 @@ def run(recipe):
     return state.gaussians, log, np.array(curve), np.diff(ticks, prepend=0.0)
 
 
-train(scene, recipes["mini-splatting2"]._replace(iterations=3), seed=0)  # compiles, or loads, the kernels
+train(scene, recipes["mini-splatting2"]._replace(iterations=3), seed=0)  # compiles the kernels, or loads them
 results = {name: run(recipe) for name, recipe in recipes.items()}
 print(f"{'recipe':<18}{'Gaussians':>10}{'at most':>10}{'PSNR (dB)':>11}{'seconds':>9}")
 for name, (gaussians, log, curve, _) in results.items():
     most = max(max(entry["counts"]) for entry in log)
     print(f"{name:<18}{len(gaussians.means):>10,}{most:>10,}{curve[-1, 3]:>11.2f}{curve[-1, 1]:>9.1f}")
 
-# %% [markdown]
-# ## What came out
-
-# %%
+# %% tags=["rounding"]
 truth = held_out.image / 255
-figure, axes = plt.subplots(2, 4, figsize=(13, 5.2))
+figure, axes = plt.subplots(2, 4, figsize=(11, 4.3))
 show(axes[0, 0], truth, "photograph, held out")
 axes[1, 0].axis("off")
 for column, (name, (gaussians, _, curve, _)) in enumerate(results.items(), start=1):
@@ -186,12 +138,42 @@ figure.colorbar(error, ax=axes[1, 0], location="right", shrink=0.9)
 plt.show()
 
 # %% [markdown]
-# ## On the way there
+# | file | what it holds | where in the paper |
+# |---|---|---|
+# | `minisplat_ref/training/schedule.py` | what a recipe is made of: what is due when, as data | |
+# | `minisplat_ref/methods/gaussian_splatting.py` | `3dgs`, `3dgs-accel` | 3DGS sec. 7.1 |
+# | `minisplat_ref/methods/mini_splatting.py` | `mini-splatting`, and `-d` without simplification | MS sec. 3 |
+# | `minisplat_ref/methods/mini_splatting2.py` | `mini-splatting2`, and `-d` | MS2 sec. 3 |
+# | `minisplat_ref/training/state.py` | what the actions in these files change: the training state | |
 #
-# The same three runs by iteration, by time and by number. The dots in the last panel are the ends.
+# *3DGS* is Kerbl et al. 2023, *MS* and *MS2* are Mini-Splatting and Mini-Splatting2, both Fang and Wang 2024.
+# **Frames and units:** the world is in metres; images are in pixels, the centre of the top-left one at (0.5, 0.5). The
+# kernels are compiled on first use, which takes some twenty seconds once.
+#
+# ## The recipes
+#
+# A recipe is data, and scales with the number of iterations: every published date is multiplied by the same factor.
+# `least_gap` keeps density control from coming so often that the gradients of most views are missing, or that the last
+# event has not been repaired; then only every second published date remains, or every third. With 24 views half of the
+# gap is enough. These are the dates of the three runs:
 
 # %%
-figure, axes = plt.subplots(1, 4, figsize=(14, 3.2))
+for recipe in recipes.values():
+    print(f"{recipe.name}: half size until {recipe.half_size_until}, colour degrees at {recipe.sh_milestones}")
+    for event in recipe.events:
+        steps = due_steps(event)
+        when = f"{steps[0]} to {steps[-1]}" if isinstance(event, During) else ", ".join(map(str, steps)) or "never"
+        print(f"    {named(event.action)[0]:<26}{when}")
+
+# %% [markdown]
+# ## How they got there
+#
+# Here are the same three runs by iteration, by time and by number. The dots in the last panel are their ends. In the
+# log each event is wrapped by a function that notes count and quality before and after it. Measuring takes time, which
+# is subtracted from the clock.
+
+# %% tags=["clock"]
+figure, axes = plt.subplots(1, 4, figsize=(11, 2.9))
 for name, (_, _, curve, seconds) in results.items():
     steps, clock, counts, psnrs = curve.T
     color = COLORS[name]
@@ -210,10 +192,10 @@ plt.show()
 # %% [markdown]
 # ## What each event does
 #
-# Gaussians and PSNR (dB, held-out views) right before and right after; events that left both as they were are not
-# listed.
+# These are the Gaussians and the PSNR (dB, held-out views) right before and right after each event. Events that changed
+# neither are not listed.
 
-# %%
+# %% tags=["rounding"]
 for name, (_, log, _, _) in results.items():
     print(f"{name}\n{'iteration':>11}  {'event':<24}{'Gaussians':>18}{'PSNR (dB)':>20}")
     for entry in log:
@@ -225,10 +207,11 @@ for name, (_, log, _, _) in results.items():
             )
 
 # %% [markdown]
-# Four of them in pictures: the same held-out view before, after, and the difference. A clone of 3DGS is as opaque as
-# what it copies, and adds to it; one of Mini-Splatting2 shares opacity with it, so that hardly anything changes.
+# Here are four of them in pictures: the same held-out view before, after, and the difference. A clone of 3DGS is as
+# opaque as the original and adds to it. A clone of Mini-Splatting2 shares the opacity of the original, so that hardly
+# anything changes.
 
-# %%
+# %% tags=["rounding"]
 chosen = (
     ("3dgs-accel", "clone_and_split"),
     ("mini-splatting", "simplify"),
@@ -242,7 +225,7 @@ def last_event(name, action):
     return [entry for entry in results[name][1] if entry["action"] == action][-1]
 
 
-figure, axes = plt.subplots(3, len(chosen), figsize=(13, 7.6))
+figure, axes = plt.subplots(3, len(chosen), figsize=(10.5, 6.6))
 for column, (name, action) in zip(axes.T, chosen, strict=True):
     entry = last_event(name, action)
     images = [render(g, held_out.camera, background=scene.background)[0].image for g in entry["gaussians"]]
@@ -254,16 +237,77 @@ figure.colorbar(difference, ax=axes[2], shrink=0.9)
 plt.show()
 
 # %% [markdown]
-# **To try:** raise the number of iterations; set a budget, `configured(recipe, budget=500)`; take `mini-splatting-d`,
-# which simplifies nothing. On a scene of your own, `minisplat-ref compare SCENE --recipes a,b,c` trains recipes and
-# writes tables, figures and crops.
+# ## Play
 #
-# ## What was shown
+# Run one more recipe and see it next to the others. What to look for:
+#
+# * `budget`: with a quarter as many Gaussians, how much PSNR is lost? (`None` leaves the recipe's own share.)
+# * `name`: `mini-splatting-d` simplifies nothing; is it better than `mini-splatting`?
+# * `n_iterations`: raise it to 2000. Which recipe gains most?
+#
+# On a scene of your own, `minisplat-ref compare SCENE --recipes a,b,c` trains recipes and writes tables, figures and
+# crops.
+
+# %% tags=["rounding"]
+name, n_iterations, budget = "mini-splatting2", 900, 300
+
+settings = {} if budget is None else {"budget": budget}
+mine = run(configured(shortened(RECIPES[name], n_iterations), **settings))[0]
+figure, axes = plt.subplots(1, 3, figsize=(9.5, 2.7))
+show(axes[0], truth, "photograph, held out")
+for panel, gaussians, title in ((axes[1], results["mini-splatting2"][0], "above"), (axes[2], mine, "yours")):
+    image = render(gaussians, held_out.camera, background=scene.background)[0].image
+    show(panel, image, f"{title}: {len(gaussians.means):,}, {quality(gaussians):.2f} dB")
+plt.show()
+
+# %% [markdown]
+# ## Exercises
+#
+# **1.** What does training cost? If the time of an iteration were proportional to the number of Gaussians, which part
+# of the work of `3dgs-accel` would `mini-splatting2` do? Compute it from the curves of the count, and compare with the
+# seconds.
+#
+# <details>
+# <summary>Solution</summary>
+#
+# The work is the area under the count. The measured share of the seconds is larger, because a part of every
+# iteration does not depend on the Gaussians: loss, events, Python.
+#
+# ```python
+# work = {name: np.trapezoid(curve[:, 2], curve[:, 0]) for name, (_, _, curve, _) in results.items()}
+# share = work["mini-splatting2"] / work["3dgs-accel"]
+# print(f"work {share:.2f}, seconds {results['mini-splatting2'][2][-1, 1] / results['3dgs-accel'][2][-1, 1]:.2f}")
+# assert share < 0.5
+# ```
+#
+# </details>
+#
+# **2.** Quality for its size: which recipe has the best PSNR *at the number of Gaussians with which* `mini-splatting2`
+# *ends*? Read it off the last panel, or compute it.
+#
+# <details>
+# <summary>Solution</summary>
+#
+# Look for the point of each curve whose count is nearest. On its way up `3dgs-accel` passes that count early, when it
+# has trained little: equal counts are not equal training, and so this comparison flatters the recipes that come back to
+# a small count at the end.
+#
+# ```python
+# n_end = results["mini-splatting2"][2][-1, 2]
+# for name, (_, _, curve, _) in results.items():
+#     nearest = curve[np.argmin(np.abs(np.log(curve[:, 2] / n_end)))]
+#     print(f"{name:<16}{nearest[2]:6.0f} Gaussians at iteration {nearest[0]:.0f}: {nearest[3]:.2f} dB")
+# ```
+#
+# </details>
+
+# %% [markdown]
+# ## What was shown, checked
 
 # %%
 ends = {name: (len(gaussians.means), curve[-1, 3]) for name, (gaussians, _, curve, _) in results.items()}
 for name, (_, log, curve, _) in results.items():
-    # Training shows views that it never saw, and the books balance: what one event left, the next one found.
+    # Views that training never saw came out well, and the counts add up: what one event left, the next one found.
     assert curve[-1, 3] > curve[0, 3] + 4
     assert all(entry["counts"][1] == following["counts"][0] for entry, following in itertools.pairwise(log))
     assert log[0]["counts"][0] == curve[0, 2] and log[-1]["counts"][1] == ends[name][0]
@@ -274,16 +318,16 @@ for name, (_, log, curve, _) in results.items():
 
 n_accel, psnr_accel = ends["3dgs-accel"]
 for name in ("mini-splatting", "mini-splatting2"):
-    # Dense first, then simplified, and learned again: far fewer Gaussians show nearly the same.
+    # Dense first, then simplified and trained on: far fewer Gaussians show nearly the same.
     (n, psnr), (_, log, curve, _) = ends[name], results[name]
     simplified = last_event(name, "simplify")
     assert simplified["counts"][1] < 0.7 * simplified["counts"][0]
     assert simplified["psnrs"][1] < simplified["psnrs"][0] < psnr
     assert n < 0.5 * n_accel and psnr > psnr_accel - 3
-    # The work of an iteration goes with its Gaussians.
+    # The work of an iteration grows with its Gaussians.
     assert curve[:, 2].sum() < 0.5 * results["3dgs-accel"][2][:, 2].sum()
 
-# An opacity reset costs much at once, an aggressive clone next to nothing.
+# An opacity reset costs much PSNR at once, an aggressive clone next to none.
 before, after = last_event("3dgs-accel", "reset_opacity")["psnrs"]
 assert after < before - 3
 before, after = last_event("mini-splatting2", "aggressive_clone")["psnrs"]

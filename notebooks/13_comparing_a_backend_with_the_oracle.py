@@ -32,18 +32,14 @@
 
 # %%
 import json
-import os
 import tempfile
 from pathlib import Path
-
-# Read when NumPy and Numba load: the scenes are small, and on a busy machine waiting threads cost more than they help.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Ellipse
 
+from figures import BLUE, GREEN, GREY, RED, show
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN
 from minisplat_ref.errors import InputError
@@ -60,16 +56,6 @@ from minisplat_ref.oracle.golden.files import export
 from minisplat_ref.oracle.golden.running import run_stages
 from minisplat_ref.oracle.golden.scenes import Recipe, inputs, truth
 from minisplat_ref.oracle.planted import planted
-
-plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
-RED, BLUE, YELLOW, GREEN, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#8a8580"
-
-
-def show(axes, image, title="", **style):
-    """Show an image or a map without ticks."""
-    shown = axes.imshow(np.clip(image, 0, 1) if image.ndim == 3 else image, interpolation="nearest", **style)
-    axes.set(title=title, xticks=[], yticks=[])
-    return shown
 
 
 def show_error(axes, given, expected, title, lowest=-16):

@@ -32,15 +32,11 @@
 # bench` measures the full-size workloads.
 
 # %%
-import os
-
-# Read when NumPy loads: the matrices here are small, and on a busy machine waiting threads cost more than they help.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
 import matplotlib.pyplot as plt
 import numpy as np
 from IPython.display import display
 
+from figures import BLUE, GREEN, GREY, RED, YELLOW
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.bench.contenders import all_contenders
 from minisplat_ref.bench.exponentials import EXPONENTIALS, relative_errors
@@ -54,9 +50,6 @@ from minisplat_ref.oracle.planted import planted
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_GRADIENT, BENCH_FLOAT32_IMAGE, BENCH_FLOAT64
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.types import TileGrid
-
-plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
-RED, BLUE, YELLOW, GREEN, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#8a8580"
 
 # %% [markdown]
 # ## Five ways to draw one image

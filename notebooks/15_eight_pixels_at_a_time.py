@@ -21,21 +21,12 @@
 # them, and how they do what is left: a tile is 64 rows of eight pixels, a set of rows is one integer, and eight pixels
 # are one number.
 #
-# | file | what it holds |
-# |---|---|
-# | `minisplat_ref/jit/lanes.py` | eight numbers as one value |
-# | `minisplat_ref/cpu/tile_state.py` | what the pixels of a tile remember |
-# | `minisplat_ref/cpu/tile_rows.py` | which rows of a tile a Gaussian reaches, and its alpha there |
-# | `minisplat_ref/cpu/compositing/forward.py`, `backward.py` | the kernels |
-#
-# **Frames and units:** pixels; x to the right, y down, the first pixel's centre at (0.5, 0.5).
+# The picture shows one Gaussian over one tile of 32 x 16 pixels. Where alpha reaches 1/255 there is a hit (yellow). The
+# kernel computes how far the ellipse reaches up and down within each strip of eight columns, which gives the rows of
+# eight that it has to visit (blue frames). The slanted ellipse becomes a staircase. A bounding box would visit the red
+# frame.
 
 # %%
-import os
-
-# Read when NumPy loads: the matrices here are small, and on a busy machine waiting threads cost more than they help.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
 import time
 
 import matplotlib.pyplot as plt
@@ -43,6 +34,7 @@ import numba
 import numpy as np
 from matplotlib.patches import Rectangle
 
+from figures import BLUE, GREY, RED, YELLOW, covariances2d, draw_ellipses
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.bench.roofs import rows_worked_on
 from minisplat_ref.bench.workloads import synth
@@ -56,18 +48,6 @@ from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.rendering import render
 from minisplat_ref.scalar.compositing import Frame, blend
 from minisplat_ref.types import Projection, TileGrid
-
-plt.rcParams.update({"figure.dpi": 100, "font.size": 9, "axes.titlesize": 10, "figure.constrained_layout.use": True})
-RED, BLUE, YELLOW, GREEN, GREY = "#d2493f", "#35608c", "#e0a526", "#3f8f6b", "#8a8580"
-
-# %% [markdown]
-# ## A tile is 64 rows, a set of rows is one integer
-#
-# One Gaussian over one tile of 32 x 16 pixels. Where alpha reaches 1/255 there is a hit (yellow). The kernel asks how
-# far the ellipse reaches up and down within each strip of eight columns, and so finds the rows of eight that it has to
-# look at (blue frames). The slanted ellipse becomes a staircase. A bounding box would have to look at the red frame.
-#
-# `reached_rows` is the function that the kernel calls. Here it runs as plain Python.
 
 
 # %%
@@ -93,7 +73,7 @@ GRID = TileGrid(TILE_WIDTH, TILE_HEIGHT, TILE_WIDTH, TILE_HEIGHT)
 
 
 def reached(projection):
-    """Rows that the kernel looks at, as bits."""
+    """Rows that the kernel visits, as bits."""
     records = records_of(projection, np.zeros((1, 3)), GSPLAT_MAIN)
     return reached_rows(records, np.zeros(1, np.int32), 0, 0, 0)
 
@@ -120,21 +100,33 @@ axis.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=RED, 
 axis.set(
     xlim=(-0.3, TILE_WIDTH + 0.3),
     ylim=(TILE_HEIGHT + 0.3, -0.3),
-    title=f"one tile: {np.count_nonzero(alphas)} hits, {n_rows} rows of eight looked at, 64 in the tile",
+    title=f"one tile: {np.count_nonzero(alphas)} hits, {n_rows} of its 64 rows of eight visited",
 )
 axis.set_aspect("equal")
 print(f"the set of rows, strip by strip: {int(bits):064b}")
 
 # %% [markdown]
-# The rows in which some pixel still accepts hits are another such integer. What there is to do for a Gaussian is the
-# intersection of the two, one `&`. Finished rows thus cost nothing, one by one and not only when the whole tile is
-# finished.
+# | file | what it holds |
+# |---|---|
+# | `minisplat_ref/jit/lanes.py` | eight numbers as one value |
+# | `minisplat_ref/cpu/compositing/tile_state.py` | what the pixels of a tile remember |
+# | `minisplat_ref/cpu/compositing/tile_rows.py` | which rows of a tile a Gaussian reaches, and its alpha there |
+# | `minisplat_ref/cpu/compositing/forward.py`, `backward.py` | the kernels |
 #
-# ## What is left to look at
+# **Frames and units:** pixels; x to the right, y down; the centre of the first pixel is (0.5, 0.5).
 #
-# A view of 20,000 Gaussians with the sizes of trained ones, 480 x 270 pixels. From left to right: what a loop over 16 x
-# 16 tiles looks at when it takes three standard deviations for the extent, as 3DGS does; all pixels under the tight
-# boxes; what the kernel looks at; the hits that there are.
+# ## A tile is 64 rows, a set of rows is one integer
+#
+# `reached_rows` is the function that the kernel calls; here it ran as plain Python. Its result is one integer, printed
+# above, with one bit per row. The rows in which some pixel still accepts hits are another such integer. The work for a
+# Gaussian is the intersection of the two, a single `&`. So finished rows cost nothing, row by row and not only when the
+# whole tile is finished.
+#
+# ## What is left to visit
+#
+# Here is a view of 20,000 Gaussians with the sizes of trained ones, 480 x 270 pixels. From left to right: what a loop
+# over 16 x 16 tiles visits when it takes three standard deviations as the extent, as 3DGS does; all pixels under the
+# tight boxes; what the kernel visits; the hits.
 
 # %%
 workload = synth(20_000)
@@ -153,29 +145,29 @@ size = np.array([workload.camera.width, workload.camera.height])
 low = np.clip((means - three_sigma[:, None]) // 16, 0, -(-size // 16))
 high = np.clip((means + three_sigma[:, None]) // 16 + 1, 0, -(-size // 16))
 boxes = projection.boxes.astype(np.int64)
-looked_at = {
+visited = {
     "16 x 16 tiles\nat 3 sigma": int((high - low).prod(axis=1).sum()) * 256,
     "tight boxes": int(((boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])).sum()),
     "the kernel's\nrows": rows_worked_on(projection, tape.splats.channels, bins) * WIDTH,
     "hits": int(output.stats.hit_count.sum()),
 }
 figure, axis = plt.subplots(figsize=(7.5, 3.0))
-bars = axis.bar(list(looked_at), [n / 1e6 for n in looked_at.values()], color=[GREY, RED, BLUE, YELLOW], width=0.6)
+bars = axis.bar(list(visited), [n / 1e6 for n in visited.values()], color=[GREY, RED, BLUE, YELLOW], width=0.6)
 axis.bar_label(bars, fmt="%.1f M", padding=2)
 axis.set(ylabel="million (pixel, Gaussian) pairs")
-axis.spines[["top", "right"]].set_visible(False)
+plt.show()
 
 # %% [markdown]
 # ## Eight numbers are one value
 #
-# A formula that is written with `+ - * /`, comparisons and `select` holds for a number, and for eight. In Python the
-# eight are an array. Compiled they are one register of the processor, and each operation is one instruction.
+# A formula that consists of `+ - * /`, comparisons and `select` works for one number and for eight. In Python the eight
+# are an array. Compiled, they are one register of the processor, and each operation is one instruction.
 #
 # Below, one Gaussian after the other is blended onto a row of pixels, twice: by the kernels' `blend`, eight pixels at a
-# time, and by the same rules as a loop over pixels with branches. Pixels finish where little light is left.
+# time, and by the same rules as a loop over pixels with branches. A pixel is finished where little light is left.
 
 
-# %%
+# %% tags=["clock"]
 @numba.njit
 def by_eights(alphas, colors, frame, light, image):
     """Blend hits [G, P] onto pixels that remember their transmittance, negative once they are finished."""
@@ -225,17 +217,18 @@ axis.plot(rows["by_eights"], color=BLUE, linewidth=2, label="eight at a time")
 axis.plot(np.arange(0, P, 12), rows["one_by_one"][::12], "o", color=YELLOW, markersize=4, label="one by one")
 axis.fill_between(np.arange(P), 0, 1, where=lights["by_eights"] < 0, color=GREY, alpha=0.15, label="finished")
 axis.set(xlabel="pixel", ylabel="colour", xlim=(0, P), ylim=(0, 1))
-axis.legend(frameon=False, ncols=3)
-axis.spines[["top", "right"]].set_visible(False)
+axis.legend(ncols=3)
+plt.show()
 
 # %% [markdown]
 # Why not leave this to the compiler? It vectorises a loop if it can prove that no store overlaps a load and that no
-# step depends on the one before; otherwise it silently does not, and the loop takes several times as long. Here the
-# code says what happens. There are no branches either: where one cannot be foreseen, what was begun behind it is lost.
+# step depends on the previous one. Otherwise it silently does not, and the loop takes several times as long. Here the
+# code says what happens. There are no branches either: a processor starts work behind a branch before it knows which
+# way it goes, and a wrong guess throws that work away.
 #
 # ## What it costs in digits
 #
-# Nothing: the arithmetic is that of the formulas, in the order that is written.
+# It costs none: the arithmetic is that of the formulas, in the order in which they are written.
 
 # %%
 exact, _ = render(workload.gaussians, workload.camera, backend=REFERENCE)
@@ -247,7 +240,71 @@ error = {
 print(f"float64: largest error {error['float64']:.1e};  float32: median over pixels {error['float32']:.1e}")
 
 # %% [markdown]
-# ## Shown above, checked here
+# ## Play
+#
+# Move, turn and resize the Gaussian. What to look for:
+#
+# * `slant`: at 0 and at 90 degrees the staircase is the box. Where is the gain largest?
+# * `opacity`: at 1/255 and below no row is left.
+# * `mean`: move it out of the tile. Which rows remain?
+
+# %%
+mean, slant, sigmas, opacity = np.array([22.0, 6.0]), np.radians(-40), (7.0, 0.7), 0.5
+
+mine = footprint(mean, slant, sigmas, opacity)
+figure, axis = plt.subplots(figsize=(6.5, 3.2))
+axis.set(xlim=(-0.3, TILE_WIDTH + 0.3), ylim=(TILE_HEIGHT + 0.3, -0.3), aspect="equal")
+draw_ellipses(axis, mean, covariances2d(mine)[0], np.sqrt(2 * np.log(max(255 * opacity, 1))), color=RED)
+for row in rows_of(reached(mine)):
+    corner = (row // TILE_HEIGHT * WIDTH, row % TILE_HEIGHT)
+    axis.add_patch(Rectangle(corner, WIDTH, 1, facecolor=BLUE, alpha=0.3, edgecolor="white"))
+axis.set(title=f"{len(list(rows_of(reached(mine))))} of 64 rows", xticks=range(0, 33, 8), yticks=range(0, 17, 4))
+plt.show()
+
+# %% [markdown]
+# ## Exercises
+#
+# **1.** Row $r$ of a tile is bit $r$, counted down the first strip, then down the next. Which integer is the set of all
+# rows that contain the pixel column 20?
+#
+# <details>
+# <summary>Solution</summary>
+#
+# Column 20 lies in strip $\lfloor 20 / 8 \rfloor = 2$, which holds the rows 32 to 47: sixteen ones, shifted by 32.
+#
+# ```python
+# column_20 = ((1 << 16) - 1) << 32
+# assert all(row // TILE_HEIGHT == 2 for row in rows_of(np.uint64(column_20)))
+# assert len(list(rows_of(np.uint64(column_20)))) == TILE_HEIGHT
+# ```
+#
+# </details>
+#
+# **2.** `blend` has no branches and yet skips hits below 1/255. How can a hit be skipped without an `if`? Write it with
+# `np.where` for eight pixels that are not finished, and compare with `blend`.
+#
+# <details>
+# <summary>Solution</summary>
+#
+# Set its alpha to zero: then its weight is zero and the transmittance is multiplied by one. The work is done and has
+# no effect. A pixel that stops keeps its transmittance with a minus sign.
+#
+# ```python
+# light, alpha = np.linspace(0.001, 1, WIDTH, dtype=np.float32), opacities[3, 200 : 200 + WIDTH]
+# alpha_used = np.where(alpha >= frame.alpha_min, np.minimum(alpha, frame.alpha_max), np.float32(0))
+# next_light = light * (1 - alpha_used)
+# is_over = next_light < frame.transmittance_min
+# expected_light = np.where(is_over, -light, next_light)
+# expected_weight = np.where(is_over, 0, light * alpha_used)
+# light_after, weight = blend(light, alpha, frame)
+# np.testing.assert_allclose(light_after, expected_light, rtol=1e-6)
+# np.testing.assert_allclose(weight, expected_weight, rtol=1e-6)
+# ```
+#
+# </details>
+
+# %% [markdown]
+# ## What was shown, checked
 
 # %%
 looked = np.zeros((TILE_HEIGHT, TILE_WIDTH), bool)
@@ -260,7 +317,7 @@ everywhere = footprint(np.array([16.0, 8.0]), 0.0, (60.0, 60.0), 0.9)
 nowhere = footprint(np.array([16.0, 60.0]), 0.0, (2.0, 2.0), 0.9)
 assert int(reached(everywhere)) == 2**N_ROWS - 1 and int(reached(nowhere)) == 0 and N_STRIPS * WIDTH == TILE_WIDTH
 
-counts = list(looked_at.values())
+counts = list(visited.values())
 assert counts == sorted(counts, reverse=True) and counts[2] < 3 * counts[3]
 
 np.testing.assert_allclose(rows["by_eights"], rows["one_by_one"], rtol=0, atol=1e-6)

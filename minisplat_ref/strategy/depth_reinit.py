@@ -196,7 +196,7 @@ def reinitial_points(
         view_points, weights = unprojected(depth_maps[i], cameras[i]).reshape(-1, 3), weight_maps[i].ravel()
         if depth_tolerance is not None:
             candidates = np.flatnonzero(weights)
-            is_refuted = _refuted(view_points[candidates], i, cameras, depth_maps, depth_tolerance)
+            is_refuted = refuted(view_points[candidates], i, cameras, depth_maps, depth_tolerance)
             unsure = candidates[is_refuted]
             if backdrop_distance is None:
                 weights[unsure] = 0
@@ -249,14 +249,31 @@ def _on_rays(depths: Floats, alpha: Floats, camera: Camera, conventions: Convent
     return PixelPoints(np.where(depths[:, :, None] > 0, points, 0).astype(depths.dtype), depths, alpha)
 
 
-def _refuted(
+def refuted(
     points: Floats, own_id: int, cameras: Sequence[Camera], depth_maps: Sequence[Floats], tolerance: float
 ) -> Bools:
-    """Return through which points [P, 3] of a view as many of its partners see as have them on their surface, or more.
+    """Return which points of a view are refuted: at least as many partners see through one as have it on their surface.
 
-    A partner that sees something nearer in that place, or whose image does not contain the point, has no vote. What
-    none can judge is taken as it comes: a corner that one photograph shows, a single photograph, a camera that only
-    turned on its tripod.
+    A partner that sees something nearer in that place, or whose image does not contain the point, has no vote. A point
+    that no partner can judge is not refuted: a corner that one photograph shows, a single photograph, a camera that
+    only turned on its tripod.
+
+    Parameters
+    ----------
+    points : ndarray of shape (P, 3)
+        World frame.
+    own_id : int
+        The view that they are from.
+    cameras : sequence of Camera
+        Of all views.
+    depth_maps : sequence of ndarray of shape (H, W)
+        Camera z of what each view sees, world units; 0 where it sees nothing.
+    tolerance : float
+        Relative difference of two depths of the same surface.
+
+    Returns
+    -------
+    ndarray of shape (P,), bool
     """
     partner_ids = _partners(points, own_id, cameras)
     n_agreeing, n_seeing_through = np.zeros((2, len(points)), np.int32)
