@@ -54,8 +54,8 @@ def log_gains(state: TrainState, iteration: Iteration, view_ids: Ints | list[int
 def switch_exposure_on(state: TrainState, iteration: Iteration, *, least_spread: float) -> str | None:
     """Give each photograph an exposure if the gains of the photographs spread by more than ``least_spread``.
 
-    The spread is the standard deviation of the logarithms. At 600 iterations it was 0.002 to 0.04 in eight scenes as they
-    were photographed, and 0.08 to 0.18 in three whose photographs were multiplied by gains from 0.7 to 1.4.
+    The spread is the standard deviation of the logarithms. At 600 iterations it was 0.002 to 0.04 in eight scenes as
+    they were photographed, and 0.08 to 0.18 in three whose photographs were multiplied by gains from 0.7 to 1.4.
     """
     if EXPOSURE.name in state.pace.switched_on or EXPOSURES in state.shared:
         return "nothing done: exposures are on"
