@@ -18,6 +18,7 @@ from functools import partial
 
 import numpy as np
 
+from minisplat_ref.methods.adaptive_exposure import hold_mean_exposure, log_gains, switch_exposure_on
 from minisplat_ref.methods.gaussian_splatting import GS, collect_gradients, prune_faint
 from minisplat_ref.methods.mini_splatting import candidates, measure_importance
 from minisplat_ref.metrics import psnr
@@ -27,9 +28,10 @@ from minisplat_ref.strategy.importance import indoor
 from minisplat_ref.strategy.ops import keep, n_rows
 from minisplat_ref.strategy.simplify import carrying_mass
 from minisplat_ref.training.adam import AdamRule
+from minisplat_ref.training.calibration import EXPOSURES
 from minisplat_ref.training.pace import Cooling, Decision, Measurement, held_out_ids
 from minisplat_ref.training.rates import Rates
-from minisplat_ref.training.schedule import During, Every
+from minisplat_ref.training.schedule import At, During, Every
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit, begin_cooling
 
 MOST_ITERATIONS = 30_000
@@ -88,12 +90,14 @@ def measure_held_out(state: TrainState, iteration: Iteration) -> str | None:
     if iteration.cooling is None or state.pace.cooling_from is not None:
         return "nothing done: all training views are trained on"
     views = iteration.scene.train_views
-    psnrs = []
-    for index in held_out_ids(len(views), iteration.cooling.hold_out_every):
+    ids, psnrs = held_out_ids(len(views), iteration.cooling.hold_out_every), []
+    # Nothing has learned their exposures, by which they are not to be judged.
+    gains = np.exp(log_gains(state, iteration, ids) if EXPOSURES in state.shared else np.zeros(len(ids)))
+    for index, gain in zip(ids, gains.astype(np.float32), strict=True):
         view = views[index].loaded()
         request = Request(iteration.scene.background, conventions=iteration.conventions, backend=iteration.backend)
         output, _ = iteration.renderer.render(state.model, view, request)
-        psnrs.append(psnr(np.clip(output.image, 0.0, 1.0), view.image, view.mask))
+        psnrs.append(psnr(np.clip(gain * output.image, 0.0, 1.0), view.image, view.mask))
     measurement = Measurement(iteration.step, tuple(psnrs), n_rows(state.gaussians), state.pace.n_pairs)
     state.pace = state.pace._replace(measurements=(*state.pace.measurements, measurement))
     return f"{measurement.psnr:.2f} dB"
@@ -173,6 +177,8 @@ ADAPTIVE = GS._replace(
     sh_milestones=(200, 400, 600),
     events=(
         During(collect_while_growing),
+        During(hold_mean_exposure),
+        At(600, partial(switch_exposure_on, least_spread=0.05)),
         Every(100, measure_held_out, start=100),
         Every(100, partial(cool_when_little_is_gained, least_gain=0.3, least_step=800), start=100),
         Every(100, partial(grow, threshold=4e-4, most_at_once=0.2, offset=OFFSET, budget=None), start=100),

@@ -270,3 +270,5 @@ POSE = Calibration(
     short_run_exponent=1.0,
 )
 """A correction of the pose per photograph."""
+
+CALIBRATIONS = (EXPOSURE, POSE)

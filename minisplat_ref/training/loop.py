@@ -34,7 +34,7 @@ from minisplat_ref.training.losses import Loss, Rendered, total_loss
 from minisplat_ref.training.pace import Decision, Pace, to_metadata, trained_ids
 from minisplat_ref.training.rates import active_sh_degree
 from minisplat_ref.training.saved_state import read_bundles, read_counters, read_generator, read_pace, written_by
-from minisplat_ref.training.schedule import During, Event, Recipe, action_name, describe
+from minisplat_ref.training.schedule import During, Event, Recipe, action_name, as_decided, describe
 from minisplat_ref.training.state import FiredEvent, Iteration, StepReport, TrainState, begin_cooling
 from minisplat_ref.types import Floats, Ints, Scene, View, numbered
 
@@ -132,12 +132,15 @@ def train(
     """
     state = initial_state(scene, recipe, seed) if state is None else state
     scene = scene._replace(train_views=numbered(scene.train_views))
-    _check_fits(state, scene, recipe)
+    _check_fits(state, scene, as_decided(recipe, state.pace))
     small_scene = _half_size(scene, recipe.least_half_size) if state.step < recipe.half_size_until else scene
     with ReadingAhead() as ahead, Interruptions() as interruptions:
-        around = _Surroundings(recipe, backend, conventions, guard, ahead)
+        around = _Surroundings(as_decided(recipe, state.pace), backend, conventions, guard, ahead)
+        switched_on = state.pace.switched_on
         while state.step < last_step(state, recipe):
             _cool_in_time(state, recipe)
+            if state.pace.switched_on != switched_on:
+                around, switched_on = around._replace(recipe=as_decided(recipe, state.pace)), state.pace.switched_on
             seen = small_scene if state.step < recipe.half_size_until else scene
             report = _iterate(state, seen, around, interruptions)
             if report.step == 1 and seen is not scene:
@@ -420,8 +423,9 @@ def load_state(path: str | Path, recipe: Recipe) -> TrainState:
             f"{path} was written by recipe {name} of {length} iterations with other settings than"
             f" {recipe.name} of {recipe.iterations} iterations: continue with the recipe of the run"
         )
+    pace = Pace() if recipe.cooling is None else read_pace(path, metadata.get("pace"))
     bundles = read_bundles(path, arrays, recipe.representation.population)
-    without_rate = [name for name in bundles.shared if name not in recipe.rates.of]
+    without_rate = [name for name in bundles.shared if name not in as_decided(recipe, pace).rates.of]
     if without_rate:
         raise InputError(f"{path}: holds {', '.join(without_rate)}, which recipe {recipe.name} does not train")
     return TrainState(
@@ -433,5 +437,5 @@ def load_state(path: str | Path, recipe: Recipe) -> TrainState:
         bundles.stats,
         bundles.shared,
         AdamState(bundles.shared_first, bundles.shared_second, counters.shared_adam_step),
-        pace=Pace() if recipe.cooling is None else read_pace(path, metadata.get("pace")),
+        pace=pace,
     )

@@ -1,4 +1,4 @@
-"""When a training ends that decides it for itself: what it has measured, what it has decided, and why.
+"""A training that decides for itself when it ends and what it needs: what it has measured, what it decided, and why.
 
 A recipe with a :class:`Cooling` has no schedule. It trains at constant rates, and holds some *training* views back to
 measure what more iterations bring; test views stay sealed. When an action of the recipe decides that they bring little
@@ -49,6 +49,8 @@ class Pace(NamedTuple):
     """Iteration after which the rates fall; None while they are constant."""
     last_step: int | None = None
     """Iteration at which the training ends; None while that is open."""
+    switched_on: tuple[str, ...] = ()
+    """Calibrations that the photographs have turned out to need, by name."""
 
     def decided(self, decision: Decision) -> "Pace":
         """Return the pace with one more decision."""
@@ -126,8 +128,9 @@ def from_metadata(value: Mapping[str, Any]) -> Pace:
         Decision(int(d["step"]), str(d["what"]), str(d["why"]), _optional(d["gain"]), _optional(d["standard_error"]))
         for d in value["decisions"]
     )
-    ends = [None if value[name] is None else int(value[name]) for name in ("cooling_from", "last_step")]
-    return Pace(measurements, decisions, int(value["n_pairs"]), *ends)
+    cooling_from, last_step = (None if value[n] is None else int(value[n]) for n in ("cooling_from", "last_step"))
+    switched_on = tuple(str(name) for name in value["switched_on"])
+    return Pace(measurements, decisions, int(value["n_pairs"]), cooling_from, last_step, switched_on)
 
 
 def _optional(number: Any) -> float | None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from minisplat_ref.constants import SH_DEGREE_MAX
 from minisplat_ref.io.checkpoint import DamagedCheckpoint
+from minisplat_ref.training.calibration import CALIBRATIONS
 from minisplat_ref.training.pace import Pace, from_metadata
 from minisplat_ref.types import Floats, Gaussians
 
@@ -85,9 +86,12 @@ def read_pace(path: str | Path, value: Any) -> Pace:
         It is missing or something else.
     """
     try:
-        return from_metadata(value)
+        pace = from_metadata(value)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise DamagedCheckpoint(f"{path}: pace is no record of measurements and decisions; {WAY_OUT}") from error
+    if not {calibration.name for calibration in CALIBRATIONS} >= set(pace.switched_on):
+        raise DamagedCheckpoint(f"{path}: pace names a calibration that does not exist; {WAY_OUT}")
+    return pace
 
 
 def read_generator(path: str | Path, state: Any) -> np.random.Generator:

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 from minisplat_ref.errors import InputError
 from minisplat_ref.rendering import Renderer
 from minisplat_ref.training.adam import AdamRule
-from minisplat_ref.training.calibration import EXPOSURE, POSE, Calibration
+from minisplat_ref.training.calibration import CALIBRATIONS, Calibration
 from minisplat_ref.training.losses import LossTerm
-from minisplat_ref.training.pace import Cooling
+from minisplat_ref.training.pace import Cooling, Pace
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.representation import GAUSSIANS, Representation
 
@@ -137,7 +137,7 @@ class Recipe(NamedTuple):
     short_run_exponent: float = 0.0
     """p of the factor ``(published / iterations)^p`` by which :func:`scaled` raises the rates of runs that are shorter
     than published; that of the means by the square of it."""
-    calibrations: tuple[Calibration, ...] = (EXPOSURE, POSE)
+    calibrations: tuple[Calibration, ...] = CALIBRATIONS
     """Parameters of each photograph; both are off unless asked for."""
     representation: Representation = GAUSSIANS
     """What is trained and how it is drawn."""
@@ -233,6 +233,11 @@ def _scaled_limit(step: int | None, factor: Fraction) -> int | None:
 
 
 # --- settings ---
+
+
+def as_decided(recipe: Recipe, pace: Pace) -> Recipe:
+    """Return the recipe with the calibrations on that a training has switched on."""
+    return configured(recipe, **dict.fromkeys(pace.switched_on, True)) if pace.switched_on else recipe
 
 
 def settings_of(recipe: Recipe) -> dict[str, Any]:
