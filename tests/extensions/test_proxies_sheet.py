@@ -10,11 +10,12 @@ from tolerances import CLOSED_FORM, GRADIENT_REL, GRADIENT_STEP, SETTLED, VERLET
 
 from minisplat_ref.cli import main
 from minisplat_ref.extensions.proxies import edit_claims, sheet_claims
-from minisplat_ref.extensions.proxies.binding import bind, rebuild
+from minisplat_ref.extensions.proxies.binding import UNBOUND, bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid
 from minisplat_ref.extensions.proxies.edit_claims import rolled, rolled_jacobian
 from minisplat_ref.extensions.proxies.fall import Setting, sheet_of
 from minisplat_ref.extensions.proxies.mass_spring import (
+    Floor,
     Sheet,
     State,
     advanced,
@@ -75,6 +76,12 @@ def test_the_springs_of_two_triangles_and_of_a_strip():
 def test_the_numbers_of_springs_of_a_grid(n):
     edges, shear, bend = spring_ends(flat_sheet(n))
     assert len(edges) == 2 * n * (n + 1) + n * n and len(shear) == n * n and len(bend) == 2 * n * (n - 1)
+
+
+def test_an_edge_that_is_the_longest_of_one_triangle_only_is_bent():
+    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0.5, 0.3, 0], [0.5, -5, 0]])
+    _, shear, bend = spring_ends(Mesh(vertices, np.array([[0, 1, 2], [1, 0, 3]])))
+    assert len(shear) == 0 and sorted(bend[0].tolist()) == [2, 3]
 
 
 def test_faces_that_share_an_edge_three_times_are_no_trouble():
@@ -223,6 +230,20 @@ def test_the_longest_step_is_that_of_stability(rng):
     assert longest_step(sheet._replace(is_pinned=np.ones(16, bool))) == np.inf
 
 
+def test_the_bound_of_the_step_holds_and_is_met(rng):
+    """No eigenvalue of ``M^-1 K`` exceeds ``(2 / longest step)^2``; two equal masses on a spring reach it."""
+    _, sheet, _ = noisy_sheet(rng, is_pinned=np.zeros(16, bool), floor=None, gravity=np.zeros(3))
+    rest = flat_sheet().vertices
+    columns = [forces(rest + move, sheet) - forces(rest - move, sheet) for move in 1e-6 * np.eye(48).reshape(48, 16, 3)]
+    K = -np.reshape(columns, (48, 48)) / 2e-6
+    largest = np.linalg.eigvals(K / np.repeat(sheet.masses, 3)).real.max()
+    assert 0.3 < largest / (2 / longest_step(sheet)) ** 2 < 1
+    _, pair = hanging_chain(1, 7.0, 0.0)
+    pair = pair._replace(masses=np.ones(2), is_pinned=np.zeros(2, bool))
+    assert_allclose((2 / longest_step(pair)) ** 2, 2 * 7.0, rtol=CLOSED_FORM)  # k over the reduced mass 1 / 2
+    assert_allclose((2 / longest_step(pair._replace(floor=Floor(0.0, 3.0, 0.0)))) ** 2, 17.0, rtol=CLOSED_FORM)
+
+
 def test_a_sheet_stretches_as_much_as_was_asked(rng):
     mesh = grid(np.zeros(3), np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), (6, 6))
     masses = vertex_masses(mesh, 1.0)
@@ -267,15 +288,20 @@ def test_fall_from_the_command_line(model, tmp_path, capsys):
 
 def test_what_is_pinned_stays(model, tmp_path, capsys):
     out = tmp_path / "fallen"
-    options = ("--pin-top", 0.1, "--pin-box", -2, 0.9, 0, -0.9, 2, 9, "--floor", 0.5, "--reach", 0.5)
+    options = ("--pin-top", 0.4, "--pin-box", -2, 0.9, 0, -0.9, 2, 9, "--floor", 0.5, "--reach", 0.5)
     assert fall(model, "--out", out, "--frames", 2, "--seconds", 0.3, *options) == 0
     before, after = flat_sheet().vertices, load_mesh(out / "mesh.ply").vertices
-    is_pinned = (before[:, 1] < -0.9) | ((before[:, 0] < -0.9) & (before[:, 1] > 0.9))
-    assert is_pinned.sum() == 5
+    is_pinned = (before[:, 1] < 0) | ((before[:, 0] < -0.9) & (before[:, 1] > 0.9))
+    assert is_pinned.sum() == 9
     assert_array_equal((before == after).all(axis=1), is_pinned)
     first, last = load_ply(model), load_ply(out / "frame_001.ply")
     moved = (first.means != last.means).any(axis=1)
-    assert f"{moved.sum()} Gaussians that fall" in capsys.readouterr().out and 0 < moved.sum() < 60
+    binding = bind(first, flat_sheet(), 0.5)
+    hangs = (binding.faces != UNBOUND) & ~is_pinned[binding.mesh.faces].all(axis=1)[binding.faces]
+    assert_array_equal(moved, hangs)
+    assert (
+        f"{binding.n_bound} Gaussians that fall" in capsys.readouterr().out and 0 < hangs.sum() < binding.n_bound < 60
+    )
 
 
 def test_bad_input_of_fall_is_one_line_and_writes_nothing(model, tmp_path, capsys):
