@@ -19,7 +19,9 @@ triangle. Triangles whose corners have not moved leave their Gaussians as they a
 surface becomes flat pieces, and a Gaussian that crosses a side of its triangle follows only the one that it is bound
 to. Corners say nothing of a stretch across their plane; there a Gaussian grows as h does, with the root of the area.
 Beyond the border of the mesh and far from its surface the map of the nearest triangle is continued, which magnifies
-its turn; ``reach`` leaves Gaussians alone that are farther away.
+its turn; ``reach`` leaves Gaussians alone that are farther away. Of a hull around a solid thing, what lies on either
+side of the middle belongs to opposite faces, and tears apart when these turn differently; a sheet, or a mesh close to
+the surface, serves better.
 
 Where this deviates from GaMeS: Gaussians are not trained on the faces but bound as they are, so they may be off the
 surface and of any shape; there, the scales of a flat Gaussian are two lengths of a Gram-Schmidt frame of the triangle,
