@@ -10,6 +10,7 @@ from tolerances import CLOSED_FORM, GRADIENT_REL, GRADIENT_STEP, SETTLED, VERLET
 
 from minisplat_ref.cli import main
 from minisplat_ref.extensions.proxies import edit_claims, sheet_claims
+from minisplat_ref.extensions.proxies import fall as fall_command
 from minisplat_ref.extensions.proxies.binding import UNBOUND, bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid
 from minisplat_ref.extensions.proxies.edit_claims import rolled, rolled_jacobian
@@ -314,6 +315,7 @@ def test_bad_input_of_fall_is_one_line_and_writes_nothing(model, tmp_path, capsy
         ("--stretch", 0): "--stretch is 0",
         ("--drag", -1): "--drag is -1",
         ("--pin-box", 8, 8, 8, 9, 9, 9): "holds no vertex",
+        ("--pin-top", 1): "every vertex of the mesh is held",
         ("--reach", 0): "is within 0 of the mesh",
         ("--cameras", tmp_path / "absent.json"): "absent.json",
     }
@@ -325,6 +327,15 @@ def test_bad_input_of_fall_is_one_line_and_writes_nothing(model, tmp_path, capsy
     words = ["proxies", "fall", model, tmp_path / "degenerate.ply", "--out", tmp_path / "out"]
     assert main([str(word) for word in words]) == 2
     assert "triangle 0 has no area" in capsys.readouterr().err and sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("positions", [np.zeros((16, 3)), np.full((16, 3), np.nan)])
+def test_a_sheet_that_collapses_or_explodes_leaves_nothing(positions, model, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(fall_command, "advanced", lambda *_: State(positions, np.zeros((16, 3))))
+    assert fall(model, "--out", tmp_path / "out") == 2
+    error = capsys.readouterr().err
+    assert "frame 1, folded flat" in error and error.count("\n") == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mesh.ply", "model.ply"]
 
 
 # Studies
