@@ -121,8 +121,8 @@ DENSITY_GRID = 1e-3
 # walk does, and twice that for the square of a difference of unit vectors that is not small.
 LPIPS_FLOAT32 = 1e-5
 
-# Products, singular vectors and logarithms of 3 x 3 matrices with entries and inverses up to 5, in float64; promised in
-# the README.
+# Products, singular vectors and logarithms of 3 x 3 matrices with entries and inverses up to 5, in float64: measured
+# 1e-14.
 AFFINE_EDIT = 1e-12
 
 # A whole image in float64 of Gaussians that were refactored: 1e-15 of footprints, through exponentials and quotients.

@@ -10,7 +10,8 @@ from tolerances import CLOSED_FORM, GRADIENT_REL, GRADIENT_STEP, SETTLED, VERLET
 
 from minisplat_ref.cli import main
 from minisplat_ref.extensions.proxies import edit_claims, sheet_claims
-from minisplat_ref.extensions.proxies.binding import bind, rebuild
+from minisplat_ref.extensions.proxies import fall as fall_command
+from minisplat_ref.extensions.proxies.binding import UNBOUND, bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid
 from minisplat_ref.extensions.proxies.edit_claims import rolled, rolled_jacobian
 from minisplat_ref.extensions.proxies.fall import Setting, sheet_of
@@ -76,6 +77,12 @@ def test_the_springs_of_two_triangles_and_of_a_strip():
 def test_the_numbers_of_springs_of_a_grid(n):
     edges, shear, bend = spring_ends(flat_sheet(n))
     assert len(edges) == 2 * n * (n + 1) + n * n and len(shear) == n * n and len(bend) == 2 * n * (n - 1)
+
+
+def test_an_edge_that_is_the_longest_of_one_triangle_only_is_bent():
+    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0.5, 0.3, 0], [0.5, -5, 0]])
+    _, shear, bend = spring_ends(Mesh(vertices, np.array([[0, 1, 2], [1, 0, 3]])))
+    assert len(shear) == 0 and sorted(bend[0].tolist()) == [2, 3]
 
 
 def test_faces_that_share_an_edge_three_times_are_no_trouble():
@@ -290,7 +297,12 @@ def test_what_is_pinned_stays(model, tmp_path, capsys):
     assert_array_equal((before == after).all(axis=1), is_pinned)
     first, last = load_ply(model), load_ply(out / "frame_001.ply")
     moved = (first.means != last.means).any(axis=1)
-    assert f"{moved.sum()} Gaussians that fall" in capsys.readouterr().out and 0 < moved.sum() < 60
+    binding = bind(first, flat_sheet(), 0.5)
+    hangs = (binding.faces != UNBOUND) & ~is_pinned[binding.mesh.faces].all(axis=1)[binding.faces]
+    assert_array_equal(moved, hangs)
+    assert (
+        f"{binding.n_bound} Gaussians that fall" in capsys.readouterr().out and 0 < hangs.sum() < binding.n_bound < 60
+    )
 
 
 def test_bad_input_of_fall_is_one_line_and_writes_nothing(model, tmp_path, capsys):
@@ -303,6 +315,7 @@ def test_bad_input_of_fall_is_one_line_and_writes_nothing(model, tmp_path, capsy
         ("--stretch", 0): "--stretch is 0",
         ("--drag", -1): "--drag is -1",
         ("--pin-box", 8, 8, 8, 9, 9, 9): "holds no vertex",
+        ("--pin-top", 1): "every vertex of the mesh is held",
         ("--reach", 0): "is within 0 of the mesh",
         ("--cameras", tmp_path / "absent.json"): "absent.json",
     }
@@ -314,6 +327,15 @@ def test_bad_input_of_fall_is_one_line_and_writes_nothing(model, tmp_path, capsy
     words = ["proxies", "fall", model, tmp_path / "degenerate.ply", "--out", tmp_path / "out"]
     assert main([str(word) for word in words]) == 2
     assert "triangle 0 has no area" in capsys.readouterr().err and sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("positions", [np.zeros((16, 3)), np.full((16, 3), np.nan)])
+def test_a_sheet_that_collapses_or_explodes_leaves_nothing(positions, model, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(fall_command, "advanced", lambda *_: State(positions, np.zeros((16, 3))))
+    assert fall(model, "--out", tmp_path / "out") == 2
+    error = capsys.readouterr().err
+    assert "frame 1, folded flat" in error and error.count("\n") == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mesh.ply", "model.ply"]
 
 
 # Studies

@@ -2,24 +2,28 @@
 
 After GaMeS (Waczynska et al. 2024, arXiv 2402.01459), which puts Gaussians onto the faces of a mesh by barycentric
 coordinates and derives rotation and scales from the corners, so that whatever moves the mesh moves the scene. Each
-Gaussian is bound to the nearest triangle. With the frame E of that triangle (:mod:`.mesh`) it is
+Gaussian is bound to the nearest triangle. In the frame E of that triangle (:mod:`.mesh`) it has the place and the axes
 
-    mu = p0 + E (b1, b2, w)       barycentric coordinates (1 - b1 - b2, b1, b2) and signed offset w along the normal
-    R diag(s) = E L               L: rotation and scales in the frame of the triangle
+    (b1, b2, w) = E^-1 (mu - p0)      barycentric coordinates (1 - b1 - b2, b1, b2), signed offset w along the normal
+    L = E^-1 R diag(s)                its rotation and scales
 
-and after the mesh has moved, with the corners p' and the frame E',
+which it keeps when the mesh has moved, with the corners p' and the frame E':
 
-    mu' = p0' + E' (b1, b2, w),   R' diag(s') V^T = E' L          that is Sigma' = F Sigma F^T,  F = E' E^-1
+    mu' = p0' + E' (b1, b2, w)
+    Sigma' = E' L (E' L)^T = F Sigma F^T,   F = E' E^-1
 
-F is the whole deformation gradient, stretch and shear included, refactored by singular values; colours turn by its
-rotation (:mod:`.deformation`).
+F is the deformation gradient of the triangle, with stretch and shear. It is the same for all Gaussians of a triangle,
+so the code computes F and not L. The covariance is refactored by singular values, and colours turn with F's rotation
+(:mod:`.deformation`).
 
 Exact: when the mesh is moved, turned and scaled, so are the Gaussians; and so is every affine map within the plane of a
 triangle. Triangles whose corners have not moved leave their Gaussians as they are, to the byte. Approximate: a bent
 surface becomes flat pieces, and a Gaussian that crosses a side of its triangle follows only the one that it is bound
 to. Corners say nothing of a stretch across their plane; there a Gaussian grows as h does, with the root of the area.
 Beyond the border of the mesh and far from its surface the map of the nearest triangle is continued, which magnifies
-its turn; ``reach`` leaves Gaussians alone that are farther away.
+its turn; ``reach`` leaves Gaussians alone that are farther away. Of a hull around a solid thing, what lies on either
+side of the middle belongs to opposite faces, and tears apart when these turn differently; a sheet, or a mesh close to
+the surface, serves better.
 
 Where this deviates from GaMeS: Gaussians are not trained on the faces but bound as they are, so they may be off the
 surface and of any shape; there, the scales of a flat Gaussian are two lengths of a Gram-Schmidt frame of the triangle,

@@ -13,6 +13,7 @@ the triangle, and once with the frame of GaMeS, which is the normal, the directi
 corner, and the Gram-Schmidt remainder of the second, with two lengths.
 """
 
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -179,13 +180,14 @@ def _gram_schmidt(mesh: Mesh) -> tuple[Floats, Floats]:
     return np.stack([normal, r2, rest / s3[:, None]], axis=2), np.column_stack([np.ones(len(s2)), s2, s3])
 
 
-def bend_errors(gaussians: Gaussians) -> dict[str, Any]:
+def bend_errors(gaussians: Gaussians, all_cells: Iterable[int]) -> dict[str, Any]:
     """Return for each number of cells the largest errors of centres and, by frame, of covariances."""
     J = rolled_jacobian(gaussians.means)
     truth = J @ _sigma(gaussians) @ np.swapaxes(J, 1, 2)
     size = np.abs(truth).max(axis=(1, 2))
-    result: dict[str, Any] = {"cells": list(CELLS), "centre": [], "covariance": {name: [] for name in FRAMES}}
-    for cells in CELLS:
+    result: dict[str, Any] = {"cells": [], "centre": [], "covariance": {name: [] for name in FRAMES}}
+    for cells in all_cells:
+        result["cells"].append(cells)
         for name, is_whole in FRAMES.items():
             carried = bent_by(cells, gaussians, is_whole)
             relative = np.abs(_sigma(carried) - truth).max(axis=(1, 2)) / size

@@ -30,7 +30,7 @@ from minisplat_ref.io.ply import save_ply
 from minisplat_ref.rendering import render
 from minisplat_ref.types import Bools, Camera, Floats
 
-STEP_FRACTION = 0.2  # of the longest stable step: Verlet's error of the energy is then about a percent of what swings
+STEP_FRACTION = 0.2  # of the longest stable step; the study proxies/sheet measures what it does to the energy
 FLOOR_DEPTH = 0.02  # of a mean edge: how far the floor gives way under a sheet that lies on it
 PICTURE_SIZE = (480, 360)  # pixels, without --cameras
 
@@ -168,6 +168,10 @@ def _pinned(args: argparse.Namespace, mesh: Mesh) -> Bools:
         is_pinned |= in_box(mesh.vertices, np.array(args.pin_box[:3]), np.array(args.pin_box[3:]))
         if not is_pinned.any():
             raise InputError("--pin-box holds no vertex of the mesh: give a larger one")
+    if is_pinned.all():
+        raise InputError(
+            "every vertex of the mesh is held, so that nothing falls: give a smaller --pin-top or --pin-box"
+        )
     return is_pinned
 
 

@@ -34,6 +34,7 @@ def run_affine(args: argparse.Namespace) -> None:
         There are no seeds, or the output folder cannot be used.
     """
     import numpy as np
+    from tqdm import tqdm
 
     from minisplat_ref.extensions.proxies import edit_claims
 
@@ -41,12 +42,13 @@ def run_affine(args: argparse.Namespace) -> None:
         raise InputError(f"--seeds is {args.seeds}: give at least 1")
     with making_folder(args.out) as folder:
         edits = {}
-        for name in edit_claims.MAPS:
+        for name in tqdm(edit_claims.MAPS, desc="edits", leave=False, disable=None):
             rows = [edit_claims.edit_errors(name, seed) for seed in range(args.seeds)]
             is_seen = rows[0].picture is not None
             worst = {field: max(getattr(row, field) for row in rows) for field in rows[0]._fields[:3]}
             edits[name] = {**worst, "picture": max(row.picture or 0.0 for row in rows) if is_seen else None}
-        bend = edit_claims.bend_errors(edit_claims.flat_gaussians(np.random.default_rng(0)))
+        cells = tqdm(edit_claims.CELLS, desc="bending", leave=False, disable=None)
+        bend = edit_claims.bend_errors(edit_claims.flat_gaussians(np.random.default_rng(0)), cells)
         _write(folder, {"seeds": args.seeds, "edits": edits, "bend": bend}, edit_claims.draw(bend, seed=0))
     print("largest error of an affine edit, in float64\n")
     table = [[name, *("-" if e is None else f"{e:.1e}" for e in errors.values())] for name, errors in edits.items()]
