@@ -124,3 +124,6 @@ LPIPS_FLOAT32 = 1e-5
 # The angle between two rotations, radians, of quaternions in float32: their components are rounded by 6e-8, and the
 # angle is four times the arc sine of half a chord.
 QUATERNION_FLOAT32 = 5e-7
+
+# A half float: half a unit in the last of 11 digits.
+HALF_FLOAT = 4.9e-4
