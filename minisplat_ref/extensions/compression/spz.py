@@ -19,8 +19,8 @@ would be somewhere else.
 **Axes.** The file's frame is RUB (x right, y up, z backward), as in OpenGL. That of a PLY of 3DGS is RDF (x right, y
 down, z forward). Niantic's library turns one into the other when its caller asks for it; we always do, as the sample
 of three Gaussians in both formats has it: y and z change sign, which is half a turn around x. So of a quaternion y and
-z change sign, and of the harmonics those that are odd in y z, which :data:`SIGNS` has from their polynomials. PlayCanvas'
-splat-transform reads what we write in the same way.
+z change sign, and of the harmonics those that are odd in y z, which :data:`SIGNS` has from their polynomials.
+PlayCanvas' splat-transform reads what we write in the same way.
 
 Opacities 0 and 1 have no logit. They are read as a quarter of a level away from the end.
 

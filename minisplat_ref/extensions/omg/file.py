@@ -72,7 +72,7 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
     sizes = LEVELS[level]
     check_gaussians(gaussians, "Gaussians")
     n, n_rest = gaussians.sh_rest.shape[:2]
-    center = (np.median(gaussians.means, axis=0) if n else np.zeros(3)).astype(np.float32)  # [3]
+    center = _center(gaussians)
     offsets = _halves(gaussians.means - center, "means")
     order = morton_order(offsets)
     rows = Gaussians(*(np.asarray(field, np.float64)[order] for field in gaussians))
@@ -109,6 +109,17 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
         "planes": planes,
     }
     return pack(CONTAINER, header, streams)
+
+
+def _center(gaussians: Gaussians) -> Floats:
+    """Return the median [3] of the centres, float32."""
+    median: Floats = np.median(gaussians.means, axis=0) if len(gaussians.means) else np.zeros(3)
+    return median.astype(np.float32)
+
+
+def order_of(gaussians: Gaussians) -> Ints:
+    """Return the rows [N] of the Gaussians in the order in which a file has them."""
+    return morton_order(_halves(gaussians.means - _center(gaussians), "means"))
 
 
 def _halves(values: Floats, name: str) -> Floats:

@@ -1,8 +1,9 @@
 """The study ``omg/distinctiveness``: what to keep of a scene, and what the rest costs as a file.
 
 A scene is trained by Mini-Splatting2, or given. Of its Gaussians that dominate a pixel, the same number is kept by
-importance alone and by importance times distinctiveness squared; both are fine-tuned for the same number of iterations,
-without any event. Then each is written as ``.omg`` and read again.
+importance alone and by importance times distinctiveness squared; both are fine-tuned for the same number of
+iterations, without any event. Then each is written as ``.omg`` and read again. Of the whole population each field by
+itself is taken from such a file, at every level, which says where the quality goes.
 
 Where does distinctiveness hurt? Pixels of the test photographs are told apart by their gradient: the flatter half of
 each photograph, and the rest. What has neighbours of its own colour is what flat regions are made of.
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.extensions import shared_study as shared
-from minisplat_ref.extensions.omg.file import OMG_FILE
+from minisplat_ref.extensions.omg.file import OMG_FILE, order_of
 from minisplat_ref.extensions.omg.method import POWER
 from minisplat_ref.extensions.omg.reference import distinct_importance, local_distinctiveness
 from minisplat_ref.io.atomic import making_folder
@@ -64,8 +65,11 @@ def run(args: argparse.Namespace) -> None:
         raise InputError(f"--fine-tune is {args.fine_tune}: give at least 1")
     scene = shared.read_scene(args)
     with making_folder(args.out) as folder:
-        runs = [measured(whole, scene, args.fine_tune, s) for s, whole in enumerate(shared.populations(args, scene))]
+        wholes = shared.populations(args, scene)
+        runs = [measured(whole, scene, args.fine_tune, seed) for seed, whole in enumerate(wholes)]
+        losses = [losses_of_fields(whole, scene) for whole in wholes]
         result = {**shared.describe(args, scene), "fine_tune": args.fine_tune, "power": POWER, "runs": runs}
+        result["losses"] = {field: [of_seed[field] for of_seed in losses] for field in losses[0]}
         shared.write(folder, result, draw(result))
     print(f"{scene.name}; fine-tuned {args.fine_tune} iterations\n")
     heading = [
@@ -80,6 +84,12 @@ def run(args: argparse.Namespace) -> None:
         "dB as .omg",
     ]
     print(markdown_table(heading, to_rows(runs)))
+    print("\ndB lost by one field from the file, at each level\n")
+    rows = [
+        [field, *(shared.with_deviation(list(of_seeds), 2) for of_seeds in zip(*of_levels, strict=True))]
+        for field, of_levels in result["losses"].items()
+    ]
+    print(markdown_table(["field", *map(str, range(len(OMG_FILE.levels)))], rows))
 
 
 def measured(whole: Gaussians, scene: Scene, iterations: int, seed: int) -> list[dict[str, Any]]:
@@ -116,6 +126,20 @@ def _row(kept: str, choice: str, at_once: Quality, tuned: Gaussians, scene: Scen
         "n_bytes": len(content),
         "packed": quality(OMG_FILE.decode(content, OMG_FILE.suffix), scene)._asdict(),
     }
+
+
+def losses_of_fields(gaussians: Gaussians, scene: Scene) -> dict[str, list[float]]:
+    """Return, for each field, the dB that are lost at each level when that field alone is what a file holds."""
+    from minisplat_ref.strategy.ops import take
+
+    whole = take(gaussians, order_of(gaussians))
+    before = quality(whole, scene).psnr
+    losses: dict[str, list[float]] = {field: [] for field in Gaussians._fields}
+    for level in range(len(OMG_FILE.levels)):
+        back = OMG_FILE.decode(OMG_FILE.encode(gaussians, level), OMG_FILE.suffix)
+        for field, of_levels in losses.items():
+            of_levels.append(before - quality(whole._replace(**{field: getattr(back, field)}), scene).psnr)
+    return losses
 
 
 def fine_tuned(gaussians: Gaussians, scene: Scene, iterations: int, seed: int) -> Gaussians:
