@@ -138,3 +138,10 @@ VERLET_SLOPE = 0.25
 # The angle between two rotations, radians, of quaternions in float32: their components are rounded by 6e-8, and the
 # angle is four times the arc sine of half a chord.
 QUATERNION_FLOAT32 = 5e-7
+
+# A half float: half a unit in the last of 11 digits.
+HALF_FLOAT = 4.9e-4
+
+# The same rotations of an SPZ by two programs, radians: the fourth component is the root of what the others leave of 1,
+# in float32 there; near zero that is the root of some roundings of 6e-8.
+SPZ_ROTATION = 1e-3

@@ -2,7 +2,9 @@
 
 import gzip
 import json
+import shutil
 import struct
+import subprocess
 import sys
 import tracemalloc
 
@@ -13,7 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import make_gaussians
-from tolerances import CLOSED_FORM, PARITY_FLOAT32_IMAGE, QUATERNION_FLOAT32, ROUNDED_TO_FLOAT32
+from tolerances import CLOSED_FORM, PARITY_FLOAT32_IMAGE, QUATERNION_FLOAT32, ROUNDED_TO_FLOAT32, SPZ_ROTATION
 
 from minisplat_ref import load_ply, save_ply
 from minisplat_ref.cli import main
@@ -305,6 +307,22 @@ def test_spz_of_another_program(shared_data):
     assert rotation_error(ply.quats, theirs.quats).max() < 0.005
     assert np.abs(theirs.sh_rest).max() > 0  # the harmonics' order and signs are seen
     assert spz_raw(ply) == gzip.decompress(path.read_bytes())  # byte for byte what they have written
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("level", [0, 1])
+def test_another_program_reads_our_spz(level, tmp_path):
+    """PlayCanvas' splat-transform, of npm, where it is on the PATH: axes, harmonics and rotations, not only bytes."""
+    program = shutil.which("splat-transform")
+    if program is None:
+        pytest.skip("no splat-transform on the PATH: npm install @playcanvas/splat-transform")
+    ours = tmp_path / "ours.spz"
+    ours.write_bytes(spz.encode(population(200), level))
+    subprocess.run([program, "-g", "cpu", ours, tmp_path / "theirs.ply"], check=True, capture_output=True)
+    back, theirs = spz.decode(ours.read_bytes(), ours), load_ply(tmp_path / "theirs.ply")
+    for name in ("means", "log_scales", "opacity_logits", "sh_dc", "sh_rest"):
+        assert_allclose(getattr(theirs, name), getattr(back, name), rtol=0, atol=10 * ROUNDED_TO_FLOAT32, err_msg=name)
+    assert rotation_error(theirs.quats, back.quats).max() < SPZ_ROTATION
 
 
 def test_spz_reaches_2048():

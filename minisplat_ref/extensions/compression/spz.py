@@ -20,6 +20,7 @@ would be somewhere else.
 down, z forward). Niantic's library turns one into the other when its caller asks for it; we always do, as the sample
 of three Gaussians in both formats has it: y and z change sign, which is half a turn around x. So of a quaternion y and
 z change sign, and of the harmonics those that are odd in y z, which :data:`SIGNS` has from their polynomials.
+PlayCanvas' splat-transform reads what we write in the same way.
 
 Opacities 0 and 1 have no logit. They are read as a quarter of a level away from the end.
 

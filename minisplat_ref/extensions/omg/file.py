@@ -1,0 +1,257 @@
+"""``.omg``: centres as halves in Morton order, and everything else as codes of small codebooks.
+
+===============  ==================  =======================================================================
+centres          half floats         of the offset from the scene's median; packed as differences
+scales           1 number a part     their logarithms
+rotations        2 numbers a part    unit quaternions with w >= 0, in (w, x) and (y, z)
+opacity          1 number a part     its logit; the paper's is the output of a network
+appearance       2 numbers a part    degree 0 (3 numbers) and the features of the higher harmonics
+===============  ==================  =======================================================================
+
+Codebooks and decoder are half floats. Indices and centres are planes of bytes that zstandard packs, where the paper has
+Huffman's code, a coder of point clouds and xz. There is no bound of the error but what the codebooks give; ``describe``
+says how many codes there are. Decoding gives the same Gaussians on every machine but for the last bit of the higher
+harmonics, which are a product of matrices.
+"""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref.constants import SH_DEGREE_MAX
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.omg.appearance import Decoder, features_of, fitted_decoder
+from minisplat_ref.extensions.omg.svq import Quantised, quantise
+from minisplat_ref.extensions.shared_container import WAY_OUT, Container, Packed, is_count, pack, take_apart, unpack
+from minisplat_ref.extensions.shared_morton import morton_order
+from minisplat_ref.extensions.shared_planes import MOST_PLANES, from_planes, to_planes, unzigzag, zigzag
+from minisplat_ref.io.formats import Format
+from minisplat_ref.types import Floats, Gaussians, Ints
+from minisplat_ref.validation import check_gaussians
+
+CONTAINER = Container(b"OMG\n", version=1)
+MOST_GAUSSIANS = 2**31 - 1
+MOST_CODES = 2**16
+LARGEST_HALF = 65504.0
+LEAST_QUAT = 2.0**-10  # of a part (w, x) whose code would be zero, since the other may be zero, too
+
+
+class Sizes(NamedTuple):
+    """Codes of each codebook, and features of the higher harmonics."""
+
+    scales: int
+    rotations: int
+    opacities: int
+    appearance: int
+    n_features: int
+    """Odd, so that with three colours there are whole pairs."""
+
+
+LEVELS = (
+    Sizes(scales=1024, rotations=8192, opacities=256, appearance=8192, n_features=9),
+    Sizes(scales=256, rotations=2048, opacities=128, appearance=4096, n_features=5),
+    Sizes(scales=64, rotations=512, opacities=64, appearance=1024, n_features=3),
+    Sizes(scales=32, rotations=128, opacities=32, appearance=256, n_features=3),
+    Sizes(scales=16, rotations=64, opacities=16, appearance=64, n_features=1),
+)
+"""Level 2 has the codebooks of the paper."""
+WIDTHS = {"scales": 1, "rotations": 2, "opacities": 1, "appearance": 2}
+
+
+def encode(gaussians: Gaussians, level: int) -> bytes:
+    """Return the Gaussians as a file.
+
+    Raises
+    ------
+    InputError
+        A value is not finite, or beyond half floats, or zstandard is missing.
+    """
+    sizes = LEVELS[level]
+    check_gaussians(gaussians, "Gaussians")
+    n, n_rest = gaussians.sh_rest.shape[:2]
+    center = _center(gaussians)
+    offsets = _halves(gaussians.means - center, "means")
+    order = morton_order(offsets)
+    rows = Gaussians(*(np.asarray(field, np.float64)[order] for field in gaussians))
+    harmonics = rows.sh_rest.reshape(n, 3 * n_rest)
+    _halves(harmonics, "sh_rest")
+    decoder = fitted_decoder(harmonics, sizes.n_features)
+    features = features_of(harmonics, decoder)
+    quats = rows.quats / np.linalg.norm(rows.quats, axis=1, keepdims=True)
+    vectors = {
+        "scales": rows.log_scales,
+        "rotations": quats * np.where(quats[:, :1] < 0, -1.0, 1.0),
+        "opacities": rows.opacity_logits[:, None],
+        "appearance": np.concatenate([rows.sh_dc, features, np.zeros((n, (3 + features.shape[1]) % 2))], axis=1),
+    }
+    quantised = {
+        name: quantise(_halves(values, name).astype(np.float64), WIDTHS[name], getattr(sizes, name))
+        for name, values in vectors.items()
+    }
+    is_zero = (quantised["rotations"].codes[0] == 0).all(axis=1)
+    quantised["rotations"].codes[0][is_zero] = [LEAST_QUAT, 0.0]
+    streams, planes = {}, {}
+    for name, integers in _integers(offsets[order], quantised).items():
+        streams[name], planes[name] = to_planes(integers)
+    for name, of_parts in quantised.items():
+        streams[f"{name} codes"] = b"".join(codes.tobytes() for codes in of_parts.codes)
+    streams["decoder"] = decoder.mean.tobytes() + decoder.directions.tobytes()
+    header = {
+        "n": n,
+        "sh_degree": math.isqrt(n_rest + 1) - 1,
+        "level": level,
+        "center": [float(x) for x in center],
+        "n_features": features.shape[1],
+        "codes": {name: [len(codes) for codes in of_parts.codes] for name, of_parts in quantised.items()},
+        "planes": planes,
+    }
+    return pack(CONTAINER, header, streams)
+
+
+def _center(gaussians: Gaussians) -> Floats:
+    """Return the median [3] of the centres, float32."""
+    median: Floats = np.median(gaussians.means, axis=0) if len(gaussians.means) else np.zeros(3)
+    return median.astype(np.float32)
+
+
+def order_of(gaussians: Gaussians) -> Ints:
+    """Return the rows [N] of the Gaussians in the order in which a file has them."""
+    return morton_order(_halves(gaussians.means - _center(gaussians), "means"))
+
+
+def _halves(values: Floats, name: str) -> Floats:
+    if not np.abs(values).max(initial=0.0) <= LARGEST_HALF:
+        raise InputError(
+            f"{name} reach {np.abs(values).max():.3g}, and half floats {LARGEST_HALF:g}: choose another format"
+        )
+    return values.astype(np.float16)
+
+
+def _integers(offsets: Floats, quantised: Mapping[str, Quantised]) -> dict[str, Any]:
+    """Return what is packed as planes: differences of the centres' ordered bit patterns, and indices."""
+    bits = offsets.view(np.int16).astype(np.int64)
+    ordered = np.where(bits < 0, -(bits & 0x7FFF), bits)  # ascending as the halves are; both zeros are 0
+    return {
+        "means": zigzag(np.diff(ordered, axis=0, prepend=0)),
+        **{name: of_parts.indices.astype(np.uint64) for name, of_parts in quantised.items()},
+    }
+
+
+def decode(content: bytes, source: str | Path) -> Gaussians:
+    """Return the Gaussians of a file, float32.
+
+    Raises
+    ------
+    InputError
+        The file is damaged, or of another kind or version.
+    """
+    packed = take_apart(CONTAINER, content, source)
+    header = _checked(packed)
+    n, n_rest = header.n, (header.sh_degree + 1) ** 2 - 1
+    differences = unzigzag(_planes(packed, header, "means", 3))
+    ordered = np.cumsum(differences, axis=0)
+    bits = np.where(ordered < 0, -ordered | 0x8000, ordered).astype(np.uint16)
+    vectors = {name: _vectors(packed, header, name) for name in WIDTHS}
+    raw = unpack(packed, "decoder", 2 * (1 + header.n_features) * 3 * n_rest)
+    table = np.frombuffer(raw, "<f2").reshape(1 + header.n_features, 3 * n_rest)
+    features = vectors["appearance"][:, 3 : 3 + header.n_features]
+    with np.errstate(over="ignore", invalid="ignore"):  # of damaged files; what is not finite is refused
+        harmonics = Decoder(table[0], table[1:]).harmonics(features)
+    gaussians = Gaussians(
+        means=np.asarray(header.center, np.float32) + bits.view(np.float16).astype(np.float32),
+        quats=vectors["rotations"],
+        log_scales=vectors["scales"],
+        opacity_logits=vectors["opacities"][:, 0],
+        sh_dc=np.ascontiguousarray(vectors["appearance"][:, :3]),
+        sh_rest=harmonics.reshape(n, n_rest, 3),
+    )
+    check_gaussians(gaussians, source)
+    return gaussians
+
+
+class _Header(NamedTuple):
+    """What a header says, checked."""
+
+    n: int
+    sh_degree: int
+    level: int
+    center: tuple[float, ...]
+    n_features: int
+    codes: Mapping[str, list[int]]
+    planes: Mapping[str, int]
+
+
+def _planes(packed: Packed, header: _Header, name: str, n_columns: int) -> Any:
+    n_planes = header.planes[name]
+    return from_planes(unpack(packed, name, n_planes * n_columns * header.n), n_planes, n_columns, header.n)
+
+
+def _vectors(packed: Packed, header: _Header, name: str) -> Floats:
+    """Return the vectors [N, D] of a stream of indices and its codebooks."""
+    counts, width = header.codes[name], WIDTHS[name]
+    raw = unpack(packed, f"{name} codes", 2 * width * sum(counts))
+    codes = np.split(np.frombuffer(raw, "<f2").reshape(-1, width), np.cumsum(counts)[:-1])
+    indices: Ints = _planes(packed, header, name, len(counts)).astype(np.int64)
+    if (indices >= np.array(counts)).any():
+        raise InputError(f"{packed.source}: damaged, {name} have codes that are not in their codebook; {WAY_OUT}")
+    return Quantised(tuple(codes), indices).vectors()
+
+
+def _checked(packed: Packed) -> _Header:
+    """Return the header, of which everything that is read has been looked at."""
+    values = {name: packed.header.get(name) for name in _Header._fields}
+    n, degree, level, center, n_features, codes, planes = values.values()
+    is_right = (
+        is_count(n, MOST_GAUSSIANS)
+        and is_count(degree, SH_DEGREE_MAX)
+        and is_count(level)
+        and isinstance(center, list)
+        and len(center) == 3
+        and all(type(x) is float and math.isfinite(x) for x in center)
+        and is_count(n_features, 3 * ((SH_DEGREE_MAX + 1) ** 2 - 1))
+        and isinstance(codes, dict)
+        and set(codes) == set(WIDTHS)
+        and isinstance(planes, dict)
+        and set(planes) == {"means", *WIDTHS}
+        and all(is_count(n_planes, MOST_PLANES) and n_planes for n_planes in planes.values())
+    )
+    if is_right:
+        assert isinstance(codes, dict) and isinstance(n_features, int)
+        n_parts = {"scales": 3, "rotations": 2, "opacities": 1, "appearance": -(-(3 + n_features) // 2)}
+        is_right = all(
+            isinstance(counts, list) and len(counts) == n_parts[name] and all(is_count(k, MOST_CODES) for k in counts)
+            for name, counts in codes.items()
+        )
+    if not is_right:
+        raise InputError(f"{packed.source}: damaged, its header does not describe Gaussians (n {n}); {WAY_OUT}")
+    return _Header(**values)  # type: ignore[arg-type]
+
+
+def describe(content: bytes, source: str | Path) -> list[tuple[str, str]]:
+    """Return the level of a file and its codebooks.
+
+    Raises
+    ------
+    InputError
+        As for :func:`decode`, of the header.
+    """
+    header = _checked(take_apart(CONTAINER, content, source))
+    rows = [("level", f"{header.level} of {len(LEVELS) - 1}")]
+    rows += [("centres", "half floats of the offset from the median")]
+    rows += [(name, f"{', '.join(map(str, counts))} codes") for name, counts in header.codes.items()]
+    return [*rows, ("features", f"{header.n_features} for the higher harmonics")]
+
+
+OMG_FILE = Format(
+    suffix=".omg",
+    summary="codebooks of sub-vectors, zstandard",
+    levels=tuple(f"{sizes.appearance} codes of appearance" for sizes in LEVELS),
+    default_level=2,
+    encode=encode,
+    decode=decode,
+    describe=describe,
+)
+"""The format."""

@@ -1,0 +1,75 @@
+"""Sub-vector quantisation: a vector in parts, and a codebook of its own for each part.
+
+A vector of d numbers becomes d / w parts of w numbers, and each part the number of the nearest of its K codes. So d / w
+times log2 K bits choose among K^(d / w) vectors, while only K d numbers are stored. One codebook for whole vectors
+would have to hold K^(d / w) codes to be as fine; at equal and *low* rates, though, it is the better one, since it knows
+which parts go together.
+
+Codes are found by Lloyd's iteration: assign each vector to the nearest code, move each code to the mean of its own.
+Everything is deterministic: codes start at vectors that lie evenly along the sorted list, and no number is drawn.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from minisplat_ref.types import Floats, Ints
+
+ITERATIONS = 12
+MOST_SAMPLES = 1 << 17  # vectors that codes are fitted to, evenly from all
+
+
+class Quantised(NamedTuple):
+    """Vectors as codes."""
+
+    codes: tuple[Floats, ...]
+    """A codebook [K, w] of float16 for each part; K may be less than was allowed."""
+    indices: Ints
+    """[N, P] rows of the codebooks."""
+
+    def vectors(self) -> Floats:
+        """Return the vectors [N, P w] that the codes stand for, float32."""
+        parts = [codes[rows] for codes, rows in zip(self.codes, self.indices.T, strict=True)]
+        return np.concatenate(parts, axis=1).astype(np.float32)
+
+
+def quantise(vectors: Floats, width: int, n_codes: int) -> Quantised:
+    """Return the vectors with each part replaced by a code.
+
+    Parameters
+    ----------
+    vectors : ndarray of shape (N, D)
+        Finite, at most 65504 in magnitude, which is what float16 holds.
+    width : int
+        w, numbers of a part; divides D.
+    n_codes : int
+        K, codes of each part at most.
+    """
+    codes, indices = [], []
+    for begin in range(0, vectors.shape[1], width):
+        part = vectors[:, begin : begin + width].astype(np.float64)
+        book = np.unique(fitted_codes(part, n_codes).astype(np.float16), axis=0)
+        codes.append(book)
+        indices.append(_nearest(book.astype(np.float64), part))
+    return Quantised(tuple(codes), np.stack(indices, axis=1))
+
+
+def fitted_codes(vectors: Floats, n_codes: int) -> Floats:
+    """Return at most K codes [K, w] for vectors [N, w]; the vectors themselves where no more than K are different."""
+    different = np.unique(vectors[:: -(-len(vectors) // MOST_SAMPLES) or 1], axis=0)
+    if len(different) <= n_codes:
+        return different
+    codes = different[np.linspace(0, len(different) - 1, n_codes).round().astype(int)]
+    for _ in range(ITERATIONS):
+        rows = _nearest(codes, different)
+        counts = np.bincount(rows, minlength=n_codes)
+        sums = np.stack([np.bincount(rows, weights=axis, minlength=n_codes) for axis in different.T], axis=1)
+        codes = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None], codes)
+    return codes
+
+
+def _nearest(codes: Floats, vectors: Floats) -> Ints:
+    if len(vectors) == 0:
+        return np.zeros(0, np.int64)
+    return cKDTree(codes).query(vectors)[1].astype(np.int64)

@@ -1,0 +1,361 @@
+"""OMG: distinctiveness by hand, codebooks, a decoder of few features, and a file of all that."""
+
+import json
+import struct
+import tracemalloc
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scenes import make_gaussians
+from tolerances import CLOSED_FORM, HALF_FLOAT
+
+from minisplat_ref import load_ply
+from minisplat_ref.backends import CPU
+from minisplat_ref.cli import main
+from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.datasets.synthetic.files import write_scene
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.extension import find_format, find_recipe
+from minisplat_ref.extensions.omg import file as omg
+from minisplat_ref.extensions.omg import study
+from minisplat_ref.extensions.omg.appearance import features_of, fitted_decoder
+from minisplat_ref.extensions.omg.method import prune_indistinct
+from minisplat_ref.extensions.omg.reference import distinct_importance, local_distinctiveness
+from minisplat_ref.extensions.omg.svq import fitted_codes, quantise
+from minisplat_ref.methods.mini_splatting import MINI_SPLATTING, prune_tail
+from minisplat_ref.rendering import SPLATTING
+from minisplat_ref.strategy.importance import indoor
+from minisplat_ref.training.loop import initial_state
+from minisplat_ref.training.schedule import action_name
+from minisplat_ref.training.state import Iteration
+from minisplat_ref.types import Gaussians
+
+LEVELS = range(len(omg.LEVELS))
+FEW_BYTES = 2_000_000  # that a refusal may take, whatever the file claims
+
+
+def population(n=300, sh_degree=3, seed=0):
+    gaussians = make_gaussians(np.random.default_rng(seed), n, sh_degree=sh_degree)
+    return Gaussians(*(field.astype(np.float32) for field in gaussians))
+
+
+# Distinctiveness
+
+
+def test_distinctiveness_by_hand(rng):
+    """Six Gaussians in a row, in whatever order their rows stand: differences to the left and to the right, added."""
+    means = np.column_stack([np.arange(6.0), np.zeros(6), np.zeros(6)])
+    gray = np.array([0.0, 1.0, 1.0, 1.0, 5.0, 2.0])
+    colors = np.column_stack([gray, gray, gray - 3])
+    expected = np.array([2.0, 1.0, 0.0, 4.0, 7.0, 6.0])  # the ends have one neighbour, which counts twice
+    for _ in range(5):
+        rows = rng.permutation(6)
+        assert_allclose(local_distinctiveness(means[rows], colors[rows]), expected[rows], atol=CLOSED_FORM)
+
+
+def test_distinctiveness_is_the_mean_of_the_channels():
+    colors = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, -3.0]])
+    assert_allclose(local_distinctiveness(np.eye(3)[:2], colors), [4.0, 4.0], rtol=CLOSED_FORM)
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_nobody_is_distinct_alone(n):
+    assert_array_equal(local_distinctiveness(np.zeros((n, 3)), np.ones((n, 3))), np.zeros(n))
+
+
+def test_score():
+    importance, distinctiveness = np.array([2.0, 3.0, 5.0]), np.array([1.0, 2.0, 0.0])
+    assert_array_equal(distinct_importance(importance, distinctiveness, 2.0), [2.0, 12.0, 0.0])
+    assert_array_equal(distinct_importance(importance, distinctiveness, 0.0), importance)
+
+
+# The event
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene("room", supersampling=1, n_views=6, width=32, height=24, n_points=120, test_every=4).scene
+
+
+def state_and_iteration(scene):
+    state = initial_state(scene, MINI_SPLATTING, seed=0)
+    nothing = dict.fromkeys(Iteration._fields)
+    iteration = Iteration(
+        **nothing | {"scene": scene, "renderer": SPLATTING, "conventions": GSPLAT_MAIN, "backend": CPU}
+    )
+    return state, iteration
+
+
+def test_without_distinctiveness_it_is_mini_splattings_pruning(scene):
+    """Power 0, to the last byte."""
+    (ours, iteration), (theirs, _) = state_and_iteration(scene), state_and_iteration(scene)
+    prune_indistinct(ours, iteration, metric=indoor, distinct_mass=0.9, distinct_power=0.0)
+    prune_tail(theirs, iteration, metric=indoor, mass=0.9, is_intersecting=True)
+    assert 0 < len(ours.gaussians.means) < len(scene.points)
+    for field, other in zip(ours.gaussians, theirs.gaussians, strict=True):
+        assert field.tobytes() == other.tobytes()
+
+
+def test_with_distinctiveness_it_keeps_fewer_and_more_distinct_ones(scene):
+    (ours, iteration), (theirs, _) = state_and_iteration(scene), state_and_iteration(scene)
+    prune_indistinct(ours, iteration, metric=indoor, distinct_mass=0.9, distinct_power=2.0)
+    prune_tail(theirs, iteration, metric=indoor, mass=0.9, is_intersecting=True)
+    assert 0 < len(ours.gaussians.means) < len(theirs.gaussians.means)
+
+
+def test_where_all_colours_are_alike_it_does_nothing(scene):
+    state, iteration = state_and_iteration(scene)
+    state.gaussians.sh_dc[:] = 0.25
+    note = prune_indistinct(state, iteration, metric=indoor, distinct_mass=0.9, distinct_power=2.0)
+    assert "all colours are alike" in note and len(state.gaussians.means) == len(scene.points)
+
+
+def test_the_recipe_is_mini_splatting_but_for_its_last_pruning():
+    recipe = find_recipe("omg")
+    pairs = list(zip(recipe.events, MINI_SPLATTING.events, strict=True))
+    changed = [(ours, theirs) for ours, theirs in pairs if ours != theirs]
+    assert [(action_name(ours), action_name(theirs)) for ours, theirs in changed] == [
+        ("prune_indistinct", "prune_tail")
+    ]
+    assert changed[0][0].step == changed[0][1].step == 20_000
+
+
+# Codebooks
+
+
+def test_few_different_vectors_are_their_own_codes(rng):
+    vectors = rng.integers(0, 3, size=(500, 4)) / 4.0
+    quantised = quantise(vectors, 2, 9)
+    assert_array_equal(quantised.vectors(), vectors)
+    assert [codes.shape for codes in quantised.codes] == [(9, 2), (9, 2)] and quantised.indices.shape == (500, 2)
+
+
+def test_codes_are_means_of_their_own_and_vectors_take_the_nearest(rng):
+    vectors = np.concatenate(
+        [middle + rng.normal(size=(n, 2)) for n, middle in ((40, 0.0), (40, 50.0), (20, np.array([-60.0, 0.0])))]
+    )
+    codes = fitted_codes(vectors, 3)
+    expected = [vectors[:40].mean(axis=0), vectors[40:80].mean(axis=0), vectors[80:].mean(axis=0)]
+    assert_allclose(codes[np.argsort(codes[:, 0])], np.array(expected)[[2, 0, 1]], rtol=CLOSED_FORM, atol=CLOSED_FORM)
+    quantised = quantise(rng.normal(size=(400, 2)), 2, 16)
+    assert len(quantised.codes[0]) == 16
+
+
+def mse(vectors, width, n_codes):
+    return np.mean((quantise(vectors, width, n_codes).vectors() - vectors) ** 2)
+
+
+def test_sub_vectors_are_cheap_at_high_rates_and_no_better_at_low_ones(rng):
+    """Six independent normal numbers: 384 numbers of codebook either way; then 6 bits a vector either way."""
+    vectors = rng.normal(size=(4000, 6))
+    assert mse(vectors, 2, 64) < 0.2 * mse(vectors, 6, 64)
+    assert mse(vectors, 6, 64) < mse(vectors, 2, 4)
+    errors = [mse(vectors, 2, k) for k in (4, 16, 64, 256)]
+    assert errors == sorted(errors, reverse=True)
+
+
+def test_harmonics_of_few_dimensions_are_recovered(rng):
+    directions, mean = rng.normal(size=(3, 45)), rng.normal(size=45)
+    harmonics = mean + rng.normal(size=(200, 3)) @ directions
+    decoder = fitted_decoder(harmonics, 3)
+    back = decoder.harmonics(features_of(harmonics, decoder))
+    assert np.abs(back - harmonics).max() < 10 * HALF_FLOAT * np.abs(harmonics).max()
+    basis = decoder.directions.astype(np.float64)
+    assert_allclose(basis @ basis.T, np.eye(3), atol=10 * HALF_FLOAT)
+
+
+def test_the_decoder_is_the_best_linear_one(rng):
+    """No other three directions do better: those of random rotations do not, and the error is what is left."""
+    harmonics = rng.normal(size=(500, 8)) * [5, 4, 3, 1, 0.5, 0.4, 0.3, 0.2]
+    decoder = fitted_decoder(harmonics, 3)
+    error = np.sum((decoder.harmonics(features_of(harmonics, decoder)) - harmonics) ** 2)
+    left = np.linalg.svd(harmonics - harmonics.mean(axis=0), compute_uv=False)[3:]
+    assert error == pytest.approx(np.sum(left**2), rel=0.01)
+
+
+# The file
+
+
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("sh_degree", range(4))
+def test_there_and_back(level, sh_degree):
+    gaussians = population(200, sh_degree)
+    content = omg.encode(gaussians, level)
+    back = omg.decode(content, "file")
+    assert omg.encode(gaussians, level) == content
+    assert all(
+        field.shape == other.shape and field.dtype == np.float32 for field, other in zip(back, gaussians, strict=True)
+    )
+    center = np.median(gaussians.means, axis=0)
+    offsets = (gaussians.means - center).astype(np.float16).astype(np.float32)
+    rows = np.lexsort((center + offsets).T)
+    found = np.lexsort(back.means.T)
+    assert_array_equal(back.means[found], (center + offsets)[rows])  # the centres by themselves, whatever their order
+    sizes = omg.LEVELS[level]
+    assert len(np.unique(back.opacity_logits)) <= sizes.opacities
+    for axis in range(3):
+        assert len(np.unique(back.log_scales[:, axis])) <= sizes.scales
+    assert len(np.unique(back.quats[:, :2], axis=0)) <= sizes.rotations
+
+
+def test_each_row_is_the_nearest_that_the_codebooks_have():
+    """With as many codes as rows only half floats are left of the error, row by row."""
+    gaussians = population(60, 1)
+    back = omg.decode(omg.encode(gaussians, 0), "file")
+    order = omg.order_of(gaussians)
+    ours = Gaussians(*(field[order] for field in gaussians))
+    for name in ("log_scales", "opacity_logits", "sh_dc", "sh_rest"):
+        field, other = getattr(ours, name), getattr(back, name)
+        assert np.abs(field - other).max() < 10 * HALF_FLOAT * np.abs(field).max(), name
+    quats = ours.quats / np.linalg.norm(ours.quats, axis=1, keepdims=True)
+    signs = np.where(quats[:, :1] < 0, -1, 1)
+    assert np.abs(quats * signs - back.quats).max() < HALF_FLOAT
+
+
+def test_sizes_fall_level_by_level():
+    gaussians = population(3000)
+    sizes = [len(omg.encode(gaussians, level)) for level in LEVELS]
+    assert sizes == sorted(sizes, reverse=True) and sizes[-1] < 12 * 3000
+
+
+@pytest.mark.parametrize("n", [0, 1, 2])
+def test_hardly_any_gaussians(n):
+    for level in LEVELS:
+        assert len(omg.decode(omg.encode(population(n), level), "file").means) == n
+
+
+def test_no_rotation_becomes_zero():
+    """Half turns have w = x = 0, and the mean of opposite y, z may be zero: so w keeps a trace."""
+    gaussians = population(40, 0)
+    gaussians.quats[:] = [0, 0, 1, 1]
+    gaussians.quats[::2] = [0, 0, -1, -1]
+    for level in LEVELS:
+        back = omg.decode(omg.encode(gaussians, level), "file")
+        assert_array_equal(back.quats[:, :2], np.tile([omg.LEAST_QUAT, 0.0], (40, 1)))
+
+
+def test_what_half_floats_do_not_reach():
+    gaussians = population(10)
+    gaussians.means[3, 0] = 1e6
+    with pytest.raises(InputError, match=r"means reach 1e\+06, and half floats 65504: choose another format"):
+        omg.encode(gaussians, 2)
+
+
+# Files that lie
+
+
+def refused(content):
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError) as caught:
+            omg.decode(content, "lie.omg")
+        assert tracemalloc.get_traced_memory()[1] < FEW_BYTES
+    finally:
+        tracemalloc.stop()
+    assert str(caught.value).startswith("lie.omg")
+    return str(caught.value)
+
+
+def with_header(content, **changes):
+    length = struct.unpack("<I", content[6:10])[0]
+    text = json.dumps(json.loads(content[10 : 10 + length]) | changes).encode()
+    return content[:6] + struct.pack("<I", len(text)) + text + content[10 + length :]
+
+
+def test_files_that_lie():
+    content = omg.encode(population(20), 2)
+    for length in (0, 4, 9, 30, len(content) // 2, len(content) - 1):
+        refused(content[:length])
+    assert "OMG of version 9" in refused(content[:4] + struct.pack("<H", 9) + content[6:])
+    assert "not a OMG file" in refused(b"MSZ\n" + content[4:])
+    assert "would take" in refused(with_header(content, n=2**31 - 1))
+    codes = {"scales": [2**16] * 3, "rotations": [2**16] * 2, "opacities": [2**16], "appearance": [2**16] * 3}
+    lies = [{"n": 2**31}, {"n": -1}, {"center": [1, 2]}, {"center": ["a", 0.0, 0.0]}, {"codes": {}}, {"n_features": 45}]
+    for lie in [*lies, {"planes": {"means": 1}}, {"sh_degree": 4}, {"codes": codes | {"scales": [-1, 2, 3]}}]:
+        assert "does not describe Gaussians" in refused(with_header(content, **lie))
+    assert "damaged" in refused(with_header(content, codes=codes))
+    assert "codebook" in refused(with_one_code(content))
+
+
+def with_one_code(content):
+    """A file whose codebook of opacities has lost all its codes but one."""
+    packed = omg.take_apart(omg.CONTAINER, content, "")
+    header = {name: value for name, value in packed.header.items() if name != "streams"}
+    header["codes"] = header["codes"] | {"opacities": [1]}
+    zstandard = pytest.importorskip("zstandard")
+    streams = {name: zstandard.ZstdDecompressor().decompress(frame) for name, frame in packed.frames.items()}
+    streams["opacities codes"] = streams["opacities codes"][:2]
+    return omg.pack(omg.CONTAINER, header, streams)
+
+
+def test_damaged_anywhere(rng):
+    content = omg.encode(population(20), 2)
+    n_refused = 0
+    for place in rng.integers(0, len(content), size=200):
+        damaged = bytearray(content)
+        damaged[place] ^= 1 << int(rng.integers(8))
+        try:
+            back = omg.decode(bytes(damaged), "lie.omg")
+        except InputError:
+            n_refused += 1
+        else:
+            assert all(np.isfinite(field).all() for field in back)
+    assert n_refused > 150
+
+
+# The command line
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """A scene, and a run of recipe omg on it."""
+    root = tmp_path_factory.mktemp("omg")
+    settings = {"n_views": 6, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
+    write_scene(make_scene("room", supersampling=1, **settings), root / "nook", settings)
+    options = ["--recipe", "omg", "--iterations", "60", "--test-every", "4", "--out", str(root / "run")]
+    assert main(["train", str(root / "nook"), *options, "--set", "distinct_mass=0.9"]) == 0
+    return root / "nook", root / "run"
+
+
+def test_train_convert_draw_and_measure(folders, tmp_path, capsys):
+    _, run = folders
+    events = [json.loads(line) for line in (run / "events.jsonl").read_text().splitlines()]
+    assert any("prune_indistinct" in json.dumps(event) for event in events)
+    out = tmp_path / "a.omg"
+    assert main(["convert", str(run), str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "level: 2 of 4" in printed and "features: 3 for the higher harmonics" in printed
+    assert find_format(out) is omg.OMG_FILE
+    assert main(["convert", str(out), str(tmp_path / "a.ply")]) == 0
+    assert len(load_ply(tmp_path / "a.ply").means) == len(load_ply(run / "point_cloud.ply").means)
+    assert main(["render", str(out), "--cameras", str(run / "cameras.json"), "--out", str(tmp_path / "views")]) == 0
+    assert main(["eval", str(run), "--model", str(out), "--out", str(tmp_path / "eval")]) == 0
+    assert main(["info", str(out)]) == 0
+    assert "codes" in capsys.readouterr().out
+
+
+def test_study(folders, tmp_path, capsys):
+    nook, run = folders
+    options = ["--fine-tune", "3", "--out", str(tmp_path / "out")]
+    assert main(["study", "omg/distinctiveness", str(nook), "--ply", str(run / "point_cloud.ply"), *options]) == 0
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    rows = result["runs"][0]
+    assert [row["kept"] for row in rows] == ["all", *("50 %",) * 2, *("25 %",) * 2, *("12.5 %",) * 2]
+    counts = [row["n_gaussians"] for row in rows]
+    assert counts == sorted(counts, reverse=True) and counts[1] == counts[2] < counts[0]
+    losses = {field: of_seeds[0] for field, of_seeds in result["losses"].items()}
+    assert set(losses) == set(Gaussians._fields) and all(len(of_levels) == 5 for of_levels in losses.values())
+    assert abs(losses["means"][0]) < 0.05  # half floats of a room of some metres, in pictures of 32 x 24
+    assert (tmp_path / "out" / "figure.png").stat().st_size > 10_000
+    assert "textured half" in capsys.readouterr().out
+
+
+def test_the_flatter_half_is_half():
+    """Of a picture whose right half is a ramp; of one that is flat everywhere, too."""
+    pixels = np.zeros((4, 8, 3), np.uint8)
+    pixels[:, 4:] = 20 * np.arange(1, 5)[None, :, None]
+    assert_array_equal(study.flatter_half(pixels)[:, :3], True)
+    assert_array_equal(study.flatter_half(pixels)[:, 5:], False)
+    assert np.count_nonzero(study.flatter_half(np.zeros((4, 8, 3)))) == 16
