@@ -8,7 +8,8 @@ cell whose output depends on more says so by a tag:
     Another processor rounds differently, and hundreds of training steps make that visible. Numbers are left out of
     the comparison, and pictures have more room.
 ``clock``
-    Its output is a time. It runs, and what it shows is stored, but only the kinds of outputs are compared.
+    Its output is a time, or depends on what is installed. It runs, and what it shows is stored, but only the kinds of
+    its outputs are compared.
 
 Solutions of exercises are blocks of Python in markdown. They are run too, after the last cell, and an error in one is
 an error of the notebook.

@@ -16,19 +16,13 @@
 # %% [markdown]
 # # 12 How a gradient check lies
 #
-# A gradient is checked by moving a parameter and looking at what the image does. It sounds too simple to go wrong, and
-# it goes wrong in both directions: right gradients look wrong, and wrong ones pass. This notebook shows five ways, with
-# errors that were found in real renderers, and what `minisplat-ref oracle gradients` does about each.
+# A gradient is checked by moving a parameter and looking at what the image does. That sounds too simple to go wrong,
+# and it goes wrong in both directions: right gradients look wrong, and wrong ones pass. This notebook shows five ways,
+# with errors that were found in real renderers, and what `minisplat-ref oracle gradients` does about each.
 #
-# | file | what it holds |
-# |---|---|
-# | `minisplat_ref/oracle/differences.py` | stencils, the refusal to cross a threshold, Jacobians block by block |
-# | `minisplat_ref/oracle/stages.py`, `setting.py` | every stage as a function with its gradient, and a scene for them |
-# | `minisplat_ref/oracle/planted.py` | backends that are wrong in one formula, on purpose |
-# | `minisplat_ref/oracle/gradients.py` | the whole proof, and what does not count as one |
-#
-# **Frames and units:** means are in the world frame, positions in the image in pixels. `v_x` is the derivative of the
-# loss by `x`. Everything here is float64 and runs on the NumPy reference.
+# The first picture shows the reason for most of them: **the image jumps**. A hit whose alpha is below 1/255 is skipped.
+# So when a Gaussian moves, pixels at its rim switch on and off, and each of them changes by up to 1/255 **at once**.
+# Below are 12 Gaussians; one of them moves to the right, and the loss is a fixed random weighting of the image.
 
 # %%
 import matplotlib.pyplot as plt
@@ -55,13 +49,6 @@ from minisplat_ref.oracle.setting import Setting, make_setting
 from minisplat_ref.oracle.stages import composite_stage, project_stage, render_stage, sh_stage
 from minisplat_ref.oracle.tolerances import GRADIENT_REL, GRADIENT_REL_NEAR_THRESHOLD
 from minisplat_ref.types import Camera, Gaussians
-
-# %% [markdown]
-# ## The image jumps
-#
-# A hit whose alpha is below 1/255 is skipped. So when a Gaussian moves, pixels at its rim switch on and off, and every
-# pixel behind them changes by up to 1/255 **at once**. Below, 12 Gaussians; one of them moves to the right, and the
-# loss is a fixed random weighting of the image.
 
 # %%
 rng = np.random.default_rng(4)
@@ -106,7 +93,7 @@ wide_losses, wide_hits = np.array([loss_and_hits(x) for x in wide]).T
 narrow_losses, _ = np.array([loss_and_hits(x) for x in narrow]).T
 jump = loss_and_hits(high)[0] - loss_and_hits(low)[0]
 
-figure, axes = plt.subplots(1, 3, figsize=(12, 3.2), width_ratios=(1, 1.3, 1.3))
+figure, axes = plt.subplots(1, 3, figsize=(11, 3), width_ratios=(1, 1.3, 1.3))
 axes[0].imshow(np.clip(image[:, :, :3], 0, 1), interpolation="nearest")
 axes[0].set(title="the scene", xticks=[], yticks=[])
 axes[1].plot(wide, wide_losses, color=BLUE)
@@ -121,12 +108,24 @@ plt.show()
 print(f"{len(np.unique(wide_hits)) - 1} changes of the hit count on the way; the one on the right is {jump:.1e} high")
 
 # %% [markdown]
-# A difference quotient that spans such a jump is not an approximation of anything. It is off by *jump / 2h*, more the
-# smaller the step. On the left of the next figure the Gaussian stands $3 \cdot 10^{-6}$ from the threshold: large steps
-# all lie. The right gradient would be called wrong by a check that cannot know why.
+# | file | what it holds |
+# |---|---|
+# | `minisplat_ref/oracle/differences.py` | stencils, the refusal to cross a threshold, Jacobians block by block |
+# | `minisplat_ref/oracle/stages.py`, `setting.py` | every stage as a function with its gradient, and a scene for them |
+# | `minisplat_ref/oracle/planted.py` | backends that are wrong in one formula, on purpose |
+# | `minisplat_ref/oracle/gradients.py` | the whole proof, and what does not count as one |
+#
+# **Frames and units:** means are in the world frame, positions in the image in pixels. `v_x` is the derivative of the
+# loss with respect to `x`. Everything here is float64 and runs on the NumPy reference.
+#
+# ## A step across a jump
+#
+# A difference quotient that spans such a jump approximates nothing. It is off by *jump / 2h*, and the smaller the step,
+# the more. On the left of the next figure the Gaussian stands $3 \cdot 10^{-6}$ from the threshold: every larger step
+# gives a wrong slope. A check that does not know this calls the right gradient wrong.
 #
 # The oracle's functions return, beside their outputs, **on which side of every threshold** each value lies: which
-# Gaussians are in which list, which hits are blended or clamped, which slopes the Jacobian follows. A stencil whose
+# Gaussians are in which list, which hits are blended or clamped, which slopes the Jacobian clamps. A stencil whose
 # points disagree is refused, and a smaller step is tried.
 
 # %%
@@ -155,7 +154,7 @@ for k, h in enumerate(steps):
 careful, used = careful_derivative(stage.function, near, 0, to_the_right)
 careful_error = abs(inner(weights, careful) / true_slope - 1)
 
-figure, axes = plt.subplots(1, 2, figsize=(12, 3.6))
+figure, axes = plt.subplots(1, 2, figsize=(11, 3.4))
 axes[0].loglog(steps[~refused], blind_errors[~refused], ".", color=GREEN, label="one side")
 axes[0].loglog(steps[refused], blind_errors[refused], "x", color=RED, label="refused: a hit switches on")
 axes[0].loglog(
@@ -184,7 +183,7 @@ for label, stencil in (("two points", CENTRAL), ("six points", SIXTH_ORDER)):
 for (label, errors), color in zip(curves.items(), (RED, BLUE), strict=True):
     axes[1].loglog(smooth_steps, errors, color=color, label=label)
 axes[1].axhline(GRADIENT_REL, color=GREY, linewidth=1)
-axes[1].annotate("what the oracle asks for", (2e-13, 1.4e-8), color=GREY)
+axes[1].annotate("what the oracle asks for", (2e-13, 1.8e-9), color=GREY)
 axes[1].axvline(STEPS[0], color=YELLOW, linewidth=1, label="the oracle's first step")
 axes[1].set(title="without thresholds", xlabel="step h", ylabel="relative error of the quotient")
 axes[1].legend()
@@ -193,11 +192,11 @@ plt.show()
 # %% [markdown]
 # ## A step too large, a step too small
 #
-# On the right: without thresholds there are two errors left. **Truncation** falls with the step, as $h^2$ for two
-# points and as $h^6$ for six. **Rounding** grows as $10^{-16} / h$. Two points leave a narrow valley, and its floor is
-# where a tight tolerance would have to be; six points leave a wide one, several digits deeper. A tolerance of
-# $10^{-3}$, which is what a single-precision check can afford, would let every error pass that is small in the
-# direction one happens to look.
+# On the right there is no threshold, and two errors are left. **Truncation** falls with the step, as $h^2$ for two
+# points and as $h^6$ for six. **Rounding** grows as $10^{-16} / h$. Two points leave a narrow valley whose floor is
+# where a tight tolerance would have to be. Six points leave a wide one, several digits deeper. A tolerance of
+# $10^{-3}$, which is what a check in single precision can afford, lets every error pass that happens to be small in the
+# direction of the check.
 
 # %%
 show_code(derivative)
@@ -205,8 +204,9 @@ show_code(derivative)
 # %% [markdown]
 # ## Nothing is easy to get right
 #
-# The commonest way to pass: there is nothing to check. Three scenes, and for each the gradient of `transposed-rs`, an
-# error that a released renderer has, compared as `allclose(analytic, numeric, rtol=1e-3, atol=1e-6)`.
+# The most common way to pass a check is that there is nothing to check. Here are three scenes, and for each the
+# gradient of `transposed-rs`, an error that a released renderer has, compared with
+# `allclose(analytic, numeric, rtol=1e-3, atol=1e-6)`.
 
 # %%
 small = tiny_setting()
@@ -239,17 +239,17 @@ for name, (_, case) in vacuous.items():
     print(f"{name:22} the oracle: {'passed' if case.passed else 'FAILED'}, {case.note[:88]}")
 
 # %% [markdown]
-# Zero equals zero. The oracle therefore fails a check in which a gradient is zero altogether or the image is all but
-# empty, and says which.
+# Zero equals zero. So the oracle fails a check in which a whole gradient is zero or the image is all but empty, and
+# says which.
 #
 # ## A direction that cancels
 #
-# Instead of every entry one can check one random direction at a time, $\langle v, \mathrm{d}f(d) \rangle = \langle g, d
-# \rangle$. Below, 400 directions for the quaternions: with the right gradient, and with one in which a single
-# Gaussian's part is 1 % off. The two sides are compared relative to $\langle g, d \rangle$, as one would, and relative
-# to the sum of the sizes of its terms, $\sum |g_i d_i|$.
+# Instead of every entry one can check one random direction at a time,
+# $\langle v, \mathrm{d}f(d) \rangle = \langle g, d \rangle$. Below are 400 directions for the quaternions: with the
+# right gradient, and with one in which the part of a single Gaussian is off by 1 %. The two sides are compared relative
+# to $\langle g, d \rangle$, as is usual, and relative to the sum of the sizes of its terms, $\sum |g_i d_i|$.
 
-# %%
+# %% tags=["rounding"]
 index = names.index("quats")
 gradient = stage.vjp(*weights)[index]
 tainted = gradient.copy()
@@ -267,7 +267,7 @@ for label, g in (("right", gradient), ("one of 12 Gaussians 1 % off", tainted)):
     relative[label] = differences / np.abs(np.tensordot(directions, g, 2))
     by_terms[label] = differences / np.tensordot(np.abs(directions), np.abs(g), 2)
 
-figure, axes = plt.subplots(1, 2, figsize=(12, 3.2), sharey=True)
+figure, axes = plt.subplots(1, 2, figsize=(11, 3.1), sharey=True)
 titles = "relative to <g, d>", "relative to its terms"
 for axis, results, title in zip(axes, (relative, by_terms), titles, strict=True):
     for (label, values), color in zip(results.items(), (GREEN, RED), strict=True):
@@ -276,7 +276,7 @@ for axis, results, title in zip(axes, (relative, by_terms), titles, strict=True)
     axis.axvline(np.log10(GRADIENT_REL), color=BLUE, linewidth=1, label="the oracle's tolerance")
     axis.set(title=title, xlabel="log10 of the discrepancy", ylabel="directions")
 axes[0].set_ylim(0, 1.45 * axes[0].get_ylim()[1])
-axes[0].legend(ncols=2, loc="upper right")
+axes[0].legend(ncols=2, loc="upper right", frameon=True, framealpha=1, edgecolor="none")
 plt.show()
 passes_lazily = np.mean(relative["one of 12 Gaussians 1 % off"] < 1e-3)
 print(f"the wrong gradient passes at rtol = 1e-3 in {100 * passes_lazily:.0f} % of the directions")
@@ -284,19 +284,19 @@ gap = by_terms["one of 12 Gaussians 1 % off"].min() / by_terms["right"].max()
 print(f"relative to the terms, right and wrong are apart by a factor of at least {gap:.0f}")
 
 # %% [markdown]
-# A tolerance of $10^{-3}$ cannot see one Gaussian in 12. Relative to $\langle g, d \rangle$ the right gradient has a
-# tail towards large errors, too, where the direction happens to cancel; judged by its terms it has none. With both a
-# tight tolerance and the right scale the two are worlds apart.
+# A tolerance of $10^{-3}$ does not notice one Gaussian in 12. Relative to $\langle g, d \rangle$ the right gradient,
+# too, has a tail of large errors, where the direction happens to cancel; relative to its terms it has none. With a
+# tight tolerance and the right scale, right and wrong are far apart.
 #
 # ## A scene that is too nice
 #
-# The last lie is the scene. Below, every planted error of a gradient against three checks:
+# The last lie is the scene. Below is every planted error of a gradient against three checks:
 #
 # * **lazy**: one random direction for each trained parameter, two points, 1 % tolerance, the sum of the image as the
 #   loss; round Gaussians with unit quaternions, an untilted camera, a black background, SH degree 0, no alpha near its
 #   clamp. Each of these choices is natural, and each hides something.
-# * **inner products** of the whole render, and the **full Jacobian** of the stage that was changed, both as in `oracle
-#   gradients`, on a scene in which every branch is taken.
+# * **inner products** of the whole render, and the **full Jacobian** of the stage that was changed, both as in
+#   `oracle gradients`, on a scene in which every branch is taken.
 
 # %%
 n = 4
@@ -370,25 +370,99 @@ axis.set_ylabel("errors of forward formulas      errors of gradients")
 plt.show()
 
 # %% [markdown]
-# The lazy check passes all of them. Round Gaussians have no orientation, so nothing about quaternions can be wrong; a
-# black background cannot be forgotten; without a depth channel no gradient comes through the depths.
+# All of them pass the lazy check. Round Gaussians have no orientation, so nothing about quaternions can be wrong;
+# nobody notices a forgotten background that is black; without a depth channel no gradient comes through the depths.
 #
-# Below the second line stand errors of **forward** formulas, planted together with their own derivatives: such a
-# gradient is right for what is computed. No gradient check will ever find them, however good it is. (Where the clamp of
-# 0.999 is found, a stencil crossed a stop that the profile does not have there.) They are found by comparison with
-# another derivation, which is what `oracle compare` and notebook 13 are about.
+# Below the second line are errors of **forward** formulas, planted together with their own derivatives: such a gradient
+# is right for what is computed. No gradient check can ever find them, however good it is. (Where the clamp of 0.999 is
+# found, a stencil crossed a stop that the profile does not have there.) A comparison with another derivation finds
+# them, which is what `oracle compare` and notebook 13 are about.
 #
 # ## And how is the checker checked?
 #
-# By errors that nobody chose. `tests/test_oracle_planted.py` walks the syntax trees of the reference's gradients,
+# With errors that nobody chose. `tests/test_oracle_planted.py` walks the syntax trees of the reference's gradients,
 # changes one sign, factor, transpose, condition or index order at a time, runs the copy, and demands that its stage
-# fails. What survives has to be listed with the reason why it changes nothing: the length of a quaternion, the
+# fails. Each change that survives is listed with the reason why it changes nothing: the length of a quaternion, the
 # transpose of a symmetric matrix, half of infinity.
 #
-# ## What was shown
+# ## Play
+#
+# Choose one of the planted errors and a step. What to look for:
+#
+# * `error_name`: the errors whose `is_forward` is true have a right gradient; which are they?
+# * `step`: at 1e-2 even the right gradient looks wrong, at 1e-12 too. Which error needs the best step to be seen?
 
 # %%
-# Thresholds: the quotient across one is wrong by jump / 2h, is refused, and a smaller step is right.
+error_name, step = "half-off-diagonal", 1e-5
+print("choose from:", ", ".join(error.name for error in PLANTED))
+
+gaps = {}
+for label, backend in (("right", REFERENCE), (error_name, planted(error_name, REFERENCE))):
+    mine = render_stage(backend, branches)
+
+    def unguarded(*arrays, function=mine.function):
+        return Point(function(*arrays).outputs)
+
+    arrays, my_rng = list(mine.inputs.values()), np.random.default_rng(3)
+    v = [my_rng.normal(size=y.shape) for y in mine.function(*arrays).outputs]
+    for k, (name, g) in enumerate(zip(mine.inputs, mine.vjp(*v), strict=True)):
+        d = my_rng.uniform(-1, 1, g.shape)
+        slope = inner(v, derivative(unguarded, arrays, k, d, step, CENTRAL))
+        gaps[label, name] = abs(slope - np.vdot(g, d)) / max(np.abs(g * d).sum(), 1e-30) + 1e-16
+
+figure, axis = plt.subplots(figsize=(8, 2.8))
+for offset, (label, color) in zip((-0.2, 0.2), (("right", BLUE), (error_name, RED)), strict=True):
+    heights = [gaps[label, name] for name in mine.inputs]
+    axis.bar(np.arange(len(mine.inputs)) + offset, heights, 0.38, color=color)
+axis.set(yscale="log", ylabel="relative to the terms", title=f"two points, step {step:g}; red: {error_name}")
+axis.set_xticks(range(len(mine.inputs)), mine.inputs, rotation=20)
+plt.show()
+
+# %% [markdown]
+# ## Exercises
+#
+# **1.** With which step $h$ are two points best, if the function has a third derivative $f'''$ and is known to a
+# relative error $\epsilon$? What remains as the error in float64 and in float32?
+#
+# <details>
+# <summary>Solution</summary>
+#
+# The error is about $h^2 |f'''| / 6 + \epsilon |f| / h$. It is smallest at $h \approx \epsilon^{1/3}$ and is then about
+# $\epsilon^{2/3}$: $10^{-11}$ in float64, and $10^{-5}$ at best in float32. The figure above has its two-point valley
+# there.
+#
+# ```python
+# steps_1d = np.logspace(-12, -1, 200)
+# slopes = (np.exp(1 + steps_1d) - np.exp(1 - steps_1d)) / (2 * steps_1d)
+# best = steps_1d[np.argmin(np.abs(slopes - np.e))]
+# assert 1e-7 < best < 1e-3  # the cube root of 1e-16 is 5e-6
+# ```
+#
+# </details>
+#
+# **2.** A cosine between the right and a wrong gradient is 0.999. Is the wrong one good enough? Construct one of cosine
+# 0.999 that has the wrong sign for one parameter of twenty.
+#
+# <details>
+# <summary>Solution</summary>
+#
+# Let the entries be of very different sizes, as they are for means, scales and colours: the small ones hardly enter the
+# cosine. With entries of size 1 and a single one of size 0.02, its sign changes the cosine by less than $10^{-4}$, and
+# this parameter moves away from its optimum for ever. Compare parameter by parameter.
+#
+# ```python
+# right_one = np.append(np.ones(19), 0.02)
+# wrong_one = np.append(np.ones(19), -0.02)
+# assert right_one @ wrong_one / np.linalg.norm(right_one) / np.linalg.norm(wrong_one) > 0.999
+# ```
+#
+# </details>
+
+# %% [markdown]
+# ## What was shown, checked
+
+# %%
+# Thresholds: the quotient across one is wrong by jump / 2h and is refused, and a smaller step is right.
 assert abs(jump) > 1e-5 and len(np.unique(wide_hits)) > 3
 far_off = refused & (steps < 1e-4)
 assert np.allclose(blind_errors[far_off] * 2 * steps[far_off], abs(jump / true_slope), rtol=0.05)
@@ -406,12 +480,12 @@ assert [passes for passes, _ in vacuous.values()] == [True, True, False]
 assert not any(case.passed for _, case in vacuous.values())
 assert "nothing was checked" in vacuous["opacities of 1e-4"][1].note
 
-# Cancelling: no tolerance between right and wrong without the right scale, a wide gap with it.
+# Cancelling: no tolerance separates right from wrong without the right scale; with it the gap is wide.
 assert passes_lazily > 0.5
 assert by_terms["right"].max() < GRADIENT_REL < by_terms["one of 12 Gaussians 1 % off"].min()
 assert by_terms["right"].max() * 10 < relative["right"].max()
 
-# Planted: the lazy check finds none, inner products and full Jacobians each error of a gradient.
+# Planted: the lazy check finds none, inner products and full Jacobians find each error of a gradient.
 assert found["no error"] == (False, False, False)
 for error in gradient_errors:
     assert found[error.name] == (False, True, True), error.name

@@ -16,19 +16,14 @@
 # %% [markdown]
 # # 13 Comparing a backend with the oracle
 #
-# You have written a renderer, or somebody gave you one. Its pictures look right. Training is slow to converge, and you
+# You have written a renderer, or you were given one. Its pictures look right. Training converges slowly, and you
 # suspect a gradient: which one? This notebook finds out. It puts renderers beside the float64 reference, stage by
-# stage, and explains five disagreements that were measured between renderers which people use.
+# stage, and explains five disagreements that were measured between renderers in use.
 #
-# | file | what it holds |
-# |---|---|
-# | `minisplat_ref/oracle/golden/` | scenes with the input, output and gradient of every stage |
-# | `minisplat_ref/oracle/comparison/` | the comparison, and what can be compared |
-# | `minisplat_ref/oracle/thresholds.py` | pixels at which rounding decides whether a hit counts |
-# | `minisplat_ref/oracle/planted.py` | copies of our own renderer with one error each |
-#
-# On a command line the same is `minisplat-ref oracle compare BACKEND`. **Frames and units:** image positions in pixels,
-# `v_x` is dLoss/dx and has the shape of x; errors are parts of the largest value of an array unless a unit is given.
+# Below is a scene of 250 Gaussians, rendered by the reference and by a suspect. The images agree to the last digits.
+# Then come the gradients of the same random loss: with respect to the Gaussians' positions, as arrows in the image, and
+# with respect to their three scales. The suspect's arrows (thin, red) lie on those of the reference. Its scale
+# gradients are off the diagonal.
 
 # %%
 import json
@@ -37,9 +32,8 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.patches import Ellipse
 
-from figures import BLUE, GREEN, GREY, RED, show
+from figures import BLUE, GREEN, GREY, RED, draw_ellipses, show
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN
 from minisplat_ref.errors import InputError
@@ -58,7 +52,7 @@ from minisplat_ref.oracle.golden.scenes import Recipe, inputs, truth
 from minisplat_ref.oracle.planted import planted
 
 
-def show_error(axes, given, expected, title, lowest=-16):
+def show_digits(axes, given, expected, title, lowest=-16):
     """Show the largest error of a pixel's channels, in powers of ten; black is no more than 10^lowest."""
     error = np.abs(given - expected).reshape(*given.shape[:2], -1).max(axis=2)
     return show(axes, np.log10(np.maximum(error, 1e-17)), title, cmap="magma", vmin=lowest, vmax=0)
@@ -80,13 +74,6 @@ def cosine(a, b):
     return float(np.vdot(a, b) / np.sqrt(np.vdot(a, a) * np.vdot(b, b)))
 
 
-# %% [markdown]
-# ## The same picture, another gradient
-#
-# A scene of 250 Gaussians, drawn by the reference and by a suspect. The images agree to the last digits. Then the
-# gradients of the same random loss: by the Gaussians' positions, seen in the image plane as arrows, and by their three
-# scales. The suspect's arrows (thin, red) lie on those of the reference. Its scale gradients are not on the diagonal.
-
 # %%
 RECIPE = Recipe("picture", "250 Gaussians to look at", GSPLAT_MAIN, (96, 64), sh_degree=2, scales=(0.03, 0.3), n=250)
 scene = truth(inputs(RECIPE))
@@ -99,9 +86,9 @@ directions = {}  # the gradient by the position, turned into the camera's axes: 
 for name, v_means in (("reference", a["v_means"]), ("suspect", suspected["v_means"])):
     directions[name] = v_means[shown] @ scene.camera.cam_from_world_R.T
 
-figure, axes = plt.subplots(1, 4, figsize=(13, 2.9), width_ratios=(1.2, 1.2, 1.2, 1))
+figure, axes = plt.subplots(1, 4, figsize=(11, 2.6), width_ratios=(1.2, 1.2, 1.2, 1))
 show(axes[0], a["image"], "reference")
-shown_error = show_error(axes[1], suspected["image"], a["image"], "error of the suspect's image")
+shown_error = show_digits(axes[1], suspected["image"], a["image"], "error of the suspect's image")
 figure.colorbar(shown_error, ax=axes[1], label="log10")
 show(axes[2], 0.35 * a["image"] + 0.65, "gradient by the positions")
 largest = np.argsort(-np.linalg.norm(directions["reference"][:, :2], axis=1))[5:60]
@@ -122,37 +109,48 @@ cosines = {name: cosine(suspected[name], a[name]) for name in names}
 print("cosine with the true gradient:", ", ".join(f"{name} {value:.3f}" for name, value in cosines.items()))
 
 # %% [markdown]
-# Opacities and colours are right, positions nearly so, scales and rotations are not. An optimiser such as Adam
-# still makes progress with them, so nothing fails; it is only worse. A look at the end result cannot say where the
-# error is, since everything that passes through the covariance is off.
+# Opacities and colours are right, positions nearly so, scales and rotations are not. An optimiser such as Adam still
+# makes progress with them, so nothing fails; it is only worse. The final gradients cannot say where the error is,
+# because everything that passes through the covariance is off.
+#
+# | file | what it holds |
+# |---|---|
+# | `minisplat_ref/oracle/golden/` | scenes with the input, output and gradient of every stage |
+# | `minisplat_ref/oracle/comparison/` | the comparison, and what can be compared |
+# | `minisplat_ref/oracle/thresholds.py` | pixels at which rounding decides whether a hit counts |
+# | `minisplat_ref/oracle/planted.py` | copies of our own renderer with one error each |
+#
+# On the command line, `minisplat-ref oracle compare BACKEND` does the same. **Frames and units:** image positions in
+# pixels; `v_x` is dLoss/dx and has the shape of x; errors are relative to the largest value of an array unless a unit
+# is given.
 #
 # ## Feed every stage with the truth
 #
 # So do not run the suspect from end to end. Give each of its stages the *reference's* input of that stage, and compare
-# what comes out. An error then stays where it arose.
+# the result. An error then stays where it arose.
 
 # %%
 half = table(compare_scene(from_backend(suspect, "float64"), scene))
 
 # %% [markdown]
-# The last two lines say the same again: further channels go through the same function, and the view is the whole
-# renderer in one call, which nothing can be fed to. So it is one stage, one column, one factor: the middle entry of the
-# conic's gradient is half of what it should be. A conic stands for
-# $\sigma = \tfrac12 (a\, dx^2 + 2 b\, dx\, dy + c\, dy^2)$, so
+# The last two lines repeat the first: further channels go through the same function, and the view is the whole renderer
+# in one call, whose stages cannot be fed. So it is one stage, one column, one factor: the middle entry of the conic's
+# gradient is half of what it should be. A conic means $\sigma = \tfrac12 (a\, dx^2 + 2 b\, dx\, dy + c\, dy^2)$, so
 #
 # $$ \frac{\partial \sigma}{\partial a} = \tfrac12 dx^2, \qquad \frac{\partial \sigma}{\partial b} = dx\, dy, \qquad
 #    \frac{\partial \sigma}{\partial c} = \tfrac12 dy^2 . $$
 #
-# The halves belong to $a$ and $c$ only. Whoever thinks of $b$ as *one of the two* off-diagonal entries of the matrix
-# gets $\tfrac12 dx\,dy$, which is right if the next function adds both entries, and wrong if it takes $b$ once.
+# Only $a$ and $c$ have the factor $\tfrac12$. If $b$ is understood as *one of the two* off-diagonal entries of the
+# matrix, its derivative is $\tfrac12 dx\,dy$, which is right if the next function adds both entries, and wrong if it
+# takes $b$ once.
 #
 # **This is a real one.** The CPU rasteriser of OpenSplat 1.2.0 multiplies this entry by 0.5 and hands it to autograd,
 # which takes $b$ once. gsplat had the same factor and removed it in March 2024. Without the factor OpenSplat's
 # gradients are right.
 #
-# **Checked against a definition** rather than against another formula: move the $b$ of single Gaussians and look at the
-# loss of the composited image. On the right, the same gradient as an arrow for each of the larger Gaussians, scaled to
-# one length: how each wants to change its shape. The suspect's are flattened.
+# **Checked against the definition** rather than against another formula: change the $b$ of single Gaussians and look at
+# the loss of the composited image. On the right is the same gradient as an arrow for each of the larger Gaussians,
+# scaled to one length: how each ellipse wants to change. The suspect's arrows are flattened.
 
 # %%
 STEP = 1e-7
@@ -175,7 +173,7 @@ for row in rows:
     differences.append((sides[0] - sides[1]) / (2 * STEP))
 staged = run_stages(suspect, scene, "float64", fed=scene.arrays)
 
-figure, axes = plt.subplots(1, 3, figsize=(13, 2.9), width_ratios=(1.1, 1, 1.2))
+figure, axes = plt.subplots(1, 3, figsize=(11, 2.8), width_ratios=(1.1, 1, 1.2))
 place = np.arange(len(rows))
 for offset, values, color, label in (
     (-0.25, differences, GREY, "difference of L"),
@@ -185,7 +183,7 @@ for offset, values, color, label in (
     axes[0].bar(place + offset, values, 0.22, color=color, label=label)
 axes[0].axhline(0, color=GREY, linewidth=0.8)
 axes[0].set(
-    title="derivative by b, four Gaussians", xticks=place, xticklabels=[f"row {row}" for row in rows], ylabel="px^2"
+    title="derivative with respect to b", xticks=place, xticklabels=[f"row {row}" for row in rows], ylabel="px^2"
 )
 axes[0].legend(frameon=False)
 factor = staged["v_conics"][shown] / a["v_conics"][shown]
@@ -205,38 +203,29 @@ plt.show()
 # %% [markdown]
 # ## A rotation that is transposed, but only once
 #
-# The second suspect draws wrong pictures, though a camera that looks down the z axis would not tell. The covariance of
-# the projection is $J R\, \Sigma\, R^T J^T$ with the rotation $R$ of the camera; this one takes $R^T$ there, and $R$
-# for the positions, as it should. The ellipses stand at the right places and are turned wrongly. **A real one, too:**
-# the kernels of the trainer 3dgs-warp-scratch do this.
+# The second suspect renders wrong pictures, although a camera without rotation would not show it. The covariance of the
+# projection is $J R\, \Sigma\, R^T J^T$ with the rotation $R$ of the camera. This renderer takes $R^T$ there, and $R$
+# for the positions, as it should. The ellipses are in the right places and are turned wrongly. **A real one, too:** the
+# kernels of the trainer 3dgs-warp-scratch do this.
 
 # %%
 turned = with_planted_error("transposed-view", "float64")
 transposed = run_stages(planted("transposed-view", CPU), scene, "float64")
 
-
-def covariance(conic):
-    """2x2 covariance of a conic (a, b, c)."""
-    return np.linalg.inv([[conic[0], conic[1]], [conic[1], conic[2]]])
-
-
-figure, axes = plt.subplots(1, 4, figsize=(13, 2.6))
+figure, axes = plt.subplots(1, 4, figsize=(11, 2.3))
 show(axes[0], a["image"], "reference")
 show(axes[1], transposed["image"], "view rotation transposed")
-figure.colorbar(show_error(axes[2], transposed["image"], a["image"], "error"), ax=axes[2], label="log10")
-axes[3].set(title="ellipses of one sigma", xlim=(0, 96), ylim=(64, 0), aspect="equal", xticks=[], yticks=[])
+figure.colorbar(show_digits(axes[2], transposed["image"], a["image"], "error"), ax=axes[2], label="log10")
+axes[3].set(title="ellipses", xlim=(0, 96), ylim=(64, 0), aspect="equal", xticks=[], yticks=[])
 for row in np.argsort(-a["radii"].max(axis=1))[10:50]:
     for conics, color in ((a["conics"], BLUE), (transposed["conics"], RED)):
-        values, vectors = np.linalg.eigh(covariance(conics[row]))
-        angle = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
-        size = 2 * np.sqrt(values)
-        axes[3].add_patch(Ellipse(a["means2d"][row], size[1], size[0], angle=angle, fill=False, edgecolor=color))
+        draw_ellipses(axes[3], a["means2d"][row], np.linalg.inv(conics[row][[[0, 1], [1, 2]]]), edgecolor=color)
 plt.show()
 turned_rows = table(compare_scene(turned, scene))
 
 # %% [markdown]
-# The positions agree, the conics do not, and `radii` follow from the same covariance within the projection. Lists,
-# colours and image were fed with the truth, and agree.
+# The positions agree, the conics do not, and `radii` come from the same covariance within the projection. Lists,
+# colours and image were fed with the truth and agree.
 #
 # Why did its author not see it? A camera without rotation is the usual first test, and there the error is zero. At two
 # degrees no pixel is off by more than a few per cent.
@@ -259,23 +248,24 @@ errors = np.array(errors)
 figure, axes = plt.subplots(figsize=(6, 2.6))
 axes.plot(angles, errors[:, 0], "o-", color=RED, markersize=4, label="conics")
 axes.plot(angles, errors[:, 1], "o-", color=BLUE, markersize=4, label="image")
-axes.set(title="error by the angle that the camera is rolled", xlabel="degrees", ylabel="relative error")
+axes.set(title="error against the roll of the camera", xlabel="degrees", ylabel="relative error")
 axes.legend(frameon=False)
 plt.show()
 
 # %% [markdown]
 # ## Differences that are no errors: conventions
 #
-# Two correct renderers may still disagree, because 3DGS has no standard. Three choices, each a profile of ours against
-# the default. The comparison treats them like errors, which is what one wants when a model was trained with one
-# renderer and is drawn by another.
+# Two correct renderers may still disagree, because 3DGS has no standard. Here are three choices, each as a profile
+# against the default. The comparison treats them like errors, which is what you want when a model was trained with one
+# renderer and is rendered by another.
 #
 # * **The clamp of alpha**: 0.99 in the 3DGS code and gsplat 1.6, 0.999 in gsplat 1.5 and OpenSplat.
 # * **The bounds of a Gaussian**: all 16-pixel tiles that a square of 3 sigma touches (3DGS), or where alpha falls below
 #   1/255 (gsplat, Mini-Splatting2): at opacity 1 that is 3.33 sigma, so the square of 3 sigma cuts visible alpha,
 #   and elsewhere it is too large.
-# * **The clamp of the Jacobian**: beyond 1.3 half fields of view the footprint is frozen; counted from the optical axis
-#   (3DGS), or from the edges of the image (gsplat). The same for a centred principal point, and only then.
+# * **The clamp of the Jacobian**: beyond 1.3 half fields of view the slope in the Jacobian is constant, measured from
+#   the optical axis (3DGS) or from the edges of the image (gsplat). Both are the same for a centred principal point,
+#   and only then.
 
 # %%
 off_centre = RECIPE._replace(principal_point=(0.15, 0.9), scales=(0.1, 0.6), spread=1.6)
@@ -285,14 +275,14 @@ choices = {
     "3 sigma, by tiles": (scene, GSPLAT_MAIN._replace(name="3 sigma", has_full_support=False)),
     "symmetric clamp of the Jacobian": (truth(inputs(off_centre)), symmetric),
 }
-figure, axes = plt.subplots(2, 3, figsize=(12, 5))
+figure, axes = plt.subplots(2, 3, figsize=(11, 4.6))
 convention_rows, convention_errors = {}, {}
 for column, (name, (view, conventions)) in zip(axes.T, choices.items(), strict=True):
     other = run_stages(REFERENCE, view._replace(conventions=conventions), "float64")
     convention_errors[name] = np.abs(other["image"] - view.arrays["image"]).max(axis=2)
     show(column[0], view.arrays["image"], f"{name}: reference")
     title = f"error, at most {convention_errors[name].max():.1e}"
-    shown_error = show_error(column[1], other["image"], view.arrays["image"], title, lowest=-7)
+    shown_error = show_digits(column[1], other["image"], view.arrays["image"], title, lowest=-7)
     figure.colorbar(shown_error, ax=column[1], label="log10")
     print(f"--- {name}")
     convention_rows[name] = table(compare_scene(by_profile(conventions, "float64"), view))
@@ -301,11 +291,11 @@ plt.show()
 # %% [markdown]
 # Each is named at the stage where it enters: `T`, `radii`, `conics`. The maps tell them apart as well: the clamp shows
 # in the middle of opaque Gaussians, the bounds at the borders of tiles and the rims of Gaussians, the Jacobian where
-# large Gaussians reach in from outside.
+# large Gaussians reach into the image from outside.
 #
-# **Bounds that differ and change nothing** are not failed. The CPU kernels drop pairs (tile, Gaussian) that no pixel
-# needs. The comparison composites the reference's footprints with the other lists; where the image stays, it
-# says "harmless", and what differs.
+# **Bounds that differ and change nothing** do not fail. The CPU kernels drop pairs (tile, Gaussian) that no pixel
+# needs. The comparison composites the reference's footprints with the other lists. Where the image is the same, it says
+# "harmless", and what differs.
 
 # %%
 harmless = table(compare_scene(from_backend(CPU, "float64"), scene))
@@ -313,12 +303,12 @@ harmless = table(compare_scene(from_backend(CPU, "float64"), scene))
 # %% [markdown]
 # ## Pixels that rounding decides
 #
-# A hit with alpha below 1/255 is skipped, so the image jumps there. If some pixel's alpha is 1/255 to the last digit,
-# one renderer takes the hit and another leaves it, and both are right. Averaged in, one such pixel drowns the
+# A hit with alpha below 1/255 is skipped, so the image jumps there. If the alpha of some pixel is 1/255 to the last
+# digit, one renderer takes the hit and another skips it, and both are right. In an average, one such pixel hides the
 # arithmetic of a million others. Here is one Gaussian whose alpha is 1/255 three pixels from its centre, and two other
-# renderers whose thresholds are not that of the reference in the twelfth digit.
+# renderers whose thresholds differ from that of the reference in the twelfth digit.
 
-# %%
+# %% tags=["rounding"]
 falloff = np.exp(-0.5 * 3**2 / 4)  # covariance 4 px^2, three pixels off
 edge = inputs(Recipe("threshold", "alpha at 1/255", GSPLAT_MAIN, (17, 17), sh_degree=0, n=1))
 R, t, focal = edge.camera.cam_from_world_R, edge.camera.cam_from_world_t, edge.camera.fx
@@ -333,14 +323,14 @@ edge = edge._replace(
     }
 )
 edge = truth(edge)
-strict = GSPLAT_MAIN._replace(name="a trifle stricter", alpha_min=GSPLAT_MAIN.alpha_min * (1 + 1e-12))
-looser = GSPLAT_MAIN._replace(name="a trifle looser", alpha_min=GSPLAT_MAIN.alpha_min * (1 - 1e-12))
+strict = GSPLAT_MAIN._replace(name="slightly stricter", alpha_min=GSPLAT_MAIN.alpha_min * (1 + 1e-12))
+looser = GSPLAT_MAIN._replace(name="slightly looser", alpha_min=GSPLAT_MAIN.alpha_min * (1 - 1e-12))
 figure, axes = plt.subplots(1, 3, figsize=(11, 3))
 show(axes[0], 60 * edge.arrays["alpha"][:, :, None] * np.ones(3), "alpha of the reference, times 60")
 flips = []
 for panel, conventions in zip(axes[1:], (strict, looser), strict=True):
     drawn = run_stages(REFERENCE, edge._replace(conventions=conventions), "float64")
-    shown_error = show_error(panel, drawn["image"], edge.arrays["image"], f"error of a renderer {conventions.name}")
+    shown_error = show_digits(panel, drawn["image"], edge.arrays["image"], f"error, {conventions.name}")
     image_row = {row.stage: row for row in compare_scene(by_profile(conventions, "float64"), edge)}["image"]
     flips.append(image_row)
 figure.colorbar(shown_error, ax=axes[1:], label="log10")
@@ -352,15 +342,15 @@ for conventions, row in zip((strict, looser), flips, strict=True):
     )
 
 # %% [markdown]
-# The four pixels are candidates: some alpha is within 1e-6 of the threshold. Whether they differ is counted, not
-# judged; the reference itself takes some and leaves others, which is what "rounding decides" means. The gradients are
-# safe as well: the cotangent `v_image` is zero there from the start, so no gradient hears of them.
+# The four pixels are candidates: some alpha is within 1e-6 of the threshold. Whether they differ is counted and not
+# judged. The reference itself takes some hits and skips others, which is what "rounding decides" means. The gradients
+# are safe as well: the cotangent `v_image` is zero at candidates, so they do not enter any gradient.
 #
 # ## Your own renderer in three lines
 #
-# `minisplat-ref oracle export golden` writes the scenes. Your program reads the .npz files, in whatever language, and
-# writes what it computes under the same names. `minisplat-ref oracle compare mine` does the rest. As an example, a
-# program of a few lines that only projects. It forgets that pixel centres are at + 0.5, the classic.
+# `minisplat-ref oracle export golden` writes the scenes. Your program, in whatever language, reads the .npz files and
+# writes what it computes under the same names. `minisplat-ref oracle compare mine` does the rest. The example is a
+# program of a few lines that only projects. It forgets that pixel centres are at +0.5, a classic error.
 
 # %%
 folder = Path(tempfile.mkdtemp())
@@ -398,10 +388,10 @@ for name, pixel_offset in (("mine", 0.5), ("mine, corrected", 0.0)):
 # %% [markdown]
 # ## And a renderer that is right
 #
-# gsplat keeps a second statement of its kernels in plain PyTorch. With the extra `minisplat_ref[peers]` it can be
-# compared on any machine; it is neither our code nor our derivation.
+# gsplat has a second version of its kernels in plain PyTorch. With the extra `minisplat_ref[peers]` it can be compared
+# on any machine. It shares neither code nor derivation with this package.
 
-# %%
+# %% tags=["clock"]
 try:
     gsplat = choose_renderer("gsplat-torch", "float64")
     truths, left_out = choose_scenes(gsplat, "sh3", "reference", None)
@@ -414,19 +404,71 @@ except InputError as error:
     print(f"not compared: {error}")
 
 # %% [markdown]
-# ## What was shown
+# ## Play
+#
+# Put any of the planted errors, or another precision, on trial. What to look for:
+#
+# * `error_name`: `"sh-sign"`, `"unsorted-depth"`, `"direction-frozen"` and the others of notebook 12. Is the first
+#   stage that diverges the one that you expect?
+# * `dtype`: in `"float32"` without an error, which stage has the largest difference, and is it still called agreement?
+
+# %%
+error_name, dtype = "background-forgotten", "float64"
+
+rows_of_yours = compare_scene(with_planted_error(error_name, dtype), scene)
+yours = table(rows_of_yours)
+print("first divergence:", getattr(first_divergence(rows_of_yours), "stage", "none"))
+
+# %% [markdown]
+# ## Exercises
+#
+# **1.** A renderer computes all its forward stages right. One of its gradients, `v_means`, is right when it is fed with
+# the truth, and wrong when the renderer runs from end to end. Where is the error?
+#
+# <details>
+# <summary>Solution</summary>
+#
+# In a stage that comes *later in the forward pass*, and so earlier in the backward pass: it hands a wrong gradient to
+# the projection, whose own gradient is right. That is the suspect of this notebook: fed with the truth its `v_means`
+# agree, end to end they do not.
+#
+# ```python
+# assert half["v_means"].status == "agrees"
+# assert cosine(suspected["v_means"], a["v_means"]) < 1 - 1e-6
+# ```
+#
+# </details>
+#
+# **2.** Why is a single image not enough for a comparison, even if it agrees to the last digit? Give two errors of this
+# notebook that a well-chosen image does not show.
+#
+# <details>
+# <summary>Solution</summary>
+#
+# The halved entry changes no image at all, only a gradient. The transposed rotation changes no image of a camera
+# without rotation, and the clamp of the Jacobian none whose principal point is centred.
+#
+# ```python
+# assert np.abs(suspected["image"] - a["image"]).max() < 1e-12
+# assert errors[0, 1] < 1e-12 < 1e-3 < errors[-1, 1]
+# ```
+#
+# </details>
+
+# %% [markdown]
+# ## What was shown, checked
 
 # %%
 # The suspect's image is right, its scale and rotation gradients are not, and opacities and colours are.
 assert np.abs(suspected["image"] - a["image"]).max() < 1e-12
 assert cosines["v_opacities"] > 1 - 1e-12 and cosines["v_sh_dc"] > 1 - 1e-12
 assert cosines["v_scales"] < 0.97 and cosines["v_quats"] < 0.97 and cosines["v_means"] < 1 - 1e-6
-# Fed with the truth, one function differs, in one column, by one factor; and differences side with the reference.
+# Fed with the truth, one function differs, in one column, by one factor; differences agree with the reference.
 assert [name for name, row in half.items() if row.status == "diverges"] == ["v_conics", "v_features", "v_view"]
 assert half["v_conics"].note == "only [:, 1] times 0.5"
 assert np.allclose(differences, a["v_conics"][rows, 1], rtol=1e-5)
 assert np.allclose(factor[:, 1], 0.5) and np.allclose(factor[:, [0, 2]], 1)
-# A transposed rotation is named at the conics; without a rotation nobody would know.
+# A transposed rotation is named at the conics; without a rotation the error does not show.
 assert first_divergence(turned_rows.values()).stage == "conics" and turned_rows["means2d"].status == "agrees"
 assert turned_rows["image"].status == "agrees"  # fed with the truth
 assert (
@@ -441,13 +483,13 @@ for (name, stages), stage in zip(convention_rows.items(), ("T", "radii", "conics
     assert convention_errors[name].max() > 1 / 255, name
 # The CPU's lists are shorter, and its image is the same.
 assert harmless["tile lists"].status == "harmless" and first_divergence(harmless.values()) is None
-# Flips: four pixels, three channels each; taken by one, left by the other, judged in neither.
+# Flips: four pixels, three channels each; taken by one, skipped by the other, judged in neither.
 assert all(row.status == "agrees" and row.n_candidates == 4 for row in flips)
 assert sum(row.difference.n_flips for row in flips) == 12 and max(row.difference.max_error for row in flips) < 1e-12
-# A program that knows nothing of ours is told what is wrong with it, and that it is right afterwards.
+# A program that shares nothing with this package is told what is wrong with it, and that it is right afterwards.
 assert dump_rows["mine"]["means2d"].status == "diverges" and dump_rows["mine"]["depths"].status == "agrees"
 assert abs(dump_rows["mine"]["means2d"].difference.max_error - 0.5) < 1e-4
 assert dump_rows["mine, corrected"]["means2d"].status == "agrees"
-# gsplat's own functions agree, if they are there to be asked.
+# gsplat's own functions agree, if they are installed.
 assert first_divergence(gsplat_rows.values()) is None
 print("all of the above holds")
