@@ -128,7 +128,10 @@ def test_culling_of_given_gaussians(scene_folder, tmp_path, capsys):
         ),
         (["split", "SCENE", "--recipe", "5dgs"], "recipe '5dgs' does not exist"),
         (["simplify", "SCENE", "--recipe", "5dgs"], "recipe '5dgs' does not exist"),
-        (["spilt", "SCENE"], "there is no study 'spilt': choose from ablation, split, culling, simplify, depth"),
+        (
+            ["spilt", "SCENE"],
+            "there is no study 'spilt': choose from adaptive, ablation, split, culling, simplify, depth",
+        ),
         (
             ["culling", "room", "--downscale", "2"],
             "room is made at 160 x 120; write it with minisplat-ref synthetic",

@@ -12,8 +12,9 @@ Trainings take long. Each leaves its record in ``runs.jsonl``, and the same comm
 """
 
 import argparse
+import contextlib
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -29,11 +30,12 @@ from minisplat_ref.metrics import evaluate
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.rates import Rates
-from minisplat_ref.training.schedule import Recipe, does
+from minisplat_ref.training.schedule import Recipe, does, scaled
 from minisplat_ref.training.state import Iteration, StepReport, TrainState
 from minisplat_ref.types import Scene, View
 
 ITERATIONS = 3000  # of recipes with a schedule
+WARM_UP = 20  # iterations
 N_MEASUREMENTS = 24  # of those; of adaptive as often
 FEW = 5  # every so many-th training photograph is left
 GAINS = (0.7, 1.4)  # of a photograph, uniform in the logarithm
@@ -135,6 +137,8 @@ def run(args: argparse.Namespace) -> None:
     records = read_records(args.out, settings)
     done = {(record["condition"], record["recipe"], record["seed"]) for record in records}
     todo = [(c, r, s) for c in args.conditions for s in args.seeds for r in recipes if (c, r, s) not in done]
+    if todo:
+        warm_up(scene, recipes.values())
     for condition, name, seed in tqdm(todo, desc="trainings", leave=False):
         measured = measure(CONDITIONS[condition](scene), recipes[name], seed)
         record = {"condition": condition, "recipe": name, "seed": seed, **measured}
@@ -152,6 +156,13 @@ def run(args: argparse.Namespace) -> None:
 
 def _named(names: Sequence[str]) -> dict[str, Recipe]:
     return {name: adaptive.ADAPTIVE if name == "adaptive" else get_recipe(name, ITERATIONS) for name in names}
+
+
+def warm_up(scene: Scene, recipes: Iterable[Recipe]) -> None:
+    """Train every recipe for a moment, so that no training counts the time of compiling."""
+    for recipe in recipes:
+        with contextlib.suppress(InputError):  # so short a schedule may ask for what cannot be
+            train(scene, scaled(recipe, WARM_UP), seed=0)
 
 
 def measure(scene: Scene, recipe: Recipe, seed: int) -> dict[str, Any]:

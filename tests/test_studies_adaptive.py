@@ -1,0 +1,81 @@
+"""The study of ``adaptive``: its conditions, its rules, its table, and a study that was interrupted."""
+
+import json
+
+import numpy as np
+import pytest
+
+from minisplat_ref.cli import main
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.experiments.studies import FIGURE, RESULT, adaptive, front
+from minisplat_ref.experiments.studies.ablation import RUNS
+from minisplat_ref.io.images import read_image
+from minisplat_ref.methods.adaptive import ADAPTIVE
+from minisplat_ref.training.schedule import action_name
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene("room", n_views=8, width=48, height=36, supersampling=1, n_points=150).scene
+
+
+def test_conditions(scene):
+    few, gains = adaptive.few_photographs(scene), adaptive.random_gains(scene)
+    assert [view.name for view in few.train_views] == [view.name for view in scene.train_views[::5]]
+    assert few.test_views is scene.test_views and gains.test_views is scene.test_views
+    ratios = [
+        np.median(new.image[old.image > 50] / old.image[old.image > 50])
+        for new, old in zip(gains.train_views, scene.train_views, strict=True)
+    ]
+    assert 0.69 < min(ratios) < 0.9 < 1.1 < max(ratios) < 1.41
+
+
+def test_each_rule_is_taken_out():
+    recipes = {name: change(ADAPTIVE) for name, change in adaptive.RULES.items()}
+    names = {name: [action_name(event) for event in recipe.events] for name, recipe in recipes.items()}
+    assert recipes["adaptive"] == ADAPTIVE and "grow" in names["adaptive"]
+    assert "grow" not in names["no growth"] and len(names["no growth"]) == len(names["adaptive"]) - 1
+    assert [n.replace("clones_while_growing", "grow") for n in names["clones of 3DGS"]] == names["adaptive"]
+    assert recipes["rates of 3DGS"].learning_rates.at(9, 1.0)["means"] == 1.6e-4
+    assert recipes["no cool-down"].cooling.last_per_extent == 1.0
+    for recipe in recipes.values():
+        assert recipe.cooling.hold_out_every == ADAPTIVE.cooling.hold_out_every
+
+
+def test_rows_by_hand():
+    def run(recipe, seed, psnrs):
+        curve = [{"step": 10 * k, "seconds": 2.0 * k, "psnr": p, "n_gaussians": 5} for k, p in enumerate(psnrs, 1)]
+        return {"condition": "whole", "recipe": recipe, "seed": seed, **curve[-1], "curve": curve}
+
+    runs = [run("a", 0, [20, 25, 24]), run("a", 1, [21, 22]), run("b", 0, [23.9, 24.5, 24.4]), run("b", 1, [22, 22.6])]
+    first, second = adaptive.summarise(runs)
+    assert (first["psnr"], first["difference"], first["fall"], first["until"]) == (23.0, 0.0, 0.5, 4.0)
+    assert second["difference"] == pytest.approx(0.5) and second["standard_error"] == pytest.approx(0.1)
+    assert second["fall"] == pytest.approx(0.05) and second["until"] == 2.0
+    never = adaptive.summarise([*runs[:1], run("b", 0, [20, 21])])[1]
+    assert never["until"] is None and never["standard_error"] is None
+
+
+def test_study_and_its_continuation(tmp_path, capsys, scene, monkeypatch):
+    monkeypatch.setattr(front, "make_scene", lambda name: make_scene("room", **SMALL))
+    monkeypatch.setattr(adaptive, "ITERATIONS", 48)
+    monkeypatch.setattr(adaptive.adaptive, "ADAPTIVE", ADAPTIVE._replace(iterations=40))
+    out = tmp_path / "out"
+    command = ["study", "adaptive", "room", "--out", str(out), "--recipes", "3dgs,adaptive", "--seeds", "0"]
+    assert main([*command, "--conditions", "whole,gains"]) == 0
+    printed = capsys.readouterr().out
+    assert "| gains     | adaptive" in printed and "until 3dgs - 0.1 dB" in printed
+    assert sorted(path.name for path in out.iterdir()) == sorted([FIGURE, RESULT, RUNS])
+    assert read_image(out / FIGURE).std() > 1
+    result = json.loads((out / RESULT).read_text())
+    assert [(row["condition"], row["recipe"], row["step"]) for row in result["summary"]] == [
+        *(("whole", "3dgs", 48), ("whole", "adaptive", 40), ("gains", "3dgs", 48), ("gains", "adaptive", 40))
+    ]
+    assert result["runs"][1]["decisions"][0]["what"] == "cool down"
+    monkeypatch.setattr(adaptive, "measure", lambda *_: pytest.fail("all is there"))
+    assert main([*command, "--conditions", "whole"]) == 0
+    assert main([*command, "--conditions", "night"]) == 2
+    assert "condition 'night' does not exist" in capsys.readouterr().err
+
+
+SMALL = {"n_views": 8, "width": 48, "height": 36, "supersampling": 1, "n_points": 150}
