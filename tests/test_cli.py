@@ -71,7 +71,7 @@ def run_folder(scene_folder, tmp_path_factory):
 
 
 def train_options(iterations=ITERATIONS):
-    return ["--iterations", str(iterations), "--test-every", "4", "--seed", "3"]
+    return ["--recipe", "3dgs-accel", "--iterations", str(iterations), "--test-every", "4", "--seed", "3"]
 
 
 # train
@@ -92,6 +92,7 @@ def test_train_leaves_a_complete_folder(run_folder, scene_folder):
     assert (metrics["psnr"], metrics["ssim"]) == (expected.psnr, expected.ssim)
 
     config = read_json(run_folder / "config.json")
+    assert not metrics["has_ended_early"]
     assert config["settings"] == {
         "scene": str(scene_folder.resolve()),
         "downscale": 1,
@@ -111,6 +112,7 @@ def test_train_leaves_a_complete_folder(run_folder, scene_folder):
         "eval_every": 0,
         "drop_bad_steps": False,
         "lpips_weights": None,
+        "minutes": None,
         "init": None,
     }
     assert config["recipe"]["iterations"] == ITERATIONS and config["versions"]["numba"]

@@ -14,6 +14,9 @@ from minisplat_ref.io.ply import load_ply
 OPENCV = (*PINHOLE, 0.1, 0.0, 0.0, 0.0)
 
 
+RECIPE = ("--recipe", "3dgs-accel")  # which is content with few views
+
+
 @pytest.fixture
 def refused(tmp_path, capfd):
     """Run a command line that must be refused, and leave the folder as it was; return the line that says why."""
@@ -36,7 +39,7 @@ def train_refused(refused, tmp_path):
     """Train on a scene that must be refused; return the line that says why."""
 
     def run(scene, *options):
-        return refused("train", scene, "--iterations", "2", "--out", tmp_path / "out", *options)
+        return refused("train", scene, *RECIPE, "--iterations", "2", "--out", tmp_path / "out", *options)
 
     return run
 
@@ -169,7 +172,7 @@ def test_out_below_a_file(refused, tmp_path):
     scene = write_colmap(tmp_path / "scene", n=4)
     (tmp_path / "file").write_text("")
     out = tmp_path / "file" / "run"
-    assert str(out) in refused("train", scene, "--iterations", "2", "--test-every", "0", "--out", out)
+    assert str(out) in refused("train", scene, *RECIPE, "--iterations", "2", "--test-every", "0", "--out", out)
 
 
 @pytest.mark.parametrize(
@@ -182,13 +185,16 @@ def test_out_below_a_file(refused, tmp_path):
         (["--unknown"], "--unknown"),
         (["--resume", "."], "leave out"),
         (["--budget", "0"], "--budget"),
-        (["--budget", "9"], "--budget means nothing to recipe 3dgs-accel: leave it out, or take one of mini-splatting"),
-        (["--simplify", "rank"], "--simplify means nothing to recipe 3dgs-accel: leave it out"),
+        (
+            ["--budget", "9", *RECIPE],
+            "--budget means nothing to recipe 3dgs-accel: leave it out, or take one of mini-splatting",
+        ),
+        (["--simplify", "rank", *RECIPE], "--simplify means nothing to recipe 3dgs-accel: leave it out"),
         (["--scene-type", "indoor", "--recipe", "3dgs"], "--scene-type means nothing to recipe 3dgs: leave it out"),
         (["--set", "exposure"], "'exposure' is not NAME=VALUE"),
         (["--set", "exposure=yes"], "exposure=yes is neither true nor false"),
         (["--set", "threshold=x"], "threshold=x is not a number"),
-        (["--set", "thresholds=1"], "no thresholds to set: choose from ceiling, "),
+        (["--set", "thresholds=1", *RECIPE], "no thresholds to set: choose from ceiling, "),
         (["--extension", "none"], "extension 'none' does not exist: choose from "),
     ],
 )
@@ -213,8 +219,8 @@ def test_two_views_for_a_recipe_that_compares_views(train_refused, tmp_path, rec
 
 def test_depth_of_points_without_tracks(tmp_path, capfd):
     scene = write_transforms(tmp_path / "scene", fl_x=40.0)
-    options = ["--extension", "geometry", "--set", "sfm_depth=1", "--iterations", "2", "--out", str(tmp_path / "out")]
-    assert main(["train", str(scene), *options]) == 2
+    options = [*RECIPE, "--extension", "geometry", "--set", "sfm_depth=1", "--iterations", "2"]
+    assert main(["train", str(scene), *options, "--out", str(tmp_path / "out")]) == 2
     assert "does not say which view sees which point" in capfd.readouterr().err
     assert not (tmp_path / "out").exists()
 

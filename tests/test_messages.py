@@ -155,7 +155,7 @@ def test_photographs_of_a_few_pixels(tmp_path):
 def test_training_says_so(tmp_path, capsys, monkeypatch):
     scene = write_transforms(tmp_path / "scene", fl_x=40.0)
     monkeypatch.setattr(train, "_train", lambda *_: 0)
-    options = ["--downscale", "4", "--out", str(tmp_path / "out"), "--backend", "reference"]
+    options = ["--recipe", "3dgs-accel", "--downscale", "4", "--out", str(tmp_path / "out"), "--backend", "reference"]
     assert main(["train", str(scene), *options]) == 0
     lines = capsys.readouterr().err.splitlines()
     assert all(line.startswith("minisplat-ref: warning: ") for line in lines)

@@ -30,7 +30,8 @@ from minisplat_ref.training.schedule import action_name
 
 SCENE = {"n_views": 6, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
 ITERATIONS = 20
-OPTIONS = ["--iterations", str(ITERATIONS), "--test-every", "4", "--seed", "3"]
+RECIPE = ("--recipe", "3dgs-accel")  # which has a schedule
+OPTIONS = [*RECIPE, "--iterations", str(ITERATIONS), "--test-every", "4", "--seed", "3"]
 
 
 def read_json(path):
@@ -620,7 +621,7 @@ def test_a_training_that_does_not_fit_into_memory_is_foreseen(original, tmp_path
 
 def test_densification_that_does_not_fit_stops_with_all_saved(original, tmp_path, monkeypatch, refused):
     """There is a checkpoint of the iteration before, since it was known that room was short."""
-    options = ["--iterations", "240", "--test-every", "4"]
+    options = [*RECIPE, "--iterations", "240", "--test-every", "4"]
     monkeypatch.setattr(memory, "free_bytes", lambda: 1.5 * 60 * 236 * 3)  # room for the new arrays of 90 Gaussians
     monkeypatch.setattr(memory, "check_start", lambda *_: "")
     monkeypatch.setattr(memory, "check_photograph", lambda *_: None)

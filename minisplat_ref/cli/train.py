@@ -31,7 +31,7 @@ DEFAULTS = {
     "downscale": 1,
     "test_every": 8,
     "undistort": False,
-    "recipe": "3dgs-accel",
+    "recipe": "adaptive",
     "iterations": None,
     "budget": None,
     "simplify": None,
@@ -85,8 +85,8 @@ def add_parser(commands: Commands) -> None:
     training.add_argument(
         "--recipe",
         metavar="R",
-        help="3dgs-accel, which is the default, 3dgs, mini-splatting, mini-splatting2, mini-splatting-d,"
-        " mini-splatting2-d or adaptive",
+        help="adaptive (default), 3dgs-accel, 3dgs, mini-splatting, mini-splatting2, mini-splatting-d or"
+        " mini-splatting2-d",
     )
     training.add_argument("--init", type=Path, metavar="PLY", help="points to start from (default: the scene's)")
     training.add_argument(

@@ -57,8 +57,8 @@ def initial_state(scene: Scene, recipe: Recipe, seed: int) -> TrainState:
         raise InputError(f"scene {scene.name} has no training views: lower the share of test views or add photographs")
     if n_views < recipe.least_views:
         raise InputError(
-            f"scene {scene.name} has {n_views} training views, recipe {recipe.name} compares what at least"
-            f" {recipe.least_views} see: add photographs or use 3dgs-accel"
+            f"scene {scene.name} has {n_views} training views, recipe {recipe.name} needs at least"
+            f" {recipe.least_views}: add photographs or use 3dgs-accel"
         )
     rng = np.random.default_rng(seed)
     representation = recipe.representation
