@@ -122,7 +122,7 @@ def test_what_convert_refuses(run, tmp_path, one_line):
     assert "are for --max-drop" in one_line("convert", run, tmp_path / "a.msz", "--scene", run)
     assert "knows its extension" in one_line("convert", run, tmp_path / "a.msz", "--extension", "velocity")
     (tmp_path / "bad.msz").write_bytes(b"MSZ\n")
-    assert "bad.msz: not a MSZ file" in one_line("convert", tmp_path / "bad.msz", tmp_path / "a.ply")
+    assert "bad.msz: not an MSZ file" in one_line("convert", tmp_path / "bad.msz", tmp_path / "a.ply")
     assert "bad.msz" in one_line("info", tmp_path / "bad.msz")
 
 

@@ -92,7 +92,7 @@ def take_apart(container: Container, content: bytes, source: str | Path) -> Pack
         It is another kind of file, of another version, or its sizes do not add up.
     """
     if len(content) < _PREFIX.size or content[:4] != container.magic:
-        raise InputError(f"{source}: not a {_name(container)} file, it does not begin with {_name(container)}")
+        raise InputError(f"{source}: not an {_name(container)} file, it does not begin with {_name(container)}")
     _, version, length = _PREFIX.unpack_from(content)
     if version != container.version:
         raise InputError(

@@ -241,8 +241,8 @@ def test_files_that_lie():
     content = omg.encode(population(20), 2)
     for length in (0, 4, 9, 30, len(content) // 2, len(content) - 1):
         refusal(omg.OMG_FILE, content[:length])
-    assert "OMG of version 9" in refusal(omg.OMG_FILE, content[:4] + struct.pack("<H", 9) + content[6:])
-    assert "not a OMG file" in refusal(omg.OMG_FILE, b"MSZ\n" + content[4:])
+    assert "OMG of version 9" in refusal(omg.OMG_FILE, content[:4] + bytes([9, 0]) + content[6:])
+    assert "not an OMG file" in refusal(omg.OMG_FILE, b"MSZ\n" + content[4:])
     assert "would take" in refusal(omg.OMG_FILE, with_header(content, n=2**31 - 1))
     codes = {"scales": [2**16] * 3, "rotations": [2**16] * 2, "opacities": [2**16], "appearance": [2**16] * 3}
     lies = [{"n": 2**31}, {"n": -1}, {"center": [1, 2]}, {"center": ["a", 0.0, 0.0]}, {"codes": {}}, {"n_features": 45}]
