@@ -134,6 +134,13 @@ def test_codes_are_means_of_their_own_and_vectors_take_the_nearest(rng):
     assert len(quantised.codes[0]) == 16
 
 
+def test_rare_vectors_are_not_starved(rng):
+    """A crowd and a thin tail: no vector is further from its code than a cell, of 64 in the width of the tail."""
+    vectors = np.concatenate([rng.normal(size=(5000, 1)), rng.uniform(-20, 20, size=(60, 1))])
+    error = np.abs(quantise(vectors, 1, 64).vectors() - vectors)
+    assert error.max() < 40 / 64
+
+
 def mse(vectors, width, n_codes):
     return np.mean((quantise(vectors, width, n_codes).vectors() - vectors) ** 2)
 
