@@ -108,10 +108,11 @@ def draw(found: Measured) -> Figure:
     axes.set(title="PSNR of test views (dB)", xlabel="pixels a side, relative to the training views")
     axes.legend(frameon=False)
     tidy(axes)
-    for panel, (name, picture) in zip(right.subplots(2, 2).ravel(), found.pictures.items(), strict=True):
-        height, width = picture.shape[:2]
+    height, width = found.pictures["photograph"].shape[:2]
+    panels = right.subplots(*((1, 4) if height > width else (2, 2))).ravel()
+    for panel, (name, picture) in zip(panels, found.pictures.items(), strict=True):
         panel.imshow(picture[height // 4 : 3 * height // 4, width // 4 : 3 * width // 4])
-        panel.set_title(f"{name}, zoom {found.zooms[-1]:g}", fontsize=9)
+        panel.set_title(f"{name}, x {found.zooms[-1]:g}", fontsize=9)
         panel.set(xticks=[], yticks=[])
     return figure
 

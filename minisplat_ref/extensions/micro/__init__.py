@@ -1,4 +1,4 @@
-"""Micro-splatting: small Gaussians, split where the photographs have edges, merged where two are one.
+"""Micro-splatting: small Gaussians, split at the photographs' edges, merged where alike.
 
 Micro-splatting, arXiv 2504.05740. Training makes Gaussians that are long or large, and a needle that explains an edge
 in one place is wrong beside it. Three changes to 3DGS (:mod:`minisplat_ref.extensions.micro.method`):

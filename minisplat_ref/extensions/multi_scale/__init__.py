@@ -1,4 +1,4 @@
-"""Multi-scale: coarse Gaussians for small pictures, fine ones for large, chosen by pixel coverage.
+"""Multi-scale: coarse Gaussians for small pictures, chosen by pixel coverage.
 
 Multi-Scale 3D Gaussian Splatting, Yan et al. 2023, arXiv 2311.17089. In a small picture most Gaussians of a scene are
 smaller than a pixel. 3DGS widens each to about one, so that they cover too much, and there is as much to sort as in a
@@ -15,9 +15,11 @@ large picture. Here several levels are kept, and a view takes of each place the 
 The sides w and w' are a further field, ``cells``, and columns of the PLY. A population of level 0 alone is 3DGS, bit
 for bit.
 
-What to know: Mip-Splatting's compensation gives better small pictures than levels do, but draws as many hits; levels
-save what is drawn. Which level is taken when decides everything: cubes of 4 pixels cost 6 dB at the full size
-(``study multi-scale/downscale``).
+Measured on the fox at 135 x 240, 1000 iterations (``study multi-scale/downscale``): at a quarter, an eighth and a
+sixteenth of the size trained levels are worth 3.1, 2.8 and 6.7 dB, and draw 1.7, 3 and 10 times fewer pairs; levels
+that are only built, about 1 to 2 dB. The core's compensation of opacities alone, on the same Gaussians, gives better
+pictures than levels down to an eighth, but costs 1.8 dB at the full size and saves few pairs. Which level is taken when
+decides much: cubes of 4 pixels instead of one cost 1.3 dB at the full size and 0.9 dB at a half.
 
 Where this deviates: the paper drops every Gaussian by its own coverage, within bounds that follow the training; then
 the members of a cube leave at other distances than their parent comes, and training has to mend that. Here coverage

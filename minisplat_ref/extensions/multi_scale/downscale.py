@@ -127,7 +127,7 @@ def draw(found: Measured) -> Figure:
             axes.plot(found.blocks, values[..., column].mean(axis=0), "o-", ms=4, color=color, label=name)
     for axes, title in ((left, "PSNR of test views (dB)"), (right, "hits that are blended, per view")):
         axes.set_xscale("log", base=2)
-        axes.set_xticks(found.blocks, [f"1/{n}" for n in found.blocks])
+        axes.set_xticks(found.blocks, ["1", *(f"1/{n}" for n in found.blocks[1:])])
         axes.set(title=title, xlabel="size of the picture")
         tidy(axes)
     right.set_yscale("log")

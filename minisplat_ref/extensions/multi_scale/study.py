@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> None:
         psnr, pairs, hits = np.moveaxis(np.mean(np.array(runs), axis=0), -1, 0)  # [blocks] each
         cells = [f"{p:.2f}, {n / 1e3:.1f}, {h / 1e3:.0f}" for p, n, h in zip(psnr, pairs, hits, strict=True)]
         rows.append([name, f"{np.mean(found.counts[name]):,.0f}", *cells])
-    print(markdown_table(["", "Gaussians", *(f"1/{n}" for n in found.blocks)], rows))
+    print(markdown_table(["", "Gaussians", "1", *(f"1/{n}" for n in found.blocks[1:])], rows))
 
 
 DOWNSCALE = Study("downscale", "a trained scene in smaller pictures, with and without levels", add_arguments, run)
