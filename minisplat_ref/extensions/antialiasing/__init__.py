@@ -19,7 +19,8 @@ size of training. Integrals over pixels (``analytic``) are as good from farther 
 the size of training by 1.3 dB.
 
 Where this deviates: the filter is measured from centres in front of a camera's image and 15 % around it, as in the
-released code, and a new Gaussian has its parent's until it is measured. The alternative to filters, the integral of a
+released code, and a new Gaussian has its parent's until it is measured. A recipe of the core that is trained with
+``--extension antialiasing`` has the filter in the image alone. The alternative to filters, the integral of a
 Gaussian over a pixel, is the extension ``analytic``.
 
     minisplat-ref train SCENE --recipe antialiasing

@@ -78,7 +78,8 @@ def coarse(
     """Return the photometric loss of a smaller picture of the view, in every ``period``-th iteration; else nothing.
 
     The levels take turns, as far as pictures of at least ``LEAST_SIZE`` pixels a side go. The gradient goes to the
-    Gaussians directly: this picture is not the one that the other terms see.
+    Gaussians directly: this picture is not the one that the other terms see, and exposures and poses that are trained
+    are not applied to it.
     """
     view, request, model = rendered.view, rendered.request, rendered.model
     sizes = [factor**level for level in range(1, n_levels + 1)]
