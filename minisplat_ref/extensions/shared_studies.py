@@ -1,8 +1,4 @@
-"""What studies of several extensions share: their folder, the scene that they train on, and pictures at other scales.
-
-At scale z a picture has z times as many pixels a side. A smaller photograph is the mean over blocks of pixels, which is
-what a sensor with larger pixels would have measured.
-"""
+"""What studies of several extensions share: their arguments and their folder, and the scene that they train on."""
 
 import argparse
 import json
@@ -13,7 +9,8 @@ import numpy as np
 
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.types import Camera, Floats, Scene
+from minisplat_ref.extensions.shared_sampling import block_means, zoomed
+from minisplat_ref.types import Floats, Scene
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -60,49 +57,27 @@ def check_at_least(least: int, **numbers: int) -> None:
             raise InputError(f"--{name} is {number}: give at least {least}")
 
 
-def read_scene(source: str) -> Scene:
-    """Load a folder at its full size, or make the synthetic scene of that name.
+def read_scene(source: str, downscale: int = 1) -> Scene:
+    """Load a folder, its photographs ``downscale`` times smaller, or make the synthetic scene of that name.
 
     Raises
     ------
     InputError
-        It is neither, or has no test views to measure.
+        It is neither, has no test views to measure, or a synthetic scene is to be made smaller.
     """
     from minisplat_ref.io import load_scene
 
     if Path(source).exists():
-        scene = load_scene(source)
+        scene = load_scene(source, downscale=downscale)
     elif source in SCENE_NAMES:
+        if downscale != 1:
+            raise InputError(f"{source} is made at 160 x 120: leave --downscale out, or give the folder of a scene")
         scene = make_scene(source).scene
     else:
         raise InputError(f"{source}: neither a folder nor one of {', '.join(SCENE_NAMES)}; give a scene")
     if not scene.test_views:
         raise InputError(f"scene {scene.name} has no test views to measure: add photographs")
     return scene
-
-
-def zoomed(camera: Camera, scale: float) -> Camera:
-    """Return the camera with ``scale`` times as many pixels a side, rounded down; the edge pixels are cut off.
-
-    The focal length is exactly ``scale`` times the old one, so that a block of old pixels is exactly one new pixel.
-    """
-    width, height = int(camera.width * scale), int(camera.height * scale)
-    return camera._replace(
-        fx=camera.fx * scale,
-        fy=camera.fy * scale,
-        cx=camera.cx * scale,
-        cy=camera.cy * scale,
-        width=width,
-        height=height,
-    )
-
-
-def block_means(image: Floats, n: int) -> Floats:
-    """Return the means [H // n, W // n, D] over blocks of n x n pixels; what is left at the edges is cut off."""
-    height, width = image.shape[0] // n, image.shape[1] // n
-    blocks = image[: height * n, : width * n].reshape(height, n, width, n, -1)
-    means: Floats = blocks.mean(axis=(1, 3))
-    return means
 
 
 def shrunk(scene: Scene, n: int) -> Scene:

@@ -1,4 +1,4 @@
-"""Analytic splatting: the alpha of a Gaussian is its mean over the pixel, not its value at the centre.
+"""Analytic splatting: alpha is a mean over the pixel, not the value at its centre.
 
 Analytic-Splatting, Liang et al. 2024, arXiv 2403.11056. A pixel collects light from a square. 3DGS takes the value of
 the footprint in the middle of it, which misses what is thinner than a pixel; hence its low-pass. Here alpha is the

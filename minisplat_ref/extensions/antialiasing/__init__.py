@@ -1,4 +1,4 @@
-"""Anti-aliasing: filters in space and in the image, so that a scene may be seen from nearer and farther.
+"""Anti-aliasing: filters in space and image, for views from nearer and from farther.
 
 Mip-Splatting, Yu et al. 2023, arXiv 2311.16493. 3DGS adds 0.3 px^2 to every footprint and leaves the opacity as it is.
 Trained at one size that is harmless, since training makes up for it; from farther everything swells and brightens,
@@ -13,8 +13,14 @@ from nearer it thins out, down to needles. Two filters take its place:
 The filter's deviation is a further field, ``filter_sigmas``, and a column of the PLY. An event measures it at the first
 iteration, and then every 100 iterations. A filter of 0 draws the Gaussians as they are, bit for bit.
 
+Measured on the fox, trained at 33 x 60 for 1000 iterations and drawn at other sizes (``study antialiasing/zoom``): at
+an eighth of the size 25.4 dB against 14.5 dB of ``3dgs-accel``, at eight times 24.8 against 19.2, and as good at the
+size of training. Integrals over pixels (``analytic``) are as good from farther and better from nearer, 25.5 dB, and at
+the size of training by 1.3 dB.
+
 Where this deviates: the filter is measured from centres in front of a camera's image and 15 % around it, as in the
-released code, and a new Gaussian has its parent's until it is measured. The alternative to filters, the integral of a
+released code, and a new Gaussian has its parent's until it is measured. A recipe of the core that is trained with
+``--extension antialiasing`` has the filter in the image alone. The alternative to filters, the integral of a
 Gaussian over a pixel, is the extension ``analytic``.
 
     minisplat-ref train SCENE --recipe antialiasing

@@ -4,44 +4,12 @@ No camera sees more of a Gaussian than one sample a pixel, so what is thinner th
 is invention. Convolved with a round Gaussian of that size it is not.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from minisplat_ref.types import Camera, Floats
+from minisplat_ref.types import Floats
 
 VARIANCE = 0.2  # of the filter, in units of the squared sampling interval
-MARGIN = 0.15  # of the image's size, by which a centre may lie outside and still be seen
 EXPONENT_MAX = 80.0  # of e^l, which float32 holds up to e^88; an opacity that is 1 to 35 digits has no gradient left
-NEAR = 0.2  # world units: what is nearer to a camera than that is not seen by it
-
-
-def sampling_intervals(means: Floats, cameras: Sequence[Camera]) -> Floats:
-    """Return the least distance between two pixels' rays at each centre, over the cameras that see it: ``z / f``.
-
-    Parameters
-    ----------
-    means : ndarray of shape (N, 3)
-        World frame.
-    cameras : sequence of Camera
-        f is the larger of a camera's two focal lengths.
-
-    Returns
-    -------
-    ndarray of shape (N,), float64
-        World units. What no camera sees gets the largest of the others, 0 where no camera sees anything.
-    """
-    intervals = np.full(len(means), np.inf)
-    for camera in cameras:
-        x, y, z = (means @ camera.cam_from_world_R.T + camera.cam_from_world_t).T.astype(np.float64)
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-        is_seen = (z > NEAR) & (np.abs(u - camera.width / 2) < (0.5 + MARGIN) * camera.width)
-        is_seen &= np.abs(v - camera.height / 2) < (0.5 + MARGIN) * camera.height
-        intervals[is_seen] = np.minimum(intervals[is_seen], z[is_seen] / max(camera.fx, camera.fy))
-    is_seen = np.isfinite(intervals)
-    intervals[~is_seen] = intervals[is_seen].max(initial=0.0)
-    return intervals
 
 
 def smoothed(log_scales: Floats, opacity_logits: Floats, sigmas: Floats) -> tuple[Floats, Floats]:

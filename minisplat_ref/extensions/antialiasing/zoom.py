@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 
 from minisplat_ref.backends import CPU
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.shared_studies import block_means, psnr_of, shrunk, tidy, zoomed
+from minisplat_ref.extensions.shared_sampling import block_means, zoomed
+from minisplat_ref.extensions.shared_studies import psnr_of, shrunk, tidy
 from minisplat_ref.rendering import Renderer, Request
 from minisplat_ref.training.loop import train
 from minisplat_ref.types import Floats, Model, Scene, View, view_from
@@ -107,10 +108,11 @@ def draw(found: Measured) -> Figure:
     axes.set(title="PSNR of test views (dB)", xlabel="pixels a side, relative to the training views")
     axes.legend(frameon=False)
     tidy(axes)
-    for panel, (name, picture) in zip(right.subplots(2, 2).ravel(), found.pictures.items(), strict=True):
-        height, width = picture.shape[:2]
+    height, width = found.pictures["photograph"].shape[:2]
+    panels = right.subplots(*((1, 4) if height > width else (2, 2))).ravel()
+    for panel, (name, picture) in zip(panels, found.pictures.items(), strict=True):
         panel.imshow(picture[height // 4 : 3 * height // 4, width // 4 : 3 * width // 4])
-        panel.set_title(f"{name}, zoom {found.zooms[-1]:g}", fontsize=9)
+        panel.set_title(f"{name}, x {found.zooms[-1]:g}", fontsize=9)
         panel.set(xticks=[], yticks=[])
     return figure
 

@@ -1,4 +1,4 @@
-"""Micro-splatting: small Gaussians, split where the photographs have edges, merged where two are one.
+"""Micro-splatting: small Gaussians, split at the photographs' edges, merged where alike.
 
 Micro-splatting, arXiv 2504.05740. Training makes Gaussians that are long or large, and a needle that explains an edge
 in one place is wrong beside it. Three changes to 3DGS (:mod:`minisplat_ref.extensions.micro.method`):
@@ -14,6 +14,12 @@ in one place is wrong beside it. Three changes to 3DGS (:mod:`minisplat_ref.exte
 ``--set`` reaches ``trace`` (lambda, 0 switches the halving off, too), ``trace_limit`` (the root of tau, in extents of
 the scene), ``beta``, ``merge_reach`` and ``merge_color``. With ``trace=0``, ``beta=0`` and ``merge_reach=0`` it is
 ``3dgs-accel``, bit for bit.
+
+Measured at equal count on a card that is half a fine checker, half a ramp (``study micro/checker``, 840 Gaussians): at
+the edges 20.5 dB against 16.9 of 3DGS, and scales in the card of a ratio of 3.8 against 7.4; on the ramp, where a few
+large Gaussians were enough, 38.9 dB against 52.0. It is the penalty that costs the ramp: detail alone gains 2.2 dB at
+the edges and costs 0.9 on the ramp. On the fox at 68 x 120, 1000 iterations, seed 0: 31.5 dB with 36,752 Gaussians;
+3DGS, its threshold lowered until it had 36,121, 30.8 dB.
 
 Where this deviates: the paper adds the P_k = max(tr(Sigma_k) - tau, 0) up; here they are averaged and measured in units
 of tau, so that lambda depends neither on the scene's unit nor on the number of Gaussians. Lambda, tau, beta and the

@@ -1,0 +1,56 @@
+"""The command ``minisplat-ref multi-scale build``: levels for a scene that was trained without any."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.multi_scale.levels import Plan, level_zero, with_levels
+from minisplat_ref.extensions.multi_scale.method import FACTOR, LEAST_COVERAGE, N_LEVELS, finest_densities
+from minisplat_ref.io.ply import load_ply, save_ply
+
+
+def add_parser(commands: Any) -> None:
+    """Add the command."""
+    parser = commands.add_parser("build", help="add coarser levels to a scene that was trained without")
+    parser.add_argument("ply", type=Path, metavar="PLY", help="point_cloud.ply of a run")
+    parser.add_argument("--cameras", type=Path, metavar="FILE", help="of its run (default cameras.json beside the PLY)")
+    parser.add_argument("--factor", type=float, default=FACTOR, metavar="F", help=f"of sizes (default {FACTOR})")
+    parser.add_argument("--levels", type=int, default=N_LEVELS, metavar="N", help=f"to add (default {N_LEVELS})")
+    parser.add_argument(
+        "--least-coverage",
+        type=float,
+        default=LEAST_COVERAGE,
+        metavar="PX",
+        help=f"what covers fewer pixels is merged (default {LEAST_COVERAGE:g})",
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="PLY to write")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Merge level after level, and write all.
+
+    Raises
+    ------
+    InputError
+        The PLY or the cameras cannot be used, or a number is out of range.
+    """
+    from minisplat_ref.io import viewpoints
+
+    if not (1 < args.factor <= 1024 and 1 <= args.levels <= 16 and args.least_coverage > 0):
+        raise InputError("give a --factor above 1, 1 to 16 --levels, and a --least-coverage above 0")
+    gaussians = load_ply(args.ply)
+    views = viewpoints.read(args.cameras or args.ply.parent / "cameras.json")
+    cameras = [view.camera for view in views if view.split != "test"]
+    levels = level_zero(gaussians, np.random.default_rng(0))
+    if len(gaussians.means) > 0:
+        plan = Plan(args.factor, args.levels, args.least_coverage)
+        levels = with_levels(levels, finest_densities(gaussians.means, cameras), plan, GSPLAT_MAIN)
+    save_ply(args.out, levels)
+    added = len(levels.means) - len(gaussians.means)
+    print(f"{added:,} coarser Gaussians beside {len(gaussians.means):,} in {args.out}")
+    return 0

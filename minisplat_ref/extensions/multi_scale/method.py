@@ -1,0 +1,117 @@
+"""How levels are drawn and trained."""
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.multi_scale.levels import MultiScaleGaussians, Plan, level_zero, with_levels
+from minisplat_ref.extensions.multi_scale.reference import are_shown, pixel_densities
+from minisplat_ref.extensions.shared_sampling import block_means, sampling_intervals, zoomed
+from minisplat_ref.methods.gaussian_splatting import GS
+from minisplat_ref.rendering import SPLATTING, Renderer, Request
+from minisplat_ref.strategy.ops import NO_PARENT, Edit, n_rows
+from minisplat_ref.training.losses import Cotangents, LossTerm, Rendered
+from minisplat_ref.training.rates import Rates
+from minisplat_ref.training.representation import Representation
+from minisplat_ref.training.schedule import At
+from minisplat_ref.training.state import Iteration, TrainState, apply_edit
+from minisplat_ref.types import Camera, Floats, Gaussians, Model, RenderOutput, View, view_from
+
+FACTOR, N_LEVELS = 4, 3  # levels for pictures of a 4th, a 16th and a 64th of the size, as in the paper
+LEAST_COVERAGE = 4.0  # pixels, of the ellipse in which alpha is at least 1/255: a deviation of 0.6 where it is opaque
+INSERTION = 15_000  # iteration: when densification has ended
+LEAST_SIZE = 8  # pixels a side of a picture that is trained on
+
+
+def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
+    """Draw of each place the level that suits the camera; the tape is that of 3DGS."""
+    g = model.gaussians
+    is_shown = are_shown(g.cells, pixel_densities(g.means, view.camera, request.conventions.near_plane))
+    if not is_shown.all():
+        is_shown = is_shown if request.is_visible is None else is_shown & request.is_visible
+        request = request._replace(is_visible=is_shown)
+    return SPLATTING.render(model, view, request)
+
+
+LEVELS = Representation(
+    "Gaussians in levels",
+    population=MultiScaleGaussians,
+    extend=level_zero,
+    renderer=Renderer("multi-scale", render, SPLATTING.render_vjp, SPLATTING.channels),
+    rates=Rates({"cells": 0.0}, frozenset()),
+)
+
+
+def finest_densities(means: Floats, cameras: list[Camera]) -> Floats:
+    """Return the largest number of pixels per world unit with which the cameras see each centre, [N].
+
+    Raises
+    ------
+    InputError
+        They see none.
+    """
+    intervals = sampling_intervals(means, cameras)
+    if not (intervals > 0).all():
+        raise InputError("no training view sees any of the Gaussians, levels have no size: give the cameras of the run")
+    return 1 / intervals
+
+
+def insert_levels(
+    state: TrainState, iteration: Iteration, *, factor: int, n_levels: int, least_coverage: float
+) -> str | None:
+    """Add the coarser levels to the population."""
+    n, plan = n_rows(state.gaussians), Plan(factor, n_levels, least_coverage)
+    if n == 0:
+        return "nothing done: there are no Gaussians"
+    densities = finest_densities(state.gaussians.means, [view.camera for view in iteration.scene.train_views])
+    gaussians: Any = with_levels(state.gaussians, densities, plan, iteration.conventions)
+    is_new = np.arange(n_rows(gaussians)) >= n
+    apply_edit(state, Edit(gaussians, np.where(is_new, NO_PARENT, np.arange(len(is_new))), is_new))
+    return None
+
+
+def coarse(
+    rendered: Rendered, *, factor: int, n_levels: int, period: int, dssim_weight: float
+) -> tuple[float, Cotangents]:
+    """Return the photometric loss of a smaller picture of the view, in every ``period``-th iteration; else nothing.
+
+    The levels take turns, as far as pictures of at least ``LEAST_SIZE`` pixels a side go. The gradient goes to the
+    Gaussians directly: this picture is not the one that the other terms see, and exposures and poses that are trained
+    are not applied to it.
+    """
+    view, request, model = rendered.view, rendered.request, rendered.model
+    sizes = [factor**level for level in range(1, n_levels + 1)]
+    sizes = [n for n in sizes if min(view.camera.width, view.camera.height) // n >= LEAST_SIZE]
+    if rendered.step % period or not sizes:
+        return 0.0, Cotangents()
+    n = sizes[rendered.step // period % len(sizes)]
+    mask = None if view.mask is None else block_means(view.mask[..., None].astype(np.float32), n)[..., 0] == 1
+    if mask is not None and not mask.any():
+        return 0.0, Cotangents()
+    small = view_from(zoomed(view.camera, 1 / n), time=view.time)
+    output, tape = render(model, small, request._replace(wants=frozenset()))
+    target = block_means(view.image.astype(np.float32) / 255, n).astype(output.image.dtype)
+    loss, loss_tape = request.backend.photometric_loss(output.image, target, dssim_weight, mask)
+    v = SPLATTING.render_vjp(tape, request.backend.photometric_loss_vjp(loss_tape), None)
+    return loss, Cotangents(gaussians={name: getattr(v.gaussians, name) for name in Gaussians._fields})
+
+
+MULTI_SCALE = GS._replace(
+    name="multi-scale",
+    losses=(
+        *GS.losses,
+        LossTerm(
+            "coarse",
+            partial(coarse, factor=FACTOR, n_levels=N_LEVELS, period=4, dssim_weight=0.2),
+            weight=0.1,
+            start=INSERTION,
+        ),
+    ),
+    events=(
+        *GS.events,
+        At(INSERTION, partial(insert_levels, factor=FACTOR, n_levels=N_LEVELS, least_coverage=LEAST_COVERAGE)),
+    ),
+)
+"""``multi-scale``: 3DGS, and from the middle of the training on coarser levels, trained on smaller pictures."""

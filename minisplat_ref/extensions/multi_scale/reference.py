@@ -1,0 +1,71 @@
+"""Which Gaussians a view shows, and how large they appear, in NumPy.
+
+A camera of focal length f shows ``c = f / z`` pixels per world unit at depth z. A cell of side w, a cube in which
+Gaussians were merged into one, covers w c pixels a side there.
+"""
+
+import numpy as np
+
+from minisplat_ref.constants import Conventions
+from minisplat_ref.types import Bools, Camera, Floats
+
+NO_CELL = float(np.finfo(np.float32).max)  # the side of the parent's cell where there is no parent: never too small
+
+
+def pixel_densities(means: Floats, camera: Camera, near_plane: float) -> Floats:
+    """Return ``c = sqrt(fx fy) / z`` [N], pixels per world unit, of centres [N, 3]; nearer ones count as at the plane.
+
+    In the dtype of the means.
+    """
+    z = means @ camera.cam_from_world_R[2].astype(means.dtype) + means.dtype.type(camera.cam_from_world_t[2])
+    return means.dtype.type(np.sqrt(camera.fx * camera.fy)) / np.maximum(z, means.dtype.type(near_plane))
+
+
+def are_shown(cells: Floats, densities: Floats) -> Bools:
+    """Return which Gaussians a view shows, [N].
+
+    ::
+
+        w c < 1 <= w' c
+
+    with the side w of a Gaussian's own cell and w' of its parent's. So what was merged gives way to what it was merged
+    into exactly where the cell shrinks below a pixel.
+
+    Parameters
+    ----------
+    cells : ndarray of shape (N, 2)
+        w, 0 of a Gaussian that was not merged; and w', ``NO_CELL`` without a parent. World units.
+    densities : ndarray of shape (N,)
+        c.
+    """
+    with np.errstate(over="ignore"):
+        own, parent = (cells * densities[:, None]).T
+    return (own < 1) & (parent >= 1)
+
+
+def coverages(log_scales: Floats, opacity_logits: Floats, densities: Floats, conventions: Conventions) -> Floats:
+    """Return how many pixels the shorter side of each Gaussian covers, seen from in front of it.
+
+    The ellipse in which alpha is at least ``alpha_min`` has, of a deviation s, the width::
+
+        S = 2 sqrt(2 ln(o / alpha_min)) s c
+
+    s is the middle one of the three: a flat Gaussian counts as wide, however it is turned, or it would leave when it is
+    seen on edge.
+
+    Parameters
+    ----------
+    log_scales : ndarray of shape (N, 3)
+    opacity_logits, densities : ndarray of shape (N,)
+    conventions : Conventions
+        ``alpha_min``.
+
+    Returns
+    -------
+    ndarray of shape (N,)
+        Pixels; 0 where the Gaussian is too faint to be seen.
+    """
+    log_opacities = -np.logaddexp(0, -opacity_logits)
+    reach = np.sqrt(2 * np.maximum(log_opacities - np.log(conventions.alpha_min), 0))
+    S: Floats = 2 * reach * np.exp(np.sort(log_scales, axis=1)[:, 1]) * densities
+    return S

@@ -1,0 +1,66 @@
+"""How finely cameras sample a scene, and the same scene at other samplings.
+
+At scale z a picture has z times as many pixels a side. A smaller photograph is the mean over blocks of pixels, which is
+what a sensor with larger pixels would have measured.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from minisplat_ref.types import Camera, Floats
+
+MARGIN = 0.15  # of the image's size, by which a centre may lie outside and still be seen
+NEAR = 0.2  # world units: what is nearer to a camera than that is not seen by it
+
+
+def sampling_intervals(means: Floats, cameras: Sequence[Camera]) -> Floats:
+    """Return the least distance between two pixels' rays at each centre, over the cameras that see it: ``z / f``.
+
+    Parameters
+    ----------
+    means : ndarray of shape (N, 3)
+        World frame.
+    cameras : sequence of Camera
+        f is the larger of a camera's two focal lengths.
+
+    Returns
+    -------
+    ndarray of shape (N,), float64
+        World units. What no camera sees gets the largest of the others, 0 where no camera sees anything.
+    """
+    intervals = np.full(len(means), np.inf)
+    for camera in cameras:
+        x, y, z = (means @ camera.cam_from_world_R.T + camera.cam_from_world_t).T.astype(np.float64)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        is_seen = (z > NEAR) & (np.abs(u - camera.width / 2) < (0.5 + MARGIN) * camera.width)
+        is_seen &= np.abs(v - camera.height / 2) < (0.5 + MARGIN) * camera.height
+        intervals[is_seen] = np.minimum(intervals[is_seen], z[is_seen] / max(camera.fx, camera.fy))
+    is_seen = np.isfinite(intervals)
+    intervals[~is_seen] = intervals[is_seen].max(initial=0.0)
+    return intervals
+
+
+def zoomed(camera: Camera, scale: float) -> Camera:
+    """Return the camera with ``scale`` times as many pixels a side, rounded down; the edge pixels are cut off.
+
+    The focal length is exactly ``scale`` times the old one, so that a block of old pixels is exactly one new pixel.
+    """
+    width, height = int(camera.width * scale), int(camera.height * scale)
+    return camera._replace(
+        fx=camera.fx * scale,
+        fy=camera.fy * scale,
+        cx=camera.cx * scale,
+        cy=camera.cy * scale,
+        width=width,
+        height=height,
+    )
+
+
+def block_means(image: Floats, n: int) -> Floats:
+    """Return the means [H // n, W // n, D] over blocks of n x n pixels; what is left at the edges is cut off."""
+    height, width = image.shape[0] // n, image.shape[1] // n
+    blocks = image[: height * n, : width * n].reshape(height, n, width, n, -1)
+    means: Floats = blocks.mean(axis=(1, 3))
+    return means
