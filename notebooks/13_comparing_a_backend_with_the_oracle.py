@@ -82,7 +82,7 @@ suspected = run_stages(suspect, scene, "float64")  # by itself, from the scene t
 a = scene.arrays
 
 shown = a["radii"][:, 0] > 0
-directions = {}  # the gradient by the position, turned into the camera's axes: right, down, forward
+directions = {}  # the gradient with respect to the position, turned into the camera's axes: right, down, forward
 for name, v_means in (("reference", a["v_means"]), ("suspect", suspected["v_means"])):
     directions[name] = v_means[shown] @ scene.camera.cam_from_world_R.T
 
@@ -90,7 +90,7 @@ figure, axes = plt.subplots(1, 4, figsize=(11, 2.6), width_ratios=(1.2, 1.2, 1.2
 show(axes[0], a["image"], "reference")
 shown_error = show_digits(axes[1], suspected["image"], a["image"], "error of the suspect's image")
 figure.colorbar(shown_error, ax=axes[1], label="log10")
-show(axes[2], 0.35 * a["image"] + 0.65, "gradient by the positions")
+show(axes[2], 0.35 * a["image"] + 0.65, "gradient, positions")
 largest = np.argsort(-np.linalg.norm(directions["reference"][:, :2], axis=1))[5:60]
 for (name, v), color, width in zip(directions.items(), (BLUE, RED), (0.014, 0.004), strict=True):
     style = {"color": color, "width": width, "angles": "xy", "scale": 25 * np.abs(v[largest]).mean(), "label": name}
@@ -101,7 +101,7 @@ axes[3].plot(a["v_scales"].ravel(), suspected["v_scales"].ravel(), ".", color=RE
 reach = 1.1 * float(np.quantile(np.abs(a["v_scales"]), 0.98))
 axes[3].plot([-reach, reach], [-reach, reach], color=GREY, linewidth=0.8)
 axes[3].set(xlim=(-reach, reach), ylim=(-reach, reach))
-axes[3].set(title="gradient by the scales", xlabel="reference", ylabel="suspect")
+axes[3].set(title="gradient, scales", xlabel="reference", ylabel="suspect")
 plt.show()
 
 names = ("v_means", "v_scales", "v_quats", "v_opacities", "v_sh_dc")
@@ -215,7 +215,7 @@ transposed = run_stages(planted("transposed-view", CPU), scene, "float64")
 figure, axes = plt.subplots(1, 4, figsize=(11, 2.3))
 show(axes[0], a["image"], "reference")
 show(axes[1], transposed["image"], "view rotation transposed")
-figure.colorbar(show_digits(axes[2], transposed["image"], a["image"], "error"), ax=axes[2], label="log10")
+figure.colorbar(show_digits(axes[2], transposed["image"], a["image"], "error, log10"), ax=axes[2])
 axes[3].set(title="ellipses", xlim=(0, 96), ylim=(64, 0), aspect="equal", xticks=[], yticks=[])
 for row in np.argsort(-a["radii"].max(axis=1))[10:50]:
     for conics, color in ((a["conics"], BLUE), (transposed["conics"], RED)):

@@ -1,0 +1,198 @@
+"""Notebooks: what is stored of them, and the script that stores and compares it. CI runs them, these tests do not."""
+
+import ast
+import base64
+import io
+import re
+
+import jupytext
+import nbformat
+import numpy as np
+import pytest
+from PIL import Image
+
+from data_tools import notebooks
+from data_tools.notebooks import FOLDER, PNG_MAX, ROOT, comparable, differences, executed, main, stripped
+
+STORED = sorted(FOLDER.glob("*.ipynb"))
+
+
+def png(values):
+    file = io.BytesIO()
+    Image.fromarray(np.asarray(values, np.uint8)).save(file, "PNG")
+    return base64.b64encode(file.getvalue()).decode()
+
+
+def notebook_of(*outputs, tags=(), source="1"):
+    cell = nbformat.v4.new_code_cell(source, metadata={"tags": list(tags)} if tags else {})
+    cell.outputs = list(outputs)
+    return nbformat.v4.new_notebook(cells=[cell])
+
+
+def printed(text, name="stdout"):
+    return nbformat.v4.new_output("stream", name=name, text=text)
+
+
+def picture(values):
+    return nbformat.v4.new_output("display_data", {"image/png": png(values), "text/plain": "<Figure>"})
+
+
+GREY = np.full((8, 9, 3), 100)
+
+
+# What is stored
+
+
+def test_every_notebook_is_here():
+    assert [path.name[:2] for path in STORED] == [f"{number:02}" for number in range(16)]
+    assert [path.stem for path in STORED] == sorted(path.stem for path in FOLDER.glob("[0-9]*.py"))
+
+
+@pytest.mark.parametrize("path", STORED, ids=lambda path: path.stem)
+def test_stored_notebook(path):
+    stored = nbformat.read(path, as_version=4)
+    text = jupytext.read(path.with_suffix(".py"))
+    assert [cell.source for cell in stored.cells] == [cell.source for cell in text.cells]
+    words = "\n".join(cell.source for cell in stored.cells if cell.cell_type == "markdown")
+    assert words.count("\n## Play\n") == 1 and words.count("\n## Exercises\n") == 1
+    assert words.count("<details>") == words.count("</details>") == 2
+    assert stored.cells[-1].cell_type == "code" and "\nassert " in stored.cells[-1].source
+
+    pngs = []
+    for cell in stored.cells:
+        for out in cell.get("outputs", []):
+            shown = str({kind: content for kind, content in out.get("data", {}).items() if kind != "image/png"})
+            assert not re.search(r"/(tmp|home|root|usr|work)/", out.get("text", "") + shown)
+            assert out.output_type != "error" and out.get("name") != "stderr"
+            if "image/png" in out.get("data", {}):
+                pngs.append(base64.b64decode(out.data["image/png"]))
+        assert cell.get("execution_count") is None and "execution" not in cell.metadata
+    assert len(pngs) >= 4 and max(map(len, pngs)) <= PNG_MAX
+    # A picture comes first: before a formula, and before the table of files.
+    first = next(k for k, cell in enumerate(stored.cells) if any("data" in out for out in cell.get("outputs", [])))
+    assert "$$" not in "".join(cell.source for cell in stored.cells[:first])
+
+
+@pytest.mark.parametrize("path", STORED, ids=lambda path: path.stem)
+def test_notebook_imports_public_names_and_names_files_that_exist(path):
+    source = path.with_suffix(".py").read_text()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ImportFrom | ast.Import):
+            names = [alias.name for alias in node.names] + [getattr(node, "module", None) or ""]
+            assert not any(part.startswith("_") for name in names for part in name.split(".")), names
+    for name in re.findall(r"`((?:minisplat_ref|tests)/[\w/.]*)`", source):
+        assert (ROOT / name).exists(), name
+
+
+# The script
+
+
+def test_the_same_is_the_same():
+    old, new = (notebook_of(printed("a 1.25\n"), picture(GREY)) for _ in range(2))
+    assert list(differences(old, new)) == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "what"),
+    [
+        (printed("a 1.25\n"), printed("a 1.26\n"), "1.26"),
+        (printed("a\n"), picture(GREY), "a picture"),
+        (picture(GREY), picture(GREY + 3), "3.00 of 255"),
+        (picture(GREY), picture(GREY[1:]), "9 x 7 pixels"),
+    ],
+)
+def test_a_difference_is_named(old, new, what):
+    [difference] = differences(notebook_of(old), notebook_of(new))
+    assert difference.startswith("cell 0: ") and what in difference
+
+
+def test_another_text_is_named():
+    assert list(differences(notebook_of(), notebook_of(source="2"))) == ["the stored notebook has another text"]
+
+
+def test_tags_leave_room():
+    old, new = notebook_of(printed("x   9.5 dB\n"), tags=["rounding"]), notebook_of(printed("x  10.5 dB\n"))
+    assert list(differences(old, new)) == []
+    [difference] = differences(old, notebook_of(printed("y 10.5 dB\n")))
+    assert "y # dB" in difference
+    noisy = notebook_of(picture(GREY), tags=["rounding"])
+    assert list(differences(noisy, notebook_of(picture(GREY + 7)))) == []
+    assert len(list(differences(noisy, notebook_of(picture(GREY + 9))))) == 1
+    timed = notebook_of(printed("3 s\n"), tags=["clock"])
+    assert list(differences(timed, notebook_of(printed("4 ms\n")))) == []
+    assert len(list(differences(timed, notebook_of(picture(GREY))))) == 1
+
+
+def test_errors_of_rounding_are_left_out():
+    assert comparable("error 3.1e-10, 0.0e+00\n", False) == comparable("error 2e-16, 4.4e-13\n", False)
+    assert comparable("error 3.1e-04\n", False) != comparable("error 3.2e-04\n", False)
+
+
+def test_what_changes_is_stripped():
+    path = printed(f"{ROOT}/notebooks/x\n")
+    result = nbformat.v4.new_output("execute_result", {"text/plain": "5"}, execution_count=7)
+    notebook = notebook_of(path, printed("a warning", name="stderr"), result, picture(GREY))
+    notebook.cells[0].execution_count = 3
+    notebook.cells[0].metadata["execution"] = {"iopub.execute_input": "2024-01-01T00:00:00"}
+    notebook.metadata["language_info"] = {"version": "3.11"}
+    [cell] = stripped(notebook, "x").cells
+    assert [out.get("text") for out in cell.outputs] == ["./notebooks/x\n", None, None]
+    assert cell.execution_count is None and cell.outputs[1].execution_count is None
+    assert "execution" not in cell.metadata and "language_info" not in notebook.metadata
+    assert list(cell.outputs[2].data) == ["image/png"]
+
+
+def test_a_large_picture_is_refused():
+    noise = np.random.default_rng(0).integers(0, 256, (400, 400, 3))
+    with pytest.raises(notebooks.InputError, match=r"x, cell 0: its picture has [\d,]+ bytes, more than 100,000"):
+        stripped(notebook_of(picture(noise)), "x")
+
+
+TEXT = """# %% [markdown]
+# A notebook.
+
+# %%
+number = 6 * 7
+print(number)
+
+# %% [markdown]
+# <details>
+# <summary>Solution</summary>
+#
+# ```python
+# assert number == SOLUTION
+# ```
+#
+# </details>
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(notebooks, "FOLDER", tmp_path)
+    (tmp_path / "00_small.py").write_text(TEXT.replace("SOLUTION", "42"))
+    return tmp_path
+
+
+def test_store_then_check_then_change(folder, capsys):
+    assert main(["00"]) == 0 and (folder / "00_small.ipynb").exists()
+    stored = nbformat.read(folder / "00_small.ipynb", as_version=4)
+    assert len(stored.cells) == 3 and stored.cells[1].outputs[0].text == "42\n"  # the solution ran and is not stored
+    assert main(["--check"]) == 0 and "00_small: as stored" in capsys.readouterr().out
+    text = (folder / "00_small.ipynb").read_text()
+    (folder / "00_small.ipynb").write_text(text.replace('"42\\n"', '"43\\n"'))
+    assert main(["--check"]) == 1 and "cell 1: text differs: - 43 + 42" in capsys.readouterr().out
+
+
+def test_a_wrong_solution_is_named(folder):
+    path = folder / "00_small.py"
+    path.write_text(TEXT.replace("SOLUTION", "41"))
+    with pytest.raises(notebooks.InputError, match=r"00_small.py, solution 1: AssertionError .*assert number == 41"):
+        executed(path)
+
+
+def test_an_unknown_name_is_answered_with_those_that_exist(folder, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["99"])
+    error = capsys.readouterr().err
+    assert stop.value.code == 2 and "no notebook's name begins with '99'" in error and error.count("\n") == 1
