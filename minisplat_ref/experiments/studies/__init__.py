@@ -68,8 +68,8 @@ def _add_seeds(parser: argparse.ArgumentParser) -> None:
 
 def _add_adaptive_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
-        "Train a scene by adaptive and by recipes with a schedule, as it is and\ndisturbed. The same command with the same "
-        "folder goes on where it was interrupted."
+        "Train a scene by adaptive and by recipes with a schedule, as it is and\ndisturbed. The same command with "
+        "the same folder goes on where it was\ninterrupted."
     )
     names = ", ".join(SYNTHETIC_SCENES)
     parser.add_argument("scene", metavar="SCENE", help=f"folder of a scene, or a synthetic one: {names}")
