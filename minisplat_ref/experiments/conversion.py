@@ -18,6 +18,7 @@ from minisplat_ref.io.ply import further_properties
 from minisplat_ref.types import Gaussians, Model
 
 MOST_VIEWS = 24
+NO_DROP = 1e-5  # dB: files have another order, in which Gaussians of equal depth are drawn; 2e-7 has been seen
 
 
 class Source(NamedTuple):
@@ -190,7 +191,7 @@ def coarsest_within(
     for level in reversed(range(len(format_.levels))):
         content = format_.encode(gaussians, level)
         drop = before - psnr_of(format_.decode(content, format_.suffix))
-        if drop <= max_drop:
+        if drop <= max_drop + NO_DROP:
             return Choice(level, content, drop)
     raise InputError(
         f"every level of {format_.suffix} loses more than {max_drop:g} dB, the finest {drop:.3f}: allow more, or choose"

@@ -104,9 +104,9 @@ def mean_and_deviation(values: Sequence[float]) -> tuple[float, float]:
 
 
 def with_deviation(values: Sequence[float], digits: int) -> str:
-    """Return mean and deviation as a table has them."""
+    """Return mean and deviation as a table has them; the number itself if it is only one."""
     mean, deviation = mean_and_deviation(values)
-    return f"{mean:.{digits}f} ± {deviation:.{digits}f}"
+    return f"{mean:.{digits}f} ± {deviation:.{digits}f}" if len(values) > 1 else f"{mean:.{digits}f}"
 
 
 def tidy(axes: "Axes") -> None:

@@ -21,6 +21,11 @@ together, and zstandard packs them. There are 13 levels; level 0 keeps each floa
 What to know: the order of the Gaussians is not kept, and nothing depends on it but ties in depth. Quaternions come back
 with another length, which means nothing. Files keep the six fields of 3DGS; the fields of an extension need a PLY.
 
+Measured on the room (``study compression/rate-distortion room``, three seeds): of 248 bytes a Gaussian in a PLY level 5
+leaves 34 and loses 0.004 dB, level 10 leaves 18.5 and loses 0.10 dB; SPZ has 18.8 and loses 0.29 dB. On the fox, 1,500
+iterations, SPZ loses 1.21 dB, of which 1.19 are its higher harmonics of 4 and 5 bits, and level 10 loses 0.21 dB at the
+same size. Where the room is 512 times smaller, the fixed steps of SPZ lose 10.9 dB, and level 5 loses what it lost.
+
 Left out: pruning, merging and training with the quantiser in the loop, which gain more than any packer; vector
 quantisation, which ``.omg`` does; arithmetic coding.
 """

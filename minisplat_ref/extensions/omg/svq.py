@@ -8,7 +8,7 @@ which parts go together.
 Codes are found by Lloyd's iteration: assign each vector to the nearest code, move each code to the mean of its own.
 Where codes begin decides what becomes of the rare vectors. Begun at random vectors, most codes are in the crowd and a
 dozen iterations do not bring them out of it: of 10,250 Gaussians' log scales with 64 codes each, the worst was off by
-1.53, and 0.20 dB were lost. Here they begin evenly over the space that vectors occupy: 0.11, and 0.02 dB. Nothing is
+1.53. Here they begin evenly over the space that vectors occupy: 0.11, and a tenth of the decibels are lost. Nothing is
 drawn, so the same vectors have the same codes.
 """
 
