@@ -312,6 +312,8 @@ def test_levels_are_built_of_a_trained_scene_and_drawn(scene_folder, tmp_path, c
     for i, size in enumerate(sizes):
         for name, extension in (("ours", ["--extension", "multi-scale"]), ("theirs", [])):
             assert main(["render", str(out), *size, *extension, "--out", str(tmp_path / f"{name}{i}")]) == 0
+    assert main(["multi-scale", "build", str(out), "--out", str(tmp_path / "twice.ply")]) == 2
+    assert "has levels already" in capsys.readouterr().err and not (tmp_path / "twice.ply").exists()
     assert main(["render", ply, "--extension", "multi-scale"]) == 2
     assert "no property cells" in capsys.readouterr().err
     for options, words in (

@@ -10,7 +10,7 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.multi_scale.levels import Plan, level_zero, with_levels
 from minisplat_ref.extensions.multi_scale.method import FACTOR, LEAST_COVERAGE, N_LEVELS, finest_densities
-from minisplat_ref.io.ply import load_ply, save_ply
+from minisplat_ref.io.ply import further_properties, load_ply, save_ply
 
 
 def add_parser(commands: Any) -> None:
@@ -44,6 +44,8 @@ def run(args: argparse.Namespace) -> int:
     if not (1 < args.factor <= 1024 and 1 <= args.levels <= 16 and args.least_coverage > 0):
         raise InputError("give a --factor above 1, 1 to 16 --levels, and a --least-coverage above 0")
     gaussians = load_ply(args.ply)
+    if "cells_0" in further_properties(args.ply):
+        raise InputError(f"{args.ply} has levels already: give a scene that was trained without")
     views = viewpoints.read(args.cameras or args.ply.parent / "cameras.json")
     cameras = [view.camera for view in views if view.split != "test"]
     levels = level_zero(gaussians, np.random.default_rng(0))

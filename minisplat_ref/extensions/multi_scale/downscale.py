@@ -28,8 +28,8 @@ EARLY = 4  # times smaller cells are pretended, so that coarse Gaussians come wh
 COMPENSATED = GSPLAT_MAIN._replace(is_antialiased=True)
 COLORS = dict(
     zip(
-        ("3dgs", "compensated", *PLANS, "too early", "trained"),
-        ("#8a8580", "#e0a526", "#6aa84f", "#35608c", "#9b6fb0", "#d2493f"),
+        ("3dgs", "compensated", *PLANS, "levels 4, compensated", "too early", "trained"),
+        ("#8a8580", "#e0a526", "#6aa84f", "#35608c", "#2fa3a3", "#9b6fb0", "#d2493f"),
         strict=True,
     )
 )
@@ -64,6 +64,7 @@ def ways(scene: Scene, iterations: int, seed: int) -> dict[str, Drawn]:
         "3dgs": Drawn(plain, SPLATTING),
         "compensated": Drawn(plain, SPLATTING, COMPENSATED),
         **{name: Drawn(gaussians, LEVELS.renderer) for name, gaussians in built.items()},
+        "levels 4, compensated": Drawn(built["levels 4"], LEVELS.renderer, COMPENSATED),
         "too early": Drawn(early, LEVELS.renderer),
         "trained": Drawn(trained, LEVELS.renderer),
     }
@@ -134,7 +135,7 @@ def draw(found: Measured) -> Figure:
     left.legend(frameon=False, fontsize=8)
     for panel, (name, image) in zip(lower.subplots(1, len(found.pictures)), found.pictures.items(), strict=True):
         panel.imshow(image)
-        panel.set_title(name, fontsize=9)
+        panel.set_title(name.replace(", ", ",\n"), fontsize=9)
         panel.set(xticks=[], yticks=[])
     return figure
 
