@@ -123,6 +123,11 @@ def test_tags_leave_room():
     assert len(list(differences(timed, notebook_of(picture(GREY))))) == 1
 
 
+def test_how_often_a_line_comes_is_rounding():
+    assert comparable("event 1\nevent   22\nend\n", True) == comparable("event 7\nend\n", True)
+    assert comparable("event 1\nend\n", True) != comparable("event 1\n", True)
+
+
 def test_errors_of_rounding_are_left_out():
     assert comparable("error 3.1e-10, 0.0e+00\n", False) == comparable("error 2e-16, 4.4e-13\n", False)
     assert comparable("error 3.1e-04\n", False) != comparable("error 3.2e-04\n", False)
