@@ -32,7 +32,7 @@ import jupytext
 import nbformat
 import numpy as np
 from nbclient import NotebookClient
-from nbclient.exceptions import CellExecutionError
+from nbclient.exceptions import CellExecutionError, CellTimeoutError, DeadKernelError
 from PIL import Image
 
 from minisplat_ref.errors import InputError, one_line
@@ -72,7 +72,8 @@ def executed(text: Path) -> Notebook:
     Raises
     ------
     InputError
-        If a cell or a solution fails, or a picture is larger than :data:`PNG_MAX`.
+        If a cell or a solution fails or takes longer than :data:`SECONDS_MAX`, or a picture is larger than
+        :data:`PNG_MAX`.
     """
     notebook = jupytext.read(text)
     cells = list(notebook.cells)
@@ -96,6 +97,8 @@ def executed(text: Path) -> Notebook:
         where = f"cell {number}" if number < len(cells) else f"solution {number - len(cells) + 1}"
         line = next((line[5:].strip() for line in _plain(error.traceback).splitlines() if line.startswith("---->")), "")
         raise InputError(f"{text.name}, {where}: {error.ename} {error.evalue} at: {line}") from None
+    except (CellTimeoutError, DeadKernelError) as error:
+        raise InputError(f"{text.name}: a cell takes more than {SECONDS_MAX} s, or Python died: {error}") from None
     notebook.cells = cells
     return stripped(notebook, text.stem)
 
@@ -225,8 +228,7 @@ def comparable(text: str, is_rounded: bool) -> list[str]:
 
 def _paths(names: Sequence[str]) -> list[Path]:
     """Texts of the notebooks whose names begin with one of these."""
-    every = sorted(path.with_suffix(".py") for path in FOLDER.glob("*.ipynb"))
-    every += sorted(path for path in FOLDER.glob("[0-9]*.py") if path not in every)
+    every = sorted(FOLDER.glob("[0-9]*.py"))
     for name in names:
         if not any(path.stem.startswith(name) for path in every):
             raise InputError(f"no notebook's name begins with {name!r}: there are {every[0].stem} to {every[-1].stem}")
@@ -244,6 +246,8 @@ def store(text: Path) -> str:
 
 def check(text: Path) -> str:
     """Run a notebook afresh; return how it differs from what is stored, or nothing."""
+    if not text.with_suffix(".ipynb").exists():
+        return "nothing is stored"
     return "; ".join(differences(nbformat.read(text.with_suffix(".ipynb"), as_version=4), executed(text)))  # type: ignore[no-untyped-call]
 
 
@@ -257,7 +261,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("names", nargs="*", metavar="NAME", help="beginnings of names, like 03 (default: all)")
     parser.add_argument("--check", action="store_true", help="run afresh and compare; nothing is written")
     args = parser.parse_args(arguments)
-    is_same = True
+    different = []
     try:
         paths = _paths(args.names)
     except InputError as error:
@@ -271,8 +275,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             what, is_good = str(error), False
         seconds = time.perf_counter() - start
         print(one_line(f"{path.stem}: {what or 'as stored'} ({seconds:.0f} s)"), flush=True)
-        is_same = is_same and is_good
-    return 0 if is_same else 1
+        if not is_good:
+            different.append(path.stem[:2])
+    if different and args.check:
+        print(f"what is meant to be different is stored by: python -m data_tools.notebooks {' '.join(different)}")
+    return 1 if different else 0
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ import numpy as np
 from matplotlib.patches import Rectangle
 from scipy.ndimage import gaussian_filter
 
-from figures import BLUE, GREY, RED, YELLOW, show, show_code
+from figures import BLUE, GREY, RED, YELLOW, show, show_code, show_error
 from minisplat_ref.constants import SSIM_SIGMA, SSIM_WINDOW
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.metrics import psnr
@@ -288,7 +288,7 @@ sizes = [
 figure, axes = plt.subplots(1, 3, figsize=(11, 2.6))
 show(axes[0], my_image, f"yours, PSNR {psnr(my_image, photo):.1f} dB")
 my_l1, my_dssim = (photometric_loss(my_image, photo, weight)[0] for weight in (0.0, 1.0))
-show(axes[1], np.abs(my_image - photo).mean(axis=2), f"L1 {my_l1:.3f}", cmap="magma", vmin=0, vmax=0.15)
+show_error(axes[1], my_image, photo, f"L1 {my_l1:.3f}", vmax=0.15)
 show(axes[2], 1 - ssim_map(my_image, photo).mean(axis=2), f"1 - SSIM {my_dssim:.3f}", cmap="magma", vmin=0, vmax=0.5)
 plt.show()
 print(f"size of the gradient: (1 - w) L1 {sizes[0]:.2f}, w (1 - SSIM) {sizes[1]:.2f}")

@@ -30,7 +30,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.collections import EllipseCollection
 
-from figures import BLUE, GREY, RED, YELLOW, covariances2d, ellipse_axes, show, show_code
+from figures import BLUE, GREY, RED, YELLOW, covariances2d, ellipse_axes, show, show_code, show_error
 from minisplat_ref.backends import CPU
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods import RECIPES, get_recipe
@@ -237,7 +237,7 @@ for line, (title, gaussians) in zip(axes, {"before": first, "after": state.gauss
     renders.append((output, tape))
     show(line[0], truth, "photograph")
     show(line[1], output.image, f"render {title}")
-    error = show(line[2], np.abs(output.image - truth).mean(axis=2), f"error {title}", cmap="magma", vmin=0, vmax=0.3)
+    error = show_error(line[2], output.image, truth, f"error {title}")
     figure.colorbar(error, ax=line[2], shrink=0.9)
 plt.show()
 

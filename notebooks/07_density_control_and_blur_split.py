@@ -32,7 +32,7 @@ from functools import partial
 import matplotlib.pyplot as plt
 import numpy as np
 
-from figures import BLUE, GREY, RED, YELLOW, covariances2d, draw_ellipses, show, show_code
+from figures import BLUE, GREY, RED, YELLOW, covariances2d, draw_ellipses, show, show_code, show_error
 from minisplat_ref.backends import CPU
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
@@ -72,7 +72,7 @@ for k, (name, photograph) in enumerate(photographs.items()):
     v_means2d = render_vjp(tape, CPU.photometric_loss_vjp(loss_tape)).means2d
     pulls[name] = float(screen_gradient_norms(v_means2d, SIZE, SIZE)[0])
     show(axes[1 + 2 * k], target, name)
-    show(axes[2 + 2 * k], np.abs(output.image - target).mean(axis=2), f"error, loss {loss:.2f}", cmap="magma", vmax=1)
+    show_error(axes[2 + 2 * k], output.image, target, f"error, loss {loss:.2f}", vmax=1)
     arrow = -5e3 * v_means2d[0]
     centre = tape.projection.means2d[0]
     axes[1 + 2 * k].annotate(
@@ -404,16 +404,16 @@ show(axes[1, 0], np.where(red_masks[1][:, :, None], truth, 0.25 * truth), "the r
 for column, (title, gaussians) in enumerate(chosen.items(), start=1):
     image = render(gaussians, held_out.camera, background=scene.background)[0].image
     show(axes[0, column], image, title)
-    error = show(axes[1, column], np.abs(image - truth).mean(axis=2), "error", cmap="magma", vmin=0, vmax=0.3)
+    error = show_error(axes[1, column], image, truth)
 figure.colorbar(error, ax=axes[1, 1:], shrink=0.9)
 plt.show()
 
 # %% [markdown]
 # With halves on the longest axis, blur split renders what was blurred, and the walls gain most. With random children,
 # in a run as short as this, SSIM gains a little and PSNR is lower than without it. The Gaussians that it splits are the
-# largest of all: a child that is drawn a metre away hangs somewhere in the room, the wall behind has a hole, and every
-# event comes before the last one is repaired. The released code draws at random and has thousands of iterations for the
-# repair. The recipes of this package use halves.
+# largest of all: a child that is drawn a metre away ends up somewhere in the room, the wall behind it has a hole, and
+# every event comes before the last one is repaired. The released code draws at random and has thousands of iterations
+# for the repair. The recipes of this package use halves.
 #
 # The thresholds matter, too. `minisplat-ref study split SCENE --out DIR` trains a whole recipe in all four ways: on
 # this room at 160 x 120 pixels, in 1500 iterations of `mini-splatting-d`, they end within 0.1 dB of each other. There

@@ -32,7 +32,7 @@ import numpy as np
 from matplotlib.patches import Ellipse
 from scipy.spatial import cKDTree
 
-from figures import BLUE, GREEN, GREY, RED, YELLOW, show, show_code
+from figures import BLUE, GREEN, GREY, RED, YELLOW, show, show_code, show_error
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods import get_recipe
@@ -367,7 +367,7 @@ figure, axes = plt.subplots(1, 3, figsize=(11, 2.9))
 images = [render(gaussians, held_out.camera, background=scene.background)[0].image for gaussians in (few, trimmed)]
 for panel, gaussians, image, label in zip(axes, (few, trimmed), images, ("before", "after"), strict=False):
     show(panel, image, f"{label}: {len(gaussians.means):,}, {quality(gaussians):.2f} dB")
-shown = show(axes[2], np.abs(images[1] - images[0]).mean(axis=2), "difference", cmap="magma", vmin=0, vmax=0.1)
+shown = show_error(axes[2], *images, "difference", vmax=0.1)
 figure.colorbar(shown, ax=axes[2], shrink=0.9)
 plt.show()
 

@@ -24,7 +24,8 @@
 #   weight.
 #
 # The picture shows the first idea on one Gaussian. A plain copy in the same place makes it more opaque; two copies that
-# share its opacity are still too wide; two that share opacity and scale are what it was, nearly.
+# share its opacity are still too wide; two that share opacity and scale look
+# nearly like the original.
 
 # %%
 import copy
@@ -34,7 +35,7 @@ from functools import partial
 import matplotlib.pyplot as plt
 import numpy as np
 
-from figures import BLUE, GREEN, GREY, RED, YELLOW, show, show_code
+from figures import BLUE, GREEN, GREY, RED, YELLOW, show, show_code, show_error
 from minisplat_ref.backends import CPU
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods import gaussian_splatting, get_recipe, mini_splatting2
@@ -219,7 +220,7 @@ for panel, (name, g) in zip(axes[:3], doubled.items(), strict=True):
     show(panel, image, f"{name}: {len(g.means)}")
     if name != "before":
         panel = axes[3 if name == "plain copies" else 4]
-        change = show(panel, np.abs(image - everything).mean(axis=2), f"change: {name}", cmap="magma", vmin=0, vmax=0.2)
+        change = show_error(panel, image, everything, f"change: {name}", vmax=0.2)
 figure.colorbar(change, ax=axes[3:], shrink=0.7)
 plt.show()
 for name, value in quality.items():
@@ -252,9 +253,7 @@ axes[0].set(title="weight of the heaviest", xlabel="Gaussians", ylim=(0, 1.05))
 axes[0].legend(frameon=False, fontsize=7, loc=(0.2, 0.3))
 show(axes[1], output.image, f"all: {n_seen}")
 show(axes[2], culled_output.image, f"the visible: {n_visible}")
-change = show(
-    axes[3], np.abs(culled_output.image - output.image).mean(axis=2), "change", cmap="magma", vmin=0, vmax=0.2
-)
+change = show_error(axes[3], culled_output.image, output.image, "change", vmax=0.2)
 figure.colorbar(change, ax=axes[3], shrink=0.8)
 plt.show()
 
@@ -420,7 +419,7 @@ for column, (name, end) in enumerate(ends.items(), start=1):
     image = render(end.gaussians, held_out.camera, **options)[0].image
     results[name] = evaluate(end.gaussians, scene.test_views, background=scene.background)
     show(axes[0, column], image, f"{name}: {len(end.gaussians.means)}")
-    error = show(axes[1, column], np.abs(image - truth).mean(axis=2), "error", cmap="magma", vmin=0, vmax=0.3)
+    error = show_error(axes[1, column], image, truth)
 figure.colorbar(error, ax=axes[1, 1:], shrink=0.9)
 plt.show()
 for name, result in results.items():

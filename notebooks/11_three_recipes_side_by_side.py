@@ -30,7 +30,7 @@ from functools import partial
 import matplotlib.pyplot as plt
 import numpy as np
 
-from figures import BLUE, GREEN, RED, show
+from figures import BLUE, GREEN, RED, show, show_error
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.metrics import evaluate
@@ -133,7 +133,7 @@ axes[1, 0].axis("off")
 for column, (name, (gaussians, _, curve, _)) in enumerate(results.items(), start=1):
     image = render(gaussians, held_out.camera, background=scene.background)[0].image
     show(axes[0, column], image, f"{name}: {len(gaussians.means):,}, {curve[-1, 3]:.2f} dB")
-    error = show(axes[1, column], np.abs(image - truth).mean(axis=2), "error", cmap="magma", vmin=0, vmax=0.3)
+    error = show_error(axes[1, column], image, truth)
 figure.colorbar(error, ax=axes[1, 0], location="right", shrink=0.9)
 plt.show()
 
@@ -232,7 +232,7 @@ for column, (name, action) in zip(axes.T, chosen, strict=True):
     counts, psnrs = entry["counts"], entry["psnrs"]
     show(column[0], images[0], f"{name}\nbefore {action}\n{counts[0]:,}, {psnrs[0]:.2f} dB")
     show(column[1], images[1], f"after\n{counts[1]:,}, {psnrs[1]:.2f} dB")
-    difference = show(column[2], np.abs(images[1] - images[0]).mean(axis=2), "", cmap="magma", vmin=0, vmax=0.2)
+    difference = show_error(column[2], *images, "", vmax=0.2)
 figure.colorbar(difference, ax=axes[2], shrink=0.9)
 plt.show()
 

@@ -448,7 +448,7 @@ plt.show()
 #
 # Let the entries be of very different sizes, as they are for means, scales and colours: the small ones hardly enter the
 # cosine. With entries of size 1 and a single one of size 0.02, its sign changes the cosine by less than $10^{-4}$, and
-# this parameter moves away from its optimum for ever. Compare parameter by parameter.
+# this parameter moves away from its optimum forever. Compare parameter by parameter.
 #
 # ```python
 # right_one = np.append(np.ones(19), 0.02)

@@ -123,6 +123,11 @@ def test_tags_leave_room():
     assert len(list(differences(timed, notebook_of(picture(GREY))))) == 1
 
 
+def test_how_often_a_line_comes_is_rounding():
+    assert comparable("event 1\nevent   22\nend\n", True) == comparable("event 7\nend\n", True)
+    assert comparable("event 1\nend\n", True) != comparable("event 1\n", True)
+
+
 def test_errors_of_rounding_are_left_out():
     assert comparable("error 3.1e-10, 0.0e+00\n", False) == comparable("error 2e-16, 4.4e-13\n", False)
     assert comparable("error 3.1e-04\n", False) != comparable("error 3.2e-04\n", False)
@@ -175,19 +180,30 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_store_then_check_then_change(folder, capsys):
+    assert main(["--check"]) == 1 and "00_small: nothing is stored" in capsys.readouterr().out
     assert main(["00"]) == 0 and (folder / "00_small.ipynb").exists()
     stored = nbformat.read(folder / "00_small.ipynb", as_version=4)
     assert len(stored.cells) == 3 and stored.cells[1].outputs[0].text == "42\n"  # the solution ran and is not stored
     assert main(["--check"]) == 0 and "00_small: as stored" in capsys.readouterr().out
     text = (folder / "00_small.ipynb").read_text()
     (folder / "00_small.ipynb").write_text(text.replace('"42\\n"', '"43\\n"'))
-    assert main(["--check"]) == 1 and "cell 1: text differs: - 43 + 42" in capsys.readouterr().out
+    assert main(["--check"]) == 1
+    shown = capsys.readouterr().out
+    assert "cell 1: text differs: - 43 + 42" in shown and shown.endswith("python -m data_tools.notebooks 00\n")
 
 
 def test_a_wrong_solution_is_named(folder):
     path = folder / "00_small.py"
     path.write_text(TEXT.replace("SOLUTION", "41"))
     with pytest.raises(notebooks.InputError, match=r"00_small.py, solution 1: AssertionError .*assert number == 41"):
+        executed(path)
+
+
+def test_a_cell_that_does_not_end_is_named(folder, monkeypatch):
+    monkeypatch.setattr(notebooks, "SECONDS_MAX", 1)
+    path = folder / "00_small.py"
+    path.write_text("# %%\nimport time\n\ntime.sleep(60)\n")
+    with pytest.raises(notebooks.InputError, match=r"00_small.py: a cell takes more than 1 s"):
         executed(path)
 
 
