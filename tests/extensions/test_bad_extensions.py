@@ -78,6 +78,9 @@ def scene_folder(tmp_path_factory):
     return folder
 
 
+SCHEDULED = ("--recipe", "3dgs-accel")  # which is content with four views
+
+
 def train(scene, out, *options):
     return ["train", str(scene), "--iterations", "2", "--out", str(out), *map(str, options)]
 
@@ -105,7 +108,9 @@ def test_everything_else_works_beside_it(outside, tmp_path, scene_folder, capfd)
     outside("broken", "raise RuntimeError('nothing')")
     for command in (
         train(scene_folder, tmp_path / "core", "--recipe", "3dgs-accel"),
-        train(scene_folder, tmp_path / "geometry", "--extension", "geometry", "--set", "depth_smoothness=0.1"),
+        train(
+            scene_folder, tmp_path / "geometry", *SCHEDULED, "--extension", "geometry", "--set", "depth_smoothness=0.1"
+        ),
         ["info", str(scene_folder)],
         ["eval", str(tmp_path / "core")],
         ["render", str(tmp_path / "core")],
@@ -175,7 +180,7 @@ def test_two_extensions_of_one_name(outside, refused, scene_folder, tmp_path):
         line = refused(*command)
         assert "extension velocity is in " in line and f"and in {package}: rename one" in line
     for command in (
-        train(scene_folder, tmp_path / "core"),
+        train(scene_folder, tmp_path / "core", *SCHEDULED),
         ["eval", str(tmp_path / "core")],
         ["info", str(scene_folder)],
     ):

@@ -152,6 +152,6 @@ def test_it_trains_as_the_page_says(faint, tmp_path):
     logits = []
     for options in (arguments, ["train", str(scene)]):
         out = tmp_path / f"out{len(logits)}"
-        assert main([*options, "--iterations", "30", "--out", str(out)]) == 0
+        assert main([*options, "--recipe", "3dgs-accel", "--iterations", "30", "--out", str(out)]) == 0
         logits.append(load_ply(out / "point_cloud.ply").opacity_logits.mean())
     assert logits[0] < logits[1]
