@@ -17,9 +17,9 @@ codebook for each part (:mod:`minisplat_ref.extensions.omg.svq`). ``.omg`` is th
     minisplat-ref convert runs/small small.omg
     minisplat-ref study omg/distinctiveness room --out DIR
 
-Measured (``study omg/distinctiveness``): of half the Gaussians, distinctiveness gains 0.3 dB on the room and on the fox,
-because the textured half of the pixels gains more (0.7 and 0.4 dB) than the flat half loses (1.6 and 0.3 dB, of a far
-smaller error). Of an eighth, it gains 1.2 dB on the room and loses 0.7 dB on the fox, where the flat half is 2.1 dB
+Measured (``study omg/distinctiveness``): of half the Gaussians, distinctiveness gains 0.3 dB on the room and on the
+fox, because the textured half of the pixels gains more (0.7 and 0.4 dB) than the flat half loses (1.6 and 0.3 dB, of a
+far smaller error). Of an eighth, it gains 1.2 dB on the room and loses 0.7 dB on the fox, where the flat half is 2.1 dB
 worse. Before fine-tuning it is worse everywhere. A file with the paper's codebooks loses 0.35 and 0.87 dB, of which the
 three features of the harmonics alone make 0.28 and 0.59. At these sizes the codebooks do not pay: the fox, 10,250
 Gaussians after 300 iterations, takes 112 kB and loses 0.68 dB at level 3; the coarsest ``.msz`` of 112 kB loses 0.45.
