@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+import zstandard
 from compact import check_damage, check_headers, population, refusal, short_run, with_header
 from numpy.testing import assert_allclose, assert_array_equal
 from tolerances import CLOSED_FORM, HALF_FLOAT
@@ -268,18 +269,31 @@ def test_files_that_lie():
     for lie in [*lies, {"planes": {"means": 1}}, {"sh_degree": 4}, {"codes": codes | {"scales": [-1, 2, 3]}}]:
         assert "does not describe Gaussians" in refusal(omg.OMG_FILE, with_header(content, **lie))
     assert "damaged" in refusal(omg.OMG_FILE, with_header(content, codes=codes))
-    assert "codebook" in refusal(omg.OMG_FILE, with_one_code(content))
+    assert "codebook" in refusal(omg.OMG_FILE, repacked(content, lose_codes))
+    assert "means is nan" in refusal(omg.OMG_FILE, repacked(content, make_nan))
 
 
-def with_one_code(content):
-    """A file whose codebook of opacities has lost all its codes but one."""
+def repacked(content, change):
+    """The file with its header and streams changed, and every checksum right."""
     packed = omg.take_apart(omg.CONTAINER, content, "")
     header = {name: value for name, value in packed.header.items() if name != "streams"}
-    header["codes"] = header["codes"] | {"opacities": [1]}
-    zstandard = pytest.importorskip("zstandard")
     streams = {name: zstandard.ZstdDecompressor().decompress(frame) for name, frame in packed.frames.items()}
-    streams["opacities codes"] = streams["opacities codes"][:2]
+    change(header, streams)
     return omg.pack(omg.CONTAINER, header, streams)
+
+
+def lose_codes(header, streams):
+    """Leave one code of opacities."""
+    header["codes"] = header["codes"] | {"opacities": [1]}
+    streams["opacities codes"] = streams["opacities codes"][:2]
+
+
+def make_nan(header, streams):
+    """Let the first centre be a signalling NaN, 0x7d00: twice that, by the zigzag map, in two planes."""
+    n = header["planes"]["means"] * 3 * header["n"]
+    low, high = bytearray(n // 2), bytearray(n // 2)
+    high[0] = 2 * 0x7D
+    streams["means"] = bytes(low + high)
 
 
 def test_damaged_anywhere(rng):

@@ -165,8 +165,9 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
     features = vectors["appearance"][:, 3 : 3 + header.n_features]
     with np.errstate(over="ignore", invalid="ignore"):  # of damaged files; what is not finite is refused
         harmonics = Decoder(table[0], table[1:]).harmonics(features)
+        means = np.asarray(header.center, np.float32) + bits.view(np.float16).astype(np.float32)
     gaussians = Gaussians(
-        means=np.asarray(header.center, np.float32) + bits.view(np.float16).astype(np.float32),
+        means=means,
         quats=vectors["rotations"],
         log_scales=vectors["scales"],
         opacity_logits=vectors["opacities"][:, 0],
