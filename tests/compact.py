@@ -12,6 +12,7 @@ from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
+from minisplat_ref.experiments.fuzzing.mutations import change_json
 from minisplat_ref.types import Gaussians
 
 FEW_BYTES = 2_000_000  # that a refusal may take, whatever the file claims
@@ -63,6 +64,20 @@ def check_damage(format_, content, rng, n_changes):
         else:
             assert all(np.isfinite(field).all() for field in back)
     assert n_refused > 0.75 * n_changes
+
+
+def check_headers(format_, content, rng, n_changes):
+    """Headers that say something else, with right lengths: files are refused in one line, or are Gaussians."""
+    length = struct.unpack("<I", content[6:10])[0]
+    for _ in range(n_changes):
+        text = change_json(content[10 : 10 + length], lambda n: int(rng.integers(n)))
+        try:
+            damaged = content[:6] + struct.pack("<I", len(text)) + text + content[10 + length :]
+            format_.describe(damaged, "lie.bin")
+            back = format_.decode(damaged, "lie.bin")
+        except InputError:
+            continue
+        assert all(np.isfinite(field).all() for field in back)
 
 
 def short_run(folder, recipe="3dgs-accel", *options):

@@ -7,7 +7,16 @@ from functools import partial
 
 import numpy as np
 import pytest
-from compact import check_damage, population, refusal, refused_line, rotation_error, short_run, with_header
+from compact import (
+    check_damage,
+    check_headers,
+    population,
+    refusal,
+    refused_line,
+    rotation_error,
+    short_run,
+    with_header,
+)
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -186,6 +195,13 @@ def test_truncated_anywhere(format_):
 @pytest.mark.parametrize("format_", [msz.MSZ, spz.SPZ], ids=lambda f: f.suffix)
 def test_damaged_anywhere(format_, rng):
     check_damage(format_, format_.encode(population(20), format_.default_level), rng, 300)
+
+
+def test_headers_that_lie_at_random(rng):
+    check_headers(msz.MSZ, msz.encode(population(7, 1), 5), rng, 300)
+    header = msz._checked(container.take_apart(msz.CONTAINER, msz.encode(population(7, 1), 5), ""))
+    steps = header.steps._replace(log_scales=55)._asdict()  # once an overflow
+    assert "which steps" in refusal(msz.MSZ, with_header(msz.encode(population(), 3), steps=steps))
 
 
 @pytest.mark.parametrize("format_", [msz.MSZ, spz.SPZ], ids=lambda f: f.suffix)

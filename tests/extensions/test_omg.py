@@ -4,7 +4,8 @@ import json
 
 import numpy as np
 import pytest
-from compact import check_damage, population, refusal, short_run, with_header
+import zstandard
+from compact import check_damage, check_headers, population, refusal, short_run, with_header
 from numpy.testing import assert_allclose, assert_array_equal
 from tolerances import CLOSED_FORM, HALF_FLOAT
 
@@ -240,6 +241,10 @@ def test_what_half_floats_do_not_reach():
     with pytest.raises(InputError, match=r"means reach 1e\+06, and half floats 65504: choose another format"):
         omg.encode(gaussians, 2)
 
+    gaussians.means[:, 0] = 1e35
+    with pytest.raises(InputError, match=r"means are 1e\+35 from the origin: move the scene"):
+        omg.encode(gaussians, 2)
+
 
 # Files that lie
 
@@ -252,26 +257,48 @@ def test_files_that_lie():
     assert "not an OMG file" in refusal(omg.OMG_FILE, b"MSZ\n" + content[4:])
     assert "would take" in refusal(omg.OMG_FILE, with_header(content, n=2**31 - 1))
     codes = {"scales": [2**16] * 3, "rotations": [2**16] * 2, "opacities": [2**16], "appearance": [2**16] * 3}
-    lies = [{"n": 2**31}, {"n": -1}, {"center": [1, 2]}, {"center": ["a", 0.0, 0.0]}, {"codes": {}}, {"n_features": 45}]
+    lies = [
+        {"n": 2**31},
+        {"n": -1},
+        {"center": [1, 2]},
+        {"center": [1e308, 0.0, 0.0]},
+        {"center": ["a", 0.0, 0.0]},
+        {"codes": {}},
+        {"n_features": 45},
+    ]
     for lie in [*lies, {"planes": {"means": 1}}, {"sh_degree": 4}, {"codes": codes | {"scales": [-1, 2, 3]}}]:
         assert "does not describe Gaussians" in refusal(omg.OMG_FILE, with_header(content, **lie))
     assert "damaged" in refusal(omg.OMG_FILE, with_header(content, codes=codes))
-    assert "codebook" in refusal(omg.OMG_FILE, with_one_code(content))
+    assert "codebook" in refusal(omg.OMG_FILE, repacked(content, lose_codes))
+    assert "means is nan" in refusal(omg.OMG_FILE, repacked(content, make_nan))
 
 
-def with_one_code(content):
-    """A file whose codebook of opacities has lost all its codes but one."""
+def repacked(content, change):
+    """The file with its header and streams changed, and every checksum right."""
     packed = omg.take_apart(omg.CONTAINER, content, "")
     header = {name: value for name, value in packed.header.items() if name != "streams"}
-    header["codes"] = header["codes"] | {"opacities": [1]}
-    zstandard = pytest.importorskip("zstandard")
     streams = {name: zstandard.ZstdDecompressor().decompress(frame) for name, frame in packed.frames.items()}
-    streams["opacities codes"] = streams["opacities codes"][:2]
+    change(header, streams)
     return omg.pack(omg.CONTAINER, header, streams)
+
+
+def lose_codes(header, streams):
+    """Leave one code of opacities."""
+    header["codes"] = header["codes"] | {"opacities": [1]}
+    streams["opacities codes"] = streams["opacities codes"][:2]
+
+
+def make_nan(header, streams):
+    """Let the first centre be a signalling NaN, 0x7d00: twice that, by the zigzag map, in two planes."""
+    n = header["planes"]["means"] * 3 * header["n"]
+    low, high = bytearray(n // 2), bytearray(n // 2)
+    high[0] = 2 * 0x7D
+    streams["means"] = bytes(low + high)
 
 
 def test_damaged_anywhere(rng):
     check_damage(omg.OMG_FILE, omg.encode(population(20), 2), rng, 200)
+    check_headers(omg.OMG_FILE, omg.encode(population(7, 1), 2), rng, 300)
 
 
 # The command line

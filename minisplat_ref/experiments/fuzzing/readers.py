@@ -15,7 +15,9 @@ from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.experiments import settings
 from minisplat_ref.experiments.fuzzing.mutations import Choose, damage
 from minisplat_ref.experiments.run_folder import CONFIG
+from minisplat_ref.extensions.extension import all_formats, find_format
 from minisplat_ref.io import load_ply, load_scene, save_ply, viewpoints, write_image
+from minisplat_ref.io.formats import read_content
 from minisplat_ref.io.images import read_image
 from minisplat_ref.io.lens import import_pycolmap
 from minisplat_ref.io.ply import load_points
@@ -145,6 +147,22 @@ def _read_ply(_: Path, file: Path) -> object:
     return load_ply(file)
 
 
+def _write_compact(folder: Path) -> None:
+    """Write the same Gaussians at every level of every format that an extension has."""
+    _write_plys(folder)
+    gaussians = load_ply(folder / "little.ply")
+    for _, format_ in all_formats():
+        for level in range(len(format_.levels)):
+            (folder / f"compact-{level}{format_.suffix}").write_bytes(format_.encode(gaussians, level))
+
+
+def _read_compact(_: Path, file: Path) -> object:
+    format_ = find_format(file)
+    assert format_ is not None, file
+    content = read_content(file)
+    return format_.describe(content, file), format_.decode(content, file)
+
+
 def _write_checkpoint(folder: Path) -> None:
     state = initial_state(_scene().scene, RECIPE, 0)
     state.stats["count"] = np.zeros(len(state.gaussians.means), np.int32)
@@ -193,6 +211,7 @@ def _read_image(_: Path, file: Path) -> object:
 
 READERS = {
     "ply": Reader(_write_plys, _read_ply, ("*.ply",)),
+    "compact": Reader(_write_compact, _read_compact, ("compact-*",)),
     "colmap-binary": Reader(_write_colmap_binary, _read_scene, ("sparse/0/*.bin",)),
     "colmap-text": Reader(_write_colmap_text, _read_scene, ("sparse/0/*.txt",)),
     "transforms": Reader(_write_transforms, _read_scene, ("transforms.json",)),

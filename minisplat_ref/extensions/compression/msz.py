@@ -31,7 +31,7 @@ from minisplat_ref.validation import check_gaussians
 
 CONTAINER = Container(b"MSZ\n", version=1)
 MOST_GAUSSIANS = 2**31 - 1
-EXPONENT_MAX = 200  # of a step, either way: beyond the range of float32
+EXPONENT_MAX = 200  # of a step, either way, beyond the range of float32; but for the centres no step is larger than 1
 
 
 class _Header(NamedTuple):
@@ -169,8 +169,9 @@ def _checked(packed: Packed) -> _Header:
     if level == 0:
         return header
     given = steps if isinstance(steps, dict) else {}
-    if set(given) != set(Exponents._fields) or not all(
-        type(step) is int and abs(step) <= EXPONENT_MAX for step in given.values()
+    most = {**dict.fromkeys(Exponents._fields, 0), "means": EXPONENT_MAX}
+    if set(given) != set(most) or not all(
+        type(step) is int and -EXPONENT_MAX <= step <= most[name] for name, step in given.items()
     ):
         raise InputError(f"{source}: damaged, its header does not say which steps its fields have; {WAY_OUT}")
     return header._replace(steps=Exponents(**given))

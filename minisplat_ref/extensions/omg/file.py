@@ -36,6 +36,7 @@ CONTAINER = Container(b"OMG\n", version=1)
 MOST_GAUSSIANS = 2**31 - 1
 MOST_CODES = 2**16
 LARGEST_HALF = 65504.0
+FARTHEST = 1e30  # that a scene's median may be from the origin, along an axis
 LEAST_QUAT = 2.0**-10  # of a part (w, x) whose code would be zero, since the other may be zero, too
 
 
@@ -73,6 +74,10 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
     check_gaussians(gaussians, "Gaussians")
     n, n_rest = gaussians.sh_rest.shape[:2]
     center = _center(gaussians)
+    if not np.abs(center).max() <= FARTHEST:
+        raise InputError(
+            f"means are {np.abs(center).max():.3g} from the origin: move the scene, or choose another format"
+        )
     offsets = _halves(gaussians.means - center, "means")
     order = morton_order(offsets)
     rows = Gaussians(*(np.asarray(field, np.float64)[order] for field in gaussians))
@@ -160,8 +165,9 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
     features = vectors["appearance"][:, 3 : 3 + header.n_features]
     with np.errstate(over="ignore", invalid="ignore"):  # of damaged files; what is not finite is refused
         harmonics = Decoder(table[0], table[1:]).harmonics(features)
+        means = np.asarray(header.center, np.float32) + bits.view(np.float16).astype(np.float32)
     gaussians = Gaussians(
-        means=np.asarray(header.center, np.float32) + bits.view(np.float16).astype(np.float32),
+        means=means,
         quats=vectors["rotations"],
         log_scales=vectors["scales"],
         opacity_logits=vectors["opacities"][:, 0],
@@ -210,7 +216,7 @@ def _checked(packed: Packed) -> _Header:
         and is_count(level)
         and isinstance(center, list)
         and len(center) == 3
-        and all(type(x) is float and math.isfinite(x) for x in center)
+        and all(type(x) is float and abs(x) <= FARTHEST for x in center)
         and is_count(n_features, 3 * ((SH_DEGREE_MAX + 1) ** 2 - 1))
         and isinstance(codes, dict)
         and set(codes) == set(WIDTHS)
