@@ -41,12 +41,14 @@ from minisplat_ref.io.atomic import replacing
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "notebooks"
-SECONDS_MAX = 120  # of a cell
+SECONDS_MAX = 300  # of a cell, on a busy machine that compiles its kernels
 PNG_MAX = 100_000  # bytes of a picture
 
-# Mean absolute difference of two pictures' values, 0 to 255: room for another version's fonts, or for the noise of a
-# training.
-PICTURE_EXACT, PICTURE_ROUNDED = 1.0, 8.0
+# Mean absolute difference of two pictures' values, 0 to 255: room for another version's fonts.
+PICTURE_EXACT = 1.0
+# The same for a picture after a training, as a part of its difference from a white page. With kernels compiled for
+# another processor (NUMBA_CPU_NAME=haswell on a Zen 5) the pictures of notebooks 06, 09 and 11 differ by up to 0.19.
+PICTURE_ROUNDED = 0.3
 
 Cell = Any  # nbformat's nodes are dictionaries whose keys are attributes, too
 Notebook = Any
@@ -202,8 +204,8 @@ def _difference(old: Cell, new: Cell, is_rounded: bool) -> str:
     if a.shape != b.shape:
         return f"picture of {b.shape[1]} x {b.shape[0]} pixels, stored are {a.shape[1]} x {a.shape[0]}"
     difference = np.abs(a - b).mean()
-    allowed = PICTURE_ROUNDED if is_rounded else PICTURE_EXACT
-    return f"picture differs by {difference:.2f} of 255, more than {allowed:g}" if difference > allowed else ""
+    allowed = max(PICTURE_EXACT, PICTURE_ROUNDED * np.abs(255 - a).mean()) if is_rounded else PICTURE_EXACT
+    return f"picture differs by {difference:.2f} of 255, more than {allowed:.2f}" if difference > allowed else ""
 
 
 def _text(out: Cell) -> str:

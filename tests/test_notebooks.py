@@ -116,8 +116,10 @@ def test_tags_leave_room():
     [difference] = differences(old, notebook_of(printed("y 10.5 dB\n")))
     assert "y # dB" in difference
     noisy = notebook_of(picture(GREY), tags=["rounding"])
-    assert list(differences(noisy, notebook_of(picture(GREY + 7)))) == []
-    assert len(list(differences(noisy, notebook_of(picture(GREY + 9))))) == 1
+    assert list(differences(noisy, notebook_of(picture(GREY + 46)))) == []  # 0.3 times the 155 to a white page
+    assert len(list(differences(noisy, notebook_of(picture(GREY + 47))))) == 1
+    thin = np.where(np.arange(9)[:, None] == 4, 0, GREY + 155)  # lines on white: a blank page is told apart
+    assert len(list(differences(notebook_of(picture(thin), tags=["rounding"]), notebook_of(picture(GREY + 155))))) == 1
     timed = notebook_of(printed("3 s\n"), tags=["clock"])
     assert list(differences(timed, notebook_of(printed("4 ms\n")))) == []
     assert len(list(differences(timed, notebook_of(picture(GREY))))) == 1
