@@ -31,6 +31,7 @@ from . import (
     oracle,
     render,
     sfm,
+    simplify,
     study,
     synthetic,
     train,
@@ -40,7 +41,7 @@ from . import (
 GROUPS = {
     "start here": (demo,),
     "preparing scenes": (sfm, undistort, downscale, synthetic),
-    "training and its results": (train, render, evaluate, convert, compare, info),
+    "training and its results": (train, render, evaluate, simplify, convert, compare, info),
     "checks and measurements": (oracle, bench, study),
     "the program itself": (extensions, cache),
 }

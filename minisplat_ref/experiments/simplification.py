@@ -1,0 +1,362 @@
+"""``simplify``: a run made smaller after the fact, and how small it may be, measured on views that take no part.
+
+Candidates keep the Gaussians of the largest blend weight, summed over pixels and views (equation 12 of Mini-Splatting),
+at a dozen sizes, and each is fine-tuned. Some *training* views decide (:func:`..training.pace.held_out_ids`): they
+count neither for the importance nor for the fine-tuning while the sizes are measured. The test views stay sealed until
+the size has been chosen, ranked and fine-tuned once more by all training views.
+
+The run has seen the held-out views in its training, and forgets what was peculiar to them as soon as it is trained
+without. So the drop of a size is not the distance to the run, but to *all* its Gaussians fine-tuned alike.
+
+Fine-tuning goes on where the run's schedule ends: its losses, its last rates, all degrees of the spherical harmonics,
+no events, moments of zero.
+"""
+
+import tempfile
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from tqdm import tqdm
+
+from minisplat_ref.backends import Backend, get_backend
+from minisplat_ref.constants import PROFILES, Conventions
+from minisplat_ref.errors import InputError
+from minisplat_ref.experiments import fingerprint, run_folder
+from minisplat_ref.experiments.checkpoints import newest_model
+from minisplat_ref.experiments.rate_distortion import (
+    PlySize,
+    Point,
+    between,
+    knee,
+    paired_drop,
+    sizes,
+    smallest_within,
+)
+from minisplat_ref.experiments.settings import Settings, load, load_photographs, recipe_of
+from minisplat_ref.extensions.extension import CORE, Extension, owner_of
+from minisplat_ref.metrics import evaluate
+from minisplat_ref.rendering import Request
+from minisplat_ref.strategy.importance import collect_importance, indoor
+from minisplat_ref.strategy.ops import contiguous, n_rows, take
+from minisplat_ref.strategy.simplify import most_important
+from minisplat_ref.training.adam import zero_moments
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.pace import Cooling, held_out_ids
+from minisplat_ref.training.rates import Rates
+from minisplat_ref.training.schedule import Recipe, configured
+from minisplat_ref.training.state import TrainState
+from minisplat_ref.types import Floats, Ints, Model, Scene, View, numbered
+
+HOLD_OUT_EVERY = 8  # training views of which one decides, as for recipe ``adaptive``
+N_CLOSER = 2  # sizes that are measured besides, where the limit of --max-drop lies
+LEAST_VIEWS = 4  # training views: two that are trained on, and two for a standard error
+HOLDING_OUT = Cooling(part=0.0, last=1.0, last_per_extent=1.0, hold_out_every=HOLD_OUT_EVERY)  # which never cools
+
+
+class Target(NamedTuple):
+    """What is asked for; the knee of the curve where all is None."""
+
+    max_drop: float | None = None
+    """dB that may be lost on the held-out training views, with one standard error."""
+    budget: int | None = None
+    """Gaussians, at most."""
+    max_bytes: int | None = None
+    """Of the PLY, at most."""
+
+    def __str__(self) -> str:
+        """Return it as it is typed."""
+        given = [f"--{name.replace('_', '-')} {value}" for name, value in self._asdict().items() if value is not None]
+        return given[0] if given else "the knee of the curve"
+
+
+class Run(NamedTuple):
+    """What is to be simplified, with all that its training needs."""
+
+    folder: Path
+    settings: Settings
+    recipe: Recipe
+    """With the calibrations that the model has parameters of."""
+    owner: Extension
+    """Whose population it is."""
+    scene: Scene
+    """Training views numbered."""
+    model: Model
+    step: int | None
+    """Iterations that the model has been trained, as far as the folder says."""
+    unfinished: int | None
+    """Iteration of the checkpoint that the model is of; None where the run has ended."""
+
+    @property
+    def backend(self) -> Backend:
+        """The run's."""
+        return get_backend(self.settings.backend)
+
+    @property
+    def conventions(self) -> Conventions:
+        """The run's."""
+        return PROFILES[self.settings.profile]
+
+    @property
+    def held_out(self) -> list[View]:
+        """The training views that decide."""
+        views = self.scene.train_views
+        return [views[k] for k in held_out_ids(len(views), HOLD_OUT_EVERY)]
+
+    @property
+    def others(self) -> list[View]:
+        """The training views that do not decide."""
+        held = set(held_out_ids(len(self.scene.train_views), HOLD_OUT_EVERY))
+        return [view for k, view in enumerate(self.scene.train_views) if k not in held]
+
+
+class Decision(NamedTuple):
+    """The measured curve, and what was chosen by it."""
+
+    reference: Point
+    """All Gaussians, fine-tuned alike."""
+    points: tuple[Point, ...]
+    """The smaller sizes, ascending."""
+    chosen: Point
+    knee: Point
+    run_psnr: float
+    """dB, of the run as it is on the held-out training views, which it was trained on."""
+    is_all_that_matter: bool
+    """Whether the budget, or the bytes, are more than all Gaussians that any view sees take."""
+
+
+def open_run(folder: Path, scene: Path | None = None) -> Run:
+    """Read a run and its photographs.
+
+    Parameters
+    ----------
+    folder : Path
+        Of a training that has ended or has a checkpoint.
+    scene : Path, optional
+        Where the photographs are now; where they were by default.
+
+    Raises
+    ------
+    InputError
+        The folder holds no run, the photographs are not there or not the run's, there are too few, or the model cannot
+        be simplified.
+    """
+    settings = load(folder)
+    saved = newest_model(folder, settings)
+    settings = settings if scene is None else settings._replace(scene=str(scene.resolve()))
+    if not Path(settings.scene).exists():
+        raise InputError(f"{settings.scene}, the scene of {folder}, is not there: --scene PATH says where it is now")
+    photographs = load_photographs(settings)
+    fingerprint.check(folder, photographs, settings.scene)
+    n_views = len(photographs.train_views)
+    if n_views < LEAST_VIEWS:
+        raise InputError(
+            f"{folder} has {n_views} training view{'s'[: n_views != 1]}, and at least {LEAST_VIEWS} are needed, two of"
+            " them to decide by: train with more photographs"
+        )
+    if n_rows(saved.model.gaussians) < 2:
+        raise InputError(f"{folder} holds {n_rows(saved.model.gaussians)} Gaussians, of which none can go: train more")
+    recipe = recipe_of(settings)
+    on = {
+        calibration.name: True
+        for calibration in recipe.calibrations
+        if calibration.initial(1).keys() <= saved.model.shared.keys()
+    }
+    run = Run(
+        folder,
+        settings,
+        configured(recipe, **on),
+        owner_of(settings.recipe, settings.extension) or CORE,
+        photographs._replace(train_views=numbered(photographs.train_views)),
+        saved.model,
+        run_folder.measured_step(folder) if saved.unfinished is None else saved.unfinished,
+        saved.unfinished,
+    )
+    _check_renderer(run)
+    return run
+
+
+def _check_renderer(run: Run) -> None:
+    """Refuse a renderer that does not say how much each row weighs in a picture."""
+    request = Request(conventions=run.conventions, backend=run.backend, wants=frozenset({"stats"}))
+    if run.recipe.renderer.render(run.model, run.scene.train_views[0], request)[0].stats is None:
+        raise InputError(
+            f"{run.folder}: renderer {run.recipe.renderer.name} of extension {run.owner.name} gives no blend weights,"
+            " by which simplify chooses: simplify a run of another extension"
+        )
+
+
+def ply_size(run: Run) -> PlySize:
+    """Return what the PLY of the run's population takes, from files of one row and of two."""
+    n_bytes = []
+    with tempfile.TemporaryDirectory() as folder:
+        for n in (1, 2):
+            path = Path(folder, f"{n}.ply")
+            run.owner.save(path, take(run.model.gaussians, np.arange(n)))
+            n_bytes.append(path.stat().st_size)
+    row = n_bytes[1] - n_bytes[0]
+    return PlySize(n_bytes[0] - row - 1, row)
+
+
+def limit_of(target: Target, size: PlySize) -> int | None:
+    """Return the most Gaussians that a target allows; None where the curve decides.
+
+    Raises
+    ------
+    InputError
+        Not even one fits.
+    """
+    if target.max_bytes is None:
+        return target.budget
+    if size.most_rows(target.max_bytes) == 0:
+        raise InputError(
+            f"--max-bytes {target.max_bytes} is too little: a PLY with one Gaussian takes {size.of(1):,} bytes; allow"
+            " more (minisplat-ref convert makes compact files, and has --max-bytes of its own)"
+        )
+    return size.most_rows(target.max_bytes)
+
+
+def fine_tuning(recipe: Recipe, iterations: int, *, holds_out: bool) -> Recipe:
+    """Return the recipe of so many iterations after the schedule's end, at the rates of the end and without events."""
+    rates = Rates(recipe.rates.at(recipe.iterations, 1.0), recipe.rates.per_extent)
+    if recipe.cooling is not None:
+        rates = rates.scaled(Fraction(1), recipe.cooling.last, recipe.cooling.last_per_extent)
+    return recipe._replace(
+        iterations=recipe.iterations + iterations,
+        learning_rates=rates,
+        events=(),
+        cooling=HOLDING_OUT if holds_out else None,
+    )
+
+
+def fine_tuned(run: Run, rows: Ints, iterations: int, *, holds_out: bool, on_step: Callable[[], None]) -> Model:
+    """Return the chosen rows after fine-tuning; the run's model stays as it is.
+
+    Parameters
+    ----------
+    run : Run
+    rows : ndarray of shape (M,) of ids
+    iterations : int
+        0 for the rows as they are.
+    holds_out : bool
+        Whether the views that decide are left out.
+    on_step : callable
+        Called after every iteration.
+    """
+    gaussians = contiguous(take(run.model.gaussians, rows))
+    shared = {name: np.array(array, order="C") for name, array in run.model.shared.items()}
+    state = TrainState(
+        gaussians,
+        zero_moments(gaussians),
+        step=run.recipe.iterations,
+        view_order=[],
+        rng=np.random.default_rng(run.settings.seed),  # all sizes see the same views in the same order
+        stats={},
+        shared=shared,
+        shared_adam=zero_moments(shared),
+    )
+    return train(
+        run.scene,
+        fine_tuning(run.recipe, iterations, holds_out=holds_out),
+        seed=run.settings.seed,
+        state=state,
+        on_step=lambda _: on_step(),
+        backend=run.backend,
+        conventions=run.conventions,
+    ).model
+
+
+def blend_weights(run: Run, views: Sequence[View]) -> Floats:
+    """Return the importance [N] of the run's Gaussians: their blend weights, summed over the pixels of the views."""
+    return indoor(
+        collect_importance(
+            run.model, views, renderer=run.recipe.renderer, conventions=run.conventions, backend=run.backend
+        )
+    )
+
+
+def psnrs_of(run: Run, model: Model, views: Sequence[View]) -> tuple[float, ...]:
+    """Return the PSNR, dB, of each view, with its own exposure and pose where the run has trained them."""
+    evaluation = evaluate(
+        model,
+        views,
+        background=run.scene.background,
+        renderer=run.recipe.renderer,
+        backend=run.backend,
+        conventions=run.conventions,
+    )
+    return tuple(view.psnr for view in evaluation.per_view)
+
+
+def decide(run: Run, target: Target, iterations: int) -> Decision:
+    """Measure the curve, closer where a limit to the drop lies, and choose a size.
+
+    Parameters
+    ----------
+    run : Run
+    target : Target
+    iterations : int
+        Of each fine-tuning.
+
+    Raises
+    ------
+    InputError
+        The target cannot be met, or no view sees any Gaussian.
+    """
+    size = ply_size(run)
+    limit = limit_of(target, size)
+    n = n_rows(run.model.gaussians)
+    importance = blend_weights(run, run.others)
+    n_candidates = int(np.count_nonzero(importance))
+    if n_candidates == 0:
+        raise InputError(f"{run.folder}: no training view sees any Gaussian: train longer, or check the cameras")
+    series = sizes(n, n_candidates)
+    counts = series if limit is None else sizes(n, n_candidates, limit)
+    n_closer = 0 if target.max_drop is None else N_CLOSER
+    total = (1 + len(counts) + n_closer) * (iterations + 1)  # each is also measured
+    with tqdm(total=total, leave=False, unit="it", dynamic_ncols=True) as bar:
+
+        def measured(rows: Ints) -> tuple[float, ...]:
+            bar.set_description_str(f"measuring {len(rows):,} Gaussians")
+            model = fine_tuned(run, rows, iterations, holds_out=True, on_step=bar.update)
+            psnrs = psnrs_of(run, model, run.held_out)
+            bar.update()
+            return psnrs
+
+        def point_of(count: int) -> Point:
+            psnrs = measured(most_important(importance, count))
+            return Point(count, size.of(count), psnrs, *paired_drop(reference.psnrs, psnrs))
+
+        reference = Point(n, size.of(n), measured(np.arange(n)), 0.0, 0.0)
+        points = [point_of(count) for count in counts]
+        for _ in range(n_closer):
+            assert target.max_drop is not None
+            count = between(points, reference, target.max_drop)
+            if count is not None and count <= n_candidates:
+                points.append(point_of(count))
+    points.sort(key=lambda point: point.n_gaussians)
+    bend = knee([point for point in (*points, reference) if point.n_gaussians in (*series, n)])
+    return Decision(
+        reference,
+        tuple(points),
+        _chosen(points, target, bend, None if limit is None else min(limit, n_candidates)),
+        bend,
+        float(np.mean(psnrs_of(run, run.model, run.held_out))),
+        limit is not None and limit > n_candidates,
+    )
+
+
+def _chosen(points: Sequence[Point], target: Target, bend: Point, limit: int | None) -> Point:
+    if limit is not None:
+        return next(point for point in points if point.n_gaussians == limit)
+    return bend if target.max_drop is None else smallest_within(points, target.max_drop)
+
+
+def finished(run: Run, decision: Decision, iterations: int) -> Model:
+    """Return the model of the chosen size: ranked, and fine-tuned, by all training views."""
+    rows = most_important(blend_weights(run, run.scene.train_views), decision.chosen.n_gaussians)
+    name = f"fine-tuning {len(rows):,} Gaussians"
+    with tqdm(total=iterations, desc=name, leave=False, unit="it", dynamic_ncols=True) as bar:
+        return fine_tuned(run, rows, iterations, holds_out=False, on_step=bar.update)
