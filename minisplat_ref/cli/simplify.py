@@ -21,7 +21,7 @@ decide by; the test views are measured once, in the end.
 
 NEW is a run folder for render, eval, info and convert, with point_cloud.ply,
 metrics.json, result.json (curve and decision), figure.png and report.html.
-It takes the time of some 12 times --fine-tune iterations of training.
+It takes the time of some 13 times --fine-tune iterations of training.
 """
 EPILOG = """\
 example:

@@ -3,7 +3,7 @@
 Candidates keep the Gaussians of the largest blend weight, summed over pixels and views (equation 12 of Mini-Splatting),
 at a dozen sizes, and each is fine-tuned. Some *training* views decide (:func:`..training.pace.held_out_ids`): they
 count neither for the importance nor for the fine-tuning while the sizes are measured. The test views stay sealed until
-the size has been chosen, ranked and fine-tuned once more by all training views.
+the size has been chosen, and ranked and fine-tuned once more by all training views.
 
 The run has seen the held-out views in its training, and forgets what was peculiar to them as soon as it is trained
 without. So the drop of a size is not the distance to the run, but to *all* its Gaussians fine-tuned alike.
@@ -21,11 +21,8 @@ from typing import NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from minisplat_ref.backends import Backend, get_backend
-from minisplat_ref.constants import PROFILES, Conventions
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments import fingerprint, run_folder
-from minisplat_ref.experiments.checkpoints import newest_model
+from minisplat_ref.experiments.opened_run import HOLD_OUT_EVERY, Run
 from minisplat_ref.experiments.rate_distortion import (
     PlySize,
     Point,
@@ -35,24 +32,19 @@ from minisplat_ref.experiments.rate_distortion import (
     sizes,
     smallest_within,
 )
-from minisplat_ref.experiments.settings import Settings, load, load_photographs, recipe_of
-from minisplat_ref.extensions.extension import CORE, Extension, owner_of
 from minisplat_ref.metrics import evaluate
-from minisplat_ref.rendering import Request
 from minisplat_ref.strategy.importance import collect_importance, indoor
 from minisplat_ref.strategy.ops import contiguous, n_rows, take
 from minisplat_ref.strategy.simplify import most_important
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.pace import Cooling, held_out_ids
+from minisplat_ref.training.pace import Cooling
 from minisplat_ref.training.rates import Rates
-from minisplat_ref.training.schedule import Recipe, configured
+from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import TrainState
-from minisplat_ref.types import Floats, Ints, Model, Scene, View, numbered
+from minisplat_ref.types import Floats, Ints, Model, View
 
-HOLD_OUT_EVERY = 8  # training views of which one decides, as for recipe ``adaptive``
 N_CLOSER = 2  # sizes that are measured besides, where the limit of --max-drop lies
-LEAST_VIEWS = 4  # training views: two that are trained on, and two for a standard error
 HOLDING_OUT = Cooling(part=0.0, last=1.0, last_per_extent=1.0, hold_out_every=HOLD_OUT_EVERY)  # which never cools
 
 
@@ -72,46 +64,6 @@ class Target(NamedTuple):
         return given[0] if given else "the knee of the curve"
 
 
-class Run(NamedTuple):
-    """What is to be simplified, with all that its training needs."""
-
-    folder: Path
-    settings: Settings
-    recipe: Recipe
-    """With the calibrations that the model has parameters of."""
-    owner: Extension
-    """Whose population it is."""
-    scene: Scene
-    """Training views numbered."""
-    model: Model
-    step: int | None
-    """Iterations that the model has been trained, as far as the folder says."""
-    unfinished: int | None
-    """Iteration of the checkpoint that the model is of; None where the run has ended."""
-
-    @property
-    def backend(self) -> Backend:
-        """The run's."""
-        return get_backend(self.settings.backend)
-
-    @property
-    def conventions(self) -> Conventions:
-        """The run's."""
-        return PROFILES[self.settings.profile]
-
-    @property
-    def held_out(self) -> list[View]:
-        """The training views that decide."""
-        views = self.scene.train_views
-        return [views[k] for k in held_out_ids(len(views), HOLD_OUT_EVERY)]
-
-    @property
-    def others(self) -> list[View]:
-        """The training views that do not decide."""
-        held = set(held_out_ids(len(self.scene.train_views), HOLD_OUT_EVERY))
-        return [view for k, view in enumerate(self.scene.train_views) if k not in held]
-
-
 class Decision(NamedTuple):
     """The measured curve, and what was chosen by it."""
 
@@ -125,67 +77,6 @@ class Decision(NamedTuple):
     """dB, of the run as it is on the held-out training views, which it was trained on."""
     is_all_that_matter: bool
     """Whether the budget, or the bytes, are more than all Gaussians that any view sees take."""
-
-
-def open_run(folder: Path, scene: Path | None = None) -> Run:
-    """Read a run and its photographs.
-
-    Parameters
-    ----------
-    folder : Path
-        Of a training that has ended or has a checkpoint.
-    scene : Path, optional
-        Where the photographs are now; where they were by default.
-
-    Raises
-    ------
-    InputError
-        The folder holds no run, the photographs are not there or not the run's, there are too few, or the model cannot
-        be simplified.
-    """
-    settings = load(folder)
-    saved = newest_model(folder, settings)
-    settings = settings if scene is None else settings._replace(scene=str(scene.resolve()))
-    if not Path(settings.scene).exists():
-        raise InputError(f"{settings.scene}, the scene of {folder}, is not there: --scene PATH says where it is now")
-    photographs = load_photographs(settings)
-    fingerprint.check(folder, photographs, settings.scene)
-    n_views = len(photographs.train_views)
-    if n_views < LEAST_VIEWS:
-        raise InputError(
-            f"{folder} has {n_views} training view{'s'[: n_views != 1]}, and at least {LEAST_VIEWS} are needed, two of"
-            " them to decide by: train with more photographs"
-        )
-    if n_rows(saved.model.gaussians) < 2:
-        raise InputError(f"{folder} holds {n_rows(saved.model.gaussians)} Gaussians, of which none can go: train more")
-    recipe = recipe_of(settings)
-    on = {
-        calibration.name: True
-        for calibration in recipe.calibrations
-        if calibration.initial(1).keys() <= saved.model.shared.keys()
-    }
-    run = Run(
-        folder,
-        settings,
-        configured(recipe, **on),
-        owner_of(settings.recipe, settings.extension) or CORE,
-        photographs._replace(train_views=numbered(photographs.train_views)),
-        saved.model,
-        run_folder.measured_step(folder) if saved.unfinished is None else saved.unfinished,
-        saved.unfinished,
-    )
-    _check_renderer(run)
-    return run
-
-
-def _check_renderer(run: Run) -> None:
-    """Refuse a renderer that does not say how much each row weighs in a picture."""
-    request = Request(conventions=run.conventions, backend=run.backend, wants=frozenset({"stats"}))
-    if run.recipe.renderer.render(run.model, run.scene.train_views[0], request)[0].stats is None:
-        raise InputError(
-            f"{run.folder}: renderer {run.recipe.renderer.name} of extension {run.owner.name} gives no blend weights,"
-            " by which simplify chooses: simplify a run of another extension"
-        )
 
 
 def ply_size(run: Run) -> PlySize:
@@ -354,9 +245,10 @@ def _chosen(points: Sequence[Point], target: Target, bend: Point, limit: int | N
     return bend if target.max_drop is None else smallest_within(points, target.max_drop)
 
 
-def finished(run: Run, decision: Decision, iterations: int) -> Model:
-    """Return the model of the chosen size: ranked, and fine-tuned, by all training views."""
-    rows = most_important(blend_weights(run, run.scene.train_views), decision.chosen.n_gaussians)
-    name = f"fine-tuning {len(rows):,} Gaussians"
+def finished(run: Run, n: int, iterations: int) -> Model:
+    """Return the ``n`` most important Gaussians, ranked and fine-tuned by all training views; or all, if ``n`` are."""
+    is_all = n == n_rows(run.model.gaussians)
+    rows = np.arange(n) if is_all else most_important(blend_weights(run, run.scene.train_views), n)
+    name = f"fine-tuning {n:,} Gaussians"
     with tqdm(total=iterations, desc=name, leave=False, unit="it", dynamic_ncols=True) as bar:
         return fine_tuned(run, rows, iterations, holds_out=False, on_step=bar.update)

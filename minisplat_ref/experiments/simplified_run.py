@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from minisplat_ref.experiments import fingerprint, run_folder
+from minisplat_ref.experiments.opened_run import Run, open_run
 from minisplat_ref.experiments.pictures import Picture, to_picture
 from minisplat_ref.experiments.plots import save_png
 from minisplat_ref.experiments.rate_distortion import Point, paired_drop
 from minisplat_ref.experiments.scoring import measure, score, to_metrics
 from minisplat_ref.experiments.settings import save_model
-from minisplat_ref.experiments.simplification import Decision, Run, Target, decide, finished, open_run
+from minisplat_ref.experiments.simplification import Decision, Target, decide, finished
 from minisplat_ref.experiments.simplification_report import Shown, draw, report_html
 from minisplat_ref.experiments.studies import FIGURE, RESULT
 from minisplat_ref.io.atomic import making_folder
@@ -53,11 +54,12 @@ def simplify_run(asked: Asked) -> dict[str, Any]:
     with making_folder(asked.out) as folder:
         run = open_run(asked.run, asked.scene)
         decision = decide(run, asked.target, asked.fine_tune)
-        model = finished(run, decision, asked.fine_tune)
+        all_alike = finished(run, decision.reference.n_gaussians, asked.fine_tune)
+        model = finished(run, decision.chosen.n_gaussians, asked.fine_tune)
         save_model(folder, run.settings, model)
-        before = measure(run.scene, run.model, run.settings)
+        before, alike = (measure(run.scene, each, run.settings) for each in (run.model, all_alike))
         after = score(folder, run.scene, model, run.settings)
-        result = to_result(run, asked, decision, before, after)
+        result = {**to_result(run, asked, decision), "test": of_test_views(before, alike, after)}
         _write_run(folder, run, result, after)
         run_folder.write_json(folder / RESULT, result)
         figure = draw(result)
@@ -84,8 +86,8 @@ def _shown(run: Run, model: Model) -> list[Shown]:
     return [Shown(view.name, view.image, before[view.name], after[view.name]) for view in views]
 
 
-def to_result(run: Run, asked: Asked, decision: Decision, before: Evaluation, after: Evaluation) -> dict[str, Any]:
-    """Return what was measured and decided, as JSON holds it."""
+def to_result(run: Run, asked: Asked, decision: Decision) -> dict[str, Any]:
+    """Return how a size was decided on, as JSON holds it."""
     size = run.scene.train_views[0].camera
     return {
         "run": str(asked.run.resolve()),
@@ -104,7 +106,6 @@ def to_result(run: Run, asked: Asked, decision: Decision, before: Evaluation, af
         "chosen": _of_point(decision.chosen),
         "knee": _of_point(decision.knee),
         "is_all_that_matter": decision.is_all_that_matter,
-        "test": _of_test_views(before, after),
     }
 
 
@@ -112,16 +113,36 @@ def _of_point(point: Point) -> dict[str, Any]:
     return {**point._asdict(), "psnrs": list(point.psnrs), "psnr": point.psnr}
 
 
-def _of_test_views(before: Evaluation, after: Evaluation) -> dict[str, Any] | None:
-    """Return PSNR before and after, dB, and the paired drop; None without test views."""
+def of_test_views(before: Evaluation, alike: Evaluation, after: Evaluation) -> dict[str, Any] | None:
+    """Return what became of the test views, as JSON holds it.
+
+    Parameters
+    ----------
+    before : Evaluation
+        Of the run.
+    alike : Evaluation
+        Of all its Gaussians, fine-tuned like those that are left.
+    after : Evaluation
+        Of those that are left.
+
+    Returns
+    -------
+    test : dict or None
+        PSNR of the three in dB; ``drop`` from the second to the third, with its standard error, which one view does not
+        have; None without test views.
+    """
     if before.psnr is None:
         return None
-    psnrs = [[view.psnr for view in evaluation.per_view] for evaluation in (before, after)]
-    drop, standard_error = paired_drop(*psnrs)
+    drop, standard_error = paired_drop(*([view.psnr for view in e.per_view] for e in (alike, after)))
     return {
         "views": [view.name for view in before.per_view],
-        **{"psnr_before": before.psnr, "psnr_after": after.psnr, "ssim_before": before.ssim, "ssim_after": after.ssim},
-        **{"drop": drop, "standard_error": standard_error if len(before.per_view) > 1 else None},
+        "psnr_before": before.psnr,
+        "psnr_alike": alike.psnr,
+        "psnr_after": after.psnr,
+        "ssim_before": before.ssim,
+        "ssim_after": after.ssim,
+        "drop": drop,
+        "standard_error": standard_error if len(before.per_view) > 1 else None,
     }
 
 
