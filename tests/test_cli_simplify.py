@@ -12,7 +12,7 @@ from tolerances import CLOSED_FORM
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.errors import InputError
+from minisplat_ref.errors import InputError, InputWarning
 from minisplat_ref.experiments import simplification
 from minisplat_ref.experiments.opened_run import HOLD_OUT_EVERY, open_run
 from minisplat_ref.experiments.progress import PSNR_MAX
@@ -26,7 +26,7 @@ from minisplat_ref.experiments.rate_distortion import (
     sizes,
     smallest_within,
 )
-from minisplat_ref.experiments.simplification import fine_tuned, fine_tuning
+from minisplat_ref.experiments.simplification import Target, decide, fine_tuned, fine_tuning
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.io import load_ply, load_scene, save_ply
 from minisplat_ref.io.images import read_image
@@ -197,9 +197,9 @@ def test_held_out_views_do_not_enter_the_fine_tuning(run_folder, monkeypatch):
 # From end to end ------------------------------------------------------------------------------------------------------
 
 
-def test_budget(halved, run_folder, capsys):
+def test_budget(halved, run_folder):
     assert {path.name for path in halved.iterdir()} == FILES
-    gaussians, result, metrics = load_ply(halved / "point_cloud.ply"), read(halved / "result.json"), {}
+    gaussians, result = load_ply(halved / "point_cloud.ply"), read(halved / "result.json")
     assert len(gaussians.means) == 70 == result["chosen"]["n_gaussians"]
     assert (halved / "point_cloud.ply").stat().st_size == result["chosen"]["n_bytes"]
     assert result["target"] == "--budget 70" and len(result["held_out"]) == 2
@@ -279,12 +279,11 @@ def test_max_drop_is_kept_by_the_smallest_of_the_measured(run_folder, tmp_path, 
     assert sum("chosen" in line for line in lines) == 1 and lines[-1].startswith("test PSNR ")
 
 
-def test_the_knee_decides_where_nothing_is_asked(run_folder, tmp_path):
-    assert simplify(run_folder, tmp_path / "out") == 0
-    result = read(tmp_path / "out" / "result.json")
-    assert result["chosen"] == result["knee"]
-    n_all = result["all"]["n_gaussians"]
-    assert len(result["curve"]) == N_SIZES and result["curve"][0]["n_gaussians"] == round(n_all / 16)
+def test_the_knee_decides_where_nothing_is_asked(run_folder):
+    decision = decide(open_run(run_folder), Target(), 1)
+    assert decision.chosen == decision.knee
+    n_all = decision.reference.n_gaussians
+    assert len(decision.points) == N_SIZES and decision.points[0].n_gaussians == round(n_all / 16)
 
 
 def test_a_budget_of_more_than_all_keeps_all_that_matter(run_folder, tmp_path, capsys):
@@ -352,8 +351,7 @@ def test_photographs_that_are_elsewhere(run_folder, scene_folder, refused, tmp_p
     (copy / "config.json").write_text(json.dumps(config))
     line = refused(copy)
     assert f"{tmp_path / 'gone'}, the scene of" in line and "--scene PATH" in line
-    assert simplify(copy, tmp_path / "out", "--budget", "50", "--scene", str(scene_folder)) == 0
-    assert read(tmp_path / "out" / "config.json")["settings"]["scene"] == str(scene_folder)
+    assert open_run(copy, scene_folder).settings.scene == str(scene_folder)
 
 
 def test_too_few_views_to_decide_by(tmp_path, refused):
@@ -387,10 +385,12 @@ def test_no_test_views(scene_folder, tmp_path, capsys):
     assert read(tmp_path / "out" / "result.json")["test"] is None
 
 
-def test_an_unfinished_run(run_folder, tmp_path, capsys):
+def test_an_unfinished_run(run_folder, tmp_path):
     """Its checkpoint is simplified, and a line says so."""
     copy = shutil.copytree(run_folder, tmp_path / "run")
     for name in ("point_cloud.ply", "metrics.json"):
         (copy / name).unlink()
-    assert simplify(copy, tmp_path / "out", "--budget", "50") == 0
-    assert "has not ended: this is its checkpoint of iteration 40" in capsys.readouterr().err
+    with pytest.warns(InputWarning, match="has not ended: this is its checkpoint of iteration 40"):
+        run = open_run(copy)
+    assert run.unfinished == run.step == 40
+    assert_array_equal(run.model.gaussians.means, load_ply(run_folder / "point_cloud.ply").means)
