@@ -5,8 +5,8 @@ at a dozen sizes, and each is fine-tuned. Some *training* views decide (:func:`.
 count neither for the importance nor for the fine-tuning while the sizes are measured. The test views stay sealed until
 the size has been chosen, and ranked and fine-tuned once more by all training views.
 
-The run has seen the held-out views in its training, and forgets what was peculiar to them as soon as it is trained
-without. So the drop of a size is not the distance to the run, but to *all* its Gaussians fine-tuned alike.
+Fine-tuning alone changes a run: it may go on learning, and it forgets what is peculiar to the held-out views, which it
+was trained on until then. So the drop of a size is not from the run, but from *all* its Gaussians, fine-tuned alike.
 
 Fine-tuning goes on where the run's schedule ends: its losses, its last rates, all degrees of the spherical harmonics,
 no events, moments of zero.

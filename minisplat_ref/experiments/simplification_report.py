@@ -13,6 +13,7 @@ from matplotlib.ticker import NullFormatter, NullLocator
 from minisplat_ref.experiments.page import captioned, cards, code, curves, page, panel, paragraph, section, table
 from minisplat_ref.experiments.pictures import Picture
 from minisplat_ref.experiments.plots import PLOT_STYLE, TITLE_COLOR, to_svg
+from minisplat_ref.experiments.rate_distortion import N_SIZES, SIZES_PER_HALVING
 
 BLUE, RED, GREY = "#2d6a8e", "#b4553d", "#8a94a0"
 TABLE_HEADING = ["Gaussians", "PLY bytes", "PSNR (dB)", "drop (dB)", "std. error", ""]
@@ -24,14 +25,14 @@ Of each size the most important Gaussians were kept, by their blend weights in t
 The held-out training views took part in neither. Bars are one standard error of the paired differences between these
 views, so what makes one view harder than another is not in them."""
 REFERENCE_TEXT = """\
-The run was trained on the held-out views and knows them better than any new one; as soon as it is trained without, it
-forgets. The drop is therefore measured against all Gaussians, fine-tuned in the same way without these views."""
+Fine-tuning alone changes a run: it may go on learning, and it forgets what is peculiar to the held-out views, which it
+was trained on until now. The drop is therefore measured against all Gaussians, fine-tuned in the same way."""
 KNEE_TEXT = """\
 The knee is where the PSNR over the logarithm of the count lies highest above the straight line between the ends of the
 measured sizes. It moves with these ends, so it decides only where no target was given."""
 TEST_TEXT = """\
 Nothing was decided on these views. The new model was ranked and fine-tuned by all training views. Fine-tuning alone
-changes the run, so its part is told apart by all Gaussians, fine-tuned alike; a drop below zero is a gain."""
+changes the run; what is due to fewer Gaussians is the drop from all of them, fine-tuned alike. Below 0 it is a gain."""
 
 
 class Shown(NamedTuple):
@@ -92,7 +93,7 @@ def _draw_psnr(axes: Axes, result: dict[str, Any]) -> None:
     axes.errorbar(counts, psnrs, yerr=errors, color=BLUE, marker="o", ms=4, capsize=3, label="fine-tuned")
     axes.axhline(result["all"]["psnr"], color=GREY, linestyle="--", linewidth=1, label="all Gaussians")
     _mark(axes, result, "psnr")
-    _finish(axes, result, "PSNR of held-out training views (dB)")
+    _finish(axes, result, "PSNR of held-out training views (dB)", 1)
     axes.legend(frameon=False, fontsize=9, loc="lower right")
 
 
@@ -105,7 +106,7 @@ def _draw_drop(axes: Axes, result: dict[str, Any]) -> None:
         axes.axhline(limit, color=RED, linewidth=1, label=f"at most {limit:g} dB")
         axes.legend(frameon=False, fontsize=9, loc="upper right")
     _mark(axes, result, "drop")
-    _finish(axes, result, "drop with its standard error (dB), enlarged")
+    _finish(axes, result, "drop with its standard error (dB), enlarged", SIZES_PER_HALVING)
     worst = chosen["drop"] + chosen["standard_error"]
     top = 3 * max(worst, limit or 0.0, LEAST_ZOOM)
     lowest = min(0.0, *(drop - error for drop, error in zip(drops, errors, strict=True)))
@@ -131,10 +132,10 @@ def _mark(axes: Axes, result: dict[str, Any], name: str) -> None:
     )
 
 
-def _finish(axes: Axes, result: dict[str, Any], title: str) -> None:
+def _finish(axes: Axes, result: dict[str, Any], title: str, ticks_per_halving: int) -> None:
     counts = [point["n_gaussians"] for point in (*result["curve"], result["all"])]
     axes.set_xscale("log")
-    ticks = result["all"]["n_gaussians"] * 2.0 ** -np.arange(6)
+    ticks = result["all"]["n_gaussians"] * 2.0 ** -(np.arange(N_SIZES + 1) / ticks_per_halving)
     axes.set_xticks(ticks, [f"{tick:,.0f}" for tick in ticks])
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_minor_formatter(NullFormatter())
@@ -163,7 +164,7 @@ def report_html(folder: Path, result: dict[str, Any], figure: Figure, shown: Seq
         cards(figures),
         section("How small it may be", paragraph(CURVE_TEXT), curves([to_svg(figure)], 1)),
         section("The decision", paragraph(_decision(result)), table(table_rows(result), TABLE_HEADING)),
-        paragraph(f"{REFERENCE_TEXT} As it was, the run has {result['run_psnr']:.2f} dB on them."),
+        paragraph(f"{REFERENCE_TEXT} Before it, the run has {result['run_psnr']:.2f} dB on them."),
         paragraph(KNEE_TEXT),
     ]
     if test is not None:
