@@ -55,9 +55,7 @@ First time here:   minisplat-ref demo
 Your own photos:   minisplat-ref sfm PHOTOS --out SCENE
                    minisplat-ref train SCENE --out runs/mine
 """
-EPILOG = """\
-minisplat-ref COMMAND --help explains a command.
-Exit codes: 0 done, 1 a check failed, 2 bad input, 130 interrupted."""
+EPILOG = "Exit codes: 0 done, 1 a check failed, 2 bad input, 130 interrupted."
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -80,7 +78,7 @@ def build_parser() -> argparse.ArgumentParser:
         group._group_actions.extend(commands._choices_actions)
         commands._choices_actions.clear()
     parser.add_argument_group("options").add_argument(
-        "-h", "--help", action="help", help="show this help message and exit"
+        "-h", "--help", action="help", help="show this message; COMMAND --help explains a command"
     )
     return parser
 

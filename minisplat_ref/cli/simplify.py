@@ -9,7 +9,7 @@ from minisplat_ref.experiments.arguments import Commands, HelpFormatter, integer
 
 DESCRIPTION = """\
 Make a run smaller: keep its most important Gaussians, fine-tune them, and
-measure at a dozen sizes what is lost. Some training views are held out to
+measure at some ten sizes what is lost. Some training views are held out to
 decide by; the test views are measured once, in the end.
 
   --max-drop dB   the smallest size that loses at most so much PSNR, with one

@@ -6,8 +6,8 @@ differences d_v = PSNR_v(before) - PSNR_v(after), in which what makes one photog
     drop = mean of d_v,   standard error = sqrt(sum (d_v - drop)^2 / (V - 1) / V)
 
 The knee is that of Kneedle (Satopaa et al. 2011): both axes go from 0 to 1, and the knee is where the curve lies
-highest above its chord. The count is taken as a logarithm. Left out: Kneedle's smoothing and its threshold, for which a
-dozen points are too few. The knee depends on where the curve begins and ends, so it decides only if nothing else does.
+highest above its chord. The count is taken as a logarithm. Left out: Kneedle's smoothing and its threshold, for which
+ten points are too few. The knee depends on where the curve begins and ends, so it decides only if nothing else does.
 """
 
 from collections.abc import Sequence

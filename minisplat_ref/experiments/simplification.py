@@ -1,7 +1,7 @@
 """``simplify``: a run made smaller after the fact, and how small it may be, measured on views that take no part.
 
 Candidates keep the Gaussians of the largest blend weight, summed over pixels and views (equation 12 of Mini-Splatting),
-at a dozen sizes, and each is fine-tuned. Some *training* views decide (:func:`..training.pace.held_out_ids`): they
+at some ten sizes, and each is fine-tuned. Some *training* views decide (:func:`..training.pace.held_out_ids`): they
 count neither for the importance nor for the fine-tuning while the sizes are measured. The test views stay sealed until
 the size has been chosen, and ranked and fine-tuned once more by all training views.
 
