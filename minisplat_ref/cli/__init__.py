@@ -31,6 +31,7 @@ from . import (
     oracle,
     render,
     sfm,
+    simplify,
     study,
     synthetic,
     train,
@@ -40,7 +41,7 @@ from . import (
 GROUPS = {
     "start here": (demo,),
     "preparing scenes": (sfm, undistort, downscale, synthetic),
-    "training and its results": (train, render, evaluate, convert, compare, info),
+    "training and its results": (train, render, evaluate, simplify, convert, compare, info),
     "checks and measurements": (oracle, bench, study),
     "the program itself": (extensions, cache),
 }
@@ -54,9 +55,7 @@ First time here:   minisplat-ref demo
 Your own photos:   minisplat-ref sfm PHOTOS --out SCENE
                    minisplat-ref train SCENE --out runs/mine
 """
-EPILOG = """\
-minisplat-ref COMMAND --help explains a command.
-Exit codes: 0 done, 1 a check failed, 2 bad input, 130 interrupted."""
+EPILOG = "Exit codes: 0 done, 1 a check failed, 2 bad input, 130 interrupted."
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -79,7 +78,7 @@ def build_parser() -> argparse.ArgumentParser:
         group._group_actions.extend(commands._choices_actions)
         commands._choices_actions.clear()
     parser.add_argument_group("options").add_argument(
-        "-h", "--help", action="help", help="show this help message and exit"
+        "-h", "--help", action="help", help="show this message; COMMAND --help explains a command"
     )
     return parser
 

@@ -1,0 +1,396 @@
+"""``simplify``: the rule that chooses by hand, what it leaves, that it keeps to its limits, and what it refuses."""
+
+import json
+import math
+import shutil
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+from tolerances import CLOSED_FORM
+
+from minisplat_ref.cli import main
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.datasets.synthetic.files import write_scene
+from minisplat_ref.errors import InputError, InputWarning
+from minisplat_ref.experiments import simplification
+from minisplat_ref.experiments.opened_run import HOLD_OUT_EVERY, open_run
+from minisplat_ref.experiments.progress import PSNR_MAX
+from minisplat_ref.experiments.rate_distortion import (
+    N_SIZES,
+    PlySize,
+    Point,
+    between,
+    knee,
+    paired_drop,
+    sizes,
+    smallest_within,
+)
+from minisplat_ref.experiments.simplification import Target, decide, fine_tuned, fine_tuning
+from minisplat_ref.extensions.extension import find_recipe
+from minisplat_ref.io import load_ply, load_scene, save_ply
+from minisplat_ref.io.images import read_image
+from minisplat_ref.methods import get_recipe
+from minisplat_ref.metrics import evaluate
+from minisplat_ref.strategy.importance import collect_importance
+from minisplat_ref.strategy.ops import take
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.pace import held_out_ids
+
+SCENE = {"n_views": 12, "width": 32, "height": 24, "n_points": 150, "test_every": 6}
+FILES = {
+    *("point_cloud.ply", "config.json", "cameras.json", "metrics.json", "renders"),
+    *("result.json", "figure.png", "report.html"),
+}
+
+
+def point(n, drop, error=0.0, psnr=30.0):
+    return Point(n, 100 * n, (psnr, psnr), drop, error)
+
+
+@pytest.fixture(scope="module")
+def scene_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scenes") / "nook"
+    write_scene(make_scene("room", supersampling=1, **SCENE), folder, SCENE)
+    return folder
+
+
+def trained(scene_folder, out, *options):
+    command = ["train", str(scene_folder), "--out", str(out), "--iterations", "40", "--test-every", "6", *options]
+    assert main(command) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def run_folder(scene_folder, tmp_path_factory):
+    return trained(scene_folder, tmp_path_factory.mktemp("runs") / "run")
+
+
+def simplify(folder, out, *options):
+    return main(["simplify", str(folder), "--out", str(out), "--fine-tune", "3", *options])
+
+
+@pytest.fixture(scope="module")
+def halved(run_folder, tmp_path_factory):
+    """Simplified to a budget, once for the tests that look at it."""
+    out = tmp_path_factory.mktemp("runs") / "halved"
+    assert simplify(run_folder, out, "--budget", "70") == 0
+    return out
+
+
+def read(path):
+    return json.loads(path.read_text())
+
+
+# The rule -------------------------------------------------------------------------------------------------------------
+
+
+def test_paired_drop_by_hand():
+    """Differences 1, 2, 6: mean 3, deviations -2, -1, 3, so variance 14 / 2 and standard error sqrt(7 / 3)."""
+    drop, error = paired_drop((20.0, 30.0, 40.0), (19.0, 28.0, 34.0))
+    assert drop == pytest.approx(3.0, rel=CLOSED_FORM) and error == pytest.approx(math.sqrt(7 / 3), rel=CLOSED_FORM)
+
+
+def test_what_all_views_have_in_common_is_no_error():
+    drop, error = paired_drop((10.0, 20.0, 40.0), (9.5, 19.5, 39.5))
+    assert drop == 0.5 and error == 0.0
+
+
+def test_drop_of_equal_pictures_and_of_one_view():
+    drop, error = paired_drop((math.inf, math.inf), (math.inf, PSNR_MAX - 1.0))
+    assert drop == 0.5 and error == 0.5
+    drop, error = paired_drop((30.0,), (29.0,))
+    assert drop == 1.0 and math.isnan(error)
+
+
+def test_smallest_within_adds_one_standard_error():
+    points = [point(10, 2.0), point(20, 0.09, 0.02), point(30, 0.06, 0.04), point(40, 0.0, 0.01)]
+    assert smallest_within(points, 0.1).n_gaussians == 30  # 20 loses 0.11 with its error
+    assert smallest_within(points, 0.11).n_gaussians == 20
+    assert smallest_within(points, 5.0).n_gaussians == 10
+
+
+def test_no_size_within():
+    points = [point(10, 2.0, 0.1), point(20, 0.5, 0.25)]
+    with pytest.raises(InputError, match=r"at most 0\.1 dB: 20 Gaussians come nearest with 0\.500 \+- 0\.250 dB on 2"):
+        smallest_within(points, 0.1)
+
+
+def test_between_halves_the_bracket_of_the_limit():
+    reference = point(400, 0.0)
+    points = [point(100, 0.5), point(200, 0.2)]
+    assert between(points, reference, 0.1) == round(math.sqrt(200 * 400))  # none is within: all Gaussians are above
+    assert between(points, reference, 0.3) == round(math.sqrt(100 * 200))
+    assert between(points, reference, 1.0) is None  # the smallest is within
+    assert between([point(399, 0.5)], reference, 0.1) is None  # no number between
+
+
+def test_sizes_are_geometric_and_keep_to_candidates():
+    series = sizes(1600, 1600)
+    assert series == [round(1600 / math.sqrt(2) ** k) for k in range(N_SIZES, 0, -1)] and series[0] == 100
+    assert sizes(1600, 300) == [size for size in series if size < 300] + [300]
+    assert sizes(1600, 1600, 250, 5000) == sorted([*series, 250, 1600])
+    assert sizes(2, 1) == [1]
+
+
+def test_knee_by_hand():
+    """Counts 1, 10, 100, 1000 are at 0, 1/3, 2/3, 1; PSNR 10, 25, 28, 30 at 0, 3/4, 9/10, 1: above by 0.42 and 0.23."""
+    psnrs = {1: 10.0, 10: 25.0, 100: 28.0, 1000: 30.0}
+    points = [point(n, 0.0, psnr=psnr) for n, psnr in psnrs.items()]
+    assert knee(points).n_gaussians == knee(points[::-1]).n_gaussians == 10
+    assert knee([*points[:1], point(10, 0.0, psnr=17.0), *points[2:]]).n_gaussians == 100  # 7/20 and 9/10
+    assert knee([point(n, 0.0) for n in (10, 100)]).n_gaussians == 10  # nothing is lost
+
+
+def test_ply_size_is_that_of_the_file(run_folder, tmp_path):
+    size = simplification.ply_size(open_run(run_folder))
+    gaussians = load_ply(run_folder / "point_cloud.ply")
+    for n in (1, 9, 10, 100):
+        save_ply(tmp_path / "a.ply", take(gaussians, np.arange(n)))
+        n_bytes = (tmp_path / "a.ply").stat().st_size
+        assert size.of(n) == n_bytes
+        assert size.most_rows(n_bytes) == n and size.most_rows(n_bytes - 1) == n - 1
+
+
+def test_digits_of_the_count_count():
+    size = PlySize(header=100, row=10)
+    assert size.of(9) == 191 and size.of(10) == 202
+    assert size.most_rows(201) == 9 and size.most_rows(202) == 10 and size.most_rows(50) == 0
+
+
+# Fine-tuning ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["3dgs-accel", "mini-splatting", "adaptive"])
+def test_rates_stay_at_their_last(name):
+    recipe = get_recipe(name, 1000)
+    tuning = fine_tuning(recipe, 20, holds_out=True)
+    assert tuning.iterations == recipe.iterations + 20 and not tuning.events
+    last = recipe.rates.at(recipe.iterations, 2.0)
+    if recipe.cooling is not None:
+        last = {n: r * (0.01 if n == "means" else 0.1) for n, r in last.items()}
+    for step in (recipe.iterations + 1, recipe.iterations + 20):
+        assert tuning.rates.at(step, 2.0) == pytest.approx(last, rel=CLOSED_FORM)
+
+
+def test_held_out_views_do_not_enter_the_fine_tuning(run_folder, monkeypatch):
+    """Which is told by the views that the loop reports: without holding out, all come up."""
+    run, seen = open_run(run_folder), {}
+
+    def watched(*args, on_step, **named):
+        def on_report(report):
+            seen[holds_out].add(report.view.name)
+            on_step(report)
+
+        return train(*args, on_step=on_report, **named)
+
+    monkeypatch.setattr(simplification, "train", watched)
+    n = len(run.scene.train_views)
+    for holds_out in (True, False):
+        seen[holds_out] = set()
+        fine_tuned(run, np.arange(50), n, holds_out=holds_out, on_step=lambda: None)
+    held = {view.name for view in run.held_out}
+    assert held == {run.scene.train_views[k].name for k in held_out_ids(n, HOLD_OUT_EVERY)}
+    assert seen[True] == {view.name for view in run.others} and seen[False] == seen[True] | held
+
+
+# From end to end ------------------------------------------------------------------------------------------------------
+
+
+def test_budget(halved, run_folder):
+    assert {path.name for path in halved.iterdir()} == FILES
+    gaussians, result = load_ply(halved / "point_cloud.ply"), read(halved / "result.json")
+    assert len(gaussians.means) == 70 == result["chosen"]["n_gaussians"]
+    assert (halved / "point_cloud.ply").stat().st_size == result["chosen"]["n_bytes"]
+    assert result["target"] == "--budget 70" and len(result["held_out"]) == 2
+    assert result["all"]["n_gaussians"] == len(load_ply(run_folder / "point_cloud.ply").means)
+    assert [p["n_gaussians"] for p in result["curve"]] == sorted(p["n_gaussians"] for p in result["curve"])
+    for p in result["curve"]:
+        drop, error = paired_drop(result["all"]["psnrs"], p["psnrs"])
+        assert (p["drop"], p["standard_error"]) == (drop, error)
+
+    metrics, test = read(halved / "metrics.json"), result["test"]
+    assert metrics["n_gaussians"] == 70 and metrics["psnr"] == test["psnr_after"]
+    before = read(run_folder / "metrics.json")["psnr"]
+    assert metrics["psnr_before"] == test["psnr_before"] == pytest.approx(before, rel=CLOSED_FORM)
+    assert test["drop"] == pytest.approx(test["psnr_alike"] - test["psnr_after"], abs=1e-9)
+    assert read_image(halved / "figure.png").std() > 1
+    page = (halved / "report.html").read_text()
+    assert "<svg" in page and 'href="http' not in page and page.count("data:image/png") == 3 * len(test["views"])
+
+
+def test_the_new_folder_is_a_run(halved, tmp_path, capsys):
+    """``render``, ``eval``, ``info`` and ``convert`` take it; ``eval`` finds what ``simplify`` has measured."""
+    copy = shutil.copytree(halved, tmp_path / "copy")
+    before = read(copy / "metrics.json")
+    assert main(["eval", str(copy)]) == 0
+    assert read(copy / "metrics.json") == before
+    assert main(["render", str(copy), "--out", str(tmp_path / "views")]) == 0
+    assert main(["convert", str(copy), str(tmp_path / "a.ply")]) == 0
+    assert (tmp_path / "a.ply").read_bytes() == (copy / "point_cloud.ply").read_bytes()
+    capsys.readouterr()
+    assert main(["info", str(copy)]) == 0
+    out = capsys.readouterr().out
+    assert "complete" in out and "psnr before" in out
+
+
+def test_same_bytes_twice(halved, run_folder, tmp_path):
+    again = tmp_path / halved.name  # the page names the folder
+    assert simplify(run_folder, again, "--budget", "70") == 0
+    for name in ("point_cloud.ply", "result.json", "metrics.json", "figure.png"):
+        assert (again / name).read_bytes() == (halved / name).read_bytes(), name
+
+
+def test_without_fine_tuning_the_most_important_stay_as_they_are(run_folder, scene_folder, tmp_path):
+    command = ["simplify", str(run_folder), "--out", str(tmp_path / "out"), "--budget", "60", "--fine-tune", "0"]
+    assert main(command) == 0
+    dense, scene = load_ply(run_folder / "point_cloud.ply"), load_scene(scene_folder, test_every=6)
+    weights = collect_importance(dense, scene.train_views).blend_weight_sum
+    rows = np.sort(np.argsort(-weights, kind="stable")[:60])
+    for ours, theirs in zip(load_ply(tmp_path / "out" / "point_cloud.ply"), take(dense, rows), strict=True):
+        assert_array_equal(ours, theirs)
+
+    # And the curve, from the beginning: ranked by the other views, measured on those that are held out.
+    held = held_out_ids(len(scene.train_views), HOLD_OUT_EVERY)
+    others = [view for k, view in enumerate(scene.train_views) if k not in held]
+    weights = collect_importance(dense, others).blend_weight_sum
+    kept = take(dense, np.sort(np.argsort(-weights, kind="stable")[:60]))
+    views = [scene.train_views[k] for k in held]
+    before, after = (
+        [view.psnr for view in evaluate(g, views, background=scene.background).per_view] for g in (dense, kept)
+    )
+    chosen = read(tmp_path / "out" / "result.json")["chosen"]
+    assert (chosen["drop"], chosen["standard_error"]) == pytest.approx(paired_drop(before, after), rel=1e-9)
+
+
+def test_max_bytes_is_a_ceiling(run_folder, tmp_path):
+    row = simplification.ply_size(open_run(run_folder)).row
+    most = (run_folder / "point_cloud.ply").stat().st_size // 2
+    assert simplify(run_folder, tmp_path / "out", "--max-bytes", str(most)) == 0
+    assert most - row < (tmp_path / "out" / "point_cloud.ply").stat().st_size <= most
+
+
+def test_max_drop_is_kept_by_the_smallest_of_the_measured(run_folder, tmp_path, capsys):
+    assert simplify(run_folder, tmp_path / "out", "--max-drop", "1") == 0
+    result = read(tmp_path / "out" / "result.json")
+    within = [p["n_gaussians"] for p in result["curve"] if p["drop"] + p["standard_error"] <= 1]
+    assert result["chosen"]["n_gaussians"] == min(within)
+    lines = capsys.readouterr().out.splitlines()
+    assert sum("chosen" in line for line in lines) == 1 and lines[-1].startswith("test PSNR ")
+
+
+def test_the_knee_decides_where_nothing_is_asked(run_folder):
+    decision = decide(open_run(run_folder), Target(), 1)
+    assert decision.chosen == decision.knee
+    n_all = decision.reference.n_gaussians
+    assert len(decision.points) == N_SIZES and decision.points[0].n_gaussians == round(n_all / 16)
+
+
+def test_a_budget_of_more_than_all_keeps_all_that_matter(run_folder, tmp_path, capsys):
+    assert simplify(run_folder, tmp_path / "out", "--budget", "100000") == 0
+    result = read(tmp_path / "out" / "result.json")
+    assert result["is_all_that_matter"] and result["chosen"] == result["curve"][-1]
+    assert "--budget 100000 is more than all" in capsys.readouterr().err
+
+
+def test_of_an_extension(scene_folder, tmp_path):
+    """A population with one more field, whose bytes count; shared parameters and exposures come along."""
+    run = trained(scene_folder, tmp_path / "run", "--recipe", "velocity", "--set", "exposure=true")
+    assert simplify(run, tmp_path / "out", "--budget", "40") == 0
+    population = find_recipe("velocity").representation.population
+    assert load_ply(tmp_path / "out" / "point_cloud.ply", population).velocities.shape == (40, 3)
+    result = read(tmp_path / "out" / "result.json")
+    assert (tmp_path / "out" / "point_cloud.ply").stat().st_size == result["chosen"]["n_bytes"]
+    exposures = [np.load(folder / "shared.npz")["exposures"] for folder in (run, tmp_path / "out")]
+    assert exposures[0].shape == exposures[1].shape == (12, 3, 4) and (exposures[0] != exposures[1]).any()
+    assert main(["eval", str(tmp_path / "out")]) == 0
+
+
+# What is refused ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def refused(tmp_path, capfd):
+    """Simplify what must be refused; nothing is left, and one line says why."""
+
+    def run(folder, *options, out=None):
+        out = out or tmp_path / "out"
+        before = sorted(tmp_path.rglob("*"))
+        try:
+            code = simplify(folder, out, *options)
+        except SystemExit as error:  # of the arguments
+            code = error.code
+        assert code == 2
+        assert sorted(tmp_path.rglob("*")) == before
+        (line,) = [line for line in capfd.readouterr().err.splitlines() if "error: " in line]
+        return line.rpartition("error: ")[2]
+
+    return run
+
+
+def test_targets_that_cannot_be_met(run_folder, refused):
+    size = simplification.ply_size(open_run(run_folder))
+    line = refused(run_folder, "--max-bytes", "10")
+    assert "--max-bytes 10 is too little" in line and f"{size.of(1):,} bytes" in line and "convert" in line
+    assert "Gaussians come nearest" in refused(run_folder, "--max-drop", "0", "--fine-tune", "0")
+    assert "not a whole number" in refused(run_folder, "--budget", "0")
+    assert "not a number of dB" in refused(run_folder, "--max-drop", "nan")
+    assert "not allowed with" in refused(run_folder, "--budget", "9", "--max-bytes", "90000")
+
+
+def test_folders_that_cannot_be_used(halved, run_folder, refused, tmp_path):
+    assert "is not a folder" in refused(tmp_path / "nowhere")
+    assert "already there and not empty" in refused(run_folder, out=halved)
+    assert "holds no run" in refused(run_folder / "renders")
+
+
+def test_photographs_that_are_elsewhere(run_folder, scene_folder, refused, tmp_path):
+    copy = shutil.copytree(run_folder, tmp_path / "run")
+    config = read(copy / "config.json")
+    config["settings"]["scene"] = str(tmp_path / "gone")
+    (copy / "config.json").write_text(json.dumps(config))
+    line = refused(copy)
+    assert f"{tmp_path / 'gone'}, the scene of" in line and "--scene PATH" in line
+    assert open_run(copy, scene_folder).settings.scene == str(scene_folder)
+
+
+def test_too_few_views_to_decide_by(tmp_path, refused):
+    options = {**SCENE, "n_views": 3, "test_every": 0}
+    write_scene(make_scene("room", supersampling=1, **options), tmp_path / "scene", options)
+    command = ["train", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), "--iterations", "2"]
+    assert main([*command, "--test-every", "0"]) == 0
+    assert "has 3 training views, and at least 4 are needed" in refused(tmp_path / "run")
+
+
+def test_a_renderer_without_blend_weights(run_folder, refused, monkeypatch):
+    from minisplat_ref.experiments import opened_run
+
+    recipe = get_recipe("3dgs-accel", 40)
+    inner = recipe.representation.renderer
+
+    def render(model, view, request):
+        output, tape = inner.render(model, view, request)
+        return output._replace(stats=None), tape
+
+    blind = recipe.representation._replace(renderer=inner._replace(name="blind", render=render))
+    monkeypatch.setattr(opened_run, "recipe_of", lambda settings: recipe._replace(representation=blind))
+    assert "renderer blind of extension core gives no blend weights" in refused(run_folder)
+
+
+def test_no_test_views(scene_folder, tmp_path, capsys):
+    command = ["train", str(scene_folder), "--out", str(tmp_path / "run"), "--iterations", "5", "--test-every", "0"]
+    assert main(command) == 0
+    assert simplify(tmp_path / "run", tmp_path / "out", "--budget", "50") == 0
+    assert capsys.readouterr().out.splitlines()[-1].endswith("50 Gaussians; no test views to measure")
+    assert read(tmp_path / "out" / "result.json")["test"] is None
+
+
+def test_an_unfinished_run(run_folder, tmp_path):
+    """Its checkpoint is simplified, and a line says so."""
+    copy = shutil.copytree(run_folder, tmp_path / "run")
+    for name in ("point_cloud.ply", "metrics.json"):
+        (copy / name).unlink()
+    with pytest.warns(InputWarning, match="has not ended: this is its checkpoint of iteration 40"):
+        run = open_run(copy)
+    assert run.unfinished == run.step == 40
+    assert_array_equal(run.model.gaussians.means, load_ply(run_folder / "point_cloud.ply").means)
