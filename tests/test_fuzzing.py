@@ -48,7 +48,8 @@ def test_damaged_file_is_read_or_refused(folders, name, data):
 def test_libraries_in_c_survive_damaged_files(name):
     outcome = fuzz(READERS[name], n_files=N_FILES)
     assert outcome.findings == ()
-    assert outcome.n_files == N_FILES and 0 < outcome.n_refused < N_FILES
+    assert outcome.n_files == N_FILES and 0 < outcome.n_refused
+    assert outcome.n_refused < N_FILES or name == "compact"  # whose checksums may notice every change
 
 
 # the fuzzing itself
