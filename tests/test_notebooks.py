@@ -37,7 +37,7 @@ def picture(values):
     return nbformat.v4.new_output("display_data", {"image/png": png(values), "text/plain": "<Figure>"})
 
 
-GREY = np.full((8, 9, 3), 100)
+GREY = np.full((16, 24, 3), 100)
 
 
 # What is stored
@@ -98,7 +98,7 @@ def test_the_same_is_the_same():
         (printed("a 1.25\n"), printed("a 1.26\n"), "1.26"),
         (printed("a\n"), picture(GREY), "a picture"),
         (picture(GREY), picture(GREY + 3), "3.00 of 255"),
-        (picture(GREY), picture(GREY[1:]), "9 x 7 pixels"),
+        (picture(GREY), picture(GREY[1:]), "24 x 15 pixels"),
     ],
 )
 def test_a_difference_is_named(old, new, what):
@@ -116,10 +116,12 @@ def test_tags_leave_room():
     [difference] = differences(old, notebook_of(printed("y 10.5 dB\n")))
     assert "y # dB" in difference
     noisy = notebook_of(picture(GREY), tags=["rounding"])
-    assert list(differences(noisy, notebook_of(picture(GREY + 46)))) == []  # 0.3 times the 155 to a white page
-    assert len(list(differences(noisy, notebook_of(picture(GREY + 47))))) == 1
-    thin = np.where(np.arange(9)[:, None] == 4, 0, GREY + 155)  # lines on white: a blank page is told apart
-    assert len(list(differences(notebook_of(picture(thin), tags=["rounding"]), notebook_of(picture(GREY + 155))))) == 1
+    assert list(differences(noisy, notebook_of(picture(GREY + 61)))) == []  # 0.4 times the 155 to a white page is 62
+    assert len(list(differences(noisy, notebook_of(picture(GREY + 63))))) == 1
+    white = GREY + 155
+    line, moved = (np.where(np.arange(24)[:, None] == column, 0, white) for column in (11, 12))
+    assert list(differences(notebook_of(picture(line), tags=["rounding"]), notebook_of(picture(moved)))) == []
+    assert len(list(differences(notebook_of(picture(line), tags=["rounding"]), notebook_of(picture(white))))) == 1
     timed = notebook_of(printed("3 s\n"), tags=["clock"])
     assert list(differences(timed, notebook_of(printed("4 ms\n")))) == []
     assert len(list(differences(timed, notebook_of(picture(GREY))))) == 1
