@@ -13,7 +13,7 @@ from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError, InputWarning
-from minisplat_ref.experiments import simplification
+from minisplat_ref.experiments import opened_run, simplification
 from minisplat_ref.experiments.opened_run import HOLD_OUT_EVERY, open_run
 from minisplat_ref.experiments.progress import PSNR_MAX
 from minisplat_ref.experiments.rate_distortion import (
@@ -362,19 +362,22 @@ def test_too_few_views_to_decide_by(tmp_path, refused):
     assert "has 3 training views, and at least 4 are needed" in refused(tmp_path / "run")
 
 
-def test_a_renderer_without_blend_weights(run_folder, refused, monkeypatch):
-    from minisplat_ref.experiments import opened_run
-
+@pytest.mark.parametrize("reason", ["", "its kernels collect none"])
+def test_a_renderer_without_blend_weights(run_folder, refused, monkeypatch, reason):
+    """Whether it leaves them out or refuses to draw."""
     recipe = get_recipe("3dgs-accel", 40)
     inner = recipe.representation.renderer
 
     def render(model, view, request):
+        if reason:
+            raise InputError(reason)
         output, tape = inner.render(model, view, request)
         return output._replace(stats=None), tape
 
     blind = recipe.representation._replace(renderer=inner._replace(name="blind", render=render))
     monkeypatch.setattr(opened_run, "recipe_of", lambda settings: recipe._replace(representation=blind))
-    assert "renderer blind of extension core gives no blend weights" in refused(run_folder)
+    line = refused(run_folder)
+    assert "renderer blind of extension core gives no blend weights" in line and reason in line
 
 
 def test_no_test_views(scene_folder, tmp_path, capsys):

@@ -10,6 +10,11 @@ A run and its folder: what ``train`` does
     :mod:`.kill_points` and :mod:`.survival` kill a training wherever it could hurt (``python -m
     data_tools.kill_points``).
 
+A smaller model from a run: what ``simplify`` does
+    :mod:`.opened_run` (what is read of the run, and the views that decide), :mod:`.rate_distortion` (drop, standard
+    error, rule and knee, by which a size is chosen), :mod:`.simplification` (sizes ranked, fine-tuned and measured),
+    :mod:`.simplified_run` (the new folder).
+
 More than one run
     :mod:`.comparison` (several recipes side by side: ``compare``), :mod:`.studies` (what a choice in a method does:
     ``study``), :mod:`.measure` (the runs of docs/measured: ``python -m data_tools.measure``).
@@ -17,7 +22,7 @@ More than one run
 The report kit
     :mod:`.page` (a page of HTML, from cards, tables, panels), :mod:`.plots` (curves as SVG and PNG), :mod:`.pictures`
     (renders, errors and depths for the eye); :mod:`minisplat_ref.reporting` has tables in Markdown and the machine.
-    Two reports are made of it: :mod:`.demo_report` and :mod:`.comparison.report`.
+    Three reports are made of it: :mod:`.demo_report`, :mod:`.comparison.report` and :mod:`.simplification_report`.
 
 :mod:`.arguments` is what the command line's parsers share. :mod:`.fuzzing` has every reader of files read damaged ones:
 ``python -m data_tools.fuzz``.

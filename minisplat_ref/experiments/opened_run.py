@@ -121,8 +121,13 @@ def open_run(folder: Path, scene: Path | None = None) -> Run:
 def _check_renderer(run: Run) -> None:
     """Refuse a renderer that does not say how much each row weighs in a picture."""
     request = Request(conventions=run.conventions, backend=run.backend, wants=frozenset({"stats"}))
-    if run.recipe.renderer.render(run.model, run.scene.train_views[0], request)[0].stats is None:
-        raise InputError(
-            f"{run.folder}: renderer {run.recipe.renderer.name} of extension {run.owner.name} gives no blend weights,"
-            " by which simplify chooses: simplify a run of another extension"
-        )
+    renderer, reason = run.recipe.renderer, ""
+    try:
+        if renderer.render(run.model, run.scene.train_views[0], request)[0].stats is not None:
+            return
+    except InputError as error:
+        reason = f" ({error})"
+    raise InputError(
+        f"{run.folder}: renderer {renderer.name} of extension {run.owner.name} gives no blend weights, by which"
+        f" simplify chooses{reason}: give a run of another recipe"
+    )
