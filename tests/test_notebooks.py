@@ -116,8 +116,8 @@ def test_tags_leave_room():
     [difference] = differences(old, notebook_of(printed("y 10.5 dB\n")))
     assert "y # dB" in difference
     noisy = notebook_of(picture(GREY), tags=["rounding"])
-    assert list(differences(noisy, notebook_of(picture(GREY + 61)))) == []  # 0.4 times the 155 to a white page is 62
-    assert len(list(differences(noisy, notebook_of(picture(GREY + 63))))) == 1
+    assert list(differences(noisy, notebook_of(picture(GREY + 92)))) == []  # 0.6 times the 155 to a white page is 93
+    assert len(list(differences(noisy, notebook_of(picture(GREY + 94))))) == 1
     white = GREY + 155
     line, moved = (np.where(np.arange(24)[:, None] == column, 0, white) for column in (11, 12))
     assert list(differences(notebook_of(picture(line), tags=["rounding"]), notebook_of(picture(moved)))) == []
