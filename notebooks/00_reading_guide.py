@@ -208,8 +208,8 @@ display(Markdown("\n".join(["| module | its docstring |", "|---|---|", *table]))
 # %% [markdown]
 # ## Reading order
 #
-# This is the order of the README, with the notebooks beside it. Everything up to the training loop is NumPy and can be
-# read without knowing Numba.
+# This is the order of `docs/ARCHITECTURE.md`, with the notebooks beside it. Everything up to the training loop is NumPy
+# and can be read without knowing Numba.
 
 # %%
 ORDER = (
@@ -346,11 +346,11 @@ assert (
     level["training"] < level["rendering"] < level["backends"] < level["reference"] == level["scalar"] < level["types"]
 )
 
-# The README has the same reading order, and every notebook is in it.
-readme = (pyproject.parent / "README.md").read_text().split("## Reading order")[1].split("\n| question")[0]
-in_readme = [name for name in re.findall(r"`([^`]+)`", readme) if name not in ("00", "notebooks/")]
+# The page on the architecture has the same reading order, and every notebook is in it.
+page = (pyproject.parent / "docs" / "ARCHITECTURE.md").read_text().split("## Reading order")[1].split("\n| question")[0]
+on_page = [name for name in re.findall(r"`([^`]+)`", page) if name not in ("00", "notebooks/")]
 here = re.findall(r"`([^`]+)`", " ".join(read for read, _, _ in ORDER))
-assert in_readme == [name for name in here if name in in_readme]
+assert on_page == [name for name in here if name in on_page]
 named = {number for _, notebooks, _ in ORDER for number in re.findall(r"\d\d", notebooks)}
 assert named | {"00"} == {path.name[:2] for path in (pyproject.parent / "notebooks").glob("[0-9]*.ipynb")}
 
