@@ -20,7 +20,8 @@ import numpy as np
 
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions import shared_study as shared
+from minisplat_ref.extensions import shared_studies
+from minisplat_ref.extensions import shared_trainings as shared
 from minisplat_ref.extensions.compression.msz import MSZ
 from minisplat_ref.extensions.compression.spz import SPZ
 from minisplat_ref.io.atomic import making_folder
@@ -82,7 +83,7 @@ def run(args: argparse.Namespace) -> None:
             "runs": runs,
             "shrunk": {name: [of_seed[name] for of_seed in shrunk] for name in shrunk[0]},
         }
-        shared.write(folder, result, draw(result))
+        shared_studies.write(folder, result, draw(result))
     print(f"{scene.name}: {shared.with_deviation(psnrs, 2)} dB, {np.mean(counts):,.0f} Gaussians\n")
     print(markdown_table(["file", "bytes", "bytes a Gaussian", "dB lost"], to_rows(runs)))
     print("\ndB lost when the scene is smaller\n")
@@ -209,7 +210,7 @@ def draw(result: dict[str, Any]) -> "Figure":
     small.minorticks_off()
     small.invert_xaxis()
     for axes in (rate, small):
-        shared.tidy(axes)
+        shared_studies.tidy(axes)
         axes.legend(frameon=False, fontsize=9)
     return figure
 

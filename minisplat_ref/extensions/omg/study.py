@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.extensions import shared_study as shared
+from minisplat_ref.extensions import shared_studies
+from minisplat_ref.extensions import shared_trainings as shared
 from minisplat_ref.extensions.omg.file import OMG_FILE, order_of
 from minisplat_ref.extensions.omg.method import POWER
 from minisplat_ref.extensions.omg.reference import distinct_importance, local_distinctiveness
@@ -70,7 +71,7 @@ def run(args: argparse.Namespace) -> None:
         losses = [losses_of_fields(whole, scene) for whole in wholes]
         result = {**shared.describe(args, scene), "fine_tune": args.fine_tune, "power": POWER, "runs": runs}
         result["losses"] = {field: [of_seed[field] for of_seed in losses] for field in losses[0]}
-        shared.write(folder, result, draw(result))
+        shared_studies.write(folder, result, draw(result))
     print(f"{scene.name}; fine-tuned {args.fine_tune} iterations\n")
     heading = [
         "kept",
@@ -231,7 +232,7 @@ def draw(result: dict[str, Any]) -> "Figure":
     halves.set(ylabel="PSNR gained by distinctiveness (dB)", title="where it helps, where it hurts")
     size.set(xlabel="kB of .omg", ylabel="PSNR of what is read again (dB)", title="bytes, and quality", ylim=None)
     for axes in (kept, halves, size):
-        shared.tidy(axes)
+        shared_studies.tidy(axes)
         axes.legend(frameon=False, fontsize=8)
     return figure
 

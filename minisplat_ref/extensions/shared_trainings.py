@@ -1,29 +1,23 @@
-"""What the studies of extensions share that train a scene: its arguments, the scene, and a folder with the results."""
+"""What studies share that train a scene once for each seed, and ask what becomes of it: arguments, trainings, means."""
 
 import argparse
-import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.extensions import shared_studies
 from minisplat_ref.types import Gaussians, Scene
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-RESULT, FIGURE = "result.json", "figure.png"
-PNG_DPI = 150
 BLUE, RED, YELLOW, GREY = "#35608c", "#d2493f", "#e0a526", "#8a8580"
 
 
 def add_scene_arguments(parser: argparse.ArgumentParser, iterations: int, recipe: str) -> None:
     """Add a scene of any kind, what it is trained by, and ``--out``."""
     parser.add_argument("scene", metavar="SCENE", help="folder of a scene, or a synthetic one such as room")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=f"new folder for {RESULT} and {FIGURE}")
+    shared_studies.add_out(parser)
     parser.add_argument("--downscale", type=int, default=1, metavar="D", help="make photographs D times smaller")
     parser.add_argument("--recipe", default=recipe, metavar="R", help="of the trainings (default %(default)s)")
     parser.add_argument(
@@ -41,21 +35,10 @@ def read_scene(args: argparse.Namespace) -> Scene:
     InputError
         It is neither, it has no test views, or a number that was given makes no sense.
     """
-    from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
-    from minisplat_ref.io import load_scene
-
     for name in ("downscale", "iterations", "seeds"):
         if getattr(args, name) < 1:
             raise InputError(f"--{name} is {getattr(args, name)}: give at least 1")
-    if Path(args.scene).exists():
-        scene = load_scene(args.scene, downscale=args.downscale)
-    elif args.scene in SCENE_NAMES:
-        scene = make_scene(args.scene).scene
-    else:
-        raise InputError(f"{args.scene}: neither a folder nor one of {', '.join(SCENE_NAMES)}; give a scene")
-    if not scene.test_views:
-        raise InputError(f"scene {scene.name} has no test views to compare by: add photographs")
-    return scene
+    return shared_studies.read_scene(args.scene, args.downscale)
 
 
 def populations(args: argparse.Namespace, scene: Scene) -> list[Gaussians]:
@@ -107,16 +90,3 @@ def with_deviation(values: Sequence[float], digits: int) -> str:
     """Return mean and deviation as a table has them; the number itself if it is only one."""
     mean, deviation = mean_and_deviation(values)
     return f"{mean:.{digits}f} ± {deviation:.{digits}f}" if len(values) > 1 else f"{mean:.{digits}f}"
-
-
-def tidy(axes: "Axes") -> None:
-    """Take away the frame above and on the right, and draw a pale grid."""
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(color="#e6eaee")
-    axes.set_axisbelow(True)
-
-
-def write(folder: Path, result: dict[str, Any], figure: "Figure") -> None:
-    """Write the results and the figure into a folder that exists."""
-    (folder / RESULT).write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
-    figure.savefig(folder / FIGURE, dpi=PNG_DPI, facecolor="white")
