@@ -9,6 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from data_tools import guided_fuzz
 from minisplat_ref.experiments.fuzzing import run
 from minisplat_ref.experiments.fuzzing.judging import judge
 from minisplat_ref.experiments.fuzzing.readers import READERS, mutant
@@ -103,3 +104,20 @@ def test_command():
     command = [sys.executable, "-m", "data_tools.fuzz", "cameras", "--seconds", "1"]
     shown = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     assert shown.stdout.startswith("| reader ") and "| cameras |" in shown.stdout
+
+
+def test_guided_fuzzing_says_what_it_needs(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "atheris", None)
+    monkeypatch.setattr(sys, "argv", ["guided_fuzz", "ply"])
+    with pytest.raises(SystemExit) as exit_info:
+        guided_fuzz.main()
+    assert exit_info.value.code == 2
+    assert "pip install 'minisplat_ref[fuzzing]'" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_guided_fuzzing_finds_nothing_in_ten_seconds():
+    pytest.importorskip("atheris")
+    command = [sys.executable, "-m", "data_tools.guided_fuzz", "ply", "--seconds", "10"]
+    done = subprocess.run(command, capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
