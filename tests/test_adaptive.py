@@ -265,7 +265,7 @@ def test_train_ends_by_itself_and_says_why(scene_folder, tmp_path, capsys):
     assert main(["info", str(run)]) == 0
     assert "complete" in capsys.readouterr().out
     assert main(["train", "--resume", str(run)]) == 2
-    assert "has decided to end" in capsys.readouterr().err
+    assert "of which the last had falling rates" in capsys.readouterr().err
 
 
 def test_minutes_are_a_limit(scene_folder, tmp_path, capsys):

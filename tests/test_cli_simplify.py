@@ -358,7 +358,7 @@ def test_too_few_views_to_decide_by(tmp_path, refused):
     options = {**SCENE, "n_views": 3, "test_every": 0}
     write_scene(make_scene("room", supersampling=1, **options), tmp_path / "scene", options)
     command = ["train", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), "--iterations", "2"]
-    assert main([*command, "--test-every", "0"]) == 0
+    assert main([*command, "--recipe", "3dgs-accel", "--test-every", "0"]) == 0
     assert "has 3 training views, and at least 4 are needed" in refused(tmp_path / "run")
 
 

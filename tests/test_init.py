@@ -130,7 +130,8 @@ def train(scene_folder, out, *options):
 
 def test_train_starts_from_the_cloud(scene_folder, dense, tmp_path, capfd, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert train(scene_folder, tmp_path / "run", "--iterations", "3", "--init", "dense.ply") == 0
+    schedule = ["--recipe", "3dgs-accel", "--iterations", "3"]
+    assert train(scene_folder, tmp_path / "run", *schedule, "--init", "dense.ply") == 0
     captured = capfd.readouterr()
     assert "8 training and 3 test views of 32 x 24, 60 points" in captured.out
     assert f"starts from 119 points of {dense}" in captured.out

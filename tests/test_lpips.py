@@ -255,7 +255,8 @@ def read_metrics(folder):
 
 
 def train(scene_folder, out, *options):
-    return main(["train", str(scene_folder), "--iterations", "8", "--test-every", "4", "--out", str(out), *options])
+    schedule = ["--recipe", "3dgs-accel", "--iterations", "8"]
+    return main(["train", str(scene_folder), *schedule, "--test-every", "4", "--out", str(out), *options])
 
 
 @pytest.fixture(scope="module")

@@ -36,6 +36,7 @@ from minisplat_ref.training.schedule import Every, configured, describe, parsed_
 from minisplat_ref.training.state import Iteration, TrainState, start_anew
 from minisplat_ref.types import Floats, Gaussians, Model, Scene, View
 
+SCHEDULED = ("--recipe", "3dgs-accel")
 CALIBRATED = {"exposure": True, "pose": True}
 
 
@@ -527,7 +528,7 @@ def scene_folder(tmp_path_factory):
 
 def test_calibrated_training_from_end_to_end(scene_folder, tmp_path, capsys):
     """Twelve iterations at once, and eight and then four: the same bytes; and every command takes the run."""
-    options = ["--set", "exposure=true", "--set", "pose=true", "--test-every", "4", "--seed", "5"]
+    options = [*SCHEDULED, "--set", "exposure=true", "--set", "pose=true", "--test-every", "4", "--seed", "5"]
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     assert main(["train", str(scene_folder), "--out", str(whole), "--iterations", "12", *options]) == 0
     assert json.loads((whole / "config.json").read_text())["recipe"]["calibrations"] == ["exposure", "pose"]
@@ -559,7 +560,8 @@ def test_calibrated_training_from_end_to_end(scene_folder, tmp_path, capsys):
 
 def test_unknown_setting_on_the_command_line(scene_folder, tmp_path, capsys):
     out = tmp_path / "out"
-    assert main(["train", str(scene_folder), "--out", str(out), "--iterations", "2", "--set", "nonsense=1"]) == 2
+    options = [*SCHEDULED, "--iterations", "2", "--set", "nonsense=1"]
+    assert main(["train", str(scene_folder), "--out", str(out), *options]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "has no nonsense to set: choose from" in line
     assert all(name in line for name in settings_of(RECIPES["3dgs-accel"]))

@@ -239,7 +239,9 @@ def _resume(folder: Path, given: dict[str, Any]) -> int:
             ours = ours._replace(scene=str(Path(given["moved"]).resolve()))
         state = checkpoints.load(folder, ours) if run_folder.has_begun(folder) else None
         if state is not None and state.pace.last_step == state.step and run_folder.is_finished(folder, state.step):
-            raise InputError(f"{folder} has decided to end after {state.step} iterations, and has: train anew")
+            raise InputError(
+                f"{folder} has ended after {state.step} iterations, of which the last had falling rates: train anew"
+            )
         is_done = state is not None and state.step == ours.iterations and run_folder.is_finished(folder, state.step)
         if state is not None and (is_done or state.step > ours.iterations):
             raise InputError(
