@@ -414,9 +414,9 @@ plt.show()
 #
 # ## Play
 #
-# What to look for: from which size `across` on do the columns agree? Put the needle's mean on the middle of a pixel, `(0.5, 0.5)`,
-# and on a corner, `(0, 0)`. Which of the methods notices? Turn it to 0 and to 45 degrees: which error of the integral
-# changes?
+# What to look for: from which size `across` on do the columns agree? Put the needle's mean on the middle of a pixel,
+# `(0.5, 0.5)`, and on a corner, `(0, 0)`. Which of the methods notices? Turn it to 0 and to 45 degrees: which error of
+# the integral changes?
 
 # %%
 mean, degrees, across, elongation = np.array([0.5, 0.5]), 45.0, 0.2, 5.0
