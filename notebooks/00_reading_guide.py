@@ -229,6 +229,7 @@ ORDER = (
     ("`oracle/`: `differences`, `gradients`, `planted`", "12", "how a gradient check lies"),
     ("`oracle/`: `golden`, `comparison`, `thresholds`", "13", "comparing a backend with the oracle"),
     ("`bench/`", "14", "speed against error"),
+    ("`methods/adaptive.py`, `training/pace.py`", "17", "how a scene tells its size"),
 )
 steps = [f"| {step} | {read} | {notebook} | {know} |" for step, (read, notebook, know) in enumerate(ORDER, 1)]
 display(Markdown("\n".join(["| step | read | notebook | you will know |", "|---|---|---|---|", *steps])))
