@@ -230,6 +230,7 @@ ORDER = (
     ("`oracle/`: `golden`, `comparison`, `thresholds`", "13", "comparing a backend with the oracle"),
     ("`bench/`", "14", "speed against error"),
     ("`extensions/`", "16", "relatives of 3DGS: scale, compactness, storage"),
+    ("`methods/adaptive.py`, `training/pace.py`", "17", "how a scene tells its size"),
 )
 steps = [f"| {step} | {read} | {notebook} | {know} |" for step, (read, notebook, know) in enumerate(ORDER, 1)]
 display(Markdown("\n".join(["| step | read | notebook | you will know |", "|---|---|---|---|", *steps])))
