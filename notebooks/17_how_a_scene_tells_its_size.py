@@ -13,7 +13,6 @@
 #     name: python3
 # ---
 
-
 # %% [markdown]
 # # 17 How a scene tells its size
 #
@@ -248,8 +247,9 @@ print(", ".join(f"{name}: {value:.2f} of the true gain" for name, value in slope
 
 # %% [markdown]
 # What is read off follows the true gains only loosely (correlation 0.55), with far too small a spread, and yet it is
-# enough to notice them. With so few small photographs the scene has largely explained the gains by colours that depend on the direction, and by Gaussians that only some cameras see. The exposures then go
-# on learning. The undisturbed scene has no such decision in its log.
+# enough to notice them. With so few small photographs the scene has probably explained much of the gains itself, by
+# colours that depend on the direction and by Gaussians that only some cameras see. The exposures go on learning. The
+# undisturbed scene has no such decision in its log.
 #
 # ## Play
 #
@@ -330,7 +330,7 @@ assert np.allclose(pair.means.mean(axis=0), alone.means[0])
 assert np.allclose(scales[:, 0] ** 2 + (OFFSET * one[0]) ** 2, one[0] ** 2)
 assert np.allclose((taus * scales[:, 0]).sum(), tau * one[0])
 assert 3 * np.abs(changes["two halves"]).max() < np.abs(changes["a clone"]).max()
-# The gains that are read off rise with the true ones, loosely and too little; nothing of the kind is decided on the undisturbed scene.
+# The gains that are read off rise with the true ones, loosely and too little; the undisturbed scene decides nothing.
 assert state.pace.decisions[0].what == "exposures" and EXPOSURES not in states["plain-wall"].shared
 assert np.corrcoef(truth[trained], read_off[trained])[0, 1] > 0.4
 assert 0.05 < slopes["read off"] < 0.5
