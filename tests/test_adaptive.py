@@ -136,7 +136,7 @@ def test_no_decision_without_evidence():
 
 def test_factors_fall_on_a_line_of_logarithms():
     cooling, pace = Cooling(0.5, 0.1, 0.01, 8), Pace(cooling_from=100, last_step=200)
-    assert cooling.factors(80, Pace()) == (1.0, 1.0)
+    assert cooling.factors(80, Pace()) == cooling.factors(80, pace) == (1.0, 1.0)
     assert cooling.factors(150, pace) == pytest.approx((0.1**0.5, 0.1))
     assert cooling.factors(200, pace) == pytest.approx((0.1, 0.01))
 

@@ -73,7 +73,8 @@ class Cooling(NamedTuple):
         """Return the factors of the rates, and of those per unit of the extent, at an iteration."""
         if pace.cooling_from is None or pace.last_step is None:
             return 1.0, 1.0
-        progress = min((step - pace.cooling_from) / max(pace.last_step - pace.cooling_from, 1), 1.0)
+        progress = (step - pace.cooling_from) / max(pace.last_step - pace.cooling_from, 1)
+        progress = min(max(progress, 0.0), 1.0)
         return self.last**progress, self.last_per_extent**progress
 
     def latest_start(self, iterations: int) -> int:
