@@ -19,7 +19,7 @@ from functools import partial
 import numpy as np
 
 from minisplat_ref.methods.adaptive_exposure import hold_mean_exposure, log_gains, switch_exposure_on
-from minisplat_ref.methods.gaussian_splatting import GS, collect_gradients, prune_faint
+from minisplat_ref.methods.gaussian_splatting import GS, GS_ACCEL, collect_gradients, prune_faint
 from minisplat_ref.methods.mini_splatting import candidates, measure_importance
 from minisplat_ref.metrics import psnr
 from minisplat_ref.rendering import Request
@@ -158,19 +158,14 @@ def prune_when_cooling(state: TrainState, iteration: Iteration, *, mass: float, 
 
 
 RAISED = 2.24  # Mini-Splatting2's rates in 3,000 iterations: 6^0.45 times those of 18,000, the square for the means
-_RATES = GS.learning_rates.of
 
 ADAPTIVE = GS._replace(
     name="adaptive",
     iterations=MOST_ITERATIONS,
     learning_rates=Rates(
         {
-            "means": 1.6e-4 * RAISED**2,
-            "quats": 1e-3 * RAISED,
-            "log_scales": 5e-3 * RAISED,
-            "opacity_logits": 2.5e-2 * RAISED,
-            "sh_dc": 2.5e-3 * RAISED,
-            "sh_rest": 2.5e-3 / 20 * RAISED,
+            name: rate * (RAISED**2 if name == "means" else RAISED)
+            for name, rate in GS_ACCEL.learning_rates.at(0, extent=1.0).items()
         }
     ),
     adam=AdamRule(is_visible_only=True, has_bias_correction=True),

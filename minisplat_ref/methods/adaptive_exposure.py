@@ -35,7 +35,7 @@ def log_gains(state: TrainState, iteration: Iteration, view_ids: Ints | list[int
     Returns
     -------
     ndarray of shape (V,)
-        Median over the pixels of ln(photograph / rendering), of the mean of the colours; 0 where no pixel says any.
+        Median over the pixels of ln(photograph / rendering), of the mean of the colours; 0 where no pixel can tell.
     """
     gains = np.zeros(len(view_ids))
     representation = iteration.representation

@@ -31,7 +31,7 @@ from minisplat_ref.training.case import Case
 from minisplat_ref.training.guard import Guard, Wrong
 from minisplat_ref.training.interruption import Interruptions
 from minisplat_ref.training.losses import Loss, Rendered, total_loss
-from minisplat_ref.training.pace import Decision, Pace, to_metadata, trained_ids
+from minisplat_ref.training.pace import Cooling, Decision, Pace, to_metadata, trained_ids
 from minisplat_ref.training.rates import active_sh_degree
 from minisplat_ref.training.saved_state import read_bundles, read_counters, read_generator, read_pace, written_by
 from minisplat_ref.training.schedule import During, Event, Recipe, action_name, as_decided, describe
@@ -233,7 +233,7 @@ def _differentiate(state: TrainState, scene: Scene, around: _Surroundings) -> _D
     """Draw a view and render it, and the gradient of its loss; of the state only the draws are changed."""
     recipe, step = around.recipe, state.step + 1
     renderer = recipe.renderer
-    view_id = _next_view(state, trained_ids(len(scene.train_views), recipe.cooling, state.pace))
+    view_id = _next_view(state, len(scene.train_views), recipe.cooling)
     view = around.ahead.load(scene.train_views[view_id], _following_view(state, scene))
     terms = [term for term in recipe.losses if term.is_due(step)]
     background = state.rng.random(3) if recipe.has_random_background else scene.background
@@ -354,10 +354,10 @@ def _with_direct(gradient: Any, direct: Mapping[str, Floats]) -> Any:
     return {**gradient, **sums} if isinstance(gradient, Mapping) else gradient._replace(**sums)
 
 
-def _next_view(state: TrainState, view_ids: list[int]) -> int:
-    """Draw without replacement; when all views have been seen, shuffle them anew."""
+def _next_view(state: TrainState, n_views: int, cooling: Cooling | None) -> int:
+    """Draw without replacement; when all views that may be trained on have been seen, shuffle them anew."""
     if not state.view_order:
-        state.view_order = state.rng.permutation(view_ids).tolist()
+        state.view_order = state.rng.permutation(trained_ids(n_views, cooling, state.pace)).tolist()
     return state.view_order.pop()
 
 
