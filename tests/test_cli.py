@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -122,7 +123,7 @@ def test_train_logs_every_few_steps(run_folder):
     log = read_log(run_folder / "log.jsonl")
     assert [record["step"] for record in log] == list(range(LOG_EVERY, ITERATIONS + 1, LOG_EVERY))
     for record in log:
-        assert set(record) == {"step", "loss", "psnr", "n_gaussians", "model_mb", "seconds", "its/s"}
+        assert set(record) == {"step", "loss", "psnr", "n_gaussians", "model_mb", "seconds", "cpu_seconds", "its/s"}
         assert record["model_mb"] == pytest.approx(record["n_gaussians"] * 59 * 4 / 1e6)  # 59 float32 at SH degree 3
         assert record["its/s"] == pytest.approx(record["step"] / record["seconds"])
     assert np.all(np.diff([record["seconds"] for record in log]) > 0)
@@ -186,7 +187,19 @@ def test_log_after_a_crash_goes_back_to_the_checkpoint(tmp_path):
     path.write_text("".join(json.dumps(record) + "\n" for record in records))
     with Progress(path, first_step=12, last_step=20) as progress:
         assert progress.seconds == pytest.approx(5.0, abs=1.0)
+        assert progress.clock.cpu_seconds is None  # the earlier part was not measured
     assert read_log(path) == records[:2]
+
+
+def test_clocks_of_a_continued_training_count_neither_waiting_nor_what_is_not_training(tmp_path):
+    path = tmp_path / "log.jsonl"
+    path.write_text(json.dumps({"step": 10, "seconds": 5.0, "cpu_seconds": 7.0, "psnr": 20.0, "loss": 0.1}) + "\n")
+    with Progress(path, first_step=10, last_step=20) as progress:
+        with progress.paused():
+            sum(range(3_000_000))
+        time.sleep(0.2)
+        seconds, cpu_seconds = progress.clock
+    assert seconds - 5.0 >= 0.2 and 0 <= cpu_seconds - 7.0 < 0.2
 
 
 # render, eval, info

@@ -44,7 +44,7 @@ def measured(scene_folder, tmp_path_factory):
 
 def qualities(folder):
     """Records without their times, which no two runs share."""
-    return [{**record, "seconds": None} for record in read_log(folder / "curve.jsonl")]
+    return [{**record, "seconds": None, "cpu_seconds": None} for record in read_log(folder / "curve.jsonl")]
 
 
 def chamfer_of(run_folder, scene_folder):
@@ -60,11 +60,13 @@ def test_records(measured, scene_folder):
     assert records[-1] == {
         "step": ITERATIONS,
         "seconds": metrics["train_seconds"],
+        "cpu_seconds": metrics["train_cpu_seconds"],
         **of_the_end,
         "chamfer": chamfer_of(measured, scene_folder),
     }
     assert len({record["chamfer"] for record in records}) == len(MEASURED)
     assert 0 < records[0]["seconds"] < records[1]["seconds"] < records[2]["seconds"]
+    assert 0 < records[0]["cpu_seconds"] < records[1]["cpu_seconds"] < records[2]["cpu_seconds"]
     assert records[0]["psnr"] != records[1]["psnr"]
 
 

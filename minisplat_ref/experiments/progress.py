@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from tqdm import tqdm
@@ -24,6 +24,15 @@ BAR_SECONDS = 0.3  # between redraws of the bar
 PLAIN_SECONDS = 30.0  # likewise where stderr is a file, in which every redraw is a line
 
 
+class Clock(NamedTuple):
+    """How long a training has taken, with the earlier parts of a continued run and without what is not training."""
+
+    seconds: float
+    """On the wall."""
+    cpu_seconds: float | None
+    """Of the processor, all threads together, which other programs lengthen but little; None where a part lacks it."""
+
+
 class Progress(AbstractContextManager["Progress"]):
     """Bar and log of one training: a context manager that is called with every :class:`StepReport`."""
 
@@ -31,7 +40,7 @@ class Progress(AbstractContextManager["Progress"]):
         records = [record for record in read_log(log_path) if record["step"] <= first_step]
         self._log_path, self._old_records = log_path, records
         self._first_step, self._last_step = first_step, last_step
-        self._seconds_before: float = records[-1]["seconds"] if records else 0.0
+        self._before = Clock(records[-1]["seconds"], records[-1].get("cpu_seconds")) if records else Clock(0.0, 0.0)
         self._losses: list[float] = []
         self._psnrs: deque[float] = deque((record["psnr"] for record in records[-1:]), maxlen=PSNR_WINDOW)
 
@@ -46,7 +55,7 @@ class Progress(AbstractContextManager["Progress"]):
             dynamic_ncols=True,
             mininterval=BAR_SECONDS if sys.stderr.isatty() else PLAIN_SECONDS,
         )
-        self._start = time.perf_counter()
+        self._start, self._cpu_start = time.perf_counter(), time.process_time()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -54,18 +63,27 @@ class Progress(AbstractContextManager["Progress"]):
         self._bar.close()
 
     @property
+    def clock(self) -> Clock:
+        """Both times, as they are now."""
+        seconds = self._before.seconds + time.perf_counter() - self._start
+        if self._before.cpu_seconds is None:
+            return Clock(seconds, None)
+        return Clock(seconds, self._before.cpu_seconds + time.process_time() - self._cpu_start)
+
+    @property
     def seconds(self) -> float:
         """Training time so far, with that of earlier parts of a continued run."""
-        return self._seconds_before + time.perf_counter() - self._start
+        return self.clock.seconds
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Stop the clock for what is not training."""
-        start = time.perf_counter()
+        """Stop both clocks for what is not training."""
+        start, cpu_start = time.perf_counter(), time.process_time()
         try:
             yield
         finally:
             self._start += time.perf_counter() - start
+            self._cpu_start += time.process_time() - cpu_start
 
     def __call__(self, report: StepReport) -> None:
         """Move the bar; every LOG_EVERY iterations measure, show and write.
@@ -88,7 +106,7 @@ class Progress(AbstractContextManager["Progress"]):
         loss, mean_psnr = float(np.mean(self._losses)), float(np.mean(self._psnrs))
         gaussians = report.state.gaussians
         n_gaussians = len(gaussians.means)
-        seconds = self.seconds
+        seconds, cpu_seconds = self.clock
         append_log(
             self._log_path,
             {
@@ -98,6 +116,7 @@ class Progress(AbstractContextManager["Progress"]):
                 "n_gaussians": n_gaussians,
                 "model_mb": sum(field.nbytes for field in gaussians) / 1e6,
                 "seconds": seconds,
+                "cpu_seconds": cpu_seconds,
                 "its/s": report.step / seconds,
             },
         )

@@ -19,7 +19,7 @@ from minisplat_ref.backends import get_backend
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
 from minisplat_ref.experiments import checkpoints, curve, events, fingerprint, run_folder
-from minisplat_ref.experiments.progress import Progress
+from minisplat_ref.experiments.progress import Clock, Progress
 from minisplat_ref.experiments.scoring import measure, score, to_metrics
 from minisplat_ref.experiments.settings import Settings, save_model, to_config
 from minisplat_ref.experiments.surface import Surface, surface_distance, true_surface
@@ -90,10 +90,10 @@ def run_training(
         if state.step == 0:
             checkpoints.save(folder, state, recipe)
         surface = true_surface(Path(settings.scene), scene) if settings.eval_every else None
-        seconds = _train(folder, scene, settings, recipe, state, surface, check_every)
+        clock = _train(folder, scene, settings, recipe, state, surface, check_every)
         is_saved = _save(folder, settings, recipe, state)
-        evaluation = _measure(folder, scene, settings, state, seconds, surface, network) if is_saved else None
-        return Outcome(evaluation, seconds, state.step >= last_step(state, recipe, settings.iterations))
+        evaluation = _measure(folder, scene, settings, state, clock, surface, network) if is_saved else None
+        return Outcome(evaluation, clock.seconds, state.step >= last_step(state, recipe, settings.iterations))
 
 
 @contextmanager
@@ -123,8 +123,8 @@ def _train(
     state: TrainState,
     surface: Surface | None,
     check_every: int,
-) -> float:
-    """Train to the end or to Ctrl-C; return the seconds."""
+) -> Clock:
+    """Train to the end or to Ctrl-C; return how long it took."""
     total = settings.iterations if recipe.cooling is None else state.pace.last_step
     progress = Progress(folder / run_folder.LOG, state.step, total)
     callbacks: list[Callable[[StepReport], None]] = [progress]
@@ -154,7 +154,7 @@ def _train(
                 conventions=PROFILES[settings.profile],
                 guard=Guard(check_every, settings.drop_bad_steps, folder, settings._asdict()),
             )
-        return progress.seconds
+        return progress.clock
 
 
 def _in_time(settings: Settings, recipe: Recipe, progress: Progress) -> Callable[[StepReport], None]:
@@ -200,7 +200,7 @@ def _measure(
     scene: Scene,
     settings: Settings,
     state: TrainState,
-    seconds: float,
+    clock: Clock,
     surface: Surface | None,
     network: Network | None,
 ) -> Evaluation | None:
@@ -212,13 +212,14 @@ def _measure(
         return None
     n_gaussians = len(state.gaussians.means)
     if settings.eval_every:
-        further = _chamfer(state.gaussians, surface)
-        curve.append(folder / run_folder.CURVE, state.step, seconds, evaluation, n_gaussians, **further)
+        further = {"cpu_seconds": clock.cpu_seconds, **_chamfer(state.gaussians, surface)}
+        curve.append(folder / run_folder.CURVE, state.step, clock.seconds, evaluation, n_gaussians, **further)
     metrics = {
         "n_gaussians": n_gaussians,
         "iterations": state.step,
         "has_ended_early": state.pace.last_step == state.step,
-        "train_seconds": seconds,
+        "train_seconds": clock.seconds,
+        "train_cpu_seconds": clock.cpu_seconds,
         "peak_rss_mb": peak_mb,
         **to_metrics(evaluation),
     }
@@ -239,9 +240,10 @@ def _curve(
     def on_step(report: StepReport) -> None:
         if report.step % settings.eval_every or report.step == report.last_step:  # the end is measured anyway
             return
-        seconds, model = progress.seconds, report.state.model
+        (seconds, cpu_seconds), model = progress.clock, report.state.model
         with progress.paused():
             evaluation, further = measure(scene, model, settings), _chamfer(model.gaussians, surface)
+            further = {"cpu_seconds": cpu_seconds, **further}
             curve.append(path, report.step, seconds, evaluation, len(model.gaussians.means), **further)
 
     return on_step
