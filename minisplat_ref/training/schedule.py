@@ -243,14 +243,14 @@ def as_decided(recipe: Recipe, pace: Pace) -> Recipe:
 def settings_of(recipe: Recipe) -> dict[str, Any]:
     """Return what :func:`configured` can replace, with its present value, the first where there are several.
 
-    Settings of events, of loss terms and of how the representation begins by their own names; the weight of a loss term
-    by the term's name; whether a calibration is on by the calibration's name.
+    Settings of events, of loss terms and of how the representation begins and is drawn by their own names; the weight of
+    a loss term by the term's name; whether a calibration is on by the calibration's name.
     """
     events = [_settings(event.action) for event in recipe.events]
     terms = [{term.name: term.weight, **_settings(term.function)} for term in recipe.losses]
     switches = [{calibration.name: calibration.is_on for calibration in recipe.calibrations}]
-    begins = [_settings(recipe.representation.extend)]
-    found = [*events, *terms, *switches, *begins]
+    representation = [_settings(recipe.representation.extend), _settings(recipe.representation.renderer.render)]
+    found = [*events, *terms, *switches, *representation]
     return {name: value for settings in reversed(found) for name, value in settings.items()}
 
 
@@ -278,9 +278,18 @@ def configured(recipe: Recipe, **settings: Any) -> Recipe:
                 calibration._replace(is_on=value) if name == calibration.name else calibration
                 for calibration in recipe.calibrations
             ),
-            representation=recipe.representation._replace(extend=_with(recipe.representation.extend, name, value)),
+            representation=_with_setting(recipe.representation, name, value),
         )
     return recipe
+
+
+def _with_setting(representation: Representation, name: str, value: Any) -> Representation:
+    """Return a representation with another value of a setting of how it begins or is drawn, if it has one."""
+    renderer = representation.renderer
+    return representation._replace(
+        extend=_with(representation.extend, name, value),
+        renderer=renderer._replace(render=_with(renderer.render, name, value)),
+    )
 
 
 def parsed_settings(recipe: Recipe, texts: Mapping[str, str]) -> dict[str, Any]:
@@ -360,6 +369,7 @@ def describe(recipe: Recipe) -> dict[str, Any]:
     """Return the recipe in numbers, strings, lists and dicts, for ``config.json`` and to compare two recipes."""
     cooling = {"cooling": recipe.cooling._asdict()} if recipe.cooling is not None else {}
     fields = {name: value for name, value in recipe._asdict().items() if name != "cooling"}
+    drawn = _settings(recipe.representation.renderer.render)
     return {
         **fields,
         **cooling,
@@ -372,6 +382,7 @@ def describe(recipe: Recipe) -> dict[str, Any]:
         "representation": {
             "name": recipe.representation.name,
             **_describe_function(recipe.representation.extend, "extend"),
+            **({"renderer": drawn} if drawn else {}),
         },
     }
 
