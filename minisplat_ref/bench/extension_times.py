@@ -73,7 +73,9 @@ def extension_cases(
         Row("3DGS, cpu float32", CORE, CPU, f32),
         Row(BASELINE, CORE, TEXTBOOK, f32),
     ]
-    references = [Row(f"{owner}, reference float64", e, REFERENCE, f64) for owner, e in ((name, extension), ("3DGS", CORE))]
+    references = [
+        Row(f"{owner}, reference float64", e, REFERENCE, f64) for owner, e in ((name, extension), ("3DGS", CORE))
+    ]
     answers, own_times = {}, {}
     for row in references:
         report(f"{workload.name}: {row.name}")

@@ -95,7 +95,7 @@ def _records(footprints: TangentFootprints, dtype: np.dtype) -> Floats:
     records = np.empty((n, SIZE), dtype)
     records[:, OPACITY] = footprints.opacities
     records[:, REF_X : REF_Y + 1] = reference
-    records[:, FIRST:CENTER] = np.concatenate([values[:, :, None], slopes], axis=2).reshape(n, -1)
+    records[:, FIRST:CENTER] = np.concatenate([values[:, :, None], slopes], axis=2).reshape(n, CENTER - FIRST)
     records[:, CENTER:] = footprints.centers
     return records
 

@@ -174,19 +174,19 @@ def project_vjp(
     camera = with_principal_point(camera, conventions)
     means, quats, scales, _ = (field[rows].astype(np.float64) for field in primitives)
     v_n, v_K, v_o, v_z = (field[rows] for field in v_footprints)
-    x, r, n, C = _in_camera(means, quats, scales, camera)
+    _, r, n, C = _in_camera(means, quats, scales, camera)
     K = footprints.conics[rows]
 
     v_G = -K @ v_K @ K
     v_C = v_G / (r * r)[:, None, None]
-    v_n = v_n - 2 * np.einsum("nij,njk,nk->ni", v_C, C, n)
+    v_n = v_n - 2 * (v_C @ C @ n[:, :, None])[:, :, 0]
     v_r = -2 * np.einsum("nij,nij->n", v_C, C) / r
     v_n = v_n - n * np.sum(n * v_n, axis=1, keepdims=True)
     v_x = v_n / r[:, None] + n * v_r[:, None]
     v_x[:, 2] += v_z
     R, _ = pose(camera, np.dtype(np.float64))
     v_quats, v_scales = covariances_vjp(quats, scales, R.T @ v_C @ R)
-    v_R = np.einsum("nij,njk->ik", 2 * v_C, R @ covariances(quats, scales)) + v_x.T @ means
+    v_R = 2 * (v_C @ R @ covariances(quats, scales)).sum(axis=0) + v_x.T @ means
     v_means2d = _in_pixels(v_footprints.normals[rows], n, camera)
     full = [_scatter(v, rows, len(footprints.radii), dtype) for v in (v_x @ R, v_quats, v_scales, v_o, v_means2d)]
     return PrimitiveGradient(*full[:4], v_R.astype(dtype), v_x.sum(axis=0).astype(dtype)), full[4]
@@ -250,9 +250,7 @@ def tangent_bases(normals: Floats) -> Floats:
     return np.stack([first, np.cross(normals, first)], axis=1)
 
 
-def _in_camera(
-    means: Floats, quats: Floats, scales: Floats, camera: Camera
-) -> tuple[Floats, Floats, Floats, Floats]:
+def _in_camera(means: Floats, quats: Floats, scales: Floats, camera: Camera) -> tuple[Floats, Floats, Floats, Floats]:
     """Return x [N, 3], r [N], n [N, 3] and C [N, 3, 3]."""
     R, t = pose(camera, means.dtype)
     x = means @ R.T + t
@@ -289,7 +287,7 @@ def _boxes(n: Floats, G: Floats, opacities: Floats, camera: Camera, conventions:
         for sign, edge in ((1, -center[k]), (-1, size[k] - center[k])):
             side = np.zeros(3)
             side[k], side[2] = sign, -sign * edge / focal[k]
-            is_seen &= n @ side + np.sqrt(ee * np.einsum("i,nij,j->n", side, G, side)) > 0
+            is_seen &= n @ side + np.sqrt(ee * ((G @ side) @ side)) > 0
     is_seen &= n[:, 2] + np.sqrt(ee * G[:, 2, 2]) > 0
     return np.where(is_seen[:, None], np.hstack([low, high]), 0)
 

@@ -146,9 +146,7 @@ def activated(gaussians: Any, is_visible: Bools | None) -> Primitives:
     return Primitives(gaussians.means, gaussians.quats, scales, opacities)
 
 
-def render(
-    model: Model, view: View, request: Request, *, buffer_size: int | None = None
-) -> tuple[RenderOutput, Tape]:
+def render(model: Model, view: View, request: Request, *, buffer_size: int | None = None) -> tuple[RenderOutput, Tape]:
     """Draw a view.
 
     Statistics of blending, surfaces and median depths, which the kernels do not collect, are those of 3DGS's footprints
@@ -170,9 +168,7 @@ def render(
     output = blended._replace(visible_ids=visible_ids, n_pairs=len(bins.gaussian_ids))
     if asked := request.wants & STATISTICS:
         splatted, _ = SPLATTING.render(model, view, request._replace(wants=asked))
-        output = output._replace(
-            stats=splatted.stats, median_depth=splatted.median_depth, extras=splatted.extras
-        )
+        output = output._replace(stats=splatted.stats, median_depth=splatted.median_depth, extras=splatted.extras)
     return output, Tape(prepared, bins, blended)
 
 

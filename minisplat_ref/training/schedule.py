@@ -243,8 +243,8 @@ def as_decided(recipe: Recipe, pace: Pace) -> Recipe:
 def settings_of(recipe: Recipe) -> dict[str, Any]:
     """Return what :func:`configured` can replace, with its present value, the first where there are several.
 
-    Settings of events, of loss terms and of how the representation begins and is drawn by their own names; the weight of
-    a loss term by the term's name; whether a calibration is on by the calibration's name.
+    Settings of events, of loss terms, and of how the representation begins and is drawn, by their own names; the weight
+    of a loss term by the term's name; whether a calibration is on by the calibration's name.
     """
     events = [_settings(event.action) for event in recipe.events]
     terms = [{term.name: term.weight, **_settings(term.function)} for term in recipe.losses]
