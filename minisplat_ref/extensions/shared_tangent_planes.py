@@ -188,12 +188,14 @@ def project_vjp(
     v_quats, v_scales = covariances_vjp(quats, scales, R.T @ v_C @ R)
     v_R = 2 * (v_C @ R @ covariances(quats, scales)).sum(axis=0) + v_x.T @ means
     v_means2d = _in_pixels(v_footprints.normals[rows], n, camera)
-    full = [_scatter(v, rows, len(footprints.radii), dtype) for v in (v_x @ R, v_quats, v_scales, v_o, v_means2d)]
-    return PrimitiveGradient(*full[:4], v_R.astype(dtype), v_x.sum(axis=0).astype(dtype)), full[4]
+    parts = v_x @ R, v_quats, v_scales, v_o, v_means2d
+    v_means, v_quats, v_scales, v_o, v_means2d = (_scatter(v, rows, len(footprints.radii), dtype) for v in parts)
+    v_t = v_x.sum(axis=0).astype(dtype)
+    return PrimitiveGradient(v_means, v_quats, v_scales, v_o, v_R.astype(dtype), v_t), v_means2d
 
 
 def hit(footprints: TangentFootprints, ids: Ints, centers: Floats) -> Hit:
-    """Evaluate Gaussians on the rays through image positions: a function of a :class:`~...reference.hits.Response`.
+    """Evaluate Gaussians on the rays through image positions: ``hit`` of a response.
 
     Parameters
     ----------

@@ -192,7 +192,8 @@ def render_vjp(tape: Tape, v_image: Floats, v_alpha: Floats | None = None) -> Re
     if p.has_depth:
         v_colors, v_depths = np.ascontiguousarray(v.colors[:, :-1]), v.colors[:, -1].astype(np.float64)
         v_background = v.background[:-1]
-    v_footprints = FootprintGradient(*v.primitives, v_depths)
+    v_normals, v_conics, v_opacities = v.primitives
+    v_footprints = FootprintGradient(v_normals, v_conics, v_opacities, v_depths)
     v_primitives, v_means2d = project_vjp(p.primitives, camera, p.conventions, footprints, v_footprints)
     v_sh = p.backend.sh_colors_vjp(g.means, g.sh_dc, g.sh_rest, camera, p.sh_degree, footprints.radii, v_colors)
     with np.errstate(over="ignore"):

@@ -352,7 +352,7 @@ def test_depth_and_statistics(rng):
 
 @pytest.mark.parametrize("buffer_size", [0, -3, 2.5, 4096])
 def test_a_bad_buffer_is_refused(buffer_size, rng):
-    with pytest.raises(InputError, match="buffer_size is .*: give 1 to 1024 hits"):
+    with pytest.raises(InputError, match=r"buffer_size is .*: give 1 to 1024 hits"):
         drawing(buffer_size).render(Model(make_gaussians(rng, 2)), view_from(make_camera()), Request())
 
 
