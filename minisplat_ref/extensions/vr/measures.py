@@ -16,7 +16,7 @@ from minisplat_ref.extensions.shared_tangent_renderer import activated
 from minisplat_ref.extensions.vr.foveation import Gaze, Zone, eccentricities, render_foveated, resolved_angles
 from minisplat_ref.extensions.vr.method import BUFFER
 from minisplat_ref.rendering import Request
-from minisplat_ref.types import Camera, Floats, Gaussians, Model, Primitives, View
+from minisplat_ref.types import Camera, Floats, Gaussians, Ints, Model, Primitives, View
 
 EVERYWHERE = 180.0  # degrees: every pixel is drawn
 WAYS = ("3DGS: EWA, by z", "tangent planes, buffer of 16", "tangent planes, exact order")
@@ -123,7 +123,7 @@ def yaw_steps(
     return {way: steps_along(way, seen, colors[rows], path, rays, GSPLAT_MAIN)[0].tolist() for way in WAYS}
 
 
-def _hit_rows(primitives: Primitives, cameras: Sequence[Camera], rays: Floats) -> Floats:
+def _hit_rows(primitives: Primitives, cameras: Sequence[Camera], rays: Floats) -> Ints:
     is_hit = np.zeros(len(primitives.means), bool)
     for camera in cameras:
         for hits in (ewa_hits, tangent_hits):

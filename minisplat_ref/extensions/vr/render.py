@@ -44,7 +44,8 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.reporting import markdown_table
     from minisplat_ref.types import Model
 
-    look = Gaze(*args.gaze, args.full)
+    x, y = args.gaze
+    look = Gaze(x, y, args.full)
     model = Model(load_ply(args.ply))
     views = viewpoints.read(args.cameras or args.ply.parent / "cameras.json")
     views = [view for view in views if view.split == "test"] or views
