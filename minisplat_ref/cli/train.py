@@ -172,6 +172,7 @@ def _start(given: dict[str, Any]) -> int:
     from minisplat_ref.experiments import curve, run_folder
     from minisplat_ref.experiments.first_use import compile_kernels
     from minisplat_ref.experiments.notices import warn_of_scene
+    from minisplat_ref.experiments.proposed_size import propose
     from minisplat_ref.experiments.settings import Settings, load_lpips, load_photographs, recipe_of
 
     run_folder.check_free(folder)
@@ -188,6 +189,9 @@ def _start(given: dict[str, Any]) -> int:
     compile_kernels(settings.backend)
     run_folder.create(folder)
     warn_of_scene(scene, settings.downscale)
+    proposal = None if "downscale" in given else propose(scene, state, recipe, settings)
+    if proposal is not None:
+        print(f"minisplat-ref: {proposal}", file=sys.stderr)
     with run_folder.held(folder):
         run_folder.check_free(folder)  # another process may have trained there meanwhile
         try:
