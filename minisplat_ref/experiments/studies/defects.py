@@ -1,4 +1,4 @@
-"""Planted defects: does ``adaptive`` find them, and does it find none where there are none?
+"""Planted defects: whether ``adaptive`` finds them, and none where there are none.
 
 Photographs of a scene are disturbed in a known way, anew in every trial, and the scene is trained until the iteration
 in which ``adaptive`` decides about exposures and poses. A trial counts what was switched on. The seed of a trial is
