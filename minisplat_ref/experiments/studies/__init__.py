@@ -277,7 +277,7 @@ DEFECTS = Study(
 )
 PRECISION = Study(
     name="precision",
-    summary="float64, float32 exact and fast, colours in float16: what a training needs",
+    summary="float64, float32 exact and fast, colours in float16: what it takes",
     add_arguments=_add_precision_arguments,
     run=_run_of("precision"),
 )
