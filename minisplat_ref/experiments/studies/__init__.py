@@ -87,13 +87,16 @@ def _add_adaptive_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="R,Q",
         help="the first is what the others are compared with (default: three of 3000 iterations, and adaptive)",
     )
-    parser.add_argument("--rules", action="store_true", help="adaptive beside itself without each of its rules")
+    variants = parser.add_mutually_exclusive_group()
+    variants.add_argument("--rules", action="store_true", help="adaptive beside itself without each of its rules")
+    variants.add_argument("--sweep", action="store_true", help="adaptive beside itself with more Gaussians and fewer")
     parser.add_argument(
         "--conditions",
         type=listed(name),
         default=("whole", "few", "gains"),
         metavar="C,D",
-        help="all photographs, every fifth, all with wrong exposures (default whole,few,gains)",
+        help="whole, few (every fifth photograph), gains (wrong exposures), poses (wrong cameras; default: the first"
+        " three)",
     )
     _add_seeds(parser)
 
