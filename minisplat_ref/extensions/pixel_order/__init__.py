@@ -11,12 +11,14 @@ map on the image plane, which stretches footprints at the edges. Here, as conven
   unit sphere in the direction of its mean (:mod:`minisplat_ref.extensions.shared_tangent_planes`).
 
 Both depend on rays alone, and so do culling by distance and the low-pass: a camera that turns sees the same colours, to
-rounding. Fixed rays through 100 random Gaussians change by up to 0.12 in a quarter of a degree under 3DGS and by 4e-15
-here (``study pixel-order/rotation``). Against the peak along each ray a footprint errs by 10.5 % at any angle, EWA's by
-10.5 % on the axis and 27.6 % at 55 degrees (``study pixel-order/projection``).
+rounding. Fixed rays through 100 random Gaussians change by up to 0.11 in half a degree under 3DGS and by 3e-15 here
+(``study pixel-order/rotation``). Against the peak along each ray a footprint errs by 10.5 % at any angle, EWA's by
+10.5 % on the axis and 27.6 % at 55 degrees (``study pixel-order/projection``). Of the pairs of hits of a pixel, 3DGS
+blends 10.9 % out of order, a buffer of 4 2.5 %, of 16 0.03 % (``study pixel-order/order``, 300 random Gaussians).
 
-Sorting is no cure for all that jumps: where two Gaussians interpenetrate, two hits of a pixel change places as the
-camera *moves*, but pixel by pixel instead of all at once.
+Sorting is no cure for all that jumps. Where two Gaussians interpenetrate, two hits of a pixel change places as the
+camera *moves*, pixel by pixel instead of all at once: in the same cloud a ray still changes by 0.13 in a step of 0.001
+aside, and under 3DGS, whose order such a walk leaves as it is, by 0.005.
 
 Where this deviates: StopThePop resorts in a hierarchy of queues, of tiles, of blocks, of pixels; here there is one
 queue a pixel, over a list by distance. Its least thickness of 0.001 world units is a thousandth of the longest axis.
