@@ -62,7 +62,9 @@ def run(args: argparse.Namespace) -> int:
         n_samples = sum(zone.n_samples for zone in zones)
         tiles, pairs = (sum(getattr(zone, name) for zone in zones) for name in ("n_tiles", "n_pairs"))
         first, share = zones[0], f"{100 * n_samples / n_pixels:.1f} %"
-        rows.append([f"from {first.begins:.1f}", f"1 for {first.block} x {first.block}", tiles, share, f"{pairs:,}"])
+        rows.append(
+            [f"from {first.begins:.1f}", f"1 for {first.block} x {first.block}", f"{tiles:,}", share, f"{pairs:,}"]
+        )
     print(markdown_table(["degrees", "rays", "tiles", "rays of all pixels", "pairs"], rows))
     print(f"\n{len(views)} pictures in {args.out}")
     return 0

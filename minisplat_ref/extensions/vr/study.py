@@ -64,7 +64,13 @@ def run_foveation(args: argparse.Namespace) -> None:
     print(markdown_table(heads, table))
     print()
     zones = [
-        [f"{row['full']:g}", f"{zone['begins']:.1f}", zone["block"] ** 2, zone["n_tiles"], f"{zone['n_samples']:,}"]
+        [
+            f"{row['full']:g}",
+            f"{zone['begins']:.1f}",
+            str(zone["block"] ** 2),
+            f"{zone['n_tiles']:,}",
+            f"{zone['n_samples']:,}",
+        ]
         for row in rows[1:]
         for zone in row["zones"]
     ]
