@@ -12,20 +12,26 @@ from scenes import as_dtype, make_camera, make_gaussians
 from tolerances import CLOSED_FORM, COVERAGE_MIN, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT32_IMAGE, PARITY_FLOAT64
 
 from minisplat_ref.backends import CPU, REFERENCE
+from minisplat_ref.bench import extension_times
+from minisplat_ref.bench.extension_times import extension_cases
+from minisplat_ref.bench.workloads import synth5k
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions import shared_tangent_planes as planes
+from minisplat_ref.extensions.extension import find_recipe, load_extension
 from minisplat_ref.extensions.pixel_order import clouds
 from minisplat_ref.extensions.pixel_order.method import ORDERED
 from minisplat_ref.extensions.pixel_order.stages import stages
 from minisplat_ref.extensions.shared_tangent_rays import tangent_hits, turned
 from minisplat_ref.extensions.shared_tangent_renderer import RESPONSE, activated
 from minisplat_ref.oracle.models import check_model_gradients
+from minisplat_ref.oracle.tolerances import BENCH_FLOAT64
 from minisplat_ref.reference.projection import project as project_ewa
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.training.schedule import configured, describe, settings_of
 from minisplat_ref.types import Gaussians, Model, Primitives, view_from
 
 DRAW = ORDERED.renderer
@@ -423,3 +429,33 @@ def test_hits_of_a_turned_camera_are_those_of_the_ray(rng):
     both, a, b = np.intersect1d(first.ids, second.ids, return_indices=True)
     assert len(both) > 10
     assert_allclose(first.hit.unclamped[a], second.hit.unclamped[b], atol=TURNED)
+
+
+# --- what the core has for it ---
+
+
+def test_settings_of_a_renderer_are_set_and_recorded():
+    recipe = find_recipe("pixel-order", 100)
+    assert settings_of(recipe)["buffer_size"] is None
+    changed = configured(recipe, buffer_size=4)
+    assert changed.representation.renderer.render.keywords == {"buffer_size": 4}
+    assert describe(changed)["representation"]["renderer"] == {"buffer_size": 4} != describe(recipe)["representation"]
+    assert "renderer" not in describe(find_recipe("3dgs-accel"))["representation"]
+
+
+def test_the_bench_times_the_renderer_and_finds_a_wrong_one(monkeypatch, capsys):
+    extension = load_extension("pixel-order")
+    cases = {case.name: case for case in extension_cases(extension, synth5k(150), 1)}
+    assert len(cases) == 7 and all(case.passed for case in cases.values()), cases
+    ours = cases["synth5k: pixel-order, cpu float64"].figures
+    assert 0 < ours["image max"] < BENCH_FLOAT64 and ours["forward (ms)"] > 0 and ours["gradient"] < BENCH_FLOAT64
+    true = extension_times._Steps.answer
+
+    def dimmed(steps):
+        found = true(steps)
+        return found._replace(image=found.image * 1.001) if steps._request.backend is CPU else found
+
+    monkeypatch.setattr(extension_times._Steps, "answer", dimmed)
+    wrong = [case.name for case in extension_cases(extension, synth5k(150), 1) if not case.passed]
+    assert "synth5k: pixel-order, cpu float64" in wrong and "synth5k: pixel-order, cpu float32" in wrong
+    assert main(["bench", "--extension", "none"]) == 2 and "does not exist" in capsys.readouterr().err

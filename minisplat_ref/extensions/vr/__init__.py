@@ -11,6 +11,11 @@ footprints and the order that it is drawn with.
     minisplat-ref study vr/foveation SCENE --ply runs/vr/point_cloud.ply --out DIR
     minisplat-ref study vr/yaw --ply runs/vr/point_cloud.ply --out DIR
 
+Measured on the fox at 135 x 240 with 4,572 Gaussians of Mini-Splatting2 (``study vr/foveation fox --downscale 2``): 8
+degrees in full take 40 % of the rays and lose 0.4 dB of the PSNR that acuity weights, 0.8 dB of the plain one. It saves
+no time there: each zone projects all Gaussians once more, and a zone of large tiles lists as many pairs. Turning
+changes fixed rays by up to 1.3e-2 in half a degree under 3DGS and by 3e-15 here (``study vr/yaw``).
+
 Where this deviates: the paper trains Mini-Splatting first and fine-tunes with its renderer for 5,000 iterations; here
 the whole training draws as the headset does, and importance, surfaces and median depths are those of 3DGS's footprints.
 One buffer of 16 hits stands for the queues of tiles, blocks and pixels. The paper's rates by eccentricity were not
