@@ -135,7 +135,7 @@ def _project_and_shade(
 ) -> Callable[[], tuple[Ints, Floats, Floats, Floats, Floats, Floats]]:
     """Return a task; activations and what it differentiates, ``weights`` on the visible Gaussians, are made before.
 
-    It returns radii, then centres, colours and gradients by means, scales and SH.
+    It returns radii, then centres, colours and gradients with respect to means, scales and SH.
     """
     primitives = Primitives(g.means, g.quats, np.exp(g.log_scales), 1 / (1 + np.exp(-g.opacity_logits)))
     is_visible = backend.project(*primitives, camera, GSPLAT_MAIN).radii[:, 0] > 0

@@ -281,7 +281,7 @@ class StraightLines:
         return max(float(np.linalg.norm(a - b) / np.linalg.norm(b)) for a, b in pairs)
 
     def _gradient(self, sums: Floats) -> tuple[Any, ...]:
-        """Gradient by centre, conic, opacity and colour."""
+        """Gradient with respect to centre, conic, opacity and colour."""
         q, qe, qy, *second = sums[:6]
         a, slope, pivot = 2 * self.hit.half_a, self.hit.slope, 2 * self.hit.half_pivot
         return (

@@ -92,7 +92,7 @@ def surface_points(means: Floats, quats: Floats, scales: Floats, camera: Camera,
 
 @scalar
 def _gaussian_vjp(n, pixels, ellipsoids, pose, lens, depths, v_surface, v):
-    """Write the gradient by one Gaussian, the sum of the shares of its pixels."""
+    """Write the gradient with respect to one Gaussian, the sum of the shares of its pixels."""
     R = rows_of(pose.R)
     quat = _wide(ellipsoids.quats[n])
     axes, scale, u = gaussian_axes(quat), _scale(ellipsoids.scales, n), _offset(ellipsoids.means, n, pose.centre)

@@ -3,8 +3,8 @@
 The C library keeps the memory of smaller arrays for the next. That of large ones goes back to the system, which clears
 what it gives, and where memory is scattered moves it together first.
 
-One block is kept, the one that was let go last. The moments of all pairs and, when they are summed, the gradient by the
-coefficients of colour take turns in it.
+One block is cached, the last one freed. The moments of all pairs and, once they are summed, the gradient with respect
+to the coefficients of colour use it in turn.
 """
 
 import weakref

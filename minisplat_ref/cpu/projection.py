@@ -192,7 +192,7 @@ def _scatter_triple(table, rows, lanes):
 
 @scalar
 def _add_row(v_pose, first, is_counted, v_p, v_V, mean, M):
-    """Add to the gradient by a row of R, and then of t: p = R x + t and V = R M."""
+    """Add to the gradient with respect to a row of R, and then of t: p = R x + t and V = R M."""
     add(v_pose, first, is_counted, v_p * mean[0] + dot(v_V, M[0]))
     add(v_pose, first + 1, is_counted, v_p * mean[1] + dot(v_V, M[1]))
     add(v_pose, first + 2, is_counted, v_p * mean[2] + dot(v_V, M[2]))

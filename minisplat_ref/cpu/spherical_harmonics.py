@@ -199,7 +199,7 @@ def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, deg
 
 @scalar
 def _rest_vjp(k, v_red, v_green, v_blue, y, rest):
-    """Replace a basis function by the gradient by it, and its coefficients by the gradient by them."""
+    """Replace a basis function and its coefficients by the gradients with respect to them."""
     y_k = _at(y, k)
     store(y, k * WIDTH, _at(rest, 3 * k) * v_red + _at(rest, 3 * k + 1) * v_green + _at(rest, 3 * k + 2) * v_blue)
     store(rest, 3 * k * WIDTH, (y_k * v_red, y_k * v_green, y_k * v_blue))
@@ -326,7 +326,7 @@ def sh_colors_vjp(
     shaded = Shaded(means, sh_dc, sh_rest.ravel(), width)
     v_shaded = Shaded(out.means, out.sh_dc, out.sh_rest.reshape(-1), width)
     v_offset = _sh_colors_vjp(shaded, _harmonics(camera, degree, dtype), radii, v_colors, v_shaded)
-    # The sum over the Gaussians of the gradient by their offset, mean - centre, with centre = -R^T t.
+    # The sum over the Gaussians of the gradient with respect to their offset, mean - centre, with centre = -R^T t.
     out.cam_from_world_R[:] = np.outer(camera.cam_from_world_t, v_offset)
     out.cam_from_world_t[:] = camera.cam_from_world_R @ v_offset
     return out

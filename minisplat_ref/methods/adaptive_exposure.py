@@ -1,13 +1,13 @@
-"""Exposure of each photograph, switched on by ``adaptive`` where the photographs show that they need it.
+"""Exposure of each photograph, which ``adaptive`` switches on where the photographs show that they need it.
 
-After some hundred iterations the scene is a blur of the right brightness. The gain of a photograph is then read off as
-the median of photograph / rendering over the pixels. Where a camera has kept its exposure these gains are nearly equal;
-where it has not, their spread is what it has done. If it is large the photographs get exposures
+After a few hundred iterations the scene is a blur of the right brightness. The gain of a photograph is then the median
+of photograph / rendering over the pixels. If the camera kept its exposure these gains are nearly equal; otherwise they
+spread as the exposure did. If the spread is large, the photographs get exposures
 (:mod:`minisplat_ref.training.calibration`) that begin with these gains.
 
-Scene and exposures are known up to a map that all photographs have in common, and which would drift: a scene twice as
+Scene and exposures are determined up to a map that all photographs share, and which would drift: a scene twice as
 bright with half the exposures looks the same in all training views, and wrong in every other. The mean of the exposures
-is therefore held at the identity.
+is therefore kept at the identity.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ from minisplat_ref.training.pace import Decision, trained_ids
 from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Floats, Ints
 
-DARK, BRIGHT = 0.05, 0.98  # brightness, of 1, of pixels that say nothing of a gain: noise, and what is saturated
+DARK, BRIGHT = 0.05, 0.98  # brightness, out of 1, beyond which pixels say nothing about a gain: noise, saturation
 
 
 def log_gains(state: TrainState, iteration: Iteration, view_ids: Ints | list[int]) -> Floats:
@@ -30,12 +30,12 @@ def log_gains(state: TrainState, iteration: Iteration, view_ids: Ints | list[int
     state, iteration
         As for every action.
     view_ids : sequence of int
-        Of training views.
+        Training views.
 
     Returns
     -------
     ndarray of shape (V,)
-        Median over the pixels of ln(photograph / rendering), of the mean of the colours; 0 where no pixel can tell.
+        Median over the pixels of ln(photograph / rendering), for the mean of the colours; 0 where no pixel qualifies.
     """
     gains = np.zeros(len(view_ids))
     representation = iteration.representation
@@ -54,8 +54,8 @@ def log_gains(state: TrainState, iteration: Iteration, view_ids: Ints | list[int
 def switch_exposure_on(state: TrainState, iteration: Iteration, *, least_spread: float) -> str | None:
     """Give each photograph an exposure if the gains of the photographs spread by more than ``least_spread``.
 
-    The spread is the standard deviation of the logarithms. At 600 iterations it was 0.002 to 0.04 in eight scenes as
-    they were photographed, and 0.08 to 0.18 in three whose photographs were multiplied by gains from 0.7 to 1.4.
+    The spread is the standard deviation of the logarithms. At 600 iterations it was 0.002 to 0.04 in eight scenes with
+    their original photographs, and 0.08 to 0.18 in three whose photographs were multiplied by gains from 0.7 to 1.4.
     """
     if EXPOSURE.name in state.pace.switched_on or EXPOSURES in state.shared:
         return "nothing done: exposures are on"
@@ -79,7 +79,7 @@ def switch_exposure_on(state: TrainState, iteration: Iteration, *, least_spread:
 
 
 def hold_mean_exposure(state: TrainState, iteration: Iteration) -> None:
-    """Keep the mean exposure of the views that are trained on at the identity; the others join with their gains."""
+    """Keep the mean exposure of the views in training at the identity; views that join start with their gains."""
     if EXPOSURES not in state.shared:
         return
     n_views = len(iteration.scene.train_views)
@@ -93,6 +93,6 @@ def hold_mean_exposure(state: TrainState, iteration: Iteration) -> None:
 
 
 def _begin_with(exposures: Floats, view_ids: list[int], gains: Floats) -> None:
-    """Write gains, given as logarithms, into the exposures of views."""
+    """Set the exposures of views to gains, given as logarithms."""
     for index, gain in zip(view_ids, gains, strict=True):
         exposures[index, :, :3] = np.exp(gain) * np.eye(3)

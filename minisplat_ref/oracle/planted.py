@@ -222,7 +222,7 @@ def _half_off_diagonal(base: Backend) -> Backend:
 
 
 def _forgotten_background(base: Backend) -> Backend:
-    """The derivative by T_end is ``v . background - v_alpha``, so this v_alpha takes the first term out."""
+    """dL/dT_end is ``v . background - v_alpha``, so this v_alpha takes the first term out."""
 
     @wraps(base.composite_vjp)
     def composite_vjp(

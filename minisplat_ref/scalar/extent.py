@@ -1,7 +1,7 @@
 """Which pixels one projected Gaussian may touch: radii and a half-open box of pixels inside the image.
 
-The numbers are whole but floats. Boxes are clamped to the image, and radii, when the boxes are made, to what int32
-holds, so that a cast to integers is defined.
+All results are whole numbers stored as floats. Boxes are clamped to the image, and radii, once the boxes are made, to
+the range of int32, so that the cast to integers is defined.
 """
 
 from typing import NamedTuple
@@ -18,12 +18,12 @@ RADIUS_MAX = np.float32(constants.RADIUS_MAX)  # exact in float32
 
 
 class Extent(NamedTuple):
-    """How far Gaussians reach, and the image that their boxes are cut to."""
+    """The rule of extent, and the image to which boxes are clipped."""
 
     alpha_min: np.floating
     """In the data's dtype."""
     has_full_support: bool
-    """As far as alpha can be ``alpha_min``; otherwise by INRIA's rule."""
+    """Whether a Gaussian reaches as far as its alpha can be ``alpha_min``; otherwise INRIA's rule applies."""
     width: int
     """Of the image, pixels."""
     height: int
@@ -31,7 +31,7 @@ class Extent(NamedTuple):
 
 @scalar
 def support_box(footprint, opacity, alpha_min, width, height):
-    """Extent at which alpha falls to alpha_min: sqrt(2 ln(opacity / alpha_min)) standard deviations along x and y."""
+    """Return the extent where alpha falls to alpha_min: sqrt(2 ln(opacity / alpha_min)) sigmas along x and y."""
     squared = TWO * log_of(larger(opacity / alpha_min, ONE))
     rx = ceil(sqrt(squared * footprint.cov_xx))
     ry = ceil(sqrt(squared * footprint.cov_yy))
@@ -44,7 +44,7 @@ def support_box(footprint, opacity, alpha_min, width, height):
 
 @scalar
 def inria_tiles(x, r, size):
-    """Pixels of the tiles that INRIA counts under [x - r, x + r], where x counts pixel centres as integers."""
+    """Return the pixels of the tiles that INRIA counts under [x - r, x + r], with pixel centres at integer x."""
     beyond = size + INRIA_TILE - 1
     first = floor(smaller(larger(x - r, ZERO), beyond) / INRIA_TILE)
     end = floor(smaller(larger(x + r + (INRIA_TILE - 1), ZERO), beyond) / INRIA_TILE)
@@ -53,7 +53,7 @@ def inria_tiles(x, r, size):
 
 @scalar
 def inria_box(footprint, width, height):
-    """Tiles touched by the square of half-side ceil(3 sqrt(lambda_1)), three standard deviations of the longer axis."""
+    """Return the tiles under the square of half-side ceil(3 sqrt(lambda_1)), three sigmas of the longer axis."""
     middle = HALF * (footprint.cov_xx + footprint.cov_yy)
     half_difference = HALF * (footprint.cov_xx - footprint.cov_yy)  # middle^2 - det, without its cancellation
     root = half_difference * half_difference + footprint.cov_xy * footprint.cov_xy

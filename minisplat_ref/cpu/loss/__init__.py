@@ -13,7 +13,7 @@ class LossTape(NamedTuple):
     """The gradient of the photometric loss, which is made together with it."""
 
     v_image: Floats
-    """[H, W, 3] derivative of the loss by the image."""
+    """[H, W, 3] derivative of the loss with respect to the image."""
 
 
 def _counts(mask: Bools | None, width: int, dtype: np.dtype) -> Floats:
@@ -48,7 +48,7 @@ def photometric_loss(
 
 
 def photometric_loss_vjp(tape: LossTape, v_loss: float = 1.0) -> Floats:
-    """Chain the derivative by the loss to the image; see ``reference.loss.photometric_loss_vjp``.
+    """Chain the derivative with respect to the loss to the image; see ``reference.loss.photometric_loss_vjp``.
 
     Where ``v_loss`` is 1 it is the tape's own array.
     """

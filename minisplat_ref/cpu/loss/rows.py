@@ -153,7 +153,7 @@ def loss_kernel(dtype: np.dtype) -> Callable:
 
     @scalar
     def vjp_row(image, target, first, v_l1, v_ssim, length, s, v_row):
-        """Gradient by a row that starts at ``first``."""
+        """Gradient with respect to a row that starts at ``first``."""
         n_values = v_row.size
         up = filled(v_l1)
         for i in range(0, n_values, WIDTH):

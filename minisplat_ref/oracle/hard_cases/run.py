@@ -1,9 +1,9 @@
 """Each hard case through every precision, forward and backward, against the reference in float64.
 
 Verdict of a case: refused with the message that it expects, in every precision; or all outputs and all gradients finite
-and as near to the reference as its tolerance says. Derivatives by the outputs are random, fixed and the same in all
-precisions, and zero at pixels that stand on a threshold: see :mod:`minisplat_ref.oracle.thresholds`. The summary has a
-line for each kind: how many cases, how many are refused, and how far the worst is from the reference.
+and within its tolerance of the reference. Derivatives with respect to the outputs are random, fixed and the same in all
+precisions, and zero at pixels on a threshold: see :mod:`minisplat_ref.oracle.thresholds`. The summary has a line for
+each kind: how many cases, how many are refused, and how far the worst is from the reference.
 """
 
 import fnmatch

@@ -93,7 +93,7 @@ class Drawing(NamedTuple):
     outputs: Arrays
     """By name; the first two axes of those that a pixel has are its row and column."""
     vjp: Callable[[Arrays], Arrays]
-    """From derivatives by the differentiable outputs to gradients by block."""
+    """From derivatives with respect to the differentiable outputs to gradients by block."""
     differentiable: tuple[str, ...]
     gradient_size: float = 0.0
     """Norm of an ordinary gradient, where that of a subject may be nothing but rounding."""
@@ -187,7 +187,7 @@ def _draw_parameters(subject: Parameters, backend: Backend, dtype: np.dtype) -> 
 
 
 def _by_opacity(logits: Floats, v_logits: Floats) -> Floats:
-    """Divide gradients by the logits' o (1 - o): near the ends they are too small to be judged beside other blocks."""
+    """Divide gradients by the logits' o (1 - o), without which they are too small near the ends to be compared."""
     small = np.exp(-np.abs(logits))  # float64, all digits
     slopes = small / (1 + small) ** 2
     return np.where(slopes > LEAST_SLOPE, v_logits / np.maximum(slopes, LEAST_SLOPE), 0)
