@@ -58,7 +58,7 @@ def _load(typing: Any, array: Any, i: Any) -> Any:
 
 
 def _written(typing: Any, array: Any, i: Any, lanes: Any, is_added: bool) -> Any:
-    """Typing of a function that writes lanes, or a tuple of them, to an array, or adds them to it."""
+    """Return the typing of a function that writes lanes, or a tuple of them, to an array, or adds them to it."""
     kind = LanesType(array.dtype)
     kinds = list(lanes) if isinstance(lanes, types.BaseTuple) else [lanes]
     if any(joined(kind, one) is None for one in kinds):
@@ -82,7 +82,7 @@ compiled(accumulate)(lambda typing, array, i, lanes: _written(typing, array, i, 
 
 
 def _row_pointers(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
-    """Where the numbers of a column stand; a table of one dimension has one column, 0."""
+    """Return pointers to a column's numbers in eight rows; a table of one dimension has one column, 0."""
     table = signature.args[0]
     array = context.make_array(table)(context, builder, args[0])
     stride, byte = builder.extract_value(array.strides, 0), ir.IntType(8).as_pointer()
@@ -151,9 +151,9 @@ def _converted(typing: Any, lanes: Any, zero: Any) -> Any:
 
 
 def _turned(builder: Any, rows: list[Any]) -> list[Any]:
-    """Columns of a square of eight rows."""
+    """Return the columns of an 8 x 8 matrix, given its rows."""
     vectors = list(rows)
-    for size in (4, 2, 1):  # blocks of this size change places across the diagonal
+    for size in (4, 2, 1):  # swap blocks of this size across the diagonal
         for k in (k for k in range(WIDTH) if not k & size):
             pair = vectors[k], vectors[k + size]
             for place, shift in ((k, 0), (k + size, size)):
@@ -172,7 +172,7 @@ def _columns_of(typing: Any, rows: Any) -> Any:
 
 
 def _register_reduction(function: Callable, emit: Callable) -> None:
-    """Fold lanes in halves with an instruction for two operands."""
+    """Register a reduction that folds lanes in halves with an instruction for two operands."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         (vector,) = args

@@ -1,8 +1,8 @@
-"""Work that threads take part by part: whoever is free takes the next.
+"""Dynamic scheduling of a parallel loop: each thread that is free takes the next part of the work.
 
-Parts are never equal work and threads never equally fast: another program may hold a core, and the cores of a laptop
-differ. So nothing may depend on which thread takes which part. Loops over Gaussians keep to fixed shares instead: they
-do little with each number, and what a core had in its cache it has again in the next loop.
+Parts are never equal work and threads never equally fast: another program may occupy a core, and the cores of a laptop
+differ. Results must not depend on which thread takes which part. Loops over Gaussians use static scheduling instead:
+they do little with each number, and a core finds its share in its cache again in the next loop.
 
 In a kernel::
 
@@ -25,14 +25,14 @@ from minisplat_ref.jit.lanes_arithmetic import compiled
 
 @scalar
 def no_turns():
-    """Return a counter of the turns that have been taken, for all threads of one loop."""
+    """Return a counter of the parts that have been taken, shared by all threads of one loop."""
     taken = np.empty(1, np.int64)
     taken[0] = 0
     return taken
 
 
 def next_turn(taken: Any) -> int:
-    """Return how many turns had been taken before this one; no two threads get the same number."""
+    """Increment the counter atomically and return its old value; no two threads get the same number."""
     taken[0] += 1
     return int(taken[0]) - 1
 
@@ -48,7 +48,7 @@ def _next_turn(typing: Any, taken: Any) -> Any:
 
 @scalar
 def turns(taken: Any, n_parts: int) -> Iterator[int]:
-    """Yield the numbers below ``n_parts`` that no other thread has got."""
+    """Yield the numbers below ``n_parts`` that no other thread has taken."""
     part = next_turn(taken)
     while part < n_parts:
         yield part

@@ -70,7 +70,7 @@ def composite_with(
     collects = with_stats or with_median_depth
     shape, n_pairs = ((height, width), len(bins.gaussian_ids)) if collects else ((0, 0), 0)
     median_depth, dominant_ids = np.empty(shape, dtype), np.empty(shape, np.int32)
-    slots = np.zeros((n_pairs, N_PAIR_STATS), dtype)  # stay zero behind the hit that finishes a tile
+    slots = np.zeros((n_pairs, N_PAIR_STATS), dtype)  # remain zero behind the hit that finishes a tile
     records = records_of(projection, colors, conventions)
     forward_kernel(exp, colors.shape[1], collects)(
         records,

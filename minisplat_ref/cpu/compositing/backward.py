@@ -1,8 +1,8 @@
-"""The backward kernel: every tile's Gaussians front to back once more, and the sum of each Gaussian's shares.
+"""The backward kernel: loop over every tile's Gaussians, front to back once more, and sum each Gaussian's gradient.
 
-Front to back with the forward's arithmetic, so that every threshold falls the same way. A pixel needs only one number
-besides its transmittance, the part S of <v, image> that lies behind the current hit: it starts as the whole and shrinks
-hit by hit.
+The loop runs front to back with the forward pass's arithmetic, so that every threshold test has the same result. A
+pixel needs only one number besides its transmittance, the part S of <v, image> that lies behind the current hit: it
+starts as the whole, and each hit subtracts its share.
 
 With d = mean - pixel, e = dx + slope dy, sigma = (a e^2 + pivot dy^2) / 2 and q = dL/dsigma, all gradients of a
 footprint are moments of q over its pixels:
@@ -10,12 +10,12 @@ footprint are moments of q over its pixels:
     dL/dmean = (a sum q e, slope a sum q e + pivot sum q dy)      dL/do = -(sum q) / o
     dL/da = (sum q e^2) / 2      dL/dslope = a sum q e dy      dL/dpivot = (sum q dy^2) / 2
 
-The moments over e rather than over dx keep a needle's gradient: over dx they grow with its length squared and cancel
-later. They are changed to those by the conic's entries in float64.
+Moments in e rather than dx keep a needle's gradient accurate: in dx they grow with its length squared and cancel later.
+The conversion to derivatives with respect to the conic's entries is done in float64.
 
-A pair (tile, Gaussian) has a slot of its own for its moments, which afterwards are added up: see
-:mod:`minisplat_ref.cpu.compositing.pair_sums`. The background lies behind all Gaussians; each tile says what reaches
-it.
+A pair (tile, Gaussian) has a slot of its own for its moments, which are summed afterwards: see
+:mod:`minisplat_ref.cpu.compositing.pair_sums`. The background lies behind all Gaussians; each tile returns its share of
+the background's gradient.
 """
 
 import functools
@@ -82,7 +82,7 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
 
     @scalar
     def background_vjp(state, sums):
-        """What reaches the background of one tile: its pixels' transmittances times v."""
+        """Compute one tile's share of the background's gradient: its pixels' transmittances times v."""
         for k in range(n_channels):
             total = filled(state.dtype.type(0))
             for i in range(0, N_ROWS * row_size, row_size):
@@ -158,7 +158,7 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
         slots,  # [M * slot_width]
         v_backgrounds,  # [n_tiles, D]
     ):
-        # Taken apart here: bundles that parallel loops read take longer to compile.
+        # Unpacked here: bundles that parallel loops read take longer to compile.
         offsets, ids, slots_of = lists
         image, alpha = pixels
         v_image, v_alpha = v_pixels

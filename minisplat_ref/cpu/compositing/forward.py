@@ -1,9 +1,9 @@
-"""The forward kernel: all tiles, every tile's Gaussians front to back, eight pixels at a time; and blend statistics.
+"""The forward kernel: blend every tile's Gaussians front to back, eight pixels at a time, and collect statistics.
 
 The number of channels, the exponential and whether statistics are collected are compile-time constants: each
 combination is its own compiled kernel.
 
-What the weights of one Gaussian in one tile add up to goes into the slot of this pair, as in
+The sums of one Gaussian's weights in one tile go into the slot of this pair, see
 :mod:`minisplat_ref.cpu.compositing.pair_sums`.
 """
 
@@ -39,7 +39,7 @@ MEDIAN = np.float32(MEDIAN_TRANSMITTANCE)  # one half: exact in float32
 
 
 class HitStats(NamedTuple):
-    """What is written about the hits; all of it empty where it is not asked for."""
+    """Output about the hits; arrays that are not asked for are empty."""
 
     slots: Floats
     """[M, 3] sum of the weights, largest weight and number of hits of each pair, by slots."""
@@ -54,7 +54,7 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
     """Compile the forward kernel for an exponential, a number of channels, with or without statistics."""
     channels = WIDTH  # fields after the transmittance: the image so far
     best = channels + n_channels * WIDTH  # largest weight so far
-    best_place = best + WIDTH  # place of its Gaussian in the tile's list, counted from 1, 0 for none
+    best_place = best + WIDTH  # index of its Gaussian in the tile's list, counted from 1, 0 for none
     crossing = best_place + WIDTH  # depth of the hit that took the transmittance below one half, or 0
     n_fields = 1 + n_channels + (3 if has_stats else 0)
     row_size = n_fields * WIDTH
@@ -71,7 +71,7 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
 
     @scalar
     def pixels_of(state, place, n_pixels):
-        """Load a field of a row; where the image ends within the row, its last pixel fills up the eight."""
+        """Load a field of a row; where the image ends within the row, its last pixel is repeated."""
         return load(state, place) if n_pixels == WIDTH else gather(state, rows_from(place, place + n_pixels), 0)
 
     @scalar
@@ -143,7 +143,7 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
         pixels,  # Pixels
         stats,  # HitStats
     ):
-        # Taken apart here: bundles that parallel loops read take longer to compile, by a quarter.
+        # Unpacked here: bundles that parallel loops read take a quarter longer to compile.
         offsets, ids, slots_of = lists
         image, alpha = pixels
         slots, median_depth, dominant_ids = stats
