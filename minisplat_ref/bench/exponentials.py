@@ -1,8 +1,8 @@
-"""Polynomial exponentials of other degrees than the one in use: what a term less, or one more, would cost and gain.
+"""Polynomial exponentials of other degrees than the one in use: the cost and gain of a term less, or one more.
 
 The form is that of :mod:`minisplat_ref.cpu.compositing.exponential`: exp(x) = 2^n 2^f with n the nearest integer to
-x log2(e), 2^f by a polynomial on [-1/2, 1/2], n added to the exponent bits. Each function is of its own at module
-level, because the compiled kernels on disk are found again by the name of the exponential.
+x log2(e), a polynomial for 2^f on [-1/2, 1/2], and n added to the exponent bits. Each degree has a function of its own
+at module level, because compiled kernels on disk are identified by the name of the exponential.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from minisplat_ref.types import Floats
 
 
 def _coefficients(degree: int) -> tuple[np.float32, ...]:
-    """Chebyshev interpolation of 2^f on [-1/2, 1/2], from f^0 up."""
+    """Return the coefficients of the Chebyshev interpolation of 2^f on [-1/2, 1/2], from f^0 up."""
     fit = np.polynomial.chebyshev.Chebyshev.interpolate(np.exp2, degree, domain=[-0.5, 0.5])
     return tuple(np.float32(value) for value in fit.convert(kind=np.polynomial.Polynomial).coef)
 
@@ -57,5 +57,5 @@ EXPONENTIALS: dict[int, Callable[[Floats], Floats]] = {
 
 
 def relative_errors(exp: Callable[[Floats], Floats], xs: Floats) -> Floats:
-    """Return the relative error at every one of some float32 numbers, evaluated in plain Python."""
+    """Return the relative errors at some float32 numbers, evaluated in plain Python."""
     return np.abs(exp(xs) / np.exp(xs.astype(np.float64)) - 1)
