@@ -1,4 +1,4 @@
-"""What draws the workloads: backends in their precisions, exponentials of other degrees, shorter cut-offs, the baseline.
+"""What draws the workloads: backends in their precisions, other exponentials, shorter cut-offs, the baseline.
 
 A shorter cut-off gives another image on purpose. It is judged by the float64 kernels with the same cut-off; the
 reported error is the one that matters to its user, against the reference with the default cut-off.
