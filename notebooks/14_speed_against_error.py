@@ -63,9 +63,9 @@ plt.show()
 
 # %% [markdown]
 # The float64 kernels agree with the reference to the last digits (black). float32 is off by $10^{-7}$ to $10^{-6}$
-# wherever there is a Gaussian, with a few bright dots. A cubic exponential raises this level everywhere. Ending a
-# Gaussian at three standard deviations, as the tiles of the 3DGS rasteriser do, leaves most pixels as they are and is
-# grossly wrong along the edges of tiles, where opaque Gaussians are cut off. Skipping every hit below 1/64 is wrong
+# wherever there is a Gaussian, with a few bright dots. A cubic exponential raises this level everywhere. Cutting a
+# Gaussian off at three standard deviations, as the tiles of the 3DGS rasteriser do, leaves most pixels as they are and
+# is grossly wrong along the edges of tiles, where opaque Gaussians are cut off. Skipping every hit below 1/64 is wrong
 # everywhere.
 #
 # | file | what it holds |
@@ -224,7 +224,7 @@ plt.show()
 # are stored as float32 pixels, and near pixel 200 their last digit is $10^{-5}$. Degree 6 gains nothing at all, because
 # rounding hides it.
 #
-# ## The race
+# ## The benchmark
 #
 # First every contender is judged: one whose error exceeds its bound, beyond what flips explain, has failed and gets no
 # time. Shorter cut-offs render other images on purpose; they must agree with float64 under *their* cut-off, and the
@@ -278,7 +278,7 @@ print(f"{np.mean(apart > 1e-5):.3%} of the pixels differ by more than 1e-5")
 # %% [markdown]
 # ## Exercises
 #
-# **1.** How many flips are to be expected? Let a pixel look at $K$ Gaussians whose alphas are spread evenly on a
+# **1.** How many flips are to be expected? Let a pixel have $K$ Gaussians whose alphas are spread evenly on a
 # logarithmic scale from $10^{-6}$ to 1, and let float32 move each alpha by a relative error of $10^{-6}$.
 #
 # <details>
