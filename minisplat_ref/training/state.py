@@ -177,7 +177,8 @@ def apply_edit(state: TrainState, edit: Edit) -> None:
 def start_anew(state: TrainState, iteration: Iteration, gaussians: Gaussians) -> None:
     """Replace the population and forget its history: zero moments, no statistics, all views still to come.
 
-    Fields that the representation has besides those of ``gaussians`` get their initial values. Shared parameters stay.
+    Fields that the representation has besides those of ``gaussians`` get their initial values. Shared parameters stay,
+    and so does the precision of the population.
 
     Raises
     ------
@@ -185,7 +186,9 @@ def start_anew(state: TrainState, iteration: Iteration, gaussians: Gaussians) ->
         So many rows do not fit into memory.
     """
     _check_room(state, len(gaussians.means))
-    state.gaussians = contiguous(iteration.representation.extend(gaussians, state.rng))
+    dtype = state.gaussians.means.dtype
+    fresh = iteration.representation.extend(gaussians, state.rng)
+    state.gaussians = contiguous(type(fresh)(*(field.astype(dtype, copy=False) for field in fresh)))
     state.adam = zero_moments(state.gaussians)
     state.stats = {}
     state.view_order = []
