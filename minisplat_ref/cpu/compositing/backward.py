@@ -42,14 +42,14 @@ from minisplat_ref.cpu.compositing.tile_state import (
     open_rows,
     row_in_image,
     rows_of,
+    scheduled_tiles,
     start_tile,
-    tiles_in_turn,
 )
 from minisplat_ref.cpu.gaussian_rows import rows_from
 from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.jit.lanes import WIDTH, counted, filled, gather, load, select, store, sum_of, sums_of
 from minisplat_ref.jit.literals import ONE, ZERO
-from minisplat_ref.jit.turns import no_turns
+from minisplat_ref.jit.scheduling import shared_counter
 from minisplat_ref.scalar.compositing import blend, sigma_vjp
 
 
@@ -162,13 +162,13 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
         offsets, ids, slots_of = lists
         image, alpha = pixels
         v_image, v_alpha = v_pixels
-        taken = no_turns()
+        taken = shared_counter()
         for _ in prange(n_threads):
             state = np.empty(N_ROWS * row_size, image.dtype)
             scratch = np.empty(SCRATCH_SIZE, image.dtype)
             start_scratch(scratch)
             further = np.empty((slot_width - N_MOMENTS - N_FUSED) * WIDTH, image.dtype)  # further channels
-            for i in tiles_in_turn(taken, n_threads, offsets):
+            for i in scheduled_tiles(taken, n_threads, offsets):
                 x0, y0 = corner(i, frame)
                 tile = Tile(x0, y0, ids[offsets[i] : offsets[i + 1]], slots_of[offsets[i] :])
                 start_tile(state, x0, y0, frame, n_fields)

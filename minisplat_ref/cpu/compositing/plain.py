@@ -56,7 +56,7 @@ from minisplat_ref.jit.lanes import (
     sum_of,
 )
 from minisplat_ref.jit.literals import ONE, ZERO
-from minisplat_ref.jit.turns import no_turns, turns
+from minisplat_ref.jit.scheduling import dynamic_range, shared_counter
 from minisplat_ref.scalar.compositing import blend, blend_vjp
 
 
@@ -91,10 +91,10 @@ def forward_kernel(response: KernelResponse, n_channels: int) -> Callable:
 
     @kernel()
     def composite_tiles(scene, background, lists, frame, n_threads, out):
-        taken = no_turns()
+        taken = shared_counter()
         for _ in prange(n_threads):
             state = np.empty((1 + n_channels) * WIDTH, out.image.dtype)
-            for tile in turns(taken, lists.offsets.size - 1):
+            for tile in dynamic_range(taken, lists.offsets.size - 1):
                 n_listed = lists.offsets[tile + 1] - lists.offsets[tile]
                 buffer = hit_buffer(n_listed if is_sorted else 0, n_channels, state.dtype)
                 for row in rows_of_tile(tile, scene, lists, frame):
@@ -194,11 +194,11 @@ def backward_kernel(response: KernelResponse, n_channels: int) -> Callable:
 
     @kernel()
     def composite_tiles_vjp(scene, lists, frame, n_threads, output, v_output, slots, v_backgrounds):
-        taken = no_turns()
+        taken = shared_counter()
         for _ in prange(n_threads):
             state = np.empty((2 + n_channels) * WIDTH, slots.dtype)
             v_place = np.empty(n_places * WIDTH, slots.dtype)
-            for tile in turns(taken, lists.offsets.size - 1):
+            for tile in dynamic_range(taken, lists.offsets.size - 1):
                 first, n_listed = lists.offsets[tile], lists.offsets[tile + 1] - lists.offsets[tile]
                 sums = np.zeros(n_listed * n_sums * WIDTH, slots.dtype)
                 buffer = hit_buffer(n_listed if is_sorted else 0, n_channels, state.dtype)

@@ -15,7 +15,7 @@ from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import WIDTH, any_of, counted, filled, load, lowest_bit, select, store
 from minisplat_ref.jit.literals import ONE, ZERO
-from minisplat_ref.jit.turns import turns
+from minisplat_ref.jit.scheduling import dynamic_range
 from minisplat_ref.scalar.compositing import Frame
 from minisplat_ref.types import Floats, Ints, TileBins
 
@@ -98,11 +98,11 @@ def first_tile(i, n_ranges, offsets):
 
 
 @scalar
-def tiles_in_turn(taken, n_threads, offsets):
+def scheduled_tiles(taken, n_threads, offsets):
     """Yield the tiles of the ranges that this thread takes."""
     n_ranges = RANGES_PER_THREAD * n_threads
-    for turn in turns(taken, n_ranges):
-        for tile in range(first_tile(turn, n_ranges, offsets), first_tile(turn + 1, n_ranges, offsets)):  # noqa: UP028
+    for i in dynamic_range(taken, n_ranges):
+        for tile in range(first_tile(i, n_ranges, offsets), first_tile(i + 1, n_ranges, offsets)):  # noqa: UP028
             yield tile
 
 

@@ -33,7 +33,7 @@ from minisplat_ref.cpu.tiling.layers import (
 )
 from minisplat_ref.jit.compile import kernel, n_threads, prange
 from minisplat_ref.jit.lanes import WIDTH
-from minisplat_ref.jit.turns import no_turns, turns
+from minisplat_ref.jit.scheduling import dynamic_range, shared_counter
 from minisplat_ref.types import Ints, Projection, TileBins, TileGrid
 
 __all__ = ["ELLIPSE_MARGIN", "TILE_HEIGHT", "TILE_WIDTH", "bin_gaussians"]
@@ -52,25 +52,25 @@ def _list_tiles(
 ):
     """Write the offsets, and return the lists and the slots of their pairs. The three passes are one kernel."""
     n_threads = len(counts)
-    taken = no_turns()
+    taken = shared_counter()
     for _ in prange(n_threads):
-        for part in turns(taken, N_PARTS):
+        for part in dynamic_range(taken, N_PARTS):
             survey_part(part, projection.boxes, projection.depths, survey)
     cut_layers(survey.up_to, layers.of_buckets, layers.edges)
 
     cells = np.empty(layers.edges[-1, TILES], np.int32)
-    taken = no_turns()
+    taken = shared_counter()
     for thread in prange(n_threads):
-        for part in turns(taken, N_PARTS):
+        for part in dynamic_range(taken, N_PARTS):
             list_part(part, survey, projection, screen, layers, cells, offsets, counts[thread])
     first_slots = np.empty(N_PARTS, np.int64)
     start_lists(counts, offsets, first_slots, tile_offsets)
 
     lists = np.empty((2, tile_offsets[-1]), np.int32)
-    taken = no_turns()
+    taken = shared_counter()
     for _ in prange(n_threads):
-        for turn in turns(taken, N_PARTS):
-            layer = turn % 2 * (N_PARTS // 2) + turn // 2  # neighbours share cache lines: far apart in time
+        for i in dynamic_range(taken, N_PARTS):
+            layer = i % 2 * (N_PARTS // 2) + i // 2  # neighbours share cache lines: far apart in time
             fill_layer(layer, layers, cells, first_slots, offsets, scratch, counts[0], lists)
     return lists
 

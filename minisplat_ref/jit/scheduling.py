@@ -6,9 +6,9 @@ they do little with each number, and a core finds its share in its cache again i
 
 In a kernel::
 
-    taken = no_turns()
+    taken = shared_counter()
     for _ in prange(n_threads):
-        for part in turns(taken, n_parts):
+        for part in dynamic_range(taken, n_parts):
             ...
 """
 
@@ -24,21 +24,21 @@ from minisplat_ref.jit.lanes_arithmetic import compiled
 
 
 @scalar
-def no_turns():
+def shared_counter():
     """Return a counter of the parts that have been taken, shared by all threads of one loop."""
     taken = np.empty(1, np.int64)
     taken[0] = 0
     return taken
 
 
-def next_turn(taken: Any) -> int:
+def fetch_and_increment(taken: Any) -> int:
     """Increment the counter atomically and return its old value; no two threads get the same number."""
     taken[0] += 1
     return int(taken[0]) - 1
 
 
-@compiled(next_turn)
-def _next_turn(typing: Any, taken: Any) -> Any:
+@compiled(fetch_and_increment)
+def _fetch_and_increment(typing: Any, taken: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         counter = context.make_array(taken)(context, builder, args[0]).data
         return builder.atomic_rmw("add", counter, ir.IntType(64)(1), "monotonic")
@@ -47,9 +47,9 @@ def _next_turn(typing: Any, taken: Any) -> Any:
 
 
 @scalar
-def turns(taken: Any, n_parts: int) -> Iterator[int]:
+def dynamic_range(taken: Any, n_parts: int) -> Iterator[int]:
     """Yield the numbers below ``n_parts`` that no other thread has taken."""
-    part = next_turn(taken)
+    part = fetch_and_increment(taken)
     while part < n_parts:
         yield part
-        part = next_turn(taken)
+        part = fetch_and_increment(taken)
