@@ -32,12 +32,12 @@ from IPython.display import display
 
 from figures import BLUE, GREEN, GREY, RED, YELLOW, show
 from minisplat_ref.backends import CPU, REFERENCE
+from minisplat_ref.bench.benchmark import benchmark
 from minisplat_ref.bench.contenders import all_contenders
 from minisplat_ref.bench.exponentials import EXPONENTIALS, relative_errors
 from minisplat_ref.bench.figure import pareto_figure
 from minisplat_ref.bench.judging import backward, expect, failure, forward, judge
 from minisplat_ref.bench.judging import relative_errors as by_parameter
-from minisplat_ref.bench.race import race
 from minisplat_ref.bench.workloads import synth
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.oracle.planted import planted
@@ -73,7 +73,7 @@ plt.show()
 # | `minisplat_ref/bench/workloads.py` | what is rendered |
 # | `minisplat_ref/bench/contenders.py` | what renders it |
 # | `minisplat_ref/oracle/thresholds.py` | which pixels are at a threshold |
-# | `minisplat_ref/bench/judging.py`, `race.py` | errors, then times |
+# | `minisplat_ref/bench/judging.py`, `benchmark.py` | errors, then times |
 #
 # **Frames and units:** images are [H, W, 3] with values in [0, 1]; an error of an image is an absolute difference, an
 # error of a gradient is relative. Times are those of the machine that ran the notebook; the command
@@ -235,7 +235,7 @@ plt.show()
 wrong = contenders["cpu-f32"]._replace(name="planted", backend=planted("half-off-diagonal"))
 small = synth(4_000, width=96, height=54, focal=80.0)
 runners = [contenders[name] for name in contenders if "exp6" not in name and "exp4" not in name]
-cases = race(small, [*runners, wrong], repeats=3)
+cases = benchmark(small, [*runners, wrong], repeats=3)
 results = {case.name.removeprefix("synth/"): case for case in cases}
 for name, case in results.items():
     f = case.figures

@@ -33,7 +33,7 @@ def pareto_figure(cases: Sequence[Case]) -> "Figure":
     Parameters
     ----------
     cases : sequence of Case
-        From ``race``, of any number of workloads.
+        From ``benchmark``, of any number of workloads.
     """
     from matplotlib.figure import Figure
 

@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 from minisplat_ref.backends import CPU, REFERENCE, Backend
-from minisplat_ref.bench.by_turns import Contest, Task, Times
+from minisplat_ref.bench.interleaving import Contest, Task, Times
 from minisplat_ref.bench.workloads import Workload, synth
 from minisplat_ref.constants import GSPLAT_MAIN, SH_DEGREE_MAX
 from minisplat_ref.jit.compile import kernel, prange

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.backends import CPU
-from minisplat_ref.bench.by_turns import times_by_turns
+from minisplat_ref.bench.interleaving import interleaved_times
 from minisplat_ref.bench.workloads import Workload, synth
 from minisplat_ref.oracle.cases import Case, Figure
 from minisplat_ref.oracle.tolerances import BENCH_FLIPPED_PIXELS, BENCH_FLOAT32_IMAGE
@@ -65,15 +65,15 @@ def slope_cases(repeats: int, report: Callable[[str], None] = lambda _: None) ->
         report(f"slopes: {n:,} Gaussians, {width} x {height}")
         views.append(_view(synth(n, width, height, FOCAL_OF_WIDTH * width)))
     report("slopes: taking turns")
-    [turns] = times_by_turns([[view.draw for view in views]], 1, repeats)
-    times = [view.least for view in turns]
-    cases = [_case(view, seconds) for view, seconds in zip(views, times, strict=True)]
+    [times] = interleaved_times([[view.draw for view in views]], 1, repeats)
+    least = [view.least for view in times]
+    cases = [_case(view, seconds) for view, seconds in zip(views, least, strict=True)]
     sizes = [(len(v.workload.gaussians.means), v.workload.camera.width * v.workload.camera.height) for v in views]
     hits = [view.n_hits for view in views]
     passed = all(case.passed for case in cases)
     note = "" if passed else "an image is wrong"
     for name, costs in (("hits", hits), ("N x pixels", [n * pixels for n, pixels in sizes])):
-        slope, spread = fitted_slope(costs, times)
+        slope, spread = fitted_slope(costs, least)
         cases.append(Case(f"slope/time against {name}", passed, {"slope": slope, "spread": spread}, note))
     return cases
 

@@ -14,10 +14,10 @@ import numba
 import numpy as np
 
 from minisplat_ref.backends import CPU, Backend
-from minisplat_ref.bench.by_turns import seconds_of
+from minisplat_ref.bench.interleaving import seconds_of
 from minisplat_ref.bench.opensplat import iteration_seconds
 from minisplat_ref.bench.profiling import REST, WHOLE, profile_cases, timed
-from minisplat_ref.bench.roofs import StraightLines
+from minisplat_ref.bench.roofline import StraightLines
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.io import load_scene
 from minisplat_ref.methods import get_recipe
@@ -68,7 +68,7 @@ def thread_cases(folder: Path | None, downscale: int, iterations: int) -> list[C
     states = {n: initial_state(scene, recipe, seed=0) for n in (1, n_all)}
     lines = StraightLines(n_all)
     lines.forward()  # compiled
-    turns: dict[int, list[dict[str, float]]] = {n: [] for n in states}
+    measured: dict[int, list[dict[str, float]]] = {n: [] for n in states}
     try:
         for first in range(1, WARM_UP + iterations + 1, TURN):
             for n, state in states.items():
@@ -79,15 +79,15 @@ def thread_cases(folder: Path | None, downscale: int, iterations: int) -> list[C
                     train(scene, recipe._replace(iterations=step), seed=0, state=state, backend=timed(CPU, seconds))
                     total = time.perf_counter() - start
                     line = seconds_of(lines.forward)
-                    turns[n].append({**seconds, REST: total - sum(seconds.values()), WHOLE: total, LINE: line})
+                    measured[n].append({**seconds, REST: total - sum(seconds.values()), WHOLE: total, LINE: line})
     finally:
         numba.set_num_threads(n_all)
     one, all_ = (state.gaussians for state in states.values())
     is_same = all(np.array_equal(a, b) for a, b in zip(one, all_, strict=True))
     note = "" if is_same else "the trained Gaussians are not the same bytes"
     cases = []
-    for stage in turns[1][0]:
-        times = [min(turn[stage] for turn in turns[n][WARM_UP:]) for n in states]
+    for stage in measured[1][0]:
+        times = [min(seconds[stage] for seconds in measured[n][WARM_UP:]) for n in states]
         figures: dict[str, Figure] = {
             "1 thread ms": 1e3 * times[0],
             f"{n_all} threads ms": 1e3 * times[1],

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.bench.by_turns import Contest, Times
+from minisplat_ref.bench.interleaving import Contest, Times
 from minisplat_ref.bench.limits import in_ms
 from minisplat_ref.bench.workloads import Workload
 from minisplat_ref.constants import GSPLAT_MAIN

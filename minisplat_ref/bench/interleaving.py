@@ -39,7 +39,7 @@ def seconds_of(task: Task) -> float:
     return time.perf_counter() - start
 
 
-def times_by_turns(groups: Sequence[Sequence[Task]], rounds: int, repeats: int) -> list[list[Times]]:
+def interleaved_times(groups: Sequence[Sequence[Task]], rounds: int, repeats: int) -> list[list[Times]]:
     """Time tasks; those in a group alternate.
 
     Parameters
@@ -64,7 +64,7 @@ def times_by_turns(groups: Sequence[Sequence[Task]], rounds: int, repeats: int) 
     return [[Times(min(own), statistics.median(own)) for own in of_group] for of_group in seconds]
 
 
-def hold(contests: Sequence[Contest], repeats: int) -> list[Case]:
+def time_contests(contests: Sequence[Contest], repeats: int) -> list[Case]:
     """Time all tasks in ``ROUNDS`` rounds; return the cases of all contests, in their order."""
-    times = times_by_turns([contest.tasks for contest in contests], ROUNDS, repeats)
+    times = interleaved_times([contest.tasks for contest in contests], ROUNDS, repeats)
     return [case for contest, own in zip(contests, times, strict=True) for case in contest.judge(own)]

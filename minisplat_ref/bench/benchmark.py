@@ -47,7 +47,7 @@ class Entry(NamedTuple):
     """Empty if it is wrong."""
 
 
-def race(
+def benchmark(
     workload: Workload, contenders: Iterable[Contender], repeats: int, report: Callable[[str], None] = lambda _: None
 ) -> list[Case]:
     """Judge every contender and time those that are right.
@@ -83,7 +83,7 @@ def race(
         report(f"{workload.name}: round {round_ + 1} of {repeats}")
         for entry in entries:
             if not entry.failure and entry.contender.name != REFERENCE_NAME:
-                _take_turn(entry, workload)
+                _time_once(entry, workload)
     baseline = next((entry for entry in entries if entry.contender.name == BASELINE_NAME), None)
     return [_case(workload, entry, baseline.times if baseline else Times([], [])) for entry in entries]
 
@@ -100,7 +100,7 @@ def _judged(contender: Contender, workload: Workload, expected: Expected, trust:
     return Entry(contender, verdict, wrong, Times([], []))
 
 
-def _take_turn(entry: Entry, workload: Workload) -> None:
+def _time_once(entry: Entry, workload: Workload) -> None:
     contender, times = entry.contender, entry.times
     if times.both and times.both[0] > SLOW_SECONDS:
         return
