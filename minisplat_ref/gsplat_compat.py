@@ -321,7 +321,7 @@ def draw(batch: Batch, c: int, conventions: Conventions, backend: Backend) -> Sp
             return np.zeros((len(means), 0), means.dtype)
         if batch.sh_degree is None:
             return colors
-        return backend.sh_colors(means, *_split(colors), _lookout(batch.cameras[c]), batch.sh_degree, radii)
+        return backend.sh_colors(means, *_split(colors), _unrotated(batch.cameras[c]), batch.sh_degree, radii)
 
     return splat(
         batch.primitives,
@@ -351,15 +351,15 @@ def draw_vjp(batch: Batch, c: int, tape: SplatTape, v_image: Floats, v_alpha: Fl
     elif batch.sh_degree is None:
         v_colors = v.colors
     else:
-        lookout = _lookout(tape.camera)
+        unrotated = _unrotated(tape.camera)
         dc, rest = _split(batch.colors_of(c))
         v_sh = tape.backend.sh_colors_vjp(
-            batch.primitives.means, dc, rest, lookout, batch.sh_degree, tape.projection.radii, v.colors
+            batch.primitives.means, dc, rest, unrotated, batch.sh_degree, tape.projection.radii, v.colors
         )
         v_means = v_means + v_sh.means
         v_colors = np.concatenate([v_sh.sh_dc[:, None], v_sh.sh_rest], axis=1)
-        w = np.linalg.solve(tape.camera.cam_from_world_R.T, -v_sh.cam_from_world_t)  # t of the lookout is -o
-        v_R, v_t = v_R + np.outer(w, lookout.cam_from_world_t), v_t - w
+        w = np.linalg.solve(tape.camera.cam_from_world_R.T, -v_sh.cam_from_world_t)  # t of the unrotated camera is -o
+        v_R, v_t = v_R + np.outer(w, unrotated.cam_from_world_t), v_t - w
     v_viewmat = np.zeros((4, 4), v_t.dtype)
     v_viewmat[:3] = np.column_stack([v_R, v_t])
     v_primitives = Primitives(v_means, v.primitives.quats, v.primitives.scales, v.primitives.opacities)
@@ -415,7 +415,7 @@ def _stacked(arrays: list[Floats]) -> Floats:
     return arrays[0][None] if len(arrays) == 1 else np.stack(arrays)
 
 
-def _lookout(camera: Camera) -> Camera:
+def _unrotated(camera: Camera) -> Camera:
     """Return a camera at the same centre with R = I: colours depend on the centre only."""
     R, t = camera.cam_from_world_R.astype(np.float64), camera.cam_from_world_t.astype(np.float64)
     return camera._replace(cam_from_world_R=np.eye(3), cam_from_world_t=np.linalg.solve(R, t))

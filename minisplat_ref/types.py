@@ -227,7 +227,7 @@ class RenderOutput(NamedTuple):
     """[H, W] depth of the hit that takes the transmittance below one half, 0 where none does; None if not asked for."""
     stats: BlendStats | None
     """Blend statistics; None if not asked for."""
-    kept: Any = None
+    saved: Any = None
     """What the backend saves for its gradient, which without it is slower but just as correct."""
     visible_ids: Ints | None = None
     """[V] rows of the population that the view does not cull, ascending; None from a compositor alone."""

@@ -224,7 +224,7 @@ def _with_records(
     """Composite with the reference and add the kernels' records, which their gradient would otherwise have to make."""
     records = np.zeros((len(colors), record_size(colors.shape[1])), colors.dtype)
     output = REFERENCE.composite(projection, colors, background, bins, conventions, **asked)
-    return output._replace(kept=records)
+    return output._replace(saved=records)
 
 
 _REFERENCE = replace(

@@ -14,7 +14,7 @@ import numpy as np
 LARGE = 1 << 25  # bytes; glibc keeps no more
 SLACK = 2  # a block may be this many times larger than requested
 
-_kept: list[np.ndarray] = []
+_cached: list[np.ndarray] = []
 
 
 def large_empty(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
@@ -23,7 +23,7 @@ def large_empty(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
     if n_bytes < LARGE:
         return np.empty(shape, dtype)
     try:
-        block = _kept.pop()  # atomic: two threads never get the same block
+        block = _cached.pop()  # atomic: two threads never get the same block
     except IndexError:
         block = np.empty(0, np.uint8)
     if not n_bytes <= block.size <= SLACK * n_bytes:
@@ -34,4 +34,4 @@ def large_empty(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
 
 
 def _keep(block: np.ndarray) -> None:
-    _kept[:] = [block]
+    _cached[:] = [block]

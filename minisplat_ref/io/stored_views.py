@@ -46,7 +46,7 @@ class Shelf:
     def __init__(self, most_bytes: float) -> None:
         self._most_bytes = most_bytes
         self._n_bytes = 0
-        self._kept: dict[Photograph, Pixels] = {}
+        self._cached: dict[Photograph, Pixels] = {}
         self._lock = threading.Lock()
 
     @property
@@ -61,21 +61,21 @@ class Shelf:
 
     def get(self, photograph: "Photograph") -> Pixels | None:
         """Return the pixels of a photograph if they are in memory."""
-        return self._kept.get(photograph)
+        return self._cached.get(photograph)
 
     def put(self, photograph: "Photograph", pixels: Pixels) -> None:
         """Keep the pixels of a photograph if there is room."""
         with self._lock:
             if pixels.n_bytes <= self.n_free:
-                self._kept[photograph] = pixels
+                self._cached[photograph] = pixels
                 self._n_bytes += pixels.n_bytes
 
     def resize(self, most_bytes: float) -> None:
         """Give the photographs more room, or less; those that came last are then evicted first."""
         with self._lock:
             self._most_bytes = most_bytes
-            while self._kept and self.n_free < 0:
-                self._n_bytes -= self._kept.popitem()[1].n_bytes
+            while self._cached and self.n_free < 0:
+                self._n_bytes -= self._cached.popitem()[1].n_bytes
 
 
 class Photograph:

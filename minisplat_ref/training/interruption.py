@@ -16,13 +16,13 @@ IMPATIENCE = 1.0  # seconds; a second Ctrl-C that comes sooner may be the first 
 
 
 class Interruptions(AbstractContextManager["Interruptions"]):
-    """Raises KeyboardInterrupt at once, but between :meth:`hold` and :meth:`release` only at the release.
+    """Raises KeyboardInterrupt at once, but between :meth:`defer` and :meth:`release` only at the release.
 
     A second Ctrl-C in between raises it at once, and may leave the work of that section half done.
     """
 
     def __init__(self) -> None:
-        self._is_held = False
+        self._is_deferring = False
         self._pressed_at: float | None = None
         self._previous: dict[int, Any] = {}
 
@@ -41,13 +41,13 @@ class Interruptions(AbstractContextManager["Interruptions"]):
         if kind is None and self._pressed_at is not None:
             raise KeyboardInterrupt
 
-    def hold(self) -> None:
+    def defer(self) -> None:
         """Defer interruptions from now on."""
-        self._is_held = True
+        self._is_deferring = True
 
     def release(self) -> None:
         """Stop deferring; raise now if an interruption came in the meantime."""
-        self._is_held = False
+        self._is_deferring = False
         if self._pressed_at is not None:
             raise KeyboardInterrupt
 
@@ -55,7 +55,7 @@ class Interruptions(AbstractContextManager["Interruptions"]):
         now = time.monotonic()
         is_impatient = self._pressed_at is not None and now - self._pressed_at > IMPATIENCE
         self._pressed_at = now if self._pressed_at is None else self._pressed_at
-        if not self._is_held or is_impatient:
+        if not self._is_deferring or is_impatient:
             raise KeyboardInterrupt
 
 

@@ -196,7 +196,7 @@ def _iterate(state: TrainState, scene: Scene, around: "_Surroundings", interrupt
     view_order, draws = list(state.view_order), state.rng.bit_generator.state
     try:
         differentiated = _differentiate(state, scene, around)
-        interruptions.hold()
+        interruptions.defer()
     except BaseException:
         state.view_order, state.rng.bit_generator.state = view_order, draws
         raise

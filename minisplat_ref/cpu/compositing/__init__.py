@@ -108,7 +108,7 @@ def composite_vjp_with(
     slots = large_empty((len(bins.gaussian_ids) * width,), dtype)
     v_backgrounds = np.empty((len(bins.tile_offsets) - 1, n_channels))  # by tiles
     backward_kernel(exp, n_channels)(
-        output.kept if output.kept is not None else records_of(projection, colors, conventions),
+        output.saved if output.saved is not None else records_of(projection, colors, conventions),
         lists_of(bins),
         n_threads(),
         frame_of(bins, conventions, dtype),
