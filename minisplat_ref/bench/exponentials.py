@@ -11,7 +11,7 @@ import numpy as np
 
 from minisplat_ref.cpu.compositing.exponential import exp_fast, powers_of_two
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import scaled_by_power
+from minisplat_ref.jit.lanes import ldexp
 from minisplat_ref.types import Floats
 
 
@@ -30,21 +30,21 @@ C0, C1, C2, C3, C4, C5, C6 = _coefficients(6)
 def exp_degree_3(x):  # type: ignore[no-untyped-def]
     """Return exp of float32 lanes x <= 0 by a cubic."""
     n, f = powers_of_two(x)
-    return scaled_by_power(((A3 * f + A2) * f + A1) * f + A0, n)
+    return ldexp(((A3 * f + A2) * f + A1) * f + A0, n)
 
 
 @scalar
 def exp_degree_4(x):  # type: ignore[no-untyped-def]
     """Return exp of float32 lanes x <= 0 by a quartic."""
     n, f = powers_of_two(x)
-    return scaled_by_power((((B4 * f + B3) * f + B2) * f + B1) * f + B0, n)
+    return ldexp((((B4 * f + B3) * f + B2) * f + B1) * f + B0, n)
 
 
 @scalar
 def exp_degree_6(x):  # type: ignore[no-untyped-def]
     """Return exp of float32 lanes x <= 0 by a polynomial of degree 6."""
     n, f = powers_of_two(x)
-    return scaled_by_power((((((C6 * f + C5) * f + C4) * f + C3) * f + C2) * f + C1) * f + C0, n)
+    return ldexp((((((C6 * f + C5) * f + C4) * f + C3) * f + C2) * f + C1) * f + C0, n)
 
 
 EXPONENTIALS: dict[int, Callable[[Floats], Floats]] = {

@@ -41,7 +41,7 @@ from minisplat_ref.cpu.compositing.tile_state import (
 )
 from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
 from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
-from minisplat_ref.jit.lanes import WIDTH, filled, load, select, store, sum_of
+from minisplat_ref.jit.lanes import WIDTH, broadcast, load, reduce_sum, select, store
 from minisplat_ref.jit.literals import ZERO
 from minisplat_ref.oracle.cases import Case, Figure
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_GRADIENT, BENCH_FLOAT32_IMAGE
@@ -103,7 +103,7 @@ def _forward_lines(drawn, hit, frame, n_hits, n_passes):  # type: ignore[no-unty
 def _backward_line(fresh, hit, frame, sums, n_hits, n_passes):  # type: ignore[no-untyped-def]
     state, scratch = np.empty(fresh.size, fresh.dtype), np.empty(SCRATCH_SIZE, fresh.dtype)
     start_scratch(scratch)
-    zero = filled(ZERO * hit.x)
+    zero = broadcast(ZERO * hit.x)
     for _ in range(n_passes):
         state[:] = fresh
         sums[:] = ZERO
@@ -138,7 +138,7 @@ def _backward_line(fresh, hit, frame, sums, n_hits, n_passes):  # type: ignore[n
                 qyy = qyy + q_shape * dy * dy
             parts = (q_sum, qe, qy, qee, qey, qyy, v_red, v_green, v_blue)
             for j in range(N_SUMS):
-                sums[j] += sum_of(parts[j])
+                sums[j] += reduce_sum(parts[j])
 
 
 @kernel()

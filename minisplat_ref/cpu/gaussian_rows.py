@@ -8,7 +8,7 @@ only sums over Gaussians have to exclude the copies.
 import numpy as np
 
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import WIDTH, converted, filled, gather, load, select, store, sum_of
+from minisplat_ref.jit.lanes import WIDTH, broadcast, cast, gather, load, reduce_sum, select, store
 from minisplat_ref.jit.literals import ZERO
 
 DOUBLE = np.float64(0)  # names the dtype
@@ -46,7 +46,7 @@ def list_visible(radii, first, end, rows):
 @scalar
 def gather_wide(table, rows, column):
     """Return a column of eight rows in float64."""
-    return converted(gather(table, rows, column), DOUBLE)
+    return cast(gather(table, rows, column), DOUBLE)
 
 
 @scalar
@@ -58,7 +58,7 @@ def triple(table, rows):
 @scalar
 def rounded(lanes, zero):
     """Return three lanes in the dtype of a number."""
-    return converted(lanes[0], zero), converted(lanes[1], zero), converted(lanes[2], zero)
+    return cast(lanes[0], zero), cast(lanes[1], zero), cast(lanes[2], zero)
 
 
 @scalar
@@ -72,8 +72,8 @@ def total_of(parts):
     """Return the sums [K] over all parts [n, K * 8], added in the order of the parts."""
     totals = np.empty(parts.shape[1] // WIDTH, np.float64)
     for k in range(totals.size):
-        total = filled(DOUBLE)
+        total = broadcast(DOUBLE)
         for part in range(parts.shape[0]):
             total = total + load(parts[part], k * WIDTH)
-        totals[k] = sum_of(total)
+        totals[k] = reduce_sum(total)
     return totals

@@ -25,7 +25,7 @@ from minisplat_ref.cpu.gaussian_rows import (
     triple,
 )
 from minisplat_ref.jit.compile import kernel, prange, scalar
-from minisplat_ref.jit.lanes import WIDTH, counted, scatter, select
+from minisplat_ref.jit.lanes import WIDTH, iota, scatter, select
 from minisplat_ref.jit.literals import ZERO
 from minisplat_ref.scalar.extent import Extent, inria_box, support_box
 from minisplat_ref.scalar.projection import (
@@ -215,7 +215,7 @@ def _project_chunk_vjp(chunk, primitives, radii, pose, lens, v, out, v_poses):
     in_rows = Pose(rows_of(pose.R), pose.centre)  # read once
     v_poses[chunk] = ZERO
     for i in range(0, count, WIDTH):
-        is_counted = counted(DOUBLE) < count - i
+        is_counted = iota(DOUBLE) < count - i
         _project_eight_vjp(listed_rows(visible, i), is_counted, primitives, in_rows, lens, v, out, v_poses[chunk])
 
 

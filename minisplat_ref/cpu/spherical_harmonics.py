@@ -20,15 +20,15 @@ from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.jit.lanes import (
     WIDTH,
-    columns_of,
-    converted,
-    counted,
+    cast,
     gather,
-    larger,
+    iota,
     load,
+    maximum,
     scatter,
     select,
     store,
+    transpose,
 )
 from minisplat_ref.jit.literals import HALF, ZERO
 from minisplat_ref.scalar.spherical_harmonics import (
@@ -79,7 +79,7 @@ def _direction(centre, means, rows):
     x, y, z = triple(means, rows)
     dx, dy, dz, inverse = direction(centre, x, y, z)
     zero = means.dtype.type(0)
-    return converted(dx, zero), converted(dy, zero), converted(dz, zero), converted(inverse, zero)
+    return cast(dx, zero), cast(dy, zero), cast(dz, zero), cast(inverse, zero)
 
 
 @scalar
@@ -95,7 +95,7 @@ def _turn(staged, column, buffer, k):
         load(staged, column + 6 * STAGE),
         load(staged, column + 7 * STAGE),
     )
-    store(buffer, k * WIDTH, columns_of(rows))
+    store(buffer, k * WIDTH, transpose(rows))
 
 
 @scalar
@@ -111,7 +111,7 @@ def _turn_back(buffer, k, staged, column):
         _at(buffer, k + 6),
         _at(buffer, k + 7),
     )
-    a, b, c, d, e, f, g, h = columns_of(columns)
+    a, b, c, d, e, f, g, h = transpose(columns)
     store(staged, column, a)
     store(staged, column + STAGE, b)
     store(staged, column + 2 * STAGE, c)
@@ -167,9 +167,9 @@ def _chunk_colors(first, end, shaded, harmonics, radii, colors):
             red = red + _at(y, k) * _at(rest, 3 * k)
             green = green + _at(y, k) * _at(rest, 3 * k + 1)
             blue = blue + _at(y, k) * _at(rest, 3 * k + 2)
-        scatter(colors, rows, 0, larger(red, ZERO))
-        scatter(colors, rows, 1, larger(green, ZERO))
-        scatter(colors, rows, 2, larger(blue, ZERO))
+        scatter(colors, rows, 0, maximum(red, ZERO))
+        scatter(colors, rows, 1, maximum(green, ZERO))
+        scatter(colors, rows, 2, maximum(blue, ZERO))
 
 
 @kernel()
@@ -288,10 +288,10 @@ def _chunk_vjp(first, end, shaded, harmonics, radii, v_colors, v, v_offset):
         scatter(v_means, rows, 0, v_x)
         scatter(v_means, rows, 1, v_y)
         scatter(v_means, rows, 2, v_z)
-        is_counted = counted(means.dtype.type(0)) < count - i
-        add(v_offset, 0, is_counted, converted(v_x, DOUBLE))
-        add(v_offset, 1, is_counted, converted(v_y, DOUBLE))
-        add(v_offset, 2, is_counted, converted(v_z, DOUBLE))
+        is_counted = iota(means.dtype.type(0)) < count - i
+        add(v_offset, 0, is_counted, cast(v_x, DOUBLE))
+        add(v_offset, 1, is_counted, cast(v_y, DOUBLE))
+        add(v_offset, 2, is_counted, cast(v_z, DOUBLE))
 
 
 @kernel()

@@ -17,12 +17,12 @@ import numpy as np
 WIDTH = 8
 
 
-def larger(a: Any, b: Any) -> Any:
+def maximum(a: Any, b: Any) -> Any:
     """Return the larger of two, lane by lane; ``a`` where one is NaN."""
     return np.where(b > a, b, a)[()]
 
 
-def smaller(a: Any, b: Any) -> Any:
+def minimum(a: Any, b: Any) -> Any:
     """Return the smaller of two, lane by lane; ``a`` where one is NaN."""
     return np.where(b < a, b, a)[()]
 
@@ -37,7 +37,7 @@ def ceil(a: Any) -> Any:
     return np.ceil(a)
 
 
-def nearest(a: Any) -> Any:
+def rint(a: Any) -> Any:
     """Return the nearest integer, as a float."""
     return np.rint(a)
 
@@ -57,7 +57,7 @@ def log_of(a: Any) -> Any:
     return np.log(a)
 
 
-def scaled_by_power(a: Any, n: Any) -> Any:
+def ldexp(a: Any, n: Any) -> Any:
     """Return ``a 2^n`` of float32 lanes, for integers n that keep it a normal number: n is added to the exponent."""
     return np.ldexp(a, np.asarray(n, np.int32))
 
@@ -67,12 +67,12 @@ def select(condition: Any, a: Any, b: Any) -> Any:
     return np.where(condition, a, b)[()]
 
 
-def filled(number: Any) -> Any:
+def broadcast(number: Any) -> Any:
     """Return lanes that all hold a number."""
     return np.full(WIDTH, number)
 
 
-def counted(zero: Any) -> Any:
+def iota(zero: Any) -> Any:
     """Return lanes 0, 1, ... 7 of the dtype of a number."""
     return np.arange(WIDTH).astype(zero.dtype)
 
@@ -108,36 +108,36 @@ def scatter(table: Any, rows: Any, column: Any, lanes: Any) -> None:
     table.reshape(len(table), -1)[np.ix_(rows, columns)] = np.reshape(lanes, (len(columns), WIDTH)).T
 
 
-def columns_of(rows: Any) -> Any:
+def transpose(rows: Any) -> Any:
     """Transpose a tuple of eight lanes: return the first number of each, then the second of each, and so on."""
     return tuple(np.array(rows).T)
 
 
-def converted(lanes: Any, zero: Any) -> Any:
+def cast(lanes: Any, zero: Any) -> Any:
     """Return lanes in the dtype of a number."""
     return lanes.astype(zero.dtype)
 
 
-def sum_of(lanes: Any) -> Any:
+def reduce_sum(lanes: Any) -> Any:
     """Return the sum of the lanes: of halves, then of quarters, then of the last two."""
     while len(lanes) > 1:
         lanes = lanes[: len(lanes) // 2] + lanes[len(lanes) // 2 :]
     return lanes[0]
 
 
-def sums_of(rows: Any) -> Any:
-    """Return the sums of a tuple of eight lanes as lanes: eight ``sum_of`` with half as many instructions."""
-    return np.array([sum_of(lanes) for lanes in rows])
+def reduce_sums(rows: Any) -> Any:
+    """Return the sums of a tuple of eight lanes as lanes: eight ``reduce_sum`` with half as many instructions."""
+    return np.array([reduce_sum(lanes) for lanes in rows])
 
 
-def largest_of(lanes: Any) -> Any:
+def reduce_max(lanes: Any) -> Any:
     """Return the largest lane."""
     while len(lanes) > 1:
-        lanes = larger(lanes[: len(lanes) // 2], lanes[len(lanes) // 2 :])
+        lanes = maximum(lanes[: len(lanes) // 2], lanes[len(lanes) // 2 :])
     return lanes[0]
 
 
-def any_of(condition: Any) -> bool:
+def reduce_any(condition: Any) -> bool:
     """Return whether a condition holds in any lane."""
     return bool(np.any(condition))
 

@@ -20,12 +20,12 @@ from minisplat_ref.jit.lanes import (
     ceil,
     exp_of,
     floor,
-    larger,
+    ldexp,
     log_of,
-    nearest,
-    scaled_by_power,
+    maximum,
+    minimum,
+    rint,
     select,
-    smaller,
     sqrt,
 )
 
@@ -151,27 +151,27 @@ for _sign, _operator in {">": operator.gt, ">=": operator.ge, "<": operator.lt, 
 # --- functions; for each, its version for single numbers first ---
 
 
-def larger_lanes(builder: Any, a: Any, b: Any) -> Any:
+def maximum_lanes(builder: Any, a: Any, b: Any) -> Any:
     """Emit the larger of two vectors lane by lane; ``a`` where one is NaN."""
     return builder.select(builder.fcmp_ordered(">", b, a), b, a)
 
 
-def _smaller(builder: Any, a: Any, b: Any) -> Any:
+def _minimum(builder: Any, a: Any, b: Any) -> Any:
     return builder.select(builder.fcmp_ordered("<", b, a), b, a)
 
 
-_register_binary(larger, larger_lanes, of_one=lambda a, b: b if b > a else a)
-_register_binary(smaller, _smaller, of_one=lambda a, b: b if b < a else a)
+_register_binary(maximum, maximum_lanes, of_one=lambda a, b: b if b > a else a)
+_register_binary(minimum, _minimum, of_one=lambda a, b: b if b < a else a)
 _register_unary(floor, lambda builder, a: _call(builder, "llvm.floor", a.type, [a]))
 _register_unary(ceil, lambda builder, a: _call(builder, "llvm.ceil", a.type, [a]))
-_register_unary(nearest, lambda builder, a: _call(builder, "llvm.rint", a.type, [a]))
+_register_unary(rint, lambda builder, a: _call(builder, "llvm.rint", a.type, [a]))
 _register_unary(sqrt, lambda builder, a: _call(builder, "llvm.sqrt", a.type, [a]), of_one=lambda a: math.sqrt(a))
 _register_unary(exp_of, lambda builder, a: _call(builder, "llvm.exp", a.type, [a]))
 _register_unary(log_of, lambda builder, a: _call(builder, "llvm.log", a.type, [a]), of_one=lambda a: math.log(a))
 
 
-@compiled(scaled_by_power)
-def _scaled_by_power(typing: Any, a: Any, n: Any) -> Any:
+@compiled(ldexp)
+def _ldexp(typing: Any, a: Any, n: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bits = ir.VectorType(I32, WIDTH)
         exponent = builder.shl(builder.fptosi(args[1], bits), ir.Constant(bits, [23] * WIDTH))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import larger, select, smaller
+from minisplat_ref.jit.lanes import maximum, minimum, select
 from minisplat_ref.jit.literals import HALF, ONE, TWO, ZERO
 
 PIVOT_MIN = np.float32(1e-14)  # smallest pivot of a conic relative to c: a little above float64's rounding
@@ -39,7 +39,7 @@ def factors(a, b, c):
     float64, and a lower bound keeps the pivot positive where they were rounded.
     """
     slope = b / a
-    return a, slope, larger(c - b * slope, PIVOT_MIN * c)
+    return a, slope, maximum(c - b * slope, PIVOT_MIN * c)
 
 
 @scalar
@@ -75,7 +75,7 @@ def blend(transmittance, unclamped, frame):
     weight : lanes
         alpha T of the hit, 0 where it is skipped.
     """
-    alpha = smaller(unclamped, frame.alpha_max)
+    alpha = minimum(unclamped, frame.alpha_max)
     after = transmittance * (ONE - alpha)
     is_hit = alpha >= frame.alpha_min
     is_blended = is_hit & (after >= frame.transmittance_min)
@@ -109,7 +109,7 @@ def blend_vjp(transmittance, weight, unclamped, behind, light, frame):
     lanes
         dL/dalpha, 0 where the hit was skipped.
     """
-    alpha = smaller(unclamped, frame.alpha_max)
+    alpha = minimum(unclamped, frame.alpha_max)
     return select(weight > ZERO, transmittance * light - behind / (ONE - alpha), ZERO)
 
 
@@ -139,5 +139,5 @@ def sigma_vjp(transmittance, weight, unclamped, behind, shade, frame):
     lanes
         dL/dsigma, 0 where the hit was skipped.
     """
-    alpha = smaller(unclamped, frame.alpha_max)
+    alpha = minimum(unclamped, frame.alpha_max)
     return select(weight > ZERO, unclamped * (behind / (ONE - alpha) - transmittance * shade), ZERO)

@@ -7,7 +7,7 @@ needle-shaped Gaussians.
 import numpy as np
 
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import larger, select, sqrt
+from minisplat_ref.jit.lanes import maximum, select, sqrt
 from minisplat_ref.jit.literals import ONE, TWO, ZERO
 
 TINY = np.finfo(np.float64).tiny  # the smallest number whose reciprocal is finite
@@ -19,8 +19,8 @@ def normalized(w, x, y, z):
 
     The quaternion is float64 and divided by its largest entry first, so that no square overflows or underflows.
     """
-    largest = larger(larger(abs(w), abs(x)), larger(abs(y), abs(z)))
-    unit = ONE / larger(largest, TINY)
+    largest = maximum(maximum(abs(w), abs(x)), maximum(abs(y), abs(z)))
+    unit = ONE / maximum(largest, TINY)
     w, x, y, z = w * unit, x * unit, y * unit, z * unit
     squared = w * w + x * x + y * y + z * z
     inverse = ONE / sqrt(select(largest > ZERO, squared, ONE))

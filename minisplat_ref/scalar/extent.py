@@ -11,7 +11,7 @@ import numpy as np
 from minisplat_ref import constants
 from minisplat_ref.constants import INRIA_ROOT_MIN, INRIA_TILE
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import ceil, floor, larger, log_of, smaller, sqrt
+from minisplat_ref.jit.lanes import ceil, floor, log_of, maximum, minimum, sqrt
 from minisplat_ref.jit.literals import HALF, ONE, THREE, TWO, ZERO
 
 RADIUS_MAX = np.float32(constants.RADIUS_MAX)  # exact in float32
@@ -32,23 +32,23 @@ class Extent(NamedTuple):
 @scalar
 def support_box(footprint, opacity, alpha_min, width, height):
     """Return the extent where alpha falls to alpha_min: sqrt(2 ln(opacity / alpha_min)) sigmas along x and y."""
-    squared = TWO * log_of(larger(opacity / alpha_min, ONE))
+    squared = TWO * log_of(maximum(opacity / alpha_min, ONE))
     rx = ceil(sqrt(squared * footprint.cov_xx))
     ry = ceil(sqrt(squared * footprint.cov_yy))
-    x0 = floor(smaller(larger(footprint.x - rx, ZERO), width))
-    y0 = floor(smaller(larger(footprint.y - ry, ZERO), height))
-    x1 = ceil(smaller(larger(footprint.x + rx, ZERO), width))
-    y1 = ceil(smaller(larger(footprint.y + ry, ZERO), height))
-    return smaller(rx, RADIUS_MAX), smaller(ry, RADIUS_MAX), x0, y0, x1, y1
+    x0 = floor(minimum(maximum(footprint.x - rx, ZERO), width))
+    y0 = floor(minimum(maximum(footprint.y - ry, ZERO), height))
+    x1 = ceil(minimum(maximum(footprint.x + rx, ZERO), width))
+    y1 = ceil(minimum(maximum(footprint.y + ry, ZERO), height))
+    return minimum(rx, RADIUS_MAX), minimum(ry, RADIUS_MAX), x0, y0, x1, y1
 
 
 @scalar
 def inria_tiles(x, r, size):
     """Return the pixels of the tiles that INRIA counts under [x - r, x + r], with pixel centres at integer x."""
     beyond = size + INRIA_TILE - 1
-    first = floor(smaller(larger(x - r, ZERO), beyond) / INRIA_TILE)
-    end = floor(smaller(larger(x + r + (INRIA_TILE - 1), ZERO), beyond) / INRIA_TILE)
-    return first * INRIA_TILE, smaller(end * INRIA_TILE, size)
+    first = floor(minimum(maximum(x - r, ZERO), beyond) / INRIA_TILE)
+    end = floor(minimum(maximum(x + r + (INRIA_TILE - 1), ZERO), beyond) / INRIA_TILE)
+    return first * INRIA_TILE, minimum(end * INRIA_TILE, size)
 
 
 @scalar
@@ -57,9 +57,9 @@ def inria_box(footprint, width, height):
     middle = HALF * (footprint.cov_xx + footprint.cov_yy)
     half_difference = HALF * (footprint.cov_xx - footprint.cov_yy)  # middle^2 - det, without its cancellation
     root = half_difference * half_difference + footprint.cov_xy * footprint.cov_xy
-    largest = middle + sqrt(larger(root, INRIA_ROOT_MIN))
+    largest = middle + sqrt(maximum(root, INRIA_ROOT_MIN))
     r = ceil(THREE * sqrt(largest))
     x0, x1 = inria_tiles(footprint.x - HALF, r, width)
     y0, y1 = inria_tiles(footprint.y - HALF, r, height)
-    r = smaller(r, RADIUS_MAX)
+    r = minimum(r, RADIUS_MAX)
     return r, r, x0, y0, x1, y1

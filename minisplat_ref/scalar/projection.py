@@ -14,7 +14,7 @@ for needles where u.u * w.w - (u.w)^2 would cancel. For the same reason the coni
 from typing import NamedTuple
 
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import larger, select, smaller, sqrt
+from minisplat_ref.jit.lanes import maximum, minimum, select, sqrt
 from minisplat_ref.jit.literals import HALF, ONE, TWO, ZERO
 from minisplat_ref.scalar.covariance import normalized, normalized_vjp, rotation, rotation_vjp
 from minisplat_ref.types import Floats
@@ -137,8 +137,8 @@ def project_gaussian(p, V, lens):
     inverse_z = ONE / p[2]
     x = p[0] * inverse_z
     y = p[1] * inverse_z
-    u = image_row(lens.fx * inverse_z, smaller(larger(x, lens.x_min), lens.x_max), V[0], V[2])
-    w = image_row(lens.fy * inverse_z, smaller(larger(y, lens.y_min), lens.y_max), V[1], V[2])
+    u = image_row(lens.fx * inverse_z, minimum(maximum(x, lens.x_min), lens.x_max), V[0], V[2])
+    w = image_row(lens.fy * inverse_z, minimum(maximum(y, lens.y_min), lens.y_max), V[1], V[2])
     cov_xx = dot(u, u)
     cov_xy = dot(u, w)
     cov_yy = dot(w, w)
@@ -147,7 +147,7 @@ def project_gaussian(p, V, lens):
     det = det_sharp + lens.eps2d * (cov_xx + cov_yy) + lens.eps2d * lens.eps2d
     compensation = ZERO * det + ONE  # NaN where det is not finite
     if lens.is_antialiased:
-        compensation = sqrt(larger(det_sharp / det, lens.compensation_floor * lens.compensation_floor))
+        compensation = sqrt(maximum(det_sharp / det, lens.compensation_floor * lens.compensation_floor))
     return Footprint(
         lens.fx * x + lens.cx,
         lens.fy * y + lens.cy,
@@ -237,8 +237,8 @@ def project_gaussian_vjp(p, V, lens, footprint, v_x, v_y, v_depth, v_cov):
         TWO * v_cov[2] * w[1] + v_cov[1] * u[1],
         TWO * v_cov[2] * w[2] + v_cov[1] * u[2],
     )
-    v_V0, v_V2x, v_dir_x = image_row_vjp(lens.fx * inverse_z, smaller(larger(x, lens.x_min), lens.x_max), V[2], v_u)
-    v_V1, v_V2y, v_dir_y = image_row_vjp(lens.fy * inverse_z, smaller(larger(y, lens.y_min), lens.y_max), V[2], v_w)
+    v_V0, v_V2x, v_dir_x = image_row_vjp(lens.fx * inverse_z, minimum(maximum(x, lens.x_min), lens.x_max), V[2], v_u)
+    v_V1, v_V2y, v_dir_y = image_row_vjp(lens.fy * inverse_z, minimum(maximum(y, lens.y_min), lens.y_max), V[2], v_w)
     v_V2 = (v_V2x[0] + v_V2y[0], v_V2x[1] + v_V2y[1], v_V2x[2] + v_V2y[2])
 
     v_ratio_x = lens.fx * v_x + select((x > lens.x_min) & (x < lens.x_max), v_dir_x, ZERO)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import larger, log_of, select, smaller, sqrt
+from minisplat_ref.jit.lanes import log_of, maximum, minimum, select, sqrt
 from minisplat_ref.jit.literals import ONE, TWO, ZERO
 
 FAR = np.float32(1e9)  # px
@@ -36,7 +36,7 @@ def visible_outline(a, slope, pivot, opacity, alpha_min, margin):
     """
     q = TWO * log_of(opacity / alpha_min)
     q = q + margin * (q + margin)
-    inverse_a, pivot = ONE / larger(a, FLAT), larger(pivot, FLAT)
+    inverse_a, pivot = ONE / maximum(a, FLAT), maximum(pivot, FLAT)
     # The inverse of the conic has 1 / a + slope^2 / pivot as its first entry, and -slope / pivot beside the diagonal.
     lean = slope / pivot
     tilt = -lean * sqrt(q / (inverse_a + slope * lean))
@@ -50,6 +50,6 @@ def rightmost_offset(outline, low, high, side):
     Takes numbers or lanes; -FAR where the band does not meet the ellipse. The left side is the right side of the
     ellipse rotated by 180 degrees.
     """
-    dy = smaller(larger(side * outline.tilt, low), high)
+    dy = minimum(maximum(side * outline.tilt, low), high)
     room = outline.q - outline.pivot * dy * dy  # negative only where the band misses the ellipse
-    return select(room < ZERO, -FAR, sqrt(larger(room, ZERO) * outline.inverse_a) - side * outline.slope * dy)
+    return select(room < ZERO, -FAR, sqrt(maximum(room, ZERO) * outline.inverse_a) - side * outline.slope * dy)

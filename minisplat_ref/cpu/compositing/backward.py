@@ -47,7 +47,7 @@ from minisplat_ref.cpu.compositing.tile_state import (
 )
 from minisplat_ref.cpu.gaussian_rows import rows_from
 from minisplat_ref.jit.compile import kernel, prange, scalar
-from minisplat_ref.jit.lanes import WIDTH, counted, filled, gather, load, select, store, sum_of, sums_of
+from minisplat_ref.jit.lanes import WIDTH, broadcast, gather, iota, load, reduce_sum, reduce_sums, select, store
 from minisplat_ref.jit.literals import ONE, ZERO
 from minisplat_ref.jit.scheduling import shared_counter
 from minisplat_ref.scalar.compositing import blend, sigma_vjp
@@ -71,7 +71,7 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
             if n_pixels == 0:
                 continue  # as start_tile left it
             first = y * frame.width + x
-            rows, is_inside = rows_from(first, first + n_pixels), counted(as_data(0)) < as_data(n_pixels)
+            rows, is_inside = rows_from(first, first + n_pixels), iota(as_data(0)) < as_data(n_pixels)
             behind = gather(v_alpha, rows, 0) * (gather(alpha, rows, 0) - ONE)  # alpha = 1 - T_final
             place = row * row_size
             for k in range(n_channels):
@@ -84,20 +84,20 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
     def background_vjp(state, sums):
         """Compute one tile's share of the background's gradient: its pixels' transmittances times v."""
         for k in range(n_channels):
-            total = filled(state.dtype.type(0))
+            total = broadcast(state.dtype.type(0))
             for i in range(0, N_ROWS * row_size, row_size):
                 total = total + abs(load(state, i)) * load(state, i + channels + k * WIDTH)
-            sums[k] = sum_of(total)
+            sums[k] = reduce_sum(total)
 
     @scalar
     def v_channel(s, k, i):
-        return load(s, i + channels + k * WIDTH) if k < n_channels else filled(s.dtype.type(0))
+        return load(s, i + channels + k * WIDTH) if k < n_channels else broadcast(s.dtype.type(0))
 
     @scalar
     def tile_vjp(s, scratch, further, records, tile, frame, slots):
         x0, y0, ids, slots_of = tile
         as_data = s.dtype.type
-        zero = filled(as_data(0))
+        zero = broadcast(as_data(0))
         is_open = open_rows(s, n_fields)
         next_rows = reached_rows(records, ids, 0, x0, y0)
         for m in range(ids.size):
@@ -142,10 +142,10 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
                 qee = qee + shape_e * e
                 qey = qey + shape_e * dy
                 qyy = qyy + shape_y * dy
-            store(slots, place, sums_of((q_sum, qe, qy, qee, qey, qyy, v_red, v_green)))
-            slots[place + N_MOMENTS + 2] = sum_of(v_blue)
+            store(slots, place, reduce_sums((q_sum, qe, qy, qee, qey, qyy, v_red, v_green)))
+            slots[place + N_MOMENTS + 2] = reduce_sum(v_blue)
             for k in range(N_FUSED, n_channels):
-                slots[place + N_MOMENTS + k] = sum_of(load(further, (k - N_FUSED) * WIDTH))
+                slots[place + N_MOMENTS + k] = reduce_sum(load(further, (k - N_FUSED) * WIDTH))
 
     @kernel()
     def composite_tiles_vjp(

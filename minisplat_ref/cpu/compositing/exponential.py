@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import exp_of, larger, nearest, scaled_by_power
+from minisplat_ref.jit.lanes import exp_of, ldexp, maximum, rint
 
 _LOG2_E = np.float32(math.log2(math.e))
 _SMALLEST = np.float32(-60.0)  # far below any visible alpha, far above denormals, which cost tens of cycles
@@ -33,8 +33,8 @@ def exp_exact(x):
 @scalar
 def powers_of_two(x):
     """Return the integer n >= -60 and f in [-1/2, 1/2] with exp(x) = 2^n 2^f, for float32 lanes."""
-    t = larger(x * _LOG2_E, _SMALLEST)
-    n = nearest(t)
+    t = maximum(x * _LOG2_E, _SMALLEST)
+    n = rint(t)
     return n, t - n
 
 
@@ -44,4 +44,4 @@ def exp_fast(x):
     n, f = powers_of_two(x)
     square = f * f
     low, middle, high = _C0 + _C1 * f, _C2 + _C3 * f, _C4 + _C5 * f  # independent, as in Estrin's scheme
-    return scaled_by_power(low + (middle + high * square) * square, n)
+    return ldexp(low + (middle + high * square) * square, n)

@@ -29,7 +29,18 @@ from minisplat_ref.cpu.compositing.tile_state import (
 )
 from minisplat_ref.cpu.gaussian_rows import rows_from
 from minisplat_ref.jit.compile import kernel, prange, scalar
-from minisplat_ref.jit.lanes import WIDTH, filled, gather, larger, largest_of, load, scatter, select, store, sum_of
+from minisplat_ref.jit.lanes import (
+    WIDTH,
+    broadcast,
+    gather,
+    load,
+    maximum,
+    reduce_max,
+    reduce_sum,
+    scatter,
+    select,
+    store,
+)
 from minisplat_ref.jit.literals import ONE, ZERO
 from minisplat_ref.jit.scheduling import shared_counter
 from minisplat_ref.scalar.compositing import blend
@@ -102,7 +113,7 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
     def blend_tile(s, scratch, records, depths, tile, frame, slots):
         x0, y0, ids, slots_of = tile
         as_data = s.dtype.type
-        zero = filled(as_data(0))
+        zero = broadcast(as_data(0))
         is_open = open_rows(s, n_fields)
         next_rows = reached_rows(records, ids, 0, x0, y0)
         for m in range(ids.size):
@@ -126,11 +137,15 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
                 if has_stats:
                     record_hit(s, i, weight, as_data(m + 1), depths[n])  # exact in float32 up to 16 million
                     total = total + weight
-                    largest = larger(largest, weight)
-                    hits = hits + select(weight > ZERO, filled(as_data(1)), ZERO)
+                    largest = maximum(largest, weight)
+                    hits = hits + select(weight > ZERO, broadcast(as_data(1)), ZERO)
             if has_stats:
                 slot = slots_of[m]
-                slots[slot, 0], slots[slot, 1], slots[slot, 2] = sum_of(total), largest_of(largest), sum_of(hits)
+                slots[slot, 0], slots[slot, 1], slots[slot, 2] = (
+                    reduce_sum(total),
+                    reduce_max(largest),
+                    reduce_sum(hits),
+                )
 
     @kernel()
     def composite_tiles(

@@ -19,7 +19,7 @@ import numpy as np
 from minisplat_ref.cpu.compositing.pixel_rows import hit_row
 from minisplat_ref.cpu.gaussian_rows import rows_from
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import WIDTH, any_of, counted, filled, load, scatter, select, store
+from minisplat_ref.jit.lanes import WIDTH, broadcast, iota, load, reduce_any, scatter, select, store
 from minisplat_ref.jit.literals import ZERO
 from minisplat_ref.types import Floats, Ints
 
@@ -55,7 +55,7 @@ def enqueue(queue, first, end, depth, row):
     while at > first:
         other = load(queue, (at - 1) * 2 * WIDTH)
         is_deeper = other > depth  # of equals, the first in the list stays the first
-        if not any_of(is_deeper):
+        if not reduce_any(is_deeper):
             break
         other_row = load(queue, (at - 1) * 2 * WIDTH + WIDTH)
         store(queue, at * 2 * WIDTH, (select(is_deeper, other, depth), select(is_deeper, other_row, row)))
@@ -82,13 +82,13 @@ def walk_sorted(hit: Callable, shade: Callable, n_channels: int, take: Callable)
     @scalar
     def walk(state, buffer, scene, row, buffer_size, frame):
         as_data = state.dtype.type
-        zero, hits, queue = filled(as_data(0)), buffer.hits, buffer.queue
+        zero, hits, queue = broadcast(as_data(0)), buffer.hits, buffer.queue
         first = end = 0
         for m in row.members:
             n = row.ids[m]
             unclamped, depth, place = hit_row(hit, scene, n, row)
             is_hit = unclamped >= frame.alpha_min
-            if not any_of(is_hit):
+            if not reduce_any(is_hit):
                 continue
             rows = hit_rows(end)
             scatter(hits, rows, ALPHA, unclamped)
@@ -97,14 +97,14 @@ def walk_sorted(hit: Callable, shade: Callable, n_channels: int, take: Callable)
             for k in range(n_channels):
                 scatter(hits, rows, CHANNELS + k, zero + shade(scene.colors, n, k, place))
             buffer.members[end] = m
-            enqueue(queue, first, end, select(is_hit, zero + depth, MISSED), counted(as_data(0)) + as_data(end * WIDTH))
+            enqueue(queue, first, end, select(is_hit, zero + depth, MISSED), iota(as_data(0)) + as_data(end * WIDTH))
             end += 1
             if end - first == buffer_size:
                 take(state, hits, queued_rows(queue, first), frame)
                 first += 1
-            if not any_of(load(state, 0) > ZERO):
+            if not reduce_any(load(state, 0) > ZERO):
                 break
-        while first < end and any_of(load(state, 0) > ZERO):
+        while first < end and reduce_any(load(state, 0) > ZERO):
             take(state, hits, queued_rows(queue, first), frame)
             first += 1
         return end

@@ -11,7 +11,7 @@ from minisplat_ref.cpu.compositing.records import N_FUSED
 from minisplat_ref.cpu.gaussian_rows import DOUBLE
 from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.jit.compile import kernel, prange, scalar
-from minisplat_ref.jit.lanes import WIDTH, converted, filled, load, store
+from minisplat_ref.jit.lanes import WIDTH, broadcast, cast, load, store
 from minisplat_ref.jit.literals import ZERO
 from minisplat_ref.scalar.compositing import conic_vjp_of_moments, factors
 
@@ -27,9 +27,9 @@ def slot_size(n_channels: int) -> int:
 @scalar
 def _sum_slots(n, slots, width, first, end, sums, projection, out):
     """Write the gradient of one Gaussian from the moments in its slots, summing the first eight numbers together."""
-    total, blue = filled(DOUBLE), DOUBLE
+    total, blue = broadcast(DOUBLE), DOUBLE
     for slot in range(first, end):
-        total = total + converted(load(slots, slot * width), DOUBLE)
+        total = total + cast(load(slots, slot * width), DOUBLE)
         blue += slots[slot * width + WIDTH]
     store(sums, 0, total)
     sums[WIDTH] = blue

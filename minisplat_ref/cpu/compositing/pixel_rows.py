@@ -6,7 +6,7 @@ import numpy as np
 
 from minisplat_ref.cpu.gaussian_rows import rows_from
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import WIDTH, counted, filled, gather, select
+from minisplat_ref.jit.lanes import WIDTH, broadcast, gather, iota, select
 from minisplat_ref.jit.literals import HALF, ONE, ZERO
 from minisplat_ref.types import Floats, Ints
 
@@ -107,14 +107,14 @@ def field_of(state, k, row, frame):
 @scalar
 def full_transmittance(row, frame, as_data):
     """Return one, and minus one for pixels beyond the image's edge, which marks them finished."""
-    return select(counted(as_data(0)) < as_data(frame.width - row.x), filled(as_data(1)), -ONE)
+    return select(iota(as_data(0)) < as_data(frame.width - row.x), broadcast(as_data(1)), -ONE)
 
 
 @scalar
 def hit_row(hit, scene, n, row):
     """Return the response's ``hit``, with alpha 0 in pixels outside the box."""
     as_data = scene.records.dtype.type
-    xs = counted(as_data(0)) + (as_data(row.x) + HALF)  # pixel centres
+    xs = iota(as_data(0)) + (as_data(row.x) + HALF)  # pixel centres
     unclamped, depth, place = hit(scene.records, n, xs, as_data(row.y) + HALF)
     is_in_box = (xs > scene.boxes[n, 0]) & (xs < scene.boxes[n, 2])
     return select(is_in_box, unclamped, ZERO), depth, place

@@ -46,14 +46,14 @@ from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.jit.lanes import (
     WIDTH,
     accumulate,
-    any_of,
-    filled,
+    broadcast,
     gather,
     load,
+    reduce_any,
+    reduce_sum,
     scatter,
     select,
     store,
-    sum_of,
 )
 from minisplat_ref.jit.literals import ONE, ZERO
 from minisplat_ref.jit.scheduling import dynamic_range, shared_counter
@@ -75,7 +75,7 @@ def forward_kernel(response: KernelResponse, n_channels: int) -> Callable:
             T, weight = blend(T, unclamped, frame)
             for k in range(n_channels):
                 accumulate(state, (1 + k) * WIDTH, weight * shade(scene.colors, n, k, place))
-            if not any_of(T > ZERO):
+            if not reduce_any(T > ZERO):
                 break
         store(state, 0, T)
 
@@ -162,19 +162,19 @@ def backward_kernel(response: KernelResponse, n_channels: int) -> Callable:
         for m in row.members:
             n = row.ids[m]
             unclamped, _, place = hit_row(hit, scene, n, row)
-            light = filled(state.dtype.type(0))
+            light = broadcast(state.dtype.type(0))
             for k in range(n_channels):
                 light = light + load(state, v_first + k * WIDTH) * shade(scene.colors, n, k, place)
             v_alpha, weight = blend_again(state, unclamped, light, frame)
             gradient = unclamped, v_alpha, weight
             chain(sums[m * n_sums * WIDTH :], v_place, state, scene, n, place, gradient, frame)
-            if not any_of(load(state, 0) > ZERO):
+            if not reduce_any(load(state, 0) > ZERO):
                 break
 
     @scalar
     def take(state, hits, rows, frame):
         """Repeat the blending of one hit of a buffer in each pixel, and store its gradient."""
-        light = filled(state.dtype.type(0))
+        light = broadcast(state.dtype.type(0))
         for k in range(n_channels):
             light = light + load(state, v_first + k * WIDTH) * gather(hits, rows, CHANNELS + k)
         v_alpha, weight = blend_again(state, gather(hits, rows, ALPHA), light, frame)
@@ -209,9 +209,9 @@ def backward_kernel(response: KernelResponse, n_channels: int) -> Callable:
                     else:
                         chain_row(sums, v_place, state, scene, row, frame)
                     for k in range(n_channels):
-                        v_backgrounds[tile, k] += sum_of(abs(load(state, 0)) * load(state, v_first + k * WIDTH))
+                        v_backgrounds[tile, k] += reduce_sum(abs(load(state, 0)) * load(state, v_first + k * WIDTH))
                 for m in range(n_listed):
                     for j in range(n_sums):
-                        slots[lists.slots[first + m], j] = sum_of(load(sums, (m * n_sums + j) * WIDTH))
+                        slots[lists.slots[first + m], j] = reduce_sum(load(sums, (m * n_sums + j) * WIDTH))
 
     return composite_tiles_vjp

@@ -12,7 +12,7 @@ from minisplat_ref.cpu.gaussian_rows import list_visible, listed_rows, rounded, 
 from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.cpu.tiling import ELLIPSE_MARGIN
 from minisplat_ref.jit.compile import kernel, prange, scalar
-from minisplat_ref.jit.lanes import WIDTH, converted, gather, scatter, select, smaller
+from minisplat_ref.jit.lanes import WIDTH, cast, gather, minimum, scatter, select
 from minisplat_ref.jit.literals import HALF, ZERO
 from minisplat_ref.scalar.compositing import factors
 from minisplat_ref.scalar.tiling import Outline, visible_outline
@@ -33,7 +33,7 @@ def record_size(n_channels: int) -> int:
 @scalar
 def _half(factor):
     """Return half of a factor of a conic; a negative one becomes so large that it leaves no hits."""
-    return select(factor >= ZERO, smaller(HALF * factor, HALF_A_MAX), HALF_A_MAX)
+    return select(factor >= ZERO, minimum(HALF * factor, HALF_A_MAX), HALF_A_MAX)
 
 
 @scalar
@@ -51,8 +51,8 @@ def _write_eight(rows, projection, colors, alpha_min, records):
         *(opacity, outline.slope, outline.inverse_a),
     )
     second_half = (
-        *(smaller(outline.pivot, HALF_A_MAX), outline.q, outline.tilt),
-        *(converted(gather(boxes, rows, 0), zero), converted(gather(boxes, rows, 2), zero)),
+        *(minimum(outline.pivot, HALF_A_MAX), outline.q, outline.tilt),
+        *(cast(gather(boxes, rows, 0), zero), cast(gather(boxes, rows, 2), zero)),
         *(gather(colors, rows, 0), gather(colors, rows, 1), gather(colors, rows, 2)),
     )
     scatter(records, rows, MEAN_X, first_half)

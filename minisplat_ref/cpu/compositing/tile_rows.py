@@ -29,14 +29,14 @@ from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import (
     WIDTH,
     bits_between,
-    counted,
-    filled,
+    broadcast,
     floor,
-    larger,
+    iota,
     load,
+    maximum,
+    minimum,
     prefetch,
     select,
-    smaller,
     store,
 )
 from minisplat_ref.jit.literals import FOUR, HALF, ONE
@@ -61,7 +61,7 @@ def start_scratch(scratch):
     """Write the pixel centres of a tile."""
     as_data = scratch.dtype.type
     for strip in range(N_STRIPS):
-        store(scratch, CENTRES_X + strip * WIDTH, counted(as_data(0)) + (HALF + as_data(strip * WIDTH)))
+        store(scratch, CENTRES_X + strip * WIDTH, iota(as_data(0)) + (HALF + as_data(strip * WIDTH)))
     for line in range(TILE_HEIGHT):
         scratch[CENTRES_Y + line] = HALF + as_data(line)
 
@@ -110,14 +110,14 @@ def reached_rows(records, ids, m, x0, y0):
     as_data = records.dtype.type
     n = ids[m]
     mx, my = records[n, MEAN_X] - as_data(x0), records[n, MEAN_Y] - as_data(y0)
-    k, zero = counted(mx), filled(as_data(0))
+    k, zero = iota(mx), broadcast(as_data(0))
     is_up = k < FOUR
     left = (k - select(is_up, zero, FOUR)) * as_data(WIDTH)  # edges of the strips
-    side = select(is_up, filled(as_data(-1)), ONE)
+    side = select(is_up, broadcast(as_data(-1)), ONE)
     low = left + (HALF - mx)
     offset = rightmost_offset(turned_outline(records, n), low, low + as_data(WIDTH - 1), side)
     bound = floor(side * my + offset + (HALF + ELLIPSE_MARGIN))  # minus the first row, or the one after the last
-    bound = side * larger(as_data(-TILE_HEIGHT), smaller(select(is_up, zero, as_data(TILE_HEIGHT)), bound))
+    bound = side * maximum(as_data(-TILE_HEIGHT), minimum(select(is_up, zero, as_data(TILE_HEIGHT)), bound))
     is_in_box = (left < records[n, COLUMN_END] - as_data(x0)) & (left > records[n, COLUMN_FIRST] - as_data(x0 + WIDTH))
     return bits_between(select(is_in_box, bound, zero))  # no branches, which would be unpredictable
 

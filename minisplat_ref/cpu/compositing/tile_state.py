@@ -13,7 +13,7 @@ import numpy as np
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import WIDTH, any_of, counted, filled, load, lowest_bit, select, store
+from minisplat_ref.jit.lanes import WIDTH, broadcast, iota, load, lowest_bit, reduce_any, select, store
 from minisplat_ref.jit.literals import ONE, ZERO
 from minisplat_ref.jit.scheduling import dynamic_range
 from minisplat_ref.scalar.compositing import Frame
@@ -127,8 +127,8 @@ def start_tile(state, x0, y0, frame, n_fields):
     state[:] = ZERO
     for row in range(N_ROWS):
         _, _, n_pixels = row_in_image(row, x0, y0, frame)
-        is_inside = counted(as_data(0)) < as_data(n_pixels)
-        store(state, row * n_fields * WIDTH, select(is_inside, filled(as_data(1)), -ONE))
+        is_inside = iota(as_data(0)) < as_data(n_pixels)
+        store(state, row * n_fields * WIDTH, select(is_inside, broadcast(as_data(1)), -ONE))
 
 
 @scalar
@@ -136,7 +136,7 @@ def open_rows(state, n_fields):
     """Return as bits the rows with a pixel that still accepts hits."""
     rows = np.uint64(0)
     for row in range(N_ROWS):
-        is_open = any_of(load(state, row * n_fields * WIDTH) > ZERO)
+        is_open = reduce_any(load(state, row * n_fields * WIDTH) > ZERO)
         rows |= np.uint64(is_open) << np.uint64(row)
     return rows
 

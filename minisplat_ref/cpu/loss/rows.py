@@ -25,7 +25,7 @@ import numpy as np
 
 from minisplat_ref.constants import SSIM_C1, SSIM_C2, SSIM_SIGMA, SSIM_WINDOW
 from minisplat_ref.jit.compile import kernel, prange, scalar
-from minisplat_ref.jit.lanes import WIDTH, filled, load, select, store, sum_of
+from minisplat_ref.jit.lanes import WIDTH, broadcast, load, reduce_sum, select, store
 from minisplat_ref.jit.literals import HALF, TWO, ZERO
 from minisplat_ref.scalar.loss import ssim_and_derivatives
 from minisplat_ref.types import Floats, Ints
@@ -132,7 +132,7 @@ def loss_kernel(dtype: np.dtype) -> Callable:
     @scalar
     def similarity_row(image, target, first, counts, n_values, length, s, derivatives):
         """Sum over a row that starts at ``first``; write the derivatives of SSIM with respect to the image's means."""
-        l1 = ssim = ZERO * filled(c1)
+        l1 = ssim = ZERO * broadcast(c1)
         for i in range(0, n_values, WIDTH):
             means = across(s, i), across(s, length + i), across(s, 2 * length + i), across(s, 3 * length + i)
             value, by_i, by_ii, by_it = ssim_and_derivatives(*means, c1, c2)
@@ -142,7 +142,7 @@ def loss_kernel(dtype: np.dtype) -> Callable:
             store(derivatives, PAD + i, count * by_i)
             store(derivatives, length + PAD + i, count * by_ii)
             store(derivatives, 2 * length + PAD + i, count * by_it)
-        return sum_of(l1), sum_of(ssim)
+        return reduce_sum(l1), reduce_sum(ssim)
 
     @scalar
     def filter_derivatives(ring, places, length, s):
@@ -156,7 +156,7 @@ def loss_kernel(dtype: np.dtype) -> Callable:
     def vjp_row(image, target, first, v_l1, v_ssim, length, s, v_row):
         """Write the gradient with respect to a row that starts at ``first``."""
         n_values = v_row.size
-        up = filled(v_l1)
+        up = broadcast(v_l1)
         for i in range(0, n_values, WIDTH):
             a, b = load(image, first + i), load(target, first + i)
             by_squares = TWO * a * across(s, length + i) + b * across(s, 2 * length + i)

@@ -14,7 +14,7 @@ import numpy as np
 
 from minisplat_ref.cpu.gaussian_rows import rounded, triple
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import WIDTH, ceil, converted, floor, gather, larger, largest_of, smaller, store
+from minisplat_ref.jit.lanes import WIDTH, cast, ceil, floor, gather, maximum, minimum, reduce_max, store
 from minisplat_ref.jit.literals import HALF, ONE
 from minisplat_ref.scalar.compositing import factors
 from minisplat_ref.scalar.tiling import rightmost_offset, visible_outline
@@ -92,7 +92,7 @@ def outlines(rows, projection, alpha_min):
     zero = projection.opacities.dtype.type(0)
     ellipse = rounded(factors(*triple(projection.conics, rows)), zero)
     _, y0, _, y1 = _boxes(projection.boxes, rows, zero)
-    n_rows = largest_of(floor((y1 - ONE) * ROWS_PER_PIXEL) - floor(y0 * ROWS_PER_PIXEL)) + ONE
+    n_rows = reduce_max(floor((y1 - ONE) * ROWS_PER_PIXEL) - floor(y0 * ROWS_PER_PIXEL)) + ONE
     opacity = gather(projection.opacities, rows, 0)
     return visible_outline(*ellipse, opacity, alpha_min, ELLIPSE_MARGIN), np.int64(n_rows)
 
@@ -100,8 +100,8 @@ def outlines(rows, projection, alpha_min):
 @scalar
 def _boxes(boxes, rows, zero):
     """Return the edges of eight boxes in the dtype of a number."""
-    x0, y0 = converted(gather(boxes, rows, 0), zero), converted(gather(boxes, rows, 1), zero)
-    x1, y1 = converted(gather(boxes, rows, 2), zero), converted(gather(boxes, rows, 3), zero)
+    x0, y0 = cast(gather(boxes, rows, 0), zero), cast(gather(boxes, rows, 1), zero)
+    x1, y1 = cast(gather(boxes, rows, 2), zero), cast(gather(boxes, rows, 3), zero)
     return x0, y0, x1, y1
 
 
@@ -111,8 +111,8 @@ def write_spans(rows, row, outline, projection, spans):
     x0, y0, x1, y1 = _boxes(projection.boxes, rows, projection.opacities.dtype.type(0))
     mx, my = gather(projection.means2d, rows, 0), gather(projection.means2d, rows, 1)
     top = (floor(y0 * ROWS_PER_PIXEL) + row) * TILE_HEIGHT
-    low, high = larger(top, y0) + (HALF - my), smaller(top + TILE_HEIGHT, y1) - (HALF + my)
+    low, high = maximum(top, y0) + (HALF - my), minimum(top + TILE_HEIGHT, y1) - (HALF + my)
     left = mx - rightmost_offset(outline, low, high, -ONE) - (HALF + ELLIPSE_MARGIN)
     right = mx + rightmost_offset(outline, low, high, ONE) + (HALF + ELLIPSE_MARGIN)
-    store(spans, 2 * row * WIDTH, floor(larger(ceil(left), x0) * COLUMNS_PER_PIXEL))
-    store(spans, (2 * row + 1) * WIDTH, ceil(smaller(floor(right), x1) * COLUMNS_PER_PIXEL))  # behind the last
+    store(spans, 2 * row * WIDTH, floor(maximum(ceil(left), x0) * COLUMNS_PER_PIXEL))
+    store(spans, (2 * row + 1) * WIDTH, ceil(minimum(floor(right), x1) * COLUMNS_PER_PIXEL))  # behind the last
