@@ -57,7 +57,7 @@ def switch_exposure_on(state: TrainState, iteration: Iteration, *, least_exposur
     state, iteration
         As for every action.
     least_exposure_gain : float
-        dB of the squared error that the photographs must gain on average; the gain must also exceed two standard errors.
+        dB of the squared error that the photographs must gain on average, and more than two standard errors.
     """
     if EXPOSURE.name in state.pace.switched_on or EXPOSURES in state.shared:
         return "nothing done: exposures are on"

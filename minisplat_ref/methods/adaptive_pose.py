@@ -36,7 +36,7 @@ def switch_pose_on(state: TrainState, iteration: Iteration, *, least_pose_gain: 
     state, iteration
         As for every action.
     least_pose_gain : float
-        dB of the squared error that the photographs must gain on average; the gain must also exceed two standard errors.
+        dB of the squared error that the photographs must gain on average, and more than two standard errors.
     """
     if POSE.name in state.pace.switched_on or ROTATIONS in state.shared:
         return "nothing done: poses are refined"
