@@ -51,8 +51,9 @@ AFRESH = ("iterations", "lpips_weights", "drop_bad_steps")  # what may be new wh
 
 DESCRIPTION = """\
 Train Gaussians on SCENE, the folder of a COLMAP scene or of a transforms.json.
-DIR will hold point_cloud.ply, metrics.json, renders/ (truth | render | error of
-each test view) and checkpoints. Ctrl-C saves what there is; --resume goes on.
+DIR will hold report.html, point_cloud.ply, metrics.json, renders/ (truth |
+render | error of each test view) and checkpoints. Ctrl-C saves what there is;
+--resume goes on.
 """
 
 
@@ -295,6 +296,7 @@ def _train(
 ) -> int:
     from minisplat_ref.experiments import checkpoints
     from minisplat_ref.experiments.run import run_training
+    from minisplat_ref.experiments.run_report import write_report
     from minisplat_ref.experiments.scoring import summary
     from minisplat_ref.training.guard import Guard
 
@@ -307,7 +309,8 @@ def _train(
         print(room)
     check_every = given.get("check_every", Guard().every)
     outcome = run_training(folder, scene, settings, recipe, state, network, check_every)
-    if outcome.evaluation is None or not outcome.is_complete:
+    report = None if outcome.evaluation is None else write_report(folder, scene)
+    if outcome.evaluation is None or report is None or not outcome.is_complete:
         if state.is_whole:
             measured = "" if outcome.evaluation else " but not measured"
             how = f"stopped after {state.step} of {settings.iterations} iterations, all saved{measured}"
@@ -319,6 +322,7 @@ def _train(
         f"{summary(outcome.evaluation)}, {len(state.gaussians.means):,} Gaussians, {outcome.seconds:.0f} s of training"
     )
     print(f"results in {folder}: point_cloud.ply, metrics.json, renders/")
+    print(f"open {report.resolve()}")
     return 0
 
 

@@ -2,7 +2,7 @@
 
 import argparse
 
-from minisplat_ref.cli.oracle import add_json_argument, publish
+from minisplat_ref.cli.oracle import add_output_arguments, publish
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.experiments.arguments import Commands, HelpFormatter
 
@@ -91,7 +91,7 @@ def add_parser(checks: Commands) -> None:
         help="float32 or float64: what is computed in, and so the tolerances (default: float64 for ours and"
         " gsplat-torch, that of each array for a folder)",
     )
-    add_json_argument(parser)
+    add_output_arguments(parser)
     parser.set_defaults(run=run)
 
 
@@ -109,7 +109,7 @@ def run(args: argparse.Namespace) -> int:
         "left_out": list(left_out),
     }
     report = as_report(renderer, rows, settings)
-    code = publish(report, args.json)
+    code = publish(report, args)
     if report.settings["not_given"]:
         print(f"not given: {', '.join(report.settings['not_given'])}")
     if left_out:
