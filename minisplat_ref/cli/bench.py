@@ -196,7 +196,7 @@ def _save_folder(report: "Report", folder: Path) -> None:
         save_figure(report.cases, folder / FIGURE)
         figures.append(pareto_section(report.cases))
     save_json(report, folder / JSON)
-    write_page(report, folder / PAGE, figures)
+    write_page(report, folder / PAGE, figures, is_by_kind=True)
     print(f"\nopen {(folder / PAGE).resolve()}")
 
 

@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import Any
 
 from minisplat_ref import __version__
-from minisplat_ref.experiments.page import cards, page, paragraph, section, table
+from minisplat_ref.experiments.page import cards, page, section, table
 from minisplat_ref.io.atomic import replacing
 from minisplat_ref.oracle.cases import Case, Report, as_table, by_kind, verdict
 from minisplat_ref.reporting import machine
 
 
-def write_page(report: Report, path: Path, figures: Iterable[str] = ()) -> None:
+def write_page(report: Report, path: Path, figures: Sequence[str] = (), *, is_by_kind: bool = False) -> None:
     """Write the page; it is there complete or not at all.
 
     Parameters
@@ -19,37 +19,41 @@ def write_page(report: Report, path: Path, figures: Iterable[str] = ()) -> None:
     report : Report
     path : Path
         Its folder must exist.
-    figures : iterable of str
+    figures : sequence of str
         Parts of a page that stand before the tables.
+    is_by_kind : bool
+        Whether cases with other figures have a table of their own; else there is one, in the order of the cases.
 
     Raises
     ------
     InputError
         If the folder does not exist.
     """
-    text = report_html(report, figures)
+    text = report_html(report, figures, is_by_kind=is_by_kind)
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
-def report_html(report: Report, figures: Iterable[str] = ()) -> str:
+def report_html(report: Report, figures: Sequence[str] = (), *, is_by_kind: bool = False) -> str:
     """Return the page as text of one self-contained HTML file."""
     n, n_failed = len(report.cases), report.n_failed
     key_figures = [(f"{n - n_failed} of {n}", "cases passed"), (f"{n_failed}", "failed")]
-    failed = [case for case in report.cases if not case.passed]
+    groups = by_kind(report.cases) if is_by_kind else [report.cases]
+    failed = [[case for case in group if not case.passed] for group in groups]
     sections = [cards(key_figures), *figures]
-    if failed:
+    if n_failed:
         sections.append(section("What failed", *_tables(failed)))
     sections += [
-        section("All cases", *_tables(report.cases)),
+        section("All cases", *_tables(groups)),
         section("What was run", table(_settings(report.settings))),
     ]
-    return page(report.title, f"{verdict([report])}.".replace("..", "."), sections)
+    title, _, rest = report.title.partition(": ")
+    sentences = [f"{text[:1].upper()}{text[1:]}." for text in (rest, verdict([report])) if text]
+    return page(title, " ".join(sentences), sections)
 
 
-def _tables(cases: Sequence[Case]) -> list[str]:
-    """Return a table for each kind of case."""
-    return [table(rows, heading) for heading, rows in map(as_table, by_kind(cases))]
+def _tables(groups: Iterable[Sequence[Case]]) -> list[str]:
+    return [table(rows, heading) for heading, rows in map(as_table, filter(None, groups))]
 
 
 def _settings(settings: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -12,11 +12,12 @@ from minisplat_ref.experiments.plots import BLUE, GREY, RED, plot, to_svg
 from minisplat_ref.training.pace import Decision, Measurement, Pace
 
 DONE = {"cool down": "the rates began to fall", "exposures": "exposures were switched on", "prune": "it pruned"}
-HEADING = ("decision", "iteration", "gain (dB)", "std. error", "why")
+HEADING = ("decision", "iteration", "why", "gain (dB)", "std. error")
 PSNR = "PSNR of the held-out training views (dB)"
 FIGURES_TEXT = """\
 Thin lines are the held-out training views, the thick one is their mean, broken lines are decisions. The work is the
-number of pairs of a tile and a Gaussian, of all iterations so far; the red line has the slope that ended the growth."""
+number of pairs of a tile and a Gaussian, of all iterations so far."""
+SLOPE_TEXT = "The red line has the slope by which it was decided that little was left to gain."
 
 
 def decisions_section(pace: Pace, n_iterations: int) -> str:
@@ -32,7 +33,8 @@ def decisions_section(pace: Pace, n_iterations: int) -> str:
     parts = [paragraph(story(pace, n_iterations))]
     if pace.measurements:
         parts += [curves([to_svg(figure) for figure in (over_iterations(pace), over_work(pace))], 2)]
-        parts += [paragraph(FIGURES_TEXT)]
+        is_by_slope = any(decision.gain is not None for decision in pace.decisions)
+        parts += [paragraph(f"{FIGURES_TEXT} {SLOPE_TEXT}" if is_by_slope else FIGURES_TEXT)]
     if pace.decisions:
         parts.append(table(map(_row, pace.decisions), HEADING))
     return section("What was decided, and why", *parts)
@@ -66,7 +68,7 @@ def _error(decision: Decision) -> str:
 
 def _row(decision: Decision) -> list[str]:
     numbers = ["" if n is None else f"{n:.3f}" for n in (decision.gain, decision.standard_error)]
-    return [decision.what, f"{decision.step:,}", *numbers, decision.why]
+    return [decision.what, f"{decision.step:,}", decision.why, *numbers]
 
 
 def over_iterations(pace: Pace) -> Figure:

@@ -19,6 +19,7 @@ POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-s
 BAD = {"FAILED", "DIVERGES FIRST", "diverges"}  # cells that stand out
 GOOD = {"passed", "agrees"}
 LONG = 44  # characters of a cell that may break into lines
+TALL = 60  # rows of a table that scrolls in the page instead of making it long
 PNG_PIXELS = 1 << 17  # of larger pictures a PNG would make the page heavy
 JPEG_QUALITY = 92
 
@@ -83,9 +84,10 @@ def cards(figures: Iterable[tuple[str, str]]) -> str:
 def table(rows: Iterable[Sequence[str]], heading: Sequence[str] = ()) -> str:
     """Return a panel with a table whose first column names the rows; a wide one scrolls under that column."""
     head = f"<thead><tr>{''.join(map(_heading_cell, heading))}</tr></thead>" if heading else ""
-    body = "".join(f"<tr>{_name_cell(name)}{''.join(map(_cell, cells))}</tr>" for name, *cells in rows)
-    kind = "data" if heading else "facts"
-    return f'<div class="panel scroll" tabindex="0"><table class="{kind}">{head}<tbody>{body}</tbody></table></div>'
+    lines = [f"<tr>{_name_cell(name)}{''.join(map(_cell, cells))}</tr>" for name, *cells in rows]
+    kind, tall = "data" if heading else "facts", " tall" * (len(lines) > TALL)
+    content = f'<table class="{kind}">{head}<tbody>{"".join(lines)}</tbody></table>'
+    return f'<div class="panel scroll{tall}" tabindex="0">{content}</div>'
 
 
 def _heading_cell(text: str) -> str:

@@ -41,7 +41,8 @@ figure img { display: block; width: 100%; height: auto; border-radius: 4px }
 figcaption { color: var(--faint); font-size: 13.5px; line-height: 1.4; padding: 6px 0 2px }
 .pixels img { image-rendering: pixelated }
 svg { display: block; width: 100%; height: auto; overflow: visible }
-.scroll { overflow: auto; max-height: 80vh; padding: 0; border-radius: 10px }
+.scroll { overflow: auto; padding: 0; border-radius: 10px }
+.tall { max-height: 80vh }
 .scroll:focus-visible, summary:focus-visible { outline: 2px solid var(--blue); outline-offset: 2px }
 table { border-collapse: collapse; width: 100%; font-size: 15px; line-height: 1.45 }
 td, th { padding: 6px 16px 6px 0; border-bottom: 1px solid var(--rule); vertical-align: top; text-align: left }

@@ -1,9 +1,10 @@
-"""What the reports of runs share: held-out views with their errors, and curves over the training."""
+"""What the reports of runs share: held-out views with their errors, curves over the training, and what fired."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from minisplat_ref.experiments.page import captioned, panel, slider
+from minisplat_ref.experiments.comparison.mechanisms import HEADING, Fired, remarks_by_mechanism, rows
+from minisplat_ref.experiments.page import captioned, panel, slider, table
 from minisplat_ref.experiments.pictures import Picture
 from minisplat_ref.experiments.plots import BLUE, GREEN, RED, plot, to_svg
 
@@ -38,3 +39,9 @@ def curve(records: Records, key: str, title: str, color: str) -> str:
     with plot(title, "iterations") as (figure, axes):
         axes.plot([record["step"] for record in records], [record[key] for record in records], color=color, lw=1.8)
     return to_svg(figure)
+
+
+def fired_tables(fired: Fired) -> list[str]:
+    """Return what the mechanisms of a recipe have done, and what they have noted."""
+    tables = [(rows(fired), HEADING), (list(remarks_by_mechanism(fired).items()), ())]
+    return [table(cells, heading) for cells, heading in tables if cells]

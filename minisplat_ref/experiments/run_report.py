@@ -7,15 +7,14 @@ from typing import Any
 from minisplat_ref import __version__
 from minisplat_ref.experiments import run_folder
 from minisplat_ref.experiments.commands import command
-from minisplat_ref.experiments.comparison.mechanisms import HEADING as MECHANISMS_HEADING
-from minisplat_ref.experiments.comparison.mechanisms import Fired, remarks, rows
+from minisplat_ref.experiments.comparison.mechanisms import Fired
 from minisplat_ref.experiments.decisions_report import decisions_section
 from minisplat_ref.experiments.events import published_times, read_mechanisms
 from minisplat_ref.experiments.page import cards, code, curves, page, paragraph, section, table
 from minisplat_ref.experiments.pictures import fitting, split
 from minisplat_ref.experiments.plots import PURPLE
 from minisplat_ref.experiments.progress import read_log
-from minisplat_ref.experiments.report_parts import ERROR_TEXT, curve, training_curves, view_panel
+from minisplat_ref.experiments.report_parts import ERROR_TEXT, curve, fired_tables, training_curves, view_panel
 from minisplat_ref.experiments.settings import Settings, load
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.io import read_image
@@ -70,7 +69,7 @@ def report_html(folder: Path, scene: Scene) -> str:
         pace = from_metadata(run_folder.read_json_object(folder / run_folder.DECISIONS))
         sections.append(decisions_section(pace, n_iterations))
     if log:
-        sections.append(section("How the training went", curves(_curves(folder, log))))
+        sections.append(section("How the training went", _curves(folder, log)))
     if (folder / run_folder.EVENTS).exists():
         sections.append(_fired(folder, settings, n_iterations))
     sections += [
@@ -141,10 +140,11 @@ def _measured(view: dict[str, Any]) -> str:
     return f"PSNR {_decibels(view['psnr'])}, SSIM {view['ssim']:.3f}"
 
 
-def _curves(folder: Path, log: list[dict[str, Any]]) -> list[str]:
+def _curves(folder: Path, log: list[dict[str, Any]]) -> str:
     measured = read_log(folder / run_folder.CURVE)
-    of_tests = [curve(measured, "psnr", "PSNR of test views (dB)", PURPLE)] if measured else []
-    return [*training_curves(log), *of_tests]
+    if not measured:
+        return curves(training_curves(log))
+    return curves([*training_curves(log), curve(measured, "psnr", "PSNR of test views (dB)", PURPLE)], n_columns=2)
 
 
 def _fired(folder: Path, settings: Settings, n_iterations: int) -> str:
@@ -152,8 +152,7 @@ def _fired(folder: Path, settings: Settings, n_iterations: int) -> str:
     published = published_times(recipe)
     runs = [read_mechanisms(folder / run_folder.EVENTS, published)]
     fired = Fired(settings.recipe, n_iterations, recipe.iterations, published, runs)
-    acted = [table(rows(fired), MECHANISMS_HEADING)] if runs[0] else []
-    return section("What fired, and when", paragraph(FIRED_TEXT), *acted, *map(paragraph, remarks(fired)))
+    return section("What fired, and when", paragraph(FIRED_TEXT), *fired_tables(fired))
 
 
 def _settings(folder: Path, settings: Settings, metrics: dict[str, Any], scene: Scene) -> list[tuple[str, str]]:

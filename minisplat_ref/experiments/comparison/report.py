@@ -13,12 +13,13 @@ from minisplat_ref.experiments.comparison.figures import (
     psnr_over_time,
 )
 from minisplat_ref.experiments.comparison.measures import MEASURES, RecipeMeasures
-from minisplat_ref.experiments.comparison.mechanisms import HEADING, Fired, remarks, rows
+from minisplat_ref.experiments.comparison.mechanisms import Fired
 from minisplat_ref.experiments.comparison.plan import Plan
 from minisplat_ref.experiments.comparison.results import Results
 from minisplat_ref.experiments.comparison.table import table_cells
 from minisplat_ref.experiments.page import cards, curves, grid, page, panel, paragraph, section, slider, table
 from minisplat_ref.experiments.plots import to_svg
+from minisplat_ref.experiments.report_parts import fired_tables
 from minisplat_ref.experiments.surface import LEAST_OPACITY, NEAR
 from minisplat_ref.types import Scene
 
@@ -109,7 +110,7 @@ def _curves(results: Results) -> str:
 
 
 def _fired_table(fired: Fired) -> str:
-    return "\n".join([paragraph(fired_title(fired)), table(rows(fired), HEADING), *map(paragraph, remarks(fired))])
+    return "\n".join([paragraph(fired_title(fired)), *fired_tables(fired)])
 
 
 def fired_title(fired: Fired) -> str:
