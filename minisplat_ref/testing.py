@@ -1,4 +1,4 @@
-"""For the tests of other renderers: does a function agree with the oracle, and if not, in which stage?
+"""For the tests of other renderers: that a function agrees with the oracle, and where it does not.
 
 ::
 
@@ -19,7 +19,7 @@ from minisplat_ref.oracle.comparison.staged import STAGES, as_report, compare_sc
 from minisplat_ref.oracle.peers.function import from_function
 
 HAS_NO_GRADIENTS = (
-    "gives no gradients: return tensors that require them, give vjp=..., or say has_gradients=False to check images only"
+    "gives no gradients: return tensors that have them, give vjp=..., or has_gradients=False for images alone"
 )
 
 
@@ -78,7 +78,9 @@ def assert_matches_oracle(
     report = as_report(renderer, rows, {"left_out": list(left_out)})
     not_given = report.settings["not_given"]
     if report.n_failed:
-        raise AssertionError(f"{report.title}\n\n{as_markdown(report)}\n\nnot given: {', '.join(not_given) or 'nothing'}")
+        raise AssertionError(
+            f"{report.title}\n\n{as_markdown(report)}\n\nnot given: {', '.join(not_given) or 'nothing'}"
+        )
     gradients = [stage for stage in STAGES if stage.startswith("v_")]
     if has_gradients and all(stage in not_given for stage in gradients):
         raise AssertionError(f"{renderer.name} {HAS_NO_GRADIENTS}")

@@ -294,9 +294,8 @@ def _train(
     given: dict[str, Any],
     room: str,
 ) -> int:
-    from minisplat_ref.experiments import checkpoints
+    from minisplat_ref.experiments import checkpoints, run_folder
     from minisplat_ref.experiments.run import run_training
-    from minisplat_ref.experiments.run_report import write_report
     from minisplat_ref.experiments.scoring import summary
     from minisplat_ref.training.guard import Guard
 
@@ -309,8 +308,7 @@ def _train(
         print(room)
     check_every = given.get("check_every", Guard().every)
     outcome = run_training(folder, scene, settings, recipe, state, network, check_every)
-    report = None if outcome.evaluation is None else write_report(folder, scene)
-    if outcome.evaluation is None or report is None or not outcome.is_complete:
+    if outcome.evaluation is None or not outcome.is_complete:
         if state.is_whole:
             measured = "" if outcome.evaluation else " but not measured"
             how = f"stopped after {state.step} of {settings.iterations} iterations, all saved{measured}"
@@ -322,7 +320,7 @@ def _train(
         f"{summary(outcome.evaluation)}, {len(state.gaussians.means):,} Gaussians, {outcome.seconds:.0f} s of training"
     )
     print(f"results in {folder}: point_cloud.ply, metrics.json, renders/")
-    print(f"open {report.resolve()}")
+    print(f"open {(folder / run_folder.REPORT).resolve()}")
     return 0
 
 

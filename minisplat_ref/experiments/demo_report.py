@@ -104,6 +104,7 @@ def report_html(
     metrics = run_folder.read_json_object(folder / run_folder.METRICS)
     evaluation, n_gaussians = outcome.evaluation, metrics["n_gaussians"]
     assert evaluation is not None, "there is a report of what was measured only"
+    worst = min(evaluation.per_view, key=lambda view: view.psnr)
     n_train, n_test, n_points = len(scene.train_views), len(scene.test_views), len(scene.points)
     size = f"{scene.train_views[0].camera.width} x {scene.train_views[0].camera.height}"
     introduction = (
@@ -113,6 +114,7 @@ def report_html(
     )
     key_figures = [
         (f"{evaluation.psnr:.2f} dB", f"PSNR, mean of {n_test} held-out views"),
+        (f"{worst.psnr:.2f} dB", f"PSNR of the worst, {worst.name}"),
         (f"{evaluation.ssim:.3f}", "SSIM, mean of the same"),
         (f"{n_gaussians:,}", f"Gaussians, from {n_points:,} points"),
         (f"{outcome.seconds:.0f} s", f"training, {metrics['iterations']} iterations with compilation"),

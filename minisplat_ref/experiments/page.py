@@ -68,6 +68,11 @@ def paragraph(text: str) -> str:
     return f"<p>{escape(text)}</p>"
 
 
+def listing(texts: Iterable[str]) -> str:
+    """Return sentences as a list."""
+    return f"<ul>{''.join(f'<li>{escape(text)}</li>' for text in texts)}</ul>"
+
+
 def code(text: str) -> str:
     """Return lines to be copied."""
     return f'<pre tabindex="0">{escape(text)}</pre>'
@@ -95,7 +100,7 @@ def _heading_cell(text: str) -> str:
 
 
 def _name_cell(text: str) -> str:
-    return f'<th scope="row">{escape(text)}</th>'
+    return f'<th scope="row">{escape(text).replace("_", "_<wbr>")}</th>'
 
 
 def _cell(text: str) -> str:

@@ -12,21 +12,24 @@ STYLE = """
   --page: #f6f7f9; --panel: #fff; --ink: #25303b; --soft: #4a5560; --faint: #616c78; --code: #eef2f6;
   --rule: #e3e7eb; --grid: #e6eaee; --edge: #8a94a0; --bad: #b3261e; --good: #2f6f3a;
   --red: #b4553d; --blue: #2d6a8e; --green: #4b7f52; --purple: #8a5a9e; --ochre: #b08a2e; --grey: #5a6570;
+  --teal: #2c7f86; --brown: #8c5a2e;
 }
 @media (prefers-color-scheme: dark) {
   :root {
     --page: #13171c; --panel: #1b2128; --ink: #e4e9ee; --soft: #b9c2cb; --faint: #98a3ae; --code: #252d35;
     --rule: #2e3740; --grid: #29313a; --edge: #6d7883; --bad: #ff8a80; --good: #8fcf9a;
     --red: #e58f78; --blue: #79b4da; --green: #88c092; --purple: #c49bd8; --ochre: #dcb862; --grey: #a5b0bb;
+    --teal: #6cc3c8; --brown: #cf9d6c;
   }
 }
 * { box-sizing: border-box }
 body { margin: 0; background: var(--page); color: var(--ink); font: 16px/1.55 system-ui, "DejaVu Sans", sans-serif;
   -webkit-text-size-adjust: 100% }
-main { max-width: 1080px; margin: 0 auto; padding: 40px 24px 64px }
-h1 { font-size: 30px; line-height: 1.2; margin: 0 0 8px; font-weight: 650; overflow-wrap: anywhere }
+main { max-width: 1080px; margin: 0 auto; padding: 40px 24px 64px; overflow-wrap: anywhere }
+h1 { font-size: 30px; line-height: 1.2; margin: 0 0 8px; font-weight: 650 }
 h2 { font-size: 20px; margin: 48px 0 4px; font-weight: 600 }
-p { margin: 4px 0 16px; color: var(--soft); max-width: 74ch; overflow-wrap: break-word }
+p, ul { margin: 4px 0 16px; color: var(--soft); max-width: 74ch }
+ul { padding-left: 20px; font-size: 15px }
 .cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 12px; margin: 24px 0 }
 .card, .panel { background: var(--panel); border: 1px solid var(--rule); border-radius: 10px }
 .card { padding: 14px 16px }
@@ -35,7 +38,7 @@ p { margin: 4px 0 16px; color: var(--soft); max-width: 74ch; overflow-wrap: brea
 .panel { padding: 16px; margin: 12px 0 }
 .row { display: grid; grid-template-columns: repeat(var(--columns, 3), minmax(0, 1fr)); gap: 12px 16px;
   align-items: start }
-.label { font-size: 14px; color: var(--soft); margin: 0 0 8px; overflow-wrap: anywhere }
+.label { font-size: 14px; color: var(--soft); margin: 0 0 8px }
 figure { margin: 0; min-width: 0 }
 figure img { display: block; width: 100%; height: auto; border-radius: 4px }
 figcaption { color: var(--faint); font-size: 13.5px; line-height: 1.4; padding: 6px 0 2px }
@@ -52,7 +55,6 @@ td { font-variant-numeric: tabular-nums }
 tbody tr:last-child > * { border-bottom: 0 }
 tbody th { color: var(--faint); font-weight: 400 }
 td:first-child, th:first-child { padding-left: 16px }
-.facts td { overflow-wrap: anywhere }
 .facts tbody th { width: 22% }
 .data { font-size: 14px }
 .data td, .data th { white-space: nowrap }
@@ -81,7 +83,7 @@ code, pre { font: 14px/1.5 ui-monospace, "DejaVu Sans Mono", monospace }
   .row { grid-template-columns: minmax(0, 1fr) }
   .cards { grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 8px }
   .card { padding: 10px 12px }
-  .card b { font-size: 20px; overflow-wrap: anywhere }
+  .card b { font-size: 20px }
   .panel { padding: 12px }
   .panel.scroll { padding: 0 }
   td:first-child, th:first-child { padding-left: 12px }

@@ -18,15 +18,16 @@ TITLE_COLOR = "#4a5560"
 GRID_COLOR = "#e6eaee"
 EDGE_COLOR = "#8a94a0"
 TICK_COLOR = "#6a7580"
-RED, BLUE, GREEN, PURPLE, OCHRE, GREY = "#b4553d", "#2d6a8e", "#4b7f52", "#8a5a9e", "#b08a2e", "#5a6570"
-SERIES = (RED, BLUE, GREEN, PURPLE, OCHRE, GREY)
+RED, BLUE, GREEN, PURPLE = "#b4553d", "#2d6a8e", "#4b7f52", "#8a5a9e"
+OCHRE, GREY, TEAL, BROWN = "#b08a2e", "#5a6570", "#2c7f86", "#8c5a2e"
+SERIES = (RED, BLUE, GREEN, PURPLE, OCHRE, GREY, TEAL, BROWN)
 PALETTE = {
     TITLE_COLOR: "soft",
     GRID_COLOR: "grid",
     EDGE_COLOR: "edge",
     TICK_COLOR: "faint",
     "#ffffff": "panel",
-    **dict(zip(SERIES, ("red", "blue", "green", "purple", "ochre", "grey"), strict=True)),
+    **dict(zip(SERIES, ("red", "blue", "green", "purple", "ochre", "grey", "teal", "brown"), strict=True)),
 }
 """Names of the colours in a page, which has a light and a dark value of each."""
 PNG_DPI = 150

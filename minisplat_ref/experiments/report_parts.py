@@ -43,5 +43,5 @@ def curve(records: Records, key: str, title: str, color: str) -> str:
 
 def fired_tables(fired: Fired) -> list[str]:
     """Return what the mechanisms of a recipe have done, and what they have noted."""
-    tables = [(rows(fired), HEADING), (list(remarks_by_mechanism(fired).items()), ())]
-    return [table(cells, heading) for cells, heading in tables if cells]
+    acted, noted = rows(fired), remarks_by_mechanism(fired)
+    return [*([table(acted, HEADING)] if acted else []), *([table(noted.items())] if noted else [])]

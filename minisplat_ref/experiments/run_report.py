@@ -32,31 +32,30 @@ What the recipe does besides gradient steps, in this run: how often, in how many
 many Gaussians their number rose or fell."""
 
 
-def write_report(folder: Path, scene: Scene) -> Path:
-    """Write the page of a measured run, and return where it is.
+def write_report(folder: Path, scene: Scene, metrics: dict[str, Any]) -> None:
+    """Write the page of a run.
 
     Parameters
     ----------
     folder : Path
     scene : Scene
         That it was trained on.
+    metrics : dict
+        What ``metrics.json`` holds, or will: the page comes before it, since that file says that a run has ended.
 
     Raises
     ------
     InputError
         A file of the run is damaged, or the page cannot be written.
     """
-    path = folder / run_folder.REPORT
-    text = report_html(folder, scene)
-    with replacing(path) as temporary:
+    text = report_html(folder, scene, metrics)
+    with replacing(folder / run_folder.REPORT) as temporary:
         temporary.write_text(text, encoding="utf-8")
-    return path
 
 
-def report_html(folder: Path, scene: Scene) -> str:
+def report_html(folder: Path, scene: Scene, metrics: dict[str, Any]) -> str:
     """Return the page as text of one self-contained HTML file."""
     settings = load(folder)
-    metrics = run_folder.read_json_object(folder / run_folder.METRICS)
     log, n_iterations = read_log(folder / run_folder.LOG), metrics["iterations"]
     introduction = (
         f"{metrics['n_gaussians']:,} Gaussians, trained for {n_iterations:,} iterations by the recipe {settings.recipe}"

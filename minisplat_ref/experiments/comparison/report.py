@@ -17,7 +17,7 @@ from minisplat_ref.experiments.comparison.mechanisms import Fired
 from minisplat_ref.experiments.comparison.plan import Plan
 from minisplat_ref.experiments.comparison.results import Results
 from minisplat_ref.experiments.comparison.table import table_cells
-from minisplat_ref.experiments.page import cards, curves, grid, page, panel, paragraph, section, slider, table
+from minisplat_ref.experiments.page import cards, curves, grid, listing, page, panel, paragraph, section, slider, table
 from minisplat_ref.experiments.plots import to_svg
 from minisplat_ref.experiments.report_parts import fired_tables
 from minisplat_ref.experiments.surface import LEAST_OPACITY, NEAR
@@ -77,7 +77,7 @@ def report_html(plan: Plan, scene: Scene, results: Results) -> str:
     heading, *cells = table_cells(results.recipes)
     sections = [
         cards(map(_card, results.recipes)),
-        section("Measures", table(cells, heading), paragraph(" ".join(notes(plan, results)))),
+        section("Measures", table(cells, heading), listing(notes(plan, results))),
         section("On the way", paragraph(CURVES_TEXT), _curves(results)),
         section("What fired, and when", paragraph(FIRED_TEXT), *(_fired_table(fired) for fired in results.fired)),
         section(

@@ -23,9 +23,8 @@ from minisplat_ref.oracle.peers.array_kinds import ARRAY_KINDS, Call, Result, ki
 from minisplat_ref.oracle.peers.cuda import rules_of
 from minisplat_ref.types import Floats
 
-REQUIRED = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height")
-REQUIRED += ("sh_degree", "backgrounds")
 PRIMITIVES = ("means", "quats", "scales", "opacities")
+REQUIRED = (*PRIMITIVES, "colors", "viewmats", "Ks", "width", "height", "sh_degree", "backgrounds")
 META = {"means2d": "means2d", "depths": "depths", "conics": "conics", "opacities": "opacities2d", "radii": "radii"}
 """Arrays of the golden format by gsplat's names of them, with one more axis in front: of the cameras."""
 LIKE_GSPLAT = "give a function with the parameters of gsplat's rasterization"
@@ -76,10 +75,10 @@ def from_function(
     InputError
         If the function has another signature.
     """
-    name = name or getattr(function, "__qualname__", type(function).__name__)
+    called: str = name or getattr(function, "__qualname__", type(function).__name__)
     if arrays is not None and arrays not in ARRAY_KINDS:
         raise InputError(f"arrays {arrays!r} are unknown; choose one of {', '.join(ARRAY_KINDS)}")
-    rasterizer = Rasterizer(name, function, vjp, arrays or kind_of(function), _parameters(function, name))
+    rasterizer = Rasterizer(called, function, vjp, arrays or kind_of(function), _parameters(function, called))
     rules = rules_of(profile)
 
     def drawn(asked: Conventions) -> Conventions | None:
@@ -89,7 +88,7 @@ def from_function(
     def give(truth: Golden) -> Arrays:
         return _colors(rasterizer, truth, dtype) | _features(rasterizer, truth, dtype) | _view(rasterizer, truth, dtype)
 
-    return Renderer(f"{name} {dtype}", dtype, False, give, drawn, ignores=("v_depths",))
+    return Renderer(f"{called} {dtype}", dtype, False, give, drawn, ignores=("v_depths",))
 
 
 def _parameters(function: Callable[..., Any], name: str) -> Callable[[str], bool]:
@@ -104,7 +103,9 @@ def _parameters(function: Callable[..., Any], name: str) -> Callable[[str], bool
     takes_any = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values())
     missing = [required for required in REQUIRED if required not in named and not takes_any]
     if missing:
-        raise InputError(f"{name} has no parameter {', '.join(missing)}: {LIKE_GSPLAT}, which are {', '.join(REQUIRED)}")
+        raise InputError(
+            f"{name} has no parameter {', '.join(missing)}: {LIKE_GSPLAT}, which are {', '.join(REQUIRED)}"
+        )
     known = (*REQUIRED, *_options(GSPLAT_MAIN), "render_mode", "packed")
     strange = [p.name for p in named.values() if p.default is inspect.Parameter.empty and p.name not in known]
     if strange:
