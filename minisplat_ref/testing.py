@@ -18,9 +18,7 @@ from minisplat_ref.oracle.comparison.renderers import choose_scenes
 from minisplat_ref.oracle.comparison.staged import STAGES, as_report, compare_scene
 from minisplat_ref.oracle.peers.function import from_function
 
-HAS_NO_GRADIENTS = (
-    "gives no gradients: return tensors that have them, give vjp=..., or has_gradients=False for images alone"
-)
+HAS_NO_GRADIENTS = "gives no gradients: let its tensors have them, give vjp, or has_gradients=False for images alone"
 
 
 def assert_matches_oracle(

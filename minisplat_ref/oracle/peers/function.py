@@ -110,7 +110,7 @@ def _parameters(function: Callable[..., Any], name: str) -> Callable[[str], bool
     strange = [p.name for p in named.values() if p.default is inspect.Parameter.empty and p.name not in known]
     if strange:
         raise InputError(f"{name} needs {', '.join(strange)}, which gsplat's rasterization has not: give a default")
-    return lambda option: takes_any or option in named
+    return lambda option: option in named or (takes_any and option != "packed")  # which only gsplat itself needs
 
 
 def _options(conventions: Conventions) -> dict[str, Any]:
@@ -253,7 +253,9 @@ def _told(rasterizer: Rasterizer, result: Result) -> Arrays:
     for name in (*META, "isect_offsets"):
         if name in meta and (meta[name].ndim == 0 or len(meta[name]) != n):
             shape = list(meta[name].shape)
-            raise InputError(f"{rasterizer.name}: meta[{name!r}] has shape {shape}, expected one row for each camera")
+            raise InputError(
+                f"{rasterizer.name}: meta[{name!r}] has shape {shape}, expected one row for each camera (packed=False)"
+            )
     told = {array: meta[name][0] for name, array in META.items() if name in meta}
     if all(name in meta for name in ("flatten_ids", "isect_offsets", "tile_size")):
         ids = meta["flatten_ids"]
