@@ -11,7 +11,13 @@ from minisplat_ref.experiments.page import curves, paragraph, section, table
 from minisplat_ref.experiments.plots import BLUE, GREY, RED, plot, to_svg
 from minisplat_ref.training.pace import Decision, Measurement, Pace
 
-DONE = {"cool down": "the rates began to fall", "exposures": "exposures were switched on", "prune": "it pruned"}
+COOLED = "cool down"
+DONE = {
+    COOLED: "the rates began to fall",
+    "exposures": "exposures were switched on",
+    "poses": "the refinement of poses was switched on",
+    "prune": "it pruned",
+}
 HEADING = ("decision", "iteration", "why", "gain (dB)", "std. error")
 PSNR = "PSNR of the held-out training views (dB)"
 FIGURES_TEXT = """\
@@ -33,7 +39,7 @@ def decisions_section(pace: Pace, n_iterations: int) -> str:
     parts = [paragraph(story(pace, n_iterations))]
     if pace.measurements:
         parts += [curves([to_svg(figure) for figure in (over_iterations(pace), over_work(pace))], 2)]
-        is_by_slope = any(decision.gain is not None for decision in pace.decisions)
+        is_by_slope = any(_is_of_slope(decision) for decision in pace.decisions)
         parts += [paragraph(f"{FIGURES_TEXT} {SLOPE_TEXT}" if is_by_slope else FIGURES_TEXT)]
     if pace.decisions:
         parts.append(table(map(_row, pace.decisions), HEADING))
@@ -108,9 +114,14 @@ def over_work(pace: Pace) -> Figure:
         _draw(axes, pace.measurements, [float(m.n_pairs) for m in pace.measurements])
         axes.set_xscale("log", base=2)
         for decision in pace.decisions:
-            if decision.gain is not None:
+            if decision.gain is not None and _is_of_slope(decision):
                 _draw_slope(axes, pace.measurements, decision.step, decision.gain)
     return figure
+
+
+def _is_of_slope(decision: Decision) -> bool:
+    """Return whether the gain is one for each doubling of the work; None where a limit ended the growth."""
+    return decision.what == COOLED and decision.gain is not None
 
 
 def _draw(axes: Axes, measurements: tuple[Measurement, ...], xs: list[float]) -> None:
