@@ -75,7 +75,7 @@ def from_function(
     InputError
         If the function has another signature.
     """
-    called: str = name or getattr(function, "__qualname__", type(function).__name__)
+    called = name or str(getattr(function, "__qualname__", type(function).__name__))
     if arrays is not None and arrays not in ARRAY_KINDS:
         raise InputError(f"arrays {arrays!r} are unknown; choose one of {', '.join(ARRAY_KINDS)}")
     rasterizer = Rasterizer(called, function, vjp, arrays or kind_of(function), _parameters(function, called))
