@@ -202,7 +202,7 @@ def choose_renderer(name: str, dtype: str | None) -> Renderer:
         return from_dumps(name, dtype)
     errors = ", ".join(error.name for error in PLANTED)
     raise InputError(
-        f"{name!r} is neither a folder of dumps nor package.module:function nor a renderer: {', '.join(BACKENDS)},"
+        f"{name!r} is neither a folder of dumps nor a renderer: package.module:function, {', '.join(BACKENDS)},"
         " gsplat-torch, gsplat, inria,"
         f" profile:NAME ({', '.join(PROFILES)}) or planted:ERROR ({errors})"
     )
