@@ -10,6 +10,7 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
+from browser import check_page
 from tolerances import BENCH_ROOM_FOR_EXPONENTIAL, ROUNDED_TO_FLOAT32
 
 from minisplat_ref.backends import CPU, REFERENCE
@@ -232,20 +233,34 @@ def test_garden_is_the_published_workload(shared_data):
     assert np.isin(subset.gaussians.means[:, 0], garden.gaussians.means[:, 0]).all()
 
 
-def test_command_writes_json_table_and_figure(tmp_path, capsys):
-    folder = tmp_path / "new" / "bench"
+@pytest.fixture(scope="module")
+def bench_folder(tmp_path_factory):
+    """What the command writes of two tiny workloads."""
+    folder = tmp_path_factory.mktemp("benches") / "new" / "bench"
     args = ["bench", "--workloads", "synth,synth5k", "--backends", "cpu-f32,textbook-f32", "--repeats", "1"]
-    assert main([*args, "--out", str(folder)]) == 0
-    report = json.loads((folder / "bench.json").read_text())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(workloads.FREE, "synth", tiny)
+        patch.setitem(workloads.FREE, "synth5k", lambda: tiny()._replace(name="synth5k"))
+        assert main([*args, "--out", str(folder)]) == 0
+    return folder
+
+
+def test_command_writes_json_table_figure_and_page(bench_folder):
+    report = json.loads((bench_folder / "bench.json").read_text())
     expected = [f"{w}/{c}" for w in ("synth", "synth5k") for c in ("reference-f64", "cpu-f32", "textbook-f32")]
     assert [case["name"] for case in report["cases"]] == expected
     assert all(case["passed"] and case["both ms"] > 0 for case in report["cases"])
     assert report["settings"]["repeats"] == 1 and report["settings"]["processor"]
-    table = (folder / "bench.md").read_text()
-    assert all(name in table for name in expected)
-    picture = read_image(folder / "bench.png")
+    table, page = ((bench_folder / name).read_text() for name in ("bench.md", "report.html"))
+    for text in (table, page):
+        assert all(name in text for name in expected)
+    picture = read_image(bench_folder / "bench.png")
     assert picture.shape[1] > 800 and len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 20
-    assert "all 6 cases passed" in capsys.readouterr().out
+    assert page.count("<svg") == 4 and "6 of 6" in page
+
+
+def test_the_page_in_a_browser(bench_folder, browser):
+    check_page(browser, bench_folder / "report.html")
 
 
 def test_command_fails_with_a_wrong_backend(monkeypatch, tmp_path, capsys):

@@ -10,11 +10,11 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.arguments import Commands, HelpFormatter, integer, listed, name
 
 if TYPE_CHECKING:
-    from minisplat_ref.oracle.cases import Case, Report
+    from minisplat_ref.oracle.cases import Report
 
 DEFAULT_WORKLOADS = ("synth", "synth5k")
 DATA_WORKLOADS = ("garden", "garden20k")
-JSON, TABLE, FIGURE = "bench.json", "bench.md", "bench.png"
+JSON, TABLE, FIGURE, PAGE = "bench.json", "bench.md", "bench.png", "report.html"
 
 DESCRIPTION = """\
 Time every backend and precision on fixed workloads, and measure its error
@@ -83,7 +83,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("--downscale", type=integer(1), default=1, metavar="K", help="of the photographs (default 1)")
     parser.add_argument("--iterations", type=integer(1), default=100, metavar="N", help="of the scene (default 100)")
     outputs = parser.add_mutually_exclusive_group()
-    outputs.add_argument("--out", type=Path, metavar="DIR", help=f"write {JSON}, {TABLE} and {FIGURE}")
+    outputs.add_argument("--out", type=Path, metavar="DIR", help=f"write {PAGE}, {JSON}, {TABLE} and {FIGURE}")
     add_json_argument(outputs)
     parser.set_defaults(run=run)
 
@@ -173,17 +173,15 @@ def _stages(args: argparse.Namespace) -> "Report":
 
 def _tables(report: "Report") -> str:
     """Return a table for each kind of case."""
-    from minisplat_ref.oracle.cases import as_markdown
+    from minisplat_ref.oracle.cases import as_markdown, by_kind
 
-    kinds: dict[tuple[str, ...], list[Case]] = {}
-    for case in report.cases:
-        kinds.setdefault(tuple(case.figures), []).append(case)
-    return "\n\n".join(as_markdown(report._replace(cases=tuple(cases))) for cases in kinds.values())
+    return "\n\n".join(as_markdown(report._replace(cases=tuple(cases))) for cases in by_kind(report.cases))
 
 
 def _save_folder(report: "Report", folder: Path) -> None:
-    """Write JSON, tables and figure into a folder, which is made."""
-    from minisplat_ref.bench.figure import save_figure
+    """Write JSON, tables, figure and page into a folder, which is made."""
+    from minisplat_ref.bench.figure import pareto_section, save_figure
+    from minisplat_ref.experiments.check_report import write_page
     from minisplat_ref.io.atomic import replacing
     from minisplat_ref.oracle.cases import save_json
 
@@ -193,9 +191,13 @@ def _save_folder(report: "Report", folder: Path) -> None:
         raise InputError(f"{folder} cannot be made: {error.strerror}") from error
     with replacing(folder / TABLE) as temporary:
         temporary.write_text(f"{report.title}\n\n{_tables(report)}\n", encoding="utf-8")
+    figures = []
     if any("both ms" in case.figures for case in report.cases):
         save_figure(report.cases, folder / FIGURE)
+        figures.append(pareto_section(report.cases))
     save_json(report, folder / JSON)
+    write_page(report, folder / PAGE, figures, is_by_kind=True)
+    print(f"\nopen {(folder / PAGE).resolve()}")
 
 
 def progress(line: str) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from minisplat_ref.backends import BACKENDS, CPU, REFERENCE, Backend
-from minisplat_ref.constants import GSPLAT_1_5, PROFILES, Conventions
+from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN, PROFILES, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.golden.files import load, read_manifest, read_npz
 from minisplat_ref.oracle.golden.format import SPECS, Arrays, Golden
@@ -202,9 +202,41 @@ def choose_renderer(name: str, dtype: str | None) -> Renderer:
         return from_dumps(name, dtype)
     errors = ", ".join(error.name for error in PLANTED)
     raise InputError(
-        f"{name!r} is neither a folder of dumps nor a renderer: {', '.join(BACKENDS)}, gsplat-torch, gsplat, inria,"
+        f"{name!r} is neither a folder of dumps nor a renderer: package.module:function, {', '.join(BACKENDS)},"
+        " gsplat-torch, gsplat, inria,"
         f" profile:NAME ({', '.join(PROFILES)}) or planted:ERROR ({errors})"
     )
+
+
+def is_function(name: str) -> bool:
+    """Return whether a name is of the form ``package.module:function``."""
+    return ":" in name and name.partition(":")[0] not in ("planted", "profile") and not Path(name).is_dir()
+
+
+def choose_function(name: str, dtype: str | None, profile: str | None, arrays: str | None) -> Renderer:
+    """Renderer of ``package.module:function``.
+
+    Parameters
+    ----------
+    name : str
+    dtype : str, optional
+        ``"float32"``, the default, or ``"float64"``.
+    profile : str, optional
+        Key of ``PROFILES``: its rules; by default those of gsplat's main branch.
+    arrays : str, optional
+        ``"numpy"``, ``"torch"`` or ``"jax"``; by default what its module has imported.
+
+    Raises
+    ------
+    InputError
+        If there is no such function, or it cannot be called like gsplat's.
+    """
+    from minisplat_ref.oracle.peers.function import from_function
+    from minisplat_ref.oracle.peers.named_function import load_function
+
+    function, vjp = load_function(name)
+    rules = GSPLAT_MAIN if profile is None else PROFILES[profile]
+    return from_function(function, vjp, name=name, arrays=arrays, dtype=dtype or "float32", profile=rules)
 
 
 def choose_scenes(
