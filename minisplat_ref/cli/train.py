@@ -54,6 +54,9 @@ Train Gaussians on SCENE, the folder of a COLMAP scene or of a transforms.json.
 DIR will hold point_cloud.ply, metrics.json, renders/ (truth | render | error of
 each test view) and checkpoints. Ctrl-C saves what there is; --resume goes on.
 """
+EPILOG = """\
+example:
+  minisplat-ref train photos/fox --downscale 2 --minutes 5 --preview"""
 
 
 def add_parser(commands: Commands) -> None:
@@ -63,6 +66,7 @@ def add_parser(commands: Commands) -> None:
         help="train Gaussians on photographs with cameras",
         usage="minisplat-ref train [-h] SCENE [options]\n       minisplat-ref train --resume DIR [--iterations N]",
         description=DESCRIPTION,
+        epilog=EPILOG,
         formatter_class=HelpFormatter,
         argument_default=argparse.SUPPRESS,
     )
@@ -73,6 +77,8 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("--resume", type=Path, metavar="DIR", help="continue the run in DIR from its last checkpoint")
     parser.add_argument("--scene", dest="moved", metavar="PATH", help="with --resume: where its photographs are now")
     parser.add_argument("--rescale", action="store_true", help="with --resume: stretch its schedule to --iterations")
+
+    parser.add_argument("--preview", action="store_true", help="keep DIR/preview.png up to date while training")
 
     data = parser.add_argument_group("photographs")
     data.add_argument("--downscale", type=integer(1), metavar="D", help="make them D times smaller (default 1)")
@@ -294,19 +300,20 @@ def _train(
     room: str,
 ) -> int:
     from minisplat_ref.experiments import checkpoints
+    from minisplat_ref.experiments.notices import describe_sizes
     from minisplat_ref.experiments.run import run_training
     from minisplat_ref.experiments.scoring import summary
     from minisplat_ref.training.guard import Guard
 
-    size = scene.train_views[0].camera
+    views = (*scene.train_views, *scene.test_views)
     print(
         f"{scene.name}: {len(scene.train_views)} training and {len(scene.test_views)} test views of"
-        f" {size.width} x {size.height}, {len(scene.points):,} points"
+        f" {describe_sizes([(view.camera.width, view.camera.height) for view in views])}, {len(scene.points):,} points"
     )
     if room:
         print(room)
     check_every = given.get("check_every", Guard().every)
-    outcome = run_training(folder, scene, settings, recipe, state, network, check_every)
+    outcome = run_training(folder, scene, settings, recipe, state, network, check_every, given.get("preview", False))
     if outcome.evaluation is None or not outcome.is_complete:
         if state.is_whole:
             measured = "" if outcome.evaluation else " but not measured"

@@ -1,10 +1,10 @@
 """Paths around a scene for ``render``: along the training cameras of a run, or on a circle around a point cloud.
 
-A camera is described in the cylinder about the scene's axis: the axis is at right angles to the pictures'
-horizontal edges, and passes through the point nearest to all optical axes. At every angle the path takes the mean of radius, height and
-viewing direction of the training cameras near that angle, so that it stays where the scene was photographed: beyond,
-nothing has taught the Gaussians what to show. Where more than a quarter of the circle was never photographed, the path
-leaves it out, and goes there and back along the rest.
+A camera is described in the cylinder about the scene's axis, which is at right angles to the horizontal edges of the
+pictures and passes through the point nearest to all optical axes. At every angle the path takes the mean of radius,
+height and viewing direction of the training cameras near that angle, so that it stays where the scene was photographed:
+beyond, nothing has taught the Gaussians what to show. Where more than a quarter of the circle was never photographed,
+the path leaves it out, and goes there and back along the rest.
 """
 
 import math

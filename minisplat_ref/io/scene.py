@@ -358,7 +358,7 @@ def _check_downscaled(photo: Photo, width: int, height: int, downscale: int) -> 
         raise InputError(
             f"{small_folder}/{photo.file}: the image is {width}x{height} but 1/{downscale} of its camera is"
             f" {exact_width:g}x{exact_height:g}; remove {small_folder} and run"
-            f" `minisplat-ref downscale {photo.folder} --factor {downscale}`"
+            f" `minisplat-ref downscale {photo.folder} --downscale {downscale}`"
         )
 
 
