@@ -1,7 +1,7 @@
 """Hooks of MkDocs: pages that are made while the site is built, and links that lead out of ``docs/``.
 
-The README, CONTRIBUTING and the changelog are pages of the site, too. A link to a file of the repository that is no page
-leads, on a code host, to that file; on the site it becomes the file's path, or leads to the API page of its module.
+The README, CONTRIBUTING and the changelog are pages of the site, too. On a code host, a link to a file that is no page
+leads to that file; on the site it becomes the path of the file, or leads to the API page of its module.
 """
 
 import os
@@ -59,7 +59,9 @@ def _public_names() -> str:
         for module, names in minisplat_ref._MODULES.items()
         for name in names
     ]
-    introduction = "What `import minisplat_ref as ms` gives, and the module of each name. All else is reached by modules."
+    introduction = (
+        "What `import minisplat_ref as ms` gives, and the module of each name. All else is reached by modules."
+    )
     return "\n".join(["# The package", "", introduction, "", "| name | module |", "|---|---|", *names])
 
 
