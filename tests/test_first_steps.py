@@ -102,6 +102,17 @@ def test_mixed_sizes_are_told(sizes, text):
     assert describe_sizes(sizes) == text
 
 
+def test_a_white_background_is_kept(scene_folder, tmp_path):
+    folder = tmp_path / "white"
+    assert main(["train", str(scene_folder), *OPTIONS, "--out", str(folder), "--background", "255,255,255"]) == 0
+    config = json.loads((folder / "config.json").read_text())
+    assert config["background"] == config["settings"]["background"] == [1, 1, 1]
+    assert main(["eval", str(folder)]) == 0
+    config["settings"]["background"] = [1, "white", 1]
+    (folder / "config.json").write_text(json.dumps(config))
+    assert main(["eval", str(folder)]) == 2
+
+
 def test_film_of_an_orbit(run_folder, tmp_path, capsys):
     arguments = ["render", str(run_folder), "--cameras", "orbit", "--out", str(tmp_path / "views"), "--frames", "4"]
     assert main([*arguments, "--film", str(tmp_path / "orbit.gif"), "--fps", "10", "--arc", "90"]) == 0

@@ -13,6 +13,7 @@ from minisplat_ref.experiments.arguments import (
     Commands,
     HelpFormatter,
     add_renderer_arguments,
+    color,
     integer,
     positive,
 )
@@ -66,7 +67,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("--film", type=Path, metavar="FILE", help="also as a film: .gif, or .mp4 with imageio[ffmpeg]")
     parser.add_argument("--fps", type=positive, default=25.0, metavar="F", help="pictures a second (default 25)")
     parser.add_argument(
-        "--background", type=_color, metavar="R,G,B", help="0 to 255 each (default: the run's, or 0,0,0)"
+        "--background", type=color, metavar="R,G,B", help="0 to 255 each (default: the run's, or 0,0,0)"
     )
     add_renderer_arguments(parser, None, "the run's, or ")
     parser.set_defaults(run=run)
@@ -218,10 +219,3 @@ def _size(text: str) -> tuple[int, int]:
     if match is None:
         raise argparse.ArgumentTypeError(f"{text!r} is not a width and height in pixels such as 640x480")
     return int(match[1]), int(match[2])
-
-
-def _color(text: str) -> tuple[float, ...]:
-    values = tuple(int(word) if word.isdecimal() else -1 for word in text.split(","))
-    if len(values) != 3 or not all(0 <= value <= 255 for value in values):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a colour such as 255,255,255")
-    return tuple(value / 255.0 for value in values)

@@ -12,6 +12,7 @@ from minisplat_ref.experiments.arguments import (
     HelpFormatter,
     add_renderer_arguments,
     assignment,
+    color,
     integer,
     option_name,
     positive,
@@ -46,6 +47,7 @@ DEFAULTS = {
     "backend": "cpu",
     "drop_bad_steps": False,
     "minutes": None,
+    "background": None,
 }
 AFRESH = ("iterations", "lpips_weights", "drop_bad_steps")  # what may be new when a run is continued
 
@@ -84,6 +86,9 @@ def add_parser(commands: Commands) -> None:
     data.add_argument("--downscale", type=integer(1), metavar="D", help="make them D times smaller (default 1)")
     data.add_argument(
         "--test-every", type=integer(0), metavar="K", help="hold out every K-th for testing, 0: none (default 8)"
+    )
+    data.add_argument(
+        "--background", type=color, metavar="R,G,B", help="behind the scene (default 0,0,0; white 255,255,255)"
     )
     data.add_argument("--undistort", action="store_true", help="remove lens distortion instead of refusing it")
 
@@ -159,6 +164,7 @@ def _start(given: dict[str, Any]) -> int:
     if options["iterations"] is None:
         options["iterations"] = _default_iterations(options["recipe"])
     options["set"] = dict(options["set"])  # of equal names the last
+    options["background"] = None if options["background"] is None else list(options["background"])
     for name in ("lpips_weights", "init"):
         options[name] = _absolute(options[name])
     scene_path = Path(given["scene"])
