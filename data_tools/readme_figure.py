@@ -1,7 +1,9 @@
-"""The README's figure: a photograph beside its render, and speed beside error. It measures nothing and reads two folders::
+"""The README's figure: a photograph beside its render, and speed beside error.
+
+Nothing is measured here; two folders are read, with BACKENDS reference-f64,cpu-f64,cpu-f32,textbook-f32::
 
     minisplat-ref train FOX --out runs/fox
-    NUMBA_NUM_THREADS=1 minisplat-ref bench --workloads synth --repeats 5 --out bench
+    NUMBA_NUM_THREADS=1 minisplat-ref bench --workloads synth --repeats 3 --backends BACKENDS --out bench
     python -m data_tools.readme_figure runs/fox bench
 
 The photograph is the test view of median PSNR. Times are the least of the turns that each contender had.

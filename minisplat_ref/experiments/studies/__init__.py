@@ -9,6 +9,7 @@
 :data:`DEPTH`               :mod:`.depth_types`: from which depth Gaussians begin anew
 :data:`EXPOSURE`            :mod:`.exposures`: exposures that were disturbed, found again
 :data:`POSE`                :mod:`.poses`: poses that were disturbed, found again
+:data:`PRECISION`           :mod:`.precision`: a training in float64, float32, and with colours in float16
 ==========================  =====================================================================
 
 Here are their names and arguments. The modules hold the work; they load matplotlib and Numba, and so wait until a study
@@ -29,7 +30,9 @@ RECIPE_HELP = "name as in train --recipe"
 
 def all_studies() -> dict[str, Study]:
     """Return the studies of this package by the name that is typed; an extension's are EXTENSION/NAME."""
-    return {study.name: study for study in (ADAPTIVE, ABLATION, SPLIT, CULLING, SIMPLIFY, DEPTH, EXPOSURE, POSE)}
+    return {
+        study.name: study for study in (ADAPTIVE, ABLATION, SPLIT, CULLING, SIMPLIFY, DEPTH, EXPOSURE, POSE, PRECISION)
+    }
 
 
 def _run_of(module: str) -> Callable[[argparse.Namespace], None]:
@@ -192,6 +195,18 @@ def _add_pose_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_precision_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Train a scene in float64, in float32 with exact and with fast kernels, and with\ncolours in float16. The same "
+        "command with the same folder goes on where it was\ninterrupted."
+    )
+    _add_scene_arguments(parser, iterations=3000)
+    parser.add_argument(
+        "--recipe", type=name, default="mini-splatting2", metavar="R", help=f"{RECIPE_HELP} (default %(default)s)"
+    )
+    _add_seeds(parser)
+
+
 ADAPTIVE = Study(
     name="adaptive",
     summary="the recipe that decides for itself, beside those with a schedule",
@@ -239,4 +254,10 @@ POSE = Study(
     summary="pose refinement: cameras moved by known amounts, and recovered",
     add_arguments=_add_pose_arguments,
     run=_run_of("poses"),
+)
+PRECISION = Study(
+    name="precision",
+    summary="float64, float32 exact and fast, colours in float16: what a training needs",
+    add_arguments=_add_precision_arguments,
+    run=_run_of("precision"),
 )
