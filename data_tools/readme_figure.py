@@ -1,79 +1,121 @@
 """The README's figure: a photograph beside its render, and speed beside error.
 
-Nothing is measured here; two folders are read, with BACKENDS reference-f64,cpu-f64,cpu-f32,textbook-f32::
+Nothing is measured here. The pictures are of one test view of a run; the times and errors are those of the table in
+``docs/measured/speed.md``, which ``minisplat-ref bench`` has printed::
 
-    minisplat-ref train FOX --out runs/fox
-    NUMBA_NUM_THREADS=1 minisplat-ref bench --workloads synth --repeats 3 --backends BACKENDS --out bench
-    python -m data_tools.readme_figure runs/fox bench
+    minisplat-ref train BANANA --out runs/banana
+    python -m data_tools.readme_figure runs/banana --view NAME
 
-The photograph is the test view of median PSNR. Times are the least of the turns that each contender had.
+BANANA is a data set of Piero Toffanin; its licence, MIT, lies beside the figure. Photographs under other licences stay
+out of the repository.
 """
 
 import argparse
 import io
-import json
+import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from minisplat_ref.errors import InputError
 from minisplat_ref.experiments import run_folder
 from minisplat_ref.experiments.pictures import GAP
 from minisplat_ref.experiments.plots import PLOT_STYLE
 from minisplat_ref.io import read_image
+from minisplat_ref.io.atomic import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-OUT = Path(__file__).parents[1] / "docs" / "figures" / "readme.png"
-CONTENDERS = {  # name in bench.json: what the figure calls it, its colour, where the text stands
-    "reference-f64": ("the reference: NumPy, float64", "#3d4650", (12, -4)),
-    "cpu-f64": ("kernels, float64", "#35608c", (12, -4)),
-    "cpu-f32": ("kernels, float32 (default)", "#d2493f", (-12, -18)),
-    "textbook-f32": ("a textbook loop,\ncompiled, float32", "#b5651d", (-12, 10)),
+DOCS = Path(__file__).parents[1] / "docs"
+CONTENDERS = {  # backend of the table: what the figure calls it, its colour, where the text stands, points
+    "reference float64": ("the reference: NumPy, float64", "#3d4650", (13, 0)),
+    "cpu float64": ("kernels, float64", "#35608c", (13, 0)),
+    "cpu float32": ("kernels, float32: the default", "#b8392f", (-13, -2)),
+    "textbook float32": ("a textbook loop, compiled, float32", "#8a5a14", (-13, 2)),
 }
+TEXT = "#22272c"
 LEAST_ERROR = 1e-16  # where the reference stands, which has none
-SIZE, DPI = (11.6, 4.4), 100  # inches; pixels per inch
+SIZE, DPI = (11.6, 4.8), 100  # inches; pixels per inch
 N_COLORS = 256  # of the PNG, to keep it small
 
 
 def main() -> None:
-    """Read the folders and write the figure."""
-    parser = argparse.ArgumentParser(description="Draw the README's figure from a run and a benchmark.")
+    """Write the figure."""
+    parser = argparse.ArgumentParser(description="Draw the README's figure.")
     parser.add_argument("run", type=Path, metavar="RUN", help="the --out folder of a training")
-    parser.add_argument("bench", type=Path, metavar="BENCH", help="the --out folder of minisplat-ref bench")
-    parser.add_argument("--out", type=Path, default=OUT, metavar="PNG", help="file to write")
+    parser.add_argument("--view", metavar="NAME", required=True, help="test view to show")
+    parser.add_argument(
+        "--out", type=Path, default=DOCS / "figures" / "readme.png", metavar="PNG", help="file to write"
+    )
     args = parser.parse_args()
-    print(f"{args.out}: {draw(args.run, args.bench, args.out)} bytes")
+    draw(args.run, args.view, args.out)
+    print(f"{args.out}: {args.out.stat().st_size:,} bytes")
 
 
-def draw(run: Path, bench: Path, out: Path) -> int:
-    """Write the figure and return its size in bytes."""
+def draw(run: Path, name: str, out: Path) -> None:
+    """Write the figure as a PNG."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     metrics = run_folder.read_json_object(run / run_folder.METRICS)
-    view = sorted(metrics["per_view"], key=lambda view: view["psnr"])[len(metrics["per_view"]) // 2]
-    truth, render = _truth_and_render(run / run_folder.RENDERS / f"{view['name']}.png")
+    psnrs = {view["name"]: view["psnr"] for view in metrics["per_view"]}
+    if name not in psnrs:
+        raise InputError(f"{run} has no test view {name!r}: give --view one of {', '.join(psnrs)}")
+    truth, render = _truth_and_render(run / run_folder.RENDERS / f"{name}.png")
     with rc_context(PLOT_STYLE):
         figure = Figure(figsize=SIZE, dpi=DPI, layout="constrained", facecolor="white")
-        grid = figure.subplots(1, 3, width_ratios=[1, 1, 2.9])
-        for axes, picture, title in (
-            (grid[0], truth, "photograph, not trained on"),
-            (grid[1], render, f"rendered: {view['psnr']:.1f} dB"),
+        grid = figure.add_gridspec(2, 2, width_ratios=[1, 2.2])
+        for row, (picture, title) in enumerate(
+            (
+                (truth, "a photograph that was held out"),
+                (render, f"its render, {psnrs[name]:.1f} dB, from {metrics['n_gaussians']:,} Gaussians"),
+            )
         ):
+            axes = figure.add_subplot(grid[row, 0])
             axes.imshow(picture, interpolation="lanczos")
-            axes.set_title(title, fontsize=11)
+            axes.set_title(title, fontsize=11, color=TEXT)
             axes.set_axis_off()
-        _draw_times(grid[2], json.loads((bench / "bench.json").read_text(encoding="utf-8"))["cases"])
+        times = times_and_errors((DOCS / "measured" / "speed.md").read_text(encoding="utf-8"))
+        _draw_times(figure.add_subplot(grid[:, 1]), times)
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png")
     picture = Image.open(buffer).convert("RGB").quantize(N_COLORS, dither=Image.Dither.NONE)
     out.parent.mkdir(parents=True, exist_ok=True)
-    picture.save(out, optimize=True)
-    return out.stat().st_size
+    with replacing(out) as temporary:
+        picture.save(temporary, format="PNG", optimize=True)
+
+
+def times_and_errors(text: str) -> dict[str, tuple[float, float]]:
+    """Return milliseconds of both passes, and the gradient's error, of each backend on ``synth``.
+
+    Parameters
+    ----------
+    text : str
+        With the table of ``docs/measured/speed.md``.
+
+    Raises
+    ------
+    InputError
+        A backend is not in the table.
+    """
+    found: dict[str, tuple[float, float]] = {}
+    for line in text.splitlines():
+        cells = [cell.strip(" *") for cell in line.strip("|").split("|")]
+        if len(cells) == 8 and cells[1] in CONTENDERS:
+            found.setdefault(cells[1], (_number(cells[3]), _number(cells[6])))  # synth comes before garden
+    for name in CONTENDERS:
+        if name not in found:
+            raise InputError(f"docs/measured/speed.md has no row of {name!r}: give it the table of minisplat-ref bench")
+    return found
+
+
+def _number(cell: str) -> float:
+    """Return the number of a cell that stands before any brackets."""
+    return float(re.sub(r"\(.*\)|,", "", cell))
 
 
 def _truth_and_render(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
@@ -83,24 +125,23 @@ def _truth_and_render(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]
     return picture[:, :width], picture[:, width + GAP : 2 * width + GAP]
 
 
-def _draw_times(axes: "Axes", cases: list[dict[str, Any]]) -> None:
-    by_name = {case["name"].split("/", 1)[1]: case["figures"] for case in cases}
+def _draw_times(axes: "Axes", found: dict[str, tuple[float, float]]) -> None:
     for name, (label, color, offset) in CONTENDERS.items():
-        figures = by_name[name]
-        error, milliseconds = max(float(figures["gradient, no flips"]), LEAST_ERROR), float(figures["least both ms"])
-        axes.plot([error], [milliseconds], "o", color=color, markersize=11)
+        milliseconds, error = found[name]
+        place = (max(error, LEAST_ERROR), milliseconds)
+        axes.plot(*place, "o", color=color, markersize=12)
         axes.annotate(
             f"{label}\n{milliseconds:,.0f} ms",
-            (error, milliseconds),
+            place,
             xytext=offset,
             textcoords="offset points",
             color=color,
             ha="left" if offset[0] > 0 else "right",
-            va="center" if offset[1] == -4 else "bottom" if offset[1] > 0 else "top",
+            va="center",
         )
-    axes.set(xscale="log", yscale="log", xlim=(LEAST_ERROR / 2, 1e-3), ylim=(10, 60_000))
-    axes.set_xlabel("error of the gradient against the reference (relative, worst parameter)")
-    axes.set_title("50,000 Gaussians, 480 x 270, forward and backward, one core (ms)", fontsize=11)
+    axes.set(xscale="log", yscale="log", xlim=(LEAST_ERROR / 3, 1e-4), ylim=(5, 30_000))
+    axes.set_xlabel("error of the gradient against the reference (relative L2, worst parameter)")
+    axes.set_title("50,000 Gaussians, forward and backward, two cores (ms)", fontsize=11, color=TEXT)
     axes.set_axisbelow(True)
 
 

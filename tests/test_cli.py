@@ -31,7 +31,7 @@ from minisplat_ref.rendering import render
 WIDTH, HEIGHT = 32, 24
 N_TRAIN, N_TEST = 6, 2
 ITERATIONS = 20
-HELP_LINES_MAX, HELP_COLUMNS_MAX = 44, 80
+HELP_LINES_MAX, HELP_COLUMNS_MAX = 45, 80
 SETTINGS = {"n_views": N_TRAIN, "width": WIDTH, "height": HEIGHT, "n_points": 60, "test_every": 4}
 RUN_FILES = {
     "cameras.json",

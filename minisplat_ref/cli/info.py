@@ -20,13 +20,13 @@ Rows = list[tuple[str, str]]
 DESCRIPTION = """\
 Say what is in a file or folder: counts, SH degree, bounds, sizes.
 
-  point_cloud.ply   Gaussians in the 3DGS layout, whoever wrote them
+  point_cloud.ply   Gaussians in the 3DGS layout, from any program
   checkpoint.npz    a training that can be continued
   run folder        the --out of a training: settings, measures, what fired
   scene folder      COLMAP (images/, sparse/0/) or transforms.json
   .spz and others   compact files of Gaussians, see minisplat-ref convert
 
-Everything is read and checked; of damaged input it says what is wrong.
+Everything is read and checked. If something is damaged, info says what.
 """
 EPILOG = """\
 examples:
@@ -44,7 +44,7 @@ def add_parser(commands: Commands) -> None:
         epilog=EPILOG,
         formatter_class=HelpFormatter,
     )
-    parser.add_argument("path", type=Path, metavar="FILE", help="any of these")
+    parser.add_argument("path", type=Path, metavar="FILE", help="any of the above")
     parser.set_defaults(run=run)
 
 

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from minisplat_ref.io.viewpoints import Viewpoint
 
 DESCRIPTION = """\
-Render a run (its --out folder), or Gaussians from whoever wrote them: a PLY or
-a compact file (.spz and others, see minisplat-ref convert).
+Render a run (its --out folder), or Gaussians that any program wrote: a PLY or a
+compact file (.spz and others, see minisplat-ref convert).
 
 Cameras, by --cameras:
   test, train, all   those of the run (default test)
@@ -60,11 +60,19 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("--cameras", metavar="WHICH", help="see above")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where to write (default: beside the input)")
     parser.add_argument("--depth", action="store_true", help="also NAME_depth.npy (camera z) and its picture")
-    parser.add_argument("--extension", metavar="E", help="that the PLY was trained with (a run knows its own)")
-    parser.add_argument("--frames", type=integer(1), default=60, metavar="N", help="of an orbit (default 60)")
-    parser.add_argument("--arc", type=_arc, metavar="A", help="degrees of an orbit (default: what was photographed)")
-    parser.add_argument("--size", type=_size, metavar="WxH", help="of an orbit (default: the run's, or 640x480)")
-    parser.add_argument("--film", type=Path, metavar="FILE", help="also as a film: .gif, or .mp4 with imageio[ffmpeg]")
+    parser.add_argument("--extension", metavar="E", help="the one that the PLY was trained with (a run knows its own)")
+    parser.add_argument(
+        "--frames", type=integer(1), default=60, metavar="N", help="number of pictures of an orbit (default 60)"
+    )
+    parser.add_argument(
+        "--arc", type=_arc, metavar="A", help="degrees that an orbit covers (default: what was photographed)"
+    )
+    parser.add_argument(
+        "--size", type=_size, metavar="WxH", help="pixels of an orbit's pictures (default: the run's, or 640x480)"
+    )
+    parser.add_argument(
+        "--film", type=Path, metavar="FILE", help="also make a film: .gif, or .mp4 with imageio[ffmpeg]"
+    )
     parser.add_argument("--fps", type=positive, default=25.0, metavar="F", help="pictures a second (default 25)")
     parser.add_argument(
         "--background", type=color, metavar="R,G,B", help="0 to 255 each (default: the run's, or 0,0,0)"

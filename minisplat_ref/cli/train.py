@@ -106,22 +106,25 @@ def add_parser(commands: Commands) -> None:
     )
     training.add_argument("--init", type=Path, metavar="PLY", help="points to start from (default: the scene's)")
     training.add_argument(
-        "--iterations", type=integer(1), metavar="N", help="one view each (default 3000; adaptive: at most)"
+        "--iterations",
+        type=integer(1),
+        metavar="N",
+        help="one view each (default 3000; adaptive decides itself)",
     )
-    training.add_argument("--minutes", type=positive, metavar="T", help="with adaptive: end after so many at most")
+    training.add_argument("--minutes", type=positive, metavar="T", help="with adaptive: the most minutes to take")
     training.add_argument(
-        "--budget", type=integer(1), metavar="N", help="most Gaussians, for recipes that choose their number"
+        "--budget", type=integer(1), metavar="N", help="the most Gaussians, for recipes that choose their number"
     )
     target = training.add_mutually_exclusive_group()
     target.add_argument(
-        "--max-drop", type=decibels, metavar="dB", help="then simplify: PSNR to lose, into DIR/simplified"
+        "--max-drop", type=decibels, metavar="dB", help="simplify at the end, into DIR/simplified: PSNR to lose"
     )
-    target.add_argument("--max-bytes", type=integer(1), metavar="B", help="likewise: size of its PLY at most")
+    target.add_argument("--max-bytes", type=integer(1), metavar="B", help="likewise: size that its PLY may have")
     training.add_argument(
         "--simplify",
         choices=("sampling", "rank", "merging"),
         metavar="S",
-        help="by sampling (default), rank or merging",
+        help="simplify by sampling (default), rank or merging",
     )
     training.add_argument(
         "--scene-type",
@@ -129,7 +132,7 @@ def add_parser(commands: Commands) -> None:
         metavar="T",
         help="indoor (default) or outdoor: what counts as important",
     )
-    training.add_argument("--extension", metavar="E", help="train with it; its own recipes are names for --recipe")
+    training.add_argument("--extension", metavar="E", help="extension to train with; its own recipes go to --recipe")
     training.add_argument(
         "--set",
         type=assignment,
@@ -141,16 +144,16 @@ def add_parser(commands: Commands) -> None:
         "--eval-every",
         type=integer(0),
         metavar="K",
-        help="measure every K iterations, into curve.jsonl (default 0)",
+        help="measure every K iterations, into curve.jsonl",
     )
     training.add_argument(
-        "--lpips-weights", type=Path, metavar="NPZ", help="measure LPIPS in the end; eval --help tells how"
+        "--lpips-weights", type=Path, metavar="NPZ", help="measure LPIPS at the end; eval --help says how"
     )
-    training.add_argument("--seed", type=integer(0), metavar="S", help="of all random draws (default 0)")
+    training.add_argument("--seed", type=integer(0), metavar="S", help="seed of all random draws (default 0)")
     training.add_argument(
-        "--check-every", type=integer(1), metavar="K", help="look for NaN in each K-th iteration (default 10)"
+        "--check-every", type=integer(1), metavar="K", help="look for NaN in every K-th iteration (default 10)"
     )
-    training.add_argument("--drop-bad-steps", action="store_true", help="leave out steps with NaN instead of stopping")
+    training.add_argument("--drop-bad-steps", action="store_true", help="skip steps with NaN instead of stopping")
     add_renderer_arguments(training, argparse.SUPPRESS)
     parser.set_defaults(run=run)
 
