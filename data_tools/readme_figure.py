@@ -4,7 +4,7 @@ Nothing is measured here. The pictures are of one test view of a run; the times 
 ``docs/measured/speed.md``, which ``minisplat-ref bench`` has printed::
 
     minisplat-ref train BANANA --out runs/banana
-    python -m data_tools.readme_figure runs/banana --view NAME
+    python -m data_tools.readme_figure runs/banana --view DSC_0423
 
 BANANA is a data set of Piero Toffanin; its licence, MIT, lies beside the figure. Photographs under other licences stay
 out of the repository.
@@ -68,11 +68,11 @@ def draw(run: Path, name: str, out: Path) -> None:
     truth, render = _truth_and_render(run / run_folder.RENDERS / f"{name}.png")
     with rc_context(PLOT_STYLE):
         figure = Figure(figsize=SIZE, dpi=DPI, layout="constrained", facecolor="white")
-        grid = figure.add_gridspec(2, 2, width_ratios=[1, 2.2])
+        grid = figure.add_gridspec(2, 2, width_ratios=[1, 1.75])
         for row, (picture, title) in enumerate(
             (
-                (truth, "a photograph that was held out"),
-                (render, f"its render, {psnrs[name]:.1f} dB, from {metrics['n_gaussians']:,} Gaussians"),
+                (truth, "a photograph, held out"),
+                (render, f"its render: {psnrs[name]:.1f} dB, {metrics['n_gaussians']:,} Gaussians"),
             )
         ):
             axes = figure.add_subplot(grid[row, 0])

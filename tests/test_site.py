@@ -8,7 +8,8 @@ from types import SimpleNamespace
 import pytest
 
 import minisplat_ref
-from data_tools import site
+from data_tools import readme_figure, site
+from minisplat_ref.errors import InputError
 
 ROOT = Path(__file__).parents[1]
 PAGES = {"index.md", "CONTRIBUTING.md", "GUIDE.md", "EXTENDING.md", "measured/speed.md", "measured/training.md"} | {
@@ -70,3 +71,12 @@ def test_metadata_agree():
     assert re.findall(r"^license: (.*)$", citation, re.MULTILINE) == [project["license"]]
     named = [author["name"] for author in project["authors"]]
     assert re.findall(r"^  - name: (.*)$", citation, re.MULTILINE) == named
+
+
+def test_the_figure_of_the_readme_has_its_numbers_from_the_table():
+    text = (ROOT / "docs" / "measured" / "speed.md").read_text(encoding="utf-8")
+    found = readme_figure.times_and_errors(text)
+    assert found["reference float64"][1] == 0 and found["textbook float32"][0] > found["cpu float32"][0]
+    with pytest.raises(InputError, match="no row of 'cpu float64'"):
+        readme_figure.times_and_errors(text.replace("cpu float64", "other"))
+    assert (ROOT / "docs" / "figures" / "readme.png").stat().st_size < 150_000
