@@ -145,3 +145,6 @@ HALF_FLOAT = 4.9e-4
 # The same rotations of an SPZ by two programs, radians: the fourth component is the root of what the others leave of 1,
 # in float32 there; near zero that is the root of some roundings of 6e-8.
 SPZ_ROTATION = 1e-3
+
+# Displacements of half a pixel that are read off slopes, pixels: linear in them, and photographs are bytes.
+DISPLACEMENT_PX = 0.15
