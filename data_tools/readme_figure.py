@@ -83,10 +83,10 @@ def draw(run: Path, name: str, out: Path) -> None:
         _draw_times(figure.add_subplot(grid[:, 1]), times)
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png")
-    picture = Image.open(buffer).convert("RGB").quantize(N_COLORS, dither=Image.Dither.NONE)
+    small = Image.open(buffer).convert("RGB").quantize(N_COLORS, dither=Image.Dither.NONE)
     out.parent.mkdir(parents=True, exist_ok=True)
     with replacing(out) as temporary:
-        picture.save(temporary, format="PNG", optimize=True)
+        small.save(temporary, format="PNG", optimize=True)
 
 
 def times_and_errors(text: str) -> dict[str, tuple[float, float]]:
