@@ -139,7 +139,7 @@ def _make_room(out: Path, names: Sequence[str]) -> None:
     strange = sorted(found - {f"{name}{end}" for name in (*listed, *names) for end in ENDS})
     if strange:
         raise InputError(
-            f"{out} holds other pictures than those of a rendering, such as {strange[0]}: give another --out, or remove"
+            f"{out} holds pictures other than those of a rendering, such as {strange[0]}: give another --out, or remove"
             " them"
         )
     run_folder.create(out)
