@@ -15,7 +15,7 @@ and not theirs, and counts on both sides of the comparison:
     gain of a photograph = 10 log10 (sum over halves |r - mean x b|^2 / sum over halves |r - (x of the other half) b|^2)
 
 In decibels of the squared error. It speaks for the calibration when its mean over the photographs is above both a least
-gain and two of its standard errors.
+gain and its standard error. One and not two: gains differ much from photograph to photograph, and these are few.
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,7 +31,6 @@ from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Bools, Floats
 
 DARK, BRIGHT = 0.05, 0.98  # brightness, of 1, of pixels that say nothing of a gain: noise, and what is saturated
-STANDARD_ERRORS = 2.0
 
 
 class Half(NamedTuple):
@@ -70,7 +69,7 @@ class Evidence(NamedTuple):
 
     def is_above(self, least_gain: float) -> bool:
         """Return whether it speaks for the calibration; ``least_gain`` in dB."""
-        return self.gain > max(least_gain, STANDARD_ERRORS * self.standard_error)
+        return self.gain > max(least_gain, self.standard_error)
 
 
 def halves_of(residual: Floats, fields: Floats, is_counted: Bools) -> tuple[Half, Half]:

@@ -57,7 +57,7 @@ def switch_exposure_on(state: TrainState, iteration: Iteration, *, least_exposur
     state, iteration
         As for every action.
     least_exposure_gain : float
-        dB of the squared error that the photographs have to gain on average, and two standard errors besides.
+        dB of the squared error that the photographs have to gain on average, more than the standard error of that.
     """
     if EXPOSURE.name in state.pace.switched_on or EXPOSURES in state.shared:
         return "nothing done: exposures are on"

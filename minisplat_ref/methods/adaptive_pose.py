@@ -36,7 +36,7 @@ def switch_pose_on(state: TrainState, iteration: Iteration, *, least_pose_gain: 
     state, iteration
         As for every action.
     least_pose_gain : float
-        dB of the squared error that the photographs have to gain on average, and two standard errors besides.
+        dB of the squared error that the photographs have to gain on average, more than the standard error of that.
     """
     if POSE.name in state.pace.switched_on or ROTATIONS in state.shared:
         return "nothing done: poses are refined"
