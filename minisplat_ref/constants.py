@@ -141,3 +141,4 @@ MINI_SPLATTING2 = INRIA._replace(
 """The rasteriser of Mini-Splatting2: INRIA's with tight bounds."""
 
 PROFILES = {profile.name: profile for profile in (GSPLAT_MAIN, GSPLAT_1_5, INRIA, MINI_SPLATTING2)}
+"""The profiles by their names, as ``--profile`` takes them."""

@@ -34,7 +34,7 @@ from minisplat_ref.rendering import render
 WIDTH, HEIGHT = 32, 24
 N_TRAIN, N_TEST = 6, 2
 ITERATIONS = 20
-HELP_LINES_MAX, HELP_COLUMNS_MAX = 40, 80
+HELP_LINES_MAX, HELP_COLUMNS_MAX = 45, 80
 SETTINGS = {"n_views": N_TRAIN, "width": WIDTH, "height": HEIGHT, "n_points": 60, "test_every": 4}
 RUN_FILES = {
     "cameras.json",
@@ -119,6 +119,7 @@ def test_train_leaves_a_complete_folder(run_folder, scene_folder):
         "lpips_weights": None,
         "minutes": None,
         "init": None,
+        "background": None,
     }
     assert config["recipe"]["iterations"] == ITERATIONS and config["versions"]["numba"]
 

@@ -80,7 +80,9 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--scene", type=Path, metavar="SCENE", help="photographs for --stages (default a made room) and opensplat"
     )
-    parser.add_argument("--downscale", type=integer(1), default=1, metavar="K", help="of the photographs (default 1)")
+    parser.add_argument(
+        "--downscale", type=integer(1), default=1, metavar="D", help="make them D times smaller (default 1)"
+    )
     parser.add_argument("--iterations", type=integer(1), default=100, metavar="N", help="of the scene (default 100)")
     outputs = parser.add_mutually_exclusive_group()
     outputs.add_argument("--out", type=Path, metavar="DIR", help=f"write {PAGE}, {JSON}, {TABLE} and {FIGURE}")

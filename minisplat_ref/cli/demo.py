@@ -24,6 +24,9 @@ pictures, depth against the exact depth, curves, and what to try next.
 Takes a minute or two on two cores. The folder that it leaves is a run like
 those of train, with the photographs in DIR/scene.
 """
+EPILOG = """\
+example:
+  minisplat-ref demo --out demo"""
 
 
 def add_parser(commands: Commands) -> None:
@@ -32,6 +35,7 @@ def add_parser(commands: Commands) -> None:
         "demo",
         help="see it work: make a scene, train it, write a report",
         description=DESCRIPTION,
+        epilog=EPILOG,
         formatter_class=HelpFormatter,
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help=f"new folder for all of it (default {DEFAULT_OUT})")

@@ -60,7 +60,7 @@ def downscale_images(images: Path, factor: int) -> Path:
         If there are no images, one cannot be read, or the new folder is already there.
     """
     if factor < 2:
-        raise InputError(f"--factor is {factor}; it must be at least 2")
+        raise InputError(f"--downscale is {factor}; it must be at least 2")
     files = list_images(images)
     target = images.with_name(f"{images.name}_{factor}")
     with making_folder(target) as folder:

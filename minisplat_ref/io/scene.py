@@ -6,13 +6,14 @@ only sizes are checked here, and pixels are read on demand (:mod:`minisplat_ref.
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from minisplat_ref import memory
 from minisplat_ref.errors import InputError
@@ -35,6 +36,7 @@ from minisplat_ref.types import Bools, Camera, Floats, Ints, Scene, View, number
 
 EXTENT_MARGIN = 1.1  # the 3DGS code's factor on the radius of the cameras; the learning rates were tuned with it
 COORDINATE_MAX = 1e18  # world units or pixels; the square of more would overflow float32
+SILENT_SECONDS = 2.0  # before reading photographs shows a progress bar
 ROTATION_TOLERANCE = 1e-3  # greatest error of R R^T = I: poses written with four digits pass, scaled ones do not
 
 
@@ -145,10 +147,10 @@ def build_scene(
     names = _view_names(photos, source)
     shelf_bytes = memory.shelf_bytes(sum(map(_n_bytes, photos)) / reading.downscale**2)
     if shelf_bytes is None:
-        views = tuple(read_view(photo, name, reading) for photo, name in zip(photos, names, strict=True))
+        views = tuple(read_view(photo, name, reading) for photo, name in _shown(photos, names))
     else:
         shelf = Shelf(shelf_bytes)
-        views = tuple(stored_view(photo, name, reading, shelf) for photo, name in zip(photos, names, strict=True))
+        views = tuple(stored_view(photo, name, reading, shelf) for photo, name in _shown(photos, names))
     folder = source if source.is_dir() else source.parent
     return Scene(
         name=folder.resolve().name,
@@ -159,6 +161,12 @@ def build_scene(
         background=reading.background,
         extent=extent,
     )
+
+
+def _shown(photos: Sequence[Photo], names: Sequence[str]) -> Iterable[tuple[Photo, str]]:
+    """Return photographs with their names, with a progress bar on a terminal if reading takes a while."""
+    pairs = list(zip(photos, names, strict=True))
+    return tqdm(pairs, desc="photographs", unit=" images", delay=SILENT_SECONDS, leave=False, disable=None)
 
 
 def _n_pixels(photo: Photo) -> int:
@@ -357,7 +365,7 @@ def _check_downscaled(photo: Photo, width: int, height: int, downscale: int) -> 
         raise InputError(
             f"{small_folder}/{photo.file}: the image is {width}x{height} but 1/{downscale} of its camera is"
             f" {exact_width:g}x{exact_height:g}; remove {small_folder} and run"
-            f" `minisplat-ref downscale {photo.folder} --factor {downscale}`"
+            f" `minisplat-ref downscale {photo.folder} --downscale {downscale}`"
         )
 
 

@@ -13,6 +13,9 @@ DESCRIPTION = """\
 Check the renderer, or another one, against the float64 reference.
 """
 EPILOG = """\
+example:
+  minisplat-ref oracle gradients
+
 Exit codes: 0 all passed, 1 a case failed, 2 bad input."""
 
 

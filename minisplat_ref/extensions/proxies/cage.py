@@ -95,7 +95,11 @@ def _middle(means: Floats) -> Floats:
 
 def add_parser(commands: Any) -> None:
     """Add the command."""
-    parser = commands.add_parser("cage", help="make a coarse mesh from a model's Gaussians, to bind them to")
+    parser = commands.add_parser(
+        "cage",
+        help="make a coarse mesh from a model's Gaussians, to bind them to",
+        epilog="example: minisplat-ref proxies cage runs/fox/point_cloud.ply cage.ply --hull",
+    )
     parser.add_argument("model", type=Path, metavar="MODEL", help="PLY of Gaussians")
     parser.add_argument("out", type=Path, metavar="MESH", help="PLY of a mesh to write")
     kind = parser.add_mutually_exclusive_group(required=True)
