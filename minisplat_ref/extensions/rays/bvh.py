@@ -4,8 +4,8 @@ Each inner node splits what is below it at the median of the centres, along the 
 most ``LEAF`` are left. It holds the boxes of both of its halves, so that a step reads one row of each table.
 
 The box of a Gaussian holds the ellipsoid on which alpha has fallen to ``alpha_min``: half as long on axis j as
-``sqrt(q Sigma_jj)`` with ``q = 2 ln(o / alpha_min)``. It is larger by a little than that, so that rounding leaves out no
-ray that grazes it.
+``sqrt(q Sigma_jj)`` with ``q = 2 ln(o / alpha_min)``. It is larger by a little than that, so that rounding leaves out
+no ray that grazes it.
 """
 
 from typing import NamedTuple
@@ -43,15 +43,13 @@ def build(low: Floats, high: Floats) -> Tree:
     """
     n_nodes = max(1, len(low))
     size = SLACK * (high - low + np.maximum(np.abs(low), np.abs(high)))
-    tree = Tree(
-        np.empty((n_nodes, 2, 6)), np.zeros((n_nodes, 2, 2), np.int32), np.arange(len(low), dtype=np.int32)
-    )
+    tree = Tree(np.empty((n_nodes, 2, 6)), np.zeros((n_nodes, 2, 2), np.int32), np.arange(len(low), dtype=np.int32))
     used = _split_all(low - size, high + size, tree)
     return Tree(tree.boxes[:used].copy(), tree.children[:used].copy(), tree.rows)
 
 
 @scalar
-def select_median(rows, first, end, middle, low, high, axis):
+def select_median(rows: Ints, first: int, end: int, middle: int, low: Floats, high: Floats, axis: int) -> None:
     """Reorder ``rows[first:end]`` so that the centres before ``middle`` are no larger than those after it."""
     left, right = first, end - 1
     while left < right:
@@ -73,7 +71,7 @@ def select_median(rows, first, end, middle, low, high, axis):
 
 
 @scalar
-def widest_axis(rows, first, end, low, high):
+def widest_axis(rows: Ints, first: int, end: int, low: Floats, high: Floats) -> int:
     """Return the axis on which the centres spread most."""
     widest, axis = -1.0, 0
     for k in range(3):
@@ -87,7 +85,7 @@ def widest_axis(rows, first, end, low, high):
 
 
 @kernel(parallel=False)
-def _split_all(low, high, tree):
+def _split_all(low: Floats, high: Floats, tree: Tree) -> int:
     """Fill the tree from the root down; return how many nodes it has."""
     firsts, ends = np.zeros(MOST_LEVELS, np.int64), np.zeros(MOST_LEVELS, np.int64)
     nodes = np.zeros(MOST_LEVELS, np.int64)
@@ -118,13 +116,13 @@ def _split_all(low, high, tree):
 
 
 @scalar
-def inverse_of(d):
+def inverse_of(d: float) -> float:
     """Return 1 / d, large where d is zero."""
     return 1.0 / (d if abs(d) > TINY else TINY)
 
 
 @scalar
-def entry(boxes, node, side, line):
+def entry(boxes: Floats, node: int, side: int, line: tuple[float, ...]) -> tuple[float, float]:
     """Return where a line enters and leaves a box; it misses it where the former is larger."""
     ox, oy, oz, ix, iy, iz = line
     x0, x1 = (boxes[node, side, 0] - ox) * ix, (boxes[node, side, 3] - ox) * ix

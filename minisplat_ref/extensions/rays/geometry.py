@@ -9,7 +9,7 @@ from minisplat_ref.constants import Conventions
 from minisplat_ref.extensions.rays.types import Rays, Whitened
 from minisplat_ref.reference.covariance import rotation_matrices, rotation_matrices_vjp
 from minisplat_ref.reference.pinhole import pinhole_rays, with_principal_point
-from minisplat_ref.types import Camera, Floats
+from minisplat_ref.types import Bools, Camera, Floats
 
 
 def whiten(means: Floats, quats: Floats, log_scales: Floats, opacities: Floats) -> Whitened:
@@ -49,7 +49,7 @@ def whiten_vjp(quats: Floats, log_scales: Floats, gaussians: Whitened, v_maps: F
     v_quats : ndarray of shape (N, 4)
     v_log_scales : ndarray of shape (N, 3)
     """
-    is_met = v_maps.any(axis=(1, 2))  # the others may have no finite map
+    is_met: Bools = np.any(v_maps, axis=(1, 2))  # the others may have no finite map
     maps = np.where(is_met[:, None, None], gaussians.maps, 0.0)
     inverse_scales = np.exp(-np.where(is_met[:, None], log_scales, 0.0).astype(np.float64))
     v_R = np.swapaxes(inverse_scales[:, :, None] * v_maps, 1, 2)

@@ -440,8 +440,9 @@ def _listed(scene: Scene, rays: Rays, conventions: Conventions, counts: Ints) ->
     """Return the hits, ``counts`` [P] of each ray, with rows of the scene in the place of the population's."""
     offsets = np.concatenate([[0], np.cumsum(counts)])
     n_hits = int(offsets[-1])
-    ids, floats = np.empty((2, n_hits), np.int64), np.empty((3, n_hits))
-    hits = Hits(offsets, *ids, *floats, np.empty(len(counts)))
+    ray_ids, rows = np.empty((2, n_hits), np.int64)
+    unclamped, depths, weights = np.empty((3, n_hits))
+    hits = Hits(offsets, ray_ids, rows, unclamped, depths, weights, np.empty(len(counts)))
     _list(scene, rays, limits_of(conventions, len(scene.ids)), n_threads(), hits)
     return hits
 

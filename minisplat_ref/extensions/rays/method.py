@@ -75,7 +75,8 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, _T
     """
     g, camera, wants = model.gaussians, view.camera, request.wants
     if wants - WANTS:
-        raise InputError(f"rays does not give {', '.join(sorted(wants - WANTS))}: use a recipe that does not ask for it")
+        names = ", ".join(sorted(wants - WANTS))
+        raise InputError(f"rays does not give {names}: use a recipe that does not ask for it")
     dtype, conventions, backend = g.means.dtype, request.conventions, request.backend
     stored_degree = math.isqrt(g.sh_rest.shape[1] + 1) - 1
     degree = stored_degree if request.sh_degree is None else min(request.sh_degree, stored_degree)
@@ -135,8 +136,10 @@ def render_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None) -> RenderGr
         "sh_dc": v_sh.sh_dc,
         "sh_rest": v_sh.sh_rest,
     }
+    further = {name: np.zeros_like(field) for name, field in g._asdict().items() if name not in of_fields}
+    of_fields = {name: field.astype(dtype) for name, field in of_fields.items()}
     return RenderGradient(
-        gaussians=g._replace(**{name: of_fields.get(name, np.zeros_like(field)).astype(dtype) for name, field in g._asdict().items()}),
+        gaussians=g._replace(**of_fields, **further),
         background=v.background.astype(dtype),
         cam_from_world_R=(v_R + v_sh.cam_from_world_R).astype(dtype),
         cam_from_world_t=(v_t + v_sh.cam_from_world_t).astype(dtype),

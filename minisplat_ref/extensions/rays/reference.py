@@ -1,6 +1,7 @@
 """A ray and a 3D Gaussian, and what a ray sees of many of them, in NumPy: every ray meets every Gaussian.
 
-RaySplats, section 3. The map ``M = diag(1/s) R^T`` takes the Gaussian around mu to the unit ball. On the ray ``O + t d``
+RaySplats, section 3. The map ``M = diag(1/s) R^T`` takes the Gaussian around mu to the unit ball. On the ray
+``O + t d``
 
     p = M (mu - O),  v = M d
     t = (v . p) / (v . v)            where the density on the ray is greatest

@@ -25,7 +25,7 @@ def blend_stats(hits: Hits, size: tuple[int, int], n: int) -> BlendStats:
     dominant_ids[rays[heaviest_last]] = ids[heaviest_last]
     counts = np.bincount(dominant_ids[dominant_ids >= 0], minlength=n)
     return BlendStats(
-        np.bincount(ids, weights, n),
+        np.bincount(ids, weights, n).astype(np.float64),
         largest,
         np.bincount(ids, minlength=n).astype(np.int32),
         counts.astype(np.int32),
