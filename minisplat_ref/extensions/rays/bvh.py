@@ -113,21 +113,3 @@ def _split_all(low: Floats, high: Floats, tree: Tree) -> int:
                 n_waiting += 1
                 used += 1
     return used
-
-
-@scalar
-def inverse_of(d: float) -> float:
-    """Return 1 / d, large where d is zero."""
-    return 1.0 / (d if abs(d) > TINY else TINY)
-
-
-@scalar
-def entry(boxes: Floats, node: int, side: int, line: tuple[float, ...]) -> tuple[float, float]:
-    """Return where a line enters and leaves a box; it misses it where the former is larger."""
-    ox, oy, oz, ix, iy, iz = line
-    x0, x1 = (boxes[node, side, 0] - ox) * ix, (boxes[node, side, 3] - ox) * ix
-    y0, y1 = (boxes[node, side, 1] - oy) * iy, (boxes[node, side, 4] - oy) * iy
-    z0, z1 = (boxes[node, side, 2] - oz) * iz, (boxes[node, side, 5] - oz) * iz
-    t0 = max(min(x0, x1), min(y0, y1), min(z0, z1))
-    t1 = min(max(x0, x1), max(y0, y1), max(z0, z1))
-    return t0, t1

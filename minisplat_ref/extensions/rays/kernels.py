@@ -1,13 +1,9 @@
 """Rays through a tree of Gaussians: the functions of :mod:`.reference`, without looking at what a ray misses.
 
-A ray goes into the nearer half first and keeps its hits sorted by t. Once those that it has found let less light
-through than a ray may end with, no later hit beyond the last of them counts, and no box that begins there: this bound
-moves nearer as hits are found. It is exact, because what else lies in front can only dim the ray more.
-
-Bundles that a kernel writes to are taken apart first: Numba drops ``bundle.array[i] = x`` from a parallel loop.
-
 The gradient needs no lock and depends on no order of threads: each ray writes what its hits contribute to rows of their
 own, and each Gaussian then adds up its rows in the order of the rays.
+
+Bundles that a kernel writes to are taken apart first: Numba drops ``bundle.array[i] = x`` from a parallel loop.
 """
 
 import math
@@ -17,17 +13,27 @@ import numpy as np
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.extensions.rays import bvh
-from minisplat_ref.extensions.rays.bvh import IS_INNER, MOST_LEVELS, entry, inverse_of
+from minisplat_ref.extensions.rays.formulas import (
+    END_MARGIN,
+    MEAN,
+    N_COLUMNS,
+    OPACITY,
+    REACH,
+    Limits,
+    back,
+    find_hits,
+    meet_vjp,
+    ray_of,
+    room_for,
+)
 from minisplat_ref.extensions.rays.types import BlendedRays, Hits, RayGradient, Rays, Whitened
 from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
+from minisplat_ref.jit.lanes import WIDTH
 from minisplat_ref.jit.turns import no_turns, turns
 from minisplat_ref.types import Floats, Ints
 
-RAYS_A_TURN = 64
+RAYS_A_TURN = 64  # a multiple of eight
 GAUSSIANS_A_TURN = 32
-MEAN, OPACITY, REACH = 9, 12, 13  # columns of a record; the map is the first nine
-N_COLUMNS = 14
-END_MARGIN = 0.999  # of the least transmittance: what is left out by the bound must not hang on a rounding
 
 
 class Scene(NamedTuple):
@@ -43,17 +49,6 @@ class Scene(NamedTuple):
     """[K, 2, 2]."""
     n: int
     """Of the population."""
-
-
-class Limits(NamedTuple):
-    """The thresholds as the kernels read them."""
-
-    alpha_min: float
-    alpha_max: float
-    transmittance_min: float
-    stops_at_equality: bool
-    capacity: int
-    """Most hits that a ray holds at once."""
 
 
 def scene_of(gaussians: Whitened, conventions: Conventions) -> Scene:
@@ -92,132 +87,10 @@ def limits_of(conventions: Conventions, n: int) -> Limits:
     )
 
 
-class Found(NamedTuple):
-    """What one ray has found, nearest first, and what it still has to look at; each thread has its own."""
-
-    depths: Floats
-    unclamped: Floats
-    rows: Ints  # of the scene
-    nodes: Ints
-    entries: Floats
-
-
-@scalar
-def room_for(capacity):
-    """Return empty lists."""
-    return Found(
-        np.empty(capacity, np.float64),
-        np.empty(capacity, np.float64),
-        np.empty(capacity, np.int64),
-        np.empty(MOST_LEVELS, np.int64),
-        np.empty(MOST_LEVELS, np.float64),
-    )
-
-
-@scalar
-def whitened(records, row, ray):
-    """Return p = M (mu - O) and v = M d."""
-    ox, oy, oz, dx, dy, dz = ray
-    ux, uy, uz = records[row, MEAN] - ox, records[row, MEAN + 1] - oy, records[row, MEAN + 2] - oz
-    p0 = records[row, 0] * ux + records[row, 1] * uy + records[row, 2] * uz
-    p1 = records[row, 3] * ux + records[row, 4] * uy + records[row, 5] * uz
-    p2 = records[row, 6] * ux + records[row, 7] * uy + records[row, 8] * uz
-    v0 = records[row, 0] * dx + records[row, 1] * dy + records[row, 2] * dz
-    v1 = records[row, 3] * dx + records[row, 4] * dy + records[row, 5] * dz
-    v2 = records[row, 6] * dx + records[row, 7] * dy + records[row, 8] * dz
-    return p0, p1, p2, v0, v1, v2
-
-
-@scalar
-def nearest_point(p0, p1, p2, v0, v1, v2):
-    """Return t and e = p - t v."""
-    t = (v0 * p0 + v1 * p1 + v2 * p2) / (v0 * v0 + v1 * v1 + v2 * v2)
-    return t, p0 - t * v0, p1 - t * v1, p2 - t * v2
-
-
-@scalar
-def insert(found, n, t, unclamped, row, ids):
-    """Put a hit in its place among n; of equal depths, the lower row of the population comes first."""
-    i = n
-    while i > 0 and (found.depths[i - 1] > t or (found.depths[i - 1] == t and ids[found.rows[i - 1]] > ids[row])):
-        found.depths[i] = found.depths[i - 1]
-        found.unclamped[i] = found.unclamped[i - 1]
-        found.rows[i] = found.rows[i - 1]
-        i -= 1
-    found.depths[i], found.unclamped[i], found.rows[i] = t, unclamped, row
-
-
-@scalar
-def find_hits(scene, ray, near, far, limits, found):
-    """Fill ``found`` with all hits of a ray that may count, sorted; return how many."""
-    ox, oy, oz, dx, dy, dz = ray
-    line = ox, oy, oz, inverse_of(dx), inverse_of(dy), inverse_of(dz)
-    boxes, children = scene.boxes, scene.children
-    least = END_MARGIN * limits.transmittance_min
-    n, T, bound = 0, 1.0, far
-    found.nodes[0], found.entries[0] = 0, near
-    n_waiting = 1
-    while n_waiting > 0:
-        n_waiting -= 1
-        if found.entries[n_waiting] > bound:
-            continue
-        node = found.nodes[n_waiting]
-        t0, t1 = entry(boxes, node, 0, line)
-        s0, s1 = entry(boxes, node, 1, line)
-        first = 0 if t0 <= s0 else 1
-        for turn in range(2):
-            side = first if turn == 0 else 1 - first
-            begin, end = (t0, t1) if side == 0 else (s0, s1)
-            count = children[node, side, 1]
-            if count == IS_INNER or begin > end or end < near or begin > bound:
-                continue
-            for row in range(children[node, side, 0], children[node, side, 0] + count):
-                p0, p1, p2, v0, v1, v2 = whitened(scene.records, row, ray)
-                t, e0, e1, e2 = nearest_point(p0, p1, p2, v0, v1, v2)
-                q = e0 * e0 + e1 * e1 + e2 * e2
-                if not (q <= scene.records[row, REACH] and near < t and t < far and t <= bound):
-                    continue
-                unclamped = scene.records[row, OPACITY] * math.exp(-0.5 * q)
-                alpha = min(limits.alpha_max, unclamped)
-                if alpha < limits.alpha_min:
-                    continue
-                insert(found, n, t, unclamped, row, scene.ids)
-                n += 1
-                T *= 1.0 - alpha
-                while n > 1 and T < least:  # does the last count without those that came to lie in front of it?
-                    without = T / (1.0 - min(limits.alpha_max, found.unclamped[n - 1]))
-                    if without >= least:
-                        break
-                    n -= 1
-                    T = without
-                if T < least:
-                    bound = found.depths[n - 1]
-        for turn in range(2):
-            side = 1 - first if turn == 0 else first
-            begin, end = (t0, t1) if side == 0 else (s0, s1)
-            if children[node, side, 1] == IS_INNER and begin <= end and end >= near and begin <= bound:
-                found.nodes[n_waiting], found.entries[n_waiting] = children[node, side, 0], begin
-                n_waiting += 1
-    return n
-
-
 @scalar
 def goes_on(T, limits):
     """Whether a ray takes the hit that leaves it with T."""
     return T > limits.transmittance_min or (T == limits.transmittance_min and not limits.stops_at_equality)
-
-
-@scalar
-def ray_of(rays, r):
-    """Return the origin and the direction of ray r."""
-    return (
-        rays.origins[r, 0],
-        rays.origins[r, 1],
-        rays.origins[r, 2],
-        rays.directions[r, 0],
-        rays.directions[r, 1],
-        rays.directions[r, 2],
-    )
 
 
 @kernel()
@@ -229,18 +102,21 @@ def _blend(scene, colors, rays, background, limits, n_threads, blended):
         image, depths, transmittances, n_hits, is_seen = blended
         for part in turns(taken, (n_rays + RAYS_A_TURN - 1) // RAYS_A_TURN):
             for r in range(part * RAYS_A_TURN, min((part + 1) * RAYS_A_TURN, n_rays)):
-                n = find_hits(scene, ray_of(rays, r), rays.near[r], rays.far[r], limits, found)
+                lane = r % WIDTH
+                if lane == 0:
+                    find_hits(scene, rays, r, n_rays, limits, found)
+                n = found.counts[lane]
                 T, red, green, blue, depth, count = 1.0, 0.0, 0.0, 0.0, 0.0, 0
                 while count < n:
-                    alpha = min(limits.alpha_max, found.unclamped[count])
+                    alpha = min(limits.alpha_max, found.unclamped[lane, count])
                     after = T * (1.0 - alpha)
                     if not goes_on(after, limits):
                         break
-                    weight, g = alpha * T, scene.ids[found.rows[count]]
+                    weight, g = alpha * T, scene.ids[found.rows[lane, count]]
                     red += weight * colors[g, 0]
                     green += weight * colors[g, 1]
                     blue += weight * colors[g, 2]
-                    depth += weight * found.depths[count]
+                    depth += weight * found.depths[lane, count]
                     is_seen[g] = True
                     T = after
                     count += 1
@@ -260,12 +136,14 @@ def _list(scene, rays, limits, n_threads, hits):
         offsets, ray_ids, rows, unclamped, depths, weights, transmittances = hits
         for part in turns(taken, (n_rays + RAYS_A_TURN - 1) // RAYS_A_TURN):
             for r in range(part * RAYS_A_TURN, min((part + 1) * RAYS_A_TURN, n_rays)):
-                find_hits(scene, ray_of(rays, r), rays.near[r], rays.far[r], limits, found)
+                lane = r % WIDTH
+                if lane == 0:
+                    find_hits(scene, rays, r, n_rays, limits, found)
                 T, first = 1.0, offsets[r]
                 for i in range(offsets[r + 1] - first):
-                    alpha = min(limits.alpha_max, found.unclamped[i])
-                    ray_ids[first + i], rows[first + i] = r, found.rows[i]
-                    unclamped[first + i], depths[first + i] = found.unclamped[i], found.depths[i]
+                    alpha = min(limits.alpha_max, found.unclamped[lane, i])
+                    ray_ids[first + i], rows[first + i] = r, found.rows[lane, i]
+                    unclamped[first + i], depths[first + i] = found.unclamped[lane, i], found.depths[lane, i]
                     weights[first + i] = alpha * T
                     T *= 1.0 - alpha
                 transmittances[r] = T
@@ -275,32 +153,6 @@ class _HitGradient(NamedTuple):
     unclamped: Floats  # [H]
     depths: Floats  # [H]
     rays: Floats  # [P, 6] with respect to origins and directions
-
-
-@scalar
-def meet_vjp(records, row, ray, unclamped, v_unclamped, v_t):
-    """Return v_p and v_v; see the reference's ``meet_vjp``."""
-    p0, p1, p2, v0, v1, v2 = whitened(records, row, ray)
-    t, e0, e1, e2 = nearest_point(p0, p1, p2, v0, v1, v2)
-    k = -unclamped * v_unclamped  # 2 v_q
-    j = v_t / (v0 * v0 + v1 * v1 + v2 * v2)
-    of_p = k * e0 + j * v0, k * e1 + j * v1, k * e2 + j * v2
-    of_v = (
-        j * (p0 - 2.0 * t * v0) - t * k * e0,
-        j * (p1 - 2.0 * t * v1) - t * k * e1,
-        j * (p2 - 2.0 * t * v2) - t * k * e2,
-    )
-    return of_p, of_v
-
-
-@scalar
-def back(records, row, v):
-    """Return M^T v."""
-    return (
-        records[row, 0] * v[0] + records[row, 3] * v[1] + records[row, 6] * v[2],
-        records[row, 1] * v[0] + records[row, 4] * v[1] + records[row, 7] * v[2],
-        records[row, 2] * v[0] + records[row, 5] * v[1] + records[row, 8] * v[2],
-    )
 
 
 class _RayCotangents(NamedTuple):
