@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -86,8 +87,8 @@ def test_an_ellipsoid_at_an_angle_is_the_largest_value_on_the_ray(backend, rng):
 
 
 def test_the_gradient_of_a_meeting(rng):
-    gaussians = random_whitened(rng, 3)
-    rays = rays_along(0.1 * rng.normal(size=(4, 3)), np.column_stack([0.2 * rng.normal(size=(4, 2)), np.ones(4)]))
+    gaussians = random_whitened(rng, 3, size=0.5)
+    rays = rays_along(0.1 * rng.normal(size=(4, 3)), gaussians.means[[0, 1, 2, 0]] + 0.2 * rng.normal(size=(4, 3)))
     rays_ids, ids = np.array([0, 0, 1, 2, 3]), np.array([0, 1, 1, 2, 0])
     inputs = [*gaussians, rays.origins, rays.directions]
 
@@ -132,7 +133,7 @@ def test_the_tree_misses_nothing(n, rng):
     directions[:6] = np.vstack([np.eye(3), -np.eye(3)])  # parallel to the sides of every box
     rays = rays_along(rng.normal(size=(200, 3)) * [1, 1, 3], directions)
     ours, theirs = (hits_of(gaussians, rays, backend) for backend in (CPU, REFERENCE))
-    assert n < 5 or len(theirs.ray_ids) > 50
+    assert n < 5 or len(theirs.ray_ids) >= 3 * n
     for name in ("offsets", "ray_ids", "gaussian_ids"):
         assert_array_equal(getattr(ours, name), getattr(theirs, name), name)
     for name in ("unclamped", "depths", "weights", "transmittances"):
@@ -355,7 +356,7 @@ def test_same_bytes_at_one_and_two_threads(room, tmp_path):
     found = set()
     for n_threads in ("1", "2"):
         out = tmp_path / n_threads
-        command = [sys.executable, "-m", "minisplat_ref", "train", str(room), "--recipe", "rays", "--iterations", "20"]
+        command = [sys.executable, "-m", "minisplat_ref", "train", str(room), "--recipe", "rays", "--iterations", "8"]
         environment = os.environ | {"NUMBA_NUM_THREADS": n_threads}
         subprocess.run([*command, "--out", str(out)], cwd=ROOT, env=environment, check=True, capture_output=True)
         found.add((out / "point_cloud.ply").read_bytes())
@@ -375,7 +376,7 @@ def test_the_degenerate_case_is_one_gaussian_on_the_axis(rng):
 def test_the_speed_is_told_with_its_error(capsys):
     assert main(["study", "rays/speed", "--gaussians", "200", "--repeats", "1"]) == 0
     out = capsys.readouterr().out
-    assert "A ray takes " in out and float(out.split("error of float32 |")[1].split("|")[0]) < PARITY_FLOAT32_IMAGE
+    assert "A ray takes " in out and float(re.search(r"error of float32 +\| +(\S+)", out)[1]) < PARITY_FLOAT32_IMAGE
     assert main(["study", "rays/speed", "--repeats", "0"]) == 2
 
 

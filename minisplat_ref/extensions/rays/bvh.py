@@ -15,7 +15,7 @@ import numpy as np
 from minisplat_ref.jit.compile import kernel, scalar
 from minisplat_ref.types import Floats, Ints
 
-LEAF = 4
+LEAF = 8
 MOST_LEVELS = 64  # of a balanced tree: more than 2^63 leaves
 IS_INNER = -1
 SLACK = 1e-9  # of a box, relative to its size and to its distance from the origin

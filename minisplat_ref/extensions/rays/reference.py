@@ -121,7 +121,7 @@ def list_hits(gaussians: Whitened, rays: Rays, conventions: Conventions) -> Hits
     transmittances = np.ones(n_rays)
     for some in _chunks(n_rays, n):
         pairs = meet(gaussians, rays, np.repeat(some, n), np.tile(np.arange(n), len(some)))
-        unclamped, t = pairs.unclamped.reshape(-1, n), pairs.depths.reshape(-1, n)
+        unclamped, t = (array.reshape(len(some), n) for array in (pairs.unclamped, pairs.depths))
         alpha = np.minimum(conventions.alpha_max, unclamped)
         is_hit = (alpha >= conventions.alpha_min) & (t > rays.near[some, None]) & (t < rays.far[some, None])
         order = np.argsort(np.where(is_hit, t, np.inf), axis=1, kind="stable")  # [P', N]
