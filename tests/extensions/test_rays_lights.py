@@ -274,7 +274,7 @@ def test_mitsuba_meets_the_same_ellipsoids():
     mitsuba.set_variant("scalar_rgb")
     from minisplat_ref.extensions.rays.reference import meet
 
-    g = claims.random_gaussians(30, np.random.default_rng(4), size=0.15)
+    g = claims.random_gaussians(30, np.random.default_rng(4), size=0.05)
     gaussians, rays = whitened_model(Model(g)), pixel_rays(demo.camera_of(12, 9), GSPLAT_MAIN)
     unit = g.quats / np.linalg.norm(g.quats, axis=1, keepdims=True)
     tensors = {"centers": g.means, "scales": np.exp(g.log_scales), "quaternions": np.roll(unit, -1, axis=1)}
