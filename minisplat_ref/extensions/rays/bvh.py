@@ -1,4 +1,4 @@
-"""A tree of boxes, and the walk of a ray through it: what a ray misses is left out in whole branches.
+"""A tree of boxes, so that what a ray misses is left out in whole branches.
 
 Each inner node splits what is below it at the median of the centres, along the axis on which they spread most, until at
 most ``LEAF`` are left. It holds the boxes of both of its halves, so that a step reads one row of each table.
@@ -19,7 +19,6 @@ LEAF = 8
 MOST_LEVELS = 64  # of a balanced tree: more than 2^63 leaves
 IS_INNER = -1
 SLACK = 1e-9  # of a box, relative to its size and to its distance from the origin
-TINY = 1e-300  # in the place of a direction's zero, so that no infinity is multiplied by zero
 
 
 class Tree(NamedTuple):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from minisplat_ref.backends import CPU, REFERENCE
+from minisplat_ref.backends import CPU, PLAIN, REFERENCE
 from minisplat_ref.constants import EXACT_ORDER, GSPLAT_MAIN
 from minisplat_ref.extensions.rays import demo, kernels, reference
 from minisplat_ref.extensions.rays.geometry import pixel_rays
@@ -176,14 +176,20 @@ def seconds_of(function: Callable[[], Any], repeats: int) -> float:
 
 
 def speed(n: int, repeats: int) -> dict[str, float]:
-    """Return microseconds of one processor for a ray and for a rasterised pixel, and the error of float32 tracing."""
+    """Return microseconds of one processor for a ray and for a rasterised pixel, and the error of float32 tracing.
+
+    Of a pixel as the tuned kernels draw it, and the plain ones. The error is that of float32 Gaussians and pictures,
+    against the reference in float64.
+    """
     wide = random_gaussians(n, np.random.default_rng(0), size=0.02)
     gaussians = Gaussians(*(field.astype(np.float32) for field in wide))
     view = view_from(demo.camera_of(240, 135))
     n_pixels, result = 240 * 135, dict[str, float]()
-    for name, renderer in (("pixel", SPLATTING), ("ray", TRACED.renderer)):
-        output, tape = renderer.render(Model(gaussians), view, Request())
-        forward = seconds_of(partial(renderer.render, Model(gaussians), view, Request()), repeats)
+    ways = (("pixel", SPLATTING, CPU), ("plain pixel", SPLATTING, PLAIN), ("ray", TRACED.renderer, CPU))
+    for name, renderer, backend in ways:
+        request = Request(backend=backend)
+        output, tape = renderer.render(Model(gaussians), view, request)
+        forward = seconds_of(partial(renderer.render, Model(gaussians), view, request), repeats)
         backward = seconds_of(partial(renderer.render_vjp, tape, np.ones_like(output.image), None), repeats)
         result |= {f"{name} forward us": forward / n_pixels * 1e6, f"{name} backward us": backward / n_pixels * 1e6}
     whitened = whitened_model(Model(gaussians))

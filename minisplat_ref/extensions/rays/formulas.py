@@ -12,13 +12,14 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.cpu.gaussian_rows import rows_from
-from minisplat_ref.extensions.rays.bvh import IS_INNER, MOST_LEVELS, TINY
+from minisplat_ref.extensions.rays.bvh import IS_INNER, MOST_LEVELS
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import WIDTH, any_of, gather, larger, largest_of, load, select, smaller, store
 from minisplat_ref.types import Floats, Ints
 
 MEAN, OPACITY, REACH = 9, 12, 13  # columns of a record; the map is the first nine
 N_COLUMNS = 14
+TINY = 1e-300  # in the place of a direction's zero, so that no infinity is multiplied by zero
 END_MARGIN = 0.999  # of the least transmittance: what is left out by the bound must not hang on a rounding
 
 
