@@ -152,3 +152,6 @@ RAY_ORDER = 1e-10
 
 # Where another program in float32 enters an ellipsoid: 6e-8 of a distance, by the root of what a grazing ray leaves.
 MITSUBA_DEPTH = 1e-3
+
+# Displacements of half a pixel that are read off slopes, pixels: linear in them, and photographs are bytes.
+DISPLACEMENT_PX = 0.15
