@@ -62,10 +62,8 @@ def run_speed(args: argparse.Namespace) -> None:
     check_at_least(1, gaussians=args.gaussians, repeats=args.repeats)
     found = claims.speed(args.gaussians, args.repeats)
     print(markdown_table(["measure", "value"], [[name, f"{value:.3g}"] for name, value in found.items()]))
-    ratios = [found["ray forward us"] / found[f"{name} forward us"] for name in ("pixel", "plain pixel")]
-    print(
-        f"\nA ray takes {ratios[0]:.1f} times as long as a pixel of the tuned kernels, {ratios[1]:.1f} of the plain ones."
-    )
+    tuned, plain = (found["ray forward us"] / found[f"{name} forward us"] for name in ("pixel", "plain pixel"))
+    print(f"\nA ray takes {tuned:.1f} times as long as a pixel of the tuned kernels, {plain:.1f} times a plain one.")
 
 
 STUDIES = (
