@@ -146,8 +146,8 @@ HALF_FLOAT = 4.9e-4
 # in float32 there; near zero that is the root of some roundings of 6e-8.
 SPZ_ROTATION = 1e-3
 
-# A ray's peak by ``Sigma^-1``, ``c - b^2 / a``, against ``|p - t v|^2``: the former is rounded by 1e-16 of c, which is up
-# to 1e5 here, the square of a distance of 6 over a thickness of 0.02.
+# A ray's peak by ``Sigma^-1``, ``c - b^2 / a``, against ``|p - t v|^2``: the former is rounded by 1e-16 of c, which is
+# up to 1e5 here, the square of a distance of 6 over a thickness of 0.02.
 RAY_ORDER = 1e-10
 
 # Where another program in float32 enters an ellipsoid: 6e-8 of a distance, by the root of what a grazing ray leaves.

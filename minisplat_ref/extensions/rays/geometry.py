@@ -3,13 +3,15 @@
 Both backends use these: they are of the size of the population or of the picture, and no loop over pairs.
 """
 
+import functools
+
 import numpy as np
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.extensions.rays.types import Rays, Whitened
 from minisplat_ref.reference.covariance import rotation_matrices, rotation_matrices_vjp
 from minisplat_ref.reference.pinhole import pinhole_rays, with_principal_point
-from minisplat_ref.types import Bools, Camera, Floats
+from minisplat_ref.types import Bools, Camera, Floats, Ints
 
 
 def whiten(means: Floats, quats: Floats, log_scales: Floats, opacities: Floats) -> Whitened:
@@ -66,6 +68,13 @@ def pixel_rays(camera: Camera, conventions: Conventions) -> Rays:
     origins = np.broadcast_to(camera.center, directions.shape)
     limits = (np.full(len(directions), plane) for plane in (conventions.near_plane, conventions.far_plane))
     return Rays(np.ascontiguousarray(origins), directions, *limits)
+
+
+@functools.cache
+def in_blocks(width: int, height: int) -> Ints:
+    """Return the pixels [H W] in blocks of 4 x 2: eight rays that go together through a tree should be neighbours."""
+    ys, xs = np.divmod(np.arange(width * height), width)
+    return np.lexsort((xs, ys, xs // 4, ys // 2))
 
 
 def pixel_rays_vjp(

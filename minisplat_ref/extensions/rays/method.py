@@ -10,7 +10,7 @@ from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.rays import kernels, reference
-from minisplat_ref.extensions.rays.geometry import pixel_rays, pixel_rays_vjp, whiten, whiten_vjp
+from minisplat_ref.extensions.rays.geometry import in_blocks, pixel_rays, pixel_rays_vjp, whiten, whiten_vjp
 from minisplat_ref.extensions.rays.statistics import blend_stats
 from minisplat_ref.extensions.rays.types import BlendedRays, Rays, Whitened
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
@@ -47,6 +47,7 @@ class _Tape(NamedTuple):
     background: Floats
     gaussians: Whitened
     tracer: Tracer
+    order: Ints  # [H W] pixels in the order of the rays
     rays: Rays
     colors: Floats  # [N, 3]
     blended: BlendedRays
@@ -84,23 +85,25 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, _T
     gaussians = whitened_model(model)
     if request.is_visible is not None:
         gaussians = gaussians._replace(opacities=np.where(request.is_visible, gaussians.opacities, 0.0))
-    tracer, rays = tracer_for(gaussians, conventions, backend), pixel_rays(camera, conventions)
+    tracer, in_rows = tracer_for(gaussians, conventions, backend), pixel_rays(camera, conventions)
+    order = in_blocks(camera.width, camera.height)
+    rays = Rays(*(field[order] for field in in_rows))
     colors = backend.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, degree, np.ones((len(g.means), 2), np.int32))
     blended = tracer.blend(colors, rays, background, conventions)
     size = camera.height, camera.width
-    image = blended.image.reshape(*size, 3)
-    if "depth" in wants:
-        image = np.concatenate([image, blended.depths.reshape(*size, 1)], axis=2)
-    stats = blend_stats(tracer.list_hits(rays, conventions), size, len(g.means)) if "stats" in wants else None
+    channels = np.column_stack([blended.image, blended.depths]) if "depth" in wants else blended.image
+    image, alpha = np.empty_like(channels, dtype), np.empty(len(order), dtype)
+    image[order], alpha[order] = channels, 1 - blended.transmittances
+    stats = blend_stats(tracer.list_hits(in_rows, conventions), size, len(g.means)) if "stats" in wants else None
     output = RenderOutput(
-        image.astype(dtype),
-        (1 - blended.transmittances).reshape(size).astype(dtype),
+        image.reshape(*size, -1),
+        alpha.reshape(size),
         median_depth=None,
         stats=stats,
         visible_ids=np.flatnonzero(blended.is_seen),
         n_pairs=int(blended.n_hits.sum()),
     )
-    return output, _Tape(model, camera, request, degree, background, gaussians, tracer, rays, colors, blended)
+    return output, _Tape(model, camera, request, degree, background, gaussians, tracer, order, rays, colors, blended)
 
 
 def render_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None) -> RenderGradient:
@@ -113,14 +116,16 @@ def render_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None) -> RenderGr
     """
     g, camera, blended = tape.model.gaussians, tape.camera, tape.blended
     n_rays, dtype = len(tape.rays.near), g.means.dtype
-    v_pixels = np.ascontiguousarray(v_image.reshape(n_rays, -1), np.float64)
+    v_pixels = v_image.reshape(n_rays, -1)[tape.order].astype(np.float64)
     v_depths = v_pixels[:, 3] if v_pixels.shape[1] > 3 else np.zeros(n_rays)
-    v_T = np.zeros(n_rays) if v_alpha is None else -np.asarray(v_alpha, np.float64).ravel()
+    v_T = np.zeros(n_rays) if v_alpha is None else -v_alpha.ravel()[tape.order].astype(np.float64)
     v = tape.tracer.blend_vjp(
         tape.colors, tape.rays, tape.background, tape.request.conventions, blended, (v_pixels[:, :3], v_depths, v_T)
     )
     v_quats, v_log_scales = whiten_vjp(g.quats, g.log_scales, tape.gaussians, v.maps)
-    v_R, v_t = pixel_rays_vjp(camera, tape.request.conventions, v.origins, v.directions)
+    v_directions = np.empty_like(v.directions)
+    v_directions[tape.order] = v.directions
+    v_R, v_t = pixel_rays_vjp(camera, tape.request.conventions, v.origins, v_directions)
     o = tape.gaussians.opacities
     v_sh = tape.request.backend.sh_colors_vjp(
         g.means, g.sh_dc, g.sh_rest, camera, tape.sh_degree, seen_radii(blended.is_seen), v.colors.astype(dtype)
