@@ -150,8 +150,9 @@ SPZ_ROTATION = 1e-3
 # up to 1e5 here, the square of a distance of 6 over a thickness of 0.02.
 RAY_ORDER = 1e-10
 
-# Where another program in float32 enters an ellipsoid: 6e-8 of a distance, by the root of what a grazing ray leaves.
-MITSUBA_DEPTH = 1e-3
+# Where Mitsuba enters an ellipsoid, by a quadratic in float32 whose constant term is the square of up to 280 standard
+# deviations: measured 2.6e-3 on the two of a hundred rays that meet the thinnest one, below 1e-3 elsewhere.
+MITSUBA_DEPTH = 5e-3
 
 # Displacements of half a pixel that are read off slopes, pixels: linear in them, and photographs are bytes.
 DISPLACEMENT_PX = 0.15

@@ -14,6 +14,7 @@ from minisplat_ref.extensions.rays import claims, demo, surroundings
 from minisplat_ref.extensions.rays.geometry import pixel_rays
 from minisplat_ref.extensions.rays.lights import shade, visibility
 from minisplat_ref.extensions.rays.method import TRACED, whitened_model
+from minisplat_ref.extensions.rays.reference import meet
 from minisplat_ref.extensions.rays.surfaces import (
     DIFFUSE,
     GLASS,
@@ -269,11 +270,9 @@ def test_the_study_draws_and_prints(tmp_path, capsys):
 
 def test_mitsuba_meets_the_same_ellipsoids():
     """Mitsuba 3 walks through ellipsoids of three standard deviations: it finds those that rays come so near to, and
-    enters the first where ``t - sqrt((9 - q) / a)`` says."""
+    enters the first where ``t - sqrt((9 - q) / a)`` says. Rays that graze one are left out: float32 decides those."""
     mitsuba = pytest.importorskip("mitsuba", reason="needs mitsuba: pip install 'minisplat_ref[rays]'")
     mitsuba.set_variant("scalar_rgb")
-    from minisplat_ref.extensions.rays.reference import meet
-
     g = claims.random_gaussians(30, np.random.default_rng(4), size=0.05)
     gaussians, rays = whitened_model(Model(g)), pixel_rays(demo.camera_of(12, 9), GSPLAT_MAIN)
     unit = g.quats / np.linalg.norm(g.quats, axis=1, keepdims=True)
@@ -286,7 +285,7 @@ def test_mitsuba_meets_the_same_ellipsoids():
     pairs = meet(gaussians, rays, np.repeat(np.arange(n_rays), n), np.tile(np.arange(n), n_rays))
     q = np.sum(pairs.e**2, axis=1)
     entries = (pairs.depths - np.sqrt(np.maximum(9 - q, 0) / np.sum(pairs.v**2, axis=1))).reshape(-1, n)
-    is_met, is_clear = (q < 9).reshape(-1, n), (np.abs(q - 9) > 0.01).reshape(-1, n)
+    is_met, is_clear = (q < 9).reshape(-1, n), (np.abs(q - 9) > 0.5).reshape(-1, n)
     for r in range(n_rays):
         first = scene.ray_intersect(mitsuba.Ray3f(rays.origins[r].tolist(), rays.directions[r].tolist()))
         found = entries[r][is_met[r] & (entries[r] > 0)]
@@ -294,4 +293,5 @@ def test_mitsuba_meets_the_same_ellipsoids():
             assert first.is_valid() == bool(len(found))
             if first.is_valid():
                 assert first.t == pytest.approx(found.min(), rel=MITSUBA_DEPTH)
-    assert 20 < is_met.any(axis=1).sum() < n_rays
+    is_met = is_met[is_clear.all(axis=1)]
+    assert 20 < is_met.any(axis=1).sum() < len(is_met)
