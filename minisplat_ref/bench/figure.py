@@ -16,7 +16,7 @@ PANELS = (
     ("image max, no flips", "image max", "largest error of the image"),
     ("gradient, no flips", "gradient", "error of the gradient, relative L2, worst parameter"),
 )
-EXACT = 1e-16  # where an error of 0 stands on a logarithmic axis
+EXACT = 1e-16  # position of an error of 0 on a logarithmic axis
 COLORS = ("#3d4650", "#35608c", "#3f8f6b", "#d2493f", "#e0a526", "#8e5ea2", "#4aa0a8", "#b5651d")
 SHAPES = {"-exp": "^", "-cut": "s", "-sigma": "s", "textbook": "D"}
 HOLLOW = "^s"  # variants: they crowd around the default
@@ -26,14 +26,14 @@ Style = dict[str, Any]
 def pareto_figure(cases: Sequence[Case]) -> "Figure":
     """Draw every workload as a row: error of the image on the left, of the gradient on the right.
 
-    A mark is the error without the pixels at thresholds; a faint line leads from it to the error with them. An error of
-    0 stands at the left edge. What failed has no time and is not drawn. The step line is the front: nothing is below
-    and left of it.
+    A marker is the error without the pixels at thresholds; a faint line leads from it to the error with them. An error
+    of 0 is at the left edge. Failed contenders have no time and are not drawn. The step line is the Pareto front:
+    nothing is below and left of it.
 
     Parameters
     ----------
     cases : sequence of Case
-        From ``race``, of any number of workloads.
+        From ``benchmark``, of any number of workloads.
     """
     from matplotlib.figure import Figure
 
