@@ -15,9 +15,16 @@ at the ellipsoid of 99 %, which for an opaque one is nearly the same; a ray has 
 code stops at 512; the loss has L1, as that of 3DGS, and not L2, so that trainings differ by the renderer alone; colours
 are those towards the camera's centre, and behind a mirror or glass towards the place where the eye seems to stand.
 Density control, which looks at gradients in the image, gets them from those in the world (:func:`.method.render_vjp`).
+Under any conventions a clamped alpha has no gradient, which INRIA's rasteriser lets through.
 
 What to know: there is no low-pass. Gaussians thinner than a pixel fall between rays, and pictures smaller than those
 trained on alias. Shadows, mirrors and glass have no gradient.
+
+Measured (``study rays/claims``, ``rays/speed``): the tree gives the picture of all pairs to 3e-15, tracing that of an
+exact order of every pixel to 2e-12; the edge of a shadow lies within a millionth of a pixel of the tangent cone. Alpha
+of a round Gaussian of a twentieth of its distance differs from the splatted one by 1 % on the axis and by 10 % at 40
+degrees from it. At 10,000 Gaussians a ray takes 19 times as long as a pixel of the tuned rasteriser, and 8 times as
+long as one of its plain kernels.
 
     minisplat-ref train SCENE --recipe rays
     minisplat-ref rays render runs/fox --scene lamp_and_mirror.json --out DIR
