@@ -53,8 +53,8 @@ from minisplat_ref.extensions.proxies.binding import bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid
 from minisplat_ref.extensions.proxies.edit_claims import RADIUS, flat_gaussians, rolled
 from minisplat_ref.extensions.proxies.edit_claims import camera as card_camera
-from minisplat_ref.extensions.proxies.mesh import Mesh
 from minisplat_ref.extensions.shared_container import take_apart
+from minisplat_ref.extensions.shared_mesh import Mesh
 from minisplat_ref.extensions.shared_sampling import block_means, zoomed
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import psnr
