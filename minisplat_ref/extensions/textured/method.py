@@ -84,8 +84,10 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, An
     if backend.is_compiled:
         output = kernel_hits.composite_hits(response_for(dtype), *blended, conventions)
     else:
-        asked = {f"with_{name}": name in request.wants for name in BY_REFERENCE}
-        output = composite_hits(RESPONSE, *blended, conventions, **asked)
+        with_stats, with_median_depth = "stats" in request.wants, "median_depth" in request.wants
+        output = composite_hits(
+            RESPONSE, *blended, conventions, with_stats=with_stats, with_median_depth=with_median_depth
+        )
     visible_ids = np.flatnonzero(projection.radii[:, 0] > 0)
     output = output._replace(visible_ids=visible_ids, n_pairs=len(bins.gaussian_ids))
     return output, _Tape(g, request, camera, sh_degree, primitives, blended, output)

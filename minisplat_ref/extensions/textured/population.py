@@ -29,7 +29,7 @@ def with_textures(gaussians: Gaussians, degree: int) -> TexturedGaussians:
     """Return Gaussians with textures of zeros up to a degree; of degree 0 they have none, and are those of 3DGS."""
     n, dtype, k = len(gaussians.means), gaussians.means.dtype, (degree + 1) ** 2 - 1
     return TexturedGaussians(
-        *(getattr(gaussians, name) for name in Gaussians._fields),
+        **{name: getattr(gaussians, name) for name in Gaussians._fields},
         color_textures=np.zeros((n, 3 * k), dtype),
         opacity_textures=np.zeros((n, k), dtype),
     )

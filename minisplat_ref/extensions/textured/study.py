@@ -73,7 +73,7 @@ def outcomes(whole: Gaussians, scene: Scene, iterations: int, seed: int) -> list
     n_floats = len(whole.means) * floats_of(whole)
     for form, replaces in ((PAPER, True), (BOTH, False)):
         n = n_floats // floats_of(prepared(whole, 3, replaces))
-        kept = take(whole, most_important(importance, min(n, np.count_nonzero(importance))))
+        kept = take(whole, most_important(importance, min(n, int(np.count_nonzero(importance)))))
         jobs.append(("as many floats", form, 3, prepared(kept, 3, replaces)))
     rows = []
     for kept_by, form, degree, population in tqdm(jobs, desc=f"fine-tunings, seed {seed}", leave=False):
