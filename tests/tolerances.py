@@ -145,3 +145,7 @@ HALF_FLOAT = 4.9e-4
 # The same rotations of an SPZ by two programs, radians: the fourth component is the root of what the others leave of 1,
 # in float32 there; near zero that is the root of some roundings of 6e-8.
 SPZ_ROTATION = 1e-3
+
+# A textured sheet 3e-7 thick, edge on, in float32: its direction turns within a hundredth of a pixel, of which 24 lose
+# 1e-6; the colour follows with a slope of up to 10 a radian.
+TEXTURE_THIN_FLOAT32 = 1e-3
