@@ -41,32 +41,26 @@ class Target(NamedTuple):
 def spread(n: int, rng: np.random.Generator) -> Gaussians:
     """Return n flat gray Gaussians that face the camera, spread over the picture, of the size that fills it."""
     extent = SIZE / FOCAL * DISTANCE  # of the picture, world units
-    sides = np.stack([rng.uniform(-0.35, 0.35, n), rng.uniform(-0.35, 0.35, n)], axis=1) * extent
-    sides[0] = 0 if n == 1 else sides[0]
+    places = rng.uniform(-0.35, 0.35, (n, 2)) * extent if n > 1 else np.zeros((1, 2))
     scale = 0.25 * extent / np.sqrt(n)
     return Gaussians(
-        means=np.column_stack([sides, np.full(n, DISTANCE) + 1e-3 * np.arange(n)]).astype(np.float32),
-        quats=np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
-        log_scales=np.tile(np.log(np.float32([scale, scale, 1e-3])), (n, 1)),
-        opacity_logits=np.full(n, 1.0, np.float32),
+        means=np.column_stack([places, DISTANCE + 1e-3 * np.arange(n)]).astype(np.float32),
+        quats=np.tile(np.eye(4, dtype=np.float32)[0], (n, 1)),
+        log_scales=np.tile(np.log([scale, scale, 1e-3]).astype(np.float32), (n, 1)),
+        opacity_logits=np.ones(n, np.float32),
         sh_dc=np.zeros((n, 3), np.float32),
         sh_rest=np.zeros((n, 0, 3), np.float32),
     )
 
 
 def cut_gaussian() -> Target:
-    """Return a Gaussian of which a straight edge has cut a third away."""
-    one = with_cuts(spread(1, np.random.default_rng(0)), np.random.default_rng(0))
-    points = np.array([[0.4, -3.0], [0.4, -1.0], [0.4, 1.0], [0.4, 3.0]], np.float32)
-    colored = one._replace(
-        curves=points.reshape(1, -1),
-        widths=np.zeros(1, np.float32),
-        opacity_logits=np.float32([3]),
-        sh_dc=one.sh_dc + 1,
-    )
-    image = drawn(colored, CUT_GAUSSIANS)
+    """Return a Gaussian of which a straight edge, 0.4 deviations from its centre, has cut the right side away."""
+    one = spread(1, np.random.default_rng(0))
+    points = np.array([[0.4, -3.0, 0.4, -1.0, 0.4, 1.0, 0.4, 3.0]], np.float32)
+    bright = one._replace(opacity_logits=np.full(1, 3, np.float32), sh_dc=np.ones((1, 3), np.float32))
+    hard = CutGaussians(*bright, curves=points, widths=np.zeros(1, np.float32))
     edge = SIZE / 2 + 0.4 * float(np.exp(one.log_scales[0, 0])) * FOCAL / DISTANCE
-    return Target(image.astype(np.float64), lambda ys: np.full_like(ys, edge))
+    return Target(drawn(hard).astype(np.float64), lambda ys: np.full_like(ys, edge))
 
 
 def card() -> Target:
@@ -80,9 +74,16 @@ def card() -> Target:
     return Target(np.repeat(BRIGHT * covered[:, :, None], 3, axis=2), edge)
 
 
-def drawn(population: Any, representation: Representation) -> Floats:
+def representation_of(population: Any) -> Representation:
+    """Return what a population with cuts, or without, is drawn and trained by."""
+    return CUT_GAUSSIANS if isinstance(population, CutGaussians) else GAUSSIANS
+
+
+def drawn(population: Any) -> Floats:
     """Return the picture [H, W, 3] of a population before black."""
-    image: Floats = representation.renderer.render(Model(population), view_from(CAMERA), Request())[0].image
+    image: Floats = (
+        representation_of(population).renderer.render(Model(population), view_from(CAMERA), Request())[0].image
+    )
     return image
 
 
@@ -94,8 +95,7 @@ def fitted(target: Target, n: int, is_cut: bool, iterations: int, seed: int) -> 
     scene = Scene("card", numbered([view]), (), none, none.astype(np.uint8), np.zeros(3), EXTENT)
     population: Any = with_cuts(spread(n, rng), rng) if is_cut else spread(n, rng)
     events = tuple(event for event in CUTS.events if is_cut and action_name(event) == set_width.__name__)
-    representation = CUT_GAUSSIANS if is_cut else GAUSSIANS
-    recipe = CUTS._replace(events=events, sh_degree=0, representation=representation)
+    recipe = CUTS._replace(events=events, sh_degree=0, representation=representation_of(population))
     state = TrainState(population, zero_moments(population), step=0, view_order=[], rng=rng, stats={})
     return train(scene, scaled(recipe, iterations), seed=seed, state=state).gaussians
 
@@ -120,7 +120,7 @@ def edge_width(image: Floats) -> float:
 
 def measured(target: Target, population: Any) -> dict[str, float]:
     """Return PSNR of the picture, of the band beside the edge and of the rest, dB, and the width of the edge, px."""
-    image = drawn(population, CUT_GAUSSIANS if isinstance(population, CutGaussians) else GAUSSIANS)
+    image = drawn(population)
     band = target.band
     return {
         "psnr": psnr_of(image, target.image),

@@ -114,7 +114,7 @@ def cut_response(exp: Callable) -> KernelResponse:
         v_z = side * mask * (ONE - mask) * v_mask * records[n, INVERSE_WIDTH] * inverse
         v_x, v_y = -v_z * x, -v_z * y
         v_points = (w_0 * v_x, w_0 * v_y, w_1 * v_x, w_1 * v_y, w_2 * v_x, w_2 * v_y, w_3 * v_x, w_3 * v_y)
-        return v_flat + v_points + (v_x, v_y)  # noqa: RUF005
+        return v_flat + v_points + (v_x, v_y)
 
     return KernelResponse(
         functools.partial(_records, conic.records),
@@ -147,7 +147,7 @@ def _records(conic_records: Callable, footprints: CutFootprints, dtype: np.dtype
     records[:, :CONIC_GRADIENTS] = conic_records(footprints.projection, dtype)[:, :CONIC_GRADIENTS]
     records[:, DEPTH], records[:, WIDTH_PX] = footprints.projection.depths, widths
     records[:, INVERSE_WIDTH] = np.where(widths > 0, 1 / np.where(widths > 0, widths, 1), 0)
-    records[:, V:INVERSES] = vertices.reshape(n, -1)
+    records[:, V:INVERSES] = vertices.reshape(n, 2 * (N_EDGES + 1))
     records[:, INVERSES:] = 1 / np.maximum(np.sum(pieces**2, axis=2), LENGTH_MIN)
     return records
 

@@ -62,7 +62,7 @@ def with_cuts(gaussians: Gaussians, rng: np.random.Generator) -> CutGaussians:
     curves = START * outwards + np.linspace(-REACH, REACH, N_POINTS)[:, None] * across  # [N, 4, 2]
     return CutGaussians(
         **{name: getattr(gaussians, name) for name in Gaussians._fields},
-        curves=curves.reshape(n, -1).astype(dtype),
+        curves=curves.reshape(n, 2 * N_POINTS).astype(dtype),
         widths=np.full(n, WIDTH, dtype),
     )
 

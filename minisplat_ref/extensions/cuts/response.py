@@ -76,7 +76,7 @@ def image_points_vjp(
     seen = with_principal_point(camera, conventions)
     v_x = pinhole_jacobians_vjp(x, seen, *slope_limits(seen, conventions, means.dtype), v_J)
     return PointsGradient(
-        curves=np.einsum("nik,nji->njk", M, v_points).reshape(len(curves), -1),
+        curves=np.einsum("nik,nji->njk", M, v_points).reshape(curves.shape),
         means=v_x @ R_c,
         quats=rotation_matrices_vjp(quats, R_c.T @ v_G),
         scales=v_scales,

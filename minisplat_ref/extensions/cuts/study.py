@@ -26,7 +26,7 @@ N_FLOATS = {"plain": 14, "cut": 22}  # of a Gaussian without view-dependent colo
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--out``, ``--iterations`` and ``--seeds``."""
     shared_studies.add_out(parser)
-    parser.add_argument("--iterations", type=int, default=2000, metavar="N", help="of each training (default 2000)")
+    parser.add_argument("--iterations", type=int, default=1000, metavar="N", help="of each training (default 1000)")
     parser.add_argument("--seeds", type=int, default=3, metavar="N", help="trainings, seeds from 0 on (default 3)")
 
 
@@ -59,11 +59,9 @@ def outcomes(iterations: int, n_seeds: int) -> tuple[list[dict[str, Any]], dict[
     jobs = [(name, kind, n) for name in targets for kind, numbers in NUMBERS.items() for n in numbers]
     rows, pictures = [], {name: [("target", target.image)] for name, target in targets.items()}
     for name, kind, n in tqdm(jobs, desc="trainings", leave=False):
-        is_cut = kind == "cut"
-        found = [card.fitted(targets[name], n, is_cut, iterations, seed) for seed in range(n_seeds)]
+        found = [card.fitted(targets[name], n, kind == "cut", iterations, seed) for seed in range(n_seeds)]
         measures = [card.measured(targets[name], population) for population in found]
-        representation = card.CUT_GAUSSIANS if is_cut else card.GAUSSIANS
-        pictures[name].append((f"{n} {kind}", card.drawn(found[0], representation)))
+        pictures[name].append((f"{n} {kind}", card.drawn(found[0])))
         row = {"picture": name, "kind": kind, "n_gaussians": n, "n_floats": n * N_FLOATS[kind]}
         rows.append({**row, **{key: [measure[key] for measure in measures] for key in measures[0]}})
     return rows, pictures

@@ -17,6 +17,12 @@ of degree 0 are 3DGS, to the last byte.
     minisplat-ref study textured/limb
     minisplat-ref oracle gradients --extension textured
 
+Measured on the fox at 135 x 240 (``study textured/counts fox --downscale 2 --fine-tune 300 --seeds 1``), 4,422
+Gaussians after 1,000 iterations of Mini-Splatting, fine-tuned for 300 more: textures on top of view-dependent colour
+gain 0.62 dB and 0.018 of SSIM on the test views. In its place they lose 0.49 dB and gain 0.006 of SSIM; of degree 1 and
+2, 1.06 and 0.76 dB are lost. With as many floats as the plain Gaussians have, 3,525 that have textures instead of view
+dependence lose 1.2 dB, and 2,192 that have both lose 3.2 dB: here a Gaussian more is worth more than its texture.
+
 Where this deviates: the ellipsoid is that of one deviation, exactly; the released kernel divides by deviations where
 their squares belong. Rays that miss it, most of those that a footprint reaches, take in the paper the colour of degree
 0, which jumps at the limb; here n points to the ray's nearest point, which does not. In the paper textures replace

@@ -159,8 +159,9 @@ def response_for(dtype: np.dtype) -> KernelResponse:
 
 def filled_up(textures: Floats, n_rows: int) -> Floats:
     """Return coefficients [N, n_rows (K-1)] of any degree as [N, n_rows, 15]."""
-    full = np.zeros((len(textures), n_rows, N_TEXTURE), textures.dtype)
-    full[:, :, : textures.shape[1] // n_rows] = textures.reshape(len(textures), n_rows, -1)
+    n, k = len(textures), textures.shape[1] // n_rows
+    full = np.zeros((n, n_rows, N_TEXTURE), textures.dtype)
+    full[:, :, :k] = textures.reshape(n, n_rows, k)
     return full
 
 

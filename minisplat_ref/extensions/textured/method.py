@@ -97,9 +97,10 @@ def _coefficients(g: TexturedGaussians, channels: Floats, is_compiled: bool) -> 
     """Return [N, D K]: of each channel its colour and its texture; a depth has none. Kernels take K = 16."""
     n, k = g.opacity_textures.shape
     textures = filled_up(g.color_textures, 3) if is_compiled else g.color_textures.reshape(n, 3, k)
-    coefficients = np.zeros((n, channels.shape[1], 1 + textures.shape[2]), channels.dtype)
+    n_channels, n_coefficients = channels.shape[1], 1 + textures.shape[2]
+    coefficients = np.zeros((n, n_channels, n_coefficients), channels.dtype)
     coefficients[:, :, 0], coefficients[:, :3, 1:] = channels, textures
-    return coefficients.reshape(n, -1)
+    return coefficients.reshape(n, n_channels * n_coefficients)
 
 
 def render_vjp(tape: _Tape | RenderTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
@@ -120,7 +121,8 @@ def render_vjp(tape: _Tape | RenderTape, v_image: Floats, v_alpha: Floats | None
         v = composite_hits_vjp(RESPONSE, *arguments)
     v_means2d, v_conics, v_opacities, v_logits, v_opacity_textures, v_frames = v.primitives
     n, k = g.opacity_textures.shape
-    v_colors = v.colors.reshape(n, v_image.shape[2], -1)  # [N, D, K]
+    n_channels = v_image.shape[2]
+    v_colors = v.colors.reshape(n, n_channels, v.colors.shape[1] // n_channels)  # [N, D, K]
 
     projection, scales = tape.blended[0].projection, tape.primitives.scales
     v_depths = np.ascontiguousarray(v_colors[:, 3, 0]) if v_image.shape[2] > 3 else np.zeros_like(projection.depths)
@@ -148,6 +150,7 @@ def render_vjp(tape: _Tape | RenderTape, v_image: Floats, v_alpha: Floats | None
     )
 
 
+# Chosen between those of 3DGS for a colour's degree 0 and, 20 times less, for its higher degrees.
 RATES = Rates({"color_textures": 2.5e-3 / 4, "opacity_textures": 5e-2 / 4}, frozenset())
 
 TEXTURED_GAUSSIANS = Representation(

@@ -96,7 +96,7 @@ def hit(footprints: Footprints, ids: Ints, centers: Floats) -> Hit:
     h = footprints.opacity_textures[ids]  # [G, K-1]
     meeting = meet(footprints.frames[ids], footprints.means2d[ids], centers)
     n, degree = meeting.directions, degree_of(h.shape[1])
-    basis = sh_basis(n.reshape(-1, 3), degree)[:, 1:].reshape(*n.shape[:2], -1)
+    basis = sh_basis(n.reshape(-1, 3), degree)[:, 1:].reshape(*n.shape[:2], h.shape[1])
     e = np.exp(np.einsum("gk,gpk->gp", h, basis) - bounds(h)[:, None])
     w = footprints.odds[ids, None]
     shares, transparencies = e * (1 + w) / (e + w), w / (e + w)
@@ -142,7 +142,7 @@ def shade_vjp(coefficients: Floats, place: Place, v: Floats) -> tuple[Floats, Fl
     """
     n_coefficients = place.basis.shape[2] + 1
     v = np.where(_unclamped(coefficients, place) >= 0, v, 0)  # [G, P, D]
-    k = coefficients.reshape(len(coefficients), -1, n_coefficients)[:, :, 1:]  # [G, D, K-1]
+    k = _by_channel(coefficients, n_coefficients)[:, :, 1:]  # [G, D, K-1]
     v_base = v.sum(axis=1)[:, :, None]  # [G, D, 1]
     v_k = np.einsum("gpd,gpk->gdk", v, place.basis)
     v_coefficients = np.concatenate([v_base, v_k], axis=2).reshape(coefficients.shape)
@@ -150,8 +150,13 @@ def shade_vjp(coefficients: Floats, place: Place, v: Floats) -> tuple[Floats, Fl
 
 
 def _unclamped(coefficients: Floats, place: Place) -> Floats:
-    by_channel = coefficients.reshape(len(coefficients), -1, place.basis.shape[2] + 1)  # [G, D, K]
+    by_channel = _by_channel(coefficients, place.basis.shape[2] + 1)
     return by_channel[:, None, :, 0] + np.einsum("gdk,gpk->gpd", by_channel[:, :, 1:], place.basis)
+
+
+def _by_channel(coefficients: Floats, n_coefficients: int) -> Floats:
+    """Return ``coefficients`` [G, D K] as [G, D, K]."""
+    return coefficients.reshape(len(coefficients), coefficients.shape[1] // n_coefficients, n_coefficients)
 
 
 RESPONSE = Response(boxes, hit, hit_vjp, FIELDS, shade, shade_vjp)
