@@ -78,7 +78,7 @@ def cut_response(exp: Callable) -> KernelResponse:
             first = select(dx * o_y - dy * o_x > ZERO, nothing + ONE, nothing - ONE)
             last = select(dx * e_y - dy * e_x > ZERO, nothing + ONE, nothing - ONE)
             beyond = select(u_x * r_y - u_y * r_x > ZERO, nothing + ONE, nothing - ONE)
-            origin = select(nothing + (u_y * o_x - u_x * o_y) > ZERO, nothing + ONE, nothing - ONE)
+            origin = select(u_y * o_x - u_x * o_y > ZERO, ONE, -ONE)
             side = select((first * last < ZERO) & (beyond * origin < ZERO), -side, side)
         # The two rays: what an end B moves along when it moves away from the centre.
         f = larger(_along(records, n, dx, dy, 0), ZERO)
@@ -93,8 +93,9 @@ def cut_response(exp: Callable) -> KernelResponse:
         """The mask: a logistic curve of the distance, or a step where the width is 0."""
         e = exp(-distance * records[n, INVERSE_WIDTH])
         soft = select(side > ZERO, ONE / (ONE + e), e / (ONE + e))
-        hard = select((side > ZERO) & (distance > ZERO), ONE, ZERO) + ZERO * distance
-        return select(distance * ZERO + records[n, WIDTH_PX] > ZERO, soft, hard)
+        nothing = filled(records.dtype.type(0))
+        hard = select((side > ZERO) & (distance > ZERO), nothing + ONE, nothing)
+        return select(records[n, WIDTH_PX] > ZERO, soft, hard)
 
     @scalar
     def hit(records, n, x, y):
