@@ -32,7 +32,7 @@ from minisplat_ref.types import (
     View,
 )
 
-START = 2.0  # deviations from the centre at which a curve begins
+START = 1.0  # deviations from the centre at which a curve begins: where nothing is drawn, it would learn nothing
 REACH = 3.0  # deviations that it goes to either side there
 WIDTH = 1.0  # px, of masks at the start of a training
 BY_REFERENCE = frozenset({"stats", "median_depth"})  # what the plain kernels do not collect

@@ -2,7 +2,7 @@
 
 Two pictures of 48 x 48 pixels: a Gaussian with a part cut away, which one Gaussian with a cut can be, and a card of one
 brightness with a curved edge, which none can. Few Gaussians are trained on each, from random places, with cuts and
-without; their number stays. The error is told apart near the edge, within 1.5 pixels of it, and elsewhere.
+without; their number stays. The error of the best seed is told apart near the edge, within 1.5 pixels, and elsewhere.
 """
 
 import argparse
@@ -26,8 +26,8 @@ N_FLOATS = {"plain": 14, "cut": 22}  # of a Gaussian without view-dependent colo
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--out``, ``--iterations`` and ``--seeds``."""
     shared_studies.add_out(parser)
-    parser.add_argument("--iterations", type=int, default=1000, metavar="N", help="of each training (default 1000)")
-    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="trainings, seeds from 0 on (default 3)")
+    parser.add_argument("--iterations", type=int, default=300, metavar="N", help="of each training (default 300)")
+    parser.add_argument("--seeds", type=int, default=4, metavar="N", help="trainings, seeds from 0 on (default 4)")
 
 
 def run(args: argparse.Namespace) -> None:
@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> None:
         rows, pictures = outcomes(args.iterations, args.seeds)
         result = {"iterations": args.iterations, "seeds": args.seeds, "rows": rows}
         shared_studies.write(folder, result, draw(rows, pictures))
-    heading = ["picture", "Gaussians", "number", "floats", "PSNR", "at the edge", "elsewhere", "edge 10-90 % (px)"]
+    heading = ["picture", "Gaussians", "number", "floats", "PSNR", "best", "at the edge", "elsewhere", "10-90 % (px)"]
     print(markdown_table(heading, [to_line(row) for row in rows]))
 
 
@@ -69,8 +69,10 @@ def outcomes(iterations: int, n_seeds: int) -> tuple[list[dict[str, Any]], dict[
 
 def to_line(row: dict[str, Any]) -> list[str]:
     """Return a line of the table."""
-    measures = [shared.with_deviation(row[key], 1) for key in ("psnr", "band", "elsewhere", "edge_width")]
-    return [row["picture"], row["kind"], str(row["n_gaussians"]), str(row["n_floats"]), *measures]
+    best = int(np.argmax(row["psnr"]))
+    measures = [f"{row[key][best]:.1f}" for key in ("psnr", "band", "elsewhere", "edge_width")]
+    numbers = [str(row["n_gaussians"]), str(row["n_floats"])]
+    return [row["picture"], row["kind"], *numbers, shared.with_deviation(row["psnr"], 1), *measures]
 
 
 def draw(rows: list[dict[str, Any]], pictures: dict[str, Any]) -> "Figure":
