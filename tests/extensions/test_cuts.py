@@ -29,7 +29,9 @@ from minisplat_ref.extensions.cuts.curve import N_EDGES, VERTICES, bernstein, cu
 from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CutGaussians, render, render_vjp, with_cuts
 from minisplat_ref.extensions.cuts.response import image_points, image_points_vjp
 from minisplat_ref.extensions.cuts.stages import stages
+from minisplat_ref.oracle.gradients import jacobian_case
 from minisplat_ref.oracle.models import check_model_gradients
+from minisplat_ref.oracle.pieces import SEED, tiny_setting
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.types import Gaussians, Model, Primitives, view_from
 
@@ -165,6 +167,14 @@ def test_the_gradient_of_the_points(rng):
 def test_the_gradient_of_the_whole_model(backend):
     report = check_model_gradients(backend, GSPLAT_MAIN, CUT_GAUSSIANS, stages)
     assert len(report.cases) == 2 and report.n_failed == 0, report.cases
+
+
+def test_a_wrong_gradient_is_found(monkeypatch):
+    path = "minisplat_ref.extensions.cuts.response.cut_vjp"
+    monkeypatch.setattr(path, lambda *args: tuple(1.001 * v for v in cut_vjp(*args)))
+    (stage,) = stages(REFERENCE, tiny_setting(GSPLAT_MAIN), np.random.default_rng(SEED))
+    case = jacobian_case(stage)
+    assert not case.passed and "is wrong" in case.note
 
 
 @pytest.mark.parametrize(
