@@ -112,7 +112,9 @@ for name, log in logs.items():
 # | `minisplat_ref/methods/adaptive.py` | the recipe: grow, measure, cool down, prune |
 # | `minisplat_ref/strategy/halving.py` | one Gaussian becomes two halves |
 # | `minisplat_ref/training/pace.py` | what was measured and decided; which views are held back |
+# | `minisplat_ref/methods/adaptive_evidence.py` | whether photographs need an exposure, or another pose |
 # | `minisplat_ref/methods/adaptive_exposure.py` | the gains of photographs |
+# | `minisplat_ref/methods/adaptive_pose.py` | the displacements of photographs |
 #
 # **Frames and units:** the world is in metres, work is counted in pairs (tile, Gaussian), PSNR in dB.
 #
@@ -211,9 +213,10 @@ for name, (psnrs, counts) in around.items():
 # ## The gains of photographs
 #
 # A camera that sets its exposure by itself makes photographs that contradict each other. At iteration 600 the scene is
-# a blur of the right brightness, and the gain of each photograph is read off as the median of photograph / rendering.
-# If the logarithms spread by more than 0.05, each photograph gets an exposure that begins with its gain. Here each
-# photograph of the bare room is multiplied by a gain between 0.7 and 1.4, and the training is cut short soon after.
+# a blur of the right brightness. If the gain of one half of each photograph explains the other half, each photograph
+# gets an exposure that begins with its gain, the median of photograph / rendering. Poses are checked in the same way,
+# by displacements instead of gains. Here each photograph of the bare room is multiplied by a gain between 0.7 and 1.4,
+# and the training is cut short soon after.
 
 # %% tags=["rounding"]
 plain = scenes["plain-wall"]

@@ -306,6 +306,32 @@ def test_of_an_extension(scene_folder, tmp_path):
     assert main(["eval", str(tmp_path / "out")]) == 0
 
 
+# After a training -----------------------------------------------------------------------------------------------------
+
+
+def test_a_training_is_followed_by_its_simplification(scene_folder, tmp_path, capsys):
+    """To the same bytes as the command does it, also where a continued run is what ends."""
+    limit = "9000"
+    run = trained(scene_folder, tmp_path / "run", "--recipe", "3dgs-accel", "--max-bytes", limit)
+    small = run / "simplified"
+    assert (small / "point_cloud.ply").stat().st_size <= int(limit) < (run / "point_cloud.ply").stat().st_size
+    assert capsys.readouterr().out.splitlines()[-1].startswith("test PSNR ")
+    assert main(["simplify", str(run), "--out", str(tmp_path / "again"), "--max-bytes", limit]) == 0
+    assert (tmp_path / "again" / "point_cloud.ply").read_bytes() == (small / "point_cloud.ply").read_bytes()
+    assert main(["train", "--resume", str(run), "--iterations", "41"]) == 0
+    assert read(small / "metrics.json")["iterations"] == 40, "what is there already stays"
+    assert f"{small} is of an earlier end of the run" in capsys.readouterr().err
+
+
+def test_a_simplification_that_cannot_follow_is_refused_before_the_training(scene_folder, tmp_path, capsys):
+    command = ["train", str(scene_folder), "--out", str(tmp_path / "run"), "--iterations", "5"]
+    assert main([*command, "--max-bytes", "10"]) == 2
+    assert "--max-bytes 10 is too little" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main([*command, "--max-drop", "0.1", "--max-bytes", "9000"])
+    assert not (tmp_path / "run").exists()
+
+
 # What is refused ------------------------------------------------------------------------------------------------------
 
 
@@ -359,7 +385,7 @@ def test_too_few_views_to_decide_by(tmp_path, refused):
     write_scene(make_scene("room", supersampling=1, **options), tmp_path / "scene", options)
     command = ["train", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), "--iterations", "2"]
     assert main([*command, "--recipe", "3dgs-accel", "--test-every", "0"]) == 0
-    assert "has 3 training views, and at least 4 are needed" in refused(tmp_path / "run")
+    assert "needs at least 4 training views, two of them to decide by, and scene" in refused(tmp_path / "run")
 
 
 @pytest.mark.parametrize("reason", ["", "its kernels collect none"])

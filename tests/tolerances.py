@@ -149,3 +149,5 @@ SPZ_ROTATION = 1e-3
 # A textured sheet 3e-7 thick, edge on, in float32: its direction turns within a hundredth of a pixel, of which 24 lose
 # 1e-6; the colour follows with a slope of up to 10 a radian.
 TEXTURE_THIN_FLOAT32 = 1e-3
+# Displacements of half a pixel that are read off slopes, pixels: linear in them, and photographs are bytes.
+DISPLACEMENT_PX = 0.15

@@ -1,11 +1,16 @@
 """``simplify``: a smaller model from a run, at a stated loss."""
 
 import argparse
-import math
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter, integer
+from minisplat_ref.experiments.arguments import Commands, HelpFormatter, decibels, integer
+
+if TYPE_CHECKING:
+    from minisplat_ref.experiments.simplified_run import Asked
+
+FINE_TUNE = 300  # iterations at each size
 
 DESCRIPTION = """\
 Make a run smaller: keep its most important Gaussians, fine-tune them, and
@@ -40,12 +45,11 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("folder", type=Path, metavar="RUN", help="the --out folder of a training")
     parser.add_argument("--out", type=Path, required=True, metavar="NEW", help="new folder for the smaller model")
     target = parser.add_mutually_exclusive_group()
-    target.add_argument("--max-drop", type=_drop, metavar="dB", help="PSNR that may be lost")
+    target.add_argument("--max-drop", type=decibels, metavar="dB", help="PSNR that may be lost")
     target.add_argument("--budget", type=integer(1), metavar="N", help="Gaussians that may stay")
     target.add_argument("--max-bytes", type=integer(1), metavar="B", help="size that the PLY may have")
-    parser.add_argument(
-        "--fine-tune", type=integer(0), default=300, metavar="N", help="iterations at each size (default 300)"
-    )
+    fine_tune = f"iterations at each size (default {FINE_TUNE})"
+    parser.add_argument("--fine-tune", type=integer(0), default=FINE_TUNE, metavar="N", help=fine_tune)
     parser.add_argument("--scene", type=Path, metavar="PATH", help="where the photographs are now, if they have moved")
     parser.set_defaults(run=run)
 
@@ -55,29 +59,32 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.experiments.first_use import compile_kernels
     from minisplat_ref.experiments.settings import load
     from minisplat_ref.experiments.simplification import Target
-    from minisplat_ref.experiments.simplification_report import TABLE_HEADING, closing_line, table_rows
-    from minisplat_ref.experiments.simplified_run import Asked, simplify_run
-    from minisplat_ref.reporting import markdown_table
+    from minisplat_ref.experiments.simplified_run import Asked
 
     compile_kernels(load(args.folder).backend)
     target = Target(args.max_drop, args.budget, args.max_bytes)
-    result = simplify_run(Asked(args.folder, args.out, target, args.fine_tune, args.scene))
+    simplify(Asked(args.folder, args.out, target, args.fine_tune, args.scene))
+    return 0
+
+
+def simplify(asked: "Asked") -> None:
+    """Simplify a run and print how that went.
+
+    Raises
+    ------
+    InputError
+        See :func:`minisplat_ref.experiments.simplified_run.simplify_run`.
+    """
+    from minisplat_ref.experiments.simplification_report import TABLE_HEADING, closing_line, table_rows
+    from minisplat_ref.experiments.simplified_run import simplify_run
+    from minisplat_ref.reporting import markdown_table
+
+    result = simplify_run(asked)
     print(markdown_table(TABLE_HEADING, table_rows(result)))
     n_held = len(result["held_out"])
     print(f"measured on {n_held} of {result['train_views']} training views, held out from ranking and fine-tuning")
     if result["is_all_that_matter"]:
         n = result["chosen"]["n_gaussians"]
-        print(f"minisplat-ref: {target} is more than all {n:,} Gaussians that matter", file=sys.stderr)
-    print(f"results in {args.out}: point_cloud.ply, metrics.json, report.html")
+        print(f"minisplat-ref: {asked.target} is more than all {n:,} Gaussians that matter", file=sys.stderr)
+    print(f"results in {asked.out}: point_cloud.ply, metrics.json, report.html")
     print(closing_line(result))
-    return 0
-
-
-def _drop(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of dB of at least 0")
-    return value

@@ -12,6 +12,7 @@ from minisplat_ref.experiments.arguments import (
     HelpFormatter,
     add_renderer_arguments,
     assignment,
+    decibels,
     integer,
     option_name,
     positive,
@@ -19,12 +20,14 @@ from minisplat_ref.experiments.arguments import (
 
 if TYPE_CHECKING:
     from minisplat_ref.experiments.settings import Settings
+    from minisplat_ref.experiments.simplification import Target
     from minisplat_ref.lpips import Network
     from minisplat_ref.training.loop import TrainState
     from minisplat_ref.training.schedule import Recipe
     from minisplat_ref.types import Scene
 
 N_ITERATIONS = 3000  # of recipes with a schedule
+SIMPLIFIED = "simplified"  # the run inside of a run that --max-drop and --max-bytes leave
 LEAST_MINUTES = 0.1  # the first iterations take seconds, to compile what has not been
 
 DEFAULTS = {
@@ -46,6 +49,8 @@ DEFAULTS = {
     "backend": "cpu",
     "drop_bad_steps": False,
     "minutes": None,
+    "max_drop": None,
+    "max_bytes": None,
 }
 AFRESH = ("iterations", "lpips_weights", "drop_bad_steps")  # what may be new when a run is continued
 
@@ -96,6 +101,11 @@ def add_parser(commands: Commands) -> None:
     training.add_argument(
         "--budget", type=integer(1), metavar="N", help="most Gaussians, for recipes that choose their number"
     )
+    target = training.add_mutually_exclusive_group()
+    target.add_argument(
+        "--max-drop", type=decibels, metavar="dB", help="then simplify: PSNR to lose, into DIR/simplified"
+    )
+    target.add_argument("--max-bytes", type=integer(1), metavar="B", help="likewise: size of its PLY at most")
     training.add_argument(
         "--simplify",
         choices=("sampling", "rank", "merging"),
@@ -162,6 +172,7 @@ def _start(given: dict[str, Any]) -> int:
     from minisplat_ref.experiments import curve, run_folder
     from minisplat_ref.experiments.first_use import compile_kernels
     from minisplat_ref.experiments.notices import warn_of_scene
+    from minisplat_ref.experiments.proposed_size import propose
     from minisplat_ref.experiments.settings import Settings, load_lpips, load_photographs, recipe_of
 
     run_folder.check_free(folder)
@@ -173,10 +184,14 @@ def _start(given: dict[str, Any]) -> int:
         curve.check_views(scene)
     network = load_lpips(settings, scene)
     state = _first_state(settings, scene, recipe)
+    _check_target(folder, settings, recipe, scene, state)
     room = _check_room(scene, state, settings)
     compile_kernels(settings.backend)
     run_folder.create(folder)
     warn_of_scene(scene, settings.downscale)
+    proposal = None if "downscale" in given else propose(scene, state, recipe, settings)
+    if proposal is not None:
+        print(f"minisplat-ref: {proposal}", file=sys.stderr)
     with run_folder.held(folder):
         run_folder.check_free(folder)  # another process may have trained there meanwhile
         try:
@@ -197,6 +212,26 @@ def _check_time(settings: "Settings", recipe: "Recipe") -> None:
         raise InputError(
             f"--minutes {settings.minutes:g} is too short to learn anything: give at least {LEAST_MINUTES:g}"
         )
+
+
+def _target(settings: "Settings") -> "Target | None":
+    """Return what a simplification after the training is to reach; None where there is none."""
+    from minisplat_ref.experiments.simplification import Target
+
+    target = Target(max_drop=settings.max_drop, max_bytes=settings.max_bytes)
+    return None if target == Target() else target
+
+
+def _check_target(folder: Path, settings: "Settings", recipe: "Recipe", scene: "Scene", state: "TrainState") -> None:
+    """Refuse, before the training, a simplification that could not follow it."""
+    from minisplat_ref.experiments.opened_run import Run
+    from minisplat_ref.experiments.simplification import check_before_training
+    from minisplat_ref.extensions.extension import CORE, owner_of
+
+    target = _target(settings)
+    if target is not None:
+        owner = owner_of(settings.recipe, settings.extension) or CORE
+        check_before_training(Run(folder, settings, recipe, owner, scene, state.model, None, None), target)
 
 
 def _default_iterations(name: str) -> int:
@@ -319,6 +354,27 @@ def _train(
         f"{summary(outcome.evaluation)}, {len(state.gaussians.means):,} Gaussians, {outcome.seconds:.0f} s of training"
     )
     print(f"results in {folder}: point_cloud.ply, metrics.json, renders/")
+    return _simplify(folder, settings)
+
+
+def _simplify(folder: Path, settings: "Settings") -> int:
+    """Make the finished run smaller if that was asked for; return the exit code."""
+    from minisplat_ref.cli.simplify import FINE_TUNE, simplify
+    from minisplat_ref.experiments.simplified_run import Asked
+
+    target, out = _target(settings), folder / SIMPLIFIED
+    if target is None:
+        return 0
+    if out.exists():
+        command = f"minisplat-ref simplify {folder} --out NEW {target}"
+        print(f"minisplat-ref: {out} is of an earlier end of the run; for a new one: {command}", file=sys.stderr)
+        return 0
+    try:
+        simplify(Asked(folder, out, target, FINE_TUNE))
+    except KeyboardInterrupt:
+        command = f"minisplat-ref simplify {folder} --out {out} {target}"
+        print(f"minisplat-ref: trained, but not simplified; to do so: {command}", file=sys.stderr)
+        return 130
     return 0
 
 

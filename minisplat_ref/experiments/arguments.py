@@ -117,3 +117,14 @@ def add_renderer_arguments(parser: argparse._ActionsContainer, default: str | No
         metavar="NAME",
         help=f"cpu, cpu-exact or reference (default {whose}cpu)",
     )
+
+
+def decibels(text: str) -> float:
+    """Read a number of dB of at least 0, as an option of the command line."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of dB of at least 0")
+    return value

@@ -90,12 +90,7 @@ def open_run(folder: Path, scene: Path | None = None) -> Run:
         raise InputError(f"{settings.scene}, the scene of {folder}, is not there: --scene PATH says where it is now")
     photographs = load_photographs(settings)
     fingerprint.check(folder, photographs, settings.scene)
-    n_views = len(photographs.train_views)
-    if n_views < LEAST_VIEWS:
-        raise InputError(
-            f"{folder} has {n_views} training view{'s'[: n_views != 1]}, and at least {LEAST_VIEWS} are needed, two of"
-            " them to decide by: train with more photographs"
-        )
+    check_views(photographs, "simplify")
     if n_rows(saved.model.gaussians) < 2:
         raise InputError(f"{folder} holds {n_rows(saved.model.gaussians)} Gaussians, of which none can go: train more")
     recipe = recipe_of(settings)
@@ -114,11 +109,21 @@ def open_run(folder: Path, scene: Path | None = None) -> Run:
         run_folder.measured_step(folder) if saved.unfinished is None else saved.unfinished,
         saved.unfinished,
     )
-    _check_renderer(run)
+    check_renderer(run)
     return run
 
 
-def _check_renderer(run: Run) -> None:
+def check_views(scene: Scene, what: str) -> None:
+    """Refuse a scene with too few training views to hold some out; ``what`` is what needs them."""
+    n_views = len(scene.train_views)
+    if n_views < LEAST_VIEWS:
+        raise InputError(
+            f"{what} needs at least {LEAST_VIEWS} training views, two of them to decide by, and scene {scene.name} has"
+            f" {n_views}: train with more photographs"
+        )
+
+
+def check_renderer(run: Run) -> None:
     """Refuse a renderer that does not say how much each row weighs in a picture."""
     request = Request(conventions=run.conventions, backend=run.backend, wants=frozenset({"stats"}))
     renderer, reason = run.recipe.renderer, ""

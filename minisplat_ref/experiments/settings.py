@@ -71,6 +71,10 @@ class Settings(NamedTuple):
     """Absolute path of the weights of LPIPS; None: it is not measured. Does not change the result."""
     minutes: float | None = None
     """Time that the training may take, for a recipe that decides its own length; the result depends on the machine."""
+    max_drop: float | None = None
+    """PSNR, dB, that a simplification after the training may lose; None: there is none."""
+    max_bytes: int | None = None
+    """Size that the PLY of a simplification after the training may have; None: there is none."""
     init: str | None = None
     """Absolute path of the PLY whose points the training starts from, not read again; None for the scene's points."""
 

@@ -22,7 +22,7 @@ import numpy as np
 from tqdm import tqdm
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.opened_run import HOLD_OUT_EVERY, Run
+from minisplat_ref.experiments.opened_run import HOLD_OUT_EVERY, Run, check_renderer, check_views
 from minisplat_ref.experiments.rate_distortion import (
     PlySize,
     Point,
@@ -80,7 +80,7 @@ class Decision(NamedTuple):
 
 
 def ply_size(run: Run) -> PlySize:
-    """Return what the PLY of the run's population takes, from files of one row and of two."""
+    """Return what the PLY of the run's population takes, measured on files of one row and of two."""
     n_bytes = []
     with tempfile.TemporaryDirectory() as folder:
         for n in (1, 2):
@@ -89,6 +89,19 @@ def ply_size(run: Run) -> PlySize:
             n_bytes.append(path.stat().st_size)
     row = n_bytes[1] - n_bytes[0]
     return PlySize(n_bytes[0] - row - 1, row)
+
+
+def check_before_training(run: Run, target: Target) -> None:
+    """Refuse, before the training, a simplification that could not follow it.
+
+    Raises
+    ------
+    InputError
+        There are too few training views, the renderer gives no blend weights, or not even one Gaussian fits.
+    """
+    check_views(run.scene, f"--{'max-drop' if target.max_bytes is None else 'max-bytes'}")
+    check_renderer(run)
+    limit_of(target, ply_size(run))
 
 
 def limit_of(target: Target, size: PlySize) -> int | None:

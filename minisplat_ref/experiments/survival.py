@@ -39,7 +39,8 @@ SCENE: dict[str, Any] = {"n_views": 6, "width": 32, "height": 24, "n_points": 12
 # begin anew from the centres at 120, prune the tail at 160.
 ITERATIONS = 240
 OPTIONS = ("--recipe", "mini-splatting", "--iterations", str(ITERATIONS), "--test-every", "4", "--eval-every", "90")
-TIMES = ("seconds", "its/s", "train_seconds", "cpu_seconds", "train_cpu_seconds", "peak_rss_mb")  # what no two trainings share
+# What no two trainings have in common:
+TIMES = ("seconds", "cpu_seconds", "its/s", "train_seconds", "train_cpu_seconds", "peak_rss_mb")
 MEANS = ("loss", "psnr")  # of the log
 
 _CHILD = "import sys; from minisplat_ref.experiments.kill_points import train_until as t; t(sys.argv[1], sys.argv[2:])"

@@ -19,6 +19,7 @@ from functools import partial
 import numpy as np
 
 from minisplat_ref.methods.adaptive_exposure import hold_mean_exposure, log_gains, switch_exposure_on
+from minisplat_ref.methods.adaptive_pose import hold_mean_pose, switch_pose_on, turn_held_out
 from minisplat_ref.methods.gaussian_splatting import GS, GS_ACCEL, collect_gradients, prune_faint
 from minisplat_ref.methods.mini_splatting import candidates, measure_importance
 from minisplat_ref.metrics import psnr
@@ -35,6 +36,7 @@ from minisplat_ref.training.schedule import At, During, Every
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit, begin_cooling
 
 MOST_ITERATIONS = 30_000
+LEAST_GAIN = 0.05  # dB of the squared error, for which a calibration of the photographs is worth its while
 LEAST_MEASUREMENTS = 4  # through which a line is drawn
 
 
@@ -91,7 +93,7 @@ def measure_held_out(state: TrainState, iteration: Iteration) -> str | None:
         return "nothing done: all training views are trained on"
     views = iteration.scene.train_views
     ids, psnrs = held_out_ids(len(views), iteration.cooling.hold_out_every), []
-    # Nothing has learned their exposures, by which they are not to be judged.
+    # Nothing has learned their exposures, by which they are not to be judged. For poses, see turn_held_out.
     gains = np.exp(log_gains(state, iteration, ids) if EXPOSURES in state.shared else np.zeros(len(ids)))
     for index, gain in zip(ids, gains.astype(np.float32), strict=True):
         view = views[index].loaded()
@@ -173,7 +175,10 @@ ADAPTIVE = GS._replace(
     events=(
         During(collect_while_growing),
         During(hold_mean_exposure),
-        At(600, partial(switch_exposure_on, least_spread=0.05)),
+        During(hold_mean_pose),
+        At(600, partial(switch_exposure_on, least_exposure_gain=LEAST_GAIN)),
+        At(600, partial(switch_pose_on, least_pose_gain=LEAST_GAIN)),
+        Every(100, turn_held_out, start=100),
         Every(100, measure_held_out, start=100),
         Every(100, partial(cool_when_little_is_gained, least_gain=0.3, least_step=800), start=100),
         Every(100, partial(grow, threshold=4e-4, most_at_once=0.2, offset=OFFSET, budget=None), start=100),

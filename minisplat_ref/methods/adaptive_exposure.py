@@ -1,9 +1,9 @@
 """Exposure of each photograph, switched on by ``adaptive`` where the photographs show that they need it.
 
-After some hundred iterations the scene is a blur of the right brightness. The gain of a photograph is then read off as
-the median of photograph / rendering over the pixels. Where a camera has kept its exposure these gains are nearly equal;
-where it has not, their spread is what it has done. If it is large the photographs get exposures
-(:mod:`minisplat_ref.training.calibration`) that begin with these gains.
+After some hundred iterations the scene is a blur of the right brightness. Where the gain of one half of a photograph
+explains the other half (:mod:`minisplat_ref.methods.adaptive_evidence`), the camera has changed its exposure. The
+photographs then get exposures (:mod:`minisplat_ref.training.calibration`) that begin with their gains, read off as the
+median of photograph / rendering over the pixels.
 
 Scene and exposures are known up to a map that all photographs have in common, and which would drift: a scene twice as
 bright with half the exposures looks the same in all training views, and wrong in every other. The mean of the exposures
@@ -12,14 +12,12 @@ is therefore held at the identity.
 
 import numpy as np
 
+from minisplat_ref.methods.adaptive_evidence import BRIGHT, DARK, exposure_evidence, switch_on
 from minisplat_ref.rendering import Request
-from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.calibration import EXPOSURE, EXPOSURES, identity_exposures
 from minisplat_ref.training.pace import Decision, trained_ids
 from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Floats, Ints
-
-DARK, BRIGHT = 0.05, 0.98  # brightness, of 1, of pixels that say nothing of a gain: noise, and what is saturated
 
 
 def log_gains(state: TrainState, iteration: Iteration, view_ids: Ints | list[int]) -> Floats:
@@ -51,30 +49,28 @@ def log_gains(state: TrainState, iteration: Iteration, view_ids: Ints | list[int
     return gains
 
 
-def switch_exposure_on(state: TrainState, iteration: Iteration, *, least_spread: float) -> str | None:
-    """Give each photograph an exposure if the gains of the photographs spread by more than ``least_spread``.
+def switch_exposure_on(state: TrainState, iteration: Iteration, *, least_exposure_gain: float) -> str | None:
+    """Give each photograph an exposure if halves of photographs explain each other by gains.
 
-    The spread is the standard deviation of the logarithms. At 600 iterations it was 0.002 to 0.04 in eight scenes as
-    they were photographed, and 0.08 to 0.18 in three whose photographs were multiplied by gains from 0.7 to 1.4.
+    Parameters
+    ----------
+    state, iteration
+        As for every action.
+    least_exposure_gain : float
+        dB of the squared error that the photographs have to gain on average, and two standard errors besides.
     """
     if EXPOSURE.name in state.pace.switched_on or EXPOSURES in state.shared:
         return "nothing done: exposures are on"
     n_views = len(iteration.scene.train_views)
     ids = trained_ids(n_views, iteration.cooling, state.pace)
-    gains = log_gains(state, iteration, ids)
-    spread = float(gains.std(ddof=1))
-    why = f"the gains of the photographs spread by {spread:.3f}"
-    if spread <= least_spread:
+    evidence = exposure_evidence(state, iteration, ids)
+    why = f"gains that spread by {evidence.spread:.3f} explain {evidence.gain:.2f} dB of the other halves"
+    if not evidence.is_above(least_exposure_gain):
         return f"nothing done: {why}"
-    exposures = identity_exposures(n_views)
+    exposures, gains = identity_exposures(n_views), log_gains(state, iteration, ids)
     _begin_with(exposures[EXPOSURES], ids, gains - gains.mean())
-    state.shared = {**state.shared, **exposures}
-    zeros = zero_moments(exposures)
-    state.shared_adam = state.shared_adam._replace(
-        first={**state.shared_adam.first, **zeros.first}, second={**state.shared_adam.second, **zeros.second}
-    )
-    decision = Decision(iteration.step, "exposures", f"{why}, more than {least_spread}", None, None)
-    state.pace = state.pace.decided(decision)._replace(switched_on=(*state.pace.switched_on, EXPOSURE.name))
+    decision = Decision(iteration.step, "exposures", why, evidence.gain, evidence.standard_error)
+    switch_on(state, EXPOSURE, exposures, decision)
     return why
 
 

@@ -179,7 +179,7 @@ def start_anew(state: TrainState, iteration: Iteration, gaussians: Gaussians) ->
     """Replace the population by one that has no past: zero moments, no statistics, all views still to come.
 
     Fields that the representation has besides those of ``gaussians`` begin as at the start of training. Shared
-    parameters stay.
+    parameters stay, and so does the precision of the population.
 
     Raises
     ------
@@ -187,7 +187,9 @@ def start_anew(state: TrainState, iteration: Iteration, gaussians: Gaussians) ->
         There is no memory for so many rows.
     """
     _check_room(state, len(gaussians.means))
-    state.gaussians = contiguous(iteration.representation.extend(gaussians, state.rng))
+    dtype = state.gaussians.means.dtype
+    fresh = iteration.representation.extend(gaussians, state.rng)
+    state.gaussians = contiguous(type(fresh)(*(field.astype(dtype, copy=False) for field in fresh)))
     state.adam = zero_moments(state.gaussians)
     state.stats = {}
     state.view_order = []

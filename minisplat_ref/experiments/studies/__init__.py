@@ -9,6 +9,8 @@
 :data:`DEPTH`               :mod:`.depth_types`: from which depth Gaussians begin anew
 :data:`EXPOSURE`            :mod:`.exposures`: exposures that were disturbed, found again
 :data:`POSE`                :mod:`.poses`: poses that were disturbed, found again
+:data:`DEFECTS`             :mod:`.defects`: wrong exposures and poses, found by ``adaptive`` where they are
+:data:`PRECISION`           :mod:`.precision`: a training in float64, float32, and with colours in float16
 ==========================  =====================================================================
 
 Here are their names and arguments. The modules hold the work; they load matplotlib and Numba, and so wait until a study
@@ -29,7 +31,8 @@ RECIPE_HELP = "name as in train --recipe"
 
 def all_studies() -> dict[str, Study]:
     """Return the studies of this package by the name that is typed; an extension's are EXTENSION/NAME."""
-    return {study.name: study for study in (ADAPTIVE, ABLATION, SPLIT, CULLING, SIMPLIFY, DEPTH, EXPOSURE, POSE)}
+    studies = (ADAPTIVE, ABLATION, SPLIT, CULLING, SIMPLIFY, DEPTH, EXPOSURE, POSE, DEFECTS, PRECISION)
+    return {study.name: study for study in studies}
 
 
 def _run_of(module: str) -> Callable[[argparse.Namespace], None]:
@@ -84,13 +87,16 @@ def _add_adaptive_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="R,Q",
         help="the first is what the others are compared with (default: three of 3000 iterations, and adaptive)",
     )
-    parser.add_argument("--rules", action="store_true", help="adaptive beside itself without each of its rules")
+    variants = parser.add_mutually_exclusive_group()
+    variants.add_argument("--rules", action="store_true", help="adaptive beside itself without each of its rules")
+    variants.add_argument("--sweep", action="store_true", help="adaptive beside itself with more Gaussians and fewer")
     parser.add_argument(
         "--conditions",
         type=listed(name),
         default=("whole", "few", "gains"),
         metavar="C,D",
-        help="all photographs, every fifth, all with wrong exposures (default whole,few,gains)",
+        help="whole, few (every fifth photograph), gains (wrong exposures), poses (wrong cameras; default: the first"
+        " three)",
     )
     _add_seeds(parser)
 
@@ -192,6 +198,32 @@ def _add_pose_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_defects_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Disturb the photographs of a scene in known ways, and count what adaptive\nswitches on. The same command with "
+        "the same folder goes on where it was\ninterrupted."
+    )
+    names = ", ".join(SYNTHETIC_SCENES)
+    parser.add_argument("scene", metavar="SCENE", help=f"folder of a scene, or a synthetic one: {names}")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=f"folder for {RESULT} and {FIGURE}")
+    parser.add_argument(
+        "--downscale", type=integer(1), default=1, metavar="D", help="make a folder's photographs D times smaller"
+    )
+    parser.add_argument("--trials", type=integer(1), default=10, metavar="N", help="of each kind (default 10)")
+
+
+def _add_precision_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Train a scene in float64, in float32 with exact and with fast kernels, and with\ncolours in float16. The same "
+        "command with the same folder goes on where it was\ninterrupted."
+    )
+    _add_scene_arguments(parser, iterations=3000)
+    parser.add_argument(
+        "--recipe", type=name, default="mini-splatting2", metavar="R", help=f"{RECIPE_HELP} (default %(default)s)"
+    )
+    _add_seeds(parser)
+
+
 ADAPTIVE = Study(
     name="adaptive",
     summary="the recipe that decides for itself, beside those with a schedule",
@@ -239,4 +271,16 @@ POSE = Study(
     summary="pose refinement: cameras moved by known amounts, and recovered",
     add_arguments=_add_pose_arguments,
     run=_run_of("poses"),
+)
+DEFECTS = Study(
+    name="defects",
+    summary="wrong exposures and poses: found where they are, and nowhere else",
+    add_arguments=_add_defects_arguments,
+    run=_run_of("defects"),
+)
+PRECISION = Study(
+    name="precision",
+    summary="float64, float32 exact and fast, colours in float16: what it takes",
+    add_arguments=_add_precision_arguments,
+    run=_run_of("precision"),
 )

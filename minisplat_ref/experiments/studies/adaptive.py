@@ -6,13 +6,15 @@ time until a recipe has the final PSNR of the first recipe less 0.1 dB, and how 
 moment. Times are those of the processor (all threads of the process together), which other programs disturb less than
 the clock on the wall.
 
-With ``--rules`` it is ``adaptive`` beside itself without one of its rules.
+With ``--rules`` it is ``adaptive`` beside itself without one of its rules, with ``--sweep`` beside itself with other
+thresholds of growth, which make more Gaussians and fewer: what the scene would have rewarded, and by how much.
 
 Trainings take long. Each leaves its record in ``runs.jsonl``, and the same command with the same folder goes on.
 """
 
 import argparse
 import contextlib
+import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -24,13 +26,14 @@ from tqdm import tqdm
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.studies.ablation import append, read_records
+from minisplat_ref.experiments.studies.defects import with_turned_cameras
 from minisplat_ref.experiments.studies.front import BLUE, RED, describe_scene, read_scene, tidy, title, write
 from minisplat_ref.methods import adaptive, gaussian_splatting, get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.rates import Rates
-from minisplat_ref.training.schedule import Recipe, does, scaled
+from minisplat_ref.training.schedule import Recipe, configured, does, scaled, settings_of
 from minisplat_ref.training.state import Iteration, StepReport, TrainState
 from minisplat_ref.types import Scene, View
 
@@ -66,10 +69,16 @@ def random_gains(scene: Scene) -> Scene:
     return scene._replace(train_views=views)
 
 
+def half_a_pixel_off(scene: Scene) -> Scene:
+    """Return the scene with every training camera turned by half a pixel; test cameras stay."""
+    return with_turned_cameras(scene, np.random.default_rng(0))
+
+
 CONDITIONS: Mapping[str, Callable[[Scene], Scene]] = {
     "whole": whole,
     "few": few_photographs,
     "gains": random_gains,
+    "poses": half_a_pixel_off,
 }
 
 
@@ -106,13 +115,28 @@ def without_growth(recipe: Recipe) -> Recipe:
     return recipe._replace(events=tuple(event for event in recipe.events if not does(event, adaptive.grow)))
 
 
+def with_threshold(recipe: Recipe, *, factor: float) -> Recipe:
+    """Return the recipe that halves Gaussians from ``factor`` times the gradient on."""
+    return configured(recipe, threshold=factor * settings_of(recipe)["threshold"])
+
+
 RULES: Mapping[str, Callable[[Recipe], Recipe]] = {
     "adaptive": lambda recipe: recipe,
     "no growth": without_growth,
     "clones of 3DGS": with_clones,
     "rates of 3DGS": with_published_rates,
     "no cool-down": without_cool_down,
+    "no prune": lambda recipe: configured(recipe, mass=1.0, least_views=0),
+    "no exposures": lambda recipe: configured(recipe, least_exposure_gain=math.inf),
+    "no poses": lambda recipe: configured(recipe, least_pose_gain=math.inf),
 }
+
+THRESHOLDS = (8.0, 4.0, 2.0, 1.4, 1.0, 0.7, 0.5, 0.25)  # times that of adaptive
+SWEEP: Mapping[str, Callable[[Recipe], Recipe]] = {
+    "adaptive" if factor == 1 else f"threshold x {factor:g}": partial(with_threshold, factor=factor)
+    for factor in THRESHOLDS
+}
+"""Eight counts: the higher the threshold, the fewer Gaussians are halved."""
 
 
 def run(args: argparse.Namespace) -> None:
@@ -129,9 +153,8 @@ def run(args: argparse.Namespace) -> None:
     unknown = [name for name in args.conditions if name not in CONDITIONS]
     if unknown:
         raise InputError(f"condition {unknown[0]!r} does not exist: choose from {', '.join(CONDITIONS)}")
-    recipes = (
-        {name: change(adaptive.ADAPTIVE) for name, change in RULES.items()} if args.rules else _named(args.recipes)
-    )
+    variants = RULES if args.rules else SWEEP if args.sweep else {}
+    recipes = {name: change(adaptive.ADAPTIVE) for name, change in variants.items()} or _named(args.recipes)
     description = describe_scene(scene)
     settings = {"scene": description["scene"], "downscale": args.downscale, "recipes": list(recipes)}
     records = read_records(args.out, settings)
@@ -152,6 +175,9 @@ def run(args: argparse.Namespace) -> None:
     print(f"seeds {', '.join(map(str, args.seeds))}; seconds of the processor\n")
     heading = ["condition", "recipe", "PSNR (dB)", "fall since its best", "Gaussians", "iterations", "seconds"]
     print(markdown_table([*heading, f"until {next(iter(recipes))} - {NEAR} dB"], [_cells(row) for row in rows]))
+    if args.sweep:
+        for condition in args.conditions:
+            print(f"\n{condition}: {describe_regret([r for r in records if r['condition'] == condition])}")
 
 
 def _named(names: Sequence[str]) -> dict[str, Recipe]:
@@ -213,6 +239,30 @@ def summarise(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 }
             )
     return rows
+
+
+def regret(records: Sequence[Mapping[str, Any]]) -> tuple[float, float]:
+    """Return what the chosen count costs, over the trainings of one seed under one condition.
+
+    Returns
+    -------
+    regret : float
+        dB from the chosen count to the best one.
+    ratio : float
+        The chosen count, as a multiple of the smallest that is within :data:`NEAR` of the best.
+    """
+    chosen = next(record for record in records if record["recipe"] == "adaptive")
+    best = max(record["psnr"] for record in records)
+    smallest = min(record["n_gaussians"] for record in records if record["psnr"] >= best - NEAR)
+    return best - chosen["psnr"], chosen["n_gaussians"] / smallest
+
+
+def describe_regret(records: Sequence[Mapping[str, Any]]) -> str:
+    """Return the mean of :func:`regret` over the seeds, in words."""
+    seeds = dict.fromkeys(record["seed"] for record in records)
+    each = [regret([record for record in records if record["seed"] == seed]) for seed in seeds]
+    cost, ratio = np.mean(each, axis=0)
+    return f"the count of adaptive costs {cost:.2f} dB, and is {ratio:.2f} times the smallest adequate one"
 
 
 def standard_error(values: Sequence[float]) -> float | None:

@@ -1,0 +1,160 @@
+"""Planted defects: whether ``adaptive`` finds them, and none where there are none.
+
+Photographs of a scene are disturbed in a known way, anew in every trial, and the scene is trained until the iteration
+in which ``adaptive`` decides about exposures and poses. A trial counts what was switched on. The seed of a trial is
+that of its disturbance and of its training.
+
+=========  ========================================================================================================
+``clean``  the scene as it is; a real one may have defects of its own
+``gains``  each photograph is multiplied by a gain of its own, from 0.9 to 1.1
+``poses``  each camera is turned about an axis of its own, across its own, so that its image moves by half a pixel
+=========  ========================================================================================================
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from tqdm import tqdm
+
+from minisplat_ref.experiments.studies.ablation import append, read_records
+from minisplat_ref.experiments.studies.front import BLUE, RED, describe_scene, read_scene, tidy, title, write
+from minisplat_ref.experiments.studies.poses import moved
+from minisplat_ref.methods import adaptive
+from minisplat_ref.methods.adaptive_exposure import switch_exposure_on
+from minisplat_ref.methods.adaptive_pose import switch_pose_on
+from minisplat_ref.reporting import markdown_table
+from minisplat_ref.training.calibration import EXPOSURE, POSE
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.schedule import firing_steps
+from minisplat_ref.training.state import StepReport
+from minisplat_ref.types import Scene
+
+LARGEST_GAIN = 0.1
+PIXELS = 0.5
+HEADING = ["photographs", "trials", "exposures switched on", "poses switched on"]
+
+
+def clean(scene: Scene, rng: np.random.Generator) -> Scene:
+    """Return the scene."""
+    return scene
+
+
+def with_gains(scene: Scene, rng: np.random.Generator) -> Scene:
+    """Return the scene with every training photograph multiplied by a gain of its own."""
+    gains = rng.uniform(1 - LARGEST_GAIN, 1 + LARGEST_GAIN, len(scene.train_views))
+    views = []
+    for view, gain in zip(scene.train_views, gains, strict=True):
+        view = view.loaded()
+        views.append(view._replace(image=np.clip(np.round(gain * view.image), 0, 255).astype(np.uint8)))
+    return scene._replace(train_views=tuple(views))
+
+
+def with_turned_cameras(scene: Scene, rng: np.random.Generator) -> Scene:
+    """Return the scene with every training camera turned so that the middle of its image moves by half a pixel."""
+    views = []
+    for view, angle in zip(scene.train_views, rng.uniform(0, 2 * np.pi, len(scene.train_views)), strict=True):
+        w = PIXELS * np.array([np.sin(angle) / view.camera.fy, np.cos(angle) / view.camera.fx, 0.0])
+        views.append(view._replace(camera=moved(view.camera, w, np.zeros(3))))
+    return scene._replace(train_views=tuple(views))
+
+
+CONDITIONS: Mapping[str, Callable[[Scene, np.random.Generator], Scene]] = {
+    "clean": clean,
+    "gains": with_gains,
+    "poses": with_turned_cameras,
+}
+
+
+class _DecidedError(Exception):
+    """Ends a training that has decided what is asked."""
+
+
+def run(args: argparse.Namespace) -> None:
+    """Train, count, write, print the table.
+
+    Raises
+    ------
+    InputError
+        The scene or the output folder cannot be used.
+    """
+    scene = read_scene(args.scene, args.downscale)
+    description = describe_scene(scene)
+    records = read_records(args.out, {"scene": description["scene"], "downscale": args.downscale})
+    done = {(record["condition"], record["seed"]) for record in records}
+    todo = [(name, seed) for seed in range(args.trials) for name in CONDITIONS if (name, seed) not in done]
+    for name, seed in tqdm(todo, desc="trials", leave=False):
+        record = {"condition": name, "seed": seed, **decide(CONDITIONS[name](scene, np.random.default_rng(seed)), seed)}
+        append(args.out, record)
+        records.append(record)
+    records = [record for record in records if record["seed"] < args.trials]
+    summary = summarise(records)
+    write(args.out, {**description, "trials": args.trials, "summary": summary, "runs": records}, draw(records))
+    print(title(description))
+    print(f"after {decision_step()} iterations of adaptive\n")
+    print(markdown_table(HEADING, to_rows(summary)))
+
+
+def decision_step() -> int:
+    """Return the iteration after which both decisions have been made."""
+    return max(
+        step for action in (switch_exposure_on, switch_pose_on) for step in firing_steps(adaptive.ADAPTIVE, action)
+    )
+
+
+def decide(scene: Scene, seed: int) -> dict[str, Any]:
+    """Train until the decisions; return what was switched on, with its evidence, and the seconds of the processor."""
+    last, notes = decision_step(), {}
+    switched_on: tuple[str, ...] = ()
+    start = time.process_time()
+
+    def on_step(report: StepReport) -> None:
+        nonlocal switched_on
+        if report.step == last:
+            switched_on = report.state.pace.switched_on
+            notes.update({fired.action: fired.note for fired in report.fired if "switch" in fired.action})
+            raise _DecidedError
+
+    try:
+        train(scene, adaptive.ADAPTIVE, seed=seed, on_step=on_step)
+    except _DecidedError:
+        pass
+    return {"switched_on": list(switched_on), "evidence": notes, "seconds": time.process_time() - start}
+
+
+def summarise(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
+    """Return for each condition the number of trials, and of those that switched each calibration on."""
+    summary = {}
+    for name in CONDITIONS:
+        own = [record for record in records if record["condition"] == name]
+        counts = {c.name: sum(c.name in record["switched_on"] for record in own) for c in (EXPOSURE, POSE)}
+        summary[name] = {"trials": len(own), **counts}
+    return summary
+
+
+def to_rows(summary: Mapping[str, Mapping[str, int]]) -> list[list[str]]:
+    """Return the lines of the table."""
+    return [
+        [name, str(row["trials"]), str(row[EXPOSURE.name]), str(row[POSE.name])]
+        for name, row in summary.items()
+        if row["trials"]
+    ]
+
+
+def draw(records: Sequence[Mapping[str, Any]]) -> Figure:
+    """Draw the part of the trials that switched each calibration on."""
+    summary = summarise(records)
+    figure = Figure(figsize=(7, 2.6), layout="constrained")
+    axes = figure.subplots()
+    for shift, calibration, color in ((-0.18, EXPOSURE.name, BLUE), (0.18, POSE.name, RED)):
+        shares = [100 * row[calibration] / max(row["trials"], 1) for row in summary.values()]
+        axes.barh(np.arange(len(summary)) + shift, shares, height=0.32, color=color, label=calibration)
+    axes.set(xlim=(0, 100), xlabel="trials in which it is switched on (%)", yticks=range(len(summary)))
+    axes.set_yticklabels(summary)
+    axes.invert_yaxis()
+    axes.legend(frameon=False)
+    tidy(axes, grid="x")
+    return figure

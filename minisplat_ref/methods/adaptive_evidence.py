@@ -1,0 +1,174 @@
+"""Whether photographs need a calibration: what one half of each says has to explain the other half.
+
+After some hundred iterations a scene is a blur in the right place. What a photograph differs from it by, the residual
+r = photograph - rendering, is explained to first order by a few fields b_k of the calibration, ``r = sum_k x_k b_k``:
+
+* a gain g of the exposure by ``x = g - 1`` and the rendering itself, b = rendering;
+* a displacement (dx, dy) in pixels, which is what a wrong pose does in the main, by ``x = -(dx, dy)`` and the slopes of
+  the rendering, b = (d/du, d/dv) rendering.
+
+The x of a photograph are fitted to its left half by least squares and judged by its right half, and the other way
+round. Noise and what the scene has not learned yet differ from half to half, and make the other half worse; an exposure
+and a pose are the same in both, and make it better. What all photographs have in common, their mean x, is the scene's
+and not theirs, and counts on both sides of the comparison:
+
+    gain of a photograph = 10 log10 (sum over halves |r - mean x b|^2 / sum over halves |r - (x of the other half) b|^2)
+
+In decibels of the squared error. It speaks for the calibration when its mean over the photographs is above both a least
+gain and two of its standard errors.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from minisplat_ref.rendering import Request
+from minisplat_ref.training.adam import zero_moments
+from minisplat_ref.training.calibration import Calibration
+from minisplat_ref.training.pace import Decision
+from minisplat_ref.training.state import Iteration, TrainState
+from minisplat_ref.types import Bools, Floats
+
+DARK, BRIGHT = 0.05, 0.98  # brightness, of 1, of pixels that say nothing of a gain: noise, and what is saturated
+STANDARD_ERRORS = 2.0
+
+
+class Half(NamedTuple):
+    """Half of a photograph, as far as least squares need it."""
+
+    normal: Floats
+    """[K, K] products of the fields, ``sum b_j b_k`` over pixels and colours."""
+    projected: Floats
+    """[K] ``sum b_k r``."""
+    energy: float
+    """``sum r^2``."""
+
+    def fitted(self) -> Floats:
+        """Return the x [K] of least squares; the smallest where several are as good."""
+        return np.linalg.lstsq(self.normal, self.projected, rcond=1e-6)[0]
+
+    def left_by(self, x: Floats) -> float:
+        """Return ``|r - sum x_k b_k|^2``."""
+        return float(self.energy - 2.0 * x @ self.projected + x @ self.normal @ x)
+
+
+class Evidence(NamedTuple):
+    """What the photographs say about a calibration."""
+
+    gain: float
+    """dB of the squared error, mean over the photographs."""
+    standard_error: float
+    """dB."""
+    fitted: Floats
+    """[V, K] x of the whole photographs, less their mean."""
+
+    @property
+    def spread(self) -> float:
+        """Root mean square of x over photographs and fields."""
+        return float(np.sqrt(np.mean(self.fitted**2)))
+
+    def is_above(self, least_gain: float) -> bool:
+        """Return whether it speaks for the calibration; ``least_gain`` in dB."""
+        return self.gain > max(least_gain, STANDARD_ERRORS * self.standard_error)
+
+
+def halves_of(residual: Floats, fields: Floats, is_counted: Bools) -> tuple[Half, Half]:
+    """Return the left and the right half of a photograph.
+
+    Parameters
+    ----------
+    residual : ndarray of shape (H, W, 3)
+        Photograph - rendering.
+    fields : ndarray of shape (K, H, W, 3)
+        b_k.
+    is_counted : ndarray of shape (H, W) of bool
+        Pixels that take part.
+    """
+    middle = residual.shape[1] // 2
+    halves = []
+    for columns in (slice(None, middle), slice(middle, None)):
+        counted = is_counted[:, columns]
+        r = residual[:, columns][counted].ravel().astype(np.float64)
+        B = fields[:, :, columns][:, counted].reshape(len(fields), -1).astype(np.float64)  # [K, pixels * 3]
+        halves.append(Half(B @ B.T, B @ r, float(r @ r)))
+    return halves[0], halves[1]
+
+
+def weigh(photographs: Sequence[tuple[Half, Half]]) -> Evidence:
+    """Return what the halves of at least two photographs say."""
+    fitted = np.array([[half.fitted() for half in pair] for pair in photographs])  # [V, 2, K]
+    common = fitted.mean(axis=(0, 1))
+    gains = []
+    for (left, right), (x_left, x_right) in zip(photographs, fitted, strict=True):
+        before = left.left_by(common) + right.left_by(common)
+        after = left.left_by(x_right) + right.left_by(x_left)
+        gains.append(10.0 * np.log10(before / after) if before > 0 and after > 0 else 0.0)
+    error = np.std(gains, ddof=1) / np.sqrt(len(gains))
+    whole = np.array([whole_of(pair).fitted() for pair in photographs])  # [V, K]
+    return Evidence(float(np.mean(gains)), float(error), whole - whole.mean(axis=0))
+
+
+def whole_of(pair: tuple[Half, Half]) -> Half:
+    """Return both halves together."""
+    left, right = pair
+    return Half(left.normal + right.normal, left.projected + right.projected, left.energy + right.energy)
+
+
+def exposure_evidence(state: TrainState, iteration: Iteration, view_ids: Sequence[int]) -> Evidence:
+    """Return what training views say about gains of their own."""
+    photographs = []
+    for photograph, rendered, is_counted in _pairs(state, iteration, view_ids):
+        seen, there = rendered.mean(axis=2), photograph.mean(axis=2)
+        says = is_counted & (seen > DARK) & (there > DARK) & (there < BRIGHT)
+        photographs.append(halves_of(photograph - rendered, rendered[None], says))
+    return weigh(photographs)
+
+
+def pose_evidence(state: TrainState, iteration: Iteration, view_ids: Sequence[int]) -> Evidence:
+    """Return what training views say about displacements of their own."""
+    return weigh(list(_halves_beside_slopes(state, iteration, view_ids)))
+
+
+def displacements(state: TrainState, iteration: Iteration, view_ids: Sequence[int]) -> Floats:
+    """Return by how much photographs [V] are displaced against their renderings, (du, dv) [V, 2] in pixels."""
+    return np.array([-whole_of(pair).fitted() for pair in _halves_beside_slopes(state, iteration, view_ids)])
+
+
+def _halves_beside_slopes(
+    state: TrainState, iteration: Iteration, view_ids: Sequence[int]
+) -> Iterator[tuple[Half, Half]]:
+    for photograph, rendered, is_counted in _pairs(state, iteration, view_ids):
+        slopes = np.stack([np.gradient(rendered, axis=1), np.gradient(rendered, axis=0)])  # [2, H, W, 3] along u, v
+        yield halves_of(photograph - rendered, slopes, is_counted)
+
+
+def switch_on(state: TrainState, calibration: Calibration, parameters: dict[str, Floats], decision: Decision) -> None:
+    """Let the training go on with a calibration.
+
+    Parameters
+    ----------
+    state : TrainState
+    calibration : Calibration
+    parameters : dict
+        Its shared parameters to begin with.
+    decision : Decision
+        Its evidence.
+    """
+    zeros = zero_moments(parameters)
+    state.shared = {**state.shared, **parameters}
+    state.shared_adam = state.shared_adam._replace(
+        first={**state.shared_adam.first, **zeros.first}, second={**state.shared_adam.second, **zeros.second}
+    )
+    pace = state.pace.decided(decision)
+    state.pace = pace._replace(switched_on=(*pace.switched_on, calibration.name))
+
+
+def _pairs(state: TrainState, iteration: Iteration, view_ids: Sequence[int]) -> Iterator[tuple[Floats, Floats, Bools]]:
+    """Iterate over photograph [H, W, 3] and rendering in [0, 1], and which pixels [H, W] are not masked."""
+    request = Request(iteration.scene.background, conventions=iteration.conventions, backend=iteration.backend)
+    for index in view_ids:
+        view = iteration.scene.train_views[index].loaded()
+        rendered = np.clip(iteration.renderer.render(state.model, view, request)[0].image, 0.0, 1.0)
+        mask: Bools = np.ones(rendered.shape[:2], bool) if view.mask is None else view.mask
+        yield view.image / np.float32(255.0), rendered, mask

@@ -1,0 +1,78 @@
+"""Pose of each photograph, refined by ``adaptive`` where the photographs show that the given ones are off.
+
+A camera that is turned by a small rotation w = (w_x, w_y, 0), in its own frame, shows everything displaced by
+
+    du = f_x w_y,   dv = -f_y w_x        pixels, near the middle of the image
+
+Where the displacement of one half of a photograph explains the other half
+(:mod:`minisplat_ref.methods.adaptive_evidence`) its pose is off. All photographs then get corrections of their poses
+(:mod:`minisplat_ref.training.calibration`), which begin with the rotations that these displacements mean. Photographs
+that are held back are not trained on: they are turned by their displacements alone, before each time that they measure.
+
+A turn of everything, cameras and scene, changes no photograph. It would drift, and test views would see the scene from
+elsewhere; so the mean rotation and the mean shift, in the world frame, are held at zero. The scale stays free.
+"""
+
+import numpy as np
+
+from minisplat_ref.methods.adaptive_evidence import displacements, pose_evidence, switch_on
+from minisplat_ref.training.calibration import POSE, ROTATIONS, SHIFTS, zero_corrections
+from minisplat_ref.training.pace import Decision, held_out_ids, trained_ids
+from minisplat_ref.training.state import Iteration, TrainState
+from minisplat_ref.types import Camera, Floats
+
+
+def rotation_of(camera: Camera, displacement: Floats) -> Floats:
+    """Return the rotation vector [3], radians, that displaces the middle of an image by (du, dv) pixels."""
+    du, dv = displacement
+    return np.array([-dv / camera.fy, du / camera.fx, 0.0])
+
+
+def switch_pose_on(state: TrainState, iteration: Iteration, *, least_pose_gain: float) -> str | None:
+    """Refine the poses if halves of photographs explain each other by displacements.
+
+    Parameters
+    ----------
+    state, iteration
+        As for every action.
+    least_pose_gain : float
+        dB of the squared error that the photographs have to gain on average, and two standard errors besides.
+    """
+    if POSE.name in state.pace.switched_on or ROTATIONS in state.shared:
+        return "nothing done: poses are refined"
+    views = iteration.scene.train_views
+    ids = trained_ids(len(views), iteration.cooling, state.pace)
+    evidence = pose_evidence(state, iteration, ids)
+    why = f"displacements of {evidence.spread:.2f} pixels explain {evidence.gain:.2f} dB of the other halves"
+    if not evidence.is_above(least_pose_gain):
+        return f"nothing done: {why}"
+    corrections = zero_corrections(len(views))
+    for index, x in zip(ids, evidence.fitted, strict=True):
+        corrections[ROTATIONS][index] = rotation_of(views[index].camera, -x)
+    decision = Decision(iteration.step, "poses", why, evidence.gain, evidence.standard_error)
+    switch_on(state, POSE, corrections, decision)
+    return why
+
+
+def turn_held_out(state: TrainState, iteration: Iteration) -> str | None:
+    """Turn the held-out training views so that they show what the scene shows, if poses are refined."""
+    if ROTATIONS not in state.shared or iteration.cooling is None or state.pace.cooling_from is not None:
+        return "nothing done: no poses are refined"
+    views = iteration.scene.train_views
+    ids = held_out_ids(len(views), iteration.cooling.hold_out_every)
+    found = displacements(state, iteration, ids)
+    for index, displacement in zip(ids, found, strict=True):
+        state.shared[ROTATIONS][index] += rotation_of(views[index].camera, displacement)
+    return f"by {np.sqrt(np.mean(found**2)):.2f} pixels"
+
+
+def hold_mean_pose(state: TrainState, iteration: Iteration) -> None:
+    """Keep the mean correction of the views that are trained on at zero."""
+    if ROTATIONS not in state.shared:
+        return
+    views = iteration.scene.train_views
+    ids = trained_ids(len(views), iteration.cooling, state.pace)
+    world_from_cam = np.array([views[index].camera.cam_from_world_R.T for index in ids])  # [V, 3, 3]
+    for corrections in (state.shared[ROTATIONS], state.shared[SHIFTS]):
+        mean = np.einsum("vij,vj->i", world_from_cam, corrections[ids]) / len(ids)  # [3] world frame
+        corrections[ids] -= np.einsum("vji,j->vi", world_from_cam, mean)
