@@ -146,8 +146,9 @@ HALF_FLOAT = 4.9e-4
 # in float32 there; near zero that is the root of some roundings of 6e-8.
 SPZ_ROTATION = 1e-3
 
-# A textured sheet 3e-7 thick, edge on, in float32: its direction turns within a hundredth of a pixel, of which 24 lose
-# 1e-6; the colour follows with a slope of up to 10 a radian.
+# A textured sheet 3e-7 thick, edge on, in float32: its direction turns within a hundredth of a pixel, and coordinates
+# of up to 24 pixels are rounded by 1e-6 of one; the colour follows with a slope of up to 10 a radian.
 TEXTURE_THIN_FLOAT32 = 1e-3
+
 # Displacements of half a pixel that are read off slopes, pixels: linear in them, and photographs are bytes.
 DISPLACEMENT_PX = 0.15

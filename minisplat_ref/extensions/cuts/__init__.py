@@ -17,10 +17,10 @@ saved, measured and rendered has hard edges. ``widths`` is a column of the PLY.
 
 Measured (``study cuts/card``, 4 seeds): a Gaussian of which a straight edge has cut a part away is drawn by one with a
 cut at 65 dB in the best of four trainings, with an edge of 0.9 pixels from 10 to 90 %; twelve without cuts reach 36 dB
-and 2.2 pixels. Two of the four found no cut, 21 dB: their curves began on a side where there is nothing to cut, and were
-pushed out. A bright card with a curved edge: six with cuts 28.5 dB at best and 26.3 ± 2.4, twelve without 24.7 and
-23.6 ± 0.9, at 132 and 168 floats. Within 1.5 pixels of the edge that is 16.5 and 13.5 dB: a hard edge has steps where
-pixels are covered in part.
+and 2.2 pixels. Two of the four found no cut, 21 dB: their curves began on a side where there is nothing to cut, and
+were pushed out. A bright card with a curved edge: six with cuts 28.5 dB at best and 26.3 ± 2.4, twelve without 24.7
+and 23.6 ± 0.9, at 132 and 168 floats. Within 1.5 pixels of the edge that is 16.5 and 13.5 dB: a hard edge has steps
+where pixels are covered in part.
 
 Where this deviates: the paper keeps the step and puts an approximation in the place of its gradient. Each Gaussian has
 one curve here. Control points are in deviations instead of world units, and follow the affine map that draws the
