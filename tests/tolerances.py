@@ -154,5 +154,9 @@ RAY_ORDER = 1e-10
 # deviations: measured 2.6e-3 on the two of a hundred rays that meet the thinnest one, below 1e-3 elsewhere.
 MITSUBA_DEPTH = 5e-3
 
+# A textured sheet 3e-7 thick, edge on, in float32: its direction turns within a hundredth of a pixel, and coordinates
+# of up to 24 pixels are rounded by 1e-6 of one; the colour follows with a slope of up to 10 a radian.
+TEXTURE_THIN_FLOAT32 = 1e-3
+
 # Displacements of half a pixel that are read off slopes, pixels: linear in them, and photographs are bytes.
 DISPLACEMENT_PX = 0.15
