@@ -30,6 +30,7 @@ examples:
   minisplat-ref bench --out bench
   minisplat-ref bench --workloads synth5k --backends cpu-f32,textbook-f32
   minisplat-ref bench --scene photos/fox --against opensplat=build/opensplat
+  minisplat-ref bench --extension analytic
 
 Exit codes: 0 all within their bounds, 1 something failed, 2 bad input."""
 
@@ -76,6 +77,9 @@ def add_parser(commands: Commands) -> None:
         "--memory", action="store_true", help="instead: peak of training in 1920 x 1080 and 12 megapixels"
     )
     others.add_argument("--large", action="store_true", help="instead: 2,000 photographs of 12 megapixels within 8 GB")
+    others.add_argument(
+        "--extension", metavar="NAME", help="instead: an extension's renderer on both backends, beside 3DGS's"
+    )
     others.add_argument("--start", action="store_true", help="instead: seconds to the first iteration, cold and warm")
     parser.add_argument(
         "--scene", type=Path, metavar="SCENE", help="photographs for --stages (default a made room) and opensplat"
@@ -108,6 +112,8 @@ def _measure(args: argparse.Namespace) -> "Report":
 
     if args.stages:
         return _stages(args)
+    if args.extension is not None:
+        return _extension(args)
     if args.slopes:
         from minisplat_ref.bench.slopes import slope_cases
 
@@ -152,6 +158,20 @@ def _benchmark(args: argparse.Namespace) -> "Report":
     if args.data is None and args.workloads is None:
         progress("garden, garden20k: skipped, they need gsplat's test_garden.npz (--data)")
     title = "Speed against error: every time beside its error against the float64 reference"
+    return Report(title, tuple(cases), {"workloads": list(names), "repeats": args.repeats})
+
+
+def _extension(args: argparse.Namespace) -> "Report":
+    from minisplat_ref.bench.extension_times import extension_cases
+    from minisplat_ref.bench.workloads import get_workload
+    from minisplat_ref.extensions.extension import load_extension
+    from minisplat_ref.oracle.cases import Report
+
+    extension = load_extension(args.extension)
+    names = args.workloads or ("synth5k",)
+    workloads = [get_workload(workload, args.data) for workload in names]
+    cases = [case for workload in workloads for case in extension_cases(extension, workload, args.repeats, progress)]
+    title = f"Renderer of {extension.name} beside that of 3DGS, each against its own float64 reference"
     return Report(title, tuple(cases), {"workloads": list(names), "repeats": args.repeats})
 
 

@@ -242,14 +242,14 @@ def as_decided(recipe: Recipe, pace: Pace) -> Recipe:
 def settings_of(recipe: Recipe) -> dict[str, Any]:
     """Return the settings that :func:`configured` can replace, each with its present value, the first of several.
 
-    Settings of events, of loss terms and of the representation's initialisation go by their own names; the weight of a
-    loss term by the term's name; whether a calibration is on by the calibration's name.
+    Settings of events, of loss terms, and of the representation's initialisation and renderer go by their own names; the
+    weight of a loss term by the term's name; whether a calibration is on by the calibration's name.
     """
     events = [_settings(event.action) for event in recipe.events]
     terms = [{term.name: term.weight, **_settings(term.function)} for term in recipe.losses]
     switches = [{calibration.name: calibration.is_on for calibration in recipe.calibrations}]
-    begins = [_settings(recipe.representation.extend)]
-    found = [*events, *terms, *switches, *begins]
+    representation = [_settings(recipe.representation.extend), _settings(recipe.representation.renderer.render)]
+    found = [*events, *terms, *switches, *representation]
     return {name: value for settings in reversed(found) for name, value in settings.items()}
 
 
@@ -277,9 +277,18 @@ def configured(recipe: Recipe, **settings: Any) -> Recipe:
                 calibration._replace(is_on=value) if name == calibration.name else calibration
                 for calibration in recipe.calibrations
             ),
-            representation=recipe.representation._replace(extend=_with(recipe.representation.extend, name, value)),
+            representation=_with_setting(recipe.representation, name, value),
         )
     return recipe
+
+
+def _with_setting(representation: Representation, name: str, value: Any) -> Representation:
+    """Return a representation with another value of a setting of how it begins or is drawn, if it has one."""
+    renderer = representation.renderer
+    return representation._replace(
+        extend=_with(representation.extend, name, value),
+        renderer=renderer._replace(render=_with(renderer.render, name, value)),
+    )
 
 
 def parsed_settings(recipe: Recipe, texts: Mapping[str, str]) -> dict[str, Any]:
@@ -359,6 +368,7 @@ def describe(recipe: Recipe) -> dict[str, Any]:
     """Return the recipe as numbers, strings, lists and dicts, for ``config.json`` and to compare two recipes."""
     cooling = {"cooling": recipe.cooling._asdict()} if recipe.cooling is not None else {}
     fields = {name: value for name, value in recipe._asdict().items() if name != "cooling"}
+    drawn = _settings(recipe.representation.renderer.render)
     return {
         **fields,
         **cooling,
@@ -371,6 +381,7 @@ def describe(recipe: Recipe) -> dict[str, Any]:
         "representation": {
             "name": recipe.representation.name,
             **_describe_function(recipe.representation.extend, "extend"),
+            **({"renderer": drawn} if drawn else {}),
         },
     }
 
