@@ -79,4 +79,4 @@ def _views(args: argparse.Namespace, means: Floats) -> list[viewpoints.Viewpoint
     if args.model.is_dir() and path.exists():
         known = viewpoints.read(path)
         return [view for view in known if view.split == "test"] or known
-    return viewpoints.orbit(means, [], args.frames, *ORBIT_SIZE)
+    return orbits.orbit(means, [], args.frames, *ORBIT_SIZE)
