@@ -58,8 +58,9 @@ AFRESH = ("iterations", "lpips_weights", "drop_bad_steps")  # what may be new wh
 
 DESCRIPTION = """\
 Train Gaussians on SCENE, the folder of a COLMAP scene or of a transforms.json.
-DIR will hold point_cloud.ply, metrics.json, renders/ (truth | render | error of
-each test view) and checkpoints. Ctrl-C saves what there is; --resume goes on.
+DIR will hold report.html, point_cloud.ply, metrics.json, renders/ (truth |
+render | error of each test view) and checkpoints. Ctrl-C saves what there is;
+--resume goes on.
 """
 EPILOG = """\
 example:
@@ -343,7 +344,7 @@ def _train(
     given: dict[str, Any],
     room: str,
 ) -> int:
-    from minisplat_ref.experiments import checkpoints
+    from minisplat_ref.experiments import checkpoints, run_folder
     from minisplat_ref.experiments.notices import describe_sizes
     from minisplat_ref.experiments.run import run_training
     from minisplat_ref.experiments.scoring import summary
@@ -370,6 +371,7 @@ def _train(
         f"{summary(outcome.evaluation)}, {len(state.gaussians.means):,} Gaussians, {outcome.seconds:.0f} s of training"
     )
     print(f"results in {folder}: point_cloud.ply, metrics.json, renders/")
+    print(f"open {(folder / run_folder.REPORT).resolve()}")
     return _simplify(folder, settings)
 
 

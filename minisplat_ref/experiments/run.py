@@ -192,7 +192,7 @@ def _save(folder: Path, settings: Settings, recipe: Recipe, state: TrainState) -
         return False
     try:
         with Interruptions() as interruptions:
-            interruptions.hold()
+            interruptions.defer()
             checkpoints.save(folder, state, recipe)
             save_model(folder, settings, state.model)
             if recipe.cooling is not None:
@@ -211,25 +211,31 @@ def _measure(
     surface: Surface | None,
     network: Network | None,
 ) -> Evaluation | None:
-    """Measure the model and write the measures, the last that a run does; None when Ctrl-C comes meanwhile."""
+    """Measure the model, write the page and then the measures, the last that a run does.
+
+    Returns None when Ctrl-C comes meanwhile.
+    """
+    from minisplat_ref.experiments.run_report import write_report  # draws curves: a training would wait for that
+
     peak_mb = peak_rss_mb()  # before the network of LPIPS takes more than the training did
+    n_gaussians = len(state.gaussians.means)
     try:
         evaluation = score(folder, scene, state.model, settings, network)
+        if settings.eval_every:
+            further = {"cpu_seconds": clock.cpu_seconds, **_chamfer(state.gaussians, surface)}
+            curve.append(folder / run_folder.CURVE, state.step, clock.seconds, evaluation, n_gaussians, **further)
+        metrics = {
+            "n_gaussians": n_gaussians,
+            "iterations": state.step,
+            "has_ended_early": state.pace.last_step == state.step,
+            "train_seconds": clock.seconds,
+            "train_cpu_seconds": clock.cpu_seconds,
+            "peak_rss_mb": peak_mb,
+            **to_metrics(evaluation),
+        }
+        write_report(folder, scene, metrics)
     except KeyboardInterrupt:
         return None
-    n_gaussians = len(state.gaussians.means)
-    if settings.eval_every:
-        further = {"cpu_seconds": clock.cpu_seconds, **_chamfer(state.gaussians, surface)}
-        curve.append(folder / run_folder.CURVE, state.step, clock.seconds, evaluation, n_gaussians, **further)
-    metrics = {
-        "n_gaussians": n_gaussians,
-        "iterations": state.step,
-        "has_ended_early": state.pace.last_step == state.step,
-        "train_seconds": clock.seconds,
-        "train_cpu_seconds": clock.cpu_seconds,
-        "peak_rss_mb": peak_mb,
-        **to_metrics(evaluation),
-    }
     run_folder.write_json(folder / run_folder.METRICS, metrics)
     return evaluation
 

@@ -1,4 +1,4 @@
-"""Where ``render`` looks from: the cameras of a run or of a JSON file; for paths around a scene see :mod:`.orbits`.
+"""Viewpoints for ``render``: the cameras of a run or of a JSON file; for paths around a scene see :mod:`.orbits`.
 
 The JSON file is the ``cameras.json`` of 3DGS training folders: a list of objects with ``img_name, width, height``,
 ``position`` (camera centre, world frame), ``rotation`` (3 x 3, world_from_camera) and ``fx, fy``; and, of our own,
@@ -30,7 +30,7 @@ class Viewpoint(NamedTuple):
     split: str
     """``train``, ``test`` or, where nothing says so, the empty string."""
     time: float = 0.0
-    """When, in [0, 1]; for scenes that move."""
+    """The moment shown, in [0, 1]; for scenes that move."""
 
 
 def scene_viewpoints(scene: Scene) -> list[Viewpoint]:
@@ -40,7 +40,7 @@ def scene_viewpoints(scene: Scene) -> list[Viewpoint]:
 
 
 def to_json(viewpoints: Sequence[Viewpoint]) -> list[dict[str, Any]]:
-    """Return what ``cameras.json`` holds."""
+    """Return the content of ``cameras.json``."""
     return [
         {
             "id": index,
