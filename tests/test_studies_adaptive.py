@@ -11,7 +11,7 @@ from minisplat_ref.experiments.studies import FIGURE, RESULT, adaptive, front
 from minisplat_ref.experiments.studies.ablation import RUNS
 from minisplat_ref.io.images import read_image
 from minisplat_ref.methods.adaptive import ADAPTIVE
-from minisplat_ref.training.schedule import action_name
+from minisplat_ref.training.schedule import action_name, settings_of
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +38,9 @@ def test_each_rule_is_taken_out():
     assert [n.replace("clones_while_growing", "grow") for n in names["clones of 3DGS"]] == names["adaptive"]
     assert recipes["rates of 3DGS"].learning_rates.at(9, 1.0)["means"] == 1.6e-4
     assert recipes["no cool-down"].cooling.last_per_extent == 1.0
+    assert settings_of(recipes["no prune"])["mass"] == 1.0
+    assert settings_of(recipes["no exposures"])["least_exposure_gain"] == np.inf
+    assert settings_of(recipes["no poses"])["least_pose_gain"] == np.inf
     for recipe in recipes.values():
         assert recipe.cooling.hold_out_every == ADAPTIVE.cooling.hold_out_every
 
@@ -54,6 +57,28 @@ def test_rows_by_hand():
     assert second["fall"] == pytest.approx(0.05) and second["until"] == 2.0
     never = adaptive.summarise([*runs[:1], run("b", 0, [20, 21])])[1]
     assert never["until"] is None and never["standard_error"] is None
+
+
+def test_regret_by_hand():
+    def run(recipe, seed, psnr, n):
+        return {"condition": "whole", "recipe": recipe, "seed": seed, "psnr": psnr, "n_gaussians": n}
+
+    runs = [
+        run("few", 0, 24.0, 50),
+        run("adaptive", 0, 24.8, 100),
+        run("many", 0, 24.95, 300),
+        run("most", 0, 25.0, 900),
+    ]
+    assert adaptive.regret(runs) == pytest.approx((0.2, 100 / 300))
+    better = [run("adaptive", 1, 25.0, 400), run("few", 1, 24.95, 100)]
+    assert adaptive.regret(better) == (0.0, 4.0)
+    assert "costs 0.10 dB, and is 2.17 times" in adaptive.describe_regret([*runs, *better])
+
+
+def test_the_sweep_has_eight_thresholds():
+    thresholds = [settings_of(change(ADAPTIVE))["threshold"] for change in adaptive.SWEEP.values()]
+    assert len(thresholds) == 8 and thresholds == sorted(thresholds, reverse=True)
+    assert settings_of(adaptive.SWEEP["adaptive"](ADAPTIVE)) == settings_of(ADAPTIVE)
 
 
 def test_study_and_its_continuation(tmp_path, capsys, scene, monkeypatch):

@@ -21,7 +21,7 @@ PANELS = (
 FRONT_TEXT = """\
 Down is faster, left is more exact. A mark is the error without the pixels at which rounding decides a hit, a faint line
 leads to the error with them; at the left edge the error is 0. Nothing lies below and left of the dotted line."""
-EXACT = 1e-16  # where an error of 0 stands on a logarithmic axis
+EXACT = 1e-16  # position of an error of 0 on a logarithmic axis
 SHAPES = {"-exp": "^", "-cut": "s", "-sigma": "s", "textbook": "D"}
 HOLLOW = "^s"  # variants: they crowd around the default
 Style = dict[str, Any]
@@ -30,14 +30,14 @@ Style = dict[str, Any]
 def pareto_figure(cases: Sequence[Case]) -> "Figure":
     """Draw every workload as a row: error of the image on the left, of the gradient on the right.
 
-    A mark is the error without the pixels at thresholds; a faint line leads from it to the error with them. An error of
-    0 stands at the left edge. What failed has no time and is not drawn. The step line is the front: nothing is below
-    and left of it.
+    A marker is the error without the pixels at thresholds; a faint line leads from it to the error with them. An error
+    of 0 is at the left edge. Failed contenders have no time and are not drawn. The step line is the Pareto front:
+    nothing is below and left of it.
 
     Parameters
     ----------
     cases : sequence of Case
-        From ``race``, of any number of workloads.
+        From ``benchmark``, of any number of workloads.
     """
     from matplotlib.figure import Figure
 

@@ -127,13 +127,13 @@ def _measure(args: argparse.Namespace) -> "Report":
 
         progress("start: train with no compiled kernels, then with them")
         return Report("From the start of train to the end of its first iteration", tuple(start_cases()), {})
-    return _race(args)
+    return _benchmark(args)
 
 
-def _race(args: argparse.Namespace) -> "Report":
+def _benchmark(args: argparse.Namespace) -> "Report":
+    from minisplat_ref.bench.benchmark import benchmark
     from minisplat_ref.bench.contenders import choose
     from minisplat_ref.bench.peers import peers_of
-    from minisplat_ref.bench.race import race
     from minisplat_ref.bench.training_time import against_opensplat
     from minisplat_ref.bench.workloads import get_workload
     from minisplat_ref.oracle.cases import Report
@@ -144,7 +144,7 @@ def _race(args: argparse.Namespace) -> "Report":
     contenders = [*choose(args.backends), *peers]
     names = args.workloads or (*DEFAULT_WORKLOADS, *(DATA_WORKLOADS if args.data else ()))
     workloads = [get_workload(workload, args.data) for workload in names]  # before the first one takes its time
-    cases = [case for workload in workloads for case in race(workload, contenders, args.repeats, progress)]
+    cases = [case for workload in workloads for case in benchmark(workload, contenders, args.repeats, progress)]
     if opensplat is not None:
         cases += against_opensplat(opensplat, args.scene, args.downscale, args.iterations)
     if args.data is None and args.workloads is None:
@@ -154,9 +154,9 @@ def _race(args: argparse.Namespace) -> "Report":
 
 
 def _stages(args: argparse.Namespace) -> "Report":
-    from minisplat_ref.bench.by_turns import hold
+    from minisplat_ref.bench.interleaving import time_contests
     from minisplat_ref.bench.limits import adams, stages, threads
-    from minisplat_ref.bench.roofs import blending
+    from minisplat_ref.bench.roofline import blending
     from minisplat_ref.bench.training_time import profile, thread_cases
     from minisplat_ref.bench.workloads import get_workload
     from minisplat_ref.oracle.cases import Report
@@ -167,7 +167,7 @@ def _stages(args: argparse.Namespace) -> "Report":
     progress("blending against straight-line loops, Adam against a copy, other stages by themselves, all by turns")
     workloads = [get_workload(workload, args.data) for workload in args.workloads or ("synth",)]
     contests = [contest for made in workloads for contest in (blending(made), *threads(made))]
-    cases += hold([*contests, *adams(), *stages()], args.repeats)
+    cases += time_contests([*contests, *adams(), *stages()], args.repeats)
     return Report("A training iteration by stages, and how far the kernels are from the limits", tuple(cases), {})
 
 

@@ -185,7 +185,7 @@ def _save(folder: Path, settings: Settings, recipe: Recipe, state: TrainState) -
         return False
     try:
         with Interruptions() as interruptions:
-            interruptions.hold()
+            interruptions.defer()
             checkpoints.save(folder, state, recipe)
             save_model(folder, settings, state.model)
             if recipe.cooling is not None:

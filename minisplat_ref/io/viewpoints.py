@@ -1,4 +1,4 @@
-"""Where ``render`` looks from: the cameras of a run, those of a JSON file, or an orbit.
+"""Viewpoints for ``render``: the cameras of a run, those of a JSON file, or an orbit.
 
 The JSON file is the ``cameras.json`` of 3DGS training folders: a list of objects with ``img_name, width, height``,
 ``position`` (camera centre, world frame), ``rotation`` (3 x 3, world_from_camera) and ``fx, fy``; and, of our own,
@@ -18,7 +18,7 @@ from minisplat_ref.io.json_file import as_array, as_number, read_json
 from minisplat_ref.io.scene import COORDINATE_MAX, ROTATION_TOLERANCE
 from minisplat_ref.types import Camera, Floats, Scene
 
-ORBIT_FOV = math.radians(50.0)  # horizontal, of an orbit that has no run's cameras to take it from
+ORBIT_FOV = math.radians(50.0)  # horizontal, for an orbit without a run's cameras
 NEEDED = "needed are position, rotation, width, height, fx, fy"
 ORBIT_ELEVATION = math.radians(20.0)  # likewise
 
@@ -33,7 +33,7 @@ class Viewpoint(NamedTuple):
     split: str
     """``train``, ``test`` or, where nothing says so, the empty string."""
     time: float = 0.0
-    """When, in [0, 1]; for scenes that move."""
+    """The moment shown, in [0, 1]; for scenes that move."""
 
 
 def scene_viewpoints(scene: Scene) -> list[Viewpoint]:
@@ -43,7 +43,7 @@ def scene_viewpoints(scene: Scene) -> list[Viewpoint]:
 
 
 def to_json(viewpoints: Sequence[Viewpoint]) -> list[dict[str, Any]]:
-    """Return what ``cameras.json`` holds."""
+    """Return the content of ``cameras.json``."""
     return [
         {
             "id": index,
@@ -111,16 +111,16 @@ def _viewpoint(entry: Any, where: str) -> Viewpoint:
 
 
 def orbit(means: Floats, like: Sequence[Viewpoint], n_frames: int, width: int, height: int) -> list[Viewpoint]:
-    """Cameras on a circle that looks at the middle of the scene.
+    """Return cameras on a circle that look at the middle of the scene.
 
     Parameters
     ----------
     means : ndarray of shape (N, 3)
         Centres of the Gaussians, world frame.
     like : sequence of Viewpoint
-        Cameras of a run, from which the circle takes its middle, height, radius and focal length. Without any, it goes
-        around the median of the means, so far out that nine tenths of them fit, with -y up (the y axis of COLMAP scenes
-        points down).
+        Cameras of a run, from which the circle takes its centre, height, radius and focal length. Without any, it
+        surrounds the median of the means, so far out that nine tenths of them are in view, with -y up (the y axis of
+        COLMAP scenes points down).
     n_frames : int
         Number of cameras.
     width, height : int
@@ -129,7 +129,7 @@ def orbit(means: Floats, like: Sequence[Viewpoint], n_frames: int, width: int, h
     Returns
     -------
     list of Viewpoint
-        Named ``orbit_000`` onwards; the time goes once from 0 to 1 on the way round.
+        Named ``orbit_000`` onwards; the time runs once from 0 to 1 around the circle.
     """
     ring = _ring_of_cameras([view.camera for view in like], width) if like else _ring_of_means(means, width, height)
     viewpoints = []
@@ -191,14 +191,14 @@ def _ring_of_means(means: Floats, width: int, height: int) -> _Ring:
 
 
 def _looking_at(position: Floats, target: Floats, up: Floats) -> Floats:
-    """Rotation cam_from_world [3, 3] whose rows are the camera's right, down and forward."""
+    """Return cam_from_world [3, 3], whose rows are the camera's right, down and forward."""
     forward = _unit(target - position, fallback=_perpendicular(up))
     right = _unit(np.cross(forward, up), fallback=_perpendicular(up))
     return np.stack([right, np.cross(forward, right), forward])
 
 
 def _perpendicular(direction: Floats) -> Floats:
-    """Some unit vector at a right angle to a direction: across it and the axis that it leans on least."""
+    """Return a unit vector perpendicular to a direction and to the axis that is least aligned with it."""
     return _unit(np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))]), fallback=np.array([1.0, 0.0, 0.0]))
 
 

@@ -1,4 +1,4 @@
-"""What a check reports: named cases that passed or did not, each with its figures; as a table and as JSON."""
+"""Reports of checks: named cases that passed or failed, each with its figures; as a table and as JSON."""
 
 import json
 from collections.abc import Iterable, Sequence
@@ -19,9 +19,9 @@ class Case(NamedTuple):
     name: str
     """Unique in its report."""
     passed: bool
-    """Whether it is as it should be."""
+    """Whether the result is as it should be."""
     figures: dict[str, Figure]
-    """What was measured, by the heading of its column."""
+    """Measured values by the heading of their column."""
     note: str = ""
     """Why it failed, or what else a reader must know; one line."""
 
@@ -67,7 +67,7 @@ def by_kind(cases: Iterable[Case]) -> list[list[Case]]:
 
 
 def save_json(report: Report, path: str | Path) -> None:
-    """Write the report; the file is there complete or not at all.
+    """Write the report, completely or not at all.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def save_json(report: Report, path: str | Path) -> None:
 
 
 def verdict(reports: Sequence[Report]) -> str:
-    """Return the closing line: how many of how many passed."""
+    """Return the closing line: how many of the cases passed."""
     n, n_failed = sum(len(report.cases) for report in reports), sum(report.n_failed for report in reports)
     return f"all {n} cases passed" if n_failed == 0 else f"{n_failed} of {n} cases failed"
 

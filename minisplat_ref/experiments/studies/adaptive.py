@@ -1,18 +1,19 @@
-"""``adaptive`` beside the recipes with a schedule: on a scene as it is, with few photographs, and with wrong exposures.
+"""Compare ``adaptive`` with recipes with a schedule: on a scene as it is, with few photographs, with wrong exposures.
 
-Every recipe is trained with every seed under every condition. On the way the test views are measured, off the clock,
-which only this study sees: nothing of it reaches the training. So there is, besides the final PSNR and the count, the
-time until a recipe has the final PSNR of the first recipe less 0.1 dB, and how far the PSNR has fallen since its best
-moment. Times are those of the processor (all threads of the process together), which other programs disturb less than
-the clock on the wall.
+Every recipe is trained with every seed under every condition. The test views are evaluated during training, without
+counting the time or influencing the training. So besides the final PSNR and the count, the study reports the time until
+a recipe reaches the final PSNR of the first recipe minus 0.1 dB, and how far the PSNR has fallen from its maximum.
+Times are processor times (of all threads of the process together), which other programs disturb less than wall time.
 
-With ``--rules`` it is ``adaptive`` beside itself without one of its rules.
+With ``--rules`` it compares ``adaptive`` with itself without one of its rules; with ``--sweep``, with itself at other
+thresholds of growth, which give more Gaussians and fewer: which number would have been best, and by how much.
 
-Trainings take long. Each leaves its record in ``runs.jsonl``, and the same command with the same folder goes on.
+Trainings take long. Each writes its record to ``runs.jsonl``, and the same command with the same folder continues.
 """
 
 import argparse
 import contextlib
+import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -24,20 +25,21 @@ from tqdm import tqdm
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.studies.ablation import append, read_records
+from minisplat_ref.experiments.studies.defects import with_turned_cameras
 from minisplat_ref.experiments.studies.front import BLUE, RED, describe_scene, read_scene, tidy, title, write
 from minisplat_ref.methods import adaptive, gaussian_splatting, get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.rates import Rates
-from minisplat_ref.training.schedule import Recipe, does, scaled
+from minisplat_ref.training.schedule import Recipe, configured, does, scaled, settings_of
 from minisplat_ref.training.state import Iteration, StepReport, TrainState
 from minisplat_ref.types import Scene, View
 
 ITERATIONS = 3000  # of recipes with a schedule
 WARM_UP = 20  # iterations
-N_MEASUREMENTS = 24  # of those; of adaptive as often
-FEW = 5  # every so many-th training photograph is left
+N_MEASUREMENTS = 24  # in those iterations; for adaptive with the same interval
+FEW = 5  # one of every so many training photographs remains
 GAINS = (0.7, 1.4)  # of a photograph, uniform in the logarithm
 NEAR = 0.1  # dB
 COLORS = (BLUE, "#7a9a3a", "#c98a2b", RED, "#6f5b9a")
@@ -66,10 +68,16 @@ def random_gains(scene: Scene) -> Scene:
     return scene._replace(train_views=views)
 
 
+def half_a_pixel_off(scene: Scene) -> Scene:
+    """Return the scene with every training camera turned by half a pixel; test cameras stay."""
+    return with_turned_cameras(scene, np.random.default_rng(0))
+
+
 CONDITIONS: Mapping[str, Callable[[Scene], Scene]] = {
     "whole": whole,
     "few": few_photographs,
     "gains": random_gains,
+    "poses": half_a_pixel_off,
 }
 
 
@@ -90,7 +98,7 @@ def clones_while_growing(
 
 
 def with_published_rates(recipe: Recipe) -> Recipe:
-    """Return the recipe with the rates of 3dgs-accel as they begin."""
+    """Return the recipe with the initial rates of 3dgs-accel."""
     rates = gaussian_splatting.GS_ACCEL.learning_rates
     return recipe._replace(learning_rates=Rates(rates.at(0, 1.0), rates.per_extent))
 
@@ -106,13 +114,28 @@ def without_growth(recipe: Recipe) -> Recipe:
     return recipe._replace(events=tuple(event for event in recipe.events if not does(event, adaptive.grow)))
 
 
+def with_threshold(recipe: Recipe, *, factor: float) -> Recipe:
+    """Return the recipe that halves Gaussians from ``factor`` times the gradient on."""
+    return configured(recipe, threshold=factor * settings_of(recipe)["threshold"])
+
+
 RULES: Mapping[str, Callable[[Recipe], Recipe]] = {
     "adaptive": lambda recipe: recipe,
     "no growth": without_growth,
     "clones of 3DGS": with_clones,
     "rates of 3DGS": with_published_rates,
     "no cool-down": without_cool_down,
+    "no prune": lambda recipe: configured(recipe, mass=1.0, least_views=0),
+    "no exposures": lambda recipe: configured(recipe, least_exposure_gain=math.inf),
+    "no poses": lambda recipe: configured(recipe, least_pose_gain=math.inf),
 }
+
+THRESHOLDS = (8.0, 4.0, 2.0, 1.4, 1.0, 0.7, 0.5, 0.25)  # times that of adaptive
+SWEEP: Mapping[str, Callable[[Recipe], Recipe]] = {
+    "adaptive" if factor == 1 else f"threshold x {factor:g}": partial(with_threshold, factor=factor)
+    for factor in THRESHOLDS
+}
+"""Eight counts: the higher the threshold, the fewer Gaussians are halved."""
 
 
 def run(args: argparse.Namespace) -> None:
@@ -129,9 +152,8 @@ def run(args: argparse.Namespace) -> None:
     unknown = [name for name in args.conditions if name not in CONDITIONS]
     if unknown:
         raise InputError(f"condition {unknown[0]!r} does not exist: choose from {', '.join(CONDITIONS)}")
-    recipes = (
-        {name: change(adaptive.ADAPTIVE) for name, change in RULES.items()} if args.rules else _named(args.recipes)
-    )
+    variants = RULES if args.rules else SWEEP if args.sweep else {}
+    recipes = {name: change(adaptive.ADAPTIVE) for name, change in variants.items()} or _named(args.recipes)
     description = describe_scene(scene)
     settings = {"scene": description["scene"], "downscale": args.downscale, "recipes": list(recipes)}
     records = read_records(args.out, settings)
@@ -152,6 +174,9 @@ def run(args: argparse.Namespace) -> None:
     print(f"seeds {', '.join(map(str, args.seeds))}; seconds of the processor\n")
     heading = ["condition", "recipe", "PSNR (dB)", "fall since its best", "Gaussians", "iterations", "seconds"]
     print(markdown_table([*heading, f"until {next(iter(recipes))} - {NEAR} dB"], [_cells(row) for row in rows]))
+    if args.sweep:
+        for condition in args.conditions:
+            print(f"\n{condition}: {describe_regret([r for r in records if r['condition'] == condition])}")
 
 
 def _named(names: Sequence[str]) -> dict[str, Recipe]:
@@ -161,7 +186,7 @@ def _named(names: Sequence[str]) -> dict[str, Recipe]:
 def warm_up(scene: Scene, recipes: Iterable[Recipe]) -> None:
     """Train every recipe for a moment, so that no training counts the time of compiling."""
     for recipe in recipes:
-        with contextlib.suppress(InputError):  # so short a schedule may ask for what cannot be
+        with contextlib.suppress(InputError):  # so short a schedule may be impossible
             train(scene, scaled(recipe, WARM_UP), seed=0)
 
 
@@ -190,7 +215,7 @@ def measure(scene: Scene, recipe: Recipe, seed: int) -> dict[str, Any]:
 def summarise(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return a row for each condition and recipe: means over the seeds, the standard error of the PSNR's difference.
 
-    The first recipe is the one that the others are compared with, seed by seed.
+    The others are compared with the first recipe, seed by seed.
     """
     rows = []
     for condition in dict.fromkeys(record["condition"] for record in records):
@@ -215,8 +240,32 @@ def summarise(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return rows
 
 
+def regret(records: Sequence[Mapping[str, Any]]) -> tuple[float, float]:
+    """Return what the chosen count costs, over the trainings of one seed under one condition.
+
+    Returns
+    -------
+    regret : float
+        dB from the chosen count to the best one.
+    ratio : float
+        The chosen count, as a multiple of the smallest that is within :data:`NEAR` of the best.
+    """
+    chosen = next(record for record in records if record["recipe"] == "adaptive")
+    best = max(record["psnr"] for record in records)
+    smallest = min(record["n_gaussians"] for record in records if record["psnr"] >= best - NEAR)
+    return best - chosen["psnr"], chosen["n_gaussians"] / smallest
+
+
+def describe_regret(records: Sequence[Mapping[str, Any]]) -> str:
+    """Return the mean of :func:`regret` over the seeds, in words."""
+    seeds = dict.fromkeys(record["seed"] for record in records)
+    each = [regret([record for record in records if record["seed"] == seed]) for seed in seeds]
+    cost, ratio = np.mean(each, axis=0)
+    return f"the count of adaptive costs {cost:.2f} dB, and is {ratio:.2f} times the smallest adequate one"
+
+
 def standard_error(values: Sequence[float]) -> float | None:
-    """Return that of the mean; None for one value."""
+    """Return the standard error of the mean; None for one value."""
     return float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None
 
 
