@@ -1,0 +1,130 @@
+"""The work of the study ``cuts/card``: pictures with one sharp edge, drawn by few Gaussians with and without cuts."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CUTS, CutGaussians, set_width, with_cuts
+from minisplat_ref.extensions.shared_studies import psnr_of
+from minisplat_ref.rendering import Request
+from minisplat_ref.training.adam import zero_moments
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.representation import GAUSSIANS, Representation
+from minisplat_ref.training.schedule import action_name, scaled
+from minisplat_ref.training.state import TrainState
+from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Model, Scene, View, numbered, view_from
+
+SIZE, FOCAL, DISTANCE = 48, 60.0, 3.0  # px, px, world units
+BAND = 1.5  # px on either side of the edge
+EXTENT = 10.0  # of the scene: so far Gaussians may move, in units of the rates of 3DGS
+BRIGHT = 0.8
+CAMERA = Camera(np.eye(3), np.zeros(3), FOCAL, FOCAL, SIZE / 2, SIZE / 2, SIZE, SIZE)
+
+
+class Target(NamedTuple):
+    """A picture with an edge."""
+
+    image: Floats
+    """[H, W, 3] in [0, 1]."""
+    edge: Callable[[Floats], Floats]
+    """x of the edge in px, for y in px."""
+
+    @property
+    def band(self) -> Bools:
+        """[H, W] True near the edge."""
+        ys, xs = np.mgrid[:SIZE, :SIZE] + 0.5
+        near: Bools = np.abs(xs - self.edge(ys)) < BAND
+        return near
+
+
+def spread(n: int, rng: np.random.Generator) -> Gaussians:
+    """Return n flat gray Gaussians that face the camera, spread over the picture, of the size that fills it."""
+    extent = SIZE / FOCAL * DISTANCE  # of the picture, world units
+    places = rng.uniform(-0.35, 0.35, (n, 2)) * extent if n > 1 else np.zeros((1, 2))
+    scale = 0.25 * extent / np.sqrt(n)
+    return Gaussians(
+        means=np.column_stack([places, DISTANCE + 1e-3 * np.arange(n)]).astype(np.float32),
+        quats=np.tile(np.eye(4, dtype=np.float32)[0], (n, 1)),
+        log_scales=np.tile(np.log([scale, scale, 1e-3]).astype(np.float32), (n, 1)),
+        opacity_logits=np.ones(n, np.float32),
+        sh_dc=np.zeros((n, 3), np.float32),
+        sh_rest=np.zeros((n, 0, 3), np.float32),
+    )
+
+
+def cut_gaussian() -> Target:
+    """Return a Gaussian of which a straight edge, 0.4 deviations from its centre, has cut the right side away."""
+    one = spread(1, np.random.default_rng(0))
+    points = np.array([[0.4, -3.0, 0.4, -1.0, 0.4, 1.0, 0.4, 3.0]], np.float32)
+    bright = one._replace(opacity_logits=np.full(1, 3, np.float32), sh_dc=np.ones((1, 3), np.float32))
+    hard = CutGaussians(*bright, curves=points, widths=np.zeros(1, np.float32))
+    edge = SIZE / 2 + 0.4 * float(np.exp(one.log_scales[0, 0])) * FOCAL / DISTANCE
+    return Target(drawn(hard).astype(np.float64), lambda ys: np.full_like(ys, edge))
+
+
+def card() -> Target:
+    """Return a bright card that fills the picture up to a curved edge; pixels on the edge are covered in part."""
+
+    def edge(ys: Floats) -> Floats:
+        return 30 - 6 * ((ys - SIZE / 2) / (SIZE / 2)) ** 2
+
+    ys, xs = np.mgrid[:SIZE, :SIZE] + 0.5
+    covered = np.clip(edge(ys) - xs + 0.5, 0, 1)
+    return Target(np.repeat(BRIGHT * covered[:, :, None], 3, axis=2), edge)
+
+
+def representation_of(population: Any) -> Representation:
+    """Return what a population with cuts, or without, is drawn and trained by."""
+    return CUT_GAUSSIANS if isinstance(population, CutGaussians) else GAUSSIANS
+
+
+def drawn(population: Any) -> Floats:
+    """Return the picture [H, W, 3] of a population before black."""
+    image: Floats = (
+        representation_of(population).renderer.render(Model(population), view_from(CAMERA), Request())[0].image
+    )
+    return image
+
+
+def fitted(target: Target, n: int, is_cut: bool, iterations: int, seed: int) -> Any:
+    """Return n Gaussians, with cuts or without, trained on the target; their number stays."""
+    rng = np.random.default_rng(seed)
+    view = View("card", CAMERA, np.rint(255 * np.clip(target.image, 0, 1)).astype(np.uint8), None)
+    none = np.zeros((0, 3))
+    scene = Scene("card", numbered([view]), (), none, none.astype(np.uint8), np.zeros(3), EXTENT)
+    population: Any = with_cuts(spread(n, rng), rng) if is_cut else spread(n, rng)
+    events = tuple(event for event in CUTS.events if is_cut and action_name(event) == set_width.__name__)
+    recipe = CUTS._replace(events=events, sh_degree=0, representation=representation_of(population))
+    state = TrainState(population, zero_moments(population), step=0, view_order=[], rng=rng, stats={})
+    return train(scene, scaled(recipe, iterations), seed=seed, state=state).gaussians
+
+
+def edge_width(image: Floats) -> float:
+    """Return over how many pixels a row rises from 10 to 90 % of its range beside the edge; the mean of middle rows.
+
+    The range is that of the row from the third pixel to the last but two.
+    """
+    widths = []
+    for row in image.mean(axis=2)[SIZE // 4 : -SIZE // 4, 2:-2].astype(np.float64):
+        top = int(np.argmax(row))
+        low, high = row[-1], row[top]
+        falling = row[top:]
+        at = [
+            float(np.interp(-(low + part * (high - low)), -np.minimum.accumulate(falling), np.arange(len(falling))))
+            for part in (0.9, 0.1)
+        ]
+        widths.append(at[1] - at[0])
+    return float(np.mean(widths))
+
+
+def measured(target: Target, population: Any) -> dict[str, float]:
+    """Return PSNR of the picture, of the band beside the edge and of the rest, dB, and the width of the edge, px."""
+    image = drawn(population)
+    band = target.band
+    return {
+        "psnr": psnr_of(image, target.image),
+        "band": psnr_of(image[band], target.image[band]),
+        "elsewhere": psnr_of(image[~band], target.image[~band]),
+        "edge_width": edge_width(np.clip(image, 0, 1)),
+    }

@@ -1,0 +1,119 @@
+"""A Bezier curve as a polygon: on which side of it a pixel lies, and how far from it, in NumPy (DisC-GS, 2405.15196).
+
+The cubic B(t) of four control points P_j, in pixels from the Gaussian's centre, is drawn as ``N_EDGES`` edges between
+``V_i = B(i / N_EDGES)``. A pixel at d is visible if the segment from the centre to it crosses an even number of edges:
+what is cut away is the curve's shadow, with a lamp in the centre. The shadow is bounded by the curve and by two rays,
+on which its ends B(0) and B(1) move away from the centre. So with the nearest point q of these N_EDGES + 2 pieces::
+
+    o_i = sum_j a_ij P_j,  u_i = sum_j b_ij P_j       a piece goes from o_i along u_i: an edge once, a ray for ever
+    f_i = clip((d - o_i) . u_i / u_i . u_i, 0, top_i),  q = o_i + f_i u_i of the piece where |d - q| is least
+    distance = +-|d - q|                              positive where it is visible
+    mask = 1 / (1 + exp(-distance / w)), or of width w = 0: 1 where it is visible, 0 where it is not
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from minisplat_ref.types import Bools, Floats, Ints
+
+N_EDGES = 8  # of which the weights are multiples of 1/512, the same in float32 and float64
+N_POINTS = 4
+LENGTH_MIN = 1e-12  # px^2: an edge that is shorter is a point
+
+
+def bernstein(t: Floats) -> Floats:
+    """Return the weights [..., 4] of the control points of a cubic at t."""
+    t = np.asarray(t)[..., None]
+    s = 1 - t
+    return np.concatenate([s**3, 3 * s**2 * t, 3 * s * t**2, t**3], axis=-1)
+
+
+VERTICES = bernstein(np.arange(N_EDGES + 1) / N_EDGES)  # [N_EDGES + 1, 4] weights of V_i
+ENDS = np.eye(N_POINTS)[[0, -1]]  # [2, 4] of B(0) and B(1)
+ORIGINS = np.concatenate([VERTICES[:-1], ENDS])  # [N_EDGES + 2, 4] a
+DIRECTIONS = np.concatenate([np.diff(VERTICES, axis=0), ENDS])  # b
+TOPS = np.concatenate([np.ones(N_EDGES), np.full(2, 1e9)])  # largest f
+
+
+class Cut(NamedTuple):
+    """Where P pixels lie beside G curves."""
+
+    is_visible: Bools  # [G, P]
+    away: Floats  # [G, P, 2] d - q, px
+    pieces: Ints  # [G, P] the nearest
+    fractions: Floats  # [G, P] f of it
+    masks: Floats  # [G, P]
+
+
+def cut(points: Floats, widths: Floats, offsets: Floats) -> Cut:
+    """Return what the curves leave of their Gaussians.
+
+    Parameters
+    ----------
+    points : ndarray of shape (G, 4, 2)
+        Control points, px from the centre.
+    widths : ndarray of shape (G,)
+        w, px.
+    offsets : ndarray of shape (G, P, 2)
+        d, pixels from the centre, px.
+    """
+    dtype = points.dtype
+    o, u = (np.einsum("ij,gjk->gik", weights.astype(dtype), points)[:, None] for weights in (ORIGINS, DIRECTIONS))
+    d = offsets[:, :, None]  # [G, P, 1, 2]
+    f = np.sum((d - o) * u, axis=3) / np.maximum(np.sum(u * u, axis=3), dtype.type(LENGTH_MIN))
+    f = np.clip(f, 0, TOPS.astype(dtype))  # [G, P, pieces]
+    away = d - o - f[..., None] * u
+    pieces = np.argmin(np.sum(away**2, axis=3), axis=2)[:, :, None]  # [G, P, 1] the first of equals
+    nearest = np.take_along_axis(away, pieces[..., None], axis=2)[:, :, 0]
+    is_visible = n_crossings(points, offsets) % 2 == 0
+    distances = np.where(is_visible, 1, -1) * np.linalg.norm(nearest, axis=2)
+    fractions = np.take_along_axis(f, pieces, axis=2)[:, :, 0]
+    return Cut(is_visible, nearest, pieces[:, :, 0], fractions, _masks(distances, widths))
+
+
+def _masks(distances: Floats, widths: Floats) -> Floats:
+    """Return the mask [G, P] of signed distances, of every width, also 0."""
+    is_soft = (widths > 0)[:, None]
+    z = distances / np.where(is_soft, widths[:, None], 1)
+    e = np.exp(-np.abs(z))
+    soft = np.where(z > 0, 1, e) / (1 + e)
+    return np.where(is_soft, soft, distances > 0).astype(distances.dtype)
+
+
+def n_crossings(points: Floats, offsets: Floats) -> Ints:
+    """Return how many edges [G, P] the segments from the centre to pixels cross.
+
+    An edge is crossed if its ends lie on different sides of the line through centre and pixel, and these on different
+    sides of the edge. Zero counts as negative: a line through a vertex crosses one of its two edges, or both or none.
+    """
+    V = np.einsum("ij,gjk->gik", VERTICES.astype(points.dtype), points)[:, None]  # [G, 1, N_EDGES + 1, 2]
+    d = offsets[:, :, None]
+    is_left = _cross(d, V) > 0  # [G, P, N_EDGES + 1]
+    o, u = V[:, :, :-1], np.diff(V, axis=2)
+    is_beyond = (_cross(u, d - o) > 0) != (_cross(u, -o) > 0)
+    return np.sum((is_left[:, :, 1:] != is_left[:, :, :-1]) & is_beyond, axis=2)
+
+
+def cut_vjp(points: Floats, widths: Floats, found: Cut, v_masks: Floats) -> tuple[Floats, Floats]:
+    """Gradient of :func:`cut` with respect to control points [G, 4, 2] and offsets [G, P, 2].
+
+    The nearest point is where a displacement along its piece changes nothing, so f counts as fixed. With the unit
+    vector e along d - q, in which the distance grows where the pixel is visible::
+
+        v_z = mask (1 - mask) v_mask / w,  v_d = +-v_z e,  v_P_j = -sum over pixels of (a_ij + f b_ij) v_d
+
+    Of width 0 the mask is a step, and the gradient is 0.
+    """
+    is_soft = (widths > 0)[:, None]
+    v_distances = found.masks * (1 - found.masks) * v_masks / np.where(is_soft, widths[:, None], 1)
+    v_distances = np.where(is_soft & found.is_visible, v_distances, np.where(is_soft, -v_distances, 0))
+    lengths = np.linalg.norm(found.away, axis=2)
+    v_offsets = (v_distances / np.where(lengths > 0, lengths, 1))[:, :, None] * found.away
+    weights = ORIGINS[found.pieces] + found.fractions[:, :, None] * DIRECTIONS[found.pieces]  # [G, P, 4]
+    return -np.einsum("gpj,gpk->gjk", weights.astype(points.dtype), v_offsets), v_offsets
+
+
+def _cross(x: Floats, y: Floats) -> Floats:
+    """Return ``x_0 y_1 - x_1 y_0`` of the last axis."""
+    return x[..., 0] * y[..., 1] - x[..., 1] * y[..., 0]

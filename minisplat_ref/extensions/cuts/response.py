@@ -1,0 +1,160 @@
+"""What a Gaussian with a cut does to a pixel, in NumPy: the curve in its plane, drawn as its footprint is.
+
+Control points are c_j in units of the first two deviations, along the first two axes of R. The affine map that makes
+the Gaussian an ellipse in the image, ``x = R_c mu + t`` and J of :mod:`minisplat_ref.reference.pinhole`, takes them
+along, and the mask multiplies alpha::
+
+    M = J(x) R_c R diag(s),   P_j = c_j1 M_1 + c_j2 M_2,   alpha = o exp(-d^T Q d / 2) mask(d)
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from minisplat_ref.constants import Conventions
+from minisplat_ref.extensions.cuts.curve import N_POINTS, Cut, cut, cut_vjp
+from minisplat_ref.reference.covariance import rotation_matrices, rotation_matrices_vjp
+from minisplat_ref.reference.hits import CONIC, ConicPlace, Hit, Response
+from minisplat_ref.reference.pinhole import (
+    pinhole_jacobians,
+    pinhole_jacobians_vjp,
+    pose,
+    slope_limits,
+    with_principal_point,
+)
+from minisplat_ref.types import Camera, Floats, Ints, Primitives, Projection
+
+
+def image_points(curves: Floats, primitives: Primitives, camera: Camera, conventions: Conventions) -> Floats:
+    """Return the control points [N, 4, 2] in pixels from the centres.
+
+    Parameters
+    ----------
+    curves : ndarray of shape (N, 8)
+        c_j, one point after the other.
+    primitives : Primitives
+        All in front of the camera.
+    camera, conventions
+        As for the projection.
+    """
+    *_, M = _maps(primitives, camera, conventions)
+    return np.einsum("nik,njk->nji", M, curves.reshape(-1, N_POINTS, 2))
+
+
+class PointsGradient(NamedTuple):
+    """Gradient of the loss with respect to what :func:`image_points` depends on."""
+
+    curves: Floats  # [N, 8]
+    means: Floats  # [N, 3]
+    quats: Floats  # [N, 4]
+    scales: Floats  # [N, 3]
+    cam_from_world_R: Floats  # [3, 3]
+    cam_from_world_t: Floats  # [3]
+
+
+def image_points_vjp(
+    curves: Floats, primitives: Primitives, camera: Camera, conventions: Conventions, v_points: Floats
+) -> PointsGradient:
+    """Gradient of :func:`image_points`.
+
+    With ``G = R_c R`` and the first two columns of ``M = J G diag(s)``::
+
+        v_c_j = M^T v_P_j,  v_M = sum_j v_P_j c_j^T,  v_J = v_M (G s)^T
+        v_G = J^T v_M s,  v_s_k = sum_i G_ik (J^T v_M)_ik,  v_R = R_c^T v_G
+        v_x = that of J,  v_mu = R_c^T v_x,  v_t = sum v_x,  v_R_c = sum v_G R^T + v_x mu^T
+    """
+    means, quats, scales, _ = primitives
+    x, R, J, M = _maps(primitives, camera, conventions)
+    R_c, _ = pose(camera, means.dtype)
+    G = (R_c @ R)[:, :, :2]
+    v_M = np.einsum("nji,njk->nik", v_points, curves.reshape(-1, N_POINTS, 2))  # [N, 2, 2]
+    v_J = np.einsum("nik,nlk,nk->nil", v_M, G, scales[:, :2])
+    v_GS = np.einsum("nil,nik->nlk", J, v_M)  # [N, 3, 2]
+    v_G, v_scales = np.zeros_like(R), np.zeros_like(scales)
+    v_G[:, :, :2] = v_GS * scales[:, None, :2]
+    v_scales[:, :2] = np.sum(G * v_GS, axis=1)
+    seen = with_principal_point(camera, conventions)
+    v_x = pinhole_jacobians_vjp(x, seen, *slope_limits(seen, conventions, means.dtype), v_J)
+    return PointsGradient(
+        curves=np.einsum("nik,nji->njk", M, v_points).reshape(curves.shape),
+        means=v_x @ R_c,
+        quats=rotation_matrices_vjp(quats, R_c.T @ v_G),
+        scales=v_scales,
+        cam_from_world_R=np.einsum("nij,nkj->ik", v_G, R) + v_x.T @ means,
+        cam_from_world_t=v_x.sum(axis=0),
+    )
+
+
+def _maps(primitives: Primitives, camera: Camera, conventions: Conventions) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return x [N, 3], R [N, 3, 3], J [N, 2, 3] and the first two columns of M [N, 2, 2]."""
+    means, quats, scales, _ = primitives
+    seen = with_principal_point(camera, conventions)
+    R_c, t = pose(camera, means.dtype)
+    x, R = means @ R_c.T + t, rotation_matrices(quats)
+    J = pinhole_jacobians(x, seen, *slope_limits(seen, conventions, means.dtype))
+    return x, R, J, (J @ R_c @ R)[:, :, :2] * scales[:, None, :2]
+
+
+class CutFootprints(NamedTuple):
+    """Gaussians with cuts as a camera sees them."""
+
+    projection: Projection
+    points: Floats
+    """[N, 4, 2] control points, px from the centre."""
+    widths: Floats
+    """[N] w of the mask, px."""
+
+    @property
+    def means2d(self) -> Floats:
+        """[N, 2] px."""
+        return self.projection.means2d
+
+    @property
+    def conics(self) -> Floats:
+        """[N, 3]."""
+        return self.projection.conics
+
+    @property
+    def opacities(self) -> Floats:
+        """[N]."""
+        return self.projection.opacities
+
+
+FIELDS = ("means2d", "conics", "opacities", "points")
+
+
+class Place(NamedTuple):
+    """Where pixels lie in Gaussians with cuts."""
+
+    conic: ConicPlace
+    uncut: Floats  # [G, P] alpha without the mask
+    cut: Cut
+
+
+def boxes(footprints: CutFootprints) -> Ints:
+    """Return the boxes of the projection: a cut only takes away."""
+    return footprints.projection.boxes
+
+
+def hit(footprints: CutFootprints, ids: Ints, centers: Floats) -> Hit:
+    """Evaluate footprints and masks at pixels; see :func:`minisplat_ref.reference.hits.conic_hit`."""
+    flat = CONIC.hit(footprints.projection, ids, centers)
+    found = cut(footprints.points[ids], footprints.widths[ids], -flat.place.offsets)
+    return Hit(flat.unclamped * found.masks, flat.depths, Place(flat.place, flat.unclamped, found))
+
+
+def hit_vjp(
+    footprints: CutFootprints, ids: Ints, hit: Hit, v_mean: Floats, v_shape: Floats, v_place: None
+) -> tuple[Floats, ...]:
+    """Gradient of :func:`hit` with respect to ``FIELDS``: the conic's for ``mask v``, and the mask's."""
+    place: Place = hit.place
+    flat = Hit(place.uncut, hit.depths, place.conic)
+    masks = place.cut.masks
+    v_means2d, v_conics, v_opacities = CONIC.hit_vjp(
+        footprints.projection, ids, flat, v_mean * masks, v_shape * masks, None
+    )
+    v_points, v_offsets = cut_vjp(footprints.points[ids], footprints.widths[ids], place.cut, v_shape * place.uncut)
+    return v_means2d - v_offsets.sum(axis=1), v_conics, v_opacities, v_points
+
+
+RESPONSE = Response(boxes, hit, hit_vjp, FIELDS)

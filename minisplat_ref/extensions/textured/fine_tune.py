@@ -1,0 +1,64 @@
+"""The command ``minisplat-ref textured fine-tune``: textures for a scene that was trained without."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.textured.population import DEGREE
+from minisplat_ref.io.ply import load_ply, save_ply
+
+
+def add_parser(commands: Any) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "fine-tune", help="train textures for the Gaussians of a run, which stay where they are"
+    )
+    parser.add_argument("scene", metavar="SCENE", help="folder that the run was trained on")
+    parser.add_argument("ply", type=Path, metavar="PLY", help="its point_cloud.ply, of Mini-Splatting in the paper")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="PLY to write")
+    parser.add_argument("--downscale", type=int, default=1, metavar="D", help="make photographs D times smaller")
+    parser.add_argument("--iterations", type=int, default=1000, metavar="N", help="default 1000")
+    parser.add_argument("--degree", type=int, default=DEGREE, metavar="L", help="of the textures, 1 to 3 (default 3)")
+    parser.add_argument(
+        "--replace", action="store_true", help="textures replace the view-dependent colour, as in the paper"
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="default 0")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Train, write, and say what it has brought on the test views.
+
+    Raises
+    ------
+    InputError
+        The scene, the PLY or the output cannot be used, or a number is out of range.
+    """
+    from tqdm import tqdm
+
+    from minisplat_ref.extensions.shared_studies import check_at_least, read_scene
+    from minisplat_ref.extensions.textured.tuning import floats_of, measured, prepared, tuned
+
+    check_at_least(1, downscale=args.downscale, iterations=args.iterations)
+    check_at_least(0, seed=args.seed)
+    if not 1 <= args.degree <= DEGREE:
+        raise InputError(f"--degree is {args.degree}: give 1, 2 or 3")
+    if not args.out.parent.is_dir():
+        raise InputError(f"{args.out.parent} is no folder: make it, or give another --out")
+    gaussians = load_ply(args.ply)
+    if len(gaussians.means) == 0:
+        raise InputError(f"{args.ply} holds no Gaussians: give that of a run")
+    scene = read_scene(args.scene, args.downscale)
+    before = measured(gaussians, scene, scene.test_views)
+    with tqdm(total=args.iterations, desc="textures", leave=False) as bar:
+        start = prepared(gaussians, args.degree, args.replace)
+        textured = tuned(start, scene, args.iterations, args.seed, lambda _: bar.update())
+    after = measured(textured, scene, scene.test_views)
+    save_ply(args.out, textured)
+    print(
+        f"{len(gaussians.means):,} Gaussians, {floats_of(gaussians)} numbers each: test PSNR {before.psnr:.2f} dB,"
+        f" SSIM {before.ssim:.4f}\nwith textures, {floats_of(textured)} numbers each: {after.psnr:.2f} dB,"
+        f" {after.ssim:.4f}; in {args.out}"
+    )
+    return 0

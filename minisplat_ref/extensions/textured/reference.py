@@ -1,0 +1,217 @@
+"""Where on a Gaussian's ellipsoid the ray of a pixel arrives, in NumPy, with the gradient (Textured-GS, 2407.09733).
+
+In the Gaussian's own axes, each in units of its deviation, the ellipsoid of one deviation is the unit sphere and the
+centre the origin. A ray from the camera is a line there. With K the camera's matrix, R_c and R the rotations of camera
+and Gaussian, s its deviations, z and p depth and pixel of its centre::
+
+    A = z diag(1 / s) R^T R_c^T K^-1          the frame: from pixels (x, y, 1) to directions
+    a = A (p, 1)                              from the camera to the centre
+    b = A (x, 1) = a + e,  e = A (x - p, 0)   from the camera along the ray
+    q = ((a x e) x b) / (b . b)               the point of the ray that is nearest to the centre
+    n = q - sqrt(1 - q . q) b / |b|           the point where it enters the sphere
+
+The length of b does not matter, and q does not take the difference of long vectors. Where a ray misses the sphere,
+q lies outside of it. There n points to q, so that it does not jump at the limb; near it the root is kept from falling
+below ``LIMB``, because its derivative grows beyond all bounds::
+
+    g = sqrt(max(1 - q . q, LIMB^2)),  n = (q - g b / |b|) / sqrt(max(1, q . q + LIMB^2))
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from minisplat_ref.reference.covariance import rotation_matrices, rotation_matrices_vjp
+from minisplat_ref.reference.pinhole import pose
+from minisplat_ref.types import Camera, Floats, Ints
+
+LIMB = 0.1  # the last 5.7 degrees before the limb, which are drawn as the last pixel's width of most Gaussians
+SCALE_MIN = 1e-9  # world units: what is thinner counts as this thin
+
+
+def inverse_intrinsics(camera: Camera, dtype: np.dtype) -> Floats:
+    """Return ``K^-1`` [3, 3], from pixels (x, y, 1) to directions of z = 1 in the camera's frame."""
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    return np.array([[1 / fx, 0, -cx / fx], [0, 1 / fy, -cy / fy], [0, 0, 1]], dtype)
+
+
+def frames(means: Floats, quats: Floats, scales: Floats, camera: Camera) -> Floats:
+    """Return the frames ``A = (z / s) (R_c R)^T K^-1`` of Gaussians.
+
+    Parameters
+    ----------
+    means : ndarray of shape (N, 3)
+        World frame.
+    quats : ndarray of shape (N, 4)
+        wxyz, any length.
+    scales : ndarray of shape (N, 3)
+        Deviations, world units.
+    camera : Camera
+        The view.
+
+    Returns
+    -------
+    ndarray of shape (N, 3, 3)
+    """
+    U, depths, _ = _turned(means, quats, camera)
+    return (depths[:, None] / np.maximum(scales, SCALE_MIN))[:, :, None] * U
+
+
+class FrameGradient(NamedTuple):
+    """Gradient of the loss with respect to what :func:`frames` takes."""
+
+    means: Floats  # [N, 3]
+    quats: Floats  # [N, 4]
+    scales: Floats  # [N, 3]
+    cam_from_world_R: Floats  # [3, 3]
+    cam_from_world_t: Floats  # [3]
+
+
+def frames_vjp(means: Floats, quats: Floats, scales: Floats, camera: Camera, v_frames: Floats) -> FrameGradient:
+    """Gradient of :func:`frames`.
+
+    With ``U = (R_c R)^T K^-1``, ``A = (z / s) U`` and ``z = (R_c mu + t)_z``::
+
+        v_U = (z / s) v_A,  v_z = sum_ij (v_A)_ij U_ij / s_i,  v_s_i = -sum_j (v_A)_ij A_ij / s_i
+        v_G = K^-T v_U^T with G = R_c R,  v_R = R_c^T v_G
+        v_R_c = sum_n v_G R^T, and v_z mu in its last row;  v_mu = v_z times that row;  v_t_z = sum_n v_z
+
+    Parameters
+    ----------
+    means, quats, scales, camera
+        As for :func:`frames`.
+    v_frames : ndarray of shape (N, 3, 3)
+        Derivative with respect to the frames.
+    """
+    U, depths, R = _turned(means, quats, camera)
+    R_c, _ = pose(camera, means.dtype)
+    ratios = 1 / np.maximum(scales, SCALE_MIN)  # [N, 3]
+    v_ratios = np.einsum("nij,nij->ni", v_frames, U) * depths[:, None]
+    v_depths = np.einsum("nij,nij,ni->n", v_frames, U, ratios)
+    v_U = (depths[:, None] * ratios)[:, :, None] * v_frames
+    v_G = np.einsum("jk,nik->nji", inverse_intrinsics(camera, means.dtype), v_U)
+    v_R_c = np.einsum("nij,nkj->ik", v_G, R)
+    v_R_c[2] += v_depths @ means
+    v_t = np.zeros(3, means.dtype)
+    v_t[2] = v_depths.sum()
+    return FrameGradient(
+        means=v_depths[:, None] * R_c[2],
+        quats=rotation_matrices_vjp(quats, R_c.T @ v_G),
+        scales=np.where(scales > SCALE_MIN, -(ratios**2) * v_ratios, 0),
+        cam_from_world_R=v_R_c,
+        cam_from_world_t=v_t,
+    )
+
+
+def _turned(means: Floats, quats: Floats, camera: Camera) -> tuple[Floats, Floats, Floats]:
+    """Return ``U = (R_c R)^T K^-1`` [N, 3, 3], depths z [N] and R [N, 3, 3]."""
+    R_c, t = pose(camera, means.dtype)
+    R = rotation_matrices(quats)
+    return np.swapaxes(R_c @ R, 1, 2) @ inverse_intrinsics(camera, means.dtype), means @ R_c[2] + t[2], R
+
+
+class Meeting(NamedTuple):
+    """Where P rays arrive at G ellipsoids."""
+
+    offsets: Floats  # [G, P, 2] x - p, px
+    a: Floats  # [G, 1, 3]
+    e: Floats  # [G, P, 3]
+    q: Floats  # [G, P, 3] nearest point
+    directions: Floats  # [G, P, 3] n, unit vectors
+
+
+def meet(frames: Floats, means2d: Floats, centers: Floats) -> Meeting:
+    """Return where the rays of pixels enter ellipsoids, or in which direction they miss them.
+
+    Parameters
+    ----------
+    frames : ndarray of shape (G, 3, 3)
+    means2d : ndarray of shape (G, 2)
+        p, px.
+    centers : ndarray of shape (P, 2)
+        x of the pixels, px.
+    """
+    offsets = centers.astype(means2d.dtype) - means2d[:, None]  # [G, P, 2]
+    e = np.einsum("gij,gpj->gpi", frames[:, :, :2], offsets)
+    a = (np.einsum("gij,gj->gi", frames[:, :, :2], means2d) + frames[:, :, 2])[:, None]  # [G, 1, 3]
+    b = a + e
+    q = np.cross(np.cross(a, e), b) / _dot(b, b)
+    squared = _dot(q, q)
+    g = np.sqrt(np.maximum(1 - squared, LIMB**2))
+    length = np.sqrt(np.maximum(1, squared + LIMB**2))
+    return Meeting(offsets, a, e, q, (q - g * b / np.sqrt(_dot(b, b))) / length)
+
+
+def meet_vjp(frames: Floats, means2d: Floats, meeting: Meeting, v_directions: Floats) -> tuple[Floats, Floats]:
+    """Gradient of :func:`meet` with respect to frames and centres, summed over the pixels.
+
+    With ``r = q - g u``, ``u = b / |b|``, ``n = r / l`` and ``h = q . q``::
+
+        v_r = v_n / l,  v_q = v_r,  v_g = -u . v_r,  v_u = -g v_r
+        v_h = -v_g / (2 g)                     where the root falls, else
+        v_h = -(n . v_n) / (2 l^2)             as the length does
+        v_q += 2 q v_h
+        v_c = b x v_q / b^2                    with c = a x e and q = c x b / b^2
+        v_b = v_q x c / b^2 - 2 b (q . v_q) / b^2 + (v_u - u (u . v_u)) / |b|
+        v_a = e x v_c + v_b,  v_e = v_c x a + v_b
+
+    Parameters
+    ----------
+    frames, means2d
+        As for :func:`meet`.
+    meeting : Meeting
+        Its result.
+    v_directions : ndarray of shape (G, P, 3)
+        Derivative with respect to n.
+
+    Returns
+    -------
+    v_frames : ndarray of shape (G, 3, 3)
+    v_means2d : ndarray of shape (G, 2)
+    """
+    offsets, a, e, q, n = meeting
+    b = a + e
+    squared, h = _dot(b, b), _dot(q, q)
+    u = b / np.sqrt(squared)
+    is_round = 1 - h > LIMB**2  # [G, P, 1] where the root is not kept from falling
+    g, length = np.sqrt(np.maximum(1 - h, LIMB**2)), np.sqrt(np.maximum(1, h + LIMB**2))
+
+    v_r = v_directions / length
+    v_u = -g * v_r
+    v_h = np.where(is_round, _dot(u, v_r) / (2 * g), -_dot(n, v_directions) / (2 * length**2))
+    v_q = v_r + 2 * q * v_h
+    c = np.cross(a, e)
+    v_c = np.cross(b, v_q) / squared
+    v_b = (np.cross(v_q, c) - 2 * b * _dot(q, v_q)) / squared + (v_u - u * _dot(u, v_u)) / np.sqrt(squared)
+    v_a = (np.cross(e, v_c) + v_b).sum(axis=1)  # [G, 3]
+    v_e = np.cross(v_c, a) + v_b  # [G, P, 3]
+
+    v_frames = np.zeros_like(frames)
+    v_frames[:, :, :2] = np.einsum("gpi,gpj->gij", v_e, offsets) + v_a[:, :, None] * means2d[:, None, :]
+    v_frames[:, :, 2] = v_a
+    v_means2d = np.einsum("gij,gi->gj", frames[:, :, :2], v_a - v_e.sum(axis=1))
+    return v_frames, v_means2d
+
+
+def _dot(x: Floats, y: Floats) -> Floats:
+    """Return ``x . y`` of the last axis, which is kept."""
+    return np.sum(x * y, axis=-1, keepdims=True)
+
+
+def visible_frames(means: Floats, quats: Floats, scales: Floats, camera: Camera, radii: Ints) -> Floats:
+    """Return the frames [N, 3, 3] where a radius is above 0; unit matrices elsewhere."""
+    rows = np.flatnonzero(radii[:, 0] > 0)
+    found = np.tile(np.eye(3, dtype=means.dtype), (len(means), 1, 1))
+    found[rows] = frames(means[rows], quats[rows], scales[rows], camera)
+    return found
+
+
+def visible_frames_vjp(
+    means: Floats, quats: Floats, scales: Floats, camera: Camera, radii: Ints, v_frames: Floats
+) -> FrameGradient:
+    """Gradient of :func:`visible_frames`: that of :func:`frames`, zero where nothing is seen."""
+    rows = np.flatnonzero(radii[:, 0] > 0)
+    v = frames_vjp(means[rows], quats[rows], scales[rows], camera, v_frames[rows])
+    v_means, v_quats, v_scales = np.zeros_like(means), np.zeros_like(quats), np.zeros_like(scales)
+    v_means[rows], v_quats[rows], v_scales[rows] = v.means, v.quats, v.scales
+    return FrameGradient(v_means, v_quats, v_scales, v.cam_from_world_R, v.cam_from_world_t)

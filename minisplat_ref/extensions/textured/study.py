@@ -1,0 +1,164 @@
+"""The studies ``textured/counts`` and ``textured/limb``.
+
+``counts``: what are textures worth at an equal number of Gaussians, and at an equal number of floats? A scene is
+trained by Mini-Splatting, or given. Its Gaussians are fine-tuned for the same number of iterations as they are, with
+textures in the place of view-dependent colour (the paper's form) and with both; textures of degree 1 and 2, too. Then
+as many of the most important Gaussians are kept that the textured ones have no more floats than the plain ones had.
+
+``limb``: does the colour jump where rays begin to miss the ellipsoid? A row of rays crosses the limb of one Gaussian;
+the largest change from one to the next is compared with that of a texture that is left out behind the limb.
+"""
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from minisplat_ref.extensions import shared_studies
+from minisplat_ref.extensions import shared_trainings as shared
+from minisplat_ref.io.atomic import making_folder
+from minisplat_ref.study import Study
+from minisplat_ref.types import Floats, Gaussians, Scene
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PLAIN = "3DGS"
+PAPER, BOTH = "textures for view", "textures and view"
+COLORS = {PLAIN: shared.GREY, PAPER: shared.RED, BOTH: shared.BLUE}
+STEPS = (0.1, 0.01, 0.001)  # px from ray to ray
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of ``counts``."""
+    shared.add_scene_arguments(parser, iterations=1000, recipe="mini-splatting")
+    parser.add_argument("--fine-tune", type=int, default=500, metavar="M", help="iterations afterwards (default 500)")
+
+
+def run(args: argparse.Namespace) -> None:
+    """Train, fine-tune, measure, write, print the table.
+
+    Raises
+    ------
+    InputError
+        The scene, the recipe, the PLY or the output folder cannot be used.
+    """
+    from minisplat_ref.reporting import markdown_table
+
+    shared_studies.check_at_least(1, **{"fine-tune": args.fine_tune})
+    scene = shared.read_scene(args)
+    with making_folder(args.out) as folder:
+        wholes = shared.populations(args, scene)
+        runs = [outcomes(whole, scene, args.fine_tune, seed) for seed, whole in enumerate(wholes)]
+        result = {**shared.describe(args, scene), "fine_tune": args.fine_tune, "runs": runs}
+        shared_studies.write(folder, result, draw(result))
+    print(f"{scene.name}; fine-tuned {args.fine_tune} iterations\n")
+    heading = ["Gaussians", "with", "degree", "number", "floats", "test PSNR", "test SSIM", "training PSNR"]
+    print(markdown_table(heading, to_rows(runs)))
+
+
+def outcomes(whole: Gaussians, scene: Scene, iterations: int, seed: int) -> list[dict[str, Any]]:
+    """Return a row for each form of a trained population."""
+    from tqdm import tqdm
+
+    from minisplat_ref.extensions.textured.tuning import floats_of, measured, prepared, tuned
+    from minisplat_ref.strategy.importance import collect_importance, indoor
+    from minisplat_ref.strategy.ops import take
+    from minisplat_ref.strategy.simplify import most_important
+
+    importance = indoor(collect_importance(whole, scene.train_views))
+    jobs: list[tuple[str, str, int, Any]] = [("all", PLAIN, 0, whole)]
+    jobs += [("all", PAPER, degree, prepared(whole, degree, True)) for degree in (1, 2, 3)]
+    jobs.append(("all", BOTH, 3, prepared(whole, 3, False)))
+    n_floats = len(whole.means) * floats_of(whole)
+    for form, replaces in ((PAPER, True), (BOTH, False)):
+        n = n_floats // floats_of(prepared(whole, 3, replaces))
+        kept = take(whole, most_important(importance, min(n, int(np.count_nonzero(importance)))))
+        jobs.append(("as many floats", form, 3, prepared(kept, 3, replaces)))
+    rows = []
+    for kept_by, form, degree, population in tqdm(jobs, desc=f"fine-tunings, seed {seed}", leave=False):
+        after = tuned(population, scene, iterations, seed)
+        test, training = (measured(after, scene, views) for views in (scene.test_views, scene.train_views))
+        rows.append(
+            {
+                "kept": kept_by,
+                "form": form,
+                "degree": degree,
+                "n_gaussians": len(population.means),
+                "n_floats": len(population.means) * floats_of(population),
+                "psnr": test.psnr,
+                "ssim": test.ssim,
+                "training_psnr": training.psnr,
+            }
+        )
+    return rows
+
+
+def to_rows(runs: list[list[dict[str, Any]]]) -> list[list[str]]:
+    """Return the lines of the table: means and deviations over the seeds."""
+    lines = []
+    for rows in zip(*runs, strict=True):
+        n, n_floats = (np.mean([row[key] for row in rows]) for key in ("n_gaussians", "n_floats"))
+        measures = [
+            shared.with_deviation([row[key] for row in rows], digits)
+            for key, digits in (("psnr", 2), ("ssim", 4), ("training_psnr", 2))
+        ]
+        first = rows[0]
+        lines.append([first["kept"], first["form"], str(first["degree"]), f"{n:,.0f}", f"{n_floats:,.0f}", *measures])
+    return lines
+
+
+def draw(result: dict[str, Any]) -> "Figure":
+    """Draw PSNR over the number of floats, of the test views and of those that were trained on."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.5, 3.6), layout="constrained")
+    for axes, key in zip(figure.subplots(1, 2), ("psnr", "training_psnr"), strict=True):
+        for form, color in COLORS.items():
+            for kept, marker in (("all", "o"), ("as many floats", "s")):
+                rows = [r for run in result["runs"] for r in run if (r["form"], r["kept"]) == (form, kept)]
+                if rows:
+                    x, y = [r["n_floats"] / 1e3 for r in rows], [r[key] for r in rows]
+                    axes.plot(x, y, marker, color=color, label=f"{form}, {kept}")
+        axes.set(xlabel="thousands of floats", ylabel=f"{'test' if key == 'psnr' else 'training'} PSNR (dB)")
+        shared_studies.tidy(axes)
+    axes.legend(frameon=False, fontsize=8)
+    figure.suptitle(result["scene"])
+    return figure
+
+
+def colors_across(step: float) -> tuple[Floats, Floats]:
+    """Return the colours of rays across the limb of a round Gaussian: with the texture, and without it beyond."""
+    from minisplat_ref.extensions.textured.reference import frames, meet
+    from minisplat_ref.reference.spherical_harmonics import sh_basis
+    from minisplat_ref.types import Camera
+
+    camera = Camera(np.eye(3), np.zeros(3), 100.0, 100.0, 50.0, 50.0, 100, 100)
+    means, quats, scales = np.array([[0.1, 0.0, 4.0]]), np.array([[1.0, 0.2, 0.3, 0.1]]), np.full((1, 3), 0.4)
+    p = 50 + 25 * means[:, :2]
+    xs = np.arange(p[0, 0] + 9, p[0, 0] + 11.5, step)  # the limb is about 10 px from the centre
+    met = meet(frames(means, quats, scales, camera), p, np.column_stack([xs, np.full(len(xs), 50.0)]))
+    texture = sh_basis(met.directions[0], 3)[:, 1:] @ np.random.default_rng(0).normal(size=15)  # [P]
+    return texture, np.where(np.sum(met.q[0] ** 2, axis=1) < 1, texture, 0)
+
+
+def add_limb_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add none."""
+
+
+def run_limb(args: argparse.Namespace) -> None:
+    """Print the largest change from ray to ray."""
+    from minisplat_ref.reporting import markdown_table
+
+    rows = []
+    for step in STEPS:
+        continued, cut = (float(np.abs(np.diff(colors)).max()) for colors in colors_across(step))
+        rows.append([f"{step:g}", f"{continued:.2g}", f"{cut:.2g}"])
+    print("largest change of a texture from ray to ray across the limb\n")
+    print(markdown_table(["rays apart (px)", "nearest point beyond", "no texture beyond"], rows))
+
+
+COUNTS = Study("counts", "textures at equal number of Gaussians, and of floats", add_arguments, run)
+"""``textured/counts``."""
+LIMB = Study("limb", "whether a texture jumps where rays begin to miss", add_limb_arguments, run_limb)
+"""``textured/limb``."""

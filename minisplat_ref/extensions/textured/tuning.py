@@ -1,0 +1,50 @@
+"""Fine-tuning: Gaussians that have been trained keep place, shape and number, and get textures."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from minisplat_ref.extensions.textured.method import FINE_TUNING, TEXTURED_GAUSSIANS
+from minisplat_ref.extensions.textured.population import TexturedGaussians, with_textures
+from minisplat_ref.metrics import Evaluation, evaluate
+from minisplat_ref.training.adam import zero_moments
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.representation import GAUSSIANS, Representation
+from minisplat_ref.training.schedule import scaled
+from minisplat_ref.training.state import StepReport, TrainState
+from minisplat_ref.types import Gaussians, Model, Scene, View
+
+
+def prepared(gaussians: Gaussians, degree: int, replaces_view: bool) -> TexturedGaussians:
+    """Return Gaussians with textures of zeros, and without view-dependent colour if textures are to replace it."""
+    if replaces_view:
+        gaussians = gaussians._replace(sh_rest=gaussians.sh_rest[:, :0])
+    return with_textures(gaussians, degree)
+
+
+def representation_of(population: Any) -> Representation:
+    """Return what the population is drawn and trained by."""
+    return TEXTURED_GAUSSIANS if isinstance(population, TexturedGaussians) else GAUSSIANS
+
+
+def tuned(
+    population: Any, scene: Scene, iterations: int, seed: int, on_step: Callable[[StepReport], None] | None = None
+) -> Any:
+    """Return a population, textured or not, after some iterations of ``FINE_TUNING``; the given one is not changed."""
+    recipe = scaled(FINE_TUNING, iterations)._replace(representation=representation_of(population))
+    copy = type(population)(*(field.copy() for field in population))
+    rng = np.random.default_rng(seed)
+    state = TrainState(copy, zero_moments(copy), step=0, view_order=[], rng=rng, stats={})
+    return train(scene, recipe, seed=seed, state=state, on_step=on_step).gaussians
+
+
+def measured(population: Any, scene: Scene, views: tuple[View, ...]) -> Evaluation:
+    """Compare pictures of a population with photographs."""
+    renderer = representation_of(population).renderer
+    return evaluate(Model(population), views, background=scene.background, renderer=renderer)
+
+
+def floats_of(population: Any) -> int:
+    """Return how many numbers a Gaussian of the population has."""
+    return sum(int(np.prod(field.shape[1:])) for field in population)

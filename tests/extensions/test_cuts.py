@@ -1,0 +1,309 @@
+"""DisC-GS: masks against polygons, gradients, parity of kernels and reference, hard cases, training end to end."""
+
+import json
+
+import numba
+import numpy as np
+import pytest
+from gradcheck import check_jacobian
+from matplotlib.path import Path as Polygon
+from numpy.testing import assert_allclose
+from scenes import as_dtype, make_camera, make_gaussians
+from tolerances import (
+    CLOSED_FORM,
+    COVERAGE_MIN,
+    PARITY_FLOAT32_GRADIENT,
+    PARITY_FLOAT32_IMAGE,
+    PARITY_FLOAT64,
+)
+
+from minisplat_ref import load_ply
+from minisplat_ref.backends import CPU, REFERENCE
+from minisplat_ref.cli import main
+from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.datasets.synthetic.files import write_scene
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.cuts import card
+from minisplat_ref.extensions.cuts.curve import N_EDGES, VERTICES, bernstein, cut, cut_vjp, n_crossings
+from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CutGaussians, render, render_vjp, with_cuts
+from minisplat_ref.extensions.cuts.response import image_points, image_points_vjp
+from minisplat_ref.extensions.cuts.stages import stages
+from minisplat_ref.oracle.gradients import jacobian_case
+from minisplat_ref.oracle.models import check_model_gradients
+from minisplat_ref.oracle.pieces import SEED, tiny_setting
+from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.types import Gaussians, Model, Primitives, view_from
+
+HARD, SOFT = np.zeros(1), np.ones(1)
+LOOP = np.array([[[2.0, -5.0], [9.0, -6.0], [6.0, 7.0], [-2.5, 5.0]]])  # px; beside the centre
+AROUND = np.array([[[-3.0, 0.5], [-2.0, 9.0], [8.0, -3.0], [-3.0, -0.5]]])  # almost closed around it
+
+
+def grid(n=41, reach=8.0):
+    """Pixels [1, n^2, 2] around the centre."""
+    steps = np.linspace(-reach, reach, n) + 0.013
+    return np.stack(np.meshgrid(steps, steps), axis=-1).reshape(1, -1, 2)
+
+
+def with_random_cuts(rng, n, **named):
+    """Gaussians of :func:`make_gaussians` with curves through them, a third of them hard."""
+    population = with_cuts(make_gaussians(rng, n, **named), rng)
+    curves = 0.4 * population.curves + 0.2 * rng.normal(size=population.curves.shape)
+    return population._replace(curves=curves, widths=np.where(np.arange(n) % 3 == 0, 0.0, 0.7))
+
+
+def drawn(population, view, backend):
+    """A picture, and the gradient of it with random weights."""
+    output, tape = render(Model(population), view, Request(np.full(3, 0.2), backend=backend))
+    rng, dtype = np.random.default_rng(1), population.means.dtype
+    v_image, v_alpha = rng.normal(size=output.image.shape), rng.normal(size=output.alpha.shape)
+    return output, render_vjp(tape, v_image.astype(dtype), v_alpha.astype(dtype))
+
+
+# --- the mask ---
+
+
+@pytest.mark.parametrize("points", [LOOP, AROUND], ids=["beside", "around"])
+def test_what_is_cut_away_is_the_shadow_of_the_curve(points):
+    """The shadow is a polygon: the curve's vertices, and far away, where the lamp in the centre throws its ends."""
+    d, vertices = grid(), VERTICES @ points[0]
+    directions = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
+    shadow = Polygon(np.concatenate([vertices, 1e3 * directions[::-1], vertices[:1]]))
+    expected = shadow.contains_points(d[0])
+    found = cut(points, HARD, d)
+    assert 0.1 < expected.mean() < 0.95
+    assert (found.masks[0] == ~expected).all()
+    assert set(np.unique(found.masks)) == {0.0, 1.0}
+
+
+def test_a_closed_curve_cuts_as_a_point_in_a_polygon(rng):
+    """Ends that meet: from a centre outside, the inside is cut away, and so is its shadow where an odd number is."""
+    points = np.array([[[3.0, 0.0], [9.0, -7.0], [9.0, 7.0], [3.0, 0.0]]])
+    polygon, d = Polygon(VERTICES @ points[0]), rng.uniform(-9, 9, size=(1, 4000, 2))
+    inside = polygon.contains_points(d[0])
+    assert inside.sum() > 50 and (n_crossings(points, d)[0] % 2 == 1)[inside].all()
+    assert (n_crossings(points, d)[0] % 2 == 0)[~inside].all()
+
+
+def test_the_polygon_is_the_curve_at_its_vertices():
+    t = np.linspace(0, 1, N_EDGES + 1)
+    straight = np.array([[0.0, 0.0], [1.0, 2.0], [2.0, 4.0], [3.0, 6.0]])
+    assert_allclose(VERTICES @ straight, t[:, None] * [3.0, 6.0], atol=CLOSED_FORM)
+    assert_allclose(bernstein(np.array(0.5)), [0.125, 0.375, 0.375, 0.125])
+    assert (VERTICES * 512 == np.rint(VERTICES * 512)).all()
+
+
+def test_a_straight_cut_is_a_logistic_curve_of_the_distance():
+    points = np.array([[[1.5, -90.0], [1.5, -30.0], [1.5, 30.0], [1.5, 90.0]]])
+    d = np.array([[[x, 0.4] for x in (-3.0, 1.0, 1.5, 1.75, 4.0)]])
+    found = cut(points, 2 * SOFT, d).masks[0]
+    assert_allclose(found, 1 / (1 + np.exp(-(1.5 - d[0, :, 0]) / 2)), rtol=CLOSED_FORM)
+    assert_allclose(cut(points, HARD, d).masks[0], [1, 1, 0, 0, 0])
+
+
+@pytest.mark.parametrize("points", [LOOP, AROUND], ids=["beside", "around"])
+def test_the_soft_mask_does_not_jump_and_narrows_to_the_hard_one(points):
+    path = np.linspace([[-8.0, -5.0]], [[8.0, 6.3]], 20_001).swapaxes(0, 1)
+    soft, hard = cut(points, SOFT, path).masks[0], cut(points, HARD, path).masks[0]
+    step = np.linalg.norm(path[0, 1] - path[0, 0])
+    assert np.abs(np.diff(hard)).max() == 1 and np.abs(np.diff(soft)).max() <= 0.2501 * step
+    narrow = cut(points, 1e-4 * SOFT, path).masks[0]
+    assert np.mean(np.abs(narrow - hard) > 1e-6) < 0.002
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        np.array([[[-2.0, -3.0], [0.0, 0.0], [0.0, 0.0], [2.0, 3.0]]]),
+        np.tile([1.5, 1.1], (1, 4, 1)),
+        np.zeros((1, 4, 2)),
+        np.array([[[1.0, 0.0], [2.0, 0.0], [3.0, 0.0], [4.0, 0.0]]]),
+    ],
+    ids=["through the centre", "a point", "the centre itself", "away from the centre"],
+)
+def test_degenerate_curves_are_finite_and_cut_nothing_if_they_have_no_breadth(points):
+    d = np.concatenate([grid(), points, np.zeros((1, 1, 2))], axis=1)
+    for widths in (HARD, SOFT):
+        found = cut(points, widths, d)
+        v_points, v_offsets = cut_vjp(points, widths, found, np.ones_like(found.masks))
+        assert all(np.isfinite(array).all() for array in (found.masks, v_points, v_offsets))
+    share = cut(points, HARD, grid()).masks.mean()
+    assert 0.3 < share < 0.7 if np.ptp(points[0, :, 1]) > 1 else share > 0.999
+
+
+@pytest.mark.parametrize("points", [LOOP, AROUND], ids=["beside", "around"])
+def test_the_gradient_of_the_mask(points, rng):
+    d = rng.uniform(-5, 8, size=(1, 12, 2))
+    check_jacobian(
+        lambda points, d: (cut(points, SOFT, d).masks,),
+        lambda v: cut_vjp(points, SOFT, cut(points, SOFT, d), v),
+        [points, d],
+        names=["points", "offsets"],
+    )
+
+
+def test_the_gradient_of_the_points(rng):
+    camera = make_camera(rng=rng)
+    curves, means = rng.normal(size=(3, 8)), rng.normal(size=(3, 3)) + np.array([0, 0, 4])
+    quats, scales = rng.normal(size=(3, 4)), rng.uniform(0.1, 0.4, size=(3, 3))
+    pose = [camera.cam_from_world_R, camera.cam_from_world_t]
+
+    def function(curves, means, quats, scales, R, t):
+        moved = camera._replace(cam_from_world_R=R, cam_from_world_t=t)
+        return (image_points(curves, Primitives(means, quats, scales, np.ones(3)), moved, GSPLAT_MAIN),)
+
+    check_jacobian(
+        function,
+        lambda v: image_points_vjp(curves, Primitives(means, quats, scales, np.ones(3)), camera, GSPLAT_MAIN, v),
+        [curves, means, quats, scales, *pose],
+        names=["curves", "means", "quats", "scales", "R", "t"],
+    )
+
+
+# --- whole pictures ---
+
+
+def test_the_gradient_of_the_whole_model(backend):
+    report = check_model_gradients(backend, GSPLAT_MAIN, CUT_GAUSSIANS, stages)
+    assert len(report.cases) == 2 and report.n_failed == 0, report.cases
+
+
+def test_a_wrong_gradient_is_found(monkeypatch):
+    path = "minisplat_ref.extensions.cuts.response.cut_vjp"
+    monkeypatch.setattr(path, lambda *args: tuple(1.001 * v for v in cut_vjp(*args)))
+    (stage,) = stages(REFERENCE, tiny_setting(GSPLAT_MAIN), np.random.default_rng(SEED))
+    case = jacobian_case(stage)
+    assert not case.passed and "is wrong" in case.note
+
+
+@pytest.mark.parametrize(
+    ("dtype", "image_rel", "gradient_rel"),
+    [(np.float64, PARITY_FLOAT64, 10 * PARITY_FLOAT64), (np.float32, PARITY_FLOAT32_IMAGE, PARITY_FLOAT32_GRADIENT)],
+)
+@pytest.mark.parametrize("size", [0.15, 0.6])
+def test_kernels_and_reference_agree(dtype, image_rel, gradient_rel, size, rng):
+    """The second scene has Gaussians as large as the picture, of some of which the camera is inside."""
+    population, view = with_random_cuts(rng, 40, size=size), view_from(make_camera(rng=rng))
+    (ours, v_ours), (theirs, v_theirs) = (
+        drawn(as_dtype(population, dtype), view, CPU),
+        drawn(population, view, REFERENCE),
+    )
+    assert ours.image.dtype == dtype and theirs.alpha.max() > COVERAGE_MIN
+    assert np.abs(ours.image - theirs.image).max() <= image_rel * np.abs(theirs.image).max()
+    for name, expected in v_theirs.gaussians._asdict().items():
+        found, scale = getattr(v_ours.gaussians, name), np.abs(expected).max()
+        assert found.dtype == dtype and (scale > 0 or name == "widths")
+        assert np.abs(found - expected).max() <= gradient_rel * scale, name
+
+
+def test_gaussians_without_points_are_3dgs_to_the_last_byte(backend, rng):
+    gaussians, view = make_gaussians(rng, 30), view_from(make_camera(rng=rng))
+    uncut = CutGaussians(*gaussians, curves=np.zeros((30, 0)), widths=np.zeros(30))
+    ours, _ = drawn(uncut, view, backend)
+    theirs, _ = SPLATTING.render(Model(gaussians), view, Request(np.full(3, 0.2), backend=backend))
+    assert theirs.alpha.max() > COVERAGE_MIN and ours.image.tobytes() == theirs.image.tobytes()
+    point = uncut._replace(curves=np.full((30, 8), 0.3))  # a curve that is a point cuts nothing
+    assert_allclose(drawn(point, view, backend)[0].image, theirs.image, atol=PARITY_FLOAT64)
+
+
+def test_needles_and_curves_through_the_centre(rng):
+    """A needle, a Gaussian with a curve through its centre, one with a curve that is a point, one around the camera."""
+    population = with_random_cuts(rng, 4)._replace(
+        means=np.array([[0.1, 0.0, 3.0], [-0.3, 0.2, 2.5], [0.3, -0.2, 2.8], [0.05, 0.02, 0.3]]),
+        log_scales=np.log([[0.8, 8e-4, 8e-4], [0.3, 0.3, 1e-6], [0.2, 0.2, 0.2], [0.6, 0.5, 0.7]]),
+        opacity_logits=np.array([1.0, 1.0, 1.0, -1.5]),
+    )
+    population.curves[1], population.curves[2] = [-2, -2, -1, -1, 1, 1, 2, 2], 0.5
+    view = view_from(make_camera())
+    theirs, v_theirs = drawn(population, view, REFERENCE)
+    for dtype, rel in ((np.float64, 100 * PARITY_FLOAT64), (np.float32, 10 * PARITY_FLOAT32_IMAGE)):
+        ours, v_ours = drawn(as_dtype(population, dtype), view, CPU)
+        assert (ours.visible_ids == np.arange(4)).all()
+        assert np.abs(ours.image - theirs.image).max() <= rel
+        assert all(np.isfinite(field).all() for field in (*v_ours.gaussians, *v_theirs.gaussians))
+
+
+def test_the_number_of_threads_does_not_change_a_byte(rng):
+    population, view = as_dtype(with_random_cuts(rng, 60), np.float32), view_from(make_camera(48, 40, rng=rng))
+    threads, results = numba.get_num_threads(), []
+    try:
+        for n in (1, min(2, threads)):
+            numba.set_num_threads(n)
+            output, v = drawn(population, view, CPU)
+            results.append([output.image.tobytes(), *(field.tobytes() for field in v.gaussians)])
+    finally:
+        numba.set_num_threads(threads)
+    assert results[0] == results[1]
+
+
+def test_no_gaussians_and_no_statistics(backend, rng):
+    none, some = (as_dtype(with_random_cuts(rng, n), np.float32) for n in (0, 5))
+    view = view_from(make_camera())
+    assert render(Model(none), view, Request(backend=backend))[0].image.max() == 0
+    asks = Request(backend=backend, wants=frozenset({"stats"}))
+    if backend.is_compiled:
+        with pytest.raises(InputError, match="--backend reference"):
+            render(Model(some), view, asks)
+    else:
+        assert render(Model(some), view, asks)[0].stats.hit_count.sum() > 0
+
+
+# --- from end to end ---
+
+SCENE = {"n_views": 6, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
+
+
+def test_trains_evaluates_and_renders(tmp_path, capsys):
+    write_scene(make_scene("room", supersampling=1, **SCENE), tmp_path / "nook", SCENE)
+    run = tmp_path / "run"
+    options = ["--recipe", "cuts", "--test-every", "4", "--iterations", "40", "--out", str(run)]
+    assert main(["train", str(tmp_path / "nook"), *options]) == 0
+    losses = [json.loads(line)["loss"] for line in (run / "log.jsonl").read_text().splitlines()]
+    assert losses[-1] < losses[0]
+    population = load_ply(run / "point_cloud.ply", CutGaussians)
+    assert population.curves.shape == (len(population.means), 8) and (population.widths == 0).all()
+    assert main(["eval", str(run)]) == 0
+    ply, cameras = str(run / "point_cloud.ply"), ["--cameras", str(run / "cameras.json")]
+    for name, extension in (("ours", ["--extension", "cuts"]), ("theirs", [])):
+        assert main(["render", ply, *cameras, *extension, "--out", str(tmp_path / name)]) == 0
+    ours, theirs = (sorted((tmp_path / name).glob("*.png")) for name in ("ours", "theirs"))
+    assert all(a.read_bytes() != b.read_bytes() for a, b in zip(ours, theirs, strict=True))
+    plain = tmp_path / "plain"
+    assert main(["train", str(tmp_path / "nook"), "--recipe", "3dgs", "--iterations", "3", "--out", str(plain)]) == 0
+    capsys.readouterr()
+    command = ["render", str(plain / "point_cloud.ply"), *cameras, "--extension", "cuts", "--out", str(tmp_path / "no")]
+    assert main(command) == 2
+    error = capsys.readouterr().err.strip()
+    assert "curves" in error and "\n" not in error and not (tmp_path / "no").exists()
+
+
+def test_one_gaussian_with_a_cut_is_a_cut_gaussian():
+    """From a curve on the right side; 3DGS spills over the edge."""
+    target = card.cut_gaussian()
+    plain, found = (card.measured(target, card.fitted(target, 1, is_cut, 300, 3)) for is_cut in (False, True))
+    assert found["psnr"] > plain["psnr"] + 20 and found["edge_width"] < 2 < plain["edge_width"]
+
+
+def test_the_width_of_an_edge():
+    image = np.zeros((card.SIZE, card.SIZE, 3))
+    image[:, :20] = 1.0
+    assert card.edge_width(image) == pytest.approx(0.8)  # of a step from one pixel to the next
+    image = np.clip((30.5 - np.arange(card.SIZE)) / 10, 0, 1)[None, :, None] * np.ones((card.SIZE, 1, 3))
+    assert card.edge_width(image) == pytest.approx(8.0)
+
+
+def test_the_study(tmp_path, monkeypatch, capsys):
+    from minisplat_ref.extensions.cuts import study
+
+    monkeypatch.setattr(study, "NUMBERS", {"plain": (1,), "cut": (1,)})
+    out = tmp_path / "study"
+    assert main(["study", "cuts/card", "--iterations", "5", "--seeds", "2", "--out", str(out)]) == 0
+    assert len(json.loads((out / "result.json").read_text())["rows"]) == 4
+    assert (out / "figure.png").stat().st_size > 10_000 and "| cut Gaussian" in capsys.readouterr().out
+    assert main(["study", "cuts/card", "--seeds", "0", "--out", str(tmp_path / "none")]) == 2
+    assert not (tmp_path / "none").exists()
+
+
+def test_the_fields_of_3dgs_come_first():
+    assert CutGaussians._fields[:6] == Gaussians._fields

@@ -1,0 +1,333 @@
+"""Textured-GS: where rays meet ellipsoids, gradients, parity of kernels and reference, fine-tuning end to end."""
+
+import json
+
+import numba
+import numpy as np
+import pytest
+from gradcheck import check_jacobian
+from numpy.testing import assert_allclose
+from scenes import as_dtype, make_camera, make_gaussians
+from tolerances import (
+    CLOSED_FORM,
+    COVERAGE_MIN,
+    PARITY_FLOAT32_GRADIENT,
+    PARITY_FLOAT32_IMAGE,
+    PARITY_FLOAT64,
+    TEXTURE_THIN_FLOAT32,
+)
+
+from minisplat_ref import load_ply
+from minisplat_ref.backends import CPU, REFERENCE
+from minisplat_ref.cli import main
+from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.datasets.synthetic.files import write_scene
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.textured.method import TEXTURED_GAUSSIANS, render, render_vjp
+from minisplat_ref.extensions.textured.population import TexturedGaussians, with_textures
+from minisplat_ref.extensions.textured.reference import LIMB, frames, frames_vjp, meet, meet_vjp
+from minisplat_ref.extensions.textured.response import RESPONSE, Footprints, bounds
+from minisplat_ref.extensions.textured.stages import stages
+from minisplat_ref.extensions.textured.study import colors_across
+from minisplat_ref.oracle.gradients import jacobian_case
+from minisplat_ref.oracle.models import check_model_gradients
+from minisplat_ref.oracle.pieces import SEED, tiny_setting
+from minisplat_ref.reference.covariance import rotation_matrices
+from minisplat_ref.reference.hits import CONIC
+from minisplat_ref.reference.pinhole import pinhole, pinhole_rays
+from minisplat_ref.reference.spherical_harmonics import sh_basis
+from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.types import Gaussians, Model, Projection, view_from
+
+DIRECTIONS = np.random.default_rng(5).normal(size=(4000, 3))
+DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
+
+
+def textured(rng, n, degree=3, **named):
+    """Gaussians of :func:`make_gaussians` with random textures."""
+    plain = with_textures(make_gaussians(rng, n, **named), degree)
+    return plain._replace(
+        color_textures=0.3 * rng.normal(size=plain.color_textures.shape),
+        opacity_textures=0.5 * rng.normal(size=plain.opacity_textures.shape),
+    )
+
+
+def of_one(mean, scales, quat=(1.0, 0.2, -0.3, 0.4)):
+    """Frame and pixel of one Gaussian before the camera of the tests."""
+    camera = make_camera()
+    means, quats, deviations = np.array([mean]), np.array([quat]), np.array([scales])
+    return frames(means, quats, deviations, camera), pinhole(means, camera), camera
+
+
+def drawn(population, view, backend, v=None):
+    """A picture, and the gradient of it with random weights."""
+    output, tape = render(Model(population), view, Request(np.full(3, 0.2), backend=backend))
+    rng, dtype = np.random.default_rng(1), population.means.dtype
+    v_image, v_alpha = rng.normal(size=output.image.shape), rng.normal(size=output.alpha.shape)
+    return output, render_vjp(tape, v_image.astype(dtype), v_alpha.astype(dtype))
+
+
+# --- where rays arrive ---
+
+
+@pytest.mark.parametrize(
+    "mean", [(0.1, 0.05, 3.0), (-0.6, 0.4, 1.5), (0.02, 0.01, 0.2)], ids=["far", "aside", "inside"]
+)
+def test_they_enter_the_ellipsoid_where_the_quadratic_says(mean):
+    """A t^2 + B t + C = 0 in the Gaussian's axes, of which the smaller root; the last camera is inside of it."""
+    scales, quat = np.array([0.5, 0.3, 0.4]), np.array([1.0, 0.2, -0.3, 0.4])
+    frame, p, camera = of_one(mean, scales, quat)
+    pixels = np.stack(np.meshgrid(np.arange(24) + 0.5, np.arange(18) + 0.5), axis=-1).reshape(-1, 2)
+    R = rotation_matrices(quat[None])[0]
+    o, d = -(R.T @ np.array(mean)) / scales, pinhole_rays(*pixels.T, camera) @ R / scales
+    A, B, C = np.sum(d * d, axis=1), 2 * d @ o, o @ o - 1
+    discriminant = B * B - 4 * A * C
+    nearest = o - (B / (2 * A))[:, None] * d
+    is_met = np.sum(nearest**2, axis=1) < 1 - LIMB**2
+    t = (-B - np.sqrt(np.where(is_met, discriminant, 0))) / (2 * A)
+    n = meet(frame, p, pixels).directions[0]
+    assert is_met.sum() > 20
+    assert_allclose(n[is_met], (o + t[:, None] * d)[is_met], atol=100 * CLOSED_FORM)  # B^2 - 4 A C loses two digits
+    assert_allclose(np.linalg.norm(n, axis=1), 1, atol=CLOSED_FORM)
+    is_missed = np.sum(nearest**2, axis=1) > 1
+    if is_missed.any():  # n points to the nearest point, raised towards the camera by the blunt limb
+        cosines = np.sum(n * nearest, axis=1) / np.linalg.norm(nearest, axis=1)
+        assert cosines[is_missed].min() >= np.cos(np.arctan(LIMB)) - CLOSED_FORM
+
+
+def test_a_texture_does_not_jump_at_the_limb():
+    """Ten times nearer rays differ ten times less; a texture that ends at the limb jumps by as much as ever."""
+    coarse, fine = (np.abs(np.diff(colors_across(step)[0])).max() for step in (0.01, 0.001))
+    assert 0 < fine < 0.15 * coarse
+    assert np.abs(np.diff(colors_across(0.001)[1])).max() > 0.1
+
+
+@pytest.mark.parametrize("reach", [0.2, 0.9, 3.0], ids=["round", "with limb", "beyond"])
+def test_the_gradient_of_the_meeting(reach, rng):
+    frame, p, _ = of_one((0.1, 0.05, 3.0), (0.5, 0.3, 0.4))
+    pixels = p + reach * rng.uniform(-3, 3, size=(7, 2))
+    check_jacobian(
+        lambda frame, p: (meet(frame, p, pixels).directions,),
+        lambda v: meet_vjp(frame, p, meet(frame, p, pixels), v),
+        [frame, p],
+        names=["frames", "means2d"],
+    )
+
+
+def test_the_gradient_of_frames(rng):
+    camera = make_camera(rng=rng)
+    inputs = [
+        rng.normal(size=(3, 3)) + np.array([0, 0, 4]),
+        rng.normal(size=(3, 4)),
+        rng.uniform(0.1, 0.4, size=(3, 3)),
+    ]
+    pose = [camera.cam_from_world_R, camera.cam_from_world_t]
+
+    def function(means, quats, scales, R, t):
+        return (frames(means, quats, scales, camera._replace(cam_from_world_R=R, cam_from_world_t=t)),)
+
+    check_jacobian(
+        function, lambda v: tuple(frames_vjp(*inputs, camera, v)), [*inputs, *pose], names=["mean", "q", "s", "R", "t"]
+    )
+
+
+# --- what they find there ---
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_a_texture_adds_no_more_to_the_logit_than_its_bound(degree, rng):
+    h = rng.normal(size=(5, (degree + 1) ** 2 - 1))
+    x = sh_basis(DIRECTIONS, degree)[:, 1:] @ h.T  # [D, 5]
+    assert (np.abs(x) <= bounds(h)).all()
+    zonal = sh_basis(np.array([[0.0, 0.0, 1.0]]), degree)[:, 1:]  # a texture that is its own largest value
+    assert bounds(zonal)[0] == pytest.approx(np.sum(zonal**2), rel=CLOSED_FORM)
+
+
+def test_opacity_is_the_sigmoid_of_logit_and_texture(rng):
+    frame, p, _ = of_one((0.1, 0.05, 3.0), (0.5, 0.3, 0.4))
+    h, logit, conic = rng.normal(size=(1, 15)), np.array([-0.7]), np.array([[0.05, 0.01, 0.04]])
+    box, ones = np.zeros((1, 4), np.int32), np.ones((1, 2), np.int32)
+    projection = Projection(p, np.ones(1), conic, 1 / (1 + np.exp(-(logit + bounds(h)))), ones, box)
+    pixels = p + rng.uniform(-6, 6, size=(9, 2))
+    hit = RESPONSE.hit(Footprints(projection, logit, h, frame), np.zeros(1, int), pixels)
+    x = sh_basis(meet(frame, p, pixels).directions[0], 3)[:, 1:] @ h[0]
+    falloff = CONIC.hit(projection._replace(opacities=np.ones(1)), np.zeros(1, int), pixels).unclamped[0]
+    assert np.ptp(x) > 0.5
+    assert_allclose(hit.unclamped[0], falloff / (1 + np.exp(-(logit + x))), rtol=CLOSED_FORM)
+
+
+def test_textures_of_degree_0_are_3dgs_to_the_last_byte(backend, rng):
+    gaussians, view = make_gaussians(rng, 30), view_from(make_camera(rng=rng))
+    (ours, v_ours), (theirs, tape) = (
+        drawn(with_textures(gaussians, 0), view, backend),
+        SPLATTING.render(Model(gaussians), view, Request(np.full(3, 0.2), backend=backend)),
+    )
+    assert theirs.alpha.max() > COVERAGE_MIN and ours.image.tobytes() == theirs.image.tobytes()
+    weights = np.random.default_rng(1)
+    v = SPLATTING.render_vjp(tape, weights.normal(size=(18, 24, 3)), weights.normal(size=(18, 24)))
+    for name in Gaussians._fields:
+        assert getattr(v_ours.gaussians, name).tobytes() == getattr(v.gaussians, name).tobytes(), name
+
+
+def test_textures_of_zeros_change_nothing(backend, rng):
+    gaussians, view = make_gaussians(rng, 30), view_from(make_camera(rng=rng))
+    ours, v = drawn(with_textures(gaussians, 3), view, backend)
+    theirs, _ = SPLATTING.render(Model(gaussians), view, Request(np.full(3, 0.2), backend=backend))
+    assert_allclose(ours.image, theirs.image, atol=PARITY_FLOAT64)
+    assert np.abs(v.gaussians.color_textures).max() > 0 and np.abs(v.gaussians.opacity_textures).max() > 0
+
+
+# --- whole pictures ---
+
+
+def test_the_gradient_of_the_whole_model(backend):
+    report = check_model_gradients(backend, GSPLAT_MAIN, TEXTURED_GAUSSIANS, stages)
+    assert len(report.cases) == 2 and report.n_failed == 0, report.cases
+
+
+def test_a_wrong_gradient_is_found(monkeypatch):
+    path = "minisplat_ref.extensions.textured.response.meet_vjp"
+    monkeypatch.setattr(path, lambda *args: tuple(1.001 * v for v in meet_vjp(*args)))
+    (stage,) = stages(REFERENCE, tiny_setting(GSPLAT_MAIN), np.random.default_rng(SEED))
+    case = jacobian_case(stage)
+    assert not case.passed and "is wrong" in case.note
+
+
+@pytest.mark.parametrize(
+    ("dtype", "image_rel", "gradient_rel"),
+    [(np.float64, PARITY_FLOAT64, 10 * PARITY_FLOAT64), (np.float32, PARITY_FLOAT32_IMAGE, PARITY_FLOAT32_GRADIENT)],
+)
+@pytest.mark.parametrize(("degree", "size"), [(3, 0.15), (2, 0.6)])
+def test_kernels_and_reference_agree(dtype, image_rel, gradient_rel, degree, size, rng):
+    """The second scene has Gaussians as large as the picture, of some of which the camera is inside."""
+    population, view = textured(rng, 40, degree, size=size), view_from(make_camera(rng=rng))
+    (ours, v_ours), (theirs, v_theirs) = (
+        drawn(as_dtype(population, dtype), view, CPU),
+        drawn(population, view, REFERENCE),
+    )
+    assert ours.image.dtype == dtype and theirs.alpha.max() > COVERAGE_MIN
+    assert np.abs(ours.image - theirs.image).max() <= image_rel * np.abs(theirs.image).max()
+    for name, expected in v_theirs.gaussians._asdict().items():
+        found, scale = getattr(v_ours.gaussians, name), np.abs(expected).max()
+        assert found.dtype == dtype and scale > 0
+        assert np.abs(found - expected).max() <= gradient_rel * scale, name
+
+
+def thin(rng):
+    """A needle a thousandth as wide as it is long, a sheet seen edge on, and a Gaussian with the camera inside."""
+    return textured(rng, 3)._replace(
+        means=np.array([[0.1, 0.0, 3.0], [-0.3, 0.2, 2.5], [0.05, 0.02, 0.3]]),
+        quats=np.array([[1.0, 0.0, 0.0, 0.3], [1.0, 0.0, 0.0, 0.0], [1.0, 0.5, 0.2, 0.0]]),
+        log_scales=np.log([[0.8, 8e-4, 8e-4], [3e-7, 0.3, 0.5], [0.6, 0.5, 0.7]]),
+        opacity_logits=np.array([1.0, 1.0, -1.5]),
+    )
+
+
+def test_needles_sheets_and_a_camera_inside(rng):
+    population, view = thin(rng), view_from(make_camera())
+    theirs, v_theirs = drawn(population, view, REFERENCE)
+    for dtype, rel in ((np.float64, 100 * PARITY_FLOAT64), (np.float32, TEXTURE_THIN_FLOAT32)):
+        ours, v_ours = drawn(as_dtype(population, dtype), view, CPU)
+        assert (ours.visible_ids == np.arange(3)).all()
+        assert np.abs(ours.image - theirs.image).max() <= rel
+        assert all(np.isfinite(field).all() for field in v_ours.gaussians)
+    assert all(np.isfinite(field).all() for field in v_theirs.gaussians)
+
+
+def test_the_number_of_threads_does_not_change_a_byte(rng):
+    population, view = as_dtype(textured(rng, 60), np.float32), view_from(make_camera(48, 40, rng=rng))
+    threads, results = numba.get_num_threads(), []
+    try:
+        for n in (1, min(2, threads)):
+            numba.set_num_threads(n)
+            output, v = drawn(population, view, CPU)
+            results.append([output.image.tobytes(), *(field.tobytes() for field in v.gaussians)])
+    finally:
+        numba.set_num_threads(threads)
+    assert results[0] == results[1]
+
+
+def test_no_gaussians_and_no_statistics(backend, rng):
+    none, some = (as_dtype(textured(rng, n), np.float32) for n in (0, 5))
+    view = view_from(make_camera())
+    assert render(Model(none), view, Request(backend=backend))[0].image.max() == 0
+    asks = Request(backend=backend, wants=frozenset({"stats"}))
+    if backend.is_compiled:
+        with pytest.raises(InputError, match="--backend reference"):
+            render(Model(some), view, asks)
+    else:
+        assert render(Model(some), view, asks)[0].stats.hit_count.sum() > 0
+    with pytest.raises(InputError, match="surface"):
+        render(Model(some), view, Request(backend=backend, wants=frozenset({"surface"})))
+
+
+# --- from end to end ---
+
+SCENE = {"n_views": 6, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
+
+
+@pytest.fixture(scope="module")
+def scene_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scenes") / "nook"
+    write_scene(make_scene("room", supersampling=1, **SCENE), folder, SCENE)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run_folder(scene_folder, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "plain"
+    options = ["--recipe", "3dgs-accel", "--test-every", "4", "--iterations", "60", "--out", str(folder)]
+    assert main(["train", str(scene_folder), *options]) == 0
+    return folder
+
+
+def test_a_run_gets_textures(scene_folder, run_folder, tmp_path, capsys):
+    out, plain = tmp_path / "textured.ply", run_folder / "point_cloud.ply"
+    options = ["--iterations", "40", "--degree", "2", "--out", str(out)]
+    assert main(["textured", "fine-tune", str(scene_folder), str(plain), *options]) == 0
+    assert "Gaussians, 59 numbers each: test PSNR" in capsys.readouterr().out
+    ours, theirs = load_ply(out, TexturedGaussians), load_ply(plain)
+    assert ours.color_textures.shape == (len(theirs.means), 24) and np.abs(ours.color_textures).max() > 0
+    assert np.abs(ours.opacity_textures).max() > 0
+    for name in ("means", "quats", "log_scales"):
+        assert getattr(ours, name).tobytes() == getattr(theirs, name).tobytes()
+    cameras = ["--cameras", str(run_folder / "cameras.json")]
+    for name, extension in (("ours", ["--extension", "textured"]), ("theirs", [])):
+        assert main(["render", str(out), *cameras, *extension, "--out", str(tmp_path / name)]) == 0
+    ours, theirs = (sorted((tmp_path / name).glob("*.png")) for name in ("ours", "theirs"))
+    assert all(a.read_bytes() != b.read_bytes() for a, b in zip(ours, theirs, strict=True))
+
+
+def test_the_recipe_trains_and_evaluates(scene_folder, tmp_path):
+    run = tmp_path / "run"
+    options = ["--recipe", "textured", "--test-every", "4", "--iterations", "30", "--out", str(run)]
+    assert main(["train", str(scene_folder), *options]) == 0
+    losses = [json.loads(line)["loss"] for line in (run / "log.jsonl").read_text().splitlines()]
+    assert losses[-1] < losses[0]
+    assert main(["eval", str(run)]) == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [(["--degree", "4"], "--degree"), (["--iterations", "0"], "--iterations"), (["--downscale", "0"], "--downscale")],
+)
+def test_bad_input_is_one_line(scene_folder, run_folder, tmp_path, capsys, options, named):
+    out = tmp_path / "t.ply"
+    command = ["textured", "fine-tune", str(scene_folder), str(run_folder / "point_cloud.ply"), "--out", str(out)]
+    assert main([*command, *options]) == 2
+    error = capsys.readouterr().err.strip()
+    assert named in error and "\n" not in error and not out.exists()
+
+
+def test_the_studies(scene_folder, run_folder, tmp_path, capsys):
+    out, ply = tmp_path / "study", str(run_folder / "point_cloud.ply")
+    options = ["--ply", ply, "--fine-tune", "3", "--out", str(out)]
+    assert main(["study", "textured/counts", str(scene_folder), *options]) == 0
+    (rows,) = json.loads((out / "result.json").read_text())["runs"]
+    assert [row["form"] for row in rows].count("textures for view") == 4
+    fewer = [row["n_floats"] for row in rows if row["kept"] == "as many floats"]
+    assert len(fewer) == 2 and max(fewer) <= rows[0]["n_floats"]
+    assert (out / "figure.png").stat().st_size > 10_000 and "| as many floats" in capsys.readouterr().out
+    assert main(["study", "textured/limb"]) == 0
+    assert "nearest point beyond" in capsys.readouterr().out
