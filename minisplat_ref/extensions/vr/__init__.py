@@ -1,4 +1,4 @@
-"""VR: Mini-Splatting on tangent planes, sorted by pixel, with fewer rays where the eye does not look.
+"""VR: Mini-Splatting on tangent planes, sorted by pixel, fewer rays away from the gaze.
 
 VRSplat, Tu et al. 2025, arXiv 2505.10144, puts three things together, so that a headset shows few Gaussians without
 popping and without stretched edges: Mini-Splatting's small model; StopThePop's order and Optimal Projection
