@@ -32,7 +32,7 @@ _CALL = (
     PlantedLine(
         "view matrix without the harmonics' share",
         "gsplat_compat:draw_vjp",
-        "v_R, v_t = v_R + np.outer(w, lookout.cam_from_world_t), v_t - w",
+        "v_R, v_t = v_R + np.outer(w, unrotated.cam_from_world_t), v_t - w",
         "pass",
     ),
     PlantedLine(
@@ -47,7 +47,7 @@ _CALL = (
     PlantedLine(
         "colours of all cameras to the first", "gsplat_compat:rasterization_vjp", "v_colors[c] if", "v_colors[0] if"
     ),
-    PlantedLine("camera's centre by the transpose", "gsplat_compat:_lookout", "np.linalg.solve(R, t)", "R.T @ t"),
+    PlantedLine("camera's centre by the transpose", "gsplat_compat:_unrotated", "np.linalg.solve(R, t)", "R.T @ t"),
     PlantedLine("depths over white", "splatting:splat", "background.dtype.type(0)", "background.dtype.type(1)"),
     PlantedLine(
         "gradient of depths lost", "splatting:splat_vjp", "v.colors[:, -1].copy()", "np.zeros_like(projection.depths)"

@@ -37,7 +37,7 @@ class Backend:
     name : str
         For messages and reports.
     is_compiled : bool
-        Whether kernels do the work; an extension that has a stage of its own chooses its form by this.
+        Whether compiled kernels do the work; an extension with a stage of its own chooses its implementation by this.
     tile_width, tile_height : int
         Size of the tiles that the image is cut into, pixels.
     """
@@ -78,7 +78,7 @@ REFERENCE = Backend(
     photometric_loss_vjp=loss.photometric_loss_vjp,
     adam_update=adam.adam_update,
 )
-"""NumPy, as in the papers: to read and to check against."""
+"""NumPy, written as in the papers, to read and to check against."""
 
 CPU = Backend(
     name="cpu",
@@ -98,7 +98,7 @@ CPU = Backend(
     photometric_loss_vjp=cpu_loss.photometric_loss_vjp,
     adam_update=cpu_adam.adam_update,
 )
-"""Numba on all cores; float32 data use a polynomial exponential."""
+"""Numba on all cores; for float32 data the exponential is a polynomial."""
 
 CPU_EXACT = replace(
     CPU,
@@ -106,7 +106,7 @@ CPU_EXACT = replace(
     composite=cpu_compositing_exact.composite,
     composite_vjp=cpu_compositing_exact.composite_vjp,
 )
-"""The same with libm's exponential in float32 too."""
+"""The same, but with libm's exponential for float32 data too."""
 
 PLAIN = replace(
     CPU,
@@ -114,13 +114,13 @@ PLAIN = replace(
     composite=cpu_plain_conic.composite,
     composite_vjp=cpu_plain_conic.composite_vjp,
 )
-"""The same with the kernels that blend any primitive; without statistics, therefore not among ``BACKENDS``."""
+"""The same with the kernels that blend any primitive; they have no statistics, so it is not in ``BACKENDS``."""
 
 BACKENDS = {backend.name: backend for backend in (REFERENCE, CPU, CPU_EXACT)}
 
 
 def get_backend(name: str) -> Backend:
-    """Backend of a name.
+    """Return the backend of a name.
 
     Parameters
     ----------

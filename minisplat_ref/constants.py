@@ -1,11 +1,11 @@
 """The numbers in the renderer's formulas, each with its reason, and the conventions on which renderers differ.
 
-Held here is what the book and the kernels, or several stages, must agree on. A number that one module alone needs (the
-design of a kernel, a date of a method, what a reader of files tolerates) stands in that module.
+This module holds what the reference and the kernels, or several stages, must agree on. A number that only one module
+needs (a kernel's design, a method's schedule, a file reader's tolerance) stays in that module.
 
-There is no single "3DGS rasteriser": released backends clamp alpha at 0.99 or 0.999, cut a Gaussian's extent at three
-sigma or where it becomes invisible, ignore or use the principal point. A :class:`Conventions` value names one such set
-of choices; every stage that depends on one takes it as an argument.
+There is no single "3DGS rasteriser": released backends clamp alpha at 0.99 or 0.999, cut a Gaussian off at three sigma
+or where it becomes invisible, ignore or use the principal point. A :class:`Conventions` value names one such set of
+choices; every stage that depends on them takes it as an argument.
 """
 
 from typing import NamedTuple
@@ -28,11 +28,11 @@ SH_C3 = (
 SH_DEGREE_MAX = 3
 
 INRIA_TILE = 16  # pixels; INRIA's rule of extent is stated in tiles of this size
-# px^4: floor of (lambda_1 - lambda_2)^2 / 4 in INRIA's largest eigenvalue: that of a disc is 0.3 px^2 too large.
+# px^4: least (lambda_1 - lambda_2)^2 / 4 in INRIA's largest eigenvalue, which makes that of a disc 0.3 px^2 too large.
 INRIA_ROOT_MIN = 0.1
 # Pixels. The largest power of two that fits int32; float32 and float64 hold it exactly. Radii are clamped when they are
-# stored; boxes are made of what they were before, or a Gaussian further beside the image than this, and which covers it
-# still, would miss it.
+# stored, after the boxes are computed: otherwise a Gaussian further outside the image than this, whose ellipse still
+# covers it, would miss it.
 RADIUS_MAX = 2.0**30
 
 JACOBIAN_CLAMP = 1.3  # the EWA Jacobian is frozen beyond 1.3 x the half field of view: it explodes as 1/z^2 outside
@@ -45,12 +45,12 @@ SSIM_SIGMA = 1.5  # pixels
 SSIM_C1 = 0.01**2  # (K1 L)^2 with dynamic range L = 1
 SSIM_C2 = 0.03**2  # (K2 L)^2
 
-LIST_ORDER = 1  # hits that a pixel holds back to sort them: each is taken as it comes
-EXACT_ORDER = 1 << 30  # more than any list holds: a pixel sorts all its hits
+LIST_ORDER = 1  # size of a pixel's sorting buffer: each hit is taken as it comes
+EXACT_ORDER = 1 << 30  # longer than any list: a pixel sorts all its hits
 
 
 class Conventions(NamedTuple):
-    """One consistent set of rasteriser choices.
+    """One consistent set of a rasteriser's choices.
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ class Conventions(NamedTuple):
     transmittance_min : float
         A pixel is finished when the next hit would take its transmittance below this; that hit is not blended.
     stops_at_equality : bool
-        Whether a pixel is finished at ``T <= transmittance_min`` (gsplat) or only at ``T <`` it (INRIA).
+        Whether a pixel is finished at ``T <= transmittance_min`` (gsplat) or only at ``T < transmittance_min`` (INRIA).
     has_full_support : bool
         True: a Gaussian reaches exactly as far as its alpha can be ``alpha_min``. False: INRIA's rule, all 16-pixel
         tiles touched by the square of half-side ``ceil(3 sqrt(lambda_max))`` around the mean, which cuts visible alpha.
@@ -80,8 +80,8 @@ class Conventions(NamedTuple):
         Jacobian clamp at ``+-1.3 tan(fov / 2)`` (INRIA), or at 1.3 x each half field of view counted from the principal
         point plus 0.3 x the half width (gsplat). Equal for a centred principal point.
     clamp_stops_mean_gradient, clamp_stops_shape_gradient : bool
-        Where alpha is clamped at ``alpha_max``, whether the gradient to ``means2d``, respectively to conics and
-        opacities, is zero. Both True is the derivative of what is computed.
+        Whether clamping at ``alpha_max`` zeroes the gradient of ``means2d``, and that of conics and opacities. With
+        both True the gradient is the derivative of what is computed.
     """
 
     name: str
@@ -141,3 +141,4 @@ MINI_SPLATTING2 = INRIA._replace(
 """The rasteriser of Mini-Splatting2: INRIA's with tight bounds."""
 
 PROFILES = {profile.name: profile for profile in (GSPLAT_MAIN, GSPLAT_1_5, INRIA, MINI_SPLATTING2)}
+"""The profiles by their names, as ``--profile`` takes them."""

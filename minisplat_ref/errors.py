@@ -1,7 +1,7 @@
-"""The one exception that means: the input is wrong, and here is the way out; and its milder form."""
+"""The one exception for bad input, whose message says how to fix it, and the warning for doubtful input."""
 
-LINE_MAX = 1000  # characters of a message; what lies in the middle of a longer one is left out
-_TAIL = 250  # characters kept at the end, where the way out stands
+LINE_MAX = 1000  # characters of a message; the middle of a longer one is left out
+_TAIL = 250  # characters kept at the end, which says how to fix the input
 
 
 class InputError(ValueError):
@@ -15,13 +15,13 @@ class InputError(ValueError):
 
 
 class InputWarning(UserWarning):
-    """Input that is used, though perhaps not as it was meant; one line, which the command line prints before going on.
+    """Input that is used, though perhaps not as intended; one line, which the command line prints before it goes on.
 
-    The message has been through :func:`one_line`, if it quotes what comes from a file.
+    A message that quotes text from a file has been through :func:`one_line`.
     """
 
 
 def one_line(message: str) -> str:
-    """Return a message on one line of LINE_MAX characters at most, all of them printable."""
+    """Return a message as one line of at most LINE_MAX printable characters."""
     text = "".join(char if char.isprintable() else repr(char)[1:-1] for char in message)
     return text if len(text) <= LINE_MAX else f"{text[: LINE_MAX - _TAIL - 5]} ... {text[-_TAIL:]}"

@@ -1,10 +1,10 @@
 """gsplat's call in NumPy: activated Gaussians and a batch of cameras in; images, opacities and gsplat's meta out.
 
-For code and tests that were written against ``gsplat.rasterization``: the same call on NumPy arrays and, in place of
-autograd, a second call that returns the gradients. N Gaussians, C cameras, D colour channels, K spherical-harmonic
-coefficients a channel. Colours are D given channels, or spherical harmonics of the direction from the camera's centre
-``o = -R^-1 t``: with the inverse, not the transpose, because the twelve free entries of a view matrix count as
-independent, and that is the point which R mu + t maps to the origin whatever they are. Left out: cameras other than
+Code and tests written against ``gsplat.rasterization`` can make the same call on NumPy arrays and, in place of
+autograd, a second call that returns the gradients. There are N Gaussians, C cameras, D colour channels and K
+spherical-harmonic coefficients per channel. Colours are D given channels, or spherical harmonics of the direction from
+the camera's centre ``o = -R^-1 t``. This is the inverse, not the transpose: the twelve free entries of a view matrix
+count as independent, and R mu + t maps that point to the origin whatever they are. Left out: cameras other than
 pinholes, packed output, and ``isect_ids`` in the meta, the keys of gsplat's own sort.
 """
 
@@ -134,16 +134,16 @@ def rasterization_vjp(
     backend: str | Backend = "cpu",
     profile: str | Conventions = GSPLAT_MAIN,
 ) -> dict[str, Floats]:
-    """Gradient of :func:`rasterization`; the views are drawn once more.
+    """Gradient of :func:`rasterization`; renders the views once more.
 
     Parameters
     ----------
     means, quats, scales, opacities, colors, viewmats, Ks, width, height
-        As for :func:`rasterization`, like all options.
+        As for :func:`rasterization`, and so are all options.
     v_render_colors : ndarray of shape (C, H, W, D)
-        Derivative of the loss by ``render_colors``.
+        Derivative of the loss with respect to ``render_colors``.
     v_render_alphas : ndarray of shape (C, H, W, 1)
-        Derivative of the loss by ``render_alphas``.
+        Derivative of the loss with respect to ``render_alphas``.
 
     Returns
     -------
@@ -167,7 +167,7 @@ def rasterization_vjp(
     for c, tape in enumerate(tapes):
         v_image, v_alpha = v_images[c], v_alphas[c]
         if batch.has_expected_depth:
-            depth = tape.output.image[..., -1]  # [H, W] still the accumulated one
+            depth = tape.output.image[..., -1]  # [H, W] still accumulated, not expected
             v_depth, v_alpha_of_depth = expected_depth_vjp(depth, tape.output.alpha, v_image[..., -1])
             v_image = np.concatenate([v_image[..., :-1], v_depth[..., None]], axis=-1)
             v_alpha = v_alpha + v_alpha_of_depth
@@ -185,21 +185,21 @@ def rasterization_vjp(
 
 
 class Meta(Mapping[str, Any]):
-    """What gsplat tells about a batch: a read-only mapping whose tile lists are made when one of them is first read.
+    """gsplat's meta of a batch: a read-only mapping whose tile lists are made when one of them is first read.
 
-    The lists take NumPy longer than the kernels take for the images, and most callers never look at them. To be asked
-    for its keys, its length or what it contains makes no list.
+    NumPy takes longer for the lists than the kernels take for the images, and most callers never read them. Asking for
+    keys, length or containment makes no list.
     """
 
     def __init__(self, values: dict[str, Any], make_tile_lists: Callable[[], dict[str, Any]]) -> None:
-        self._values = values  # None under the keys of lists that are not made yet
+        self._values = values  # None for lists that are not made yet
         self._make_tile_lists: Callable[[], dict[str, Any]] | None = make_tile_lists
 
     def __getitem__(self, key: str) -> Any:
         make = self._make_tile_lists
         if key in TILE_LISTS and make is not None:
             self._values.update(make())
-            self._make_tile_lists = None  # and what they were made of
+            self._make_tile_lists = None  # frees what they were made of
         return self._values[key]
 
     def __contains__(self, key: object) -> bool:
@@ -216,7 +216,7 @@ class Meta(Mapping[str, Any]):
 
 
 class Views(NamedTuple):
-    """C cameras as gsplat is given them."""
+    """C cameras in the form that gsplat takes."""
 
     viewmats: Floats  # [C, 4, 4] cam_from_world, OpenCV axes
     Ks: Floats  # [C, 3, 3] pixels
@@ -228,8 +228,8 @@ class Batch(NamedTuple):
     """The checked arguments of one call."""
 
     primitives: Primitives
-    colors: Floats  # [N, D] or [N, K, 3], or one such array for every camera
-    has_own_colors: bool  # of every camera
+    colors: Floats  # [N, D] or [N, K, 3], or one such array per camera
+    has_own_colors: bool  # whether there is one per camera
     cameras: tuple[Camera, ...]  # [C]
     backgrounds: Floats  # [C, D]
     sh_degree: int | None
@@ -251,7 +251,7 @@ class Batch(NamedTuple):
         return self.render_mode.endswith("ED")
 
     def colors_of(self, c: int) -> Floats:
-        """Colours or coefficients that camera c sees."""
+        """Return the colours or coefficients that camera c sees."""
         return self.colors[c] if self.has_own_colors else self.colors
 
 
@@ -312,7 +312,7 @@ def checked_batch(
 
 
 def draw(batch: Batch, c: int, conventions: Conventions, backend: Backend) -> SplatTape:
-    """Draw view c; an expected depth is still the accumulated one."""
+    """Render view c; where an expected depth is wanted, the channel still holds the accumulated depth."""
     means, colors = batch.primitives.means, batch.colors_of(c)
     background = batch.backgrounds[c]
 
@@ -321,7 +321,7 @@ def draw(batch: Batch, c: int, conventions: Conventions, backend: Backend) -> Sp
             return np.zeros((len(means), 0), means.dtype)
         if batch.sh_degree is None:
             return colors
-        return backend.sh_colors(means, *_split(colors), _lookout(batch.cameras[c]), batch.sh_degree, radii)
+        return backend.sh_colors(means, *_split(colors), _unrotated(batch.cameras[c]), batch.sh_degree, radii)
 
     return splat(
         batch.primitives,
@@ -337,11 +337,11 @@ def draw(batch: Batch, c: int, conventions: Conventions, backend: Backend) -> Sp
 def draw_vjp(batch: Batch, c: int, tape: SplatTape, v_image: Floats, v_alpha: Floats) -> ViewGradient:
     """Gradient of :func:`draw`.
 
-    Spherical harmonics add, through the camera's centre::
+    Spherical harmonics add, via the camera's centre::
 
         o = -R^-1 t,  w = R^-T v_o:  v_R = -w o^T,  v_t = -w
 
-    The image, whose derivative is ``v_image`` [H, W, D], is the one with the accumulated depth.
+    ``v_image`` [H, W, D] is the derivative with respect to the image with the accumulated depth.
     """
     v = splat_vjp(tape, v_image, v_alpha)
     v_means, v_colors, v_background = v.primitives.means, np.zeros_like(batch.colors_of(c)), v.background
@@ -351,15 +351,15 @@ def draw_vjp(batch: Batch, c: int, tape: SplatTape, v_image: Floats, v_alpha: Fl
     elif batch.sh_degree is None:
         v_colors = v.colors
     else:
-        lookout = _lookout(tape.camera)
+        unrotated = _unrotated(tape.camera)
         dc, rest = _split(batch.colors_of(c))
         v_sh = tape.backend.sh_colors_vjp(
-            batch.primitives.means, dc, rest, lookout, batch.sh_degree, tape.projection.radii, v.colors
+            batch.primitives.means, dc, rest, unrotated, batch.sh_degree, tape.projection.radii, v.colors
         )
         v_means = v_means + v_sh.means
         v_colors = np.concatenate([v_sh.sh_dc[:, None], v_sh.sh_rest], axis=1)
-        w = np.linalg.solve(tape.camera.cam_from_world_R.T, -v_sh.cam_from_world_t)  # t of the lookout is -o
-        v_R, v_t = v_R + np.outer(w, lookout.cam_from_world_t), v_t - w
+        w = np.linalg.solve(tape.camera.cam_from_world_R.T, -v_sh.cam_from_world_t)  # t of the unrotated camera is -o
+        v_R, v_t = v_R + np.outer(w, unrotated.cam_from_world_t), v_t - w
     v_viewmat = np.zeros((4, 4), v_t.dtype)
     v_viewmat[:3] = np.column_stack([v_R, v_t])
     v_primitives = Primitives(v_means, v.primitives.quats, v.primitives.scales, v.primitives.opacities)
@@ -367,7 +367,7 @@ def draw_vjp(batch: Batch, c: int, tape: SplatTape, v_image: Floats, v_alpha: Fl
 
 
 def _meta(tapes: list[SplatTape]) -> Meta:
-    """What gsplat tells about a batch, every array [C, N, ...]."""
+    """Return gsplat's meta of a batch, every array [C, N, ...]."""
     projections, camera = [tape.projection for tape in tapes], tapes[0].camera
     grid = TileGrid(camera.width, camera.height, META_TILE_SIZE, META_TILE_SIZE)
     dtype = projections[0].depths.dtype
@@ -377,8 +377,7 @@ def _meta(tapes: list[SplatTape]) -> Meta:
     names = ("means2d", "depths", "opacities", "radii")
     values: dict[str, Any] = {name: np.stack([getattr(p, name) for p in projections]) for name in names}
     values["conics"] = np.clip(conics, -largest, largest, out=conics)
-    # The lists are made of boxes and of depths that no caller can change. All else they share with the meta: it would
-    # be kept alive for nothing.
+    # The lists need only boxes and depths, which no caller can change. To keep all else would waste memory.
     shared = ("means2d", "opacities", "radii", "conics")
     kept = [p._replace(**{name: values[name][c] for name in shared}) for c, p in enumerate(projections)]
     return Meta(
@@ -397,10 +396,10 @@ def _meta(tapes: list[SplatTape]) -> Meta:
 
 
 def _tile_lists(projections: list[Projection], grid: TileGrid, conventions: Conventions) -> dict[str, Any]:
-    """Which Gaussians each tile holds, by the keys in ``TILE_LISTS``; the Gaussians of camera c begin at c N."""
+    """Return each tile's Gaussians under the keys of ``TILE_LISTS``; the Gaussians of camera c begin at c N."""
     n = len(projections[0].depths)
     bins = [bin_gaussians(projection, grid, conventions) for projection in projections]
-    n_pairs = np.cumsum([0] + [len(lists.gaussian_ids) for lists in bins])  # before each camera, and in all
+    n_pairs = np.cumsum([0] + [len(lists.gaussian_ids) for lists in bins])  # before each camera, and in total
     ids = [lists.gaussian_ids + c * n for c, lists in enumerate(bins)]
     starts = [lists.tile_offsets[:-1] + before for lists, before in zip(bins, n_pairs, strict=False)]
     arrays = (
@@ -412,16 +411,16 @@ def _tile_lists(projections: list[Projection], grid: TileGrid, conventions: Conv
 
 
 def _stacked(arrays: list[Floats]) -> Floats:
-    """Arrays [C, ...]; that of a single camera is not copied."""
+    """Stack C arrays to [C, ...]; that of a single camera is not copied."""
     return arrays[0][None] if len(arrays) == 1 else np.stack(arrays)
 
 
-def _lookout(camera: Camera) -> Camera:
+def _unrotated(camera: Camera) -> Camera:
     """Return a camera at the same centre with R = I: colours depend on the centre only."""
     R, t = camera.cam_from_world_R.astype(np.float64), camera.cam_from_world_t.astype(np.float64)
     return camera._replace(cam_from_world_R=np.eye(3), cam_from_world_t=np.linalg.solve(R, t))
 
 
 def _split(coefficients: Floats) -> tuple[Floats, Floats]:
-    """Coefficients [N, K, 3] as those of degree 0 [N, 3] and the others [N, K-1, 3]."""
+    """Split coefficients [N, K, 3] into those of degree 0 [N, 3] and the others [N, K-1, 3]."""
     return np.ascontiguousarray(coefficients[:, 0]), np.ascontiguousarray(coefficients[:, 1:])

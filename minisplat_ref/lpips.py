@@ -1,22 +1,22 @@
 """LPIPS: how different two images look to a network that was trained to recognise objects (Zhang et al., CVPR 2018).
 
-Equation (1) of the paper, of images x and x0, layers l and pixels h, w of a layer::
+Equation (1) of the paper, for images x and x0, layers l and pixels h, w of a layer::
 
     d(x, x0) = sum_l 1 / (H_l W_l) sum_hw || w_l * (y_lhw - y0_lhw) ||^2
 
-y_l [H_l, W_l, C_l] are the features of a layer after its ReLU, each pixel's divided by its length over the channels;
-w_l [C_l] says how much a channel counts. Files hold the squares of w_l, as the heads ``lin0`` to ``lin4``, each a
-convolution of 1 x 1 pixel over the squared differences. 0 is equal, more is more different.
+y_l [H_l, W_l, C_l] are the features of a layer after its ReLU, each pixel's vector divided by its length; w_l [C_l]
+weights the channels. Files hold the squares of w_l, as the heads ``lin0`` to ``lin4``, each a convolution of 1 x 1
+pixel over the squared differences. Equal images have distance 0.
 
 The network takes colours from -1 to 1, and first shifts and scales each channel. **The evaluation released with 3DGS
 gives other figures**: it shifts and scales colours from 0 to 1 by the same numbers. gsplat's example trainer follows it
-with VGG16, on purpose, but not with AlexNet. :func:`lpips` takes [0, 1] to [-1, 1] first, as the authors say; for
+with VGG16, on purpose, but not with AlexNet. :func:`lpips` maps [0, 1] to [-1, 1] first, as the authors say; for
 3DGS's figure, call it with ``(1 + image) / 2`` and ``(1 + target) / 2``, of images rounded to 8 bits.
 
-Weights are the user's: a file of the state dict of the package ``lpips``, which :data:`HOW_TO_MAKE` makes. The dtype is
-that of the image, so usually float32, in which the networks were trained and published figures are computed. VGG16
-takes 204 MB for 480 x 270 pixels, and in proportion for more. Left out: SqueezeNet, version 0.0 of the weights,
-gradients, large images by parts.
+The user provides the weights: a file of the state dict of the package ``lpips``, which :data:`HOW_TO_MAKE` makes. The
+dtype is that of the image, so usually float32, in which the networks were trained and published figures are computed.
+VGG16 takes 204 MB for 480 x 270 pixels, and proportionally more for more. Left out: SqueezeNet, version 0.0 of the
+weights, gradients, splitting large images into parts.
 """
 
 import zipfile
@@ -39,19 +39,19 @@ HOW_TO_MAKE = (
     "where the package lpips is installed (net='alex' is smaller and faster)"
 )
 
-# Of colours from -1 to 1: 2 mean - 1 and 2 std of ImageNet's colours, to three digits as the package has them.
+# For colours from -1 to 1: 2 mean - 1 and 2 std of ImageNet's colours, rounded to three digits as in the package.
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
 
 LEAST_LENGTH = 1e-10  # added to the length of a pixel's features, which may all be zero
-WINDOW_BYTES = 1 << 25  # of the copied windows of a convolution; more at once is not faster
+WINDOW_BYTES = 1 << 25  # size of the copied windows of a convolution; more at once is not faster
 
 
 class Convolution(NamedTuple):
     """A convolution followed by a ReLU."""
 
     key: str
-    """Its arrays in the file are ``net.KEY.weight`` [K, C, size, size] and ``net.KEY.bias`` [K]."""
+    """KEY in the names of its arrays in the file: ``net.KEY.weight`` [K, C, size, size], ``net.KEY.bias`` [K]."""
     n_in: int
     """Channels C of its input."""
     n_out: int
@@ -74,11 +74,11 @@ class MaxPool(NamedTuple):
 
 
 class Backbone(NamedTuple):
-    """What a network consists of."""
+    """A network without its weights."""
 
     name: str
     slices: tuple[tuple[Convolution | MaxPool, ...], ...]
-    """Layers in their order; each slice ends with a convolution, whose features are compared."""
+    """Layers in order; each slice ends with a convolution, whose features are compared."""
 
 
 VGG16 = Backbone(
@@ -113,7 +113,7 @@ class Network(NamedTuple):
 
 
 def load_network(path: str | Path) -> Network:
-    """Read the weights of a network; the shape of its first filters tells VGG16 from AlexNet.
+    """Read a network's weights; the shape of its first filters tells VGG16 from AlexNet.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ def _head(i: int) -> str:
 
 
 def _read_arrays(path: str | Path) -> dict[str, NDArray]:
-    """Return those arrays of an .npz that any network needs."""
+    """Return the arrays of an .npz that some network needs."""
     names = {name for backbone in BACKBONES for name in expected_shapes(backbone)}
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:  # a .npy is a TypeError here
@@ -179,12 +179,12 @@ def _read_arrays(path: str | Path) -> dict[str, NDArray]:
 
 
 def _wrong(arrays: Mapping[str, NDArray], name: str) -> str:
-    """What is wrong with an array."""
+    """Return what is wrong with an array."""
     return f"{name} is {arrays[name].dtype} of shape {arrays[name].shape}" if name in arrays else f"{name} is missing"
 
 
 def check_views(network: Network, views: Sequence[View]) -> None:
-    """Refuse views that are too small for the network, whose last layers would have no pixel left.
+    """Refuse views that are too small for the network, whose last layers would be left without pixels.
 
     Raises
     ------
@@ -204,7 +204,7 @@ def _check_size(backbone: Backbone, height: int, width: int, name: str) -> None:
 
 
 def _fits(backbone: Backbone, n: int) -> bool:
-    """Whether an image of n x n pixels has pixels left after every layer."""
+    """Return whether an image of n x n pixels has pixels left after every layer."""
     for layer in (layer for layers in backbone.slices for layer in layers):
         padding = layer.padding if isinstance(layer, Convolution) else 0
         if n + 2 * padding < layer.size:
@@ -219,11 +219,11 @@ def lpips(image: Floats, target: Floats | Ints, network: Network, mask: Bools | 
     Parameters
     ----------
     image, target : ndarray of shape (H, W, 3)
-        In [0, 1]; the target may also be bytes, of which 255 is 1. Float32 or float64, in which all is computed.
+        In [0, 1]; the target may also be bytes, of which 255 is 1. Float32 or float64, the dtype of the computation.
     network : Network
     mask : ndarray of shape (H, W) of booleans, optional
-        Pixels that count; default all. Outside, the image is replaced by the target before the network looks at it, and
-        the means over pixels are divided by the fraction that counts.
+        Pixels that count; default all. Outside, the target replaces the image before the network sees it, and the means
+        over pixels are divided by the fraction that counts.
 
     Returns
     -------
@@ -253,12 +253,12 @@ def lpips(image: Floats, target: Floats | Ints, network: Network, mask: Bools | 
 
 
 def _shifted_and_scaled(image: Floats) -> Floats:
-    """What the network is given, [H, W, 3], of colours in [0, 1]."""
+    """Return the network's input [H, W, 3] for colours in [0, 1]."""
     return (2 * image - 1 - np.array(SHIFT, image.dtype)) / np.array(SCALE, image.dtype)
 
 
 def _layer_distance(y: Floats, y0: Floats, squared_w: Floats) -> float:
-    """Return a layer's term of equation (1), of features [H, W, C] and the squares [C] of its w."""
+    """Return a layer's term of equation (1), given features [H, W, C] and the squares [C] of its w."""
     difference = _unit(y)  # [H, W, C]; in place, as this is where most memory is needed
     difference -= _unit(y0)
     np.square(difference, out=difference)
@@ -266,13 +266,13 @@ def _layer_distance(y: Floats, y0: Floats, squared_w: Floats) -> float:
 
 
 def _unit(features: Floats) -> Floats:
-    """Features [H, W, C], each pixel's divided by its length."""
+    """Return features [H, W, C] with each pixel's vector divided by its length."""
     lengths = np.sqrt(np.einsum("ijc,ijc->ij", features, features))  # [H, W]
     return features / (lengths + features.dtype.type(LEAST_LENGTH))[:, :, None]
 
 
 def _apply(layers: Sequence[Convolution | MaxPool], x: Floats, weights: Mapping[str, Floats]) -> Floats:
-    """Features [H', W', K] after some layers."""
+    """Return the features [H', W', K] after some layers."""
     for layer in layers:
         if isinstance(layer, MaxPool):
             x = max_pool(x, layer.size, layer.stride)
@@ -286,11 +286,11 @@ def _apply(layers: Sequence[Convolution | MaxPool], x: Floats, weights: Mapping[
 def convolve(x: Floats, weight: Floats, bias: Floats, stride: int, padding: int) -> Floats:
     """Return the response of every filter at every window.
 
-    With zeros beyond the borders, as networks have it (the filter is not mirrored)::
+    There are zeros beyond the borders, and the filter is not mirrored, as is usual for networks::
 
         y_ijk = b_k + sum_cuv w_kcuv x_c(s i + u - p, s j + v - p)
 
-    Windows are copied into the rows of a matrix, some rows of pixels at a time, so that the sum is a matrix product.
+    Windows are copied into the rows of a matrix, a few rows of pixels at a time, so that the sum is a matrix product.
 
     Parameters
     ----------
@@ -310,7 +310,7 @@ def convolve(x: Floats, weight: Floats, bias: Floats, stride: int, padding: int)
     """
     n_out, _, size, _ = weight.shape
     windows = _windows(np.pad(x, ((padding, padding), (padding, padding), (0, 0))), size, stride)  # [H', W', C, u, v]
-    windows = windows.transpose(0, 1, 3, 4, 2)  # [H', W', u, v, C]: runs of C neighbouring numbers copy fastest
+    windows = windows.transpose(0, 1, 3, 4, 2)  # [H', W', u, v, C]: contiguous runs of C numbers copy fastest
     filters = weight.transpose(2, 3, 1, 0).reshape(-1, n_out)  # [u v C, K]
     height, width = windows.shape[:2]
     y = np.empty((height, width, n_out), x.dtype)
@@ -329,7 +329,7 @@ def max_pool(x: Floats, size: int, stride: int) -> Floats:
     ----------
     x : ndarray of shape (H, W, C)
     size, stride : int
-        Of the windows, pixels; what is left over on the right and below does not count.
+        Of the windows, pixels; a remainder on the right and at the bottom is ignored.
 
     Returns
     -------
@@ -341,5 +341,5 @@ def max_pool(x: Floats, size: int, stride: int) -> Floats:
 
 
 def _windows(x: Floats, size: int, stride: int) -> Floats:
-    """View [H', W', C, size, size] of the windows of an image [H, W, C]."""
+    """Return a view [H', W', C, size, size] of the windows of an image [H, W, C]."""
     return sliding_window_view(x, (size, size), axis=(0, 1))[::stride, ::stride]

@@ -1,12 +1,12 @@
-"""What a training and a picture take of memory, and what there is: to say no in time, before the system kills.
+"""Estimate the memory that a training or a picture needs, and refuse before the system would kill the process.
 
 The model of a training is the one that ``bench --memory`` measures against: the parameters, their gradient and Adam's
-two moments; what a view makes of each Gaussian; the images of an iteration, or of a measurement where this is more; 48
-bytes for every pair (tile, Gaussian).
-What the program, its compiled kernels and the photographs take is there before and is not counted; photographs that are
-read when they are needed, because they would take too much, count as far as they will stay in memory.
+two moments; the intermediate values of each Gaussian in a view; the images of an iteration, or of an evaluation where
+this is more; 48 bytes for every pair (tile, Gaussian).
+The program, its compiled kernels and the photographs are in memory already and are not counted. Photographs that are
+read on demand, because all together would take too much, count as far as they will stay in memory.
 
-What is free is asked of Linux. Other systems do not say it in a file; nothing is refused there.
+Free memory is read from Linux. Other systems do not publish it in a file; nothing is refused there.
 """
 
 import math
@@ -15,27 +15,27 @@ from typing import NamedTuple
 
 from minisplat_ref.errors import InputError
 
-PHOTOGRAPH_BYTES = 3  # a pixel
-IMAGE_BYTES = 4 * (3 + 1 + 3)  # a pixel in an iteration: image, alpha, and the derivative with respect to the image
-# A pixel while it is measured: image, alpha and the clipped image in float32, their differences in float64.
+PHOTOGRAPH_BYTES = 3  # per pixel
+IMAGE_BYTES = 4 * (3 + 1 + 3)  # per pixel in an iteration: image, alpha, and the derivative with respect to the image
+# Per pixel in an evaluation: image, alpha and the clipped image in float32, their differences in float64.
 MEASURING_BYTES = 4 * (3 + 1 + 3) + 8 * 3
 N_COPIES = 4  # of the population: parameters, gradient, two moments
-# What a view makes of each: activations, footprint, colour, and derivatives with respect to them. Measured: 75 of
-# 200,000 in two megapixels, 210 of 1,500,000 in twelve.
+# Per Gaussian in a view: activations, footprint, colour, and derivatives with respect to them. Measured: 75 of 200,000
+# in two megapixels, 210 of 1,500,000 in twelve.
 BYTES_PER_GAUSSIAN = 150
-# The 9 sums of its gradient, its places in the tile's list and in the Gaussian's, and one number to spare.
+# Per pair: the 9 sums of its gradient, its indices in the tile's list and in the Gaussian's, and one spare number.
 BYTES_PER_PAIR = 48
 PAIRS_PER_GAUSSIAN = 3.0  # where no view has been rendered yet; in three small scenes 0.7 to 3.3
-# A pixel, at the peak of rendering a picture and writing it; measured at 12 and 48 megapixels: 64.2 and 64.1, with
+# Per pixel, at the peak of rendering a picture and writing it; measured at 12 and 48 megapixels: 64.2 and 64.1, with
 # depth 68.2 and 68.1.
 PICTURE_BYTES, DEPTH_PICTURE_BYTES = 65, 69
-SHELF_SHARE = 0.5  # part of the free memory that photographs may keep; Gaussians need the other
-READING_BYTES = 10  # a pixel of the file, while it is decoded; measured with JPEG and PNG of 12 megapixels: 10.0
-RESERVE = 0.95  # part of the free memory that may be planned with
+SHELF_SHARE = 0.5  # share of the free memory that photographs may fill; Gaussians need the rest
+READING_BYTES = 10  # per pixel of the file while it is decoded; measured with JPEG and PNG of 12 megapixels: 10.0
+RESERVE = 0.95  # share of the free memory that may be planned with
 
 
 class Needs(NamedTuple):
-    """What a training takes of memory, besides what the program and the photographs take already."""
+    """The memory that a training needs besides what the program and the photographs take already."""
 
     n_rows: int
     """Of the population."""
@@ -46,38 +46,38 @@ class Needs(NamedTuple):
     n_pixels: int
     """Of the largest photograph."""
     reading_bytes: float
-    """For photographs that are read when they are needed; 0 where all are in memory."""
+    """For photographs that are read on demand; 0 where all are in memory."""
     kept_bytes: float = 0.0
-    """For those of them that will stay in memory when they have been read."""
+    """For those of them that will stay in memory once they have been read."""
 
     @property
     def at_the_peak(self) -> float:
-        """Bytes, of an iteration or of a measurement, which has no gradient and no pairs, but more of the image."""
+        """Bytes of an iteration, or of an evaluation, which needs no gradient and no pairs but more of the image."""
         iteration = IMAGE_BYTES * self.n_pixels + training_bytes(self.n_rows, self.population_bytes, self.n_pairs)
         measurement = MEASURING_BYTES * self.n_pixels + (N_COPIES - 1) * self.population_bytes
         return max(iteration, measurement) + self.reading_bytes + self.kept_bytes
 
     @property
     def to_come(self) -> float:
-        """The same without the parameters and their moments, which are there already."""
+        """Bytes at the peak without the parameters and their moments, which are in memory already."""
         return self.at_the_peak - (N_COPIES - 1) * self.population_bytes
 
 
 def reading_bytes(n_pixels: int, n_file_pixels: int) -> float:
-    """Return what photographs take that are read one by one: this one, the next one, and decoding it.
+    """Return the bytes that photographs take when they are read one by one: this one, the next one, and decoding it.
 
     Parameters
     ----------
     n_pixels : int
         Of the largest one, as it is trained on.
     n_file_pixels : int
-        Of the largest one in its file.
+        Of the largest one, as stored in its file.
     """
     return 2 * PHOTOGRAPH_BYTES * n_pixels + READING_BYTES * n_file_pixels
 
 
 def training_bytes(n_rows: float, population_bytes: int, n_pairs: float) -> float:
-    """Bytes of a training that grow with its population.
+    """Return the bytes of a training that grow with its population.
 
     Parameters
     ----------
@@ -92,21 +92,21 @@ def training_bytes(n_rows: float, population_bytes: int, n_pairs: float) -> floa
 
 
 def rows_that_fit(n_rows: int, population_bytes: int, n_pairs: float, free: float) -> float:
-    """Return how large a population may become, rows.
+    """Return how many rows a population may grow to.
 
-    While rows are added, the new parameters and moments stand beside all that was there before; afterwards everything
-    is larger in the same proportion.
+    While rows are added, the new parameters and moments exist beside the old arrays; afterwards everything is larger in
+    the same proportion.
 
     Parameters
     ----------
     n_rows : int
-        Of the population as it is.
+        Of the population now.
     population_bytes : int
         Of its parameters.
     n_pairs : float
         Pairs (tile, Gaussian) of the last view.
     free : float
-        Bytes, beside what the population takes now.
+        Bytes, besides what the population takes now.
     """
     if n_rows == 0:
         return math.inf
@@ -115,12 +115,12 @@ def rows_that_fit(n_rows: int, population_bytes: int, n_pairs: float, free: floa
 
 
 def bytes_to_double(n_rows: int, population_bytes: int, n_pairs: float) -> float:
-    """Return the free memory with which a population may become twice as large: see :func:`rows_that_fit`."""
+    """Return the free memory that a population needs to double: see :func:`rows_that_fit`."""
     return max(training_bytes(n_rows, population_bytes, n_pairs), 2 * (N_COPIES - 1) * population_bytes)
 
 
 def free_bytes() -> float:
-    """Return how much memory this process can still get, by the system, its limits and those of its container."""
+    """Return how many bytes this process can still get from the system, within its limits and its container's."""
     return RESERVE * min(_of_the_system(), _of_the_control_group(), _of_the_address_space())
 
 
@@ -132,7 +132,7 @@ def _of_the_system() -> float:
 
 
 def _of_the_control_group(root: str = "/sys/fs/cgroup", own: str = "/proc/self/cgroup") -> float:
-    """Least of what the limits of containers and batch systems leave; control groups of version 2 or 1."""
+    """Return the least that the limits of containers and batch systems leave (control groups, version 2 or 1)."""
     free = math.inf
     for _, controllers, name in (line.split(":", 2) for line in _lines(own)):
         if controllers and "memory" not in controllers.split(","):
@@ -142,7 +142,7 @@ def _of_the_control_group(root: str = "/sys/fs/cgroup", own: str = "/proc/self/c
         for group in (folder, *folder.parents):
             limit, used, stat = (_lines(str(group / file)) for file in (of_limit, of_use, "memory.stat"))
             if limit and used and limit[0] != "max":
-                cached = sum(int(line.split()[1]) for line in stat if line.split()[0] == of_cache)  # given up on demand
+                cached = sum(int(line.split()[1]) for line in stat if line.split()[0] == of_cache)  # freed on demand
                 free = min(free, int(limit[0]) - int(used[0]) + cached)
     return free
 
@@ -152,7 +152,7 @@ _VERSION_2 = ("memory.max", "memory.current", "inactive_file")
 
 
 def _of_the_address_space() -> float:
-    """What ``ulimit -v`` leaves."""
+    """Return what ``ulimit -v`` leaves."""
     try:
         import resource  # absent on Windows
     except ImportError:
@@ -171,9 +171,9 @@ def _lines(path: str) -> list[str]:
 
 
 def check_start(needs: Needs) -> str:
-    """Say what a training begins with and how far it may grow, in a line; nothing where the system does not say.
+    """Return a line that says what a training starts with and how far it may grow; empty where free memory is unknown.
 
-    The parameters and their moments are there already.
+    The parameters and their moments are in memory already.
 
     Raises
     ------
@@ -202,7 +202,7 @@ def check_picture(width: int, height: int, with_depth: bool) -> None:
     Raises
     ------
     InputError
-        Names the largest one of these proportions that does.
+        Names the largest one of the same proportions that does.
     """
     needed, free = (DEPTH_PICTURE_BYTES if with_depth else PICTURE_BYTES) * width * height, free_bytes()
     if needed > free:
@@ -214,12 +214,12 @@ def check_picture(width: int, height: int, with_depth: bool) -> None:
 
 
 def shelf_bytes(n_bytes: float) -> float | None:
-    """Return how much of the photographs of a scene may stay in memory; None if all of them may.
+    """Return how many bytes of a scene's photographs may stay in memory; None if all of them may.
 
     Parameters
     ----------
     n_bytes : float
-        What all of them take.
+        Size of all of them.
     """
     most = SHELF_SHARE * free_bytes()
     return None if n_bytes <= most else most
@@ -235,7 +235,7 @@ def check_photograph(source: str | Path, n_pixels: int, downscale: int) -> None:
     n_pixels : int
         Of the largest photograph at full size.
     downscale : int
-        Factor by which it is made smaller when it has been read.
+        Factor by which it is reduced once it has been read.
 
     Raises
     ------

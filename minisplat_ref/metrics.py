@@ -1,10 +1,10 @@
 """How close renderings are to photographs: PSNR, SSIM, LPIPS, and the evaluation of a set of views.
 
 Renderings are clipped to [0, 1] but not rounded to 8 bits, which would add 1.3e-6 to the mean squared error: 0.006 dB
-at 30 dB. PSNR is that of the mean squared error over all pixels and channels of an image; the released 3DGS script
-averages a PSNR per channel instead, which is never lower. Means over views are means of the views' values.
+at 30 dB. PSNR is computed from the mean squared error over all pixels and channels of an image; the released 3DGS
+script averages the PSNR of the channels instead, which is never lower. Means over views are means of the views' values.
 
-LPIPS needs the weights of a network, which are not ours to ship: without them an :class:`Evaluation` says so.
+LPIPS needs the weights of a network, which are not ours to ship; without them an :class:`Evaluation` says so.
 """
 
 import math
@@ -28,7 +28,7 @@ NO_VIEWS = "there are no views to evaluate"
 
 
 class ViewMetrics(NamedTuple):
-    """Agreement of one view."""
+    """The metrics of one view."""
 
     name: str
     psnr: float
@@ -39,7 +39,7 @@ class ViewMetrics(NamedTuple):
 
 
 class Evaluation(NamedTuple):
-    """Agreement of several views."""
+    """The metrics of several views."""
 
     psnr: float | None
     """dB, mean of the views; None without views."""
@@ -76,7 +76,7 @@ def psnr(image: Floats, target: Floats | Ints, mask: Bools | None = None) -> flo
     """
     if mask is not None and not mask.any():
         raise InputError("mask leaves no pixel to compare: leave the view out")
-    squared = image.astype(np.float64)  # of 12 megapixels 288 MB: the only array of this size
+    squared = image.astype(np.float64)  # 288 MB for 12 megapixels: the only array of this size
     for row, numbers in zip(squared, target, strict=True):
         row -= numbers.astype(image.dtype) / 255 if target.dtype == np.uint8 else numbers
         np.square(row, out=row)
@@ -85,7 +85,7 @@ def psnr(image: Floats, target: Floats | Ints, mask: Bools | None = None) -> flo
 
 
 def ssim(image: Floats, target: Floats | Ints, mask: Bools | None = None, *, backend: Backend = CPU) -> float:
-    """Return the mean structural similarity, by the window and zero padding of the training loss.
+    """Return the mean structural similarity, with the window and zero padding of the training loss.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def evaluate(
     Raises
     ------
     InputError
-        A view is too small for the network; nothing has been rendered then.
+        A view is too small for the network; raised before anything is rendered.
     """
     if network is not None:
         check_views(network, views)

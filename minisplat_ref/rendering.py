@@ -1,12 +1,12 @@
 """From trained parameters to an image and back.
 
 Activations live here (3DGS section 5.1): ``scales = exp(log_scales)``, ``opacities = sigmoid(opacity_logits)``. Left
-out: checks for NaN, which belong to whoever reads a file; a Gaussian whose footprint is not finite is culled.
+out: checks for NaN, which belong where a file is read; a Gaussian whose footprint is not finite is culled.
 
-A :class:`Renderer` is the pair of functions that everything calls which draws a model: training, evaluation,
-importance, depth reinitialisation, the commands. ``SPLATTING`` is that of 3DGS. Another way of drawing is another
-value; most wrap ``SPLATTING``: they make Gaussians of what they have (moved to the view's time, decoded, chosen by
-level), draw these, and carry the gradient back.
+A :class:`Renderer` is the pair of functions that all code calls to draw a model: training, evaluation, importance,
+depth reinitialisation, the commands. ``SPLATTING`` is that of 3DGS. Another way of drawing is another value; most wrap
+``SPLATTING``: they turn what they have into Gaussians (moved to the view's time, decoded, chosen by level), draw these,
+and carry the gradient back.
 """
 
 import math
@@ -36,11 +36,11 @@ from minisplat_ref.types import (
 
 
 class RenderTape(NamedTuple):
-    """What :func:`render` did, for :func:`render_vjp` and for statistics of what was visible."""
+    """Record of a call of :func:`render`, for :func:`render_vjp` and for statistics of what was visible."""
 
     gaussians: Gaussians
     sh_degree: int  # active
-    splats: SplatTape  # the activated Gaussians and what became of them
+    splats: SplatTape  # the activated Gaussians and the results of each stage
 
     @property
     def projection(self) -> Projection:
@@ -55,7 +55,7 @@ class RenderGradient(NamedTuple):
     background: Floats  # [3]
     cam_from_world_R: Floats  # [3, 3] with respect to the nine entries, unconstrained
     cam_from_world_t: Floats  # [3]
-    means2d: Floats  # [N, 2] with respect to the projected centres, per pixel: what density control looks at
+    means2d: Floats  # [N, 2] with respect to the projected centres, per pixel: input of density control
     shared: Mapping[str, Floats] = NOTHING  # with respect to the model's shared parameters, by name
 
 
@@ -89,7 +89,7 @@ def render(
     backend : Backend
         Implementation of the stages.
     is_visible : ndarray of shape (N,) of booleans, optional
-        Rows that take part; the others are culled as if they were transparent. All by default.
+        Rows to draw; the others are culled as if they were transparent. All by default.
     with_depth : bool
         Append the accumulated depth, ``sum w z``, as the last channel of the image.
     with_stats, with_median_depth : bool
@@ -110,7 +110,7 @@ def render(
     background = np.zeros(3, dtype) if background is None else np.asarray(background, dtype)
 
     with np.errstate(over="ignore"):
-        # The projection culls the largest number; infinity times a zero gradient would be NaN.
+        # The largest finite number is culled like infinity, but infinity times a zero gradient would be NaN.
         scales = np.minimum(np.exp(gaussians.log_scales), np.finfo(dtype).max)
         opacities = 1 / (1 + np.exp(-gaussians.opacity_logits))
     if is_visible is not None:
@@ -141,16 +141,16 @@ def render_vjp(tape: RenderTape, v_image: Floats, v_alpha: Floats | None = None)
     ::
 
         v_log_s = s v_s,  v_logit = o (1 - o) v_o
-        the means and the pose are used twice, by the projection and by the viewing direction
+        the means and the pose have two terms each, from the projection and from the viewing direction
 
     Parameters
     ----------
     tape : RenderTape
         From the forward function.
     v_image : ndarray of shape (H, W, D)
-        Derivative by the image; D is 4 with depth.
+        Derivative with respect to the image; D is 4 with depth.
     v_alpha : ndarray of shape (H, W), optional
-        Derivative by the accumulated opacity; 0 by default.
+        Derivative with respect to the accumulated opacity; 0 by default.
 
     Returns
     -------
@@ -161,7 +161,7 @@ def render_vjp(tape: RenderTape, v_image: Floats, v_alpha: Floats | None = None)
     scales, opacities = splats.primitives.scales, splats.primitives.opacities
     v_alpha = np.zeros_like(splats.output.alpha) if v_alpha is None else v_alpha
     with np.errstate(over="ignore"):
-        transparencies = 1 / (1 + np.exp(g.opacity_logits))  # 1 - o, of which few digits are left in 1 - 0.9999
+        transparencies = 1 / (1 + np.exp(g.opacity_logits))  # 1 - o, without the cancellation of 1 - 0.9999
     v = splat_vjp(splats, v_image, v_alpha)
     v_sh = splats.backend.sh_colors_vjp(
         g.means, g.sh_dc, g.sh_rest, splats.camera, tape.sh_degree, splats.projection.radii, v.colors
@@ -185,16 +185,16 @@ def render_vjp(tape: RenderTape, v_image: Floats, v_alpha: Floats | None = None)
 
 
 class Request(NamedTuple):
-    """How a view is to be rendered, and what is wanted besides its colours."""
+    """How to render a view, and what to return besides its colours."""
 
     background: Floats | None = None
     """[3] RGB behind everything; black by default."""
     sh_degree: int | None = None
-    """Highest degree of the spherical harmonics; all that are stored by default, and where fewer are stored."""
+    """Highest degree of the spherical harmonics; by default, and at most, the stored degree."""
     conventions: Conventions = GSPLAT_MAIN
     backend: Backend = CPU
     is_visible: Bools | None = None
-    """[N] rows that take part; all by default."""
+    """[N] rows to draw; all by default."""
     wants: frozenset[str] = frozenset()
     """``depth``: a channel with ``sum w z``. ``stats``: blend statistics. ``median_depth``. ``surface``, in the
     output's extras: where each pixel's ray meets its dominant Gaussian. ``dominant_depth``, there too: [H, W] depth of
@@ -210,7 +210,7 @@ class Renderer(NamedTuple):
     render_vjp: Callable[[Any, Floats, Floats | None], RenderGradient]
     """``render_vjp(tape, v_image, v_alpha)``: v_image is [H, W, D] with all channels, v_alpha [H, W] or None."""
     channels: Callable[[frozenset[str]], dict[str, slice]]
-    """``channels(wants)``: where the image has which channel."""
+    """``channels(wants)``: the image's channels by name."""
 
 
 def as_model(model: Any) -> Model:

@@ -1,4 +1,4 @@
-"""What every report states in the same way: a table in Markdown, and the machine that its figures were measured on."""
+"""Parts that all reports share: a table in Markdown, and the machine on which the figures were measured."""
 
 import platform
 from collections.abc import Sequence
@@ -13,9 +13,9 @@ def markdown_table(heading: Sequence[str], rows: Sequence[Sequence[str]], *, is_
     heading : sequence of str
         One text per column.
     rows : sequence of sequences of str
-        As many texts each.
+        One text per column each.
     is_aligned : bool
-        Pad the cells to columns, to be read in a terminal; otherwise a long cell does not widen the others.
+        Pad the cells so that columns line up in a terminal; otherwise a long cell does not widen its column.
     """
     table = [heading, *rows]
     widths = [max(map(len, column)) if is_aligned else 0 for column in zip(*table, strict=True)]
@@ -25,7 +25,7 @@ def markdown_table(heading: Sequence[str], rows: Sequence[Sequence[str]], *, is_
 
 
 def machine() -> dict[str, str | int]:
-    """Return what times depend on: processor, threads, and the versions of what computes."""
+    """Return what timings depend on: processor, threads, and versions of the numerical packages."""
     import numba
     import numpy as np
 

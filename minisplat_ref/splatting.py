@@ -1,8 +1,8 @@
-"""One view of activated Gaussians: projected, shaded, sorted into tiles, composited; and the way back.
+"""Render one view of activated Gaussians: project, shade, sort into tiles, composite; and the same backwards.
 
-The order of the stages is 3DGS section 6's. What the Gaussians are before their activations, and where their colours
-come from, is left to the caller: :mod:`minisplat_ref.rendering` holds trained parameters and spherical harmonics,
-:mod:`minisplat_ref.gsplat_compat` whatever it is given.
+The order of the stages is that of 3DGS section 6. The caller decides what the Gaussians are before their activations
+and where their colours come from: :mod:`minisplat_ref.rendering` has trained parameters and spherical harmonics,
+:mod:`minisplat_ref.gsplat_compat` takes what it is given.
 """
 
 from collections.abc import Callable
@@ -29,7 +29,7 @@ __all__ = ["Primitives", "SplatGradient", "SplatTape", "splat", "splat_vjp"]
 
 
 class SplatTape(NamedTuple):
-    """What :func:`splat` did, for :func:`splat_vjp`."""
+    """Record of a call of :func:`splat`, for :func:`splat_vjp`."""
 
     primitives: Primitives
     camera: Camera
@@ -37,19 +37,19 @@ class SplatTape(NamedTuple):
     backend: Backend
     projection: Projection  # radii are 0 where culled
     channels: Floats  # [N, D] colours, then the depth if asked for
-    background: Floats  # [D] with a depth channel's 0
+    background: Floats  # [D] 0 in a depth channel
     has_depth: bool
     bins: TileBins
     output: RenderOutput
 
 
 class SplatGradient(NamedTuple):
-    """Gradient of the loss with respect to what :func:`splat` takes, and by the projected centres."""
+    """Gradient of the loss with respect to the inputs of :func:`splat` and the projected centres."""
 
     primitives: PrimitiveGradient  # and the pose, as far as the projection depends on it
     colors: Floats  # [N, D] without the depth channel
     background: Floats  # [D] without the depth channel
-    means2d: Floats  # [N, 2] per pixel: what density control looks at
+    means2d: Floats  # [N, 2] per pixel: input of density control
 
 
 def splat(
@@ -113,9 +113,9 @@ def splat_vjp(tape: SplatTape, v_image: Floats, v_alpha: Floats) -> SplatGradien
     tape : SplatTape
         From the forward function.
     v_image : ndarray of shape (H, W, D)
-        Derivative by the image, depth channel included where there is one.
+        Derivative with respect to the image, including its depth channel if it has one.
     v_alpha : ndarray of shape (H, W)
-        Derivative by the accumulated opacity.
+        Derivative with respect to the accumulated opacity.
 
     Returns
     -------

@@ -1,12 +1,12 @@
 """The contract of a backend: one protocol per stage, in the order of a training step.
 
-A protocol states what a stage takes and returns, with the shapes as comments; what the numbers mean, and the equations,
-stand at the function of the same name in :mod:`minisplat_ref.reference`. N Gaussians, K spherical-harmonic coefficients
-a channel, D image channels, H x W pixels, P points of structure from motion. The arrays of one call share a dtype,
-float32 or float64, and the results have it too; only conics and their gradient may be float64 throughout. Nothing is
-changed in place but what :class:`AdamUpdate` updates.
+A protocol states what a stage takes and returns, with the shapes as comments; the function of the same name in
+:mod:`minisplat_ref.reference` documents the meaning and the equations. There are N Gaussians, K spherical-harmonic
+coefficients per channel, D image channels, H x W pixels and P points of structure from motion. The arrays of one call
+share a dtype, float32 or float64, and so do the results; only conics and their gradient may be float64 throughout. Only
+:class:`AdamUpdate` changes arrays in place.
 
-The tape of a loss belongs to the backend that made it: any value, which only that backend's gradient reads.
+The tape of a loss belongs to the backend that made it: it may be any value, which only that backend's gradient reads.
 """
 
 from typing import Any, Protocol
@@ -168,7 +168,7 @@ class PhotometricLoss(Protocol):
 
 
 class PhotometricLossVjp(Protocol):
-    """Chain the derivative by the loss to the image [H, W, 3]."""
+    """Chain ``v_loss`` to the image [H, W, 3]."""
 
     def __call__(self, tape: Any, v_loss: float = 1.0) -> Floats: ...
 

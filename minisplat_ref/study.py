@@ -1,7 +1,7 @@
 """A study: a claim about a method, which a command measures and puts in a table and a figure.
 
-Those of 3DGS and Mini-Splatting are in :mod:`minisplat_ref.experiments.studies`; an extension brings its own. Both are
-run by ``minisplat-ref study NAME``.
+Studies of 3DGS and Mini-Splatting are in :mod:`minisplat_ref.experiments.studies`; an extension brings its own.
+``minisplat-ref study NAME`` runs either.
 """
 
 import argparse
@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 
 class Study(NamedTuple):
-    """What there is to measure, and how."""
+    """What to measure, and how."""
 
     name: str
-    """As it is typed after ``minisplat-ref study``; a study of an extension is typed EXTENSION/NAME."""
+    """The NAME of ``minisplat-ref study NAME``; for a study of an extension the user types EXTENSION/NAME."""
     summary: str
-    """What is measured; short enough to stand behind the name in a line of 80 columns."""
+    """What is measured; short enough to follow the name in a line of 80 columns."""
     add_arguments: Callable[[argparse.ArgumentParser], None]
     """Adds the arguments to the parser, and a description where the summary is not enough; loads nothing heavy."""
     run: Callable[[argparse.Namespace], int | None]

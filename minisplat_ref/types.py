@@ -1,10 +1,10 @@
 """The bundles that stages pass to each other: shape, dtype, frame and unit of every field.
 
-N Gaussians, K spherical-harmonic coefficients a channel, D image channels, M (tile, Gaussian) pairs, H x W pixels.
-Arrays are C-contiguous; floating fields of one bundle share one dtype, float32 or float64, and every stage returns the
-dtype that it is given; in the kernels conics alone, and their derivative, are float64. World and camera frames are
-right-handed; camera axes are OpenCV's: x right, y down, z forward. Image coordinates are in pixels, x right and y down,
-and the centre of the top-left pixel is (0.5, 0.5).
+There are N Gaussians, K spherical-harmonic coefficients per channel, D image channels, M (tile, Gaussian) pairs and
+H x W pixels. Arrays are C-contiguous; floating-point fields of one bundle share one dtype, float32 or float64, and
+every stage returns the dtype that it is given; only conics and their derivative are float64 in the kernels. World and
+camera frames are right-handed; camera axes are OpenCV's: x right, y down, z forward. Image coordinates are in pixels, x
+right and y down, and the centre of the top-left pixel is (0.5, 0.5).
 """
 
 from collections.abc import Iterable, Mapping
@@ -22,8 +22,8 @@ Bools = NDArray[np.bool_]
 class Gaussians(NamedTuple):
     """A population of Gaussians: the trained parameters, before their activations.
 
-    Gradients and Adam moments share this type. Any NamedTuple of arrays [N, ...] whose first field is ``means`` is a
-    population, too: an extension's has further fields.
+    Gradients and Adam moments have this type too. Any NamedTuple of arrays [N, ...] whose first field is ``means`` is a
+    population; those of extensions have further fields.
     """
 
     means: Floats
@@ -41,7 +41,7 @@ class Gaussians(NamedTuple):
 
 
 class Primitives(NamedTuple):
-    """Gaussians after their activations: what a camera can be pointed at."""
+    """Gaussians after their activations, ready to be rendered."""
 
     means: Floats
     """[N, 3] world frame, world units."""
@@ -54,7 +54,7 @@ class Primitives(NamedTuple):
 
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
-"""The mapping without entries: the default where nothing is asked for, given or shared."""
+"""An empty mapping, the default for fields and arguments that are mappings."""
 
 
 class Model(NamedTuple):
@@ -126,30 +126,30 @@ class ProjectionGradient(NamedTuple):
     depths: Floats
     """[N]."""
     conics: Floats
-    """[N, 3]; the entry of b is the derivative by b itself, which stands twice in the symmetric matrix."""
+    """[N, 3]; the entry of b is the derivative with respect to b itself, which occurs twice in the symmetric matrix."""
     opacities: Floats
     """[N]."""
 
 
 class PrimitiveGradient(NamedTuple):
-    """Gradient of the loss with respect to what :func:`project` takes."""
+    """Gradient of the loss with respect to the inputs of :func:`project`."""
 
     means: Floats
     """[N, 3]."""
     quats: Floats
     """[N, 4]."""
     scales: Floats
-    """[N, 3] by the activated scales."""
+    """[N, 3] with respect to the activated scales."""
     opacities: Floats
-    """[N] by the activated opacities."""
+    """[N] with respect to the activated opacities."""
     cam_from_world_R: Floats
-    """[3, 3] by the nine entries, unconstrained."""
+    """[3, 3] with respect to the nine entries, unconstrained."""
     cam_from_world_t: Floats
     """[3]."""
 
 
 class SHGradient(NamedTuple):
-    """Gradient of the loss with respect to what :func:`sh_colors` takes."""
+    """Gradient of the loss with respect to the inputs of :func:`sh_colors`."""
 
     means: Floats
     """[N, 3] through the viewing direction."""
@@ -164,7 +164,7 @@ class SHGradient(NamedTuple):
 
 
 class TileGrid(NamedTuple):
-    """How an image is cut into tiles; the last column and row of tiles may hang over the edge."""
+    """How an image is divided into tiles; the last column and row of tiles may extend beyond the image."""
 
     width: int
     """Image width, pixels."""
@@ -187,14 +187,14 @@ class TileGrid(NamedTuple):
 
 
 class TileBins(NamedTuple):
-    """For every tile the Gaussians that may touch it, front to back; tiles in row-major order."""
+    """The Gaussians that may touch each tile, front to back; tiles in row-major order."""
 
     gaussian_ids: Ints
     """[M] int32, ordered by (tile, depth, index)."""
     tile_offsets: Ints
     """[n_tiles + 1] int64; tile t owns gaussian_ids[tile_offsets[t]:tile_offsets[t + 1]]."""
     slots: Ints
-    """[M] int32 place of each pair when the pairs are grouped by Gaussian instead of by tile."""
+    """[M] int32 index of each pair when the pairs are grouped by Gaussian instead of by tile."""
     gaussian_offsets: Ints
     """[N + 1] int64; Gaussian n owns the slots gaussian_offsets[n]:gaussian_offsets[n + 1]."""
     grid: TileGrid
@@ -202,7 +202,7 @@ class TileBins(NamedTuple):
 
 
 class BlendStats(NamedTuple):
-    """Per-Gaussian statistics of one view's compositing (Mini-Splatting); w = alpha T is the weight of a hit."""
+    """Per-Gaussian statistics of compositing one view (Mini-Splatting); w = alpha T is the weight of a hit."""
 
     blend_weight_sum: Floats
     """[N] sum of w over the pixels."""
@@ -227,18 +227,18 @@ class RenderOutput(NamedTuple):
     """[H, W] depth of the hit that takes the transmittance below one half, 0 where none does; None if not asked for."""
     stats: BlendStats | None
     """Blend statistics; None if not asked for."""
-    kept: Any = None
-    """What the backend that made it keeps for its gradient, which is as right, but slower, without."""
+    saved: Any = None
+    """What the backend saves for its gradient, which without it is slower but just as correct."""
     visible_ids: Ints | None = None
     """[V] rows of the population that the view does not cull, ascending; None from a compositor alone."""
     extras: Mapping[str, Any] = NOTHING
-    """What was asked for by name and is no channel, such as ``surface``, a :class:`SurfacePoints`."""
+    """Results requested by name that are not channels, such as ``surface``, a :class:`SurfacePoints`."""
     n_pairs: int = 0
-    """Pairs (tile, Gaussian) of the view, which memory grows with; 0 where the renderer does not say."""
+    """Pairs (tile, Gaussian) of the view, with which memory grows; 0 where the renderer does not say."""
 
 
 class CompositeGradient(NamedTuple):
-    """Gradient of the loss with respect to what :func:`composite` takes."""
+    """Gradient of the loss with respect to the inputs of :func:`composite`."""
 
     means2d: Floats
     """[N, 2] per pixel."""
@@ -253,10 +253,10 @@ class CompositeGradient(NamedTuple):
 
 
 class BlendGradient(NamedTuple):
-    """Gradient of the loss with respect to what is blended, whatever the primitives are."""
+    """Gradient of the loss with respect to what is blended, for any kind of primitives."""
 
     primitives: tuple[Floats, ...]
-    """One array for each field of the primitives that their response has a derivative for."""
+    """One array for each field of the primitives that has a derivative in their response."""
     colors: Floats
     """[N, S] coefficients of colour."""
     background: Floats
@@ -273,7 +273,7 @@ class SurfacePoints(NamedTuple):
 
 
 class AdamStep(NamedTuple):
-    """The numbers of one step of Adam that hold for a whole array."""
+    """The constants of one step of Adam, the same for a whole array."""
 
     rate: float
     """Learning rate, bias corrections included."""
@@ -301,26 +301,27 @@ class View(NamedTuple):
     """[Q] rows of :attr:`Scene.points` that structure from motion found in the photograph, ascending; None where that
     is not known."""
     view_id: int = -1
-    """Place among the training views of its scene, which is where arrays of one row a photograph have its own; -1 for
-    a view that is not trained on."""
+    """Index among the training views of its scene, and in arrays with one row per photograph; -1 for a view that is not
+    trained on."""
     time: float = 0.0
-    """When it was taken, in the scene's own unit, from 0 to 1 as a rule; for scenes that move."""
+    """When it was taken, in the scene's own unit, usually from 0 to 1; for scenes that move."""
 
     def loaded(self) -> "View":
-        """Return a view that holds its pixels: itself, but of a view that reads them when they are needed a copy.
+        """Return a view that holds its pixels: itself, or a copy if the view reads its pixels on demand.
 
-        Scenes whose photographs memory cannot hold have such views: :class:`minisplat_ref.io.stored_views.StoredView`.
+        Scenes whose photographs do not fit into memory have such views:
+        :class:`minisplat_ref.io.stored_views.StoredView`.
         """
         return self
 
 
 def numbered(views: Iterable[View]) -> tuple[View, ...]:
-    """Return training views with their places among themselves as ``view_id``."""
+    """Return training views with their indices as ``view_id``."""
     return tuple(view._replace(view_id=i) for i, view in enumerate(views))
 
 
 def view_from(camera: Camera, *, name: str = "", time: float = 0.0) -> View:
-    """Return a view without a photograph: a place to render from."""
+    """Return a view without a photograph, to render from."""
     return View(name, camera, np.zeros((0, 0, 3), np.uint8), None, time=time)
 
 

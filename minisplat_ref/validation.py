@@ -1,6 +1,6 @@
-"""Checks of what comes from outside: once, at the boundary; the stages trust what they are given.
+"""Checks of input, once, at the boundary; the stages trust their arguments.
 
-Every failure is an :class:`InputError` of one line that names the argument or the file, the first bad place, and what
+Every failure is an :class:`InputError` of one line that names the argument or the file, the first bad element, and what
 to do. Zero Gaussians are no failure, nor are Gaussians that no camera sees.
 """
 
@@ -48,14 +48,14 @@ def check_finite(name: str, array: Floats) -> None:
 
 def check_quats(source: str | Path, quats: Floats) -> None:
     """Refuse quaternions [N, 4] of length zero, which are no rotation; any other length is fine."""
-    half_turns = np.flatnonzero(quats[:, 0] == 0)  # few; to look along every row would take NumPy ten times as long
+    half_turns = np.flatnonzero(quats[:, 0] == 0)  # few; a reduction along every row would take NumPy ten times as long
     zero_rows = half_turns[~quats[half_turns].any(axis=1)]
     if zero_rows.size:
         raise InputError(f"{source}: the rotation of row {zero_rows[0]} is a zero quaternion; remove that Gaussian")
 
 
 def check_array(name: str, value: Any, shapes: tuple[Shape, ...], sizes: dict[str, int], dtype: np.dtype) -> Floats:
-    """Return a C-contiguous array of finite numbers, of the one dtype and of one of the shapes.
+    """Return a C-contiguous array of finite numbers, of the given dtype and one of the shapes.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def check_array(name: str, value: Any, shapes: tuple[Shape, ...], sizes: dict[st
     shapes : tuple of shapes
         Allowed shapes, of different lengths; a letter stands for a size, for example ``("N", 3)``.
     sizes : dict
-        Sizes by letter; a letter that is new takes its size from this array.
+        Sizes by letter; a new letter takes its size from this array.
     dtype : dtype
         Required; float32 or float64.
     """
@@ -114,13 +114,13 @@ def check_size(name: str, value: Any) -> int:
 
 
 def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
-    """Refuse a string that is none of the choices."""
+    """Refuse a string that is not one of the choices."""
     if value not in choices:
         raise InputError(f"{name} {value!r} is unknown; choose one of {', '.join(choices)}")
 
 
 def check_sh_degree(name: str, degree: Any, n_coefficients: int) -> None:
-    """Refuse an active degree that is not 0 to 3, or that needs more coefficients than there are."""
+    """Refuse an active degree outside 0 to 3, or one that needs more coefficients than there are."""
     if not isinstance(degree, int | np.integer) or not 0 <= degree <= SH_DEGREE_MAX:
         raise InputError(f"{name} is {degree!r}; it must be 0 to {SH_DEGREE_MAX}")
     if (degree + 1) ** 2 > n_coefficients:
@@ -162,7 +162,7 @@ def chosen_conventions(
     eps2d: float | None,
     rasterize_mode: str,
 ) -> Conventions:
-    """Return the profile, or the one of that name, with what else was given in its place."""
+    """Return the profile, given itself or by name, with the other values that were given in place of its own."""
     if isinstance(profile, str):
         check_choice("profile", profile, tuple(PROFILES))
         profile = PROFILES[profile]

@@ -1,13 +1,13 @@
 """Compile the kernels of training, rendering and evaluation ahead of their use, on all processors.
 
-A process compiles one function at a time, so that a first iteration waits for one kernel after the other. Here every
-stage is compiled by itself, in several processes, and found on disk by whoever needs it. A stage alone needs arguments
-of the types that the stages before it would give; they come from the reference, which compiles nothing. An extension is
-warmed up by drawing and differentiating a tiny model with its renderer and losses, after the stages: what is not its
-own is found on disk by then.
+A process compiles one function at a time, so a first iteration would wait for one kernel after the other. Here several
+processes compile the stages one by one, and whatever runs later finds them on disk. A single stage needs arguments of
+the types that the stages before it return; these come from the reference, which compiles nothing. An extension is
+warmed up after the stages, by drawing and differentiating a tiny model with its renderer and losses; by then the
+kernels that are not its own are on disk.
 
-Left out: numbers of channels other than those that training and rendering use (3, and 4 with depth), which gsplat's
-signature allows, the kernels of ``bench``, and those of an extension's actions. They are compiled at their first use.
+Left out: other numbers of channels than training and rendering use (3, and 4 with depth), which gsplat's signature
+allows, the kernels of ``bench``, and those of an extension's actions. They are compiled at their first use.
 """
 
 import gc
@@ -47,7 +47,7 @@ from minisplat_ref.types import (
 
 WIDTH, HEIGHT = 24, 18
 N_GAUSSIANS = 4
-DEGREE = 1  # of the spherical harmonics: a number at run time, so that any will do
+DEGREE = 1  # of the spherical harmonics: known only at run time, so any value will do
 
 Dtype = type[np.floating]
 Arguments = ParamSpec("Arguments")
@@ -55,14 +55,14 @@ HasConics = TypeVar("HasConics", Projection, CompositeGradient)
 
 
 class Compiled(NamedTuple):
-    """One stage that is ready."""
+    """One stage that has been compiled."""
 
     name: str
     """Key of ``STAGES``, or ``extension NAME``."""
     seconds: float
-    """That it took; little where it was on disk already."""
+    """Time that it took; little where it was on disk already."""
     problem: str = ""
-    """Why an extension could not be drawn, one line; empty where all is well."""
+    """Why an extension could not be drawn, in one line; empty if it could."""
 
 
 def _stage(name: str, with_depth: bool = False, with_stats: bool = False) -> Callable[[Dtype], None]:
@@ -105,13 +105,13 @@ STAGES: dict[str, Callable[[Dtype], None]] = {
     "projection": _stage("project"),
     "colours": _stage("sh_colors"),
     "Adam": _adam,
-    # From here on not every training and no ordinary rendering.
+    # Those below are not used by every training, nor by ordinary rendering.
     "blending with depth, backward": _stage("composite_vjp", with_depth=True),
     "blending with depth": _stage("composite", with_depth=True),
     "blend statistics": _stage("composite", with_stats=True),
     "surface points": _surface_points,
 }
-"""What is compiled together, by what it is called; the slow ones first, so that no process is left with one."""
+"""What is compiled together, by name; slow ones first, so that no process ends up with a slow one last."""
 
 FIRST_ITERATION = tuple(STAGES)[:9]
 """Those that the first iteration of every training needs."""
@@ -123,9 +123,9 @@ def warm_up(
     n_processes: int | None = None,
     extensions: Iterable[str] = (),
 ) -> Generator[Compiled, None, None]:
-    """Compile stages in processes of their own, and yield each when it is ready; closed early, it ends them.
+    """Compile stages in other processes and yield each when it is ready; closing the generator ends the processes.
 
-    The main module of the program is imported by each of those processes: a script must call this under
+    Each of those processes imports the program's main module: a script must call this under
     ``if __name__ == "__main__"``.
 
     Parameters
@@ -141,7 +141,7 @@ def warm_up(
     """
     names, extension_names = tuple(STAGES if stages is None else stages), tuple(extensions)
     n_processes = min(n_processes or os.cpu_count() or 1, max(len(names), len(extension_names)))
-    # Fresh interpreters: a fork of a process in which kernels have run could not run any.
+    # Fresh interpreters, because a fork of a process in which kernels have run cannot run any.
     context = get_context("spawn")
     pool, others = ProcessPoolExecutor(n_processes, context, initializer=_prepare_process), active_children()
     try:
@@ -149,7 +149,7 @@ def warm_up(
             futures = [pool.submit(task, name, dtype) for name in batch]
             for future in as_completed(futures):
                 yield future.result()
-    except BaseException:  # nobody waits for the rest: Ctrl-C, which they do not see, or an error
+    except BaseException:  # nothing waits for the rest after an error, or after Ctrl-C, which the processes ignore
         for process in active_children():
             if process not in others:
                 process.kill()
@@ -159,13 +159,13 @@ def warm_up(
 
 
 def _prepare_process() -> None:
-    gc.disable()  # what the compiler makes is many small objects, of which few can go
+    gc.disable()  # the compiler makes many small objects, of which few can be freed
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
-    """End this process when the parent is killed: it would wait for work for ever."""
+    """End this process when the parent is killed; it would wait for work for ever."""
     parent = parent_process()
     if parent is not None:
         parent.join()
@@ -184,7 +184,7 @@ def _compile_extension(name: str, dtype: Dtype) -> Compiled:
         _draw_extension(load_extension(name), dtype)
     except InputError as error:
         problem = " ".join(str(error).split())
-    except Exception as error:  # whatever the renderer of somebody else does
+    except Exception as error:  # an extension's renderer may raise anything
         problem = f"extension {name} does not draw: {type(error).__name__}: {' '.join(str(error).split())}"
     return Compiled(f"extension {name}", time.perf_counter() - start, problem)
 
@@ -208,7 +208,7 @@ def _draw_extension(extension: Extension, dtype: Dtype) -> None:
 
 
 def _in_kernel_types(function: Callable[Arguments, HasConics]) -> Callable[Arguments, HasConics]:
-    """Return a stage of the reference whose conics, or gradient by them, are float64 as those of the kernels."""
+    """Return a stage of the reference whose conics, or their gradient, are float64 as in the kernels."""
 
     def stage(*args: Arguments.args, **named: Arguments.kwargs) -> HasConics:
         bundle = function(*args, **named)
@@ -221,10 +221,10 @@ def _in_kernel_types(function: Callable[Arguments, HasConics]) -> Callable[Argum
 def _with_records(
     projection: Projection, colors: Floats, background: Floats, bins: TileBins, conventions: Conventions, **asked: bool
 ) -> RenderOutput:
-    """Composite by the reference, with records as the kernels keep: else their gradient would have to make them."""
+    """Composite with the reference and add the kernels' records, which their gradient would otherwise have to make."""
     records = np.zeros((len(colors), record_size(colors.shape[1])), colors.dtype)
     output = REFERENCE.composite(projection, colors, background, bins, conventions, **asked)
-    return output._replace(kept=records)
+    return output._replace(saved=records)
 
 
 _REFERENCE = replace(

@@ -17,12 +17,12 @@
 # # 00 Reading guide
 #
 # `minisplat_ref` renders and trains scenes made of 3D Gaussians (3DGS, Kerbl et al. 2023). It states every formula
-# twice: once as matrices in NumPy, to be read, and once as scalars for fast loops, to be used. Each form is tested
-# against the other. This notebook is the guide: a first result, the stages in pictures, the folders, the reading order,
-# and the choices in which renderers differ.
+# twice: as matrices in NumPy, to be read, and as scalars for fast loops, to be used. Each form is tested against the
+# other. This notebook is the guide: a first result, the stages in pictures, the folders, the reading order, and the
+# choices in which renderers differ.
 #
-# First the result. A ray tracer takes fourteen tiny photographs of a room and gives points on its surfaces. Each point
-# becomes a Gaussian, sixty gradient steps fit them to the photographs, and a view that the training never saw is
+# First the result. A ray tracer renders fourteen tiny photographs of a room and samples points on its surfaces. Each
+# point becomes a Gaussian, sixty gradient steps fit them to the photographs, and a view that the training never saw is
 # rendered. All of that is the next cell, in ten lines.
 
 # %%
@@ -75,11 +75,11 @@ panels[3].set(xlabel="step", title="training loss", ylim=(0, None))
 plt.show()
 
 # %% [markdown]
-# PSNR is $10 \log_{10}(1 / \text{mean squared error})$ in dB; higher is better. This ran on the NumPy reference, so
-# that nothing had to be compiled. `backend=CPU`, the default, is the fast one; it compiles its kernels during the first
-# call, which takes about half a minute, once. The learning rates are raised because sixty steps are few, and the
-# density control of 3DGS (`events`) is left out. `minisplat-ref demo` does the same properly on the fast backend, with
-# density control and a report.
+# PSNR is $10 \log_{10}(1 / \text{mean squared error})$ in dB; higher is better. This ran on the NumPy reference, which
+# needs no compilation. `backend=CPU`, the default, is the fast one; it compiles its kernels during the first call,
+# which takes about half a minute, once. The learning rates are raised because sixty steps are few, and the density
+# control of 3DGS (`events`) is left out. `minisplat-ref demo` does the same properly on the fast backend, with density
+# control and a report.
 #
 # Every notebook shows its pictures before its formulas, and ends with a cell to play with, two exercises with hidden
 # solutions, and assertions of what it has shown.
@@ -267,7 +267,7 @@ display(Markdown("\n".join("| " + " | ".join(row) + " |" for row in table)))
 #
 # ## Play
 #
-# Does a choice show? Below is the trained view with the conventions of another profile, and the difference from the
+# Is a choice visible? Below is the trained view with the conventions of another profile, and the difference from the
 # default. What to look for:
 #
 # * `name`: try `GSPLAT_1_5` and `MINI_SPLATTING2`. Which differs in fewest pixels?
@@ -288,14 +288,14 @@ plt.show()
 # %% [markdown]
 # ## Exercises
 #
-# **1.** Start the training of the first cell from 200 points instead of 1500, and take 15 or 30 steps. What do points
-# give, and what do steps? Guess before you run it.
+# **1.** Start the training of the first cell from 200 points instead of 1500, and take 15 or 30 steps. What do more
+# points improve, and what more steps? Guess before you run it.
 #
 # <details>
 # <summary>Solution</summary>
 #
-# Points are where colour can be put; steps are how long it is fitted. Fewer points leave larger Gaussians and lose
-# detail that no number of steps brings back without density control.
+# Points are the places for colour; steps are how long it is fitted. Fewer points leave larger Gaussians and lose detail
+# that no number of steps brings back without density control.
 #
 # ```python
 # def trained_psnr(n_points, iterations):

@@ -106,7 +106,7 @@ print(*blending, sep="\n")
 # %% [markdown]
 # | file | what it holds | equation |
 # |---|---|---|
-# | `minisplat_ref/reference/tiling.py` | which ellipses a tile has to look at, in which order | 3DGS sec. 6 |
+# | `minisplat_ref/reference/tiling.py` | which ellipses a tile has to blend, in which order | 3DGS sec. 6 |
 # | `minisplat_ref/reference/hits.py` | alpha of a hit, transmittance in front of it | 3DGS (3), (4) |
 # | `minisplat_ref/reference/compositing.py` | image, alpha, median depth, blend statistics | 3DGS (3) |
 #

@@ -17,8 +17,8 @@
 # # 06 Training a tiny scene
 #
 # All stages together: photographs with their cameras and a few hundred points go in, several thousand Gaussians come
-# out. Training is a loop of render, loss, gradient, step. Now and then Gaussians are added where one of them is pulled
-# to two places, and removed where they do not help.
+# out. Training is a loop of render, loss, gradient, step. Now and then Gaussians are added where the views pull one to
+# two places, and removed where they do not help.
 #
 # Here is what goes in. A ray tracer photographs a small room from 24 places, and from 4 more that training never sees.
 # Structure from motion would give points on the surfaces; here they are exact, 600 of them.

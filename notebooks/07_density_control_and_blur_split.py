@@ -17,9 +17,9 @@
 # # 07 Density control and blur split
 #
 # Training starts with a few hundred Gaussians and needs many thousands. Which ones should become two? 3DGS looks at the
-# gradient with respect to the position: where it is large, the photographs pull one Gaussian to two places. This sign
+# gradient with respect to the position: where it is large, the photographs pull one Gaussian to two places. This signal
 # has a blind spot. A large Gaussian in front of a fine texture is pulled to all sides at once, the pulls cancel, and
-# the texture stays blurred. Mini-Splatting adds a second sign, an area, and calls the event *blur split*.
+# the texture stays blurred. Mini-Splatting adds a second signal, an area, and calls the event *blur split*.
 #
 # Here is the blind spot with a single grey Gaussian and two photographs: one is dark on the left and bright on the
 # right, the other is a fine checkerboard. The arrow is the step that gradient descent would take. The texture needs a
@@ -87,15 +87,15 @@ for name, pull in pulls.items():
 # %% [markdown]
 # | file | what it holds | where in the paper |
 # |---|---|---|
-# | `minisplat_ref/strategy/clone_split.py` | the gradient's sign; clone, split, prune | 3DGS sec. 5.2 |
-# | `minisplat_ref/strategy/blur_split.py` | the area's sign; children on the longest axis | MS sec. 4.1, eq. 2 |
+# | `minisplat_ref/strategy/clone_split.py` | the gradient as signal; clone, split, prune | 3DGS sec. 5.2 |
+# | `minisplat_ref/strategy/blur_split.py` | the area as signal; children on the longest axis | MS sec. 4.1, eq. 2 |
 # | `minisplat_ref/methods/` | the same as events of a recipe | |
 #
 # *3DGS* is Kerbl et al. 2023, *MS* is Mini-Splatting, Fang and Wang 2024. **Frames and units:** the world is in metres;
 # image coordinates are pixels, x right, y down. Gradients with respect to the position are in units in which the image
 # is 2 wide and 2 high.
 #
-# ## The second sign: how many pixels a Gaussian dominates
+# ## The second signal: how many pixels a Gaussian dominates
 #
 # The compositor counts at how many pixels each Gaussian *dominates*, that is, has the largest blending weight
 # $w = \alpha T$. A Gaussian that dominates more than a fraction $\theta = 2 \cdot 10^{-4}$ of an image since the last
@@ -107,9 +107,9 @@ show_code(is_blurred)
 
 # %% [markdown]
 # In photographs of 128 x 96 pixels a fraction of $2 \cdot 10^{-4}$ is 2.5 pixels, less than any Gaussian can be made to
-# cover; the recipes never call 64 pixels blurred (`least_area`). We take $\theta = 6 \cdot 10^{-3}$, which is 74
-# pixels. The threshold of the gradient is raised to $10^{-3}$ for a similar reason: in a small image every Gaussian
-# covers a larger part, and gradients are larger.
+# cover; in the recipes an area of up to 64 pixels never counts as blurred (`least_area`). We take $\theta = 6 \cdot
+# 10^{-3}$, which is 74 pixels. The threshold of the gradient is raised to $10^{-3}$ for a similar reason: in a small
+# image every Gaussian covers a larger part, and gradients are larger.
 #
 # Next is a room with 300 points, trained for 350 iterations with the density control of 3DGS alone:
 
@@ -415,10 +415,10 @@ plt.show()
 # every event comes before the last one is repaired. The released code draws at random and has thousands of iterations
 # for the repair. The recipes of this package use halves.
 #
-# The thresholds matter, too. `minisplat-ref study split SCENE --out DIR` trains a whole recipe in all four ways: on
-# this room at 160 x 120 pixels, in 1500 iterations of `mini-splatting-d`, they end within 0.1 dB of each other. There
-# the gradient's threshold is the published one, which asks for a split nearly everywhere in small images, and the area
-# adds hardly any.
+# The thresholds matter too. `minisplat-ref study split SCENE --out DIR` trains a whole recipe in all four ways: on this
+# room at 160 x 120 pixels, in 1500 iterations of `mini-splatting-d`, they end within 0.1 dB of each other. There the
+# gradient's threshold is the published one, which asks for a split nearly everywhere in small images, and the area adds
+# hardly any.
 #
 # ## Play
 #

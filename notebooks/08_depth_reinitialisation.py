@@ -94,24 +94,24 @@ plt.show()
 # %% [markdown]
 # ## Where is what a pixel shows?
 #
-# - **mid-point**: the densest point of the *dominant* Gaussian, the one with the largest blending weight
-#   $w = \alpha T$. It is the middle of the ray's chord through the Gaussian, at
-#   $t = \dfrac{d^T \Sigma^{-1} (\mu - o)}{d^T \Sigma^{-1} d}$ on the ray $o + t\,d$;
+# - **midpoint**: the densest point of the *dominant* Gaussian, the one with the largest blending weight $w = \alpha T$.
+#   It is the middle of the ray's chord through the Gaussian, at $t = \dfrac{d^T \Sigma^{-1} (\mu - o)}{d^T \Sigma^{-1}
+#   d}$ on the ray $o + t\,d$;
 # - **centre**: the point of the ray at the depth of the dominant Gaussian's mean;
 # - **blended**: the point of the ray at the blended depth $\sum w z / \sum w$.
 #
-# The mid-points follow the wall. The centres flatten it to one depth; with many small Gaussians that matters less. The
+# The midpoints follow the wall. The centres flatten it to one depth; with many small Gaussians that matters less. The
 # blended depth lies between the wall and the Gaussian in front, where there is nothing. Where the front one is
 # transparent, the other two stay on the wall, because it has the larger weight: their points always lie on *some*
 # surface.
 #
 # | file | what it holds | where in the paper |
 # |---|---|---|
-# | `minisplat_ref/strategy/depth_reinit.py` | points of the pixels; which are drawn; the guards | MS sec. 4.1, app. D |
+# | `minisplat_ref/strategy/depth_reinit.py` | points of the pixels; which are drawn; safeguards | MS sec. 4.1, app. D |
 # | `minisplat_ref/strategy/simplify.py` | `sample`: drawing without replacement | |
 # | `minisplat_ref/experiments/studies/depth_types.py` | the comparison below, larger, with several seeds | MS table 4 |
 #
-# *MS* is Mini-Splatting, Fang and Wang 2024; the guards are not in the paper. **Frames and units:** the world is in
+# *MS* is Mini-Splatting, Fang and Wang 2024; the safeguards are not in the paper. **Frames and units:** the world is in
 # metres, z up; camera axes are x right, y down, z forward; a depth is the camera z.
 #
 # ## In a room
@@ -273,12 +273,12 @@ for line, name in zip(axes, ("outdoor", "plain-wall"), strict=True):
 plt.show()
 
 # %% [markdown]
-# ## Guards
+# ## Safeguards
 #
-# There are three guards. The paper has none of them; the recipes use the second together with the third:
+# There are three safeguards. The paper has none of them; the recipes use the second together with the third:
 #
-# - **a floor of the accumulated opacity** (`least_alpha`): rays that are nearly empty are not drawn. This costs
-#   nothing, and helps only as long as the sky is *not* painted yet;
+# - **a least accumulated opacity** (`least_alpha`): rays that are nearly empty are not drawn. This costs nothing, and
+#   helps only as long as the sky is *not* painted yet;
 # - **a vote of the other views** (`depth_tolerance`): up to 8 other views vote. A point is refuted if at least as many
 #   see through it as have it on their own surface. A view that sees something nearer in that place has no vote;
 # - **a backdrop** (`backdrop_distance`): a refuted point moves along its ray to behind the scene, so that there is
@@ -307,8 +307,8 @@ for name in truths:
         print(f"{name:<12}{choice:<16}{told['n']:>7}{cells}")
 
 # %% [markdown]
-# In this table a point that the backdrop has moved away from a surface counts as off it. The floor changes next to
-# nothing outdoors, because after training the sky is as opaque as the ground. The vote helps, but leaves many wrong
+# In this table a point that the backdrop has moved away from a surface counts as off it. The least opacity changes next
+# to nothing outdoors, because after training the sky is as opaque as the ground. The vote helps, but leaves many wrong
 # points. Blended depth is the worst choice in every scene, as in the paper, where it costs ten decibels.
 
 # %% tags=["rounding"]
@@ -339,14 +339,14 @@ for name in ("outdoor", "plain-wall"):
 
 # %% [markdown]
 # Not by themselves. Outdoors the vote removes points that hang in the sky, but the sky still has to be painted, and
-# there is less left to paint it on: wrong points are of use. The backdrop gives something to paint on again, this time
+# there is less left to paint it on: wrong points are useful. The backdrop gives something to paint on again, this time
 # behind the scene and not in the middle of it. On the plain wall the three are within a decibel. In runs as short and
 # small as these, one seed says little about a decibel or two; `minisplat-ref study depth outdoor --out DIR` trains the
 # whole recipe at 160 x 120 with three seeds. The recipes use vote and backdrop.
 #
 # ## Play
 #
-# Choose a scene and the guards. What to look for:
+# Choose a scene and the safeguards. What to look for:
 #
 # * `depth_tolerance`: at 0.01 views refute each other's noise, at 0.3 they agree with almost everything.
 # * `least_alpha`: at 0.999, what happens outdoors, and what on the plain wall?
@@ -368,8 +368,8 @@ plt.show()
 # %% [markdown]
 # ## Exercises
 #
-# **1.** Derive the formula of the mid-point: along the ray $o + t\,d$, where is the density
-# $e^{-\frac12 (x - \mu)^T \Sigma^{-1} (x - \mu)}$ largest?
+# **1.** Derive the formula of the midpoint: along the ray $o + t\,d$, where is the density $e^{-\frac12 (x - \mu)^T
+# \Sigma^{-1} (x - \mu)}$ largest?
 #
 # <details>
 # <summary>Solution</summary>

@@ -16,7 +16,7 @@
 # %% [markdown]
 # # 09 Importance and simplification
 #
-# A trained scene holds more Gaussians than its photographs need. Mini-Splatting asks how much each of them contributes,
+# A trained scene has more Gaussians than its photographs need. Mini-Splatting asks how much each of them contributes,
 # drops those that never dominate a pixel, and draws a few of the others at random, the important ones more often. This
 # notebook follows one population from many to few, and compares sampling with plainer ways.
 #

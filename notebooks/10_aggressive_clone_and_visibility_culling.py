@@ -287,8 +287,8 @@ print(f"{few.sum()} of {n} Gaussians are visible in fewer than two views; the ev
 # %% [markdown]
 # ## What culling saves, and what it costs
 #
-# The times depend on the machine and on what else it does; with and without culling take turns. What is culled is small
-# and faint, so it is a smaller share of the work than of the Gaussians.
+# The times depend on the machine and on what else it does; iterations with and without culling alternate. What is
+# culled is small and faint, so it is a smaller share of the work than of the Gaussians.
 
 # %% tags=["clock"]
 targets = [np.multiply(v.image, np.float32(1 / 255), dtype=np.float32) for v in scene.train_views]

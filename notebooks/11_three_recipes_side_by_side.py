@@ -18,7 +18,7 @@
 #
 # One scene, one start, three methods: `3dgs-accel` adds Gaussians where gradients ask for them and keeps them;
 # `mini-splatting` adds more, then draws a few by importance; `mini-splatting2` does the same much sooner, so that most
-# of the time is spent on few. The stages are those of notebooks 06 to 10; here is what they are worth together.
+# of the time is spent on few. The stages are those of notebooks 06 to 10; here is how they work together.
 #
 # First the result, on a view that training never saw. How each recipe got there, event by event, follows below.
 

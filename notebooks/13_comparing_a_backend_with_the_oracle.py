@@ -17,7 +17,7 @@
 # # 13 Comparing a backend with the oracle
 #
 # You have written a renderer, or you were given one. Its pictures look right. Training converges slowly, and you
-# suspect a gradient: which one? This notebook finds out. It puts renderers beside the float64 reference, stage by
+# suspect a gradient: which one? This notebook finds out. It compares renderers with the float64 reference, stage by
 # stage, and explains five disagreements that were measured between renderers in use.
 #
 # Below is a scene of 250 Gaussians, rendered by the reference and by a suspect. The images agree to the last digits.
@@ -134,8 +134,9 @@ half = table(compare_scene(from_backend(suspect, "float64"), scene))
 
 # %% [markdown]
 # The last two lines repeat the first: further channels go through the same function, and the view is the whole renderer
-# in one call, whose stages cannot be fed. So it is one stage, one column, one factor: the middle entry of the conic's
-# gradient is half of what it should be. A conic means $\sigma = \tfrac12 (a\, dx^2 + 2 b\, dx\, dy + c\, dy^2)$, so
+# in one call, to whose stages no truth can be given. So it is one stage, one column, one factor: the middle entry of
+# the conic's gradient is half of what it should be. A conic means $\sigma = \tfrac12 (a\, dx^2 + 2 b\, dx\, dy + c\,
+# dy^2)$, so
 #
 # $$ \frac{\partial \sigma}{\partial a} = \tfrac12 dx^2, \qquad \frac{\partial \sigma}{\partial b} = dx\, dy, \qquad
 #    \frac{\partial \sigma}{\partial c} = \tfrac12 dy^2 . $$
@@ -205,7 +206,7 @@ plt.show()
 #
 # The second suspect renders wrong pictures, although a camera without rotation would not show it. The covariance of the
 # projection is $J R\, \Sigma\, R^T J^T$ with the rotation $R$ of the camera. This renderer takes $R^T$ there, and $R$
-# for the positions, as it should. The ellipses are in the right places and are turned wrongly. **A real one, too:** the
+# for the positions, as it should. The ellipses are in the right places and are turned wrongly. **A real one too:** the
 # kernels of the trainer 3dgs-warp-scratch do this.
 
 # %%

@@ -32,12 +32,12 @@ from IPython.display import display
 
 from figures import BLUE, GREEN, GREY, RED, YELLOW, show
 from minisplat_ref.backends import CPU, REFERENCE
+from minisplat_ref.bench.benchmark import benchmark
 from minisplat_ref.bench.contenders import all_contenders
 from minisplat_ref.bench.exponentials import EXPONENTIALS, relative_errors
 from minisplat_ref.bench.figure import pareto_figure
 from minisplat_ref.bench.judging import backward, expect, failure, forward, judge
 from minisplat_ref.bench.judging import relative_errors as by_parameter
-from minisplat_ref.bench.race import race
 from minisplat_ref.bench.workloads import synth
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.oracle.planted import planted
@@ -63,9 +63,9 @@ plt.show()
 
 # %% [markdown]
 # The float64 kernels agree with the reference to the last digits (black). float32 is off by $10^{-7}$ to $10^{-6}$
-# wherever there is a Gaussian, with a few bright dots. A cubic exponential raises this level everywhere. Ending a
-# Gaussian at three standard deviations, as the tiles of the 3DGS rasteriser do, leaves most pixels as they are and is
-# grossly wrong along the edges of tiles, where opaque Gaussians are cut off. Skipping every hit below 1/64 is wrong
+# wherever there is a Gaussian, with a few bright dots. A cubic exponential raises this level everywhere. Cutting a
+# Gaussian off at three standard deviations, as the tiles of the 3DGS rasteriser do, leaves most pixels as they are and
+# is grossly wrong along the edges of tiles, where opaque Gaussians are cut off. Skipping every hit below 1/64 is wrong
 # everywhere.
 #
 # | file | what it holds |
@@ -73,7 +73,7 @@ plt.show()
 # | `minisplat_ref/bench/workloads.py` | what is rendered |
 # | `minisplat_ref/bench/contenders.py` | what renders it |
 # | `minisplat_ref/oracle/thresholds.py` | which pixels are at a threshold |
-# | `minisplat_ref/bench/judging.py`, `race.py` | errors, then times |
+# | `minisplat_ref/bench/judging.py`, `benchmark.py` | errors, then times |
 #
 # **Frames and units:** images are [H, W, 3] with values in [0, 1]; an error of an image is an absolute difference, an
 # error of a gradient is relative. Times are those of the machine that ran the notebook; the command
@@ -224,7 +224,7 @@ plt.show()
 # are stored as float32 pixels, and near pixel 200 their last digit is $10^{-5}$. Degree 6 gains nothing at all, because
 # rounding hides it.
 #
-# ## The race
+# ## The benchmark
 #
 # First every contender is judged: one whose error exceeds its bound, beyond what flips explain, has failed and gets no
 # time. Shorter cut-offs render other images on purpose; they must agree with float64 under *their* cut-off, and the
@@ -235,7 +235,7 @@ plt.show()
 wrong = contenders["cpu-f32"]._replace(name="planted", backend=planted("half-off-diagonal"))
 small = synth(4_000, width=96, height=54, focal=80.0)
 runners = [contenders[name] for name in contenders if "exp6" not in name and "exp4" not in name]
-cases = race(small, [*runners, wrong], repeats=3)
+cases = benchmark(small, [*runners, wrong], repeats=3)
 results = {case.name.removeprefix("synth/"): case for case in cases}
 for name, case in results.items():
     f = case.figures
@@ -278,7 +278,7 @@ print(f"{np.mean(apart > 1e-5):.3%} of the pixels differ by more than 1e-5")
 # %% [markdown]
 # ## Exercises
 #
-# **1.** How many flips are to be expected? Let a pixel look at $K$ Gaussians whose alphas are spread evenly on a
+# **1.** How many flips are to be expected? Let a pixel have $K$ Gaussians whose alphas are spread evenly on a
 # logarithmic scale from $10^{-6}$ to 1, and let float32 move each alpha by a relative error of $10^{-6}$.
 #
 # <details>

@@ -36,7 +36,7 @@ from matplotlib.patches import Rectangle
 
 from figures import BLUE, GREY, RED, YELLOW, covariances2d, draw_ellipses
 from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.bench.roofs import rows_worked_on
+from minisplat_ref.bench.roofline import rows_worked_on
 from minisplat_ref.bench.workloads import synth
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.cpu.compositing.records import records_of
@@ -109,7 +109,7 @@ print(f"the set of rows, strip by strip: {int(bits):064b}")
 # | file | what it holds |
 # |---|---|
 # | `minisplat_ref/jit/lanes.py` | eight numbers as one value |
-# | `minisplat_ref/cpu/compositing/tile_state.py` | what the pixels of a tile remember |
+# | `minisplat_ref/cpu/compositing/tile_state.py` | the state of a tile's pixels |
 # | `minisplat_ref/cpu/compositing/tile_rows.py` | which rows of a tile a Gaussian reaches, and its alpha there |
 # | `minisplat_ref/cpu/compositing/forward.py`, `backward.py` | the kernels |
 #
@@ -223,8 +223,8 @@ plt.show()
 # %% [markdown]
 # Why not leave this to the compiler? It vectorises a loop if it can prove that no store overlaps a load and that no
 # step depends on the previous one. Otherwise it silently does not, and the loop takes several times as long. Here the
-# code says what happens. There are no branches either: a processor starts work behind a branch before it knows which
-# way it goes, and a wrong guess throws that work away.
+# code says what happens. There are no branches either: a processor executes past a branch before it knows which way it
+# goes, and a misprediction discards that work.
 #
 # ## What it costs in digits
 #

@@ -23,10 +23,10 @@
 # Nothing here is a benchmark. The figures of a folder's docstring are measured with `minisplat-ref study`; the pictures
 # here show why they come out as they do.
 #
-# ## Small Gaussians: what a needle pays
+# ## Small Gaussians: the penalty of a needle
 #
 # Below are four round Gaussians and one needle. The needle covers as much area as each of the others. Micro-splatting
-# lets the sum of the squared deviations cost something above a limit. Only the needle pays. On the right its scales
+# penalises the sum of the squared deviations above a limit. Only the needle is penalised. On the right its scales
 # follow the penalty's gradient alone: the long one shrinks, and the short ones hardly move.
 
 # %%
@@ -53,8 +53,8 @@ from minisplat_ref.extensions.proxies.binding import bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid
 from minisplat_ref.extensions.proxies.edit_claims import RADIUS, flat_gaussians, rolled
 from minisplat_ref.extensions.proxies.edit_claims import camera as card_camera
-from minisplat_ref.extensions.proxies.mesh import Mesh
 from minisplat_ref.extensions.shared_container import take_apart
+from minisplat_ref.extensions.shared_mesh import Mesh
 from minisplat_ref.extensions.shared_sampling import block_means, zoomed
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import psnr
@@ -103,12 +103,12 @@ plt.show()
 #    \operatorname{tr} \Sigma_k = \sum_j s_{kj}^2, \qquad
 #    \frac{\partial P}{\partial \log s_{kj}} = \frac{2 s_{kj}^2}{\tau N} \ \text{above the limit.} $$
 #
-# The gradient grows with the square of a scale: the long axis pays sixteen times what the third axis pays. During
+# The gradient grows with the square of a scale: that of the long axis is sixteen times that of the third axis. During
 # densification a Gaussian above the limit is also replaced by two of half its covariance.
 #
 # | folder | what it changes |
 # |---|---|
-# | `minisplat_ref/extensions/micro/` | long and large Gaussians cost something |
+# | `minisplat_ref/extensions/micro/` | long and large Gaussians are penalised |
 # | `minisplat_ref/extensions/antialiasing/` | two filters instead of the dilation |
 # | `minisplat_ref/extensions/analytic/` | alpha is the mean over a pixel |
 # | `minisplat_ref/extensions/multi_scale/` | coarser Gaussians for smaller pictures |
@@ -122,8 +122,8 @@ plt.show()
 # ## A thin Gaussian under zoom
 #
 # The same needle is drawn at four sizes, from far (top) to near (bottom). The left column is the truth: the mean of the
-# Gaussian over each pixel. Beside it is what a renderer draws that takes the value at the pixel's centre; that dilates
-# first, as 3DGS does; that uses Mip-Splatting's filter; or that integrates.
+# Gaussian over each pixel. Beside it are four renderers: one takes the value at the pixel's centre; one dilates first,
+# as 3DGS does; one uses Mip-Splatting's filter; one integrates.
 
 # %%
 ZOOMS, MEAN, ANGLE = (0.25, 0.5, 1.0, 2.0), np.array([0.3, 0.4]), 0.5
@@ -166,8 +166,8 @@ plt.show()
 # $l_k$. There the pixel's square is turned with the ellipse, which is why the integral is close and not exact.
 #
 # The same over all sizes. On the right is Mip-Splatting's second filter, in space: a scale grows by what the nearest
-# training view could resolve, and the opacity falls so that the product with the scales stays. Approaching the Gaussian
-# beyond that view then shows no needles that nobody has seen.
+# training view could resolve, and the opacity falls so that the product with the scales stays. Moving closer than that
+# view then shows no needles that no photograph contains.
 
 # %%
 sigmas = np.geomspace(0.1, 2, 14)
@@ -310,9 +310,9 @@ print(f"{n_common} of {len(importance) // 2} are kept by both scores")
 # $$ S_i = I_i\, LD_i^\lambda, \qquad LD_i = \tfrac13 \sum_{\text{channels}} |c_i - c_{\text{prev}}| +
 #    |c_i - c_{\text{next}}|, \qquad \lambda = 2 . $$
 #
-# Neighbours are the ones before and after in Morton order, which sorts a tree of cubes into a line. What is textured is
-# bright in the middle picture, walls are dark. Right after pruning the second score has the lower PSNR here. Neither
-# half is meant to be used as it is: training goes on, and `study omg/distinctiveness` measures what is gained then.
+# Neighbours are the ones before and after in Morton order, which sorts an octree into a line. Textured parts are bright
+# in the middle picture, walls are dark. Right after pruning the second score has the lower PSNR here. Neither half is
+# meant to be used as it is: training goes on, and `study omg/distinctiveness` measures the gain after it.
 #
 # ## Storing: an error with a bound
 #

@@ -17,12 +17,12 @@
 # # 17 How a scene tells its size
 #
 # How many Gaussians does a scene need, and when has it been learned? The recipe `adaptive` has no schedule. It holds
-# some *training* views back, lets the population grow, and ends when those views gain little.
+# out some *training* views, lets the population grow, and ends when those views gain little.
 #
 # Below it trains, with the same settings, a room whose walls are bare, and the same room with textures and more
-# furniture. On the left are two views that no decision has looked at. On the right is what the training saw of itself:
-# the PSNR of the views held back, and the number of Gaussians. A dotted line marks where the cool-down begins, and with
-# it the prune.
+# furniture. On the left are two views that no decision has used. On the right is what the training measured: the PSNR
+# of the held-out views, and the number of Gaussians. A dotted line marks where the cool-down begins, and with it the
+# prune.
 
 # %%
 from functools import partial
@@ -90,9 +90,9 @@ plt.show()
 # %% [markdown]
 # The bare room ends earlier and with fewer Gaussians, at a higher PSNR. At this size it is not the *growth* that tells
 # them apart: the curves of the counts lie on each other until the first one ends. What tells them apart is when the end
-# comes, and what the prune leaves. Do not make much of the end, one measurement earlier by a slope just below the
-# threshold, with three views held back. The prune leaves three fifths of the Gaussians of the bare room, and seven
-# tenths of the other. This is the log of the decisions, as the state keeps it:
+# comes, and what the prune leaves. Do not read much into the end, which is one measurement earlier, by a slope just
+# below the threshold, with three held-out views. The prune keeps three fifths of the Gaussians of the bare room, and
+# seven tenths of the other. This is the log of the decisions, as the state keeps it:
 
 # %% tags=["rounding"]
 rows = ["| scene | iteration | decision | why |", "|---|---|---|---|"]
@@ -166,14 +166,14 @@ show_code(halves)
 # %% [markdown]
 # ## The slope: dB for each doubling of the work
 #
-# More iterations nearly always bring a little more. The question is what the little costs, so PSNR is drawn over the
+# More iterations nearly always bring a little more. The question is the cost of that little, so PSNR is drawn over the
 # logarithm of the work. A line goes through the measurements since half of the work,
 #
 # $$ \mathrm{PSNR} \approx c + g \log_2(\text{pairs}), $$
 #
 # and the rates begin to fall when $g < 0.3$ dB. As they fall, noise in the Gaussians settles and PSNR rises once more.
-# Had they fallen by a schedule, a plateau could have been made by the schedule; with constant rates it is one of the
-# scene. All training views, also those held back, are trained on in the cool-down.
+# With a schedule of falling rates, a plateau could be due to the schedule; with constant rates it is due to the scene.
+# All training views, including the held-out ones, are trained on in the cool-down.
 
 # %% tags=["rounding"]
 figure, axes = plt.subplots(1, 3, figsize=(11, 2.9), width_ratios=(1.3, 1, 1))
@@ -206,9 +206,9 @@ for name, (psnrs, counts) in around.items():
 # %% [markdown]
 # ## The prune
 #
-# In the first iteration of the cool-down those Gaussians stay that carry 98 % of all blend weight in the training
-# views, unless only one view sees them. The right panel and the lines below it show what that costs in the test views,
-# which nothing had looked at, and what the cool-down then makes of the rest.
+# In the first iteration of the cool-down only those Gaussians stay that carry 98 % of all blend weight in the training
+# views, and of these only those that more than one view sees. The right panel and the lines below it show the cost in
+# the test views, which nothing has used, and the gain of the cool-down.
 #
 # ## The gains of photographs
 #
@@ -251,8 +251,8 @@ print(state.pace.decisions[0].why)
 print(", ".join(f"{name}: {value:.2f} of the true gain" for name, value in slopes.items()))
 
 # %% [markdown]
-# What is read off follows the true gains only loosely (correlation 0.55), with far too small a spread, and yet it is
-# enough to notice them. With so few small photographs the scene has probably explained much of the gains itself, by
+# The measured gains follow the true ones only loosely (correlation 0.55), with far too small a spread, but that is
+# enough to detect them. With so few small photographs the scene has probably explained much of the gains itself, by
 # colours that depend on the direction and by Gaussians that only some cameras see. The exposures go on learning. The
 # undisturbed scene has no such decision in its log.
 #

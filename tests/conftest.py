@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import Browser, find_browser
 
 from minisplat_ref.backends import BACKENDS, CPU, REFERENCE
 
@@ -42,3 +43,13 @@ def shared_data():
     if not SHARED_DATA.is_dir():
         pytest.skip(f"no real scenes at {SHARED_DATA}")
     return SHARED_DATA
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory):
+    """A headless Chromium, in which reports are opened."""
+    program = find_browser()
+    if program is None:
+        pytest.skip("no Chromium is installed (Debian: apt-get install chromium), in which reports would be opened")
+    with Browser(program, tmp_path_factory.mktemp("browser")) as opened:
+        yield opened

@@ -77,9 +77,9 @@ def test_noise_is_no_evidence_and_neither_is_what_all_have_in_common():
         assert not weigh(photographs_of(np.full(12, 3.0), 1.0, rng)).is_above(0.0)
 
 
-def test_two_standard_errors_and_the_least_gain():
-    assert Evidence(0.3, 0.1, np.zeros((2, 1))).is_above(0.05)
-    assert not Evidence(0.2, 0.1, np.zeros((2, 1))).is_above(0.05)
+def test_one_standard_error_and_the_least_gain():
+    assert Evidence(0.3, 0.2, np.zeros((2, 1))).is_above(0.05)
+    assert not Evidence(0.2, 0.2, np.zeros((2, 1))).is_above(0.05)
     assert not Evidence(0.04, 0.001, np.zeros((2, 1))).is_above(0.05)
 
 

@@ -10,25 +10,26 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
+from browser import check_page
 from tolerances import BENCH_ROOM_FOR_EXPONENTIAL, ROUNDED_TO_FLOAT32
 
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.bench import (
-    by_turns,
+    benchmark,
     contenders,
+    interleaving,
     large_scene,
     limits,
     peak_memory,
     profiling,
-    race,
-    roofs,
+    roofline,
     slopes,
     start_time,
     training_time,
     workloads,
 )
-from minisplat_ref.bench.by_turns import hold, times_by_turns
 from minisplat_ref.bench.exponentials import EXPONENTIALS, relative_errors
+from minisplat_ref.bench.interleaving import interleaved_times, time_contests
 from minisplat_ref.bench.passes import RASTERIZATION
 from minisplat_ref.bench.peers import peers_of
 from minisplat_ref.cli import main
@@ -74,7 +75,7 @@ def tiny_workloads(monkeypatch):
 
 @pytest.fixture(scope="module")
 def cases():
-    return {case.name: case for case in race.race(tiny(), contenders.choose(NAMES), repeats=2)}
+    return {case.name: case for case in benchmark.benchmark(tiny(), contenders.choose(NAMES), repeats=2)}
 
 
 def test_everyone_is_judged_and_timed(cases):
@@ -105,7 +106,7 @@ def test_ratios_are_of_the_least_times(cases):
     for ratio, time in (("x textbook", "least both ms"), ("x textbook, forward", "least forward ms")):
         assert textbook[ratio] == 1
         assert figures[ratio] == pytest.approx(textbook[time] / figures[time])
-    [reference] = race.race(tiny(), contenders.choose(()), repeats=1)  # and no baseline
+    [reference] = benchmark.benchmark(tiny(), contenders.choose(()), repeats=1)  # and no baseline
     assert reference.figures["x textbook"] is None and reference.figures["x textbook, forward"] is None
 
 
@@ -114,7 +115,7 @@ def test_rasterization_is_judged_as_render_is(backend):
     """In float64 its image and gradient are the reference's, activations included, or it gets no time."""
     bounds = BENCH_FLOAT64, BENCH_FLOAT64
     contender = contenders.Contender("rasterization", backend, np.float64, *bounds, passes=RASTERIZATION)
-    [_, case] = race.race(tiny(), [*contenders.choose(()), contender], repeats=1)
+    [_, case] = benchmark.benchmark(tiny(), [*contenders.choose(()), contender], repeats=1)
     assert case.passed == (backend is CPU) and (case.figures["both ms"] is None) == (backend is not CPU)
     assert ("gradient of" in case.note) == (backend is not CPU)
 
@@ -137,7 +138,7 @@ def with_pixel(value):
 )
 def test_a_wrong_backend_gets_no_time(backend, reason):
     wrong = contenders.Contender("wrong", backend, np.float32)
-    [_, case] = race.race(tiny(), [*contenders.choose(()), wrong], repeats=2)
+    [_, case] = benchmark.benchmark(tiny(), [*contenders.choose(()), wrong], repeats=2)
     assert not case.passed and reason in case.note
     assert case.figures["turns"] == 0 and case.figures["both ms"] is None
 
@@ -232,20 +233,34 @@ def test_garden_is_the_published_workload(shared_data):
     assert np.isin(subset.gaussians.means[:, 0], garden.gaussians.means[:, 0]).all()
 
 
-def test_command_writes_json_table_and_figure(tmp_path, capsys):
-    folder = tmp_path / "new" / "bench"
+@pytest.fixture(scope="module")
+def bench_folder(tmp_path_factory):
+    """What the command writes of two tiny workloads."""
+    folder = tmp_path_factory.mktemp("benches") / "new" / "bench"
     args = ["bench", "--workloads", "synth,synth5k", "--backends", "cpu-f32,textbook-f32", "--repeats", "1"]
-    assert main([*args, "--out", str(folder)]) == 0
-    report = json.loads((folder / "bench.json").read_text())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(workloads.FREE, "synth", tiny)
+        patch.setitem(workloads.FREE, "synth5k", lambda: tiny()._replace(name="synth5k"))
+        assert main([*args, "--out", str(folder)]) == 0
+    return folder
+
+
+def test_command_writes_json_table_figure_and_page(bench_folder):
+    report = json.loads((bench_folder / "bench.json").read_text())
     expected = [f"{w}/{c}" for w in ("synth", "synth5k") for c in ("reference-f64", "cpu-f32", "textbook-f32")]
     assert [case["name"] for case in report["cases"]] == expected
     assert all(case["passed"] and case["both ms"] > 0 for case in report["cases"])
     assert report["settings"]["repeats"] == 1 and report["settings"]["processor"]
-    table = (folder / "bench.md").read_text()
-    assert all(name in table for name in expected)
-    picture = read_image(folder / "bench.png")
+    table, page = ((bench_folder / name).read_text() for name in ("bench.md", "report.html"))
+    for text in (table, page):
+        assert all(name in text for name in expected)
+    picture = read_image(bench_folder / "bench.png")
     assert picture.shape[1] > 800 and len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 20
-    assert "all 6 cases passed" in capsys.readouterr().out
+    assert page.count("<svg") == 4 and "6 of 6" in page
+
+
+def test_the_page_in_a_browser(bench_folder, browser):
+    check_page(browser, bench_folder / "report.html")
 
 
 def test_command_fails_with_a_wrong_backend(monkeypatch, tmp_path, capsys):
@@ -295,8 +310,8 @@ def test_opensplat_is_timed_by_its_command_line(tmp_path, capsys, monkeypatch):
     steps = 'for i in $(seq "$3"); do sleep 0.02; echo "Step $i: 0.4 [50%]"; done'  # the third argument is -n's value
     program = _fake_opensplat(tmp_path, f'echo $(ls $1 $1/sparse/0 $1/images/) $OMP_WAIT_POLICY "$@" >> {log}; {steps}')
     scene = ["--scene", str(tmp_path / "room"), "--iterations", "2"]
-    race_ = ["--workloads", "synth", "--backends", "cpu-f32", "--repeats", "1"]
-    assert main(["bench", *race_, *scene, "--against", f"opensplat={program}", "--json", str(tmp_path / "b.json")]) == 0
+    once = ["--workloads", "synth", "--backends", "cpu-f32", "--repeats", "1"]
+    assert main(["bench", *once, *scene, "--against", f"opensplat={program}", "--json", str(tmp_path / "b.json")]) == 0
     calls = log.read_text().splitlines()
     assert [call.split(" -n ")[1].split()[:3] for call in calls] == [["7", "-d", "1"]] * 2  # five warm up
     for call in calls:
@@ -309,17 +324,17 @@ def test_opensplat_is_timed_by_its_command_line(tmp_path, capsys, monkeypatch):
     assert "not compared here" in theirs["note"] and "of 4 iterations, " in theirs["note"]
     assert ours["note"].endswith("Gaussians, 32 x 24")
     broken = _fake_opensplat(tmp_path, "echo no such scene >&2; echo usage >&2; exit 3")
-    assert main(["bench", *race_, *scene, "--against", f"opensplat={broken}"]) == 2
+    assert main(["bench", *once, *scene, "--against", f"opensplat={broken}"]) == 2
     assert "no such scene" in capsys.readouterr().err
     silent = _fake_opensplat(tmp_path, "echo Done")
-    assert main(["bench", *race_, *scene, "--against", f"opensplat={silent}"]) == 2
+    assert main(["bench", *once, *scene, "--against", f"opensplat={silent}"]) == 2
     assert "0 lines for 7 iterations" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(not (find_spec("torch") and find_spec("gsplat")), reason="needs torch and gsplat, the extra peers")
 def test_gsplat_is_a_contender():
     [gsplat], program = peers_of(["gsplat-torch"])
-    [_, case] = race.race(tiny(), [*contenders.choose(()), gsplat], repeats=1)
+    [_, case] = benchmark.benchmark(tiny(), [*contenders.choose(()), gsplat], repeats=1)
     assert program is None and case.passed, case
     assert case.name == "synth/gsplat-torch" and case.figures["both ms"] > 0
 
@@ -342,30 +357,30 @@ def test_stages_add_up_to_the_iteration(tmp_path, monkeypatch):
 
 
 def test_tasks_alternate_in_every_round(monkeypatch):
-    clock, turns = [0.0], []
+    clock, runs = [0.0], []
 
     def task(name, *seconds):
         def run():
-            turns.append(name)
-            clock[0] += seconds[turns.count(name) - 1]
+            runs.append(name)
+            clock[0] += seconds[runs.count(name) - 1]
 
         return run
 
-    monkeypatch.setattr(by_turns.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(interleaving.time, "perf_counter", lambda: clock[0])
     groups = [[task("a", 9, 1, 5, 2, 1), task("b", 9, 3, 3, 3, 3)], [task("c", 9, 4, 4, 4, 4)]]
-    [a, b], [c] = times_by_turns(groups, rounds=2, repeats=2)
-    assert "".join(turns) == "abc" + "ababcc" * 2
+    [a, b], [c] = interleaved_times(groups, rounds=2, repeats=2)
+    assert "".join(runs) == "abc" + "ababcc" * 2
     assert (a, b, c) == ((1, 1.5), (3, 3), (4, 4))  # without the first turn, which compiles
 
 
 def test_straight_lines_do_the_arithmetic_of_a_hit():
-    lines = roofs.StraightLines(2)
+    lines = roofline.StraightLines(2)
     lines.forward()
     lines.backward()
     assert 0 < lines.image_error() < BENCH_FLOAT32_IMAGE
     assert 0 < lines.gradient_error() < BENCH_FLOAT32_GRADIENT
-    assert lines.n_pairs == 2 * roofs.N_PASSES * roofs.N_HITS * 32 * 16
-    for copy, i in np.ndindex(2, roofs.N_SUMS):
+    assert lines.n_pairs == 2 * roofline.N_PASSES * roofline.N_HITS * 32 * 16
+    for copy, i in np.ndindex(2, roofline.N_SUMS):
         lines.sums[copy, i] *= 1.01
         assert lines.gradient_error() > BENCH_FLOAT32_GRADIENT
         lines.sums[copy, i] /= 1.01
@@ -374,7 +389,7 @@ def test_straight_lines_do_the_arithmetic_of_a_hit():
 
 
 def test_threads_give_the_same_bytes():
-    cases = hold(limits.threads(tiny()), repeats=1)
+    cases = time_contests(limits.threads(tiny()), repeats=1)
     assert len(cases) == (numba.get_num_threads() > 1)
     assert all(case.passed and case.figures["x"] > 0 for case in cases)
 
@@ -398,14 +413,14 @@ def test_training_on_one_thread_gives_the_same_bytes(monkeypatch):
 
 def test_adam_moves_the_part_that_is_seen(monkeypatch):
     monkeypatch.setattr(limits, "N", 1_000)
-    whole, part = hold(limits.adams(), repeats=1)
+    whole, part = time_contests(limits.adams(), repeats=1)
     assert whole.passed and part.passed and part.name == "roof/adam 30% of 1,000"
 
     def step_of_all(parameters, gradient, state, rates, rule, rows):
         return adam_step(parameters, gradient, state, rates, rule._replace(is_visible_only=False), rows)
 
     monkeypatch.setattr(limits, "adam_step", step_of_all)
-    whole, part = hold(limits.adams(), repeats=1)
+    whole, part = time_contests(limits.adams(), repeats=1)
     assert whole.passed and not part.passed
 
 

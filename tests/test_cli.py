@@ -1,8 +1,10 @@
 """The command line from end to end: what each command leaves, how it is continued and interrupted, its help."""
 
+import html
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -10,6 +12,7 @@ import time
 
 import numpy as np
 import pytest
+from browser import check_page
 from tolerances import PSNR_FLOAT32
 
 import minisplat_ref
@@ -31,7 +34,7 @@ from minisplat_ref.rendering import render
 WIDTH, HEIGHT = 32, 24
 N_TRAIN, N_TEST = 6, 2
 ITERATIONS = 20
-HELP_LINES_MAX, HELP_COLUMNS_MAX = 40, 80
+HELP_LINES_MAX, HELP_COLUMNS_MAX = 45, 80
 SETTINGS = {"n_views": N_TRAIN, "width": WIDTH, "height": HEIGHT, "n_points": 60, "test_every": 4}
 RUN_FILES = {
     "cameras.json",
@@ -43,6 +46,7 @@ RUN_FILES = {
     "metrics.json",
     "point_cloud.ply",
     "renders",
+    "report.html",
 }
 
 
@@ -115,6 +119,7 @@ def test_train_leaves_a_complete_folder(run_folder, scene_folder):
         "lpips_weights": None,
         "minutes": None,
         "init": None,
+        "background": None,
     }
     assert config["recipe"]["iterations"] == ITERATIONS and config["versions"]["numba"]
 
@@ -291,21 +296,60 @@ def test_info_names_counts(run_folder, scene_folder, capsys):
 # demo
 
 
-def test_demo_writes_a_self_contained_report(tmp_path, monkeypatch, capsys):
+@pytest.fixture(scope="module")
+def demo_folder(tmp_path_factory):
+    """What a demo leaves, in a folder whose name a shell would take apart."""
+    place = tmp_path_factory.mktemp("a demo")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demo, "SCENE", {**demo.SCENE, **SETTINGS})
+        patch.chdir(place)
+        assert main(["demo", "--iterations", "10"]) == 0
+    return place / "minisplat-demo"
+
+
+def test_demo_does_not_touch_another(demo_folder, monkeypatch, capsys):
     monkeypatch.setattr(demo, "SCENE", {**demo.SCENE, **SETTINGS})
-    monkeypatch.chdir(tmp_path)
-    assert main(["demo", "--iterations", "10"]) == 0
-    assert main(["demo", "--iterations", "5"]) == 0  # does not touch the first
-    out = capsys.readouterr().out
-    assert str(tmp_path / "minisplat-demo-2" / "report.html") in out
-    folder = tmp_path / "minisplat-demo"
-    assert {path.name for path in folder.iterdir()} == RUN_FILES | {"scene", "report.html"}
+    monkeypatch.chdir(demo_folder.parent)
+    before = (demo_folder / "metrics.json").read_bytes()
+    assert main(["demo", "--iterations", "5"]) == 0
+    assert (demo_folder / "metrics.json").read_bytes() == before
+    assert str(demo_folder.parent / "minisplat-demo-2" / "report.html") in capsys.readouterr().out
+
+
+def test_demo_writes_a_self_contained_report(demo_folder):
+    folder = demo_folder
+    assert {path.name for path in folder.iterdir()} == RUN_FILES | {"scene"}
     page = (folder / "report.html").read_text()
     links = re.findall(r'(?:src|href)="([^"]*)"', page)
     assert all(link.startswith(("data:image/png;base64,", "#")) for link in links)
-    assert not re.search(r"url\((?!#)|@import|<script|<link", page)
+    assert not re.search(r"url\((?!#)|@import|<script src|<link", page)
     assert page.count("data:image/png") == 3 * 2 * N_TEST and page.count("<svg") == 3
     assert f"{read_json(folder / 'metrics.json')['psnr']:.2f} dB" in page
+
+
+def test_the_commands_of_a_demo_run_from_anywhere(demo_folder, tmp_path):
+    """The first of them, in a shell, in another folder."""
+    page = html.unescape((demo_folder / "report.html").read_text())
+    line = re.search(r"<pre[^>]*>(.*render .*)</pre>", page)[1]
+    assert shlex.quote(str(demo_folder)) in line
+    subprocess.run(f"{line} --frames 1", shell=True, cwd=tmp_path, check=True)
+    assert not any(tmp_path.iterdir()) and any(demo_folder.rglob("*orbit*"))
+
+
+def test_the_report_of_a_demo_in_a_browser(demo_folder, browser):
+    check_page(browser, demo_folder / "report.html")
+
+
+def test_the_report_of_a_training_in_a_browser(run_folder, browser):
+    check_page(browser, run_folder / "report.html")
+
+
+def test_the_report_of_a_training_shows_it(run_folder):
+    page, metrics = (run_folder / "report.html").read_text(), read_json(run_folder / "metrics.json")
+    worst = min(metrics["per_view"], key=lambda view: view["psnr"])
+    assert f"{metrics['psnr']:.2f} dB" in page and f"PSNR of the worst, {worst['name']}" in page
+    assert page.count("data:image/png") == 3 * N_TEST and page.count('class="slider"') == N_TEST
+    assert page.count("<svg") == 3 and "What was decided" not in page
 
 
 # help

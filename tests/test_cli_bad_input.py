@@ -248,7 +248,7 @@ def compare_refused(refused, tmp_path):
     ("options", "reason"),
     [
         (["--iterations", "3,2,1"], "3 numbers for 2 recipes"),
-        (["--test-every", "0"], "without test views"),
+        (["--test-every", "0"], "has no test views"),
         (["--test-every", "1"], "0 training and 6 test"),
         (["--seeds", "1,0,1"], "--seeds names 1 more than once"),
         (["--budget", "10"], "--budget means nothing to 3dgs, 3dgs-accel"),

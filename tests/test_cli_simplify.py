@@ -6,6 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
+from browser import check_page
 from numpy.testing import assert_array_equal
 from tolerances import CLOSED_FORM
 
@@ -217,6 +218,10 @@ def test_budget(halved, run_folder):
     assert read_image(halved / "figure.png").std() > 1
     page = (halved / "report.html").read_text()
     assert "<svg" in page and 'href="http' not in page and page.count("data:image/png") == 3 * len(test["views"])
+
+
+def test_the_report_in_a_browser(halved, browser):
+    check_page(browser, halved / "report.html")
 
 
 def test_the_new_folder_is_a_run(halved, tmp_path, capsys):

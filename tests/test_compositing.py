@@ -337,11 +337,11 @@ def test_gradient_of_an_output_from_elsewhere(fast_backend, rng):
     grid = TileGrid(6, 5, fast_backend.tile_width, fast_backend.tile_height)
     bins = fast_backend.bin_gaussians(projection, grid, GSPLAT_MAIN)
     output = fast_backend.composite(*inputs, bins, GSPLAT_MAIN)
-    assert output.kept is not None
+    assert output.saved is not None
     v = rng.normal(size=(5, 6, 3)), rng.normal(size=(5, 6))
     gradients = [
         fast_backend.composite_vjp(*inputs, bins, GSPLAT_MAIN, any_output, *v)
-        for any_output in (output, output._replace(kept=None))
+        for any_output in (output, output._replace(saved=None))
     ]
     assert all(np.abs(part).max() > GRADIENT_FLOOR for part in gradients[0])
     for ours, theirs in zip(*gradients, strict=True):

@@ -53,7 +53,7 @@ def test_downscale(tmp_path, rng, capsys):
     for name, image in images.items():
         write_image(tmp_path / "images" / name, image)
     on_the_fly = load_scene(tmp_path, downscale=5)
-    assert main(["downscale", str(tmp_path), "--factor", "5"]) == 0
+    assert main(["downscale", str(tmp_path), "--downscale", "5"]) == 0
     assert capsys.readouterr().out == f"{tmp_path / 'images_5'}\n"
     for name, image in images.items():
         np.testing.assert_array_equal(read_image(tmp_path / "images_5" / name), resize_image(image, 6, 5))
@@ -74,8 +74,11 @@ def test_downscale_of_a_folder_of_images(tmp_path):
     [
         (["nowhere"], "no such folder"),
         (["empty"], "no images in it"),
-        (["scene", "--factor", "1"], "--factor is 1; it must be at least 2"),
-        (["scene", "--factor", "3"], "images_3: already there and not empty; choose another name or remove it first"),
+        (["scene", "--downscale", "1"], "--downscale is 1; it must be at least 2"),
+        (
+            ["scene", "--downscale", "3"],
+            "images_3: already there and not empty; choose another name or remove it first",
+        ),
         (["broken"], "b.png: not an image that Pillow can read"),
     ],
 )

@@ -131,7 +131,7 @@ def test_what_was_held_back_to_the_end_is_raised_there():
     handler = signal.getsignal(signal.SIGINT)
     done = []
     with pytest.raises(KeyboardInterrupt), Interruptions() as interruptions:
-        interruptions.hold()
+        interruptions.defer()
         press()
         done.append(np.zeros(3))
     assert len(done) == 1 and signal.getsignal(signal.SIGINT) is handler

@@ -9,27 +9,27 @@ from minisplat_ref.cpu.compositing.exponential import exp_exact, exp_fast
 from minisplat_ref.jit.lanes import (
     WIDTH,
     accumulate,
-    any_of,
     bits_between,
-    converted,
-    counted,
-    filled,
+    broadcast,
+    cast,
     floor,
     gather,
-    larger,
-    largest_of,
+    iota,
+    ldexp,
     load,
     lowest_bit,
-    nearest,
+    maximum,
+    minimum,
     prefetch,
-    scaled_by_power,
+    reduce_any,
+    reduce_max,
+    reduce_sum,
+    reduce_sums,
+    rint,
     scatter,
     select,
-    smaller,
     sqrt,
     store,
-    sum_of,
-    sums_of,
 )
 from minisplat_ref.jit.literals import ONE
 
@@ -58,10 +58,10 @@ OPERATIONS = {
     "divide": lambda a, b: a / b,
     "negative": lambda a, b: -a,
     "absolute": lambda a, b: abs(a),
-    "larger": lambda a, b: larger(a, b),
-    "smaller": lambda a, b: smaller(a, b),
+    "maximum": lambda a, b: maximum(a, b),
+    "minimum": lambda a, b: minimum(a, b),
     "floor": lambda a, b: floor(a),
-    "nearest": lambda a, b: nearest(a),
+    "nearest": lambda a, b: rint(a),
     "root": lambda a, b: sqrt(abs(a)),
     "select": lambda a, b: select((a < b) & (a > -b), a, b),
     "select at equality": lambda a, b: select(a >= a, select(b <= b, a, b), b),
@@ -91,8 +91,8 @@ def test_operation(operation, dtype, rng):
 def test_single_number_is_taken_eight_times(dtype, rng):
     def run(a, number, out):
         store(out, 0, number - load(a, 0))
-        store(out, WIDTH, filled(a[0]))
-        store(out, 2 * WIDTH, counted(a[0]))
+        store(out, WIDTH, broadcast(a[0]))
+        store(out, 2 * WIDTH, iota(a[0]))
         store(out, 3 * WIDTH, number)
 
     a, number = rng.normal(size=WIDTH).astype(dtype), np.float32(0.75)
@@ -102,7 +102,7 @@ def test_single_number_is_taken_eight_times(dtype, rng):
 
 
 def test_wider_number_does_not_meet_narrower_lanes():
-    product = compiled(lambda a, number: sum_of(load(a, 0) * number))
+    product = compiled(lambda a, number: reduce_sum(load(a, 0) * number))
     with pytest.raises(numba.TypingError):
         product(np.ones(WIDTH, np.float32), 0.5)
     assert product(np.ones(WIDTH), np.float32(0.5)) == 4
@@ -115,7 +115,7 @@ def test_lanes_are_not_changed_in_place():
     def add(a):
         total = load(a, 0)
         total += load(a, 0)
-        return sum_of(total)
+        return reduce_sum(total)
 
     with pytest.raises(numba.TypingError):
         add(np.ones(WIDTH))
@@ -126,10 +126,10 @@ def test_reductions_have_one_order(dtype, rng):
     def run(a, out):
         first = load(a, 0), load(a, WIDTH), load(a, 2 * WIDTH), load(a, 3 * WIDTH)
         last = load(a, 4 * WIDTH), load(a, 5 * WIDTH), load(a, 6 * WIDTH), load(a, 7 * WIDTH)
-        store(out, 0, sums_of((*first, *last)))
+        store(out, 0, reduce_sums((*first, *last)))
         for i in range(8):
-            out[WIDTH + i] = sum_of(load(a, i * WIDTH))
-            out[2 * WIDTH + i] = largest_of(load(a, i * WIDTH))
+            out[WIDTH + i] = reduce_sum(load(a, i * WIDTH))
+            out[2 * WIDTH + i] = reduce_max(load(a, i * WIDTH))
 
     a = rng.normal(size=8 * WIDTH).astype(dtype)
     fast, plain = two_ways(run, a, np.zeros(3 * WIDTH, dtype))
@@ -144,15 +144,15 @@ def test_reductions_have_one_order(dtype, rng):
 @pytest.mark.parametrize("lane", range(WIDTH))
 def test_any_sees_every_lane(lane):
     a = np.zeros(WIDTH, np.float32)
-    found = compiled(lambda a: any_of(load(a, 0) > np.float32(0.5)))
-    assert not found(a) and not any_of(a > 0.5)
+    found = compiled(lambda a: reduce_any(load(a, 0) > np.float32(0.5)))
+    assert not found(a) and not reduce_any(a > 0.5)
     a[lane] = 1
-    assert found(a) and any_of(a > 0.5)
+    assert found(a) and reduce_any(a > 0.5)
 
 
 def test_power_of_two_is_added_to_the_exponent(rng):
     def run(a, n, out):
-        store(out, 0, scaled_by_power(load(a, 0), load(n, 0)))
+        store(out, 0, ldexp(load(a, 0), load(n, 0)))
 
     a, n = rng.uniform(0.7, 1.4, WIDTH).astype(np.float32), rng.integers(-60, 1, WIDTH).astype(np.float32)
     fast, plain = two_ways(run, a, n, np.zeros_like(a))
@@ -197,7 +197,7 @@ ROWS = (9, 0, 4, 4, 7, 2, 11, 5)
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_gather_takes_a_column_of_eight_rows(dtype, table_dtype, rng):
     def run(table, zero, out):
-        store(out, 0, converted(gather(table, ROWS, 2), zero))
+        store(out, 0, cast(gather(table, ROWS, 2), zero))
 
     table = (10 * rng.normal(size=(12, 3))).astype(table_dtype)
     fast, plain = two_ways(run, table, dtype(0), np.zeros(WIDTH, dtype))

@@ -11,8 +11,8 @@ N = LARGE // 4 + 1000
 
 
 @pytest.fixture(autouse=True)
-def nothing_kept(monkeypatch):
-    monkeypatch.setattr(memory, "_kept", [])
+def nothing_cached(monkeypatch):
+    monkeypatch.setattr(memory, "_cached", [])
 
 
 def address(array):
@@ -41,13 +41,13 @@ def test_not_while_a_view_is_held():
 def test_other_sizes_get_their_own():
     first = large_empty((4 * N,), SINGLE)
     del first
-    [block] = memory._kept
+    [block] = memory._cached
     much_smaller = large_empty((N,), SINGLE)
-    assert memory._kept == []  # what does not fit is given back
+    assert memory._cached == []  # what does not fit is given back
     assert not np.shares_memory(block, much_smaller)
 
 
-def test_small_arrays_are_not_kept():
+def test_small_arrays_are_not_cached():
     small = large_empty((10,), SINGLE)
     del small
-    assert memory._kept == []
+    assert memory._cached == []

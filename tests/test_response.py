@@ -26,7 +26,7 @@ from minisplat_ref.cpu.compositing.exponential import exp_exact
 from minisplat_ref.cpu.compositing.responses import KernelResponse, conic_response
 from minisplat_ref.errors import InputError
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import larger, load, select
+from minisplat_ref.jit.lanes import load, maximum, select
 from minisplat_ref.jit.literals import ONE, TWO, ZERO
 from minisplat_ref.reference import compositing
 from minisplat_ref.reference.hits import CONIC, Hit, Response, blending_order, tile_hits
@@ -86,7 +86,7 @@ def dome_kernel_response():
     @scalar
     def hit(records, n, x, y):
         u, v = (x - records[n, 0]) * records[n, 2], (y - records[n, 1]) * records[n, 2]
-        height = larger(ONE - (u * u + v * v), ZERO)
+        height = maximum(ONE - (u * u + v * v), ZERO)
         return records[n, 3] * height, records[n, 4] + u * records[n, 5] + v * records[n, 6], (u, v + ZERO * u, height)
 
     @scalar

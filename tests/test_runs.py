@@ -240,7 +240,7 @@ def test_measuring_other_photographs_needs_a_place_for_it(done, scene, tmp_path,
     assert read_json(out / "metrics.json")["notes"] and len(list((out / "renders").iterdir())) == 2
     assert main(["eval", str(done), "--out", str(out)]) == 0  # an earlier evaluation is replaced
     (out / "letters.txt").write_text("")
-    assert f"{out} holds something else than an evaluation" in refused("eval", done, "--out", out)
+    assert f"{out} holds something other than an evaluation" in refused("eval", done, "--out", out)
 
 
 def test_pictures_of_views_that_are_no_more_do_not_stay(done):
@@ -591,7 +591,7 @@ def test_pictures_of_somebody_else_are_not_touched(done, tmp_path, refused):
     (out / "beach.png").write_bytes(b"")
     (out / "notes.txt").write_text("")
     line = refused("render", done, "--out", out)
-    assert f"{out} holds other pictures than those of a rendering, such as beach.png" in line
+    assert f"{out} holds pictures other than those of a rendering, such as beach.png" in line
     assert {path.name for path in out.iterdir()} == {"beach.png", "notes.txt"}
     (out / "beach.png").unlink()
     (out / "pictures.json").write_text('{"pictures": ["../../run/checkpoint", "../x"]}')

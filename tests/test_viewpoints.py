@@ -7,7 +7,8 @@ import pytest
 from scenes import make_camera
 from tolerances import CLOSED_FORM, ORBIT_DAMPING
 
-from minisplat_ref.io.viewpoints import Viewpoint, orbit, read, to_json
+from minisplat_ref.io.orbits import orbit
+from minisplat_ref.io.viewpoints import Viewpoint, read, to_json
 
 WIDTH, HEIGHT = 24, 18
 

@@ -27,3 +27,4 @@ def test_wheel_holds_the_package_alone(tmp_path):
     assert {name.split("/")[0] for name in names} == {"minisplat_ref", f"minisplat_ref-{version}.dist-info"}
     expected = {path.relative_to(ROOT).as_posix() for path in (ROOT / "minisplat_ref").rglob("*.py")}
     assert {name for name in names if name.endswith(".py")} == expected
+    assert "minisplat_ref/py.typed" in names  # so that type checkers look into the package

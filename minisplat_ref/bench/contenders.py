@@ -1,7 +1,7 @@
-"""Who draws the workloads: backends in their precisions, exponentials of other degrees, shorter cut-offs, the baseline.
+"""What draws the workloads: backends in their precisions, other exponentials, shorter cut-offs, the baseline.
 
-A shorter cut-off is another image by intention. It is held to the float64 kernels with the same cut-off; the error that
-is reported is the one that counts for its user, against the reference with the default's.
+A shorter cut-off gives another image on purpose. It is judged by the float64 kernels with the same cut-off; the
+reported error is the one that matters to its user, against the reference with the default cut-off.
 """
 
 import functools
@@ -30,7 +30,7 @@ DEGREE_IN_USE = 5
 
 
 class Contender(NamedTuple):
-    """A way to draw, and what it must be good for."""
+    """A way to draw, and its error bounds."""
 
     name: str
     """Unique."""
@@ -39,20 +39,20 @@ class Contender(NamedTuple):
     dtype: type[np.floating]
     """Of all data."""
     image_bound: float = BENCH_FLOAT32_IMAGE
-    """Largest error of a channel at a pixel that stands at no threshold."""
+    """Largest error of a channel at a pixel that is at no threshold."""
     gradient_bound: float = BENCH_FLOAT32_GRADIENT
     """Largest relative L2 error of a parameter's gradient, the same pixels."""
     conventions: Conventions = GSPLAT_MAIN
     """The default's, or with another cut-off."""
     slack: float = 0.0
-    """Relative error of its exponential: so far from a threshold, hits may still fall on the other side."""
+    """Relative error of its exponential: this far from a threshold, hits may still fall on the other side."""
     passes: Passes = RENDER
-    """The public functions that it is called through."""
+    """The public functions through which it is called."""
 
 
 REFERENCE_NAME = "reference-f64"
 BASELINE_NAME = "textbook-f32"
-CHECKED_NAME = "cpu-f64"  # judged first: it says what a shorter cut-off should give
+CHECKED_NAME = "cpu-f64"  # judged first: it is the truth for a shorter cut-off
 
 
 @functools.cache
@@ -75,14 +75,14 @@ def all_contenders() -> dict[str, Contender]:
     return {contender.name: contender for contender in contenders}
 
 
-KNOWN = (REFERENCE.name, CPU.name, CPU_EXACT.name)  # backends that the list names itself; others may be installed
+KNOWN = (REFERENCE.name, CPU.name, CPU_EXACT.name)  # backends that the list already has; others may be installed
 
 CUT_OFFS = {
     "cut-1/128": GSPLAT_MAIN._replace(name="CUT_1_128", alpha_min=1 / 128),
     "cut-1/64": GSPLAT_MAIN._replace(name="CUT_1_64", alpha_min=1 / 64),
     "3-sigma": GSPLAT_MAIN._replace(name="THREE_SIGMA", has_full_support=False),
 }
-"""Hits of higher alpha are skipped too; or a Gaussian ends at three standard deviations, by INRIA's tiles."""
+"""Skip hits of higher alpha too; or cut a Gaussian off at three standard deviations, by INRIA's tiles."""
 
 
 def choose(names: tuple[str, ...] | None) -> list[Contender]:
@@ -109,14 +109,14 @@ def _of_degree(degree: int) -> Contender:
         f"cpu-f32-exp{degree}",
         with_exponential(exp, f"cpu-exp{degree}"),
         np.float32,
-        BENCH_FLOAT32_IMAGE + error,  # a pixel is a mean of colours: alphas off by e move it by at most e
+        BENCH_FLOAT32_IMAGE + error,  # a pixel is a mean of colours: relative errors e of alphas change it by at most e
         BENCH_FLOAT32_GRADIENT + BENCH_EXPONENTIAL_GRADIENT * error,
         slack=error,
     )
 
 
 def with_exponential(exp: Callable, name: str) -> Backend:
-    """Return the CPU backend with blending by another exponential."""
+    """Return the CPU backend with another exponential for blending."""
 
     def composite(
         projection: Projection,

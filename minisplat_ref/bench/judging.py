@@ -1,4 +1,4 @@
-"""Is what a contender draws right? Errors against float64 on the same numbers, flips of thresholds apart."""
+"""Does a contender draw correctly? Errors against float64 on the same numbers, apart from flips at thresholds."""
 
 import time
 from typing import Any, NamedTuple
@@ -24,11 +24,11 @@ class Expected(NamedTuple):
     quiet_gradient: Gaussians
     """For the cotangent without the pixels at thresholds."""
     thresholds: Thresholds
-    """Where those are."""
+    """Pixels at thresholds."""
     forward_seconds: float
-    """That the image took."""
+    """Time of the image."""
     backward_seconds: float
-    """That the gradient took."""
+    """Time of the gradient."""
 
 
 class Verdict(NamedTuple):
@@ -39,7 +39,7 @@ class Verdict(NamedTuple):
     image_rms: float
     """Root mean square over all of them."""
     quiet_image_max: float
-    """Largest error of a pixel that stands at no threshold."""
+    """Largest error of a pixel that is at no threshold."""
     n_flips: int
     """Pixels at thresholds with an error above the bound."""
     n_wrong: int
@@ -49,7 +49,7 @@ class Verdict(NamedTuple):
     quiet_gradient: float
     """The same for the cotangent without the pixels at thresholds."""
     worst_parameter: str
-    """Whose quiet gradient that is."""
+    """The parameter with that largest error."""
 
 
 def expect(workload: Workload, backend: Backend, conventions: Conventions = GSPLAT_MAIN) -> Expected:
@@ -73,14 +73,14 @@ def with_slack(expected: Expected, workload: Workload, conventions: Conventions,
 
 
 def judge(contender: Contender, workload: Workload, expected: Expected) -> Verdict:
-    """Compare a contender with the answer.
+    """Compare a contender with the expected answer.
 
     Parameters
     ----------
     contender : Contender
     workload : Workload
     expected : Expected
-        For the conventions that it is held to: its own to be judged, the default's to be reported.
+        For its own conventions, to judge it; for the default's, to report its error.
     """
     image, tape = forward(contender, workload)
     gradient = backward(contender, tape, workload.v_image)
@@ -104,7 +104,7 @@ def judge(contender: Contender, workload: Workload, expected: Expected) -> Verdi
 
 
 def failure(contender: Contender, verdict: Verdict) -> str:
-    """Say in one line what is wrong; nothing where all is right."""
+    """Say in one line what is wrong; return an empty string if nothing is."""
     if verdict.n_wrong:
         return f"{verdict.n_wrong} pixels are off by more than {contender.image_bound:.1e} and no threshold explains it"
     if not verdict.quiet_gradient <= contender.gradient_bound:
@@ -116,7 +116,7 @@ def failure(contender: Contender, verdict: Verdict) -> str:
 
 
 def forward(contender: Contender, workload: Workload) -> tuple[Floats, Any]:
-    """Draw; returns the image and what :func:`backward` needs."""
+    """Draw; return the image and a tape for :func:`backward`."""
     gaussians = Gaussians._make(field.astype(contender.dtype, copy=False) for field in workload.gaussians)
     return contender.passes.forward(gaussians, workload.camera, contender.conventions, contender.backend)
 

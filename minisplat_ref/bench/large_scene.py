@@ -1,9 +1,9 @@
-"""Trainings on photographs of 12 megapixels: the peak of memory that was foreseen, and the one that was measured.
+"""Trainings on photographs of 12 megapixels: compare the predicted peak of memory with the measured one.
 
 Each is a training as ``train`` does it, in a process of its own: checkpoint, some iterations, PLY and evaluation.
-One holds all photographs in memory. One has two thousand of them, which would take 72 GB, and as many Gaussians as 8 GB
-hold; it runs as if there were no more memory than that. Photographs are made small and enlarged, and of many views a
-few are shown again and again under names of their own: what memory they take does not depend on what is on them.
+One has all photographs in memory. One has two thousand of them, which would take 72 GB, and as many Gaussians as fit
+into 8 GB; it runs as if there were no more memory than that. Photographs are traced small and enlarged, and a few are
+repeated under different names to make many views: their memory does not depend on their content.
 """
 
 import json
@@ -41,7 +41,7 @@ N_TRACED = 8  # views, which larger scenes repeat
 N_POINTS = 20_000
 N_ITERATIONS = 6  # a PSNR is measured in the fifth and the last
 TEST_EVERY = 4
-TOLERANCE = 0.2  # of a foreseen peak
+TOLERANCE = 0.2  # of a predicted peak
 WITHIN = 8e9  # bytes, of the whole process
 SIGMA = 1.5  # pixels: standard deviation of the Gaussians that are given
 RESULT = "result.json"
@@ -57,7 +57,7 @@ class Large(NamedTuple):
     n_gaussians: int | None
     """None to start from the scene's points."""
     within: float | None
-    """Bytes of memory that there are; None for those of the machine."""
+    """Bytes of memory to allow; None for those of the machine."""
 
 
 MODERATE = Large("all in memory", N_TRACED, None, None)
@@ -65,12 +65,12 @@ LARGEST = Large("within 8 GB", 2000, 5_000_000, WITHIN)
 
 
 def large_case(large: Large) -> Case:
-    """Measure; the case fails if the peak is not near what was foreseen, or beyond the memory that there is.
+    """Measure; the case fails if the peak is not near the prediction, or exceeds the allowed memory.
 
     Raises
     ------
     InputError
-        The system does not say how much memory a process holds, or the process ends before it is through.
+        The system does not say how much memory a process uses, or the process ends prematurely.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -128,7 +128,7 @@ def write_photographs(folder: Path, n: int, enlarged: int) -> None:
 
 
 def measure(folder: str, n_gaussians: str, within: str) -> None:
-    """Train on the scenes in a folder, and leave there what the larger one took; for the process."""
+    """Train on the scenes in a folder, and store there the memory of the larger one; runs in its own process."""
     path, n, most = Path(folder), json.loads(n_gaussians), json.loads(within)
     _train(path / "small", path / "first", None)  # loads the kernels
     note = forget_peak()
@@ -140,7 +140,7 @@ def measure(folder: str, n_gaussians: str, within: str) -> None:
 
 
 def _train(scene_folder: Path, out: Path, n: int | None) -> dict[str, float]:
-    """Train; return what was foreseen and what was measured, beyond what was there before, and of the process."""
+    """Train; return predicted and measured peaks, beyond the memory used before, and that of the process."""
     settings = Settings(
         scene=str(scene_folder),
         downscale=1,
@@ -164,7 +164,7 @@ def _train(scene_folder: Path, out: Path, n: int | None) -> dict[str, float]:
 
 
 def _state(scene: Scene, n: int) -> TrainState:
-    """Return ``n`` Gaussians around the scene's points, of a few pixels each, as they are in the end of a training."""
+    """Return ``n`` Gaussians around the scene's points, a few pixels in size each, as at the end of a training."""
     rng, camera = np.random.default_rng(0), scene.train_views[0].camera
     depth = np.median((scene.points @ camera.cam_from_world_R.T + camera.cam_from_world_t)[:, 2])
     sigma = SIGMA * depth / camera.fx

@@ -1,4 +1,4 @@
-"""Single stages on 200,000 Gaussians, Adam against a copy, and what further threads bring."""
+"""Single stages on 200,000 Gaussians, Adam against a copy, and the gain of more threads."""
 
 from collections.abc import Callable, Sequence
 
@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 from minisplat_ref.backends import CPU, REFERENCE, Backend
-from minisplat_ref.bench.by_turns import Contest, Task, Times
+from minisplat_ref.bench.interleaving import Contest, Task, Times
 from minisplat_ref.bench.workloads import Workload, synth
 from minisplat_ref.constants import GSPLAT_MAIN, SH_DEGREE_MAX
 from minisplat_ref.jit.compile import kernel, prange
@@ -19,9 +19,9 @@ from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Ints, Primitiv
 N = 200_000
 SH_COEFFICIENTS = 16  # degree 3
 IMAGE_SHAPE = (270, 480, 3)
-WIDTHS = (3, 4, 3, 1, 3, 45)  # numbers of a Gaussian of degree 3, field by field
+WIDTHS = (3, 4, 3, 1, 3, 45)  # numbers per Gaussian of degree 3, field by field
 ADAM_ARRAYS = 7  # values, gradient and both moments are read, all but the gradient are written
-COPY_TRANSFERS = 3  # a number is read and written, and what it overwrites has come from memory before
+COPY_TRANSFERS = 3  # a number is read and written, and the overwritten cache line is read first
 COPY_CHUNKS = 64
 VISIBLE_SHARE = 0.3
 
@@ -37,20 +37,20 @@ def _copy(  # type: ignore[no-untyped-def]
 
 
 def stages() -> list[Contest]:
-    """Projection with colours, tile lists and the loss in float32, each beside its error.
+    """Return contests of projection with colours, tile lists and the loss in float32, each with its error.
 
     Returns
     -------
     list of Contest
-        A case fails if its result is not the reference's, in float64 on the same numbers.
+        A case fails if its result differs from the reference's, in float64 on the same numbers.
     """
     return [_projection(), _lists(), _loss()]
 
 
 def adams() -> list[Contest]:
-    """Adam on Gaussians of 59 numbers against a copy that moves as many bytes.
+    """Return contests of Adam on Gaussians of 59 numbers against a copy that moves as many bytes.
 
-    Once on all of them, once on a random part as a view that sees few would; only the rows of that part count as moved.
+    One updates all of them, one a random part, like a view that sees few; only the rows of that part count as moved.
     """
     is_seen = np.random.default_rng(5).random(N) < VISIBLE_SHARE
     return [
@@ -91,7 +91,7 @@ def in_ms(times: Times) -> dict[str, Figure]:
 
 
 def threads(workload: Workload) -> list[Contest]:
-    """Forward and backward on one thread and on all; nothing where there is only one."""
+    """Return contests of forward and backward on one thread and on all; none if there is only one thread."""
     n_all = numba.get_num_threads()
     if n_all == 1:
         return []
@@ -123,7 +123,7 @@ def _projection() -> Contest:
     weights = [rng.normal(size=(N, *shape)) for shape in ((2,), (), (3,), (), (3,))]
     camera = workload.camera
     reference, cpu = (_project_and_shade(*pair, camera, weights)() for pair in ((REFERENCE, exact), (CPU, single)))
-    rows = (reference[0][:, 0] > 0) & (cpu[0][:, 0] > 0)  # one on the edge of being culled says nothing
+    rows = (reference[0][:, 0] > 0) & (cpu[0][:, 0] > 0)  # those at the edge of being culled are not compared
     pairs = zip(reference[1:], cpu[1:], strict=True)
     error = max(float(np.linalg.norm(b[rows] - a[rows]) / np.linalg.norm(a[rows])) for a, b in pairs)
     task = _project_and_shade(CPU, single, camera, weights)
@@ -133,14 +133,14 @@ def _projection() -> Contest:
 def _project_and_shade(
     backend: Backend, g: Gaussians, camera: Camera, weights: Sequence[Floats]
 ) -> Callable[[], tuple[Ints, Floats, Floats, Floats, Floats, Floats]]:
-    """Return a task; activations and what it differentiates, ``weights`` on the visible Gaussians, are made before.
+    """Return a task; activations and its cotangents, ``weights`` on the visible Gaussians, are made beforehand.
 
-    It returns radii, then centres, colours and gradients by means, scales and SH.
+    The task returns radii, then centres, colours and gradients with respect to means, scales and SH.
     """
     primitives = Primitives(g.means, g.quats, np.exp(g.log_scales), 1 / (1 + np.exp(-g.opacity_logits)))
     is_visible = backend.project(*primitives, camera, GSPLAT_MAIN).radii[:, 0] > 0
     v = [np.where(is_visible.reshape(-1, *[1] * (w.ndim - 1)), w, 0) for w in weights]
-    # The kernels give and take conics in float64, whatever the data.
+    # The kernels return and take conics in float64, whatever the data.
     dtypes = [g.means.dtype if backend is REFERENCE or k != 2 else np.float64 for k in range(len(v))]
     v = [array.astype(dtype) for array, dtype in zip(v, dtypes, strict=True)]
 
@@ -159,7 +159,7 @@ def _lists() -> Contest:
     workload = synth(N)
     tape = render(_float32(workload.gaussians), workload.camera)[1].splats
     projection, grid = tape.projection, tape.bins.grid
-    # The reference lists more pairs; those that ours leave out must not change the image.
+    # The reference lists more pairs; those that the kernels leave out must not change the image.
     longer = REFERENCE.bin_gaussians(projection, grid, GSPLAT_MAIN)
     image = CPU.composite(projection, tape.channels, tape.background, longer, GSPLAT_MAIN).image
     error = float(np.abs(image - tape.output.image).max())
@@ -183,7 +183,7 @@ def _loss() -> Contest:
 
 
 def _contest(name: str, tasks: tuple[Task, ...], error: float, bound: float, other: str = "") -> Contest:
-    """Return the contest of a stage, whose error is known; ``other`` is what it is compared with, if anything."""
+    """Return the contest of a stage whose error is known; ``other`` names what it is compared with, if anything."""
     note = "" if error <= bound else f"off by {error:.1e}, more than {bound:.1e}"
 
     def judge(times: Sequence[Times]) -> list[Case]:

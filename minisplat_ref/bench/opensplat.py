@@ -1,16 +1,16 @@
-"""OpenSplat, a trainer in C++, timed through its command line; the options are those of version 1.2.
+"""Time OpenSplat, a trainer in C++, through its command line; the options are those of version 1.2.
 
-It prints a line in every iteration, and when a line comes is all that is read of it: times of single iterations have a
-median, which survives that other programs run now and then, and the difference of two whole runs does not. What it
-renders is not compared here; ``oracle compare`` does that with its dumps.
+It prints a line in every iteration, and only the arrival times of these lines are used: the median over single
+iterations is robust against other programs that run now and then, unlike the difference of two whole runs. Its
+renderings are not compared here; ``oracle compare`` does that with its dumps.
 
-Its iteration is made as like ours as its options allow. The number of Gaussians stays, because it never comes to a
-refinement. It counts as densifying all the while, because afterwards it would step its optimiser in every 32nd or 64th
-iteration only. What remains different: it steps the SH coefficients above degree 0 in every 16th iteration, all other
-parameters of all Gaussians in every one, and it adds up the statistics that a refinement would use.
+Its iteration is made as similar to ours as its options allow. The number of Gaussians is constant, because it never
+reaches a refinement. It stays in its densifying phase, because afterwards it would step its optimiser only in every
+32nd or 64th iteration. These differences remain: it steps the SH coefficients above degree 0 in every 16th iteration,
+all other parameters of all Gaussians in every one, and it accumulates the statistics that a refinement would use.
 
-It draws with threads of its own, while those of OpenMP, which its libtorch calculates with, spin while they wait
-for more and take the cores from them, which on a busy machine costs it a multiple of its time. They are told to sleep.
+It renders with threads of its own, while the OpenMP threads of its libtorch spin as they wait and take the cores from
+them, which on a busy machine multiplies its time. They are told to sleep.
 """
 
 import os
@@ -36,9 +36,9 @@ def iteration_seconds(program: Path, scene: Path, downscale: int, iterations: in
     program : Path
         OpenSplat's executable.
     scene : Path
-        Folder of a COLMAP scene. Any other is handed over as it is.
+        Folder of a COLMAP scene. Any other is passed on as it is.
     downscale : int
-        Factor by which the photographs are made smaller.
+        Factor by which the photographs are reduced.
     iterations : int
         Of the training, on the processor.
 
@@ -50,7 +50,7 @@ def iteration_seconds(program: Path, scene: Path, downscale: int, iterations: in
     Raises
     ------
     InputError
-        It cannot be run, or fails, or does not say when an iteration is over.
+        It cannot be run, fails, or does not report iterations.
     """
     with tempfile.TemporaryDirectory() as folder:
         options = ["-n", str(iterations), "-d", str(downscale), *FIXED_POPULATION, "--cpu"]
@@ -81,10 +81,10 @@ def iteration_seconds(program: Path, scene: Path, downscale: int, iterations: in
 
 
 def _lay_out(scene: Path, folder: Path) -> Path:
-    """Return a folder from which it reads the cameras and points that we read.
+    """Return a folder from which it reads the same cameras and points as we do.
 
-    It takes a transforms.json before a COLMAP model, and stops where that names no points; and of COLMAP's two formats
-    it reads the binary one. So it gets a folder with a binary model and links to the pictures, and nothing else.
+    It prefers a transforms.json to a COLMAP model, and stops if that names no points; of COLMAP's two formats it reads
+    only the binary one. So it gets a folder with a binary model and links to the photographs, and nothing else.
     """
     if find_model(scene) is None:
         return scene
@@ -98,6 +98,6 @@ def _lay_out(scene: Path, folder: Path) -> Path:
 
 
 def check_program(program: Path) -> None:
-    """Raise an InputError unless there is something to run, before anything else takes its time."""
+    """Raise an InputError unless the program can be run, before anything else takes time."""
     if not program.is_file() or not os.access(program, os.X_OK):
         raise InputError(f"{program} is not a program: give opensplat=PATH of OpenSplat's executable")

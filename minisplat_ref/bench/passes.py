@@ -1,8 +1,8 @@
-"""Which public functions draw a workload and differentiate it: ``render``, or gsplat's call on activated Gaussians.
+"""The public functions that draw a workload and differentiate it: ``render``, or gsplat's call on activated Gaussians.
 
-Both start from parameters and end with their gradient, so that the times of one can be held against those of the other:
-activations count in both. ``rasterization_vjp`` keeps nothing of the forward pass, as gsplat's signature has it; it
-draws once more, and the time of its backward pass holds that.
+Both start from parameters and end with their gradient, so that their times can be compared: activations count in both.
+``rasterization_vjp`` keeps nothing of the forward pass, because of gsplat's signature; it renders once more, which
+counts as part of its backward pass.
 """
 
 import math
@@ -41,7 +41,7 @@ def _render_vjp(tape: RenderTape, v_image: Floats) -> Gaussians:
 def _rasterization(
     gaussians: Gaussians, camera: Camera, conventions: Conventions, backend: Backend
 ) -> tuple[Floats, dict[str, Any]]:
-    """The call's own arguments are all that its gradient needs."""
+    """Render, and return the call's arguments, which are all that its gradient needs."""
     dtype, viewmat = gaussians.means.dtype, np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = camera.cam_from_world_R, camera.cam_from_world_t
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])

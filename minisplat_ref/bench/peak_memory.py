@@ -1,10 +1,10 @@
-"""How much memory training takes: a few iterations on 200,000 Gaussians in 1920 x 1080, in a process of its own.
+"""The memory that training takes: a few iterations on 200,000 Gaussians in 1920 x 1080, in a process of its own.
 
-Several, because the first does without the moments, which are only then written, and without what one iteration leaves
-to the next. Counted is what that process holds at its peak beyond what it held before the Gaussians were there, with
-all kernels loaded. The bound is what no training can do without (:mod:`minisplat_ref.memory`): the model, Adam's two
-moments, the gradients, the images of an iteration, 150 bytes for what a view makes of every Gaussian, and 48 for every
-pair (tile, Gaussian).
+There are several iterations, because moments are first written at the end of the first, and some memory passes from one
+iteration to the next. The figure is the peak of that process beyond its memory before the Gaussians existed, with all
+kernels loaded. The bound is what every training needs (:mod:`minisplat_ref.memory`): the model, Adam's two moments, the
+gradients, the images of an iteration, 150 bytes for the intermediate values of every Gaussian in a view, and 48 for
+every pair (tile, Gaussian).
 """
 
 import json
@@ -41,7 +41,7 @@ def memory_case() -> Case:
     Raises
     ------
     InputError
-        The system does not say how much memory a process holds, or the process ends before it is through.
+        The system does not say how much memory a process uses, or the process ends prematurely.
     """
     width, height = SIZE
     workload = synth(N, width, height, FOCAL_OF_WIDTH * width)
@@ -83,7 +83,7 @@ def memory_case() -> Case:
 
 
 def measure(folder: str) -> None:
-    """Train on the inputs in a folder, and leave the first iteration's image and the peak there; for the process."""
+    """Train on the inputs in a folder, and store the first image and the peak there; runs in its own process."""
     from minisplat_ref.methods import get_recipe
     from minisplat_ref.training.adam import zero_moments
     from minisplat_ref.training.loop import StepReport, train

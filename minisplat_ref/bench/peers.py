@@ -1,7 +1,7 @@
-"""Other people's renderers, timed in the same run where the user has them.
+"""Other people's renderers, timed in the same run if the user has them.
 
-gsplat's functions in plain PyTorch have no list of the hits of a pixel; theirs is made by CUDA. The adapter takes it
-from the reference, in NumPy, and that is part of its time.
+gsplat's functions in plain PyTorch do not list the hits of a pixel; gsplat does that in CUDA. The adapter takes the
+list from the reference, in NumPy, and that is part of its time.
 """
 
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ def peers_of(names: Sequence[str]) -> tuple[list[Contender], Path | None]:
     Raises
     ------
     InputError
-        A name is unknown, or what it needs is missing.
+        A name is unknown, or its renderer is not installed.
     """
     contenders: list[Contender] = []
     program = None

@@ -1,4 +1,4 @@
-"""How much memory this process holds, and the most that it has held since a moment that can be chosen."""
+"""The memory that this process uses, and its peak since a chosen moment."""
 
 import os
 from pathlib import Path
@@ -7,7 +7,7 @@ from minisplat_ref.errors import InputError
 
 
 def forget_peak() -> str:
-    """Make the system count the peak anew; return what a reader must know where it cannot."""
+    """Reset the system's peak; return a note for the reader if that is impossible."""
     try:
         Path("/proc/self/clear_refs").write_text("5")
     except OSError:
@@ -16,17 +16,17 @@ def forget_peak() -> str:
 
 
 def held() -> int:
-    """Bytes of memory in use now; Linux only, like :func:`forget_peak`."""
+    """Return the bytes of memory in use now; Linux only, like :func:`forget_peak`."""
     return _from_status("VmRSS") or 0
 
 
 def peak() -> int:
-    """Most bytes in use since :func:`forget_peak`, or ever where that does not work."""
+    """Return the most bytes in use since :func:`forget_peak`, or ever where that does not work."""
     return _from_status("VmHWM") or _most_so_far()
 
 
 def _from_status(key: str) -> int | None:
-    """Read a line of what Linux says of this process."""
+    """Read a line of Linux's status of this process."""
     if not os.path.exists("/proc/self/status"):
         return None
     lines = Path("/proc/self/status").read_text().splitlines()

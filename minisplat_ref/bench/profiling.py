@@ -1,6 +1,6 @@
-"""Where a training iteration spends its time: every stage of a backend behind a stopwatch.
+"""Profile a training iteration: time every stage of a backend.
 
-What is not a stage (activations, the photograph as floats, Python between the stages) shows as the rest.
+Everything else (activations, the photograph as floats, Python between the stages) is reported as the rest.
 """
 
 import time
@@ -16,13 +16,13 @@ REST, WHOLE = "rest", "whole iteration"
 
 
 def timed(backend: Backend, seconds: dict[str, float]) -> Backend:
-    """Return the backend with a stopwatch in each stage.
+    """Return the backend with a timer around each stage.
 
     Parameters
     ----------
     backend : Backend
     seconds : dict
-        Gets the sum of the times of every stage that is called, by its name.
+        Receives the total time of every stage that is called, by its name.
     """
     stages: dict[str, Any] = {field.name: getattr(backend, field.name) for field in fields(backend)}
     watched: dict[str, Any] = {name: _timed(f, name, seconds) for name, f in stages.items() if callable(f)}

@@ -1,9 +1,9 @@
-"""What cost grows with: views of the same random scene from few Gaussians to many, and from small images to large.
+"""How cost scales: views of the same random scene from few Gaussians to many, and from small images to large.
 
-A renderer that is close to its limit pays for *hits*, the pairs (pixel, Gaussian) that contribute to the image, and for
-little else; one that is not pays for every Gaussian in every pixel. The slope is that of a straight line through the
+The cost of a renderer close to its limit is proportional to *hits*, the pairs (pixel, Gaussian) that contribute to the
+image; that of a naive one to all Gaussians times all pixels. The slope is that of a straight line through the
 logarithms: 1 is proportional, 0 is constant. Time is forward and backward together, float32, all threads, the least of
-its turns; all views take turns, so that a slow minute of the machine hits all of them.
+its runs; views are timed alternately, so that a slow minute of the machine affects all of them.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,14 +12,14 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.backends import CPU
-from minisplat_ref.bench.by_turns import times_by_turns
+from minisplat_ref.bench.interleaving import interleaved_times
 from minisplat_ref.bench.workloads import Workload, synth
 from minisplat_ref.oracle.cases import Case, Figure
 from minisplat_ref.oracle.tolerances import BENCH_FLIPPED_PIXELS, BENCH_FLOAT32_IMAGE
 from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.types import Floats, Gaussians
 
-FOCAL_OF_WIDTH = 400 / 480  # of ``synth``: a larger image shows the same, finer
+FOCAL_OF_WIDTH = 400 / 480  # of ``synth``: a larger image shows the same at a higher resolution
 SMALL, MIDDLE, LARGE = (480, 270), (960, 540), (1920, 1080)
 VIEWS: tuple[tuple[int, tuple[int, int]], ...] = (
     (12_500, SMALL),
@@ -40,9 +40,9 @@ class View(NamedTuple):
     workload: Workload
     n_hits: int
     flipped: float
-    """Part of the pixels that differ from float64 by more than float32 does."""
+    """Fraction of the pixels that differ from float64 by more than float32's tolerance."""
     draw: Callable[[], object]
-    """Draw and differentiate it."""
+    """Draws and differentiates it."""
 
 
 def slope_cases(repeats: int, report: Callable[[str], None] = lambda _: None) -> list[Case]:
@@ -51,9 +51,9 @@ def slope_cases(repeats: int, report: Callable[[str], None] = lambda _: None) ->
     Parameters
     ----------
     repeats : int
-        Turns of each.
+        Runs of each.
     report : callable
-        Called with a line on what is being done.
+        Called with a line about the progress.
 
     Returns
     -------
@@ -65,15 +65,15 @@ def slope_cases(repeats: int, report: Callable[[str], None] = lambda _: None) ->
         report(f"slopes: {n:,} Gaussians, {width} x {height}")
         views.append(_view(synth(n, width, height, FOCAL_OF_WIDTH * width)))
     report("slopes: taking turns")
-    [turns] = times_by_turns([[view.draw for view in views]], 1, repeats)
-    times = [view.least for view in turns]
-    cases = [_case(view, seconds) for view, seconds in zip(views, times, strict=True)]
+    [times] = interleaved_times([[view.draw for view in views]], 1, repeats)
+    least = [view.least for view in times]
+    cases = [_case(view, seconds) for view, seconds in zip(views, least, strict=True)]
     sizes = [(len(v.workload.gaussians.means), v.workload.camera.width * v.workload.camera.height) for v in views]
     hits = [view.n_hits for view in views]
     passed = all(case.passed for case in cases)
     note = "" if passed else "an image is wrong"
     for name, costs in (("hits", hits), ("N x pixels", [n * pixels for n, pixels in sizes])):
-        slope, spread = fitted_slope(costs, times)
+        slope, spread = fitted_slope(costs, least)
         cases.append(Case(f"slope/time against {name}", passed, {"slope": slope, "spread": spread}, note))
     return cases
 
@@ -86,7 +86,7 @@ def fitted_slope(costs: Sequence[float], seconds: Sequence[float]) -> tuple[floa
     slope : float
         1 where time is proportional to cost.
     spread : float
-        Factor by which the time that is farthest from the line is off.
+        Largest factor between a time and the line.
     """
     x, y = np.log(costs), np.log(seconds)
     slope, constant = np.polyfit(x, y, 1)
@@ -94,7 +94,7 @@ def fitted_slope(costs: Sequence[float], seconds: Sequence[float]) -> tuple[floa
 
 
 def flipped_pixels(image: Floats, exact: Floats) -> float:
-    """Return the part of the pixels that differ by more than float32 explains; what is not finite does."""
+    """Return the fraction of pixels that differ by more than float32 explains, or are not finite."""
     return float(np.mean(~(np.abs(image - exact).max(axis=2) <= BENCH_FLOAT32_IMAGE)))
 
 

@@ -1,7 +1,7 @@
-"""From the start of the program to the end of its first training iteration: fresh installed, and ever after.
+"""The time from program start to the end of the first training iteration, just after installation and later.
 
-The command ``train`` is run on a small made scene, with an empty folder for its kernels and then with the same one
-again; its log tells when the first iteration is over.
+The command ``train`` runs on a small synthetic scene, with an empty folder for its kernels and then again with the same
+one; its log tells when the first iteration is over.
 """
 
 import os
@@ -37,7 +37,7 @@ def start_cases() -> list[Case]:
     Returns
     -------
     list of Case
-        A case fails if the loss of the iteration is not that of the reference, or if cold and warm differ in a byte.
+        A case fails if the loss of the iteration differs from the reference's, or if cold and warm differ in a byte.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -1,11 +1,11 @@
 """The baseline: blending as a textbook writes it, one loop per pixel over the Gaussians of its tile.
 
-This is the only place beside the reference and the kernels that states blending, and on purpose: it is what a careful
-student would write after reading 3DGS, kept to say what the shape of the real kernels is worth. It is correct, parallel
-over tiles, and uses none of their tricks: scalar ``math.exp``, branches, 16 x 16 tiles listed by their boxes, and a
-backward pass from back to front that divides the transmittance back up. Literals are float64, so float32 data are
-blended in float64. Projection, colours and loss are those of the CPU backend, the tile lists those of the reference.
-Left out: blend statistics, conventions other than the default's.
+This is deliberately the only other implementation of blending besides the reference and the kernels: it is what a
+careful student would write after reading 3DGS, and measures the gain of the real kernels' design. It is correct,
+parallel over tiles, and uses none of their tricks: it has scalar ``math.exp``, branches, 16 x 16 tiles listed by boxes,
+and a backward pass from back to front that recovers the transmittance by division. Literals are float64, so float32
+data are blended in float64. Projection, colours and loss are those of the CPU backend, the tile lists those of the
+reference. Left out: blend statistics, conventions other than the default's.
 """
 
 import math
@@ -22,7 +22,7 @@ from minisplat_ref.types import CompositeGradient, Floats, Ints, Projection, Ren
 
 
 class Splats(NamedTuple):
-    """What the loops read of the Gaussians."""
+    """The Gaussians as the loops read them."""
 
     means2d: Floats
     """[N, 2] pixels."""
@@ -108,7 +108,7 @@ def _differentiate(  # type: ignore[no-untyped-def]
     height, width, n_channels = v_image.shape
     n_workers, n_tiles = sums.shape[0], tile_offsets.size - 1
     for worker in prange(n_workers):
-        total = sums[worker]  # each thread adds to an array of its own
+        total = sums[worker]  # each thread has an array of its own
         for tile in range(worker, n_tiles, n_workers):
             x0, y0 = tile % n_tiles_x * tile_width, tile // n_tiles_x * tile_height
             for y in range(y0, min(y0 + tile_height, height)):
@@ -145,7 +145,7 @@ def _differentiate(  # type: ignore[no-untyped-def]
                         v_a = T * shade - behind / (1.0 - a)
                         behind += a * T * shade
                         if opacities[n] * falloff > alpha_max:
-                            continue  # the clamp does not move
+                            continue  # a clamped alpha has no derivative
                         v_sigma = -opacities[n] * falloff * v_a
                         total[n, 0] += v_sigma * (conics[n, 0] * dx + conics[n, 1] * dy)
                         total[n, 1] += v_sigma * (conics[n, 1] * dx + conics[n, 2] * dy)

@@ -1,6 +1,6 @@
-"""What training iterations cost, while the number of Gaussians stays the same.
+"""The time of training iterations with a constant number of Gaussians.
 
-By stages, on one thread and on all, and beside OpenSplat's.
+It is measured by stages, on one thread and on all, and in comparison with OpenSplat.
 """
 
 import statistics
@@ -14,10 +14,10 @@ import numba
 import numpy as np
 
 from minisplat_ref.backends import CPU, Backend
-from minisplat_ref.bench.by_turns import seconds_of
+from minisplat_ref.bench.interleaving import seconds_of
 from minisplat_ref.bench.opensplat import iteration_seconds
 from minisplat_ref.bench.profiling import REST, WHOLE, profile_cases, timed
-from minisplat_ref.bench.roofs import StraightLines
+from minisplat_ref.bench.roofline import StraightLines
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.io import load_scene
 from minisplat_ref.methods import get_recipe
@@ -27,20 +27,20 @@ from minisplat_ref.types import Scene
 
 WARM_UP = 5  # iterations that compile and are not timed
 TURNS = 2  # of each trainer
-TURN = 10  # iterations on as many threads: after the first few, the caches hold this training and not the other
+TURN = 10  # consecutive iterations on as many threads: after a few, the caches have this training and not the other
 LINE = "straight line"
 ROOM: dict[str, Any] = {"n_views": 6, "width": 192, "height": 144, "n_points": 8000}  # where no scene is given
 
 
 def profile(folder: Path | None, downscale: int, iterations: int) -> list[Case]:
-    """Train with a stopwatch in every stage.
+    """Train with a timer around every stage.
 
     Parameters
     ----------
     folder : Path or None
-        Photographs; a made room where there are none.
+        Photographs; a synthetic room if None.
     downscale : int
-        Factor by which they are made smaller.
+        Factor by which they are reduced.
     iterations : int
         To time.
     """
@@ -50,16 +50,16 @@ def profile(folder: Path | None, downscale: int, iterations: int) -> list[Case]:
 
 
 def thread_cases(folder: Path | None, downscale: int, iterations: int) -> list[Case]:
-    """Train twice by turns of some iterations, on one thread and on all; nothing where there is only one.
+    """Train twice, alternating every few iterations, on one thread and on all; return nothing if there is only one.
 
-    In every turn straight-line loops are run as well, equal and independent ones for all threads: what these gain is
-    what the processor has to give.
+    In between, straight-line loops run as well, equal and independent ones for all threads: their speed-up is what the
+    processor can give.
 
     Returns
     -------
     list of Case
-        The least time of every stage and of the whole iteration. A stage with a factor near 1 is what does not run in
-        parallel. All fail if the two trainings do not end with the same bytes.
+        The least time of every stage and of the whole iteration. A stage with a factor near 1 does not run in parallel.
+        All fail if the two trainings do not end with the same bytes.
     """
     n_all = numba.get_num_threads()
     if n_all == 1:
@@ -68,7 +68,7 @@ def thread_cases(folder: Path | None, downscale: int, iterations: int) -> list[C
     states = {n: initial_state(scene, recipe, seed=0) for n in (1, n_all)}
     lines = StraightLines(n_all)
     lines.forward()  # compiled
-    turns: dict[int, list[dict[str, float]]] = {n: [] for n in states}
+    measured: dict[int, list[dict[str, float]]] = {n: [] for n in states}
     try:
         for first in range(1, WARM_UP + iterations + 1, TURN):
             for n, state in states.items():
@@ -79,15 +79,15 @@ def thread_cases(folder: Path | None, downscale: int, iterations: int) -> list[C
                     train(scene, recipe._replace(iterations=step), seed=0, state=state, backend=timed(CPU, seconds))
                     total = time.perf_counter() - start
                     line = seconds_of(lines.forward)
-                    turns[n].append({**seconds, REST: total - sum(seconds.values()), WHOLE: total, LINE: line})
+                    measured[n].append({**seconds, REST: total - sum(seconds.values()), WHOLE: total, LINE: line})
     finally:
         numba.set_num_threads(n_all)
     one, all_ = (state.gaussians for state in states.values())
     is_same = all(np.array_equal(a, b) for a, b in zip(one, all_, strict=True))
     note = "" if is_same else "the trained Gaussians are not the same bytes"
     cases = []
-    for stage in turns[1][0]:
-        times = [min(turn[stage] for turn in turns[n][WARM_UP:]) for n in states]
+    for stage in measured[1][0]:
+        times = [min(seconds[stage] for seconds in measured[n][WARM_UP:]) for n in states]
         figures: dict[str, Figure] = {
             "1 thread ms": 1e3 * times[0],
             f"{n_all} threads ms": 1e3 * times[1],
@@ -98,7 +98,7 @@ def thread_cases(folder: Path | None, downscale: int, iterations: int) -> list[C
 
 
 def against_opensplat(program: Path, folder: Path, downscale: int, iterations: int) -> list[Case]:
-    """Time training iterations of OpenSplat and ours on the same photographs, from the same points, by turns."""
+    """Time training iterations of OpenSplat and ours alternately, on the same photographs from the same points."""
     scene = load_scene(folder, downscale=downscale, test_every=0, undistort=True)  # it withholds no view
     ours: list[float] = []
     theirs: list[float] = []
@@ -139,7 +139,7 @@ def _train(scene: Scene, iterations: int, backend: Backend, on_warm: Callable[[]
 
 
 def _scene(folder: Path | None, downscale: int) -> Scene:
-    """Load the photographs, or make some."""
+    """Load the photographs, or make a synthetic scene."""
     if folder is None:
         return make_scene("room", **ROOM).scene
     return load_scene(folder, downscale=downscale, undistort=True)

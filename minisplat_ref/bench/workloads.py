@@ -1,7 +1,7 @@
-"""The fixed workloads: the same Gaussians, camera and cotangent for everyone, in every run.
+"""The fixed workloads: the same Gaussians, camera and cotangent for every contender, in every run.
 
 ``synth`` is random but sized like a trained scene; ``garden`` has the points of a real one (``test_garden.npz`` of
-gsplat's tests) with random shapes, and many more hits a pixel. ``synth5k`` and ``garden20k`` are for slow renderers.
+gsplat's tests) with random shapes, and many more hits per pixel. ``synth5k`` and ``garden20k`` are for slow renderers.
 """
 
 from collections.abc import Callable
@@ -17,8 +17,8 @@ from minisplat_ref.types import Camera, Floats, Gaussians
 
 SYNTH_SIZE = 50_000
 GARDEN_BOX = 2.0  # world units: points within +-2 of the table
-GARDEN_NEAR = 0.2  # points nearer to the camera are left out: renderers disagree about what to do with them
-GARDEN_FOCAL = 481.0  # px for both axes, and a centred principal point: some renderers know no other
+GARDEN_NEAR = 0.2  # points nearer to the camera are left out, because renderers treat them differently
+GARDEN_FOCAL = 481.0  # px for both axes, and a centred principal point: some renderers support no other
 GARDEN_SUBSET = 20_000
 
 
@@ -28,7 +28,7 @@ class Workload(NamedTuple):
     name: str
     """Key in reports."""
     gaussians: Gaussians
-    """float64, but every number is a float32 too, so that all precisions get the same numbers."""
+    """float64, but every number is exact in float32, so that all precisions get the same numbers."""
     camera: Camera
     """View."""
     v_image: Floats
@@ -57,7 +57,7 @@ def garden(data: Path, subset: int | None = None) -> Workload:
     Parameters
     ----------
     data : Path
-        ``test_garden.npz`` of gsplat's repository, or the folder that holds it.
+        ``test_garden.npz`` of gsplat's repository, or its folder.
     subset : int, optional
         Number of Gaussians to draw from them; all by default.
 
@@ -130,7 +130,7 @@ def _centred(width: int, height: int, focal: float) -> Camera:
 
 
 def _workload(name: str, gaussians: Gaussians, camera: Camera) -> Workload:
-    """Round everything to float32 numbers, the camera's too."""
+    """Round everything to float32 numbers, including the camera."""
     v_image = np.random.default_rng(1).normal(size=(camera.height, camera.width, 3))
     camera = camera._replace(
         cam_from_world_R=_rounded(camera.cam_from_world_R), cam_from_world_t=_rounded(camera.cam_from_world_t)

@@ -15,6 +15,7 @@ import warnings
 from collections.abc import Sequence
 from typing import TextIO
 
+from minisplat_ref import __version__
 from minisplat_ref.errors import InputError, InputWarning
 from minisplat_ref.experiments.arguments import HelpFormatter, Parser
 
@@ -77,9 +78,9 @@ def build_parser() -> argparse.ArgumentParser:
         # argparse lists all commands under one heading; here each is listed under its own.
         group._group_actions.extend(commands._choices_actions)
         commands._choices_actions.clear()
-    parser.add_argument_group("options").add_argument(
-        "-h", "--help", action="help", help="show this message; COMMAND --help explains a command"
-    )
+    options = parser.add_argument_group("options")
+    options.add_argument("-h", "--help", action="help", help="show this message; COMMAND --help explains a command")
+    options.add_argument("--version", action="version", version=f"minisplat-ref {__version__}", help="show the version")
     return parser
 
 

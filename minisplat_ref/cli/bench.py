@@ -10,11 +10,11 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.arguments import Commands, HelpFormatter, integer, listed, name
 
 if TYPE_CHECKING:
-    from minisplat_ref.oracle.cases import Case, Report
+    from minisplat_ref.oracle.cases import Report
 
 DEFAULT_WORKLOADS = ("synth", "synth5k")
 DATA_WORKLOADS = ("garden", "garden20k")
-JSON, TABLE, FIGURE = "bench.json", "bench.md", "bench.png"
+JSON, TABLE, FIGURE, PAGE = "bench.json", "bench.md", "bench.png", "report.html"
 
 DESCRIPTION = """\
 Time every backend and precision on fixed workloads, and measure its error
@@ -30,6 +30,7 @@ examples:
   minisplat-ref bench --out bench
   minisplat-ref bench --workloads synth5k --backends cpu-f32,textbook-f32
   minisplat-ref bench --scene photos/fox --against opensplat=build/opensplat
+  minisplat-ref bench --extension analytic
 
 Exit codes: 0 all within their bounds, 1 something failed, 2 bad input."""
 
@@ -76,14 +77,19 @@ def add_parser(commands: Commands) -> None:
         "--memory", action="store_true", help="instead: peak of training in 1920 x 1080 and 12 megapixels"
     )
     others.add_argument("--large", action="store_true", help="instead: 2,000 photographs of 12 megapixels within 8 GB")
+    others.add_argument(
+        "--extension", metavar="NAME", help="instead: an extension's renderer on both backends, beside 3DGS's"
+    )
     others.add_argument("--start", action="store_true", help="instead: seconds to the first iteration, cold and warm")
     parser.add_argument(
         "--scene", type=Path, metavar="SCENE", help="photographs for --stages (default a made room) and opensplat"
     )
-    parser.add_argument("--downscale", type=integer(1), default=1, metavar="K", help="of the photographs (default 1)")
+    parser.add_argument(
+        "--downscale", type=integer(1), default=1, metavar="D", help="make them D times smaller (default 1)"
+    )
     parser.add_argument("--iterations", type=integer(1), default=100, metavar="N", help="of the scene (default 100)")
     outputs = parser.add_mutually_exclusive_group()
-    outputs.add_argument("--out", type=Path, metavar="DIR", help=f"write {JSON}, {TABLE} and {FIGURE}")
+    outputs.add_argument("--out", type=Path, metavar="DIR", help=f"write {PAGE}, {JSON}, {TABLE} and {FIGURE}")
     add_json_argument(outputs)
     parser.set_defaults(run=run)
 
@@ -106,6 +112,8 @@ def _measure(args: argparse.Namespace) -> "Report":
 
     if args.stages:
         return _stages(args)
+    if args.extension is not None:
+        return _extension(args)
     if args.slopes:
         from minisplat_ref.bench.slopes import slope_cases
 
@@ -127,13 +135,13 @@ def _measure(args: argparse.Namespace) -> "Report":
 
         progress("start: train with no compiled kernels, then with them")
         return Report("From the start of train to the end of its first iteration", tuple(start_cases()), {})
-    return _race(args)
+    return _benchmark(args)
 
 
-def _race(args: argparse.Namespace) -> "Report":
+def _benchmark(args: argparse.Namespace) -> "Report":
+    from minisplat_ref.bench.benchmark import benchmark
     from minisplat_ref.bench.contenders import choose
     from minisplat_ref.bench.peers import peers_of
-    from minisplat_ref.bench.race import race
     from minisplat_ref.bench.training_time import against_opensplat
     from minisplat_ref.bench.workloads import get_workload
     from minisplat_ref.oracle.cases import Report
@@ -144,7 +152,7 @@ def _race(args: argparse.Namespace) -> "Report":
     contenders = [*choose(args.backends), *peers]
     names = args.workloads or (*DEFAULT_WORKLOADS, *(DATA_WORKLOADS if args.data else ()))
     workloads = [get_workload(workload, args.data) for workload in names]  # before the first one takes its time
-    cases = [case for workload in workloads for case in race(workload, contenders, args.repeats, progress)]
+    cases = [case for workload in workloads for case in benchmark(workload, contenders, args.repeats, progress)]
     if opensplat is not None:
         cases += against_opensplat(opensplat, args.scene, args.downscale, args.iterations)
     if args.data is None and args.workloads is None:
@@ -153,10 +161,24 @@ def _race(args: argparse.Namespace) -> "Report":
     return Report(title, tuple(cases), {"workloads": list(names), "repeats": args.repeats})
 
 
+def _extension(args: argparse.Namespace) -> "Report":
+    from minisplat_ref.bench.extension_times import extension_cases
+    from minisplat_ref.bench.workloads import get_workload
+    from minisplat_ref.extensions.extension import load_extension
+    from minisplat_ref.oracle.cases import Report
+
+    extension = load_extension(args.extension)
+    names = args.workloads or ("synth5k",)
+    workloads = [get_workload(workload, args.data) for workload in names]
+    cases = [case for workload in workloads for case in extension_cases(extension, workload, args.repeats, progress)]
+    title = f"Renderer of {extension.name} beside that of 3DGS, each against its own float64 reference"
+    return Report(title, tuple(cases), {"workloads": list(names), "repeats": args.repeats})
+
+
 def _stages(args: argparse.Namespace) -> "Report":
-    from minisplat_ref.bench.by_turns import hold
+    from minisplat_ref.bench.interleaving import time_contests
     from minisplat_ref.bench.limits import adams, stages, threads
-    from minisplat_ref.bench.roofs import blending
+    from minisplat_ref.bench.roofline import blending
     from minisplat_ref.bench.training_time import profile, thread_cases
     from minisplat_ref.bench.workloads import get_workload
     from minisplat_ref.oracle.cases import Report
@@ -167,23 +189,21 @@ def _stages(args: argparse.Namespace) -> "Report":
     progress("blending against straight-line loops, Adam against a copy, other stages by themselves, all by turns")
     workloads = [get_workload(workload, args.data) for workload in args.workloads or ("synth",)]
     contests = [contest for made in workloads for contest in (blending(made), *threads(made))]
-    cases += hold([*contests, *adams(), *stages()], args.repeats)
+    cases += time_contests([*contests, *adams(), *stages()], args.repeats)
     return Report("A training iteration by stages, and how far the kernels are from the limits", tuple(cases), {})
 
 
 def _tables(report: "Report") -> str:
     """Return a table for each kind of case."""
-    from minisplat_ref.oracle.cases import as_markdown
+    from minisplat_ref.oracle.cases import as_markdown, by_kind
 
-    kinds: dict[tuple[str, ...], list[Case]] = {}
-    for case in report.cases:
-        kinds.setdefault(tuple(case.figures), []).append(case)
-    return "\n\n".join(as_markdown(report._replace(cases=tuple(cases))) for cases in kinds.values())
+    return "\n\n".join(as_markdown(report._replace(cases=tuple(cases))) for cases in by_kind(report.cases))
 
 
 def _save_folder(report: "Report", folder: Path) -> None:
-    """Write JSON, tables and figure into a folder, which is made."""
-    from minisplat_ref.bench.figure import save_figure
+    """Write JSON, tables, figure and page into a folder, which is made."""
+    from minisplat_ref.bench.figure import pareto_section, save_figure
+    from minisplat_ref.experiments.check_report import write_page
     from minisplat_ref.io.atomic import replacing
     from minisplat_ref.oracle.cases import save_json
 
@@ -193,9 +213,13 @@ def _save_folder(report: "Report", folder: Path) -> None:
         raise InputError(f"{folder} cannot be made: {error.strerror}") from error
     with replacing(folder / TABLE) as temporary:
         temporary.write_text(f"{report.title}\n\n{_tables(report)}\n", encoding="utf-8")
+    figures = []
     if any("both ms" in case.figures for case in report.cases):
         save_figure(report.cases, folder / FIGURE)
+        figures.append(pareto_section(report.cases))
     save_json(report, folder / JSON)
+    write_page(report, folder / PAGE, figures, is_by_kind=True)
+    print(f"\nopen {(folder / PAGE).resolve()}")
 
 
 def progress(line: str) -> None:

@@ -15,16 +15,16 @@ if TYPE_CHECKING:
 
 DESCRIPTION = """\
 Write the Gaussians of a run, of a checkpoint.npz by itself, of a PLY or of a
-compact file. What OUT is goes by its suffix: .ply is the 3DGS layout with every
-float, the compact formats come with extensions (minisplat-ref extensions
-compression), and so do their levels of precision, 0 being the finest.
+compact file. The suffix of OUT says what is written: .ply is the 3DGS layout
+with every float; compact formats and their levels of precision, of which 0 is
+the finest, come with extensions (see minisplat-ref extensions compression).
 
   --max-bytes B   the finest level whose file has at most B bytes
   --max-drop dB   the coarsest level that loses at most so much PSNR, measured
                   on at most 24 training views of the run, or of --scene
 """
 EPILOG = """\
-Of a run that has not ended, the newest whole checkpoint is taken.
+If a run has not ended, its newest whole checkpoint is converted.
 
 examples:
   minisplat-ref convert runs/fox fox.ply

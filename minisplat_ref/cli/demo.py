@@ -14,7 +14,6 @@ RECIPE = "3dgs-accel"
 SCHEDULE_ITERATIONS = 30_000  # the published pace: compressed to so few iterations it would only split and clone
 ITERATIONS = 750  # fit into two minutes with compilation, and densify twice
 DEFAULT_OUT = "minisplat-demo"
-REPORT = "report.html"
 
 DESCRIPTION = f"""\
 See the program work, with nothing to download: ray-trace photographs of a
@@ -25,6 +24,9 @@ pictures, depth against the exact depth, curves, and what to try next.
 Takes a minute or two on two cores. The folder that it leaves is a run like
 those of train, with the photographs in DIR/scene.
 """
+EPILOG = """\
+example:
+  minisplat-ref demo --out demo"""
 
 
 def add_parser(commands: Commands) -> None:
@@ -33,6 +35,7 @@ def add_parser(commands: Commands) -> None:
         "demo",
         help="see it work: make a scene, train it, write a report",
         description=DESCRIPTION,
+        epilog=EPILOG,
         formatter_class=HelpFormatter,
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help=f"new folder for all of it (default {DEFAULT_OUT})")
@@ -86,14 +89,13 @@ def run(args: argparse.Namespace) -> int:
         return 130
     pictures = view_pictures(folder, synthetic, scene, outcome.evaluation)
     page = report_html(folder, scene, settings, outcome, pictures, time.perf_counter() - start)
-    (folder / REPORT).write_text(page, encoding="utf-8")
+    (folder / run_folder.REPORT).write_text(page, encoding="utf-8")
     if not outcome.is_complete:
-        print(
-            f"minisplat-ref: stopped after {state.step} iterations, report of these: {folder / REPORT}", file=sys.stderr
-        )
+        report = folder / run_folder.REPORT
+        print(f"minisplat-ref: stopped after {state.step} iterations, report of these: {report}", file=sys.stderr)
         return 130
     print(f"{summary(outcome.evaluation)}, {len(state.gaussians.means):,} Gaussians")
-    print(f"open {(folder / REPORT).resolve()}")
+    print(f"open {(folder / run_folder.REPORT).resolve()}")
     return 0
 
 

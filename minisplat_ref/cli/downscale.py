@@ -13,7 +13,7 @@ photographs smaller while loading where it is not: this saves time, no more.
 """
 EPILOG = """\
 example:
-  minisplat-ref downscale photos/fox --factor 4"""
+  minisplat-ref downscale photos/fox --downscale 4"""
 
 
 def add_parser(commands: Commands) -> None:
@@ -26,7 +26,7 @@ def add_parser(commands: Commands) -> None:
         formatter_class=HelpFormatter,
     )
     parser.add_argument("scene", type=Path, metavar="SCENE", help="scene with images/, or a folder of images")
-    parser.add_argument("--factor", type=int, default=2, metavar="D", help="divide width and height by D (default 2)")
+    parser.add_argument("--downscale", type=int, default=2, metavar="D", help="make them D times smaller (default 2)")
     parser.set_defaults(run=run)
 
 
@@ -35,5 +35,5 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.datasets.downscale import downscale_images
 
     images = args.scene / "images"
-    print(downscale_images(images if images.is_dir() else args.scene, args.factor))
+    print(downscale_images(images if images.is_dir() else args.scene, args.downscale))
     return 0

@@ -10,20 +10,20 @@ DESCRIPTION = """\
 Measure a run on its test views: PSNR, SSIM and, given the weights of its
 network, LPIPS of point_cloud.ply, view by view.
 
-Rewrites DIR/metrics.json and DIR/renders/ (truth | render | error). What is not
-the run's result on its own test views has a folder of its own: other views of
-its photographs (--test-every), other Gaussians such as those that convert has
-written (--model) or a run that has not ended DIR/eval-..., another scene --out,
-without which it is refused. Renders are clipped to [0, 1] and not rounded; SSIM
-has an 11 x 11 window and zero padding; the mean of the views stands for all.
+Rewrites DIR/metrics.json and DIR/renders/ (truth | render | error). Everything
+but the run's result on its own test views goes into a folder of its own: other
+views of its photographs (--test-every), other Gaussians (--model) and a run
+that has not ended into DIR/eval-..., another scene into --out, then required.
+Renders are clipped to [0, 1] and not rounded; SSIM has an 11 x 11 window and
+zero padding; the figures are means over the views.
 """
 EPILOG = """\
 LPIPS is null without the weights of VGG16 or AlexNet (net='alex'), which are
-not part of this program. Where the package lpips is installed, this makes them:
+not part of this program. If the package lpips is installed, this makes them:
   python -c "import lpips, numpy
   numpy.savez('vgg.npz', **lpips.LPIPS(net='vgg').state_dict())"
 Colours go in from -1 to 1, as its authors say; the evaluation published with
-3DGS gives it 0 to 1, so its figures are others.
+3DGS passes 0 to 1, so its figures differ.
 
 examples:
   minisplat-ref eval runs/fox

@@ -13,20 +13,20 @@ if TYPE_CHECKING:
     from minisplat_ref.experiments.settings import Settings
     from minisplat_ref.types import Floats
 
-NOT_SHOWN = ("per_view", "n_gaussians", "iterations")  # of metrics.json: too long, or said by the PLY or checkpoint
+NOT_SHOWN = ("per_view", "n_gaussians", "iterations", "lpips_reason")  # of metrics.json: too long, or said elsewhere
 
 Rows = list[tuple[str, str]]
 
 DESCRIPTION = """\
 Say what is in a file or folder: counts, SH degree, bounds, sizes.
 
-  point_cloud.ply   Gaussians in the 3DGS layout, whoever wrote them
+  point_cloud.ply   Gaussians in the 3DGS layout, from any program
   checkpoint.npz    a training that can be continued
   run folder        the --out of a training: settings, measures, what fired
   scene folder      COLMAP (images/, sparse/0/) or transforms.json
   .spz and others   compact files of Gaussians, see minisplat-ref convert
 
-Everything is read and checked; of damaged input it says what is wrong.
+Everything is read and checked. If something is damaged, info says what.
 """
 EPILOG = """\
 examples:
@@ -44,7 +44,7 @@ def add_parser(commands: Commands) -> None:
         epilog=EPILOG,
         formatter_class=HelpFormatter,
     )
-    parser.add_argument("path", type=Path, metavar="FILE", help="any of these")
+    parser.add_argument("path", type=Path, metavar="FILE", help="any of the above")
     parser.set_defaults(run=run)
 
 
@@ -126,10 +126,14 @@ def _run_rows(folder: Path) -> Rows:
 
     settings = load(folder)
     rows = [("state", _state_of_run(folder, settings.iterations))]
-    rows += [(name.replace("_", " "), str(value)) for name, value in settings._asdict().items()]
+    rows += [(name.replace("_", " "), _short(value)) for name, value in settings._asdict().items() if _says(value)]
     if (folder / METRICS).exists():
         metrics = read_json_object(folder / METRICS)
-        rows += [(name.replace("_", " "), _short(metrics[name])) for name in metrics if name not in NOT_SHOWN]
+        rows += [
+            (name.replace("_", " "), _short(value))
+            for name, value in metrics.items()
+            if name not in NOT_SHOWN and _says(value)
+        ]
     if (folder / EVENTS).exists():
         rows += _event_rows(folder, settings)
     if (folder / CHECKPOINT).exists() or (folder / PREVIOUS).exists():
@@ -169,18 +173,19 @@ def _event_rows(folder: Path, settings: "Settings") -> Rows:
 
 
 def _scene_rows(path: Path) -> Rows:
+    from minisplat_ref.experiments.notices import describe_sizes
     from minisplat_ref.io import load_scene
 
     scene = load_scene(path, undistort=True)
     views = (*scene.train_views, *scene.test_views)
-    sizes = sorted({(view.camera.width, view.camera.height) for view in views})
     focals = sorted(view.camera.fx for view in views)
+    n_masks = sum(view.mask is not None for view in views)
     return [
         ("scene", scene.name),
         ("views", f"{len(views)}: {len(scene.train_views)} training, {len(scene.test_views)} test"),
-        ("image sizes", ", ".join(f"{width} x {height}" for width, height in sizes)),
+        ("image sizes", describe_sizes([(view.camera.width, view.camera.height) for view in views])),
         ("focal length", f"{focals[0]:.1f} to {focals[-1]:.1f} px"),
-        ("masks", f"{sum(view.mask is not None for view in views)} views"),
+        *([("masks", f"{n_masks} of {len(views)} views")] if n_masks else []),
         ("points", f"{len(scene.points):,}"),
         *_bounds_rows(scene.points),
         ("extent", f"{scene.extent:.4g} world units"),
@@ -236,5 +241,14 @@ def _size(path: Path) -> str:
     return f"{path.stat().st_size / 1e6:.2f} MB"
 
 
+def _says(value: Any) -> bool:
+    """Return whether a setting or measure says anything: not what was not given, not measured or switched off."""
+    return value is not None and value is not False and value != {}
+
+
 def _short(value: Any) -> str:
+    if value is True:
+        return "yes"
+    if isinstance(value, dict):
+        return ", ".join(f"{name}={setting}" for name, setting in value.items())
     return f"{value:.4f}" if isinstance(value, float) else str(value)

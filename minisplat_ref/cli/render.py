@@ -1,6 +1,7 @@
 """``render``: pictures of a trained scene from a run's cameras, an orbit or a camera file."""
 
 import argparse
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,19 +9,27 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter, add_renderer_arguments, integer
+from minisplat_ref.experiments.arguments import (
+    Commands,
+    HelpFormatter,
+    add_renderer_arguments,
+    color,
+    integer,
+    positive,
+)
 
 if TYPE_CHECKING:
     from minisplat_ref.experiments.scoring import Trained
     from minisplat_ref.io.viewpoints import Viewpoint
 
 DESCRIPTION = """\
-Render a run (its --out folder), or Gaussians from whoever wrote them: a PLY or
-a compact file (.spz and others, see minisplat-ref convert).
+Render a run (its --out folder), or Gaussians that any program wrote: a PLY or a
+compact file (.spz and others, see minisplat-ref convert).
 
 Cameras, by --cameras:
   test, train, all   those of the run (default test)
-  orbit              a circle around the scene (default for a PLY)
+  orbit              along the training cameras, there and back unless they
+                     stand all around; a circle around a PLY (its default)
   FILE.json          list of cameras, as in the cameras.json of 3DGS: img_name,
                      width, height, position, rotation (world_from_camera),
                      fx, fy and, if the principal point is off centre, cx, cy
@@ -28,7 +37,8 @@ Cameras, by --cameras:
 EPILOG = """\
 examples:
   minisplat-ref render runs/fox
-  minisplat-ref render runs/fox --cameras orbit --frames 120 --depth
+  minisplat-ref render runs/fox --cameras orbit --film fox.gif
+  minisplat-ref render runs/fox --cameras orbit --arc 360 --frames 120 --depth
   minisplat-ref render point_cloud.ply --size 640x360 --profile INRIA
 """
 RUN_CAMERAS = ("test", "train", "all")
@@ -50,11 +60,22 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("--cameras", metavar="WHICH", help="see above")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where to write (default: beside the input)")
     parser.add_argument("--depth", action="store_true", help="also NAME_depth.npy (camera z) and its picture")
-    parser.add_argument("--extension", metavar="E", help="that the PLY was trained with (a run knows its own)")
-    parser.add_argument("--frames", type=integer(1), default=60, metavar="N", help="of an orbit (default 60)")
-    parser.add_argument("--size", type=_size, metavar="WxH", help="of an orbit (default: the run's, or 640x480)")
+    parser.add_argument("--extension", metavar="E", help="the one that the PLY was trained with (a run knows its own)")
     parser.add_argument(
-        "--background", type=_color, metavar="R,G,B", help="0 to 255 each (default: the run's, or 0,0,0)"
+        "--frames", type=integer(1), default=60, metavar="N", help="number of pictures of an orbit (default 60)"
+    )
+    parser.add_argument(
+        "--arc", type=_arc, metavar="A", help="degrees that an orbit covers (default: what was photographed)"
+    )
+    parser.add_argument(
+        "--size", type=_size, metavar="WxH", help="pixels of an orbit's pictures (default: the run's, or 640x480)"
+    )
+    parser.add_argument(
+        "--film", type=Path, metavar="FILE", help="also make a film: .gif, or .mp4 with imageio[ffmpeg]"
+    )
+    parser.add_argument("--fps", type=positive, default=25.0, metavar="F", help="pictures a second (default 25)")
+    parser.add_argument(
+        "--background", type=color, metavar="R,G,B", help="0 to 255 each (default: the run's, or 0,0,0)"
     )
     add_renderer_arguments(parser, None, "the run's, or ")
     parser.set_defaults(run=run)
@@ -70,6 +91,7 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.experiments.notices import warn_of_model
     from minisplat_ref.experiments.pictures import depth_picture, depth_range
     from minisplat_ref.io import write_image
+    from minisplat_ref.io.film import check_film, write_film
     from minisplat_ref.io.names import file_names
     from minisplat_ref.reference.depth import expected_depth
     from minisplat_ref.types import view_from
@@ -81,6 +103,8 @@ def run(args: argparse.Namespace) -> int:
     out: Path = args.out or source.default_out
     largest = max((view.camera for view in views), key=lambda camera: camera.width * camera.height)
     memory.check_picture(largest.width, largest.height, args.depth)
+    if args.film is not None:
+        check_film(args.film, [(view.camera.width, view.camera.height) for view in views])
     names = file_names([view.name for view in views])
     _make_room(out, names)
     wants = frozenset({"depth"} if args.depth else ())
@@ -92,6 +116,9 @@ def run(args: argparse.Namespace) -> int:
             np.save(out / f"{name}_depth.npy", depth)
             write_image(out / f"{name}_depth.png", depth_picture(depth, *depth_range(depth)))
     print(f"{len(views)} pictures in {out}")
+    if args.film is not None:
+        write_film(args.film, [out / f"{name}.png" for name in names], args.fps)
+        print(f"film: {args.film}")
     return 0
 
 
@@ -112,7 +139,7 @@ def _make_room(out: Path, names: Sequence[str]) -> None:
     strange = sorted(found - {f"{name}{end}" for name in (*listed, *names) for end in ENDS})
     if strange:
         raise InputError(
-            f"{out} holds other pictures than those of a rendering, such as {strange[0]}: give another --out, or remove"
+            f"{out} holds pictures other than those of a rendering, such as {strange[0]}: give another --out, or remove"
             " them"
         )
     run_folder.create(out)
@@ -166,13 +193,15 @@ def _open_file(path: Path, args: argparse.Namespace) -> _Source:
 
 
 def _choose_views(args: argparse.Namespace, source: _Source) -> "list[Viewpoint]":
-    from minisplat_ref.io import viewpoints
+    from minisplat_ref.io import orbits, viewpoints
 
     which: str = args.cameras or ("test" if source.cameras else "orbit")
     if which == "orbit":
         like = source.cameras[0].camera if source.cameras else None
         width, height = args.size or ((like.width, like.height) if like else ORBIT_SIZE)
-        return viewpoints.orbit(source.trained.model.gaussians.means, source.cameras, args.frames, width, height)
+        followed = [view for view in source.cameras if view.split != "test"] or source.cameras
+        means = source.trained.model.gaussians.means
+        return orbits.orbit(means, followed, args.frames, width, height, args.arc)
     if which not in RUN_CAMERAS:
         return viewpoints.read(Path(which))
     if not source.cameras:
@@ -183,15 +212,18 @@ def _choose_views(args: argparse.Namespace, source: _Source) -> "list[Viewpoint]
     return views
 
 
+def _arc(text: str) -> float:
+    try:
+        degrees = float(text)
+    except ValueError:
+        degrees = 0.0
+    if not 0 < degrees <= 360:
+        raise argparse.ArgumentTypeError(f"{text!r} is not an angle above 0 and at most 360 degrees")
+    return math.radians(degrees)
+
+
 def _size(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"([1-9]\d*)[xX]([1-9]\d*)", text)
     if match is None:
         raise argparse.ArgumentTypeError(f"{text!r} is not a width and height in pixels such as 640x480")
     return int(match[1]), int(match[2])
-
-
-def _color(text: str) -> tuple[float, ...]:
-    values = tuple(int(word) if word.isdecimal() else -1 for word in text.split(","))
-    if len(values) != 3 or not all(0 <= value <= 255 for value in values):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a colour such as 255,255,255")
-    return tuple(value / 255.0 for value in values)

@@ -11,8 +11,8 @@ CAMERA_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")
 DESCRIPTION = """\
 Estimate cameras and sparse points from photographs (structure from motion, by
 COLMAP, on the CPU). SCENE will be a COLMAP scene: images/, upright, shrunk and
-without lens distortion, and sparse/0/. Photographs that found no place in it
-are named and left out; if hardly any found one, there is no scene.
+without lens distortion, and sparse/0/. Photographs that cannot be placed are
+named and left out; if hardly any can be placed, no scene is made.
 
 It needs at least two photographs that overlap, of something with texture.
 """

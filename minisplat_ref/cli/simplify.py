@@ -14,8 +14,8 @@ FINE_TUNE = 300  # iterations at each size
 
 DESCRIPTION = """\
 Make a run smaller: keep its most important Gaussians, fine-tune them, and
-measure at some ten sizes what is lost. Some training views are held out to
-decide by; the test views are measured once, in the end.
+measure at about ten sizes what is lost. Some training views are held out to
+decide by; the test views are measured once, at the end.
 
   --max-drop dB   the smallest size that loses at most so much PSNR, with one
                   standard error on top
@@ -26,7 +26,7 @@ decide by; the test views are measured once, in the end.
 
 NEW is a run folder for render, eval, info and convert, with point_cloud.ply,
 metrics.json, result.json (curve and decision), figure.png and report.html.
-It takes the time of some 13 times --fine-tune iterations of training.
+It takes as long as about 13 times --fine-tune iterations of training.
 """
 EPILOG = """\
 example:

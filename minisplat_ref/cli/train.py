@@ -12,6 +12,7 @@ from minisplat_ref.experiments.arguments import (
     HelpFormatter,
     add_renderer_arguments,
     assignment,
+    color,
     decibels,
     integer,
     option_name,
@@ -49,6 +50,7 @@ DEFAULTS = {
     "backend": "cpu",
     "drop_bad_steps": False,
     "minutes": None,
+    "background": None,
     "max_drop": None,
     "max_bytes": None,
 }
@@ -56,9 +58,13 @@ AFRESH = ("iterations", "lpips_weights", "drop_bad_steps")  # what may be new wh
 
 DESCRIPTION = """\
 Train Gaussians on SCENE, the folder of a COLMAP scene or of a transforms.json.
-DIR will hold point_cloud.ply, metrics.json, renders/ (truth | render | error of
-each test view) and checkpoints. Ctrl-C saves what there is; --resume goes on.
+DIR will hold report.html, point_cloud.ply, metrics.json, renders/ (truth |
+render | error of each test view) and checkpoints. Ctrl-C saves what there is;
+--resume goes on.
 """
+EPILOG = """\
+example:
+  minisplat-ref train photos/fox --downscale 2 --minutes 5 --preview"""
 
 
 def add_parser(commands: Commands) -> None:
@@ -68,6 +74,7 @@ def add_parser(commands: Commands) -> None:
         help="train Gaussians on photographs with cameras",
         usage="minisplat-ref train [-h] SCENE [options]\n       minisplat-ref train --resume DIR [--iterations N]",
         description=DESCRIPTION,
+        epilog=EPILOG,
         formatter_class=HelpFormatter,
         argument_default=argparse.SUPPRESS,
     )
@@ -79,10 +86,15 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("--scene", dest="moved", metavar="PATH", help="with --resume: where its photographs are now")
     parser.add_argument("--rescale", action="store_true", help="with --resume: stretch its schedule to --iterations")
 
+    parser.add_argument("--preview", action="store_true", help="keep DIR/preview.png up to date while training")
+
     data = parser.add_argument_group("photographs")
     data.add_argument("--downscale", type=integer(1), metavar="D", help="make them D times smaller (default 1)")
     data.add_argument(
         "--test-every", type=integer(0), metavar="K", help="hold out every K-th for testing, 0: none (default 8)"
+    )
+    data.add_argument(
+        "--background", type=color, metavar="R,G,B", help="behind the scene (default 0,0,0; white 255,255,255)"
     )
     data.add_argument("--undistort", action="store_true", help="remove lens distortion instead of refusing it")
 
@@ -95,22 +107,25 @@ def add_parser(commands: Commands) -> None:
     )
     training.add_argument("--init", type=Path, metavar="PLY", help="points to start from (default: the scene's)")
     training.add_argument(
-        "--iterations", type=integer(1), metavar="N", help="one view each (default 3000; adaptive: at most)"
+        "--iterations",
+        type=integer(1),
+        metavar="N",
+        help="one view each (default 3000; adaptive decides itself)",
     )
-    training.add_argument("--minutes", type=positive, metavar="T", help="with adaptive: end after so many at most")
+    training.add_argument("--minutes", type=positive, metavar="T", help="with adaptive: the most minutes to take")
     training.add_argument(
-        "--budget", type=integer(1), metavar="N", help="most Gaussians, for recipes that choose their number"
+        "--budget", type=integer(1), metavar="N", help="the most Gaussians, for recipes that choose their number"
     )
     target = training.add_mutually_exclusive_group()
     target.add_argument(
-        "--max-drop", type=decibels, metavar="dB", help="then simplify: PSNR to lose, into DIR/simplified"
+        "--max-drop", type=decibels, metavar="dB", help="simplify at the end, into DIR/simplified: PSNR to lose"
     )
-    target.add_argument("--max-bytes", type=integer(1), metavar="B", help="likewise: size of its PLY at most")
+    target.add_argument("--max-bytes", type=integer(1), metavar="B", help="likewise: size that its PLY may have")
     training.add_argument(
         "--simplify",
         choices=("sampling", "rank", "merging"),
         metavar="S",
-        help="by sampling (default), rank or merging",
+        help="simplify by sampling (default), rank or merging",
     )
     training.add_argument(
         "--scene-type",
@@ -118,7 +133,7 @@ def add_parser(commands: Commands) -> None:
         metavar="T",
         help="indoor (default) or outdoor: what counts as important",
     )
-    training.add_argument("--extension", metavar="E", help="train with it; its own recipes are names for --recipe")
+    training.add_argument("--extension", metavar="E", help="extension to train with; its own recipes go to --recipe")
     training.add_argument(
         "--set",
         type=assignment,
@@ -130,16 +145,16 @@ def add_parser(commands: Commands) -> None:
         "--eval-every",
         type=integer(0),
         metavar="K",
-        help="measure every K iterations, into curve.jsonl (default 0)",
+        help="measure every K iterations, into curve.jsonl",
     )
     training.add_argument(
-        "--lpips-weights", type=Path, metavar="NPZ", help="measure LPIPS in the end; eval --help tells how"
+        "--lpips-weights", type=Path, metavar="NPZ", help="measure LPIPS at the end; eval --help says how"
     )
-    training.add_argument("--seed", type=integer(0), metavar="S", help="of all random draws (default 0)")
+    training.add_argument("--seed", type=integer(0), metavar="S", help="seed of all random draws (default 0)")
     training.add_argument(
-        "--check-every", type=integer(1), metavar="K", help="look for NaN in each K-th iteration (default 10)"
+        "--check-every", type=integer(1), metavar="K", help="look for NaN in every K-th iteration (default 10)"
     )
-    training.add_argument("--drop-bad-steps", action="store_true", help="leave out steps with NaN instead of stopping")
+    training.add_argument("--drop-bad-steps", action="store_true", help="skip steps with NaN instead of stopping")
     add_renderer_arguments(training, argparse.SUPPRESS)
     parser.set_defaults(run=run)
 
@@ -163,6 +178,7 @@ def _start(given: dict[str, Any]) -> int:
     if options["iterations"] is None:
         options["iterations"] = _default_iterations(options["recipe"])
     options["set"] = dict(options["set"])  # of equal names the last
+    options["background"] = None if options["background"] is None else list(options["background"])
     for name in ("lpips_weights", "init"):
         options[name] = _absolute(options[name])
     scene_path = Path(given["scene"])
@@ -328,20 +344,21 @@ def _train(
     given: dict[str, Any],
     room: str,
 ) -> int:
-    from minisplat_ref.experiments import checkpoints
+    from minisplat_ref.experiments import checkpoints, run_folder
+    from minisplat_ref.experiments.notices import describe_sizes
     from minisplat_ref.experiments.run import run_training
     from minisplat_ref.experiments.scoring import summary
     from minisplat_ref.training.guard import Guard
 
-    size = scene.train_views[0].camera
+    views = (*scene.train_views, *scene.test_views)
     print(
         f"{scene.name}: {len(scene.train_views)} training and {len(scene.test_views)} test views of"
-        f" {size.width} x {size.height}, {len(scene.points):,} points"
+        f" {describe_sizes([(view.camera.width, view.camera.height) for view in views])}, {len(scene.points):,} points"
     )
     if room:
         print(room)
     check_every = given.get("check_every", Guard().every)
-    outcome = run_training(folder, scene, settings, recipe, state, network, check_every)
+    outcome = run_training(folder, scene, settings, recipe, state, network, check_every, given.get("preview", False))
     if outcome.evaluation is None or not outcome.is_complete:
         if state.is_whole:
             measured = "" if outcome.evaluation else " but not measured"
@@ -354,6 +371,7 @@ def _train(
         f"{summary(outcome.evaluation)}, {len(state.gaussians.means):,} Gaussians, {outcome.seconds:.0f} s of training"
     )
     print(f"results in {folder}: point_cloud.ply, metrics.json, renders/")
+    print(f"open {(folder / run_folder.REPORT).resolve()}")
     return _simplify(folder, settings)
 
 

@@ -1,1 +1,1 @@
-"""All Gaussians or all pixels: parallel loops over the formulas of ``scalar``."""
+"""The CPU backend: parallel loops over all Gaussians or all pixels, around the formulas of ``scalar``."""

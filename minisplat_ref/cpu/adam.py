@@ -1,7 +1,7 @@
-"""The optimiser step on one array: bound by memory, so each number is read and written once.
+"""The optimiser step on one array. It is memory-bound, so each number is read and written once.
 
-The array is taken as flat: rows that follow one another are one run of numbers, whatever their width, and eight numbers
-are updated at a time. Without this a row of three numbers costs as much as one of ten.
+The array is treated as flat: consecutive rows form one run of numbers, whatever their width, and eight numbers are
+updated at a time. Otherwise a row of three numbers would cost as much as one of ten.
 """
 
 from typing import NamedTuple

@@ -1,6 +1,6 @@
 """Surface point of every pixel, forward and backward: the loops over ``scalar/depth.py``.
 
-Backward, the pixels are grouped by their Gaussian first, so that each Gaussian has one writer.
+The backward pass groups the pixels by their Gaussian first, so that each Gaussian has one writer.
 """
 
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from minisplat_ref.types import Camera, Floats, Ints, SurfacePoints
 
 
 class Ellipsoids(NamedTuple):
-    """Gaussians without what does not move their surface points."""
+    """The fields of Gaussians on which surface points depend."""
 
     means: Floats
     """[N, 3] world frame."""
@@ -92,7 +92,7 @@ def surface_points(means: Floats, quats: Floats, scales: Floats, camera: Camera,
 
 @scalar
 def _gaussian_vjp(n, pixels, ellipsoids, pose, lens, depths, v_surface, v):
-    """Write the gradient by one Gaussian, the sum of the shares of its pixels."""
+    """Write the gradient with respect to one Gaussian, the sum over its pixels."""
     R = rows_of(pose.R)
     quat = _wide(ellipsoids.quats[n])
     axes, scale, u = gaussian_axes(quat), _scale(ellipsoids.scales, n), _offset(ellipsoids.means, n, pose.centre)

@@ -1,14 +1,14 @@
-"""Eight Gaussians as one step: which rows of the tables they are, and their numbers as lanes.
+"""Process eight Gaussians together: which rows of the tables they are, and their numbers as lanes.
 
-Forward, all Gaussians are gone through in order; backward, and for colours, those that the camera sees, from a list.
-The last row of a range fills up the last eight. What is written to it several times is the same; only sums over
-Gaussians have to leave the copies out.
+The forward pass loops over all Gaussians in order; the backward pass, and colours, over a list of those that the camera
+sees. Copies of the last row of a range pad the last eight. Writing the same values to it several times is harmless;
+only sums over Gaussians have to exclude the copies.
 """
 
 import numpy as np
 
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import WIDTH, converted, filled, gather, load, select, store, sum_of
+from minisplat_ref.jit.lanes import WIDTH, broadcast, cast, gather, load, reduce_sum, select, store
 from minisplat_ref.jit.literals import ZERO
 
 DOUBLE = np.float64(0)  # names the dtype
@@ -30,9 +30,9 @@ def listed_rows(rows, i):
 
 @scalar
 def list_visible(radii, first, end, rows):
-    """List the visible Gaussians of a range, and the last of them again; return their number.
+    """List the visible Gaussians of a range, padded with the last of them; return their number.
 
-    There is no branch: it could not be foreseen.
+    There is no branch, which would be unpredictable.
     """
     count = 0
     for n in range(first, end):
@@ -46,7 +46,7 @@ def list_visible(radii, first, end, rows):
 @scalar
 def gather_wide(table, rows, column):
     """Return a column of eight rows in float64."""
-    return converted(gather(table, rows, column), DOUBLE)
+    return cast(gather(table, rows, column), DOUBLE)
 
 
 @scalar
@@ -58,22 +58,22 @@ def triple(table, rows):
 @scalar
 def rounded(lanes, zero):
     """Return three lanes in the dtype of a number."""
-    return converted(lanes[0], zero), converted(lanes[1], zero), converted(lanes[2], zero)
+    return cast(lanes[0], zero), cast(lanes[1], zero), cast(lanes[2], zero)
 
 
 @scalar
 def add(sums, k, is_counted, lanes):
-    """Add to the eight sums number ``k`` of a buffer."""
+    """Add lanes to the ``k``-th eight sums of a buffer."""
     store(sums, k * WIDTH, load(sums, k * WIDTH) + select(is_counted, lanes, ZERO))
 
 
 @scalar
 def total_of(parts):
-    """Add up the sums of all parts [n, K * 8], in the order of the parts; return [K]."""
+    """Return the sums [K] over all parts [n, K * 8], added in the order of the parts."""
     totals = np.empty(parts.shape[1] // WIDTH, np.float64)
     for k in range(totals.size):
-        total = filled(DOUBLE)
+        total = broadcast(DOUBLE)
         for part in range(parts.shape[0]):
             total = total + load(parts[part], k * WIDTH)
-        totals[k] = sum_of(total)
+        totals[k] = reduce_sum(total)
     return totals

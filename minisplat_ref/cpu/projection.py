@@ -1,15 +1,14 @@
 """Projection of all Gaussians of a view, forward and backward: the loops over ``scalar/projection.py``.
 
-The body of a parallel loop is a function of its own: Numba 0.68 loses writes to a NamedTuple's arrays that stand
-directly under ``prange``. Every Gaussian has one writer. Only the camera gradient is a sum over Gaussians: a fixed
-number of chunks, whatever the number of threads, each adds up its own part in float64, and the parts are added in
-order.
+The body of a parallel loop is a function of its own: Numba 0.68 loses writes to a NamedTuple's arrays directly under
+``prange``. Every Gaussian has one writer. Only the camera gradient is a sum over Gaussians: a fixed number of chunks,
+whatever the number of threads, each sum their part in float64, and the parts are added in order.
 
-Eight Gaussians are one step. Branches become masks: culled Gaussians are computed too, and stored as zeros.
+Eight Gaussians are processed together. Branches become masks: culled Gaussians are computed too, and stored as zeros.
 
-The arithmetic is float64 whatever the data: float32 would lose the position of a mean far from the world's origin, the
-overflow of f / z squared, and the thin axis of a needle. Results are rounded when they are stored, except conics: see
-:class:`Projection`.
+The arithmetic is float64 whatever the data: in float32 a mean far from the world's origin would lose its position, a
+needle its thin axis, and the square of f / z could overflow. Results are rounded when they are stored, except conics:
+see :class:`Projection`.
 """
 
 import numpy as np
@@ -26,7 +25,7 @@ from minisplat_ref.cpu.gaussian_rows import (
     triple,
 )
 from minisplat_ref.jit.compile import kernel, prange, scalar
-from minisplat_ref.jit.lanes import WIDTH, counted, scatter, select
+from minisplat_ref.jit.lanes import WIDTH, iota, scatter, select
 from minisplat_ref.jit.literals import ZERO
 from minisplat_ref.scalar.extent import Extent, inria_box, support_box
 from minisplat_ref.scalar.projection import (
@@ -51,17 +50,17 @@ N_CHUNKS = 64  # parts of the camera-gradient sum; fixed, so that its rounding d
 
 
 def pose_of(camera: Camera) -> Pose:
-    """Return R and the point that R x + t takes to the origin, float64.
+    """Return R and the point that R x + t maps to the origin, float64.
 
-    The point is the camera centre. It is solved for rather than taken as -R^T t, so that R (x - point) equals R x + t
-    also where R is not quite a rotation: the gradient counts its nine entries as free.
+    The point is the camera centre. It is solved for rather than computed as -R^T t, so that R (x - point) equals
+    R x + t even where R is not quite a rotation: the gradient treats its nine entries as free.
     """
     R = np.ascontiguousarray(camera.cam_from_world_R, np.float64)
     return Pose(R, -np.linalg.solve(R, np.asarray(camera.cam_from_world_t, np.float64)))
 
 
 def lens_of(camera: Camera, conventions: Conventions) -> Lens:
-    """Camera intrinsics and conventions as float64 scalars."""
+    """Return camera intrinsics and conventions as float64 scalars."""
     cx, cy = camera.cx, camera.cy
     if not conventions.uses_principal_point:
         cx, cy = camera.width / 2, camera.height / 2
@@ -119,7 +118,7 @@ def _project_eight(rows, primitives, pose, lens, extent, out):
 
 @scalar
 def _scatter_seen(is_seen, table, rows, column, lanes):
-    """Write lanes to a column; zeros where a Gaussian is culled."""
+    """Write lanes to a column, with zeros where a Gaussian is culled."""
     scatter(table, rows, column, select(is_seen, lanes, ZERO))
 
 
@@ -192,7 +191,7 @@ def _scatter_triple(table, rows, lanes):
 
 @scalar
 def _add_row(v_pose, first, is_counted, v_p, v_V, mean, M):
-    """Add to the gradient by a row of R, and then of t: p = R x + t and V = R M."""
+    """Add to the gradient with respect to a row of R, and then of t: p = R x + t and V = R M."""
     add(v_pose, first, is_counted, v_p * mean[0] + dot(v_V, M[0]))
     add(v_pose, first + 1, is_counted, v_p * mean[1] + dot(v_V, M[1]))
     add(v_pose, first + 2, is_counted, v_p * mean[2] + dot(v_V, M[2]))
@@ -216,7 +215,7 @@ def _project_chunk_vjp(chunk, primitives, radii, pose, lens, v, out, v_poses):
     in_rows = Pose(rows_of(pose.R), pose.centre)  # read once
     v_poses[chunk] = ZERO
     for i in range(0, count, WIDTH):
-        is_counted = counted(DOUBLE) < count - i
+        is_counted = iota(DOUBLE) < count - i
         _project_eight_vjp(listed_rows(visible, i), is_counted, primitives, in_rows, lens, v, out, v_poses[chunk])
 
 

@@ -1,9 +1,9 @@
 """Colours of all visible Gaussians of a view, forward and backward: the loops over ``scalar/spherical_harmonics.py``.
 
-Eight Gaussians are one step. The formulas want the same coefficient of all eight, but in memory the coefficients of one
-Gaussian stand together. They are therefore turned in small buffers that stay in the cache. To and from memory they go
-row after row: processors fetch ahead of a single stream, and not of eight rows taken column by column.
-Work is proportional to what the camera sees: a chunk of Gaussians goes through the list of its visible ones.
+Eight Gaussians are processed together. The formulas need the same coefficient of all eight, but in memory the
+coefficients of one Gaussian are contiguous. They are therefore transposed in small buffers that stay in the cache, and
+copied to and from memory row by row: processors prefetch a single stream, but not eight rows read column by column.
+Work is proportional to what the camera sees: each chunk of Gaussians loops over a list of its visible ones.
 
 Helpers have no loops and no branches: the compiler would count references of the arrays that such a helper is given,
 an atomic operation each.
@@ -20,15 +20,15 @@ from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.jit.lanes import (
     WIDTH,
-    columns_of,
-    converted,
-    counted,
+    cast,
     gather,
-    larger,
+    iota,
     load,
+    maximum,
     scatter,
     select,
     store,
+    transpose,
 )
 from minisplat_ref.jit.literals import HALF, ZERO
 from minisplat_ref.scalar.spherical_harmonics import (
@@ -50,7 +50,7 @@ STAGE = 48  # N_REST in whole lanes
 
 
 class Shaded(NamedTuple):
-    """What the colours depend on of the Gaussians, or the gradient with respect to it."""
+    """The fields of the Gaussians on which colours depend, or the gradient with respect to them."""
 
     means: Floats
     """[N, 3] world frame."""
@@ -63,7 +63,7 @@ class Shaded(NamedTuple):
 
 
 class Harmonics(NamedTuple):
-    """Where they are seen from, and the basis functions."""
+    """The viewpoint and the basis functions."""
 
     centre: Floats
     """[3] of the camera, float64."""
@@ -75,16 +75,16 @@ class Harmonics(NamedTuple):
 
 @scalar
 def _direction(centre, means, rows):
-    """Directions to means in the data's dtype; the difference is float64, for worlds whose origin is far away."""
+    """Return directions to means in the data's dtype; the difference is float64, for means far from the origin."""
     x, y, z = triple(means, rows)
     dx, dy, dz, inverse = direction(centre, x, y, z)
     zero = means.dtype.type(0)
-    return converted(dx, zero), converted(dy, zero), converted(dz, zero), converted(inverse, zero)
+    return cast(dx, zero), cast(dy, zero), cast(dz, zero), cast(inverse, zero)
 
 
 @scalar
 def _turn(staged, column, buffer, k):
-    """Turn eight columns of the rows on stage: number k of all eight comes to stand at 8 k of the buffer."""
+    """Transpose eight columns of the staged rows into a buffer, where number k of all eight starts at 8 k."""
     rows = (
         load(staged, column),
         load(staged, column + STAGE),
@@ -95,12 +95,12 @@ def _turn(staged, column, buffer, k):
         load(staged, column + 6 * STAGE),
         load(staged, column + 7 * STAGE),
     )
-    store(buffer, k * WIDTH, columns_of(rows))
+    store(buffer, k * WIDTH, transpose(rows))
 
 
 @scalar
 def _turn_back(buffer, k, staged, column):
-    """Turn eight columns of a buffer back into rows on stage: the inverse of ``_turn``."""
+    """Transpose eight columns of a buffer back into staged rows: the inverse of ``_turn``."""
     columns = (
         _at(buffer, k),
         _at(buffer, k + 1),
@@ -111,7 +111,7 @@ def _turn_back(buffer, k, staged, column):
         _at(buffer, k + 6),
         _at(buffer, k + 7),
     )
-    a, b, c, d, e, f, g, h = columns_of(columns)
+    a, b, c, d, e, f, g, h = transpose(columns)
     store(staged, column, a)
     store(staged, column + STAGE, b)
     store(staged, column + 2 * STAGE, c)
@@ -129,7 +129,7 @@ def _at(buffer, k):
 
 @scalar
 def _constant(sh_dc, rows, c0):
-    """Colours of degree 0."""
+    """Return the colours of degree 0."""
     red, green, blue = gather(sh_dc, rows, 0), gather(sh_dc, rows, 1), gather(sh_dc, rows, 2)
     return HALF + c0 * red, HALF + c0 * green, HALF + c0 * blue
 
@@ -167,9 +167,9 @@ def _chunk_colors(first, end, shaded, harmonics, radii, colors):
             red = red + _at(y, k) * _at(rest, 3 * k)
             green = green + _at(y, k) * _at(rest, 3 * k + 1)
             blue = blue + _at(y, k) * _at(rest, 3 * k + 2)
-        scatter(colors, rows, 0, larger(red, ZERO))
-        scatter(colors, rows, 1, larger(green, ZERO))
-        scatter(colors, rows, 2, larger(blue, ZERO))
+        scatter(colors, rows, 0, maximum(red, ZERO))
+        scatter(colors, rows, 1, maximum(green, ZERO))
+        scatter(colors, rows, 2, maximum(blue, ZERO))
 
 
 @kernel()
@@ -199,7 +199,7 @@ def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, deg
 
 @scalar
 def _rest_vjp(k, v_red, v_green, v_blue, y, rest):
-    """Replace a basis function by the gradient by it, and its coefficients by the gradient by them."""
+    """Replace a basis function and its coefficients by the gradients with respect to them."""
     y_k = _at(y, k)
     store(y, k * WIDTH, _at(rest, 3 * k) * v_red + _at(rest, 3 * k + 1) * v_green + _at(rest, 3 * k + 2) * v_blue)
     store(rest, 3 * k * WIDTH, (y_k * v_red, y_k * v_green, y_k * v_blue))
@@ -261,7 +261,7 @@ def _chunk_vjp(first, end, shaded, harmonics, radii, v_colors, v, v_offset):
             red = red + _at(y, k) * _at(rest, 3 * k)
             green = green + _at(y, k) * _at(rest, 3 * k + 1)
             blue = blue + _at(y, k) * _at(rest, 3 * k + 2)
-        # A colour that is clamped at zero does not move.
+        # A colour that is clamped at zero has no derivative.
         v_red = select(red > ZERO, gather(v_colors, rows, 0), ZERO)
         v_green = select(green > ZERO, gather(v_colors, rows, 1), ZERO)
         v_blue = select(blue > ZERO, gather(v_colors, rows, 2), ZERO)
@@ -288,10 +288,10 @@ def _chunk_vjp(first, end, shaded, harmonics, radii, v_colors, v, v_offset):
         scatter(v_means, rows, 0, v_x)
         scatter(v_means, rows, 1, v_y)
         scatter(v_means, rows, 2, v_z)
-        is_counted = counted(means.dtype.type(0)) < count - i
-        add(v_offset, 0, is_counted, converted(v_x, DOUBLE))
-        add(v_offset, 1, is_counted, converted(v_y, DOUBLE))
-        add(v_offset, 2, is_counted, converted(v_z, DOUBLE))
+        is_counted = iota(means.dtype.type(0)) < count - i
+        add(v_offset, 0, is_counted, cast(v_x, DOUBLE))
+        add(v_offset, 1, is_counted, cast(v_y, DOUBLE))
+        add(v_offset, 2, is_counted, cast(v_z, DOUBLE))
 
 
 @kernel()
@@ -326,7 +326,7 @@ def sh_colors_vjp(
     shaded = Shaded(means, sh_dc, sh_rest.ravel(), width)
     v_shaded = Shaded(out.means, out.sh_dc, out.sh_rest.reshape(-1), width)
     v_offset = _sh_colors_vjp(shaded, _harmonics(camera, degree, dtype), radii, v_colors, v_shaded)
-    # The sum over the Gaussians of the gradient by their offset, mean - centre, with centre = -R^T t.
+    # Sum over the Gaussians of the gradient with respect to their offset, mean - centre, with centre = -R^T t.
     out.cam_from_world_R[:] = np.outer(camera.cam_from_world_t, v_offset)
     out.cam_from_world_t[:] = camera.cam_from_world_R @ v_offset
     return out

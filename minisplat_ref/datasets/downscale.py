@@ -17,12 +17,12 @@ UNREAD_SUFFIXES = (
     *(".heic", ".heif", ".avif", ".jxl"),
     *(".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"),
 )
-"""Photographs of telephones and cameras that Pillow does not decode."""
+"""Formats of phones and cameras that Pillow does not decode."""
 NAMED_MAX = 20  # files that a message names
 
 
 def list_images(folder: Path) -> list[Path]:
-    """Image files in a folder and below, sorted by name; a warning names photographs of formats that are not read."""
+    """Return the image files in a folder and below, sorted by name; warn of photographs in unsupported formats."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give a folder with photographs")
     found = sorted(file for file in folder.rglob("*") if file.is_file())
@@ -45,7 +45,7 @@ def downscale_images(images: Path, factor: int) -> Path:
     Parameters
     ----------
     images : Path
-        Folder of images; folders in it are kept.
+        Folder of images; its subfolders are kept.
     factor : int
         At least 2.
 
@@ -60,7 +60,7 @@ def downscale_images(images: Path, factor: int) -> Path:
         If there are no images, one cannot be read, or the new folder is already there.
     """
     if factor < 2:
-        raise InputError(f"--factor is {factor}; it must be at least 2")
+        raise InputError(f"--downscale is {factor}; it must be at least 2")
     files = list_images(images)
     target = images.with_name(f"{images.name}_{factor}")
     with making_folder(target) as folder:

@@ -2,8 +2,8 @@
 
 Photographs are turned upright (EXIF) and shrunk, SIFT features are found and matched, cameras and points are estimated
 one image after the other (incremental mapping), and the result is undistorted. What is left is a COLMAP scene with
-pinhole cameras: ``images/`` and ``sparse/0/``. Photographs that found no place are named and left out. The focal length
-in the EXIF data is COLMAP's first guess; place and time are not copied.
+pinhole cameras: ``images/`` and ``sparse/0/``. Photographs that could not be registered are named and left out. The
+focal length in the EXIF data is COLMAP's initial value; location and time are not copied.
 """
 
 from collections.abc import Sequence
@@ -23,17 +23,17 @@ from minisplat_ref.io.lens import import_quiet_pycolmap
 
 CAMERA_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model)
 FOCAL_TAGS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
-LEAST_PHOTOS, LEAST_SHARE = 3, 0.25  # of those given, below which what comes out is no scene of them
+LEAST_PHOTOS, LEAST_SHARE = 3, 0.25  # of the given ones; fewer registered photographs are no scene of them
 SEED = 0  # of RANSAC: the same photographs give the same cameras, up to the order in which threads finish
 
 
 class SfmResult(NamedTuple):
-    """What came out, for the report."""
+    """The result, for the report."""
 
     n_photos: int
     """Photographs that were given."""
     left_out: tuple[str, ...]
-    """Names of those that found no place, in the folder of photographs."""
+    """Names of those that could not be registered, in the folder of photographs."""
     other_groups: tuple[int, ...]
     """Sizes of the groups that fit together, but not with the scene."""
     n_points: int
@@ -96,7 +96,7 @@ def run_sfm(
 
 
 def advice(matching: str) -> str:
-    """What usually helps photographs that found no place, after they were matched in this way."""
+    """Return what usually helps photographs that could not be registered after this kind of matching."""
     if matching == "sequential":
         return (
             "--matching sequential compares neighbours in the order of file names, which suits frames of a video; for"
@@ -121,13 +121,13 @@ def prepare_photos(files: Sequence[Path], photos: Path, target: Path, long_side:
             image = ImageOps.exif_transpose(opened).convert("RGB")
         image.thumbnail((long_side, long_side), Image.Resampling.LANCZOS)
         (target / name).parent.mkdir(parents=True, exist_ok=True)
-        image.save(target / name, exif=exif, **SAVE_OPTIONS["JPEG"])  # a PNG does not look at these options
+        image.save(target / name, exif=exif, **SAVE_OPTIONS["JPEG"])  # PNG ignores these options
         sizes[name] = image.size
     return sizes
 
 
 def _focal_exif(image: Image.Image) -> Image.Exif:
-    """EXIF data with what tells the focal length; place, time and the orientation, which is applied, are left out."""
+    """Return the EXIF data of the focal length only; location, time and the orientation, now applied, are left out."""
     source, focal = image.getexif(), Image.Exif()
     focal.update({tag: source[tag] for tag in CAMERA_TAGS if tag in source})
     lens = source.get_ifd(ExifTags.IFD.Exif)
@@ -138,7 +138,7 @@ def _focal_exif(image: Image.Image) -> Image.Exif:
 def _reconstruct(
     work: Path, sizes: dict[str, tuple[int, int]], matching: str, camera_model: str, photos: Path
 ) -> list[Any]:
-    """Features, matches, and the models of incremental mapping, each a ``pycolmap.Reconstruction``, largest first."""
+    """Find and match features, and return the models of incremental mapping as reconstructions, largest first."""
     pycolmap = import_quiet_pycolmap()
     pycolmap.set_random_seed(SEED)
     database, images = work / "database.db", work / "images"

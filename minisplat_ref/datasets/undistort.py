@@ -1,8 +1,8 @@
-"""Copy a scene, its photographs warped so that they have no lens distortion.
+"""Copy a scene and remove the lens distortion of its photographs.
 
 Every photograph is warped to the pinhole that COLMAP chooses for its lens (same focal length, no blank pixels). A
-COLMAP scene keeps its points and 2D features, a transforms.json scene its poses and points; masks are warped along, and
-an alpha channel is composited onto black in the latter, where it is no mask.
+COLMAP scene keeps its points and 2D features, a transforms.json scene its poses and points; masks are warped too, and
+in a transforms.json scene, where alpha is no mask, it is composited onto black.
 """
 
 import json
@@ -73,7 +73,7 @@ def undistort_model(model: Path, images: Path, out: Path) -> None:
 
 
 def _undistort_colmap(scene: Path, model: Path, folder: Path) -> None:
-    """Undistort model and images by COLMAP's own program, masks by the loader's route, which gives the same camera."""
+    """Undistort model and images with COLMAP, and masks as the loader does, which gives the same camera."""
     photos = colmap_photos(scene, read_model(scene))
     _check_distorted(scene, photos)
     undistort_model(model, scene / "images", folder)
@@ -85,7 +85,7 @@ def _undistort_colmap(scene: Path, model: Path, folder: Path) -> None:
 
 
 def _undistort_transforms(files: Sequence[Path], folder: Path) -> None:
-    """Write images, masks, points and each file anew, with intrinsics per frame."""
+    """Write images, masks, points and each transforms file, with intrinsics per frame."""
     contents = [read_transforms(file) for file in files]
     pairs = [existing_frames(file, content) for file, content in zip(files, contents, strict=True)]
     photos = [photo for of_file in pairs for _, photo in of_file]
@@ -96,7 +96,7 @@ def _undistort_transforms(files: Sequence[Path], folder: Path) -> None:
 
 
 def _names_of_copies(file: Path, photos: Sequence[Photo]) -> list[Path]:
-    """Where the copies of photographs go: as they lie in the folder of the file, or into OUTSIDE from beside it."""
+    """Return the paths of copied photographs: the same if inside the file's folder, and in OUTSIDE if beside it."""
     scene = os.path.abspath(file.parent)
     paths = [Path(os.path.relpath(os.path.abspath(photo.path), scene)) for photo in photos]
     is_outside = [path.parts[0] == ".." for path in paths]
@@ -151,13 +151,13 @@ def _intrinsics(camera: Camera) -> dict[str, Any]:
 
 
 def _write(path: Path, image: NDArray) -> None:
-    """Write an image in a folder that may have to be made."""
+    """Write an image, creating its folder if necessary."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_image(path, image)
 
 
 def _check_distorted(source: Path, photos: Sequence[Photo]) -> None:
-    """Refuse photographs that cannot be read, and work that is not needed."""
+    """Refuse photographs that cannot be read, and scenes that have no distortion."""
     for photo in photos:
         check_photo(photo, source, undistort=True)
     if all(photo.lens is None for photo in photos):

@@ -86,6 +86,14 @@ def assignment(text: str) -> tuple[str, str]:
     return name.strip(), value.strip()
 
 
+def color(text: str) -> tuple[float, ...]:
+    """Parse R,G,B from 0 to 255 to three numbers from 0 to 1."""
+    values = tuple(int(word) if word.isdecimal() else -1 for word in text.split(","))
+    if len(values) != 3 or not all(0 <= value <= 255 for value in values):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a colour such as 255,255,255")
+    return tuple(value / 255.0 for value in values)
+
+
 def option_name(name: str) -> str:
     """Return how a setting is called on the command line."""
     return name.upper() if name == "scene" else f"--{name.replace('_', '-')}"

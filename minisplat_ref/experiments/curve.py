@@ -20,7 +20,7 @@ def check_views(scene: Scene) -> None:
         There are no test views.
     """
     if not scene.test_views:
-        raise InputError(f"scene {scene.name} was split without test views, which are to be measured: set --test-every")
+        raise InputError(f"scene {scene.name} has no test views to measure: give --test-every above 0")
 
 
 def keep_until(path: Path, step: int) -> None:

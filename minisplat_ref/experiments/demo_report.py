@@ -2,18 +2,27 @@
 
 import os
 import platform
-import shutil
-import sys
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from minisplat_ref import __version__
 from minisplat_ref.datasets.synthetic import SyntheticScene
 from minisplat_ref.experiments import run_folder
-from minisplat_ref.experiments.page import captioned, cards, code, curves, page, panel, paragraph, section, table
+from minisplat_ref.experiments.commands import command
+from minisplat_ref.experiments.page import (
+    captioned,
+    cards,
+    code,
+    curves,
+    page,
+    panel,
+    paragraph,
+    section,
+    slider,
+    table,
+)
 from minisplat_ref.experiments.pictures import (
     Picture,
     colored,
@@ -22,8 +31,8 @@ from minisplat_ref.experiments.pictures import (
     error_picture,
     to_picture,
 )
-from minisplat_ref.experiments.plots import plot, to_svg
 from minisplat_ref.experiments.progress import read_log
+from minisplat_ref.experiments.report_parts import ERROR_TEXT, training_curves, view_panel
 from minisplat_ref.experiments.run import Outcome
 from minisplat_ref.experiments.scoring import load_trained
 from minisplat_ref.experiments.settings import Settings
@@ -31,15 +40,12 @@ from minisplat_ref.metrics import Evaluation
 from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.types import Floats, Scene
 
-N_SHOWN = 3  # test views
 DEPTH_ERROR_RANGE = 0.1  # of the true depth: larger differences are all shown as the brightest colour
 
-VIEWS_TEXT = """\
-The training never saw these views. Error is the mean absolute difference of the three channels:
-dark is none, bright is a quarter of the range or more."""
+VIEWS_TEXT = f"The training never saw these views. {ERROR_TEXT}"
 DEPTH_TEXT = """\
 Nothing taught the Gaussians depth. Here is the distance that they came to, next to the exact one
-of the ray tracer. Near is bright; the third picture is the difference relative to the true depth."""
+of the ray tracer. Near is bright; beside it stands the difference relative to the true depth."""
 CURVES_TEXT = """\
 Where the number of Gaussians jumps, those with a large gradient were cloned or split: the loss
 jumps with it, and recovers."""
@@ -65,10 +71,10 @@ class ViewPictures(NamedTuple):
 
 
 def view_pictures(folder: Path, synthetic: SyntheticScene, scene: Scene, evaluation: Evaluation) -> list[ViewPictures]:
-    """Render the first test views with depth."""
+    """Render the test views with depth."""
     true_depths = {view.name: synthetic.test_depths[i] for i, view in enumerate(synthetic.scene.test_views)}
     trained, pictures = load_trained(folder), []
-    for view, metrics in zip(scene.test_views[:N_SHOWN], evaluation.per_view, strict=False):
+    for view, metrics in zip(scene.test_views, evaluation.per_view, strict=True):
         output = trained.render(view, frozenset({"depth"}))
         image = to_picture(output.image[..., :3])
         pictures.append(
@@ -98,6 +104,7 @@ def report_html(
     metrics = run_folder.read_json_object(folder / run_folder.METRICS)
     evaluation, n_gaussians = outcome.evaluation, metrics["n_gaussians"]
     assert evaluation is not None, "there is a report of what was measured only"
+    worst = min(evaluation.per_view, key=lambda view: view.psnr)
     n_train, n_test, n_points = len(scene.train_views), len(scene.test_views), len(scene.points)
     size = f"{scene.train_views[0].camera.width} x {scene.train_views[0].camera.height}"
     introduction = (
@@ -107,6 +114,7 @@ def report_html(
     )
     key_figures = [
         (f"{evaluation.psnr:.2f} dB", f"PSNR, mean of {n_test} held-out views"),
+        (f"{worst.psnr:.2f} dB", f"PSNR of the worst, {worst.name}"),
         (f"{evaluation.ssim:.3f}", "SSIM, mean of the same"),
         (f"{n_gaussians:,}", f"Gaussians, from {n_points:,} points"),
         (f"{outcome.seconds:.0f} s", f"training, {metrics['iterations']} iterations with compilation"),
@@ -126,28 +134,21 @@ def report_html(
         ("Files", f"{folder.resolve()}: Gaussians, measures, log, checkpoint, pictures"),
     ]
     steps = [
-        part
-        for text, command in _next_steps(folder, metrics["iterations"])
-        for part in (paragraph(text), code(command))
+        part for text, lines in _next_steps(folder, metrics["iterations"]) for part in (paragraph(text), code(lines))
     ]
     sections = [
         cards(key_figures),
-        section("Held-out views", paragraph(VIEWS_TEXT), *map(_color_panel, pictures)),
+        section("Held-out views", paragraph(VIEWS_TEXT), *map(_view_panel, pictures)),
         section("Depth", paragraph(DEPTH_TEXT), *map(_depth_panel, pictures)),
-        section("How the training went", paragraph(CURVES_TEXT), curves(_curves(log))),
+        section("How the training went", paragraph(CURVES_TEXT), curves(training_curves(log))),
         section("What was run", table(rows)),
         section("What to try next", *steps),
     ]
     return page("A room, rebuilt from photographs", introduction, sections)
 
 
-def _color_panel(view: ViewPictures) -> str:
-    pictures = [
-        captioned(view.truth, "truth"),
-        captioned(view.render, "render"),
-        captioned(view.error, "error"),
-    ]
-    return panel(f"{view.name}: {view.caption}", pictures)
+def _view_panel(view: ViewPictures) -> str:
+    return view_panel(f"{view.name}: {view.caption}", view.truth, view.render, view.error)
 
 
 def _depth_panel(view: ViewPictures) -> str:
@@ -155,44 +156,27 @@ def _depth_panel(view: ViewPictures) -> str:
     is_seen = view.true_depth > 0  # [H, W]
     relative = np.abs(view.depth - view.true_depth) / np.where(is_seen, view.true_depth, 1.0) * is_seen  # [H, W]
     median = float(np.median(relative[is_seen])) if is_seen.any() else 0.0
+    true, rendered = (depth_picture(depth, near, far) for depth in (view.true_depth, view.depth))
+    difference = colored(relative, 0.0, DEPTH_ERROR_RANGE, "magma")
     pictures = [
-        captioned(depth_picture(view.true_depth, near, far), f"true depth, {near:.2f} to {far:.2f} units"),
-        captioned(depth_picture(view.depth, near, far), "rendered depth, same colours"),
-        captioned(colored(relative, 0.0, DEPTH_ERROR_RANGE, "magma"), "relative difference, 0 to 10 % or more"),
+        slider(true, {f"render, {near:.2f} to {far:.2f} units": rendered}),
+        captioned(difference, "relative difference, 0 to 10 % or more"),
     ]
-    return panel(f"{view.name}: median difference {100 * median:.1f} %", pictures)
-
-
-def _curves(log: Sequence[Mapping[str, Any]]) -> list[str]:
-    """SVG of loss, PSNR and number of Gaussians over the steps."""
-    steps = [record["step"] for record in log]
-    kinds = (
-        ("loss", "loss", "#b4553d"),
-        ("psnr", "PSNR of training views (dB)", "#2d6a8e"),
-        ("n_gaussians", "Gaussians", "#4b7f52"),
-    )
-    return [_curve(steps, [record[key] for record in log], title, color) for key, title, color in kinds]
-
-
-def _curve(steps: Sequence[int], values: Sequence[float], title: str, color: str) -> str:
-    with plot(title, "step") as (figure, axes):
-        axes.plot(steps, values, color=color, linewidth=1.8)
-    return to_svg(figure)
+    return panel(f"{view.name}: median difference {100 * median:.1f} %", pictures, n_columns=2)
 
 
 def _next_steps(folder: Path, n_iterations: int) -> list[tuple[str, str]]:
-    """Return sentences with the command to copy, which runs from the folder in which the demo was started."""
-    is_installed = shutil.which("minisplat-ref") is not None  # otherwise the environment has not been activated
-    program = "minisplat-ref" if is_installed else f"{os.path.relpath(sys.executable)} -m minisplat_ref"
+    """Return sentences, each with lines to copy."""
+    sfm, training = (command(*words) for words in (("sfm", "PHOTOS", "--out", "SCENE"), ("train", "SCENE")))
     return [
-        ("Walk around the room:", f"{program} render {folder} --cameras orbit --depth"),
-        ("Train on, for a few minutes more:", f"{program} train --resume {folder} --iterations {2 * n_iterations}"),
+        ("Walk around the room:", command("render", folder, "--cameras", "orbit", "--depth")),
+        (
+            "Train on, for a few minutes more:",
+            command("train", "--resume", folder, "--iterations", str(2 * n_iterations)),
+        ),
         (
             "Render the same views with the reference, which is NumPy and made to be read:",
-            f"{program} render {folder} --backend reference --out {folder / 'reference'}",
+            command("render", folder, "--backend", "reference", "--out", folder / "reference"),
         ),
-        (
-            "Train on your own photographs; the first command finds out where they were taken from:",
-            f"{program} sfm PHOTOS --out SCENE\n{program} train SCENE --out runs/mine",
-        ),
+        ("Train on your own photographs; the first line finds out where they were taken from:", f"{sfm}\n{training}"),
     ]

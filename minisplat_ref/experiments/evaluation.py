@@ -74,7 +74,7 @@ def evaluate_run(
     warn_if_not_kept(settings.backend)
     photographs = load_photographs(asked)
     if not photographs.test_views:
-        raise InputError(f"{asked.scene} was split without test views: give --test-every")
+        raise InputError(f"{asked.scene} has no test views: give --test-every above 0")
     network = load_lpips(asked, photographs)
     entries = fingerprint.read(folder)
     fingerprint.warn_of_unchecked(folder, entries)
@@ -146,4 +146,4 @@ def _check_target(folder: Path) -> None:
         raise InputError(f"{folder} is a file: give another --out")
     names = {path.name for path in folder.iterdir()} if folder.exists() else set()
     if names - {run_folder.METRICS, run_folder.RENDERS}:
-        raise InputError(f"{folder} holds something else than an evaluation: give another --out")
+        raise InputError(f"{folder} holds something other than an evaluation: give another --out")

@@ -15,6 +15,8 @@ from minisplat_ref.training.loop import HALF_SIZE
 from minisplat_ref.training.schedule import During, Recipe, action_name
 from minisplat_ref.training.state import FiredEvent
 
+N_NOTES = 3  # of a mechanism that a line names: the first ones and the last
+
 Records = Sequence[Mapping[str, Any]]
 """Of ``events.jsonl``: step, and the fields of a :class:`FiredEvent`."""
 
@@ -69,7 +71,7 @@ def read_mechanisms(path: Path, published: Mapping[str, int]) -> list[Mechanism]
         There is no record of it, or it is damaged.
     """
     if not path.exists():
-        raise InputError(f"{path} is missing, which says what fired in the run: train anew")
+        raise InputError(f"{path}, which says what fired in the run, is missing: train anew")
     try:
         return mechanisms(read_log(path), published)
     except (KeyError, TypeError) as error:
@@ -117,14 +119,17 @@ def never_fired(found: Iterable[Mechanism], published: Iterable[str]) -> list[st
 
 
 def describe(mechanism: Mechanism) -> str:
-    """Return in a line what a mechanism has done."""
+    """Return in a line what a mechanism has done; of many notes, the first and the last."""
     m = mechanism
     times, steps = "once", f"at {m.first:,}"
     change = f"{m.n_before:,} -> {m.n_after:,} Gaussians"
     if m.times > 1:
         times, steps = f"{m.times} times", f"from {m.first:,} to {m.last:,}"
         change = f"+{m.added:,} -{m.removed:,} Gaussians"
-    return "; ".join([f"{times} (published {m.published}), {steps}", change, *describe_notes(m.notes)])
+    notes = describe_notes(m.notes)
+    if len(notes) > N_NOTES:
+        notes = [*notes[: N_NOTES - 1], "...", notes[-1]]
+    return "; ".join([f"{times} (published {m.published}), {steps}", change, *notes])
 
 
 def describe_notes(notes: Mapping[str, int]) -> list[str]:

@@ -3,12 +3,16 @@
 Each is a warning of one line, which the command line prints before it goes on.
 """
 
+import math
 import warnings
+from collections import Counter
+from collections.abc import Sequence
 
 from minisplat_ref.errors import InputWarning, one_line
 from minisplat_ref.strategy.initialization import N_NEIGHBOURS, N_RANDOM_POINTS
 from minisplat_ref.types import Model, Scene
 
+N_SIZES = 3  # of photographs that are all named
 LEAST_SIDE = 16  # pixels; SSIM compares windows of 11 x 11, and 3DGS cuts an image into tiles of 16 x 16
 
 
@@ -35,6 +39,21 @@ def warn_of_scene(scene: Scene, downscale: int) -> None:
             f"photographs of scene {scene.name} are {width} x {height} pixels{cause}; from fewer than {LEAST_SIDE} x"
             f" {LEAST_SIDE} hardly any structure can be learned, and measures of them say little"
         )
+
+
+def describe_sizes(sizes: Sequence[tuple[int, int]]) -> str:
+    """Return the sizes (width, height) of photographs in half a line; how many there are of each, if they are mixed."""
+    counts = sorted(Counter(sizes).items(), reverse=True)
+    if len(counts) == 1:
+        return f"{sizes[0][0]} x {sizes[0][1]}"
+    if len(counts) <= N_SIZES:
+        return " and ".join(f"{width} x {height} ({n} of them)" for (width, height), n in counts)
+    (least_width, least_height), (width, height) = (pick(sizes, key=math.prod) for pick in (min, max))
+    n_portrait = sum(width < height for width, height in sizes)
+    return (
+        f"{len(counts)} sizes from {least_width} x {least_height} to {width} x {height} ({len(sizes) - n_portrait}"
+        f" landscape, {n_portrait} portrait)"
+    )
 
 
 def warn_of_model(model: Model, source: object) -> None:

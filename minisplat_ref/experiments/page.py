@@ -1,49 +1,27 @@
-"""The look of a report: one HTML file with pictures, curves and tables, and nothing that it loads from elsewhere.
+"""The one look of all reports: an HTML file with pictures, curves and tables, and nothing that it loads from elsewhere.
 
-Pictures are PNG in base64, curves are inline SVG (:mod:`minisplat_ref.experiments.plots`), the style sheet is in the
-page.
+Pictures are in the page in base64, curves are inline SVG (:mod:`minisplat_ref.experiments.plots`), and so are the style
+sheet and the few lines of script (:mod:`minisplat_ref.experiments.page_style`), without which nothing is missing: a
+slider is then two pictures beside each other. The page tells the browser to load nothing else.
 """
 
 import base64
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 
 from PIL import Image
 
+from minisplat_ref.experiments.page_style import SCRIPT, STYLE
 from minisplat_ref.experiments.pictures import Picture
 
-STYLE = """
-:root { color-scheme: light }
-body { margin: 0; background: #f6f7f9; color: #25303b; font: 16px/1.55 system-ui, "DejaVu Sans", sans-serif }
-main { max-width: 1080px; margin: 0 auto; padding: 40px 24px 64px }
-h1 { font-size: 30px; line-height: 1.2; margin: 0 0 8px; font-weight: 650 }
-h2 { font-size: 20px; margin: 48px 0 4px; font-weight: 600 }
-p { margin: 4px 0 16px; color: #4a5560; max-width: 74ch }
-.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 12px; margin: 24px 0 }
-.card, .panel { background: #fff; border: 1px solid #e3e7eb; border-radius: 10px }
-.card { padding: 14px 16px }
-.card b { display: block; font-size: 24px; font-weight: 600; font-variant-numeric: tabular-nums }
-.card span { color: #6a7580; font-size: 13.5px }
-.panel { padding: 16px; margin: 12px 0; overflow-x: auto }
-.row { display: grid; grid-template-columns: repeat(var(--columns, 3), minmax(0, 1fr)); gap: 12px }
-figure { margin: 0 }
-figure img { display: block; width: 100%; border-radius: 4px }
-figcaption { color: #6a7580; font-size: 13.5px; padding: 6px 0 2px }
-.pixels img { image-rendering: pixelated }
-.label { font-size: 14px; color: #4a5560; margin: 0 0 8px }
-svg { display: block; width: 100%; height: auto }
-table { border-collapse: collapse; width: 100%; font-size: 15px }
-td, th { padding: 6px 8px; border-bottom: 1px solid #eef1f4; vertical-align: top; text-align: left }
-th { font-weight: 600 }
-tr:last-child td { border-bottom: 0 }
-td:first-child { color: #6a7580; width: 30% }
-td { font-variant-numeric: tabular-nums }
-pre { background: #eef2f6; border-radius: 8px; padding: 12px 14px; margin: 6px 0 16px; overflow-x: auto }
-pre, code { font-size: 14px }
-code, pre { font-family: ui-monospace, "DejaVu Sans Mono", monospace }
-@media (max-width: 700px) { .row { grid-template-columns: 1fr } }
-"""
+POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+BAD = {"FAILED", "DIVERGES FIRST", "diverges"}  # cells that stand out
+GOOD = {"passed", "agrees"}
+LONG = 44  # characters of a cell that may break into lines
+TALL = 60  # rows of a table that scrolls in the page instead of making it long
+PNG_PIXELS = 1 << 17  # of larger pictures a PNG would make the page heavy
+JPEG_QUALITY = 92
 
 
 def page(title: str, introduction: str, parts: Iterable[str]) -> str:
@@ -64,6 +42,7 @@ def page(title: str, introduction: str, parts: Iterable[str]) -> str:
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="Content-Security-Policy" content="{POLICY}">
 <title>{escape(title)}</title>
 <style>{STYLE}</style>
 </head>
@@ -73,6 +52,7 @@ def page(title: str, introduction: str, parts: Iterable[str]) -> str:
 <p>{escape(introduction)}</p>
 {newline.join(parts)}
 </main>
+<script>{SCRIPT}</script>
 </body>
 </html>
 """
@@ -88,9 +68,14 @@ def paragraph(text: str) -> str:
     return f"<p>{escape(text)}</p>"
 
 
+def listing(texts: Iterable[str]) -> str:
+    """Return sentences as a list."""
+    return f"<ul>{''.join(f'<li>{escape(text)}</li>' for text in texts)}</ul>"
+
+
 def code(text: str) -> str:
     """Return lines to be copied."""
-    return f"<pre>{escape(text)}</pre>"
+    return f'<pre tabindex="0">{escape(text)}</pre>'
 
 
 def cards(figures: Iterable[tuple[str, str]]) -> str:
@@ -102,14 +87,25 @@ def cards(figures: Iterable[tuple[str, str]]) -> str:
 
 
 def table(rows: Iterable[Sequence[str]], heading: Sequence[str] = ()) -> str:
-    """Return a panel with a table whose first column names the rows."""
-    head = f"<tr>{_cells('th', heading)}</tr>" if heading else ""
-    body = "".join(f"<tr>{_cells('td', row)}</tr>" for row in rows)
-    return f'<div class="panel"><table>{head}{body}</table></div>'
+    """Return a panel with a table whose first column names the rows; a wide one scrolls under that column."""
+    head = f"<thead><tr>{''.join(map(_heading_cell, heading))}</tr></thead>" if heading else ""
+    lines = [f"<tr>{_name_cell(name)}{''.join(map(_cell, cells))}</tr>" for name, *cells in rows]
+    kind, tall = "data" if heading else "facts", " tall" * (len(lines) > TALL)
+    content = f'<table class="{kind}">{head}<tbody>{"".join(lines)}</tbody></table>'
+    return f'<div class="panel scroll{tall}" tabindex="0">{content}</div>'
 
 
-def _cells(tag: str, row: Sequence[str]) -> str:
-    return "".join(f"<{tag}>{escape(cell)}</{tag}>" for cell in row)
+def _heading_cell(text: str) -> str:
+    return f'<th scope="col">{escape(text)}</th>'
+
+
+def _name_cell(text: str) -> str:
+    return f'<th scope="row">{escape(text).replace("_", "_<wbr>")}</th>'
+
+
+def _cell(text: str) -> str:
+    kind = "bad" if text in BAD else "good" if text in GOOD else "long" if len(text) > LONG else ""
+    return f'<td class="{kind}">{escape(text)}</td>' if kind else f"<td>{escape(text)}</td>"
 
 
 def panel(label: str, figures: Sequence[str], n_columns: int = 3) -> str:
@@ -120,17 +116,45 @@ def panel(label: str, figures: Sequence[str], n_columns: int = 3) -> str:
     )
 
 
+def grid(panels: Sequence[str], *, is_smooth: bool = True) -> str:
+    """Return panels two beside each other; pictures that are not smoothed show their pixels."""
+    kind = "row" if is_smooth else "row pixels"
+    return f'<div class="{kind}" style="--columns: 2">{"".join(panels)}</div>'
+
+
 def curves(svgs: Sequence[str], n_columns: int = 3) -> str:
     """Return curves side by side, in as many rows as it takes."""
     return f'<div class="panel row" style="--columns: {min(n_columns, len(svgs))}">{"".join(svgs)}</div>'
 
 
+def slider(truth: Picture, renders: Mapping[str, Picture]) -> str:
+    """Return a picture of which the left part is the truth and the right part a render, with a line that moves.
+
+    Parameters
+    ----------
+    truth : ndarray of shape (H, W, 3)
+        sRGB.
+    renders : mapping
+        Pictures of the same size by their captions; of several, the reader chooses one.
+    """
+    figures = [captioned(truth, "truth"), *(captioned(picture, caption) for caption, picture in renders.items())]
+    return f'<div class="slider">{"".join(figures)}</div>'
+
+
 def captioned(picture: Picture, caption: str) -> str:
     """Return a picture with a caption."""
-    png = io.BytesIO()
-    Image.fromarray(picture).save(png, format="PNG")
-    content = base64.b64encode(png.getvalue()).decode("ascii")
+    height, width = picture.shape[:2]
     return (
-        f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{content}">'
+        f'<figure><img alt="{escape(caption)}" width="{width}" height="{height}" src="{_data_url(picture)}">'
         f"<figcaption>{escape(caption)}</figcaption></figure>"
     )
+
+
+def _data_url(picture: Picture) -> str:
+    """Return the picture in base64, a large one as JPEG with colours at full resolution."""
+    is_large = picture.shape[0] * picture.shape[1] > PNG_PIXELS
+    kind = "jpeg" if is_large else "png"
+    options = {"quality": JPEG_QUALITY, "subsampling": 0} if is_large else {}
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, format=kind, **options)
+    return f"data:image/{kind};base64,{base64.b64encode(file.getvalue()).decode('ascii')}"

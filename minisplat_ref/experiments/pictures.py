@@ -2,6 +2,7 @@
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from minisplat_ref.types import Floats
 
@@ -52,3 +53,19 @@ def side_by_side(pictures: list[Picture]) -> Picture:
     gap = np.full((pictures[0].shape[0], GAP, 3), 255, dtype=np.uint8)
     with_gaps = [part for picture in pictures for part in (gap, picture)]
     return np.concatenate(with_gaps[1:], axis=1)
+
+
+def split(joined: Picture, n: int) -> list[Picture]:
+    """Take pictures apart that :func:`side_by_side` has joined; all are of one width."""
+    width = (joined.shape[1] - (n - 1) * GAP) // n
+    return [joined[:, k * (width + GAP) : k * (width + GAP) + width] for k in range(n)]
+
+
+def fitting(picture: Picture, longest: int) -> Picture:
+    """Return a picture [H, W, 3] whose longer side has at most so many pixels, averaged down where it has more."""
+    height, width = picture.shape[:2]
+    scale = longest / max(height, width)
+    if scale >= 1:
+        return picture
+    size = (max(1, round(scale * width)), max(1, round(scale * height)))
+    return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BOX))

@@ -1,8 +1,10 @@
 """Curves in one style, as inline SVG for a page and as PNG files."""
 
 import io
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -14,20 +16,35 @@ from minisplat_ref.io.atomic import replacing
 
 TITLE_COLOR = "#4a5560"
 GRID_COLOR = "#e6eaee"
+EDGE_COLOR = "#8a94a0"
+TICK_COLOR = "#6a7580"
+RED, BLUE, GREEN, PURPLE = "#b4553d", "#2d6a8e", "#4b7f52", "#8a5a9e"
+OCHRE, GREY, TEAL, BROWN = "#b08a2e", "#5a6570", "#2c7f86", "#8c5a2e"
+SERIES = (RED, BLUE, GREEN, PURPLE, OCHRE, GREY, TEAL, BROWN)
+PALETTE = {
+    TITLE_COLOR: "soft",
+    GRID_COLOR: "grid",
+    EDGE_COLOR: "edge",
+    TICK_COLOR: "faint",
+    "#ffffff": "panel",
+    **dict(zip(SERIES, ("red", "blue", "green", "purple", "ochre", "grey", "teal", "brown"), strict=True)),
+}
+"""Names of the colours in a page, which has a light and a dark value of each."""
 PNG_DPI = 150
 PLOT_STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # text stays text: smaller, and in the page's own font
     "svg.hashsalt": "minisplat-ref",  # the same run gives the same bytes
     "font.family": "sans-serif",
     "font.size": 11,
-    "axes.edgecolor": "#8a94a0",
+    "text.color": TITLE_COLOR,
+    "axes.edgecolor": EDGE_COLOR,
     "axes.labelcolor": TITLE_COLOR,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
     "grid.color": GRID_COLOR,
-    "xtick.color": "#6a7580",
-    "ytick.color": "#6a7580",
+    "xtick.color": TICK_COLOR,
+    "ytick.color": TICK_COLOR,
 }
 
 
@@ -53,13 +70,19 @@ def plot(title: str, x_label: str, size: tuple[float, float] = (4.4, 3.0)) -> It
 
 
 def to_svg(figure: Figure) -> str:
-    """Return the figure as an element of a page."""
+    """Return the figure as an element of a page, in the page's colours, named after the titles of its axes."""
     buffer = io.StringIO()
     no_metadata = dict.fromkeys(("Creator", "Date", "Format", "Type"))
     with rc_context(PLOT_STYLE):
         figure.savefig(buffer, format="svg", transparent=True, metadata=no_metadata)
-    svg = buffer.getvalue()
-    return svg[svg.index("<svg") :]
+    text = buffer.getvalue()
+    svg = re.sub(
+        r'<g id="[^"]*">', "<g>", text[text.index("<svg") :]
+    )  # the same in every figure, and nothing needs them
+    for color, name in PALETTE.items():
+        svg = svg.replace(color, f"var(--{name})")
+    titles = ", ".join(axes.get_title(loc="left") for axes in figure.axes)
+    return svg.replace("<svg", f'<svg role="img" aria-label="{escape(titles)}"', 1)
 
 
 def save_png(figure: Figure, path: Path) -> None:

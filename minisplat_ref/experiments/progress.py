@@ -16,6 +16,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import replacing, unwritable
 from minisplat_ref.metrics import psnr
 from minisplat_ref.training.loop import StepReport
+from minisplat_ref.training.pace import Cooling
 
 LOG_EVERY = 5  # iterations; a PSNR is measured as often
 PSNR_WINDOW = 20  # measured views that the shown PSNR is the mean of: single views differ too much to show a trend
@@ -36,10 +37,10 @@ class Clock(NamedTuple):
 class Progress(AbstractContextManager["Progress"]):
     """Bar and log of one training: a context manager that is called with every :class:`StepReport`."""
 
-    def __init__(self, log_path: Path, first_step: int, last_step: int | None) -> None:
+    def __init__(self, log_path: Path, first_step: int, last_step: int | None, cooling: Cooling | None = None) -> None:
         records = [record for record in read_log(log_path) if record["step"] <= first_step]
         self._log_path, self._old_records = log_path, records
-        self._first_step, self._last_step = first_step, last_step
+        self._first_step, self._last_step, self._cooling = first_step, last_step, cooling
         self._before = Clock(records[-1]["seconds"], records[-1].get("cpu_seconds")) if records else Clock(0.0, 0.0)
         self._losses: list[float] = []
         self._psnrs: deque[float] = deque((record["psnr"] for record in records[-1:]), maxlen=PSNR_WINDOW)
@@ -120,8 +121,17 @@ class Progress(AbstractContextManager["Progress"]):
                 "its/s": report.step / seconds,
             },
         )
-        self._bar.set_postfix_str(f"loss {loss:.4f}, {mean_psnr:.2f} dB, {n_gaussians:,} Gaussians", refresh=False)
+        line = f"loss {loss:.4f}, {mean_psnr:.2f} dB, {n_gaussians:,} Gaussians{self._least_rest(report)}"
+        self._bar.set_postfix_str(line, refresh=False)
         self._losses.clear()
+
+    def _least_rest(self, report: StepReport) -> str:
+        """Say how long a training that has not decided its length goes on at least: as if it began to cool now."""
+        if self._cooling is None or report.last_step is not None:
+            return ""
+        bar = self._bar.format_dict
+        rate = bar["rate"] or (bar["n"] - bar["initial"]) / bar["elapsed"]  # the first is of the last few iterations
+        return f", at least {tqdm.format_interval(self._cooling.part * report.step / rate)} to go"
 
 
 def write_log(path: Path, records: Iterable[dict[str, Any]]) -> None:

@@ -1,9 +1,9 @@
-"""A size to train large photographs at, and what the size that they have would cost.
+"""Propose a size at which to train large photographs, with the time of an iteration at both sizes.
 
-The work of an iteration grows with the pixels that the Gaussians cover, and so does the number of Gaussians that pay.
-Photographs of a camera therefore take hours where a quarter of their sides takes minutes and shows most of the scene.
-Both iterations are timed here, on this machine, with the Gaussians that training starts from. These are few and large;
-later ones are more, so the ratio is a lower bound.
+The work of an iteration grows with the pixels that the Gaussians cover, and so does the useful number of Gaussians.
+Full-size photographs therefore take hours, where a quarter of their width and height takes minutes and shows most of
+the scene. Both iterations are timed here, on this machine, with the Gaussians from which training starts. Later ones
+are more numerous, so the ratio is a lower bound.
 """
 
 import math
@@ -28,7 +28,7 @@ REPEATS = 3
 
 
 def propose(scene: Scene, state: TrainState, recipe: Recipe, settings: Settings) -> str | None:
-    """Return a line that proposes a size, or None where the photographs are of a comfortable one.
+    """Return a line that proposes a size, or None if the photographs are small enough.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def propose(scene: Scene, state: TrainState, recipe: Recipe, settings: Settings)
 
 
 def _iteration_seconds(model: Model, view: View, recipe: Recipe, settings: Settings) -> float:
-    """Return how long it takes to draw a view and to differentiate it, median of a few; the first does not count."""
+    """Return the median time to render and differentiate a view, over a few runs after a first one."""
     request = Request(conventions=PROFILES[settings.profile], backend=get_backend(settings.backend))
     v_image = np.ones((view.camera.height, view.camera.width, 3), np.float32)  # [H, W, 3]
     seconds = []

@@ -19,6 +19,7 @@ from minisplat_ref.backends import get_backend
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
 from minisplat_ref.experiments import checkpoints, curve, events, fingerprint, run_folder
+from minisplat_ref.experiments.preview import previewing
 from minisplat_ref.experiments.progress import Clock, Progress
 from minisplat_ref.experiments.scoring import measure, score, to_metrics
 from minisplat_ref.experiments.settings import Settings, save_model, to_config
@@ -55,6 +56,7 @@ def run_training(
     state: TrainState,
     network: Network | None = None,
     check_every: int = Guard().every,
+    shows_preview: bool = False,
 ) -> Outcome:
     """Train, save and measure.
 
@@ -74,6 +76,8 @@ def run_training(
         Of the settings, to measure LPIPS with: read before the training, so that nothing can be wrong with it after.
     check_every : int
         Iterations after which parameters and gradients are looked at for numbers that are not finite.
+    shows_preview : bool
+        Keep a picture of the training up to date: :mod:`.preview`.
 
     Returns
     -------
@@ -90,7 +94,7 @@ def run_training(
         if state.step == 0:
             checkpoints.save(folder, state, recipe)
         surface = true_surface(Path(settings.scene), scene) if settings.eval_every else None
-        clock = _train(folder, scene, settings, recipe, state, surface, check_every)
+        clock = _train(folder, scene, settings, recipe, state, surface, check_every, shows_preview)
         is_saved = _save(folder, settings, recipe, state)
         evaluation = _measure(folder, scene, settings, state, clock, surface, network) if is_saved else None
         return Outcome(evaluation, clock.seconds, state.step >= last_step(state, recipe, settings.iterations))
@@ -123,10 +127,11 @@ def _train(
     state: TrainState,
     surface: Surface | None,
     check_every: int,
+    shows_preview: bool,
 ) -> Clock:
     """Train to the end or to Ctrl-C; return how long it took."""
     total = settings.iterations if recipe.cooling is None else state.pace.last_step
-    progress = Progress(folder / run_folder.LOG, state.step, total)
+    progress = Progress(folder / run_folder.LOG, state.step, total, recipe.cooling)
     callbacks: list[Callable[[StepReport], None]] = [progress]
     if state.step == 0 or (folder / run_folder.EVENTS).exists():  # else half a record would hide what fired before
         curve.keep_until(folder / run_folder.EVENTS, state.step)
@@ -134,6 +139,8 @@ def _train(
     if settings.eval_every:
         curve.keep_until(folder / run_folder.CURVE, state.step)
         callbacks.append(_curve(folder / run_folder.CURVE, scene, settings, progress, surface))
+    if shows_preview:
+        callbacks.append(previewing(folder, scene, settings, progress))
     if settings.minutes is not None:
         callbacks.append(_in_time(settings, recipe, progress))
     callbacks.append(checkpoints.saving(folder, recipe))  # after the records: what it continues from is in them
@@ -185,7 +192,7 @@ def _save(folder: Path, settings: Settings, recipe: Recipe, state: TrainState) -
         return False
     try:
         with Interruptions() as interruptions:
-            interruptions.hold()
+            interruptions.defer()
             checkpoints.save(folder, state, recipe)
             save_model(folder, settings, state.model)
             if recipe.cooling is not None:
@@ -204,25 +211,31 @@ def _measure(
     surface: Surface | None,
     network: Network | None,
 ) -> Evaluation | None:
-    """Measure the model and write the measures, the last that a run does; None when Ctrl-C comes meanwhile."""
+    """Measure the model, write the page and then the measures, the last that a run does.
+
+    Returns None when Ctrl-C comes meanwhile.
+    """
+    from minisplat_ref.experiments.run_report import write_report  # draws curves: a training would wait for that
+
     peak_mb = peak_rss_mb()  # before the network of LPIPS takes more than the training did
+    n_gaussians = len(state.gaussians.means)
     try:
         evaluation = score(folder, scene, state.model, settings, network)
+        if settings.eval_every:
+            further = {"cpu_seconds": clock.cpu_seconds, **_chamfer(state.gaussians, surface)}
+            curve.append(folder / run_folder.CURVE, state.step, clock.seconds, evaluation, n_gaussians, **further)
+        metrics = {
+            "n_gaussians": n_gaussians,
+            "iterations": state.step,
+            "has_ended_early": state.pace.last_step == state.step,
+            "train_seconds": clock.seconds,
+            "train_cpu_seconds": clock.cpu_seconds,
+            "peak_rss_mb": peak_mb,
+            **to_metrics(evaluation),
+        }
+        write_report(folder, scene, metrics)
     except KeyboardInterrupt:
         return None
-    n_gaussians = len(state.gaussians.means)
-    if settings.eval_every:
-        further = {"cpu_seconds": clock.cpu_seconds, **_chamfer(state.gaussians, surface)}
-        curve.append(folder / run_folder.CURVE, state.step, clock.seconds, evaluation, n_gaussians, **further)
-    metrics = {
-        "n_gaussians": n_gaussians,
-        "iterations": state.step,
-        "has_ended_early": state.pace.last_step == state.step,
-        "train_seconds": clock.seconds,
-        "train_cpu_seconds": clock.cpu_seconds,
-        "peak_rss_mb": peak_mb,
-        **to_metrics(evaluation),
-    }
     run_folder.write_json(folder / run_folder.METRICS, metrics)
     return evaluation
 

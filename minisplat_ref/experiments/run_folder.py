@@ -22,6 +22,7 @@ CHECKPOINT = "checkpoint.npz"  # what `--resume` continues from
 PREVIOUS = "checkpoint-previous.npz"  # the one before, should that be damaged
 CAMERAS = "cameras.json"  # cameras of all views and hashes of their photographs: to render without them, to know them
 DECISIONS = "decisions.json"  # what a recipe that decides its own length has measured and decided
+REPORT = "report.html"  # all of it to look at
 RENDERS = "renders"  # truth | render | error of each test view
 
 WORK = {CHECKPOINT, PREVIOUS, POINT_CLOUD, METRICS}  # what has taken time; a run without any has not begun

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from tqdm import tqdm
+
 from minisplat_ref.backends import get_backend
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputWarning, one_line
@@ -101,12 +103,16 @@ def score(folder: Path, scene: Scene, model: Model, settings: Settings, network:
     """
     names = [view.name for view in scene.test_views]
     stems = dict(zip(names, file_names(names), strict=True))
-    with replacing_folder(folder / RENDERS) as renders:
+    with (
+        replacing_folder(folder / RENDERS) as renders,
+        tqdm(total=len(names), desc="measuring", unit="view", delay=2.0, leave=False, disable=None) as bar,
+    ):
 
         def save(view: View, image: Floats, _: ViewMetrics) -> None:
             picture = to_picture(image)
             panels = [view.image, picture, error_picture(view.image, picture)]
             write_image(renders / f"{stems[view.name]}.png", side_by_side(panels))
+            bar.update()
 
         return measure(scene, model, settings, on_view=save, network=network)
 
@@ -124,12 +130,14 @@ def _finite(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def summary(evaluation: Evaluation) -> str:
-    """Return the measures in half a line."""
+    """Return the measures in half a line; of several views, which is the worst."""
     if evaluation.psnr is None or evaluation.ssim is None:
         return "no test views to measure"
     n_views = len(evaluation.per_view)
     lpips = "" if evaluation.lpips is None else f", LPIPS {evaluation.lpips:.4f} by {evaluation.lpips_network}"
+    worst = min(evaluation.per_view, key=lambda view: view.psnr)
+    and_worst = f"; the worst is {one_line(worst.name)} with {worst.psnr:.2f} dB" if n_views > 1 else ""
     return (
         f"PSNR {evaluation.psnr:.2f} dB, SSIM {evaluation.ssim:.4f}{lpips}"
-        f" (mean of {n_views} test view{'s'[: n_views > 1]})"
+        f" (mean of {n_views} test view{'s'[: n_views > 1]}{and_worst})"
     )

@@ -77,6 +77,8 @@ class Settings(NamedTuple):
     """Size that the PLY of a simplification after the training may have; None: there is none."""
     init: str | None = None
     """Absolute path of the PLY whose points the training starts from, not read again; None for the scene's points."""
+    background: list | None = None
+    """[3] RGB in [0, 1] behind the scene, and behind transparent pixels of a transforms.json; None for black."""
 
 
 def recipe_of(settings: Settings) -> Recipe:
@@ -168,6 +170,7 @@ def load(folder: Path) -> Settings:
         texts_are_wrong = any(not isinstance(text, str) for text in settings.set.values())
         wrong = ["set"] * texts_are_wrong + ["profile"] * (settings.profile not in PROFILES)
         wrong += ["backend"] * (settings.backend not in BACKENDS)
+        wrong += ["background"] * (settings.background is not None and as_array(settings.background, (3,)) is None)
     if wrong:
         name = wrong[0]
         raise InputError(
@@ -211,6 +214,7 @@ def load_photographs(settings: Settings) -> Scene:
         settings.scene,
         downscale=settings.downscale,
         test_every=settings.test_every,
+        background=settings.background,
         undistort=settings.undistort,
     )
 

@@ -1,6 +1,6 @@
 """What ``simplify`` shows: its table, the curve as a figure, and ``report.html``."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,12 +10,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, NullLocator
 
-from minisplat_ref.experiments.page import captioned, cards, code, curves, page, panel, paragraph, section, table
+from minisplat_ref.experiments.commands import command
+from minisplat_ref.experiments.page import cards, code, curves, grid, page, panel, paragraph, section, slider, table
 from minisplat_ref.experiments.pictures import Picture
-from minisplat_ref.experiments.plots import PLOT_STYLE, TITLE_COLOR, to_svg
+from minisplat_ref.experiments.plots import BLUE, EDGE_COLOR, PLOT_STYLE, RED, TITLE_COLOR, to_svg
 from minisplat_ref.experiments.rate_distortion import N_SIZES, SIZES_PER_HALVING
 
-BLUE, RED, GREY = "#2d6a8e", "#b4553d", "#8a94a0"
 TABLE_HEADING = ["Gaussians", "PLY bytes", "PSNR (dB)", "drop (dB)", "std. error", ""]
 N_BELOW = 3  # sizes below the chosen one on the enlarged axes
 LEAST_ZOOM = 0.1  # dB that the enlarged axis of drops shows at least
@@ -78,11 +78,15 @@ def _with_error(drop: dict[str, Any]) -> str:
 
 def draw(result: dict[str, Any]) -> Figure:
     """Draw PSNR and drop against the number of Gaussians, with what was chosen and the knee."""
+    return _figure(result, _draw_psnr, _draw_drop)
+
+
+def _figure(result: dict[str, Any], *draws: Callable[[Axes, dict[str, Any]], None]) -> Figure:
+    """Draw plots beside each other."""
     with rc_context(PLOT_STYLE):
-        figure = Figure(figsize=(10.4, 3.9), layout="constrained")
-        left, right = figure.subplots(1, 2)
-        _draw_psnr(left, result)
-        _draw_drop(right, result)
+        figure = Figure(figsize=(5.2 * len(draws), 3.9), layout="constrained")
+        for axes, draw_on in zip(figure.subplots(1, len(draws), squeeze=False)[0], draws, strict=True):
+            draw_on(axes, result)
     return figure
 
 
@@ -91,7 +95,7 @@ def _draw_psnr(axes: Axes, result: dict[str, Any]) -> None:
     counts, psnrs = ([point[name] for point in points] for name in ("n_gaussians", "psnr"))
     errors = [point["standard_error"] for point in points]
     axes.errorbar(counts, psnrs, yerr=errors, color=BLUE, marker="o", ms=4, capsize=3, label="fine-tuned")
-    axes.axhline(result["all"]["psnr"], color=GREY, linestyle="--", linewidth=1, label="all Gaussians")
+    axes.axhline(result["all"]["psnr"], color=EDGE_COLOR, linestyle="--", linewidth=1, label="all Gaussians")
     _mark(axes, result, "psnr")
     _finish(axes, result, "PSNR of held-out training views (dB)", 1)
     axes.legend(frameon=False, fontsize=9, loc="lower right")
@@ -101,7 +105,7 @@ def _draw_drop(axes: Axes, result: dict[str, Any]) -> None:
     points, chosen, limit = result["curve"], result["chosen"], result["max_drop"]
     counts, drops, errors = ([p[name] for p in points] for name in ("n_gaussians", "drop", "standard_error"))
     axes.errorbar(counts, drops, yerr=errors, color=BLUE, marker="o", ms=4, capsize=3)
-    axes.axhline(0, color=GREY, linestyle="--", linewidth=1)
+    axes.axhline(0, color=EDGE_COLOR, linestyle="--", linewidth=1)
     if limit is not None:
         axes.axhline(limit, color=RED, linewidth=1, label=f"at most {limit:g} dB")
         axes.legend(frameon=False, fontsize=9, loc="upper right")
@@ -118,7 +122,7 @@ def _draw_drop(axes: Axes, result: dict[str, Any]) -> None:
 def _mark(axes: Axes, result: dict[str, Any], name: str) -> None:
     """Ring the chosen size, and let the knee be a dotted line."""
     chosen, bend = result["chosen"], result["knee"]
-    axes.axvline(bend["n_gaussians"], color=GREY, linestyle=":", linewidth=1.3, label="knee")
+    axes.axvline(bend["n_gaussians"], color=EDGE_COLOR, linestyle=":", linewidth=1.3, label="knee")
     axes.plot(
         chosen["n_gaussians"],
         chosen[name],
@@ -144,7 +148,7 @@ def _finish(axes: Axes, result: dict[str, Any], title: str, ticks_per_halving: i
     axes.set_xlabel("Gaussians")
 
 
-def report_html(folder: Path, result: dict[str, Any], figure: Figure, shown: Sequence[Shown]) -> str:
+def report_html(folder: Path, result: dict[str, Any], shown: Sequence[Shown]) -> str:
     """Return the page as text of one self-contained HTML file; ``folder`` is where the new model will lie."""
     chosen, test = result["chosen"], result["test"]
     n, n_all, n_held = chosen["n_gaussians"], result["all"]["n_gaussians"], len(result["held_out"])
@@ -160,24 +164,25 @@ def report_html(folder: Path, result: dict[str, Any], figure: Figure, shown: Seq
     ]
     if test is not None:
         figures.append((f"{test['psnr_after']:.2f} dB", f"test PSNR, from {test['psnr_before']:.2f} dB"))
+    svgs = [to_svg(_figure(result, draw_on)) for draw_on in (_draw_psnr, _draw_drop)]
     sections = [
         cards(figures),
-        section("How small it may be", paragraph(CURVE_TEXT), curves([to_svg(figure)], 1)),
+        section("How small it may be", paragraph(CURVE_TEXT), curves(svgs, 2)),
         section("The decision", paragraph(_decision(result)), table(table_rows(result), TABLE_HEADING)),
         paragraph(f"{REFERENCE_TEXT} Before it, the run has {result['run_psnr']:.2f} dB on them."),
         paragraph(KNEE_TEXT),
     ]
     if test is not None:
-        pictures = [_panel(view) for view in shown]
-        sections.append(section("Test views", paragraph(f"{closing_line(result)}. {TEST_TEXT}"), *pictures))
-    commands = f"minisplat-ref render {folder} --cameras orbit\nminisplat-ref convert {folder} {folder}.spz"
-    sections.append(section("What to do with it", code(commands)))
+        about = paragraph(f"{closing_line(result)}. {TEST_TEXT}")
+        sections.append(section("Test views", about, grid(list(map(_panel, shown)))))
+    walk = command("render", folder, "--cameras", "orbit")
+    pack = command("convert", folder, folder.parent / f"{folder.name}.spz")
+    sections.append(section("What to do with it", code(f"{walk}\n{pack}")))
     return page(f"{result['scene']}, simplified", introduction, sections)
 
 
 def _panel(view: Shown) -> str:
-    pictures = {"truth": view.truth, "before": view.before, "after": view.after}
-    return panel(view.name, [captioned(picture, caption) for caption, picture in pictures.items()])
+    return panel(view.name, [slider(view.truth, {"after": view.after, "before": view.before})], n_columns=1)
 
 
 def _decision(result: dict[str, Any]) -> str:

@@ -22,7 +22,6 @@ from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.metrics import Evaluation, ViewMetrics
 from minisplat_ref.types import Floats, Model, View
 
-REPORT = "report.html"
 N_SHOWN = 3  # test views
 
 
@@ -62,9 +61,8 @@ def simplify_run(asked: Asked) -> dict[str, Any]:
         result = {**to_result(run, asked, decision), "test": of_test_views(before, alike, after)}
         _write_run(folder, run, result, after)
         run_folder.write_json(folder / RESULT, result)
-        figure = draw(result)
-        save_png(figure, folder / FIGURE)
-        (folder / REPORT).write_text(report_html(asked.out, result, figure, _shown(run, model)), encoding="utf-8")
+        save_png(draw(result), folder / FIGURE)
+        (folder / run_folder.REPORT).write_text(report_html(asked.out, result, _shown(run, model)), encoding="utf-8")
     return result
 
 

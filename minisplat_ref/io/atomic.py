@@ -1,6 +1,6 @@
-"""A file or folder is there complete or not at all: written beside its place, then renamed onto it.
+"""Write a file or folder completely or not at all: write a temporary one beside it, then rename it.
 
-A process that is killed leaves its unfinished part behind, under a name by which :func:`remove_parts` knows it.
+A process that is killed leaves its unfinished part behind, under a name that :func:`remove_parts` recognises.
 """
 
 import contextlib
@@ -32,7 +32,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
     ------
     InputError
         If the folder does not exist, or the file cannot be written: the disk is full or read-only, or there is a limit
-        to the size of files. What was at ``path`` is as it was.
+        to the size of files. A previous file at ``path`` stays unchanged.
     """
     path = Path(path)
     if not path.absolute().parent.is_dir():
@@ -41,7 +41,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
     try:
         yield temporary
         with open(temporary, "r+b") as file:
-            os.fsync(file.fileno())  # the rename must not overtake the content; a disk may say only now that it is full
+            os.fsync(file.fileno())  # before the rename; a full disk may only be reported now
         os.replace(temporary, path)
     except OSError as error:
         if error.filename is not None and Path(os.fsdecode(error.filename)) != temporary:
@@ -110,12 +110,12 @@ def replacing_folder(path: str | Path) -> Iterator[Path]:
 
 
 def is_part(path: Path) -> bool:
-    """Return whether a file or folder is what a process was writing when it was killed."""
+    """Return whether a file or folder is the unfinished output of a killed process."""
     return re.fullmatch(r"\..+\.\d+\.part", path.name) is not None
 
 
 def remove_parts(folder: Path) -> None:
-    """Remove what killed processes were writing in a folder. No other process may be writing there now."""
+    """Remove the unfinished output of killed processes in a folder. No other process may be writing there now."""
     for path in filter(is_part, folder.iterdir()):
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
@@ -124,5 +124,5 @@ def remove_parts(folder: Path) -> None:
 
 
 def _part_of(path: Path) -> Path:
-    """Name for what is being written, unique to this process."""
+    """Return a name for unfinished output, unique to this process."""
     return path.absolute().with_name(f".{path.absolute().name}.{os.getpid()}.part")

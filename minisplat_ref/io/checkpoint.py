@@ -1,7 +1,7 @@
 """Checkpoints: named arrays and one JSON description in a .npz file that is either whole or absent.
 
-The file says the SHA-256 of what it holds. Zip's own check sums see a damaged array, but neither one that is missing
-nor one that belongs to another checkpoint.
+The file contains the SHA-256 of its contents. Zip's own checksums detect a damaged array, but neither a missing one nor
+one that belongs to another checkpoint.
 """
 
 import hashlib
@@ -26,7 +26,7 @@ _HEADER = "header"
 
 
 class DamagedCheckpoint(InputError):
-    """The file is missing, cannot be read, or does not hold what was written: an older one may do."""
+    """The file is missing, cannot be read, or is not what was written; an older one may still be intact."""
 
 
 def save_checkpoint(
@@ -36,7 +36,7 @@ def save_checkpoint(
     *,
     previous: str | Path | None = None,
 ) -> None:
-    """Write a checkpoint; whoever opens ``path`` meanwhile, or after a crash, finds the old one or the new one.
+    """Write a checkpoint; during the writing, or after a crash, ``path`` is the old one or the new one.
 
     Parameters
     ----------
@@ -47,12 +47,12 @@ def save_checkpoint(
     metadata : mapping
         Anything that JSON can hold; integers of any size and floats come back exactly.
     previous : path, optional
-        Where the file that is replaced is kept, once the new one has been written.
+        Path to which the replaced file moves once the new one has been written.
 
     Raises
     ------
     InputError
-        The file cannot be written; the old one is as it was.
+        The file cannot be written; the old one stays unchanged.
     """
     content = {"format": FORMAT, "metadata": dict(metadata), "sha256": _digest(arrays, metadata)}
     header = np.frombuffer(json.dumps(content).encode(), np.uint8)
@@ -64,7 +64,7 @@ def save_checkpoint(
 
 
 def _keep(path: Path, name: Path) -> None:
-    """Give a file a second name, at which it stays when the first is replaced."""
+    """Give a file a second name, under which it remains when the first is replaced."""
     with replacing(name) as temporary:
         try:
             os.link(path, temporary)
@@ -73,7 +73,7 @@ def _keep(path: Path, name: Path) -> None:
 
 
 def _digest(arrays: Mapping[str, NDArray[Any]], metadata: Mapping[str, Any]) -> str:
-    """SHA-256 of the description, and of the names, types, shapes and bytes of all arrays."""
+    """Return the SHA-256 of the description and of the names, types, shapes and bytes of all arrays."""
     digest = hashlib.sha256(json.dumps(dict(metadata)).encode())
     for name, array in sorted(arrays.items()):
         digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
@@ -104,7 +104,7 @@ def load_checkpoint(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str
 
 
 def load_metadata(path: str | Path) -> dict[str, Any]:
-    """Read the description alone. The arrays are not looked at: they, or the description, may be damaged.
+    """Read the description alone, without checking for damage.
 
     Raises
     ------

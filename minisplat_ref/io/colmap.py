@@ -1,9 +1,9 @@
 """Scenes that COLMAP has calibrated: ``images/`` with ``sparse/0/`` or ``sparse/``, binary or text, read by pycolmap.
 
-Poses are COLMAP's, which are ours: cam_from_world, OpenCV axes, the centre of the top-left pixel at (0.5, 0.5). Masks
-are where COLMAP looks for them (``masks/<file>.png``, as in ``0001.jpg.png``) or at ``masks/<name>.png``. An alpha
-channel is a mask too. A point's track says which views see it. Left out: 2D features, and images that COLMAP could not
-register.
+Poses follow COLMAP's convention, which is also ours: cam_from_world, OpenCV axes, the centre of the top-left pixel at
+(0.5, 0.5). Masks are where COLMAP looks for them (``masks/<file>.png``, as in ``0001.jpg.png``) or at
+``masks/<name>.png``. An alpha channel is a mask too. A point's track says which views see it. Left out: 2D features,
+and images that COLMAP could not register.
 """
 
 import struct
@@ -41,7 +41,7 @@ BINARY_RECORDS = {
     "points3D.bin": Records(n_fixed=43, has_name=False, count_format="<Q", n_item=8),
     "frames.bin": Records(n_fixed=64, has_name=False, count_format="<I", n_item=16),
 }
-# What pycolmap raises for damaged files: its own checks, and what garbage leads to that is read as an id or a count.
+# What pycolmap raises for damaged files: from its own checks, and when it takes garbage for an id or a count.
 DAMAGE_ERRORS = (ValueError, IndexError, RuntimeError, MemoryError, OSError)
 
 
@@ -87,7 +87,7 @@ def load_colmap(
 
 
 def find_model(path: Path) -> Path | None:
-    """Folder of the COLMAP model of a scene, None if it has none."""
+    """Return the folder of the COLMAP model of a scene, None if it has none."""
     folders = (path / folder for folder in MODEL_FOLDERS)
     return next((f for f in folders if (f / "cameras.bin").is_file() or (f / "cameras.txt").is_file()), None)
 
@@ -114,7 +114,7 @@ def read_model(path: Path) -> Any:
     if is_binary:
         size = 8 + sum(24 + 8 * len(camera.params) for camera in reconstruction.cameras.values())
         found = (model / "cameras.bin").stat().st_size
-        if found < size:  # which pycolmap does not notice
+        if found < size:  # pycolmap does not notice
             raise InputError(f"{model / 'cameras.bin'}: truncated, {found} of {size} bytes; copy or export it again")
     return reconstruction
 
@@ -131,7 +131,7 @@ def colmap_photos(path: Path, reconstruction: Any) -> list[Photo]:
 
 
 def _name(path: Path, image: Any) -> str:
-    """Name of an image, which must be text and stay in ``images/``."""
+    """Return the name of an image, which must be text and stay in ``images/``."""
     try:
         return name_inside(image.name, path)
     except UnicodeDecodeError:
@@ -141,7 +141,7 @@ def _name(path: Path, image: Any) -> str:
 
 
 def _photo(path: Path, folder: Path, name: str, image: Any, seen: Mapping[int, Ints] | None) -> Photo:
-    """One registered image of the model, and what it sees of the points where there are tracks."""
+    """Return a registered image of the model, with the points that it sees if there are tracks."""
     masks = path / "masks"
     candidates = (masks / f"{name}.png", (masks / name).with_suffix(".png"))
     pose = image.cam_from_world().matrix()  # [3, 4]
@@ -167,19 +167,19 @@ def _photo(path: Path, folder: Path, name: str, image: Any, seen: Mapping[int, I
 
 
 def _lens(camera: Any) -> Lens | None:
-    """Distortion of a ``pycolmap.Camera``; a polynomial model whose coefficients are all zero has none."""
+    """Return the distortion of a ``pycolmap.Camera``; a polynomial model with all-zero coefficients has none."""
     name, params = camera.model.name, np.asarray(camera.params)
     has_zero_distortion = name in POLYNOMIAL_MODELS and not params[list(camera.extra_params_idxs())].any()
     return None if name in PINHOLE_MODELS or has_zero_distortion else Lens(name, tuple(params.tolist()))
 
 
 def _sorted_points(reconstruction: Any) -> list[Any]:
-    """Sparse points by ascending id, so that the order does not depend on the file's."""
+    """Return the sparse points by ascending id, so that the order does not depend on the file's."""
     return [point for _, point in sorted(reconstruction.points3D.items())]
 
 
 def _point_ids(reconstruction: Any) -> dict[int, Ints] | None:
-    """Rows of the points that each image sees, by the image's id; None for a model that was written without tracks."""
+    """Return the rows of the points that each image sees, by the image's id; None for a model without tracks."""
     rows: dict[int, list[int]] = {}
     for row, point in enumerate(_sorted_points(reconstruction)):
         for element in point.track.elements:
@@ -189,14 +189,14 @@ def _point_ids(reconstruction: Any) -> dict[int, Ints] | None:
 
 
 def _points(reconstruction: Any) -> tuple[Floats, NDArray[np.uint8]]:
-    """Sparse points and their colours, [P, 3] each."""
+    """Return the sparse points and their colours, [P, 3] each."""
     points = _sorted_points(reconstruction)
     positions = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
     return positions, np.array([point.color for point in points], np.uint8).reshape(-1, 3)
 
 
 def _check_records(file: Path, layout: Records) -> None:
-    """Walk over the records of a binary file before pycolmap does: it takes what is not there for counts, and hangs."""
+    """Check the records of a binary file before pycolmap reads it, which takes missing bytes for counts and hangs."""
     content = file.read_bytes()
     offset = 8
     try:

@@ -1,7 +1,7 @@
-"""What a compact file format of Gaussians is: a suffix, levels of precision, and a pair of functions.
+"""A compact file format of Gaussians: a suffix, levels of precision, and a pair of functions.
 
-A PLY keeps every float. A format keeps less, at one of several levels, and says how much may be lost. Formats belong to
-extensions: ``minisplat_ref.extensions.extension.find_format`` finds them by the suffix of a file.
+A PLY stores every float. A format stores less, at one of several levels, and says how much may be lost. Formats belong
+to extensions: ``minisplat_ref.extensions.extension.find_format`` finds them by the suffix of a file.
 """
 
 from collections.abc import Callable
@@ -17,19 +17,19 @@ class Format(NamedTuple):
     """A compact file format of the six fields of 3DGS."""
 
     suffix: str
-    """What names of such files end in, with its dot."""
+    """The end of the names of such files, including the dot."""
     summary: str
     """What it is, in half a line."""
     levels: tuple[str, ...]
-    """What each level of precision is; the finest, and as a rule largest, first."""
+    """Description of each level of precision; the finest, and usually largest, first."""
     default_level: int
-    """The level that is written when nobody says which."""
+    """Index of the level that is written by default."""
     encode: Callable[[Gaussians, int], bytes]
     """``encode(gaussians, level)``: a whole file. Raises InputError where a value does not fit the format."""
     decode: Callable[[bytes, str | Path], Gaussians]
     """``decode(content, source)`` of a whole file; float32, finite. Raises InputError, which names ``source``."""
     describe: Callable[[bytes, str | Path], list[tuple[str, str]]]
-    """``describe(content, source)``: names and values that say what the file keeps, and how precisely."""
+    """``describe(content, source)``: names and values that say what the file stores, and how precisely."""
 
 
 def read_content(path: str | Path) -> bytes:

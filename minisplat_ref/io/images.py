@@ -29,23 +29,23 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 """Files that count as photographs."""
 
 SAVE_OPTIONS: dict[str, dict[str, Any]] = {"JPEG": {"quality": 95, "subsampling": 0}}
-PIXELS_MAX = 2**29  # of an image: more than cameras have, and 1.6 GB in memory
-PLAUSIBLE_PIXELS = 100_000_000  # up to here a flat image may be packed into any number of bytes
-PIXELS_PER_BYTE = 10_000  # beyond, a byte holds no more: a white PNG of one bit has one for 8256
+PIXELS_MAX = 2**29  # per image: more than cameras have, and 1.6 GB in memory
+PLAUSIBLE_PIXELS = 100_000_000  # up to this size, an image may be compressed into any number of bytes
+PIXELS_PER_BYTE = 10_000  # limit for larger ones: a white 1-bit PNG has 8256 pixels per byte
 DAMAGE_ERRORS = (  # what Pillow's decoders raise for damaged files
     *(OSError, SyntaxError, ValueError, TypeError, LookupError, ArithmeticError, AttributeError, EOFError),
     *(RuntimeError, struct.error, zlib.error),
 )
-_LOCK = threading.Lock()  # Pillow's limit and Python's filters of warnings are those of all threads
+_LOCK = threading.Lock()  # Pillow's limit and Python's warning filters are shared by all threads
 MASK_THRESHOLD = 128  # a mask pixel counts from half white on; masks saved as JPEG are not exactly 0 and 255
 
 
 @contextmanager
 def open_image(path: Path) -> Iterator[Image.Image]:
-    """Open an image file with Pillow; whatever goes wrong while it is decoded becomes an InputError naming the file.
+    """Open an image file with Pillow; any error in decoding becomes an InputError that names the file.
 
-    Pillow's limit of pixels, beyond which it speaks of a bomb, is below what telephones take; ours is
-    :data:`PIXELS_MAX`. What Pillow warns of, such as damaged EXIF data, does not matter here. One thread at a time.
+    Pillow's limit of pixels, beyond which it reports a decompression bomb, is below the size of phone photographs; ours
+    is :data:`PIXELS_MAX`. Pillow's warnings, such as damaged EXIF data, do not matter here. One thread at a time.
     """
     try:
         with _LOCK, _File(path) as file, warnings.catch_warnings():
@@ -73,7 +73,7 @@ def open_image(path: Path) -> Iterator[Image.Image]:
 
 
 class _File(io.BufferedReader):
-    """A file that is asked for no more bytes than it has: Pillow asks for as many as a damaged PNG claims."""
+    """A file that never reads more bytes than it has: Pillow requests as many as a damaged PNG claims."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(io.FileIO(path))
@@ -86,7 +86,7 @@ class _File(io.BufferedReader):
 
 @contextmanager
 def _without_limit() -> Iterator[None]:
-    """Set Pillow's limit of pixels aside while a file is opened, which reads no pixels."""
+    """Lift Pillow's limit of pixels while a file is opened, which reads no pixels."""
     limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
     try:
         yield
@@ -103,13 +103,13 @@ def check_n_pixels(what: str | Path, width: int, height: int) -> None:
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
-    """Width and height in pixels, from the file's header alone."""
+    """Return width and height in pixels, from the file's header alone."""
     with open_image(Path(path)) as image:
         return image.size
 
 
 def is_turned(path: str | Path) -> bool:
-    """Return whether the file's EXIF data ask to show it with width and height exchanged."""
+    """Return whether the file's EXIF orientation exchanges width and height."""
     with open_image(Path(path)) as image:
         return image.getexif().get(ExifTags.Base.Orientation, 1) in (5, 6, 7, 8)
 
@@ -185,7 +185,7 @@ def resize_mask(mask: Bools, width: int, height: int) -> Bools:
 
 
 def downscaled_size(width: int, height: int, factor: int) -> tuple[int, int]:
-    """Width and height in pixels after division by ``factor``, rounded, at least 1."""
+    """Return width and height in pixels after division by ``factor``, rounded, at least 1."""
     return max(1, round(width / factor)), max(1, round(height / factor))
 
 
@@ -197,7 +197,7 @@ def write_image(path: str | Path, image: NDArray) -> None:
     path : str or Path
         File to make or replace; its suffix chooses the format. JPEGs are of quality 95 without chroma subsampling.
     image : ndarray of shape (H, W), (H, W, 3) or (H, W, 4)
-        uint8 as it is, bool as black and white, or floats, clipped to [0, 1] and rounded to the nearest of 256 levels.
+        uint8, bool as black and white, or floats, clipped to [0, 1] and rounded to the nearest of 256 levels.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""JSON from outside: whatever a file holds, it becomes a value or an InputError of one line."""
+"""Read JSON from outside: whatever a file contains, the result is a value or an InputError of one line."""
 
 import json
 import math
@@ -33,17 +33,17 @@ def read_json(path: Path, way_out: str) -> Any:
 
 
 def parse_json(content: bytes, source: str | Path, way_out: str) -> Any:
-    """Parse JSON in UTF-8; ``source`` is named by the InputError where it is none."""
+    """Parse JSON in UTF-8; if it is invalid, the InputError names ``source``."""
     try:
-        return json.loads(content.decode("utf-8-sig"))  # some editors begin files with a mark of the byte order
-    except ValueError as error:  # also of undecodable bytes, and of integers of thousands of digits
+        return json.loads(content.decode("utf-8-sig"))  # some editors begin files with a byte order mark
+    except ValueError as error:  # also for undecodable bytes, and integers of thousands of digits
         raise InputError(f"{source}: not valid JSON ({error}); {way_out}") from None
     except RecursionError:
         raise InputError(f"{source}: lists or objects are nested too deeply to be read; {way_out}") from None
 
 
 def as_number(value: Any) -> float:
-    """Return what a file gives for a number, NaN where it is none or too large; text that spells a number counts."""
+    """Return a value from a file as a number, NaN if it is none or too large; text that spells a number counts."""
     try:
         return float(value)
     except (TypeError, ValueError, OverflowError):
@@ -51,7 +51,7 @@ def as_number(value: Any) -> float:
 
 
 def as_array(value: Any, *shapes: tuple[int, ...]) -> Floats | None:
-    """Return lists of numbers as a float64 array of one of the shapes, None where they are none; may hold NaN."""
+    """Return lists of numbers as a float64 array of one of the shapes, else None; it may contain NaN."""
     try:
         array = np.array(value, np.float64)
     except (TypeError, ValueError, OverflowError):

@@ -1,4 +1,4 @@
-"""Lens distortion: the renderer knows pinhole cameras only, so other photographs are warped to a pinhole by pycolmap.
+"""Lens distortion: the renderer has only pinhole cameras, so pycolmap warps other photographs to a pinhole.
 
 COLMAP chooses the pinhole: the same focal length, and the largest image without blank pixels.
 """
@@ -15,7 +15,7 @@ from minisplat_ref.types import Bools, Camera
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
 POLYNOMIAL_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-"""Models of which all-zero distortion coefficients make a pinhole."""
+"""Models that are a pinhole if all distortion coefficients are zero."""
 
 
 class Lens(NamedTuple):
@@ -30,9 +30,8 @@ class Lens(NamedTuple):
 def import_pycolmap() -> ModuleType:
     """Import pycolmap when it is first needed: it takes a while to load, and a few platforms have no wheel.
 
-    Pillow must be loaded before, as it is by the imports of this module: pycolmap 4.2 exports a zlib of its own, and
-    when it comes first, the zlib of the system binds to it half and half; the next PNG that Pillow writes then aborts
-    the process.
+    Pillow must be loaded before, as it is by the imports of this module: pycolmap 4.2 exports a zlib of its own, and if
+    it is loaded first, the system's zlib binds partly to it; the next PNG that Pillow writes then aborts the process.
     """
     try:
         import pycolmap
@@ -45,7 +44,7 @@ def import_pycolmap() -> ModuleType:
 
 
 def import_quiet_pycolmap() -> ModuleType:
-    """Import pycolmap and switch off its log: what goes wrong comes as an exception or an empty result."""
+    """Import pycolmap and switch off its log: errors come as exceptions or empty results."""
     pycolmap = import_pycolmap()
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL
     return pycolmap

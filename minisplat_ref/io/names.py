@@ -1,12 +1,12 @@
-"""Names of files: those that a scene's files give must stay with the scene, and those that we give must be names.
+"""File names: those read from a scene's files must stay inside the scene, and those written must be valid.
 
-What is read. COLMAP names its images relative to ``images/`` and never climbs out of it, so there is nothing to allow.
-A transforms.json names files relative to itself: nerfstudio's lie below it, instant-ngp's sometimes in the folder next
-to it (``../images/0001.jpg``), some exporters write absolute paths of the same places. Those are read, and nothing
-further away. The check is of the name, before any link is followed: a link inside the scene may lead anywhere, because
-whoever owns the disk has put it there.
+*Reading.* COLMAP names its images relative to ``images/`` and never climbs out of it, so no exception is needed. A
+transforms.json names files relative to itself: nerfstudio's lie below it, instant-ngp's sometimes in the folder next to
+it (``../images/0001.jpg``), some exporters write absolute paths of the same places. Those are read, and nothing further
+away. The check applies to the name, before any link is followed: a link inside the scene may lead anywhere, because the
+owner of the disk put it there.
 
-What is written. A name from a file never becomes a path: :func:`file_names` makes one file name of each.
+*Writing.* A name from a file never becomes a path: :func:`file_names` turns each into one file name.
 """
 
 import os
@@ -16,13 +16,13 @@ from pathlib import Path
 
 from minisplat_ref.errors import InputError
 
-CHARACTERS_MAX = 100  # of a file name without suffix; of four bytes each at most, so that 255 may be too few for more
+CHARACTERS_MAX = 100  # in a file name without suffix; characters take up to four bytes, and file systems allow 255
 BYTES_MAX = 200
 RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)  # devices, not files, on Windows
 
 
 def is_file(path: Path) -> bool:
-    """Return whether a file is there; a name that no file can have is none."""
+    """Return whether a file exists; False for a name that no file can have."""
     try:
         return path.is_file()
     except (OSError, ValueError):  # too long, or with a zero byte
@@ -58,7 +58,7 @@ def path_beside(file: Path, name: str) -> Path:
     Returns
     -------
     Path
-        Without ``..`` but for one at its beginning, so that it means the same whether links are followed or not.
+        Without ``..`` except for one at its beginning, so that it means the same whether links are followed or not.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def path_beside(file: Path, name: str) -> Path:
     folder = file.parent
     path = os.path.normpath(name.replace("\\", "/"))  # some exporters run on Windows
     if os.path.isabs(path):
-        for form in (os.path.abspath, os.path.realpath):  # the folder as it was called, and as it is
+        for form in (os.path.abspath, os.path.realpath):  # the folder as named, and with links resolved
             if Path(path).is_relative_to(Path(form(folder)).parent):
                 return Path(path)
     elif Path(path).parts[:2] != ("..", "..") and not Path(path).drive:
@@ -80,10 +80,10 @@ def path_beside(file: Path, name: str) -> Path:
 
 
 def file_names(names: Sequence[str]) -> list[str]:
-    """Return one file name, without suffix, for each name, whatever characters it holds.
+    """Return one file name, without suffix, for each name, whatever characters it contains.
 
-    Letters, digits, ``.``, ``-`` and ``_`` stay, others become ``_``. Where such names would not be different, on
-    file systems that ignore case, too, or one of them would be no name, all have their number in front.
+    Letters, digits, ``.``, ``-`` and ``_`` stay, others become ``_``. If the results would not differ, even on file
+    systems that ignore case, or one of them would be invalid, all are prefixed with their number.
     """
     stems = [_shortened(re.sub(r"[^\w.-]", "_", name)) for name in names]
     is_unique = len({stem.casefold() for stem in stems}) == len(stems)
@@ -92,5 +92,5 @@ def file_names(names: Sequence[str]) -> list[str]:
 
 
 def _shortened(stem: str) -> str:
-    """Return the last characters of a name that is too long: numbers stand at the end."""
+    """Return the last characters of a name that is too long, because numbers are usually at the end."""
     return stem[-CHARACTERS_MAX:].encode()[-BYTES_MAX:].decode(errors="ignore")

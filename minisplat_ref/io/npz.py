@@ -1,8 +1,8 @@
-"""Arrays from .npz files that others may have written: nothing is allocated before the file is known to hold it.
+"""Read arrays from untrusted .npz files: nothing is allocated before the file is known to contain it.
 
-An .npz is a zip of .npy files: a header in Python's notation, then the bytes of an array. Read are numbers and truth
-values, stored or deflated; the header is matched, not evaluated, and no object is ever unpickled. Left out: structured
-types, texts, times.
+An .npz is a zip of .npy files: a header in Python's notation, then the bytes of an array. This reads numbers and
+booleans, stored or deflated; the header is matched, not evaluated, and no object is ever unpickled. Left out:
+structured types, strings, times.
 """
 
 import math
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from minisplat_ref.errors import InputError
 
-RATIO_MAX = 16  # bytes of arrays per byte of file: floating-point numbers hardly pack, a thousand is what zeros do
+RATIO_MAX = 16  # bytes of arrays per byte of file: floating-point numbers hardly compress, zeros a thousandfold
 _PREFIX = 10  # bytes before the text of a header of format 1.0: magic, version, length of the text
 _HEADER = re.compile(
     r"\{\s*'descr':\s*'(?P<dtype>[<>|=]?[a-zA-Z]\d{0,4})',\s*'fortran_order':\s*(?P<is_fortran>True|False),"
@@ -46,7 +46,7 @@ def read_npz(path: str | Path, way_out: str, names: Collection[str] | None = Non
     Raises
     ------
     InputError
-        If the file is missing, damaged or no .npz, holds anything but numbers, or claims more than fits it.
+        If the file is missing, damaged or no .npz, contains anything but numbers, or claims more than fits in it.
     """
     try:
         with open(path, "rb") as file, zipfile.ZipFile(file) as archive:
@@ -92,7 +92,7 @@ def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: str | Pat
             raise InputError(
                 f"{path}: {info.filename} should be {dtype}{list(shape)}, but {n_bytes} bytes are there; {way_out}"
             )
-        content = file.read()  # of the last bytes the checksum is compared
+        content = file.read()  # reading to the end compares the checksum
     if len(content) != n_bytes:
         raise InputError(f"{path}: {info.filename} is truncated; {way_out}")
     array = np.frombuffer(content, dtype).reshape(shape, order="F" if header["is_fortran"] == "True" else "C")

@@ -41,8 +41,8 @@ def load_ply(path: str | Path, population: Any = Gaussians) -> Any:
         The file; spherical harmonics of degree 0 to 3, with or without normals. Bytes after the declared vertices do
         not matter.
     population : type
-        :class:`Gaussians`, or a NamedTuple that has its fields and others, which come from the properties that
-        :func:`save_ply` has written.
+        :class:`Gaussians`, or a NamedTuple with its fields and others, which are read from the properties that
+        :func:`save_ply` writes.
 
     Returns
     -------
@@ -92,7 +92,7 @@ def load_ply(path: str | Path, population: Any = Gaussians) -> Any:
 
 
 def _further_names(columns: Iterable[str], field: str) -> tuple[str, ...]:
-    """Properties of a further field: ``FIELD`` if its shape is [N], ``FIELD_0``, ``FIELD_1``, ... if it is [N, k]."""
+    """Return a further field's properties: ``FIELD`` if it has shape [N], ``FIELD_0``, ``FIELD_1``, ... for [N, k]."""
     numbered = [name for name in columns if re.fullmatch(rf"{re.escape(field)}_\d+", name)]
     return (field,) if field in columns else tuple(sorted(numbered, key=lambda name: int(name.rpartition("_")[2])))
 
@@ -115,10 +115,10 @@ def save_ply(path: str | Path, gaussians: Any) -> None:
     Parameters
     ----------
     path : str or Path
-        File to make or replace; it is complete or not there.
+        File to create or replace, completely or not at all.
     gaussians : Gaussians, or a NamedTuple that has its fields and others
-        Any spherical-harmonic degree, which is kept; N may be 0. A further field of shape [N] becomes a property of its
-        name, one of shape [N, k] the properties ``NAME_0``, ``NAME_1``, ...: other readers skip them.
+        Of any spherical-harmonic degree; N may be 0. A further field of shape [N] becomes a property with its name, one
+        of shape [N, k] the properties ``NAME_0``, ``NAME_1``, ...; other readers skip them.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def save_ply(path: str | Path, gaussians: Any) -> None:
 
 
 def _further_properties(name: str, field: NDArray) -> tuple[tuple[str, ...], NDArray]:
-    """Names of the properties of a further field, and their values [k, N]."""
+    """Return the names of a further field's properties, and their values [k, N]."""
     if field.ndim == 1:
         return (name,), field[None]
     if field.ndim == 2:
@@ -169,7 +169,7 @@ class PointCloud(NamedTuple):
 
     @property
     def dropped(self) -> str:
-        """Half a sentence on the points that were left out, empty if there are none."""
+        """Return half a sentence on the points that were left out, empty if there are none."""
         n = len(self.points) + self.n_dropped
         return f"{self.n_dropped:,} of {n:,} points are not finite" if self.n_dropped else ""
 
@@ -189,7 +189,7 @@ def load_points(path: str | Path) -> PointCloud:
     ----------
     path : str or Path
         The file, with the properties ``x``, ``y``, ``z`` and, for colours, ``red``, ``green``, ``blue``: integers from
-        0 to 255 or floats from 0 to 1. All else in it is passed over.
+        0 to 255 or floats from 0 to 1. Everything else is ignored.
 
     Returns
     -------
@@ -216,7 +216,7 @@ def load_points(path: str | Path) -> PointCloud:
 
 
 def _as_bytes(path: str | Path, columns: Mapping[str, NDArray], colors: Floats) -> NDArray[np.uint8]:
-    """Colours [P, 3] as bytes, by the type that each has in the file."""
+    """Return colours [P, 3] as bytes, converted by the type that each has in the file."""
     is_float = [columns[name].dtype.kind == "f" for name in COLORS]
     levels = np.rint(colors * np.where(is_float, 255.0, 1.0))  # [P, 3]
     for name, column, values, floats in zip(COLORS, levels.T, colors.T, is_float, strict=True):
@@ -241,7 +241,7 @@ def check_finite(path: str | Path, columns: Mapping[str, NDArray]) -> None:
 
 
 def _sh_rest_names(columns: Mapping[str, NDArray], path: str | Path) -> tuple[str, ...]:
-    """Names of the higher coefficients, f_rest_0 first: the file may list them in any order."""
+    """Return the names of the higher coefficients, f_rest_0 first; the file may list them in any order."""
     n_rest = sum(name.startswith("f_rest_") for name in columns)
     allowed = [3 * ((degree + 1) ** 2 - 1) for degree in range(SH_DEGREE_MAX + 1)]
     if n_rest not in allowed:
@@ -253,7 +253,7 @@ def _sh_rest_names(columns: Mapping[str, NDArray], path: str | Path) -> tuple[st
 
 
 def _way_out(path: str | Path, columns: Mapping[str, NDArray]) -> str:
-    """What to do with a PLY that does not hold Gaussians."""
+    """Return what to do with a PLY that does not contain Gaussians."""
     if "packed_position" in columns:
         return "it is a compressed splat: export it as a plain PLY"
     n_faces = n_rows_of(path, "face")

@@ -1,8 +1,7 @@
-"""The container PLY: a header that names elements and their properties, then the rows; its vertices as columns.
+"""The PLY container: a header that names elements and their properties, then the rows; its vertices as columns.
 
-Read: ASCII, little- and big-endian, any scalar type, elements and properties in any order. Other elements and
-properties that are lists are passed over; :mod:`.ply_faces` reads faces. Written: little-endian vertices, and
-triangles.
+Reading supports ASCII, little- and big-endian, any scalar type, elements and properties in any order. Other elements
+and list properties are skipped; :mod:`.ply_faces` reads faces. Writing supports little-endian vertices and triangles.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,8 +27,8 @@ SCALAR_TYPES = {
 }
 COUNT_TYPES = [name for name, code in SCALAR_TYPES.items() if code[0] != "f"]
 BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-CORNERS = ("vertex_indices", "vertex_index")  # the list of a face, as different programs call it; ours is the first
-ROWS_AT_ONCE = 1 << 16  # that are put together for writing
+CORNERS = ("vertex_indices", "vertex_index")  # names of a face's list in different programs; we write the first
+ROWS_AT_ONCE = 1 << 16  # assembled for writing
 HEADER_LINE_MAX = 4096  # bytes; no header line is longer, and a file without line breaks must not be read whole
 
 
@@ -40,7 +39,7 @@ class Property(NamedTuple):
     dtype: np.dtype
     """Of the value, or of every value of the list, in the file's byte order."""
     count_dtype: np.dtype | None
-    """Of the number of values that stands before a list; None for a single value."""
+    """Of the number of values that precedes a list; None for a single value."""
 
 
 class Element(NamedTuple):
@@ -50,26 +49,26 @@ class Element(NamedTuple):
     n: int
     """Number of rows."""
     properties: Sequence[Property]
-    """What each row holds, in its order."""
+    """Of each row, in order."""
 
     @property
     def scalars(self) -> list[Property]:
-        """Properties that are no lists."""
+        """Return the properties that are not lists."""
         return [p for p in self.properties if p.count_dtype is None]
 
     @property
     def has_lists(self) -> bool:
-        """Whether rows differ in length."""
+        """Return whether rows may differ in length."""
         return len(self.scalars) < len(self.properties)
 
     @property
     def dtype(self) -> np.dtype:
-        """Structured dtype of a row, without its lists; no two of the names may be equal."""
+        """Return the structured dtype of a row without its lists; all names must differ."""
         return np.dtype([(p.name, p.dtype) for p in self.scalars])
 
 
 class Header(NamedTuple):
-    """What stands before the rows."""
+    """The contents of a file's header."""
 
     encoding: str
     elements: Sequence[Element]
@@ -77,12 +76,12 @@ class Header(NamedTuple):
 
     @property
     def before(self) -> Sequence[Element]:
-        """Elements whose rows stand before the vertices."""
+        """Return the elements whose rows come before the vertices."""
         return self.elements[: [element.name for element in self.elements].index("vertex")]
 
     @property
     def vertices(self) -> Element:
-        """What is read."""
+        """Return the element that is read."""
         return self.elements[len(self.before)]
 
 
@@ -129,7 +128,7 @@ def read_vertices(path: str | Path) -> dict[str, NDArray]:
     with open_ply(path) as file:
         header = read_header(file, path)
         if header.encoding == "ascii":
-            with np.errstate(over="ignore"):  # what exceeds its type becomes infinite, which readers look for
+            with np.errstate(over="ignore"):  # values beyond their type become infinite, for which readers check
                 rows = _read_ascii(file, path, sum(element.n for element in header.before), header.vertices)
         else:
             for element in header.before:
@@ -153,7 +152,7 @@ def write_vertices(path: str | Path, columns: Mapping[str, NDArray], triangles: 
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {n}\n{properties}end_header\n"
     with replacing(path) as temporary, open(temporary, "wb") as file:
         file.write(header.encode("ascii"))
-        for start in range(0, n, ROWS_AT_ONCE):  # so that memory never holds all of them twice
+        for start in range(0, n, ROWS_AT_ONCE):  # so that they are never all in memory twice
             part = slice(start, start + ROWS_AT_ONCE)
             rows = np.empty(len(range(n)[part]), dtype)
             for name, column in columns.items():
@@ -166,7 +165,7 @@ def write_vertices(path: str | Path, columns: Mapping[str, NDArray], triangles: 
 
 
 def open_ply(path: Path) -> BinaryIO:
-    """Open a file, or raise an InputError that says why that is impossible."""
+    """Open a file, or raise an InputError that says why it cannot be opened."""
     try:
         return path.open("rb")
     except OSError as error:
@@ -174,7 +173,7 @@ def open_ply(path: Path) -> BinaryIO:
 
 
 def read_header(file: BinaryIO, path: Path) -> Header:
-    """Read up to the line end_header; there are vertices, and no two of their columns have one name."""
+    """Read up to the line end_header; check that there are vertices, and that no two of their columns share a name."""
     if file.readline(8).strip() != b"ply":
         raise InputError(f"{path}: not a PLY file, it does not begin with 'ply'")
     encoding = ""
@@ -219,7 +218,7 @@ def _property(name: str, kind: str, count: str | None, order: str) -> Property:
 
 
 def pass_over(file: BinaryIO, path: Path, element: Element) -> None:
-    """Move the file behind an element, in a binary file."""
+    """Move the file's position past an element, in a binary file."""
     if element.has_lists:
         for _ in range(element.n):
             _read_row(file, path, element)
@@ -231,7 +230,7 @@ def pass_over(file: BinaryIO, path: Path, element: Element) -> None:
 
 
 def _read_binary(file: BinaryIO, path: Path, vertices: Element) -> NDArray:
-    """Read the declared vertices; what follows them is not looked at."""
+    """Read the declared vertices and ignore what follows them."""
     n, dtype = vertices.n, vertices.dtype
     if vertices.has_lists:
         return np.frombuffer(b"".join(_read_row(file, path, vertices) for _ in range(n)), dtype)
@@ -268,7 +267,7 @@ def read_exactly(file: BinaryIO, path: Path, n: int) -> bytes:
 
 
 def _read_ascii(file: BinaryIO, path: Path, n_before: int, vertices: Element) -> NDArray:
-    """Read the declared vertices, one a line, behind the lines of other elements."""
+    """Read the declared vertices, one per line, after the lines of other elements."""
     n, n_scalars = vertices.n, len(vertices.scalars)
     found = path.stat().st_size - file.tell()
     if found + 1 < n_before + 2 * n * n_scalars:  # a line, or a character and a gap for each number
@@ -290,10 +289,10 @@ def _read_ascii(file: BinaryIO, path: Path, n_before: int, vertices: Element) ->
 
 
 def _scalars(words: Sequence[str], element: Element) -> list[str]:
-    """Those words of a line that are no lists."""
+    """Return the words of a line that do not belong to lists."""
     scalars, rest = [], iter(words)
     for _, _, count_dtype in element.properties:
-        word = next(rest, "")  # of which there is no number
+        word = next(rest, "")  # "" is no number and fails below
         if count_dtype is None:
             scalars.append(word)
         else:

@@ -1,19 +1,19 @@
 """From photographs with cameras to a :class:`Scene`: what the COLMAP and transforms.json readers have in common.
 
 Pixels are read, masked, composited, undistorted and downscaled here, and everything that makes a scene unusable is
-found here. All photographs are held in memory as uint8 if they take a moderate part of it; of a scene whose photographs
-would take more, only sizes are checked here, and pixels are read whenever they are needed
-(:mod:`minisplat_ref.io.stored_views`).
+detected here. All photographs are kept in memory as uint8 if they take a moderate part of it; if they would take more,
+only sizes are checked here, and pixels are read on demand (:mod:`minisplat_ref.io.stored_views`).
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from minisplat_ref import memory
 from minisplat_ref.errors import InputError
@@ -35,7 +35,8 @@ from minisplat_ref.io.stored_views import Photograph, Pixels, Shelf, StoredView
 from minisplat_ref.types import Bools, Camera, Floats, Ints, Scene, View, numbered
 
 EXTENT_MARGIN = 1.1  # the 3DGS code's factor on the radius of the cameras; the learning rates were tuned with it
-COORDINATE_MAX = 1e18  # world units or pixels; a square of more is no float32
+COORDINATE_MAX = 1e18  # world units or pixels; the square of more would overflow float32
+SILENT_SECONDS = 2.0  # before reading photographs shows a progress bar
 ROTATION_TOLERANCE = 1e-3  # greatest error of R R^T = I: poses written with four digits pass, scaled ones do not
 
 
@@ -59,7 +60,7 @@ class Photo(NamedTuple):
 
     @property
     def path(self) -> Path:
-        """The image file at full resolution."""
+        """Return the image file at full resolution."""
         return self.folder / self.file
 
 
@@ -106,12 +107,12 @@ def build_scene(
     point_colors: NDArray[np.uint8],
     reading: Reading,
 ) -> Scene:
-    """Put the scene together, with all pixels in memory if they take a moderate part of it.
+    """Build the scene, with all pixels in memory if they take a moderate part of it.
 
     Parameters
     ----------
     source : Path
-        What the user asked for; named in errors, and its folder names the scene.
+        The path that the user gave; errors name it, and its folder names the scene.
     train_photos, test_photos : sequence of Photo
         At least two training photographs.
     points : ndarray of shape (P, 3)
@@ -146,10 +147,10 @@ def build_scene(
     names = _view_names(photos, source)
     shelf_bytes = memory.shelf_bytes(sum(map(_n_bytes, photos)) / reading.downscale**2)
     if shelf_bytes is None:
-        views = tuple(read_view(photo, name, reading) for photo, name in zip(photos, names, strict=True))
+        views = tuple(read_view(photo, name, reading) for photo, name in _shown(photos, names))
     else:
         shelf = Shelf(shelf_bytes)
-        views = tuple(stored_view(photo, name, reading, shelf) for photo, name in zip(photos, names, strict=True))
+        views = tuple(stored_view(photo, name, reading, shelf) for photo, name in _shown(photos, names))
     folder = source if source.is_dir() else source.parent
     return Scene(
         name=folder.resolve().name,
@@ -162,12 +163,18 @@ def build_scene(
     )
 
 
+def _shown(photos: Sequence[Photo], names: Sequence[str]) -> Iterable[tuple[Photo, str]]:
+    """Return photographs with their names, with a progress bar on a terminal if reading takes a while."""
+    pairs = list(zip(photos, names, strict=True))
+    return tqdm(pairs, desc="photographs", unit=" images", delay=SILENT_SECONDS, leave=False, disable=None)
+
+
 def _n_pixels(photo: Photo) -> int:
     return photo.camera.width * photo.camera.height
 
 
 def _n_bytes(photo: Photo) -> int:
-    """Bytes of its pixels and its mask at full resolution."""
+    """Return the bytes of its pixels and its mask at full resolution."""
     return (3 + (photo.mask_path is not None)) * _n_pixels(photo)
 
 
@@ -211,20 +218,20 @@ def _check_points(points: Floats, source: Path) -> None:
 
 
 def camera_extent(cameras: Sequence[Camera]) -> float:
-    """1.1 x the largest distance of a camera centre from the mean centre, world units."""
+    """Return 1.1 x the largest distance of a camera centre from the mean centre, world units."""
     centers = np.stack([camera.center for camera in cameras])  # [V, 3]
     return EXTENT_MARGIN * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
 
 
 def read_view(photo: Photo, name: str, reading: Reading) -> View:
     """Return the view of a photograph with its pixels."""
-    camera = _camera(photo, reading)  # before the pixels are read, of which a damaged file can claim any number
+    camera = _camera(photo, reading)  # before reading pixels, because a damaged file can claim any number of them
     image, mask = _read_pixels(photo, reading, camera)
     return View(name, camera, image, mask, photo.point_ids, time=photo.time)
 
 
 def stored_view(photo: Photo, name: str, reading: Reading, shelf: Shelf) -> View:
-    """Return the view of a photograph whose pixels are read when they are needed; of the file only the size is read."""
+    """Return the view of a photograph whose pixels are read on demand; now only the file's size is read."""
     camera = _camera(photo, reading)
     read = partial(_read_again, photo, reading, camera, _signature(photo, reading))
     n_pixels = _n_pixels(photo) if _path(photo, reading) == photo.path else camera.width * camera.height
@@ -233,14 +240,14 @@ def stored_view(photo: Photo, name: str, reading: Reading, shelf: Shelf) -> View
 
 
 def _path(photo: Photo, reading: Reading) -> Path:
-    """File to read: in the folder of downscaled images where there is one; lenses are of the full size."""
+    """Return the file to read: a downscaled image if there is one, except with a lens, which needs the full size."""
     small_folder = photo.folder.with_name(f"{photo.folder.name}_{reading.downscale}")
     is_small = reading.downscale > 1 and photo.lens is None and small_folder.is_dir()
     return small_folder / photo.file if is_small else photo.path
 
 
 def _camera(photo: Photo, reading: Reading) -> Camera:
-    """Camera of the view, undistorted and downscaled; refuses a file whose size is not that of its camera."""
+    """Return the view's camera, undistorted and downscaled; refuse a file whose size is not that of its camera."""
     camera, path = photo.camera, _path(photo, reading)
     width, height = image_size(path)
     if path != photo.path:
@@ -263,7 +270,7 @@ def _read_pixels(photo: Photo, reading: Reading, camera: Camera) -> Pixels:
 
 
 def _read_again(photo: Photo, reading: Reading, camera: Camera, signature: list[tuple[int, int] | None]) -> Pixels:
-    """Read one photograph, which may be long after its scene was loaded, from files that are still the same."""
+    """Read one photograph, perhaps long after its scene was loaded, and check that its files have not changed."""
     now = _signature(photo, reading)
     try:
         if None not in now and now != signature:
@@ -276,14 +283,14 @@ def _read_again(photo: Photo, reading: Reading, camera: Camera, signature: list[
 
 
 def _signature(photo: Photo, reading: Reading) -> list[tuple[int, int] | None]:
-    """Time of the last change and size of the files of a photograph, None for one that is missing."""
+    """Return modification time and size of a photograph's files, None for a missing file."""
     paths = [_path(photo, reading), *([] if photo.mask_path is None else [photo.mask_path])]
     stats = [path.stat() if is_file(path) else None for path in paths]
     return [None if stat is None else (stat.st_mtime_ns, stat.st_size) for stat in stats]
 
 
 def half_size(view: View) -> View:
-    """Return the view with half as many pixels a side, rounded, and its camera's intrinsics to match."""
+    """Return the view at half the width and height, rounded, with matching intrinsics."""
     width, height = downscaled_size(view.camera.width, view.camera.height, 2)
     camera = rescale_camera(view.camera, width, height)
     if isinstance(view, StoredView):
@@ -301,7 +308,7 @@ def _resized(pixels: Pixels, width: int, height: int) -> Pixels:
 
 
 def rescale_camera(camera: Camera, width: int, height: int) -> Camera:
-    """Intrinsics of the same view at another size; exact ratios, since the image's corner is the origin."""
+    """Return the camera of the same view at another size; ratios are exact, as the image's corner is the origin."""
     ratio_x, ratio_y = width / camera.width, height / camera.height
     return camera._replace(
         fx=camera.fx * ratio_x,
@@ -316,7 +323,7 @@ def rescale_camera(camera: Camera, width: int, height: int) -> Camera:
 def _apply_alpha_and_mask(
     image: NDArray[np.uint8], photo: Photo, reading: Reading
 ) -> tuple[NDArray[np.uint8], Bools | None]:
-    """RGB image and mask at the image's size, from its alpha channel and its mask file."""
+    """Return RGB image and mask at the image's size, from its alpha channel and its mask file."""
     height, width = image.shape[:2]
     mask = None if photo.mask_path is None else read_mask(photo.mask_path)
     if mask is not None and mask.shape not in ((height, width), (photo.camera.height, photo.camera.width)):
@@ -335,7 +342,7 @@ def _apply_alpha_and_mask(
 
 
 def _wrong_size(photo: Photo, path: Path, width: int, height: int) -> str:
-    """What to do about an image [height, width] that is not of its camera's size."""
+    """Return what to do about an image [height, width] whose size is not its camera's."""
     camera = photo.camera
     problem = f"{path}: the image is {width}x{height} but its camera is {camera.width}x{camera.height}"
     if (height, width) == (camera.width, camera.height) and is_turned(path):
@@ -351,19 +358,19 @@ def _wrong_size(photo: Photo, path: Path, width: int, height: int) -> str:
 
 
 def _check_downscaled(photo: Photo, width: int, height: int, downscale: int) -> None:
-    """A ready-made downscaled image may be rounded up or down, no more."""
+    """Refuse a ready-made downscaled image whose size differs by more than rounding."""
     exact_width, exact_height = photo.camera.width / downscale, photo.camera.height / downscale
     if abs(width - exact_width) >= 1 or abs(height - exact_height) >= 1:
         small_folder = f"{photo.folder}_{downscale}"
         raise InputError(
             f"{small_folder}/{photo.file}: the image is {width}x{height} but 1/{downscale} of its camera is"
             f" {exact_width:g}x{exact_height:g}; remove {small_folder} and run"
-            f" `minisplat-ref downscale {photo.folder} --factor {downscale}`"
+            f" `minisplat-ref downscale {photo.folder} --downscale {downscale}`"
         )
 
 
 def _view_names(photos: Sequence[Photo], source: Path) -> list[str]:
-    """File names without suffix; with their folders where that is not unique (train/r_0 and test/r_0)."""
+    """Return file names without suffix, with their folders if they are not unique (train/r_0 and test/r_0)."""
     files = [Path(photo.folder.name, photo.file).with_suffix("") for photo in photos]
     names = [file.name for file in files]
     if len(set(names)) < len(names):

@@ -1,10 +1,10 @@
-"""Views whose photographs are read from disk when they are needed, for scenes whose photographs memory cannot hold.
+"""Views whose photographs are read from disk on demand, for scenes whose photographs do not fit into memory.
 
-Of such a scene a fixed set of photographs stays in memory: the first that are read, as many as a given number of bytes
-holds. Training shows all views in a new order again and again. With room for a part f of the photographs, a fixed set
-saves the part f of the reading, whatever the order; a cache that lets go of the least recently used saves
-``f + (1 - f) ln(1 - f)``, 15 % with room for half of them, since a photograph that has just been shown is the one that
-is needed latest. Where Gaussians need the room, photographs give it up.
+A fixed set of photographs stays in memory: the first that are read, as many as fit into a given number of bytes.
+Training cycles through all views, each time in a new order. With room for a fraction f of the photographs, a fixed set
+saves the fraction f of the reading, whatever the order; a cache that evicts the least recently used saves
+``f + (1 - f) ln(1 - f)``, 15 % with room for half of them, because the photograph used last is the one needed latest.
+Where Gaussians need the memory, photographs are evicted.
 """
 
 import threading
@@ -21,7 +21,7 @@ from minisplat_ref.types import Bools, View
 
 
 class Pixels(NamedTuple):
-    """What is read of a photograph."""
+    """The pixels of a photograph and its mask."""
 
     image: NDArray[np.uint8]
     """[H, W, 3], as :attr:`View.image`."""
@@ -30,7 +30,7 @@ class Pixels(NamedTuple):
 
     @property
     def n_bytes(self) -> int:
-        """What they take of memory."""
+        """Return the memory that they take, bytes."""
         return self.image.nbytes + (0 if self.mask is None else self.mask.nbytes)
 
 
@@ -46,51 +46,51 @@ class Shelf:
     def __init__(self, most_bytes: float) -> None:
         self._most_bytes = most_bytes
         self._n_bytes = 0
-        self._kept: dict[Photograph, Pixels] = {}
+        self._cached: dict[Photograph, Pixels] = {}
         self._lock = threading.Lock()
 
     @property
     def n_bytes(self) -> int:
-        """What stands there takes of memory."""
+        """Return the memory that the photographs on it take, bytes."""
         return self._n_bytes
 
     @property
     def n_free(self) -> float:
-        """Bytes that are still free."""
+        """Return the bytes that are still free."""
         return self._most_bytes - self._n_bytes
 
     def get(self, photograph: "Photograph") -> Pixels | None:
-        """Return the pixels of a photograph if they stand there."""
-        return self._kept.get(photograph)
+        """Return the pixels of a photograph if they are in memory."""
+        return self._cached.get(photograph)
 
     def put(self, photograph: "Photograph", pixels: Pixels) -> None:
         """Keep the pixels of a photograph if there is room."""
         with self._lock:
             if pixels.n_bytes <= self.n_free:
-                self._kept[photograph] = pixels
+                self._cached[photograph] = pixels
                 self._n_bytes += pixels.n_bytes
 
     def resize(self, most_bytes: float) -> None:
-        """Give the photographs more room, or less: then the last that have come go first."""
+        """Give the photographs more room, or less; those that came last are then evicted first."""
         with self._lock:
             self._most_bytes = most_bytes
-            while self._kept and self.n_free < 0:
-                self._n_bytes -= self._kept.popitem()[1].n_bytes
+            while self._cached and self.n_free < 0:
+                self._n_bytes -= self._cached.popitem()[1].n_bytes
 
 
 class Photograph:
-    """A photograph on disk, whose pixels may stay in memory when they have been read.
+    """A photograph on disk, whose pixels may stay in memory once they have been read.
 
     Parameters
     ----------
     read : callable
         Reads it; gives the same pixels every time.
     n_pixels : int
-        Of the file, which all have to be decoded.
+        Of the file, all of which have to be decoded.
     shelf : Shelf
         Where there may be room for them.
     may_stay : bool
-        False for what is computed from another photograph.
+        False for pixels that are computed from another photograph.
     """
 
     def __init__(self, read: Callable[[], Pixels], n_pixels: int, shelf: Shelf, may_stay: bool = True) -> None:
@@ -100,7 +100,7 @@ class Photograph:
 
     def pixels(self) -> Pixels:
         """Return the pixels, from memory or from disk."""
-        with self._lock:  # whoever wants it while another thread reads it waits for that
+        with self._lock:  # wait if another thread is reading it
             pixels = self.shelf.get(self)
             if pixels is None:
                 pixels = self._read()
@@ -110,9 +110,9 @@ class Photograph:
 
 
 class StoredView(View):
-    """A view whose image and mask are read anew whenever they are asked for, unless they stay in memory.
+    """A view whose image and mask are read again at every access, unless they stay in memory.
 
-    Who needs both, or one of them twice, calls :meth:`loaded` once. In the place of the image the tuple holds a
+    Code that needs both, or one of them twice, calls :meth:`loaded` once. In place of the image the tuple has a
     :class:`Photograph`.
     """
 
@@ -120,17 +120,17 @@ class StoredView(View):
 
     @property
     def photograph(self) -> Photograph:
-        """Where the pixels come from."""
+        """Return the source of the pixels."""
         return cast(Photograph, self[2])
 
     @property
     def image(self) -> NDArray[np.uint8]:
-        """[H, W, 3], as of any view."""
+        """Return the image [H, W, 3], as for any view."""
         return self.photograph.pixels().image
 
     @property
     def mask(self) -> Bools | None:
-        """[H, W] or None, as of any view."""
+        """Return the mask [H, W] or None, as for any view."""
         return self.photograph.pixels().mask
 
     def loaded(self) -> View:
@@ -139,13 +139,13 @@ class StoredView(View):
         return View(*self)._replace(image=image, mask=mask)
 
     def _replace(self, **fields: Any) -> View:  # type: ignore[override]
-        """Return the view with other fields; with another image or mask it holds both of them."""
+        """Return the view with other fields; with another image or mask it has both in memory."""
         if fields.keys() & {"image", "mask"}:
             return self.loaded()._replace(**fields)
         return super()._replace(**fields)
 
     def changed(self, change: Callable[[Pixels], Pixels]) -> View:
-        """Return the view with pixels that are computed from its own whenever they are asked for."""
+        """Return the view with pixels that are computed from its own at every access."""
         photograph = self.photograph
         changed: Any = Photograph(
             lambda: change(photograph.pixels()), photograph.n_pixels, photograph.shelf, may_stay=False
@@ -154,7 +154,7 @@ class StoredView(View):
 
 
 def make_room(views: Sequence[View], needed: float) -> float:
-    """Let photographs keep a part of the free memory at most, and nothing of what is needed otherwise.
+    """Limit photographs to a share of the memory that is free once something else has what it needs.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ def make_room(views: Sequence[View], needed: float) -> float:
     Returns
     -------
     float
-        How many bytes more the photographs will keep when they have been read.
+        How many more bytes the photographs will occupy once they have been read.
     """
     shelves = {view.photograph.shelf for view in views if isinstance(view, StoredView)}  # one, or none
     for shelf in shelves:
@@ -175,10 +175,10 @@ def make_room(views: Sequence[View], needed: float) -> float:
 
 
 class ReadingAhead(AbstractContextManager["ReadingAhead"]):
-    """Reads, in a thread, the photograph that is needed next; the thread ends with the context.
+    """Reads the next photograph ahead in a thread, which ends with the context.
 
-    There is no thread where photographs are in memory anyway. Kernels whose loops run in parallel let go of Python's
-    lock, as decoders do: one goes on while the other works.
+    There is no thread if photographs are in memory anyway. Parallel kernels release Python's global interpreter lock,
+    as decoders do, so both run at the same time.
     """
 
     def __init__(self) -> None:
@@ -186,7 +186,7 @@ class ReadingAhead(AbstractContextManager["ReadingAhead"]):
         self._next: tuple[View, Future[View]] | None = None
 
     def __exit__(self, *_: object) -> None:
-        """Wait for the photograph that is being read, if there is one, and forget it."""
+        """Wait for the photograph that is being read, if any, and discard it."""
         self._next = None
         self._executor.shutdown(cancel_futures=True)
 
@@ -197,7 +197,7 @@ class ReadingAhead(AbstractContextManager["ReadingAhead"]):
         ----------
         view : View
         following : View, optional
-            The view that is needed next, where that is known; its photograph is read from now on.
+            The view that is needed next, if known; the thread starts to read its photograph.
         """
         expected, self._next = self._next, None
         loaded = expected[1].result() if expected is not None and expected[0] is view else view.loaded()

@@ -9,7 +9,7 @@
 
 Poses are world_from_camera in OpenGL axes (x right, y up, z backward); flipping the y and z columns gives OpenCV axes,
 and the inverse gives cam_from_world. The world frame stays the file's. An alpha channel is composited onto the
-background. Which paths are read says :mod:`.names`. Left out: ``depth_file_path``, file lists of splits, per-frame
+background. :mod:`.names` says which paths are read. Left out: ``depth_file_path``, file lists of splits, per-frame
 exposure, rolling shutter.
 """
 
@@ -90,7 +90,7 @@ def load_transforms(
 
 
 def find_transforms(path: Path) -> tuple[Path, ...]:
-    """Training file and, for Blender scenes that have one, test file; empty if there is none."""
+    """Return the training file and, for Blender scenes that have one, the test file; empty if there is none."""
     if path.is_file():
         return (path,)
     train, test = (path / name for name in BLENDER_FILES)
@@ -138,21 +138,21 @@ def find_points(file: Path, transforms: Mapping[str, Any]) -> Path | None:
 
 
 def _image_file(file: Path, file_path: str) -> Path | None:
-    """Image of a frame: the path relative to the JSON file, with a suffix tried where it has none; None if missing."""
+    """Return a frame's image, relative to the JSON file; try suffixes if it has none. None if missing."""
     path = path_beside(file, file_path)
     candidates = (path, *(path.parent / (path.name + suffix) for suffix in IMAGE_SUFFIXES))
     return next((candidate for candidate in candidates if is_file(candidate)), None)
 
 
 def _named_file(file: Path, entries: Mapping[str, Any], key: str) -> Path:
-    """Path that an entry gives."""
+    """Return the path that an entry gives."""
     if not isinstance(entries[key], str):
         raise InputError(f"{file}: {key} is {reprlib.repr(entries[key])}, not the path of a file; repair or remove it")
     return path_beside(file, entries[key])
 
 
 def _time(file: Path, frame: Mapping[str, Any]) -> float:
-    """When the photograph was taken, the entry ``time`` of scenes that move; 0 where there is none."""
+    """Return when the photograph was taken, the entry ``time`` of scenes that move; 0 without one."""
     time = as_number(frame.get("time", 0.0))
     if not math.isfinite(time):
         raise InputError(f"{file}: {frame.get('file_path')} has the time {reprlib.repr(frame['time'])}: give a number")
@@ -160,14 +160,14 @@ def _time(file: Path, frame: Mapping[str, Any]) -> float:
 
 
 def _photo(file: Path, frame: Mapping[str, Any], image_file: Path) -> Photo:
-    """One frame; ``frame`` already holds the top level's entries that it does not override."""
+    """Return one frame's photograph; ``frame`` includes the top level's entries that it does not override."""
     mask_path = _named_file(file, frame, "mask_path") if frame.get("mask_path") else None
     camera, lens = _camera(file, frame, image_file)
     return Photo(image_file.parent, image_file.name, mask_path, camera, lens, time=_time(file, frame))
 
 
 def _camera(file: Path, frame: Mapping[str, Any], image_file: Path) -> tuple[Camera, Lens | None]:
-    """Camera and lens of a frame, whichever dialect describes its focal length."""
+    """Return camera and lens of a frame, in whichever dialect its focal length is given."""
 
     def number(key: str, default: float = 0.0) -> float:
         value = frame.get(key, default)
@@ -193,7 +193,7 @@ def _camera(file: Path, frame: Mapping[str, Any], image_file: Path) -> tuple[Cam
         raise InputError(f"{file}: {frame['file_path']} has neither fl_x nor camera_angle_x; add one of them")
     matrix = np.array(frame["transform_matrix"], np.float64)
     R = (matrix[:3, :3] * OPENCV_FROM_OPENGL).T
-    with np.errstate(over="ignore", invalid="ignore"):  # check_photo refuses what comes of it
+    with np.errstate(over="ignore", invalid="ignore"):  # check_photo refuses the result
         t = -R @ matrix[:3, 3]
     camera = Camera(
         cam_from_world_R=np.ascontiguousarray(R),

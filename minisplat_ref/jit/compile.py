@@ -4,25 +4,25 @@
 kernels that call it. ``kernel`` compiles a parallel loop. Six facts shape this file:
 
 * Numba's on-disk cache does not notice that a function *called* by a kernel has changed. The cache therefore lives in a
-  folder named by a hash of all sources that kernels are made of: an edit anywhere makes a new folder. So does another
-  version of what compiles them: Numba's own index notices another processor and another Numba, but not another LLVM,
-  another NumPy, which computes the constants that are compiled in, or other options of the compiler. A kernel that is
-  made of an extension's functions, too, lives in a folder inside that one, named by a hash of the extension's sources:
-  editing an extension does not compile the core again.
-* Numba tells functions of one name apart by a counter of the process, and writes it into the cached code. Kernels that
-  different processes compiled for different numbers of channels can so hold different functions under one name, and a
-  process that loads both runs one of them twice. What a function closes over is therefore part of its name here:
-  functions by module and name, bundles of them field by field, numbers by type and value, and nothing by its address.
+  folder named by a hash of all sources that kernels are made of: an edit anywhere makes a new folder. So do other
+  versions of the compiler's parts: Numba's own index notices another processor and another Numba, but not another LLVM,
+  another NumPy, which computes the constants that are compiled in, or other compiler options. A kernel that contains an
+  extension's functions lives in a folder inside that one, named by a hash of the extension's sources: editing an
+  extension does not recompile the core.
+* Numba distinguishes functions of the same name by a per-process counter, and writes it into the cached code. So
+  kernels that different processes compiled for different numbers of channels can contain different functions under one
+  name, and a process that loads both runs one of them twice. Therefore a function's name here includes what it closes
+  over: functions by module and name, bundles of them field by field, numbers by type and value, nothing by its address.
 * Two processes that save to Numba's cache at the same moment take the same file name, and later processes load the
   wrong kernel. Saving is therefore one process at a time.
 * Numba's ``workqueue`` threading layer aborts the process when two Python threads enter parallel regions, so all
   kernels share one lock.
-* ``fastmath=True`` would let the compiler assume that no NaN exists and ``isnan`` return False. Kernels may only
+* ``fastmath=True`` would let the compiler assume that there are no NaN, and ``isnan`` return False. Kernels may only
   contract ``a * b + c`` to one rounding.
-* What stands in the cache has been optimised twice, and a compiler that may change the order of a sum gives other last
-  digits the second time. Where eight numbers are computed at once, :mod:`minisplat_ref.jit.lanes` says so and fixes
-  the order. What is left free, which products are contracted, has given the same bytes just compiled and loaded from
-  the cache wherever that was tried; ``tests/test_kernels.py`` tries it on the processor that it runs on.
+* Code in the cache has been optimised twice, and a compiler that may reorder a sum gives other last digits the second
+  time. Where eight numbers are computed at once, :mod:`minisplat_ref.jit.lanes` says so and fixes the order. The
+  compiler may still choose which products to contract; freshly compiled and cached code have nevertheless given the
+  same bytes wherever that was tried, and ``tests/test_kernels.py`` tries it on the processor that it runs on.
 """
 
 import functools
@@ -54,17 +54,17 @@ __all__ = [
 ]
 
 if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
-    # Numba would take TBB first where it is installed; it takes longer to start and end a parallel loop.
+    # Numba prefers TBB where it is installed, but TBB takes longer to start and end a parallel loop.
     numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # type: ignore[attr-defined]
 
 if "OMP_WAIT_POLICY" not in os.environ:
-    # OpenMP's threads wait for the next parallel loop for a fraction of a millisecond before they sleep, not for many:
-    # as fast on free cores, and on busy ones a thread that waits does not keep the one that it waits for from running.
+    # OpenMP's threads spin for a fraction of a millisecond before they sleep, instead of many: as fast on free cores,
+    # and on busy ones a spinning thread does not keep the one that it waits for from running.
     os.environ.setdefault("GOMP_SPINCOUNT", "5000")
 
 _KERNEL_LOCK = threading.RLock()
 _PACKAGE = Path(__file__).parent.parent
-_PARALLEL = {  # loops over prange, in the order in which they stand, and nothing that Numba finds by itself
+_PARALLEL = {  # only loops over prange, in their order, and nothing that Numba parallelises on its own
     "prange": True,
     **dict.fromkeys(("comprehension", "fusion", "inplace_binop", "numpy", "reduction", "setitem", "stencil"), False),
 }
@@ -74,7 +74,7 @@ _COMPILER_OPTIONS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "BOUNDSCHECK", "D
 
 @functools.cache
 def source_hash() -> str:
-    """Hash of every source file of the core that is compiled into a kernel, and of what compiles it."""
+    """Return a hash of all source files of the core that kernels are compiled from, and of the compiler's versions."""
     versions = (platform.python_version(), np.__version__, numba.__version__, llvmlite.__version__)
     options = (str(getattr(numba.config, name)) for name in _COMPILER_OPTIONS)
     folders = (_PACKAGE / name for name in _KERNEL_FOLDERS)
@@ -83,7 +83,7 @@ def source_hash() -> str:
 
 
 def _hash_of(text: str, sources: Iterable[Path], root: Path) -> str:
-    """Hash of a text, and of the names below ``root`` and the contents of files."""
+    """Return a hash of a text and of files: their names below ``root`` and their contents."""
     digest = hashlib.sha256(text.encode())
     for source in sorted(sources):
         digest.update(source.relative_to(root).as_posix().encode())
@@ -92,7 +92,7 @@ def _hash_of(text: str, sources: Iterable[Path], root: Path) -> str:
 
 
 def cache_root() -> Path:
-    """Return the folder in which every version of the kernels has one of its own."""
+    """Return the folder that contains one folder for every version of the kernels."""
     if base := os.environ.get("NUMBA_CACHE_DIR"):
         return Path(base)
     if os.name == "nt":
@@ -106,13 +106,13 @@ def cache_folder(function: Callable | None = None) -> str | None:
     Parameters
     ----------
     function : callable, optional
-        The kernel, where it may be made of functions from outside the core.
+        The kernel, if it may contain functions from outside the core.
 
     Returns
     -------
     str or None
-        None where nothing can be kept: the folder cannot be written, or a function was typed into a session and has no
-        source file. Every process then compiles its own.
+        None where nothing can be cached: the folder cannot be written, or a function was typed interactively and has no
+        source file. Every process then compiles its own kernels.
     """
     folder = cache_root() / source_hash()
     try:
@@ -125,9 +125,9 @@ def cache_folder(function: Callable | None = None) -> str | None:
 
 
 def _modules_of(value: Any) -> set[str]:
-    """Names of the modules outside the core whose functions a value is, holds or closes over.
+    """Return the modules outside the core that define the functions that a value is, contains or closes over.
 
-    Of an extension only the package itself is named: ``minisplat_ref.extensions.NAME``.
+    Of an extension only the package itself is returned: ``minisplat_ref.extensions.NAME``.
     """
     if isinstance(value, tuple):
         return set[str]().union(*map(_modules_of, value))
@@ -144,9 +144,9 @@ def _modules_of(value: Any) -> set[str]:
 
 
 def _folder_of_module(module: str) -> str:
-    """Name of the folder for kernels that a module outside the core is part of, by a hash of its sources.
+    """Return the name of the folder for kernels with functions of a module outside the core: a hash of its sources.
 
-    Of a package all files count, and so do the files ``shared_*.py`` beside an extension.
+    It covers all files of a package, and the files ``shared_*.py`` beside an extension.
 
     Raises
     ------
@@ -165,8 +165,8 @@ def _folder_of_module(module: str) -> str:
 
 @contextmanager
 def _one_process_at_a_time(folder: str) -> Iterator[None]:
-    """Hold a lock on the cache; the system gives it back when the file is closed, however the process ends."""
-    Path(folder).mkdir(parents=True, exist_ok=True)  # somebody may have cleared the cache
+    """Hold a lock on the cache; the system releases it when the file is closed, however the process ends."""
+    Path(folder).mkdir(parents=True, exist_ok=True)  # the cache may have been cleared
     with open(Path(folder) / "lock", "a+b") as file:
         if os.name == "nt":
             import msvcrt
@@ -191,14 +191,14 @@ def _save_alone(compiled: Any, folder: str) -> None:
 
 
 def scalar(function: Callable) -> Callable:
-    """Mark a formula of one Gaussian or one pixel that kernels call; in Python it is the function itself."""
-    # Inlined always: a call would count the references of every array it is given, an atomic operation each. Nobody
-    # calls it through a C pointer, and the wrapper for that would be a tenth of what is compiled.
+    """Mark a formula of one Gaussian or one pixel that kernels call; in Python the function stays itself."""
+    # Always inlined: a call would count references to every array argument, an atomic operation each. Nothing calls it
+    # through a C pointer, and the wrapper for that would be a tenth of the compiled code.
     return register_jitable(forceinline=True, no_cfunc_wrapper=True)(_named_after_closure(function))
 
 
 def _named_after_closure(function: Callable) -> Callable:
-    """Make the name of a function unique to what it closes over; compiled symbols are named after it."""
+    """Add what a function closes over to its name, after which compiled symbols are named."""
     names = [_name_of(cell.cell_contents) for cell in function.__closure__ or ()]
     if names:
         function.__qualname__ += "_" + hashlib.sha256("|".join(names).encode()).hexdigest()[:16]
@@ -206,16 +206,16 @@ def _named_after_closure(function: Callable) -> Callable:
 
 
 def _name_of(value: Any) -> str:
-    """Describe what a function closes over: the same in every process, and different for different things.
+    """Describe a value that a function closes over: the same in every process, and different for different values.
 
     Raises
     ------
     TypeError
-        Nothing but its address tells the value from others of its type.
+        Only its address distinguishes the value from others of its type.
     """
     if isinstance(value, FunctionType):
         inside = (cell.cell_contents for cell in value.__closure__ or ())
-        line = value.__code__.co_firstlineno  # two lambdas of one function have one name
+        line = value.__code__.co_firstlineno  # lambdas of one function share a name
         return f"{value.__module__}.{value.__qualname__}:{line}({','.join(map(_name_of, inside))})"
     if isinstance(value, tuple):
         return f"{type(value).__name__}({','.join(map(_name_of, value))})"

@@ -1,8 +1,8 @@
-"""The folders of compiled kernels: which there are, what they hold, and how to get rid of them.
+"""The folders of compiled kernels: list them, describe them, and remove them.
 
-Every version of the kernels has a folder of its own, named by a hash (:mod:`minisplat_ref.jit.compile`). Nothing stale
-can be loaded that way, but the folders of old versions stay behind: only a person knows which of them another
-installation still uses. What else lies in the same place, such as the cache of other packages that use Numba where
+Every version of the kernels has a folder of its own, named by a hash (:mod:`minisplat_ref.jit.compile`). So nothing
+stale can be loaded, but the folders of old versions stay behind: only the user knows which of them another installation
+still uses. Other content in the same place, such as the cache of other packages that use Numba where
 ``NUMBA_CACHE_DIR`` is set, is neither listed nor touched.
 """
 
@@ -26,7 +26,7 @@ class KernelFolder(NamedTuple):
     """Compiled functions, one for each combination of types."""
     n_bytes: int
     is_current: bool
-    """Whether this installation, as it is, uses it."""
+    """Whether this installation uses it now."""
 
 
 def kernel_folders() -> list[KernelFolder]:
@@ -38,7 +38,7 @@ def kernel_folders() -> list[KernelFolder]:
 
 
 def remove(folder: KernelFolder) -> None:
-    """Delete a folder of kernels. Processes that run keep what they have loaded; later ones compile again.
+    """Delete a folder of kernels. Running processes keep what they have loaded; later ones compile again.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def remove(folder: KernelFolder) -> None:
 
 
 def _is_ours(path: Path) -> bool:
-    """Whether it is named like a folder of kernels and holds nothing else."""
+    """Return whether it is named like a folder of kernels and contains nothing else."""
     if path.is_symlink() or not path.is_dir() or not _HASH.fullmatch(path.name):
         return False
     return all(file.is_dir() or any(map(file.match, _KERNEL_FILES)) for file in path.rglob("*"))

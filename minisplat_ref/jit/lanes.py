@@ -1,13 +1,13 @@
 """Eight numbers as one value: eight pixels of a row, or eight Gaussians.
 
-A formula written for one number holds for eight: ``+ - * /``, comparisons and the functions below take lanes as they
-take single numbers. Compiled, eight float32 lanes are one AVX register, so that a loop over rows of pixels is vector
-code because it says so, and not because the compiler could prove that it may be: nothing is tested before the loop,
-nothing is left over after it, and every sum has the order that is written. In plain Python lanes are an array of eight.
+A formula written for one number works for eight: ``+ - * /``, comparisons and the functions below take lanes as they
+take single numbers. Compiled, eight float32 lanes are one AVX register: a loop over rows of pixels is explicit vector
+code and does not depend on the compiler's proof that it may be. There are no tests before the loop, no remainder after
+it, and every sum has the order that is written. In plain Python lanes are an array of eight.
 
-A single number that meets lanes is taken eight times. It may be narrower than they are but not wider: a float64 that
-meets float32 lanes by mistake does not compile. Where the lanes differ in what they should do, ``select`` chooses.
-Lanes are values: ``x += y`` would change every name of the same array in Python, and does not compile.
+A single number combined with lanes is broadcast. It may be narrower than they are but not wider: a float64 that is
+combined with float32 lanes by mistake does not compile. Where lanes need different results, ``select`` chooses. Lanes
+are values: ``x += y`` would change every name of the same array in Python, and does not compile.
 """
 
 from typing import Any
@@ -17,27 +17,27 @@ import numpy as np
 WIDTH = 8
 
 
-def larger(a: Any, b: Any) -> Any:
+def maximum(a: Any, b: Any) -> Any:
     """Return the larger of two, lane by lane; ``a`` where one is NaN."""
     return np.where(b > a, b, a)[()]
 
 
-def smaller(a: Any, b: Any) -> Any:
+def minimum(a: Any, b: Any) -> Any:
     """Return the smaller of two, lane by lane; ``a`` where one is NaN."""
     return np.where(b < a, b, a)[()]
 
 
 def floor(a: Any) -> Any:
-    """Return the next integer below."""
+    """Return the largest integer not above."""
     return np.floor(a)
 
 
 def ceil(a: Any) -> Any:
-    """Return the next integer above."""
+    """Return the smallest integer not below."""
     return np.ceil(a)
 
 
-def nearest(a: Any) -> Any:
+def rint(a: Any) -> Any:
     """Return the nearest integer, as a float."""
     return np.rint(a)
 
@@ -57,7 +57,7 @@ def log_of(a: Any) -> Any:
     return np.log(a)
 
 
-def scaled_by_power(a: Any, n: Any) -> Any:
+def ldexp(a: Any, n: Any) -> Any:
     """Return ``a 2^n`` of float32 lanes, for integers n that keep it a normal number: n is added to the exponent."""
     return np.ldexp(a, np.asarray(n, np.int32))
 
@@ -67,35 +67,35 @@ def select(condition: Any, a: Any, b: Any) -> Any:
     return np.where(condition, a, b)[()]
 
 
-def filled(number: Any) -> Any:
+def broadcast(number: Any) -> Any:
     """Return lanes that all hold a number."""
     return np.full(WIDTH, number)
 
 
-def counted(zero: Any) -> Any:
+def iota(zero: Any) -> Any:
     """Return lanes 0, 1, ... 7 of the dtype of a number."""
     return np.arange(WIDTH).astype(zero.dtype)
 
 
 def load(array: Any, i: Any) -> Any:
-    """Return the eight numbers of a 1-d array from ``i`` on."""
+    """Return the eight numbers of a 1D array from ``i`` on."""
     return array[i : i + WIDTH].copy()
 
 
 def store(array: Any, i: Any, lanes: Any) -> None:
-    """Write lanes, or a tuple of lanes one after the other, to a 1-d array from ``i`` on."""
+    """Write lanes, or a tuple of lanes one after the other, to a 1D array from ``i`` on."""
     numbers = np.ravel(lanes)
     array[i : i + max(numbers.size, WIDTH)] = numbers
 
 
 def accumulate(array: Any, i: Any, lanes: Any) -> None:
-    """Add lanes, or a tuple of lanes one after the other, to the numbers of a 1-d array from ``i`` on."""
+    """Add lanes, or a tuple of lanes one after the other, to the numbers of a 1D array from ``i`` on."""
     for k, one in enumerate(lanes if isinstance(lanes, tuple) else (lanes,)):
         array[i + k * WIDTH : i + (k + 1) * WIDTH] += one
 
 
 def gather(table: Any, rows: Any, column: Any) -> Any:
-    """Return one number from each of eight rows of a table [N, ...]; further dimensions count as flat."""
+    """Return one number from each of eight rows of a table [N, ...]; further dimensions are flattened."""
     return table.reshape(len(table), -1)[list(rows), column]
 
 
@@ -108,53 +108,53 @@ def scatter(table: Any, rows: Any, column: Any, lanes: Any) -> None:
     table.reshape(len(table), -1)[np.ix_(rows, columns)] = np.reshape(lanes, (len(columns), WIDTH)).T
 
 
-def columns_of(rows: Any) -> Any:
-    """Return the columns of the square whose rows are a tuple of eight lanes: the first number of each, and so on."""
+def transpose(rows: Any) -> Any:
+    """Transpose a tuple of eight lanes: return the first number of each, then the second of each, and so on."""
     return tuple(np.array(rows).T)
 
 
-def converted(lanes: Any, zero: Any) -> Any:
+def cast(lanes: Any, zero: Any) -> Any:
     """Return lanes in the dtype of a number."""
     return lanes.astype(zero.dtype)
 
 
-def sum_of(lanes: Any) -> Any:
+def reduce_sum(lanes: Any) -> Any:
     """Return the sum of the lanes: of halves, then of quarters, then of the last two."""
     while len(lanes) > 1:
         lanes = lanes[: len(lanes) // 2] + lanes[len(lanes) // 2 :]
     return lanes[0]
 
 
-def sums_of(rows: Any) -> Any:
-    """Return the sums of a tuple of eight lanes as lanes: eight times ``sum_of``, for half of the instructions."""
-    return np.array([sum_of(lanes) for lanes in rows])
+def reduce_sums(rows: Any) -> Any:
+    """Return the sums of a tuple of eight lanes as lanes: eight ``reduce_sum`` with half as many instructions."""
+    return np.array([reduce_sum(lanes) for lanes in rows])
 
 
-def largest_of(lanes: Any) -> Any:
+def reduce_max(lanes: Any) -> Any:
     """Return the largest lane."""
     while len(lanes) > 1:
-        lanes = larger(lanes[: len(lanes) // 2], lanes[len(lanes) // 2 :])
+        lanes = maximum(lanes[: len(lanes) // 2], lanes[len(lanes) // 2 :])
     return lanes[0]
 
 
-def any_of(condition: Any) -> bool:
-    """Whether a condition holds in any lane."""
+def reduce_any(condition: Any) -> bool:
+    """Return whether a condition holds in any lane."""
     return bool(np.any(condition))
 
 
 def prefetch(table: Any, row: Any) -> None:
-    """Ask for a row of a table [N, D] before it is needed: memory answers while something else is computed."""
+    """Prefetch a row of a table [N, D], so that it is loaded while something else is computed."""
 
 
 def lowest_bit(bits: Any) -> int:
-    """Return the place of the lowest bit that is set in an integer that is not zero."""
+    """Return the index of the lowest set bit of an integer that is not zero."""
     return (int(bits) & -int(bits)).bit_length() - 1
 
 
 def bits_between(bounds: Any) -> Any:
-    """Return an integer of 64 bits: of its quarter ``k``, the bits from ``bounds[k]`` to before ``bounds[4 + k]``.
+    """Return an integer of 64 bits; in its quarter ``k`` the bits [``bounds[k]``, ``bounds[4 + k]``) are set.
 
-    Bounds are integers up to 16, in lanes. A start is not negative; no bits lie before an end that is not behind it.
+    Bounds are integers up to 16, in lanes. A start is not negative; an end that is not above its start sets no bits.
     """
     bits = 0
     for k in range(4):

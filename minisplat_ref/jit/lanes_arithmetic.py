@@ -1,7 +1,7 @@
 """How lanes are compiled: their type, arithmetic, and the functions that work lane by lane.
 
-Each Python function of :mod:`minisplat_ref.jit.lanes` gets a second meaning here, an instruction of LLVM for a
-vector of eight. No kernel names this file.
+Each Python function of :mod:`minisplat_ref.jit.lanes` gets a compiled implementation here, an LLVM instruction for a
+vector of eight. No kernel imports this file.
 """
 
 import math
@@ -20,12 +20,12 @@ from minisplat_ref.jit.lanes import (
     ceil,
     exp_of,
     floor,
-    larger,
+    ldexp,
     log_of,
-    nearest,
-    scaled_by_power,
+    maximum,
+    minimum,
+    rint,
     select,
-    smaller,
     sqrt,
 )
 
@@ -42,7 +42,7 @@ class LanesType(types.Type):
 
 @register_model(LanesType)
 class _Model(models.PrimitiveModel):
-    """A vector of LLVM."""
+    """An LLVM vector."""
 
     def __init__(self, manager: Any, lanes: LanesType) -> None:
         element = ir.IntType(1) if lanes.element == types.boolean else manager.lookup(lanes.element).get_value_type()
@@ -53,7 +53,7 @@ class _Model(models.PrimitiveModel):
 
 
 def joined(*kinds: types.Type) -> LanesType | None:
-    """Lanes that all operands become; None where none are lanes, or one is too wide for them."""
+    """Return the type of lanes that all operands become; None if none are lanes, or one is too wide for them."""
     lanes = next((kind for kind in kinds if isinstance(kind, LanesType)), None)
     if lanes is None:
         return None
@@ -65,7 +65,7 @@ def joined(*kinds: types.Type) -> LanesType | None:
 
 
 def spread(context: Any, builder: Any, value: Any, kind: types.Type, lanes: LanesType) -> Any:
-    """Take a single number eight times; lanes are what they are."""
+    """Broadcast a single number; lanes stay as they are."""
     if isinstance(kind, LanesType):
         return value
     nothing = ir.Constant(context.get_value_type(lanes), ir.Undefined)
@@ -86,9 +86,9 @@ def _call(builder: Any, name: str, result: Any, args: Any) -> Any:
 
 
 def compiled(function: Callable) -> Callable[[Callable], None]:
-    """Register what a function is in compiled code.
+    """Register a function's compiled implementation.
 
-    Numba's ``overload`` would do, but compiles a function around each of them, which takes longer than all the rest.
+    Numba's ``overload`` would do, but compiles a wrapper for each of them, which takes longer than everything else.
     """
 
     def register(definition: Callable) -> None:
@@ -100,7 +100,7 @@ def compiled(function: Callable) -> Callable[[Callable], None]:
 
 
 def _typed(emit: Callable, has_boolean_result: bool = False) -> Callable:
-    """Return the typing of a function of lanes, and with it ``emit``, which writes its instruction."""
+    """Return the typing of a function of lanes, together with ``emit``, which writes its instruction."""
 
     def typed(*kinds: Any) -> Any:
         lanes = joined(*kinds)
@@ -117,7 +117,7 @@ def _typed(emit: Callable, has_boolean_result: bool = False) -> Callable:
 
 
 def _register_unary(function: Callable, emit: Callable, of_one: Callable | None = None) -> None:
-    """Register a function of lanes; ``of_one`` is the function of single numbers, where Numba knows none."""
+    """Register a function of lanes; ``of_one`` is the function of single numbers if Numba has none."""
     typed = _typed(emit)
     compiled(function)(lambda typing, a: typed(a))
     if of_one is not None:
@@ -148,30 +148,30 @@ for _sign, _operator in {">": operator.gt, ">=": operator.ge, "<": operator.lt, 
     )
 
 
-# --- functions; each has its meaning in Python first ---
+# --- functions; for each, its version for single numbers first ---
 
 
-def larger_lanes(builder: Any, a: Any, b: Any) -> Any:
-    """Build the larger of two vectors lane by lane; ``a`` where one is NaN."""
+def maximum_lanes(builder: Any, a: Any, b: Any) -> Any:
+    """Emit the larger of two vectors lane by lane; ``a`` where one is NaN."""
     return builder.select(builder.fcmp_ordered(">", b, a), b, a)
 
 
-def _smaller(builder: Any, a: Any, b: Any) -> Any:
+def _minimum(builder: Any, a: Any, b: Any) -> Any:
     return builder.select(builder.fcmp_ordered("<", b, a), b, a)
 
 
-_register_binary(larger, larger_lanes, of_one=lambda a, b: b if b > a else a)
-_register_binary(smaller, _smaller, of_one=lambda a, b: b if b < a else a)
+_register_binary(maximum, maximum_lanes, of_one=lambda a, b: b if b > a else a)
+_register_binary(minimum, _minimum, of_one=lambda a, b: b if b < a else a)
 _register_unary(floor, lambda builder, a: _call(builder, "llvm.floor", a.type, [a]))
 _register_unary(ceil, lambda builder, a: _call(builder, "llvm.ceil", a.type, [a]))
-_register_unary(nearest, lambda builder, a: _call(builder, "llvm.rint", a.type, [a]))
+_register_unary(rint, lambda builder, a: _call(builder, "llvm.rint", a.type, [a]))
 _register_unary(sqrt, lambda builder, a: _call(builder, "llvm.sqrt", a.type, [a]), of_one=lambda a: math.sqrt(a))
 _register_unary(exp_of, lambda builder, a: _call(builder, "llvm.exp", a.type, [a]))
 _register_unary(log_of, lambda builder, a: _call(builder, "llvm.log", a.type, [a]), of_one=lambda a: math.log(a))
 
 
-@compiled(scaled_by_power)
-def _scaled_by_power(typing: Any, a: Any, n: Any) -> Any:
+@compiled(ldexp)
+def _ldexp(typing: Any, a: Any, n: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bits = ir.VectorType(I32, WIDTH)
         exponent = builder.shl(builder.fptosi(args[1], bits), ir.Constant(bits, [23] * WIDTH))

@@ -10,33 +10,33 @@ from numba.core import cgutils
 from minisplat_ref.jit.lanes import (
     WIDTH,
     accumulate,
-    any_of,
     bits_between,
-    columns_of,
-    converted,
-    counted,
-    filled,
+    broadcast,
+    cast,
     gather,
-    largest_of,
+    iota,
     load,
     lowest_bit,
     prefetch,
+    reduce_any,
+    reduce_max,
+    reduce_sum,
+    reduce_sums,
     scatter,
     store,
-    sum_of,
-    sums_of,
+    transpose,
 )
-from minisplat_ref.jit.lanes_arithmetic import I32, LanesType, compiled, joined, larger_lanes, spread
+from minisplat_ref.jit.lanes_arithmetic import I32, LanesType, compiled, joined, maximum_lanes, spread
 
 
-@compiled(filled)
-def _filled(typing: Any, number: Any) -> Any:
+@compiled(broadcast)
+def _broadcast(typing: Any, number: Any) -> Any:
     lanes = LanesType(number)
     return lanes(number), lambda context, builder, signature, args: spread(context, builder, args[0], number, lanes)
 
 
-@compiled(counted)
-def _counted(typing: Any, zero: Any) -> Any:
+@compiled(iota)
+def _iota(typing: Any, zero: Any) -> Any:
     lanes = LanesType(zero)
     return lanes(zero), lambda context, builder, signature, args: ir.Constant(
         context.get_value_type(lanes), [float(k) for k in range(WIDTH)]
@@ -58,7 +58,7 @@ def _load(typing: Any, array: Any, i: Any) -> Any:
 
 
 def _written(typing: Any, array: Any, i: Any, lanes: Any, is_added: bool) -> Any:
-    """Typing of a function that writes lanes, or a tuple of them, to an array, or adds them to it."""
+    """Return the typing of a function that writes lanes, or a tuple of them, to an array, or adds them to it."""
     kind = LanesType(array.dtype)
     kinds = list(lanes) if isinstance(lanes, types.BaseTuple) else [lanes]
     if any(joined(kind, one) is None for one in kinds):
@@ -82,7 +82,7 @@ compiled(accumulate)(lambda typing, array, i, lanes: _written(typing, array, i, 
 
 
 def _row_pointers(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
-    """Where the numbers of a column stand; a table of one dimension has one column, 0."""
+    """Return pointers to a column's numbers in eight rows; a table of one dimension has one column, 0."""
     table = signature.args[0]
     array = context.make_array(table)(context, builder, args[0])
     stride, byte = builder.extract_value(array.strides, 0), ir.IntType(8).as_pointer()
@@ -142,8 +142,8 @@ def _convert(builder: Any, vector: Any, kind: Any) -> Any:
     return (builder.fptrunc if isinstance(kind.element, ir.FloatType) else builder.fpext)(vector, kind)
 
 
-@compiled(converted)
-def _converted(typing: Any, lanes: Any, zero: Any) -> Any:
+@compiled(cast)
+def _cast(typing: Any, lanes: Any, zero: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return _convert(builder, args[0], context.get_value_type(LanesType(zero)))
 
@@ -151,9 +151,9 @@ def _converted(typing: Any, lanes: Any, zero: Any) -> Any:
 
 
 def _turned(builder: Any, rows: list[Any]) -> list[Any]:
-    """Columns of a square of eight rows."""
+    """Return the columns of an 8 x 8 matrix, given its rows."""
     vectors = list(rows)
-    for size in (4, 2, 1):  # blocks of this size change places across the diagonal
+    for size in (4, 2, 1):  # swap blocks of this size across the diagonal
         for k in (k for k in range(WIDTH) if not k & size):
             pair = vectors[k], vectors[k + size]
             for place, shift in ((k, 0), (k + size, size)):
@@ -163,8 +163,8 @@ def _turned(builder: Any, rows: list[Any]) -> list[Any]:
     return vectors
 
 
-@compiled(columns_of)
-def _columns_of(typing: Any, rows: Any) -> Any:
+@compiled(transpose)
+def _transpose(typing: Any, rows: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return context.make_tuple(builder, rows, _turned(builder, cgutils.unpack_tuple(builder, args[0])))
 
@@ -172,7 +172,7 @@ def _columns_of(typing: Any, rows: Any) -> Any:
 
 
 def _register_reduction(function: Callable, emit: Callable) -> None:
-    """Fold lanes in halves with an instruction for two operands."""
+    """Register a reduction that folds lanes in halves with an instruction for two operands."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         (vector,) = args
@@ -186,8 +186,8 @@ def _register_reduction(function: Callable, emit: Callable) -> None:
     compiled(function)(lambda typing, lanes: (lanes.element(lanes), generate))
 
 
-@compiled(sums_of)
-def _sums_of(typing: Any, rows: Any) -> Any:
+@compiled(reduce_sums)
+def _reduce_sums(typing: Any, rows: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         vectors, width = cgutils.unpack_tuple(builder, args[0]), WIDTH
         while width > 1:  # two vectors become one: the sums of the halves of what each holds, one after the other
@@ -201,12 +201,12 @@ def _sums_of(typing: Any, rows: Any) -> Any:
     return rows.dtype(rows), generate
 
 
-_register_reduction(sum_of, lambda builder, a, b: builder.fadd(a, b))
-_register_reduction(largest_of, larger_lanes)
+_register_reduction(reduce_sum, lambda builder, a, b: builder.fadd(a, b))
+_register_reduction(reduce_max, maximum_lanes)
 
 
-@compiled(any_of)
-def _any_of(typing: Any, condition: Any) -> Any:
+@compiled(reduce_any)
+def _reduce_any(typing: Any, condition: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bits = builder.bitcast(args[0], ir.IntType(WIDTH))
         return builder.icmp_unsigned("!=", bits, ir.IntType(WIDTH)(0))

@@ -1,4 +1,4 @@
-"""Numbers that meet a float32 without widening it: a bare Python literal would turn the expression into float64.
+"""Constants that do not widen a float32: a bare Python literal would turn the expression into float64.
 
 Each is exact in float32, so that it is exact in float64 arithmetic too.
 """

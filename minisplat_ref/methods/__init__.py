@@ -1,4 +1,4 @@
-"""The methods: one file per paper, which holds what the method does and when, as a recipe.
+"""The methods, one file per paper: the actions of the method, and its recipe, which says when they act.
 
 A recipe is data (:mod:`minisplat_ref.training.schedule`), written for its published number of iterations.
 """

@@ -1,14 +1,14 @@
-"""``adaptive``: the scene decides how many Gaussians it needs, and when it has been learned.
+"""``adaptive``: the scene decides how many Gaussians it needs and when training ends.
 
-No paper has published the whole; ``docs/measured/adaptive.md`` has the evidence for each rule, and what was tried and
-did not pay. There is no schedule and no setting that depends on the scene:
+No paper has published the whole; ``docs/measured/adaptive.md`` has the evidence for each rule, and what was tried
+without success. There is no schedule, and no setting depends on the scene:
 
 *Grow.* Every 100 iterations the Gaussians whose mean screen gradient reaches a threshold are halved
-(:mod:`minisplat_ref.strategy.halving`), the strongest first, and at most a fifth of all at a time. A Gaussian that fits
-what it covers has a small gradient, so growth fades where a scene has enough.
+(:mod:`minisplat_ref.strategy.halving`), those with the largest first, and at most a fifth of all at a time. A Gaussian
+that fits what it covers has a small gradient, so growth fades where a scene has enough.
 
-*Measure.* Every 100 iterations the held-out training views are rendered. What their PSNR gains for each doubling of the
-work, in pairs (tile, Gaussian), is the slope of a line through the measurements since half of the work.
+*Measure.* Every 100 iterations the held-out training views are rendered. The gain of their PSNR for each doubling of
+the work, in pairs (tile, Gaussian), is the slope of a line through the measurements since half of the work.
 
 *Cool down.* When the slope falls below a threshold, rates fall and all training views are trained on
 (:mod:`minisplat_ref.training.pace`).
@@ -36,8 +36,8 @@ from minisplat_ref.training.schedule import At, During, Every
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit, begin_cooling
 
 MOST_ITERATIONS = 30_000
-LEAST_GAIN = 0.05  # dB of the squared error, for which a calibration of the photographs is worth its while
-LEAST_MEASUREMENTS = 4  # through which a line is drawn
+LEAST_GAIN = 0.05  # dB of the squared error, for which a calibration of the photographs is worthwhile
+LEAST_MEASUREMENTS = 4  # to fit a line
 
 
 def collect_while_growing(state: TrainState, iteration: Iteration) -> None:
@@ -59,20 +59,20 @@ def grow(
     offset: float,
     budget: int | None = None,
 ) -> str | None:
-    """Halve the Gaussians whose mean gradient reaches ``threshold``, and start collecting anew.
+    """Halve the Gaussians whose mean gradient reaches ``threshold``, and reset the collected gradients.
 
     Parameters
     ----------
     state, iteration
         As for every action.
     threshold : float
-        Of the mean length of the screen gradient, in normalised device coordinates.
+        Least mean length of the screen gradient, in normalised device coordinates.
     most_at_once : float
-        Part of the Gaussians that are halved at most, those with the largest gradients.
+        At most this fraction of the Gaussians is halved, those with the largest gradients.
     offset : float
         How far apart the halves are, see :func:`minisplat_ref.strategy.halving.halves`.
     budget : int, optional
-        Gaussians that there may be at most; those that the training begins with may be more.
+        Largest number of Gaussians to grow to; the training may begin with more.
     """
     if state.pace.cooling_from is not None:
         return "nothing done: the rates are falling"
@@ -88,12 +88,12 @@ def grow(
 
 
 def measure_held_out(state: TrainState, iteration: Iteration) -> str | None:
-    """Render the held-out training views and note their PSNR."""
+    """Render the held-out training views and record their PSNR."""
     if iteration.cooling is None or state.pace.cooling_from is not None:
         return "nothing done: all training views are trained on"
     views = iteration.scene.train_views
     ids, psnrs = held_out_ids(len(views), iteration.cooling.hold_out_every), []
-    # Nothing has learned their exposures, by which they are not to be judged. For poses, see turn_held_out.
+    # Their exposures are not trained and must not enter the measurement. For poses, see turn_held_out.
     gains = np.exp(log_gains(state, iteration, ids) if EXPOSURES in state.shared else np.zeros(len(ids)))
     for index, gain in zip(ids, gains.astype(np.float32), strict=True):
         view = views[index].loaded()
@@ -108,7 +108,7 @@ def measure_held_out(state: TrainState, iteration: Iteration) -> str | None:
 def cool_when_little_is_gained(
     state: TrainState, iteration: Iteration, *, least_gain: float, least_step: int
 ) -> str | None:
-    """Let the rates fall when the held-out views gain less than ``least_gain`` for each doubling of the work.
+    """Begin the cool-down when the held-out views gain less than ``least_gain`` for each doubling of the work.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def cool_when_little_is_gained(
     least_gain : float
         dB for each doubling of the work.
     least_step : int
-        Iterations before which nothing is decided: all degrees of the spherical harmonics should take part.
+        No decision before this iteration: all degrees of the spherical harmonics should be active.
     """
     pace = state.pace
     if iteration.cooling is None or pace.cooling_from is not None or iteration.step < least_step:
@@ -126,7 +126,7 @@ def cool_when_little_is_gained(
     if len(recent) < LEAST_MEASUREMENTS:
         return None
     doublings = np.log2([m.n_pairs for m in recent])
-    slopes = np.polyfit(doublings, np.array([m.psnrs for m in recent]), 1)[0]  # [V] dB a doubling
+    slopes = np.polyfit(doublings, np.array([m.psnrs for m in recent]), 1)[0]  # [V] dB per doubling
     gain, error = float(slopes.mean()), float(slopes.std(ddof=1) / np.sqrt(len(slopes)))
     if gain >= least_gain:
         return f"{gain:.2f} dB for each doubling of the work"
@@ -137,16 +137,16 @@ def cool_when_little_is_gained(
 
 
 def prune_when_cooling(state: TrainState, iteration: Iteration, *, mass: float, least_views: int) -> None:
-    """Remove what carries little of the training views, in the first iteration of the cool-down.
+    """Remove Gaussians that contribute little to the training views, in the first iteration of the cool-down.
 
     Parameters
     ----------
     state, iteration
         As for every action.
     mass : float
-        Part of the blend weight of all training views that the Gaussians that stay carry: the most important ones.
+        The most important Gaussians that carry this fraction of the blend weight of all training views stay.
     least_views : int
-        Those that belong to the visible part of fewer views go, however much they carry there.
+        Those that are visible in fewer views are removed, however much they contribute there.
     """
     if state.pace.cooling_from is None or iteration.step != state.pace.cooling_from + 1:
         return

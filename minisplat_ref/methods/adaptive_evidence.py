@@ -1,21 +1,21 @@
-"""Whether photographs need a calibration: what one half of each says has to explain the other half.
+"""Whether photographs need a calibration: parameters fitted to one half of each have to explain the other half.
 
-After some hundred iterations a scene is a blur in the right place. What a photograph differs from it by, the residual
-r = photograph - rendering, is explained to first order by a few fields b_k of the calibration, ``r = sum_k x_k b_k``:
+After a few hundred iterations a scene is a blur in the right place. To first order, a calibration explains the residual
+r = photograph - rendering by a few fields b_k, ``r = sum_k x_k b_k``:
 
 * a gain g of the exposure by ``x = g - 1`` and the rendering itself, b = rendering;
-* a displacement (dx, dy) in pixels, which is what a wrong pose does in the main, by ``x = -(dx, dy)`` and the slopes of
-  the rendering, b = (d/du, d/dv) rendering.
+* a displacement (dx, dy) in pixels, the main effect of a wrong pose, by ``x = -(dx, dy)`` and the slopes of the
+  rendering, b = (d/du, d/dv) rendering.
 
-The x of a photograph are fitted to its left half by least squares and judged by its right half, and the other way
-round. Noise and what the scene has not learned yet differ from half to half, and make the other half worse; an exposure
-and a pose are the same in both, and make it better. What all photographs have in common, their mean x, is the scene's
-and not theirs, and counts on both sides of the comparison:
+The x of a photograph are fitted to its left half by least squares and judged on its right half, and vice versa. Noise
+and what the scene has not learned yet differ from half to half, and worsen the other half; an exposure and a pose are
+the same in both, and improve it. The mean x of all photographs belongs to the scene and not to them, and enters both
+sides of the comparison:
 
     gain of a photograph = 10 log10 (sum over halves |r - mean x b|^2 / sum over halves |r - (x of the other half) b|^2)
 
-In decibels of the squared error. It speaks for the calibration when its mean over the photographs is above both a least
-gain and two of its standard errors.
+It is in decibels of the squared error. It supports the calibration if its mean over the photographs is above both a
+least gain and its standard error. One suffices: gains differ much between photographs, and there are few of these.
 """
 
 from collections.abc import Iterator, Sequence
@@ -30,12 +30,11 @@ from minisplat_ref.training.pace import Decision
 from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Bools, Floats
 
-DARK, BRIGHT = 0.05, 0.98  # brightness, of 1, of pixels that say nothing of a gain: noise, and what is saturated
-STANDARD_ERRORS = 2.0
+DARK, BRIGHT = 0.05, 0.98  # brightness, out of 1, beyond which pixels say nothing about a gain: noise, saturation
 
 
 class Half(NamedTuple):
-    """Half of a photograph, as far as least squares need it."""
+    """Half of a photograph, reduced to the sums of least squares."""
 
     normal: Floats
     """[K, K] products of the fields, ``sum b_j b_k`` over pixels and colours."""
@@ -45,7 +44,7 @@ class Half(NamedTuple):
     """``sum r^2``."""
 
     def fitted(self) -> Floats:
-        """Return the x [K] of least squares; the smallest where several are as good."""
+        """Return the least-squares x [K]; the one of least norm if there are several."""
         return np.linalg.lstsq(self.normal, self.projected, rcond=1e-6)[0]
 
     def left_by(self, x: Floats) -> float:
@@ -61,7 +60,7 @@ class Evidence(NamedTuple):
     standard_error: float
     """dB."""
     fitted: Floats
-    """[V, K] x of the whole photographs, less their mean."""
+    """[V, K] x of the whole photographs, minus their mean."""
 
     @property
     def spread(self) -> float:
@@ -69,8 +68,8 @@ class Evidence(NamedTuple):
         return float(np.sqrt(np.mean(self.fitted**2)))
 
     def is_above(self, least_gain: float) -> bool:
-        """Return whether it speaks for the calibration; ``least_gain`` in dB."""
-        return self.gain > max(least_gain, STANDARD_ERRORS * self.standard_error)
+        """Return whether it supports the calibration; ``least_gain`` in dB."""
+        return self.gain > max(least_gain, self.standard_error)
 
 
 def halves_of(residual: Floats, fields: Floats, is_counted: Bools) -> tuple[Half, Half]:
@@ -83,7 +82,7 @@ def halves_of(residual: Floats, fields: Floats, is_counted: Bools) -> tuple[Half
     fields : ndarray of shape (K, H, W, 3)
         b_k.
     is_counted : ndarray of shape (H, W) of bool
-        Pixels that take part.
+        Pixels that count.
     """
     middle = residual.shape[1] // 2
     halves = []
@@ -96,7 +95,7 @@ def halves_of(residual: Floats, fields: Floats, is_counted: Bools) -> tuple[Half
 
 
 def weigh(photographs: Sequence[tuple[Half, Half]]) -> Evidence:
-    """Return what the halves of at least two photographs say."""
+    """Return the evidence from the halves of at least two photographs."""
     fitted = np.array([[half.fitted() for half in pair] for pair in photographs])  # [V, 2, K]
     common = fitted.mean(axis=(0, 1))
     gains = []
@@ -116,7 +115,7 @@ def whole_of(pair: tuple[Half, Half]) -> Half:
 
 
 def exposure_evidence(state: TrainState, iteration: Iteration, view_ids: Sequence[int]) -> Evidence:
-    """Return what training views say about gains of their own."""
+    """Return the training views' evidence for individual gains."""
     photographs = []
     for photograph, rendered, is_counted in _pairs(state, iteration, view_ids):
         seen, there = rendered.mean(axis=2), photograph.mean(axis=2)
@@ -126,12 +125,12 @@ def exposure_evidence(state: TrainState, iteration: Iteration, view_ids: Sequenc
 
 
 def pose_evidence(state: TrainState, iteration: Iteration, view_ids: Sequence[int]) -> Evidence:
-    """Return what training views say about displacements of their own."""
+    """Return the training views' evidence for individual displacements."""
     return weigh(list(_halves_beside_slopes(state, iteration, view_ids)))
 
 
 def displacements(state: TrainState, iteration: Iteration, view_ids: Sequence[int]) -> Floats:
-    """Return by how much photographs [V] are displaced against their renderings, (du, dv) [V, 2] in pixels."""
+    """Return the displacements (du, dv) [V, 2], pixels, of photographs against their renderings."""
     return np.array([-whole_of(pair).fitted() for pair in _halves_beside_slopes(state, iteration, view_ids)])
 
 
@@ -144,14 +143,14 @@ def _halves_beside_slopes(
 
 
 def switch_on(state: TrainState, calibration: Calibration, parameters: dict[str, Floats], decision: Decision) -> None:
-    """Let the training go on with a calibration.
+    """Continue the training with a calibration.
 
     Parameters
     ----------
     state : TrainState
     calibration : Calibration
     parameters : dict
-        Its shared parameters to begin with.
+        Its initial shared parameters.
     decision : Decision
         Its evidence.
     """

@@ -1,13 +1,13 @@
-"""Exposure of each photograph, switched on by ``adaptive`` where the photographs show that they need it.
+"""Exposure of each photograph, which ``adaptive`` switches on where the photographs show that they need it.
 
-After some hundred iterations the scene is a blur of the right brightness. Where the gain of one half of a photograph
+After a few hundred iterations the scene is a blur of the right brightness. If the gain of one half of a photograph
 explains the other half (:mod:`minisplat_ref.methods.adaptive_evidence`), the camera has changed its exposure. The
-photographs then get exposures (:mod:`minisplat_ref.training.calibration`) that begin with their gains, read off as the
-median of photograph / rendering over the pixels.
+photographs then get exposures (:mod:`minisplat_ref.training.calibration`) that begin with their gains, the medians of
+photograph / rendering over the pixels.
 
-Scene and exposures are known up to a map that all photographs have in common, and which would drift: a scene twice as
+Scene and exposures are determined up to a map that all photographs share, and which would drift: a scene twice as
 bright with half the exposures looks the same in all training views, and wrong in every other. The mean of the exposures
-is therefore held at the identity.
+is therefore kept at the identity.
 """
 
 import numpy as np
@@ -28,12 +28,12 @@ def log_gains(state: TrainState, iteration: Iteration, view_ids: Ints | list[int
     state, iteration
         As for every action.
     view_ids : sequence of int
-        Of training views.
+        Training views.
 
     Returns
     -------
     ndarray of shape (V,)
-        Median over the pixels of ln(photograph / rendering), of the mean of the colours; 0 where no pixel can tell.
+        Median over the pixels of ln(photograph / rendering), for the mean of the colours; 0 where no pixel qualifies.
     """
     gains = np.zeros(len(view_ids))
     representation = iteration.representation
@@ -57,7 +57,7 @@ def switch_exposure_on(state: TrainState, iteration: Iteration, *, least_exposur
     state, iteration
         As for every action.
     least_exposure_gain : float
-        dB of the squared error that the photographs have to gain on average, and two standard errors besides.
+        dB of the squared error that the photographs must gain on average, and more than the standard error.
     """
     if EXPOSURE.name in state.pace.switched_on or EXPOSURES in state.shared:
         return "nothing done: exposures are on"
@@ -75,7 +75,7 @@ def switch_exposure_on(state: TrainState, iteration: Iteration, *, least_exposur
 
 
 def hold_mean_exposure(state: TrainState, iteration: Iteration) -> None:
-    """Keep the mean exposure of the views that are trained on at the identity; the others join with their gains."""
+    """Keep the mean exposure of the views in training at the identity; views that join start with their gains."""
     if EXPOSURES not in state.shared:
         return
     n_views = len(iteration.scene.train_views)
@@ -89,6 +89,6 @@ def hold_mean_exposure(state: TrainState, iteration: Iteration) -> None:
 
 
 def _begin_with(exposures: Floats, view_ids: list[int], gains: Floats) -> None:
-    """Write gains, given as logarithms, into the exposures of views."""
+    """Set the exposures of views to gains, given as logarithms."""
     for index, gain in zip(view_ids, gains, strict=True):
         exposures[index, :, :3] = np.exp(gain) * np.eye(3)

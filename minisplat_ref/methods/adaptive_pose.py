@@ -1,4 +1,4 @@
-"""Pose of each photograph, refined by ``adaptive`` where the photographs show that the given ones are off.
+"""Pose of each photograph, which ``adaptive`` refines where the photographs show that the given poses are off.
 
 A camera that is turned by a small rotation w = (w_x, w_y, 0), in its own frame, shows everything displaced by
 
@@ -6,11 +6,11 @@ A camera that is turned by a small rotation w = (w_x, w_y, 0), in its own frame,
 
 Where the displacement of one half of a photograph explains the other half
 (:mod:`minisplat_ref.methods.adaptive_evidence`) its pose is off. All photographs then get corrections of their poses
-(:mod:`minisplat_ref.training.calibration`), which begin with the rotations that these displacements mean. Photographs
-that are held back are not trained on: they are turned by their displacements alone, before each time that they measure.
+(:mod:`minisplat_ref.training.calibration`), which begin with the rotations that correspond to these displacements.
+Held-out photographs are not trained on: before each measurement they are rotated by their displacements alone.
 
-A turn of everything, cameras and scene, changes no photograph. It would drift, and test views would see the scene from
-elsewhere; so the mean rotation and the mean shift, in the world frame, are held at zero. The scale stays free.
+A rotation of everything, cameras and scene, changes no photograph. It would drift, and test views would see the scene
+from elsewhere; so the mean rotation and the mean shift, in the world frame, are kept at zero. The scale stays free.
 """
 
 import numpy as np
@@ -36,7 +36,7 @@ def switch_pose_on(state: TrainState, iteration: Iteration, *, least_pose_gain: 
     state, iteration
         As for every action.
     least_pose_gain : float
-        dB of the squared error that the photographs have to gain on average, and two standard errors besides.
+        dB of the squared error that the photographs must gain on average, and more than the standard error.
     """
     if POSE.name in state.pace.switched_on or ROTATIONS in state.shared:
         return "nothing done: poses are refined"

@@ -1,7 +1,8 @@
 """3DGS (Kerbl et al. 2023): its density control and opacity reset as actions, and when each of them acts.
 
 The mathematics is in :mod:`minisplat_ref.strategy.clone_split`; an action takes its arguments from the training state
-and puts the result back. ``3dgs`` is the method as released, ``3dgs-accel`` the same with the authors' later optimiser.
+and stores the result there. ``3dgs`` is the method as released, ``3dgs-accel`` the same with the authors' later
+optimiser.
 """
 
 import math
@@ -23,8 +24,9 @@ from minisplat_ref.types import Gaussians
 def collect_gradients(state: TrainState, iteration: Iteration) -> None:
     """Add the view's positional gradients to ``stats["gradient_sum"]`` and count it in ``stats["view_count"]``.
 
-    While views are culled (Mini-Splatting2), ``stats["gradient_factor"]`` says which part of its views a Gaussian is
-    still rendered in; gradients are lowered by it, so that their mean refers to all views, as the threshold does.
+    While views are culled (Mini-Splatting2), ``stats["gradient_factor"]`` is the fraction of its views in which a
+    Gaussian is still rendered; gradients are multiplied by it, so that their mean, like the threshold, refers to all
+    views.
     """
     n = n_rows(state.gaussians)
     if "gradient_sum" not in state.stats:
@@ -47,11 +49,11 @@ def clone_and_split(
     draw_children: Callable[..., Gaussians] = clone_split.random_children,
     most_per_pixel: float = math.inf,
 ) -> str | None:
-    """Densify where the mean of the collected gradients reaches ``threshold``, and start collecting anew.
+    """Densify where the mean of the collected gradients reaches ``threshold``, and reset the collected gradients.
 
     Gaussians larger than ``size_fraction`` of the scene's extent are split, the others cloned; those that
     ``stats["is_blurred"]`` marks are split whatever their size and gradient (Mini-Splatting). While there are
-    ``most_per_pixel`` Gaussians or more for each pixel of the training views, collecting goes on instead.
+    ``most_per_pixel`` Gaussians or more for each pixel of the training views, gradients are only collected.
     """
     if n_rows(state.gaussians) >= most_per_pixel * n_pixels(iteration.scene):
         return "paused: as many Gaussians as most_per_pixel allows"
@@ -90,16 +92,16 @@ def reset_opacity(state: TrainState, iteration: Iteration, *, ceiling: float) ->
 
 
 def reset_opacity_on_white(state: TrainState, iteration: Iteration, *, ceiling: float) -> str | None:
-    """As :func:`reset_opacity`, if the scene is in front of white, where early floaters hide best."""
+    """Do :func:`reset_opacity` if the background is white, where early floaters hide best."""
     if not np.all(iteration.scene.background == 1.0):
         return "nothing done: the background is not white"
     reset_opacity(state, iteration, ceiling=ceiling)
     return None
 
 
-# Densification needs the mean gradient over about all views, and time to settle: each event multiplies the Gaussians
-# by up to two, so that events compressed to every few iterations let their number explode. What an opacity reset fades
-# needs some hundred iterations to come back.
+# Densification needs the mean gradient over nearly all views, and time to settle: each event up to doubles the number
+# of Gaussians, so it would explode if events were compressed to every few iterations. After an opacity reset, Gaussians
+# need a few hundred iterations to become opaque again.
 DENSIFY_LEAST_GAP = 100
 _densifying = partial(Every, 100, stop=15_000, least_gap=DENSIFY_LEAST_GAP)
 

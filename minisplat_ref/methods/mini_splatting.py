@@ -1,8 +1,8 @@
 """Mini-Splatting (Fang and Wang 2024): densify by blur split and depth, then keep few Gaussians, chosen by importance.
 
-As released, without opacity resets. Where the released code has numbers for photographs of a megapixel, ours depend on
-the scene: as many points are drawn as there were Gaussians, and what is blurred covers at least a few pixels. Each
-difference stands in ``docs/FIDELITY.md``.
+As released, without opacity resets. Where the released code has constants for photographs of a megapixel, ours depend
+on the scene: as many points are drawn as there were Gaussians, and a blurred Gaussian covers at least a few pixels.
+``docs/FIDELITY.md`` lists each difference.
 """
 
 from collections.abc import Callable
@@ -31,9 +31,9 @@ from minisplat_ref.training.state import Iteration, TrainState, apply_edit, star
 from minisplat_ref.types import Floats
 
 Metric = Callable[[ImportanceStats], Floats]
-"""Importance [N] of what all training views see: ``importance.indoor`` or ``importance.outdoor``."""
+"""Maps the statistics of all training views to importance [N]: ``importance.indoor`` or ``importance.outdoor``."""
 
-VISIBILITY_MASS = 0.99  # of a view's blend weight is carried by what is called visible in it (Mini-Splatting2)
+VISIBILITY_MASS = 0.99  # fraction of a view's blend weight that its visible Gaussians carry (Mini-Splatting2)
 
 
 def measure_importance(
@@ -41,7 +41,7 @@ def measure_importance(
 ) -> ImportanceStats:
     """Render all training views for their blend statistics, without culling.
 
-    ``visibility_mass`` is the part of a view's blend weight that its visible Gaussians carry.
+    ``visibility_mass`` is the fraction of a view's blend weight that its visible Gaussians carry.
     """
     return collect_importance(
         state.model,
@@ -54,16 +54,16 @@ def measure_importance(
 
 
 def candidates(stats: ImportanceStats, metric: Metric, least_views: int, *, is_intersecting: bool) -> Floats:
-    """Return the importance [N], 0 for what may not be kept.
+    """Return the importance [N], 0 for Gaussians that may not be kept.
 
     Parameters
     ----------
     stats : ImportanceStats
     metric : Metric
     least_views : int
-        Those that belong to the visible part of fewer views may not.
+        Those that are visible in fewer views may not.
     is_intersecting : bool
-        Those that dominate no pixel of any view may not.
+        If True, those that dominate no pixel of any view may not.
 
     Raises
     ------
@@ -80,21 +80,21 @@ def candidates(stats: ImportanceStats, metric: Metric, least_views: int, *, is_i
 
 
 def cull(state: TrainState, stats: ImportanceStats) -> None:
-    """From now on train each view with the Gaussians that carry most of its blend weight only."""
+    """From now on train each view only with the Gaussians that carry most of its blend weight."""
     state.stats["is_visible"] = stats.is_visible  # [N, V]
     factors = visibility.gradient_factors(stats.is_visible, stats.frustum_count)
     state.stats["gradient_factor"] = factors.astype(np.float32)
 
 
 def is_culling(state: TrainState) -> bool:
-    """Return whether views are culled at present."""
+    """Return whether views are currently culled."""
     return "is_visible" in state.stats
 
 
 def collect_blur(state: TrainState, iteration: Iteration, *, area_fraction: float, least_area: int = 0) -> None:
-    """Mark in ``stats["is_blurred"]`` what dominates more than ``area_fraction`` of the view's pixels.
+    """Mark in ``stats["is_blurred"]`` the Gaussians that dominate more than ``area_fraction`` of the view's pixels.
 
-    Up to ``least_area`` pixels are not blurred in any view.
+    A Gaussian that dominates at most ``least_area`` pixels is not blurred, however small the view.
     """
     stats, camera = iteration.output.stats, iteration.view.camera
     assert stats is not None, "listed in the recipe without BLEND_STATS"
@@ -116,11 +116,12 @@ def reinitialise_from_depth(
     points_per_gaussian: float,
     drawn_mass: float | None = None,
 ) -> None:
-    """Begin again with points that the views' depths give, without view-dependent colour.
+    """Start again from points that the views' depths give, without view-dependent colour.
 
-    Their number is ``points_per_gaussian`` times that of the population. Points through which other views see, to
-    ``depth_tolerance``, move out to ``backdrop_extents`` times the scene's extent. With ``drawn_mass`` depths are those
-    of the Gaussians that carry this part of the importance (Mini-Splatting2); they are counted before.
+    Their number is ``points_per_gaussian`` times that of the population. Points that other views see through, by more
+    than ``depth_tolerance``, move out to ``backdrop_extents`` times the scene's extent. With ``drawn_mass``, only the
+    Gaussians that carry this fraction of the importance are rendered for the depths (Mini-Splatting2); the number of
+    points is that of the population before.
     """
     n_points = round(points_per_gaussian * n_rows(state.gaussians))
     if drawn_mass is not None:
@@ -144,7 +145,7 @@ def reinitialise_from_depth(
 def prune_large_by_distance(state: TrainState, iteration: Iteration, *, size_fraction: float) -> None:
     """Remove Gaussians larger than ``size_fraction`` of the scene's extent, or of their distance where that is larger.
 
-    The distance is from the middle of the cameras. In 3DGS the limit is the same everywhere, and whatever is far, such
+    The distance is from the mean of the cameras. In 3DGS the limit is the same everywhere, so that distant things, such
     as the sky, could not be covered.
     """
     center = np.mean([view.camera.center for view in iteration.scene.train_views], axis=0)  # [3]
@@ -172,19 +173,19 @@ def simplify(
     state, iteration
         As for every action.
     metric : callable
-        What importance is.
+        Which importance is used.
     choose : callable
         ``choose(gaussians, importance, n, rng)`` returns the edit that leaves n.
     keep_fraction : float
-        Of the candidates, when there is no budget.
+        Fraction of the candidates to keep when there is no budget.
     budget : int, optional
-        Number of Gaussians to keep; all candidates, where there are no more.
+        Number of Gaussians to keep; all candidates if there are fewer.
     least_views : int
-        Those that belong to the visible part of fewer views are no candidates.
+        Those that are visible in fewer views are no candidates.
     is_intersecting : bool
-        Nor are those that dominate no pixel of any training view.
+        If True, nor are those that dominate no pixel of any training view.
     visibility_mass : float
-        Part of a view's blend weight that its visible Gaussians carry.
+        Fraction of a view's blend weight that its visible Gaussians carry.
     """
     stats = measure_importance(state, iteration, visibility_mass)
     if is_culling(state):
@@ -212,7 +213,7 @@ def prune_tail(
 ) -> None:
     """Keep the most important Gaussians that together carry ``mass`` of the importance.
 
-    With ``is_intersecting`` only those count that dominate some pixel of a training view; ``least_views`` and
+    With ``is_intersecting`` only those count that dominate a pixel of some training view; ``least_views`` and
     ``visibility_mass`` as for :func:`simplify`.
     """
     stats = measure_importance(state, iteration, visibility_mass)
@@ -223,12 +224,12 @@ def prune_tail(
 
 
 def restart_from_means(state: TrainState, iteration: Iteration, *, sh_degree: int) -> None:
-    """Begin again with the Gaussians' own centres and colours; all else, the moments too, is as at the start."""
+    """Start again from the Gaussians' centres and colours; everything else, including the moments, is reset."""
     start_anew(state, iteration, simplification.reinitialised(state.gaussians, sh_degree))
 
 
 def store_sh(state: TrainState, iteration: Iteration, *, sh_degree: int) -> None:
-    """Make room for view-dependent colour, zero at first; the moments begin anew."""
+    """Add coefficients of view-dependent colour, zero at first; the moments are reset."""
     n = n_rows(state.gaussians)
     sh_rest = np.zeros((n, (sh_degree + 1) ** 2 - 1, 3), state.gaussians.sh_rest.dtype)
     state.gaussians = state.gaussians._replace(sh_rest=sh_rest)
@@ -236,22 +237,22 @@ def store_sh(state: TrainState, iteration: Iteration, *, sh_degree: int) -> None
 
 
 def restart_adam(state: TrainState, iteration: Iteration) -> None:
-    """Forget all moments."""
+    """Reset all moments."""
     state.adam = zero_moments(state.gaussians)
 
 
-KEEP_FRACTION = 0.5  # of the Gaussians that dominate some pixel
-BLUR_AREA = 2e-4  # paper, equation 2: what dominates more of an image than this is too large
+KEEP_FRACTION = 0.5  # of the Gaussians that dominate a pixel
+BLUR_AREA = 2e-4  # paper, equation 2: a Gaussian that dominates a larger fraction of an image is too large
 # Pixels. The low-pass filter makes the smallest Gaussian some 2 pixels wide: where the paper's fraction is only a few
 # pixels, as in photographs of less than a megapixel, splitting would never end.
 LEAST_BLURRED_AREA = 64
 
-# Sky and bare walls have no depth that photographs settle. The paper takes the points as they come, which leaves veils
-# in the air; here what other views see through goes far behind the scene.
+# Photographs do not determine the depth of sky and bare walls. The paper takes the points as they are, which leaves
+# veils in the air; here points that other views see through move far behind the scene.
 DEPTH_TOLERANCE = 0.05
 BACKDROP_EXTENTS = 30.0
 
-SHORT_RUN_EXPONENT = 0.45  # what is begun anew has to be learned again: compressed runs raise their rates
+SHORT_RUN_EXPONENT = 0.45  # reinitialised Gaussians have to be learned again: compressed runs raise their rates
 
 _densifying = partial(Every, 100, stop=15_000, skip=5_000, least_gap=DENSIFY_LEAST_GAP)
 

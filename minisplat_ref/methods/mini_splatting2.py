@@ -1,4 +1,4 @@
-"""Mini-Splatting2 (Fang and Wang 2024): dense in 3000 iterations, then simplified, so that most train few Gaussians."""
+"""Mini-Splatting2 (Fang and Wang 2024): dense after 3000 iterations, then simplified, so most iterations train few."""
 
 import math
 from collections.abc import Callable
@@ -50,7 +50,7 @@ def aggressive_clone(
     visibility_mass: float = VISIBILITY_MASS,
     most_per_pixel: float = math.inf,
 ) -> None:
-    """Clone the critical Gaussians, after dropping those that hardly any view sees, and cull views from now on.
+    """Drop Gaussians that hardly any view sees, clone the critical ones, and cull views from now on.
 
     Parameters
     ----------
@@ -61,11 +61,11 @@ def aggressive_clone(
     factor : int
         Copies that a critical Gaussian becomes.
     tail_mass : float
-        Only the most important Gaussians that carry this part of the importance stay.
+        Only the most important Gaussians that carry this fraction of the importance stay.
     least_views : int
-        Those that belong to the visible part of fewer views go.
+        Those that are visible in fewer views are dropped.
     visibility_mass : float
-        Part of a view's blend weight that its visible Gaussians carry.
+        Fraction of a view's blend weight that its visible Gaussians carry.
     most_per_pixel : float
         Nothing is cloned while there are this many Gaussians or more for each pixel of the training views.
     """
@@ -86,9 +86,9 @@ def stop_culling(state: TrainState, iteration: Iteration) -> None:
         state.stats.pop(name, None)
 
 
-KEEP_FRACTION = 0.6  # of the Gaussians that dominate some pixel
+KEEP_FRACTION = 0.6  # of the Gaussians that dominate a pixel
 MOST_PER_PIXEL = 0.1
-_LEAST_VIEWS = 2  # what only one view sees is as likely a floater as a surface
+_LEAST_VIEWS = 2  # seen by only one view, a Gaussian is as likely a floater as a surface
 _cloning = partial(
     aggressive_clone,
     critical=cloning.critical_by_mass,

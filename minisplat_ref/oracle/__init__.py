@@ -3,7 +3,7 @@
 Each check answers one question, and ``minisplat-ref oracle`` runs it. Read them in this order:
 
 ===============  ============================================================================  =============
-module           what a reader finds there                                                     command
+module           content                                                                       command
 ===============  ============================================================================  =============
 ``cases``        what every check reports: named cases that passed or not, as table and JSON
 ``tolerances``   every tolerance and every margin, with its reason
@@ -11,16 +11,16 @@ module           what a reader finds there                                      
 ``setting``      a small scene on which every branch of every gradient is taken
 ``stages``       each stage of a backend as a function with its gradient
 ``public_call``  the same for ``rasterization``, in every mode
-``pieces``       the same for the reference's formulas below the stages
+``pieces``       the same for the formulas of the reference inside the stages
 ``differences``  sixth-order differences that refuse to cross a threshold
 ``gradients``    are the gradients derivatives?                                                ``gradients``
 ``planted``      would an error be found? Backends that are wrong in one formula, on purpose   ``compare``
 ``truth``        is float64 enough? The formulas in 50 digits                                  ``truth``
 ``hard_cases``   what breaks renderers, as data; every precision against the reference         ``hard-cases``
-``golden``       arrays of every stage, for whoever writes another renderer                    ``export``
+``golden``       arrays of every stage, for authors of other renderers                         ``export``
 ``comparison``   where does another renderer differ, and does it matter?                       ``compare``
-``peers``        renderers of others: gsplat in PyTorch and in CUDA, the 3DGS rasteriser       ``compare``
+``peers``        other renderers: gsplat in PyTorch and in CUDA, the 3DGS rasteriser           ``compare``
 ===============  ============================================================================  =============
 
-Correctness only: speed, and what it costs in digits, is :mod:`minisplat_ref.bench`.
+This package is about correctness only; for speed, and what it costs in digits, see :mod:`minisplat_ref.bench`.
 """

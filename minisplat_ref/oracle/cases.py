@@ -1,7 +1,7 @@
-"""What a check reports: named cases that passed or did not, each with its figures; as a table and as JSON."""
+"""Reports of checks: named cases that passed or failed, each with its figures; as a table and as JSON."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,9 +19,9 @@ class Case(NamedTuple):
     name: str
     """Unique in its report."""
     passed: bool
-    """Whether it is as it should be."""
+    """Whether the result is as it should be."""
     figures: dict[str, Figure]
-    """What was measured, by the heading of its column."""
+    """Measured values by the heading of their column."""
     note: str = ""
     """Why it failed, or what else a reader must know; one line."""
 
@@ -42,19 +42,32 @@ class Report(NamedTuple):
         return sum(not case.passed for case in self.cases)
 
 
-def as_markdown(report: Report) -> str:
-    """Return the cases as an aligned table: name, verdict, figures, note."""
-    headings = list(dict.fromkeys(key for case in report.cases for key in case.figures))
-    has_notes = any(case.note for case in report.cases)
+def as_table(cases: Sequence[Case]) -> tuple[list[str], list[list[str]]]:
+    """Return heading and rows: name, verdict, figures and, where some case has one, a note."""
+    names = list(dict.fromkeys(key for case in cases for key in case.figures))
+    has_notes = any(case.note for case in cases)
     rows = []
-    for case in report.cases:
-        cells = [_cell(case.figures.get(heading)) for heading in headings]
+    for case in cases:
+        cells = [_cell(case.figures.get(name)) for name in names]
         rows.append([case.name, "passed" if case.passed else "FAILED", *cells, *([case.note] if has_notes else [])])
-    return markdown_table(["case", "verdict", *headings, *(["note"] if has_notes else [])], rows)
+    return ["case", "verdict", *names, *(["note"] if has_notes else [])], rows
+
+
+def as_markdown(report: Report) -> str:
+    """Return the cases as an aligned table; see :func:`as_table`."""
+    return markdown_table(*as_table(report.cases))
+
+
+def by_kind(cases: Iterable[Case]) -> list[list[Case]]:
+    """Return the cases that have the same figures together, in the order of the first of each kind."""
+    kinds: dict[tuple[str, ...], list[Case]] = {}
+    for case in cases:
+        kinds.setdefault(tuple(case.figures), []).append(case)
+    return list(kinds.values())
 
 
 def save_json(report: Report, path: str | Path) -> None:
-    """Write the report; the file is there complete or not at all.
+    """Write the report, completely or not at all.
 
     Parameters
     ----------
@@ -79,7 +92,7 @@ def save_json(report: Report, path: str | Path) -> None:
 
 
 def verdict(reports: Sequence[Report]) -> str:
-    """Return the closing line: how many of how many passed."""
+    """Return the closing line: how many of the cases passed."""
     n, n_failed = sum(len(report.cases) for report in reports), sum(report.n_failed for report in reports)
     return f"all {n} cases passed" if n_failed == 0 else f"{n_failed} of {n} cases failed"
 

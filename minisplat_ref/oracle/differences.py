@@ -1,8 +1,8 @@
-"""Are these gradients derivatives? Central differences against VJPs, refusing to pass on nothing.
+"""Are these gradients derivatives? Compare central differences with VJPs; a check of nothing does not pass.
 
-A function under test maps arrays to a :class:`Point`: its outputs, and on which side of each threshold its values lie.
-A renderer is full of thresholds (skip, stop, clamp, order), and a difference across one is not a derivative of
-anything: it is refused and tried again with a smaller step, never averaged in.
+A function under test maps arrays to a :class:`Point`: its outputs, and the side of each threshold on which its values
+lie. A renderer is full of thresholds (skip, stop, clamp, order), and a difference across one is not a derivative: it is
+refused and tried again with a smaller step, never averaged in.
 
 The sixth-order stencil makes tight checks possible. At a step h the plain central difference is wrong by
 ``h^2 f''' / 6``, rounding by ``1e-16 f / h``: no h makes both smaller than about 1e-10 f. With six points the first
@@ -23,7 +23,7 @@ SIXTH_ORDER = (3 / 4, -3 / 20, 1 / 60)
 """The same for six points; error h^6 f^(7) / 140."""
 
 STEPS = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
-"""Steps to try, the first being best for values of order 1; each next one only where the one before is refused."""
+"""Steps to try: the first is best for values of order 1, the next are used only where the one before is refused."""
 
 
 class Point(NamedTuple):
@@ -31,7 +31,7 @@ class Point(NamedTuple):
 
     outputs: tuple[Floats, ...]
     sides: tuple[np.ndarray, ...] = ()
-    """Arrays that change when a threshold is crossed and at no other time; of any shape."""
+    """Arrays, of any shape, that change if and only if a threshold is crossed."""
 
 
 Function = Callable[..., Point]
@@ -43,7 +43,7 @@ class ThresholdCrossed(Exception):
 
 
 class Block(NamedTuple):
-    """Derivative of one output by one input."""
+    """Derivative of one output with respect to one input."""
 
     output: str
     input: str
@@ -54,7 +54,7 @@ class Block(NamedTuple):
 
     @property
     def is_zero(self) -> bool:
-        """Whether there is nothing in it; the VJP has to agree."""
+        """Return whether the block is zero; the VJP has to agree."""
         return self.size <= GRADIENT_FLOOR
 
 
@@ -66,7 +66,7 @@ class JacobianCheck(NamedTuple):
     step: float
     """Smallest step that a threshold forced."""
     n_refused: int
-    """Columns for which every step crossed a threshold: nothing is known about them."""
+    """Columns for which every step crossed a threshold, so that they are unchecked."""
 
     @property
     def error(self) -> float:
@@ -75,7 +75,7 @@ class JacobianCheck(NamedTuple):
 
     @property
     def vacuous(self) -> tuple[str, ...]:
-        """Inputs and outputs with zero blocks only: nothing was checked about them."""
+        """Return the inputs and outputs with zero blocks only: nothing was checked about them."""
         names = dict.fromkeys(name for block in self.blocks for name in (block.input, block.output))
         alive = {name for block in self.blocks if not block.is_zero for name in (block.input, block.output)}
         return tuple(name for name in names if name not in alive)
@@ -90,11 +90,11 @@ class InnerProduct(NamedTuple):
     error: float
     """Difference between the two sides, relative to ``size``."""
     step: float
-    """Step that was used; 0 where each crossed a threshold: nothing is known."""
+    """Step that was used; 0 if all crossed a threshold, so that it is unchecked."""
 
 
 def inner(a: Sequence[Floats], b: Sequence[Floats]) -> float:
-    """Sum of products over two tuples of arrays."""
+    """Return the sum of products over two tuples of arrays."""
     return sum(float(np.vdot(x, y)) for x, y in zip(a, b, strict=True))
 
 
@@ -106,7 +106,7 @@ def derivative(
     step: float,
     weights: Sequence[float] = SIXTH_ORDER,
 ) -> tuple[Floats, ...]:
-    """Derivative of all outputs when one input moves along a direction.
+    """Return the derivative of all outputs along a direction of one input.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def derivative(
 def careful_derivative(
     function: Function, inputs: Sequence[Floats], index: int, direction: Floats, steps: Sequence[float] = STEPS
 ) -> tuple[tuple[Floats, ...], float]:
-    """:func:`derivative` at the first of ``steps`` that crosses no threshold, and that step."""
+    """Return :func:`derivative` with the first of ``steps`` that crosses no threshold, and that step."""
     for step in steps:
         try:
             return derivative(function, inputs, index, direction, step), step
@@ -161,7 +161,7 @@ def careful_derivative(
 
 
 def analytic_jacobians(vjp: Vjp, outputs: Sequence[Floats]) -> tuple[Floats, ...]:
-    """Derivatives [n_outputs, n_inputs] of all outputs by each input: one call of the VJP for every output entry."""
+    """Return derivatives [n_outputs, n_inputs] with respect to each input: one VJP for every entry of the outputs."""
     rows = []
     for o, output in enumerate(outputs):
         for k in range(np.size(output)):
@@ -222,7 +222,7 @@ def check_jacobians(
         pairs = zip(np.split(np.stack(columns, 1), ends), np.split(analytic[index][:, known], ends), strict=True)
         for output, (expected, got) in zip(output_names, pairs, strict=True):
             size = float(np.abs(expected).max())
-            error = float(np.abs(got - expected).max())  # NaN stays NaN, which no tolerance admits
+            error = float(np.abs(got - expected).max())  # NaN stays NaN and fails any tolerance
             blocks.append(Block(output, name, size, error / size if size > GRADIENT_FLOOR else error))
     return JacobianCheck(tuple(blocks), min(used, default=0.0), n_refused)
 

@@ -1,10 +1,10 @@
-"""The gradient proof: each stage of a backend by full Jacobians, by inner products and against automatic derivatives.
+"""The gradient proof: check each stage of a backend with full Jacobians, inner products and automatic differentiation.
 
-Beside the stages, the public call ``rasterization`` in every mode, with what it adds to the stages.
+Besides the stages it checks the public call ``rasterization`` in every mode, with what it adds to the stages.
 
-Full Jacobians on a tiny scene see every entry of every gradient, also those that a random direction would cancel; inner
-products on a larger one see many tiles and long lists. A check that could not fail is a failure: nothing in the image,
-a gradient of zero, a column that no step could reach without crossing a threshold.
+Full Jacobians on a tiny scene cover every entry of every gradient, including those that cancel along a random
+direction; inner products on a larger scene cover many tiles and long lists. A check that cannot fail counts as failed:
+an empty image, a zero gradient, a column for which every step crosses a threshold.
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ from minisplat_ref.oracle.tolerances import (
 from minisplat_ref.types import Floats
 
 AUTOGRAD = "torch autograd"
-"""Setting of the report: what was compared with, or why nothing was."""
+"""Setting of the report: the peer of the comparison, or why there was none."""
 
 MANY_STEPS = STEPS[1:]  # among thousands of hits some cross a threshold at any larger step
 
@@ -48,7 +48,7 @@ def check_all_gradients(backends: Sequence[Backend], conventions: Conventions) -
     Returns
     -------
     Report
-        The cases of all; their names begin with the backend's where there are several.
+        The cases of all; their names begin with the backend's if there are several.
     """
     reports = [check_gradients(backend, conventions) for backend in backends]
     if len(reports) == 1:
@@ -69,14 +69,14 @@ def check_gradients(backend: Backend, conventions: Conventions) -> Report:
     Parameters
     ----------
     backend : Backend
-        Whose forward and backward functions have to fit; in float64.
+        Whose backward functions must match its forward ones; in float64.
     conventions : Conventions
-        Profile to do it under. The comparison with gsplat is done under gsplat's.
+        Profile of the check. The comparison with gsplat uses gsplat's.
 
     Returns
     -------
     Report
-        A case for each stage and way of checking; the formulas below the stages, too, for the reference.
+        A case for each stage and way of checking; for the reference, also for the formulas inside the stages.
     """
     rng = np.random.default_rng(SEED)
     tiny, larger = tiny_setting(conventions), make_setting(rng, 60, 40, 30, conventions, sh_degree=3)
@@ -106,7 +106,7 @@ def public_call_cases(backend: Backend, conventions: Conventions) -> list[Case]:
 
 
 def jacobian_case(stage: Stage) -> Case:
-    """Full Jacobians of a stage, by its VJP and by differences."""
+    """Compare full Jacobians of a stage, from its VJP and from differences."""
     inputs, outputs = list(stage.inputs.values()), stage.function(*stage.inputs.values()).outputs
     check = check_jacobians(
         stage.function, stage.vjp, inputs, names=list(stage.inputs), output_names=list(stage.outputs)
@@ -126,7 +126,7 @@ def jacobian_case(stage: Stage) -> Case:
 
 
 def inner_product_case(stage: Stage, rng: np.random.Generator) -> Case:
-    """Directional derivatives of a stage, one for each input."""
+    """Compare directional derivatives of a stage, one for each input."""
     inputs, outputs = list(stage.inputs.values()), stage.function(*stage.inputs.values()).outputs
     products = check_inner_products(stage.function, stage.vjp, inputs, rng, names=list(stage.inputs), steps=MANY_STEPS)
     problems = [f"{p.input}: every step crosses a threshold" for p in products if p.step == 0]
@@ -144,7 +144,7 @@ def inner_product_case(stage: Stage, rng: np.random.Generator) -> Case:
 
 
 def autograd_cases(backend: Backend) -> list[Case]:
-    """Gradients of projection, colours and compositing beside torch's own, through gsplat's functions.
+    """Compare the gradients of projection, colours and compositing with torch's autograd through gsplat's functions.
 
     Raises
     ------

@@ -1,14 +1,13 @@
-"""The gradient proof for a whole model: any representation through its own renderer, without code of its own.
+"""The gradient proof for a whole model: any representation with its own renderer, without further code.
 
-The Gaussians of the tiny scene become the representation's population. Fields that they did not have, and shared
-parameters, begin as training begins them, often at zero or at the identity, where much of a gradient vanishes: here
-they are moved by random noise. A field whose learning rate is 0, which an event sets and no gradient, is moved, too,
-but not differentiated: a bound or a number of samples has no derivative. The view is at time 0.7, so that what depends
-on time does.
+The Gaussians of the tiny scene become the representation's population. Its further fields, and shared parameters, have
+the initial values of training, often zero or the identity, where much of a gradient vanishes: here random noise is
+added. A field of learning rate 0, which an event sets instead of a gradient, gets noise too but is not differentiated:
+a bound or a number of samples has no derivative. The view is at time 0.7, so that time has an effect.
 
-Which hits are blended and which of them are clamped is noted as the renderer calls the stages of its backend. A
-threshold of the renderer's own, a gate or a ReLU, is not seen: its stage belongs into the extension's ``stages``. One
-with the name that the whole renderer has here takes its place.
+The calls of the backend's stages record which hits are blended and which of them are clamped. They do not see a
+threshold of the renderer's own, a gate or a ReLU: its stage belongs in the extension's ``stages``. A stage there with
+the name that the whole renderer has here replaces it.
 """
 
 from collections.abc import Callable, Sequence
@@ -43,13 +42,13 @@ def check_model_gradients(
     Parameters
     ----------
     backend : Backend
-        That the renderer is asked to use; in float64.
+        Backend for the renderer to use; in float64.
     conventions : Conventions
-        Profile to do it under.
+        Profile of the check.
     representation : Representation
-        What is drawn.
+        What is rendered.
     stages : callable, optional
-        ``stages(backend, setting, rng)``: what an extension has besides its renderer.
+        ``stages(backend, setting, rng)``: an extension's stages besides its renderer.
 
     Returns
     -------
@@ -130,7 +129,7 @@ def model_stage(backend: Backend, setting: Setting, representation: Representati
 
 
 def _noisy_population(gaussians: Gaussians, representation: Representation, rng: np.random.Generator) -> Any:
-    """Make the Gaussians into a population, and move what they did not have."""
+    """Turn the Gaussians into a population, and add noise to its further fields."""
     population = representation.extend(gaussians, rng)
     known = gaussians._asdict()
     return population._make(
@@ -149,6 +148,6 @@ def _view(camera: Camera) -> View:
 
 
 def _scene(setting: Setting, view: View) -> Scene:
-    """Return a scene of one view, from which shared parameters can begin."""
+    """Return a scene of one view, from which to initialise shared parameters."""
     points = setting.gaussians.means[:N_POINTS]
     return Scene("tiny", (view,), (), points, np.full(points.shape, 128, np.uint8), setting.background, extent=1.0)

@@ -1,7 +1,7 @@
-"""The reference's formulas one by one, below the stages: what a stage's gradient is built of.
+"""The reference's formulas one by one, inside the stages: the building blocks of a stage's gradient.
 
-Each function here takes a module of :mod:`minisplat_ref.reference`, so that a copy of it with an error in one place can
-be put in; the tests do that with every operator of every gradient.
+Each function here takes a module of :mod:`minisplat_ref.reference`, or a copy of it with an error in one place; the
+tests do the latter with every operator of every gradient.
 """
 
 from collections.abc import Callable
@@ -34,12 +34,12 @@ SEED = 20240229
 
 
 def tiny_setting(conventions: Conventions = GSPLAT_MAIN, sh_degree: int = 1) -> Setting:
-    """Five Gaussians in 9 x 7 pixels."""
+    """Return five Gaussians in 9 x 7 pixels."""
     return make_setting(np.random.default_rng(SEED), 5, 9, 7, conventions, sh_degree)
 
 
 def projected(setting: Setting) -> tuple[Projection, TileBins]:
-    """Footprints and tile lists by the reference."""
+    """Return footprints and tile lists, computed by the reference."""
     backend, camera, conventions = with_module(), setting.camera, setting.conventions
     projection = backend.project(*setting.primitives, camera, conventions)
     grid = TileGrid(camera.width, camera.height, backend.tile_width, backend.tile_height)
@@ -132,7 +132,7 @@ def depth_pieces(m: Module) -> tuple[Stage, ...]:
     depth, alpha = rng.uniform(2, 3, size=(4, 5)), rng.uniform(0.3, 1, size=(4, 5))
     alpha[1, 2] = 0.0
     accumulated = depth * alpha
-    is_hit = (alpha > 0).astype(float)  # a pixel that was not hit cannot be moved into a hit by a derivative
+    is_hit = (alpha > 0).astype(float)  # differences must not turn an empty pixel into a hit
 
     def expected(accumulated: Floats, alpha: Floats) -> Point:
         return Point((m.expected_depth(accumulated * is_hit, alpha * is_hit),))
@@ -162,7 +162,7 @@ def _sh_pieces(m: Module) -> tuple[Stage, ...]:
 
 
 def _slanted(hits: Module) -> Response:
-    """The conic with depths and colours that change over the Gaussian; pixels sort two hits at a time."""
+    """Return the conic with depths and colours that vary over the Gaussian; pixels sort two hits at a time."""
 
     def hit(projection: Projection, ids: Ints, centers: Floats) -> Hit:
         flat: Hit = hits.conic_hit(projection, ids, centers)
@@ -184,7 +184,7 @@ def _slanted(hits: Module) -> Response:
 
 
 def _blending_stage(compositing: Module, response: Response) -> Stage:
-    """``composite_hits`` of a response to projected Gaussians; tile lists and boxes are held."""
+    """Return ``composite_hits`` of a response to projected Gaussians; tile lists and boxes are fixed."""
     plain, p, bins = composite_stage(with_module(), tiny_setting()), *projected(tiny_setting())
 
     def moved(means2d: Floats, conics: Floats, opacities: Floats) -> Projection:

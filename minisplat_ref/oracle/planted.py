@@ -1,9 +1,9 @@
 """Would an error be found? Backends that are wrong in one formula, on purpose.
 
-Most of these errors were met in renderers that people use; the others are the classic slips. Each wraps one stage of a
-given backend, so that the same error can be put into the reference and into the kernels. An error in a forward formula
-is planted together with its own derivative: its gradients are right for what it computes, and only a comparison finds
-it. An error in a gradient leaves the image alone: only a check of gradients finds it.
+Most of these errors occurred in renderers that people use; the others are classic mistakes. Each wraps one stage of a
+given backend, so that the same error can be planted in the reference and in the kernels. An error in a forward formula
+is planted together with its own derivative: its gradients are correct for what it computes, and only a comparison finds
+it. An error in a gradient does not change the image: only a check of gradients finds it.
 """
 
 from collections.abc import Callable
@@ -47,23 +47,23 @@ class Planted(NamedTuple):
     what: str
     """The error, one line."""
     plant: Change
-    """Makes a wrong backend of a right one."""
+    """Turns a correct backend into a wrong one."""
 
     @property
     def is_forward(self) -> bool:
-        """Whether images are wrong, and not gradients."""
+        """Return whether images are wrong, rather than gradients."""
         return not self.stage.startswith("v_")
 
 
 def planted(name: str, backend: Backend = CPU) -> Backend:
-    """Backend with one error.
+    """Return a backend with one error.
 
     Parameters
     ----------
     name : str
         Of one of :data:`PLANTED`.
     backend : Backend
-        What to put it into.
+        Where to plant it.
 
     Returns
     -------
@@ -102,7 +102,7 @@ def _shifted(camera: Camera) -> Camera:
 
 
 def _transposed_view(base: Backend) -> Backend:
-    """With means R R mu and the rotation R^T, a point's camera coordinates are R mu + t still: only J R^T differs."""
+    """With means R R mu and the rotation R^T, a point's camera coordinates are still R mu + t: only J R^T differs."""
 
     def turned(means: Floats, camera: Camera) -> tuple[Floats, Camera, Floats]:
         R = np.asarray(camera.cam_from_world_R, means.dtype)
@@ -222,7 +222,7 @@ def _half_off_diagonal(base: Backend) -> Backend:
 
 
 def _forgotten_background(base: Backend) -> Backend:
-    """The derivative by T_end is ``v . background - v_alpha``, so this v_alpha takes the first term out."""
+    """dL/dT_end is ``v . background - v_alpha``, so this v_alpha takes the first term out."""
 
     @wraps(base.composite_vjp)
     def composite_vjp(

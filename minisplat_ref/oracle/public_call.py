@@ -1,8 +1,8 @@
 """The public call as a stage under test: ``rasterization`` of a batch of two cameras, in every mode.
 
-Between a backend's stages and what a user calls lies code that can be wrong by itself: channels are put together and
-taken apart, an accumulated depth is divided by the opacity, gradients of the cameras are added, and spherical harmonics
-reach the view matrices through the camera's centre. Checks of the stages see none of it.
+Between a backend's stages and the user's call there is code that can be wrong by itself: channels are concatenated and
+split, an accumulated depth is divided by the opacity, gradients of the cameras are added, and spherical harmonics
+depend on the view matrices via the camera's centre. Checks of the stages cover none of it.
 """
 
 import math
@@ -33,7 +33,7 @@ class Call(NamedTuple):
 
     @property
     def name(self) -> str:
-        """For reports."""
+        """Return its name for reports."""
         colors = f"{self.n_channels} channels" if self.n_channels else "harmonics"
         words = [colors] if self.has_colors else []
         words += ["of each camera"] if self.has_own_colors else []
@@ -42,7 +42,7 @@ class Call(NamedTuple):
 
     @property
     def has_colors(self) -> bool:
-        """Whether the image depends on colours and background."""
+        """Return whether the image depends on colours and background."""
         return self.render_mode.startswith("RGB")
 
 

@@ -1,8 +1,8 @@
-"""A view in which a training found a number that is not finite, computed again by every backend.
+"""Compute a view in which a training found a number that is not finite again with every backend.
 
-If the reference in float64 is finite where another is not, the error is in that one; if all are not, it is in the
-parameters, the formula or the data. Where nothing is wrong with any of them it has been mended, or did not come from
-what the view depends on.
+If the reference in float64 is finite where another backend is not, the error is in that one; if none is finite, it is
+in the parameters, the formula or the data. If all are finite, the error has been fixed, or its cause was not in the
+inputs of the view.
 """
 
 from typing import Any

@@ -1,8 +1,8 @@
-"""A scene to test gradients on: small, and drawn by hand where it matters.
+"""A scene on which to test gradients: small, and placed by hand where it matters.
 
-A hit that is clamped, a pixel that stops early, a mean outside the clamp of the Jacobian on either axis, a colour below
-zero, a principal point off centre and a turned camera: every branch of every gradient is taken. The Jacobian's limits
-differ along x and y, and one mean lies between them: whoever clamps y by the limit of x is found out.
+It has a clamped hit, a pixel that stops early, a mean outside the clamp of the Jacobian on either axis, a colour below
+zero, a principal point off centre and a rotated camera: every branch of every gradient is taken. The Jacobian's limits
+differ along x and y, and one mean lies between them, which detects code that clamps y by the limit of x.
 """
 
 from typing import NamedTuple
@@ -18,7 +18,7 @@ POSE = ("cam_from_world_R", "cam_from_world_t")
 
 
 class Setting(NamedTuple):
-    """What a stage is tested on."""
+    """The scene on which a stage is tested."""
 
     gaussians: Gaussians
     camera: Camera
@@ -27,13 +27,13 @@ class Setting(NamedTuple):
 
     @property
     def primitives(self) -> Primitives:
-        """The Gaussians, activated."""
+        """Return the activated Gaussians."""
         g = self.gaussians
         return Primitives(g.means, g.quats, np.exp(g.log_scales), 1 / (1 + np.exp(-g.opacity_logits)))
 
     @property
     def pose(self) -> dict[str, Floats]:
-        """What moves the camera."""
+        """Return the pose of the camera by name."""
         return dict(zip(POSE, pose(self.camera, np.dtype(float)), strict=True))
 
 

@@ -1,6 +1,6 @@
 """Every differentiable stage of a backend as a function of arrays with its VJP.
 
-What is not differentiated (tile lists, dominant Gaussians, radii) is held as it is at the scene itself.
+Results that are not differentiated (tile lists, dominant Gaussians, radii) are fixed at their values for the scene.
 """
 
 import dataclasses
@@ -45,7 +45,7 @@ class Stage(NamedTuple):
 
 
 def backend_stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
-    """All differentiable stages of a backend, and the whole render.
+    """Return all differentiable stages of a backend, and the whole render.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def backend_stages(backend: Backend, setting: Setting, rng: np.random.Generator)
 
 
 def project_stage(backend: Backend, setting: Setting) -> Stage:
-    """``project`` by Gaussians and pose."""
+    """Return ``project`` as a function of Gaussians and pose."""
     _, camera, _, conventions = setting
     inputs = {**setting.primitives._asdict(), **setting.pose}
 
@@ -95,7 +95,7 @@ def project_stage(backend: Backend, setting: Setting) -> Stage:
 
 
 def sh_stage(backend: Backend, setting: Setting) -> Stage:
-    """``sh_colors`` by means, coefficients and pose."""
+    """Return ``sh_colors`` as a function of means, coefficients and pose."""
     g, camera = setting.gaussians, setting.camera
     radii = backend.project(*setting.primitives, camera, setting.conventions).radii
     degree = int(np.sqrt(g.sh_rest.shape[1] + 1)) - 1
@@ -112,7 +112,7 @@ def sh_stage(backend: Backend, setting: Setting) -> Stage:
 
 
 def composite_stage(backend: Backend, setting: Setting) -> Stage:
-    """``composite`` by footprints, opacities, three channels and background; tile lists and boxes are held."""
+    """Return ``composite`` of footprints, opacities, three channels and background; tile lists and boxes are fixed."""
     projection, bins, colors = _composited(backend, setting)
     conventions, background = setting.conventions, setting.background
     inputs = {
@@ -136,7 +136,7 @@ def composite_stage(backend: Backend, setting: Setting) -> Stage:
 
 
 def surface_stage(backend: Backend, setting: Setting) -> Stage:
-    """``surface_points`` by Gaussians, for the dominant Gaussians of the view; one is put behind the camera then."""
+    """Return ``surface_points`` of Gaussians, for the view's dominant ones, one of them moved behind the camera."""
     projection, bins, colors = _composited(backend, setting)
     output = backend.composite(projection, colors, setting.background, bins, setting.conventions, with_stats=True)
     ids, camera = output.stats.dominant_ids, setting.camera  # type: ignore[union-attr]  # stats were asked for
@@ -155,7 +155,7 @@ def surface_stage(backend: Backend, setting: Setting) -> Stage:
 
 
 def photometric_stage(backend: Backend, camera: Camera, rng: np.random.Generator) -> Stage:
-    """``photometric_loss`` by the image, some pixels masked out."""
+    """Return ``photometric_loss`` as a function of the image, with some pixels masked out."""
     shape = camera.height, camera.width, 3
     target, image = rng.uniform(size=shape), rng.uniform(size=shape)
     mask = rng.uniform(size=shape[:2]) < 0.8
@@ -172,7 +172,7 @@ def photometric_stage(backend: Backend, camera: Camera, rng: np.random.Generator
 
 
 def splat_stage(backend: Backend, setting: Setting, module: object = splatting, *, with_depth: bool = True) -> Stage:
-    """``splat`` by activated Gaussians, colours, background and pose."""
+    """Return ``splat`` as a function of activated Gaussians, colours, background and pose."""
     _, _, colors = _composited(backend, setting)
     _, camera, background, conventions = setting
     inputs = {**setting.primitives._asdict(), "colors": colors, "background": background, **setting.pose}
@@ -196,7 +196,7 @@ def splat_stage(backend: Backend, setting: Setting, module: object = splatting, 
 
 
 def render_stage(backend: Backend, setting: Setting, module: object = rendering) -> Stage:
-    """``render`` with depth, by every trained parameter, background and pose."""
+    """Return ``render`` with depth as a function of every trained parameter, background and pose."""
     gaussians, camera, background, conventions = setting
     inputs = {**gaussians._asdict(), "background": background, **setting.pose}
 
@@ -234,7 +234,7 @@ def _moved(camera: Camera, R: Floats, t: Floats) -> Camera:
 
 
 def _composited(backend: Backend, setting: Setting) -> tuple[Projection, TileBins, Floats]:
-    """Footprints, tile lists and degree-0 colours of the scene, to start in the middle of the pipeline."""
+    """Return footprints, tile lists and degree-0 colours of the scene, to start in the middle of the pipeline."""
     camera, conventions = setting.camera, setting.conventions
     projection = backend.project(*setting.primitives, camera, conventions)
     grid = TileGrid(camera.width, camera.height, backend.tile_width, backend.tile_height)
@@ -248,14 +248,14 @@ def _view_point(tape: splatting.SplatTape) -> Point:
 
 
 def hit_sides(projection: Projection, bins: TileBins, conventions: Conventions) -> Sides:
-    """Which Gaussians are listed, which hits are blended and which are clamped."""
+    """Return which Gaussians are listed, which hits are blended and which are clamped."""
     tiles = list(tile_hits(projection, bins, conventions))
     blended = np.concatenate([np.ravel(tile.alphas > 0) for tile in tiles])
     return bins.gaussian_ids, bins.tile_offsets, blended, np.concatenate([np.ravel(tile.is_clamped) for tile in tiles])
 
 
 def slope_sides(means: Floats, camera: Camera, conventions: Conventions) -> np.ndarray:
-    """Whether the Jacobian of each point's projection follows its slopes."""
+    """Return whether each point's slopes are inside the Jacobian's clamp."""
     camera = with_principal_point(camera, conventions)
     R, t = pose(camera, means.dtype)
     in_camera, limits = means @ R.T + t, np.full(2, np.inf)
@@ -264,7 +264,7 @@ def slope_sides(means: Floats, camera: Camera, conventions: Conventions) -> np.n
 
 
 def watched(backend: Backend) -> tuple[Backend, list[np.ndarray]]:
-    """Return the backend, and a list to which its stages append on which side of their thresholds they were."""
+    """Return the backend, and a list to which its stages append the sides of their thresholds."""
     sides: list[np.ndarray] = []
 
     def project(

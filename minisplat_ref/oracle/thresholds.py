@@ -14,20 +14,20 @@ median     the transmittance behind a hit with one half: whose depth is the    m
            median depth
 =========  ==================================================================  =================
 
-Two correct renderers that round differently disagree at such pixels by a whole hit, and no precision but the other
-one's own mends that. The pixels are found here, in float64, and set aside by whoever compares: counted, not averaged
-into an error of arithmetic, and not excused beyond what the hits at their thresholds can change. How near is near
-enough depends on what rounds: see :class:`Margins`.
+Two correct renderers that round differently disagree at such pixels by a whole hit, and higher precision does not help.
+The pixels are found here, in float64, and comparisons set them aside: they are counted, not averaged into the
+arithmetic error, and excused only as far as the hits at their thresholds can change them. How near is near enough
+depends on what is rounded: see :class:`Margins`.
 
-Order is the threshold that can flip a whole image. All Gaussians of a wall that a camera faces squarely have one depth;
-if the camera is turned against the world's axes, rounding the means spreads these depths by some 1e-8 of themselves,
-and float64 sorts by that noise. In float32 they are equal, and the rows of the table decide: neither order is wrong.
-Our float32 kernels compute depths in float64 and sort them rounded, as other float32 renderers do. To sort them as they
-are would agree with the reference here, and with no other renderer, for an order that is noise; tile lists would take
-18 to 31 % longer (processor time of one thread, 13,000 to 200,000 Gaussians).
+Order is the threshold that can change a whole image. All Gaussians of a wall that a camera faces squarely have the same
+depth; if the camera is rotated against the world's axes, rounding the means spreads these depths by a relative 1e-8,
+and float64 sorts by that noise. In float32 they are equal, and the order of the rows decides: neither order is wrong.
+Our float32 kernels compute depths in float64 and sort them rounded, as other float32 renderers do. Sorting them
+unrounded would agree with the reference here, but with no other renderer, for an order that is noise; tile lists would
+take 18 to 31 % longer (processor time of one thread, 13,000 to 200,000 Gaussians).
 
-Left out: the border of a footprint's box. A hit near ``alpha_min`` counts as one inside and outside of it, since
-another renderer's box may hold it.
+Left out: the border of a footprint's box. A hit near ``alpha_min`` counts inside and outside of it, since another
+renderer's box may contain it.
 """
 
 from typing import NamedTuple
@@ -46,7 +46,7 @@ class Thresholds(NamedTuple):
     """What the thresholds can do to each pixel."""
 
     allowance: Floats
-    """[H, W] bound of the change of any channel when hits at thresholds fall on the other side; mostly 0."""
+    """[H, W] upper bound of the change of any channel if hits at thresholds fall on the other side; mostly 0."""
     jumps: Bools
     """[H, W] whether the image may jump, and its gradient with it: skip, stop, order."""
     kinks: Bools
@@ -56,14 +56,14 @@ class Thresholds(NamedTuple):
 
     @property
     def is_near(self) -> Bools:
-        """[H, W] whether a hit stands at a threshold of the image or of the gradient."""
+        """[H, W] whether a hit is at a threshold of the image or of the gradient."""
         return self.jumps | self.kinks
 
 
 class _OfTile(NamedTuple):
     """The same for the P pixels of one tile."""
 
-    change: Floats  # [P] weight that may come or go
+    change: Floats  # [P] weight that may be added or lost
     jumps: Bools  # [P]
     kinks: Bools  # [P]
     medians: Bools  # [P]
@@ -85,13 +85,13 @@ def thresholds(
     projection : Projection
         Footprints, float64.
     bins : TileBins
-        The Gaussians of each tile. A Gaussian that is not listed is not looked at.
+        The Gaussians of each tile. A Gaussian that is not listed is not examined.
     conventions : Conventions
         The thresholds.
     margins : Margins
         How near is near enough.
     slack : float
-        Relative error of alphas beyond what the margins stand for, as of a polynomial exponential.
+        Relative error of alphas beyond the margins, such as that of a polynomial exponential.
     span : float
         Largest difference of two colours, for the allowance.
 
@@ -114,10 +114,10 @@ def thresholds(
 
 
 def thresholds_of_view(tape: SplatTape, slack: float = 0.0) -> Thresholds:
-    """Find the pixels at a threshold of any float32 renderer, of a view that was drawn in float64.
+    """Find the pixels at a threshold of any float32 renderer, for a view that was rendered in float64.
 
-    The Gaussians are projected and listed once more, so that those are looked at, too, whose peak is just below
-    ``alpha_min``, and their boxes reach as far as a hit that is nearly one.
+    The Gaussians are projected and listed once more, to include those whose peak is just below ``alpha_min``, and so
+    that boxes extend to all pixels that are nearly hit.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ def span_of(tape: SplatTape) -> float:
 
 
 def lenient_conventions(conventions: Conventions, margins: Margins, slack: float = 0.0) -> Conventions:
-    """Conventions under which every hit that may count does: skipped a little later, and never stopped."""
+    """Return conventions under which every hit that may count does: a lower skip threshold and no stop."""
     of_places = 1e5 * margins.place  # at 17,000 pixels, where alpha changes by up to 6 of itself a pixel
     alpha_min = conventions.alpha_min - (margins.skip + slack + of_places) * conventions.alpha_min
     return conventions._replace(alpha_min=alpha_min, transmittance_min=0.0)
@@ -156,7 +156,7 @@ def lenient_conventions(conventions: Conventions, margins: Margins, slack: float
 def _of_tile(
     tile: TileHits, projection: Projection, conventions: Conventions, margins: Margins, slack: float
 ) -> _OfTile:
-    """Look at every hit of a tile; the rows of the arrays are its G hits, front to back, the columns its P pixels."""
+    """Examine every hit of a tile; the rows of the arrays are its G hits, front to back, the columns its P pixels."""
     alpha_min, stop = conventions.alpha_min, conventions.transmittance_min
     unclamped = tile.hit.unclamped  # [G, P] whether they count or not
     rough = slack + margins.place * _change_by_place(tile, projection)  # [G, P] relative doubt about alphas
@@ -167,7 +167,7 @@ def _of_tile(
     before, after = T[:-1], T[1:]
     # Relative doubt about the transmittance: d ln(1 - alpha) = alpha / (1 - alpha) times the relative error of alpha.
     doubt = margins.stop + np.cumsum(2 * alpha_min * is_skip + rough * alphas / (1 - alphas), axis=0)
-    is_open = before > stop * (1 - doubt)  # behind what surely stops, nothing is looked at any more
+    is_open = before > stop * (1 - doubt)  # hits behind a certain stop are ignored
     hits = np.where((alphas > 0) | is_skip, tile.alphas, 0)  # those that count, or may
     is_stop = is_open & (hits > 0) & (np.abs(after - stop) <= stop * doubt)
     is_clamp = is_open & (np.abs(unclamped - conventions.alpha_max) <= margins.clamp * conventions.alpha_max)
@@ -179,10 +179,10 @@ def _of_tile(
 
 
 def _change_by_place(tile: TileHits, projection: Projection) -> Floats:
-    """Relative change [G, P] of each alpha, in parts of the relative rounding of coordinates.
+    """Return the relative change [G, P] of each alpha per relative rounding of coordinates.
 
-    It is sum_k |(Q d)_k| (|p_k| + |d_k|): the logarithm of alpha changes by Q d with the centre p, and what is rounded
-    are the centre and its offset d from the pixel.
+    It is sum_k |(Q d)_k| (|p_k| + |d_k|): the derivative of ln alpha with respect to the centre p is Q d up to its
+    sign, and both p and its offset d from the pixel are rounded.
     """
     offsets: Floats = tile.hit.place.offsets  # [G, P, 2]
     slopes = np.einsum("gij,gpj->gpi", conic_matrices(projection.conics[tile.ids]), offsets)
@@ -191,12 +191,12 @@ def _change_by_place(tile: TileHits, projection: Projection) -> Floats:
 
 
 def _change_by_order(depths: Floats, alphas: Floats, before: Floats, stop: Floats, margins: Margins) -> Floats:
-    """Weight [P] that changes places where hits are blended in another order.
+    """Return the weight [P] that moves between hits that may be blended in another order.
 
-    Hits of a pixel that rounding may exchange are a group: each is so near behind the one before it. With T in front of
-    the group, exchanging two neighbours moves at most ``T alpha_i alpha_j``, and any order is reached by exchanging
-    each pair once at most; exactly equal depths are no pair, since then the lower row is first. What a group moves is
-    never more than T, and all of T where the pixel may end within the group, at another of its hits.
+    Hits of a pixel that rounding may exchange form a group: each is close enough behind the one before it. With T in
+    front of the group, exchanging two neighbours moves at most ``T alpha_i alpha_j``, and exchanging each pair at most
+    once reaches any order; exactly equal depths are no pair, since then the lower row is first. A group moves at most
+    T, and all of T if the pixel may end within the group, at another of its hits.
 
     Parameters
     ----------

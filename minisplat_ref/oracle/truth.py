@@ -1,9 +1,9 @@
-"""A truth above float64: what the formulas in which digits get lost should give, by definition, in 50 digits.
+"""A truth more precise than float64: compute, from definitions and in 50 digits, what loses digits in our formulas.
 
-Nothing here is one of our formulas. A rotation turns vectors by the sandwich q v q*; a projected covariance uses the
+Nothing here is one of our formulas. A rotation is the sandwich product q v q*; a projected covariance uses the
 numerical derivative of the camera's map itself; an inverse is a linear solve; the densest point of a ray is a minimum;
-transmittance is a product. From that follow error figures for the float64 reference, for the kernels with float32 data,
-which project in float64, and for the textbook's formulas in float32, which the reference has when it is given float32:
+transmittance is a product. This gives error figures for the float64 reference, for the kernels with float32 data, which
+project in float64, and for the textbook's formulas in float32, which are the reference on float32 data:
 ``R mu + t``, ``A Sigma A^T``, ``a c - b^2``.
 
 A relative error is divided by the condition number of what is computed, the factor by which any formula may enlarge
@@ -35,7 +35,7 @@ Matrix = Any
 
 
 class View(NamedTuple):
-    """Gaussians and a camera, in numbers that float32 holds exactly, but for the camera's t, which is float64."""
+    """Gaussians and a camera, in numbers that are exact in float32 except for the camera's t, which is float64."""
 
     name: str
     means: Floats
@@ -66,7 +66,7 @@ def check_truth() -> Report:
 
 
 def views() -> tuple[View, ...]:
-    """Ordinary Gaussians, needles with an axis ratio of 3000, and the ordinary ones a million units from the origin."""
+    """Return ordinary Gaussians, needles with an axis ratio of 3000, and the ordinary ones 1e6 units away."""
     rng = np.random.default_rng(SEED)
     z = rng.uniform(2, 4, size=N_GAUSSIANS)
     means = np.column_stack([rng.uniform(-0.25, 0.25, size=(N_GAUSSIANS, 2)) * z[:, None], z])
@@ -83,7 +83,7 @@ def views() -> tuple[View, ...]:
 
 
 def true_rotation(quat: Floats) -> Matrix:
-    """Matrix whose columns are the axes turned by ``q v q* / |q|^2``, in the algebra of quaternions."""
+    """Return the matrix whose columns are the axes rotated by ``q v q* / |q|^2``, in the algebra of quaternions."""
     mp = _mpmath()
     q = [mp.mpf(float(x)) for x in quat]
     columns = [
@@ -93,14 +93,14 @@ def true_rotation(quat: Floats) -> Matrix:
 
 
 def true_covariance(quat: Floats, scales: Floats) -> Matrix:
-    """Second moment of ``sum_k s_k z_k r_k`` with independent unit normal z: ``sum_k s_k^2 r_k r_k^T``."""
+    """Return the second moment of ``sum_k s_k z_k r_k`` with independent unit normal z: ``sum_k s_k^2 r_k r_k^T``."""
     mp = _mpmath()
     R = true_rotation(quat)
     return sum((mp.mpf(float(s)) ** 2 * R[:, k] * R[:, k].T for k, s in enumerate(scales)), mp.zeros(3, 3))
 
 
 def true_projection(mean: Floats, Sigma: Matrix, camera: Camera) -> tuple[Matrix, Matrix]:
-    """Pixel [2] of a point, and the covariance [2, 2] there with the low-pass, through the map's derivative."""
+    """Return the pixel [2] of a point, and the covariance [2, 2] with the low-pass, from the map's derivative."""
     mp = _mpmath()
 
     def pixel(*point: Any) -> Matrix:
@@ -117,7 +117,7 @@ def true_projection(mean: Floats, Sigma: Matrix, camera: Camera) -> tuple[Matrix
 
 
 def true_transmittance(means2d: Floats, conics: Floats, opacities: Floats, center: Floats) -> Any:
-    """Product of ``1 - o exp(-d^T Q d / 2)`` over all Gaussians at one pixel centre."""
+    """Return the product of ``1 - o exp(-d^T Q d / 2)`` over all Gaussians at one pixel centre."""
     mp = _mpmath()
     T = mp.mpf(1)
     for mean, (a, b, c), opacity in zip(means2d, conics, opacities, strict=True):
@@ -168,7 +168,7 @@ def _transmittance_cases() -> Iterator[Case]:
         boxes = np.tile(np.array([0, 0, 9, 9], np.int32), (n, 1))
         projection = Projection._make([*fields, np.full((n, 2), 9, np.int32), boxes])
         bins = backend.bin_gaussians(projection, TileGrid(9, 9, backend.tile_width, backend.tile_height), conventions)
-        # Nothing but the background shines: the image is the transmittance, without the rounding of 1 - alpha.
+        # Only the background is not black: the image is the transmittance, without the rounding of 1 - alpha.
         output = backend.composite(projection, np.zeros((n, 1), dtype), np.ones(1, dtype), bins, conventions)
         return _errors([truth], output.image[4, 4])
 
@@ -181,7 +181,7 @@ def _transmittance_cases() -> Iterator[Case]:
 def _case(
     name: str, condition: Floats, reference: Floats, kernel: Floats | None = None, textbook: Floats | None = None
 ) -> Case:
-    """Judge errors [n] of the reference and, where there is one, of the float32 kernel, each over its condition."""
+    """Judge errors [n] of the reference and, if there is one, of the float32 kernel, each divided by its condition."""
     judged = {"f64 / condition": (float((reference / condition).max()), TRUTH_FLOAT64)}
     if kernel is not None:
         judged["f32 / condition"] = float((kernel / condition).max()), TRUTH_FLOAT32
@@ -203,14 +203,14 @@ def _projected(backend: Backend, view: View, dtype: Any) -> Projection:
 
 
 def _errors(truth: Any, got: Any) -> float:
-    """Largest difference, relative to the largest true entry; taken in 50 digits."""
+    """Return the largest difference, relative to the largest true entry, computed in 50 digits."""
     mp = _mpmath()
     truth, got = list(truth), [mp.mpf(float(x)) for x in np.ravel(got)]
     return float(max(abs(t - g) for t, g in zip(truth, got, strict=True)) / max(map(abs, truth)))
 
 
 def _product(p: list[Any], q: list[Any]) -> list[Any]:
-    """Product of two quaternions wxyz, from ``i^2 = j^2 = k^2 = i j k = -1``."""
+    """Return the product of two quaternions wxyz, from ``i^2 = j^2 = k^2 = i j k = -1``."""
     a, b, c, d = p
     e, f, g, h = q
     return [

@@ -3,7 +3,7 @@
 Read the modules in this order; it is that of the papers.
 
 ===================  ==============================================================  ============================
-module               what a reader knows afterwards                                  equations
+module               what you will know after reading it                             equations
 ===================  ==============================================================  ============================
 covariance           how a quaternion and three scales make an ellipsoid             3DGS (6)
 pinhole              where a camera sees a point, and how that moves with the point  EWA splatting (29)
@@ -14,12 +14,12 @@ spherical_harmonics  how its colour depends on the viewing direction            
 tiling               how ellipses are sorted, tile by tile, front to back            3DGS sec. 6
 hits                 how strongly an ellipse covers a pixel, and what it leaves      3DGS (3), (4)
 compositing          how hits become a pixel, and a pixel's error becomes theirs     3DGS (3)
-depth                how far away what a pixel shows is, by two definitions          Mini-Splatting appendix D
+depth                the depth of what a pixel shows, by two definitions             Mini-Splatting appendix D
 loss                 how far a rendered picture is from a photograph                 3DGS (7), Wang et al. 2004
 adam                 how a gradient becomes a step                                   Kingma and Ba 2015
 ===================  ==============================================================  ============================
 
-Nothing here is written for speed and nothing here is differentiated by a framework. ``v_x`` is the derivative of the
-loss by ``x`` and has its shape; a function ``f_vjp`` maps the derivative by the outputs of ``f`` to that by its inputs.
-Arrays keep the dtype that they come in with.
+Nothing here is written for speed, and no framework differentiates it. ``v_x`` is the derivative of the loss with
+respect to ``x`` and has its shape; a function ``f_vjp`` maps the derivatives with respect to the outputs of ``f`` to
+those with respect to its inputs. Arrays keep the dtype that they come in with.
 """

@@ -1,8 +1,8 @@
 """Stage 2b: what the low-pass does to a projected covariance, and how to undo its brightening.
 
 The 3DGS code adds ``eps I`` to every projected covariance C, so that no Gaussian is thinner than about a pixel; this is
-EWA splatting's prefilter. A Gaussian of unchanged opacity then covers more; Mip-Splatting's factor makes its integral
-what it was. Left out: Mip-Splatting's 3D smoothing filter.
+EWA splatting's prefilter. At unchanged opacity the wider Gaussian would add more light; Mip-Splatting's factor restores
+its integral. Left out: Mip-Splatting's 3D smoothing filter.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from minisplat_ref.types import Floats
 
 
 def compensations(C: Floats, B: Floats) -> Floats:
-    """Opacity factors that keep a Gaussian's integral when the low-pass widens it.
+    """Return the opacity factors that keep a Gaussian's integral when the low-pass widens it.
 
     With covariances C and ``B = C + eps I``::
 
@@ -32,7 +32,7 @@ def compensations(C: Floats, B: Floats) -> Floats:
 
 
 def compensations_vjp(C: Floats, B: Floats, v_compensations: Floats) -> Floats:
-    """Gradient of :func:`compensations` by C; both of its arguments move with C.
+    """Gradient of :func:`compensations` with respect to C; both of its arguments move with C.
 
     With ``r = det(C) / det(B)`` and ``d det(C) = <adj(C), dC>``::
 
@@ -44,12 +44,12 @@ def compensations_vjp(C: Floats, B: Floats, v_compensations: Floats) -> Floats:
     C, B : ndarray of shape (N, 2, 2)
         As for the forward function.
     v_compensations : ndarray of shape (N,)
-        Derivative by rho.
+        Derivative with respect to rho.
 
     Returns
     -------
     ndarray of shape (N, 2, 2)
-        Derivative by the four entries of C; symmetric.
+        Derivative with respect to the four entries of C; symmetric.
     """
     ratios = determinants(C) / determinants(B)
     v_ratios = np.where(ratios > COMPENSATION_FLOOR**2, v_compensations / (2 * compensations(C, B)), 0)
@@ -58,11 +58,11 @@ def compensations_vjp(C: Floats, B: Floats, v_compensations: Floats) -> Floats:
 
 
 def determinants(matrices: Floats) -> Floats:
-    """Determinants [N] of matrices [N, 2, 2]."""
+    """Return the determinants [N] of matrices [N, 2, 2]."""
     return matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] * matrices[:, 1, 0]
 
 
 def adjugates(matrices: Floats) -> Floats:
-    """[[d, -b], [-c, a]] of ``matrices`` [[a, b], [c, d]]: ``adj(C) C = det(C) I``, also where no inverse exists."""
+    """Return [[d, -b], [-c, a]] for ``matrices`` [[a, b], [c, d]]: ``adj(C) C = det(C) I``, even without an inverse."""
     signs = np.array([[1, -1], [-1, 1]], dtype=matrices.dtype)
     return signs * matrices[:, ::-1, ::-1].swapaxes(1, 2)

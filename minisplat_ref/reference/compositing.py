@@ -1,6 +1,6 @@
-"""Stage 5: sorted Gaussians are blended front to back into pixels, and a pixel's derivative goes back to them.
+"""Stage 5: blend sorted Gaussians into pixels, front to back, and carry a pixel's derivative back to them.
 
-3DGS equation (3) with the hits of :mod:`hits`, each of weight ``w_g = alpha_g T_g``::
+This is 3DGS equation (3) with the hits of :mod:`hits`, each of weight ``w_g = alpha_g T_g``::
 
     image = sum_g w_g c_g + T_end background,   alpha = 1 - T_end = sum_g w_g
 
@@ -44,9 +44,9 @@ def composite_hits(
     primitives : NamedTuple
         What ``response`` takes.
     colors : ndarray of shape (N, S)
-        D channels, or what ``response.shade`` makes them of.
+        D channels, or the coefficients from which ``response.shade`` computes them.
     background : ndarray of shape (D,)
-        Seen through what transmittance is left.
+        Seen through the transmittance that is left.
     bins : TileBins
         The primitives of each tile, nearest first.
     conventions : Conventions
@@ -75,7 +75,7 @@ def composite_hits(
         image[ys, xs] = light + transmittance[:, None] * background
         alpha[ys, xs] = 1 - transmittance
         if median_depth is not None and len(ids):
-            is_beyond = tile.transmittances[1:] < MEDIAN_TRANSMITTANCE  # [G, P] from the hit on that crosses one half
+            is_beyond = tile.transmittances[1:] < MEDIAN_TRANSMITTANCE  # [G, P] true from the hit that crosses one half
             crossing = np.argmax(is_beyond, axis=0)[None]
             depths = sorted_by(crossing, sorted_by(order, tile.hit.depths))[0]
             median_depth[ys, xs] = np.where(transmittance < MEDIAN_TRANSMITTANCE, depths, 0)
@@ -83,7 +83,7 @@ def composite_hits(
             stats.blend_weight_sum[ids] += weights.sum(axis=1)
             stats.blend_weight_max[ids] = np.maximum(stats.blend_weight_max[ids], weights.max(axis=1))
             stats.hit_count[ids] += (weights > 0).sum(axis=1, dtype=np.int32)
-            heaviest = np.argmax(sorted_by(order, weights), axis=0)  # the first, so the front-most, of equals
+            heaviest = np.argmax(sorted_by(order, weights), axis=0)  # of equals the first, which is in front
             ids_in_order = sorted_by(order, np.broadcast_to(ids[:, None], weights.shape))  # [G, P]
             dominant = np.where(weights.max(axis=0) > 0, sorted_by(heaviest[None], ids_in_order)[0], -1)
             stats.dominant_ids[ys, xs] = dominant
@@ -104,16 +104,16 @@ def composite_hits_vjp(
     """Gradient of :func:`composite_hits` with respect to what it blends.
 
     For one pixel with ``v = v_image``: alpha is ``1 - T_end``, so the derivative with respect to ``T_end`` is
-    ``v . background - v_alpha``. And ``alpha_g`` multiplies its own light by ``T_g`` and, in every later T, what lies
-    behind by ``1 - alpha_g``::
+    ``v . background - v_alpha``. A hit contributes ``alpha_g T_g c_g`` and multiplies everything behind it by
+    ``1 - alpha_g``, therefore::
 
         v_c_g        = w_g v
         v_background = T_end v
         behind_g     = sum_{j behind g} w_j (c_j . v) + T_end (v . background - v_alpha)
         v_alpha_g    = T_g (c_g . v) - behind_g / (1 - alpha_g)
 
-    From there the response's own derivatives lead on: ``v_alpha_g`` is 0 where alpha was clamped. The skip, the stop
-    and the order are treated as fixed: the image jumps there and has no derivative.
+    The response's own derivatives do the rest, with ``v_alpha_g`` 0 where alpha was clamped. The skip, the stop and the
+    order are treated as fixed: the image jumps there and has no derivative.
 
     Parameters
     ----------
@@ -178,9 +178,9 @@ def composite(
     projection : Projection
         Footprints, opacities and depths.
     colors : ndarray of shape (N, D)
-        Any number of channels, also none.
+        Any number of channels, including none.
     background : ndarray of shape (D,)
-        Seen through what transmittance is left.
+        Seen through the transmittance that is left.
     bins : TileBins
         The Gaussians of each tile, nearest first.
     conventions : Conventions
@@ -217,7 +217,7 @@ def composite_vjp(
     v_image: Floats,
     v_alpha: Floats,
 ) -> CompositeGradient:
-    """Gradient of :func:`composite` with respect to what it takes.
+    """Gradient of :func:`composite` with respect to its inputs.
 
     ::
 
@@ -230,9 +230,9 @@ def composite_vjp(
     output : RenderOutput
         Its result for these inputs. Not needed here: kernels start from its alpha.
     v_image : ndarray of shape (H, W, D)
-        Derivative by the image.
+        Derivative with respect to the image.
     v_alpha : ndarray of shape (H, W)
-        Derivative by the accumulated opacity.
+        Derivative with respect to the accumulated opacity.
 
     Returns
     -------
@@ -247,7 +247,7 @@ def composite_vjp(
 def composite_all_pairs(
     projection: Projection, colors: Floats, background: Floats, width: int, height: int, conventions: Conventions
 ) -> tuple[Floats, Floats]:
-    """Blend without tiles and without products: the recursion of 3DGS over all Gaussians, to check :func:`composite`.
+    """Blend by 3DGS's recursion over all Gaussians, without tiles or cumulative products, to check :func:`composite`.
 
     Every pixel carries its transmittance T and whether it is finished. For each Gaussian from near to far::
 
@@ -288,8 +288,8 @@ def composite_all_pairs(
 
 
 def _sum_behind(terms: Floats) -> Floats:
-    """Sums [G, P] of the rows after each row."""
-    sums = np.cumsum(terms[::-1], axis=0)[::-1]  # [G, P] itself included
+    """Return for each row the sum [G, P] of the rows after it."""
+    sums = np.cumsum(terms[::-1], axis=0)[::-1]  # [G, P] including the row itself
     return np.concatenate([sums[1:], np.zeros_like(terms[:1])])
 
 

@@ -1,7 +1,7 @@
 """Stage 1: a Gaussian's covariance from its quaternion and scales.
 
-3DGS equation (6), ``Sigma = R S S^T R^T``. The factors keep Sigma positive semi-definite whatever an optimiser does to
-them. Left out: activations (``scales`` are standard deviations, not logarithms).
+This is 3DGS equation (6), ``Sigma = R S S^T R^T``. The factors keep Sigma positive semi-definite whatever an optimiser
+does to them. Left out: activations (``scales`` are standard deviations, not logarithms).
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ LEVI_CIVITA[[0, 2, 1], [2, 1, 0], [1, 0, 2]] = -1
 
 
 def rotation_matrices(quats: Floats) -> Floats:
-    """Rotation matrices of quaternions.
+    """Return the rotation matrices of quaternions.
 
     With the unit quaternion ``(w, v) = q / |q|`` and the matrix ``K`` of the cross product, ``K x = v x x``::
 
@@ -50,12 +50,12 @@ def rotation_matrices_vjp(quats: Floats, v_rotations: Floats) -> Floats:
     quats : ndarray of shape (N, 4)
         As for the forward function.
     v_rotations : ndarray of shape (N, 3, 3)
-        Derivative by the nine entries.
+        Derivative with respect to the nine entries.
 
     Returns
     -------
     ndarray of shape (N, 4)
-        Derivative by ``quats``; orthogonal to each, because their length does not matter.
+        Derivative with respect to ``quats``; orthogonal to each, because their length does not matter.
     """
     u, length, exponent = _normalized(quats)
     w, K = _cross_product_matrices(u)
@@ -68,7 +68,7 @@ def rotation_matrices_vjp(quats: Floats, v_rotations: Floats) -> Floats:
 
 
 def covariances(quats: Floats, scales: Floats) -> Floats:
-    """Covariances ``Sigma = M M^T`` with ``M = R diag(s)``: 3DGS equation (6).
+    """Return the covariances ``Sigma = M M^T`` with ``M = R diag(s)``: 3DGS equation (6).
 
     Parameters
     ----------
@@ -102,14 +102,14 @@ def covariances_vjp(quats: Floats, scales: Floats, v_covariances: Floats) -> tup
     scales : ndarray of shape (N, 3)
         As for the forward function.
     v_covariances : ndarray of shape (N, 3, 3)
-        Derivative by the nine entries; need not be symmetric.
+        Derivative with respect to the nine entries; need not be symmetric.
 
     Returns
     -------
     v_quats : ndarray of shape (N, 4)
-        Derivative by ``quats``.
+        Derivative with respect to ``quats``.
     v_scales : ndarray of shape (N, 3)
-        Derivative by ``scales``.
+        Derivative with respect to ``scales``.
     """
     R = rotation_matrices(quats)
     M = R * scales[:, None, :]
@@ -122,8 +122,8 @@ def covariances_vjp(quats: Floats, scales: Floats, v_covariances: Floats) -> tup
 def _normalized(quats: Floats) -> tuple[Floats, Floats, Ints]:
     """Return ``u = q / |q|`` [N, 4], and l and k [N, 1] with ``|q| = l 2^k``; for the zero quaternion 0, 1 and 0.
 
-    Squares of entries above 1e19 or below 1e-23 are beyond float32. So q is first divided by a power of two, which
-    rounds nothing, so that its largest entry lies between 1/2 and 1.
+    Squares of entries above 1e19 or below 1e-23 leave the range of float32. Therefore q is first divided by a power of
+    two, which is exact and brings its largest entry between 1/2 and 1.
     """
     _, exponent = np.frexp(np.abs(quats).max(axis=1, keepdims=True))
     scaled = np.ldexp(quats, -exponent)

@@ -1,15 +1,15 @@
-"""Stage 6: the depth of what a pixel shows: the mean of all its hits, or where its ray meets the Gaussian of the most.
+"""Stage 6: the depth of what a pixel shows: the mean over its hits, or where its ray meets the dominant Gaussian.
 
 The blended depth divided by the accumulated opacity is the mean depth of the hits. Where a ray passes through several
-surfaces, it lies on none of them. Mini-Splatting appendix D asks for one surface instead: along the ray
+surfaces, this mean lies on none of them. Mini-Splatting appendix D asks for one surface instead: along the ray
 ``x(t) = o + t d`` a Gaussian is densest where ``(x - mu)^T Sigma^-1 (x - mu)`` is least::
 
     t = (mu - o)^T Sigma^-1 d / (d^T Sigma^-1 d)
 
 This is also the middle of the chord through the ellipsoid at any number of sigmas, so no size has to be chosen. The
-direction has camera z equal to 1, so that t is the depth. Left out: lens effects; rays that miss the ellipsoid are not
-told apart (nor does Mini-Splatting); the depth of the middle hit, sharper at edges but without a derivative by
-opacities, comes from the compositing.
+direction has camera z equal to 1, so that t is the depth. Left out: lens effects; a test whether the ray hits the
+ellipsoid at all (Mini-Splatting has none either). The median depth, which is sharper at edges but has no derivative
+with respect to opacities, comes from compositing.
 """
 
 import numpy as np
@@ -21,9 +21,9 @@ from minisplat_ref.types import Bools, Camera, Floats, Ints, SurfacePoints
 
 
 def expected_depth(accumulated_depth: Floats, alpha: Floats) -> Floats:
-    """Mean depth of what a pixel shows: ``z = D / alpha`` with ``D = sum_g w_g z_g`` and ``alpha = sum_g w_g``.
+    """Return the mean depth of a pixel's hits: ``z = D / alpha`` with ``D = sum_g w_g z_g`` and ``alpha = sum_g w_g``.
 
-    gsplat divides by ``max(alpha, 1e-10)``, which is the same: a pixel that was hit has alpha_min at least.
+    gsplat divides by ``max(alpha, 1e-10)``, which is the same: the alpha of a pixel that was hit is at least alpha_min.
 
     Parameters
     ----------
@@ -53,14 +53,14 @@ def expected_depth_vjp(accumulated_depth: Floats, alpha: Floats, v_depth: Floats
     accumulated_depth, alpha
         As for the forward function.
     v_depth : ndarray of shape (..., H, W)
-        Derivative by the depth.
+        Derivative with respect to the depth.
 
     Returns
     -------
     v_accumulated_depth : ndarray of shape (..., H, W)
-        Derivative by ``accumulated_depth``.
+        Derivative with respect to ``accumulated_depth``.
     v_alpha : ndarray of shape (..., H, W)
-        Derivative by ``alpha``.
+        Derivative with respect to ``alpha``.
     """
     is_hit = _is_hit(accumulated_depth, alpha)
     v_accumulated_depth = np.where(is_hit, v_depth / np.where(is_hit, alpha, 1), 0)
@@ -68,7 +68,7 @@ def expected_depth_vjp(accumulated_depth: Floats, alpha: Floats, v_depth: Floats
 
 
 def surface_points(means: Floats, quats: Floats, scales: Floats, camera: Camera, dominant_ids: Ints) -> SurfacePoints:
-    """Densest point of each pixel's dominant Gaussian on the pixel's ray.
+    """Return the point on each pixel's ray at which the pixel's dominant Gaussian is densest.
 
     With the whitening ``W = diag(1 / s) R^T``, for which ``Sigma^-1 = W^T W``::
 
@@ -112,7 +112,7 @@ def surface_points_vjp(
     v_points: Floats,
     v_depths: Floats,
 ) -> tuple[Floats, Floats, Floats]:
-    """Gradient of :func:`surface_points` by the Gaussians.
+    """Gradient of :func:`surface_points` with respect to the Gaussians.
 
     ::
 
@@ -127,18 +127,18 @@ def surface_points_vjp(
     means, quats, scales, camera, dominant_ids
         As for :func:`surface_points`.
     v_points : ndarray of shape (H, W, 3)
-        Derivative by the points.
+        Derivative with respect to the points.
     v_depths : ndarray of shape (H, W)
-        Derivative by the depths.
+        Derivative with respect to the depths.
 
     Returns
     -------
     v_means : ndarray of shape (N, 3)
-        Derivative by ``means``.
+        Derivative with respect to ``means``.
     v_quats : ndarray of shape (N, 4)
-        Derivative by ``quats``.
+        Derivative with respect to ``quats``.
     v_scales : ndarray of shape (N, 3)
-        Derivative by ``scales``.
+        Derivative with respect to ``scales``.
     """
     ys, xs = np.nonzero(dominant_ids >= 0)
     ids = dominant_ids[ys, xs]

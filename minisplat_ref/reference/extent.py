@@ -1,6 +1,6 @@
 """Stage 2c: how far a projected Gaussian reaches, as a box of pixels. Nothing here has a gradient.
 
-Two rules, chosen by the conventions. Full support (gsplat, Mini-Splatting2): the box holds every pixel whose alpha
+The conventions choose one of two rules. Full support (gsplat, Mini-Splatting2): the box holds every pixel whose alpha
 reaches ``alpha_min``, solved from ``opacity exp(-r^2 / 2) = alpha_min``. INRIA's (the 3DGS code): all 16-pixel tiles
 that the square of half-side 3 sigma touches, whatever the opacity.
 """
@@ -14,7 +14,7 @@ from minisplat_ref.types import Camera, Floats
 def extents(
     means2d: Floats, covariances2d: Floats, opacities: Floats, camera: Camera, conventions: Conventions
 ) -> tuple[Floats, Floats]:
-    """Half-extents and boxes of projected Gaussians, as whole numbers in floating point.
+    """Return half-extents and boxes of projected Gaussians, as whole numbers in floating point.
 
     A row with non-finite input is meaningless, as is one whose opacity is below ``alpha_min``; the caller culls it.
 
@@ -47,7 +47,7 @@ def extents(
 def _full_support(
     means2d: Floats, covariances2d: Floats, opacities: Floats, alpha_min: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Tight box of the ellipse ``d^T conic d = e^2``: its half-sides are ``e sqrt(cov_xx)`` and ``e sqrt(cov_yy)``."""
+    """Bound the ellipse ``d^T conic d = e^2`` tightly: half-sides ``e sqrt(cov_xx)`` and ``e sqrt(cov_yy)``."""
     e = np.sqrt(2 * np.log(np.maximum(opacities / alpha_min, 1)))  # [N] sigmas
     variances = np.diagonal(covariances2d, axis1=1, axis2=2)  # [N, 2]
     radii = np.ceil(e[:, None] * np.sqrt(variances))
@@ -57,7 +57,7 @@ def _full_support(
 def _three_sigma_tiles(
     means2d: Floats, covariances2d: Floats, opacities: Floats, alpha_min: float
 ) -> tuple[Floats, Floats, Floats]:
-    """INRIA's rule; its pixel centres are whole numbers, ours are at + 0.5."""
+    """Apply INRIA's rule; its pixel centres are whole numbers, ours are at + 0.5."""
     mid = np.trace(covariances2d, axis1=1, axis2=2) / 2  # [N]
     det = covariances2d[:, 0, 0] * covariances2d[:, 1, 1] - covariances2d[:, 0, 1] * covariances2d[:, 1, 0]
     lambda_max = mid + np.sqrt(np.maximum(INRIA_ROOT_MIN, mid * mid - det))

@@ -1,16 +1,17 @@
-"""Stage 5a: which primitives hit which pixels of a tile, how strongly, and what light is left in front of each hit.
+"""Stage 5a: which primitives hit which pixels of a tile, how strongly, and the transmittance in front of each hit.
 
-3DGS equations (3) and (4), the volume rendering of Max (1995) with one sample per Gaussian::
+These are 3DGS equations (3) and (4), the volume rendering of Max (1995) with one sample per Gaussian::
 
     alpha_g = min(alpha_max, o_g exp(-d^T Q_g d / 2)),   d = p_g - pixel centre
     T_g = prod_{j before g} (1 - alpha_j)
 
-What a primitive does to a pixel is a :class:`Response`. That of 3DGS is ``CONIC``: a Gaussian is a flat ellipse here,
-without any use of its 3D shape. Rays against 3D Gaussians, surfels, masks and pixel integrals are other responses.
+What a primitive does to a pixel is a :class:`Response`. That of 3DGS is ``CONIC``: here a Gaussian is a flat ellipse,
+and its 3D shape plays no part. Rays against 3D Gaussians, surfels, masks and pixel integrals are other responses.
 
-A tile is one array with hits along the rows and pixels along the columns. Skipping a hit is ``alpha_g = 0``, which
-changes no product and no sum. What stands before a hit is the list's order, that of the means' depths; or each pixel
-sorts its own hits by their depths on its ray, all of them or those that fit a buffer (StopThePop, Radl et al. 2024).
+A tile is one array with hits along the rows and pixels along the columns. A skipped hit has ``alpha_g = 0``, which
+changes no product and no sum. Hits are taken in the order of the tile's list, which is that of the means' depths; or
+each pixel sorts its own hits by their depths on its ray, all of them or those that fit a buffer (StopThePop, Radl et
+al. 2024).
 """
 
 import heapq
@@ -28,7 +29,7 @@ class Hit(NamedTuple):
 
     unclamped: Floats  # [G, P] alpha before the clamp
     depths: Floats  # [G, P] along the ray; only their order counts
-    place: Any  # where inside of the primitive, arrays [G, P, ...]: what colours and gradients depend on
+    place: Any  # where inside the primitive, arrays [G, P, ...]: what colours and gradients depend on
 
 
 class Response(NamedTuple):
@@ -36,7 +37,7 @@ class Response(NamedTuple):
 
     ``primitives`` are any bundle that the functions understand. Without ``shade`` a primitive has the same colour
     everywhere, D numbers; with it, S coefficients become D channels at the place of the hit: a texture, spherical
-    harmonics on an ellipsoid, the depth on the ray. Where a primitive is missed, places have to be finite, too.
+    harmonics on an ellipsoid, the depth on the ray. Places have to be finite even where a pixel misses the primitive.
     """
 
     boxes: Callable[[Any], Ints]
@@ -46,8 +47,9 @@ class Response(NamedTuple):
     hit_vjp: Callable[[Any, Ints, Hit, Floats, Floats, Any], tuple[Floats, ...]]
     """(primitives, ids, hits, v_mean [G, P], v_shape [G, P], v_place) -> an array [G, ...] for each of ``fields``.
 
-    ``v_mean`` and ``v_shape`` are the derivative with respect to ``unclamped`` for what moves the primitive, and for
-    all else: conventions may stop either at the clamp. ``v_place`` comes from ``shade_vjp``; None without it.
+    ``v_mean`` and ``v_shape`` both are the derivative with respect to ``unclamped``: the first for what moves the
+    primitive, the second for all else, because conventions may stop either at the clamp. ``v_place`` comes from
+    ``shade_vjp`` and is None without it.
     """
     fields: tuple[str, ...]
     """Names of the fields of ``primitives`` that have a derivative."""
@@ -56,9 +58,9 @@ class Response(NamedTuple):
     shade_vjp: Callable[[Floats, Any, Floats], tuple[Floats, Any]] | None = None
     """(coefficients, place, v [G, P, D]) -> (v_coefficients [G, S], v_place)."""
     buffer_size: int = LIST_ORDER
-    """Hits that a pixel holds back, of which it takes the nearest when they are complete: a k-buffer.
+    """Size of each pixel's k-buffer: when it is full, the pixel takes the nearest of the hits in it.
 
-    ``LIST_ORDER`` = 1 takes them as they come, ``EXACT_ORDER`` holds any number.
+    ``LIST_ORDER`` = 1 takes hits in the order of the list, ``EXACT_ORDER`` buffers any number.
     """
 
 
@@ -146,10 +148,10 @@ class TileHits(NamedTuple):
     ids: Ints  # [G] front to back
     ys: Ints  # [P] pixel rows
     xs: Ints  # [P] pixel columns
-    hit: Hit  # of all pixels, whether they count or not
+    hit: Hit  # of all pixels, before the skip and the stop
     is_clamped: Bools  # [G, P] unclamped > alpha_max
     alphas: Floats  # [G, P] 0 where there is no hit
-    order: Ints | None  # [G, P] each pixel takes the primitive of row order[0] first; None: that of the list
+    order: Ints | None  # [G, P] each pixel takes the primitive of row order[0] first; None: the order of the list
     transmittances: Floats  # [G + 1, P] row r is T before the r-th that a pixel takes, the last row is T_end
 
 
@@ -190,7 +192,7 @@ def tile_hits(
         is_listed = response.buffer_size == LIST_ORDER
         order = None if is_listed else blending_order(is_hit, hit.depths, response.buffer_size)
 
-        # T never rises, so once a hit would take it below the threshold, that hit and all behind it are left out.
+        # T never rises: once a hit would take it below the threshold, that hit and all behind it are left out.
         in_order = sorted_by(order, alphas)
         in_order = np.where(goes_on(_transmittances(in_order)[1:], conventions), in_order, 0)
         alphas, is_clamped = unsorted_by(order, in_order), hit.unclamped > conventions.alpha_max
@@ -200,13 +202,13 @@ def tile_hits(
 def blending_order(is_hit: Bools, depths: Floats, buffer_size: int) -> Ints:
     """Return for each pixel the rows of its tile's list in the order in which it takes them.
 
-    A pixel goes through the list and holds back ``buffer_size`` hits; when they are complete it takes the nearest, of
-    equals the first. What misses it takes no room.
+    A pixel reads the list into a buffer of ``buffer_size`` hits; whenever it is full, the pixel takes the nearest, of
+    equals the first. Primitives that miss the pixel take no room in the buffer.
 
     Parameters
     ----------
     is_hit : ndarray of shape (G, P)
-        Which rows of the list hit which pixels; the others may come anywhere.
+        Which rows of the list hit which pixels; the other rows may come anywhere.
     depths : ndarray of shape (G, P)
         Along the pixel's ray.
     buffer_size : int
@@ -235,12 +237,12 @@ def blending_order(is_hit: Bools, depths: Floats, buffer_size: int) -> Ints:
 
 
 def sorted_by(order: Ints | None, values: Any) -> Any:
-    """Return ``values`` [G, P] of the list's rows in the pixels' own ``order`` [G, P], if they have one."""
+    """Return ``values`` [G, P], given by rows of the list, in the pixels' own ``order`` [G, P], if they have one."""
     return values if order is None else np.take_along_axis(values, order, axis=0)
 
 
 def unsorted_by(order: Ints | None, values: Any) -> Any:
-    """Return ``values`` [G, P] in the pixels' own ``order`` [G, P] as rows of the list: undoes :func:`sorted_by`."""
+    """Return ``values`` [G, P], given in the pixels' own ``order``, by rows of the list: undo :func:`sorted_by`."""
     if order is None:
         return values
     rows = np.empty_like(values)
@@ -249,18 +251,18 @@ def unsorted_by(order: Ints | None, values: Any) -> Any:
 
 
 def _transmittances(alphas: Floats) -> Floats:
-    """T before each of G hits and after the last, [G + 1, P]: the running product of ``1 - alpha``."""
+    """Return T before each of G hits and after the last, [G + 1, P]: the running product of ``1 - alpha``."""
     ones = np.ones_like(alphas, shape=(1, alphas.shape[1]))
     return np.cumprod(np.concatenate([ones, 1 - alphas]), axis=0)
 
 
 def goes_on(transmittances: Floats, conventions: Conventions) -> Bools:
-    """Whether a pixel takes the hit that would leave it with ``transmittances``; ``conventions`` set the bound."""
+    """Return whether a pixel takes a hit that would leave it with ``transmittances``; ``conventions`` set the bound."""
     if conventions.stops_at_equality:
         return transmittances > conventions.transmittance_min
     return transmittances >= conventions.transmittance_min
 
 
 def conic_matrices(conics: Floats) -> Floats:
-    """[[a, b], [b, c]] of ``conics`` (a, b, c) [G, 3]."""
+    """Return [[a, b], [b, c]] for ``conics`` (a, b, c) [G, 3]."""
     return conics[:, [0, 1, 1, 2]].reshape(-1, 2, 2)

@@ -1,8 +1,8 @@
 """Stage 7: how far a rendered picture is from a photograph.
 
-3DGS equation (7), ``(1 - w) L1 + w (1 - SSIM)``, with the structural similarity of Wang et al. (2004): a Gaussian
-window of 11 pixels, here with zeros beyond the border as in the 3DGS code. Left out: the halving of D-SSIM in some
-texts; the code that the published numbers come from does not halve.
+This is 3DGS equation (7), ``(1 - w) L1 + w (1 - SSIM)``, with the structural similarity of Wang et al. (2004): a
+Gaussian window of 11 pixels, here with zeros beyond the border as in the 3DGS code. Left out: the halving of D-SSIM in
+some texts; the code that produced the published numbers does not halve.
 """
 
 from typing import NamedTuple
@@ -29,7 +29,7 @@ class LossTape(NamedTuple):
 def photometric_loss(
     image: Floats, target: Floats | Ints, dssim_weight: float, mask: Bools | None = None
 ) -> tuple[float, LossTape]:
-    """Loss of an image: ``(1 - w) mean |I - T| + w (1 - mean SSIM)``.
+    """Return the loss of an image, ``(1 - w) mean |I - T| + w (1 - mean SSIM)``.
 
     Parameters
     ----------
@@ -38,8 +38,8 @@ def photometric_loss(
     dssim_weight : float
         w; 0.2 in 3DGS.
     mask : ndarray of bool of shape (H, W), optional
-        Both means run over these pixels. Outside, the image is replaced by the target before the windows look at it,
-        so that what is masked out neither counts nor leaks in. An empty mask gives 0.
+        Both means run over these pixels. Outside, the target replaces the image before the windows are applied, so that
+        masked pixels neither count nor leak in. An empty mask gives 0.
 
     Returns
     -------
@@ -71,12 +71,12 @@ def photometric_loss_vjp(tape: LossTape, v_loss: float = 1.0) -> Floats:
     tape : LossTape
         From the forward function.
     v_loss : float
-        Derivative by the loss.
+        Derivative with respect to the loss.
 
     Returns
     -------
     ndarray of shape (H, W, 3)
-        Derivative by the image; zero outside the mask.
+        Derivative with respect to the image; zero outside the mask.
     """
     image, target, w, mask = tape
     n = max(1, image.shape[2] * int(np.count_nonzero(mask)))  # an empty mask gives zeros, not 0/0
@@ -87,7 +87,7 @@ def photometric_loss_vjp(tape: LossTape, v_loss: float = 1.0) -> Floats:
 
 
 def ssim_map(image: Floats, target: Floats) -> Floats:
-    """Structural similarity of two images around each pixel, each channel by itself.
+    """Return the structural similarity of two images around each pixel, channel by channel.
 
     With window means ``mu_x = blur(x)``, variances ``blur(x^2) - mu_x^2`` and covariance ``blur(x y) - mu_x mu_y``::
 
@@ -108,7 +108,7 @@ def ssim_map(image: Floats, target: Floats) -> Floats:
 
 
 def ssim_map_vjp(image: Floats, target: Floats, v_map: Floats) -> Floats:
-    """Gradient of :func:`ssim_map` by the image x; that by the target is the same with the arguments exchanged.
+    """Gradient of :func:`ssim_map` with respect to the image x; for that of the target, exchange the arguments.
 
     Call the four factors ``S = P Q / (A B)``. They depend on x through ``mu = blur(x)``, ``m = blur(x^2)`` and
     ``k = blur(x y)``, and blur is its own adjoint::
@@ -123,12 +123,12 @@ def ssim_map_vjp(image: Floats, target: Floats, v_map: Floats) -> Floats:
     image, target : ndarray of shape (H, W, 3)
         As for the forward function.
     v_map : ndarray of shape (H, W, 3)
-        Derivative by the map.
+        Derivative with respect to the map.
 
     Returns
     -------
     ndarray of shape (H, W, 3)
-        Derivative by ``image``.
+        Derivative with respect to ``image``.
     """
     mu_x, mu_y, P, Q, A, B = _ssim_terms(image, target)
     S = P * Q / (A * B)
@@ -148,14 +148,14 @@ def _ssim_terms(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats, Floats, F
 
 
 def _blur(image: Floats) -> Floats:
-    """Gaussian window over [H, W, C] with zeros beyond the border: ``K_H image K_W``, K symmetric, so K^T = K."""
+    """Blur [H, W, C] with the Gaussian window and zeros beyond the border: ``K_H image K_W`` with K^T = K."""
     height, width, _ = image.shape
     K_rows, K_columns = _window_matrix(height).astype(image.dtype), _window_matrix(width).astype(image.dtype)
     return np.moveaxis(K_rows @ np.moveaxis(image, 2, 0) @ K_columns, 0, 2)
 
 
 def _window_matrix(n: int) -> Floats:
-    """Matrix [n, n] that applies the 1D window: ``K_ij = g(i - j)``, g normalised over the whole window."""
+    """Return the matrix [n, n] of the 1D window: ``K_ij = g(i - j)``, g normalised over the whole window."""
     reach = SSIM_WINDOW // 2
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / SSIM_SIGMA) ** 2)
     weights /= weights.sum()

@@ -1,4 +1,4 @@
-"""Stage 2a: the camera model. A point in the camera frame becomes a pixel; a Gaussian there needs the map's derivative.
+"""Stage 2a: the camera model. It maps a point in the camera frame to a pixel; a Gaussian needs the map's derivative.
 
 Left out: lens distortion (images are undistorted beforehand) and rolling shutter.
 """
@@ -16,7 +16,7 @@ def pose(camera: Camera, dtype: np.dtype) -> tuple[Floats, Floats]:
 
 
 def pinhole(means_cam: Floats, camera: Camera) -> Floats:
-    """Pixel positions of points: ``p_k = f_k x_k / z + c_k`` for k = x, y.
+    """Return the pixel positions of points: ``p_k = f_k x_k / z + c_k`` for k = x, y.
 
     Parameters
     ----------
@@ -43,19 +43,19 @@ def pinhole_vjp(means_cam: Floats, camera: Camera, v_means2d: Floats) -> Floats:
     means_cam, camera
         As for the forward function.
     v_means2d : ndarray of shape (N, 2)
-        Derivative by the pixel positions.
+        Derivative with respect to the pixel positions.
 
     Returns
     -------
     ndarray of shape (N, 3)
-        Derivative by ``means_cam``.
+        Derivative with respect to ``means_cam``.
     """
     limits = np.full(2, np.inf, dtype=means_cam.dtype)
     return np.einsum("nki,nk->ni", pinhole_jacobians(means_cam, camera, -limits, limits), v_means2d)
 
 
 def pinhole_rays(xs: Floats | float, ys: Floats | float, camera: Camera) -> Floats:
-    """Directions of the rays through image positions, ``r = ((x - c_x) / f_x, (y - c_y) / f_y, 1)``.
+    """Return the directions of the rays through image positions, ``r = ((x - c_x) / f_x, (y - c_y) / f_y, 1)``.
 
     :func:`pinhole` maps every point ``z r`` back to (x, y), and z is its depth.
 
@@ -76,7 +76,7 @@ def pinhole_rays(xs: Floats | float, ys: Floats | float, camera: Camera) -> Floa
 
 
 def pinhole_jacobians(means_cam: Floats, camera: Camera, low: Floats, high: Floats) -> Floats:
-    """Jacobians of :func:`pinhole`, EWA splatting equation (29), with the slopes x/z and y/z kept in [low, high].
+    """Return the Jacobians of :func:`pinhole`, EWA splatting equation (29), with x/z and y/z clamped to [low, high].
 
     ::
 
@@ -107,9 +107,9 @@ def pinhole_jacobians(means_cam: Floats, camera: Camera, low: Floats, high: Floa
 
 
 def pinhole_jacobians_vjp(means_cam: Floats, camera: Camera, low: Floats, high: Floats, v_jacobians: Floats) -> Floats:
-    """Gradient of :func:`pinhole_jacobians` by the points.
+    """Gradient of :func:`pinhole_jacobians` with respect to the points.
 
-    Every entry is proportional to 1/z, and a slope that is not clamped depends on x and on z once more::
+    Every entry is proportional to 1/z, and a slope that is not clamped depends on x and again on z::
 
         v_u_k = -f_k / z V_k2          where low_k < x_k / z < high_k, else 0
         v_x_k = v_u_k / z
@@ -120,12 +120,12 @@ def pinhole_jacobians_vjp(means_cam: Floats, camera: Camera, low: Floats, high: 
     means_cam, camera, low, high
         As for the forward function.
     v_jacobians : ndarray of shape (N, 2, 3)
-        V, derivative by the entries of J.
+        V, derivative with respect to the entries of J.
 
     Returns
     -------
     ndarray of shape (N, 3)
-        Derivative by ``means_cam``.
+        Derivative with respect to ``means_cam``.
     """
     focal = np.array([camera.fx, camera.fy], dtype=means_cam.dtype)
     z = means_cam[:, 2:]
@@ -137,10 +137,10 @@ def pinhole_jacobians_vjp(means_cam: Floats, camera: Camera, low: Floats, high: 
 
 
 def slope_limits(camera: Camera, conventions: Conventions, dtype: np.dtype) -> tuple[Floats, Floats]:
-    """Lowest and highest (x/z, y/z) up to which the Jacobian follows the mean.
+    """Return the lowest and highest (x/z, y/z) up to which the Jacobian follows the mean.
 
     Far outside the image the expansion is worthless and its 1/z^2 entry explodes, so the 3DGS code freezes the slope
-    there. gsplat counts the margin from the image's edges, INRIA from the axis.
+    there. gsplat measures the margin from the image's edges, INRIA from the axis.
 
     Parameters
     ----------

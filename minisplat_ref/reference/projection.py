@@ -27,14 +27,14 @@ from minisplat_ref.types import Camera, Floats, PrimitiveGradient, Projection, P
 def project(
     means: Floats, quats: Floats, scales: Floats, opacities: Floats, camera: Camera, conventions: Conventions
 ) -> Projection:
-    """Project Gaussians into the image and cull those that it cannot show.
+    """Project Gaussians into the image and cull those that it does not show.
 
     ::
 
         x = R mu + t,  p = pinhole(x),  A = J(x) R,  C = A Sigma A^T,  B = C + eps I,  Q = B^-1
 
-    Culled: not ``near < z < far``; opacity (compensated) below ``alpha_min``; a box outside the image; B not finite or
-    not invertible.
+    A Gaussian is culled unless ``near < z < far``; if its (compensated) opacity is below ``alpha_min``; if its box lies
+    outside the image; if B is not finite or not invertible.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def project_vjp(
 ) -> PrimitiveGradient:
     """Gradient of :func:`project`; culled Gaussians get zeros.
 
-    With ``V_Q = [[v_a, v_b / 2], [v_b / 2, v_c]]``, since b stands twice in Q::
+    With ``V_Q = [[v_a, v_b / 2], [v_b / 2, v_c]]``, since b occurs twice in Q::
 
         v_B = -Q V_Q Q
         v_rho = o v_o',  v_o = rho v_o'                        (o' = rho o is the projection's opacity)
@@ -109,12 +109,12 @@ def project_vjp(
     projection : Projection
         Its result; tells which rows were culled.
     v_projection : ProjectionGradient
-        Derivative of the loss by its fields.
+        Derivative of the loss with respect to its fields.
 
     Returns
     -------
     PrimitiveGradient
-        Derivative by the Gaussians and by the camera's pose.
+        Derivative with respect to the Gaussians and by the camera's pose.
     """
     camera = with_principal_point(camera, conventions)
     rows = np.flatnonzero(projection.radii[:, 0] > 0)  # [V] visible
@@ -164,12 +164,12 @@ def _entries(symmetric: Floats) -> Floats:
 
 
 def _symmetric(entries: Floats) -> Floats:
-    """[[a, b], [b, c]] of (a, b, c) [N, 3]."""
+    """Return [[a, b], [b, c]] for (a, b, c) [N, 3]."""
     return entries[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
 
 
 def _scatter(values: Floats, rows: np.ndarray, n: int) -> Floats:
-    """Array of n rows with ``values`` at ``rows`` and zeros elsewhere."""
+    """Return an array of n rows with ``values`` at ``rows`` and zeros elsewhere."""
     full = np.zeros((n, *values.shape[1:]), dtype=values.dtype)
     full[rows] = values
     return full

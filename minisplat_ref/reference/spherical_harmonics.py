@@ -1,7 +1,7 @@
 """Stage 3: a Gaussian's colour as seen from the camera.
 
-3DGS section 3: each channel is a sum of real spherical harmonics of the viewing direction, up to degree 3. Left out:
-the conversion from sRGB (3DGS blends in sRGB as it is).
+In 3DGS section 3 each channel is a sum of real spherical harmonics of the viewing direction, up to degree 3. Left out:
+the conversion from sRGB (3DGS blends sRGB values as they are).
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from minisplat_ref.types import Camera, Floats, Ints, SHGradient
 
 
 def sh_basis(directions: Floats, degree: int) -> Floats:
-    """Real spherical harmonics as polynomials of unit directions.
+    """Return real spherical harmonics as polynomials of unit directions.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def sh_basis(directions: Floats, degree: int) -> Floats:
 
 
 def sh_basis_jacobian(directions: Floats, degree: int) -> Floats:
-    """Derivative [N, (degree + 1)^2, 3] of the polynomials of :func:`sh_basis` by the x, y, z of ``directions``."""
+    """Return the derivative [N, (degree + 1)^2, 3] of :func:`sh_basis` with respect to x, y, z of ``directions``."""
     x, y, z = directions.T
     xx, yy, zz = x * x, y * y, z * z
     o, one = np.zeros_like(x), np.ones_like(x)
@@ -82,7 +82,7 @@ def sh_basis_jacobian(directions: Floats, degree: int) -> Floats:
 
 
 def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int, radii: Ints) -> Floats:
-    """Colours towards the camera: ``max(0, 0.5 + sum_k c_k Y_k(d))`` with ``d = (mu - o) / |mu - o|``.
+    """Return colours as the camera sees them: ``max(0, 0.5 + sum_k c_k Y_k(d))`` with ``d = (mu - o) / |mu - o|``.
 
     The camera's centre is ``o = -R^T t``.
 
@@ -133,12 +133,12 @@ def sh_colors_vjp(
     means, sh_dc, sh_rest, camera, degree, radii
         As for :func:`sh_colors`.
     v_colors : ndarray of shape (N, 3)
-        Derivative by the colours.
+        Derivative with respect to the colours.
 
     Returns
     -------
     SHGradient
-        Derivative by means, coefficients and the camera's pose.
+        Derivatives with respect to means, coefficients and the camera's pose.
     """
     rows = np.flatnonzero(radii[:, 0] > 0)
     d, distances = _directions(means[rows], camera)
@@ -161,12 +161,12 @@ def sh_colors_vjp(
 
 
 def _unclamped(basis: Floats, coefficients: Floats) -> Floats:
-    """``0.5 + sum_k c_k Y_k`` [N, 3]; the half makes zero coefficients mid-grey."""
+    """Return ``0.5 + sum_k c_k Y_k`` [N, 3]; the half makes zero coefficients mid-grey."""
     return 0.5 + np.einsum("nk,nkc->nc", basis, coefficients)
 
 
 def _coefficients(sh_dc: Floats, sh_rest: Floats, degree: int) -> Floats:
-    """Active coefficients [N, (degree + 1)^2, 3]."""
+    """Return the active coefficients [N, (degree + 1)^2, 3]."""
     return np.concatenate([sh_dc[:, None], sh_rest[:, : (degree + 1) ** 2 - 1]], axis=1)
 
 

@@ -1,7 +1,7 @@
-"""Stage 4: which Gaussians each tile of the image has to look at, and in which order.
+"""Stage 4: which Gaussians each tile of the image has to blend, and in which order.
 
-3DGS section 6: one key (tile, depth) for every tile that a Gaussian touches, and one sort. The order is that of the
-depths of the means, the same for all pixels: an approximation that is exact only for Gaussians that do not overlap
+3DGS section 6 makes one key (tile, depth) for every tile that a Gaussian touches, and sorts once. The order is that of
+the depths of the means, the same for all pixels: an approximation that is exact only for Gaussians that do not overlap
 along the ray. Left out: dropping pairs that no pixel of the tile needs, which changes no image.
 """
 
@@ -42,7 +42,7 @@ def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventio
     order = np.lexsort((ids, projection.depths[ids], tiles))  # the last key is the first to sort by
     n_tiles = grid.n_tiles_x * grid.n_tiles_y
     offsets = np.searchsorted(tiles[order], np.arange(n_tiles + 1))
-    gaussian_offsets = np.append(0, np.cumsum(n_pairs))  # before the sort the pairs stand grouped by Gaussian
+    gaussian_offsets = np.append(0, np.cumsum(n_pairs))  # before the sort, pairs are grouped by Gaussian
     return TileBins(
         ids[order].astype(np.int32), offsets.astype(np.int64), order.astype(np.int32), gaussian_offsets, grid
     )

@@ -1,1 +1,1 @@
-"""One Gaussian or one pixel: the stages as scalar formulas, inlined into the kernels of ``cpu``."""
+"""The stages as scalar formulas for one Gaussian or one pixel, inlined into the kernels of ``cpu``."""

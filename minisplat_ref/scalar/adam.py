@@ -1,4 +1,4 @@
-"""Adam for one value, or for eight as lanes (Kingma and Ba 2015)."""
+"""Adam (Kingma and Ba 2015) for one value, or for eight in lanes."""
 
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ class Step(NamedTuple):
 
 @scalar
 def adam_value(value, gradient, first, second, step):
-    """Return the value and both moments one step on."""
+    """Return the value and both moments after one step."""
     first = first + step.keep1 * (gradient - first)
     second = second + step.keep2 * (gradient * gradient - second)
     return value - step.rate * first / (sqrt(second) + step.eps), first, second

@@ -1,7 +1,7 @@
 """Alpha blending of one hit at one pixel (3DGS equations (3) and (4)), forward and backward.
 
-Eight pixels at a time (``lanes``), with selections instead of branches. A finished pixel keeps the negative of its
-transmittance, so that no later hit can pass the stop test and no second array is needed to remember it.
+The functions take eight pixels at a time (``lanes``), with ``select`` instead of branches. A finished pixel stores its
+transmittance negated: no later hit passes the stop test, and no second array has to say which pixels are finished.
 """
 
 from typing import NamedTuple
@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import larger, select, smaller
+from minisplat_ref.jit.lanes import maximum, minimum, select
 from minisplat_ref.jit.literals import HALF, ONE, TWO, ZERO
 
-PIVOT_MIN = np.float32(1e-14)  # of a conic, relative to c: a little above float64's rounding
+PIVOT_MIN = np.float32(1e-14)  # smallest pivot of a conic relative to c: a little above float64's rounding
 
 
 class Frame(NamedTuple):
@@ -34,22 +34,26 @@ class Frame(NamedTuple):
 def factors(a, b, c):
     """Return (a, slope, pivot) with a dx^2 + 2 b dx dy + c dy^2 = a (dx + slope dy)^2 + pivot dy^2.
 
-    A sum of squares: for a long oblique needle the three terms on the left are many orders larger than their sum. The
-    pivot c - b^2 / a is such a difference itself, so conics are float64. Where they were rounded, it is kept positive.
+    The right side is a sum of squares, which cannot cancel; for a long oblique needle the three terms on the left are
+    many orders of magnitude larger than their sum. The pivot c - b^2 / a is such a difference itself, so conics are
+    float64, and a lower bound keeps the pivot positive where they were rounded.
     """
     slope = b / a
-    return a, slope, larger(c - b * slope, PIVOT_MIN * c)
+    return a, slope, maximum(c - b * slope, PIVOT_MIN * c)
 
 
 @scalar
 def mahalanobis(e, half_a, least):
-    """Return sigma = d^T conic d / 2 of e = dx + slope dy and ``least`` = pivot dy^2 / 2; see ``factors``."""
+    """Return sigma = d^T conic d / 2, given e = dx + slope dy and ``least`` = pivot dy^2 / 2; see ``factors``."""
     return half_a * e * e + least
 
 
 @scalar
 def conic_vjp_of_moments(slope, ee, ey, yy):
-    """Gradient by (a, b, c) from the moments of dL/dsigma over e^2, e dy and dy^2, with dx = e - slope dy."""
+    """Return the gradient with respect to (a, b, c), given sums of dL/dsigma times e^2, e dy and dy^2.
+
+    e = dx + slope dy, as in ``factors``.
+    """
     return HALF * (ee - slope * (TWO * ey - slope * yy)), ey - slope * yy, HALF * yy
 
 
@@ -71,7 +75,7 @@ def blend(transmittance, unclamped, frame):
     weight : lanes
         alpha T of the hit, 0 where it is skipped.
     """
-    alpha = smaller(unclamped, frame.alpha_max)
+    alpha = minimum(unclamped, frame.alpha_max)
     after = transmittance * (ONE - alpha)
     is_hit = alpha >= frame.alpha_min
     is_blended = is_hit & (after >= frame.transmittance_min)
@@ -82,7 +86,7 @@ def blend(transmittance, unclamped, frame):
 
 @scalar
 def blend_vjp(transmittance, weight, unclamped, behind, light, frame):
-    """Gradient of the loss with respect to the alpha of one hit, as if it were not clamped.
+    """Return the derivative of the loss with respect to the alpha of one hit, ignoring the clamp.
 
     With S the part of <v, image> that is composited behind the hit, background and alpha channel included, the image is
     ... + T alpha c + (1 - alpha) (S / (1 - alpha)), so that dL/dalpha = T <v, c> - S / (1 - alpha).
@@ -105,13 +109,13 @@ def blend_vjp(transmittance, weight, unclamped, behind, light, frame):
     lanes
         dL/dalpha, 0 where the hit was skipped.
     """
-    alpha = smaller(unclamped, frame.alpha_max)
+    alpha = minimum(unclamped, frame.alpha_max)
     return select(weight > ZERO, transmittance * light - behind / (ONE - alpha), ZERO)
 
 
 @scalar
 def sigma_vjp(transmittance, weight, unclamped, behind, shade, frame):
-    """Gradient of the loss by the sigma of one hit, where alpha is not clamped.
+    """Return the derivative of the loss with respect to the sigma of one hit, where alpha is not clamped.
 
     With S the part of <v, image> that is composited behind the hit, background and alpha channel included, the image is
     ... + T alpha c + (1 - alpha) (S / (1 - alpha)), so that dL/dalpha = T <v, c> - S / (1 - alpha); and
@@ -135,5 +139,5 @@ def sigma_vjp(transmittance, weight, unclamped, behind, shade, frame):
     lanes
         dL/dsigma, 0 where the hit was skipped.
     """
-    alpha = smaller(unclamped, frame.alpha_max)
+    alpha = minimum(unclamped, frame.alpha_max)
     return select(weight > ZERO, unclamped * (behind / (ONE - alpha) - transmittance * shade), ZERO)

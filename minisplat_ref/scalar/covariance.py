@@ -7,7 +7,7 @@ needle-shaped Gaussians.
 import numpy as np
 
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import larger, select, sqrt
+from minisplat_ref.jit.lanes import maximum, select, sqrt
 from minisplat_ref.jit.literals import ONE, TWO, ZERO
 
 TINY = np.finfo(np.float64).tiny  # the smallest number whose reciprocal is finite
@@ -15,12 +15,12 @@ TINY = np.finfo(np.float64).tiny  # the smallest number whose reciprocal is fini
 
 @scalar
 def normalized(w, x, y, z):
-    """Return the unit quaternion and the reciprocal of its former length; zeros for the zero quaternion.
+    """Return the unit quaternion and the reciprocal of the original length; zeros for the zero quaternion.
 
-    It is float64, and divided by its largest entry first, so that no square leaves the range of floats.
+    The quaternion is float64 and divided by its largest entry first, so that no square overflows or underflows.
     """
-    largest = larger(larger(abs(w), abs(x)), larger(abs(y), abs(z)))
-    unit = ONE / larger(largest, TINY)
+    largest = maximum(maximum(abs(w), abs(x)), maximum(abs(y), abs(z)))
+    unit = ONE / maximum(largest, TINY)
     w, x, y, z = w * unit, x * unit, y * unit, z * unit
     squared = w * w + x * x + y * y + z * z
     inverse = ONE / sqrt(select(largest > ZERO, squared, ONE))
@@ -29,7 +29,7 @@ def normalized(w, x, y, z):
 
 @scalar
 def rotation(w, x, y, z):
-    """Return the nine entries, row by row, of the rotation of a unit quaternion."""
+    """Return the rotation matrix of a unit quaternion: nine entries, row by row."""
     return (
         (ONE - TWO * (y * y + z * z), TWO * (x * y - w * z), TWO * (x * z + w * y)),
         (TWO * (x * y + w * z), ONE - TWO * (x * x + z * z), TWO * (y * z - w * x)),
@@ -39,7 +39,7 @@ def rotation(w, x, y, z):
 
 @scalar
 def rotation_vjp(w, x, y, z, v):
-    """Chain ``v[i][j] = dL/dR_ij`` to a unit quaternion: each line collects the entries in which it stands."""
+    """Chain ``v[i][j] = dL/dR_ij`` to a unit quaternion; each line collects the entries with one component."""
     v_w = TWO * (x * (v[2][1] - v[1][2]) + y * (v[0][2] - v[2][0]) + z * (v[1][0] - v[0][1]))
     v_x = TWO * (
         w * (v[2][1] - v[1][2]) + y * (v[0][1] + v[1][0]) + z * (v[0][2] + v[2][0]) - TWO * x * (v[1][1] + v[2][2])
@@ -55,7 +55,7 @@ def rotation_vjp(w, x, y, z, v):
 
 @scalar
 def normalized_vjp(unit, inverse_length, v_unit):
-    """Chain through q / |q|: the part of the cotangent along the unit quaternion is lost."""
+    """Chain through q / |q|, which removes the part of the cotangent along the unit quaternion."""
     w, x, y, z = unit
     v_w, v_x, v_y, v_z = v_unit
     along = w * v_w + x * v_x + y * v_y + z * v_z

@@ -1,6 +1,6 @@
-"""Where the ray of one pixel meets one Gaussian: the point of greatest density (Mini-Splatting appendix D).
+"""Where the ray of one pixel meets one Gaussian: at its greatest density (Mini-Splatting appendix D).
 
-In the Gaussian's own axes, with p the mean seen from the ray's origin and r the ray's direction, the density along
+In the Gaussian's own axes, with p the mean relative to the ray's origin and r the ray's direction, the density along
 o + t d is greatest at the weighted least-squares solution of p = t r:
 
     t = (sum_k p_k r_k / s_k^2) / (sum_k r_k^2 / s_k^2)
@@ -16,14 +16,14 @@ from minisplat_ref.scalar.projection import dot, transposed
 
 @scalar
 def gaussian_axes(quat):
-    """Unit axes of a Gaussian in the world frame, one per row."""
+    """Return a Gaussian's unit axes in the world frame, one per row."""
     w, x, y, z, _ = normalized(quat[0], quat[1], quat[2], quat[3])
     return transposed(rotation(w, x, y, z))
 
 
 @scalar
 def pixel_ray(R, x, y, fx, fy, cx, cy):
-    """World direction of the ray through an image point, of camera z equal to 1."""
+    """Return the world direction of the ray through an image point, scaled to a camera z of 1."""
     columns = transposed(R)
     in_camera = ((x - cx) / fx, (y - cy) / fy, ONE * fx / fx)
     return dot(columns[0], in_camera), dot(columns[1], in_camera), dot(columns[2], in_camera)
@@ -31,7 +31,7 @@ def pixel_ray(R, x, y, fx, fy, cx, cy):
 
 @scalar
 def densest_depth(axes, scale, u, d):
-    """Return t for u = mean - origin and the direction d."""
+    """Return t, given u = mean - origin and the direction d."""
     numerator = dot(axes[0], u) * dot(axes[0], d) / (scale[0] * scale[0])
     denominator = dot(axes[0], d) * dot(axes[0], d) / (scale[0] * scale[0])
     for k in range(1, 3):
@@ -43,16 +43,16 @@ def densest_depth(axes, scale, u, d):
 
 @scalar
 def densest_depth_vjp(axis, s, t, precision, v_t, u, d):
-    """One axis' share of the chain of dL/dt; ``precision`` is the denominator of t.
+    """Return one axis's share of the gradient, given dL/dt; ``precision`` is the denominator of t.
 
     Returns
     -------
     v_axis : tuple
-        By the axis.
+        With respect to the axis.
     v_s : float
-        By its standard deviation.
+        With respect to its standard deviation.
     v_p : float
-        By the mean's coordinate along the axis.
+        With respect to the mean's coordinate along the axis.
     """
     p = dot(axis, u)
     r = dot(axis, d)

@@ -6,11 +6,11 @@ from minisplat_ref.jit.literals import HALF, ONE, TWO
 
 @scalar
 def ssim_and_derivatives(mean_i, mean_t, mean_squares, mean_it, c1, c2):
-    """Return SSIM = (A1 A2) / (B1 B2), and its derivatives by the windowed means of I, I^2 and I T.
+    """Return SSIM = (A1 A2) / (B1 B2), and its derivatives with respect to the windowed means of I, I^2 and I T.
 
-    All means are of images whose 1/2 has been subtracted, which changes no variance. Of I^2 and T^2 SSIM needs the sum
-    of the means only. The variance and the covariance depend on mean_i too, which gives the second half of its
-    derivative. All quotients are products with one inverse, for a division costs as much as many products.
+    All means are of images from which 1/2 has been subtracted, which changes no variance. Of I^2 and T^2, SSIM needs
+    only the sum of the means. The variance and the covariance depend on mean_i too, which gives the second half of its
+    derivative. All quotients are products with one inverse, because a division costs as much as many products.
     """
     light_i, light_t = mean_i + HALF, mean_t + HALF
     a1 = TWO * light_i * light_t + c1

@@ -14,14 +14,14 @@ for needles where u.u * w.w - (u.w)^2 would cancel. For the same reason the coni
 from typing import NamedTuple
 
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import larger, select, smaller, sqrt
+from minisplat_ref.jit.lanes import maximum, minimum, select, sqrt
 from minisplat_ref.jit.literals import HALF, ONE, TWO, ZERO
 from minisplat_ref.scalar.covariance import normalized, normalized_vjp, rotation, rotation_vjp
 from minisplat_ref.types import Floats
 
 
 class Pose(NamedTuple):
-    """Where a camera is: a point x of the world has the camera coordinates R (x - centre)."""
+    """A camera's pose: a point x in the world has the camera coordinates R (x - centre)."""
 
     R: Floats
     """[3, 3] float64."""
@@ -69,13 +69,13 @@ class Footprint(NamedTuple):
 
 @scalar
 def dot(a, b):
-    """Inner product of two triples."""
+    """Return the inner product of two triples."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @scalar
 def rows_of(matrix):
-    """Tuple of rows of a 3 x 3 array."""
+    """Return the rows of a 3 x 3 array as a tuple."""
     return (
         (matrix[0, 0], matrix[0, 1], matrix[0, 2]),
         (matrix[1, 0], matrix[1, 1], matrix[1, 2]),
@@ -85,14 +85,14 @@ def rows_of(matrix):
 
 @scalar
 def to_camera(R, centre, x, y, z):
-    """Camera coordinates of a world point; subtracting the centre first keeps digits far from the world's origin."""
+    """Return camera coordinates of a world point; subtracting the centre first keeps digits far from the origin."""
     d = (x - centre[0], y - centre[1], z - centre[2])
     return dot(R[0], d), dot(R[1], d), dot(R[2], d)
 
 
 @scalar
 def axes(quat, scale):
-    """Columns R_g diag(s) as rows: M[j][k] is world component j of axis k times its standard deviation."""
+    """Return M = R_g diag(s) as rows: M[j][k] is world component j of axis k times its standard deviation."""
     qw, qx, qy, qz, _ = normalized(quat[0], quat[1], quat[2], quat[3])
     r = rotation(qw, qx, qy, qz)
     return (
@@ -104,7 +104,7 @@ def axes(quat, scale):
 
 @scalar
 def rotated(R, M):
-    """Matrix product of two 3 x 3 tuples of rows."""
+    """Return the matrix product of two 3 x 3 tuples of rows."""
     c0 = (M[0][0], M[1][0], M[2][0])
     c1 = (M[0][1], M[1][1], M[2][1])
     c2 = (M[0][2], M[1][2], M[2][2])
@@ -117,13 +117,13 @@ def rotated(R, M):
 
 @scalar
 def transposed(M):
-    """Transpose of a 3 x 3 tuple of rows."""
+    """Return the transpose of a 3 x 3 tuple of rows."""
     return ((M[0][0], M[1][0], M[2][0]), (M[0][1], M[1][1], M[2][1]), (M[0][2], M[1][2], M[2][2]))
 
 
 @scalar
 def image_row(focal_over_z, direction, V_row, V_2):
-    """One row of U."""
+    """Return one row of U."""
     return (
         focal_over_z * (V_row[0] - direction * V_2[0]),
         focal_over_z * (V_row[1] - direction * V_2[1]),
@@ -133,12 +133,12 @@ def image_row(focal_over_z, direction, V_row, V_2):
 
 @scalar
 def project_gaussian(p, V, lens):
-    """Footprint of a Gaussian with camera coordinates p and camera-frame axes V."""
+    """Return the footprint of a Gaussian with camera coordinates p and camera-frame axes V."""
     inverse_z = ONE / p[2]
     x = p[0] * inverse_z
     y = p[1] * inverse_z
-    u = image_row(lens.fx * inverse_z, smaller(larger(x, lens.x_min), lens.x_max), V[0], V[2])
-    w = image_row(lens.fy * inverse_z, smaller(larger(y, lens.y_min), lens.y_max), V[1], V[2])
+    u = image_row(lens.fx * inverse_z, minimum(maximum(x, lens.x_min), lens.x_max), V[0], V[2])
+    w = image_row(lens.fy * inverse_z, minimum(maximum(y, lens.y_min), lens.y_max), V[1], V[2])
     cov_xx = dot(u, u)
     cov_xy = dot(u, w)
     cov_yy = dot(w, w)
@@ -147,7 +147,7 @@ def project_gaussian(p, V, lens):
     det = det_sharp + lens.eps2d * (cov_xx + cov_yy) + lens.eps2d * lens.eps2d
     compensation = ZERO * det + ONE  # NaN where det is not finite
     if lens.is_antialiased:
-        compensation = sqrt(larger(det_sharp / det, lens.compensation_floor * lens.compensation_floor))
+        compensation = sqrt(maximum(det_sharp / det, lens.compensation_floor * lens.compensation_floor))
     return Footprint(
         lens.fx * x + lens.cx,
         lens.fy * y + lens.cy,
@@ -163,9 +163,9 @@ def project_gaussian(p, V, lens):
 
 @scalar
 def conic(footprint):
-    """Inverse (a, b, c) of the projected covariance.
+    """Return the inverse (a, b, c) of the projected covariance.
 
-    c is put together so that the pivot c - b^2 / a is 1 / cov_yy to all digits, which cov_xx / det would not give.
+    c is computed so that the pivot c - b^2 / a is 1 / cov_yy to all digits, which c = cov_xx / det would not give.
     """
     a = footprint.cov_yy / footprint.det
     pivot = ONE / footprint.cov_yy
@@ -175,10 +175,10 @@ def conic(footprint):
 
 @scalar
 def conic_vjp(footprint, v_conic):
-    """Gradient by (cov_xx, cov_xy, cov_yy), by way of the factors a, slope = b / a and pivot = c - b^2 / a.
+    """Return the gradient with respect to (cov_xx, cov_xy, cov_yy), via a, slope = b / a and pivot = c - b^2 / a.
 
     The three are 1 / (cov_xx - cov_xy^2 / cov_yy), -cov_xy / cov_yy and 1 / cov_yy. For a needle the entries of
-    ``v_conic`` are large and cancel in the gradients by a and slope; they do so here, in two sums, and nowhere else.
+    ``v_conic`` are large and cancel in the derivatives with respect to a and slope: in two sums here, nowhere else.
     """
     a = footprint.cov_yy / footprint.det
     pivot = ONE / footprint.cov_yy
@@ -194,7 +194,7 @@ def conic_vjp(footprint, v_conic):
 
 @scalar
 def compensation_vjp(footprint, v_compensation, lens):
-    """Gradient of sqrt(det_sharp / det) by (cov_xx, cov_xy, cov_yy); zero on the floor."""
+    """Return the gradient of sqrt(det_sharp / det) with respect to (cov_xx, cov_xy, cov_yy); zero on the floor."""
     rho = footprint.compensation
     if not lens.is_antialiased:
         return ZERO * rho, ZERO * rho, ZERO * rho
@@ -209,7 +209,7 @@ def compensation_vjp(footprint, v_compensation, lens):
 
 @scalar
 def image_row_vjp(focal_over_z, direction, V_2, v_row):
-    """Gradient of one row of U by (V_row, V_2, direction)."""
+    """Return the gradient of one row of U with respect to (V_row, V_2, direction)."""
     v_V_row = (focal_over_z * v_row[0], focal_over_z * v_row[1], focal_over_z * v_row[2])
     v_V_2 = (-direction * v_V_row[0], -direction * v_V_row[1], -direction * v_V_row[2])
     return v_V_row, v_V_2, -dot(v_V_row, V_2)
@@ -217,10 +217,10 @@ def image_row_vjp(focal_over_z, direction, V_2, v_row):
 
 @scalar
 def project_gaussian_vjp(p, V, lens, footprint, v_x, v_y, v_depth, v_cov):
-    """Chain gradients of image position, depth and projected covariance to p and V.
+    """Chain gradients with respect to image position, depth and projected covariance to p and V.
 
-    The focal factor of a row is f / z, so the row's own share of dL/dz is -(row . v_row) / z; a clamped direction does
-    not move with p.
+    A row has the factor f / z, so its own share of dL/dz is -(row . v_row) / z; a clamped direction does not depend on
+    p.
     """
     inverse_z = ONE / p[2]
     x = p[0] * inverse_z
@@ -237,8 +237,8 @@ def project_gaussian_vjp(p, V, lens, footprint, v_x, v_y, v_depth, v_cov):
         TWO * v_cov[2] * w[1] + v_cov[1] * u[1],
         TWO * v_cov[2] * w[2] + v_cov[1] * u[2],
     )
-    v_V0, v_V2x, v_dir_x = image_row_vjp(lens.fx * inverse_z, smaller(larger(x, lens.x_min), lens.x_max), V[2], v_u)
-    v_V1, v_V2y, v_dir_y = image_row_vjp(lens.fy * inverse_z, smaller(larger(y, lens.y_min), lens.y_max), V[2], v_w)
+    v_V0, v_V2x, v_dir_x = image_row_vjp(lens.fx * inverse_z, minimum(maximum(x, lens.x_min), lens.x_max), V[2], v_u)
+    v_V1, v_V2y, v_dir_y = image_row_vjp(lens.fy * inverse_z, minimum(maximum(y, lens.y_min), lens.y_max), V[2], v_w)
     v_V2 = (v_V2x[0] + v_V2y[0], v_V2x[1] + v_V2y[1], v_V2x[2] + v_V2y[2])
 
     v_ratio_x = lens.fx * v_x + select((x > lens.x_min) & (x < lens.x_max), v_dir_x, ZERO)

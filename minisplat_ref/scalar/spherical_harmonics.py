@@ -11,7 +11,7 @@ from minisplat_ref.jit.literals import FOUR, ONE, SIX, THREE, TWO, ZERO
 
 @scalar
 def direction(centre, x, y, z):
-    """Unit direction from the camera centre to a point, and one over its length; zeros at the centre itself."""
+    """Return the unit direction from the camera centre to a point, and 1 / distance; zeros at the centre itself."""
     dx = x - centre[0]
     dy = y - centre[1]
     dz = z - centre[2]
@@ -22,7 +22,7 @@ def direction(centre, x, y, z):
 
 @scalar
 def direction_vjp(x, y, z, inverse, v_x, v_y, v_z):
-    """Chain through d / |d|: the part along the direction is lost."""
+    """Chain through d / |d|, which removes the part along the direction."""
     along = x * v_x + y * v_y + z * v_z
     return (v_x - along * x) * inverse, (v_y - along * y) * inverse, (v_z - along * z) * inverse
 
@@ -61,13 +61,13 @@ def basis_3(x, y, z, c):
 
 @scalar
 def basis_1_vjp(c, v):
-    """Chain the gradient by the basis functions of degree 1 to the direction."""
+    """Chain the gradient with respect to the basis functions of degree 1 to the direction."""
     return -c[1] * v[2], -c[1] * v[0], c[1] * v[1]
 
 
 @scalar
 def basis_2_vjp(x, y, z, c, v):
-    """Chain the gradient by the basis functions of degree 2 to the direction."""
+    """Chain the gradient with respect to the basis functions of degree 2 to the direction."""
     return (
         c[2] * (y * v[0] - z * v[3]) - TWO * x * (c[3] * v[2] - c[4] * v[4]),
         c[2] * (x * v[0] - z * v[1]) - TWO * y * (c[3] * v[2] + c[4] * v[4]),
@@ -77,7 +77,7 @@ def basis_2_vjp(x, y, z, c, v):
 
 @scalar
 def basis_3_vjp(x, y, z, c, v):
-    """Chain the gradient by the basis functions of degree 3 to the direction."""
+    """Chain the gradient with respect to the basis functions of degree 3 to the direction."""
     xx = x * x
     yy = y * y
     zz = z * z

@@ -1,4 +1,4 @@
-"""Aggressive clone of Mini-Splatting2: the Gaussians that matter are cloned, and the picture stays as it is.
+"""Aggressive clone of Mini-Splatting2: clone the Gaussians that matter without changing the picture.
 
 A plain copy makes a Gaussian more opaque. Here the N copies share the opacity and the size of the one that they replace
 (the rule by which 3DGS-MCMC relocates Gaussians). With its opacity o and scales s,
@@ -6,11 +6,11 @@ A plain copy makes a Gaussian more opaque. Here the N copies share the opacity a
     o' = 1 - (1 - o)^(1/N)                       N copies composite to o at the centre
     s' = s o / sum_k C(N, k) (-1)^(k+1) o'^k / sqrt(k)        k = 1 ... N
 
-the latter because along a line through the centre, where one copy has alpha u(x) = o' exp(-x^2 / 2 s'^2), N have
+The latter holds because along a line through the centre, where one copy has alpha u(x) = o' exp(-x^2 / 2 s'^2), N have
 1 - (1 - u)^N, a sum of Gaussians of widths s' / sqrt(k), whose integral is that of the old profile, sqrt(2 pi) s o.
 
-Two readings of *critical* are here, the released code's and the paper's; they differ a lot. Left out: what the released
-code removes just before (the training loop's).
+There are two readings of *critical*, the released code's and the paper's, and they differ a lot. Left out: what the
+released code removes just before, which is an action of the recipe.
 """
 
 import math
@@ -24,20 +24,20 @@ from minisplat_ref.strategy.ops import Edit, concat, n_rows, take
 from minisplat_ref.types import Bools, Floats, Gaussians
 
 LEAST_SHARED_OPACITY = 0.0051
-"""A copy is not made fainter than this, just above the 0.005 at which density control removes it, unless its parent is.
-The released code's. Its other bound, 1 - 1e-7, is not needed: the logits are computed without 1 - o."""
+"""Copies are not made fainter than this, just above density control's limit of 0.005, unless their parent is.
+From the released code. Its other bound, 1 - 1e-7, is not needed: the logits are computed without 1 - o."""
 
 
 def critical_by_mass(stats: ImportanceStats, mass: float = 0.99) -> Bools:
-    """Tell which Gaussians carry ``mass`` of the blend weight among those that dominate a pixel: the released code.
+    """Return which Gaussians carry ``mass`` of the blend weight among those that dominate a pixel: the released code.
 
-    It is a large part of all Gaussians.
+    This is a large part of all Gaussians.
 
     Parameters
     ----------
     stats : ImportanceStats
     mass : float
-        Part of the sum, in (0, 1].
+        Fraction of the sum, in (0, 1].
 
     Returns
     -------
@@ -47,9 +47,9 @@ def critical_by_mass(stats: ImportanceStats, mass: float = 0.99) -> Bools:
 
 
 def critical_by_weight(stats: ImportanceStats, quantile: float = 0.99) -> Bools:
-    """Tell which Gaussians have the largest blending weights: the paper's words.
+    """Return which Gaussians have the largest blending weights, as the paper says.
 
-    It is one in a hundred, and more where the weights of many reach the ceiling of alpha.
+    This is one in a hundred, and more where the weights of many reach alpha's upper bound.
 
     Parameters
     ----------
@@ -89,13 +89,13 @@ def shared_opacities(opacities: Floats, factor: int) -> Floats:
 def shared_scale_factors(opacities: Floats, factor: int) -> Floats:
     """Return s' / s, by which the scales of ``factor`` copies shrink.
 
-    The opacity that both sides of the quotient contain is taken out, so that faint Gaussians are no 0 / 0::
+    Numerator and denominator are divided by the opacity, so that faint Gaussians do not give 0 / 0::
 
         o / o' = (1 - (1 - o')^N) / o' = sum_j (1 - o')^j        j = 0 ... N - 1
         s' / s = sum_j (1 - o')^j  /  sum_k C(N, k) (-o')^(k-1) / sqrt(k)
 
-    Terms of the second sum cancel: of the 16 digits, N log10(1 + o') are lost. It matters for tens of copies of an
-    opaque Gaussian only.
+    Terms of the second sum cancel: N log10(1 + o') of the 16 digits are lost. This matters only for tens of copies of
+    an opaque Gaussian.
 
     Parameters
     ----------
@@ -131,8 +131,8 @@ def clone(gaussians: Gaussians, is_critical: Bools, *, factor: int = 2) -> Edit:
     Returns
     -------
     edit : Edit
-        All rows in their order, the critical ones changed in place, so that they keep their moments; then the first
-        copy of every critical one, the second, and so on.
+        All rows in their order, the critical ones changed in place so that they keep their moments; then the first copy
+        of every critical one, the second, and so on.
 
     Raises
     ------

@@ -1,13 +1,13 @@
 """Blur split of Mini-Splatting (Sec. 4.1, Eq. 2): a Gaussian that fills a patch of some view is split.
 
 In a smooth, blurred region the positional gradient is small, so density control by gradients leaves one large Gaussian
-where the photograph has detail. The sign of it is an area: the number of pixels at which the Gaussian has the largest
-blending weight. Such Gaussians join the split set of :func:`minisplat_ref.strategy.clone_split.clone_and_split`,
-whatever their gradient and size.
+where the photograph has detail. Such a Gaussian is recognised by its area, the number of pixels at which it has the
+largest blending weight, and joins the split set of :func:`minisplat_ref.strategy.clone_split.clone_and_split`, whatever
+its gradient and size.
 
 The released code draws the children at random, as 3DGS does
-(:func:`minisplat_ref.strategy.clone_split.random_children`). The other form, here, cuts the longest axis. Left out: who
-collects the areas from one event to the next (the training loop).
+(:func:`minisplat_ref.strategy.clone_split.random_children`). The other form, here, cuts the longest axis. Left out: to
+collect the areas from one event to the next, which is an action of the recipe.
 """
 
 import math
@@ -23,7 +23,7 @@ HALF_SCALE = math.sqrt(1 - 2 / math.pi)  # its standard deviation; 1 / 1.66
 
 
 def is_blurred(dominant_count: Ints, width: int, height: int, *, area_fraction: float, least_area: int = 0) -> Bools:
-    """Tell which Gaussians lead at too large a part of one view.
+    """Return which Gaussians dominate too large a part of one view.
 
     Parameters
     ----------
@@ -32,9 +32,9 @@ def is_blurred(dominant_count: Ints, width: int, height: int, *, area_fraction: 
     width, height : int
         Image size, pixels.
     area_fraction : float
-        Largest part of the image that is not blurred; 2e-4 in the paper.
+        A Gaussian that dominates a larger fraction of the image is blurred; 2e-4 in the paper.
     least_area : int
-        Pixels that are never called blurred, however small the image.
+        So many pixels are not blurred, however small the image.
 
     Returns
     -------
@@ -46,12 +46,12 @@ def is_blurred(dominant_count: Ints, width: int, height: int, *, area_fraction: 
 def principal_axis_children(gaussians: Gaussians, parent_ids: Ints, rng: np.random.Generator) -> Gaussians:
     """Return two children of each parent, one on either side of its centre on the longest axis.
 
-    The plane through the centre and across the longest axis k cuts the Gaussian into two halves. A child has the mean
-    and the variance of its half on that axis, and is as its parent on the others::
+    The plane through the centre, perpendicular to the longest axis k, cuts the Gaussian into two halves. Along k a
+    child has the mean and the variance of its half; along the other axes it is like its parent::
 
         mu' = mu +- sqrt(2 / pi) s_k R_k        s_k' = sqrt(1 - 2 / pi) s_k
 
-    The even mixture of the two has the parent's mean and covariance, as 2 / pi + (1 - 2 / pi) = 1.
+    The equal mixture of the two has the parent's mean and covariance, as 2 / pi + (1 - 2 / pi) = 1.
 
     Parameters
     ----------
@@ -59,8 +59,7 @@ def principal_axis_children(gaussians: Gaussians, parent_ids: Ints, rng: np.rand
     parent_ids : ndarray of shape (P,)
         Rows to split.
     rng : numpy.random.Generator
-        Not used: nothing is drawn. It makes the signature that of
-        :func:`minisplat_ref.strategy.clone_split.random_children`.
+        Not used, but makes the signature that of :func:`minisplat_ref.strategy.clone_split.random_children`.
 
     Returns
     -------

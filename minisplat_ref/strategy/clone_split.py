@@ -1,12 +1,12 @@
 """Adaptive density control of 3DGS (Sec. 5.2): clone, split, prune, opacity reset.
 
 The signal is the gradient of the loss with respect to a Gaussian's position *in the image*, averaged over the views
-that saw it since the last event: where it is large, one Gaussian is pulled to two places. Small Gaussians are then
+that saw it since the last event: where it is large, the views pull one Gaussian to two places. Small Gaussians are then
 cloned, large ones split.
 
-Left out, on purpose: the removal of Gaussians that are large on the screen (radius above 20 px). The released code
+Left out on purpose: the removal of Gaussians that are large on the screen (radius above 20 px). The released code
 contains it, but the densification just before it zeroes the recorded radii, so it never removes anything; the paper's
-figures were measured like this. The removal of those large in the world does work, and is here.
+figures were measured like this. The removal of Gaussians that are large in the world works there, and is here.
 """
 
 import math
@@ -25,13 +25,13 @@ SPLIT_SHRINK = 0.8 * N_CHILDREN  # children's scales are the parent's divided by
 def screen_gradient_norms(v_means2d: Floats, width: int, height: int) -> Floats:
     """Return the length of the positional gradient in normalised device coordinates.
 
-    The image is two units wide and high, whatever its resolution, so v_ndc = v_pixel * (W, H) / 2. The released
-    threshold 2e-4 is in this unit.
+    In them the image is two units wide and high, whatever its resolution, so v_ndc = v_pixel * (W, H) / 2. The
+    released threshold 2e-4 is in this unit.
 
     Parameters
     ----------
     v_means2d : ndarray of shape (V, 2)
-        Gradient by the projected centres, per pixel.
+        Gradient with respect to the projected centres, per pixel.
     width, height : int
         Image size, pixels.
 
@@ -44,7 +44,7 @@ def screen_gradient_norms(v_means2d: Floats, width: int, height: int) -> Floats:
 
 
 def random_children(gaussians: Gaussians, parent_ids: Ints, rng: np.random.Generator) -> Gaussians:
-    """Return two children of each parent, drawn from it: mu + R (s * n) with n ~ N(0, I).
+    """Return two children of each parent, with centres drawn from it: mu + R (s * n) with n ~ N(0, I).
 
     They have 1/1.6 of its scales and the same opacity and colour.
 
@@ -91,7 +91,7 @@ def clone_and_split(
     mean_norms : ndarray of shape (N,)
         Mean of :func:`screen_gradient_norms` over the views that saw the Gaussian; 0 if none did.
     threshold : float
-        As ``mean_norms``.
+        In the unit of ``mean_norms``.
     size_limit : float
         Largest scale up to which a Gaussian is cloned rather than split, world units.
     rng : numpy.random.Generator
@@ -123,20 +123,20 @@ def clone_and_split(
 
 
 def prune_faint(gaussians: Gaussians, *, least_opacity: float) -> Edit:
-    """Remove what is nearly transparent: opacity below ``least_opacity``."""
+    """Remove nearly transparent Gaussians, of opacity below ``least_opacity``."""
     return keep(gaussians, gaussians.opacity_logits >= logit(least_opacity))
 
 
 def prune_large(gaussians: Gaussians, *, size_limit: float | Floats) -> Edit:
-    """Remove what is larger than ``size_limit`` (world units, for all or [N] for each) along any axis."""
+    """Remove Gaussians larger than ``size_limit`` (world units; one for all, or [N]) along any axis."""
     return keep(gaussians, gaussians.log_scales.max(axis=1, initial=-np.inf) <= np.log(size_limit))
 
 
 def capped_opacity_logits(opacity_logits: Floats, *, ceiling: float) -> Floats:
-    """Return the logits with opacities lowered to ``ceiling`` where they are above (the opacity reset).
+    """Return the logits with opacities lowered to ``ceiling`` where they are above it (the opacity reset).
 
-    What the photographs need becomes opaque again within some hundred iterations; floaters near the cameras do not, and
-    :func:`prune_faint` takes them.
+    Gaussians that the photographs need become opaque again within a few hundred iterations; floaters near the cameras
+    do not, and :func:`prune_faint` removes them.
     """
     return np.minimum(opacity_logits, opacity_logits.dtype.type(logit(ceiling)))
 

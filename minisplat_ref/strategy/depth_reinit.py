@@ -1,19 +1,19 @@
-"""Depth reinitialisation (Mini-Splatting, Sec. 4.1): all Gaussians give way to points of the surface that they show.
+"""Depth reinitialisation (Mini-Splatting, Sec. 4.1): replace all Gaussians by points of the surface that they show.
 
 Trained Gaussians crowd where gradients were large and leave plain surfaces to few. A fresh set with equally many points
-per photograph covers the scene evenly. A point is where a pixel's ray meets what the pixel shows, and its colour is the
-photograph's. The paper compares three meanings of "where" (Table 4):
+per photograph covers the scene evenly. A point lies where a pixel's ray meets what the pixel shows, and its colour is
+the photograph's. The paper compares three definitions of "where" (Table 4):
 
-- mid-point: the densest point of the dominant Gaussian on the ray (appendix D), the default;
+- midpoint: the densest point of the dominant Gaussian on the ray (appendix D), the default;
 - centre: the ray at the depth of the dominant Gaussian's mean;
 - blended: the ray at the blended depth, ``sum w z / sum w``.
 
 The paper says that pixels are chosen at random; the released code draws them with probability proportional to the
-accumulated opacity, and so do we. Two guards are ours, for what photographs do not settle, such as sky and bare walls:
-a floor of the accumulated opacity, below which no pixel is drawn, and a vote of other views on each point.
+accumulated opacity, and so do we. Two safeguards are ours, for places where the photographs do not determine the depth,
+such as sky and bare walls: a least accumulated opacity of drawn pixels, and a vote of other views on each point.
 
-Left out: that a Gaussian whose densest point lies behind the camera leaves the transmittance untouched, as in the
-released kernel. Such a pixel has no point here.
+Left out: in the released kernel a Gaussian whose densest point lies behind the camera does not change the
+transmittance. Here such a pixel has no point.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,13 +32,13 @@ from minisplat_ref.rendering import SPLATTING, Renderer, Request, as_model
 from minisplat_ref.strategy.simplify import sample
 from minisplat_ref.types import Bools, Camera, Floats, Ints, View
 
-N_PARTNERS = 8  # views that vote on a point: more of them admit more chance agreements, and cost time
+N_PARTNERS = 8  # views that vote on a point: more of them agree more often by chance, and cost time
 BEST_PARALLAX = np.radians(
     20.0
 )  # of partners: from a nearer one a floater looks the same, from a farther one less is seen
 LEAST_SCORE = 0.05  # of a partner: 1 degree of parallax on all points, or the best on a twentieth of them
-MAP_BYTES = 8  # a pixel: depth and weight in float32
-N_PROBES = 256  # points of a view by which its partners are chosen
+MAP_BYTES = 8  # per pixel: depth and weight in float32
+N_PROBES = 256  # points of a view with which its partners are chosen
 
 
 class PixelPoints(NamedTuple):
@@ -55,13 +55,13 @@ class PixelPoints(NamedTuple):
 def midpoint_points(
     model: Any, view: View, conventions: Conventions, backend: Backend, renderer: Renderer = SPLATTING
 ) -> PixelPoints:
-    """Densest point of the dominant Gaussian on each ray, which is the middle of the ray's chord through it.
+    """Return the densest point of the dominant Gaussian on each ray, the midpoint of the ray's chord through it.
 
     Parameters
     ----------
     model : Model or Gaussians
     view : View
-        Its camera is looked through.
+        Only its camera is used.
     conventions : Conventions
     backend : Backend
     renderer : Renderer
@@ -80,9 +80,9 @@ def midpoint_points(
 def centre_points(
     model: Any, view: View, conventions: Conventions, backend: Backend, renderer: Renderer = SPLATTING
 ) -> PixelPoints:
-    """Point of each ray at the depth of the dominant Gaussian's mean.
+    """Return the point on each ray at the depth of the dominant Gaussian's mean.
 
-    Not the mean itself: all pixels of a large Gaussian would become one point.
+    It is not the mean itself, with which all pixels of a large Gaussian would become one point.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def centre_points(
 def blended_points(
     model: Any, view: View, conventions: Conventions, backend: Backend, renderer: Renderer = SPLATTING
 ) -> PixelPoints:
-    """Point of each ray at the blended depth, ``sum w z / sum w``.
+    """Return the point on each ray at the blended depth, ``sum w z / sum w``.
 
     Where a ray passes through several surfaces, at the edge of an object or under a floater, it lies on none of them.
 
@@ -153,12 +153,12 @@ def reinitial_points(
     least_alpha : float
         Pixels of lower accumulated opacity are not drawn; 0 for the paper's rule.
     depth_tolerance : float or None
-        Up to this relative difference between its depth and another view's, a point is on that view's surface. It is
-        refuted if of up to 8 other views as many see through it as have it on their surface, or more. None for the
-        paper's rule, which does not ask. What no other view can judge is not refuted.
+        A point is on another view's surface if its depth differs from that view's by at most this, relatively. It is
+        refuted if, of up to 8 other views, at least as many see through it as have it on their surface. A point that no
+        other view can judge is not refuted. None for the paper's rule, which refutes nothing.
     backdrop_distance : float or None
-        A point that is refuted moves along its ray to this distance from the camera, world units: behind the scene.
-        None: it is not drawn.
+        Refuted points move along their rays to this distance from the camera, behind the scene, world units. None: they
+        are not drawn.
     rng : numpy.random.Generator
         Draws the pixels.
     renderer : Renderer
@@ -175,13 +175,13 @@ def reinitial_points(
     Raises
     ------
     InputError
-        There are fewer points than views, no pixel of any view can be drawn, or memory does not hold all depths.
+        There are fewer points than views, no pixel of any view can be drawn, or all depths do not fit into memory.
     """
     if n_points < len(views):
         raise InputError(f"{n_points} points from {len(views)} views are none from each: ask for more points")
     cameras = [with_principal_point(view.camera, conventions) for view in views]
     _check_room(cameras)
-    depth_maps, weight_maps = [], []  # MAP_BYTES a pixel of all views; points would be 12 more
+    depth_maps, weight_maps = [], []  # MAP_BYTES per pixel of all views; points would be 12 more
     for view in views:
         _, depths, alpha = points_of(model, view, conventions, backend, renderer)
         is_drawable = (depths > 0) & (alpha >= least_alpha)
@@ -254,16 +254,16 @@ def refuted(
 ) -> Bools:
     """Return which points of a view are refuted: at least as many partners see through one as have it on their surface.
 
-    A partner that sees something nearer in that place, or whose image does not contain the point, has no vote. A point
-    that no partner can judge is not refuted: a corner that one photograph shows, a single photograph, a camera that
-    only turned on its tripod.
+    A partner that sees something nearer there, or whose image does not contain the point, has no vote. A point that no
+    partner can judge is not refuted: a corner that only one photograph shows, a single photograph, a camera that only
+    turned on its tripod.
 
     Parameters
     ----------
     points : ndarray of shape (P, 3)
         World frame.
     own_id : int
-        The view that they are from.
+        The view that they come from.
     cameras : sequence of Camera
         Of all views.
     depth_maps : sequence of ndarray of shape (H, W)
@@ -287,7 +287,7 @@ def refuted(
 
 
 def _partners(points: Floats, own_id: int, cameras: Sequence[Camera]) -> Ints:
-    """Return up to ``N_PARTNERS`` views that see many of the points [P, 3] from another side, but not too much so."""
+    """Return up to ``N_PARTNERS`` views that see many of the points [P, 3] from another, but similar, direction."""
     probes = points[:: max(1, len(points) // N_PROBES)]  # [S, 3]
     own_rays = _rays(probes, cameras[own_id])  # [S, 3]
     scores = np.zeros(len(cameras))

@@ -1,14 +1,14 @@
-"""Growth that nearly leaves the picture as it is: a Gaussian becomes two halves, side by side on its longest axis.
+"""Growth that hardly changes the picture: replace a Gaussian by two halves, side by side on its longest axis.
 
 A clone of 3DGS doubles the opacity where it is put, and a child of its split lands at random: both spoil the picture,
-and the next iterations repair it. Here the two halves have together the mean, the covariance and the optical depth of
+and the next iterations repair it. Here the two halves together have the mean, the covariance and the optical depth of
 the Gaussian that they replace. With the offset d from its centre, in standard deviations along the longest axis k,
 
-    mu' = mu +- d s_k R_k        s_k' = sqrt(1 - d^2) s_k              mean and covariance of the even mixture stay
-    tau = -ln(1 - o)             tau' = tau / (2 sqrt(1 - d^2))        so does the integral of tau exp(-x^2 / 2)
+    mu' = mu +- d s_k R_k        s_k' = sqrt(1 - d^2) s_k              keeps mean and covariance of the equal mixture
+    tau = -ln(1 - o)             tau' = tau / (2 sqrt(1 - d^2))        keeps the integral of tau exp(-x^2 / 2)
 
-the latter because the integral of a Gaussian is proportional to its height and its width. In place of the
-clones and splits of 3DGS they gain 0.6 dB with a quarter of the Gaussians (``docs/measured/adaptive.md``).
+The latter holds because the integral of a Gaussian is proportional to its height and its width. In place of the clones
+and splits of 3DGS the halves gain 0.6 dB with a quarter of the Gaussians (``docs/measured/adaptive.md``).
 """
 
 import math
@@ -23,7 +23,7 @@ OFFSET = 0.5  # standard deviations from the old centre to the new ones
 
 
 def halves(gaussians: Gaussians, parent_ids: Ints, *, offset: float = OFFSET) -> Edit:
-    """Replace Gaussians by two halves each.
+    """Replace each chosen Gaussian by two halves.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def halves(gaussians: Gaussians, parent_ids: Ints, *, offset: float = OFFSET) ->
     Returns
     -------
     edit : Edit
-        All rows in their order, each parent changed into its first half, which keeps its moments; then the second
+        All rows in their order, each parent changed into its first half, which keeps the moments; then the second
         halves.
     """
     parents = take(gaussians, parent_ids)

@@ -1,11 +1,11 @@
-"""Importance of each Gaussian to the training views (Mini-Splatting, Sec. 3.2 and appendix E), and who carries most.
+"""Importance of each Gaussian to the training views (Mini-Splatting, Sec. 3.2 and appendix E), and which carry most.
 
 The weight w = alpha T of a hit is a Gaussian's share of a pixel. Everything here is a sum, a maximum or a count of
-weights over the pixels of all training views. *Dominant* is what has the largest weight at a pixel.
+weights over the pixels of all training views. The Gaussian with the largest weight at a pixel *dominates* it.
 
-The thresholds of Mini-Splatting2 are parts of a sum, not ranks: 0.99 keeps those that together carry 99 % of it, often
-more than half of all. Left out: the 1e-6 that the released code adds to every importance before it sums them up, which
-for a million Gaussians is a sum of its own.
+The thresholds of Mini-Splatting2 are fractions of a sum, not ranks: 0.99 keeps those that together carry 99 % of it,
+often more than half of all. Left out: the 1e-6 that the released code adds to every importance before summing, which
+adds up for a million Gaussians.
 """
 
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from minisplat_ref.types import Bools, Floats, Ints, View
 
 
 class ImportanceStats(NamedTuple):
-    """What all training views together see of each Gaussian."""
+    """Statistics of each Gaussian over all training views."""
 
     blend_weight_sum: Floats
     """[N] sum of w over pixels and views."""
@@ -34,7 +34,7 @@ class ImportanceStats(NamedTuple):
     frustum_count: Ints
     """[N] int32 views that do not cull it."""
     is_visible: Bools
-    """[N, V] True in the views where it is one of those that carry most of the blend weight."""
+    """[N, V] whether it is among the Gaussians that carry most of the view's blend weight."""
 
 
 def collect_importance(
@@ -46,18 +46,18 @@ def collect_importance(
     backend: Backend = CPU,
     visibility_mass: float = 0.99,
 ) -> ImportanceStats:
-    """Render every view for its blend statistics, and add them up in float64.
+    """Render every view for its blend statistics, and accumulate them in float64.
 
     Parameters
     ----------
     model : Model or Gaussians
     views : sequence of View
-        The training views, at the resolution that is trained on; only their cameras, indices and times matter.
+        The training views, at the resolution of training; only their cameras, indices and times matter.
     renderer : Renderer
     conventions : Conventions
     backend : Backend
     visibility_mass : float
-        Part of a view's blend weight that its visible Gaussians carry.
+        Fraction of a view's blend weight that its visible Gaussians carry.
 
     Returns
     -------
@@ -80,7 +80,7 @@ def collect_importance(
         view = output.stats
         assert view is not None
         total.blend_weight_sum[:] += view.blend_weight_sum
-        is_dominant = view.dominant_count > 0  # [N] never without a hit, so nothing is divided by 0
+        is_dominant = view.dominant_count > 0  # [N] implies a hit, so nothing is divided by 0
         total.mean_weight_sum[is_dominant] += view.blend_weight_sum[is_dominant] / view.hit_count[is_dominant]
         np.maximum(total.blend_weight_max, view.blend_weight_max, out=total.blend_weight_max)
         total.dominant_count[:] += view.dominant_count
@@ -92,7 +92,7 @@ def collect_importance(
 def indoor(stats: ImportanceStats) -> Floats:
     """Return the importance [N] for indoor scenes: the sum of weights over all pixels and views (equation 12).
 
-    What covers many pixels counts more.
+    Gaussians that cover many pixels count more.
     """
     return stats.blend_weight_sum
 
@@ -106,23 +106,23 @@ def outdoor(stats: ImportanceStats) -> Floats:
 
 
 def mass_mask(importance: Floats, mass: float) -> Bools:
-    """Tell which are the most important rows that together carry ``mass`` of the sum.
+    """Return a mask of the most important rows that together carry ``mass`` of the sum.
 
     Parameters
     ----------
     importance : ndarray of shape (N,)
         Not negative.
     mass : float
-        Part of the sum, in [0, 1]: at 1 all rows that are not zero.
+        Fraction of the sum, in [0, 1]; at 1 all rows that are not zero.
 
     Returns
     -------
     mask : ndarray of shape (N,) of booleans
-        Rows of zero are never in it. Of equals the later ones are left out first.
+        False where the importance is zero. Of equals the later ones are left out first.
     """
     ids = np.flatnonzero(importance)[::-1]
     ascending = ids[np.argsort(importance[ids], kind="stable")]
-    carried = np.cumsum(importance[ascending], dtype=np.float64)  # by each row and all that are less important
+    carried = np.cumsum(importance[ascending], dtype=np.float64)  # by each row and all less important ones
     n_left_out = np.searchsorted(carried, (1.0 - mass) * carried[-1:], side="right").sum()  # 0 where there are no rows
     mask = np.zeros(len(importance), bool)
     mask[ascending[n_left_out:]] = True

@@ -17,7 +17,7 @@ from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Scene
 N_NEIGHBOURS = 3
 LEAST_SQUARED_DISTANCE = 1e-7  # world units^2; points in the same place would get a scale of zero, whose log is -inf
 INITIAL_OPACITY = 0.1
-N_RANDOM_POINTS = 100_000  # what 3DGS draws for scenes without points
+N_RANDOM_POINTS = 100_000  # as 3DGS draws for scenes without points
 
 
 def initial_gaussians(scene: Scene, sh_degree: int, rng: np.random.Generator) -> Gaussians:
@@ -27,7 +27,7 @@ def initial_gaussians(scene: Scene, sh_degree: int, rng: np.random.Generator) ->
     ----------
     scene : Scene
     sh_degree : int
-        Degree that is stored; coefficients above 0 start at zero.
+        Stored degree; coefficients above degree 0 start at zero.
     rng : numpy.random.Generator
         Draws the random points; untouched when the scene has points.
 
@@ -67,7 +67,7 @@ def from_points(points: Floats, colors: NDArray[np.uint8], sh_degree: int) -> Ga
 
 
 def from_means(means: Floats, sh_dc: Floats, sh_degree: int) -> Gaussians:
-    """Return what :func:`from_points` does, of colours that are given as coefficients and in their dtype.
+    """Do the same as :func:`from_points` with colours given as coefficients, and in their dtype.
 
     Parameters
     ----------
@@ -106,8 +106,8 @@ def random_points(cameras: Sequence[Camera], extent: float, n: int, rng: np.rand
     """Return points drawn uniformly in the cube around the cameras, without those that no camera sees.
 
     The cube is centred on the mean of the camera centres and reaches ``extent`` to each side, so it holds all cameras.
-    That covers an object that they surround; of a landscape that they look out on, only the near part. A point that
-    no camera sees would never get a gradient and stay for ever.
+    It covers an object that they surround, but only the near part of a landscape that they look out on. A point that no
+    camera sees would never get a gradient and would stay forever.
 
     Parameters
     ----------

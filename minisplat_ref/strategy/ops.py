@@ -24,7 +24,7 @@ class Edit(NamedTuple):
     parent_ids: Ints
     """[M] row of the old population that this one is, or descends from; ``NO_PARENT`` where there is none."""
     is_new: Bools
-    """[M] True where the row begins without moments; such a row may still have a parent (a clone)."""
+    """[M] whether the row starts with zero moments; such a row may still have a parent (a clone)."""
 
 
 def n_rows(population: NamedTuple) -> int:
@@ -49,12 +49,12 @@ def concat(*populations: Population) -> Population:
 
 
 def contiguous(population: Population) -> Population:
-    """Return the population with every field C-contiguous, uncopied if it is."""
+    """Return the population with every field C-contiguous; fields that already are are not copied."""
     return population._make(np.ascontiguousarray(field) for field in population)
 
 
 def inherit(field: NDArray[Any], parent_ids: Ints, is_reset: Bools) -> NDArray[Any]:
-    """Return one array of the edited population: the parents' rows, zeros where ``is_reset`` or without a parent.
+    """Return one array of the edited population: the parents' rows, or zeros where ``is_reset`` or without a parent.
 
     Parameters
     ----------

@@ -1,14 +1,14 @@
-"""Simplification: few Gaussians that show nearly the same (Mini-Splatting, equation 3).
+"""Simplification: keep few Gaussians that show nearly the same (Mini-Splatting, equation 3).
 
-Importance (:mod:`minisplat_ref.strategy.importance`) says how much a Gaussian matters to the training views. Four ways
-of using it are here, to be compared at equal numbers:
+Importance (:mod:`minisplat_ref.strategy.importance`) says how much a Gaussian matters to the training views. There are
+four ways to use it, to be compared at equal numbers of Gaussians:
 
 - sampling, the paper's: draw Gaussians with probability proportional to importance, so that plain regions keep some;
 - rank: keep the most important ones;
-- mass: keep those that together carry a part of all importance;
+- mass: keep those that together carry a given fraction of all importance;
 - merging: replace near neighbours by one Gaussian with their common mean and covariance. It is not in the paper.
 
-Left out: when each is done, and that the optimiser starts anew, which are the recipe's.
+Left out: when each is done, and the restart of the optimiser, which the recipe decides.
 """
 
 from typing import Any
@@ -26,14 +26,14 @@ from minisplat_ref.strategy.initialization import from_means
 from minisplat_ref.strategy.ops import Edit, keep, take
 from minisplat_ref.types import Floats, Gaussians, Ints
 
-COLOR_REACH = 10.0  # a difference of 1 in colour is as far as this many median distances to the nearest centre
-LARGEST_OPACITY = GSPLAT_MAIN.alpha_max  # of a merged Gaussian: what is more is neither seen nor trained
+COLOR_REACH = 10.0  # a difference of 1 in colour counts like this many median distances to the nearest centre
+LARGEST_OPACITY = GSPLAT_MAIN.alpha_max  # of a merged Gaussian: above it, alpha is clamped and has no gradient
 
 
 def intersection_preserving(importance: Floats, dominant_count: Ints) -> Floats:
     """Return the importance with 0 where the Gaussian dominates no pixel of any view (equation 3).
 
-    Those that do are the ones that rays meet first and foremost; the others are buried or smeared over many.
+    Those that dominate a pixel are the first that rays meet; the others are buried, or one of many that share a pixel.
 
     Parameters
     ----------
@@ -47,8 +47,8 @@ def intersection_preserving(importance: Floats, dominant_count: Ints) -> Floats:
 def sample(importance: Floats, n: int, rng: np.random.Generator) -> Ints:
     """Draw ``n`` different rows with probability proportional to importance.
 
-    The law is that of drawing one after the other among those that are left. Drawing all at once has the same law: add
-    to every log importance a number from the standard Gumbel distribution, and take the ``n`` largest.
+    The distribution is that of drawing one after the other from the rows that are left. This draws all at once from the
+    same distribution: add a standard Gumbel variate to every log importance, and take the ``n`` largest.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def _candidates(importance: Floats, n: int) -> Ints:
 
 
 def by_sampling(gaussians: Gaussians, importance: Floats, n: int, rng: np.random.Generator) -> Edit:
-    """Keep the ``n`` Gaussians that :func:`sample` draws. As the next two, a choice that an event is given."""
+    """Keep the ``n`` Gaussians that :func:`sample` draws. An event can take this function or one of the next two."""
     return keep(gaussians, sample(importance, n, rng))
 
 
@@ -116,24 +116,24 @@ def by_rank(gaussians: Gaussians, importance: Floats, n: int, rng: np.random.Gen
 
 
 def by_merging(gaussians: Gaussians, importance: Floats, n: int, rng: np.random.Generator) -> Edit:
-    """Leave ``n`` Gaussians by :func:`merge_neighbours`; nothing is drawn."""
+    """Merge down to ``n`` Gaussians with :func:`merge_neighbours`; nothing is drawn."""
     return merge_neighbours(gaussians, importance, n)
 
 
 def merge_neighbours(gaussians: Gaussians, importance: Floats, n: int) -> Edit:
     """Merge near neighbours until ``n`` Gaussians are left; those without importance are dropped first.
 
-    Neighbours are near in space and in colour. In each round pairs that are each other's nearest neighbour become one,
-    the cheaper half of them by Ward's criterion, squared distance times w_1 w_2 / (w_1 + w_2), by which unimportant
-    ones go first. Of the members m of a cluster, with importance w_m and d_m = mu_m - mu::
+    Neighbours are near in space and in colour. Each round considers the pairs that are each other's nearest neighbour
+    and merges the cheaper half of them by Ward's criterion, squared distance times w_1 w_2 / (w_1 + w_2), by which
+    unimportant ones go first. With the members m of a cluster, their importance w_m and d_m = mu_m - mu::
 
         mu    = sum w_m mu_m / sum w_m                      all other fields alike, such as the colour's coefficients
         Sigma = sum w_m (Sigma_m + d_m d_m^T) / sum w_m     quaternion and scales by its eigenvectors and eigenvalues
         tau A = sum tau_m A_m,   o = 1 - exp(-tau)
 
-    tau is the optical thickness of a Gaussian, and A^2 = s1^2 s2^2 + s2^2 s3^2 + s3^2 s1^2 of its scales stands for
-    its cross-section. So two in one place stop as much light as both did, and two side by side become a larger one of
-    about their opacity.
+    tau is the optical thickness of a Gaussian, and A, with A^2 = s1^2 s2^2 + s2^2 s3^2 + s3^2 s1^2, stands for its
+    cross-section. So two in one place, merged, absorb as much light as before, and two side by side become a larger one
+    of about their opacity.
 
     Parameters
     ----------
@@ -144,8 +144,8 @@ def merge_neighbours(gaussians: Gaussians, importance: Floats, n: int) -> Edit:
     Returns
     -------
     edit : Edit
-        Ordered by the first member of each. Who was not merged stays the same; a merged row is new, and its parent is
-        its most important member.
+        Ordered by the first member of each cluster. Rows that were not merged stay the same; a merged row is new, and
+        its parent is its most important member.
 
     Raises
     ------
@@ -161,14 +161,14 @@ def merge_neighbours(gaussians: Gaussians, importance: Floats, n: int) -> Edit:
 
 
 def merge_clusters(gaussians: Any, weights: Floats, labels: Ints) -> Edit:
-    """Merge each cluster into one Gaussian that has its moments: the equations of :func:`merge_neighbours`.
+    """Merge each cluster into one Gaussian with the cluster's moments: the equations of :func:`merge_neighbours`.
 
     Parameters
     ----------
     gaussians : Gaussians, or another population with its fields
         N rows; of a further field the weighted mean is taken.
     weights : ndarray of shape (N,), float64
-        Above 0; only their ratios inside of a cluster count.
+        Above 0; only their ratios within a cluster count.
     labels : ndarray of shape (N,) of ids
         Number of each row's cluster, from 0 on without gaps.
 
@@ -190,7 +190,7 @@ def merge_clusters(gaussians: Any, weights: Floats, labels: Ints) -> Edit:
 
 
 def optical_masses(gaussians: Any) -> Floats:
-    """Return ``tau A`` [N] of each Gaussian, float64: the light that it stops, which merging conserves."""
+    """Return ``tau A`` [N] of each Gaussian, float64: the light that it absorbs, which merging conserves."""
     scales = np.exp(gaussians.log_scales.astype(np.float64))
     return np.logaddexp(0.0, gaussians.opacity_logits.astype(np.float64)) * _cross_sections(scales**2)
 
@@ -203,7 +203,7 @@ def _places(gaussians: Gaussians) -> Floats:
 
 
 def _clusters(places: Floats, weights: Floats, n: int) -> Ints:
-    """Return for each row the number of its cluster, of which there are ``n``, in the order of their first rows."""
+    """Return for each row the number of its cluster; the ``n`` clusters are numbered by their first rows."""
     labels = np.arange(len(places))
     sums = np.column_stack([weights[:, None] * places, weights])  # [C, 7]
     while len(sums) > n:
@@ -223,11 +223,11 @@ def _clusters(places: Floats, weights: Floats, n: int) -> Ints:
 def mutual_neighbours(places: Floats) -> Ints:
     """Return pairs [P, 2] of rows that are nearest to each other, the lower row first.
 
-    Where distances are equal, neighbours may go round in a circle (points in one place, grids). All pairs of a row and
-    its neighbour are therefore ranked, and a pair counts if it is the first of both its rows: the closest always does.
+    Where distances are equal (coincident points, grids), nearest neighbours may form cycles. All pairs of a row and its
+    neighbour are therefore ranked, and a pair counts if it is the first of both its rows: the closest always does.
     """
     rows = np.arange(len(places))
-    distances, nearest = cKDTree(places).query(places, 2)  # [M, 2] a row itself need not come before one in its place
+    distances, nearest = cKDTree(places).query(places, 2)  # [M, 2] a row need not come before a coincident one
     is_self = nearest[:, 0] == rows
     other = np.where(is_self, nearest[:, 1], nearest[:, 0])
     order = np.argsort(np.where(is_self, distances[:, 1], distances[:, 0]), kind="stable")
@@ -239,7 +239,7 @@ def mutual_neighbours(places: Floats) -> Ints:
 
 
 def _merged(members: Any, weights: Floats, labels: Ints) -> Gaussians:
-    """Return one Gaussian, float64, per cluster; the members of a cluster stand together."""
+    """Return one Gaussian, float64, per cluster; the members of a cluster are contiguous."""
     starts = np.flatnonzero(np.diff(labels, prepend=-1))  # [n]
     sizes = np.diff(starts, append=len(labels))
     shares = weights / np.repeat(np.add.reduceat(weights, starts), sizes)  # [M]
@@ -252,11 +252,11 @@ def _merged(members: Any, weights: Floats, labels: Ints) -> Gaussians:
     scales = np.exp(members.log_scales)
     sigmas = mean_of(covariances(members.quats, scales) + offsets[:, :, None] * offsets[:, None, :])  # [n, 3, 3]
     variances, axes = np.linalg.eigh(sigmas)
-    # No variance is below the least of the members', but rounding does not know that.
+    # No variance is below the least of the members', except by rounding.
     variances = np.maximum(variances, np.minimum.reduceat(scales.min(axis=1) ** 2, starts)[:, None])
     axes[np.linalg.det(axes) < 0, :, 0] *= -1  # a rotation, not a reflection
 
-    thickness = np.logaddexp(0.0, members.opacity_logits)  # tau = -ln(1 - o), of the logit
+    thickness = np.logaddexp(0.0, members.opacity_logits)  # tau = -ln(1 - o), from the logit
     tau = np.add.reduceat(thickness * _cross_sections(scales**2), starts) / _cross_sections(variances)
     averages = members._make(map(mean_of, members))
     merged: Gaussians = averages._replace(
@@ -269,22 +269,22 @@ def _merged(members: Any, weights: Floats, labels: Ints) -> Gaussians:
 
 
 def _cross_sections(variances: Floats) -> Floats:
-    """Return s1 s2, s2 s3 and s3 s1 added as squares, of variances s^2 [M, 3]: proportional to an area [M]."""
+    """Return A [M] with A^2 = s1^2 s2^2 + s2^2 s3^2 + s3^2 s1^2, given variances s^2 [M, 3]: an area up to a factor."""
     s1, s2, s3 = variances.T
     return np.sqrt(s1 * s2 + s2 * s3 + s3 * s1)
 
 
 def reinitialised(gaussians: Gaussians, sh_degree: int) -> Gaussians:
-    """Return Gaussians with these centres and colours, and all else as at the start of training.
+    """Return Gaussians with these centres and colours, and all other fields as at the start of training.
 
-    Mini-Splatting does it after it has sampled: what remains has to grow over the gaps.
+    Mini-Splatting does this after sampling: the Gaussians that remain have to grow over the gaps.
 
     Parameters
     ----------
     gaussians : Gaussians
         At least 4.
     sh_degree : int
-        Degree that is stored from now on; coefficients above 0 are zero.
+        Stored degree from now on; coefficients above degree 0 are zero.
 
     Returns
     -------

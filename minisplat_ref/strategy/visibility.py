@@ -1,28 +1,28 @@
-"""Visibility culling of Mini-Splatting2: each training view is drawn with the Gaussians that matter to it.
+"""Visibility culling of Mini-Splatting2: draw each training view only with the Gaussians that matter to it.
 
 A Gaussian is *visible* in a view if it belongs to the most important ones that together carry 0.99 of the view's blend
-weight (:func:`minisplat_ref.strategy.importance.collect_importance`). The table [N, V] of who is visible where is
-measured now and then, with culling off, on the training views alone; in between, children have their parent's row. Left
-out: skipping the others when a view is drawn, which is the renderer's.
+weight (:func:`minisplat_ref.strategy.importance.collect_importance`). The table [N, V] of this visibility is measured
+now and then, with culling off, on the training views alone; in between, children inherit their parent's row. Left out:
+skipping the others when a view is drawn, which the renderer does.
 """
 
 import numpy as np
 
 from minisplat_ref.types import Bools, Floats, Ints
 
-COUNT_OFFSET = 0.1  # views; the released code's, against division by zero
+COUNT_OFFSET = 0.1  # views; against division by zero, from the released code
 
 
 def gradient_factors(is_visible: Bools, frustum_count: Ints) -> Floats:
-    """Return what the positional gradients are multiplied by while views are culled.
+    """Return the factors by which positional gradients are multiplied while views are culled.
 
     Density control compares the mean gradient, over the views that see the Gaussian, with a threshold that was chosen
-    without culling. Culling takes away those views in which the Gaussian hardly counts and its gradient is small, so
-    the mean rises. With the views left out at zero it is the mean over all views again::
+    without culling. Culling removes the views in which the Gaussian hardly counts and its gradient is small, so the
+    mean rises. Counting those views as zero restores the mean over all views::
 
         f = (views in which it is visible) / (views with it in the frustum + 0.1)
 
-    The paper does not mention the factor, the released code has it.
+    The factor is in the released code, not in the paper.
 
     Parameters
     ----------
@@ -40,17 +40,17 @@ def gradient_factors(is_visible: Bools, frustum_count: Ints) -> Floats:
 
 
 def seen_by_few(is_visible: Bools, least_views: int) -> Bools:
-    """Tell which Gaussians are visible in fewer than ``least_views`` training views.
+    """Return which Gaussians are visible in fewer than ``least_views`` training views.
 
-    Depth from one view is a guess; the released code removes what fewer than two see. Of a scene with two views it
-    would leave next to nothing, so no more than half of the views, rounded up, are ever asked for.
+    Depth from one view is a guess; the released code removes what fewer than two views see. In a scene with two views
+    this would leave next to nothing, so at most half of the views, rounded up, are required.
 
     Parameters
     ----------
     is_visible : ndarray of shape (N, V) of booleans
         Per training view.
     least_views : int
-        2 in the released code; 0 for nobody.
+        2 in the released code; 0 for none.
 
     Returns
     -------
@@ -61,7 +61,7 @@ def seen_by_few(is_visible: Bools, least_views: int) -> Bools:
 
 
 def culled_fraction(is_visible: Bools, frustum_count: Ints) -> float:
-    """Return which part of the (Gaussian, view) pairs culling removes, of those that the frustum leaves.
+    """Return the fraction of the (Gaussian, view) pairs in the frustum that culling removes.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""Training: the state, the loop, the schedule of what happens when, Adam and its learning rates."""
+"""Training: the state, the loop, the schedule of events, Adam and its learning rates."""

@@ -3,7 +3,7 @@
     m <- m + (1 - beta1) (g - m)          v <- v + (1 - beta2) (g^2 - v)
     p <- p - rate  m / (1 - beta1^t)  /  (sqrt(v / (1 - beta2^t)) + eps)
 
-Dense is what 3DGS uses. *Visible-only* is the sparse Adam of 3DGS-accel (Taming 3DGS): a Gaussian that the view did not
+3DGS uses dense Adam. *Visible-only* is the sparse Adam of 3DGS-accel (Taming 3DGS): a Gaussian that the view did not
 see keeps its parameters and moments, where dense Adam would let it coast on its momentum; and there are no bias
 corrections (the two denominators 1 - beta^t), so a new Gaussian's first steps are up to (1-beta1)/sqrt(1-beta2) = 3.2
 times the rate. Mini-Splatting2 is visible-only with the corrections.
@@ -22,18 +22,18 @@ Parameters = TypeVar("Parameters")  # a population, or a mapping of shared param
 
 
 class AdamRule(NamedTuple):
-    """Which Adam."""
+    """A variant of Adam."""
 
     is_visible_only: bool
     """Update only the rows that the view sees."""
     has_bias_correction: bool
-    """Divide the moments by 1 - beta^t, t the steps taken since the moments were zeroed."""
+    """Divide the moments by 1 - beta^t, where t counts the steps since the moments were zeroed."""
     beta1: float = 0.9
     """Decay of the mean gradient."""
     beta2: float = 0.999
     """Decay of the mean squared gradient."""
     eps: float = 1e-15
-    """Added to the root. Far below the usual 1e-8, because the gradient of one Gaussian is often as small as that."""
+    """Added to the root. Far below the usual 1e-8, because the gradient of one Gaussian is often that small."""
 
 
 class AdamState(NamedTuple, Generic[Parameters]):
@@ -80,7 +80,7 @@ def adam_step(
     state : AdamState
         Its arrays are updated in place.
     rates : mapping of str to float
-        The learning rate of each field by name; further names do not matter.
+        The learning rate of each field by name; other names are ignored.
     rule : AdamRule
     visible_ids : ndarray of shape (V,)
         Rows that a visible-only rule updates, ascending; the others are neither read nor written.

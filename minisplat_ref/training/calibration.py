@@ -1,17 +1,17 @@
-"""Exposure and pose of each photograph, trained along with the scene: neither is a property of the scene itself.
+"""Exposure and pose of each photograph, trained along with the scene although neither is a property of the scene.
 
-Both are shared parameters of the model with one row per training view, and each is a renderer that wraps another one.
+Both are shared parameters of the model with one row per training view, and each has a renderer that wraps another one.
 A view that is not trained on (``view_id`` -1) has no row, and is rendered as if nothing were calibrated. Both are off
 unless a recipe or ``--set exposure=true``, ``--set pose=true`` switches them on.
 
-*Exposure*, of the 2024 update of 3DGS: the colours of view v pass through an affine map, ``c' = A_v c + b_v``, stored
-as E_v = [A_v | b_v], 3 x 4, which starts as the identity. The released code multiplies by its matrix from the other
-side, so that it stores the transpose of A_v. It also clamps c' to [0, 1], which stops the gradient of what is too
-bright; here nothing is clamped. The scene's colours and the maps are known up to one map that all views have in common.
+*Exposure*, from the 2024 update of 3DGS: the colours of view v pass through an affine map, ``c' = A_v c + b_v``, stored
+as E_v = [A_v | b_v], 3 x 4, which starts as the identity. The released code multiplies from the other side, so it
+stores the transpose of A_v. It also clamps c' to [0, 1], which stops the gradient where the result is too bright; here
+nothing is clamped. The scene's colours and the maps are determined up to one map that all views share.
 
 *Pose*: the pose of view v is corrected on its left, ``R' = Q_v R, t' = Q_v t + u_v`` with ``Q_v = exp([w_v]_x)``, for a
-rotation vector w (radians, camera frame) and a shift u (world units, camera frame). The scene and the poses are known
-up to a similarity transform that all views have in common: held-out poses have to be aligned before they are compared.
+rotation vector w (radians, camera frame) and a shift u (world units, camera frame). The scene and the poses are
+determined up to a similarity transform that all views share: align held-out poses before comparing them.
 """
 
 from collections.abc import Callable
@@ -25,18 +25,18 @@ from minisplat_ref.training.rates import LogLinear, Rates
 from minisplat_ref.types import Floats, Model, RenderOutput, View
 
 EXPOSURES, ROTATIONS, SHIFTS = "exposures", "pose_rotations", "pose_shifts"  # names of the shared parameters
-LEAST_ANGLE = 1e-4  # radians; below it a series replaces (a - sin a) / a^3, of which rounding leaves few digits
+LEAST_ANGLE = 1e-4  # radians; below it a series replaces (a - sin a) / a^3, which would cancel
 
 
 class Calibration(NamedTuple):
-    """Parameters that each training photograph has, and how they enter its rendering."""
+    """Parameters of each training photograph, and how they enter its rendering."""
 
     name: str
     """``--set NAME=true`` switches it on."""
     initial: Callable[[int], dict[str, Floats]]
-    """``initial(n_views)`` returns the shared parameters before training, by name; they change no rendering."""
+    """``initial(n_views)`` returns the initial shared parameters by name; they change no rendering."""
     wrap: Callable[[Renderer], Renderer]
-    """Returns a renderer that applies them around the given one."""
+    """Wraps the given renderer in one that applies them."""
     rates: Rates
     """Learning rates of the shared parameters."""
     short_run_exponent: float = 0.0
@@ -58,7 +58,7 @@ def expose(colors: Floats, exposure: Floats) -> Floats:
     Parameters
     ----------
     colors : ndarray of shape (H, W, 3)
-        Linear or not: whatever the photographs are compared in.
+        In the colour space in which photographs are compared, linear or not.
     exposure : ndarray of shape (3, 4)
         E = [A | b].
 
@@ -90,7 +90,7 @@ def expose_vjp(colors: Floats, exposure: Floats, v_exposed: Floats) -> tuple[Flo
     -------
     v_colors : ndarray of shape (H, W, 3)
     v_exposure : ndarray of shape (3, 4)
-        float64, as the sums over millions of pixels are.
+        float64, because it sums over millions of pixels.
     """
     A = exposure[:, :3]
     v_A = (v_exposed.swapaxes(1, 2) @ colors).sum(axis=0, dtype=np.float64)  # [3, 3] the rows of pixels one by one
@@ -103,18 +103,18 @@ class _ExposureTape(NamedTuple):
     model: Model
     view: View
     colors: Floats  # [H, W, 3] before the map
-    rgb: slice  # where the image has them
+    rgb: slice  # their channels in the image
 
 
 def with_exposures(inner: Renderer) -> Renderer:
-    """Return a renderer that maps the colours of each training view by its exposure; other channels stay."""
+    """Return a renderer that applies each training view's exposure to its colours; other channels stay."""
 
     def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, _ExposureTape]:
         output, tape = inner.render(model, view, request)
         rgb = inner.channels(request.wants)["rgb"]
         colors = output.image[..., rgb]
         if _has_row(model, view, EXPOSURES):
-            image = output.image.copy()  # the inner tape may keep the other one
+            image = output.image.copy()  # the inner tape may refer to the original
             image[..., rgb] = expose(colors, model.shared[EXPOSURES][view.view_id])
             output = output._replace(image=image)
         return output, _ExposureTape(tape, model, view, colors, rgb)
@@ -135,7 +135,7 @@ def with_exposures(inner: Renderer) -> Renderer:
 
 
 def zero_corrections(n_views: int) -> dict[str, Floats]:
-    """Return zero rotation vectors and shifts for every view, [V, 3] each, float64 as poses are."""
+    """Return zero rotation vectors and shifts for every view, [V, 3] each, float64 like poses."""
     return {ROTATIONS: np.zeros((n_views, 3)), SHIFTS: np.zeros((n_views, 3))}
 
 
@@ -164,7 +164,7 @@ def correct_pose(R: Floats, t: Floats, w: Floats, u: Floats) -> tuple[Floats, Fl
 def correct_pose_vjp(R: Floats, t: Floats, w: Floats, v_R: Floats, v_t: Floats) -> tuple[Floats, Floats]:
     """Gradient of :func:`correct_pose` with respect to w and u.
 
-    A small change of w turns Q further by J dw, J its left Jacobian: ``dQ = [J dw]_x Q``. Hence ::
+    A small change dw of w rotates Q further by J dw, with the left Jacobian J: ``dQ = [J dw]_x Q``. Hence ::
 
         v_Q = v_R' R^T + v_t' t^T,   M = v_Q Q^T
         v_w = J^T (M_21 - M_12, M_02 - M_20, M_10 - M_01),   v_u = v_t'
@@ -208,14 +208,14 @@ def left_jacobian(w: Floats) -> Floats:
     x, y, z = w
     W = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     first = 0.5 * np.sinc(a / (2 * np.pi)) ** 2  # 1 - cos a = 2 sin^2(a / 2); NumPy's sinc(x) is sin(pi x) / (pi x)
-    second = 1 / 6 if a < LEAST_ANGLE else (a - np.sin(a)) / a**3  # the series goes on with - a^2 / 120
+    second = 1 / 6 if a < LEAST_ANGLE else (a - np.sin(a)) / a**3  # the next term of the series is -a^2 / 120
     return np.eye(3) + first * W + second * W @ W
 
 
 class _PoseTape(NamedTuple):
     inner: Any  # tape of the wrapped renderer
     model: Model
-    view: View  # with the pose that was given
+    view: View  # with its given pose
 
 
 def with_poses(inner: Renderer) -> Renderer:
@@ -262,10 +262,10 @@ POSE = Calibration(
     "pose",
     zero_corrections,
     with_poses,
-    # The rate of gsplat's trainer. In R iterations a parameter can travel 0.2 rate R, here 0.06 radians; a shorter run
-    # keeps this path, not the rate. Measured on 24 cameras turned by 0.52 degrees, rate R and the degrees that remain:
+    # The rate of gsplat's trainer. In R iterations a parameter can move by 0.2 rate R, here 0.06 radians; a shorter run
+    # keeps this path length, not the rate. Measured on 24 cameras turned by 0.52 degrees, as rate R: remaining degrees,
     # in 600 iterations 0.075: 0.35, 0.15: 0.31, 0.3: 0.31, 0.6: 0.32, 1.2: 0.35; in 2400 0.34, 0.27, 0.27, 0.31, 0.35.
-    # A longer path spoils what has been found, a shorter one does not get there.
+    # A longer path spoils what has been found, a shorter one does not reach it.
     Rates({ROTATIONS: LogLinear(1e-5, 1e-7, 30_000), SHIFTS: LogLinear(1e-5, 1e-7, 30_000)}, frozenset({SHIFTS})),
     short_run_exponent=1.0,
 )

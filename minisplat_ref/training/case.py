@@ -1,4 +1,4 @@
-"""One view of one iteration as a file: what its numbers depend on, to be computed again elsewhere."""
+"""Save one view of one iteration as a file with everything its numbers depend on, to compute them again elsewhere."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,7 +15,7 @@ from minisplat_ref.training.losses import LossTerm
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.types import Camera, Floats, Model, Scene, View
 
-_KIND = "case"  # tells the file from a checkpoint
+_KIND = "case"  # distinguishes the file from a checkpoint
 
 
 class Case(NamedTuple):
@@ -25,14 +25,14 @@ class Case(NamedTuple):
     model: Model
     view: View
     scene: Scene
-    """A loss term may look at its points and its extent."""
+    """A loss term may use its points and its extent."""
     request: Request
     recipe: Recipe
     """Its renderer and loss terms."""
 
     @property
     def terms(self) -> Sequence[LossTerm]:
-        """The loss terms that are due."""
+        """Return the loss terms that are due."""
         return [term for term in self.recipe.losses if term.is_due(self.step)]
 
 
@@ -44,9 +44,9 @@ def save_case(path: Path, case: Case, wrong: str, settings: Mapping[str, Any]) -
     path : Path
     case : Case
     wrong : str
-        What was found in it.
+        What was found to be wrong in it.
     settings : mapping
-        Of the run; anything that JSON can hold. Empty where it was none of the command line.
+        Of the run; anything that JSON can hold. Empty unless the run was started from the command line.
     """
     view, request, camera = case.view, case.request, case.view.camera
     optional = {
@@ -84,18 +84,18 @@ def save_case(path: Path, case: Case, wrong: str, settings: Mapping[str, Any]) -
 
 
 class SavedCase(NamedTuple):
-    """What a file holds; the recipe is found by whoever knows where recipes are."""
+    """The contents of a file; the caller, which knows where recipes are, supplies the recipe."""
 
     arrays: Mapping[str, Any]
     metadata: Mapping[str, Any]
 
     @property
     def wrong(self) -> str:
-        """What was found."""
+        """Return what was found to be wrong."""
         return self.metadata["wrong"]
 
     def of(self, recipe: Recipe) -> Case:
-        """Return the case, of the recipe's population."""
+        """Return the case, with the recipe's type of population."""
         arrays, about, request = self.arrays, self.metadata["view"], self.metadata["request"]
         fx, fy, cx, cy, width, height = self.metadata["intrinsics"]
         camera = Camera(arrays["view.R"], arrays["view.t"], fx, fy, cx, cy, int(width), int(height))
@@ -129,7 +129,7 @@ def load_case(path: str | Path) -> SavedCase:
     Raises
     ------
     InputError
-        The file is missing, damaged, or something else.
+        The file is missing, damaged, or not a case.
     """
     arrays, metadata = load_checkpoint(path)
     if metadata.get("kind") != _KIND:

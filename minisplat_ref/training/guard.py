@@ -1,10 +1,10 @@
-"""Numbers that go wrong, caught where they arise: the first that is not finite, by stage, view and row.
+"""Catch numbers that are not finite where they arise, and name the first by stage, view and row.
 
 One NaN in a gradient is a NaN parameter after the step, and the projection culls what is not finite: the picture loses
-a Gaussian, and nothing says so. Of every iteration the loss is looked at, which costs nothing; every few iterations,
-and when rows come or go, all parameters and their gradient. If a number is wrong there, the view is drawn and
-differentiated again with a backend whose stages are looked at one by one: the first whose output is not finite is the
-culprit. What that took is written to a file, which ``minisplat-ref oracle replay FILE`` runs through every backend.
+a Gaussian, and nothing says so. The loss is checked in every iteration, which costs nothing; all parameters and their
+gradient every few iterations, and when rows are added or removed. If one of them is not finite, the view is rendered
+and differentiated again with a backend that checks every stage: the first whose output is not finite is the culprit.
+Its inputs are written to a file, which ``minisplat-ref oracle replay FILE`` runs through every backend.
 """
 
 import math
@@ -24,7 +24,7 @@ from minisplat_ref.training.losses import Loss, Rendered, total_loss
 from minisplat_ref.types import NOTHING, Floats, Model, RenderOutput
 
 FILE = "bad-numbers-{}.npz"  # of an iteration
-PARAMETERS, GRADIENT = "parameters", "gradient"  # what stands before and after the stages
+PARAMETERS, GRADIENT = "parameters", "gradient"  # what is checked before and after the stages
 _WATCHED: dict[str, tuple[str, ...]] = {
     "project": ("means2d", "depths", "conics", "opacities"),
     "sh_colors": ("colors",),
@@ -35,14 +35,14 @@ _WATCHED: dict[str, tuple[str, ...]] = {
     "sh_colors_vjp": ("means", "sh_dc", "sh_rest"),
     "project_vjp": ("means", "quats", "scales", "opacities"),
 }
-"""Of every stage the outputs that are numbers; a stage with one output has no name for it."""
+"""The numeric outputs of every stage; a stage with one output has no name for it."""
 
 
 class Wrong(NamedTuple):
     """A number that is not finite."""
 
     stage: str
-    """Of the backend, ``parameters``, ``gradient``, or what an event is called."""
+    """A stage of the backend, ``parameters``, ``gradient``, or an event's name."""
     name: str
     """Of the array; derivatives begin with ``v_``."""
     place: tuple[int, ...]
@@ -52,7 +52,7 @@ class Wrong(NamedTuple):
     """Shape of the array."""
 
     def __str__(self) -> str:
-        """Say it in half a line."""
+        """Describe it in half a line."""
         if not self.place:
             return f"{self.stage}: {self.name} is {self.value}"
         if self.name in ("image", "alpha", "v_image"):
@@ -71,17 +71,17 @@ def first_wrong(stage: str, arrays: Mapping[str, Any]) -> Wrong | None:
 
 
 class Examination(NamedTuple):
-    """What a view's rendering and gradient are."""
+    """A view's rendering and gradient, and what is wrong with them."""
 
     wrong: Wrong | None
-    """The first number that is not finite, in the order of computing."""
+    """The first number that is not finite, in the order of computation."""
     loss: Loss
     output: RenderOutput
     gradient: RenderGradient
 
 
 def examine(case: Case) -> Examination:
-    """Draw and differentiate a view, and look at every stage on the way."""
+    """Render and differentiate a view, and check every stage on the way."""
     renderer = case.recipe.renderer
     found: list[Wrong] = []
 
@@ -91,7 +91,7 @@ def examine(case: Case) -> Examination:
 
     look(PARAMETERS, _parameters(case.model))
     request = case.request._replace(backend=_watched(case.request.backend, look))
-    with np.errstate(all="ignore"):  # it is known that something is wrong
+    with np.errstate(all="ignore"):  # the checks report what is wrong
         output, tape = renderer.render(case.model, case.view, request)
         channels = renderer.channels(request.wants)
         rendered = Rendered(output, channels, case.view, case.scene, case.model, case.step, request)
@@ -107,14 +107,14 @@ def _parameters(model: Model) -> dict[str, Floats]:
 
 
 def _gradients(gradient: RenderGradient, loss: Loss) -> dict[str, Floats]:
-    """Return derivatives with respect to the parameters: those through the image, and the direct ones of loss terms."""
+    """Return the derivatives with respect to the parameters: those via the image, and the direct ones of loss terms."""
     through_image = {**fields_of(gradient.gaussians), **gradient.shared}
     direct = {f"{name} (direct)": array for name, array in {**loss.v_gaussians, **loss.v_shared}.items()}
     return {f"v_{name}": array for name, array in {**through_image, **direct}.items()}
 
 
 def _watched(backend: Backend, look: Callable[[str, Mapping[str, Any]], None]) -> Backend:
-    """Return the backend with stages whose outputs are looked at."""
+    """Return the backend with every stage wrapped so that ``look`` sees its outputs."""
 
     def watched(stage: str) -> Callable[..., Any]:
         function = getattr(backend, stage)
@@ -131,41 +131,41 @@ def _watched(backend: Backend, look: Callable[[str, Mapping[str, Any]], None]) -
 
 
 def _outputs(stage: str, output: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the outputs of a stage that are numbers, by name."""
+    """Yield the numeric outputs of a stage by name."""
     names, prefix = _WATCHED[stage], "v_" if stage.endswith("_vjp") else ""
     if len(names) == 1:
-        yield prefix + names[0], output[0] if stage == "photometric_loss" else output  # whose tape is its own affair
+        yield prefix + names[0], output[0] if stage == "photometric_loss" else output  # without the loss's tape
     else:
         yield from ((prefix + name, getattr(output, name)) for name in names)
 
 
 class BadNumbers(InputError):
-    """A training has been stopped, because a number in it was not finite."""
+    """A training was stopped because a number in it was not finite."""
 
 
 class Guard(NamedTuple):
-    """How closely a training is watched, and what happens when a number goes wrong."""
+    """How often a training's numbers are checked, and what happens when one is not finite."""
 
     every: int = 10
-    """Iterations after which parameters and gradient are looked at; the loss always is."""
+    """Parameters and gradient are checked every so many iterations, the loss in every one."""
     drops_steps: bool = False
-    """Leave out the step whose gradient is wrong, and go on; then every iteration is looked at."""
+    """Skip the step whose gradient is wrong, and go on; then every iteration is checked."""
     folder: Path | None = None
-    """Where the case is written; nowhere by default."""
+    """Folder to which the case is written; by default it is not."""
     settings: Mapping[str, Any] = NOTHING
-    """What the file is to say of the run, for whoever replays it."""
+    """What the file says about the run, for those who replay it."""
 
     def is_due(self, step: int) -> bool:
-        """Return whether iteration ``step`` is looked at closely."""
+        """Return whether parameters and gradient are checked in iteration ``step``."""
         return self.drops_steps or step % self.every == 0
 
     def wrong_in(self, case: Case, loss: Loss, gradient: RenderGradient) -> Wrong | None:
-        """Return what is wrong where the step is to be dropped, None where it may be taken.
+        """Return what is wrong if the step is to be dropped, None if it may be taken.
 
         Raises
         ------
         BadNumbers
-            A number is wrong, and steps are not dropped, or it is a parameter, which no dropping mends.
+            A number is wrong and steps are not dropped, or it is a parameter, which dropping a step does not repair.
         """
         is_close = self.is_due(case.step)
         if math.isfinite(loss.value) and not (
@@ -179,7 +179,7 @@ class Guard(NamedTuple):
         raise self.stopped(case, wrong)
 
     def check_parameters(self, case: Case, stage: str) -> None:
-        """Look at the parameters after a step or an event.
+        """Check the parameters after a step or an event.
 
         Raises
         ------
@@ -190,7 +190,7 @@ class Guard(NamedTuple):
             raise self.stopped(case, wrong)
 
     def stopped(self, case: Case, wrong: Wrong) -> BadNumbers:
-        """Write the case, and return the error that says what is wrong."""
+        """Write the case and return the error that says what is wrong."""
         text = f"iteration {case.step}, view {case.view.name}, {wrong}"
         if wrong.stage == PARAMETERS and self.every > 1:
             text += f", since one of the last {self.every} iterations; --check-every 1 finds which"
@@ -199,7 +199,7 @@ class Guard(NamedTuple):
         return BadNumbers(text)
 
     def _save(self, case: Case, wrong: Wrong) -> Path | None:
-        """Write the case, of many dropped steps the first, and return where."""
+        """Write the case, only the first of many dropped steps, and return where."""
         if self.folder is None or (self.drops_steps and any(self.folder.glob(FILE.format("*")))):
             return None
         path = self.folder / FILE.format(case.step)

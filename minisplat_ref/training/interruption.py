@@ -1,6 +1,6 @@
-"""Ctrl-C, and when it may come: half an Adam step must not be saved.
+"""Defer Ctrl-C while the state changes, so that half an Adam step is never saved.
 
-SIGTERM, which ``docker stop`` and batch systems send before they kill, counts as Ctrl-C where the program has said so
+SIGTERM, which ``docker stop`` and batch systems send before they kill, counts as Ctrl-C where the program asks for it
 (:func:`terminated_like_interrupted`).
 """
 
@@ -12,22 +12,22 @@ from contextlib import AbstractContextManager, contextmanager
 from types import FrameType
 from typing import Any, Self
 
-IMPATIENCE = 1.0  # seconds; a second Ctrl-C after them is meant, one before may be the same, sent along by a parent
+IMPATIENCE = 1.0  # seconds; a second Ctrl-C that comes sooner may be the first one again, relayed by a parent
 
 
 class Interruptions(AbstractContextManager["Interruptions"]):
-    """Raises KeyboardInterrupt at once, but between :meth:`hold` and :meth:`release` only at the release.
+    """Raises KeyboardInterrupt at once, but between :meth:`defer` and :meth:`release` only at the release.
 
-    Who presses again while it is held back gets it at once: what was held together is then half done.
+    A second Ctrl-C in between raises it at once, and may leave the work of that section half done.
     """
 
     def __init__(self) -> None:
-        self._is_held = False
+        self._is_deferring = False
         self._pressed_at: float | None = None
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
-        """Take the signals over, in the main thread: Python delivers none to others."""
+        """Install the signal handlers, in the main thread: Python delivers signals to no other."""
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 if number == signal.SIGINT or callable(signal.getsignal(number)):
@@ -35,19 +35,19 @@ class Interruptions(AbstractContextManager["Interruptions"]):
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Give the signals back; raise what was held back and not released, unless another error is on its way."""
+        """Restore the handlers; raise an interruption that is still deferred, unless another error is in flight."""
         for number, handler in self._previous.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)  # None: not installed from Python
         if kind is None and self._pressed_at is not None:
             raise KeyboardInterrupt
 
-    def hold(self) -> None:
-        """Hold interruptions back from now on."""
-        self._is_held = True
+    def defer(self) -> None:
+        """Defer interruptions from now on."""
+        self._is_deferring = True
 
     def release(self) -> None:
-        """Let them through again, beginning with one that came meanwhile."""
-        self._is_held = False
+        """Stop deferring; raise now if an interruption came in the meantime."""
+        self._is_deferring = False
         if self._pressed_at is not None:
             raise KeyboardInterrupt
 
@@ -55,7 +55,7 @@ class Interruptions(AbstractContextManager["Interruptions"]):
         now = time.monotonic()
         is_impatient = self._pressed_at is not None and now - self._pressed_at > IMPATIENCE
         self._pressed_at = now if self._pressed_at is None else self._pressed_at
-        if not self._is_held or is_impatient:
+        if not self._is_deferring or is_impatient:
             raise KeyboardInterrupt
 
 

@@ -1,11 +1,11 @@
 """The training loop: one photograph, one gradient step, and whatever the recipe says is due.
 
-Order inside an iteration: render, loss, gradients, Adam, then the events that are due. 3DGS runs its density control
-*before* Adam, and because it replaces the parameter tensors, that iteration's step is silently lost (likewise in
-Mini-Splatting; gsplat steps first, as here). Here no step is lost, the last iteration's included.
+The order inside an iteration is: render, loss, gradients, Adam, then the events that are due. 3DGS runs its density
+control *before* Adam, and because it replaces the parameter tensors, that iteration's step is silently lost (likewise
+in Mini-Splatting; gsplat steps first, as here). Here no step is lost, not even the last.
 
-While a recipe warms up on views of half the size, they are the scene's views to everything in the loop. A culling table
-of Mini-Splatting2, if an event has made one, says which Gaussians take part in a view.
+While a recipe warms up on views of half the size, these are the scene's views for everything in the loop. If an event
+has made a culling table (Mini-Splatting2), it says which Gaussians are rendered in a view.
 """
 
 import json
@@ -38,7 +38,7 @@ from minisplat_ref.training.schedule import During, Event, Recipe, action_name, 
 from minisplat_ref.training.state import FiredEvent, Iteration, StepReport, TrainState, begin_cooling
 from minisplat_ref.types import Floats, Ints, Scene, View, numbered
 
-HALF_SIZE = "half_size_views"  # what training on views of half the size is called in the record of what fired
+HALF_SIZE = "half_size_views"  # name of training on views of half the size in the record of what fired
 SHARED_RULE = AdamRule(is_visible_only=False, has_bias_correction=True)  # shared parameters have no visible rows
 
 __all__ = ["StepReport", "TrainState", "initial_state", "load_state", "save_state", "train"]
@@ -96,14 +96,14 @@ def train(
     conventions: Conventions = GSPLAT_MAIN,
     guard: Guard = Guard(),  # noqa: B008  (a constant)
 ) -> TrainState:
-    """Train until ``recipe.iterations``, or until the recipe decides that it is enough.
+    """Train until ``recipe.iterations``, or until the recipe decides to stop.
 
     Parameters
     ----------
     scene : Scene
     recipe : Recipe
     seed : int
-        Seed of the whole run; without effect when ``state`` is given, which carries its generator.
+        Seed of the whole run; ignored when ``state`` is given, which has its own generator.
     state : TrainState, optional
         Where to start or continue, changed in place and returned; default ``initial_state(scene, recipe, seed)``.
     on_step : callable, optional
@@ -111,7 +111,7 @@ def train(
     backend : Backend
     conventions : Conventions
     guard : Guard
-        How closely numbers are watched, and what happens when one is not finite.
+        How often numbers are checked, and what happens when one is not finite.
 
     Returns
     -------
@@ -121,14 +121,14 @@ def train(
     Raises
     ------
     InputError
-        The scene has no training views or is not the one that ``state`` was trained on; a loss term says that the
-        scene lacks what it needs; a number is not finite; memory has no room for more Gaussians; or a photograph that
-        has to be read again is gone or has changed.
+        The scene has no training views or is not the one that ``state`` was trained on; it lacks what a loss term
+        needs; a number is not finite; more Gaussians do not fit into memory; or a photograph that has to be read again
+        is gone or has changed.
     KeyboardInterrupt
-        After Ctrl-C, at once, or at the end of the iteration where that has begun to change the state: the ``state``
-        that was passed in is whole and can be saved. Whoever presses again during it does not want to wait.
+        After Ctrl-C: at once, or at the end of the iteration if that has begun to change the state, so that the
+        ``state`` that was passed in is whole and can be saved. A second Ctrl-C does not wait for the end.
 
-    After any of these ``state.is_whole`` says whether the state stands between two iterations and can be saved.
+    After any of these ``state.is_whole`` says whether the state lies between two iterations and can be saved.
     """
     state = initial_state(scene, recipe, seed) if state is None else state
     scene = scene._replace(train_views=numbered(scene.train_views))
@@ -147,7 +147,7 @@ def train(
                 report = report._replace(fired=(_half_size_event(report, recipe), *report.fired))
             if on_step is not None:
                 on_step(report)
-            del report  # and with it the image, before the next is made
+            del report  # frees its image before the next is made
             interruptions.release()
     return state
 
@@ -160,14 +160,14 @@ def last_step(state: TrainState, recipe: Recipe, iterations: int | None = None) 
     state : TrainState
     recipe : Recipe
     iterations : int, optional
-        At most so many; those of the recipe by default.
+        Upper limit; that of the recipe by default.
     """
     most = recipe.iterations if iterations is None else iterations
     return most if recipe.cooling is None or state.pace.last_step is None else min(state.pace.last_step, most)
 
 
 def _cool_in_time(state: TrainState, recipe: Recipe) -> None:
-    """Let the rates fall from now on, if otherwise the given iterations would end before they have."""
+    """Begin the cool-down now if it would otherwise not end within the given iterations."""
     if recipe.cooling is None or state.pace.cooling_from is not None:
         return
     if state.step >= recipe.cooling.latest_start(recipe.iterations):
@@ -176,7 +176,7 @@ def _cool_in_time(state: TrainState, recipe: Recipe) -> None:
 
 
 def _check_fits(state: TrainState, scene: Scene, recipe: Recipe) -> None:
-    """Refuse a state of another scene: its views, and what it holds of each of them, must be those of the scene."""
+    """Refuse a state of another scene: its views, and its arrays with a row per view, must match the scene's."""
     n_views = len(scene.train_views)
     if max(state.view_order, default=0) >= n_views:
         raise InputError(f"scene {scene.name} has fewer training views than the run to continue: give the same scene")
@@ -192,11 +192,11 @@ def _check_fits(state: TrainState, scene: Scene, recipe: Recipe) -> None:
 
 
 def _iterate(state: TrainState, scene: Scene, around: "_Surroundings", interruptions: Interruptions) -> StepReport:
-    """Do one iteration; what fails before the step leaves the state as if the iteration had not begun."""
+    """Do one iteration; an error before the step leaves the state as if the iteration had not begun."""
     view_order, draws = list(state.view_order), state.rng.bit_generator.state
     try:
         differentiated = _differentiate(state, scene, around)
-        interruptions.hold()
+        interruptions.defer()
     except BaseException:
         state.view_order, state.rng.bit_generator.state = view_order, draws
         raise
@@ -226,11 +226,11 @@ class _Differentiated(NamedTuple):
     visible_ids: Ints
     """[V] rows that the view sees, ascending."""
     wrong: Wrong | None
-    """Why the step is to be left out, if it is."""
+    """Why the step is to be skipped, if it is."""
 
 
 def _differentiate(state: TrainState, scene: Scene, around: _Surroundings) -> _Differentiated:
-    """Draw a view and render it, and the gradient of its loss; of the state only the draws are changed."""
+    """Choose a view at random, render it and differentiate its loss; only the state's random draws change."""
     recipe, step = around.recipe, state.step + 1
     renderer = recipe.renderer
     view_id = _next_view(state, len(scene.train_views), recipe.cooling)
@@ -259,7 +259,7 @@ def _differentiate(state: TrainState, scene: Scene, around: _Surroundings) -> _D
 
 
 def _change(state: TrainState, scene: Scene, around: _Surroundings, differentiated: _Differentiated) -> StepReport:
-    """Take the step, and do what is due."""
+    """Take the step, and run the events that are due."""
     case, rendered, loss, gradient, visible_ids, wrong = differentiated
     recipe, backend, guard, view = around.recipe, around.backend, around.guard, case.view
     notes: list[str] = []
@@ -312,7 +312,7 @@ def _act(event: Event, state: TrainState, iteration: Iteration) -> FiredEvent:
 
 
 def _half_size_event(report: StepReport, recipe: Recipe) -> FiredEvent:
-    """Return the record of what is no event, but can be off where views are small: the first iteration tells it."""
+    """Return the first iteration's record of whether views are halved: no event, but small views are not halved."""
     n = n_rows(report.state.gaussians)
     return FiredEvent(HALF_SIZE, n, n, 0.0, f"until iteration {recipe.half_size_until}")
 
@@ -349,13 +349,13 @@ def _due(recipe: Recipe, step: int) -> list[Event]:
 
 
 def _with_direct(gradient: Any, direct: Mapping[str, Floats]) -> Any:
-    """Add derivatives that loss terms have with respect to parameters to those through the image."""
+    """Add the direct derivatives of loss terms with respect to parameters to those via the image."""
     sums = {name: fields_of(gradient)[name] + v for name, v in direct.items()}
     return {**gradient, **sums} if isinstance(gradient, Mapping) else gradient._replace(**sums)
 
 
 def _next_view(state: TrainState, n_views: int, cooling: Cooling | None) -> int:
-    """Draw without replacement; when all views that may be trained on have been seen, shuffle them anew."""
+    """Draw a view without replacement; when all views that may be trained on have been seen, shuffle them again."""
     if not state.view_order:
         state.view_order = state.rng.permutation(trained_ids(n_views, cooling, state.pace)).tolist()
     return state.view_order.pop()
@@ -367,7 +367,7 @@ def _following_view(state: TrainState, scene: Scene) -> View | None:
 
 
 def _half_size(scene: Scene, least: int) -> Scene:
-    """Halve the training views, unless they are so small that no structure would be left in them."""
+    """Halve the training views, unless they are so small that no structure would be left."""
     sizes = [min(view.camera.width, view.camera.height) for view in scene.train_views]
     if min(sizes) < 2 * least:
         return scene
@@ -385,7 +385,7 @@ def save_state(path: str | Path, state: TrainState, recipe: Recipe, *, previous:
     recipe : Recipe
         By which it is trained.
     previous : str or Path, optional
-        Where the checkpoint that stood at ``path`` is kept.
+        The checkpoint that was at ``path`` moves here.
     """
     assert state.is_whole, "half an iteration must not be saved"
     groups = {

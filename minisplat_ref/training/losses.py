@@ -1,9 +1,9 @@
-"""What is minimised: a sum of terms, each of which says how it falls when the rendering or the model changes.
+"""The loss: a weighted sum of terms, each of which returns its value and its derivatives.
 
-A term is a function of what was rendered, and returns its value with its *cotangents*, the derivatives of the value
-with respect to the channels of the image, alpha, the fields of the population and the shared parameters: whatever of
-these it depends on. The loss is ``L = sum_k w_k L_k``, and so are its cotangents. Which terms a method has, and from
-when to when, is data of its recipe.
+A term is a function of what was rendered. It returns its value with its *cotangents*, the derivatives of the value with
+respect to the channels of the image, alpha, the fields of the population and the shared parameters, as far as it
+depends on them. The loss is ``L = sum_k w_k L_k``, and its cotangents are the same sum. A recipe says as data which
+terms a method has, and in which iterations.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -17,12 +17,12 @@ from minisplat_ref.types import NOTHING, Floats, Model, RenderOutput, Scene, Vie
 
 
 class Rendered(NamedTuple):
-    """What a loss term may look at: one training view, rendered, and its surroundings."""
+    """The input of a loss term: one rendered training view and its context."""
 
     output: RenderOutput
-    """Image [H, W, D] with all channels that the terms asked for, and alpha."""
+    """Image [H, W, D] with all channels that the terms want, and alpha."""
     channels: Mapping[str, slice]
-    """Where each channel lies in the last axis of the image: ``rgb``, ``depth``, ..."""
+    """Each channel's slice of the last axis of the image: ``rgb``, ``depth``, ..."""
     view: View
     """The photograph."""
     scene: Scene
@@ -38,14 +38,14 @@ class Rendered(NamedTuple):
 
 
 class Cotangents(NamedTuple):
-    """Derivatives of a loss with respect to what it depends on directly; what is left out is zero."""
+    """Derivatives of a loss with respect to its direct inputs; those left out are zero."""
 
     channels: Mapping[str, Floats] = NOTHING
     """By name of the channel, [H, W, d] each."""
     alpha: Floats | None = None
     """[H, W]."""
     gaussians: Mapping[str, Floats] = NOTHING
-    """By field of the population, [N, ...] each: terms that look at the parameters, such as an opacity penalty."""
+    """By field of the population, [N, ...] each: for terms on the parameters themselves, such as an opacity penalty."""
     shared: Mapping[str, Floats] = NOTHING
     """By name of the shared parameter."""
 
@@ -54,11 +54,11 @@ class LossTerm(NamedTuple):
     """One term of the loss, as data."""
 
     name: str
-    """By which ``--set NAME=WEIGHT`` reaches it."""
+    """The NAME in ``--set NAME=WEIGHT``."""
     function: Callable[[Rendered], tuple[float, Cotangents]]
-    """Its settings are bound with ``functools.partial``, where ``--set`` reaches them, too."""
+    """Its settings are bound with ``functools.partial``, so that ``--set`` reaches them too."""
     weight: float
-    """Factor; 0 leaves the term out, and with it what it wants."""
+    """Factor; 0 leaves out the term and what it wants rendered."""
     wants: frozenset[str] = frozenset()
     """What has to be rendered for it besides ``rgb``; see :class:`minisplat_ref.rendering.Request`."""
     start: int = 0
@@ -98,7 +98,7 @@ class Loss(NamedTuple):
     v_alpha: Floats | None
     """[H, W]; None where no term depends on alpha."""
     v_gaussians: Mapping[str, Floats]
-    """Direct derivatives with respect to fields of the population, without those through the image."""
+    """Direct derivatives with respect to fields of the population, without those via the image."""
     v_shared: Mapping[str, Floats]
     """Direct derivatives with respect to shared parameters."""
 

@@ -1,9 +1,9 @@
-"""A training that decides for itself when it ends and what it needs: what it has measured, what it decided, and why.
+"""A training that decides for itself when to end and what it needs: its measurements, its decisions, and why.
 
 A recipe with a :class:`Cooling` has no schedule. It trains at constant rates, and holds some *training* views back to
-measure what more iterations bring; test views stay sealed. When an action of the recipe decides that they bring little
-(:func:`begin_cooling`), or when the given number of iterations leaves no more time, the rates fall, on all training
-views, and the training is over. So a plateau is one of the scene, and not one that falling rates have made.
+measure the gain of more iterations; test views are never used. When an action of the recipe decides that the gain is
+small (:func:`begin_cooling`), or when the given number of iterations leaves no more time, a cool-down with falling
+rates on all training views ends the training. So a plateau is due to the scene and not to falling rates.
 """
 
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 
 class Measurement(NamedTuple):
-    """What the held-out training views said."""
+    """One evaluation of the held-out training views."""
 
     step: int
     psnrs: tuple[float, ...]
@@ -22,7 +22,7 @@ class Measurement(NamedTuple):
 
     @property
     def psnr(self) -> float:
-        """Mean of the views, dB."""
+        """Return the mean of the views, dB."""
         return sum(self.psnrs) / len(self.psnrs)
 
 
@@ -33,13 +33,13 @@ class Decision(NamedTuple):
     what: str
     why: str
     gain: float | None
-    """dB of the held-out views by which it was decided; None where something else decided."""
+    """The gain in dB of the held-out views on which the decision rests; None where it rests on something else."""
     standard_error: float | None
-    """dB, of the gain, over the views."""
+    """Of the gain, over the views, dB."""
 
 
 class Pace(NamedTuple):
-    """How far a training that decides its own length has come."""
+    """Progress of a training that decides its own length."""
 
     measurements: tuple[Measurement, ...] = ()
     decisions: tuple[Decision, ...] = ()
@@ -50,7 +50,7 @@ class Pace(NamedTuple):
     last_step: int | None = None
     """Iteration at which the training ends; None while that is open."""
     switched_on: tuple[str, ...] = ()
-    """Calibrations that the photographs have turned out to need, by name."""
+    """Names of the calibrations that the photographs turned out to need."""
 
     def decided(self, decision: Decision) -> "Pace":
         """Return the pace with one more decision."""
@@ -61,13 +61,13 @@ class Cooling(NamedTuple):
     """How a training without a schedule ends."""
 
     part: float
-    """Length of the cool-down, as a part of the iterations before it."""
+    """Length of the cool-down, as a fraction of the iterations before it."""
     last: float
-    """Factor of the rates at its end,"""
+    """Factor of the rates at its end."""
     last_per_extent: float
-    """and of those that are per unit of the scene's extent; in between their logarithms fall linearly."""
+    """The same for rates per unit of the scene's extent; until the end, the factors' logarithms fall linearly."""
     hold_out_every: int
-    """Before it, one training view of so many is held back for decisions."""
+    """Before the cool-down, one of every so many training views is held back for decisions."""
 
     def factors(self, step: int, pace: Pace) -> tuple[float, float]:
         """Return the factors of the rates, and of those per unit of the extent, at an iteration."""
@@ -78,7 +78,7 @@ class Cooling(NamedTuple):
         return self.last**progress, self.last_per_extent**progress
 
     def latest_start(self, iterations: int) -> int:
-        """Return the iteration after which it has to begin, to end at ``iterations``."""
+        """Return the iteration after which the cool-down has to begin to end at ``iterations``."""
         return max(1, int(iterations / (1.0 + self.part)))
 
 
@@ -105,7 +105,7 @@ def trained_ids(n_views: int, cooling: Cooling | None, pace: Pace) -> list[int]:
 
 
 def to_metadata(pace: Pace) -> dict[str, Any]:
-    """Return the pace as a checkpoint holds it."""
+    """Return the pace as it is stored in a checkpoint."""
     return {
         **pace._asdict(),
         "measurements": [m._asdict() for m in pace.measurements],

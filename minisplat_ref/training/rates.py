@@ -1,6 +1,6 @@
 """Learning rates and the spherical-harmonic degree as functions of the iteration (3DGS, Sec. 7.1).
 
-Left out: the delayed start of the position rate, which the published settings never switch on.
+Left out: the delayed start of the position rate, which the published settings never use.
 """
 
 from collections.abc import Mapping, Sequence
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 
 class Rewind(NamedTuple):
-    """A schedule that goes back once: from iteration ``at`` on it runs again from where it stood at ``to``."""
+    """A jump back in a schedule: from iteration ``at`` on, it runs again from its value at ``to``."""
 
     at: int
     to: int
@@ -25,7 +25,7 @@ class LogLinear(NamedTuple):
     steps: int
     """Iterations from ``first`` to ``last``."""
     rewind: Rewind | None = None
-    """Mini-Splatting: Gaussians that were made anew in mid-run may move as far as young ones do."""
+    """Mini-Splatting: Gaussians that were reinitialised in mid-run may move as far as new ones do."""
 
     def at(self, step: int) -> float:
         """Return the rate at ``step``."""
@@ -49,7 +49,7 @@ class Rates(NamedTuple):
 
     of: Mapping[str, float | LogLinear]
     per_extent: frozenset[str] = frozenset({"means"})
-    """Those that are per unit of the scene's extent: a scene twice as large moves its Gaussians twice as far."""
+    """Names of rates per unit of the scene's extent: in a scene twice as large, Gaussians move twice as far."""
 
     def at(self, step: int, extent: float) -> dict[str, float]:
         """Return every rate.
@@ -69,7 +69,7 @@ class Rates(NamedTuple):
         return self._replace(of={**self.of, **rates})
 
     def joined(self, other: "Rates") -> "Rates":
-        """Return these rates and the other's; of one name, these, and whether it is per extent is theirs to say."""
+        """Return these rates and the other's; for a name in both, these decide rate and extent."""
         return Rates({**other.of, **self.of}, self.per_extent | (other.per_extent - self.of.keys()))
 
     def scaled(self, factor: Fraction, raised: float, raised_per_extent: float) -> "Rates":
@@ -78,11 +78,11 @@ class Rates(NamedTuple):
         Parameters
         ----------
         factor : Fraction
-            The lengths of the schedules are multiplied by it.
+            Multiplies the lengths of the schedules.
         raised : float
-            The rates themselves are multiplied by it,
+            Multiplies the rates themselves,
         raised_per_extent : float
-            except those per unit of the extent, which are multiplied by this.
+            except those per unit of the extent, which this multiplies.
         """
 
         def scaled_one(name: str, rate: float | LogLinear) -> float | LogLinear:
@@ -98,5 +98,5 @@ class Rates(NamedTuple):
 
 
 def active_sh_degree(step: int, milestones: Sequence[int]) -> int:
-    """Return the degree of the spherical harmonics to render at ``step``, if it is stored: one more each milestone."""
+    """Return the degree of the spherical harmonics to render at ``step``, if stored: one more after each milestone."""
     return sum(step >= milestone for milestone in milestones)

@@ -1,6 +1,6 @@
-"""What a scene is made of: the population that is trained, how it begins, how it is drawn.
+"""The representation of a scene: the population that is trained, how it is initialised, how it is rendered.
 
-The first is :data:`GAUSSIANS`, 3DGS's own. An extension's has further fields or another renderer.
+The first is :data:`GAUSSIANS`, that of 3DGS. An extension's has further fields or another renderer.
 """
 
 from collections.abc import Callable, Mapping
@@ -14,7 +14,7 @@ from minisplat_ref.types import NOTHING, Floats, Gaussians, Scene
 
 
 def as_it_is(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
-    """Return the Gaussians: the population is theirs."""
+    """Return the Gaussians themselves as the population."""
     return gaussians
 
 
@@ -24,15 +24,15 @@ def nothing_shared(scene: Scene, rng: np.random.Generator) -> Mapping[str, Float
 
 
 class Representation(NamedTuple):
-    """What a scene is made of."""
+    """What is trained to represent a scene."""
 
     name: str
     population: Any = Gaussians
     """The NamedTuple of arrays [N, ...] that is trained; its first field is ``means``."""
     extend: Callable[[Gaussians, np.random.Generator], Any] = as_it_is
-    """Makes Gaussians into the population: at the start, and after every reinitialisation."""
+    """Turns Gaussians into the population, at the start and after every reinitialisation."""
     shared: Callable[[Scene, np.random.Generator], Mapping[str, Floats]] = nothing_shared
-    """Shared parameters before training."""
+    """Returns the initial shared parameters."""
     renderer: Renderer = SPLATTING
     rates: Rates = Rates({}, frozenset())
     """Learning rates of its own fields and shared parameters, where the recipe has none for them."""

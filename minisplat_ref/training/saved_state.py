@@ -1,7 +1,7 @@
-"""What a checkpoint must hold to be continued: each part is checked before the training sees it.
+"""Check each part of a checkpoint before a training continues from it.
 
-A checkpoint that has been cut, mixed with another or edited by hand would otherwise fail in the middle of an iteration,
-or be continued with numbers that belong to nothing.
+A checkpoint that was truncated, mixed with another or edited by hand would otherwise fail in the middle of an
+iteration, or continue with numbers that make no sense.
 """
 
 from collections.abc import Mapping
@@ -24,11 +24,11 @@ GAUSSIAN_SHAPES: Mapping[str, tuple[tuple[int, ...], ...]] = {
     **{"means": ((3,),), "quats": ((4,),), "log_scales": ((3,),), "opacity_logits": ((),), "sh_dc": ((3,),)},
     "sh_rest": tuple(((degree + 1) ** 2 - 1, 3) for degree in range(SH_DEGREE_MAX + 1)),
 }
-"""Shapes that the fields of :class:`Gaussians` may have beside their rows."""
+"""Shapes that the fields of :class:`Gaussians` may have after their first axis."""
 
 
 class Counters(NamedTuple):
-    """How far a training is."""
+    """How far a training has come."""
 
     step: int
     adam_step: int
@@ -49,7 +49,7 @@ class Bundles(NamedTuple):
 
 
 def written_by(metadata: Mapping[str, Any]) -> tuple[str, str]:
-    """Return name and length, in iterations, of the recipe that a checkpoint says it was written by."""
+    """Return the name and length, in iterations, of the recipe under which a checkpoint says it was written."""
     recipe = metadata.get("recipe")
     recipe = recipe if isinstance(recipe, dict) else {}
     n_iterations = recipe.get("iterations")
@@ -62,7 +62,7 @@ def read_counters(path: str | Path, metadata: Mapping[str, Any]) -> Counters:
     Raises
     ------
     DamagedCheckpoint
-        One is missing or something else.
+        One is missing or not such a number.
     """
 
     def check(name: str, value: Any) -> int:
@@ -83,7 +83,7 @@ def read_pace(path: str | Path, value: Any) -> Pace:
     Raises
     ------
     DamagedCheckpoint
-        It is missing or something else.
+        It is missing or malformed.
     """
     try:
         pace = from_metadata(value)
@@ -101,12 +101,12 @@ def read_generator(path: str | Path, state: Any) -> np.random.Generator:
     ----------
     path : str or Path
     state : any
-        What ``bit_generator.state`` of NumPy's PCG64 was.
+        The value of ``bit_generator.state`` of NumPy's PCG64.
 
     Raises
     ------
     DamagedCheckpoint
-        It is not such a state.
+        It is no such state.
     """
     rng = np.random.default_rng()
     limits = {"state": 2**N_STATE_BITS, "inc": 2**N_STATE_BITS, "has_uint32": 2, "uinteger": 2**32}
@@ -133,8 +133,8 @@ def read_bundles(path: str | Path, arrays: Mapping[str, NDArray[Any]], populatio
     Raises
     ------
     DamagedCheckpoint
-        A field is missing or surplus, has another number of rows than ``means``, is no floating-point array, or holds
-        NaN or infinity; or moments do not fit what they are moments of.
+        A field is missing or unknown, has another number of rows than ``means``, is no floating-point array, or holds
+        NaN or infinity; or moments do not match their parameters.
     """
     groups: dict[str, dict[str, NDArray[Any]]] = {name: {} for name in Bundles._fields}
     for name, array in arrays.items():
@@ -156,7 +156,7 @@ def read_bundles(path: str | Path, arrays: Mapping[str, NDArray[Any]], populatio
 
 
 def check_fields(path: str | Path, fields: Mapping[str, NDArray[Any]]) -> None:
-    """Refuse fields of a population, whatever it is, that have no rows in common or are not finite numbers."""
+    """Refuse fields of any population that differ in their number of rows or are not finite numbers."""
     if "means" not in fields or fields["means"].ndim != 2:
         raise DamagedCheckpoint(f"{path}: gaussians.means is missing or has no rows of coordinates; {WAY_OUT}")
     n = len(fields["means"])
@@ -177,7 +177,7 @@ def _check_population(path: str | Path, fields: Mapping[str, NDArray[Any]], popu
         )
     check_fields(path, fields)
     for name, shapes in GAUSSIAN_SHAPES.items():
-        if population is Gaussians and fields[name].shape[1:] not in shapes:  # another's are its own affair
+        if population is Gaussians and fields[name].shape[1:] not in shapes:  # only these shapes are known here
             raise _misfit(path, name, fields[name])
 
 
@@ -188,7 +188,7 @@ def _misfit(path: str | Path, name: str, array: NDArray[Any]) -> DamagedCheckpoi
 def _check_moments(
     path: str | Path, group: str, moments: Mapping[str, NDArray[Any]], fields: Mapping[str, NDArray[Any]]
 ) -> None:
-    """Refuse moments of Adam that are not of the same shapes and types as the parameters."""
+    """Refuse moments of Adam whose shapes or types differ from the parameters'."""
     for name in sorted(moments.keys() | fields.keys()):
         moment, field = moments.get(name), fields.get(name)
         if moment is None or field is None or moment.shape != field.shape or moment.dtype != field.dtype:
@@ -197,7 +197,7 @@ def _check_moments(
 
 
 def _check_numbers(path: str | Path, name: str, array: NDArray[Any]) -> None:
-    """Refuse what is not float32 or float64, and NaN."""
+    """Refuse an array that is not float32 or float64 or not finite."""
     if array.dtype not in (np.float32, np.float64):
         raise DamagedCheckpoint(f"{path}: {name} has dtype {array.dtype}, not float32 or float64; {WAY_OUT}")
     if np.isnan(array).any():

@@ -1,4 +1,4 @@
-"""What happens when: a training method as data, and how it is scaled to another length, set differently, described.
+"""A training method as data: what happens when; how to scale it to another length, change its settings, describe it.
 
 Events act after the optimiser step of their iteration, in the order in which they are listed.
 """
@@ -35,7 +35,7 @@ class During(NamedTuple):
     start: int = 0
     stop: int | None = None
     wants: frozenset[str] = frozenset()
-    """What is to be rendered in these iterations for the action; see :class:`minisplat_ref.rendering.Request`."""
+    """What to render in these iterations for the action; see :class:`minisplat_ref.rendering.Request`."""
 
     def is_due(self, step: int) -> bool:
         """Return whether the action belongs to iteration ``step``, counted from 1."""
@@ -50,8 +50,7 @@ class Every(NamedTuple):
     """Act at the multiples of ``period`` with ``start < step < stop``, except those of ``skip``.
 
     These iterations are the published ones. In a run of another length the action comes at ``factor`` times each of
-    them, rounded like every other milestone, so that what was before something else stays before it, and the gaps
-    shrink alike.
+    them, rounded like every other milestone, so that the order of events stays and all gaps shrink alike.
     """
 
     period: int
@@ -60,19 +59,19 @@ class Every(NamedTuple):
     stop: int | None = None
     skip: int | None = None
     least_gap: int = 1
-    """Iterations between two actions, and from the last one to ``stop``, below which no compression brings them: of
-    the published iterations only every second stays then, or every third, and so on, counted back from ``stop``."""
+    """Least number of iterations between two actions, and from the last one to ``stop``. Where compression would go
+    below it, only every second published iteration stays, or every third, and so on, counted back from ``stop``."""
     factor: Fraction = Fraction(1)
     """Length of the run, divided by the published length."""
 
     @property
     def stride(self) -> int:
-        """Published iterations from one action that stays to the next."""
+        """Return the number of published iterations from one action that stays to the next."""
         return self.period * math.ceil(self.least_gap / (self.period * self.factor))
 
     def is_due(self, step: int) -> bool:
         """Return whether the action belongs to iteration ``step``, counted from 1."""
-        length, of = self.factor.as_integer_ratio()  # what is published at p comes at p length / of
+        length, of = self.factor.as_integer_ratio()  # the action published at p comes at p length / of
         first, last = (2 * step - 1) * of // (2 * length), (2 * step + 1) * of // (2 * length)
         multiples = range(first + -first % self.period, last + 1, self.period)
         return any(self._stays(published) and _scaled(published, self.factor) == step for published in multiples)
@@ -91,7 +90,7 @@ class Every(NamedTuple):
 
 
 class At(NamedTuple):
-    """Act once, at iteration ``step``."""
+    """Act once, in iteration ``step``."""
 
     step: int
     action: Action
@@ -129,30 +128,30 @@ class Recipe(NamedTuple):
     events: tuple[Event, ...]
     """What happens besides gradient steps; several due in one iteration act in this order."""
     half_size_until: int = 0
-    """Iterations that train on views of half the width and height, from the first on (Mini-Splatting2)."""
+    """Number of first iterations that train on views of half the width and height (Mini-Splatting2)."""
     least_half_size: int = 100
-    """Pixels a side; if half of a view were smaller, no view is halved."""
+    """Pixels per side; if half of any view were smaller, no view is halved."""
     least_views: int = 1
-    """Training views without which the method makes no sense."""
+    """Least number of training views that the method needs."""
     short_run_exponent: float = 0.0
-    """p of the factor ``(published / iterations)^p`` by which :func:`scaled` raises the rates of runs that are shorter
-    than published; that of the means by the square of it."""
+    """p of the factor ``(published / iterations)^p`` by which :func:`scaled` raises the rates of runs shorter than
+    published; the rate of the means is raised by its square."""
     calibrations: tuple[Calibration, ...] = CALIBRATIONS
     """Parameters of each photograph; both are off unless asked for."""
     representation: Representation = GAUSSIANS
-    """What is trained and how it is drawn."""
+    """What is trained and how it is rendered."""
     cooling: Cooling | None = None
-    """How a method without a schedule ends: its milestones are iterations whatever the length, and ``iterations`` is a
-    limit; None for methods with a schedule."""
+    """How a method without a schedule ends: its milestones do not scale with the length, and ``iterations`` is a limit.
+    None for methods with a schedule."""
 
     @property
     def active_calibrations(self) -> tuple[Calibration, ...]:
-        """Those that are on."""
+        """Return the calibrations that are on."""
         return tuple(calibration for calibration in self.calibrations if calibration.is_on)
 
     @property
     def renderer(self) -> Renderer:
-        """The representation's, wrapped by the calibrations that are on."""
+        """Return the representation's renderer, wrapped by the calibrations that are on."""
         return functools.reduce(
             lambda renderer, calibration: calibration.wrap(renderer),
             self.active_calibrations,
@@ -161,37 +160,37 @@ class Recipe(NamedTuple):
 
     @property
     def rates(self) -> Rates:
-        """Learning rates of everything: the recipe's, the representation's own, those of the calibrations."""
+        """Return all learning rates: the recipe's, the representation's, the calibrations'."""
         rates = self.learning_rates.joined(self.representation.rates)
         return functools.reduce(Rates.joined, (calibration.rates for calibration in self.active_calibrations), rates)
 
 
 def does(event: Event, *actions: Action) -> bool:
-    """Return whether an event does one of the actions, whatever settings are bound to it."""
+    """Return whether an event's action is one of these, whatever settings are bound to it."""
     action = event.action
     return (action.func if isinstance(action, partial) else action) in actions
 
 
 def firing_steps(recipe: Recipe, *actions: Action) -> list[int]:
-    """Return the iterations in which a recipe does one of the actions."""
+    """Return the iterations in which one of the actions of a recipe acts."""
     events = [event for event in recipe.events if does(event, *actions)]
     return [step for step in range(1, recipe.iterations + 1) if any(event.is_due(step) for event in events)]
 
 
 def without(recipe: Recipe, action: Action) -> Recipe:
-    """Return the recipe without the events that do ``action``."""
+    """Return the recipe without the events of ``action``."""
     return recipe._replace(events=tuple(event for event in recipe.events if not does(event, action)))
 
 
 def scaled(recipe: Recipe, iterations: int) -> Recipe:
     """Return the recipe for another number of iterations, all milestones moved in proportion.
 
-    Every iteration at which something happens is multiplied by ``iterations / recipe.iterations`` and rounded to the
-    nearest integer (ties to even): of each event and loss term, of the spherical harmonics and of the rates' schedules.
-    So the order of events is that of the recipe, whatever the length. A one-time event happens at iteration 1 at the
-    earliest; of periodic ones fewer may stay, see :attr:`Every.least_gap`. What must not come before its ``least_step``
-    is left out of runs that are too short for it. Thresholds stay; so do learning rates, unless the recipe or the
-    calibration has a ``short_run_exponent``. A recipe that decides its own length keeps everything but the limit.
+    Every milestone is multiplied by ``iterations / recipe.iterations`` and rounded to the nearest integer (ties to
+    even): those of each event and loss term, of the spherical harmonics and of the rates' schedules. So the order of
+    events is that of the recipe, whatever the length. A one-time event happens at iteration 1 at the earliest; periodic
+    ones may happen less often, see :attr:`Every.least_gap`. An event that would come before its ``least_step`` is left
+    out. Thresholds stay; so do learning rates, unless the recipe or the calibration has a ``short_run_exponent``. A
+    recipe that decides its own length keeps everything but the limit.
 
     Raises
     ------
@@ -236,21 +235,21 @@ def _scaled_limit(step: int | None, factor: Fraction) -> int | None:
 
 
 def as_decided(recipe: Recipe, pace: Pace) -> Recipe:
-    """Return the recipe with the calibrations on that a training has switched on."""
+    """Return the recipe with those calibrations on that a training has switched on."""
     return configured(recipe, **dict.fromkeys(pace.switched_on, True)) if pace.switched_on else recipe
 
 
 def settings_of(recipe: Recipe) -> dict[str, Any]:
-    """Return what :func:`configured` can replace, with its present value, the first where there are several.
+    """Return the settings that :func:`configured` can replace, each with its present value, the first of several.
 
-    Settings of events, of loss terms and of how the representation begins by their own names; the weight of a loss term
-    by the term's name; whether a calibration is on by the calibration's name.
+    Settings of events, of loss terms, and of the representation's initialisation and renderer go by their own names;
+    the weight of a loss term by the term's name; whether a calibration is on by the calibration's name.
     """
     events = [_settings(event.action) for event in recipe.events]
     terms = [{term.name: term.weight, **_settings(term.function)} for term in recipe.losses]
     switches = [{calibration.name: calibration.is_on for calibration in recipe.calibrations}]
-    begins = [_settings(recipe.representation.extend)]
-    found = [*events, *terms, *switches, *begins]
+    representation = [_settings(recipe.representation.extend), _settings(recipe.representation.renderer.render)]
+    found = [*events, *terms, *switches, *representation]
     return {name: value for settings in reversed(found) for name, value in settings.items()}
 
 
@@ -278,21 +277,30 @@ def configured(recipe: Recipe, **settings: Any) -> Recipe:
                 calibration._replace(is_on=value) if name == calibration.name else calibration
                 for calibration in recipe.calibrations
             ),
-            representation=recipe.representation._replace(extend=_with(recipe.representation.extend, name, value)),
+            representation=_with_setting(recipe.representation, name, value),
         )
     return recipe
+
+
+def _with_setting(representation: Representation, name: str, value: Any) -> Representation:
+    """Return a representation with another value of a setting of how it begins or is drawn, if it has one."""
+    renderer = representation.renderer
+    return representation._replace(
+        extend=_with(representation.extend, name, value),
+        renderer=renderer._replace(render=_with(renderer.render, name, value)),
+    )
 
 
 def parsed_settings(recipe: Recipe, texts: Mapping[str, str]) -> dict[str, Any]:
     """Return settings for :func:`configured` from text, each of the type of the present value.
 
-    A function is given by its name, such as ``metric=outdoor``: one that stands in the module of the present one and
-    takes the same arguments. For a number, other than the weight of a loss term, ``none`` is None.
+    A function is given by its name, such as ``metric=outdoor``; it must be defined in the module of the present one and
+    take the same arguments. For a number other than the weight of a loss term, ``none`` is None.
 
     Raises
     ------
     InputError
-        The recipe has no such setting, or the text is no value of its type.
+        The recipe has no such setting, or the text is not a value of its type.
     """
     known = settings_of(recipe)
     unknown = [name for name in texts if name not in known]
@@ -327,13 +335,13 @@ def _parsed(name: str, text: str, present: Any, may_be_none: bool) -> Any:
 
 
 def _number(text: str) -> int | float:
-    """Return a whole number if the text is one: the present value is None, which says nothing of the type."""
+    """Return an integer if the text is one, else a float: a present value of None does not tell the type."""
     value = float(text)
     return int(value) if value.is_integer() else value
 
 
 def _alternatives(function: Callable[..., Any]) -> dict[str, Callable[..., Any]]:
-    """Return the public functions that stand in the module of this one and take the same arguments, by name."""
+    """Return by name the public functions in the module of this one that take the same arguments."""
     names, module = list(inspect.signature(function).parameters), function.__module__
     functions = inspect.getmembers(sys.modules[module], inspect.isfunction)
     return {
@@ -344,7 +352,7 @@ def _alternatives(function: Callable[..., Any]) -> dict[str, Callable[..., Any]]
 
 
 def _settings(function: Callable[..., Any]) -> dict[str, Any]:
-    """Return what is bound to a function by name."""
+    """Return the keyword arguments bound to a function."""
     return dict(function.keywords) if isinstance(function, partial) else {}
 
 
@@ -357,9 +365,10 @@ def _with(function: Callable[..., Any], name: str, value: Any) -> Callable[..., 
 
 
 def describe(recipe: Recipe) -> dict[str, Any]:
-    """Return the recipe in numbers, strings, lists and dicts, for ``config.json`` and to compare two recipes."""
+    """Return the recipe as numbers, strings, lists and dicts, for ``config.json`` and to compare two recipes."""
     cooling = {"cooling": recipe.cooling._asdict()} if recipe.cooling is not None else {}
     fields = {name: value for name, value in recipe._asdict().items() if name != "cooling"}
+    drawn = _settings(recipe.representation.renderer.render)
     return {
         **fields,
         **cooling,
@@ -372,12 +381,13 @@ def describe(recipe: Recipe) -> dict[str, Any]:
         "representation": {
             "name": recipe.representation.name,
             **_describe_function(recipe.representation.extend, "extend"),
+            **({"renderer": drawn} if drawn else {}),
         },
     }
 
 
 def action_name(event: Event) -> str:
-    """Return what the action of an event is called, in :func:`describe` and in the record of what fired."""
+    """Return the name of an event's action, as used by :func:`describe` and in the record of what fired."""
     return _name(event.action)
 
 
@@ -394,7 +404,7 @@ def _described(fields: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as JSON can hold it."""
+    """Return a value in a form that JSON can hold."""
     if isinstance(value, frozenset):
         return sorted(value)
     return str(value) if isinstance(value, Fraction) else value
@@ -406,6 +416,6 @@ def _describe_function(function: Callable[..., Any], role: str) -> dict[str, Any
 
 
 def _name(function: Any) -> str:
-    """Return what a function is called; a partial by the function inside."""
+    """Return a function's name; a partial has that of the function inside."""
     function = function.func if isinstance(function, partial) else function
     return getattr(function, "__name__", repr(function))

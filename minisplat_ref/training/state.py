@@ -1,9 +1,8 @@
-"""The training state, what an action may look at, and how rows come and go.
+"""The training state, the input of actions, and how rows are added and removed.
 
 An action is a function ``action(state, iteration, **settings)`` that changes the :class:`TrainState` it is given; a
-recipe names it, its settings and the iterations at which it acts. It returns None, or a note of a few words for the
-record: why it has changed nothing, for one. :func:`apply_edit` and :func:`start_anew` are the two places where rows
-come and go.
+recipe names it, its settings and the iterations in which it acts. It returns None, or a note of a few words for the
+record, for example why it has changed nothing. Only :func:`apply_edit` and :func:`start_anew` add or remove rows.
 """
 
 import math
@@ -32,11 +31,11 @@ class TrainState:
     gaussians: Any
     """The population: :class:`Gaussians` or an extension's; its arrays are updated in place."""
     adam: AdamState[Any]
-    """Moments, row by row those of ``gaussians``."""
+    """Moments, in the rows of ``gaussians``."""
     step: int
     """Iterations done."""
     view_order: list[int]
-    """Training views still to come before the list is shuffled anew; the next one stands last."""
+    """Training views still to come before the list is shuffled again; the next one is last."""
     rng: np.random.Generator
     """The only source of randomness."""
     stats: dict[str, NDArray[Any]]
@@ -48,22 +47,22 @@ class TrainState:
     pace: Pace = field(default_factory=Pace)
     """What a recipe that decides its own length has measured and decided."""
     is_whole: bool = True
-    """False while an iteration is changing it; if it stays so, the iteration failed half-way: not to be saved."""
+    """False while an iteration changes the state; if it stays so, the iteration failed halfway: do not save."""
     most_rows: float = math.inf
     """Rows that memory has room for, as far as is known."""
 
     @property
     def model(self) -> Model:
-        """The parameters, as they are rendered."""
+        """Return the parameters, as the renderer takes them."""
         return Model(self.gaussians, self.shared)
 
 
 def unheard(text: str) -> None:
-    """Say something to nobody."""
+    """Discard a message."""
 
 
 class Iteration(NamedTuple):
-    """What an action may look at: the iteration that has just been done, and its surroundings.
+    """The input of an action besides the state: the iteration just done, and its context.
 
     Rows are those that were rendered; a recipe lists the actions that use them before those that edit rows.
     """
@@ -72,7 +71,7 @@ class Iteration(NamedTuple):
     view: View
     """The training view that was rendered."""
     output: RenderOutput
-    """Its rendering; with blend statistics if an action of this iteration needs them."""
+    """Its rendering, with blend statistics if an action of this iteration wants them."""
     visible_ids: Ints
     """[V] rows that the view saw (radius above zero), ascending."""
     v_means2d: Floats
@@ -80,24 +79,24 @@ class Iteration(NamedTuple):
     backend: Backend
     conventions: Conventions
     renderer: Renderer = SPLATTING
-    """How the model is drawn."""
+    """How the model is rendered."""
     representation: Representation = GAUSSIANS
-    """What the model is made of."""
+    """What is trained."""
     step: int = 0
     """Its number, from 1."""
     iterations: int = 0
-    """Of the training, at most."""
+    """Upper limit of the training's length."""
     cooling: Cooling | None = None
     """How it ends, if it has no schedule."""
     say: Callable[[str], None] = unheard
-    """Tells the user something in one line, at once; what only the record needs is returned."""
+    """Tells the user something in one line, at once; a note for the record alone is returned instead."""
 
 
 class FiredEvent(NamedTuple):
-    """What one event of the recipe has done in an iteration; events of every iteration (``During``) are not told."""
+    """What one event of the recipe did in an iteration; events of every iteration (``During``) are not recorded."""
 
     action: str
-    """Name of the action, as ``describe`` has it."""
+    """Name of the action, as in ``describe``."""
     n_before: int
     """Gaussians when it began."""
     n_after: int
@@ -105,11 +104,11 @@ class FiredEvent(NamedTuple):
     seconds: float
     """How long it took."""
     note: str | None = None
-    """What the action says of it, such as why it has changed nothing."""
+    """The action's note, such as why it has changed nothing."""
 
 
 class StepReport(NamedTuple):
-    """What ``train(on_step=...)`` is told after every iteration."""
+    """What ``train`` passes to ``on_step`` after every iteration."""
 
     step: int
     """Iterations done, from 1."""
@@ -121,22 +120,22 @@ class StepReport(NamedTuple):
     state: TrainState
     """The state after the iteration; it is safe to save."""
     last_step: int | None = None
-    """Iteration at which the training ends; None while a recipe that decides it has not."""
+    """Iteration at which the training ends; None while a recipe that decides this has not done so."""
     fired: tuple[FiredEvent, ...] = ()
     """Events that acted after the gradient step, in their order."""
     notes: tuple[str, ...] = ()
-    """What the user is to be told at once, a line each."""
+    """Messages to the user, one line each."""
 
 
 def n_pixels(scene: Scene) -> int:
-    """Return the number of pixels of all training views: the size of a scene, as far as learning from it goes."""
+    """Return the number of pixels of all training views: the amount of data to learn from."""
     return sum(view.camera.width * view.camera.height for view in scene.train_views)
 
 
 def begin_cooling(
     state: TrainState, cooling: Cooling, iterations: int, decision: Decision, length: int | None = None
 ) -> None:
-    """Let the rates fall from the next iteration on, and all training views be trained on.
+    """Begin the cool-down: from the next iteration on, rates fall and all training views are trained on.
 
     Parameters
     ----------
@@ -146,9 +145,9 @@ def begin_cooling(
     iterations : int
         Iteration at which the training ends at the latest.
     decision : Decision
-        That has brought it about; its ``step`` is the last at constant rates.
+        The reason; its ``step`` is the last at constant rates.
     length : int, optional
-        Iterations that the cool-down takes; by default its part of those before it.
+        Iterations of the cool-down; by default ``cooling.part`` of those before it.
     """
     length = max(1, math.ceil(cooling.part * decision.step)) if length is None else length
     state.pace = state.pace.decided(decision)._replace(
@@ -158,12 +157,12 @@ def begin_cooling(
 
 
 def apply_edit(state: TrainState, edit: Edit) -> None:
-    """Replace the population; new rows get zero moments, statistics follow the parents.
+    """Replace the population; new rows get zero moments, and statistics follow the parents.
 
     Raises
     ------
     InputError
-        There is no memory for so many rows.
+        So many rows do not fit into memory.
     """
     _check_room(state, len(edit.parent_ids))
     no_reset = np.zeros(len(edit.parent_ids), bool)
@@ -176,15 +175,15 @@ def apply_edit(state: TrainState, edit: Edit) -> None:
 
 
 def start_anew(state: TrainState, iteration: Iteration, gaussians: Gaussians) -> None:
-    """Replace the population by one that has no past: zero moments, no statistics, all views still to come.
+    """Replace the population and forget its history: zero moments, no statistics, all views still to come.
 
-    Fields that the representation has besides those of ``gaussians`` begin as at the start of training. Shared
-    parameters stay, and so does the precision of the population.
+    Fields that the representation has besides those of ``gaussians`` get their initial values. Shared parameters stay,
+    and so does the precision of the population.
 
     Raises
     ------
     InputError
-        There is no memory for so many rows.
+        So many rows do not fit into memory.
     """
     _check_room(state, len(gaussians.means))
     dtype = state.gaussians.means.dtype

@@ -24,7 +24,6 @@ from minisplat_ref.extensions.proxies.mass_spring import (
     forces,
     longest_step,
 )
-from minisplat_ref.extensions.proxies.mesh import Mesh, load_mesh, save_mesh
 from minisplat_ref.extensions.proxies.springs import (
     Stiffness,
     spring_ends,
@@ -33,6 +32,7 @@ from minisplat_ref.extensions.proxies.springs import (
     stiffness_for_stretch,
     vertex_masses,
 )
+from minisplat_ref.extensions.shared_mesh import Mesh, load_mesh, save_mesh
 from minisplat_ref.io.images import read_image
 from minisplat_ref.io.ply import load_ply, save_ply
 

@@ -13,6 +13,9 @@ DESCRIPTION = """\
 Check the renderer, or another one, against the float64 reference.
 """
 EPILOG = """\
+example:
+  minisplat-ref oracle gradients
+
 Exit codes: 0 all passed, 1 a case failed, 2 bad input."""
 
 
@@ -37,11 +40,21 @@ def add_json_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the cases to FILE")
 
 
-def publish(report: "Report", json_file: Path | None) -> int:
-    """Print the table and the verdict, write the file that was asked for; return 1 where a case failed, else 0."""
+def add_output_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add ``--json FILE`` and ``--report FILE``."""
+    add_json_argument(parser)
+    parser.add_argument("--report", type=Path, metavar="FILE", help="also write a page to look at, like report.html")
+
+
+def publish(report: "Report", args: argparse.Namespace) -> int:
+    """Print the table and the verdict, write the files that were asked for; return 1 where a case failed, else 0."""
     from minisplat_ref.oracle.cases import as_markdown, save_json, verdict
 
     print(f"{report.title}\n\n{as_markdown(report)}\n\n{verdict([report])}")
-    if json_file is not None:
-        save_json(report, json_file)
+    if args.json is not None:
+        save_json(report, args.json)
+    if args.report is not None:
+        from minisplat_ref.experiments.check_report import write_page
+
+        write_page(report, args.report)
     return 1 if report.n_failed else 0

@@ -2,8 +2,9 @@
 
 import argparse
 
-from minisplat_ref.cli.oracle import add_json_argument, publish
+from minisplat_ref.cli.oracle import add_output_arguments, publish
 from minisplat_ref.constants import PROFILES
+from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.arguments import Commands, HelpFormatter
 
 DESCRIPTION = """\
@@ -14,6 +15,9 @@ from the image back to the scene; and last the whole view, by one call.
 
 BACKEND is one of
 
+  MODULE:FUNCTION any function with the signature of gsplat's rasterization, on
+                  NumPy, torch or JAX arrays; gradients by FUNCTION_vjp beside it,
+                  else by torch or JAX
   DIR             a folder of arrays that your own renderer has written, in the
                   format of oracle export; the README.md in there explains it
   cpu, cpu-exact, reference
@@ -44,6 +48,7 @@ flips, and the candidates for them. For radii and tile lists: rows and tiles tha
 differ. Every stage is reported in the scene where it is furthest off.
 
 examples:
+  minisplat-ref oracle compare my_package.my_module:rasterization
   minisplat-ref oracle compare cpu --dtype float32
   minisplat-ref oracle compare planted:half-off-diagonal --scene ordinary
   minisplat-ref oracle compare profile:INRIA --scene sh3 --json differences.json
@@ -69,7 +74,7 @@ def add_parser(checks: Commands) -> None:
         epilog=EPILOG,
         formatter_class=HelpFormatter,
     )
-    parser.add_argument("backend", metavar="BACKEND", help="a renderer's name, or a folder of its arrays")
+    parser.add_argument("backend", metavar="BACKEND", help="a function, a renderer's name, or a folder of arrays")
     parser.add_argument("--scene", default="all", metavar="NAME", help=f"{', '.join(SCENES)}, or all (default)")
     parser.add_argument(
         "--against",
@@ -82,26 +87,38 @@ def add_parser(checks: Commands) -> None:
         type=str.upper,
         choices=tuple(PROFILES),
         metavar="NAME",
-        help=f"conventions for every scene, in place of its own: {', '.join(PROFILES)}",
+        help=f"conventions for every scene, in place of its own; of a function: its rules: {', '.join(PROFILES)}",
     )
     parser.add_argument(
         "--dtype",
         choices=("float32", "float64"),
         metavar="TYPE",
         help="float32 or float64: what is computed in, and so the tolerances (default: float64 for ours and"
-        " gsplat-torch, that of each array for a folder)",
+        " gsplat-torch, float32 for a function, that of each array for a folder)",
     )
-    add_json_argument(parser)
+    parser.add_argument(
+        "--arrays",
+        choices=("numpy", "torch", "jax"),
+        metavar="KIND",
+        help="what a function is called with: numpy, torch or jax (default: what its module imports)",
+    )
+    add_output_arguments(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Compare every scene, print the table of stages."""
-    from minisplat_ref.oracle.comparison.renderers import choose_renderer, choose_scenes
+    from minisplat_ref.oracle.comparison.renderers import choose_function, choose_renderer, choose_scenes, is_function
     from minisplat_ref.oracle.comparison.staged import as_report, compare_scene
 
-    renderer = choose_renderer(args.backend, args.dtype)
-    scenes, left_out = choose_scenes(renderer, args.scene, args.against, args.profile)
+    if is_function(args.backend):
+        renderer = choose_function(args.backend, args.dtype, args.profile, args.arrays)
+        scenes, left_out = choose_scenes(renderer, args.scene, args.against, None)
+    elif args.arrays is not None:
+        raise InputError(f"--arrays is for a function, and {args.backend} is none: leave it out")
+    else:
+        renderer = choose_renderer(args.backend, args.dtype)
+        scenes, left_out = choose_scenes(renderer, args.scene, args.against, args.profile)
     rows = [row for scene in scenes.values() for row in compare_scene(renderer, scene)]
     settings = {
         "against": args.against,
@@ -109,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
         "left_out": list(left_out),
     }
     report = as_report(renderer, rows, settings)
-    code = publish(report, args.json)
+    code = publish(report, args)
     if report.settings["not_given"]:
         print(f"not given: {', '.join(report.settings['not_given'])}")
     if left_out:

@@ -2,7 +2,7 @@
 
 import argparse
 
-from minisplat_ref.cli.oracle import add_json_argument, publish
+from minisplat_ref.cli.oracle import add_output_arguments, publish
 from minisplat_ref.constants import GSPLAT_MAIN, PROFILES
 from minisplat_ref.experiments.arguments import BACKENDS as NAMES
 from minisplat_ref.experiments.arguments import Commands, HelpFormatter
@@ -50,7 +50,7 @@ def add_parser(checks: Commands) -> None:
         help=f"rasteriser conventions: {', '.join(PROFILES)} (default {GSPLAT_MAIN.name})",
     )
     parser.add_argument("--extension", metavar="NAME", help="check this extension instead of the core")
-    add_json_argument(parser)
+    add_output_arguments(parser)
     parser.set_defaults(run=run)
 
 
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     backends = tuple(BACKENDS.values()) if args.backend is None else (get_backend(args.backend),)
     report = check_all_gradients(backends, PROFILES[args.profile])
     print(f"{AUTOGRAD}: {report.settings[AUTOGRAD]}")
-    return publish(report, args.json)
+    return publish(report, args)
 
 
 def _check_extension(args: argparse.Namespace) -> int:
@@ -77,4 +77,4 @@ def _check_extension(args: argparse.Namespace) -> int:
     report = check_model_gradients(
         get_backend(args.backend or "reference"), PROFILES[args.profile], extension.representation, extension.stages
     )
-    return publish(report, args.json)
+    return publish(report, args)

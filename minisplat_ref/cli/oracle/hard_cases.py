@@ -2,7 +2,7 @@
 
 import argparse
 
-from minisplat_ref.cli.oracle import add_json_argument, publish
+from minisplat_ref.cli.oracle import add_output_arguments, publish
 from minisplat_ref.experiments.arguments import Commands, HelpFormatter
 
 DESCRIPTION = """\
@@ -34,7 +34,7 @@ def add_parser(checks: Commands) -> None:
     parser.add_argument(
         "--only", metavar="PATTERN", default="", help="cases whose name holds this; * and ? are wildcards"
     )
-    add_json_argument(parser)
+    add_output_arguments(parser)
     parser.set_defaults(run=run)
 
 
@@ -45,6 +45,6 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.oracle.hard_cases.run import by_group, matching, run_hard_cases
 
     report = run_hard_cases(matching(HARD_CASES, args.only))
-    exit_code = publish(report, args.json)
+    exit_code = publish(report, args)
     print(f"\nworst of each kind\n\n{as_markdown(by_group(report, GROUPS))}")
     return exit_code

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from minisplat_ref.cli.oracle import add_json_argument, publish
+from minisplat_ref.cli.oracle import add_output_arguments, publish
 from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.arguments import Commands, HelpFormatter
 
@@ -35,7 +35,7 @@ def add_parser(checks: Commands) -> None:
         formatter_class=HelpFormatter,
     )
     parser.add_argument("file", type=Path, metavar="FILE", help="bad-numbers-N.npz of a run")
-    add_json_argument(parser)
+    add_output_arguments(parser)
     parser.set_defaults(run=run)
 
 
@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
         case = saved.of(_recipe(saved.metadata))
     except (KeyError, TypeError) as error:
         raise InputError(f"{args.file} is not of this version: {error}") from error
-    return publish(replay(case, saved.wrong), args.json)
+    return publish(replay(case, saved.wrong), args)
 
 
 def _recipe(metadata: Mapping[str, Any]) -> "Recipe":

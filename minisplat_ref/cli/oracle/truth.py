@@ -2,7 +2,7 @@
 
 import argparse
 
-from minisplat_ref.cli.oracle import add_json_argument, publish
+from minisplat_ref.cli.oracle import add_output_arguments, publish
 from minisplat_ref.experiments.arguments import Commands, HelpFormatter
 
 DESCRIPTION = """\
@@ -26,7 +26,7 @@ def add_parser(checks: Commands) -> None:
         epilog=EPILOG,
         formatter_class=HelpFormatter,
     )
-    add_json_argument(parser)
+    add_output_arguments(parser)
     parser.set_defaults(run=run)
 
 
@@ -34,4 +34,4 @@ def run(args: argparse.Namespace) -> int:
     """Check, print the table."""
     from minisplat_ref.oracle.truth import check_truth
 
-    return publish(check_truth(), args.json)
+    return publish(check_truth(), args)

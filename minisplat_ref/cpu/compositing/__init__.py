@@ -70,7 +70,7 @@ def composite_with(
     collects = with_stats or with_median_depth
     shape, n_pairs = ((height, width), len(bins.gaussian_ids)) if collects else ((0, 0), 0)
     median_depth, dominant_ids = np.empty(shape, dtype), np.empty(shape, np.int32)
-    slots = np.zeros((n_pairs, N_PAIR_STATS), dtype)  # stay zero behind the hit that finishes a tile
+    slots = np.zeros((n_pairs, N_PAIR_STATS), dtype)  # remain zero behind the hit that finishes a tile
     records = records_of(projection, colors, conventions)
     forward_kernel(exp, colors.shape[1], collects)(
         records,
@@ -108,7 +108,7 @@ def composite_vjp_with(
     slots = large_empty((len(bins.gaussian_ids) * width,), dtype)
     v_backgrounds = np.empty((len(bins.tile_offsets) - 1, n_channels))  # by tiles
     backward_kernel(exp, n_channels)(
-        output.kept if output.kept is not None else records_of(projection, colors, conventions),
+        output.saved if output.saved is not None else records_of(projection, colors, conventions),
         lists_of(bins),
         n_threads(),
         frame_of(bins, conventions, dtype),

@@ -1,8 +1,8 @@
-"""The backward kernel: every tile's Gaussians front to back once more, and the sum of each Gaussian's shares.
+"""The backward kernel: loop over every tile's Gaussians, front to back once more, and sum each Gaussian's gradient.
 
-Front to back with the forward's arithmetic, so that every threshold falls the same way. A pixel needs only one number
-besides its transmittance, the part S of <v, image> that lies behind the current hit: it starts as the whole and shrinks
-hit by hit.
+The loop runs front to back with the forward pass's arithmetic, so that every threshold test has the same result. A
+pixel needs only one number besides its transmittance, the part S of <v, image> that lies behind the current hit: it
+starts as the whole, and each hit subtracts its share.
 
 With d = mean - pixel, e = dx + slope dy, sigma = (a e^2 + pivot dy^2) / 2 and q = dL/dsigma, all gradients of a
 footprint are moments of q over its pixels:
@@ -10,12 +10,12 @@ footprint are moments of q over its pixels:
     dL/dmean = (a sum q e, slope a sum q e + pivot sum q dy)      dL/do = -(sum q) / o
     dL/da = (sum q e^2) / 2      dL/dslope = a sum q e dy      dL/dpivot = (sum q dy^2) / 2
 
-The moments over e rather than over dx keep a needle's gradient: over dx they grow with its length squared and cancel
-later. They are changed to those by the conic's entries in float64.
+Moments in e rather than dx keep a needle's gradient accurate: in dx they grow with its length squared and cancel later.
+The conversion to derivatives with respect to the conic's entries is done in float64.
 
-A pair (tile, Gaussian) has a slot of its own for its moments, which afterwards are added up: see
-:mod:`minisplat_ref.cpu.compositing.pair_sums`. The background lies behind all Gaussians; each tile says what reaches
-it.
+A pair (tile, Gaussian) has a slot of its own for its moments, which are summed afterwards: see
+:mod:`minisplat_ref.cpu.compositing.pair_sums`. The background lies behind all Gaussians; each tile returns its share of
+the background's gradient.
 """
 
 import functools
@@ -42,14 +42,14 @@ from minisplat_ref.cpu.compositing.tile_state import (
     open_rows,
     row_in_image,
     rows_of,
+    scheduled_tiles,
     start_tile,
-    tiles_in_turn,
 )
 from minisplat_ref.cpu.gaussian_rows import rows_from
 from minisplat_ref.jit.compile import kernel, prange, scalar
-from minisplat_ref.jit.lanes import WIDTH, counted, filled, gather, load, select, store, sum_of, sums_of
+from minisplat_ref.jit.lanes import WIDTH, broadcast, gather, iota, load, reduce_sum, reduce_sums, select, store
 from minisplat_ref.jit.literals import ONE, ZERO
-from minisplat_ref.jit.turns import no_turns
+from minisplat_ref.jit.scheduling import shared_counter
 from minisplat_ref.scalar.compositing import blend, sigma_vjp
 
 
@@ -71,7 +71,7 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
             if n_pixels == 0:
                 continue  # as start_tile left it
             first = y * frame.width + x
-            rows, is_inside = rows_from(first, first + n_pixels), counted(as_data(0)) < as_data(n_pixels)
+            rows, is_inside = rows_from(first, first + n_pixels), iota(as_data(0)) < as_data(n_pixels)
             behind = gather(v_alpha, rows, 0) * (gather(alpha, rows, 0) - ONE)  # alpha = 1 - T_final
             place = row * row_size
             for k in range(n_channels):
@@ -82,22 +82,22 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
 
     @scalar
     def background_vjp(state, sums):
-        """What reaches the background of one tile: its pixels' transmittances times v."""
+        """Compute one tile's share of the background's gradient: its pixels' transmittances times v."""
         for k in range(n_channels):
-            total = filled(state.dtype.type(0))
+            total = broadcast(state.dtype.type(0))
             for i in range(0, N_ROWS * row_size, row_size):
                 total = total + abs(load(state, i)) * load(state, i + channels + k * WIDTH)
-            sums[k] = sum_of(total)
+            sums[k] = reduce_sum(total)
 
     @scalar
     def v_channel(s, k, i):
-        return load(s, i + channels + k * WIDTH) if k < n_channels else filled(s.dtype.type(0))
+        return load(s, i + channels + k * WIDTH) if k < n_channels else broadcast(s.dtype.type(0))
 
     @scalar
     def tile_vjp(s, scratch, further, records, tile, frame, slots):
         x0, y0, ids, slots_of = tile
         as_data = s.dtype.type
-        zero = filled(as_data(0))
+        zero = broadcast(as_data(0))
         is_open = open_rows(s, n_fields)
         next_rows = reached_rows(records, ids, 0, x0, y0)
         for m in range(ids.size):
@@ -142,10 +142,10 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
                 qee = qee + shape_e * e
                 qey = qey + shape_e * dy
                 qyy = qyy + shape_y * dy
-            store(slots, place, sums_of((q_sum, qe, qy, qee, qey, qyy, v_red, v_green)))
-            slots[place + N_MOMENTS + 2] = sum_of(v_blue)
+            store(slots, place, reduce_sums((q_sum, qe, qy, qee, qey, qyy, v_red, v_green)))
+            slots[place + N_MOMENTS + 2] = reduce_sum(v_blue)
             for k in range(N_FUSED, n_channels):
-                slots[place + N_MOMENTS + k] = sum_of(load(further, (k - N_FUSED) * WIDTH))
+                slots[place + N_MOMENTS + k] = reduce_sum(load(further, (k - N_FUSED) * WIDTH))
 
     @kernel()
     def composite_tiles_vjp(
@@ -158,17 +158,17 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
         slots,  # [M * slot_width]
         v_backgrounds,  # [n_tiles, D]
     ):
-        # Taken apart here: bundles that parallel loops read take longer to compile.
+        # Unpacked here: bundles that parallel loops read take longer to compile.
         offsets, ids, slots_of = lists
         image, alpha = pixels
         v_image, v_alpha = v_pixels
-        taken = no_turns()
+        taken = shared_counter()
         for _ in prange(n_threads):
             state = np.empty(N_ROWS * row_size, image.dtype)
             scratch = np.empty(SCRATCH_SIZE, image.dtype)
             start_scratch(scratch)
             further = np.empty((slot_width - N_MOMENTS - N_FUSED) * WIDTH, image.dtype)  # further channels
-            for i in tiles_in_turn(taken, n_threads, offsets):
+            for i in scheduled_tiles(taken, n_threads, offsets):
                 x0, y0 = corner(i, frame)
                 tile = Tile(x0, y0, ids[offsets[i] : offsets[i + 1]], slots_of[offsets[i] :])
                 start_tile(state, x0, y0, frame, n_fields)

@@ -1,4 +1,4 @@
-"""Blending with libm's exponential in both precisions: what the polynomial is measured against."""
+"""Blending with libm's exponential in both precisions, the baseline for the polynomial."""
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.compositing import composite_vjp_with, composite_with

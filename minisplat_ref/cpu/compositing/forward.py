@@ -1,9 +1,9 @@
-"""The forward kernel: all tiles, every tile's Gaussians front to back, eight pixels at a time; and blend statistics.
+"""The forward kernel: blend every tile's Gaussians front to back, eight pixels at a time, and collect statistics.
 
 The number of channels, the exponential and whether statistics are collected are compile-time constants: each
 combination is its own compiled kernel.
 
-What the weights of one Gaussian in one tile add up to goes into the slot of this pair, as in
+The sums of one Gaussian's weights in one tile go into the slot of this pair, see
 :mod:`minisplat_ref.cpu.compositing.pair_sums`.
 """
 
@@ -24,14 +24,25 @@ from minisplat_ref.cpu.compositing.tile_state import (
     open_rows,
     row_in_image,
     rows_of,
+    scheduled_tiles,
     start_tile,
-    tiles_in_turn,
 )
 from minisplat_ref.cpu.gaussian_rows import rows_from
 from minisplat_ref.jit.compile import kernel, prange, scalar
-from minisplat_ref.jit.lanes import WIDTH, filled, gather, larger, largest_of, load, scatter, select, store, sum_of
+from minisplat_ref.jit.lanes import (
+    WIDTH,
+    broadcast,
+    gather,
+    load,
+    maximum,
+    reduce_max,
+    reduce_sum,
+    scatter,
+    select,
+    store,
+)
 from minisplat_ref.jit.literals import ONE, ZERO
-from minisplat_ref.jit.turns import no_turns
+from minisplat_ref.jit.scheduling import shared_counter
 from minisplat_ref.scalar.compositing import blend
 from minisplat_ref.types import Floats, Ints
 
@@ -39,7 +50,7 @@ MEDIAN = np.float32(MEDIAN_TRANSMITTANCE)  # one half: exact in float32
 
 
 class HitStats(NamedTuple):
-    """What is written about the hits; all of it empty where it is not asked for."""
+    """Output about the hits; arrays that are not asked for are empty."""
 
     slots: Floats
     """[M, 3] sum of the weights, largest weight and number of hits of each pair, by slots."""
@@ -54,7 +65,7 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
     """Compile the forward kernel for an exponential, a number of channels, with or without statistics."""
     channels = WIDTH  # fields after the transmittance: the image so far
     best = channels + n_channels * WIDTH  # largest weight so far
-    best_place = best + WIDTH  # place of its Gaussian in the tile's list, counted from 1, 0 for none
+    best_place = best + WIDTH  # index of its Gaussian in the tile's list, counted from 1, 0 for none
     crossing = best_place + WIDTH  # depth of the hit that took the transmittance below one half, or 0
     n_fields = 1 + n_channels + (3 if has_stats else 0)
     row_size = n_fields * WIDTH
@@ -71,7 +82,7 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
 
     @scalar
     def pixels_of(state, place, n_pixels):
-        """Load a field of a row; where the image ends within the row, its last pixel fills up the eight."""
+        """Load a field of a row; where the image ends within the row, its last pixel is repeated."""
         return load(state, place) if n_pixels == WIDTH else gather(state, rows_from(place, place + n_pixels), 0)
 
     @scalar
@@ -102,7 +113,7 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
     def blend_tile(s, scratch, records, depths, tile, frame, slots):
         x0, y0, ids, slots_of = tile
         as_data = s.dtype.type
-        zero = filled(as_data(0))
+        zero = broadcast(as_data(0))
         is_open = open_rows(s, n_fields)
         next_rows = reached_rows(records, ids, 0, x0, y0)
         for m in range(ids.size):
@@ -126,11 +137,15 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
                 if has_stats:
                     record_hit(s, i, weight, as_data(m + 1), depths[n])  # exact in float32 up to 16 million
                     total = total + weight
-                    largest = larger(largest, weight)
-                    hits = hits + select(weight > ZERO, filled(as_data(1)), ZERO)
+                    largest = maximum(largest, weight)
+                    hits = hits + select(weight > ZERO, broadcast(as_data(1)), ZERO)
             if has_stats:
                 slot = slots_of[m]
-                slots[slot, 0], slots[slot, 1], slots[slot, 2] = sum_of(total), largest_of(largest), sum_of(hits)
+                slots[slot, 0], slots[slot, 1], slots[slot, 2] = (
+                    reduce_sum(total),
+                    reduce_max(largest),
+                    reduce_sum(hits),
+                )
 
     @kernel()
     def composite_tiles(
@@ -143,16 +158,16 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
         pixels,  # Pixels
         stats,  # HitStats
     ):
-        # Taken apart here: bundles that parallel loops read take longer to compile, by a quarter.
+        # Unpacked here: bundles that parallel loops read take a quarter longer to compile.
         offsets, ids, slots_of = lists
         image, alpha = pixels
         slots, median_depth, dominant_ids = stats
-        taken = no_turns()
+        taken = shared_counter()
         for _ in prange(n_threads):
             state = np.empty(N_ROWS * row_size, image.dtype)
             scratch = np.empty(SCRATCH_SIZE, image.dtype)
             start_scratch(scratch)
-            for i in tiles_in_turn(taken, n_threads, offsets):
+            for i in scheduled_tiles(taken, n_threads, offsets):
                 x0, y0 = corner(i, frame)
                 tile = Tile(x0, y0, ids[offsets[i] : offsets[i + 1]], slots_of[offsets[i] :])
                 start_tile(state, x0, y0, frame, n_fields)

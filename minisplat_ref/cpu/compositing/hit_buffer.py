@@ -1,14 +1,14 @@
-"""Pixels that sort their own hits: a buffer of those that wait, from which each pixel takes the nearest.
+"""Per-pixel sorting: a buffer of waiting hits, from which each pixel takes the nearest.
 
-A row of eight pixels goes through the list of its tile and writes down every hit; what waits is a queue of their
-numbers, sorted by depth in each of the eight pixels by itself::
+For a row of eight pixels a loop over the tile's list writes down every hit; the waiting hits are a queue of their
+indices, which each of the eight pixels sorts by its own depths::
 
     hits   [M * 8, F]  row 8 h + i: hit h in pixel i | alpha | v_alpha | weight | D channels |
     queue  [M, 2, 8]   depths and rows of hits       | taken ... | first: nearest | ... | end: farthest |
 
-A new hit enters at the end and moves forward past those that are deeper. When ``buffer_size`` hits wait, or the list is
-at its end, the first is taken. In a pixel that it misses, a hit is infinitely near: it is the next to be taken there,
-as nothing, and takes no room from the pixel's other hits.
+A new hit is inserted at the end and moves forward past deeper ones. When ``buffer_size`` hits wait, or the list has
+ended, the first is taken. In a pixel that the primitive misses, the hit has depth -infinity: it is taken next, has no
+effect, and uses no room in the pixel's buffer.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ import numpy as np
 from minisplat_ref.cpu.compositing.pixel_rows import hit_row
 from minisplat_ref.cpu.gaussian_rows import rows_from
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import WIDTH, any_of, counted, filled, load, scatter, select, store
+from minisplat_ref.jit.lanes import WIDTH, broadcast, iota, load, reduce_any, scatter, select, store
 from minisplat_ref.jit.literals import ZERO
 from minisplat_ref.types import Floats, Ints
 
@@ -32,7 +32,7 @@ class HitBuffer(NamedTuple):
 
     hits: Floats  # [M * 8, CHANNELS + D]
     queue: Floats  # [M * 2 * 8]
-    members: Ints  # [M] place in the tile's list of each hit
+    members: Ints  # [M] index in the tile's list of each hit
 
 
 @scalar
@@ -50,12 +50,12 @@ def hit_rows(h):
 
 @scalar
 def enqueue(queue, first, end, depth, row):
-    """Insert eight hits into ``queue``, which holds the places from ``first`` to before ``end``."""
+    """Insert eight hits into ``queue``, which occupies the positions [first, end)."""
     at = end
     while at > first:
         other = load(queue, (at - 1) * 2 * WIDTH)
         is_deeper = other > depth  # of equals, the first in the list stays the first
-        if not any_of(is_deeper):
+        if not reduce_any(is_deeper):
             break
         other_row = load(queue, (at - 1) * 2 * WIDTH + WIDTH)
         store(queue, at * 2 * WIDTH, (select(is_deeper, other, depth), select(is_deeper, other_row, row)))
@@ -66,7 +66,7 @@ def enqueue(queue, first, end, depth, row):
 
 @scalar
 def queued_rows(queue, at):
-    """Return the eight rows of hits at a place of ``queue``."""
+    """Return the eight rows of hits at a position of ``queue``."""
     i = at * 2 * WIDTH + WIDTH
     near = np.int64(queue[i]), np.int64(queue[i + 1]), np.int64(queue[i + 2]), np.int64(queue[i + 3])
     far = np.int64(queue[i + 4]), np.int64(queue[i + 5]), np.int64(queue[i + 6]), np.int64(queue[i + 7])
@@ -74,7 +74,7 @@ def queued_rows(queue, at):
 
 
 def walk_sorted(hit: Callable, shade: Callable, n_channels: int, take: Callable) -> Callable:
-    """Return the function that gives the hits of a row to ``take``, nearest first, and returns how many there are.
+    """Return a function that passes the hits of a row to ``take``, nearest first, and returns their number.
 
     ``take(state, hits, rows, frame)`` reads and changes ``state``, whose first eight numbers are the transmittances.
     """
@@ -82,13 +82,13 @@ def walk_sorted(hit: Callable, shade: Callable, n_channels: int, take: Callable)
     @scalar
     def walk(state, buffer, scene, row, buffer_size, frame):
         as_data = state.dtype.type
-        zero, hits, queue = filled(as_data(0)), buffer.hits, buffer.queue
+        zero, hits, queue = broadcast(as_data(0)), buffer.hits, buffer.queue
         first = end = 0
         for m in row.members:
             n = row.ids[m]
             unclamped, depth, place = hit_row(hit, scene, n, row)
             is_hit = unclamped >= frame.alpha_min
-            if not any_of(is_hit):
+            if not reduce_any(is_hit):
                 continue
             rows = hit_rows(end)
             scatter(hits, rows, ALPHA, unclamped)
@@ -97,14 +97,14 @@ def walk_sorted(hit: Callable, shade: Callable, n_channels: int, take: Callable)
             for k in range(n_channels):
                 scatter(hits, rows, CHANNELS + k, zero + shade(scene.colors, n, k, place))
             buffer.members[end] = m
-            enqueue(queue, first, end, select(is_hit, zero + depth, MISSED), counted(as_data(0)) + as_data(end * WIDTH))
+            enqueue(queue, first, end, select(is_hit, zero + depth, MISSED), iota(as_data(0)) + as_data(end * WIDTH))
             end += 1
             if end - first == buffer_size:
                 take(state, hits, queued_rows(queue, first), frame)
                 first += 1
-            if not any_of(load(state, 0) > ZERO):
+            if not reduce_any(load(state, 0) > ZERO):
                 break
-        while first < end and any_of(load(state, 0) > ZERO):
+        while first < end and reduce_any(load(state, 0) > ZERO):
             take(state, hits, queued_rows(queue, first), frame)
             first += 1
         return end

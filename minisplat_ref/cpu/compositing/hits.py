@@ -1,4 +1,4 @@
-"""Blending of any primitives: the functions around the plain kernels, twins of those in ``reference.compositing``."""
+"""Blend any primitives: the functions around the plain kernels, twins of those in ``reference.compositing``."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ N_CHUNKS = 64  # of the primitives, when their slots are added up
 
 @kernel()
 def sum_slots(slots, offsets, totals):
-    """Add the slots [M, G + S] of each Gaussian, which lie from ``offsets`` [N + 1] on, up in float64 [N, G + S]."""
+    """Sum each Gaussian's slots of [M, G + S], which ``offsets`` [N + 1] delimit, in float64 to [N, G + S]."""
     for chunk in prange(N_CHUNKS):
         for n in range(totals.shape[0] * chunk // N_CHUNKS, totals.shape[0] * (chunk + 1) // N_CHUNKS):
             for slot in range(offsets[n], offsets[n + 1]):
@@ -86,7 +86,7 @@ def _lists(bins: TileBins, response: KernelResponse) -> Lists:
 
 
 def _compiled_for(response: KernelResponse) -> KernelResponse:
-    """The response that stands for those whose buffers are of other sizes: they share a kernel."""
+    """Return the response whose kernel is shared by those that differ only in the size of their buffers."""
     return response._replace(buffer_size=min(response.buffer_size, LIST_ORDER + 1))
 
 

@@ -1,8 +1,8 @@
-"""What a Gaussian's pairs with tiles add up to: its gradient, and its blend statistics.
+"""Sum a Gaussian's contributions over tiles: its gradient and its blend statistics.
 
-A pair (tile, Gaussian) has a slot of its own, which only the thread that blends the tile writes; afterwards each
-Gaussian adds up its slots in order, in float64. No two threads write the same number, and the sums have the same bytes
-at any number of threads. Cost: 6 + D numbers a pair.
+A pair (tile, Gaussian) has a slot of its own, which only the thread that blends the tile writes; afterwards the slots
+of each Gaussian are summed in order, in float64. No two threads write the same number, and the sums have the same bytes
+at any number of threads. This costs 6 + D numbers per pair.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ from minisplat_ref.cpu.compositing.records import N_FUSED
 from minisplat_ref.cpu.gaussian_rows import DOUBLE
 from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.jit.compile import kernel, prange, scalar
-from minisplat_ref.jit.lanes import WIDTH, converted, filled, load, store
+from minisplat_ref.jit.lanes import WIDTH, broadcast, cast, load, store
 from minisplat_ref.jit.literals import ZERO
 from minisplat_ref.scalar.compositing import conic_vjp_of_moments, factors
 
@@ -20,16 +20,16 @@ N_PAIR_STATS = 3  # sum of the weights, largest weight, number of hits
 
 
 def slot_size(n_channels: int) -> int:
-    """Numbers in a pair's slot: its moments and the sums of its channels, three at least."""
+    """Return the size of a pair's slot: its moments and the sums of its channels, at least three."""
     return N_MOMENTS + max(n_channels, N_FUSED)
 
 
 @scalar
 def _sum_slots(n, slots, width, first, end, sums, projection, out):
-    """Gradient of one Gaussian from the moments in its slots, the first eight numbers of a slot at a time."""
-    total, blue = filled(DOUBLE), DOUBLE
+    """Write the gradient of one Gaussian from the moments in its slots, summing the first eight numbers together."""
+    total, blue = broadcast(DOUBLE), DOUBLE
     for slot in range(first, end):
-        total = total + converted(load(slots, slot * width), DOUBLE)
+        total = total + cast(load(slots, slot * width), DOUBLE)
         blue += slots[slot * width + WIDTH]
     store(sums, 0, total)
     sums[WIDTH] = blue
@@ -50,7 +50,7 @@ def _sum_slots(n, slots, width, first, end, sums, projection, out):
 
 @scalar
 def _write_zeros(n, out):
-    """Gradient of a Gaussian without a pair."""
+    """Write the gradient of a Gaussian without pairs."""
     out.means2d[n, 0] = out.means2d[n, 1] = out.opacities[n] = ZERO
     for k in range(3):
         out.conics[n, k] = ZERO
@@ -79,7 +79,7 @@ def sum_slots(
 
 @scalar
 def _sum_pair_stats(n, slots, offsets, stats):
-    """Statistics of one Gaussian from those of its pairs."""
+    """Write the statistics of one Gaussian from those of its pairs."""
     total = 0.0
     largest = slots.dtype.type(0)
     n_hits = 0

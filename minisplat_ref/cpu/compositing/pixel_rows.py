@@ -1,4 +1,4 @@
-"""Eight pixels of a line as one step, and the bundles that the plain kernels read and write."""
+"""Rows of eight pixels, which are processed together, and the bundles that the plain kernels read and write."""
 
 from typing import NamedTuple
 
@@ -6,13 +6,13 @@ import numpy as np
 
 from minisplat_ref.cpu.gaussian_rows import rows_from
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import WIDTH, counted, filled, gather, select
+from minisplat_ref.jit.lanes import WIDTH, broadcast, gather, iota, select
 from minisplat_ref.jit.literals import HALF, ONE, ZERO
 from minisplat_ref.types import Floats, Ints
 
 
 class Scene(NamedTuple):
-    """What the kernels read of the primitives."""
+    """The primitives, as the kernels read them."""
 
     records: Floats  # [N, F] of the response
     colors: Floats  # [N, S] coefficients of D channels
@@ -20,11 +20,11 @@ class Scene(NamedTuple):
 
 
 class Lists(NamedTuple):
-    """Which primitives the pixels of every tile meet, and how many hits a pixel holds back to sort them."""
+    """The primitives of every tile, and the size of a pixel's sorting buffer."""
 
     offsets: Ints  # [n_tiles + 1] tile t owns ids[offsets[t] : offsets[t + 1]]
     ids: Ints  # [M] nearest first
-    slots: Ints  # [M] place of each pair when the pairs are grouped by primitive
+    slots: Ints  # [M] index of each pair when the pairs are grouped by primitive
     tile_width: int  # pixels
     tile_height: int  # pixels
     buffer_size: int  # hits
@@ -38,17 +38,17 @@ class Pixels(NamedTuple):
 
 
 class Row(NamedTuple):
-    """Eight pixels of a line, and which primitives they may meet."""
+    """Eight pixels of a line, and the primitives that may hit them."""
 
     x: int  # column of the first
     y: int  # line
     ids: Ints  # [M] list of the tile, nearest first
-    members: Ints  # [n] places in it of the primitives whose box holds one of the pixels
+    members: Ints  # [n] indices into ``ids`` of the primitives whose box contains one of the pixels
 
 
 @scalar
 def start_tile(tile, lists, frame):
-    """Return column and line of a tile's first pixel, and how many rows of eight it has on a line."""
+    """Return column and line of a tile's first pixel, and its number of rows of eight per line."""
     n_tiles_x = (frame.width + lists.tile_width - 1) // lists.tile_width
     x0, y0 = tile % n_tiles_x * lists.tile_width, tile // n_tiles_x * lists.tile_height
     return x0, y0, (lists.tile_width + WIDTH - 1) // WIDTH
@@ -56,14 +56,14 @@ def start_tile(tile, lists, frame):
 
 @scalar
 def list_rows(boxes, ids, tile, lists, frame):
-    """Deal the list of a tile out to its rows of eight pixels.
+    """Distribute a tile's list to its rows of eight pixels.
 
     Returns
     -------
     members : ndarray of shape (n_rows, M)
-        Places in ``ids`` [M] of the primitives whose box holds a pixel of the row, in the list's order.
+        Indices into ``ids`` [M] of the primitives whose box contains a pixel of the row, in the list's order.
     counts : ndarray of shape (n_rows,)
-        How many they are.
+        How many of them there are.
     """
     x0, y0, n_per_line = start_tile(tile, lists, frame)
     x_end, y_end = min(x0 + lists.tile_width, frame.width), min(y0 + lists.tile_height, frame.height)
@@ -81,7 +81,7 @@ def list_rows(boxes, ids, tile, lists, frame):
 
 @scalar
 def rows_of_tile(tile, scene, lists, frame):
-    """Yield the rows of a tile that lie in the image."""
+    """Yield the rows of a tile that lie inside the image."""
     ids = lists.ids[lists.offsets[tile] : lists.offsets[tile + 1]]
     members, counts = list_rows(scene.boxes, ids, tile, lists, frame)
     x0, y0, n_per_line = start_tile(tile, lists, frame)
@@ -93,7 +93,7 @@ def rows_of_tile(tile, scene, lists, frame):
 
 @scalar
 def row_pixels(row, frame):
-    """Return the places of a row's pixels in the image; those beyond its edge repeat the last."""
+    """Return the flat indices of a row's pixels in the image; those beyond its edge repeat the last."""
     first = row.y * frame.width + row.x
     return rows_from(first, first + min(WIDTH, frame.width - row.x))
 
@@ -106,15 +106,15 @@ def field_of(state, k, row, frame):
 
 @scalar
 def full_transmittance(row, frame, as_data):
-    """Return one, and minus one for pixels beyond the image's edge: they are finished."""
-    return select(counted(as_data(0)) < as_data(frame.width - row.x), filled(as_data(1)), -ONE)
+    """Return one, and minus one for pixels beyond the image's edge, which marks them finished."""
+    return select(iota(as_data(0)) < as_data(frame.width - row.x), broadcast(as_data(1)), -ONE)
 
 
 @scalar
 def hit_row(hit, scene, n, row):
-    """Return what ``hit`` of a response does, with alpha 0 in the pixels that the box does not hold."""
+    """Return the response's ``hit``, with alpha 0 in pixels outside the box."""
     as_data = scene.records.dtype.type
-    xs = counted(as_data(0)) + (as_data(row.x) + HALF)  # pixel centres
+    xs = iota(as_data(0)) + (as_data(row.x) + HALF)  # pixel centres
     unclamped, depth, place = hit(scene.records, n, xs, as_data(row.y) + HALF)
     is_in_box = (xs > scene.boxes[n, 0]) & (xs < scene.boxes[n, 2])
     return select(is_in_box, unclamped, ZERO), depth, place

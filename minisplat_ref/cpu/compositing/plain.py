@@ -1,8 +1,8 @@
 """The plain kernels: blending forward and backward, for any primitive. Read these first, then the tuned ones.
 
-Every splatting method is this loop: a pixel meets the primitives of its tile, nearest first, and takes from each what
-the light in front has left. What a primitive is stands in a :class:`KernelResponse`; here is only the loop, eight
-pixels of a line at a time. The list of a tile is dealt out to its rows of eight, and each goes through its own::
+Every splatting method is this loop: for each pixel, loop over the primitives of its tile, nearest first, and add each
+one's colour times alpha times the transmittance in front of it. A :class:`KernelResponse` defines the primitive; this
+module has only the loop, over eight pixels of a line at a time. A tile's list is distributed to its rows of eight::
 
     a tile               its list [M]           members of row 0      state of a row, eight numbers each
     +-------+-------+    +---+---+---+---+--    +---+---+---+--       forward            backward
@@ -17,14 +17,14 @@ pixels of a line at a time. The list of a tile is dealt out to its rows of eight
     sums [M, G + S, 8] of a tile, backward:    | record's gradient: G | colours' gradient: S | of every listed primitive
     slots [pairs, G + S] of all tiles:         the same with the eight added up; a primitive's slots lie side by side
 
-Backward, a row goes through the list from the front once more, so that every threshold falls as it did forward. Of
-<v, image> it keeps the part that lies behind the current hit: it starts as the whole and shrinks hit by hit. No two
-threads write to one slot, and slots are added up in their order, so that the bytes of a gradient do not depend on the
-number of threads.
+The backward pass runs over a row's list from the front once more, so that every threshold test has the same result as
+in the forward pass. It keeps the part of <v, image> that lies behind the current hit: this starts as the whole, and
+each hit subtracts its share. No two threads write to one slot, and slots are summed in order, so that the bytes of a
+gradient do not depend on the number of threads.
 
 The functions around these kernels are in :mod:`minisplat_ref.cpu.compositing.hits`. Where pixels sort their hits
-(``buffer_size`` above 1), :mod:`minisplat_ref.cpu.compositing.hit_buffer` goes through the list. Left out: what the
-tuned kernels (``forward``, ``backward``) do to be faster, and blend statistics.
+(``buffer_size`` above 1), :mod:`minisplat_ref.cpu.compositing.hit_buffer` runs over the list. Left out: what makes the
+tuned kernels (``forward``, ``backward``) faster, and blend statistics.
 """
 
 import functools
@@ -46,17 +46,17 @@ from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.jit.lanes import (
     WIDTH,
     accumulate,
-    any_of,
-    filled,
+    broadcast,
     gather,
     load,
+    reduce_any,
+    reduce_sum,
     scatter,
     select,
     store,
-    sum_of,
 )
 from minisplat_ref.jit.literals import ONE, ZERO
-from minisplat_ref.jit.turns import no_turns, turns
+from minisplat_ref.jit.scheduling import dynamic_range, shared_counter
 from minisplat_ref.scalar.compositing import blend, blend_vjp
 
 
@@ -75,7 +75,7 @@ def forward_kernel(response: KernelResponse, n_channels: int) -> Callable:
             T, weight = blend(T, unclamped, frame)
             for k in range(n_channels):
                 accumulate(state, (1 + k) * WIDTH, weight * shade(scene.colors, n, k, place))
-            if not any_of(T > ZERO):
+            if not reduce_any(T > ZERO):
                 break
         store(state, 0, T)
 
@@ -91,10 +91,10 @@ def forward_kernel(response: KernelResponse, n_channels: int) -> Callable:
 
     @kernel()
     def composite_tiles(scene, background, lists, frame, n_threads, out):
-        taken = no_turns()
+        taken = shared_counter()
         for _ in prange(n_threads):
             state = np.empty((1 + n_channels) * WIDTH, out.image.dtype)
-            for tile in turns(taken, lists.offsets.size - 1):
+            for tile in dynamic_range(taken, lists.offsets.size - 1):
                 n_listed = lists.offsets[tile + 1] - lists.offsets[tile]
                 buffer = hit_buffer(n_listed if is_sorted else 0, n_channels, state.dtype)
                 for row in rows_of_tile(tile, scene, lists, frame):
@@ -122,7 +122,7 @@ def backward_kernel(response: KernelResponse, n_channels: int) -> Callable:
 
     @scalar
     def start_row(state, output, v_output, row, frame):
-        """Fetch v for eight pixels, and <v, image> with the share of alpha = 1 - T_end."""
+        """Load v for eight pixels, and <v, image> including the term of alpha = 1 - T_end."""
         pixels, T = row_pixels(row, frame), full_transmittance(row, frame, state.dtype.type)
         store(state, 0, T)
         behind = gather(v_output.alpha, pixels, 0) * (gather(output.alpha, pixels, 0) - ONE)
@@ -134,7 +134,7 @@ def backward_kernel(response: KernelResponse, n_channels: int) -> Callable:
 
     @scalar
     def blend_again(state, unclamped, light, frame):
-        """Blend a hit with <v, colour> = ``light`` once more; return dL/dalpha and the weight."""
+        """Repeat the blending of a hit with <v, colour> = ``light``; return dL/dalpha and the weight."""
         T = load(state, 0)
         after, weight = blend(T, unclamped, frame)
         behind = load(state, behind_place) - weight * light
@@ -144,7 +144,7 @@ def backward_kernel(response: KernelResponse, n_channels: int) -> Callable:
 
     @scalar
     def chain(sums, v_place, state, scene, n, place, gradient, frame):
-        """Add what eight pixels contribute to the ``sums`` [(G + S) * 8] of primitive n."""
+        """Add the contributions of eight pixels to the ``sums`` [(G + S) * 8] of primitive n."""
         unclamped, v_alpha, weight = gradient
         v_place[:] = ZERO
         for k in range(n_channels):
@@ -158,23 +158,23 @@ def backward_kernel(response: KernelResponse, n_channels: int) -> Callable:
 
     @scalar
     def chain_row(sums, v_place, state, scene, row, frame):
-        """Go through the members of a row's list once more and add to their ``sums``."""
+        """Loop over the members of a row's list once more and add to their ``sums``."""
         for m in row.members:
             n = row.ids[m]
             unclamped, _, place = hit_row(hit, scene, n, row)
-            light = filled(state.dtype.type(0))
+            light = broadcast(state.dtype.type(0))
             for k in range(n_channels):
                 light = light + load(state, v_first + k * WIDTH) * shade(scene.colors, n, k, place)
             v_alpha, weight = blend_again(state, unclamped, light, frame)
             gradient = unclamped, v_alpha, weight
             chain(sums[m * n_sums * WIDTH :], v_place, state, scene, n, place, gradient, frame)
-            if not any_of(load(state, 0) > ZERO):
+            if not reduce_any(load(state, 0) > ZERO):
                 break
 
     @scalar
     def take(state, hits, rows, frame):
-        """Blend one hit of a buffer in each pixel once more, and write its gradient down."""
-        light = filled(state.dtype.type(0))
+        """Repeat the blending of one hit of a buffer in each pixel, and store its gradient."""
+        light = broadcast(state.dtype.type(0))
         for k in range(n_channels):
             light = light + load(state, v_first + k * WIDTH) * gather(hits, rows, CHANNELS + k)
         v_alpha, weight = blend_again(state, gather(hits, rows, ALPHA), light, frame)
@@ -185,7 +185,7 @@ def backward_kernel(response: KernelResponse, n_channels: int) -> Callable:
 
     @scalar
     def chain_sorted_row(sums, v_place, buffer, state, scene, row, buffer_size, frame):
-        """Do the same where pixels sort their hits: in their order for dL/dalpha, then in the list's for the rest."""
+        """Do :func:`chain_row` where pixels sort their hits: dL/dalpha in their order, the rest in the list's order."""
         for h in range(walk(state, buffer, scene, row, buffer_size, frame)):
             m, rows = buffer.members[h], hit_rows(h)
             unclamped, _, place = hit_row(hit, scene, row.ids[m], row)
@@ -194,11 +194,11 @@ def backward_kernel(response: KernelResponse, n_channels: int) -> Callable:
 
     @kernel()
     def composite_tiles_vjp(scene, lists, frame, n_threads, output, v_output, slots, v_backgrounds):
-        taken = no_turns()
+        taken = shared_counter()
         for _ in prange(n_threads):
             state = np.empty((2 + n_channels) * WIDTH, slots.dtype)
             v_place = np.empty(n_places * WIDTH, slots.dtype)
-            for tile in turns(taken, lists.offsets.size - 1):
+            for tile in dynamic_range(taken, lists.offsets.size - 1):
                 first, n_listed = lists.offsets[tile], lists.offsets[tile + 1] - lists.offsets[tile]
                 sums = np.zeros(n_listed * n_sums * WIDTH, slots.dtype)
                 buffer = hit_buffer(n_listed if is_sorted else 0, n_channels, state.dtype)
@@ -209,9 +209,9 @@ def backward_kernel(response: KernelResponse, n_channels: int) -> Callable:
                     else:
                         chain_row(sums, v_place, state, scene, row, frame)
                     for k in range(n_channels):
-                        v_backgrounds[tile, k] += sum_of(abs(load(state, 0)) * load(state, v_first + k * WIDTH))
+                        v_backgrounds[tile, k] += reduce_sum(abs(load(state, 0)) * load(state, v_first + k * WIDTH))
                 for m in range(n_listed):
                     for j in range(n_sums):
-                        slots[lists.slots[first + m], j] = sum_of(load(sums, (m * n_sums + j) * WIDTH))
+                        slots[lists.slots[first + m], j] = reduce_sum(load(sums, (m * n_sums + j) * WIDTH))
 
     return composite_tiles_vjp

@@ -1,4 +1,4 @@
-"""3DGS by the plain kernels: stages of a backend, with the response of a projected Gaussian.
+"""3DGS with the plain kernels: stages of a backend, with the response of a projected Gaussian.
 
 As in ``compositing``, float32 data use the polynomial exponential and float64 data libm's.
 """

@@ -1,8 +1,8 @@
-"""What the blending kernels read of a Gaussian: one record of 13 numbers and its colours, with three a cache line.
+"""The record of a Gaussian that blending kernels read: 13 numbers and its colours; with three, one cache line.
 
-Beside centre, conic and opacity it holds the visible ellipse with x and y exchanged, from which a kernel learns the
-rows that the ellipse reaches in a strip of columns, and the columns of the box. Records are made eight at a time:
-numbers of eight Gaussians in, their columns out.
+Besides centre, conic and opacity it holds the visible ellipse with x and y exchanged, from which a kernel computes the
+rows that the ellipse reaches in a strip of columns, and the columns of the box. Records are made eight at a time, by
+transposing the numbers of eight Gaussians.
 """
 
 import numpy as np
@@ -12,28 +12,28 @@ from minisplat_ref.cpu.gaussian_rows import list_visible, listed_rows, rounded, 
 from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.cpu.tiling import ELLIPSE_MARGIN
 from minisplat_ref.jit.compile import kernel, prange, scalar
-from minisplat_ref.jit.lanes import WIDTH, converted, gather, scatter, select, smaller
+from minisplat_ref.jit.lanes import WIDTH, cast, gather, minimum, scatter, select
 from minisplat_ref.jit.literals import HALF, ZERO
 from minisplat_ref.scalar.compositing import factors
 from minisplat_ref.scalar.tiling import Outline, visible_outline
 from minisplat_ref.types import Floats, Projection
 
-# Columns. The conic is there as its factors, two of them halved as sigma wants them; columns of pixels are floats.
+# Columns. The conic is stored as its factors, two of them halved as sigma needs them; pixel columns are floats.
 MEAN_X, MEAN_Y, HALF_A, SLOPE, HALF_PIVOT, OPACITY = range(6)
 TURNED_SLOPE, TURNED_INVERSE_A, TURNED_PIVOT, Q, TURNED_TILT, COLUMN_FIRST, COLUMN_END, COLOR = range(6, 14)
-N_FUSED = 3  # channels that every record has; fewer are filled up with zeros
+N_FUSED = 3  # channels that every record has; fewer are padded with zeros
 HALF_A_MAX = np.float32(1e30)  # without a low-pass a footprint can be thinner than float32 can square
 
 
 def record_size(n_channels: int) -> int:
-    """Numbers in a record."""
+    """Return the size of a record."""
     return COLOR + max(n_channels, N_FUSED)
 
 
 @scalar
 def _half(factor):
-    """Half of a factor of a conic; one that is negative becomes so large that its negative squares are no hits."""
-    return select(factor >= ZERO, smaller(HALF * factor, HALF_A_MAX), HALF_A_MAX)
+    """Return half of a factor of a conic; a negative one becomes so large that it leaves no hits."""
+    return select(factor >= ZERO, minimum(HALF * factor, HALF_A_MAX), HALF_A_MAX)
 
 
 @scalar
@@ -51,8 +51,8 @@ def _write_eight(rows, projection, colors, alpha_min, records):
         *(opacity, outline.slope, outline.inverse_a),
     )
     second_half = (
-        *(smaller(outline.pivot, HALF_A_MAX), outline.q, outline.tilt),
-        *(converted(gather(boxes, rows, 0), zero), converted(gather(boxes, rows, 2), zero)),
+        *(minimum(outline.pivot, HALF_A_MAX), outline.q, outline.tilt),
+        *(cast(gather(boxes, rows, 0), zero), cast(gather(boxes, rows, 2), zero)),
         *(gather(colors, rows, 0), gather(colors, rows, 1), gather(colors, rows, 2)),
     )
     scatter(records, rows, MEAN_X, first_half)
@@ -83,7 +83,7 @@ def _write_records(
 
 @scalar
 def turned_outline(records, n):
-    """Outline of the visible ellipse with x and y exchanged: ``rightmost_offset`` then gives its lowest point."""
+    """Return the visible ellipse with x and y exchanged, of which ``rightmost_offset`` gives the lowest point."""
     return Outline(
         records[n, TURNED_SLOPE],
         records[n, TURNED_INVERSE_A],

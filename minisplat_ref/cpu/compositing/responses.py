@@ -1,10 +1,10 @@
-"""What the plain kernels know of a primitive: how it answers a pixel, as formulas on lanes over a row of numbers.
+"""Responses for the plain kernels: what a primitive does to a pixel, as formulas on lanes over a row of numbers.
 
 The reference describes a response as functions of whole arrays (``reference.hits``); here each is a ``scalar`` function
-of one primitive and eight pixels. A kernel never sees what a primitive is: it reads the row that ``records`` made of
-it, and gives back the gradient with respect to the first numbers of that row, which ``records_vjp`` turns into one with
-respect to the primitive. What a ray has to know of the camera goes into the record as well: the direction of a pixel's
-ray is linear in (x, y, 1).
+of one primitive and eight pixels. A kernel never sees the primitive itself: it reads the row that ``records`` made of
+it, and returns the gradient with respect to the first numbers of that row, which ``records_vjp`` converts to one with
+respect to the primitive. What a ray depends on of the camera is in the record too: the direction of a pixel's ray is
+linear in (x, y, 1).
 
 The conic, a flat ellipse in the image, is the first response and that of 3DGS. Its record holds the conic as factors:
 with e = dx + slope dy, sigma = (a e^2 + pivot dy^2) / 2.
@@ -25,21 +25,21 @@ from minisplat_ref.types import Floats, Ints, Projection
 
 @scalar
 def constant_color(colors, n, k, place):
-    """Channel k of a primitive whose row of colours [D] holds in all of its pixels."""
+    """Return channel k of a primitive that has the same colours [D] in all pixels."""
     return colors[n, k]
 
 
 @scalar
 def constant_color_vjp(colors, n, k, place, v):
-    """Gradient with respect to the one coefficient of the channel; the place does not matter."""
+    """Return the derivative with respect to the channel's one coefficient; there is none for the place."""
     return (v,), ()
 
 
 class KernelResponse(NamedTuple):
     """A response for the kernels. The first three functions are NumPy over all primitives, the others lanes of one hit.
 
-    A ``place`` is a tuple of lanes, whatever ``shade`` and the derivatives want to know of a hit: offsets, the
-    coordinates (u, v) on a surfel, the depth. It has to be finite where the primitive is missed, too.
+    A ``place`` is a tuple of lanes with whatever ``shade`` and the derivatives need of a hit: offsets, the coordinates
+    (u, v) on a surfel, the depth. It has to be finite even where the primitive is missed.
     """
 
     records: Callable[[Any, np.dtype], Floats]
@@ -53,8 +53,8 @@ class KernelResponse(NamedTuple):
     hit_vjp: Callable
     """(records, n, place, v_mean, v_shape, v_place) -> ``n_gradients`` lanes.
 
-    ``v_mean`` and ``v_shape`` are dL/dalpha for what moves the primitive and for all else: conventions may stop either
-    at the clamp. ``v_place`` [n_places * 8] is dL/dplace, from ``shade``.
+    ``v_mean`` and ``v_shape`` both are dL/dalpha: the first for what moves the primitive, the second for all else,
+    because conventions may stop either at the clamp. ``v_place`` [n_places * 8] is dL/dplace, from ``shade``.
     """
     n_gradients: int
     """Numbers at the start of a record that have a derivative."""
@@ -67,9 +67,9 @@ class KernelResponse(NamedTuple):
     n_places: int = 0
     """Numbers at the start of a place that colours depend on."""
     buffer_size: int = LIST_ORDER
-    """Hits that a pixel holds back, of which it takes the nearest when they are complete: a k-buffer.
+    """Size of each pixel's k-buffer: when it is full, the pixel takes the nearest of the hits in it.
 
-    ``LIST_ORDER`` = 1 takes them as they come, ``EXACT_ORDER`` holds any number.
+    ``LIST_ORDER`` = 1 takes hits in the order of the list, ``EXACT_ORDER`` buffers any number.
     """
 
 
@@ -80,7 +80,7 @@ HALF_A_MAX = 1e30  # without a low-pass a footprint can be thinner than float32 
 
 @functools.cache
 def conic_response(exp: Callable) -> KernelResponse:
-    """Response of projected Gaussians, with an exponential of :mod:`minisplat_ref.cpu.compositing.exponential`."""
+    """Return the response of projected Gaussians for one of :mod:`minisplat_ref.cpu.compositing.exponential`."""
 
     @scalar
     def conic_hit(records, n, x, y):
@@ -103,7 +103,7 @@ def conic_response(exp: Callable) -> KernelResponse:
 
 
 def _conic_factors(projection: Projection) -> tuple[Floats, Floats, Floats]:
-    """a, slope and pivot of every footprint in float64; those of a circle where it is culled."""
+    """Return a, slope and pivot of every footprint in float64; those of a circle where it is culled."""
     is_culled = projection.radii[:, 0] == 0
     a, b, c = projection.conics.T
     return factors(a + is_culled, b, c + is_culled)  # conics of culled Gaussians are 0
@@ -113,7 +113,7 @@ def _conic_records(projection: Projection, dtype: np.dtype) -> Floats:
     a, slope, pivot = _conic_factors(projection)
     records = np.empty((len(a), DEPTH + 1), dtype)
     records[:, MEAN_X], records[:, MEAN_Y] = projection.means2d.T
-    # Rounding can leave a factor that is negative: then no pixel but the centre's is hit.
+    # Rounding can make a factor negative: then only the pixel at the centre is hit.
     records[:, HALF_A] = np.where(a >= 0, np.minimum(a / 2, HALF_A_MAX), HALF_A_MAX)
     records[:, HALF_PIVOT] = np.where(pivot >= 0, np.minimum(pivot / 2, HALF_A_MAX), HALF_A_MAX)
     records[:, SLOPE], records[:, OPACITY], records[:, DEPTH] = slope, projection.opacities, projection.depths
@@ -121,7 +121,7 @@ def _conic_records(projection: Projection, dtype: np.dtype) -> Floats:
 
 
 def _conic_records_vjp(projection: Projection, v_records: Floats) -> tuple[Floats, ...]:
-    """Gradient with respect to means2d, conics and opacities."""
+    """Return the gradient with respect to means2d, conics and opacities."""
     a, slope, _ = _conic_factors(projection)
     ee, ey, yy = v_records[:, HALF_A], v_records[:, SLOPE] / a, v_records[:, HALF_PIVOT]
     v_conics = np.column_stack(conic_vjp_of_moments(slope, ee, ey, yy))

@@ -1,11 +1,11 @@
 """Which part of a tile a Gaussian reaches, and its alpha there.
 
-The rows that the visible ellipse reaches are found strip by strip, so that a slanted ellipse is a staircase of rows
+The rows that the visible ellipse reaches are found strip by strip, so that a slanted ellipse covers a staircase of rows
 rather than its box. What all pixels of a line share is computed once, for all lines of the tile together.
 
-Alpha is written down for all rows before any is blended: the exponential is a long chain of operations of which each
-waits for the one before, and blending another. A processor hides the waiting behind other pixels, as far ahead as it
-can look, and it looks further ahead if there is less to do for each pixel.
+Alpha is computed for all rows before any is blended. The exponential is a long chain of dependent operations, and
+blending is another. A processor hides their latency by executing other pixels out of order, and its window spans more
+pixels if there is less to do for each.
 """
 
 from collections.abc import Callable
@@ -29,14 +29,14 @@ from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import (
     WIDTH,
     bits_between,
-    counted,
-    filled,
+    broadcast,
     floor,
-    larger,
+    iota,
     load,
+    maximum,
+    minimum,
     prefetch,
     select,
-    smaller,
     store,
 )
 from minisplat_ref.jit.literals import FOUR, HALF, ONE
@@ -45,14 +45,14 @@ from minisplat_ref.scalar.tiling import rightmost_offset
 
 FETCH_AHEAD = 8  # Gaussians
 
-# Places in the scratch of a thread, which fits a page of memory: a load from an address that lies whole pages from
-# where something has just been stored waits for it.
+# Offsets into a thread's scratch buffer, which fits a page of memory: a load waits for a recent store if their
+# addresses differ by a multiple of the page size.
 ALPHAS = 0  # of the rows that the current Gaussian reaches
 CENTRES_X = N_ROWS * WIDTH  # pixel centres of a row of each strip, counted from the tile's edge
-CENTRES_Y = CENTRES_X + N_STRIPS * WIDTH  # and of every line of pixels
+CENTRES_Y = CENTRES_X + N_STRIPS * WIDTH  # the same for every line of pixels
 TO_MEAN_Y = CENTRES_Y + TILE_HEIGHT  # dy of each line
 RIDGE = TO_MEAN_Y + TILE_HEIGHT  # where sigma is least on each line
-LEAST = RIDGE + TILE_HEIGHT  # and that sigma
+LEAST = RIDGE + TILE_HEIGHT  # that least sigma
 SCRATCH_SIZE = LEAST + TILE_HEIGHT
 
 
@@ -61,7 +61,7 @@ def start_scratch(scratch):
     """Write the pixel centres of a tile."""
     as_data = scratch.dtype.type
     for strip in range(N_STRIPS):
-        store(scratch, CENTRES_X + strip * WIDTH, counted(as_data(0)) + (HALF + as_data(strip * WIDTH)))
+        store(scratch, CENTRES_X + strip * WIDTH, iota(as_data(0)) + (HALF + as_data(strip * WIDTH)))
     for line in range(TILE_HEIGHT):
         scratch[CENTRES_Y + line] = HALF + as_data(line)
 
@@ -70,7 +70,7 @@ def start_scratch(scratch):
 def write_lines(scratch, mx, my, slope, half_pivot):
     """Write what all pixels of a line share: with e = dx + slope dy, sigma is (a e^2 + pivot dy^2) / 2.
 
-    On each line it is least at mx + slope dy, and e is the way from there.
+    On each line it is least at mx + slope dy, and e is the distance from there.
     """
     for i in range(0, TILE_HEIGHT, WIDTH):
         dy = my - load(scratch, CENTRES_Y + i)
@@ -99,10 +99,10 @@ def sigma_of(scratch, row, half_a):
 
 @scalar
 def reached_rows(records, ids, m, x0, y0):
-    """Rows of eight pixels that the visible ellipse of the tile's m-th Gaussian reaches, as bits.
+    """Return as bits the rows of eight pixels that the visible ellipse of the tile's m-th Gaussian reaches.
 
-    Eight bounds at once: how far it reaches up in each of the four strips, and how far down. A kernel asks one Gaussian
-    ahead: the record is then on its way from memory, and the root computed, while the one before is blended.
+    It computes eight bounds at once: how far the ellipse reaches up and down in each of the four strips. A kernel calls
+    it one Gaussian ahead: while the one before is blended, the record is fetched and the root computed.
     """
     if m >= ids.size:
         return np.uint64(0)
@@ -110,20 +110,20 @@ def reached_rows(records, ids, m, x0, y0):
     as_data = records.dtype.type
     n = ids[m]
     mx, my = records[n, MEAN_X] - as_data(x0), records[n, MEAN_Y] - as_data(y0)
-    k, zero = counted(mx), filled(as_data(0))
+    k, zero = iota(mx), broadcast(as_data(0))
     is_up = k < FOUR
     left = (k - select(is_up, zero, FOUR)) * as_data(WIDTH)  # edges of the strips
-    side = select(is_up, filled(as_data(-1)), ONE)
+    side = select(is_up, broadcast(as_data(-1)), ONE)
     low = left + (HALF - mx)
     offset = rightmost_offset(turned_outline(records, n), low, low + as_data(WIDTH - 1), side)
     bound = floor(side * my + offset + (HALF + ELLIPSE_MARGIN))  # minus the first row, or the one after the last
-    bound = side * larger(as_data(-TILE_HEIGHT), smaller(select(is_up, zero, as_data(TILE_HEIGHT)), bound))
+    bound = side * maximum(as_data(-TILE_HEIGHT), minimum(select(is_up, zero, as_data(TILE_HEIGHT)), bound))
     is_in_box = (left < records[n, COLUMN_END] - as_data(x0)) & (left > records[n, COLUMN_FIRST] - as_data(x0 + WIDTH))
-    return bits_between(select(is_in_box, bound, zero))  # no branches: what is reached cannot be foreseen
+    return bits_between(select(is_in_box, bound, zero))  # no branches, which would be unpredictable
 
 
 def alpha_writer(exp: Callable) -> Callable:
-    """Return the function that writes opacity exp(-sigma) of a Gaussian, to the places of the rows it reaches."""
+    """Return a function that writes a Gaussian's opacity exp(-sigma) for the rows that it reaches."""
 
     @scalar
     def write_alphas(scratch, rows, records, n, x0, y0):

@@ -1,9 +1,9 @@
-"""What the pixels of one tile remember while its Gaussians pass by, and how tiles are dealt out to threads.
+"""The state of one tile's pixels while its Gaussians are blended, and the scheduling of tiles to threads.
 
-A tile of 32 x 16 pixels is 64 rows of eight pixels, and any set of them is an integer of 64 bits: the rows that a
-Gaussian reaches, the rows in which a pixel still accepts hits, and by one ``&`` the rows that there is work to do in.
-The rows are numbered down a strip eight pixels wide, then down the next. Of each row all fields lie side by side in
-memory, the transmittance first, then whatever a kernel keeps.
+A tile of 32 x 16 pixels is 64 rows of eight pixels, and any set of rows is an integer of 64 bits: the rows that a
+Gaussian reaches, the rows in which a pixel still accepts hits, and by one ``&`` the rows with work to do. The rows are
+numbered down a strip eight pixels wide, then down the next. All fields of a row are contiguous in memory, the
+transmittance first, then the fields of the kernel.
 """
 
 from typing import NamedTuple
@@ -13,23 +13,23 @@ import numpy as np
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import WIDTH, any_of, counted, filled, load, lowest_bit, select, store
+from minisplat_ref.jit.lanes import WIDTH, broadcast, iota, load, lowest_bit, reduce_any, select, store
 from minisplat_ref.jit.literals import ONE, ZERO
-from minisplat_ref.jit.turns import turns
+from minisplat_ref.jit.scheduling import dynamic_range
 from minisplat_ref.scalar.compositing import Frame
 from minisplat_ref.types import Floats, Ints, TileBins
 
 N_STRIPS = TILE_WIDTH // WIDTH
 N_ROWS = N_STRIPS * TILE_HEIGHT  # bits of an integer
 RANGES_PER_THREAD = 32
-CHECK_EVERY = 16  # hits between two looks at which pixels are finished
+CHECK_EVERY = 16  # hits between two checks which pixels are finished
 
 
 class TileLists(NamedTuple):
-    """What kernels read of the tiles' lists; see :class:`~minisplat_ref.types.TileBins`."""
+    """The tiles' lists as kernels read them; see :class:`~minisplat_ref.types.TileBins`."""
 
     offsets: Ints
-    """[n_tiles + 1] tile t owns the pairs from offsets[t] to before offsets[t + 1]."""
+    """[n_tiles + 1] tile t owns the pairs [offsets[t], offsets[t + 1])."""
     ids: Ints
     """[M] Gaussian of each pair."""
     slots: Ints
@@ -64,7 +64,7 @@ def lists_of(bins: TileBins) -> TileLists:
 
 
 def frame_of(bins: TileBins, conventions: Conventions, dtype: np.dtype) -> Frame:
-    """Image size and thresholds as the kernels take them."""
+    """Return image size and thresholds in the form that kernels take."""
     least = dtype.type(conventions.transmittance_min)
     if conventions.stops_at_equality:
         least = np.nextafter(least, dtype.type(1))  # T > t is T >= the next float above t
@@ -80,11 +80,11 @@ def frame_of(bins: TileBins, conventions: Conventions, dtype: np.dtype) -> Frame
 
 @scalar
 def first_tile(i, n_ranges, offsets):
-    """First tile of range ``i``, if the tiles, in their order, are cut into ranges of about equal numbers of pairs.
+    """Return the first tile of range ``i`` when the tiles are cut, in order, into ranges of about equally many pairs.
 
-    Neighbouring tiles share Gaussians, so a range of them keeps records in the cache. A range is one thread's work;
-    there are many per thread because equal pairs are not equal work where pixels finish early, nor threads equally
-    fast.
+    Neighbouring tiles share Gaussians, so a range of tiles keeps their records in the cache. One thread works on a
+    range; there are many ranges per thread, because where pixels finish early equal numbers of pairs are not equal
+    work, and threads are not equally fast.
     """
     first, end = 0, offsets.size - 1
     wanted = (offsets[end] + end) * i // n_ranges  # an empty tile is some work too
@@ -98,11 +98,11 @@ def first_tile(i, n_ranges, offsets):
 
 
 @scalar
-def tiles_in_turn(taken, n_threads, offsets):
-    """Yield the tiles of the ranges that this thread gets."""
+def scheduled_tiles(taken, n_threads, offsets):
+    """Yield the tiles of the ranges that this thread takes."""
     n_ranges = RANGES_PER_THREAD * n_threads
-    for turn in turns(taken, n_ranges):
-        for tile in range(first_tile(turn, n_ranges, offsets), first_tile(turn + 1, n_ranges, offsets)):  # noqa: UP028
+    for i in dynamic_range(taken, n_ranges):
+        for tile in range(first_tile(i, n_ranges, offsets), first_tile(i + 1, n_ranges, offsets)):  # noqa: UP028
             yield tile
 
 
@@ -115,7 +115,7 @@ def corner(tile, frame):
 
 @scalar
 def row_in_image(row, x0, y0, frame):
-    """Return column and line of a row's first pixel, and how many of its eight pixels the image has."""
+    """Return column and line of a row's first pixel, and how many of its eight pixels lie in the image."""
     x, y = x0 + row // TILE_HEIGHT * WIDTH, y0 + row % TILE_HEIGHT
     return x, y, max(0, min(WIDTH, frame.width - x)) if y < frame.height else 0
 
@@ -127,16 +127,16 @@ def start_tile(state, x0, y0, frame, n_fields):
     state[:] = ZERO
     for row in range(N_ROWS):
         _, _, n_pixels = row_in_image(row, x0, y0, frame)
-        is_inside = counted(as_data(0)) < as_data(n_pixels)
-        store(state, row * n_fields * WIDTH, select(is_inside, filled(as_data(1)), -ONE))
+        is_inside = iota(as_data(0)) < as_data(n_pixels)
+        store(state, row * n_fields * WIDTH, select(is_inside, broadcast(as_data(1)), -ONE))
 
 
 @scalar
 def open_rows(state, n_fields):
-    """Rows with a pixel that accepts hits, as bits."""
+    """Return as bits the rows with a pixel that still accepts hits."""
     rows = np.uint64(0)
     for row in range(N_ROWS):
-        is_open = any_of(load(state, row * n_fields * WIDTH) > ZERO)
+        is_open = reduce_any(load(state, row * n_fields * WIDTH) > ZERO)
         rows |= np.uint64(is_open) << np.uint64(row)
     return rows
 

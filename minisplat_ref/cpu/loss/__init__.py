@@ -10,14 +10,14 @@ from minisplat_ref.types import Bools, Floats, Ints
 
 
 class LossTape(NamedTuple):
-    """The gradient of the photometric loss, which is made together with it."""
+    """The gradient of the photometric loss, which is computed together with the loss."""
 
     v_image: Floats
-    """[H, W, 3] derivative of the loss by the image."""
+    """[H, W, 3] derivative of the loss with respect to the image."""
 
 
 def _counts(mask: Bools | None, width: int, dtype: np.dtype) -> Floats:
-    """1 for each number that counts and 0 for the others [H, L]; one row stands for all where there is no mask."""
+    """Return 1 for numbers that count and 0 for others [H, L]; without a mask, one row stands for all."""
     counts = np.zeros((1 if mask is None else len(mask), row_length(width)), dtype)
     counts[:, : 3 * width] = 1 if mask is None else np.repeat(mask, 3, axis=1)
     return counts
@@ -26,7 +26,7 @@ def _counts(mask: Bools | None, width: int, dtype: np.dtype) -> Floats:
 def photometric_loss(
     image: Floats, target: Floats | Ints, dssim_weight: float, mask: Bools | None = None
 ) -> tuple[float, LossTape]:
-    """(1 - w) mean |I - T| + w (1 - mean SSIM); see ``reference.loss.photometric_loss``."""
+    """Return (1 - w) mean |I - T| + w (1 - mean SSIM); see ``reference.loss.photometric_loss``."""
     (height, width, _), dtype = image.shape, image.dtype
     n_values = image.size if mask is None else 3 * int(np.count_nonzero(mask))
     if n_values == 0:
@@ -48,8 +48,8 @@ def photometric_loss(
 
 
 def photometric_loss_vjp(tape: LossTape, v_loss: float = 1.0) -> Floats:
-    """Chain the derivative by the loss to the image; see ``reference.loss.photometric_loss_vjp``.
+    """Chain ``v_loss`` to the image; see ``reference.loss.photometric_loss_vjp``.
 
-    Where ``v_loss`` is 1 it is the tape's own array.
+    Where ``v_loss`` is 1, the result is the tape's own array.
     """
     return tape.v_image if v_loss == 1 else tape.v_image * tape.v_image.dtype.type(v_loss)

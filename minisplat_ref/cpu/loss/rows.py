@@ -1,19 +1,20 @@
-"""The kernel of L1 + D-SSIM, forward and backward: row after row of the image, eight numbers at a time.
+"""The kernel of L1 + D-SSIM, forward and backward: row by row of the image, eight numbers at a time.
 
 The Gaussian window is separable, and the row of an interleaved RGB image is one flat array in which the horizontal
-neighbours of a channel lie three numbers apart. A row is filtered completely, vertically and then horizontally, while
+neighbours of a channel are three numbers apart. A row is filtered completely, vertically and then horizontally, while
 it is in the cache. Numbers of a row that have the same weight are added first.
 
-A window needs eleven rows of both images, and the gradient of a row the derivatives of SSIM in the eleven rows around
-it. Both are kept in rings of rows, which stay in the cache, instead of five more images in memory: so the gradient, but
-for a factor, is made together with the loss. Rows are filtered vertically two at a time, for what two windows share is
-read once; a ring has twelve rows. Each thread goes down a band of rows, and the rows beyond its edges are computed once
-more. The first of two rows is not rounded as the second is, since the compiler contracts other products. So a band
-begins at an even row, and with it every pair for the gradient; pairs for the similarity begin at odd rows.
+A window needs eleven rows of both images, and the gradient of a row needs the derivatives of SSIM in the eleven rows
+around it. Both are kept in ring buffers of rows, which stay in the cache, instead of five more images in memory: so the
+gradient, up to a factor, is computed together with the loss. Rows are filtered vertically two at a time, so that what
+two windows share is read once; a ring has twelve rows. Each thread works down a band of rows, and computes the rows
+beyond its edges redundantly. The first of two rows is rounded differently from the second, because the compiler
+contracts other products. So a band begins at an even row, and with it every pair for the gradient; pairs for the
+similarity begin at odd rows.
 
-Rows of the images get margins as black as zeros, wide enough for the window and for the last eight numbers of a row, so
-that no number is a special case. They are kept less one half, and moments are those of I - 1/2 and T - 1/2: variances
-are differences of moments, and of these smaller ones few digits cancel.
+Rows of the images get margins that represent black, wide enough for the window and for the last eight numbers of a row,
+so that no number is a special case. One half is subtracted, and moments are those of I - 1/2 and T - 1/2: variances are
+differences of moments, and these smaller ones cancel less.
 """
 
 import functools
@@ -24,38 +25,38 @@ import numpy as np
 
 from minisplat_ref.constants import SSIM_C1, SSIM_C2, SSIM_SIGMA, SSIM_WINDOW
 from minisplat_ref.jit.compile import kernel, prange, scalar
-from minisplat_ref.jit.lanes import WIDTH, filled, load, select, store, sum_of
+from minisplat_ref.jit.lanes import WIDTH, broadcast, load, reduce_sum, select, store
 from minisplat_ref.jit.literals import HALF, TWO, ZERO
 from minisplat_ref.scalar.loss import ssim_and_derivatives
 from minisplat_ref.types import Floats, Ints
 
 HALF_WINDOW = SSIM_WINDOW // 2
 N_RING = SSIM_WINDOW + 1  # rows that two windows cover
-PAD = 3 * HALF_WINDOW  # numbers of margin before an interleaved row, and at least as many behind it
+PAD = 3 * HALF_WINDOW  # width of the margin before an interleaved row; the one behind it is at least as wide
 
 
 class Pictures(NamedTuple):
-    """An image and what it should look like, row by row."""
+    """An image and its target, row by row."""
 
     image: Floats
     """[H, 3 W] interleaved RGB."""
     target: Floats | Ints
     """[H, 3 W] likewise, or bytes."""
     unit: np.floating
-    """What a number of the target stands for, in the dtype of the image."""
+    """Factor from the target's numbers to [0, 1], in the dtype of the image."""
     counts: Floats
     """[H, L] 1 where a number counts and 0 elsewhere; or one row [1, L] for all."""
 
 
 def row_length(width: int) -> int:
-    """Numbers in a row with margins, a multiple of eight."""
+    """Return the length of a row with margins, a multiple of eight."""
     n_blocks = -(-3 * width // WIDTH) - (-2 * PAD // WIDTH)
     return n_blocks * WIDTH
 
 
 @scalar
 def _pad_row(row, pictures, padded_image, padded_target):
-    """Copy a row of both images, less 1/2, between margins that are black; they are equal where they do not count."""
+    """Copy a row of both images, minus 1/2, between black margins; numbers that do not count are the target's."""
     image, target, unit, counts = pictures
     if row < 0 or row >= image.shape[0]:
         padded_image[:] = -HALF
@@ -85,7 +86,7 @@ def loss_kernel(dtype: np.dtype) -> Callable:
 
     @scalar
     def moments_down(image, target, places, i):
-        """Windowed means down a column of I, T, I^2 + T^2 and I T: four for a row and four for the next."""
+        """Return windowed means down a column of I, T, I^2 + T^2 and I T: four for a row and four for the next."""
         a, b = load(image, places[0] + i), load(target, places[0] + i)
         i_0, t_0, squares_0, products_0 = edge * a, edge * b, edge * (a * a + b * b), edge * (a * b)
         a, b = load(image, places[SSIM_WINDOW] + i), load(target, places[SSIM_WINDOW] + i)
@@ -101,7 +102,7 @@ def loss_kernel(dtype: np.dtype) -> Callable:
 
     @scalar
     def down(ring, places, i):
-        """Windowed means down a column, for a row and the next."""
+        """Return windowed means down a column, for a row and the next."""
         mean_0, mean_1 = edge * load(ring, places[0] + i), edge * load(ring, places[SSIM_WINDOW] + i)
         for k in range(1, SSIM_WINDOW):
             a = load(ring, places[k] + i)
@@ -130,8 +131,8 @@ def loss_kernel(dtype: np.dtype) -> Callable:
 
     @scalar
     def similarity_row(image, target, first, counts, n_values, length, s, derivatives):
-        """Sums of a row that starts at ``first``, and the derivatives of its SSIM by the means that hold the image."""
-        l1 = ssim = ZERO * filled(c1)
+        """Sum over a row that starts at ``first``; write the derivatives of SSIM with respect to the image's means."""
+        l1 = ssim = ZERO * broadcast(c1)
         for i in range(0, n_values, WIDTH):
             means = across(s, i), across(s, length + i), across(s, 2 * length + i), across(s, 3 * length + i)
             value, by_i, by_ii, by_it = ssim_and_derivatives(*means, c1, c2)
@@ -141,7 +142,7 @@ def loss_kernel(dtype: np.dtype) -> Callable:
             store(derivatives, PAD + i, count * by_i)
             store(derivatives, length + PAD + i, count * by_ii)
             store(derivatives, 2 * length + PAD + i, count * by_it)
-        return sum_of(l1), sum_of(ssim)
+        return reduce_sum(l1), reduce_sum(ssim)
 
     @scalar
     def filter_derivatives(ring, places, length, s):
@@ -153,16 +154,16 @@ def loss_kernel(dtype: np.dtype) -> Callable:
 
     @scalar
     def vjp_row(image, target, first, v_l1, v_ssim, length, s, v_row):
-        """Gradient by a row that starts at ``first``."""
+        """Write the gradient with respect to a row that starts at ``first``."""
         n_values = v_row.size
-        up = filled(v_l1)
+        up = broadcast(v_l1)
         for i in range(0, n_values, WIDTH):
             a, b = load(image, first + i), load(target, first + i)
             by_squares = TWO * a * across(s, length + i) + b * across(s, 2 * length + i)
             by_ssim = across(s, i) + by_squares
             by_l1 = select(a > b, up, select(a < b, -up, ZERO * up))
             store(s, 3 * length + i, by_l1 + v_ssim * by_ssim)
-        for i in range(n_values):  # a slice would be copied with a test for each number
+        for i in range(n_values):  # copying a slice would test each number
             v_row[i] = s[3 * length + i]
 
     @scalar
@@ -173,7 +174,7 @@ def loss_kernel(dtype: np.dtype) -> Callable:
         images[:] = targets[:] = -HALF
         ring, s = np.zeros(N_RING * 3 * length, v_image.dtype), np.empty(8 * length, v_image.dtype)
         places = np.empty(N_RING, np.int64)
-        # Each time two rows are padded, the two from y on get their similarity, and the two from v_y on their gradient.
+        # Each step pads two rows, computes the similarity of the two from y on and the gradient of the two from v_y on.
         for y in range(start - 3 * HALF_WINDOW, end + HALF_WINDOW, 2):
             for half in range(2):
                 row = y + HALF_WINDOW + half

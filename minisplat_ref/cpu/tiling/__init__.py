@@ -1,16 +1,16 @@
 """Lists of the Gaussians that touch each tile, front to back.
 
-The pairs (tile, Gaussian) are never sorted. The Gaussians are dealt into layers of about equal numbers, each behind the
-one before; when it is known how many pairs each layer has in each tile, every layer knows where in each tile's list its
-pairs start, so that the layers are sorted by depth and written into the lists independently. Three passes:
+The pairs (tile, Gaussian) are never sorted. The Gaussians are split by depth into layers of about equal numbers, each
+behind the one before. The counts of each layer's pairs in each tile tell where in the tile's list they start, so that
+the layers can be sorted by depth and written into the lists independently. There are three passes:
 
-1. The survey counts the Gaussians of each part of the input by depth, which says where layers begin, and finds the wide
+1. The survey makes a histogram of depths for each part of the input, which says where layers begin, and finds the wide
    boxes.
 2. Every part finds the tiles of its Gaussians and enters each Gaussian into its layer, in the order of the input.
-3. Every layer is sorted, and fills the lists. Its entries and cells fit the second-level cache, where random access is
+3. Every layer is sorted and fills the lists. Its entries and cells fit the second-level cache, where random access is
    cheap.
 
-Parts and layers are fixed in number, so that no result depends on the number of threads or on which of them takes what.
+The numbers of parts and layers are fixed, so that no result depends on the threads.
 """
 
 import numpy as np
@@ -33,7 +33,7 @@ from minisplat_ref.cpu.tiling.layers import (
 )
 from minisplat_ref.jit.compile import kernel, n_threads, prange
 from minisplat_ref.jit.lanes import WIDTH
-from minisplat_ref.jit.turns import no_turns, turns
+from minisplat_ref.jit.scheduling import dynamic_range, shared_counter
 from minisplat_ref.types import Ints, Projection, TileBins, TileGrid
 
 __all__ = ["ELLIPSE_MARGIN", "TILE_HEIGHT", "TILE_WIDTH", "bin_gaussians"]
@@ -50,27 +50,27 @@ def _list_tiles(
     tile_offsets,  # [n_tiles + 1]
     scratch,  # Scratch
 ):
-    """Write the offsets; return the lists and the slots of their pairs. The three passes are one kernel."""
+    """Write the offsets, and return the lists and the slots of their pairs. The three passes are one kernel."""
     n_threads = len(counts)
-    taken = no_turns()
+    taken = shared_counter()
     for _ in prange(n_threads):
-        for part in turns(taken, N_PARTS):
+        for part in dynamic_range(taken, N_PARTS):
             survey_part(part, projection.boxes, projection.depths, survey)
     cut_layers(survey.up_to, layers.of_buckets, layers.edges)
 
     cells = np.empty(layers.edges[-1, TILES], np.int32)
-    taken = no_turns()
+    taken = shared_counter()
     for thread in prange(n_threads):
-        for part in turns(taken, N_PARTS):
+        for part in dynamic_range(taken, N_PARTS):
             list_part(part, survey, projection, screen, layers, cells, offsets, counts[thread])
     first_slots = np.empty(N_PARTS, np.int64)
     start_lists(counts, offsets, first_slots, tile_offsets)
 
     lists = np.empty((2, tile_offsets[-1]), np.int32)
-    taken = no_turns()
+    taken = shared_counter()
     for _ in prange(n_threads):
-        for turn in turns(taken, N_PARTS):
-            layer = turn % 2 * (N_PARTS // 2) + turn // 2  # neighbours share cache lines: far apart in time
+        for i in dynamic_range(taken, N_PARTS):
+            layer = i % 2 * (N_PARTS // 2) + i // 2  # neighbours share cache lines: far apart in time
             fill_layer(layer, layers, cells, first_slots, offsets, scratch, counts[0], lists)
     return lists
 
@@ -78,8 +78,8 @@ def _list_tiles(
 def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventions) -> TileBins:
     """List the Gaussians that touch each tile; see ``reference.tiling.bin_gaussians``.
 
-    Of the tiles under a Gaussian's box, those are left out in which no pixel centre can reach
-    ``conventions.alpha_min``; a box within one row or one column of tiles is not looked at so closely.
+    Tiles under a Gaussian's box are left out if no pixel centre in them can reach ``conventions.alpha_min``; a box
+    within one row or one column of tiles is not examined that closely.
     """
     n, n_tiles, dtype = len(projection.depths), grid.n_tiles_x * grid.n_tiles_y, projection.depths.dtype
     keys: Ints = projection.depths.view(np.int32 if dtype == np.float32 else np.int64)

@@ -1,36 +1,35 @@
 """Which tiles each Gaussian reaches.
 
-A box of pixels within one row or one column of tiles reaches all of these tiles, nearly always one or two. Only where
-it is wide, over several rows and several columns, it is asked which of the tiles the visible ellipse reaches: that
-drops most of those that the box of a slanted needle would give. Elsewhere few would be dropped, and blending finds out
-by itself that there is no row of pixels to visit.
+A box of pixels within one row or one column of tiles reaches all of these tiles, nearly always one or two. Only for a
+wide box, over several rows and several columns, is the visible ellipse tested against the tiles: that drops most of the
+tiles in the box of a slanted needle. Elsewhere few would be dropped, and blending skips tiles without a row of pixels
+to visit anyway.
 
-Ellipses are measured eight at a time: in each row of tiles, the first column and the one behind the last. A processor
-guesses which way a branch goes and works ahead; a wrong guess costs as much as it worked ahead. So no branch depends on
-an ellipse: every tile under the box is written, and the place moves on where it is reached. The others are overwritten
-by what follows.
+Ellipses are bounded eight at a time: in each row of tiles, the first column and the one past the last. Branch
+mispredictions are expensive, so no branch depends on an ellipse: every tile under the box is written, and the position
+advances only if the tile is reached; otherwise the next write overwrites it.
 """
 
 import numpy as np
 
 from minisplat_ref.cpu.gaussian_rows import rounded, triple
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import WIDTH, ceil, converted, floor, gather, larger, largest_of, smaller, store
+from minisplat_ref.jit.lanes import WIDTH, cast, ceil, floor, gather, maximum, minimum, reduce_max, store
 from minisplat_ref.jit.literals import HALF, ONE
 from minisplat_ref.scalar.compositing import factors
 from minisplat_ref.scalar.tiling import rightmost_offset, visible_outline
 
-COLUMN_BITS, ROW_BITS = 5, 4  # for shifts: // must mind the sign, which no box has
+COLUMN_BITS, ROW_BITS = 5, 4  # for shifts: // has to handle negative numbers, which boxes do not contain
 TILE_WIDTH = 1 << COLUMN_BITS  # pixels
 TILE_HEIGHT = 1 << ROW_BITS
 COLUMNS_PER_PIXEL, ROWS_PER_PIXEL = np.float32(1 / TILE_WIDTH), np.float32(1 / TILE_HEIGHT)  # exact
 ELLIPSE_MARGIN = np.float32(0.02)  # px and relative: rounding must not lose a pixel that the compositor would blend
-SPARE = 2  # places behind the last that may be written
+SPARE = 2  # positions past the last that may be written
 
 
 @scalar
 def tiles_of_box(boxes, n):
-    """First column and row of tiles under a box of pixels, and the numbers of columns and rows; none if it is empty."""
+    """Return first column and row of the tiles under a box of pixels, and numbers of columns and rows; 0 if empty."""
     x0, y0, x1, y1 = boxes[n, 0], boxes[n, 1], boxes[n, 2], boxes[n, 3]
     column, row = x0 >> COLUMN_BITS, y0 >> ROW_BITS
     is_visible = (x0 < x1) & (y0 < y1)
@@ -57,7 +56,7 @@ def write_line(box, n_tiles_x, base, tiles, place):
     Returns
     -------
     int
-        The place behind the last tile.
+        The position past the last tile.
     """
     column, row, n_columns, n_rows = box
     first, step = base + row * n_tiles_x + column, n_tiles_x if n_rows > 1 else 1
@@ -69,9 +68,9 @@ def write_line(box, n_tiles_x, base, tiles, place):
 
 @scalar
 def write_wide(box, spans, i, n_tiles_x, base, tiles, place):
-    """Write the tiles that the ellipse in a wide box reaches: number ``i`` of the eight whose ``spans`` these are.
+    """Write the tiles that the ellipse in a wide box reaches, the ``i``-th of the eight with these ``spans``.
 
-    Many wide boxes have two columns; a loop that nearly always ends at once is foreseen.
+    Many wide boxes have two columns; a loop that nearly always ends at once is well predicted.
     """
     column, row, n_columns, n_rows = box
     for k in range(n_rows):
@@ -89,20 +88,20 @@ def write_wide(box, spans, i, n_tiles_x, base, tiles, place):
 
 @scalar
 def outlines(rows, projection, alpha_min):
-    """Visible ellipses of eight Gaussians, and the most rows of tiles that one of their boxes has."""
+    """Return the visible ellipses of eight Gaussians, and the largest number of rows of tiles in their boxes."""
     zero = projection.opacities.dtype.type(0)
     ellipse = rounded(factors(*triple(projection.conics, rows)), zero)
     _, y0, _, y1 = _boxes(projection.boxes, rows, zero)
-    n_rows = largest_of(floor((y1 - ONE) * ROWS_PER_PIXEL) - floor(y0 * ROWS_PER_PIXEL)) + ONE
+    n_rows = reduce_max(floor((y1 - ONE) * ROWS_PER_PIXEL) - floor(y0 * ROWS_PER_PIXEL)) + ONE
     opacity = gather(projection.opacities, rows, 0)
     return visible_outline(*ellipse, opacity, alpha_min, ELLIPSE_MARGIN), np.int64(n_rows)
 
 
 @scalar
 def _boxes(boxes, rows, zero):
-    """Edges of eight boxes in the dtype of a number."""
-    x0, y0 = converted(gather(boxes, rows, 0), zero), converted(gather(boxes, rows, 1), zero)
-    x1, y1 = converted(gather(boxes, rows, 2), zero), converted(gather(boxes, rows, 3), zero)
+    """Return the edges of eight boxes in the dtype of a number."""
+    x0, y0 = cast(gather(boxes, rows, 0), zero), cast(gather(boxes, rows, 1), zero)
+    x1, y1 = cast(gather(boxes, rows, 2), zero), cast(gather(boxes, rows, 3), zero)
     return x0, y0, x1, y1
 
 
@@ -112,8 +111,8 @@ def write_spans(rows, row, outline, projection, spans):
     x0, y0, x1, y1 = _boxes(projection.boxes, rows, projection.opacities.dtype.type(0))
     mx, my = gather(projection.means2d, rows, 0), gather(projection.means2d, rows, 1)
     top = (floor(y0 * ROWS_PER_PIXEL) + row) * TILE_HEIGHT
-    low, high = larger(top, y0) + (HALF - my), smaller(top + TILE_HEIGHT, y1) - (HALF + my)
+    low, high = maximum(top, y0) + (HALF - my), minimum(top + TILE_HEIGHT, y1) - (HALF + my)
     left = mx - rightmost_offset(outline, low, high, -ONE) - (HALF + ELLIPSE_MARGIN)
     right = mx + rightmost_offset(outline, low, high, ONE) + (HALF + ELLIPSE_MARGIN)
-    store(spans, 2 * row * WIDTH, floor(larger(ceil(left), x0) * COLUMNS_PER_PIXEL))
-    store(spans, (2 * row + 1) * WIDTH, ceil(smaller(floor(right), x1) * COLUMNS_PER_PIXEL))  # behind the last
+    store(spans, 2 * row * WIDTH, floor(maximum(ceil(left), x0) * COLUMNS_PER_PIXEL))
+    store(spans, (2 * row + 1) * WIDTH, ceil(minimum(floor(right), x1) * COLUMNS_PER_PIXEL))  # behind the last

@@ -1,8 +1,8 @@
-"""What is done with each part of the input and with each layer, while tile lists are made.
+"""The steps of making tile lists, for each part of the input and for each layer.
 
-:mod:`minisplat_ref.cpu.tiling` tells the plan. A guess that fails and memory that answers late are dear. So there are
-no branches on what cannot be foreseen: the culled are a layer of their own, behind all others, and boxes that are wide
-are listed first and measured together. What is about to be written or read at random is asked for ahead.
+:mod:`minisplat_ref.cpu.tiling` explains the algorithm. Branch mispredictions and cache misses are expensive. So there
+are no unpredictable branches: the culled Gaussians are a layer of their own, behind all others, and wide boxes are
+listed first and processed together. Random accesses are prefetched.
 """
 
 from typing import NamedTuple
@@ -17,12 +17,12 @@ from minisplat_ref.jit.lanes import WIDTH, prefetch
 from minisplat_ref.types import Ints
 
 N_PARTS = 16  # of the input, and as many layers
-BUCKET_SHIFT = 18  # of the bits of a float32: 32 buckets of depth to a factor of two
-N_BUCKETS = 1 << 10  # from 1/128 to 2^25; the first and the last also take what lies beyond
+BUCKET_SHIFT = 18  # of the bits of a float32: 32 buckets of depth per factor of two
+N_BUCKETS = 1 << 10  # from 1/128 to 2^25; the first and the last also hold what lies beyond
 FIRST_BUCKET = int(np.float32(1 / 128).view(np.int32)) >> BUCKET_SHIFT
 CULLED = N_BUCKETS  # the bucket behind them all
 GAUSSIANS, TILES = 0, 1  # columns of a count; the tiles are those under boxes
-TILES_BIT, GAUSSIANS_MASK = 32, (1 << 32) - 1  # of a count in one number
+TILES_BIT, GAUSSIANS_MASK = 32, (1 << 32) - 1  # both counts packed into one integer
 SQUARES, OTHERS = 0, 1  # lists of Gaussians with wide boxes
 ID, FIRST, COUNT, SLOT = range(4)  # columns of an entry: a Gaussian, its cells, its first slot within its part
 FETCH_AHEAD = 8  # entries
@@ -38,7 +38,7 @@ class Screen(NamedTuple):
 
 
 class Survey(NamedTuple):
-    """What the first pass learns of each part, and the depths as integers."""
+    """Results of the first pass for each part, and the depths as integers."""
 
     keys: Ints
     """[N] bits of the depths: positive floats are ordered as their bits are."""
@@ -56,8 +56,8 @@ class Survey(NamedTuple):
 class Layers(NamedTuple):
     """The Gaussians, layer by layer, and within a layer in the order of the input; the culled come last.
 
-    A cell is one tile in one layer. Beside the layers stand the cells of all pairs, layer * n_tiles + tile as int32;
-    between the parts of a layer places are left over.
+    A cell is one tile in one layer. Another array has the cells of all pairs, layer * n_tiles + tile as int32, with
+    gaps between the parts of a layer.
     """
 
     of_buckets: Ints
@@ -83,7 +83,7 @@ class Scratch(NamedTuple):
 
 @scalar
 def part_of(n, i):
-    """First and end of part ``i`` of ``n`` things."""
+    """Return the range [first, end) of part ``i`` of ``n`` elements."""
     return n * i // N_PARTS, n * (i + 1) // N_PARTS
 
 
@@ -120,7 +120,7 @@ def survey_part(part, boxes, depths, survey):
 
 @scalar
 def _end_list(ids, count):
-    """Fill up the last eight of a list, and write how many it has behind them all."""
+    """Pad the last eight of a list, and write its length after them all."""
     ids[count : count + WIDTH] = ids[max(count - 1, 0)]
     ids[-1] = count
 
@@ -177,7 +177,7 @@ def _write_wide(part, survey, projection, screen, layers, cells, cursors, wide):
                 n = ids[i + k]
                 box, layer = tiles_of_box(projection.boxes, n), layers.of_buckets[survey.buckets[n]]
                 first, base = cursors[layer, TILES], layer * n_tiles
-                if kind == SQUARES:  # foreseen, and then the loops of write_wide have a fixed length
+                if kind == SQUARES:  # predictable, and then the loops of write_wide have a fixed length
                     behind = write_wide((box[0], box[1], 2, 2), spans, k, n_tiles_x, base, cells, first)
                 else:
                     behind = write_wide(box, spans, k, n_tiles_x, base, cells, first)
@@ -193,7 +193,7 @@ def list_part(part, survey, projection, screen, layers, cells, offsets, counts):
     cursors, wide = layers.edges[part:-1:N_PARTS].copy(), np.empty((end - start, 2), np.int32)
     _write_wide(part, survey, projection, screen, layers, cells, cursors, wide)
     slot = 0
-    for n in range(start, end):  # without branches: what can be seen cannot be foreseen either
+    for n in range(start, end):  # without branches: visibility would be unpredictable
         column, row, n_columns, n_rows = tiles_of_box(boxes, n)
         layer = layers.of_buckets[survey.buckets[n]]
         is_wide = (n_columns > 1) & (n_rows > 1)
@@ -256,7 +256,7 @@ def start_lists(counts, offsets, first_slots, tile_offsets):
 
 @scalar
 def fill_layer(layer, layers, cells, first_slots, offsets, scratch, starts, lists):
-    """Sort one layer and write its pairs; and complete the offsets of the part of the same number.
+    """Sort one layer and write its pairs; also complete the offsets of the part with the same number.
 
     Parameters
     ----------
@@ -271,7 +271,7 @@ def fill_layer(layer, layers, cells, first_slots, offsets, scratch, starts, list
     scratch : Scratch
         Overwritten, where the layer and the part have their Gaussians.
     starts : ndarray of shape (N_PARTS * n_tiles,)
-        Where each cell goes on in the lists; those of the layer move to their ends.
+        Where the next pair of each cell goes in the lists; those of the layer advance to their ends.
     lists : ndarray of shape (2, M)
         Receives Gaussians and slots.
     """

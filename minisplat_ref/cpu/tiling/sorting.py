@@ -1,8 +1,9 @@
-"""Order of positive floats: a radix sort of their bits.
+"""Sort positive floats with a radix sort of their bits.
 
-Positive IEEE floats are ordered as the integers that their bits spell, and those are sorted digit by digit in linear
-passes. Each pass is stable, which makes equal keys keep their order. Keys that are near each other share their leading
-bits: digits are those of the difference to the smallest key, and there are as few pairs of them as the largest needs.
+Positive IEEE floats have the same order as the integers with their bits, and those are sorted digit by digit in linear
+passes. Each pass is stable, so equal keys keep their order. Keys close to each other share their leading bits:
+therefore digits are those of the difference to the smallest key, and only as many pairs of digits as the largest
+difference needs are sorted.
 """
 
 from minisplat_ref.jit.compile import scalar
@@ -14,7 +15,7 @@ KEY_BITS = 63  # of the longest keys; a shift by more has no meaning
 
 @scalar
 def _start_places(keys, lowest, shift, places, next_places):
-    """Find where the first key of each digit goes, for the two digits from ``shift`` on: one pass counts both."""
+    """Find where the first key of each digit goes, for the two digits from ``shift`` on, counting both in one pass."""
     places[:] = 0
     next_places[:] = 0
     for key in keys:
@@ -52,7 +53,7 @@ def sort_stably(keys, values, other_keys, other_values, places):
     lowest = highest = keys[0] if keys.size > 0 else 0
     for key in keys:
         lowest, highest = min(lowest, key), max(highest, key)
-    for shift in range(0, KEY_BITS, 2 * DIGIT_BITS):  # two digits each time: so the last pass is one back
+    for shift in range(0, KEY_BITS, 2 * DIGIT_BITS):  # two digits each time: the second pass is back
         if (highest - lowest) >> shift == 0:
             break
         _start_places(keys, lowest, shift, places[0], places[1])

@@ -25,7 +25,7 @@ EXTENT_MARGIN = 1.1  # of the largest distance of a camera from the mean: the de
 
 
 class SyntheticScene(NamedTuple):
-    """A scene with the truth that a photograph does not have. V training and T test views."""
+    """A scene with the truth that photographs lack, with V training and T test views."""
 
     scene: Scene
     """What a loader would return."""
@@ -63,19 +63,19 @@ def make_scene(
     name : str
         One of ``SCENE_NAMES``.
     n_views : int
-        Training views; the test views come on top.
+        Training views; test views are additional.
     width, height : int
         Image size, pixels.
     seed : int
         Textures, camera path and points follow from it.
     supersampling : int
-        n of the n x n colour samples a pixel.
+        n of the n x n colour samples per pixel.
     n_points : int
         Sparse points; fewer when the views share too few surfaces.
     point_noise : float
         Standard deviation of the error of each point coordinate, metres.
     test_every : int
-        In walking order the first of every so many views is a test view, as loaders split; 0 for no test views.
+        In walking order the first of every so many views is a test view, like in loaders; 0 for no test views.
     progress : callable
         Wraps the sequence of cameras while the views are traced; ``tqdm.tqdm`` shows a bar.
 
@@ -129,7 +129,7 @@ def make_scene(
 
 
 def _stack_truth(traced: Sequence[TracedView], ids: Sequence[int], width: int, height: int) -> tuple[Floats, Floats]:
-    """Depths [n, H, W] and normals [n, H, W, 3] of some views; n may be 0."""
+    """Return depths [n, H, W] and normals [n, H, W, 3] of some views; n may be 0."""
     depths, normals = np.zeros((len(ids), height, width)), np.zeros((len(ids), height, width, 3))
     for row, index in enumerate(ids):
         depths[row], normals[row] = traced[index].depth, traced[index].normals

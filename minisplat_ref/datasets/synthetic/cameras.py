@@ -1,6 +1,6 @@
-"""Synthetic scenes, stage 5: where the photographer stands.
+"""Synthetic scenes, stage 5: camera poses.
 
-A walk around the scene at changing distance and height, always looking inwards and upright.
+The cameras walk around the scene at varying distance and height, upright and looking inwards.
 """
 
 from typing import NamedTuple
@@ -30,7 +30,7 @@ class Orbit(NamedTuple):
 
 
 def orbit_cameras(orbit: Orbit, n_cameras: int, width: int, height: int, rng: np.random.Generator) -> list[Camera]:
-    """Cameras at equal angles around the target, at quasi-random radius and height.
+    """Return cameras at equal angles around the target, at quasi-random radius and height.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def orbit_cameras(orbit: Orbit, n_cameras: int, width: int, height: int, rng: np
 
 
 def look_at(position: Floats, target: Floats, focal: float, width: int, height: int) -> Camera:
-    """Camera at a position that sees the target in the image's centre, with the world's z axis upright.
+    """Return a camera at a position with the target in the image's centre and the world's z axis upright.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Synthetic scenes, stage 9: a scene as a folder that every splatting program reads.
 
-``images/*.png`` and ``sparse/0/{cameras,images,points3D}.txt`` are a COLMAP text model with tracks. Beside it, what no
-photograph has: ``depths/*.npy`` and ``normals/*.npy`` (float32), and ``scene_info.json``.
+``images/*.png`` and ``sparse/0/{cameras,images,points3D}.txt`` are a COLMAP text model with tracks. The truth is beside
+it: ``depths/*.npy`` and ``normals/*.npy`` (float32), and ``scene_info.json``.
 """
 
 import json
@@ -29,7 +29,7 @@ UNITS = (
 
 
 def check_free(folder: Path) -> None:
-    """Refuse a folder that holds something already.
+    """Refuse a folder that is not empty.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def write_scene(synthetic: SyntheticScene, folder: Path, settings: Mapping[str, 
     check_free(folder)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        # Beside the folder, because a rename across disks is a copy.
+        # Beside the folder, because renaming across disks would copy.
         with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as temporary:
             unfinished = Path(temporary) / "scene"
             _write_files(synthetic, unfinished, settings)
@@ -96,7 +96,7 @@ def load_depths(folder: Path, names: Sequence[str]) -> list[Floats] | None:
         info = json.loads((folder / INFO).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    # Other programs leave depths/ and other notes: the sentence on units is what says that these are the truth.
+    # Other programs write depths/ and notes too: only our sentence on units identifies these as the truth.
     if not isinstance(info, dict) or info.get("units") != UNITS or not all(path.is_file() for path in paths):
         return None
     return [_load_depth(path) for path in paths]
@@ -113,7 +113,7 @@ def _load_depth(path: Path) -> Floats:
 
 
 def _write_files(synthetic: SyntheticScene, folder: Path, settings: Mapping[str, Any]) -> None:
-    """Everything that the folder holds."""
+    """Write everything into the folder."""
     scene = synthetic.scene
     model = folder / "sparse" / "0"
     for subfolder in (folder / "images", folder / "depths", folder / "normals", model):
@@ -147,13 +147,13 @@ def _write_files(synthetic: SyntheticScene, folder: Path, settings: Mapping[str,
 
 
 def _camera_line(camera: Camera) -> str:
-    """COLMAP's line for a pinhole: id, model, size, fx fy cx cy. Its pixel centres are at +0.5, as ours are."""
+    """Return COLMAP's line for a pinhole: id, model, size, fx fy cx cy. Its pixel centres are at +0.5, as ours are."""
     intrinsics = _numbers([camera.fx, camera.fy, camera.cx, camera.cy])
     return f"{CAMERA_ID} PINHOLE {camera.width} {camera.height} {intrinsics}\n"
 
 
 def _image_lines(image_id: int, view: View, point_ids: Ints, points: Floats) -> str:
-    """COLMAP's two lines for a view: its pose as wxyz quaternion and translation; then x, y, point of what it sees."""
+    """Return COLMAP's two lines for a view: its pose (quaternion wxyz, translation); x, y, point id of what it sees."""
     x, y, z, w = Rotation.from_matrix(view.camera.cam_from_world_R).as_quat()
     pose = _numbers([w, x, y, z, *view.camera.cam_from_world_t])
     pixels, _ = project_points(view.camera, points[point_ids])
@@ -162,7 +162,7 @@ def _image_lines(image_id: int, view: View, point_ids: Ints, points: Floats) -> 
 
 
 def _point_lines(synthetic: SyntheticScene, seen: Sequence[Ints]) -> str:
-    """COLMAP's line for each point: id, position, colour, reprojection error, and its track of (image, observation).
+    """Return COLMAP's line for each point: id, position, colour, reprojection error, track of (image, observation).
 
     The observations are projections of the points themselves, noise included, so that the error is 0.
     """
@@ -179,5 +179,5 @@ def _point_lines(synthetic: SyntheticScene, seen: Sequence[Ints]) -> str:
 
 
 def _numbers(values: list[float] | Floats) -> str:
-    """Decimal numbers that read back as the same float64."""
+    """Return decimal numbers that read back as the same float64."""
     return " ".join(repr(float(value)) for value in values)

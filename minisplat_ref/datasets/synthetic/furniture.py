@@ -1,6 +1,6 @@
-"""Synthetic scenes, stage 6: what the worlds are furnished with. Metres, z up.
+"""Synthetic scenes, stage 6: the furniture. Metres, z up.
 
-Every piece is a list of primitives, described in a frame of its own that stands on the floor.
+Every piece is a list of primitives, described in a frame of its own on the floor.
 """
 
 from typing import NamedTuple
@@ -97,7 +97,7 @@ def fence(foot: Floats) -> list[Primitive]:
 
 
 class _Placement(NamedTuple):
-    """A piece of furniture's own frame, so that its parts are described where they belong on it."""
+    """The local frame of a piece of furniture, in which its parts are described."""
 
     origin: Floats
     rotation: Floats
@@ -120,7 +120,7 @@ class _Placement(NamedTuple):
 def place(
     shape: Shape, look: Texture | Material, centre: list[float] | Floats, rotation: Floats | None = None
 ) -> Primitive:
-    """A primitive; a bare texture is a matte material."""
+    """Place a primitive; a texture alone is a matte material."""
     material = look if isinstance(look, Material) else Material(look)
     return Primitive(shape, material, np.array(centre, float), np.eye(3) if rotation is None else rotation)
 
@@ -128,7 +128,7 @@ def place(
 def sheet(
     half_x: float, half_y: float, look: Texture, centre: list[float] | Floats, rotation: Floats | None = None
 ) -> Primitive:
-    """A wall, floor or ceiling: the world ends behind it."""
+    """Place a wall, floor or ceiling, behind which the world ends."""
     return place(Rectangle(half_x, half_y), look, centre, rotation)._replace(casts_shadow=False)
 
 

@@ -1,7 +1,7 @@
-"""Synthetic scenes, stage 2: shapes placed in the world, and which of them a ray meets first.
+"""Synthetic scenes, stage 2: shapes placed in the world, and which of them a ray hits first.
 
-Placing is a rotation and a shift, which keep the ray parameter t, so that distances need no conversion. Nothing is
-transparent, and there is no tree over the primitives: a bounding sphere for each is enough for a few dozen.
+Placing is a rotation and a translation, which keep the ray parameter t, so that distances need no conversion. Nothing
+is transparent, and there is no acceleration structure: a bounding sphere each is enough for a few dozen primitives.
 """
 
 from collections.abc import Iterator
@@ -13,11 +13,11 @@ from minisplat_ref.datasets.synthetic.materials import Material
 from minisplat_ref.datasets.synthetic.shapes import Shape, dot
 from minisplat_ref.types import Floats, Ints
 
-TINY = 1e-30  # added to directions: changes a zero component only, so that a parallel ray passes at 1e30 and not at 0/0
+TINY = 1e-30  # added to directions: changes only a zero component, so that a parallel ray gives 1e30 instead of 0/0
 
 
 class Primitive(NamedTuple):
-    """A shape placed in the world, with its look."""
+    """A shape placed in the world, with its material."""
 
     shape: Shape
     """Geometry in its own frame."""
@@ -44,7 +44,7 @@ class Primitive(NamedTuple):
 
 
 class Hits(NamedTuple):
-    """What n rays meet first."""
+    """The first hits of n rays."""
 
     distances: Floats
     """[n] ray parameter t, infinity where nothing is hit."""
@@ -53,7 +53,7 @@ class Hits(NamedTuple):
 
 
 def first_hits(primitives: tuple[Primitive, ...], origins: Floats, directions: Floats) -> Hits:
-    """Nearest intersection of every ray with every primitive.
+    """Return the nearest intersection of every ray with the primitives.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def first_hits(primitives: tuple[Primitive, ...], origins: Floats, directions: F
 
 
 def rays_by_primitive(primitives: tuple[Primitive, ...], hits: Hits) -> Iterator[tuple[Primitive, Ints]]:
-    """Every primitive that is hit, with the ids [m] of the rays that hit it."""
+    """Yield every primitive that is hit, with the ids [m] of the rays that hit it."""
     order = np.argsort(hits.primitive_ids, kind="stable")
     bounds = np.searchsorted(hits.primitive_ids[order], np.arange(len(primitives) + 1))
     for index in np.flatnonzero(np.diff(bounds)):
@@ -104,9 +104,9 @@ def facing_normals(primitives: tuple[Primitive, ...], hits: Hits, points: Floats
     primitives : tuple of Primitive
         The world.
     hits : Hits
-        What the n rays meet.
+        First hits of the n rays.
     points : ndarray of shape (n, 3)
-        Where, world frame; any value where nothing is hit.
+        Hit points, world frame; any value where nothing is hit.
     directions : ndarray of shape (n, 3)
         Of the rays, world frame.
     """
@@ -117,12 +117,12 @@ def facing_normals(primitives: tuple[Primitive, ...], hits: Hits, points: Floats
 
 
 def take_rows(array: Floats, ids: Ints) -> Floats:
-    """``array[ids]`` for an array [n, 3]: numpy.take copies whole rows and is five times as fast."""
+    """Return ``array[ids]`` of an array [n, 3]: numpy.take copies whole rows and is five times as fast."""
     return array.take(ids, axis=0)
 
 
 def _rays_near(primitive: Primitive, origins: Floats, unit_directions: Floats) -> Ints:
-    """Ids of the rays that enter the bounding sphere: small objects are tested against few rays.
+    """Return ids of the rays that enter the bounding sphere, so that small objects are tested against few rays.
 
     Seen from outside, a sphere fills the cone ``cos(angle) >= sqrt(distance^2 - radius^2) / distance``.
     """

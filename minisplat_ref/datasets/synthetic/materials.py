@@ -1,8 +1,8 @@
-"""Synthetic scenes, stage 3: what surfaces look like. Procedural solid textures and the parameters of the shading.
+"""Synthetic scenes, stage 3: materials. Procedural solid textures and the parameters of the shading.
 
 A texture maps points [n, 3] in the frame of a shape to linear RGB [n, 3]. It is a pattern in space, so that every shape
-can wear every texture without texture coordinates. Colours are given as sRGB hex codes and kept linear, because light
-adds up linearly.
+can have every texture without texture coordinates. Colours are given as sRGB hex codes and stored linear, because light
+adds linearly.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ Texture = Callable[[Floats], Floats]
 
 
 class Material(NamedTuple):
-    """Look of a surface."""
+    """Appearance of a surface."""
 
     texture: Texture
     """Diffuse albedo."""
@@ -115,7 +115,7 @@ class Bricks:
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Clouds: smooth random values on lattices of halving cell sizes, mixed between two colours."""
+    """Clouds: smooth random values on lattices of halving cell sizes that mix two colours."""
 
     low: str
     high: str

@@ -42,12 +42,12 @@ from minisplat_ref.types import Floats
 
 
 class Setting(NamedTuple):
-    """A world and the way around it."""
+    """A world and the camera path around it."""
 
     world: World
-    """What is seen."""
+    """The surfaces and the light."""
     orbit: Orbit
-    """From where."""
+    """The camera path."""
 
 
 def room(rng: np.random.Generator) -> Setting:
@@ -162,7 +162,7 @@ SETTINGS: dict[str, Callable[[np.random.Generator], Setting]] = {
 
 
 def _lamp_world(primitives: list[Primitive]) -> World:
-    """A room's light: a lamp under the ceiling, and walls that scatter a warm rest of it."""
+    """Light a room with a lamp under the ceiling and warm ambient light scattered by the walls."""
     lamp = np.array([0.35, -0.25, ROOM_HEIGHT - 0.12])
     panel = place(
         Box(0.3, 0.3, 0.02), Material(Plain("#fffaf0"), is_light=True), lamp + np.array([0.0, 0.0, 0.06]), np.eye(3)

@@ -45,7 +45,7 @@ class Rectangle:
 
     @property
     def bound_radius(self) -> float:
-        """Infinite: walls and floors fill the view, so a test that rejects nothing would only cost time."""
+        """Return infinity: walls and floors fill the view, so a test that rejects nothing would only cost time."""
         return np.inf
 
     def distances(self, origins: Floats, directions: Floats) -> Floats:
@@ -159,13 +159,13 @@ def _slab(origins: Floats, directions: Floats, axis: int, half: float) -> tuple[
 
 
 def _first_positive(entry: Floats, leave: Floats, is_hit: Bools) -> Floats:
-    """The entry when it lies ahead, the exit for a ray that starts inside, infinity behind and beside."""
+    """Return the entry if it lies ahead, the exit for a ray that starts inside, infinity for a miss."""
     t = np.where(entry > 0, entry, leave)
     return np.where(is_hit & (t > 0), t, np.inf)
 
 
 def dot(a: Floats, b: Floats) -> Floats:
-    """Inner product along the last axis; either side may be one vector for all."""
+    """Return the inner product along the last axis; either argument may be one vector for all."""
     if b.ndim == 2 and a.ndim == 1:
         return b @ a
     return np.einsum("...i,...i->...", a, b)

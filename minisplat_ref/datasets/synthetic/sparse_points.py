@@ -1,7 +1,7 @@
 """Synthetic scenes, stage 8: the points that structure from motion would have found.
 
-Feature detectors fire where the picture changes, so that points are drawn in proportion to the image gradient: many on
-textures and edges, hardly any on bare walls, none at the sky. A point counts when at least two training views see it.
+Feature detectors respond where the image changes, so points are drawn in proportion to the image gradient: many on
+textures and edges, hardly any on bare walls, none at the sky. A point counts if at least two training views see it.
 Positions, colours and visibility come from the ray tracer and are exact; noise is added on request.
 """
 
@@ -24,9 +24,9 @@ from minisplat_ref.datasets.synthetic.tracer import (
 from minisplat_ref.types import Bools, Camera, Floats, Ints
 
 N_VIEWS_MIN = 2  # a point is triangulated from at least two views
-OVERSAMPLING = 1.3  # candidates drawn per wanted point: some are seen once only
-GRADIENT_MIN = 2.0  # grey levels a pixel; less is shading of a bare surface, on which no feature detector fires
-BARE_WEIGHT = 0.005  # of a pixel below that, beside its gradient's excess for the others: the odd wrong match on a wall
+OVERSAMPLING = 1.3  # candidates drawn per wanted point: some are seen only once
+GRADIENT_MIN = 2.0  # grey levels per pixel; less is shading of a bare surface, where feature detectors do not respond
+BARE_WEIGHT = 0.005  # of a pixel below that; others have their gradient's excess. The odd wrong match on a wall
 
 
 class SparsePoints(NamedTuple):
@@ -59,7 +59,7 @@ def sample_points(
     traced : sequence of V TracedView
         What they see.
     n_points : int
-        How many to return at most; fewer when the views share too few surfaces.
+        Largest number to return; fewer if the views share too few surfaces.
     noise : float
         Standard deviation of the error of each coordinate, world units.
     rng : numpy.random.Generator
@@ -72,8 +72,8 @@ def sample_points(
     """
     weights = np.stack([_feature_weights(view) for view in traced]).ravel()  # [V H W]
     pixels = np.flatnonzero(weights)
-    # The first of several exponential clocks to ring is each with probability proportional to its rate, so sorting the
-    # ringing times draws without replacement.
+    # The least of several exponential variates is each with probability proportional to its rate, so sorting the
+    # variates draws without replacement.
     pixels = pixels[np.argsort(rng.exponential(size=len(pixels)) / weights[pixels])]
     batches = [SparsePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((len(cameras), 0), bool))]
     n_missing = n_points
@@ -101,7 +101,7 @@ def project_points(camera: Camera, points: Floats) -> tuple[Floats, Floats]:
 
 
 def _feature_weights(view: TracedView) -> Floats:
-    """[H, W] how likely a feature detector fires at a pixel; 0 at the sky."""
+    """Return how likely [H, W] a feature detector responds at a pixel; 0 at the sky."""
     grey = view.image.mean(axis=2)
     gradient = np.hypot(*np.gradient(grey))
     return np.where(view.depth > 0, np.maximum(gradient - GRADIENT_MIN, 0.0) + BARE_WEIGHT, 0.0)

@@ -1,11 +1,11 @@
-"""Synthetic scenes, stage 4: light. Ray-traces one view of a world: colour, exact depth, exact normals.
+"""Synthetic scenes, stage 4: light. Ray-trace one view of a world: colour, exact depth, exact normals.
 
-Lambert's law under one small area light with shadows, a sky-to-ground gradient of ambient light, Blinn-Phong
-highlights, and mirror reflections with Schlick's Fresnel term. No indirect light beyond one reflection, no refraction,
-no lens.
+The model is Lambert's law under one small area light with shadows, a sky-to-ground gradient of ambient light,
+Blinn-Phong highlights, and mirror reflections with Schlick's Fresnel term. Left out: indirect light beyond one
+reflection, refraction, lenses.
 
-Depth and normals belong to pixel centres and are never averaged: an average across an edge lies on neither surface.
-Colour is the mean of n x n samples a pixel.
+Depth and normals are those of pixel centres and are never averaged: an average across an edge lies on neither surface.
+Colour is the mean of n x n samples per pixel.
 """
 
 from collections.abc import Callable
@@ -27,8 +27,8 @@ from minisplat_ref.reference.pinhole import pinhole_rays
 from minisplat_ref.types import Camera, Floats, Ints
 
 SURFACE_OFFSET = 1e-6  # world units; a reflected ray starts this far off its surface, so that it does not hit it again
-BLOCK_RAYS = 100_000  # at once: enough to hide NumPy's overhead for a call, few enough to stay in the cache
-LIT_UP_TO = 1.0 - 1e-6  # of the way from the light to a point: a blocker nearer than this casts a shadow
+BLOCK_RAYS = 100_000  # at once: enough to hide the overhead of NumPy's calls, few enough to stay in the cache
+LIT_UP_TO = 1.0 - 1e-6  # fraction of the way from the light to a point, up to which a blocker casts a shadow
 
 
 class World(NamedTuple):
@@ -71,7 +71,7 @@ def trace_view(world: World, camera: Camera, supersampling: int) -> TracedView:
     camera : Camera
         From where.
     supersampling : int
-        n of the n x n colour samples a pixel.
+        n of the n x n colour samples per pixel.
 
     Returns
     -------
@@ -129,7 +129,7 @@ def radiance(
     Parameters
     ----------
     world : World
-        What the rays meet.
+        The surfaces and the light.
     origins : ndarray of shape (3,) or (n, 3)
         World frame.
     directions : ndarray of shape (n, 3)
@@ -137,7 +137,7 @@ def radiance(
     hits : Hits
         First hits of these rays.
     light_ids : ndarray of shape (n,)
-        Which sample of the light shines for each ray.
+        Which sample of the light each ray uses.
     n_bounces : int
         How many more reflections to follow.
 
@@ -212,7 +212,7 @@ def _add_reflection(
     reflectance: float,
     n_bounces: int,
 ) -> Floats:
-    """[n, 3] the surface's own colour mixed with what it mirrors, by Schlick's F = F0 + (1 - F0) (1 - cos)^5."""
+    """Mix the surface's colours [n, 3] with their reflections, by Schlick's F = F0 + (1 - F0) (1 - cos)^5."""
     cosine = -np.einsum("ni,ni->n", normals, directions)[:, None]  # [n, 1]
     fresnel = reflectance + (1.0 - reflectance) * (1.0 - np.clip(cosine, 0.0, 1.0)) ** 5
     mirrored = directions + 2.0 * cosine * normals  # [n, 3]

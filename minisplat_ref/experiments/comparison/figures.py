@@ -10,9 +10,8 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from minisplat_ref.experiments.comparison.crops import Crop
 from minisplat_ref.experiments.comparison.measures import best_record
-from minisplat_ref.experiments.plots import PLOT_STYLE, TITLE_COLOR, plot
+from minisplat_ref.experiments.plots import PLOT_STYLE, SERIES, TITLE_COLOR, plot
 
-COLORS = ("#b4553d", "#2d6a8e", "#4b7f52", "#8a5a9e", "#b08a2e", "#5a6570")  # of the recipes, in their order
 SIZE = (5.6, 4.0)  # inches, of a plot
 CROP_WIDTH = 2.2  # inches, in the gallery
 BEST_MARK: dict[str, Any] = {
@@ -29,7 +28,7 @@ Curves = Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]
 
 def color(index: int) -> str:
     """Return the colour of a recipe."""
-    return COLORS[index % len(COLORS)]
+    return SERIES[index % len(SERIES)]
 
 
 def psnr_over_time(curves: Curves) -> Figure:

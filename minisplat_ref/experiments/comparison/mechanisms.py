@@ -63,13 +63,24 @@ def rows(fired: Fired) -> list[list[str]]:
 
 def remarks(fired: Fired) -> list[str]:
     """Return what the table does not say: notes of the mechanisms, and those that never acted."""
-    notes = dict.fromkeys(
-        f"{mechanism.action}: {note}"
-        for run in fired.runs
-        for mechanism in run
-        for note in describe_notes(mechanism.notes)
-    )
-    return [*notes, *([f"never: {', '.join(fired.never)}"] if fired.never else [])]
+    return [f"{name}: {note}" for name, notes in _notes(fired).items() for note in notes]
+
+
+def remarks_by_mechanism(fired: Fired) -> dict[str, str]:
+    """Return the same with one line for each mechanism."""
+    return {name: "; ".join(notes) for name, notes in _notes(fired).items()}
+
+
+def _notes(fired: Fired) -> dict[str, list[str]]:
+    notes: dict[str, dict[str, None]] = {}
+    for mechanism in (mechanism for run in fired.runs for mechanism in run):
+        if mechanism.notes:
+            notes.setdefault(mechanism.action, {}).update(dict.fromkeys(describe_notes(mechanism.notes)))
+    return {**{name: list(texts) for name, texts in notes.items()}, **_never(fired)}
+
+
+def _never(fired: Fired) -> dict[str, list[str]]:
+    return {"never": [", ".join(fired.never)]} if fired.never else {}
 
 
 def _range(values: Iterable[int]) -> str:

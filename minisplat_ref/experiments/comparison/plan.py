@@ -143,7 +143,7 @@ def check(plan: Plan) -> Scene:
             raise InputError(f"--{option.replace('_', '-')} means nothing to {', '.join(plan.recipes)}: leave it out")
     scene = load_scene(plan.scene, downscale=plan.downscale, test_every=plan.test_every)
     if not scene.test_views:
-        raise InputError(f"scene {scene.name} was split without test views to compare on: give --test-every above 0")
+        raise InputError(f"scene {scene.name} has no test views to compare on: give --test-every above 0")
     if plan.lpips_weights is not None:
         check_views(load_network(plan.lpips_weights), scene.test_views)
     start = scene if plan.init is None else load_start(plan.init, scene)[0]

@@ -13,12 +13,13 @@ from minisplat_ref.experiments.comparison.figures import (
     psnr_over_time,
 )
 from minisplat_ref.experiments.comparison.measures import MEASURES, RecipeMeasures
-from minisplat_ref.experiments.comparison.mechanisms import HEADING, Fired, remarks, rows
+from minisplat_ref.experiments.comparison.mechanisms import Fired
 from minisplat_ref.experiments.comparison.plan import Plan
 from minisplat_ref.experiments.comparison.results import Results
 from minisplat_ref.experiments.comparison.table import table_cells
-from minisplat_ref.experiments.page import captioned, cards, curves, page, panel, paragraph, section, table
+from minisplat_ref.experiments.page import cards, curves, grid, listing, page, panel, paragraph, section, slider, table
 from minisplat_ref.experiments.plots import to_svg
+from minisplat_ref.experiments.report_parts import fired_tables
 from minisplat_ref.experiments.surface import LEAST_OPACITY, NEAR
 from minisplat_ref.types import Scene
 
@@ -74,10 +75,9 @@ def report_html(plan: Plan, scene: Scene, results: Results) -> str:
         f" and measured on {n_test} more that no training saw."
     )
     heading, *cells = table_cells(results.recipes)
-    crops = "".join(_crop_panel(crop, plan.recipes) for crop in results.crops)
     sections = [
         cards(map(_card, results.recipes)),
-        section("Measures", table(cells, heading), paragraph(" ".join(notes(plan, results)))),
+        section("Measures", table(cells, heading), listing(notes(plan, results))),
         section("On the way", paragraph(CURVES_TEXT), _curves(results)),
         section("What fired, and when", paragraph(FIRED_TEXT), *(_fired_table(fired) for fired in results.fired)),
         section(
@@ -86,7 +86,7 @@ def report_html(plan: Plan, scene: Scene, results: Results) -> str:
                 "Half of them are where the recipes differ most, the others where there is most detail;"
                 f" seed {plan.seeds[0]}."
             ),
-            f'<div class="pixels">{crops}</div>',
+            grid([_crop_panel(crop, plan.recipes) for crop in results.crops], is_smooth=False),
         ),
         section("What was run", table(_settings(plan, scene, results))),
     ]
@@ -110,7 +110,7 @@ def _curves(results: Results) -> str:
 
 
 def _fired_table(fired: Fired) -> str:
-    return "\n".join([paragraph(fired_title(fired)), table(rows(fired), HEADING), *map(paragraph, remarks(fired))])
+    return "\n".join([paragraph(fired_title(fired)), *fired_tables(fired)])
 
 
 def fired_title(fired: Fired) -> str:
@@ -119,9 +119,8 @@ def fired_title(fired: Fired) -> str:
 
 
 def _crop_panel(crop: Crop, recipes: Sequence[str]) -> str:
-    pictures = [captioned(crop.truth, "truth")]
-    pictures += [captioned(image, recipe) for image, recipe in zip(crop.renders, recipes, strict=True)]
-    return panel(f"{crop.view}: {crop.reason}", pictures, n_columns=len(pictures))
+    renders = dict(zip(recipes, crop.renders, strict=True))
+    return panel(f"{crop.view}: {crop.reason}", [slider(crop.truth, renders)], n_columns=1)
 
 
 def _settings(plan: Plan, scene: Scene, results: Results) -> list[tuple[str, str]]:

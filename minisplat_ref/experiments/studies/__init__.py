@@ -13,8 +13,8 @@
 :data:`PRECISION`           :mod:`.precision`: a training in float64, float32, and with colours in float16
 ==========================  =====================================================================
 
-Here are their names and arguments. The modules hold the work; they load matplotlib and Numba, and so wait until a study
-runs. What they share is in :mod:`.front`.
+This module has their names and arguments. The other modules do the work and load matplotlib and Numba, so they are
+imported when a study runs. :mod:`.front` has what they share.
 """
 
 import argparse
@@ -25,12 +25,12 @@ from pathlib import Path
 from minisplat_ref.experiments.arguments import SYNTHETIC_SCENES, fraction, integer, listed, name
 from minisplat_ref.study import Study
 
-RESULT, FIGURE = "result.json", "figure.png"  # what every study leaves in its folder
+RESULT, FIGURE = "result.json", "figure.png"  # files that every study writes
 RECIPE_HELP = "name as in train --recipe"
 
 
 def all_studies() -> dict[str, Study]:
-    """Return the studies of this package by the name that is typed; an extension's are EXTENSION/NAME."""
+    """Return the studies of this package by the name that users type; an extension's are EXTENSION/NAME."""
     studies = (ADAPTIVE, ABLATION, SPLIT, CULLING, SIMPLIFY, DEPTH, EXPOSURE, POSE, DEFECTS, PRECISION)
     return {study.name: study for study in studies}
 

@@ -1,12 +1,12 @@
-"""What each mechanism of Mini-Splatting is worth: the recipe, and the recipe without one of them, seed by seed.
+"""The effect of each mechanism of Mini-Splatting: compare the recipe with the recipe without one of them, by seed.
 
-A mechanism is taken out by a setting or by leaving out its event; everything else, the dates included, stays. A row
-about a mechanism that never acts would say nothing. So there is none where it has no date at this length, or has not
-fired in the full training, whose record of events tells: small photographs, for example, are never halved. The same can
-be asked of our own deviations from the published method (``docs/FIDELITY.md``).
+A mechanism is removed by a setting or by leaving out its event; everything else, including all dates, stays. A row
+about a mechanism that never acts would be meaningless. So there is none if it has no date at this length, or did not
+fire in the full training according to its record of events: small photographs, for example, are never halved. The study
+can do the same for our own deviations from the published method (``docs/FIDELITY.md``).
 
-Trainings take long. Each leaves its record in ``runs.jsonl`` as soon as it ends, and the same command with the same
-folder goes on with those that are missing.
+Trainings take long. Each writes its record to ``runs.jsonl`` as soon as it ends, and the same command with the same
+folder continues with those that are missing.
 """
 
 import argparse
@@ -57,12 +57,12 @@ MEASURES = ("psnr", "ssim", "n_gaussians", "seconds")
 
 
 def with_bias_correction(recipe: Recipe) -> Recipe:
-    """Return 3dgs-accel as the baseline of Mini-Splatting2's tables; the other recipes have the correction."""
+    """Return 3dgs-accel with bias correction, the baseline of Mini-Splatting2's tables; other recipes have it."""
     return recipe._replace(adam=recipe.adam._replace(has_bias_correction=True))
 
 
 def with_settings(**settings: Any) -> Callable[[Recipe], Recipe]:
-    """Return what replaces settings of a recipe, and leaves one as it is that has not all of them."""
+    """Return a function that replaces settings of a recipe, and returns a recipe without all of them unchanged."""
     return lambda recipe: configured(recipe, **settings) if settings.keys() <= settings_of(recipe).keys() else recipe
 
 
@@ -82,14 +82,14 @@ MECHANISMS: Mapping[str, Callable[[Recipe], Recipe]] = {
     "reinitialisation": partial(without, action=mini_splatting.reinitialise_from_depth),
     "sky guard": with_settings(depth_tolerance=None),
     "intersection preservation": with_settings(is_intersecting=False),
-    "sampling": with_settings(choose=simplification.by_rank),  # the most important ones are kept instead
+    "sampling": with_settings(choose=simplification.by_rank),  # keeps the most important ones instead
     "restart": partial(without, action=mini_splatting.restart_from_means),
-    "culling": with_settings(visibility_mass=1.0),  # whatever a view shows at all is visible in it
+    "culling": with_settings(visibility_mass=1.0),  # every Gaussian with any weight in a view is visible
     "clone": with_settings(factor=1),
     "half-size warm-up": lambda recipe: recipe._replace(half_size_until=0),
     "last prune": partial(without, action=mini_splatting.prune_tail),
 }
-"""The published recipe without each mechanism; one that has not got it, unchanged."""
+"""The published recipe without each mechanism; a recipe that does not have it stays unchanged."""
 
 DEVIATIONS: Mapping[str, Callable[[Recipe], Recipe]] = {
     "least blurred area": with_settings(least_area=0),
@@ -158,10 +158,10 @@ def run(args: argparse.Namespace) -> None:
 def variants_of(
     published: Recipe, iterations: int, rules: Mapping[str, Callable[[Recipe], Recipe]] = MECHANISMS
 ) -> dict[str, Recipe]:
-    """Return the recipe of so many iterations, and without each thing that it has, if that acts in as many."""
+    """Return the recipe for so many iterations, and without each mechanism that acts within them."""
 
     def of_length(recipe: Recipe) -> Recipe:
-        return scaled(recipe, iterations)._replace(short_run_exponent=0.0)  # its work is done
+        return scaled(recipe, iterations)._replace(short_run_exponent=0.0)  # the rates are already raised
 
     full = of_length(published)
     variants = {name: of_length(take_out(published)) for name, take_out in rules.items()}
@@ -177,19 +177,19 @@ def has_date(recipe: Recipe, mechanism: str) -> bool:
 
 
 def count_actions(records: Sequence[Mapping[str, Any]], variants: Iterable[str]) -> dict[str, int]:
-    """Return how often each mechanism has fired in a full training, in the one where it did so least."""
+    """Return how often each mechanism fired in a full training, the least of all seeds."""
     fired = [record["fired"] for record in records if record["without"] == FULL]
     names = {name: ACTIONS[name].__name__ if name in ACTIONS else HALF_SIZE for name in variants if name in MECHANISMS}
     return {name: min(times.get(action, 0) for times in fired) for name, action in names.items()}
 
 
 def read_records(folder: Path, settings: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Make the folder, or return what it holds from an earlier call with the same settings.
+    """Make the folder, or return its records of an earlier call with the same settings.
 
     Raises
     ------
     InputError
-        The folder is of other settings, or holds something else.
+        The folder belongs to other settings, or contains something else.
     """
     path = folder / RUNS
     if not folder.exists():
@@ -205,13 +205,13 @@ def read_records(folder: Path, settings: Mapping[str, Any]) -> list[dict[str, An
 
 
 def append(folder: Path, record: Mapping[str, Any]) -> None:
-    """Keep the record of a training that has ended."""
+    """Append the record of a completed training."""
     with open(folder / RUNS, "a", encoding="utf-8") as file:
         file.write(json.dumps(record) + "\n")
 
 
 def measure(scene: Scene, recipe: Recipe, seed: int) -> dict[str, Any]:
-    """Train once; return the test views' measures, the seconds of the training alone, and how often what has fired."""
+    """Train once; return the test views' measures, the seconds of the training alone, and counts of fired events."""
     fired: Counter[str] = Counter()
     start = time.perf_counter()
     state = train(scene, recipe, seed=seed, on_step=lambda report: fired.update(e.action for e in report.fired))
@@ -226,8 +226,8 @@ def summarise(
 ) -> dict[str, dict[str, tuple[float, float]]]:
     """Return mean and deviation over the seeds, for each variant and measure.
 
-    ``difference`` is that of the PSNR from the full recipe's of the same seed: what seeds have in common is not in its
-    deviation.
+    ``difference`` is that of the PSNR from the full recipe's with the same seed, so that its deviation excludes the
+    effect of the seed that both share.
     """
     full = {record["seed"]: record["psnr"] for record in records if record["without"] == FULL}
     summary = {}

@@ -1,15 +1,14 @@
-"""``adaptive`` beside the recipes with a schedule: on a scene as it is, with few photographs, and with wrong exposures.
+"""Compare ``adaptive`` with recipes with a schedule: on a scene as it is, with few photographs, with wrong exposures.
 
-Every recipe is trained with every seed under every condition. On the way the test views are measured, off the clock,
-which only this study sees: nothing of it reaches the training. So there is, besides the final PSNR and the count, the
-time until a recipe has the final PSNR of the first recipe less 0.1 dB, and how far the PSNR has fallen since its best
-moment. Times are those of the processor (all threads of the process together), which other programs disturb less than
-the clock on the wall.
+Every recipe is trained with every seed under every condition. The test views are evaluated during training, without
+counting the time or influencing the training. So besides the final PSNR and the count, the study reports the time until
+a recipe reaches the final PSNR of the first recipe minus 0.1 dB, and how far the PSNR has fallen from its maximum.
+Times are processor times (of all threads of the process together), which other programs disturb less than wall time.
 
-With ``--rules`` it is ``adaptive`` beside itself without one of its rules, with ``--sweep`` beside itself with other
-thresholds of growth, which make more Gaussians and fewer: what the scene would have rewarded, and by how much.
+With ``--rules`` it compares ``adaptive`` with itself without one of its rules; with ``--sweep``, with itself at other
+thresholds of growth, which give more Gaussians and fewer: which number would have been best, and by how much.
 
-Trainings take long. Each leaves its record in ``runs.jsonl``, and the same command with the same folder goes on.
+Trainings take long. Each writes its record to ``runs.jsonl``, and the same command with the same folder continues.
 """
 
 import argparse
@@ -39,8 +38,8 @@ from minisplat_ref.types import Scene, View
 
 ITERATIONS = 3000  # of recipes with a schedule
 WARM_UP = 20  # iterations
-N_MEASUREMENTS = 24  # of those; of adaptive as often
-FEW = 5  # every so many-th training photograph is left
+N_MEASUREMENTS = 24  # in those iterations; for adaptive with the same interval
+FEW = 5  # one of every so many training photographs remains
 GAINS = (0.7, 1.4)  # of a photograph, uniform in the logarithm
 NEAR = 0.1  # dB
 COLORS = (BLUE, "#7a9a3a", "#c98a2b", RED, "#6f5b9a")
@@ -99,7 +98,7 @@ def clones_while_growing(
 
 
 def with_published_rates(recipe: Recipe) -> Recipe:
-    """Return the recipe with the rates of 3dgs-accel as they begin."""
+    """Return the recipe with the initial rates of 3dgs-accel."""
     rates = gaussian_splatting.GS_ACCEL.learning_rates
     return recipe._replace(learning_rates=Rates(rates.at(0, 1.0), rates.per_extent))
 
@@ -187,7 +186,7 @@ def _named(names: Sequence[str]) -> dict[str, Recipe]:
 def warm_up(scene: Scene, recipes: Iterable[Recipe]) -> None:
     """Train every recipe for a moment, so that no training counts the time of compiling."""
     for recipe in recipes:
-        with contextlib.suppress(InputError):  # so short a schedule may ask for what cannot be
+        with contextlib.suppress(InputError):  # so short a schedule may be impossible
             train(scene, scaled(recipe, WARM_UP), seed=0)
 
 
@@ -216,7 +215,7 @@ def measure(scene: Scene, recipe: Recipe, seed: int) -> dict[str, Any]:
 def summarise(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return a row for each condition and recipe: means over the seeds, the standard error of the PSNR's difference.
 
-    The first recipe is the one that the others are compared with, seed by seed.
+    The others are compared with the first recipe, seed by seed.
     """
     rows = []
     for condition in dict.fromkeys(record["condition"] for record in records):
@@ -266,7 +265,7 @@ def describe_regret(records: Sequence[Mapping[str, Any]]) -> str:
 
 
 def standard_error(values: Sequence[float]) -> float | None:
-    """Return that of the mean; None for one value."""
+    """Return the standard error of the mean; None for one value."""
     return float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None
 
 

@@ -1,9 +1,9 @@
-"""Visibility culling of Mini-Splatting2: what it takes away beyond the frustum, the time it saves, and what it costs.
+"""Visibility culling of Mini-Splatting2: what it removes beyond the frustum, the time it saves, and its cost.
 
-The recipe is trained to two places: before the simplification, where Gaussians are many, and before culling ends,
-where they are few. The photographs have their full size throughout. At each place the table of who is visible where is
-measured anew, as the recipe's events do, and the training is continued twice from the same state, with the table and
-without, one iteration of each in turn. Gaussians from a PLY are measured as they are.
+The recipe is trained up to two points: before the simplification, where there are many Gaussians, and before culling
+ends, where there are few. The photographs have their full size throughout. At each point the visibility table is
+measured again, as the recipe's events do, and the training is continued twice from the same state, with the table and
+without, one iteration of each alternately. Gaussians from a PLY are measured as they are.
 """
 
 import argparse
@@ -103,7 +103,7 @@ def measure(state: TrainState, scene: Scene, recipe: Recipe, repeats: int) -> di
         Stays as it is.
     scene : Scene
     recipe : Recipe
-        Of the iterations that are timed; its events are left out.
+        Recipe of the timed iterations; its events are left out.
     repeats : int
         Iterations of either kind.
 
@@ -141,7 +141,7 @@ def compare_views(gaussians: Gaussians, scene: Scene, is_visible: Bools) -> dict
 
 
 def time_both(state: TrainState, scene: Scene, recipe: Recipe, is_visible: Bools, repeats: int) -> NDArray[np.float64]:
-    """Time training iterations without and with the table in turn: render, loss, gradients, Adam.
+    """Time training iterations alternately without and with the table: render, loss, gradients, Adam.
 
     Returns
     -------
@@ -154,7 +154,7 @@ def time_both(state: TrainState, scene: Scene, recipe: Recipe, is_visible: Bools
     arms[1].stats["is_visible"] = is_visible
     seconds = np.zeros((WARM_UP + repeats, 2))
     for i in tqdm(range(len(seconds)), desc="timing", leave=False):
-        for k in (0, 1) if i % 2 else (1, 0):  # each goes first as often as second
+        for k in (0, 1) if i % 2 else (1, 0):  # each is first as often as second
             one_more = recipe._replace(iterations=arms[k].step + 1, events=())
             start = time.perf_counter()
             train(scene, one_more, seed=0, state=arms[k])
@@ -200,7 +200,7 @@ def to_rows(result: dict[str, dict[str, Any]]) -> list[list[str]]:
 
 
 def draw(places: dict[str, dict[str, NDArray[Any]]]) -> Figure:
-    """Draw the culled part of each view, the times of all iterations, and what culling costs each view."""
+    """Draw the culled part of each view, the times of all iterations, and the loss of PSNR in each view."""
     figure = Figure(figsize=(11, 3), layout="constrained")
     culled, times, cost = figure.subplots(1, 3)
     for (name, measures), color in zip(places.items(), (BLUE, RED), strict=False):

@@ -1,8 +1,8 @@
 """Planted defects: whether ``adaptive`` finds them, and none where there are none.
 
-Photographs of a scene are disturbed in a known way, anew in every trial, and the scene is trained until the iteration
-in which ``adaptive`` decides about exposures and poses. A trial counts what was switched on. The seed of a trial is
-that of its disturbance and of its training.
+Photographs of a scene are disturbed in a known way, differently in every trial, and the scene is trained until the
+iteration in which ``adaptive`` decides about exposures and poses. A trial records what was switched on. Its seed is
+used for the disturbance and the training.
 
 =========  ========================================================================================================
 ``clean``  the scene as it is; a real one may have defects of its own
@@ -70,7 +70,7 @@ CONDITIONS: Mapping[str, Callable[[Scene, np.random.Generator], Scene]] = {
 
 
 class _DecidedError(Exception):
-    """Ends a training that has decided what is asked."""
+    """Ends a training once it has decided."""
 
 
 def run(args: argparse.Namespace) -> None:

@@ -1,12 +1,12 @@
 """Depth reinitialisation, the paper's comparison (Table 4): mid-point, centre or blended depth, and with our guards.
 
-A synthetic scene, whose true depths are known, is trained by the recipe itself, with all its events, once for each
-choice and seed; only what reinitialisation draws differs. Just before the first of them, up to which all choices of a
-seed are the same training, the points that it is about to draw are compared with the truth. How many of the points that
-were sent behind the scene are still there when simplification comes says whether density control leaves them alone.
+A synthetic scene with known depths is trained with the recipe itself, including all events, once for each choice and
+seed; only the points drawn by reinitialisation differ. Just before the first reinitialisation, up to which all choices
+of a seed are the same training, the points that it is about to draw are compared with the truth. The number of points
+behind the scene that are left at the time of simplification shows whether density control removes them.
 
-A point's error is its camera z against the true depth at its pixel, relative to the latter. A point of the sky has no
-true depth: it hangs in front of the sky if it is nearer than the depth within which most of the surfaces are.
+A point's error is that of its camera z relative to the true depth at its pixel. A point of the sky has no true depth:
+it hangs in front of the sky if it is nearer than the depth within which most of the surfaces are.
 """
 
 import argparse
@@ -53,7 +53,7 @@ from minisplat_ref.training.loop import StepReport, train
 from minisplat_ref.training.schedule import Recipe, configured, firing_steps
 from minisplat_ref.types import Bools, Floats, Model, Scene
 
-LEAST_ALPHA = 0.9  # of the guard that asks for opacity
+LEAST_ALPHA = 0.9  # of the safeguard that requires opacity
 FAR = 0.5 * BACKDROP_EXTENTS  # extents from the origin beyond which there is nothing but the backdrop
 OFF_SURFACE = 0.05  # relative error above which a point is not on its surface
 SKY_BEHIND = 0.95  # share of the surfaces that a point of the sky has to be behind
@@ -68,7 +68,7 @@ class Choice(NamedTuple):
     has_backdrop: bool = False
 
     def applied_to(self, recipe: Recipe) -> Recipe:
-        """Return the recipe with its reinitialisation drawing like this."""
+        """Return the recipe with this choice in its reinitialisation."""
         return configured(
             recipe,
             points_of=self.points_of,
@@ -141,8 +141,8 @@ def measure(truth: SyntheticScene, recipe: Recipe, seeds: tuple[int, ...]) -> It
     Yields
     ------
     run : dict
-        The :data:`MEASURES`, ``psnr`` of the test views in the end. ``backdrop_left`` is the part of the points sent
-        behind the scene that densification has left, None where none were sent.
+        The :data:`MEASURES`, with the final ``psnr`` of the test views. ``backdrop_left`` is the fraction of the points
+        moved behind the scene that survive densification, None if none were moved.
     """
     with tqdm(total=len(seeds) * len(CHOICES), desc="trainings", leave=False) as bar:
         for seed in seeds:
@@ -157,7 +157,7 @@ def measure_one(truth: SyntheticScene, recipe: Recipe, choice: Choice, seed: int
     reinitialised = firing_steps(recipe, reinitialise_from_depth)
     densified = min(s for s in firing_steps(recipe, simplify, store_sh, restart_from_means) if s > reinitialised[-1])
     drawn: dict[str, float] = {}
-    counts: dict[int, int] = {}  # of what is far out, by iteration
+    counts: dict[int, int] = {}  # of distant Gaussians, by iteration
 
     def look(report: StepReport) -> None:
         model = report.state.model
@@ -174,17 +174,17 @@ def measure_one(truth: SyntheticScene, recipe: Recipe, choice: Choice, seed: int
 
 
 def n_far(model: Model, scene: Scene) -> int:
-    """Return how many Gaussians are farther out than :data:`FAR` extents of the scene."""
+    """Return the number of Gaussians beyond :data:`FAR` extents of the scene."""
     return int(np.count_nonzero(np.linalg.norm(model.gaussians.means, axis=1) > FAR * scene.extent))
 
 
 def drawn_points(
     model: Any, scene: Scene, choice: Choice, rng: np.random.Generator, n_points: int | None = None
 ) -> tuple[Floats, NDArray[np.int64]]:
-    """Return points [P, 3] and the pixels [P] they are of, counted through all training views.
+    """Return points [P, 3] and the pixels [P] they come from, numbered through all training views.
 
-    There are ``n_points`` at most, or as many as there are Gaussians. Points come with their pixels' colours. In
-    photographs in which the colour is the number of the pixel, that tells which pixel it is.
+    There are at most ``n_points``, or as many as there are Gaussians. Points come with their pixels' colours, so
+    photographs whose colours encode the number of the pixel tell which pixel it is.
     """
     model = as_model(model)
     shape = (len(scene.train_views), *scene.train_views[0].image.shape[:2])
@@ -205,7 +205,7 @@ def drawn_points(
 
 
 def depth_errors(points: Floats, pixels: NDArray[np.int64], truth: SyntheticScene) -> tuple[Floats, Bools]:
-    """Return the relative errors [P] of points [P, 3] of these pixels [P], and which [P] hang in front of the sky.
+    """Return the relative errors [P] of points [P, 3] from pixels [P], and which [P] hang in front of the sky.
 
     The error of a point of the sky is NaN.
     """
@@ -221,7 +221,7 @@ def depth_errors(points: Floats, pixels: NDArray[np.int64], truth: SyntheticScen
 
 
 def errors(points: Floats, pixels: NDArray[np.int64], truth: SyntheticScene) -> dict[str, float]:
-    """Return what the true depths say of points [P, 3] of these pixels [P]; shares are of all points."""
+    """Compare points [P, 3] from pixels [P] with the true depths; shares are of all points."""
     relative, is_in_front = depth_errors(points, pixels, truth)
     return {
         "median_error": float(np.nanmedian(relative)),
@@ -244,7 +244,7 @@ def summarise(runs: list[dict[str, Any]]) -> dict[str, dict[str, tuple[float, fl
 
 
 def to_rows(summary: dict[str, dict[str, tuple[float, float]]]) -> list[list[str]]:
-    """Return the lines of the table: means, and of PSNR the deviation over the seeds as well."""
+    """Return the lines of the table: means, and for PSNR also the deviation over the seeds."""
     rows = []
     for choice, row in summary.items():
         mean, deviation = row["psnr"]

@@ -1,13 +1,13 @@
-"""Exposures: photographs are multiplied by known gains, and the training has to find the gains.
+"""Exposures: multiply photographs by known gains, which the training has to recover.
 
-Every photograph of a synthetic scene is mapped by ``T_v``, a gain per channel and an offset. The scene is trained
-three times: on the photographs as they were, on the disturbed ones, and on these with exposures. The maps E_v that come
-out are known up to one map that all have in common: the scene may have the colours ``K [c; 1]``, if only
-``E_v K = T_v``. K is fitted by least squares before anything is compared, and held-out renderings are mapped back by
-its inverse. Without exposures every E_v is the identity, and K the best that one map can do.
+Every photograph of a synthetic scene is mapped by ``T_v``, a gain per channel and an offset. The scene is trained three
+times: on the original photographs, on the disturbed ones, and on these with exposures. The resulting maps E_v are
+determined up to one map that all share: the scene may have the colours ``K [c; 1]`` as long as ``E_v K = T_v``. K is
+fitted by least squares before anything is compared, and held-out renderings are mapped back by its inverse. Without
+exposures every E_v is the identity, and K the best single map.
 
-Maps are compared by what they do to the colours that the photographs have: those are mostly near gray, so that the nine
-entries of A_v are hardly known one by one.
+Maps are compared by their effect on the colours in the photographs: those are mostly near gray and hardly determine the
+nine entries of A_v individually.
 """
 
 import argparse
@@ -33,7 +33,7 @@ from minisplat_ref.types import Floats, Gaussians, Model, Scene
 RECIPE = "3dgs-accel"
 GAINS = (0.7, 1.4)  # per channel, uniform in the logarithm
 OFFSETS = (0.0, 0.09)
-DARKER = 1 / 1.5  # of all photographs alike, so that none saturates: a part of the common map
+DARKER = 1 / 1.5  # factor of all photographs, so that none saturates: part of the common map
 ARMS = ("undisturbed", "disturbed", "calibrated")
 
 
@@ -97,8 +97,8 @@ def disturbed_exposures(scene: Scene, rng: np.random.Generator) -> tuple[Scene, 
 def common_map(exposures: Floats, truth: Floats) -> Floats:
     """Return the K [3, 4] that minimises ``sum_v |E_v K - T_v|^2``.
 
-    ``E_v K`` is A_v K + [0 | b_v]. With the colours of all photographs weighted alike in every view, the squared error
-    of the mapped colours has the same minimum.
+    ``E_v K`` is A_v K + [0 | b_v]. If the colours of all photographs have the same weights in every view, the squared
+    error of the mapped colours has the same minimum.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def composed(exposures: Floats, K: Floats) -> Floats:
 
 
 def color_errors(maps: Floats, truth: Floats, colors: Floats) -> Floats:
-    """Return the root mean square [V] by which two sets of maps [V, 3, 4] differ on colours [P, 3], in units of 1."""
+    """Return the root mean square difference [V] of two sets of maps [V, 3, 4] on colours [P, 3] in [0, 1]."""
     homogeneous = np.column_stack([colors, np.ones(len(colors))])  # [P, 4]
     moments = homogeneous.T @ homogeneous / len(colors)  # [4, 4]
     differences = maps - truth  # [V, 3, 4]
@@ -126,7 +126,7 @@ def color_errors(maps: Floats, truth: Floats, colors: Floats) -> Floats:
 
 
 def mapped_mean(maps: Floats, colors: Floats) -> list[list[float]]:
-    """Return the mean of colours [P, 3] as each of the maps shows it, [V, 3]."""
+    """Return the mean of colours [P, 3] under each of the maps, [V, 3]."""
     return (maps @ np.append(colors.mean(axis=0), 1)).tolist()
 
 
@@ -139,7 +139,7 @@ def inverse(K: Floats) -> Floats:
 def held_out_psnr(gaussians: Gaussians, scene: Scene, K: Floats) -> float:
     """Return the mean PSNR of the test views, whose renderings are mapped by the inverse of K.
 
-    The renderer with exposures does it: its only exposure is the inverse, and every view uses it.
+    The renderer with exposures does this: its only exposure is the inverse, and every view uses it.
     """
     views = [view._replace(view_id=0) for view in scene.test_views]
     model = Model(gaussians, {EXPOSURES: inverse(K)[None]})

@@ -1,4 +1,4 @@
-"""What the studies share: the scene, means over seeds, the look of axes, and a folder with JSON and a figure."""
+"""Parts that all studies share: the scene, means over seeds, the style of axes, and a folder with JSON and a figure."""
 
 import json
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ def read_scene(source: str, downscale: int) -> Scene:
     Raises
     ------
     InputError
-        It is neither, or a synthetic scene is to be made smaller.
+        It is neither, or a synthetic scene is to be downscaled.
     """
     if Path(source).exists():
         return load_scene(Path(source), downscale=downscale)
@@ -38,7 +38,7 @@ def read_scene(source: str, downscale: int) -> Scene:
 
 
 def describe_scene(scene: Scene) -> dict[str, Any]:
-    """Return what the figures depend on besides the method: photographs, their size, points, machine."""
+    """Return what results depend on besides the method: photographs, their size, points, machine."""
     camera = scene.train_views[0].camera
     return {
         "scene": scene.name,
@@ -65,7 +65,7 @@ def mean_and_deviation(values: Sequence[float]) -> tuple[float, float]:
 
 
 def tidy(axes: Axes, grid: Literal["x", "both"] = "both") -> None:
-    """Take away the frame above and on the right, and draw a pale grid across the named axes."""
+    """Remove the frame above and on the right, and draw a pale grid for the named axes."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(axis=grid, color=GRID_COLOR)
     axes.set_axisbelow(True)

@@ -1,13 +1,13 @@
-"""Poses: every camera is turned and moved by a known amount, and the training has to move it back.
+"""Poses: rotate and shift every camera by a known amount, which the training has to correct.
 
 A synthetic scene is trained three times: with its true cameras, with the disturbed ones, and with these and pose
-refinement. Poses are known up to one similarity transform ``x_true = s S x + d`` that scene and cameras have in common,
-so it is fitted to the camera centres before anything is compared, and held-out cameras are carried into the trained
-scene by its inverse.
+refinement. Poses are determined up to one similarity transform ``x_true = s S x + d`` that scene and cameras share, so
+it is fitted to the camera centres before anything is compared, and its inverse maps held-out cameras into the trained
+scene.
 
-A rotation of the camera and a shift across its axis move an image nearly alike, and only differences of depth tell them
-apart: errors of the two may remain together that hardly move a pixel. So there is a third measure besides angle and
-distance: by how many pixels the points that a photograph shows are displaced in it, as the median.
+A rotation of the camera and a shift across its axis move an image nearly alike, and only differences of depth
+distinguish them: errors of both may remain that compensate each other in the image. So there is a third measure besides
+angle and distance: the median displacement, in pixels, of the points that a photograph shows.
 """
 
 import argparse
@@ -35,7 +35,7 @@ ARMS = ("undisturbed", "disturbed", "calibrated")
 
 
 class Disturbance(NamedTuple):
-    """By how much each camera is moved, in a random direction."""
+    """By how much each camera is rotated and shifted, in random directions."""
 
     degrees: float
     shift: float
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> None:
     Raises
     ------
     InputError
-        The scene or the output folder cannot be used, or the disturbance is no number that makes sense.
+        The scene or the output folder cannot be used, or the disturbance is out of range.
     """
     if not (0 <= args.degrees < 90 and 0 <= args.shift < 1):
         raise InputError(f"--degrees is {args.degrees} and --shift {args.shift}: give 0 to 90 and 0 to 1")
@@ -117,7 +117,7 @@ def measure(
 
 
 def disturbed_poses(scene: Scene, disturbance: Disturbance, rng: np.random.Generator) -> Scene:
-    """Return the scene with every training camera turned and shifted in random directions of its own."""
+    """Return the scene with every training camera rotated and shifted in its own random directions."""
     directions = rng.normal(size=(2, len(scene.train_views), 3))
     directions /= np.linalg.norm(directions, axis=2, keepdims=True)
     rotations = np.radians(disturbance.degrees) * directions[0]  # [V, 3]
@@ -138,7 +138,7 @@ def centres(cameras: list[Camera]) -> Floats:
 
 
 def aligning(cameras: list[Camera], truth: list[Camera]) -> Similarity:
-    """Return the similarity that carries the camera centres to the true ones with the least squares (Umeyama 1991).
+    """Return the least-squares similarity that maps the camera centres to the true ones (Umeyama 1991).
 
     ::
 
@@ -155,14 +155,14 @@ def aligning(cameras: list[Camera], truth: list[Camera]) -> Similarity:
 
 
 def carried(camera: Camera, similarity: Similarity) -> Camera:
-    """Return a camera that sees in the true frame what the given one sees in the trained scene."""
+    """Map a camera from the trained scene to the true frame."""
     s, S, d = similarity
     R = camera.cam_from_world_R @ S.T
     return camera._replace(cam_from_world_R=R, cam_from_world_t=s * camera.cam_from_world_t - R @ d)
 
 
 def carried_back(camera: Camera, similarity: Similarity) -> Camera:
-    """Return a camera that sees in the trained scene what the given one sees in the true frame."""
+    """Map a camera from the true frame to the trained scene."""
     s, S, d = similarity
     R, t = camera.cam_from_world_R, camera.cam_from_world_t
     return camera._replace(cam_from_world_R=R @ S, cam_from_world_t=(R @ d + t) / s)
@@ -176,7 +176,7 @@ def errors(cameras: list[Camera], truth: list[Camera]) -> tuple[Floats, Floats]:
 
 
 def displacement(camera: Camera, view: View, scene: Scene) -> float:
-    """Return the median distance, pixels, of the points of a view between a camera's image and the view's own."""
+    """Return the median distance, pixels, between a view's points as seen by a camera and by the view's own."""
     points = scene.points[view.point_ids]  # [Q, 3]
     images = []
     for seen_by in (camera, view.camera):
@@ -186,7 +186,7 @@ def displacement(camera: Camera, view: View, scene: Scene) -> float:
 
 
 def held_out_psnr(gaussians: Gaussians, scene: Scene, similarity: Similarity) -> float:
-    """Return the mean PSNR of the test views, whose cameras are carried into the trained scene."""
+    """Return the mean PSNR of the test views, with their cameras mapped into the trained scene."""
     views = [view._replace(camera=carried_back(view.camera, similarity)) for view in scene.test_views]
     psnr = evaluate(gaussians, views, background=scene.background).psnr
     assert psnr is not None, "there are test views"

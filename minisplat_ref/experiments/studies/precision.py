@@ -1,8 +1,8 @@
 """The precision that a training needs: the same recipe and seeds in float64, float32 and with colours in float16.
 
-Rounding changes a training long before it harms it: after some hundred iterations two precisions have other Gaussians,
-as two seeds have. So what counts is the PSNR of the test views, over seeds, against that of float32 with fast kernels,
-which is what ``train`` does; beside it the seconds of the processor and the bytes of the parameters.
+Rounding changes a training long before it harms it: after a few hundred iterations two precisions have different
+Gaussians, like two seeds. So the study compares the PSNR of the test views, over seeds, with that of float32 with fast
+kernels, which is what ``train`` uses; it also reports processor time and the bytes of the parameters.
 
 =======================  =========================================================================================
 ``float64``              parameters, moments and kernels
@@ -55,7 +55,7 @@ HEADING = ["precision", "PSNR (dB)", f"difference from {FAST} (dB)", "SSIM", "Ga
 
 
 class Precision(NamedTuple):
-    """How a training computes, and what it keeps."""
+    """How a training computes and stores its parameters."""
 
     dtype: DTypeLike
     """Of parameters and moments."""
@@ -150,7 +150,7 @@ def with_half_colours(model: Model) -> Model:
 
 
 def n_bytes(population: Any, *, has_half_colours: bool) -> int:
-    """Return what the parameters take; colours of two bytes each where they are float16."""
+    """Return the bytes of the parameters; a float16 colour takes two."""
     sizes = {name: field.nbytes for name, field in population._asdict().items()}
     if has_half_colours:
         sizes |= {name: 2 * getattr(population, name).size for name in COLOURS}
@@ -158,7 +158,7 @@ def n_bytes(population: Any, *, has_half_colours: bool) -> int:
 
 
 def measure(scene: Scene, recipe: Recipe, name: str, seed: int) -> list[dict[str, Any]]:
-    """Train once; return the record of the training, and that of its rounded colours where these are looked at."""
+    """Train once; return the record of the training, and that of its rounded colours if these are evaluated."""
     precision = PRECISIONS[name]
     start = time.process_time()
     state = trained(scene, recipe, precision, seed)

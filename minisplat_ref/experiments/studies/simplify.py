@@ -1,9 +1,9 @@
 """Simplification at equal counts: sampling by importance against pruning by rank or mass, and against merging.
 
-A dense population is trained once, or read from a PLY. Each choice leaves the same numbers of its Gaussians, and all
-are then fine-tuned for the same number of iterations, without any event. A seed decides what is sampled and the order
-of views. Who dominates no pixel is no candidate, whatever the choice. Pruning to a mass keeps what rank keeps, and
-only sets the number by itself; so its number is one of those that are measured, and both have one line.
+A dense population is trained once, or read from a PLY. Each choice reduces it to the same numbers of Gaussians, and all
+are then fine-tuned for the same number of iterations, without any event. A seed determines the samples and the order of
+views. Gaussians that dominate no pixel are no candidates, whatever the choice. Pruning by mass keeps the same as rank
+and only determines the number by itself; so its number is one of those that are measured, and both share one line.
 
 Chamfer distances are those of the centres that are kept, before fine-tuning: the mean distance to the nearest point of
 a cloud, and the mean distance from the cloud's points to the nearest centre, added. The clouds are the dense

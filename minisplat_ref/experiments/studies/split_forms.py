@@ -1,8 +1,8 @@
 """Blur split, its two forms: children drawn at random, as in the released code, or cut on the longest axis.
 
-The recipe is trained in four ways. Two of them switch blur split off: the rule for children is that of the split by
-gradients, too, and what it does there is to be told from what blur split does. Means and deviations are over seeds; a
-seed decides the order of views, random children and, in depth reinitialisation, pixels.
+The recipe is trained in four ways. Two of them switch blur split off: the split by gradients uses the same rule for
+children, and its effect there has to be separated from that of blur split. Means and deviations are over seeds; a seed
+determines the order of views, random children and, in depth reinitialisation, pixels.
 """
 
 import argparse

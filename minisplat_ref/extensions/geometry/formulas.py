@@ -1,4 +1,4 @@
-"""One pixel's part in the geometric losses: its tie to a neighbour, what an error costs, which way its surface faces.
+"""One pixel's part in the geometric losses: its edge weight to a neighbour, the cost of an error, its normal.
 
 A plane N . X = c is seen along the ray (s, t, 1) at the inverse depth w = N . (s, t, 1) / c, which is linear in s and
 t. Conversely N is proportional to (w_s, w_t, w - s w_s - t w_t). With forward differences, from a pixel of depth z to
@@ -40,7 +40,7 @@ def huber_vjp(error, tolerance):
 
 
 @scalar
-def facing(z, z_right, z_down, s, t, fx, fy):
+def pixel_normal(z, z_right, z_down, s, t, fx, fy):
     """Unit normal of a pixel of slopes s and t, and the inverse length of N."""
     p = fx * (z_right - z) / z_right
     q = fy * (z_down - z) / z_down
@@ -50,9 +50,9 @@ def facing(z, z_right, z_down, s, t, fx, fy):
 
 
 @scalar
-def facing_vjp(z, z_right, z_down, s, t, fx, fy, v_normal):
+def pixel_normal_vjp(z, z_right, z_down, s, t, fx, fy, v_normal):
     """Gradient by log(z_right / z) and log(z_down / z), since p = fx (1 - exp(-log(z_right / z)))."""
-    normal, inverse_length = facing(z, z_right, z_down, s, t, fx, fy)
+    normal, inverse_length = pixel_normal(z, z_right, z_down, s, t, fx, fy)
     along = dot(normal, v_normal)
     v_x = (v_normal[0] - along * normal[0]) * inverse_length
     v_y = (v_normal[1] - along * normal[1]) * inverse_length

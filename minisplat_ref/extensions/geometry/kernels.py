@@ -11,7 +11,7 @@ import numpy as np
 
 from minisplat_ref.constants import DEPTH_ALPHA_MIN
 from minisplat_ref.cpu.projection import pose_of
-from minisplat_ref.extensions.geometry.formulas import edge_weight, facing, facing_vjp, huber, huber_vjp
+from minisplat_ref.extensions.geometry.formulas import edge_weight, huber, huber_vjp, pixel_normal, pixel_normal_vjp
 from minisplat_ref.extensions.geometry.weights import EDGE_SHARPNESS, SFM_DEPTH_TOLERANCE, GeometricWeights
 from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.jit.literals import HALF, ONE, ZERO
@@ -28,7 +28,7 @@ class GeometricTape(NamedTuple):
     """[H, W] 0 for none."""
     lens: Floats
     """[4] fx, fy, cx, cy."""
-    ties: Floats
+    edges: Floats
     """[2, H, W] weight between a pixel and its right and its lower neighbour; 0 where one of them has no depth."""
     normals: Floats
     """[H, W, 3] 0 for none."""
@@ -45,54 +45,54 @@ class GeometricTape(NamedTuple):
 
 
 @kernel()
-def _tie(depth, photograph, sharpness, ties):
+def _weigh_edges(depth, photograph, sharpness, edges):
     height, width = depth.shape
     for y in prange(height):
         for x in range(width):
             if depth[y, x] <= ZERO:
                 continue
             if x + 1 < width and depth[y, x + 1] > ZERO:
-                ties[0, y, x] = edge_weight(photograph[y, x], photograph[y, x + 1], sharpness)
+                edges[0, y, x] = edge_weight(photograph[y, x], photograph[y, x + 1], sharpness)
             if y + 1 < height and depth[y + 1, x] > ZERO:
-                ties[1, y, x] = edge_weight(photograph[y, x], photograph[y + 1, x], sharpness)
+                edges[1, y, x] = edge_weight(photograph[y, x], photograph[y + 1, x], sharpness)
 
 
 @kernel()
-def _depth_steps(depth, ties, sums):
+def _depth_steps(depth, edges, sums):
     height, width = depth.shape
     for y in prange(height):
         for x in range(width):
             if x + 1 < width and depth[y, x] > ZERO and depth[y, x + 1] > ZERO:
-                sums[y, 0] += ties[0, y, x] * abs(math.log(depth[y, x + 1] / depth[y, x]))
+                sums[y, 0] += edges[0, y, x] * abs(math.log(depth[y, x + 1] / depth[y, x]))
                 sums[y, 1] += ONE
             if y + 1 < height and depth[y, x] > ZERO and depth[y + 1, x] > ZERO:
-                sums[y, 0] += ties[1, y, x] * abs(math.log(depth[y + 1, x] / depth[y, x]))
+                sums[y, 0] += edges[1, y, x] * abs(math.log(depth[y + 1, x] / depth[y, x]))
                 sums[y, 1] += ONE
 
 
 @scalar
-def _pull(tie, z, z_other):
+def _pull(weight, z, z_other):
     """Derivative of a pair's cost by log z."""
     if z > z_other:
-        return tie
-    return -tie if z < z_other else ZERO * tie
+        return weight
+    return -weight if z < z_other else ZERO * weight
 
 
 @kernel()
-def _depth_steps_vjp(depth, ties, v_pair, v_logs):
+def _depth_steps_vjp(depth, edges, v_pair, v_logs):
     height, width = depth.shape
     for y in prange(height):
         for x in range(width):
             z = depth[y, x]
             v = ZERO * z
             if x + 1 < width:
-                v += _pull(ties[0, y, x], z, depth[y, x + 1])
+                v += _pull(edges[0, y, x], z, depth[y, x + 1])
             if x > 0:
-                v += _pull(ties[0, y, x - 1], z, depth[y, x - 1])
+                v += _pull(edges[0, y, x - 1], z, depth[y, x - 1])
             if y + 1 < height:
-                v += _pull(ties[1, y, x], z, depth[y + 1, x])
+                v += _pull(edges[1, y, x], z, depth[y + 1, x])
             if y > 0:
-                v += _pull(ties[1, y - 1, x], z, depth[y - 1, x])
+                v += _pull(edges[1, y - 1, x], z, depth[y - 1, x])
             v_logs[y, x] += v_pair * v
 
 
@@ -108,7 +108,7 @@ def _normals(depth, lens, normals):
             z, z_right, z_down = depth[y, x], depth[y, x + 1], depth[y + 1, x]
             if z > ZERO and z_right > ZERO and z_down > ZERO:
                 s, t = (x + HALF - cx) / fx, (y + HALF - cy) / fy
-                normal, _ = facing(z, z_right, z_down, s, t, fx, fy)
+                normal, _ = pixel_normal(z, z_right, z_down, s, t, fx, fy)
                 for i in range(3):
                     normals[y, x, i] = normal[i]
 
@@ -125,7 +125,7 @@ def _half_square(a, b):
 
 
 @kernel()
-def _turns(normals, ties, sums):
+def _normal_differences(normals, edges, sums):
     height, width, _ = normals.shape
     for y in prange(height):
         for x in range(width):
@@ -133,23 +133,23 @@ def _turns(normals, ties, sums):
             if not _is_normal(normal):
                 continue
             if x + 1 < width and _is_normal(normals[y, x + 1]):
-                sums[y, 0] += ties[0, y, x] * ties[0, y, x + 1] * _half_square(normal, normals[y, x + 1])
+                sums[y, 0] += edges[0, y, x] * edges[0, y, x + 1] * _half_square(normal, normals[y, x + 1])
                 sums[y, 1] += ONE
             if y + 1 < height and _is_normal(normals[y + 1, x]):
-                sums[y, 0] += ties[1, y, x] * ties[1, y + 1, x] * _half_square(normal, normals[y + 1, x])
+                sums[y, 0] += edges[1, y, x] * edges[1, y + 1, x] * _half_square(normal, normals[y + 1, x])
                 sums[y, 1] += ONE
 
 
 @scalar
-def _add_turn(v, tie, a, b):
+def _add_difference(v, weight, a, b):
     """Add the derivative of a pair's cost by its first normal; no normal has no part in it."""
     if not _is_normal(b):
         return v
-    return v[0] + tie * (a[0] - b[0]), v[1] + tie * (a[1] - b[1]), v[2] + tie * (a[2] - b[2])
+    return v[0] + weight * (a[0] - b[0]), v[1] + weight * (a[1] - b[1]), v[2] + weight * (a[2] - b[2])
 
 
 @kernel()
-def _turns_vjp(depth, lens, normals, ties, v_pair, v_steps):
+def _normal_differences_vjp(depth, lens, normals, edges, v_pair, v_steps):
     height, width = depth.shape
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     for y in prange(height - 1):
@@ -159,14 +159,14 @@ def _turns_vjp(depth, lens, normals, ties, v_pair, v_steps):
                 continue
             # The last row and column have no normals, so neighbours to the right and below are always there.
             v = (ZERO * fx, ZERO * fx, ZERO * fx)
-            v = _add_turn(v, v_pair * ties[0, y, x] * ties[0, y, x + 1], n, normals[y, x + 1])
-            v = _add_turn(v, v_pair * ties[1, y, x] * ties[1, y + 1, x], n, normals[y + 1, x])
+            v = _add_difference(v, v_pair * edges[0, y, x] * edges[0, y, x + 1], n, normals[y, x + 1])
+            v = _add_difference(v, v_pair * edges[1, y, x] * edges[1, y + 1, x], n, normals[y + 1, x])
             if x > 0:
-                v = _add_turn(v, v_pair * ties[0, y, x - 1] * ties[0, y, x], n, normals[y, x - 1])
+                v = _add_difference(v, v_pair * edges[0, y, x - 1] * edges[0, y, x], n, normals[y, x - 1])
             if y > 0:
-                v = _add_turn(v, v_pair * ties[1, y - 1, x] * ties[1, y, x], n, normals[y - 1, x])
+                v = _add_difference(v, v_pair * edges[1, y - 1, x] * edges[1, y, x], n, normals[y - 1, x])
             s, t = (x + HALF - cx) / fx, (y + HALF - cy) / fy
-            v_right, v_down = facing_vjp(depth[y, x], depth[y, x + 1], depth[y + 1, x], s, t, fx, fy, v)
+            v_right, v_down = pixel_normal_vjp(depth[y, x], depth[y, x + 1], depth[y + 1, x], s, t, fx, fy, v)
             v_steps[0, y, x] = v_right
             v_steps[1, y, x] = v_down
 
@@ -221,16 +221,16 @@ def geometric_loss(
     depth = np.zeros((height, width), dtype)
     np.divide(accumulated_depth, alpha, out=depth, where=counts_here)
     lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    ties, normals = np.zeros((2, height, width), dtype), np.zeros((height, width, 3), dtype)
+    edges, normals = np.zeros((2, height, width), dtype), np.zeros((height, width, 3), dtype)
     sums = np.zeros((2, height, 2))  # depth and normals: of costs, of pairs
     if weights.depth_smoothness or weights.normal_smoothness:
         photograph = np.ascontiguousarray(photograph, dtype)
-        _tie(depth, photograph, dtype.type(EDGE_SHARPNESS), ties)
+        _weigh_edges(depth, photograph, dtype.type(EDGE_SHARPNESS), edges)
     if weights.depth_smoothness:
-        _depth_steps(depth, ties, sums[0])
+        _depth_steps(depth, edges, sums[0])
     if weights.normal_smoothness:
         _normals(depth, lens.astype(dtype), normals)
-        _turns(normals, ties, sums[1])
+        _normal_differences(normals, edges, sums[1])
     pixels, costs, slopes = _seen_points(depth, camera, lens, points if weights.sfm_depth else points[:0])
 
     costs_of_pairs, n_pairs = np.moveaxis(sums.sum(axis=1), 1, 0)
@@ -239,7 +239,7 @@ def geometric_loss(
     loss += weights.sfm_depth * costs.sum() / max(1, len(costs))
     counts = n_pairs.astype(np.int64)
     lens = lens.astype(dtype)
-    tape = GeometricTape(accumulated_depth, alpha, depth, lens, ties, normals, counts, pixels, slopes, weights)
+    tape = GeometricTape(accumulated_depth, alpha, depth, lens, edges, normals, counts, pixels, slopes, weights)
     return float(loss), tape
 
 
@@ -259,11 +259,11 @@ def geometric_loss_vjp(tape: GeometricTape, v_loss: float = 1.0) -> tuple[Floats
     v_logs = np.zeros(depth.shape, dtype)
     if weights.depth_smoothness:
         v_pair = dtype.type(v_loss * weights.depth_smoothness / max(1, tape.counts[0]))
-        _depth_steps_vjp(depth, tape.ties, v_pair, v_logs)
+        _depth_steps_vjp(depth, tape.edges, v_pair, v_logs)
     if weights.normal_smoothness:
         v_pair = dtype.type(v_loss * weights.normal_smoothness / max(1, tape.counts[1]))
         v_right, v_down = v_steps = np.zeros((2, *depth.shape), dtype)
-        _turns_vjp(depth, tape.lens, tape.normals, tape.ties, v_pair, v_steps)
+        _normal_differences_vjp(depth, tape.lens, tape.normals, tape.edges, v_pair, v_steps)
         v_logs -= v_right + v_down
         v_logs[:, 1:] += v_right[:, :-1]
         v_logs[1:] += v_down[:-1]

@@ -231,7 +231,10 @@ def normal_smoothness(normals: Floats, photograph: Floats) -> float:
     float
         0 for any plane.
     """
-    terms = [e[:, :, None] * np.diff(normals, axis=axis) ** 2 / 2 for axis, e in enumerate(_turns(normals, photograph))]
+    terms = [
+        e[:, :, None] * np.diff(normals, axis=axis) ** 2 / 2
+        for axis, e in enumerate(_normal_weights(normals, photograph))
+    ]
     return sum(float(np.sum(term, dtype=np.float64)) for term in terms)
 
 
@@ -255,7 +258,7 @@ def normal_smoothness_vjp(normals: Floats, photograph: Floats, v_loss: float = 1
         Derivative by the normals.
     """
     v_normals = np.zeros_like(normals)
-    for axis, e in enumerate(_turns(normals, photograph)):
+    for axis, e in enumerate(_normal_weights(normals, photograph)):
         v_normals += _diff_vjp(v_loss * e[:, :, None] * np.diff(normals, axis=axis), axis)
     return v_normals
 
@@ -298,8 +301,8 @@ def _logs_and_weights(depth: Floats, photograph: Floats) -> tuple[Floats, tuple[
     return np.log(np.where(has_depth, depth, 1)), _mean_weights(edge_weights(photograph), has_depth)
 
 
-def _turns(normals: Floats, photograph: Floats) -> tuple[Floats, Floats]:
-    """What each difference of normals along axis 0 and 1 counts in the mean."""
+def _normal_weights(normals: Floats, photograph: Floats) -> tuple[Floats, Floats]:
+    """Return the weight in the mean of each difference of normals along axis 0 and 1."""
     down, right = edge_weights(photograph)
     spanned = down[:-1, :-1] * down[1:, :-1], right[:-1, :-1] * right[:-1, 1:]  # [H - 2, W - 1], [H - 1, W - 2]
     return _mean_weights(spanned, np.any(normals != 0, axis=2))

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-EDGE_SHARPNESS = 10.0  # neighbours that differ by 0.1, 25 of 255 levels, are tied e times more loosely than equal ones
+EDGE_SHARPNESS = 10.0  # neighbours that differ by 0.1, 25 of 255 levels, count e times less than equal ones
 # Depth ratios within 1 % count as noise. The covariances of the points of four photographed scenes say 0.1 to 0.2 % for
 # the median observation and 0.2 to 0.7 % for the 90th percentile; wrong matches and silhouettes are off by far more.
 SFM_DEPTH_TOLERANCE = 0.01

@@ -15,7 +15,11 @@ from minisplat_ref.io.ply import further_properties, load_ply, save_ply
 
 def add_parser(commands: Any) -> None:
     """Add the command."""
-    parser = commands.add_parser("build", help="add coarser levels to a scene that was trained without")
+    parser = commands.add_parser(
+        "build",
+        help="add coarser levels to a scene that was trained without",
+        epilog="example: minisplat-ref multi-scale build runs/fox/point_cloud.ply --out levels.ply",
+    )
     parser.add_argument("ply", type=Path, metavar="PLY", help="point_cloud.ply of a run")
     parser.add_argument("--cameras", type=Path, metavar="FILE", help="of its run (default cameras.json beside the PLY)")
     parser.add_argument("--factor", type=float, default=FACTOR, metavar="F", help=f"of sizes (default {FACTOR})")

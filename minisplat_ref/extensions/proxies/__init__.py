@@ -7,7 +7,7 @@ Three ways of changing a trained scene without training it again.
   (:mod:`.deformation`); colours turn with the rotation in A (:mod:`.sh_rotation`).
 - *Binding to a mesh* (:mod:`.binding`), after GaMeS (arXiv 2402.01459): each Gaussian belongs to the nearest triangle
   (:mod:`.nearest`), by barycentric coordinates, an offset along the normal, and its axes in the frame of the triangle
-  (:mod:`.mesh`). When the mesh is deformed, Sigma' = F Sigma F^T with the triangle's deformation gradient F.
+  (``shared_mesh``). When the mesh is deformed, Sigma' = F Sigma F^T with the triangle's deformation gradient F.
 - *Physics* (:mod:`.mass_spring`, :mod:`.springs`): the mesh as masses and springs under gravity, by Verlet's step, with
   an account of the energy, and the scene bound to it.
 

@@ -2,7 +2,7 @@
 
 After GaMeS (Waczynska et al. 2024, arXiv 2402.01459), which puts Gaussians onto the faces of a mesh by barycentric
 coordinates and derives rotation and scales from the corners, so that whatever moves the mesh moves the scene. Each
-Gaussian is bound to the nearest triangle. In the frame E of that triangle (:mod:`.mesh`) it has the place and the axes
+Gaussian is bound to the nearest triangle. In the frame E of that triangle (``shared_mesh``) it has the place and axes
 
     (b1, b2, w) = E^-1 (mu - p0)      barycentric coordinates (1 - b1 - b2, b1, b2), signed offset w along the normal
     L = E^-1 R diag(s)                its rotation and scales
@@ -38,8 +38,8 @@ import numpy as np
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.proxies.deformation import Deformation, deformed
-from minisplat_ref.extensions.proxies.mesh import Mesh, frames
 from minisplat_ref.extensions.proxies.nearest import nearest_triangles
+from minisplat_ref.extensions.shared_mesh import Mesh, frames
 from minisplat_ref.types import Floats, Gaussians, Ints
 
 UNBOUND = -1

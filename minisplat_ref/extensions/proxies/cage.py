@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.proxies.mesh import Mesh, check_mesh, save_mesh
 from minisplat_ref.extensions.proxies.model_file import load_model
+from minisplat_ref.extensions.shared_mesh import Mesh, check_mesh, save_mesh
 from minisplat_ref.types import Floats
 
 KEPT = 0.98  # of the Gaussians along each axis; the rest are floaters, which would blow the mesh up
@@ -95,7 +95,11 @@ def _middle(means: Floats) -> Floats:
 
 def add_parser(commands: Any) -> None:
     """Add the command."""
-    parser = commands.add_parser("cage", help="make a coarse mesh from a model's Gaussians, to bind them to")
+    parser = commands.add_parser(
+        "cage",
+        help="make a coarse mesh from a model's Gaussians, to bind them to",
+        epilog="example: minisplat-ref proxies cage runs/fox/point_cloud.ply cage.ply --hull",
+    )
     parser.add_argument("model", type=Path, metavar="MODEL", help="PLY of Gaussians")
     parser.add_argument("out", type=Path, metavar="MESH", help="PLY of a mesh to write")
     kind = parser.add_mutually_exclusive_group(required=True)

@@ -20,10 +20,10 @@ from minisplat_ref.extensions.proxies.mass_spring import (
     energies,
     longest_step,
 )
-from minisplat_ref.extensions.proxies.mesh import Mesh, check_mesh, load_mesh, save_mesh
 from minisplat_ref.extensions.proxies.model_file import load_model
 from minisplat_ref.extensions.proxies.springs import springs_of, stiffness_for_stretch, vertex_masses
-from minisplat_ref.io import viewpoints
+from minisplat_ref.extensions.shared_mesh import Mesh, check_mesh, load_mesh, save_mesh
+from minisplat_ref.io import orbits, viewpoints
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.images import write_image
 from minisplat_ref.io.ply import save_ply
@@ -179,4 +179,4 @@ def _camera(cameras: Path | None, means: Floats) -> Camera:
     """Return the first camera of a file, or one that sees the whole scene."""
     if cameras is not None:
         return viewpoints.read(cameras)[0].camera
-    return viewpoints.orbit(means, [], 1, *PICTURE_SIZE)[0].camera
+    return orbits.orbit(means, [], 1, *PICTURE_SIZE)[0].camera

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from minisplat_ref.extensions.proxies.binding import bind, check_bound, rebuild
-from minisplat_ref.extensions.proxies.mesh import check_same_faces, load_mesh
 from minisplat_ref.extensions.proxies.model_file import load_model
+from minisplat_ref.extensions.shared_mesh import check_same_faces, load_mesh
 from minisplat_ref.io.ply import save_ply
 
 DESCRIPTION = """\
@@ -15,6 +15,9 @@ Bind the Gaussians of a model to a mesh, and write them as they are after the
 mesh has been deformed: in a modelling program, or by a script that moves its
 vertices. Both meshes have the same faces.
 """
+EPILOG = """\
+example:
+  minisplat-ref proxies follow runs/fox rest.ply deformed.ply fox-deformed.ply"""
 
 
 def add_parser(commands: Any) -> None:
@@ -23,6 +26,7 @@ def add_parser(commands: Any) -> None:
         "follow",
         help="deform a scene as a mesh was deformed",
         description=DESCRIPTION,
+        epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("model", type=Path, metavar="MODEL", help="PLY of Gaussians, or a run's folder")

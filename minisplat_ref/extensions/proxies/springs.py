@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import csr_array
 
-from minisplat_ref.extensions.proxies.mesh import Mesh
+from minisplat_ref.extensions.shared_mesh import Mesh
 from minisplat_ref.types import Floats, Ints
 
 AS_LONG = 1 - 1e-9  # of the longest side, from which on a side counts as the longest: rounding

@@ -10,7 +10,11 @@ from minisplat_ref.io.ply import load_ply, save_ply
 
 def add_parser(commands: Any) -> None:
     """Add the command."""
-    parser = commands.add_parser("freeze", help="write the scene at one moment, for viewers that know no motion")
+    parser = commands.add_parser(
+        "freeze",
+        help="write the scene at one moment, for viewers that know no motion",
+        epilog="example: minisplat-ref velocity freeze runs/moving/point_cloud.ply --time 0.5 --out still.ply",
+    )
     parser.add_argument("ply", type=Path, metavar="PLY", help="point_cloud.ply of a run of recipe velocity")
     parser.add_argument("--time", type=float, default=0.0, metavar="T", help="the moment (default 0)")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="PLY to write")

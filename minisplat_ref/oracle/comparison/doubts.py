@@ -1,6 +1,6 @@
-"""Which values of a scene rounding decides: pixels at thresholds, and what is counted or summed over them.
+"""Which values of a scene depend on rounding: pixels at thresholds, and counts and sums over them.
 
-An exact scene leaves nothing to rounding, and nothing is set aside there.
+An exact scene leaves nothing to rounding, so nothing is set aside there.
 """
 
 import numpy as np
@@ -13,13 +13,13 @@ from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.types import Bools
 
 PIXELWISE = ("image", "alpha", "feature_image", "accumulated_depth", "view", "view_alpha")
-"""Arrays of images that a hit more or less changes."""
+"""Image arrays that one hit more or less would change."""
 BY_GAUSSIAN = ("blend_weight_sum", "blend_weight_max", "hit_count")
-"""Arrays of Gaussians that a hit more or less changes."""
+"""Gaussian arrays that one hit more or less would change."""
 
 
 def doubts(truth: Golden) -> dict[str, Bools]:
-    """Return for each array that rounding may decide where it does, along the array's first axes.
+    """Return, for each array that rounding may change, where it may do so, along the array's first axes.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def doubts(truth: Golden) -> dict[str, Bools]:
 
 
 def _ties(truth: Golden) -> Bools:
-    """Find the pixels [H, W] whose two largest weights are as good as equal."""
+    """Find the pixels [H, W] whose two largest weights are equal up to rounding."""
     a = truth.arrays
     ties = np.zeros(a["alpha"].shape, bool)
     bins = reference_bins(a, truth.conventions, (int(a["tile_size"][0]), int(a["tile_size"][1])))
@@ -57,6 +57,6 @@ def _ties(truth: Golden) -> Bools:
 
 
 def _touching(truth: Golden, pixels: Bools) -> Bools:
-    """Find the Gaussians [N] whose box holds one of these pixels."""
+    """Find the Gaussians [N] whose box contains one of these pixels."""
     boxes = truth.arrays["boxes"]
     return np.array([pixels[y0:y1, x0:x1].any() for x0, y0, x1, y1 in boxes], bool).reshape(len(boxes))

@@ -1,7 +1,7 @@
-"""How far two arrays are apart, with what rounding decides set aside; and whether other bounds change the image.
+"""How much two arrays differ, apart from values that rounding decides; and whether other bounds change the image.
 
 Boxes and tile lists differ between renderers for good reasons; what counts is whether the image does. So the reference
-draws the truth's footprints once more, within the other's bounds or in the other's order.
+renders the truth's footprints once more, within the other renderer's bounds or in its order.
 """
 
 from typing import NamedTuple
@@ -17,16 +17,16 @@ from minisplat_ref.types import Bools, Floats, Ints, Projection, TileBins
 
 
 class Difference(NamedTuple):
-    """Of one array from the truth's."""
+    """Difference of an array from the truth."""
 
     max_error: float
     """Largest |given - expected|; infinite where one of them is not finite."""
     rms_error: float
-    """Root of the mean square of the same."""
+    """Root mean square of given - expected."""
     scale: float
     """Largest |expected|, or 1 where all is zero."""
     tolerance: float
-    """Allowed part of the scale."""
+    """Allowed error relative to the scale."""
     n_over: int
     """Number of values that are off by more."""
     n: int
@@ -36,12 +36,12 @@ class Difference(NamedTuple):
 
     @property
     def relative(self) -> float:
-        """Largest error as a part of the scale."""
+        """Return the largest error relative to the scale."""
         return self.max_error / self.scale
 
     @property
     def excess(self) -> float:
-        """Largest error in units of what is allowed; above 1 it diverges."""
+        """Return the largest error in units of the allowed one; above 1 the array diverges."""
         return self.relative / self.tolerance if self.tolerance else np.inf * (self.max_error > 0)
 
 
@@ -53,10 +53,10 @@ def difference(given: Floats, expected: Floats, tolerance: float, may_flip: Bool
     given, expected : ndarray
         The other renderer's and the truth's.
     tolerance : float
-        Part of the largest expected value that a value may be off.
+        Allowed error relative to the largest expected value.
     may_flip : ndarray of bool, optional
-        Places, along the first axes, that rounding decides. They are neither averaged in nor failed, but counted
-        where they are off.
+        Places, along the first axes, that rounding decides. They are neither averaged nor failed, but counted where
+        they are off.
 
     Returns
     -------
@@ -90,7 +90,7 @@ FOOTPRINT = ("means2d", "depths", "conics", "opacities2d")
 
 
 class Bounds(NamedTuple):
-    """What became of a difference in bounds or lists."""
+    """The effect of a difference in bounds or lists."""
 
     n_different: int  # rows, or tiles
     n: int
@@ -172,7 +172,7 @@ def compare_lists(given: Arrays, truth: Golden) -> Bounds | None:
 
 
 def _changes_image(projection: Projection, bins: TileBins, truth: Golden) -> bool:
-    """Whether the reference's image is another one with these boxes and lists."""
+    """Return whether these boxes and lists change the reference's image."""
     arrays = truth.arrays
     output = REFERENCE.composite(projection, arrays["colors"], arrays["background"], bins, truth.conventions)
     may_flip = thresholds(projection, bins, truth.conventions).jumps
@@ -181,7 +181,7 @@ def _changes_image(projection: Projection, bins: TileBins, truth: Golden) -> boo
 
 
 def _boxes_of(projection: Projection, radii: Ints, truth: Golden) -> Ints:
-    """Boxes of half-sides ``radii`` around the means, in the image."""
+    """Return boxes of half-sides ``radii`` around the means, clipped to the image."""
     size = truth.arrays["image_size"]
     low = np.clip(np.floor(projection.means2d - radii), 0, size)
     high = np.clip(np.ceil(projection.means2d + radii), 0, size)
@@ -189,7 +189,7 @@ def _boxes_of(projection: Projection, radii: Ints, truth: Golden) -> Ints:
 
 
 def _merged(rows: Bools, given: Floats, expected: Floats) -> Floats:
-    """The given values in these rows, the expected ones in all others."""
+    """Return the given values in these rows and the expected ones in all others."""
     merged = expected.copy()
     merged[rows] = given[rows]
     return merged

@@ -1,8 +1,8 @@
-"""What can be compared: anything that gives arrays of the golden format for a scene; and which one a name means.
+"""The renderers that can be compared: anything that returns arrays of the golden format for a scene; and their names.
 
-First what a renderer is; then ours (the backends, a backend with a planted error, the reference by other conventions);
-then a folder of arrays that some other renderer has written; last, from what a user types to a renderer and to the
-scenes that it is compared on. Those of others are in :mod:`minisplat_ref.oracle.peers`.
+The module defines a renderer; then ours (the backends, a backend with a planted error, the reference under other
+conventions); then a folder of arrays written by some other renderer; last, how names that users type select a renderer
+and the scenes to compare. Other people's renderers are in :mod:`minisplat_ref.oracle.peers`.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from minisplat_ref.backends import BACKENDS, CPU, REFERENCE, Backend
-from minisplat_ref.constants import GSPLAT_1_5, PROFILES, Conventions
+from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN, PROFILES, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.golden.files import load, read_manifest, read_npz
 from minisplat_ref.oracle.golden.format import SPECS, Arrays, Golden
@@ -32,15 +32,15 @@ class Renderer(NamedTuple):
     name: str
     """For messages and reports."""
     dtype: str | None
-    """``"float32"`` or ``"float64"``: what it computes in, which sets the tolerances; None: the dtype of each array."""
+    """``"float32"`` or ``"float64"``, in which it computes and which sets tolerances; None: the dtype of each array."""
     is_staged: bool
-    """Whether every stage was fed with the truth, so that a difference arose in its own stage."""
+    """Whether the truth is the input of every stage, so that a difference arises in its own stage."""
     arrays: Callable[[Golden], Arrays]
-    """All arrays that it can give for a scene of which the truth is known; shapes as in the golden format."""
+    """Returns all arrays that it can for a scene with known truth; shapes as in the golden format."""
     rules: Callable[[Conventions], Conventions | None] = _as_they_are
     """The conventions that it follows when a scene asks for these; None where it cannot draw the scene at all."""
     ignores: tuple[str, ...] = ()
-    """Cotangents that it cannot take; they are made zero for the truth as well."""
+    """Cotangents that it cannot take; they are set to zero for the truth as well."""
     scenes: tuple[str, ...] | None = None
     """Names of the scenes that it has; None for any."""
 
@@ -78,7 +78,7 @@ def with_planted_error(name: str, dtype: str) -> Renderer:
 
 
 def by_profile(conventions: Conventions, dtype: str) -> Renderer:
-    """Compare the reference by other conventions than the scene's: what a choice of conventions costs."""
+    """Compare the reference under other conventions than the scene's: the effect of a choice of conventions."""
     return from_backend(REFERENCE, dtype, conventions)
 
 
@@ -90,7 +90,7 @@ def from_dumps(path: str | Path, dtype: str | None = None) -> Renderer:
     path : str or Path
         Folder with a folder for each scene. A manifest is not needed; where there is one, its hashes are checked.
     dtype : str, optional
-        What the renderer computed in, if it wrote another dtype than that.
+        In which the renderer computed, if it differs from the dtype that it wrote.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def from_dumps(path: str | Path, dtype: str | None = None) -> Renderer:
 
 
 def _read(folder: Path, truth: Golden) -> Arrays:
-    """Arrays of a scene that the truth has, too; the input among them must be the truth's."""
+    """Return the arrays of a scene that the truth has too; inputs among them must equal the truth's."""
     arrays: Arrays = {}
     for file in sorted(folder.glob("*.npz")):
         for name, array in read_npz(file).items():
@@ -120,7 +120,7 @@ def _read(folder: Path, truth: Golden) -> Arrays:
             arrays[name] = array
     for name, array in arrays.items():
         if SPECS[name].role in ("input", "cotangent") and name != "tile_size":
-            expected = truth.arrays[name].astype(np.float32)  # what float32 kept of it
+            expected = truth.arrays[name].astype(np.float32)  # rounded
             if not np.array_equal(array.astype(np.float32), expected):
                 raise InputError(
                     f"{folder}: its {name} is not that of the golden scene {truth.name!r}; render the scene that"
@@ -167,7 +167,7 @@ OTHERS: dict[str, Callable[[], Renderer]] = {"gsplat": _gsplat, "inria": _inria}
 
 
 def choose_renderer(name: str, dtype: str | None) -> Renderer:
-    """Renderer of a name.
+    """Return the renderer of a name.
 
     Parameters
     ----------
@@ -202,15 +202,47 @@ def choose_renderer(name: str, dtype: str | None) -> Renderer:
         return from_dumps(name, dtype)
     errors = ", ".join(error.name for error in PLANTED)
     raise InputError(
-        f"{name!r} is neither a folder of dumps nor a renderer: {', '.join(BACKENDS)}, gsplat-torch, gsplat, inria,"
+        f"{name!r} is neither a folder of dumps nor a renderer: package.module:function, {', '.join(BACKENDS)},"
+        " gsplat-torch, gsplat, inria,"
         f" profile:NAME ({', '.join(PROFILES)}) or planted:ERROR ({errors})"
     )
+
+
+def is_function(name: str) -> bool:
+    """Return whether a name is of the form ``package.module:function``."""
+    return ":" in name and name.partition(":")[0] not in ("planted", "profile") and not Path(name).is_dir()
+
+
+def choose_function(name: str, dtype: str | None, profile: str | None, arrays: str | None) -> Renderer:
+    """Renderer of ``package.module:function``.
+
+    Parameters
+    ----------
+    name : str
+    dtype : str, optional
+        ``"float32"``, the default, or ``"float64"``.
+    profile : str, optional
+        Key of ``PROFILES``: its rules; by default those of gsplat's main branch.
+    arrays : str, optional
+        ``"numpy"``, ``"torch"`` or ``"jax"``; by default what its module has imported.
+
+    Raises
+    ------
+    InputError
+        If there is no such function, or it cannot be called like gsplat's.
+    """
+    from minisplat_ref.oracle.peers.function import from_function
+    from minisplat_ref.oracle.peers.named_function import load_function
+
+    function, vjp = load_function(name)
+    rules = GSPLAT_MAIN if profile is None else PROFILES[profile]
+    return from_function(function, vjp, name=name, arrays=arrays, dtype=dtype or "float32", profile=rules)
 
 
 def choose_scenes(
     renderer: Renderer, name: str, against: str, profile: str | None
 ) -> tuple[dict[str, Golden], tuple[str, ...]]:
-    """Truths for a renderer.
+    """Return the truths for a renderer.
 
     Parameters
     ----------
@@ -228,8 +260,8 @@ def choose_scenes(
     scenes : dict of Golden
         With all arrays, by name.
     left_out : tuple of str
-        Names of the scenes that the renderer cannot draw, by their conventions; and exact scenes, where ours would
-        round, in float32, or other thresholds are asked for than the scene's own.
+        Names of the scenes whose conventions the renderer does not support; and of exact scenes, where ours would round
+        in float32, or other thresholds than the scene's own are requested.
 
     Raises
     ------
@@ -263,7 +295,7 @@ def choose_scenes(
 
 
 def _with_truth(golden: Golden, rules: Conventions, ignores: tuple[str, ...]) -> Golden:
-    """All arrays, by these rules and with zero for what is ignored; those of a folder where they are that already."""
+    """Return all arrays under these rules, with zeros for what is ignored; a folder's own if they are that already."""
     is_complete = "v_means" in golden.arrays and not any(golden.arrays[name].any() for name in ignores)
     if is_complete and rules == golden.conventions:
         return golden

@@ -1,7 +1,7 @@
-"""The stages in their order, each compared with the truth; the first that diverges is named, and all are reported.
+"""Compare the stages with the truth in order; name the first that diverges, and report them all.
 
-Forward from the projection to the image and the loss, then the gradients from the image back to the scene. The report
-has one line for each stage, over all scenes.
+The order is forward from the projection to the image and the loss, then the gradients from the image back to the scene.
+The report has one line for each stage, over all scenes.
 """
 
 from collections.abc import Iterable, Mapping
@@ -73,7 +73,7 @@ class Row(NamedTuple):
     stage: str
     status: Status
     difference: Difference | None
-    """Of the array that is furthest off; None where nothing was given, or where it was not measured by numbers."""
+    """Of the array with the largest error; None where nothing was given or no numbers were compared."""
     bounds: Bounds | None = None
     """For radii and tile lists."""
     n_candidates: int = 0
@@ -90,7 +90,7 @@ def compare_scene(renderer: Renderer, truth: Golden) -> list[Row]:
     Parameters
     ----------
     renderer : Renderer
-        Whoever is compared.
+        The renderer that is compared.
     truth : Golden
         All arrays, by the conventions that the renderer follows.
 
@@ -125,22 +125,22 @@ def compare_scene(renderer: Renderer, truth: Golden) -> list[Row]:
 
 
 def first_divergence(rows: Iterable[Row]) -> Row | None:
-    """Row of the earliest stage that diverges, in the scene where it is furthest off; None where all agree."""
+    """Return the row of the earliest stage that diverges, in the scene with the largest error; None if all agree."""
     diverging = [row for row in rows if row.status == "diverges"]
     order = list(STAGES)
     return min(diverging, key=lambda row: (order.index(row.stage), -excess(row)), default=None)
 
 
 def excess(row: Row) -> float:
-    """Largest error of a row in units of what is allowed; 0 where it was not measured by numbers."""
+    """Return the largest error of a row in units of the allowed one; 0 where no numbers were compared."""
     return row.difference.excess if row.difference is not None else 0.0
 
 
 def _relation(renderer: Renderer, row: Row, first: Row) -> str:
-    """Say what a difference has to do with the first one; nothing where neither can be the other's cause.
+    """Say how a difference is related to the first one; return nothing if neither can cause the other.
 
-    It may follow from the first if it is computed from what is wrong there: of a renderer whose stages were each fed
-    with the truth, only in the view. Two results of one stage are wrong beside each other.
+    It may follow from the first if it is computed from the wrong values; if the truth is the input of every stage, this
+    is possible only in the view. Two results of one stage are wrong independently.
     """
     is_fed = renderer.is_staged and not any(SPECS[name].stage == "view" for name in row.arrays)
     if not is_fed and any(set(first.arrays) & _sources(name) for name in row.arrays):
@@ -150,7 +150,7 @@ def _relation(renderer: Renderer, row: Row, first: Row) -> str:
 
 
 def _sources(name: str) -> set[str]:
-    """Return the names of all arrays that one is computed from, directly or not."""
+    """Return the names of all arrays from which one is computed, directly or indirectly."""
     found, new = set[str](), {name}
     while new:
         found |= new
@@ -159,7 +159,7 @@ def _sources(name: str) -> set[str]:
 
 
 def _direct_sources(name: str) -> tuple[str, ...]:
-    """Return what the function reads that computes an array; for the view, what its parts give."""
+    """Return the inputs of the function that computes an array; for the view, the results of its parts."""
     spec = SPECS[name]
     if spec.role in ("input", "cotangent"):
         return ()
@@ -238,7 +238,7 @@ def _row_of_arrays(
 
 
 def _shape_of_error(given: np.ndarray, expected: np.ndarray, d: Difference) -> str:
-    """Say where an error sits if it sits in one column, and whether it is a factor."""
+    """Say in which column an error is, if in one only, and whether it is a constant factor."""
     if d.n_over == 0 or not np.isfinite(given).all():
         return "" if d.n_over == 0 else "not finite"
     given, expected = np.asarray(given, np.float64), np.asarray(expected, np.float64)
@@ -254,7 +254,7 @@ def _shape_of_error(given: np.ndarray, expected: np.ndarray, d: Difference) -> s
 
 
 def as_report(renderer: Renderer, rows: list[Row], settings: Mapping[str, Any]) -> Report:
-    """One case for each stage that was given, with the scene where it is furthest off."""
+    """Return one case for each stage that was given, with the scene of the largest error."""
     scenes = list(dict.fromkeys(row.scene for row in rows))
     first = first_divergence(rows)
     given = [stage for stage in STAGES if any(r.stage == stage and r.status != "not given" for r in rows)]

@@ -1,4 +1,4 @@
-"""Whether the arrays of a golden scene fit each other: kernels index by them, and would read past their ends."""
+"""Check that the arrays of a golden scene are consistent: otherwise kernels would index past their ends."""
 
 from pathlib import Path
 
@@ -61,5 +61,5 @@ def check_arrays(source: Path, arrays: Arrays, way_out: str) -> None:
 
 
 def _are_rows(ids: Ints, lowest: int, n: int) -> bool:
-    """Whether ids lie in [lowest, n)."""
+    """Return whether ids lie in [lowest, n)."""
     return not ids.size or bool(ids.min() >= lowest and ids.max() < n)

@@ -1,4 +1,4 @@
-"""A folder of golden vectors: written whole or not at all, and checked when it is read."""
+"""A folder of golden vectors: written completely or not at all, and checked when it is read."""
 
 import hashlib
 import json
@@ -86,7 +86,7 @@ def load(path: str | Path) -> dict[str, Golden]:
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """Manifest of a folder, None where there is none.
+    """Return the manifest of a folder, None if there is none.
 
     Raises
     ------
@@ -122,7 +122,7 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
 
 
 def read_npz(path: Path) -> Arrays:
-    """Arrays of a file.
+    """Return the arrays of a file.
 
     Raises
     ------
@@ -213,7 +213,7 @@ def _read_scene(folder: Path, name: str, entry: Mapping[str, Any]) -> Golden:
 
 
 def _conventions(folder: Path, name: str, values: Mapping[str, Any]) -> Conventions:
-    """Conventions of a scene, each of the type that the profiles have."""
+    """Return the conventions of a scene, each value of the type that the profiles have."""
     conventions = Conventions(**values)
     for field, value, usual in zip(Conventions._fields, conventions, GSPLAT_MAIN, strict=True):
         is_number = isinstance(usual, float) and isinstance(value, int | float) and not isinstance(value, bool)

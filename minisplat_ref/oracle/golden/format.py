@@ -1,8 +1,8 @@
 """The golden format: every array by name, and the page that explains it to people who will never read our Python.
 
-An array has a name, a stage, a role, a shape, a unit, a meaning, and a tolerance that says how exactly it must be met.
-A name belongs to one array of a scene. The arrays of a stage stand in one file; a stage's inputs that other stages made
-stand in theirs. Left out: the activations (exponential, sigmoid), which belong to the trainer.
+An array has a name, a stage, a role, a shape, a unit, a meaning, and a tolerance that says how exactly it must be
+reproduced. Names are unique in a scene. The arrays of a stage are in one file; its inputs from other stages are in
+theirs. Left out: the activations (exponential, sigmoid), which belong to the trainer.
 """
 
 import inspect

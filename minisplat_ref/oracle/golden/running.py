@@ -1,8 +1,8 @@
-"""All arrays of a golden scene, by any backend's stages: each by itself, or one after the other.
+"""Compute all arrays of a golden scene with any backend's stages, each on its own or one after the other.
 
-Fed with the arrays of a truth, every stage by itself is given the truth's input, so that an error stays in its stage.
-The last two stages are calls of the package that a backend is only a part of: the view, which is the public call
-``rasterization``, and Adam with its corrections of the moments.
+If the arrays of a truth are given, they are the input of every stage, so that an error stays in its stage. The last two
+stages are calls of which a backend is only a part: the view, which is the public call ``rasterization``, and Adam with
+its bias corrections.
 """
 
 from collections import ChainMap
@@ -19,7 +19,7 @@ from minisplat_ref.training.adam import AdamRule, AdamState, adam_step
 from minisplat_ref.types import Floats, Primitives, Projection, ProjectionGradient, RenderOutput, TileBins, TileGrid
 
 Take = Callable[[str], Floats]
-"""Reads an array of this name: floating ones in the dtype that is computed in."""
+"""Reads an array by name; floating-point arrays come in the dtype of the computation."""
 
 # Fields of a stage's result, by array.
 PROJECTION = ("means2d", "depths", "conics", "opacities2d", "radii", "boxes")
@@ -37,25 +37,25 @@ VIEW_GRADIENT = {
 
 
 def projection_of(arrays: Arrays) -> Projection:
-    """Projection of the arrays of these names."""
+    """Return the projection made of the arrays with its fields' names."""
     return Projection(*(arrays[name] for name in PROJECTION))
 
 
 def grid_of(arrays: Arrays, tile_size: tuple[int, int]) -> TileGrid:
-    """Tiles of any size over the image."""
+    """Return the grid of tiles of any size over the image."""
     width, height = map(int, arrays["image_size"])
     return TileGrid(width, height, *tile_size)
 
 
 def reference_bins(arrays: Arrays, conventions: Conventions, tile_size: tuple[int, int]) -> TileBins:
-    """Tile lists that the reference makes of a projection, on tiles of any size."""
+    """Return the tile lists that the reference makes from a projection, for tiles of any size."""
     return REFERENCE.bin_gaussians(projection_of(arrays), grid_of(arrays, tile_size), conventions)
 
 
 def run_stages(
     backend: Backend, scene: Golden, dtype: str, fed: Arrays | None = None, without: Collection[str] = ()
 ) -> Arrays:
-    """Outputs and gradients of every stage.
+    """Return the outputs and gradients of every stage.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def _loss(backend: Backend, take: Take) -> Arrays:
 
 
 def _features(backend: Backend, take: Take, projection: Projection, bins: TileBins, c: Conventions) -> Arrays:
-    """Features and, as one channel more over black, depths."""
+    """Return features and depths, the latter as one more channel over black."""
     channels = np.column_stack([take("features"), projection.depths])
     background = np.append(take("feature_background"), channels.dtype.type(0))
     blending = (projection, channels, background, bins, c)
@@ -162,7 +162,7 @@ def _features(backend: Backend, take: Take, projection: Projection, bins: TileBi
 
 def _statistics(backend: Backend, blending: tuple[Projection, Floats, Floats, TileBins, Conventions]) -> Arrays:
     output = backend.composite(*blending, with_stats=True, with_median_depth=True)
-    assert output.stats is not None and output.median_depth is not None  # they were asked for
+    assert output.stats is not None and output.median_depth is not None  # they were requested
     return {**dict(zip(STATISTICS, output.stats, strict=True)), "median_depth": output.median_depth}
 
 

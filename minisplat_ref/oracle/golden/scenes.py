@@ -1,8 +1,8 @@
-"""The scenes of the golden vectors: how their inputs are drawn, and all their arrays by the reference.
+"""The scenes of the golden vectors: how their inputs are drawn, and all their arrays, computed by the reference.
 
 The scenes are small, random, and each has one thing that renderers get wrong. Their numbers are rounded to float32, so
-that float32 and float64 renderers are given the same problem; only the rotation is not, which would no longer be one.
-Two scenes are exact: placed by hand, with values that equal a threshold in binary.
+that float32 and float64 renderers get the same problem; only the rotation is not rounded, or it would be none. Two
+scenes are exact: placed by hand, with values that equal a threshold in binary.
 """
 
 from typing import NamedTuple
@@ -37,7 +37,7 @@ class Recipe(NamedTuple):
 
 
 def _with_round_thresholds(conventions: Conventions, name: str) -> Conventions:
-    """Return conventions whose thresholds a float holds, and which opacities and products of them reach."""
+    """Return conventions whose thresholds are exact in binary and equal to reachable opacities and products."""
     return conventions._replace(
         name=name, near_plane=2.0**-2, far_plane=8.0, alpha_min=2.0**-8, alpha_max=0.75, transmittance_min=2.0**-3
     )
@@ -113,7 +113,7 @@ ADAM_SHAPE = (24, 3)
 
 
 def inputs(recipe: Recipe, seed: int = 0) -> Golden:
-    """Scene of a recipe with its inputs.
+    """Return the scene of a recipe with its inputs.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def inputs(recipe: Recipe, seed: int = 0) -> Golden:
 
 
 def _scattered(recipe: Recipe, rng: np.random.Generator) -> Arrays:
-    """Gaussians anywhere in the view; those behind the camera would be seen if their depth had the other sign."""
+    """Scatter Gaussians over the view; those behind the camera would be seen if their depth had the other sign."""
     size, center, n = np.array(recipe.size), np.multiply(recipe.size, recipe.principal_point), recipe.n
     R = rotation_matrices(np.array([[1.0, 0.21, -0.34, 0.13]]))[0]
     t = np.array([0.25, -0.5, 0.75])
@@ -179,10 +179,10 @@ def _scattered(recipe: Recipe, rng: np.random.Generator) -> Arrays:
 
 
 def _at_thresholds(recipe: Recipe, rng: np.random.Generator) -> Arrays:
-    """Piles of Gaussians on the centres of five pixels, where their alphas are their opacities, in whole 256ths.
+    """Stack Gaussians on the centres of five pixels, where their alphas are their opacities, multiples of 1/256.
 
-    The camera looks along z from a place in whole eighths; all depths that matter are powers of two, so that a
-    projection rounds nothing. The piles are so far apart that none reaches the middle of another.
+    The camera looks along z from a position in multiples of 1/8; all depths that matter are powers of two, so that the
+    projection rounds nothing. The stacks are so far apart that none reaches the centre of another.
     """
     near, far, least = recipe.conventions.near_plane, recipe.conventions.far_plane, recipe.conventions.alpha_min
     rows = np.array(
@@ -210,7 +210,7 @@ def _at_thresholds(recipe: Recipe, rng: np.random.Generator) -> Arrays:
 
 
 def _adam_inputs(rng: np.random.Generator) -> Arrays:
-    """Gradients from 1e-6 to 1, on either side of eps, and rows that never had one."""
+    """Draw gradients from 1e-6 to 1, on either side of eps, and rows that never had one."""
     had = rng.uniform(size=(ADAM_SHAPE[0], 1)) < 0.8
     size = 10 ** rng.uniform(-6, 0, ADAM_SHAPE) * had
     return {
@@ -223,15 +223,15 @@ def _adam_inputs(rng: np.random.Generator) -> Arrays:
 
 
 def truth(scene: Golden, *, seed: int = 0, zeros: tuple[str, ...] = ()) -> Golden:
-    """Scene with all arrays, by the reference in float64.
+    """Return the scene with all arrays, computed by the reference in float64.
 
     Parameters
     ----------
     scene : Golden
         With its inputs.
     seed : int
-        Of the cotangents. They are 0 at the pixels whose hits rounding decides, and at Gaussians that are culled: no
-        gradient is to depend on those.
+        Of the cotangents. They are 0 at pixels whose hits rounding decides, and at culled Gaussians, because no
+        gradient should depend on those.
     zeros : tuple of str
         Cotangents that are zero throughout, for a renderer that cannot take them.
 
@@ -266,7 +266,7 @@ def truth(scene: Golden, *, seed: int = 0, zeros: tuple[str, ...] = ()) -> Golde
 
 
 def _view_by_stages(scene: Golden) -> Arrays:
-    """Make the view of stages that are known, and not by the public call, which is compared with it.
+    """Compute the view from stages that are known, not with the public call, which is compared with it.
 
     ::
 
@@ -315,7 +315,7 @@ def _view_by_stages(scene: Golden) -> Arrays:
 
 
 def _adam_by_the_book(a: Arrays) -> Arrays:
-    """Adam as algorithm 1 of its paper states it, with the corrections where they stand there."""
+    """Do a step of Adam as algorithm 1 of its paper states it, with its bias corrections."""
     rate, beta1, beta2, eps, step = a["adam_settings"]
     m = beta1 * a["adam_first"] + (1 - beta1) * a["adam_gradient"]
     v = beta2 * a["adam_second"] + (1 - beta2) * a["adam_gradient"] ** 2
@@ -330,5 +330,5 @@ def _adam_by_the_book(a: Arrays) -> Arrays:
 
 
 def golden_scenes() -> dict[str, Golden]:
-    """All scenes with all arrays, by name."""
+    """Return all scenes with all arrays, by name."""
     return {recipe.name: truth(inputs(recipe)) for recipe in RECIPES}

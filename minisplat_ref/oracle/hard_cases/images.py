@@ -1,4 +1,4 @@
-"""Hard cases of pictures: images of one pixel or of nothing, extreme colours, losses that divide 0 by nearly 0."""
+"""Hard cases of images: one pixel or nothing in view, extreme colours, losses that divide 0 by nearly 0."""
 
 import numpy as np
 

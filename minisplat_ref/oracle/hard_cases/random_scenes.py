@@ -1,8 +1,8 @@
-"""Random scenes of many kinds, each at three sizes: what the hand-made cases leave between them.
+"""Random scenes of many kinds, each at three sizes, to cover the space between the hand-made cases.
 
-A hand-made case puts one thing where it hurts. Here every number of a kind is drawn at random, many Gaussians overlap,
-and tiles, lists and sums are as long as in small trainings; each kind is drawn as a few Gaussians in a thumbnail, as
-some, and as many in several tiles, of which none divides the image.
+A hand-made case tests one thing at its hardest. Here every number of a kind is random, many Gaussians overlap, and
+tiles, lists and sums are as long as in small trainings. Each kind is drawn at three sizes: a few Gaussians in a
+thumbnail, some, and many in several tiles whose size does not divide the image's.
 """
 
 import zlib
@@ -23,7 +23,7 @@ ALPHA_MIN = 1 / 256  # near enough to 1/255, and a number of both precisions
 
 
 class Draw(NamedTuple):
-    """What a kind is drawn with."""
+    """The parameters of a random scene."""
 
     rng: np.random.Generator
     n: int
@@ -211,7 +211,7 @@ def _quaternions(d: Draw) -> Subject:
 
 
 def _turns(d: Draw) -> Subject:
-    """Axes on the world's axes, or nearly, and equal scales: where a rotation's derivatives vanish."""
+    """Draw axes on the world's axes, or nearly, and equal scales, where a rotation's derivatives vanish."""
     quats = np.eye(4)[d.rng.integers(0, 4, d.n)] + d.rng.choice([0, 1e-20, 1e-7], (d.n, 1)) * d.rng.normal(
         size=(d.n, 4)
     )

@@ -1,9 +1,9 @@
-"""Each hard case through every precision, forward and backward, against the reference in float64.
+"""Run each hard case in every precision, forward and backward, and compare it with the reference in float64.
 
-Verdict of a case: refused with the message that it expects, in every precision; or all outputs and all gradients finite
-and as near to the reference as its tolerance says. Derivatives by the outputs are random, fixed and the same in all
-precisions, and zero at pixels that stand on a threshold: see :mod:`minisplat_ref.oracle.thresholds`. The summary has a
-line for each kind: how many cases, how many are refused, and how far the worst is from the reference.
+A case passes if every precision refuses it with the expected message; or if all outputs and all gradients are finite
+and within its tolerance of the reference. Derivatives with respect to the outputs are random, fixed and the same in all
+precisions, and zero at pixels on a threshold: see :mod:`minisplat_ref.oracle.thresholds`. The summary has a line for
+each kind: how many cases, how many are refused, and how far the worst is from the reference.
 """
 
 import fnmatch
@@ -39,7 +39,7 @@ PRECISIONS = (
 
 
 class Outcome(NamedTuple):
-    """What one precision made of a case."""
+    """The results of one precision for a case."""
 
     outputs: Arrays
     gradients: Arrays
@@ -68,7 +68,7 @@ def run_hard_cases(cases: Sequence[HardCase], precisions: Sequence[Precision] = 
 
 
 def matching(cases: Sequence[HardCase], pattern: str) -> tuple[HardCase, ...]:
-    """Return the cases whose name holds the pattern, in which ``*`` and ``?`` are wildcards.
+    """Return the cases whose name contains the pattern, in which ``*`` and ``?`` are wildcards.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def run_hard_case(case: HardCase, precisions: Sequence[Precision] = PRECISIONS) 
 
 
 def _refusal(case: HardCase, refusal: str, subject: Subject, precisions: Sequence[Precision]) -> Case:
-    """Check that the reference and every precision refuse the subject, in one line that holds what it should."""
+    """Check that the reference and every precision refuse the subject, in one line with the expected text."""
     for precision in (Precision("reference", REFERENCE, np.float64), *precisions):
         try:
             drawing(subject, precision.backend, np.dtype(precision.dtype))
@@ -153,7 +153,7 @@ def _outcome(drawn: Drawing, cotangents: Arrays, dtype: type) -> Outcome:
 
 
 def _cotangents(name: str, scale: float, drawn: Drawing, at_threshold: Bools | None) -> Arrays:
-    """Random derivatives that float32 holds, the same in every precision and every run."""
+    """Return random derivatives that are exact in float32, the same in every precision and every run."""
     rng = np.random.default_rng(zlib.crc32(name.encode()))
     cotangents: Arrays = {}
     for key in drawn.differentiable:
@@ -165,7 +165,7 @@ def _cotangents(name: str, scale: float, drawn: Drawing, at_threshold: Bools | N
 
 
 def _problems_of_reference(case: HardCase, expected: Outcome) -> list[str]:
-    """What is wrong with the reference itself, or with a case that checks nothing."""
+    """Return what is wrong with the reference itself, or that the case checks nothing."""
     if (name := _not_finite(expected)) is not None:
         return [f"reference: {name} is not finite"]
     moved = [key for key, v in expected.gradients.items() if "background" not in key and v.any()]
@@ -186,7 +186,7 @@ def _size(outputs: Arrays) -> float:
 
 
 def _image_error(actual: Arrays, expected: Arrays, at_threshold: Bools | None) -> tuple[float, np.ndarray]:
-    """Largest error of the outputs off the thresholds, each relative to its size, and the errors on them [P]."""
+    """Return the outputs' largest error away from thresholds, relative to their sizes, and the errors at them [P]."""
     worst, on_threshold = 0.0, np.zeros(0 if at_threshold is None else at_threshold.sum())
     for name, value in expected.items():
         with np.errstate(invalid="ignore"):
@@ -201,7 +201,7 @@ def _image_error(actual: Arrays, expected: Arrays, at_threshold: Bools | None) -
 
 
 def _gradient_error(actual: Arrays, expected: Arrays, least: float) -> tuple[str, float]:
-    """Block with the largest relative L2 error, and that error."""
+    """Return the block with the largest relative L2 error, and that error."""
     norms = {key: float(np.linalg.norm(value)) for key, value in expected.items()}
     present = [norm for norm in norms.values() if norm > 0]
     floor = max(least, BLOCK_FLOOR * float(np.median(present)) if present else 0.0)

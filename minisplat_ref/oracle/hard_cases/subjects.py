@@ -1,9 +1,8 @@
-"""What a hard case is, and how what it draws goes through the public boundary and back.
+"""Hard cases and their subjects: what is drawn, through the public functions, forward and backward.
 
-A subject holds float64 arrays whose numbers float32 holds too, so that every precision is given the same scene. What is
-refused is refused where users' input is: by :func:`check_gaussians`, with which every reader of a file ends, and by the
-checks of :func:`rasterization`. A case adds why the subject is hard, what is right, and how near a precision has to
-come.
+A subject has float64 arrays whose numbers are exact in float32, so that every precision gets the same scene. Bad input
+is refused where users' input is: by :func:`check_gaussians`, which every file reader calls last, and by the checks of
+:func:`rasterization`. A case adds why the subject is hard, the correct behaviour, and the tolerance of each precision.
 """
 
 from collections.abc import Callable
@@ -58,7 +57,7 @@ class Pictures(NamedTuple):
 
 
 class Surface(NamedTuple):
-    """Gaussians whose surface points are asked for: the stage that depth reinitialisation uses."""
+    """Gaussians whose surface points are computed: the stage that depth reinitialisation uses."""
 
     gaussians: Gaussians
     camera: Camera
@@ -88,15 +87,15 @@ class HardCase(NamedTuple):
 
 
 class Drawing(NamedTuple):
-    """What a precision made of a subject."""
+    """The rendering of a subject in one precision."""
 
     outputs: Arrays
     """By name; the first two axes of those that a pixel has are its row and column."""
     vjp: Callable[[Arrays], Arrays]
-    """From derivatives by the differentiable outputs to gradients by block."""
+    """Maps derivatives with respect to the differentiable outputs to gradients, by name of the block."""
     differentiable: tuple[str, ...]
     gradient_size: float = 0.0
-    """Norm of an ordinary gradient, where that of a subject may be nothing but rounding."""
+    """Norm of an ordinary gradient, for subjects whose own may be nothing but rounding."""
 
 
 def cast(bundle: Any, dtype: np.dtype) -> Any:
@@ -133,7 +132,7 @@ def drawing(subject: Subject, backend: Backend, dtype: np.dtype) -> Drawing:
 
 
 def splat_tapes(subject: Subject, backend: Backend) -> list[SplatTape]:
-    """Return what was splatted in float64, view by view, to look for pixels at thresholds; nothing of a loss."""
+    """Return the float64 tapes view by view, to look for pixels at thresholds; none for a loss."""
     if isinstance(subject, Parameters):
         _, tape = render(
             subject.gaussians,
@@ -187,7 +186,7 @@ def _draw_parameters(subject: Parameters, backend: Backend, dtype: np.dtype) -> 
 
 
 def _by_opacity(logits: Floats, v_logits: Floats) -> Floats:
-    """Divide gradients by the logits' o (1 - o): near the ends they are too small to be judged beside other blocks."""
+    """Divide gradients by the logits' o (1 - o), without which they are too small near the ends to be compared."""
     small = np.exp(-np.abs(logits))  # float64, all digits
     slopes = small / (1 + small) ** 2
     return np.where(slopes > LEAST_SLOPE, v_logits / np.maximum(slopes, LEAST_SLOPE), 0)

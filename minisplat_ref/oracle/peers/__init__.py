@@ -1,1 +1,1 @@
-"""Renderers of others, called through their own functions: ``gsplat_torch`` on the CPU, ``cuda`` on a GPU."""
+"""Other renderers, called through their own functions: ``gsplat_torch`` on the CPU, ``cuda`` on a GPU."""

@@ -1,9 +1,9 @@
 """Renderers on a GPU: gsplat's kernels, one by one, and the rasteriser of 3DGS, which is one call.
 
-gsplat 1.5 and 1.6: each kernel is fed with the reference's own input. Left out: its rendering of batches, packed
-projection, and the loss, which gsplat leaves to others.
+gsplat 1.5 and 1.6: each kernel gets the reference's input. Left out: its rendering of batches, packed projection, and
+the loss, which gsplat does not have.
 
-``diff_gaussian_rasterization``: whatever its one call gives, end to end; no footprints, lists, alpha or pose gradients.
+``diff_gaussian_rasterization``: the results of its one call, end to end; no footprints, lists, alpha or pose gradients.
 Its gradient with respect to the projected centres is in normalised device coordinates, in which an image is two wide;
 here it is per pixel.
 """
@@ -55,7 +55,7 @@ def from_functions(functions: ModuleType, name: str, profile: Conventions, devic
     name : str
         For reports.
     profile : Conventions
-        What this version does.
+        The conventions of this version.
     device : str
         Where the functions compute.
     """
@@ -123,7 +123,7 @@ def _project(scene: _Scene) -> Arrays:
         opacities=opacities.detach(),
     )
     opacities2d = opacities * (compensations[0] if c.is_antialiased else 1)
-    is_shown = (radii[0] > 0).all(dim=1)  # the rows of culled Gaussians hold whatever was there before
+    is_shown = (radii[0] > 0).all(dim=1)  # the rows of culled Gaussians are uninitialised
     fields = {"means2d": means2d[0], "depths": depths[0], "conics": conics[0], "opacities2d": opacities2d}
     fields = {name: torch.where(is_shown.view(-1, *(1,) * (x.dim() - 1)), x, 0) for name, x in fields.items()}
     gradients = _gradients([(x, scene.tensor(f"v_{name}")) for name, x in fields.items()], leaves)
@@ -186,7 +186,7 @@ def _tiles(scene: _Scene) -> tuple[int, int]:
 
 
 def _gradients(pairs: list[tuple[Tensor, Tensor]], leaves: list[Tensor]) -> list[Floats]:
-    """Gradients of the sum of output times cotangent."""
+    """Return the gradients of the sum of output times cotangent."""
     import torch
 
     return [_numpy(v) for v in torch.autograd.grad(sum((x * v).sum() for x, v in pairs), leaves)]
@@ -269,7 +269,7 @@ def _arrays(rasterizer: ModuleType, truth: Golden, device: str) -> Arrays:
     }
     fields = rasterizer.GaussianRasterizationSettings._fields
     settings |= {name: False for name in fields if name not in settings}  # switches of later versions
-    centers = torch.zeros(len(a["means"]), 3, device=device, requires_grad=True)  # its gradient is by the 2D means
+    centers = torch.zeros(len(a["means"]), 3, device=device, requires_grad=True)  # its gradient is that of the 2D means
     image, radii, *_ = rasterizer.GaussianRasterizer(rasterizer.GaussianRasterizationSettings(**settings))(
         means3D=leaves["means"],
         means2D=centers,

@@ -1,9 +1,9 @@
 """gsplat 1.5.3's functions in plain PyTorch as a backend: NumPy in, NumPy out, gradients by autograd.
 
-gsplat keeps a second statement of its CUDA kernels for its own tests. The file with them is loaded by itself, because
-importing the package looks for CUDA. Everything that is compared is computed there: covariances, projection, conics,
-radii, tile lists, spherical harmonics, alpha and the sums over hits. Four things are ours, since gsplat has them in
-CUDA only or takes them from a package that does:
+gsplat has a second implementation of its CUDA kernels for its own tests. That file is loaded alone, because importing
+the package looks for CUDA. It computes everything that is compared: covariances, projection, conics, radii, tile lists,
+spherical harmonics, alpha and the sums over hits. Four things are ours, since gsplat has them in CUDA only or takes
+them from a package that does:
 
 * which hits a pixel blends, from the reference's thresholds at gsplat's values (no gradient goes through it);
 * the weights ``alpha_g prod (1 - alpha_j)`` of a pixel's hits, in four lines of torch;
@@ -53,7 +53,7 @@ Tensor = Any
 
 @functools.cache
 def load() -> tuple[ModuleType, ModuleType]:
-    """Torch, and gsplat's file of functions.
+    """Return torch and gsplat's module of functions.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def gsplat_torch() -> Backend:
 def project(
     means: Floats, quats: Floats, scales: Floats, opacities: Floats, camera: Camera, conventions: Conventions
 ) -> Projection:
-    """``_quat_scale_to_covar_preci`` and ``_fully_fused_projection``."""
+    """Call ``_quat_scale_to_covar_preci`` and ``_fully_fused_projection``."""
     leaves = [_tensor(x) for x in (means, quats, scales, opacities, *_pose(camera, means))]
     radii, *fields = _project(camera, conventions, *leaves)
     radii = radii.numpy().astype(np.int32)
@@ -133,7 +133,7 @@ def project_vjp(
 
 
 def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int, radii: Ints) -> Floats:
-    """``_spherical_harmonics``."""
+    """Call ``_spherical_harmonics``."""
     leaves = [_tensor(x) for x in (means, sh_dc, sh_rest, *_pose(camera, means))]
     return np.where(radii[:, :1] > 0, _colors(degree, *leaves)[0].numpy(), 0)
 
@@ -148,7 +148,7 @@ def sh_colors_vjp(
 
 
 def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventions) -> TileBins:
-    """``_isect_tiles`` and ``_isect_offset_encode``; sorted by the depth in float32."""
+    """Call ``_isect_tiles`` and ``_isect_offset_encode``; the lists are sorted by the depth in float32."""
     torch, gsplat = load()
     with torch.no_grad():
         means2d, radii = _tensor(projection.means2d)[None], _tensor(projection.radii)[None]
@@ -174,7 +174,7 @@ def composite(
     with_stats: bool = False,
     with_median_depth: bool = False,
 ) -> RenderOutput:
-    """``accumulate`` over the hits that its thresholds let through; statistics and median depth it does not have."""
+    """Call ``accumulate`` for the hits that pass its thresholds; it has no statistics and no median depth."""
     if with_stats or with_median_depth:
         raise InputError("gsplat's torch functions have no blend statistics and no median depth")
     leaves = [_tensor(x) for x in (projection.means2d, projection.conics, projection.opacities, colors, background)]
@@ -267,7 +267,7 @@ def _composite(
 
 
 def _hits(projection: Projection, bins: TileBins, conventions: Conventions) -> tuple[Tensor, Tensor]:
-    """Pixel [M] and Gaussian [M] of every blended hit, pixel by pixel and front to back."""
+    """Return pixel [M] and Gaussian [M] of every blended hit, pixel by pixel and front to back."""
     torch, _ = load()
     pixels, ids = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for tile in tile_hits(projection, bins, conventions):
@@ -278,7 +278,7 @@ def _hits(projection: Projection, bins: TileBins, conventions: Conventions) -> t
 
 
 def _weights(alphas: Tensor, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, Tensor]:
-    """Weight and transmittance of each hit: hits as a table with a row for each pixel, and running products."""
+    """Return weight and transmittance of each hit, as running products over a table with a row for each pixel."""
     torch, _ = load()
     is_first = torch.ones_like(ray_indices, dtype=torch.bool)
     is_first[1:] = ray_indices[1:] != ray_indices[:-1]
@@ -299,7 +299,7 @@ def _sums(weights: Tensor, values: Tensor | None, ray_indices: Tensor, n_rays: i
 def _autograd(
     function: Callable[..., tuple[Tensor, ...]], inputs: tuple[Floats, ...], cotangents: Any
 ) -> tuple[Floats, ...]:
-    """Gradients by all inputs; zeros by those that do not count."""
+    """Return the gradients with respect to all inputs, zeros for those without effect."""
     torch, _ = load()
     leaves = [_tensor(x).requires_grad_() for x in inputs]
     pairs = [(out, _tensor(v)) for out, v in zip(function(*leaves), cotangents, strict=True) if out.requires_grad]

@@ -1,10 +1,10 @@
-"""How far the processor would let it go: the blending kernels against straight-line loops.
+"""The processor's limit: compare the blending kernels with straight-line loops.
 
-The straight-line loops do the arithmetic of one hit on all pixels of a tile, over and over on the same numbers: no
-lists, no sorting, nothing fetched from memory, nothing to find out. A kernel that took no longer per pair would be
-perfect. They run on as many threads as the kernels, one copy on each: cores that share their clock or their arithmetic
-with each other, or with somebody else, slow down both. A *pair* is a Gaussian and a pixel in one of the rows of eight
-that a kernel computes for it: those that the visible ellipse reaches and that are not finished.
+The straight-line loops do the arithmetic of one hit on all pixels of a tile, over and over on the same numbers: without
+lists, sorting, memory accesses or branches. A kernel that took no longer per pair would be perfect. They run on as many
+threads as the kernels, one copy on each, because cores that share a clock or execution units with each other, or with
+other programs, slow down both. A *pair* is a Gaussian and a pixel in one of the rows of eight that a kernel computes
+for it: those that the visible ellipse reaches and that are not finished.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.bench.by_turns import Contest, Times
+from minisplat_ref.bench.interleaving import Contest, Times
 from minisplat_ref.bench.limits import in_ms
 from minisplat_ref.bench.workloads import Workload
 from minisplat_ref.constants import GSPLAT_MAIN
@@ -41,7 +41,7 @@ from minisplat_ref.cpu.compositing.tile_state import (
 )
 from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
 from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
-from minisplat_ref.jit.lanes import WIDTH, filled, load, select, store, sum_of
+from minisplat_ref.jit.lanes import WIDTH, broadcast, load, reduce_sum, select, store
 from minisplat_ref.jit.literals import ZERO
 from minisplat_ref.oracle.cases import Case, Figure
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_GRADIENT, BENCH_FLOAT32_IMAGE
@@ -49,13 +49,13 @@ from minisplat_ref.rendering import render
 from minisplat_ref.scalar.compositing import blend, conic_vjp_of_moments, factors, sigma_vjp
 from minisplat_ref.types import CompositeGradient, Floats, Gaussians, Projection, TileBins, TileGrid
 
-N_HITS = 100  # of opacity 0.005: transmittance 0.6 is left, so that none of them stops
+N_HITS = 100  # of opacity 0.005: they leave transmittance 0.6, so that no pixel is finished
 N_PASSES = 50
 N_SUMS = 9
 SUMS_SIZE = 16  # so that no two copies write to the same cache line
 N_COLORS = 3
 DRAWN_FIELDS = 1 + N_COLORS  # of a pixel: transmittance, colours
-SHADED_FIELDS = 2 + N_COLORS  # transmittance, what lies behind, v
+SHADED_FIELDS = 2 + N_COLORS  # of a pixel: transmittance, part behind the hit, v
 
 
 class Hit(NamedTuple):
@@ -103,7 +103,7 @@ def _forward_lines(drawn, hit, frame, n_hits, n_passes):  # type: ignore[no-unty
 def _backward_line(fresh, hit, frame, sums, n_hits, n_passes):  # type: ignore[no-untyped-def]
     state, scratch = np.empty(fresh.size, fresh.dtype), np.empty(SCRATCH_SIZE, fresh.dtype)
     start_scratch(scratch)
-    zero = filled(ZERO * hit.x)
+    zero = broadcast(ZERO * hit.x)
     for _ in range(n_passes):
         state[:] = fresh
         sums[:] = ZERO
@@ -138,7 +138,7 @@ def _backward_line(fresh, hit, frame, sums, n_hits, n_passes):  # type: ignore[n
                 qyy = qyy + q_shape * dy * dy
             parts = (q_sum, qe, qy, qee, qey, qyy, v_red, v_green, v_blue)
             for j in range(N_SUMS):
-                sums[j] += sum_of(parts[j])
+                sums[j] += reduce_sum(parts[j])
 
 
 @kernel()
@@ -152,7 +152,7 @@ _write_alphas = alpha_writer(exp_fast)
 
 @kernel(parallel=False)
 def _count_rows(records, ids, tile_offsets, frame):  # type: ignore[no-untyped-def]
-    """Take the kernels' steps with nothing but the transmittance."""
+    """Count the rows that the kernels compute, by updating only the transmittance."""
     state, scratch = np.empty(N_ROWS * WIDTH, records.dtype), np.empty(SCRATCH_SIZE, records.dtype)
     start_scratch(scratch)
     total = 0
@@ -181,12 +181,12 @@ def rows_worked_on(projection: Projection, channels: Floats, bins: TileBins) -> 
 
 
 def blending(workload: Workload) -> Contest:
-    """Return the contest of the blending kernels in float32 on a workload with the straight-line loops.
+    """Return the contest between the blending kernels, in float32 on a workload, and the straight-line loops.
 
     Returns
     -------
     Contest
-        Forward and backward. A case fails if its straight-line loop does not give what the reference gives.
+        Forward and backward. A case fails if its straight-line loop does not reproduce the reference.
     """
     gaussians = Gaussians._make(field.astype(np.float32) for field in workload.gaussians)
     output, tape = render(gaussians, workload.camera, with_stats=True)
@@ -281,7 +281,7 @@ class StraightLines:
         return max(float(np.linalg.norm(a - b) / np.linalg.norm(b)) for a, b in pairs)
 
     def _gradient(self, sums: Floats) -> tuple[Any, ...]:
-        """Gradient by centre, conic, opacity and colour."""
+        """Return the gradient with respect to centre, conic, opacity and colour."""
         q, qe, qy, *second = sums[:6]
         a, slope, pivot = 2 * self.hit.half_a, self.hit.slope, 2 * self.hit.half_pivot
         return (
@@ -293,6 +293,6 @@ class StraightLines:
 
 
 def _by_rows(image: Floats) -> Floats:
-    """Image [TILE_HEIGHT, TILE_WIDTH, D] of one tile as its rows of eight pixels [N_ROWS, D, WIDTH]."""
+    """Rearrange one tile's image [TILE_HEIGHT, TILE_WIDTH, D] to its rows of eight pixels [N_ROWS, D, WIDTH]."""
     strips = image.reshape(TILE_HEIGHT, -1, WIDTH, image.shape[2])
     return np.ascontiguousarray(strips.transpose(1, 0, 3, 2).reshape(N_ROWS, image.shape[2], WIDTH))

@@ -1,9 +1,8 @@
-"""Times of tasks that take turns, again and again through a whole measurement.
+"""Interleaved timing: tasks that are compared run alternately throughout a measurement.
 
-A shared machine is disturbed for seconds at a time: what else it does makes a thread slower, and lets a second one
-bring less. Tasks timed one after the other would each meet another machine. So those that are to be compared
-alternate, and all have their turns in every round. The least time is that of a free machine, the median what to expect
-of this one.
+A shared machine is disturbed for seconds at a time: other work slows a thread down, and makes a second thread gain
+less. Tasks timed one after the other would each run under other conditions. So tasks that are compared alternate, and
+all run in every round. The least time is that of an idle machine, the median what to expect of this one.
 """
 
 import statistics
@@ -30,29 +29,29 @@ class Contest(NamedTuple):
 
     tasks: tuple[Task, ...]
     judge: Callable[[Sequence[Times]], list[Case]]
-    """Makes the cases of the times, one of each task."""
+    """Makes the cases from the times, one for each task."""
 
 
 def seconds_of(task: Task) -> float:
-    """Return how long a task takes, once."""
+    """Run a task once and return the seconds that it took."""
     start = time.perf_counter()
     task()
     return time.perf_counter() - start
 
 
-def times_by_turns(groups: Sequence[Sequence[Task]], rounds: int, repeats: int) -> list[list[Times]]:
-    """Time tasks; those of a group alternate.
+def interleaved_times(groups: Sequence[Sequence[Task]], rounds: int, repeats: int) -> list[list[Times]]:
+    """Time tasks; those in a group alternate.
 
     Parameters
     ----------
     groups : sequence of sequences of callables
     rounds, repeats : int
-        In each round, each group has ``repeats`` turns. A turn before the first compiles and is not timed.
+        Each group runs ``repeats`` times in each round. A run before the first compiles and is not timed.
 
     Returns
     -------
     list of list of Times
-        One of each task.
+        One for each task.
     """
     seconds: list[list[list[float]]] = [[[] for _ in tasks] for tasks in groups]
     for task in (task for tasks in groups for task in tasks):
@@ -65,7 +64,7 @@ def times_by_turns(groups: Sequence[Sequence[Task]], rounds: int, repeats: int) 
     return [[Times(min(own), statistics.median(own)) for own in of_group] for of_group in seconds]
 
 
-def hold(contests: Sequence[Contest], repeats: int) -> list[Case]:
-    """Let all tasks take turns for ``ROUNDS`` rounds; return the cases of all contests, in their order."""
-    times = times_by_turns([contest.tasks for contest in contests], ROUNDS, repeats)
+def time_contests(contests: Sequence[Contest], repeats: int) -> list[Case]:
+    """Time all tasks in ``ROUNDS`` rounds; return the cases of all contests, in their order."""
+    times = interleaved_times([contest.tasks for contest in contests], ROUNDS, repeats)
     return [case for contest, own in zip(contests, times, strict=True) for case in contest.judge(own)]

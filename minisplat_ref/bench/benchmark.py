@@ -1,7 +1,7 @@
-"""Times and errors in one run: who is wrong gets no time, and all others take turns.
+"""Times and errors in one run: contenders that are wrong are not timed, all others are timed alternately.
 
-The machine's other work and its clock change from minute to minute. So every round gives each contender one turn, and
-what is reported is the median and the least of its turns; a ratio of two of them is worth more than either.
+The machine's other work and its clock rate change from minute to minute. So every round runs each contender once, and
+the report has the median and the least of its times; their ratios are more reliable than the times themselves.
 """
 
 import time
@@ -17,12 +17,12 @@ from minisplat_ref.bench.workloads import Workload
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.oracle.cases import Case, Figure
 
-SLOW_SECONDS = 4.0  # a contender that takes longer a turn gets only one: it would heat the machine for the others
+SLOW_SECONDS = 4.0  # a contender that takes longer runs only once: it would heat the machine for the others
 MILLI = 1e3
 
 
 class Times(NamedTuple):
-    """Turns of one contender, seconds."""
+    """Times of one contender, seconds."""
 
     forward: list[float]
     """From parameters to image."""
@@ -31,7 +31,7 @@ class Times(NamedTuple):
 
     @property
     def both(self) -> list[float]:
-        """Forward and backward of each turn together."""
+        """Return the sum of forward and backward for each run."""
         return [a + b for a, b in zip(self.forward, self.backward, strict=True)]
 
 
@@ -40,14 +40,14 @@ class Entry(NamedTuple):
 
     contender: Contender
     verdict: Verdict
-    """Errors against the default's cut-off."""
+    """Errors against the reference with the default cut-off."""
     failure: str
-    """Why it is wrong, empty where it is right."""
+    """Why it is wrong, empty if it is right."""
     times: Times
-    """Empty where it is wrong."""
+    """Empty if it is wrong."""
 
 
-def race(
+def benchmark(
     workload: Workload, contenders: Iterable[Contender], repeats: int, report: Callable[[str], None] = lambda _: None
 ) -> list[Case]:
     """Judge every contender and time those that are right.
@@ -56,11 +56,11 @@ def race(
     ----------
     workload : Workload
     contenders : iterable of Contender
-        The reference is judged by nobody and timed once, while it gives the answer.
+        The reference is not judged, and timed once, while it computes the expected answer.
     repeats : int
-        Turns of each.
+        Runs of each.
     report : callable
-        Called with a line on what is being done.
+        Called with a line about the progress.
 
     Returns
     -------
@@ -83,7 +83,7 @@ def race(
         report(f"{workload.name}: round {round_ + 1} of {repeats}")
         for entry in entries:
             if not entry.failure and entry.contender.name != REFERENCE_NAME:
-                _take_turn(entry, workload)
+                _time_once(entry, workload)
     baseline = next((entry for entry in entries if entry.contender.name == BASELINE_NAME), None)
     return [_case(workload, entry, baseline.times if baseline else Times([], [])) for entry in entries]
 
@@ -100,7 +100,7 @@ def _judged(contender: Contender, workload: Workload, expected: Expected, trust:
     return Entry(contender, verdict, wrong, Times([], []))
 
 
-def _take_turn(entry: Entry, workload: Workload) -> None:
+def _time_once(entry: Entry, workload: Workload) -> None:
     contender, times = entry.contender, entry.times
     if times.both and times.both[0] > SLOW_SECONDS:
         return
@@ -142,7 +142,7 @@ def _least(seconds: list[float]) -> float | None:
 
 
 def _ratio(baseline: list[float], own: list[float]) -> float | None:
-    """How many times faster than the baseline, by the least times."""
+    """Return how many times faster than the baseline it is, by the least times."""
     return min(baseline) / min(own) if baseline and own else None
 
 

@@ -1,0 +1,103 @@
+"""Hooks of MkDocs: pages that are made while the site is built, and links that lead out of ``docs/``.
+
+The README, CONTRIBUTING and the changelog are pages of the site, too. On a code host, a link to a file that is no page
+leads to that file; on the site it becomes the path of the file, or leads to the API page of its module.
+"""
+
+import os
+import posixpath
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mkdocs.config.defaults import MkDocsConfig
+    from mkdocs.structure.files import Files
+    from mkdocs.structure.pages import Page
+
+ROOT = Path(__file__).parents[1]
+FROM_ROOT = {"index.md": "README.md", "CONTRIBUTING.md": "CONTRIBUTING.md", "CHANGELOG.md": "CHANGELOG.md"}
+API = {
+    "types": ("Types and constants", ("minisplat_ref.types", "minisplat_ref.constants", "minisplat_ref.errors")),
+    "rendering": (
+        "Rendering",
+        ("minisplat_ref.rendering", "minisplat_ref.splatting", "minisplat_ref.backends", "minisplat_ref.stages"),
+    ),
+    "gsplat_compat": ("gsplat's call", ("minisplat_ref.gsplat_compat",)),
+    "reference": ("The reference", ("minisplat_ref.reference",)),
+    "strategy": ("Density control", ("minisplat_ref.strategy",)),
+    "training": ("Training", ("minisplat_ref.training",)),
+    "methods": ("Recipes", ("minisplat_ref.methods",)),
+    "metrics": ("Metrics", ("minisplat_ref.metrics", "minisplat_ref.lpips")),
+    "io": ("Files", ("minisplat_ref.io",)),
+    "extensions": ("Extensions", ("minisplat_ref.extensions.extension",)),
+}
+"""Pages of the API reference: title, and the packages whose docstrings stand there."""
+
+LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s#]+)(#[^)\s]*)?\)")
+
+
+def on_files(files: "Files", config: "MkDocsConfig") -> "Files":
+    """Add the pages that have no file in ``docs/``."""
+    from mkdocs.structure.files import File
+
+    for page, source in FROM_ROOT.items():
+        files.append(File.generated(config, page, content=(ROOT / source).read_text(encoding="utf-8")))
+    files.append(File.generated(config, "api/index.md", content=_public_names()))
+    for name, (title, modules) in API.items():
+        text = "\n\n".join([f"# {title}", *(f"::: {module}" for module in modules)])
+        files.append(File.generated(config, f"api/{name}.md", content=text))
+    return files
+
+
+def _public_names() -> str:
+    """Return the page of what ``import minisplat_ref as ms`` gives, each name with a link to where it is explained."""
+    import minisplat_ref
+
+    names = [
+        f"| [`ms.{name}`][{module}.{name}] | `{module}` |"
+        for module, names in minisplat_ref._MODULES.items()
+        for name in names
+    ]
+    introduction = (
+        "What `import minisplat_ref as ms` gives, and the module of each name. All else is reached by modules."
+    )
+    return "\n".join(["# The package", "", introduction, "", "| name | module |", "|---|---|", *names])
+
+
+def on_page_markdown(markdown: str, *, page: "Page", files: "Files", **_: Any) -> str:
+    """Let every link lead to a page of the site, or name the file of the repository that it leads to."""
+    uri = page.file.src_uri
+    in_repository = FROM_ROOT.get(uri, f"docs/{uri}")
+
+    def change(match: re.Match[str]) -> str:
+        is_image, text, target, anchor = match[1], match[2], match[3], match[4] or ""
+        if ":" in target:
+            return match[0]
+        path = posixpath.normpath(posixpath.join(posixpath.dirname(in_repository), target))
+        if not (ROOT / path).exists():
+            return match[0]  # MkDocs says that it is broken
+        for destination in _pages_of(path):
+            if files.get_file_from_path(destination) is not None:
+                relative = posixpath.relpath(destination, posixpath.dirname(uri) or ".")
+                return f"{is_image}[{text}]({relative}{anchor})"
+        name = text.strip("`").rstrip("/")
+        return f"`{path}`" if path.endswith(name) else f"{text} (`{path}`)"
+
+    return LINK.sub(change, markdown)
+
+
+def _pages_of(path: str) -> list[str]:
+    """Return where a file of the repository may stand on the site, the best place first."""
+    pages = [page for page, source in FROM_ROOT.items() if source == path]
+    if path.startswith("docs/"):
+        pages.append(path.removeprefix("docs/"))
+    if path == "docs/measured":
+        pages.append("measured/training.md")
+    module = os.path.splitext(path)[0].replace("/", ".")
+    pages += [f"api/{name}.md" for name, (_, modules) in API.items() if _is_below(module, modules)]
+    return pages
+
+
+def _is_below(module: str, packages: tuple[str, ...]) -> bool:
+    return any(module == package or module.startswith(f"{package}.") for package in packages)

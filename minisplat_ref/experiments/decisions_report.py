@@ -1,0 +1,138 @@
+"""What a training without a schedule has decided, for a page: a paragraph, figures with the evidence, and a table.
+
+Of the recipe ``adaptive`` (:mod:`minisplat_ref.training.pace`): at which iteration it did what, and why.
+"""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from minisplat_ref.experiments.page import curves, paragraph, section, table
+from minisplat_ref.experiments.plots import BLUE, GREY, RED, plot, to_svg
+from minisplat_ref.training.pace import Decision, Measurement, Pace
+
+COOLED = "cool down"
+DONE = {
+    COOLED: "the rates began to fall",
+    "exposures": "exposures were switched on",
+    "poses": "the refinement of poses was switched on",
+    "prune": "it pruned",
+}
+HEADING = ("decision", "iteration", "why", "gain (dB)", "std. error")
+PSNR = "PSNR of the held-out training views (dB)"
+FIGURES_TEXT = """\
+Thin lines are the held-out training views, the thick one is their mean, broken lines are decisions. The work is the
+number of pairs of a tile and a Gaussian, of all iterations so far."""
+SLOPE_TEXT = "The red line has the slope by which it was decided that little was left to gain."
+
+
+def decisions_section(pace: Pace, n_iterations: int) -> str:
+    """Return the part of a page that says what was decided.
+
+    Parameters
+    ----------
+    pace : Pace
+        Of the end of the run.
+    n_iterations : int
+        That the run has done.
+    """
+    parts = [paragraph(story(pace, n_iterations))]
+    if pace.measurements:
+        parts += [curves([to_svg(figure) for figure in (over_iterations(pace), over_work(pace))], 2)]
+        is_by_slope = any(_is_of_slope(decision) for decision in pace.decisions)
+        parts += [paragraph(f"{FIGURES_TEXT} {SLOPE_TEXT}" if is_by_slope else FIGURES_TEXT)]
+    if pace.decisions:
+        parts.append(table(map(_row, pace.decisions), HEADING))
+    return section("What was decided, and why", *parts)
+
+
+def story(pace: Pace, n_iterations: int) -> str:
+    """Return what was decided as sentences."""
+    n = len(pace.measurements)
+    sentences = []
+    if n:
+        first, last = pace.measurements[0], pace.measurements[-1]
+        sentences.append(
+            f"{len(last.psnrs)} training views were held back and measured {n} time{'s'[: n > 1]}: from"
+            f" {first.psnr:.2f} dB after {first.step:,} iterations to {last.psnr:.2f} dB after {last.step:,}."
+        )
+    sentences += [f"After iteration {d.step:,} {DONE.get(d.what, d.what)}: {d.why}{_error(d)}." for d in pace.decisions]
+    if pace.cooling_from is None:
+        sentences.append(f"It was stopped at iteration {n_iterations:,}, while the rates were constant.")
+    elif pace.last_step == n_iterations:
+        sentences.append(
+            f"With all training views and falling rates it went on to iteration {n_iterations:,}, its end."
+        )
+    else:
+        sentences.append(f"It was stopped at iteration {n_iterations:,} of the {pace.last_step:,} that it had planned.")
+    return " ".join(sentences)
+
+
+def _error(decision: Decision) -> str:
+    return "" if decision.standard_error is None else f" (standard error {decision.standard_error:.2f} dB)"
+
+
+def _row(decision: Decision) -> list[str]:
+    numbers = ["" if n is None else f"{n:.3f}" for n in (decision.gain, decision.standard_error)]
+    return [decision.what, f"{decision.step:,}", decision.why, *numbers]
+
+
+def over_iterations(pace: Pace) -> Figure:
+    """Draw the PSNR of the held-out views over the iterations, with what was decided."""
+    with plot(PSNR, "iterations", (5.6, 3.6)) as (figure, axes):
+        _draw(axes, pace.measurements, [float(m.step) for m in pace.measurements])
+        for decision in pace.decisions:
+            axes.axvline(decision.step, color=GREY, linestyle="--", linewidth=1)
+        _name_decisions(axes, pace.decisions)
+        axes.set_xlim(left=0)
+    return figure
+
+
+def _name_decisions(axes: Axes, decisions: tuple[Decision, ...]) -> None:
+    """Write what was decided at the foot of its line; what was decided at nearly one iteration stands in one label."""
+    labels: dict[int, list[str]] = {}
+    for decision in decisions:
+        near = next((step for step in labels if decision.step - step <= 1), decision.step)
+        labels.setdefault(near, []).append(decision.what)
+    for step, names in labels.items():
+        axes.annotate(
+            ", ".join(names),
+            (step, 0.02),
+            (-3, 0),
+            xycoords=("data", "axes fraction"),
+            textcoords="offset points",
+            rotation=90,
+            ha="right",
+            va="bottom",
+            fontsize=9,
+        )
+
+
+def over_work(pace: Pace) -> Figure:
+    """Draw the same over the work, by whose doublings the gain is counted."""
+    with plot(PSNR, "work (pairs of tile and Gaussian)", (5.6, 3.6)) as (figure, axes):
+        _draw(axes, pace.measurements, [float(m.n_pairs) for m in pace.measurements])
+        axes.set_xscale("log", base=2)
+        for decision in pace.decisions:
+            if decision.gain is not None and _is_of_slope(decision):
+                _draw_slope(axes, pace.measurements, decision.step, decision.gain)
+    return figure
+
+
+def _is_of_slope(decision: Decision) -> bool:
+    """Return whether the gain is one for each doubling of the work; None where a limit ended the growth."""
+    return decision.what == COOLED and decision.gain is not None
+
+
+def _draw(axes: Axes, measurements: tuple[Measurement, ...], xs: list[float]) -> None:
+    axes.plot(xs, np.array([m.psnrs for m in measurements]), color=BLUE, linewidth=0.6, alpha=0.45)
+    axes.plot(xs, [m.psnr for m in measurements], color=BLUE, linewidth=2.2, marker="o", markersize=3)
+
+
+def _draw_slope(axes: Axes, measurements: tuple[Measurement, ...], step: int, gain: float) -> None:
+    """Draw the line through the measurements since half of the work, of which ``gain`` dB a doubling is the slope."""
+    before = [m for m in measurements if m.step <= step]
+    recent = [m for m in before if 2 * m.n_pairs >= before[-1].n_pairs]
+    doublings = np.log2([m.n_pairs for m in recent])
+    middle = np.mean([m.psnr for m in recent])
+    axes.plot(2**doublings, middle + gain * (doublings - doublings.mean()), color=RED, linewidth=2, zorder=3)

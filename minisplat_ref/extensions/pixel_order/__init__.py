@@ -1,0 +1,45 @@
+"""Pixel order: footprints on tangent planes, each pixel in the order of its own ray.
+
+3DGS draws with two approximations that show when a camera turns. It sorts Gaussians by the camera z of their means, the
+same for all pixels, so that one jumps in front of another in a whole picture at once; and it expands the perspective
+map on the image plane, which stretches footprints at the edges. Here, as conventions of a renderer that trains:
+
+- *Order* (StopThePop, Radl et al. 2024, arXiv 2402.00525). A pixel sorts its hits by where on its ray each Gaussian is
+  densest, ``t = d^T C^-1 x / (d^T C^-1 d)``: exactly, or within a buffer of k hits (``--set buffer_size=8``), which is
+  exact where k is not below the number of hits.
+- *Projection* (Optimal Projection, Huang et al. 2024, arXiv 2402.00752). A footprint lies on the plane that touches the
+  unit sphere in the direction of its mean (:mod:`minisplat_ref.extensions.shared_tangent_planes`).
+
+Both depend on rays alone, and so do culling by distance and the low-pass: a camera that turns sees the same colours, to
+rounding. Fixed rays through 100 random Gaussians change by up to 0.11 in half a degree under 3DGS and by 3e-15 here
+(``study pixel-order/rotation``). Against the peak along each ray a footprint errs by 10.5 % at any angle, EWA's by
+10.5 % on the axis and 27.6 % at 55 degrees (``study pixel-order/projection``). Of the pairs of hits of a pixel, 3DGS
+blends 10.9 % out of order, a buffer of 4 2.5 %, of 16 0.03 % (``study pixel-order/order``, 300 random Gaussians).
+
+Sorting is no cure for all that jumps. Where two Gaussians interpenetrate, two hits of a pixel change places as the
+camera *moves*, pixel by pixel instead of all at once: in the same cloud a ray still changes by 0.13 in a step of 0.001
+aside, and under 3DGS, whose order such a walk leaves as it is, by 0.005.
+
+Where this deviates: StopThePop resorts in a hierarchy of queues, of tiles, of blocks, of pixels; here there is one
+queue a pixel, over a list by distance. Its least thickness of 0.001 world units is a thousandth of the longest axis.
+The order has no derivative, as there. Statistics of blending, surfaces and median depths are left to 3DGS's footprints.
+
+    minisplat-ref train SCENE --recipe pixel-order
+    minisplat-ref train SCENE --recipe pixel-order --set buffer_size=8
+    minisplat-ref study pixel-order/order --out DIR
+    minisplat-ref bench --extension pixel-order
+    minisplat-ref oracle gradients --extension pixel-order
+"""
+
+from minisplat_ref.extensions.extension import Extension
+from minisplat_ref.extensions.pixel_order.method import ORDERED, PIXEL_ORDER
+from minisplat_ref.extensions.pixel_order.stages import stages
+from minisplat_ref.extensions.pixel_order.study import ORDER, PROJECTION, ROTATION
+
+EXTENSION = Extension(
+    "pixel-order",
+    recipes=(PIXEL_ORDER,),
+    representation=ORDERED,
+    stages=stages,
+    studies=(ROTATION, PROJECTION, ORDER),
+)

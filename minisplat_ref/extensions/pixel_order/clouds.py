@@ -1,0 +1,194 @@
+"""Random Gaussians and the cameras of the studies, and what is measured of them."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from minisplat_ref.constants import EXACT_ORDER, GSPLAT_MAIN, LIST_ORDER, Conventions
+from minisplat_ref.extensions.shared_studies import tidy
+from minisplat_ref.extensions.shared_tangent_planes import hit, project
+from minisplat_ref.extensions.shared_tangent_rays import (
+    WAYS,
+    ewa_hits,
+    misordered_pairs,
+    moved,
+    steps_along,
+    tangent_hits,
+    turned,
+)
+from minisplat_ref.reference.covariance import covariances
+from minisplat_ref.reference.hits import blending_order
+from minisplat_ref.types import Camera, Floats, Primitives
+
+BARE = GSPLAT_MAIN._replace(eps2d=0.0)
+ANGLES = (0.0, 15.0, 30.0, 45.0, 55.0)  # degrees off the optical axis
+BUFFERS = {"list by distance": LIST_ORDER, "buffer of 4": 4, "buffer of 8": 8, "buffer of 16": 16, "exact": EXACT_ORDER}
+WALK, WALK_STEPS = 0.4, 40  # world units aside, and steps
+WALKS = {"walk": 1, "walk_in_tenths": 10}
+CHUNK = 64  # pixels at a time
+COLORS = ("#8a8580", "#e0a526", "#6aa84f", "#35608c", "#d2493f")
+
+
+def cloud(n: int, rng: np.random.Generator) -> tuple[Primitives, Floats]:
+    """Return n overlapping anisotropic Gaussians around (0, 0, 4), 0.03 to 0.6 large, and their colours [n, 3]."""
+    means = rng.normal(size=(n, 3)) * [1.2, 0.8, 0.8] + [0, 0, 4]
+    scales = np.exp(rng.uniform(np.log(0.03), np.log(0.6), (n, 3)))
+    return Primitives(means, rng.normal(size=(n, 4)), scales, rng.uniform(0.2, 0.95, n)), rng.uniform(size=(n, 3))
+
+
+def wide_camera(fov: float = 100.0, width: int = 64, height: int = 64) -> Camera:
+    """Return a camera at the origin that looks along z, ``fov`` degrees wide."""
+    focal = width / 2 / np.tan(np.radians(fov / 2))
+    return Camera(np.eye(3), np.zeros(3), focal, focal, width / 2, height / 2, width, height)
+
+
+def rays_ahead(n: int, half_angle: float) -> Floats:
+    """Return n x n rays [n * n, 3] that fill a square of ``half_angle`` degrees around z."""
+    slopes = np.linspace(-1, 1, n) * np.tan(np.radians(half_angle))
+    x, y = np.meshgrid(slopes, slopes)
+    return np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+
+
+# --- the rotation ---
+
+
+def rotation(n: int, n_steps: int, seed: int, conventions: Conventions = GSPLAT_MAIN) -> dict[str, dict[str, Any]]:
+    """Return, by way, how colours change in a step: the worst ray's, of a yaw of +-20 degrees and of walks aside.
+
+    The rays are the same all the time. Of the walks the mean over the rays counts, too: where a whole Gaussian changes
+    places at once, the mean jumps, and does so in a step of a tenth as well. Where pixels change one after the other,
+    it does not.
+    """
+    primitives, colors = cloud(n, np.random.default_rng(seed))
+    camera, rays = wide_camera(), rays_ahead(8, 18.0)
+    yaws = [turned(camera, yaw) for yaw in np.radians(np.linspace(-20, 20, n_steps + 1))]
+    found: dict[str, dict[str, Any]] = {}
+    for way in WAYS:
+        found[way] = {"yaw": steps_along(way, primitives, colors, yaws, rays, conventions)[0].tolist()}
+        for name, k in WALKS.items():
+            path = [moved(camera, aside) for aside in np.linspace(0, WALK, k * WALK_STEPS + 1)]
+            worst, mean = steps_along(way, primitives, colors, path, rays, conventions)
+            found[way] |= {f"{name}_worst": float(worst.max()), f"{name}_mean": float(mean.max())}
+    return found
+
+
+def draw_rotation(found: dict[str, dict[str, Any]]) -> Figure:
+    """Draw the largest change in each step of the yaw."""
+    figure = Figure(figsize=(8, 4.2), layout="constrained")
+    axes = figure.subplots()
+    for (way, values), color in zip(found.items(), COLORS, strict=True):
+        steps = np.maximum(values["yaw"], 1e-17)
+        axes.semilogy(np.linspace(-20, 20, len(steps)), steps, color=color, lw=1.2, label=way)
+    axes.set(title="Largest colour change of a fixed ray in a step", xlabel="yaw (degrees)", ylim=(1e-17, 1))
+    axes.legend(frameon=False, fontsize=8)
+    tidy(axes)
+    return figure
+
+
+# --- the projection ---
+
+
+def peak_responses(primitives: Primitives, rays: Floats) -> Floats:
+    """Return ``exp(-min_t |x - t d|^2_C / 2)`` [N, P] of rays from the origin: what no projection approximates."""
+    precisions = np.linalg.inv(covariances(primitives.quats, primitives.scales))
+    a = np.einsum("pi,nij,pj->np", rays, precisions, rays)
+    b = np.einsum("pi,nij,nj->np", rays, precisions, primitives.means)
+    c = np.einsum("ni,nij,nj->n", primitives.means, precisions, primitives.means)
+    peaks: Floats = np.exp(-(c[:, None] - b * b / a) / 2)
+    return peaks
+
+
+def projection_errors(n: int, seed: int) -> dict[str, list[float]]:
+    """Return the errors over ``ANGLES``: ``sum |G - peak| / sum peak`` over rays, the mean of n Gaussians.
+
+    The same Gaussians and rays are turned away from the axis together, so that the truth stays.
+    """
+    rng, rays = np.random.default_rng(seed), rays_ahead(41, 25.0)
+    scales = np.exp(rng.uniform(np.log(0.02), np.log(0.15), (n, 3)))
+    ahead = Primitives(np.tile([0.0, 0.0, 1.0], (n, 1)), rng.normal(size=(n, 4)), scales, np.ones(n))
+    truth = peak_responses(ahead, rays)
+    camera = wide_camera(170.0, 2000, 2000)
+    found: dict[str, list[float]] = {"EWA": [], "tangent planes": []}
+    for angle in ANGLES:
+        seen = turned(camera, np.radians(angle))  # which turns what lies ahead away from the axis
+        in_camera = rays @ seen.cam_from_world_R.T
+        is_ahead = in_camera[:, 2] > 0.05
+        for name, hits in (("EWA", ewa_hits), ("tangent planes", tangent_hits)):
+            drawn = hits(ahead, seen, in_camera[is_ahead], BARE)
+            expected = truth[drawn.ids][:, is_ahead]
+            errors = np.abs(drawn.hit.unclamped - expected).sum(axis=1) / expected.sum(axis=1)
+            found[name].append(float(errors.mean()))
+    return found
+
+
+def draw_projection(found: dict[str, list[float]]) -> Figure:
+    """Draw the errors over the angle."""
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    axes = figure.subplots()
+    for (name, errors), color in zip(found.items(), (COLORS[0], COLORS[4]), strict=True):
+        axes.plot(ANGLES, errors, "o-", color=color, label=name)
+    axes.set(title="Error of the footprint, relative", xlabel="degrees off the axis", ylim=(0, None))
+    axes.legend(frameon=False)
+    tidy(axes)
+    return figure
+
+
+# --- the order ---
+
+
+def orders(primitives: Primitives, colors: Floats, camera: Camera, centers: Floats) -> list[dict[str, Any]]:
+    """Return what each order does to the pixels at ``centers`` [P, 2]: pairs of hits out of order, and colours.
+
+    The first row is the order of 3DGS, by camera z, of the same footprints.
+    """
+    footprints = project(primitives, camera, GSPLAT_MAIN)
+    ways = {"list by z": (LIST_ORDER, footprints.depths)}
+    ways |= {name: (buffer_size, footprints.distances) for name, buffer_size in BUFFERS.items()}
+    pairs, wrong = dict.fromkeys(ways, 0), dict.fromkeys(ways, 0)
+    pictures: dict[str, list[Floats]] = {name: [] for name in ways}
+    ids = np.flatnonzero(footprints.radii[:, 0] > 0)
+    for first in range(0, len(centers), CHUNK):
+        found = hit(footprints, ids, centers[first : first + CHUNK])
+        alphas = np.minimum(GSPLAT_MAIN.alpha_max, found.unclamped)
+        alphas = np.where(alphas >= GSPLAT_MAIN.alpha_min, alphas, 0)
+        rows = np.flatnonzero(alphas.any(axis=1))
+        for name, (buffer_size, keys) in ways.items():
+            listed = rows[np.argsort(keys[ids[rows]], kind="stable")]
+            order = blending_order(alphas[listed] > 0, found.depths[listed], buffer_size)
+            a, depths = (np.take_along_axis(array[listed], order, axis=0) for array in (alphas, found.depths))
+            T = np.cumprod(np.concatenate([np.ones((1, a.shape[1])), 1 - a]), axis=0)
+            pictures[name].append(np.einsum("gp,gpd->pd", a * T[:-1], colors[ids[listed]][order]))
+            n_pairs, n_wrong = misordered_pairs(a > 0, depths)
+            pairs[name], wrong[name] = pairs[name] + n_pairs, wrong[name] + n_wrong
+    exact = np.concatenate(pictures["exact"])
+    result = []
+    for name, parts in pictures.items():
+        errors = np.abs(np.concatenate(parts) - exact)
+        largest, mean = float(errors.max()), float(errors.mean())
+        share = wrong[name] / max(pairs[name], 1)
+        result.append({"order": name, "misordered": share, "largest_error": largest, "mean_error": mean})
+    return result
+
+
+def draw_orders(rows: list[dict[str, Any]]) -> Figure:
+    """Draw the share of misordered pairs, and the error that it makes."""
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    names = [row["order"] for row in rows]
+    for axes, key, title in zip(
+        figure.subplots(1, 2),
+        ("misordered", "mean_error"),
+        ("Pairs of hits out of order (%)", "Mean error of a colour (% of white)"),
+        strict=True,
+    ):
+        axes.barh(names, [100 * row[key] for row in rows], color=COLORS[3])
+        axes.invert_yaxis()
+        axes.set_title(title)
+        tidy(axes)
+    return figure
+
+
+def grid_centers(camera: Camera, step: int) -> Floats:
+    """Return the centres [P, 2] of every ``step``-th pixel along both axes."""
+    x, y = np.meshgrid(np.arange(0, camera.width, step) + 0.5, np.arange(0, camera.height, step) + 0.5)
+    return np.stack([x, y], axis=-1).reshape(-1, 2)

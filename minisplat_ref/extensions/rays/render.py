@@ -1,0 +1,82 @@
+"""The command ``minisplat-ref rays render``: a trained scene among lights, mirrors, glass and meshes."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from minisplat_ref.backends import CPU
+from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.rays import surroundings
+from minisplat_ref.extensions.rays.geometry import pixel_rays
+from minisplat_ref.extensions.rays.lights import World, shade
+from minisplat_ref.extensions.rays.method import tracer_for, whitened_model
+from minisplat_ref.io import orbits, viewpoints, write_image
+from minisplat_ref.io.atomic import making_folder
+from minisplat_ref.io.names import file_names
+from minisplat_ref.io.ply import load_ply
+from minisplat_ref.types import Floats, Model
+
+ORBIT_SIZE = (320, 240)  # pixels
+
+
+def add_parser(commands: Any) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "render",
+        help="draw a scene among lights, mirrors, glass and meshes",
+        description=surroundings.__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("model", type=Path, metavar="MODEL", help="PLY of Gaussians, or the folder of a run")
+    parser.add_argument("--scene", type=Path, required=True, metavar="JSON", help="what stands around them, see above")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for the pictures")
+    parser.add_argument("--cameras", type=Path, metavar="JSON", help="cameras.json (default: the run's test views)")
+    parser.add_argument("--frames", type=int, default=12, metavar="N", help="of an orbit, where no camera is known")
+    parser.add_argument(
+        "--background", type=float, nargs=3, default=(0.0, 0.0, 0.0), metavar=("R", "G", "B"), help="0 to 1 each"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Trace a picture for each camera.
+
+    Raises
+    ------
+    InputError
+        The model, the surroundings or the cameras cannot be used.
+    """
+    from tqdm import tqdm
+
+    if args.frames < 1:
+        raise InputError(f"--frames is {args.frames}: give at least 1")
+    background = np.array(args.background)
+    if not ((background >= 0) & (background <= 1)).all():
+        raise InputError(f"--background is {' '.join(f'{x:g}' for x in background)}: give three numbers from 0 to 1")
+    around = surroundings.read(args.scene)
+    gaussians = load_ply(args.model / "point_cloud.ply" if args.model.is_dir() else args.model)
+    whitened = whitened_model(Model(gaussians))
+    surroundings.check_lights(around, whitened, args.scene)
+    views = _views(args, gaussians.means)
+    world = World(gaussians, tracer_for(whitened, GSPLAT_MAIN, CPU), around, background, GSPLAT_MAIN)
+    with making_folder(args.out) as folder:
+        names = file_names([view.name for view in views])
+        for name, view in zip(names, tqdm(views, desc="tracing", unit="view", disable=None), strict=True):
+            image = shade(world, pixel_rays(view.camera, GSPLAT_MAIN))
+            write_image(folder / f"{name}.png", image.reshape(view.camera.height, view.camera.width, 3))
+    print(f"{len(views)} pictures in {args.out}")
+    return 0
+
+
+def _views(args: argparse.Namespace, means: Floats) -> list[viewpoints.Viewpoint]:
+    """Return the cameras that are given, those of the run's test views, or an orbit."""
+    if args.cameras is not None:
+        return viewpoints.read(args.cameras)
+    path = args.model / "cameras.json"
+    if args.model.is_dir() and path.exists():
+        known = viewpoints.read(path)
+        return [view for view in known if view.split == "test"] or known
+    return orbits.orbit(means, [], args.frames, *ORBIT_SIZE)

@@ -1,0 +1,140 @@
+"""Colours on given rays instead of pixels: what studies ask that turn a camera and look along the same rays again."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from minisplat_ref.constants import EXACT_ORDER, LIST_ORDER, Conventions
+from minisplat_ref.extensions.shared_tangent_planes import hit, project
+from minisplat_ref.reference.hits import Hit, blending_order, conic_hit, goes_on
+from minisplat_ref.reference.pinhole import pinhole
+from minisplat_ref.reference.projection import project as project_ewa
+from minisplat_ref.types import Bools, Camera, Floats, Ints, Primitives
+
+
+class RayHits(NamedTuple):
+    """What Gaussians do to P rays; G of them, in the order of a list."""
+
+    ids: Ints  # [G] rows
+    hit: Hit  # [G, P]
+
+
+def ewa_hits(primitives: Primitives, camera: Camera, rays: Floats, conventions: Conventions) -> RayHits:
+    """Evaluate 3DGS's footprints on rays [P, 3] of the camera's frame; the list is by camera z."""
+    projection = project_ewa(*primitives, camera, conventions)
+    ids = _listed(projection.depths, projection.radii)
+    return RayHits(ids, conic_hit(projection, ids, pinhole(rays, camera)))
+
+
+def tangent_hits(primitives: Primitives, camera: Camera, rays: Floats, conventions: Conventions) -> RayHits:
+    """Evaluate footprints on tangent planes on rays [P, 3] of the camera's frame; the list is by distance."""
+    footprints = project(primitives, camera, conventions)
+    ids = _listed(footprints.distances, footprints.radii)
+    return RayHits(ids, hit(footprints, ids, pinhole(rays, camera)))
+
+
+def sorted_ewa_hits(primitives: Primitives, camera: Camera, rays: Floats, conventions: Conventions) -> RayHits:
+    """Evaluate 3DGS's footprints with the depths on the rays: the order alone is StopThePop's."""
+    found, footprints = ewa_hits(primitives, camera, rays, conventions), project(primitives, camera, conventions)
+    depths = hit(footprints, found.ids, pinhole(rays, camera)).depths
+    return found._replace(hit=found.hit._replace(depths=depths))
+
+
+WAYS: dict[str, tuple[Callable[[Primitives, Camera, Floats, Conventions], RayHits], int]] = {
+    "3DGS: EWA, by z": (ewa_hits, LIST_ORDER),
+    "EWA, exact order": (sorted_ewa_hits, EXACT_ORDER),
+    "tangent planes, by distance": (tangent_hits, LIST_ORDER),
+    "tangent planes, buffer of 16": (tangent_hits, 16),
+    "tangent planes, exact order": (tangent_hits, EXACT_ORDER),
+}
+"""Footprints and orders that are compared, by name."""
+
+
+def ray_colors(
+    way: str, primitives: Primitives, colors: Floats, camera: Camera, rays: Floats, conventions: Conventions
+) -> Floats:
+    """Return the light [P, 3] along rays of the world over black.
+
+    Parameters
+    ----------
+    way : str
+        Key of ``WAYS``.
+    primitives : Primitives
+        N Gaussians.
+    colors : ndarray of shape (N, 3)
+        The same towards all sides.
+    camera : Camera
+        Decides footprints and order.
+    rays : ndarray of shape (P, 3)
+        Directions in the world's frame, in front of the camera.
+    conventions : Conventions
+    """
+    hits, buffer_size = WAYS[way]
+    found = hits(primitives, camera, rays @ camera.cam_from_world_R.T, conventions)
+    alphas = np.minimum(conventions.alpha_max, found.hit.unclamped)
+    is_hit = alphas >= conventions.alpha_min
+    order = blending_order(is_hit, found.hit.depths, buffer_size)
+    alphas = np.take_along_axis(np.where(is_hit, alphas, 0), order, axis=0)
+    T = np.cumprod(np.concatenate([np.ones((1, len(rays))), 1 - alphas]), axis=0)
+    alphas = np.where(goes_on(T[1:], conventions), alphas, 0)
+    light: Floats = np.einsum("gp,gpd->pd", alphas * T[:-1], colors[found.ids][order])
+    return light
+
+
+def misordered_pairs(is_hit: Bools, depths: Floats) -> tuple[int, int]:
+    """Count the pairs of hits of all rays, and those that stand in the other order than their depths.
+
+    Parameters
+    ----------
+    is_hit : ndarray of shape (G, P)
+        In the order in which they are blended.
+    depths : ndarray of shape (G, P)
+    """
+    n_pairs = n_wrong = 0
+    for ray in range(depths.shape[1]):
+        own = depths[is_hit[:, ray], ray]
+        n_pairs += len(own) * (len(own) - 1) // 2
+        n_wrong += int(np.triu(own[:, None] > own[None, :], 1).sum())
+    return n_pairs, n_wrong
+
+
+def _listed(depths: Floats, radii: Ints) -> Ints:
+    """Rows that are seen, nearest first."""
+    rows = np.flatnonzero(radii[:, 0] > 0)
+    listed: Ints = rows[np.argsort(depths[rows], kind="stable")]
+    return listed
+
+
+def turned(camera: Camera, yaw: float) -> Camera:
+    """Return the camera turned by ``yaw`` radians about its own y axis, where it stands."""
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    Y = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
+    R = Y @ np.asarray(camera.cam_from_world_R, np.float64)
+    return camera._replace(cam_from_world_R=R, cam_from_world_t=Y @ np.asarray(camera.cam_from_world_t, np.float64))
+
+
+def moved(camera: Camera, aside: float) -> Camera:
+    """Return the camera moved along its own x axis."""
+    return camera._replace(cam_from_world_t=camera.cam_from_world_t - np.array([aside, 0.0, 0.0]))
+
+
+def steps_along(
+    way: str,
+    primitives: Primitives,
+    colors: Floats,
+    path: list[Camera],
+    rays: Floats,
+    conventions: Conventions,
+) -> tuple[Floats, Floats]:
+    """Return the change of the rays' colours in each step of a path of n cameras: of the worst ray, and the mean.
+
+    Of a colour's three channels the one counts that changes most.
+
+    Returns
+    -------
+    largest, mean : ndarray of shape (n - 1,)
+    """
+    seen = np.stack([ray_colors(way, primitives, colors, camera, rays, conventions) for camera in path])
+    changes = np.abs(np.diff(seen, axis=0)).max(axis=2)  # [n - 1, P]
+    return changes.max(axis=1), changes.mean(axis=1)

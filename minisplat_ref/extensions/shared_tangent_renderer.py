@@ -1,0 +1,216 @@
+"""Gaussians drawn by their footprints on tangent planes, each pixel in its own order, and the way back."""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref.backends import REFERENCE, Backend
+from minisplat_ref.constants import EXACT_ORDER, Conventions
+from minisplat_ref.cpu.compositing import hits as kernel_hits
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.shared_tangent_kernels import response_for
+from minisplat_ref.extensions.shared_tangent_planes import (
+    FootprintGradient,
+    TangentFootprints,
+    hit,
+    hit_vjp,
+    project,
+    project_vjp,
+)
+from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
+from minisplat_ref.reference.hits import Response
+from minisplat_ref.rendering import SPLATTING, RenderGradient, Request
+from minisplat_ref.types import (
+    Bools,
+    Camera,
+    Floats,
+    Gaussians,
+    Model,
+    Primitives,
+    Projection,
+    RenderOutput,
+    TileBins,
+    TileGrid,
+    View,
+)
+
+BUFFER_MAX = 1024  # hits; beyond, None is meant
+STATISTICS = frozenset({"stats", "median_depth", "surface", "dominant_depth"})  # left to 3DGS's footprints
+
+RESPONSE = Response(lambda footprints: footprints.boxes, hit, hit_vjp, ("normals", "conics", "opacities"))
+"""The book's response; in the order of the list, until ``buffer_size`` says otherwise."""
+
+
+class Prepared(NamedTuple):
+    """A view of Gaussians, projected and coloured."""
+
+    gaussians: Any
+    sh_degree: int  # active
+    primitives: Primitives
+    view_camera: Camera
+    footprints: TangentFootprints
+    channels: Floats  # [N, D] colours, then the depth if asked for
+    background: Floats  # [D]
+    has_depth: bool
+    conventions: Conventions
+    backend: Backend
+    buffer_size: int
+
+    def listed(self) -> TileBins:
+        """Return the tiles' lists, nearest means first."""
+        camera = self.footprints.camera
+        grid = TileGrid(camera.width, camera.height, self.backend.tile_width, self.backend.tile_height)
+        f, zeros = self.footprints, np.zeros((len(self.channels), 3))
+        by_distance = Projection(zeros[:, :2], f.distances, zeros, f.opacities, f.radii, f.boxes)
+        return REFERENCE.bin_gaussians(by_distance, grid, self.conventions)
+
+    def blended(self, bins: TileBins) -> RenderOutput:
+        """Return the picture by kernels or by the book."""
+        inputs = self.footprints, self.channels, self.background, bins, self.conventions
+        if self.backend.is_compiled:
+            return kernel_hits.composite_hits(response_for(self.channels.dtype, self.buffer_size), *inputs)
+        return composite_hits(RESPONSE._replace(buffer_size=self.buffer_size), *inputs)
+
+
+class Tape(NamedTuple):
+    """What :func:`render` did, for :func:`render_vjp`."""
+
+    prepared: Prepared
+    bins: TileBins
+    output: RenderOutput
+
+
+def prepare(model: Model, camera: Camera, request: Request, buffer_size: int | None) -> Prepared:
+    """Project and colour the Gaussians of a model.
+
+    Raises
+    ------
+    InputError
+        The buffer holds no hit, or the conventions are not those of tangent planes.
+    """
+    g, backend = model.gaussians, request.backend
+    size = checked_buffer(buffer_size)
+    dtype = g.means.dtype
+    stored_degree = math.isqrt(g.sh_rest.shape[1] + 1) - 1
+    sh_degree = stored_degree if request.sh_degree is None else min(request.sh_degree, stored_degree)
+    background = np.zeros(3, dtype) if request.background is None else np.asarray(request.background, dtype)
+    primitives = activated(g, request.is_visible)
+    footprints = project(primitives, camera, request.conventions)
+    channels = backend.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, sh_degree, footprints.radii)
+    has_depth = "depth" in request.wants
+    if has_depth:
+        channels = np.column_stack([channels, footprints.depths.astype(dtype)])
+        background = np.append(background, dtype.type(0))
+    return Prepared(
+        g,
+        sh_degree,
+        primitives,
+        camera,
+        footprints,
+        channels,
+        background,
+        has_depth,
+        request.conventions,
+        backend,
+        size,
+    )
+
+
+def checked_buffer(buffer_size: int | None) -> int:
+    """Return the hits that a pixel holds back; None is any number.
+
+    Raises
+    ------
+    InputError
+        It is no whole number of at least 1.
+    """
+    if buffer_size is None:
+        return EXACT_ORDER
+    if buffer_size != int(buffer_size) or not 1 <= buffer_size <= BUFFER_MAX:
+        raise InputError(
+            f"buffer_size is {buffer_size}: give 1 to {BUFFER_MAX} hits, 1 for the order of the list, or none for the"
+            " exact order"
+        )
+    return int(buffer_size)
+
+
+def activated(gaussians: Any, is_visible: Bools | None) -> Primitives:
+    """Return Gaussians after their activations; those of ``is_visible`` alone where it is given."""
+    dtype = gaussians.means.dtype
+    with np.errstate(over="ignore"):
+        scales = np.minimum(np.exp(gaussians.log_scales), np.finfo(dtype).max)
+        opacities = 1 / (1 + np.exp(-gaussians.opacity_logits))
+    if is_visible is not None:
+        opacities = np.where(is_visible, opacities, dtype.type(0))
+    return Primitives(gaussians.means, gaussians.quats, scales, opacities)
+
+
+def render(model: Model, view: View, request: Request, *, buffer_size: int | None = None) -> tuple[RenderOutput, Tape]:
+    """Draw a view.
+
+    Statistics of blending, surfaces and median depths, which the kernels do not collect, are those of 3DGS's footprints
+    in its order.
+
+    Parameters
+    ----------
+    model : Model
+        A population that has the six fields of :class:`Gaussians`.
+    view : View
+    request : Request
+    buffer_size : int, optional
+        Hits that a pixel holds back to sort them; all by default.
+    """
+    prepared = prepare(model, view.camera, request, buffer_size)
+    bins = prepared.listed()
+    blended = prepared.blended(bins)
+    visible_ids = np.flatnonzero(prepared.footprints.radii[:, 0] > 0)
+    output = blended._replace(visible_ids=visible_ids, n_pairs=len(bins.gaussian_ids))
+    if asked := request.wants & STATISTICS:
+        splatted, _ = SPLATTING.render(model, view, request._replace(wants=asked))
+        output = output._replace(stats=splatted.stats, median_depth=splatted.median_depth, extras=splatted.extras)
+    return output, Tape(prepared, bins, blended)
+
+
+def render_vjp(tape: Tape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
+    """Gradient of :func:`render`, by the chain rule.
+
+    ::
+
+        v_log_s = s v_s,  v_logit = o (1 - o) v_o
+        the means and the pose are used twice, by the projection and by the viewing direction
+    """
+    p, bins, output = tape
+    g, footprints, camera = p.gaussians, p.footprints, p.view_camera
+    v_output = v_image, np.zeros_like(output.alpha) if v_alpha is None else v_alpha
+    inputs = footprints, p.channels, p.background, bins, p.conventions, output, v_output
+    if p.backend.is_compiled:
+        v = kernel_hits.composite_hits_vjp(response_for(p.channels.dtype, p.buffer_size), *inputs)
+    else:
+        v = composite_hits_vjp(RESPONSE._replace(buffer_size=p.buffer_size), *inputs)
+    v_colors, v_background, v_depths = v.colors, v.background, np.zeros(len(v.colors))
+    if p.has_depth:
+        v_colors, v_depths = np.ascontiguousarray(v.colors[:, :-1]), v.colors[:, -1].astype(np.float64)
+        v_background = v.background[:-1]
+    v_normals, v_conics, v_opacities = v.primitives
+    v_footprints = FootprintGradient(v_normals, v_conics, v_opacities, v_depths)
+    v_primitives, v_means2d = project_vjp(p.primitives, camera, p.conventions, footprints, v_footprints)
+    v_sh = p.backend.sh_colors_vjp(g.means, g.sh_dc, g.sh_rest, camera, p.sh_degree, footprints.radii, v_colors)
+    with np.errstate(over="ignore"):
+        transparencies = 1 / (1 + np.exp(g.opacity_logits))
+    further = {name: np.zeros_like(field) for name, field in g._asdict().items() if name not in Gaussians._fields}
+    return RenderGradient(
+        gaussians=g._replace(
+            means=v_primitives.means + v_sh.means,
+            quats=v_primitives.quats,
+            log_scales=p.primitives.scales * v_primitives.scales,
+            opacity_logits=p.primitives.opacities * transparencies * v_primitives.opacities,
+            sh_dc=v_sh.sh_dc,
+            sh_rest=v_sh.sh_rest,
+            **further,
+        ),
+        background=v_background,
+        cam_from_world_R=v_primitives.cam_from_world_R + v_sh.cam_from_world_R,
+        cam_from_world_t=v_primitives.cam_from_world_t + v_sh.cam_from_world_t,
+        means2d=v_means2d,
+    )

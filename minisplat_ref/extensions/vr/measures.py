@@ -1,0 +1,146 @@
+"""The work of the studies ``vr/foveation`` and ``vr/yaw``."""
+
+import statistics
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from minisplat_ref.backends import CPU
+from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
+from minisplat_ref.extensions.shared_studies import tidy
+from minisplat_ref.extensions.shared_tangent_rays import ewa_hits, steps_along, tangent_hits, turned
+from minisplat_ref.extensions.shared_tangent_renderer import activated
+from minisplat_ref.extensions.vr.foveation import Gaze, Zone, eccentricities, render_foveated, resolved_angles
+from minisplat_ref.extensions.vr.method import BUFFER
+from minisplat_ref.rendering import Request
+from minisplat_ref.types import Camera, Floats, Gaussians, Ints, Model, Primitives, View
+
+EVERYWHERE = 180.0  # degrees: every pixel is drawn
+WAYS = ("3DGS: EWA, by z", "tangent planes, buffer of 16", "tangent planes, exact order")
+COLORS = ("#8a8580", "#35608c", "#d2493f")
+
+
+def weighted_psnr(image: Floats, target: Floats, angles: Floats) -> float:
+    """Return the PSNR, dB, with pixels weighted by what an eye resolves of them: ``1 / MAR(e)^2``.
+
+    Parameters
+    ----------
+    image, target : ndarray of shape (H, W, 3)
+        In [0, 1].
+    angles : ndarray of shape (H, W)
+        Eccentricities, degrees.
+    """
+    weights = 1 / resolved_angles(angles) ** 2
+    squared = np.mean((np.clip(image, 0, 1).astype(np.float64) - target) ** 2, axis=2)
+    return float(-10 * np.log10(np.average(squared, weights=weights)))
+
+
+def foveated(
+    model: Model, views: Sequence[View], background: Floats, fulls: Sequence[float], repeats: int
+) -> list[dict[str, Any]]:
+    """Return work and errors, a row for each angle ``full``, the first that of the whole picture.
+
+    The eye looks at the middle of each view. Work is counted relative to the whole picture's.
+    """
+    request, rows = Request(background, backend=CPU), []
+    whole: list[Floats] = []
+    for full in (EVERYWHERE, *fulls):
+        psnrs, against_whole, plain, times = [], [], [], []
+        zones: list[list[Zone]] = []
+        for v, view in enumerate(views):
+            camera = view.camera
+            gaze = Gaze(camera.width / 2, camera.height / 2, full)
+            seconds = []
+            for _ in range(repeats):
+                start = time.perf_counter()
+                image, found = render_foveated(model, camera, request, gaze, BUFFER)
+                seconds.append(time.perf_counter() - start)
+            if full == EVERYWHERE:
+                whole.append(image)
+            zones.append(found)
+            times.append(min(seconds))
+            angles, truth = eccentricities(camera, gaze.x, gaze.y), view.loaded().image / 255
+            psnrs.append(weighted_psnr(image, truth, angles))
+            plain.append(weighted_psnr(image, truth, np.zeros_like(angles)))
+            if full != EVERYWHERE:
+                against_whole.append(weighted_psnr(image, np.clip(whole[v], 0, 1), angles))
+        by_zone = [
+            {"block": z[0].block, "begins": z[0].begins, **{n: sum(getattr(one, n) for one in z) for n in COUNTS}}
+            for z in zip(*zones, strict=True)
+        ]
+        rows.append(
+            {
+                "full": full,
+                "zones": by_zone,
+                **{name: sum(zone[name] for zone in by_zone) for name in COUNTS},
+                "seconds": sum(times),
+                "weighted_psnr": statistics.mean(psnrs),
+                "psnr": statistics.mean(plain),
+                "weighted_psnr_of_whole": statistics.mean(against_whole) if against_whole else None,
+            }
+        )
+    return rows
+
+
+COUNTS = ("n_tiles", "n_samples", "n_pairs")
+
+
+def draw_foveated(rows: list[dict[str, Any]]) -> Figure:
+    """Draw the weighted PSNR over the rays that are drawn."""
+    figure = Figure(figsize=(6.5, 4), layout="constrained")
+    axes = figure.subplots()
+    work = [100 * row["n_samples"] / rows[0]["n_samples"] for row in rows]
+    axes.plot(work, [row["weighted_psnr"] for row in rows], "o", color=COLORS[2], label="weighted by acuity")
+    axes.plot(work, [row["psnr"] for row in rows], "o", color=COLORS[0], label="unweighted")
+    for x, row in zip(work, rows, strict=True):
+        label = "everywhere" if row["full"] == EVERYWHERE else f"{row['full']:g} degrees"
+        axes.annotate(label, (x, row["weighted_psnr"]), fontsize=8, xytext=(4, 4), textcoords="offset points")
+    axes.set(title="Test views: PSNR (dB)", xlabel="rays drawn (% of the pixels)")
+    axes.legend(frameon=False)
+    tidy(axes)
+    return figure
+
+
+def yaw_steps(
+    gaussians: Gaussians, camera: Camera, n_rays: int, half_angle: float, n_steps: int
+) -> dict[str, list[float]]:
+    """Return the largest change of any ray's colour in each step of a yaw of +-``half_angle`` degrees, by way.
+
+    n_rays x n_rays rays within 6 degrees of the camera's axis; Gaussians have their colours of degree 0. Those that no
+    ray hits at five of the cameras are left out.
+    """
+    wide = Gaussians._make(field.astype(np.float64) for field in gaussians)
+    primitives, colors = activated(wide, None), np.maximum(0.5 + SH_C0 * wide.sh_dc, 0)
+    slopes = np.linspace(-1, 1, n_rays) * np.tan(np.radians(6.0))
+    x, y = np.meshgrid(slopes, slopes)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ camera.cam_from_world_R
+    path = [turned(camera, yaw) for yaw in np.radians(np.linspace(-half_angle, half_angle, n_steps + 1))]
+    rows = _hit_rows(primitives, path[:: max(n_steps // 4, 1)], rays)
+    seen = Primitives._make(field[rows] for field in primitives)
+    return {way: steps_along(way, seen, colors[rows], path, rays, GSPLAT_MAIN)[0].tolist() for way in WAYS}
+
+
+def _hit_rows(primitives: Primitives, cameras: Sequence[Camera], rays: Floats) -> Ints:
+    is_hit = np.zeros(len(primitives.means), bool)
+    for camera in cameras:
+        for hits in (ewa_hits, tangent_hits):
+            found = hits(primitives, camera, rays @ camera.cam_from_world_R.T, GSPLAT_MAIN)
+            is_hit[found.ids] |= (found.hit.unclamped >= GSPLAT_MAIN.alpha_min).any(axis=1)
+    return np.flatnonzero(is_hit)
+
+
+def draw_yaw(found: dict[str, list[float]], half_angle: float) -> Figure:
+    """Draw the largest change in each step."""
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    axes = figure.subplots()
+    for (way, steps), color in zip(found.items(), COLORS, strict=True):
+        axes.semilogy(
+            np.linspace(-half_angle, half_angle, len(steps)), np.maximum(steps, 1e-17), color=color, label=way
+        )
+    axes.set(title="Largest colour change of a fixed ray in a step", xlabel="yaw (degrees)", ylim=(1e-17, 1))
+    axes.legend(frameon=False, fontsize=8)
+    tidy(axes)
+    return figure

@@ -1,0 +1,70 @@
+"""The command ``minisplat-ref vr render``: pictures for an eye that looks at a given pixel."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+FULL = 8.0  # degrees in which every pixel is drawn
+
+
+def add_parser(commands: Any) -> None:
+    """Add the command."""
+    parser = commands.add_parser("render", help="draw pictures with fewer rays away from where the eye looks")
+    parser.add_argument("ply", type=Path, metavar="PLY", help="point_cloud.ply of a run")
+    parser.add_argument("--gaze", type=gaze, required=True, metavar="X,Y", help="where the eye looks, pixels")
+    parser.add_argument("--full", type=float, default=FULL, metavar="DEG", help=f"drawn in full (default {FULL:g})")
+    parser.add_argument("--cameras", type=Path, metavar="FILE", help="of the run (default cameras.json beside the PLY)")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for the pictures")
+    parser.set_defaults(run=run)
+
+
+def gaze(text: str) -> tuple[float, float]:
+    """Return x and y of ``X,Y``."""
+    try:
+        x, y = (float(word) for word in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no place in a picture such as 320,240") from None
+    return x, y
+
+
+def run(args: argparse.Namespace) -> int:
+    """Draw the test views, or all where there are none, and print the work of each zone.
+
+    Raises
+    ------
+    InputError
+        The PLY or the cameras cannot be used, the gaze lies outside of a picture, or the folder exists.
+    """
+    from minisplat_ref.extensions.vr.foveation import Gaze, check_gaze, render_foveated
+    from minisplat_ref.extensions.vr.method import BUFFER
+    from minisplat_ref.io import load_ply, viewpoints, write_image
+    from minisplat_ref.io.atomic import making_folder
+    from minisplat_ref.io.names import file_names
+    from minisplat_ref.rendering import Request
+    from minisplat_ref.reporting import markdown_table
+    from minisplat_ref.types import Model
+
+    x, y = args.gaze
+    look = Gaze(x, y, args.full)
+    model = Model(load_ply(args.ply))
+    views = viewpoints.read(args.cameras or args.ply.parent / "cameras.json")
+    views = [view for view in views if view.split == "test"] or views
+    for view in views:
+        check_gaze(look, view.camera, view.name)
+    names = file_names([view.name for view in views])
+    with making_folder(args.out) as folder:
+        drawn = [render_foveated(model, view.camera, Request(), look, BUFFER) for view in views]
+        for name, (image, _) in zip(names, drawn, strict=True):
+            write_image(folder / f"{name}.png", image)
+    n_pixels = sum(view.camera.width * view.camera.height for view in views)
+    rows = []
+    for zones in zip(*(zones for _, zones in drawn), strict=True):
+        n_samples = sum(zone.n_samples for zone in zones)
+        tiles, pairs = (sum(getattr(zone, name) for zone in zones) for name in ("n_tiles", "n_pairs"))
+        first, share = zones[0], f"{100 * n_samples / n_pixels:.1f} %"
+        rows.append(
+            [f"from {first.begins:.1f}", f"1 for {first.block} x {first.block}", f"{tiles:,}", share, f"{pairs:,}"]
+        )
+    print(markdown_table(["degrees", "rays", "tiles", "rays of all pixels", "pairs"], rows))
+    print(f"\n{len(views)} pictures in {args.out}")
+    return 0

@@ -1,0 +1,164 @@
+"""One call of a rasterizer with NumPy arrays, torch tensors or JAX arrays, and its gradients: NumPy in, NumPy out.
+
+The gradients are those of the function's own ``vjp`` where there is one. Otherwise torch and JAX differentiate; plain
+NumPy has none. Torch also differentiates with respect to what the function tells in its meta, so that a gradient that
+is wrong can be found between the image and the projection.
+"""
+
+import inspect
+import sys
+from collections.abc import Callable, Mapping
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.types import Floats
+
+ARRAY_KINDS = ("numpy", "torch", "jax")
+INTERMEDIATE = ("means2d", "depths", "conics", "opacities")  # of the meta, that torch may differentiate by
+
+
+class Call(NamedTuple):
+    """What a rasterizer is called with."""
+
+    leaves: dict[str, Floats]
+    """Arguments that it is differentiated with respect to."""
+    others: dict[str, Any]
+    """Further arguments: arrays and settings."""
+    v_colors: Floats
+    """[1, H, W, D] derivative of the loss with respect to the image."""
+    v_alphas: Floats
+    """[1, H, W, 1] derivative of the loss with respect to alpha."""
+
+
+class Result(NamedTuple):
+    """What it gave."""
+
+    colors: np.ndarray
+    alphas: np.ndarray
+    meta: dict[str, np.ndarray]
+    """What it told besides; empty where it tells nothing."""
+    gradients: dict[str, np.ndarray]
+    """With respect to leaves, by their names; an argument that nothing depends on is absent."""
+    of_meta: dict[str, np.ndarray]
+    """The same with respect to intermediate arrays of the meta."""
+
+
+def kind_of(function: Callable[..., Any]) -> str:
+    """Return which arrays a function computes with, by what its module has imported: torch, then jax, else numpy."""
+    inner = inspect.unwrap(getattr(function, "func", function))  # of a functools.partial
+    name = getattr(inner, "__module__", None) or type(inner).__module__
+    values = vars(sys.modules[name]).values() if name in sys.modules else ()
+    origins = [v.__name__ if isinstance(v, ModuleType) else getattr(v, "__module__", None) for v in values]
+    roots = {origin.partition(".")[0] for origin in origins if isinstance(origin, str)}
+    return next((kind for kind in ("torch", "jax") if kind in roots), "numpy")
+
+
+def run(kind: str, function: Callable[..., Any], vjp: Callable[..., Any] | None, call: Call) -> Result:
+    """Call a rasterizer forward and, if it can be differentiated, backward.
+
+    Parameters
+    ----------
+    kind : {"numpy", "torch", "jax"}
+    function : callable
+        As gsplat's ``rasterization``: returns image, alpha and perhaps a meta.
+    vjp : callable or None
+        Takes the same arguments, ``v_render_colors`` and ``v_render_alphas``; returns a mapping with ``v_means`` and so
+        on.
+    call : Call
+        All of it in one dtype.
+
+    Raises
+    ------
+    InputError
+        If the result is not a tuple of image, alpha and perhaps a meta.
+    """
+    result = {"numpy": _run_numpy, "torch": _run_torch, "jax": _run_jax}[kind](function, call, vjp is None)
+    if vjp is None:
+        return result
+    to = _to_torch if kind == "torch" else _to_jax if kind == "jax" else np.array
+    arguments = {name: to(value) if isinstance(value, np.ndarray) else value for name, value in call.others.items()}
+    arguments |= {name: to(value) for name, value in call.leaves.items()}
+    given = vjp(**arguments, v_render_colors=to(call.v_colors), v_render_alphas=to(call.v_alphas))
+    if not isinstance(given, Mapping):
+        raise InputError(f"the vjp returned {type(given).__name__}: return a dict with v_means, v_quats and so on")
+    gradients = {name: _numpy(given[f"v_{name}"]) for name in call.leaves if given.get(f"v_{name}") is not None}
+    return result._replace(gradients=gradients)
+
+
+def _run_numpy(function: Callable[..., Any], call: Call, _: bool) -> Result:
+    copies = {name: value.copy() for name, value in call.leaves.items()}
+    colors, alphas, meta = _parts(function(**copies, **call.others))
+    return Result(_numpy(colors), _numpy(alphas), _arrays_of(meta), {}, {})
+
+
+def _run_torch(function: Callable[..., Any], call: Call, is_differentiated: bool) -> Result:
+    import torch
+
+    leaves = {name: _to_torch(value).requires_grad_(is_differentiated) for name, value in call.leaves.items()}
+    others = {name: _to_torch(v) if isinstance(v, np.ndarray) else v for name, v in call.others.items()}
+    colors, alphas, meta = _parts(function(**leaves, **others))
+    gradients, of_meta = {}, {}
+    pairs = [(x, _to_torch(v)) for x, v in ((colors, call.v_colors), (alphas, call.v_alphas)) if _requires_grad(x)]
+    if pairs and is_differentiated and all(x.shape == v.shape for x, v in pairs):
+        between = {name: meta[name] for name in INTERMEDIATE if _requires_grad(meta.get(name))}
+        outputs, weights = zip(*((x, v.to(x)) for x, v in pairs), strict=True)
+        found = torch.autograd.grad(outputs, [*leaves.values(), *between.values()], weights, allow_unused=True)
+        named = [(name, None if v is None else _numpy(v)) for name, v in zip([*leaves, *between], found, strict=True)]
+        gradients = {name: v for name, v in named[: len(leaves)] if v is not None}
+        of_meta = {name: v for name, v in named[len(leaves) :] if v is not None}
+    return Result(_numpy(colors), _numpy(alphas), _arrays_of(meta), gradients, of_meta)
+
+
+def _run_jax(function: Callable[..., Any], call: Call, is_differentiated: bool) -> Result:
+    import jax
+
+    if next(iter(call.leaves.values())).dtype == np.float64:
+        jax.config.update("jax_enable_x64", True)
+    leaves = {name: _to_jax(value) for name, value in call.leaves.items()}
+    others = {name: _to_jax(v) if isinstance(v, np.ndarray) else v for name, v in call.others.items()}
+    colors, alphas, meta = _parts(function(**leaves, **others))
+    gradients = {}
+    if is_differentiated and colors.shape == call.v_colors.shape and alphas.shape == call.v_alphas.shape:
+        _, pull = jax.vjp(lambda given: _parts(function(**given, **others))[:2], leaves)
+        (found,) = pull((_to_jax(call.v_colors), _to_jax(call.v_alphas)))
+        gradients = {name: _numpy(v) for name, v in found.items()}
+    return Result(_numpy(colors), _numpy(alphas), _arrays_of(meta), gradients, {})
+
+
+def _parts(returned: Any) -> tuple[Any, Any, Mapping[str, Any]]:
+    """Return image, alpha and meta."""
+    if not isinstance(returned, tuple | list) or len(returned) not in (2, 3):
+        what = f"{len(returned)} values" if isinstance(returned, tuple | list) else type(returned).__name__
+        raise InputError(f"it returned {what}: return (render_colors, render_alphas, meta), or the first two")
+    meta = returned[2] if len(returned) == 3 else {}
+    return returned[0], returned[1], meta if isinstance(meta, Mapping) else {}
+
+
+def _arrays_of(meta: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    return {name: _numpy(meta[name]) for name in (*INTERMEDIATE, *_TOLD) if meta.get(name) is not None}
+
+
+_TOLD = ("radii", "flatten_ids", "isect_offsets", "tile_size")
+
+
+def _requires_grad(value: Any) -> bool:
+    return bool(getattr(value, "requires_grad", False))
+
+
+def _to_torch(array: Floats) -> Any:
+    import torch
+
+    return torch.tensor(array, device="cuda" if torch.cuda.is_available() else "cpu")
+
+
+def _to_jax(array: Floats) -> Any:
+    import jax.numpy as jnp
+
+    return jnp.asarray(array)
+
+
+def _numpy(value: Any) -> np.ndarray:
+    return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)

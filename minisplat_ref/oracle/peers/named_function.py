@@ -1,0 +1,53 @@
+"""From ``package.module:function``, as it is typed, to the function."""
+
+import importlib
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from minisplat_ref.errors import InputError
+
+N_SHOWN = 8  # names that a message proposes
+
+
+def load_function(text: str) -> tuple[Callable[..., Any], Callable[..., Any] | None]:
+    """Import a function, and the gradient of the name ``function_vjp`` if there is one beside it.
+
+    Parameters
+    ----------
+    text : str
+        ``package.module:function``; the module is looked for in the current folder, too.
+
+    Raises
+    ------
+    InputError
+        If the module cannot be imported, or has no such function.
+    """
+    module_name, _, name = text.partition(":")
+    if not module_name or not name.isidentifier():
+        raise InputError(f"{text!r} is no function: write package.module:function")
+    module = _imported(module_name)
+    function = getattr(module, name, None)
+    if function is None:
+        own = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
+        there = f"there are {', '.join(own[:N_SHOWN])}" if own else "it has no function"
+        raise InputError(f"module {module_name} has no {name!r}: {there}")
+    if not callable(function):
+        raise InputError(f"{text} is {type(function).__name__}, not a function")
+    return function, getattr(module, f"{name}_vjp", None)
+
+
+def _imported(name: str) -> ModuleType:
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{name}.".startswith(f"{error.name}."):
+            raise InputError(f"module {name} needs {error.name}, which is not installed") from error
+        raise InputError(f"module {error.name} is not found: start in its folder, or install it") from error
+    except Exception as error:  # of somebody else's code, whatever it is
+        raise InputError(f"importing {name} raised {type(error).__name__}: {error}") from error

@@ -1,0 +1,174 @@
+"""A headless Chromium for tests: opens a page, runs script in it, presses keys, takes pictures.
+
+It is driven through its DevTools protocol over two pipes, so nothing but the browser itself is needed. Where there is
+none, :func:`find_browser` says None and tests skip.
+"""
+
+import base64
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "chrome-headless-shell")
+OPTIONS = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run")
+SECONDS = 60  # for the browser to answer; it takes a fraction of one on an idle machine
+
+
+def find_browser() -> str | None:
+    """Path of a Chromium, None where there is none."""
+    return next((path for path in map(shutil.which, NAMES) if path is not None), None)
+
+
+class Browser:
+    """One headless browser with one tab; a context manager."""
+
+    def __init__(self, program: str, profile: Path) -> None:
+        to_browser, self._write = os.pipe()
+        self._read, from_browser = os.pipe()
+
+        def wire() -> None:  # the browser reads descriptor 3 and writes 4
+            os.dup2(to_browser, 63), os.dup2(from_browser, 64)
+            os.dup2(63, 3), os.dup2(64, 4)
+
+        command = [program, *OPTIONS, f"--user-data-dir={profile}", "--remote-debugging-pipe", "about:blank"]
+        self._process = subprocess.Popen(
+            command, preexec_fn=wire, close_fds=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        os.close(to_browser), os.close(from_browser)
+        self._buffer, self._n, self._session = b"", 0, None
+        self.events: list[dict[str, Any]] = []
+
+    def __enter__(self) -> Self:
+        targets = self.send("Target.getTargets")["targetInfos"]
+        target = next(target["targetId"] for target in targets if target["type"] == "page")
+        self._session = self.send("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        for domain in ("Page", "Runtime", "Log", "Network"):
+            self.send(f"{domain}.enable")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._process.kill()
+        self._process.wait()
+        os.close(self._read), os.close(self._write)
+
+    def send(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """Call a method of the protocol; events that come meanwhile are kept."""
+        self._n += 1
+        message = {"id": self._n, "method": method, "params": parameters}
+        if self._session is not None:
+            message["sessionId"] = self._session
+        os.write(self._write, json.dumps(message).encode() + b"\0")
+        while True:
+            answer = self._receive()
+            if answer.get("id") == self._n:
+                assert "error" not in answer, (method, answer["error"])
+                return answer["result"]
+            self.events.append(answer)
+
+    def _receive(self) -> dict[str, Any]:
+        import select
+
+        while b"\0" not in self._buffer:
+            assert select.select([self._read], [], [], SECONDS)[0], f"the browser is silent for {SECONDS} seconds"
+            data = os.read(self._read, 1 << 20)
+            assert data, "the browser has ended"
+            self._buffer += data
+        text, self._buffer = self._buffer.split(b"\0", 1)
+        return json.loads(text)
+
+    def open(self, path: Path, *, width: int, is_dark: bool = False, has_script: bool = True) -> None:
+        """Load a page in a window ``width`` pixels wide."""
+        self.send(
+            "Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=width < 700
+        )
+        scheme = "dark" if is_dark else "light"
+        self.send("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+        self.send("Emulation.setScriptExecutionDisabled", value=not has_script)
+        self.events.clear()
+        self.send("Page.navigate", url=path.resolve().as_uri())
+        while not any(event.get("method") == "Page.loadEventFired" for event in self.events):
+            self.events.append(self._receive())
+
+    def run(self, script: str) -> Any:
+        """Value of an expression in the page."""
+        result = self.send("Runtime.evaluate", expression=script, returnByValue=True)
+        assert "exceptionDetails" not in result, result
+        return result["result"].get("value")
+
+    def press(self, key: str, code: int) -> None:
+        """Press and release a key."""
+        for kind in ("keyDown", "keyUp"):
+            self.send("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code)
+
+    def complaints(self) -> list[str]:
+        """What the page's console and its loading have complained about since it was opened."""
+        found = []
+        for event in self.events:
+            method, values = event.get("method"), event.get("params", {})
+            if method in ("Runtime.exceptionThrown", "Log.entryAdded", "Network.loadingFailed"):
+                found.append(json.dumps(values)[:300])
+        return found
+
+    def requests(self) -> list[str]:
+        """Addresses that the page has asked for, itself and what is inside it left out."""
+        urls = [e["params"]["request"]["url"] for e in self.events if e.get("method") == "Network.requestWillBeSent"]
+        return [url for url in urls if not url.startswith(("data:", "file:"))] + [
+            url for url in urls[1:] if url.startswith("file:")
+        ]
+
+    def picture(self, path: Path) -> None:
+        """Write the whole page as PNG."""
+        data = self.send("Page.captureScreenshot", format="png", captureBeyondViewport=True)["data"]
+        path.write_bytes(base64.b64decode(data))
+
+
+def check_page(browser: Browser, path: Path) -> None:
+    """Assert what holds for every report: nothing is loaded, nothing fails, nothing is wider than the window."""
+    for width in (390, 1280):
+        for is_dark in (False, True):
+            browser.open(path, width=width, is_dark=is_dark)
+            assert browser.complaints() == [] and browser.requests() == []
+            # Where the script has not run there are no pictures to compare, or something is wrong.
+            assert browser.run("document.querySelectorAll('.slider:not(.live)').length") == 0
+            assert browser.run("document.documentElement.scrollWidth") <= width, browser.run(TOO_WIDE)
+            assert browser.run("[...document.images].every(image => image.naturalWidth > 0)")
+            light = browser.run("getComputedStyle(document.body).backgroundColor")
+            assert (light != "rgb(246, 247, 249)") == is_dark
+            assert browser.run(CONTRASTS) == []
+
+
+TOO_WIDE = """
+[...document.querySelectorAll("main *")].filter(node => node.getBoundingClientRect().right > innerWidth
+  && !node.closest(".scroll, pre")).map(node => node.tagName + " " + node.textContent.slice(0, 40)).slice(0, 5)
+"""
+"""What reaches beyond the window."""
+
+CONTRASTS = """
+(() => {
+  const parse = text => { const n = text.match(/[\\d.]+/g).map(Number); return n.length < 4 ? [...n, 1] : n; };
+  const linear = c => (c /= 255) <= 0.03928 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4;
+  const light = ([r, g, b]) => 0.2126 * linear(r) + 0.7152 * linear(g) + 0.0722 * linear(b);
+  const behind = node => {
+    for (; node; node = node.parentElement) {
+      const color = parse(getComputedStyle(node).backgroundColor);
+      if (color[3] > 0) return color;
+    }
+    return [255, 255, 255];
+  };
+  const weak = new Set();
+  for (const node of document.querySelectorAll("h1, h2, p, li, b, span, th, td, pre, figcaption, .label, .bar, text")) {
+    if (!node.textContent.trim()) continue;
+    const style = getComputedStyle(node), ink = light(parse(node.tagName === "text" ? style.fill : style.color));
+    const paper = light(behind(node)), ratio = (Math.max(ink, paper) + 0.05) / (Math.min(ink, paper) + 0.05);
+    if (ratio < 4.5) weak.add(node.tagName + " " + ratio.toFixed(1) + " " + node.textContent.slice(0, 40));
+  }
+  return [...weak].slice(0, 5);
+})()
+"""
+"""Texts whose contrast with what is behind them is below 4.5, as the accessibility guidelines ask of small text."""

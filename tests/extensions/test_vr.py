@@ -1,0 +1,164 @@
+"""VR: acuity and zones by hand, foveated pictures against whole ones, gradients, from end to end."""
+
+import json
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scenes import as_dtype, make_camera, make_gaussians
+from tolerances import CLOSED_FORM
+
+from minisplat_ref import save_ply
+from minisplat_ref.backends import CPU, REFERENCE
+from minisplat_ref.cli import main
+from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.datasets.synthetic.files import write_scene
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.vr import foveation, measures
+from minisplat_ref.extensions.vr.foveation import Gaze, eccentricities, render_foveated, zone_begins, zone_weights
+from minisplat_ref.extensions.vr.method import BUFFER, HEADSET
+from minisplat_ref.extensions.vr.stages import stages
+from minisplat_ref.oracle.models import check_model_gradients
+from minisplat_ref.rendering import Request
+from minisplat_ref.types import Model, view_from
+
+CAMERA = make_camera(80, 60, fx=60.0, fy=60.0)
+REQUEST = Request(np.array([0.2, 0.4, 0.6]), backend=REFERENCE)
+
+
+def whole(model):
+    return HEADSET.renderer.render(model, view_from(CAMERA), REQUEST)[0].image
+
+
+# --- zones by hand ---
+
+
+def test_eccentricities_are_angles_to_the_gaze():
+    angles = eccentricities(CAMERA, 40.0, 30.5)
+    assert angles[30, 39] == pytest.approx(np.degrees(np.arctan(0.5 / 60)), rel=0.1)
+    assert_allclose(angles[30, 79], np.degrees(np.arctan2(39.5, 60) - np.arctan2(0, 60)), rtol=1e-3)
+    corner = eccentricities(CAMERA, 0.5, 30.0)[29, 79]
+    assert corner == pytest.approx(np.degrees(np.arctan2(39.5, 60) + np.arctan2(39.5, 60)), abs=0.1)
+
+
+def test_zones_begin_where_the_resolved_angle_has_doubled():
+    _, second, third = zone_begins(6.0)
+    at_full = foveation.resolved_angles(np.array(6.0))
+    assert second == pytest.approx(6.0, rel=CLOSED_FORM)
+    assert foveation.resolved_angles(np.array(third)) == pytest.approx(2 * at_full, rel=CLOSED_FORM)
+
+
+def test_weights_add_up_and_never_draw_too_coarsely():
+    angles = np.linspace(0, 60, 601)
+    weights = zone_weights(angles, 6.0)
+    assert_allclose(np.sum(weights, axis=0), 1, rtol=CLOSED_FORM)
+    for weight, begins in zip(weights, zone_begins(6.0), strict=True):
+        assert not weight[angles < begins].any() and weight.max() == 1
+
+
+# --- pictures ---
+
+
+def test_all_in_full_is_the_whole_picture(rng):
+    model = Model(make_gaussians(rng, 25))
+    image, zones = render_foveated(model, CAMERA, REQUEST, Gaze(40, 30, 180.0), BUFFER)
+    assert_array_equal(image, whole(model))
+    assert [zone.n_samples for zone in zones] == [80 * 60, 0, 0]
+
+
+def test_the_fovea_is_drawn_in_full_and_the_rest_is_near(rng):
+    model, gaze = Model(make_gaussians(rng, 25, size=0.3)), Gaze(20, 30, 8.0)
+    image, zones = render_foveated(model, CAMERA, REQUEST, gaze, BUFFER)
+    expected, angles = whole(model), eccentricities(CAMERA, gaze.x, gaze.y)
+    assert_array_equal(image[angles <= 8.0], expected[angles <= 8.0])
+    error = np.abs(image - expected)
+    assert 0 < error[angles > 20].max() < 0.3 and error.mean() < 0.02
+    assert [zone.block for zone in zones] == [1, 2, 4] and all(zone.n_tiles > 0 for zone in zones)
+    assert sum(zone.n_samples for zone in zones) < 0.8 * 80 * 60
+
+
+def test_what_is_smooth_is_interpolated_exactly():
+    """A plane of light: bilinear between the middles of blocks, wherever four of them lie around."""
+    coarse = np.add.outer(np.arange(5.0), 2 * np.arange(7.0))[:, :, None] * np.ones(3)
+    fine = foveation._interpolated(coarse, 2, (10, 14))
+    ys, xs = (np.arange(10) + 0.5) / 2 - 0.5, (np.arange(14) + 0.5) / 2 - 0.5
+    assert_allclose(fine[1:-1, 1:-1, 0], np.add.outer(ys, 2 * xs)[1:-1, 1:-1], rtol=CLOSED_FORM)
+
+
+def test_weighted_psnr_counts_the_fovea(rng):
+    angles = eccentricities(CAMERA, 40, 30)
+    target = np.full((60, 80, 3), 0.5)
+    near, far = target.copy(), target.copy()
+    near[28:32, 38:42] += 0.1
+    far[:4, :4] += 0.1
+    plain = np.zeros_like(angles)
+    assert measures.weighted_psnr(near, target, plain) == pytest.approx(measures.weighted_psnr(far, target, plain))
+    assert measures.weighted_psnr(near, target, angles) < measures.weighted_psnr(far, target, angles) - 15
+
+
+@pytest.mark.parametrize("gaze", [Gaze(-1, 5, 8), Gaze(81, 5, 8), Gaze(5, 60.5, 8), Gaze(np.nan, 5, 8), Gaze(5, 5, -1)])
+def test_a_gaze_outside_is_refused(gaze, rng):
+    with pytest.raises(InputError, match=r"gaze .* lies outside of picture|--full is -1 degrees"):
+        render_foveated(Model(make_gaussians(rng, 2)), CAMERA, REQUEST, gaze, BUFFER)
+
+
+def test_the_gradient_of_the_whole_model():
+    report = check_model_gradients(REFERENCE, GSPLAT_MAIN, HEADSET, stages)
+    assert len(report.cases) == 2 and report.n_failed == 0, report.cases
+
+
+def test_a_yaw_does_not_pop(rng):
+    gaussians = as_dtype(make_gaussians(rng, 30, size=0.5), np.float32)
+    found = measures.yaw_steps(gaussians, make_camera(), 3, 8.0, 8)
+    assert max(found["tangent planes, exact order"]) < 1e-10 < 1e-3 < max(found["3DGS: EWA, by z"])
+
+
+# --- from end to end ---
+
+SCENE = {"n_views": 6, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
+
+
+def test_trains_renders_and_studies(tmp_path, capsys):
+    scene, run = tmp_path / "nook", tmp_path / "run"
+    write_scene(make_scene("room", supersampling=1, **SCENE), scene, SCENE)
+    options = ["--recipe", "vr", "--test-every", "4", "--iterations", "30", "--out", str(run)]
+    assert main(["train", str(scene), *options]) == 0
+    ply, pictures = str(run / "point_cloud.ply"), tmp_path / "pictures"
+    assert main(["vr", "render", ply, "--gaze", "10,12", "--full", "4", "--out", str(pictures)]) == 0
+    assert len(list(pictures.glob("*.png"))) == 2 and "1 for 4 x 4" in capsys.readouterr().out
+    study = ["--ply", ply, "--repeats", "1", "--out", str(tmp_path / "study")]
+    assert main(["study", "vr/foveation", str(scene), *study]) == 0
+    rows = json.loads((tmp_path / "study" / "result.json").read_text())["rows"]
+    assert rows[0]["n_samples"] > rows[1]["n_samples"] and "weighted PSNR" in capsys.readouterr().out
+    assert main(["study", "vr/yaw", "--ply", ply, "--steps", "2", "--out", str(tmp_path / "yaw")]) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--gaze", "99,12"], "gaze 99,12 lies outside of"),
+        (["--gaze", "1"], "no place in a picture"),
+        (["--gaze", "1,2", "--full", "200"], "--full is 200 degrees"),
+    ],
+)
+def test_bad_input_is_one_line(arguments, says, tmp_path, rng, capsys):
+    save_ply(tmp_path / "a.ply", as_dtype(make_gaussians(rng, 3), np.float32))
+    camera = {"img_name": "v", "position": [0, 0, 0], "rotation": np.eye(3).tolist()}
+    camera |= {"width": 24, "height": 18, "fx": 30, "fy": 30}
+    (tmp_path / "cameras.json").write_text(json.dumps([camera]))
+    out = tmp_path / "out"
+    try:
+        code = main(["vr", "render", str(tmp_path / "a.ply"), *arguments, "--out", str(out)])
+    except SystemExit as stop:
+        code = stop.code
+    assert code == 2 and says in capsys.readouterr().err and not out.exists()
+
+
+def test_kernels_draw_what_the_reference_draws(rng):
+    model, gaze = Model(make_gaussians(rng, 25)), Gaze(20, 30, 8.0)
+    images = [
+        render_foveated(model, CAMERA, REQUEST._replace(backend=backend), gaze, BUFFER)[0]
+        for backend in (CPU, REFERENCE)
+    ]
+    assert_allclose(images[0], images[1], atol=1e-11)
