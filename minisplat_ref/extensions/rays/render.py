@@ -13,7 +13,7 @@ from minisplat_ref.extensions.rays import surroundings
 from minisplat_ref.extensions.rays.geometry import pixel_rays
 from minisplat_ref.extensions.rays.lights import World, shade
 from minisplat_ref.extensions.rays.method import tracer_for, whitened_model
-from minisplat_ref.io import viewpoints, write_image
+from minisplat_ref.io import orbits, viewpoints, write_image
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.names import file_names
 from minisplat_ref.io.ply import load_ply
@@ -79,4 +79,4 @@ def _views(args: argparse.Namespace, means: Floats) -> list[viewpoints.Viewpoint
     if args.model.is_dir() and path.exists():
         known = viewpoints.read(path)
         return [view for view in known if view.split == "test"] or known
-    return viewpoints.orbit(means, [], args.frames, *ORBIT_SIZE)
+    return orbits.orbit(means, [], args.frames, *ORBIT_SIZE)
