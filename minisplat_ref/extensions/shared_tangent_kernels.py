@@ -18,7 +18,7 @@ from minisplat_ref.cpu.compositing.exponential import exp_exact, exp_fast
 from minisplat_ref.cpu.compositing.responses import KernelResponse
 from minisplat_ref.extensions.shared_tangent_planes import COSINE_MIN, TangentFootprints, tangent_bases
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import larger, select
+from minisplat_ref.jit.lanes import maximum, select
 from minisplat_ref.jit.literals import HALF, ONE, ZERO
 from minisplat_ref.types import Floats
 
@@ -48,7 +48,7 @@ def tangent_response(exp: Callable) -> KernelResponse:
         a, b = plane(records, n, WHITE, dx, dy), plane(records, n, WHITE + 3, dx, dy)
         c = plane(records, n, WHITE + 6, dx, dy)
         along = records[n, CENTER] * a + records[n, CENTER + 1] * b + records[n, CENTER + 2] * c
-        return records[n, OPACITY] * falloff, along / larger(a * a + b * b + c * c, _TINY), (u, v, falloff)
+        return records[n, OPACITY] * falloff, along / maximum(a * a + b * b + c * c, _TINY), (u, v, falloff)
 
     @scalar
     def hit_vjp(records, n, place, v_mean, v_shape, v_place):

@@ -242,8 +242,8 @@ def as_decided(recipe: Recipe, pace: Pace) -> Recipe:
 def settings_of(recipe: Recipe) -> dict[str, Any]:
     """Return the settings that :func:`configured` can replace, each with its present value, the first of several.
 
-    Settings of events, of loss terms, and of the representation's initialisation and renderer go by their own names; the
-    weight of a loss term by the term's name; whether a calibration is on by the calibration's name.
+    Settings of events, of loss terms, and of the representation's initialisation and renderer go by their own names;
+    the weight of a loss term by the term's name; whether a calibration is on by the calibration's name.
     """
     events = [_settings(event.action) for event in recipe.events]
     terms = [{term.name: term.weight, **_settings(term.function)} for term in recipe.losses]

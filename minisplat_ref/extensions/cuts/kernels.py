@@ -14,7 +14,7 @@ from minisplat_ref.cpu.compositing.responses import MEAN_X, OPACITY, KernelRespo
 from minisplat_ref.extensions.cuts.curve import LENGTH_MIN, N_EDGES, N_POINTS, VERTICES
 from minisplat_ref.extensions.cuts.response import CutFootprints
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import filled, larger, select, smaller, sqrt
+from minisplat_ref.jit.lanes import broadcast, maximum, minimum, select, sqrt
 from minisplat_ref.jit.literals import ONE, ZERO
 from minisplat_ref.types import Floats, Ints
 
@@ -55,7 +55,7 @@ def cut_response(exp: Callable) -> KernelResponse:
     @scalar
     def side_and_nearest(records, n, dx, dy):
         """+1 where an even number of edges is crossed, else -1; and the nearest point to the pixel at d."""
-        nothing = filled(records.dtype.type(0))
+        nothing = broadcast(records.dtype.type(0))
         nearest = (nothing, nothing, nothing + _FAR, nothing, nothing, nothing, nothing)
         side = nothing + ONE
         for i in range(N_EDGES):
@@ -66,7 +66,7 @@ def cut_response(exp: Callable) -> KernelResponse:
                 records[n, V + 2 * i + 3],
             )
             u_x, u_y, r_x, r_y = e_x - o_x, e_y - o_y, dx - o_x, dy - o_y
-            f = smaller(larger((r_x * u_x + r_y * u_y) * records[n, INVERSES + i], ZERO), ONE)
+            f = minimum(maximum((r_x * u_x + r_y * u_y) * records[n, INVERSES + i], ZERO), ONE)
             g = ONE - f
             weights = (
                 g * _WEIGHTS[i, 0] + f * _WEIGHTS[i + 1, 0],
@@ -81,10 +81,10 @@ def cut_response(exp: Callable) -> KernelResponse:
             origin = select(u_y * o_x - u_x * o_y > ZERO, ONE, -ONE)
             side = select((first * last < ZERO) & (beyond * origin < ZERO), -side, side)
         # The two rays: what an end B moves along when it moves away from the centre.
-        f = larger(_along(records, n, dx, dy, 0), ZERO)
+        f = maximum(_along(records, n, dx, dy, 0), ZERO)
         away = dx - (ONE + f) * records[n, V], dy - (ONE + f) * records[n, V + 1]
         nearest = nearer(nearest, away, (ONE + f, nothing, nothing, nothing))
-        f = larger(_along(records, n, dx, dy, 1), ZERO)
+        f = maximum(_along(records, n, dx, dy, 1), ZERO)
         away = dx - (ONE + f) * records[n, V + 2 * N_EDGES], dy - (ONE + f) * records[n, V + 2 * N_EDGES + 1]
         return side, nearer(nearest, away, (nothing, nothing, nothing, ONE + f))
 
@@ -93,7 +93,7 @@ def cut_response(exp: Callable) -> KernelResponse:
         """The mask: a logistic curve of the distance, or a step where the width is 0."""
         e = exp(-distance * records[n, INVERSE_WIDTH])
         soft = select(side > ZERO, ONE / (ONE + e), e / (ONE + e))
-        nothing = filled(records.dtype.type(0))
+        nothing = broadcast(records.dtype.type(0))
         hard = select((side > ZERO) & (distance > ZERO), nothing + ONE, nothing)
         return select(records[n, WIDTH_PX] > ZERO, soft, hard)
 

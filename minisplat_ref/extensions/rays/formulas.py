@@ -14,7 +14,7 @@ import numpy as np
 from minisplat_ref.cpu.gaussian_rows import rows_from
 from minisplat_ref.extensions.rays.bvh import IS_INNER, MOST_LEVELS
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import WIDTH, any_of, gather, larger, largest_of, load, select, smaller, store
+from minisplat_ref.jit.lanes import WIDTH, gather, load, maximum, minimum, reduce_any, reduce_max, select, store
 from minisplat_ref.types import Floats, Ints
 
 MEAN, OPACITY, REACH = 9, 12, 13  # columns of a record; the map is the first nine
@@ -100,8 +100,8 @@ def entry(boxes, node, side, line):
     x0, x1 = (boxes[node, side, 0] - ox) * ix, (boxes[node, side, 3] - ox) * ix
     y0, y1 = (boxes[node, side, 1] - oy) * iy, (boxes[node, side, 4] - oy) * iy
     z0, z1 = (boxes[node, side, 2] - oz) * iz, (boxes[node, side, 5] - oz) * iz
-    t0 = larger(larger(smaller(x0, x1), smaller(y0, y1)), smaller(z0, z1))
-    t1 = smaller(smaller(larger(x0, x1), larger(y0, y1)), larger(z0, z1))
+    t0 = maximum(maximum(minimum(x0, x1), minimum(y0, y1)), minimum(z0, z1))
+    t1 = minimum(minimum(maximum(x0, x1), maximum(y0, y1)), maximum(z0, z1))
     return t0, t1
 
 
@@ -139,7 +139,7 @@ def find_hits(scene, rays, first, end, limits, found):
     eight = rows_from(first, end)
     ray, near, far = rays_of(rays, eight), gather(rays.near, eight, 0), gather(rays.far, eight, 0)
     line = ray[0], ray[1], ray[2], inverse_of(ray[3]), inverse_of(ray[4]), inverse_of(ray[5])
-    bound, farthest = far, largest_of(far)
+    bound, farthest = far, reduce_max(far)
     store(bounds, 0, far)
     for k in range(WIDTH):
         counts[k], left[k] = 0, 1.0
@@ -152,9 +152,9 @@ def find_hits(scene, rays, first, end, limits, found):
         node = nodes[n_waiting]
         a0, a1 = entry(boxes, node, 0, line)
         b0, b1 = entry(boxes, node, 1, line)
-        a_is_met = any_of((a0 <= a1) & (a1 >= near) & (a0 <= bound))
-        b_is_met = any_of((b0 <= b1) & (b1 >= near) & (b0 <= bound))
-        a_entry, b_entry = -largest_of(-a0), -largest_of(-b0)
+        a_is_met = reduce_any((a0 <= a1) & (a1 >= near) & (a0 <= bound))
+        b_is_met = reduce_any((b0 <= b1) & (b1 >= near) & (b0 <= bound))
+        a_entry, b_entry = -reduce_max(-a0), -reduce_max(-b0)
         nearer = 0 if a_entry <= b_entry else 1
         for step in range(2):  # nodes are put aside, the farther one first
             side = nearer if step == 1 else 1 - nearer
@@ -169,7 +169,7 @@ def find_hits(scene, rays, first, end, limits, found):
                 t, e0, e1, e2 = nearest_point(*whitened(records, row, ray))
                 q = e0 * e0 + e1 * e1 + e2 * e2
                 is_met = (q <= records[row, REACH]) & (near < t) & (t < far) & (t <= bound)
-                if not any_of(is_met):
+                if not reduce_any(is_met):
                     continue
                 store(ts, 0, t)
                 store(qs, 0, select(is_met, q, np.inf))
@@ -202,7 +202,7 @@ def find_hits(scene, rays, first, end, limits, found):
                     if T < least:
                         bounds[k] = depths[k, n - 1]
                 bound = load(bounds, 0)
-        farthest = largest_of(bound)
+        farthest = reduce_max(bound)
 
 
 @scalar

@@ -29,7 +29,7 @@ from minisplat_ref.extensions.rays.formulas import (
 from minisplat_ref.extensions.rays.types import BlendedRays, Hits, RayGradient, Rays, Whitened
 from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
 from minisplat_ref.jit.lanes import WIDTH
-from minisplat_ref.jit.turns import no_turns, turns
+from minisplat_ref.jit.scheduling import dynamic_range, shared_counter
 from minisplat_ref.types import Floats, Ints
 
 RAYS_A_TURN = 64  # a multiple of eight
@@ -96,11 +96,11 @@ def goes_on(T, limits):
 @kernel()
 def _blend(scene, colors, rays, background, limits, n_threads, blended):
     n_rays = len(rays.near)
-    taken = no_turns()
+    taken = shared_counter()
     for _ in prange(n_threads):
         found = room_for(limits.capacity)
         image, depths, transmittances, n_hits, is_seen = blended
-        for part in turns(taken, (n_rays + RAYS_A_TURN - 1) // RAYS_A_TURN):
+        for part in dynamic_range(taken, (n_rays + RAYS_A_TURN - 1) // RAYS_A_TURN):
             for r in range(part * RAYS_A_TURN, min((part + 1) * RAYS_A_TURN, n_rays)):
                 lane = r % WIDTH
                 if lane == 0:
@@ -130,11 +130,11 @@ def _blend(scene, colors, rays, background, limits, n_threads, blended):
 def _list(scene, rays, limits, n_threads, hits):
     """Write the hits down, with rows of the scene; ``hits.offsets`` says how many there are."""
     n_rays = len(rays.near)
-    taken = no_turns()
+    taken = shared_counter()
     for _ in prange(n_threads):
         found = room_for(limits.capacity)
         offsets, ray_ids, rows, unclamped, depths, weights, transmittances = hits
-        for part in turns(taken, (n_rays + RAYS_A_TURN - 1) // RAYS_A_TURN):
+        for part in dynamic_range(taken, (n_rays + RAYS_A_TURN - 1) // RAYS_A_TURN):
             for r in range(part * RAYS_A_TURN, min((part + 1) * RAYS_A_TURN, n_rays)):
                 lane = r % WIDTH
                 if lane == 0:
@@ -165,10 +165,10 @@ class _RayCotangents(NamedTuple):
 def _differentiate_rays(scene, colors, rays, limits, n_threads, hits, cotangents, v):
     """Write the gradient with respect to each hit and each ray, from the last hit to the first."""
     n_rays = len(rays.near)
-    taken = no_turns()
+    taken = shared_counter()
     for _ in prange(n_threads):
         v_unclamped, v_depths, v_rays = v
-        for part in turns(taken, (n_rays + RAYS_A_TURN - 1) // RAYS_A_TURN):
+        for part in dynamic_range(taken, (n_rays + RAYS_A_TURN - 1) // RAYS_A_TURN):
             for r in range(part * RAYS_A_TURN, min((part + 1) * RAYS_A_TURN, n_rays)):
                 ray, behind = ray_of(rays, r), cotangents.behind[r]
                 red, green, blue = cotangents.image[r, 0], cotangents.image[r, 1], cotangents.image[r, 2]
@@ -208,10 +208,10 @@ def _sort_by_gaussian(rows, offsets, order):
 def _add_up(scene, rays, n_threads, hits, groups, v_image, v, sums):
     """Add the gradient of each Gaussian up: the map, the mean, the opacity, the colour."""
     n_rows = len(scene.ids)
-    taken = no_turns()
+    taken = shared_counter()
     order, offsets = groups
     for _ in prange(n_threads):
-        for part in turns(taken, (n_rows + GAUSSIANS_A_TURN - 1) // GAUSSIANS_A_TURN):
+        for part in dynamic_range(taken, (n_rows + GAUSSIANS_A_TURN - 1) // GAUSSIANS_A_TURN):
             for row in range(part * GAUSSIANS_A_TURN, min((part + 1) * GAUSSIANS_A_TURN, n_rows)):
                 mean = scene.records[row, MEAN], scene.records[row, MEAN + 1], scene.records[row, MEAN + 2]
                 for k in range(16):

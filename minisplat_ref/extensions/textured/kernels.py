@@ -36,7 +36,7 @@ from minisplat_ref.extensions.textured.formulas import (
 from minisplat_ref.extensions.textured.reference import LIMB
 from minisplat_ref.extensions.textured.response import Footprints, bounds
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes import larger, select, smaller, sqrt
+from minisplat_ref.jit.lanes import maximum, minimum, select, sqrt
 from minisplat_ref.jit.literals import HALF, ONE, TWO, ZERO
 from minisplat_ref.scalar.spherical_harmonics import basis_1, basis_1_vjp, basis_2, basis_2_vjp, basis_3, basis_3_vjp
 from minisplat_ref.types import Floats, Ints
@@ -71,8 +71,8 @@ def textured_response(exp: Callable, constants: tuple) -> KernelResponse:
     def direction(b, q, inverse):
         """n, the unit vector u along b, g and 1 / l^2."""
         h = dot_3(q, q)
-        g, u = sqrt(larger(ONE - h, limb_squared)), times_3(sqrt(inverse), b)
-        shrink = ONE / larger(h + limb_squared, ONE)
+        g, u = sqrt(maximum(ONE - h, limb_squared)), times_3(sqrt(inverse), b)
+        shrink = ONE / maximum(h + limb_squared, ONE)
         return times_3(sqrt(shrink), plus_3(q, times_3(-g, u))), u, g, shrink
 
     @scalar
@@ -88,7 +88,7 @@ def textured_response(exp: Callable, constants: tuple) -> KernelResponse:
         v, _, _, _ = direction(b, q, inverse)
         Y1 = basis_1(v[0], v[1], v[2], constants)
         Y2, Y3 = basis_2(v[0], v[1], v[2], constants), basis_3(v[0], v[1], v[2], constants)
-        raised, odds = exp(smaller(texture(records, n, H, Y1, Y2, Y3) - records[n, BOUND], ZERO)), records[n, ODDS]
+        raised, odds = exp(minimum(texture(records, n, H, Y1, Y2, Y3) - records[n, BOUND], ZERO)), records[n, ODDS]
         share, transparency = raised * (ONE + odds) / (raised + odds), odds / (raised + odds)
         return flat * share, records[n, DEPTH], (Y1, Y2, Y3, dx, (e, dy, falloff), share, transparency)
 
@@ -125,7 +125,7 @@ def textured_response(exp: Callable, constants: tuple) -> KernelResponse:
     @scalar
     def shade(colors, n, k, place):
         first = k * (1 + N_TEXTURE)
-        return larger(colors[n, first] + texture(colors, n, first + 1, place[0], place[1], place[2]), ZERO)
+        return maximum(colors[n, first] + texture(colors, n, first + 1, place[0], place[1], place[2]), ZERO)
 
     @scalar
     def shade_vjp(colors, n, k, place, v):
