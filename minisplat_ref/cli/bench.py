@@ -40,6 +40,7 @@ def add_parser(commands: Commands) -> None:
     parser = commands.add_parser(
         "bench",
         help="measure speed against error",
+        usage="minisplat-ref bench [-h] [options]",
         description=DESCRIPTION,
         epilog=EPILOG,
         formatter_class=HelpFormatter,
