@@ -75,10 +75,14 @@ def test_regret_by_hand():
     assert "costs 0.10 dB, and is 2.17 times" in adaptive.describe_regret([*runs, *better])
 
 
-def test_the_sweep_has_eight_thresholds():
-    thresholds = [settings_of(change(ADAPTIVE))["threshold"] for change in adaptive.SWEEP.values()]
-    assert len(thresholds) == 8 and thresholds == sorted(thresholds, reverse=True)
-    assert settings_of(adaptive.SWEEP["adaptive"](ADAPTIVE)) == settings_of(ADAPTIVE)
+def test_the_sweep_goes_from_little_growth_to_much():
+    settings = [settings_of(change(ADAPTIVE)) for change in adaptive.SWEEP.values()]
+    growth = [(-each["threshold"], each["most_at_once"]) for each in settings]
+    assert len(growth) == 8 and growth == sorted(set(growth))
+    assert adaptive.SWEEP["adaptive"](ADAPTIVE) == ADAPTIVE
+    for each in settings:
+        others = {"threshold": 4e-4, "most_at_once": 0.2}
+        assert {**each, **others} == settings_of(ADAPTIVE), "nothing else differs"
 
 
 def test_study_and_its_continuation(tmp_path, capsys, scene, monkeypatch):

@@ -114,9 +114,10 @@ def without_growth(recipe: Recipe) -> Recipe:
     return recipe._replace(events=tuple(event for event in recipe.events if not does(event, adaptive.grow)))
 
 
-def with_threshold(recipe: Recipe, *, factor: float) -> Recipe:
-    """Return the recipe that halves Gaussians from ``factor`` times the gradient on."""
-    return configured(recipe, threshold=factor * settings_of(recipe)["threshold"])
+def with_growth(recipe: Recipe, **factors: float) -> Recipe:
+    """Return the recipe with settings of its growth multiplied by factors."""
+    settings = settings_of(recipe)
+    return configured(recipe, **{name: factor * settings[name] for name, factor in factors.items()})
 
 
 RULES: Mapping[str, Callable[[Recipe], Recipe]] = {
@@ -130,12 +131,15 @@ RULES: Mapping[str, Callable[[Recipe], Recipe]] = {
     "no poses": lambda recipe: configured(recipe, least_pose_gain=math.inf),
 }
 
-THRESHOLDS = (8.0, 4.0, 2.0, 1.4, 1.0, 0.7, 0.5, 0.25)  # times that of adaptive
 SWEEP: Mapping[str, Callable[[Recipe], Recipe]] = {
-    "adaptive" if factor == 1 else f"threshold x {factor:g}": partial(with_threshold, factor=factor)
-    for factor in THRESHOLDS
+    **{f"threshold x {factor:g}": partial(with_growth, threshold=factor) for factor in (8.0, 4.0, 2.0, 1.4)},
+    "adaptive": lambda recipe: recipe,
+    **{
+        f"threshold / 2, growth x {factor:g}": partial(with_growth, threshold=0.5, most_at_once=factor)
+        for factor in (1.5, 2.0, 3.0)
+    },
 }
-"""Eight counts: the higher the threshold, the fewer Gaussians are halved."""
+"""Eight counts. In small photographs nearly all gradients are above the threshold, and the growth at a time decides."""
 
 
 def run(args: argparse.Namespace) -> None:
