@@ -118,6 +118,8 @@ def test_train_leaves_a_complete_folder(run_folder, scene_folder):
         "drop_bad_steps": False,
         "lpips_weights": None,
         "minutes": None,
+        "max_drop": None,
+        "max_bytes": None,
         "init": None,
         "background": None,
     }

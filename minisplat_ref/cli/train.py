@@ -58,9 +58,8 @@ AFRESH = ("iterations", "lpips_weights", "drop_bad_steps")  # what may be new wh
 
 DESCRIPTION = """\
 Train Gaussians on SCENE, the folder of a COLMAP scene or of a transforms.json.
-DIR will hold report.html, point_cloud.ply, metrics.json, renders/ (truth |
-render | error of each test view) and checkpoints. Ctrl-C saves what there is;
---resume goes on.
+DIR will hold report.html, point_cloud.ply, metrics.json, renders/ of the test
+views and checkpoints. Ctrl-C saves what there is; --resume goes on.
 """
 EPILOG = """\
 example:
