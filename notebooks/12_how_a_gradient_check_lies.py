@@ -414,7 +414,9 @@ figure, axis = plt.subplots(figsize=(8, 2.8))
 for offset, (label, color) in zip((-0.2, 0.2), (("right", BLUE), (error_name, RED)), strict=True):
     heights = [gaps[label, name] for name in mine.inputs]
     axis.bar(np.arange(len(mine.inputs)) + offset, heights, 0.38, color=color)
-axis.set(yscale="log", ylabel="relative to the terms", title=f"two points, step {step:g}; red: {error_name}")
+axis.set(
+    yscale="log", ylim=(1e-14, 1), ylabel="relative to the terms", title=f"two points, step {step:g}; red: {error_name}"
+)
 axis.set_xticks(range(len(mine.inputs)), mine.inputs, rotation=20)
 plt.show()
 
