@@ -148,7 +148,8 @@ EQUIVALENT = {
     " -> _logs_and_weights(0.5 * depth, photograph)": HOMOGENEOUS,
     "depth_smoothness_vjp: v_loss * e * np.sign(np.diff(logs, axis=axis))"
     " -> v_loss * e / np.sign(np.diff(logs, axis=axis))": ONES,
-    "normal_smoothness_vjp: _normal_weights(normals, photograph) -> _normal_weights(0.5 * normals, photograph)": COUNTED,
+    "normal_smoothness_vjp: _normal_weights(normals, photograph)"
+    " -> _normal_weights(0.5 * normals, photograph)": COUNTED,
     "splat_vjp: SplatGradient(v_primitives, v_colors, v_background, v.means2d)"
     " -> SplatGradient(v_primitives, v_colors, v_background, 0.5 * v.means2d)": NOT_AN_INPUT,
 }
