@@ -107,11 +107,13 @@ def test_gif_holds_the_pictures(tmp_path, pictures):
             np.testing.assert_array_equal(np.asarray(film.convert("RGB")), np.full((7, 9, 3), 60 * k))
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # imageio-ffmpeg leaves pipes open
 def test_mp4_holds_the_pictures(tmp_path, pictures):
     imageio = pytest.importorskip("imageio.v2", reason="needs imageio, of the extra [video]")
     pytest.importorskip("imageio_ffmpeg", reason="needs ffmpeg, of the extra [video]")
     write_film(tmp_path / "a.mp4", pictures, fps=20)
-    frames = list(imageio.get_reader(tmp_path / "a.mp4").iter_data())
+    with imageio.get_reader(tmp_path / "a.mp4") as reader:
+        frames = list(reader.iter_data())
     assert [frame.shape for frame in frames] == 3 * [(6, 8, 3)]
     assert [round(float(frame.mean()) / 60) for frame in frames] == [0, 1, 2]
 
