@@ -188,8 +188,8 @@ axes[0].set(
 )
 axes[0].legend(frameon=False)
 factor = staged["v_conics"][shown] / a["v_conics"][shown]
-for column, (name, color) in enumerate((("a", BLUE), ("b", RED), ("c", GREEN))):
-    axes[1].plot(factor[:, column], ".", color=color, markersize=3, label=name)
+for column, (name, color, size) in enumerate((("a", BLUE, 7), ("b", RED, 3), ("c", GREEN, 3))):  # c lies on a
+    axes[1].plot(factor[:, column], ".", color=color, markersize=size, label=name)
 axes[1].set(title="suspect / reference, all Gaussians", xlabel="Gaussian", ylim=(0.3, 1.2))
 axes[1].legend(frameon=False, ncols=3, loc="lower right")
 show(axes[2], 0.35 * a["image"] + 0.65, r"$v_a - v_c$ to the right, $v_b$ up")

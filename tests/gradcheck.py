@@ -40,5 +40,5 @@ def check_inner_products(function, gradients, inputs, cotangents, rng, *, names,
         outputs = derivative(lambda *moved: Point(function(*moved)), inputs, index, direction, step, CENTRAL)
         numeric, analytic = inner(cotangents, outputs), float(np.vdot(gradients[index], direction))
         size = float(np.abs(gradients[index] * direction).sum())
-        assert size > GRADIENT_FLOOR, f"the gradient by {name} is zero: nothing was checked"
-        assert abs(analytic - numeric) <= rel * size, f"gradient by {name}: {analytic} against {numeric}"
+        assert size > GRADIENT_FLOOR, f"the gradient with respect to {name} is zero: nothing was checked"
+        assert abs(analytic - numeric) <= rel * size, f"gradient with respect to {name}: {analytic} against {numeric}"

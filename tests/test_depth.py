@@ -140,7 +140,7 @@ def test_surface_point_gradients(rng):
 
 
 def test_points_do_not_depend_on_the_size(rng):
-    # t is the same at any number of sigmas, so the gradient by the scales has no component along them.
+    # t is the same at any number of sigmas, so the gradient with respect to the scales has no component along them.
     camera, (means, quats, scales, _) = make_camera(4, 3), activated(make_gaussians(rng, 12))
     ids = np.arange(12).reshape(3, 4)
     v = rng.normal(size=(3, 4, 3)), rng.normal(size=(3, 4))

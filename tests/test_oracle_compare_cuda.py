@@ -126,7 +126,7 @@ def test_gsplat_is_asked_only_for_what_it_does():
 
 
 class Splat(torch.autograd.Function):
-    """The 3DGS rasteriser, by the reference in its profile; the gradient by its 2D means is per half image."""
+    """The 3DGS rasteriser, by the reference in its profile; the gradient of its 2D means is per half image."""
 
     @staticmethod
     def forward(ctx, means, means2d, shs, opacities, scales, rotations, camera, settings):

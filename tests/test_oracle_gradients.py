@@ -82,7 +82,7 @@ def test_what_every_step_crosses_is_reported():
 def test_nothing_is_not_a_proof():
     zero = Stage("zero", {"x": ONE}, ("y",), lambda x: Point((0 * x,)), lambda v: (0 * v,))
     assert "nothing was checked about x" in jacobian_case(zero).note
-    assert "the gradient by x is zero" in inner_product_case(zero, np.random.default_rng(0)).note
+    assert "the gradient with respect to x is zero" in inner_product_case(zero, np.random.default_rng(0)).note
 
 
 def test_a_small_block_does_not_hide_behind_a_large_one():
@@ -196,7 +196,7 @@ def test_harmonics_missing_from_the_view_matrix_are_found(monkeypatch, rng):
 
     monkeypatch.setattr(gsplat_compat, "draw_vjp", wrong)
     assert public_case(Call("RGB", n_channels=5), rng).passed
-    assert public_case(Call("RGB"), rng).note == "gradient by viewmats is wrong"
+    assert public_case(Call("RGB"), rng).note == "gradient with respect to viewmats is wrong"
 
 
 def test_y_clamped_by_the_limit_of_x_is_found(monkeypatch):

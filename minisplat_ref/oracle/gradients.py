@@ -130,8 +130,10 @@ def inner_product_case(stage: Stage, rng: np.random.Generator) -> Case:
     inputs, outputs = list(stage.inputs.values()), stage.function(*stage.inputs.values()).outputs
     products = check_inner_products(stage.function, stage.vjp, inputs, rng, names=list(stage.inputs), steps=MANY_STEPS)
     problems = [f"{p.input}: every step crosses a threshold" for p in products if p.step == 0]
-    problems += [f"the gradient by {p.input} is zero" for p in products if p.size <= GRADIENT_FLOOR]
-    problems += [f"gradient by {p.input} is wrong" for p in products if p.step > 0 and not p.error <= _limit(p.step)]
+    problems += [f"the gradient with respect to {p.input} is zero" for p in products if p.size <= GRADIENT_FLOOR]
+    problems += [
+        f"gradient with respect to {p.input} is wrong" for p in products if p.step > 0 and not p.error <= _limit(p.step)
+    ]
     step = min(p.step for p in products)
     figures = {
         "error": max(p.error for p in products),
@@ -164,7 +166,7 @@ def autograd_cases(backend: Backend) -> list[Case]:
         gradients = zip(ours.vjp(*cotangents), theirs.vjp(*cotangents), strict=True)
         errors = [_relative(got, expected) for got, expected in gradients]
         wrong = zip(ours.inputs, errors, strict=True)
-        problems = [f"gradient by {name} differs" for name, error in wrong if not error <= PEER_REL]
+        problems = [f"gradient with respect to {name} differs" for name, error in wrong if not error <= PEER_REL]
         figures = {"error": max(errors), "limit": PEER_REL}
         cases.append(_case(f"{ours.name}: {AUTOGRAD}", ours, outputs, figures, problems))
     return cases

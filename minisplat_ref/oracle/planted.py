@@ -323,10 +323,10 @@ PLANTED = (
     Planted(
         "transposed-pose",
         "v_R",
-        "gradient by the view rotation transposed",
+        "gradient of the view rotation transposed",
         _changed_project_vjp(lambda v, q: v._replace(cam_from_world_R=v.cam_from_world_R.T.copy())),
     ),
-    Planted("depth-forgotten", "v_means", "gradient by the depths not handed on to the means", _forgotten_depth),
+    Planted("depth-forgotten", "v_means", "gradient of the depths not handed on to the means", _forgotten_depth),
     Planted("direction-frozen", "v_means", "colours do not move with the viewing direction", _frozen_direction),
 )
 """In the order of the pipeline, forward before backward."""

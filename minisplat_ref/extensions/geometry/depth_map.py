@@ -49,12 +49,12 @@ def depth_normals_vjp(depth: Floats, camera: Camera, v_normals: Floats) -> Float
     depth, camera
         As for the forward function.
     v_normals : ndarray of shape (H - 1, W - 1, 3)
-        Derivative by the normals.
+        Derivative with respect to the normals.
 
     Returns
     -------
     ndarray of shape (H, W)
-        Derivative by the depth.
+        Derivative with respect to the depth.
     """
     a, b, N, exists = _cross_products(depth, camera)
     length = np.where(exists, np.linalg.norm(N, axis=2, keepdims=True), 1)

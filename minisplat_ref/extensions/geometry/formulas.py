@@ -35,7 +35,7 @@ def huber(error, tolerance):
 
 @scalar
 def huber_vjp(error, tolerance):
-    """Derivative by the error: -1 to 1."""
+    """Derivative with respect to the error: -1 to 1."""
     return min(max(error / tolerance, -ONE), ONE)
 
 
@@ -51,7 +51,7 @@ def pixel_normal(z, z_right, z_down, s, t, fx, fy):
 
 @scalar
 def pixel_normal_vjp(z, z_right, z_down, s, t, fx, fy, v_normal):
-    """Gradient by log(z_right / z) and log(z_down / z), since p = fx (1 - exp(-log(z_right / z)))."""
+    """Gradient with respect to log(z_right / z) and log(z_down / z), since p = fx (1 - exp(-log(z_right / z)))."""
     normal, inverse_length = pixel_normal(z, z_right, z_down, s, t, fx, fy)
     along = dot(normal, v_normal)
     v_x = (v_normal[0] - along * normal[0]) * inverse_length

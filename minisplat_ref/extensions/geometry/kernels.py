@@ -254,7 +254,7 @@ def _seen_points(depth: Floats, camera: Camera, lens: Floats, points: Floats) ->
 
 
 def geometric_loss_vjp(tape: GeometricTape, v_loss: float = 1.0) -> tuple[Floats, Floats]:
-    """Chain the derivative by the loss to accumulated depth and opacity; see ``reference.geometric_loss``."""
+    """Carry the loss's derivative on to accumulated depth and opacity; see ``reference.geometric_loss``."""
     depth, weights, dtype = tape.depth, tape.weights, tape.depth.dtype
     v_logs = np.zeros(depth.shape, dtype)
     if weights.depth_smoothness:

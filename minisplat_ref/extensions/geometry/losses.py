@@ -12,7 +12,7 @@ from minisplat_ref.training.losses import Cotangents, LossTerm, Rendered
 
 
 def geometric(rendered: Rendered, weights: GeometricWeights) -> tuple[float, Cotangents]:
-    """Return the geometric loss with these weights, and its derivatives by depth channel and alpha."""
+    """Return the geometric loss with these weights, and its derivatives with respect to depth channel and alpha."""
     view = rendered.view
     points = rendered.scene.points[view.point_ids] if view.point_ids is not None else rendered.scene.points[:0]
     photograph = view.image * np.float32(1 / 255)  # [H, W, 3]

@@ -10,7 +10,8 @@ Depths are compared by the logarithm of their ratio. The unit of a scene from st
 weight must not depend on it; triangulation errors grow with the distance; too near and too far count alike, where
 inverse depth hardly sees an error behind a far point. A point looks at the pixel it falls on: interpolating would mix
 both sides of a silhouette, and half a pixel of a surface tilted by 60 degrees is 0.2 % of its depth at a focal length
-of 500 pixels, less than the tolerance. Left out: uncertainties of single points, and gradients by the pose.
+of 500 pixels, less than the tolerance. Left out: uncertainties of single points, and the gradient
+with respect to the pose.
 """
 
 from typing import NamedTuple
@@ -97,14 +98,14 @@ def geometric_loss_vjp(tape: GeometricTape, v_loss: float = 1.0) -> tuple[Floats
     tape : GeometricTape
         From the forward function.
     v_loss : float
-        Derivative by the loss.
+        Derivative with respect to the loss.
 
     Returns
     -------
     v_accumulated_depth : ndarray of shape (H, W)
-        Derivative by the accumulated depth.
+        Derivative with respect to the accumulated depth.
     v_alpha : ndarray of shape (H, W)
-        Derivative by the accumulated opacity.
+        Derivative with respect to the accumulated opacity.
     """
     depth, photograph, camera, weights = tape.depth, tape.photograph, tape.camera, tape.weights
     v_normals = normal_smoothness_vjp(depth_normals(depth, camera), photograph, v_loss * weights.normal_smoothness)
@@ -154,12 +155,12 @@ def sfm_depth_loss_vjp(depth: Floats, camera: Camera, points: Floats, v_loss: fl
     depth, camera, points
         As for the forward function.
     v_loss : float
-        Derivative by the loss.
+        Derivative with respect to the loss.
 
     Returns
     -------
     ndarray of shape (H, W)
-        Derivative by the depth.
+        Derivative with respect to the depth.
     """
     rows, columns, errors = _depth_errors(depth, camera, points)
     slopes = np.clip(errors / SFM_DEPTH_TOLERANCE, -1, 1)
@@ -201,12 +202,12 @@ def depth_smoothness_vjp(depth: Floats, photograph: Floats, v_loss: float = 1.0)
     depth, photograph
         As for the forward function.
     v_loss : float
-        Derivative by the loss.
+        Derivative with respect to the loss.
 
     Returns
     -------
     ndarray of shape (H, W)
-        Derivative by the depth.
+        Derivative with respect to the depth.
     """
     logs, weights = _logs_and_weights(depth, photograph)
     v_logs = np.zeros_like(depth)
@@ -250,12 +251,12 @@ def normal_smoothness_vjp(normals: Floats, photograph: Floats, v_loss: float = 1
     normals, photograph
         As for the forward function.
     v_loss : float
-        Derivative by the loss.
+        Derivative with respect to the loss.
 
     Returns
     -------
     ndarray of shape (H - 1, W - 1, 3)
-        Derivative by the normals.
+        Derivative with respect to the normals.
     """
     v_normals = np.zeros_like(normals)
     for axis, e in enumerate(_normal_weights(normals, photograph)):

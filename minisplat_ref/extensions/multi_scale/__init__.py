@@ -23,7 +23,7 @@ decides much: cubes of 4 pixels instead of one cost 1.3 dB at the full size and 
 
 Where this deviates: the paper drops every Gaussian by its own coverage, within bounds that follow the training; then
 the members of a cube leave at other distances than their parent comes, and training has to mend that. Here coverage
-says who is merged, and the cube's coverage when. Averages are moments, voxels are octaves of the finest sampling
+says which are merged, and the cube's coverage when. Averages are moments, voxels are octaves of the finest sampling
 instead of contracted coordinates, the coarse loss comes on top of the fine one, and levels take turns. Left out:
 changing the bounds during training, since cells do not change.
 

@@ -312,9 +312,9 @@ The other stages are each by itself; nothing of L depends on them:
 In a scene that is called exact, some values equal their thresholds in binary (a transmittance, an alpha, a depth). In
 float64 no rounding is an excuse there: it shows what a renderer does at equality.
 
-`b` of a conic stands twice in its matrix; `v_conics[:, 1]` is the derivative by b itself, so it holds both. Pose
-gradients are by the nine entries of R as if they were free. Skips, stops, boxes and the order of the Gaussians count as
-fixed.
+`b` of a conic stands twice in its matrix; `v_conics[:, 1]` is the derivative with respect to b itself and holds both.
+Pose gradients are with respect to the nine entries of R as if they were free. Skips, stops, boxes and the order of the
+Gaussians count as fixed.
 
 ## Stages
 

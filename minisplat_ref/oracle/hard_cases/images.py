@@ -127,13 +127,13 @@ COLORS = (
     HardCase(
         "color-below-0",
         "all channels are negative before the clamp",
-        "black, and no gradient by the colours",
+        "black, and no gradient with respect to the colours",
         lambda: _clamped(-0.3),
     ),
     HardCase(
         "color-just-above-0",
         "1e-3 above the clamp",
-        "nearly black, and the whole gradient by the colours",
+        "nearly black, and the whole gradient with respect to the colours",
         lambda: _clamped(1e-3),
     ),
     HardCase(

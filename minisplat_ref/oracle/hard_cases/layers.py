@@ -44,7 +44,7 @@ LAYERS = (
     HardCase(
         "logit-plus-9",
         "1 - o = 1e-4 has three digits in float32 where it is a difference",
-        "a gradient by the logit with all digits",
+        "a gradient with respect to the logit with all digits",
         lambda: Parameters(cloud(scales=0.3, opacity_logits=np.full(30, 9.0)), camera()),
         BEHIND,
     ),
@@ -238,19 +238,19 @@ LAYERS = (
     HardCase(
         "alone-behind-opaque-layers",
         "what is left behind three opaque hits is a difference from the whole pixel, and here the whole gradient",
-        "the gradient by a short quaternion, to three digits less than others",
+        "the gradient with respect to a short quaternion, to three digits less than others",
         _seen_through_layers,
         BEHIND,
     ),
     HardCase(
         "subnormal-gradients",
-        "derivatives by the image of 1e-40: subnormal in float32, their products are 0",
+        "derivatives with respect to the image of 1e-40: subnormal in float32, their products are 0",
         "finite gradients, as good as zero",
         lambda: Parameters(cloud(), camera(), cotangent_scale=1e-40),
     ),
     HardCase(
         "huge-gradients",
-        "derivatives by the image of 1e20: their squares are beyond float32",
+        "derivatives with respect to the image of 1e20: their squares are beyond float32",
         "1e20 times the gradient",
         lambda: Parameters(cloud(), camera(), cotangent_scale=1e20),
     ),

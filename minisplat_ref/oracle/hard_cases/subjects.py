@@ -186,7 +186,7 @@ def _draw_parameters(subject: Parameters, backend: Backend, dtype: np.dtype) -> 
 
 
 def _by_opacity(logits: Floats, v_logits: Floats) -> Floats:
-    """Divide gradients by the logits' o (1 - o), without which they are too small near the ends to be compared."""
+    """Divide gradients with respect to logits by o (1 - o): near the ends they are too small to be compared."""
     small = np.exp(-np.abs(logits))  # float64, all digits
     slopes = small / (1 + small) ** 2
     return np.where(slopes > LEAST_SLOPE, v_logits / np.maximum(slopes, LEAST_SLOPE), 0)
