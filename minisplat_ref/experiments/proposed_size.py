@@ -28,7 +28,7 @@ REPEATS = 3
 
 
 def propose(scene: Scene, state: TrainState, recipe: Recipe, settings: Settings) -> str | None:
-    """Return a line that proposes a size, or None if the photographs are small enough.
+    """Return a line that proposes a size, or None if the photographs are small enough or the backend is not compiled.
 
     Parameters
     ----------
@@ -39,6 +39,8 @@ def propose(scene: Scene, state: TrainState, recipe: Recipe, settings: Settings)
     recipe : Recipe
     settings : Settings
     """
+    if not get_backend(settings.backend).is_compiled:
+        return None  # NumPy takes minutes for what is timed here
     view = max(scene.train_views, key=lambda view: view.camera.width * view.camera.height)
     width, height = view.camera.width, view.camera.height
     if max(width, height) < LARGE:

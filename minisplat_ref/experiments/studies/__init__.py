@@ -62,6 +62,16 @@ def _add_scene_arguments(parser: argparse.ArgumentParser, iterations: int) -> No
     )
 
 
+def _add_resumed_scene_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add a scene of any kind, ``--downscale`` and a folder with which the study goes on."""
+    names = ", ".join(SYNTHETIC_SCENES)
+    parser.add_argument("scene", metavar="SCENE", help=f"folder of a scene, or a synthetic one: {names}")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=f"folder for {RESULT} and {FIGURE}")
+    parser.add_argument(
+        "--downscale", type=integer(1), default=1, metavar="D", help="make a folder's photographs D times smaller"
+    )
+
+
 def _add_seeds(parser: argparse.ArgumentParser) -> None:
     """Add ``--seeds``."""
     parser.add_argument(
@@ -74,12 +84,7 @@ def _add_adaptive_arguments(parser: argparse.ArgumentParser) -> None:
         "Train a scene by adaptive and by recipes with a schedule, as it is and\ndisturbed. The same command with "
         "the same folder goes on where it was\ninterrupted."
     )
-    names = ", ".join(SYNTHETIC_SCENES)
-    parser.add_argument("scene", metavar="SCENE", help=f"folder of a scene, or a synthetic one: {names}")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=f"folder for {RESULT} and {FIGURE}")
-    parser.add_argument(
-        "--downscale", type=integer(1), default=1, metavar="D", help="make a folder's photographs D times smaller"
-    )
+    _add_resumed_scene_arguments(parser)
     parser.add_argument(
         "--recipes",
         type=listed(name),
@@ -203,12 +208,7 @@ def _add_defects_arguments(parser: argparse.ArgumentParser) -> None:
         "Disturb the photographs of a scene in known ways, and count what adaptive\nswitches on. The same command with "
         "the same folder goes on where it was\ninterrupted."
     )
-    names = ", ".join(SYNTHETIC_SCENES)
-    parser.add_argument("scene", metavar="SCENE", help=f"folder of a scene, or a synthetic one: {names}")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help=f"folder for {RESULT} and {FIGURE}")
-    parser.add_argument(
-        "--downscale", type=integer(1), default=1, metavar="D", help="make a folder's photographs D times smaller"
-    )
+    _add_resumed_scene_arguments(parser)
     parser.add_argument("--trials", type=integer(1), default=10, metavar="N", help="of each kind (default 10)")
 
 

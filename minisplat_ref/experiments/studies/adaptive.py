@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.studies.ablation import append, read_records
-from minisplat_ref.experiments.studies.defects import with_turned_cameras
+from minisplat_ref.experiments.studies.defects import multiplied, with_turned_cameras
 from minisplat_ref.experiments.studies.front import BLUE, RED, describe_scene, read_scene, tidy, title, write
 from minisplat_ref.methods import adaptive, gaussian_splatting, get_recipe
 from minisplat_ref.metrics import evaluate
@@ -34,7 +34,7 @@ from minisplat_ref.training.loop import train
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.schedule import Recipe, configured, does, scaled, settings_of
 from minisplat_ref.training.state import Iteration, StepReport, TrainState
-from minisplat_ref.types import Scene, View
+from minisplat_ref.types import Scene
 
 ITERATIONS = 3000  # of recipes with a schedule
 WARM_UP = 20  # iterations
@@ -58,14 +58,7 @@ def few_photographs(scene: Scene) -> Scene:
 def random_gains(scene: Scene) -> Scene:
     """Return the scene with every training photograph multiplied by a gain of its own; test views stay."""
     low, high = np.log(GAINS)
-    gains = np.exp(np.random.default_rng(0).uniform(low, high, len(scene.train_views)))
-
-    def multiplied(view: View, gain: float) -> View:
-        view = view.loaded()
-        return view._replace(image=np.clip(np.round(view.image * gain), 0, 255).astype(np.uint8))
-
-    views = tuple(multiplied(view, gain) for view, gain in zip(scene.train_views, gains, strict=True))
-    return scene._replace(train_views=views)
+    return multiplied(scene, np.exp(np.random.default_rng(0).uniform(low, high, len(scene.train_views))))
 
 
 def half_a_pixel_off(scene: Scene) -> Scene:

@@ -12,6 +12,7 @@ used for the disturbance and the training.
 """
 
 import argparse
+import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -31,7 +32,7 @@ from minisplat_ref.training.calibration import EXPOSURE, POSE
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import firing_steps
 from minisplat_ref.training.state import StepReport
-from minisplat_ref.types import Scene
+from minisplat_ref.types import Floats, Scene
 
 LARGEST_GAIN = 0.1
 PIXELS = 0.5
@@ -45,7 +46,11 @@ def clean(scene: Scene, rng: np.random.Generator) -> Scene:
 
 def with_gains(scene: Scene, rng: np.random.Generator) -> Scene:
     """Return the scene with every training photograph multiplied by a gain of its own."""
-    gains = rng.uniform(1 - LARGEST_GAIN, 1 + LARGEST_GAIN, len(scene.train_views))
+    return multiplied(scene, rng.uniform(1 - LARGEST_GAIN, 1 + LARGEST_GAIN, len(scene.train_views)))
+
+
+def multiplied(scene: Scene, gains: Floats) -> Scene:
+    """Return the scene with its training photographs multiplied by ``gains`` [V]; test photographs stay."""
     views = []
     for view, gain in zip(scene.train_views, gains, strict=True):
         view = view.loaded()
@@ -118,10 +123,8 @@ def decide(scene: Scene, seed: int) -> dict[str, Any]:
             notes.update({fired.action: fired.note for fired in report.fired if "switch" in fired.action})
             raise _DecidedError
 
-    try:
+    with contextlib.suppress(_DecidedError):
         train(scene, adaptive.ADAPTIVE, seed=seed, on_step=on_step)
-    except _DecidedError:
-        pass
     return {"switched_on": list(switched_on), "evidence": notes, "seconds": time.process_time() - start}
 
 
