@@ -2,21 +2,20 @@
 
 import numpy as np
 import pytest
+from adaptive_states import iteration_of, state_of
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import as_dtype, make_camera, make_gaussians
 from tolerances import DISPLACEMENT_PX
 
 from minisplat_ref.backends import CPU
-from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.methods.adaptive import ADAPTIVE
 from minisplat_ref.methods.adaptive_evidence import Evidence, Half, displacements, halves_of, weigh
 from minisplat_ref.methods.adaptive_pose import hold_mean_pose, rotation_of, switch_pose_on, turn_held_out
 from minisplat_ref.rendering import render
 from minisplat_ref.training.calibration import ROTATIONS, SHIFTS, correct_pose
-from minisplat_ref.training.loop import initial_state, load_state, save_state, train
+from minisplat_ref.training.loop import load_state, save_state, train
 from minisplat_ref.training.pace import Pace, held_out_ids, trained_ids
 from minisplat_ref.training.schedule import At, Every, configured
-from minisplat_ref.training.state import Iteration
 from minisplat_ref.types import Scene, View
 
 BACKGROUND = np.array([0.3, 0.3, 0.3])
@@ -119,21 +118,6 @@ def pixels():
 @pytest.fixture(scope="module")
 def disturbed(truth, pixels):
     return scene_of(truth, pixels)
-
-
-def state_of(scene, truth):
-    state = initial_state(scene, ADAPTIVE, 0)
-    state.gaussians = type(truth)(*(field.copy() for field in truth))
-    return state
-
-
-def iteration_of(scene, step=600):
-    return Iteration(
-        *(scene, scene.train_views[0], None, np.zeros(0, int), None, CPU, GSPLAT_MAIN),
-        step=step,
-        iterations=30_000,
-        cooling=ADAPTIVE.cooling,
-    )
 
 
 def test_displacements_are_read_off(disturbed, truth, pixels):

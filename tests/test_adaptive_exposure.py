@@ -2,20 +2,19 @@
 
 import numpy as np
 import pytest
+from adaptive_states import iteration_of, state_of
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import as_dtype, make_camera, make_gaussians
 
 from minisplat_ref.backends import CPU
-from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.io.checkpoint import DamagedCheckpoint, load_checkpoint, save_checkpoint
 from minisplat_ref.methods.adaptive import ADAPTIVE
 from minisplat_ref.methods.adaptive_exposure import hold_mean_exposure, log_gains, switch_exposure_on
 from minisplat_ref.rendering import render
 from minisplat_ref.training.calibration import EXPOSURES
-from minisplat_ref.training.loop import initial_state, load_state, save_state, train
+from minisplat_ref.training.loop import load_state, save_state, train
 from minisplat_ref.training.pace import Pace, held_out_ids, trained_ids
 from minisplat_ref.training.schedule import At, Every, configured
-from minisplat_ref.training.state import Iteration
 from minisplat_ref.types import Scene, View
 
 GAINS = np.array([0.7, 1.2, 1.0, 0.8, 1.1, 0.9, 1.3, 1.0])
@@ -44,22 +43,6 @@ def truth():
 @pytest.fixture
 def disturbed(truth):
     return scene_of(truth, GAINS)
-
-
-def state_of(scene, truth):
-    """The truth, trained."""
-    state = initial_state(scene, ADAPTIVE, 0)
-    state.gaussians = type(truth)(*(field.copy() for field in truth))
-    return state
-
-
-def iteration_of(scene, step=600):
-    return Iteration(
-        *(scene, scene.train_views[0], None, np.zeros(0, int), None, CPU, GSPLAT_MAIN),
-        step=step,
-        iterations=30_000,
-        cooling=ADAPTIVE.cooling,
-    )
 
 
 def test_gains_are_read_off(disturbed, truth):

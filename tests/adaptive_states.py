@@ -1,0 +1,26 @@
+"""A training by ``adaptive`` in mid-run, for the tests of what it decides about its photographs."""
+
+import numpy as np
+
+from minisplat_ref.backends import CPU
+from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.methods.adaptive import ADAPTIVE
+from minisplat_ref.training.loop import initial_state
+from minisplat_ref.training.state import Iteration
+
+
+def state_of(scene, truth):
+    """The truth, trained."""
+    state = initial_state(scene, ADAPTIVE, 0)
+    state.gaussians = type(truth)(*(field.copy() for field in truth))
+    return state
+
+
+def iteration_of(scene, step=600):
+    """An iteration whose view and rendering no decision uses."""
+    return Iteration(
+        *(scene, scene.train_views[0], None, np.zeros(0, int), None, CPU, GSPLAT_MAIN),
+        step=step,
+        iterations=30_000,
+        cooling=ADAPTIVE.cooling,
+    )
