@@ -156,9 +156,9 @@ def time_both(state: TrainState, scene: Scene, recipe: Recipe, is_visible: Bools
     for i in tqdm(range(len(seconds)), desc="timing", leave=False):
         for k in (0, 1) if i % 2 else (1, 0):  # each is first as often as second
             one_more = recipe._replace(iterations=arms[k].step + 1, events=())
-            start = time.perf_counter()
+            start = time.process_time()
             train(scene, one_more, seed=0, state=arms[k])
-            seconds[i, k] = time.perf_counter() - start
+            seconds[i, k] = time.process_time() - start
     return seconds[WARM_UP:]
 
 
