@@ -60,7 +60,7 @@ def populations(args: argparse.Namespace, scene: Scene) -> list[Gaussians]:
     recipe = get_recipe(args.recipe, args.iterations)
     trained = []
     for seed in range(args.seeds):
-        with tqdm(total=recipe.iterations, desc=f"{recipe.name}, seed {seed}", leave=False) as bar:
+        with tqdm(total=recipe.iterations, desc=f"{recipe.name}, seed {seed}", leave=False, disable=None) as bar:
             trained.append(train(scene, recipe, seed=seed, on_step=lambda _: bar.update()).gaussians)
     return trained
 

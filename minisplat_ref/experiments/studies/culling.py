@@ -90,7 +90,7 @@ def resume_from(state: TrainState, gaussians: Gaussians, step: int) -> None:
 
 def reach(state: TrainState, scene: Scene, recipe: Recipe, step: int) -> None:
     """Train until ``step``."""
-    with tqdm(total=step - state.step, desc=f"to iteration {step}", leave=False) as bar:
+    with tqdm(total=step - state.step, desc=f"to iteration {step}", leave=False, disable=None) as bar:
         train(scene, recipe._replace(iterations=step), seed=0, state=state, on_step=lambda _: bar.update())
 
 
@@ -153,7 +153,7 @@ def time_both(state: TrainState, scene: Scene, recipe: Recipe, is_visible: Bools
         arm.stats.pop("is_visible", None)
     arms[1].stats["is_visible"] = is_visible
     seconds = np.zeros((WARM_UP + repeats, 2))
-    for i in tqdm(range(len(seconds)), desc="timing", leave=False):
+    for i in tqdm(range(len(seconds)), desc="timing", leave=False, disable=None):
         for k in (0, 1) if i % 2 else (1, 0):  # each is first as often as second
             one_more = recipe._replace(iterations=arms[k].step + 1, events=())
             start = time.perf_counter()

@@ -105,7 +105,7 @@ def mean_psnr(
     return psnr
 
 
-def points(
+def rate_points(
     gaussians: Gaussians, views: tuple[View, ...], background: Floats, psnr: float, program: str | None
 ) -> Iterator[Point]:
     """Yield the size and the loss of each file of the Gaussians, whose own PSNR is given."""

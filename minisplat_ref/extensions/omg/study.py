@@ -1,6 +1,6 @@
 """The study ``omg/distinctiveness``: which Gaussians of a scene to keep, and what they cost as a file.
 
-The Gaussians come from a training with Mini-Splatting2 or from a PLY. Of those that dominate a pixel, the same number is
+The Gaussians come from a training with Mini-Splatting2 or from a PLY. Of those that dominate a pixel, equally many are
 kept by importance alone and by importance times distinctiveness squared; both selections are fine-tuned for the same
 number of iterations, without any event. Then each is written as ``.omg`` and read again. For the whole population, each
 field by itself is taken from such a file at every level, which shows where the quality is lost.
@@ -109,7 +109,7 @@ def measured(whole: Gaussians, scene: Scene, iterations: int, seed: int) -> list
     tuned = fine_tuned(whole, scene, iterations, seed)
     rows = [_row("all", "", quality(whole, scene), tuned, scene)]
     jobs = [(fraction, choice) for fraction in FRACTIONS for choice in CHOICES]
-    for fraction, choice in tqdm(jobs, desc=f"fine-tunings, seed {seed}", leave=False):
+    for fraction, choice in tqdm(jobs, desc=f"fine-tunings, seed {seed}", leave=False, disable=None):
         score = distinct_importance(importance, distinctiveness, CHOICES[choice])
         n = max(1, round(fraction * np.count_nonzero(importance)))
         kept = take(whole, most_important(score, min(n, np.count_nonzero(score))))
@@ -255,7 +255,7 @@ def _over_seeds(
 
 
 def _gain(runs: list[list[dict[str, Any]]], half: str) -> tuple[Floats, Floats]:
-    """Return the gain of distinctiveness in a half of the pixels after fine-tuning: means and deviations by fraction."""
+    """Return the gain of distinctiveness in a half of the pixels after fine-tuning: mean and deviation by fraction."""
     plain, distinct = CHOICES
     gains = [
         [b["tuned"][half] - a["tuned"][half] for a, b in zip(_of(rows, plain), _of(rows, distinct), strict=True)]

@@ -74,7 +74,7 @@ def fitted_codes(vectors: Floats, n_codes: int) -> Floats:
 
 
 def _initial_codes(vectors: Floats, n_codes: int) -> Floats:
-    """Return vectors [K, w] spread evenly over the space that all occupy: one per cell of the largest fitting cells."""
+    """Return vectors [K, w] spread evenly over the occupied space: one per cell, of the largest cells that give K."""
     low = vectors.min(axis=0)
     side = float((vectors.max(axis=0) - low).max())
     for bits in range(1, MOST_BITS):
