@@ -108,7 +108,7 @@ def test_spz_reaches_2048():
     gaussians.means[1] = [2047.99, 0, 0]
     assert np.isfinite(spz.decode(spz.encode(gaussians, 0), "file").means).all()
     gaussians.means[1] = [2048, 0, 0]
-    with pytest.raises(InputError, match=r"centre of row 1 is 2048 away, and SPZ reaches 2048 \(1 of 3 are too far\)"):
+    with pytest.raises(InputError, match=r"centre of row 1 is 2048 away, but SPZ reaches 2048 \(1 of 3 are too far\)"):
         spz.encode(gaussians, 0)
 
 

@@ -19,8 +19,8 @@ def traces(log_scales: Floats) -> Floats:
 def trace_penalty(log_scales: Floats, limit: float) -> float:
     """Return ``mean_k max(tr(Sigma_k) / tau - 1, 0)``.
 
-    The mean replaces the paper's sum, and the trace is in units of its limit, so that one weight fits scenes of any size
-    and any number of Gaussians.
+    The mean replaces the paper's sum, and the trace is in units of its limit, so one weight fits scenes of any size and
+    any number of Gaussians.
 
     Parameters
     ----------

@@ -14,9 +14,7 @@ def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tupl
     """Return the penalty with a limit that half of the Gaussians exceed; all backends share it."""
     log_scales = setting.gaussians.log_scales
     ordered, middle = np.sort(traces(log_scales)), len(log_scales) // 2
-    limit = float(
-        ordered[middle - 1 : middle + 1].mean()
-    )  # between two traces, because the penalty has no derivative at one
+    limit = float(ordered[middle - 1 : middle + 1].mean())  # between traces: no kink there
 
     def function(log_scales: Floats) -> Point:
         return Point((np.asarray(trace_penalty(log_scales, limit)),), (traces(log_scales) > limit,))
