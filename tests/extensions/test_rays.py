@@ -94,11 +94,11 @@ def test_the_gradient_of_a_meeting(rng):
 
     def forward(means, maps, opacities, origins, directions):
         moved = rays._replace(origins=origins, directions=directions)
-        pairs = reference.meet(Whitened(means, maps, opacities), moved, rays_ids, ids)
+        pairs = reference.evaluate_pairs(Whitened(means, maps, opacities), moved, rays_ids, ids)
         return pairs.unclamped, pairs.depths
 
     def vjp(v_unclamped, v_depths):
-        parts = reference.meet_vjp(gaussians, rays, rays_ids, ids, v_unclamped, v_depths)
+        parts = reference.evaluate_pairs_vjp(gaussians, rays, rays_ids, ids, v_unclamped, v_depths)
         rows = (ids, ids, ids, rays_ids, rays_ids)
         return tuple(reference._summed(part, row, 3 + (row is rays_ids)) for part, row in zip(parts, rows, strict=True))
 
@@ -225,13 +225,13 @@ def test_the_gradient_of_the_whole_model(backend):
 
 
 def test_a_wrong_gradient_is_found(monkeypatch):
-    correct = reference.meet_vjp
+    correct = reference.evaluate_pairs_vjp
 
     def wrong(*args):
         v_means, *others = correct(*args)
         return 1.001 * v_means, *others
 
-    monkeypatch.setattr(reference, "meet_vjp", wrong)
+    monkeypatch.setattr(reference, "evaluate_pairs_vjp", wrong)
     report = check_model_gradients(REFERENCE, GSPLAT_MAIN, TRACED, stages)
     assert report.n_failed == 2 and "is wrong" in report.cases[0].note
 

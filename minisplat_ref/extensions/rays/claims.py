@@ -15,7 +15,7 @@ from minisplat_ref.extensions.rays.geometry import pixel_rays
 from minisplat_ref.extensions.rays.lights import shade, visibility
 from minisplat_ref.extensions.rays.method import TRACED, whitened_model
 from minisplat_ref.extensions.rays.surfaces import MIRROR
-from minisplat_ref.extensions.rays.surroundings import Surroundings, joined, made_of, parallelogram
+from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenated_surfaces, parallelogram, surfaces_of
 from minisplat_ref.extensions.shared_studies import tidy
 from minisplat_ref.reference.compositing import composite_hits
 from minisplat_ref.reference.hits import Hit, Response
@@ -92,8 +92,8 @@ def mirror_difference(n: int, seed: int) -> float:
     gaussians.means[:, 2] -= 10  # behind the camera, which sees them in the mirror alone
     z = 1.5
     sides = np.array([[4.0, 0.0, 0.0], [0.0, 4.0, 0.0]])
-    wall = made_of(parallelogram(np.array([-2.0, -2.0, z]), sides), MIRROR)
-    world = demo.world_of(gaussians, Surroundings(np.zeros((0, 3)), 1.0, 0.0, joined([wall])), BLACK)
+    wall = surfaces_of(parallelogram(np.array([-2.0, -2.0, z]), sides), MIRROR)
+    world = demo.world_of(gaussians, Surroundings(np.zeros((0, 3)), 1.0, 0.0, concatenated_surfaces([wall])), BLACK)
     in_mirror = shade(world, pixel_rays(camera, GSPLAT_MAIN))
     flip = np.diag([1.0, 1.0, -1.0])
     mirrored = camera._replace(cam_from_world_R=flip, cam_from_world_t=-flip @ [0.0, 0.0, 2 * z])
@@ -112,7 +112,7 @@ def shadow_edge(n_samples: int = 2000) -> dict[str, float]:
     centre, lamp = np.array([0.0, 1.0, 4.0]), np.array([0.0, -1.0, 4.0])
     one = demo.discs(centre[None], np.array([[0.0, 0.0, 1.0]]), s, np.full((1, 3), 0.5))
     one = one._replace(log_scales=np.full((1, 3), np.log(s)), opacity_logits=np.array([6.0]))
-    world = demo.world_of(one, Surroundings(lamp[None], 0.0, 0.0, joined([])), BLACK)
+    world = demo.world_of(one, Surroundings(lamp[None], 0.0, 0.0, concatenated_surfaces([])), BLACK)
     x = np.linspace(0, 2, n_samples)
     points = np.column_stack([x, np.full_like(x, height), np.full_like(x, 4.0)])
     V = visibility(world, points, lamp - points, 0.0)

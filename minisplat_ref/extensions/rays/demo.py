@@ -10,7 +10,7 @@ from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.extensions.rays.lights import World
 from minisplat_ref.extensions.rays.method import tracer_for, whitened_model
 from minisplat_ref.extensions.rays.surfaces import MIRROR
-from minisplat_ref.extensions.rays.surroundings import Surroundings, joined, made_of, parallelogram
+from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenated_surfaces, parallelogram, surfaces_of
 from minisplat_ref.types import Camera, Floats, Gaussians, Model
 
 CENTRE, RADIUS, N_BALL = np.array([-0.4, 0.2, 4.0]), 0.6, 300
@@ -55,7 +55,7 @@ def discs(means: Floats, normals: Floats, size: float, colors: Floats) -> Gaussi
     )
 
 
-def together(*parts: Gaussians) -> Gaussians:
+def concatenated(*parts: Gaussians) -> Gaussians:
     """Return several populations as one."""
     return Gaussians(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
 
@@ -73,6 +73,6 @@ def world_of(gaussians: Gaussians, surroundings: Surroundings, background: Float
 
 def demo_world() -> World:
     """Return the whole scene."""
-    mirror = made_of(parallelogram(MIRROR_CORNER, MIRROR_SIDES), MIRROR, np.array([0.9, 0.9, 0.95]))
-    around = Surroundings(LAMP[None], 0.35, BIAS, joined([mirror]))
-    return world_of(together(ball(), floor()), around, np.array([0.1, 0.12, 0.16]))
+    mirror = surfaces_of(parallelogram(MIRROR_CORNER, MIRROR_SIDES), MIRROR, np.array([0.9, 0.9, 0.95]))
+    around = Surroundings(LAMP[None], 0.35, BIAS, concatenated_surfaces([mirror]))
+    return world_of(concatenated(ball(), floor()), around, np.array([0.1, 0.12, 0.16]))

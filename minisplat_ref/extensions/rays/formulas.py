@@ -50,7 +50,7 @@ class Found(NamedTuple):
 
 
 @scalar
-def room_for(capacity):
+def empty_lists(capacity):
     """Return empty lists."""
     return Found(
         np.empty((WIDTH, capacity), np.float64),
@@ -94,7 +94,7 @@ def inverse_of(d):
 
 
 @scalar
-def entry(boxes, node, side, line):
+def slab_interval(boxes, node, side, line):
     """Return where lines enter and leave a box; they miss it where the former is larger."""
     ox, oy, oz, ix, iy, iz = line
     x0, x1 = (boxes[node, side, 0] - ox) * ix, (boxes[node, side, 3] - ox) * ix
@@ -150,8 +150,8 @@ def find_hits(scene, rays, first, end, limits, found):
         if entries[n_waiting] > farthest:
             continue
         node = nodes[n_waiting]
-        a0, a1 = entry(boxes, node, 0, line)
-        b0, b1 = entry(boxes, node, 1, line)
+        a0, a1 = slab_interval(boxes, node, 0, line)
+        b0, b1 = slab_interval(boxes, node, 1, line)
         a_is_met = reduce_any((a0 <= a1) & (a1 >= near) & (a0 <= bound))
         b_is_met = reduce_any((b0 <= b1) & (b1 >= near) & (b0 <= bound))
         a_entry, b_entry = -reduce_max(-a0), -reduce_max(-b0)
@@ -206,8 +206,8 @@ def find_hits(scene, rays, first, end, limits, found):
 
 
 @scalar
-def meet_vjp(records, row, ray, unclamped, v_unclamped, v_t):
-    """Return v_p and v_v; see the reference's ``meet_vjp``."""
+def evaluate_pairs_vjp(records, row, ray, unclamped, v_unclamped, v_t):
+    """Return v_p and v_v; see the reference's ``evaluate_pairs_vjp``."""
     p0, p1, p2, v0, v1, v2 = whitened(records, row, ray)
     t, e0, e1, e2 = nearest_point(p0, p1, p2, v0, v1, v2)
     k = -unclamped * v_unclamped  # 2 v_q
@@ -222,7 +222,7 @@ def meet_vjp(records, row, ray, unclamped, v_unclamped, v_t):
 
 
 @scalar
-def back(records, row, v):
+def times_transpose(records, row, v):
     """Return M^T v."""
     return (
         records[row, 0] * v[0] + records[row, 3] * v[1] + records[row, 6] * v[2],

@@ -71,7 +71,7 @@ def pixel_rays(camera: Camera, conventions: Conventions) -> Rays:
 
 
 @functools.cache
-def in_blocks(width: int, height: int) -> Ints:
+def block_order(width: int, height: int) -> Ints:
     """Return the pixels [H W] in blocks of 4 x 2: eight rays that go together through a tree should be neighbours."""
     ys, xs = np.divmod(np.arange(width * height), width)
     return np.lexsort((xs, ys, xs // 4, ys // 2))

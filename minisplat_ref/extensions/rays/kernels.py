@@ -20,11 +20,11 @@ from minisplat_ref.extensions.rays.formulas import (
     OPACITY,
     REACH,
     Limits,
-    back,
+    empty_lists,
+    evaluate_pairs_vjp,
     find_hits,
-    meet_vjp,
     ray_of,
-    room_for,
+    times_transpose,
 )
 from minisplat_ref.extensions.rays.types import BlendedRays, Hits, RayGradient, Rays, Whitened
 from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
@@ -32,8 +32,8 @@ from minisplat_ref.jit.lanes import WIDTH
 from minisplat_ref.jit.scheduling import dynamic_range, shared_counter
 from minisplat_ref.types import Floats, Ints
 
-RAYS_A_TURN = 64  # a multiple of eight
-GAUSSIANS_A_TURN = 32
+RAYS_PER_PART = 64  # a multiple of eight
+GAUSSIANS_PER_PART = 32
 
 
 class Scene(NamedTuple):
@@ -98,10 +98,10 @@ def _blend(scene, colors, rays, background, limits, n_threads, blended):
     n_rays = len(rays.near)
     taken = shared_counter()
     for _ in prange(n_threads):
-        found = room_for(limits.capacity)
+        found = empty_lists(limits.capacity)
         image, depths, transmittances, n_hits, is_seen = blended
-        for part in dynamic_range(taken, (n_rays + RAYS_A_TURN - 1) // RAYS_A_TURN):
-            for r in range(part * RAYS_A_TURN, min((part + 1) * RAYS_A_TURN, n_rays)):
+        for part in dynamic_range(taken, (n_rays + RAYS_PER_PART - 1) // RAYS_PER_PART):
+            for r in range(part * RAYS_PER_PART, min((part + 1) * RAYS_PER_PART, n_rays)):
                 lane = r % WIDTH
                 if lane == 0:
                     find_hits(scene, rays, r, n_rays, limits, found)
@@ -132,10 +132,10 @@ def _list(scene, rays, limits, n_threads, hits):
     n_rays = len(rays.near)
     taken = shared_counter()
     for _ in prange(n_threads):
-        found = room_for(limits.capacity)
+        found = empty_lists(limits.capacity)
         offsets, ray_ids, rows, unclamped, depths, weights, transmittances = hits
-        for part in dynamic_range(taken, (n_rays + RAYS_A_TURN - 1) // RAYS_A_TURN):
-            for r in range(part * RAYS_A_TURN, min((part + 1) * RAYS_A_TURN, n_rays)):
+        for part in dynamic_range(taken, (n_rays + RAYS_PER_PART - 1) // RAYS_PER_PART):
+            for r in range(part * RAYS_PER_PART, min((part + 1) * RAYS_PER_PART, n_rays)):
                 lane = r % WIDTH
                 if lane == 0:
                     find_hits(scene, rays, r, n_rays, limits, found)
@@ -168,8 +168,8 @@ def _differentiate_rays(scene, colors, rays, limits, n_threads, hits, cotangents
     taken = shared_counter()
     for _ in prange(n_threads):
         v_unclamped, v_depths, v_rays = v
-        for part in dynamic_range(taken, (n_rays + RAYS_A_TURN - 1) // RAYS_A_TURN):
-            for r in range(part * RAYS_A_TURN, min((part + 1) * RAYS_A_TURN, n_rays)):
+        for part in dynamic_range(taken, (n_rays + RAYS_PER_PART - 1) // RAYS_PER_PART):
+            for r in range(part * RAYS_PER_PART, min((part + 1) * RAYS_PER_PART, n_rays)):
                 ray, behind = ray_of(rays, r), cotangents.behind[r]
                 red, green, blue = cotangents.image[r, 0], cotangents.image[r, 1], cotangents.image[r, 2]
                 for k in range(6):
@@ -184,8 +184,11 @@ def _differentiate_rays(scene, colors, rays, limits, n_threads, hits, cotangents
                     behind += weight * light
                     v_unclamped[h] = v_alpha if unclamped <= limits.alpha_max else 0.0
                     v_depths[h] = weight * cotangents.depths[r]
-                    of_p, of_v = meet_vjp(scene.records, row, ray, unclamped, v.unclamped[h], v.depths[h])
-                    of_mean, of_direction = back(scene.records, row, of_p), back(scene.records, row, of_v)
+                    of_p, of_v = evaluate_pairs_vjp(scene.records, row, ray, unclamped, v.unclamped[h], v.depths[h])
+                    of_mean, of_direction = (
+                        times_transpose(scene.records, row, of_p),
+                        times_transpose(scene.records, row, of_v),
+                    )
                     for k in range(3):
                         v_rays[r, k] -= of_mean[k]
                         v_rays[r, 3 + k] += of_direction[k]
@@ -211,8 +214,8 @@ def _add_up(scene, rays, n_threads, hits, groups, v_image, v, sums):
     taken = shared_counter()
     order, offsets = groups
     for _ in prange(n_threads):
-        for part in dynamic_range(taken, (n_rows + GAUSSIANS_A_TURN - 1) // GAUSSIANS_A_TURN):
-            for row in range(part * GAUSSIANS_A_TURN, min((part + 1) * GAUSSIANS_A_TURN, n_rows)):
+        for part in dynamic_range(taken, (n_rows + GAUSSIANS_PER_PART - 1) // GAUSSIANS_PER_PART):
+            for row in range(part * GAUSSIANS_PER_PART, min((part + 1) * GAUSSIANS_PER_PART, n_rows)):
                 mean = scene.records[row, MEAN], scene.records[row, MEAN + 1], scene.records[row, MEAN + 2]
                 for k in range(16):
                     sums[row, k] = 0.0
@@ -221,8 +224,8 @@ def _add_up(scene, rays, n_threads, hits, groups, v_image, v, sums):
                     r = hits.ray_ids[h]
                     ray = ray_of(rays, r)
                     unclamped = hits.unclamped[h]
-                    of_p, of_v = meet_vjp(scene.records, row, ray, unclamped, v.unclamped[h], v.depths[h])
-                    of_mean = back(scene.records, row, of_p)
+                    of_p, of_v = evaluate_pairs_vjp(scene.records, row, ray, unclamped, v.unclamped[h], v.depths[h])
+                    of_mean = times_transpose(scene.records, row, of_p)
                     for a in range(3):
                         for b in range(3):
                             sums[row, 3 * a + b] += of_p[a] * (mean[b] - ray[b]) + of_v[a] * ray[3 + b]

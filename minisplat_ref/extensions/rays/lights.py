@@ -26,7 +26,7 @@ from minisplat_ref.extensions.rays.surfaces import (
     DIFFUSE,
     GLASS,
     MIRROR,
-    going_on,
+    continued,
     nearest_triangles,
     reflected,
     refracted,
@@ -107,12 +107,12 @@ def _advance(world: World, bundle: _Bundle, image: Floats, *, sees_surfaces: boo
     for rows in (mirror, glass):
         arriving, normals = _rows(rays, rows), surfaces.normals[faces[rows]]
         colors = rest[rows] * surfaces.colors[faces[rows]]
-        back = going_on(arriving, depths[rows], reflected(arriving.directions, normals))
+        back = continued(arriving, depths[rows], reflected(arriving.directions, normals))
         if rows is mirror:
             following.append(bundle.some(rows, back, colors))
             continue
         bent, shares, _ = refracted(arriving.directions, normals, surfaces.indices[faces[rows]])
-        through = going_on(arriving, depths[rows], bent)
+        through = continued(arriving, depths[rows], bent)
         following.append(bundle.some(rows, back, rest[rows] * shares[:, None]))
         following.append(bundle.some(rows, through, colors * (1 - shares)[:, None]))
     return [some for some in following if len(some.pixels)]

@@ -10,7 +10,7 @@ from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.rays import kernels, reference
-from minisplat_ref.extensions.rays.geometry import in_blocks, pixel_rays, pixel_rays_vjp, whiten, whiten_vjp
+from minisplat_ref.extensions.rays.geometry import block_order, pixel_rays, pixel_rays_vjp, whiten, whiten_vjp
 from minisplat_ref.extensions.rays.statistics import blend_stats
 from minisplat_ref.extensions.rays.types import BlendedRays, Rays, Whitened
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
@@ -86,7 +86,7 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, _T
     if request.is_visible is not None:
         gaussians = gaussians._replace(opacities=np.where(request.is_visible, gaussians.opacities, 0.0))
     tracer, in_rows = tracer_for(gaussians, conventions, backend), pixel_rays(camera, conventions)
-    order = in_blocks(camera.width, camera.height)
+    order = block_order(camera.width, camera.height)
     rays = Rays(*(field[order] for field in in_rows))
     colors = backend.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, degree, np.ones((len(g.means), 2), np.int32))
     blended = tracer.blend(colors, rays, background, conventions)

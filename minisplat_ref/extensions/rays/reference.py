@@ -36,7 +36,7 @@ class Pairs(NamedTuple):
     unclamped: Floats  # [H] o exp(-q / 2)
 
 
-def meet(gaussians: Whitened, rays: Rays, ray_ids: Ints, gaussian_ids: Ints) -> Pairs:
+def evaluate_pairs(gaussians: Whitened, rays: Rays, ray_ids: Ints, gaussian_ids: Ints) -> Pairs:
     """Evaluate Gaussians on rays, pair by pair.
 
     Parameters
@@ -63,10 +63,10 @@ def meet(gaussians: Whitened, rays: Rays, ray_ids: Ints, gaussian_ids: Ints) -> 
     return Pairs(p, v, e, t, unclamped)
 
 
-def meet_vjp(
+def evaluate_pairs_vjp(
     gaussians: Whitened, rays: Rays, ray_ids: Ints, gaussian_ids: Ints, v_unclamped: Floats, v_depths: Floats
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Gradient of :func:`meet`, pair by pair.
+    """Gradient of :func:`evaluate_pairs`, pair by pair.
 
     Because e is at a right angle to v, neither t in q nor the rest of v has a share in dq/dp::
 
@@ -80,7 +80,7 @@ def meet_vjp(
     Parameters
     ----------
     gaussians, rays, ray_ids, gaussian_ids
-        As for :func:`meet`.
+        As for :func:`evaluate_pairs`.
     v_unclamped, v_depths : ndarray of shape (H,)
         Derivatives with respect to its results.
 
@@ -89,7 +89,7 @@ def meet_vjp(
     tuple
         With respect to means [H, 3], maps [H, 3, 3], opacities [H], origins [H, 3] and directions [H, 3].
     """
-    pairs = meet(gaussians, rays, ray_ids, gaussian_ids)
+    pairs = evaluate_pairs(gaussians, rays, ray_ids, gaussian_ids)
     t, e = pairs.depths[:, None], pairs.e
     a = np.sum(pairs.v * pairs.v, axis=1, keepdims=True)  # [H, 1]
     v_q = (-0.5 * pairs.unclamped * v_unclamped)[:, None]
@@ -120,7 +120,7 @@ def list_hits(gaussians: Whitened, rays: Rays, conventions: Conventions) -> Hits
     ids, alphas, depths, weights, rows = ([np.zeros(0, kind)] for kind in (int, float, float, float, int))
     transmittances = np.ones(n_rays)
     for some in _chunks(n_rays, n):
-        pairs = meet(gaussians, rays, np.repeat(some, n), np.tile(np.arange(n), len(some)))
+        pairs = evaluate_pairs(gaussians, rays, np.repeat(some, n), np.tile(np.arange(n), len(some)))
         unclamped, t = (array.reshape(len(some), n) for array in (pairs.unclamped, pairs.depths))
         alpha = np.minimum(conventions.alpha_max, unclamped)
         is_hit = (alpha >= conventions.alpha_min) & (t > rays.near[some, None]) & (t < rays.far[some, None])
@@ -215,7 +215,7 @@ def blend_rays_vjp(
     behind = np.cumsum(table[:, :0:-1], axis=1)[:, ::-1] - table[:, 1:] + table[:, :1]  # B [P, K]
     v_alphas = hits.weights / alphas * f - behind[ray_ids, places] / (1 - alphas)
     v_unclamped = np.where(hits.unclamped <= conventions.alpha_max, v_alphas, 0.0)
-    pairs = meet_vjp(gaussians, rays, ray_ids, ids, v_unclamped, hits.weights * v_depths[ray_ids])
+    pairs = evaluate_pairs_vjp(gaussians, rays, ray_ids, ids, v_unclamped, hits.weights * v_depths[ray_ids])
     n, n_rays = len(gaussians.means), len(rays.near)
     return RayGradient(
         means=_summed(pairs[0], ids, n),

@@ -83,7 +83,7 @@ def nearest_triangles(corners: Floats, rays: Rays) -> tuple[Floats, Ints]:
     return depths, faces
 
 
-def going_on(rays: Rays, depths: Floats, directions: Floats) -> Rays:
+def continued(rays: Rays, depths: Floats, directions: Floats) -> Rays:
     """Return rays [P] that leave ``O + t d`` in other directions [P, 3] of the same lengths; t is counted on."""
     points = rays.origins + depths[:, None] * rays.directions
     return Rays(points - depths[:, None] * directions, directions, depths, rays.far)

@@ -49,14 +49,14 @@ class Surroundings(NamedTuple):
     surfaces: Surfaces
 
 
-def made_of(mesh: Mesh, kind: int, color: Floats | None = None, index: float = INDEX) -> Surfaces:
+def surfaces_of(mesh: Mesh, kind: int, color: Floats | None = None, index: float = INDEX) -> Surfaces:
     """Return a mesh as surfaces of one kind."""
     n = len(mesh.faces)
     colors = np.tile(np.ones(3) if color is None else color, (n, 1))
     return Surfaces(mesh.corners, normals_of(mesh.corners), np.full(n, kind), colors, np.full(n, index))
 
 
-def joined(surfaces: list[Surfaces]) -> Surfaces:
+def concatenated_surfaces(surfaces: list[Surfaces]) -> Surfaces:
     """Return several surfaces as one; of none an empty one."""
     nothing = Surfaces(np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0, int), np.zeros((0, 3)), np.zeros(0))
     return Surfaces(*(np.concatenate(fields) for fields in zip(nothing, *surfaces, strict=True)))
@@ -89,7 +89,7 @@ def read(path: Path) -> Surroundings:
         if not 0 <= number <= 1:
             raise InputError(f"{path}: {name} is {content[name]}: give a number from 0 to 1")
     parts = [_surface(entry, f"{path}, surface {i}", path.parent) for i, entry in enumerate(surfaces)]
-    return Surroundings(np.array(places).reshape(-1, 3), ambient, bias, joined(parts))
+    return Surroundings(np.array(places).reshape(-1, 3), ambient, bias, concatenated_surfaces(parts))
 
 
 def check_lights(surroundings: Surroundings, gaussians: Whitened, source: str | Path) -> None:
@@ -138,7 +138,7 @@ def _surface(entry: Any, where: str, folder: Path) -> Surfaces:
     index = as_number(entry.get("index", INDEX))
     if not 1 <= index <= MOST:
         raise InputError(f"{where}: index is {entry['index']}: the index of refraction of glass is at least 1")
-    return made_of(mesh, kind, color, index)
+    return surfaces_of(mesh, kind, color, index)
 
 
 def _check_closed(mesh: Mesh, where: str) -> None:
