@@ -1,4 +1,4 @@
-"""Rays that go on: mirrors, glass, shadows, triangles; the command that draws them; Mitsuba's ellipsoids as a peer."""
+"""Secondary rays: mirrors, glass, shadows, triangles, the command that draws them, and Mitsuba as a peer."""
 
 import json
 
@@ -38,7 +38,7 @@ WALL = np.array([[4.0, 0.0, 0.0], [0.0, 4.0, 0.0]])
 
 
 def box(low, high):
-    """A closed mesh with normals outwards."""
+    """Return a closed mesh whose normals point outwards."""
     x, y, z = np.array([low, high]).T
     vertices = np.array([[x[i & 1], y[i >> 1 & 1], z[i >> 2]] for i in range(8)], float)
     quads = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
@@ -58,7 +58,7 @@ def rays_of(origins, directions):
 
 
 def test_a_ray_meets_a_triangle_where_its_plane_is(rng):
-    """By solving ``O + t d = p0 + u e1 + v e2``."""
+    """The expected values solve ``O + t d = p0 + u e1 + v e2``."""
     corners, rays = rng.normal(size=(20, 3, 3)), rays_of(3 * rng.normal(size=(50, 3)), rng.normal(size=(50, 3)))
     depths, faces = nearest_triangles(corners, rays)
     for r in range(50):
@@ -107,7 +107,7 @@ def test_snell_schlick_and_total_reflection():
 
 
 def test_a_pane_shifts_what_is_behind_it():
-    """Through a pane of thickness h a ray leaves in its old direction, beside itself by h sin(a - b) / cos(b)."""
+    """A ray through a pane of thickness h keeps its direction and is shifted by h sin(a - b) / cos(b)."""
     h, a = 0.5, np.radians(40)
     b = np.arcsin(np.sin(a) / 1.5)
     pane = surfaces_of(box([-9, -9, 1], [9, 9, 1 + h]), GLASS)
@@ -178,7 +178,7 @@ def test_the_edge_of_a_shadow_is_where_the_tangent_cone_meets_the_floor():
 
 
 def test_a_lamp_in_front_of_a_gaussian_is_not_dimmed_by_it(rng):
-    """Only what lies between counts; a faint Gaussian between lets its share through."""
+    """Only what lies between counts; a faint Gaussian between transmits its part."""
     veil = demo.discs(np.array([[0.0, 0, 2]]), np.array([[0.0, 0, 1]]), 0.5, np.full((1, 3), 0.5))
     world = demo.world_of(veil._replace(opacity_logits=np.zeros(1)), around(), BLACK)
     point = np.array([[0.0, 0, 4]])
@@ -269,8 +269,8 @@ def test_the_study_draws_and_prints(tmp_path, capsys):
 
 
 def test_mitsuba_meets_the_same_ellipsoids():
-    """Mitsuba 3 walks through ellipsoids of three standard deviations: it finds those that rays come so near to, and
-    enters the first where ``t - sqrt((9 - q) / a)`` says. Rays that graze one are left out: float32 decides those."""
+    """Mitsuba 3 intersects rays with ellipsoids of three standard deviations, and must find those with q < 9, and enter
+    the first at ``t - sqrt((9 - q) / a)``. Rays that graze one are left out, because float32 decides those."""
     mitsuba = pytest.importorskip("mitsuba", reason="needs mitsuba: pip install 'minisplat_ref[rays]'")
     mitsuba.set_variant("scalar_rgb")
     g = claims.random_gaussians(30, np.random.default_rng(4), size=0.05)

@@ -22,9 +22,7 @@ _LINEAR, _CUBIC = np.float32(LINEAR), np.float32(CUBIC)
 
 @functools.cache
 def pixel_response(exp: Callable) -> KernelResponse:
-    """Return the response of projected Gaussians with an exponential of
-    :mod:`minisplat_ref.cpu.compositing.exponential`.
-    """
+    """Return the response of Gaussians with an exponential of :mod:`minisplat_ref.cpu.compositing.exponential`."""
 
     @scalar
     def cdf_and_pdf(x):

@@ -11,9 +11,7 @@ from minisplat_ref.study import Study
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--out``, ``--places`` and ``--seed``."""
     add_out(parser)
-    parser.add_argument(
-        "--places", type=int, default=64, metavar="N", help="positions of the centre in its pixel (default 64)"
-    )
+    parser.add_argument("--places", type=int, default=64, metavar="N", help="positions within a pixel (default 64)")
     parser.add_argument("--seed", type=int, default=0, metavar="S", help="seed of positions and angles (default 0)")
 
 

@@ -1,9 +1,9 @@
-"""Rays through a tree of Gaussians: the functions of :mod:`.reference`, without looking at what a ray misses.
+"""Rays through a tree of Gaussians: the functions of :mod:`.reference`, which skip what a ray misses.
 
-The gradient needs no lock and depends on no order of threads: each ray writes what its hits contribute to rows of their
-own, and each Gaussian then adds up its rows in the order of the rays.
+The gradient needs no lock and does not depend on the order of threads: each ray writes the contributions of its hits to
+rows of their own, and each Gaussian then sums its rows in the order of the rays.
 
-Bundles that a kernel writes to are taken apart first: Numba drops ``bundle.array[i] = x`` from a parallel loop.
+A kernel unpacks bundles before it writes to them, because Numba drops ``bundle.array[i] = x`` from a parallel loop.
 """
 
 import math
@@ -21,8 +21,8 @@ from minisplat_ref.extensions.rays.formulas import (
     REACH,
     Limits,
     empty_lists,
-    evaluate_pairs_vjp,
     find_hits,
+    pair_vjp,
     ray_of,
     times_transpose,
 )
@@ -40,19 +40,19 @@ class Scene(NamedTuple):
     """Gaussians in the order of a tree's leaves."""
 
     records: Floats
-    """[N', N_COLUMNS] of those that can be seen at all."""
+    """[N', N_COLUMNS] records of the Gaussians that can be seen at all."""
     ids: Ints
-    """[N'] int32 rows of the population."""
+    """[N'] int32 their rows in the population."""
     boxes: Floats
-    """[K, 2, 6], as in :class:`.bvh.Tree`; a bundle of a kernel holds no other bundle."""
+    """[K, 2, 6] as in :class:`.bvh.Tree`, which is unpacked, since bundles of kernels cannot be nested."""
     children: Ints
-    """[K, 2, 2]."""
+    """[K, 2, 2] as in :class:`.bvh.Tree`."""
     n: int
-    """Of the population."""
+    """Number of Gaussians of the population."""
 
 
 def scene_of(gaussians: Whitened, conventions: Conventions) -> Scene:
-    """Return Gaussians with their tree; those that are too faint, or not finite, are left out."""
+    """Return Gaussians with their tree, without those that are too faint or not finite."""
     # Half-extents of the ellipsoid |M x|^2 = q: Sigma = M^-1 M^-T, and row i of M is R_i / s_i.
     least = max(conventions.alpha_min, np.finfo(np.float64).tiny)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -73,7 +73,10 @@ def scene_of(gaussians: Whitened, conventions: Conventions) -> Scene:
 
 
 def limits_of(conventions: Conventions, n: int) -> Limits:
-    """Return the thresholds of conventions; a ray through n Gaussians holds few if each takes its part of the light."""
+    """Return the thresholds of conventions, and the number of hits that a ray through n Gaussians has to store.
+
+    Each hit takes at least ``alpha_min`` of the light, which bounds that number.
+    """
     least = END_MARGIN * conventions.transmittance_min
     capacity = n
     if least > 0 and conventions.alpha_min > 0:
@@ -89,7 +92,7 @@ def limits_of(conventions: Conventions, n: int) -> Limits:
 
 @scalar
 def goes_on(T, limits):
-    """Whether a ray takes the hit that leaves it with T."""
+    """Return whether a ray takes a hit that leaves it with the transmittance T."""
     return T > limits.transmittance_min or (T == limits.transmittance_min and not limits.stops_at_equality)
 
 
@@ -128,7 +131,7 @@ def _blend(scene, colors, rays, background, limits, n_threads, blended):
 
 @kernel()
 def _list(scene, rays, limits, n_threads, hits):
-    """Write the hits down, with rows of the scene; ``hits.offsets`` says how many there are."""
+    """Write the hits with rows of the scene; ``hits.offsets`` tells how many each ray has."""
     n_rays = len(rays.near)
     taken = shared_counter()
     for _ in prange(n_threads):
@@ -184,7 +187,7 @@ def _differentiate_rays(scene, colors, rays, limits, n_threads, hits, cotangents
                     behind += weight * light
                     v_unclamped[h] = v_alpha if unclamped <= limits.alpha_max else 0.0
                     v_depths[h] = weight * cotangents.depths[r]
-                    of_p, of_v = evaluate_pairs_vjp(scene.records, row, ray, unclamped, v.unclamped[h], v.depths[h])
+                    of_p, of_v = pair_vjp(scene.records, row, ray, unclamped, v.unclamped[h], v.depths[h])
                     of_mean, of_direction = (
                         times_transpose(scene.records, row, of_p),
                         times_transpose(scene.records, row, of_v),
@@ -209,7 +212,7 @@ def _sort_by_gaussian(rows, offsets, order):
 
 @kernel()
 def _add_up(scene, rays, n_threads, hits, groups, v_image, v, sums):
-    """Add the gradient of each Gaussian up: the map, the mean, the opacity, the colour."""
+    """Sum the gradients of each Gaussian with respect to its map, mean, opacity and colour."""
     n_rows = len(scene.ids)
     taken = shared_counter()
     order, offsets = groups
@@ -224,7 +227,7 @@ def _add_up(scene, rays, n_threads, hits, groups, v_image, v, sums):
                     r = hits.ray_ids[h]
                     ray = ray_of(rays, r)
                     unclamped = hits.unclamped[h]
-                    of_p, of_v = evaluate_pairs_vjp(scene.records, row, ray, unclamped, v.unclamped[h], v.depths[h])
+                    of_p, of_v = pair_vjp(scene.records, row, ray, unclamped, v.unclamped[h], v.depths[h])
                     of_mean = times_transpose(scene.records, row, of_p)
                     for a in range(3):
                         for b in range(3):
@@ -235,7 +238,7 @@ def _add_up(scene, rays, n_threads, hits, groups, v_image, v, sums):
 
 
 def blend_rays(scene: Scene, colors: Floats, rays: Rays, background: Floats, conventions: Conventions) -> BlendedRays:
-    """Blend what each ray meets: see :func:`minisplat_ref.extensions.rays.reference.blend_rays`.
+    """Blend the hits of each ray; see :func:`minisplat_ref.extensions.rays.reference.blend_rays`.
 
     Parameters
     ----------
@@ -252,7 +255,7 @@ def blend_rays(scene: Scene, colors: Floats, rays: Rays, background: Floats, con
 
 
 def list_hits(scene: Scene, rays: Rays, conventions: Conventions) -> Hits:
-    """Return the blended hits of each ray: see :func:`minisplat_ref.extensions.rays.reference.list_hits`."""
+    """Return the blended hits of each ray; see :func:`minisplat_ref.extensions.rays.reference.list_hits`."""
     counts = blend_rays(scene, np.zeros((scene.n, 3)), rays, np.zeros(3), conventions).n_hits
     hits = _listed(scene, rays, conventions, counts)
     return hits._replace(gaussian_ids=scene.ids[hits.gaussian_ids].astype(np.int64))
@@ -292,7 +295,7 @@ def blend_rays_vjp(
 
 
 def _listed(scene: Scene, rays: Rays, conventions: Conventions, counts: Ints) -> Hits:
-    """Return the hits, ``counts`` [P] of each ray, with rows of the scene in the place of the population's."""
+    """Return the hits, ``counts`` [P] per ray, with rows of the scene instead of the population's."""
     offsets = np.concatenate([[0], np.cumsum(counts)])
     n_hits = int(offsets[-1])
     ray_ids, rows = np.empty((2, n_hits), np.int64)
