@@ -108,7 +108,7 @@ def run(args: argparse.Namespace) -> int:
     names = file_names([view.name for view in views])
     _make_room(out, names)
     wants = frozenset({"depth"} if args.depth else ())
-    for name, view in zip(names, tqdm(views, desc="rendering", unit="view"), strict=True):
+    for name, view in zip(names, tqdm(views, desc="rendering", unit="view", disable=None), strict=True):
         output = source.trained.render(view_from(view.camera, time=view.time), wants)
         write_image(out / f"{name}.png", output.image[..., :3])
         if args.depth:

@@ -220,7 +220,7 @@ def decide(run: Run, target: Target, iterations: int) -> Decision:
     counts = series if limit is None else sizes(n, n_candidates, limit)
     n_closer = 0 if target.max_drop is None else N_CLOSER
     total = (1 + len(counts) + n_closer) * (iterations + 1)  # each is also measured
-    with tqdm(total=total, leave=False, unit="it", dynamic_ncols=True) as bar:
+    with tqdm(total=total, leave=False, unit="it", dynamic_ncols=True, disable=None) as bar:
 
         def measured(rows: Ints) -> tuple[float, ...]:
             bar.set_description_str(f"measuring {len(rows):,} Gaussians")
@@ -263,5 +263,5 @@ def finished(run: Run, n: int, iterations: int) -> Model:
     is_all = n == n_rows(run.model.gaussians)
     rows = np.arange(n) if is_all else most_important(blend_weights(run, run.scene.train_views), n)
     name = f"fine-tuning {n:,} Gaussians"
-    with tqdm(total=iterations, desc=name, leave=False, unit="it", dynamic_ncols=True) as bar:
+    with tqdm(total=iterations, desc=name, leave=False, unit="it", dynamic_ncols=True, disable=None) as bar:
         return fine_tuned(run, rows, iterations, holds_out=False, on_step=bar.update)

@@ -1,4 +1,4 @@
-"""A container of packed bytes: magic, version, a header in JSON, then one zstandard frame for each stream.
+"""A container of packed bytes: magic, version, a JSON header, then one zstandard frame for each stream.
 
 ::
 
@@ -8,8 +8,8 @@
     header     JSON; "streams" lists [name, bytes packed] in the order of the frames
     frames     back to back, to the end of the file
 
-A frame holds its own checksum. Nothing is allocated for what the file claims before the claim is found possible: a
-frame of zstandard has blocks of at least 4 bytes (3 of header, 1 of content), each of which makes at most 2^17 bytes.
+A frame holds its own checksum. No memory is allocated for a claimed size before it is checked to be possible: a
+zstandard frame has blocks of at least 4 bytes (3 of header, 1 of content), each of which makes at most 2^17 bytes.
 """
 
 import json
@@ -22,10 +22,10 @@ from minisplat_ref import memory
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.json_file import parse_json
 
-# Of zstandard. Bytes of quantised numbers hardly repeat; what packs them is their entropy. So the strongest parser is
-# left with a short search: ten times as fast as level 19, and 0.3 to 4 % larger.
+# Parameters of zstandard. Bytes of quantised numbers hardly repeat, so entropy coding does most of the packing. The
+# strongest parser with a short search is ten times as fast as level 19, and its files are 0.3 to 4 % larger.
 PARAMETERS = {"window_log": 17, "hash_log": 15, "chain_log": 16, "search_log": 3}
-LEVEL = 19  # that all other parameters are of
+LEVEL = 19  # the source of all other parameters
 HEADER_MAX = 1 << 16  # bytes
 RATIO_MAX = 1 << 15  # bytes made of one packed byte: 2^17 of 4
 WAY_OUT = "copy or export the file again"
@@ -33,22 +33,22 @@ _PREFIX = struct.Struct("<4sHI")
 
 
 class Container(NamedTuple):
-    """What a format begins with."""
+    """The magic and the version of a format."""
 
     magic: bytes
     """Four bytes."""
     version: int
-    """That is written, and the only one that is read."""
+    """The version that is written, and the only one that is read."""
 
 
 class Packed(NamedTuple):
-    """A file that has been taken apart, but not unpacked."""
+    """The parts of a file, still packed."""
 
     header: Mapping[str, Any]
     frames: Mapping[str, bytes]
-    """By the names of the streams."""
+    """Packed frames by the names of their streams."""
     source: str | Path
-    """The file, for messages."""
+    """Name of the file, for messages."""
 
 
 def _zstandard() -> Any:
@@ -62,15 +62,16 @@ def _zstandard() -> Any:
 
 
 def pack(container: Container, header: Mapping[str, Any], streams: Mapping[str, bytes]) -> bytes:
-    """Return a file.
+    """Return the content of a file.
 
     Parameters
     ----------
     container : Container
+        Magic and version.
     header : mapping
         JSON values; less than 64 KiB of text.
     streams : mapping of str to bytes
-        Unpacked.
+        The streams before packing.
 
     Raises
     ------
@@ -90,8 +91,17 @@ def pack(container: Container, header: Mapping[str, Any], streams: Mapping[str, 
     return b"".join([prefix, text, *frames.values()])
 
 
-def take_apart(container: Container, content: bytes, source: str | Path) -> Packed:
+def parse(container: Container, content: bytes, source: str | Path) -> Packed:
     """Check magic, version and sizes of a file, and return its header and its frames, still packed.
+
+    Parameters
+    ----------
+    container : Container
+        The magic and version to expect.
+    content : bytes
+        The whole file.
+    source : str or Path
+        Its name, for messages.
 
     Raises
     ------
@@ -132,12 +142,21 @@ def _name(container: Container) -> str:
 
 
 def is_count(value: Any, largest: int = 2**53) -> bool:
-    """Return whether a value of a header is a whole number from 0 to ``largest``; true and false are none."""
+    """Return whether a value of a header is an integer from 0 to ``largest``; booleans are not."""
     return type(value) is int and 0 <= value <= largest
 
 
 def unpack(packed: Packed, name: str, n_bytes: int) -> bytes:
-    """Unpack a stream, of which the header says how large it is.
+    """Return the unpacked bytes of a stream, whose size the header tells.
+
+    Parameters
+    ----------
+    packed : Packed
+        The file.
+    name : str
+        Name of the stream.
+    n_bytes : int
+        Its size.
 
     Raises
     ------

@@ -5,10 +5,10 @@ A triangle with the corners p0, p1, p2 has the frame
     E = [e1, e2, h n],   e1 = p1 - p0,   e2 = p2 - p0,   n = e1 x e2 / |e1 x e2|,   h = sqrt(|e1 x e2|)
 
 in which a point is ``x = p0 + E (b1, b2, w)``: (1 - b1 - b2, b1, b2) are the barycentric coordinates of its projection
-onto the plane of the triangle, and w is its signed distance from that plane in units of h. As h grows like the
-triangle, a mesh that is turned, moved and scaled takes its points along exactly.
+onto the plane of the triangle, and w is its signed distance from that plane in units of h. As h scales with the
+triangle, a mesh that is rotated, translated and scaled takes its points along exactly.
 
-Left out: textures, normals and colours of a mesh; formats other than PLY.
+Left out are textures, normals and colours of a mesh, and formats other than PLY.
 """
 
 from pathlib import Path
@@ -31,7 +31,7 @@ class Mesh(NamedTuple):
     vertices: Floats
     """[P, 3] float64, world frame."""
     faces: Ints
-    """[T, 3] rows of the vertices that are the corners of each triangle."""
+    """[T, 3] rows of the vertices at the corners of each triangle."""
 
     @property
     def corners(self) -> Floats:
@@ -45,12 +45,12 @@ def frames(mesh: Mesh) -> Floats:
     Parameters
     ----------
     mesh : Mesh
-        Every triangle has an area.
+        T triangles, each with an area.
 
     Returns
     -------
     ndarray of shape (T, 3, 3)
-        world_from_triangle, world units.
+        E, world_from_triangle, in world units.
     """
     p0, p1, p2 = np.moveaxis(mesh.corners, 1, 0)  # [T, 3] each
     e1, e2 = p1 - p0, p2 - p0
@@ -60,12 +60,17 @@ def frames(mesh: Mesh) -> Floats:
 
 
 def load_mesh(path: str | Path) -> Mesh:
-    """Read a triangle mesh from a PLY file; faces of more than three corners are cut into triangles, like a fan.
+    """Read a triangle mesh from a PLY file; faces of more than three corners become triangle fans.
+
+    Parameters
+    ----------
+    path : str or Path
+        PLY with vertices and faces.
 
     Raises
     ------
     InputError
-        If the file cannot be read, has no faces, or :func:`check_mesh` refuses what it holds.
+        The file cannot be read, has no faces, or :func:`check_mesh` refuses its mesh.
     """
     columns = read_vertices(path)
     missing = [name for name in MEANS if name not in columns]
@@ -86,17 +91,24 @@ def load_mesh(path: str | Path) -> Mesh:
 
 
 def save_mesh(path: str | Path, mesh: Mesh) -> None:
-    """Write a mesh as a PLY in float64, complete or not at all."""
+    """Write a mesh as a PLY with float64 vertices; the file is complete or not written at all."""
     write_vertices(path, dict(zip(MEANS, mesh.vertices.T, strict=True)), mesh.faces)
 
 
 def check_mesh(mesh: Mesh, source: str | Path) -> None:
-    """Refuse corners that do not exist and triangles without an area; ``source`` is what messages begin with.
+    """Refuse corners that do not exist and triangles without an area.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        The mesh to check.
+    source : str or Path
+        Its name, with which messages begin.
 
     Raises
     ------
     InputError
-        One line that names the first bad face.
+        The mesh is bad; the line names the first bad face.
     """
     is_absent = (mesh.faces < 0) | (mesh.faces >= len(mesh.vertices))  # [T, 3]
     if is_absent.any():
@@ -118,12 +130,19 @@ def check_mesh(mesh: Mesh, source: str | Path) -> None:
 
 
 def check_same_faces(rest: Mesh, deformed: Mesh, source: str | Path) -> None:
-    """Refuse a deformed mesh whose vertices or faces are not those of the mesh at rest, one for one.
+    """Refuse a deformed mesh whose numbers of vertices or whose faces differ from those of the mesh at rest.
+
+    Parameters
+    ----------
+    rest, deformed : Mesh
+        Both meshes.
+    source : str or Path
+        Name of the deformed mesh, for the message.
 
     Raises
     ------
     InputError
-        One line that says what differs.
+        They differ; the line says how.
     """
     if len(deformed.vertices) != len(rest.vertices) or not np.array_equal(deformed.faces, rest.faces):
         raise InputError(

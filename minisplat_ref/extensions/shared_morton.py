@@ -1,7 +1,7 @@
-"""Morton order: points that are near each other in space become near each other in a list.
+"""Morton order, in which points that are near each other in space are mostly near each other in a list.
 
-The code of a cell ``(x, y, z)`` is its bits taken in turn, ``... z1 y1 x1 z0 y0 x0``. Sorting by it walks the leaves of
-an octree, so what follows each other is alike and packs well.
+The code of a cell ``(x, y, z)`` interleaves the bits of its coordinates, ``... z1 y1 x1 z0 y0 x0``. Sorting by the code
+visits the leaves of an octree in order, so consecutive points are alike and pack well.
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from minisplat_ref.types import Floats, Ints
 
 BITS = 21  # of a coordinate: three of them fill 63 bits
-# How 21 bits are spread to every third place: each step moves the upper half of every group by its distance.
+# These steps spread 21 bits to every third place; each moves the upper half of every group by its distance.
 _SPREAD = (
     (32, 0x001F00000000FFFF),
     (16, 0x001F0000FF0000FF),
@@ -21,17 +21,17 @@ _SPREAD = (
 
 
 def cells_of(points: Floats | Ints) -> NDArray[np.uint64]:
-    """Return the cell of each point in a cube of 2^21 cells a side, which just holds them all.
+    """Return the cell of each point in the smallest cube that holds them all, with 2^21 cells per side.
 
     Parameters
     ----------
     points : ndarray of shape (N, 3)
-        Finite.
+        Finite coordinates in any frame.
 
     Returns
     -------
     ndarray of shape (N, 3) of uint64
-        Below 2^21.
+        Coordinates of the cells, below 2^21.
     """
     if len(points) == 0:
         return np.zeros((0, 3), np.uint64)
@@ -52,5 +52,5 @@ def morton_codes(cells: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 def morton_order(points: Floats | Ints) -> Ints:
-    """Return the rows [N] of points [N, 3] in Morton order; points of one cell stay as they follow each other."""
+    """Return the rows [N] of points [N, 3] in Morton order; points of one cell keep their order."""
     return np.argsort(morton_codes(cells_of(points)), kind="stable")

@@ -1,7 +1,7 @@
-"""Integers as planes of bytes: all lowest bytes, then all second ones, so that a packer finds like beside like.
+"""Integers as planes of bytes: all lowest bytes, then all second ones, so that similar bytes are adjacent for a packer.
 
-Columns are kept together within a plane. Signed integers go through the zigzag map ``0, -1, 1, -2, ... -> 0, 1, 2,
-3, ...``, which leaves the upper bytes of small ones zero.
+The values of a column are adjacent within a plane. Signed integers are first mapped by zigzag encoding,
+``0, -1, 1, -2, ... -> 0, 1, 2, 3, ...``, which leaves the upper bytes of small ones zero.
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ def zigzag(values: Ints) -> NDArray[np.uint64]:
 
 
 def unzigzag(values: NDArray[np.uint64]) -> Ints:
-    """Return the int64 that :func:`zigzag` has mapped."""
+    """Return the int64 values that :func:`zigzag` has encoded."""
     return (values >> np.uint64(1)).view(np.int64) ^ -(values & np.uint64(1)).view(np.int64)
 
 
@@ -31,7 +31,7 @@ def to_planes(values: NDArray[np.uint64]) -> tuple[bytes, int]:
 
 
 def from_planes(raw: bytes, n_planes: int, n_columns: int, n: int) -> NDArray[np.uint64]:
-    """Return the integers [N, C] of bytes [P, C, N]."""
+    """Return the integers [N, C] that :func:`to_planes` has stored as bytes [P, C, N]."""
     planes = np.frombuffer(raw, np.uint8).reshape(n_planes, n_columns, n)
     columns = np.zeros(planes.shape[1:], np.uint64)  # [C, N]
     for p, plane in enumerate(planes):

@@ -1,7 +1,7 @@
-"""How finely cameras sample a scene, and the same scene at other samplings.
+"""Sampling intervals of cameras, and pictures at other samplings.
 
-At scale z a picture has z times as many pixels a side. A smaller photograph is the mean over blocks of pixels, which is
-what a sensor with larger pixels would have measured.
+At scale z a picture has z times as many pixels per side. A smaller photograph is the mean over blocks of pixels, which
+is what a sensor with larger pixels would have measured.
 """
 
 from collections.abc import Sequence
@@ -10,24 +10,24 @@ import numpy as np
 
 from minisplat_ref.types import Camera, Floats
 
-MARGIN = 0.15  # of the image's size, by which a centre may lie outside and still be seen
-NEAR = 0.2  # world units: what is nearer to a camera than that is not seen by it
+MARGIN = 0.15  # fraction of the image's size by which a centre may lie outside and still count as seen
+NEAR = 0.2  # world units: a camera does not see what is nearer than that
 
 
 def sampling_intervals(means: Floats, cameras: Sequence[Camera]) -> Floats:
-    """Return the least distance between two pixels' rays at each centre, over the cameras that see it: ``z / f``.
+    """Return the least distance ``z / f`` between two pixels' rays at each centre, over the cameras that see it.
 
     Parameters
     ----------
     means : ndarray of shape (N, 3)
-        World frame.
+        Centres, world frame.
     cameras : sequence of Camera
         f is the larger of a camera's two focal lengths.
 
     Returns
     -------
     ndarray of shape (N,), float64
-        World units. What no camera sees gets the largest of the others, 0 where no camera sees anything.
+        World units. A centre that no camera sees gets the largest of the others, or 0 if no camera sees any.
     """
     intervals = np.full(len(means), np.inf)
     for camera in cameras:
@@ -43,7 +43,7 @@ def sampling_intervals(means: Floats, cameras: Sequence[Camera]) -> Floats:
 
 
 def zoomed(camera: Camera, scale: float) -> Camera:
-    """Return the camera with ``scale`` times as many pixels a side, rounded down; the edge pixels are cut off.
+    """Return the camera with ``scale`` times as many pixels per side, rounded down; the edge pixels are cut off.
 
     The focal length is exactly ``scale`` times the old one, so that a block of old pixels is exactly one new pixel.
     """
@@ -59,7 +59,7 @@ def zoomed(camera: Camera, scale: float) -> Camera:
 
 
 def block_means(image: Floats, n: int) -> Floats:
-    """Return the means [H // n, W // n, D] over blocks of n x n pixels; what is left at the edges is cut off."""
+    """Return the means [H // n, W // n, D] over blocks of n x n pixels; the remainder at the edges is cut off."""
     height, width = image.shape[0] // n, image.shape[1] // n
     blocks = image[: height * n, : width * n].reshape(height, n, width, n, -1)
     means: Floats = blocks.mean(axis=(1, 3))

@@ -1,4 +1,4 @@
-"""What studies of several extensions share: their arguments and their folder, and the scene that they train on."""
+"""Arguments, scenes and output that the studies of several extensions share."""
 
 import argparse
 import json
@@ -28,7 +28,7 @@ def add_out(parser: argparse.ArgumentParser) -> None:
 
 
 def add_scene(parser: argparse.ArgumentParser, downscale: int, iterations: int) -> None:
-    """Add a scene of any kind, ``--downscale``, ``--iterations``, ``--seeds`` and ``--out``."""
+    """Add the scene, ``--downscale``, ``--iterations``, ``--seeds`` and ``--out`` with their defaults."""
     parser.add_argument(
         "scene",
         nargs="?",
@@ -39,13 +39,15 @@ def add_scene(parser: argparse.ArgumentParser, downscale: int, iterations: int) 
     parser.add_argument(
         "--downscale", type=int, default=downscale, metavar="D", help=f"train at 1/D of its size (default {downscale})"
     )
-    parser.add_argument("--iterations", type=int, default=iterations, metavar="N", help=f"default {iterations}")
-    parser.add_argument("--seeds", type=int, default=2, metavar="N", help="from 0 on, of the trainings (default 2)")
+    parser.add_argument(
+        "--iterations", type=int, default=iterations, metavar="N", help=f"per training (default {iterations})"
+    )
+    parser.add_argument("--seeds", type=int, default=2, metavar="N", help="number of seeds, from 0 on (default 2)")
     add_out(parser)
 
 
 def check_at_least(least: int, **numbers: int) -> None:
-    """Refuse arguments that are too small, one line.
+    """Refuse arguments that are too small.
 
     Raises
     ------
@@ -58,12 +60,12 @@ def check_at_least(least: int, **numbers: int) -> None:
 
 
 def read_scene(source: str, downscale: int = 1) -> Scene:
-    """Load a folder, its photographs ``downscale`` times smaller, or make the synthetic scene of that name.
+    """Load a scene from a folder, with photographs ``downscale`` times smaller, or make the synthetic one of that name.
 
     Raises
     ------
     InputError
-        It is neither, has no test views to measure, or a synthetic scene is to be made smaller.
+        ``source`` is neither, has no test views, or is a synthetic scene that is to be made smaller.
     """
     from minisplat_ref.io import load_scene
 
@@ -102,18 +104,18 @@ def shrunk(scene: Scene, n: int) -> Scene:
 
 
 def psnr_of(image: Floats, target: Floats) -> float:
-    """Return the PSNR of a picture that is clipped to [0, 1], dB."""
+    """Return the PSNR of a picture clipped to [0, 1], dB."""
     return float(-10 * np.log10(np.mean((np.clip(image, 0, 1).astype(np.float64) - target) ** 2)))
 
 
 def tidy(axes: "Axes") -> None:
-    """Take away the frame above and on the right, and draw a pale grid."""
+    """Remove the upper and right spines, and draw a pale grid."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(color=GRID_COLOR)
     axes.set_axisbelow(True)
 
 
 def write(folder: Path, result: dict[str, Any], figure: "Figure") -> None:
-    """Write the results and the figure into a folder that exists."""
+    """Write ``result.json`` and ``figure.png`` to a folder that exists."""
     (folder / "result.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
     figure.savefig(folder / "figure.png", dpi=PNG_DPI, facecolor="white")

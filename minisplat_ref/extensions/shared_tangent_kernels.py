@@ -1,12 +1,12 @@
-"""Footprints on tangent planes on lanes: a response for the plain kernels, stated without the book's m, n and K.
+"""Footprints on tangent planes on lanes: a response for the plain kernels, stated without the reference's m, n and K.
 
-A footprint is three planes through the camera, linear functions of a pixel: two numerators whose quotients with the
-third are the whitened place u on the tangent plane, ``K = A^T A``::
+A footprint is three linear functions of a pixel, planes through the camera: two numerators whose quotients with the
+third are the whitened coordinates u on the tangent plane, with ``K = A^T A``::
 
     u_k = (a_k . d) / (n . d),   alpha = o exp(-(u_1^2 + u_2^2) / 2)
 
-Each plane is stored by its value at a pixel of the footprint's box and its slopes along x and y: differences of large
-numbers are taken in float64, before a float32 kernel begins. The same holds for the three of the depth, M d.
+Each plane is stored by its value at a pixel of the footprint's box and its slopes along x and y, so that differences of
+large numbers are taken in float64, before a float32 kernel begins. The three planes M d of the depth are stored alike.
 """
 
 import functools
@@ -22,7 +22,7 @@ from minisplat_ref.jit.lanes import maximum, select
 from minisplat_ref.jit.literals import HALF, ONE, ZERO
 from minisplat_ref.types import Floats
 
-# Of a record. The first eight have the derivatives of what stands in the second line.
+# Columns of a record, and of its gradient.
 OPACITY, REF_X, REF_Y, FIRST, SECOND, COSINE, WHITE, CENTER = 0, 1, 2, 3, 6, 9, 12, 21
 V_OPACITY, V_MOVE, V_STRETCH, V_SHAPE, N_GRADIENTS = 0, 1, 3, 5, 8
 SIZE = CENTER + 3
@@ -31,7 +31,7 @@ _COSINE_MIN, _TINY = np.float32(COSINE_MIN), np.float32(1e-30)
 
 @functools.cache
 def tangent_response(exp: Callable) -> KernelResponse:
-    """Response on tangent planes, with an exponential of :mod:`minisplat_ref.cpu.compositing.exponential`."""
+    """Return the response on tangent planes with an exponential of :mod:`minisplat_ref.cpu.compositing.exponential`."""
 
     @scalar
     def plane(records, n, k, dx, dy):
@@ -52,7 +52,7 @@ def tangent_response(exp: Callable) -> KernelResponse:
 
     @scalar
     def hit_vjp(records, n, place, v_mean, v_shape, v_place):
-        """Moments of q = dL/dsigma: with u, with |u|^2 u, and with u u^T; see ``_records_vjp``."""
+        """Add the moments of ``q = dL/dsigma`` with u, with ``|u|^2 u`` and with ``u u^T``; see ``_records_vjp``."""
         u, v, falloff = place
         alpha = records[n, OPACITY] * falloff
         q, p = -alpha * v_shape, -alpha * v_mean

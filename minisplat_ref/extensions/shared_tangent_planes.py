@@ -1,26 +1,27 @@
 """Footprints on tangent planes of the unit sphere, in NumPy: Optimal Projection (Huang et al. 2024, arXiv 2402.00752).
 
-EWA expands the perspective map on the image plane, where it is stretched more and more towards the edges. Here each
-Gaussian is projected on the plane that touches the unit sphere in the direction of its mean. With x the mean and C the
-covariance in the camera's frame::
+EWA expands the perspective map on the image plane, where footprints are stretched more and more towards the edges. Here
+each Gaussian is projected onto the plane tangent to the unit sphere in the direction of its mean. With x the mean and C
+the covariance in the camera's frame::
 
     r = |x|,  n = x / r,  P = I - n n^T
     G = P C P / r^2 + e P,   K = G^+                (the pseudo-inverse: both vanish along n)
     m = d / (n . d) - n                             the ray d meets the plane n . y = 1 at n + m
     alpha = o exp(-m^T K m / 2)   where n . d > 0
 
-The low-pass e is ``eps2d / (fx fy)``: that of 3DGS where the optical axis is, and the same on every tangent plane. So a
-footprint depends on rays alone: a camera that turns sees the same colours.
+The low-pass e is ``eps2d / (fx fy)``, which is that of 3DGS on the optical axis, and the same on every tangent plane.
+So a footprint depends on rays alone, and a camera that turns sees the same colours.
 
-The order of hits needs where on its ray a Gaussian is densest (StopThePop, Radl et al. 2024, arXiv 2402.00525, equation
+Hits are ordered by where on its ray a Gaussian is densest (StopThePop, Radl et al. 2024, arXiv 2402.00525, equation
 (9)). With the whitening M, for which ``C^-1 = M^T M``::
 
     t = (M d . M x) / (M d . M d)
 
-It has no derivative: only the order counts. Flat Gaussians count as a thousandth of their longest axis thick in it.
+It has no derivative, since only the order counts. In it, flat Gaussians count as at least a thousandth of their longest
+axis thick.
 
-Left out: conventions that compensate opacities (``is_antialiased``), the clamp of EWA's Jacobian, which nothing here
-needs, and INRIA's extent. A Gaussian is culled by its distance, not by its camera z, or turning would cull.
+Left out are conventions that compensate opacities (``is_antialiased``), the clamp of EWA's Jacobian, which nothing here
+needs, and INRIA's extent. A Gaussian is culled by its distance, not by its camera z, or turning the camera would cull.
 """
 
 from typing import NamedTuple
@@ -40,7 +41,7 @@ THICKNESS_MIN = 1e-3  # of an axis, relative to the longest, where depths are co
 
 
 class TangentFootprints(NamedTuple):
-    """What one camera sees of N Gaussians; float64 whatever the data, camera frame. Culled ones have zeros."""
+    """The footprints of N Gaussians for one camera, in its frame and in float64; zeros where culled."""
 
     normals: Floats
     """[N, 3] n."""
@@ -49,7 +50,7 @@ class TangentFootprints(NamedTuple):
     opacities: Floats
     """[N] o."""
     distances: Floats
-    """[N] r, world units: what lists are sorted by."""
+    """[N] r, world units; lists are sorted by it."""
     depths: Floats
     """[N] camera z of the means, world units."""
     whitenings: Floats
@@ -61,7 +62,7 @@ class TangentFootprints(NamedTuple):
     boxes: Ints
     """[N, 4] int32 pixels x0, y0, x1, y1 (half-open, in the image); empty where culled."""
     camera: Camera
-    """With the principal point that the conventions use."""
+    """The camera, with the principal point that the conventions use."""
 
 
 class FootprintGradient(NamedTuple):
@@ -78,7 +79,7 @@ class FootprintGradient(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Where rays meet the tangent planes; G Gaussians, P rays."""
+    """The intersections of P rays with the tangent planes of G Gaussians."""
 
     points: Floats  # [G, P, 3] m
     falloffs: Floats  # [G, P] exp(-m^T K m / 2), 0 where the ray misses the plane
@@ -86,17 +87,19 @@ class Place(NamedTuple):
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # non-finite rows are culled, not reported
 def project(primitives: Primitives, camera: Camera, conventions: Conventions) -> TangentFootprints:
-    """Project Gaussians on their tangent planes, and cull those that the camera cannot show.
+    """Project Gaussians onto their tangent planes, and cull those that the camera cannot show.
 
-    Culled: not ``near < r < far``; opacity below ``alpha_min``; G not finite or not invertible; outside the image.
+    A Gaussian is culled unless ``near < r < far``, if its opacity is below ``alpha_min``, if G is not finite or not
+    invertible, or if it lies outside the image.
 
     Parameters
     ----------
     primitives : Primitives
         N Gaussians, world frame.
     camera : Camera
+        The view.
     conventions : Conventions
-        Planes, low-pass, principal point.
+        Near and far planes, low-pass, principal point and ``alpha_min`` are used.
 
     Raises
     ------
@@ -145,7 +148,7 @@ def project_vjp(
 ) -> tuple[PrimitiveGradient, Floats]:
     """Gradient of :func:`project`; culled Gaussians get zeros.
 
-    A response reads K along the tangent plane only, where ``dK = -K dG K``. With ``P dP P = 0`` and, for ``dn`` in the
+    A response reads K in the tangent plane only, where ``dK = -K dG K``. With ``P dP P = 0`` and, for ``dn`` in the
     plane, ``P dP C P = -dn (P C n)^T``::
 
         v_G  = -K v_K K
@@ -159,16 +162,17 @@ def project_vjp(
     primitives, camera, conventions
         As for :func:`project`.
     footprints : TangentFootprints
-        Its result.
+        The result of :func:`project`.
     v_footprints : FootprintGradient
-        Derivative of the loss.
+        Derivative with respect to the footprints.
 
     Returns
     -------
     v_primitives : PrimitiveGradient
         In the dtype of the primitives.
     v_means2d : ndarray of shape (N, 2)
-        Derivative as a footprint moves in the image with its shape on the sphere, per pixel; 0 beside the image plane.
+        Derivative per pixel by which a footprint moves in the image, its shape on the sphere fixed; 0 where its
+        direction does not meet the image plane.
     """
     dtype, rows = primitives.means.dtype, np.flatnonzero(footprints.radii[:, 0] > 0)  # [V] visible
     camera = with_principal_point(camera, conventions)
@@ -195,13 +199,14 @@ def project_vjp(
 
 
 def hit(footprints: TangentFootprints, ids: Ints, centers: Floats) -> Hit:
-    """Evaluate Gaussians on the rays through image positions: ``hit`` of a response.
+    """Return the hits of Gaussians on the rays through image positions; this is the ``hit`` of a response.
 
     Parameters
     ----------
     footprints : TangentFootprints
+        From :func:`project`.
     ids : ndarray of shape (G,)
-        Which of them.
+        Rows of the Gaussians.
     centers : ndarray of shape (P, 2)
         Image positions, px.
     """
@@ -233,7 +238,7 @@ def hit_vjp(
     Returns
     -------
     tuple
-        With respect to normals [G, 3], conics [G, 3, 3] and opacities [G].
+        Gradients with respect to normals [G, 3], conics [G, 3, 3] and opacities [G].
     """
     m, falloffs = found.place
     v_sigma = -footprints.opacities[ids, None] * falloffs
@@ -245,7 +250,7 @@ def hit_vjp(
 
 
 def tangent_bases(normals: Floats) -> Floats:
-    """Return two orthonormal rows [N, 2, 3] that span the plane across each unit vector [N, 3]."""
+    """Return two orthonormal rows [N, 2, 3] that span the plane perpendicular to each unit vector [N, 3]."""
     axes = np.eye(3)[np.argmin(np.abs(normals), axis=1)] if len(normals) else normals
     first = np.cross(axes, normals)
     first = first / np.linalg.norm(first, axis=1, keepdims=True)
@@ -265,11 +270,11 @@ def _low_pass(camera: Camera, conventions: Conventions) -> float:
 
 
 def _boxes(n: Floats, G: Floats, opacities: Floats, camera: Camera, conventions: Conventions) -> Floats:
-    """Boxes [N, 4] of the pixels whose rays lie in the cone of ``alpha >= alpha_min``.
+    """Return boxes [N, 4] of the pixels whose rays lie in the cone of ``alpha >= alpha_min``.
 
-    The cone's rays are n + e G^(1/2) times unit vectors, ``e^2 = 2 ln(o / alpha_min)``; a plane l . d = 0 touches it
-    where ``(l . n)^2 = e^2 l^T G l``. Of the planes d_x = c d_z that is a quadratic in c. A cone that reaches beyond
-    the image plane has no such bounds: it gets the whole image, unless it lies on the far side of one of its edges.
+    The cone's rays are n + e G^(1/2) times unit vectors, ``e^2 = 2 ln(o / alpha_min)``; a plane l . d = 0 is tangent to
+    it where ``(l . n)^2 = e^2 l^T G l``. For the planes d_x = c d_z this is a quadratic in c. A cone that reaches
+    across the plane z = 0 has no such bounds: it gets the whole image, unless it lies beyond one of its edges.
     """
     ee = 2 * np.log(np.maximum(opacities / conventions.alpha_min, 1))  # [N] e^2
     size, focal = np.array([camera.width, camera.height]), np.array([camera.fx, camera.fy])
@@ -295,14 +300,14 @@ def _boxes(n: Floats, G: Floats, opacities: Floats, camera: Camera, conventions:
 
 
 def _in_pixels(v_normals: Floats, normals: Floats, camera: Camera) -> Floats:
-    """Chain a derivative along the sphere to the pixel that a direction is seen at: ``dn = (n_z / f) P e_k dp_k``."""
+    """Return the derivative with respect to the pixel at which a direction is seen: ``dn = (n_z / f) P e_k dp_k``."""
     focal = np.array([camera.fx, camera.fy])
     along = v_normals - normals * np.sum(normals * v_normals, axis=1, keepdims=True)
     return along[:, :2] * np.maximum(normals[:, 2:], 0) / focal
 
 
 def _scatter(values: Floats, rows: Ints, n: int, dtype: np.dtype) -> Floats:
-    """Array of n rows with ``values`` at ``rows`` and zeros elsewhere."""
+    """Return an array of n rows with ``values`` at ``rows`` and zeros elsewhere."""
     full = np.zeros((n, *values.shape[1:]), dtype)
     full[rows] = values
     return full

@@ -1,4 +1,4 @@
-"""Colours on given rays instead of pixels: what studies ask that turn a camera and look along the same rays again."""
+"""Colours on given rays instead of pixels, for studies that turn a camera and look along the same rays again."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -14,34 +14,34 @@ from minisplat_ref.types import Bools, Camera, Floats, Ints, Primitives
 
 
 class RayHits(NamedTuple):
-    """What Gaussians do to P rays; G of them, in the order of a list."""
+    """The hits of G Gaussians, in the order of a list, on P rays."""
 
     ids: Ints  # [G] rows
     hit: Hit  # [G, P]
 
 
 def ewa_hits(primitives: Primitives, camera: Camera, rays: Floats, conventions: Conventions) -> RayHits:
-    """Evaluate 3DGS's footprints on rays [P, 3] of the camera's frame; the list is by camera z."""
+    """Return the hits of 3DGS's footprints on rays [P, 3] of the camera's frame, listed by camera z."""
     projection = project_ewa(*primitives, camera, conventions)
     ids = _listed(projection.depths, projection.radii)
     return RayHits(ids, conic_hit(projection, ids, pinhole(rays, camera)))
 
 
 def tangent_hits(primitives: Primitives, camera: Camera, rays: Floats, conventions: Conventions) -> RayHits:
-    """Evaluate footprints on tangent planes on rays [P, 3] of the camera's frame; the list is by distance."""
+    """Return the hits of footprints on tangent planes on rays [P, 3] of the camera's frame, listed by distance."""
     footprints = project(primitives, camera, conventions)
     ids = _listed(footprints.distances, footprints.radii)
     return RayHits(ids, hit(footprints, ids, pinhole(rays, camera)))
 
 
 def sorted_ewa_hits(primitives: Primitives, camera: Camera, rays: Floats, conventions: Conventions) -> RayHits:
-    """Evaluate 3DGS's footprints with the depths on the rays: the order alone is StopThePop's."""
+    """Return the hits of 3DGS's footprints with the depths on the rays, so that only the order is StopThePop's."""
     found, footprints = ewa_hits(primitives, camera, rays, conventions), project(primitives, camera, conventions)
     depths = hit(footprints, found.ids, pinhole(rays, camera)).depths
     return found._replace(hit=found.hit._replace(depths=depths))
 
 
-WAYS: dict[str, tuple[Callable[[Primitives, Camera, Floats, Conventions], RayHits], int]] = {
+METHODS: dict[str, tuple[Callable[[Primitives, Camera, Floats, Conventions], RayHits], int]] = {
     "3DGS: EWA, by z": (ewa_hits, LIST_ORDER),
     "EWA, exact order": (sorted_ewa_hits, EXACT_ORDER),
     "tangent planes, by distance": (tangent_hits, LIST_ORDER),
@@ -52,25 +52,26 @@ WAYS: dict[str, tuple[Callable[[Primitives, Camera, Floats, Conventions], RayHit
 
 
 def ray_colors(
-    way: str, primitives: Primitives, colors: Floats, camera: Camera, rays: Floats, conventions: Conventions
+    method: str, primitives: Primitives, colors: Floats, camera: Camera, rays: Floats, conventions: Conventions
 ) -> Floats:
-    """Return the light [P, 3] along rays of the world over black.
+    """Return the colours [P, 3] along rays of the world over black.
 
     Parameters
     ----------
     way : str
-        Key of ``WAYS``.
+        Key of ``METHODS``.
     primitives : Primitives
         N Gaussians.
     colors : ndarray of shape (N, 3)
-        The same towards all sides.
+        Colours, the same in all directions.
     camera : Camera
-        Decides footprints and order.
+        It determines footprints and order.
     rays : ndarray of shape (P, 3)
-        Directions in the world's frame, in front of the camera.
+        Directions in the world frame, in front of the camera.
     conventions : Conventions
+        Thresholds and low-pass.
     """
-    hits, buffer_size = WAYS[way]
+    hits, buffer_size = METHODS[method]
     found = hits(primitives, camera, rays @ camera.cam_from_world_R.T, conventions)
     alphas = np.minimum(conventions.alpha_max, found.hit.unclamped)
     is_hit = alphas >= conventions.alpha_min
@@ -83,13 +84,14 @@ def ray_colors(
 
 
 def misordered_pairs(is_hit: Bools, depths: Floats) -> tuple[int, int]:
-    """Count the pairs of hits of all rays, and those that stand in the other order than their depths.
+    """Return the number of pairs of hits of all rays, and of those in the opposite order to their depths.
 
     Parameters
     ----------
     is_hit : ndarray of shape (G, P)
-        In the order in which they are blended.
+        Hits in the order in which they are blended.
     depths : ndarray of shape (G, P)
+        Depths in that order, world units.
     """
     n_pairs = n_wrong = 0
     for ray in range(depths.shape[1]):
@@ -100,41 +102,41 @@ def misordered_pairs(is_hit: Bools, depths: Floats) -> tuple[int, int]:
 
 
 def _listed(depths: Floats, radii: Ints) -> Ints:
-    """Rows that are seen, nearest first."""
+    """Return the rows that are seen, nearest first."""
     rows = np.flatnonzero(radii[:, 0] > 0)
     listed: Ints = rows[np.argsort(depths[rows], kind="stable")]
     return listed
 
 
-def turned(camera: Camera, yaw: float) -> Camera:
-    """Return the camera turned by ``yaw`` radians about its own y axis, where it stands."""
+def yawed(camera: Camera, yaw: float) -> Camera:
+    """Return the camera rotated in place by ``yaw`` radians about its own y axis."""
     cos, sin = np.cos(yaw), np.sin(yaw)
     Y = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
     R = Y @ np.asarray(camera.cam_from_world_R, np.float64)
     return camera._replace(cam_from_world_R=R, cam_from_world_t=Y @ np.asarray(camera.cam_from_world_t, np.float64))
 
 
-def moved(camera: Camera, aside: float) -> Camera:
-    """Return the camera moved along its own x axis."""
-    return camera._replace(cam_from_world_t=camera.cam_from_world_t - np.array([aside, 0.0, 0.0]))
+def translated(camera: Camera, dx: float) -> Camera:
+    """Return the camera moved by ``dx`` world units along its own x axis."""
+    return camera._replace(cam_from_world_t=camera.cam_from_world_t - np.array([dx, 0.0, 0.0]))
 
 
-def steps_along(
-    way: str,
+def color_changes(
+    method: str,
     primitives: Primitives,
     colors: Floats,
     path: list[Camera],
     rays: Floats,
     conventions: Conventions,
 ) -> tuple[Floats, Floats]:
-    """Return the change of the rays' colours in each step of a path of n cameras: of the worst ray, and the mean.
+    """Return the largest and the mean change of the rays' colours in each step of a path of n cameras.
 
-    Of a colour's three channels the one counts that changes most.
+    The channel that changes most counts.
 
     Returns
     -------
     largest, mean : ndarray of shape (n - 1,)
     """
-    seen = np.stack([ray_colors(way, primitives, colors, camera, rays, conventions) for camera in path])
+    seen = np.stack([ray_colors(method, primitives, colors, camera, rays, conventions) for camera in path])
     changes = np.abs(np.diff(seen, axis=0)).max(axis=2)  # [n - 1, P]
     return changes.max(axis=1), changes.mean(axis=1)

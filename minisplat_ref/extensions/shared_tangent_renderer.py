@@ -1,4 +1,4 @@
-"""Gaussians drawn by their footprints on tangent planes, each pixel in its own order, and the way back."""
+"""A renderer of footprints on tangent planes, in which each pixel has its own order, and its gradient."""
 
 import math
 from typing import Any, NamedTuple
@@ -35,15 +35,15 @@ from minisplat_ref.types import (
     View,
 )
 
-BUFFER_MAX = 1024  # hits; beyond, None is meant
-STATISTICS = frozenset({"stats", "median_depth", "surface", "dominant_depth"})  # left to 3DGS's footprints
+BUFFER_MAX = 1024  # hits; for more, use None
+STATISTICS = frozenset({"stats", "median_depth", "surface", "dominant_depth"})  # computed with 3DGS's footprints
 
 RESPONSE = Response(lambda footprints: footprints.boxes, hit, hit_vjp, ("normals", "conics", "opacities"))
-"""The book's response; in the order of the list, until ``buffer_size`` says otherwise."""
+"""The response of the reference, in the order of the list unless ``buffer_size`` is set."""
 
 
 class Prepared(NamedTuple):
-    """A view of Gaussians, projected and coloured."""
+    """A view of Gaussians after projection and shading."""
 
     gaussians: Any
     sh_degree: int  # active
@@ -66,7 +66,7 @@ class Prepared(NamedTuple):
         return REFERENCE.bin_gaussians(by_distance, grid, self.conventions)
 
     def blended(self, bins: TileBins) -> RenderOutput:
-        """Return the picture by kernels or by the book."""
+        """Return the picture, drawn by kernels or by the reference."""
         inputs = self.footprints, self.channels, self.background, bins, self.conventions
         if self.backend.is_compiled:
             return kernel_hits.composite_hits(response_for(self.channels.dtype, self.buffer_size), *inputs)
@@ -74,7 +74,7 @@ class Prepared(NamedTuple):
 
 
 class Tape(NamedTuple):
-    """What :func:`render` did, for :func:`render_vjp`."""
+    """What :func:`render` keeps for :func:`render_vjp`."""
 
     prepared: Prepared
     bins: TileBins
@@ -82,12 +82,12 @@ class Tape(NamedTuple):
 
 
 def prepare(model: Model, camera: Camera, request: Request, buffer_size: int | None) -> Prepared:
-    """Project and colour the Gaussians of a model.
+    """Project and shade the Gaussians of a model.
 
     Raises
     ------
     InputError
-        The buffer holds no hit, or the conventions are not those of tangent planes.
+        The size of the buffer is out of range, or the conventions ask for compensated opacities.
     """
     g, backend = model.gaussians, request.backend
     size = checked_buffer(buffer_size)
@@ -118,12 +118,12 @@ def prepare(model: Model, camera: Camera, request: Request, buffer_size: int | N
 
 
 def checked_buffer(buffer_size: int | None) -> int:
-    """Return the hits that a pixel holds back; None is any number.
+    """Return the number of hits that a pixel sorts in its buffer; None for all.
 
     Raises
     ------
     InputError
-        It is no whole number of at least 1.
+        It is not an integer from 1 to ``BUFFER_MAX``.
     """
     if buffer_size is None:
         return EXACT_ORDER
@@ -136,7 +136,7 @@ def checked_buffer(buffer_size: int | None) -> int:
 
 
 def activated(gaussians: Any, is_visible: Bools | None) -> Primitives:
-    """Return Gaussians after their activations; those of ``is_visible`` alone where it is given."""
+    """Return the activated Gaussians, or only those of ``is_visible`` where it is given."""
     dtype = gaussians.means.dtype
     with np.errstate(over="ignore"):
         scales = np.minimum(np.exp(gaussians.log_scales), np.finfo(dtype).max)
@@ -147,7 +147,7 @@ def activated(gaussians: Any, is_visible: Bools | None) -> Primitives:
 
 
 def render(model: Model, view: View, request: Request, *, buffer_size: int | None = None) -> tuple[RenderOutput, Tape]:
-    """Draw a view.
+    """Draw a view; return the picture and a tape.
 
     Statistics of blending, surfaces and median depths, which the kernels do not collect, are those of 3DGS's footprints
     in its order.
@@ -157,9 +157,11 @@ def render(model: Model, view: View, request: Request, *, buffer_size: int | Non
     model : Model
         A population that has the six fields of :class:`Gaussians`.
     view : View
+        Its camera is used.
     request : Request
+        What is wanted, and by which backend.
     buffer_size : int, optional
-        Hits that a pixel holds back to sort them; all by default.
+        Hits that a pixel sorts in its buffer; all by default.
     """
     prepared = prepare(model, view.camera, request, buffer_size)
     bins = prepared.listed()
@@ -178,7 +180,8 @@ def render_vjp(tape: Tape, v_image: Floats, v_alpha: Floats | None = None) -> Re
     ::
 
         v_log_s = s v_s,  v_logit = o (1 - o) v_o
-        the means and the pose are used twice, by the projection and by the viewing direction
+
+    The means and the pose are used twice, by the projection and by the viewing direction, so two gradients are summed.
     """
     p, bins, output = tape
     g, footprints, camera = p.gaussians, p.footprints, p.view_camera

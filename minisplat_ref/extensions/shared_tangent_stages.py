@@ -1,4 +1,4 @@
-"""What the gradient proof checks of a representation on tangent planes: its renderer, with thresholds of its own."""
+"""The stage of the gradient check of a representation on tangent planes: its renderer with its own thresholds."""
 
 import numpy as np
 
@@ -14,14 +14,17 @@ from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Floats, Gaussians, Ints, Model
 
 
-def watching_stage(
+def renderer_stage(
     backend: Backend,
     setting: Setting,
     representation: Representation,
     buffer_size: int | None,
     rng: np.random.Generator,
 ) -> Stage:
-    """Return the renderer; what is listed, blended and clamped, and in which order, the reference tells once more."""
+    """Return the renderer as a stage whose points record what is listed, blended and clamped, and in which order.
+
+    The reference computes these records again, so that the check notices a step across a threshold.
+    """
     stage = model_stage(backend, setting, representation, rng)
     response = RESPONSE._replace(buffer_size=checked_buffer(buffer_size))
 
@@ -42,7 +45,7 @@ def watching_stage(
 
 
 def _blended_order(order: Ints | None, alphas: Floats) -> Ints:
-    """Return the order [G * P] of what is blended; what is not may come anywhere."""
+    """Return the order [G * P] of the blended hits; the place of the others does not matter."""
     if order is None:
         return np.zeros(0, int)
     return np.where(np.take_along_axis(alphas, order, axis=0) > 0, order, -1).ravel()

@@ -1,4 +1,4 @@
-"""What studies share that train a scene once for each seed, and ask what becomes of it: arguments, trainings, means."""
+"""Arguments, trainings and means that studies share which train a scene once per seed."""
 
 import argparse
 from collections.abc import Sequence
@@ -15,25 +15,25 @@ BLUE, RED, YELLOW, GREY = "#35608c", "#d2493f", "#e0a526", "#8a8580"
 
 
 def add_scene_arguments(parser: argparse.ArgumentParser, iterations: int, recipe: str) -> None:
-    """Add a scene of any kind, what it is trained by, and ``--out``."""
+    """Add the scene, the options of its trainings, and ``--out``."""
     parser.add_argument("scene", metavar="SCENE", help="folder of a scene, or a synthetic one such as room")
     shared_studies.add_out(parser)
     parser.add_argument("--downscale", type=int, default=1, metavar="D", help="make photographs D times smaller")
-    parser.add_argument("--recipe", default=recipe, metavar="R", help="of the trainings (default %(default)s)")
+    parser.add_argument("--recipe", default=recipe, metavar="R", help="recipe of the trainings (default %(default)s)")
     parser.add_argument(
-        "--iterations", type=int, default=iterations, metavar="N", help="of each training (default %(default)s)"
+        "--iterations", type=int, default=iterations, metavar="N", help="per training (default %(default)s)"
     )
-    parser.add_argument("--ply", type=Path, metavar="FILE", help="take these Gaussians, and train none")
-    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="trainings, seeds from 0 on (default 3)")
+    parser.add_argument("--ply", type=Path, metavar="FILE", help="take these Gaussians instead of training")
+    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="number of seeds, from 0 on (default 3)")
 
 
 def read_scene(args: argparse.Namespace) -> Scene:
-    """Load a folder, or make the synthetic scene of that name.
+    """Load a scene from a folder, or make the synthetic one of that name.
 
     Raises
     ------
     InputError
-        It is neither, it has no test views, or a number that was given makes no sense.
+        The scene is neither, it has no test views, or a number is out of range.
     """
     for name in ("downscale", "iterations", "seeds"):
         if getattr(args, name) < 1:
@@ -42,7 +42,7 @@ def read_scene(args: argparse.Namespace) -> Scene:
 
 
 def populations(args: argparse.Namespace, scene: Scene) -> list[Gaussians]:
-    """Return what is studied: the given Gaussians, or those of a training for each seed.
+    """Return the given Gaussians, or those of one training per seed.
 
     Raises
     ------
@@ -60,13 +60,13 @@ def populations(args: argparse.Namespace, scene: Scene) -> list[Gaussians]:
     recipe = get_recipe(args.recipe, args.iterations)
     trained = []
     for seed in range(args.seeds):
-        with tqdm(total=recipe.iterations, desc=f"{recipe.name}, seed {seed}", leave=False) as bar:
+        with tqdm(total=recipe.iterations, desc=f"{recipe.name}, seed {seed}", leave=False, disable=None) as bar:
             trained.append(train(scene, recipe, seed=seed, on_step=lambda _: bar.update()).gaussians)
     return trained
 
 
 def describe(args: argparse.Namespace, scene: Scene) -> dict[str, Any]:
-    """Return what the figures depend on."""
+    """Return the scene and the settings on which the results depend."""
     from minisplat_ref.reporting import describe_machine
 
     camera = scene.train_views[0].camera
@@ -87,6 +87,6 @@ def mean_and_deviation(values: Sequence[float]) -> tuple[float, float]:
 
 
 def with_deviation(values: Sequence[float], digits: int) -> str:
-    """Return mean and deviation as a table has them; the number itself if it is only one."""
+    """Return mean and deviation as text for a table; of a single value, the value alone."""
     mean, deviation = mean_and_deviation(values)
     return f"{mean:.{digits}f} ± {deviation:.{digits}f}" if len(values) > 1 else f"{mean:.{digits}f}"

@@ -40,10 +40,11 @@ from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.types import Model, Projection, view_from
 
 DRAW = INTEGRATED.renderer
-# A logistic curve instead of the normal distribution: 3.9e-4 at most (``analytic/footprint``), of two differences each.
+# The logistic curve differs from the normal distribution by 3.9e-4 at most (``analytic/footprint``), in two
+# differences.
 LOGISTIC_ERROR = 2e-3
-# Gradients in float32, relative to the largest: an integral is a difference of two values of a curve, and in its
-# derivative with respect to a scale two terms cancel once more, which loses a digit beside PARITY_FLOAT32_GRADIENT.
+# Gradients in float32, relative to the largest. An integral is a difference of two values of a curve, and in its
+# derivative with respect to a scale two terms cancel again, which loses a digit compared to PARITY_FLOAT32_GRADIENT.
 INTEGRAL_FLOAT32_GRADIENT = 2e-4
 
 
@@ -70,11 +71,11 @@ def test_along_the_image_axes_it_is_the_exact_mean(sigmas):
 
 
 def test_at_an_angle_it_keeps_the_mass_of_the_image():
-    """The turned squares of all pixels cover the plane only on average: over 16 places the sum is the mass."""
+    """The rotated squares of all pixels cover the plane only on average, so the mean over 16 positions is the mass."""
     C, sums = footprint.covariance(0.6, 3.0, 0.6), []
     for step in range(16):
         mean = np.array([step % 4, step // 4]) / 4
-        sums.append(footprint.drawn(mean, C, EXACT_RESPONSE).sum())
+        sums.append(footprint.alphas_of(mean, C, EXACT_RESPONSE).sum())
     mass = footprint.OPACITY * 2 * np.pi * np.sqrt(np.linalg.det(C))
     assert np.mean(sums) == pytest.approx(mass, rel=1e-4) and np.ptp(sums) < 0.02 * mass
 
@@ -90,9 +91,9 @@ def test_a_wide_gaussian_is_its_value_at_the_centre():
 
 def test_the_logistic_curve_is_near_the_normal_one():
     x = np.linspace(-6, 6, 1001)
-    assert np.abs(LOGISTIC.below(x) - NORMAL.below(x)).max() < 4e-4
+    assert np.abs(LOGISTIC.cdf(x) - NORMAL.cdf(x)).max() < 4e-4
     mean, C = np.array([0.3, 0.4]), footprint.covariance(0.4, 3.0, 0.3)
-    exact, logistic = (footprint.drawn(mean, C, response) for response in (EXACT_RESPONSE, RESPONSE))
+    exact, logistic = (footprint.alphas_of(mean, C, response) for response in (EXACT_RESPONSE, RESPONSE))
     assert 0 < np.abs(exact - logistic).max() < LOGISTIC_ERROR
 
 
@@ -116,7 +117,7 @@ def random_conics(rng, n):
 def test_the_gradient_of_axes(rng):
     conics = random_conics(rng, 6)
     axes = axes_of(conics)
-    for k, conic in enumerate(conics):  # they are the eigenvectors and the roots of the eigenvalues
+    for k, conic in enumerate(conics):  # the axes are the eigenvectors, the rates the roots of the eigenvalues
         e = np.array([np.cos(axes.angles[k]), np.sin(axes.angles[k])])
         assert_allclose(conic[[0, 1, 1, 2]].reshape(2, 2) @ e, axes.rates[k, 0] ** 2 * e, atol=PARITY_FLOAT64 * 10)
     check_jacobian(
@@ -174,7 +175,7 @@ def test_a_wrong_gradient_is_found(monkeypatch):
 )
 @pytest.mark.parametrize("size", [0.15, 0.02])
 def test_kernels_and_reference_agree(dtype, image_rel, gradient_rel, size, rng):
-    """Gaussians of some pixels, and of fractions of one. The reference is in float64."""
+    """They agree for Gaussians of several pixels and of fractions of one; the reference is in float64."""
     gaussians, view = make_gaussians(rng, 60, size=size), view_from(make_camera(rng=rng))
     v_image, v_alpha = rng.normal(size=(18, 24, 3)), rng.normal(size=(18, 24))
     results = []
@@ -200,7 +201,7 @@ def test_wide_gaussians_are_drawn_as_by_3dgs_without_a_low_pass(backend, rng):
 
 
 def test_a_thin_needle_misses_no_tile(rng):
-    """A needle between the rows of pixel centres, a twentieth of a pixel thick: 3DGS without low-pass sees nothing."""
+    """3DGS without low-pass does not see a needle between rows of pixel centres, a twentieth of a pixel thick."""
     needle = make_gaussians(rng, 1, sh_degree=0)._replace(
         means=np.array([[0.0, 0.0, 3.0]]),
         quats=np.array([[1.0, 0, 0, 0]]),

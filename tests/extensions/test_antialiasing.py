@@ -57,7 +57,7 @@ def test_the_nearest_camera_that_sees_it_counts():
 
 
 def test_a_filtered_gaussian_by_hand():
-    """Deviations 3, 4 and 12 with a filter of 4: 5, sqrt(32) and sqrt(160); the opacity keeps the integral."""
+    """A filter of 4 makes deviations of 3, 4 and 12 become 5, sqrt(32) and sqrt(160); opacity keeps the integral."""
     scales, opacity = np.array([[3.0, 4, 12]]), 0.7
     found, logits = smoothed(np.log(scales), np.log([opacity / (1 - opacity)]), np.array([4.0]))
     expected = np.sqrt([[25.0, 32, 160]])
@@ -93,7 +93,7 @@ def test_extremes_stay_finite(log_scale, logit):
 
 
 def test_the_image_keeps_its_mass_when_a_gaussian_is_filtered():
-    """A faint sphere far away and a filter of its size: four times the area, and as much light in the image."""
+    """A filter of its own size doubles the area of a distant ball; the light in the image follows in closed form."""
     still = as_dtype(make_gaussians(np.random.default_rng(0), 1, sh_degree=0), np.float64)._replace(
         means=np.array([[0.0, 0, 10]]),
         quats=np.array([[1.0, 0, 0, 0]]),
@@ -115,7 +115,7 @@ def test_the_image_keeps_its_mass_when_a_gaussian_is_filtered():
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_without_filters_it_is_3dgs_exactly(backend, dtype, rng):
-    """The 3D filter alone around 3DGS's renderer; and the 2D filter is 3DGS's compensation with another variance."""
+    """The 3D filter alone wraps 3DGS's renderer, and the 2D filter is 3DGS's compensation with another variance."""
     gaussians, view = as_dtype(make_gaussians(rng, 40), dtype), view_from(make_camera(rng=rng))
     zero = unfiltered(gaussians, rng)
     mip = GSPLAT_MAIN._replace(eps2d=EPS2D, is_antialiased=True)
@@ -235,7 +235,7 @@ def test_a_ply_is_drawn_with_its_filters_and_one_without_is_refused(run_folder, 
 
 
 def test_a_recipe_of_the_core_is_filtered_too(scene_folder, tmp_path):
-    """With the representation alone nothing measures filters: zero, and a column in the PLY."""
+    """With the representation alone no event measures filters: they are zero, and a column in the PLY."""
     options = ["--extension", "antialiasing", "--test-every", "4", "--iterations", "5", "--out", str(tmp_path / "run")]
     assert main(["train", str(scene_folder), *options]) == 0
     assert_array_equal(load_ply(tmp_path / "run" / "point_cloud.ply", FilteredGaussians).filter_sigmas, 0)

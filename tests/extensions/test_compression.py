@@ -1,4 +1,4 @@
-"""Compact files: bounds that hold for every number, bytes that stay the same, and files that lie."""
+"""Compact files: bounds that hold for every number, bytes that stay the same, and damaged files."""
 
 import json
 import struct
@@ -44,7 +44,7 @@ def float32(low, high):
 
 @st.composite
 def populations(draw):
-    """Gaussians of any values that a lattice reaches, N from 0 to 7, degree 0 to 3."""
+    """Draw Gaussians of any values that a lattice reaches, N from 0 to 7, of degree 0 to 3."""
     n, degree = draw(st.integers(0, 7)), draw(st.integers(0, 3))
     shapes = {
         "means": ((n, 3), float32(-(2.0**13), 2.0**13)),
@@ -94,7 +94,7 @@ def test_rotations_stay_within_their_angle(quats, exponent):
 
 
 def test_ties_of_the_largest_component():
-    """All components alike, and one that rounds up to the largest: the first is the one, and positive."""
+    """If all components are alike, or one rounds up to the largest, the first becomes 1 and is positive."""
     quats = np.array([[-1, 1, 1, -1], [0.9999, -1.0, 0, 0]], np.float32)
     rotations = lattice.to_rotations(quats, -6)
     assert rotations.largest.tolist() == [0, 0]
@@ -107,7 +107,7 @@ def test_ties_of_the_largest_component():
 @settings(max_examples=40, deadline=None)
 @given(populations(), st.sampled_from(LEVELS))
 def test_msz_bound_and_same_bytes(gaussians, level):
-    """Every number within its bound, and the second encoding is the first."""
+    """Every number is within its bound, and the second encoding equals the first."""
     content = msz.encode(gaussians, level)
     back = msz.decode(content, "file")
     assert msz.encode(back, level) == content
@@ -130,7 +130,7 @@ def test_msz_bound_and_same_bytes(gaussians, level):
 
 
 def matching_rows(gaussians, back, bound):
-    """The row of each decoded one: by the order of the centres' lattice points, which the format promises."""
+    """Return the row of each decoded Gaussian, by the order of the centres' lattice points, which is defined."""
     order = morton_order(np.rint(gaussians.means.astype(np.float64) / (2 * bound)))
     assert sorted(order.tolist()) == list(range(len(back.means)))
     return order
@@ -143,16 +143,16 @@ def test_msz_becomes_smaller_level_by_level(sh_degree):
 
 
 def test_msz_step_of_centres_follows_the_scene():
-    """A scene ten times as large, in other units, has the same integers if ten were a power of two: take eight."""
+    """A scene eight times as large has the same integers, because eight is a power of two."""
     gaussians = population()
     larger = gaussians._replace(means=8 * gaussians.means, log_scales=gaussians.log_scales + np.float32(np.log(8.0)))
-    steps = [msz._checked(container.take_apart(msz.CONTAINER, msz.encode(g, 6), "")).steps for g in (gaussians, larger)]
+    steps = [msz._checked(container.parse(msz.CONTAINER, msz.encode(g, 6), "")).steps for g in (gaussians, larger)]
     assert steps[1].means - steps[0].means in (2, 3, 4)  # log scales are rounded, too
     assert steps[0].means < np.log2(np.exp(gaussians.log_scales).min())
 
 
 def test_small_gaussians_decide_and_thin_ones_do_not():
-    """Middle axes of e^-3 (a tenth and more) and of 1: 2^-5 is the last power of two below e^-3 = 0.0498."""
+    """With middle axes of e^-3 (a tenth and more) and of 1, the size is 2^-5, the last power below e^-3 = 0.0498."""
     log_scales = np.full((40, 3), 0.0)
     log_scales[:6] = [-9.0, -3.0, 2.0]
     integers = lattice.to_lattice(log_scales, -8, "log_scales")
@@ -176,13 +176,13 @@ def test_msz_refuses_nan():
 
 
 @pytest.mark.parametrize("format_", [msz.MSZ, spz.SPZ], ids=lambda f: f.suffix)
-def test_nothing_there_and_back(format_):
+def test_round_trip_of_no_gaussians(format_):
     for level in range(len(format_.levels)):
         back = format_.decode(format_.encode(population(0), level), "file")
         assert len(back.means) == 0 and back.sh_rest.shape == (0, 15, 3)
 
 
-# Files that lie
+# Damaged files
 
 
 @pytest.mark.parametrize("format_", [msz.MSZ, spz.SPZ], ids=lambda f: f.suffix)
@@ -199,7 +199,7 @@ def test_damaged_anywhere(format_, rng):
 
 def test_headers_that_lie_at_random(rng):
     check_headers(msz.MSZ, msz.encode(population(7, 1), 5), rng, 300)
-    header = msz._checked(container.take_apart(msz.CONTAINER, msz.encode(population(7, 1), 5), ""))
+    header = msz._checked(container.parse(msz.CONTAINER, msz.encode(population(7, 1), 5), ""))
     steps = header.steps._replace(log_scales=55)._asdict()  # once an overflow
     assert "which steps" in refusal(msz.MSZ, with_header(msz.encode(population(), 3), steps=steps))
 
@@ -266,7 +266,7 @@ def study(run, out, *options):
 
 
 def test_study_of_a_ply(run, tmp_path, capsys):
-    """What keeps every float loses nothing, and the finest lattice is nearer than the coarsest."""
+    """Formats that keep every float lose nothing, and the finest lattice loses less than the coarsest."""
     copier = tmp_path / "copier"
     copier.write_text('#!/bin/sh\n[ "$1 $2" = "-g cpu" ] && cp "$3" "$4"\n')
     copier.chmod(0o755)
@@ -280,11 +280,11 @@ def test_study_of_a_ply(run, tmp_path, capsys):
     assert sizes["ply"] == sizes["sog"] == (run / "point_cloud.ply").stat().st_size
     assert sizes["msz 5"] == len(msz.encode(load_ply(run / "point_cloud.ply"), 5))
     assert (tmp_path / "out" / "figure.png").stat().st_size > 10_000
-    assert "bytes a Gaussian" in capsys.readouterr().out
+    assert "bytes per Gaussian" in capsys.readouterr().out
 
 
 def test_a_smaller_scene_is_the_same_picture_and_only_spz_suffers(run):
-    """At 1/512 the step of SPZ, 2^-12, is as large as an eighth of a unit was."""
+    """At 1/512 of the size the step of SPZ, 2^-12, is an eighth of an original unit."""
     views, gaussians = load_scene(run.parent / "nook").test_views, load_ply(run / "point_cloud.ply")
     pictures = []
     for factor in (1.0, 1 / 512):

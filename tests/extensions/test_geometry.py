@@ -29,7 +29,7 @@ NO_POINTS = np.zeros((0, 3))
 
 
 def functions_of(backend):
-    """The module whose functions the loss terms take under a backend."""
+    """Return the module whose functions the loss terms use under a backend."""
     return kernels if backend.is_compiled else reference
 
 
@@ -41,19 +41,19 @@ TERMS = {"points": SFM, "depth": DEPTH, "normals": NORMALS, "all": ALL}
 
 
 def slopes(camera):
-    """x/z and y/z [H, W] of the pixel centres."""
+    """Return x/z and y/z [H, W] of the pixel centres."""
     ys, xs = np.mgrid[: camera.height, : camera.width] + 0.5
     return (xs - camera.cx) / camera.fx, (ys - camera.cy) / camera.fy
 
 
 def plane_depth(camera, normal, offset):
-    """Depth [H, W] of the plane normal . X = offset in the camera frame."""
+    """Return the depth [H, W] of the plane ``normal . X = offset`` in the camera frame."""
     s, t = slopes(camera)
     return offset / (normal[0] * s + normal[1] * t + normal[2])
 
 
 def lift(camera, columns, rows, depths):
-    """World points in front of the image positions, at the depths given."""
+    """Return the world points at image positions and depths."""
     x = (np.asarray(columns) - camera.cx) / camera.fx * depths
     y = (np.asarray(rows) - camera.cy) / camera.fy * depths
     in_camera = np.column_stack([x, y, np.broadcast_to(depths, x.shape)])
@@ -65,14 +65,14 @@ def flat_photograph(camera):
 
 
 def loss_of(backend, depth, camera, weights, *, photograph=None, points=NO_POINTS, alpha=1.0, mask=None):
-    """Loss of an expected depth map that is seen with an opacity."""
+    """Return the loss of an expected depth map that is seen with an opacity."""
     alpha = np.broadcast_to(alpha, depth.shape).astype(depth.dtype)
     photograph = flat_photograph(camera) if photograph is None else photograph
     return functions_of(backend).geometric_loss(alpha * depth, alpha, photograph, camera, points, weights, mask)
 
 
 def rough_view(rng, camera):
-    """Accumulated depth, opacity, photograph and points of a bumpy surface with holes, seen by a turned camera."""
+    """Return accumulated depth, opacity, photograph and points of a bumpy surface with holes and a rotated camera."""
     shape = camera.height, camera.width
     depth = 3 + 0.1 * rng.uniform(-1, 1, size=shape)
     alpha = rng.uniform(0.2, 1, size=shape) * (rng.uniform(size=shape) < 0.9)
@@ -159,7 +159,7 @@ def test_depth_error_at_a_point(backend, ratio, rng):
     assert loss == pytest.approx(cost, rel=1e2 * CLOSED_FORM, abs=CLOSED_FORM)
     v_depth, v_alpha = functions_of(backend).geometric_loss_vjp(tape)
     expected = np.zeros((18, 24))
-    expected[3, 5] = slope / 1.6  # by log z, both points' halves added up, over the accumulated depth
+    expected[3, 5] = slope / 1.6  # with respect to log z, summed over both points' halves, over the accumulated depth
     assert_allclose(v_depth, expected, rtol=1e2 * CLOSED_FORM, atol=1e2 * CLOSED_FORM)
     assert_allclose(v_alpha, -2 * expected, rtol=1e2 * CLOSED_FORM, atol=1e2 * CLOSED_FORM)
 
@@ -245,7 +245,7 @@ def test_loss_gradient(backend, term, is_masked, rng):
         loss, _ = functions_of(backend).geometric_loss(accumulated, alpha, photograph, camera, points, weights, mask)
         return (np.array(loss),)
 
-    # Empty pixels must stay so, hence moves in proportion.
+    # Empty pixels must stay empty, so the steps are proportional to the values.
     _, tape = functions_of(backend).geometric_loss(accumulated, alpha, photograph, camera, points, weights, mask)
     v_accumulated, v_alpha = functions_of(backend).geometric_loss_vjp(tape, 300.0)
     check_inner_products(
@@ -299,7 +299,7 @@ def test_gradient_through_the_renderer(backend, term, rng):
 @pytest.mark.parametrize("is_masked", [False, True])
 @pytest.mark.parametrize("term", EXTENSION.losses, ids=lambda term: term.name)
 def test_each_term_is_given_what_its_view_holds(backend, term, is_masked, rng):
-    """Photograph, mask, the points that the view sees; and depth and alpha get their derivatives."""
+    """A term gets the photograph, the mask and the points that the view sees; depth and alpha get derivatives."""
     camera = make_camera(rng=rng)
     sums, alpha, photograph, points = rough_view(rng, camera)
     image = np.concatenate([rng.uniform(size=(18, 24, 3)), sums[..., None]], axis=-1)
@@ -328,7 +328,7 @@ def test_tiny_images(backend, size, expected, dtype):
     # Depth grows from 2 to 3, so that the steps of a line add up to log(3/2), those of a square to twice that.
     width, height = size
     camera, depth = make_camera(width, height), np.linspace(2, 3, width * height, dtype=dtype).reshape(height, width)
-    points = lift(camera, [0.5], [0.5], 2.0)  # where they say
+    points = lift(camera, [0.5], [0.5], 2.0)  # at the depth of the map
     loss, tape = loss_of(backend, depth, camera, GeometricWeights(1.0, 1.0, 1.0), points=points)
     assert loss == pytest.approx(expected * np.log(1.5), rel=PARITY_FLOAT32_LOSS)
     v_depth, v_alpha = functions_of(backend).geometric_loss_vjp(tape)
@@ -381,7 +381,7 @@ def test_same_bytes_at_any_number_of_threads(rng):
 
 
 def test_the_gradient_proof_covers_it(backend, rng):
-    """What ``oracle gradients --extension geometry`` adds to the check of the whole model."""
+    """``oracle gradients --extension geometry`` adds these stages to the check of the whole model."""
     cases = [jacobian_case(stage) for stage in EXTENSION.stages(backend, tiny_setting(), rng)]
     assert len(cases) == (1 if backend.is_compiled else 5) and all(case.passed for case in cases), cases
 

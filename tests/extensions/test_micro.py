@@ -108,7 +108,7 @@ def test_box_means_are_means_over_boxes(rng):
 
 
 def test_detail_lowers_the_threshold(rng):
-    """Two Gaussians of one gradient: the one before detail is cloned, the other is not; at beta 0 neither is."""
+    """Of two Gaussians with equal gradients, the one in front of detail is cloned; at beta 0 neither is."""
     gaussians = balls([[0, 0, 0], [1, 0, 0]], [0.1, 0.1])
     for beta, n in ((0.0, 2), (0.5, 3), (2.0, 4)):
         stats = {
@@ -176,8 +176,8 @@ def tiny_scene(rng):
     return Scene("tiny", tuple(views), (), truth.means.astype(float), colors, np.zeros(3), 1.0)
 
 
-def hurried(recipe):
-    """The recipe in 40 iterations with everything that it does, densification where nearly all are pulled."""
+def shortened(recipe):
+    """Return the recipe in 40 iterations with all its events, and a low threshold of densification."""
 
     def sooner(event):
         if isinstance(event, During):
@@ -194,7 +194,7 @@ def hurried(recipe):
 
 def test_switched_off_it_is_3dgs_to_the_byte(backend, rng):
     scene = tiny_scene(rng)
-    recipes = (configured(hurried(find_recipe("micro")), **OFF), hurried(find_recipe("3dgs-accel")))
+    recipes = (configured(shortened(find_recipe("micro")), **OFF), shortened(find_recipe("3dgs-accel")))
     ours, theirs = (train(scene, recipe, seed=1, backend=backend) for recipe in recipes)
     assert len(ours.gaussians.means) > 40  # rows have come
     for a, b in ((ours.gaussians, theirs.gaussians), *zip(ours.adam[:2], theirs.adam[:2], strict=True)):
@@ -207,7 +207,7 @@ def test_each_of_the_three_changes_something(name, value, rng):
     scene = tiny_scene(rng)
     settings = {**OFF, name: value, "trace_limit": 0.2, "merge_color": 1.0}
     changed, plain = (
-        train(scene, configured(hurried(find_recipe("micro")), **each), seed=1) for each in (settings, OFF)
+        train(scene, configured(shortened(find_recipe("micro")), **each), seed=1) for each in (settings, OFF)
     )
     assert min(len(changed.gaussians.means), len(plain.gaussians.means)) > 30
     assert changed.gaussians.means.tobytes() != plain.gaussians.means.tobytes()

@@ -30,11 +30,11 @@ from minisplat_ref.training.losses import Rendered
 from minisplat_ref.types import Gaussians, Model, Scene, View, view_from
 
 DRAW = LEVELS.renderer
-EVERYTHING = 1e9  # pixels of coverage: all are merged that share a cell
+EVERYTHING = 1e9  # pixels of coverage, so that all Gaussians that share a cell are merged
 
 
 def grid(n_side, spacing, depth=4.03, size=0.05):
-    """Small opaque balls in a plane in front of the camera, none of them on the border of a cell."""
+    """Return small opaque balls in a plane in front of the camera, none of them on the border of a cell."""
     steps = (np.arange(n_side) - (n_side - 1) / 2) * spacing + 0.0137
     x, y = (axis.ravel() for axis in np.meshgrid(steps, steps))
     n = len(x)
@@ -65,7 +65,7 @@ def shown_in(levels, camera):
 
 
 def test_coverage_is_the_width_of_the_visible_ellipse():
-    """Of a flat Gaussian the middle scale counts; alpha at half that width is 1/255."""
+    """The middle scale of a flat Gaussian counts, and alpha at half that width is 1/255."""
     log_scales, logits = np.log([[0.001, 0.2, 0.7]]), np.array([2.0])
     (S,) = coverages(log_scales, logits, np.array([50.0]), GSPLAT_MAIN)
     alpha = 1 / (1 + np.exp(-2.0)) * np.exp(-0.5 * (S / 2 / (0.2 * 50)) ** 2)
@@ -79,7 +79,7 @@ def test_densities_are_pixels_per_unit_and_stop_at_the_near_plane():
     assert_allclose(pixel_densities(means, camera, 0.5), [10, 5, 60], rtol=CLOSED_FORM)
 
 
-def test_a_parent_comes_where_its_members_go():
+def test_a_parent_appears_where_its_members_disappear():
     cells = np.array([[0, 0.1], [0.1, 0.4], [0.4, NO_CELL], [0, NO_CELL]])
     for density, expected in ((11, [1, 0, 0, 1]), (10, [1, 0, 0, 1]), (9, [0, 1, 0, 1]), (2, [0, 0, 1, 1])):
         assert_array_equal(are_shown(cells, np.full(4, float(density))), np.array(expected, bool))
@@ -108,7 +108,7 @@ def test_levels_keep_light_and_moments():
 
 
 def test_each_place_is_shown_once_at_every_size():
-    """Cells nest: whatever the size, each Gaussian of level 0 or exactly one of those it was merged into is shown."""
+    """Cells nest, so at any size each Gaussian of level 0, or exactly one that it was merged into, is shown."""
     levels = in_levels(grid(16, 0.05), Plan(2, 4, EVERYTHING))
     counts = []
     for size in (64, 40, 32, 24, 16, 8, 4):
@@ -122,7 +122,7 @@ def test_each_place_is_shown_once_at_every_size():
 
 
 def leaves(levels, row):
-    """Gaussians of level 0 that a row stands for."""
+    """Return the Gaussians of level 0 that a row represents."""
     own, parent = levels.cells.T
     if own[row] == 0:
         return [row]
@@ -221,7 +221,7 @@ def test_the_gradient_of_the_coarse_loss(rng):
     )
 
 
-def test_the_coarse_loss_takes_turns_and_minds_the_mask(rng):
+def test_the_coarse_loss_alternates_between_levels_and_respects_the_mask(rng):
     levels = level_zero(make_gaussians(rng, 12), rng)
     assert TERM(rendered(levels, rng, step=5)) == (0.0, TERM(rendered(levels, rng, step=5))[1])
     assert not TERM(rendered(levels, rng, step=5))[1].gaussians

@@ -44,7 +44,7 @@ DRAW = SIGNED.renderer
 
 
 def of_colors(colors, **changes):
-    """A row of balls on the axis of a 9 x 9 camera, nearest first, 2 px wide, with constant colours [N, 3]."""
+    """Return balls on the axis of a 9 x 9 camera, nearest first, 2 px wide, with constant colours [N, 3]."""
     n = len(colors)
     fields = {
         "means": np.column_stack([np.zeros((n, 2)), 3.0 + 0.1 * np.arange(n)]),
@@ -58,7 +58,7 @@ def of_colors(colors, **changes):
 
 
 def of_either_sign(rng, n, **options):
-    """Gaussians whose colours spread about zero, by degree 0 and above."""
+    """Return Gaussians whose colours spread around zero, by degree 0 and above."""
     gaussians = make_gaussians(rng, n, **options)
     return gaussians._replace(sh_dc=3 * gaussians.sh_dc - 0.5 / SH_C0)
 
@@ -79,7 +79,7 @@ def drawn(renderer, gaussians, view, backend, **options):
 # --- closed form ---
 
 
-def test_a_negative_gaussian_before_a_positive_one_by_hand(backend):
+def test_a_negative_gaussian_in_front_of_a_positive_one_by_hand(backend):
     front, back = np.array([-0.4, 0.0, 0.3]), np.array([0.9, 0.6, 0.2])
     output, _ = drawn(DRAW, of_colors([front, back]), small_view(), backend)
     expected = 0.5 * front + 0.25 * back + 0.25 * BACKGROUND

@@ -1,4 +1,4 @@
-"""OMG: distinctiveness by hand, codebooks, a decoder of few features, and a file of all that."""
+"""OMG: distinctiveness by hand, codebooks, a decoder of few features, and the file that holds them."""
 
 import json
 
@@ -37,7 +37,7 @@ LEVELS = range(len(omg.LEVELS))
 
 
 def test_distinctiveness_by_hand(rng):
-    """Six Gaussians in a row, in whatever order their rows stand: differences to the left and to the right, added."""
+    """For six Gaussians in a line, the differences to the left and right neighbours add up, whatever the row order."""
     means = np.column_stack([np.arange(6.0), np.zeros(6), np.zeros(6)])
     gray = np.array([0.0, 1.0, 1.0, 1.0, 5.0, 2.0])
     colors = np.column_stack([gray, gray, gray - 3])
@@ -53,7 +53,7 @@ def test_distinctiveness_is_the_mean_of_the_channels():
 
 
 @pytest.mark.parametrize("n", [0, 1])
-def test_nobody_is_distinct_alone(n):
+def test_a_single_gaussian_is_not_distinct(n):
     assert_array_equal(local_distinctiveness(np.zeros((n, 3)), np.ones((n, 3))), np.zeros(n))
 
 
@@ -81,7 +81,7 @@ def state_and_iteration(scene):
 
 
 def test_without_distinctiveness_it_is_mini_splattings_pruning(scene):
-    """Power 0, to the last byte."""
+    """With the power 0 it agrees to the last byte."""
     (ours, iteration), (theirs, _) = state_and_iteration(scene), state_and_iteration(scene)
     prune_indistinct(ours, iteration, metric=indoor, distinct_mass=0.9, distinct_power=0.0)
     prune_tail(theirs, iteration, metric=indoor, mass=0.9, is_intersecting=True)
@@ -136,7 +136,7 @@ def test_codes_are_means_of_their_own_and_vectors_take_the_nearest(rng):
 
 
 def test_rare_vectors_are_not_starved(rng):
-    """A crowd and a thin tail: no vector is further from its code than a cell, of 64 in the width of the tail."""
+    """Beside a dense cluster, no vector of a thin tail is further from its code than 1/64 of the tail's width."""
     vectors = np.concatenate([rng.normal(size=(5000, 1)), rng.uniform(-20, 20, size=(60, 1))])
     error = np.abs(quantise(vectors, 1, 64).vectors() - vectors)
     assert error.max() < 40 / 64
@@ -147,7 +147,7 @@ def mse(vectors, width, n_codes):
 
 
 def test_sub_vectors_are_cheap_at_high_rates_and_no_better_at_low_ones(rng):
-    """Six independent normal numbers: 384 numbers of codebook either way; then 6 bits a vector either way."""
+    """For six independent normal numbers, codebooks are compared at equal size (384 numbers) and at 6 bits a vector."""
     vectors = rng.normal(size=(4000, 6))
     assert mse(vectors, 2, 64) < 0.2 * mse(vectors, 6, 64)
     assert mse(vectors, 6, 64) < mse(vectors, 2, 4)
@@ -166,7 +166,7 @@ def test_harmonics_of_few_dimensions_are_recovered(rng):
 
 
 def test_the_decoder_is_the_best_linear_one(rng):
-    """No other three directions do better: those of random rotations do not, and the error is what is left."""
+    """Three directions of random rotations do no better, and the error is the variance that is left."""
     harmonics = rng.normal(size=(500, 8)) * [5, 4, 3, 1, 0.5, 0.4, 0.3, 0.2]
     decoder = fitted_decoder(harmonics, 3)
     error = np.sum((decoder.harmonics(features_of(harmonics, decoder)) - harmonics) ** 2)
@@ -179,7 +179,7 @@ def test_the_decoder_is_the_best_linear_one(rng):
 
 @pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize("sh_degree", range(4))
-def test_there_and_back(level, sh_degree):
+def test_round_trip(level, sh_degree):
     gaussians = population(200, sh_degree)
     content = omg.encode(gaussians, level)
     back = omg.decode(content, "file")
@@ -200,7 +200,7 @@ def test_there_and_back(level, sh_degree):
 
 
 def test_each_row_is_the_nearest_that_the_codebooks_have():
-    """With as many codes as rows only half floats are left of the error, row by row."""
+    """With as many codes as rows, only the error of half floats is left, row by row."""
     gaussians = population(60, 1)
     back = omg.decode(omg.encode(gaussians, 0), "file")
     order = omg.order_of(gaussians)
@@ -226,7 +226,7 @@ def test_hardly_any_gaussians(n):
 
 
 def test_no_rotation_becomes_zero():
-    """Half turns have w = x = 0, and the mean of opposite y, z may be zero: so w keeps a trace."""
+    """Rotations by 180 degrees have w = x = 0, and the mean of opposite (y, z) may be zero, so w is kept above zero."""
     gaussians = population(40, 0)
     gaussians.quats[:] = [0, 0, 1, 1]
     gaussians.quats[::2] = [0, 0, -1, -1]
@@ -238,7 +238,7 @@ def test_no_rotation_becomes_zero():
 def test_what_half_floats_do_not_reach():
     gaussians = population(10)
     gaussians.means[3, 0] = 1e6
-    with pytest.raises(InputError, match=r"means reach 1e\+06, and half floats 65504: choose another format"):
+    with pytest.raises(InputError, match=r"means reach 1e\+06, but half floats 65504: choose another format"):
         omg.encode(gaussians, 2)
 
     gaussians.means[:, 0] = 1e35
@@ -246,10 +246,10 @@ def test_what_half_floats_do_not_reach():
         omg.encode(gaussians, 2)
 
 
-# Files that lie
+# Damaged files
 
 
-def test_files_that_lie():
+def test_damaged_files():
     content = omg.encode(population(20), 2)
     for length in (0, 4, 9, 30, len(content) // 2, len(content) - 1):
         refusal(omg.OMG_FILE, content[:length])
@@ -274,8 +274,8 @@ def test_files_that_lie():
 
 
 def repacked(content, change):
-    """The file with its header and streams changed, and every checksum right."""
-    packed = omg.take_apart(omg.CONTAINER, content, "")
+    """Return the file with its header and streams changed and every checksum right."""
+    packed = omg.parse(omg.CONTAINER, content, "")
     header = {name: value for name, value in packed.header.items() if name != "streams"}
     streams = {name: zstandard.ZstdDecompressor().decompress(frame) for name, frame in packed.frames.items()}
     change(header, streams)
@@ -283,13 +283,13 @@ def repacked(content, change):
 
 
 def lose_codes(header, streams):
-    """Leave one code of opacities."""
+    """Drop all codes of opacities but one."""
     header["codes"] = header["codes"] | {"opacities": [1]}
     streams["opacities codes"] = streams["opacities codes"][:2]
 
 
 def make_nan(header, streams):
-    """Let the first centre be a signalling NaN, 0x7d00: twice that, by the zigzag map, in two planes."""
+    """Make the first centre a signalling NaN, 0x7d00; zigzag encoding doubles it, and it takes two planes."""
     n = header["planes"]["means"] * 3 * header["n"]
     low, high = bytearray(n // 2), bytearray(n // 2)
     high[0] = 2 * 0x7D
@@ -306,7 +306,7 @@ def test_damaged_anywhere(rng):
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
-    """A scene, and a run of recipe omg on it."""
+    """Return a scene, and a run of the recipe omg on it."""
     run = short_run(tmp_path_factory.mktemp("omg"), "omg", "--set", "distinct_mass=0.9")
     return run.parent / "nook", run
 
@@ -345,7 +345,7 @@ def test_study(folders, tmp_path, capsys):
 
 
 def test_the_flatter_half_is_half():
-    """Of a picture whose right half is a ramp; of one that is flat everywhere, too."""
+    """This holds for a picture whose right half is a ramp, and for one that is flat everywhere."""
     pixels = np.zeros((4, 8, 3), np.uint8)
     pixels[:, 4:] = 20 * np.arange(1, 5)[None, :, None]
     assert_array_equal(study.flatter_half(pixels)[:, :3], True)

@@ -12,7 +12,7 @@ from minisplat_ref.extensions.shared_planes import from_planes, to_planes, unzig
 # Morton order and planes of bytes
 
 
-def test_morton_codes_are_bits_in_turn(rng):
+def test_morton_codes_interleave_bits(rng):
     cells = rng.integers(0, 2**21, size=(50, 3), dtype=np.uint64)
     cells[:4] = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [2**21 - 1] * 3]
     expected = [sum((int(x[a]) >> b & 1) << (3 * b + a) for b in range(21) for a in range(3)) for x in cells]
@@ -21,7 +21,7 @@ def test_morton_codes_are_bits_in_turn(rng):
 
 
 def test_morton_order_walks_an_octree(rng):
-    """The eight corners of a cube, x fastest; equal points stay as they follow each other."""
+    """The eight corners of a cube come with x fastest; equal points keep their order."""
     corners = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], np.float64)
     shuffled = rng.permutation(8)
     assert_array_equal(corners[shuffled][morton_order(corners[shuffled])], corners)
@@ -39,7 +39,7 @@ def test_morton_neighbours_are_near(rng):
 
 
 @given(hnp.arrays(np.int64, st.tuples(st.integers(0, 5), st.integers(0, 4)), elements=st.integers(-(2**63), 2**63 - 1)))
-def test_planes_there_and_back(values):
+def test_planes_round_trip(values):
     raw, n_planes = to_planes(zigzag(values))
     assert_array_equal(unzigzag(from_planes(raw, n_planes, values.shape[1], len(values))), values)
     assert len(raw) == n_planes * values.size

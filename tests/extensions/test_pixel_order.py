@@ -25,7 +25,7 @@ from minisplat_ref.extensions.extension import find_recipe, load_extension
 from minisplat_ref.extensions.pixel_order import clouds
 from minisplat_ref.extensions.pixel_order.method import ORDERED
 from minisplat_ref.extensions.pixel_order.stages import stages
-from minisplat_ref.extensions.shared_tangent_rays import tangent_hits, turned
+from minisplat_ref.extensions.shared_tangent_rays import tangent_hits, yawed
 from minisplat_ref.extensions.shared_tangent_renderer import RESPONSE, activated
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT64
@@ -35,8 +35,8 @@ from minisplat_ref.training.schedule import configured, describe, settings_of
 from minisplat_ref.types import Gaussians, Model, Primitives, view_from
 
 DRAW = ORDERED.renderer
-# A fixed ray seen by cameras that differ by a turn: some dozens of roundings of 1e-16, in exponents of up to 5.5.
-TURNED = 1e-12
+# A fixed ray seen by cameras that differ by a rotation: dozens of roundings of 1e-16, in exponents of up to 5.5.
+ROTATED = 1e-12
 BARE = GSPLAT_MAIN._replace(eps2d=0.0)
 
 
@@ -59,7 +59,7 @@ def as_gaussians(primitives, rng):
 
 
 def test_a_round_gaussian_off_the_axis_is_round_on_its_tangent_plane():
-    """A ball of deviation s at distance r: exp(-tan(angle)^2 r^2 / 2 s^2) whatever its direction."""
+    """A ball of deviation s at distance r is exp(-tan(angle)^2 r^2 / 2 s^2) in any direction."""
     ball, camera = one([1.5, 0.8, 2.0], [0.2, 0.2, 0.2]), make_camera(90, 60, fx=40.0, fy=44.0)
     footprints = planes.project(ball, camera, BARE)
     pixels = np.array([[75.5, 40.5], [80.5, 50.5], [70.5, 45.5]])
@@ -83,7 +83,7 @@ def test_on_the_axis_it_is_3dgs():
 
 
 def test_away_from_the_axis_it_is_ewa_with_a_denominator(rng):
-    """exp(-d^T Q d / 2) with EWA's Q becomes exp(-d^T Q d / (2 (1 + h . d)^2)): a derivation of its own."""
+    """EWA's exp(-d^T Q d / 2) becomes exp(-d^T Q d / (2 (1 + h . d)^2)), which is derived independently."""
     gaussians, camera = make_gaussians(rng, 12), make_camera(60, 44, fx=30.0, fy=33.0)
     primitives = Primitives(*activated(gaussians, None))
     projection, footprints = project_ewa(*primitives, camera, BARE), planes.project(primitives, camera, BARE)
@@ -124,7 +124,7 @@ def test_boxes_hold_what_is_seen_and_little_more(rng):
 
 
 def test_turning_changes_no_colour(rng):
-    """Pictures of one pixel, through the whole renderer, of a camera whose principal point follows a ray."""
+    """The whole renderer draws pictures of one pixel with a camera whose principal point follows a ray."""
     primitives, _ = clouds.cloud(40, rng)
     model = Model(as_gaussians(primitives, rng))
     eye = clouds.wide_camera()
@@ -133,7 +133,7 @@ def test_turning_changes_no_colour(rng):
             for ray in ([0.1, -0.05, 1.0], [-0.2, 0.15, 1.0]):
                 colors, alphas = [], []
                 for yaw in np.radians([-35, -10, 0, 20, 40]):
-                    seen = turned(eye, yaw)
+                    seen = yawed(eye, yaw)
                     d = seen.cam_from_world_R @ ray
                     pixel = seen._replace(
                         width=1, height=1, cx=0.5 - seen.fx * d[0] / d[2], cy=0.5 - seen.fy * d[1] / d[2]
@@ -141,7 +141,7 @@ def test_turning_changes_no_colour(rng):
                     output, _ = drawing(buffer_size).render(model, view_from(pixel), Request(backend=backend))
                     colors.append(output.image[0, 0])
                     alphas.append(output.alpha[0, 0])
-                assert np.ptp(colors, axis=0).max() < TURNED and min(alphas) > COVERAGE_MIN
+                assert np.ptp(colors, axis=0).max() < ROTATED and min(alphas) > COVERAGE_MIN
     d = seen.cam_from_world_R @ ray
     by_3dgs = SPLATTING.render(model, view_from(pixel), Request(backend=REFERENCE))[0].image[0, 0]
     assert np.abs(by_3dgs - colors[0]).max() > 1e-3  # which does change
@@ -175,7 +175,7 @@ def test_a_wrong_gradient_is_found(monkeypatch):
 
 
 def test_means2d_move_a_footprint_in_the_image(rng):
-    """A shift of the principal point moves everything by a pixel; of a small footprint on the axis shape stays."""
+    """A shift of the principal point moves everything by a pixel; a small footprint on the axis keeps its shape."""
     model = Model(make_gaussians(rng, 1, sh_degree=0, size=0.02)._replace(means=np.array([[0.0, 0.0, 3.0]])))
     camera, v_image = make_camera(fx=60.0, fy=60.0), rng.normal(size=(18, 24, 3))
     _, tape = DRAW.render(model, view_from(camera), Request(backend=REFERENCE))
@@ -190,11 +190,11 @@ def test_means2d_move_a_footprint_in_the_image(rng):
         (loss(camera.cx + h, camera.cy) - loss(camera.cx - h, camera.cy)) / (2 * h),
         (loss(camera.cx, camera.cy + h) - loss(camera.cx, camera.cy - h)) / (2 * h),
     ]
-    assert_allclose(v, numeric, rtol=5e-3)  # a pixel is no turn, by the square of the footprint's angle
+    assert_allclose(v, numeric, rtol=5e-3)  # a shift differs from a rotation by the square of the footprint's angle
 
 
 def test_the_gradient_of_alpha(rng):
-    """Of opacities and, along the tangent plane, of conics."""
+    """It is right with respect to opacities and, in the tangent plane, to conics."""
     primitives = Primitives(*activated(make_gaussians(rng, 3), None))
     footprints = planes.project(primitives, make_camera(), GSPLAT_MAIN)
     ids, pixels = np.arange(3), rng.uniform((4, 4), (20, 14), (5, 2))
@@ -259,7 +259,7 @@ def test_a_buffer_as_large_as_the_list_is_exact(backend, rng):
 
 
 def test_two_crossed_gaussians_change_places_from_pixel_to_pixel(backend, rng):
-    """Plates that cross each other along the vertical: on the left one is in front, on the right the other."""
+    """Of two plates that cross along a vertical line, one is in front on the left, the other on the right."""
     turn = np.array([np.cos(np.pi / 8), 0, np.sin(np.pi / 8), 0])
     plates = Gaussians(
         means=np.array([[0.0, 0, 3], [0.0, 0, 3.01]]),
@@ -419,16 +419,16 @@ def test_a_run_without_test_views_is_refused(tmp_path, capsys):
     assert not (tmp_path / "o").exists() and "no.ply" in capsys.readouterr().err
 
 
-def test_hits_of_a_turned_camera_are_those_of_the_ray(rng):
+def test_hits_of_a_rotated_camera_are_those_of_the_ray(rng):
     primitives, _ = clouds.cloud(20, rng)
     rays = clouds.rays_ahead(3, 10.0)
     first, second = (
         tangent_hits(primitives, camera, rays @ camera.cam_from_world_R.T, GSPLAT_MAIN)
-        for camera in (clouds.wide_camera(), turned(clouds.wide_camera(), 0.4))
+        for camera in (clouds.wide_camera(), yawed(clouds.wide_camera(), 0.4))
     )
     both, a, b = np.intersect1d(first.ids, second.ids, return_indices=True)
     assert len(both) > 10
-    assert_allclose(first.hit.unclamped[a], second.hit.unclamped[b], atol=TURNED)
+    assert_allclose(first.hit.unclamped[a], second.hit.unclamped[b], atol=ROTATED)
 
 
 # --- what the core has for it ---

@@ -14,9 +14,9 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.fuzzing.judging import judge
 from minisplat_ref.experiments.fuzzing.readers import Reader, mutant
 from minisplat_ref.extensions.extension import load_extension
-from minisplat_ref.extensions.proxies.affine import Affine, about, edited, in_ball, in_box, rotation_about
+from minisplat_ref.extensions.proxies.affine import Affine, about_point, edited, in_ball, in_box, rotation_about
 from minisplat_ref.extensions.proxies.binding import UNBOUND, bind, rebuild
-from minisplat_ref.extensions.proxies.cage import grid, hull_of, sheet_through
+from minisplat_ref.extensions.proxies.cage import convex_hull, grid, sheet_through
 from minisplat_ref.extensions.proxies.deformation import polar_rotations, quaternions
 from minisplat_ref.extensions.proxies.nearest import nearest_triangles, triangle_distances
 from minisplat_ref.extensions.proxies.sh_rotation import sh_rotations
@@ -28,9 +28,9 @@ from minisplat_ref.rendering import render
 from minisplat_ref.types import Gaussians
 
 LINEAR = {  # A of x -> A x + b
-    "turn": rotation_about((20, -50, 70)),
-    "turn and scale": 1.7 * rotation_about((20, -50, 70)),
-    "mirror": np.diag([1.0, -1.0, 1.0]) @ rotation_about((5, 6, 7)),
+    "rotation": rotation_about((20, -50, 70)),
+    "rotation and scale": 1.7 * rotation_about((20, -50, 70)),
+    "reflection": np.diag([1.0, -1.0, 1.0]) @ rotation_about((5, 6, 7)),
     "stretch": np.diag([0.3, 1.0, 4.0]),
     "shear": np.array([[1.0, 0.8, -0.3], [0.0, 1.0, 0.5], [0.2, 0.0, 1.0]]),
 }
@@ -50,13 +50,13 @@ def all_of(gaussians):
 
 
 def crumpled(rng, n=40, n_faces=200):
-    """Triangles of random corners, which share vertices and cross each other."""
+    """Return triangles with random corners, which share vertices and cross each other."""
     faces = np.array([rng.choice(n, 3, replace=False) for _ in range(n_faces)])
     return Mesh(rng.normal(size=(n, 3)), faces)
 
 
 def flat_sheet(n=4):
-    """Two by two units in the plane z = 3 before the test camera."""
+    """Return a sheet of two by two units in the plane z = 3 in front of the test camera."""
     return grid(np.array([-1.0, -1.0, 3.0]), np.array([2.0, 0, 0]), np.array([0, 2.0, 0]), (n, n))
 
 
@@ -64,8 +64,8 @@ def flat_sheet(n=4):
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_turned_colours_are_those_of_the_direction_turned_back(sign, rng):
-    """f'(Q d) = f(d) for each degree by itself."""
+def test_rotated_colours_are_those_of_the_direction_rotated_back(sign, rng):
+    """f'(Q d) = f(d) holds for each degree by itself."""
     Q = sign * rotation_about(tuple(rng.uniform(-180, 180, 3)))
     d = rng.normal(size=(40, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
@@ -78,7 +78,7 @@ def test_turned_colours_are_those_of_the_direction_turned_back(sign, rng):
 
 
 def test_the_rotation_of_degree_one_is_the_matrix_itself(rng):
-    """Y_1 = C (-y, z, -x), so D_1 is Q with its axes in that order."""
+    """Since Y_1 = C (-y, z, -x), D_1 is Q with its axes in that order."""
     Q = rotation_about((30, 40, 50))
     order, signs = [1, 2, 0], np.array([-1.0, 1.0, -1.0])
     expected = signs[:, None] * Q[np.ix_(order, order)] * signs
@@ -107,7 +107,7 @@ def test_an_affine_edit_is_the_gaussian_transformed(name, rng):
 
 @pytest.mark.parametrize("name", LINEAR)
 def test_thin_gaussians_stay_thin(name, rng):
-    """Of needles and discs, a billion times as long as thick, the volume is right in every digit."""
+    """The volume of needles and discs a billion times as long as thick is right in every digit."""
     gaussians, A = make_gaussians(rng, 60), LINEAR[name]
     thin = gaussians._replace(log_scales=np.log(rng.permuted(np.tile([1.0, 1e-4, 1e-9], (60, 1)), axis=1)))
     after = edited(thin, Affine(A, SHIFT), all_of(thin))
@@ -119,7 +119,7 @@ def test_thin_gaussians_stay_thin(name, rng):
 def test_nothing_and_what_is_not_selected_keep_their_bytes(dtype, rng):
     gaussians = as_dtype(make_gaussians(rng, 50), dtype)
     everything, some = all_of(gaussians), rng.random(50) < 0.5
-    assert is_same(edited(gaussians, about(np.eye(3), rng.normal(size=3), np.zeros(3)), everything), gaussians)
+    assert is_same(edited(gaussians, about_point(np.eye(3), rng.normal(size=3), np.zeros(3)), everything), gaussians)
     assert_array_equal(rotation_about((0.0, 0.0, 0.0)), np.eye(3), strict=True)
     moved = edited(gaussians, Affine(np.eye(3), SHIFT), everything)
     assert is_same(moved[1:], gaussians[1:]) and not (moved.means == gaussians.means).any()
@@ -138,7 +138,7 @@ def test_float32_is_rounded_once(rng):
 
 
 def test_an_edit_and_its_inverse_cancel(rng):
-    gaussians, A = make_gaussians(rng, 50), LINEAR["turn and scale"]
+    gaussians, A = make_gaussians(rng, 50), LINEAR["rotation and scale"]
     there = edited(gaussians, Affine(A, SHIFT), all_of(gaussians))
     back = edited(there, Affine(np.linalg.inv(A), -np.linalg.solve(A, SHIFT)), all_of(gaussians))
     assert np.abs(there.sh_rest - gaussians.sh_rest).max() > 0.1
@@ -148,8 +148,8 @@ def test_an_edit_and_its_inverse_cancel(rng):
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.7])
-def test_a_turned_scene_looks_as_from_a_camera_turned_back(scale, rng):
-    """With R_c' = R_c Q^T and t_c' = s t_c - R_c Q^T b: shape, place, order and colours of every degree."""
+def test_a_rotated_scene_looks_as_from_a_camera_rotated_back(scale, rng):
+    """With R_c' = R_c Q^T and t_c' = s t_c - R_c Q^T b, shapes, places, order and colours of every degree agree."""
     gaussians, camera = make_gaussians(rng, 60), make_camera(rng=rng)
     Q = rotation_about((20, -50, 70))
     turned = edited(gaussians, Affine(scale * Q, SHIFT), all_of(gaussians))
@@ -164,7 +164,7 @@ def test_a_turned_scene_looks_as_from_a_camera_turned_back(scale, rng):
 
 
 def test_quaternions_of_half_turns(rng):
-    """Where w is 0, and next to it, for every axis."""
+    """They are right where w is 0, and close to it, for every axis."""
     axes = np.concatenate([np.eye(3), -np.eye(3), rng.normal(size=(5, 3))])
     for w in (0.0, 1e-12, -1e-12, 1.0):
         quats = np.column_stack([np.full(len(axes), w), axes])
@@ -193,7 +193,7 @@ def test_maps_without_an_inverse_are_refused(A, rng):
 
 def test_the_fixed_point_stays(rng):
     pivot = rng.normal(size=3)
-    A, b = about(LINEAR["shear"], pivot, SHIFT)
+    A, b = about_point(LINEAR["shear"], pivot, SHIFT)
     assert_allclose(A @ pivot + b, pivot + SHIFT, atol=CLOSED_FORM)
 
 
@@ -245,8 +245,8 @@ def test_a_mesh_at_rest_keeps_every_byte(rng):
         assert is_same(rebuild(Mesh(mesh.vertices.copy(), mesh.faces), bind(gaussians, mesh)), gaussians)
 
 
-@pytest.mark.parametrize("name", ["turn", "turn and scale"])
-def test_a_mesh_that_is_turned_and_scaled_takes_everything_along(name, rng):
+@pytest.mark.parametrize("name", ["rotation", "rotation and scale"])
+def test_a_mesh_that_is_rotated_and_scaled_takes_everything_along(name, rng):
     gaussians, mesh, A = make_gaussians(rng, 60), crumpled(rng), LINEAR[name]
     carried = rebuild(Mesh(mesh.vertices @ A.T + SHIFT, mesh.faces), bind(gaussians, mesh))
     expected = edited(gaussians, Affine(A, SHIFT), all_of(gaussians))
@@ -256,7 +256,7 @@ def test_a_mesh_that_is_turned_and_scaled_takes_everything_along(name, rng):
 
 
 def test_a_sheet_that_is_sheared_in_its_plane_shears_what_lies_in_it(rng):
-    """An affine map within the plane of the triangles, for Gaussians that are flat in it, is that of the Gaussians."""
+    """An affine map within the plane of the triangles acts exactly on Gaussians that are flat in it."""
     A = np.array([[1.3, 0.7, 0], [-0.2, 0.8, 0], [0, 0, 1]])
     mesh, gaussians = flat_sheet(), make_gaussians(rng, 60)
     flat = gaussians._replace(
@@ -308,12 +308,12 @@ def test_grids_hulls_and_sheets(rng):
     assert mesh.vertices.shape == (12, 3) and mesh.faces.shape == (12, 3)
     assert_allclose(frames(mesh)[:, 2, 2], 1, atol=CLOSED_FORM)  # unit cells: h = 1, normals along right x up
     points = rng.normal(size=(500, 3)) * [3, 1, 0.01]
-    hull, sheet = hull_of(points), sheet_through(points, 6)
+    hull, sheet = convex_hull(points), sheet_through(points, 6)
     inward = hull.corners.mean(axis=1) - hull.vertices.mean(axis=0)
     assert (np.sum(frames(hull)[:, :, 2] * inward, axis=1) > 0).all()
     assert len(sheet.faces) == 2 * 6 * 2 and np.abs(sheet.vertices[:, 2]).max() < 0.1
     for few in (points[:2], np.zeros((10, 3)), np.zeros((10, 3)) + np.arange(10)[:, None]):
-        for make in (hull_of, lambda means: sheet_through(means, 6)):
+        for make in (convex_hull, lambda means: sheet_through(means, 6)):
             with pytest.raises(InputError):
                 make(few)
 
@@ -388,7 +388,7 @@ def test_edit_from_the_command_line(model, tmp_path, capsys):
     assert run("edit", model, out, *options, "--about", 0, 0, 3) == 0
     is_selected = before.means[:, 0] <= 0
     assert f"{is_selected.sum()} of 60 Gaussians edited" in capsys.readouterr().out
-    affine = about(2 * rotation_about((0, 30, 0)), np.array([0.0, 0, 3]), np.array([-1.0, 0, 0]))
+    affine = about_point(2 * rotation_about((0, 30, 0)), np.array([0.0, 0, 3]), np.array([-1.0, 0, 0]))
     assert is_same(load_ply(out), edited(before, affine, is_selected))
     assert run("edit", model, out, "--sphere", 0, 0, 3, 0.7, "--matrix", 1, 0.5, 0, 0, 1, 0, 0, 0, 1) == 0
     assert run("edit", model, out, "--scale", 1, 2, 3) == 0
@@ -433,7 +433,7 @@ def test_bad_input_is_one_line_and_writes_nothing(model, tmp_path, capsys):
         ("edit", tmp_path / "none.ply", out): "cannot be opened",
         ("edit", mesh, out): "not a PLY of Gaussians",
         ("edit", model, out, "--sphere", 99, 99, 99, 1): "none of its 60 Gaussians is selected",
-        ("edit", model, out, "--scale", 0): "presses Gaussians flat",
+        ("edit", model, out, "--scale", 0): "flattens Gaussians",
         ("edit", model, out, "--scale", 1, 2): "--scale has 2 numbers",
         ("edit", model, out, "--near", mesh): "belong together",
         ("edit", model, out, "--scale", 2, "--matrix", *range(9)): "takes the place",
@@ -443,7 +443,7 @@ def test_bad_input_is_one_line_and_writes_nothing(model, tmp_path, capsys):
         ("follow", model, mesh, other, out): "not the 9 and 8 of the mesh at rest",
         ("follow", points, mesh, mesh, out, "--reach", 0.1): "within 0.1 of the mesh",
         ("follow", mesh, mesh, mesh, out): "not a PLY of Gaussians",
-        ("cage", points, out, "--hull"): "1 Gaussians have no mesh",
+        ("cage", points, out, "--hull"): "1 Gaussians are too few",
         ("cage", model, out, "--cells", 0): "--cells is 0",
     }
     for words, message in cases.items():
@@ -467,7 +467,7 @@ def test_fields_that_cannot_be_moved_are_said(tmp_path, model, capsys):
 
 
 def test_a_real_scene_can_be_bent(shared_data, tmp_path, capsys):
-    """A hundred Gaussians of somebody else's training, with rotations that are not normalised."""
+    """It works on a hundred Gaussians of somebody else's training, whose rotations are not normalised."""
     model, rest, bent, out = shared_data / "ply" / "epfl_pc_short_100.ply", *(tmp_path / f"{i}.ply" for i in range(3))
     assert run("cage", model, rest, "--hull") == 0
     mesh = load_mesh(rest)

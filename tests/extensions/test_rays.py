@@ -65,7 +65,7 @@ def random_whitened(rng, n, size=0.15):
 
 
 def test_a_ball_at_a_distance(backend):
-    """The value at the nearest point, ``o exp(-r^2 / 2 s^2)``, at the distance along the ray."""
+    """Its value is that at the nearest point, ``o exp(-r^2 / 2 s^2)``, at the distance along the ray."""
     rays = rays_along([0, 0, 0], [[0, 0, 1], [0, 0, 2], [0.1, 0, 1]])
     hits = hits_of(one([0, 0.2, 4], [0.3] * 3), rays, backend)
     squared = 0.04 + 16 - 16 / 1.01  # of the distance of the last ray: |mu|^2 - (mu . d)^2 / d^2
@@ -86,7 +86,7 @@ def test_an_ellipsoid_at_an_angle_is_the_largest_value_on_the_ray(backend, rng):
     assert hits.depths[0] == pytest.approx(t[np.argmax(values)], abs=1e-5)
 
 
-def test_the_gradient_of_a_meeting(rng):
+def test_the_gradient_of_pairs(rng):
     gaussians = random_whitened(rng, 3, size=0.5)
     rays = rays_along(0.1 * rng.normal(size=(4, 3)), gaussians.means[[0, 1, 2, 0]] + 0.2 * rng.normal(size=(4, 3)))
     rays_ids, ids = np.array([0, 0, 1, 2, 3]), np.array([0, 1, 1, 2, 0])
@@ -94,11 +94,11 @@ def test_the_gradient_of_a_meeting(rng):
 
     def forward(means, maps, opacities, origins, directions):
         moved = rays._replace(origins=origins, directions=directions)
-        pairs = reference.meet(Whitened(means, maps, opacities), moved, rays_ids, ids)
+        pairs = reference.evaluate_pairs(Whitened(means, maps, opacities), moved, rays_ids, ids)
         return pairs.unclamped, pairs.depths
 
     def vjp(v_unclamped, v_depths):
-        parts = reference.meet_vjp(gaussians, rays, rays_ids, ids, v_unclamped, v_depths)
+        parts = reference.evaluate_pairs_vjp(gaussians, rays, rays_ids, ids, v_unclamped, v_depths)
         rows = (ids, ids, ids, rays_ids, rays_ids)
         return tuple(reference._summed(part, row, 3 + (row is rays_ids)) for part, row in zip(parts, rows, strict=True))
 
@@ -127,7 +127,7 @@ def test_the_gradient_of_maps_and_of_pixels(rng):
 
 @pytest.mark.parametrize("n", [0, 1, 4, 5, 9, 300])
 def test_the_tree_misses_nothing(n, rng):
-    """Rays that point anywhere, from inside and outside: the same hits in the same order as by all pairs."""
+    """Rays in any direction, from inside and outside, have the same hits in the same order as by all pairs."""
     gaussians = random_whitened(rng, n, size=0.3)
     directions = rng.normal(size=(200, 3))
     directions[:6] = np.vstack([np.eye(3), -np.eye(3)])  # parallel to the sides of every box
@@ -161,7 +161,7 @@ def test_every_box_holds_what_is_below_it(rng):
 
 @pytest.mark.parametrize("conventions", [GSPLAT_MAIN, INRIA, GSPLAT_MAIN._replace(alpha_min=0.0)])
 def test_opaque_layers_end_a_ray_where_they_should(conventions, rng):
-    """Sixty layers, most of them opaque, in random order: what is behind the last one that counts is not looked at."""
+    """Of sixty layers in random order, most of them opaque, those behind the last one that counts are not tested."""
     n = 60
     gaussians = Whitened(
         np.column_stack([0.01 * rng.normal(size=(n, 2)), rng.permutation(np.linspace(2, 5, n))]),
@@ -225,13 +225,13 @@ def test_the_gradient_of_the_whole_model(backend):
 
 
 def test_a_wrong_gradient_is_found(monkeypatch):
-    correct = reference.meet_vjp
+    correct = reference.evaluate_pairs_vjp
 
     def wrong(*args):
         v_means, *others = correct(*args)
         return 1.001 * v_means, *others
 
-    monkeypatch.setattr(reference, "meet_vjp", wrong)
+    monkeypatch.setattr(reference, "evaluate_pairs_vjp", wrong)
     report = check_model_gradients(REFERENCE, GSPLAT_MAIN, TRACED, stages)
     assert report.n_failed == 2 and "is wrong" in report.cases[0].note
 
@@ -259,7 +259,7 @@ def test_small_gaussians_on_the_axis_are_splatted_alike():
 
 @pytest.fixture
 def bare(rng):
-    """Draw Gaussians from the origin by either backend; 24 x 18 pixels."""
+    """Return a function that draws Gaussians from the origin by either backend, 24 x 18 pixels."""
     camera = make_camera(fx=30.0, fy=30.0)
 
     def draw(gaussians, conventions=GSPLAT_MAIN):
@@ -278,7 +278,7 @@ def bare(rng):
 
 
 def test_a_camera_inside_a_gaussian_sees_what_peaks_in_front(bare):
-    """The centre lies just ahead: rays forward find the peak in front. Just behind: no ray finds it."""
+    """If the centre lies just ahead, forward rays find the peak in front; if just behind, no ray finds it."""
     assert bare(one([0, 0, 0.1], [0.5] * 3)).min() > 0.7
     assert bare(one([0, 0, -0.1], [0.5] * 3)).max() == 0
 
@@ -289,7 +289,7 @@ def test_a_needle_of_a_millionth_is_hit_where_it_is(bare):
 
 
 def test_rays_parallel_to_a_flat_gaussian():
-    """In its plane a ray meets it; beside it, though by a thousandth, it does not."""
+    """A ray in its plane hits it; one beside it, even by a thousandth, does not."""
     flat = one([0, 0, 3], [0.5, 1e-5, 0.5])
     for backend in (CPU, REFERENCE):
         hits = hits_of(flat, rays_along([[0, 0, 0], [0, 1e-3, 0]], [[0, 0, 1], [0, 0, 1]]), backend)
@@ -298,7 +298,7 @@ def test_rays_parallel_to_a_flat_gaussian():
 
 
 def test_grazing_rays_are_found_to_the_last_digit(rng):
-    """Rays that touch the ellipsoid of ``alpha_min``, or pass it by a 10^-9th: the tree decides as all pairs do."""
+    """For rays that touch the ellipsoid of ``alpha_min`` or miss it by 1e-9, the tree decides as all pairs do."""
     s, opacity = 0.2, 0.9
     radius = s * np.sqrt(2 * np.log(255 * opacity))
     nudges = np.array([-1e-9, -1e-12, 0, 1e-12, 1e-9])
@@ -310,7 +310,7 @@ def test_grazing_rays_are_found_to_the_last_digit(rng):
 
 
 def test_what_cannot_be_drawn_is_left_out(bare, rng):
-    """Sizes of 0 and infinity, a centre that is no number, an opacity of 0, a Gaussian behind the camera."""
+    """Sizes of 0 and infinity, a NaN centre, an opacity of 0 and a Gaussian behind the camera are left out."""
     good = random_whitened(rng, 6)
     bad = Whitened(*(np.repeat(field[:1], 6, axis=0) for field in good))
     bad.maps[0], bad.maps[1], bad.maps[2] = np.inf, 0, np.nan
@@ -364,7 +364,7 @@ def test_same_bytes_at_one_and_two_threads(room, tmp_path):
 
 
 def test_the_degenerate_case_is_one_gaussian_on_the_axis(rng):
-    """In the direction of its centre a Gaussian has its opacity, splatted or traced."""
+    """In the direction of its centre a Gaussian has its opacity, whether splatted or traced."""
     g = make_gaussians(rng, 1)._replace(means=np.array([[0.0, 0.0, 3.0]]))
     view = view_from(make_camera(25, 17))
     bare = GSPLAT_MAIN._replace(eps2d=0.0)
@@ -381,7 +381,7 @@ def test_the_speed_is_told_with_its_error(capsys):
 
 
 def test_limits_hold_every_hit_that_counts():
-    """With nothing to stop a ray there is room for all Gaussians."""
+    """If nothing stops a ray, there is room for all Gaussians."""
     assert kernels.limits_of(GSPLAT_MAIN, 10).capacity == 12
     assert kernels.limits_of(GSPLAT_MAIN, 10**6).capacity < 2500
     assert kernels.limits_of(GSPLAT_MAIN._replace(transmittance_min=0.0), 10**6).capacity > 10**6

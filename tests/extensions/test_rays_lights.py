@@ -1,4 +1,4 @@
-"""Rays that go on: mirrors, glass, shadows, triangles; the command that draws them; Mitsuba's ellipsoids as a peer."""
+"""Secondary rays: mirrors, glass, shadows, triangles, the command that draws them, and Mitsuba as a peer."""
 
 import json
 
@@ -14,18 +14,18 @@ from minisplat_ref.extensions.rays import claims, demo, surroundings
 from minisplat_ref.extensions.rays.geometry import pixel_rays
 from minisplat_ref.extensions.rays.lights import shade, visibility
 from minisplat_ref.extensions.rays.method import TRACED, whitened_model
-from minisplat_ref.extensions.rays.reference import meet
+from minisplat_ref.extensions.rays.reference import evaluate_pairs
 from minisplat_ref.extensions.rays.surfaces import (
     DIFFUSE,
     GLASS,
     MIRROR,
-    going_on,
+    continued,
     nearest_triangles,
     normals_of,
     reflected,
     refracted,
 )
-from minisplat_ref.extensions.rays.surroundings import Surroundings, joined, made_of, parallelogram
+from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenated_surfaces, parallelogram, surfaces_of
 from minisplat_ref.extensions.rays.types import Rays
 from minisplat_ref.extensions.shared_mesh import Mesh, save_mesh
 from minisplat_ref.io.ply import save_ply
@@ -38,7 +38,7 @@ WALL = np.array([[4.0, 0.0, 0.0], [0.0, 4.0, 0.0]])
 
 
 def box(low, high):
-    """A closed mesh with normals outwards."""
+    """Return a closed mesh whose normals point outwards."""
     x, y, z = np.array([low, high]).T
     vertices = np.array([[x[i & 1], y[i >> 1 & 1], z[i >> 2]] for i in range(8)], float)
     quads = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
@@ -46,7 +46,7 @@ def box(low, high):
 
 
 def around(*surfaces, lights=NO_LIGHTS, ambient=0.0):
-    return Surroundings(np.asarray(lights, float), ambient, 0.0, joined(list(surfaces)))
+    return Surroundings(np.asarray(lights, float), ambient, 0.0, concatenated_surfaces(list(surfaces)))
 
 
 def rays_of(origins, directions):
@@ -58,7 +58,7 @@ def rays_of(origins, directions):
 
 
 def test_a_ray_meets_a_triangle_where_its_plane_is(rng):
-    """By solving ``O + t d = p0 + u e1 + v e2``."""
+    """The expected values solve ``O + t d = p0 + u e1 + v e2``."""
     corners, rays = rng.normal(size=(20, 3, 3)), rays_of(3 * rng.normal(size=(50, 3)), rng.normal(size=(50, 3)))
     depths, faces = nearest_triangles(corners, rays)
     for r in range(50):
@@ -88,7 +88,7 @@ def test_the_normals_of_a_box_point_outwards():
 
 def test_a_mirrored_ray_seems_to_come_from_the_mirrored_eye():
     rays, n = rays_of([[1, 2, 0]], [[0.3, -0.2, 1]]), np.array([[0.0, 0.0, -1.0]])
-    back = going_on(rays, np.array([5.0]), reflected(rays.directions, n))
+    back = continued(rays, np.array([5.0]), reflected(rays.directions, n))
     assert_allclose(back.origins, [[1, 2, 10]], rtol=CLOSED_FORM)
     assert_allclose(back.directions, [[0.3, -0.2, -1]])
 
@@ -107,16 +107,16 @@ def test_snell_schlick_and_total_reflection():
 
 
 def test_a_pane_shifts_what_is_behind_it():
-    """Through a pane of thickness h a ray leaves in its old direction, beside itself by h sin(a - b) / cos(b)."""
+    """A ray through a pane of thickness h keeps its direction and is shifted by h sin(a - b) / cos(b)."""
     h, a = 0.5, np.radians(40)
     b = np.arcsin(np.sin(a) / 1.5)
-    pane = made_of(box([-9, -9, 1], [9, 9, 1 + h]), GLASS)
+    pane = surfaces_of(box([-9, -9, 1], [9, 9, 1 + h]), GLASS)
     d = np.array([[np.sin(a), 0.0, np.cos(a)]])
     rays = rays_of([[0, 0, 0]], d)
     for _ in range(2):
         depths, faces = nearest_triangles(pane.corners, rays._replace(near=rays.near * (1 + 1e-7)))
         bent, _, _ = refracted(rays.directions, pane.normals[faces], pane.indices[faces])
-        rays = going_on(rays, depths, bent)
+        rays = continued(rays, depths, bent)
     assert_allclose(rays.directions, d, atol=CLOSED_FORM)
     beside = np.linalg.norm(np.cross(rays.origins + depths * rays.directions, d))
     assert beside == pytest.approx(h * np.sin(a - b) / np.cos(b), rel=1e-9)
@@ -130,7 +130,7 @@ def test_a_mirror_shows_what_the_mirrored_camera_sees():
 
 def test_glass_of_index_one_is_not_there():
     gaussians, camera = claims.random_gaussians(100, np.random.default_rng(3)), demo.camera_of(32, 24)
-    air = made_of(box([-3, -3, 2], [3, 3, 4.1]), GLASS, index=1.0)
+    air = surfaces_of(box([-3, -3, 2], [3, 3, 4.1]), GLASS, index=1.0)
     images = [
         shade(demo.world_of(gaussians, around(*parts), BLACK), pixel_rays(camera, GSPLAT_MAIN))
         for parts in ((air,), ())
@@ -142,7 +142,7 @@ def test_glass_of_index_one_is_not_there():
 
 def test_two_mirrors_that_face_each_other_end():
     sides = np.array([[4.0, 0, 0], [0, 4.0, 0]])
-    walls = [made_of(parallelogram(np.array([-2, -2, z]), sides), MIRROR) for z in (1.0, -1.0)]
+    walls = [surfaces_of(parallelogram(np.array([-2, -2, z]), sides), MIRROR) for z in (1.0, -1.0)]
     world = demo.world_of(claims.random_gaussians(0, np.random.default_rng(0)), around(*walls), np.ones(3))
     assert_allclose(shade(world, rays_of([[0, 0, 0]], [[0.0, 0, 1]])), 1)  # after three of them, the background
 
@@ -153,7 +153,7 @@ def test_two_mirrors_that_face_each_other_end():
 def test_gaussians_in_front_of_a_mesh_cover_it_and_those_behind_it_do_not_count():
     front = demo.discs(np.array([[0.0, 0, 2]]), np.array([[0.0, 0, 1]]), 0.5, np.array([[1.0, 0, 0]]))
     behind = front._replace(means=np.array([[0.0, 0, 4]]))
-    wall = made_of(parallelogram(np.array([-4.0, -4, 3]), 2 * WALL), DIFFUSE, np.array([0.0, 0.0, 1.0]))
+    wall = surfaces_of(parallelogram(np.array([-4.0, -4, 3]), 2 * WALL), DIFFUSE, np.array([0.0, 0.0, 1.0]))
     rays = rays_of([[0, 0, 0], [0, 0, 0]], [[0.0, 0, 1], [0.9, 0, 1]])
     o = 1 / (1 + np.exp(-4))
     image = shade(demo.world_of(front, around(wall), BLACK), rays)
@@ -162,13 +162,13 @@ def test_gaussians_in_front_of_a_mesh_cover_it_and_those_behind_it_do_not_count(
 
 
 def test_a_wall_is_lit_by_the_cosine_and_dark_behind_another():
-    wall = made_of(parallelogram(np.array([-2.0, -2, 3]), WALL), DIFFUSE)
+    wall = surfaces_of(parallelogram(np.array([-2.0, -2, 3]), WALL), DIFFUSE)
     lamp = np.array([[1.0, 0.0, 2.0]])
     nobody = claims.random_gaussians(0, np.random.default_rng(0))
     rays = rays_of([[0, 0, 0]], [[0.0, 0, 1]])
     lit = shade(demo.world_of(nobody, around(wall, lights=lamp, ambient=0.2), BLACK), rays)
     assert_allclose(lit, 0.2 + 0.8 * np.sqrt(0.5), rtol=CLOSED_FORM)
-    screen = made_of(parallelogram(np.array([0.1, -1.0, 2.5]), 0.5 * WALL), DIFFUSE)
+    screen = surfaces_of(parallelogram(np.array([0.1, -1.0, 2.5]), 0.5 * WALL), DIFFUSE)
     dark = shade(demo.world_of(nobody, around(wall, screen, lights=lamp, ambient=0.2), BLACK), rays)
     assert_allclose(dark, 0.2)
 
@@ -178,7 +178,7 @@ def test_the_edge_of_a_shadow_is_where_the_tangent_cone_meets_the_floor():
 
 
 def test_a_lamp_in_front_of_a_gaussian_is_not_dimmed_by_it(rng):
-    """Only what lies between counts; a faint Gaussian between lets its share through."""
+    """Only what lies between counts; a faint Gaussian between transmits its part."""
     veil = demo.discs(np.array([[0.0, 0, 2]]), np.array([[0.0, 0, 1]]), 0.5, np.full((1, 3), 0.5))
     world = demo.world_of(veil._replace(opacity_logits=np.zeros(1)), around(), BLACK)
     point = np.array([[0.0, 0, 4]])
@@ -192,7 +192,7 @@ def test_a_lamp_in_front_of_a_gaussian_is_not_dimmed_by_it(rng):
 @pytest.fixture
 def ply(tmp_path):
     path = tmp_path / "ball.ply"
-    save_ply(path, demo.together(demo.ball(60), demo.floor(8)))
+    save_ply(path, demo.concatenated(demo.ball(60), demo.floor(8)))
     return path
 
 
@@ -269,8 +269,8 @@ def test_the_study_draws_and_prints(tmp_path, capsys):
 
 
 def test_mitsuba_meets_the_same_ellipsoids():
-    """Mitsuba 3 walks through ellipsoids of three standard deviations: it finds those that rays come so near to, and
-    enters the first where ``t - sqrt((9 - q) / a)`` says. Rays that graze one are left out: float32 decides those."""
+    """Mitsuba 3 intersects rays with ellipsoids of three standard deviations, and must find those with q < 9, and enter
+    the first at ``t - sqrt((9 - q) / a)``. Rays that graze one are left out, because float32 decides those."""
     mitsuba = pytest.importorskip("mitsuba", reason="needs mitsuba: pip install 'minisplat_ref[rays]'")
     mitsuba.set_variant("scalar_rgb")
     g = claims.random_gaussians(30, np.random.default_rng(4), size=0.05)
@@ -282,7 +282,7 @@ def test_mitsuba_meets_the_same_ellipsoids():
         {"type": "scene", "all": {"type": "ellipsoids", "extent": 3.0, "extent_adaptive_clamping": False, **shape}}
     )
     n, n_rays = len(g.means), len(rays.near)
-    pairs = meet(gaussians, rays, np.repeat(np.arange(n_rays), n), np.tile(np.arange(n), n_rays))
+    pairs = evaluate_pairs(gaussians, rays, np.repeat(np.arange(n_rays), n), np.tile(np.arange(n), n_rays))
     q = np.sum(pairs.e**2, axis=1)
     entries = (pairs.depths - np.sqrt(np.maximum(9 - q, 0) / np.sum(pairs.v**2, axis=1))).reshape(-1, n)
     is_met, is_clear = (q < 9).reshape(-1, n), (np.abs(q - 9) > 0.5).reshape(-1, n)

@@ -1,4 +1,4 @@
-"""SPZ: bytes by hand, axes, and files of and for other programs."""
+"""SPZ: bytes worked out by hand, axes, and exchange of files with other programs."""
 
 import gzip
 import shutil
@@ -23,7 +23,7 @@ def spz_raw(gaussians, level=0):
 
 
 def test_spz_by_hand():
-    """One Gaussian whose bytes can be worked out with a pencil."""
+    """The bytes of one Gaussian are those worked out with a pencil."""
     gaussians = Gaussians(
         means=np.array([[1.0, -2.0, 0.5]], np.float32),
         quats=np.array([[2.0, 0.0, 0.0, 0.0]], np.float32),
@@ -45,7 +45,7 @@ def test_spz_by_hand():
 
 
 def test_spz_signs_are_those_of_the_basis(rng):
-    """Half a turn around x: each harmonic of the turned direction is plus or minus that of the direction."""
+    """Under half a turn around x each harmonic keeps its value or changes its sign."""
     directions = rng.normal(size=(20, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     turned = directions * [1, -1, -1]
@@ -54,7 +54,7 @@ def test_spz_signs_are_those_of_the_basis(rng):
 
 @pytest.mark.parametrize("level", [0, 1])
 @pytest.mark.parametrize("sh_degree", range(4))
-def test_spz_there_and_back(level, sh_degree, rng):
+def test_spz_round_trip(level, sh_degree, rng):
     gaussians = population(200, sh_degree)
     gaussians = gaussians._replace(sh_rest=np.clip(gaussians.sh_rest, -0.9, 0.9), sh_dc=0.5 * gaussians.sh_dc)
     content = spz.encode(gaussians, level)
@@ -74,7 +74,7 @@ def test_spz_there_and_back(level, sh_degree, rng):
 
 
 def test_spz_of_another_program(shared_data):
-    """Three trained Gaussians as PLY and as SPZ of version 3, both by others."""
+    """Another program has written three trained Gaussians as PLY and as SPZ of version 3."""
     ply = load_ply(shared_data / "ply" / "metalsplatter_train_3points.ply")
     path = shared_data / "ply" / "metalsplatter_train_3points.spz"
     theirs = spz.decode(path.read_bytes(), path)
@@ -90,7 +90,7 @@ def test_spz_of_another_program(shared_data):
 @pytest.mark.slow
 @pytest.mark.parametrize("level", [0, 1])
 def test_another_program_reads_our_spz(level, tmp_path):
-    """PlayCanvas' splat-transform, of npm, where it is on the PATH: axes, harmonics and rotations, not only bytes."""
+    """PlayCanvas' splat-transform, if it is on the PATH, agrees on axes, harmonics and rotations."""
     program = shutil.which("splat-transform")
     if program is None:
         pytest.skip("no splat-transform on the PATH: npm install @playcanvas/splat-transform")
@@ -108,7 +108,7 @@ def test_spz_reaches_2048():
     gaussians.means[1] = [2047.99, 0, 0]
     assert np.isfinite(spz.decode(spz.encode(gaussians, 0), "file").means).all()
     gaussians.means[1] = [2048, 0, 0]
-    with pytest.raises(InputError, match=r"centre of row 1 is 2048 away, and SPZ reaches 2048 \(1 of 3 are too far\)"):
+    with pytest.raises(InputError, match=r"centre of row 1 is 2048 away, but SPZ reaches 2048 \(1 of 3 are too far\)"):
         spz.encode(gaussians, 0)
 
 

@@ -1,4 +1,4 @@
-"""Linear motion: where a Gaussian is at a time, its gradient, standing still exactly, velocities that are found."""
+"""Linear motion: positions and their gradient, the static case, which equals 3DGS exactly, and recovered velocities."""
 
 import json
 from functools import partial
@@ -52,7 +52,7 @@ def draw(gaussians, camera, time, **options):
 
 
 def test_a_gaussian_is_where_it_should_be():
-    """One round Gaussian that crosses the optical axis at time 0.5: what it covers then is known in closed form."""
+    """The picture of one round Gaussian that crosses the optical axis at time 0.5 is known in closed form."""
     z, sigma, opacity = 4.0, 0.3, 0.9
     velocity = np.array([1.0, -0.6, 2.0])
     means = np.array([[0.0, 0.0, z]]) - 0.5 * velocity
@@ -79,7 +79,7 @@ def test_a_gaussian_is_where_it_should_be():
 
 @pytest.mark.parametrize("time", [-0.5, 0.0, 0.25, 1.0])
 def test_a_moment_is_a_still_scene(time, backend, rng):
-    """At any time, the picture of moving Gaussians is that of still ones that stand there."""
+    """At any time, the picture of moving Gaussians is that of static ones at the same positions."""
     gaussians = as_dtype(make_gaussians(rng, 20), np.float32)
     velocities = (0.3 * rng.normal(size=(20, 3))).astype(np.float32)
     there = gaussians._replace(means=gaussians.means + np.float32(time) * velocities)
@@ -139,7 +139,7 @@ def test_backends_agree(dtype, image_rel, gradient_rel, rng):
 
 
 def tiny_scene(rng, times):
-    """Views of still Gaussians, and their centres as points."""
+    """Return views of static Gaussians, with their centres as points."""
     truth = as_dtype(make_gaussians(rng, 30), np.float32)
     views = []
     for i, time in enumerate(times):
@@ -166,7 +166,7 @@ def _keep_image(images, report):
 
 @pytest.mark.parametrize("case", ["no times", "no rate"])
 def test_standing_still_is_3dgs_to_the_byte(case, backend, rng):
-    """A training of 40 iterations with every event: the six fields, their moments and every image."""
+    """In a training of 40 iterations with every event, the six fields, their moments and every image agree."""
     times = [0.0] * 4 if case == "no times" else [0.0, 0.3, 0.6, 1.0]
     scene = tiny_scene(rng, times)
     recipe = find_recipe("velocity")._replace(iterations=40, events=EVENTS)
@@ -192,7 +192,7 @@ def test_standing_still_is_3dgs_to_the_byte(case, backend, rng):
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_velocities_are_found(seed, record_property):
-    """The study: a scene of which everything is known, with and without velocities."""
+    """This runs the study on its known scene, with and without velocities."""
     truth = moving_gaussians(np.random.default_rng(seed))
     still, moved = (outcome(find_recipe(name, 600), truth, seed) for name in ("3dgs-accel", "velocity"))
     record_property("velocity_rmse", moved.velocity_rmse)
@@ -222,7 +222,7 @@ def truth():
 
 @pytest.fixture(scope="module")
 def scene_folder(truth, tmp_path_factory):
-    """The moving scene as a transforms.json with times, and its points at time 0."""
+    """Return the folder of the moving scene, a transforms.json with times, and its points at time 0."""
     folder = tmp_path_factory.mktemp("scenes") / "moving"
     (folder / "images").mkdir(parents=True)
     frames = []

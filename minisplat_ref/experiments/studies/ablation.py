@@ -138,7 +138,7 @@ def run(args: argparse.Namespace) -> None:
     records = read_records(args.out, {**settings, "deviations": args.deviations, "scene": description["scene"]})
     done = {(record["without"], record["seed"]) for record in records}
     missing = [(name, seed) for seed in args.seeds for name in variants if (name, seed) not in done]
-    for name, seed in tqdm(missing, desc="trainings", leave=False):
+    for name, seed in tqdm(missing, desc="trainings", leave=False, disable=None):
         record = {"without": name, "seed": seed, **measure(scene, variants[name], seed)}
         append(args.out, record)
         records.append(record)

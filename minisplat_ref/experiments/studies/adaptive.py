@@ -158,7 +158,7 @@ def run(args: argparse.Namespace) -> None:
     todo = [(c, r, s) for c in args.conditions for s in args.seeds for r in recipes if (c, r, s) not in done]
     if todo:
         warm_up(scene, recipes.values())
-    for condition, name, seed in tqdm(todo, desc="trainings", leave=False):
+    for condition, name, seed in tqdm(todo, desc="trainings", leave=False, disable=None):
         measured = measure(CONDITIONS[condition](scene), recipes[name], seed)
         record = {"condition": condition, "recipe": name, "seed": seed, **measured}
         append(args.out, record)

@@ -90,7 +90,7 @@ def resume_from(state: TrainState, gaussians: Gaussians, step: int) -> None:
 
 def reach(state: TrainState, scene: Scene, recipe: Recipe, step: int) -> None:
     """Train until ``step``."""
-    with tqdm(total=step - state.step, desc=f"to iteration {step}", leave=False) as bar:
+    with tqdm(total=step - state.step, desc=f"to iteration {step}", leave=False, disable=None) as bar:
         train(scene, recipe._replace(iterations=step), seed=0, state=state, on_step=lambda _: bar.update())
 
 

@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> None:
     records = read_records(args.out, {"scene": description["scene"], "downscale": args.downscale})
     done = {(record["condition"], record["seed"]) for record in records}
     todo = [(name, seed) for seed in range(args.trials) for name in CONDITIONS if (name, seed) not in done]
-    for name, seed in tqdm(todo, desc="trials", leave=False):
+    for name, seed in tqdm(todo, desc="trials", leave=False, disable=None):
         record = {"condition": name, "seed": seed, **decide(CONDITIONS[name](scene, np.random.default_rng(seed)), seed)}
         append(args.out, record)
         records.append(record)

@@ -144,7 +144,7 @@ def measure(truth: SyntheticScene, recipe: Recipe, seeds: tuple[int, ...]) -> It
         The :data:`MEASURES`, with the final ``psnr`` of the test views. ``backdrop_left`` is the fraction of the points
         moved behind the scene that survive densification, None if none were moved.
     """
-    with tqdm(total=len(seeds) * len(CHOICES), desc="trainings", leave=False) as bar:
+    with tqdm(total=len(seeds) * len(CHOICES), desc="trainings", leave=False, disable=None) as bar:
         for seed in seeds:
             for name, choice in CHOICES.items():
                 yield {"choice": name, "seed": seed, **measure_one(truth, recipe, choice, seed)}

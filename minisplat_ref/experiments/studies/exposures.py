@@ -66,7 +66,7 @@ def measure(scene: Scene, recipe: Recipe, seed: int, arms: tuple[str, ...] = ARM
     disturbed, maps = disturbed_exposures(scene, np.random.default_rng(seed))
     colors = np.concatenate([view.image.reshape(-1, 3) for view in scene.train_views]) / 255
     result = {}
-    for arm in tqdm(arms, desc="trainings", leave=False):
+    for arm in tqdm(arms, desc="trainings", leave=False, disable=None):
         photographed, truth = (scene, identities) if arm == "undisturbed" else (disturbed, maps)
         state = train(photographed, configured(recipe, exposure=arm == "calibrated"), seed=seed)
         exposures = state.shared.get(EXPOSURES, identities)

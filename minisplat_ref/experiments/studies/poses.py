@@ -97,7 +97,7 @@ def measure(
     disturbed = disturbed_poses(scene, disturbance, np.random.default_rng(seed))
     truth = [view.camera for view in scene.train_views]
     result = {}
-    for arm in tqdm(arms, desc="trainings", leave=False):
+    for arm in tqdm(arms, desc="trainings", leave=False, disable=None):
         seen = scene if arm == "undisturbed" else disturbed
         cameras = [view.camera for view in seen.train_views]
         state = train(seen, configured(recipe, pose=arm == "calibrated"), seed=seed)

@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> None:
     for name in dict.fromkeys(name for name, _ in todo):  # compile: no training is to count that
         with contextlib.suppress(InputError):  # so short a schedule may ask for what cannot be
             trained(scene, get_recipe(args.recipe, WARM_UP), PRECISIONS[name], 0)
-    for name, seed in tqdm(todo, desc="trainings", leave=False):
+    for name, seed in tqdm(todo, desc="trainings", leave=False, disable=None):
         for record in measure(scene, recipe, name, seed):
             append(args.out, record)
             records.append(record)

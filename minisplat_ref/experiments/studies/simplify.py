@@ -98,7 +98,7 @@ def run(args: argparse.Namespace) -> None:
 
 def train_dense(scene: Scene, recipe: Recipe, seed: int) -> Gaussians:
     """Return the population that is to be simplified."""
-    with tqdm(total=recipe.iterations, desc=recipe.name, leave=False) as bar:
+    with tqdm(total=recipe.iterations, desc=recipe.name, leave=False, disable=None) as bar:
         return train(scene, recipe, seed=seed, on_step=lambda _: bar.update()).gaussians
 
 
@@ -155,7 +155,7 @@ def measure(
     """
     trees = {name: cKDTree(cloud) for name, cloud in clouds.items()}
     jobs = [(kept, choice, seed) for kept in counts for choice in CHOICES for seed in seeds]
-    for kept, choice, seed in tqdm(jobs, desc="fine-tunings", leave=False):
+    for kept, choice, seed in tqdm(jobs, desc="fine-tunings", leave=False, disable=None):
         rng = np.random.default_rng(seed)
         edit: Edit = CHOICES[choice](dense, importance, counts[kept], rng)
         gaussians = edit.gaussians

@@ -62,7 +62,9 @@ def run(args: argparse.Namespace) -> None:
         raise InputError(f"recipe {args.recipe} has no blur split to compare: choose from {names}")
     with making_folder(args.out) as folder:
         jobs = [(form, seed) for seed in args.seeds for form in FORMS]
-        runs = [measure(scene, recipe, form, seed) for form, seed in tqdm(jobs, desc="trainings", leave=False)]
+        runs = [
+            measure(scene, recipe, form, seed) for form, seed in tqdm(jobs, desc="trainings", leave=False, disable=None)
+        ]
         summary = summarise(runs)
         description = describe_scene(scene)
         settings = {"recipe": args.recipe, "iterations": args.iterations, "seeds": list(args.seeds)}

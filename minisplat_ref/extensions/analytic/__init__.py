@@ -1,22 +1,22 @@
 """Analytic splatting: alpha is a mean over the pixel, not the value at its centre.
 
-Analytic-Splatting, Liang et al. 2024, arXiv 2403.11056. A pixel collects light from a square. 3DGS takes the value of
-the footprint in the middle of it, which misses what is thinner than a pixel; hence its low-pass. Here alpha is the
-integral over the square, in closed form, and there is no low-pass (:mod:`minisplat_ref.extensions.analytic.reference`):
+This follows Analytic-Splatting, Liang et al. 2024, arXiv 2403.11056. A pixel collects light from a square. 3DGS takes
+the value of the footprint at its centre, which misses what is thinner than a pixel; hence its low-pass. Here alpha is
+the integral over the square, in closed form, without a low-pass (:mod:`minisplat_ref.extensions.analytic.reference`):
 
     alpha = o 2 pi l_1 l_2 prod_k [F((u_k + 1/2) / l_k) - F((u_k - 1/2) / l_k)]
 
-with the offset u along the footprint's axes and its deviations l. F is the normal distribution function, or in the
-recipe, as in the paper, ``1 / (1 + exp(-(1.6 x + 0.07 x^3)))``, which needs no error function. With the former it is
-exact where the axes are the image's. Elsewhere the square is turned along with them: the needle at an angle is where it
-errs, by 9 % at a deviation of a tenth of a pixel (``study analytic/footprint``).
+with the offset u along the footprint's axes and its standard deviations l. F is the normal distribution function or, in
+the recipe as in the paper, ``1 / (1 + exp(-(1.6 x + 0.07 x^3)))``, which needs no error function. With the former the
+integral is exact where the axes are the image's. Elsewhere the square is rotated along with them, so needles at an
+angle have an error: 9 % at a standard deviation of a tenth of a pixel (``study analytic/footprint``).
 
-It is a response (:class:`minisplat_ref.reference.hits.Response`): all else of the renderer is 3DGS's, on the plain
-kernels or the reference. Blend statistics come from the reference alone.
+The integral is a response (:class:`minisplat_ref.reference.hits.Response`); the rest of the renderer is that of 3DGS,
+on the plain kernels or the reference. Only the reference collects blend statistics.
 
-Where this deviates: the derivative with respect to a footprint's angle is taken as 0 where it is round, for there is
-none; the list of tiles is the reference's. Left out: the thresholds for the longest and thinnest footprints of the
-released code; here both are bounds of the deviations.
+This deviates from the paper as follows: the derivative with respect to a footprint's angle is taken as 0 where the
+footprint is round, since it does not exist there, and the list of tiles is the reference's. The released code's
+thresholds for the longest and thinnest footprints are replaced by bounds of the standard deviations.
 
     minisplat-ref train SCENE --recipe analytic
     minisplat-ref study analytic/footprint --out DIR

@@ -1,9 +1,9 @@
-"""The work of the study ``analytic/footprint``: alphas of one Gaussian in the pixels around it against exact integrals.
+"""The study ``analytic/footprint``: alphas of one Gaussian in the pixels around it against exact integrals.
 
-The truth of a round Gaussian is the product of two error functions; that of a needle at an angle is the mean of 48 x 48
-values a pixel. What is compared gets the same Gaussian: the value at the centre; with the dilation of 3DGS; with
-Mip-Splatting's filter, which keeps the integral; and the integral along the footprint's axes, with either distribution
-function.
+The truth of a round Gaussian is a product of differences of error functions; that of a needle at an angle is the mean
+of 48 x 48 values per pixel. Compared with it are the value at the pixel's centre, that value with the dilation of 3DGS
+or with Mip-Splatting's filter, which keeps the integral, and the integral along the footprint's axes with either
+distribution function.
 """
 
 from typing import Any
@@ -20,7 +20,7 @@ from minisplat_ref.types import Floats, Projection
 SIGMAS = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0)  # px
 ELONGATION = 5.0  # of the needle
 REACH = 12  # pixels from the middle to the edge of the picture
-SAMPLES = 48  # a side and pixel
+SAMPLES = 48  # per pixel and side
 DILATION, MIP = 0.3, 0.1  # px^2
 OPACITY = 0.8
 METHODS = ("centre", "dilation", "Mip filter", "integral, logistic", "integral, erf")
@@ -34,14 +34,14 @@ def centres() -> Floats:
 
 
 def covariance(sigma: float, elongation: float, angle: float) -> Floats:
-    """Return the covariance [2, 2] of deviations ``sigma`` and ``elongation`` times that, px^2."""
+    """Return the covariance [2, 2], px^2, with standard deviations ``sigma`` and ``elongation`` times that."""
     cos, sin = np.cos(angle), np.sin(angle)
     R = np.array([[cos, -sin], [sin, cos]])
     return R @ np.diag([(elongation * sigma) ** 2, sigma**2]) @ R.T
 
 
-def drawn(mean: Floats, C: Floats, response: Response, opacity: float = OPACITY) -> Floats:
-    """Return the alphas [P] of one Gaussian by a response."""
+def alphas_of(mean: Floats, C: Floats, response: Response, opacity: float = OPACITY) -> Floats:
+    """Return the alphas [P] of one Gaussian under a response."""
     conic = np.linalg.inv(C)[[0, 0, 1], [0, 1, 1]]
     ones = np.ones((1, 2), np.int32)
     projection = Projection(mean[None], np.ones(1), conic[None], np.array([opacity]), ones, np.zeros((1, 4), np.int32))
@@ -50,7 +50,7 @@ def drawn(mean: Floats, C: Floats, response: Response, opacity: float = OPACITY)
 
 
 def truth(mean: Floats, C: Floats) -> Floats:
-    """Return the mean alpha [P] of each pixel: by error functions if C is round, else by many samples."""
+    """Return the mean alpha [P] of each pixel, by error functions if C is round, otherwise by many samples."""
     offsets = mean - centres()  # [P, 2]
     if C[0, 1] == 0:
         rates = 1 / np.sqrt(np.diag(C))
@@ -67,16 +67,16 @@ def approximations(mean: Floats, C: Floats) -> dict[str, Floats]:
     mip = C + MIP * np.eye(2)
     compensated = OPACITY * float(compensations(C[None], mip[None])[0])
     return {
-        "centre": drawn(mean, C, CONIC),
-        "dilation": drawn(mean, C + DILATION * np.eye(2), CONIC),
-        "Mip filter": drawn(mean, mip, CONIC, compensated),
-        "integral, logistic": drawn(mean, C, RESPONSE),
-        "integral, erf": drawn(mean, C, EXACT_RESPONSE),
+        "centre": alphas_of(mean, C, CONIC),
+        "dilation": alphas_of(mean, C + DILATION * np.eye(2), CONIC),
+        "Mip filter": alphas_of(mean, mip, CONIC, compensated),
+        "integral, logistic": alphas_of(mean, C, RESPONSE),
+        "integral, erf": alphas_of(mean, C, EXACT_RESPONSE),
     }
 
 
 def errors(sigma: float, elongation: float, n: int, rng: np.random.Generator) -> dict[str, float]:
-    """Return the relative RMS errors over pixels and ``n`` places of the centre; needles at random angles."""
+    """Return the relative RMS errors over pixels and ``n`` positions of the centre; needles have random angles."""
     squared, total = dict.fromkeys(METHODS, 0.0), 0.0
     for _ in range(n):
         mean, angle = rng.uniform(0, 1, 2), 0.0 if elongation == 1 else rng.uniform(0, np.pi)
@@ -99,13 +99,13 @@ def measure(n: int, seed: int) -> dict[str, dict[str, list[float]]]:
 
 
 def largest_difference() -> float:
-    """Return how far the two distribution functions are apart."""
+    """Return the largest difference between the two distribution functions."""
     x = np.linspace(-6, 6, 24_001)
-    return float(np.abs(LOGISTIC.below(x) - NORMAL.below(x)).max())
+    return float(np.abs(LOGISTIC.cdf(x) - NORMAL.cdf(x)).max())
 
 
 def draw(found: dict[str, dict[str, list[float]]]) -> Figure:
-    """Draw the errors over sigma, round and needle."""
+    """Draw the errors against sigma for a round Gaussian and for a needle."""
     figure = Figure(figsize=(9.5, 3.6), layout="constrained")
     titles = {"round": "round Gaussian", "needle": f"needle, {ELONGATION:g} times as long, at random angles"}
     panels = figure.subplots(1, 2, sharey=True)
@@ -122,5 +122,5 @@ def draw(found: dict[str, dict[str, list[float]]]) -> Figure:
 
 
 def summarise(found: dict[str, dict[str, list[float]]]) -> dict[str, Any]:
-    """Return what is written."""
+    """Return the content of ``result.json``."""
     return {"sigmas": list(SIGMAS), "errors": found, "largest_difference_of_distributions": largest_difference()}

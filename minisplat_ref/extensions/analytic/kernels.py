@@ -1,6 +1,6 @@
 """The integral over a pixel on lanes: a response for the plain kernels, with the logistic distribution function.
 
-It shares the axes of footprints with the reference; what happens in a pixel is written anew.
+It shares the axes of footprints with the reference; the formulas of a pixel are stated independently.
 """
 
 import functools
@@ -22,11 +22,11 @@ _LINEAR, _CUBIC = np.float32(LINEAR), np.float32(CUBIC)
 
 @functools.cache
 def pixel_response(exp: Callable) -> KernelResponse:
-    """Response of projected Gaussians, with an exponential of :mod:`minisplat_ref.cpu.compositing.exponential`."""
+    """Return the response of Gaussians with an exponential of :mod:`minisplat_ref.cpu.compositing.exponential`."""
 
     @scalar
-    def below_and_density(x):
-        """F(x) = 1 / (1 + exp(-y)) with y = 1.6 x + 0.07 x^3, by exp(-|y|), and its derivative."""
+    def cdf_and_pdf(x):
+        """Return ``F(x) = 1 / (1 + exp(-y))`` with ``y = 1.6 x + 0.07 x^3``, by ``exp(-|y|)``, and its derivative."""
         square = x * x
         y = x * (_LINEAR + _CUBIC * square)
         e = exp(-abs(y))
@@ -35,16 +35,16 @@ def pixel_response(exp: Callable) -> KernelResponse:
 
     @scalar
     def integral(u, rate):
-        """I, and its derivatives with respect to u and the rate."""
-        high, high_density = below_and_density((u + HALF) * rate)
-        low, low_density = below_and_density((u - HALF) * rate)
-        by_rate = (u + HALF) * high_density - (u - HALF) * low_density
-        return high - low, rate * (high_density - low_density), by_rate
+        """Return I, and its derivatives with respect to u and the rate."""
+        high, high_pdf = cdf_and_pdf((u + HALF) * rate)
+        low, low_pdf = cdf_and_pdf((u - HALF) * rate)
+        by_rate = (u + HALF) * high_pdf - (u - HALF) * low_pdf
+        return high - low, rate * (high_pdf - low_pdf), by_rate
 
     @scalar
     def hit(records, n, x, y):
         dx, dy = records[n, MEAN_X] - x, records[n, MEAN_Y] - y
-        # I is even in u: of a negative one, where both tails are small, no difference of two ones is taken.
+        # I is even in u; with u <= 0 both tails are small, so no two numbers near one are subtracted.
         u_1 = records[n, COS] * dx + records[n, SIN] * dy
         u_2 = records[n, COS] * dy - records[n, SIN] * dx
         I_1, _, _ = integral(-abs(u_1), records[n, RATE_1])
@@ -53,7 +53,7 @@ def pixel_response(exp: Callable) -> KernelResponse:
 
     @scalar
     def hit_vjp(records, n, place, v_mean, v_shape, v_place):
-        """With M = 2 pi o / (r_1 r_2): v_I_1 = v M I_2, v_r_k -= v alpha / r_k, v_angle = v_u_1 u_2 - v_u_2 u_1."""
+        """With ``M = 2 pi o / (r_1 r_2)``: v_I_1 = v M I_2, v_r_k -= v alpha / r_k, v_angle = v_u_1 u_2 - v_u_2 u_1."""
         u_1, u_2, I_1, I_2 = place
         mass, cos, sin = records[n, MASS], records[n, COS], records[n, SIN]
         _, by_u_1, by_r_1 = integral(u_1, records[n, RATE_1])

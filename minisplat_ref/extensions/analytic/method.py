@@ -1,4 +1,4 @@
-"""How scenes are drawn by integrals over pixels, and the recipe that trains them."""
+"""The renderer with integrals over pixels, and the recipe that trains with it."""
 
 from dataclasses import replace
 from functools import partial
@@ -27,12 +27,12 @@ def composite(
     with_stats: bool = False,
     with_median_depth: bool = False,
 ) -> RenderOutput:
-    """Blend with the plain kernels; as ``reference.compositing.composite`` with integrals.
+    """Blend integrals with the plain kernels; arguments and result are those of ``reference.compositing.composite``.
 
     Raises
     ------
     InputError
-        Statistics are asked for, which the plain kernels do not collect.
+        Statistics are requested, which the plain kernels do not collect.
     """
     if with_stats or with_median_depth:
         raise InputError("the kernels of analytic collect no statistics: use --backend reference")
@@ -74,9 +74,9 @@ def reference_composite_vjp(
 
 
 def integrating(backend: Backend) -> Backend:
-    """Return the backend with integrals over pixels in the place of samples at their centres.
+    """Return the backend with integrals over pixels instead of samples at their centres.
 
-    Lists of tiles are the reference's: those of the kernels leave out what reaches no pixel's centre.
+    Lists of tiles are the reference's, because those of the kernels omit footprints that reach no pixel's centre.
     """
     name = f"{backend.name} with integrals"
     if backend.is_compiled:
@@ -93,7 +93,7 @@ def integrating(backend: Backend) -> Backend:
 
 
 def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
-    """Draw the view as 3DGS does, without a low-pass and with integrals; the tape keeps the backend."""
+    """Draw the view as 3DGS does, but with integrals and without a low-pass; the tape keeps the backend."""
     conventions = request.conventions._replace(eps2d=0.0, is_antialiased=False)
     backend = integrating(request.backend)
     return SPLATTING.render(model, view, request._replace(backend=backend, conventions=conventions))
@@ -105,4 +105,4 @@ INTEGRATED = Representation(
 )
 
 ANALYTIC = GS_ACCEL._replace(name="analytic")
-"""``analytic``: 3DGS whose alphas are means over pixels."""
+"""The recipe ``analytic``: 3DGS whose alphas are means over pixels."""

@@ -1,4 +1,4 @@
-"""What the gradient proof checks: the renderer, with the thresholds that its integrals cross."""
+"""The stage of the gradient check: the renderer with the thresholds of its integrals."""
 
 import numpy as np
 
@@ -14,9 +14,10 @@ from minisplat_ref.types import Floats, TileGrid
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
-    """Return the renderer; which integrals are blended and which are clamped is found out once more, by the reference.
+    """Return the renderer as a stage whose points record which integrals are blended and which are clamped.
 
-    What the backend's own compositing would tell of its thresholds is about values at centres.
+    The reference computes these records again, so that the check notices a step across a threshold; those of the
+    core's stages are about values at pixel centres.
     """
     stage = model_stage(backend, setting, INTEGRATED, rng)
     conventions = setting.conventions._replace(eps2d=0.0)

@@ -1,4 +1,4 @@
-"""The study ``analytic/footprint`` asks how far from the integral over a pixel each way of drawing is."""
+"""The study ``analytic/footprint`` measures how far each method is from the integral over a pixel."""
 
 import argparse
 
@@ -11,12 +11,12 @@ from minisplat_ref.study import Study
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--out``, ``--places`` and ``--seed``."""
     add_out(parser)
-    parser.add_argument("--places", type=int, default=64, metavar="N", help="of the centre in its pixel (default 64)")
-    parser.add_argument("--seed", type=int, default=0, metavar="S", help="of places and angles (default 0)")
+    parser.add_argument("--places", type=int, default=64, metavar="N", help="positions within a pixel (default 64)")
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="seed of positions and angles (default 0)")
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure the errors, write, print a table.
+    """Measure the errors, write the results, and print a table.
 
     Raises
     ------

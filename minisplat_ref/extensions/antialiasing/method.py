@@ -1,4 +1,4 @@
-"""The population with a filter for each Gaussian, how it is drawn, and the recipe that measures and trains it."""
+"""The population with a filter for each Gaussian, its renderer, and the recipe that trains it."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -15,11 +15,11 @@ from minisplat_ref.training.schedule import At, Every
 from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Floats, Gaussians, Model, RenderOutput, View
 
-EPS2D = 0.1  # px^2: variance of Mip-Splatting's 2D filter, a pixel's own being 1/12
+EPS2D = 0.1  # px^2, the variance of Mip-Splatting's 2D filter; that of a pixel is 1/12
 
 
 class FilteredGaussians(NamedTuple):
-    """Gaussians with 3D filters: the fields of :class:`Gaussians`, and one more."""
+    """Gaussians with 3D filters: the fields of :class:`Gaussians` and one more."""
 
     means: Floats
     quats: Floats
@@ -28,21 +28,21 @@ class FilteredGaussians(NamedTuple):
     sh_dc: Floats
     sh_rest: Floats
     filter_sigmas: Floats
-    """[N] standard deviation of the 3D filter, world units; 0 filters nothing. An event sets it, no gradient does."""
+    """[N] standard deviation of the 3D filter, world units; 0 for no filter. An event sets it; it has no gradient."""
 
 
 class _Tape(NamedTuple):
-    inner: Any  # of the renderer that drew
+    inner: Any  # tape of the wrapped renderer
     gaussians: FilteredGaussians
 
 
 def unfiltered(gaussians: Gaussians, rng: np.random.Generator) -> FilteredGaussians:
-    """Return the Gaussians with filters of size zero, until they are measured."""
+    """Return the Gaussians with filters of size zero, which an event measures later."""
     return FilteredGaussians(**gaussians._asdict(), filter_sigmas=np.zeros_like(gaussians.opacity_logits))
 
 
 def filtered(g: FilteredGaussians) -> Gaussians:
-    """Return the Gaussians of 3DGS that are drawn."""
+    """Return the Gaussians of 3DGS after the 3D filter."""
     log_scales, opacity_logits = smoothed(g.log_scales, g.opacity_logits, g.filter_sigmas)
     return Gaussians(g.means, g.quats, log_scales, opacity_logits, g.sh_dc, g.sh_rest)
 
@@ -66,7 +66,7 @@ def with_3d_filter(inner: Renderer) -> Renderer:
 
 
 def with_2d_filter(inner: Renderer) -> Renderer:
-    """Return a renderer that blurs footprints by ``EPS2D`` and keeps their integrals, where 3DGS dilates by 0.3."""
+    """Return a renderer that blurs footprints by ``EPS2D`` and keeps their integrals; 3DGS dilates by 0.3 px^2."""
 
     def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
         conventions = request.conventions._replace(eps2d=EPS2D, is_antialiased=True)
@@ -76,7 +76,7 @@ def with_2d_filter(inner: Renderer) -> Renderer:
 
 
 def measure_filters(state: TrainState, iteration: Iteration, *, variance: float) -> None:
-    """Set each filter's variance to ``variance`` times the squared least sampling interval of the training views."""
+    """Set each filter's variance to ``variance`` times the squared smallest sampling interval of the training views."""
     cameras = [view.camera for view in iteration.scene.train_views]
     g = state.gaussians
     sigmas = np.sqrt(variance) * sampling_intervals(g.means, cameras)
@@ -100,4 +100,4 @@ ANTIALIASING = GS_ACCEL._replace(
     name="antialiasing",
     events=(*GS_ACCEL.events, At(1, _measure), Every(100, _measure, least_gap=DENSIFY_LEAST_GAP // 2)),
 )
-"""``antialiasing``: 3DGS with Mip-Splatting's two filters."""
+"""The recipe ``antialiasing``: 3DGS with Mip-Splatting's two filters."""

@@ -1,7 +1,7 @@
 """Mip-Splatting's 3D filter (Yu et al. 2023, equations 7 to 9) in NumPy, with its gradient.
 
-No camera sees more of a Gaussian than one sample a pixel, so what is thinner than the finest pixel in which it was seen
-is invention. Convolved with a round Gaussian of that size it is not.
+A camera samples a Gaussian once per pixel, so detail finer than the finest pixel that saw it is not supported by the
+photographs. Convolution with a round Gaussian of that size removes such detail.
 """
 
 import numpy as np
@@ -9,17 +9,17 @@ import numpy as np
 from minisplat_ref.types import Floats
 
 VARIANCE = 0.2  # of the filter, in units of the squared sampling interval
-EXPONENT_MAX = 80.0  # of e^l, which float32 holds up to e^88; an opacity that is 1 to 35 digits has no gradient left
+EXPONENT_MAX = 80.0  # of e^l, which float32 holds up to e^88; an opacity within 1e-35 of 1 has no gradient left
 
 
 def smoothed(log_scales: Floats, opacity_logits: Floats, sigmas: Floats) -> tuple[Floats, Floats]:
-    """Return scales and opacities of Gaussians that are convolved with round ones, their integrals unchanged.
+    """Return scales and opacities of Gaussians convolved with round ones; their integrals do not change.
 
     ::
 
         s'^2 = s^2 + sigma^2,   o' = rho o,   rho = prod_j s_j / s'_j
 
-    and in the logarithms and logits, with ``t_j = sigma^2 / s_j^2``, so that nothing is rounded where sigma is 0::
+    In logarithms and logits, with ``t_j = sigma^2 / s_j^2``, nothing is rounded where sigma is 0::
 
         log s'_j = log s_j + log(1 + t_j) / 2
         log rho  = -sum_j log(1 + t_j) / 2
@@ -28,6 +28,7 @@ def smoothed(log_scales: Floats, opacity_logits: Floats, sigmas: Floats) -> tupl
     Parameters
     ----------
     log_scales : ndarray of shape (N, 3)
+        log s, world units.
     opacity_logits : ndarray of shape (N,)
         l, with o = 1 / (1 + e^-l).
     sigmas : ndarray of shape (N,)
@@ -82,7 +83,7 @@ def smoothed_vjp(
 
 
 def _ratios(log_scales: Floats, sigmas: Floats) -> Floats:
-    """Return t = sigma^2 / s^2 [N, 3], at most the largest number."""
+    """Return t = sigma^2 / s^2 [N, 3], at most the largest finite number."""
     with np.errstate(over="ignore"):
         t = (np.abs(sigmas)[:, None] * np.exp(-log_scales)) ** 2
     return np.minimum(t, np.finfo(t.dtype).max)

@@ -1,4 +1,4 @@
-"""The study ``antialiasing/zoom`` asks what filters and integrals are worth at other sizes than the trained one."""
+"""The study ``antialiasing/zoom`` measures what filters and integrals gain at other sizes than the trained one."""
 
 import argparse
 
@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Train, measure, write, print a table.
+    """Train, measure, write the results, and print a table.
 
     Raises
     ------
@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> None:
         found = zoom.measure(scene, args.downscale, args.iterations, args.seeds)
         settings = {key: getattr(args, key) for key in ("scene", "downscale", "iterations", "seeds")}
         write(folder, {**settings, **zoom.summarise(found)}, zoom.draw(found))
-    print("PSNR (dB) of test views: mean of the seeds, and half of their range\n")
+    print("PSNR (dB) of test views: mean over the seeds ± half their range\n")
     rows = [
         [name, f"{np.mean(found.counts[name]):,.0f}", *(_mean_and_spread(values) for values in zip(*runs, strict=True))]
         for name, runs in found.psnr.items()
@@ -43,4 +43,4 @@ def _mean_and_spread(values: tuple[float, ...]) -> str:
     return f"{np.mean(values):.2f} ± {np.ptp(values) / 2:.2f}"
 
 
-ZOOM = Study("zoom", "a scene from farther and nearer than it was trained", add_arguments, run)
+ZOOM = Study("zoom", "a scene seen from farther and nearer than in training", add_arguments, run)

@@ -1,8 +1,7 @@
-"""The work of the study ``antialiasing/zoom``: scenes that were trained at one size, seen from farther and from nearer.
+"""The study ``antialiasing/zoom``: scenes trained at one size, seen from farther and from nearer.
 
-Photographs of a D-th of their size are trained on. Test views are drawn with the same camera and more or fewer pixels,
-and compared with means over blocks of the photographs' own pixels, as far as these go: zooms of more than D have no
-truth.
+Training uses photographs at 1/D of their size. Test views are drawn with the same camera and more or fewer pixels, and
+compared with means over blocks of the photographs' pixels; so zooms of more than D have no truth.
 """
 
 from typing import Any, NamedTuple
@@ -20,11 +19,11 @@ from minisplat_ref.types import Floats, Model, Scene, View, view_from
 
 RECIPES = {"3dgs-accel": "#8a8580", "antialiasing": "#d2493f", "analytic": "#35608c"}
 FARTHEST = 8  # times smaller than the training views
-LEAST_SIZE = 4  # pixels a side of a picture that is measured
+LEAST_SIZE = 4  # pixels per side of the smallest picture that is measured
 
 
 class Trained(NamedTuple):
-    """A scene that was trained at one size."""
+    """A population trained at one size, with its renderer."""
 
     model: Model
     renderer: Renderer
@@ -37,14 +36,14 @@ class Trained(NamedTuple):
 
 
 def trained(name: str, scene: Scene, iterations: int, seed: int) -> Trained:
-    """Train a scene by a recipe."""
+    """Train a scene with a recipe."""
     recipe = find_recipe(name, iterations)
     state = train(scene, recipe, seed=seed, backend=CPU)
     return Trained(state.model, recipe.renderer, scene.background)
 
 
 def blocks(scene: Scene, downscale: int) -> list[int]:
-    """Return the sides n of the blocks that are compared, the largest first: from 8 D to 1 in steps of two."""
+    """Return the sides n of the blocks that are compared, the largest first: from 8 D to 1 in factors of two."""
     camera = scene.test_views[0].camera
     sides = [FARTHEST * downscale]
     while sides[-1] % 2 == 0:
@@ -53,7 +52,7 @@ def blocks(scene: Scene, downscale: int) -> list[int]:
 
 
 def psnrs(found: Trained, scene: Scene, sides: list[int]) -> list[float]:
-    """Return the mean PSNR of the test views for each size of block, dB."""
+    """Return the mean PSNR of the test views, dB, for each size of block."""
     views = [view.loaded() for view in scene.test_views]
     return [
         float(
@@ -66,20 +65,20 @@ def psnrs(found: Trained, scene: Scene, sides: list[int]) -> list[float]:
 
 
 class Measured(NamedTuple):
-    """What the study has found."""
+    """The results of the study."""
 
     zooms: list[float]
-    """Pixels a side relative to the training views."""
+    """Pixels per side, relative to the training views."""
     psnr: dict[str, list[list[float]]]
-    """By recipe: for each seed, over the zooms, dB."""
+    """dB by recipe, then seed, then zoom."""
     counts: dict[str, list[int]]
-    """Gaussians, for each seed."""
+    """Number of Gaussians by recipe, then seed."""
     pictures: dict[str, Floats]
-    """Of the first test view at the largest zoom, and the photograph."""
+    """The first test view at the largest zoom by recipe, and the photograph."""
 
 
 def measure(scene: Scene, downscale: int, iterations: int, seeds: int) -> Measured:
-    """Train the scene by every recipe with every seed, and measure."""
+    """Train the scene with every recipe and seed, and measure."""
     small, sides = shrunk(scene, downscale), blocks(scene, downscale)
     psnr: dict[str, list[list[float]]] = {name: [] for name in RECIPES}
     counts: dict[str, list[int]] = {name: [] for name in RECIPES}
@@ -95,7 +94,7 @@ def measure(scene: Scene, downscale: int, iterations: int, seeds: int) -> Measur
 
 
 def draw(found: Measured) -> Figure:
-    """Draw the PSNR over the zoom, and a part of a view from near."""
+    """Draw the PSNR over the zoom, and a detail of a view from nearby."""
     figure = Figure(figsize=(11, 5.2), layout="constrained")
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1, 1.1))[0]
     axes = left.subplots()
@@ -105,7 +104,7 @@ def draw(found: Measured) -> Figure:
         axes.plot(found.zooms, values.mean(axis=0), "o-", ms=4, color=color, label=name)
     axes.set_xscale("log", base=2)
     axes.set_xticks(found.zooms, [f"{zoom:g}" if zoom >= 1 else f"1/{1 / zoom:g}" for zoom in found.zooms])
-    axes.set(title="PSNR of test views (dB)", xlabel="pixels a side, relative to the training views")
+    axes.set(title="PSNR of test views (dB)", xlabel="pixels per side, relative to the training views")
     axes.legend(frameon=False)
     tidy(axes)
     height, width = found.pictures["photograph"].shape[:2]
@@ -118,5 +117,5 @@ def draw(found: Measured) -> Figure:
 
 
 def summarise(found: Measured) -> dict[str, Any]:
-    """Return what is written."""
+    """Return the content of ``result.json``."""
     return {"zooms": found.zooms, "psnr": found.psnr, "counts": found.counts}

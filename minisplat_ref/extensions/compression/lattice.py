@@ -1,14 +1,15 @@
-"""Uniform quantisation to lattices whose steps are powers of two, with bounds that hold to the last bit.
+"""Uniform quantisation to lattices whose steps are powers of two, with error bounds that hold to the last bit.
 
 A value x becomes the integer ``q = rint(x / step)`` and comes back as ``q step``, so ``|q step - x| <= step / 2``. With
-``step = 2^e`` this is no estimate. Dividing by a power of two is exact. Of float32 values the result is one, too: where
-``|q| <= 2^24`` it has 24 bits, and where ``|q|`` is larger, the neighbours of x are further apart than the lattice, so
-x is on it. What is on the lattice stays where it is, hence encoding what was decoded gives the same integers.
+``step = 2^e`` this bound is exact, because dividing by a power of two is exact. If x is a float32, so is the result:
+where ``|q| <= 2^24`` it has 24 bits, and where ``|q|`` is larger, adjacent float32 numbers are further apart than the
+lattice, so x is on it. A value on the lattice stays where it is, hence encoding what was decoded gives the same
+integers.
 
-A quaternion q, whose length means nothing, is divided by its largest component. That becomes 1, the others are in [-1,
-1], and the sign is chosen so that the first component of magnitude 1 is +1. All this is decided by the integers, and
-so it, too, is the same the second time. The three others are off by at most ``step / 2`` each; as |q| >= 1, the
-rotation is off by at most ``2 asin(sqrt(3) step / 2)``.
+A quaternion q, whose length has no meaning, is divided by its largest component. That becomes 1, the others are in
+[-1, 1], and the sign is chosen so that the first component of magnitude 1 is +1. The integers decide all this, so it is
+the same in a second encoding. The three others are off by at most ``step / 2`` each; as |q| >= 1, the rotation is off
+by at most ``2 asin(sqrt(3) step / 2)``.
 """
 
 import math
@@ -28,11 +29,11 @@ def to_lattice(values: Floats, exponent: int, name: str) -> Ints:
     Parameters
     ----------
     values : ndarray of float32
-        Finite.
+        x, of any shape; finite.
     exponent : int
         e.
     name : str
-        Of the values, for the message.
+        What the values are, for the message.
 
     Raises
     ------
@@ -42,7 +43,7 @@ def to_lattice(values: Floats, exponent: int, name: str) -> Ints:
     scaled = np.ldexp(values.astype(np.float64), -exponent)
     if not np.abs(scaled).max(initial=0.0) <= LARGEST:
         raise InputError(
-            f"{name} reach {np.abs(values).max():.3g}, too far for steps of 2^{exponent}: remove what is so far out, or"
+            f"{name} reach {np.abs(values).max():.3g}, too far for steps of 2^{exponent}: remove the outliers, or"
             " write the exact level, --level 0"
         )
     return np.rint(scaled).astype(np.int64)
@@ -55,16 +56,16 @@ def from_lattice(integers: Ints, exponent: int) -> Floats:
 
 
 class Rotations(NamedTuple):
-    """Quaternions over their largest components, on the lattice."""
+    """Quaternions divided by their largest components, on the lattice."""
 
     largest: Ints
-    """[N] which component is 1: 0 to 3, of w, x, y, z."""
+    """[N] index of the component that is 1, in the order w, x, y, z."""
     others: Ints
     """[N, 3] the remaining components in their order, integers of at most ``1 / step`` in magnitude."""
 
 
 def to_rotations(quats: Floats, exponent: int) -> Rotations:
-    """Quantise rotations.
+    """Return the quaternions divided by their largest components, quantised.
 
     Parameters
     ----------
@@ -94,5 +95,5 @@ def _is_other(largest: Ints) -> np.ndarray:
 
 
 def rotation_bound(exponent: int) -> float:
-    """Return the largest angle, radians, by which a quantised rotation is off."""
+    """Return the largest error of a quantised rotation, radians; the step is ``2^exponent``."""
     return 2.0 * math.asin(min(1.0, math.sqrt(3.0) * 2.0**exponent / 2.0))

@@ -1,10 +1,10 @@
-"""The levels of precision of ``.msz``: which step each field has.
+"""The levels of precision of ``.msz``, and the step that each gives to each field.
 
-Level 0 keeps every float32. From level 1 to 12 geometry and colours take turns in becoming coarser by a factor of two,
-so two levels are one bit less for every number.
+Level 0 keeps every float32. From level 1 to 12 geometry and colours alternately become coarser by a factor of two, so
+every second level takes one bit less for every number.
 
-Centres need a step that fits the scene: it is a part of the size of its small Gaussians. The size is taken from
-scales that have been quantised already, or the second encoding might choose another one.
+The step of the centres must fit the scene: it is a fraction of the size of the small Gaussians. That size is computed
+from scales that are already quantised, or a second encoding might choose another step.
 """
 
 import math
@@ -20,7 +20,7 @@ SMALL = 0.1  # quantile of the Gaussians' middle standard deviations that stands
 
 
 class Exponents(NamedTuple):
-    """Steps as powers of two."""
+    """The step of each field, as a power of two."""
 
     means: int
     """Relative to the size of the small Gaussians; in a file, world units."""
@@ -33,14 +33,14 @@ class Exponents(NamedTuple):
 
 
 # Chosen so that at level 8 each field by itself costs less than 0.03 dB in a short training of a phone video. Higher
-# harmonics need the finest step: there are 45 of them, and all their errors meet in one colour.
+# harmonics need the finest step, because the errors of all 45 add up in one colour.
 FINEST = Exponents(means=-7, quats=-10, log_scales=-8, opacity_logits=-6, sh_dc=-8, sh_rest=-9)
 """Of level 1."""
 
 
 def exponents(level: int) -> Exponents:
     """Return the exponents of a level from 1 to 12; that of the means is relative."""
-    geometry, color = level // 2, (level - 1) // 2  # bits that are given up
+    geometry, color = level // 2, (level - 1) // 2  # bits that are dropped
     coarser = Exponents(geometry, geometry, geometry, color, color, color)
     return Exponents(*(finest + bits for finest, bits in zip(FINEST, coarser, strict=True)))
 
@@ -51,9 +51,10 @@ def size_exponent(log_scales: Ints, exponent: int) -> int:
     Parameters
     ----------
     log_scales : ndarray of shape (N, 3)
-        On the lattice of step 2^exponent. Of the three the middle one counts: a flat Gaussian may be as thin as it
-        likes.
+        Integers on the lattice of step 2^exponent. The middle one of the three counts, so that flat Gaussians may be as
+        thin as they are.
     exponent : int
+        Of the step of ``log_scales``.
     """
     if len(log_scales) == 0:
         return 0
@@ -63,5 +64,5 @@ def size_exponent(log_scales: Ints, exponent: int) -> int:
 
 
 def describe_levels() -> tuple[str, ...]:
-    """Return what each level is, in a few words."""
+    """Return a short description of each level."""
     return ("exact", *(f"log scales in steps of 2^{exponents(level).log_scales}" for level in range(1, N_LEVELS)))

@@ -1,14 +1,14 @@
 """``.msz``: Gaussians in Morton order, each field on its lattice, in planes of bytes packed by zstandard.
 
 The header holds the number of Gaussians, the degree of their spherical harmonics, the level, and for each field the
-exponent of its step and the number of its planes; half a step is the bound of the error. Streams:
+exponent of its step and the number of its planes; half a step bounds the error. The streams are
 
-- ``means``: differences of each row to the one before, which Morton order makes small;
+- ``means``: differences between consecutive rows, which Morton order makes small;
 - ``largest`` and ``quats``: see :mod:`minisplat_ref.extensions.compression.lattice`;
 - ``log_scales``, ``opacity_logits``, ``sh_dc``, ``sh_rest``: one column for each number.
 
 At level 0 each field is a stream of the bit patterns of its float32. Encoding what was decoded gives the same file,
-byte for byte: the order, too, depends on lattice points alone, and what shares a cell stays as it is.
+byte for byte: the order, too, depends on lattice points alone, and Gaussians of one cell stay in their order.
 """
 
 import math
@@ -22,7 +22,7 @@ from minisplat_ref.constants import SH_DEGREE_MAX
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.compression import lattice, levels
 from minisplat_ref.extensions.compression.levels import Exponents
-from minisplat_ref.extensions.shared_container import WAY_OUT, Container, Packed, is_count, pack, take_apart, unpack
+from minisplat_ref.extensions.shared_container import WAY_OUT, Container, Packed, is_count, pack, parse, unpack
 from minisplat_ref.extensions.shared_morton import morton_order
 from minisplat_ref.extensions.shared_planes import MOST_PLANES, from_planes, to_planes, unzigzag, zigzag
 from minisplat_ref.io.formats import Format
@@ -31,11 +31,11 @@ from minisplat_ref.validation import check_gaussians
 
 CONTAINER = Container(b"MSZ\n", version=1)
 MOST_GAUSSIANS = 2**31 - 1
-EXPONENT_MAX = 200  # of a step, either way, beyond the range of float32; but for the centres no step is larger than 1
+EXPONENT_MAX = 200  # of a step, positive or negative: beyond the range of float32. Only steps of centres may exceed 1
 
 
 class _Header(NamedTuple):
-    """What a header says, checked."""
+    """The checked content of a header."""
 
     n: int
     sh_degree: int
@@ -46,23 +46,23 @@ class _Header(NamedTuple):
 
     @property
     def widths(self) -> dict[str, int]:
-        """Numbers of a row of each field."""
+        """Numbers per Gaussian of each field."""
         n_rest = (self.sh_degree + 1) ** 2 - 1
         return {"means": 3, "quats": 4, "log_scales": 3, "opacity_logits": 1, "sh_dc": 3, "sh_rest": 3 * n_rest}
 
     @property
     def stream_widths(self) -> dict[str, int]:
-        """Numbers of a row of each stream."""
+        """Numbers per Gaussian of each stream."""
         return self.widths if self.level == 0 else {**self.widths, "quats": 3, "largest": 1}
 
 
 def encode(gaussians: Gaussians, level: int) -> bytes:
-    """Return the Gaussians as a file.
+    """Return the content of a file that holds the Gaussians.
 
     Parameters
     ----------
     gaussians : Gaussians
-        Rounded to float32.
+        They are rounded to float32.
     level : int
         0 to 12, see :mod:`minisplat_ref.extensions.compression.levels`.
 
@@ -116,14 +116,21 @@ def _lattice_streams(rows: Gaussians, level: int) -> tuple[Exponents, dict[str, 
 
 
 def decode(content: bytes, source: str | Path) -> Gaussians:
-    """Return the Gaussians of a file, in float32; the inverse of :func:`encode` within half a step.
+    """Return the Gaussians of a file, in float32; this inverts :func:`encode` to within half a step.
+
+    Parameters
+    ----------
+    content : bytes
+        The whole file.
+    source : str or Path
+        Its name, for messages.
 
     Raises
     ------
     InputError
         The file is damaged, of another kind or version, or holds no Gaussians of 3DGS.
     """
-    packed = take_apart(CONTAINER, content, source)
+    packed = parse(CONTAINER, content, source)
     header = _checked(packed)
     streams = {}
     for name, width in header.stream_widths.items():
@@ -154,12 +161,12 @@ def _from_lattices(streams: Mapping[str, Any], steps: Exponents, source: str | P
 
 
 def _checked(packed: Packed) -> _Header:
-    """Return the header, of which everything that is read has been looked at."""
+    """Return the header after checking every value that is read."""
     values, source = packed.header, packed.source
     n, degree, level, steps, planes = (values.get(name) for name in ("n", "sh_degree", "level", "steps", "planes"))
     if not is_count(n, MOST_GAUSSIANS) or not is_count(degree, SH_DEGREE_MAX) or not is_count(level):
         raise InputError(
-            f"{source}: damaged, its header says n {n}, sh_degree {degree}, level {level}, which cannot be; {WAY_OUT}"
+            f"{source}: damaged, its header says n {n}, sh_degree {degree}, level {level}, which is invalid; {WAY_OUT}"
         )
     assert isinstance(n, int) and isinstance(degree, int) and isinstance(level, int)
     header = _Header(n, degree, level, None, planes if isinstance(planes, dict) else {})
@@ -178,14 +185,14 @@ def _checked(packed: Packed) -> _Header:
 
 
 def describe(content: bytes, source: str | Path) -> list[tuple[str, str]]:
-    """Return the level of a file and how far its values may be off.
+    """Return the level of a file and the error bounds of its values, as pairs of name and text.
 
     Raises
     ------
     InputError
-        As for :func:`decode`, of the header.
+        The header is refused, as by :func:`decode`.
     """
-    header = _checked(take_apart(CONTAINER, content, source))
+    header = _checked(parse(CONTAINER, content, source))
     if header.steps is None:
         return [("level", "0: every float32 as it was, in Morton order")]
     half = {name: 2.0 ** (exponent - 1) for name, exponent in header.steps._asdict().items()}

@@ -1,7 +1,8 @@
 """``.spz``: Niantic's format, versions 2 and 3, read and written.
 
-A gzip stream of a header of 16 bytes (magic, version, number N, degree of the spherical harmonics, fractional bits,
-flags) and then, each for all Gaussians: centres, opacities, colours, scales, rotations, higher harmonics.
+A file is a gzip stream. It holds a header of 16 bytes (magic, version, number N, degree of the spherical harmonics,
+fractional bits, flags) and then, each for all Gaussians, centres, opacities, colours, scales, rotations and higher
+harmonics.
 
 ===========  ==========================================================================================
 centres      3 x 24 bits, two's complement, in steps of ``2^-12`` (the fractional bits of the header)
@@ -13,19 +14,19 @@ rotation     version 2: x, y, z as ``127.5 (q + 1)`` with w >= 0; version 3: 2 b
 harmonics    ``128 c + 128``, to a multiple of 8 for degree 1 and of 16 above; RGB last
 ===========  ==========================================================================================
 
-Colours, scales and harmonics outside of their ranges become the ends of these; centres outside are refused, since they
-would be somewhere else.
+Colours, scales and harmonics outside their ranges are clipped; centres outside are refused, since clipping would move
+them.
 
 **Axes.** The file's frame is RUB (x right, y up, z backward), as in OpenGL. That of a PLY of 3DGS is RDF (x right, y
-down, z forward). Niantic's library turns one into the other when its caller asks for it; we always do, as the sample
-of three Gaussians in both formats has it: y and z change sign, which is half a turn around x. So of a quaternion y and
-z change sign, and of the harmonics those that are odd in y z, which :data:`SIGNS` has from their polynomials.
-PlayCanvas' splat-transform reads what we write in the same way.
+down, z forward). Niantic's library converts one to the other when its caller asks for it; we always do, in agreement
+with a sample of three Gaussians in both formats. y and z change sign, which is a rotation by 180 degrees around x. So
+the y and z of a quaternion change sign, and so do the harmonics that are odd in y and z together, which :data:`SIGNS`
+derives from their polynomials. PlayCanvas' splat-transform reads what we write in the same way.
 
-Opacities 0 and 1 have no logit. They are read as a quarter of a level away from the end.
+Opacities 0 and 1 have no logit. They are read as a quarter of a quantisation level away from the end.
 
-Left out: version 1 (half floats) and 4 (zstandard, extensions); the flag that a scene was trained with antialiasing,
-which is read over, and written as 0.
+Left out are version 1 (half floats), version 4 (zstandard, extensions), and the flag that a scene was trained with
+antialiasing, which is ignored when read and written as 0.
 """
 
 import math
@@ -68,14 +69,21 @@ class _Header(NamedTuple):
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Bytes of a Gaussian, by attribute, in the order of the file."""
+        """Bytes per Gaussian of each attribute, in the order of the file."""
         rotation = 4 if self.version == 3 else 3
         rest = BYTES_OF_REST[self.sh_degree]
         return {"means": 9, "opacities": 1, "colors": 3, "scales": 3, "rotations": rotation, "sh_rest": rest}
 
 
 def encode(gaussians: Gaussians, level: int) -> bytes:
-    """Return the Gaussians, of the world frame of a PLY, as a file; level 0 is version 3, level 1 version 2.
+    """Return the content of a file that holds the Gaussians.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        In the world frame of a PLY.
+    level : int
+        0 writes version 3, 1 version 2.
 
     Raises
     ------
@@ -90,7 +98,7 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
     if out.any():
         row = int(np.flatnonzero(out.any(axis=1))[0])
         raise InputError(
-            f"the centre of row {row} is {np.abs(means[row]).max():.6g} away, and SPZ reaches {REACH:g}"
+            f"the centre of row {row} is {np.abs(means[row]).max():.6g} away, but SPZ reaches {REACH:g}"
             f" ({int(out.any(axis=1).sum()):,} of {n:,} are too far): scale the scene down, or choose another format"
         )
     opacities = 0.5 * (1.0 + np.tanh(0.5 * gaussians.opacity_logits.astype(np.float64)))  # the sigmoid
@@ -107,7 +115,7 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
     )
     sh_degree = math.isqrt(n_rest + 1) - 1
     header = HEADER.pack(MAGIC, version, n, sh_degree, FRACTIONAL_BITS, 0, 0)
-    compressor = zlib.compressobj(9, zlib.DEFLATED, 31)  # gzip, without a name and a time
+    compressor = zlib.compressobj(9, zlib.DEFLATED, 31)  # gzip, without a file name and a time
     return compressor.compress(header + b"".join(part.tobytes() for part in parts)) + compressor.flush()
 
 
@@ -116,7 +124,7 @@ def _to_bytes(values: Floats) -> NDArray[np.uint8]:
 
 
 def _to_buckets(values: Floats) -> NDArray[np.uint8]:
-    """Round ``128 c`` [N, K-1, 3] to multiples of a bucket, and move it up by 128."""
+    """Return ``128 c`` [N, K-1, 3] rounded to multiples of a bucket, plus 128."""
     n_rest = values.shape[1]
     degrees = np.repeat([1, 2, 3], [3, 5, 7])[:n_rest]
     bucket = np.array([2.0 ** (8 - SH_BITS[int(degree)]) for degree in degrees])[:, None]  # [K-1, 1]
@@ -124,7 +132,7 @@ def _to_buckets(values: Floats) -> NDArray[np.uint8]:
 
 
 def _to_vector(quats: Floats) -> NDArray[np.uint8]:
-    """Return x, y, z of unit quaternions whose w is not negative, a byte each."""
+    """Return x, y, z of unit quaternions whose w is not negative, in one byte each."""
     quats = quats / np.linalg.norm(quats, axis=1, keepdims=True) * np.where(quats[:, :1] < 0, -1.0, 1.0)
     return _to_bytes(127.5 * (quats[:, 1:] + 1.0))
 
@@ -136,7 +144,7 @@ def _from_vector(raw: NDArray[np.uint8]) -> Floats:
 
 
 def _to_smallest_three(quats: Floats) -> NDArray[np.uint32]:
-    """Return unit quaternions without their largest component, which is made positive, in 32 bits."""
+    """Return unit quaternions in 32 bits, without their largest component, which is made positive."""
     xyzw = np.roll(quats / np.linalg.norm(quats, axis=1, keepdims=True), -1, axis=1)  # [N, 4]
     largest = np.argmax(np.abs(xyzw), axis=1)  # [N]
     xyzw *= np.where(np.take_along_axis(xyzw, largest[:, None], axis=1) < 0, -1.0, 1.0)
@@ -161,18 +169,25 @@ def _from_smallest_three(raw: NDArray[np.uint8]) -> Floats:
 def decode(content: bytes, source: str | Path) -> Gaussians:
     """Return the Gaussians of a file, float32, in the world frame of a PLY.
 
+    Parameters
+    ----------
+    content : bytes
+        The whole file.
+    source : str or Path
+        Its name, for messages.
+
     Raises
     ------
     InputError
         The file is damaged, of another kind or version, or claims more than it holds.
     """
-    header, body = _take_apart(content, source)
+    header, body = _parse(content, source)
     raw, begin = {}, 0
     for name, size in header.sizes.items():
         part = np.frombuffer(body, np.uint8, header.n * size, begin)
         raw[name] = part.reshape(header.n, size)
         begin += header.n * size
-    # Three bytes as the upper ones of four: an arithmetic shift carries the sign down.
+    # Three bytes become the upper ones of four, so that an arithmetic shift extends the sign.
     words = np.zeros((header.n, 3, 4), np.uint8)
     words[..., 1:] = raw["means"].reshape(header.n, 3, 3)
     steps: Ints = words.view("<i4")[..., 0] >> 8  # [N, 3]
@@ -193,18 +208,18 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
     return gaussians
 
 
-def _take_apart(content: bytes, source: str | Path) -> tuple[_Header, bytes]:
-    """Return the header and all that follows it, once the header is known to be possible."""
+def _parse(content: bytes, source: str | Path) -> tuple[_Header, bytes]:
+    """Return the header and all that follows it, after checking the header."""
     if content[:4] == struct.pack("<I", MAGIC):
-        raise InputError(f"{source}: SPZ of version 4 or later, which is not read: export it as version 2 or 3")
+        raise InputError(f"{source}: SPZ of version 4 or later, which is not supported: export it as version 2 or 3")
     if content[:2] != b"\x1f\x8b":
         raise InputError(f"{source}: not an SPZ file, it is not packed by gzip; give one that ends in .spz")
     head, _ = _inflate(content, HEADER.size, source)
     if len(head) < HEADER.size or HEADER.unpack(head)[0] != MAGIC:
-        raise InputError(f"{source}: not an SPZ file, what gzip packed does not begin with NGSP; {WAY_OUT}")
+        raise InputError(f"{source}: not an SPZ file, its content does not begin with NGSP; {WAY_OUT}")
     _, version, n, degree, fractional_bits, _, _ = HEADER.unpack(head)
     if version not in VERSIONS:
-        raise InputError(f"{source}: SPZ of version {version}, which is not read: export it as version 2 or 3")
+        raise InputError(f"{source}: SPZ of version {version}, which is not supported: export it as version 2 or 3")
     if degree >= len(BYTES_OF_REST) or fractional_bits > 23:
         raise InputError(
             f"{source}: damaged, spherical harmonics of degree {degree} and {fractional_bits} fractional bits;"
@@ -223,7 +238,7 @@ def _take_apart(content: bytes, source: str | Path) -> tuple[_Header, bytes]:
 
 
 def _inflate(content: bytes, n_bytes: int, source: str | Path) -> tuple[bytes, bool]:
-    """Return the first bytes that gzip has packed, and whether more follow or they end with the right checksum."""
+    """Return the first ``n_bytes`` of a gzip stream, and whether more follow or it ends with the right checksum."""
     try:
         gzip = zlib.decompressobj(31)
         head = gzip.decompress(content, n_bytes)
@@ -234,14 +249,14 @@ def _inflate(content: bytes, n_bytes: int, source: str | Path) -> tuple[bytes, b
 
 
 def describe(content: bytes, source: str | Path) -> list[tuple[str, str]]:
-    """Return the version of a file and how far its values may be off.
+    """Return the version of a file and the error bounds of its values, as pairs of name and text.
 
     Raises
     ------
     InputError
-        As for :func:`decode`.
+        The file is refused, as by :func:`decode`.
     """
-    header, _ = _take_apart(content, source)
+    header, _ = _parse(content, source)
     return [
         ("SPZ version", str(header.version)),
         ("centres", f"within {2.0 ** (-header.fractional_bits - 1):.3g} world units along each axis"),

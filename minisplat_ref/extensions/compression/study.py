@@ -1,12 +1,12 @@
 """The study ``compression/rate-distortion``: what bytes cost in quality, and what a fixed step costs in a small scene.
 
-A scene is trained, or a PLY given. Every level of every format of this extension is written, read again and measured on
-the test views; beside them the PLY itself and, where the program ``splat-transform`` of PlayCanvas is named, its SOG.
-Sizes are those of whole files.
+The Gaussians come from a training or from a PLY. They are written at every level of every format of this extension,
+read again and measured on the test views; so is the PLY itself and, if ``--splat-transform`` names that program of
+PlayCanvas, its SOG. Sizes are those of whole files.
 
-The second question: SPZ has a fixed step of 2^-12 world units for centres and a fixed range for scales, ``.msz`` a step
-that follows the small Gaussians. The scene, Gaussians, cameras and near plane together, is made smaller and smaller;
-every picture stays the same, and what a file loses should, too.
+SPZ has a fixed step of 2^-12 world units for centres and a fixed range for scales; the step of ``.msz`` follows the
+small Gaussians. So the study also makes the scene smaller and smaller, with Gaussians, cameras and near plane together:
+every picture stays the same, and so should the loss of a file.
 """
 
 import argparse
@@ -34,30 +34,30 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SHRUNK = (1.0, 1 / 8, 1 / 64, 1 / 512)  # by which a scene is made smaller
+SHRUNK = (1.0, 1 / 8, 1 / 64, 1 / 512)  # sizes of the scene, relative to the original
 SHRUNK_LEVEL = 5  # of .msz
 COLORS = {"ply": shared.GREY, "msz": shared.BLUE, "spz": shared.RED, "sog": shared.YELLOW}
 
 
 class Point(NamedTuple):
-    """A file and what it shows."""
+    """The size of a file and the quality of what it holds."""
 
     name: str
     """Format and level."""
     n_bytes: int
     bytes_per_gaussian: float
     drop: float
-    """dB of PSNR that are lost, on the test views."""
+    """Loss of PSNR on the test views, dB."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the study."""
     shared.add_scene_arguments(parser, iterations=1000, recipe="mini-splatting2")
-    parser.add_argument("--splat-transform", metavar="PROGRAM", help="measure SOG, too, as this program writes it")
+    parser.add_argument("--splat-transform", metavar="PROGRAM", help="measure SOG, too, written by this program")
 
 
 def run(args: argparse.Namespace) -> None:
-    """Train, measure, write, print the tables.
+    """Train, measure, write the results, and print the tables.
 
     Raises
     ------
@@ -70,11 +70,11 @@ def run(args: argparse.Namespace) -> None:
     with making_folder(args.out) as folder:
         runs, shrunk, psnrs, counts = [], [], [], []
         for gaussians in shared.populations(args, scene):
-            psnr = measured(gaussians, scene.test_views, scene.background)
+            psnr = mean_psnr(gaussians, scene.test_views, scene.background)
             psnrs.append(psnr)
             counts.append(len(gaussians.means))
             judge = (scene.test_views, scene.background, psnr)
-            runs.append([point._asdict() for point in points(gaussians, *judge, args.splat_transform)])
+            runs.append([point._asdict() for point in rate_points(gaussians, *judge, args.splat_transform)])
             shrunk.append(drops_when_shrunk(gaussians, scene.test_views, scene.background))
         result = {
             **shared.describe(args, scene),
@@ -85,8 +85,8 @@ def run(args: argparse.Namespace) -> None:
         }
         shared_studies.write(folder, result, draw(result))
     print(f"{scene.name}: {shared.with_deviation(psnrs, 2)} dB, {np.mean(counts):,.0f} Gaussians\n")
-    print(markdown_table(["file", "bytes", "bytes a Gaussian", "dB lost"], to_rows(runs)))
-    print("\ndB lost when the scene is smaller\n")
+    print(markdown_table(["file", "bytes", "bytes per Gaussian", "dB lost"], to_rows(runs)))
+    print("\ndB lost by size of the scene\n")
     rows = [
         [name, *(shared.with_deviation(list(of_seeds), 3) for of_seeds in zip(*drops, strict=True))]
         for name, drops in result["shrunk"].items()
@@ -94,10 +94,10 @@ def run(args: argparse.Namespace) -> None:
     print(markdown_table(["file", *(f"1/{1 / factor:.0f}" for factor in SHRUNK)], rows))
 
 
-def measured(
+def mean_psnr(
     gaussians: Gaussians, views: tuple[View, ...], background: Floats, conventions: Conventions = GSPLAT_MAIN
 ) -> float:
-    """Return the PSNR, dB."""
+    """Return the mean PSNR over views, dB."""
     from minisplat_ref.metrics import evaluate
 
     psnr = evaluate(gaussians, views, background=background, conventions=conventions).psnr
@@ -105,34 +105,34 @@ def measured(
     return psnr
 
 
-def points(
+def rate_points(
     gaussians: Gaussians, views: tuple[View, ...], background: Floats, psnr: float, program: str | None
 ) -> Iterator[Point]:
-    """Yield every file that there is of the Gaussians, whose own PSNR is given."""
+    """Yield the size and the loss of each file of the Gaussians, whose own PSNR is given."""
     n = max(1, len(gaussians.means))
     with tempfile.TemporaryDirectory() as folder:
         ply = Path(folder, "a.ply")
         save_ply(ply, gaussians)
         size = ply.stat().st_size
-        yield Point("ply", size, size / n, psnr - measured(load_ply(ply), views, background))
+        yield Point("ply", size, size / n, psnr - mean_psnr(load_ply(ply), views, background))
         if program is not None:
-            size, back = through_sog(program, ply)
-            yield Point("sog", size, size / n, psnr - measured(back, views, background))
+            size, back = sog_round_trip(program, ply)
+            yield Point("sog", size, size / n, psnr - mean_psnr(back, views, background))
     for format_ in (SPZ, MSZ):
         for level, name in enumerate(format_.levels):
-            content, back = there_and_back(gaussians, format_, level)
+            content, back = round_trip(gaussians, format_, level)
             label = f"{format_.suffix[1:]} {name if format_ is SPZ else level}"
-            yield Point(label, len(content), len(content) / n, psnr - measured(back, views, background))
+            yield Point(label, len(content), len(content) / n, psnr - mean_psnr(back, views, background))
 
 
-def there_and_back(gaussians: Gaussians, format_: Format, level: int) -> tuple[bytes, Gaussians]:
-    """Return a file's bytes, and what is read from them."""
+def round_trip(gaussians: Gaussians, format_: Format, level: int) -> tuple[bytes, Gaussians]:
+    """Return the content of a file, and the Gaussians that are read from it."""
     content = format_.encode(gaussians, level)
     return content, format_.decode(content, format_.suffix)
 
 
-def through_sog(program: str, ply: Path) -> tuple[int, Gaussians]:
-    """Return the size of the SOG that the program makes of a PLY, and the Gaussians that it makes of that.
+def sog_round_trip(program: str, ply: Path) -> tuple[int, Gaussians]:
+    """Return the size of the SOG that the program makes from a PLY, and the Gaussians that it reads from it.
 
     Raises
     ------
@@ -149,16 +149,16 @@ def through_sog(program: str, ply: Path) -> tuple[int, Gaussians]:
 
 
 def drops_when_shrunk(gaussians: Gaussians, views: tuple[View, ...], background: Floats) -> dict[str, list[float]]:
-    """Return the dB that are lost by each format when the scene, cameras too, is made smaller by each of SHRUNK."""
+    """Return the loss of each format, dB, at each size of the scene in ``SHRUNK``."""
     drops: dict[str, list[float]] = {"msz 5": [], "spz version 3": []}
     for factor in SHRUNK:
         small = shrink(gaussians, factor)
         near = tuple(view.loaded()._replace(camera=shrunk_camera(view, factor)) for view in views)
         conventions = GSPLAT_MAIN._replace(near_plane=factor * GSPLAT_MAIN.near_plane)
-        before = measured(small, near, background, conventions)
+        before = mean_psnr(small, near, background, conventions)
         for name, (format_, level) in zip(drops, ((MSZ, SHRUNK_LEVEL), (SPZ, 0)), strict=True):
-            back = there_and_back(small, format_, level)[1]
-            drops[name].append(before - measured(back, near, background, conventions))
+            back = round_trip(small, format_, level)[1]
+            drops[name].append(before - mean_psnr(back, near, background, conventions))
     return drops
 
 
@@ -196,7 +196,7 @@ def draw(result: dict[str, Any]) -> "Figure":
         _draw_kind(rate, kind, result["runs"])
     rate.axhline(0, color=shared.GREY, linewidth=0.8)
     rate.set(
-        xscale="log", xlabel="bytes a Gaussian", ylabel="PSNR lost (dB)", title=f"{result['scene']}: bytes and loss"
+        xscale="log", xlabel="bytes per Gaussian", ylabel="PSNR lost (dB)", title=f"{result['scene']}: bytes and loss"
     )
     ticks = (8, 16, 32, 64, 128, 256)
     rate.set_xticks(ticks, [str(tick) for tick in ticks])
@@ -205,7 +205,7 @@ def draw(result: dict[str, Any]) -> "Figure":
         color = COLORS[name.split()[0]]
         means, deviations = np.transpose([shared.mean_and_deviation(d) for d in zip(*drops, strict=True)])
         small.errorbar(SHRUNK, means, yerr=deviations, color=color, marker="o", ms=4, capsize=3, label=f".{name}")
-    small.set(xscale="log", xlabel="size of the scene", ylabel="PSNR lost (dB)", title="the same scene, smaller")
+    small.set(xscale="log", xlabel="size of the scene", ylabel="PSNR lost (dB)", title="the same scene made smaller")
     small.set_xticks(SHRUNK, ["1", *(f"1/{1 / factor:.0f}" for factor in SHRUNK[1:])])
     small.minorticks_off()
     small.invert_xaxis()
@@ -216,7 +216,7 @@ def draw(result: dict[str, Any]) -> "Figure":
 
 
 def _draw_kind(axes: "Axes", kind: str, runs: list[list[dict[str, Any]]]) -> None:
-    """Draw the files of one format: a line through its levels."""
+    """Draw the files of one format as a line through its levels."""
     of_levels = [of_seeds for of_seeds in zip(*runs, strict=True) if of_seeds[0]["name"].split()[0] == kind]
     if not of_levels:
         return
@@ -228,4 +228,4 @@ def _draw_kind(axes: "Axes", kind: str, runs: list[list[dict[str, Any]]]) -> Non
 
 
 RATE_DISTORTION = Study("rate-distortion", "bytes against quality: .msz beside PLY, SPZ and SOG", add_arguments, run)
-"""``compression/rate-distortion``."""
+"""The study ``compression/rate-distortion``."""

@@ -1,16 +1,16 @@
 """Geometric losses: the depth of the sparse points, smooth depth, smooth normals.
 
-Three terms that join the loss of any recipe, ``train SCENE --extension geometry --set sfm_depth=0.1``; each has the
-weight 0 until it is set:
+Three terms join the loss of any recipe, ``train SCENE --extension geometry --set sfm_depth=0.1``; each has the weight 0
+until it is set:
 
-- ``sfm_depth``: Huber's loss of the relative depth error at the points that structure from motion found in the view
+- ``sfm_depth`` is the Huber loss of the relative depth error at the points that structure from motion found in the view
   (after DS-NeRF, Deng et al. 2022);
-- ``depth_smoothness``: relative depth steps between neighbouring pixels, less where the photograph has an edge (after
-  Godard et al. 2017);
-- ``normal_smoothness``: turns of the surface between neighbouring pixels, from normals of the depth map (after 2D
-  Gaussian Splatting, Huang et al. 2024).
+- ``depth_smoothness`` penalises relative depth steps between neighbouring pixels, less where the photograph has an edge
+  (after Godard et al. 2017);
+- ``normal_smoothness`` penalises differences of neighbouring normals of the depth map (after 2D Gaussian Splatting,
+  Huang et al. 2024).
 
-All look at the expected depth ``sum w z / alpha``, so their gradient goes to the depth channel and to alpha.
+All are functions of the expected depth ``sum w z / alpha``, so their gradient goes to the depth channel and to alpha.
 """
 
 from minisplat_ref.extensions.extension import Extension

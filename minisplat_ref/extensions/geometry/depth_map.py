@@ -1,8 +1,8 @@
-"""Stage 7, optional: which way the surface faces that the depth map of a view shows.
+"""Stage 7, optional: normals of the surface that the depth map of a view shows.
 
-The pixels of a depth map, lifted to points, make a surface whose normals are cross products of neighbouring
-differences, as in 2D Gaussian Splatting (Huang et al. 2024). Left out: the last row and column of pixels, which lack
-a neighbour.
+The pixels of a depth map, lifted to points, form a surface whose normals are cross products of neighbouring
+differences, as in 2D Gaussian Splatting (Huang et al. 2024). The last row and column of pixels lack a neighbour and
+have no normal.
 """
 
 import numpy as np
@@ -12,23 +12,23 @@ from minisplat_ref.types import Bools, Camera, Floats
 
 
 def depth_normals(depth: Floats, camera: Camera) -> Floats:
-    """Unit normals of the surface through a depth map's points ``X = z r``, r = ((x - cx) / fx, (y - cy) / fy, 1).
+    """Return unit normals of the surface through a depth map's points ``X = z r``, r = ((x - cx)/fx, (y - cy)/fy, 1).
 
-    From a pixel's point, its right neighbour's and its lower neighbour's::
+    A normal follows from the points of a pixel, of its right neighbour and of its lower neighbour::
 
         N = (X_down - X) x (X_right - X),   n = N / |N|
 
     Parameters
     ----------
     depth : ndarray of shape (H, W)
-        Camera z; 0 for none.
+        Camera z, world units; 0 where there is no depth.
     camera : Camera
-        Its intrinsics.
+        Its intrinsics are used.
 
     Returns
     -------
     ndarray of shape (H - 1, W - 1, 3)
-        Camera frame, towards the camera; 0 where one of the three pixels has no depth.
+        Unit vectors of the camera frame that point towards the camera; 0 where one of the three pixels has no depth.
     """
     _, _, N, exists = _cross_products(depth, camera)
     return np.where(exists, N, 0) / np.where(exists, np.linalg.norm(N, axis=2, keepdims=True), 1)
@@ -41,7 +41,7 @@ def depth_normals_vjp(depth: Floats, camera: Camera, v_normals: Floats) -> Float
 
         v_N = (v_n - (n . v_n) n) / |N|                        0 where there is no normal
         v_a = b x v_N,  v_b = v_N x a
-        v_X = sums of v_a, v_b and -(v_a + v_b) over the normals that a point has a part in
+        v_X = sums of v_a, v_b and -(v_a + v_b) over the normals that depend on a point
         v_z = r . v_X
 
     Parameters
@@ -71,15 +71,15 @@ def depth_normals_vjp(depth: Floats, camera: Camera, v_normals: Floats) -> Float
 
 
 def _rays(camera: Camera, depth: Floats) -> Floats:
-    """Camera-frame directions [H, W, 3] of the pixel centres, with z equal to 1."""
+    """Return the camera-frame directions r [H, W, 3] of the pixel centres, whose z is 1."""
     height, width = depth.shape
     return pinhole_rays(np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5, camera).astype(depth.dtype)
 
 
 def _cross_products(depth: Floats, camera: Camera) -> tuple[Floats, Floats, Floats, Bools]:
-    """Return a, b and N [H - 1, W - 1, 3] and whether all three pixels have a depth [H - 1, W - 1, 1].
+    """Return a, b and N [H - 1, W - 1, 3], and whether all three pixels have a depth [H - 1, W - 1, 1].
 
-    N is not zero then: three rays through different pixels are linearly independent.
+    Where they have one, N is not zero, because three rays through different pixels are linearly independent.
     """
     points = depth[:, :, None] * _rays(camera, depth)
     a, b = points[1:, :-1] - points[:-1, :-1], points[:-1, 1:] - points[:-1, :-1]

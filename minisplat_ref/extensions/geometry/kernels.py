@@ -1,7 +1,8 @@
 """Losses of a depth map, forward and backward: the loops over ``formulas.py``.
 
-All three terms depend on ratios of depths alone, so that backward everything is collected by the logarithm of the
-depth; and log z = log(sum w z) - log(alpha). Backward, a pixel gathers from its neighbours: each number has one writer.
+All three terms depend on ratios of depths alone, so the backward pass collects derivatives with respect to the
+logarithm of the depth, log z = log(sum w z) - log(alpha). There a pixel gathers from its neighbours, so each number has
+one writer.
 """
 
 import math
@@ -20,24 +21,24 @@ from minisplat_ref.types import Bools, Camera, Floats, Ints
 
 
 class GeometricTape(NamedTuple):
-    """What the gradient of the geometric loss needs again."""
+    """What the forward pass keeps for the gradient of the geometric loss."""
 
     accumulated_depth: Floats
     alpha: Floats
     depth: Floats
-    """[H, W] 0 for none."""
+    """[H, W] 0 where there is none."""
     lens: Floats
     """[4] fx, fy, cx, cy."""
     edges: Floats
     """[2, H, W] weight between a pixel and its right and its lower neighbour; 0 where one of them has no depth."""
     normals: Floats
-    """[H, W, 3] 0 for none."""
+    """[H, W, 3] 0 where there is none."""
     counts: Ints
-    """[2] pairs of depths and pairs of normals."""
+    """[2] numbers of pairs of depths and of pairs of normals."""
     point_pixels: Ints
     """[n] flat index of the pixel that a point falls on."""
     point_slopes: Floats
-    """[n] derivative of each point's cost by the pixel's log depth."""
+    """[n] derivative of each point's cost with respect to the pixel's log depth."""
     weights: GeometricWeights
 
 
@@ -71,8 +72,8 @@ def _depth_steps(depth, edges, sums):
 
 
 @scalar
-def _pull(weight, z, z_other):
-    """Derivative of a pair's cost by log z."""
+def _pair_derivative(weight, z, z_other):
+    """Return the derivative of a pair's cost with respect to log z."""
     if z > z_other:
         return weight
     return -weight if z < z_other else ZERO * weight
@@ -86,13 +87,13 @@ def _depth_steps_vjp(depth, edges, v_pair, v_logs):
             z = depth[y, x]
             v = ZERO * z
             if x + 1 < width:
-                v += _pull(edges[0, y, x], z, depth[y, x + 1])
+                v += _pair_derivative(edges[0, y, x], z, depth[y, x + 1])
             if x > 0:
-                v += _pull(edges[0, y, x - 1], z, depth[y, x - 1])
+                v += _pair_derivative(edges[0, y, x - 1], z, depth[y, x - 1])
             if y + 1 < height:
-                v += _pull(edges[1, y, x], z, depth[y + 1, x])
+                v += _pair_derivative(edges[1, y, x], z, depth[y + 1, x])
             if y > 0:
-                v += _pull(edges[1, y - 1, x], z, depth[y - 1, x])
+                v += _pair_derivative(edges[1, y - 1, x], z, depth[y - 1, x])
             v_logs[y, x] += v_pair * v
 
 
@@ -142,7 +143,7 @@ def _normal_differences(normals, edges, sums):
 
 @scalar
 def _add_difference(v, weight, a, b):
-    """Add the derivative of a pair's cost by its first normal; no normal has no part in it."""
+    """Add the derivative of a pair's cost with respect to its first normal; a missing normal adds nothing."""
     if not _is_normal(b):
         return v
     return v[0] + weight * (a[0] - b[0]), v[1] + weight * (a[1] - b[1]), v[2] + weight * (a[2] - b[2])
@@ -213,7 +214,7 @@ def geometric_loss(
     weights: GeometricWeights,
     mask: Bools | None = None,
 ) -> tuple[float, GeometricTape]:
-    """Weighted sum of the terms, of which those of weight 0 are not computed; see ``reference.geometric_loss``."""
+    """Return the weighted sum of the terms; those of weight 0 are not computed. See ``reference.geometric_loss``."""
     dtype, (height, width) = accumulated_depth.dtype, accumulated_depth.shape
     counts_here = (alpha > DEPTH_ALPHA_MIN) & (accumulated_depth > 0)
     if mask is not None:
@@ -222,7 +223,7 @@ def geometric_loss(
     np.divide(accumulated_depth, alpha, out=depth, where=counts_here)
     lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     edges, normals = np.zeros((2, height, width), dtype), np.zeros((height, width, 3), dtype)
-    sums = np.zeros((2, height, 2))  # depth and normals: of costs, of pairs
+    sums = np.zeros((2, height, 2))  # for depths and for normals: sum of costs, number of pairs
     if weights.depth_smoothness or weights.normal_smoothness:
         photograph = np.ascontiguousarray(photograph, dtype)
         _weigh_edges(depth, photograph, dtype.type(EDGE_SHARPNESS), edges)
@@ -244,7 +245,7 @@ def geometric_loss(
 
 
 def _seen_points(depth: Floats, camera: Camera, lens: Floats, points: Floats) -> tuple[Ints, Floats, Floats]:
-    """Pixel, cost and slope [n] of the points that fall on a pixel with depth, in float64 like their positions."""
+    """Return pixel, cost and slope [n] of the points that fall on a pixel with depth, in float64 as their positions."""
     n = len(points)
     pixels, costs, slopes = np.full(n, -1), np.zeros(n), np.zeros(n)
     points = np.ascontiguousarray(points, np.float64)
@@ -254,7 +255,7 @@ def _seen_points(depth: Floats, camera: Camera, lens: Floats, points: Floats) ->
 
 
 def geometric_loss_vjp(tape: GeometricTape, v_loss: float = 1.0) -> tuple[Floats, Floats]:
-    """Carry the loss's derivative on to accumulated depth and opacity; see ``reference.geometric_loss``."""
+    """Return the gradient with respect to accumulated depth and opacity; see ``reference.geometric_loss_vjp``."""
     depth, weights, dtype = tape.depth, tape.weights, tape.depth.dtype
     v_logs = np.zeros(depth.shape, dtype)
     if weights.depth_smoothness:

@@ -1,4 +1,4 @@
-"""The geometric terms as loss terms: what each is given, and to which channels its gradient goes."""
+"""The geometric terms as loss terms, with their inputs and the channels that receive their gradients."""
 
 from functools import partial
 from typing import Any
@@ -12,7 +12,15 @@ from minisplat_ref.training.losses import Cotangents, LossTerm, Rendered
 
 
 def geometric(rendered: Rendered, weights: GeometricWeights) -> tuple[float, Cotangents]:
-    """Return the geometric loss with these weights, and its derivatives with respect to depth channel and alpha."""
+    """Return the geometric loss, and its derivatives with respect to the depth channel and alpha.
+
+    Parameters
+    ----------
+    rendered : Rendered
+        The view, with a depth channel.
+    weights : GeometricWeights
+        Factors of the terms.
+    """
     view = rendered.view
     points = rendered.scene.points[view.point_ids] if view.point_ids is not None else rendered.scene.points[:0]
     photograph = view.image * np.float32(1 / 255)  # [H, W, 3]
@@ -24,7 +32,7 @@ def geometric(rendered: Rendered, weights: GeometricWeights) -> tuple[float, Cot
 
 
 def sfm_depth(rendered: Rendered) -> tuple[float, Cotangents]:
-    """Return how far the depth at the sparse points is from theirs.
+    """Return the Huber loss of the depth at the sparse points of the view.
 
     Raises
     ------

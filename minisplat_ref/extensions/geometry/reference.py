@@ -1,17 +1,18 @@
-"""Stage 7, optional: how far a rendered depth map is from what is known or likely about surfaces.
+"""Stage 7, optional: losses that compare a rendered depth map with what is known or likely about surfaces.
 
-Three terms beside the photometric loss, none of them part of 3DGS or Mini-Splatting, all weighted 0 by default:
+There are three terms beside the photometric loss. None is part of 3DGS or Mini-Splatting; all have the weight 0 by
+default:
 
 * depth at the points of structure from motion, as in DS-NeRF (Deng et al. 2022), here robust (Huber 1964);
 * depth smoothness that photographed edges switch off, as in Monodepth (Godard et al. 2017);
 * normal smoothness with the same edges: half the squared difference of neighbouring normals, 1 minus their cosine.
 
-Depths are compared by the logarithm of their ratio. The unit of a scene from structure from motion is arbitrary, so a
-weight must not depend on it; triangulation errors grow with the distance; too near and too far count alike, where
-inverse depth hardly sees an error behind a far point. A point looks at the pixel it falls on: interpolating would mix
-both sides of a silhouette, and half a pixel of a surface tilted by 60 degrees is 0.2 % of its depth at a focal length
-of 500 pixels, less than the tolerance. Left out: uncertainties of single points, and the gradient
-with respect to the pose.
+Depths are compared by the logarithm of their ratio, for three reasons. The unit of a scene from structure from motion
+is arbitrary, so a weight must not depend on it; triangulation errors grow with the distance; and too near counts as
+much as too far, while inverse depth is hardly sensitive to an error behind a far point. A point is compared with the
+pixel that it falls on: interpolating would mix both sides of a silhouette, and half a pixel of a surface tilted by 60
+degrees is 0.2 % of its depth at a focal length of 500 pixels, less than the tolerance. Left out are uncertainties of
+single points, and the gradient with respect to the pose.
 """
 
 from typing import NamedTuple
@@ -26,7 +27,7 @@ from minisplat_ref.types import Bools, Camera, Floats, Ints
 
 
 class GeometricTape(NamedTuple):
-    """What the gradient of the geometric loss needs."""
+    """What the forward pass keeps for the gradient of the geometric loss."""
 
     accumulated_depth: Floats
     """[H, W]."""
@@ -51,7 +52,7 @@ def geometric_loss(
     weights: GeometricWeights,
     mask: Bools | None = None,
 ) -> tuple[float, GeometricTape]:
-    """Weighted sum of :func:`sfm_depth_loss`, :func:`depth_smoothness` and :func:`normal_smoothness`.
+    """Return the weighted sum of :func:`sfm_depth_loss`, :func:`depth_smoothness` and :func:`normal_smoothness`.
 
     Parameters
     ----------
@@ -64,11 +65,11 @@ def geometric_loss(
     camera : Camera
         The view; its principal point is used.
     points : ndarray of shape (Q, 3)
-        Points that the view is known to see, world frame; Q may be 0.
+        World points that the view is known to see; Q may be 0.
     weights : GeometricWeights
         Factors of the terms.
     mask : ndarray of bool of shape (H, W), optional
-        Pixels that count; the others are treated as if nothing was hit.
+        True where a pixel counts; the others are treated as if nothing was hit.
 
     Returns
     -------
@@ -116,9 +117,9 @@ def geometric_loss_vjp(tape: GeometricTape, v_loss: float = 1.0) -> tuple[Floats
 
 
 def sfm_depth_loss(depth: Floats, camera: Camera, points: Floats) -> float:
-    """Mean over the points of ``h(log(z / z_p))``: z of the pixel that a point falls on, z_p of the point itself.
+    """Return the mean of ``h(log(z / z_p))`` over points of depth z_p, with z of the pixel that a point falls on.
 
-    h is Huber's function with the tolerance tau, a quadratic that goes on as a line::
+    h is the Huber function with the tolerance tau, a quadratic that continues as a line::
 
         h(e) = e^2 / (2 tau)  where |e| <= tau,   |e| - tau / 2  beyond
 
@@ -148,7 +149,7 @@ def sfm_depth_loss_vjp(depth: Floats, camera: Camera, points: Floats, v_loss: fl
 
     With n points that count::
 
-        v_z = sum over the pixel's points of  v_loss h'(e) / (n z),   h'(e) = e / tau kept in [-1, 1]
+        v_z = sum over the pixel's points of  v_loss h'(e) / (n z),   h'(e) = clip(e / tau, -1, 1)
 
     Parameters
     ----------
@@ -170,19 +171,19 @@ def sfm_depth_loss_vjp(depth: Floats, camera: Camera, points: Floats, v_loss: fl
 
 
 def depth_smoothness(depth: Floats, photograph: Floats) -> float:
-    """Mean of ``e |log z' - log z|`` over all pairs of horizontal or vertical neighbours that both have a depth.
+    """Return the mean of ``e |log z' - log z|`` over all pairs of horizontal or vertical neighbours with depth.
 
     Parameters
     ----------
     depth : ndarray of shape (H, W)
         Camera z; 0 for none.
     photograph : ndarray of shape (H, W, 3)
-        Gives the weights e, :func:`edge_weights`.
+        It determines the weights e, see :func:`edge_weights`.
 
     Returns
     -------
     float
-        0 for equal depths everywhere; a plane that is tilted against the image is not free.
+        0 for equal depths everywhere; a plane that is tilted against the image has a loss.
     """
     logs, weights = _logs_and_weights(depth, photograph)
     terms = [e * np.abs(np.diff(logs, axis=axis)) for axis, e in enumerate(weights)]
@@ -192,7 +193,7 @@ def depth_smoothness(depth: Floats, photograph: Floats) -> float:
 def depth_smoothness_vjp(depth: Floats, photograph: Floats, v_loss: float = 1.0) -> Floats:
     """Gradient of :func:`depth_smoothness`.
 
-    With n pairs; each difference hands its derivative to its second pixel and the negative to its first::
+    With n pairs, each difference adds its derivative to its second pixel and the negative to its first::
 
         v_difference = v_loss e sign(log z' - log z) / n
         v_z = (sum of v_difference where second - sum of v_difference where first) / z
@@ -217,15 +218,15 @@ def depth_smoothness_vjp(depth: Floats, photograph: Floats, v_loss: float = 1.0)
 
 
 def normal_smoothness(normals: Floats, photograph: Floats) -> float:
-    """Mean of ``e (1 - n . n') = e |n' - n|^2 / 2`` over all pairs of horizontal or vertical neighbours.
+    """Return the mean of ``e (1 - n . n') = e |n' - n|^2 / 2`` over all pairs of horizontal or vertical neighbours.
 
     Parameters
     ----------
     normals : ndarray of shape (H - 1, W - 1, 3)
-        :func:`depth_normals`; 0 for none. Pairs of two normals count.
+        From :func:`depth_normals`; 0 where there is none. Pairs count where both normals exist.
     photograph : ndarray of shape (H, W, 3)
-        Gives the weights. A normal spans two pixels, so a pair of them may step over two edges: e is the product of
-        their :func:`edge_weights`.
+        It determines the weights. A normal spans two pixels, so a pair of normals may cross two edges, and e is the
+        product of their :func:`edge_weights`.
 
     Returns
     -------
@@ -242,7 +243,7 @@ def normal_smoothness(normals: Floats, photograph: Floats) -> float:
 def normal_smoothness_vjp(normals: Floats, photograph: Floats, v_loss: float = 1.0) -> Floats:
     """Gradient of :func:`normal_smoothness`.
 
-    With n pairs; each difference hands its derivative to its second normal and the negative to its first::
+    With n_pairs pairs, each difference adds its derivative to its second normal and the negative to its first::
 
         v_difference = v_loss e (n' - n) / n_pairs
 
@@ -265,7 +266,7 @@ def normal_smoothness_vjp(normals: Floats, photograph: Floats, v_loss: float = 1
 
 
 def edge_weights(photograph: Floats) -> tuple[Floats, Floats]:
-    """Weights ``exp(-k mean |I' - I|)`` of neighbouring pixels: 1 where equal, near 0 across an edge.
+    """Return weights ``exp(-k mean |I' - I|)`` of neighbouring pixels: 1 where equal, near 0 across an edge.
 
     Parameters
     ----------
@@ -284,7 +285,7 @@ def edge_weights(photograph: Floats) -> tuple[Floats, Floats]:
 
 
 def _depth_errors(depth: Floats, camera: Camera, points: Floats) -> tuple[Ints, Ints, Floats]:
-    """Row, column and ``log(z / z_p)`` [n] of the points that fall on a pixel with a depth."""
+    """Return row, column and ``log(z / z_p)`` [n] of the points that fall on a pixel with a depth."""
     R, t = pose(camera, points.dtype)
     in_camera = points @ R.T + t
     in_camera = in_camera[in_camera[:, 2] > 0]
@@ -297,26 +298,26 @@ def _depth_errors(depth: Floats, camera: Camera, points: Floats) -> tuple[Ints, 
 
 
 def _logs_and_weights(depth: Floats, photograph: Floats) -> tuple[Floats, tuple[Floats, Floats]]:
-    """Log depths [H, W], 0 where there is none, and what each difference along axis 0 and 1 counts in the mean."""
+    """Return log depths [H, W], 0 where there is none, and the weight of each difference along axes 0 and 1."""
     has_depth = depth > 0
     return np.log(np.where(has_depth, depth, 1)), _mean_weights(edge_weights(photograph), has_depth)
 
 
 def _normal_weights(normals: Floats, photograph: Floats) -> tuple[Floats, Floats]:
-    """Return the weight in the mean of each difference of normals along axis 0 and 1."""
+    """Return the weight of each difference of normals along axes 0 and 1 in the mean."""
     down, right = edge_weights(photograph)
     spanned = down[:-1, :-1] * down[1:, :-1], right[:-1, :-1] * right[:-1, 1:]  # [H - 2, W - 1], [H - 1, W - 2]
     return _mean_weights(spanned, np.any(normals != 0, axis=2))
 
 
 def _mean_weights(weights: tuple[Floats, Floats], exists: Bools) -> tuple[Floats, Floats]:
-    """Weights of neighbours that both exist, 0 for the others, divided by the number of such pairs in both axes."""
+    """Return weights over the number of pairs that exist, along both axes; 0 where one of a pair does not exist."""
     both_down, both_right = exists[:-1] & exists[1:], exists[:, :-1] & exists[:, 1:]
     n = max(1, int(np.count_nonzero(both_down) + np.count_nonzero(both_right)))
     return np.where(both_down, weights[0], 0) / n, np.where(both_right, weights[1], 0) / n
 
 
 def _diff_vjp(v_difference: Floats, axis: int) -> Floats:
-    """Gradient of ``np.diff``: v_x_j = v_difference_(j-1) - v_difference_j."""
+    """Gradient of ``np.diff``: ``v_x_j = v_difference_(j-1) - v_difference_j``."""
     padding = [(1, 1) if a == axis else (0, 0) for a in range(v_difference.ndim)]
     return -np.diff(np.pad(v_difference, padding), axis=axis)

@@ -1,4 +1,4 @@
-"""What the gradient proof checks of the geometric losses: the whole loss, and the formulas that it is built of."""
+"""The stages of the gradient check: the whole geometric loss, and the formulas that it consists of."""
 
 from collections.abc import Callable
 from types import ModuleType
@@ -19,7 +19,7 @@ from minisplat_ref.types import Camera, Floats
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
-    """Return the loss as a backend computes it; of the reference its formulas, too."""
+    """Return the loss as a backend computes it and, for the reference, also its formulas."""
     if backend.is_compiled:
         return (geometric_stage(kernels, setting.camera, rng),)
     pieces = [stage for module, pieces_of in PIECES.items() for stage in pieces_of(module)]
@@ -27,7 +27,10 @@ def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tupl
 
 
 def geometric_stage(module: Module, camera: Camera, rng: np.random.Generator) -> Stage:
-    """``geometric_loss`` of a module, all its terms, by accumulated depth and opacity; one pixel is masked out."""
+    """Return ``geometric_loss`` of a module with all terms, as a function of accumulated depth and opacity.
+
+    One pixel is masked out.
+    """
     shape = camera.height, camera.width
     depth, alpha = rng.uniform(2, 3, size=shape), rng.uniform(0.3, 1, size=shape)
     photograph = rng.uniform(size=(*shape, 3))
@@ -50,7 +53,7 @@ def geometric_stage(module: Module, camera: Camera, rng: np.random.Generator) ->
 
 
 def points_near(depth: Floats, camera: Camera, rng: np.random.Generator) -> Floats:
-    """Points [6, 3], world frame, in front of and behind a depth map: by 0.3 % and by 6 %, Huber's two regimes."""
+    """Return world points [6, 3], 0.3 % and 6 % in front of and behind a depth map: both regimes of the Huber loss."""
     rows, columns = (rng.choice(size, 6, replace=size < 6) for size in depth.shape)
     z = depth[rows, columns] * (1 + np.array([0.003, -0.004, 0.002, 0.06, -0.06, 0.05]))
     in_camera = z[:, None] * pinhole_rays(columns + 0.5, rows + 0.5, camera)
@@ -58,7 +61,7 @@ def points_near(depth: Floats, camera: Camera, rng: np.random.Generator) -> Floa
 
 
 def depth_map_pieces(m: Module) -> tuple[Stage, ...]:
-    """``depth_normals``; one pixel has no depth."""
+    """Return ``depth_normals`` as a stage; one pixel has no depth."""
     rng, camera = np.random.default_rng(SEED), tiny_setting().camera
     depth = rng.uniform(2, 3, size=(4, 5))
     depth[1, 2] = 0.0
@@ -75,7 +78,7 @@ def depth_map_pieces(m: Module) -> tuple[Stage, ...]:
 
 
 def geometric_pieces(m: Module) -> tuple[Stage, ...]:
-    """The three terms, and their sum."""
+    """Return the three terms and their sum as stages."""
     rng, camera = np.random.default_rng(SEED), tiny_setting().camera
     depth, photograph = rng.uniform(2, 3, size=(7, 9)), rng.uniform(size=(7, 9, 3))
     points = points_near(depth, camera, rng)
@@ -104,4 +107,4 @@ PIECES: dict[ModuleType, Callable[[Module], tuple[Stage, ...]]] = {
     depth_map: depth_map_pieces,
     reference: geometric_pieces,
 }
-"""The modules with gradients, and the stages that their functions are tested in."""
+"""The modules with gradients, and the stages that test their functions."""

@@ -1,30 +1,32 @@
 """Micro-splatting: small Gaussians, split at the photographs' edges, merged where alike.
 
-Micro-splatting, arXiv 2504.05740. Training makes Gaussians that are long or large, and a needle that explains an edge
-in one place is wrong beside it. Three changes to 3DGS (:mod:`minisplat_ref.extensions.micro.method`):
+This follows Micro-splatting, arXiv 2504.05740. Training makes Gaussians that are long or large, and a needle that
+explains an edge in one place is wrong beside it. There are three changes to 3DGS
+(:mod:`minisplat_ref.extensions.micro.method`):
 
 - *Trace penalty.* ``L = L_photometric + lambda mean_k max(tr(Sigma_k) / tau - 1, 0)`` with
-  ``tr(Sigma) = s0^2 + s1^2 + s2^2`` and ``d tr / d s_j = 2 s_j``. What pays it during densification is replaced by two
-  Gaussians of half the covariance.
-- *Detail.* The threshold of densification is ``tau0 / (1 + beta g_k)``: g_k is the strength of the photographs' edges
-  (Sobel) under the Gaussian, relative to its mean over the photograph.
-- *Merging.* After densification pairs of nearest neighbours of about the same colour and size become one Gaussian of
-  their moments (:func:`minisplat_ref.strategy.simplify.merge_clusters`).
+  ``tr(Sigma) = s0^2 + s1^2 + s2^2`` and ``d tr / d s_j = 2 s_j``. During densification a Gaussian with a penalty is
+  replaced by two of half the covariance.
+- *Detail.* The threshold of densification is ``tau0 / (1 + beta g_k)``, where g_k is the strength of the photographs'
+  edges (Sobel) under the Gaussian, relative to its mean over the photograph.
+- *Merging.* After densification pairs of nearest neighbours of about the same colour and size become one Gaussian with
+  their common moments (:func:`minisplat_ref.strategy.simplify.merge_clusters`).
 
-``--set`` reaches ``trace`` (lambda, 0 switches the halving off, too), ``trace_limit`` (the root of tau, in extents of
-the scene), ``beta``, ``merge_reach`` and ``merge_color``. With ``trace=0``, ``beta=0`` and ``merge_reach=0`` it is
-``3dgs-accel``, bit for bit.
+``--set`` reaches ``trace`` (lambda; 0 switches the halving off, too), ``trace_limit`` (the square root of tau, in
+extents of the scene), ``beta``, ``merge_reach`` and ``merge_color``. With ``trace=0``, ``beta=0`` and ``merge_reach=0``
+the method is ``3dgs-accel``, bit for bit.
 
-Measured at equal count on a card that is half a fine checker, half a ramp (``study micro/checker``, 840 Gaussians): at
-the edges 20.5 dB against 16.9 of 3DGS, and scales in the card of a ratio of 3.8 against 7.4; on the ramp, where a few
-large Gaussians were enough, 38.9 dB against 52.0. It is the penalty that costs the ramp: detail alone gains 2.2 dB at
-the edges and costs 0.9 on the ramp. On the fox at 68 x 120, 1000 iterations, seed 0: 31.5 dB with 36,752 Gaussians;
-3DGS, its threshold lowered until it had 36,121, 30.8 dB.
+Measured at equal count on a test chart that is half a fine checkerboard, half a ramp (``study micro/checker``, 840
+Gaussians): at the edges 20.5 dB against 16.9 dB of 3DGS, with a ratio of the in-plane scales of 3.8 against 7.4; on the
+ramp, where a few large Gaussians were enough, 38.9 dB against 52.0. The penalty costs the ramp: detail alone gains
+2.2 dB at the edges and costs 0.9 on the ramp. On the fox at 68 x 120, after 1000 iterations with seed 0, the method
+reaches 31.5 dB with 36,752 Gaussians; 3DGS, its threshold lowered until it had 36,121, reaches 30.8 dB.
 
-Where this deviates: the paper adds the P_k = max(tr(Sigma_k) - tau, 0) up; here they are averaged and measured in units
-of tau, so that lambda depends neither on the scene's unit nor on the number of Gaussians. Lambda, tau, beta and the
-reach of merging are ours, the abstract does not say them. Left out: LPIPS in the loss, whose weights are not ours to
-ship; pruning by opacity times scale, which 3DGS's own pruning does in two steps.
+This deviates from the paper as follows. The paper sums P_k = max(tr(Sigma_k) - tau, 0); here the P_k are averaged and
+measured in units of tau, so that lambda depends neither on the scene's unit nor on the number of Gaussians. Lambda,
+tau, beta and the reach of merging are our choices, since the abstract does not state them. Left out are LPIPS in the
+loss, whose weights are not ours to ship, and pruning by opacity times scale, which 3DGS's own pruning does in two
+steps.
 
     minisplat-ref train SCENE --recipe micro
     minisplat-ref study micro/checker --out DIR

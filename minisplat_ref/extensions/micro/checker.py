@@ -1,8 +1,8 @@
-"""The work of the study ``micro/checker``: a card that is half a fine checker and half a smooth ramp.
+"""The study ``micro/checker``: a test chart that is half a fine checkerboard and half a smooth ramp.
 
-Several cameras look straight at the card. Every variant starts from the same points and gets the same number of new
-Gaussians at each densification, those with the largest scaled gradients; so all end with the same count, and differ in
-where their Gaussians are and which shape they have.
+Several cameras look straight at the chart. Every variant starts from the same points and gets the same number of new
+Gaussians at each densification, from those with the largest scaled gradients. So all end with the same count, and
+differ in the places and shapes of their Gaussians.
 """
 
 from functools import partial
@@ -25,42 +25,42 @@ from minisplat_ref.training.state import Iteration, TrainState, apply_edit
 from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Model, Scene, View, numbered
 
 WIDTH, HEIGHT, FOCAL, DISTANCE = 96, 64, 96.0, 4.0  # pixels, world units
-CELL = 4.5 * DISTANCE / FOCAL  # side of a square of the checker, world units: no whole number of pixels
-N_VIEWS, N_TEST, SHIFT = 12, 4, 0.3  # cameras, and how far they stand from the middle
-N_POINTS, N_STEPS, N_NEW = 120, 12, 60  # Gaussians at first, densifications, new ones in each
+CELL = 4.5 * DISTANCE / FOCAL  # side of a square of the checkerboard, world units; not a whole number of pixels
+N_VIEWS, N_TEST, SHIFT = 12, 4, 0.3  # cameras, test cameras, and their largest distance from the axis
+N_POINTS, N_STEPS, N_NEW = 120, 12, 60  # initial Gaussians, densifications, new Gaussians in each
 EXTENT = 2.0
-BORDER = 4  # pixels beside the border of the halves that count to neither
-SAMPLES = 8  # a side and pixel of the photographs
+BORDER = 4  # pixels beside the border of the halves that count as neither
+SAMPLES = 8  # per pixel and side, of the photographs
 
 
 class Variant(NamedTuple):
-    """What is changed with respect to 3DGS."""
+    """The changes to 3DGS that are switched on."""
 
     beta: float
     weight: float
-    """Of the trace penalty."""
+    """Weight of the trace penalty."""
     color: str
 
 
 class Outcome(NamedTuple):
-    """One training."""
+    """The measurements of one training."""
 
     n: int
     psnr_edges: float
-    """Where the photographs of the checker have more edges than on average, dB."""
+    """Over pixels of the checkerboard with more edges than on average, dB."""
     psnr_smooth: float
-    """On the ramp, dB."""
+    """Over the ramp, dB."""
     psnr: float
     anisotropy: float
-    """Median of the largest scale over the middle one: the thickness across the card is not seen."""
+    """Median ratio of the largest to the middle scale; no camera sees the thickness across the chart."""
     n_smooth: int
-    """Gaussians on the ramp."""
+    """Number of Gaussians on the ramp."""
     picture: Floats
     gaussians: Gaussians
 
 
 def variants(beta: float, weight: float) -> dict[str, Variant]:
-    """Return what is compared, by name."""
+    """Return the variants that are compared, by name."""
     return {
         "3dgs": Variant(0.0, 0.0, "#8a8580"),
         "detail": Variant(beta, 0.0, "#35608c"),
@@ -70,7 +70,7 @@ def variants(beta: float, weight: float) -> dict[str, Variant]:
 
 
 def card(x: Floats, y: Floats) -> Floats:
-    """Return the colour [..., 3] of the card: checkers at x < 0, a ramp at x >= 0."""
+    """Return the colour [..., 3] of the chart: a checkerboard at x < 0, a ramp at x >= 0."""
     dark = (np.floor(x / CELL) + np.floor(y / CELL)) % 2
     checker = np.stack([0.1 + 0.8 * dark, 0.15 + 0.6 * dark, 0.8 - 0.6 * dark], axis=-1)
     ramp = np.stack([0.35 + 0.2 * x, 0.5 + 0.15 * y, 0.6 - 0.15 * x], axis=-1)
@@ -78,7 +78,7 @@ def card(x: Floats, y: Floats) -> Floats:
 
 
 def photograph(camera: Camera) -> Floats:
-    """Return what the camera sees of the card at z = 0, [H, W, 3] in [0, 1]: means over its pixels."""
+    """Return the photograph of the chart at z = 0, [H, W, 3] in [0, 1]: means over the pixels."""
     steps = (np.arange(SAMPLES) + 0.5) / SAMPLES
     u = (np.arange(WIDTH)[:, None] + steps).ravel()
     v = (np.arange(HEIGHT)[:, None] + steps).ravel()
@@ -91,7 +91,7 @@ def photograph(camera: Camera) -> Floats:
 
 
 def checker_scene(seed: int) -> Scene:
-    """Return photographs of the card, and gray points on it."""
+    """Return the scene of the chart: its photographs, and grey points on it."""
     rng = np.random.default_rng(seed)
     views = []
     for i in range(N_VIEWS + N_TEST):
@@ -121,7 +121,7 @@ def grow(state: TrainState, iteration: Iteration, *, beta: float) -> None:
 
 
 def trained(variant: Variant, scene: Scene, iterations: int, seed: int) -> Gaussians:
-    """Train the card by a variant; densification ends at three quarters."""
+    """Train the chart with a variant; densification ends after three quarters of the iterations."""
     base = scaled(GS_ACCEL, iterations)
     period = iterations * 3 // 4 // (N_STEPS + 1)
     stop = period * (N_STEPS + 1)
@@ -139,7 +139,7 @@ def trained(variant: Variant, scene: Scene, iterations: int, seed: int) -> Gauss
 
 
 def halves(view: View) -> tuple[Bools, Bools]:
-    """Return the pixels [H, W] at edges of the checker, and those of the ramp."""
+    """Return which pixels [H, W] are at edges of the checkerboard, and which on the ramp."""
     camera = view.camera
     border = camera.cx - camera.fx * camera.center[0] / DISTANCE  # pixels: where x = 0 is seen
     columns = np.arange(WIDTH) + 0.5
@@ -149,7 +149,7 @@ def halves(view: View) -> tuple[Bools, Bools]:
 
 
 def outcome(gaussians: Gaussians, scene: Scene) -> Outcome:
-    """Measure the held-out views; errors are pooled over them."""
+    """Measure the held-out views, pooling errors over them."""
     squares: dict[str, list[Floats]] = {"edges": [], "smooth": [], "all": []}
     image = np.zeros((HEIGHT, WIDTH, 3))
     for view in scene.test_views:
@@ -173,7 +173,7 @@ def outcome(gaussians: Gaussians, scene: Scene) -> Outcome:
 
 
 def measure(iterations: int, seeds: int, beta: float, weight: float) -> dict[str, list[Outcome]]:
-    """Return the outcomes of each variant, one for each seed."""
+    """Return the outcomes of each variant, one per seed."""
     outcomes: dict[str, list[Outcome]] = {name: [] for name in variants(beta, weight)}
     for seed in range(seeds):
         scene = checker_scene(seed)
@@ -193,7 +193,7 @@ def summarise(outcomes: dict[str, list[Outcome]]) -> dict[str, Any]:
 
 
 def draw(outcomes: dict[str, list[Outcome]], beta: float, weight: float) -> Figure:
-    """Draw the photograph and, of each variant, its picture and its Gaussians on the card."""
+    """Draw the photograph and, for each variant, its picture and its Gaussians on the chart."""
     figure = Figure(figsize=(12, 3.7), layout="constrained")
     names = list(outcomes)
     target = checker_scene(0).test_views[-1].image / 255
@@ -206,7 +206,7 @@ def draw(outcomes: dict[str, list[Outcome]], beta: float, weight: float) -> Figu
         upper, lower = rows[:, column]
         upper.imshow(result.picture)
         edges, smooth = psnr_of(result.picture[:, : WIDTH // 2], target[:, : WIDTH // 2]), result.psnr_smooth
-        upper.set_title(f"{name}: checker {edges:.1f}, ramp {smooth:.1f} dB", fontsize=9)
+        upper.set_title(f"{name}: edges {edges:.1f}, ramp {smooth:.1f} dB", fontsize=9)
         lower.scatter(*result.gaussians.means[:, :2].T, s=3, color=color, lw=0)
         lower.axvline(0, color="#4a5560", lw=0.8)
         lower.set(xlim=(-2.2, 2.2), ylim=(1.6, -1.6), aspect="equal")

@@ -1,4 +1,4 @@
-"""The actions of Micro-splatting, its loss term, and the recipe that says when they act."""
+"""The actions of Micro-splatting, its loss term, and the recipe that schedules them."""
 
 from functools import partial
 
@@ -22,13 +22,13 @@ from minisplat_ref.training.schedule import During, Event, Every, does
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
 from minisplat_ref.types import Floats, Gaussians, Ints, Scene
 
-# The paper gives neither lambda, tau nor beta. These were chosen on the fox at 67 x 120 pixels.
+# The abstract gives neither lambda, tau nor beta. These were chosen on the fox at 67 x 120 pixels.
 WEIGHT, LIMIT, BETA = 1e-3, 0.05, 0.5
 MERGE_REACH, MERGE_COLOR = 1.0, 0.1
 
 
 def squared_limit(scene: Scene, trace_limit: float) -> float:
-    """Return tau, world units squared: ``trace_limit`` is its root in units of the scene's extent."""
+    """Return tau, world units squared; ``trace_limit`` is its square root in units of the scene's extent."""
     return (trace_limit * scene.extent) ** 2
 
 
@@ -43,7 +43,7 @@ def trace(rendered: Rendered, *, trace_limit: float) -> tuple[float, Cotangents]
 def collect_detail(state: TrainState, iteration: Iteration) -> None:
     """Add the detail of the photograph under each visible Gaussian to ``stats["detail_sum"]``.
 
-    Under it is the box of pixels that it may touch. The views are counted by ``collect_gradients``.
+    The detail is the mean over the box of pixels that the Gaussian may touch. ``collect_gradients`` counts the views.
     """
     if "detail_sum" not in state.stats:
         state.stats["detail_sum"] = np.zeros(n_rows(state.gaussians), np.float32)
@@ -61,7 +61,7 @@ def clone_and_split_by_detail(
 ) -> str | None:
     """Densify as 3DGS does, with the threshold ``tau0 / (1 + beta g)`` for a Gaussian in front of detail g.
 
-    g is the mean of :func:`collect_detail` over the views: 1 where the photographs have as many edges as on average.
+    g is the mean of the detail over the views that see the Gaussian; it is 1 where edges are as strong as on average.
     """
     g = state.stats.pop("detail_sum") / np.maximum(state.stats["view_count"], 1)  # [N]
     gradients = state.stats["gradient_sum"]
@@ -70,12 +70,12 @@ def clone_and_split_by_detail(
 
 
 def halved_children(gaussians: Gaussians, parent_ids: Ints, rng: np.random.Generator) -> Gaussians:
-    """Return two children of half the parent's covariance each, their centres drawn from the other half.
+    """Return two children with half the parent's covariance each, whose centres are drawn from the other half.
 
-    So the children's covariance and that of their centres add up to the parent's, in expectation. Their cross-sections
-    add up to the parent's, too, and they keep its opacity: the light that is stopped stays.
+    So the children's covariance and that of their centres add up to the parent's in expectation. Their cross-sections
+    add up to the parent's, too, and they keep its opacity, so they stop as much light.
 
-    Parameters, result and order of rows as for :func:`minisplat_ref.strategy.clone_split.random_children`.
+    Parameters, result and order of rows are those of :func:`minisplat_ref.strategy.clone_split.random_children`.
     """
     parents = take(gaussians, np.tile(parent_ids, clone_split.N_CHILDREN))
     dtype = parents.means.dtype
@@ -86,12 +86,13 @@ def halved_children(gaussians: Gaussians, parent_ids: Ints, rng: np.random.Gener
 
 
 def halve_large(state: TrainState, iteration: Iteration, *, trace: float, trace_limit: float) -> str | None:
-    """Replace every Gaussian that pays the trace penalty by two of half the covariance.
+    """Replace every Gaussian with a trace penalty by two of half the covariance.
 
-    Where the weight ``trace`` of the penalty is zero none pays. ``--set trace=0`` reaches both, by their common name.
+    Nothing happens where the weight ``trace`` of the penalty is zero; ``--set trace=0`` reaches both by their common
+    name.
     """
     if trace == 0:
-        return "nothing done: the trace costs nothing"
+        return "nothing done: the trace penalty has no weight"
     n = n_rows(state.gaussians)
     edit = clone_split.clone_and_split(
         state.gaussians,
@@ -107,7 +108,7 @@ def halve_large(state: TrainState, iteration: Iteration, *, trace: float, trace_
 
 
 def clusters(gaussians: Gaussians, *, reach: float, color_reach: float) -> Ints:
-    """Return labels [N] for merging: pairs of nearest neighbours that are alike share one, all others are alone."""
+    """Return labels [N] for merging: mutual nearest neighbours that are alike share one, all others have their own."""
     labels = np.arange(n_rows(gaussians))
     if len(labels) < 2:
         return labels
@@ -122,7 +123,7 @@ def clusters(gaussians: Gaussians, *, reach: float, color_reach: float) -> Ints:
 
 
 def merge_alike(state: TrainState, iteration: Iteration, *, merge_reach: float, merge_color: float) -> str | None:
-    """Merge pairs of neighbours that are nearly the same into one Gaussian of their moments (``merge_clusters``)."""
+    """Merge pairs of nearly equal neighbours into one Gaussian with their moments (``merge_clusters``)."""
     labels = clusters(state.gaussians, reach=merge_reach, color_reach=merge_color)
     n = n_rows(state.gaussians)
     if n == 0 or labels.max() + 1 == n:
@@ -133,7 +134,7 @@ def merge_alike(state: TrainState, iteration: Iteration, *, merge_reach: float, 
 
 
 def _with_detail(event: Event) -> Event:
-    """Return the event of 3DGS, its densification with the thresholds of this method."""
+    """Return an event of 3DGS, with the thresholds of this method if it is densification."""
     if not does(event, clone_and_split):
         return event
     assert isinstance(event.action, partial)
@@ -159,10 +160,10 @@ MICRO = GS_ACCEL._replace(
         Every(
             1_000,
             partial(merge_alike, merge_reach=MERGE_REACH, merge_color=MERGE_COLOR),
-            start=14_999,  # the first time when densification has ended, also in short runs
+            start=14_999,  # the first occasion after densification, also in shorter runs
             stop=25_000,
             least_gap=DENSIFY_LEAST_GAP,
         ),
     ),
 )
-"""``micro``: 3DGS with small Gaussians, more of them in front of detail, and fewer twins."""
+"""The recipe ``micro``: 3DGS with small Gaussians, more of them in front of detail, and fewer duplicates."""

@@ -17,15 +17,15 @@ def traces(log_scales: Floats) -> Floats:
 
 
 def trace_penalty(log_scales: Floats, limit: float) -> float:
-    """Return ``mean_k max(tr(Sigma_k) / limit - 1, 0)``.
+    """Return ``mean_k max(tr(Sigma_k) / tau - 1, 0)``.
 
-    The mean instead of the paper's sum, and the trace in units of its limit: so that one weight fits scenes of any size
-    and any number of Gaussians.
+    The mean replaces the paper's sum, and the trace is in units of its limit, so one weight fits scenes of any size and
+    any number of Gaussians.
 
     Parameters
     ----------
     log_scales : ndarray of shape (N, 3)
-        N may be 0.
+        Logarithms of the standard deviations, world units; N may be 0.
     limit : float
         tau, world units squared; above 0.
     """
@@ -66,7 +66,7 @@ def detail_map(photograph: NDArray) -> Floats:
     Parameters
     ----------
     photograph : ndarray of shape (H, W, 3)
-        RGB in any unit.
+        RGB in any unit; gamma-encoded, as photographs are.
     """
     luminance = photograph @ LUMA
     g = np.hypot(sobel(luminance, axis=0), sobel(luminance, axis=1)) / SOBEL_SUM  # [H, W] per pixel
@@ -77,15 +77,16 @@ def detail_map(photograph: NDArray) -> Floats:
 def box_means(image: Floats, boxes: Ints) -> Floats:
     """Return the mean of an image over each box of pixels, 0 where a box is empty.
 
-    With the sums ``S[y, x]`` of all that lies above and to the left, a box takes four of them::
+    A summed-area table S, whose entry ``S[y, x]`` is the sum of all pixels above and to the left, gives::
 
         mean = (S[y1, x1] - S[y0, x1] - S[y1, x0] + S[y0, x0]) / ((y1 - y0) (x1 - x0))
 
     Parameters
     ----------
     image : ndarray of shape (H, W)
+        Any values.
     boxes : ndarray of shape (N, 4)
-        Half-open x0, y0, x1, y1 inside of the image.
+        Half-open x0, y0, x1, y1 inside the image, pixels.
 
     Returns
     -------
@@ -99,19 +100,21 @@ def box_means(image: Floats, boxes: Ints) -> Floats:
 
 
 def are_alike(distances: Floats, sizes: Floats, colors: Floats, *, reach: float, color_reach: float) -> Bools:
-    """Tell which pairs of Gaussians are near and alike enough to become one.
+    """Return which pairs of Gaussians are near and alike enough to become one.
 
-    Near: closer than ``reach`` times the smaller of their sizes. Alike: of colours that differ by less than
-    ``color_reach`` in every channel, and neither more than twice as large as the other.
+    They are near if they are closer than ``reach`` times the smaller of their sizes, and alike if their colours differ
+    by less than ``color_reach`` in every channel and neither is more than twice as large as the other.
 
     Parameters
     ----------
     distances : ndarray of shape (P,)
-        Between the centres, world units.
+        Distances between the centres, world units.
     sizes : ndarray of shape (P, 2)
-        ``sqrt(tr(Sigma))`` of both.
+        ``sqrt(tr(Sigma))`` of both, world units.
     colors : ndarray of shape (P, 2, 3)
+        Colours of degree 0, from 0 to 1.
     reach, color_reach : float
+        The limits above.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""What the gradient proof checks of Micro-splatting: the trace penalty."""
+"""The stage of the gradient check of Micro-splatting: the trace penalty."""
 
 import numpy as np
 
@@ -11,10 +11,10 @@ from minisplat_ref.types import Floats
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
-    """Return the penalty with a limit that half of the Gaussians exceed; no backend has a form of its own."""
+    """Return the penalty with a limit that half of the Gaussians exceed; all backends share it."""
     log_scales = setting.gaussians.log_scales
     ordered, middle = np.sort(traces(log_scales)), len(log_scales) // 2
-    limit = float(ordered[middle - 1 : middle + 1].mean())  # at none of them, or it would have no derivative
+    limit = float(ordered[middle - 1 : middle + 1].mean())  # between traces: no kink there
 
     def function(log_scales: Floats) -> Point:
         return Point((np.asarray(trace_penalty(log_scales, limit)),), (traces(log_scales) > limit,))

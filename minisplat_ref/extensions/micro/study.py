@@ -1,4 +1,4 @@
-"""The study ``micro/checker`` asks what trace penalty and detail are worth at equal count."""
+"""The study ``micro/checker`` measures what trace penalty and detail gain at equal count."""
 
 import argparse
 
@@ -13,16 +13,16 @@ from minisplat_ref.study import Study
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--out``, ``--iterations``, ``--seeds``, ``--beta`` and ``--trace``."""
     add_out(parser)
-    parser.add_argument("--iterations", type=int, default=1500, metavar="N", help="of each training (default 1500)")
     parser.add_argument(
-        "--seeds", type=int, default=3, metavar="N", help="from 0 on, of scene and training (default 3)"
+        "--iterations", type=int, default=1500, metavar="N", help="iterations per training (default 1500)"
     )
+    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="number of seeds, from 0 on (default 3)")
     parser.add_argument("--beta", type=float, default=1.0, metavar="B", help="weight of the detail (default 1)")
     parser.add_argument("--trace", type=float, default=0.001, metavar="L", help="weight of the penalty (default 0.001)")
 
 
 def run(args: argparse.Namespace) -> None:
-    """Train the card by every variant with every seed, write, print a table.
+    """Train the chart with every variant and seed, write the results, and print a table.
 
     Raises
     ------
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> None:
         write(folder, {**settings, "variants": result}, checker.draw(outcomes, args.beta, args.trace))
     rows = [[name, *(_mean_and_spread(numbers[key]) for key in checker.NUMBERS)] for name, numbers in result.items()]
     heading = ["variant", "Gaussians", "PSNR at edges", "PSNR of the ramp", "PSNR", "largest / middle scale", "on ramp"]
-    print("mean of the seeds, and half of their range\n")
+    print("mean over the seeds ± half their range\n")
     print(markdown_table(heading, rows))
 
 
@@ -48,4 +48,4 @@ def _mean_and_spread(values: list[float]) -> str:
     return f"{np.mean(values):.2f} ± {np.ptp(values) / 2:.2f}"
 
 
-CHECKER = Study("checker", "a checker beside a ramp: small Gaussians and detail at equal count", add_arguments, run)
+CHECKER = Study("checker", "small Gaussians and detail at equal count, on edges and on a ramp", add_arguments, run)

@@ -1,4 +1,4 @@
-"""The command ``minisplat-ref multi-scale build``: levels for a scene that was trained without any."""
+"""The command ``minisplat-ref multi-scale build``, which adds levels to a scene that was trained without any."""
 
 import argparse
 from pathlib import Path
@@ -17,26 +17,26 @@ def add_parser(commands: Any) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "build",
-        help="add coarser levels to a scene that was trained without",
+        help="add coarser levels to a scene that was trained without any",
         epilog="example: minisplat-ref multi-scale build runs/fox/point_cloud.ply --out levels.ply",
     )
     parser.add_argument("ply", type=Path, metavar="PLY", help="point_cloud.ply of a run")
-    parser.add_argument("--cameras", type=Path, metavar="FILE", help="of its run (default cameras.json beside the PLY)")
-    parser.add_argument("--factor", type=float, default=FACTOR, metavar="F", help=f"of sizes (default {FACTOR})")
-    parser.add_argument("--levels", type=int, default=N_LEVELS, metavar="N", help=f"to add (default {N_LEVELS})")
+    parser.add_argument("--cameras", type=Path, metavar="FILE", help="cameras (default cameras.json beside the PLY)")
+    parser.add_argument("--factor", type=float, default=FACTOR, metavar="F", help=f"ratio of sizes (default {FACTOR})")
+    parser.add_argument("--levels", type=int, default=N_LEVELS, metavar="N", help=f"levels to add (default {N_LEVELS})")
     parser.add_argument(
         "--least-coverage",
         type=float,
         default=LEAST_COVERAGE,
         metavar="PX",
-        help=f"what covers fewer pixels is merged (default {LEAST_COVERAGE:g})",
+        help=f"merge Gaussians that cover fewer pixels (default {LEAST_COVERAGE:g})",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="PLY to write")
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Merge level after level, and write all.
+    """Merge level after level, and write all levels.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("give a --factor above 1, 1 to 16 --levels, and a --least-coverage above 0")
     gaussians = load_ply(args.ply)
     if "cells_0" in further_properties(args.ply):
-        raise InputError(f"{args.ply} has levels already: give a scene that was trained without")
+        raise InputError(f"{args.ply} has levels already: give a scene that was trained without any")
     views = viewpoints.read(args.cameras or args.ply.parent / "cameras.json")
     cameras = [view.camera for view in views if view.split != "test"]
     levels = level_zero(gaussians, np.random.default_rng(0))

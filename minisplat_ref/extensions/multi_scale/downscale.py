@@ -1,7 +1,7 @@
-"""The work of the study ``multi-scale/downscale``: a trained scene in smaller and smaller pictures.
+"""The study ``multi-scale/downscale``: a trained scene in smaller and smaller pictures.
 
-The truth at 1/n of the size is the mean over blocks of n x n pixels of the photographs that were held out. Beside the
-error it is counted what is drawn: pairs of a Gaussian and a tile, which are sorted, and hits, which are blended.
+The truth at 1/n of the size is the mean over blocks of n x n pixels of the held-out photographs. Beside the error the
+study counts the work: pairs of a Gaussian and a tile, which are sorted, and hits, which are blended.
 """
 
 from typing import Any, NamedTuple
@@ -22,9 +22,9 @@ from minisplat_ref.training.schedule import configured
 from minisplat_ref.types import Floats, Model, Scene, view_from
 
 BLOCKS = (1, 2, 4, 8, 16)
-LEAST_SIZE = 4  # pixels a side of a picture that is measured
+LEAST_SIZE = 4  # pixels per side of the smallest picture that is measured
 PLANS = {"levels 2": Plan(2, 4, LEAST_COVERAGE), "levels 4": Plan(4, 2, LEAST_COVERAGE)}
-EARLY = 4  # times smaller cells are pretended, so that coarse Gaussians come while their cells are 4 pixels wide
+EARLY = 4  # cells are divided by this, so that coarse Gaussians appear while their cells are 4 pixels wide
 COMPENSATED = GSPLAT_MAIN._replace(is_antialiased=True)
 COLORS = dict(
     zip(
@@ -35,8 +35,8 @@ COLORS = dict(
 )
 
 
-class Drawn(NamedTuple):
-    """One way of drawing the scene."""
+class Variant(NamedTuple):
+    """A population of the scene, and how it is drawn."""
 
     gaussians: Any
     renderer: Renderer
@@ -44,15 +44,15 @@ class Drawn(NamedTuple):
 
 
 class Figures(NamedTuple):
-    """What one way costs and is worth at one size, means over the test views."""
+    """Quality and work of one variant at one size, as means over the test views."""
 
     psnr: float
     n_pairs: float
     n_hits: float
 
 
-def ways(scene: Scene, iterations: int, seed: int) -> dict[str, Drawn]:
-    """Train the scene without levels and with them, and build levels of the former."""
+def variants(scene: Scene, iterations: int, seed: int) -> dict[str, Variant]:
+    """Train the scene without and with levels, and build levels for the former; return all variants by name."""
     plain = train(scene, find_recipe("3dgs", iterations), seed=seed, backend=CPU).gaussians
     zero = level_zero(plain, np.random.default_rng(0))
     densities = finest_densities(plain.means, [view.camera for view in scene.train_views])
@@ -61,46 +61,46 @@ def ways(scene: Scene, iterations: int, seed: int) -> dict[str, Drawn]:
     recipe = configured(find_recipe("multi-scale", iterations), factor=4, n_levels=2)
     trained = train(scene, recipe, seed=seed, backend=CPU).gaussians
     return {
-        "3dgs": Drawn(plain, SPLATTING),
-        "compensated": Drawn(plain, SPLATTING, COMPENSATED),
-        **{name: Drawn(gaussians, LEVELS.renderer) for name, gaussians in built.items()},
-        "levels 4, compensated": Drawn(built["levels 4"], LEVELS.renderer, COMPENSATED),
-        "too early": Drawn(early, LEVELS.renderer),
-        "trained": Drawn(trained, LEVELS.renderer),
+        "3dgs": Variant(plain, SPLATTING),
+        "compensated": Variant(plain, SPLATTING, COMPENSATED),
+        **{name: Variant(gaussians, LEVELS.renderer) for name, gaussians in built.items()},
+        "levels 4, compensated": Variant(built["levels 4"], LEVELS.renderer, COMPENSATED),
+        "too early": Variant(early, LEVELS.renderer),
+        "trained": Variant(trained, LEVELS.renderer),
     }
 
 
-def picture(way: Drawn, scene: Scene, i: int, n: int) -> Any:
+def picture(variant: Variant, scene: Scene, i: int, n: int) -> Any:
     """Return test view ``i`` at 1/n of its size, with blend statistics."""
     camera = zoomed(scene.test_views[i].camera, 1 / n)
-    request = Request(scene.background, conventions=way.conventions, backend=CPU, wants=frozenset({"stats"}))
-    return way.renderer.render(Model(way.gaussians), view_from(camera), request)[0]
+    request = Request(scene.background, conventions=variant.conventions, backend=CPU, wants=frozenset({"stats"}))
+    return variant.renderer.render(Model(variant.gaussians), view_from(camera), request)[0]
 
 
-def figures(way: Drawn, scene: Scene, n: int) -> Figures:
+def figures(variant: Variant, scene: Scene, n: int) -> Figures:
     """Measure the test views at 1/n of their size."""
     rows = []
     for i, view in enumerate(scene.test_views):
-        output = picture(way, scene, i, n)
+        output = picture(variant, scene, i, n)
         target = block_means(view.loaded().image.astype(float) / 255, n)
         rows.append((psnr_of(output.image, target), output.n_pairs, output.stats.hit_count.sum()))
     return Figures(*(float(value) for value in np.mean(rows, axis=0)))
 
 
 class Measured(NamedTuple):
-    """What the study has found."""
+    """The results of the study."""
 
     blocks: list[int]
     figures: dict[str, list[list[Figures]]]
-    """By way: for each seed, over the blocks."""
+    """Figures by variant, then seed, then size of block."""
     counts: dict[str, list[int]]
-    """Gaussians of all levels, for each seed."""
+    """Number of Gaussians of all levels by variant, then seed."""
     pictures: dict[str, Floats]
-    """Of the first test view at a quarter of its size, and the photograph."""
+    """The first test view at a quarter of its size by variant, and the photograph."""
 
 
 def measure(scene: Scene, iterations: int, seeds: int) -> Measured:
-    """Train with every seed, and measure every way at every size."""
+    """Train with every seed, and measure every variant at every size."""
     camera = scene.test_views[0].camera
     blocks = [n for n in BLOCKS if min(camera.width, camera.height) // n >= LEAST_SIZE]
     found: dict[str, list[list[Figures]]] = {name: [] for name in COLORS}
@@ -108,15 +108,15 @@ def measure(scene: Scene, iterations: int, seeds: int) -> Measured:
     shown = min(4, blocks[-1])
     pictures = {"photograph": block_means(scene.test_views[0].loaded().image.astype(float) / 255, shown)}
     for seed in range(seeds):
-        for name, way in ways(scene, iterations, seed).items():
-            found[name].append([figures(way, scene, n) for n in blocks])
-            counts[name].append(len(way.gaussians.means))
-            pictures.setdefault(name, np.clip(picture(way, scene, 0, shown).image, 0, 1))
+        for name, variant in variants(scene, iterations, seed).items():
+            found[name].append([figures(variant, scene, n) for n in blocks])
+            counts[name].append(len(variant.gaussians.means))
+            pictures.setdefault(name, np.clip(picture(variant, scene, 0, shown).image, 0, 1))
     return Measured(blocks, found, counts, pictures)
 
 
 def draw(found: Measured) -> Figure:
-    """Draw PSNR and hits over the size, and a small picture by each way."""
+    """Draw PSNR and hits over the size, and a small picture of each variant."""
     figure = Figure(figsize=(11, 6), layout="constrained")
     upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.6, 1))[:, 0]
     left, right = upper.subplots(1, 2)
@@ -126,7 +126,7 @@ def draw(found: Measured) -> Figure:
             low, high = values[..., column].min(axis=0), values[..., column].max(axis=0)
             axes.fill_between(found.blocks, low, high, color=color, alpha=0.25, lw=0)
             axes.plot(found.blocks, values[..., column].mean(axis=0), "o-", ms=4, color=color, label=name)
-    for axes, title in ((left, "PSNR of test views (dB)"), (right, "hits that are blended, per view")):
+    for axes, title in ((left, "PSNR of test views (dB)"), (right, "blended hits per view")):
         axes.set_xscale("log", base=2)
         axes.set_xticks(found.blocks, ["1", *(f"1/{n}" for n in found.blocks[1:])])
         axes.set(title=title, xlabel="size of the picture")
@@ -141,7 +141,7 @@ def draw(found: Measured) -> Figure:
 
 
 def summarise(found: Measured) -> dict[str, Any]:
-    """Return what is written."""
+    """Return the content of ``result.json``."""
     by_name = {
         name: {key: [[getattr(row, key) for row in rows] for rows in runs] for key in Figures._fields}
         for name, runs in found.figures.items()

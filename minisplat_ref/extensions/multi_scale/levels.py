@@ -1,9 +1,9 @@
-"""From Gaussians to levels: what is too small to be seen from farther away is merged, cell by cell.
+"""From Gaussians to levels: Gaussians that are too small to be seen from farther away are merged, cell by cell.
 
-Level l is made for pictures of 1/F^l of the size of the training views. Of the Gaussians that are shown at the level
-before, those that would cover too few pixels are sorted into cubes as large as a pixel of that size, and all in a cube
-become one of their common moments and of the light that they stop (``strategy.simplify.merge_clusters``). The others
-stay as they are, and a cube with a single small one keeps it.
+Level l is made for pictures of 1/F^l of the size of the training views. Of the Gaussians that are shown at the previous
+level, those that would cover too few pixels are sorted into cubes as large as a pixel of that size, and all in a cube
+become one Gaussian with their common moments, which stops as much light (``strategy.simplify.merge_clusters``). The
+others stay as they are, and a cube with a single small one keeps it.
 """
 
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ from minisplat_ref.types import Floats, Gaussians, Ints
 
 
 class MultiScaleGaussians(NamedTuple):
-    """Gaussians of several levels: the fields of :class:`Gaussians`, and one more."""
+    """Gaussians of several levels: the fields of :class:`Gaussians` and one more."""
 
     means: Floats
     quats: Floats
@@ -27,19 +27,20 @@ class MultiScaleGaussians(NamedTuple):
     sh_dc: Floats
     sh_rest: Floats
     cells: Floats
-    """[N, 2] sides of the cube that was merged into this Gaussian, 0 where none was, and of the one that this Gaussian
-    was merged in, ``NO_CELL`` where it was not. World units. An event sets them, no gradient does."""
+    """[N, 2] world units: the side w of the cube that was merged into this Gaussian, 0 where none was, and the side w'
+    of the cube in which this Gaussian was merged, ``NO_CELL`` where it was not. An event sets them; they have no
+    gradient."""
 
 
 class Plan(NamedTuple):
-    """How levels are made."""
+    """Settings of the levels."""
 
     factor: float
-    """F: each level is for pictures as many times smaller."""
+    """F: each level is for pictures smaller by this factor."""
     n_levels: int
-    """Without the finest."""
+    """Number of levels besides the finest."""
     least_coverage: float
-    """Pixels: what covers fewer is merged."""
+    """Gaussians that cover fewer pixels than this are merged."""
 
 
 def level_zero(gaussians: Gaussians, rng: np.random.Generator) -> MultiScaleGaussians:
@@ -52,23 +53,25 @@ def level_zero(gaussians: Gaussians, rng: np.random.Generator) -> MultiScaleGaus
 def with_levels(
     gaussians: MultiScaleGaussians, densities: Floats, plan: Plan, conventions: Conventions
 ) -> MultiScaleGaussians:
-    """Return the Gaussians with coarser levels behind them.
+    """Return the Gaussians with coarser levels appended.
 
     Parameters
     ----------
     gaussians : MultiScaleGaussians
-        N rows.
+        N rows of level 0.
     densities : ndarray of shape (N,)
-        The largest number of pixels per world unit in which each was trained.
+        The largest density, pixels per world unit, at which each was trained.
     plan : Plan
+        Settings of the levels.
     conventions : Conventions
+        ``alpha_min`` is used.
 
     Returns
     -------
     MultiScaleGaussians
-        The N rows in their order, the parents' cells of some set, and then level after level.
+        The N rows in their order, some with the cells of their parents, and then level after level.
     """
-    octaves = np.round(np.log2(densities))  # cells of one size lie on one grid
+    octaves = np.round(np.log2(densities))  # so that cells of equal size lie on one grid
     gaussians = gaussians._replace(cells=gaussians.cells.copy())
     front = np.flatnonzero(gaussians.cells[:, 1] == NO_CELL)
     for level in range(1, plan.n_levels + 1):
@@ -90,7 +93,7 @@ def with_levels(
 
 
 def _in_common_cells(means: Floats, sides: Floats, is_small: Any) -> tuple[Ints, Ints]:
-    """Return the small rows that share a cell with another, and the number of the cell of each, from 0 on."""
+    """Return the small rows that share a cell with another, and the index of each one's cell."""
     ids = np.flatnonzero(is_small)
     places = np.column_stack([sides[ids], np.floor(means[ids].astype(np.float64) / sides[ids, None])])
     _, labels, counts = np.unique(places, axis=0, return_inverse=True, return_counts=True)
@@ -99,7 +102,7 @@ def _in_common_cells(means: Floats, sides: Floats, is_small: Any) -> tuple[Ints,
 
 
 def _merged(members: MultiScaleGaussians, labels: Ints) -> MultiScaleGaussians:
-    """Return one Gaussian for each label, weighted by the light that the members stop."""
+    """Return one Gaussian per label, with moments weighted by the light that the members stop."""
     masses = np.maximum(optical_masses(members), np.finfo(np.float64).tiny)
     merged: Any = merge_clusters(members, masses, labels).gaussians
     return merged

@@ -1,4 +1,4 @@
-"""How levels are drawn and trained."""
+"""The renderer of levels, and the recipe that trains them."""
 
 from functools import partial
 from typing import Any
@@ -19,14 +19,14 @@ from minisplat_ref.training.schedule import At
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
 from minisplat_ref.types import Camera, Floats, Gaussians, Model, RenderOutput, View, view_from
 
-FACTOR, N_LEVELS = 4, 3  # levels for pictures of a 4th, a 16th and a 64th of the size, as in the paper
-LEAST_COVERAGE = 4.0  # pixels, of the ellipse in which alpha is at least 1/255: a deviation of 0.6 where it is opaque
-INSERTION = 15_000  # iteration: when densification has ended
-LEAST_SIZE = 8  # pixels a side of a picture that is trained on
+FACTOR, N_LEVELS = 4, 3  # levels for pictures of 1/4, 1/16 and 1/64 of the size, as in the paper
+LEAST_COVERAGE = 4.0  # pixels, of the ellipse where alpha is at least 1/255; if opaque, a standard deviation of 0.6
+INSERTION = 15_000  # iteration at which densification has ended
+LEAST_SIZE = 8  # pixels per side of the smallest picture that is trained on
 
 
 def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
-    """Draw of each place the level that suits the camera; the tape is that of 3DGS."""
+    """Draw at each place the level that suits the camera; the tape is that of 3DGS."""
     g = model.gaussians
     is_shown = are_shown(g.cells, pixel_densities(g.means, view.camera, request.conventions.near_plane))
     if not is_shown.all():
@@ -45,16 +45,16 @@ LEVELS = Representation(
 
 
 def finest_densities(means: Floats, cameras: list[Camera]) -> Floats:
-    """Return the largest number of pixels per world unit with which the cameras see each centre, [N].
+    """Return the largest density [N], pixels per world unit, at which the cameras see each centre [N, 3].
 
     Raises
     ------
     InputError
-        They see none.
+        The cameras see no centre.
     """
     intervals = sampling_intervals(means, cameras)
     if not (intervals > 0).all():
-        raise InputError("no training view sees any of the Gaussians, levels have no size: give the cameras of the run")
+        raise InputError("no training view sees a Gaussian, so levels have no size: give the cameras of the run")
     return 1 / intervals
 
 
@@ -75,11 +75,11 @@ def insert_levels(
 def coarse(
     rendered: Rendered, *, factor: int, n_levels: int, period: int, dssim_weight: float
 ) -> tuple[float, Cotangents]:
-    """Return the photometric loss of a smaller picture of the view, in every ``period``-th iteration; else nothing.
+    """Return the photometric loss of a smaller picture of the view in every ``period``-th iteration, otherwise zero.
 
-    The levels take turns, as far as pictures of at least ``LEAST_SIZE`` pixels a side go. The gradient goes to the
-    Gaussians directly: this picture is not the one that the other terms see, and exposures and poses that are trained
-    are not applied to it.
+    The levels alternate, as far as pictures have at least ``LEAST_SIZE`` pixels per side. The gradient goes to the
+    Gaussians directly: this picture is not the one of the other terms, and trained exposures and poses are not applied
+    to it.
     """
     view, request, model = rendered.view, rendered.request, rendered.model
     sizes = [factor**level for level in range(1, n_levels + 1)]
@@ -114,4 +114,4 @@ MULTI_SCALE = GS._replace(
         At(INSERTION, partial(insert_levels, factor=FACTOR, n_levels=N_LEVELS, least_coverage=LEAST_COVERAGE)),
     ),
 )
-"""``multi-scale``: 3DGS, and from the middle of the training on coarser levels, trained on smaller pictures."""
+"""The recipe ``multi-scale``: 3DGS and, from mid-training on, coarser levels trained on smaller pictures."""

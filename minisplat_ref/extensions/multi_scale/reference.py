@@ -1,7 +1,7 @@
-"""Which Gaussians a view shows, and how large they appear, in NumPy.
+"""The choice of the Gaussians that a view shows, and their coverage in pixels, in NumPy.
 
 A camera of focal length f shows ``c = f / z`` pixels per world unit at depth z. A cell of side w, a cube in which
-Gaussians were merged into one, covers w c pixels a side there.
+Gaussians were merged into one, covers w c pixels per side there.
 """
 
 import numpy as np
@@ -13,9 +13,21 @@ NO_CELL = float(np.finfo(np.float32).max)  # the side of the parent's cell where
 
 
 def pixel_densities(means: Floats, camera: Camera, near_plane: float) -> Floats:
-    """Return ``c = sqrt(fx fy) / z`` [N], pixels per world unit, of centres [N, 3]; nearer ones count as at the plane.
+    """Return the densities ``c = sqrt(fx fy) / z`` of centres.
 
-    In the dtype of the means.
+    Parameters
+    ----------
+    means : ndarray of shape (N, 3)
+        Centres, world frame.
+    camera : Camera
+        Pose and focal lengths are used.
+    near_plane : float
+        Least z, world units; nearer centres count as at this depth.
+
+    Returns
+    -------
+    ndarray of shape (N,)
+        Pixels per world unit, in the dtype of the means.
     """
     z = means @ camera.cam_from_world_R[2].astype(means.dtype) + means.dtype.type(camera.cam_from_world_t[2])
     return means.dtype.type(np.sqrt(camera.fx * camera.fy)) / np.maximum(z, means.dtype.type(near_plane))
@@ -28,15 +40,15 @@ def are_shown(cells: Floats, densities: Floats) -> Bools:
 
         w c < 1 <= w' c
 
-    with the side w of a Gaussian's own cell and w' of its parent's. So what was merged gives way to what it was merged
-    into exactly where the cell shrinks below a pixel.
+    with the side w of a Gaussian's own cell and w' of its parent's. So the members of a cell are replaced by their
+    parent exactly where the cell shrinks below a pixel.
 
     Parameters
     ----------
     cells : ndarray of shape (N, 2)
-        w, 0 of a Gaussian that was not merged; and w', ``NO_CELL`` without a parent. World units.
+        World units: w, 0 where nothing was merged into the Gaussian, and w', ``NO_CELL`` where it has no parent.
     densities : ndarray of shape (N,)
-        c.
+        c, pixels per world unit.
     """
     with np.errstate(over="ignore"):
         own, parent = (cells * densities[:, None]).T
@@ -44,21 +56,24 @@ def are_shown(cells: Floats, densities: Floats) -> Bools:
 
 
 def coverages(log_scales: Floats, opacity_logits: Floats, densities: Floats, conventions: Conventions) -> Floats:
-    """Return how many pixels the shorter side of each Gaussian covers, seen from in front of it.
+    """Return how many pixels wide each Gaussian appears, seen face on.
 
-    The ellipse in which alpha is at least ``alpha_min`` has, of a deviation s, the width::
+    The ellipse in which alpha is at least ``alpha_min`` has, for a standard deviation s, the width::
 
         S = 2 sqrt(2 ln(o / alpha_min)) s c
 
-    s is the middle one of the three: a flat Gaussian counts as wide, however it is turned, or it would leave when it is
-    seen on edge.
+    s is the middle one of the three, so a flat Gaussian counts as wide in any orientation; otherwise it would disappear
+    when seen edge on.
 
     Parameters
     ----------
     log_scales : ndarray of shape (N, 3)
-    opacity_logits, densities : ndarray of shape (N,)
+        World units.
+    opacity_logits : ndarray of shape (N,)
+    densities : ndarray of shape (N,)
+        c, pixels per world unit.
     conventions : Conventions
-        ``alpha_min``.
+        ``alpha_min`` is used.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""The study ``multi-scale/downscale`` asks what levels are worth in small pictures, and what they save."""
+"""The study ``multi-scale/downscale`` measures what levels gain in small pictures, and what they save."""
 
 import argparse
 
@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Train, measure, write, print a table.
+    """Train, measure, write the results, and print a table.
 
     Raises
     ------
@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> None:
         found = downscale.measure(scene, args.iterations, args.seeds)
         settings = {key: getattr(args, key) for key in ("scene", "downscale", "iterations", "seeds")}
         write(folder, {**settings, **downscale.summarise(found)}, downscale.draw(found))
-    print("PSNR (dB) of test views, and thousands of pairs and of hits per view: means of the seeds\n")
+    print("PSNR (dB) of test views, and thousands of pairs and of hits per view: means over the seeds\n")
     rows = []
     for name, runs in found.figures.items():
         psnr, pairs, hits = np.moveaxis(np.mean(np.array(runs), axis=0), -1, 0)  # [blocks] each

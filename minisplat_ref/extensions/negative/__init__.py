@@ -1,7 +1,7 @@
 """Negative Gaussians: colours may be below zero, so that one can be cut out of another.
 
-NegGS, Kasymov et al. 2024, arXiv 2405.18163. A sum of Gaussians is hilly, and a ring takes several of them. The
-difference of two, a wide one less a narrow one in its middle, has a hollow, with as many numbers as two hills:
+This follows NegGS, Kasymov et al. 2024, arXiv 2405.18163. A sum of Gaussians has bumps, and a ring takes several. The
+difference of two, a wide one minus a narrow one in its middle, has a hollow, and takes as many numbers as two bumps:
 
     f_c = (N(m0, S0) - c N(m1, S1)) / (1 - c),   0 <= c < 1
 
@@ -11,28 +11,29 @@ are *divided*; the construction is this weighted difference, and the quotient on
 
 In a scene the negative component is a Gaussian whose *colour* is negative; its opacity stays between 0 and 1, and the
 compositing is that of 3DGS, ``C = sum_i w_i c_i + T_end b``. So one thing changes in the renderer: the colour is
-``c = 0.5 + sum_k c_k Y_k(d)``, without the ``max(0, .)`` (:mod:`minisplat_ref.extensions.negative.method`). A part of
-the Gaussians begins negative. Where all colours are positive the image is that of 3DGS, bit for bit.
+``c = 0.5 + sum_k c_k Y_k(d)``, without the ``max(0, .)`` (:mod:`minisplat_ref.extensions.negative.method`). A fraction
+of the Gaussians starts negative. Where all colours are positive the image is that of 3DGS, bit for bit.
 
-What to know:
+Four consequences are worth knowing:
 
 - A negative Gaussian in front of others dims them like any other: it adds ``-w |c|`` and takes its part of the
-  transmittance. It hollows out a *colour*, and no hole through which one could see. ``study negative/backdrop``
-  measures this, ``study negative/rings`` when a difference is worth more Gaussians than it costs.
+  transmittance. It cancels a *colour*, but makes no hole to see through. ``study negative/backdrop`` measures this;
+  ``study negative/rings`` measures when a difference saves more Gaussians than it costs.
 - The image may be below zero, too. What is written and measured is clipped to [0, 1]; the loss sees it unclipped, as
-  3DGS's loss sees what is above one, because a clipped pixel has no gradient.
-- Pruning looks at opacity and size, never at the colour: a Gaussian whose colour is near zero, which may be on its way
-  from one side to the other, stays. That colour has a gradient, which that of 3DGS loses at zero.
+  3DGS's loss sees values above one, because a clipped pixel has no gradient.
+- Pruning considers opacity and size, never the colour, so a Gaussian whose colour is near zero, which may be about to
+  change its sign, stays. That colour has a gradient, which 3DGS loses at zero.
 - The PLY is that of 3DGS, with ``f_dc`` below -1.77 where the colour is negative. Other programs read it and clamp.
 
 Measured: in a plane one pair fits a ring better than two positive Gaussians at any thickness from 0.2 to 0.9 of the
-outer radius; better than three only above 0.42, and if the heights may be a hundred times the ring's; and never as well
-as four (``study negative/rings``). Before a black wall a negative colour makes the hole of a ring black, 37.5 dB there
-against 14.9 dB; before dots the hole of either lets 1 to 2 % through, where four Gaussians side by side leave 90 %.
+outer radius, better than three only above 0.42 and if the heights may be a hundred times the ring's, and never as well
+as four (``study negative/rings``). In front of a black wall a negative colour makes the hole of a ring black, with
+37.5 dB there against 14.9 dB; in front of dots the hole transmits 1 to 2 % with colours of either kind, where four
+Gaussians side by side leave 90 %.
 
-Where this deviates: how the released code chooses its negative components, and with which colours they start, was not
-known to us. Here they are drawn at random, and a drawn Gaussian starts with its colour negated. Left out: a density
-for each pair; the components pair up, or not, as the photographs want.
+How the released code chooses its negative components, and with which colours they start, was not known to us. Here they
+are drawn at random, and a drawn Gaussian starts with its colour negated. A density for each pair is left out; the
+components pair up, or not, as the photographs require.
 
     minisplat-ref train SCENE --recipe negative
 """
@@ -42,4 +43,4 @@ from minisplat_ref.extensions.negative.method import NEGATIVE, SIGNED
 from minisplat_ref.extensions.negative.study import STUDIES
 
 EXTENSION = Extension("negative", recipes=(NEGATIVE,), representation=SIGNED, studies=STUDIES)
-"""Gaussians of either sign, how they are drawn, the recipe that trains them, and two studies."""
+"""Gaussians of either sign with their renderer, the recipe that trains them, and two studies."""

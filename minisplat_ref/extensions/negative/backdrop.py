@@ -1,9 +1,9 @@
-"""A ring of two Gaussians in front of a wall: what a negative colour does, and does not do, in compositing.
+"""The study ``negative/backdrop``: what a negative colour does, and does not do, in compositing.
 
-A wide Gaussian and a smaller one before it are fitted to the picture of an opaque ring, with colours clamped at zero as
-in 3DGS and with colours of either sign; four Gaussians side by side, clamped, are the alternative. The wall is black,
-where the hole of the ring is a matter of colour, or covered with dots, which are to be seen through the hole. Truth and
-fits are rendered by this package in float64; all that the fit does not touch is fixed.
+A wide Gaussian and a smaller one in front of it are fitted to the picture of an opaque ring, with colours clamped at
+zero as in 3DGS and with colours of either sign; four clamped Gaussians side by side are the alternative. Behind the
+ring is a wall. It is black, so that the hole of the ring is a matter of colour, or it has dots, which should be visible
+through the hole. Truth and fits are rendered by this package in float64; everything that is not fitted is fixed.
 """
 
 from typing import Any, NamedTuple
@@ -24,7 +24,7 @@ from minisplat_ref.types import Camera, Floats, Gaussians, Model, View, view_fro
 SIZE = 64  # pixels a side
 FOCAL = 64.0  # pixels
 WALL_Z, BACK_Z, FRONT_Z = 4.0, 3.0, 2.9  # camera z, world units
-N_DOTS = 16  # a side of the wall
+N_DOTS = 16  # per side of the wall
 INNER, OUTER, BLUR = 9.0, 22.0, 1.5  # radii of the ring and standard deviation of its edges, pixels
 COLOR = np.array([0.95, 0.6, 0.2])  # of the ring
 FITTED = ("means", "log_scales", "opacity_logits", "sh_dc")
@@ -32,7 +32,7 @@ EVALUATIONS = 300  # at most, of one fit
 
 
 class Case(NamedTuple):
-    """One way of making the ring."""
+    """A renderer and a number of Gaussians to make the ring with."""
 
     renderer: Renderer
     n: int  # Gaussians
@@ -56,7 +56,7 @@ class Fit(NamedTuple):
 
 
 def view() -> View:
-    """Return the camera: at the origin, looking along z."""
+    """Return the view of a camera at the origin that looks along z."""
     return view_from(Camera(np.eye(3), np.zeros(3), FOCAL, FOCAL, SIZE / 2, SIZE / 2, SIZE, SIZE))
 
 
@@ -74,9 +74,9 @@ def balls(means: Floats, scales: Floats, opacities: Floats, colors: Floats) -> G
 
 
 def wall(name: str) -> Gaussians:
-    """Return the wall: nothing, or dots of random colours."""
+    """Return the Gaussians of a wall: none for ``black``, dots of random colours for ``dots``."""
     n = 0 if name == "black" else N_DOTS
-    half = 0.5 * SIZE / FOCAL * WALL_Z  # of the wall's width, world units
+    half = 0.5 * SIZE / FOCAL * WALL_Z  # half the wall's width, world units
     places = ((np.arange(n) + 0.5) / max(n, 1) * 2 - 1) * half  # [n]
     x, y = np.meshgrid(places, places)
     means = np.column_stack([x.ravel(), y.ravel(), np.full(n * n, WALL_Z)])
@@ -99,7 +99,7 @@ def truth(behind: Gaussians) -> Floats:
 
 
 def start(n: int, rng: np.random.Generator) -> Gaussians:
-    """Return two Gaussians, a dark one before a bright one, or n of them side by side on the ring; all a bit off."""
+    """Return a dark Gaussian in front of a bright one if n is 2, or n along the ring; all slightly displaced."""
     unit = BACK_Z / FOCAL  # world units a pixel
     if n == 2:
         centres, scales = np.zeros((2, 2)), np.array([OUTER, INNER]) / 2
@@ -115,9 +115,9 @@ def start(n: int, rng: np.random.Generator) -> Gaussians:
 
 
 def fitted(behind: Gaussians, target: Floats, case: Case, n_starts: int, rng: np.random.Generator) -> Fit:
-    """Return the best of several fits of the Gaussians before the wall, by the gradient of the renderer and L-BFGS.
+    """Return the best of several fits of the Gaussians in front of a wall, by the renderer's gradient and L-BFGS.
 
-    Means move in the image plane, so that the order stays; scales, opacities and colours are free.
+    Means move parallel to the image plane, so that the order stays; scales, opacities and colours are free.
     """
     fits = [_fit_once(behind, target, case.renderer, start(case.n, rng)) for _ in range(n_starts)]
     _, ring = min(fits, key=lambda fit: fit[0])
@@ -173,7 +173,7 @@ def measure(n_starts: int, seed: int) -> dict[str, dict[str, Fit]]:
 
 
 def summarise(fits: dict[str, dict[str, Fit]]) -> dict[str, Any]:
-    """Return the figures of the table."""
+    """Return the content of ``result.json``."""
     return {
         name: {case: {k: v for k, v in fit._asdict().items() if k != "image"} for case, fit in row.items()}
         for name, row in fits.items()
@@ -181,7 +181,7 @@ def summarise(fits: dict[str, dict[str, Fit]]) -> dict[str, Any]:
 
 
 def draw(fits: dict[str, dict[str, Fit]]) -> Figure:
-    """Draw truth and fits, a row for each wall."""
+    """Draw truth and fits, one row per wall."""
     figure = Figure(figsize=(8.4, 4.9), layout="constrained")
     for row, (name, cases) in zip(figure.subplots(len(WALLS), 1 + len(CASES)), fits.items(), strict=True):
         row[0].imshow(np.clip(truth(wall(name)), 0, 1))
@@ -189,7 +189,7 @@ def draw(fits: dict[str, dict[str, Fit]]) -> Figure:
         row[0].set_ylabel(f"wall: {name}", fontsize=9)
         for axes, (case, fit) in zip(row[1:], cases.items(), strict=True):
             axes.imshow(fit.image)
-            hole = f"hole {fit.hole_psnr:.1f} dB, lets through {fit.see_through:.0%}"
+            hole = f"hole {fit.hole_psnr:.1f} dB, transmits {fit.see_through:.0%}"
             axes.set_title(f"{case}: {fit.psnr:.1f} dB\n{hole}", fontsize=8)
         for axes in row:
             axes.set(xticks=[], yticks=[])

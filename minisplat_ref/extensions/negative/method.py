@@ -1,12 +1,12 @@
 """Colours of either sign from the stages of any backend, and the recipe that trains them.
 
-No stage is written anew. The backends compute ``u = max(0, c)``; with all coefficients negated, which mirrors the
-colour at the mid-grey 0.5, they compute ``l = max(0, 1 - c)``; and
+No stage is written anew. The backends compute ``u = max(0, c)``; with all coefficients negated, which reflects the
+colour at mid-grey, 0.5, they compute ``l = max(0, 1 - c)``; and
 
     c = u  where u > 0,   1 - l  elsewhere
 
 because 1 - c is above zero wherever u is zero. So no channel is ever clamped on both sides, a colour of exactly zero
-has its gradient, and a Gaussian whose channels are all positive is shaded by the first call alone, as in 3DGS.
+has a gradient, and a Gaussian whose channels are all positive is shaded by the first call alone, as in 3DGS.
 """
 
 from dataclasses import replace
@@ -22,25 +22,25 @@ from minisplat_ref.rendering import SPLATTING, Renderer, Request
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Camera, Floats, Gaussians, Ints, Model, RenderOutput, SHGradient, View
 
-FRACTION = 0.2  # of the Gaussians begin negative: the share reported as best for the paper's scenes
+FRACTION = 0.2  # of the Gaussians start negative: reported as best for the paper's scenes
 
 
 def signed_colors(
     backend: Backend, means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int, radii: Ints
 ) -> Floats:
-    """Colours towards the camera without a clamp, ``c = 0.5 + sum_k c_k Y_k(d)``.
+    """Return colours towards the camera without a clamp, ``c = 0.5 + sum_k c_k Y_k(d)``.
 
     Parameters
     ----------
     backend : Backend
-        Whose stage is called, once or twice.
+        Its stage is called once or twice.
     means, sh_dc, sh_rest, camera, degree, radii
         As for :func:`minisplat_ref.reference.spherical_harmonics.sh_colors`.
 
     Returns
     -------
     ndarray of shape (N, 3)
-        RGB of either sign; zeros for culled rows.
+        RGB of either sign; zero for culled rows.
     """
     colors = backend.sh_colors(means, sh_dc, sh_rest, camera, degree, radii)  # u [N, 3]
     rows = _clamped_rows(colors, radii)
@@ -92,7 +92,7 @@ def signed_colors_vjp(
 
 
 def _clamped_rows(upper: Floats, radii: Ints) -> Ints:
-    """Return the rows [M] of visible Gaussians with a channel of u [N, 3] at zero: the others need no second call."""
+    """Return the rows [M] of visible Gaussians with a channel of u [N, 3] at zero; the others need no second call."""
     return np.flatnonzero((radii[:, 0] > 0) & (upper == 0).any(axis=1))
 
 
@@ -112,15 +112,16 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, An
 
 
 def with_negatives(gaussians: Gaussians, rng: np.random.Generator, *, fraction: float) -> Gaussians:
-    """Negate the colours of a part of the Gaussians, drawn without replacement.
+    """Return the Gaussians with the colours of a fraction of them negated.
 
     Parameters
     ----------
     gaussians : Gaussians
-        N of them.
+        N Gaussians; they are not changed.
     rng : numpy.random.Generator
+        Draws the rows, without replacement.
     fraction : float
-        In [0, 1]; the part is rounded to a whole number.
+        In [0, 1]; the number of rows is rounded.
     """
     n = len(gaussians.means)
     rows = rng.choice(n, size=round(fraction * n), replace=False)
@@ -136,4 +137,4 @@ SIGNED = Representation(
 )
 
 NEGATIVE = GS_ACCEL._replace(name="negative")
-"""``negative``: 3DGS with negative Gaussians."""
+"""The recipe ``negative``: 3DGS with negative Gaussians."""

@@ -9,22 +9,25 @@ import numpy as np
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.types import Floats
 
-ROUNDING = 1e-12  # eigenvalues below this part of the largest count as zero: differences of covariances in float64
+ROUNDING = 1e-12  # eigenvalues of a difference of covariances below this part of the largest count as zero
 
 
 def density(points: Floats, mean: Floats, covariance: Floats) -> Floats:
-    """Return N(m, S) at points.
+    """Return the normal density N(m, S) at points.
 
     Parameters
     ----------
     points : ndarray of shape (P, n)
+        x, in any unit.
     mean : ndarray of shape (n,)
+        m.
     covariance : ndarray of shape (n, n)
-        Symmetric, positive definite.
+        S, symmetric and positive definite.
 
     Returns
     -------
     ndarray of shape (P,)
+        Per unit of volume.
     """
     offsets = points - mean  # [P, n]
     squared_radii = np.sum(offsets * np.linalg.solve(covariance, offsets.T).T, axis=1)  # [P]
@@ -34,7 +37,24 @@ def density(points: Floats, mean: Floats, covariance: Floats) -> Floats:
 def difference(
     points: Floats, mean0: Floats, covariance0: Floats, mean1: Floats, covariance1: Floats, c: float
 ) -> Floats:
-    """Return ``f_c = (N(m0, S0) - c N(m1, S1)) / (1 - c)`` at points [P, n]; c is in [0, 1)."""
+    """Return ``f_c = (N(m0, S0) - c N(m1, S1)) / (1 - c)`` at points.
+
+    Parameters
+    ----------
+    points : ndarray of shape (P, n)
+        x, in any unit.
+    mean0, mean1 : ndarray of shape (n,)
+        Means of the positive and of the negative Gaussian.
+    covariance0, covariance1 : ndarray of shape (n, n)
+        Their covariances.
+    c : float
+        In [0, 1).
+
+    Returns
+    -------
+    ndarray of shape (P,)
+        Per unit of volume; negative somewhere if c exceeds :func:`largest_weight`.
+    """
     return (density(points, mean0, covariance0) - c * density(points, mean1, covariance1)) / (1 - c)
 
 
@@ -42,8 +62,8 @@ def largest_weight(mean0: Floats, covariance0: Floats, mean1: Floats, covariance
     """Return the largest c for which :func:`difference` is a density: ``min_x N(m0, S0) / N(m1, S1)``.
 
     The logarithm of the quotient is quadratic in x, with the Hessian ``S1^-1 - S0^-1``. It has a minimum if that is
-    positive semidefinite, which is to say if ``S0 - S1`` is: the negative Gaussian is nowhere the wider one. With
-    d = m1 - m0, and completing the square,
+    positive semidefinite, that is, if ``S0 - S1`` is, so that the negative Gaussian is wider in no direction. With
+    d = m1 - m0, completing the square gives
 
         min = sqrt(det S1 / det S0) exp(-d^T (S0 - S1)^-1 d / 2)
 
@@ -53,13 +73,14 @@ def largest_weight(mean0: Floats, covariance0: Floats, mean1: Floats, covariance
     Parameters
     ----------
     mean0, mean1 : ndarray of shape (n,)
-        Of the positive and of the negative Gaussian.
+        Means of the positive and of the negative Gaussian.
     covariance0, covariance1 : ndarray of shape (n, n)
+        Their covariances.
 
     Returns
     -------
     float
-        In [0, 1]; 0 if no c above zero will do.
+        In [0, 1]; 0 if the difference is a density for no c above zero.
     """
     widths, axes = np.linalg.eigh(covariance0 - covariance1)  # [n], [n, n]
     d = axes.T @ (mean1 - mean0)  # [n]
@@ -83,6 +104,8 @@ def negated(sh_dc: Floats, sh_rest: Floats) -> tuple[Floats, Floats]:
     Parameters
     ----------
     sh_dc : ndarray of shape (N, 3)
+        c_0.
     sh_rest : ndarray of shape (N, K-1, 3)
+        c_1 and above.
     """
     return -sh_dc - sh_dc.dtype.type(1 / SH_C0), -sh_rest

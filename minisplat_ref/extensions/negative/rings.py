@@ -1,11 +1,12 @@
-"""One Gaussian less another against sums of positive ones: rings of several thicknesses, without compositing.
+"""The study ``negative/rings``: differences of two Gaussians against sums of positive ones, without compositing.
 
-The setting of the paper's argument: in a plane, ``f(x) = sum_k s_k w_k exp(-|L_k (x - m_k)|^2 / 2)`` with signs s_k
-that are given, and everything else fitted to the picture of a ring by least squares. The fit is not convex, so it
-starts several times, and the best counts.
+This is the setting of the paper's argument. In a plane, ``f(x) = sum_k s_k w_k exp(-|L_k (x - m_k)|^2 / 2)`` has given
+signs s_k, and everything else is fitted to the picture of a ring by least squares. The fit is not convex, so it starts
+several times, and the best result counts.
 
-What a pair is worth depends on how high its two Gaussians may be. The best pair of all is two huge ones that all but
-cancel, the derivative of a Gaussian with respect to its width; so the pair is fitted with two bounds of the heights.
+The quality of a pair depends on the allowed heights of its two Gaussians. The best pair of all consists of two huge
+ones that almost cancel, the derivative of a Gaussian with respect to its width; so the pair is fitted with two bounds
+of the heights.
 """
 
 from typing import Any, NamedTuple
@@ -21,13 +22,13 @@ from minisplat_ref.types import Floats
 OUTER = 0.7  # radius; the picture is the square from -1 to 1
 THICKNESSES = (0.9, 0.75, 0.6, 0.45, 0.3, 0.2)  # of the ring, in units of its outer radius
 BLUR = 0.04  # standard deviation of the edges
-SIZE = 32  # samples a side
+SIZE = 32  # samples per side
 PARAMETERS = ("a", "m_x", "m_y", "L_xx", "L_yy", "L_yx")
 EVALUATIONS = 200  # at most, of one fit
 
 
 class Sum(NamedTuple):
-    """Which Gaussians are summed."""
+    """The Gaussians of a sum."""
 
     signs: tuple[int, ...]
     height_max: float  # of each; the ring's is 1
@@ -75,9 +76,11 @@ def hills(parameters: Floats, model: Sum, points: Floats) -> tuple[Floats, Float
     Parameters
     ----------
     parameters : ndarray of shape (K, 6)
-        In the order of ``PARAMETERS``; L is lower triangular, and of any sign.
+        In the order of ``PARAMETERS``; L is lower triangular, and its entries may have any sign.
     model : Sum
+        Signs and bounds of the heights.
     points : ndarray of shape (P, 2)
+        x.
 
     Returns
     -------
@@ -120,7 +123,7 @@ def fitted(target: Floats, model: Sum, n_starts: int, rng: np.random.Generator) 
 
 
 def _start(model: Sum, rng: np.random.Generator) -> Floats:
-    """Draw parameters [K, 6]: round, of a third to all of the ring's size, anywhere in it, of height 0.7."""
+    """Draw parameters [K, 6] of round Gaussians anywhere in the ring, of a third to all of its size and height 0.7."""
     n = len(model.signs)
     L = np.exp(rng.uniform(0, np.log(3), n)) / OUTER  # [K]
     centres = rng.uniform(-OUTER, OUTER, (n, 2)) / np.sqrt(2)
@@ -128,7 +131,7 @@ def _start(model: Sum, rng: np.random.Generator) -> Floats:
 
 
 def measure(n_seeds: int, n_starts: int) -> dict[float, dict[str, list[Fit]]]:
-    """Return the fits by thickness and model, one for each seed."""
+    """Return the fits by thickness and model, one per seed."""
     return {
         thickness: {
             name: [fitted(ring(thickness), model, n_starts, np.random.default_rng(seed)) for seed in range(n_seeds)]
@@ -176,7 +179,7 @@ def _panel(axes: Axes, picture: Floats, title: str) -> None:
 
 
 def summarise(fits: dict[float, dict[str, list[Fit]]]) -> dict[str, Any]:
-    """Return the figures of the table."""
+    """Return the content of ``result.json``."""
     psnrs = {name: [[fit.psnr for fit in fits[t][name]] for t in THICKNESSES] for name in MODELS}
     means = {name: [float(np.mean(values)) for values in rows] for name, rows in psnrs.items()}
     return {

@@ -1,6 +1,6 @@
-"""The claims as studies: where a difference of Gaussians helps, and what it does not do in compositing.
+"""The studies of this extension: where a difference of Gaussians helps, and what it does not do in compositing.
 
-Both write ``result.json`` and ``figure.png`` into a new folder, and print a Markdown table.
+Both write ``result.json`` and ``figure.png`` to a new folder and print a Markdown table.
 """
 
 import argparse
@@ -25,8 +25,8 @@ PNG_DPI = 150
 def add_ring_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--out``, ``--seeds`` and ``--starts``."""
     _add_out(parser)
-    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="from 0 on, for the starts (default 3)")
-    parser.add_argument("--starts", type=int, default=16, metavar="N", help="of each fit; the best counts (default 16)")
+    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="number of seeds, from 0 on (default 3)")
+    parser.add_argument("--starts", type=int, default=16, metavar="N", help="per fit; the best counts (default 16)")
 
 
 def run_rings(args: argparse.Namespace) -> None:
@@ -48,7 +48,7 @@ def run_rings(args: argparse.Namespace) -> None:
         [f"{thickness}", *(_mean_and_spread(result["psnr"][name][t]) for name in rings.MODELS)]
         for t, thickness in enumerate(rings.THICKNESSES)
     ]
-    print("PSNR (dB) of the best fit: mean of the seeds, and half of their range\n")
+    print("PSNR (dB) of the best fit: mean over the seeds ± half their range\n")
     print(markdown_table(["thickness / outer radius", *rings.MODELS], rows))
     print()
     for pair, others in result["crossings"].items():
@@ -59,12 +59,12 @@ def run_rings(args: argparse.Namespace) -> None:
 def add_backdrop_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--out``, ``--seed`` and ``--starts``."""
     _add_out(parser)
-    parser.add_argument("--seed", type=int, default=0, metavar="S", help="of the starts (default 0)")
-    parser.add_argument("--starts", type=int, default=4, metavar="N", help="of each fit; the best counts (default 4)")
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the starts (default 0)")
+    parser.add_argument("--starts", type=int, default=4, metavar="N", help="per fit; the best counts (default 4)")
 
 
 def run_backdrop(args: argparse.Namespace) -> None:
-    """Fit a ring before a black wall and before a dotted one.
+    """Fit a ring in front of a black wall and of a dotted one.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def run_backdrop(args: argparse.Namespace) -> None:
         for wall, cases in result.items()
         for case, fit in cases.items()
     ]
-    heading = ["wall", "Gaussians of the ring", "PSNR (dB)", "in the hole", "what the hole lets through"]
+    heading = ["wall", "Gaussians of the ring", "PSNR (dB)", "in the hole", "transmittance of the hole"]
     print(markdown_table(heading, rows))
 
 
@@ -109,7 +109,7 @@ def _write(folder: Path, result: dict[str, Any], figure: "Figure") -> None:
 
 
 STUDIES = (
-    Study("rings", "one Gaussian less another against 2 to 4 positive ones", add_ring_arguments, run_rings),
-    Study("backdrop", "a ring's hole: negative colours do not see through", add_backdrop_arguments, run_backdrop),
+    Study("rings", "one Gaussian minus another against 2 to 4 positive ones", add_ring_arguments, run_rings),
+    Study("backdrop", "the hole of a ring: negative colours do not open it", add_backdrop_arguments, run_backdrop),
 )
-"""``negative/rings`` and ``negative/backdrop``."""
+"""The studies ``negative/rings`` and ``negative/backdrop``."""

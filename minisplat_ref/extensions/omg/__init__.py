@@ -1,35 +1,36 @@
 """OMG: few Gaussians, chosen by how they differ from their neighbours, in sub-vector codebooks.
 
-Optimized Minimal Gaussians, Lee et al. 2025, arXiv 2503.16924. Mini-Splatting keeps what is important to the
-photographs. Of two important Gaussians side by side that look alike, one would do. So the score that Gaussians are kept
-by has the difference of a Gaussian's colour from its neighbours' in Morton order as a factor
+This follows Optimized Minimal Gaussians, Lee et al. 2025, arXiv 2503.16924. Mini-Splatting keeps what is important to
+the photographs, but of two important Gaussians side by side that look alike, one would do. So the pruning score is
+multiplied by the difference of a Gaussian's colour from its neighbours' in Morton order
 (:mod:`minisplat_ref.extensions.omg.reference`),
 
     S_i = I_i LD_i^lambda,   LD_i = mean_channels |c_i - c_prev| + |c_i - c_next|,   lambda = 2
 
-and the Gaussians of the largest scores that carry 99 % of all stay (:mod:`minisplat_ref.extensions.omg.method`). What
-is left is stored with few attributes: three numbers of colour and a few features, which a decoder that all share makes
-into spherical harmonics (:mod:`minisplat_ref.extensions.omg.appearance`); and each group of numbers in parts, with a
-codebook for each part (:mod:`minisplat_ref.extensions.omg.svq`). ``.omg`` is the file
-(:mod:`minisplat_ref.extensions.omg.file`).
+and the Gaussians of the largest scores that together carry 99 % of the sum stay
+(:mod:`minisplat_ref.extensions.omg.method`). They are stored with few attributes. The appearance has three numbers of
+colour and a few features, from which a shared decoder computes the spherical harmonics
+(:mod:`minisplat_ref.extensions.omg.appearance`). Each vector is split into parts, with a codebook for each part
+(:mod:`minisplat_ref.extensions.omg.svq`). ``.omg`` is the file (:mod:`minisplat_ref.extensions.omg.file`).
 
     minisplat-ref train SCENE --recipe omg --out runs/small
     minisplat-ref convert runs/small small.omg
     minisplat-ref study omg/distinctiveness room --out DIR
 
-Measured (``study omg/distinctiveness``): of half the Gaussians, distinctiveness gains 0.3 dB on the room and on the
-fox, because the textured half of the pixels gains more (0.7 and 0.4 dB) than the flat half loses (1.6 and 0.3 dB, of a
-far smaller error). Of an eighth, it gains 1.2 dB on the room and loses 0.7 dB on the fox, where the flat half is 2.1 dB
-worse. Before fine-tuning it is worse everywhere. A file with the paper's codebooks loses 0.35 and 0.87 dB, of which the
-three features of the harmonics alone make 0.28 and 0.59. At these sizes the codebooks do not pay: the fox, 10,250
-Gaussians after 300 iterations, takes 112 kB and loses 0.68 dB at level 3; the coarsest ``.msz`` of 112 kB loses 0.45.
+Measured (``study omg/distinctiveness``): when half the Gaussians are kept, distinctiveness gains 0.3 dB on the room and
+on the fox, because the textured half of the pixels gains more (0.7 and 0.4 dB) than the flat half, whose error is far
+smaller, loses (1.6 and 0.3 dB). When an eighth is kept, it gains 1.2 dB on the room and loses 0.7 dB on the fox, where
+the flat half is 2.1 dB worse. Before fine-tuning it is worse everywhere. A file with the paper's codebooks loses 0.35
+and 0.87 dB, of which the three features of the harmonics alone cost 0.28 and 0.59. At these sizes the codebooks do not
+pay: the fox, 10,250 Gaussians after 300 iterations, takes 112 kB and loses 0.68 dB at level 3, where the coarsest
+``.msz``, also of 112 kB, loses 0.45.
 
-Where this deviates: the paper's networks, trained from iteration 15,000 on, are a linear decoder here that is fitted
-when the file is written, and opacity, which a network makes there, has a codebook. The paper trains for 1,000 more
-iterations with the codes; here they are fitted afterwards, and nothing is trained. Centres are packed by differences in
-Morton order instead of a coder of point clouds, indices by zstandard instead of Huffman's code and xz. The released
-code seems to use the sorting permutation where its inverse is meant, which is the same only if the rows are sorted
-already; here it is the inverse.
+This deviates from the paper in four ways. The paper's networks, trained from iteration 15,000 on, are replaced by a
+linear decoder that is fitted when the file is written; opacity, which a network computes there, has a codebook. The
+paper trains for 1,000 more iterations with the codes; here they are fitted after the training. Centres are packed as
+differences in Morton order instead of by a point-cloud coder, and indices by zstandard instead of Huffman coding and
+xz. The released code seems to use the sorting permutation where its inverse is meant, which is the same only if the
+rows are sorted already; here it is the inverse.
 """
 
 from minisplat_ref.extensions.extension import Extension
@@ -38,4 +39,4 @@ from minisplat_ref.extensions.omg.method import OMG
 from minisplat_ref.extensions.omg.study import DISTINCTIVENESS
 
 EXTENSION = Extension("omg", recipes=(OMG,), formats=(OMG_FILE,), studies=(DISTINCTIVENESS,))
-"""A recipe, a format and a study."""
+"""The recipe ``omg``, the format ``.omg`` and a study."""

@@ -1,11 +1,11 @@
-"""Few attributes for view-dependent colour: the higher harmonics of a scene, [N, 45], as a few features and a decoder.
+"""View-dependent colour in few numbers: the higher harmonics of a scene, [N, 45], as features and a shared decoder.
 
 With the mean m of all rows and orthonormal rows b_k, the principal directions,
 
     h_i = m + sum_k f_ik b_k,   f_ik = b_k . (h_i - m)
 
-is the linear decoder of the least squared error for its number of features. It stands where the paper has small
-networks, which read a position and three features and are trained with the scene.
+is the linear decoder with the least squared error for its number of features (principal component analysis). It
+replaces the paper's small networks, which read a position and three features and are trained with the scene.
 """
 
 from typing import NamedTuple
@@ -16,7 +16,7 @@ from minisplat_ref.types import Floats
 
 
 class Decoder(NamedTuple):
-    """From features to harmonics; float16, as it is stored."""
+    """A linear map from features to harmonics, in float16 as it is stored."""
 
     mean: Floats
     """[D] m."""
@@ -30,7 +30,15 @@ class Decoder(NamedTuple):
 
 
 def fitted_decoder(harmonics: Floats, n_features: int) -> Decoder:
-    """Return the best linear decoder of harmonics [N, D]; with fewer features where D or N are fewer."""
+    """Return the linear decoder of harmonics [N, D] with the least squared error.
+
+    Parameters
+    ----------
+    harmonics : ndarray of shape (N, D)
+        h.
+    n_features : int
+        F; it is reduced to D or N where these are smaller.
+    """
     n, d = harmonics.shape
     rows = harmonics.astype(np.float64)
     mean = rows.mean(axis=0) if n else np.zeros(d)
@@ -40,6 +48,6 @@ def fitted_decoder(harmonics: Floats, n_features: int) -> Decoder:
 
 
 def features_of(harmonics: Floats, decoder: Decoder) -> Floats:
-    """Return the features [N, F] of harmonics [N, D], float64."""
+    """Return the features ``f_ik = b_k . (h_i - m)`` [N, F] of harmonics [N, D], float64."""
     mean, directions = decoder.mean.astype(np.float64), decoder.directions.astype(np.float64)
     return (harmonics.astype(np.float64) - mean) @ directions.T

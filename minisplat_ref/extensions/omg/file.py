@@ -1,17 +1,17 @@
-"""``.omg``: centres as halves in Morton order, and everything else as codes of small codebooks.
+"""``.omg``: centres as half floats in Morton order, and everything else as codes of small codebooks.
 
 ===============  ==================  =======================================================================
 centres          half floats         of the offset from the scene's median; packed as differences
-scales           1 number a part     their logarithms
-rotations        2 numbers a part    unit quaternions with w >= 0, in (w, x) and (y, z)
-opacity          1 number a part     its logit; the paper's is the output of a network
-appearance       2 numbers a part    degree 0 (3 numbers) and the features of the higher harmonics
+scales           1 number per part   their logarithms
+rotations        2 numbers per part  unit quaternions with w >= 0, in (w, x) and (y, z)
+opacity          1 number per part   its logit; in the paper a network computes it
+appearance       2 numbers per part  degree 0 (3 numbers) and the features of the higher harmonics
 ===============  ==================  =======================================================================
 
-Codebooks and decoder are half floats. Indices and centres are planes of bytes that zstandard packs, where the paper has
-Huffman's code, a coder of point clouds and xz. There is no bound of the error but what the codebooks give; ``describe``
-says how many codes there are. Decoding gives the same Gaussians on every machine but for the last bit of the higher
-harmonics, which are a product of matrices.
+Codebooks and decoder are half floats. Indices and centres are planes of bytes that zstandard packs, where the paper
+uses Huffman coding, a point-cloud coder and xz. The error has no bound other than the codebooks; ``describe`` says how
+many codes there are. Decoding gives the same Gaussians on every machine except for the last bit of the higher
+harmonics, which are a matrix product.
 """
 
 import math
@@ -25,7 +25,7 @@ from minisplat_ref.constants import SH_DEGREE_MAX
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.omg.appearance import Decoder, features_of, fitted_decoder
 from minisplat_ref.extensions.omg.svq import Quantised, quantise
-from minisplat_ref.extensions.shared_container import WAY_OUT, Container, Packed, is_count, pack, take_apart, unpack
+from minisplat_ref.extensions.shared_container import WAY_OUT, Container, Packed, is_count, pack, parse, unpack
 from minisplat_ref.extensions.shared_morton import morton_order
 from minisplat_ref.extensions.shared_planes import MOST_PLANES, from_planes, to_planes, unzigzag, zigzag
 from minisplat_ref.io.formats import Format
@@ -36,19 +36,19 @@ CONTAINER = Container(b"OMG\n", version=1)
 MOST_GAUSSIANS = 2**31 - 1
 MOST_CODES = 2**16
 LARGEST_HALF = 65504.0
-FARTHEST = 1e30  # that a scene's median may be from the origin, along an axis
-LEAST_QUAT = 2.0**-10  # of a part (w, x) whose code would be zero, since the other may be zero, too
+FARTHEST = 1e30  # distance of a scene's median from the origin along an axis
+LEAST_QUAT = 2.0**-10  # replaces w in a code (w, x) of zero, since (y, z) may be zero, too
 
 
 class Sizes(NamedTuple):
-    """Codes of each codebook, and features of the higher harmonics."""
+    """Number of codes in each codebook, and number of features of the higher harmonics."""
 
     scales: int
     rotations: int
     opacities: int
     appearance: int
     n_features: int
-    """Odd, so that with three colours there are whole pairs."""
+    """Odd, so that together with three colours it is even and splits into pairs."""
 
 
 LEVELS = (
@@ -63,7 +63,14 @@ WIDTHS = {"scales": 1, "rotations": 2, "opacities": 1, "appearance": 2}
 
 
 def encode(gaussians: Gaussians, level: int) -> bytes:
-    """Return the Gaussians as a file.
+    """Return the content of a file that holds the Gaussians.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        N Gaussians; N may be 0.
+    level : int
+        Index into ``LEVELS``.
 
     Raises
     ------
@@ -123,20 +130,20 @@ def _center(gaussians: Gaussians) -> Floats:
 
 
 def order_of(gaussians: Gaussians) -> Ints:
-    """Return the rows [N] of the Gaussians in the order in which a file has them."""
+    """Return the rows [N] of the Gaussians in the order of a file."""
     return morton_order(_halves(gaussians.means - _center(gaussians), "means"))
 
 
 def _halves(values: Floats, name: str) -> Floats:
     if not np.abs(values).max(initial=0.0) <= LARGEST_HALF:
         raise InputError(
-            f"{name} reach {np.abs(values).max():.3g}, and half floats {LARGEST_HALF:g}: choose another format"
+            f"{name} reach {np.abs(values).max():.3g}, but half floats {LARGEST_HALF:g}: choose another format"
         )
     return values.astype(np.float16)
 
 
 def _integers(offsets: Floats, quantised: Mapping[str, Quantised]) -> dict[str, Any]:
-    """Return what is packed as planes: differences of the centres' ordered bit patterns, and indices."""
+    """Return the integers that are packed as planes: differences of the centres' ordered bit patterns, and indices."""
     bits = offsets.view(np.int16).astype(np.int64)
     ordered = np.where(bits < 0, -(bits & 0x7FFF), bits)  # ascending as the halves are; both zeros are 0
     return {
@@ -148,12 +155,19 @@ def _integers(offsets: Floats, quantised: Mapping[str, Quantised]) -> dict[str, 
 def decode(content: bytes, source: str | Path) -> Gaussians:
     """Return the Gaussians of a file, float32.
 
+    Parameters
+    ----------
+    content : bytes
+        The whole file.
+    source : str or Path
+        Its name, for messages.
+
     Raises
     ------
     InputError
         The file is damaged, or of another kind or version.
     """
-    packed = take_apart(CONTAINER, content, source)
+    packed = parse(CONTAINER, content, source)
     header = _checked(packed)
     n, n_rest = header.n, (header.sh_degree + 1) ** 2 - 1
     differences = unzigzag(_planes(packed, header, "means", 3))
@@ -179,7 +193,7 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
 
 
 class _Header(NamedTuple):
-    """What a header says, checked."""
+    """The checked content of a header."""
 
     n: int
     sh_degree: int
@@ -207,7 +221,7 @@ def _vectors(packed: Packed, header: _Header, name: str) -> Floats:
 
 
 def _checked(packed: Packed) -> _Header:
-    """Return the header, of which everything that is read has been looked at."""
+    """Return the header after checking every value that is read."""
     values = {name: packed.header.get(name) for name in _Header._fields}
     n, degree, level, center, n_features, codes, planes = values.values()
     is_right = (
@@ -237,14 +251,14 @@ def _checked(packed: Packed) -> _Header:
 
 
 def describe(content: bytes, source: str | Path) -> list[tuple[str, str]]:
-    """Return the level of a file and its codebooks.
+    """Return the level of a file and its codebooks, as pairs of name and text.
 
     Raises
     ------
     InputError
-        As for :func:`decode`, of the header.
+        The header is refused, as by :func:`decode`.
     """
-    header = _checked(take_apart(CONTAINER, content, source))
+    header = _checked(parse(CONTAINER, content, source))
     rows = [("level", f"{header.level} of {len(LEVELS) - 1}")]
     rows += [("centres", "half floats of the offset from the median")]
     rows += [(name, f"{', '.join(map(str, counts))} codes") for name, counts in header.codes.items()]
@@ -260,4 +274,4 @@ OMG_FILE = Format(
     decode=decode,
     describe=describe,
 )
-"""The format."""
+"""The format ``.omg``."""

@@ -1,4 +1,4 @@
-"""The event that prunes what is neither important nor distinct, and the recipe that has it."""
+"""The event that prunes what is neither important nor distinct, and the recipe that uses it."""
 
 from functools import partial
 
@@ -12,15 +12,16 @@ from minisplat_ref.training.schedule import action_name
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
 
 POWER = 2.0  # lambda
-MASS = 0.99  # tau of the model that the paper calls M; 0.96 is XS, 0.9999 XL
+MASS = 0.99  # tau of the paper's model M; XS has 0.96, XL 0.9999
 
 
 def prune_indistinct(
     state: TrainState, iteration: Iteration, *, metric: Metric, distinct_mass: float, distinct_power: float
 ) -> str | None:
-    """Keep the Gaussians of the largest scores that together carry ``distinct_mass`` of them all.
+    """Keep the Gaussians of the largest scores that together carry the fraction ``distinct_mass`` of the sum.
 
-    The score is ``importance distinctiveness^distinct_power``; what dominates no pixel of a training view has none.
+    The score is ``importance distinctiveness^distinct_power``; Gaussians that dominate no pixel of a training view have
+    none.
     """
     stats = measure_importance(state, iteration)
     important = candidates(stats, metric, 0, is_intersecting=True)  # [N]
@@ -41,4 +42,4 @@ OMG = MINI_SPLATTING._replace(
         for event in MINI_SPLATTING.events
     ),
 )
-"""``omg``: Mini-Splatting, whose last pruning goes by distinctiveness, too."""
+"""The recipe ``omg``: Mini-Splatting whose last pruning also considers distinctiveness."""

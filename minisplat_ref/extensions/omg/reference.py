@@ -1,11 +1,11 @@
-"""How distinct a Gaussian is from its neighbours, and the score that Gaussians are kept by.
+"""The distinctiveness of a Gaussian from its neighbours, and the pruning score.
 
 With the colours c_i of degree 0, in Morton order of the centres::
 
     LD_i = 1/3 sum_channels |c_i - c_prev| + |c_i - c_next|
     S_i  = I_i LD_i^lambda
 
-Morton order stands for a search of neighbours: it costs a sort. It misses neighbours across the faces of large cells.
+Morton order replaces a neighbour search and costs only a sort. It misses neighbours across the faces of large cells.
 """
 
 import numpy as np
@@ -22,12 +22,12 @@ def local_distinctiveness(means: Floats, colors: Floats) -> Floats:
     means : ndarray of shape (N, 3)
         World frame.
     colors : ndarray of shape (N, 3)
-        Coefficients of degree 0, or any other colours; features of any number of channels will do.
+        Coefficients of degree 0, or any other features; the number of channels is arbitrary.
 
     Returns
     -------
     ndarray of shape (N,)
-        LD, float64, not negative. At both ends of the order the only neighbour counts twice; 0 for N = 1.
+        LD, float64, not negative. At either end of the order the only neighbour counts twice; 0 for N = 1.
     """
     n = len(means)
     if n < 2:

@@ -1,12 +1,12 @@
-"""The study ``omg/distinctiveness``: what to keep of a scene, and what the rest costs as a file.
+"""The study ``omg/distinctiveness``: which Gaussians of a scene to keep, and what they cost as a file.
 
-A scene is trained by Mini-Splatting2, or given. Of its Gaussians that dominate a pixel, the same number is kept by
-importance alone and by importance times distinctiveness squared; both are fine-tuned for the same number of
-iterations, without any event. Then each is written as ``.omg`` and read again. Of the whole population each field by
-itself is taken from such a file, at every level, which says where the quality goes.
+The Gaussians come from a training with Mini-Splatting2 or from a PLY. Of those that dominate a pixel, equally many are
+kept by importance alone and by importance times distinctiveness squared; both selections are fine-tuned for the same
+number of iterations, without any event. Then each is written as ``.omg`` and read again. For the whole population, each
+field by itself is taken from such a file at every level, which shows where the quality is lost.
 
-Where does distinctiveness hurt? Pixels of the test photographs are told apart by their gradient: the flatter half of
-each photograph, and the rest. What has neighbours of its own colour is what flat regions are made of.
+Distinctiveness hurts flat regions, because these consist of Gaussians whose neighbours have the same colour. So the
+study splits the pixels of each test photograph by their gradient into the flatter half and the rest.
 """
 
 import argparse
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FRACTIONS = (0.5, 0.25, 0.125)
-FINE_TUNING = "3dgs"  # its learning rates, from the first to the last
+FINE_TUNING = "3dgs"  # the recipe whose learning rates are used, from the first to the last
 CHOICES = {"importance": 0.0, "with distinctiveness": POWER}
-"""What is kept, by the power of distinctiveness in the score."""
+"""The selections, with the power of distinctiveness in their score."""
 COLORS = dict(zip(CHOICES, (shared.BLUE, shared.RED), strict=True))
 
 
@@ -40,19 +40,21 @@ class Quality(NamedTuple):
 
     psnr: float
     flat: float
-    """Of the flatter half of the pixels of each view."""
+    """Over the flatter half of the pixels of each view."""
     textured: float
-    """Of the others."""
+    """Over the other half."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the study."""
     shared.add_scene_arguments(parser, iterations=1000, recipe="mini-splatting2")
-    parser.add_argument("--fine-tune", type=int, default=200, metavar="M", help="iterations afterwards (default 200)")
+    parser.add_argument(
+        "--fine-tune", type=int, default=200, metavar="M", help="iterations of fine-tuning (default 200)"
+    )
 
 
 def run(args: argparse.Namespace) -> None:
-    """Train, prune, fine-tune, measure, write, print the table.
+    """Train, prune, fine-tune, measure, write the results, and print the tables.
 
     Raises
     ------
@@ -94,7 +96,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def measured(whole: Gaussians, scene: Scene, iterations: int, seed: int) -> list[dict[str, Any]]:
-    """Return a row for the whole population, and one for each fraction and choice."""
+    """Return the measurements of the whole population, and of each fraction and choice."""
     from tqdm import tqdm
 
     from minisplat_ref.strategy.importance import collect_importance, indoor
@@ -107,7 +109,7 @@ def measured(whole: Gaussians, scene: Scene, iterations: int, seed: int) -> list
     tuned = fine_tuned(whole, scene, iterations, seed)
     rows = [_row("all", "", quality(whole, scene), tuned, scene)]
     jobs = [(fraction, choice) for fraction in FRACTIONS for choice in CHOICES]
-    for fraction, choice in tqdm(jobs, desc=f"fine-tunings, seed {seed}", leave=False):
+    for fraction, choice in tqdm(jobs, desc=f"fine-tunings, seed {seed}", leave=False, disable=None):
         score = distinct_importance(importance, distinctiveness, CHOICES[choice])
         n = max(1, round(fraction * np.count_nonzero(importance)))
         kept = take(whole, most_important(score, min(n, np.count_nonzero(score))))
@@ -130,7 +132,7 @@ def _row(kept: str, choice: str, at_once: Quality, tuned: Gaussians, scene: Scen
 
 
 def losses_of_fields(gaussians: Gaussians, scene: Scene) -> dict[str, list[float]]:
-    """Return, for each field, the dB that are lost at each level when that field alone is what a file holds."""
+    """Return the loss at each level, dB, when one field alone is taken from a file; by field."""
     from minisplat_ref.strategy.ops import take
 
     whole = take(gaussians, order_of(gaussians))
@@ -144,7 +146,7 @@ def losses_of_fields(gaussians: Gaussians, scene: Scene) -> dict[str, list[float
 
 
 def fine_tuned(gaussians: Gaussians, scene: Scene, iterations: int, seed: int) -> Gaussians:
-    """Return the Gaussians after some iterations with all stored colour and without events; these stay as they are."""
+    """Return the Gaussians after fine-tuning with all stored harmonics and without events; the input is not changed."""
     from minisplat_ref.methods import get_recipe
     from minisplat_ref.training.adam import zero_moments
     from minisplat_ref.training.loop import train
@@ -160,7 +162,7 @@ def fine_tuned(gaussians: Gaussians, scene: Scene, iterations: int, seed: int) -
 
 
 def quality(gaussians: Gaussians, scene: Scene) -> Quality:
-    """Measure all pixels of the test views, the flatter half of each, and the others; means over the views."""
+    """Return the mean PSNR over the test views of all pixels, of the flatter half of each view, and of the rest."""
     from minisplat_ref.metrics import ViewMetrics, evaluate, psnr
 
     found = []
@@ -203,7 +205,7 @@ def to_rows(runs: list[list[dict[str, Any]]]) -> list[list[str]]:
 
 
 def draw(result: dict[str, Any]) -> "Figure":
-    """Draw PSNR against the part that is kept, what distinctiveness changes in either half, and bytes against PSNR."""
+    """Draw PSNR against the fraction kept, the gain of distinctiveness in either half, and PSNR against bytes."""
     from matplotlib.figure import Figure
 
     runs = result["runs"]
@@ -229,8 +231,8 @@ def draw(result: dict[str, Any]) -> "Figure":
         axes.set_xticks(FRACTIONS, [f"{100 * fraction:g} %" for fraction in FRACTIONS])
         axes.minorticks_off()
     kept.set(ylabel="PSNR (dB)", title=result["scene"])
-    halves.set(ylabel="PSNR gained by distinctiveness (dB)", title="where it helps, where it hurts")
-    size.set(xlabel="kB of .omg", ylabel="PSNR of what is read again (dB)", title="bytes, and quality", ylim=None)
+    halves.set(ylabel="PSNR gained by distinctiveness (dB)", title="where it helps and where it hurts")
+    size.set(xlabel="kB of .omg", ylabel="PSNR when read again (dB)", title="bytes and quality", ylim=None)
     for axes in (kept, halves, size):
         shared_studies.tidy(axes)
         axes.legend(frameon=False, fontsize=8)
@@ -253,7 +255,7 @@ def _over_seeds(
 
 
 def _gain(runs: list[list[dict[str, Any]]], half: str) -> tuple[Floats, Floats]:
-    """Return what distinctiveness gains in a half of the pixels after fine-tuning: means and deviations by fraction."""
+    """Return the gain of distinctiveness in a half of the pixels after fine-tuning: mean and deviation by fraction."""
     plain, distinct = CHOICES
     gains = [
         [b["tuned"][half] - a["tuned"][half] for a, b in zip(_of(rows, plain), _of(rows, distinct), strict=True)]
@@ -269,7 +271,5 @@ def _of(rows: list[dict[str, Any]], choice: str) -> list[dict[str, Any]]:
     return [row for row in rows if row["choice"] == choice]
 
 
-DISTINCTIVENESS = Study(
-    "distinctiveness", "which Gaussians to keep: 50, 25 and 12.5 %; flat and textured", add_arguments, run
-)
-"""``omg/distinctiveness``."""
+DISTINCTIVENESS = Study("distinctiveness", "which 50, 25 and 12.5 % of the Gaussians to keep", add_arguments, run)
+"""The study ``omg/distinctiveness``."""

@@ -1,15 +1,15 @@
-"""Sub-vector quantisation: a vector in parts, and a codebook of its own for each part.
+"""Sub-vector quantisation: vectors are split into parts, and each part has a codebook of its own.
 
-A vector of d numbers becomes d / w parts of w numbers, and each part the number of the nearest of its K codes. So d / w
+A vector of d numbers becomes d / w parts of w numbers, and each part the index of the nearest of its K codes. So d / w
 times log2 K bits choose among K^(d / w) vectors, while only K d numbers are stored. One codebook for whole vectors
-would have to hold K^(d / w) codes to be as fine; at equal and *low* rates, though, it is the better one, since it knows
-which parts go together.
+would need K^(d / w) codes to be as fine; at equal and *low* rates, though, it is the better one, since it can exploit
+the dependence between parts.
 
-Codes are found by Lloyd's iteration: assign each vector to the nearest code, move each code to the mean of its own.
-Where codes begin decides what becomes of the rare vectors. Begun at random vectors, most codes are in the crowd and a
-dozen iterations do not bring them out of it: of 10,250 Gaussians' log scales with 64 codes each, the worst was off by
-1.53. Here they begin evenly over the space that vectors occupy: 0.11, and a tenth of the decibels are lost. Nothing is
-drawn, so the same vectors have the same codes.
+Codes are fitted by Lloyd's algorithm, which assigns each vector to the nearest code and moves each code to the mean of
+its vectors. The initial codes decide how well rare vectors fare. With random vectors as initial codes, most codes lie
+where vectors are dense, and a dozen iterations do not move them out: for the log scales of 10,250 Gaussians with 64
+codes each, the largest error was 1.53. Here codes start evenly over the space that vectors occupy. The largest error is
+0.11, and a tenth of the decibels are lost. Nothing is random, so the same vectors have the same codes.
 """
 
 from typing import NamedTuple
@@ -20,12 +20,12 @@ from scipy.spatial import cKDTree
 from minisplat_ref.types import Floats, Ints
 
 ITERATIONS = 12
-MOST_BITS = 50  # of cells a side
-MOST_SAMPLES = 1 << 17  # vectors that codes are fitted to, evenly from all
+MOST_BITS = 50  # log2 of the cells per side
+MOST_SAMPLES = 1 << 17  # vectors to which codes are fitted, evenly spaced among all
 
 
 class Quantised(NamedTuple):
-    """Vectors as codes."""
+    """Vectors as indices into codebooks."""
 
     codes: tuple[Floats, ...]
     """A codebook [K, w] of float16 for each part; K may be less than was allowed."""
@@ -39,16 +39,16 @@ class Quantised(NamedTuple):
 
 
 def quantise(vectors: Floats, width: int, n_codes: int) -> Quantised:
-    """Return the vectors with each part replaced by a code.
+    """Return the vectors with each part replaced by the index of a code.
 
     Parameters
     ----------
     vectors : ndarray of shape (N, D)
         Finite, at most 65504 in magnitude, which is what float16 holds.
     width : int
-        w, numbers of a part; divides D.
+        w, numbers per part; it divides D.
     n_codes : int
-        K, codes of each part at most.
+        K, the largest number of codes per part.
     """
     codes, indices = [], []
     for begin in range(0, vectors.shape[1], width):
@@ -60,11 +60,11 @@ def quantise(vectors: Floats, width: int, n_codes: int) -> Quantised:
 
 
 def fitted_codes(vectors: Floats, n_codes: int) -> Floats:
-    """Return at most K codes [K, w] for vectors [N, w]; the vectors themselves where no more than K are different."""
+    """Return at most K codes [K, w] for vectors [N, w]; if no more than K vectors differ, these are the codes."""
     different = np.unique(vectors[:: -(-len(vectors) // MOST_SAMPLES) or 1], axis=0)
     if len(different) <= n_codes:
         return different
-    codes = _spread(different, n_codes)
+    codes = _initial_codes(different, n_codes)
     for _ in range(ITERATIONS):
         rows = _nearest(codes, different)
         counts = np.bincount(rows, minlength=n_codes)
@@ -73,8 +73,8 @@ def fitted_codes(vectors: Floats, n_codes: int) -> Floats:
     return codes
 
 
-def _spread(vectors: Floats, n_codes: int) -> Floats:
-    """Return vectors [K, w] that lie evenly in the space that all occupy: one of a cell, of cells just small enough."""
+def _initial_codes(vectors: Floats, n_codes: int) -> Floats:
+    """Return vectors [K, w] spread evenly over the occupied space: one per cell, of the largest cells that give K."""
     low = vectors.min(axis=0)
     side = float((vectors.max(axis=0) - low).max())
     for bits in range(1, MOST_BITS):

@@ -1,4 +1,4 @@
-"""Random Gaussians and the cameras of the studies, and what is measured of them."""
+"""The random Gaussians, cameras and measurements of the studies."""
 
 from typing import Any
 
@@ -9,13 +9,13 @@ from minisplat_ref.constants import EXACT_ORDER, GSPLAT_MAIN, LIST_ORDER, Conven
 from minisplat_ref.extensions.shared_studies import tidy
 from minisplat_ref.extensions.shared_tangent_planes import hit, project
 from minisplat_ref.extensions.shared_tangent_rays import (
-    WAYS,
+    METHODS,
+    color_changes,
     ewa_hits,
     misordered_pairs,
-    moved,
-    steps_along,
     tangent_hits,
-    turned,
+    translated,
+    yawed,
 )
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.reference.hits import blending_order
@@ -24,7 +24,7 @@ from minisplat_ref.types import Camera, Floats, Primitives
 BARE = GSPLAT_MAIN._replace(eps2d=0.0)
 ANGLES = (0.0, 15.0, 30.0, 45.0, 55.0)  # degrees off the optical axis
 BUFFERS = {"list by distance": LIST_ORDER, "buffer of 4": 4, "buffer of 8": 8, "buffer of 16": 16, "exact": EXACT_ORDER}
-WALK, WALK_STEPS = 0.4, 40  # world units aside, and steps
+WALK, WALK_STEPS = 0.4, 40  # sideways distance in world units, and steps
 WALKS = {"walk": 1, "walk_in_tenths": 10}
 CHUNK = 64  # pixels at a time
 COLORS = ("#8a8580", "#e0a526", "#6aa84f", "#35608c", "#d2493f")
@@ -54,22 +54,22 @@ def rays_ahead(n: int, half_angle: float) -> Floats:
 
 
 def rotation(n: int, n_steps: int, seed: int, conventions: Conventions = GSPLAT_MAIN) -> dict[str, dict[str, Any]]:
-    """Return, by way, how colours change in a step: the worst ray's, of a yaw of +-20 degrees and of walks aside.
+    """Return the changes of colours per step by method, in a yaw of +-20 degrees and in sideways walks.
 
-    The rays are the same all the time. Of the walks the mean over the rays counts, too: where a whole Gaussian changes
-    places at once, the mean jumps, and does so in a step of a tenth as well. Where pixels change one after the other,
-    it does not.
+    The rays stay fixed, and the worst ray counts. In walks the mean over the rays is returned, too: where the order of
+    two whole Gaussians changes at once, the mean jumps, even if steps are ten times shorter; where pixels change one
+    after the other, it does not.
     """
     primitives, colors = cloud(n, np.random.default_rng(seed))
     camera, rays = wide_camera(), rays_ahead(8, 18.0)
-    yaws = [turned(camera, yaw) for yaw in np.radians(np.linspace(-20, 20, n_steps + 1))]
+    yaws = [yawed(camera, yaw) for yaw in np.radians(np.linspace(-20, 20, n_steps + 1))]
     found: dict[str, dict[str, Any]] = {}
-    for way in WAYS:
-        found[way] = {"yaw": steps_along(way, primitives, colors, yaws, rays, conventions)[0].tolist()}
+    for method in METHODS:
+        found[method] = {"yaw": color_changes(method, primitives, colors, yaws, rays, conventions)[0].tolist()}
         for name, k in WALKS.items():
-            path = [moved(camera, aside) for aside in np.linspace(0, WALK, k * WALK_STEPS + 1)]
-            worst, mean = steps_along(way, primitives, colors, path, rays, conventions)
-            found[way] |= {f"{name}_worst": float(worst.max()), f"{name}_mean": float(mean.max())}
+            path = [translated(camera, dx) for dx in np.linspace(0, WALK, k * WALK_STEPS + 1)]
+            worst, mean = color_changes(method, primitives, colors, path, rays, conventions)
+            found[method] |= {f"{name}_worst": float(worst.max()), f"{name}_mean": float(mean.max())}
     return found
 
 
@@ -77,10 +77,10 @@ def draw_rotation(found: dict[str, dict[str, Any]]) -> Figure:
     """Draw the largest change in each step of the yaw."""
     figure = Figure(figsize=(8, 4.2), layout="constrained")
     axes = figure.subplots()
-    for (way, values), color in zip(found.items(), COLORS, strict=True):
+    for (method, values), color in zip(found.items(), COLORS, strict=True):
         steps = np.maximum(values["yaw"], 1e-17)
-        axes.semilogy(np.linspace(-20, 20, len(steps)), steps, color=color, lw=1.2, label=way)
-    axes.set(title="Largest colour change of a fixed ray in a step", xlabel="yaw (degrees)", ylim=(1e-17, 1))
+        axes.semilogy(np.linspace(-20, 20, len(steps)), steps, color=color, lw=1.2, label=method)
+    axes.set(title="Largest colour change of a fixed ray per step", xlabel="yaw (degrees)", ylim=(1e-17, 1))
     axes.legend(frameon=False, fontsize=8)
     tidy(axes)
     return figure
@@ -90,7 +90,7 @@ def draw_rotation(found: dict[str, dict[str, Any]]) -> Figure:
 
 
 def peak_responses(primitives: Primitives, rays: Floats) -> Floats:
-    """Return ``exp(-min_t |x - t d|^2_C / 2)`` [N, P] of rays from the origin: what no projection approximates."""
+    """Return the peaks ``exp(-min_t |x - t d|^2_C / 2)`` [N, P] on rays from the origin, without any projection."""
     precisions = np.linalg.inv(covariances(primitives.quats, primitives.scales))
     a = np.einsum("pi,nij,pj->np", rays, precisions, rays)
     b = np.einsum("pi,nij,nj->np", rays, precisions, primitives.means)
@@ -100,9 +100,9 @@ def peak_responses(primitives: Primitives, rays: Floats) -> Floats:
 
 
 def projection_errors(n: int, seed: int) -> dict[str, list[float]]:
-    """Return the errors over ``ANGLES``: ``sum |G - peak| / sum peak`` over rays, the mean of n Gaussians.
+    """Return the errors ``sum |G - peak| / sum peak`` over rays at each angle of ``ANGLES``, as means of n Gaussians.
 
-    The same Gaussians and rays are turned away from the axis together, so that the truth stays.
+    The same Gaussians and rays are rotated away from the axis together, so the truth stays.
     """
     rng, rays = np.random.default_rng(seed), rays_ahead(41, 25.0)
     scales = np.exp(rng.uniform(np.log(0.02), np.log(0.15), (n, 3)))
@@ -111,7 +111,7 @@ def projection_errors(n: int, seed: int) -> dict[str, list[float]]:
     camera = wide_camera(170.0, 2000, 2000)
     found: dict[str, list[float]] = {"EWA": [], "tangent planes": []}
     for angle in ANGLES:
-        seen = turned(camera, np.radians(angle))  # which turns what lies ahead away from the axis
+        seen = yawed(camera, np.radians(angle))  # so that what lay ahead is off the axis
         in_camera = rays @ seen.cam_from_world_R.T
         is_ahead = in_camera[:, 2] > 0.05
         for name, hits in (("EWA", ewa_hits), ("tangent planes", tangent_hits)):
@@ -123,7 +123,7 @@ def projection_errors(n: int, seed: int) -> dict[str, list[float]]:
 
 
 def draw_projection(found: dict[str, list[float]]) -> Figure:
-    """Draw the errors over the angle."""
+    """Draw the errors against the angle."""
     figure = Figure(figsize=(6, 4), layout="constrained")
     axes = figure.subplots()
     for (name, errors), color in zip(found.items(), (COLORS[0], COLORS[4]), strict=True):
@@ -138,9 +138,9 @@ def draw_projection(found: dict[str, list[float]]) -> Figure:
 
 
 def orders(primitives: Primitives, colors: Floats, camera: Camera, centers: Floats) -> list[dict[str, Any]]:
-    """Return what each order does to the pixels at ``centers`` [P, 2]: pairs of hits out of order, and colours.
+    """Return the pairs of hits out of order and the errors of colours by order, at image positions ``centers`` [P, 2].
 
-    The first row is the order of 3DGS, by camera z, of the same footprints.
+    The first row has the order of 3DGS, by camera z, with the same footprints.
     """
     footprints = project(primitives, camera, GSPLAT_MAIN)
     ways = {"list by z": (LIST_ORDER, footprints.depths)}
@@ -172,7 +172,7 @@ def orders(primitives: Primitives, colors: Floats, camera: Camera, centers: Floa
 
 
 def draw_orders(rows: list[dict[str, Any]]) -> Figure:
-    """Draw the share of misordered pairs, and the error that it makes."""
+    """Draw the fraction of misordered pairs, and the resulting error of colours."""
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     names = [row["order"] for row in rows]
     for axes, key, title in zip(

@@ -1,4 +1,4 @@
-"""The representation that is drawn on tangent planes in the order of each pixel, and the recipe that trains it."""
+"""The representation drawn on tangent planes in the order of each pixel, and the recipe that trains it."""
 
 from functools import partial
 
@@ -13,4 +13,4 @@ ORDERED = Representation(
 )
 
 PIXEL_ORDER = GS_ACCEL._replace(name="pixel-order")
-"""``pixel-order``: 3DGS on tangent planes; ``--set buffer_size=8`` sorts within a buffer instead of exactly."""
+"""The recipe ``pixel-order``: 3DGS on tangent planes; ``--set buffer_size=8`` sorts in a buffer instead of exactly."""

@@ -1,4 +1,4 @@
-"""What the gradient proof checks: the renderer, exactly sorted and with a small buffer."""
+"""The stages of the gradient check: the renderer, sorted exactly and with a small buffer."""
 
 from functools import partial
 
@@ -7,7 +7,7 @@ import numpy as np
 from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.pixel_order.method import ORDERED
 from minisplat_ref.extensions.shared_tangent_renderer import render
-from minisplat_ref.extensions.shared_tangent_stages import watching_stage
+from minisplat_ref.extensions.shared_tangent_stages import renderer_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 
@@ -15,10 +15,10 @@ BUFFER = 4  # hits
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
-    """Return the renderer in both orders."""
+    """Return the renderer in both orders as stages."""
     renderer = ORDERED.renderer._replace(render=partial(render, buffer_size=BUFFER))
     buffered = ORDERED._replace(name=f"{ORDERED.name}, buffer of {BUFFER}", renderer=renderer)
     return (
-        watching_stage(backend, setting, ORDERED, None, rng),
-        watching_stage(backend, setting, buffered, BUFFER, rng),
+        renderer_stage(backend, setting, ORDERED, None, rng),
+        renderer_stage(backend, setting, buffered, BUFFER, rng),
     )

@@ -18,18 +18,18 @@ if TYPE_CHECKING:
 
 def _add_cloud(parser: argparse.ArgumentParser, n: int) -> None:
     add_out(parser)
-    parser.add_argument("--gaussians", type=int, default=n, metavar="N", help=f"of the cloud (default {n})")
-    parser.add_argument("--seed", type=int, default=0, metavar="S", help="of the cloud (default 0)")
+    parser.add_argument("--gaussians", type=int, default=n, metavar="N", help=f"number of Gaussians (default {n})")
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the Gaussians (default 0)")
 
 
 def add_rotation_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--gaussians``, ``--steps``, ``--seed`` and ``--out``."""
     _add_cloud(parser, 100)
-    parser.add_argument("--steps", type=int, default=80, metavar="N", help="of the yaw (default 80)")
+    parser.add_argument("--steps", type=int, default=80, metavar="N", help="steps of the yaw (default 80)")
 
 
 def run_rotation(args: argparse.Namespace) -> None:
-    """Turn and move a camera, write, print a table.
+    """Turn and move a camera, write the results, and print a table.
 
     Raises
     ------
@@ -42,11 +42,11 @@ def run_rotation(args: argparse.Namespace) -> None:
     with making_folder(args.out) as folder:
         found = clouds.rotation(args.gaussians, args.steps, args.seed)
         write(folder, {"gaussians": args.gaussians, "seed": args.seed, "ways": found}, clouds.draw_rotation(found))
-    print(f"Largest change of fixed rays' colours in a step: of {40 / args.steps:g} degrees, or of a walk aside\n")
+    print(f"Largest change of fixed rays' colours in a step of {40 / args.steps:g} degrees, or of a sideways walk\n")
     keys = ("walk_worst", "walk_in_tenths_worst", "walk_mean", "walk_in_tenths_mean")
-    rows = [[way, f"{max(v['yaw']):.1e}", *(f"{v[key]:.1e}" for key in keys)] for way, v in found.items()]
-    heads = ["a ray, turning", "a ray, walking", "in tenths", "mean of the rays, walking", "in tenths"]
-    print(markdown_table(["way", *heads], rows))
+    rows = [[method, f"{max(v['yaw']):.1e}", *(f"{v[key]:.1e}" for key in keys)] for method, v in found.items()]
+    heads = ["worst ray, yaw", "worst ray, walk", "tenth of a step", "mean of rays, walk", "tenth of a step"]
+    print(markdown_table(["method", *heads], rows))
 
 
 def add_projection_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,7 +55,7 @@ def add_projection_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_projection(args: argparse.Namespace) -> None:
-    """Measure footprints against the peak along the ray, write, print a table.
+    """Measure footprints against the peak along the ray, write the results, and print a table.
 
     Raises
     ------
@@ -77,14 +77,12 @@ def run_projection(args: argparse.Namespace) -> None:
 def add_order_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--ply``, ``--gaussians``, ``--every``, ``--seed`` and ``--out``."""
     _add_cloud(parser, 300)
-    parser.add_argument(
-        "--ply", type=Path, metavar="FILE", help="of a run, seen by its first test camera, for the cloud"
-    )
-    parser.add_argument("--every", type=int, default=4, metavar="N", help="N-th pixel along both axes (default 4)")
+    parser.add_argument("--ply", type=Path, metavar="FILE", help="use the PLY of a run, seen by its first test camera")
+    parser.add_argument("--every", type=int, default=4, metavar="N", help="N-th pixels along both axes (default 4)")
 
 
 def run_order(args: argparse.Namespace) -> None:
-    """Count pairs of hits out of order, write, print a table.
+    """Count pairs of hits out of order, write the results, and print a table.
 
     Raises
     ------
@@ -138,4 +136,4 @@ ROTATION = Study(
 PROJECTION = Study(
     "projection", "footprints against the peak along rays, off the axis", add_projection_arguments, run_projection
 )
-ORDER = Study("order", "hits out of order, by list, buffers and exactly", add_order_arguments, run_order)
+ORDER = Study("order", "hits out of order in a list and in buffers", add_order_arguments, run_order)

@@ -1,18 +1,19 @@
 """Editing and physics: Gaussians that follow a mesh, fall like cloth, or are edited in part.
 
-Three ways of changing a trained scene without training it again.
+There are three ways to change a trained scene without training it again.
 
-- *Affine edits* (:mod:`.affine`) apply x -> A x + b to what a box, a ball or a mesh selects. Exact:
+- *Affine edits* (:mod:`.affine`) apply x -> A x + b to what a box, a ball or a mesh selects. They are exact:
   mu' = A mu + b, Sigma' = A Sigma A^T, refactored into quaternion and scales by singular values
-  (:mod:`.deformation`); colours turn with the rotation in A (:mod:`.sh_rotation`).
+  (:mod:`.deformation`); colours rotate with the rotation in A (:mod:`.sh_rotation`).
 - *Binding to a mesh* (:mod:`.binding`), after GaMeS (arXiv 2402.01459): each Gaussian belongs to the nearest triangle
   (:mod:`.nearest`), by barycentric coordinates, an offset along the normal, and its axes in the frame of the triangle
   (``shared_mesh``). When the mesh is deformed, Sigma' = F Sigma F^T with the triangle's deformation gradient F.
-- *Physics* (:mod:`.mass_spring`, :mod:`.springs`): the mesh as masses and springs under gravity, by Verlet's step, with
-  an account of the energy, and the scene bound to it.
+- *Physics* (:mod:`.mass_spring`, :mod:`.springs`): the mesh moves as masses and springs under gravity, integrated by
+  velocity Verlet with an account of the energy, and the scene bound to it follows.
 
-Where this deviates from GaMeS is in :mod:`.binding`: nothing is trained on the faces, and the whole of F acts on a
-Gaussian. Left out: training with a mesh, collisions of a sheet with itself, solids, relighting of what was turned.
+:mod:`.binding` says where this deviates from GaMeS: nothing is trained on the faces, and the whole of F acts on a
+Gaussian. Left out are training with a mesh, collisions of a sheet with itself, solids, and relighting of what was
+rotated.
 
     minisplat-ref proxies edit runs/fox out.ply --sphere 0 0 2 0.5 --rotate 0 30 0
     minisplat-ref proxies cage runs/banana sheet.ply --cells 20

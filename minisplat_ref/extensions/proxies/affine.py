@@ -4,7 +4,7 @@ A Gaussian under an affine map is a Gaussian, so nothing is approximated in its 
 
     mu' = A mu + b,   Sigma' = A Sigma A^T
 
-(:mod:`.deformation` says how the covariance becomes a quaternion and scales again, and how colours turn). A Gaussian
+(:mod:`.deformation` says how the covariance becomes a quaternion and scales again, and how colours rotate). A Gaussian
 belongs to a selection if its centre does; one that straddles the border is not cut.
 """
 
@@ -20,7 +20,7 @@ from minisplat_ref.extensions.proxies.deformation import Deformation, deformed
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.types import Bools, Floats, Gaussians
 
-LEAST_STRETCH = 1e-9  # smallest singular value of A over its largest; beyond, Gaussians are flat for all that follows
+LEAST_STRETCH = 1e-9  # smallest singular value of A over its largest; below this, Gaussians would be numerically flat
 
 
 class Affine(NamedTuple):
@@ -32,8 +32,8 @@ class Affine(NamedTuple):
     """[3] float64, world units."""
 
 
-def about(linear: Floats, pivot: Floats, translation: Floats) -> Affine:
-    """Return the map that applies A about a fixed point p, then moves: ``x -> p + A (x - p) + t``.
+def about_point(linear: Floats, pivot: Floats, translation: Floats) -> Affine:
+    """Return the map that applies A about a fixed point p, then translates: ``x -> p + A (x - p) + t``.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def rotation_about(axis_angle: Sequence[float]) -> Floats:
 
 
 def in_box(means: Floats, low: Floats, high: Floats) -> Bools:
-    """Return which centres [N, 3] lie in an axis-parallel box, its faces included: [N] booleans."""
+    """Return which centres [N, 3] lie in an axis-aligned box, its faces included: [N] booleans."""
     is_inside: Bools = np.all((means >= low) & (means <= high), axis=1)
     return is_inside
 
@@ -79,11 +79,11 @@ def edited(gaussians: Gaussians, affine: Affine, is_selected: Bools) -> Gaussian
     Parameters
     ----------
     gaussians : Gaussians
-        Before.
+        The Gaussians before the edit.
     affine : Affine
-        The map; a mirror, with det A < 0, is fine.
+        The map; a reflection, with det A < 0, is allowed.
     is_selected : ndarray of shape (N,) of booleans
-        The others keep their bytes. So do all under the identity, and under a translation all fields but the means.
+        The others keep their bytes. Under the identity all keep them; under a translation all fields but the means do.
 
     Returns
     -------
@@ -93,7 +93,7 @@ def edited(gaussians: Gaussians, affine: Affine, is_selected: Bools) -> Gaussian
     Raises
     ------
     InputError
-        If A is not finite, or singular: it would press Gaussians flat.
+        A or b is not finite, or A is singular, so that it would flatten Gaussians.
     """
     A, b = affine
     if not (np.isfinite(A).all() and np.isfinite(b).all()):
@@ -101,7 +101,7 @@ def edited(gaussians: Gaussians, affine: Affine, is_selected: Bools) -> Gaussian
     stretches = np.linalg.svd(A, compute_uv=False)  # descending
     if not stretches[2] > LEAST_STRETCH * stretches[0]:
         raise InputError(
-            f"A stretches by {stretches[0]:g}, {stretches[1]:g} and {stretches[2]:g}, which presses Gaussians flat;"
+            f"A stretches by {stretches[0]:g}, {stretches[1]:g} and {stretches[2]:g}, which flattens Gaussians;"
             " scale by numbers that are not 0"
         )
     maps = Deformation(np.stack([np.eye(3), A]), is_selected.astype(np.int64))
@@ -112,12 +112,19 @@ def edited(gaussians: Gaussians, affine: Affine, is_selected: Bools) -> Gaussian
 
 
 def check_selected(is_selected: Bools, source: str | Path) -> None:
-    """Refuse a selection of nothing.
+    """Refuse an empty selection.
+
+    Parameters
+    ----------
+    is_selected : ndarray of shape (N,) of booleans
+        The selection.
+    source : str or Path
+        The model's file, for the message.
 
     Raises
     ------
     InputError
-        One line with the model's name.
+        Nothing is selected; the line names the model.
     """
     if not is_selected.any():
         raise InputError(

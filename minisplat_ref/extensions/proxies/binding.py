@@ -1,8 +1,8 @@
-"""Gaussians bound to the triangles of a mesh: the mesh is moved, and they follow.
+"""Gaussians bound to the triangles of a mesh: the mesh is deformed, and they follow.
 
 After GaMeS (Waczynska et al. 2024, arXiv 2402.01459), which puts Gaussians onto the faces of a mesh by barycentric
 coordinates and derives rotation and scales from the corners, so that whatever moves the mesh moves the scene. Each
-Gaussian is bound to the nearest triangle. In the frame E of that triangle (``shared_mesh``) it has the place and axes
+Gaussian is bound to the nearest triangle. In the frame E of that triangle (``shared_mesh``) it has place and axes
 
     (b1, b2, w) = E^-1 (mu - p0)      barycentric coordinates (1 - b1 - b2, b1, b2), signed offset w along the normal
     L = E^-1 R diag(s)                its rotation and scales
@@ -13,21 +13,21 @@ which it keeps when the mesh has moved, with the corners p' and the frame E':
     Sigma' = E' L (E' L)^T = F Sigma F^T,   F = E' E^-1
 
 F is the deformation gradient of the triangle, with stretch and shear. It is the same for all Gaussians of a triangle,
-so the code computes F and not L. The covariance is refactored by singular values, and colours turn with F's rotation
+so the code computes F and not L. The covariance is refactored by singular values, and colours rotate with F's rotation
 (:mod:`.deformation`).
 
-Exact: when the mesh is moved, turned and scaled, so are the Gaussians; and so is every affine map within the plane of a
-triangle. Triangles whose corners have not moved leave their Gaussians as they are, to the byte. Approximate: a bent
-surface becomes flat pieces, and a Gaussian that crosses a side of its triangle follows only the one that it is bound
-to. Corners say nothing of a stretch across their plane; there a Gaussian grows as h does, with the root of the area.
-Beyond the border of the mesh and far from its surface the map of the nearest triangle is continued, which magnifies
-its turn; ``reach`` leaves Gaussians alone that are farther away. Of a hull around a solid thing, what lies on either
-side of the middle belongs to opposite faces, and tears apart when these turn differently; a sheet, or a mesh close to
-the surface, serves better.
+Two things are exact. When the mesh is translated, rotated and scaled, so are the Gaussians; and an affine map within
+the plane of a triangle acts exactly on them. Triangles whose corners have not moved leave their Gaussians as they are,
+to the byte. The rest is approximate: a bent surface becomes flat pieces, and a Gaussian that crosses a side of its
+triangle follows only the one that it is bound to. Corners say nothing of a stretch across their plane; in that
+direction a Gaussian grows as h does, with the square root of the area. Beyond the border of the mesh and far from its
+surface the map of the nearest triangle is extrapolated, which magnifies its rotation; ``reach`` leaves Gaussians alone
+that are farther away. Inside a hull around a solid object, Gaussians on either side of the middle belong to opposite
+faces, and are torn apart when these rotate differently; a sheet, or a mesh close to the surface, serves better.
 
-Where this deviates from GaMeS: Gaussians are not trained on the faces but bound as they are, so they may be off the
-surface and of any shape; there, the scales of a flat Gaussian are two lengths of a Gram-Schmidt frame of the triangle,
-which takes no notice of shear.
+This deviates from GaMeS in two ways. Gaussians are not trained on the faces but bound as they are, so they may lie off
+the surface and have any shape. And in GaMeS the scales of a flat Gaussian are two lengths of a Gram-Schmidt frame of
+the triangle, which ignores shear.
 """
 
 from collections.abc import Callable, Iterable
@@ -46,12 +46,12 @@ UNBOUND = -1
 
 
 class Binding(NamedTuple):
-    """Gaussians, and where each sits in the frame of its triangle."""
+    """Gaussians, and the coordinates of each in the frame of its triangle."""
 
     gaussians: Gaussians
-    """N rows, as they are while the mesh is at rest."""
+    """N Gaussians, as they are while the mesh is at rest."""
     mesh: Mesh
-    """At rest."""
+    """The mesh at rest."""
     faces: Ints
     """[N] triangle of each Gaussian, or ``UNBOUND``."""
     barycentric: Floats
@@ -80,9 +80,9 @@ def bind(
     Parameters
     ----------
     gaussians : Gaussians
-        To be bound.
+        N Gaussians.
     mesh : Mesh
-        At rest; in the world frame of the Gaussians, and every triangle with an area.
+        The mesh at rest, in the world frame of the Gaussians; every triangle has an area.
     reach : float
         Gaussians whose centre is farther than this from the surface, world units, are not bound and stay.
     progress : callable
@@ -111,7 +111,7 @@ def rebuild(deformed_mesh: Mesh, binding: Binding) -> Gaussians:
     Parameters
     ----------
     deformed_mesh : Mesh
-        With the faces of the mesh at rest, and every triangle with an area.
+        It has the faces of the mesh at rest, and every triangle has an area.
     binding : Binding
         From :func:`bind`.
 
@@ -137,12 +137,21 @@ def rebuild(deformed_mesh: Mesh, binding: Binding) -> Gaussians:
 
 
 def check_bound(binding: Binding, reach: float, source: str | Path) -> None:
-    """Refuse a binding of nothing; ``source`` is the model's file.
+    """Refuse a binding that binds no Gaussian.
+
+    Parameters
+    ----------
+    binding : Binding
+        From :func:`bind`.
+    reach : float
+        World units, for the message.
+    source : str or Path
+        The model's file, for the message.
 
     Raises
     ------
     InputError
-        One line that names model and reach.
+        Nothing is bound; the line names model and reach.
     """
     if binding.n_bound == 0:
         raise InputError(

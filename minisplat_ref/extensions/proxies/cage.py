@@ -12,7 +12,7 @@ from minisplat_ref.extensions.proxies.model_file import load_model
 from minisplat_ref.extensions.shared_mesh import Mesh, check_mesh, save_mesh
 from minisplat_ref.types import Floats
 
-KEPT = 0.98  # of the Gaussians along each axis; the rest are floaters, which would blow the mesh up
+MIDDLE_FRACTION = 0.98  # of the Gaussians along each axis; the rest are floaters, which would inflate the mesh
 
 
 def grid(origin: Floats, right: Floats, up: Floats, n_cells: tuple[int, int]) -> Mesh:
@@ -21,11 +21,11 @@ def grid(origin: Floats, right: Floats, up: Floats, n_cells: tuple[int, int]) ->
     Parameters
     ----------
     origin : ndarray of shape (3,)
-        Corner, world frame.
+        The corner where both sides begin, world frame.
     right, up : ndarray of shape (3,)
-        Sides, world units.
+        The sides, world units.
     n_cells : tuple of 2 ints
-        Along ``right`` and ``up``; vertex (i, j) is row ``j (n + 1) + i``. Normals point along ``right x up``.
+        Cells along ``right`` and ``up``; vertex (i, j) is row ``j (n + 1) + i``. Normals point along ``right x up``.
     """
     n, m = n_cells
     j, i = np.mgrid[: m + 1, : n + 1]
@@ -39,8 +39,15 @@ def grid(origin: Floats, right: Floats, up: Floats, n_cells: tuple[int, int]) ->
 def sheet_through(means: Floats, n_cells: int) -> Mesh:
     """Return a flat rectangular sheet through points, in the plane in which they spread most.
 
-    The plane is that of the two largest principal axes of the middle 98 % of the points along each coordinate, and so
-    are the borders; cells are about square, ``n_cells`` of them along the longer side.
+    The two largest principal axes of the middle 98 % of the points along each coordinate span the plane and give the
+    directions of the borders; cells are about square.
+
+    Parameters
+    ----------
+    means : ndarray of shape (N, 3)
+        Points, world frame.
+    n_cells : int
+        Cells along the longer side.
 
     Raises
     ------
@@ -51,7 +58,7 @@ def sheet_through(means: Floats, n_cells: int) -> Mesh:
     centre = points.mean(axis=0)
     axes = np.linalg.svd(points - centre, full_matrices=False)[2][:2]  # [2, 3]
     along = (points - centre) @ axes.T  # [N, 2]
-    low, high = np.quantile(along, [(1 - KEPT) / 2, (1 + KEPT) / 2], axis=0)
+    low, high = np.quantile(along, [(1 - MIDDLE_FRACTION) / 2, (1 + MIDDLE_FRACTION) / 2], axis=0)
     sides = high - low
     n_across = max(1, round(n_cells * float(sides[1] / sides[0]))) if sides[0] > 0 else 1
     mesh = grid(centre + low @ axes, sides[0] * axes[0], sides[1] * axes[1], (n_cells, n_across))
@@ -59,8 +66,8 @@ def sheet_through(means: Floats, n_cells: int) -> Mesh:
     return mesh
 
 
-def hull_of(means: Floats) -> Mesh:
-    """Return the convex hull of the middle 98 % of the points along each coordinate; normals point outwards.
+def convex_hull(means: Floats) -> Mesh:
+    """Return the convex hull of the middle 98 % of points [N, 3] along each coordinate; normals point outwards.
 
     Raises
     ------
@@ -72,7 +79,7 @@ def hull_of(means: Floats) -> Mesh:
         hull = ConvexHull(points)
     except (QhullError, ValueError):
         raise InputError(
-            f"{len(points)} Gaussians have no convex hull: they lie in one plane; give --cells N for a sheet"
+            f"{len(points)} Gaussians have no convex hull, since they lie in one plane: give --cells N for a sheet"
         ) from None
     corners = points[hull.simplices]  # [T, 3, 3]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -88,8 +95,8 @@ def _middle(means: Floats) -> Floats:
     """Return the points that are in the middle 98 % along each coordinate."""
     means = means.astype(np.float64)
     if len(means) < 3:
-        raise InputError(f"{len(means)} Gaussians have no mesh: give a model of more")
-    low, high = np.quantile(means, [(1 - KEPT) / 2, (1 + KEPT) / 2], axis=0)
+        raise InputError(f"{len(means)} Gaussians are too few for a mesh: give a larger model")
+    low, high = np.quantile(means, [(1 - MIDDLE_FRACTION) / 2, (1 + MIDDLE_FRACTION) / 2], axis=0)
     return means[((means >= low) & (means <= high)).all(axis=1)]
 
 
@@ -97,14 +104,14 @@ def add_parser(commands: Any) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "cage",
-        help="make a coarse mesh from a model's Gaussians, to bind them to",
+        help="make a coarse mesh around a model's Gaussians to bind them to",
         epilog="example: minisplat-ref proxies cage runs/fox/point_cloud.ply cage.ply --hull",
     )
     parser.add_argument("model", type=Path, metavar="MODEL", help="PLY of Gaussians")
     parser.add_argument("out", type=Path, metavar="MESH", help="PLY of a mesh to write")
     kind = parser.add_mutually_exclusive_group(required=True)
-    kind.add_argument("--hull", action="store_true", help="the convex hull of the middle 98 %% of them")
-    kind.add_argument("--cells", type=int, metavar="N", help="a flat sheet through them, N cells long")
+    kind.add_argument("--hull", action="store_true", help="make the convex hull of the middle 98 %% of them")
+    kind.add_argument("--cells", type=int, metavar="N", help="make a flat sheet through them, N cells long")
     parser.set_defaults(run=run)
 
 
@@ -113,7 +120,7 @@ def run(args: argparse.Namespace) -> int:
     if args.cells is not None and args.cells < 1:
         raise InputError(f"--cells is {args.cells}: give at least 1")
     means = load_model(args.model).means
-    mesh = hull_of(means) if args.hull else sheet_through(means, args.cells)
+    mesh = convex_hull(means) if args.hull else sheet_through(means, args.cells)
     save_mesh(args.out, mesh)
     print(f"a mesh of {len(mesh.vertices):,} vertices and {len(mesh.faces):,} triangles in {args.out}")
     return 0

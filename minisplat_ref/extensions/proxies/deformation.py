@@ -1,4 +1,4 @@
-"""What a deformation gradient does to Gaussians: Sigma' = F Sigma F^T, refactored, and colours that turn along.
+"""Gaussians under a deformation gradient: Sigma' = F Sigma F^T, refactored, and colours that rotate along.
 
 Near its centre a deformation is the affine map x -> mu' + F (x - mu), which takes a Gaussian to a Gaussian, exactly:
 
@@ -10,27 +10,28 @@ The factorisation is of M', not of Sigma', whose condition number is the square 
 thousand times as wide as thick would lose six digits more. The smallest scale comes from the volume, and so loses none.
 Where F is a rotation times a number c, the axes stay what they are, R' = Q R and s' = c s.
 
-Colours have no shape to be sheared. They are turned by the rotation in F, the orthogonal factor Q of its polar
-decomposition F = Q P, P = (F^T F)^(1/2): the rotation nearest to F. For rigid motions this is exact; for others it is a
+Colours have no shape to be sheared. They are rotated by the orthogonal factor Q of the polar decomposition
+F = Q P, P = (F^T F)^(1/2), which is the rotation nearest to F. For rigid motions this is exact; for others it is a
 choice, since a model does not know how its light came about. Opacities stay.
 
-Both are done in float64 and rounded to the dtype of the Gaussians. Rows whose F is the identity keep their bytes.
+All this is computed in float64 and rounded to the dtype of the Gaussians. Rows whose F is the identity keep their
+bytes.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.extensions.proxies.sh_rotation import turned_sh
+from minisplat_ref.extensions.proxies.sh_rotation import rotated_sh
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.types import Floats, Gaussians, Ints
 
-SIMILARITY = 1e-14  # by which F^T F / c^2 may differ from the identity if F counts as a rotation times c: rounding
-LEAST_LOG_RATIO = -30.0  # of a scale to the largest; what is thinner, 1e-13 of its length, counts as that thin
+SIMILARITY = 1e-14  # rounding: by this much F^T F / c^2 may differ from the identity if F counts as a rotation times c
+LEAST_LOG_RATIO = -30.0  # of a scale to the largest; thinner ones, below 1e-13 of the length, count as that thin
 
 
 class Deformation(NamedTuple):
-    """Linear maps, and which of them applies to each Gaussian."""
+    """Linear maps, and the index of the one that applies to each Gaussian."""
 
     F: Floats
     """[M, 3, 3] invertible, float64: world after from world before."""
@@ -48,26 +49,26 @@ def polar_rotations(F: Floats) -> Floats:
     Parameters
     ----------
     F : ndarray of shape (M, 3, 3)
-        Invertible.
+        Invertible matrices.
 
     Returns
     -------
     ndarray of shape (M, 3, 3)
-        Rotations; of a mirror, where det F < 0, also with the determinant -1.
+        Orthogonal matrices, whose determinant has the sign of det F: rotations, or rotated reflections.
     """
     U, _, Vt = np.linalg.svd(F)
     return U @ Vt
 
 
 def deformed(gaussians: Gaussians, means: Floats, deformation: Deformation) -> Gaussians:
-    """Return Gaussians that were moved and deformed.
+    """Return the Gaussians after a deformation.
 
     Parameters
     ----------
     gaussians : Gaussians
-        Before.
+        N Gaussians before the deformation.
     means : ndarray of shape (N, 3)
-        Where the centres come to lie, world frame.
+        Their centres after it, world frame.
     deformation : Deformation
         The gradient of the deformation at each centre.
 
@@ -83,7 +84,7 @@ def deformed(gaussians: Gaussians, means: Floats, deformation: Deformation) -> G
     if len(moved):
         R = rotation_matrices(gaussians.quats[moved].astype(np.float64))  # [N', 3, 3]
         quats[moved], log_scales[moved] = _refactored(F, rows[moved], R, gaussians.log_scales[moved].astype(np.float64))
-        sh_rest[moved] = turned_sh(gaussians.sh_rest[moved], polar_rotations(F), rows[moved])
+        sh_rest[moved] = rotated_sh(gaussians.sh_rest[moved], polar_rotations(F), rows[moved])
     return gaussians._replace(
         means=means.astype(gaussians.means.dtype), quats=quats, log_scales=log_scales, sh_rest=sh_rest
     )
@@ -106,7 +107,7 @@ def _refactored(F: Floats, rows: Ints, R: Floats, log_scales: Floats) -> tuple[F
     similar = is_similar[rows]
     U[similar] = (polar_rotations(F)[rows] @ R)[similar]
     new_log_scales[similar] = log_scales[similar] + 0.5 * np.log(c2)[rows[similar], None]
-    U[:, :, 2] *= np.sign(np.linalg.det(U))[:, None]  # a mirrored axis is the same axis
+    U[:, :, 2] *= np.sign(np.linalg.det(U))[:, None]  # an axis of the opposite sign is the same axis
     return quaternions(U), new_log_scales
 
 

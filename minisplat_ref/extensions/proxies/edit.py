@@ -1,4 +1,4 @@
-"""The command ``minisplat-ref proxies edit``: scale, turn and move a part of a scene."""
+"""The command ``minisplat-ref proxies edit``, which scales, rotates and moves a part of a scene."""
 
 import argparse
 from pathlib import Path
@@ -9,7 +9,7 @@ import numpy as np
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.proxies.affine import (
     Affine,
-    about,
+    about_point,
     check_selected,
     edited,
     in_ball,
@@ -23,9 +23,9 @@ from minisplat_ref.io.ply import save_ply
 from minisplat_ref.types import Bools, Floats
 
 DESCRIPTION = """\
-Apply x -> A x + b to a part of a scene: scale, then turn, about a fixed point,
-then move. Without a selection, to all of it. Several selections: what is in
-all of them.
+Apply x -> A x + b to a part of a scene: scale, then rotate, about a fixed
+point, then move. Without a selection the whole scene is edited; with several
+selections, what is in all of them.
 """
 EPILOG = """\
 examples:
@@ -40,7 +40,7 @@ def add_parser(commands: Any) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "edit",
-        help="scale, turn and move a part of a scene, exactly",
+        help="scale, rotate and move a part of a scene, exactly",
         description=DESCRIPTION,
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -48,21 +48,21 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("model", type=Path, metavar="MODEL", help="PLY of Gaussians, or a run's folder")
     parser.add_argument("out", type=Path, metavar="OUT", help="PLY to write")
     select = parser.add_argument_group("selection")
-    _add(select, "--box", 6, "X0 Y0 Z0 X1 Y1 Z1", "centres between two corners")
-    _add(select, "--sphere", 4, "X Y Z R", "centres in a ball")
-    select.add_argument("--near", type=Path, metavar="MESH", help="centres near the surface of a mesh (PLY)")
-    select.add_argument("--within", type=float, metavar="D", help="with --near: how near, world units")
+    _add(select, "--box", 6, "X0 Y0 Z0 X1 Y1 Z1", "select centres between two corners")
+    _add(select, "--sphere", 4, "X Y Z R", "select centres in a ball")
+    select.add_argument("--near", type=Path, metavar="MESH", help="select centres near the surface of a mesh (PLY)")
+    select.add_argument("--within", type=float, metavar="D", help="largest distance for --near, world units")
     change = parser.add_argument_group("change")
-    change.add_argument("--scale", type=float, nargs="+", metavar="S", help="one factor, or one for each axis")
-    _add(change, "--rotate", 3, "X Y Z", "axis times angle in degrees, right-handed")
-    _add(change, "--translate", 3, "X Y Z", "world units")
+    change.add_argument("--scale", type=float, nargs="+", metavar="S", help="scale by one factor, or one for each axis")
+    _add(change, "--rotate", 3, "X Y Z", "rotate by axis times angle in degrees, right-handed")
+    _add(change, "--translate", 3, "X Y Z", "move by a vector, world units")
     _add(change, "--about", 3, "X Y Z", "fixed point (default: the mean of the selected centres)")
-    _add(change, "--matrix", 9, "A11 ... A33", "A, row by row, in place of --scale and --rotate")
+    _add(change, "--matrix", 9, "A11 ... A33", "give A, row by row, in place of --scale and --rotate")
     parser.set_defaults(run=run)
 
 
 def _add(group: Any, name: str, n: int, metavar: str, text: str) -> None:
-    """Add an option of n numbers; negative ones need no equals sign, as they stand apart."""
+    """Add an option of n numbers; negative ones need no equals sign, because they are separate arguments."""
     names = tuple(metavar.split()) if len(metavar.split()) == n else ("A11", *("...",) * (n - 2), "A33")
     group.add_argument(name, type=float, nargs=n, metavar=names, help=text)
 
@@ -75,21 +75,21 @@ def run(args: argparse.Namespace) -> int:
     is_selected = _selected(args, means)
     check_selected(is_selected, args.model)
     pivot = means[is_selected].mean(axis=0) if args.about is None else np.array(args.about)
-    affine: Affine = about(linear, pivot, np.array(args.translate or (0.0, 0.0, 0.0)))
+    affine: Affine = about_point(linear, pivot, np.array(args.translate or (0.0, 0.0, 0.0)))
     save_ply(args.out, edited(gaussians, affine, is_selected))
     print(f"{is_selected.sum():,} of {len(means):,} Gaussians edited, in {args.out}")
     return 0
 
 
 def _linear(args: argparse.Namespace) -> Floats:
-    """Return A."""
+    """Return the matrix A [3, 3] that the arguments describe."""
     if args.matrix is not None:
         if args.scale is not None or args.rotate is not None:
             raise InputError("--matrix takes the place of --scale and --rotate: leave them out")
         return np.array(args.matrix).reshape(3, 3)
     scale = args.scale or [1.0]
     if len(scale) not in (1, 3):
-        raise InputError(f"--scale has {len(scale)} numbers: give one factor, or one for each axis")
+        raise InputError(f"--scale has {len(scale)} numbers: give one factor, or three, one for each axis")
     return rotation_about(args.rotate or (0.0, 0.0, 0.0)) * np.broadcast_to(scale, 3)
 
 

@@ -1,16 +1,16 @@
 """What the study ``proxies/affine`` measures: how exact edits are, and what bending a sheet of Gaussians costs.
 
-Affine edits are compared with the affine map itself: of centres, covariances, colours towards turned directions and,
-where the map is a similarity, of the picture with that from a camera which was moved the other way. All in float64.
+Affine edits are compared with the affine map itself, in float64: centres, covariances, colours towards rotated
+directions and, where the map is a similarity, the picture with that of a camera which was moved the other way.
 
 Bending is not affine. A flat sheet of flat Gaussians is sheared and rolled onto a cylinder of radius r,
 
     phi(x, y, 0) = (r sin(u / r), y, r - r cos(u / r)),   u = x + y / 2
 
-by a mesh of n x n cells whose vertices are moved exactly. The truth for a Gaussian is phi at its centre, and Sigma
-deformed by phi's derivative there. It is compared with what the binding makes of it, once with the whole gradient F of
-the triangle, and once with the frame of GaMeS, which is the normal, the direction from the centroid to the first
-corner, and the Gram-Schmidt remainder of the second, with two lengths.
+by a mesh of n x n cells whose vertices are moved exactly. The true centre of a Gaussian is phi at its centre, and the
+true covariance is Sigma deformed by phi's derivative there. Both are compared with the result of the binding, once with
+the whole gradient F of the triangle, and once with the frame of GaMeS, which is the normal, the direction from the
+centroid to the first corner, and the Gram-Schmidt remainder of the second, with two lengths.
 """
 
 from collections.abc import Iterable
@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 
 from minisplat_ref.backends import CPU
 from minisplat_ref.constants import SH_C0
-from minisplat_ref.extensions.proxies.affine import Affine, about, edited, in_ball, rotation_about
+from minisplat_ref.extensions.proxies.affine import Affine, about_point, edited, in_ball, rotation_about
 from minisplat_ref.extensions.proxies.binding import Binding, bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid
 from minisplat_ref.extensions.proxies.deformation import Deformation, deformed, polar_rotations
@@ -32,13 +32,13 @@ from minisplat_ref.rendering import render
 from minisplat_ref.types import Camera, Floats, Gaussians
 
 MAPS = {
-    "turn": rotation_about((20.0, -50.0, 70.0)),
-    "turn and scale": 1.7 * rotation_about((20.0, -50.0, 70.0)),
-    "mirror": np.diag([1.0, -1.0, 1.0]) @ rotation_about((5.0, 6.0, 7.0)),
+    "rotation": rotation_about((20.0, -50.0, 70.0)),
+    "rotation and scale": 1.7 * rotation_about((20.0, -50.0, 70.0)),
+    "reflection": np.diag([1.0, -1.0, 1.0]) @ rotation_about((5.0, 6.0, 7.0)),
     "stretch": np.diag([0.3, 1.0, 4.0]),
     "shear": np.array([[1.0, 0.8, -0.3], [0.0, 1.0, 0.5], [0.2, 0.0, 1.0]]),
 }
-SIMILAR = ("turn", "turn and scale", "mirror")
+SIMILAR = ("rotation", "rotation and scale", "reflection")
 SHIFT = np.array([0.3, -0.2, 0.1])
 N = 200  # Gaussians
 CELLS = (2, 4, 8, 16, 32, 64)
@@ -48,16 +48,16 @@ FRAMES = {"whole gradient": True, "two lengths": False}
 
 
 class EditErrors(NamedTuple):
-    """Largest errors of one map, over all Gaussians and seeds."""
+    """The largest errors of one map over all Gaussians and seeds."""
 
     centre: float
-    """World units, of a scene of about 2."""
+    """World units; the scene is about 2 wide."""
     covariance: float
-    """Relative to the largest entry of each."""
+    """Relative to the largest entry of each matrix."""
     color: float
-    """Of [0, 1]."""
+    """On the scale from 0 to 1."""
     picture: float | None
-    """Of [0, 1]; None where no camera sees the same."""
+    """On the scale from 0 to 1; None where no camera sees the same picture."""
 
 
 def cloud(rng: np.random.Generator) -> Gaussians:
@@ -100,7 +100,7 @@ def edit_errors(name: str, seed: int) -> EditErrors:
 def _moved_back(A: Floats, Q: Floats) -> Camera:
     """Return the camera that sees ``A x + b`` as :func:`camera` sees x, for ``A = s Q``: R' = R Q^T, t' = s t - R' b.
 
-    Of a mirror, its first axis is mirrored as well, and so is the picture: not a rotation, but the same formulas.
+    For a reflection the camera's rotation becomes a reflection, too, and so the picture is mirrored; the formulas stay.
     """
     s = np.linalg.norm(A[:, 0])
     R = camera().cam_from_world_R @ Q.T
@@ -121,7 +121,7 @@ def _picture(gaussians: Gaussians, view: Camera) -> Floats:
 
 
 def flat_gaussians(rng: np.random.Generator) -> Gaussians:
-    """Return flat Gaussians of random axes in the plane z = 0, in the square from -1 to 1; checkered."""
+    """Return checkered flat Gaussians with random axes in the square from -1 to 1 of the plane z = 0."""
     n = 40
     axis = (np.arange(n) + 0.5) / n * 2 - 1
     x, y = (values.ravel() for values in np.meshgrid(axis, axis))
@@ -153,7 +153,7 @@ def rolled_jacobian(points: Floats) -> Floats:
 
 
 def bent_by(cells: int, gaussians: Gaussians, is_whole: bool) -> Gaussians:
-    """Return the sheet as a mesh of n x n cells rolls it, by the whole gradient or by GaMeS's frame."""
+    """Return the sheet after a mesh of n x n cells has rolled it, by the whole gradient or by GaMeS's frame."""
     mesh = grid(np.array([-1.0, -1.0, 0.0]), np.array([2.0, 0.0, 0.0]), np.array([0.0, 2.0, 0.0]), (cells, cells))
     binding, moved = bind(gaussians, mesh), Mesh(rolled(mesh.vertices), mesh.faces)
     carried = rebuild(moved, binding)
@@ -181,7 +181,7 @@ def _gram_schmidt(mesh: Mesh) -> tuple[Floats, Floats]:
 
 
 def bend_errors(gaussians: Gaussians, all_cells: Iterable[int]) -> dict[str, Any]:
-    """Return for each number of cells the largest errors of centres and, by frame, of covariances."""
+    """Return the largest errors of centres and, for each frame, of covariances, by number of cells."""
     J = rolled_jacobian(gaussians.means)
     truth = J @ _sigma(gaussians) @ np.swapaxes(J, 1, 2)
     size = np.abs(truth).max(axis=(1, 2))
@@ -197,14 +197,14 @@ def bend_errors(gaussians: Gaussians, all_cells: Iterable[int]) -> dict[str, Any
 
 
 def draw(bend: dict[str, Any], seed: int) -> Figure:
-    """Draw a sheet, an edit of its middle, the sheet when it is rolled, and the errors of that."""
+    """Draw a sheet, an edit of its middle, the rolled sheet, and the errors of rolling."""
     figure = Figure(figsize=(9.0, 2.6), layout="constrained")
     panels = figure.subplots(1, 4, gridspec_kw={"width_ratios": [1, 1, 1, 1.5]})
     sheet, centre = flat_gaussians(np.random.default_rng(seed)), np.zeros(3)
-    raised = about(rotation_about((0.0, 0.0, 45.0)), centre, np.array([0.0, 0.0, -0.4]))
+    raised = about_point(rotation_about((0.0, 0.0, 45.0)), centre, np.array([0.0, 0.0, -0.4]))
     pictures = {
         "a sheet": sheet,
-        "its middle turned\nby 45° and raised": edited(sheet, raised, in_ball(sheet.means, centre, 0.6)),
+        "its middle rotated\nby 45° and raised": edited(sheet, raised, in_ball(sheet.means, centre, 0.6)),
         f"sheared and rolled\nby {CELLS[3]} x {CELLS[3]} cells": bent_by(CELLS[3], sheet, True),
     }
     for axes, (title, gaussians) in zip(panels, pictures.items(), strict=False):
@@ -213,7 +213,7 @@ def draw(bend: dict[str, Any], seed: int) -> Figure:
         axes.set_title(title, fontsize=8)
         axes.set(xticks=[], yticks=[])
     axes = panels[3]
-    axes.loglog(bend["cells"], bend["centre"], "o-", color="0.5", label="centre (of a sheet 2 wide)")
+    axes.loglog(bend["cells"], bend["centre"], "o-", color="0.5", label="centre (the sheet is 2 wide)")
     for (name, errors), color in zip(bend["covariance"].items(), ("tab:blue", "tab:red"), strict=True):
         axes.loglog(bend["cells"], errors, "o-", color=color, label=f"covariance, {name}")
     axes.set_xticks(bend["cells"], [str(n) for n in bend["cells"]])
@@ -226,6 +226,6 @@ def draw(bend: dict[str, Any], seed: int) -> Figure:
 
 
 def _before_the_camera(sheet: Gaussians) -> Gaussians:
-    """Return the sheet as it is seen obliquely from above."""
+    """Return the sheet tilted and moved so that the camera sees it obliquely from above."""
     tilted = Affine(rotation_about((-50.0, 0.0, 0.0)), np.array([0.0, -0.1, 3.2]))
     return edited(sheet, tilted, np.ones(len(sheet.means), bool))

@@ -1,4 +1,4 @@
-"""The command ``minisplat-ref proxies fall``: a scene bound to a mesh that falls like cloth, frame by frame."""
+"""The command ``minisplat-ref proxies fall``, which binds a scene to a mesh and lets it fall like cloth."""
 
 import argparse
 import json
@@ -16,8 +16,8 @@ from minisplat_ref.extensions.proxies.mass_spring import (
     Floor,
     Sheet,
     State,
-    advanced,
     energies,
+    integrated,
     longest_step,
 )
 from minisplat_ref.extensions.proxies.model_file import load_model
@@ -31,16 +31,16 @@ from minisplat_ref.rendering import render
 from minisplat_ref.types import Bools, Camera, Floats
 
 STEP_FRACTION = 0.2  # of the longest stable step; the study proxies/sheet measures what it does to the energy
-FLOOR_DEPTH = 0.02  # of a mean edge: how far the floor gives way under a sheet that lies on it
+FLOOR_DEPTH = 0.02  # how far the floor gives way under a sheet that lies on it, in mean edges
 PICTURE_SIZE = (480, 360)  # pixels, without --cameras
 
 DESCRIPTION = """\
 Bind the Gaussians of a model to a mesh, let the mesh fall as a sheet of masses
-and springs, and write in DIR for every frame the Gaussians (frame_000.ply) and
-their picture (frame_000.png), the mesh in the end (mesh.ply), and where the
+and springs, and write to DIR the Gaussians (frame_000.ply) and the picture
+(frame_000.png) of every frame, the mesh at the end (mesh.ply), and where the
 energy went (energy.json).
 
-The default gravity points along y, which is down in scenes of COLMAP.
+The default gravity points along y, which is down in most COLMAP scenes.
 """
 EPILOG = """\
 example:
@@ -49,22 +49,22 @@ example:
 
 
 class Setting(NamedTuple):
-    """What acts on a mesh that falls."""
+    """Forces and constraints on a mesh that falls."""
 
     gravity: Floats
     """[3] world units per second squared; not zero."""
     is_pinned: Bools
-    """[P]."""
+    """[P] True where a vertex does not move."""
     stretch: float
     """See :func:`~minisplat_ref.extensions.proxies.springs.stiffness_for_stretch`."""
     drag: float
     """1 / second."""
     drop: float | None
-    """How far below the lowest vertex the floor is, world units; None for no floor."""
+    """Distance of the floor below the lowest vertex, world units; None for no floor."""
 
 
 def sheet_of(mesh: Mesh, setting: Setting) -> Sheet:
-    """Return the mesh as a sheet at rest, with the density 1."""
+    """Return the mesh as a sheet at rest with mass 1 per unit of area."""
     g = float(np.linalg.norm(setting.gravity))
     masses = vertex_masses(mesh, 1.0)
     stiffness = stiffness_for_stretch(mesh, float(masses.sum()) * g, setting.stretch)
@@ -87,23 +87,34 @@ def add_parser(commands: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("model", type=Path, metavar="MODEL", help="PLY of Gaussians, or a run's folder")
-    parser.add_argument("mesh", type=Path, metavar="MESH", help="PLY of a mesh as it fits the model")
+    parser.add_argument("mesh", type=Path, metavar="MESH", help="PLY of a mesh that fits the model")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for the results")
     add_reach(parser)
-    parser.add_argument("--frames", type=int, default=12, metavar="N", help="the first is the model (default 12)")
-    parser.add_argument("--seconds", type=float, default=1.0, metavar="T", help="of the last frame (default 1)")
-    parser.add_argument("--cameras", type=Path, metavar="JSON", help="draw from the first of a cameras.json")
+    parser.add_argument(
+        "--frames", type=int, default=12, metavar="N", help="frames; the first is the model (default 12)"
+    )
+    parser.add_argument("--seconds", type=float, default=1.0, metavar="T", help="time of the last frame (default 1)")
+    parser.add_argument("--cameras", type=Path, metavar="JSON", help="draw from the first camera of a cameras.json")
     physics = parser.add_argument_group("physics")
     physics.add_argument(
-        "--gravity", type=float, nargs=3, default=(0.0, 9.81, 0.0), metavar=("X", "Y", "Z"), help="default 0 9.81 0"
+        "--gravity",
+        type=float,
+        nargs=3,
+        default=(0.0, 9.81, 0.0),
+        metavar=("X", "Y", "Z"),
+        help="world units / s^2 (default 0 9.81 0)",
     )
-    physics.add_argument("--pin-top", type=float, default=0.0, metavar="F", help="hold the highest fraction of it")
     physics.add_argument(
-        "--pin-box", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"), help="hold what is inside"
+        "--pin-top", type=float, default=0.0, metavar="F", help="hold the highest fraction F of the mesh"
     )
-    physics.add_argument("--floor", type=float, metavar="D", help="a floor D below the mesh's lowest vertex")
-    physics.add_argument("--stretch", type=float, default=0.02, metavar="F", help="by its own weight (default 0.02)")
-    physics.add_argument("--drag", type=float, default=0.5, metavar="C", help="of the air, 1 / second (default 0.5)")
+    physics.add_argument(
+        "--pin-box", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"), help="hold the vertices inside"
+    )
+    physics.add_argument("--floor", type=float, metavar="D", help="put a floor D below the mesh's lowest vertex")
+    physics.add_argument(
+        "--stretch", type=float, default=0.02, metavar="F", help="stretch by the sheet's own weight (default 0.02)"
+    )
+    physics.add_argument("--drag", type=float, default=0.5, metavar="C", help="drag of the air, 1 / s (default 0.5)")
     parser.set_defaults(run=run)
 
 
@@ -125,7 +136,7 @@ def run(args: argparse.Namespace) -> int:
         check_bound(binding, args.reach, args.model)
         for frame in tqdm(range(args.frames), desc="frames", leave=False, disable=None):
             if frame > 0:
-                state = advanced(state, sheet, step, n_steps)
+                state = integrated(state, sheet, step, n_steps)
             now = Mesh(state.positions, mesh.faces)
             check_mesh(now, f"frame {frame}, folded flat: give a smaller --stretch or more --drag")
             moved = rebuild(now, binding)
@@ -138,21 +149,21 @@ def run(args: argparse.Namespace) -> int:
         moved_energy = max(record["kinetic"] + record["dissipated"] for record in records)
         result = {"step": step, "n_steps": (args.frames - 1) * n_steps, "frames": records}
         (folder / "energy.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
-    share = f", energy kept to {swing / moved_energy:.1e} of what moved" if moved_energy > 0 else ""
+    share = f", energy conserved to {swing / moved_energy:.1e} of what moved" if moved_energy > 0 else ""
     print(f"{args.frames} frames of {binding.n_bound:,} Gaussians that fall{share}, in {args.out}")
     return 0
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Refuse numbers that make no sense, before anything is read."""
+    """Refuse numbers out of range before anything is read."""
     if args.frames < 2:
-        raise InputError(f"--frames is {args.frames}: give at least 2, the first is the model as it is")
+        raise InputError(f"--frames is {args.frames}: give at least 2, since the first is the model as it is")
     numbers = {"--seconds": args.seconds, "--stretch": args.stretch}
     for name, number in numbers.items():
         if not 0 < number < np.inf:
             raise InputError(f"{name} is {number:g}: give a number above 0")
     if not (np.isfinite(args.gravity).all() and any(args.gravity)):
-        raise InputError("--gravity is not a finite vector other than 0: without it nothing falls")
+        raise InputError("--gravity is 0 or not finite, with which nothing falls: give another vector")
     for name, number in (("--drag", args.drag), ("--floor", args.floor or 0.0), ("--pin-top", args.pin_top)):
         if not 0 <= number < np.inf:
             raise InputError(f"{name} is {number:g}: give a number that is not negative")
@@ -169,9 +180,7 @@ def _pinned(args: argparse.Namespace, mesh: Mesh) -> Bools:
         if not is_pinned.any():
             raise InputError("--pin-box holds no vertex of the mesh: give a larger one")
     if is_pinned.all():
-        raise InputError(
-            "every vertex of the mesh is held, so that nothing falls: give a smaller --pin-top or --pin-box"
-        )
+        raise InputError("every vertex of the mesh is held, so nothing falls: give a smaller --pin-top or --pin-box")
     return is_pinned
 
 

@@ -1,4 +1,4 @@
-"""The command ``minisplat-ref proxies follow``: a scene that follows a mesh which was deformed elsewhere."""
+"""The command ``minisplat-ref proxies follow``, which makes a scene follow a mesh that was deformed elsewhere."""
 
 import argparse
 from functools import partial
@@ -11,9 +11,9 @@ from minisplat_ref.extensions.shared_mesh import check_same_faces, load_mesh
 from minisplat_ref.io.ply import save_ply
 
 DESCRIPTION = """\
-Bind the Gaussians of a model to a mesh, and write them as they are after the
-mesh has been deformed: in a modelling program, or by a script that moves its
-vertices. Both meshes have the same faces.
+Bind the Gaussians of a model to a mesh, and write them deformed as the mesh was
+deformed: in a modelling program, or by a script that moves its vertices. Both
+meshes must have the same faces.
 """
 EPILOG = """\
 example:
@@ -30,7 +30,7 @@ def add_parser(commands: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("model", type=Path, metavar="MODEL", help="PLY of Gaussians, or a run's folder")
-    parser.add_argument("rest", type=Path, metavar="REST", help="PLY of the mesh as it fits the model")
+    parser.add_argument("rest", type=Path, metavar="REST", help="PLY of the mesh that fits the model")
     parser.add_argument("deformed", type=Path, metavar="DEFORMED", help="PLY of the same mesh with moved vertices")
     parser.add_argument("out", type=Path, metavar="OUT", help="PLY to write")
     add_reach(parser)

@@ -1,4 +1,4 @@
-"""A sheet of masses and springs that falls: forces, energies, and the step of Stoermer and Verlet.
+"""A falling sheet of masses and springs: forces, energies, and velocity Verlet.
 
 Vertices have masses m, springs pull with ``k (l - l0)`` along themselves, gravity g pulls everything, a floor pushes
 back what is below it with ``k_f`` times its depth, and drag slows everything down, ``dv/dt = -c v``. Pinned vertices do
@@ -6,19 +6,19 @@ not move. The forces other than drag are minus the gradient of
 
     elastic + floor + gravity = sum_s k (l - l0)^2 / 2  +  sum_v k_f depth^2 / 2  -  sum_v m g . x
 
-A step of length h is symmetric: half a step of drag, half a kick, a drift, half a kick, half a step of drag,
+A step of length h is symmetric. It takes half a step of drag, half a kick, a drift, half a kick, half a step of drag:
 
     v <- e^(-c h/2) v;   v <- v + h/2 f(x)/m;   x <- x + h v;   v <- v + h/2 f(x)/m;   v <- e^(-c h/2) v
 
-The middle is velocity Verlet: second order, exact in free fall, and symplectic, so that its error of the energy is of
-order h^2 and does not grow with time. Drag is solved exactly, so what it takes away is known exactly: kinetic, elastic,
-floor and gravity energies and what was dissipated add up to the energy at the start, to within that error. This is
-the check of a simulation. Verlet is stable for ``h < 2 / omega`` with the highest frequency of the sheet, which
-:func:`longest_step` bounds.
+The middle is velocity Verlet. It is of second order, exact in free fall, and symplectic, so that its error of the
+energy is of order h^2 and does not grow with time. Drag is solved exactly, so the energy that it takes away is known
+exactly: kinetic, elastic, floor and gravitational energy and what was dissipated add up to the energy at the start, to
+within that error. This sum checks a simulation. Verlet is stable for ``h < 2 / omega`` with the highest frequency omega
+of the sheet, which :func:`longest_step` bounds.
 
-Why not implicit Euler, as most cloth simulations: it may take long steps because it damps, by an amount that depends on
-the step and that nothing accounts for. Left out: collisions of the sheet with itself and with other things; friction
-but for the drag on the floor; strain limits.
+Most cloth simulations use implicit Euler instead. It can take long steps because it damps, but by an amount that
+depends on the step and that nothing accounts for. Left out are collisions of the sheet with itself and with other
+objects, friction except for the drag on the floor, and strain limits.
 """
 
 from typing import NamedTuple
@@ -30,21 +30,21 @@ from minisplat_ref.types import Bools, Floats
 
 
 class Floor(NamedTuple):
-    """A plane across gravity, which pushes up what is below it."""
+    """A plane perpendicular to gravity, which pushes up what is below it."""
 
     height: float
     """Along the direction opposite to gravity, world units."""
     stiffness: float
-    """Force per depth, of each vertex."""
+    """k_f, force per depth on each vertex."""
     drag: float
-    """1 / time, for vertices that are below the floor, besides the drag of all: friction and loss together."""
+    """1 / time, on vertices below the floor, besides the drag on all; it stands for friction and inelastic loss."""
 
 
 class Sheet(NamedTuple):
-    """What moves, and what acts on it."""
+    """Masses and springs, and the forces and constraints on them."""
 
     masses: Floats
-    """[P]."""
+    """[P] m."""
     springs: Springs
     """Between the P vertices."""
     is_pinned: Bools
@@ -54,22 +54,22 @@ class Sheet(NamedTuple):
     drag: float = 0.0
     """c, 1 / time."""
     floor: Floor | None = None
-    """None for none."""
+    """None for no floor."""
 
 
 class State(NamedTuple):
-    """A sheet at a moment."""
+    """Positions and velocities of a sheet at one time."""
 
     positions: Floats
     """[P, 3] world frame."""
     velocities: Floats
-    """[P, 3]."""
+    """[P, 3] world units per unit of time."""
     dissipated: float = 0.0
-    """Energy that drag has taken away so far."""
+    """Energy that drag has taken away since the start."""
 
 
 class Energies(NamedTuple):
-    """Where the energy of a sheet is."""
+    """The energy of a sheet, by kind."""
 
     kinetic: float
     elastic: float
@@ -79,19 +79,19 @@ class Energies(NamedTuple):
 
     @property
     def total(self) -> float:
-        """What stays the same."""
+        """Sum of all kinds, which is conserved."""
         return sum(self)
 
 
 def depths(positions: Floats, sheet: Sheet) -> Floats:
-    """Return how far each vertex [P] is below the floor, 0 above it and where there is none."""
+    """Return the depth of each vertex [P] below the floor; 0 above it, and where there is no floor."""
     if sheet.floor is None:
         return np.zeros(len(positions))
     return np.maximum(0, sheet.floor.height + positions @ _down(sheet))
 
 
 def energies(state: State, sheet: Sheet) -> Energies:
-    """Return the energies of a moment."""
+    """Return the energies of a sheet in a state."""
     stretched = np.linalg.norm(sheet.springs.incidence @ state.positions, axis=1) - sheet.springs.rest_lengths  # [S]
     floor = sheet.floor.stiffness if sheet.floor else 0.0
     return Energies(
@@ -104,20 +104,22 @@ def energies(state: State, sheet: Sheet) -> Energies:
 
 
 def forces(positions: Floats, sheet: Sheet) -> Floats:
-    """Return minus the gradient of the energies with respect to the positions; of pinned vertices, zero.
+    """Return minus the gradient of the potential energies with respect to the positions; zero at pinned vertices.
 
-    With ``d = x_a - x_b`` and ``l = |d|`` of a spring, ``f_a = -k (1 - l0 / l) d = -f_b``. A spring of length zero has
-    no direction, and no force.
+    A spring with ``d = x_a - x_b`` and ``l = |d|`` pulls with ``f_a = -k (1 - l0 / l) d = -f_b``. A spring of length
+    zero has no direction, and exerts no force.
 
     Parameters
     ----------
     positions : ndarray of shape (P, 3)
-        World frame.
+        x, world frame.
     sheet : Sheet
+        Masses, springs, gravity and floor; drag is no part of this.
 
     Returns
     -------
     ndarray of shape (P, 3)
+        f, mass times world units per squared unit of time.
     """
     springs = sheet.springs
     d = springs.incidence @ positions  # [S, 3]
@@ -133,8 +135,8 @@ def forces(positions: Floats, sheet: Sheet) -> Floats:
 def longest_step(sheet: Sheet) -> float:
     """Return a step below which Verlet is stable, ``2 / omega``; infinite if nothing vibrates.
 
-    By Gershgorin's circles of ``M^-1 K``, a row of which holds k / m for each spring of a vertex on the diagonal and
-    again beside it: ``omega^2 <= max_v (2 sum_s k_s + k_f) / m_v``. This holds as long as no spring is pressed to less
+    A row of ``M^-1 K`` holds k / m for each spring of a vertex, once on the diagonal and once off it, so Gershgorin's
+    circles give ``omega^2 <= max_v (2 sum_s k_s + k_f) / m_v``. This holds as long as no spring is compressed to less
     than half its length.
     """
     around = abs(sheet.springs.incidence).T @ sheet.springs.stiffness  # [P]
@@ -143,18 +145,19 @@ def longest_step(sheet: Sheet) -> float:
     return 2 / float(np.sqrt(squared.max())) if len(squared) and squared.max() > 0 else np.inf
 
 
-def advanced(state: State, sheet: Sheet, step: float, n_steps: int) -> State:
-    """Return the sheet after a number of steps of the length ``step``; see the top of this file.
+def integrated(state: State, sheet: Sheet, step: float, n_steps: int) -> State:
+    """Return the state of a sheet after a number of steps of velocity Verlet; the top of this file states the step.
 
     Parameters
     ----------
     state : State
-        Pinned vertices have the velocity 0.
+        The state at the start, in which pinned vertices have the velocity 0.
     sheet : Sheet
+        Masses, springs, and all that acts on them.
     step : float
-        h, below :func:`longest_step`.
+        h, below :func:`longest_step`; units of time.
     n_steps : int
-        0 or more.
+        Number of steps, 0 or more.
     """
     half, inverse_masses = step / 2, 1 / sheet.masses[:, None]
     x, v, dissipated = state.positions.copy(), state.velocities.copy(), state.dissipated
@@ -176,9 +179,9 @@ def _slow_down(positions: Floats, velocities: Floats, sheet: Sheet, time: float)
     rates = np.full(len(positions), sheet.drag)
     if sheet.floor is not None:
         rates += np.where(depths(positions, sheet) > 0, sheet.floor.drag, 0.0)
-    kept = np.exp(-rates * time)[:, None]  # [P, 1]
-    lost = float(np.sum(sheet.masses[:, None] * (1 - kept * kept) * velocities**2) / 2)
-    velocities *= kept
+    decay = np.exp(-rates * time)[:, None]  # [P, 1]
+    lost = float(np.sum(sheet.masses[:, None] * (1 - decay * decay) * velocities**2) / 2)
+    velocities *= decay
     return lost
 
 

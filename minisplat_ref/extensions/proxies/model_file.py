@@ -1,4 +1,4 @@
-"""Reading the model that a command of this extension works on."""
+"""Reads the model that a command of this extension works on."""
 
 import warnings
 from pathlib import Path
@@ -9,12 +9,17 @@ from minisplat_ref.types import Gaussians
 
 
 def load_model(path: Path) -> Gaussians:
-    """Read the Gaussians of a PLY, of a run's folder the one in it; warn of properties that are left out.
+    """Read the Gaussians of a PLY, or of the PLY in a run's folder; warn of properties that are left out.
+
+    Parameters
+    ----------
+    path : Path
+        A PLY, or the folder of a run.
 
     Raises
     ------
     InputError
-        If there is no PLY of Gaussians.
+        There is no PLY of Gaussians.
     """
     file = path / "point_cloud.ply" if path.is_dir() else path
     gaussians: Gaussians = load_ply(file)

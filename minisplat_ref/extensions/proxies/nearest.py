@@ -1,10 +1,10 @@
-"""The triangle of a mesh that is nearest to a point, exactly.
+"""Exact search for the triangle of a mesh that is nearest to a point.
 
-The squared distance of x from a triangle is that from its plane, if the projection of x lies inside, and otherwise the
-least of those from its three sides. To compare every point with every triangle takes long; so a k-d tree of the
-triangles' centres proposes the k nearest ones. A triangle reaches no farther from its centre than r, the largest such
-distance in the mesh, so if the best of the k lies nearer than the k-th centre less r, no other can be better. The
-points for which this does not hold are asked again with more candidates.
+The distance of x from a triangle is that from its plane, if the projection of x lies inside, and otherwise the least of
+those from its three sides. Comparing every point with every triangle takes long; so a k-d tree of the triangles'
+centres proposes the k nearest ones. A triangle extends no farther from its centre than r, the largest such distance in
+the mesh, so if the best of the k lies nearer than the k-th centre less r, no other can be better. The points for which
+this does not hold are searched again with more candidates.
 """
 
 from collections.abc import Callable, Iterable
@@ -21,10 +21,10 @@ PAIRS_AT_ONCE = 1 << 18  # of points and triangles; a dozen arrays of 3 float64 
 
 
 class Nearest(NamedTuple):
-    """For each point the nearest triangle."""
+    """The nearest triangle of each point."""
 
     faces: Ints
-    """[N] rows of the mesh's faces; the first of several that are equally near."""
+    """[N] rows of the mesh's faces; of several that are equally near, the first."""
     distances: Floats
     """[N] world units."""
 
@@ -41,7 +41,7 @@ def triangle_distances(points: Floats, corners: Floats) -> Floats:
     points : ndarray of shape (..., 3)
         World frame.
     corners : ndarray of shape (..., 3, 3)
-        Triangle, corner, axis; of triangles that have an area.
+        World frame: triangle, corner, axis. Every triangle has an area.
 
     Returns
     -------
@@ -69,9 +69,9 @@ def nearest_triangles(
     points : ndarray of shape (N, 3)
         World frame.
     mesh : Mesh
-        At least one triangle, and none without an area.
+        It has at least one triangle, and every triangle has an area.
     progress : callable
-        Wraps the parts that the points are taken in; ``tqdm.tqdm`` shows a bar.
+        Wraps the batches in which points are searched; ``tqdm.tqdm`` shows a bar.
     """
     points = points.astype(np.float64)
     centres = mesh.corners.mean(axis=1)  # [T, 3]

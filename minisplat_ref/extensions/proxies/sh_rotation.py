@@ -1,13 +1,13 @@
-"""Rotation of real spherical harmonics: the colour that a Gaussian shows towards d is afterwards shown towards Q d.
+"""Rotation of real spherical harmonics: the colour that a Gaussian showed towards d is shown towards Q d afterwards.
 
-A function f(d) = sum_k c_k Y_k(d) that is turned by an orthogonal Q is f'(d) = f(Q^T d). Each degree l is closed under
+A function f(d) = sum_k c_k Y_k(d) rotated by an orthogonal Q is f'(d) = f(Q^T d). Each degree l is closed under
 rotations, so there are matrices D_l(Q) with c'_l = D_l c_l, and since the Y are orthonormal,
 
     D_l[i, j] = integral over the sphere of Y_li(d) Y_lj(Q^T d).
 
 The integrand is a polynomial of degree 2 l <= 6, which the quadrature below integrates exactly (Gauss-Legendre in z
-with four nodes, equal steps of the azimuth), so that D_l is exact but for rounding. This takes the place of the usual
-recursions over l and of tables of Wigner's matrices: there is no convention that could be wrong but that of
+with four nodes, equal steps of the azimuth), so that D_l is exact up to rounding. This replaces the usual recursions
+over l and tables of Wigner matrices; the only convention that could be wrong is that of
 :func:`~minisplat_ref.reference.spherical_harmonics.sh_basis`, whose functions are integrated.
 """
 
@@ -21,7 +21,7 @@ from minisplat_ref.types import Floats, Ints
 
 
 def _sphere_quadrature() -> tuple[Floats, Floats]:
-    """Return directions [P, 3] and weights [P] that integrate polynomials of degree 7 on the sphere, and of lower."""
+    """Return directions [P, 3] and weights [P] that integrate polynomials of degree up to 7 on the sphere exactly."""
     z, weights = np.polynomial.legendre.leggauss(SH_DEGREE_MAX + 1)  # exact up to degree 7
     n = 2 * SH_DEGREE_MAX + 2  # steps of the azimuth; exact up to degree n - 1 = 7
     angles = 2 * np.pi * np.arange(n) / n
@@ -34,7 +34,7 @@ _DIRECTIONS, _WEIGHTS = _sphere_quadrature()
 
 
 def sh_rotations(Q: Floats, degree: int) -> list[Floats]:
-    """Return the matrices that turn spherical harmonics, one for each degree from 1 on.
+    """Return the matrices that rotate spherical harmonics, one for each degree from 1 on.
 
     ::
 
@@ -43,7 +43,7 @@ def sh_rotations(Q: Floats, degree: int) -> list[Floats]:
     Parameters
     ----------
     Q : ndarray of shape (M, 3, 3)
-        Orthogonal, to_from: rotations or, as a mirror does, with the determinant -1.
+        Orthogonal, to_from: rotations, or reflections with the determinant -1.
     degree : int
         Highest degree, 0 to 3.
 
@@ -59,8 +59,8 @@ def sh_rotations(Q: Floats, degree: int) -> list[Floats]:
     return [there[:, block].T @ before[:, :, block] for block in blocks]
 
 
-def turned_sh(sh_rest: Floats, Q: Floats, rows: Ints) -> Floats:
-    """Return coefficients turned by the rotation of each row: ``c'_l = D_l(Q) c_l`` for every degree and channel.
+def rotated_sh(sh_rest: Floats, Q: Floats, rows: Ints) -> Floats:
+    """Return coefficients rotated by the matrix of each row: ``c'_l = D_l(Q) c_l`` for every degree and channel.
 
     Parameters
     ----------
@@ -69,12 +69,12 @@ def turned_sh(sh_rest: Floats, Q: Floats, rows: Ints) -> Floats:
     Q : ndarray of shape (M, 3, 3)
         Orthogonal matrices.
     rows : ndarray of shape (N,) of integers
-        Which of the matrices turns each Gaussian: many Gaussians share one triangle.
+        Index of the matrix that rotates each Gaussian; many Gaussians share one triangle.
 
     Returns
     -------
     ndarray of shape (N, K-1, 3)
-        In float64.
+        Float64.
     """
     degree = math.isqrt(sh_rest.shape[1] + 1) - 1
     turned, start = np.empty(sh_rest.shape), 0

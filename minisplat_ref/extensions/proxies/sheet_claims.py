@@ -1,15 +1,16 @@
-"""What the study ``proxies/sheet`` measures: a sheet of masses and springs against what is known of it.
+"""What the study ``proxies/sheet`` measures: a sheet of masses and springs against closed forms.
 
-- *Free fall*: nothing is held, nothing else acts. Every Gaussian bound to the sheet is where ``x + v t + g t^2 / 2``
-  says, and its shape does not change. Verlet is exact here, but for rounding.
+- *Free fall*: nothing is held, and only gravity acts. Every Gaussian bound to the sheet is at ``x + v t + g t^2 / 2``,
+  and its shape does not change. Verlet is exact here up to rounding.
 - *Hanging*: a sheet of length L is held at two sides that are D < L apart, and drag brings it to rest. A sheet that
-  cannot be stretched or that resists no folding hangs in a catenary: the point at the arc length s from the middle is
+  neither stretches nor resists folding hangs in a catenary: the point at the arc length s from the middle is
 
       x = a asinh(s / a),   y = a cosh(D / 2a) - sqrt(a^2 + s^2)  below the supports,   2 a sinh(D / 2a) = L
 
-  The largest distance of a vertex from its place, over L, by cells and by stretch under the own weight.
-- *Energy*: a sheet held at one side swings down. The largest change of the sum of all energies, over the largest
-  kinetic energy and what was dissipated, by the length of the step: without drag, with it, and onto a floor.
+  The study tells the largest distance of a vertex from its place over L, by number of cells and by stretch under the
+  sheet's own weight.
+- *Energy*: a sheet held at one side swings down without drag, with drag, and onto a floor. The study tells the largest
+  change of the sum of all energies over the largest sum of kinetic and dissipated energy, by the length of the step.
 """
 
 from typing import Any, NamedTuple
@@ -22,7 +23,7 @@ from minisplat_ref.constants import SH_C0
 from minisplat_ref.extensions.proxies.binding import bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid
 from minisplat_ref.extensions.proxies.fall import Setting, sheet_of
-from minisplat_ref.extensions.proxies.mass_spring import Energies, Sheet, State, advanced, energies, longest_step
+from minisplat_ref.extensions.proxies.mass_spring import Energies, Sheet, State, energies, integrated, longest_step
 from minisplat_ref.extensions.proxies.springs import springs_of, stiffness_for_stretch, vertex_masses
 from minisplat_ref.extensions.shared_mesh import Mesh
 from minisplat_ref.reference.covariance import covariances
@@ -43,7 +44,7 @@ SIZE = 180  # pixels a side
 
 
 class Swing(NamedTuple):
-    """A way in which the sheet swings."""
+    """Conditions under which the sheet swings."""
 
     drag: float
     drop: float | None  # of the floor below the sheet
@@ -53,7 +54,7 @@ SWINGS = {"no drag": Swing(0.0, None), "drag": Swing(1.0, None), "drag, onto a f
 
 
 def level_sheet(n_cells: int) -> Mesh:
-    """Return a unit square at y = 0, with gravity across it."""
+    """Return a unit square at y = 0, perpendicular to gravity."""
     return grid(np.array([-0.5, 0.0, -0.5]), np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]), (n_cells, n_cells))
 
 
@@ -64,7 +65,7 @@ def free_fall(seed: int) -> dict[str, float]:
     n_steps = int(np.ceil(1 / (0.2 * longest_step(sheet))))
     velocity = np.array([0.3, -2.0, 0.1])
     state = State(mesh.vertices, np.broadcast_to(velocity, mesh.vertices.shape))
-    after = rebuild(Mesh(advanced(state, sheet, 1 / n_steps, n_steps).positions, mesh.faces), bind(gaussians, mesh))
+    after = rebuild(Mesh(integrated(state, sheet, 1 / n_steps, n_steps).positions, mesh.faces), bind(gaussians, mesh))
     sigma, sigma_after = (covariances(g.quats, np.exp(g.log_scales)) for g in (gaussians, after))
     return {
         "steps": n_steps,
@@ -80,8 +81,8 @@ def catenary(s: Floats) -> Floats:
     return np.column_stack([a * np.arcsinh(s / a), a * np.cosh(SPAN / 2 / a) - np.sqrt(a * a + s * s)])
 
 
-def hung(n_cells: int, stretch: float) -> tuple[Floats, Floats]:
-    """Return where the vertices [P, 2] of a sheet come to rest, across and below, and the catenary's points [P, 2]."""
+def hanging_sheet(n_cells: int, stretch: float) -> tuple[Floats, Floats]:
+    """Return the vertices [P, 2] of a sheet at rest, across and below, and the catenary's points [P, 2]."""
     rest = grid(
         np.array([-LENGTH / 2, 0.0, 0.0]),
         np.array([LENGTH, 0.0, 0.0]),
@@ -90,19 +91,19 @@ def hung(n_cells: int, stretch: float) -> tuple[Floats, Floats]:
     )
     s = rest.vertices[:, 0]
     half_angle = brentq(lambda t: np.sin(t) / t - SPAN / LENGTH, 1e-3, 3.1)
-    r = LENGTH / 2 / half_angle  # it starts as an arc of a circle, which is neither stretched nor at rest
+    r = LENGTH / 2 / half_angle  # it starts as a circular arc, which is neither stretched nor at rest
     start = np.column_stack([r * np.sin(s / r), r * np.cos(s / r) - r * np.cos(half_angle), rest.vertices[:, 2]])
     masses = vertex_masses(rest, 1.0)
     stiffness = stiffness_for_stretch(rest, float(masses.sum()) * G, stretch)._replace(bend=0.0)
     is_pinned = np.abs(np.abs(s) - LENGTH / 2) < 1e-9
     sheet = Sheet(masses, springs_of(rest, stiffness), is_pinned, GRAVITY, SETTLING_DRAG)
     step = SETTLING_STEP * longest_step(sheet)
-    end = advanced(State(start, np.zeros_like(start)), sheet, step, int(SETTLING / step))
+    end = integrated(State(start, np.zeros_like(start)), sheet, step, int(SETTLING / step))
     return end.positions[:, :2], catenary(s)
 
 
-def swung(swing: Swing, fraction: float) -> list[Energies]:
-    """Return the energies, over time, of a sheet that is held at one side; ``fraction`` of the longest step."""
+def swinging_sheet(swing: Swing, fraction: float) -> list[Energies]:
+    """Return the energies over time of a sheet held at one side; a step is ``fraction`` of the longest stable one."""
     mesh = level_sheet(SWING_CELLS)
     is_pinned = mesh.vertices[:, 0] < -0.5 + 1e-9
     sheet = sheet_of(mesh, Setting(GRAVITY, is_pinned, 0.01, swing.drag, swing.drop))
@@ -110,26 +111,26 @@ def swung(swing: Swing, fraction: float) -> list[Energies]:
     state = State(mesh.vertices, np.zeros_like(mesh.vertices))
     found = [energies(state, sheet)]
     for _ in range(SAMPLES):
-        state = advanced(state, sheet, SWING_TIME / SAMPLES / n_steps, n_steps)
+        state = integrated(state, sheet, SWING_TIME / SAMPLES / n_steps, n_steps)
         found.append(energies(state, sheet))
     return found
 
 
 def energy_error(found: list[Energies]) -> float:
-    """Return the largest change of the total over the most that was kinetic or dissipated."""
+    """Return the largest change of the total energy over the largest sum of kinetic and dissipated energy."""
     return max(abs(e.total - found[0].total) for e in found) / max(e.kinetic + e.dissipated for e in found)
 
 
 def measure(seed: int, progress: Any) -> dict[str, Any]:
-    """Return all figures; ``progress`` wraps the sequence of simulations."""
+    """Run all simulations and return their errors; ``progress`` wraps the sequence of simulations."""
     hanging = {f"{stretch:g}": dict.fromkeys(map(str, CELLS), 0.0) for stretch in STRETCHES}
     energy = {name: dict.fromkeys(map(str, STEPS), 0.0) for name in SWINGS}
     jobs = [*((stretch, n) for stretch in STRETCHES for n in CELLS), *((name, f) for name in SWINGS for f in STEPS)]
     for key, number in progress(jobs):
         if isinstance(key, str):
-            energy[key][str(number)] = energy_error(swung(SWINGS[key], number))
+            energy[key][str(number)] = energy_error(swinging_sheet(SWINGS[key], number))
         else:
-            found, expected = hung(int(number), key)
+            found, expected = hanging_sheet(int(number), key)
             hanging[f"{key:g}"][str(number)] = float(np.linalg.norm(found - expected, axis=1).max() / LENGTH)
     return {"free_fall": free_fall(seed), "hanging": hanging, "energy": energy}
 
@@ -179,14 +180,14 @@ def pictures(seed: int) -> list[Floats]:
     camera = Camera(R, -R @ target + [0, 0, distance], 1.55 * SIZE, 1.55 * SIZE, SIZE / 2, SIZE / 2, SIZE, SIZE)
     for moment in FRAMES:
         n_steps = round((moment - time) / step)
-        state, time = advanced(state, sheet, step, n_steps), time + n_steps * step
+        state, time = integrated(state, sheet, step, n_steps), time + n_steps * step
         moved = rebuild(Mesh(state.positions, mesh.faces), binding)
         images.append(np.clip(render(moved, camera, background=np.ones(3))[0].image, 0, 1))
     return images
 
 
 def draw(result: dict[str, Any], seed: int) -> Figure:
-    """Draw the carpet at several moments; the catenary, the energies and their error below."""
+    """Draw the carpet at several times, and below it the catenary, the energies and their error."""
     figure = Figure(figsize=(9.6, 5.0), layout="constrained")
     n = len(FRAMES)
     places = figure.add_gridspec(2, 3 * n, height_ratios=[1, 1.25])
@@ -197,20 +198,20 @@ def draw(result: dict[str, Any], seed: int) -> Figure:
         axes.set(xticks=[], yticks=[])
     hanging, shares, errors = (figure.add_subplot(places[1, n * i : n * i + n]) for i in range(3))
     for stretch, color in zip(STRETCHES[:2], ("tab:red", "tab:blue"), strict=True):
-        found, _ = hung(CELLS[0], stretch)
+        found, _ = hanging_sheet(CELLS[0], stretch)
         hanging.plot(*found[: CELLS[0] + 1].T, "o", color=color, ms=4, label=f"{CELLS[0]} cells, stretch {stretch:g}")
     hanging.plot(*catenary(np.linspace(-LENGTH / 2, LENGTH / 2, 200)).T, "k", lw=0.8, label="catenary")
     hanging.invert_yaxis()
     hanging.set_aspect("equal")
     hanging.set_xlabel("across and below the supports, world units", fontsize=8)
     hanging.set_title("a sheet that hangs from two sides", fontsize=9)
-    swing = swung(SWINGS["drag, onto a floor"], STEPS[2])
+    swing = swinging_sheet(SWINGS["drag, onto a floor"], STEPS[2])
     times = np.linspace(0, SWING_TIME, len(swing))
     for name in Energies._fields:
         values = np.array([getattr(e, name) for e in swing])
         shares.plot(times, values - values[0], label=name, lw=1.2)
     shares.plot(times, [e.total - swing[0].total for e in swing], "k", label="total", lw=1.2)
-    shares.set_title("energies of a sheet that\nfalls onto a floor, less their start", fontsize=9)
+    shares.set_title("energies of a sheet that falls\nonto a floor, less their initial values", fontsize=9)
     shares.set_xlabel("seconds", fontsize=8)
     for (name, by_step), color in zip(result["energy"].items(), ("tab:blue", "tab:green", "tab:red"), strict=True):
         errors.loglog(STEPS, list(by_step.values()), "o-", color=color, ms=4, label=name)

@@ -18,11 +18,11 @@ from scipy.sparse import csr_array
 from minisplat_ref.extensions.shared_mesh import Mesh
 from minisplat_ref.types import Floats, Ints
 
-AS_LONG = 1 - 1e-9  # of the longest side, from which on a side counts as the longest: rounding
+LONGEST_RATIO = 1 - 1e-9  # rounding: a side of at least this part of the longest one counts as the longest
 
 
 class Stiffness(NamedTuple):
-    """Spring constants of the three kinds, force per length; 0 leaves a kind out."""
+    """Spring constants of the three kinds, force per length; 0 omits a kind."""
 
     structural: float
     shear: float
@@ -46,7 +46,7 @@ def springs_between(ends: Ints, vertices: Floats, stiffness: Floats) -> Springs:
     Parameters
     ----------
     ends : ndarray of shape (S, 2)
-        Rows of the vertices.
+        Rows of the vertices that each spring connects.
     vertices : ndarray of shape (P, 3)
         World frame.
     stiffness : ndarray of shape (S,)
@@ -60,7 +60,15 @@ def springs_between(ends: Ints, vertices: Floats, stiffness: Floats) -> Springs:
 
 
 def springs_of(mesh: Mesh, stiffness: Stiffness) -> Springs:
-    """Return the springs of a mesh, which is at rest: structural, shear, bend."""
+    """Return the structural, shear and bend springs of a mesh that is at rest.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        At rest.
+    stiffness : Stiffness
+        Constants of the three kinds, force per length.
+    """
     edges, shear, bend = spring_ends(mesh)
     kinds = [(ends, k) for ends, k in zip((edges, shear, bend), stiffness, strict=True) if k > 0]
     ends = np.concatenate([ends for ends, _ in kinds])
@@ -76,7 +84,7 @@ def spring_ends(mesh: Mesh) -> tuple[Ints, Ints, Ints]:
     opposite = mesh.faces.T.ravel()  # [3 T] the corner that a side lies opposite to
     corners = mesh.corners
     lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - np.roll(corners, -2, axis=1), axis=2)  # [T, 3] opposite k
-    is_longest = (lengths >= AS_LONG * lengths.max(axis=1, keepdims=True)).T.ravel()  # [3 T]
+    is_longest = (lengths >= LONGEST_RATIO * lengths.max(axis=1, keepdims=True)).T.ravel()  # [3 T]
 
     edges, edge_of = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True)
     order = np.argsort(edge_of.ravel(), kind="stable")  # sides grouped by their edge
@@ -90,9 +98,16 @@ def spring_ends(mesh: Mesh) -> tuple[Ints, Ints, Ints]:
 
 
 def vertex_masses(mesh: Mesh, density: float) -> Floats:
-    """Return the masses [P] of the vertices, a third of each triangle's; ``density`` is mass per area.
+    """Return the masses [P] of the vertices, which get a third of the mass of each of their triangles.
 
-    A vertex that no triangle has gets the mean mass: it falls, but carries nothing.
+    A vertex without a triangle gets the mean mass; it falls, but no Gaussian is bound to it.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        At rest.
+    density : float
+        Mass per area.
     """
     corners = mesh.corners
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2  # [T]
@@ -101,21 +116,21 @@ def vertex_masses(mesh: Mesh, density: float) -> Floats:
 
 
 def stiffness_for_stretch(mesh: Mesh, weight: float, stretch: float) -> Stiffness:
-    """Return spring constants with which a square sheet that hangs from one side becomes longer by about a fraction.
+    """Return spring constants with which a square sheet that hangs from one side stretches by about a given fraction.
 
-    A column of n springs with the constant k and the length e, of which each carries the weights w below it, is longer
-    by ``w n^2 / 2 k``, which over its length n e is ``n w / 2 k e``. So
+    In a column of n springs of constant k and length e, each spring carries the weights w below it, so the column
+    stretches by ``w n^2 / 2 k``, which over its length n e is ``n w / 2 k e``. So
 
         k = L w / (2 e^2 f),   L the mesh's longest extent, e its mean edge, f the fraction.
 
-    Shear springs are as stiff as structural ones, bend springs a hundredth: cloth is easily folded.
+    Shear springs are as stiff as structural ones, bend springs a hundredth of that, since cloth folds easily.
 
     Parameters
     ----------
     mesh : Mesh
         At rest.
     weight : float
-        Of the whole sheet: mass times gravity.
+        Weight of the whole sheet, mass times gravity.
     stretch : float
         f, above 0.
     """

@@ -1,6 +1,6 @@
-"""The claims as studies: how exact edits are, and whether a sheet falls as physics says.
+"""The studies of this extension: how exact edits are, and whether a sheet falls as physics says.
 
-Both write ``result.json`` and ``figure.png`` into a new folder, and print Markdown tables.
+Both write ``result.json`` and ``figure.png`` to a new folder and print Markdown tables.
 """
 
 import argparse
@@ -22,7 +22,7 @@ PNG_DPI = 150
 def add_affine_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--out`` and ``--seeds``."""
     _add_out(parser)
-    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="from 0 on, of the clouds (default 3)")
+    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="number of seeds, from 0 on (default 3)")
 
 
 def run_affine(args: argparse.Namespace) -> None:
@@ -31,7 +31,7 @@ def run_affine(args: argparse.Namespace) -> None:
     Raises
     ------
     InputError
-        There are no seeds, or the output folder cannot be used.
+        ``--seeds`` is below 1, or the output folder cannot be used.
     """
     import numpy as np
     from tqdm import tqdm
@@ -62,7 +62,7 @@ def run_affine(args: argparse.Namespace) -> None:
 def add_sheet_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--out`` and ``--seed``."""
     _add_out(parser)
-    parser.add_argument("--seed", type=int, default=0, metavar="S", help="of the carpet's Gaussians (default 0)")
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the carpet's Gaussians (default 0)")
 
 
 def run_sheet(args: argparse.Namespace) -> None:
@@ -86,8 +86,8 @@ def run_sheet(args: argparse.Namespace) -> None:
         f" {fall['centre']:.1e}, covariances by {fall['covariance']:.1e} of the largest\n"
     )
     print("a hanging sheet: largest distance from the catenary over the sheet's length\n")
-    print(_table("stretch by its own weight", " cells", result["hanging"]))
-    print("\na swinging sheet: largest change of the total energy over what was kinetic or dissipated\n")
+    print(_table("stretch under its own weight", " cells", result["hanging"]))
+    print("\na swinging sheet: largest change of the total energy over the kinetic and dissipated energy\n")
     print(_table("step over the longest stable one", "", result["energy"]))
 
 
@@ -110,7 +110,7 @@ def _write(folder: Path, result: dict[str, Any], figure: "Figure") -> None:
 
 
 STUDIES = (
-    Study("affine", "edits against the affine maps, a rolled sheet", add_affine_arguments, run_affine),
-    Study("sheet", "a sheet that falls, hangs and swings: shape and energy", add_sheet_arguments, run_sheet),
+    Study("affine", "edits against affine maps, and a rolled sheet", add_affine_arguments, run_affine),
+    Study("sheet", "shape and energy of a sheet that falls, hangs and swings", add_sheet_arguments, run_sheet),
 )
-"""``proxies/affine`` and ``proxies/sheet``."""
+"""The studies ``proxies/affine`` and ``proxies/sheet``."""

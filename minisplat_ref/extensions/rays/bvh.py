@@ -1,11 +1,11 @@
-"""A tree of boxes, so that what a ray misses is left out in whole branches.
+"""A bounding volume hierarchy, with which a ray skips whole branches that it misses.
 
-Each inner node splits what is below it at the median of the centres, along the axis on which they spread most, until at
-most ``LEAF`` are left. It holds the boxes of both of its halves, so that a step reads one row of each table.
+Each inner node splits its Gaussians at the median of the centres, along the axis on which they spread most, until at
+most ``LEAF`` are left. It stores the boxes of both halves, so that a step reads one row of each table.
 
-The box of a Gaussian holds the ellipsoid on which alpha has fallen to ``alpha_min``: half as long on axis j as
-``sqrt(q Sigma_jj)`` with ``q = 2 ln(o / alpha_min)``. It is larger by a little than that, so that rounding leaves out
-no ray that grazes it.
+The box of a Gaussian contains the ellipsoid on which alpha has fallen to ``alpha_min``; its half-length along axis j is
+``sqrt(q Sigma_jj)`` with ``q = 2 ln(o / alpha_min)``. It is slightly enlarged, so that rounding never excludes a ray
+that grazes it.
 """
 
 from typing import NamedTuple
@@ -22,23 +22,23 @@ SLACK = 1e-9  # of a box, relative to its size and to its distance from the orig
 
 
 class Tree(NamedTuple):
-    """Boxes of boxes; row 0 is the root."""
+    """A bounding volume hierarchy with K inner nodes; row 0 is the root."""
 
     boxes: Floats
     """[K, 2, 6] of both halves: low x, y, z, high x, y, z."""
     children: Ints
     """[K, 2, 2] int32: a node and ``IS_INNER``, or the first row of a leaf and how many it has."""
     rows: Ints
-    """[N] int32 what stands in the leaves, one after the other."""
+    """[N] int32 rows of the Gaussians, leaf after leaf."""
 
 
 def build(low: Floats, high: Floats) -> Tree:
-    """Return the tree of boxes.
+    """Return the tree of N boxes.
 
     Parameters
     ----------
     low, high : ndarray of shape (N, 3)
-        Corners, float64, finite. N may be 0.
+        Opposite corners, float64 and finite, world frame. N may be 0.
     """
     n_nodes = max(1, len(low))
     size = SLACK * (high - low + np.maximum(np.abs(low), np.abs(high)))
@@ -85,7 +85,7 @@ def widest_axis(rows: Ints, first: int, end: int, low: Floats, high: Floats) -> 
 
 @kernel(parallel=False)
 def _split_all(low: Floats, high: Floats, tree: Tree) -> int:
-    """Fill the tree from the root down; return how many nodes it has."""
+    """Fill the tree from the root down, and return the number of its nodes."""
     firsts, ends = np.zeros(MOST_LEVELS, np.int64), np.zeros(MOST_LEVELS, np.int64)
     nodes = np.zeros(MOST_LEVELS, np.int64)
     ends[0] = len(tree.rows)

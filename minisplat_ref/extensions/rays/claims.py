@@ -1,4 +1,4 @@
-"""The work of the studies: each claim as a function that returns what it measures."""
+"""The measurements of the studies, one function per claim."""
 
 import time
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from minisplat_ref.extensions.rays.geometry import pixel_rays
 from minisplat_ref.extensions.rays.lights import shade, visibility
 from minisplat_ref.extensions.rays.method import TRACED, whitened_model
 from minisplat_ref.extensions.rays.surfaces import MIRROR
-from minisplat_ref.extensions.rays.surroundings import Surroundings, joined, made_of, parallelogram
+from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenated_surfaces, parallelogram, surfaces_of
 from minisplat_ref.extensions.shared_studies import tidy
 from minisplat_ref.reference.compositing import composite_hits
 from minisplat_ref.reference.hits import Hit, Response
@@ -41,17 +41,17 @@ def random_gaussians(n: int, rng: np.random.Generator, size: float = 0.1) -> Gau
 
 
 def tree_against_brute_force(n: int, seed: int) -> float:
-    """Return the largest difference of two pictures: by the tree, and by all pairs of rays and Gaussians."""
+    """Return the largest difference between pictures by the tree and by all pairs of rays and Gaussians."""
     gaussians, view = random_gaussians(n, np.random.default_rng(seed)), view_from(demo.camera_of(64, 48))
     images = [TRACED.renderer.render(Model(gaussians), view, Request(backend=b))[0].image for b in (CPU, REFERENCE)]
     return float(np.abs(images[0] - images[1]).max())
 
 
 def exact_order(gaussians: Gaussians, camera: Camera) -> Floats:
-    """Return the picture [H, W, 3] by the response seam: every pixel sorts the peaks on its ray, by ``Sigma^-1``.
+    """Return the picture [H, W, 3] of a response with which every pixel sorts the peaks on its ray.
 
-    With ``d^T S d = a``, ``d^T S (mu - O) = b`` and ``(mu - O)^T S (mu - O) = c`` of ``S = Sigma^-1``, the peak lies at
-    ``b / a`` and is ``o exp(-(c - b^2 / a) / 2)``.
+    With ``S = Sigma^-1``, ``a = d^T S d``, ``b = d^T S (mu - O)`` and ``c = (mu - O)^T S (mu - O)``, the peak lies at
+    ``t = b / a`` and is ``o exp(-(c - b^2 / a) / 2)``.
     """
     M = whitened_model(Model(gaussians)).maps
     S = np.swapaxes(M, 1, 2) @ M  # [N, 3, 3]
@@ -87,13 +87,13 @@ def order_difference(n: int, seed: int) -> float:
 
 
 def mirror_difference(n: int, seed: int) -> float:
-    """Return the largest difference between a picture in a mirror and that of the mirrored camera."""
+    """Return the largest difference between the picture in a mirror and that of the mirrored camera."""
     gaussians, camera = random_gaussians(n, np.random.default_rng(seed)), demo.camera_of(64, 48)
-    gaussians.means[:, 2] -= 10  # behind the camera, which sees them in the mirror alone
+    gaussians.means[:, 2] -= 10  # behind the camera, which sees them only in the mirror
     z = 1.5
     sides = np.array([[4.0, 0.0, 0.0], [0.0, 4.0, 0.0]])
-    wall = made_of(parallelogram(np.array([-2.0, -2.0, z]), sides), MIRROR)
-    world = demo.world_of(gaussians, Surroundings(np.zeros((0, 3)), 1.0, 0.0, joined([wall])), BLACK)
+    wall = surfaces_of(parallelogram(np.array([-2.0, -2.0, z]), sides), MIRROR)
+    world = demo.world_of(gaussians, Surroundings(np.zeros((0, 3)), 1.0, 0.0, concatenated_surfaces([wall])), BLACK)
     in_mirror = shade(world, pixel_rays(camera, GSPLAT_MAIN))
     flip = np.diag([1.0, 1.0, -1.0])
     mirrored = camera._replace(cam_from_world_R=flip, cam_from_world_t=-flip @ [0.0, 0.0, 2 * z])
@@ -102,17 +102,17 @@ def mirror_difference(n: int, seed: int) -> float:
 
 
 def shadow_edge(n_samples: int = 2000) -> dict[str, float]:
-    """Return how far the edge of a ball's shadow on a floor lies from where the lamp's tangent cone meets it.
+    """Return the distance of the edge of a ball's shadow on a floor from where the lamp's tangent cone meets the floor.
 
-    The ball is one opaque Gaussian, whose silhouette from the lamp is where the light that it lets through is one half:
-    ``o exp(-q / 2) = 1/2``, a ball of radius ``s sqrt(2 ln 2 o)``. Along a line on the floor below the lamp the edge is
-    interpolated; a pixel is what one covers there of a picture 240 wide.
+    The ball is one opaque Gaussian. Its silhouette from the lamp is where it transmits one half of the light, ``o
+    exp(-q / 2) = 1/2``, which is a ball of radius ``s sqrt(2 ln 2 o)``. The edge is interpolated along a line on the
+    floor below the lamp; the unit is a pixel there of a picture 240 wide.
     """
     s, opacity, height = 0.3, 1 / (1 + np.exp(-6.0)), 2.0
     centre, lamp = np.array([0.0, 1.0, 4.0]), np.array([0.0, -1.0, 4.0])
     one = demo.discs(centre[None], np.array([[0.0, 0.0, 1.0]]), s, np.full((1, 3), 0.5))
     one = one._replace(log_scales=np.full((1, 3), np.log(s)), opacity_logits=np.array([6.0]))
-    world = demo.world_of(one, Surroundings(lamp[None], 0.0, 0.0, joined([])), BLACK)
+    world = demo.world_of(one, Surroundings(lamp[None], 0.0, 0.0, concatenated_surfaces([])), BLACK)
     x = np.linspace(0, 2, n_samples)
     points = np.column_stack([x, np.full_like(x, height), np.full_like(x, 4.0)])
     V = visibility(world, points, lamp - points, 0.0)
@@ -126,7 +126,7 @@ def shadow_edge(n_samples: int = 2000) -> dict[str, float]:
 def splatting_errors() -> dict[str, list[float]]:
     """Return the mean difference of alpha between splatting and tracing, relative to the mean of alpha.
 
-    One round Gaussian of opacity 0.8, by its angular size and by how far off the axis it lies; without the low-pass.
+    There is one round Gaussian of opacity 0.8, without the low-pass; errors are by angle off the axis and angular size.
     """
     found: dict[str, list[float]] = {}
     bare = GSPLAT_MAIN._replace(eps2d=0.0)
@@ -166,7 +166,7 @@ def draw(errors: dict[str, list[float]]) -> Figure:
 
 
 def seconds_of(function: Callable[[], Any], repeats: int) -> float:
-    """Return the least time of processors that a call takes, of all threads together."""
+    """Return the least processor time of a call, summed over all threads, seconds."""
     times = []
     for _ in range(repeats):
         start = time.process_time()
@@ -176,9 +176,9 @@ def seconds_of(function: Callable[[], Any], repeats: int) -> float:
 
 
 def speed(n: int, repeats: int) -> dict[str, float]:
-    """Return microseconds of one processor for a ray and for a rasterised pixel, and the error of float32 tracing.
+    """Return processor microseconds per ray and per rasterised pixel, and the error of float32 tracing.
 
-    Of a pixel as the tuned kernels draw it, and the plain ones. The error is that of float32 Gaussians and pictures,
+    Pixels are drawn by the tuned kernels and by the plain ones. The error is that of float32 Gaussians and pictures
     against the reference in float64.
     """
     wide = random_gaussians(n, np.random.default_rng(0), size=0.02)

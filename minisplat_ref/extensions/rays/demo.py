@@ -10,7 +10,7 @@ from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.extensions.rays.lights import World
 from minisplat_ref.extensions.rays.method import tracer_for, whitened_model
 from minisplat_ref.extensions.rays.surfaces import MIRROR
-from minisplat_ref.extensions.rays.surroundings import Surroundings, joined, made_of, parallelogram
+from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenated_surfaces, parallelogram, surfaces_of
 from minisplat_ref.types import Camera, Floats, Gaussians, Model
 
 CENTRE, RADIUS, N_BALL = np.array([-0.4, 0.2, 4.0]), 0.6, 300
@@ -21,7 +21,7 @@ BIAS = 0.15  # of the way to the lamp: the thickness of the ball's shell
 
 
 def ball(n: int = N_BALL, centre: Floats = CENTRE, radius: float = RADIUS) -> Gaussians:
-    """Return discs on a sphere, by the golden angle, with a colour that tells where they are."""
+    """Return discs spread over a sphere by the golden angle, coloured by position."""
     k = np.arange(n) + 0.5
     y, angle = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
     normals = np.column_stack([np.sqrt(1 - y * y) * np.cos(angle), y, np.sqrt(1 - y * y) * np.sin(angle)])
@@ -40,8 +40,8 @@ def floor(n_side: int = 24) -> Gaussians:
 
 
 def discs(means: Floats, normals: Floats, size: float, colors: Floats) -> Gaussians:
-    """Return nearly opaque Gaussians, a fiftieth as thick as wide, with their thin axes along unit normals."""
-    half = normals + np.array([0.0, 0.0, 1.0])  # the half-way vector: a turn by pi about it takes z to the normal
+    """Return nearly opaque Gaussians, a fiftieth as thick as wide, whose thin axes are unit normals."""
+    half = normals + np.array([0.0, 0.0, 1.0])  # the half-way vector: rotation by pi about it takes z to the normal
     is_opposite = np.linalg.norm(half, axis=1) < 1e-9
     half[is_opposite] = [1.0, 0.0, 0.0]
     n = len(means)
@@ -55,8 +55,8 @@ def discs(means: Floats, normals: Floats, size: float, colors: Floats) -> Gaussi
     )
 
 
-def together(*parts: Gaussians) -> Gaussians:
-    """Return several populations as one."""
+def concatenated(*parts: Gaussians) -> Gaussians:
+    """Return several populations concatenated to one."""
     return Gaussians(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
 
 
@@ -66,13 +66,13 @@ def camera_of(width: int = 240, height: int = 180) -> Camera:
 
 
 def world_of(gaussians: Gaussians, surroundings: Surroundings, background: Floats) -> World:
-    """Return Gaussians in surroundings, for the kernels."""
+    """Return Gaussians and their surroundings as a world for the kernels."""
     tracer = tracer_for(whitened_model(Model(gaussians)), GSPLAT_MAIN, CPU)
     return World(gaussians, tracer, surroundings, background, GSPLAT_MAIN)
 
 
 def demo_world() -> World:
     """Return the whole scene."""
-    mirror = made_of(parallelogram(MIRROR_CORNER, MIRROR_SIDES), MIRROR, np.array([0.9, 0.9, 0.95]))
-    around = Surroundings(LAMP[None], 0.35, BIAS, joined([mirror]))
-    return world_of(together(ball(), floor()), around, np.array([0.1, 0.12, 0.16]))
+    mirror = surfaces_of(parallelogram(MIRROR_CORNER, MIRROR_SIDES), MIRROR, np.array([0.9, 0.9, 0.95]))
+    around = Surroundings(LAMP[None], 0.35, BIAS, concatenated_surfaces([mirror]))
+    return world_of(concatenated(ball(), floor()), around, np.array([0.1, 0.12, 0.16]))

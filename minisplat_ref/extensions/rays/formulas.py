@@ -1,9 +1,9 @@
-"""Eight rays on their way through a tree, and what one ray and one Gaussian do to each other.
+"""Traversal of a tree by eight rays, and the formulas of one ray and one Gaussian.
 
-Eight rays go together, as lanes: a box or a Gaussian is looked at if any of them may meet it. Each keeps its own hits,
-sorted by t. Once those that a ray has found let less light through than it may end with, no hit beyond the last of them
-counts, and no box that begins there: this bound moves nearer as hits are found. It is exact, because what else lies in
-front can only dim the ray more.
+Eight rays are traced together as lanes: a box or a Gaussian is tested if any of them may hit it. Each ray keeps its own
+hits, sorted by t. Once the hits that a ray has found transmit less light than the ray may end with, no hit beyond the
+last of them counts, and no box that begins there; this bound moves nearer as more hits are found. It is exact, because
+further hits in front can only dim the ray more.
 """
 
 import math
@@ -17,31 +17,31 @@ from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import WIDTH, gather, load, maximum, minimum, reduce_any, reduce_max, select, store
 from minisplat_ref.types import Floats, Ints
 
-MEAN, OPACITY, REACH = 9, 12, 13  # columns of a record; the map is the first nine
+MEAN, OPACITY, REACH = 9, 12, 13  # columns of a record, whose first nine are the map M
 N_COLUMNS = 14
-TINY = 1e-300  # in the place of a direction's zero, so that no infinity is multiplied by zero
-END_MARGIN = 0.999  # of the least transmittance: what is left out by the bound must not hang on a rounding
+TINY = 1e-300  # replaces zero components of a direction, so that no infinity is multiplied by zero
+END_MARGIN = 0.999  # of the least transmittance, so that rounding does not decide what the bound omits
 
 
 class Limits(NamedTuple):
-    """The thresholds as the kernels read them."""
+    """The thresholds in the form that the kernels use."""
 
     alpha_min: float
     alpha_max: float
     transmittance_min: float
     stops_at_equality: bool
     capacity: int
-    """Most hits that a ray holds at once."""
+    """Largest number of hits that a ray stores."""
 
 
 class Found(NamedTuple):
-    """What eight rays have found, nearest first, and what they still have to look at; each thread has its own."""
+    """The hits of eight rays, nearest first, and the stack of nodes that they still have to visit; one per thread."""
 
     depths: Floats  # [8, capacity]
     unclamped: Floats  # [8, capacity]
     rows: Ints  # [8, capacity] of the scene
     counts: Ints  # [8]
-    left: Floats  # [8] transmittance behind all that was found
+    left: Floats  # [8] transmittance behind all hits
     bounds: Floats  # [8] t beyond which nothing counts
     nodes: Ints  # [MOST_LEVELS]
     entries: Floats  # [MOST_LEVELS] a lower bound of t in the node
@@ -50,8 +50,8 @@ class Found(NamedTuple):
 
 
 @scalar
-def room_for(capacity):
-    """Return empty lists."""
+def empty_lists(capacity):
+    """Return empty lists with room for ``capacity`` hits per ray."""
     return Found(
         np.empty((WIDTH, capacity), np.float64),
         np.empty((WIDTH, capacity), np.float64),
@@ -68,7 +68,7 @@ def room_for(capacity):
 
 @scalar
 def whitened(records, row, ray):
-    """Return p = M (mu - O) and v = M d, of one ray or of eight."""
+    """Return ``p = M (mu - O)`` and ``v = M d`` of one ray or of eight."""
     ox, oy, oz, dx, dy, dz = ray
     ux, uy, uz = records[row, MEAN] - ox, records[row, MEAN + 1] - oy, records[row, MEAN + 2] - oz
     p0 = records[row, 0] * ux + records[row, 1] * uy + records[row, 2] * uz
@@ -82,7 +82,7 @@ def whitened(records, row, ray):
 
 @scalar
 def nearest_point(p0, p1, p2, v0, v1, v2):
-    """Return t and e = p - t v."""
+    """Return t and ``e = p - t v``."""
     t = (v0 * p0 + v1 * p1 + v2 * p2) / (v0 * v0 + v1 * v1 + v2 * v2)
     return t, p0 - t * v0, p1 - t * v1, p2 - t * v2
 
@@ -94,8 +94,8 @@ def inverse_of(d):
 
 
 @scalar
-def entry(boxes, node, side, line):
-    """Return where lines enter and leave a box; they miss it where the former is larger."""
+def slab_interval(boxes, node, side, line):
+    """Return the t at which lines enter and leave a box; they miss it where the former is larger."""
     ox, oy, oz, ix, iy, iz = line
     x0, x1 = (boxes[node, side, 0] - ox) * ix, (boxes[node, side, 3] - ox) * ix
     y0, y1 = (boxes[node, side, 1] - oy) * iy, (boxes[node, side, 4] - oy) * iy
@@ -107,7 +107,7 @@ def entry(boxes, node, side, line):
 
 @scalar
 def ray_of(rays, r):
-    """Return the origin and the direction of ray r."""
+    """Return origin and direction of ray r."""
     origins, directions = rays.origins, rays.directions
     return origins[r, 0], origins[r, 1], origins[r, 2], directions[r, 0], directions[r, 1], directions[r, 2]
 
@@ -128,10 +128,10 @@ def rays_of(rays, rows):
 
 @scalar
 def find_hits(scene, rays, first, end, limits, found):
-    """Fill ``found`` with all hits that may count, of the eight rays from ``first`` on, or fewer before ``end``.
+    """Fill ``found`` with all hits that may count of the eight rays from ``first`` on, or fewer before ``end``.
 
-    One long loop: of every array that a helper with branches is given, references would be counted, which takes longer
-    than what the helper does.
+    This is one long loop, because a helper with branches would count references of every array that it is given, which
+    takes longer than its work.
     """
     records, ids, boxes, children = scene.records, scene.ids, scene.boxes, scene.children
     depths, alphas, rows, counts, left, bounds, nodes, entries, ts, qs = found
@@ -150,18 +150,18 @@ def find_hits(scene, rays, first, end, limits, found):
         if entries[n_waiting] > farthest:
             continue
         node = nodes[n_waiting]
-        a0, a1 = entry(boxes, node, 0, line)
-        b0, b1 = entry(boxes, node, 1, line)
+        a0, a1 = slab_interval(boxes, node, 0, line)
+        b0, b1 = slab_interval(boxes, node, 1, line)
         a_is_met = reduce_any((a0 <= a1) & (a1 >= near) & (a0 <= bound))
         b_is_met = reduce_any((b0 <= b1) & (b1 >= near) & (b0 <= bound))
         a_entry, b_entry = -reduce_max(-a0), -reduce_max(-b0)
         nearer = 0 if a_entry <= b_entry else 1
-        for step in range(2):  # nodes are put aside, the farther one first
+        for step in range(2):  # push nodes, the farther one first
             side = nearer if step == 1 else 1 - nearer
             if children[node, side, 1] == IS_INNER and (a_is_met if side == 0 else b_is_met):
                 nodes[n_waiting], entries[n_waiting] = children[node, side, 0], a_entry if side == 0 else b_entry
                 n_waiting += 1
-        for step in range(2):  # leaves are looked at, the nearer one first
+        for step in range(2):  # test leaves, the nearer one first
             side = nearer if step == 0 else 1 - nearer
             if children[node, side, 1] == IS_INNER or not (a_is_met if side == 0 else b_is_met):
                 continue
@@ -192,7 +192,7 @@ def find_hits(scene, rays, first, end, limits, found):
                     depths[k, i], alphas[k, i], rows[k, i] = t_k, unclamped, row
                     n += 1
                     T = left[k] * (1.0 - alpha)
-                    while n > 1 and T < least:  # does the last count, with what came to lie in front of it?
+                    while n > 1 and T < least:  # does the last still count behind the new one?
                         without = T / (1.0 - min(alpha_max, alphas[k, n - 1]))
                         if without >= least:
                             break
@@ -206,8 +206,8 @@ def find_hits(scene, rays, first, end, limits, found):
 
 
 @scalar
-def meet_vjp(records, row, ray, unclamped, v_unclamped, v_t):
-    """Return v_p and v_v; see the reference's ``meet_vjp``."""
+def pair_vjp(records, row, ray, unclamped, v_unclamped, v_t):
+    """Return v_p and v_v; see the reference's ``evaluate_pairs_vjp``."""
     p0, p1, p2, v0, v1, v2 = whitened(records, row, ray)
     t, e0, e1, e2 = nearest_point(p0, p1, p2, v0, v1, v2)
     k = -unclamped * v_unclamped  # 2 v_q
@@ -222,8 +222,8 @@ def meet_vjp(records, row, ray, unclamped, v_unclamped, v_t):
 
 
 @scalar
-def back(records, row, v):
-    """Return M^T v."""
+def times_transpose(records, row, v):
+    """Return ``M^T v``."""
     return (
         records[row, 0] * v[0] + records[row, 3] * v[1] + records[row, 6] * v[2],
         records[row, 1] * v[0] + records[row, 4] * v[1] + records[row, 7] * v[2],

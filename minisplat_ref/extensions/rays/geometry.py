@@ -1,6 +1,6 @@
-"""Before and after tracing: Gaussians to unit balls, pixels to rays, each map beside its gradient.
+"""Maps before and after tracing, beside their gradients: Gaussians to unit balls, and pixels to rays.
 
-Both backends use these: they are of the size of the population or of the picture, and no loop over pairs.
+Both backends share them, since they take one step per Gaussian or per pixel and no loop over pairs.
 """
 
 import functools
@@ -22,11 +22,11 @@ def whiten(means: Floats, quats: Floats, log_scales: Floats, opacities: Floats) 
     means : ndarray of shape (N, 3)
         World frame.
     quats : ndarray of shape (N, 4)
-        Of any length.
+        Quaternions wxyz of any length.
     log_scales : ndarray of shape (N, 3)
         Logarithms of the standard deviations, world units.
     opacities : ndarray of shape (N,)
-        Activated.
+        Activated opacities, from 0 to 1.
     """
     R = rotation_matrices(quats.astype(np.float64))
     with np.errstate(over="ignore", invalid="ignore"):
@@ -42,7 +42,7 @@ def whiten_vjp(quats: Floats, log_scales: Floats, gaussians: Whitened, v_maps: F
     quats, log_scales
         As for :func:`whiten`.
     gaussians : Whitened
-        Its result.
+        The result of :func:`whiten`.
     v_maps : ndarray of shape (N, 3, 3)
         Derivative with respect to the maps.
 
@@ -59,9 +59,9 @@ def whiten_vjp(quats: Floats, log_scales: Floats, gaussians: Whitened, v_maps: F
 
 
 def pixel_rays(camera: Camera, conventions: Conventions) -> Rays:
-    """Return the rays through the centres of all pixels, row by row; their directions have a camera z of 1.
+    """Return the rays [H W] through the centres of all pixels, row by row, with directions whose camera z is 1.
 
-    So t is the camera z of a point on the ray, and the planes of ``conventions`` are its limits.
+    So t is the camera z of a point on the ray, and the near and far planes of ``conventions`` bound it.
     """
     camera = with_principal_point(camera, conventions).astype(np.float64)
     directions = _camera_rays(camera) @ camera.cam_from_world_R
@@ -71,8 +71,8 @@ def pixel_rays(camera: Camera, conventions: Conventions) -> Rays:
 
 
 @functools.cache
-def in_blocks(width: int, height: int) -> Ints:
-    """Return the pixels [H W] in blocks of 4 x 2: eight rays that go together through a tree should be neighbours."""
+def block_order(width: int, height: int) -> Ints:
+    """Return the pixels [H W] in blocks of 4 x 2, since eight rays that traverse a tree together should be adjacent."""
     ys, xs = np.divmod(np.arange(width * height), width)
     return np.lexsort((xs, ys, xs // 4, ys // 2))
 

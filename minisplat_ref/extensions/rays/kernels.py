@@ -1,9 +1,9 @@
-"""Rays through a tree of Gaussians: the functions of :mod:`.reference`, without looking at what a ray misses.
+"""Rays through a tree of Gaussians: the functions of :mod:`.reference`, which skip what a ray misses.
 
-The gradient needs no lock and depends on no order of threads: each ray writes what its hits contribute to rows of their
-own, and each Gaussian then adds up its rows in the order of the rays.
+The gradient needs no lock and does not depend on the order of threads: each ray writes the contributions of its hits to
+rows of their own, and each Gaussian then sums its rows in the order of the rays.
 
-Bundles that a kernel writes to are taken apart first: Numba drops ``bundle.array[i] = x`` from a parallel loop.
+A kernel unpacks bundles before it writes to them, because Numba drops ``bundle.array[i] = x`` from a parallel loop.
 """
 
 import math
@@ -20,11 +20,11 @@ from minisplat_ref.extensions.rays.formulas import (
     OPACITY,
     REACH,
     Limits,
-    back,
+    empty_lists,
     find_hits,
-    meet_vjp,
+    pair_vjp,
     ray_of,
-    room_for,
+    times_transpose,
 )
 from minisplat_ref.extensions.rays.types import BlendedRays, Hits, RayGradient, Rays, Whitened
 from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
@@ -32,27 +32,27 @@ from minisplat_ref.jit.lanes import WIDTH
 from minisplat_ref.jit.scheduling import dynamic_range, shared_counter
 from minisplat_ref.types import Floats, Ints
 
-RAYS_A_TURN = 64  # a multiple of eight
-GAUSSIANS_A_TURN = 32
+RAYS_PER_PART = 64  # a multiple of eight
+GAUSSIANS_PER_PART = 32
 
 
 class Scene(NamedTuple):
     """Gaussians in the order of a tree's leaves."""
 
     records: Floats
-    """[N', N_COLUMNS] of those that can be seen at all."""
+    """[N', N_COLUMNS] records of the Gaussians that can be seen at all."""
     ids: Ints
-    """[N'] int32 rows of the population."""
+    """[N'] int32 their rows in the population."""
     boxes: Floats
-    """[K, 2, 6], as in :class:`.bvh.Tree`; a bundle of a kernel holds no other bundle."""
+    """[K, 2, 6] as in :class:`.bvh.Tree`, which is unpacked, since bundles of kernels cannot be nested."""
     children: Ints
-    """[K, 2, 2]."""
+    """[K, 2, 2] as in :class:`.bvh.Tree`."""
     n: int
-    """Of the population."""
+    """Number of Gaussians of the population."""
 
 
 def scene_of(gaussians: Whitened, conventions: Conventions) -> Scene:
-    """Return Gaussians with their tree; those that are too faint, or not finite, are left out."""
+    """Return Gaussians with their tree, without those that are too faint or not finite."""
     # Half-extents of the ellipsoid |M x|^2 = q: Sigma = M^-1 M^-T, and row i of M is R_i / s_i.
     least = max(conventions.alpha_min, np.finfo(np.float64).tiny)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -73,7 +73,10 @@ def scene_of(gaussians: Whitened, conventions: Conventions) -> Scene:
 
 
 def limits_of(conventions: Conventions, n: int) -> Limits:
-    """Return the thresholds of conventions; a ray through n Gaussians holds few if each takes its part of the light."""
+    """Return the thresholds of conventions, and the number of hits that a ray through n Gaussians has to store.
+
+    Each hit takes at least ``alpha_min`` of the light, which bounds that number.
+    """
     least = END_MARGIN * conventions.transmittance_min
     capacity = n
     if least > 0 and conventions.alpha_min > 0:
@@ -89,7 +92,7 @@ def limits_of(conventions: Conventions, n: int) -> Limits:
 
 @scalar
 def goes_on(T, limits):
-    """Whether a ray takes the hit that leaves it with T."""
+    """Return whether a ray takes a hit that leaves it with the transmittance T."""
     return T > limits.transmittance_min or (T == limits.transmittance_min and not limits.stops_at_equality)
 
 
@@ -98,10 +101,10 @@ def _blend(scene, colors, rays, background, limits, n_threads, blended):
     n_rays = len(rays.near)
     taken = shared_counter()
     for _ in prange(n_threads):
-        found = room_for(limits.capacity)
+        found = empty_lists(limits.capacity)
         image, depths, transmittances, n_hits, is_seen = blended
-        for part in dynamic_range(taken, (n_rays + RAYS_A_TURN - 1) // RAYS_A_TURN):
-            for r in range(part * RAYS_A_TURN, min((part + 1) * RAYS_A_TURN, n_rays)):
+        for part in dynamic_range(taken, (n_rays + RAYS_PER_PART - 1) // RAYS_PER_PART):
+            for r in range(part * RAYS_PER_PART, min((part + 1) * RAYS_PER_PART, n_rays)):
                 lane = r % WIDTH
                 if lane == 0:
                     find_hits(scene, rays, r, n_rays, limits, found)
@@ -128,14 +131,14 @@ def _blend(scene, colors, rays, background, limits, n_threads, blended):
 
 @kernel()
 def _list(scene, rays, limits, n_threads, hits):
-    """Write the hits down, with rows of the scene; ``hits.offsets`` says how many there are."""
+    """Write the hits with rows of the scene; ``hits.offsets`` tells how many each ray has."""
     n_rays = len(rays.near)
     taken = shared_counter()
     for _ in prange(n_threads):
-        found = room_for(limits.capacity)
+        found = empty_lists(limits.capacity)
         offsets, ray_ids, rows, unclamped, depths, weights, transmittances = hits
-        for part in dynamic_range(taken, (n_rays + RAYS_A_TURN - 1) // RAYS_A_TURN):
-            for r in range(part * RAYS_A_TURN, min((part + 1) * RAYS_A_TURN, n_rays)):
+        for part in dynamic_range(taken, (n_rays + RAYS_PER_PART - 1) // RAYS_PER_PART):
+            for r in range(part * RAYS_PER_PART, min((part + 1) * RAYS_PER_PART, n_rays)):
                 lane = r % WIDTH
                 if lane == 0:
                     find_hits(scene, rays, r, n_rays, limits, found)
@@ -168,8 +171,8 @@ def _differentiate_rays(scene, colors, rays, limits, n_threads, hits, cotangents
     taken = shared_counter()
     for _ in prange(n_threads):
         v_unclamped, v_depths, v_rays = v
-        for part in dynamic_range(taken, (n_rays + RAYS_A_TURN - 1) // RAYS_A_TURN):
-            for r in range(part * RAYS_A_TURN, min((part + 1) * RAYS_A_TURN, n_rays)):
+        for part in dynamic_range(taken, (n_rays + RAYS_PER_PART - 1) // RAYS_PER_PART):
+            for r in range(part * RAYS_PER_PART, min((part + 1) * RAYS_PER_PART, n_rays)):
                 ray, behind = ray_of(rays, r), cotangents.behind[r]
                 red, green, blue = cotangents.image[r, 0], cotangents.image[r, 1], cotangents.image[r, 2]
                 for k in range(6):
@@ -184,8 +187,11 @@ def _differentiate_rays(scene, colors, rays, limits, n_threads, hits, cotangents
                     behind += weight * light
                     v_unclamped[h] = v_alpha if unclamped <= limits.alpha_max else 0.0
                     v_depths[h] = weight * cotangents.depths[r]
-                    of_p, of_v = meet_vjp(scene.records, row, ray, unclamped, v.unclamped[h], v.depths[h])
-                    of_mean, of_direction = back(scene.records, row, of_p), back(scene.records, row, of_v)
+                    of_p, of_v = pair_vjp(scene.records, row, ray, unclamped, v.unclamped[h], v.depths[h])
+                    of_mean, of_direction = (
+                        times_transpose(scene.records, row, of_p),
+                        times_transpose(scene.records, row, of_v),
+                    )
                     for k in range(3):
                         v_rays[r, k] -= of_mean[k]
                         v_rays[r, 3 + k] += of_direction[k]
@@ -206,13 +212,13 @@ def _sort_by_gaussian(rows, offsets, order):
 
 @kernel()
 def _add_up(scene, rays, n_threads, hits, groups, v_image, v, sums):
-    """Add the gradient of each Gaussian up: the map, the mean, the opacity, the colour."""
+    """Sum the gradients of each Gaussian with respect to its map, mean, opacity and colour."""
     n_rows = len(scene.ids)
     taken = shared_counter()
     order, offsets = groups
     for _ in prange(n_threads):
-        for part in dynamic_range(taken, (n_rows + GAUSSIANS_A_TURN - 1) // GAUSSIANS_A_TURN):
-            for row in range(part * GAUSSIANS_A_TURN, min((part + 1) * GAUSSIANS_A_TURN, n_rows)):
+        for part in dynamic_range(taken, (n_rows + GAUSSIANS_PER_PART - 1) // GAUSSIANS_PER_PART):
+            for row in range(part * GAUSSIANS_PER_PART, min((part + 1) * GAUSSIANS_PER_PART, n_rows)):
                 mean = scene.records[row, MEAN], scene.records[row, MEAN + 1], scene.records[row, MEAN + 2]
                 for k in range(16):
                     sums[row, k] = 0.0
@@ -221,8 +227,8 @@ def _add_up(scene, rays, n_threads, hits, groups, v_image, v, sums):
                     r = hits.ray_ids[h]
                     ray = ray_of(rays, r)
                     unclamped = hits.unclamped[h]
-                    of_p, of_v = meet_vjp(scene.records, row, ray, unclamped, v.unclamped[h], v.depths[h])
-                    of_mean = back(scene.records, row, of_p)
+                    of_p, of_v = pair_vjp(scene.records, row, ray, unclamped, v.unclamped[h], v.depths[h])
+                    of_mean = times_transpose(scene.records, row, of_p)
                     for a in range(3):
                         for b in range(3):
                             sums[row, 3 * a + b] += of_p[a] * (mean[b] - ray[b]) + of_v[a] * ray[3 + b]
@@ -232,7 +238,7 @@ def _add_up(scene, rays, n_threads, hits, groups, v_image, v, sums):
 
 
 def blend_rays(scene: Scene, colors: Floats, rays: Rays, background: Floats, conventions: Conventions) -> BlendedRays:
-    """Blend what each ray meets: see :func:`minisplat_ref.extensions.rays.reference.blend_rays`.
+    """Blend the hits of each ray; see :func:`minisplat_ref.extensions.rays.reference.blend_rays`.
 
     Parameters
     ----------
@@ -249,7 +255,7 @@ def blend_rays(scene: Scene, colors: Floats, rays: Rays, background: Floats, con
 
 
 def list_hits(scene: Scene, rays: Rays, conventions: Conventions) -> Hits:
-    """Return the blended hits of each ray: see :func:`minisplat_ref.extensions.rays.reference.list_hits`."""
+    """Return the blended hits of each ray; see :func:`minisplat_ref.extensions.rays.reference.list_hits`."""
     counts = blend_rays(scene, np.zeros((scene.n, 3)), rays, np.zeros(3), conventions).n_hits
     hits = _listed(scene, rays, conventions, counts)
     return hits._replace(gaussian_ids=scene.ids[hits.gaussian_ids].astype(np.int64))
@@ -289,7 +295,7 @@ def blend_rays_vjp(
 
 
 def _listed(scene: Scene, rays: Rays, conventions: Conventions, counts: Ints) -> Hits:
-    """Return the hits, ``counts`` [P] of each ray, with rows of the scene in the place of the population's."""
+    """Return the hits, ``counts`` [P] per ray, with rows of the scene instead of the population's."""
     offsets = np.concatenate([[0], np.cumsum(counts)])
     n_hits = int(offsets[-1])
     ray_ids, rows = np.empty((2, n_hits), np.int64)

@@ -1,18 +1,18 @@
-"""Rays that go on: shadows of point lights, mirrors, glass, and triangles among the Gaussians. Nothing has a gradient.
+"""Secondary rays: shadows of point lights, mirrors, glass, and triangles among the Gaussians, without gradients.
 
-RaySplats, section 3.3. A ray blends the Gaussians in front of the first triangle, and the triangle takes the light that
-they leave:
+This is section 3.3 of RaySplats. A ray blends the Gaussians in front of the first triangle, and the triangle gets the
+transmittance that they leave:
 
     C = sum_i w_i c_i V_i + T_end * { albedo * E(x)       diffuse
                                       tint * C'           mirror, C' along d - 2 (d . n) n
                                       F C' + (1 - F) tint C''   glass, C'' along Snell's d'
                                       background          no triangle }
 
-The light that reaches x is ``E = a + (1 - a) mean_l |n . l| V_l``, with the ambient share a; of a Gaussian, whose
-normal nobody knows, ``a + (1 - a) mean_l V_l``. V_l is the transmittance between x and the lamp, 0 behind a triangle
-that is not glass. A Gaussian's colour holds the light under which it was photographed; shadows come on top of that.
+The light that reaches x is ``E = a + (1 - a) mean_l |n . l| V_l``, with the ambient fraction a; for a Gaussian, whose
+normal is unknown, it is ``a + (1 - a) mean_l V_l``. V_l is the transmittance between x and lamp l, 0 behind a triangle
+that is not glass. A Gaussian's colour includes the light under which it was photographed; shadows multiply it.
 
-Rays that have met ``MOST_BOUNCES`` surfaces see no further ones, and those that carry less than ``LEAST`` end.
+Rays that have hit ``MOST_BOUNCES`` surfaces ignore further ones, and those that carry less than ``LEAST`` end.
 """
 
 from typing import NamedTuple
@@ -26,7 +26,7 @@ from minisplat_ref.extensions.rays.surfaces import (
     DIFFUSE,
     GLASS,
     MIRROR,
-    going_on,
+    continued,
     nearest_triangles,
     reflected,
     refracted,
@@ -42,7 +42,7 @@ HITS_AT_ONCE = 1 << 17
 
 
 class World(NamedTuple):
-    """All that a ray can meet."""
+    """Everything that a ray can hit."""
 
     gaussians: Gaussians
     tracer: Tracer
@@ -53,26 +53,26 @@ class World(NamedTuple):
 
 
 class _Bundle(NamedTuple):
-    """Rays on their way, and what their light counts in the picture."""
+    """Rays, with the pixels to which they contribute and their throughput."""
 
     rays: Rays
     pixels: Ints  # [R]
     throughput: Floats  # [R, 3]
 
     def some(self, rows: Ints, rays: Rays, factors: Floats) -> "_Bundle":
-        """Return the rays that go on from these rows [R'] with factors [R', 3], without those that carry nothing."""
+        """Return ``rays`` that continue from rows [R'] with factors [R', 3], without those that carry no light."""
         throughput = self.throughput[rows] * factors
         kept = throughput.max(axis=1, initial=0.0) >= LEAST
         return _Bundle(_rows(rays, kept), self.pixels[rows][kept], throughput[kept])
 
 
 def shade(world: World, rays: Rays) -> Floats:
-    """Return what rays see, [P, 3].
+    """Return the colours [P, 3] that rays see.
 
     Parameters
     ----------
     world : World
-        What they meet.
+        What they can hit.
     rays : Rays
         P rays from the eye.
     """
@@ -88,7 +88,7 @@ def shade(world: World, rays: Rays) -> Floats:
 
 
 def _advance(world: World, bundle: _Bundle, image: Floats, *, sees_surfaces: bool) -> list[_Bundle]:
-    """Add the light of one stretch of each ray to the picture; return the rays that go on."""
+    """Add the light of one segment of each ray to the picture, and return the secondary rays."""
     rays, surfaces = bundle.rays, world.surroundings.surfaces
     leaving = rays._replace(near=rays.near * (1 + AWAY))
     corners = surfaces.corners if sees_surfaces else surfaces.corners[:0]
@@ -107,19 +107,19 @@ def _advance(world: World, bundle: _Bundle, image: Floats, *, sees_surfaces: boo
     for rows in (mirror, glass):
         arriving, normals = _rows(rays, rows), surfaces.normals[faces[rows]]
         colors = rest[rows] * surfaces.colors[faces[rows]]
-        back = going_on(arriving, depths[rows], reflected(arriving.directions, normals))
+        back = continued(arriving, depths[rows], reflected(arriving.directions, normals))
         if rows is mirror:
             following.append(bundle.some(rows, back, colors))
             continue
         bent, shares, _ = refracted(arriving.directions, normals, surfaces.indices[faces[rows]])
-        through = going_on(arriving, depths[rows], bent)
+        through = continued(arriving, depths[rows], bent)
         following.append(bundle.some(rows, back, rest[rows] * shares[:, None]))
         following.append(bundle.some(rows, through, colors * (1 - shares)[:, None]))
     return [some for some in following if len(some.pixels)]
 
 
 def gaussian_light(world: World, rays: Rays, hits: Hits) -> Floats:
-    """Return ``sum_i w_i c_i E_i`` [R, 3] of the hits of R rays, with colours towards each ray's own origin."""
+    """Return ``sum_i w_i c_i E_i`` [R, 3] over the hits of R rays, with colours towards each ray's own origin."""
     light = np.zeros((len(rays.near), 3))
     g = world.gaussians
     coefficients = np.concatenate([g.sh_dc[:, None], g.sh_rest], axis=1)  # [N, K, 3]
@@ -153,16 +153,20 @@ def irradiance(world: World, points: Floats, normals: Floats | None) -> Floats:
 
 
 def visibility(world: World, points: Floats, to_light: Floats, start: float) -> Floats:
-    """Return how much light passes from a lamp to each point: ``V = prod (1 - alpha)`` over what lies between.
+    """Return the transmittance ``V = prod (1 - alpha)`` between a lamp and each point.
 
     Parameters
     ----------
     world : World
         What may lie between.
     points, to_light : ndarray of shape (Q, 3)
-        The points, and the way from each to the lamp.
+        The points, and the vector from each to the lamp, world units.
     start : float
-        Share of the way on which nothing counts.
+        Fraction of that vector along which no Gaussian counts.
+
+    Returns
+    -------
+    ndarray of shape (Q,)
     """
     n = len(points)
     rays = Rays(points, to_light, np.full(n, start), np.ones(n))

@@ -1,4 +1,4 @@
-"""How a scene is drawn by rays through its pixels, and the recipe that trains it so."""
+"""The renderer that traces a ray per pixel, and the recipe that trains with it."""
 
 import math
 from functools import partial
@@ -10,7 +10,7 @@ from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.rays import kernels, reference
-from minisplat_ref.extensions.rays.geometry import in_blocks, pixel_rays, pixel_rays_vjp, whiten, whiten_vjp
+from minisplat_ref.extensions.rays.geometry import block_order, pixel_rays, pixel_rays_vjp, whiten, whiten_vjp
 from minisplat_ref.extensions.rays.statistics import blend_stats
 from minisplat_ref.extensions.rays.types import BlendedRays, Rays, Whitened
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
@@ -33,7 +33,7 @@ class Tracer(NamedTuple):
 
 
 def tracer_for(gaussians: Whitened, conventions: Conventions, backend: Backend) -> Tracer:
-    """Return how a backend traces: every ray against every Gaussian, or kernels with a tree, which is built here."""
+    """Return the tracer of a backend: every ray against every Gaussian, or kernels with a tree, which is built here."""
     module: Any = kernels if backend.is_compiled else reference
     scene = kernels.scene_of(gaussians, conventions) if backend.is_compiled else gaussians
     return Tracer(*(partial(f, scene) for f in (module.list_hits, module.blend_rays, module.blend_rays_vjp)))
@@ -54,12 +54,12 @@ class _Tape(NamedTuple):
 
 
 def seen_radii(is_seen: Any) -> Ints:
-    """Return radii [N, 2] as a projection would: 0 for what the stage of colours is to leave out."""
+    """Return radii [N, 2] like those of a projection: 0 for Gaussians that the stage of colours should skip."""
     return np.repeat(is_seen.astype(np.int32)[:, None], 2, axis=1)
 
 
 def whitened_model(model: Model) -> Whitened:
-    """Return the Gaussians of a model as rays meet them."""
+    """Return the Gaussians of a model in the form that is traced."""
     g = model.gaussians
     with np.errstate(over="ignore"):
         opacities = 1 / (1 + np.exp(-g.opacity_logits.astype(np.float64)))
@@ -72,7 +72,7 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, _T
     Raises
     ------
     InputError
-        More is wanted than ``depth`` and ``stats``, or a degree that is not stored.
+        More is wanted than ``depth`` and ``stats``, or a degree of harmonics that is not stored.
     """
     g, camera, wants = model.gaussians, view.camera, request.wants
     if wants - WANTS:
@@ -86,7 +86,7 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, _T
     if request.is_visible is not None:
         gaussians = gaussians._replace(opacities=np.where(request.is_visible, gaussians.opacities, 0.0))
     tracer, in_rows = tracer_for(gaussians, conventions, backend), pixel_rays(camera, conventions)
-    order = in_blocks(camera.width, camera.height)
+    order = block_order(camera.width, camera.height)
     rays = Rays(*(field[order] for field in in_rows))
     colors = backend.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, degree, np.ones((len(g.means), 2), np.int32))
     blended = tracer.blend(colors, rays, background, conventions)
@@ -109,8 +109,8 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, _T
 def render_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None) -> RenderGradient:
     """Gradient of :func:`render`.
 
-    Nothing is projected, so there is no gradient with respect to a projected centre. Density control gets what comes
-    nearest: a centre that moves parallel to the image by ``z / f`` moves by a pixel in it, so
+    Nothing is projected, so there is no gradient with respect to a projected centre. Density control gets the closest
+    substitute: a centre that moves parallel to the image by ``z / f`` moves by a pixel in it, so
 
         v_means2d_k = z / f_k (R v_mu)_k
     """
@@ -155,4 +155,4 @@ def render_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None) -> RenderGr
 TRACED = Representation("gaussians traced by rays", renderer=Renderer("rays", render, render_vjp, SPLATTING.channels))
 
 RAYS = GS_ACCEL._replace(name="rays")
-"""``rays``: 3DGS whose pixels are rays."""
+"""The recipe ``rays``: 3DGS with traced rays instead of footprints."""

@@ -1,6 +1,6 @@
-"""A ray and a 3D Gaussian, and what a ray sees of many of them, in NumPy: every ray meets every Gaussian.
+"""Ray tracing of 3D Gaussians in NumPy: every ray is tested against every Gaussian.
 
-RaySplats, section 3. The map ``M = diag(1/s) R^T`` takes the Gaussian around mu to the unit ball. On the ray
+This is section 3 of RaySplats. The map ``M = diag(1/s) R^T`` takes the Gaussian around mu to the unit ball. On the ray
 ``O + t d``
 
     p = M (mu - O),  v = M d
@@ -8,9 +8,9 @@ RaySplats, section 3. The map ``M = diag(1/s) R^T`` takes the Gaussian around mu
     e = p - t v,  q = e . e          the squared distance from the centre there, in standard deviations
     alpha = min(alpha_max, o exp(-q / 2))
 
-Hits are taken in the order of t, of equal ones the lower row first, with the weights ``w_i = alpha_i T_i`` of 3DGS
-equation (3). What does not count: ``alpha < alpha_min``, t outside of the ray's limits, and everything from the hit on
-that would take the transmittance to its least value.
+Hits are blended in the order of t, and of the rows where t is equal, with the weights ``w_i = alpha_i T_i`` of equation
+(3) of 3DGS. A hit does not count if ``alpha < alpha_min`` or t is outside the ray's limits; the first hit that would
+reduce the transmittance to its minimum ends the ray and does not count either.
 """
 
 from collections.abc import Iterator
@@ -27,7 +27,7 @@ PAIRS_AT_ONCE = 1 << 18  # of rays and Gaussians: some thirty arrays of float64,
 
 
 class Pairs(NamedTuple):
-    """Rays and Gaussians that meet, pair by pair."""
+    """The intermediate values of H pairs of a ray and a Gaussian."""
 
     p: Floats  # [H, 3]
     v: Floats  # [H, 3]
@@ -36,8 +36,8 @@ class Pairs(NamedTuple):
     unclamped: Floats  # [H] o exp(-q / 2)
 
 
-def meet(gaussians: Whitened, rays: Rays, ray_ids: Ints, gaussian_ids: Ints) -> Pairs:
-    """Evaluate Gaussians on rays, pair by pair.
+def evaluate_pairs(gaussians: Whitened, rays: Rays, ray_ids: Ints, gaussian_ids: Ints) -> Pairs:
+    """Return the values of Gaussians at their peaks on rays, pair by pair.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def meet(gaussians: Whitened, rays: Rays, ray_ids: Ints, gaussian_ids: Ints) -> 
     rays : Rays
         P rays.
     ray_ids, gaussian_ids : ndarray of shape (H,)
-        The pairs.
+        Indices of the ray and of the Gaussian of each pair.
 
     Returns
     -------
@@ -56,19 +56,19 @@ def meet(gaussians: Whitened, rays: Rays, ray_ids: Ints, gaussian_ids: Ints) -> 
     M = gaussians.maps[gaussian_ids]  # [H, 3, 3]
     p = np.einsum("hij,hj->hi", M, gaussians.means[gaussian_ids] - rays.origins[ray_ids])
     v = np.einsum("hij,hj->hi", M, rays.directions[ray_ids])
-    with np.errstate(invalid="ignore", over="ignore"):  # of a Gaussian that is too thin for float64; it is not hit
+    with np.errstate(invalid="ignore", over="ignore"):  # a Gaussian that is too thin for float64 is not hit
         t = np.sum(v * p, axis=1) / np.sum(v * v, axis=1)
         e = p - t[:, None] * v
         unclamped = gaussians.opacities[gaussian_ids] * np.exp(-0.5 * np.sum(e * e, axis=1))
     return Pairs(p, v, e, t, unclamped)
 
 
-def meet_vjp(
+def evaluate_pairs_vjp(
     gaussians: Whitened, rays: Rays, ray_ids: Ints, gaussian_ids: Ints, v_unclamped: Floats, v_depths: Floats
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Gradient of :func:`meet`, pair by pair.
+    """Gradient of :func:`evaluate_pairs`, pair by pair.
 
-    Because e is at a right angle to v, neither t in q nor the rest of v has a share in dq/dp::
+    Because e is orthogonal to v, the dependence of t on p does not contribute to dq/dp::
 
         E = exp(-q / 2)
         v_o = E v_alpha,   v_q = -o E v_alpha / 2
@@ -80,16 +80,16 @@ def meet_vjp(
     Parameters
     ----------
     gaussians, rays, ray_ids, gaussian_ids
-        As for :func:`meet`.
+        As for :func:`evaluate_pairs`.
     v_unclamped, v_depths : ndarray of shape (H,)
         Derivatives with respect to its results.
 
     Returns
     -------
     tuple
-        With respect to means [H, 3], maps [H, 3, 3], opacities [H], origins [H, 3] and directions [H, 3].
+        Gradients with respect to means [H, 3], maps [H, 3, 3], opacities [H], origins [H, 3] and directions [H, 3].
     """
-    pairs = meet(gaussians, rays, ray_ids, gaussian_ids)
+    pairs = evaluate_pairs(gaussians, rays, ray_ids, gaussian_ids)
     t, e = pairs.depths[:, None], pairs.e
     a = np.sum(pairs.v * pairs.v, axis=1, keepdims=True)  # [H, 1]
     v_q = (-0.5 * pairs.unclamped * v_unclamped)[:, None]
@@ -120,14 +120,14 @@ def list_hits(gaussians: Whitened, rays: Rays, conventions: Conventions) -> Hits
     ids, alphas, depths, weights, rows = ([np.zeros(0, kind)] for kind in (int, float, float, float, int))
     transmittances = np.ones(n_rays)
     for some in _chunks(n_rays, n):
-        pairs = meet(gaussians, rays, np.repeat(some, n), np.tile(np.arange(n), len(some)))
+        pairs = evaluate_pairs(gaussians, rays, np.repeat(some, n), np.tile(np.arange(n), len(some)))
         unclamped, t = (array.reshape(len(some), n) for array in (pairs.unclamped, pairs.depths))
         alpha = np.minimum(conventions.alpha_max, unclamped)
         is_hit = (alpha >= conventions.alpha_min) & (t > rays.near[some, None]) & (t < rays.far[some, None])
         order = np.argsort(np.where(is_hit, t, np.inf), axis=1, kind="stable")  # [P', N]
         alpha = np.take_along_axis(np.where(is_hit, alpha, 0.0), order, axis=1)
         after = np.cumprod(1 - alpha, axis=1)
-        alpha = np.where(goes_on(after, conventions), alpha, 0.0)  # T never rises: what is cut off is the end
+        alpha = np.where(goes_on(after, conventions), alpha, 0.0)  # T never rises, so only the end is cut off
         T = np.cumprod(np.column_stack([np.ones(len(some)), 1 - alpha]), axis=1)  # [P', N + 1]
         row, place = np.nonzero(alpha > 0)  # of each ray in its order
         found = order[row, place]
@@ -153,18 +153,18 @@ def list_hits(gaussians: Whitened, rays: Rays, conventions: Conventions) -> Hits
 def blend_rays(
     gaussians: Whitened, colors: Floats, rays: Rays, background: Floats, conventions: Conventions
 ) -> BlendedRays:
-    """Blend what each ray meets: ``sum_i w_i c_i + T_end b``, and the accumulated depth ``sum_i w_i t_i``.
+    """Return the colour ``sum_i w_i c_i + T_end b`` and the accumulated depth ``sum_i w_i t_i`` of each ray.
 
     Parameters
     ----------
     gaussians : Whitened
         N Gaussians.
     colors : ndarray of shape (N, 3)
-        One for each.
+        One colour per Gaussian.
     rays : Rays
         P rays.
     background : ndarray of shape (3,)
-        Behind everything.
+        b.
     conventions : Conventions
         Clamp, skip and stop thresholds.
     """
@@ -188,8 +188,8 @@ def blend_rays_vjp(
 ) -> RayGradient:
     """Gradient of :func:`blend_rays`.
 
-    With ``f_i = v_image . c_i + v_depth t_i`` and what stands behind hit i,
-    ``B_i = sum_{j > i} w_j f_j + T_end (v_image . b + v_T)``::
+    With ``f_i = v_image . c_i + v_depth t_i`` and the sum ``B_i = sum_{j > i} w_j f_j + T_end (v_image . b + v_T)``
+    over what lies behind hit i::
 
         v_c_i     = w_i v_image,   v_t_i = w_i v_depth,   v_b = sum T_end v_image
         v_alpha_i = T_i f_i - B_i / (1 - alpha_i)                                     0 where alpha is clamped
@@ -199,7 +199,7 @@ def blend_rays_vjp(
     gaussians, colors, rays, background, conventions
         As for :func:`blend_rays`.
     blended : BlendedRays
-        Its result.
+        The result of :func:`blend_rays`.
     v_blended : tuple
         Derivatives with respect to the image [P, 3], the depths [P] and the transmittances [P].
     """
@@ -215,7 +215,7 @@ def blend_rays_vjp(
     behind = np.cumsum(table[:, :0:-1], axis=1)[:, ::-1] - table[:, 1:] + table[:, :1]  # B [P, K]
     v_alphas = hits.weights / alphas * f - behind[ray_ids, places] / (1 - alphas)
     v_unclamped = np.where(hits.unclamped <= conventions.alpha_max, v_alphas, 0.0)
-    pairs = meet_vjp(gaussians, rays, ray_ids, ids, v_unclamped, hits.weights * v_depths[ray_ids])
+    pairs = evaluate_pairs_vjp(gaussians, rays, ray_ids, ids, v_unclamped, hits.weights * v_depths[ray_ids])
     n, n_rays = len(gaussians.means), len(rays.near)
     return RayGradient(
         means=_summed(pairs[0], ids, n),
@@ -229,14 +229,14 @@ def blend_rays_vjp(
 
 
 def _summed(values: Floats, rows: Ints, n_rows: int) -> Floats:
-    """Return the sums [n_rows, ...] of values [H, ...] that belong to the same row."""
+    """Return the sums [n_rows, ...] of those values [H, ...] that belong to the same row."""
     sums = np.zeros((n_rows, *values.shape[1:]))
     np.add.at(sums, rows, values)
     return sums
 
 
 def _chunks(n_rays: int, n: int) -> Iterator[Ints]:
-    """Yield the rays in parts, so that not too many pairs are looked at at once."""
+    """Yield the rays in chunks, so that not too many pairs are in memory at once."""
     step = max(1, PAIRS_AT_ONCE // max(n, 1))
     for first in range(0, n_rays, step):
         yield np.arange(first, min(first + step, n_rays))

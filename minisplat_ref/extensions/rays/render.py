@@ -1,4 +1,4 @@
-"""The command ``minisplat-ref rays render``: a trained scene among lights, mirrors, glass and meshes."""
+"""The command ``minisplat-ref rays render``, which draws a trained scene among lights, mirrors, glass and meshes."""
 
 import argparse
 from pathlib import Path
@@ -31,10 +31,12 @@ def add_parser(commands: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("model", type=Path, metavar="MODEL", help="PLY of Gaussians, or the folder of a run")
-    parser.add_argument("--scene", type=Path, required=True, metavar="JSON", help="what stands around them, see above")
+    parser.add_argument("--scene", type=Path, required=True, metavar="JSON", help="lights and surfaces, see above")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for the pictures")
     parser.add_argument("--cameras", type=Path, metavar="JSON", help="cameras.json (default: the run's test views)")
-    parser.add_argument("--frames", type=int, default=12, metavar="N", help="of an orbit, where no camera is known")
+    parser.add_argument(
+        "--frames", type=int, default=12, metavar="N", help="of an orbit without cameras (default 12)"
+    )
     parser.add_argument(
         "--background", type=float, nargs=3, default=(0.0, 0.0, 0.0), metavar=("R", "G", "B"), help="0 to 1 each"
     )

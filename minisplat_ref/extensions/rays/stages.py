@@ -1,4 +1,4 @@
-"""What the gradient proof checks: the renderer, with the thresholds that its rays cross."""
+"""The stage of the gradient check: the renderer with the thresholds of its rays."""
 
 import numpy as np
 
@@ -14,7 +14,10 @@ from minisplat_ref.types import Floats
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
-    """Return the renderer; which hits are blended, in which order, and which are clamped, the reference finds out."""
+    """Return the renderer as a stage whose points record which hits are blended, in which order, and which are clamped.
+
+    The reference computes these records again, so that the check notices a step across a threshold.
+    """
     stage = model_stage(backend, setting, TRACED, rng)
 
     def function(*args: Floats) -> Point:

@@ -1,4 +1,4 @@
-"""Blend statistics of one view from its list of hits, as Mini-Splatting wants them."""
+"""Blend statistics of one view from its list of hits, as Mini-Splatting needs them."""
 
 import numpy as np
 
@@ -7,16 +7,16 @@ from minisplat_ref.types import BlendStats
 
 
 def blend_stats(hits: Hits, size: tuple[int, int], n: int) -> BlendStats:
-    """Return what each of n Gaussians contributes to a picture.
+    """Return the contribution of each of n Gaussians to a picture.
 
     Parameters
     ----------
     hits : Hits
-        Of the picture's rays, row by row.
+        Hits of the picture's rays, row by row.
     size : tuple of 2 ints
         Height and width.
     n : int
-        Gaussians.
+        Number of Gaussians.
     """
     ids, rays, weights = hits.gaussian_ids, hits.ray_ids, hits.weights
     largest, dominant_ids = np.zeros(n), np.full(size[0] * size[1], -1, np.int32)

@@ -11,12 +11,12 @@ from minisplat_ref.study import Study
 def add_claims_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--out``, ``--gaussians`` and ``--seed``."""
     add_out(parser)
-    parser.add_argument("--gaussians", type=int, default=300, metavar="N", help="of random scenes (default 300)")
-    parser.add_argument("--seed", type=int, default=0, metavar="S", help="of these (default 0)")
+    parser.add_argument("--gaussians", type=int, default=300, metavar="N", help="Gaussians per scene (default 300)")
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the scenes (default 0)")
 
 
 def run_claims(args: argparse.Namespace) -> None:
-    """Measure each claim, draw the scene, write, print.
+    """Measure each claim, draw the scene, write the results, and print a table.
 
     Raises
     ------
@@ -45,12 +45,12 @@ def run_claims(args: argparse.Namespace) -> None:
 
 def add_speed_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--gaussians`` and ``--repeats``."""
-    parser.add_argument("--gaussians", type=int, default=10_000, metavar="N", help="default 10000")
-    parser.add_argument("--repeats", type=int, default=5, metavar="N", help="the least time counts (default 5)")
+    parser.add_argument("--gaussians", type=int, default=10_000, metavar="N", help="number (default 10000)")
+    parser.add_argument("--repeats", type=int, default=5, metavar="N", help="timings; the least counts (default 5)")
 
 
 def run_speed(args: argparse.Namespace) -> None:
-    """Time a ray against a rasterised pixel, and print both with the error of tracing.
+    """Time a ray and a rasterised pixel, and print both times with the error of tracing.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def run_speed(args: argparse.Namespace) -> None:
 
 
 STUDIES = (
-    Study("claims", "tracing against exact order, mirrors, shadows, splatting", add_claims_arguments, run_claims),
-    Study("speed", "a ray against a rasterised pixel", add_speed_arguments, run_speed),
+    Study("claims", "tracing against exact order, mirrors, shadows and splatting", add_claims_arguments, run_claims),
+    Study("speed", "time of a ray and of a rasterised pixel", add_speed_arguments, run_speed),
 )
-"""``rays/claims`` and ``rays/speed``."""
+"""The studies ``rays/claims`` and ``rays/speed``."""

@@ -1,12 +1,12 @@
-"""Triangles among the Gaussians: where a ray meets them, and where it goes from there.
+"""Triangles among the Gaussians: intersection with rays, reflection and refraction.
 
-Where the ray ``O + t d`` meets the triangle p0, p1, p2 follows from Cramer's rule (Moeller and Trumbore 1997), with
-``e1 = p1 - p0``, ``e2 = p2 - p0``, ``s = O - p0`` and ``D = e1 . (d x e2)``:
+The intersection of the ray ``O + t d`` with the triangle p0, p1, p2 follows from Cramer's rule (Moeller and Trumbore
+1997), with ``e1 = p1 - p0``, ``e2 = p2 - p0``, ``s = O - p0`` and ``D = e1 . (d x e2)``:
 
     u = s . (d x e2) / D,   v = d . (s x e1) / D,   t = e2 . (s x e1) / D;    hit if u, v >= 0 and u + v <= 1
 
-A ray that goes on from x = O + t d in the direction d' keeps its t: its origin becomes ``x - t d'``, where the eye
-seems to stand. Behind a mirror this is the mirrored camera, exactly.
+A ray that continues from x = O + t d in the direction d' keeps its t; its origin becomes ``x - t d'``, the apparent
+position of the eye. Behind a mirror this is exactly the mirrored camera.
 """
 
 from typing import NamedTuple
@@ -18,23 +18,23 @@ from minisplat_ref.types import Bools, Floats, Ints
 
 PAIRS_AT_ONCE = 1 << 18  # of rays and triangles: some ten arrays of 3 float64, 60 MB
 NONE = -1
-AWAY = 1e-7  # of t, by which a ray is taken off the surface that it leaves
+AWAY = 1e-7  # fraction of t by which a ray starts off the surface that it leaves
 DIFFUSE, MIRROR, GLASS = range(3)
 
 
 class Surfaces(NamedTuple):
-    """Triangles and what they are made of."""
+    """Triangles and their materials."""
 
     corners: Floats
     """[F, 3, 3] triangle, corner, axis; world frame."""
     normals: Floats
-    """[F, 3] of length 1; out of the glass."""
+    """[F, 3] unit normals, which point out of glass."""
     kinds: Ints
     """[F] ``DIFFUSE``, ``MIRROR`` or ``GLASS``."""
     colors: Floats
-    """[F, 3] what is sent back, or let through."""
+    """[F, 3] fraction of the light that is reflected or transmitted."""
     indices: Floats
-    """[F] of refraction."""
+    """[F] index of refraction."""
 
 
 def normals_of(corners: Floats) -> Floats:
@@ -45,7 +45,7 @@ def normals_of(corners: Floats) -> Floats:
 
 
 def nearest_triangles(corners: Floats, rays: Rays) -> tuple[Floats, Ints]:
-    """Return the first triangle on each ray, between its limits.
+    """Return the first triangle on each ray between its limits.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def nearest_triangles(corners: Floats, rays: Rays) -> tuple[Floats, Ints]:
     depths : ndarray of shape (P,)
         t; infinite where there is none.
     faces : ndarray of shape (P,)
-        Which; ``NONE`` where there is none.
+        Rows of the triangles; ``NONE`` where there is none.
     """
     n_rays = len(rays.near)
     depths, faces = np.full(n_rays, np.inf), np.full(n_rays, NONE)
@@ -83,8 +83,8 @@ def nearest_triangles(corners: Floats, rays: Rays) -> tuple[Floats, Ints]:
     return depths, faces
 
 
-def going_on(rays: Rays, depths: Floats, directions: Floats) -> Rays:
-    """Return rays [P] that leave ``O + t d`` in other directions [P, 3] of the same lengths; t is counted on."""
+def continued(rays: Rays, depths: Floats, directions: Floats) -> Rays:
+    """Return rays [P] that leave ``O + t d`` in new directions [P, 3] of the same lengths and keep counting t."""
     points = rays.origins + depths[:, None] * rays.directions
     return Rays(points - depths[:, None] * directions, directions, depths, rays.far)
 
@@ -95,9 +95,9 @@ def reflected(directions: Floats, normals: Floats) -> Floats:
 
 
 def refracted(directions: Floats, normals: Floats, indices: Floats) -> tuple[Floats, Floats, Bools]:
-    """Send rays through the boundary of glass: Snell's law, and Schlick's share of what it reflects.
+    """Return the refracted directions at the boundary of glass by Snell's law, and the reflected fraction by Schlick's.
 
-    With the ratio r of the indices before and behind it, c = |d . n| / |d| and n against the ray::
+    With the ratio r of the indices before and behind the boundary, c = |d . n| / |d| and n against the ray::
 
         d' = r d + (r c - c') |d| n,   c' = sqrt(1 - r^2 (1 - c^2))
         F  = F0 + (1 - F0) (1 - c_air)^5,   F0 = ((1 - r) / (1 + r))^2
@@ -107,16 +107,16 @@ def refracted(directions: Floats, normals: Floats, indices: Floats) -> tuple[Flo
     Parameters
     ----------
     directions : ndarray of shape (P, 3)
-        Of any length.
+        d, of any length.
     normals : ndarray of shape (P, 3)
-        Out of the glass: a ray along them leaves it.
+        Unit normals that point out of the glass; a ray along them leaves it.
     indices : ndarray of shape (P,)
-        Of the glass.
+        Indices of refraction of the glass.
 
     Returns
     -------
     directions : ndarray of shape (P, 3)
-        Of the same lengths; unchanged where all is reflected.
+        d', of the same lengths; d where all is reflected.
     shares : ndarray of shape (P,)
         F in [0, 1]; 1 where all is reflected.
     is_total : ndarray of shape (P,) of booleans

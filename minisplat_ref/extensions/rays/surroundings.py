@@ -1,4 +1,4 @@
-"""What stands around the Gaussians: lights, mirrors, glass and meshes, from a JSON file.
+"""The surroundings of the Gaussians: lights, mirrors, glass and meshes, from a JSON file.
 
     {
       "lights": [[0, -3, 1]],
@@ -11,10 +11,10 @@
       ]
     }
 
-A surface is a parallelogram, or the triangles of a PLY that lies beside the JSON unless its path says otherwise. Glass
-is a closed mesh whose normals point outwards. "color" is white unless it is given. "ambient" is the share of light that
-comes from no lamp and throws no shadow, "bias" the part of the way to a lamp on which a Gaussian finds nothing in front
-of it: a floor of many Gaussians would lie in its own shadow.
+A surface is a parallelogram, or the triangles of a PLY, whose path is relative to the folder of the JSON. Glass is a
+closed mesh whose normals point outwards. "color" is white by default. "ambient" is the fraction of light that comes
+from no lamp and casts no shadow. "bias" is the fraction of the way from a Gaussian to a lamp on which nothing shadows
+it; without it, a floor of many Gaussians would lie in its own shadow.
 """
 
 from pathlib import Path
@@ -32,7 +32,7 @@ from minisplat_ref.types import Floats
 KINDS = {"diffuse": DIFFUSE, "mirror": MIRROR, "glass": GLASS}
 KEYS = {"lights", "ambient", "bias", "surfaces"}
 SURFACE_KEYS = {"kind", "mesh", "corner", "sides", "color", "index"}
-OPAQUE = 0.5  # alpha at a lamp from which on it counts as walled in
+OPAQUE = 0.5  # alpha of a Gaussian at a lamp above which the lamp is refused
 INDEX = 1.5  # of window glass
 MOST = 1e9  # of a coordinate, and of an index of refraction
 
@@ -43,21 +43,21 @@ class Surroundings(NamedTuple):
     lights: Floats
     """[L, 3] world frame; all of the same brightness."""
     ambient: float
-    """Share in [0, 1] of light that throws no shadow."""
+    """Fraction in [0, 1] of light that casts no shadow."""
     bias: float
-    """Share in [0, 1) of the way from a Gaussian to a lamp on which no Gaussian counts."""
+    """Fraction in [0, 1) of the way from a Gaussian to a lamp on which no Gaussian counts."""
     surfaces: Surfaces
 
 
-def made_of(mesh: Mesh, kind: int, color: Floats | None = None, index: float = INDEX) -> Surfaces:
-    """Return a mesh as surfaces of one kind."""
+def surfaces_of(mesh: Mesh, kind: int, color: Floats | None = None, index: float = INDEX) -> Surfaces:
+    """Return the triangles of a mesh as surfaces of one kind; ``color`` is white by default."""
     n = len(mesh.faces)
     colors = np.tile(np.ones(3) if color is None else color, (n, 1))
     return Surfaces(mesh.corners, normals_of(mesh.corners), np.full(n, kind), colors, np.full(n, index))
 
 
-def joined(surfaces: list[Surfaces]) -> Surfaces:
-    """Return several surfaces as one; of none an empty one."""
+def concatenated_surfaces(surfaces: list[Surfaces]) -> Surfaces:
+    """Return several surfaces as one, which is empty if there are none."""
     nothing = Surfaces(np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0, int), np.zeros((0, 3)), np.zeros(0))
     return Surfaces(*(np.concatenate(fields) for fields in zip(nothing, *surfaces, strict=True)))
 
@@ -69,12 +69,12 @@ def parallelogram(corner: Floats, sides: Floats) -> Mesh:
 
 
 def read(path: Path) -> Surroundings:
-    """Read a description.
+    """Read the surroundings from a JSON file.
 
     Raises
     ------
     InputError
-        It cannot be read, a name in it is unknown, a number makes no sense, a surface has no area or glass is open.
+        It cannot be read, a name in it is unknown, a number is out of range, a surface has no area, or glass is open.
     """
     content = read_json(path, "give the lights and surfaces as minisplat-ref rays render --help shows")
     if not isinstance(content, dict):
@@ -89,16 +89,16 @@ def read(path: Path) -> Surroundings:
         if not 0 <= number <= 1:
             raise InputError(f"{path}: {name} is {content[name]}: give a number from 0 to 1")
     parts = [_surface(entry, f"{path}, surface {i}", path.parent) for i, entry in enumerate(surfaces)]
-    return Surroundings(np.array(places).reshape(-1, 3), ambient, bias, joined(parts))
+    return Surroundings(np.array(places).reshape(-1, 3), ambient, bias, concatenated_surfaces(parts))
 
 
 def check_lights(surroundings: Surroundings, gaussians: Whitened, source: str | Path) -> None:
-    """Refuse a light inside of an opaque Gaussian, which would hide it from everything.
+    """Refuse a light inside an opaque Gaussian, which would hide it from everything.
 
     Raises
     ------
     InputError
-        One line that names both.
+        There is one; the line names both.
     """
     for i, light in enumerate(surroundings.lights):
         offsets = np.einsum("nij,nj->ni", gaussians.maps, light - gaussians.means)
@@ -138,11 +138,11 @@ def _surface(entry: Any, where: str, folder: Path) -> Surfaces:
     index = as_number(entry.get("index", INDEX))
     if not 1 <= index <= MOST:
         raise InputError(f"{where}: index is {entry['index']}: the index of refraction of glass is at least 1")
-    return made_of(mesh, kind, color, index)
+    return surfaces_of(mesh, kind, color, index)
 
 
 def _check_closed(mesh: Mesh, where: str) -> None:
-    """Refuse a mesh with an edge that does not run once in either direction: no light would find its way out."""
+    """Refuse a mesh in which an edge does not run once in either direction, so that glass would be open."""
     edges = np.stack([mesh.faces, np.roll(mesh.faces, -1, axis=1)], axis=2).reshape(-1, 2)
     there, back = (np.sort(ends[:, 0] * len(mesh.vertices) + ends[:, 1]) for ends in (edges, edges[:, ::-1]))
     if not np.array_equal(there, back) or (np.diff(there) == 0).any():

@@ -1,4 +1,4 @@
-"""The bundles of ray tracing. All floats are float64: a thin Gaussian far away leaves float32 no digit of its distance.
+"""The bundles of ray tracing, all in float64, because float32 has no digits left for a thin Gaussian far away.
 
 P rays, N Gaussians, H hits.
 """
@@ -25,7 +25,7 @@ class Rays(NamedTuple):
     origins: Floats
     """[P, 3] world frame."""
     directions: Floats
-    """[P, 3] of any length but zero, which depths are counted in."""
+    """[P, 3] of any length but zero; depths are in units of it."""
     near: Floats
     """[P]."""
     far: Floats
@@ -33,7 +33,7 @@ class Rays(NamedTuple):
 
 
 class Hits(NamedTuple):
-    """What rays meet and blend, ray after ray, nearest first."""
+    """The blended hits of rays, ray after ray, nearest first."""
 
     offsets: Ints
     """[P + 1] ray r has the hits offsets[r]:offsets[r + 1]."""
@@ -52,7 +52,7 @@ class Hits(NamedTuple):
 
 
 class BlendedRays(NamedTuple):
-    """What rays see."""
+    """The colours that rays see, and what their gradient needs."""
 
     image: Floats
     """[P, 3] background included."""
@@ -61,13 +61,13 @@ class BlendedRays(NamedTuple):
     transmittances: Floats
     """[P] behind the last hit."""
     n_hits: Ints
-    """[P] of each ray."""
+    """[P] number of blended hits."""
     is_seen: Bools
     """[N] whether any ray has blended the Gaussian."""
 
 
 class RayGradient(NamedTuple):
-    """Gradient of the loss with respect to all that :class:`BlendedRays` depend on."""
+    """Gradient of the loss with respect to everything that :class:`BlendedRays` depends on."""
 
     means: Floats
     """[N, 3]."""

@@ -1,17 +1,17 @@
 """Linear motion: every Gaussian has a velocity, and a view shows the scene at its time.
 
-The smallest extension that is a method: one field more, a renderer that wraps 3DGS's, a recipe; and, as others may have
-them, a command and a study. It is the worked example of ``docs/EXTENDING.md``. The centre of a Gaussian at the time t
-of a view is
+This is the smallest extension that is a method. It has one more field, a renderer that wraps that of 3DGS, a recipe, a
+command and a study, and it is the worked example of ``docs/EXTENDING.md``. The centre of a Gaussian at the time t of a
+view is
 
     mu(t) = mu + t nu
 
 and everything else stays as it is (:mod:`minisplat_ref.extensions.velocity.reference`). Velocities start at zero, so
-that an untrained model is a static one. Times are those of the views, ``time`` in a transforms.json: 0 where a scene
-does not say, which leaves the velocities without a gradient.
+that an untrained model is a static one. Times are those of the views, ``time`` in a transforms.json; they are 0 where a
+scene has none, which leaves the velocities without a gradient.
 
-Left out: rotations and colours that change, and motion that is not straight; that is 4DGS's subject. No paper is
-followed here; linear motion is the first-order case of all of them.
+Left out are rotations and colours that change, and motion that is not straight, the subject of 4DGS. No single paper is
+followed; linear motion is the first-order case of all of them.
 
     minisplat-ref train SCENE --recipe velocity
     minisplat-ref velocity freeze runs/SCENE-velocity/point_cloud.ply --time 0.5 --out still.ply

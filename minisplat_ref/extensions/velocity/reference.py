@@ -1,4 +1,4 @@
-"""Where a Gaussian is at a time, and the gradient of that: ``mu(t) = mu + t nu``."""
+"""The position of a Gaussian at a time, ``mu(t) = mu + t nu``, and its gradient."""
 
 from minisplat_ref.types import Floats
 
@@ -9,9 +9,9 @@ def means_at(means: Floats, velocities: Floats, time: float) -> Floats:
     Parameters
     ----------
     means : ndarray of shape (N, 3)
-        At time 0, world frame.
+        Centres mu at time 0, world frame.
     velocities : ndarray of shape (N, 3)
-        World units per unit of time.
+        nu, world units per unit of time.
     time : float
         t.
 

@@ -1,11 +1,11 @@
 """The study ``velocity/motion`` asks whether velocities are found, and what is lost without them.
 
-A scene of which everything is known: a dozen round Gaussians, each with a velocity of its own, photographed by cameras
-on an arc at times from 0 to 1. Both recipes start from the Gaussians as they are at time 0, at rest, and keep their
-number, so that row n of the result is Gaussian n of the scene.
+The scene is known exactly: a dozen round Gaussians, each with a velocity of its own, are photographed by cameras on an
+arc at times from 0 to 1. Both recipes start from the Gaussians at time 0, at rest, and keep their number, so that row n
+of the result is Gaussian n of the scene.
 
-The start is kind: from gray points of one size, 600 iterations find other motions that explain the training views, with
-an error of 0.24 instead of 0.01.
+This start is favourable. From grey points of one size, 600 iterations find other motions that explain the training
+views, with an error of 0.24 instead of 0.01.
 """
 
 import argparse
@@ -31,16 +31,16 @@ SPEED = 0.5  # largest velocity along an axis
 
 
 class Outcome(NamedTuple):
-    """What a recipe has made of the scene."""
+    """The errors of a trained scene."""
 
     psnr: float
-    """Of the held-out views, dB."""
+    """Mean over the held-out views, dB."""
     velocity_rmse: float
-    """World units per unit of time, over all axes; of a still population, what the velocities are themselves."""
+    """RMS error over all axes, world units per unit of time; without velocities, the RMS of the true ones."""
 
 
 def moving_gaussians(rng: np.random.Generator) -> MovingGaussians:
-    """Return round Gaussians of random colours and velocities, on a grid in the plane z = 0 and a little off it."""
+    """Return round Gaussians with random colours and velocities on a grid near the plane z = 0."""
     n = N_GAUSSIANS
     rows, columns = np.divmod(np.arange(n), 4)
     grid = 0.8 * np.column_stack([columns - 1.5, rows - 1.0, np.zeros(n)])  # [N, 3]
@@ -64,7 +64,7 @@ def camera_at(azimuth: float) -> Camera:
 
 
 def photographs(truth: MovingGaussians) -> tuple[View, ...]:
-    """Return pictures of the scene in 8 bits, by the reference; places and times come in different orders."""
+    """Return 8-bit pictures of the scene by the reference; the order of the times is not that of the cameras."""
     views = []
     for i in range(N_VIEWS):
         camera, time = camera_at(ARC * np.sin(2.4 * i)), (7 * i % N_VIEWS) / (N_VIEWS - 1)
@@ -90,7 +90,7 @@ def moving_scene(truth: MovingGaussians) -> Scene:
 
 
 def outcome(recipe: Recipe, truth: MovingGaussians, seed: int) -> Outcome:
-    """Train a recipe without density control from the scene at rest, and compare."""
+    """Train a recipe without density control from the scene at rest, and return its errors."""
     scene, recipe = moving_scene(truth), recipe._replace(events=(), sh_degree=0)
     state = initial_state(scene, recipe, seed)
     still = Gaussians(*(field.copy() for field in truth[: len(Gaussians._fields)]))
@@ -106,8 +106,10 @@ def outcome(recipe: Recipe, truth: MovingGaussians, seed: int) -> Outcome:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the study."""
-    parser.add_argument("--iterations", type=int, default=600, metavar="N", help="of each training (default 600)")
-    parser.add_argument("--seed", type=int, default=0, metavar="S", help="of scene and trainings (default 0)")
+    parser.add_argument(
+        "--iterations", type=int, default=600, metavar="N", help="iterations per training (default 600)"
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="seed of scene and trainings (default 0)")
 
 
 def run(args: argparse.Namespace) -> int:

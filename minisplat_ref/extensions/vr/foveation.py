@@ -1,15 +1,15 @@
-"""Foveated pictures: fewer rays the further they are from where the eye looks.
+"""Foveated rendering: fewer rays the further they are from the gaze.
 
-The least angle that an eye resolves grows about linearly with the eccentricity e, the angle to the gaze (Guenter et al.
-2012)::
+The minimum angle of resolution of the eye grows about linearly with the eccentricity e, the angle to the gaze (Guenter
+et al. 2012)::
 
     MAR(e) = w + m e,   w = 1/48 degree, m = 0.0275
 
-The display's pixel counts as what the eye resolves at ``full``: up to there every pixel is drawn. Where MAR has
-doubled, one ray for each block of 2 x 2 pixels is enough, where it has doubled again, one for 4 x 4. These coarse
-pictures are drawn through the middles of the blocks by the same footprints, low-pass included, in the tiles that need
-them and no others; between the middles they are interpolated, and in a ring where a zone begins two pictures are
-blended.
+The pixel of the display counts as what the eye resolves at the eccentricity ``full``; up to there every pixel is drawn.
+Where MAR has doubled, one ray for each block of 2 x 2 pixels is enough, and where it has doubled again, one for 4 x 4.
+These coarse pictures are drawn through the centres of the blocks with the same footprints, low-pass included, and only
+in the tiles that need them. They are interpolated between the centres, and blended with the finer picture in a ring
+where a zone begins.
 """
 
 from typing import NamedTuple
@@ -23,43 +23,43 @@ from minisplat_ref.rendering import Request
 from minisplat_ref.types import Bools, Camera, Floats, Model, TileBins
 
 ACUITY_OFFSET, ACUITY_SLOPE = 1 / 48, 0.0275  # degrees, and degrees per degree
-N_ZONES = 3  # blocks of 1, 2 and 4 pixels a side
+N_ZONES = 3  # blocks of 1, 2 and 4 pixels per side
 RING = 0.2  # width of a blended ring, relative to the eccentricity at which it begins
 
 
 class Gaze(NamedTuple):
-    """Where the eye looks."""
+    """The point of the picture at which the eye looks."""
 
     x: float
     """Pixels."""
     y: float
     """Pixels."""
     full: float
-    """Degrees around it in which every pixel is drawn."""
+    """Eccentricity up to which every pixel is drawn, degrees."""
 
 
 class Zone(NamedTuple):
-    """What was drawn at one rate."""
+    """The work of drawing at one rate."""
 
     block: int
-    """Pixels a side for one ray."""
+    """Pixels per side of the block of one ray."""
     begins: float
-    """Eccentricity, degrees."""
+    """Eccentricity at which the zone begins, degrees."""
     n_tiles: int
-    """That were drawn."""
+    """Number of tiles that were drawn."""
     n_samples: int
-    """Rays of them."""
+    """Number of their rays."""
     n_pairs: int
-    """Pairs (tile, Gaussian) of them."""
+    """Number of their pairs (tile, Gaussian)."""
 
 
 def resolved_angles(eccentricities: Floats) -> Floats:
-    """Return MAR(e), degrees."""
+    """Return the minimum angle of resolution MAR(e), degrees, at eccentricities in degrees."""
     return ACUITY_OFFSET + ACUITY_SLOPE * eccentricities
 
 
 def zone_begins(full: float) -> list[float]:
-    """Return the eccentricities [N_ZONES], degrees, where each zone begins: where MAR has doubled once more."""
+    """Return the eccentricities [N_ZONES], degrees, at which each zone begins: where MAR has doubled once more."""
     return [0.0] + [
         (2.0**k * (ACUITY_OFFSET + ACUITY_SLOPE * full) - ACUITY_OFFSET) / ACUITY_SLOPE for k in range(N_ZONES - 1)
     ]
@@ -75,7 +75,7 @@ def eccentricities(camera: Camera, x: float, y: float) -> Floats:
 
 
 def zone_weights(eccentricities: Floats, full: float) -> list[Floats]:
-    """Return the weight [H, W] of each zone's picture; they add up to one.
+    """Return the weight [H, W] of each zone's picture; the weights add up to one.
 
     A ring lies in the coarser zone, so that no pixel is drawn more coarsely than its eccentricity allows.
     """
@@ -89,16 +89,16 @@ def zone_weights(eccentricities: Floats, full: float) -> list[Floats]:
 
 
 def check_gaze(gaze: Gaze, camera: Camera, name: str = "picture") -> None:
-    """Refuse a gaze outside a picture, and an angle without meaning.
+    """Refuse a gaze outside a picture, and an angle out of range.
 
     Raises
     ------
     InputError
-        One line.
+        The gaze lies outside, or ``full`` is not from 0 to 180 degrees.
     """
     if not (0 <= gaze.x <= camera.width and 0 <= gaze.y <= camera.height):
         raise InputError(
-            f"gaze {gaze.x:g},{gaze.y:g} lies outside of {name}, which has {camera.width} x {camera.height} pixels:"
+            f"gaze {gaze.x:g},{gaze.y:g} lies outside {name}, which has {camera.width} x {camera.height} pixels:"
             f" give x from 0 to {camera.width} and y from 0 to {camera.height}"
         )
     if not 0 <= gaze.full <= 180:
@@ -113,23 +113,26 @@ def render_foveated(
     Parameters
     ----------
     model : Model
+        The Gaussians.
     camera : Camera
+        The camera of the whole picture.
     request : Request
-        Without wishes besides colours.
+        It asks for colours only.
     gaze : Gaze
+        Where the eye looks.
     buffer_size : int, optional
-        Hits that a pixel holds back; all by default.
+        Hits that a pixel sorts in its buffer; all by default.
 
     Returns
     -------
     image : ndarray of shape (H, W, 3)
     zones : list of Zone
-        The work.
+        The work of each zone.
 
     Raises
     ------
     InputError
-        The gaze lies outside of the picture.
+        The gaze lies outside the picture.
     """
     check_gaze(gaze, camera)
     weights = zone_weights(eccentricities(camera, gaze.x, gaze.y), gaze.full)
@@ -152,7 +155,7 @@ def render_foveated(
 
 
 def _coarser(camera: Camera, block: int) -> Camera:
-    """Return the camera whose pixels are blocks; those at the edges may hang over."""
+    """Return the camera whose pixels are blocks; those at the edges may extend beyond the picture."""
     return camera._replace(
         fx=camera.fx / block,
         fy=camera.fy / block,
@@ -164,7 +167,7 @@ def _coarser(camera: Camera, block: int) -> Camera:
 
 
 def _needed_samples(is_needed: Bools, block: int) -> Bools:
-    """Return which blocks' middles pixels need: their own block's, and its neighbours' to interpolate between."""
+    """Return which samples are needed: those of the blocks of needed pixels, and their neighbours for interpolation."""
     if block == 1:
         return is_needed
     height, width = (-(-n // block) for n in is_needed.shape)
@@ -185,7 +188,7 @@ def _needed_tiles(is_needed: Bools, bins: TileBins) -> Bools:
 
 
 def _kept(bins: TileBins, is_kept: Bools) -> TileBins:
-    """Return the lists with those of other tiles empty; enough to draw, not to differentiate."""
+    """Return the lists with those of other tiles empty; this suffices for drawing, not for differentiating."""
     counts = np.diff(bins.tile_offsets)
     offsets = np.concatenate([[0], np.cumsum(np.where(is_kept, counts, 0))])
     pairs = np.repeat(is_kept, counts)
@@ -204,7 +207,7 @@ def _n_pixels(tiles: Bools, bins: TileBins) -> int:
 
 
 def _interpolated(coarse: Floats, block: int, shape: tuple[int, int]) -> Floats:
-    """Return a picture [H, W, 3] between the middles of its blocks, bilinear; beyond the outermost it stays."""
+    """Return a picture [H, W, 3] by bilinear interpolation between the centres of blocks, clamped at the edges."""
     if block == 1:
         return coarse
     for axis, size in enumerate(shape):

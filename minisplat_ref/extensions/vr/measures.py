@@ -1,4 +1,4 @@
-"""The work of the studies ``vr/foveation`` and ``vr/yaw``."""
+"""The measurements of the studies ``vr/foveation`` and ``vr/yaw``."""
 
 import statistics
 import time
@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.extensions.shared_studies import tidy
-from minisplat_ref.extensions.shared_tangent_rays import ewa_hits, steps_along, tangent_hits, turned
+from minisplat_ref.extensions.shared_tangent_rays import color_changes, ewa_hits, tangent_hits, yawed
 from minisplat_ref.extensions.shared_tangent_renderer import activated
 from minisplat_ref.extensions.vr.foveation import Gaze, Zone, eccentricities, render_foveated, resolved_angles
 from minisplat_ref.extensions.vr.method import BUFFER
@@ -19,12 +19,12 @@ from minisplat_ref.rendering import Request
 from minisplat_ref.types import Camera, Floats, Gaussians, Ints, Model, Primitives, View
 
 EVERYWHERE = 180.0  # degrees: every pixel is drawn
-WAYS = ("3DGS: EWA, by z", "tangent planes, buffer of 16", "tangent planes, exact order")
+METHODS = ("3DGS: EWA, by z", "tangent planes, buffer of 16", "tangent planes, exact order")
 COLORS = ("#8a8580", "#35608c", "#d2493f")
 
 
 def weighted_psnr(image: Floats, target: Floats, angles: Floats) -> float:
-    """Return the PSNR, dB, with pixels weighted by what an eye resolves of them: ``1 / MAR(e)^2``.
+    """Return the PSNR, dB, with pixels weighted by the resolution of the eye, ``1 / MAR(e)^2``.
 
     Parameters
     ----------
@@ -41,9 +41,9 @@ def weighted_psnr(image: Floats, target: Floats, angles: Floats) -> float:
 def foveated(
     model: Model, views: Sequence[View], background: Floats, fulls: Sequence[float], repeats: int
 ) -> list[dict[str, Any]]:
-    """Return work and errors, a row for each angle ``full``, the first that of the whole picture.
+    """Return work and errors for each angle of ``fulls``, after those of pictures that are drawn in full everywhere.
 
-    The eye looks at the middle of each view. Work is counted relative to the whole picture's.
+    The eye looks at the middle of each view. Counts are totals over the views.
     """
     request, rows = Request(background, backend=CPU), []
     whole: list[Floats] = []
@@ -89,7 +89,7 @@ COUNTS = ("n_tiles", "n_samples", "n_pairs")
 
 
 def draw_foveated(rows: list[dict[str, Any]]) -> Figure:
-    """Draw the weighted PSNR over the rays that are drawn."""
+    """Draw the weighted PSNR against the number of rays."""
     figure = Figure(figsize=(6.5, 4), layout="constrained")
     axes = figure.subplots()
     work = [100 * row["n_samples"] / rows[0]["n_samples"] for row in rows]
@@ -107,20 +107,21 @@ def draw_foveated(rows: list[dict[str, Any]]) -> Figure:
 def yaw_steps(
     gaussians: Gaussians, camera: Camera, n_rays: int, half_angle: float, n_steps: int
 ) -> dict[str, list[float]]:
-    """Return the largest change of any ray's colour in each step of a yaw of +-``half_angle`` degrees, by way.
+    """Return the largest change of any ray's colour in each step of a yaw of +-``half_angle`` degrees, by method.
 
-    n_rays x n_rays rays within 6 degrees of the camera's axis; Gaussians have their colours of degree 0. Those that no
-    ray hits at five of the cameras are left out.
+    There are n_rays x n_rays rays within 6 degrees of the camera's axis. Gaussians have their colours of degree 0;
+    those that no ray hits at any of five of the cameras are left out.
     """
     wide = Gaussians._make(field.astype(np.float64) for field in gaussians)
     primitives, colors = activated(wide, None), np.maximum(0.5 + SH_C0 * wide.sh_dc, 0)
     slopes = np.linspace(-1, 1, n_rays) * np.tan(np.radians(6.0))
     x, y = np.meshgrid(slopes, slopes)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ camera.cam_from_world_R
-    path = [turned(camera, yaw) for yaw in np.radians(np.linspace(-half_angle, half_angle, n_steps + 1))]
+    path = [yawed(camera, yaw) for yaw in np.radians(np.linspace(-half_angle, half_angle, n_steps + 1))]
     rows = _hit_rows(primitives, path[:: max(n_steps // 4, 1)], rays)
     seen = Primitives._make(field[rows] for field in primitives)
-    return {way: steps_along(way, seen, colors[rows], path, rays, GSPLAT_MAIN)[0].tolist() for way in WAYS}
+    seen_by = (seen, colors[rows], path, rays, GSPLAT_MAIN)
+    return {method: color_changes(method, *seen_by)[0].tolist() for method in METHODS}
 
 
 def _hit_rows(primitives: Primitives, cameras: Sequence[Camera], rays: Floats) -> Ints:
@@ -136,11 +137,11 @@ def draw_yaw(found: dict[str, list[float]], half_angle: float) -> Figure:
     """Draw the largest change in each step."""
     figure = Figure(figsize=(8, 4), layout="constrained")
     axes = figure.subplots()
-    for (way, steps), color in zip(found.items(), COLORS, strict=True):
+    for (method, steps), color in zip(found.items(), COLORS, strict=True):
         axes.semilogy(
-            np.linspace(-half_angle, half_angle, len(steps)), np.maximum(steps, 1e-17), color=color, label=way
+            np.linspace(-half_angle, half_angle, len(steps)), np.maximum(steps, 1e-17), color=color, label=method
         )
-    axes.set(title="Largest colour change of a fixed ray in a step", xlabel="yaw (degrees)", ylim=(1e-17, 1))
+    axes.set(title="Largest colour change of a fixed ray per step", xlabel="yaw (degrees)", ylim=(1e-17, 1))
     axes.legend(frameon=False, fontsize=8)
     tidy(axes)
     return figure

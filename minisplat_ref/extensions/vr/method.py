@@ -7,7 +7,7 @@ from minisplat_ref.methods.mini_splatting2 import MINI_SPLATTING2
 from minisplat_ref.rendering import SPLATTING, Renderer
 from minisplat_ref.training.representation import Representation
 
-BUFFER = 16  # hits that a pixel holds back
+BUFFER = 16  # hits that a pixel sorts in its buffer
 
 HEADSET = Representation(
     "gaussians on tangent planes, sorted in a buffer",
@@ -15,4 +15,4 @@ HEADSET = Representation(
 )
 
 VR = MINI_SPLATTING2._replace(name="vr")
-"""``vr``: Mini-Splatting2 on tangent planes; importance is that of 3DGS's footprints."""
+"""The recipe ``vr``: Mini-Splatting2 on tangent planes; importance is that of 3DGS's footprints."""

@@ -1,4 +1,4 @@
-"""The command ``minisplat-ref vr render``: pictures for an eye that looks at a given pixel."""
+"""The command ``minisplat-ref vr render``, which draws pictures for an eye that looks at a given pixel."""
 
 import argparse
 from pathlib import Path
@@ -11,9 +11,9 @@ def add_parser(commands: Any) -> None:
     """Add the command."""
     parser = commands.add_parser("render", help="draw pictures with fewer rays away from where the eye looks")
     parser.add_argument("ply", type=Path, metavar="PLY", help="point_cloud.ply of a run")
-    parser.add_argument("--gaze", type=gaze, required=True, metavar="X,Y", help="where the eye looks, pixels")
+    parser.add_argument("--gaze", type=gaze, required=True, metavar="X,Y", help="pixel at which the eye looks")
     parser.add_argument("--full", type=float, default=FULL, metavar="DEG", help=f"drawn in full (default {FULL:g})")
-    parser.add_argument("--cameras", type=Path, metavar="FILE", help="of the run (default cameras.json beside the PLY)")
+    parser.add_argument("--cameras", type=Path, metavar="FILE", help="default cameras.json beside the PLY")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for the pictures")
     parser.set_defaults(run=run)
 
@@ -23,17 +23,17 @@ def gaze(text: str) -> tuple[float, float]:
     try:
         x, y = (float(word) for word in text.split(","))
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no place in a picture such as 320,240") from None
+        raise argparse.ArgumentTypeError(f"{text!r} is not a pixel such as 320,240") from None
     return x, y
 
 
 def run(args: argparse.Namespace) -> int:
-    """Draw the test views, or all where there are none, and print the work of each zone.
+    """Draw the test views, or all views where there are none, and print the work of each zone.
 
     Raises
     ------
     InputError
-        The PLY or the cameras cannot be used, the gaze lies outside of a picture, or the folder exists.
+        The PLY or the cameras cannot be used, the gaze lies outside a picture, or the folder exists.
     """
     from minisplat_ref.extensions.vr.foveation import Gaze, check_gaze, render_foveated
     from minisplat_ref.extensions.vr.method import BUFFER

@@ -1,14 +1,14 @@
-"""What the gradient proof checks: the renderer."""
+"""The stage of the gradient check: the renderer."""
 
 import numpy as np
 
 from minisplat_ref.backends import Backend
-from minisplat_ref.extensions.shared_tangent_stages import watching_stage
+from minisplat_ref.extensions.shared_tangent_stages import renderer_stage
 from minisplat_ref.extensions.vr.method import BUFFER, HEADSET
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
-    """Return the renderer with its buffer."""
-    return (watching_stage(backend, setting, HEADSET, BUFFER, rng),)
+    """Return the renderer with its buffer as a stage."""
+    return (renderer_stage(backend, setting, HEADSET, BUFFER, rng),)

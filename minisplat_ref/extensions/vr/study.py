@@ -16,13 +16,13 @@ def add_foveation_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the scene, ``--ply``, ``--downscale``, ``--repeats`` and ``--out``."""
     parser.add_argument("scene", metavar="SCENE", help="folder of a scene, or a synthetic one")
     parser.add_argument("--ply", type=Path, required=True, metavar="FILE", help="Gaussians that were trained on it")
-    parser.add_argument("--downscale", type=int, default=1, metavar="D", help="photographs at 1/D of their size")
-    parser.add_argument("--repeats", type=int, default=3, metavar="N", help="of each picture's time (default 3)")
+    parser.add_argument("--downscale", type=int, default=1, metavar="D", help="use photographs at 1/D of their size")
+    parser.add_argument("--repeats", type=int, default=3, metavar="N", help="timings per picture (default 3)")
     add_out(parser)
 
 
 def run_foveation(args: argparse.Namespace) -> None:
-    """Draw the test views at rates by eccentricity, write, print two tables.
+    """Draw the test views at rates by eccentricity, write the results, and print two tables.
 
     Raises
     ------
@@ -80,12 +80,14 @@ def run_foveation(args: argparse.Namespace) -> None:
 def add_yaw_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--ply``, ``--steps`` and ``--out``."""
     parser.add_argument("--ply", type=Path, required=True, metavar="FILE", help="point_cloud.ply of a run")
-    parser.add_argument("--steps", type=int, default=40, metavar="N", help="of a yaw of +-10 degrees (default 40)")
+    parser.add_argument(
+        "--steps", type=int, default=40, metavar="N", help="steps of a yaw of +-10 degrees (default 40)"
+    )
     add_out(parser)
 
 
 def run_yaw(args: argparse.Namespace) -> None:
-    """Turn the first test camera of a run, write, print a table.
+    """Turn the first test camera of a run, write the results, and print a table.
 
     Raises
     ------
@@ -107,11 +109,11 @@ def run_yaw(args: argparse.Namespace) -> None:
         write(folder, result, measures.draw_yaw(found, 10.0))
     step, n = 20 / args.steps, len(gaussians.means)
     print(f"Largest change of a fixed ray's colour in a step of {step:g} degrees, {n:,} Gaussians\n")
-    rows = [[way, f"{max(steps):.1e}", f"{sorted(steps)[len(steps) // 2]:.1e}"] for way, steps in found.items()]
-    print(markdown_table(["way", "largest", "median of the steps"], rows))
+    rows = [[method, f"{max(steps):.1e}", f"{sorted(steps)[len(steps) // 2]:.1e}"] for method, steps in found.items()]
+    print(markdown_table(["method", "largest", "median of the steps"], rows))
 
 
 FOVEATION = Study(
-    "foveation", "work against PSNR where fewer rays are drawn aside", add_foveation_arguments, run_foveation
+    "foveation", "work against PSNR with fewer rays away from the gaze", add_foveation_arguments, run_foveation
 )
-YAW = Study("yaw", "colours of fixed rays of a trained scene while the camera turns", add_yaw_arguments, run_yaw)
+YAW = Study("yaw", "colours of fixed rays through a trained scene while the camera turns", add_yaw_arguments, run_yaw)
