@@ -34,9 +34,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--scene", type=Path, required=True, metavar="JSON", help="lights and surfaces, see above")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for the pictures")
     parser.add_argument("--cameras", type=Path, metavar="JSON", help="cameras.json (default: the run's test views)")
-    parser.add_argument(
-        "--frames", type=int, default=12, metavar="N", help="of an orbit without cameras (default 12)"
-    )
+    parser.add_argument("--frames", type=int, default=12, metavar="N", help="of an orbit without cameras (default 12)")
     parser.add_argument(
         "--background", type=float, nargs=3, default=(0.0, 0.0, 0.0), metavar=("R", "G", "B"), help="0 to 1 each"
     )
