@@ -212,6 +212,45 @@ def test_jax_differentiates():
     assert np.array_equal(gradients["backgrounds"], call.v_colors.sum((1, 2))) and not gradients["colors"].any()
 
 
+def test_a_jax_renderer_agrees(monkeypatch, capsys):
+    """By the command line in float64, by the assertion in float32 afterwards: the former leaves no trace in JAX."""
+    jax = pytest.importorskip("jax")
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    code, said = compare(capsys, "jax_renderer:rasterization", "--scene", "odd-size", "--dtype", "float64")
+    assert code == 0 and "all 15 cases passed" in said.out and "v_view" in said.out.split("not given")[0]
+    import jax_renderer
+
+    assert not jax.config.jax_enable_x64
+    report = assert_matches_oracle(jax_renderer.rasterization, scenes=SCENE)
+    assert report.n_failed == 0 and len(report.cases) == 15
+
+
+def test_a_wrong_jax_renderer_is_found():
+    jax = pytest.importorskip("jax")
+    from jax_renderer import rasterization
+
+    def without_gradient_of_scales(scales, **arguments):
+        return rasterization(scales=jax.lax.stop_gradient(scales), **arguments)
+
+    with pytest.raises(AssertionError, match="first stage that diverges is v_scales"):
+        assert_matches_oracle(without_gradient_of_scales, arrays="jax", scenes=SCENE, dtype="float64")
+
+
+def test_the_own_vjp_of_a_jax_renderer_gets_its_dtype():
+    jax = pytest.importorskip("jax")
+
+    def function(means, **_):
+        return means[None, None], means[None, None, :, :1]
+
+    def own_vjp(means, v_render_colors, v_render_alphas, **_):
+        return {"v_means": v_render_colors[0, 0] * (means.dtype == jax.numpy.float64)}
+
+    ones = np.ones((1, 1, 2, 3))
+    call = Call({"means": np.full((2, 3), 1 / 3)}, {}, ones, ones[..., :1])
+    result = run("jax", function, own_vjp, call)
+    assert result.colors.dtype == np.float64 and np.array_equal(result.gradients["means"], ones[0, 0])
+
+
 def example():
     """The first block of the section on functions in docs/ORACLE.md: gsplat's torch functions as a renderer."""
     text = (DOCS / "ORACLE.md").read_text()

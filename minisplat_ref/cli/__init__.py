@@ -11,6 +11,7 @@ which and what to do), 130 interrupted. A programming error keeps its traceback.
 import argparse
 import os
 import sys
+import textwrap
 import warnings
 from collections.abc import Sequence
 from typing import TextIO
@@ -90,7 +91,7 @@ def _parser_of(argv: Sequence[str]) -> argparse.ArgumentParser:
     name = argv[0] if argv else ""
     if name.startswith("-") or name in _command_names(parser):
         return parser
-    from minisplat_ref.extensions import folders
+    from minisplat_ref.extensions import folders, summaries
 
     if name not in folders():
         return parser
@@ -101,7 +102,12 @@ def _parser_of(argv: Sequence[str]) -> argparse.ArgumentParser:
         raise InputError(f"extension {name} has no commands: see minisplat-ref extensions {name}")
     parser = Parser(prog="minisplat-ref", formatter_class=HelpFormatter)
     parser.set_defaults(run=None)
-    own = parser.add_subparsers(metavar="EXTENSION").add_parser(name, formatter_class=HelpFormatter)
+    own = parser.add_subparsers(metavar="EXTENSION").add_parser(
+        name,
+        description=textwrap.fill(summaries()[name], 80),
+        epilog=f"minisplat-ref {name} COMMAND --help explains a command.",
+        formatter_class=HelpFormatter,
+    )
     commands = own.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in extension.commands:
         command.add_parser(commands)

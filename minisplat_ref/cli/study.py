@@ -58,7 +58,21 @@ def run(args: argparse.Namespace) -> int:
     study = studies[args.name]
     parser = Parser(prog=f"minisplat-ref study {args.name}", description=study.summary, formatter_class=HelpFormatter)
     study.add_arguments(parser)
+    parser.epilog = _example(parser)
     return study.run(parser.parse_args(args.arguments)) or 0
+
+
+EXAMPLES = {"SCENE": "room", "FILE": "runs/mine/point_cloud.ply", "DIR": "study"}
+"""What stands in the example of a study for a required argument, by its placeholder."""
+
+
+def _example(parser: argparse.ArgumentParser) -> str:
+    """Return a line that calls a study with all that it requires."""
+    words = [parser.prog]
+    for action in parser._actions:
+        if action.required:
+            words += [*action.option_strings[-1:], EXAMPLES.get(str(action.metavar), str(action.metavar))]
+    return f"example:\n  {' '.join(words)}"
 
 
 def _extension_studies(name: str) -> "dict[str, Study]":

@@ -99,7 +99,7 @@ def test_weighted_psnr_counts_the_fovea(rng):
 
 @pytest.mark.parametrize("gaze", [Gaze(-1, 5, 8), Gaze(81, 5, 8), Gaze(5, 60.5, 8), Gaze(np.nan, 5, 8), Gaze(5, 5, -1)])
 def test_a_gaze_outside_is_refused(gaze, rng):
-    with pytest.raises(InputError, match=r"gaze .* lies outside of picture|--full is -1 degrees"):
+    with pytest.raises(InputError, match=r"gaze .* lies outside picture|--full is -1 degrees"):
         render_foveated(Model(make_gaussians(rng, 2)), CAMERA, REQUEST, gaze, BUFFER)
 
 
@@ -137,8 +137,8 @@ def test_trains_renders_and_studies(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--gaze", "99,12"], "gaze 99,12 lies outside of"),
-        (["--gaze", "1"], "no place in a picture"),
+        (["--gaze", "99,12"], "gaze 99,12 lies outside"),
+        (["--gaze", "1"], "not a pixel"),
         (["--gaze", "1,2", "--full", "200"], "--full is 200 degrees"),
     ],
 )

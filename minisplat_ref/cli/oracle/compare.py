@@ -8,10 +8,11 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.arguments import Commands, HelpFormatter
 
 DESCRIPTION = """\
-Compare a renderer with the float64 reference, stage by stage, and name the first
-stage that differs: projection, tile lists, colours, compositing, losses, further
-channels and depths, blend statistics, surface points, Adam; then the gradients
-from the image back to the scene; and last the whole view, by one call.
+Compare a renderer with the float64 reference, stage by stage, and name the
+first stage that differs. The stages are projection, tile lists, colours,
+compositing, losses, further channels and depths, blend statistics, surface
+points and Adam; then the gradients from the image back to the scene; and last
+the whole view, by one call.
 
 BACKEND is one of
 

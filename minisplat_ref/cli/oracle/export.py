@@ -9,9 +9,9 @@ DESCRIPTION = """\
 Write golden vectors: the inputs, outputs, cotangents and gradients of every
 stage of the reference, in float64, as plain arrays in .npz files.
 
-With them a renderer in any language can be tested without our code. DIR/README.md
-explains every array; DIR/manifest.json says the same to programs, with the
-conventions of each scene, the tolerances and a hash of each file.
+They test a renderer in any language without our code. DIR/README.md explains
+every array; DIR/manifest.json tells programs the same, with the conventions of
+each scene, the tolerances and a hash of each file.
 """
 EPILOG = """\
 example:

@@ -17,9 +17,9 @@ every mode, for every backend, in float64:
 
 A difference across a threshold is refused, and a check of nothing fails.
 
-With --extension NAME: the extension's renderer as a whole, by every field of its
-population and every shared parameter, at time 0.7, and what stages it has; with
-the reference unless --backend names another.
+With --extension NAME the extension's whole renderer is checked with respect to
+every field of its population and every shared parameter, at time 0.7, and so
+are its own stages; by the reference unless --backend names another.
 """
 EPILOG = """\
 examples:

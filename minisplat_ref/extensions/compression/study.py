@@ -53,7 +53,7 @@ class Point(NamedTuple):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the study."""
     shared.add_scene_arguments(parser, iterations=1000, recipe="mini-splatting2")
-    parser.add_argument("--splat-transform", metavar="PROGRAM", help="measure SOG, too, written by this program")
+    parser.add_argument("--splat-transform", metavar="CMD", help="measure SOG, too, written by this program")
 
 
 def run(args: argparse.Namespace) -> None:

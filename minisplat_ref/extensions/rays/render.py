@@ -20,6 +20,23 @@ from minisplat_ref.io.ply import load_ply
 from minisplat_ref.types import Floats, Model
 
 ORBIT_SIZE = (320, 240)  # pixels
+DESCRIPTION = """\
+Trace a scene together with lights, mirrors, glass and meshes, which a JSON file
+describes:
+
+  {"lights": [[0, -3, 1]], "ambient": 0.3, "bias": 0.02, "surfaces": [
+    {"kind": "mirror", "corner": [-1, -1, 4], "sides": [[2, 0, 0], [0, 2, 0]]},
+    {"kind": "glass", "mesh": "block.ply", "index": 1.5},
+    {"kind": "diffuse", "mesh": "chair.ply", "color": [0.8, 0.6, 0.4]}]}
+
+A surface is a parallelogram, or the triangles of a PLY, whose path is relative
+to the folder of the JSON. Glass is a closed mesh whose normals point outwards.
+"ambient" is the fraction of light that casts no shadow, "bias" the fraction of
+the way from a Gaussian to a lamp on which nothing shadows it.
+"""
+EPILOG = """\
+example:
+  minisplat-ref rays render runs/fox --scene lamp_and_mirror.json --out lit"""
 
 
 def add_parser(commands: Any) -> None:
@@ -27,16 +44,15 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "render",
         help="draw a scene among lights, mirrors, glass and meshes",
-        description=surroundings.__doc__,
+        description=DESCRIPTION,
+        epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("model", type=Path, metavar="MODEL", help="PLY of Gaussians, or the folder of a run")
     parser.add_argument("--scene", type=Path, required=True, metavar="JSON", help="lights and surfaces, see above")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for the pictures")
     parser.add_argument("--cameras", type=Path, metavar="JSON", help="cameras.json (default: the run's test views)")
-    parser.add_argument(
-        "--frames", type=int, default=12, metavar="N", help="of an orbit without cameras (default 12)"
-    )
+    parser.add_argument("--frames", type=int, default=12, metavar="N", help="of an orbit without cameras (default 12)")
     parser.add_argument(
         "--background", type=float, nargs=3, default=(0.0, 0.0, 0.0), metavar=("R", "G", "B"), help="0 to 1 each"
     )

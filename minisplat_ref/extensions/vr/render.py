@@ -9,7 +9,11 @@ FULL = 8.0  # degrees in which every pixel is drawn
 
 def add_parser(commands: Any) -> None:
     """Add the command."""
-    parser = commands.add_parser("render", help="draw pictures with fewer rays away from where the eye looks")
+    parser = commands.add_parser(
+        "render",
+        help="draw pictures with fewer rays away from the gaze",
+        epilog="example: minisplat-ref vr render runs/vr/point_cloud.ply --gaze 320,240 --out pictures",
+    )
     parser.add_argument("ply", type=Path, metavar="PLY", help="point_cloud.ply of a run")
     parser.add_argument("--gaze", type=gaze, required=True, metavar="X,Y", help="pixel at which the eye looks")
     parser.add_argument("--full", type=float, default=FULL, metavar="DEG", help=f"drawn in full (default {FULL:g})")

@@ -8,6 +8,7 @@ is wrong can be found between the image and the projection.
 import inspect
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -75,17 +76,21 @@ def run(kind: str, function: Callable[..., Any], vjp: Callable[..., Any] | None,
     InputError
         If the result is not a tuple of image, alpha and perhaps a meta.
     """
-    result = {"numpy": _run_numpy, "torch": _run_torch, "jax": _run_jax}[kind](function, call, vjp is None)
-    if vjp is None:
-        return result
+    dtype = next(iter(call.leaves.values())).dtype
+    with _jax_precision(dtype) if kind == "jax" else nullcontext():
+        result = {"numpy": _run_numpy, "torch": _run_torch, "jax": _run_jax}[kind](function, call, vjp is None)
+        return result if vjp is None else result._replace(gradients=_own_gradients(kind, vjp, call))
+
+
+def _own_gradients(kind: str, vjp: Callable[..., Any], call: Call) -> dict[str, np.ndarray]:
+    """Return the gradients that a rasterizer's own vjp computes."""
     to = _to_torch if kind == "torch" else _to_jax if kind == "jax" else np.array
     arguments = {name: to(value) if isinstance(value, np.ndarray) else value for name, value in call.others.items()}
     arguments |= {name: to(value) for name, value in call.leaves.items()}
     given = vjp(**arguments, v_render_colors=to(call.v_colors), v_render_alphas=to(call.v_alphas))
     if not isinstance(given, Mapping):
         raise InputError(f"the vjp returned {type(given).__name__}: return a dict with v_means, v_quats and so on")
-    gradients = {name: _numpy(given[f"v_{name}"]) for name in call.leaves if given.get(f"v_{name}") is not None}
-    return result._replace(gradients=gradients)
+    return {name: _numpy(given[f"v_{name}"]) for name in call.leaves if given.get(f"v_{name}") is not None}
 
 
 def _run_numpy(function: Callable[..., Any], call: Call, _: bool) -> Result:
@@ -115,17 +120,29 @@ def _run_torch(function: Callable[..., Any], call: Call, is_differentiated: bool
 def _run_jax(function: Callable[..., Any], call: Call, is_differentiated: bool) -> Result:
     import jax
 
-    if next(iter(call.leaves.values())).dtype == np.float64:
-        jax.config.update("jax_enable_x64", True)
     leaves = {name: _to_jax(value) for name, value in call.leaves.items()}
     others = {name: _to_jax(v) if isinstance(v, np.ndarray) else v for name, v in call.others.items()}
     colors, alphas, meta = _parts(function(**leaves, **others))
     gradients = {}
     if is_differentiated and colors.shape == call.v_colors.shape and alphas.shape == call.v_alphas.shape:
         _, pull = jax.vjp(lambda given: _parts(function(**given, **others))[:2], leaves)
-        (found,) = pull((_to_jax(call.v_colors), _to_jax(call.v_alphas)))
-        gradients = {name: _numpy(v) for name, v in found.items()}
+        # A cotangent has to have the dtype of its output, which may differ from that of the arguments.
+        cotangents = _to_jax(call.v_colors).astype(colors.dtype), _to_jax(call.v_alphas).astype(alphas.dtype)
+        gradients = {name: _numpy(v) for name, v in pull(cotangents)[0].items()}
     return Result(_numpy(colors), _numpy(alphas), _arrays_of(meta), gradients, {})
+
+
+def _jax_precision(dtype: np.dtype) -> AbstractContextManager[Any]:
+    """Return a context in which JAX computes in float64 if ``dtype`` is that; otherwise its setting stays."""
+    import jax
+
+    if dtype != np.float64:
+        return nullcontext()
+    if hasattr(jax, "enable_x64"):
+        return jax.enable_x64(True)
+    from jax.experimental import enable_x64  # before JAX 0.8
+
+    return enable_x64()
 
 
 def _parts(returned: Any) -> tuple[Any, Any, Mapping[str, Any]]:
