@@ -1,0 +1,10 @@
+"""Fans: each Gaussian as translucent coloured triangles, a mesh for any modelling program.
+
+MeshSplats, Tobiasz et al. 2025, arXiv 2502.07754.
+"""
+
+from minisplat_ref.extensions.extension import Extension
+from minisplat_ref.extensions.fans.method import FANS, FANS_OF_GAUSSIANS
+from minisplat_ref.extensions.fans.stages import stages
+
+EXTENSION = Extension("fans", recipes=(FANS,), representation=FANS_OF_GAUSSIANS, stages=stages)
