@@ -4,7 +4,17 @@ MeshSplats, Tobiasz et al. 2025, arXiv 2502.07754.
 """
 
 from minisplat_ref.extensions.extension import Extension
+from minisplat_ref.extensions.fans import export, fine_tune
+from minisplat_ref.extensions.fans.mesh_files import load_fans, save_fans
 from minisplat_ref.extensions.fans.method import FANS, FANS_OF_GAUSSIANS
 from minisplat_ref.extensions.fans.stages import stages
 
-EXTENSION = Extension("fans", recipes=(FANS,), representation=FANS_OF_GAUSSIANS, stages=stages)
+EXTENSION = Extension(
+    "fans",
+    recipes=(FANS,),
+    representation=FANS_OF_GAUSSIANS,
+    save=save_fans,
+    load=load_fans,
+    commands=(export, fine_tune),
+    stages=stages,
+)

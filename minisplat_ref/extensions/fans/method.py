@@ -5,7 +5,7 @@ mesh files hold, numbers in [0, 1] without an activation: after each step they a
 """
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -45,9 +45,7 @@ class _Tape(NamedTuple):
     backend: Backend
 
 
-def render(
-    model: Model, view: View, request: Request, *, most_layers: int | None = None
-) -> tuple[RenderOutput, _Tape]:
+def render(model: Model, view: View, request: Request, *, most_layers: int | None = None) -> tuple[RenderOutput, _Tape]:
     """Draw fans by depth peeling; ``most_layers`` are blended in a pixel, by default all."""
     fans, conventions, backend = model.gaussians, request.conventions, request.backend
     dtype, v = fans.means.dtype, fans.n_vertices
