@@ -8,6 +8,7 @@ from minisplat_ref.extensions.fans import export, fine_tune
 from minisplat_ref.extensions.fans.mesh_files import load_fans, save_fans
 from minisplat_ref.extensions.fans.method import FANS, FANS_OF_GAUSSIANS
 from minisplat_ref.extensions.fans.stages import stages
+from minisplat_ref.extensions.fans.study import PROFILE, REFIT
 
 EXTENSION = Extension(
     "fans",
@@ -17,4 +18,5 @@ EXTENSION = Extension(
     load=load_fans,
     commands=(export, fine_tune),
     stages=stages,
+    studies=(PROFILE, REFIT),
 )

@@ -16,8 +16,8 @@ import numpy as np
 from scipy.optimize import minimize
 
 from minisplat_ref.constants import GSPLAT_MAIN
-from minisplat_ref.extensions.fans.shapes import FanShape
-from minisplat_ref.extensions.fans.tuning import alpha_of, converted
+from minisplat_ref.extensions.fans.shapes import FanShape, converted
+from minisplat_ref.extensions.fans.tuning import alpha_of
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.types import Camera, Floats, Gaussians, view_from
 

@@ -70,6 +70,13 @@ def drawn(population: Any, view: View, **request: Any) -> Floats:
     return clipped
 
 
+def alpha_of(population: Any, view: View, **request: Any) -> Floats:
+    """Return the accumulated opacity [H, W] of fans or Gaussians."""
+    output, _ = representation_of(population).renderer.render(Model(population), view, Request(**request))
+    alpha: Floats = output.alpha
+    return alpha
+
+
 def measured(population: Any, scene: Scene, views: tuple[View, ...]) -> Evaluation:
     """Compare pictures of fans or Gaussians with photographs."""
     renderer = representation_of(population).renderer
