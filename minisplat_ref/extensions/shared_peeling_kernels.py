@@ -17,6 +17,7 @@ The plane of a triangle makes ``g_i = b_i / t`` and their sum ``s = 1 / t`` line
 
 and the gradient with respect to ``M`` is ``-M^-T v_g g^T``. They are written as a value and two slopes about an
 *anchor*, the pixel nearest to the first corner, so that float32 loses nothing to the distance from the image's corner.
+Which pixels a triangle covers is decided in float64 whatever the data: of two neighbours always by one of them.
 """
 
 import math
@@ -58,6 +59,8 @@ class Lens(NamedTuple):
 class Planes(NamedTuple):
     """Triangles as their pixels see them."""
 
+    edges: Floats
+    """[T, 3, 3] float64: the product of each row with d is positive on the inner side of an edge."""
     columns: Floats
     """[T, N_COLUMNS]."""
     anchors: Ints
@@ -74,7 +77,7 @@ class Fragments(NamedTuple):
     pixels: Ints
     """[F] int32 flat index."""
     places: Floats
-    """[F, 3] b_1, b_2 and 1/t."""
+    """[F, 3] b_1, b_2 and 1/t: on an edge they may be a rounding below 0."""
 
 
 class Layers(NamedTuple):
@@ -135,6 +138,24 @@ def inverse_rows(P_0, P_1, P_2):
 
 
 @scalar
+def is_first(a, b):
+    """Whether a comes before b, by coordinates."""
+    return a[0] < b[0] or (a[0] == b[0] and (a[1] < b[1] or (a[1] == b[1] and a[2] < b[2])))
+
+
+@scalar
+def edge_row(P, Q):
+    """Return P x Q, for Q and P the same numbers with the other sign: a pixel is on one side of an edge, or the other.
+
+    A compiler may round the two products of a cross product differently, and then they do not only change places.
+    """
+    if is_first(P, Q):
+        return cross(P, Q)
+    row = cross(Q, P)
+    return -row[0], -row[1], -row[2]
+
+
+@scalar
 def grown(box, x, y):
     """Return the box with a point of the image in it."""
     return min(box[0], x), min(box[1], y), max(box[2], x), max(box[3], y)
@@ -160,7 +181,7 @@ def pixel_at(x, end):
 
 @kernel()
 def _set_up(vertices, faces, lens, planes):
-    columns, anchors, boxes = planes
+    edges, columns, anchors, boxes = planes
     for n in prange(faces.shape[0]):
         P_0, P_1, P_2 = vertex(vertices, faces, n, 0), vertex(vertices, faces, n, 1), vertex(vertices, faces, n, 2)
         row_1, row_2, normal, volume = inverse_rows(P_0, P_1, P_2)
@@ -182,6 +203,11 @@ def _set_up(vertices, faces, lens, planes):
             anchors[n, 1] = min(pixel_at(lens.fy * P_0[1] / P_0[2] + lens.cy - 0.5, lens.height), lens.height - 1)
         x = (anchors[n, 0] + 0.5 - lens.cx) / lens.fx
         y = (anchors[n, 1] + 0.5 - lens.cy) / lens.fy
+        sign = 1.0 if volume > 0 else -1.0
+        opposite = edge_row(P_1, P_2), edge_row(P_2, P_0), edge_row(P_0, P_1)
+        for i in range(3):
+            for axis in range(3):
+                edges[n, i, axis] = sign * opposite[i][axis]
         for column, row in ((G_1, row_1), (G_2, row_2), (S, normal)):
             columns[n, column] = (row[0] * x + row[1] * y + row[2]) / volume
             columns[n, column + 1] = row[0] / volume / lens.fx
@@ -189,54 +215,59 @@ def _set_up(vertices, faces, lens, planes):
 
 
 @scalar
-def is_within(value, slope_x, slope_y):
-    """Whether a pixel lies on the inner side of an edge; exactly on it, whether it does once it moves to the right."""
-    return value > ZERO or (value == ZERO and (slope_x > ZERO or (slope_x == ZERO and slope_y > ZERO)))
+def is_within(edges, n, i, x, y):
+    """Whether the ray (x, y, 1) passes an edge on its inner side; if exactly on it, whether one to the right does."""
+    a, b = edges[n, i, 0], edges[n, i, 1]
+    value = a * x + (b * y + edges[n, i, 2])
+    return value > 0 or (value == 0 and (a > 0 or (a == 0 and b > 0)))
 
 
 @scalar
-def covered(planes, n, x, y, near):
-    """Return whether triangle n covers a pixel, and g_1, g_2 and s there."""
+def reciprocal_depth(planes, n, x, y):
+    """Return s = 1 / t of a pixel in the plane of triangle n."""
     c = planes.columns
     as_data = c.dtype.type
     dx, dy = as_data(x - planes.anchors[n, 0]), as_data(y - planes.anchors[n, 1])
-    g_1 = c[n, G_1] + c[n, G_1 + 1] * dx + c[n, G_1 + 2] * dy
-    g_2 = c[n, G_2] + c[n, G_2 + 1] * dx + c[n, G_2 + 2] * dy
-    s = c[n, S] + c[n, S + 1] * dx + c[n, S + 2] * dy
-    g_0, slope_x = s - g_1 - g_2, c[n, S + 1] - c[n, G_1 + 1] - c[n, G_2 + 1]
-    slope_y = c[n, S + 2] - c[n, G_1 + 2] - c[n, G_2 + 2]
-    is_inside = (
-        s > ZERO
-        and near * s < ONE
-        and is_within(g_0, slope_x, slope_y)
-        and is_within(g_1, c[n, G_1 + 1], c[n, G_1 + 2])
-        and is_within(g_2, c[n, G_2 + 1], c[n, G_2 + 2])
-    )
-    return is_inside, g_1, g_2, s
+    return c[n, S] + c[n, S + 1] * dx + c[n, S + 2] * dy
+
+
+@scalar
+def covers(planes, n, x, y, lens):
+    """Whether triangle n covers a pixel, and is beyond the near plane there."""
+    s = reciprocal_depth(planes, n, x, y)
+    if not (s > ZERO and lens.near * s < ONE):
+        return False
+    u, v = (x + 0.5 - lens.cx) / lens.fx, (y + 0.5 - lens.cy) / lens.fy
+    edges = planes.edges
+    return is_within(edges, n, 0, u, v) and is_within(edges, n, 1, u, v) and is_within(edges, n, 2, u, v)
 
 
 @kernel()
-def _count(planes, near, counts):
+def _count(planes, lens, counts):
     boxes = planes.boxes
     for n in prange(counts.size):
         for y in range(boxes[n, 1], boxes[n, 3]):
             for x in range(boxes[n, 0], boxes[n, 2]):
-                counts[n] += covered(planes, n, x, y, near)[0]
+                counts[n] += covers(planes, n, x, y, lens)
 
 
 @kernel()
-def _list(planes, near, width, fragments):
-    boxes = planes.boxes
+def _list(planes, lens, fragments):
+    boxes, anchors, c = planes.boxes, planes.anchors, planes.columns
     offsets, pixels, places = fragments
     for n in prange(boxes.shape[0]):
         f = offsets[n]
         for y in range(boxes[n, 1], boxes[n, 3]):
             for x in range(boxes[n, 0], boxes[n, 2]):
-                is_inside, g_1, g_2, s = covered(planes, n, x, y, near)
-                if is_inside:
-                    pixels[f] = y * width + x
-                    places[f, 0], places[f, 1], places[f, 2] = g_1 / s, g_2 / s, s
-                    f += 1
+                if not covers(planes, n, x, y, lens):
+                    continue
+                dx, dy = c.dtype.type(x - anchors[n, 0]), c.dtype.type(y - anchors[n, 1])
+                s = reciprocal_depth(planes, n, x, y)
+                pixels[f] = y * lens.width + x
+                places[f, 0] = (c[n, G_1] + c[n, G_1 + 1] * dx + c[n, G_1 + 2] * dy) / s
+                places[f, 1] = (c[n, G_2] + c[n, G_2 + 1] * dx + c[n, G_2 + 2] * dy) / s
+                places[f, 2] = s
+                f += 1
 
 
 @kernel(parallel=False)
@@ -298,7 +329,7 @@ def _blend(layers, places, shades, background, most_layers, n_threads, out):
                     sift_down(ids, i, ids.size, places)
                 T, n_left = shades.dtype.type(1), ids.size
                 image[p, :] = ZERO
-                while n_left > max(ids.size - most_layers, 0) and T > ZERO:
+                while n_left > max(ids.size - most_layers, 0):
                     f = ids[0]
                     n_left -= 1
                     ids[0], ids[n_left] = ids[n_left], f
@@ -374,16 +405,17 @@ def peel(mesh: TranslucentMesh, frame: Frame, background: Floats) -> Peeled:
     R, t = camera.cam_from_world_R.astype(np.float64), camera.cam_from_world_t.astype(np.float64)
     vertices = mesh.vertices.astype(np.float64) @ R.T + t
     n, n_pixels, size = len(mesh.faces), camera.width * camera.height, (camera.height, camera.width)
-    planes = Planes(np.zeros((n, N_COLUMNS), dtype), np.zeros((n, 2), np.int32), np.zeros((n, 4), np.int32))
+    planes = Planes(
+        np.zeros((n, 3, 3)), np.zeros((n, N_COLUMNS), dtype), np.zeros((n, 2), np.int32), np.zeros((n, 4), np.int32)
+    )
     lens = Lens(*map(float, (camera.fx, camera.fy, camera.cx, camera.cy, frame.near)), camera.width, camera.height)
     _set_up(vertices, mesh.faces, lens, planes)
     counts = np.zeros(n, np.int64)
-    near = dtype.type(frame.near)
-    _count(planes, near, counts)
+    _count(planes, lens, counts)
     offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
     n_fragments = int(offsets[-1])
     fragments = Fragments(offsets, np.empty(n_fragments, np.int32), np.empty((n_fragments, 3), dtype))
-    _list(planes, near, camera.width, fragments)
+    _list(planes, lens, fragments)
     layers = Layers(np.zeros(n_pixels + 1, np.int64), np.empty(n_fragments, np.int64))
     _sort_by_pixel(fragments.pixels, layers.offsets, layers.ids)
 

@@ -10,13 +10,14 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.backends import Backend
+from minisplat_ref.errors import InputError
 from minisplat_ref.extensions import shared_peeling_kernels as kernels
 from minisplat_ref.extensions import shared_peeling_reference as reference
 from minisplat_ref.extensions.fans.shapes import Fans, FanShape, converted, mesh_of, mesh_of_vjp
 from minisplat_ref.extensions.shared_peeling import ALL_LAYERS, Frame, Peeled, TranslucentMesh
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.reference.pinhole import with_principal_point
-from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, Request
+from minisplat_ref.rendering import Renderer, RenderGradient, Request
 from minisplat_ref.strategy.ops import keep
 from minisplat_ref.training.rates import LogLinear, Rates
 from minisplat_ref.training.representation import Representation
@@ -46,7 +47,17 @@ class _Tape(NamedTuple):
 
 
 def render(model: Model, view: View, request: Request, *, most_layers: int | None = None) -> tuple[RenderOutput, _Tape]:
-    """Draw fans by depth peeling; ``most_layers`` are blended in a pixel, by default all."""
+    """Draw fans by depth peeling; ``most_layers`` are blended in a pixel, by default all.
+
+    Raises
+    ------
+    InputError
+        Something is wanted besides colours, or ``most_layers`` is below 1.
+    """
+    if request.wants:
+        raise InputError(f"fans are drawn without {', '.join(sorted(request.wants))}: draw the Gaussians for that")
+    if most_layers is not None and most_layers < 1:
+        raise InputError(f"most_layers is {most_layers}: give at least 1, or none for all")
     fans, conventions, backend = model.gaussians, request.conventions, request.backend
     dtype, v = fans.means.dtype, fans.n_vertices
     background = np.zeros(3, dtype) if request.background is None else np.asarray(request.background, dtype)
@@ -100,7 +111,7 @@ FANS_OF_GAUSSIANS = Representation(
     "fans",
     population=Fans,
     extend=partial(as_fans, **FanShape()._asdict()),
-    renderer=Renderer("fans", partial(render, most_layers=None), render_vjp, SPLATTING.channels),
+    renderer=Renderer("fans", partial(render, most_layers=None), render_vjp, lambda wants: {"rgb": slice(0, 3)}),
     rates=Rates(
         {"rims": LogLinear(1.6e-4, 1.6e-6, 30_000), "colors": 2.5e-3, "opacities": 5e-3},
         frozenset({"rims"}),
