@@ -52,6 +52,7 @@ class Lens(NamedTuple):
     cx: float
     cy: float
     near: float
+    least_angle: float
     width: int
     height: int
 
@@ -187,7 +188,7 @@ def _set_up(vertices, faces, lens, planes):
         row_1, row_2, normal, volume = inverse_rows(P_0, P_1, P_2)
         boxes[n, :] = 0
         # Written so that NaN is not drawn.
-        if not abs(volume) > LEAST_ANGLE * math.sqrt(dot(normal, normal)) * math.sqrt(dot(P_0, P_0)):
+        if not abs(volume) > lens.least_angle * math.sqrt(dot(normal, normal)) * math.sqrt(dot(P_0, P_0)):
             continue
         box = np.inf, np.inf, -np.inf, -np.inf
         box = grown_by_side(box, P_0, P_1, lens)
@@ -408,7 +409,8 @@ def peel(mesh: TranslucentMesh, frame: Frame, background: Floats) -> Peeled:
     planes = Planes(
         np.zeros((n, 3, 3)), np.zeros((n, N_COLUMNS), dtype), np.zeros((n, 2), np.int32), np.zeros((n, 4), np.int32)
     )
-    lens = Lens(*map(float, (camera.fx, camera.fy, camera.cx, camera.cy, frame.near)), camera.width, camera.height)
+    numbers = camera.fx, camera.fy, camera.cx, camera.cy, frame.near, LEAST_ANGLE
+    lens = Lens(*map(float, numbers), camera.width, camera.height)
     _set_up(vertices, mesh.faces, lens, planes)
     counts = np.zeros(n, np.int64)
     _count(planes, lens, counts)

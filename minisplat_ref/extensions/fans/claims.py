@@ -1,7 +1,6 @@
 """The work of the study ``fans/refit``: what a trained scene loses as a mesh, and what refitting gives back."""
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +17,7 @@ from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import scaled
 from minisplat_ref.training.state import TrainState
-from minisplat_ref.types import Floats, Gaussians, Model, Scene, View
+from minisplat_ref.types import Gaussians, Model, Scene, View
 
 REACHES, RIMS = (2.0, 2.5, 3.0, 3.5), (0.0, 0.1, 0.2)
 SIDES = (3, 4, 6, 8, 12, 16)
@@ -90,7 +89,7 @@ def refit_rows(
     for name, shape in FORMS.items():
         told(name)
         forms[name] = converted(gaussians, shape)
-        fitted = best_shape(gaussians, shape, judge.views, photographs)
+        fitted = best_shape(gaussians, shape, judge.views, photographs, scene.background)
         shapes[f"{name}, reach and rim"] = fitted
         forms[f"{name}, reach and rim"] = converted(gaussians, fitted)
         forms[f"{name}, vertices"] = tuned(forms[f"{name}, reach and rim"], scene, iterations, seed)
@@ -114,16 +113,15 @@ def trained_on(gaussians: Gaussians, scene: Scene, iterations: int, seed: int) -
 
 
 def layer_rows(fans: Fans, judge: Judge) -> list[dict[str, Any]]:
-    """Return the PSNR of pictures of a few layers against that of all, and the number of layers of a pixel."""
+    """Return the error of pictures of a few layers against that of all, and the number of layers of a pixel."""
     request = Request(judge.scene.background.astype(np.float32))
     whole = [render(Model(fans), view, request) for view in judge.views]
     layers = np.concatenate([tape.peeled.n_layers.ravel() for _, tape in whole])
     rows: list[dict[str, Any]] = [{"layers": "all", "mean": float(layers.mean()), "most": int(layers.max())}]
     for n in LAYERS:
-        draw = partial(render, most_layers=n)
-        images: list[Floats] = [draw(Model(fans), view, request)[0].image for view in judge.views]
-        psnrs = [psnr_of(image, np.clip(output.image, 0, 1)) for image, (output, _) in zip(images, whole, strict=True)]
-        rows.append({"layers": n, "psnr": float(np.mean(psnrs))})
+        images = [render(Model(fans), view, request, most_layers=n)[0].image for view in judge.views]
+        squares = [np.mean((image - output.image) ** 2) for image, (output, _) in zip(images, whole, strict=True)]
+        rows.append({"layers": n, "rms_levels": 255 * float(np.sqrt(np.mean(squares)))})
     return rows
 
 

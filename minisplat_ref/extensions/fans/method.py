@@ -84,9 +84,9 @@ def render_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None = None) -> R
     v_alpha = np.zeros(v_image.shape[:2], v_image.dtype) if v_alpha is None else v_alpha
     peel_vjp = (kernels if tape.backend.is_compiled else reference).peel_vjp
     v = peel_vjp(tape.mesh, tape.frame, tape.background, tape.peeled, v_image, v_alpha)
-    R, t = camera.cam_from_world_R, camera.cam_from_world_t
-    depths = fans.means @ R[2].astype(fans.means.dtype) + t[2].astype(fans.means.dtype)  # [N]
-    v_moved = v.vertices.reshape(len(fans.means), -1, 3).sum(axis=1) @ R[:2].T.astype(fans.means.dtype)  # [N, 2]
+    R, t = (array.astype(fans.means.dtype) for array in (camera.cam_from_world_R, camera.cam_from_world_t))
+    depths = fans.means @ R[2] + t[2]  # [N]
+    v_moved = v.vertices.reshape(len(fans.means), fans.n_vertices, 3).sum(axis=1) @ R[:2].T  # [N, 2]
     return RenderGradient(
         gaussians=mesh_of_vjp(fans, v.vertices, v.rgba),
         background=v.background,
@@ -94,6 +94,11 @@ def render_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None = None) -> R
         cam_from_world_t=v.cam_from_world_t,
         means2d=v_moved * depths[:, None] / np.array([camera.fx, camera.fy], fans.means.dtype),
     )
+
+
+def channels(wants: frozenset[str]) -> dict[str, slice]:
+    """Return the channels of a picture, which are colours whatever is wanted."""
+    return {"rgb": slice(0, 3)}
 
 
 def keep_in_range(state: TrainState, iteration: Iteration) -> None:
@@ -111,7 +116,7 @@ FANS_OF_GAUSSIANS = Representation(
     "fans",
     population=Fans,
     extend=partial(as_fans, **FanShape()._asdict()),
-    renderer=Renderer("fans", partial(render, most_layers=None), render_vjp, lambda wants: {"rgb": slice(0, 3)}),
+    renderer=Renderer("fans", partial(render, most_layers=None), render_vjp, channels),
     rates=Rates(
         {"rims": LogLinear(1.6e-4, 1.6e-6, 30_000), "colors": 2.5e-3, "opacities": 5e-3},
         frozenset({"rims"}),

@@ -154,7 +154,8 @@ def table(n_planes: int, n_owned: int) -> Ints:
 
 def vertices_of(fans: Fans) -> Floats:
     """Return the vertices [N, V, 3], the centre first."""
-    return np.concatenate([fans.means[:, None], fans.rims.reshape(len(fans.means), -1, 3)], axis=1)
+    rims_in_a_row = fans.rims.reshape(len(fans.means), fans.n_vertices - 1, 3)
+    return np.concatenate([fans.means[:, None], rims_in_a_row], axis=1)
 
 
 def mesh_of(fans: Fans, is_drawn: Bools | None = None) -> TranslucentMesh:

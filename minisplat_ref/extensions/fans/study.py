@@ -166,8 +166,9 @@ def print_tables(runs: list[dict[str, Any]]) -> None:
         print(f"\n{name} against splats of degree 0, seed 0\n")
         print(markdown_table(["sides", "reach", "rim", "PSNR"], lines))
     for name, (whole, *rows) in runs[0]["layers"].items():
-        cells = ", ".join(f"{row['layers']}: {row['psnr']:.1f} dB" for row in rows)
-        print(f"\n{name}: {whole['mean']:.1f} layers a pixel, at most {whole['most']}; the nearest only, {cells}")
+        cells = ", ".join(f"{row['layers']}: {row['rms_levels']:.2g}" for row in rows)
+        print(f"\n{name}: {whole['mean']:.1f} layers a pixel, at most {whole['most']}")
+        print(f"RMS of the nearest alone, in 8-bit levels, {cells}")
 
 
 def draw(result: dict[str, Any], pictures: dict[str, Any]) -> "Figure":

@@ -1,6 +1,7 @@
 """Refitting: the two numbers of all fans at once, or every vertex by itself."""
 
 from collections.abc import Callable
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,8 @@ from minisplat_ref.training.state import StepReport, TrainState
 from minisplat_ref.types import Floats, Gaussians, Model, Scene, View
 
 REACHES = 1.0, 4.0  # between which k is sought
-EVALUATIONS = 40  # at most, of one search
+FIRST_REACHES, FIRST_RIMS = (1.5, 2.0, 2.5, 3.0, 3.5), (0.0, 0.2)  # the best of which a search begins with
+EVALUATIONS = 60  # at most, of one search
 
 
 def tuned(
@@ -32,18 +34,25 @@ def tuned(
     return result
 
 
-def best_shape(gaussians: Gaussians, shape: FanShape, views: list[View], targets: list[Floats]) -> FanShape:
-    """Return the shape with the reach and the rim whose pictures are nearest to targets, by the simplex method.
+def best_shape(
+    gaussians: Gaussians, shape: FanShape, views: list[View], targets: list[Floats], background: Floats
+) -> FanShape:
+    """Return the shape with the reach and the rim whose pictures are nearest to targets.
+
+    The simplex method starts from the best of a coarse grid: where a rim is not transparent, the error jumps as it
+    moves over a pixel, and has many small minima.
 
     Parameters
     ----------
     gaussians : Gaussians
     shape : FanShape
-        Where the search begins; sides, and whether fans are flat, stay.
+        Its sides, and whether fans are flat.
     views : list of View
         From where.
     targets : list of ndarray of shape (H, W, 3)
         Photographs or pictures in [0, 1]; the sum of squared differences counts.
+    background : ndarray of shape (3,)
+        RGB behind everything.
     """
 
     def clipped(x: Floats) -> FanShape:
@@ -51,11 +60,13 @@ def best_shape(gaussians: Gaussians, shape: FanShape, views: list[View], targets
 
     def cost(x: Floats) -> float:
         fans = converted(gaussians, clipped(x))
-        return sum(float(np.mean((drawn(fans, v) - target) ** 2)) for v, target in zip(views, targets, strict=True))
+        pictures = [drawn(fans, view, background=background) for view in views]
+        return sum(float(np.mean((p - target) ** 2)) for p, target in zip(pictures, targets, strict=True))
 
-    simplex = np.array([[shape.reach, shape.rim], [0.8 * shape.reach, shape.rim], [shape.reach, shape.rim + 0.2]])
-    options = {"maxfev": EVALUATIONS, "xatol": 0.01, "fatol": 1e-9, "initial_simplex": simplex}
-    return clipped(minimize(cost, simplex[0], method="Nelder-Mead", options=options).x)
+    first = min((np.array(place) for place in product(FIRST_REACHES, FIRST_RIMS)), key=cost)
+    simplex = first + np.array([[0.0, 0.0], [-0.2, 0.0], [0.0, 0.05]])
+    options = {"maxfev": EVALUATIONS, "xatol": 0.005, "fatol": 1e-9, "initial_simplex": simplex}
+    return clipped(minimize(cost, first, method="Nelder-Mead", options=options).x)
 
 
 def representation_of(population: Any) -> Any:
