@@ -160,3 +160,7 @@ TEXTURE_THIN_FLOAT32 = 1e-3
 
 # Displacements of half a pixel that are read off slopes, pixels: linear in them, and photographs are bytes.
 DISPLACEMENT_PX = 0.15
+
+# The integral of a fan's profile by a sum over a grid of spacing 0.01, relative: its rim, a jump of up to one half, is
+# off by half a spacing of a reach of 2.
+PROFILE_GRID = 5e-3
