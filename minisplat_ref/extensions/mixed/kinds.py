@@ -21,6 +21,7 @@ import math
 import numpy as np
 
 from minisplat_ref.extensions.mixed.population import MixedGaussians, counts, quaternions
+from minisplat_ref.extensions.mixed.projection import in_plane
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.types import Bools, Floats, Ints
 
@@ -29,18 +30,12 @@ DISC_SHRINK = 2.0  # of the deviation of a disc that becomes a triangle
 EDGE = (-3 * ROOT_HALF_PI + math.sqrt(9 * math.pi / 2 + math.sqrt(3) * 2 * math.pi * (DISC_SHRINK**2 - 1))) / (
     math.sqrt(3) / 2
 )
-CORNERS = EDGE / math.sqrt(3) * np.array([[math.cos(t), math.sin(t)] for t in (0, 2 * math.pi / 3, 4 * math.pi / 3)])
-
-
-def in_plane(population: MixedGaussians) -> Floats:
-    """Return the vertices in the plane of the first two axes from the first vertex, [N, 3, 2], world units."""
-    placed = np.concatenate([np.zeros_like(population.vertices[:, :2]), population.vertices], axis=1)
-    return placed.reshape(-1, 3, 2)
+CORNERS = EDGE * np.array([-1 / math.sqrt(12), 0.5, -1 / math.sqrt(12), -0.5])  # the second and the third, whitened
 
 
 def whitened(population: MixedGaussians) -> Floats:
     """Return the vertices [N, 3, 2] in deviations, in their plane."""
-    return in_plane(population) * np.exp(-population.log_scales[:, None, :2])
+    return in_plane(population.vertices, counts(population)) * np.exp(-population.log_scales[:, None, :2])
 
 
 def coverage(whitened_vertices: Floats, n_vertices: Ints) -> Floats:
@@ -59,11 +54,12 @@ def simplified(population: MixedGaussians, *, least: float, least_height: float)
     ----------
     population : MixedGaussians
     least : float
-        Deviations: a hull whose vertices are all nearer to each other becomes an ellipse at their mean.
+        Deviations: a hull whose vertices are all nearer to each other becomes an ellipse.
     least_height : float
         Deviations: a triangle of a smaller altitude becomes the line of its longest edge.
     """
-    n, y, places = counts(population), whitened(population), in_plane(population)
+    n, y = counts(population), whitened(population)
+    places = in_plane(population.vertices, n)
     lengths = np.linalg.norm(np.roll(y, -1, axis=1) - y, axis=2)  # [N, 3] of the edges from k to k + 1
     lengths[n == 2, 1:] = 0  # of a line only the first counts
     longest = lengths.max(axis=1)
@@ -74,12 +70,10 @@ def simplified(population: MixedGaussians, *, least: float, least_height: float)
     rows = np.arange(len(n))
     start = np.where(is_line, np.argmax(lengths, axis=1), 0)
     first, second = places[rows, start], places[rows, (start + 1) % 3]
-    used = (np.arange(3) < n[:, None])[:, :, None]
-    middle = np.sum(places * used, axis=1) / n[:, None].astype(places.dtype)
-    moved = np.where(is_point[:, None], middle, np.where(is_line[:, None], first, 0))
-    further = np.where(is_point[:, None], 0, second - first)
     changed = is_point | is_line
-    vertices = np.where(changed[:, None], np.column_stack([further, np.zeros_like(further)]), population.vertices)
+    half = np.where(is_line[:, None], (second - first) / 2, 0)
+    vertices = np.where(changed[:, None], np.column_stack([half, np.zeros_like(half)]), population.vertices)
+    moved = np.where(is_line[:, None], (first + second) / 2, 0)
     R = rotation_matrices(population.quats)
     means = population.means + np.einsum("nij,nj->ni", R[:, :, :2], moved)
     left = np.where(is_point, 1, np.where(is_line, 2, population.n_vertices))
@@ -119,14 +113,11 @@ def promoted(population: MixedGaussians, *, ratio: float, size_limit: float) -> 
     flat = (log_s[:, 0] + log_s[:, 1]) / 2 - np.log(DISC_SHRINK)  # of a disc
     new_log_s = np.where(needle, log_s[:, [1, 1, 2]], np.column_stack([flat, flat, log_s[:, 2]]))
     half = ROOT_HALF_PI * (np.exp(log_s[:, 0]) - np.exp(log_s[:, 1]))
-    ends = np.zeros((len(rows), 3, 2))
-    ends[:, 0, 0], ends[:, 1, 0] = -half, half
-    places = np.where(needle[:, :, None], ends, np.exp(flat)[:, None, None] * CORNERS)
+    along = np.outer(half, [1.0, 0.0, 0.0, 0.0])
     fields = {
-        "means": population.means[rows] + np.einsum("nij,nj->ni", R[:, :, :2], places[:, 0]),
         "quats": quaternions(R),
         "log_scales": new_log_s,
-        "vertices": (places[:, 1:] - places[:, :1]).reshape(-1, 4) * np.where(needle, [1, 1, 0, 0], 1),
+        "vertices": np.where(needle, along, np.exp(flat)[:, None] * CORNERS),
         "n_vertices": np.where(needle[:, 0], 2, 3),
     }
     whole = {name: getattr(population, name).copy() for name in fields}

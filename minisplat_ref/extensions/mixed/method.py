@@ -6,12 +6,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from minisplat_ref.backends import Backend
+from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.compositing import hits as kernel_hits
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.mixed.kernels import response_for
 from minisplat_ref.extensions.mixed.kinds import promoted, simplified
 from minisplat_ref.extensions.mixed.population import MixedGaussians, counts, grouped
-from minisplat_ref.extensions.mixed.projection import FootprintGradient, Seen, project, project_vjp, tile_lists
+from minisplat_ref.extensions.mixed.projection import Hulls, footprints_of, footprints_vjp
 from minisplat_ref.extensions.mixed.response import RESPONSE, Footprints
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
@@ -26,8 +28,10 @@ from minisplat_ref.types import (
     Floats,
     Model,
     Primitives,
+    ProjectionGradient,
     RenderOutput,
     TileBins,
+    TileGrid,
     View,
 )
 
@@ -41,7 +45,7 @@ class _Tape(NamedTuple):
     request: Request
     camera: Camera
     sh_degree: int  # active
-    seen: Seen
+    hulls: Hulls
     blended: tuple[Footprints, Floats, Floats, TileBins]  # footprints, colours, background, tile lists
     output: RenderOutput
 
@@ -73,14 +77,15 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, An
     if request.is_visible is not None:
         opacities = np.where(request.is_visible, opacities, opacities.dtype.type(0))
     primitives = Primitives(g.means, g.quats, scales, opacities)
-    seen = project(primitives, g.vertices, n_vertices, camera, conventions, backend)
-    projection = seen.footprints.projection
-    colors = backend.sh_colors(seen.anchors.means, g.sh_dc, g.sh_rest, camera, sh_degree, projection.radii)  # [N, 3]
+    hulls = Hulls(primitives, g.vertices, n_vertices)
+    footprints = footprints_of(hulls, backend.project(*primitives, camera, conventions), camera, conventions)
+    projection = footprints.projection
+    colors = backend.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, sh_degree, projection.radii)  # [N, 3]
     if "depth" in request.wants:
         colors = np.column_stack([colors, projection.depths])
         background = np.append(background, background.dtype.type(0))
-    bins = tile_lists(seen.footprints, camera, conventions, backend)
-    blended = seen.footprints, colors, background, bins
+    bins = tile_lists(footprints, camera, conventions, backend)
+    blended = footprints, colors, background, bins
     if backend.is_compiled:
         output = kernel_hits.composite_hits(response_for(dtype), *blended, conventions)
     else:
@@ -90,14 +95,11 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, An
         )
     visible_ids = np.flatnonzero(projection.radii[:, 0] > 0)
     output = output._replace(visible_ids=visible_ids, n_pairs=len(bins.gaussian_ids))
-    return output, _Tape(g, request, camera, sh_degree, seen, blended, output)
+    return output, _Tape(g, request, camera, sh_degree, hulls, blended, output)
 
 
 def render_vjp(tape: _Tape | RenderTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
-    """Gradient of :func:`render`: of the footprints and of the colours, added up.
-
-    ``means2d``, which density control reads, is the gradient of moving a hull as a whole: the sum over its vertices.
-    """
+    """Gradient of :func:`render`: of ellipses, of colours and of vertices, added up."""
     if isinstance(tape, RenderTape):
         return SPLATTING.render_vjp(tape, v_image, v_alpha)
     g, backend, conventions, camera = tape.gaussians, tape.request.backend, tape.request.conventions, tape.camera
@@ -107,33 +109,43 @@ def render_vjp(tape: _Tape | RenderTape, v_image: Floats, v_alpha: Floats | None
         v = kernel_hits.composite_hits_vjp(response_for(g.means.dtype), *arguments)
     else:
         v = composite_hits_vjp(RESPONSE, *arguments)
-    v_vertices, v_conics, v_opacities = v.primitives
+    v_means2d, v_conics, v_opacities, v_vertices = v.primitives
 
-    seen, anchors = tape.seen, tape.seen.anchors
-    projection = seen.footprints.projection
+    hulls, footprints = tape.hulls, tape.blended[0]
+    primitives, projection = hulls.primitives, footprints.projection
     v_depths = np.ascontiguousarray(v.colors[:, 3]) if v_image.shape[2] > 3 else np.zeros_like(projection.depths)
+    v_projection = ProjectionGradient(v_means2d, v_depths, v_conics, v_opacities)
+    v_flat = backend.project_vjp(*primitives, camera, conventions, projection, v_projection)
     v_rgb = np.ascontiguousarray(v.colors[:, :3])
-    v_sh = backend.sh_colors_vjp(anchors.means, g.sh_dc, g.sh_rest, camera, tape.sh_degree, projection.radii, v_rgb)
-    v_footprints = FootprintGradient(v_vertices, v_conics, v_opacities, v_depths, v_sh.means)
-    v_hulls = project_vjp(seen, g.vertices, camera, conventions, backend, v_footprints)
+    v_sh = backend.sh_colors_vjp(g.means, g.sh_dc, g.sh_rest, camera, tape.sh_degree, projection.radii, v_rgb)
+    v_hulls = footprints_vjp(hulls, footprints, camera, conventions, v_vertices)
     with np.errstate(over="ignore"):
         transparencies = 1 / (1 + np.exp(g.opacity_logits))
     return RenderGradient(
         gaussians=MixedGaussians(
-            means=v_hulls.means,
-            quats=v_hulls.quats,
-            log_scales=anchors.scales * v_hulls.scales,
-            opacity_logits=anchors.opacities * transparencies * v_hulls.opacities,
+            means=v_flat.means + v_sh.means + v_hulls.means,
+            quats=v_flat.quats + v_hulls.quats,
+            log_scales=primitives.scales * v_flat.scales,
+            opacity_logits=primitives.opacities * transparencies * v_flat.opacities,
             sh_dc=v_sh.sh_dc,
             sh_rest=v_sh.sh_rest,
-            vertices=v_hulls.offsets,
+            vertices=v_hulls.vertices,
             n_vertices=np.zeros_like(g.n_vertices),
         ),
         background=v.background[:3],
-        cam_from_world_R=v_hulls.cam_from_world_R + v_sh.cam_from_world_R,
-        cam_from_world_t=v_hulls.cam_from_world_t + v_sh.cam_from_world_t,
-        means2d=v_vertices.sum(axis=1),
+        cam_from_world_R=v_flat.cam_from_world_R + v_sh.cam_from_world_R + v_hulls.cam_from_world_R,
+        cam_from_world_t=v_flat.cam_from_world_t + v_sh.cam_from_world_t + v_hulls.cam_from_world_t,
+        means2d=v_means2d,
     )
+
+
+def tile_lists(footprints: Footprints, camera: Camera, conventions: Conventions, backend: Backend) -> TileBins:
+    """Return the tiles' lists, nearest means first; a line or triangle is in the lists of all tiles under its box."""
+    projection = footprints.projection
+    # The backend leaves out tiles that an ellipse does not reach: one without bounds reaches all.
+    conics = np.where((footprints.n_vertices > 1)[:, None], 0, projection.conics)
+    grid = TileGrid(camera.width, camera.height, backend.tile_width, backend.tile_height)
+    return backend.bin_gaussians(projection._replace(conics=conics), grid, conventions)
 
 
 def simplify_hulls(state: TrainState, iteration: Iteration, *, least: float, least_height: float) -> str:

@@ -3,7 +3,7 @@
 MP-GS clusters points hierarchically into groups of one, two or three, and makes each an ellipse, a line or a triangle.
 Here two points may join if one is among the three nearest neighbours of the other and their colours differ by less than
 5 in CIE Lab; pairs join in the order of their distance, as long as a group has at most three points and each two of
-them are alike. A group's frame has its plane in the first two axes and its first point for the mean.
+them are alike. A group's frame has its plane in the first two axes.
 """
 
 from typing import NamedTuple
@@ -27,16 +27,16 @@ class MixedGaussians(NamedTuple):
     """Ellipses, lines and triangles; the other fields are those of :class:`Gaussians`."""
 
     means: Floats
-    """[N, 3] the first vertices."""
+    """[N, 3] the means of the vertices."""
     quats: Floats
-    """[N, 4] as for Gaussians; further vertices lie in the plane of the first two axes."""
+    """[N, 4] as for Gaussians; vertices lie in the plane of the first two axes."""
     log_scales: Floats
     opacity_logits: Floats
     sh_dc: Floats
     sh_rest: Floats
     vertices: Floats
-    """[N, 4] a_2, b_2, a_3, b_3: the second and the third vertex from the first, along the first two axes, world
-    units. What a line or an ellipse does not have has no effect."""
+    """[N, 4] a_2, b_2, a_3, b_3: the second and the third vertex from the mean, along the first two axes, world units.
+    What a line or an ellipse does not have has no effect."""
     n_vertices: Floats
     """[N] 1 of an ellipse, 2 of a line, 3 of a triangle. Set by events, not learnt."""
 
@@ -68,11 +68,11 @@ def grouped(gaussians: Gaussians, rng: np.random.Generator) -> MixedGaussians:
     weights = (of_hulls >= 0) / (of_hulls >= 0).sum(axis=1, keepdims=True)  # [H, 3]; the row -1 counts 0
     blended = {
         name: np.einsum("hk,hk...->h...", weights, getattr(gaussians, name)[of_hulls]).astype(dtype)
-        for name in ("log_scales", "opacity_logits", "sh_dc", "sh_rest")
+        for name in ("means", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
     }
     points = gaussians.means[np.where(of_hulls >= 0, of_hulls, of_hulls[:, :1])]
     R = plane_frames(points)
-    in_plane = np.einsum("hij,hki->hkj", R[:, :, :2], (points - points[:, :1]).astype(np.float64))
+    in_plane = np.einsum("hij,hki->hkj", R[:, :, :2], points - blended["means"][:, None].astype(np.float64))
     scales = np.repeat(blended["log_scales"].mean(axis=1, keepdims=True) + np.log(SHRINK), 3, axis=1)
     changed = {**blended, "log_scales": scales, "quats": quaternions(R)}
     changed |= {"vertices": in_plane[:, 1:].reshape(-1, 4), "n_vertices": (of_hulls >= 0).sum(axis=1)}

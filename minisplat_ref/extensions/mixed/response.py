@@ -14,6 +14,8 @@ with weights w; the distance is the least over all weights, so that it does not 
 ones (the envelope theorem). Its gradient is that of an ellipse around the nearest point, distributed by the weights::
 
     d = sum_k w_k p_k - x,   alpha = o exp(-d^T Q d / 2),   v_p_k = w_k v_d
+
+Vertices are given from the hull's centre, which moves them all.
 """
 
 from typing import NamedTuple
@@ -32,11 +34,16 @@ class Footprints(NamedTuple):
     """Hulls as a camera sees them."""
 
     projection: Projection
-    """Its centres are those of the first vertices; its conics belong to all vertices."""
+    """Of the centres; the conics belong to all vertices."""
     vertices: Floats
-    """[N, 3, 2] p_k, px; those that a hull does not have repeat the first."""
+    """[N, 3, 2] p_k from the centre, px; zeros where a hull has no such vertex, and for an ellipse."""
     n_vertices: Ints
     """[N] 1, 2 or 3."""
+
+    @property
+    def means2d(self) -> Floats:
+        """[N, 2] the centres, px."""
+        return self.projection.means2d
 
     @property
     def conics(self) -> Floats:
@@ -49,7 +56,7 @@ class Footprints(NamedTuple):
         return self.projection.opacities
 
 
-FIELDS = ("vertices", "conics", "opacities")
+FIELDS = ("means2d", "conics", "opacities", "vertices")
 
 
 class Nearest(NamedTuple):
@@ -71,7 +78,7 @@ def nearest(vertices: Floats, n_vertices: Ints, Q: Floats, centers: Floats) -> N
     vertices : ndarray of shape (G, 3, 2)
         p_k, px.
     n_vertices : ndarray of shape (G,)
-        m: of a line only the first edge counts, of an ellipse the first vertex.
+        m: of a line only the first edge counts, which of an ellipse has no length.
     Q : ndarray of shape (G, 2, 2)
         px^-2.
     centers : ndarray of shape (P, 2)
@@ -134,7 +141,8 @@ def boxes(footprints: Footprints) -> Ints:
 def hit(footprints: Footprints, ids: Ints, centers: Floats) -> Hit:
     """Evaluate hulls at pixels; see :func:`minisplat_ref.reference.hits.conic_hit`."""
     projection, Q = footprints.projection, conic_matrices(footprints.conics[ids])
-    found = nearest(footprints.vertices[ids], footprints.n_vertices[ids], Q, centers)
+    vertices = footprints.means2d[ids, None] + footprints.vertices[ids]
+    found = nearest(vertices, footprints.n_vertices[ids], Q, centers)
     sigmas = np.einsum("gpi,gij,gpj->gp", found.offsets, Q, found.offsets) / 2
     falloffs = np.exp(-np.maximum(sigmas, 0))
     # A negative square is a rounding error.
@@ -145,22 +153,23 @@ def hit(footprints: Footprints, ids: Ints, centers: Floats) -> Hit:
 
 def hit_vjp(
     footprints: Footprints, ids: Ints, hit: Hit, v_mean: Floats, v_shape: Floats, v_place: None
-) -> tuple[Floats, Floats, Floats]:
+) -> tuple[Floats, ...]:
     """Gradient of :func:`hit` with respect to ``FIELDS``, summed over the pixels.
 
     With ``alpha = o E``, ``E = exp(-sigma)``, ``sigma = d^T Q d / 2``::
 
         v_o = E v_alpha,  v_sigma = -o E v_alpha
-        v_p_k = v_sigma w_k Q d
+        v_d = v_sigma Q d,  v_p_k = w_k v_d, and the centre's is v_d, as d is 0 inside a triangle
         v_a = v_sigma dx^2 / 2,  v_b = v_sigma dx dy,  v_c = v_sigma dy^2 / 2
     """
     (weights, d, _), falloffs = hit.place
     unclamped = footprints.opacities[ids, None] * falloffs  # [G, P] o E
     Q = conic_matrices(footprints.conics[ids])
-    v_vertices = np.einsum("gp,gpk,gij,gpj->gki", -unclamped * v_mean, weights, Q, d)
+    v_d = np.einsum("gp,gij,gpj->gpi", -unclamped * v_mean, Q, d)
     v_Q = np.einsum("gp,gpi,gpj->gij", -unclamped * v_shape / 2, d, d)
     v_conics = np.column_stack([v_Q[:, 0, 0], 2 * v_Q[:, 0, 1], v_Q[:, 1, 1]])
-    return v_vertices, v_conics, np.sum(falloffs * v_shape, axis=1)
+    v_vertices = np.einsum("gpk,gpi->gki", weights, v_d)
+    return v_d.sum(axis=1), v_conics, np.sum(falloffs * v_shape, axis=1), v_vertices
 
 
 RESPONSE = Response(boxes, hit, hit_vjp, FIELDS)
