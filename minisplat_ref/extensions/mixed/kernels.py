@@ -73,9 +73,10 @@ def hull_response(exp: Callable) -> KernelResponse:
         d_x, d_y, sigma = select(is_nearer, x, d_x), select(is_nearer, y, d_y), select(is_nearer, new, sigma)
         w_1, w_2, w_3 = select(is_nearer, f, w_1), select(is_nearer, ZERO, w_2), select(is_nearer, ONE - f, w_3)
         turn = records[n, TURN]
-        outside = (turn * side(o_1, o_2) <= ZERO) | (turn * side(o_2, o_3) <= ZERO) | (turn * side(o_3, o_1) <= ZERO)
-        d_x, d_y, sigma = select(outside, d_x, ZERO), select(outside, d_y, ZERO), select(outside, sigma, ZERO)
-        return d_x, d_y, sigma, select(outside, w_1, ZERO), select(outside, w_2, ZERO), select(outside, w_3, ZERO)
+        turns = minimum(minimum(turn * side(o_1, o_2), turn * side(o_2, o_3)), turn * side(o_3, o_1))
+        inside = turns > ZERO
+        d_x, d_y, sigma = select(inside, ZERO, d_x), select(inside, ZERO, d_y), select(inside, ZERO, sigma)
+        return d_x, d_y, sigma, select(inside, ZERO, w_1), select(inside, ZERO, w_2), select(inside, ZERO, w_3)
 
     @scalar
     def hit(records, n, x, y):

@@ -37,6 +37,8 @@ from minisplat_ref.types import (
 
 BY_REFERENCE = frozenset({"stats", "median_depth"})  # what the plain kernels do not collect
 
+BOUNDLESS = np.array([1e-12, 0.0, 1e-12])  # px^-2: a million pixels
+
 
 class _Tape(NamedTuple):
     """What :func:`render` did."""
@@ -142,8 +144,8 @@ def render_vjp(tape: _Tape | RenderTape, v_image: Floats, v_alpha: Floats | None
 def tile_lists(footprints: Footprints, camera: Camera, conventions: Conventions, backend: Backend) -> TileBins:
     """Return the tiles' lists, nearest means first; a line or triangle is in the lists of all tiles under its box."""
     projection = footprints.projection
-    # The backend leaves out tiles that an ellipse does not reach: one without bounds reaches all.
-    conics = np.where((footprints.n_vertices > 1)[:, None], 0, projection.conics)
+    # The backend leaves out tiles that an ellipse does not reach: one that is nearly without bounds reaches all.
+    conics = np.where((footprints.n_vertices > 1)[:, None], BOUNDLESS, projection.conics)
     grid = TileGrid(camera.width, camera.height, backend.tile_width, backend.tile_height)
     return backend.bin_gaussians(projection._replace(conics=conics), grid, conventions)
 
