@@ -109,18 +109,11 @@ def render(
         raise InputError(f"sh_degree is {sh_degree}; these Gaussians store degrees 0 to {stored_degree}")
     background = np.zeros(3, dtype) if background is None else np.asarray(background, dtype)
 
-    with np.errstate(over="ignore"):
-        # The largest finite number is culled like infinity, but infinity times a zero gradient would be NaN.
-        scales = np.minimum(np.exp(gaussians.log_scales), np.finfo(dtype).max)
-        opacities = 1 / (1 + np.exp(-gaussians.opacity_logits))
-    if is_visible is not None:
-        opacities = np.where(is_visible, opacities, opacities.dtype.type(0))
-
     def shade(radii: Ints) -> Floats:
         return backend.sh_colors(gaussians.means, gaussians.sh_dc, gaussians.sh_rest, camera, sh_degree, radii)
 
     splats = splat(
-        Primitives(gaussians.means, gaussians.quats, scales, opacities),
+        activated(gaussians, is_visible),
         shade,
         camera,
         background,
@@ -133,6 +126,26 @@ def render(
     visible_ids = np.flatnonzero(splats.projection.radii[:, 0] > 0)
     output = splats.output._replace(visible_ids=visible_ids, n_pairs=len(splats.bins.gaussian_ids))
     return output, RenderTape(gaussians, sh_degree, splats)
+
+
+def activated(gaussians: Any, is_visible: Bools | None = None) -> Primitives:
+    """Return Gaussians after their activations.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        Or any population that has its first four fields.
+    is_visible : ndarray of shape (N,) of booleans, optional
+        The opacity of the others is 0.
+    """
+    dtype = gaussians.means.dtype
+    with np.errstate(over="ignore"):
+        # The largest finite number is culled like infinity, but infinity times a zero gradient would be NaN.
+        scales = np.minimum(np.exp(gaussians.log_scales), np.finfo(dtype).max)
+        opacities = 1 / (1 + np.exp(-gaussians.opacity_logits))
+    if is_visible is not None:
+        opacities = np.where(is_visible, opacities, opacities.dtype.type(0))
+    return Primitives(gaussians.means, gaussians.quats, scales, opacities)
 
 
 def render_vjp(tape: RenderTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:

@@ -20,9 +20,8 @@ from minisplat_ref.extensions.shared_tangent_planes import (
 )
 from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
 from minisplat_ref.reference.hits import Response
-from minisplat_ref.rendering import SPLATTING, RenderGradient, Request
+from minisplat_ref.rendering import SPLATTING, RenderGradient, Request, activated
 from minisplat_ref.types import (
-    Bools,
     Camera,
     Floats,
     Gaussians,
@@ -133,17 +132,6 @@ def checked_buffer(buffer_size: int | None) -> int:
             " exact order"
         )
     return int(buffer_size)
-
-
-def activated(gaussians: Any, is_visible: Bools | None) -> Primitives:
-    """Return Gaussians after their activations; those of ``is_visible`` alone where it is given."""
-    dtype = gaussians.means.dtype
-    with np.errstate(over="ignore"):
-        scales = np.minimum(np.exp(gaussians.log_scales), np.finfo(dtype).max)
-        opacities = 1 / (1 + np.exp(-gaussians.opacity_logits))
-    if is_visible is not None:
-        opacities = np.where(is_visible, opacities, dtype.type(0))
-    return Primitives(gaussians.means, gaussians.quats, scales, opacities)
 
 
 def render(model: Model, view: View, request: Request, *, buffer_size: int | None = None) -> tuple[RenderOutput, Tape]:

@@ -1,21 +1,15 @@
-"""DisC-GS: masks against polygons, gradients, parity of kernels and reference, hard cases, training end to end."""
+"""DisC-GS: masks against polygons, gradients, hard cases, training end to end; see also ``test_shared_payload``."""
 
 import json
 
-import numba
 import numpy as np
 import pytest
 from gradcheck import check_jacobian
 from matplotlib.path import Path as Polygon
 from numpy.testing import assert_allclose
+from payloads import drawn, random_cuts
 from scenes import as_dtype, make_camera, make_gaussians
-from tolerances import (
-    CLOSED_FORM,
-    COVERAGE_MIN,
-    PARITY_FLOAT32_GRADIENT,
-    PARITY_FLOAT32_IMAGE,
-    PARITY_FLOAT64,
-)
+from tolerances import CLOSED_FORM, PARITY_FLOAT32_IMAGE, PARITY_FLOAT64
 
 from minisplat_ref import load_ply
 from minisplat_ref.backends import CPU, REFERENCE
@@ -23,42 +17,22 @@ from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.cuts import card
 from minisplat_ref.extensions.cuts.curve import N_EDGES, VERTICES, bernstein, cut, cut_vjp, n_crossings
-from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CutGaussians, render, render_vjp, with_cuts
+from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CutGaussians
 from minisplat_ref.extensions.cuts.response import image_points, image_points_vjp
-from minisplat_ref.extensions.cuts.stages import stages
-from minisplat_ref.oracle.gradients import jacobian_case
-from minisplat_ref.oracle.models import check_model_gradients
-from minisplat_ref.oracle.pieces import SEED, tiny_setting
-from minisplat_ref.rendering import SPLATTING, Request
-from minisplat_ref.types import Gaussians, Model, Primitives, view_from
+from minisplat_ref.types import Gaussians, Primitives, view_from
 
 HARD, SOFT = np.zeros(1), np.ones(1)
 LOOP = np.array([[[2.0, -5.0], [9.0, -6.0], [6.0, 7.0], [-2.5, 5.0]]])  # px; beside the centre
 AROUND = np.array([[[-3.0, 0.5], [-2.0, 9.0], [8.0, -3.0], [-3.0, -0.5]]])  # almost closed around it
+RENDERER = CUT_GAUSSIANS.renderer
 
 
 def grid(n=41, reach=8.0):
     """Pixels [1, n^2, 2] around the centre."""
     steps = np.linspace(-reach, reach, n) + 0.013
     return np.stack(np.meshgrid(steps, steps), axis=-1).reshape(1, -1, 2)
-
-
-def with_random_cuts(rng, n, **named):
-    """Gaussians of :func:`make_gaussians` with curves through them, a third of them hard."""
-    population = with_cuts(make_gaussians(rng, n, **named), rng)
-    curves = 0.4 * population.curves + 0.2 * rng.normal(size=population.curves.shape)
-    return population._replace(curves=curves, widths=np.where(np.arange(n) % 3 == 0, 0.0, 0.7))
-
-
-def drawn(population, view, backend):
-    """A picture, and the gradient of it with random weights."""
-    output, tape = render(Model(population), view, Request(np.full(3, 0.2), backend=backend))
-    rng, dtype = np.random.default_rng(1), population.means.dtype
-    v_image, v_alpha = rng.normal(size=output.image.shape), rng.normal(size=output.alpha.shape)
-    return output, render_vjp(tape, v_image.astype(dtype), v_alpha.astype(dtype))
 
 
 # --- the mask ---
@@ -164,89 +138,21 @@ def test_the_gradient_of_the_points(rng):
 # --- whole pictures ---
 
 
-def test_the_gradient_of_the_whole_model(backend):
-    report = check_model_gradients(backend, GSPLAT_MAIN, CUT_GAUSSIANS, stages)
-    assert len(report.cases) == 2 and report.n_failed == 0, report.cases
-
-
-def test_a_wrong_gradient_is_found(monkeypatch):
-    path = "minisplat_ref.extensions.cuts.response.cut_vjp"
-    monkeypatch.setattr(path, lambda *args: tuple(1.001 * v for v in cut_vjp(*args)))
-    (stage,) = stages(REFERENCE, tiny_setting(GSPLAT_MAIN), np.random.default_rng(SEED))
-    case = jacobian_case(stage)
-    assert not case.passed and "is wrong" in case.note
-
-
-@pytest.mark.parametrize(
-    ("dtype", "image_rel", "gradient_rel"),
-    [(np.float64, PARITY_FLOAT64, 10 * PARITY_FLOAT64), (np.float32, PARITY_FLOAT32_IMAGE, PARITY_FLOAT32_GRADIENT)],
-)
-@pytest.mark.parametrize("size", [0.15, 0.6])
-def test_kernels_and_reference_agree(dtype, image_rel, gradient_rel, size, rng):
-    """The second scene has Gaussians as large as the picture, of some of which the camera is inside."""
-    population, view = with_random_cuts(rng, 40, size=size), view_from(make_camera(rng=rng))
-    (ours, v_ours), (theirs, v_theirs) = (
-        drawn(as_dtype(population, dtype), view, CPU),
-        drawn(population, view, REFERENCE),
-    )
-    assert ours.image.dtype == dtype and theirs.alpha.max() > COVERAGE_MIN
-    assert np.abs(ours.image - theirs.image).max() <= image_rel * np.abs(theirs.image).max()
-    for name, expected in v_theirs.gaussians._asdict().items():
-        found, scale = getattr(v_ours.gaussians, name), np.abs(expected).max()
-        assert found.dtype == dtype and (scale > 0 or name == "widths")
-        assert np.abs(found - expected).max() <= gradient_rel * scale, name
-
-
-def test_gaussians_without_points_are_3dgs_to_the_last_byte(backend, rng):
-    gaussians, view = make_gaussians(rng, 30), view_from(make_camera(rng=rng))
-    uncut = CutGaussians(*gaussians, curves=np.zeros((30, 0)), widths=np.zeros(30))
-    ours, _ = drawn(uncut, view, backend)
-    theirs, _ = SPLATTING.render(Model(gaussians), view, Request(np.full(3, 0.2), backend=backend))
-    assert theirs.alpha.max() > COVERAGE_MIN and ours.image.tobytes() == theirs.image.tobytes()
-    point = uncut._replace(curves=np.full((30, 8), 0.3))  # a curve that is a point cuts nothing
-    assert_allclose(drawn(point, view, backend)[0].image, theirs.image, atol=PARITY_FLOAT64)
-
-
 def test_needles_and_curves_through_the_centre(rng):
     """A needle, a Gaussian with a curve through its centre, one with a curve that is a point, one around the camera."""
-    population = with_random_cuts(rng, 4)._replace(
+    population = random_cuts(rng, make_gaussians(rng, 4))._replace(
         means=np.array([[0.1, 0.0, 3.0], [-0.3, 0.2, 2.5], [0.3, -0.2, 2.8], [0.05, 0.02, 0.3]]),
         log_scales=np.log([[0.8, 8e-4, 8e-4], [0.3, 0.3, 1e-6], [0.2, 0.2, 0.2], [0.6, 0.5, 0.7]]),
         opacity_logits=np.array([1.0, 1.0, 1.0, -1.5]),
     )
     population.curves[1], population.curves[2] = [-2, -2, -1, -1, 1, 1, 2, 2], 0.5
     view = view_from(make_camera())
-    theirs, v_theirs = drawn(population, view, REFERENCE)
+    theirs, v_theirs = drawn(RENDERER, population, view, REFERENCE)
     for dtype, rel in ((np.float64, 100 * PARITY_FLOAT64), (np.float32, 10 * PARITY_FLOAT32_IMAGE)):
-        ours, v_ours = drawn(as_dtype(population, dtype), view, CPU)
+        ours, v_ours = drawn(RENDERER, as_dtype(population, dtype), view, CPU)
         assert (ours.visible_ids == np.arange(4)).all()
         assert np.abs(ours.image - theirs.image).max() <= rel
         assert all(np.isfinite(field).all() for field in (*v_ours.gaussians, *v_theirs.gaussians))
-
-
-def test_the_number_of_threads_does_not_change_a_byte(rng):
-    population, view = as_dtype(with_random_cuts(rng, 60), np.float32), view_from(make_camera(48, 40, rng=rng))
-    threads, results = numba.get_num_threads(), []
-    try:
-        for n in (1, min(2, threads)):
-            numba.set_num_threads(n)
-            output, v = drawn(population, view, CPU)
-            results.append([output.image.tobytes(), *(field.tobytes() for field in v.gaussians)])
-    finally:
-        numba.set_num_threads(threads)
-    assert results[0] == results[1]
-
-
-def test_no_gaussians_and_no_statistics(backend, rng):
-    none, some = (as_dtype(with_random_cuts(rng, n), np.float32) for n in (0, 5))
-    view = view_from(make_camera())
-    assert render(Model(none), view, Request(backend=backend))[0].image.max() == 0
-    asks = Request(backend=backend, wants=frozenset({"stats"}))
-    if backend.is_compiled:
-        with pytest.raises(InputError, match="--backend reference"):
-            render(Model(some), view, asks)
-    else:
-        assert render(Model(some), view, asks)[0].stats.hit_count.sum() > 0
 
 
 # --- from end to end ---

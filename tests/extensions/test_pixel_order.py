@@ -26,11 +26,11 @@ from minisplat_ref.extensions.pixel_order import clouds
 from minisplat_ref.extensions.pixel_order.method import ORDERED
 from minisplat_ref.extensions.pixel_order.stages import stages
 from minisplat_ref.extensions.shared_tangent_rays import tangent_hits, turned
-from minisplat_ref.extensions.shared_tangent_renderer import RESPONSE, activated
+from minisplat_ref.extensions.shared_tangent_renderer import RESPONSE
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT64
 from minisplat_ref.reference.projection import project as project_ewa
-from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.rendering import SPLATTING, Request, activated
 from minisplat_ref.training.schedule import configured, describe, settings_of
 from minisplat_ref.types import Gaussians, Model, Primitives, view_from
 
@@ -85,7 +85,7 @@ def test_on_the_axis_it_is_3dgs():
 def test_away_from_the_axis_it_is_ewa_with_a_denominator(rng):
     """exp(-d^T Q d / 2) with EWA's Q becomes exp(-d^T Q d / (2 (1 + h . d)^2)): a derivation of its own."""
     gaussians, camera = make_gaussians(rng, 12), make_camera(60, 44, fx=30.0, fy=33.0)
-    primitives = Primitives(*activated(gaussians, None))
+    primitives = activated(gaussians)
     projection, footprints = project_ewa(*primitives, camera, BARE), planes.project(primitives, camera, BARE)
     ids = np.flatnonzero((projection.radii[:, 0] > 0) & (footprints.radii[:, 0] > 0))
     pixels = rng.uniform((5, 5), (55, 39), (9, 2))
@@ -195,7 +195,7 @@ def test_means2d_move_a_footprint_in_the_image(rng):
 
 def test_the_gradient_of_alpha(rng):
     """Of opacities and, along the tangent plane, of conics."""
-    primitives = Primitives(*activated(make_gaussians(rng, 3), None))
+    primitives = activated(make_gaussians(rng, 3))
     footprints = planes.project(primitives, make_camera(), GSPLAT_MAIN)
     ids, pixels = np.arange(3), rng.uniform((4, 4), (20, 14), (5, 2))
 

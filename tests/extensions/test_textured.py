@@ -1,56 +1,34 @@
-"""Textured-GS: where rays meet ellipsoids, gradients, parity of kernels and reference, fine-tuning end to end."""
+"""Textured-GS: where rays meet ellipsoids, gradients, fine-tuning end to end; see also ``test_shared_payload``."""
 
 import json
 
-import numba
 import numpy as np
 import pytest
 from gradcheck import check_jacobian
 from numpy.testing import assert_allclose
+from payloads import drawn, random_textures
 from scenes import as_dtype, make_camera, make_gaussians
-from tolerances import (
-    CLOSED_FORM,
-    COVERAGE_MIN,
-    PARITY_FLOAT32_GRADIENT,
-    PARITY_FLOAT32_IMAGE,
-    PARITY_FLOAT64,
-    TEXTURE_THIN_FLOAT32,
-)
+from tolerances import CLOSED_FORM, PARITY_FLOAT64, TEXTURE_THIN_FLOAT32
 
 from minisplat_ref import load_ply
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
-from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.textured.method import TEXTURED_GAUSSIANS, render, render_vjp
+from minisplat_ref.extensions.textured.method import TEXTURED_GAUSSIANS
 from minisplat_ref.extensions.textured.population import TexturedGaussians, with_textures
 from minisplat_ref.extensions.textured.reference import LIMB, frames, frames_vjp, meet, meet_vjp
 from minisplat_ref.extensions.textured.response import RESPONSE, Footprints, bounds
-from minisplat_ref.extensions.textured.stages import stages
 from minisplat_ref.extensions.textured.study import colors_across
-from minisplat_ref.oracle.gradients import jacobian_case
-from minisplat_ref.oracle.models import check_model_gradients
-from minisplat_ref.oracle.pieces import SEED, tiny_setting
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.reference.hits import CONIC
 from minisplat_ref.reference.pinhole import pinhole, pinhole_rays
 from minisplat_ref.reference.spherical_harmonics import sh_basis
-from minisplat_ref.rendering import SPLATTING, Request
-from minisplat_ref.types import Gaussians, Model, Projection, view_from
+from minisplat_ref.types import Projection, view_from
 
+RENDERER = TEXTURED_GAUSSIANS.renderer
 DIRECTIONS = np.random.default_rng(5).normal(size=(4000, 3))
 DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
-
-
-def textured(rng, n, degree=3, **named):
-    """Gaussians of :func:`make_gaussians` with random textures."""
-    plain = with_textures(make_gaussians(rng, n, **named), degree)
-    return plain._replace(
-        color_textures=0.3 * rng.normal(size=plain.color_textures.shape),
-        opacity_textures=0.5 * rng.normal(size=plain.opacity_textures.shape),
-    )
 
 
 def of_one(mean, scales, quat=(1.0, 0.2, -0.3, 0.4)):
@@ -58,14 +36,6 @@ def of_one(mean, scales, quat=(1.0, 0.2, -0.3, 0.4)):
     camera = make_camera()
     means, quats, deviations = np.array([mean]), np.array([quat]), np.array([scales])
     return frames(means, quats, deviations, camera), pinhole(means, camera), camera
-
-
-def drawn(population, view, backend, v=None):
-    """A picture, and the gradient of it with random weights."""
-    output, tape = render(Model(population), view, Request(np.full(3, 0.2), backend=backend))
-    rng, dtype = np.random.default_rng(1), population.means.dtype
-    v_image, v_alpha = rng.normal(size=output.image.shape), rng.normal(size=output.alpha.shape)
-    return output, render_vjp(tape, v_image.astype(dtype), v_alpha.astype(dtype))
 
 
 # --- where rays arrive ---
@@ -157,66 +127,18 @@ def test_opacity_is_the_sigmoid_of_logit_and_texture(rng):
     assert_allclose(hit.unclamped[0], falloff / (1 + np.exp(-(logit + x))), rtol=CLOSED_FORM)
 
 
-def test_textures_of_degree_0_are_3dgs_to_the_last_byte(backend, rng):
-    gaussians, view = make_gaussians(rng, 30), view_from(make_camera(rng=rng))
-    (ours, v_ours), (theirs, tape) = (
-        drawn(with_textures(gaussians, 0), view, backend),
-        SPLATTING.render(Model(gaussians), view, Request(np.full(3, 0.2), backend=backend)),
-    )
-    assert theirs.alpha.max() > COVERAGE_MIN and ours.image.tobytes() == theirs.image.tobytes()
-    weights = np.random.default_rng(1)
-    v = SPLATTING.render_vjp(tape, weights.normal(size=(18, 24, 3)), weights.normal(size=(18, 24)))
-    for name in Gaussians._fields:
-        assert getattr(v_ours.gaussians, name).tobytes() == getattr(v.gaussians, name).tobytes(), name
-
-
-def test_textures_of_zeros_change_nothing(backend, rng):
-    gaussians, view = make_gaussians(rng, 30), view_from(make_camera(rng=rng))
-    ours, v = drawn(with_textures(gaussians, 3), view, backend)
-    theirs, _ = SPLATTING.render(Model(gaussians), view, Request(np.full(3, 0.2), backend=backend))
-    assert_allclose(ours.image, theirs.image, atol=PARITY_FLOAT64)
+def test_textures_of_zeros_have_a_gradient(rng):
+    """So that a training leaves them; that they change nothing is tested for all payloads."""
+    _, v = drawn(RENDERER, with_textures(make_gaussians(rng, 30), 3), view_from(make_camera(rng=rng)), REFERENCE)
     assert np.abs(v.gaussians.color_textures).max() > 0 and np.abs(v.gaussians.opacity_textures).max() > 0
 
 
 # --- whole pictures ---
 
 
-def test_the_gradient_of_the_whole_model(backend):
-    report = check_model_gradients(backend, GSPLAT_MAIN, TEXTURED_GAUSSIANS, stages)
-    assert len(report.cases) == 2 and report.n_failed == 0, report.cases
-
-
-def test_a_wrong_gradient_is_found(monkeypatch):
-    path = "minisplat_ref.extensions.textured.response.meet_vjp"
-    monkeypatch.setattr(path, lambda *args: tuple(1.001 * v for v in meet_vjp(*args)))
-    (stage,) = stages(REFERENCE, tiny_setting(GSPLAT_MAIN), np.random.default_rng(SEED))
-    case = jacobian_case(stage)
-    assert not case.passed and "is wrong" in case.note
-
-
-@pytest.mark.parametrize(
-    ("dtype", "image_rel", "gradient_rel"),
-    [(np.float64, PARITY_FLOAT64, 10 * PARITY_FLOAT64), (np.float32, PARITY_FLOAT32_IMAGE, PARITY_FLOAT32_GRADIENT)],
-)
-@pytest.mark.parametrize(("degree", "size"), [(3, 0.15), (2, 0.6)])
-def test_kernels_and_reference_agree(dtype, image_rel, gradient_rel, degree, size, rng):
-    """The second scene has Gaussians as large as the picture, of some of which the camera is inside."""
-    population, view = textured(rng, 40, degree, size=size), view_from(make_camera(rng=rng))
-    (ours, v_ours), (theirs, v_theirs) = (
-        drawn(as_dtype(population, dtype), view, CPU),
-        drawn(population, view, REFERENCE),
-    )
-    assert ours.image.dtype == dtype and theirs.alpha.max() > COVERAGE_MIN
-    assert np.abs(ours.image - theirs.image).max() <= image_rel * np.abs(theirs.image).max()
-    for name, expected in v_theirs.gaussians._asdict().items():
-        found, scale = getattr(v_ours.gaussians, name), np.abs(expected).max()
-        assert found.dtype == dtype and scale > 0
-        assert np.abs(found - expected).max() <= gradient_rel * scale, name
-
-
 def thin(rng):
     """A needle a thousandth as wide as it is long, a sheet seen edge on, and a Gaussian with the camera inside."""
-    return textured(rng, 3)._replace(
+    return random_textures(rng, make_gaussians(rng, 3))._replace(
         means=np.array([[0.1, 0.0, 3.0], [-0.3, 0.2, 2.5], [0.05, 0.02, 0.3]]),
         quats=np.array([[1.0, 0.0, 0.0, 0.3], [1.0, 0.0, 0.0, 0.0], [1.0, 0.5, 0.2, 0.0]]),
         log_scales=np.log([[0.8, 8e-4, 8e-4], [3e-7, 0.3, 0.5], [0.6, 0.5, 0.7]]),
@@ -226,40 +148,13 @@ def thin(rng):
 
 def test_needles_sheets_and_a_camera_inside(rng):
     population, view = thin(rng), view_from(make_camera())
-    theirs, v_theirs = drawn(population, view, REFERENCE)
+    theirs, v_theirs = drawn(RENDERER, population, view, REFERENCE)
     for dtype, rel in ((np.float64, 100 * PARITY_FLOAT64), (np.float32, TEXTURE_THIN_FLOAT32)):
-        ours, v_ours = drawn(as_dtype(population, dtype), view, CPU)
+        ours, v_ours = drawn(RENDERER, as_dtype(population, dtype), view, CPU)
         assert (ours.visible_ids == np.arange(3)).all()
         assert np.abs(ours.image - theirs.image).max() <= rel
         assert all(np.isfinite(field).all() for field in v_ours.gaussians)
     assert all(np.isfinite(field).all() for field in v_theirs.gaussians)
-
-
-def test_the_number_of_threads_does_not_change_a_byte(rng):
-    population, view = as_dtype(textured(rng, 60), np.float32), view_from(make_camera(48, 40, rng=rng))
-    threads, results = numba.get_num_threads(), []
-    try:
-        for n in (1, min(2, threads)):
-            numba.set_num_threads(n)
-            output, v = drawn(population, view, CPU)
-            results.append([output.image.tobytes(), *(field.tobytes() for field in v.gaussians)])
-    finally:
-        numba.set_num_threads(threads)
-    assert results[0] == results[1]
-
-
-def test_no_gaussians_and_no_statistics(backend, rng):
-    none, some = (as_dtype(textured(rng, n), np.float32) for n in (0, 5))
-    view = view_from(make_camera())
-    assert render(Model(none), view, Request(backend=backend))[0].image.max() == 0
-    asks = Request(backend=backend, wants=frozenset({"stats"}))
-    if backend.is_compiled:
-        with pytest.raises(InputError, match="--backend reference"):
-            render(Model(some), view, asks)
-    else:
-        assert render(Model(some), view, asks)[0].stats.hit_count.sum() > 0
-    with pytest.raises(InputError, match="surface"):
-        render(Model(some), view, Request(backend=backend, wants=frozenset({"surface"})))
 
 
 # --- from end to end ---

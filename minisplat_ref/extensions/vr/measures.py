@@ -12,10 +12,9 @@ from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.extensions.shared_studies import tidy
 from minisplat_ref.extensions.shared_tangent_rays import ewa_hits, steps_along, tangent_hits, turned
-from minisplat_ref.extensions.shared_tangent_renderer import activated
 from minisplat_ref.extensions.vr.foveation import Gaze, Zone, eccentricities, render_foveated, resolved_angles
 from minisplat_ref.extensions.vr.method import BUFFER
-from minisplat_ref.rendering import Request
+from minisplat_ref.rendering import Request, activated
 from minisplat_ref.types import Camera, Floats, Gaussians, Ints, Model, Primitives, View
 
 EVERYWHERE = 180.0  # degrees: every pixel is drawn
@@ -113,7 +112,7 @@ def yaw_steps(
     ray hits at five of the cameras are left out.
     """
     wide = Gaussians._make(field.astype(np.float64) for field in gaussians)
-    primitives, colors = activated(wide, None), np.maximum(0.5 + SH_C0 * wide.sh_dc, 0)
+    primitives, colors = activated(wide), np.maximum(0.5 + SH_C0 * wide.sh_dc, 0)
     slopes = np.linspace(-1, 1, n_rays) * np.tan(np.radians(6.0))
     x, y = np.meshgrid(slopes, slopes)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ camera.cam_from_world_R

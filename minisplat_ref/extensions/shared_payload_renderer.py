@@ -1,0 +1,221 @@
+"""Conics with a payload: Gaussians that are projected and listed as 3DGS does, and carry what changes their pixels.
+
+A texture, a cut, vertices: an extension says in a :class:`Payload` what its footprints are made of and what they do to
+a pixel. Activations, projection, colours, tile lists, the choice between kernels and reference, and the way back
+through all of them are the same, and are here.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref.backends import REFERENCE, Backend
+from minisplat_ref.constants import Conventions
+from minisplat_ref.cpu.compositing import hits as kernel_hits
+from minisplat_ref.cpu.compositing.responses import KernelResponse
+from minisplat_ref.errors import InputError
+from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
+from minisplat_ref.reference.hits import Response
+from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, RenderTape, Request, activated
+from minisplat_ref.types import (
+    Camera,
+    Floats,
+    Ints,
+    Model,
+    Primitives,
+    Projection,
+    ProjectionGradient,
+    RenderOutput,
+    TileBins,
+    TileGrid,
+    View,
+)
+
+BY_REFERENCE = frozenset({"stats", "median_depth"})  # what the plain kernels do not collect
+
+
+class Projected(NamedTuple):
+    """Activated Gaussians, and how a camera sees their ellipses."""
+
+    gaussians: Any
+    """A population that has the six fields of :class:`Gaussians`, and its own."""
+    primitives: Primitives
+    camera: Camera
+    conventions: Conventions
+    backend: Backend
+    projection: Projection
+
+    @property
+    def rows(self) -> Ints:
+        """[V] those that are not culled."""
+        return np.flatnonzero(self.projection.radii[:, 0] > 0)
+
+    def of(self, rows: Ints) -> Primitives:
+        """Return some of the primitives."""
+        return Primitives(*(field[rows] for field in self.primitives))
+
+
+class PayloadGradient(NamedTuple):
+    """Gradient of the loss as far as it passes through what the footprints carry."""
+
+    fields: Mapping[str, Floats]
+    """With respect to fields of the population, by name; they replace what the ellipses' gradient says."""
+    means: Floats
+    """[N, 3]; this and what follows is added to the ellipses' gradient."""
+    quats: Floats
+    """[N, 4]."""
+    scales: Floats
+    """[N, 3] with respect to the activated scales."""
+    cam_from_world_R: Floats
+    """[3, 3]."""
+    cam_from_world_t: Floats
+    """[3]."""
+
+
+def stored_logits(gaussians: Any) -> Floats:
+    """Return the logits [N] of opacity as they are stored."""
+    logits: Floats = gaussians.opacity_logits
+    return logits
+
+
+def channels_alone(projected: Projected, channels: Floats) -> Floats:
+    """Return the channels [N, D]: a colour is the same all over a footprint."""
+    return channels
+
+
+def channels_alone_vjp(
+    projected: Projected, v_coefficients: Floats, n_channels: int
+) -> tuple[Floats, Mapping[str, Floats]]:
+    """Gradient of :func:`channels_alone` with respect to channels, and to no field of the population."""
+    return v_coefficients, {}
+
+
+class Payload(NamedTuple):
+    """What an extension knows about its Gaussians."""
+
+    plural: str
+    """Their name in messages."""
+    response: Response
+    """The book's. Its ``fields`` begin with those of a conic: means2d, conics and opacities."""
+    response_for: Callable[[np.dtype], KernelResponse]
+    """The kernels', for arrays of a dtype."""
+    is_plain: Callable[[Any], bool]
+    """Whether a population carries nothing: then 3DGS draws it."""
+    footprints: Callable[[Projected], Any]
+    """Return what the responses take. Its field ``projection`` is what is listed and coloured."""
+    footprints_vjp: Callable[[Projected, tuple[Floats, ...]], PayloadGradient]
+    """Return the gradient of ``footprints`` for that of the response's fields after the conic's."""
+    opacity_logits: Callable[[Any], Floats] = stored_logits
+    """Return the logits [N] of the opacities that are projected."""
+    coefficients: Callable[[Projected, Floats], Floats] = channels_alone
+    """Return what the response's ``shade`` takes, made of channels [N, D]: the colours, and a depth if asked for."""
+    coefficients_vjp: Callable[[Projected, Floats, int], tuple[Floats, Mapping[str, Floats]]] = channels_alone_vjp
+    """Return its gradient with respect to the D channels, and with respect to fields of the population."""
+    is_wider: bool = False
+    """Whether footprints reach beyond their ellipses. Then tiles are listed by boxes alone."""
+
+
+class PayloadTape(NamedTuple):
+    """What a renderer of payloads did."""
+
+    payload: Payload
+    projected: Projected
+    sh_degree: int  # active
+    blended: tuple[Any, Floats, Floats, TileBins]  # footprints, coefficients, background, tile lists
+    output: RenderOutput
+
+
+def payload_renderer(name: str, payload: Payload) -> Renderer:
+    """Return the renderer of Gaussians with a payload."""
+    return Renderer(name, partial(_render, payload), _render_vjp, SPLATTING.channels)
+
+
+def _render(payload: Payload, model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
+    """Draw the view; without a payload as 3DGS does.
+
+    Raises
+    ------
+    InputError
+        Something is wanted that is not collected here.
+    """
+    g = model.gaussians
+    if payload.is_plain(g):
+        return SPLATTING.render(model, view, request)
+    backend, conventions, dtype, camera = request.backend, request.conventions, g.means.dtype, view.camera
+    missing = request.wants - {"depth"} - (frozenset() if backend.is_compiled else BY_REFERENCE)
+    if missing:
+        way_out = "use --backend reference" if missing <= BY_REFERENCE else "train a recipe that does without"
+        raise InputError(f"{payload.plural} are drawn without {', '.join(sorted(missing))}: {way_out}")
+    stored_degree = math.isqrt(g.sh_rest.shape[1] + 1) - 1
+    sh_degree = stored_degree if request.sh_degree is None else min(request.sh_degree, stored_degree)
+    background = np.zeros(3, dtype) if request.background is None else np.asarray(request.background, dtype)
+
+    primitives = activated(g._replace(opacity_logits=payload.opacity_logits(g)), request.is_visible)
+    projection = backend.project(*primitives, camera, conventions)
+    projected = Projected(g, primitives, camera, conventions, backend, projection)
+    footprints = payload.footprints(projected)
+    listed: Projection = footprints.projection
+    channels = backend.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, sh_degree, listed.radii)  # [N, 3]
+    if "depth" in request.wants:
+        channels = np.column_stack([channels, listed.depths])
+        background = np.append(background, background.dtype.type(0))
+    grid = TileGrid(camera.width, camera.height, backend.tile_width, backend.tile_height)
+    bins = (REFERENCE if payload.is_wider else backend).bin_gaussians(listed, grid, conventions)
+    blended = footprints, payload.coefficients(projected, channels), background, bins
+    if backend.is_compiled:
+        output = kernel_hits.composite_hits(payload.response_for(dtype), *blended, conventions)
+    else:
+        with_stats, with_median_depth = "stats" in request.wants, "median_depth" in request.wants
+        output = composite_hits(
+            payload.response, *blended, conventions, with_stats=with_stats, with_median_depth=with_median_depth
+        )
+    output = output._replace(visible_ids=np.flatnonzero(listed.radii[:, 0] > 0), n_pairs=len(bins.gaussian_ids))
+    return output, PayloadTape(payload, projected, sh_degree, blended, output)
+
+
+def _render_vjp(tape: PayloadTape | RenderTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
+    """Gradient of :func:`_render`: of the projection, of the colours and of the payload, added up.
+
+    ::
+
+        v_log_s = s v_s,  v_logit = o (1 - o) v_o
+    """
+    if isinstance(tape, RenderTape):
+        return SPLATTING.render_vjp(tape, v_image, v_alpha)
+    payload, projected = tape.payload, tape.projected
+    g, primitives, camera, conventions, backend, projection = projected
+    v_alpha = np.zeros_like(tape.output.alpha) if v_alpha is None else v_alpha
+    arguments = *tape.blended, conventions, tape.output, (v_image, v_alpha)
+    if backend.is_compiled:
+        v = kernel_hits.composite_hits_vjp(payload.response_for(g.means.dtype), *arguments)
+    else:
+        v = composite_hits_vjp(payload.response, *arguments)
+    v_means2d, v_conics, v_opacities, *v_carried = v.primitives
+    v_channels, v_fields = payload.coefficients_vjp(projected, v.colors, v_image.shape[2])
+
+    v_depths = np.ascontiguousarray(v_channels[:, 3]) if v_image.shape[2] > 3 else np.zeros_like(projection.depths)
+    v_projection = ProjectionGradient(v_means2d, v_depths, v_conics, v_opacities)
+    v_flat = backend.project_vjp(*primitives, camera, conventions, projection, v_projection)
+    v_rgb, radii = np.ascontiguousarray(v_channels[:, :3]), tape.blended[0].projection.radii
+    v_sh = backend.sh_colors_vjp(g.means, g.sh_dc, g.sh_rest, camera, tape.sh_degree, radii, v_rgb)
+    v_more = payload.footprints_vjp(projected, tuple(v_carried))
+    with np.errstate(over="ignore"):
+        transparencies = 1 / (1 + np.exp(payload.opacity_logits(g)))
+    of_3dgs = {
+        "means": v_flat.means + v_sh.means + v_more.means,
+        "quats": v_flat.quats + v_more.quats,
+        "log_scales": primitives.scales * (v_flat.scales + v_more.scales),
+        "opacity_logits": primitives.opacities * transparencies * v_flat.opacities,
+        "sh_dc": v_sh.sh_dc,
+        "sh_rest": v_sh.sh_rest,
+    }
+    return RenderGradient(
+        gaussians=g._replace(**{**of_3dgs, **v_fields, **v_more.fields}),
+        background=v.background[:3],
+        cam_from_world_R=v_flat.cam_from_world_R + v_sh.cam_from_world_R + v_more.cam_from_world_R,
+        cam_from_world_t=v_flat.cam_from_world_t + v_sh.cam_from_world_t + v_more.cam_from_world_t,
+        means2d=v_means2d,
+    )

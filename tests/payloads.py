@@ -1,0 +1,85 @@
+"""Gaussians with payloads for the tests, and what differs between them."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref.extensions.cuts.curve import cut_vjp
+from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CutGaussians, with_cuts
+from minisplat_ref.extensions.cuts.stages import stages as cuts_stages
+from minisplat_ref.extensions.textured.method import TEXTURED_GAUSSIANS
+from minisplat_ref.extensions.textured.population import with_textures
+from minisplat_ref.extensions.textured.reference import meet_vjp
+from minisplat_ref.extensions.textured.stages import stages as textured_stages
+from minisplat_ref.rendering import Request
+from minisplat_ref.training.representation import Representation
+from minisplat_ref.types import Gaussians, Model
+
+BACKGROUND = np.full(3, 0.2)
+
+
+class Case(NamedTuple):
+    """What differs between payloads."""
+
+    representation: Representation
+    random: Callable[..., Any]
+    """(rng, gaussians) -> a population whose payloads matter."""
+    plain: Callable[[Gaussians], Any]
+    """The same Gaussians without a payload."""
+    harmless: Callable[[Gaussians], Any]
+    """With payloads that change nothing."""
+    stages: Callable[..., Any]
+    formula: tuple[str, Callable[..., Any]]
+    """A function of the reference that returns gradients, and where its caller finds it."""
+    not_learnt: frozenset[str] = frozenset()
+
+
+def random_cuts(rng, gaussians):
+    """Curves through the Gaussians, a third of them hard."""
+    population, n = with_cuts(gaussians, rng), len(gaussians.means)
+    curves = 0.4 * population.curves + 0.2 * rng.normal(size=population.curves.shape)
+    return population._replace(curves=curves, widths=np.where(np.arange(n) % 3 == 0, 0.0, 0.7))
+
+
+def uncut(gaussians, n_numbers=0):
+    """Without curves, or with curves that are points, which cut nothing."""
+    n = len(gaussians.means)
+    return CutGaussians(*gaussians, curves=np.full((n, n_numbers), 0.3), widths=np.zeros(n))
+
+
+def random_textures(rng, gaussians, degree=3):
+    plain = with_textures(gaussians, degree)
+    return plain._replace(
+        color_textures=0.3 * rng.normal(size=plain.color_textures.shape),
+        opacity_textures=0.5 * rng.normal(size=plain.opacity_textures.shape),
+    )
+
+
+CASES = {
+    "cuts": Case(
+        CUT_GAUSSIANS,
+        random_cuts,
+        uncut,
+        lambda gaussians: uncut(gaussians, 8),
+        cuts_stages,
+        ("minisplat_ref.extensions.cuts.response.cut_vjp", cut_vjp),
+        frozenset({"widths"}),
+    ),
+    "textured": Case(
+        TEXTURED_GAUSSIANS,
+        random_textures,
+        lambda gaussians: with_textures(gaussians, 0),
+        lambda gaussians: with_textures(gaussians, 3),
+        textured_stages,
+        ("minisplat_ref.extensions.textured.response.meet_vjp", meet_vjp),
+    ),
+}
+
+
+def drawn(renderer, population, view, backend):
+    """A picture, and the gradient of it with random weights."""
+    output, tape = renderer.render(Model(population), view, Request(BACKGROUND, backend=backend))
+    rng, dtype = np.random.default_rng(1), population.means.dtype
+    v_image, v_alpha = rng.normal(size=output.image.shape), rng.normal(size=output.alpha.shape)
+    return output, renderer.render_vjp(tape, v_image.astype(dtype), v_alpha.astype(dtype))
