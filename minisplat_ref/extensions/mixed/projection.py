@@ -152,10 +152,10 @@ class VertexGradient(NamedTuple):
     cam_from_world_t: Floats  # [3]
 
 
-def footprints_vjp(
-    hulls: Hulls, footprints: Footprints, camera: Camera, conventions: Conventions, v_vertices: Floats
-) -> VertexGradient:
+def footprints_vjp(hulls: Hulls, camera: Camera, conventions: Conventions, v_vertices: Floats) -> VertexGradient:
     """Gradient of :func:`footprints_of` through its ``vertices``; the projection's is that of ellipses.
+
+    A hull that is not seen has derivatives ``v_vertices`` [N, 3, 2] of 0, and is left out.
 
     With ``y_k = R_c x_k + t``, ``x = R_c mu + t``, ``G = R_c R`` and the pinhole's Jacobians::
 
@@ -163,7 +163,7 @@ def footprints_vjp(
         v_(a,b)_k = G[:, :2]^T v_y_k,  v_G[:, :2] = sum_k v_y_k (a, b)_k^T,  v_R = R_c^T v_G
         v_mu = R_c^T v_x,  v_t = sum v_x,  v_R_c = sum v_G R^T + v_x mu^T
     """
-    rows = np.flatnonzero((hulls.n_vertices > 1) & (footprints.projection.radii[:, 0] > 0))
+    rows = np.flatnonzero((hulls.n_vertices > 1) & v_vertices.any(axis=(1, 2)))
     seen, v_p, eye = hulls.of(rows), v_vertices[rows], with_principal_point(camera, conventions)
     R_c, _ = pose(camera, v_p.dtype)
     x, y, G = seen.in_camera(camera)

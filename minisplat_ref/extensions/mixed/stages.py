@@ -1,20 +1,16 @@
 """What the gradient proof checks: the renderer, with hulls of all kinds and the edges on which pixels' hits lie."""
 
-from typing import Any
-
 import numpy as np
 
 from minisplat_ref.backends import Backend
-from minisplat_ref.extensions.mixed.method import MIXED_GAUSSIANS, render
+from minisplat_ref.extensions.mixed.method import MIXED_GAUSSIANS
 from minisplat_ref.extensions.mixed.population import MixedGaussians, as_ellipses
-from minisplat_ref.extensions.mixed.response import INSIDE, RESPONSE
-from minisplat_ref.oracle.differences import Point
-from minisplat_ref.oracle.models import model_stage
+from minisplat_ref.extensions.mixed.response import INSIDE
+from minisplat_ref.extensions.shared_payload_stages import watching_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
-from minisplat_ref.reference.hits import TileHits, tile_hits
-from minisplat_ref.rendering import Request
-from minisplat_ref.types import Bools, Floats, Gaussians, Ints, Model, RenderOutput, View
+from minisplat_ref.reference.hits import TileHits
+from minisplat_ref.types import Bools, Floats, Gaussians, Ints
 
 SPAN = 1.0  # of the vertices from the first, in the Gaussians' own deviations
 N_EDGES = 3
@@ -22,23 +18,7 @@ N_EDGES = 3
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
     """Return the renderer; what is hit, and where the nearest points of hulls lie, is found by the reference."""
-    sides: list[Bools | Ints] = []
-
-    def watched(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
-        output, tape = render(model, view, request)
-        footprints, _, _, bins = tape.blended
-        tiles = tile_hits(footprints, bins, setting.conventions, RESPONSE)
-        sides[:] = [bins.gaussian_ids, *(side for tile in tiles for side in _sides(tile))]
-        return output, tape
-
-    renderer = MIXED_GAUSSIANS.renderer._replace(render=watched)
-    stage = model_stage(backend, setting, MIXED_GAUSSIANS._replace(extend=of_all_kinds, renderer=renderer), rng)
-
-    def function(*args: Floats) -> Point:
-        point = stage.function(*args)
-        return Point(point.outputs, (*point.sides, *sides))
-
-    return (stage._replace(function=function),)
+    return (watching_stage(backend, setting, MIXED_GAUSSIANS._replace(extend=of_all_kinds), _sides, rng),)
 
 
 def of_all_kinds(gaussians: Gaussians, rng: np.random.Generator) -> MixedGaussians:
@@ -50,7 +30,7 @@ def of_all_kinds(gaussians: Gaussians, rng: np.random.Generator) -> MixedGaussia
     return population._replace(vertices=vertices.reshape(n, 4).astype(gaussians.means.dtype), n_vertices=kinds)
 
 
-def _sides(tile: TileHits) -> tuple[Bools | Ints, ...]:
+def _sides(tile: TileHits, colors: Floats) -> tuple[Bools | Ints, ...]:
     """Which hits count and are clamped; on which edge, or, numbered behind them, at which vertex the nearest point is.
 
     Squares of distances have no second derivative where the nearest point goes from an edge to a vertex.
