@@ -1,9 +1,9 @@
 """The population of ellipses, lines and triangles, and how it begins: near points of like colour become one.
 
 MP-GS clusters points hierarchically into groups of one, two or three, and makes each an ellipse, a line or a triangle.
-Here two points may join if one is among the three nearest neighbours of the other and their colours differ by less than
-5 in CIE Lab; pairs join in the order of their distance, as long as a group has at most three points and each two of
-them are alike. A group's frame has its plane in the first two axes.
+Here two points may join if one is among the three nearest neighbours of the other, no further than twice as far as the
+nearest of either, and their colours differ by less than 5 in CIE Lab; pairs join in the order of their distance, as
+long as a group has at most three points and each two of them are alike. A group's frame has its plane in the first two axes.
 """
 
 from typing import NamedTuple
@@ -18,6 +18,7 @@ from minisplat_ref.types import Floats, Gaussians, Ints
 
 COLOR_DISTANCE = 5.0  # in Lab, the paper's
 N_NEIGHBOURS = 3
+REACH = 2.0  # of a pair, in distances of the nearest neighbours
 SHRINK = 0.5  # of a group's deviations: its hull spans what lay between its points
 SRGB_FROM_XYZ = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
 LAB_KNEE = 6 / 29
@@ -112,9 +113,11 @@ def _pairs(points: Floats, lab: Floats) -> list[list[int]]:
     distances, neighbours = cKDTree(points).query(points, k)
     first, second = np.repeat(np.arange(n), k), neighbours.ravel()
     low, high = np.minimum(first, second), np.maximum(first, second)
-    is_alike = (low < high) & (np.linalg.norm(lab[low] - lab[high], axis=1) < COLOR_DISTANCE)
-    order = np.lexsort((high, low, distances.ravel()))
-    order = order[is_alike[order]]
+    apart, nearest = distances.ravel(), distances[:, 1]
+    is_near = (low < high) & (apart <= REACH * np.minimum(nearest[low], nearest[high]))
+    is_alike = np.linalg.norm(lab[low] - lab[high], axis=1) < COLOR_DISTANCE
+    order = np.lexsort((high, low, apart))
+    order = order[(is_near & is_alike)[order]]
     found: list[list[int]] = np.stack([low, high], axis=1)[order].tolist()
     return found
 
