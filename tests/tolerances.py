@@ -164,3 +164,9 @@ DISPLACEMENT_PX = 0.15
 # The integral of a fan's profile by a sum over a grid of spacing 0.01, relative: its rim, a jump of up to one half, is
 # off by half a spacing of a reach of 2.
 PROFILE_GRID = 5e-3
+
+# A Gaussian rim summed at steps of a twentieth of a pixel, of some pixels' width: smooth, but for the hull's corners.
+HULL_COVERAGE = 1e-4
+
+# alpha on a tangent, relative: roundings of 1e-16 times distances of some ten pixels, times -2 ln(alpha / o) of 11.
+TANGENT_LEVEL = 1e-12
