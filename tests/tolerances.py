@@ -160,3 +160,9 @@ TEXTURE_THIN_FLOAT32 = 1e-3
 
 # Displacements of half a pixel that are read off slopes, pixels: linear in them, and photographs are bytes.
 DISPLACEMENT_PX = 0.15
+
+# A Gaussian rim summed at steps of a twentieth of a pixel, of some pixels' width: smooth, but for the hull's corners.
+HULL_COVERAGE = 1e-4
+
+# alpha on a tangent, relative: roundings of 1e-16 times distances of some ten pixels, times -2 ln(alpha / o) of 11.
+TANGENT_LEVEL = 1e-12
