@@ -8,13 +8,14 @@ Gaussian where its density on the ray is greatest, and takes its value there:
 
 Each ray blends its own hits in the order of t, with the weights of 3DGS. So an ellipsoid is no approximation at any
 angle, no Gaussian pops in front of another when the camera turns, and rays may start anywhere: shadows, mirrors, glass
-and triangles need no new formula (:mod:`.lights`). What a ray does not come near is left out by a tree (:mod:`.bvh`).
+and triangles need no new formula (:mod:`.lights`). What a ray does not come near is left out by a tree of boxes
+(``shared_bvh``).
 
 Where this deviates from the paper: a Gaussian ends where alpha falls below ``alpha_min`` = 1/255, as in 3DGS, and not
 at the ellipsoid of 99 %, which for an opaque one is nearly the same; a ray has any number of hits, where the released
 code stops at 512; the loss has L1, as that of 3DGS, and not L2, so that trainings differ by the renderer alone; colours
 are those towards the camera's centre, and behind a mirror or glass towards the place where the eye seems to stand.
-Density control, which looks at gradients in the image, gets them from those in the world (:func:`.method.render_vjp`).
+Density control, which looks at gradients in the image, gets them from those in the world (``shared_ray_renderer``).
 Under any conventions a clamped alpha has no gradient, which INRIA's rasteriser lets through.
 
 What to know: there is no low-pass. Gaussians thinner than a pixel fall between rays, and pictures smaller than those
