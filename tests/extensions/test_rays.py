@@ -28,11 +28,14 @@ from minisplat_ref.constants import GSPLAT_MAIN, INRIA
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.rays import bvh, claims, kernels, reference
-from minisplat_ref.extensions.rays.geometry import pixel_rays, pixel_rays_vjp, whiten, whiten_vjp
+from minisplat_ref.extensions import shared_bvh as bvh
+from minisplat_ref.extensions.rays import claims, reference
+from minisplat_ref.extensions.rays.geometry import Whitened, whiten, whiten_vjp
 from minisplat_ref.extensions.rays.method import TRACED, tracer_for, whitened_model
 from minisplat_ref.extensions.rays.stages import stages
-from minisplat_ref.extensions.rays.types import Rays, Whitened
+from minisplat_ref.extensions.shared_ray_blending import summed
+from minisplat_ref.extensions.shared_ray_traversal import limits_of
+from minisplat_ref.extensions.shared_rays import Rays, pixel_rays, pixel_rays_vjp
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.types import Gaussians, Model, view_from
@@ -100,7 +103,7 @@ def test_the_gradient_of_pairs(rng):
     def vjp(v_unclamped, v_depths):
         parts = reference.evaluate_pairs_vjp(gaussians, rays, rays_ids, ids, v_unclamped, v_depths)
         rows = (ids, ids, ids, rays_ids, rays_ids)
-        return tuple(reference._summed(part, row, 3 + (row is rays_ids)) for part, row in zip(parts, rows, strict=True))
+        return tuple(summed(part, row, 3 + (row is rays_ids)) for part, row in zip(parts, rows, strict=True))
 
     check_jacobian(forward, vjp, inputs, names=["means", "maps", "opacities", "origins", "directions"])
 
@@ -228,8 +231,8 @@ def test_a_wrong_gradient_is_found(monkeypatch):
     correct = reference.evaluate_pairs_vjp
 
     def wrong(*args):
-        v_means, *others = correct(*args)
-        return 1.001 * v_means, *others
+        v = correct(*args)
+        return v._replace(means=1.001 * v.means)
 
     monkeypatch.setattr(reference, "evaluate_pairs_vjp", wrong)
     report = check_model_gradients(REFERENCE, GSPLAT_MAIN, TRACED, stages)
@@ -381,7 +384,7 @@ def test_the_speed_is_told_with_its_error(capsys):
 
 
 def test_limits_hold_every_hit_that_counts():
-    """If nothing stops a ray, there is room for all Gaussians."""
-    assert kernels.limits_of(GSPLAT_MAIN, 10).capacity == 12
-    assert kernels.limits_of(GSPLAT_MAIN, 10**6).capacity < 2500
-    assert kernels.limits_of(GSPLAT_MAIN._replace(transmittance_min=0.0), 10**6).capacity > 10**6
+    """With nothing to stop a ray there is room for all Gaussians."""
+    assert limits_of(GSPLAT_MAIN, 10).capacity == 12
+    assert limits_of(GSPLAT_MAIN, 10**6).capacity < 2500
+    assert limits_of(GSPLAT_MAIN._replace(transmittance_min=0.0), 10**6).capacity > 10**6

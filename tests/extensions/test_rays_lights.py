@@ -11,7 +11,6 @@ from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.rays import claims, demo, surroundings
-from minisplat_ref.extensions.rays.geometry import pixel_rays
 from minisplat_ref.extensions.rays.lights import shade, visibility
 from minisplat_ref.extensions.rays.method import TRACED, whitened_model
 from minisplat_ref.extensions.rays.reference import evaluate_pairs
@@ -26,8 +25,8 @@ from minisplat_ref.extensions.rays.surfaces import (
     refracted,
 )
 from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenated_surfaces, parallelogram, surfaces_of
-from minisplat_ref.extensions.rays.types import Rays
 from minisplat_ref.extensions.shared_mesh import Mesh, save_mesh
+from minisplat_ref.extensions.shared_rays import Rays, pixel_rays
 from minisplat_ref.io.ply import save_ply
 from minisplat_ref.rendering import Request
 from minisplat_ref.types import Model, view_from

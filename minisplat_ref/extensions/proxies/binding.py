@@ -14,7 +14,7 @@ which it keeps when the mesh has moved, with the corners p' and the frame E':
 
 F is the deformation gradient of the triangle, with stretch and shear. It is the same for all Gaussians of a triangle,
 so the code computes F and not L. The covariance is refactored by singular values, and colours rotate with F's rotation
-(:mod:`.deformation`).
+(``shared_deformation``).
 
 Two things are exact. When the mesh is translated, rotated and scaled, so are the Gaussians; and an affine map within
 the plane of a triangle acts exactly on them. Triangles whose corners have not moved leave their Gaussians as they are,
@@ -37,8 +37,8 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.proxies.deformation import Deformation, deformed
 from minisplat_ref.extensions.proxies.nearest import nearest_triangles
+from minisplat_ref.extensions.shared_deformation import Deformation, deformed
 from minisplat_ref.extensions.shared_mesh import Mesh, frames
 from minisplat_ref.types import Floats, Gaussians, Ints
 
