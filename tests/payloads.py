@@ -8,6 +8,11 @@ import numpy as np
 from minisplat_ref.extensions.cuts.curve import cut_vjp
 from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CutGaussians, with_cuts
 from minisplat_ref.extensions.cuts.stages import stages as cuts_stages
+from minisplat_ref.extensions.mixed.method import MIXED_GAUSSIANS
+from minisplat_ref.extensions.mixed.population import as_ellipses
+from minisplat_ref.extensions.mixed.projection import in_plane_vjp
+from minisplat_ref.extensions.mixed.stages import of_all_kinds
+from minisplat_ref.extensions.mixed.stages import stages as mixed_stages
 from minisplat_ref.extensions.textured.method import TEXTURED_GAUSSIANS
 from minisplat_ref.extensions.textured.population import with_textures
 from minisplat_ref.extensions.textured.reference import meet_vjp
@@ -56,6 +61,10 @@ def random_textures(rng, gaussians, degree=3):
     )
 
 
+def triangles_of_one_point(gaussians):
+    return as_ellipses(gaussians)._replace(n_vertices=np.full(len(gaussians.means), 3.0))
+
+
 CASES = {
     "cuts": Case(
         CUT_GAUSSIANS,
@@ -65,6 +74,15 @@ CASES = {
         cuts_stages,
         ("minisplat_ref.extensions.cuts.response.cut_vjp", cut_vjp),
         frozenset({"widths"}),
+    ),
+    "mixed": Case(
+        MIXED_GAUSSIANS,
+        lambda rng, gaussians: of_all_kinds(gaussians, rng),
+        as_ellipses,
+        triangles_of_one_point,
+        mixed_stages,
+        ("minisplat_ref.extensions.mixed.projection.in_plane_vjp", in_plane_vjp),
+        frozenset({"n_vertices"}),
     ),
     "textured": Case(
         TEXTURED_GAUSSIANS,

@@ -44,7 +44,7 @@ GREY = np.full((16, 24, 3), 100)
 
 
 def test_every_notebook_is_here():
-    assert [path.name[:2] for path in STORED] == [f"{number:02}" for number in range(18)]
+    assert [path.name[:2] for path in STORED] == [f"{number:02}" for number in range(20)]
     assert [path.stem for path in STORED] == sorted(path.stem for path in FOLDER.glob("[0-9]*.py"))
 
 

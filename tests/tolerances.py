@@ -160,3 +160,17 @@ TEXTURE_THIN_FLOAT32 = 1e-3
 
 # Displacements of half a pixel that are read off slopes, pixels: linear in them, and photographs are bytes.
 DISPLACEMENT_PX = 0.15
+
+# A Gaussian rim summed at steps of a twentieth of a pixel, of some pixels' width: smooth, but for the hull's corners.
+HULL_COVERAGE = 1e-4
+
+# alpha on a tangent, relative: roundings of 1e-16 times distances of some ten pixels, times -2 ln(alpha / o) of 11.
+TANGENT_LEVEL = 1e-12
+
+# Where a ray meets a polygon, by its plane and by a triangle: rounded by 1e-16 over the cosine of the angle to the
+# normal, the least of which is 1e-3 among some thousand hits, and over the width, a twentieth of the distance.
+PLANE_DEPTH = 1e-10
+
+# The integral of a fan's profile by a sum over a grid of spacing 0.01, relative: its rim, a jump of up to one half, is
+# off by half a spacing of a reach of 2.
+PROFILE_GRID = 5e-3

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import REFERENCE, Backend
+from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.compositing import hits as kernel_hits
 from minisplat_ref.cpu.compositing.responses import KernelResponse
@@ -81,6 +81,12 @@ def stored_logits(gaussians: Any) -> Floats:
     return logits
 
 
+def projection_alone(footprints: Any) -> Projection:
+    """Return the projection of footprints that reach no further than their ellipses."""
+    projection: Projection = footprints.projection
+    return projection
+
+
 def channels_alone(projected: Projected, channels: Floats) -> Floats:
     """Return the channels [N, D]: a colour is the same all over a footprint."""
     return channels
@@ -105,7 +111,7 @@ class Payload(NamedTuple):
     is_plain: Callable[[Any], bool]
     """Whether a population carries nothing: then 3DGS draws it."""
     footprints: Callable[[Projected], Any]
-    """Return what the responses take. Its field ``projection`` is what is listed and coloured."""
+    """Return what the responses take. Its field ``projection`` says what is seen: the ellipses', or more or less."""
     footprints_vjp: Callable[[Projected, tuple[Floats, ...]], PayloadGradient]
     """Return the gradient of ``footprints`` for that of the response's fields after the conic's."""
     opacity_logits: Callable[[Any], Floats] = stored_logits
@@ -114,8 +120,8 @@ class Payload(NamedTuple):
     """Return what the response's ``shade`` takes, made of channels [N, D]: the colours, and a depth if asked for."""
     coefficients_vjp: Callable[[Projected, Floats, int], tuple[Floats, Mapping[str, Floats]]] = channels_alone_vjp
     """Return its gradient with respect to the D channels, and with respect to fields of the population."""
-    is_wider: bool = False
-    """Whether footprints reach beyond their ellipses. Then tiles are listed by boxes alone."""
+    listed: Callable[[Any], Projection] = projection_alone
+    """Return, of the footprints, by what tiles are listed: ellipses that hold all that is drawn, in their boxes."""
 
 
 class PayloadTape(NamedTuple):
@@ -157,13 +163,13 @@ def _render(payload: Payload, model: Model, view: View, request: Request) -> tup
     projection = backend.project(*primitives, camera, conventions)
     projected = Projected(g, primitives, camera, conventions, backend, projection)
     footprints = payload.footprints(projected)
-    listed: Projection = footprints.projection
+    listed = payload.listed(footprints)
     channels = backend.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, sh_degree, listed.radii)  # [N, 3]
     if "depth" in request.wants:
         channels = np.column_stack([channels, listed.depths])
         background = np.append(background, background.dtype.type(0))
     grid = TileGrid(camera.width, camera.height, backend.tile_width, backend.tile_height)
-    bins = (REFERENCE if payload.is_wider else backend).bin_gaussians(listed, grid, conventions)
+    bins = backend.bin_gaussians(listed, grid, conventions)
     blended = footprints, payload.coefficients(projected, channels), background, bins
     if backend.is_compiled:
         output = kernel_hits.composite_hits(payload.response_for(dtype), *blended, conventions)
@@ -186,7 +192,8 @@ def _render_vjp(tape: PayloadTape | RenderTape, v_image: Floats, v_alpha: Floats
     if isinstance(tape, RenderTape):
         return SPLATTING.render_vjp(tape, v_image, v_alpha)
     payload, projected = tape.payload, tape.projected
-    g, primitives, camera, conventions, backend, projection = projected
+    g, primitives, camera, conventions, backend, _ = projected
+    projection: Projection = tape.blended[0].projection
     v_alpha = np.zeros_like(tape.output.alpha) if v_alpha is None else v_alpha
     arguments = *tape.blended, conventions, tape.output, (v_image, v_alpha)
     if backend.is_compiled:
@@ -199,8 +206,8 @@ def _render_vjp(tape: PayloadTape | RenderTape, v_image: Floats, v_alpha: Floats
     v_depths = np.ascontiguousarray(v_channels[:, 3]) if v_image.shape[2] > 3 else np.zeros_like(projection.depths)
     v_projection = ProjectionGradient(v_means2d, v_depths, v_conics, v_opacities)
     v_flat = backend.project_vjp(*primitives, camera, conventions, projection, v_projection)
-    v_rgb, radii = np.ascontiguousarray(v_channels[:, :3]), tape.blended[0].projection.radii
-    v_sh = backend.sh_colors_vjp(g.means, g.sh_dc, g.sh_rest, camera, tape.sh_degree, radii, v_rgb)
+    v_rgb = np.ascontiguousarray(v_channels[:, :3])
+    v_sh = backend.sh_colors_vjp(g.means, g.sh_dc, g.sh_rest, camera, tape.sh_degree, projection.radii, v_rgb)
     v_more = payload.footprints_vjp(projected, tuple(v_carried))
     with np.errstate(over="ignore"):
         transparencies = 1 / (1 + np.exp(payload.opacity_logits(g)))

@@ -1,7 +1,8 @@
 """The PLY container: a header that names elements and their properties, then the rows; its vertices as columns.
 
 Reading supports ASCII, little- and big-endian, any scalar type, elements and properties in any order. Other elements
-and list properties are skipped; :mod:`.ply_faces` reads faces. Writing supports little-endian vertices and triangles.
+and list properties are skipped; :mod:`.ply_faces` reads faces. Writing supports little-endian vertices, and faces of
+equally many corners.
 """
 
 from collections.abc import Mapping, Sequence
@@ -137,18 +138,18 @@ def read_vertices(path: str | Path) -> dict[str, NDArray]:
     return {name: rows[name].astype(rows[name].dtype.newbyteorder("=")) for name in rows.dtype.names or ()}
 
 
-def write_vertices(path: str | Path, columns: Mapping[str, NDArray], triangles: NDArray | None = None) -> None:
+def write_vertices(path: str | Path, columns: Mapping[str, NDArray], faces: NDArray | None = None) -> None:
     """Write columns of equal length P as the vertices of a little-endian PLY, complete or not at all.
 
-    Each property has the scalar type of its column: uint8, int32, float32 and so on. Triangles [T, 3], rows of
-    vertices, become its faces.
+    Each property has the scalar type of its column: uint8, int32, float32 and so on. Faces [F, c], rows of vertices,
+    have the same number of corners each, at most 255.
     """
     type_names = {code: name for name, code in reversed(SCALAR_TYPES.items()) if not name[-1].isdigit()}
     dtype = np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
     n = len(next(iter(columns.values())))
     properties = "".join(f"property {type_names[c.dtype.str[1:]]} {name}\n" for name, c in columns.items())
-    if triangles is not None:
-        properties += f"element face {len(triangles)}\nproperty list uchar int {CORNERS[0]}\n"
+    if faces is not None:
+        properties += f"element face {len(faces)}\nproperty list uchar int {CORNERS[0]}\n"
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {n}\n{properties}end_header\n"
     with replacing(path) as temporary, open(temporary, "wb") as file:
         file.write(header.encode("ascii"))
@@ -158,10 +159,10 @@ def write_vertices(path: str | Path, columns: Mapping[str, NDArray], triangles: 
             for name, column in columns.items():
                 rows[name] = column[part]
             file.write(rows.data)
-        if triangles is not None:
-            faces = np.empty(len(triangles), [("n", "u1"), ("corners", "<i4", 3)])
-            faces["n"], faces["corners"] = 3, triangles
-            file.write(faces.tobytes())
+        if faces is not None:
+            lists = np.empty(len(faces), [("n", "u1"), ("corners", "<i4", faces.shape[1])])
+            lists["n"], lists["corners"] = faces.shape[1], faces
+            file.write(lists.tobytes())
 
 
 def open_ply(path: Path) -> BinaryIO:

@@ -17,10 +17,10 @@ from minisplat_ref.extensions.extension import load_extension
 from minisplat_ref.extensions.proxies.affine import Affine, about_point, edited, in_ball, in_box, rotation_about
 from minisplat_ref.extensions.proxies.binding import UNBOUND, bind, rebuild
 from minisplat_ref.extensions.proxies.cage import convex_hull, grid, sheet_through
-from minisplat_ref.extensions.proxies.deformation import polar_rotations, quaternions
 from minisplat_ref.extensions.proxies.nearest import nearest_triangles, triangle_distances
-from minisplat_ref.extensions.proxies.sh_rotation import sh_rotations
+from minisplat_ref.extensions.shared_deformation import polar_rotations, quaternions
 from minisplat_ref.extensions.shared_mesh import Mesh, check_mesh, frames, load_mesh, save_mesh
+from minisplat_ref.extensions.shared_sh_rotation import sh_rotations
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.reference.covariance import covariances, rotation_matrices
 from minisplat_ref.reference.spherical_harmonics import sh_basis

@@ -28,11 +28,14 @@ from minisplat_ref.constants import GSPLAT_MAIN, INRIA
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.rays import bvh, claims, kernels, reference
-from minisplat_ref.extensions.rays.geometry import pixel_rays, pixel_rays_vjp, whiten, whiten_vjp
+from minisplat_ref.extensions import shared_bvh as bvh
+from minisplat_ref.extensions.rays import claims, reference
+from minisplat_ref.extensions.rays.geometry import Whitened, whiten, whiten_vjp
 from minisplat_ref.extensions.rays.method import TRACED, tracer_for, whitened_model
 from minisplat_ref.extensions.rays.stages import stages
-from minisplat_ref.extensions.rays.types import Rays, Whitened
+from minisplat_ref.extensions.shared_ray_blending import summed
+from minisplat_ref.extensions.shared_ray_traversal import limits_of
+from minisplat_ref.extensions.shared_rays import Rays, pixel_rays, pixel_rays_vjp
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.types import Gaussians, Model, view_from
@@ -94,13 +97,13 @@ def test_the_gradient_of_pairs(rng):
 
     def forward(means, maps, opacities, origins, directions):
         moved = rays._replace(origins=origins, directions=directions)
-        pairs = reference.evaluate_pairs(Whitened(means, maps, opacities), moved, rays_ids, ids)
+        pairs = reference.meet(Whitened(means, maps, opacities), moved, rays_ids, ids)
         return pairs.unclamped, pairs.depths
 
     def vjp(v_unclamped, v_depths):
-        parts = reference.evaluate_pairs_vjp(gaussians, rays, rays_ids, ids, v_unclamped, v_depths)
+        parts = reference.meet_vjp(gaussians, rays, rays_ids, ids, v_unclamped, v_depths)
         rows = (ids, ids, ids, rays_ids, rays_ids)
-        return tuple(reference._summed(part, row, 3 + (row is rays_ids)) for part, row in zip(parts, rows, strict=True))
+        return tuple(summed(part, row, 3 + (row is rays_ids)) for part, row in zip(parts, rows, strict=True))
 
     check_jacobian(forward, vjp, inputs, names=["means", "maps", "opacities", "origins", "directions"])
 
@@ -225,13 +228,13 @@ def test_the_gradient_of_the_whole_model(backend):
 
 
 def test_a_wrong_gradient_is_found(monkeypatch):
-    correct = reference.evaluate_pairs_vjp
+    correct = reference.meet_vjp
 
     def wrong(*args):
-        v_means, *others = correct(*args)
-        return 1.001 * v_means, *others
+        v = correct(*args)
+        return v._replace(means=1.001 * v.means)
 
-    monkeypatch.setattr(reference, "evaluate_pairs_vjp", wrong)
+    monkeypatch.setattr(reference, "meet_vjp", wrong)
     report = check_model_gradients(REFERENCE, GSPLAT_MAIN, TRACED, stages)
     assert report.n_failed == 2 and "is wrong" in report.cases[0].note
 
@@ -382,6 +385,6 @@ def test_the_speed_is_told_with_its_error(capsys):
 
 def test_limits_hold_every_hit_that_counts():
     """If nothing stops a ray, there is room for all Gaussians."""
-    assert kernels.limits_of(GSPLAT_MAIN, 10).capacity == 12
-    assert kernels.limits_of(GSPLAT_MAIN, 10**6).capacity < 2500
-    assert kernels.limits_of(GSPLAT_MAIN._replace(transmittance_min=0.0), 10**6).capacity > 10**6
+    assert limits_of(GSPLAT_MAIN, 10).capacity == 12
+    assert limits_of(GSPLAT_MAIN, 10**6).capacity < 2500
+    assert limits_of(GSPLAT_MAIN._replace(transmittance_min=0.0), 10**6).capacity > 10**6

@@ -1,10 +1,10 @@
 """Editing and physics: Gaussians that follow a mesh, fall like cloth, or are edited in part.
 
-There are three ways to change a trained scene without training it again.
+Three ways of changing a trained scene without training it again.
 
-- *Affine edits* (:mod:`.affine`) apply x -> A x + b to what a box, a ball or a mesh selects. They are exact:
+- *Affine edits* (:mod:`.affine`) apply x -> A x + b to what a box, a ball or a mesh selects. Exact:
   mu' = A mu + b, Sigma' = A Sigma A^T, refactored into quaternion and scales by singular values
-  (:mod:`.deformation`); colours rotate with the rotation in A (:mod:`.sh_rotation`).
+  (``shared_deformation``); colours turn with the rotation in A (``shared_sh_rotation``).
 - *Binding to a mesh* (:mod:`.binding`), after GaMeS (arXiv 2402.01459): each Gaussian belongs to the nearest triangle
   (:mod:`.nearest`), by barycentric coordinates, an offset along the normal, and its axes in the frame of the triangle
   (``shared_mesh``). When the mesh is deformed, Sigma' = F Sigma F^T with the triangle's deformation gradient F.

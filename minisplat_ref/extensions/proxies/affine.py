@@ -4,7 +4,7 @@ A Gaussian under an affine map is a Gaussian, so nothing is approximated in its 
 
     mu' = A mu + b,   Sigma' = A Sigma A^T
 
-(:mod:`.deformation` says how the covariance becomes a quaternion and scales again, and how colours rotate). A Gaussian
+(``shared_deformation`` says how the covariance becomes a quaternion and scales again, and how colours turn). A Gaussian
 belongs to a selection if its centre does; one that straddles the border is not cut.
 """
 
@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.proxies.deformation import Deformation, deformed
+from minisplat_ref.extensions.shared_deformation import Deformation, deformed
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.types import Bools, Floats, Gaussians
 

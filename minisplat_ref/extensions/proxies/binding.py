@@ -2,7 +2,8 @@
 
 After GaMeS (Waczynska et al. 2024, arXiv 2402.01459), which puts Gaussians onto the faces of a mesh by barycentric
 coordinates and derives rotation and scales from the corners, so that whatever moves the mesh moves the scene. Each
-Gaussian is bound to the nearest triangle. In the frame E of that triangle (``shared_mesh``) it has place and axes
+Gaussian is bound to the nearest triangle. In the frame E of that triangle (``shared_mesh``) it has the position and
+axes
 
     (b1, b2, w) = E^-1 (mu - p0)      barycentric coordinates (1 - b1 - b2, b1, b2), signed offset w along the normal
     L = E^-1 R diag(s)                its rotation and scales
@@ -13,21 +14,21 @@ which it keeps when the mesh has moved, with the corners p' and the frame E':
     Sigma' = E' L (E' L)^T = F Sigma F^T,   F = E' E^-1
 
 F is the deformation gradient of the triangle, with stretch and shear. It is the same for all Gaussians of a triangle,
-so the code computes F and not L. The covariance is refactored by singular values, and colours rotate with F's rotation
-(:mod:`.deformation`).
+so the code computes F and not L. The covariance is refactored by singular values, and colours turn with F's rotation
+(``shared_deformation``).
 
-Two things are exact. When the mesh is translated, rotated and scaled, so are the Gaussians; and an affine map within
-the plane of a triangle acts exactly on them. Triangles whose corners have not moved leave their Gaussians as they are,
-to the byte. The rest is approximate: a bent surface becomes flat pieces, and a Gaussian that crosses a side of its
-triangle follows only the one that it is bound to. Corners say nothing of a stretch across their plane; in that
-direction a Gaussian grows as h does, with the square root of the area. Beyond the border of the mesh and far from its
-surface the map of the nearest triangle is extrapolated, which magnifies its rotation; ``reach`` leaves Gaussians alone
-that are farther away. Inside a hull around a solid object, Gaussians on either side of the middle belong to opposite
-faces, and are torn apart when these rotate differently; a sheet, or a mesh close to the surface, serves better.
+Exact: when the mesh is moved, turned and scaled, so are the Gaussians; and so is every affine map within the plane of a
+triangle. Triangles whose corners have not moved leave their Gaussians as they are, to the byte. Approximate: a bent
+surface becomes flat pieces, and a Gaussian that crosses a side of its triangle follows only the one that it is bound
+to. Corners say nothing of a stretch across their plane; there a Gaussian grows as h does, with the root of the area.
+Beyond the border of the mesh and far from its surface the map of the nearest triangle is continued, which magnifies
+its turn; ``reach`` leaves Gaussians alone that are farther away. Of a hull around a solid thing, what lies on either
+side of the middle belongs to opposite faces, and tears apart when these turn differently; a sheet, or a mesh close to
+the surface, serves better.
 
-This deviates from GaMeS in two ways. Gaussians are not trained on the faces but bound as they are, so they may lie off
-the surface and have any shape. And in GaMeS the scales of a flat Gaussian are two lengths of a Gram-Schmidt frame of
-the triangle, which ignores shear.
+Where this deviates from GaMeS: Gaussians are not trained on the faces but bound as they are, so they may be off the
+surface and of any shape; there, the scales of a flat Gaussian are two lengths of a Gram-Schmidt frame of the triangle,
+which takes no notice of shear.
 """
 
 from collections.abc import Callable, Iterable
@@ -37,8 +38,8 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.proxies.deformation import Deformation, deformed
 from minisplat_ref.extensions.proxies.nearest import nearest_triangles
+from minisplat_ref.extensions.shared_deformation import Deformation, deformed
 from minisplat_ref.extensions.shared_mesh import Mesh, frames
 from minisplat_ref.types import Floats, Gaussians, Ints
 

@@ -16,9 +16,9 @@ from minisplat_ref.extensions.proxies.affine import (
     in_box,
     rotation_about,
 )
-from minisplat_ref.extensions.proxies.model_file import load_model
 from minisplat_ref.extensions.proxies.nearest import nearest_triangles
 from minisplat_ref.extensions.shared_mesh import load_mesh
+from minisplat_ref.extensions.shared_model_file import load_model
 from minisplat_ref.io.ply import save_ply
 from minisplat_ref.types import Bools, Floats
 

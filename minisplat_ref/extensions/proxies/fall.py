@@ -20,9 +20,9 @@ from minisplat_ref.extensions.proxies.mass_spring import (
     integrated,
     longest_step,
 )
-from minisplat_ref.extensions.proxies.model_file import load_model
 from minisplat_ref.extensions.proxies.springs import springs_of, stiffness_for_stretch, vertex_masses
 from minisplat_ref.extensions.shared_mesh import Mesh, check_mesh, load_mesh, save_mesh
+from minisplat_ref.extensions.shared_model_file import load_model
 from minisplat_ref.io import orbits, viewpoints
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.images import write_image

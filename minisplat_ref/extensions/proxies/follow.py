@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from minisplat_ref.extensions.proxies.binding import bind, check_bound, rebuild
-from minisplat_ref.extensions.proxies.model_file import load_model
 from minisplat_ref.extensions.shared_mesh import check_same_faces, load_mesh
+from minisplat_ref.extensions.shared_model_file import load_model
 from minisplat_ref.io.ply import save_ply
 
 DESCRIPTION = """\

@@ -6,26 +6,26 @@ of the pixel's ray ``O + t d`` where its density is greatest:
     p = M (mu - O),  v = M d,  M = diag(1/s) R^T
     t = (v . p) / (v . v),   alpha = min(alpha_max, o exp(-|p - t v|^2 / 2))
 
-Each ray blends its own hits in the order of t, with the weights of 3DGS. So ellipsoids are exact at any angle, no
-Gaussian pops in front of another when the camera turns, and rays may start anywhere: shadows, mirrors, glass and
-triangles need no new formula (:mod:`.lights`). A bounding volume hierarchy skips what a ray does not come near
-(:mod:`.bvh`).
+Each ray blends its own hits in the order of t, with the weights of 3DGS. So an ellipsoid is no approximation at any
+angle, no Gaussian pops in front of another when the camera turns, and rays may start anywhere: shadows, mirrors, glass
+and triangles need no new formula (:mod:`.lights`). What a ray does not come near is left out by a tree of boxes
+(``shared_bvh``).
 
-This deviates from the paper as follows. A Gaussian ends where alpha falls below ``alpha_min`` = 1/255, as in 3DGS, and
-not at the ellipsoid of 99 %, which is nearly the same for an opaque one. A ray has any number of hits, where the
-released code stops at 512. The loss uses L1, as that of 3DGS, and not L2, so that trainings differ by the renderer
-alone. Colours are those towards the camera's centre, and behind a mirror or glass towards the apparent position of the
-eye. Density control, which needs gradients in the image, gets them from those in the world
-(:func:`.method.render_vjp`). Under all conventions a clamped alpha has no gradient, though INRIA's rasteriser has one.
+Where this deviates from the paper: a Gaussian ends where alpha falls below ``alpha_min`` = 1/255, as in 3DGS, and not
+at the ellipsoid of 99 %, which for an opaque one is nearly the same; a ray has any number of hits, where the released
+code stops at 512; the loss has L1, as that of 3DGS, and not L2, so that trainings differ by the renderer alone; colours
+are those towards the camera's centre, and behind a mirror or glass towards the place where the eye seems to stand.
+Density control, which looks at gradients in the image, gets them from those in the world (``shared_ray_renderer``).
+Under any conventions a clamped alpha has no gradient, which INRIA's rasteriser lets through.
 
-There is no low-pass: Gaussians thinner than a pixel fall between rays, and pictures smaller than those of the training
-alias. Shadows, mirrors and glass have no gradient.
+What to know: there is no low-pass. Gaussians thinner than a pixel fall between rays, and pictures smaller than those
+trained on alias. Shadows, mirrors and glass have no gradient.
 
-Measured (``study rays/claims``, ``rays/speed``): with the tree the picture is that of all pairs to 3e-15, and tracing
-agrees with an exact order in every pixel to 2e-12; the edge of a shadow lies within a millionth of a pixel of the
-tangent cone. For a round Gaussian whose standard deviation is a twentieth of its distance, alpha differs from the
-splatted one by 1 % on the axis and by 10 % at 40 degrees from it. With 10,000 Gaussians a ray takes 19 times as long as
-a pixel of the tuned rasteriser, and 8 times as long as one of its plain kernels.
+Measured (``study rays/claims``, ``rays/speed``): the tree gives the picture of all pairs to 3e-15, tracing that of an
+exact order of every pixel to 2e-12; the edge of a shadow lies within a millionth of a pixel of the tangent cone. Alpha
+of a round Gaussian of a twentieth of its distance differs from the splatted one by 1 % on the axis and by 10 % at 40
+degrees from it. At 10,000 Gaussians a ray takes 19 times as long as a pixel of the tuned rasteriser, and 8 times as
+long as one of its plain kernels.
 
     minisplat-ref train SCENE --recipe rays
     minisplat-ref rays render runs/fox --scene lamp_and_mirror.json --out DIR

@@ -10,12 +10,13 @@ from matplotlib.figure import Figure
 
 from minisplat_ref.backends import CPU, PLAIN, REFERENCE
 from minisplat_ref.constants import EXACT_ORDER, GSPLAT_MAIN
-from minisplat_ref.extensions.rays import demo, kernels, reference
-from minisplat_ref.extensions.rays.geometry import pixel_rays
+from minisplat_ref.extensions.rays import demo
+from minisplat_ref.extensions.rays.kernels import scene_of
 from minisplat_ref.extensions.rays.lights import shade, visibility
-from minisplat_ref.extensions.rays.method import TRACED, whitened_model
+from minisplat_ref.extensions.rays.method import TRACED, tracer_for, whitened_model
 from minisplat_ref.extensions.rays.surfaces import MIRROR
 from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenated_surfaces, parallelogram, surfaces_of
+from minisplat_ref.extensions.shared_rays import pixel_rays
 from minisplat_ref.extensions.shared_studies import tidy
 from minisplat_ref.reference.compositing import composite_hits
 from minisplat_ref.reference.hits import Hit, Response
@@ -193,10 +194,12 @@ def speed(n: int, repeats: int) -> dict[str, float]:
         backward = seconds_of(partial(renderer.render_vjp, tape, np.ones_like(output.image), None), repeats)
         result |= {f"{name} forward us": forward / n_pixels * 1e6, f"{name} backward us": backward / n_pixels * 1e6}
     whitened = whitened_model(Model(gaussians))
-    result["tree ms"] = 1e3 * seconds_of(partial(kernels.scene_of, whitened, GSPLAT_MAIN), repeats)
+    result["tree ms"] = 1e3 * seconds_of(partial(scene_of, whitened, GSPLAT_MAIN), repeats)
     result["hits per ray"] = output.n_pairs / n_pixels
     few = pixel_rays(demo.camera_of(40, 22), GSPLAT_MAIN)
     colors = np.clip(0.5 + gaussians.sh_dc.astype(np.float64), 0, 1)
-    exact = reference.blend_rays(whitened_model(Model(wide)), colors, few, BLACK, GSPLAT_MAIN).image
-    traced = kernels.blend_rays(kernels.scene_of(whitened, GSPLAT_MAIN), colors, few, BLACK, GSPLAT_MAIN).image
+    exact, traced = (
+        tracer_for(some, GSPLAT_MAIN, backend).blend(colors, few, BLACK, GSPLAT_MAIN).image
+        for some, backend in ((whitened_model(Model(wide)), REFERENCE), (whitened, CPU))
+    )
     return {**result, "error of float32": float(np.abs(traced.astype(np.float32) - exact).max())}

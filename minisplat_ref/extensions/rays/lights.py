@@ -20,7 +20,6 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.extensions.rays.method import Tracer
 from minisplat_ref.extensions.rays.surfaces import (
     AWAY,
     DIFFUSE,
@@ -32,7 +31,7 @@ from minisplat_ref.extensions.rays.surfaces import (
     refracted,
 )
 from minisplat_ref.extensions.rays.surroundings import Surroundings
-from minisplat_ref.extensions.rays.types import Hits, Rays
+from minisplat_ref.extensions.shared_rays import Hits, Rays, Tracer
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.types import Floats, Gaussians, Ints
 

@@ -1,158 +1,47 @@
 """The renderer that traces a ray per pixel, and the recipe that trains with it."""
 
-import math
-from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
-from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.rays import kernels, reference
-from minisplat_ref.extensions.rays.geometry import block_order, pixel_rays, pixel_rays_vjp, whiten, whiten_vjp
-from minisplat_ref.extensions.rays.statistics import blend_stats
-from minisplat_ref.extensions.rays.types import BlendedRays, Rays, Whitened
+from minisplat_ref.extensions import shared_ray_blending, shared_ray_kernels
+from minisplat_ref.extensions.rays.geometry import Whitened, whiten, whiten_vjp
+from minisplat_ref.extensions.rays.kernels import RESPONSE, scene_of
+from minisplat_ref.extensions.rays.reference import meeting_of
+from minisplat_ref.extensions.shared_ray_renderer import Traced, renderer_of
+from minisplat_ref.extensions.shared_rays import Tracer
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
-from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, Request
 from minisplat_ref.training.representation import Representation
-from minisplat_ref.types import Camera, Floats, Ints, Model, RenderOutput, View
-
-WANTS = frozenset({"depth", "stats"})
-
-
-class Tracer(NamedTuple):
-    """The three functions of tracing for one population, by a backend."""
-
-    list_hits: Any
-    """``list_hits(rays, conventions)``."""
-    blend: Any
-    """``blend(colors, rays, background, conventions)``."""
-    blend_vjp: Any
-    """``blend_vjp(colors, rays, background, conventions, blended, v_blended)``."""
-
-
-def tracer_for(gaussians: Whitened, conventions: Conventions, backend: Backend) -> Tracer:
-    """Return the tracer of a backend: every ray against every Gaussian, or kernels with a tree, which is built here."""
-    module: Any = kernels if backend.is_compiled else reference
-    scene = kernels.scene_of(gaussians, conventions) if backend.is_compiled else gaussians
-    return Tracer(*(partial(f, scene) for f in (module.list_hits, module.blend_rays, module.blend_rays_vjp)))
-
-
-class _Tape(NamedTuple):
-    model: Model
-    camera: Camera
-    request: Request
-    sh_degree: int
-    background: Floats
-    gaussians: Whitened
-    tracer: Tracer
-    order: Ints  # [H W] pixels in the order of the rays
-    rays: Rays
-    colors: Floats  # [N, 3]
-    blended: BlendedRays
-
-
-def seen_radii(is_seen: Any) -> Ints:
-    """Return radii [N, 2] like those of a projection: 0 for Gaussians that the stage of colours should skip."""
-    return np.repeat(is_seen.astype(np.int32)[:, None], 2, axis=1)
+from minisplat_ref.types import Floats, Model
 
 
 def whitened_model(model: Model) -> Whitened:
     """Return the Gaussians of a model in the form that is traced."""
-    g = model.gaussians
     with np.errstate(over="ignore"):
-        opacities = 1 / (1 + np.exp(-g.opacity_logits.astype(np.float64)))
-    return whiten(g.means, g.quats, g.log_scales, opacities)
+        opacities = 1 / (1 + np.exp(-model.gaussians.opacity_logits.astype(np.float64)))
+    return _prepare(model.gaussians, opacities)
 
 
-def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, _Tape]:
-    """Trace a ray through the centre of each pixel.
-
-    Raises
-    ------
-    InputError
-        More is wanted than ``depth`` and ``stats``, or a degree of harmonics that is not stored.
-    """
-    g, camera, wants = model.gaussians, view.camera, request.wants
-    if wants - WANTS:
-        names = ", ".join(sorted(wants - WANTS))
-        raise InputError(f"rays does not give {names}: use a recipe that does not ask for it")
-    dtype, conventions, backend = g.means.dtype, request.conventions, request.backend
-    stored_degree = math.isqrt(g.sh_rest.shape[1] + 1) - 1
-    degree = stored_degree if request.sh_degree is None else min(request.sh_degree, stored_degree)
-    background = np.zeros(3) if request.background is None else np.asarray(request.background, np.float64)
-    gaussians = whitened_model(model)
-    if request.is_visible is not None:
-        gaussians = gaussians._replace(opacities=np.where(request.is_visible, gaussians.opacities, 0.0))
-    tracer, in_rows = tracer_for(gaussians, conventions, backend), pixel_rays(camera, conventions)
-    order = block_order(camera.width, camera.height)
-    rays = Rays(*(field[order] for field in in_rows))
-    colors = backend.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, degree, np.ones((len(g.means), 2), np.int32))
-    blended = tracer.blend(colors, rays, background, conventions)
-    size = camera.height, camera.width
-    channels = np.column_stack([blended.image, blended.depths]) if "depth" in wants else blended.image
-    image, alpha = np.empty_like(channels, dtype), np.empty(len(order), dtype)
-    image[order], alpha[order] = channels, 1 - blended.transmittances
-    stats = blend_stats(tracer.list_hits(in_rows, conventions), size, len(g.means)) if "stats" in wants else None
-    output = RenderOutput(
-        image.reshape(*size, -1),
-        alpha.reshape(size),
-        median_depth=None,
-        stats=stats,
-        visible_ids=np.flatnonzero(blended.is_seen),
-        n_pairs=int(blended.n_hits.sum()),
-    )
-    return output, _Tape(model, camera, request, degree, background, gaussians, tracer, order, rays, colors, blended)
+def tracer_for(gaussians: Whitened, conventions: Conventions, backend: Backend) -> Tracer:
+    """Return the tracer of a backend: every ray against every Gaussian, or kernels with a tree, which is built here."""
+    if backend.is_compiled:
+        return shared_ray_kernels.tracer_of(RESPONSE, scene_of(gaussians, conventions))
+    return shared_ray_blending.tracer_of(meeting_of(gaussians))
 
 
-def render_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None) -> RenderGradient:
-    """Gradient of :func:`render`.
-
-    Nothing is projected, so there is no gradient with respect to a projected centre. Density control gets the closest
-    substitute: a centre that moves parallel to the image by ``z / f`` moves by a pixel in it, so
-
-        v_means2d_k = z / f_k (R v_mu)_k
-    """
-    g, camera, blended = tape.model.gaussians, tape.camera, tape.blended
-    n_rays, dtype = len(tape.rays.near), g.means.dtype
-    v_pixels = v_image.reshape(n_rays, -1)[tape.order].astype(np.float64)
-    v_depths = v_pixels[:, 3] if v_pixels.shape[1] > 3 else np.zeros(n_rays)
-    v_T = np.zeros(n_rays) if v_alpha is None else -v_alpha.ravel()[tape.order].astype(np.float64)
-    v = tape.tracer.blend_vjp(
-        tape.colors, tape.rays, tape.background, tape.request.conventions, blended, (v_pixels[:, :3], v_depths, v_T)
-    )
-    v_quats, v_log_scales = whiten_vjp(g.quats, g.log_scales, tape.gaussians, v.maps)
-    v_directions = np.empty_like(v.directions)
-    v_directions[tape.order] = v.directions
-    v_R, v_t = pixel_rays_vjp(camera, tape.request.conventions, v.origins, v_directions)
-    o = tape.gaussians.opacities
-    v_sh = tape.request.backend.sh_colors_vjp(
-        g.means, g.sh_dc, g.sh_rest, camera, tape.sh_degree, seen_radii(blended.is_seen), v.colors.astype(dtype)
-    )
-    R, t = camera.cam_from_world_R, camera.cam_from_world_t
-    depths = np.where(blended.is_seen, g.means @ R[2] + t[2], 0.0)  # [N]
-    v_in_image = (v.means @ R.T)[:, :2] * depths[:, None] / [camera.fx, camera.fy]
-    of_fields = {
-        "means": v.means + v_sh.means,
-        "quats": v_quats,
-        "log_scales": v_log_scales,
-        "opacity_logits": o * (1 - o) * v.opacities,
-        "sh_dc": v_sh.sh_dc,
-        "sh_rest": v_sh.sh_rest,
-    }
-    further = {name: np.zeros_like(field) for name, field in g._asdict().items() if name not in of_fields}
-    of_fields = {name: field.astype(dtype) for name, field in of_fields.items()}
-    return RenderGradient(
-        gaussians=g._replace(**of_fields, **further),
-        background=v.background.astype(dtype),
-        cam_from_world_R=(v_R + v_sh.cam_from_world_R).astype(dtype),
-        cam_from_world_t=(v_t + v_sh.cam_from_world_t).astype(dtype),
-        means2d=v_in_image.astype(dtype),
-    )
+def _prepare(population: Any, opacities: Floats) -> Whitened:
+    return whiten(population.means, population.quats, population.log_scales, opacities)
 
 
-TRACED = Representation("gaussians traced by rays", renderer=Renderer("rays", render, render_vjp, SPLATTING.channels))
+def _shapes_vjp(population: Any, gaussians: Whitened, v_maps: Floats) -> tuple[Floats, Floats]:
+    return whiten_vjp(population.quats, population.log_scales, gaussians, v_maps)
+
+
+TRACED = Representation(
+    "gaussians traced by rays", renderer=renderer_of(Traced("rays", _prepare, tracer_for, _shapes_vjp))
+)
 
 RAYS = GS_ACCEL._replace(name="rays")
 """The recipe ``rays``: 3DGS with traced rays instead of footprints."""

@@ -10,9 +10,9 @@ from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.rays import surroundings
-from minisplat_ref.extensions.rays.geometry import pixel_rays
 from minisplat_ref.extensions.rays.lights import World, shade
 from minisplat_ref.extensions.rays.method import tracer_for, whitened_model
+from minisplat_ref.extensions.shared_rays import pixel_rays
 from minisplat_ref.io import orbits, viewpoints, write_image
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.names import file_names

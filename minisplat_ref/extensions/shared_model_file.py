@@ -1,4 +1,4 @@
-"""Reads the model that a command of this extension works on."""
+"""Reading the model that a command works on."""
 
 import warnings
 from pathlib import Path

@@ -1,0 +1,134 @@
+"""The work of the study ``fans/refit``: what a trained scene loses as a mesh, and what refitting gives back."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref.extensions.fans.mesh_files import write_mesh
+from minisplat_ref.extensions.fans.method import render
+from minisplat_ref.extensions.fans.shapes import Fans, FanShape, converted, mesh_of, visible_mesh
+from minisplat_ref.extensions.fans.tuning import best_shape, drawn, measured, tuned
+from minisplat_ref.extensions.shared_studies import psnr_of
+from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
+from minisplat_ref.rendering import Request
+from minisplat_ref.training.adam import zero_moments
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.schedule import scaled
+from minisplat_ref.training.state import TrainState
+from minisplat_ref.types import Gaussians, Model, Scene, View
+
+REACHES, RIMS = (2.0, 2.5, 3.0, 3.5), (0.0, 0.1, 0.2)
+SIDES = (3, 4, 6, 8, 12, 16)
+LAYERS = (4, 8, 16, 32, 64)
+MOST_VIEWS = 4  # training views that shapes are compared and fitted on
+FLAT, SOLID = "flat fans", "solid fans"
+FORMS = {FLAT: FanShape(), SOLID: FanShape(is_flat=False)}
+
+
+class Judge(NamedTuple):
+    """A scene, and the views on which shapes are compared."""
+
+    scene: Scene
+    views: list[View]
+
+
+def judge_of(scene: Scene) -> Judge:
+    """Return the scene with a few of its training views, spread evenly."""
+    n = len(scene.train_views)
+    rows = np.unique(np.linspace(0, n - 1, min(n, MOST_VIEWS)).round().astype(int))
+    return Judge(scene, [scene.train_views[row].loaded() for row in rows])
+
+
+def shape_rows(gaussians: Gaussians, judge: Judge, shape: FanShape) -> list[dict[str, Any]]:
+    """Return the PSNR of fans against splats of degree 0, over reach and rim, and at the best of these over sides."""
+    background = judge.scene.background
+    targets = [drawn(gaussians, view, background=background, sh_degree=0) for view in judge.views]
+
+    def row(shape: FanShape) -> dict[str, Any]:
+        fans = converted(gaussians, shape)
+        psnrs = [
+            psnr_of(drawn(fans, v, background=background), target)
+            for v, target in zip(judge.views, targets, strict=True)
+        ]
+        return {**shape._asdict(), "psnr": float(np.mean(psnrs))}
+
+    rows = [row(shape._replace(reach=reach, rim=rim)) for reach in REACHES for rim in RIMS]
+    best = max(rows, key=lambda row: row["psnr"])
+    at_best = shape._replace(reach=best["reach"], rim=best["rim"])
+    sides = [n for n in SIDES if n != shape.n_sides and (shape.is_flat or n % 4 == 0)]
+    return [*rows, *(row(at_best._replace(n_sides=n)) for n in sides)]
+
+
+def refit_rows(
+    gaussians: Gaussians, judge: Judge, iterations: int, seed: int, folder: Path, told: Callable[[str], None]
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Return a row for each form of a scene, and the populations by its name.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+    judge : Judge
+    iterations : int
+        Of the vertices' refit, and of the splats that are trained on beside it.
+    seed : int
+    folder : Path
+        Where meshes are written, to be counted in bytes.
+    told : callable
+        Called with the name of what comes next.
+    """
+    scene = judge.scene
+    without_view = gaussians._replace(sh_rest=gaussians.sh_rest[:, :0])
+    forms: dict[str, Any] = {"splats": gaussians, "splats, degree 0": without_view}
+    told("splats, trained on")
+    forms["splats, trained on"] = trained_on(gaussians, scene, iterations, seed)
+    forms["splats, degree 0, trained on"] = trained_on(without_view, scene, iterations, seed)
+    photographs = [view.image / 255 for view in judge.views]
+    shapes: dict[str, FanShape] = {}
+    for name, shape in FORMS.items():
+        told(name)
+        forms[name] = converted(gaussians, shape)
+        fitted = best_shape(gaussians, shape, judge.views, photographs, scene.background)
+        shapes[f"{name}, reach and rim"] = fitted
+        forms[f"{name}, reach and rim"] = converted(gaussians, fitted)
+        forms[f"{name}, vertices"] = tuned(forms[f"{name}, reach and rim"], scene, iterations, seed)
+    rows = []
+    for name, population in forms.items():
+        test, training = (measured(population, scene, views) for views in (scene.test_views, scene.train_views))
+        shape_found = shapes.get(name)
+        fit = {} if shape_found is None else {"reach": shape_found.reach, "rim": shape_found.rim}
+        size = {} if isinstance(population, Gaussians) else _size(population, folder / "mesh.ply")
+        rows.append({"form": name, "psnr": test.psnr, "ssim": test.ssim, "training_psnr": training.psnr, **fit, **size})
+    return rows, forms
+
+
+def trained_on(gaussians: Gaussians, scene: Scene, iterations: int, seed: int) -> Gaussians:
+    """Return Gaussians after further iterations of 3DGS that leave their number as it is."""
+    recipe = scaled(GS_ACCEL._replace(events=(), sh_milestones=(0, 0, 0)), iterations)
+    copy = Gaussians(*(field.copy() for field in gaussians))
+    state = TrainState(copy, zero_moments(copy), step=0, view_order=[], rng=np.random.default_rng(seed), stats={})
+    result: Gaussians = train(scene, recipe, seed=seed, state=state).gaussians
+    return result
+
+
+def layer_rows(fans: Fans, judge: Judge) -> list[dict[str, Any]]:
+    """Return the error of pictures of a few layers against that of all, and the number of layers of a pixel."""
+    request = Request(judge.scene.background.astype(np.float32))
+    whole = [render(Model(fans), view, request) for view in judge.views]
+    layers = np.concatenate([tape.peeled.n_layers.ravel() for _, tape in whole])
+    rows: list[dict[str, Any]] = [{"layers": "all", "mean": float(layers.mean()), "most": int(layers.max())}]
+    for n in LAYERS:
+        images = [render(Model(fans), view, request, most_layers=n)[0].image for view in judge.views]
+        squares = [np.mean((image - output.image) ** 2) for image, (output, _) in zip(images, whole, strict=True)]
+        rows.append({"layers": n, "rms_levels": 255 * float(np.sqrt(np.mean(squares)))})
+    return rows
+
+
+def _size(fans: Fans, path: Path) -> dict[str, int]:
+    """Return the triangles and vertices of a mesh, and its bytes as a PLY; the file does not stay."""
+    mesh = visible_mesh(mesh_of(fans), 1 / 255)
+    write_mesh(path, mesh)
+    n_bytes = path.stat().st_size
+    path.unlink()
+    return {"triangles": len(mesh.faces), "vertices": len(mesh.vertices), "bytes": n_bytes}

@@ -1,0 +1,67 @@
+"""The command ``minisplat-ref fans fine-tune``: fans whose vertices are optimised against photographs."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.fans.arguments import add_shape, load_as_fans, shape_of
+
+EPILOG = """\
+example:
+  minisplat-ref fans fine-tune photos/fox runs/fox fans.ply --downscale 4
+  minisplat-ref render fans.ply --extension fans --cameras runs/fox/cameras.json
+  minisplat-ref fans export fans.ply fox.glb"""
+
+
+def add_parser(commands: Any) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "fine-tune",
+        help="optimise positions, colours and opacities of a scene's vertices",
+        description="Make fans of a trained scene and train their vertices, by the loss of 3DGS.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("scene", metavar="SCENE", help="folder of photographs that the model was trained on")
+    parser.add_argument("model", type=Path, metavar="MODEL", help="PLY of Gaussians or of fans, or a run's folder")
+    parser.add_argument("out", type=Path, metavar="OUT", help="PLY of fans to write")
+    parser.add_argument("--downscale", type=int, default=1, metavar="D", help="make photographs D times smaller")
+    parser.add_argument("--iterations", type=int, default=1000, metavar="N", help="default 1000")
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="default 0")
+    add_shape(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Train, write, and say what it has brought on the test views.
+
+    Raises
+    ------
+    InputError
+        The scene, the model or the output cannot be used, or a number is out of range.
+    """
+    from tqdm import tqdm
+
+    from minisplat_ref.extensions.fans.mesh_files import save_fans
+    from minisplat_ref.extensions.fans.tuning import measured, tuned
+    from minisplat_ref.extensions.shared_studies import check_at_least, read_scene
+
+    check_at_least(1, downscale=args.downscale, iterations=args.iterations)
+    check_at_least(0, seed=args.seed)
+    if args.out.suffix.lower() != ".ply":
+        raise InputError(f"{args.out}: fine-tuned fans are written as a .ply, of which fans export makes other formats")
+    if not args.out.parent.is_dir():
+        raise InputError(f"{args.out.parent} is no folder: make it, or give another OUT")
+    start = load_as_fans(args.model, shape_of(args))
+    scene = read_scene(args.scene, args.downscale)
+    before = measured(start, scene, scene.test_views)
+    with tqdm(total=args.iterations, desc="vertices", leave=False, disable=None) as bar:
+        fans = tuned(start, scene, args.iterations, args.seed, lambda _: bar.update())
+    after = measured(fans, scene, scene.test_views)
+    save_fans(args.out, fans)
+    print(
+        f"{len(start.means):,} fans: test PSNR {before.psnr:.2f} dB, SSIM {before.ssim:.4f}\n"
+        f"fine-tuned, {len(fans.means):,} fans: {after.psnr:.2f} dB, {after.ssim:.4f}; in {args.out}"
+    )
+    return 0

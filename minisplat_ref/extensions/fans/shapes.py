@@ -1,0 +1,189 @@
+"""Fans: Gaussians as vertices that are shared by a few triangles (MeshSplats, 2502.07754).
+
+A fan has a centre vertex at mu and n on a rim, k standard deviations away, and the triangles between the centre and
+two neighbours. Opacity is o at the centre and a fraction of it on the rim, and linear in between.
+
+- *Flat*: one fan in the plane of the two larger axes (``shared_fans``): 1 + n vertices, n triangles.
+- *Solid*: three fans, in the planes of the axes (0, 1), (1, 2) and (2, 0). Where two of them meet, on an axis, they
+  share the vertex: 1 + 3 n - 6 vertices, 3 n triangles. Four must divide n.
+
+The rim's vertices are held by *plane*: a flat fan has one plane that owns all n; of a solid one, plane p owns all but
+those at a quarter and at three quarters of the turn, which lie on the next plane's first axis and are its own.
+"""
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+
+from minisplat_ref.constants import SH_C0
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.shared_fans import flattened, rims
+from minisplat_ref.extensions.shared_peeling import TranslucentMesh
+from minisplat_ref.reference.covariance import rotation_matrices
+from minisplat_ref.types import Bools, Floats, Gaussians, Ints
+
+SOLID_PLANES = 3
+
+
+class FanShape(NamedTuple):
+    """How Gaussians become fans; the defaults fit a Gaussian's profile best with eight sides."""
+
+    n_sides: int = 8
+    """n."""
+    reach: float = 2.5
+    """k, standard deviations from the centre to the rim."""
+    rim: float = 0.0
+    """Opacity on the rim as a fraction of that of the centre, in [0, 1]."""
+    is_flat: bool = True
+    """Whether a Gaussian becomes one fan, or three."""
+
+
+class Fans(NamedTuple):
+    """A population of fans."""
+
+    means: Floats
+    """[N, 3] vertices at the centres, world frame."""
+    rims: Floats
+    """[N, F, m, 3] vertices on the rims by the plane that owns them, world frame: (F, m) is (1, n) or (3, n - 2)."""
+    colors: Floats
+    """[N, 1 + F m, 3] RGB of the vertices in [0, 1], the centre's first."""
+    opacities: Floats
+    """[N, 1 + F m] of the vertices in [0, 1]."""
+
+    @property
+    def n_vertices(self) -> int:
+        """Vertices of one fan, or of one solid triple of fans."""
+        return 1 + self.rims.shape[1] * self.rims.shape[2]
+
+
+def check_shape(shape: FanShape) -> None:
+    """Refuse shapes that are none.
+
+    Raises
+    ------
+    InputError
+        One line that names the number.
+    """
+    if shape.n_sides < 3:
+        raise InputError(f"a fan of {shape.n_sides} sides encloses no area: give at least 3")
+    if not shape.is_flat and shape.n_sides % 4:
+        raise InputError(f"three fans share vertices where 4 divides their sides, which are {shape.n_sides}: give 4, 8")
+    if not 0 < shape.reach < np.inf:
+        raise InputError(f"a rim {shape.reach:g} standard deviations away is no rim: give a number above 0")
+    if not 0 <= shape.rim <= 1:
+        raise InputError(f"the rim's opacity is {shape.rim:g} times the centre's, not in [0, 1]: give such a part")
+
+
+def converted(gaussians: Gaussians, shape: FanShape) -> Fans:
+    """Return the fans of Gaussians, in their dtype.
+
+    Colours are those of degree 0, ``0.5 + C_0 c_0``, clipped to [0, 1], which is what mesh files hold.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        N of them, of any degree.
+    shape : FanShape
+
+    Raises
+    ------
+    InputError
+        As for :func:`check_shape`.
+    """
+    check_shape(shape)
+    dtype, n = gaussians.means.dtype, len(gaussians.means)
+    if shape.is_flat:
+        flat = flattened(gaussians.means, gaussians.quats, gaussians.log_scales)
+        corners = rims(flat.means, flat.spans, np.full(n, shape.reach), shape.n_sides)[:, None]  # [N, 1, n, 3]
+    else:
+        corners = _solid_rims(gaussians, shape)
+    opacities = 1 / (1 + np.exp(-gaussians.opacity_logits))  # [N]
+    fans = Fans(gaussians.means, corners.astype(dtype), np.zeros(()), np.zeros(()))
+    v = fans.n_vertices
+    colors = np.clip(0.5 + SH_C0 * gaussians.sh_dc, 0, 1)[:, None]  # [N, 1, 3]
+    parts = np.concatenate([np.ones(1), np.full(v - 1, shape.rim)]).astype(dtype)
+    return fans._replace(
+        colors=np.repeat(colors, v, axis=1).astype(dtype),
+        opacities=opacities[:, None] * parts,
+    )
+
+
+def _solid_rims(gaussians: Gaussians, shape: FanShape) -> Floats:
+    """Return the rims [N, 3, n - 2, 3] of three planes."""
+    R = rotation_matrices(gaussians.quats.astype(np.float64))
+    with np.errstate(over="ignore"):
+        half_axes = R * np.exp(gaussians.log_scales.astype(np.float64))[:, None]  # [N, 3, 3] columns s_a e_a
+    return np.stack(
+        [
+            rims(
+                gaussians.means.astype(np.float64),
+                half_axes[:, :, [p, (p + 1) % SOLID_PLANES]],
+                np.full(len(R), shape.reach),
+                shape.n_sides,
+            )[:, _owned(shape.n_sides)]
+            for p in range(SOLID_PLANES)
+        ],
+        axis=1,
+    )
+
+
+def _owned(n_sides: int) -> list[int]:
+    """Return which of a solid plane's rim vertices it owns."""
+    return [j for j in range(n_sides) if j not in (n_sides // 4, 3 * n_sides // 4)]
+
+
+@functools.cache
+def table(n_planes: int, n_owned: int) -> Ints:
+    """Return the triangles of one fan, or of a solid triple [T_1, 3], as rows of its vertices: the centre is 0."""
+    if n_planes == 1:
+        rings = [list(range(n_owned))]
+    else:
+        n_sides = n_owned + 2
+        own = {j: place for place, j in enumerate(_owned(n_sides))}
+        crossing = {n_sides // 4: 0, 3 * n_sides // 4: own[n_sides // 2]}  # of the next plane: its axis, either end
+        rings = [
+            [
+                n_owned * ((p + (j in crossing)) % SOLID_PLANES) + (crossing[j] if j in crossing else own[j])
+                for j in range(n_sides)
+            ]
+            for p in range(SOLID_PLANES)
+        ]
+    return np.array([(0, 1 + a, 1 + b) for ring in rings for a, b in zip(ring, ring[1:] + ring[:1], strict=True)])
+
+
+def vertices_of(fans: Fans) -> Floats:
+    """Return the vertices [N, V, 3], the centre first."""
+    rims_in_a_row = fans.rims.reshape(len(fans.means), fans.n_vertices - 1, 3)
+    return np.concatenate([fans.means[:, None], rims_in_a_row], axis=1)
+
+
+def mesh_of(fans: Fans, is_drawn: Bools | None = None) -> TranslucentMesh:
+    """Return fans as one mesh, of N V vertices.
+
+    Parameters
+    ----------
+    fans : Fans
+    is_drawn : ndarray of shape (N,) of booleans, optional
+        Whose triangles to list; all by default.
+    """
+    n, v = len(fans.means), fans.n_vertices
+    rows = np.arange(n) if is_drawn is None else np.flatnonzero(is_drawn)
+    faces = v * rows[:, None, None] + table(*fans.rims.shape[1:3])  # [N, T_1, 3]
+    rgba = np.concatenate([fans.colors, fans.opacities[:, :, None]], axis=2)  # [N, V, 4]
+    return TranslucentMesh(vertices_of(fans).reshape(n * v, 3), rgba.reshape(n * v, 4), faces.reshape(-1, 3))
+
+
+def mesh_of_vjp(fans: Fans, v_vertices: Floats, v_rgba: Floats) -> Fans:
+    """Gradient of :func:`mesh_of`, given those with respect to vertices [N V, 3] and RGBA [N V, 4]."""
+    n, v = len(fans.means), fans.n_vertices
+    v_vertices, v_rgba = v_vertices.reshape(n, v, 3), v_rgba.reshape(n, v, 4)
+    fields = v_vertices[:, 0], v_vertices[:, 1:].reshape(fans.rims.shape), v_rgba[:, :, :3], v_rgba[:, :, 3]
+    return Fans._make(np.ascontiguousarray(field) for field in fields)
+
+
+def visible_mesh(mesh: TranslucentMesh, least_opacity: float) -> TranslucentMesh:
+    """Return the mesh without triangles whose vertices all are fainter than ``least_opacity``, and unused vertices."""
+    faces = mesh.faces[(mesh.rgba[mesh.faces, 3] >= least_opacity).any(axis=1)]
+    used, rows = np.unique(faces, return_inverse=True)
+    return TranslucentMesh(mesh.vertices[used], mesh.rgba[used], rows.reshape(faces.shape))

@@ -1,0 +1,94 @@
+"""Refitting: the two numbers of all fans at once, or every vertex by itself."""
+
+from collections.abc import Callable
+from itertools import product
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+
+from minisplat_ref.extensions.fans.method import FANS_OF_GAUSSIANS, FINE_TUNING
+from minisplat_ref.extensions.fans.shapes import Fans, FanShape, converted
+from minisplat_ref.metrics import Evaluation, evaluate
+from minisplat_ref.rendering import Request
+from minisplat_ref.training.adam import zero_moments
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.representation import GAUSSIANS
+from minisplat_ref.training.schedule import scaled
+from minisplat_ref.training.state import StepReport, TrainState
+from minisplat_ref.types import Floats, Gaussians, Model, Scene, View
+
+REACHES = 1.0, 4.0  # between which k is sought
+FIRST_REACHES, FIRST_RIMS = (1.5, 2.0, 2.5, 3.0, 3.5), (0.0, 0.2)  # the best of which a search begins with
+EVALUATIONS = 60  # at most, of one search
+
+
+def tuned(
+    fans: Fans, scene: Scene, iterations: int, seed: int, on_step: Callable[[StepReport], None] | None = None
+) -> Fans:
+    """Return fans after some iterations of ``FINE_TUNING`` of their vertices; the given ones are not changed."""
+    copy = Fans(*(field.copy() for field in fans))
+    state = TrainState(copy, zero_moments(copy), step=0, view_order=[], rng=np.random.default_rng(seed), stats={})
+    recipe = scaled(FINE_TUNING, iterations)._replace(representation=FANS_OF_GAUSSIANS)
+    result: Fans = train(scene, recipe, seed=seed, state=state, on_step=on_step).gaussians
+    return result
+
+
+def best_shape(
+    gaussians: Gaussians, shape: FanShape, views: list[View], targets: list[Floats], background: Floats
+) -> FanShape:
+    """Return the shape with the reach and the rim whose pictures are nearest to targets.
+
+    The simplex method starts from the best of a coarse grid: where a rim is not transparent, the error jumps as it
+    moves over a pixel, and has many small minima.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+    shape : FanShape
+        Its sides, and whether fans are flat.
+    views : list of View
+        From where.
+    targets : list of ndarray of shape (H, W, 3)
+        Photographs or pictures in [0, 1]; the sum of squared differences counts.
+    background : ndarray of shape (3,)
+        RGB behind everything.
+    """
+
+    def clipped(x: Floats) -> FanShape:
+        return shape._replace(reach=float(np.clip(x[0], *REACHES)), rim=float(np.clip(x[1], 0, 1)))
+
+    def cost(x: Floats) -> float:
+        fans = converted(gaussians, clipped(x))
+        pictures = [drawn(fans, view, background=background) for view in views]
+        return sum(float(np.mean((p - target) ** 2)) for p, target in zip(pictures, targets, strict=True))
+
+    first = min((np.array(place) for place in product(FIRST_REACHES, FIRST_RIMS)), key=cost)
+    simplex = first + np.array([[0.0, 0.0], [-0.2, 0.0], [0.0, 0.05]])
+    options = {"maxfev": EVALUATIONS, "xatol": 0.005, "fatol": 1e-9, "initial_simplex": simplex}
+    return clipped(minimize(cost, first, method="Nelder-Mead", options=options).x)
+
+
+def representation_of(population: Any) -> Any:
+    """Return what a population of fans, or of Gaussians, is drawn by."""
+    return FANS_OF_GAUSSIANS if isinstance(population, Fans) else GAUSSIANS
+
+
+def drawn(population: Any, view: View, **request: Any) -> Floats:
+    """Return the picture [H, W, 3] of fans or Gaussians, clipped to [0, 1]; ``request`` as for :class:`Request`."""
+    image = representation_of(population).renderer.render(Model(population), view, Request(**request))[0].image
+    clipped: Floats = np.clip(image, 0, 1)
+    return clipped
+
+
+def alpha_of(population: Any, view: View, **request: Any) -> Floats:
+    """Return the accumulated opacity [H, W] of fans or Gaussians."""
+    output, _ = representation_of(population).renderer.render(Model(population), view, Request(**request))
+    alpha: Floats = output.alpha
+    return alpha
+
+
+def measured(population: Any, scene: Scene, views: tuple[View, ...]) -> Evaluation:
+    """Compare pictures of fans or Gaussians with photographs."""
+    renderer = representation_of(population).renderer
+    return evaluate(Model(population), views, background=scene.background, renderer=renderer)

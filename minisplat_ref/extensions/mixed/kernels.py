@@ -1,0 +1,169 @@
+"""Hulls on lanes: a response for the plain kernels.
+
+A record begins with the conic's, whose factors whiten: ``e = dx + slope dy`` and dy are, but for their lengths, the
+whitened coordinates. It goes on with the vertices from the centre, and for each edge u with ``g = Q u / (u . Q u)``, so
+that the nearest point of a line through o along u is found by one product, ``f = -(o . g)``.
+"""
+
+import functools
+from collections.abc import Callable
+
+import numpy as np
+
+from minisplat_ref.cpu.compositing.exponential import exp_exact, exp_fast
+from minisplat_ref.cpu.compositing.responses import (
+    HALF_A,
+    HALF_PIVOT,
+    MEAN_X,
+    MEAN_Y,
+    OPACITY,
+    SLOPE,
+    KernelResponse,
+    conic_response,
+)
+from minisplat_ref.extensions.mixed.response import FLAT, Footprints
+from minisplat_ref.jit.compile import scalar
+from minisplat_ref.jit.lanes import broadcast, maximum, minimum, select
+from minisplat_ref.jit.literals import ONE, TWO, ZERO
+from minisplat_ref.scalar.compositing import mahalanobis
+from minisplat_ref.types import Floats, Ints
+
+CONIC_GRADIENTS = 6  # a record begins with the conic's own: centre, factors and opacity
+V_1, V_2, V_3 = range(CONIC_GRADIENTS, CONIC_GRADIENTS + 6, 2)  # vertices from the centre
+N_GRADIENTS = V_3 + 2
+DEPTH, COUNT, TURN = range(N_GRADIENTS, N_GRADIENTS + 3)  # TURN: sign of the triangle's area, 0 if it is flat
+G_12, G_23, G_31 = range(TURN + 1, TURN + 7, 2)
+N_COLUMNS = G_31 + 2
+
+
+@functools.cache
+def hull_response(exp: Callable) -> KernelResponse:
+    """Response of hulls, with an exponential of :mod:`minisplat_ref.cpu.compositing.exponential`."""
+    conic = conic_response(exp)
+
+    @scalar
+    def from_pixel(records, n, d_x, d_y, vertex):
+        """A vertex from the pixel from which the centre is at d."""
+        return d_x + records[n, vertex], d_y + records[n, vertex + 1]
+
+    @scalar
+    def on_edge(records, n, o, end, g):
+        """The nearest point of an edge between two vertices: offset from the pixel, sigma, and where it lies on it."""
+        u = end[0] - o[0], end[1] - o[1]
+        f = minimum(maximum(-(o[0] * records[n, g] + o[1] * records[n, g + 1]), ZERO), ONE)
+        d_x, d_y = o[0] + f * u[0], o[1] + f * u[1]
+        e = d_x + records[n, SLOPE] * d_y
+        return d_x, d_y, mahalanobis(e, records[n, HALF_A], records[n, HALF_PIVOT] * d_y * d_y), f
+
+    @scalar
+    def on_triangle(records, n, d_x, d_y):
+        """The nearest point of a triangle: offset from the pixel, sigma, and the weights of the vertices."""
+        nothing = broadcast(records.dtype.type(0))
+        o_1 = from_pixel(records, n, d_x, d_y, V_1)
+        o_2 = from_pixel(records, n, d_x, d_y, V_2)
+        o_3 = from_pixel(records, n, d_x, d_y, V_3)
+        d_x, d_y, sigma, f = on_edge(records, n, o_1, o_2, G_12)
+        w_1, w_2, w_3 = ONE - f, f, nothing
+        x, y, new, f = on_edge(records, n, o_2, o_3, G_23)
+        is_nearer = new < sigma
+        d_x, d_y, sigma = select(is_nearer, x, d_x), select(is_nearer, y, d_y), select(is_nearer, new, sigma)
+        w_1, w_2, w_3 = select(is_nearer, ZERO, w_1), select(is_nearer, ONE - f, w_2), select(is_nearer, f, w_3)
+        x, y, new, f = on_edge(records, n, o_3, o_1, G_31)
+        is_nearer = new < sigma
+        d_x, d_y, sigma = select(is_nearer, x, d_x), select(is_nearer, y, d_y), select(is_nearer, new, sigma)
+        w_1, w_2, w_3 = select(is_nearer, f, w_1), select(is_nearer, ZERO, w_2), select(is_nearer, ONE - f, w_3)
+        turn = records[n, TURN]
+        turns = minimum(minimum(turn * side(o_1, o_2), turn * side(o_2, o_3)), turn * side(o_3, o_1))
+        inside = turns > ZERO
+        d_x, d_y, sigma = select(inside, ZERO, d_x), select(inside, ZERO, d_y), select(inside, ZERO, sigma)
+        return d_x, d_y, sigma, select(inside, ZERO, w_1), select(inside, ZERO, w_2), select(inside, ZERO, w_3)
+
+    @scalar
+    def hit(records, n, x, y):
+        nothing = broadcast(records.dtype.type(0))
+        d_x, d_y = records[n, MEAN_X] - x, records[n, MEAN_Y] - y + nothing
+        w_1, w_2, w_3 = nothing + ONE, nothing, nothing
+        if records[n, COUNT] == ONE:
+            e = d_x + records[n, SLOPE] * d_y
+            sigma = mahalanobis(e, records[n, HALF_A], records[n, HALF_PIVOT] * d_y * d_y)
+        elif records[n, COUNT] == TWO:
+            o_1, o_2 = from_pixel(records, n, d_x, d_y, V_1), from_pixel(records, n, d_x, d_y, V_2)
+            d_x, d_y, sigma, w_2 = on_edge(records, n, o_1, o_2, G_12)
+            w_1 = ONE - w_2
+        else:
+            d_x, d_y, sigma, w_1, w_2, w_3 = on_triangle(records, n, d_x, d_y)
+        falloff = exp(-sigma)
+        return records[n, OPACITY] * falloff, records[n, DEPTH], (d_x, d_y, falloff, w_1, w_2, w_3)
+
+    @scalar
+    def hit_vjp(records, n, place, v_mean, v_shape, v_place):
+        """With q = dL/dsigma = -alpha v: that of a conic around the nearest point, v_d distributed by the weights."""
+        d_x, d_y, falloff, w_1, w_2, w_3 = place
+        a, slope, pivot = TWO * records[n, HALF_A], records[n, SLOPE], TWO * records[n, HALF_PIVOT]
+        alpha = records[n, OPACITY] * falloff
+        e, q_shape = d_x + slope * d_y, -alpha * v_shape
+        ae = a * e
+        v_x, v_y = -alpha * v_mean * ae, -alpha * v_mean * (pivot * d_y + slope * ae)
+        return (
+            v_x,
+            v_y,
+            q_shape * e * e,
+            q_shape * ae * d_y,
+            q_shape * d_y * d_y,
+            falloff * v_shape,
+            w_1 * v_x,
+            w_1 * v_y,
+            w_2 * v_x,
+            w_2 * v_y,
+            w_3 * v_x,
+            w_3 * v_y,
+        )
+
+    return KernelResponse(
+        functools.partial(_records, conic.records),
+        functools.partial(_records_vjp, conic.records_vjp),
+        _boxes,
+        hit,
+        hit_vjp,
+        N_GRADIENTS,
+    )
+
+
+@scalar
+def side(a, b):
+    """On which side of the edge from a to b the origin lies: the cross product of both."""
+    return a[0] * b[1] - a[1] * b[0]
+
+
+def response_for(dtype: np.dtype) -> KernelResponse:
+    """Return the response for arrays of a dtype: float32 data use the polynomial exponential."""
+    return hull_response(exp_fast if dtype == np.float32 else exp_exact)
+
+
+def _records(conic_records: Callable, footprints: Footprints, dtype: np.dtype) -> Floats:
+    projection, vertices, n_vertices = footprints
+    vertices, (a, b, c) = vertices.astype(np.float64), projection.conics.astype(np.float64).T
+    records = np.zeros((len(a), N_COLUMNS), dtype)
+    records[:, :CONIC_GRADIENTS] = conic_records(projection, dtype)[:, :CONIC_GRADIENTS]
+    records[:, DEPTH], records[:, COUNT] = projection.depths, n_vertices
+    edges = np.stack([vertices[:, j] - vertices[:, i] for i, j in ((0, 1), (1, 2), (2, 0))], axis=1)  # [N, 3, 2]
+    x, y = edges[:, :, 0], edges[:, :, 1]
+    Q_x, Q_y = a[:, None] * x + b[:, None] * y, b[:, None] * x + c[:, None] * y
+    lengths = x * Q_x + y * Q_y  # squared, [N, 3]
+    inverses = np.where(lengths > 0, 1 / np.where(lengths > 0, lengths, 1), 0)
+    records[:, G_12:N_COLUMNS] = np.stack([Q_x * inverses, Q_y * inverses], axis=2).reshape(-1, 6)
+    records[:, V_1:N_GRADIENTS] = vertices.reshape(-1, 6)
+    area = y[:, 0] * x[:, 2] - x[:, 0] * y[:, 2]  # twice
+    is_flat = np.abs(area) <= FLAT * np.max(x * x + y * y, axis=1)
+    records[:, TURN] = np.where(is_flat, 0, np.sign(area))
+    return records
+
+
+def _records_vjp(conic_records_vjp: Callable, footprints: Footprints, v_records: Floats) -> tuple[Floats, ...]:
+    """Gradient with respect to the footprints' ``FIELDS``."""
+    v_vertices = v_records[:, V_1:N_GRADIENTS].reshape(-1, 3, 2).astype(footprints.vertices.dtype)
+    return *conic_records_vjp(footprints.projection, v_records), v_vertices
+
+
+def _boxes(footprints: Footprints) -> Ints:
+    return footprints.projection.boxes

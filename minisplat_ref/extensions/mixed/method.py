@@ -1,0 +1,98 @@
+"""How ellipses, lines and triangles are drawn, and the recipe that trains them."""
+
+from functools import partial
+
+import numpy as np
+
+from minisplat_ref.extensions.mixed.kernels import response_for
+from minisplat_ref.extensions.mixed.kinds import promoted, simplified
+from minisplat_ref.extensions.mixed.population import MixedGaussians, counts, grouped
+from minisplat_ref.extensions.mixed.projection import Hulls, footprints_of, footprints_vjp
+from minisplat_ref.extensions.mixed.response import RESPONSE, Footprints
+from minisplat_ref.extensions.shared_payload_renderer import Payload, PayloadGradient, Projected, payload_renderer
+from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
+from minisplat_ref.training.rates import Rates
+from minisplat_ref.training.representation import Representation
+from minisplat_ref.training.schedule import Every
+from minisplat_ref.training.state import Iteration, TrainState
+from minisplat_ref.types import Bools, Floats, Projection
+
+BOUNDLESS = np.array([1e-12, 0.0, 1e-12])  # px^-2: a million pixels
+
+
+def _is_plain(g: MixedGaussians) -> bool:
+    return bool(np.all(counts(g) == 1))
+
+
+def _hulls(projected: Projected) -> Hulls:
+    g: MixedGaussians = projected.gaussians
+    return Hulls(projected.primitives, g.vertices, counts(g))
+
+
+def _footprints(projected: Projected) -> Footprints:
+    return footprints_of(_hulls(projected), projected.projection, projected.camera, projected.conventions)
+
+
+def _footprints_vjp(projected: Projected, v: tuple[Floats, ...]) -> PayloadGradient:
+    """Gradient of :func:`_footprints` for that with respect to the vertices in the image."""
+    (v_vertices,) = v
+    found = footprints_vjp(_hulls(projected), projected.camera, projected.conventions, v_vertices)
+    fields = {"vertices": found.vertices, "n_vertices": np.zeros_like(projected.gaussians.n_vertices)}
+    v_scales = np.zeros_like(projected.primitives.scales)
+    return PayloadGradient(fields, found.means, found.quats, v_scales, found.cam_from_world_R, found.cam_from_world_t)
+
+
+def _listed(footprints: Footprints) -> Projection:
+    """Return the projection with ellipses that reach all tiles under the boxes of lines and triangles."""
+    projection = footprints.projection
+    conics = np.where((footprints.n_vertices > 1)[:, None], BOUNDLESS, projection.conics)
+    return projection._replace(conics=conics)
+
+
+PAYLOAD = Payload(
+    "lines and triangles", RESPONSE, response_for, _is_plain, _footprints, _footprints_vjp, listed=_listed
+)
+
+
+def simplify_hulls(state: TrainState, iteration: Iteration, *, least: float, least_height: float) -> str:
+    """Take vertices away where they make no difference; see :func:`minisplat_ref.extensions.mixed.kinds.simplified`."""
+    population, changed = simplified(state.gaussians, least=least, least_height=least_height)
+    return _changed(state, population, changed)
+
+
+def promote(state: TrainState, iteration: Iteration, *, ratio: float, size_fraction: float) -> str:
+    """Make lines of needles and triangles of discs; see :func:`minisplat_ref.extensions.mixed.kinds.promoted`."""
+    size_limit = size_fraction * iteration.scene.extent
+    population, changed = promoted(state.gaussians, ratio=ratio, size_limit=size_limit)
+    return _changed(state, population, changed)
+
+
+def _changed(state: TrainState, population: MixedGaussians, changed: Bools) -> str:
+    """Replace the population; what has changed its shape loses the moments of its shape."""
+    state.gaussians = population
+    for moment in (state.adam.first, state.adam.second):
+        for name in ("means", "quats", "log_scales", "vertices"):
+            getattr(moment, name)[changed] = 0
+    n = np.bincount(counts(population), minlength=4)
+    return f"{np.count_nonzero(changed)} changed: {n[1]} ellipses, {n[2]} lines, {n[3]} triangles"
+
+
+MIXED_GAUSSIANS = Representation(
+    "ellipses, lines and triangles",
+    population=MixedGaussians,
+    extend=grouped,
+    renderer=payload_renderer("mixed", PAYLOAD),
+    rates=Rates({"vertices": 2e-4, "n_vertices": 0.0}, frozenset({"vertices"})),
+)
+
+_changing = partial(Every, 500, stop=15_000, least_gap=100)
+
+MIXED = GS_ACCEL._replace(
+    name="mixed",
+    events=(
+        *GS_ACCEL.events,
+        _changing(partial(simplify_hulls, least=0.5, least_height=0.5), start=1_000),
+        _changing(partial(promote, ratio=6.0, size_fraction=0.01), start=1_000),
+    ),
+)
+"""``mixed``: 3DGS with ellipses, lines and triangles."""

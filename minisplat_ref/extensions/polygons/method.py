@@ -1,0 +1,53 @@
+"""How polygons are drawn by rays through the pixels, how training starts, and the recipe."""
+
+import numpy as np
+
+from minisplat_ref.backends import Backend
+from minisplat_ref.constants import Conventions
+from minisplat_ref.extensions import shared_ray_blending, shared_ray_kernels
+from minisplat_ref.extensions.polygons.geometry import Polygons, polygons_of, spans_vjp
+from minisplat_ref.extensions.polygons.kernels import RESPONSE, fans_of, scene_of
+from minisplat_ref.extensions.polygons.reference import meeting_of
+from minisplat_ref.extensions.shared_ray_renderer import Traced, renderer_of
+from minisplat_ref.extensions.shared_rays import Tracer
+from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
+from minisplat_ref.training.representation import Representation
+from minisplat_ref.types import Gaussians
+
+LOG_THICKNESS = float(np.log(1e-5))  # of the axis across, as in the paper; what is drawn has none
+
+
+def tracer_for(polygons: Polygons, conventions: Conventions, backend: Backend) -> Tracer:
+    """Return how a backend traces: every ray against every polygon, or kernels with a tree of all triangles."""
+    if backend.is_compiled:
+        return shared_ray_kernels.tracer_of(RESPONSE, scene_of(fans_of(polygons), conventions))
+    return shared_ray_blending.tracer_of(meeting_of(polygons))
+
+
+def pressed_flat(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
+    """Return the Gaussians with a thickness of 1e-5 along their thinnest axes; balls are turned at random first.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        Of any shape. Those that training starts from are balls, whose axes say nothing: along the first of them all
+        polygons would face the same way, and a camera in their planes would see none.
+    rng : Generator
+        For the directions of the balls.
+    """
+    log_scales, quats = gaussians.log_scales.copy(), gaussians.quats.copy()
+    is_ball = np.ptp(log_scales, axis=1) == 0
+    quats[is_ball] = rng.normal(size=(is_ball.sum(), 4))
+    rows = np.arange(len(log_scales))
+    log_scales[rows, np.argmin(log_scales, axis=1)] = LOG_THICKNESS
+    return gaussians._replace(log_scales=log_scales, quats=quats)
+
+
+TRACED = Representation(
+    "flat Gaussians in polygons",
+    extend=pressed_flat,
+    renderer=renderer_of(Traced("polygons", polygons_of, tracer_for, spans_vjp)),
+)
+
+POLYGONS = GS_ACCEL._replace(name="polygons")
+"""``polygons``: 3DGS of flat Gaussians, whose pixels are rays."""

@@ -1,0 +1,164 @@
+"""A picture by rays through its pixels, and its gradient: what the renderers share that trace Gaussians of any kind.
+
+A renderer is made of a :class:`Traced`: what becomes of a population before it is traced, and how that is traced.
+"""
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref.backends import Backend
+from minisplat_ref.constants import Conventions
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.shared_rays import (
+    BlendedRays,
+    Rays,
+    Tracer,
+    blend_stats,
+    block_order,
+    pixel_rays,
+    pixel_rays_vjp,
+)
+from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, Request
+from minisplat_ref.types import Bools, Camera, Floats, Ints, Model, RenderOutput, View
+
+WANTS = frozenset({"depth", "stats"})
+
+
+class Traced(NamedTuple):
+    """A kind of Gaussians that is traced."""
+
+    name: str
+    """Of the extension."""
+    prepare: Callable[[Any, Floats], Any]
+    """``prepare(population, opacities)``: the Gaussians as rays meet them, of opacities [N] in float64, 0 where one is
+    not to be drawn."""
+    tracer_for: Callable[[Any, Conventions, Backend], Tracer]
+    """``tracer_for(prepared, conventions, backend)``: how a backend traces them; trees are built here."""
+    shapes_vjp: Callable[[Any, Any, Floats], tuple[Floats, Floats]]
+    """``shapes_vjp(population, prepared, v_shapes)``: the gradient with respect to quaternions [N, 4] and logarithms of
+    scales [N, 3]."""
+
+
+def renderer_of(traced: Traced) -> Renderer:
+    """Return the renderer that traces a ray through the centre of each pixel."""
+    return Renderer(traced.name, partial(render, traced), render_vjp, SPLATTING.channels)
+
+
+class _Tape(NamedTuple):
+    model: Model
+    camera: Camera
+    request: Request
+    sh_degree: int
+    background: Floats
+    traced: Traced
+    opacities: Floats  # [N]
+    prepared: Any
+    tracer: Tracer
+    order: Ints  # [H W] pixels in the order of the rays
+    rays: Rays
+    colors: Floats  # [N, 3]
+    blended: BlendedRays
+
+
+def render(traced: Traced, model: Model, view: View, request: Request) -> tuple[RenderOutput, _Tape]:
+    """Trace a ray through the centre of each pixel.
+
+    Raises
+    ------
+    InputError
+        More is wanted than ``depth`` and ``stats``, or a degree of harmonics that is not stored.
+    """
+    g, camera, wants = model.gaussians, view.camera, request.wants
+    if wants - WANTS:
+        names = ", ".join(sorted(wants - WANTS))
+        raise InputError(f"{traced.name} does not give {names}: use a recipe that does not ask for it")
+    dtype, conventions, backend = g.means.dtype, request.conventions, request.backend
+    stored_degree = math.isqrt(g.sh_rest.shape[1] + 1) - 1
+    degree = stored_degree if request.sh_degree is None else min(request.sh_degree, stored_degree)
+    background = np.zeros(3) if request.background is None else np.asarray(request.background, np.float64)
+    opacities = _opacities(g.opacity_logits, request.is_visible)
+    prepared = traced.prepare(g, opacities)
+    tracer, in_rows = traced.tracer_for(prepared, conventions, backend), pixel_rays(camera, conventions)
+    order = block_order(camera.width, camera.height)
+    rays = Rays(*(field[order] for field in in_rows))
+    colors = backend.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, degree, np.ones((len(g.means), 2), np.int32))
+    blended = tracer.blend(colors, rays, background, conventions)
+    size = camera.height, camera.width
+    channels = np.column_stack([blended.image, blended.depths]) if "depth" in wants else blended.image
+    image, alpha = np.empty_like(channels, dtype), np.empty(len(order), dtype)
+    image[order], alpha[order] = channels, 1 - blended.transmittances
+    stats = blend_stats(tracer.list_hits(in_rows, conventions), size, len(g.means)) if "stats" in wants else None
+    output = RenderOutput(
+        image.reshape(*size, -1),
+        alpha.reshape(size),
+        median_depth=None,
+        stats=stats,
+        visible_ids=np.flatnonzero(blended.is_seen),
+        n_pairs=int(blended.n_hits.sum()),
+    )
+    tape = _Tape(
+        model, camera, request, degree, background, traced, opacities, prepared, tracer, order, rays, colors, blended
+    )
+    return output, tape
+
+
+def render_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None) -> RenderGradient:
+    """Gradient of :func:`render`.
+
+    Nothing is projected, so there is no gradient with respect to a projected centre. Density control gets the closest
+    substitute: a centre that moves parallel to the image by ``z / f`` moves by a pixel in it, so
+
+        v_means2d_k = z / f_k (R v_mu)_k
+    """
+    g, camera, blended = tape.model.gaussians, tape.camera, tape.blended
+    n_rays, dtype = len(tape.rays.near), g.means.dtype
+    v_pixels = v_image.reshape(n_rays, -1)[tape.order].astype(np.float64)
+    v_depths = v_pixels[:, 3] if v_pixels.shape[1] > 3 else np.zeros(n_rays)
+    v_T = np.zeros(n_rays) if v_alpha is None else -v_alpha.ravel()[tape.order].astype(np.float64)
+    v = tape.tracer.blend_vjp(
+        tape.colors, tape.rays, tape.background, tape.request.conventions, blended, (v_pixels[:, :3], v_depths, v_T)
+    )
+    v_quats, v_log_scales = tape.traced.shapes_vjp(g, tape.prepared, v.shapes)
+    v_directions = np.empty_like(v.directions)
+    v_directions[tape.order] = v.directions
+    v_R, v_t = pixel_rays_vjp(camera, tape.request.conventions, v.origins, v_directions)
+    o = tape.opacities
+    v_sh = tape.request.backend.sh_colors_vjp(
+        g.means, g.sh_dc, g.sh_rest, camera, tape.sh_degree, _seen_radii(blended.is_seen), v.colors.astype(dtype)
+    )
+    R, t = camera.cam_from_world_R, camera.cam_from_world_t
+    depths = np.where(blended.is_seen, g.means @ R[2] + t[2], 0.0)  # [N]
+    v_in_image = (v.means @ R.T)[:, :2] * depths[:, None] / [camera.fx, camera.fy]
+    of_fields = {
+        "means": v.means + v_sh.means,
+        "quats": v_quats,
+        "log_scales": v_log_scales,
+        "opacity_logits": o * (1 - o) * v.opacities,
+        "sh_dc": v_sh.sh_dc,
+        "sh_rest": v_sh.sh_rest,
+    }
+    further = {name: np.zeros_like(field) for name, field in g._asdict().items() if name not in of_fields}
+    of_fields = {name: field.astype(dtype) for name, field in of_fields.items()}
+    return RenderGradient(
+        gaussians=g._replace(**of_fields, **further),
+        background=v.background.astype(dtype),
+        cam_from_world_R=(v_R + v_sh.cam_from_world_R).astype(dtype),
+        cam_from_world_t=(v_t + v_sh.cam_from_world_t).astype(dtype),
+        means2d=v_in_image.astype(dtype),
+    )
+
+
+def _opacities(logits: Floats, is_visible: Bools | None) -> Floats:
+    """Return opacities [N] in float64, 0 where a Gaussian is not to be drawn."""
+    with np.errstate(over="ignore"):
+        opacities = 1 / (1 + np.exp(-logits.astype(np.float64)))
+    return opacities if is_visible is None else np.where(is_visible, opacities, 0.0)
+
+
+def _seen_radii(is_seen: Bools) -> Ints:
+    """Return radii [N, 2] like those of a projection: 0 for Gaussians that the stage of colours should skip."""
+    return np.repeat(is_seen.astype(np.int32)[:, None], 2, axis=1)
