@@ -46,6 +46,7 @@ from minisplat_ref.extensions.rays.demo import (
     MIRROR_CORNER,
     MIRROR_SIDES,
     ball,
+    concatenated,
     discs,
     floor,
     world_of,
