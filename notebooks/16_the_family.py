@@ -53,7 +53,7 @@ from minisplat_ref.extensions.proxies.binding import bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid
 from minisplat_ref.extensions.proxies.edit_claims import RADIUS, flat_gaussians, rolled
 from minisplat_ref.extensions.proxies.edit_claims import camera as card_camera
-from minisplat_ref.extensions.shared_container import take_apart
+from minisplat_ref.extensions.shared_container import parse
 from minisplat_ref.extensions.shared_mesh import Mesh
 from minisplat_ref.extensions.shared_sampling import block_means, zoomed
 from minisplat_ref.methods import get_recipe
@@ -328,7 +328,7 @@ for level in (4, 8, 12):
     rounding[level] = (exponent, (back - room.log_scales).ravel())
 files = {level: encode(room, level) for level in (1, 4, 8, 12)}
 sizes = {
-    level: {name: len(frame) / len(room.means) for name, frame in take_apart(CONTAINER, content, "room").frames.items()}
+    level: {name: len(frame) / len(room.means) for name, frame in parse(CONTAINER, content, "room").frames.items()}
     for level, content in files.items()
 }
 

@@ -16,7 +16,7 @@ from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Floats, Model, RenderOutput, View
 
 
-def watching_stage(
+def renderer_stage(
     backend: Backend,
     setting: Setting,
     representation: Representation,

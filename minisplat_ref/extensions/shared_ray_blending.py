@@ -75,7 +75,7 @@ def list_hits(meeting: Meeting, rays: Rays, conventions: Conventions) -> Hits:
         order = np.argsort(np.where(is_hit, t, np.inf), axis=1, kind="stable")  # [P', N]
         alpha = np.take_along_axis(np.where(is_hit, alpha, 0.0), order, axis=1)
         after = np.cumprod(1 - alpha, axis=1)
-        alpha = np.where(goes_on(after, conventions), alpha, 0.0)  # T never rises: what is cut off is the end
+        alpha = np.where(goes_on(after, conventions), alpha, 0.0)  # T never rises, so only the end is cut off
         T = np.cumprod(np.column_stack([np.ones(len(some)), 1 - alpha]), axis=1)  # [P', N + 1]
         row, place = np.nonzero(alpha > 0)  # of each ray in its order
         found = order[row, place]
@@ -101,18 +101,18 @@ def list_hits(meeting: Meeting, rays: Rays, conventions: Conventions) -> Hits:
 def blend_rays(
     meeting: Meeting, colors: Floats, rays: Rays, background: Floats, conventions: Conventions
 ) -> BlendedRays:
-    """Blend what each ray meets: ``sum_i w_i c_i + T_end b``, and the accumulated depth ``sum_i w_i t_i``.
+    """Return the colour ``sum_i w_i c_i + T_end b`` and the accumulated depth ``sum_i w_i t_i`` of each ray.
 
     Parameters
     ----------
     meeting : Meeting
         N Gaussians.
     colors : ndarray of shape (N, 3)
-        One for each.
+        One colour per Gaussian.
     rays : Rays
         P rays.
     background : ndarray of shape (3,)
-        Behind everything.
+        b.
     conventions : Conventions
         Clamp, skip and stop thresholds.
     """
@@ -136,8 +136,8 @@ def blend_rays_vjp(
 ) -> RayGradient:
     """Gradient of :func:`blend_rays`.
 
-    With ``f_i = v_image . c_i + v_depth t_i`` and what stands behind hit i,
-    ``B_i = sum_{j > i} w_j f_j + T_end (v_image . b + v_T)``::
+    With ``f_i = v_image . c_i + v_depth t_i`` and the sum ``B_i = sum_{j > i} w_j f_j + T_end (v_image . b + v_T)``
+    over what lies behind hit i::
 
         v_c_i     = w_i v_image,   v_t_i = w_i v_depth,   v_b = sum T_end v_image
         v_alpha_i = T_i f_i - B_i / (1 - alpha_i)                                     0 where alpha is clamped
@@ -147,7 +147,7 @@ def blend_rays_vjp(
     meeting, colors, rays, background, conventions
         As for :func:`blend_rays`.
     blended : BlendedRays
-        Its result.
+        The result of :func:`blend_rays`.
     v_blended : tuple
         Derivatives with respect to the image [P, 3], the depths [P] and the transmittances [P].
     """
@@ -176,14 +176,14 @@ def blend_rays_vjp(
 
 
 def summed(values: Floats, rows: Ints, n_rows: int) -> Floats:
-    """Return the sums [n_rows, ...] of values [H, ...] that belong to the same row."""
+    """Return the sums [n_rows, ...] of those values [H, ...] that belong to the same row."""
     sums = np.zeros((n_rows, *values.shape[1:]))
     np.add.at(sums, rows, values)
     return sums
 
 
 def _chunks(n_rays: int, n: int) -> Iterator[Ints]:
-    """Yield the rays in parts, so that not too many pairs are looked at at once."""
+    """Yield the rays in chunks, so that not too many pairs are in memory at once."""
     step = max(1, PAIRS_AT_ONCE // max(n, 1))
     for first in range(0, n_rays, step):
         yield np.arange(first, min(first + step, n_rays))

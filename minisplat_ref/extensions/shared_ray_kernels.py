@@ -14,15 +14,15 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.extensions.shared_ray_traversal import OPACITY, Scene, finder, limits_of, ray_of, room_for
+from minisplat_ref.extensions.shared_ray_traversal import OPACITY, Scene, empty_lists, finder, limits_of, ray_of
 from minisplat_ref.extensions.shared_rays import BlendedRays, Hits, RayGradient, Rays, Tracer
 from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
 from minisplat_ref.jit.lanes import WIDTH
 from minisplat_ref.jit.scheduling import dynamic_range, shared_counter
 from minisplat_ref.types import Floats, Ints
 
-RAYS_A_TURN = 64  # a multiple of eight
-GAUSSIANS_A_TURN = 32
+RAYS_PER_PART = 64  # a multiple of eight
+GAUSSIANS_PER_PART = 32
 
 
 class RayResponse(NamedTuple):
@@ -57,7 +57,7 @@ def tracer_of(response: RayResponse, scene: Scene) -> Tracer:
 
 @scalar
 def goes_on(T, limits):
-    """Whether a ray takes the hit that leaves it with T."""
+    """Return whether a ray takes a hit that leaves it with the transmittance T."""
     return T > limits.transmittance_min or (T == limits.transmittance_min and not limits.stops_at_equality)
 
 
@@ -84,10 +84,10 @@ def _kernels_of(response: RayResponse) -> _Kernels:
         n_rays = len(rays.near)
         taken = shared_counter()
         for _ in prange(n_threads):
-            found = room_for(limits.capacity)
+            found = empty_lists(limits.capacity)
             image, depths, transmittances, n_hits, is_seen = blended
-            for part in dynamic_range(taken, (n_rays + RAYS_A_TURN - 1) // RAYS_A_TURN):
-                for r in range(part * RAYS_A_TURN, min((part + 1) * RAYS_A_TURN, n_rays)):
+            for part in dynamic_range(taken, (n_rays + RAYS_PER_PART - 1) // RAYS_PER_PART):
+                for r in range(part * RAYS_PER_PART, min((part + 1) * RAYS_PER_PART, n_rays)):
                     lane = r % WIDTH
                     if lane == 0:
                         find_hits(scene, rays, r, n_rays, limits, found)
@@ -113,14 +113,14 @@ def _kernels_of(response: RayResponse) -> _Kernels:
 
     @kernel()
     def list_all(scene, rays, limits, n_threads, hits):
-        """Write the hits down, with rows of the scene; ``hits.offsets`` says how many there are."""
+        """Write the hits with rows of the scene; ``hits.offsets`` tells how many each ray has."""
         n_rays = len(rays.near)
         taken = shared_counter()
         for _ in prange(n_threads):
-            found = room_for(limits.capacity)
+            found = empty_lists(limits.capacity)
             offsets, ray_ids, rows, unclamped, depths, weights, transmittances = hits
-            for part in dynamic_range(taken, (n_rays + RAYS_A_TURN - 1) // RAYS_A_TURN):
-                for r in range(part * RAYS_A_TURN, min((part + 1) * RAYS_A_TURN, n_rays)):
+            for part in dynamic_range(taken, (n_rays + RAYS_PER_PART - 1) // RAYS_PER_PART):
+                for r in range(part * RAYS_PER_PART, min((part + 1) * RAYS_PER_PART, n_rays)):
                     lane = r % WIDTH
                     if lane == 0:
                         find_hits(scene, rays, r, n_rays, limits, found)
@@ -140,8 +140,8 @@ def _kernels_of(response: RayResponse) -> _Kernels:
         taken = shared_counter()
         for _ in prange(n_threads):
             v_unclamped, v_depths, v_rays = v
-            for part in dynamic_range(taken, (n_rays + RAYS_A_TURN - 1) // RAYS_A_TURN):
-                for r in range(part * RAYS_A_TURN, min((part + 1) * RAYS_A_TURN, n_rays)):
+            for part in dynamic_range(taken, (n_rays + RAYS_PER_PART - 1) // RAYS_PER_PART):
+                for r in range(part * RAYS_PER_PART, min((part + 1) * RAYS_PER_PART, n_rays)):
                     ray, behind = ray_of(rays, r), cotangents.behind[r]
                     red, green, blue = cotangents.image[r, 0], cotangents.image[r, 1], cotangents.image[r, 2]
                     for k in range(6):
@@ -170,8 +170,8 @@ def _kernels_of(response: RayResponse) -> _Kernels:
         taken = shared_counter()
         order, offsets = groups
         for _ in prange(n_threads):
-            for part in dynamic_range(taken, (n_rows + GAUSSIANS_A_TURN - 1) // GAUSSIANS_A_TURN):
-                for row in range(part * GAUSSIANS_A_TURN, min((part + 1) * GAUSSIANS_A_TURN, n_rows)):
+            for part in dynamic_range(taken, (n_rows + GAUSSIANS_PER_PART - 1) // GAUSSIANS_PER_PART):
+                for row in range(part * GAUSSIANS_PER_PART, min((part + 1) * GAUSSIANS_PER_PART, n_rows)):
                     for k in range(n_sums):
                         sums[row, k] = 0.0
                     for i in range(offsets[row], offsets[row + 1]):
@@ -267,7 +267,7 @@ def blend_rays_vjp(
 
 
 def _listed(response: RayResponse, scene: Scene, rays: Rays, conventions: Conventions, counts: Ints) -> Hits:
-    """Return the hits, ``counts`` [P] of each ray, with rows of the scene in the place of the population's."""
+    """Return the hits, ``counts`` [P] per ray, with rows of the scene instead of the population's."""
     offsets = np.concatenate([[0], np.cumsum(counts)])
     n_hits = int(offsets[-1])
     ray_ids, rows = np.empty((2, n_hits), np.int64)

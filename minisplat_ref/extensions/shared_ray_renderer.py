@@ -18,7 +18,7 @@ from minisplat_ref.extensions.shared_rays import (
     Rays,
     Tracer,
     blend_stats,
-    in_blocks,
+    block_order,
     pixel_rays,
     pixel_rays_vjp,
 )
@@ -70,7 +70,7 @@ def render(traced: Traced, model: Model, view: View, request: Request) -> tuple[
     Raises
     ------
     InputError
-        More is wanted than ``depth`` and ``stats``, or a degree that is not stored.
+        More is wanted than ``depth`` and ``stats``, or a degree of harmonics that is not stored.
     """
     g, camera, wants = model.gaussians, view.camera, request.wants
     if wants - WANTS:
@@ -83,7 +83,7 @@ def render(traced: Traced, model: Model, view: View, request: Request) -> tuple[
     opacities = _opacities(g.opacity_logits, request.is_visible)
     prepared = traced.prepare(g, opacities)
     tracer, in_rows = traced.tracer_for(prepared, conventions, backend), pixel_rays(camera, conventions)
-    order = in_blocks(camera.width, camera.height)
+    order = block_order(camera.width, camera.height)
     rays = Rays(*(field[order] for field in in_rows))
     colors = backend.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, degree, np.ones((len(g.means), 2), np.int32))
     blended = tracer.blend(colors, rays, background, conventions)
@@ -109,8 +109,8 @@ def render(traced: Traced, model: Model, view: View, request: Request) -> tuple[
 def render_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None) -> RenderGradient:
     """Gradient of :func:`render`.
 
-    Nothing is projected, so there is no gradient with respect to a projected centre. Density control gets what comes
-    nearest: a centre that moves parallel to the image by ``z / f`` moves by a pixel in it, so
+    Nothing is projected, so there is no gradient with respect to a projected centre. Density control gets the closest
+    substitute: a centre that moves parallel to the image by ``z / f`` moves by a pixel in it, so
 
         v_means2d_k = z / f_k (R v_mu)_k
     """
@@ -160,5 +160,5 @@ def _opacities(logits: Floats, is_visible: Bools | None) -> Floats:
 
 
 def _seen_radii(is_seen: Bools) -> Ints:
-    """Return radii [N, 2] as a projection would: 0 for what the stage of colours is to leave out."""
+    """Return radii [N, 2] like those of a projection: 0 for Gaussians that the stage of colours should skip."""
     return np.repeat(is_seen.astype(np.int32)[:, None], 2, axis=1)

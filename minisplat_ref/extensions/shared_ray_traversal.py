@@ -21,19 +21,19 @@ from minisplat_ref.jit.lanes import WIDTH, gather, load, maximum, minimum, reduc
 from minisplat_ref.types import Floats, Ints
 
 OPACITY = 0  # column of a record; the others are the extension's
-TINY = 1e-300  # in the place of a direction's zero, so that no infinity is multiplied by zero
-END_MARGIN = 0.999  # of the least transmittance: what is left out by the bound must not hang on a rounding
+TINY = 1e-300  # replaces zero components of a direction, so that no infinity is multiplied by zero
+END_MARGIN = 0.999  # of the least transmittance, so that rounding does not decide what the bound omits
 
 
 class Limits(NamedTuple):
-    """The thresholds as the kernels read them."""
+    """The thresholds in the form that the kernels use."""
 
     alpha_min: float
     alpha_max: float
     transmittance_min: float
     stops_at_equality: bool
     capacity: int
-    """Most hits that a ray holds at once."""
+    """Largest number of hits that a ray stores."""
 
 
 class Scene(NamedTuple):
@@ -42,25 +42,25 @@ class Scene(NamedTuple):
     records: Floats
     """[N', C] of those that can be seen at all; the column ``OPACITY`` is the opacity."""
     gaussian_ids: Ints
-    """[N'] int32 rows of the population."""
+    """[N'] int32 their rows in the population."""
     parts: Ints
     """[N'] int32 which part of the Gaussian; 0 of a whole one."""
     boxes: Floats
     """[K, 2, 6], as in :class:`.shared_bvh.Tree`; a bundle of a kernel holds no other bundle."""
     children: Ints
-    """[K, 2, 2]."""
+    """[K, 2, 2] as in :class:`.bvh.Tree`."""
     n: int
-    """Of the population."""
+    """Number of Gaussians of the population."""
 
 
 class Found(NamedTuple):
-    """What eight rays have found, nearest first, and what they still have to look at; each thread has its own."""
+    """The hits of eight rays, nearest first, and the stack of nodes that they still have to visit; one per thread."""
 
     depths: Floats  # [8, capacity]
     unclamped: Floats  # [8, capacity]
     rows: Ints  # [8, capacity] of the scene
     counts: Ints  # [8]
-    left: Floats  # [8] transmittance behind all that was found
+    left: Floats  # [8] transmittance behind all hits
     bounds: Floats  # [8] t beyond which nothing counts
     nodes: Ints  # [MOST_LEVELS]
     entries: Floats  # [MOST_LEVELS] a lower bound of t in the node
@@ -69,8 +69,8 @@ class Found(NamedTuple):
 
 
 @scalar
-def room_for(capacity):
-    """Return empty lists."""
+def empty_lists(capacity):
+    """Return empty lists with room for ``capacity`` hits per ray."""
     return Found(
         np.empty((WIDTH, capacity), np.float64),
         np.empty((WIDTH, capacity), np.float64),
@@ -93,7 +93,7 @@ def inverse_of(d):
 
 @scalar
 def entry(boxes, node, side, line):
-    """Return where lines enter and leave a box; they miss it where the former is larger."""
+    """Return the t at which lines enter and leave a box; they miss it where the former is larger."""
     ox, oy, oz, ix, iy, iz = line
     x0, x1 = (boxes[node, side, 0] - ox) * ix, (boxes[node, side, 3] - ox) * ix
     y0, y1 = (boxes[node, side, 1] - oy) * iy, (boxes[node, side, 4] - oy) * iy
@@ -105,7 +105,7 @@ def entry(boxes, node, side, line):
 
 @scalar
 def ray_of(rays, r):
-    """Return the origin and the direction of ray r."""
+    """Return origin and direction of ray r."""
     origins, directions = rays.origins, rays.directions
     return origins[r, 0], origins[r, 1], origins[r, 2], directions[r, 0], directions[r, 1], directions[r, 2]
 
@@ -125,7 +125,10 @@ def rays_of(rays, rows):
 
 
 def limits_of(conventions: Conventions, n: int) -> Limits:
-    """Return the thresholds of conventions; a ray through n Gaussians holds few if each takes its part of the light."""
+    """Return the thresholds of conventions, and the number of hits that a ray through n Gaussians has to store.
+
+    Each hit takes at least ``alpha_min`` of the light, which bounds that number.
+    """
     least = END_MARGIN * conventions.transmittance_min
     capacity = n
     if least > 0 and conventions.alpha_min > 0:
@@ -180,12 +183,12 @@ def finder(meet: Callable) -> Callable:
             b_is_met = reduce_any((b0 <= b1) & (b1 >= near) & (b0 <= bound))
             a_entry, b_entry = -reduce_max(-a0), -reduce_max(-b0)
             nearer = 0 if a_entry <= b_entry else 1
-            for step in range(2):  # nodes are put aside, the farther one first
+            for step in range(2):  # push nodes, the farther one first
                 side = nearer if step == 1 else 1 - nearer
                 if children[node, side, 1] == IS_INNER and (a_is_met if side == 0 else b_is_met):
                     nodes[n_waiting], entries[n_waiting] = children[node, side, 0], a_entry if side == 0 else b_entry
                     n_waiting += 1
-            for step in range(2):  # leaves are looked at, the nearer one first
+            for step in range(2):  # test leaves, the nearer one first
                 side = nearer if step == 0 else 1 - nearer
                 if children[node, side, 1] == IS_INNER or not (a_is_met if side == 0 else b_is_met):
                     continue
@@ -215,7 +218,7 @@ def finder(meet: Callable) -> Callable:
                         depths[k, i], alphas[k, i], rows[k, i] = t_k, unclamped, row
                         n += 1
                         T = left[k] * (1.0 - alpha)
-                        while n > 1 and T < least:  # does the last count, with what came to lie in front of it?
+                        while n > 1 and T < least:  # does the last still count behind the new one?
                             without = T / (1.0 - min(alpha_max, alphas[k, n - 1]))
                             if without >= least:
                                 break

@@ -20,7 +20,7 @@ class Rays(NamedTuple):
     origins: Floats
     """[P, 3] world frame."""
     directions: Floats
-    """[P, 3] of any length but zero, which depths are counted in."""
+    """[P, 3] of any length but zero; depths are in units of it."""
     near: Floats
     """[P]."""
     far: Floats
@@ -28,7 +28,7 @@ class Rays(NamedTuple):
 
 
 class Hits(NamedTuple):
-    """What rays meet and blend, ray after ray, nearest first."""
+    """The blended hits of rays, ray after ray, nearest first."""
 
     offsets: Ints
     """[P + 1] ray r has the hits offsets[r]:offsets[r + 1]."""
@@ -47,7 +47,7 @@ class Hits(NamedTuple):
 
 
 class BlendedRays(NamedTuple):
-    """What rays see."""
+    """The colours that rays see, and what their gradient needs."""
 
     image: Floats
     """[P, 3] background included."""
@@ -56,13 +56,13 @@ class BlendedRays(NamedTuple):
     transmittances: Floats
     """[P] behind the last hit."""
     n_hits: Ints
-    """[P] of each ray."""
+    """[P] number of blended hits."""
     is_seen: Bools
     """[N] whether any ray has blended the Gaussian."""
 
 
 class RayGradient(NamedTuple):
-    """Gradient of the loss with respect to all that :class:`BlendedRays` depend on."""
+    """Gradient of the loss with respect to everything that :class:`BlendedRays` depends on."""
 
     means: Floats
     """[N, 3]."""
@@ -93,9 +93,9 @@ class Tracer(NamedTuple):
 
 
 def pixel_rays(camera: Camera, conventions: Conventions) -> Rays:
-    """Return the rays through the centres of all pixels, row by row; their directions have a camera z of 1.
+    """Return the rays [H W] through the centres of all pixels, row by row, with directions whose camera z is 1.
 
-    So t is the camera z of a point on the ray, and the planes of ``conventions`` are its limits.
+    So t is the camera z of a point on the ray, and the near and far planes of ``conventions`` bound it.
     """
     camera = with_principal_point(camera, conventions).astype(np.float64)
     directions = _camera_rays(camera) @ camera.cam_from_world_R
@@ -105,8 +105,8 @@ def pixel_rays(camera: Camera, conventions: Conventions) -> Rays:
 
 
 @functools.cache
-def in_blocks(width: int, height: int) -> Ints:
-    """Return the pixels [H W] in blocks of 4 x 2: eight rays that go together through a tree should be neighbours."""
+def block_order(width: int, height: int) -> Ints:
+    """Return the pixels [H W] in blocks of 4 x 2, since eight rays that traverse a tree together should be adjacent."""
     ys, xs = np.divmod(np.arange(width * height), width)
     return np.lexsort((xs, ys, xs // 4, ys // 2))
 
@@ -140,16 +140,16 @@ def pixel_rays_vjp(
 
 
 def blend_stats(hits: Hits, size: tuple[int, int], n: int) -> BlendStats:
-    """Return what each of n Gaussians contributes to a picture.
+    """Return the contribution of each of n Gaussians to a picture.
 
     Parameters
     ----------
     hits : Hits
-        Of the picture's rays, row by row.
+        Hits of the picture's rays, row by row.
     size : tuple of 2 ints
         Height and width.
     n : int
-        Gaussians.
+        Number of Gaussians.
     """
     ids, rays, weights = hits.gaussian_ids, hits.ray_ids, hits.weights
     largest, dominant_ids = np.zeros(n), np.full(size[0] * size[1], -1, np.int32)

@@ -58,7 +58,7 @@ def ray_colors(
 
     Parameters
     ----------
-    way : str
+    method : str
         Key of ``METHODS``.
     primitives : Primitives
         N Gaussians.

@@ -144,7 +144,7 @@ def test_nothing_to_merge_and_nothing_seen():
     far_apart = grid(3, 1.0)
     assert len(in_levels(far_apart, Plan(2, 2, EVERYTHING)).means) == 9
     behind = far_apart._replace(means=-far_apart.means)
-    with pytest.raises(InputError, match="no training view sees any"):
+    with pytest.raises(InputError, match="no training view sees a Gaussian"):
         finest_densities(behind.means, [camera_of(64)])
 
 

@@ -5,7 +5,7 @@ import numpy as np
 from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.cuts.curve import N_EDGES, TOPS
 from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CutGaussians, with_cuts
-from minisplat_ref.extensions.shared_payload_stages import watching_stage
+from minisplat_ref.extensions.shared_payload_stages import renderer_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.reference.hits import TileHits
@@ -14,7 +14,7 @@ from minisplat_ref.types import Floats, Gaussians
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
     """Return the renderer; what is hit, and which part of a curve is nearest, is found by the reference."""
-    return (watching_stage(backend, setting, CUT_GAUSSIANS._replace(extend=_near), _sides, rng),)
+    return (renderer_stage(backend, setting, CUT_GAUSSIANS._replace(extend=_near), _sides, rng),)
 
 
 def _near(gaussians: Gaussians, rng: np.random.Generator) -> CutGaussians:

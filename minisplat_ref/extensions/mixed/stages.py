@@ -6,7 +6,7 @@ from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.mixed.method import MIXED_GAUSSIANS
 from minisplat_ref.extensions.mixed.population import MixedGaussians, as_ellipses
 from minisplat_ref.extensions.mixed.response import INSIDE
-from minisplat_ref.extensions.shared_payload_stages import watching_stage
+from minisplat_ref.extensions.shared_payload_stages import renderer_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.reference.hits import TileHits
@@ -18,7 +18,7 @@ N_EDGES = 3
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
     """Return the renderer; what is hit, and where the nearest points of hulls lie, is found by the reference."""
-    return (watching_stage(backend, setting, MIXED_GAUSSIANS._replace(extend=of_all_kinds), _sides, rng),)
+    return (renderer_stage(backend, setting, MIXED_GAUSSIANS._replace(extend=of_all_kinds), _sides, rng),)
 
 
 def of_all_kinds(gaussians: Gaussians, rng: np.random.Generator) -> MixedGaussians:

@@ -21,7 +21,7 @@ N_COLUMNS = 14
 
 @scalar
 def whitened(records, row, ray):
-    """Return p = M (mu - O) and v = M d, of one ray or of eight."""
+    """Return ``p = M (mu - O)`` and ``v = M d`` of one ray or of eight."""
     ox, oy, oz, dx, dy, dz = ray
     ux, uy, uz = records[row, MEAN] - ox, records[row, MEAN + 1] - oy, records[row, MEAN + 2] - oz
     p0 = records[row, MAP] * ux + records[row, MAP + 1] * uy + records[row, MAP + 2] * uz
@@ -35,7 +35,7 @@ def whitened(records, row, ray):
 
 @scalar
 def nearest_point(p0, p1, p2, v0, v1, v2):
-    """Return t and e = p - t v."""
+    """Return t and ``e = p - t v``."""
     t = (v0 * p0 + v1 * p1 + v2 * p2) / (v0 * v0 + v1 * v1 + v2 * v2)
     return t, p0 - t * v0, p1 - t * v1, p2 - t * v2
 
@@ -50,7 +50,7 @@ def meet(records, row, ray):
 
 @scalar
 def back(records, row, v):
-    """Return M^T v."""
+    """Return ``M^T v``."""
     return (
         records[row, MAP] * v[0] + records[row, MAP + 3] * v[1] + records[row, MAP + 6] * v[2],
         records[row, MAP + 1] * v[0] + records[row, MAP + 4] * v[1] + records[row, MAP + 7] * v[2],

@@ -3,7 +3,7 @@
 import numpy as np
 
 from minisplat_ref.backends import Backend
-from minisplat_ref.extensions.shared_payload_stages import watching_stage
+from minisplat_ref.extensions.shared_payload_stages import renderer_stage
 from minisplat_ref.extensions.textured.method import TEXTURED_GAUSSIANS
 from minisplat_ref.extensions.textured.reference import LIMB
 from minisplat_ref.extensions.textured.response import shade
@@ -17,7 +17,7 @@ NEAR_LIMB = 0.06  # of 1 - q . q, whose root has higher derivatives that a large
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
     """Return the renderer; what is hit, clamped or cut, and where a ray passes the limb, is found by the reference."""
-    return (watching_stage(backend, setting, TEXTURED_GAUSSIANS, _sides, rng),)
+    return (renderer_stage(backend, setting, TEXTURED_GAUSSIANS, _sides, rng),)
 
 
 def _sides(tile: TileHits, coefficients: Floats) -> tuple[Bools | Floats, ...]:
