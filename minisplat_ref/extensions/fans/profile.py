@@ -24,7 +24,7 @@ from minisplat_ref.types import Camera, Floats, Gaussians, view_from
 REACH_OF_GRID, STEP = 5.0, 0.025  # standard deviations
 SIZE, DISTANCE = 65, 10.0  # px, standard deviations
 OPACITY = 0.8
-SCALES = {"disc": (1.0, 1.0, 0.01), "ball": (1.0, 1.0, 1.0)}
+SCALES = {"disc": (1.0, 1.0, 0.01), "ball": (1.0, 1.0, 0.999)}  # a flat fan faces the camera first
 ANGLES = tuple(range(0, 91, 10))  # degrees
 
 
