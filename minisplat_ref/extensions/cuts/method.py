@@ -73,7 +73,7 @@ class _Tape(NamedTuple):
     gaussians: CutGaussians
     request: Request
     camera: Camera
-    sh_degree: int  # active
+    sh_degree: int | Ints  # active
     primitives: Primitives  # activated
     blended: tuple[CutFootprints, Floats, Floats, TileBins]  # footprints, colours, background, tile lists
     output: RenderOutput
@@ -96,7 +96,7 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, An
         way_out = "use --backend reference" if missing <= BY_REFERENCE else "train a recipe that does without"
         raise InputError(f"Gaussians with cuts are drawn without {', '.join(sorted(missing))}: {way_out}")
     stored_degree = math.isqrt(g.sh_rest.shape[1] + 1) - 1
-    sh_degree = stored_degree if request.sh_degree is None else min(request.sh_degree, stored_degree)
+    sh_degree = stored_degree if request.sh_degree is None else np.minimum(request.sh_degree, stored_degree)
     background = np.zeros(3, dtype) if request.background is None else np.asarray(request.background, dtype)
 
     with np.errstate(over="ignore"):

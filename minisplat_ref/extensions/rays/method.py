@@ -43,7 +43,7 @@ class _Tape(NamedTuple):
     model: Model
     camera: Camera
     request: Request
-    sh_degree: int
+    sh_degree: int | Ints
     background: Floats
     gaussians: Whitened
     tracer: Tracer
@@ -80,7 +80,7 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, _T
         raise InputError(f"rays does not give {names}: use a recipe that does not ask for it")
     dtype, conventions, backend = g.means.dtype, request.conventions, request.backend
     stored_degree = math.isqrt(g.sh_rest.shape[1] + 1) - 1
-    degree = stored_degree if request.sh_degree is None else min(request.sh_degree, stored_degree)
+    degree = stored_degree if request.sh_degree is None else np.minimum(request.sh_degree, stored_degree)
     background = np.zeros(3) if request.background is None else np.asarray(request.background, np.float64)
     gaussians = whitened_model(model)
     if request.is_visible is not None:

@@ -20,6 +20,7 @@ from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import (
     Camera,
     Floats,
+    Ints,
     Model,
     Primitives,
     ProjectionGradient,
@@ -38,7 +39,7 @@ class _Tape(NamedTuple):
     gaussians: TexturedGaussians
     request: Request
     camera: Camera
-    sh_degree: int  # active, of the view-dependent colour
+    sh_degree: int | Ints  # active, of the view-dependent colour
     primitives: Primitives  # activated, with the opacity o_B
     blended: tuple[Footprints, Floats, Floats, TileBins]  # footprints, coefficients of colour, background, tile lists
     output: RenderOutput
@@ -61,7 +62,7 @@ def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, An
         way_out = "use --backend reference" if missing <= BY_REFERENCE else "train a recipe that does without"
         raise InputError(f"textured Gaussians are drawn without {', '.join(sorted(missing))}: {way_out}")
     stored_degree = math.isqrt(g.sh_rest.shape[1] + 1) - 1
-    sh_degree = stored_degree if request.sh_degree is None else min(request.sh_degree, stored_degree)
+    sh_degree = stored_degree if request.sh_degree is None else np.minimum(request.sh_degree, stored_degree)
     background = np.zeros(3, dtype) if request.background is None else np.asarray(request.background, dtype)
 
     with np.errstate(over="ignore"):
