@@ -3,8 +3,8 @@
 Eight Gaussians are processed together. The formulas need the same coefficient of all eight, but in memory the
 coefficients of one Gaussian are contiguous. They are therefore transposed in small buffers that stay in the cache, and
 copied to and from memory row by row: processors prefetch a single stream, but not eight rows read column by column.
-Work is proportional to what the camera sees, and to the coefficients there are: each chunk of Gaussians loops, degree by
-degree, over a list of the visible ones of that degree.
+Work is proportional to what the camera sees and to the coefficients that there are: each chunk of Gaussians loops,
+degree by degree, over a list of the visible ones of that degree.
 
 Helpers have no loops and no branches: the compiler would count references of the arrays that such a helper is given,
 an atomic operation each.

@@ -26,6 +26,7 @@ from minisplat_ref.types import (
     Camera,
     Floats,
     Gaussians,
+    Ints,
     Model,
     Primitives,
     Projection,

@@ -14,7 +14,7 @@ directions from which the Gaussian has been seen is removed, from the highest do
     variation_l = sqrt( mean over v and colours of (c_l(d_v) - mean c_l)^2 )
 
 and the mean, which does not depend on the view, goes to the coefficient of degree 0: ``k_00 += mean c_l / Y_00``. What
-the photographs cannot show in steps of 1/255 is not worth its numbers.
+hardly shows in photographs is not worth its numbers.
 
 Absent bands are zeros in ``sh_rest``, which every viewer of PLY files understands; neither colours nor Adam compute
 with them (``stats["sh_degree"]`` is the degree of each Gaussian).
@@ -65,10 +65,10 @@ def grow_bands(state: TrainState, iteration: Iteration, *, views_per_coefficient
         Training views that a Gaussian must have been seen in for each coefficient of a channel of its colour.
     """
     n, n_views = n_rows(state.gaussians), len(iteration.scene.train_views)
-    if DEGREES not in state.stats:
-        state.stats[DEGREES], state.stats[SEEN] = np.zeros(n, np.uint8), np.zeros((n, n_views), bool)
     if state.pace.cooling_from is not None:
         return
+    if DEGREES not in state.stats:
+        state.stats[DEGREES], state.stats[SEEN] = np.zeros(n, np.uint8), np.zeros((n, n_views), bool)
     is_seen, view = state.stats[SEEN], iteration.view.view_id
     ids = iteration.visible_ids[iteration.v_means2d[iteration.visible_ids].any(axis=1)]  # those in front of others
     ids = ids[~is_seen[ids, view]]
@@ -89,7 +89,7 @@ def cut_bands_when_cooling(state: TrainState, iteration: Iteration, *, least_var
     """
     if state.pace.cooling_from is None or iteration.step != state.pace.cooling_from + 1:
         return
-    degrees, is_seen = state.stats[DEGREES], state.stats[SEEN]
+    degrees, is_seen = state.stats[DEGREES], state.stats.pop(SEEN)
     state.gaussians, state.stats[DEGREES] = without_idle_bands(
         state.gaussians, degrees, iteration.scene.train_views, is_seen, least_variation
     )

@@ -27,7 +27,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.studies.ablation import append, read_records
 from minisplat_ref.experiments.studies.defects import multiplied, with_turned_cameras
 from minisplat_ref.experiments.studies.front import BLUE, RED, describe_scene, read_scene, tidy, title, write
-from minisplat_ref.methods import adaptive, gaussian_splatting, get_recipe
+from minisplat_ref.methods import adaptive, adaptive_bands, gaussian_splatting, get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.training.loop import train
@@ -107,6 +107,13 @@ def without_growth(recipe: Recipe) -> Recipe:
     return recipe._replace(events=tuple(event for event in recipe.events if not does(event, adaptive.grow)))
 
 
+def with_all_bands(recipe: Recipe) -> Recipe:
+    """Return the recipe with the harmonics of 3DGS: all degrees for all Gaussians, one more every 200 iterations."""
+    actions = adaptive_bands.grow_bands, adaptive_bands.cut_bands_when_cooling
+    events = tuple(event for event in recipe.events if not does(event, *actions))
+    return recipe._replace(events=events, sh_milestones=(200, 400, 600))
+
+
 def with_growth(recipe: Recipe, **factors: float) -> Recipe:
     """Return the recipe with settings of its growth multiplied by factors."""
     settings = settings_of(recipe)
@@ -120,6 +127,9 @@ RULES: Mapping[str, Callable[[Recipe], Recipe]] = {
     "rates of 3DGS": with_published_rates,
     "no cool-down": without_cool_down,
     "no prune": lambda recipe: configured(recipe, mass=1.0, least_views=0),
+    "all bands": with_all_bands,
+    "no bands": lambda recipe: configured(recipe, views_per_coefficient=math.inf),
+    "no cut of bands": lambda recipe: configured(recipe, least_variation=0.0),
     "no exposures": lambda recipe: configured(recipe, least_exposure_gain=math.inf),
     "no poses": lambda recipe: configured(recipe, least_pose_gain=math.inf),
 }
