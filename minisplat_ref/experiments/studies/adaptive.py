@@ -31,10 +31,10 @@ from minisplat_ref.methods import adaptive, adaptive_bands, gaussian_splatting, 
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.rates import Rates
+from minisplat_ref.training.rates import Rates, n_coefficients
 from minisplat_ref.training.schedule import Recipe, configured, does, scaled, settings_of
 from minisplat_ref.training.state import Iteration, StepReport, TrainState
-from minisplat_ref.types import Scene
+from minisplat_ref.types import Gaussians, Scene
 
 ITERATIONS = 3000  # of recipes with a schedule
 WARM_UP = 20  # iterations
@@ -42,6 +42,7 @@ N_MEASUREMENTS = 24  # in those iterations; for adaptive with the same interval
 FEW = 5  # one of every so many training photographs remains
 GAINS = (0.7, 1.4)  # of a photograph, uniform in the logarithm
 NEAR = 0.1  # dB
+MEANS = ("psnr", "n_gaussians", "n_numbers", "step", "seconds")  # over seeds
 COLORS = (BLUE, "#7a9a3a", "#c98a2b", RED, "#6f5b9a")
 
 
@@ -179,7 +180,16 @@ def run(args: argparse.Namespace) -> None:
     write(args.out, result, draw(records))
     print(title(description))
     print(f"seeds {', '.join(map(str, args.seeds))}; seconds of the processor\n")
-    heading = ["condition", "recipe", "PSNR (dB)", "fall since its best", "Gaussians", "iterations", "seconds"]
+    heading = [
+        "condition",
+        "recipe",
+        "PSNR (dB)",
+        "fall since its best",
+        "Gaussians",
+        "numbers",
+        "iterations",
+        "seconds",
+    ]
     print(markdown_table([*heading, f"until {next(iter(recipes))} - {NEAR} dB"], [_cells(row) for row in rows]))
     if args.sweep:
         for condition in args.conditions:
@@ -211,12 +221,20 @@ def measure(scene: Scene, recipe: Recipe, seed: int) -> dict[str, Any]:
         value = evaluate(report.state.model, scene.test_views, background=scene.background, renderer=recipe.renderer)
         n = len(report.state.gaussians.means)
         curve.append({"step": report.step, "seconds": now - start - paused, "psnr": value.psnr, "n_gaussians": n})
-        curve[-1]["ssim"] = value.ssim
+        curve[-1] |= {"ssim": value.ssim, "n_numbers": n_numbers(report.state.gaussians)}
         paused += time.process_time() - now
 
     state = train(scene, recipe, seed=seed, on_step=on_step)
     decisions = [decision._asdict() for decision in state.pace.decisions]
     return {**curve[-1], "curve": curve, "decisions": decisions}
+
+
+def n_numbers(gaussians: Gaussians) -> int:
+    """Return how many numbers a model consists of, without those of bands of the harmonics that are zero."""
+    of_coefficients = np.sqrt(np.arange(1, gaussians.sh_rest.shape[1] + 1)).astype(int)  # [K - 1] degrees
+    degrees = (gaussians.sh_rest.any(axis=2) * of_coefficients).max(axis=1, initial=0)  # [N]
+    n_others = sum(int(np.prod(field.shape[1:])) for name, field in gaussians._asdict().items() if name != "sh_rest")
+    return int((n_others + 3 * n_coefficients(degrees)).sum())
 
 
 def summarise(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -237,7 +255,7 @@ def summarise(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 {
                     "condition": condition,
                     "recipe": name,
-                    **{k: float(np.mean([run[k] for run in runs])) for k in ("psnr", "n_gaussians", "step", "seconds")},
+                    **{k: float(np.mean([run[k] for run in runs])) for k in MEANS},
                     "difference": float(np.mean(differences)),
                     "standard_error": standard_error(differences),
                     "fall": float(np.mean([max(p["psnr"] for p in run["curve"]) - run["psnr"] for run in runs])),
@@ -289,6 +307,7 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
         f"{row['psnr']:.2f} ({row['difference']:+.2f}{error})",
         f"{row['fall']:.2f}",
         f"{row['n_gaussians']:,.0f}",
+        f"{row['n_numbers']:,.0f}",
         f"{row['step']:,.0f}",
         f"{row['seconds']:.0f}",
         "never" if row["until"] is None else f"{row['until']:.0f}",
