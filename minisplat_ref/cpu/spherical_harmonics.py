@@ -139,8 +139,9 @@ def _constant(sh_dc, rows, c0):
 
 
 @scalar
-def _chunk_colors(first, end, shaded, harmonics, degree, radii, colors):
+def _chunk_colors(span, degree, shaded, harmonics, radii, colors):
     """Evaluate the colours of the Gaussians of one degree; the others' are left as they are."""
+    first, end = span
     means, sh_dc, sh_rest, width = shaded
     centre, c, degrees = harmonics.centre, harmonics.constants, harmonics.degrees
     staged = np.empty(STAGE * WIDTH, means.dtype)
@@ -188,7 +189,7 @@ def _sh_colors(
             for channel in range(3):
                 colors[n, channel] = ZERO
         for degree in range(harmonics.lowest, harmonics.highest + 1):
-            _chunk_colors(first, end, shaded, harmonics, degree, radii, colors)
+            _chunk_colors((first, end), degree, shaded, harmonics, radii, colors)
 
 
 def _harmonics(camera: Camera, degree: int | Ints, means: Floats) -> Harmonics:
@@ -238,8 +239,9 @@ def _zero_culled(first, end, radii, v):
 
 
 @scalar
-def _chunk_vjp(first, end, shaded, harmonics, degree, radii, v_colors, v, v_offset):
-    """Chain the gradient of the Gaussians of one degree, and add those with respect to their offsets up."""
+def _chunk_vjp(span, degree, shaded, harmonics, radii, v_colors, v, v_offset):
+    """Chain the gradient of the Gaussians of one degree, and add up those with respect to their offsets."""
+    first, end = span
     means, sh_dc, sh_rest, width = shaded
     centre, c, degrees = harmonics.centre, harmonics.constants, harmonics.degrees
     v_means, v_dc, v_rest, _ = v
@@ -320,7 +322,7 @@ def _sh_colors_vjp(
         v_offsets[chunk] = ZERO
         _zero_culled(first, end, radii, v)
         for degree in range(harmonics.lowest, harmonics.highest + 1):
-            _chunk_vjp(first, end, shaded, harmonics, degree, radii, v_colors, v, v_offsets[chunk])
+            _chunk_vjp((first, end), degree, shaded, harmonics, radii, v_colors, v, v_offsets[chunk])
     return total_of(v_offsets)
 
 
