@@ -39,7 +39,7 @@ class RenderTape(NamedTuple):
     """Record of a call of :func:`render`, for :func:`render_vjp` and for statistics of what was visible."""
 
     gaussians: Gaussians
-    sh_degree: int  # active
+    sh_degree: int | Ints  # active, of all or [N] of each
     splats: SplatTape  # the activated Gaussians and the results of each stage
 
     @property
@@ -64,7 +64,7 @@ def render(
     camera: Camera,
     *,
     background: Floats | None = None,
-    sh_degree: int | None = None,
+    sh_degree: int | Ints | None = None,
     conventions: Conventions = GSPLAT_MAIN,
     backend: Backend = CPU,
     is_visible: Bools | None = None,
@@ -82,8 +82,8 @@ def render(
         View.
     background : ndarray of shape (3,), optional
         RGB behind everything; black by default.
-    sh_degree : int, optional
-        Active degree, at most the stored one, which is the default.
+    sh_degree : int, or ndarray of shape (N,) of int, optional
+        Active degree, of all Gaussians or of each, at most the stored one, which is the default.
     conventions : Conventions
         Profile of the rasteriser.
     backend : Backend
@@ -105,8 +105,10 @@ def render(
     dtype = gaussians.means.dtype
     stored_degree = math.isqrt(gaussians.sh_rest.shape[1] + 1) - 1
     sh_degree = stored_degree if sh_degree is None else sh_degree
-    if not 0 <= sh_degree <= stored_degree:
-        raise InputError(f"sh_degree is {sh_degree}; these Gaussians store degrees 0 to {stored_degree}")
+    lowest, highest = np.min(sh_degree, initial=stored_degree), np.max(sh_degree, initial=0)
+    if not 0 <= lowest <= highest <= stored_degree:
+        wrong = highest if lowest >= 0 else lowest
+        raise InputError(f"sh_degree is {wrong}; these Gaussians store degrees 0 to {stored_degree}")
     background = np.zeros(3, dtype) if background is None else np.asarray(background, dtype)
 
     def shade(radii: Ints) -> Floats:
@@ -202,8 +204,9 @@ class Request(NamedTuple):
 
     background: Floats | None = None
     """[3] RGB behind everything; black by default."""
-    sh_degree: int | None = None
-    """Highest degree of the spherical harmonics; by default, and at most, the stored degree."""
+    sh_degree: int | Ints | None = None
+    """Highest degree of the spherical harmonics, of all Gaussians or [N] of each; by default, and at most, the stored
+    degree."""
     conventions: Conventions = GSPLAT_MAIN
     backend: Backend = CPU
     is_visible: Bools | None = None
@@ -239,7 +242,7 @@ def _render_model(model: Model, view: View, request: Request) -> tuple[RenderOut
         gaussians,
         view.camera,
         background=request.background,
-        sh_degree=None if request.sh_degree is None else min(request.sh_degree, stored_degree),
+        sh_degree=None if request.sh_degree is None else np.minimum(request.sh_degree, stored_degree),
         conventions=request.conventions,
         backend=request.backend,
         is_visible=request.is_visible,

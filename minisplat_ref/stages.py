@@ -69,7 +69,7 @@ class SHColors(Protocol):
         sh_dc: Floats,  # [N, 3]
         sh_rest: Floats,  # [N, K-1, 3]
         camera: Camera,
-        degree: int,  # active, at most the stored one
+        degree: int | Ints,  # active, at most the stored one: of all Gaussians, or [N] of each
         radii: Ints,  # [N, 2] of the projection, 0 where culled
     ) -> Floats: ...
 
@@ -83,7 +83,7 @@ class SHColorsVjp(Protocol):
         sh_dc: Floats,  # [N, 3]
         sh_rest: Floats,  # [N, K-1, 3]
         camera: Camera,
-        degree: int,
+        degree: int | Ints,
         radii: Ints,  # [N, 2]
         v_colors: Floats,  # [N, 3]
     ) -> SHGradient: ...
@@ -184,4 +184,5 @@ class AdamUpdate(Protocol):
         second: Floats,  # [N, W] mean squared gradient
         rows: Ints | None,  # [V] to update, each once; None for all
         step: AdamStep,
+        widths: Ints | None = None,  # [N] numbers of each row to update, the first ones; None for all
     ) -> None: ...

@@ -132,6 +132,29 @@ def test_visible_only_leaves_the_other_rows_alone(backend, rng):
         assert_array_equal(new[hidden], old[hidden])
 
 
+@pytest.mark.parametrize("rule", [DENSE, SPARSE])
+def test_only_the_first_numbers_of_a_row_are_updated(backend, rng, rule):
+    """As in a full update; the others may hold any gradient, and keep their values and moments."""
+    n, ids = 40, np.arange(0, 40, 3)
+    start, gradient = random_pair(rng, n), random_pair(rng, n)
+    full, part = copy(start), copy(start)
+    state, state_of_part = zero_moments(start), zero_moments(start)
+    widths = rng.integers(0, 7, size=n)
+    is_updated = (np.arange(6) < widths[:, None]).reshape(n, 2, 3)
+    for _ in range(2):
+        state = adam_step(full, gradient, state, RATES, rule, ids, backend)
+        hidden = gradient._replace(b=np.where(is_updated, gradient.b, np.nan))
+        state_of_part = adam_step(part, hidden, state_of_part, RATES, rule, ids, backend, widths={"b": widths})
+    assert_array_equal(part.a, full.a)
+    assert (full.b != start.b)[~is_updated].any()
+    for own, expected, untouched in (
+        (part.b, full.b, start.b),
+        (state_of_part.first.b, state.first.b, 0),
+        (state_of_part.second.b, state.second.b, 0),
+    ):
+        assert_array_equal(own, np.where(is_updated, expected, untouched))
+
+
 def test_rows_one_by_one_are_all_rows(rng):
     """Runs of rows, eight numbers at a time, rows alone and the whole array at once: the same bytes."""
     n = 301

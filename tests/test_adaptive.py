@@ -81,8 +81,8 @@ def test_no_step_is_taken_on_held_out_views_before_the_cool_down(scene, reports)
 
 def test_it_ends_after_the_cool_down(reports):
     seen, state = reports
-    decision, pruned = state.pace.decisions
-    assert decision.what == "cool down" and decision.step == state.pace.cooling_from == pruned.step - 1
+    decision, pruned, cut = state.pace.decisions
+    assert decision.what == "cool down" and decision.step == state.pace.cooling_from == pruned.step - 1 == cut.step - 1
     assert state.step == state.pace.last_step == min(700, decision.step + -(-6 * decision.step // 10))
     assert seen[0][2] is None and seen[-1][2] == state.step
     assert [m.step for m in state.pace.measurements] == list(range(200, decision.step + 1, 100))

@@ -95,6 +95,48 @@ def test_higher_degrees_wait_until_they_are_active(backend, rng):
         assert_array_equal(cut, full)
 
 
+def coefficients_of(gaussians, degrees):
+    """The coefficients without those above each Gaussian's degree."""
+    is_present = np.arange(gaussians.sh_rest.shape[1]) < ((degrees.astype(int) + 1) ** 2 - 1)[:, None]
+    return np.where(is_present[:, :, None], gaussians.sh_rest, 0), is_present
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_absent_bands_are_bands_of_zeros(backend, dtype, rng):
+    """Colours, and their gradients with respect to all that is there, are the same to the last bit."""
+    gaussians = make_gaussians(rng, 300)
+    gaussians = gaussians._make(field.astype(dtype) for field in gaussians)
+    camera, v = make_camera(rng=rng), rng.normal(size=(300, 3)).astype(dtype)
+    radii = rng.integers(0, 2, size=300)[:, None].repeat(2, axis=1).astype(np.int32)
+    degrees = rng.integers(0, 4, size=300).astype(np.uint8)
+    present, is_present = coefficients_of(gaussians, degrees)
+    gaussians.sh_rest[~is_present] = np.nan  # nobody looks
+    own = (gaussians.means, gaussians.sh_dc, gaussians.sh_rest, camera, degrees, radii)
+    full = (gaussians.means, gaussians.sh_dc, present, camera, 3, radii)
+    colors, expected = backend.sh_colors(*own), backend.sh_colors(*full)
+    assert_array_equal(colors, expected)
+    assert (colors > 0).any()
+    gradient, expected = backend.sh_colors_vjp(*own, v), backend.sh_colors_vjp(*full, v)
+    assert_array_equal(gradient.means, expected.means)
+    assert_array_equal(gradient.sh_dc, expected.sh_dc)
+    assert_array_equal(gradient.sh_rest, np.where(is_present[:, :, None], expected.sh_rest, 0))
+    assert (expected.sh_rest[~is_present] != 0).any()
+    tolerance = PARITY_FLOAT64 if dtype == np.float64 else PARITY_FLOAT32_GRADIENT  # sums in another order
+    for name in ("cam_from_world_R", "cam_from_world_t"):
+        e = getattr(expected, name)
+        assert_allclose(getattr(gradient, name), e, rtol=0, atol=tolerance * np.abs(e).max())
+
+
+def test_equal_degrees_are_one_degree(backend, rng):
+    gaussians, camera, radii = make_gaussians(rng, 40), make_camera(rng=rng), np.ones((40, 2), np.int32)
+    arrays, v = (gaussians.means, gaussians.sh_dc, gaussians.sh_rest, camera), rng.normal(size=(40, 3))
+    each = np.full(40, 2, np.uint8)
+    assert_array_equal(backend.sh_colors(*arrays, each, radii), backend.sh_colors(*arrays, 2, radii))
+    both = (backend.sh_colors_vjp(*arrays, degree, radii, v) for degree in (each, 2))
+    for own, one in zip(*both, strict=True):
+        assert_array_equal(own, one)
+
+
 def test_culled_gaussians_are_black(backend, rng):
     gaussians, camera = make_gaussians(rng, 4), make_camera()
     gaussians.means[1] = np.nan
@@ -191,11 +233,12 @@ def test_a_colour_of_exactly_zero_has_no_gradient(backend, dtype):
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, "each"])
 def test_backends_agree(fast_backend, degree, dtype, rng):
     gaussians, camera = make_gaussians(rng, 100), make_camera(rng=rng)
     radii = rng.integers(0, 2, size=100)[:, None].repeat(2, axis=1).astype(np.int32)
     v = rng.normal(size=(100, 3))
+    degree = rng.integers(0, 4, size=100).astype(np.uint8) if degree == "each" else degree
     arrays = (gaussians.means, gaussians.sh_dc, gaussians.sh_rest)
     expected = REFERENCE.sh_colors(*arrays, camera, degree, radii)
     v_expected = REFERENCE.sh_colors_vjp(*arrays, camera, degree, radii, v)

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from scenes import make_gaussians
 
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
@@ -39,6 +40,9 @@ def test_each_rule_is_taken_out():
     assert recipes["rates of 3DGS"].learning_rates.at(9, 1.0)["means"] == 1.6e-4
     assert recipes["no cool-down"].cooling.last_per_extent == 1.0
     assert settings_of(recipes["no prune"])["mass"] == 1.0
+    assert recipes["all bands"].sh_milestones and len(names["all bands"]) == len(names["adaptive"]) - 2
+    assert settings_of(recipes["no bands"])["views_per_coefficient"] == np.inf
+    assert settings_of(recipes["no cut of bands"])["least_variation"] == 0.0
     assert settings_of(recipes["no exposures"])["least_exposure_gain"] == np.inf
     assert settings_of(recipes["no poses"])["least_pose_gain"] == np.inf
     for recipe in recipes.values():
@@ -47,7 +51,10 @@ def test_each_rule_is_taken_out():
 
 def test_rows_by_hand():
     def run(recipe, seed, psnrs):
-        curve = [{"step": 10 * k, "seconds": 2.0 * k, "psnr": p, "n_gaussians": 5} for k, p in enumerate(psnrs, 1)]
+        curve = [
+            {"step": 10 * k, "seconds": 2.0 * k, "psnr": p, "n_gaussians": 5, "n_numbers": 70}
+            for k, p in enumerate(psnrs, 1)
+        ]
         return {"condition": "whole", "recipe": recipe, "seed": seed, **curve[-1], "curve": curve}
 
     runs = [run("a", 0, [20, 25, 24]), run("a", 1, [21, 22]), run("b", 0, [23.9, 24.5, 24.4]), run("b", 1, [22, 22.6])]
@@ -57,6 +64,17 @@ def test_rows_by_hand():
     assert second["fall"] == pytest.approx(0.05) and second["until"] == 2.0
     never = adaptive.summarise([*runs[:1], run("b", 0, [20, 21])])[1]
     assert never["until"] is None and never["standard_error"] is None
+
+
+def test_numbers_of_bands_that_are_there():
+    """14 for degree 0; a Gaussian with a coefficient of degree 2 has all eight up to it, of three colours."""
+    gaussians = make_gaussians(np.random.default_rng(0), 3)
+    assert adaptive.n_numbers(gaussians) == 3 * 59
+    gaussians.sh_rest[1:] = 0
+    assert adaptive.n_numbers(gaussians) == 59 + 2 * 14
+    gaussians.sh_rest[2, 3, 1] = 1e-9
+    assert adaptive.n_numbers(gaussians) == 59 + 14 + 14 + 24
+    assert adaptive.n_numbers(gaussians._replace(sh_rest=gaussians.sh_rest[:, :0])) == 3 * 14
 
 
 def test_regret_by_hand():

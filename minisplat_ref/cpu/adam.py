@@ -6,6 +6,8 @@ updated at a time. Otherwise a row of three numbers would cost as much as one of
 
 from typing import NamedTuple
 
+import numpy as np
+
 from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.jit.lanes import WIDTH, load, store
 from minisplat_ref.scalar.adam import Step, adam_value
@@ -67,6 +69,20 @@ def _update_rows(
             _update_run(tables, row * width, after * width, step)
 
 
+@kernel()
+def _update_parts(
+    tables,  # Tables
+    rows,  # [V] ascending
+    width,  # numbers in a row, W
+    widths,  # [N] of them to update
+    step,
+):
+    for chunk in prange(N_CHUNKS):
+        for i in range(rows.size * chunk // N_CHUNKS, rows.size * (chunk + 1) // N_CHUNKS):
+            start = rows[i] * width
+            _update_run(tables, start, start + widths[rows[i]], step)
+
+
 def adam_update(
     values: Floats,
     gradient: Floats,
@@ -74,12 +90,16 @@ def adam_update(
     second: Floats,
     rows: Ints | None,
     step: AdamStep,
+    widths: Ints | None = None,
 ) -> None:
     """Update values and moments in place; see ``reference.adam.adam_update``."""
     numbers = (step.rate, 1 - step.beta1, 1 - step.beta2, step.eps)
     in_dtype = Step._make(values.dtype.type(number) for number in numbers)
     tables = Tables(values.reshape(-1), gradient.reshape(-1), first.reshape(-1), second.reshape(-1))
-    if rows is None:
+    if widths is not None:
+        rows = np.arange(len(values)) if rows is None else rows
+        _update_parts(tables, rows, values.shape[1], widths, in_dtype)
+    elif rows is None:
         _update_all(tables, in_dtype)
     else:
         _update_rows(tables, rows, values.shape[1], in_dtype)

@@ -38,6 +38,22 @@ def list_visible(radii, first, end, rows):
     for n in range(first, end):
         rows[count] = n
         count += int(radii[n, 0] > 0)
+    return padded(rows, count)
+
+
+@scalar
+def list_visible_of(radii, degrees, degree, first, end, rows):
+    """List those of the visible Gaussians of a range whose colours have a degree; otherwise as ``list_visible``."""
+    count = 0
+    for n in range(first, end):
+        rows[count] = n
+        count += int(radii[n, 0] > 0) & int(degrees[n] == degree)
+    return padded(rows, count)
+
+
+@scalar
+def padded(rows, count):
+    """Pad a list with copies of its last row; return the number without these."""
     for i in range(count, count + WIDTH):
         rows[i] = rows[max(count - 1, 0)]
     return count

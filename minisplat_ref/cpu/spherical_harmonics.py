@@ -3,7 +3,8 @@
 Eight Gaussians are processed together. The formulas need the same coefficient of all eight, but in memory the
 coefficients of one Gaussian are contiguous. They are therefore transposed in small buffers that stay in the cache, and
 copied to and from memory row by row: processors prefetch a single stream, but not eight rows read column by column.
-Work is proportional to what the camera sees: each chunk of Gaussians loops over a list of its visible ones.
+Work is proportional to what the camera sees and to the coefficients that there are: each chunk of Gaussians loops,
+degree by degree, over a list of the visible ones of that degree.
 
 Helpers have no loops and no branches: the compiler would count references of the arrays that such a helper is given,
 an atomic operation each.
@@ -14,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import SH_C0, SH_C1, SH_C2, SH_C3
-from minisplat_ref.cpu.gaussian_rows import DOUBLE, add, list_visible, listed_rows, total_of, triple
+from minisplat_ref.cpu.gaussian_rows import DOUBLE, add, list_visible_of, listed_rows, total_of, triple
 from minisplat_ref.cpu.memory import large_empty
 from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.jit.compile import kernel, prange, scalar
@@ -67,10 +68,13 @@ class Harmonics(NamedTuple):
 
     centre: Floats
     """[3] of the camera, float64."""
-    degree: int
-    """Active degree."""
     constants: Floats
     """[10] of degrees 0, 1, 2 (3) and 3 (5)."""
+    degrees: Ints
+    """[N] uint8, active degree of each Gaussian."""
+    lowest: int
+    """Of the degrees, likewise below."""
+    highest: int
 
 
 @scalar
@@ -135,18 +139,17 @@ def _constant(sh_dc, rows, c0):
 
 
 @scalar
-def _chunk_colors(first, end, shaded, harmonics, radii, colors):
+def _chunk_colors(span, degree, shaded, harmonics, radii, colors):
+    """Evaluate the colours of the Gaussians of one degree; the others' are left as they are."""
+    first, end = span
     means, sh_dc, sh_rest, width = shaded
-    centre, degree, c = harmonics
+    centre, c, degrees = harmonics.centre, harmonics.constants, harmonics.degrees
     staged = np.empty(STAGE * WIDTH, means.dtype)
     y = np.empty(N_BASES * WIDTH, means.dtype)
     rest = np.empty(N_REST * WIDTH, means.dtype)
     visible = np.empty(end - first + WIDTH, np.int64)
-    count = list_visible(radii, first, end, visible)
+    count = list_visible_of(radii, degrees, degree, first, end, visible)
     n_rest = (degree + 1) * (degree + 1) - 1
-    for n in range(first, end):
-        for channel in range(3):
-            colors[n, channel] = ZERO
     for i in range(0, count, WIDTH):
         rows = listed_rows(visible, i)
         dx, dy, dz, _ = _direction(centre, means, rows)
@@ -182,18 +185,25 @@ def _sh_colors(
     n_gaussians = radii.shape[0]
     for chunk in prange(N_CHUNKS):
         first, end = n_gaussians * chunk // N_CHUNKS, n_gaussians * (chunk + 1) // N_CHUNKS
-        _chunk_colors(first, end, shaded, harmonics, radii, colors)
+        for n in range(first, end):
+            for channel in range(3):
+                colors[n, channel] = ZERO
+        for degree in range(harmonics.lowest, harmonics.highest + 1):
+            _chunk_colors((first, end), degree, shaded, harmonics, radii, colors)
 
 
-def _harmonics(camera: Camera, degree: int, dtype: np.dtype) -> Harmonics:
-    return Harmonics(camera.astype(np.float64).center, degree, np.array(_CONSTANTS, dtype))
+def _harmonics(camera: Camera, degree: int | Ints, means: Floats) -> Harmonics:
+    degrees = np.full(len(means), degree, np.uint8)
+    lowest, highest = (int(np.min(degree, initial=255)), int(np.max(degree, initial=0)))
+    constants = np.array(_CONSTANTS, means.dtype)
+    return Harmonics(camera.astype(np.float64).center, constants, degrees, lowest, highest)
 
 
-def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int, radii: Ints) -> Floats:
+def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int | Ints, radii: Ints) -> Floats:
     """Evaluate the colour of every visible Gaussian; see ``reference.spherical_harmonics.sh_colors``."""
     colors = np.empty(sh_dc.shape, sh_dc.dtype)
     shaded = Shaded(means, sh_dc, sh_rest.ravel(), 3 * sh_rest.shape[1])
-    _sh_colors(shaded, _harmonics(camera, degree, means.dtype), radii, colors)
+    _sh_colors(shaded, _harmonics(camera, degree, means), radii, colors)
     return colors
 
 
@@ -229,18 +239,18 @@ def _zero_culled(first, end, radii, v):
 
 
 @scalar
-def _chunk_vjp(first, end, shaded, harmonics, radii, v_colors, v, v_offset):
+def _chunk_vjp(span, degree, shaded, harmonics, radii, v_colors, v, v_offset):
+    """Chain the gradient of the Gaussians of one degree, and add up those with respect to their offsets."""
+    first, end = span
     means, sh_dc, sh_rest, width = shaded
-    centre, degree, c = harmonics
+    centre, c, degrees = harmonics.centre, harmonics.constants, harmonics.degrees
     v_means, v_dc, v_rest, _ = v
     staged = np.empty(STAGE * WIDTH, means.dtype)
     y = np.empty(N_BASES * WIDTH, means.dtype)
     rest = np.zeros(max(width, WIDTH) * WIDTH, means.dtype)  # beyond the active degree the gradient is zero
     visible = np.empty(end - first + WIDTH, np.int64)
-    count = list_visible(radii, first, end, visible)
+    count = list_visible_of(radii, degrees, degree, first, end, visible)
     n_rest = (degree + 1) * (degree + 1) - 1
-    v_offset[:] = ZERO
-    _zero_culled(first, end, radii, v)
     for i in range(0, count, WIDTH):
         rows = listed_rows(visible, i)
         dx, dy, dz, inverse = _direction(centre, means, rows)
@@ -271,11 +281,14 @@ def _chunk_vjp(first, end, shaded, harmonics, radii, v_colors, v, v_offset):
         for k in range(n_rest):
             _rest_vjp(k, v_red, v_green, v_blue, y, rest)
         for column in range(0, width, WIDTH):
-            _turn_back(rest, min(column, width - WIDTH), staged, column)
-        for r in range(WIDTH):
-            for column in range(0, width, WIDTH):
-                k = min(column, width - WIDTH)
-                store(v_rest, visible[i + r] * width + k, load(staged, r * STAGE + column))
+            k = min(column, width - WIDTH)
+            if k < 3 * n_rest:
+                _turn_back(rest, k, staged, column)
+            for r in range(WIDTH):
+                if k < 3 * n_rest:
+                    store(v_rest, visible[i + r] * width + k, load(staged, r * STAGE + column))
+                else:
+                    store(v_rest, visible[i + r] * width + k, v_rest.dtype.type(0))
         v_d = (ZERO * dx, ZERO * dx, ZERO * dx)
         if degree >= 1:
             v_d = _added(v_d, basis_1_vjp(c, _triple_at(y, 0)))
@@ -306,12 +319,15 @@ def _sh_colors_vjp(
     v_offsets = np.empty((N_CHUNKS, 3 * WIDTH), np.float64)
     for chunk in prange(N_CHUNKS):
         first, end = n_gaussians * chunk // N_CHUNKS, n_gaussians * (chunk + 1) // N_CHUNKS
-        _chunk_vjp(first, end, shaded, harmonics, radii, v_colors, v, v_offsets[chunk])
+        v_offsets[chunk] = ZERO
+        _zero_culled(first, end, radii, v)
+        for degree in range(harmonics.lowest, harmonics.highest + 1):
+            _chunk_vjp((first, end), degree, shaded, harmonics, radii, v_colors, v, v_offsets[chunk])
     return total_of(v_offsets)
 
 
 def sh_colors_vjp(
-    means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int, radii: Ints, v_colors: Floats
+    means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int | Ints, radii: Ints, v_colors: Floats
 ) -> SHGradient:
     """Chain the gradient of the colours to their inputs; see ``reference.spherical_harmonics.sh_colors_vjp``."""
     dtype = means.dtype
@@ -325,7 +341,7 @@ def sh_colors_vjp(
     width = 3 * sh_rest.shape[1]
     shaded = Shaded(means, sh_dc, sh_rest.ravel(), width)
     v_shaded = Shaded(out.means, out.sh_dc, out.sh_rest.reshape(-1), width)
-    v_offset = _sh_colors_vjp(shaded, _harmonics(camera, degree, dtype), radii, v_colors, v_shaded)
+    v_offset = _sh_colors_vjp(shaded, _harmonics(camera, degree, means), radii, v_colors, v_shaded)
     # Sum over the Gaussians of the gradient with respect to their offset, mean - centre, with centre = -R^T t.
     out.cam_from_world_R[:] = np.outer(camera.cam_from_world_t, v_offset)
     out.cam_from_world_t[:] = camera.cam_from_world_R @ v_offset

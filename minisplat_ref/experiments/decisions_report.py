@@ -17,6 +17,7 @@ DONE = {
     "exposures": "exposures were switched on",
     "poses": "the refinement of poses was switched on",
     "prune": "it pruned",
+    "bands": "it removed idle bands of the harmonics",
 }
 HEADING = ("decision", "iteration", "why", "gain (dB)", "std. error")
 PSNR = "PSNR of the held-out training views (dB)"

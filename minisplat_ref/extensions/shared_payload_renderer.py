@@ -129,7 +129,7 @@ class PayloadTape(NamedTuple):
 
     payload: Payload
     projected: Projected
-    sh_degree: int  # active
+    sh_degree: int | Ints  # active
     blended: tuple[Any, Floats, Floats, TileBins]  # footprints, coefficients, background, tile lists
     output: RenderOutput
 
@@ -156,7 +156,7 @@ def _render(payload: Payload, model: Model, view: View, request: Request) -> tup
         way_out = "use --backend reference" if missing <= BY_REFERENCE else "train a recipe that does without"
         raise InputError(f"{payload.plural} are drawn without {', '.join(sorted(missing))}: {way_out}")
     stored_degree = math.isqrt(g.sh_rest.shape[1] + 1) - 1
-    sh_degree = stored_degree if request.sh_degree is None else min(request.sh_degree, stored_degree)
+    sh_degree = stored_degree if request.sh_degree is None else np.minimum(request.sh_degree, stored_degree)
     background = np.zeros(3, dtype) if request.background is None else np.asarray(request.background, dtype)
 
     primitives = activated(g._replace(opacity_logits=payload.opacity_logits(g)), request.is_visible)

@@ -52,7 +52,7 @@ class _Tape(NamedTuple):
     model: Model
     camera: Camera
     request: Request
-    sh_degree: int
+    sh_degree: int | Ints
     background: Floats
     traced: Traced
     opacities: Floats  # [N]
@@ -78,7 +78,7 @@ def render(traced: Traced, model: Model, view: View, request: Request) -> tuple[
         raise InputError(f"{traced.name} does not give {names}: use a recipe that does not ask for it")
     dtype, conventions, backend = g.means.dtype, request.conventions, request.backend
     stored_degree = math.isqrt(g.sh_rest.shape[1] + 1) - 1
-    degree = stored_degree if request.sh_degree is None else min(request.sh_degree, stored_degree)
+    degree = stored_degree if request.sh_degree is None else np.minimum(request.sh_degree, stored_degree)
     background = np.zeros(3) if request.background is None else np.asarray(request.background, np.float64)
     opacities = _opacities(g.opacity_logits, request.is_visible)
     prepared = traced.prepare(g, opacities)

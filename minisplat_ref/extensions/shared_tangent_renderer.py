@@ -25,6 +25,7 @@ from minisplat_ref.types import (
     Camera,
     Floats,
     Gaussians,
+    Ints,
     Model,
     Primitives,
     Projection,
@@ -45,7 +46,7 @@ class Prepared(NamedTuple):
     """A view of Gaussians after projection and shading."""
 
     gaussians: Any
-    sh_degree: int  # active
+    sh_degree: int | Ints  # active
     primitives: Primitives
     view_camera: Camera
     footprints: TangentFootprints
@@ -92,7 +93,7 @@ def prepare(model: Model, camera: Camera, request: Request, buffer_size: int | N
     size = checked_buffer(buffer_size)
     dtype = g.means.dtype
     stored_degree = math.isqrt(g.sh_rest.shape[1] + 1) - 1
-    sh_degree = stored_degree if request.sh_degree is None else min(request.sh_degree, stored_degree)
+    sh_degree = stored_degree if request.sh_degree is None else np.minimum(request.sh_degree, stored_degree)
     background = np.zeros(3, dtype) if request.background is None else np.asarray(request.background, dtype)
     primitives = activated(g, request.is_visible)
     footprints = project(primitives, camera, request.conventions)

@@ -7,6 +7,9 @@ without success. There is no schedule, and no setting depends on the scene:
 (:mod:`minisplat_ref.strategy.halving`), those with the largest first, and at most a fifth of all at a time. A Gaussian
 that fits what it covers has a small gradient, so growth fades where a scene has enough.
 
+*View dependence.* Each Gaussian has as many bands of the harmonics as the views that show it determine
+(:mod:`minisplat_ref.methods.adaptive_bands`).
+
 *Measure.* Every 100 iterations the held-out training views are rendered. The gain of their PSNR for each doubling of
 the work, in pairs (tile, Gaussian), is the slope of a line through the measurements since half of the work.
 
@@ -18,6 +21,7 @@ from functools import partial
 
 import numpy as np
 
+from minisplat_ref.methods.adaptive_bands import cut_bands_when_cooling, grow_bands
 from minisplat_ref.methods.adaptive_exposure import hold_mean_exposure, log_gains, switch_exposure_on
 from minisplat_ref.methods.adaptive_pose import hold_mean_pose, switch_pose_on, turn_held_out
 from minisplat_ref.methods.gaussian_splatting import GS, GS_ACCEL, collect_gradients, prune_faint
@@ -38,6 +42,7 @@ from minisplat_ref.training.state import Iteration, TrainState, apply_edit, begi
 MOST_ITERATIONS = 30_000
 LEAST_GAIN = 0.05  # dB of the squared error, for which a calibration of the photographs is worthwhile
 LEAST_MEASUREMENTS = 4  # to fit a line
+LEAST_VARIATION = 4 / 255  # of a band of the harmonics, out of 1
 
 
 def collect_while_growing(state: TrainState, iteration: Iteration) -> None:
@@ -117,7 +122,7 @@ def cool_when_little_is_gained(
     least_gain : float
         dB for each doubling of the work.
     least_step : int
-        No decision before this iteration: all degrees of the spherical harmonics should be active.
+        No decision before this iteration: the first measurements rise steeply.
     """
     pace = state.pace
     if iteration.cooling is None or pace.cooling_from is not None or iteration.step < least_step:
@@ -171,9 +176,10 @@ ADAPTIVE = GS._replace(
         }
     ),
     adam=AdamRule(is_visible_only=True, has_bias_correction=True),
-    sh_milestones=(200, 400, 600),
+    sh_milestones=(),  # degrees are those of the Gaussians, see grow_bands
     events=(
         During(collect_while_growing),
+        During(partial(grow_bands, views_per_coefficient=2.0)),
         During(hold_mean_exposure),
         During(hold_mean_pose),
         At(600, partial(switch_exposure_on, least_exposure_gain=LEAST_GAIN)),
@@ -184,6 +190,7 @@ ADAPTIVE = GS._replace(
         Every(100, partial(grow, threshold=4e-4, most_at_once=0.2, offset=OFFSET, budget=None), start=100),
         Every(100, partial(prune_faint, least_opacity=0.005), start=100),
         During(partial(prune_when_cooling, mass=0.98, least_views=2)),
+        During(partial(cut_bands_when_cooling, least_variation=LEAST_VARIATION)),
     ),
     least_views=5,
     cooling=Cooling(part=0.6, last=0.1, last_per_extent=0.01, hold_out_every=8),

@@ -291,7 +291,7 @@ def _forgotten_depth(base: Backend) -> Backend:
 def _frozen_direction(base: Backend) -> Backend:
     @wraps(base.sh_colors_vjp)
     def sh_colors_vjp(
-        means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int, radii: Ints, v_colors: Floats
+        means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int | Ints, radii: Ints, v_colors: Floats
     ) -> SHGradient:
         v = base.sh_colors_vjp(means, sh_dc, sh_rest, camera, degree, radii, v_colors)
         return v._replace(means=np.zeros_like(v.means))

@@ -274,7 +274,9 @@ def watched(backend: Backend) -> tuple[Backend, list[np.ndarray]]:
         sides.extend((projection.radii > 0, slope_sides(means, camera, conventions)))
         return projection
 
-    def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int, radii: Ints) -> Floats:
+    def sh_colors(
+        means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int | Ints, radii: Ints
+    ) -> Floats:
         colors = backend.sh_colors(means, sh_dc, sh_rest, camera, degree, radii)
         sides.append(colors > 0)
         return colors

@@ -21,6 +21,7 @@ def adam_update(
     second: Floats,
     rows: Ints | None,
     step: AdamStep,
+    widths: Ints | None = None,
 ) -> None:
     """Update ``values`` and both moments in place.
 
@@ -32,10 +33,14 @@ def adam_update(
         Rows to update, each once; the others are neither read nor written. None for all.
     step : AdamStep
         Rate, decay of the two means, and what is added to the root.
+    widths : ndarray of shape (N,), optional
+        How many numbers of each row to update, from the first on; the others stay as they are. None for all.
     """
     chosen = slice(None) if rows is None else rows
     g, m, v = gradient[chosen], first[chosen], second[chosen]  # [V, W]
     m = m + (1 - step.beta1) * (g - m)
     v = v + (1 - step.beta2) * (g * g - v)
-    first[chosen], second[chosen] = m, v
-    values[chosen] -= step.rate * m / (np.sqrt(v) + step.eps)
+    p = values[chosen] - step.rate * m / (np.sqrt(v) + step.eps)
+    is_updated = True if widths is None else np.arange(values.shape[1]) < widths[chosen, None]  # [V, W]
+    for array, updated in ((values, p), (first, m), (second, v)):
+        array[chosen] = np.where(is_updated, updated, array[chosen])

@@ -81,7 +81,7 @@ def sh_basis_jacobian(directions: Floats, degree: int) -> Floats:
     return np.moveaxis(np.array(rows), 2, 0)  # [K, 3, N] -> [N, K, 3]
 
 
-def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int, radii: Ints) -> Floats:
+def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int | Ints, radii: Ints) -> Floats:
     """Return colours as the camera sees them: ``max(0, 0.5 + sum_k c_k Y_k(d))`` with ``d = (mu - o) / |mu - o|``.
 
     The camera's centre is ``o = -R^T t``.
@@ -96,8 +96,8 @@ def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, deg
         Coefficients of degree 1 and above.
     camera : Camera
         The view.
-    degree : int
-        Active degree, at most the stored one; higher coefficients are ignored.
+    degree : int, or ndarray of shape (N,) of int
+        Active degree, at most the stored one, of all Gaussians or of each; higher coefficients are ignored.
     radii : ndarray of shape (N, 2)
         From the projection; rows with 0 were culled.
 
@@ -109,12 +109,12 @@ def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, deg
     rows = np.flatnonzero(radii[:, 0] > 0)
     d, _ = _directions(means[rows], camera)
     colors = np.zeros_like(sh_dc)
-    colors[rows] = np.maximum(0, _unclamped(sh_basis(d, degree), _coefficients(sh_dc, sh_rest, degree)[rows]))
+    colors[rows] = np.maximum(0, _unclamped(*_active(d, sh_dc, sh_rest, degree, rows)))
     return colors
 
 
 def sh_colors_vjp(
-    means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int, radii: Ints, v_colors: Floats
+    means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int | Ints, radii: Ints, v_colors: Floats
 ) -> SHGradient:
     """Gradient of :func:`sh_colors`; culled rows and unused degrees get zeros.
 
@@ -142,13 +142,12 @@ def sh_colors_vjp(
     """
     rows = np.flatnonzero(radii[:, 0] > 0)
     d, distances = _directions(means[rows], camera)
-    coefficients = _coefficients(sh_dc, sh_rest, degree)[rows]  # [V, K, 3]
-    basis = sh_basis(d, degree)  # [V, K]
+    basis, coefficients = _active(d, sh_dc, sh_rest, degree, rows)  # [V, K], [V, K, 3]
 
     v = np.where(_unclamped(basis, coefficients) > 0, v_colors[rows], 0)
     v_coefficients = basis[:, :, None] * v[:, None, :]
     v_basis = np.einsum("nkc,nc->nk", coefficients, v)
-    v_d = np.einsum("nk,nki->ni", v_basis, sh_basis_jacobian(d, degree))
+    v_d = np.einsum("nk,nki->ni", v_basis, sh_basis_jacobian(d, int(np.max(degree, initial=0))))
     v_r = (v_d - d * np.sum(d * v_d, axis=1, keepdims=True)) / distances
     v_o = -v_r.sum(axis=0)
 
@@ -165,9 +164,13 @@ def _unclamped(basis: Floats, coefficients: Floats) -> Floats:
     return 0.5 + np.einsum("nk,nkc->nc", basis, coefficients)
 
 
-def _coefficients(sh_dc: Floats, sh_rest: Floats, degree: int) -> Floats:
-    """Return the active coefficients [N, (degree + 1)^2, 3]."""
-    return np.concatenate([sh_dc[:, None], sh_rest[:, : (degree + 1) ** 2 - 1]], axis=1)
+def _active(d: Floats, sh_dc: Floats, sh_rest: Floats, degree: int | Ints, rows: Ints) -> tuple[Floats, Floats]:
+    """Return the basis functions [V, K] and coefficients [V, K, 3] of rows; zeros above a row's own degree."""
+    highest = int(np.max(degree, initial=0))
+    coefficients = np.concatenate([sh_dc[:, None], sh_rest[:, : (highest + 1) ** 2 - 1]], axis=1)[rows]  # [V, K, 3]
+    own = np.broadcast_to(degree, len(sh_dc))[rows].astype(int)  # [V]
+    is_active = np.arange((highest + 1) ** 2) < ((own + 1) ** 2)[:, None]  # [V, K]
+    return np.where(is_active, sh_basis(d, highest), 0), np.where(is_active[:, :, None], coefficients, 0)
 
 
 def _directions(means: Floats, camera: Camera) -> tuple[Floats, Floats]:

@@ -16,7 +16,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 
 from minisplat_ref.backends import CPU, Backend
-from minisplat_ref.types import AdamStep, Floats, Ints
+from minisplat_ref.types import NOTHING, AdamStep, Floats, Ints
 
 Parameters = TypeVar("Parameters")  # a population, or a mapping of shared parameters
 
@@ -70,6 +70,8 @@ def adam_step(
     rule: AdamRule,
     visible_ids: Ints,
     backend: Backend = CPU,
+    *,
+    widths: Mapping[str, Ints] = NOTHING,
 ) -> AdamState[Parameters]:
     """Update ``parameters`` and the moments in place.
 
@@ -86,6 +88,9 @@ def adam_step(
         Rows that a visible-only rule updates, ascending; the others are neither read nor written.
     backend : Backend
         Implementation of the update.
+    widths : mapping of str to ndarray of shape (N,)
+        For fields of which a row has only so many numbers, the first ones, to update; the others are neither read nor
+        written.
 
     Returns
     -------
@@ -100,5 +105,9 @@ def adam_step(
     for name, rate in ((name, rates[name]) for name in bundles[0]):
         arrays = (bundle[name] for bundle in bundles)
         values, g, first, second = (a.reshape(len(a), math.prod(a.shape[1:])) for a in arrays)  # [N, width] each
-        backend.adam_update(values, g, first, second, rows, AdamStep(rate * correction, rule.beta1, rule.beta2, eps))
+        update = AdamStep(rate * correction, rule.beta1, rule.beta2, eps)
+        if name in widths:
+            backend.adam_update(values, g, first, second, rows, update, widths[name])
+        else:
+            backend.adam_update(values, g, first, second, rows, update)
     return state._replace(step=step)

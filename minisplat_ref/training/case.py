@@ -48,12 +48,13 @@ def save_case(path: Path, case: Case, wrong: str, settings: Mapping[str, Any]) -
     settings : mapping
         Of the run; anything that JSON can hold. Empty unless the run was started from the command line.
     """
-    view, request, camera = case.view, case.request, case.view.camera
+    view, request, camera, degree = case.view, case.request, case.view.camera, case.request.sh_degree
     optional = {
         "view.mask": view.mask,
         "view.point_ids": view.point_ids,
         "request.background": request.background,
         "request.is_visible": request.is_visible,
+        "request.sh_degree": degree if isinstance(degree, np.ndarray) else None,
     }
     arrays = {
         **{f"gaussians.{name}": array for name, array in fields_of(case.model.gaussians).items()},
@@ -75,7 +76,7 @@ def save_case(path: Path, case: Case, wrong: str, settings: Mapping[str, Any]) -
         "intrinsics": [float(value) for value in camera[2:]],
         "extent": float(case.scene.extent),
         "request": {
-            "sh_degree": request.sh_degree,
+            "sh_degree": None if isinstance(degree, np.ndarray) else degree,
             "conventions": request.conventions._asdict(),
             "wants": sorted(request.wants),
         },
@@ -111,7 +112,7 @@ class SavedCase(NamedTuple):
             scene,
             Request(
                 arrays.get("request.background"),
-                request["sh_degree"],
+                arrays.get("request.sh_degree", request["sh_degree"]),
                 Conventions(**request["conventions"]),
                 is_visible=arrays.get("request.is_visible"),
                 wants=frozenset(request["wants"]),

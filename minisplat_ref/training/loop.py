@@ -5,7 +5,8 @@ control *before* Adam, and because it replaces the parameter tensors, that itera
 in Mini-Splatting; gsplat steps first, as here). Here no step is lost, not even the last.
 
 While a recipe warms up on views of half the size, these are the scene's views for everything in the loop. If an event
-has made a culling table (Mini-Splatting2), it says which Gaussians are rendered in a view.
+has made a culling table (Mini-Splatting2), it says which Gaussians are rendered in a view; if one has given each
+Gaussian a degree of its harmonics, neither colours nor Adam compute with the bands above it.
 """
 
 import json
@@ -32,11 +33,11 @@ from minisplat_ref.training.guard import Guard, Wrong
 from minisplat_ref.training.interruption import Interruptions
 from minisplat_ref.training.losses import Loss, Rendered, total_loss
 from minisplat_ref.training.pace import Cooling, Decision, Pace, to_metadata, trained_ids
-from minisplat_ref.training.rates import active_sh_degree
+from minisplat_ref.training.rates import active_sh_degree, n_coefficients
 from minisplat_ref.training.saved_state import read_bundles, read_counters, read_generator, read_pace, written_by
 from minisplat_ref.training.schedule import During, Event, Recipe, action_name, as_decided, describe
-from minisplat_ref.training.state import FiredEvent, Iteration, StepReport, TrainState, begin_cooling
-from minisplat_ref.types import Floats, Ints, Scene, View, numbered
+from minisplat_ref.training.state import DEGREES, FiredEvent, Iteration, StepReport, TrainState, begin_cooling
+from minisplat_ref.types import NOTHING, Floats, Ints, Scene, View, numbered
 
 HALF_SIZE = "half_size_views"  # name of training on views of half the size in the record of what fired
 SHARED_RULE = AdamRule(is_visible_only=False, has_bias_correction=True)  # shared parameters have no visible rows
@@ -182,8 +183,8 @@ def _check_fits(state: TrainState, scene: Scene, recipe: Recipe) -> None:
         raise InputError(f"scene {scene.name} has fewer training views than the run to continue: give the same scene")
     expected = {name: a.shape for c in recipe.active_calibrations for name, a in c.initial(n_views).items()}
     differing = [name for name, shape in expected.items() if getattr(state.shared.get(name), "shape", None) != shape]
-    if state.stats.get("is_visible", np.zeros((0, n_views))).shape[1:] != (n_views,):
-        differing.append("is_visible")
+    per_view = [name for name in ("is_visible", "is_seen") if name in state.stats]
+    differing += [name for name in per_view if state.stats[name].shape[1:] != (n_views,)]
     if differing:
         raise InputError(
             f"scene {scene.name} has {n_views} training views, for which the run to continue holds no"
@@ -239,7 +240,7 @@ def _differentiate(state: TrainState, scene: Scene, around: _Surroundings) -> _D
     background = state.rng.random(3) if recipe.has_random_background else scene.background
     request = Request(
         background.astype(np.float32),
-        sh_degree=active_sh_degree(step, recipe.sh_milestones),
+        sh_degree=state.stats.get(DEGREES, active_sh_degree(step, recipe.sh_milestones)),
         conventions=around.conventions,
         backend=around.backend,
         is_visible=state.stats["is_visible"][:, view_id] if "is_visible" in state.stats else None,
@@ -324,7 +325,10 @@ def _step(
     _, _, loss, gradient, visible_ids, _ = differentiated
     backend = around.backend
     v_gaussians = _with_direct(gradient.gaussians, loss.v_gaussians)
-    state.adam = adam_step(state.gaussians, v_gaussians, state.adam, rates, around.recipe.adam, visible_ids, backend)
+    widths = {"sh_rest": 3 * n_coefficients(state.stats[DEGREES])} if DEGREES in state.stats else NOTHING
+    state.adam = adam_step(
+        state.gaussians, v_gaussians, state.adam, rates, around.recipe.adam, visible_ids, backend, widths=widths
+    )
     if state.shared:
         v_shared = {name: np.zeros_like(array) for name, array in state.shared.items()}
         v_shared = _with_direct({**v_shared, **gradient.shared}, loss.v_shared)

@@ -7,6 +7,10 @@ from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from minisplat_ref.types import Ints
+
 
 class Rewind(NamedTuple):
     """A jump back in a schedule: from iteration ``at`` on, it runs again from its value at ``to``."""
@@ -95,6 +99,11 @@ class Rates(NamedTuple):
         """Return the rates in numbers, strings, lists and dicts."""
         of = {name: rate.described() if isinstance(rate, LogLinear) else rate for name, rate in self.of.items()}
         return {"of": of, "per_extent": sorted(self.per_extent)}
+
+
+def n_coefficients(degrees: Ints) -> Ints:
+    """Return the coefficients above degree 0 that colours of these degrees have in each channel."""
+    return (degrees.astype(np.int64) + 1) ** 2 - 1
 
 
 def active_sh_degree(step: int, milestones: Sequence[int]) -> int:

@@ -15,6 +15,8 @@ from minisplat_ref.constants import SH_DEGREE_MAX
 from minisplat_ref.io.checkpoint import DamagedCheckpoint
 from minisplat_ref.training.calibration import CALIBRATIONS
 from minisplat_ref.training.pace import Pace, from_metadata
+from minisplat_ref.training.rates import n_coefficients
+from minisplat_ref.training.state import DEGREES
 from minisplat_ref.types import Floats, Gaussians
 
 WAY_OUT = "give another checkpoint or train anew"
@@ -149,6 +151,8 @@ def read_bundles(path: str | Path, arrays: Mapping[str, NDArray[Any]], populatio
     for name, array in groups["stats"].items():
         if array.shape[:1] != (n,):
             raise DamagedCheckpoint(f"{path}: stats.{name} has shape {list(array.shape)} for {n} Gaussians; {WAY_OUT}")
+    if DEGREES in groups["stats"]:
+        _check_degrees(path, groups["stats"][DEGREES], groups["gaussians"])
     for name, array in groups["shared"].items():
         _check_numbers(path, f"shared.{name}", array)
     gaussians, first, second = (population(**groups[name]) for name in ("gaussians", "first", "second"))
@@ -194,6 +198,14 @@ def _check_moments(
         if moment is None or field is None or moment.shape != field.shape or moment.dtype != field.dtype:
             raise DamagedCheckpoint(f"{path}: {group}.{name} does not fit the parameters that it belongs to; {WAY_OUT}")
         _check_numbers(path, f"{group}.{name}", moment)
+
+
+def _check_degrees(path: str | Path, degrees: NDArray[Any], fields: Mapping[str, NDArray[Any]]) -> None:
+    """Refuse degrees of the Gaussians' harmonics above the stored one: kernels would write beyond their rows."""
+    n_stored = fields["sh_rest"].shape[1] if "sh_rest" in fields else 0
+    is_possible = degrees.ndim == 1 and degrees.dtype == np.uint8
+    if not is_possible or n_coefficients(degrees).max(initial=0) > n_stored:
+        raise DamagedCheckpoint(f"{path}: stats.{DEGREES} holds no degrees of the stored harmonics; {WAY_OUT}")
 
 
 def _check_numbers(path: str | Path, name: str, array: NDArray[Any]) -> None:

@@ -27,14 +27,14 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.studies.ablation import append, read_records
 from minisplat_ref.experiments.studies.defects import multiplied, with_turned_cameras
 from minisplat_ref.experiments.studies.front import BLUE, RED, describe_scene, read_scene, tidy, title, write
-from minisplat_ref.methods import adaptive, gaussian_splatting, get_recipe
+from minisplat_ref.methods import adaptive, adaptive_bands, gaussian_splatting, get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.rates import Rates
+from minisplat_ref.training.rates import Rates, n_coefficients
 from minisplat_ref.training.schedule import Recipe, configured, does, scaled, settings_of
 from minisplat_ref.training.state import Iteration, StepReport, TrainState
-from minisplat_ref.types import Scene
+from minisplat_ref.types import Gaussians, Scene
 
 ITERATIONS = 3000  # of recipes with a schedule
 WARM_UP = 20  # iterations
@@ -42,6 +42,7 @@ N_MEASUREMENTS = 24  # in those iterations; for adaptive with the same interval
 FEW = 5  # one of every so many training photographs remains
 GAINS = (0.7, 1.4)  # of a photograph, uniform in the logarithm
 NEAR = 0.1  # dB
+MEANS = ("psnr", "n_gaussians", "n_numbers", "step", "seconds")  # over seeds
 COLORS = (BLUE, "#7a9a3a", "#c98a2b", RED, "#6f5b9a")
 
 
@@ -107,6 +108,13 @@ def without_growth(recipe: Recipe) -> Recipe:
     return recipe._replace(events=tuple(event for event in recipe.events if not does(event, adaptive.grow)))
 
 
+def with_all_bands(recipe: Recipe) -> Recipe:
+    """Return the recipe with the harmonics of 3DGS: all degrees for all Gaussians, one more every 200 iterations."""
+    actions = adaptive_bands.grow_bands, adaptive_bands.cut_bands_when_cooling
+    events = tuple(event for event in recipe.events if not does(event, *actions))
+    return recipe._replace(events=events, sh_milestones=(200, 400, 600))
+
+
 def with_growth(recipe: Recipe, **factors: float) -> Recipe:
     """Return the recipe with settings of its growth multiplied by factors."""
     settings = settings_of(recipe)
@@ -120,6 +128,9 @@ RULES: Mapping[str, Callable[[Recipe], Recipe]] = {
     "rates of 3DGS": with_published_rates,
     "no cool-down": without_cool_down,
     "no prune": lambda recipe: configured(recipe, mass=1.0, least_views=0),
+    "all bands": with_all_bands,
+    "no bands": lambda recipe: configured(recipe, views_per_coefficient=math.inf),
+    "no cut of bands": lambda recipe: configured(recipe, least_variation=0.0),
     "no exposures": lambda recipe: configured(recipe, least_exposure_gain=math.inf),
     "no poses": lambda recipe: configured(recipe, least_pose_gain=math.inf),
 }
@@ -169,7 +180,16 @@ def run(args: argparse.Namespace) -> None:
     write(args.out, result, draw(records))
     print(title(description))
     print(f"seeds {', '.join(map(str, args.seeds))}; seconds of the processor\n")
-    heading = ["condition", "recipe", "PSNR (dB)", "fall since its best", "Gaussians", "iterations", "seconds"]
+    heading = [
+        "condition",
+        "recipe",
+        "PSNR (dB)",
+        "fall since its best",
+        "Gaussians",
+        "numbers",
+        "iterations",
+        "seconds",
+    ]
     print(markdown_table([*heading, f"until {next(iter(recipes))} - {NEAR} dB"], [_cells(row) for row in rows]))
     if args.sweep:
         for condition in args.conditions:
@@ -201,12 +221,20 @@ def measure(scene: Scene, recipe: Recipe, seed: int) -> dict[str, Any]:
         value = evaluate(report.state.model, scene.test_views, background=scene.background, renderer=recipe.renderer)
         n = len(report.state.gaussians.means)
         curve.append({"step": report.step, "seconds": now - start - paused, "psnr": value.psnr, "n_gaussians": n})
-        curve[-1]["ssim"] = value.ssim
+        curve[-1] |= {"ssim": value.ssim, "n_numbers": n_numbers(report.state.gaussians)}
         paused += time.process_time() - now
 
     state = train(scene, recipe, seed=seed, on_step=on_step)
     decisions = [decision._asdict() for decision in state.pace.decisions]
     return {**curve[-1], "curve": curve, "decisions": decisions}
+
+
+def n_numbers(gaussians: Gaussians) -> int:
+    """Return how many numbers a model consists of, without those of bands of the harmonics that are zero."""
+    of_coefficients = np.sqrt(np.arange(1, gaussians.sh_rest.shape[1] + 1)).astype(int)  # [K - 1] degrees
+    degrees = (gaussians.sh_rest.any(axis=2) * of_coefficients).max(axis=1, initial=0)  # [N]
+    n_others = sum(int(np.prod(field.shape[1:])) for name, field in gaussians._asdict().items() if name != "sh_rest")
+    return int((n_others + 3 * n_coefficients(degrees)).sum())
 
 
 def summarise(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -227,7 +255,7 @@ def summarise(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 {
                     "condition": condition,
                     "recipe": name,
-                    **{k: float(np.mean([run[k] for run in runs])) for k in ("psnr", "n_gaussians", "step", "seconds")},
+                    **{k: float(np.mean([run[k] for run in runs])) for k in MEANS},
                     "difference": float(np.mean(differences)),
                     "standard_error": standard_error(differences),
                     "fall": float(np.mean([max(p["psnr"] for p in run["curve"]) - run["psnr"] for run in runs])),
@@ -279,6 +307,7 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
         f"{row['psnr']:.2f} ({row['difference']:+.2f}{error})",
         f"{row['fall']:.2f}",
         f"{row['n_gaussians']:,.0f}",
+        f"{row['n_numbers']:,.0f}",
         f"{row['step']:,.0f}",
         f"{row['seconds']:.0f}",
         "never" if row["until"] is None else f"{row['until']:.0f}",

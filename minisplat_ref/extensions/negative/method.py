@@ -46,7 +46,8 @@ def signed_colors(
     rows = _clamped_rows(colors, radii)
     if len(rows) > 0:
         upper = colors[rows]  # [M, 3]
-        lower = backend.sh_colors(means[rows], -sh_dc[rows], -sh_rest[rows], camera, degree, radii[rows])  # l [M, 3]
+        own = np.broadcast_to(degree, len(means))[rows]  # [M]
+        lower = backend.sh_colors(means[rows], -sh_dc[rows], -sh_rest[rows], camera, own, radii[rows])  # l [M, 3]
         colors[rows] = np.where(upper == 0, 1 - lower, upper)
     return colors
 
@@ -57,7 +58,7 @@ def signed_colors_vjp(
     sh_dc: Floats,
     sh_rest: Floats,
     camera: Camera,
-    degree: int,
+    degree: int | Ints,
     radii: Ints,
     v_colors: Floats,
 ) -> SHGradient:
@@ -81,7 +82,8 @@ def signed_colors_vjp(
     if len(rows) == 0:
         return v
     v_lower = np.where(colors[rows] == 0, -v_colors[rows], v_colors.dtype.type(0))  # [M, 3]
-    v_l = backend.sh_colors_vjp(means[rows], -sh_dc[rows], -sh_rest[rows], camera, degree, radii[rows], v_lower)
+    own = np.broadcast_to(degree, len(means))[rows]  # [M]
+    v_l = backend.sh_colors_vjp(means[rows], -sh_dc[rows], -sh_rest[rows], camera, own, radii[rows], v_lower)
     v.means[rows] += v_l.means
     v.sh_dc[rows] -= v_l.sh_dc
     v.sh_rest[rows] -= v_l.sh_rest

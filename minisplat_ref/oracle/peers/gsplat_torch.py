@@ -28,7 +28,7 @@ from unittest.mock import patch
 import numpy as np
 
 from minisplat_ref.backends import REFERENCE, Backend
-from minisplat_ref.constants import Conventions
+from minisplat_ref.constants import SH_DEGREE_MAX, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.types import (
@@ -132,19 +132,26 @@ def project_vjp(
     return PrimitiveGradient(*_autograd(lambda *x: _project(camera, conventions, *x)[1:], inputs, cotangents))
 
 
-def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int, radii: Ints) -> Floats:
+def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int | Ints, radii: Ints) -> Floats:
     """Call ``_spherical_harmonics``."""
     leaves = [_tensor(x) for x in (means, sh_dc, sh_rest, *_pose(camera, means))]
-    return np.where(radii[:, :1] > 0, _colors(degree, *leaves)[0].numpy(), 0)
+    return np.where(radii[:, :1] > 0, _colors(_one(degree), *leaves)[0].numpy(), 0)
 
 
 def sh_colors_vjp(
-    means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int, radii: Ints, v_colors: Floats
+    means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int | Ints, radii: Ints, v_colors: Floats
 ) -> SHGradient:
     """Autograd of :func:`sh_colors`."""
     inputs = means, sh_dc, sh_rest, *_pose(camera, means)
     cotangents = [np.where(radii[:, :1] > 0, v_colors, 0)]
-    return SHGradient(*_autograd(functools.partial(_colors, degree), inputs, cotangents))
+    return SHGradient(*_autograd(functools.partial(_colors, _one(degree)), inputs, cotangents))
+
+
+def _one(degree: int | Ints) -> int:
+    """Return the degree of all Gaussians; gsplat has no degree of each."""
+    if np.min(degree, initial=SH_DEGREE_MAX) < np.max(degree, initial=0):
+        raise InputError("gsplat gives all Gaussians one degree of the spherical harmonics: give one number")
+    return int(np.max(degree, initial=0))
 
 
 def bin_gaussians(projection: Projection, grid: TileGrid, conventions: Conventions) -> TileBins:
