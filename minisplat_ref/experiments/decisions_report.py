@@ -15,6 +15,7 @@ COOLED = "cool down"
 DONE = {
     COOLED: "the rates began to fall",
     "exposures": "exposures were switched on",
+    "sky": "a sky took the place of the largest Gaussians",
     "poses": "the refinement of poses was switched on",
     "prune": "it pruned",
     "bands": "it removed idle bands of the harmonics",

@@ -17,7 +17,7 @@ from minisplat_ref.extensions.extension import CORE, Extension, owner_of
 from minisplat_ref.rendering import Request
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.pace import held_out_ids
-from minisplat_ref.training.schedule import Recipe, configured
+from minisplat_ref.training.schedule import Recipe, as_trained
 from minisplat_ref.types import Model, Scene, View, numbered
 
 HOLD_OUT_EVERY = 8  # training views of which one decides
@@ -94,15 +94,10 @@ def open_run(folder: Path, scene: Path | None = None) -> Run:
     if n_rows(saved.model.gaussians) < 2:
         raise InputError(f"{folder} holds {n_rows(saved.model.gaussians)} Gaussians, of which none can go: train more")
     recipe = recipe_of(settings)
-    on = {
-        calibration.name: True
-        for calibration in recipe.calibrations
-        if calibration.initial(1).keys() <= saved.model.shared.keys()
-    }
     run = Run(
         folder,
         settings,
-        configured(recipe, **on),
+        as_trained(recipe, saved.model),
         owner_of(settings.recipe, settings.extension) or CORE,
         photographs._replace(train_views=numbered(photographs.train_views)),
         saved.model,

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from minisplat_ref.experiments.pictures import error_picture, side_by_side, to_picture
 from minisplat_ref.experiments.progress import Progress
-from minisplat_ref.experiments.scoring import Trained
-from minisplat_ref.experiments.settings import Settings, recipe_of
+from minisplat_ref.experiments.scoring import Trained, renderer_of
+from minisplat_ref.experiments.settings import Settings
 from minisplat_ref.io import write_image
 from minisplat_ref.training.loop import StepReport
 from minisplat_ref.types import Scene
@@ -33,7 +33,6 @@ def previewing(folder: Path, scene: Scene, settings: Settings, progress: Progres
         Of the training.
     """
     view = (*scene.test_views, *scene.train_views)[0]
-    renderer = recipe_of(settings).renderer
     last = -math.inf
 
     def on_step(report: StepReport) -> None:
@@ -41,7 +40,9 @@ def previewing(folder: Path, scene: Scene, settings: Settings, progress: Progres
         if time.perf_counter() - last < SECONDS and report.step != report.last_step:
             return
         with progress.paused():
-            trained = Trained(report.state.model, renderer, scene.background, settings.profile, settings.backend)
+            model = report.state.model
+            renderer = renderer_of(settings, model)
+            trained = Trained(model, renderer, scene.background, settings.profile, settings.backend)
             picture = to_picture(trained.render(view).image[..., :3])
             write_image(folder / FILE, side_by_side([view.image, picture, error_picture(view.image, picture)]))
         last = time.perf_counter()

@@ -21,6 +21,7 @@ from minisplat_ref.io.names import file_names
 from minisplat_ref.lpips import Network
 from minisplat_ref.metrics import Evaluation, ViewMetrics, evaluate
 from minisplat_ref.rendering import Renderer, Request
+from minisplat_ref.training.schedule import as_trained
 from minisplat_ref.types import Floats, Model, RenderOutput, Scene, View
 
 
@@ -42,6 +43,11 @@ class Trained(NamedTuple):
         return self.renderer.render(self.model, view, request)[0]
 
 
+def renderer_of(settings: Settings, model: Model) -> Renderer:
+    """Return how a run draws its model: with the sky that it has been given, too."""
+    return as_trained(recipe_of(settings), model).renderer
+
+
 def load_trained(folder: Path) -> Trained:
     """Read the newest model of a run; of one that has not ended, the checkpoint's, with a warning.
 
@@ -55,7 +61,7 @@ def load_trained(folder: Path) -> Trained:
     if saved.unfinished is not None:
         message = f"{folder} has not ended: this is its checkpoint of iteration {saved.unfinished}"
         warnings.warn(one_line(message), InputWarning, stacklevel=2)
-    renderer, background = recipe_of(settings).renderer, load_background(folder)
+    renderer, background = renderer_of(settings, saved.model), load_background(folder)
     return Trained(saved.model, renderer, background, settings.profile, settings.backend)
 
 
@@ -73,7 +79,7 @@ def measure(
         background=scene.background,
         on_view=on_view,
         network=network,
-        renderer=recipe_of(settings).renderer,
+        renderer=renderer_of(settings, model),
         backend=get_backend(settings.backend),
         conventions=PROFILES[settings.profile],
     )

@@ -24,6 +24,7 @@ import numpy as np
 from minisplat_ref.methods.adaptive_bands import cut_bands_when_cooling, grow_bands
 from minisplat_ref.methods.adaptive_exposure import hold_mean_exposure, log_gains, switch_exposure_on
 from minisplat_ref.methods.adaptive_pose import hold_mean_pose, switch_pose_on, turn_held_out
+from minisplat_ref.methods.adaptive_sky import switch_sky_on
 from minisplat_ref.methods.gaussian_splatting import GS, GS_ACCEL, collect_gradients, prune_faint
 from minisplat_ref.methods.mini_splatting import candidates, measure_importance
 from minisplat_ref.metrics import psnr
@@ -41,6 +42,7 @@ from minisplat_ref.training.state import Iteration, TrainState, apply_edit, begi
 
 MOST_ITERATIONS = 30_000
 LEAST_GAIN = 0.05  # dB of the squared error, for which a calibration of the photographs is worthwhile
+LEAST_SKY_GAIN = 0.2  # dB, likewise, for a sky: larger, because the photographs share it and agree about it
 LEAST_MEASUREMENTS = 4  # to fit a line
 LEAST_VARIATION = 4 / 255  # of a band of the harmonics, out of 1
 
@@ -182,6 +184,7 @@ ADAPTIVE = GS._replace(
         During(partial(grow_bands, views_per_coefficient=2.0)),
         During(hold_mean_exposure),
         During(hold_mean_pose),
+        At(100, partial(switch_sky_on, least_sky_gain=LEAST_SKY_GAIN)),
         At(600, partial(switch_exposure_on, least_exposure_gain=LEAST_GAIN)),
         At(600, partial(switch_pose_on, least_pose_gain=LEAST_GAIN)),
         Every(100, turn_held_out, start=100),

@@ -16,6 +16,7 @@ from minisplat_ref.methods.adaptive_evidence import BRIGHT, DARK, exposure_evide
 from minisplat_ref.rendering import Request
 from minisplat_ref.training.calibration import EXPOSURE, EXPOSURES, identity_exposures
 from minisplat_ref.training.pace import Decision, trained_ids
+from minisplat_ref.training.sky import with_sky
 from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Floats, Ints
 
@@ -36,11 +37,11 @@ def log_gains(state: TrainState, iteration: Iteration, view_ids: Ints | list[int
         Median over the pixels of ln(photograph / rendering), for the mean of the colours; 0 where no pixel qualifies.
     """
     gains = np.zeros(len(view_ids))
-    representation = iteration.representation
+    renderer = with_sky(iteration.representation.renderer)
     request = Request(iteration.scene.background, conventions=iteration.conventions, backend=iteration.backend)
     for k, index in enumerate(view_ids):
         view = iteration.scene.train_views[index].loaded()
-        rendered = representation.renderer.render(state.model, view, request)[0].image
+        rendered = renderer.render(state.model, view, request)[0].image
         seen, photographed = (np.mean(image, axis=2) for image in (np.clip(rendered, 0, 1), view.image / 255.0))
         says = (seen > DARK) & (photographed > DARK) & (photographed < BRIGHT)
         says = says if view.mask is None else says & view.mask

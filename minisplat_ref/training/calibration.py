@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from minisplat_ref.rendering import Renderer, RenderGradient, Request
 from minisplat_ref.training.rates import LogLinear, Rates
+from minisplat_ref.training.sky import SKY, clear_sky, with_sky
 from minisplat_ref.types import Floats, Model, RenderOutput, View
 
 EXPOSURES, ROTATIONS, SHIFTS = "exposures", "pose_rotations", "pose_shifts"  # names of the shared parameters
@@ -271,4 +272,7 @@ POSE = Calibration(
 )
 """A correction of the pose per photograph."""
 
-CALIBRATIONS = (EXPOSURE, POSE)
+BACKDROP = Calibration("sky", clear_sky, with_sky, Rates({SKY: 1e-3}))
+"""A sky, which all views share."""
+
+CALIBRATIONS = (BACKDROP, EXPOSURE, POSE)  # each wraps those before it: a photograph's exposure changes its sky too

@@ -20,6 +20,7 @@ from minisplat_ref.training.losses import LossTerm
 from minisplat_ref.training.pace import Cooling, Pace
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.representation import GAUSSIANS, Representation
+from minisplat_ref.types import Model
 
 Action = Callable[..., str | None]
 """``action(state, iteration)``; see :mod:`minisplat_ref.training.state`. Its settings are bound with ``partial``."""
@@ -137,7 +138,7 @@ class Recipe(NamedTuple):
     """p of the factor ``(published / iterations)^p`` by which :func:`scaled` raises the rates of runs shorter than
     published; the rate of the means is raised by its square."""
     calibrations: tuple[Calibration, ...] = CALIBRATIONS
-    """Parameters of each photograph; both are off unless asked for."""
+    """Parameters of each photograph, and a sky; all are off unless asked for."""
     representation: Representation = GAUSSIANS
     """What is trained and how it is rendered."""
     cooling: Cooling | None = None
@@ -237,6 +238,12 @@ def _scaled_limit(step: int | None, factor: Fraction) -> int | None:
 def as_decided(recipe: Recipe, pace: Pace) -> Recipe:
     """Return the recipe with those calibrations on that a training has switched on."""
     return configured(recipe, **dict.fromkeys(pace.switched_on, True)) if pace.switched_on else recipe
+
+
+def as_trained(recipe: Recipe, model: Model) -> Recipe:
+    """Return the recipe with those calibrations on that a model has parameters of, given or decided upon."""
+    on = {c.name: True for c in recipe.calibrations if c.initial(1).keys() <= model.shared.keys()}
+    return configured(recipe, **on)
 
 
 def settings_of(recipe: Recipe) -> dict[str, Any]:

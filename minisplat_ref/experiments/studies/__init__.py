@@ -94,14 +94,15 @@ def _add_adaptive_arguments(parser: argparse.ArgumentParser) -> None:
     )
     variants = parser.add_mutually_exclusive_group()
     variants.add_argument("--rules", action="store_true", help="adaptive beside itself without each of its rules")
+    variants.add_argument("--candidates", action="store_true", help="adaptive beside itself with rules it lacks")
     variants.add_argument("--sweep", action="store_true", help="adaptive beside itself with more Gaussians and fewer")
     parser.add_argument(
         "--conditions",
         type=listed(name),
         default=("whole", "few", "gains"),
         metavar="C,D",
-        help="whole, few (every fifth photograph), gains (wrong exposures), poses (wrong cameras; default: the first"
-        " three)",
+        help="whole, few (every fifth photograph), gains (wrong exposures), poses (wrong cameras), sizes"
+        " (every second at half the size), sky (synthetic scenes, cut off; default: the first three)",
     )
     _add_seeds(parser)
 
@@ -209,6 +210,13 @@ def _add_defects_arguments(parser: argparse.ArgumentParser) -> None:
         "the same folder goes on where it was\ninterrupted."
     )
     _add_resumed_scene_arguments(parser)
+    parser.add_argument(
+        "--conditions",
+        type=listed(name),
+        default=(),
+        metavar="C,D",
+        help="clean, gains, poses, sky (default: all, sky of synthetic scenes alone)",
+    )
     parser.add_argument("--trials", type=integer(1), default=10, metavar="N", help="of each kind (default 10)")
 
 

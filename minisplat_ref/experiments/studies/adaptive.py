@@ -6,7 +6,8 @@ a recipe reaches the final PSNR of the first recipe minus 0.1 dB, and how far th
 Times are processor times (of all threads of the process together), which other programs disturb less than wall time.
 
 With ``--rules`` it compares ``adaptive`` with itself without one of its rules; with ``--sweep``, with itself at other
-thresholds of growth, which give more Gaussians and fewer: which number would have been best, and by how much.
+thresholds of growth, which give more Gaussians and fewer: which number would have been best, and by how much. With
+``--candidates``, with itself and one rule more (:mod:`minisplat_ref.experiments.studies.adaptive_candidates`).
 
 Trainings take long. Each writes its record to ``runs.jsonl``, and the same command with the same folder continues.
 """
@@ -25,14 +26,16 @@ from tqdm import tqdm
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.studies.ablation import append, read_records
-from minisplat_ref.experiments.studies.defects import multiplied, with_turned_cameras
+from minisplat_ref.experiments.studies.adaptive_candidates import CANDIDATES
+from minisplat_ref.experiments.studies.defects import multiplied, under_a_sky, with_turned_cameras
 from minisplat_ref.experiments.studies.front import BLUE, RED, describe_scene, read_scene, tidy, title, write
+from minisplat_ref.io.scene import half_size
 from minisplat_ref.methods import adaptive, adaptive_bands, gaussian_splatting, get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.rates import Rates, n_coefficients
-from minisplat_ref.training.schedule import Recipe, configured, does, scaled, settings_of
+from minisplat_ref.training.schedule import Recipe, as_trained, configured, does, scaled, settings_of
 from minisplat_ref.training.state import Iteration, StepReport, TrainState
 from minisplat_ref.types import Gaussians, Scene
 
@@ -67,11 +70,24 @@ def half_a_pixel_off(scene: Scene) -> Scene:
     return with_turned_cameras(scene, np.random.default_rng(0))
 
 
+def planted_sky(scene: Scene) -> Scene:
+    """Return a synthetic scene cut off under a sky, in the test views, too."""
+    return under_a_sky(scene, np.random.default_rng(0))
+
+
+def two_sizes(scene: Scene) -> Scene:
+    """Return the scene with every second training photograph at half the width and height."""
+    views = (half_size(view) if k % 2 else view for k, view in enumerate(scene.train_views))
+    return scene._replace(train_views=tuple(views))
+
+
 CONDITIONS: Mapping[str, Callable[[Scene], Scene]] = {
     "whole": whole,
     "few": few_photographs,
     "gains": random_gains,
     "poses": half_a_pixel_off,
+    "sizes": two_sizes,
+    "sky": planted_sky,
 }
 
 
@@ -131,6 +147,7 @@ RULES: Mapping[str, Callable[[Recipe], Recipe]] = {
     "all bands": with_all_bands,
     "no bands": lambda recipe: configured(recipe, views_per_coefficient=math.inf),
     "no cut of bands": lambda recipe: configured(recipe, least_variation=0.0),
+    "no sky": lambda recipe: configured(recipe, least_sky_gain=math.inf),
     "no exposures": lambda recipe: configured(recipe, least_exposure_gain=math.inf),
     "no poses": lambda recipe: configured(recipe, least_pose_gain=math.inf),
 }
@@ -160,7 +177,7 @@ def run(args: argparse.Namespace) -> None:
     unknown = [name for name in args.conditions if name not in CONDITIONS]
     if unknown:
         raise InputError(f"condition {unknown[0]!r} does not exist: choose from {', '.join(CONDITIONS)}")
-    variants = RULES if args.rules else SWEEP if args.sweep else {}
+    variants = RULES if args.rules else SWEEP if args.sweep else CANDIDATES if args.candidates else {}
     recipes = {name: change(adaptive.ADAPTIVE) for name, change in variants.items()} or _named(args.recipes)
     description = describe_scene(scene)
     settings = {"scene": description["scene"], "downscale": args.downscale, "recipes": list(recipes)}
@@ -218,7 +235,9 @@ def measure(scene: Scene, recipe: Recipe, seed: int) -> dict[str, Any]:
         if report.step % every and report.step != report.last_step:
             return
         now = time.process_time()
-        value = evaluate(report.state.model, scene.test_views, background=scene.background, renderer=recipe.renderer)
+        model = report.state.model
+        renderer = as_trained(recipe, model).renderer
+        value = evaluate(model, scene.test_views, background=scene.background, renderer=renderer)
         n = len(report.state.gaussians.means)
         curve.append({"step": report.step, "seconds": now - start - paused, "psnr": value.psnr, "n_gaussians": n})
         curve[-1] |= {"ssim": value.ssim, "n_numbers": n_numbers(report.state.gaussians)}

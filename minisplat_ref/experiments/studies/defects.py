@@ -1,13 +1,14 @@
 """Planted defects: whether ``adaptive`` finds them, and none where there are none.
 
 Photographs of a scene are disturbed in a known way, differently in every trial, and the scene is trained until the
-iteration in which ``adaptive`` decides about exposures and poses. A trial records what was switched on. Its seed is
-used for the disturbance and the training.
+iteration in which ``adaptive`` has decided about a sky, exposures and poses. A trial records what was switched on. Its
+seed is used for the disturbance and the training.
 
 =========  ========================================================================================================
 ``clean``  the scene as it is; a real one may have defects of its own
 ``gains``  each photograph is multiplied by a gain of its own, from 0.9 to 1.1
 ``poses``  each camera is turned about an axis of its own, across its own, so that its image moves by half a pixel
+``sky``    what is higher than 1.2 m becomes sky: two random colours, from the horizon to the zenith (synthetic scenes)
 =========  ========================================================================================================
 """
 
@@ -21,22 +22,29 @@ import numpy as np
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
+from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
+from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.studies.ablation import append, read_records
 from minisplat_ref.experiments.studies.front import BLUE, RED, describe_scene, read_scene, tidy, title, write
 from minisplat_ref.experiments.studies.poses import moved
 from minisplat_ref.methods import adaptive
 from minisplat_ref.methods.adaptive_exposure import switch_exposure_on
 from minisplat_ref.methods.adaptive_pose import switch_pose_on
+from minisplat_ref.methods.adaptive_sky import switch_sky_on
 from minisplat_ref.reporting import markdown_table
-from minisplat_ref.training.calibration import EXPOSURE, POSE
+from minisplat_ref.training.calibration import BACKDROP, EXPOSURE, POSE
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import firing_steps
+from minisplat_ref.training.sky import unit_rays
 from minisplat_ref.training.state import StepReport
-from minisplat_ref.types import Floats, Scene
+from minisplat_ref.types import Floats, Scene, View
 
 LARGEST_GAIN = 0.1
 PIXELS = 0.5
-HEADING = ["photographs", "trials", "exposures switched on", "poses switched on"]
+GREEN = "#7a9a3a"
+CUT = 1.2  # metres
+CALIBRATIONS = (BACKDROP, EXPOSURE, POSE)
+HEADING = ["photographs", "trials", "sky switched on", "exposures switched on", "poses switched on"]
 
 
 def clean(scene: Scene, rng: np.random.Generator) -> Scene:
@@ -67,10 +75,45 @@ def with_turned_cameras(scene: Scene, rng: np.random.Generator) -> Scene:
     return scene._replace(train_views=tuple(views))
 
 
+def under_a_sky(scene: Scene, rng: np.random.Generator) -> Scene:
+    """Return a synthetic scene cut off at a height of 1.2 m, under a sky whose two colours are drawn at random.
+
+    Photographs show the sky where there was none, or something above the cut; the points above the cut go.
+
+    Raises
+    ------
+    InputError
+        The scene is not synthetic: nobody knows how high its pixels are.
+    """
+    if scene.name not in SCENE_NAMES:
+        raise InputError(f"condition sky cuts off a synthetic scene: give one of {', '.join(SCENE_NAMES)}")
+    truth = make_scene(scene.name)
+    horizon, zenith = rng.uniform(0.2, 1.0, (2, 3))
+
+    def cut_off(view: View, depth: Floats) -> View:
+        camera = view.camera
+        rays = unit_rays(camera, np.arange(camera.width * camera.height), np.dtype(float))  # [P, 3] camera frame
+        up = rays @ camera.cam_from_world_R[:, 2]  # [P]
+        heights = camera.center[2] + depth.ravel() / rays[:, 2] * up  # metres
+        is_sky = (depth.ravel() == 0) | (heights > CUT)
+        sky = np.round(255.0 * (horizon + np.sqrt(np.maximum(up, 0.0))[:, None] * (zenith - horizon)))
+        image = np.where(is_sky[:, None], sky, view.image.reshape(-1, 3)).astype(np.uint8)
+        return view._replace(image=image.reshape(view.image.shape), point_ids=None)
+
+    below = scene.points[:, 2] <= CUT
+    return scene._replace(
+        train_views=tuple(map(cut_off, scene.train_views, truth.train_depths)),
+        test_views=tuple(map(cut_off, scene.test_views, truth.test_depths)),
+        points=scene.points[below],
+        point_colors=scene.point_colors[below],
+    )
+
+
 CONDITIONS: Mapping[str, Callable[[Scene, np.random.Generator], Scene]] = {
     "clean": clean,
     "gains": with_gains,
     "poses": with_turned_cameras,
+    "sky": under_a_sky,
 }
 
 
@@ -90,12 +133,16 @@ def run(args: argparse.Namespace) -> None:
     description = describe_scene(scene)
     records = read_records(args.out, {"scene": description["scene"], "downscale": args.downscale})
     done = {(record["condition"], record["seed"]) for record in records}
-    todo = [(name, seed) for seed in range(args.trials) for name in CONDITIONS if (name, seed) not in done]
+    unknown = [name for name in args.conditions if name not in CONDITIONS]
+    if unknown:
+        raise InputError(f"condition {unknown[0]!r} does not exist: choose from {', '.join(CONDITIONS)}")
+    names = args.conditions or [name for name in CONDITIONS if name != "sky" or scene.name in SCENE_NAMES]
+    todo = [(name, seed) for seed in range(args.trials) for name in names if (name, seed) not in done]
     for name, seed in tqdm(todo, desc="trials", leave=False, disable=None):
         record = {"condition": name, "seed": seed, **decide(CONDITIONS[name](scene, np.random.default_rng(seed)), seed)}
         append(args.out, record)
         records.append(record)
-    records = [record for record in records if record["seed"] < args.trials]
+    records = [record for record in records if record["seed"] < args.trials and record["condition"] in names]
     summary = summarise(records)
     write(args.out, {**description, "trials": args.trials, "summary": summary, "runs": records}, draw(records))
     print(title(description))
@@ -104,10 +151,8 @@ def run(args: argparse.Namespace) -> None:
 
 
 def decision_step() -> int:
-    """Return the iteration after which both decisions have been made."""
-    return max(
-        step for action in (switch_exposure_on, switch_pose_on) for step in firing_steps(adaptive.ADAPTIVE, action)
-    )
+    """Return the iteration after which all decisions have been made."""
+    return max(firing_steps(adaptive.ADAPTIVE, switch_sky_on, switch_exposure_on, switch_pose_on))
 
 
 def decide(scene: Scene, seed: int) -> dict[str, Any]:
@@ -133,7 +178,7 @@ def summarise(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, int]]
     summary = {}
     for name in CONDITIONS:
         own = [record for record in records if record["condition"] == name]
-        counts = {c.name: sum(c.name in record["switched_on"] for record in own) for c in (EXPOSURE, POSE)}
+        counts = {c.name: sum(c.name in record["switched_on"] for record in own) for c in CALIBRATIONS}
         summary[name] = {"trials": len(own), **counts}
     return summary
 
@@ -141,7 +186,7 @@ def summarise(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, int]]
 def to_rows(summary: Mapping[str, Mapping[str, int]]) -> list[list[str]]:
     """Return the lines of the table."""
     return [
-        [name, str(row["trials"]), str(row[EXPOSURE.name]), str(row[POSE.name])]
+        [name, str(row["trials"]), *(str(row[c.name]) for c in CALIBRATIONS)]
         for name, row in summary.items()
         if row["trials"]
     ]
@@ -152,9 +197,9 @@ def draw(records: Sequence[Mapping[str, Any]]) -> Figure:
     summary = summarise(records)
     figure = Figure(figsize=(7, 2.6), layout="constrained")
     axes = figure.subplots()
-    for shift, calibration, color in ((-0.18, EXPOSURE.name, BLUE), (0.18, POSE.name, RED)):
-        shares = [100 * row[calibration] / max(row["trials"], 1) for row in summary.values()]
-        axes.barh(np.arange(len(summary)) + shift, shares, height=0.32, color=color, label=calibration)
+    for shift, calibration, color in zip((-0.27, 0.0, 0.27), CALIBRATIONS, (GREEN, BLUE, RED), strict=True):
+        shares = [100 * row[calibration.name] / max(row["trials"], 1) for row in summary.values()]
+        axes.barh(np.arange(len(summary)) + shift, shares, height=0.25, color=color, label=calibration.name)
     axes.set(xlim=(0, 100), xlabel="trials in which it is switched on (%)", yticks=range(len(summary)))
     axes.set_yticklabels(summary)
     axes.invert_yaxis()

@@ -45,7 +45,7 @@ from minisplat_ref.metrics import evaluate
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import initial_state, train
-from minisplat_ref.training.schedule import Recipe
+from minisplat_ref.training.schedule import Recipe, as_trained
 from minisplat_ref.training.state import StepReport, TrainState
 from minisplat_ref.types import Model, Scene
 
@@ -165,7 +165,9 @@ def measure(scene: Scene, recipe: Recipe, name: str, seed: int) -> list[dict[str
     seconds = time.process_time() - start
 
     def record(precision_name: str, model: Model, *, has_half_colours: bool) -> dict[str, Any]:
-        quality = evaluate(model, scene.test_views, background=scene.background, renderer=recipe.renderer)
+        quality = evaluate(
+            model, scene.test_views, background=scene.background, renderer=as_trained(recipe, model).renderer
+        )
         return {
             "precision": precision_name,
             "seed": seed,

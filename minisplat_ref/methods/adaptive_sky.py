@@ -1,0 +1,152 @@
+"""A sky, which ``adaptive`` gives to scenes whose photographs show one.
+
+Structure from motion finds no points in a sky, and training covers it with the Gaussians of the horizon, which it makes
+large: after a hundred iterations hardly any pixel is transparent. So the question is not what shows through, but what
+would do better. The larger a Gaussian is beside the path of the cameras, the more it looks the same from all of them,
+as a sky does. The large Gaussians are taken away, and the harmonics of a sky (:mod:`minisplat_ref.training.sky`) are
+fitted to what is then missing, r = photograph - rendering, by least squares over the pixels of half of the photographs
+
+    r = sum_k s_k b_k,   b_k = T Y_k        T: transmittance, Y_k: spherical harmonics in the direction of the pixel
+
+The other half of the photographs judges, and vice versa, the two in turns along the path of the cameras. They compare
+with the same fit to the scene as it is, with all its Gaussians: gaps that any colour would fill are no evidence of a
+sky.
+
+    gain of a photograph = 10 log10 (|r - sum s_k b_k|^2 as it is / |r - sum s_k b_k|^2 without the large Gaussians)
+
+A wall that is all of one colour is no sky: its photographs disagree about the direction in which its edges lie.
+
+If the sky is better, only the largest of these Gaussians are removed, those that are larger than the path of the
+cameras itself. Others show a part of the scene besides, such as the far ground, and training takes the sky off them.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from minisplat_ref.constants import SH_DEGREE_MAX
+from minisplat_ref.methods.adaptive_evidence import Evidence, switch_on
+from minisplat_ref.reference.spherical_harmonics import sh_basis
+from minisplat_ref.rendering import Request
+from minisplat_ref.strategy.ops import keep
+from minisplat_ref.training.calibration import BACKDROP
+from minisplat_ref.training.pace import Decision, trained_ids
+from minisplat_ref.training.sky import N_BASIS, SKY, unit_rays
+from minisplat_ref.training.state import Iteration, TrainState, apply_edit
+from minisplat_ref.types import Bools, Floats
+
+LARGE, HUGE = 0.25, 1.0  # of the scene's extent: standard deviation along the longest axis, to question and to remove
+RIDGE = 1e-3  # of the mean diagonal entry of the normal matrix: directions that no photograph shows get no large colour
+MOST_VIEWS = 24  # photographs that are looked at, evenly spread
+
+
+class Behind(NamedTuple):
+    """A photograph, reduced to the sums of least squares for a sky behind its rendering."""
+
+    normal: Floats
+    """[16, 16] ``sum b_k b_l`` over the pixels."""
+    projected: Floats
+    """[16, 3] ``sum b_k r``."""
+    energy: float
+    """``sum r^2``."""
+
+    def left_by(self, sky: Floats) -> float:
+        """Return ``|r - sum_k s_k b_k|^2`` for the coefficients s [16, 3]."""
+        return float(self.energy - 2.0 * np.sum(sky * self.projected) + np.sum(sky * (self.normal @ sky)))
+
+
+def behind(residual: Floats, transmittance: Floats, basis: Floats) -> Behind:
+    """Return the sums of a photograph.
+
+    Parameters
+    ----------
+    residual : ndarray of shape (P, 3)
+        r of the pixels that count.
+    transmittance : ndarray of shape (P,)
+        T.
+    basis : ndarray of shape (P, 16)
+        Y_k.
+    """
+    b = transmittance[:, None] * basis
+    return Behind(b.T @ b, b.T @ residual, float(np.sum(residual**2)))
+
+
+def fitted_sky(photographs: Sequence[Behind]) -> Floats:
+    """Return the coefficients [16, 3] that explain photographs best, drawn a little towards zero."""
+    normal = np.sum([photograph.normal for photograph in photographs], axis=0)
+    projected = np.sum([photograph.projected for photograph in photographs], axis=0)
+    ridge = max(RIDGE * np.trace(normal) / N_BASIS, np.finfo(float).tiny)
+    return np.linalg.solve(normal + ridge * np.eye(N_BASIS), projected)
+
+
+def left_by_the_others(photographs: Sequence[Behind]) -> Floats:
+    """Return what is left of each photograph [V] by a sky that was fitted to every second one, not to itself."""
+    skies = [fitted_sky(photographs[1 - parity :: 2]) for parity in (0, 1)]
+    return np.array([photograph.left_by(skies[k % 2]) for k, photograph in enumerate(photographs)])
+
+
+def compare(as_it_is: Sequence[Behind], without_large: Sequence[Behind]) -> Evidence:
+    """Return what at least two photographs say about a sky in place of the large Gaussians; ``fitted`` is its s_k."""
+    before, after = left_by_the_others(as_it_is), left_by_the_others(without_large)
+    gains = [10.0 * np.log10(b / a) if a > 0 and b > 0 else 0.0 for a, b in zip(after, before, strict=True)]
+    error = np.std(gains, ddof=1) / np.sqrt(len(gains))
+    return Evidence(float(np.mean(gains)), float(error), fitted_sky(without_large))
+
+
+def is_larger(state: TrainState, iteration: Iteration, than: float) -> Bools:
+    """Return which Gaussians [N] have a standard deviation above ``than`` times the scene's extent."""
+    larger: Bools = np.exp(state.gaussians.log_scales).max(axis=1) > than * iteration.scene.extent
+    return larger
+
+
+def photographs_behind(
+    state: TrainState, iteration: Iteration, view_ids: Sequence[int], is_drawn: Bools | None
+) -> list[Behind]:
+    """Return the sums of training views whose rendering has the Gaussians ``is_drawn`` [N]; None for all."""
+    request = Request(
+        iteration.scene.background,
+        conventions=iteration.conventions,
+        backend=iteration.backend,
+        is_visible=is_drawn,
+    )
+    photographs = []
+    for index in view_ids:
+        view = iteration.scene.train_views[index].loaded()
+        output = iteration.renderer.render(state.model, view, request)[0]
+        counted = np.arange(output.alpha.size) if view.mask is None else np.flatnonzero(view.mask)
+        residual = view.image / 255.0 - np.clip(output.image, 0.0, 1.0)
+        rays = unit_rays(view.camera, counted, np.dtype(float)) @ view.camera.cam_from_world_R
+        transmittance = 1.0 - output.alpha.ravel()[counted].astype(float)
+        basis = sh_basis(rays, SH_DEGREE_MAX)
+        photographs.append(behind(residual.reshape(-1, 3)[counted], transmittance, basis))
+    return photographs
+
+
+def switch_sky_on(state: TrainState, iteration: Iteration, *, least_sky_gain: float) -> str | None:
+    """Put a sky in place of the largest Gaussians if photographs explain each other better by it.
+
+    Parameters
+    ----------
+    state, iteration
+        As for every action.
+    least_sky_gain : float
+        dB of the squared error that the photographs must gain on average, and more than the standard error.
+    """
+    if BACKDROP.name in state.pace.switched_on or SKY in state.shared:
+        return "nothing done: there is a sky"
+    large, huge = (is_larger(state, iteration, than) for than in (LARGE, HUGE))
+    n = int(np.count_nonzero(large))
+    if n == 0:
+        return "nothing done: no Gaussian is large"
+    ids = trained_ids(len(iteration.scene.train_views), iteration.cooling, state.pace)
+    ids = ids[:: -(-len(ids) // MOST_VIEWS)]
+    evidence = compare(*(photographs_behind(state, iteration, ids, drawn) for drawn in (None, ~large)))
+    why = f"a sky in place of {n:,} Gaussians explains {evidence.gain:.2f} dB more of the other photographs"
+    if not evidence.is_above(least_sky_gain):
+        return f"nothing done: {why}"
+    sky = fitted_sky(photographs_behind(state, iteration, ids, ~huge)).astype(np.float32)
+    apply_edit(state, keep(state.gaussians, ~huge))
+    decision = Decision(iteration.step, "sky", why, evidence.gain, evidence.standard_error)
+    switch_on(state, BACKDROP, {SKY: sky}, decision)
+    return why
