@@ -40,7 +40,7 @@ from minisplat_ref.types import Floats, Ints
 
 G_1, G_2, S = 0, 3, 6  # columns of a plane: each a value at the anchor, and the slopes along x and y, per pixel
 N_COLUMNS = 9
-SLACK = 1e-6  # px that boxes are too large by
+SLACK = 1e-6  # px that boxes and rows are too large by
 PIXELS_A_TURN = 64
 
 
@@ -64,6 +64,8 @@ class Rays(NamedTuple):
     """[W] of each column."""
     v: Floats
     """[H] of each row."""
+    per_slope: float
+    """fx, pixels."""
     near: float
 
 
@@ -252,12 +254,30 @@ def covers(planes, n, x, y, rays):
     return s > ZERO and rays.near * s < ONE
 
 
+@scalar
+def span(planes, n, y, rays):
+    """Return the columns x0, x1 between which triangle n can cover pixels of a row; a slack on either side."""
+    edges, first, last = planes.edges, planes.boxes[n, 0], planes.boxes[n, 2]
+    low, high = float(first), float(last)
+    for i in range(3):
+        a, b = edges[n, i, 0], edges[n, i, 1]
+        if abs(a) > SLACK * abs(b):  # an edge along the row bounds it nowhere, or by rounding
+            # Where the row meets the edge, in pixels from the first one's centre.
+            x = (-(b * rays.v[y] + edges[n, i, 2]) / a - rays.u[0]) * rays.per_slope
+            if a > 0:
+                low = max(low, x - SLACK)
+            else:
+                high = min(high, x + 1 + SLACK)
+    return (math.ceil(low), math.ceil(high)) if low < high else (first, first)
+
+
 @kernel()
 def _count(planes, rays, counts):
     boxes = planes.boxes
     for n in prange(counts.size):
         for y in range(boxes[n, 1], boxes[n, 3]):
-            for x in range(boxes[n, 0], boxes[n, 2]):
+            x0, x1 = span(planes, n, y, rays)
+            for x in range(x0, x1):
                 counts[n] += covers(planes, n, x, y, rays)
 
 
@@ -268,7 +288,8 @@ def _list(planes, rays, fragments):
     for n in prange(boxes.shape[0]):
         f = offsets[n]
         for y in range(boxes[n, 1], boxes[n, 3]):
-            for x in range(boxes[n, 0], boxes[n, 2]):
+            x0, x1 = span(planes, n, y, rays)
+            for x in range(x0, x1):
                 if not covers(planes, n, x, y, rays):
                     continue
                 dx, dy = c.dtype.type(x - anchors[n, 0]), c.dtype.type(y - anchors[n, 1])
@@ -422,7 +443,7 @@ def peel(mesh: TranslucentMesh, frame: Frame, background: Floats) -> Peeled:
     lens = Lens(fx, fy, cx, cy, float(frame.near), LEAST_ANGLE, camera.width, camera.height)
     _set_up(vertices, mesh.faces, lens, planes)
     counts = np.zeros(n, np.int64)
-    rays = Rays((np.arange(size[1]) + 0.5 - cx) / fx, (np.arange(size[0]) + 0.5 - cy) / fy, lens.near)
+    rays = Rays((np.arange(size[1]) + 0.5 - cx) / fx, (np.arange(size[0]) + 0.5 - cy) / fy, fx, lens.near)
     _count(planes, rays, counts)
     offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
     n_fragments = int(offsets[-1])
