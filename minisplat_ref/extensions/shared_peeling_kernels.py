@@ -40,7 +40,7 @@ from minisplat_ref.types import Floats, Ints
 
 G_1, G_2, S = 0, 3, 6  # columns of a plane: each a value at the anchor, and the slopes along x and y, per pixel
 N_COLUMNS = 9
-SLACK = 1e-6  # px that boxes are too large by
+SLACK = 1e-6  # px that boxes and rows are too large by
 PIXELS_A_TURN = 64
 
 
@@ -55,6 +55,18 @@ class Lens(NamedTuple):
     least_angle: float
     width: int
     height: int
+
+
+class Rays(NamedTuple):
+    """The rays (u, v, 1) of the pixels, in float64."""
+
+    u: Floats
+    """[W] of each column."""
+    v: Floats
+    """[H] of each row."""
+    per_slope: float
+    """fx, pixels."""
+    near: float
 
 
 class Planes(NamedTuple):
@@ -216,10 +228,10 @@ def _set_up(vertices, faces, lens, planes):
 
 
 @scalar
-def is_within(edges, n, i, x, y):
-    """Whether the ray (x, y, 1) passes an edge on its inner side; if exactly on it, whether one to the right does."""
+def is_within(edges, n, i, u, v):
+    """Whether the ray (u, v, 1) passes an edge on its inner side; if exactly on it, whether one to the right does."""
     a, b = edges[n, i, 0], edges[n, i, 1]
-    value = a * x + (b * y + edges[n, i, 2])
+    value = a * u + (b * v + edges[n, i, 2])
     return value > 0 or (value == 0 and (a > 0 or (a == 0 and b > 0)))
 
 
@@ -233,38 +245,56 @@ def reciprocal_depth(planes, n, x, y):
 
 
 @scalar
-def covers(planes, n, x, y, lens):
+def covers(planes, n, x, y, rays):
     """Whether triangle n covers a pixel, and is beyond the near plane there."""
-    s = reciprocal_depth(planes, n, x, y)
-    if not (s > ZERO and lens.near * s < ONE):
+    u, v, edges = rays.u[x], rays.v[y], planes.edges
+    if not (is_within(edges, n, 0, u, v) and is_within(edges, n, 1, u, v) and is_within(edges, n, 2, u, v)):
         return False
-    u, v = (x + 0.5 - lens.cx) / lens.fx, (y + 0.5 - lens.cy) / lens.fy
-    edges = planes.edges
-    return is_within(edges, n, 0, u, v) and is_within(edges, n, 1, u, v) and is_within(edges, n, 2, u, v)
+    s = reciprocal_depth(planes, n, x, y)
+    return s > ZERO and rays.near * s < ONE
+
+
+@scalar
+def span(planes, n, y, rays):
+    """Return the columns x0, x1 between which triangle n can cover pixels of a row; a slack on either side."""
+    edges, first, last = planes.edges, planes.boxes[n, 0], planes.boxes[n, 2]
+    low, high = float(first), float(last)
+    for i in range(3):
+        a, b = edges[n, i, 0], edges[n, i, 1]
+        if abs(a) > SLACK * abs(b):  # an edge along the row bounds it nowhere, or by rounding
+            # Where the row meets the edge, in pixels from the first one's centre.
+            x = (-(b * rays.v[y] + edges[n, i, 2]) / a - rays.u[0]) * rays.per_slope
+            if a > 0:
+                low = max(low, x - SLACK)
+            else:
+                high = min(high, x + 1 + SLACK)
+    return (math.ceil(low), math.ceil(high)) if low < high else (first, first)
 
 
 @kernel()
-def _count(planes, lens, counts):
+def _count(planes, rays, counts):
     boxes = planes.boxes
     for n in prange(counts.size):
         for y in range(boxes[n, 1], boxes[n, 3]):
-            for x in range(boxes[n, 0], boxes[n, 2]):
-                counts[n] += covers(planes, n, x, y, lens)
+            x0, x1 = span(planes, n, y, rays)
+            for x in range(x0, x1):
+                counts[n] += covers(planes, n, x, y, rays)
 
 
 @kernel()
-def _list(planes, lens, fragments):
+def _list(planes, rays, fragments):
     boxes, anchors, c = planes.boxes, planes.anchors, planes.columns
     offsets, pixels, places = fragments
     for n in prange(boxes.shape[0]):
         f = offsets[n]
         for y in range(boxes[n, 1], boxes[n, 3]):
-            for x in range(boxes[n, 0], boxes[n, 2]):
-                if not covers(planes, n, x, y, lens):
+            x0, x1 = span(planes, n, y, rays)
+            for x in range(x0, x1):
+                if not covers(planes, n, x, y, rays):
                     continue
                 dx, dy = c.dtype.type(x - anchors[n, 0]), c.dtype.type(y - anchors[n, 1])
                 s = reciprocal_depth(planes, n, x, y)
-                pixels[f] = y * lens.width + x
+                pixels[f] = y * rays.u.size + x
                 places[f, 0] = (c[n, G_1] + c[n, G_1 + 1] * dx + c[n, G_1 + 2] * dy) / s
                 places[f, 1] = (c[n, G_2] + c[n, G_2 + 1] * dx + c[n, G_2 + 2] * dy) / s
                 places[f, 2] = s
@@ -413,11 +443,12 @@ def peel(mesh: TranslucentMesh, frame: Frame, background: Floats) -> Peeled:
     lens = Lens(fx, fy, cx, cy, float(frame.near), LEAST_ANGLE, camera.width, camera.height)
     _set_up(vertices, mesh.faces, lens, planes)
     counts = np.zeros(n, np.int64)
-    _count(planes, lens, counts)
+    rays = Rays((np.arange(size[1]) + 0.5 - cx) / fx, (np.arange(size[0]) + 0.5 - cy) / fy, fx, lens.near)
+    _count(planes, rays, counts)
     offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
     n_fragments = int(offsets[-1])
     fragments = Fragments(offsets, np.empty(n_fragments, np.int32), np.empty((n_fragments, 3), dtype))
-    _list(planes, lens, fragments)
+    _list(planes, rays, fragments)
     layers = Layers(np.zeros(n_pixels + 1, np.int64), np.empty(n_fragments, np.int64))
     _sort_by_pixel(fragments.pixels, layers.offsets, layers.ids)
 

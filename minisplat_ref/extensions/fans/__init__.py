@@ -26,13 +26,13 @@ and 25.24 dB without view dependence; flat fans of k = 2.5 18.64 dB, of the fitt
 more than overlap; solid fans 22.54 and, with k = 2.77, 23.13 dB. Trained for 250 iterations, flat fans reach 27.51 dB
 and solid ones 28.05 dB, without view dependence; splats that were trained on as long 27.96 dB, and 26.82 dB without.
 These are 22,566 and 67,707 triangles, 0.7 and 1.7 MB. A pixel has 21 and 32 layers: the nearest 16 alone are off by 5
-and 16 of 255 levels, the nearest 32 by less than one.
+and 16 of 255 levels, the nearest 32 by less than one. Fans of 5,000 Gaussians are drawn and differentiated 1.9 times as
+fast as these by 3DGS's textbook loop; in float32 they cover the pixels that they cover in float64 (``bench``).
 
-Where this deviates: the paper trains in a differentiable rasteriser of other authors. Colours and opacities are clipped
-to [0, 1] after every step. Fans are pruned whole, by their most opaque vertex; single triangles are left out when a
-mesh is exported. The paper's k and rim are not known to be the same for all its scenes. A flat fan is in the plane of
-the two larger axes, also of a Gaussian that is not flat, which then vanishes when it is seen edge on; three fans
-overlap instead, and a ball is up to a third too opaque.
+Where this deviates: colours and opacities are clipped to [0, 1] after every step, so that a file holds what is drawn.
+Fans are pruned whole, by their most opaque vertex; single triangles are left out when a mesh is exported. A flat fan
+lies in the plane of the two larger axes, also of a Gaussian that is not flat, and vanishes when it is seen edge on;
+three fans do not, but overlap: turned by 50 degrees, those of a ball err by 34 % (``study fans/profile``).
 
 Left out: textures, view-dependent colour, growing new fans, pruning by gradients; .obj files have no opacities.
 """
