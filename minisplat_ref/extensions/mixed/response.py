@@ -104,7 +104,7 @@ def nearest(vertices: Floats, n_vertices: Ints, Q: Floats, centers: Floats) -> N
         offsets = np.where(is_nearer[:, :, None], d, offsets)
         edges, least = np.where(is_nearer, edge, edges), np.where(is_nearer, squared, least)
     inside = _inside(vertices, from_pixels) & (n_vertices == 3)[:, None]
-    outside = ~inside[:, :, None]
+    outside = np.logical_not(inside)[:, :, None]
     return Nearest(weights * outside, offsets * outside, np.where(inside, INSIDE, edges))
 
 
@@ -117,7 +117,7 @@ def _inside(vertices: Floats, from_pixels: Floats) -> Bools:
     area = _cross(edges[:, 0], -edges[:, 2])  # twice
     is_flat = np.abs(area) <= FLAT * np.max(np.sum(edges**2, axis=2), axis=1)
     turns = np.where(is_flat, 0, np.sign(area))[:, None, None] * _cross(edges[:, :, None], -from_pixels)
-    inside: Bools = (turns > 0).all(axis=1)
+    inside: Bools = np.logical_and.reduce(turns > 0, axis=1)
     return inside
 
 

@@ -1,8 +1,9 @@
 """The study ``mixed/scene`` compares populations of as many floats on scenes.
 
-Points of a scene become ellipses, lines and triangles by groups; 3DGS gets as many floats, by leaving points out at
-random, and, for comparison, all of the points. Nothing is densified or pruned, so that numbers stay; kinds change as
-the recipe has it.
+Points of a scene become ellipses, lines and triangles by groups. 3DGS gets as many floats, by leaving points out at
+random; and, for comparison, all of the points, and one Gaussian for each group, which tells what vertices are worth
+apart from the choice of points. Nothing is densified or pruned, so that numbers stay; kinds change as the recipe has
+it.
 """
 
 import argparse
@@ -10,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from minisplat_ref.constants import SH_C0
+from minisplat_ref.datasets.synthetic import SCENE_NAMES
 from minisplat_ref.extensions import shared_studies
 from minisplat_ref.extensions import shared_trainings as shared
 from minisplat_ref.io.atomic import making_folder
@@ -21,8 +24,8 @@ if TYPE_CHECKING:
 
     from minisplat_ref.training.schedule import Recipe
 
-ALL, PLAIN, MIXED = "3DGS, all points", "3DGS, as many floats", "mixed"
-COLORS = {ALL: shared.YELLOW, PLAIN: shared.GREY, MIXED: shared.RED}
+ALL, PLAIN, GROUPS, MIXED = "3DGS, all points", "3DGS, as many floats", "3DGS, one for each group", "mixed"
+COLORS = {ALL: shared.YELLOW, PLAIN: shared.GREY, GROUPS: shared.BLUE, MIXED: shared.RED}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,8 +48,7 @@ def run(args: argparse.Namespace) -> None:
     from minisplat_ref.reporting import describe_machine, markdown_table
 
     shared_studies.check_at_least(1, downscale=args.downscale, iterations=args.iterations, seeds=args.seeds)
-    synthetic = shared_studies.SCENE_NAMES
-    scenes = [shared_studies.read_scene(s, 1 if s in synthetic else args.downscale) for s in args.scenes]
+    scenes = [shared_studies.read_scene(s, 1 if s in SCENE_NAMES else args.downscale) for s in args.scenes]
     with making_folder(args.out) as folder:
         rows = [row for scene in scenes for row in outcomes(scene, args.iterations, args.seeds)]
         result = {"iterations": args.iterations, "seeds": args.seeds, "downscale": args.downscale, "rows": rows}
@@ -74,8 +76,13 @@ def outcomes(scene: Scene, iterations: int, n_seeds: int) -> list[dict[str, Any]
     order = np.random.default_rng(0).permutation(len(scene.points))
     fewer = np.sort(order[: min(n_equal, len(order))])
     part = scene._replace(points=scene.points[fewer], point_colors=scene.point_colors[fewer])
-    jobs = ((ALL, plain, scene), (PLAIN, plain, part), (MIXED, mixed, scene))
-    return [{"scene": scene.name, "primitives": name, **trained(*job, iterations, n_seeds)} for name, *job in jobs]
+    colors = np.rint(255 * np.clip(0.5 + SH_C0 * groups.sh_dc, 0, 1)).astype(np.uint8)
+    middles = scene._replace(points=groups.means.astype(np.float64), point_colors=colors)
+    jobs = ((ALL, plain, scene), (PLAIN, plain, part), (GROUPS, plain, middles), (MIXED, mixed, scene))
+    return [
+        {"scene": scene.name, "primitives": name, **trained(recipe, of_points, iterations, n_seeds)}
+        for name, recipe, of_points in jobs
+    ]
 
 
 def trained(recipe: "Recipe", scene: Scene, iterations: int, n_seeds: int) -> dict[str, Any]:

@@ -18,15 +18,16 @@ from minisplat_ref.extensions import shared_studies
 from minisplat_ref.extensions import shared_trainings as shared
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.study import Study
+from minisplat_ref.types import Floats
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ENOUGH = 30.0  # dB
 COLORS = {1: shared.GREY, 2: shared.BLUE, 3: shared.RED}
-NUMBERS = {
-    "shapes": {1: (1, 2, 3, 4, 6, 8, 12), 2: (1, 2, 4), 3: (1, 2, 4)},
-    "letter": {1: (3, 5, 8, 12, 16), 2: (2, 3, 4, 7, 12), 3: (2, 3, 4, 7, 12)},
+NUMBERS: dict[str, dict[int, tuple[int, ...]]] = {
+    "shapes": {1: (1, 2, 3, 4, 6, 8, 12), 2: (1, 2), 3: (1, 2)},
+    "letter": {1: (3, 5, 9, 14), 2: (2, 4, 8, 12), 3: (2, 4, 7, 11)},
 }
 SHOWN = {"shapes": {1: 3, 2: 1, 3: 1}, "letter": {1: 5, 2: 4, 3: 4}}  # about as many floats of each kind
 
@@ -34,8 +35,8 @@ SHOWN = {"shapes": {1: 3, 2: 1, 3: 1}, "letter": {1: 5, 2: 4, 3: 4}}  # about as
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--out``, ``--iterations`` and ``--seeds``."""
     shared_studies.add_out(parser)
-    parser.add_argument("--iterations", type=int, default=600, metavar="N", help="of each training (default 600)")
-    parser.add_argument("--seeds", type=int, default=4, metavar="N", help="trainings, seeds from 0 on (default 4)")
+    parser.add_argument("--iterations", type=int, default=400, metavar="N", help="of each training (default 400)")
+    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="trainings, seeds from 0 on (default 3)")
 
 
 def run(name: str, args: argparse.Namespace) -> None:
@@ -70,7 +71,8 @@ def outcomes(name: str, iterations: int, n_seeds: int) -> tuple[list[dict[str, A
     draws = shapes if name == "shapes" else {"letter": fit.letter_a, "ring": fit.ring}
     targets = {picture: draw().astype(np.float64) for picture, draw in draws.items()}
     jobs = [(picture, m, n) for picture in targets for m, numbers in NUMBERS[name].items() for n in numbers]
-    rows, pictures = [], {picture: [("target", target)] for picture, target in targets.items()}
+    rows: list[dict[str, Any]] = []
+    pictures: dict[str, list[tuple[str, Floats]]] = {key: [("target", target)] for key, target in targets.items()}
     for picture, m, n in tqdm(jobs, desc="trainings", leave=False):
         fits = [
             fit.drawn(fit.fitted(targets[picture], n, n_vertices=m, iterations=iterations, seed=seed))
