@@ -160,3 +160,7 @@ TEXTURE_THIN_FLOAT32 = 1e-3
 
 # Displacements of half a pixel that are read off slopes, pixels: linear in them, and photographs are bytes.
 DISPLACEMENT_PX = 0.15
+
+# The picture with and without a Gaussian, in float64: the difference has the rounding of both, 1e-16 for each of a few
+# hits, relative to pixels of the order of one, of which a thousand are squared and summed.
+REMOVAL = 1e-10

@@ -36,7 +36,9 @@ from minisplat_ref.types import (
 )
 
 BUFFER_MAX = 1024  # hits; beyond, None is meant
-STATISTICS = frozenset({"stats", "median_depth", "surface", "dominant_depth"})  # left to 3DGS's footprints
+STATISTICS = frozenset(
+    {"stats", "median_depth", "surface", "dominant_depth", "removal_changes"}
+)  # left to 3DGS's footprints
 
 RESPONSE = Response(lambda footprints: footprints.boxes, hit, hit_vjp, ("normals", "conics", "opacities"))
 """The book's response; in the order of the list, until ``buffer_size`` says otherwise."""

@@ -12,6 +12,9 @@ the work, in pairs (tile, Gaussian), is the slope of a line through the measurem
 
 *Cool down.* When the slope falls below a threshold, rates fall and all training views are trained on
 (:mod:`minisplat_ref.training.pace`).
+
+*Prune.* Meanwhile what the photographs would hardly miss is removed in slices
+(:mod:`minisplat_ref.methods.adaptive_prune`).
 """
 
 from functools import partial
@@ -20,14 +23,12 @@ import numpy as np
 
 from minisplat_ref.methods.adaptive_exposure import hold_mean_exposure, log_gains, switch_exposure_on
 from minisplat_ref.methods.adaptive_pose import hold_mean_pose, switch_pose_on, turn_held_out
+from minisplat_ref.methods.adaptive_prune import prune_in_slices
 from minisplat_ref.methods.gaussian_splatting import GS, GS_ACCEL, collect_gradients, prune_faint
-from minisplat_ref.methods.mini_splatting import candidates, measure_importance
 from minisplat_ref.metrics import psnr
 from minisplat_ref.rendering import Request
 from minisplat_ref.strategy.halving import OFFSET, halves
-from minisplat_ref.strategy.importance import indoor
-from minisplat_ref.strategy.ops import keep, n_rows
-from minisplat_ref.strategy.simplify import carrying_mass
+from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.adam import AdamRule
 from minisplat_ref.training.calibration import EXPOSURES
 from minisplat_ref.training.pace import Cooling, Decision, Measurement, held_out_ids
@@ -136,29 +137,6 @@ def cool_when_little_is_gained(
     return why
 
 
-def prune_when_cooling(state: TrainState, iteration: Iteration, *, mass: float, least_views: int) -> None:
-    """Remove Gaussians that contribute little to the training views, in the first iteration of the cool-down.
-
-    Parameters
-    ----------
-    state, iteration
-        As for every action.
-    mass : float
-        The most important Gaussians that carry this fraction of the blend weight of all training views stay.
-    least_views : int
-        Those that are visible in fewer views are removed, however much they contribute there.
-    """
-    if state.pace.cooling_from is None or iteration.step != state.pace.cooling_from + 1:
-        return
-    n = n_rows(state.gaussians)
-    stats = measure_importance(state, iteration)
-    importance = candidates(stats, indoor, least_views, is_intersecting=False)
-    apply_edit(state, keep(state.gaussians, carrying_mass(importance, mass)))
-    left = n_rows(state.gaussians)
-    why = f"{left:,} of {n:,} Gaussians carry {mass} of all blend weight"
-    state.pace = state.pace.decided(Decision(iteration.step, "prune", why, None, None))
-
-
 RAISED = 2.24  # Mini-Splatting2's rates in 3,000 iterations: 6^0.45 times those of 18,000, the square for the means
 
 ADAPTIVE = GS._replace(
@@ -183,7 +161,7 @@ ADAPTIVE = GS._replace(
         Every(100, partial(cool_when_little_is_gained, least_gain=0.3, least_step=800), start=100),
         Every(100, partial(grow, threshold=4e-4, most_at_once=0.2, offset=OFFSET, budget=None), start=100),
         Every(100, partial(prune_faint, least_opacity=0.005), start=100),
-        During(partial(prune_when_cooling, mass=0.98, least_views=2)),
+        During(partial(prune_in_slices, least_views=2, least_slope=0.6, most_pruned=0.2)),
     ),
     least_views=5,
     cooling=Cooling(part=0.6, last=0.1, last_per_extent=0.01, hold_out_every=8),

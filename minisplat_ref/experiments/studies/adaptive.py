@@ -27,6 +27,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.studies.ablation import append, read_records
 from minisplat_ref.experiments.studies.defects import multiplied, with_turned_cameras
 from minisplat_ref.experiments.studies.front import BLUE, RED, describe_scene, read_scene, tidy, title, write
+from minisplat_ref.experiments.studies.pruning import prune_by_exact_change, prune_by_weight, with_pruning_by
 from minisplat_ref.methods import adaptive, gaussian_splatting, get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.reporting import markdown_table
@@ -119,7 +120,9 @@ RULES: Mapping[str, Callable[[Recipe], Recipe]] = {
     "clones of 3DGS": with_clones,
     "rates of 3DGS": with_published_rates,
     "no cool-down": without_cool_down,
-    "no prune": lambda recipe: configured(recipe, mass=1.0, least_views=0),
+    "no prune": lambda recipe: configured(recipe, least_slope=0.0, least_views=0),
+    "prune by blend weight": partial(with_pruning_by, action=prune_by_weight),
+    "prune by exact change": partial(with_pruning_by, action=prune_by_exact_change),
     "no exposures": lambda recipe: configured(recipe, least_exposure_gain=math.inf),
     "no poses": lambda recipe: configured(recipe, least_pose_gain=math.inf),
 }
