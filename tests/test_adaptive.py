@@ -19,6 +19,7 @@ from minisplat_ref.methods.adaptive import ADAPTIVE, cool_when_little_is_gained,
 from minisplat_ref.methods.adaptive_prune import N_SLICES, prune_in_slices, slice_due
 from minisplat_ref.methods.mini_splatting import measure_importance
 from minisplat_ref.rendering import SPLATTING
+from minisplat_ref.strategy.error_weights import collect_error_weights
 from minisplat_ref.strategy.halving import halves
 from minisplat_ref.strategy.removal import collect_removal_costs
 from minisplat_ref.training.loop import initial_state, load_state, save_state, train
@@ -148,21 +149,26 @@ def test_factors_fall_on_a_line_of_logarithms():
 # How it grows ---------------------------------------------------------------------------------------------------------
 
 
-def test_the_strongest_are_halved_and_not_too_many(scene):
+def test_those_behind_most_error_are_halved_and_not_too_many(scene):
+    """Of three above the threshold two: those of largest error, or of largest gradient, which are others."""
     state = initial_state(scene, ADAPTIVE, 0)
-    n = len(state.gaussians.means)
-    means = np.zeros(n, np.float32)
-    means[[3, 5, 9]] = (1e-3, 3e-3, 2e-3)
-    before, views = state.gaussians, np.full(n, 2, np.int32)
-    state.stats = {"gradient_sum": 2 * means, "view_count": views}
+    before, n = state.gaussians, len(state.gaussians.means)
+    here = Iteration(scene, scene.train_views[0], None, np.zeros(0, int), None, CPU, GSPLAT_MAIN, cooling=COOLING)
+    trained = [scene.train_views[k] for k in trained_ids(len(scene.train_views), COOLING, state.pace)]
+    errors = collect_error_weights(before, trained, background=scene.background)
+    above = np.argsort(errors)[-3:]
+    means, views = np.zeros(n, np.float32), np.full(n, 2, np.int32)
+    means[above] = (3e-3, 2e-3, 1e-3)
     settings = {"threshold": 4e-4, "offset": 0.5}
-    grow(state, iteration(100), most_at_once=2 / n, **settings)
-    expected = halves(before, np.array([5, 9]), offset=0.5).gaussians
-    for field, other in zip(state.gaussians, expected, strict=True):
-        assert_array_equal(field, other)
-    assert state.stats == {}
+    for error_views, chosen in ((24, above[1:]), (0, above[:2])):
+        state.gaussians, state.stats = before, {"gradient_sum": 2 * means, "view_count": views}
+        grow(state, here, most_at_once=2 / n, error_views=error_views, **settings)
+        expected = halves(before, np.sort(chosen), offset=0.5).gaussians
+        for field, other in zip(state.gaussians, expected, strict=True):
+            assert_array_equal(field, other)
+        assert state.stats == {}
     state.pace = state.pace._replace(cooling_from=100)
-    assert "falling" in grow(state, iteration(200), most_at_once=1.0, **settings)
+    assert "falling" in grow(state, here, most_at_once=1.0, error_views=0, **settings)
 
 
 def test_a_budget_is_a_ceiling(scene):

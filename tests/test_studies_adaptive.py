@@ -39,6 +39,7 @@ def test_each_rule_is_taken_out():
     assert recipes["rates of 3DGS"].learning_rates.at(9, 1.0)["means"] == 1.6e-4
     assert recipes["no cool-down"].cooling.last_per_extent == 1.0
     assert settings_of(recipes["no prune"])["least_slope"] == 0.0
+    assert settings_of(recipes["largest gradients first"])["error_views"] == 0
     for name, way in (("prune by blend weight", "prune_by_weight"), ("prune by exact change", "prune_by_exact_change")):
         assert [n.replace(way, "prune_in_slices") for n in names[name]] == names["adaptive"] != names[name]
     assert settings_of(recipes["no exposures"])["least_exposure_gain"] == np.inf

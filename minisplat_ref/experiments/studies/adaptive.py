@@ -118,6 +118,7 @@ RULES: Mapping[str, Callable[[Recipe], Recipe]] = {
     "adaptive": lambda recipe: recipe,
     "no growth": without_growth,
     "clones of 3DGS": with_clones,
+    "largest gradients first": lambda recipe: configured(recipe, error_views=0),
     "rates of 3DGS": with_published_rates,
     "no cool-down": without_cool_down,
     "no prune": lambda recipe: configured(recipe, least_slope=0.0, least_views=0),
