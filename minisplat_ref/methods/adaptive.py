@@ -90,7 +90,7 @@ def grow(
     candidates = np.flatnonzero(means >= threshold)
     most = int(most_at_once * n) if budget is None else min(int(most_at_once * n), max(budget - n, 0))
     if len(candidates) > most:
-        ranks = _error_weights(state, iteration, error_views) if error_views else means
+        ranks = _error_weights(state, iteration, error_views) if error_views and most else means
         candidates = np.sort(candidates[np.argsort(-ranks[candidates], kind="stable")[:most]])
     share = np.count_nonzero(means >= threshold) / max(n, 1)
     apply_edit(state, halves(state.gaussians, candidates, offset=offset))
