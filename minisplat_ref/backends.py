@@ -12,6 +12,7 @@ from minisplat_ref.cpu import compositing as cpu_compositing
 from minisplat_ref.cpu import depth as cpu_depth
 from minisplat_ref.cpu import loss as cpu_loss
 from minisplat_ref.cpu import projection as cpu_projection
+from minisplat_ref.cpu import removal as cpu_removal
 from minisplat_ref.cpu import spherical_harmonics as cpu_spherical_harmonics
 from minisplat_ref.cpu import tiling as cpu_tiling
 from minisplat_ref.cpu.compositing import exact as cpu_compositing_exact
@@ -23,6 +24,7 @@ from minisplat_ref.reference import (
     depth,
     loss,
     projection,
+    removal,
     spherical_harmonics,
     tiling,
 )
@@ -53,6 +55,7 @@ class Backend:
     bin_gaussians: stages.BinGaussians
     composite: stages.Composite
     composite_vjp: stages.CompositeVjp
+    removal_changes: stages.RemovalChanges
     surface_points: stages.ComputeSurfacePoints
     surface_points_vjp: stages.SurfacePointsVjp
     photometric_loss: stages.PhotometricLoss
@@ -72,6 +75,7 @@ REFERENCE = Backend(
     bin_gaussians=tiling.bin_gaussians,
     composite=compositing.composite,
     composite_vjp=compositing.composite_vjp,
+    removal_changes=removal.removal_changes,
     surface_points=depth.surface_points,
     surface_points_vjp=depth.surface_points_vjp,
     photometric_loss=loss.photometric_loss,
@@ -92,6 +96,7 @@ CPU = Backend(
     bin_gaussians=cpu_tiling.bin_gaussians,
     composite=cpu_compositing.composite,
     composite_vjp=cpu_compositing.composite_vjp,
+    removal_changes=cpu_removal.removal_changes,
     surface_points=cpu_depth.surface_points,
     surface_points_vjp=cpu_depth.surface_points_vjp,
     photometric_loss=cpu_loss.photometric_loss,

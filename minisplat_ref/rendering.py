@@ -214,7 +214,8 @@ class Request(NamedTuple):
     wants: frozenset[str] = frozenset()
     """``depth``: a channel with ``sum w z``. ``stats``: blend statistics. ``median_depth``. ``surface``, in the
     output's extras: where each pixel's ray meets its dominant Gaussian. ``dominant_depth``, there too: [H, W] depth of
-    that Gaussian's mean. A renderer may know further names."""
+    that Gaussian's mean. ``removal_changes``, there too: [N] squared change of the colours without each Gaussian. A
+    renderer may know further names."""
 
 
 class Renderer(NamedTuple):
@@ -247,7 +248,7 @@ def _render_model(model: Model, view: View, request: Request) -> tuple[RenderOut
         backend=request.backend,
         is_visible=request.is_visible,
         with_depth="depth" in wants,
-        with_stats=bool(wants & {"stats", *_EXTRAS}),
+        with_stats=bool(wants & _OF_STATS),
         with_median_depth="median_depth" in wants,
     )
     extras = {name: extra(tape, output) for name, extra in _EXTRAS.items() if name in wants}
@@ -269,10 +270,19 @@ def _dominant_depth(tape: RenderTape, output: RenderOutput) -> Floats:
     return depths[output.stats.dominant_ids]
 
 
+def _removal_changes(tape: RenderTape, output: RenderOutput) -> Floats:
+    """Return the squared change of the colours [N] without each Gaussian."""
+    s = tape.splats
+    assert not s.has_depth, "a channel of depths has another unit"
+    return s.backend.removal_changes(s.projection, s.channels, s.background, s.bins, s.conventions, output)
+
+
 _EXTRAS: dict[str, Callable[[RenderTape, RenderOutput], Any]] = {
     "surface": _surface,
     "dominant_depth": _dominant_depth,
+    "removal_changes": _removal_changes,
 }
+_OF_STATS = frozenset({"stats", "surface", "dominant_depth"})  # what needs blend statistics
 
 
 def _channels(wants: frozenset[str]) -> dict[str, slice]:

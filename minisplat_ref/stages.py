@@ -127,6 +127,20 @@ class CompositeVjp(Protocol):
     ) -> CompositeGradient: ...
 
 
+class RemovalChanges(Protocol):
+    """Compute for each Gaussian [N], float64, the squared change of the picture without it."""
+
+    def __call__(
+        self,
+        projection: Projection,
+        colors: Floats,  # [N, D]
+        background: Floats,  # [D]
+        bins: TileBins,
+        conventions: Conventions,
+        output: RenderOutput,  # of the same backend's Composite
+    ) -> Floats: ...
+
+
 class ComputeSurfacePoints(Protocol):
     """Find where each pixel's ray meets its dominant Gaussian."""
 

@@ -84,6 +84,11 @@ def _surface_points(dtype: Dtype) -> None:
     CPU.surface_points(primitives.means, primitives.quats, primitives.scales, tape.splats.camera, stats.dominant_ids)
 
 
+def _removal_changes(dtype: Dtype) -> None:
+    s = _draw(dtype, _REFERENCE, False, with_stats=False).splats
+    CPU.removal_changes(s.projection, s.channels, s.background, s.bins, s.conventions, s.output)
+
+
 def _photometric_loss(dtype: Dtype) -> None:
     image, photograph = np.zeros((HEIGHT, WIDTH, 3), dtype), np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     CPU.photometric_loss_vjp(CPU.photometric_loss(image, photograph, 0.2)[1])
@@ -110,6 +115,7 @@ STAGES: dict[str, Callable[[Dtype], None]] = {
     "blending with depth": _stage("composite", with_depth=True),
     "blend statistics": _stage("composite", with_stats=True),
     "surface points": _surface_points,
+    "removal of Gaussians": _removal_changes,
 }
 """What is compiled together, by name; slow ones first, so that no process ends up with a slow one last."""
 

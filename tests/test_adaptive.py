@@ -15,9 +15,13 @@ from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.checkpoint import DamagedCheckpoint, load_checkpoint, save_checkpoint
 from minisplat_ref.methods import get_recipe
-from minisplat_ref.methods.adaptive import ADAPTIVE, cool_when_little_is_gained, grow, prune_when_cooling
+from minisplat_ref.methods.adaptive import ADAPTIVE, cool_when_little_is_gained, grow
+from minisplat_ref.methods.adaptive_prune import N_SLICES, prune_in_slices, slice_due
 from minisplat_ref.methods.mini_splatting import measure_importance
+from minisplat_ref.rendering import SPLATTING
+from minisplat_ref.strategy.error_weights import collect_error_weights
 from minisplat_ref.strategy.halving import halves
+from minisplat_ref.strategy.removal import collect_removal_costs
 from minisplat_ref.training.loop import initial_state, load_state, save_state, train
 from minisplat_ref.training.pace import (
     Cooling,
@@ -81,8 +85,11 @@ def test_no_step_is_taken_on_held_out_views_before_the_cool_down(scene, reports)
 
 def test_it_ends_after_the_cool_down(reports):
     seen, state = reports
-    decision, pruned, cut = state.pace.decisions
-    assert decision.what == "cool down" and decision.step == state.pace.cooling_from == pruned.step - 1 == cut.step - 1
+    decision, *others = state.pace.decisions
+    pruned = [other for other in others if other.what == "prune"]
+    assert decision.what == "cool down" and decision.step == state.pace.cooling_from == pruned[0].step - 1
+    assert [other.step for other in others if other.what == "bands"] == [decision.step + 1]
+    assert {other.what for other in others} == {"prune", "bands"}
     assert state.step == state.pace.last_step == min(700, decision.step + -(-6 * decision.step // 10))
     assert seen[0][2] is None and seen[-1][2] == state.step
     assert [m.step for m in state.pace.measurements] == list(range(200, decision.step + 1, 100))
@@ -144,21 +151,26 @@ def test_factors_fall_on_a_line_of_logarithms():
 # How it grows ---------------------------------------------------------------------------------------------------------
 
 
-def test_the_strongest_are_halved_and_not_too_many(scene):
+def test_those_behind_most_error_are_halved_and_not_too_many(scene):
+    """Of three above the threshold two: those of largest error, or of largest gradient, which are others."""
     state = initial_state(scene, ADAPTIVE, 0)
-    n = len(state.gaussians.means)
-    means = np.zeros(n, np.float32)
-    means[[3, 5, 9]] = (1e-3, 3e-3, 2e-3)
-    before, views = state.gaussians, np.full(n, 2, np.int32)
-    state.stats = {"gradient_sum": 2 * means, "view_count": views}
+    before, n = state.gaussians, len(state.gaussians.means)
+    here = Iteration(scene, scene.train_views[0], None, np.zeros(0, int), None, CPU, GSPLAT_MAIN, cooling=COOLING)
+    trained = [scene.train_views[k] for k in trained_ids(len(scene.train_views), COOLING, state.pace)]
+    errors = collect_error_weights(before, trained, background=scene.background)
+    above = np.argsort(errors)[-3:]
+    means, views = np.zeros(n, np.float32), np.full(n, 2, np.int32)
+    means[above] = (3e-3, 2e-3, 1e-3)
     settings = {"threshold": 4e-4, "offset": 0.5}
-    grow(state, iteration(100), most_at_once=2 / n, **settings)
-    expected = halves(before, np.array([5, 9]), offset=0.5).gaussians
-    for field, other in zip(state.gaussians, expected, strict=True):
-        assert_array_equal(field, other)
-    assert state.stats == {}
+    for error_views, chosen in ((24, above[1:]), (0, above[:2])):
+        state.gaussians, state.stats = before, {"gradient_sum": 2 * means, "view_count": views}
+        grow(state, here, most_at_once=2 / n, error_views=error_views, **settings)
+        expected = halves(before, np.sort(chosen), offset=0.5).gaussians
+        for field, other in zip(state.gaussians, expected, strict=True):
+            assert_array_equal(field, other)
+        assert state.stats == {}
     state.pace = state.pace._replace(cooling_from=100)
-    assert "falling" in grow(state, iteration(200), most_at_once=1.0, **settings)
+    assert "falling" in grow(state, here, most_at_once=1.0, error_views=0, **settings)
 
 
 def test_a_budget_is_a_ceiling(scene):
@@ -170,24 +182,63 @@ def test_a_budget_is_a_ceiling(scene):
         assert max(counts) == max(budget, 200)
 
 
-def test_what_carries_little_goes_when_the_rates_begin_to_fall(scene):
-    """A Gaussian far behind a camera carries nothing; a second one is seen by a single view."""
+def test_slices_are_spread_over_the_first_part_of_the_cool_down():
+    pace = Pace(cooling_from=1000, last_step=1600)
+    due = {step: slice_due(pace, step) for step in range(900, 1700) if slice_due(pace, step) is not None}
+    assert due == {1001 + 48 * k: k for k in range(N_SLICES)}  # 48 is 0.64 * 600 / 8
+    assert slice_due(pace._replace(cooling_from=None, last_step=None), 1001) is None
+    assert slice_due(Pace(cooling_from=10, last_step=12), 12) == 1  # as short as can be
+
+
+PRUNING = {"least_views": 2, "least_slope": 0.3, "most_pruned": 0.2}
+
+
+@pytest.fixture
+def cooling(scene):
+    """A state that begins to cool, and its iteration; the first Gaussian lies far behind the cameras."""
     state = initial_state(scene, ADAPTIVE, 0)
     centres = np.array([view.camera.center for view in scene.train_views])
     state.gaussians.means[0] = 100 * (centres.mean(axis=0) - scene.points.mean(axis=0))
-    state.pace = Pace(cooling_from=10, last_step=20)
-    here = Iteration(scene, scene.train_views[0], None, np.zeros(0, int), None, CPU, GSPLAT_MAIN)
-    untouched = state.gaussians
-    prune_when_cooling(state, here._replace(step=10), mass=0.98, least_views=2)
-    prune_when_cooling(state, here._replace(step=12), mass=0.98, least_views=2)
-    assert state.gaussians is untouched
-    stats = measure_importance(state, here)
-    carried = np.where(stats.is_visible.sum(axis=1) >= 2, stats.blend_weight_sum, 0)
-    prune_when_cooling(state, here._replace(step=11), mass=0.98, least_views=2)
-    kept = np.isin(untouched.means[:, 0], state.gaussians.means[:, 0])
-    assert not kept[0] and 0 < kept.sum() < 200
-    assert 0.98 <= carried[kept].sum() / carried.sum() < 1 and carried[kept].min() >= carried[~kept].max()
-    assert state.pace.decisions[-1].what == "prune"
+    state.pace = Pace(cooling_from=10, last_step=110)
+    return state, Iteration(scene, scene.train_views[0], None, np.zeros(0, int), None, CPU, GSPLAT_MAIN)
+
+
+def test_what_few_views_see_goes_when_the_rates_begin_to_fall(cooling):
+    state, here = cooling
+    before = state.gaussians
+    for step in (10, 12):
+        prune_in_slices(state, here._replace(step=step), **PRUNING)
+        assert state.gaussians is before
+    is_visible = measure_importance(state, here).is_visible
+    prune_in_slices(state, here._replace(step=11), **PRUNING | {"least_slope": 0.0})
+    assert_array_equal(state.gaussians.means, before.means[is_visible.sum(axis=1) >= 2])
+    (decision,) = state.pace.decisions
+    assert decision.what == "prune" and "fewer than 2 views" in decision.why
+
+
+def test_what_the_photographs_would_hardly_miss_goes_in_slices(cooling):
+    state, here = cooling
+    before, settings = state.gaussians, PRUNING | {"least_views": 0}
+    keep_out = collect_removal_costs(state.model, here.scene.train_views, background=here.scene.background)
+    prune_in_slices(state, here._replace(step=19), **settings | {"least_slope": 1e9})
+    assert_array_equal(state.gaussians.means, before.means[np.sort(np.argsort(keep_out.changes, kind="stable")[40:])])
+    assert "40 of 200 Gaussians change the training views by" in state.pace.decisions[-1].why
+    prune_in_slices(state, here._replace(step=27), **settings | {"least_slope": 1e-9})
+    assert len(state.gaussians.means) == 160 and len(state.pace.decisions) == 1  # a slice of less than 1 % is left out
+
+
+def test_a_renderer_that_does_not_say_is_not_pruned_by_it(cooling):
+    state, here = cooling
+
+    def render(model, view, request):
+        return SPLATTING.render(model, view, request._replace(wants=request.wants & {"stats"}))
+
+    said = []
+    silent = here._replace(renderer=SPLATTING._replace(name="silent", render=render), say=said.append)
+    prune_in_slices(state, silent._replace(step=11), **PRUNING)
+    prune_in_slices(state, silent._replace(step=19), **PRUNING)
+    assert len(said) == 1 and "renderer silent does not say" in said[0]
+    assert len(state.pace.decisions) == 1
 
 
 def test_it_grows_until_it_cools(reports):

@@ -126,7 +126,8 @@ def test_training_recovers_the_gains_and_continues_byte_for_byte(disturbed, tmp_
             save_state(saved[-1], report.state, recipe)
 
     straight = train(disturbed, recipe, seed=0, on_step=save)
-    assert [decision.what for decision in straight.pace.decisions] == ["exposures", "cool down", "prune", "bands"]
+    whats = [decision.what for decision in straight.pace.decisions]
+    assert whats[:2] == ["exposures", "cool down"] and set(whats[2:]) == {"prune", "bands"}
     found = straight.shared[EXPOSURES][:, :, :3].trace(axis1=1, axis2=2) / 3
     assert np.corrcoef(found, GAINS)[0, 1] > 0.95
     for path in saved:

@@ -39,10 +39,13 @@ def test_each_rule_is_taken_out():
     assert [n.replace("clones_while_growing", "grow") for n in names["clones of 3DGS"]] == names["adaptive"]
     assert recipes["rates of 3DGS"].learning_rates.at(9, 1.0)["means"] == 1.6e-4
     assert recipes["no cool-down"].cooling.last_per_extent == 1.0
-    assert settings_of(recipes["no prune"])["mass"] == 1.0
     assert recipes["all bands"].sh_milestones and len(names["all bands"]) == len(names["adaptive"]) - 2
     assert settings_of(recipes["no bands"])["views_per_coefficient"] == np.inf
     assert settings_of(recipes["no cut of bands"])["least_variation"] == 0.0
+    assert settings_of(recipes["no prune"])["least_slope"] == 0.0
+    assert settings_of(recipes["largest gradients first"])["error_views"] == 0
+    for name, way in (("prune by blend weight", "prune_by_weight"), ("prune by exact change", "prune_by_exact_change")):
+        assert [n.replace(way, "prune_in_slices") for n in names[name]] == names["adaptive"] != names[name]
     assert settings_of(recipes["no exposures"])["least_exposure_gain"] == np.inf
     assert settings_of(recipes["no poses"])["least_pose_gain"] == np.inf
     for recipe in recipes.values():

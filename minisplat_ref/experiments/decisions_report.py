@@ -95,7 +95,8 @@ def _name_decisions(axes: Axes, decisions: tuple[Decision, ...]) -> None:
     labels: dict[int, list[str]] = {}
     for decision in decisions:
         near = next((step for step in labels if decision.step - step <= 1), decision.step)
-        labels.setdefault(near, []).append(decision.what)
+        names = labels.setdefault(near, [])
+        names += [decision.what] * (decision.what not in names)
     for step, names in labels.items():
         axes.annotate(
             ", ".join(names),

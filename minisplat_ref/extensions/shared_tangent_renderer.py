@@ -36,7 +36,8 @@ from minisplat_ref.types import (
 )
 
 BUFFER_MAX = 1024  # hits; for more, use None
-STATISTICS = frozenset({"stats", "median_depth", "surface", "dominant_depth"})  # computed with 3DGS's footprints
+STATISTICS = frozenset({"stats", "median_depth", "surface", "dominant_depth", "removal_changes"})
+"""Computed with 3DGS's footprints."""
 
 RESPONSE = Response(lambda footprints: footprints.boxes, hit, hit_vjp, ("normals", "conics", "opacities"))
 """The response of the reference, in the order of the list unless ``buffer_size`` is set."""

@@ -4,8 +4,9 @@ No paper has published the whole; ``docs/measured/adaptive.md`` has the evidence
 without success. There is no schedule, and no setting depends on the scene:
 
 *Grow.* Every 100 iterations the Gaussians whose mean screen gradient reaches a threshold are halved
-(:mod:`minisplat_ref.strategy.halving`), those with the largest first, and at most a fifth of all at a time. A Gaussian
-that fits what it covers has a small gradient, so growth fades where a scene has enough.
+(:mod:`minisplat_ref.strategy.halving`), at most a fifth of all at a time; those come first that stand behind most of
+the pictures' error (:mod:`minisplat_ref.strategy.error_weights`). A Gaussian that fits what it covers has a small
+gradient, so growth fades where a scene has enough.
 
 *View dependence.* Each Gaussian has as many bands of the harmonics as the views that show it determine
 (:mod:`minisplat_ref.methods.adaptive_bands`).
@@ -15,8 +16,12 @@ the work, in pairs (tile, Gaussian), is the slope of a line through the measurem
 
 *Cool down.* When the slope falls below a threshold, rates fall and all training views are trained on
 (:mod:`minisplat_ref.training.pace`).
+
+*Prune.* Meanwhile what the photographs would hardly miss is removed in slices
+(:mod:`minisplat_ref.methods.adaptive_prune`).
 """
 
+import math
 from functools import partial
 
 import numpy as np
@@ -24,21 +29,21 @@ import numpy as np
 from minisplat_ref.methods.adaptive_bands import cut_bands_when_cooling, grow_bands
 from minisplat_ref.methods.adaptive_exposure import hold_mean_exposure, log_gains, switch_exposure_on
 from minisplat_ref.methods.adaptive_pose import hold_mean_pose, switch_pose_on, turn_held_out
+from minisplat_ref.methods.adaptive_prune import prune_in_slices
 from minisplat_ref.methods.adaptive_sky import switch_sky_on
 from minisplat_ref.methods.gaussian_splatting import GS, GS_ACCEL, collect_gradients, prune_faint
-from minisplat_ref.methods.mini_splatting import candidates, measure_importance
 from minisplat_ref.metrics import psnr
 from minisplat_ref.rendering import Request
+from minisplat_ref.strategy.error_weights import collect_error_weights
 from minisplat_ref.strategy.halving import OFFSET, halves
-from minisplat_ref.strategy.importance import indoor
-from minisplat_ref.strategy.ops import keep, n_rows
-from minisplat_ref.strategy.simplify import carrying_mass
+from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.adam import AdamRule
 from minisplat_ref.training.calibration import EXPOSURES
-from minisplat_ref.training.pace import Cooling, Decision, Measurement, held_out_ids
+from minisplat_ref.training.pace import Cooling, Decision, Measurement, held_out_ids, trained_ids
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.schedule import At, During, Every
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit, begin_cooling
+from minisplat_ref.types import Floats
 
 MOST_ITERATIONS = 30_000
 LEAST_GAIN = 0.05  # dB of the squared error, for which a calibration of the photographs is worthwhile
@@ -64,6 +69,7 @@ def grow(
     threshold: float,
     most_at_once: float,
     offset: float,
+    error_views: int,
     budget: int | None = None,
 ) -> str | None:
     """Halve the Gaussians whose mean gradient reaches ``threshold``, and reset the collected gradients.
@@ -75,9 +81,12 @@ def grow(
     threshold : float
         Least mean length of the screen gradient, in normalised device coordinates.
     most_at_once : float
-        At most this fraction of the Gaussians is halved, those with the largest gradients.
+        At most this fraction of the Gaussians is halved, those behind most of the pictures' error.
     offset : float
         How far apart the halves are, see :func:`minisplat_ref.strategy.halving.halves`.
+    error_views : int
+        At most so many of the views that are trained on, evenly spread, are rendered to say where the error is; with 0
+        the gradients decide which come first.
     budget : int, optional
         Largest number of Gaussians to grow to; the training may begin with more.
     """
@@ -88,10 +97,25 @@ def grow(
     candidates = np.flatnonzero(means >= threshold)
     most = int(most_at_once * n) if budget is None else min(int(most_at_once * n), max(budget - n, 0))
     if len(candidates) > most:
-        candidates = np.sort(candidates[np.argsort(-means[candidates], kind="stable")[:most]])
+        ranks = _error_weights(state, iteration, error_views) if error_views and most else means
+        candidates = np.sort(candidates[np.argsort(-ranks[candidates], kind="stable")[:most]])
     share = np.count_nonzero(means >= threshold) / max(n, 1)
     apply_edit(state, halves(state.gaussians, candidates, offset=offset))
     return f"{share:.1%} above the threshold"
+
+
+def _error_weights(state: TrainState, iteration: Iteration, most_views: int) -> Floats:
+    """Return the error behind which each Gaussian stands [N], in at most so many of the views that are trained on."""
+    views = iteration.scene.train_views
+    ids = trained_ids(len(views), iteration.cooling, state.pace)
+    return collect_error_weights(
+        state.model,
+        [views[index] for index in ids[:: math.ceil(len(ids) / most_views)]],
+        background=iteration.scene.background,
+        renderer=iteration.renderer,
+        conventions=iteration.conventions,
+        backend=iteration.backend,
+    )
 
 
 def measure_held_out(state: TrainState, iteration: Iteration) -> str | None:
@@ -143,29 +167,6 @@ def cool_when_little_is_gained(
     return why
 
 
-def prune_when_cooling(state: TrainState, iteration: Iteration, *, mass: float, least_views: int) -> None:
-    """Remove Gaussians that contribute little to the training views, in the first iteration of the cool-down.
-
-    Parameters
-    ----------
-    state, iteration
-        As for every action.
-    mass : float
-        The most important Gaussians that carry this fraction of the blend weight of all training views stay.
-    least_views : int
-        Those that are visible in fewer views are removed, however much they contribute there.
-    """
-    if state.pace.cooling_from is None or iteration.step != state.pace.cooling_from + 1:
-        return
-    n = n_rows(state.gaussians)
-    stats = measure_importance(state, iteration)
-    importance = candidates(stats, indoor, least_views, is_intersecting=False)
-    apply_edit(state, keep(state.gaussians, carrying_mass(importance, mass)))
-    left = n_rows(state.gaussians)
-    why = f"{left:,} of {n:,} Gaussians carry {mass} of all blend weight"
-    state.pace = state.pace.decided(Decision(iteration.step, "prune", why, None, None))
-
-
 RAISED = 2.24  # Mini-Splatting2's rates in 3,000 iterations: 6^0.45 times those of 18,000, the square for the means
 
 ADAPTIVE = GS._replace(
@@ -190,9 +191,13 @@ ADAPTIVE = GS._replace(
         Every(100, turn_held_out, start=100),
         Every(100, measure_held_out, start=100),
         Every(100, partial(cool_when_little_is_gained, least_gain=0.3, least_step=800), start=100),
-        Every(100, partial(grow, threshold=4e-4, most_at_once=0.2, offset=OFFSET, budget=None), start=100),
+        Every(
+            100,
+            partial(grow, threshold=4e-4, most_at_once=0.2, offset=OFFSET, error_views=24, budget=None),
+            start=100,
+        ),
         Every(100, partial(prune_faint, least_opacity=0.005), start=100),
-        During(partial(prune_when_cooling, mass=0.98, least_views=2)),
+        During(partial(prune_in_slices, least_views=2, least_slope=0.6, most_pruned=0.2)),
         During(partial(cut_bands_when_cooling, least_variation=LEAST_VARIATION)),
     ),
     least_views=5,

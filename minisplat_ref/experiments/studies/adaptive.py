@@ -29,6 +29,7 @@ from minisplat_ref.experiments.studies.ablation import append, read_records
 from minisplat_ref.experiments.studies.adaptive_candidates import CANDIDATES
 from minisplat_ref.experiments.studies.defects import multiplied, under_a_sky, with_turned_cameras
 from minisplat_ref.experiments.studies.front import BLUE, RED, describe_scene, read_scene, tidy, title, write
+from minisplat_ref.experiments.studies.pruning import prune_by_exact_change, prune_by_weight, with_pruning_by
 from minisplat_ref.io.scene import half_size
 from minisplat_ref.methods import adaptive, adaptive_bands, gaussian_splatting, get_recipe
 from minisplat_ref.metrics import evaluate
@@ -141,13 +142,16 @@ RULES: Mapping[str, Callable[[Recipe], Recipe]] = {
     "adaptive": lambda recipe: recipe,
     "no growth": without_growth,
     "clones of 3DGS": with_clones,
+    "largest gradients first": lambda recipe: configured(recipe, error_views=0),
     "rates of 3DGS": with_published_rates,
     "no cool-down": without_cool_down,
-    "no prune": lambda recipe: configured(recipe, mass=1.0, least_views=0),
     "all bands": with_all_bands,
     "no bands": lambda recipe: configured(recipe, views_per_coefficient=math.inf),
     "no cut of bands": lambda recipe: configured(recipe, least_variation=0.0),
     "no sky": lambda recipe: configured(recipe, least_sky_gain=math.inf),
+    "no prune": lambda recipe: configured(recipe, least_slope=0.0, least_views=0),
+    "prune by blend weight": partial(with_pruning_by, action=prune_by_weight),
+    "prune by exact change": partial(with_pruning_by, action=prune_by_exact_change),
     "no exposures": lambda recipe: configured(recipe, least_exposure_gain=math.inf),
     "no poses": lambda recipe: configured(recipe, least_pose_gain=math.inf),
 }

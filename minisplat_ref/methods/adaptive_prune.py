@@ -1,0 +1,89 @@
+"""How ``adaptive`` prunes: in slices, while the rates fall, what the photographs would hardly miss.
+
+With the cool-down all photographs are trained on, and the error falls because the rates do. What most Gaussians add to
+the pictures is then known: :mod:`minisplat_ref.strategy.removal` computes the change of the squared error without each
+of them, in one pass over the training views. Those that are not worth their place go, a slice at a time; after each
+slice the training repairs what it can, and the changes are computed anew. At the end of the cool-down nothing is
+removed, so that it can converge.
+"""
+
+import numpy as np
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.methods.mini_splatting import candidates, measure_importance
+from minisplat_ref.strategy.importance import indoor
+from minisplat_ref.strategy.ops import keep, n_rows
+from minisplat_ref.strategy.removal import collect_removal_costs, worth_their_place
+from minisplat_ref.training.pace import Decision, Pace
+from minisplat_ref.training.state import Iteration, TrainState, apply_edit
+
+N_SLICES = 8
+LAST_SLICE = 0.64  # no slice after this part of the cool-down
+LEAST_SLICE = 0.01  # of the Gaussians; a smaller slice is not worth a disturbance
+
+
+def slice_due(pace: Pace, step: int) -> int | None:
+    """Return which slice is due at an iteration, from 0; None where none is."""
+    if pace.cooling_from is None or pace.last_step is None:
+        return None
+    every = max(1, int(LAST_SLICE * (pace.last_step - pace.cooling_from) / N_SLICES))
+    number, rest = divmod(step - pace.cooling_from - 1, every)
+    return number if rest == 0 and 0 <= number < N_SLICES else None
+
+
+def prune_in_slices(
+    state: TrainState, iteration: Iteration, *, least_views: int, least_slope: float, most_pruned: float
+) -> None:
+    """Remove Gaussians that the training views would hardly miss, a slice at a time, while the rates fall.
+
+    Parameters
+    ----------
+    state, iteration
+        As for every action.
+    least_views : int
+        Those that are visible in fewer views are removed before the first slice, however much they change there.
+    least_slope : float
+        Those stay whose removal raises the squared error by at least this many times what the count falls by, both
+        relative: 0.6 are 1.8 dB for each doubling, before the others learn to replace them.
+    most_pruned : float
+        A slice is at most this fraction of the Gaussians.
+    """
+    number = slice_due(state.pace, iteration.step)
+    if number is None:
+        return
+    if number == 0:
+        prune_seen_by_few(state, iteration, least_views)
+    n = n_rows(state.gaussians)
+    try:
+        costs = collect_removal_costs(
+            state.model,
+            iteration.scene.train_views,
+            background=iteration.scene.background,
+            renderer=iteration.renderer,
+            conventions=iteration.conventions,
+            backend=iteration.backend,
+        )
+    except InputError as reason:
+        if number == 0:
+            iteration.say(f"nothing more is pruned: {reason}")
+        return
+    rows = worth_their_place(costs, least_slope, most_pruned)
+    if n - len(rows) < LEAST_SLICE * n:
+        return
+    apply_edit(state, keep(state.gaussians, rows))
+    lost = 10.0 * np.log10(1.0 + float(np.delete(costs.changes, rows).sum()) / costs.squared_error)
+    why = f"{n - len(rows):,} of {n:,} Gaussians change the training views by {lost:.2f} dB"
+    _record(state, iteration, why)
+
+
+def prune_seen_by_few(state: TrainState, iteration: Iteration, least_views: int) -> None:
+    """Remove what fewer than ``least_views`` views see, and what none does."""
+    n = n_rows(state.gaussians)
+    rows = np.flatnonzero(candidates(measure_importance(state, iteration), indoor, least_views, is_intersecting=False))
+    if len(rows) < n:
+        apply_edit(state, keep(state.gaussians, rows))
+        _record(state, iteration, f"{n - len(rows):,} of {n:,} Gaussians are visible in fewer than {least_views} views")
+
+
+def _record(state: TrainState, iteration: Iteration, why: str) -> None:
+    state.pace = state.pace.decided(Decision(iteration.step, "prune", why, None, None))

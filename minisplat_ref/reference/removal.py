@@ -1,0 +1,59 @@
+"""How much the picture would change without each Gaussian.
+
+A pixel is linear in the alpha of each of its hits (3DGS equation (3)), so without hit g its colour C changes by exactly
+``-q_g = -alpha_g dC/dalpha_g``. With the residual ``r = C - photograph``, the squared error changes by::
+
+    sum of |r - q_g|^2 - |r|^2 = sum of |q_g|^2 - 2 r . q_g          over pixels and channels
+
+The second term is a gradient, that of the squared error with respect to the Gaussian's opacity, times the opacity. At a
+minimum it vanishes, and then the first is the whole increase: the saliency of optimal brain damage (LeCun et al. 1990).
+In mid-training the gradient is large, and says what the next steps will correct. So this stage returns the first term.
+
+It is exact for one Gaussian, unless the pixel stops before its last hit: without g it could take some more. It is not
+additive: of two Gaussians one behind the other, each alone may be superfluous.
+"""
+
+import numpy as np
+
+from minisplat_ref.constants import Conventions
+from minisplat_ref.reference.hits import tile_hits
+from minisplat_ref.types import Floats, Projection, RenderOutput, TileBins
+
+
+def removal_changes(
+    projection: Projection,
+    colors: Floats,
+    background: Floats,
+    bins: TileBins,
+    conventions: Conventions,
+    output: RenderOutput,
+) -> Floats:
+    """Return the squared change of the picture without each Gaussian.
+
+    With the light ``B_g = sum_{j behind g} w_j c_j + T_end background`` that passes through hit g, removing the hit
+    takes its own light away and lets all of B_g through, of which it has let only ``1 - alpha_g`` pass::
+
+        q_g = w_g c_g - alpha_g / (1 - alpha_g) B_g
+        S_g = sum over pixels and channels of q_g^2
+
+    Parameters
+    ----------
+    projection, colors, background, bins, conventions
+        As for :func:`~minisplat_ref.reference.compositing.composite`.
+    output : RenderOutput
+        Its result for these inputs. Not needed here: kernels start from its image.
+
+    Returns
+    -------
+    changes : ndarray of shape (N,)
+        S, float64, in squared units of the channels; 0 for Gaussians without hits.
+    """
+    changes = np.zeros(len(colors))
+    for tile in tile_hits(projection, bins, conventions):
+        alphas = tile.alphas[:, :, None]  # [G, P, 1]
+        lights = alphas * tile.transmittances[:-1, :, None] * colors[tile.ids][:, None]  # [G, P, D] w_g c_g
+        from_here = np.cumsum(lights[::-1], axis=0)[::-1]  # of g and all behind it
+        B = from_here - lights + tile.transmittances[-1][:, None] * background
+        q = lights - alphas / (1 - alphas) * B
+        changes[tile.ids] += np.sum(q**2, axis=(1, 2), dtype=np.float64)
+    return changes
