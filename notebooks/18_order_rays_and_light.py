@@ -51,13 +51,13 @@ from minisplat_ref.extensions.rays.demo import (
     together,
     world_of,
 )
-from minisplat_ref.extensions.rays.geometry import pixel_rays
 from minisplat_ref.extensions.rays.kernels import scene_of
 from minisplat_ref.extensions.rays.lights import shade
 from minisplat_ref.extensions.rays.method import whitened_model
 from minisplat_ref.extensions.rays.surfaces import GLASS, MIRROR
 from minisplat_ref.extensions.rays.surroundings import Surroundings, joined, made_of, parallelogram
 from minisplat_ref.extensions.shared_mesh import Mesh
+from minisplat_ref.extensions.shared_rays import pixel_rays
 from minisplat_ref.extensions.shared_tangent_rays import ewa_hits, ray_colors, tangent_hits, turned
 from minisplat_ref.extensions.vr.foveation import Gaze, eccentricities, render_foveated, zone_begins, zone_weights
 from minisplat_ref.reference.covariance import covariances
