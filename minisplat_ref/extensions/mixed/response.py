@@ -117,7 +117,7 @@ def _inside(vertices: Floats, from_pixels: Floats) -> Bools:
     area = _cross(edges[:, 0], -edges[:, 2])  # twice
     is_flat = np.abs(area) <= FLAT * np.max(np.sum(edges**2, axis=2), axis=1)
     turns = np.where(is_flat, 0, np.sign(area))[:, None, None] * _cross(edges[:, :, None], -from_pixels)
-    inside: Bools = (turns > 0).all(axis=1)
+    inside: Bools = np.logical_and.reduce(turns > 0, axis=1)
     return inside
 
 

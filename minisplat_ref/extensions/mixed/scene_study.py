@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from minisplat_ref.constants import SH_C0
+from minisplat_ref.datasets.synthetic import SCENE_NAMES
 from minisplat_ref.extensions import shared_studies
 from minisplat_ref.extensions import shared_trainings as shared
 from minisplat_ref.io.atomic import making_folder
@@ -47,8 +48,7 @@ def run(args: argparse.Namespace) -> None:
     from minisplat_ref.reporting import describe_machine, markdown_table
 
     shared_studies.check_at_least(1, downscale=args.downscale, iterations=args.iterations, seeds=args.seeds)
-    synthetic = shared_studies.SCENE_NAMES
-    scenes = [shared_studies.read_scene(s, 1 if s in synthetic else args.downscale) for s in args.scenes]
+    scenes = [shared_studies.read_scene(s, 1 if s in SCENE_NAMES else args.downscale) for s in args.scenes]
     with making_folder(args.out) as folder:
         rows = [row for scene in scenes for row in outcomes(scene, args.iterations, args.seeds)]
         result = {"iterations": args.iterations, "seeds": args.seeds, "downscale": args.downscale, "rows": rows}
@@ -79,7 +79,10 @@ def outcomes(scene: Scene, iterations: int, n_seeds: int) -> list[dict[str, Any]
     colors = np.rint(255 * np.clip(0.5 + SH_C0 * groups.sh_dc, 0, 1)).astype(np.uint8)
     middles = scene._replace(points=groups.means.astype(np.float64), point_colors=colors)
     jobs = ((ALL, plain, scene), (PLAIN, plain, part), (GROUPS, plain, middles), (MIXED, mixed, scene))
-    return [{"scene": scene.name, "primitives": name, **trained(*job, iterations, n_seeds)} for name, *job in jobs]
+    return [
+        {"scene": scene.name, "primitives": name, **trained(recipe, of_points, iterations, n_seeds)}
+        for name, recipe, of_points in jobs
+    ]
 
 
 def trained(recipe: "Recipe", scene: Scene, iterations: int, n_seeds: int) -> dict[str, Any]:

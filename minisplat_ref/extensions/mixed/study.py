@@ -18,13 +18,14 @@ from minisplat_ref.extensions import shared_studies
 from minisplat_ref.extensions import shared_trainings as shared
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.study import Study
+from minisplat_ref.types import Floats
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ENOUGH = 30.0  # dB
 COLORS = {1: shared.GREY, 2: shared.BLUE, 3: shared.RED}
-NUMBERS = {
+NUMBERS: dict[str, dict[int, tuple[int, ...]]] = {
     "shapes": {1: (1, 2, 3, 4, 6, 8, 12), 2: (1, 2), 3: (1, 2)},
     "letter": {1: (3, 5, 9, 14), 2: (2, 4, 8, 12), 3: (2, 4, 7, 11)},
 }
@@ -70,7 +71,8 @@ def outcomes(name: str, iterations: int, n_seeds: int) -> tuple[list[dict[str, A
     draws = shapes if name == "shapes" else {"letter": fit.letter_a, "ring": fit.ring}
     targets = {picture: draw().astype(np.float64) for picture, draw in draws.items()}
     jobs = [(picture, m, n) for picture in targets for m, numbers in NUMBERS[name].items() for n in numbers]
-    rows, pictures = [], {picture: [("target", target)] for picture, target in targets.items()}
+    rows: list[dict[str, Any]] = []
+    pictures: dict[str, list[tuple[str, Floats]]] = {key: [("target", target)] for key, target in targets.items()}
     for picture, m, n in tqdm(jobs, desc="trainings", leave=False):
         fits = [
             fit.drawn(fit.fitted(targets[picture], n, n_vertices=m, iterations=iterations, seed=seed))
