@@ -81,7 +81,8 @@ def outcomes(name: str, iterations: int, n_seeds: int) -> tuple[list[dict[str, A
         psnr = [shared_studies.psnr_of(image, targets[picture]) for image in fits]
         if n == SHOWN[name][m]:
             best = int(np.argmax(psnr))
-            pictures[picture].append((f"{n} {fit.NAMES[m]}, {psnr[best]:.1f} dB", fits[best]))
+            name_of_kind = fit.NAMES[m].removesuffix("s") if n == 1 else fit.NAMES[m]
+            pictures[picture].append((f"{n} {name_of_kind}, {psnr[best]:.1f} dB", fits[best]))
         row = {"picture": picture, "kind": fit.NAMES[m], "n_vertices": m, "number": n}
         rows.append({**row, "n_floats": n * fit.N_FLOATS[m], "psnr": psnr})
     return rows, pictures
