@@ -1,5 +1,7 @@
 """Bands of the harmonics: who gets them, which are cut, and that a matt scene has hardly any and a shiny one has."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from adaptive_states import iteration_of, state_of
@@ -8,7 +10,9 @@ from scenes import as_dtype, make_camera, make_gaussians
 from tolerances import CLOSED_FORM
 
 from minisplat_ref.backends import CPU
-from minisplat_ref.constants import SH_C0, SH_C1
+from minisplat_ref.constants import GSPLAT_MAIN, SH_C0, SH_C1
+from minisplat_ref.errors import InputError
+from minisplat_ref.experiments.simplification import fine_tuned
 from minisplat_ref.io.checkpoint import DamagedCheckpoint, load_checkpoint, save_checkpoint
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.methods.adaptive import ADAPTIVE
@@ -23,6 +27,7 @@ from minisplat_ref.reference.spherical_harmonics import sh_colors
 from minisplat_ref.rendering import render
 from minisplat_ref.training.loop import load_state, save_state, train
 from minisplat_ref.training.pace import Pace, held_out_ids
+from minisplat_ref.training.rates import present_degrees
 from minisplat_ref.training.schedule import configured
 from minisplat_ref.training.state import DEGREES
 from minisplat_ref.types import Camera, Gaussians, Scene, View, view_from
@@ -186,12 +191,33 @@ def test_absent_bands_are_zeros_for_every_viewer(trained, tmp_path):
 
 
 def test_no_band_for_fewer_views_than_it_needs(matt):
-    """Of eight views, one of which at least is held back, none determines four coefficients twice."""
+    """Four of six views are trained on before the cool-down, and six are needed for degree 1."""
     scene, truth = matt
-    few = scene._replace(train_views=scene.train_views[:8])
-    assert len(held_out_ids(8, 8)) > 0
+    few = scene._replace(train_views=scene.train_views[::4])
+    assert len(few.train_views) - len(held_out_ids(6, 8)) == 4
     state = train(few, SHORT._replace(iterations=60), seed=0, state=state_of(few, truth))
     assert not state.stats[DEGREES].any() and not state.gaussians.sh_rest.any()
+
+
+def test_fine_tuning_leaves_absent_bands_absent(matt, trained):
+    scene, degrees = matt[0], trained[1].stats[DEGREES]
+    run = SimpleNamespace(
+        model=trained[1].model,
+        recipe=SHORT,
+        settings=SimpleNamespace(seed=0),
+        scene=scene,
+        backend=CPU,
+        conventions=GSPLAT_MAIN,
+    )
+    rows = np.arange(len(degrees))
+    tuned = fine_tuned(run, rows, 5, holds_out=False, on_step=lambda: None).gaussians.sh_rest
+    assert_array_equal(present_degrees(tuned), degrees)
+    assert (tuned != trained[1].gaussians.sh_rest)[degrees > 1][:, 3:].any()
+
+
+def test_a_negative_number_of_views():
+    with pytest.raises(InputError, match="views_per_coefficient is -1"):
+        highest_degree(np.array([3]), -1.0)
 
 
 @pytest.mark.parametrize("wrong", [np.full(30, 4, np.uint8), np.zeros(30, np.int64), np.zeros((30, 1), np.uint8)])

@@ -39,9 +39,9 @@ from minisplat_ref.strategy.simplify import most_important
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import Cooling
-from minisplat_ref.training.rates import Rates
+from minisplat_ref.training.rates import Rates, present_degrees
 from minisplat_ref.training.schedule import Recipe
-from minisplat_ref.training.state import TrainState
+from minisplat_ref.training.state import DEGREES, TrainState
 from minisplat_ref.types import Floats, Ints, Model, View
 
 N_CLOSER = 2  # sizes that are measured besides, where the limit of --max-drop lies
@@ -151,13 +151,14 @@ def fine_tuned(run: Run, rows: Ints, iterations: int, *, holds_out: bool, on_ste
     """
     gaussians = contiguous(take(run.model.gaussians, rows))
     shared = {name: np.array(array, order="C") for name, array in run.model.shared.items()}
+    has_own_degrees = run.recipe.cooling is not None and "sh_rest" in gaussians._fields
     state = TrainState(
         gaussians,
         zero_moments(gaussians),
         step=run.recipe.iterations,
         view_order=[],
         rng=np.random.default_rng(run.settings.seed),  # all sizes see the same views in the same order
-        stats={},
+        stats={DEGREES: present_degrees(gaussians.sh_rest)} if has_own_degrees else {},
         shared=shared,
         shared_adam=zero_moments(shared),
     )

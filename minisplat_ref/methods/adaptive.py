@@ -179,10 +179,10 @@ ADAPTIVE = GS._replace(
         }
     ),
     adam=AdamRule(is_visible_only=True, has_bias_correction=True),
-    sh_milestones=(),  # degrees are those of the Gaussians, see grow_bands
+    sh_milestones=(2, 2, 2),  # of Gaussians without degrees of their own; grow_bands gives them these in the first one
     events=(
         During(collect_while_growing),
-        During(partial(grow_bands, views_per_coefficient=2.0)),
+        During(partial(grow_bands, views_per_coefficient=1.5)),
         During(hold_mean_exposure),
         During(hold_mean_pose),
         At(100, partial(switch_sky_on, least_sky_gain=LEAST_SKY_GAIN)),

@@ -23,10 +23,11 @@ with them (``stats["sh_degree"]`` is the degree of each Gaussian).
 import numpy as np
 
 from minisplat_ref.constants import SH_C0, SH_DEGREE_MAX
+from minisplat_ref.errors import InputError
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.pace import Decision
-from minisplat_ref.training.rates import n_coefficients
+from minisplat_ref.training.rates import n_coefficients, present_degrees
 from minisplat_ref.training.state import DEGREES, Iteration, TrainState
 from minisplat_ref.types import Bools, Floats, Gaussians, Ints, View
 
@@ -41,7 +42,7 @@ def highest_degree(n_views: Ints, views_per_coefficient: float, most: int = SH_D
     n_views : ndarray of shape (N,) of int
         Training views in which each Gaussian has been seen.
     views_per_coefficient : float
-        Above zero.
+        At least zero.
     most : int
         Highest degree that there is.
 
@@ -49,7 +50,14 @@ def highest_degree(n_views: Ints, views_per_coefficient: float, most: int = SH_D
     -------
     ndarray of shape (N,) of uint8
         0 also where there are fewer views than one coefficient needs.
+
+    Raises
+    ------
+    InputError
+        ``views_per_coefficient`` is negative.
     """
+    if not views_per_coefficient >= 0:
+        raise InputError(f"views_per_coefficient is {views_per_coefficient}: give a number of at least 0")
     least = views_per_coefficient * np.arange(2, most + 2) ** 2  # [most] views of degrees 1, 2, ...
     return np.searchsorted(least, n_views, side="right").astype(np.uint8)
 
@@ -68,13 +76,14 @@ def grow_bands(state: TrainState, iteration: Iteration, *, views_per_coefficient
     if state.pace.cooling_from is not None:
         return
     if DEGREES not in state.stats:
-        state.stats[DEGREES], state.stats[SEEN] = np.zeros(n, np.uint8), np.zeros((n, n_views), bool)
+        state.stats |= {DEGREES: present_degrees(state.gaussians.sh_rest), SEEN: np.zeros((n, n_views), bool)}
     is_seen, view = state.stats[SEEN], iteration.view.view_id
     ids = iteration.visible_ids[iteration.v_means2d[iteration.visible_ids].any(axis=1)]  # those in front of others
     ids = ids[~is_seen[ids, view]]
     is_seen[ids, view] = True
     stored = round((state.gaussians.sh_rest.shape[1] + 1) ** 0.5) - 1
-    state.stats[DEGREES][ids] = highest_degree(is_seen[ids].sum(axis=1), views_per_coefficient, stored)
+    determined = highest_degree(is_seen[ids].sum(axis=1), views_per_coefficient, stored)
+    state.stats[DEGREES][ids] = np.maximum(state.stats[DEGREES][ids], determined)
 
 
 def cut_bands_when_cooling(state: TrainState, iteration: Iteration, *, least_variation: float) -> None:

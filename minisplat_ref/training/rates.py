@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.types import Ints
+from minisplat_ref.types import Floats, Ints
 
 
 class Rewind(NamedTuple):
@@ -104,6 +104,12 @@ class Rates(NamedTuple):
 def n_coefficients(degrees: Ints) -> Ints:
     """Return the coefficients above degree 0 that colours of these degrees have in each channel."""
     return (degrees.astype(np.int64) + 1) ** 2 - 1
+
+
+def present_degrees(sh_rest: Floats) -> Ints:
+    """Return the highest degree [N] of which a Gaussian has a coefficient that is not zero; ``sh_rest`` [N, K-1, 3]."""
+    of_coefficients = np.sqrt(np.arange(1, sh_rest.shape[1] + 1)).astype(np.uint8)  # [K-1]
+    return (sh_rest.any(axis=2) * of_coefficients).max(axis=1, initial=0)
 
 
 def active_sh_degree(step: int, milestones: Sequence[int]) -> int:

@@ -35,7 +35,7 @@ from minisplat_ref.methods import adaptive, adaptive_bands, gaussian_splatting, 
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.rates import Rates, n_coefficients
+from minisplat_ref.training.rates import Rates, n_coefficients, present_degrees
 from minisplat_ref.training.schedule import Recipe, as_trained, configured, does, scaled, settings_of
 from minisplat_ref.training.state import Iteration, StepReport, TrainState
 from minisplat_ref.types import Gaussians, Scene
@@ -254,10 +254,8 @@ def measure(scene: Scene, recipe: Recipe, seed: int) -> dict[str, Any]:
 
 def n_numbers(gaussians: Gaussians) -> int:
     """Return how many numbers a model consists of, without those of bands of the harmonics that are zero."""
-    of_coefficients = np.sqrt(np.arange(1, gaussians.sh_rest.shape[1] + 1)).astype(int)  # [K - 1] degrees
-    degrees = (gaussians.sh_rest.any(axis=2) * of_coefficients).max(axis=1, initial=0)  # [N]
     n_others = sum(int(np.prod(field.shape[1:])) for name, field in gaussians._asdict().items() if name != "sh_rest")
-    return int((n_others + 3 * n_coefficients(degrees)).sum())
+    return int((n_others + 3 * n_coefficients(present_degrees(gaussians.sh_rest))).sum())
 
 
 def summarise(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
