@@ -39,6 +39,7 @@ def test_each_rule_is_taken_out():
     assert recipes["rates of 3DGS"].learning_rates.at(9, 1.0)["means"] == 1.6e-4
     assert recipes["no cool-down"].cooling.last_per_extent == 1.0
     assert settings_of(recipes["no prune"])["mass"] == 1.0
+    assert settings_of(recipes["no sky"])["least_sky_gain"] == np.inf
     assert settings_of(recipes["no exposures"])["least_exposure_gain"] == np.inf
     assert settings_of(recipes["no poses"])["least_pose_gain"] == np.inf
     for recipe in recipes.values():
