@@ -35,7 +35,7 @@ from minisplat_ref.methods.adaptive_sky import switch_sky_on
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.training.calibration import BACKDROP, EXPOSURE, POSE
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import firing_steps
+from minisplat_ref.training.schedule import Action, firing_steps
 from minisplat_ref.training.sky import unit_rays
 from minisplat_ref.training.state import StepReport
 from minisplat_ref.types import Floats, Scene, View
@@ -45,7 +45,11 @@ PIXELS = 0.5
 COLORS = {"sky": "#7a9a3a", "exposure": BLUE, "pose": RED}
 HEIGHT = 0.25  # of a bar
 CUT = 1.2  # metres
-SWITCHES = {BACKDROP.name: switch_sky_on, EXPOSURE.name: switch_exposure_on, POSE.name: switch_pose_on}
+SWITCHES: Mapping[str, Action] = {
+    BACKDROP.name: switch_sky_on,
+    EXPOSURE.name: switch_exposure_on,
+    POSE.name: switch_pose_on,
+}
 
 
 def clean(scene: Scene, rng: np.random.Generator) -> Scene:
