@@ -46,6 +46,7 @@ def test_each_rule_is_taken_out():
     assert settings_of(recipes["largest gradients first"])["error_views"] == 0
     for name, way in (("prune by blend weight", "prune_by_weight"), ("prune by exact change", "prune_by_exact_change")):
         assert [n.replace(way, "prune_in_slices") for n in names[name]] == names["adaptive"] != names[name]
+    assert settings_of(recipes["no sky"])["least_sky_gain"] == np.inf
     assert settings_of(recipes["no exposures"])["least_exposure_gain"] == np.inf
     assert settings_of(recipes["no poses"])["least_pose_gain"] == np.inf
     for recipe in recipes.values():

@@ -7,8 +7,8 @@ import pytest
 
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.studies import defects
-from minisplat_ref.training.calibration import EXPOSURE, POSE
 
 
 @pytest.fixture(scope="module")
@@ -39,10 +39,65 @@ def test_command(tmp_path, capsys):
     command = ["study", "defects", str(tmp_path / "room"), "--trials", "1", "--out", str(tmp_path / "out")]
     assert main(command) == 0
     result = json.loads((tmp_path / "out" / "result.json").read_text())
-    assert [run["condition"] for run in result["runs"]] == list(defects.CONDITIONS)
+    assert [run["condition"] for run in result["runs"]] == ["clean", "gains", "poses"]
     for run in result["runs"]:
         row = result["summary"][run["condition"]]
-        assert row == {"trials": 1, **{c.name: int(c.name in run["switched_on"]) for c in (EXPOSURE, POSE)}}
+        assert row == {"trials": 1, **{what: int(what in run["switched_on"]) for what in ("sky", "exposure", "pose")}}
+        del run["evidence"]["switch_sky_on"]
         assert all("explain" in note for note in run["evidence"].values()) and len(run["evidence"]) == 2
     printed = capsys.readouterr().out
-    assert f"after {defects.decision_step()} iterations" in printed and "| poses " in printed
+    assert f"after {defects.decision_step(['pose'])} iterations" in printed and "| poses " in printed
+
+
+def test_sky_is_planted_above_the_cut():
+    """Where something lower than 1.2 m is seen, the photograph stays; elsewhere its colours are those of the sky."""
+    truth = make_scene("room")
+    scene = defects.under_a_sky(truth.scene, np.random.default_rng(0))
+    assert 0 < len(scene.points) < len(truth.scene.points) and scene.points[:, 2].max() <= defects.CUT
+    shown, heights = [], []
+    for view, other, depth in zip(truth.scene.test_views, scene.test_views, truth.test_depths, strict=True):
+        camera, (v, u) = view.camera, np.indices(depth.shape)
+        rays = np.stack(
+            [(u + 0.5 - camera.cx) / camera.fx, (v + 0.5 - camera.cy) / camera.fy, np.ones(depth.shape)], -1
+        )
+        points = (depth[..., None] * rays - camera.cam_from_world_t) @ camera.cam_from_world_R
+        is_low = points[..., 2] < defects.CUT - 1e-6
+        assert 0.1 < is_low.mean() < 1.0
+        np.testing.assert_array_equal(other.image[is_low], view.image[is_low])
+        assert (other.image[~is_low] != view.image[~is_low]).any(axis=-1).mean() > 0.9
+        up = (rays @ camera.cam_from_world_R)[..., 2] / np.linalg.norm(rays, axis=-1)
+        shown.append(other.image[~is_low])
+        heights.append(np.sqrt(np.maximum(up[~is_low], 0)))
+    gradient = np.column_stack([np.ones(len(np.concatenate(heights))), np.concatenate(heights)])
+    colors = np.concatenate(shown).astype(float)
+    explained = gradient @ np.linalg.lstsq(gradient, colors, rcond=None)[0]
+    assert np.ptp(colors, axis=0).max() > 5 and np.abs(colors - explained).max() <= 1.0  # rounded to bytes
+
+
+def test_sky_alone_is_asked_of_a_scene_that_is_synthetic(scene, tmp_path, capsys):
+    out = tmp_path / "out"
+    command = [
+        "study",
+        "defects",
+        "room",
+        "--conditions",
+        "clean",
+        "--asked",
+        "sky",
+        "--trials",
+        "1",
+        "--out",
+        str(out),
+    ]
+    assert main(command) == 0
+    result = json.loads((out / "result.json").read_text())
+    (run,) = result["runs"]
+    assert list(run["evidence"]) == ["switch_sky_on"] and result["summary"]["clean"] == {"trials": 1, "sky": 0}
+    assert "after 100 iterations" in capsys.readouterr().out
+    with pytest.raises(InputError, match="cuts off a synthetic scene"):
+        defects.under_a_sky(scene, np.random.default_rng(0))  # of another size than the room that is made by its name
+    for option, value in (("--asked", "weather"), ("--conditions", "rain")):
+        capsys.readouterr()
+        assert main(["study", "defects", "room", option, value, "--out", str(tmp_path / "none")]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert value in line and "sky" in line and not (tmp_path / "none" / "result.json").exists()

@@ -2,7 +2,8 @@
 
 Both are shared parameters of the model with one row per training view, and each has a renderer that wraps another one.
 A view that is not trained on (``view_id`` -1) has no row, and is rendered as if nothing were calibrated. Both are off
-unless a recipe or ``--set exposure=true``, ``--set pose=true`` switches them on.
+unless a recipe or ``--set exposure=true``, ``--set pose=true`` switches them on. So is the sky
+(:mod:`minisplat_ref.training.sky`), which all views share, and which is drawn in every view: ``--set sky=true``.
 
 *Exposure*, from the 2024 update of 3DGS: the colours of view v pass through an affine map, ``c' = A_v c + b_v``, stored
 as E_v = [A_v | b_v], 3 x 4, which starts as the identity. The released code multiplies from the other side, so it
@@ -30,7 +31,7 @@ LEAST_ANGLE = 1e-4  # radians; below it a series replaces (a - sin a) / a^3, whi
 
 
 class Calibration(NamedTuple):
-    """Parameters of each training photograph, and how they enter its rendering."""
+    """Parameters of each training photograph, or of what lies behind all, and how they enter a rendering."""
 
     name: str
     """``--set NAME=true`` switches it on."""

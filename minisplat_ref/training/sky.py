@@ -77,12 +77,12 @@ def sky_colors_vjp(rays: Floats, R: Floats, sky: Floats, v_colors: Floats) -> tu
     -------
     v_sky : ndarray of shape (16, 3)
     v_R : ndarray of shape (3, 3)
-        With respect to the nine entries, unconstrained.
+        With respect to the nine entries, unconstrained; both are float64, because they sum over many pixels.
     """
     directions = rays @ R
-    v_sky = sh_basis(directions, SH_DEGREE_MAX).T @ v_colors
+    v_sky = np.einsum("pk,pc->kc", sh_basis(directions, SH_DEGREE_MAX), v_colors, dtype=np.float64)
     v_d = np.einsum("pk,pki->pi", v_colors @ sky.T, sh_basis_jacobian(directions, SH_DEGREE_MAX))
-    return v_sky, rays.T @ v_d
+    return v_sky, np.einsum("pi,pj->ij", rays, v_d, dtype=np.float64)
 
 
 class _Tape(NamedTuple):
@@ -125,6 +125,6 @@ def with_sky(inner: Renderer) -> Renderer:
         v_alphas.ravel()[tape.pixels] -= np.sum(tape.colors * v_pixels, axis=1)  # T = 1 - alpha
         v = inner.render_vjp(tape.inner, v_image, v_alphas)
         shared = {**v.shared, SKY: v_sky.astype(tape.dtype, copy=False)}
-        return v._replace(shared=shared, cam_from_world_R=v.cam_from_world_R + v_R)
+        return v._replace(shared=shared, cam_from_world_R=v.cam_from_world_R + v_R.astype(v_image.dtype))
 
     return Renderer(f"{inner.name} with sky", render, render_vjp, inner.channels)

@@ -217,6 +217,13 @@ def _add_defects_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="C,D",
         help="clean, gains, poses, sky (default: all, sky of synthetic scenes alone)",
     )
+    parser.add_argument(
+        "--asked",
+        type=listed(name),
+        default=("sky", "exposure", "pose"),
+        metavar="A,B",
+        help="train until it is decided about these alone (default: sky,exposure,pose)",
+    )
     parser.add_argument("--trials", type=integer(1), default=10, metavar="N", help="of each kind (default 10)")
 
 

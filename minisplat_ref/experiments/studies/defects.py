@@ -16,6 +16,7 @@ import argparse
 import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,17 +35,21 @@ from minisplat_ref.methods.adaptive_sky import switch_sky_on
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.training.calibration import BACKDROP, EXPOSURE, POSE
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import firing_steps
+from minisplat_ref.training.schedule import Action, firing_steps
 from minisplat_ref.training.sky import unit_rays
 from minisplat_ref.training.state import StepReport
 from minisplat_ref.types import Floats, Scene, View
 
 LARGEST_GAIN = 0.1
 PIXELS = 0.5
-GREEN = "#7a9a3a"
+COLORS = {"sky": "#7a9a3a", "exposure": BLUE, "pose": RED}
+HEIGHT = 0.25  # of a bar
 CUT = 1.2  # metres
-CALIBRATIONS = (BACKDROP, EXPOSURE, POSE)
-HEADING = ["photographs", "trials", "sky switched on", "exposures switched on", "poses switched on"]
+SWITCHES: Mapping[str, Action] = {
+    BACKDROP.name: switch_sky_on,
+    EXPOSURE.name: switch_exposure_on,
+    POSE.name: switch_pose_on,
+}
 
 
 def clean(scene: Scene, rng: np.random.Generator) -> Scene:
@@ -75,6 +80,11 @@ def with_turned_cameras(scene: Scene, rng: np.random.Generator) -> Scene:
     return scene._replace(train_views=tuple(views))
 
 
+def _places(scene: Scene) -> Floats:
+    """Return width and position [V, 4] of the training cameras."""
+    return np.array([[view.camera.width, *view.camera.cam_from_world_t] for view in scene.train_views])
+
+
 def under_a_sky(scene: Scene, rng: np.random.Generator) -> Scene:
     """Return a synthetic scene cut off at a height of 1.2 m, under a sky whose two colours are drawn at random.
 
@@ -85,9 +95,9 @@ def under_a_sky(scene: Scene, rng: np.random.Generator) -> Scene:
     InputError
         The scene is not synthetic: nobody knows how high its pixels are.
     """
-    if scene.name not in SCENE_NAMES:
-        raise InputError(f"condition sky cuts off a synthetic scene: give one of {', '.join(SCENE_NAMES)}")
-    truth = make_scene(scene.name)
+    truth = make_scene(scene.name) if scene.name in SCENE_NAMES else None
+    if truth is None or not np.array_equal(_places(truth.scene), _places(scene)):
+        raise InputError(f"condition sky cuts off a synthetic scene: give the name of one, {', '.join(SCENE_NAMES)}")
     horizon, zenith = rng.uniform(0.2, 1.0, (2, 3))
 
     def cut_off(view: View, depth: Floats) -> View:
@@ -131,41 +141,48 @@ def run(args: argparse.Namespace) -> None:
     """
     scene = read_scene(args.scene, args.downscale)
     description = describe_scene(scene)
-    records = read_records(args.out, {"scene": description["scene"], "downscale": args.downscale})
+    settings = {"scene": description["scene"], "downscale": args.downscale, "asked": list(args.asked)}
+    records = read_records(args.out, settings)
     done = {(record["condition"], record["seed"]) for record in records}
     unknown = [name for name in args.conditions if name not in CONDITIONS]
     if unknown:
         raise InputError(f"condition {unknown[0]!r} does not exist: choose from {', '.join(CONDITIONS)}")
-    names = args.conditions or [name for name in CONDITIONS if name != "sky" or scene.name in SCENE_NAMES]
+    unasked = [name for name in args.asked if name not in SWITCHES]
+    if unasked:
+        raise InputError(f"{unasked[0]!r} is nothing that adaptive switches on: choose from {', '.join(SWITCHES)}")
+    names = args.conditions or [name for name in CONDITIONS if name != "sky" or not Path(args.scene).exists()]
     todo = [(name, seed) for seed in range(args.trials) for name in names if (name, seed) not in done]
     for name, seed in tqdm(todo, desc="trials", leave=False, disable=None):
-        record = {"condition": name, "seed": seed, **decide(CONDITIONS[name](scene, np.random.default_rng(seed)), seed)}
+        disturbed = CONDITIONS[name](scene, np.random.default_rng(seed))
+        record = {"condition": name, "seed": seed, **decide(disturbed, seed, args.asked)}
         append(args.out, record)
         records.append(record)
     records = [record for record in records if record["seed"] < args.trials and record["condition"] in names]
-    summary = summarise(records)
-    write(args.out, {**description, "trials": args.trials, "summary": summary, "runs": records}, draw(records))
+    summary = summarise(records, args.asked)
+    result = {**description, **settings, "trials": args.trials, "summary": summary, "runs": records}
+    write(args.out, result, draw(summary, args.asked))
     print(title(description))
-    print(f"after {decision_step()} iterations of adaptive\n")
-    print(markdown_table(HEADING, to_rows(summary)))
+    print(f"after {decision_step(args.asked)} iterations of adaptive\n")
+    heading = ["photographs", "trials", *(f"{name} switched on" for name in args.asked)]
+    print(markdown_table(heading, to_rows(summary)))
 
 
-def decision_step() -> int:
-    """Return the iteration after which all decisions have been made."""
-    return max(firing_steps(adaptive.ADAPTIVE, switch_sky_on, switch_exposure_on, switch_pose_on))
+def decision_step(asked: Sequence[str]) -> int:
+    """Return the iteration after which it has been decided about all that is asked."""
+    return max(firing_steps(adaptive.ADAPTIVE, *(SWITCHES[name] for name in asked)))
 
 
-def decide(scene: Scene, seed: int) -> dict[str, Any]:
+def decide(scene: Scene, seed: int, asked: Sequence[str]) -> dict[str, Any]:
     """Train until the decisions; return what was switched on, with its evidence, and the seconds of the processor."""
-    last, notes = decision_step(), {}
+    last, notes = decision_step(asked), {}
     switched_on: tuple[str, ...] = ()
     start = time.process_time()
 
     def on_step(report: StepReport) -> None:
         nonlocal switched_on
+        notes.update({fired.action: fired.note for fired in report.fired if "switch" in fired.action})
+        switched_on = report.state.pace.switched_on
         if report.step == last:
-            switched_on = report.state.pace.switched_on
-            notes.update({fired.action: fired.note for fired in report.fired if "switch" in fired.action})
             raise _DecidedError
 
     with contextlib.suppress(_DecidedError):
@@ -173,33 +190,30 @@ def decide(scene: Scene, seed: int) -> dict[str, Any]:
     return {"switched_on": list(switched_on), "evidence": notes, "seconds": time.process_time() - start}
 
 
-def summarise(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
-    """Return for each condition the number of trials, and of those that switched each calibration on."""
+def summarise(records: Sequence[Mapping[str, Any]], asked: Sequence[str]) -> dict[str, dict[str, int]]:
+    """Return for each condition the number of trials, and of those that switched on what is asked."""
     summary = {}
     for name in CONDITIONS:
         own = [record for record in records if record["condition"] == name]
-        counts = {c.name: sum(c.name in record["switched_on"] for record in own) for c in CALIBRATIONS}
+        counts = {what: sum(what in record["switched_on"] for record in own) for what in asked}
         summary[name] = {"trials": len(own), **counts}
     return summary
 
 
 def to_rows(summary: Mapping[str, Mapping[str, int]]) -> list[list[str]]:
     """Return the lines of the table."""
-    return [
-        [name, str(row["trials"]), *(str(row[c.name]) for c in CALIBRATIONS)]
-        for name, row in summary.items()
-        if row["trials"]
-    ]
+    return [[name, *map(str, row.values())] for name, row in summary.items() if row["trials"]]
 
 
-def draw(records: Sequence[Mapping[str, Any]]) -> Figure:
-    """Draw the part of the trials that switched each calibration on."""
-    summary = summarise(records)
+def draw(summary: Mapping[str, Mapping[str, int]], asked: Sequence[str]) -> Figure:
+    """Draw the part of the trials that switched on what is asked."""
+    summary = {name: row for name, row in summary.items() if row["trials"]}
     figure = Figure(figsize=(7, 2.6), layout="constrained")
     axes = figure.subplots()
-    for shift, calibration, color in zip((-0.27, 0.0, 0.27), CALIBRATIONS, (GREEN, BLUE, RED), strict=True):
-        shares = [100 * row[calibration.name] / max(row["trials"], 1) for row in summary.values()]
-        axes.barh(np.arange(len(summary)) + shift, shares, height=0.25, color=color, label=calibration.name)
+    for k, what in enumerate(asked):
+        shares = [100 * row[what] / row["trials"] for row in summary.values()]
+        places = np.arange(len(summary)) + HEIGHT * (k - 0.5 * (len(asked) - 1))
+        axes.barh(places, shares, HEIGHT, color=COLORS[what], label=what)
     axes.set(xlim=(0, 100), xlabel="trials in which it is switched on (%)", yticks=range(len(summary)))
     axes.set_yticklabels(summary)
     axes.invert_yaxis()
