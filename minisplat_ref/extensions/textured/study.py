@@ -76,7 +76,7 @@ def outcomes(whole: Gaussians, scene: Scene, iterations: int, seed: int) -> list
         kept = take(whole, most_important(importance, min(n, int(np.count_nonzero(importance)))))
         jobs.append(("as many floats", form, 3, prepared(kept, 3, replaces)))
     rows = []
-    for kept_by, form, degree, population in tqdm(jobs, desc=f"fine-tunings, seed {seed}", leave=False):
+    for kept_by, form, degree, population in tqdm(jobs, desc=f"fine-tunings, seed {seed}", leave=False, disable=None):
         after = tuned(population, scene, iterations, seed)
         test, training = (measured(after, scene, views) for views in (scene.test_views, scene.train_views))
         rows.append(
