@@ -1,4 +1,4 @@
-"""Cuts: a Bezier curve in the plane of each Gaussian cuts a part of it away, so that edges are sharp.
+"""Cuts: a Bezier curve in each Gaussian's plane cuts a part of it away, so edges are sharp.
 
 This follows DisC-GS, Qu et al. 2024, arXiv 2405.15196. A Gaussian is smooth, and spills over the edges of what it
 shows. Here each has a cubic curve in the plane of its first two axes
