@@ -231,8 +231,8 @@ ORDER = (
     ("`bench/`", "14", "speed against error"),
     ("`extensions/`", "16", "relatives of 3DGS: scale, compactness, storage"),
     ("`methods/adaptive.py`, `training/pace.py`", "17", "how a scene tells its size"),
-    ("`extensions/`: `pixel_order`, `vr`, `rays`", "18", "orders of pixels, tangent planes, rays that go on"),
-    ("`extensions/`: `textured`, `cuts`, `analytic`", "19", "paint on a Gaussian, sharp edges, what a pixel sees"),
+    ("`pixel_order`, `vr`, `rays`", "18", "orders of pixels, tangent planes, rays that go on"),
+    ("`textured`, `cuts`, `mixed`, `polygons`, `fans`", "19", "paint and sharp edges; lines, polygons, meshes"),
 )
 steps = [f"| {step} | {read} | {notebook} | {know} |" for step, (read, notebook, know) in enumerate(ORDER, 1)]
 display(Markdown("\n".join(["| step | read | notebook | you will know |", "|---|---|---|---|", *steps])))

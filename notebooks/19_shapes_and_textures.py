@@ -18,25 +18,36 @@
 #
 # A Gaussian has one colour for each direction that it is seen from, and fades out on all sides alike. So a painted ball
 # takes many of them, and a sharp edge takes more. This notebook shows relatives that give a Gaussian more to say: paint
-# on its surface, a cut through it, a better answer to what a pixel sees of it.
+# on its surface, a cut through it, a better answer to what a pixel sees of it, lines and triangles in the place of
+# ellipses. The last two turn Gaussians into polygons and meshes, for programs that know nothing of Gaussians.
 #
 # ## Paint on one Gaussian
 #
 # On the left is a soft ball with three stripes. One plain Gaussian can only take its mean colour. The others have a
 # texture of degree 1, 2 and 3, whose coefficients are the best there are, by least squares. Last are five plain
-# Gaussians, the best of three trainings: about as many numbers as the one with a texture of degree 3.
+# Gaussians, the better of two trainings: about as many numbers as the one with a texture of degree 3.
 
 # %%
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.collections import PolyCollection
 
-from figures import BLUE, GREY, RED, YELLOW, show
+from figures import BLUE, GREEN, GREY, PLUM, RED, YELLOW, show
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.extensions.analytic.footprint import OPACITY, approximations, covariance, truth
 from minisplat_ref.extensions.analytic.reference import NORMAL, integrals
 from minisplat_ref.extensions.cuts import card
 from minisplat_ref.extensions.cuts.curve import VERTICES, cut
+from minisplat_ref.extensions.fans.method import render as render_fans
+from minisplat_ref.extensions.fans.profile import fan_profile, profile_error
+from minisplat_ref.extensions.fans.shapes import FanShape, converted, mesh_of
+from minisplat_ref.extensions.mixed import fit
+from minisplat_ref.extensions.mixed import response as hull_response
+from minisplat_ref.extensions.polygons import claims as polygon_claims
+from minisplat_ref.extensions.polygons.soup import soup_of
+from minisplat_ref.extensions.rays.demo import ball as ball_of_discs
+from minisplat_ref.extensions.shared_fans import fitted_spans, rims
 from minisplat_ref.extensions.shared_studies import psnr_of
 from minisplat_ref.extensions.textured.method import TEXTURED_GAUSSIANS
 from minisplat_ref.extensions.textured.population import with_textures
@@ -45,8 +56,8 @@ from minisplat_ref.extensions.textured.study import colors_across
 from minisplat_ref.extensions.textured.tuning import floats_of
 from minisplat_ref.reference.pinhole import pinhole
 from minisplat_ref.reference.spherical_harmonics import sh_basis
-from minisplat_ref.rendering import Request
-from minisplat_ref.types import Model, view_from
+from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.types import Camera, Model, view_from
 
 # %% tags=["rounding"]
 SIZE = card.SIZE
@@ -69,7 +80,8 @@ def painted(k):
     return whole._replace(sh_dc=(k[:1] * SH_C0 - 0.5) / SH_C0, color_textures=k[1:].T.reshape(1, -1))
 
 
-alpha = TEXTURED_GAUSSIANS.renderer.render(Model(painted(np.ones((1, 3)))), view_from(card.CAMERA), Request())[0].alpha
+black = Request(backend=REFERENCE)
+alpha = TEXTURED_GAUSSIANS.renderer.render(Model(painted(np.ones((1, 3)))), view_from(card.CAMERA), black)[0].alpha
 slanted = (xs + 0.6 * ys - 38.4) / 6.5
 stripes = np.select([slanted < -1, slanted > 1], [0, 2], 1)
 STRIPES = np.array([[0.85, 0.2, 0.15], [0.95, 0.9, 0.8], [0.15, 0.35, 0.75]])
@@ -83,7 +95,7 @@ for degree in range(4):
     terms = alpha.reshape(-1, 1) * basis[:, : (degree + 1) ** 2]
     k = np.linalg.lstsq(terms, ball.reshape(-1, 3), rcond=None)[0]
     textured[degree] = painted(k)
-tries = [card.fitted(card.Target(ball, lambda rows: rows), 5, False, 1500, seed) for seed in range(3)]
+tries = [card.fitted(card.Target(ball, lambda rows: rows), 5, False, 1500, seed) for seed in (0, 2)]
 five = max(tries, key=lambda population: psnr_of(card.drawn(population), ball))
 
 pictures = {f"degree {degree}": (drawn(g), floats_of(g)) for degree, g in textured.items()}
@@ -111,6 +123,9 @@ plt.show()
 # | `minisplat_ref/extensions/textured/` | colour and opacity over its ellipsoid (Textured-GS) |
 # | `minisplat_ref/extensions/cuts/` | a Bezier curve that cuts a part away (DisC-GS) |
 # | `minisplat_ref/extensions/analytic/` | the mean over a pixel instead of a sample (Analytic-Splatting) |
+# | `minisplat_ref/extensions/mixed/` | two or three centres: lines and triangles (MP-GS) |
+# | `minisplat_ref/extensions/polygons/` | corners that can be edited (REdiSplats) |
+# | `minisplat_ref/extensions/fans/` | triangles with a transparent rim (MeshSplats) |
 #
 # **Frames and units:** pictures are 48 x 48 pixels, and lengths in them are pixels; curves have their control points in
 # deviations of their Gaussian.
@@ -262,7 +277,166 @@ plt.show()
 #
 # Notebook 16 compares the methods under zoom.
 #
+# ## Lines and triangles
+#
+# A Gaussian falls off with the distance from a *point*. Let it fall off with the distance from a segment or from a
+# triangle instead, and it is a line with round ends, or a patch with soft edges. Below each row is a target and two
+# attempts: ellipses, then lines or triangles, the better of two trainings. The last row is fair: a letter is made of
+# neither.
 
+# %% tags=["rounding"]
+TARGETS = {"line": fit.one_line(), "triangle": fit.one_triangle(), "letter": fit.letter_a()}
+ATTEMPTS = {"line": ((3, 1), (1, 2)), "triangle": ((4, 1), (1, 3)), "letter": ((5, 1), (4, 3))}
+
+
+def best_fit(target, n, n_vertices):
+    """Return the better of two fits, its picture and its PSNR."""
+    fits = [fit.fitted(target, n, n_vertices=n_vertices, iterations=400, seed=seed) for seed in range(2)]
+    pictures = [fit.drawn(population) for population in fits]
+    psnrs = [psnr_of(image, target) for image in pictures]
+    best = int(np.argmax(psnrs))
+    return fits[best], pictures[best], psnrs[best]
+
+
+figure, axes = plt.subplots(1, 9, figsize=(11, 1.9), width_ratios=3 * (1, 1, 1))
+attempts = {}
+for k, (name, target) in enumerate(TARGETS.items()):
+    show(axes[3 * k], target, name)
+    for panel, (number, n_vertices) in zip(axes[3 * k + 1 : 3 * k + 3], ATTEMPTS[name], strict=True):
+        _, image, psnr = attempts[name, n_vertices] = best_fit(target, number, n_vertices)
+        show(panel, image, f"{number} {fit.NAMES[n_vertices][: -1 if number == 1 else None]}\n{psnr:.1f} dB")
+        panel.set_xlabel(f"{number * fit.N_FLOATS[n_vertices]} numbers", fontsize=8)
+plt.show()
+
+# %% [markdown]
+# Targets from their own family are drawn exactly, and by no small number of ellipses. For the letter, three-sided
+# patches are better at equal numbers, but not by as much. One formula covers all three kinds. In whitened pixels
+# $y = L^{-1} x$, where $L L^T$ is the covariance that all vertices share,
+#
+# $$ \alpha = o \exp\left(-\tfrac12 \operatorname{dist}(y, \operatorname{conv}\{y_1, \dots, y_m\})^2\right) . $$
+#
+# With $m = 1$ that is 3DGS. The paper builds the same from ellipses around the vertices and their common tangents. The
+# picture shows lines of equal alpha, and from some pixels the way to the nearest point of the hull. These ways are not
+# perpendicular to it, because distance is measured in the metric of the ellipse.
+
+# %%
+Q = np.linalg.inv(np.array([[9.0, 4.0], [4.0, 4.0]]))
+HULLS = np.array([[-9.0, 4.0], [9.0, -6.0], [5.0, 9.0]])  # vertices, px
+side = np.linspace(-20, 20, 81)
+pixels = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+some = np.array([[-14.0, -8.0], [0.0, -14.0], [15.0, 4.0], [-4.0, 14.0], [4.0, 2.0], [14.0, -14.0]])
+
+
+def reached(m, at):
+    """Return for pixels [P, 2] the offsets [P, 2] to the nearest points of the hull of m vertices."""
+    vertices = np.where(np.arange(3)[:, None] < m, HULLS, HULLS[0])
+    return hull_response.nearest(vertices[None], np.array([m]), Q[None], at).offsets[0]
+
+
+hull_alphas = {}
+figure, axes = plt.subplots(1, 3, figsize=(9.5, 3))
+for panel, (m, name) in zip(axes, ((1, "ellipse"), (2, "line"), (3, "triangle")), strict=True):
+    ways = reached(m, pixels)
+    hull_alphas[m] = np.exp(-0.5 * np.einsum("pi,ij,pj->p", ways, Q, ways)).reshape(81, 81)
+    show(panel, hull_alphas[m], name, cmap="gray", vmin=0, vmax=1, extent=(-20, 20, 20, -20))
+    panel.contour(side, side, hull_alphas[m], [0.05, 0.3, 0.7], colors=[BLUE, GREEN, YELLOW], linewidths=1)
+    panel.plot(*HULLS[:m].T, "o", color=RED)
+    for pixel, way in zip(some, reached(m, some), strict=True):
+        panel.annotate("", pixel + way, pixel, arrowprops={"arrowstyle": "->", "color": PLUM})
+plt.show()
+
+# %% [markdown]
+# ## Polygons that can be edited
+#
+# A flat Gaussian can be written down as a polygon: eight corners on the ellipse where it has faded. Any mesh program
+# can move corners. Then the way back: which flat Gaussian fits the moved corners best? On the left a checkered sheet of
+# polygons; then it is sheared, and bent into a half-pipe. Black are the corners after the edit, red those of the
+# Gaussians that fit. Only where the edit is not affine do they differ.
+
+# %%
+sheet = polygon_claims.sheet(5)  # of 5 x 5 splats
+sheet = sheet._replace(log_scales=sheet.log_scales - np.log(2.5))  # so small that they hardly overlap
+soup = soup_of(sheet, 8)
+SHEAR = np.array([[1.0, 0.5, 0.0], [0.0, 0.8, 0.0], [0.3, 0.0, 1.0]])
+edits = {"at rest": soup.corners, "sheared": soup.corners @ SHEAR.T}
+edits["bent by 180 degrees"] = polygon_claims.bent(soup.corners, 180)
+misses = {}
+figure, axes = plt.subplots(1, 4, figsize=(11, 3), width_ratios=(1, 1, 1, 1.1))
+paint = np.column_stack([np.clip(0.5 + SH_C0 * sheet.sh_dc[soup.rows], 0, 1), np.full(len(soup.rows), 0.5)])
+for panel, (name, corners) in zip(axes, edits.items(), strict=False):
+    refit = rims(*fitted_spans(corners, soup.radii), soup.radii, 8)
+    misses[name] = np.abs(refit - corners).max()
+    seen, seen_refit = (in_view[..., :2] / in_view[..., 2:] for in_view in map(polygon_claims.placed, (corners, refit)))
+    panel.add_collection(PolyCollection(seen, facecolors=paint, edgecolors="black", linewidths=0.6))
+    panel.add_collection(PolyCollection(seen_refit, facecolors="none", edgecolors=RED, linewidths=0.7))
+    panel.set(aspect="equal", xlim=(-0.42, 0.42), ylim=(0.3, -0.4), xticks=[], yticks=[])
+    panel.set_title(f"{name}: off by {misses[name]:.2f}")
+per_side, bend_misses = (4, 8, 16, 32), {}
+for angle, color in ((45, BLUE), (180, RED)):
+    found = []
+    for number in per_side:
+        these = soup_of(polygon_claims.sheet(number), 8)
+        corners = polygon_claims.bent(these.corners, angle)
+        refit = rims(*fitted_spans(corners, these.radii), these.radii, 8)
+        spread = np.sqrt(np.mean((corners - corners.mean(axis=1, keepdims=True)) ** 2))
+        found.append(np.sqrt(np.mean((refit - corners) ** 2)) / spread)
+    bend_misses[angle] = found
+    axes[3].loglog(np.square(per_side), found, "o-", color=color, label=f"bent by {angle} degrees")
+axes[3].set(title="corners off, relative to a polygon", xlabel="splats of the sheet")
+axes[3].legend()
+plt.show()
+
+# %% [markdown]
+# With the half axes $S = [s_a e_a,\; s_b e_b]$ and the radius $r$ at which alpha has fallen to 1/291, the corners are
+#
+# $$ x_j = \mu + r S (\cos\varphi_j, \sin\varphi_j)^T, \qquad
+#    S = \frac{2}{n r} \sum_j (x_j - \mu)\,(\cos\varphi_j, \sin\varphi_j) , $$
+#
+# and the second formula, least squares, is the way back. A shear leaves $S$ with oblique columns, which are turned to
+# the axes of the same ellipse. The remaining error of a bend falls as splats become smaller: a small piece of a
+# cylinder is nearly flat.
+#
+# ## Fans: a mesh for any program
+#
+# The other way round: can a scene be exported as a mesh of triangles that other programs draw? Each Gaussian becomes a
+# fan: opaque in the middle, transparent on the rim, linear in between. Left: the profile of a Gaussian, and those of
+# three fans. Then the ball of notebook 18 as Gaussians, its mesh, and its fans, of which a pixel draws only the nearest
+# layer, the first four, and all (depth peeling).
+
+# %%
+SHAPES = {"rim transparent": FanShape(), "rim at 0.2": FanShape(rim=0.2), "reach 3.5": FanShape(reach=3.5)}
+radius_of = np.linspace(0, 4, 200)
+on_line = np.column_stack([radius_of, np.zeros(200)])
+round_ball = ball_of_discs(120)
+eye = Camera(np.eye(3), np.zeros(3), 150.0, 150.0, 47.0, 24.0, 64, 64)
+LAYERS = (1, 4, None)
+request = Request(np.array([0.1, 0.12, 0.16]), backend=REFERENCE)
+fans = converted(round_ball, FanShape())
+as_gaussians = SPLATTING.render(Model(round_ball), view_from(eye), request)[0].image
+peeled = {layers: render_fans(Model(fans), view_from(eye), request, most_layers=layers)[0].image for layers in LAYERS}
+
+figure, axes = plt.subplots(1, 6, figsize=(11, 2.4), width_ratios=(1.5, 1, 1, 1, 1, 1))
+axes[0].plot(radius_of, np.exp(-(radius_of**2) / 2), color="black", linewidth=3, alpha=0.3, label="Gaussian")
+for (name, shape), color in zip(SHAPES.items(), (BLUE, YELLOW, RED), strict=True):
+    axes[0].plot(radius_of, fan_profile(on_line, shape), color=color, label=f"{name}: {profile_error(shape):.2f}")
+axes[0].set(title="profile, and its error", xlabel="deviations")
+axes[0].legend(fontsize=7)
+show(axes[1], as_gaussians, "Gaussians")
+mesh = mesh_of(fans)
+points = mesh.vertices @ eye.cam_from_world_R.T + eye.cam_from_world_t
+axes[2].triplot(*(eye.fx * points[:, :2] / points[:, 2:] + [eye.cx, eye.cy]).T, mesh.faces, color=BLUE, linewidth=0.15)
+axes[2].set(aspect="equal", xlim=(0, 64), ylim=(64, 0), xticks=[], yticks=[], title=f"{len(mesh.faces)} triangles")
+for panel, (layers, image) in zip(axes[3:], peeled.items(), strict=True):
+    name = "all layers" if layers is None else f"{layers} layer{'s' * (layers > 1)}"
+    show(panel, image, f"{name}: {psnr_of(image, as_gaussians):.1f} dB")
+plt.show()
+
+# %% [markdown]
+# $$ \operatorname{fan}(r, \theta) = 1 - \frac{r \cos\theta}{k \cos(\pi / n)} \quad \text{up to the rim,} $$
+#
+# at the distance $r$ from the centre and the angle $\theta$ from the middle of a side. A linear slope is no bell, so
+# that a scene loses something; refitting colours, opacities and vertices gives a part of it back (`study fans/refit`).
+#
 # ## Play
 #
 # Draw a curve. What to look for:
@@ -340,6 +514,21 @@ values = {name: result[1] for name, result in results.items()}
 assert values["1 with a cut"]["psnr"] > values["4 plain"]["psnr"] + 10 > values["1 plain"]["psnr"]
 assert values["begun left"]["psnr"] < values["4 plain"]["psnr"]
 assert values["1 with a cut"]["edge_width"] < 2 < values["1 plain"]["edge_width"]
+# Lines and triangles draw their own kind exactly; and a letter better than as many numbers of ellipses.
+reached_psnr = {key: found_psnr for key, (_, _, found_psnr) in attempts.items()}
+assert reached_psnr["line", 2] > 40 > reached_psnr["line", 1]
+assert reached_psnr["triangle", 3] > 40 > reached_psnr["triangle", 1]
+assert reached_psnr["letter", 3] > reached_psnr["letter", 1] + 2
+# A hull of more vertices holds that of fewer.
+assert np.all(hull_alphas[1] <= hull_alphas[2] + 1e-12) and np.all(hull_alphas[2] <= hull_alphas[3] + 1e-12)
+# An affine edit is carried back exactly, and the error of a bend halves as splats become half as wide.
+assert max(misses["at rest"], misses["sheared"]) < 1e-12 and misses["bent by 180 degrees"] > 0.01
+falls = np.diff(np.log2(list(bend_misses.values())), axis=1)
+assert np.all((falls > -1.3) & (falls < -0.7))
+# Of the three fans the first is nearest to a Gaussian; a pixel needs all of its layers.
+assert profile_error(FanShape()) == min(map(profile_error, SHAPES.values()))
+psnrs_of_layers = [psnr_of(image, as_gaussians) for image in peeled.values()]
+assert np.all(np.diff(psnrs_of_layers) > 5) and psnrs_of_layers[-1] > 25
 # The mean keeps the light wherever a needle lies, a sample does not.
 assert np.isclose(averaged.sum(), whole, rtol=1e-6) and abs(sampled.sum() / whole - 1) > 0.1
 assert np.ptp(light["centre"]) > 1 and np.abs(np.array(light["integral, logistic"]) - 1).max() < 0.02

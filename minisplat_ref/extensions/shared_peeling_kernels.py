@@ -409,8 +409,8 @@ def peel(mesh: TranslucentMesh, frame: Frame, background: Floats) -> Peeled:
     planes = Planes(
         np.zeros((n, 3, 3)), np.zeros((n, N_COLUMNS), dtype), np.zeros((n, 2), np.int32), np.zeros((n, 4), np.int32)
     )
-    numbers = camera.fx, camera.fy, camera.cx, camera.cy, frame.near, LEAST_ANGLE
-    lens = Lens(*map(float, numbers), camera.width, camera.height)
+    fx, fy, cx, cy = map(float, (camera.fx, camera.fy, camera.cx, camera.cy))
+    lens = Lens(fx, fy, cx, cy, float(frame.near), LEAST_ANGLE, camera.width, camera.height)
     _set_up(vertices, mesh.faces, lens, planes)
     counts = np.zeros(n, np.int64)
     _count(planes, lens, counts)

@@ -196,8 +196,8 @@ def _is_inside(b: Floats, slopes: Floats) -> Bools:
 def _candidates(corners: Floats, is_drawn: Bools, frame: Frame) -> Iterator[tuple[Ints, Ints]]:
     """Yield pairs of triangles and pixels: those of its box, or all if it passes through the near plane."""
     width, height = frame.camera.width, frame.camera.height
-    is_crossing = (corners[:, :, 2] <= frame.near).any(axis=1)
-    is_drawn = is_drawn & (corners[:, :, 2] > frame.near).any(axis=1)
+    is_crossing = np.asarray((corners[:, :, 2] <= frame.near).any(axis=1))
+    is_drawn = is_drawn & np.asarray((corners[:, :, 2] > frame.near).any(axis=1))
     in_front = np.where(is_crossing[:, None, None], [0.0, 0.0, 1.0], corners)
     with np.errstate(over="ignore", invalid="ignore"):
         uv = pinhole(in_front.reshape(-1, 3), frame.camera).reshape(-1, 3, 2)

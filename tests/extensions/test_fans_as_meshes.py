@@ -145,7 +145,7 @@ def test_the_error_and_the_mass_of_profiles():
     grid = np.stack(np.meshgrid(axis, axis), axis=-1)
     for shape in (FanShape(), FLAT, FanShape(3, 2.0, 0.5)):
         assert fan_profile(grid, shape).sum() * 1e-4 / (2 * np.pi) == pytest.approx(mass(shape), rel=PROFILE_GRID)
-    assert [round(profile_error(s), 2) for s in (FanShape(), FanShape(reach=2.3, rim=0.2))] == [0.12, 0.26]
+    assert [round(profile_error(s), 2) for s in (FanShape(reach=2.5), FanShape(reach=2.3, rim=0.2))] == [0.12, 0.26]
 
 
 # --- the renderer ---
@@ -313,7 +313,7 @@ def test_trimesh_opens_what_is_exported(suffix, model, tmp_path, capsys):
     assert ("opaque" in told.err) == (suffix == "obj")
     (opened,) = trimesh.load_scene(out, process=False).geometry.values()
     assert len(opened.faces) == 960 and len(opened.vertices) == 760
-    fans = converted(as_dtype(make_gaussians(np.random.default_rng(3), 40), np.float32), FanShape(8, 2.5, 0.2, False))
+    fans = converted(as_dtype(make_gaussians(np.random.default_rng(3), 40), np.float32), FanShape(8, 3.0, 0.2, False))
     mesh = mesh_of(fans)
     assert_allclose(opened.vertices[opened.faces], mesh.vertices[mesh.faces], atol=1e-6)
     if suffix == "glb":

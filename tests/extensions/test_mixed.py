@@ -227,8 +227,9 @@ def test_an_empty_hull_is_its_ellipse_and_a_flat_one_its_longest_line(rng):
     point = np.repeat(TRIANGLE[:, :1], 3, axis=1)
     for n_vertices in (2, 3):
         assert_allclose(alphas(point, n_vertices, centers), alphas(point, 1, centers), rtol=CLOSED_FORM)
-    flat = np.array([[[2.0, 1.0], [14.0, 4.0], [8.0, 2.5]]])
-    far = np.array([[2.0, 1.0]]) + np.array([[12.0, 3.0]]) * rng.uniform(-40, 40, size=(200, 1))  # on its line
+    start, along = np.array([2.1, 1.3]), np.array([11.7, 3.1])
+    flat = start + np.array([[[0.0], [1.0], [1 / 3]]]) * along  # whose area is a rounding error
+    far = start + rng.uniform(-40, 40, size=(200, 1)) * along  # on its line
     for pixels in (centers, far):
         assert_allclose(alphas(flat, 3, pixels), alphas(flat, 2, pixels), rtol=1e3 * CLOSED_FORM)
 
@@ -343,3 +344,37 @@ def test_one_line_is_found_and_one_ellipse_is_not_enough():
     target = fit.one_line()
     line, ellipse = (fit.fitted(target, 1, n_vertices=m, iterations=200, seed=0) for m in (2, 1))
     assert psnr_of(fit.drawn(line), target) > psnr_of(fit.drawn(ellipse), target) + 10
+
+
+def test_the_letter_is_a_silhouette():
+    """Bright on its strokes, black elsewhere, in between where a pixel is covered in part."""
+    image = fit.letter_a()[..., 0]
+    assert image[30, 24] == pytest.approx(0.8) and image[20, 24] == 0 and image[2, 2] == 0
+    assert 0.05 < np.mean((image > 0) & (image < 0.79)) < 0.2
+
+
+@pytest.mark.parametrize(("name", "n_pictures"), [("shapes", 3), ("letter", 2)])
+def test_the_studies_of_pictures(name, n_pictures, tmp_path, monkeypatch, capsys):
+    from minisplat_ref.extensions.mixed import study
+
+    monkeypatch.setitem(study.NUMBERS, name, {1: (1,), 2: (1,), 3: (1,)})
+    monkeypatch.setitem(study.SHOWN, name, {1: 1, 2: 1, 3: 1})
+    out = tmp_path / "study"
+    assert main(["study", f"mixed/{name}", "--iterations", "3", "--seeds", "2", "--out", str(out)]) == 0
+    result = json.loads((out / "result.json").read_text())
+    assert len(result["rows"]) == len(result["needed"]) == 3 * n_pictures
+    assert (out / "figure.png").stat().st_size > 10_000 and "| triangles" in capsys.readouterr().out
+    assert main(["study", f"mixed/{name}", "--seeds", "0", "--out", str(tmp_path / "none")]) == 2
+    assert not (tmp_path / "none").exists()
+
+
+def test_the_study_of_scenes(tmp_path, capsys):
+    write_scene(make_scene("room", supersampling=1, **SCENE), tmp_path / "nook", SCENE)
+    options = ["--downscale", "1", "--iterations", "3", "--seeds", "1", "--out", str(tmp_path / "study")]
+    assert main(["study", "mixed/scene", str(tmp_path / "nook"), *options]) == 0
+    whole, equal, groups_alone, mixed = json.loads((tmp_path / "study" / "result.json").read_text())["rows"]
+    assert whole["n_floats"] > mixed["n_floats"] >= equal["n_floats"] > 0.95 * mixed["n_floats"]
+    assert groups_alone["number"] == mixed["number"] == sum(mixed["kinds"]) and mixed["kinds"][1] > 0
+    assert "mixed" in capsys.readouterr().out
+    assert main(["study", "mixed/scene", str(tmp_path / "gone"), *options[:-1], str(tmp_path / "none")]) == 2
+    assert "gone" in capsys.readouterr().err and not (tmp_path / "none").exists()

@@ -286,13 +286,23 @@ def test_a_triangle_through_the_near_plane_is_cut_there(peeling):
     floor = TranslucentMesh(
         np.array(HARD["around the camera"]) * [1, -5, 1], np.full((3, 4), 0.5), np.array([[0, 1, 2]])
     )
-    peeled = peeling.peel(floor, frame_of(), BACKGROUND)
+    near = 2.5
+    peeled = peeling.peel(floor, Frame(make_camera(), near), BACKGROUND)
     d = pinhole_rays(CENTERS[..., 0], CENTERS[..., 1], make_camera())
     t = 0.5 / d[..., 1]  # where the floor y = 0.5 is met
     x, z = t * d[..., 0], t
-    expected = (t > NEAR) & (np.abs(x) < 4 * (9 - z) / 11) & (z < 9)
-    assert 50 < expected.sum() < expected.size
+    expected = (t > near) & (np.abs(x) < 4 * (9 - z) / 11) & (z < 9)
+    assert 20 < expected.sum() < (t > 0).sum()
     assert_array_equal(peeled.n_layers == 1, expected)
+
+
+@pytest.mark.parametrize(("height", "is_drawn"), [(3e-8, True), (3e-10, False)])
+def test_a_plane_that_all_but_holds_the_camera_is_not_drawn(peeling, height, is_drawn):
+    """A floor so little below the camera that a row of pixels, which looks down as little, meets it at depth 3."""
+    vertices = np.array([[-9.0, height, 1], [9, height, 1], [0, height, 50]])
+    floor = TranslucentMesh(vertices, np.full((3, 4), 0.5), np.array([[0, 1, 2]]))
+    peeled = peeling.peel(floor, frame_of(make_camera(cy=9.5 - 28 * height / 3)), BACKGROUND)
+    assert (peeled.n_layers[9] == is_drawn).all()
 
 
 def test_of_coincident_triangles_the_first_is_in_front(peeling):

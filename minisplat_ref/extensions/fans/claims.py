@@ -8,7 +8,7 @@ import numpy as np
 
 from minisplat_ref.extensions.fans.mesh_files import write_mesh
 from minisplat_ref.extensions.fans.method import render
-from minisplat_ref.extensions.fans.shapes import Fans, FanShape, converted, mesh_of, visible_mesh
+from minisplat_ref.extensions.fans.shapes import FRONT_REACH, Fans, FanShape, converted, mesh_of, visible_mesh
 from minisplat_ref.extensions.fans.tuning import best_shape, drawn, measured, tuned
 from minisplat_ref.extensions.shared_studies import psnr_of
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
@@ -24,7 +24,7 @@ SIDES = (3, 4, 6, 8, 12, 16)
 LAYERS = (4, 8, 16, 32, 64)
 MOST_VIEWS = 4  # training views that shapes are compared and fitted on
 FLAT, SOLID = "flat fans", "solid fans"
-FORMS = {FLAT: FanShape(), SOLID: FanShape(is_flat=False)}
+FORMS = {FLAT: FanShape(reach=FRONT_REACH), SOLID: FanShape(reach=FRONT_REACH, is_flat=False)}
 
 
 class Judge(NamedTuple):

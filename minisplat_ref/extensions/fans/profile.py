@@ -17,14 +17,14 @@ from scipy.optimize import minimize
 
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
-from minisplat_ref.extensions.fans.shapes import FanShape, converted
+from minisplat_ref.extensions.fans.shapes import FRONT_REACH, FanShape, converted
 from minisplat_ref.extensions.fans.tuning import alpha_of
 from minisplat_ref.types import Camera, Floats, Gaussians, view_from
 
 REACH_OF_GRID, STEP = 5.0, 0.025  # standard deviations
 SIZE, DISTANCE = 65, 10.0  # px, standard deviations
 OPACITY = 0.8
-SCALES = {"disc": (1.0, 1.0, 0.01), "ball": (1.0, 1.0, 1.0)}
+SCALES = {"disc": (1.0, 1.0, 0.01), "ball": (1.0, 1.0, 0.999)}  # a flat fan faces the camera first
 ANGLES = tuple(range(0, 91, 10))  # degrees
 
 
@@ -83,7 +83,7 @@ def tilts() -> list[Tilt]:
             for angle in np.radians(ANGLES):
                 one = _turned(scales, angle)
                 expected = alpha_of(one, view, conventions=sharp, backend=REFERENCE)
-                fans = converted(one, FanShape(is_flat=is_flat))
+                fans = converted(one, FanShape(reach=FRONT_REACH, is_flat=is_flat))
                 found = alpha_of(fans, view, conventions=sharp, backend=REFERENCE)
                 errors.append(float(np.linalg.norm(found - expected) / np.linalg.norm(expected)))
             results.append(Tilt(kind, is_flat, errors))

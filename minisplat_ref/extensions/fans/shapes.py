@@ -24,14 +24,18 @@ from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.types import Bools, Floats, Gaussians, Ints
 
 SOLID_PLANES = 3
+FRONT_REACH = 2.5  # k of the fan of 8 sides that is nearest to a Gaussian seen from the front; its rim is transparent
 
 
 class FanShape(NamedTuple):
-    """How Gaussians become fans; the defaults fit a Gaussian's profile best with eight sides."""
+    """How Gaussians become fans.
+
+    The default reach is larger than ``FRONT_REACH``: a scene of many shows holes more than it shows fans that overlap.
+    """
 
     n_sides: int = 8
     """n."""
-    reach: float = 2.5
+    reach: float = 3.0
     """k, standard deviations from the centre to the rim."""
     rim: float = 0.0
     """Opacity on the rim as a fraction of that of the centre, in [0, 1]."""

@@ -176,8 +176,8 @@ def draw(result: dict[str, Any], pictures: dict[str, Any]) -> "Figure":
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12.0, 6.6), layout="constrained")
-    top, bottom = figure.subfigures(2, 1, height_ratios=(1, 1))
-    left, right = top.subplots(1, 2)
+    parts: Any = figure.subfigures(2, 1)
+    left, right = parts[0].subplots(1, 2)
     run = result["runs"][0]
     for name, style in (("flat fans", "o-"), ("solid fans", "s--")):
         for rim, color in RIM_COLORS.items():
@@ -198,7 +198,7 @@ def draw(result: dict[str, Any], pictures: dict[str, Any]) -> "Figure":
     right.set(xlabel="test PSNR (dB)", xlim=(min(p for p, _ in psnrs) - 2, None))
     for axes in (left, right):
         shared_studies.tidy(axes)
-    for axes, (title, image) in zip(bottom.subplots(1, len(pictures)), pictures.items(), strict=True):
+    for axes, (title, image) in zip(parts[1].subplots(1, len(pictures)), pictures.items(), strict=True):
         axes.imshow(np.clip(image, 0, 1))
         axes.set_title(title, fontsize=8)
         axes.set_axis_off()

@@ -1,6 +1,6 @@
 """Refitting: the two numbers of all fans at once, or every vertex by itself."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import product
 from typing import Any
 
@@ -35,7 +35,7 @@ def tuned(
 
 
 def best_shape(
-    gaussians: Gaussians, shape: FanShape, views: list[View], targets: list[Floats], background: Floats
+    gaussians: Gaussians, shape: FanShape, views: Sequence[View], targets: Sequence[Floats], background: Floats
 ) -> FanShape:
     """Return the shape with the reach and the rim whose pictures are nearest to targets.
 
@@ -47,9 +47,9 @@ def best_shape(
     gaussians : Gaussians
     shape : FanShape
         Its sides, and whether fans are flat.
-    views : list of View
+    views : sequence of View
         From where.
-    targets : list of ndarray of shape (H, W, 3)
+    targets : sequence of ndarray of shape (H, W, 3)
         Photographs or pictures in [0, 1]; the sum of squared differences counts.
     background : ndarray of shape (3,)
         RGB behind everything.

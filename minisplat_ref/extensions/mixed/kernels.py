@@ -142,20 +142,21 @@ def response_for(dtype: np.dtype) -> KernelResponse:
 
 def _records(conic_records: Callable, footprints: Footprints, dtype: np.dtype) -> Floats:
     projection, vertices, n_vertices = footprints
-    vertices, (a, b, c) = vertices.astype(np.float64), projection.conics.astype(np.float64).T
-    records = np.zeros((len(a), N_COLUMNS), dtype)
+    records = np.zeros((len(n_vertices), N_COLUMNS), dtype)
     records[:, :CONIC_GRADIENTS] = conic_records(projection, dtype)[:, :CONIC_GRADIENTS]
-    records[:, DEPTH], records[:, COUNT] = projection.depths, n_vertices
-    edges = np.stack([vertices[:, j] - vertices[:, i] for i, j in ((0, 1), (1, 2), (2, 0))], axis=1)  # [N, 3, 2]
-    x, y = edges[:, :, 0], edges[:, :, 1]
-    Q_x, Q_y = a[:, None] * x + b[:, None] * y, b[:, None] * x + c[:, None] * y
-    lengths = x * Q_x + y * Q_y  # squared, [N, 3]
+    records[:, V_1:N_GRADIENTS], records[:, DEPTH] = vertices.reshape(-1, 6), projection.depths
+    records[:, COUNT] = n_vertices
+    rows = np.flatnonzero(n_vertices > 1)
+    v_x, v_y = np.moveaxis(vertices[rows].astype(np.float64), 2, 0)  # [H, 3] each
+    x, y = np.roll(v_x, -1, axis=1) - v_x, np.roll(v_y, -1, axis=1) - v_y  # of the edges
+    a, b, c = projection.conics[rows].astype(np.float64).T[:, :, None]
+    Q_x, Q_y = a * x + b * y, b * x + c * y
+    lengths = x * Q_x + y * Q_y  # squared
     inverses = np.where(lengths > 0, 1 / np.where(lengths > 0, lengths, 1), 0)
-    records[:, G_12:N_COLUMNS] = np.stack([Q_x * inverses, Q_y * inverses], axis=2).reshape(-1, 6)
-    records[:, V_1:N_GRADIENTS] = vertices.reshape(-1, 6)
+    records[rows, G_12:N_COLUMNS:2], records[rows, G_12 + 1 : N_COLUMNS : 2] = Q_x * inverses, Q_y * inverses
     area = y[:, 0] * x[:, 2] - x[:, 0] * y[:, 2]  # twice
     is_flat = np.abs(area) <= FLAT * np.max(x * x + y * y, axis=1)
-    records[:, TURN] = np.where(is_flat, 0, np.sign(area))
+    records[rows, TURN] = np.where(is_flat, 0, np.sign(area))
     return records
 
 

@@ -3,8 +3,7 @@
 MP-GS clusters points hierarchically into groups of one, two or three, and makes each an ellipse, a line or a triangle.
 Here two points may join if one is among the three nearest neighbours of the other, no further than twice as far as the
 nearest of either, and their colours differ by less than 5 in CIE Lab; pairs join in the order of their distance, as
-long as a group has at most three points and each two of them are alike. A group's frame has its plane in the first two
-axes.
+long as a group has at most three points and each two of them are alike. A group's plane is that of its first two axes.
 """
 
 from typing import NamedTuple

@@ -101,7 +101,7 @@ def footprints_of(hulls: Hulls, projection: Projection, camera: Camera, conventi
     rows = np.flatnonzero(hulls.n_vertices > 1)
     vertices = np.zeros((len(hulls.n_vertices), N_VERTICES, 2), projection.means2d.dtype)
     of_rows, vertices[rows] = _project(hulls.of(rows), camera, conventions)
-    merged = Projection(*(field.copy() for field in projection))
+    merged = Projection._make(field.copy() for field in projection)
     for whole, part in zip(merged, of_rows, strict=True):
         whole[rows] = part
     return Footprints(merged, vertices, hulls.n_vertices)

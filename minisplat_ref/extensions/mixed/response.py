@@ -104,7 +104,7 @@ def nearest(vertices: Floats, n_vertices: Ints, Q: Floats, centers: Floats) -> N
         offsets = np.where(is_nearer[:, :, None], d, offsets)
         edges, least = np.where(is_nearer, edge, edges), np.where(is_nearer, squared, least)
     inside = _inside(vertices, from_pixels) & (n_vertices == 3)[:, None]
-    outside = ~inside[:, :, None]
+    outside = np.logical_not(inside)[:, :, None]
     return Nearest(weights * outside, offsets * outside, np.where(inside, INSIDE, edges))
 
 

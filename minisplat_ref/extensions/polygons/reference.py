@@ -11,7 +11,7 @@ It hits the polygon of n sides and radius r if it is on the inner side of every 
     u cos psi_j + v sin psi_j <= r cos(pi / n),   psi_j = (2 j + 1) pi / n
 
 A polygon of radius 0 is never hit. The edge has no gradient: at most ``o exp(-(r cos(pi / n))^2 / 2)`` of alpha ends
-there, 2/255 for an octagon of opacity 1.
+there, 0.008 for an octagon of opacity 1.
 """
 
 from typing import NamedTuple

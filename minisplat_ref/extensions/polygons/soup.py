@@ -162,6 +162,8 @@ def carried(gaussians: Gaussians, soup: Soup, corners: Floats, source: str | Pat
         A polygon is degenerate: its corners coincide, or lie on one line.
     """
     moved = np.flatnonzero((corners != soup.corners.astype(corners.dtype)).any(axis=(1, 2)))
+    if len(moved) == 0:
+        return gaussians, 0
     rows, radii, after = soup.rows[moved], soup.radii[moved], corners[moved].astype(np.float64)
     widths = least_widths(after)
     is_degenerate = widths <= LEAST_WIDTH
