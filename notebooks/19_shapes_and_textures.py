@@ -280,9 +280,9 @@ plt.show()
 # ## Lines and triangles
 #
 # A Gaussian falls off with the distance from a *point*. Let it fall off with the distance from a segment or from a
-# triangle instead, and it is a line with round ends, or a patch with soft edges. Below each row is a target and two
-# attempts: ellipses, then lines or triangles, the better of two trainings. The last row is fair: a letter is made of
-# neither.
+# triangle instead, and it is a line with round ends, or a patch with soft edges. Below are three targets, and beside
+# each two attempts: ellipses, then lines or triangles, the better of two trainings. The first two targets are a line
+# and a triangle themselves. The last is fair: a letter is made of none of the three.
 
 # %% tags=["rounding"]
 TARGETS = {"line": fit.one_line(), "triangle": fit.one_triangle(), "letter": fit.letter_a()}
@@ -309,8 +309,8 @@ for k, (name, target) in enumerate(TARGETS.items()):
 plt.show()
 
 # %% [markdown]
-# Targets from their own family are drawn exactly, and by no small number of ellipses. For the letter, three-sided
-# patches are better at equal numbers, but not by as much. One formula covers all three kinds. In whitened pixels
+# A line draws a line, and a triangle a triangle; a few ellipses do not. The letter is drawn better by triangles than by
+# as many numbers of ellipses, but it is not drawn exactly. One formula covers all three kinds. In whitened pixels
 # $y = L^{-1} x$, where $L L^T$ is the covariance that all vertices share,
 #
 # $$ \alpha = o \exp\left(-\tfrac12 \operatorname{dist}(y, \operatorname{conv}\{y_1, \dots, y_m\})^2\right) . $$

@@ -105,7 +105,8 @@ class _Steps:
         self._view = View("bench", camera, photograph, None, view_id=0)
         scene = Scene("bench", (self._view,), (), workload.gaussians.means, gray, np.zeros(3), extent=1.0)
         shared = {name: np.asarray(array, row.dtype) for name, array in representation.shared(scene, rng).items()}
-        self._model = Model(representation.extend(gaussians, rng), shared)
+        populate = row.extension.sample or representation.extend
+        self._model = Model(populate(gaussians, rng), shared)
         self._renderer, self._v_image = representation.renderer, workload.v_image.astype(row.dtype)
         self._request = Request(np.zeros(3, row.dtype), backend=row.backend)
         self._drawn: Any = None

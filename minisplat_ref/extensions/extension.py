@@ -7,6 +7,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions import folders, module_of
 from minisplat_ref.io.formats import Format
@@ -16,6 +18,7 @@ from minisplat_ref.study import Study
 from minisplat_ref.training.losses import LossTerm
 from minisplat_ref.training.representation import GAUSSIANS, Representation
 from minisplat_ref.training.schedule import Recipe, scaled
+from minisplat_ref.types import Gaussians
 
 
 class Extension(NamedTuple):
@@ -37,6 +40,9 @@ class Extension(NamedTuple):
     """Modules with ``add_parser(commands)`` and ``run(args)``: ``minisplat-ref NAME COMMAND``."""
     stages: Callable[..., Any] | None = None
     """``stages(backend, setting, rng)``: what ``oracle gradients --extension NAME`` checks."""
+    sample: Callable[[Gaussians, np.random.Generator], Any] | None = None
+    """Makes of any Gaussians a population that exercises the renderer, for ``bench --extension NAME``; by default the
+    representation's ``extend``, which may leave them as they are."""
     studies: tuple[Study, ...] = ()
     """Its measured claims: ``minisplat-ref study NAME/...``."""
     formats: tuple[Format, ...] = ()

@@ -12,12 +12,15 @@ from tolerances import CLOSED_FORM, HULL_COVERAGE, PARITY_FLOAT32_IMAGE, PARITY_
 
 from minisplat_ref import load_ply
 from minisplat_ref.backends import CPU, REFERENCE
+from minisplat_ref.bench.extension_times import extension_cases
+from minisplat_ref.bench.workloads import synth5k
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.cpu.compositing.hits import composite_hits as composite_by_kernels
 from minisplat_ref.cpu.compositing.plain_conic import composite as composite_conics
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
+from minisplat_ref.extensions.extension import load_extension
 from minisplat_ref.extensions.mixed import fit
 from minisplat_ref.extensions.mixed.kernels import response_for
 from minisplat_ref.extensions.mixed.kinds import coverage, promoted, simplified, whitened
@@ -344,6 +347,20 @@ def test_one_line_is_found_and_one_ellipse_is_not_enough():
     target = fit.one_line()
     line, ellipse = (fit.fitted(target, 1, n_vertices=m, iterations=200, seed=0) for m in (2, 1))
     assert psnr_of(fit.drawn(line), target) > psnr_of(fit.drawn(ellipse), target) + 10
+
+
+def test_bench_times_hulls():
+    """Its Gaussians have random colours: groups of them would be ellipses alone."""
+    drawn_by_bench = []
+
+    def watched(model, view, request):
+        drawn_by_bench.append(np.bincount(counts(model.gaussians), minlength=4)[1:].tolist())
+        return RENDERER.render(model, view, request)
+
+    representation = MIXED_GAUSSIANS._replace(renderer=RENDERER._replace(render=watched))
+    extension = load_extension("mixed")._replace(representation=representation)
+    cases = extension_cases(extension, synth5k(150), 1)
+    assert all(case.passed for case in cases) and {tuple(kinds) for kinds in drawn_by_bench} == {(50, 50, 50)}
 
 
 def test_the_letter_is_a_silhouette():

@@ -28,11 +28,10 @@ and solid ones 28.05 dB, without view dependence; splats that were trained on as
 These are 22,566 and 67,707 triangles, 0.7 and 1.7 MB. A pixel has 21 and 32 layers: the nearest 16 alone are off by 5
 and 16 of 255 levels, the nearest 32 by less than one.
 
-Where this deviates: the paper trains in a differentiable rasteriser of other authors. Colours and opacities are clipped
-to [0, 1] after every step. Fans are pruned whole, by their most opaque vertex; single triangles are left out when a
-mesh is exported. The paper's k and rim are not known to be the same for all its scenes. A flat fan is in the plane of
-the two larger axes, also of a Gaussian that is not flat, which then vanishes when it is seen edge on; three fans
-overlap instead, and a ball is up to a third too opaque.
+Where this deviates: colours and opacities are clipped to [0, 1] after every step, so that a file holds what is drawn.
+Fans are pruned whole, by their most opaque vertex; single triangles are left out when a mesh is exported. A flat fan
+lies in the plane of the two larger axes, also of a Gaussian that is not flat, and vanishes when it is seen edge on;
+three fans do not, but overlap: turned by 50 degrees, those of a ball err by 34 % (``study fans/profile``).
 
 Left out: textures, view-dependent colour, growing new fans, pruning by gradients; .obj files have no opacities.
 """

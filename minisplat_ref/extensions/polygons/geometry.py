@@ -35,13 +35,12 @@ def polygons_of(population: Any, opacities: Floats, n_sides: int = N_SIDES) -> P
     population : Gaussians, or a NamedTuple with its fields
         N rows; the least scale of each does not matter.
     opacities : ndarray of shape (N,)
-        Activated, and 0 where a Gaussian is not to be drawn, whose polygon is then empty.
+        Activated, and 0 where a Gaussian is not to be drawn.
     n_sides : int
         3 or more.
     """
     flat = flattened(population.means, population.quats, population.log_scales)
-    radii = np.where(opacities > 0, opacity_radii(population.opacity_logits), 0.0)
-    return Polygons(flat.means, flat.spans, radii, opacities, n_sides)
+    return Polygons(flat.means, flat.spans, opacity_radii(population.opacity_logits), opacities, n_sides)
 
 
 def spans_vjp(population: Any, polygons: Polygons, v_spans: Floats) -> tuple[Floats, Floats]:

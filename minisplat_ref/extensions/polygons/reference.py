@@ -53,7 +53,7 @@ def meet(polygons: Polygons, rays: Rays, ray_ids: Ints, gaussian_ids: Ints) -> P
     S, d = polygons.spans[gaussian_ids], rays.directions[ray_ids]  # [H, 3, 2], [H, 3]
     offsets = polygons.means[gaussian_ids] - rays.origins[ray_ids]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # a ray in the plane; no finite size
-        n = np.cross(S[:, :, 0], S[:, :, 1])
+        n = np.cross(polygons.spans[:, :, 0], polygons.spans[:, :, 1])[gaussian_ids]
         t = np.sum(n * offsets, axis=1) / np.sum(n * d, axis=1)
         x = t[:, None] * d - offsets
         places = np.einsum("hi,hik->hk", x, S) / np.sum(S * S, axis=1)
@@ -65,8 +65,10 @@ def meet(polygons: Polygons, rays: Rays, ray_ids: Ints, gaussian_ids: Ints) -> P
 def is_inside(places: Floats, radii: Floats, n_sides: int) -> Bools:
     """Return whether places (u, v) [H, 2] lie in polygons of radii [H], their edges included."""
     psi = (2 * np.arange(n_sides) + 1) * np.pi / n_sides
-    outermost = np.max(places @ np.array([np.cos(psi), np.sin(psi)]), axis=1)
-    is_in: Bools = (outermost <= radii * np.cos(np.pi / n_sides)) & (radii > 0)
+    is_in: Bools = (radii > 0) & (np.abs(places) <= radii[:, None]).all(axis=1)  # few pairs go on from here
+    near = np.flatnonzero(is_in)
+    outermost = np.max(places[near] @ np.array([np.cos(psi), np.sin(psi)]), axis=1)
+    is_in[near] = outermost <= radii[near] * np.cos(np.pi / n_sides)
     return is_in
 
 
