@@ -1,4 +1,4 @@
-"""Mixed: ellipses, lines and triangles in one model, by the distance to the hull of their vertices.
+"""Mixed: ellipses, lines and triangles in one model, by the distance to the hulls of vertices.
 
 MP-GS, arXiv 2507.11321. A Gaussian is an ellipse in the image. A line has two vertices with one covariance, a triangle
 three; one formula draws them all (:mod:`minisplat_ref.extensions.mixed.response`):
