@@ -55,10 +55,10 @@ from minisplat_ref.extensions.rays.kernels import scene_of
 from minisplat_ref.extensions.rays.lights import shade
 from minisplat_ref.extensions.rays.method import whitened_model
 from minisplat_ref.extensions.rays.surfaces import GLASS, MIRROR
-from minisplat_ref.extensions.rays.surroundings import Surroundings, joined, made_of, parallelogram
+from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenated_surfaces, surfaces_of, parallelogram
 from minisplat_ref.extensions.shared_mesh import Mesh
 from minisplat_ref.extensions.shared_rays import pixel_rays
-from minisplat_ref.extensions.shared_tangent_rays import ewa_hits, ray_colors, tangent_hits, turned
+from minisplat_ref.extensions.shared_tangent_rays import ewa_hits, ray_colors, tangent_hits, yawed
 from minisplat_ref.extensions.vr.foveation import Gaze, eccentricities, render_foveated, zone_begins, zone_weights
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.reference.pinhole import pinhole_rays
@@ -83,12 +83,12 @@ def pictured(gaussians, renderer, view_camera, background=1.0, render=None):
     return (render or renderer.render)(Model(gaussians), view_from(view_camera), request)[0].image
 
 
-seen = {name: [pictured(pair, renderer, turned(camera, yaw)) for yaw in TURNS] for name, renderer in WAYS.items()}
+seen = {name: [pictured(pair, renderer, yawed(camera, yaw)) for yaw in TURNS] for name, renderer in WAYS.items()}
 yaws = FLIP + np.radians(np.linspace(-3, 3, 61))
 ray = np.array([[0.0, 0.0, 1.0]])  # of the world: it stays where it is
 on_ray = {
     name: np.concatenate(
-        [ray_colors(way, activated(pair), PAINT, turned(camera, yaw), ray, GSPLAT_MAIN) for yaw in yaws]
+        [ray_colors(way, activated(pair), PAINT, yawed(camera, yaw), ray, GSPLAT_MAIN) for yaw in yaws]
     )
     for name, way in zip(WAYS, ("3DGS: EWA, by z", "tangent planes, exact order"), strict=True)
 }
@@ -384,7 +384,7 @@ def descend(node, ids, level):
 
 
 descend(0, np.arange(len(rays.near)), 0)
-world = world_of(scene, Surroundings(np.zeros((0, 3)), 1.0, 0.0, joined([])), request.background)
+world = world_of(scene, Surroundings(np.zeros((0, 3)), 1.0, 0.0, concatenated_surfaces([])), request.background)
 hits = world.tracer.list_hits(rays, GSPLAT_MAIN)
 n_hits = np.diff(hits.offsets)
 
@@ -413,7 +413,7 @@ print(f"a ray asks {asked}, and hits {n_hits.mean():.1f}")
 
 # %%
 DARK = request.background
-NO_LAMP, NO_SURFACE = np.zeros((0, 3)), joined([])
+NO_LAMP, NO_SURFACE = np.zeros((0, 3)), concatenated_surfaces([])
 
 
 def cube(centre, half, yaw):
@@ -426,13 +426,13 @@ def cube(centre, half, yaw):
     return Mesh(centre + half * corners @ turn.T, faces)
 
 
-mirror = made_of(parallelogram(MIRROR_CORNER, MIRROR_SIDES), MIRROR, np.array([0.9, 0.9, 0.95]))
-block = made_of(cube(np.array([0.15, 0.58, 3.3]), 0.3, 0.5), GLASS, np.array([0.95, 1.0, 0.97]), 1.5)
+mirror = surfaces_of(parallelogram(MIRROR_CORNER, MIRROR_SIDES), MIRROR, np.array([0.9, 0.9, 0.95]))
+block = surfaces_of(cube(np.array([0.15, 0.58, 3.3]), 0.3, 0.5), GLASS, np.array([0.95, 1.0, 0.97]), 1.5)
 around = {
     "as it was photographed": Surroundings(NO_LAMP, 1.0, 0.0, NO_SURFACE),
     "a lamp": Surroundings(LAMP[None], 0.35, BIAS, NO_SURFACE),
-    "a mirror": Surroundings(LAMP[None], 0.35, BIAS, joined([mirror])),
-    "a block of glass": Surroundings(LAMP[None], 0.35, BIAS, joined([mirror, block])),
+    "a mirror": Surroundings(LAMP[None], 0.35, BIAS, concatenated_surfaces([mirror])),
+    "a block of glass": Surroundings(LAMP[None], 0.35, BIAS, concatenated_surfaces([mirror, block])),
 }
 lit = {
     name: shade(world_of(scene, these, DARK), rays).reshape(eye.height, eye.width, 3) for name, these in around.items()
@@ -463,7 +463,7 @@ leaning = np.array([[np.sin(np.radians(s * lean)), 0.0, np.cos(np.radians(lean))
 two = discs(np.array([[-0.3, 0.0, 4.0], [0.3, 0.0, 4.0 + apart]]), leaning, 0.45, PAINT)
 figure, axes = plt.subplots(1, 4, figsize=(11, 2.7))
 for panel, (degrees, (name, renderer)) in zip(axes, [(a, way) for way in WAYS.items() for a in (0, yaw)], strict=True):
-    show(panel, pictured(two, renderer, turned(camera, np.radians(degrees))), f"{name}, yaw {degrees:g}")
+    show(panel, pictured(two, renderer, yawed(camera, np.radians(degrees))), f"{name}, yaw {degrees:g}")
 plt.show()
 
 # %% [markdown]

@@ -1,4 +1,4 @@
-"""Gaussians with payloads for the tests, and what differs between them."""
+"""Gaussians with payloads for the tests, and the differences between them."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -25,7 +25,7 @@ BACKGROUND = np.full(3, 0.2)
 
 
 class Case(NamedTuple):
-    """What differs between payloads."""
+    """One kind of payload: its functions and populations."""
 
     representation: Representation
     random: Callable[..., Any]
@@ -41,14 +41,14 @@ class Case(NamedTuple):
 
 
 def random_cuts(rng, gaussians):
-    """Curves through the Gaussians, a third of them hard."""
+    """Return Gaussians with curves through them, a third with hard edges."""
     population, n = with_cuts(gaussians, rng), len(gaussians.means)
     curves = 0.4 * population.curves + 0.2 * rng.normal(size=population.curves.shape)
     return population._replace(curves=curves, widths=np.where(np.arange(n) % 3 == 0, 0.0, 0.7))
 
 
 def uncut(gaussians, n_numbers=0):
-    """Without curves, or with curves that are points, which cut nothing."""
+    """Return Gaussians without curves, or with curves that are points, which cut nothing."""
     n = len(gaussians.means)
     return CutGaussians(*gaussians, curves=np.full((n, n_numbers), 0.3), widths=np.zeros(n))
 
@@ -96,7 +96,7 @@ CASES = {
 
 
 def drawn(renderer, population, view, backend):
-    """A picture, and the gradient of it with random weights."""
+    """Return a picture, and its gradient with random weights."""
     output, tape = renderer.render(Model(population), view, Request(BACKGROUND, backend=backend))
     rng, dtype = np.random.default_rng(1), population.means.dtype
     v_image, v_alpha = rng.normal(size=output.image.shape), rng.normal(size=output.alpha.shape)

@@ -105,12 +105,12 @@ def _parser_of(argv: Sequence[str]) -> argparse.ArgumentParser:
     own = parser.add_subparsers(metavar="EXTENSION").add_parser(
         name,
         description=textwrap.fill(summaries()[name], 80),
-        epilog=f"minisplat-ref {name} COMMAND --help explains a command.",
         formatter_class=HelpFormatter,
     )
     commands = own.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in extension.commands:
         command.add_parser(commands)
+    own.epilog = f"example:\n  minisplat-ref {name} {next(iter(commands.choices))} --help"
     return parser
 
 

@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     return study.run(parser.parse_args(args.arguments)) or 0
 
 
-EXAMPLES = {"SCENE": "room", "FILE": "runs/mine/point_cloud.ply", "DIR": "study"}
+EXAMPLES = {"SCENE": "room", "FILE": "runs/mine.ply", "DIR": "study"}
 """What stands in the example of a study for a required argument, by its placeholder."""
 
 

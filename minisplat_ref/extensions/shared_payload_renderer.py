@@ -1,8 +1,8 @@
-"""Conics with a payload: Gaussians that are projected and listed as 3DGS does, and carry what changes their pixels.
+"""Conics with a payload: Gaussians that are projected and listed as 3DGS does, with data that change their pixels.
 
-A texture, a cut, vertices: an extension says in a :class:`Payload` what its footprints are made of and what they do to
-a pixel. Activations, projection, colours, tile lists, the choice between kernels and reference, and the way back
-through all of them are the same, and are here.
+The payload is a texture, a cut or vertices. An extension states in a :class:`Payload` what its footprints consist of
+and what they do to a pixel. Activations, projection, colours, tile lists, the choice between kernels and reference, and
+the gradient of all of them are the same, and are in this file.
 """
 
 import math
@@ -38,7 +38,7 @@ BY_REFERENCE = frozenset({"stats", "median_depth"})  # what the plain kernels do
 
 
 class Projected(NamedTuple):
-    """Activated Gaussians, and how a camera sees their ellipses."""
+    """Activated Gaussians, and their ellipses in the image of a camera."""
 
     gaussians: Any
     """A population that has the six fields of :class:`Gaussians`, and its own."""
@@ -59,12 +59,12 @@ class Projected(NamedTuple):
 
 
 class PayloadGradient(NamedTuple):
-    """Gradient of the loss as far as it passes through what the footprints carry."""
+    """Gradient of the loss through the payload of the footprints."""
 
     fields: Mapping[str, Floats]
-    """With respect to fields of the population, by name; they replace what the ellipses' gradient says."""
+    """With respect to fields of the population, by name; these replace the gradient of the ellipses."""
     means: Floats
-    """[N, 3]; this and what follows is added to the ellipses' gradient."""
+    """[N, 3]; this and the following fields are added to the gradient of the ellipses."""
     quats: Floats
     """[N, 4]."""
     scales: Floats
@@ -88,7 +88,7 @@ def projection_alone(footprints: Any) -> Projection:
 
 
 def channels_alone(projected: Projected, channels: Floats) -> Floats:
-    """Return the channels [N, D]: a colour is the same all over a footprint."""
+    """Return the channels [N, D], for colours that are constant over a footprint."""
     return channels
 
 
@@ -100,16 +100,16 @@ def channels_alone_vjp(
 
 
 class Payload(NamedTuple):
-    """What an extension knows about its Gaussians."""
+    """The functions in which an extension describes its Gaussians."""
 
     plural: str
     """Their name in messages."""
     response: Response
-    """The book's. Its ``fields`` begin with those of a conic: means2d, conics and opacities."""
+    """That of the reference. Its ``fields`` begin with those of a conic: means2d, conics and opacities."""
     response_for: Callable[[np.dtype], KernelResponse]
-    """The kernels', for arrays of a dtype."""
+    """That of the kernels, for arrays of a dtype."""
     is_plain: Callable[[Any], bool]
-    """Whether a population carries nothing: then 3DGS draws it."""
+    """Return whether a population has no payload, so that 3DGS draws it."""
     footprints: Callable[[Projected], Any]
     """Return what the responses take. Its field ``projection`` says what is seen: the ellipses', or more or less."""
     footprints_vjp: Callable[[Projected, tuple[Floats, ...]], PayloadGradient]
@@ -125,7 +125,7 @@ class Payload(NamedTuple):
 
 
 class PayloadTape(NamedTuple):
-    """What a renderer of payloads did."""
+    """What the renderer keeps for its gradient."""
 
     payload: Payload
     projected: Projected
@@ -140,12 +140,12 @@ def payload_renderer(name: str, payload: Payload) -> Renderer:
 
 
 def _render(payload: Payload, model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
-    """Draw the view; without a payload as 3DGS does.
+    """Draw the view; without a payload 3DGS draws it.
 
     Raises
     ------
     InputError
-        Something is wanted that is not collected here.
+        Something is wanted that this renderer does not collect.
     """
     g = model.gaussians
     if payload.is_plain(g):
@@ -183,7 +183,7 @@ def _render(payload: Payload, model: Model, view: View, request: Request) -> tup
 
 
 def _render_vjp(tape: PayloadTape | RenderTape, v_image: Floats, v_alpha: Floats | None = None) -> RenderGradient:
-    """Gradient of :func:`_render`: of the projection, of the colours and of the payload, added up.
+    """Gradient of :func:`_render`, the sum of those through the projection, the colours and the payload.
 
     ::
 

@@ -1,4 +1,4 @@
-"""What the gradient proof checks of Gaussians with a payload: their renderer, with the thresholds of their hits."""
+"""The stage of the gradient check of Gaussians with a payload: their renderer with the thresholds of their hits."""
 
 from collections.abc import Callable
 from typing import Any
@@ -23,7 +23,7 @@ def renderer_stage(
     sides_of: Callable[[TileHits, Floats], tuple[np.ndarray, ...]],
     rng: np.random.Generator,
 ) -> Stage:
-    """Return the renderer; the reference finds once more what is hit.
+    """Return the renderer as a stage whose points record the hits, which the reference computes again.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ def renderer_stage(
         As for :func:`minisplat_ref.oracle.models.model_stage`; the renderer is one of
         :func:`minisplat_ref.extensions.shared_payload_renderer.payload_renderer`.
     sides_of : callable
-        Of a tile's hits and the coefficients [N, S] of the colours: on which sides of their thresholds they are.
+        Returns, for a tile's hits and the coefficients [N, S] of the colours, on which sides of thresholds they are.
     """
     sides: list[np.ndarray] = []
 

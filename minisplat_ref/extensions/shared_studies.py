@@ -2,8 +2,9 @@
 
 import argparse
 import json
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PNG_DPI = 150
+Item = TypeVar("Item")
 GRID_COLOR = "#e6eaee"
 
 
@@ -101,6 +103,14 @@ def shrunk(scene: Scene, n: int) -> Scene:
         image = np.rint(block_means(photograph.image.astype(np.float64), n)).astype(np.uint8)
         views.append(photograph._replace(camera=camera, image=image, mask=None))
     return scene._replace(train_views=tuple(views))
+
+
+def with_progress(items: Iterable[Item], description: str) -> Iterable[Item]:
+    """Return an iterable that shows a progress bar while it is consumed; none is shown outside a terminal."""
+    from tqdm import tqdm
+
+    bar: Iterable[Item] = tqdm(items, desc=description, leave=False, disable=None)
+    return bar
 
 
 def psnr_of(image: Floats, target: Floats) -> float:

@@ -30,7 +30,7 @@ RENDERER = CUT_GAUSSIANS.renderer
 
 
 def grid(n=41, reach=8.0):
-    """Pixels [1, n^2, 2] around the centre."""
+    """Return pixels [1, n^2, 2] around the centre."""
     steps = np.linspace(-reach, reach, n) + 0.013
     return np.stack(np.meshgrid(steps, steps), axis=-1).reshape(1, -1, 2)
 
@@ -40,7 +40,7 @@ def grid(n=41, reach=8.0):
 
 @pytest.mark.parametrize("points", [LOOP, AROUND], ids=["beside", "around"])
 def test_what_is_cut_away_is_the_shadow_of_the_curve(points):
-    """The shadow is a polygon: the curve's vertices, and far away, where the lamp in the centre throws its ends."""
+    """The shadow is the polygon of the curve's vertices and, far away, the ends projected by a lamp at the centre."""
     d, vertices = grid(), VERTICES @ points[0]
     directions = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
     shadow = Polygon(np.concatenate([vertices, 1e3 * directions[::-1], vertices[:1]]))
@@ -52,7 +52,7 @@ def test_what_is_cut_away_is_the_shadow_of_the_curve(points):
 
 
 def test_a_closed_curve_cuts_as_a_point_in_a_polygon(rng):
-    """Ends that meet: from a centre outside, the inside is cut away, and so is its shadow where an odd number is."""
+    """If the ends meet and the centre is outside, the inside is cut away, and so is where an odd number is crossed."""
     points = np.array([[[3.0, 0.0], [9.0, -7.0], [9.0, 7.0], [3.0, 0.0]]])
     polygon, d = Polygon(VERTICES @ points[0]), rng.uniform(-9, 9, size=(1, 4000, 2))
     inside = polygon.contains_points(d[0])
@@ -185,7 +185,7 @@ def test_trains_evaluates_and_renders(tmp_path, capsys):
 
 
 def test_one_gaussian_with_a_cut_is_a_cut_gaussian():
-    """From a curve on the right side; 3DGS spills over the edge."""
+    """Starting with a curve on the right side it is reproduced; 3DGS spills over the edge."""
     target = card.cut_gaussian()
     plain, found = (card.measured(target, card.fitted(target, 1, is_cut, 300, 3)) for is_cut in (False, True))
     assert found["psnr"] > plain["psnr"] + 20 and found["edge_width"] < 2 < plain["edge_width"]

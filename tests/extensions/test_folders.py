@@ -1,16 +1,19 @@
 """What every extension of the package promises, found by its folder: no list names them."""
 
+import argparse
 import ast
 import inspect
 from importlib import import_module
 
 import pytest
 
+from minisplat_ref.cli import main
 from minisplat_ref.extensions import folders, module_of, summaries
 from minisplat_ref.extensions.extension import Extension, load_extension
 from minisplat_ref.training.schedule import describe
 
 MOST_POSITIONAL = 8
+COLUMNS_MAX = 80
 NAMES = list(folders())
 FILES = [(name, path) for name, folder in folders().items() for path in sorted(folder.rglob("*.py"))]
 
@@ -44,6 +47,30 @@ def test_its_population_begins_with_means_and_its_recipes_can_be_described(name)
     assert extension.representation.population._fields[0] == "means"
     for recipe in extension.recipes:
         assert describe(recipe)["name"] == recipe.name
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_help_has_an_example_and_fits_a_terminal(name, capsys, monkeypatch):
+    """This holds for the extension's commands and for its studies."""
+    monkeypatch.setenv("COLUMNS", "80")
+    extension = load_extension(name)
+    lines = [[name]] if extension.commands else []
+    lines += [[name, command] for command in command_names(extension)]
+    lines += [["study", f"{name}/{study.name}"] for study in extension.studies]
+    for line in lines:
+        with pytest.raises(SystemExit) as end:
+            main([*line, "--help"])
+        text = capsys.readouterr().out
+        assert end.value.code == 0 and "example" in text, line
+        assert max(map(len, text.splitlines())) <= COLUMNS_MAX, line
+
+
+def command_names(extension):
+    """Return the names under which the commands of an extension are called."""
+    commands = argparse.ArgumentParser().add_subparsers()
+    for command in extension.commands:
+        command.add_parser(commands)
+    return list(commands.choices)
 
 
 @pytest.mark.parametrize(("name", "path"), FILES, ids=label)

@@ -1,4 +1,4 @@
-"""Conics with a payload: what all of them promise, each with its own population."""
+"""Conics with a payload: the properties that all kinds share, each tested with its own population."""
 
 import numba
 import numpy as np
@@ -42,13 +42,13 @@ def test_a_wrong_gradient_is_found(case, monkeypatch):
 )
 @pytest.mark.parametrize("size", [0.15, 0.6])
 def test_kernels_and_reference_agree(case, dtype, image_rel, gradient_rel, size, rng):
-    """The second scene has Gaussians as large as the picture, of some of which the camera is inside."""
+    """The second scene has Gaussians as large as the picture, and the camera is inside some of them."""
     population, view = case.random(rng, make_gaussians(rng, 40, size=size)), view_from(make_camera(rng=rng))
     agree(case, population, view, dtype, image_rel, gradient_rel)
 
 
 def test_kernels_and_reference_agree_on_textures_of_a_lower_degree(rng):
-    """The kernels fill them up with zeros."""
+    """The kernels pad them with zeros."""
     population, view = random_textures(rng, make_gaussians(rng, 40), 2), view_from(make_camera(rng=rng))
     agree(CASES["textured"], population, view, np.float64, PARITY_FLOAT64, 10 * PARITY_FLOAT64)
 

@@ -1,4 +1,4 @@
-"""Textured-GS: where rays meet ellipsoids, gradients, fine-tuning end to end; see also ``test_shared_payload``."""
+"""Textured-GS: hits of rays on ellipsoids, gradients, fine-tuning end to end; see also ``test_shared_payload``."""
 
 import json
 
@@ -32,7 +32,7 @@ DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 
 
 def of_one(mean, scales, quat=(1.0, 0.2, -0.3, 0.4)):
-    """Frame and pixel of one Gaussian before the camera of the tests."""
+    """Return frame and pixel of one Gaussian in front of the camera of the tests."""
     camera = make_camera()
     means, quats, deviations = np.array([mean]), np.array([quat]), np.array([scales])
     return frames(means, quats, deviations, camera), pinhole(means, camera), camera
@@ -45,7 +45,7 @@ def of_one(mean, scales, quat=(1.0, 0.2, -0.3, 0.4)):
     "mean", [(0.1, 0.05, 3.0), (-0.6, 0.4, 1.5), (0.02, 0.01, 0.2)], ids=["far", "aside", "inside"]
 )
 def test_they_enter_the_ellipsoid_where_the_quadratic_says(mean):
-    """A t^2 + B t + C = 0 in the Gaussian's axes, of which the smaller root; the last camera is inside of it."""
+    """They enter at the smaller root of A t^2 + B t + C = 0 in the Gaussian's axes; the last camera is inside it."""
     scales, quat = np.array([0.5, 0.3, 0.4]), np.array([1.0, 0.2, -0.3, 0.4])
     frame, p, camera = of_one(mean, scales, quat)
     pixels = np.stack(np.meshgrid(np.arange(24) + 0.5, np.arange(18) + 0.5), axis=-1).reshape(-1, 2)
@@ -67,7 +67,7 @@ def test_they_enter_the_ellipsoid_where_the_quadratic_says(mean):
 
 
 def test_a_texture_does_not_jump_at_the_limb():
-    """Ten times nearer rays differ ten times less; a texture that ends at the limb jumps by as much as ever."""
+    """Rays ten times closer differ ten times less; a texture that ends at the limb jumps as much as before."""
     coarse, fine = (np.abs(np.diff(colors_across(step)[0])).max() for step in (0.01, 0.001))
     assert 0 < fine < 0.15 * coarse
     assert np.abs(np.diff(colors_across(0.001)[1])).max() > 0.1
@@ -128,7 +128,7 @@ def test_opacity_is_the_sigmoid_of_logit_and_texture(rng):
 
 
 def test_textures_of_zeros_have_a_gradient(rng):
-    """So that a training leaves them; that they change nothing is tested for all payloads."""
+    """So training changes them; that they change no picture is tested for all payloads."""
     _, v = drawn(RENDERER, with_textures(make_gaussians(rng, 30), 3), view_from(make_camera(rng=rng)), REFERENCE)
     assert np.abs(v.gaussians.color_textures).max() > 0 and np.abs(v.gaussians.opacity_textures).max() > 0
 

@@ -17,8 +17,8 @@ the whole view, by one call.
 BACKEND is one of
 
   MODULE:FUNCTION any function with the signature of gsplat's rasterization, on
-                  NumPy, torch or JAX arrays; gradients by FUNCTION_vjp beside it,
-                  else by torch or JAX
+                  NumPy, torch or JAX arrays; gradients by FUNCTION_vjp beside
+                  it, else by torch or JAX
   DIR             a folder of arrays that your own renderer has written, in the
                   format of oracle export; the README.md in there explains it
   cpu, cpu-exact, reference
@@ -31,8 +31,8 @@ BACKEND is one of
   planted:ERROR   ours with one error in it, to see how that is reported
 
 Ours, gsplat-torch and gsplat are given the reference's own input at every
-stage, so that an error stays where it arose. With the others, and in the view, a
-later difference may follow from the first, and is marked so.
+stage, so that an error stays where it arose. With the others, and in the view,
+a later difference may follow from the first, and is marked so.
 
 A pixel in which rounding decides a hit (alpha within 1e-6 of 1/255, the
 transmittance as near to the stop threshold, or two depths that float32 cannot
@@ -43,9 +43,9 @@ float32.) Boxes and tile lists that differ without changing the image are
 harmless.
 """
 EPILOG = """\
-columns: largest and RMS error; the largest as a part of the largest value of the
-array, and what is allowed of that; how many values are over it, and of how many;
-flips, and the candidates for them. For radii and tile lists: rows and tiles that
+columns: largest and RMS error; the largest as a part of the largest value of
+the array, and its limit; how many values exceed that, and of how many; flips,
+and the candidates for them. For radii and tile lists, rows and tiles that
 differ. Every stage is reported in the scene where it is furthest off.
 
 examples:

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from minisplat_ref.extensions.analytic.reference import EXACT_RESPONSE, LOGISTIC, NORMAL, RESPONSE, integrals
-from minisplat_ref.extensions.shared_studies import tidy
+from minisplat_ref.extensions.shared_studies import tidy, with_progress
 from minisplat_ref.reference.antialiasing import compensations
 from minisplat_ref.reference.hits import CONIC, Response
 from minisplat_ref.types import Floats, Projection
@@ -93,7 +93,7 @@ def measure(n: int, seed: int) -> dict[str, dict[str, list[float]]]:
     found: dict[str, dict[str, list[float]]] = {}
     for shape, elongation, places in (("round", 1.0, n), ("needle", ELONGATION, max(1, n // 8))):
         rng = np.random.default_rng(seed)
-        rows = [errors(sigma, elongation, places, rng) for sigma in SIGMAS]
+        rows = [errors(sigma, elongation, places, rng) for sigma in with_progress(SIGMAS, shape)]
         found[shape] = {name: [row[name] for row in rows] for name in METHODS}
     return found
 

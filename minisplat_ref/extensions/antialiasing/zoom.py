@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from minisplat_ref.backends import CPU
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.shared_sampling import block_means, zoomed
-from minisplat_ref.extensions.shared_studies import psnr_of, shrunk, tidy
+from minisplat_ref.extensions.shared_studies import psnr_of, shrunk, tidy, with_progress
 from minisplat_ref.rendering import Renderer, Request
 from minisplat_ref.training.loop import train
 from minisplat_ref.types import Floats, Model, Scene, View, view_from
@@ -85,7 +85,7 @@ def measure(scene: Scene, downscale: int, iterations: int, seeds: int) -> Measur
     view = scene.test_views[0].loaded()
     pictures = {"photograph": block_means(view.image.astype(float) / 255, sides[-1])}
     for seed in range(seeds):
-        for name in RECIPES:
+        for name in with_progress(RECIPES, f"trainings, seed {seed}"):
             found = trained(name, small, iterations, seed)
             psnr[name].append(psnrs(found, scene, sides))
             counts[name].append(len(found.model.gaussians.means))

@@ -74,7 +74,8 @@ def run(args: argparse.Namespace) -> None:
             psnrs.append(psnr)
             counts.append(len(gaussians.means))
             judge = (scene.test_views, scene.background, psnr)
-            runs.append([point._asdict() for point in rate_points(gaussians, *judge, args.splat_transform)])
+            files = rate_points(gaussians, *judge, args.splat_transform)
+            runs.append([point._asdict() for point in shared_studies.with_progress(files, "files")])
             shrunk.append(drops_when_shrunk(gaussians, scene.test_views, scene.background))
         result = {
             **shared.describe(args, scene),
@@ -151,7 +152,7 @@ def sog_round_trip(program: str, ply: Path) -> tuple[int, Gaussians]:
 def drops_when_shrunk(gaussians: Gaussians, views: tuple[View, ...], background: Floats) -> dict[str, list[float]]:
     """Return the loss of each format, dB, at each size of the scene in ``SHRUNK``."""
     drops: dict[str, list[float]] = {"msz 5": [], "spz version 3": []}
-    for factor in SHRUNK:
+    for factor in shared_studies.with_progress(SHRUNK, "sizes"):
         small = shrink(gaussians, factor)
         near = tuple(view.loaded()._replace(camera=shrunk_camera(view, factor)) for view in views)
         conventions = GSPLAT_MAIN._replace(near_plane=factor * GSPLAT_MAIN.near_plane)

@@ -1,4 +1,4 @@
-"""The work of the study ``cuts/card``: pictures with one sharp edge, drawn by few Gaussians with and without cuts."""
+"""The study ``cuts/card``: pictures with one sharp edge, drawn by few Gaussians with and without cuts."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Model, Scene, 
 
 SIZE, FOCAL, DISTANCE = 48, 60.0, 3.0  # px, px, world units
 BAND = 1.5  # px on either side of the edge
-EXTENT = 10.0  # of the scene: so far Gaussians may move, in units of the rates of 3DGS
+EXTENT = 10.0  # of the scene; it sets how far the rates of 3DGS let Gaussians move
 BRIGHT = 0.8
 CAMERA = Camera(np.eye(3), np.zeros(3), FOCAL, FOCAL, SIZE / 2, SIZE / 2, SIZE, SIZE)
 
@@ -39,8 +39,8 @@ class Target(NamedTuple):
 
 
 def spread(n: int, rng: np.random.Generator) -> Gaussians:
-    """Return n flat gray Gaussians that face the camera, spread over the picture, of the size that fills it."""
-    extent = SIZE / FOCAL * DISTANCE  # of the picture, world units
+    """Return n flat grey Gaussians that face the camera, spread over the picture and large enough to fill it."""
+    extent = SIZE / FOCAL * DISTANCE  # width of the picture, world units
     places = rng.uniform(-0.35, 0.35, (n, 2)) * extent if n > 1 else np.zeros((1, 2))
     scale = 0.25 * extent / np.sqrt(n)
     return Gaussians(
@@ -54,7 +54,7 @@ def spread(n: int, rng: np.random.Generator) -> Gaussians:
 
 
 def cut_gaussian() -> Target:
-    """Return a Gaussian of which a straight edge, 0.4 deviations from its centre, has cut the right side away."""
+    """Return a Gaussian whose right side is cut away by a straight edge 0.4 standard deviations from its centre."""
     one = spread(1, np.random.default_rng(0))
     points = np.array([[0.4, -3.0, 0.4, -1.0, 0.4, 1.0, 0.4, 3.0]], np.float32)
     bright = one._replace(opacity_logits=np.full(1, 3, np.float32), sh_dc=np.ones((1, 3), np.float32))
@@ -64,7 +64,7 @@ def cut_gaussian() -> Target:
 
 
 def card() -> Target:
-    """Return a bright card that fills the picture up to a curved edge; pixels on the edge are covered in part."""
+    """Return a bright card that fills the picture up to a curved edge; pixels on the edge are partly covered."""
 
     def edge(ys: Floats) -> Floats:
         return 30 - 6 * ((ys - SIZE / 2) / (SIZE / 2)) ** 2
@@ -75,12 +75,12 @@ def card() -> Target:
 
 
 def representation_of(population: Any) -> Representation:
-    """Return what a population with cuts, or without, is drawn and trained by."""
+    """Return the representation of a population with or without cuts."""
     return CUT_GAUSSIANS if isinstance(population, CutGaussians) else GAUSSIANS
 
 
 def drawn(population: Any) -> Floats:
-    """Return the picture [H, W, 3] of a population before black."""
+    """Return the picture [H, W, 3] of a population in front of black."""
     image: Floats = (
         representation_of(population).renderer.render(Model(population), view_from(CAMERA), Request())[0].image
     )
@@ -88,7 +88,7 @@ def drawn(population: Any) -> Floats:
 
 
 def fitted(target: Target, n: int, is_cut: bool, iterations: int, seed: int) -> Any:
-    """Return n Gaussians, with cuts or without, trained on the target; their number stays."""
+    """Return n Gaussians with or without cuts, trained on the target without density control."""
     rng = np.random.default_rng(seed)
     view = View("card", CAMERA, np.rint(255 * np.clip(target.image, 0, 1)).astype(np.uint8), None)
     none = np.zeros((0, 3))
@@ -101,9 +101,9 @@ def fitted(target: Target, n: int, is_cut: bool, iterations: int, seed: int) -> 
 
 
 def edge_width(image: Floats) -> float:
-    """Return over how many pixels a row rises from 10 to 90 % of its range beside the edge; the mean of middle rows.
+    """Return the number of pixels over which a row rises from 10 to 90 % of its range, as the mean of middle rows.
 
-    The range is that of the row from the third pixel to the last but two.
+    The range is that of the row from the third pixel to the third from the end.
     """
     widths = []
     for row in image.mean(axis=2)[SIZE // 4 : -SIZE // 4, 2:-2].astype(np.float64):
@@ -119,7 +119,7 @@ def edge_width(image: Floats) -> float:
 
 
 def measured(target: Target, population: Any) -> dict[str, float]:
-    """Return PSNR of the picture, of the band beside the edge and of the rest, dB, and the width of the edge, px."""
+    """Return the PSNR of the picture, of the band around the edge and of the rest, dB, and the edge's width, px."""
     image = drawn(population)
     band = target.band
     return {

@@ -1,14 +1,15 @@
-"""A Bezier curve as a polygon: on which side of it a pixel lies, and how far from it, in NumPy (DisC-GS, 2405.15196).
+"""A Bezier curve as a polygon: the side on which a pixel lies, and its distance, in NumPy (DisC-GS, 2405.15196).
 
 The cubic B(t) of four control points P_j, in pixels from the Gaussian's centre, is drawn as ``N_EDGES`` edges between
-``V_i = B(i / N_EDGES)``. A pixel at d is visible if the segment from the centre to it crosses an even number of edges:
-what is cut away is the curve's shadow, with a lamp in the centre. The shadow is bounded by the curve and by two rays,
-on which its ends B(0) and B(1) move away from the centre. So with the nearest point q of these N_EDGES + 2 pieces::
+``V_i = B(i / N_EDGES)``. A pixel at d is visible if the segment from the centre to it crosses an even number of edges,
+so the part that is cut away is the shadow of the curve with a lamp at the centre. The shadow is bounded by the curve
+and by two rays, on which its ends B(0) and B(1) move away from the centre. With the nearest point q of these
+N_EDGES + 2 pieces::
 
-    o_i = sum_j a_ij P_j,  u_i = sum_j b_ij P_j       a piece goes from o_i along u_i: an edge once, a ray for ever
+    o_i = sum_j a_ij P_j,  u_i = sum_j b_ij P_j       a piece runs from o_i along u_i: an edge once, a ray for ever
     f_i = clip((d - o_i) . u_i / u_i . u_i, 0, top_i),  q = o_i + f_i u_i of the piece where |d - q| is least
-    distance = +-|d - q|                              positive where it is visible
-    mask = 1 / (1 + exp(-distance / w)), or of width w = 0: 1 where it is visible, 0 where it is not
+    distance = +-|d - q|                              positive where the pixel is visible
+    mask = 1 / (1 + exp(-distance / w)); with the width w = 0, 1 where the pixel is visible and 0 elsewhere
 """
 
 from typing import NamedTuple
@@ -17,9 +18,9 @@ import numpy as np
 
 from minisplat_ref.types import Bools, Floats, Ints
 
-N_EDGES = 8  # of which the weights are multiples of 1/512, the same in float32 and float64
+N_EDGES = 8  # their weights are multiples of 1/512, which are exact in float32 and float64
 N_POINTS = 4
-LENGTH_MIN = 1e-12  # px^2: an edge that is shorter is a point
+LENGTH_MIN = 1e-12  # px^2: a shorter edge counts as a point
 
 
 def bernstein(t: Floats) -> Floats:
@@ -37,7 +38,7 @@ TOPS = np.concatenate([np.ones(N_EDGES), np.full(2, 1e9)])  # largest f
 
 
 class Cut(NamedTuple):
-    """Where P pixels lie beside G curves."""
+    """The positions of P pixels relative to G curves."""
 
     is_visible: Bools  # [G, P]
     away: Floats  # [G, P, 2] d - q, px
@@ -47,7 +48,7 @@ class Cut(NamedTuple):
 
 
 def cut(points: Floats, widths: Floats, offsets: Floats) -> Cut:
-    """Return what the curves leave of their Gaussians.
+    """Return the masks that curves make, and the nearest points on them.
 
     Parameters
     ----------
@@ -56,7 +57,7 @@ def cut(points: Floats, widths: Floats, offsets: Floats) -> Cut:
     widths : ndarray of shape (G,)
         w, px.
     offsets : ndarray of shape (G, P, 2)
-        d, pixels from the centre, px.
+        d, the pixels' positions relative to the centre, px.
     """
     dtype = points.dtype
     o, u = (np.einsum("ij,gjk->gik", weights.astype(dtype), points)[:, None] for weights in (ORIGINS, DIRECTIONS))
@@ -73,7 +74,7 @@ def cut(points: Floats, widths: Floats, offsets: Floats) -> Cut:
 
 
 def _masks(distances: Floats, widths: Floats) -> Floats:
-    """Return the mask [G, P] of signed distances, of every width, also 0."""
+    """Return the masks [G, P] of signed distances [G, P] for widths [G], which may be 0."""
     is_soft = (widths > 0)[:, None]
     z = distances / np.where(is_soft, widths[:, None], 1)
     e = np.exp(-np.abs(z))
@@ -84,8 +85,9 @@ def _masks(distances: Floats, widths: Floats) -> Floats:
 def n_crossings(points: Floats, offsets: Floats) -> Ints:
     """Return how many edges [G, P] the segments from the centre to pixels cross.
 
-    An edge is crossed if its ends lie on different sides of the line through centre and pixel, and these on different
-    sides of the edge. Zero counts as negative: a line through a vertex crosses one of its two edges, or both or none.
+    An edge is crossed if its ends lie on different sides of the line through centre and pixel, and centre and pixel on
+    different sides of the edge. Zero counts as negative, so a line through a vertex crosses one of its two edges, or
+    both or none.
     """
     V = np.einsum("ij,gjk->gik", VERTICES.astype(points.dtype), points)[:, None]  # [G, 1, N_EDGES + 1, 2]
     d = offsets[:, :, None]
@@ -98,12 +100,12 @@ def n_crossings(points: Floats, offsets: Floats) -> Ints:
 def cut_vjp(points: Floats, widths: Floats, found: Cut, v_masks: Floats) -> tuple[Floats, Floats]:
     """Gradient of :func:`cut` with respect to control points [G, 4, 2] and offsets [G, P, 2].
 
-    The nearest point is where a displacement along its piece changes nothing, so f counts as fixed. With the unit
-    vector e along d - q, in which the distance grows where the pixel is visible::
+    At the nearest point a displacement along its piece does not change the distance, so f counts as fixed. With the
+    unit vector e along d - q, along which the distance grows where the pixel is visible::
 
         v_z = mask (1 - mask) v_mask / w,  v_d = +-v_z e,  v_P_j = -sum over pixels of (a_ij + f b_ij) v_d
 
-    Of width 0 the mask is a step, and the gradient is 0.
+    With the width 0 the mask is a step, and the gradient is 0.
     """
     is_soft = (widths > 0)[:, None]
     v_distances = found.masks * (1 - found.masks) * v_masks / np.where(is_soft, widths[:, None], 1)

@@ -1,7 +1,7 @@
 """Gaussians with cuts on lanes: a response for the plain kernels.
 
-A record holds the polygon's vertices and one over the squared length of each piece, so that a pixel goes over the
-edges once: it counts crossings by the sign of a product and keeps the nearest point with its weights.
+A record holds the polygon's vertices and the inverse squared length of each piece, so that a pixel takes one loop over
+the edges, which counts crossings by the sign of a product and keeps the nearest point with its weights.
 """
 
 import functools
@@ -19,12 +19,12 @@ from minisplat_ref.jit.literals import ONE, ZERO
 from minisplat_ref.types import Floats, Ints
 
 CONIC_GRADIENTS = 6  # a record begins with the conic's own: mean, factors and opacity
-POINTS = CONIC_GRADIENTS  # whose numbers the kernels do not need: gradients alone
-SHIFT = POINTS + 2 * N_POINTS  # of the mask by the centre's pixel
+POINTS = CONIC_GRADIENTS  # gradients of the control points; the kernels do not read these columns
+SHIFT = POINTS + 2 * N_POINTS  # gradient of the mask with respect to the centre's pixel
 N_GRADIENTS = SHIFT + 2
 DEPTH, WIDTH_PX, INVERSE_WIDTH = range(N_GRADIENTS, N_GRADIENTS + 3)
 V = INVERSE_WIDTH + 1  # vertices, x and y
-INVERSES = V + 2 * (N_EDGES + 1)  # of the edges' squared lengths, then of the two rays'
+INVERSES = V + 2 * (N_EDGES + 1)  # inverse squared lengths of the edges, then of the two rays
 N_COLUMNS = INVERSES + N_EDGES + 2
 _WEIGHTS = VERTICES.astype(np.float32)  # exact
 _FAR = np.float32(1e30)  # px^2
@@ -32,13 +32,13 @@ _FAR = np.float32(1e30)  # px^2
 
 @functools.cache
 def cut_response(exp: Callable) -> KernelResponse:
-    """Response of Gaussians with cuts, with an exponential of :mod:`minisplat_ref.cpu.compositing.exponential`."""
+    """Return the response of cut Gaussians with an exponential of :mod:`minisplat_ref.cpu.compositing.exponential`."""
     conic = conic_response(exp)
     flat_hit, flat_hit_vjp = conic.hit, conic.hit_vjp
 
     @scalar
     def nearer(nearest, away, weights):
-        """The nearer of two points of the curve: d - q with its square, and the control points' weights."""
+        """Return the nearer of two points of the curve: d - q with its square, and the control points' weights."""
         x, y, square, w_0, w_1, w_2, w_3 = nearest
         new = away[0] * away[0] + away[1] * away[1]
         is_nearer = new < square
@@ -54,7 +54,7 @@ def cut_response(exp: Callable) -> KernelResponse:
 
     @scalar
     def side_and_nearest(records, n, dx, dy):
-        """+1 where an even number of edges is crossed, else -1; and the nearest point to the pixel at d."""
+        """Return +1 where an even number of edges is crossed, else -1, and the nearest point to the pixel at d."""
         nothing = broadcast(records.dtype.type(0))
         nearest = (nothing, nothing, nothing + _FAR, nothing, nothing, nothing, nothing)
         side = nothing + ONE
@@ -80,7 +80,7 @@ def cut_response(exp: Callable) -> KernelResponse:
             beyond = select(u_x * r_y - u_y * r_x > ZERO, nothing + ONE, nothing - ONE)
             origin = select(u_y * o_x - u_x * o_y > ZERO, ONE, -ONE)
             side = select((first * last < ZERO) & (beyond * origin < ZERO), -side, side)
-        # The two rays: what an end B moves along when it moves away from the centre.
+        # The two rays, along which the ends B move away from the centre.
         f = maximum(_along(records, n, dx, dy, 0), ZERO)
         away = dx - (ONE + f) * records[n, V], dy - (ONE + f) * records[n, V + 1]
         nearest = nearer(nearest, away, (ONE + f, nothing, nothing, nothing))
@@ -90,7 +90,7 @@ def cut_response(exp: Callable) -> KernelResponse:
 
     @scalar
     def masked(records, n, side, distance):
-        """The mask: a logistic curve of the distance, or a step where the width is 0."""
+        """Return the mask: a logistic curve of the distance, or a step where the width is 0."""
         e = exp(-distance * records[n, INVERSE_WIDTH])
         soft = select(side > ZERO, ONE / (ONE + e), e / (ONE + e))
         nothing = broadcast(records.dtype.type(0))
@@ -107,7 +107,7 @@ def cut_response(exp: Callable) -> KernelResponse:
 
     @scalar
     def hit_vjp(records, n, place, v_mean, v_shape, v_place):
-        """v_z = mask (1 - mask) v_mask / w along the unit vector from the nearest point, and its weights."""
+        """Add ``v_z = mask (1 - mask) v_mask / w`` along the unit vector from the nearest point, by its weights."""
         mask, side, (x, y, square, w_0, w_1, w_2, w_3), flat = place
         v_flat = flat_hit_vjp(records, n, flat, mask * v_mean, mask * v_shape, v_place)
         v_mask = v_shape * records[n, OPACITY] * flat[2]
@@ -129,7 +129,7 @@ def cut_response(exp: Callable) -> KernelResponse:
 
 @scalar
 def _along(records, n, dx, dy, end):
-    """How far a pixel lies along one of the rays, from the curve's end on, in units of the end's distance."""
+    """Return how far beyond the curve's end a pixel lies along one of the rays, in units of the end's distance."""
     k = V + 2 * N_EDGES * end
     along = (dx - records[n, k]) * records[n, k] + (dy - records[n, k + 1]) * records[n, k + 1]
     return along * records[n, INVERSES + N_EDGES + end]
@@ -154,7 +154,7 @@ def _records(conic_records: Callable, footprints: CutFootprints, dtype: np.dtype
 
 
 def _records_vjp(conic_records_vjp: Callable, footprints: CutFootprints, v_records: Floats) -> tuple[Floats, ...]:
-    """Gradient with respect to the footprints' ``FIELDS``."""
+    """Return the gradient with respect to the footprints' ``FIELDS``."""
     v_means2d, v_conics, v_opacities = conic_records_vjp(footprints.projection, v_records)
     dtype = footprints.means2d.dtype
     v_points = v_records[:, POINTS:SHIFT].reshape(-1, N_POINTS, 2).astype(dtype)

@@ -1,4 +1,4 @@
-"""The population of Gaussians with cuts, how it is drawn, and the recipe that trains it."""
+"""The population of Gaussians with cuts, its renderer, and the recipe that trains it."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -16,8 +16,8 @@ from minisplat_ref.training.schedule import At
 from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Floats, Gaussians
 
-START = 1.0  # deviations from the centre at which a curve begins: where nothing is drawn, it would learn nothing
-REACH = 3.0  # deviations that it goes to either side there
+START = 1.0  # initial distance of a curve from the centre, in standard deviations; farther out it would learn nothing
+REACH = 3.0  # initial half-length of a curve, in standard deviations
 WIDTH = 1.0  # px, of masks at the start of a training
 
 
@@ -31,13 +31,13 @@ class CutGaussians(NamedTuple):
     sh_dc: Floats
     sh_rest: Floats
     curves: Floats
-    """[N, 8] control points of a cubic, in deviations along the Gaussian's first two axes, one after the other."""
+    """[N, 8] control points of a cubic, in standard deviations along the Gaussian's first two axes, point by point."""
     widths: Floats
-    """[N] px, of the mask in the image: 0 is a hard edge. Set by events, not learnt."""
+    """[N] width of the mask in the image, px; 0 makes a hard edge. Events set it; it is not trained."""
 
 
 def with_cuts(gaussians: Gaussians, rng: np.random.Generator) -> CutGaussians:
-    """Return Gaussians with a straight curve each, at the side, in a random direction."""
+    """Return Gaussians, each with a straight curve on one side of its centre in a random direction."""
     n, dtype = len(gaussians.means), gaussians.means.dtype
     angles = rng.uniform(0, 2 * np.pi, n)
     outwards = np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None]  # [N, 1, 2]
@@ -80,7 +80,7 @@ PAYLOAD = Payload("Gaussians with cuts", RESPONSE, response_for, _is_plain, _foo
 
 
 def set_width(state: TrainState, iteration: Iteration, *, width: float) -> None:
-    """Make all masks ``width`` pixels wide; 0 makes hard edges."""
+    """Set the width of all masks to ``width`` pixels; 0 makes hard edges."""
     gaussians: Any = state.gaussians
     state.gaussians = gaussians._replace(widths=np.full_like(gaussians.widths, width))
 
@@ -101,4 +101,4 @@ CUTS = GS_ACCEL._replace(
         At(30_000, partial(set_width, width=0.0)),
     ),
 )
-"""``cuts``: 3DGS with a cut through each Gaussian: its edge is a pixel wide, then half of one, and hard in the end."""
+"""The recipe ``cuts``: 3DGS with a cut in each Gaussian, whose edge is a pixel wide, then half a pixel, then hard."""

@@ -1,8 +1,8 @@
-"""What a Gaussian with a cut does to a pixel, in NumPy: the curve in its plane, drawn as its footprint is.
+"""The response of a Gaussian with a cut, in NumPy: the curve in its plane is mapped to the image as its footprint is.
 
-Control points are c_j in units of the first two deviations, along the first two axes of R. The affine map that makes
-the Gaussian an ellipse in the image, ``x = R_c mu + t`` and J of :mod:`minisplat_ref.reference.pinhole`, takes them
-along, and the mask multiplies alpha::
+Control points are c_j along the first two axes of R, in units of the first two standard deviations. The affine map that
+makes the Gaussian an ellipse in the image, with ``x = R_c mu + t`` and J of :mod:`minisplat_ref.reference.pinhole`,
+applies to them, and the mask multiplies alpha::
 
     M = J(x) R_c R diag(s),   P_j = c_j1 M_1 + c_j2 M_2,   alpha = o exp(-d^T Q d / 2) mask(d)
 """
@@ -31,9 +31,9 @@ def image_points(curves: Floats, primitives: Primitives, camera: Camera, convent
     Parameters
     ----------
     curves : ndarray of shape (N, 8)
-        c_j, one point after the other.
+        c_j, point by point.
     primitives : Primitives
-        All in front of the camera.
+        N Gaussians in front of the camera.
     camera, conventions
         As for the projection.
     """
@@ -42,7 +42,7 @@ def image_points(curves: Floats, primitives: Primitives, camera: Camera, convent
 
 
 class PointsGradient(NamedTuple):
-    """Gradient of the loss with respect to what :func:`image_points` depends on."""
+    """Gradient of the loss with respect to everything that :func:`image_points` depends on."""
 
     curves: Floats  # [N, 8]
     means: Floats  # [N, 3]
@@ -96,7 +96,7 @@ def _maps(primitives: Primitives, camera: Camera, conventions: Conventions) -> t
 
 
 class CutFootprints(NamedTuple):
-    """Gaussians with cuts as a camera sees them."""
+    """The footprints of Gaussians with cuts."""
 
     projection: Projection
     points: Floats
@@ -124,7 +124,7 @@ FIELDS = ("means2d", "conics", "opacities", "points")
 
 
 class Place(NamedTuple):
-    """Where pixels lie in Gaussians with cuts."""
+    """The positions of pixels in Gaussians with cuts."""
 
     conic: ConicPlace
     uncut: Floats  # [G, P] alpha without the mask
@@ -132,12 +132,12 @@ class Place(NamedTuple):
 
 
 def boxes(footprints: CutFootprints) -> Ints:
-    """Return the boxes of the projection: a cut only takes away."""
+    """Return the boxes of the projection, which a cut cannot enlarge."""
     return footprints.projection.boxes
 
 
 def hit(footprints: CutFootprints, ids: Ints, centers: Floats) -> Hit:
-    """Evaluate footprints and masks at pixels; see :func:`minisplat_ref.reference.hits.conic_hit`."""
+    """Return the hits of footprints with their masks at pixels; see :func:`minisplat_ref.reference.hits.conic_hit`."""
     flat = CONIC.hit(footprints.projection, ids, centers)
     found = cut(footprints.points[ids], footprints.widths[ids], -flat.place.offsets)
     return Hit(flat.unclamped * found.masks, flat.depths, Place(flat.place, flat.unclamped, found))
@@ -146,7 +146,7 @@ def hit(footprints: CutFootprints, ids: Ints, centers: Floats) -> Hit:
 def hit_vjp(
     footprints: CutFootprints, ids: Ints, hit: Hit, v_mean: Floats, v_shape: Floats, v_place: None
 ) -> tuple[Floats, ...]:
-    """Gradient of :func:`hit` with respect to ``FIELDS``: the conic's for ``mask v``, and the mask's."""
+    """Gradient of :func:`hit` with respect to ``FIELDS``: that of the conic for ``mask v``, and that of the mask."""
     place: Place = hit.place
     flat = Hit(place.uncut, hit.depths, place.conic)
     masks = place.cut.masks

@@ -1,4 +1,4 @@
-"""What the gradient proof checks: the renderer, with the thresholds of masked hits."""
+"""The stage of the gradient check: the renderer with the thresholds of masked hits."""
 
 import numpy as np
 
@@ -13,18 +13,18 @@ from minisplat_ref.types import Floats, Gaussians
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
-    """Return the renderer; what is hit, and which part of a curve is nearest, is found by the reference."""
+    """Return the renderer as a stage; the reference finds which hits count, and which part of a curve is nearest."""
     return (renderer_stage(backend, setting, CUT_GAUSSIANS._replace(extend=_near), _sides, rng),)
 
 
 def _near(gaussians: Gaussians, rng: np.random.Generator) -> CutGaussians:
-    """Return Gaussians whose curves go through what is bright, or little would depend on them."""
+    """Return Gaussians whose curves pass through their bright parts; otherwise little would depend on them."""
     population = with_cuts(gaussians, rng)
     return population._replace(curves=0.4 * population.curves)
 
 
 def _sides(tile: TileHits, colors: Floats) -> tuple[np.ndarray, ...]:
-    """Which hits count and are clamped; which vertex of a polygon is nearest, or, numbered behind them, which piece."""
+    """Return which hits count, which are clamped, and the nearest vertex or, numbered after the vertices, piece."""
     is_hit, found = tile.alphas > 0, tile.hit.place.cut
     edges = np.arange(N_EDGES)
     first, last = np.array([*edges, 0, N_EDGES]), np.array([*edges + 1, 0, N_EDGES])  # vertices of each piece

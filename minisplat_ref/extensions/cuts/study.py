@@ -1,8 +1,9 @@
-"""The study ``cuts/card`` asks what a cut is worth where a picture has a sharp edge.
+"""The study ``cuts/card`` measures what cuts gain where a picture has a sharp edge.
 
-Two pictures of 48 x 48 pixels: a Gaussian with a part cut away, which one Gaussian with a cut can be, and a card of one
-brightness with a curved edge, which none can. Few Gaussians are trained on each, from random places, with cuts and
-without; their number stays. The error of the best seed is told apart near the edge, within 1.5 pixels, and elsewhere.
+There are two pictures of 48 x 48 pixels: a Gaussian with a part cut away, which one Gaussian with a cut can reproduce,
+and a card of one brightness with a curved edge, which none can. Few Gaussians are trained on each from random
+positions, with and without cuts; their number stays. The error of the best seed is given near the edge, within 1.5
+pixels, and elsewhere.
 """
 
 import argparse
@@ -20,18 +21,18 @@ if TYPE_CHECKING:
 
 NUMBERS = {"plain": (1, 3, 6, 12), "cut": (1, 3, 6)}
 COLORS = {"plain": shared.GREY, "cut": shared.RED}
-N_FLOATS = {"plain": 14, "cut": 22}  # of a Gaussian without view-dependent colour
+N_FLOATS = {"plain": 14, "cut": 22}  # per Gaussian without view-dependent colour
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--out``, ``--iterations`` and ``--seeds``."""
     shared_studies.add_out(parser)
-    parser.add_argument("--iterations", type=int, default=300, metavar="N", help="of each training (default 300)")
-    parser.add_argument("--seeds", type=int, default=4, metavar="N", help="trainings, seeds from 0 on (default 4)")
+    parser.add_argument("--iterations", type=int, default=300, metavar="N", help="per training (default 300)")
+    parser.add_argument("--seeds", type=int, default=4, metavar="N", help="number of seeds, from 0 on (default 4)")
 
 
 def run(args: argparse.Namespace) -> None:
-    """Train, measure, write, print the table.
+    """Train, measure, write the results, and print the table.
 
     Raises
     ------
@@ -50,7 +51,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def outcomes(iterations: int, n_seeds: int) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Return a row for each picture, kind and number, and pictures of the first seed with the targets."""
+    """Return a row per picture, kind and number, and the targets with pictures of the first seed."""
     from tqdm import tqdm
 
     from minisplat_ref.extensions.cuts import card
@@ -58,7 +59,7 @@ def outcomes(iterations: int, n_seeds: int) -> tuple[list[dict[str, Any]], dict[
     targets = {"cut Gaussian": card.cut_gaussian(), "card": card.card()}
     jobs = [(name, kind, n) for name in targets for kind, numbers in NUMBERS.items() for n in numbers]
     rows, pictures = [], {name: [("target", target.image)] for name, target in targets.items()}
-    for name, kind, n in tqdm(jobs, desc="trainings", leave=False):
+    for name, kind, n in tqdm(jobs, desc="trainings", leave=False, disable=None):
         found = [card.fitted(targets[name], n, kind == "cut", iterations, seed) for seed in range(n_seeds)]
         measures = [card.measured(targets[name], population) for population in found]
         pictures[name].append((f"{n} {kind}", card.drawn(found[0])))
@@ -76,7 +77,7 @@ def to_line(row: dict[str, Any]) -> list[str]:
 
 
 def draw(rows: list[dict[str, Any]], pictures: dict[str, Any]) -> "Figure":
-    """Draw PSNR over the number of floats, and the pictures."""
+    """Draw PSNR against the number of floats, and the pictures."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(14.0, 5.0), layout="constrained")
@@ -100,5 +101,5 @@ def draw(rows: list[dict[str, Any]], pictures: dict[str, Any]) -> "Figure":
     return figure
 
 
-CARD = Study("card", "pictures with a sharp edge, by few Gaussians with cuts and without", add_arguments, run)
-"""``cuts/card``."""
+CARD = Study("card", "pictures with a sharp edge, by few Gaussians with and without cuts", add_arguments, run)
+"""The study ``cuts/card``."""

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from minisplat_ref.backends import CPU
 from minisplat_ref.extensions.micro.method import collect_detail, trace
 from minisplat_ref.extensions.micro.reference import detail_map
-from minisplat_ref.extensions.shared_studies import psnr_of
+from minisplat_ref.extensions.shared_studies import psnr_of, with_progress
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL, collect_gradients
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.strategy import clone_split
@@ -177,7 +177,7 @@ def measure(iterations: int, seeds: int, beta: float, weight: float) -> dict[str
     outcomes: dict[str, list[Outcome]] = {name: [] for name in variants(beta, weight)}
     for seed in range(seeds):
         scene = checker_scene(seed)
-        for name, variant in variants(beta, weight).items():
+        for name, variant in with_progress(variants(beta, weight).items(), f"trainings, seed {seed}"):
             outcomes[name].append(outcome(trained(variant, scene, iterations, seed), scene))
     return outcomes
 

@@ -15,7 +15,7 @@ from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.multi_scale.levels import Plan, level_zero, with_levels
 from minisplat_ref.extensions.multi_scale.method import LEAST_COVERAGE, LEVELS, finest_densities
 from minisplat_ref.extensions.shared_sampling import block_means, zoomed
-from minisplat_ref.extensions.shared_studies import psnr_of, tidy
+from minisplat_ref.extensions.shared_studies import psnr_of, tidy, with_progress
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import configured
@@ -108,7 +108,7 @@ def measure(scene: Scene, iterations: int, seeds: int) -> Measured:
     shown = min(4, blocks[-1])
     pictures = {"photograph": block_means(scene.test_views[0].loaded().image.astype(float) / 255, shown)}
     for seed in range(seeds):
-        for name, variant in variants(scene, iterations, seed).items():
+        for name, variant in with_progress(variants(scene, iterations, seed).items(), f"measuring, seed {seed}"):
             found[name].append([figures(variant, scene, n) for n in blocks])
             counts[name].append(len(variant.gaussians.means))
             pictures.setdefault(name, np.clip(picture(variant, scene, 0, shown).image, 0, 1))

@@ -16,6 +16,7 @@ from scipy.special import erf
 from minisplat_ref.backends import CPU
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.extensions.negative.method import SIGNED
+from minisplat_ref.extensions.shared_studies import with_progress
 from minisplat_ref.metrics import psnr
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
 from minisplat_ref.strategy.ops import concat
@@ -166,7 +167,7 @@ def measure(n_starts: int, seed: int) -> dict[str, dict[str, Fit]]:
     return {
         name: {
             case_name: fitted(wall(name), truth(wall(name)), case, n_starts, np.random.default_rng(seed))
-            for case_name, case in CASES.items()
+            for case_name, case in with_progress(CASES.items(), f"fits before {name}")
         }
         for name in WALLS
     }

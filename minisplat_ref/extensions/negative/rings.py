@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from scipy.optimize import least_squares
 from scipy.special import erf, expit, logit
 
+from minisplat_ref.extensions.shared_studies import with_progress
 from minisplat_ref.types import Floats
 
 OUTER = 0.7  # radius; the picture is the square from -1 to 1
@@ -137,7 +138,7 @@ def measure(n_seeds: int, n_starts: int) -> dict[float, dict[str, list[Fit]]]:
             name: [fitted(ring(thickness), model, n_starts, np.random.default_rng(seed)) for seed in range(n_seeds)]
             for name, model in MODELS.items()
         }
-        for thickness in THICKNESSES
+        for thickness in with_progress(THICKNESSES, "rings")
     }
 
 

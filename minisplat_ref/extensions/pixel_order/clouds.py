@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from minisplat_ref.constants import EXACT_ORDER, GSPLAT_MAIN, LIST_ORDER, Conventions
-from minisplat_ref.extensions.shared_studies import tidy
+from minisplat_ref.extensions.shared_studies import tidy, with_progress
 from minisplat_ref.extensions.shared_tangent_planes import hit, project
 from minisplat_ref.extensions.shared_tangent_rays import (
     METHODS,
@@ -64,7 +64,7 @@ def rotation(n: int, n_steps: int, seed: int, conventions: Conventions = GSPLAT_
     camera, rays = wide_camera(), rays_ahead(8, 18.0)
     yaws = [yawed(camera, yaw) for yaw in np.radians(np.linspace(-20, 20, n_steps + 1))]
     found: dict[str, dict[str, Any]] = {}
-    for method in METHODS:
+    for method in with_progress(METHODS, "methods"):
         found[method] = {"yaw": color_changes(method, primitives, colors, yaws, rays, conventions)[0].tolist()}
         for name, k in WALKS.items():
             path = [translated(camera, dx) for dx in np.linspace(0, WALK, k * WALK_STEPS + 1)]
@@ -110,7 +110,7 @@ def projection_errors(n: int, seed: int) -> dict[str, list[float]]:
     truth = peak_responses(ahead, rays)
     camera = wide_camera(170.0, 2000, 2000)
     found: dict[str, list[float]] = {"EWA": [], "tangent planes": []}
-    for angle in ANGLES:
+    for angle in with_progress(ANGLES, "angles"):
         seen = yawed(camera, np.radians(angle))  # so that what lay ahead is off the axis
         in_camera = rays @ seen.cam_from_world_R.T
         is_ahead = in_camera[:, 2] > 0.05
@@ -148,7 +148,7 @@ def orders(primitives: Primitives, colors: Floats, camera: Camera, centers: Floa
     pairs, wrong = dict.fromkeys(ways, 0), dict.fromkeys(ways, 0)
     pictures: dict[str, list[Floats]] = {name: [] for name in ways}
     ids = np.flatnonzero(footprints.radii[:, 0] > 0)
-    for first in range(0, len(centers), CHUNK):
+    for first in with_progress(range(0, len(centers), CHUNK), "pixels"):
         found = hit(footprints, ids, centers[first : first + CHUNK])
         alphas = np.minimum(GSPLAT_MAIN.alpha_max, found.unclamped)
         alphas = np.where(alphas >= GSPLAT_MAIN.alpha_min, alphas, 0)

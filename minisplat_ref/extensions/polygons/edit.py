@@ -19,7 +19,7 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "edit",
         help="carry an edit of a model's polygons back to its Gaussians",
-        description="Carry an edit of the polygons that `polygons export` wrote back to the Gaussians of the model.",
+        description="Apply an edit of exported polygons to the Gaussians of the model.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -17,7 +17,7 @@ from minisplat_ref.extensions.rays.method import TRACED, tracer_for, whitened_mo
 from minisplat_ref.extensions.rays.surfaces import MIRROR
 from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenated_surfaces, parallelogram, surfaces_of
 from minisplat_ref.extensions.shared_rays import pixel_rays
-from minisplat_ref.extensions.shared_studies import tidy
+from minisplat_ref.extensions.shared_studies import tidy, with_progress
 from minisplat_ref.reference.compositing import composite_hits
 from minisplat_ref.reference.hits import Hit, Response
 from minisplat_ref.rendering import SPLATTING, Request
@@ -131,7 +131,7 @@ def splatting_errors() -> dict[str, list[float]]:
     """
     found: dict[str, list[float]] = {}
     bare = GSPLAT_MAIN._replace(eps2d=0.0)
-    for angle in OFF_AXIS:
+    for angle in with_progress(OFF_AXIS, "angles off the axis"):
         errors = []
         for sigma in SIGMAS:
             direction = np.array([np.sin(np.radians(angle)), 0.0, np.cos(np.radians(angle))])
@@ -187,7 +187,7 @@ def speed(n: int, repeats: int) -> dict[str, float]:
     view = view_from(demo.camera_of(240, 135))
     n_pixels, result = 240 * 135, dict[str, float]()
     ways = (("pixel", SPLATTING, CPU), ("plain pixel", SPLATTING, PLAIN), ("ray", TRACED.renderer, CPU))
-    for name, renderer, backend in ways:
+    for name, renderer, backend in with_progress(ways, "timing"):
         request = Request(backend=backend)
         output, tape = renderer.render(Model(gaussians), view, request)
         forward = seconds_of(partial(renderer.render, Model(gaussians), view, request), repeats)

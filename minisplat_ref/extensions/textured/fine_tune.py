@@ -1,4 +1,4 @@
-"""The command ``minisplat-ref textured fine-tune``: textures for a scene that was trained without."""
+"""The command ``minisplat-ref textured fine-tune``, which adds textures to a scene that was trained without any."""
 
 import argparse
 from pathlib import Path
@@ -12,23 +12,27 @@ from minisplat_ref.io.ply import load_ply, save_ply
 def add_parser(commands: Any) -> None:
     """Add the command."""
     parser = commands.add_parser(
-        "fine-tune", help="train textures for the Gaussians of a run, which stay where they are"
+        "fine-tune",
+        help="train textures for the Gaussians of a run, which stay where they are",
+        epilog="example: minisplat-ref textured fine-tune SCENE runs/few/point_cloud.ply --out textured.ply",
     )
     parser.add_argument("scene", metavar="SCENE", help="folder that the run was trained on")
-    parser.add_argument("ply", type=Path, metavar="PLY", help="its point_cloud.ply, of Mini-Splatting in the paper")
+    parser.add_argument("ply", type=Path, metavar="PLY", help="its point_cloud.ply; the paper uses Mini-Splatting")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="PLY to write")
     parser.add_argument("--downscale", type=int, default=1, metavar="D", help="make photographs D times smaller")
-    parser.add_argument("--iterations", type=int, default=1000, metavar="N", help="default 1000")
-    parser.add_argument("--degree", type=int, default=DEGREE, metavar="L", help="of the textures, 1 to 3 (default 3)")
+    parser.add_argument("--iterations", type=int, default=1000, metavar="N", help="length (default 1000)")
     parser.add_argument(
-        "--replace", action="store_true", help="textures replace the view-dependent colour, as in the paper"
+        "--degree", type=int, default=DEGREE, metavar="L", help="degree of textures, 1 to 3 (default 3)"
     )
-    parser.add_argument("--seed", type=int, default=0, metavar="S", help="default 0")
+    parser.add_argument(
+        "--replace", action="store_true", help="replace the view-dependent colour by textures, as in the paper"
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the training (default 0)")
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Train, write, and say what it has brought on the test views.
+    """Train, write the PLY, and print the change on the test views.
 
     Raises
     ------
@@ -48,10 +52,10 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"{args.out.parent} is no folder: make it, or give another --out")
     gaussians = load_ply(args.ply)
     if len(gaussians.means) == 0:
-        raise InputError(f"{args.ply} holds no Gaussians: give that of a run")
+        raise InputError(f"{args.ply} holds no Gaussians: give the PLY of a run")
     scene = read_scene(args.scene, args.downscale)
     before = measured(gaussians, scene, scene.test_views)
-    with tqdm(total=args.iterations, desc="textures", leave=False) as bar:
+    with tqdm(total=args.iterations, desc="textures", leave=False, disable=None) as bar:
         start = prepared(gaussians, args.degree, args.replace)
         textured = tuned(start, scene, args.iterations, args.seed, lambda _: bar.update())
     after = measured(textured, scene, scene.test_views)

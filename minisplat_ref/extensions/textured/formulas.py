@@ -1,4 +1,4 @@
-"""Vectors of lanes: tuples of 3, 5 or 7, as the harmonics of degree 1, 2 and 3 are."""
+"""Vectors of lanes: tuples of 3, 5 or 7, the numbers of harmonics of degree 1, 2 and 3."""
 
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import WIDTH, load

@@ -1,10 +1,10 @@
 """Textured Gaussians on lanes: a response for the plain kernels.
 
 With the frame in units of its distance, ``a^ = a / |a|``, ``D = A_xy / |a|`` and ``C = a^ x A_xy`` by columns, and the
-pixel's offset d = x - p, the ray and the nearest point are ``b = a^ + D d`` and ``q = (C d) x b / b^2``: numbers of
-order one in float32, however thin a Gaussian is and however far.
+pixel's offset d = x - p, the ray and the nearest point are ``b = a^ + D d`` and ``q = (C d) x b / b^2``. These numbers
+are of order one in float32, however thin or far away a Gaussian is.
 
-Textures have 15 coefficients here; those of a lower degree are filled up with zeros.
+Textures have 15 coefficients here; those of a lower degree are padded with zeros.
 """
 
 import functools
@@ -53,14 +53,14 @@ ODDS_MAX = 1e30  # so that a product with it stays finite in float32
 
 @functools.cache
 def textured_response(exp: Callable, constants: tuple) -> KernelResponse:
-    """Response of textured Gaussians, with an exponential; ``constants`` are those of the harmonics, then LIMB^2."""
+    """Return the response of textured Gaussians; ``constants`` are those of the harmonics, then LIMB^2."""
     conic = conic_response(exp)
     flat_hit, flat_hit_vjp = conic.hit, conic.hit_vjp
     limb_squared = constants[-1]
 
     @scalar
     def ray(records, n, dx, dy):
-        """b, q and 1 / b^2 of the pixel at d from the centre, and c = C d."""
+        """Return b, q and ``1 / b^2`` of the pixel at d from the centre, and ``c = C d``."""
         along = plus_3(times_3(dx, row_3(records, n, D_X)), times_3(dy, row_3(records, n, D_Y)))
         b = plus_3(row_3(records, n, A), along)
         c = plus_3(times_3(dx, row_3(records, n, C_X)), times_3(dy, row_3(records, n, C_Y)))
@@ -69,7 +69,7 @@ def textured_response(exp: Callable, constants: tuple) -> KernelResponse:
 
     @scalar
     def direction(b, q, inverse):
-        """n, the unit vector u along b, g and 1 / l^2."""
+        """Return n, the unit vector u along b, g and ``1 / l^2``."""
         h = dot_3(q, q)
         g, u = sqrt(maximum(ONE - h, limb_squared)), times_3(sqrt(inverse), b)
         shrink = ONE / maximum(h + limb_squared, ONE)
@@ -77,7 +77,7 @@ def textured_response(exp: Callable, constants: tuple) -> KernelResponse:
 
     @scalar
     def texture(table, n, k, Y1, Y2, Y3):
-        """Sum of the harmonics with 15 coefficients of row n, from column k on."""
+        """Return the sum of the harmonics with the 15 coefficients of row n from column k on."""
         return dot_3(row_3(table, n, k), Y1) + dot_5(row_5(table, n, k + 3), Y2) + dot_7(row_7(table, n, k + 8), Y3)
 
     @scalar
@@ -94,7 +94,7 @@ def textured_response(exp: Callable, constants: tuple) -> KernelResponse:
 
     @scalar
     def hit_vjp(records, n, place, v_mean, v_shape, v_place):
-        """From alpha to x, from the Y_k to n, from n to b and c = C d, in the order of the reference."""
+        """Differentiate from alpha to x, from the Y_k to n, and from n to b and ``c = C d``, as the reference does."""
         Y1, Y2, Y3, dx, flat, share, transparency = place
         dy, falloff = -flat[1], flat[2]
         v_flat = flat_hit_vjp(records, n, flat, share * v_mean, share * v_shape, v_place)
@@ -158,7 +158,7 @@ def response_for(dtype: np.dtype) -> KernelResponse:
 
 
 def filled_up(textures: Floats, n_rows: int) -> Floats:
-    """Return coefficients [N, n_rows (K-1)] of any degree as [N, n_rows, 15]."""
+    """Return coefficients [N, n_rows (K-1)] of any degree padded with zeros to [N, n_rows, 15]."""
     n, k = len(textures), textures.shape[1] // n_rows
     full = np.zeros((n, n_rows, N_TEXTURE), textures.dtype)
     full[:, :, :k] = textures.reshape(n, n_rows, k)

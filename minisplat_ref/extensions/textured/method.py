@@ -1,4 +1,4 @@
-"""How textured Gaussians are drawn, and the recipes that train them."""
+"""The renderer of textured Gaussians, and the recipes that train them."""
 
 from collections.abc import Mapping
 
@@ -42,7 +42,7 @@ def _footprints_vjp(projected: Projected, v: tuple[Floats, ...]) -> PayloadGradi
 
 
 def _coefficients(projected: Projected, channels: Floats) -> Floats:
-    """Return [N, D K]: of each channel its colour and its texture; a depth has none. Kernels take K = 16."""
+    """Return [N, D K], for each channel its colour and its texture; a depth has no texture. Kernels use K = 16."""
     g = projected.gaussians
     n, k = g.opacity_textures.shape
     is_compiled = projected.backend.is_compiled
@@ -86,7 +86,7 @@ TEXTURED_GAUSSIANS = Representation(
 )
 
 TEXTURED = GS_ACCEL._replace(name="textured")
-"""``textured``: 3DGS with textures from the first iteration on."""
+"""The recipe ``textured``: 3DGS with textures from the first iteration on."""
 
 FINE_TUNING = GS._replace(
     name="textured-fine-tuning",
@@ -94,4 +94,4 @@ FINE_TUNING = GS._replace(
     events=(),
     sh_milestones=(0, 0, 0),
 )
-"""Opacities, colours and textures alone, of all Gaussians as they are: the paper's fine-tuning."""
+"""The paper's fine-tuning: opacities, colours and textures are trained, and nothing else changes."""

@@ -16,17 +16,17 @@ class TexturedGaussians(NamedTuple):
     quats: Floats
     log_scales: Floats
     opacity_logits: Floats
-    """[N] logit of the opacity's degree 0."""
+    """[N] coefficient l of degree 0 of the opacity's logit."""
     sh_dc: Floats
     sh_rest: Floats
     color_textures: Floats
-    """[N, 3 (K-1)] coefficients of degree 1 and above over the ellipsoid, those of red first."""
+    """[N, 3 (K-1)] coefficients k_k of degree 1 and above over the ellipsoid, those of red first."""
     opacity_textures: Floats
-    """[N, K-1] the same of the logit."""
+    """[N, K-1] coefficients h_k of degree 1 and above of the logit."""
 
 
 def with_textures(gaussians: Gaussians, degree: int) -> TexturedGaussians:
-    """Return Gaussians with textures of zeros up to a degree; of degree 0 they have none, and are those of 3DGS."""
+    """Return Gaussians with textures of zeros up to a degree; with degree 0 they have none, and are those of 3DGS."""
     n, dtype, k = len(gaussians.means), gaussians.means.dtype, (degree + 1) ** 2 - 1
     return TexturedGaussians(
         **{name: getattr(gaussians, name) for name in Gaussians._fields},

@@ -1,8 +1,8 @@
-"""Where on a Gaussian's ellipsoid the ray of a pixel arrives, in NumPy, with the gradient (Textured-GS, 2407.09733).
+"""The point of a Gaussian's ellipsoid that the ray of a pixel hits, and its gradient, in NumPy (2407.09733).
 
-In the Gaussian's own axes, each in units of its deviation, the ellipsoid of one deviation is the unit sphere and the
-centre the origin. A ray from the camera is a line there. With K the camera's matrix, R_c and R the rotations of camera
-and Gaussian, s its deviations, z and p depth and pixel of its centre::
+In the Gaussian's own axes, each in units of its standard deviation, the ellipsoid of one standard deviation is the unit
+sphere around the origin, and a ray from the camera is a line. With K the camera's matrix, R_c and R the rotations of
+camera and Gaussian, s its standard deviations, z and p depth and pixel of its centre::
 
     A = z diag(1 / s) R^T R_c^T K^-1          the frame: from pixels (x, y, 1) to directions
     a = A (p, 1)                              from the camera to the centre
@@ -10,9 +10,9 @@ and Gaussian, s its deviations, z and p depth and pixel of its centre::
     q = ((a x e) x b) / (b . b)               the point of the ray that is nearest to the centre
     n = q - sqrt(1 - q . q) b / |b|           the point where it enters the sphere
 
-The length of b does not matter, and q does not take the difference of long vectors. Where a ray misses the sphere,
-q lies outside of it. There n points to q, so that it does not jump at the limb; near it the root is kept from falling
-below ``LIMB``, because its derivative grows beyond all bounds::
+The length of b does not matter, and q needs no difference of long vectors. Where a ray misses the sphere, q lies
+outside it. There n points to q, so that it does not jump at the limb. Near the limb the derivative of the root is
+unbounded, so the root is kept from falling below ``LIMB``::
 
     g = sqrt(max(1 - q . q, LIMB^2)),  n = (q - g b / |b|) / sqrt(max(1, q . q + LIMB^2))
 """
@@ -25,8 +25,8 @@ from minisplat_ref.reference.covariance import rotation_matrices, rotation_matri
 from minisplat_ref.reference.pinhole import pose
 from minisplat_ref.types import Camera, Floats, Ints
 
-LIMB = 0.1  # the last 5.7 degrees before the limb, which are drawn as the last pixel's width of most Gaussians
-SCALE_MIN = 1e-9  # world units: what is thinner counts as this thin
+LIMB = 0.1  # the last 5.7 degrees before the limb, which cover less than the last pixel of most Gaussians
+SCALE_MIN = 1e-9  # world units: thinner Gaussians count as this thin
 
 
 def inverse_intrinsics(camera: Camera, dtype: np.dtype) -> Floats:
@@ -45,20 +45,21 @@ def frames(means: Floats, quats: Floats, scales: Floats, camera: Camera) -> Floa
     quats : ndarray of shape (N, 4)
         wxyz, any length.
     scales : ndarray of shape (N, 3)
-        Deviations, world units.
+        Standard deviations, world units.
     camera : Camera
         The view.
 
     Returns
     -------
     ndarray of shape (N, 3, 3)
+        A.
     """
-    U, depths, _ = _turned(means, quats, camera)
+    U, depths, _ = _rotated_rays(means, quats, camera)
     return (depths[:, None] / np.maximum(scales, SCALE_MIN))[:, :, None] * U
 
 
 class FrameGradient(NamedTuple):
-    """Gradient of the loss with respect to what :func:`frames` takes."""
+    """Gradient of the loss with respect to the arguments of :func:`frames`."""
 
     means: Floats  # [N, 3]
     quats: Floats  # [N, 4]
@@ -83,7 +84,7 @@ def frames_vjp(means: Floats, quats: Floats, scales: Floats, camera: Camera, v_f
     v_frames : ndarray of shape (N, 3, 3)
         Derivative with respect to the frames.
     """
-    U, depths, R = _turned(means, quats, camera)
+    U, depths, R = _rotated_rays(means, quats, camera)
     R_c, _ = pose(camera, means.dtype)
     ratios = 1 / np.maximum(scales, SCALE_MIN)  # [N, 3]
     v_ratios = np.einsum("nij,nij->ni", v_frames, U) * depths[:, None]
@@ -103,7 +104,7 @@ def frames_vjp(means: Floats, quats: Floats, scales: Floats, camera: Camera, v_f
     )
 
 
-def _turned(means: Floats, quats: Floats, camera: Camera) -> tuple[Floats, Floats, Floats]:
+def _rotated_rays(means: Floats, quats: Floats, camera: Camera) -> tuple[Floats, Floats, Floats]:
     """Return ``U = (R_c R)^T K^-1`` [N, 3, 3], depths z [N] and R [N, 3, 3]."""
     R_c, t = pose(camera, means.dtype)
     R = rotation_matrices(quats)
@@ -111,7 +112,7 @@ def _turned(means: Floats, quats: Floats, camera: Camera) -> tuple[Floats, Float
 
 
 class Meeting(NamedTuple):
-    """Where P rays arrive at G ellipsoids."""
+    """The points at which P rays hit G ellipsoids."""
 
     offsets: Floats  # [G, P, 2] x - p, px
     a: Floats  # [G, 1, 3]
@@ -121,15 +122,16 @@ class Meeting(NamedTuple):
 
 
 def meet(frames: Floats, means2d: Floats, centers: Floats) -> Meeting:
-    """Return where the rays of pixels enter ellipsoids, or in which direction they miss them.
+    """Return the points at which the rays of pixels enter ellipsoids, or the directions in which they miss them.
 
     Parameters
     ----------
     frames : ndarray of shape (G, 3, 3)
+        A, from :func:`frames`.
     means2d : ndarray of shape (G, 2)
         p, px.
     centers : ndarray of shape (P, 2)
-        x of the pixels, px.
+        x, the centres of the pixels, px.
     """
     offsets = centers.astype(means2d.dtype) - means2d[:, None]  # [G, P, 2]
     e = np.einsum("gij,gpj->gpi", frames[:, :, :2], offsets)
@@ -148,8 +150,8 @@ def meet_vjp(frames: Floats, means2d: Floats, meeting: Meeting, v_directions: Fl
     With ``r = q - g u``, ``u = b / |b|``, ``n = r / l`` and ``h = q . q``::
 
         v_r = v_n / l,  v_q = v_r,  v_g = -u . v_r,  v_u = -g v_r
-        v_h = -v_g / (2 g)                     where the root falls, else
-        v_h = -(n . v_n) / (2 l^2)             as the length does
+        v_h = -v_g / (2 g)                     where g depends on h, else
+        v_h = -(n . v_n) / (2 l^2)             since l depends on it
         v_q += 2 q v_h
         v_c = b x v_q / b^2                    with c = a x e and q = c x b / b^2
         v_b = v_q x c / b^2 - 2 b (q . v_q) / b^2 + (v_u - u (u . v_u)) / |b|
@@ -160,7 +162,7 @@ def meet_vjp(frames: Floats, means2d: Floats, meeting: Meeting, v_directions: Fl
     frames, means2d
         As for :func:`meet`.
     meeting : Meeting
-        Its result.
+        The result of :func:`meet`.
     v_directions : ndarray of shape (G, P, 3)
         Derivative with respect to n.
 
@@ -173,7 +175,7 @@ def meet_vjp(frames: Floats, means2d: Floats, meeting: Meeting, v_directions: Fl
     b = a + e
     squared, h = _dot(b, b), _dot(q, q)
     u = b / np.sqrt(squared)
-    is_round = 1 - h > LIMB**2  # [G, P, 1] where the root is not kept from falling
+    is_round = 1 - h > LIMB**2  # [G, P, 1] where g depends on h
     g, length = np.sqrt(np.maximum(1 - h, LIMB**2)), np.sqrt(np.maximum(1, h + LIMB**2))
 
     v_r = v_directions / length
@@ -194,7 +196,7 @@ def meet_vjp(frames: Floats, means2d: Floats, meeting: Meeting, v_directions: Fl
 
 
 def _dot(x: Floats, y: Floats) -> Floats:
-    """Return ``x . y`` of the last axis, which is kept."""
+    """Return ``x . y`` along the last axis, which stays with length 1."""
     return np.sum(x * y, axis=-1, keepdims=True)
 
 

@@ -1,4 +1,4 @@
-"""What a textured Gaussian does to a pixel, in NumPy: opacity and colour at the point n where its ray arrives.
+"""The response of a textured Gaussian, in NumPy: opacity and colour at the point n that the pixel's ray hits.
 
 With the real spherical harmonics Y_k, the opacity o = sigmoid(l) of 3DGS and its colour c, which may depend on the
 view::
@@ -7,13 +7,13 @@ view::
     color(n) = max(0, c + sum_k k_k Y_k(n))   for each channel; k from 1 on, since o and c are of degree 0
     alpha    = opacity(n) exp(-d^T Q d / 2)
 
-The harmonics of degree 1 to L add up to ``sum_k Y_k^2 = ((L + 1)^2 - 1) / (4 pi)`` for every n, so that ``|x| <= B``
-with ``B = |h| sqrt(((L + 1)^2 - 1) / (4 pi))``. A footprint is as large as one of the opacity sigmoid(l + B) would be,
-and alpha is a part of that one's: with ``w = exp(-(l + B))`` and ``e = exp(x - B)``::
+The squares of the harmonics of degree 1 to L add up to ``sum_k Y_k^2 = ((L + 1)^2 - 1) / (4 pi)`` for every n, so ``|x|
+<= B`` with ``B = |h| sqrt(((L + 1)^2 - 1) / (4 pi))``. A footprint is as large as that of the opacity ``o_B = sigmoid(l
++ B)``, and alpha is the alpha of that one times m: with ``w = exp(-(l + B))`` and ``e = exp(x - B)``::
 
     alpha = o_B exp(-d^T Q d / 2) m,  m = e (1 + w) / (e + w),  1 - opacity(n) = w / (e + w)
 
-B itself has no derivative: what it adds to o_B, m takes away.
+B needs no derivative, because a change of o_B and of m by B cancel.
 """
 
 import math
@@ -33,13 +33,13 @@ def degree_of(n_coefficients: int) -> int:
 
 
 def bounds(opacity_textures: Floats) -> Floats:
-    """Return B [N], the most that textures [N, K-1] can add to the logit."""
+    """Return B [N], the largest value that textures [N, K-1] can add to the logit."""
     bound: Floats = np.linalg.norm(opacity_textures, axis=1)
     return bound * bound.dtype.type(math.sqrt(opacity_textures.shape[1] / (4 * math.pi)))
 
 
 class Footprints(NamedTuple):
-    """Textured Gaussians as a camera sees them."""
+    """The footprints of textured Gaussians."""
 
     projection: Projection
     """Of the opacity o_B, compensated where the conventions ask for it."""
@@ -67,7 +67,7 @@ class Footprints(NamedTuple):
 
     @property
     def odds(self) -> Floats:
-        """[N] w; of what is too faint to be seen it may be infinite."""
+        """[N] w, which may be infinite for Gaussians that are too faint to be seen."""
         with np.errstate(over="ignore"):
             return np.exp(-(self.logits + bounds(self.opacity_textures)))
 
@@ -76,7 +76,7 @@ FIELDS = ("means2d", "conics", "opacities", "logits", "opacity_textures", "frame
 
 
 class Place(NamedTuple):
-    """Where G Gaussians are met by P pixels."""
+    """The hits of P pixels on G Gaussians."""
 
     conic: ConicPlace
     meeting: Meeting
@@ -91,7 +91,7 @@ def boxes(footprints: Footprints) -> Ints:
 
 
 def hit(footprints: Footprints, ids: Ints, centers: Floats) -> Hit:
-    """Evaluate footprints at pixels; see :func:`minisplat_ref.reference.hits.conic_hit`."""
+    """Return the hits of footprints at pixels; see :func:`minisplat_ref.reference.hits.conic_hit`."""
     flat = CONIC.hit(footprints.projection, ids, centers)
     h = footprints.opacity_textures[ids]  # [G, K-1]
     meeting = meet(footprints.frames[ids], footprints.means2d[ids], centers)
@@ -106,7 +106,7 @@ def hit(footprints: Footprints, ids: Ints, centers: Floats) -> Hit:
 def hit_vjp(
     footprints: Footprints, ids: Ints, hit: Hit, v_mean: Floats, v_shape: Floats, v_basis: Floats
 ) -> tuple[Floats, ...]:
-    """Gradient of :func:`hit` with respect to ``FIELDS``; ``v_basis`` is what colours add to that of the Y_k.
+    """Gradient of :func:`hit` with respect to ``FIELDS``; ``v_basis`` is the colours' derivative with respect to Y_k.
 
     ::
 
@@ -130,15 +130,15 @@ def hit_vjp(
 
 
 def shade(coefficients: Floats, place: Place) -> Floats:
-    """Return the channels [G, P, D] of ``coefficients`` [G, D K], of each channel c and its k_k."""
+    """Return the channels [G, P, D] of ``coefficients`` [G, D K], which hold c and the k_k of each channel."""
     return np.maximum(0, _unclamped(coefficients, place))
 
 
 def shade_vjp(coefficients: Floats, place: Place, v: Floats) -> tuple[Floats, Floats]:
     """Gradient of :func:`shade` with respect to coefficients [G, D K] and Y_k [G, P, K-1].
 
-    Zero where the channel was cut. At zero itself it passes: a colour of 3DGS that has been cut to zero can still get a
-    texture.
+    It is zero where the channel was clamped, but not at zero itself, so that a colour of 3DGS that was clamped to zero
+    can still get a texture.
     """
     n_coefficients = place.basis.shape[2] + 1
     v = np.where(_unclamped(coefficients, place) >= 0, v, 0)  # [G, P, D]

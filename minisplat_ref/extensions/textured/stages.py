@@ -1,4 +1,4 @@
-"""What the gradient proof checks: the renderer, with the thresholds of textured hits."""
+"""The stage of the gradient check: the renderer with the thresholds of textured hits."""
 
 import numpy as np
 
@@ -12,16 +12,16 @@ from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.reference.hits import TileHits
 from minisplat_ref.types import Bools, Floats
 
-NEAR_LIMB = 0.06  # of 1 - q . q, whose root has higher derivatives that a large step does not see through
+NEAR_LIMB = 0.06  # of 1 - q . q, whose root has large higher derivatives, which need small steps
 
 
 def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tuple[Stage, ...]:
-    """Return the renderer; what is hit, clamped or cut, and where a ray passes the limb, is found by the reference."""
+    """Return the renderer as a stage; the reference finds what is hit or clamped, and where a ray passes the limb."""
     return (renderer_stage(backend, setting, TEXTURED_GAUSSIANS, _sides, rng),)
 
 
 def _sides(tile: TileHits, coefficients: Floats) -> tuple[Bools | Floats, ...]:
-    """Which hits count, which are clamped, which colours are cut; near the limb the eighth of an octave of the root."""
+    """Return which hits count, which hits and colours are clamped, and near the limb eighths of octaves of the root."""
     is_hit, place = tile.alphas > 0, tile.hit.place
     colors = shade(coefficients[tile.ids], place)  # [G, P, D]
     left = 1 - np.sum(place.meeting.q**2, axis=2)  # [G, P]

@@ -1,12 +1,13 @@
 """The studies ``textured/counts`` and ``textured/limb``.
 
-``counts``: what are textures worth at an equal number of Gaussians, and at an equal number of floats? A scene is
-trained by Mini-Splatting, or given. Its Gaussians are fine-tuned for the same number of iterations as they are, with
-textures in the place of view-dependent colour (the paper's form) and with both; textures of degree 1 and 2, too. Then
-as many of the most important Gaussians are kept that the textured ones have no more floats than the plain ones had.
+``counts`` measures what textures gain at an equal number of Gaussians, and at an equal number of floats. The Gaussians
+come from a training with Mini-Splatting or from a PLY. They are fine-tuned for the same number of iterations without
+textures, with textures instead of view-dependent colour (the paper's form), and with both; textures of degree 1 and 2
+are tried, too. Then only so many of the most important Gaussians are kept that the textured ones have no more floats
+than the plain ones had.
 
-``limb``: does the colour jump where rays begin to miss the ellipsoid? A row of rays crosses the limb of one Gaussian;
-the largest change from one to the next is compared with that of a texture that is left out behind the limb.
+``limb`` asks whether the colour jumps where rays begin to miss the ellipsoid. A row of rays crosses the limb of one
+Gaussian; the largest change from one to the next is compared with that of a texture that ends at the limb.
 """
 
 import argparse
@@ -32,11 +33,13 @@ STEPS = (0.1, 0.01, 0.001)  # px from ray to ray
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``counts``."""
     shared.add_scene_arguments(parser, iterations=1000, recipe="mini-splatting")
-    parser.add_argument("--fine-tune", type=int, default=500, metavar="M", help="iterations afterwards (default 500)")
+    parser.add_argument(
+        "--fine-tune", type=int, default=500, metavar="M", help="iterations of fine-tuning (default 500)"
+    )
 
 
 def run(args: argparse.Namespace) -> None:
-    """Train, fine-tune, measure, write, print the table.
+    """Train, fine-tune, measure, write the results, and print the table.
 
     Raises
     ------
@@ -58,7 +61,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def outcomes(whole: Gaussians, scene: Scene, iterations: int, seed: int) -> list[dict[str, Any]]:
-    """Return a row for each form of a trained population."""
+    """Return the measurements of each form of a trained population."""
     from tqdm import tqdm
 
     from minisplat_ref.extensions.textured.tuning import floats_of, measured, prepared, tuned
@@ -76,7 +79,7 @@ def outcomes(whole: Gaussians, scene: Scene, iterations: int, seed: int) -> list
         kept = take(whole, most_important(importance, min(n, int(np.count_nonzero(importance)))))
         jobs.append(("as many floats", form, 3, prepared(kept, 3, replaces)))
     rows = []
-    for kept_by, form, degree, population in tqdm(jobs, desc=f"fine-tunings, seed {seed}", leave=False):
+    for kept_by, form, degree, population in tqdm(jobs, desc=f"seed {seed}", leave=False, disable=None):
         after = tuned(population, scene, iterations, seed)
         test, training = (measured(after, scene, views) for views in (scene.test_views, scene.train_views))
         rows.append(
@@ -109,7 +112,7 @@ def to_rows(runs: list[list[dict[str, Any]]]) -> list[list[str]]:
 
 
 def draw(result: dict[str, Any]) -> "Figure":
-    """Draw PSNR over the number of floats, of the test views and of those that were trained on."""
+    """Draw PSNR against the number of floats, for test views and training views."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.5, 3.6), layout="constrained")
@@ -128,7 +131,7 @@ def draw(result: dict[str, Any]) -> "Figure":
 
 
 def colors_across(step: float) -> tuple[Floats, Floats]:
-    """Return the colours of rays across the limb of a round Gaussian: with the texture, and without it beyond."""
+    """Return the colours of rays across a round Gaussian's limb, with the texture and without it beyond the limb."""
     from minisplat_ref.extensions.textured.reference import frames, meet
     from minisplat_ref.reference.spherical_harmonics import sh_basis
     from minisplat_ref.types import Camera
@@ -143,7 +146,7 @@ def colors_across(step: float) -> tuple[Floats, Floats]:
 
 
 def add_limb_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add none."""
+    """Add no arguments."""
 
 
 def run_limb(args: argparse.Namespace) -> None:
@@ -158,7 +161,7 @@ def run_limb(args: argparse.Namespace) -> None:
     print(markdown_table(["rays apart (px)", "nearest point beyond", "no texture beyond"], rows))
 
 
-COUNTS = Study("counts", "textures at equal number of Gaussians, and of floats", add_arguments, run)
-"""``textured/counts``."""
+COUNTS = Study("counts", "textures at equal numbers of Gaussians, and of floats", add_arguments, run)
+"""The study ``textured/counts``."""
 LIMB = Study("limb", "whether a texture jumps where rays begin to miss", add_limb_arguments, run_limb)
-"""``textured/limb``."""
+"""The study ``textured/limb``."""

@@ -1,4 +1,4 @@
-"""Fine-tuning: Gaussians that have been trained keep place, shape and number, and get textures."""
+"""Fine-tuning: trained Gaussians keep position, shape and number, and get textures."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,21 +17,21 @@ from minisplat_ref.types import Gaussians, Model, Scene, View
 
 
 def prepared(gaussians: Gaussians, degree: int, replaces_view: bool) -> TexturedGaussians:
-    """Return Gaussians with textures of zeros, and without view-dependent colour if textures are to replace it."""
+    """Return Gaussians with textures of zeros, and without view-dependent colour if textures replace it."""
     if replaces_view:
         gaussians = gaussians._replace(sh_rest=gaussians.sh_rest[:, :0])
     return with_textures(gaussians, degree)
 
 
 def representation_of(population: Any) -> Representation:
-    """Return what the population is drawn and trained by."""
+    """Return the representation of a population with or without textures."""
     return TEXTURED_GAUSSIANS if isinstance(population, TexturedGaussians) else GAUSSIANS
 
 
 def tuned(
     population: Any, scene: Scene, iterations: int, seed: int, on_step: Callable[[StepReport], None] | None = None
 ) -> Any:
-    """Return a population, textured or not, after some iterations of ``FINE_TUNING``; the given one is not changed."""
+    """Return a population with or without textures after fine-tuning; the given one is not changed."""
     recipe = scaled(FINE_TUNING, iterations)._replace(representation=representation_of(population))
     copy = type(population)(*(field.copy() for field in population))
     rng = np.random.default_rng(seed)
@@ -46,5 +46,5 @@ def measured(population: Any, scene: Scene, views: tuple[View, ...]) -> Evaluati
 
 
 def floats_of(population: Any) -> int:
-    """Return how many numbers a Gaussian of the population has."""
+    """Return the number of floats per Gaussian of a population."""
     return sum(int(np.prod(field.shape[1:])) for field in population)

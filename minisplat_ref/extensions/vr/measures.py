@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
-from minisplat_ref.extensions.shared_studies import tidy
+from minisplat_ref.extensions.shared_studies import tidy, with_progress
 from minisplat_ref.extensions.shared_tangent_rays import color_changes, ewa_hits, tangent_hits, yawed
 from minisplat_ref.extensions.vr.foveation import Gaze, Zone, eccentricities, render_foveated, resolved_angles
 from minisplat_ref.extensions.vr.method import BUFFER
@@ -46,7 +46,7 @@ def foveated(
     """
     request, rows = Request(background, backend=CPU), []
     whole: list[Floats] = []
-    for full in (EVERYWHERE, *fulls):
+    for full in with_progress((EVERYWHERE, *fulls), "angles"):
         psnrs, against_whole, plain, times = [], [], [], []
         zones: list[list[Zone]] = []
         for v, view in enumerate(views):
@@ -120,7 +120,7 @@ def yaw_steps(
     rows = _hit_rows(primitives, path[:: max(n_steps // 4, 1)], rays)
     seen = Primitives._make(field[rows] for field in primitives)
     seen_by = (seen, colors[rows], path, rays, GSPLAT_MAIN)
-    return {method: color_changes(method, *seen_by)[0].tolist() for method in METHODS}
+    return {method: color_changes(method, *seen_by)[0].tolist() for method in with_progress(METHODS, "methods")}
 
 
 def _hit_rows(primitives: Primitives, cameras: Sequence[Camera], rays: Floats) -> Ints:

@@ -39,6 +39,7 @@ def run(args: argparse.Namespace) -> int:
     InputError
         The PLY or the cameras cannot be used, the gaze lies outside a picture, or the folder exists.
     """
+    from minisplat_ref.extensions.shared_studies import with_progress
     from minisplat_ref.extensions.vr.foveation import Gaze, check_gaze, render_foveated
     from minisplat_ref.extensions.vr.method import BUFFER
     from minisplat_ref.io import load_ply, viewpoints, write_image
@@ -57,7 +58,8 @@ def run(args: argparse.Namespace) -> int:
         check_gaze(look, view.camera, view.name)
     names = file_names([view.name for view in views])
     with making_folder(args.out) as folder:
-        drawn = [render_foveated(model, view.camera, Request(), look, BUFFER) for view in views]
+        bar = with_progress(views, "rendering")
+        drawn = [render_foveated(model, view.camera, Request(), look, BUFFER) for view in bar]
         for name, (image, _) in zip(names, drawn, strict=True):
             write_image(folder / f"{name}.png", image)
     n_pixels = sum(view.camera.width * view.camera.height for view in views)
