@@ -55,7 +55,7 @@ from minisplat_ref.extensions.rays.kernels import scene_of
 from minisplat_ref.extensions.rays.lights import shade
 from minisplat_ref.extensions.rays.method import whitened_model
 from minisplat_ref.extensions.rays.surfaces import GLASS, MIRROR
-from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenated_surfaces, surfaces_of, parallelogram
+from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenated_surfaces, parallelogram, surfaces_of
 from minisplat_ref.extensions.shared_mesh import Mesh
 from minisplat_ref.extensions.shared_rays import pixel_rays
 from minisplat_ref.extensions.shared_tangent_rays import ewa_hits, ray_colors, tangent_hits, yawed
