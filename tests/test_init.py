@@ -178,7 +178,7 @@ def test_the_scene_s_own_points_give_the_same_bytes(scene_folder, tmp_path):
 def test_losses_on_sparse_points_keep_the_scene_s_own(scene_folder, tmp_path):
     """Views know rows of the scene's 60 points, which the cloud of ten does not have."""
     cloud = write_cloud(tmp_path / "few.ply", load_scene(scene_folder).points[:10])
-    options = ["--iterations", "3", "--extension", "geometry", "--set", "sfm_depth=1"]
+    options = ["--recipe", "3dgs-accel", "--iterations", "3", "--extension", "geometry", "--set", "sfm_depth=1"]
     assert train(scene_folder, tmp_path / "run", *options, "--init", str(cloud)) == 0
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["n_gaussians"] == 10
 

@@ -19,6 +19,7 @@ from minisplat_ref.training.state import Iteration, TrainState, apply_edit
 
 N_SLICES = 8
 LAST_SLICE = 0.64  # no slice after this part of the cool-down
+LEAST_GAP = 20  # iterations from slice to slice, in which the others learn to replace what is gone
 LEAST_SLICE = 0.01  # of the Gaussians; a smaller slice is not worth a disturbance
 
 
@@ -26,9 +27,11 @@ def slice_due(pace: Pace, step: int) -> int | None:
     """Return which slice is due at an iteration, from 0; None where none is."""
     if pace.cooling_from is None or pace.last_step is None:
         return None
-    every = max(1, int(LAST_SLICE * (pace.last_step - pace.cooling_from) / N_SLICES))
-    number, rest = divmod(step - pace.cooling_from - 1, every)
-    return number if rest == 0 and 0 <= number < N_SLICES else None
+    last = LAST_SLICE * (pace.last_step - pace.cooling_from)
+    every = max(LEAST_GAP, int(last / N_SLICES))
+    since = step - pace.cooling_from - 1
+    number, rest = divmod(since, every)
+    return number if rest == 0 and 0 <= number < N_SLICES and since <= last else None
 
 
 def prune_in_slices(

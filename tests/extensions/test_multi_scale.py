@@ -300,7 +300,8 @@ def test_interrupted_after_the_insertion_then_resumed_gives_the_same_bytes(
 
 def test_levels_are_built_of_a_trained_scene_and_drawn(scene_folder, tmp_path, capsys):
     run, out = tmp_path / "plain", tmp_path / "levels.ply"
-    assert main(["train", str(scene_folder), "--test-every", "4", "--iterations", "20", "--out", str(run)]) == 0
+    short = ["--recipe", "3dgs-accel", "--test-every", "4", "--iterations", "20"]
+    assert main(["train", str(scene_folder), *short, "--out", str(run)]) == 0
     ply = str(run / "point_cloud.ply")
     assert main(["multi-scale", "build", ply, "--factor", "2", "--out", str(out)]) == 0
     assert "coarser Gaussians beside" in capsys.readouterr().out
