@@ -8,7 +8,8 @@ import pytest
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.experiments.studies import FIGURE, RESULT, ablation, front
-from minisplat_ref.experiments.studies.ablation import FULL, RUNS, variants_of
+from minisplat_ref.experiments.studies.ablation import FULL, variants_of
+from minisplat_ref.experiments.studies.front import RUNS
 from minisplat_ref.io.images import read_image
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.training.schedule import action_name, configured, settings_of

@@ -10,13 +10,11 @@ folder continues with those that are missing.
 """
 
 import argparse
-import json
 import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
@@ -26,8 +24,10 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.studies.front import (
     BLUE,
     RED,
+    append,
     describe_scene,
     mean_and_deviation,
+    read_records,
     read_scene,
     tidy,
     title,
@@ -51,7 +51,6 @@ from minisplat_ref.training.schedule import (
 )
 from minisplat_ref.types import Scene
 
-RUNS = "runs.jsonl"
 FULL = "everything"
 MEASURES = ("psnr", "ssim", "n_gaussians", "seconds")
 
@@ -181,33 +180,6 @@ def count_actions(records: Sequence[Mapping[str, Any]], variants: Iterable[str])
     fired = [record["fired"] for record in records if record["without"] == FULL]
     names = {name: ACTIONS[name].__name__ if name in ACTIONS else HALF_SIZE for name in variants if name in MECHANISMS}
     return {name: min(times.get(action, 0) for times in fired) for name, action in names.items()}
-
-
-def read_records(folder: Path, settings: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Make the folder, or return its records of an earlier call with the same settings.
-
-    Raises
-    ------
-    InputError
-        The folder belongs to other settings, or contains something else.
-    """
-    path = folder / RUNS
-    if not folder.exists():
-        folder.mkdir(parents=True)
-        path.write_text(json.dumps(settings) + "\n", encoding="utf-8")
-        return []
-    if not path.is_file():
-        raise InputError(f"{folder} exists and is not of this study: give another --out")
-    first, *lines = path.read_text(encoding="utf-8").splitlines()
-    if json.loads(first) != settings:
-        raise InputError(f"{folder} holds trainings of {first}: give another --out, or the same settings")
-    return [json.loads(line) for line in lines]
-
-
-def append(folder: Path, record: Mapping[str, Any]) -> None:
-    """Append the record of a completed training."""
-    with open(folder / RUNS, "a", encoding="utf-8") as file:
-        file.write(json.dumps(record) + "\n")
 
 
 def measure(scene: Scene, recipe: Recipe, seed: int) -> dict[str, Any]:

@@ -25,10 +25,19 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.studies.ablation import append, read_records
 from minisplat_ref.experiments.studies.adaptive_candidates import CANDIDATES
 from minisplat_ref.experiments.studies.defects import multiplied, under_a_sky, with_turned_cameras
-from minisplat_ref.experiments.studies.front import BLUE, RED, describe_scene, read_scene, tidy, title, write
+from minisplat_ref.experiments.studies.front import (
+    BLUE,
+    RED,
+    append,
+    describe_scene,
+    read_records,
+    read_scene,
+    tidy,
+    title,
+    write,
+)
 from minisplat_ref.experiments.studies.pruning import prune_by_exact_change, prune_by_weight, with_pruning_by
 from minisplat_ref.io.scene import half_size
 from minisplat_ref.methods import adaptive, adaptive_bands, gaussian_splatting, get_recipe

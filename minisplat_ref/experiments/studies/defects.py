@@ -25,8 +25,17 @@ from tqdm import tqdm
 
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.studies.ablation import append, read_records
-from minisplat_ref.experiments.studies.front import BLUE, RED, describe_scene, read_scene, tidy, title, write
+from minisplat_ref.experiments.studies.front import (
+    BLUE,
+    RED,
+    append,
+    describe_scene,
+    read_records,
+    read_scene,
+    tidy,
+    title,
+    write,
+)
 from minisplat_ref.experiments.studies.poses import moved
 from minisplat_ref.methods import adaptive
 from minisplat_ref.methods.adaptive_exposure import switch_exposure_on

@@ -1,7 +1,11 @@
-"""Parts that all studies share: the scene, means over seeds, the style of axes, and a folder with JSON and a figure."""
+"""Parts that all studies share: the scene, means over seeds, the style of axes, and a folder with JSON and a figure.
+
+Trainings take long. A study that appends the record of each to ``runs.jsonl`` as soon as it ends continues with the
+missing ones when it is called again with the same folder.
+"""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,6 +22,7 @@ from minisplat_ref.reporting import describe_machine
 from minisplat_ref.types import Scene
 
 BLUE, RED = "#35608c", "#d2493f"
+RUNS = "runs.jsonl"
 
 
 def read_scene(source: str, downscale: int) -> Scene:
@@ -57,6 +62,33 @@ def title(description: dict[str, Any]) -> str:
         f"{description['scene']}, {description['train_views']} training views of {width} x {height}; "
         f"{description['machine']}"
     )
+
+
+def read_records(folder: Path, settings: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Make the folder, or return its records of an earlier call with the same settings.
+
+    Raises
+    ------
+    InputError
+        The folder belongs to other settings, or contains something else.
+    """
+    path = folder / RUNS
+    if not folder.exists():
+        folder.mkdir(parents=True)
+        path.write_text(json.dumps(settings) + "\n", encoding="utf-8")
+        return []
+    if not path.is_file():
+        raise InputError(f"{folder} exists and is not of this study: give another --out")
+    first, *lines = path.read_text(encoding="utf-8").splitlines()
+    if json.loads(first) != settings:
+        raise InputError(f"{folder} holds trainings of {first}: give another --out, or the same settings")
+    return [json.loads(line) for line in lines]
+
+
+def append(folder: Path, record: Mapping[str, Any]) -> None:
+    """Append the record of a completed training."""
+    with open(folder / RUNS, "a", encoding="utf-8") as file:
+        file.write(json.dumps(record) + "\n")
 
 
 def mean_and_deviation(values: Sequence[float]) -> tuple[float, float]:

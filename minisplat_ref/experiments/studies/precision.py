@@ -28,13 +28,14 @@ from tqdm import tqdm
 
 from minisplat_ref.backends import CPU, CPU_EXACT, Backend
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.studies.ablation import append, read_records
 from minisplat_ref.experiments.studies.adaptive import WARM_UP, standard_error
 from minisplat_ref.experiments.studies.front import (
     BLUE,
     RED,
+    append,
     describe_scene,
     mean_and_deviation,
+    read_records,
     read_scene,
     tidy,
     title,
