@@ -46,9 +46,9 @@ from minisplat_ref.extensions.rays.demo import (
     MIRROR_CORNER,
     MIRROR_SIDES,
     ball,
+    concatenated,
     discs,
     floor,
-    together,
     world_of,
 )
 from minisplat_ref.extensions.rays.kernels import scene_of
@@ -261,7 +261,7 @@ plt.show()
 # of 2 x 2 and of 4 x 4 pixels, and interpolates between them.
 
 # %%
-scene = together(ball(), floor())
+scene = concatenated(ball(), floor())
 headset = Camera(np.eye(3), np.zeros(3), 90.0, 90.0, 72.0, 54.0, 144, 108)
 request = Request(np.array([0.1, 0.12, 0.16]), backend=REFERENCE)
 at = headset.fx * CENTRE[:2] / CENTRE[2] + [headset.cx, headset.cy]
