@@ -5,14 +5,16 @@ import numpy as np
 from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.methods.adaptive import ADAPTIVE
+from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import initial_state
 from minisplat_ref.training.state import Iteration
 
 
 def state_of(scene, truth):
-    """The truth, trained."""
+    """A training that has come to the truth, with moments for each of its Gaussians."""
     state = initial_state(scene, ADAPTIVE, 0)
     state.gaussians = type(truth)(*(field.copy() for field in truth))
+    state.adam = zero_moments(state.gaussians)
     return state
 
 

@@ -11,7 +11,6 @@ from minisplat_ref.methods.adaptive import ADAPTIVE, LEAST_SKY_GAIN
 from minisplat_ref.methods.adaptive_sky import HUGE, LARGE, Behind, behind, compare, fitted_sky, switch_sky_on
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.strategy.ops import concat
-from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import load_state, save_state, train
 from minisplat_ref.training.pace import Pace
 from minisplat_ref.training.schedule import At
@@ -59,13 +58,6 @@ def with_veils(truth, size):
     return concat(truth, veils)
 
 
-def started(scene, gaussians):
-    """A training that has come to these Gaussians, with moments for each of them."""
-    state = state_of(scene, gaussians)
-    state.adam = zero_moments(state.gaussians)
-    return state
-
-
 # Least squares --------------------------------------------------------------------------------------------------------
 
 
@@ -104,7 +96,7 @@ def test_photographs_judge_each_other():
 
 def test_veils_before_a_sky_are_replaced_by_it(truth, sky):
     scene = scene_of(truth, {SKY: sky})
-    state = started(scene, with_veils(truth, 1.5 * HUGE))
+    state = state_of(scene, with_veils(truth, 1.5 * HUGE))
     assert "in place of 3" in switch_sky_on(state, iteration_of(scene, 100), least_sky_gain=LEAST_SKY_GAIN)
     assert_array_equal(state.gaussians.means, truth.means)
     assert state.adam.first.means.shape == truth.means.shape
@@ -122,7 +114,7 @@ def test_veils_before_a_sky_are_replaced_by_it(truth, sky):
 
 def test_gaussians_that_are_large_but_not_huge_stay(truth, sky):
     scene = scene_of(truth, {SKY: sky})
-    state = started(scene, with_veils(truth, 0.5 * (LARGE + HUGE)))
+    state = state_of(scene, with_veils(truth, 0.5 * (LARGE + HUGE)))
     switch_sky_on(state, iteration_of(scene, 100), least_sky_gain=LEAST_SKY_GAIN)
     assert state.pace.switched_on == ("sky",) and len(state.gaussians.means) == len(truth.means) + 3
 
@@ -130,7 +122,7 @@ def test_gaussians_that_are_large_but_not_huge_stay(truth, sky):
 def test_large_things_that_are_there_stay(truth):
     everything = with_veils(truth, 1.5 * HUGE)
     scene = scene_of(everything, {})
-    state = started(scene, everything)
+    state = state_of(scene, everything)
     assert "nothing done: a sky in place of 3" in switch_sky_on(
         state, iteration_of(scene, 100), least_sky_gain=LEAST_SKY_GAIN
     )
@@ -139,7 +131,7 @@ def test_large_things_that_are_there_stay(truth):
 
 def test_without_large_gaussians_nothing_is_asked(truth, sky):
     scene = scene_of(truth, {SKY: sky})
-    state = started(scene, truth)
+    state = state_of(scene, truth)
     assert "no Gaussian is large" in switch_sky_on(state, iteration_of(scene, 100), least_sky_gain=LEAST_SKY_GAIN)
 
 
@@ -155,7 +147,7 @@ def test_training_goes_on_with_the_sky_byte_for_byte(truth, sky, tmp_path):
             save_state(saved[0], report.state, recipe)
 
     def start():
-        return started(scene, with_veils(truth, 1.5 * HUGE))
+        return state_of(scene, with_veils(truth, 1.5 * HUGE))
 
     straight = train(scene, recipe, seed=0, state=start(), on_step=save)
     again = train(scene, recipe, seed=0, state=load_state(saved[0], recipe))
