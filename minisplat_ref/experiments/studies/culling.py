@@ -153,7 +153,7 @@ def time_both(state: TrainState, scene: Scene, recipe: Recipe, is_visible: Bools
         arm.stats.pop("is_visible", None)
     arms[1].stats["is_visible"] = is_visible
     seconds = np.zeros((WARM_UP + repeats, 2))
-    for i in tqdm(range(len(seconds)), desc="timing", leave=False):
+    for i in tqdm(range(len(seconds)), desc="timing", leave=False, disable=None):
         for k in (0, 1) if i % 2 else (1, 0):  # each is first as often as second
             one_more = recipe._replace(iterations=arms[k].step + 1, events=())
             start = time.process_time()

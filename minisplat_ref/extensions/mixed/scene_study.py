@@ -96,7 +96,7 @@ def trained(recipe: "Recipe", scene: Scene, iterations: int, n_seeds: int) -> di
 
     row: dict[str, Any] = {"psnr": [], "ssim": []}
     for seed in range(n_seeds):
-        with tqdm(total=iterations, desc=f"{recipe.name}, seed {seed}", leave=False) as bar:
+        with tqdm(total=iterations, desc=f"{recipe.name}, seed {seed}", leave=False, disable=None) as bar:
             state = train(scene, scaled(recipe, iterations), seed=seed, on_step=lambda _: bar.update())
         renderer = recipe.representation.renderer
         found = evaluate(state.model, scene.test_views, background=scene.background, renderer=renderer)

@@ -73,7 +73,7 @@ def outcomes(name: str, iterations: int, n_seeds: int) -> tuple[list[dict[str, A
     jobs = [(picture, m, n) for picture in targets for m, numbers in NUMBERS[name].items() for n in numbers]
     rows: list[dict[str, Any]] = []
     pictures: dict[str, list[tuple[str, Floats]]] = {key: [("target", target)] for key, target in targets.items()}
-    for picture, m, n in tqdm(jobs, desc="trainings", leave=False):
+    for picture, m, n in tqdm(jobs, desc="trainings", leave=False, disable=None):
         fits = [
             fit.drawn(fit.fitted(targets[picture], n, n_vertices=m, iterations=iterations, seed=seed))
             for seed in range(n_seeds)

@@ -154,7 +154,7 @@ def run_limb(args: argparse.Namespace) -> None:
     from minisplat_ref.reporting import markdown_table
 
     rows = []
-    for step in STEPS:
+    for step in shared_studies.with_progress(STEPS, "spacings"):
         continued, cut = (float(np.abs(np.diff(colors)).max()) for colors in colors_across(step))
         rows.append([f"{step:g}", f"{continued:.2g}", f"{cut:.2g}"])
     print("largest change of a texture from ray to ray across the limb\n")

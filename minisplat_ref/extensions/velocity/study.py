@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.backends import CPU, REFERENCE
+from minisplat_ref.extensions.shared_studies import with_progress
 from minisplat_ref.extensions.velocity.method import MOVING, VELOCITY, MovingGaussians
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.metrics import evaluate
@@ -114,11 +115,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Train both recipes and print a table."""
-    truth = moving_gaussians(np.random.default_rng(args.seed))
-    print("| recipe     | PSNR dB | error of velocities |\n|------------|---------|---------------------|")
-    for recipe in (GS_ACCEL, VELOCITY._replace(representation=MOVING)):
+    truth, rows = moving_gaussians(np.random.default_rng(args.seed)), []
+    recipes = (GS_ACCEL, VELOCITY._replace(representation=MOVING))
+    for recipe in with_progress(recipes, "trainings"):
         psnr, error = outcome(scaled(recipe, args.iterations), truth, args.seed)
-        print(f"| {recipe.name:<10} | {psnr:7.2f} | {error:19.4f} |")
+        rows.append(f"| {recipe.name:<10} | {psnr:7.2f} | {error:19.4f} |")
+    print(
+        "| recipe     | PSNR dB | error of velocities |\n|------------|---------|---------------------|",
+        *rows,
+        sep="\n",
+    )
     return 0
 
 
