@@ -130,6 +130,20 @@ def render(
     return output, RenderTape(gaussians, sh_degree, splats)
 
 
+def drawn_degree(sh_rest: Floats, wanted: int | Ints | None) -> int | Ints:
+    """Return the degree of the spherical harmonics to draw: the stored one, or less where less is wanted.
+
+    Parameters
+    ----------
+    sh_rest : ndarray of shape (N, K, 3)
+        Coefficients of degrees 1 and above.
+    wanted : int, or ndarray of shape (N,) of int, optional
+        Of all Gaussians or of each; None: all that is stored.
+    """
+    stored = math.isqrt(sh_rest.shape[1] + 1) - 1
+    return stored if wanted is None else np.minimum(wanted, stored)
+
+
 def activated(gaussians: Any, is_visible: Bools | None = None) -> Primitives:
     """Return Gaussians after their activations.
 

@@ -5,7 +5,6 @@ and what they do to a pixel. Activations, projection, colours, tile lists, the c
 the gradient of all of them are the same, and are in this file.
 """
 
-import math
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
@@ -19,7 +18,7 @@ from minisplat_ref.cpu.compositing.responses import KernelResponse
 from minisplat_ref.errors import InputError
 from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
 from minisplat_ref.reference.hits import Response
-from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, RenderTape, Request, activated
+from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, RenderTape, Request, activated, drawn_degree
 from minisplat_ref.types import (
     Camera,
     Floats,
@@ -155,8 +154,7 @@ def _render(payload: Payload, model: Model, view: View, request: Request) -> tup
     if missing:
         way_out = "use --backend reference" if missing <= BY_REFERENCE else "train a recipe that does without"
         raise InputError(f"{payload.plural} are drawn without {', '.join(sorted(missing))}: {way_out}")
-    stored_degree = math.isqrt(g.sh_rest.shape[1] + 1) - 1
-    sh_degree = stored_degree if request.sh_degree is None else np.minimum(request.sh_degree, stored_degree)
+    sh_degree = drawn_degree(g.sh_rest, request.sh_degree)
     background = np.zeros(3, dtype) if request.background is None else np.asarray(request.background, dtype)
 
     primitives = activated(g._replace(opacity_logits=payload.opacity_logits(g)), request.is_visible)

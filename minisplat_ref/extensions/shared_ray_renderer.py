@@ -3,7 +3,6 @@
 A renderer is made of a :class:`Traced`: what becomes of a population before it is traced, and how that is traced.
 """
 
-import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -22,7 +21,7 @@ from minisplat_ref.extensions.shared_rays import (
     pixel_rays,
     pixel_rays_vjp,
 )
-from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, Request
+from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, Request, drawn_degree
 from minisplat_ref.types import Bools, Camera, Floats, Ints, Model, RenderOutput, View
 
 WANTS = frozenset({"depth", "stats"})
@@ -77,8 +76,7 @@ def render(traced: Traced, model: Model, view: View, request: Request) -> tuple[
         names = ", ".join(sorted(wants - WANTS))
         raise InputError(f"{traced.name} does not give {names}: use a recipe that does not ask for it")
     dtype, conventions, backend = g.means.dtype, request.conventions, request.backend
-    stored_degree = math.isqrt(g.sh_rest.shape[1] + 1) - 1
-    degree = stored_degree if request.sh_degree is None else np.minimum(request.sh_degree, stored_degree)
+    degree = drawn_degree(g.sh_rest, request.sh_degree)
     background = np.zeros(3) if request.background is None else np.asarray(request.background, np.float64)
     opacities = _opacities(g.opacity_logits, request.is_visible)
     prepared = traced.prepare(g, opacities)

@@ -1,6 +1,5 @@
 """A renderer of footprints on tangent planes, in which each pixel has its own order, and its gradient."""
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +19,7 @@ from minisplat_ref.extensions.shared_tangent_planes import (
 )
 from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
 from minisplat_ref.reference.hits import Response
-from minisplat_ref.rendering import SPLATTING, RenderGradient, Request, activated
+from minisplat_ref.rendering import SPLATTING, RenderGradient, Request, activated, drawn_degree
 from minisplat_ref.types import (
     Camera,
     Floats,
@@ -93,8 +92,7 @@ def prepare(model: Model, camera: Camera, request: Request, buffer_size: int | N
     g, backend = model.gaussians, request.backend
     size = checked_buffer(buffer_size)
     dtype = g.means.dtype
-    stored_degree = math.isqrt(g.sh_rest.shape[1] + 1) - 1
-    sh_degree = stored_degree if request.sh_degree is None else np.minimum(request.sh_degree, stored_degree)
+    sh_degree = drawn_degree(g.sh_rest, request.sh_degree)
     background = np.zeros(3, dtype) if request.background is None else np.asarray(request.background, dtype)
     primitives = activated(g, request.is_visible)
     footprints = project(primitives, camera, request.conventions)
