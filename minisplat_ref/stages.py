@@ -134,10 +134,9 @@ class RemovalChanges(Protocol):
         self,
         projection: Projection,
         colors: Floats,  # [N, D]
-        background: Floats,  # [D]
         bins: TileBins,
         conventions: Conventions,
-        output: RenderOutput,  # of the same backend's Composite
+        output: RenderOutput,  # of the same backend's Composite, and perhaps light from behind all hits in its image
     ) -> Floats: ...
 
 

@@ -86,7 +86,7 @@ def _surface_points(dtype: Dtype) -> None:
 
 def _removal_changes(dtype: Dtype) -> None:
     s = _draw(dtype, _REFERENCE, False, with_stats=False).splats
-    CPU.removal_changes(s.projection, s.channels, s.background, s.bins, s.conventions, s.output)
+    CPU.removal_changes(s.projection, s.channels, s.bins, s.conventions, s.output)
 
 
 def _photometric_loss(dtype: Dtype) -> None:

@@ -7,7 +7,7 @@ import pytest
 from gradcheck import check_inner_products
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import as_dtype, make_camera, make_gaussians
-from tolerances import CLOSED_FORM, GRADIENT_STEP_IMAGE, PARITY_FLOAT32_IMAGE
+from tolerances import CLOSED_FORM, GRADIENT_STEP_IMAGE, PARITY_FLOAT32_IMAGE, REMOVAL
 
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
@@ -130,6 +130,22 @@ def test_gradient_through_the_whole_renderer(rng, model, view, wants):
             names=names,
             step=GRADIENT_STEP_IMAGE,
         )
+
+
+@pytest.mark.parametrize("backend", [REFERENCE, CPU], ids=["reference", "cpu"])
+def test_what_a_removal_changes_counts_the_sky_behind(model, view, backend):
+    """Against the pictures without each Gaussian; a sky of TRANSMITTANCE_MIN is drawn or not, and tolerated."""
+    whole = drawn(BEHIND, model, view, backend).image
+    n = len(model.gaussians.means)
+    expected = []
+    for i in range(n):
+        request = Request(BACKGROUND, backend=backend, is_visible=np.arange(n) != i)
+        expected.append(np.sum((BEHIND.render(model, view, request)[0].image - whole) ** 2))
+    output = BEHIND.render(model, view, Request(BACKGROUND, backend=backend, wants=frozenset({"removal_changes"})))[0]
+    assert_allclose(output.extras["removal_changes"], expected, rtol=REMOVAL, atol=REMOVAL)
+    assert np.count_nonzero(expected) >= n // 2
+    without = drawn(SPLATTING, model, view, backend, frozenset({"removal_changes"})).extras["removal_changes"]
+    assert np.abs(without - expected).max() > 0.1 * max(expected), "the sky makes a difference"
 
 
 # Through the commands -------------------------------------------------------------------------------------------------

@@ -40,7 +40,6 @@ from minisplat_ref.types import Floats, Projection, RenderOutput, TileBins
 def removal_changes(
     projection: Projection,
     colors: Floats,
-    background: Floats,
     bins: TileBins,
     conventions: Conventions,
     output: RenderOutput,

@@ -23,25 +23,26 @@ from minisplat_ref.types import Floats, Projection, RenderOutput, TileBins
 def removal_changes(
     projection: Projection,
     colors: Floats,
-    background: Floats,
     bins: TileBins,
     conventions: Conventions,
     output: RenderOutput,
 ) -> Floats:
     """Return the squared change of the picture without each Gaussian.
 
-    With the light ``B_g = sum_{j behind g} w_j c_j + T_end background`` that passes through hit g, removing the hit
-    takes its own light away and lets all of B_g through, of which it has let only ``1 - alpha_g`` pass::
+    Behind hit g comes the light that the pixel's colour C has besides that of the hits up to g: from other hits, the
+    background, a sky. Removing the hit takes its own light away and lets all of B_g through, of which it has let only
+    ``1 - alpha_g`` pass::
 
+        B_g = C - sum_{j up to g} w_j c_j
         q_g = w_g c_g - alpha_g / (1 - alpha_g) B_g
         S_g = sum over pixels and channels of q_g^2
 
     Parameters
     ----------
-    projection, colors, background, bins, conventions
+    projection, colors, bins, conventions
         As for :func:`~minisplat_ref.reference.compositing.composite`.
     output : RenderOutput
-        Its result for these inputs. Not needed here: kernels start from its image.
+        Its result for these inputs; C is its image, to which light from behind all hits may have been added.
 
     Returns
     -------
@@ -52,8 +53,7 @@ def removal_changes(
     for tile in tile_hits(projection, bins, conventions):
         alphas = tile.alphas[:, :, None]  # [G, P, 1]
         lights = alphas * tile.transmittances[:-1, :, None] * colors[tile.ids][:, None]  # [G, P, D] w_g c_g
-        from_here = np.cumsum(lights[::-1], axis=0)[::-1]  # of g and all behind it
-        B = from_here - lights + tile.transmittances[-1][:, None] * background
+        B = output.image[tile.ys, tile.xs] - np.cumsum(lights, axis=0)
         q = lights - alphas / (1 - alphas) * B
         changes[tile.ids] += np.sum(q**2, axis=(1, 2), dtype=np.float64)
     return changes

@@ -85,6 +85,13 @@ def sky_colors_vjp(rays: Floats, R: Floats, sky: Floats, v_colors: Floats) -> tu
     return v_sky, np.einsum("pi,pj->ij", rays, v_d, dtype=np.float64)
 
 
+def sky_picture(camera: Camera, sky: Floats, dtype: np.dtype) -> Floats:
+    """Return the colours [H, W, 3] of the sky alone."""
+    rays = unit_rays(camera, np.arange(camera.height * camera.width), dtype)
+    colors = sky_colors(rays, camera.cam_from_world_R.astype(dtype), sky.astype(dtype, copy=False))
+    return colors.reshape(camera.height, camera.width, 3)
+
+
 class _Tape(NamedTuple):
     inner: Any  # tape of the wrapped renderer
     sky: Floats  # [16, 3] in the dtype of the image
@@ -101,11 +108,13 @@ def with_sky(inner: Renderer) -> Renderer:
     """Return a renderer that draws the sky behind everything, if the model has one; other channels stay."""
 
     def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
-        output, tape = inner.render(model, view, request)
         if SKY not in model.shared:
-            return output, tape
-        image, dtype = output.image.copy(), output.image.dtype  # the inner tape may refer to the original
+            return inner.render(model, view, request)
         camera = with_principal_point(view.camera, request.conventions)
+        if "removal_changes" in request.wants:
+            request = request._replace(behind=sky_picture(camera, model.shared[SKY], model.gaussians.means.dtype))
+        output, tape = inner.render(model, view, request)
+        image, dtype = output.image.copy(), output.image.dtype  # the inner tape may refer to the original
         transmittance = 1 - output.alpha.ravel()
         pixels = np.flatnonzero(transmittance >= TRANSMITTANCE_MIN)
         sky, R = model.shared[SKY].astype(dtype, copy=False), camera.cam_from_world_R.astype(dtype)
