@@ -79,6 +79,7 @@ def test_noise_is_no_evidence_and_neither_is_what_all_have_in_common():
 def test_one_standard_error_and_the_least_gain():
     assert Evidence(0.3, 0.2, np.zeros((2, 1))).is_above(0.05)
     assert not Evidence(0.2, 0.2, np.zeros((2, 1))).is_above(0.05)
+    assert not Evidence(0.3, 0.2, np.zeros((2, 1))).is_above(0.05, n_errors=3)
     assert not Evidence(0.04, 0.001, np.zeros((2, 1))).is_above(0.05)
 
 

@@ -38,6 +38,7 @@ from minisplat_ref.types import Bools, Floats
 
 LARGE, HUGE = 0.25, 1.0  # of the scene's extent: standard deviation along the longest axis, to question and to remove
 RIDGE = 1e-3  # of the mean diagonal entry of the normal matrix: directions that no photograph shows get no large colour
+N_ERRORS = 3.0  # standard errors that the gain must exceed: photographs share the sky, so nearly all of them should gain
 MOST_VIEWS = 24  # photographs that are looked at, evenly spread
 
 
@@ -131,7 +132,7 @@ def switch_sky_on(state: TrainState, iteration: Iteration, *, least_sky_gain: fl
     state, iteration
         As for every action.
     least_sky_gain : float
-        dB of the squared error that the photographs must gain on average, and more than the standard error.
+        dB of the squared error that the photographs must gain on average, and more than three standard errors.
     """
     if BACKDROP.name in state.pace.switched_on or SKY in state.shared:
         return "nothing done: there is a sky"
@@ -143,7 +144,7 @@ def switch_sky_on(state: TrainState, iteration: Iteration, *, least_sky_gain: fl
     ids = ids[:: -(-len(ids) // MOST_VIEWS)]
     evidence = compare(*(photographs_behind(state, iteration, ids, drawn) for drawn in (None, ~large)))
     why = f"a sky in place of {n:,} Gaussians explains {evidence.gain:.2f} dB more of the other photographs"
-    if not evidence.is_above(least_sky_gain):
+    if not evidence.is_above(least_sky_gain, N_ERRORS):
         return f"nothing done: {why}"
     sky = fitted_sky(photographs_behind(state, iteration, ids, ~huge)).astype(np.float32)
     apply_edit(state, keep(state.gaussians, ~huge))
