@@ -271,7 +271,7 @@ def _render_model(model: Model, view: View, request: Request) -> tuple[RenderOut
     return output._replace(extras=extras), tape
 
 
-def _surface(tape: RenderTape, output: RenderOutput, _: Request) -> Any:
+def _surface(tape: RenderTape, output: RenderOutput, request: Request) -> Any:
     """Return the densest point of the dominant Gaussian on each ray, a :class:`SurfacePoints`."""
     assert output.stats is not None
     means, quats, scales, _ = tape.splats.primitives
@@ -279,7 +279,7 @@ def _surface(tape: RenderTape, output: RenderOutput, _: Request) -> Any:
     return tape.splats.backend.surface_points(means, quats, scales, camera, output.stats.dominant_ids)
 
 
-def _dominant_depth(tape: RenderTape, output: RenderOutput, _: Request) -> Floats:
+def _dominant_depth(tape: RenderTape, output: RenderOutput, request: Request) -> Floats:
     """Return the depth [H, W] of the dominant Gaussian's mean; 0 where nothing was hit."""
     assert output.stats is not None
     depths = np.append(tape.projection.depths, tape.projection.depths.dtype.type(0))  # [N + 1]: id -1 gets 0

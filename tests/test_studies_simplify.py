@@ -16,6 +16,7 @@ from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.strategy.importance import collect_importance, indoor
 from minisplat_ref.strategy.initialization import from_points
+from minisplat_ref.strategy.removal import collect_removal_costs
 from minisplat_ref.strategy.simplify import carrying_mass, intersection_preserving, most_important
 from minisplat_ref.training.loop import train
 
@@ -65,13 +66,18 @@ def test_study(scene_folder, dense_file, tmp_path, capsys, restart):
     assert np.array_equal(carrying_mass(importance, simplify.MASS), most_important(importance, n_of_mass))
 
     runs = {(run["kept"], run["choice"], run["seed"]): run for run in result["runs"]}
-    assert len(runs) == len(result["runs"]) == 3 * 3 * 2
+    assert len(runs) == len(result["runs"]) == 3 * 4 * 2
     for (kept, _, _), row in runs.items():
         assert row["n_gaussians"] == result["counts"][kept] and row["chamfer_dense"] > 0
         assert row["psnr"] != row["psnr_tuned"]
     for kept in result["counts"]:
         assert runs[kept, "rank, mass", 0]["psnr"] == runs[kept, "rank, mass", 1]["psnr"]
         assert runs[kept, "sampling", 0]["psnr"] != runs[kept, "sampling", 1]["psnr"]
+
+    changes = collect_removal_costs(dense, scene.train_views, background=scene.background).changes * (importance > 0)
+    kept = dense._make(field[most_important(changes, n_of_mass)] for field in dense)
+    psnr = evaluate(kept, scene.test_views, background=scene.background).psnr
+    assert runs["mass 0.99", "least change", 0]["psnr"] == psnr != runs["mass 0.99", "rank, mass", 0]["psnr"]
 
     # One of the measures by another way.
     kept = dense._make(field[most_important(importance, n_of_mass)] for field in dense)
@@ -83,7 +89,7 @@ def test_study(scene_folder, dense_file, tmp_path, capsys, restart):
     # The table says the means and deviations.
     printed = capsys.readouterr().out.splitlines()
     lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in printed if line.startswith("|")]
-    assert len(lines) == 2 + 9
+    assert len(lines) == 2 + 12
     for label, n, choice, *cells in lines[2:]:
         values = [runs[label, choice, seed]["psnr_tuned"] for seed in (0, 1)]
         mean, deviation = map(float, cells[1].split(" ± "))

@@ -38,7 +38,7 @@ from minisplat_ref.types import Bools, Floats
 
 LARGE, HUGE = 0.25, 1.0  # of the scene's extent: standard deviation along the longest axis, to question and to remove
 RIDGE = 1e-3  # of the mean diagonal entry of the normal matrix: directions that no photograph shows get no large colour
-N_ERRORS = 3.0  # standard errors that the gain must exceed: photographs share the sky, so nearly all of them should gain
+N_ERRORS = 3.0  # standard errors that the gain must exceed: photographs share a sky, so nearly all of them gain
 MOST_VIEWS = 24  # photographs that are looked at, evenly spread
 
 

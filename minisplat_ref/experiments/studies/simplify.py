@@ -1,9 +1,11 @@
-"""Simplification at equal counts: sampling by importance against pruning by rank or mass, and against merging.
+"""Simplification at equal counts: sampling by importance against pruning by rank or mass, merging, and least change.
 
 A dense population is trained once, or read from a PLY. Each choice reduces it to the same numbers of Gaussians, and all
 are then fine-tuned for the same number of iterations, without any event. A seed determines the samples and the order of
 views. Gaussians that dominate no pixel are no candidates, whatever the choice. Pruning by mass keeps the same as rank
-and only determines the number by itself; so its number is one of those that are measured, and both share one line.
+and only determines the number by itself; so its number is one of those that are measured, and both share one line. The
+choices weigh by importance (equation 12 of Mini-Splatting) but for the last, which keeps those without which the
+pictures would change most (:mod:`minisplat_ref.strategy.removal`).
 
 Chamfer distances are those of the centres that are kept, before fine-tuning: the mean distance to the nearest point of
 a cloud, and the mean distance from the cloud's points to the nearest centre, added. The clouds are the dense
@@ -11,7 +13,7 @@ population's centres and, where a synthetic scene knows them, the points that th
 """
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -41,14 +43,21 @@ from minisplat_ref.reporting import markdown_table
 from minisplat_ref.strategy import simplify
 from minisplat_ref.strategy.importance import collect_importance, indoor
 from minisplat_ref.strategy.ops import Edit, contiguous, n_rows
+from minisplat_ref.strategy.removal import collect_removal_costs
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Floats, Gaussians, Scene
 
-CHOICES = {"sampling": simplify.by_sampling, "rank, mass": simplify.by_rank, "merging": simplify.by_merging}
-COLORS = dict(zip(CHOICES, (BLUE, RED, "#e0a526"), strict=True))
+CHANGE = "least change"
+CHOICES = {
+    "sampling": simplify.by_sampling,
+    "rank, mass": simplify.by_rank,
+    "merging": simplify.by_merging,
+    CHANGE: simplify.by_rank,
+}
+COLORS = dict(zip(CHOICES, (BLUE, RED, "#e0a526", "#7a9a3a"), strict=True))
 GREY = "#8a8580"
 MASS = 0.99  # of both papers
 FINE_TUNING = "3dgs"  # its learning rates, from the first to the last
@@ -73,9 +82,11 @@ def run(args: argparse.Namespace) -> None:
         clouds = {"dense": dense.means, **true_surface(args.scene)}
         stats = collect_importance(dense, scene.train_views)
         importance = simplify.intersection_preserving(indoor(stats), stats.dominant_count)
+        changes = collect_removal_costs(dense, scene.train_views, background=scene.background).changes
+        weights = dict.fromkeys(CHOICES, importance) | {CHANGE: np.where(importance > 0, changes, 0)}
         counts = counts_to_keep(importance, args.fractions)
         runs = list(
-            measure(scene, dense, importance, counts, clouds, args.fine_tune, is_restart=args.restart, seeds=args.seeds)
+            measure(scene, dense, weights, counts, clouds, args.fine_tune, is_restart=args.restart, seeds=args.seeds)
         )
         settings = {
             "recipe": None if args.ply else args.recipe,
@@ -122,7 +133,7 @@ def counts_to_keep(importance: Floats, fractions: tuple[float, ...]) -> dict[str
 def measure(
     scene: Scene,
     dense: Gaussians,
-    importance: Floats,
+    weights: Mapping[str, Floats],
     counts: dict[str, int],
     clouds: dict[str, Floats],
     iterations: int,
@@ -137,8 +148,8 @@ def measure(
     scene : Scene
     dense : Gaussians
         Stays as it is.
-    importance : ndarray of shape (N,)
-        0 for those that may not be kept.
+    weights : dict of ndarrays of shape (N,)
+        What each choice weighs by; 0 for those that may not be kept.
     counts : dict
     clouds : dict of ndarrays of shape (P, 3)
         World frame.
@@ -157,7 +168,7 @@ def measure(
     jobs = [(kept, choice, seed) for kept in counts for choice in CHOICES for seed in seeds]
     for kept, choice, seed in tqdm(jobs, desc="fine-tunings", leave=False, disable=None):
         rng = np.random.default_rng(seed)
-        edit: Edit = CHOICES[choice](dense, importance, counts[kept], rng)
+        edit: Edit = CHOICES[choice](dense, weights[choice], counts[kept], rng)
         gaussians = edit.gaussians
         row = {
             "kept": kept,
