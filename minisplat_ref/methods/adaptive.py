@@ -26,6 +26,7 @@ from functools import partial
 
 import numpy as np
 
+from minisplat_ref.methods.adaptive_antialiasing import switch_antialiasing_on
 from minisplat_ref.methods.adaptive_bands import cut_bands_when_cooling, grow_bands
 from minisplat_ref.methods.adaptive_exposure import hold_mean_exposure, log_gains, switch_exposure_on
 from minisplat_ref.methods.adaptive_pose import hold_mean_pose, switch_pose_on, turn_held_out
@@ -46,7 +47,7 @@ from minisplat_ref.training.state import Iteration, TrainState, apply_edit, begi
 from minisplat_ref.types import Floats
 
 MOST_ITERATIONS = 30_000
-LEAST_GAIN = 0.05  # dB of the squared error, for which a calibration of the photographs is worthwhile
+LEAST_GAIN = 0.1  # dB of the squared error, for which a calibration of the photographs is worthwhile
 LEAST_SKY_GAIN = 0.2  # dB, likewise, for a sky: larger, because the photographs share it and agree about it
 LEAST_MEASUREMENTS = 4  # to fit a line
 LEAST_VARIATION = 4 / 255  # of a band of the harmonics, out of 1
@@ -188,6 +189,7 @@ ADAPTIVE = GS._replace(
         At(100, partial(switch_sky_on, least_sky_gain=LEAST_SKY_GAIN)),
         At(600, partial(switch_exposure_on, least_exposure_gain=LEAST_GAIN)),
         At(600, partial(switch_pose_on, least_pose_gain=LEAST_GAIN)),
+        At(600, partial(switch_antialiasing_on, least_antialiasing_gain=LEAST_GAIN)),
         Every(100, turn_held_out, start=100),
         Every(100, measure_held_out, start=100),
         Every(100, partial(cool_when_little_is_gained, least_gain=0.3, least_step=800), start=100),

@@ -30,6 +30,7 @@ from minisplat_ref.training.pace import Decision
 from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Bools, Floats
 
+RIDGE = 1e-3  # of the mean square of a field over the halves: where next to nothing is drawn, x would be arbitrary
 DARK, BRIGHT = 0.05, 0.98  # brightness, out of 1, beyond which pixels say nothing about a gain: noise, saturation
 
 
@@ -43,9 +44,9 @@ class Half(NamedTuple):
     energy: float
     """``sum r^2``."""
 
-    def fitted(self) -> Floats:
-        """Return the least-squares x [K]; the one of least norm if there are several."""
-        return np.linalg.lstsq(self.normal, self.projected, rcond=1e-6)[0]
+    def fitted(self, ridge: float = 0.0) -> Floats:
+        """Return the x [K] that minimises ``|r - sum x_k b_k|^2 + ridge |x|^2``; of several that of least norm."""
+        return np.linalg.lstsq(self.normal + ridge * np.eye(len(self.normal)), self.projected, rcond=1e-6)[0]
 
     def left_by(self, x: Floats) -> float:
         """Return ``|r - sum x_k b_k|^2``."""
@@ -96,7 +97,8 @@ def halves_of(residual: Floats, fields: Floats, is_counted: Bools) -> tuple[Half
 
 def weigh(photographs: Sequence[tuple[Half, Half]]) -> Evidence:
     """Return the evidence from the halves of at least two photographs."""
-    fitted = np.array([[half.fitted() for half in pair] for pair in photographs])  # [V, 2, K]
+    ridge = RIDGE * float(np.mean([np.diag(half.normal).mean() for pair in photographs for half in pair]))
+    fitted = np.array([[half.fitted(ridge) for half in pair] for pair in photographs])  # [V, 2, K]
     common = fitted.mean(axis=(0, 1))
     gains = []
     for (left, right), (x_left, x_right) in zip(photographs, fitted, strict=True):
@@ -104,7 +106,7 @@ def weigh(photographs: Sequence[tuple[Half, Half]]) -> Evidence:
         after = left.left_by(x_right) + right.left_by(x_left)
         gains.append(10.0 * np.log10(before / after) if before > 0 and after > 0 else 0.0)
     error = np.std(gains, ddof=1) / np.sqrt(len(gains))
-    whole = np.array([whole_of(pair).fitted() for pair in photographs])  # [V, K]
+    whole = np.array([whole_of(pair).fitted(ridge) for pair in photographs])  # [V, K]
     return Evidence(float(np.mean(gains)), float(error), whole - whole.mean(axis=0))
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from minisplat_ref.methods.adaptive_evidence import BRIGHT, DARK, exposure_evidence, switch_on
 from minisplat_ref.rendering import Request
 from minisplat_ref.training.calibration import EXPOSURE, EXPOSURES, identity_exposures
+from minisplat_ref.training.compensation import with_compensation
 from minisplat_ref.training.pace import Decision, trained_ids
 from minisplat_ref.training.sky import with_sky
 from minisplat_ref.training.state import Iteration, TrainState
@@ -37,7 +38,7 @@ def log_gains(state: TrainState, iteration: Iteration, view_ids: Ints | list[int
         Median over the pixels of ln(photograph / rendering), for the mean of the colours; 0 where no pixel qualifies.
     """
     gains = np.zeros(len(view_ids))
-    renderer = with_sky(iteration.representation.renderer)
+    renderer = with_sky(with_compensation(iteration.representation.renderer))
     request = Request(iteration.scene.background, conventions=iteration.conventions, backend=iteration.backend)
     for k, index in enumerate(view_ids):
         view = iteration.scene.train_views[index].loaded()

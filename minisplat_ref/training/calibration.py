@@ -3,7 +3,8 @@
 Both are shared parameters of the model with one row per training view, and each has a renderer that wraps another one.
 A view that is not trained on (``view_id`` -1) has no row, and is rendered as if nothing were calibrated. Both are off
 unless a recipe or ``--set exposure=true``, ``--set pose=true`` switches them on. So is the sky
-(:mod:`minisplat_ref.training.sky`), which all views share, and which is drawn in every view: ``--set sky=true``.
+(:mod:`minisplat_ref.training.sky`), which all views share, and which is drawn in every view: ``--set sky=true``; and
+the compensation of opacities (:mod:`minisplat_ref.training.compensation`): ``--set antialiasing=true``.
 
 *Exposure*, from the 2024 update of 3DGS: the colours of view v pass through an affine map, ``c' = A_v c + b_v``, stored
 as E_v = [A_v | b_v], 3 x 4, which starts as the identity. The released code multiplies from the other side, so it
@@ -22,6 +23,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from minisplat_ref.rendering import Renderer, RenderGradient, Request
+from minisplat_ref.training.compensation import COMPENSATION, compensation, with_compensation
 from minisplat_ref.training.rates import LogLinear, Rates
 from minisplat_ref.training.sky import SKY, clear_sky, with_sky
 from minisplat_ref.types import Floats, Model, RenderOutput, View
@@ -36,7 +38,8 @@ class Calibration(NamedTuple):
     name: str
     """``--set NAME=true`` switches it on."""
     initial: Callable[[int], dict[str, Floats]]
-    """``initial(n_views)`` returns the initial shared parameters by name; they change no rendering."""
+    """``initial(n_views)`` returns the initial shared parameters by name; they change no rendering, but that of
+    ``antialiasing``, which says by being there that opacities are compensated."""
     wrap: Callable[[Renderer], Renderer]
     """Wraps the given renderer in one that applies them."""
     rates: Rates
@@ -276,4 +279,8 @@ POSE = Calibration(
 BACKDROP = Calibration("sky", clear_sky, with_sky, Rates({SKY: 1e-3}))
 """A sky, which all views share."""
 
-CALIBRATIONS = (BACKDROP, EXPOSURE, POSE)  # each wraps those before it: a photograph's exposure changes its sky too
+ANTIALIASING = Calibration("antialiasing", compensation, with_compensation, Rates({COMPENSATION: 0.0}))
+"""Compensated opacities, in all views."""
+
+# Each wraps those before it: a photograph's exposure changes its sky too.
+CALIBRATIONS = (ANTIALIASING, BACKDROP, EXPOSURE, POSE)

@@ -9,7 +9,7 @@
 :data:`DEPTH`               :mod:`.depth_types`: from which depth Gaussians begin anew
 :data:`EXPOSURE`            :mod:`.exposures`: exposures that were disturbed, found again
 :data:`POSE`                :mod:`.poses`: poses that were disturbed, found again
-:data:`DEFECTS`             :mod:`.defects`: wrong exposures and poses, found by ``adaptive`` where they are
+:data:`DEFECTS`             :mod:`.defects`: planted defects of photographs, found by ``adaptive`` where they are
 :data:`PRECISION`           :mod:`.precision`: a training in float64, float32, and with colours in float16
 ==========================  =====================================================================
 
@@ -215,14 +215,14 @@ def _add_defects_arguments(parser: argparse.ArgumentParser) -> None:
         type=listed(name),
         default=(),
         metavar="C,D",
-        help="clean, gains, poses, sky (default: all, sky of synthetic scenes alone)",
+        help="clean, gains, poses, sizes, sky (default: all, sky of synthetic scenes alone)",
     )
     parser.add_argument(
         "--asked",
         type=listed(name),
-        default=("sky", "exposure", "pose"),
+        default=("sky", "exposure", "pose", "antialiasing"),
         metavar="A,B",
-        help="train until it is decided about these alone (default: sky,exposure,pose)",
+        help="train until it is decided about these alone (default: all: sky,exposure,pose,antialiasing)",
     )
     parser.add_argument("--trials", type=integer(1), default=10, metavar="N", help="of each kind (default 10)")
 
@@ -289,7 +289,7 @@ POSE = Study(
 )
 DEFECTS = Study(
     name="defects",
-    summary="wrong exposures and poses: found where they are, and nowhere else",
+    summary="planted defects of photographs: found where they are, nowhere else",
     add_arguments=_add_defects_arguments,
     run=_run_of("defects"),
 )

@@ -163,6 +163,7 @@ RULES: Mapping[str, Callable[[Recipe], Recipe]] = {
     "prune by exact change": partial(with_pruning_by, action=prune_by_exact_change),
     "no exposures": lambda recipe: configured(recipe, least_exposure_gain=math.inf),
     "no poses": lambda recipe: configured(recipe, least_pose_gain=math.inf),
+    "no anti-aliasing": lambda recipe: configured(recipe, least_antialiasing_gain=math.inf),
 }
 
 SWEEP: Mapping[str, Callable[[Recipe], Recipe]] = {

@@ -4,22 +4,19 @@
 ``near cameras``     Gaussians that are near a training camera and cover much of its photograph are removed
 ``opacities``        a loss on the mean opacity, as 3DGS-MCMC has it
 ``scales``           a loss on the mean standard deviation, in units of the scene's extent, likewise
-``anti-aliasing``    opacities are compensated for what the low-pass of 0.3 px^2 adds to thin Gaussians
+``anti-aliasing``    opacities are compensated from the first iteration, whatever the photographs say
 ===================  ==================================================================================================
 """
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
 
 import numpy as np
 
-from minisplat_ref.rendering import Renderer, Request
 from minisplat_ref.strategy.ops import keep, n_rows
 from minisplat_ref.training.losses import Cotangents, LossTerm, Rendered
-from minisplat_ref.training.schedule import Every, Recipe
+from minisplat_ref.training.schedule import Every, Recipe, configured
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
-from minisplat_ref.types import Model, RenderOutput, View
 
 WEIGHT = 0.01  # of both losses, 3DGS-MCMC
 
@@ -67,17 +64,6 @@ def mean_scale(rendered: Rendered) -> tuple[float, Cotangents]:
     return float(relative.mean()), Cotangents(gaussians={"log_scales": relative / relative.size})
 
 
-def compensating(inner: Renderer) -> Renderer:
-    """Return a renderer with the compensated opacities of the core's conventions."""
-
-    def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
-        return inner.render(
-            model, view, request._replace(conventions=request.conventions._replace(is_antialiased=True))
-        )
-
-    return Renderer(f"{inner.name} with compensated opacities", render, inner.render_vjp, inner.channels)
-
-
 def with_near_check(recipe: Recipe) -> Recipe:
     """Return the recipe with :func:`remove_near_cameras`."""
     event = Every(100, partial(remove_near_cameras, nearness=0.25, part=0.05), start=100)
@@ -89,16 +75,10 @@ def with_term(recipe: Recipe, term: LossTerm) -> Recipe:
     return recipe._replace(losses=(*recipe.losses, term))
 
 
-def with_antialiasing(recipe: Recipe) -> Recipe:
-    """Return the recipe with compensated opacities."""
-    representation = recipe.representation
-    return recipe._replace(representation=representation._replace(renderer=compensating(representation.renderer)))
-
-
 CANDIDATES: Mapping[str, Callable[[Recipe], Recipe]] = {
     "adaptive": lambda recipe: recipe,
     "near cameras": with_near_check,
     "opacities": partial(with_term, term=LossTerm("mean_opacity", mean_opacity, WEIGHT)),
     "scales": partial(with_term, term=LossTerm("mean_scale", mean_scale, WEIGHT)),
-    "anti-aliasing": with_antialiasing,
+    "anti-aliasing": lambda recipe: configured(recipe, antialiasing=True),
 }

@@ -1,13 +1,14 @@
 """Planted defects: whether ``adaptive`` finds them, and none where there are none.
 
 Photographs of a scene are disturbed in a known way, differently in every trial, and the scene is trained until the
-iteration in which ``adaptive`` has decided about a sky, exposures and poses. A trial records what was switched on. Its
-seed is used for the disturbance and the training.
+iteration in which ``adaptive`` has decided about a sky, exposures, poses and anti-aliasing. A trial records what was
+switched on. Its seed is used for the disturbance and the training.
 
 =========  ========================================================================================================
 ``clean``  the scene as it is; a real one may have defects of its own
 ``gains``  each photograph is multiplied by a gain of its own, from 0.9 to 1.1
 ``poses``  each camera is turned about an axis of its own, across its own, so that its image moves by half a pixel
+``sizes``  each photograph has the half width and height, or not, by chance
 ``sky``    what is higher than 1.2 m becomes sky: two random colours, from the horizon to the zenith (synthetic scenes)
 =========  ========================================================================================================
 """
@@ -37,12 +38,14 @@ from minisplat_ref.experiments.studies.front import (
     write,
 )
 from minisplat_ref.experiments.studies.poses import moved
+from minisplat_ref.io.scene import half_size
 from minisplat_ref.methods import adaptive
+from minisplat_ref.methods.adaptive_antialiasing import switch_antialiasing_on
 from minisplat_ref.methods.adaptive_exposure import switch_exposure_on
 from minisplat_ref.methods.adaptive_pose import switch_pose_on
 from minisplat_ref.methods.adaptive_sky import switch_sky_on
 from minisplat_ref.reporting import markdown_table
-from minisplat_ref.training.calibration import BACKDROP, EXPOSURE, POSE
+from minisplat_ref.training.calibration import ANTIALIASING, BACKDROP, EXPOSURE, POSE
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import Action, firing_steps
 from minisplat_ref.training.sky import unit_rays
@@ -51,13 +54,14 @@ from minisplat_ref.types import Floats, Scene, View
 
 LARGEST_GAIN = 0.1
 PIXELS = 0.5
-COLORS = {"sky": "#7a9a3a", "exposure": BLUE, "pose": RED}
-HEIGHT = 0.25  # of a bar
+COLORS = {"sky": "#7a9a3a", "exposure": BLUE, "pose": RED, "antialiasing": "#c98a2b"}
+HEIGHT = 0.2  # of a bar
 CUT = 1.2  # metres
 SWITCHES: Mapping[str, Action] = {
     BACKDROP.name: switch_sky_on,
     EXPOSURE.name: switch_exposure_on,
     POSE.name: switch_pose_on,
+    ANTIALIASING.name: switch_antialiasing_on,
 }
 
 
@@ -86,6 +90,12 @@ def with_turned_cameras(scene: Scene, rng: np.random.Generator) -> Scene:
     for view, angle in zip(scene.train_views, rng.uniform(0, 2 * np.pi, len(scene.train_views)), strict=True):
         w = PIXELS * np.array([np.sin(angle) / view.camera.fy, np.cos(angle) / view.camera.fx, 0.0])
         views.append(view._replace(camera=moved(view.camera, w, np.zeros(3))))
+    return scene._replace(train_views=tuple(views))
+
+
+def with_two_sizes(scene: Scene, rng: np.random.Generator) -> Scene:
+    """Return the scene with about half of the training photographs at half the width and height."""
+    views = (half_size(view) if rng.random() < 0.5 else view for view in scene.train_views)
     return scene._replace(train_views=tuple(views))
 
 
@@ -132,6 +142,7 @@ CONDITIONS: Mapping[str, Callable[[Scene, np.random.Generator], Scene]] = {
     "clean": clean,
     "gains": with_gains,
     "poses": with_turned_cameras,
+    "sizes": with_two_sizes,
     "sky": under_a_sky,
 }
 

@@ -1,0 +1,42 @@
+"""Compensated opacities: photographs of different resolution of the same things.
+
+A rasteriser adds a low-pass of 0.3 px^2 to every footprint, so that none falls between two pixels. A Gaussian that is
+thin in a photograph is then drawn larger, and therefore too strong: the more so, the fewer pixels the photograph has
+for it. The compensation of gsplat and Mip-Splatting (Yu et al. 2024, its 2D filter) multiplies the opacity by what the
+low-pass has added::
+
+    o' = o sqrt(det S / det(S + 0.3 I))        S: covariance of the footprint, px^2
+
+so that a photograph of half the size shows the same scene at half the size. The core's conventions have it
+(``is_antialiased``). Here it is a property of the model: who has trained with it must be drawn with it. The shared
+parameter ``compensation`` [1] says so by being there; it is not trained, and its value does not matter. A PLY file has
+no place for it: other viewers draw thin Gaussians a little too strong, unless they can be told.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from minisplat_ref.rendering import Renderer, Request
+from minisplat_ref.types import Floats, Model, RenderOutput, View
+
+COMPENSATION = "compensation"  # name of the shared parameter
+
+
+def compensation(n_views: int) -> dict[str, Floats]:
+    """Return the parameter that says that opacities are compensated; ``n_views`` does not matter."""
+    return {COMPENSATION: np.ones(1, np.float32)}
+
+
+def with_compensation(inner: Renderer) -> Renderer:
+    """Return a renderer that compensates opacities if the model asks for it."""
+
+    def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
+        return inner.render(model, view, compensated(request) if COMPENSATION in model.shared else request)
+
+    return Renderer(f"{inner.name} with compensation", render, inner.render_vjp, inner.channels)
+
+
+def compensated(request: Request) -> Request:
+    """Return the request with compensated opacities."""
+    return request._replace(conventions=request.conventions._replace(is_antialiased=True))
