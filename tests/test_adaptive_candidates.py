@@ -7,17 +7,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import make_camera, make_gaussians
 from tolerances import CLOSED_FORM, GRADIENT_REL
 
-from minisplat_ref.backends import REFERENCE
-from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.experiments.studies.adaptive_candidates import (
     CANDIDATES,
-    compensating,
     mean_opacity,
     mean_scale,
     remove_near_cameras,
 )
 from minisplat_ref.methods.adaptive import ADAPTIVE
-from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.losses import Rendered
 from minisplat_ref.training.state import TrainState
@@ -63,15 +59,6 @@ def test_mean_scale_by_hand(rng):
     gaussians = make_gaussians(rng, 2)._replace(log_scales=np.log([[1.0, 2.0, 3.0], [4.0, 5.0, 9.0]]))
     value, _ = mean_scale(Rendered(None, {}, None, scene_with(make_camera(rng=rng)), Model(gaussians), 1, None))
     assert value == pytest.approx(4.0 / 2.0, rel=CLOSED_FORM)
-
-
-def test_compensation_is_that_of_the_conventions(rng):
-    model, view = Model(make_gaussians(rng, 12)), view_from(make_camera(rng=rng))
-    request = Request(backend=REFERENCE)
-    image = compensating(SPLATTING).render(model, view, request)[0].image
-    expected = request._replace(conventions=GSPLAT_MAIN._replace(is_antialiased=True))
-    assert_array_equal(image, SPLATTING.render(model, view, expected)[0].image)
-    assert np.abs(image - SPLATTING.render(model, view, request)[0].image).max() > 1e-3
 
 
 def test_each_candidate_is_adaptive_and_one_rule_more():

@@ -76,6 +76,15 @@ def test_noise_is_no_evidence_and_neither_is_what_all_have_in_common():
         assert not weigh(photographs_of(np.full(12, 3.0), 1.0, rng)).is_above(0.0)
 
 
+def test_where_next_to_nothing_is_drawn_no_amount_is_read_from_noise():
+    """A half whose field is a thousandth of the others' would say x = 1000 without a ridge."""
+    rng = np.random.default_rng(0)
+    photographs = photographs_of(np.zeros(12), 0.1, rng)
+    faint = halves_of(np.ones((8, 8, 3)), np.full((1, 8, 8, 3), 1e-3), np.ones((8, 8), bool))
+    evidence = weigh([*photographs, faint])
+    assert np.abs(evidence.fitted).max() < 2.0 and evidence.gain < 0.05
+
+
 def test_one_standard_error_and_the_least_gain():
     assert Evidence(0.3, 0.2, np.zeros((2, 1))).is_above(0.05)
     assert not Evidence(0.2, 0.2, np.zeros((2, 1))).is_above(0.05)

@@ -33,18 +33,26 @@ def test_cameras_are_turned_by_half_a_pixel(scene):
         np.testing.assert_allclose(moved.center, camera.center, atol=1e-12)
 
 
+def test_about_half_of_the_photographs_are_halved(scene):
+    disturbed = defects.with_two_sizes(scene, np.random.default_rng(0))
+    sizes = [view.image.shape[:2] for view in disturbed.train_views]
+    assert set(sizes) == {(30, 40), (15, 20)} and [view.camera.width for view in disturbed.train_views] == [
+        width for _, width in sizes
+    ]
+
+
 def test_command(tmp_path, capsys):
     options = ["--views", "9", "--width", "40", "--height", "30", "--supersampling", "1", "--points", "150"]
     assert main(["synthetic", "room", "--out", str(tmp_path / "room"), *options]) == 0
     command = ["study", "defects", str(tmp_path / "room"), "--trials", "1", "--out", str(tmp_path / "out")]
     assert main(command) == 0
     result = json.loads((tmp_path / "out" / "result.json").read_text())
-    assert [run["condition"] for run in result["runs"]] == ["clean", "gains", "poses"]
+    assert [run["condition"] for run in result["runs"]] == ["clean", "gains", "poses", "sizes"]
     for run in result["runs"]:
         row = result["summary"][run["condition"]]
-        assert row == {"trials": 1, **{what: int(what in run["switched_on"]) for what in ("sky", "exposure", "pose")}}
+        assert row == {"trials": 1, **{what: int(what in run["switched_on"]) for what in defects.SWITCHES}}
         del run["evidence"]["switch_sky_on"]
-        assert all("explain" in note for note in run["evidence"].values()) and len(run["evidence"]) == 2
+        assert all("explain" in note for note in run["evidence"].values()) and len(run["evidence"]) == 3
     printed = capsys.readouterr().out
     assert f"after {defects.decision_step(['pose'])} iterations" in printed and "| poses " in printed
 

@@ -9,10 +9,11 @@ r = photograph - rendering by a few fields b_k, ``r = sum_k x_k b_k``:
 
 The x of a photograph are fitted to its left half by least squares and judged on its right half, and vice versa. Noise
 and what the scene has not learned yet differ from half to half, and worsen the other half; an exposure and a pose are
-the same in both, and improve it. The mean x of all photographs belongs to the scene and not to them, and enters both
-sides of the comparison:
+the same in both, and improve it. The x that explains all photographs together best belongs to the scene and not to
+them; it is what the comparison starts from:
 
-    gain of a photograph = 10 log10 (sum over halves |r - mean x b|^2 / sum over halves |r - (x of the other half) b|^2)
+    gain of a photograph = 10 log10 (before / after)
+    before = sum over halves |r - common x b|^2,   after = sum over halves |r - (x of the other half) b|^2
 
 It is in decibels of the squared error. It supports the calibration if its mean over the photographs is above both a
 least gain and its standard error. One suffices: gains differ much between photographs, and there are few of these.
@@ -97,23 +98,24 @@ def halves_of(residual: Floats, fields: Floats, is_counted: Bools) -> tuple[Half
 
 def weigh(photographs: Sequence[tuple[Half, Half]]) -> Evidence:
     """Return the evidence from the halves of at least two photographs."""
-    ridge = RIDGE * float(np.mean([np.diag(half.normal).mean() for pair in photographs for half in pair]))
+    everything = together([half for pair in photographs for half in pair])
+    ridge = RIDGE * float(np.diag(everything.normal).mean()) / (2 * len(photographs))
     fitted = np.array([[half.fitted(ridge) for half in pair] for pair in photographs])  # [V, 2, K]
-    common = fitted.mean(axis=(0, 1))
+    common = everything.fitted(ridge)
     gains = []
     for (left, right), (x_left, x_right) in zip(photographs, fitted, strict=True):
         before = left.left_by(common) + right.left_by(common)
         after = left.left_by(x_right) + right.left_by(x_left)
         gains.append(10.0 * np.log10(before / after) if before > 0 and after > 0 else 0.0)
     error = np.std(gains, ddof=1) / np.sqrt(len(gains))
-    whole = np.array([whole_of(pair).fitted(ridge) for pair in photographs])  # [V, K]
+    whole = np.array([together(pair).fitted(ridge) for pair in photographs])  # [V, K]
     return Evidence(float(np.mean(gains)), float(error), whole - whole.mean(axis=0))
 
 
-def whole_of(pair: tuple[Half, Half]) -> Half:
-    """Return both halves together."""
-    left, right = pair
-    return Half(left.normal + right.normal, left.projected + right.projected, left.energy + right.energy)
+def together(halves: Sequence[Half]) -> Half:
+    """Return the sums over several halves."""
+    normals, projected, energies = zip(*halves, strict=True)
+    return Half(np.sum(normals, axis=0), np.sum(projected, axis=0), float(np.sum(energies)))
 
 
 def exposure_evidence(state: TrainState, iteration: Iteration, view_ids: Sequence[int]) -> Evidence:
@@ -133,7 +135,7 @@ def pose_evidence(state: TrainState, iteration: Iteration, view_ids: Sequence[in
 
 def displacements(state: TrainState, iteration: Iteration, view_ids: Sequence[int]) -> Floats:
     """Return the displacements (du, dv) [V, 2], pixels, of photographs against their renderings."""
-    return np.array([-whole_of(pair).fitted() for pair in _halves_beside_slopes(state, iteration, view_ids)])
+    return np.array([-together(pair).fitted() for pair in _halves_beside_slopes(state, iteration, view_ids)])
 
 
 def _halves_beside_slopes(
