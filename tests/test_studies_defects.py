@@ -54,7 +54,7 @@ def test_command(tmp_path, capsys):
         del run["evidence"]["switch_sky_on"]
         assert all("explain" in note for note in run["evidence"].values()) and len(run["evidence"]) == 3
     printed = capsys.readouterr().out
-    assert f"after {defects.decision_step(['pose'])} iterations" in printed and "| poses " in printed
+    assert f"after {defects.decision_step(list(defects.SWITCHES))} iterations" in printed and "| poses " in printed
 
 
 def test_sky_is_planted_above_the_cut():
