@@ -188,8 +188,8 @@ ADAPTIVE = GS._replace(
         During(hold_mean_pose),
         At(100, partial(switch_sky_on, least_sky_gain=LEAST_SKY_GAIN)),
         At(600, partial(switch_exposure_on, least_exposure_gain=LEAST_GAIN)),
-        At(600, partial(switch_pose_on, least_pose_gain=LEAST_GAIN)),
-        At(700, partial(switch_antialiasing_on, least_antialiasing_gain=LEAST_GAIN)),  # exposures are in force
+        At(650, partial(switch_antialiasing_on, least_antialiasing_gain=LEAST_GAIN)),
+        At(700, partial(switch_pose_on, least_pose_gain=LEAST_GAIN)),
         Every(100, turn_held_out, start=100),
         Every(100, measure_held_out, start=100),
         Every(100, partial(cool_when_little_is_gained, least_gain=0.3, least_step=800), start=100),
