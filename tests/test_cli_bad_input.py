@@ -194,7 +194,7 @@ def test_out_below_a_file(refused, tmp_path):
         (["--set", "exposure"], "'exposure' is not NAME=VALUE"),
         (["--set", "exposure=yes"], "exposure=yes is neither true nor false"),
         (["--set", "threshold=x"], "threshold=x is not a number"),
-        (["--set", "thresholds=1", *RECIPE], "no thresholds to set: choose from ceiling, "),
+        (["--set", "thresholds=1", *RECIPE], "no thresholds to set: choose from antialiasing, "),
         (["--extension", "none"], "extension 'none' does not exist: choose from "),
     ],
 )

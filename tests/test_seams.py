@@ -333,7 +333,7 @@ def test_text_becomes_a_value_of_the_present_type(name, text, value):
         ("metric", "underwater", "metric=underwater names no function: choose from indoor, outdoor"),
         ("metric", "none", "metric=none names no function"),
         ("choose", "merge_neighbours", "names no function: choose from by_merging, by_rank, by_sampling"),
-        ("nonsense", "1", "recipe mini-splatting has no nonsense to set: choose from area_fraction, .*threshold"),
+        ("nonsense", "1", "recipe mini-splatting has no nonsense to set: choose from antialiasing, .*threshold"),
     ],
 )
 def test_text_that_is_no_such_value_is_refused(name, text, message):
