@@ -27,15 +27,14 @@ from minisplat_ref.experiments.rate_distortion import (
     sizes,
     smallest_within,
 )
-from minisplat_ref.experiments.simplification import Target, decide, fine_tuned, fine_tuning, importance_of
+from minisplat_ref.experiments.simplification import Target, decide, fine_tuned, fine_tuning
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.io import load_ply, load_scene, save_ply
 from minisplat_ref.io.images import read_image
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
-from minisplat_ref.strategy.importance import collect_importance, indoor
+from minisplat_ref.strategy.importance import collect_importance
 from minisplat_ref.strategy.ops import take
-from minisplat_ref.strategy.removal import CHANGES, collect_removal_costs
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import held_out_ids
 
@@ -247,20 +246,20 @@ def test_same_bytes_twice(halved, run_folder, tmp_path):
         assert (again / name).read_bytes() == (halved / name).read_bytes(), name
 
 
-def test_without_fine_tuning_those_that_change_most_stay_as_they_are(run_folder, scene_folder, tmp_path):
+def test_without_fine_tuning_the_most_important_stay_as_they_are(run_folder, scene_folder, tmp_path):
     command = ["simplify", str(run_folder), "--out", str(tmp_path / "out"), "--budget", "60", "--fine-tune", "0"]
     assert main(command) == 0
     dense, scene = load_ply(run_folder / "point_cloud.ply"), load_scene(scene_folder, test_every=6)
-    changes = collect_removal_costs(dense, scene.train_views, background=scene.background).changes
-    rows = np.sort(np.argsort(-changes, kind="stable")[:60])
+    weights = collect_importance(dense, scene.train_views).blend_weight_sum
+    rows = np.sort(np.argsort(-weights, kind="stable")[:60])
     for ours, theirs in zip(load_ply(tmp_path / "out" / "point_cloud.ply"), take(dense, rows), strict=True):
         assert_array_equal(ours, theirs)
 
     # And the curve, from the beginning: ranked by the other views, measured on those that are held out.
     held = held_out_ids(len(scene.train_views), HOLD_OUT_EVERY)
     others = [view for k, view in enumerate(scene.train_views) if k not in held]
-    changes = collect_removal_costs(dense, others, background=scene.background).changes
-    kept = take(dense, np.sort(np.argsort(-changes, kind="stable")[:60]))
+    weights = collect_importance(dense, others).blend_weight_sum
+    kept = take(dense, np.sort(np.argsort(-weights, kind="stable")[:60]))
     views = [scene.train_views[k] for k in held]
     before, after = (
         [view.psnr for view in evaluate(g, views, background=scene.background).per_view] for g in (dense, kept)
@@ -392,21 +391,6 @@ def test_too_few_views_to_decide_by(tmp_path, refused):
     command = ["train", str(tmp_path / "scene"), "--out", str(tmp_path / "run"), "--iterations", "2"]
     assert main([*command, "--recipe", "3dgs-accel", "--test-every", "0"]) == 0
     assert "needs at least 4 training views, two of them to decide by, and scene" in refused(tmp_path / "run")
-
-
-def test_a_renderer_that_does_not_say_what_a_removal_changes(run_folder):
-    """Then blend weights rank."""
-    run = open_run(run_folder)
-
-    def render(model, view, request):
-        return run.recipe.renderer.render(model, view, request._replace(wants=request.wants - {CHANGES}))
-
-    silent = run.recipe.representation._replace(renderer=run.recipe.renderer._replace(render=render))
-    views = run.scene.train_views
-    weights = indoor(collect_importance(run.model, views))
-    assert_array_equal(importance_of(run._replace(recipe=run.recipe._replace(representation=silent)), views), weights)
-    changes = collect_removal_costs(run.model, views, background=run.scene.background).changes
-    assert_array_equal(importance_of(run, views), changes)
 
 
 @pytest.mark.parametrize("reason", ["", "its kernels collect none"])

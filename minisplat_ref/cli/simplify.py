@@ -13,10 +13,9 @@ if TYPE_CHECKING:
 FINE_TUNE = 300  # iterations at each size
 
 DESCRIPTION = """\
-Make a run smaller: keep the Gaussians without which its pictures would
-change most, fine-tune them, and measure at about ten sizes what is lost. Some
-training views are held out to decide by; the test views are measured once, at
-the end.
+Make a run smaller: keep its most important Gaussians, fine-tune them, and
+measure at about ten sizes what is lost. Some training views are held out to
+decide by; the test views are measured once, at the end.
 
   --max-drop dB   the smallest size that loses at most so much PSNR, with one
                   standard error on top

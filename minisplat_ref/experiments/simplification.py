@@ -1,11 +1,9 @@
 """``simplify``: a run made smaller after the fact, and how small it may be, measured on views that take no part.
 
-Candidates keep the Gaussians without which the pictures would change most (:mod:`minisplat_ref.strategy.removal`), at
-some ten sizes, and each is fine-tuned. A renderer that does not know these changes has them ranked by blend weight,
-summed over pixels and views (equation 12 of Mini-Splatting). Some *training* views decide
-(:func:`..training.pace.held_out_ids`): they count neither for the ranks nor for the fine-tuning while the sizes are
-measured. The test views stay sealed until the size has been chosen, and ranked and fine-tuned once more by all training
-views.
+Candidates keep the Gaussians of the largest blend weight, summed over pixels and views (equation 12 of Mini-Splatting),
+at some ten sizes, and each is fine-tuned. Some *training* views decide (:func:`..training.pace.held_out_ids`): they
+count neither for the importance nor for the fine-tuning while the sizes are measured. The test views stay sealed until
+the size has been chosen, and ranked and fine-tuned once more by all training views.
 
 Fine-tuning alone changes a run: it may go on learning, and it forgets what is peculiar to the held-out views, which it
 was trained on until then. So the drop of a size is not from the run, but from *all* its Gaussians, fine-tuned alike.
@@ -37,7 +35,6 @@ from minisplat_ref.experiments.rate_distortion import (
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.strategy.importance import collect_importance, indoor
 from minisplat_ref.strategy.ops import contiguous, n_rows, take
-from minisplat_ref.strategy.removal import collect_removal_costs
 from minisplat_ref.strategy.simplify import most_important
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import train
@@ -176,20 +173,13 @@ def fine_tuned(run: Run, rows: Ints, iterations: int, *, holds_out: bool, on_ste
     ).model
 
 
-def importance_of(run: Run, views: Sequence[View]) -> Floats:
-    """Return what the views' pictures would change without each of the run's Gaussians [N], or its blend weight."""
-    renderer, conventions, backend = run.recipe.renderer, run.conventions, run.backend
-    try:
-        return collect_removal_costs(
-            run.model,
-            views,
-            background=run.scene.background,
-            renderer=renderer,
-            conventions=conventions,
-            backend=backend,
-        ).changes
-    except InputError:  # the renderer does not say
-        return indoor(collect_importance(run.model, views, renderer=renderer, conventions=conventions, backend=backend))
+def blend_weights(run: Run, views: Sequence[View]) -> Floats:
+    """Return the importance [N] of the run's Gaussians: their blend weights, summed over the pixels of the views."""
+    return indoor(
+        collect_importance(
+            run.model, views, renderer=run.recipe.renderer, conventions=run.conventions, backend=run.backend
+        )
+    )
 
 
 def psnrs_of(run: Run, model: Model, views: Sequence[View]) -> tuple[float, ...]:
@@ -223,7 +213,7 @@ def decide(run: Run, target: Target, iterations: int) -> Decision:
     size = ply_size(run)
     limit = limit_of(target, size)
     n = n_rows(run.model.gaussians)
-    importance = importance_of(run, run.others)
+    importance = blend_weights(run, run.others)
     n_candidates = int(np.count_nonzero(importance))
     if n_candidates == 0:
         raise InputError(f"{run.folder}: no training view sees any Gaussian: train longer, or check the cameras")
@@ -272,7 +262,7 @@ def _chosen(points: Sequence[Point], target: Target, bend: Point, limit: int | N
 def finished(run: Run, n: int, iterations: int) -> Model:
     """Return the ``n`` most important Gaussians, ranked and fine-tuned by all training views; or all, if ``n`` are."""
     is_all = n == n_rows(run.model.gaussians)
-    rows = np.arange(n) if is_all else most_important(importance_of(run, run.scene.train_views), n)
+    rows = np.arange(n) if is_all else most_important(blend_weights(run, run.scene.train_views), n)
     name = f"fine-tuning {n:,} Gaussians"
     with tqdm(total=iterations, desc=name, leave=False, unit="it", dynamic_ncols=True, disable=None) as bar:
         return fine_tuned(run, rows, iterations, holds_out=False, on_step=bar.update)

@@ -21,10 +21,9 @@ N_BELOW = 3  # sizes below the chosen one on the enlarged axes
 LEAST_ZOOM = 0.1  # dB that the enlarged axis of drops shows at least
 
 CURVE_TEXT = """\
-Of each size the Gaussians were kept without which the pictures of the training views would change most (or, where the
-renderer does not say, those of the largest blend weight), and all were fine-tuned alike. The held-out training views
-took part in neither. Bars are one standard error of the paired differences between these views, so what makes one view
-harder than another is not in them."""
+Of each size the most important Gaussians were kept, by their blend weights in the training views, and fine-tuned alike.
+The held-out training views took part in neither. Bars are one standard error of the paired differences between these
+views, so what makes one view harder than another is not in them."""
 REFERENCE_TEXT = """\
 Fine-tuning alone changes a run: it may go on learning, and it forgets what is peculiar to the held-out views, which it
 was trained on until now. The drop is therefore measured against all Gaussians, fine-tuned in the same way."""
