@@ -226,7 +226,7 @@ class Request(NamedTuple):
     is_visible: Bools | None = None
     """[N] rows to draw; all by default."""
     behind: Floats | None = None
-    """[H, W, 3] light that a wrapping renderer adds where it comes through the model; ``removal_changes`` counts it."""
+    """[H, W, 3] light that a wrapping renderer adds where it comes through the model; the output's extras count it."""
     wants: frozenset[str] = frozenset()
     """``depth``: a channel with ``sum w z``. ``stats``: blend statistics. ``median_depth``. ``surface``, in the
     output's extras: where each pixel's ray meets its dominant Gaussian. ``dominant_depth``, there too: [H, W] depth of
@@ -267,11 +267,14 @@ def _render_model(model: Model, view: View, request: Request) -> tuple[RenderOut
         with_stats=bool(wants & _OF_STATS),
         with_median_depth="median_depth" in wants,
     )
-    extras = {name: extra(tape, output, request) for name, extra in _EXTRAS.items() if name in wants}
+    lit = output
+    if request.behind is not None:
+        lit = output._replace(image=output.image + (1 - output.alpha[..., None]) * request.behind)
+    extras = {name: extra(tape, lit) for name, extra in _EXTRAS.items() if name in wants}
     return output._replace(extras=extras), tape
 
 
-def _surface(tape: RenderTape, output: RenderOutput, request: Request) -> Any:
+def _surface(tape: RenderTape, output: RenderOutput) -> Any:
     """Return the densest point of the dominant Gaussian on each ray, a :class:`SurfacePoints`."""
     assert output.stats is not None
     means, quats, scales, _ = tape.splats.primitives
@@ -279,23 +282,21 @@ def _surface(tape: RenderTape, output: RenderOutput, request: Request) -> Any:
     return tape.splats.backend.surface_points(means, quats, scales, camera, output.stats.dominant_ids)
 
 
-def _dominant_depth(tape: RenderTape, output: RenderOutput, request: Request) -> Floats:
+def _dominant_depth(tape: RenderTape, output: RenderOutput) -> Floats:
     """Return the depth [H, W] of the dominant Gaussian's mean; 0 where nothing was hit."""
     assert output.stats is not None
     depths = np.append(tape.projection.depths, tape.projection.depths.dtype.type(0))  # [N + 1]: id -1 gets 0
     return depths[output.stats.dominant_ids]
 
 
-def _removal_changes(tape: RenderTape, output: RenderOutput, request: Request) -> Floats:
+def _removal_changes(tape: RenderTape, output: RenderOutput) -> Floats:
     """Return the squared change of the colours [N] without each Gaussian."""
     s = tape.splats
     assert not s.has_depth, "a channel of depths has another unit"
-    if request.behind is not None:
-        output = output._replace(image=output.image + (1 - output.alpha[..., None]) * request.behind)
     return s.backend.removal_changes(s.projection, s.channels, s.bins, s.conventions, output)
 
 
-_EXTRAS: dict[str, Callable[[RenderTape, RenderOutput, Request], Any]] = {
+_EXTRAS: dict[str, Callable[[RenderTape, RenderOutput], Any]] = {
     "surface": _surface,
     "dominant_depth": _dominant_depth,
     "removal_changes": _removal_changes,

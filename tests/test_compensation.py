@@ -86,12 +86,12 @@ def test_a_run_keeps_it(tmp_path, capsys):
 # The decision ---------------------------------------------------------------------------------------------------------
 
 
-def scene_of(truth, n_small):
-    """Photographs of the truth with compensated opacities, the first ``n_small`` of them at half the size."""
+def scene_of(truth, has_two_sizes):
+    """Photographs of the truth with compensated opacities; of two sizes, every second one has half the size."""
     rng, views = np.random.default_rng(1), []
     for i in range(N_VIEWS):
         view = View(f"view{i}", make_camera(48, 32, rng=rng), np.zeros((32, 48, 3), np.uint8), None, view_id=i)
-        view = half_size(view) if i % 2 and i // 2 < n_small else view
+        view = half_size(view) if has_two_sizes and i % 2 else view
         image = drawn(Model(truth, compensation(1)), view.camera)[0].image
         views.append(view._replace(image=np.round(255 * np.clip(image, 0, 1)).astype(np.uint8)))
     colors = np.full((len(truth.means), 3), 128, np.uint8)
@@ -105,7 +105,7 @@ def decided(truth, scene):
 
 
 def test_two_sizes_ask_for_it(truth):
-    scene = scene_of(truth, N_VIEWS)
+    scene = scene_of(truth, has_two_sizes=True)
     state, note = decided(truth, scene)
     assert "explain" in note and state.pace.switched_on == ("antialiasing",) and COMPENSATION in state.shared
     assert state.pace.decisions[0].gain > LEAST_GAIN
@@ -114,5 +114,5 @@ def test_two_sizes_ask_for_it(truth):
 
 
 def test_one_size_does_not(truth):
-    state, note = decided(truth, scene_of(truth, 0))
+    state, note = decided(truth, scene_of(truth, has_two_sizes=False))
     assert note.startswith("nothing done: amounts") and state.pace == Pace() and state.shared == {}

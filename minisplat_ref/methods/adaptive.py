@@ -17,7 +17,11 @@ the work, in pairs (tile, Gaussian), is the slope of a line through the measurem
 *Cool down.* When the slope falls below a threshold, rates fall and all training views are trained on
 (:mod:`minisplat_ref.training.pace`).
 
-*Prune.* Meanwhile what the photographs would hardly miss is removed in slices
+*Ask the photographs.* A sky, exposures, refined poses and compensated opacities are each switched on once, and only if
+one half of the photographs, or of each photograph, shows the other half what it gains by them
+(:mod:`minisplat_ref.methods.adaptive_sky`, :mod:`minisplat_ref.methods.adaptive_evidence`).
+
+*Prune.* While the rates fall, what the photographs would hardly miss is removed in slices
 (:mod:`minisplat_ref.methods.adaptive_prune`).
 """
 

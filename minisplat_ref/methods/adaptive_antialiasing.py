@@ -7,29 +7,28 @@ another x than the mean. Where some show them smaller, by their own size or from
 others less: then opacities are compensated from now on (:mod:`minisplat_ref.training.compensation`).
 """
 
-import numpy as np
-
-from minisplat_ref.methods.adaptive_evidence import Evidence, halves_of, switch_on, weigh
-from minisplat_ref.rendering import Request
+from minisplat_ref.methods.adaptive_evidence import (
+    Evidence,
+    drawn,
+    halves_of,
+    pairs,
+    plain_request,
+    switch_on,
+    weigh,
+)
 from minisplat_ref.training.calibration import ANTIALIASING
 from minisplat_ref.training.compensation import COMPENSATION, compensated, compensation
 from minisplat_ref.training.pace import Decision, trained_ids
 from minisplat_ref.training.state import Iteration, TrainState
-from minisplat_ref.types import Bools
 
 
 def antialiasing_evidence(state: TrainState, iteration: Iteration, view_ids: list[int]) -> Evidence:
     """Return the training views' evidence for individual amounts of compensation."""
-    request = Request(iteration.scene.background, conventions=iteration.conventions, backend=iteration.backend)
+    request = compensated(plain_request(iteration))
     photographs = []
-    for index in view_ids:
-        view = iteration.scene.train_views[index].loaded()
-        rendered, other = (
-            np.clip(iteration.renderer.render(state.model, view, asked)[0].image, 0.0, 1.0)
-            for asked in (request, compensated(request))
-        )
-        counted: Bools = np.ones(rendered.shape[:2], bool) if view.mask is None else view.mask
-        photographs.append(halves_of(view.image / np.float32(255.0) - rendered, (other - rendered)[None], counted))
+    for view, photograph, rendered, is_counted in pairs(state, iteration, view_ids):
+        field = drawn(state, iteration, view, request) - rendered
+        photographs.append(halves_of(photograph - rendered, field[None], is_counted))
     return weigh(photographs)
 
 

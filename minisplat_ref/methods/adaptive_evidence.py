@@ -29,7 +29,7 @@ from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.calibration import Calibration
 from minisplat_ref.training.pace import Decision
 from minisplat_ref.training.state import Iteration, TrainState
-from minisplat_ref.types import Bools, Floats
+from minisplat_ref.types import Bools, Floats, View
 
 RIDGE = 1e-3  # of the mean square of a field over the halves: where next to nothing is drawn, x would be arbitrary
 DARK, BRIGHT = 0.05, 0.98  # brightness, out of 1, beyond which pixels say nothing about a gain: noise, saturation
@@ -118,10 +118,42 @@ def together(halves: Sequence[Half]) -> Half:
     return Half(np.sum(normals, axis=0), np.sum(projected, axis=0), float(np.sum(energies)))
 
 
+class Pair(NamedTuple):
+    """A photograph and its rendering."""
+
+    view: View
+    photograph: Floats
+    """[H, W, 3] in [0, 1]."""
+    rendered: Floats
+    """[H, W, 3] in [0, 1]."""
+    is_counted: Bools
+    """[H, W]: pixels that are not masked."""
+
+
+def pairs(state: TrainState, iteration: Iteration, view_ids: Sequence[int]) -> Iterator[Pair]:
+    """Iterate over training views beside what the scene shows of them."""
+    request = plain_request(iteration)
+    for index in view_ids:
+        view = iteration.scene.train_views[index].loaded()
+        rendered = drawn(state, iteration, view, request)
+        is_counted: Bools = np.ones(rendered.shape[:2], bool) if view.mask is None else view.mask
+        yield Pair(view, view.image / np.float32(255.0), rendered, is_counted)
+
+
+def plain_request(iteration: Iteration) -> Request:
+    """Return a request for colours, in the conventions of the training."""
+    return Request(iteration.scene.background, conventions=iteration.conventions, backend=iteration.backend)
+
+
+def drawn(state: TrainState, iteration: Iteration, view: View, request: Request) -> Floats:
+    """Return the scene as it is, [H, W, 3] in [0, 1]."""
+    return np.clip(iteration.renderer.render(state.model, view, request)[0].image, 0.0, 1.0)
+
+
 def exposure_evidence(state: TrainState, iteration: Iteration, view_ids: Sequence[int]) -> Evidence:
     """Return the training views' evidence for individual gains."""
     photographs = []
-    for photograph, rendered, is_counted in _pairs(state, iteration, view_ids):
+    for _, photograph, rendered, is_counted in pairs(state, iteration, view_ids):
         seen, there = rendered.mean(axis=2), photograph.mean(axis=2)
         says = is_counted & (seen > DARK) & (there > DARK) & (there < BRIGHT)
         photographs.append(halves_of(photograph - rendered, rendered[None], says))
@@ -141,7 +173,7 @@ def displacements(state: TrainState, iteration: Iteration, view_ids: Sequence[in
 def _halves_beside_slopes(
     state: TrainState, iteration: Iteration, view_ids: Sequence[int]
 ) -> Iterator[tuple[Half, Half]]:
-    for photograph, rendered, is_counted in _pairs(state, iteration, view_ids):
+    for _, photograph, rendered, is_counted in pairs(state, iteration, view_ids):
         slopes = np.stack([np.gradient(rendered, axis=1), np.gradient(rendered, axis=0)])  # [2, H, W, 3] along u, v
         yield halves_of(photograph - rendered, slopes, is_counted)
 
@@ -165,13 +197,3 @@ def switch_on(state: TrainState, calibration: Calibration, parameters: dict[str,
     )
     pace = state.pace.decided(decision)
     state.pace = pace._replace(switched_on=(*pace.switched_on, calibration.name))
-
-
-def _pairs(state: TrainState, iteration: Iteration, view_ids: Sequence[int]) -> Iterator[tuple[Floats, Floats, Bools]]:
-    """Iterate over photograph [H, W, 3] and rendering in [0, 1], and which pixels [H, W] are not masked."""
-    request = Request(iteration.scene.background, conventions=iteration.conventions, backend=iteration.backend)
-    for index in view_ids:
-        view = iteration.scene.train_views[index].loaded()
-        rendered = np.clip(iteration.renderer.render(state.model, view, request)[0].image, 0.0, 1.0)
-        mask: Bools = np.ones(rendered.shape[:2], bool) if view.mask is None else view.mask
-        yield view.image / np.float32(255.0), rendered, mask

@@ -12,8 +12,7 @@ is therefore kept at the identity.
 
 import numpy as np
 
-from minisplat_ref.methods.adaptive_evidence import BRIGHT, DARK, exposure_evidence, switch_on
-from minisplat_ref.rendering import Request
+from minisplat_ref.methods.adaptive_evidence import BRIGHT, DARK, exposure_evidence, plain_request, switch_on
 from minisplat_ref.training.calibration import EXPOSURE, EXPOSURES, identity_exposures
 from minisplat_ref.training.compensation import with_compensation
 from minisplat_ref.training.pace import Decision, trained_ids
@@ -39,7 +38,7 @@ def log_gains(state: TrainState, iteration: Iteration, view_ids: Ints | list[int
     """
     gains = np.zeros(len(view_ids))
     renderer = with_sky(with_compensation(iteration.representation.renderer))
-    request = Request(iteration.scene.background, conventions=iteration.conventions, backend=iteration.backend)
+    request = plain_request(iteration)
     for k, index in enumerate(view_ids):
         view = iteration.scene.train_views[index].loaded()
         rendered = renderer.render(state.model, view, request)[0].image

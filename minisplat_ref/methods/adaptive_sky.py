@@ -14,7 +14,9 @@ sky.
 
     gain of a photograph = 10 log10 (|r - sum s_k b_k|^2 as it is / |r - sum s_k b_k|^2 without the large Gaussians)
 
-A wall that is all of one colour is no sky: its photographs disagree about the direction in which its edges lie.
+A wall that is all of one colour is no sky: its photographs disagree about the direction in which its edges lie. All
+photographs see one sky, so nearly all of them gain by whatever it explains; the mean gain has to exceed three standard
+errors, where a calibration that each photograph has for itself needs one.
 
 If the sky is better, only the largest of these Gaussians are removed, those that are larger than the path of the
 cameras itself. Others show a part of the scene besides, such as the far ground, and training takes the sky off them.
@@ -26,9 +28,8 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import SH_DEGREE_MAX
-from minisplat_ref.methods.adaptive_evidence import Evidence, switch_on
+from minisplat_ref.methods.adaptive_evidence import Evidence, plain_request, switch_on
 from minisplat_ref.reference.spherical_harmonics import sh_basis
-from minisplat_ref.rendering import Request
 from minisplat_ref.strategy.ops import keep
 from minisplat_ref.training.calibration import BACKDROP
 from minisplat_ref.training.pace import Decision, trained_ids
@@ -38,7 +39,7 @@ from minisplat_ref.types import Bools, Floats
 
 LARGE, HUGE = 0.25, 1.0  # of the scene's extent: standard deviation along the longest axis, to question and to remove
 RIDGE = 1e-3  # of the mean diagonal entry of the normal matrix: directions that no photograph shows get no large colour
-N_ERRORS = 3.0  # standard errors that the gain must exceed: photographs share a sky, so nearly all of them gain
+N_ERRORS = 3.0  # standard errors that the gain must exceed
 MOST_VIEWS = 24  # photographs that are looked at, evenly spread
 
 
@@ -105,12 +106,7 @@ def photographs_behind(
     state: TrainState, iteration: Iteration, view_ids: Sequence[int], is_drawn: Bools | None
 ) -> list[Behind]:
     """Return the sums of training views whose rendering has the Gaussians ``is_drawn`` [N]; None for all."""
-    request = Request(
-        iteration.scene.background,
-        conventions=iteration.conventions,
-        backend=iteration.backend,
-        is_visible=is_drawn,
-    )
+    request = plain_request(iteration)._replace(is_visible=is_drawn)
     photographs = []
     for index in view_ids:
         view = iteration.scene.train_views[index].loaded()

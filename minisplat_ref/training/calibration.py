@@ -1,10 +1,17 @@
-"""Exposure and pose of each photograph, trained along with the scene although neither is a property of the scene.
+"""What a training may add to the Gaussians: exposures, poses, a sky, compensated opacities.
 
-Both are shared parameters of the model with one row per training view, and each has a renderer that wraps another one.
-A view that is not trained on (``view_id`` -1) has no row, and is rendered as if nothing were calibrated. Both are off
-unless a recipe or ``--set exposure=true``, ``--set pose=true`` switches them on. So is the sky
-(:mod:`minisplat_ref.training.sky`), which all views share, and which is drawn in every view: ``--set sky=true``; and
-the compensation of opacities (:mod:`minisplat_ref.training.compensation`): ``--set antialiasing=true``.
+Each is a set of shared parameters of the model, and a renderer that applies them around another renderer. Each is off
+unless a recipe switches it on, or the user with ``--set NAME=true``:
+
+================  =======================================================================================
+``exposure``      colours of each photograph, here
+``pose``          place and direction of each camera, here
+``sky``           what lies behind everything: :mod:`minisplat_ref.training.sky`
+``antialiasing``  opacities for photographs of several sizes: :mod:`minisplat_ref.training.compensation`
+================  =======================================================================================
+
+The first two have a row for each training view. A view that is not trained on (``view_id`` -1) has none, and is drawn
+as if nothing were calibrated. The others belong to the scene, and are drawn in every view.
 
 *Exposure*, from the 2024 update of 3DGS: the colours of view v pass through an affine map, ``c' = A_v c + b_v``, stored
 as E_v = [A_v | b_v], 3 x 4, which starts as the identity. The released code multiplies from the other side, so it
@@ -33,13 +40,12 @@ LEAST_ANGLE = 1e-4  # radians; below it a series replaces (a - sin a) / a^3, whi
 
 
 class Calibration(NamedTuple):
-    """Parameters of each training photograph, or of what lies behind all, and how they enter a rendering."""
+    """Shared parameters, and how they enter a rendering."""
 
     name: str
     """``--set NAME=true`` switches it on."""
     initial: Callable[[int], dict[str, Floats]]
-    """``initial(n_views)`` returns the initial shared parameters by name; they change no rendering, but that of
-    ``antialiasing``, which says by being there that opacities are compensated."""
+    """``initial(n_views)`` returns the initial shared parameters by name."""
     wrap: Callable[[Renderer], Renderer]
     """Wraps the given renderer in one that applies them."""
     rates: Rates

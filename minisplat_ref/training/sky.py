@@ -19,6 +19,7 @@ from minisplat_ref.constants import SH_DEGREE_MAX
 from minisplat_ref.reference.pinhole import pinhole_rays, with_principal_point
 from minisplat_ref.reference.spherical_harmonics import sh_basis, sh_basis_jacobian
 from minisplat_ref.rendering import Renderer, RenderGradient, Request
+from minisplat_ref.strategy.removal import CHANGES
 from minisplat_ref.types import Camera, Floats, Ints, Model, RenderOutput, View
 
 SKY = "sky"  # name of the shared parameter
@@ -111,7 +112,7 @@ def with_sky(inner: Renderer) -> Renderer:
         if SKY not in model.shared:
             return inner.render(model, view, request)
         camera = with_principal_point(view.camera, request.conventions)
-        if "removal_changes" in request.wants:
+        if CHANGES in request.wants:
             request = request._replace(behind=sky_picture(camera, model.shared[SKY], model.gaussians.means.dtype))
         output, tape = inner.render(model, view, request)
         image, dtype = output.image.copy(), output.image.dtype  # the inner tape may refer to the original

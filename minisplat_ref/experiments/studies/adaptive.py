@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.studies.adaptive_candidates import CANDIDATES
-from minisplat_ref.experiments.studies.defects import multiplied, under_a_sky, with_turned_cameras
+from minisplat_ref.experiments.studies.defects import halved, multiplied, under_a_sky, with_turned_cameras
 from minisplat_ref.experiments.studies.front import (
     BLUE,
     RED,
@@ -39,7 +39,6 @@ from minisplat_ref.experiments.studies.front import (
     write,
 )
 from minisplat_ref.experiments.studies.pruning import prune_by_exact_change, prune_by_weight, with_pruning_by
-from minisplat_ref.io.scene import half_size
 from minisplat_ref.methods import adaptive, adaptive_bands, gaussian_splatting, get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.reporting import markdown_table
@@ -87,8 +86,7 @@ def planted_sky(scene: Scene) -> Scene:
 
 def two_sizes(scene: Scene) -> Scene:
     """Return the scene with every second training photograph at half the width and height."""
-    views = (half_size(view) if k % 2 else view for k, view in enumerate(scene.train_views))
-    return scene._replace(train_views=tuple(views))
+    return halved(scene, np.arange(len(scene.train_views)) % 2 == 1)
 
 
 CONDITIONS: Mapping[str, Callable[[Scene], Scene]] = {

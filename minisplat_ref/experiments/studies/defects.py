@@ -50,7 +50,7 @@ from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import Action, firing_steps
 from minisplat_ref.training.sky import unit_rays
 from minisplat_ref.training.state import StepReport
-from minisplat_ref.types import Floats, Scene, View
+from minisplat_ref.types import Bools, Floats, Scene, View
 
 LARGEST_GAIN = 0.1
 PIXELS = 0.5
@@ -95,7 +95,12 @@ def with_turned_cameras(scene: Scene, rng: np.random.Generator) -> Scene:
 
 def with_two_sizes(scene: Scene, rng: np.random.Generator) -> Scene:
     """Return the scene with about half of the training photographs at half the width and height."""
-    views = (half_size(view) if rng.random() < 0.5 else view for view in scene.train_views)
+    return halved(scene, rng.random(len(scene.train_views)) < 0.5)
+
+
+def halved(scene: Scene, is_halved: Bools) -> Scene:
+    """Return the scene with the training photographs ``is_halved`` [V] at half the width and height."""
+    views = (half_size(view) if small else view for view, small in zip(scene.train_views, is_halved, strict=True))
     return scene._replace(train_views=tuple(views))
 
 
