@@ -5,6 +5,7 @@ import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -92,6 +93,18 @@ def test_kernels_of_an_extension_are_hashed_with_its_sources():
                 assert kept.name.startswith(f"{name.replace('-', '_')}-") and kept.parent.name == _jit.source_hash()
                 n_kernels += 1
     assert n_kernels > 0
+
+
+def test_shared_kernels_are_hashed_with_what_they_may_call(tmp_path, monkeypatch):
+    name = "minisplat_ref.extensions.shared_kernels"
+    module = ModuleType(name)
+    module.__file__ = str(tmp_path / "shared_kernels.py")
+    monkeypatch.setitem(sys.modules, name, module)
+    for file in ("shared_kernels.py", "shared_formulas.py"):
+        (tmp_path / file).write_text("")
+    before = _jit._folder_of_module(name)
+    (tmp_path / "shared_formulas.py").write_text("ONE = 1\n")
+    assert _jit._folder_of_module(name) != before
 
 
 def test_numba_notices_another_processor_and_another_numba(tmp_path, monkeypatch):

@@ -16,6 +16,7 @@ from minisplat_ref.extensions import extension as extension_module
 from minisplat_ref.extensions.compression import levels, msz, spz
 from minisplat_ref.extensions.extension import Extension, find_format, load_extension
 from minisplat_ref.extensions.shared_morton import morton_order
+from minisplat_ref.training.calibration import EXPOSURES
 
 LEVELS = range(levels.N_LEVELS)
 
@@ -126,6 +127,19 @@ def test_sizes_and_drops_on_the_command_line(run, tmp_path, one_line, capfd):
     convert(ply, tmp_path / "d.msz", "--max-drop", "0.05", "--scene", run.parent / "nook")
     needs = one_line("convert", ply, tmp_path / "e.msz", "--max-drop", "0.05")
     assert "is no run: give --scene PATH" in needs
+
+
+def test_a_drop_is_measured_with_the_exposures_of_the_run(run):
+    source = conversion.open_source(run)
+    exposures = np.tile(np.eye(3, 4, dtype=np.float32), (6, 1, 1))
+    exposures[:, :, 3] = 0.5
+    exposed = source._replace(model=source.model._replace(shared={EXPOSURES: exposures}))
+
+    def psnr_of(given, scene=None):
+        return conversion.judge_of(given, run, scene, None).psnr_of(given.model.gaussians)
+
+    assert psnr_of(exposed) < psnr_of(source) - 3
+    assert psnr_of(exposed, run.parent / "nook") == psnr_of(source)  # other photographs: they have no exposures
 
 
 def test_what_convert_refuses(run, tmp_path, one_line):

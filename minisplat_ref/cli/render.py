@@ -4,6 +4,7 @@ import argparse
 import math
 import re
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -106,10 +107,12 @@ def run(args: argparse.Namespace) -> int:
     if args.film is not None:
         check_film(args.film, [(view.camera.width, view.camera.height) for view in views])
     names = file_names([view.name for view in views])
-    _make_room(out, names)
     wants = frozenset({"depth"} if args.depth else ())
-    for name, view in zip(names, tqdm(views, desc="rendering", unit="view", disable=None), strict=True):
-        output = source.trained.render(view_from(view.camera, time=view.time), wants)
+    outputs = (source.trained.render(view_from(view.camera, time=view.time), wants) for view in views)
+    first = next(outputs)  # what cannot be drawn is refused before the folder is touched
+    _make_room(out, names)
+    drawn = tqdm(chain([first], outputs), desc="rendering", total=len(views), unit="view", disable=None)
+    for name, output in zip(names, drawn, strict=True):
         write_image(out / f"{name}.png", output.image[..., :3])
         if args.depth:
             depth = expected_depth(output.image[..., 3], output.alpha)  # [H, W]

@@ -17,7 +17,7 @@ from minisplat_ref.io.formats import Format, read_content
 from minisplat_ref.io.ply import further_properties
 from minisplat_ref.training.compensation import with_compensation
 from minisplat_ref.training.sky import with_sky
-from minisplat_ref.types import Gaussians, Model
+from minisplat_ref.types import Gaussians, Model, numbered
 
 MOST_VIEWS = 24
 NO_DROP = 1e-5  # dB: files have another order, in which Gaussians of equal depth are drawn; 2e-7 has been seen
@@ -215,7 +215,7 @@ def judge_of(source: Source, path: Path, scene: Path | None, downscale: int | No
     Parameters
     ----------
     source : Source
-        Its shared parameters and its renderer are used, too.
+        Its shared parameters and its renderer are used, too; exposures and poses with the run's own photographs only.
     path : Path
         Where it comes from; if that is a run, its settings and photographs are taken.
     scene : Path, optional
@@ -230,11 +230,13 @@ def judge_of(source: Source, path: Path, scene: Path | None, downscale: int | No
     """
     from minisplat_ref.backends import get_backend
     from minisplat_ref.constants import GSPLAT_MAIN, PROFILES
+    from minisplat_ref.experiments.scoring import renderer_of
     from minisplat_ref.experiments.settings import load, load_photographs
     from minisplat_ref.io import load_scene
     from minisplat_ref.metrics import evaluate
 
     profile, backend = GSPLAT_MAIN.name, "cpu"
+    renderer = with_sky(with_compensation(source.owner.representation.renderer))
     if path.is_dir():
         settings = load(path)
         photographs = load_photographs(
@@ -244,6 +246,9 @@ def judge_of(source: Source, path: Path, scene: Path | None, downscale: int | No
             )
         )
         profile, backend = settings.profile, settings.backend
+        if scene is None:  # its own photographs, for which it may have exposures and poses
+            renderer = renderer_of(settings, source.model)
+            photographs = photographs._replace(train_views=numbered(photographs.train_views))
     elif scene is not None:
         photographs = load_scene(scene, downscale=downscale or 1, undistort=True)
     else:
@@ -257,7 +262,7 @@ def judge_of(source: Source, path: Path, scene: Path | None, downscale: int | No
             source.model._replace(gaussians=gaussians),
             views,
             background=photographs.background,
-            renderer=with_sky(with_compensation(source.owner.representation.renderer)),
+            renderer=renderer,
             backend=get_backend(backend),
             conventions=PROFILES[profile],
         ).psnr

@@ -146,7 +146,8 @@ def _modules_of(value: Any) -> set[str]:
 def _folder_of_module(module: str) -> str:
     """Return the name of the folder for kernels with functions of a module outside the core: a hash of its sources.
 
-    It covers all files of a package, and the files ``shared_*.py`` beside an extension.
+    It covers all files of a package. Files ``shared_*.py`` may call each other: it covers all of them for one of them,
+    and for an extension, which is beside them.
 
     Raises
     ------
@@ -160,6 +161,8 @@ def _folder_of_module(module: str) -> str:
     if file.name == "__init__.py":
         sources = {*file.parent.rglob("*.py"), *file.parent.parent.glob("shared_*.py")}
         file = file.parent
+    elif file.name.startswith("shared_"):
+        sources = {*file.parent.glob("shared_*.py")}
     return f"{module.rpartition('.')[2]}-{_hash_of(module, sources, file.parent)}"
 
 
