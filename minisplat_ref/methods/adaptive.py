@@ -172,17 +172,12 @@ def cool_when_little_is_gained(
     return why
 
 
-RAISED = 2.24  # Mini-Splatting2's rates in 3,000 iterations: 6^0.45 times those of 18,000, the square for the means
+RAISED = 2.24  # 6^0.45, as Mini-Splatting2's rates in a sixth of its iterations; for the means, too, not its square
 
 ADAPTIVE = GS._replace(
     name="adaptive",
     iterations=MOST_ITERATIONS,
-    learning_rates=Rates(
-        {
-            name: rate * (RAISED**2 if name == "means" else RAISED)
-            for name, rate in GS_ACCEL.learning_rates.at(0, extent=1.0).items()
-        }
-    ),
+    learning_rates=Rates({name: RAISED * rate for name, rate in GS_ACCEL.learning_rates.at(0, extent=1.0).items()}),
     adam=AdamRule(is_visible_only=True, has_bias_correction=True),
     sh_milestones=(2, 2, 2),  # of Gaussians without degrees of their own; grow_bands gives them these in the first one
     events=(
@@ -203,7 +198,7 @@ ADAPTIVE = GS._replace(
             start=100,
         ),
         Every(100, partial(prune_faint, least_opacity=0.005), start=100),
-        During(partial(prune_in_slices, least_views=2, least_slope=0.6, most_pruned=0.2)),
+        During(partial(prune_in_slices, least_views=2, least_slope=1.0, most_pruned=0.2)),
         During(partial(cut_bands_when_cooling, least_variation=LEAST_VARIATION)),
     ),
     least_views=5,

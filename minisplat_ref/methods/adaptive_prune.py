@@ -47,7 +47,7 @@ def prune_in_slices(
         Those that are visible in fewer views are removed before the first slice, however much they change there.
     least_slope : float
         Those stay whose removal raises the squared error by at least this many times what the count falls by, both
-        relative: 0.6 are 1.8 dB for each doubling, before the others learn to replace them.
+        relative: 1.0 is 3 dB for each doubling, before the others learn to replace them.
     most_pruned : float
         A slice is at most this fraction of the Gaussians.
     """
