@@ -221,7 +221,7 @@ for name, (psnrs, counts) in around.items():
 # $$ S_g = \sum_{\text{pixels}} q_g^2, \qquad q_g = \alpha_g \left( T_g c_g - \frac{B_g}{1 - \alpha_g} \right), $$
 #
 # where $B_g$ is what lies behind it. It stays if the relative change of the error, $S_g / \mathrm{SSE}$, is at least
-# 0.6 of the relative change $1 / N$ of the count. After each slice the others learn to replace what is gone. The right
+# the relative change $1 / N$ of the count. After each slice the others learn to replace what is gone. The right
 # panel and the lines below it show the cost in the test views, which nothing has used, and the gain of the cool-down.
 #
 # ## The gains of photographs
@@ -267,10 +267,10 @@ print(state.pace.decisions[0].why)
 print(", ".join(f"{name}: {value:.2f} of the true gain" for name, value in slopes.items()))
 
 # %% [markdown]
-# The measured gains follow the true ones only loosely (correlation 0.55), with far too small a spread, but that is
+# The measured gains follow the true ones only loosely (correlation 0.38), with far too small a spread, but that is
 # enough to detect them. With so few small photographs the scene has probably explained much of the gains itself, by
-# colours that depend on the direction and by Gaussians that only some cameras see. The exposures go on learning. The
-# undisturbed scene has no such decision in its log.
+# colours that depend on the direction and by Gaussians that only some cameras see. The exposures go on learning, and
+# soon follow better (0.70). The undisturbed scene has no such decision in its log.
 #
 # ## Play
 #
@@ -352,9 +352,11 @@ assert np.allclose(pair.means.mean(axis=0), alone.means[0])
 assert np.allclose(scales[:, 0] ** 2 + (OFFSET * one[0]) ** 2, one[0] ** 2)
 assert np.allclose((taus * scales[:, 0]).sum(), tau * one[0])
 assert 3 * np.abs(changes["two halves"]).max() < np.abs(changes["a clone"]).max()
-# The gains that are read off rise with the true ones, loosely and too little; the undisturbed scene decides nothing.
+# The gains that are read off rise with the true ones, too little and loosely, what is learned from them less loosely;
+# the undisturbed scene decides nothing.
 assert state.pace.decisions[0].what == "exposures" and EXPOSURES not in states["plain-wall"].shared
-assert np.corrcoef(truth[trained], read_off[trained])[0, 1] > 0.4
+among = np.corrcoef([truth[trained], read_off[trained], learned[trained]])
+assert 0 < among[0, 1] < among[0, 2] and among[0, 2] > 0.5
 assert 0.05 < slopes["read off"] < 0.5
 assert factors[: states["room"].pace.cooling_from] == [1.0] * states["room"].pace.cooling_from
 assert trained_ids(24, recipe.cooling, states["room"].pace) == list(range(24))

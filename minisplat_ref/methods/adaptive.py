@@ -146,6 +146,8 @@ def cool_when_little_is_gained(
 ) -> str | None:
     """Begin the cool-down when the held-out views gain less than ``least_gain`` for each doubling of the work.
 
+    What counts are the measurements since half of the work, and since a calibration was last switched on.
+
     Parameters
     ----------
     state, iteration
@@ -158,7 +160,8 @@ def cool_when_little_is_gained(
     pace = state.pace
     if iteration.cooling is None or pace.cooling_from is not None or iteration.step < least_step:
         return None
-    recent = [m for m in pace.measurements if 2 * m.n_pairs >= pace.n_pairs]
+    changed = max((decision.step for decision in pace.decisions), default=0)  # before, they are of another model
+    recent = [m for m in pace.measurements if 2 * m.n_pairs >= pace.n_pairs and m.step > changed]
     if len(recent) < LEAST_MEASUREMENTS:
         return None
     doublings = np.log2([m.n_pairs for m in recent])
