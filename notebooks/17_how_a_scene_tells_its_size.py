@@ -108,8 +108,8 @@ for name, log in logs.items():
 
 # %% [markdown]
 # Every hundred iterations `grow` halves the Gaussians whose screen gradient reaches a threshold, at most a fifth of
-# all. In the room more than a fifth is above it until the end; in the bare room it is less than a fifth from iteration
-# 600 on, and less at each event. In small photographs the limit is what counts, see `docs/measured/adaptive.md`.
+# all. In the room more than a fifth is above it until the end; in the bare room it is always less, and from iteration
+# 500 on less at each event. In small photographs the limit is what counts, see `docs/measured/adaptive.md`.
 #
 # | file | what it holds |
 # |---|---|

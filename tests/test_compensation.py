@@ -13,9 +13,12 @@ from minisplat_ref.backends import CPU
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.io.scene import half_size
+from minisplat_ref.methods import adaptive_exposure
 from minisplat_ref.methods.adaptive import LEAST_GAIN
 from minisplat_ref.methods.adaptive_antialiasing import switch_antialiasing_on
+from minisplat_ref.methods.adaptive_evidence import Evidence
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.training.calibration import EXPOSURES
 from minisplat_ref.training.compensation import COMPENSATION, compensation, with_compensation
 from minisplat_ref.training.pace import Pace
 from minisplat_ref.types import Gaussians, Model, Scene, View, view_from
@@ -111,6 +114,22 @@ def test_two_sizes_ask_for_it(truth):
     assert state.pace.decisions[0].gain > LEAST_GAIN
     again = switch_antialiasing_on(state, iteration_of(scene), least_antialiasing_gain=LEAST_GAIN)
     assert again == "nothing done: opacities are compensated"
+
+
+@pytest.mark.parametrize(
+    ("gain", "least_antialiasing_gain", "are_on"),
+    [(0.2, LEAST_GAIN, False), (0.2, np.inf, True), (20.0, LEAST_GAIN, True)],
+)
+def test_of_gains_and_compensation_what_explains_more(gain, least_antialiasing_gain, are_on, truth, monkeypatch):
+    found = Evidence(gain, 0.01, np.zeros((N_VIEWS, 1)))
+    monkeypatch.setattr(adaptive_exposure, "exposure_evidence", lambda *_: found)
+    least = {"least_exposure_gain": LEAST_GAIN, "least_antialiasing_gain": least_antialiasing_gain}
+    scene = scene_of(truth, has_two_sizes=True)
+    state = state_of(scene, truth._replace(opacity_logits=truth.opacity_logits - 1))
+    note = adaptive_exposure.switch_exposure_on(state, iteration_of(scene), **least)
+    assert ("compensation" not in note) == (EXPOSURES in state.shared) == are_on
+    note = switch_antialiasing_on(state, iteration_of(scene), least_antialiasing_gain=LEAST_GAIN)
+    assert (note == "nothing done: photographs have exposures") == (COMPENSATION not in state.shared) == are_on
 
 
 def test_one_size_does_not(truth):

@@ -189,7 +189,7 @@ ADAPTIVE = GS._replace(
         During(hold_mean_exposure),
         During(hold_mean_pose),
         At(100, partial(switch_sky_on, least_sky_gain=LEAST_SKY_GAIN)),
-        At(600, partial(switch_exposure_on, least_exposure_gain=LEAST_GAIN)),
+        At(600, partial(switch_exposure_on, least_exposure_gain=LEAST_GAIN, least_antialiasing_gain=LEAST_GAIN)),
         At(650, partial(switch_antialiasing_on, least_antialiasing_gain=LEAST_GAIN)),
         At(700, partial(switch_pose_on, least_pose_gain=LEAST_GAIN)),
         Every(100, turn_held_out, start=100),

@@ -1,9 +1,11 @@
 """Exposure of each photograph, which ``adaptive`` switches on where the photographs show that they need it.
 
 After a few hundred iterations the scene is a blur of the right brightness. If the gain of one half of a photograph
-explains the other half (:mod:`minisplat_ref.methods.adaptive_evidence`), the camera has changed its exposure. The
-photographs then get exposures (:mod:`minisplat_ref.training.calibration`) that begin with their gains, the medians of
-photograph / rendering over the pixels.
+explains the other half (:mod:`minisplat_ref.methods.adaptive_evidence`), the camera has changed its exposure, unless
+compensated opacities explain more of it (:mod:`minisplat_ref.methods.adaptive_antialiasing`), which change the
+brightness of photographs, too: one of the two is switched on. The photographs then get exposures
+(:mod:`minisplat_ref.training.calibration`) that begin with their gains, the medians of photograph / rendering over the
+pixels.
 
 Scene and exposures are determined up to a map that all photographs share, and which would drift: a scene twice as
 bright with half the exposures looks the same in all training views, and wrong in every other. The mean of the exposures
@@ -12,6 +14,7 @@ is therefore kept at the identity.
 
 import numpy as np
 
+from minisplat_ref.methods.adaptive_antialiasing import antialiasing_evidence
 from minisplat_ref.methods.adaptive_evidence import BRIGHT, DARK, exposure_evidence, plain_request, switch_on
 from minisplat_ref.training.calibration import EXPOSURE, EXPOSURES, identity_exposures
 from minisplat_ref.training.compensation import with_compensation
@@ -50,7 +53,9 @@ def log_gains(state: TrainState, iteration: Iteration, view_ids: Ints | list[int
     return gains
 
 
-def switch_exposure_on(state: TrainState, iteration: Iteration, *, least_exposure_gain: float) -> str | None:
+def switch_exposure_on(
+    state: TrainState, iteration: Iteration, *, least_exposure_gain: float, least_antialiasing_gain: float
+) -> str | None:
     """Give each photograph an exposure if halves of photographs explain each other by gains.
 
     Parameters
@@ -59,6 +64,8 @@ def switch_exposure_on(state: TrainState, iteration: Iteration, *, least_exposur
         As for every action.
     least_exposure_gain : float
         dB of the squared error that the photographs must gain on average, and more than the standard error.
+    least_antialiasing_gain : float
+        The same for compensated opacities. If these explain more, it is they that the photographs need.
     """
     if EXPOSURE.name in state.pace.switched_on or EXPOSURES in state.shared:
         return "nothing done: exposures are on"
@@ -68,6 +75,9 @@ def switch_exposure_on(state: TrainState, iteration: Iteration, *, least_exposur
     why = f"gains that spread by {evidence.spread:.3f} explain {evidence.gain:.2f} dB of the other halves"
     if not evidence.is_above(least_exposure_gain):
         return f"nothing done: {why}"
+    rival = antialiasing_evidence(state, iteration, ids)
+    if rival.gain > evidence.gain and rival.is_above(least_antialiasing_gain):
+        return f"nothing done: {why}, and amounts of compensation {rival.gain:.2f} dB"
     exposures, gains = identity_exposures(n_views), log_gains(state, iteration, ids)
     _begin_with(exposures[EXPOSURES], ids, gains - gains.mean())
     decision = Decision(iteration.step, "exposures", why, evidence.gain, evidence.standard_error)
