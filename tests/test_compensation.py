@@ -128,8 +128,6 @@ def test_of_gains_and_compensation_what_explains_more(gain, least_antialiasing_g
     state = state_of(scene, truth._replace(opacity_logits=truth.opacity_logits - 1))
     note = adaptive_exposure.switch_exposure_on(state, iteration_of(scene), **least)
     assert ("compensation" not in note) == (EXPOSURES in state.shared) == are_on
-    note = switch_antialiasing_on(state, iteration_of(scene), least_antialiasing_gain=LEAST_GAIN)
-    assert (note == "nothing done: photographs have exposures") == (COMPENSATION not in state.shared) == are_on
 
 
 def test_one_size_does_not(truth):

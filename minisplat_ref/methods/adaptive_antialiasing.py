@@ -4,8 +4,7 @@ What the compensation would do to a photograph is a field, b = compensated rende
 fitted to each half of each photograph and judged on the other (:mod:`minisplat_ref.methods.adaptive_evidence`). Where
 all photographs show things at the same size, the Gaussians have learned what the low-pass adds, and no photograph wants
 another x than the mean. Where some show them smaller, by their own size or from afar, those want more of it, and the
-others less: then opacities are compensated from now on (:mod:`minisplat_ref.training.compensation`), unless gains of
-the photographs have explained more (:mod:`minisplat_ref.methods.adaptive_exposure`).
+others less: then opacities are compensated from now on (:mod:`minisplat_ref.training.compensation`).
 """
 
 from minisplat_ref.methods.adaptive_evidence import (
@@ -17,7 +16,7 @@ from minisplat_ref.methods.adaptive_evidence import (
     switch_on,
     weigh,
 )
-from minisplat_ref.training.calibration import ANTIALIASING, EXPOSURES
+from minisplat_ref.training.calibration import ANTIALIASING
 from minisplat_ref.training.compensation import COMPENSATION, compensated, compensation
 from minisplat_ref.training.pace import Decision, trained_ids
 from minisplat_ref.training.state import Iteration, TrainState
@@ -45,8 +44,6 @@ def switch_antialiasing_on(state: TrainState, iteration: Iteration, *, least_ant
     """
     if COMPENSATION in state.shared or iteration.conventions.is_antialiased:
         return "nothing done: opacities are compensated"
-    if EXPOSURES in state.shared:
-        return "nothing done: photographs have exposures"
     n_views = len(iteration.scene.train_views)
     evidence = antialiasing_evidence(state, iteration, trained_ids(n_views, iteration.cooling, state.pace))
     why = f"amounts of compensation that spread by {evidence.spread:.2f} explain {evidence.gain:.2f} dB of other halves"

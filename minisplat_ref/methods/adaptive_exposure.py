@@ -2,10 +2,9 @@
 
 After a few hundred iterations the scene is a blur of the right brightness. If the gain of one half of a photograph
 explains the other half (:mod:`minisplat_ref.methods.adaptive_evidence`), the camera has changed its exposure, unless
-compensated opacities explain more of it (:mod:`minisplat_ref.methods.adaptive_antialiasing`), which change the
-brightness of photographs, too: one of the two is switched on. The photographs then get exposures
-(:mod:`minisplat_ref.training.calibration`) that begin with their gains, the medians of photograph / rendering over the
-pixels.
+compensated opacities explain more (:mod:`minisplat_ref.methods.adaptive_antialiasing`), which change the brightness of
+photographs, too. The photographs then get exposures (:mod:`minisplat_ref.training.calibration`) that begin with their
+gains, the medians of photograph / rendering over the pixels.
 
 Scene and exposures are determined up to a map that all photographs share, and which would drift: a scene twice as
 bright with half the exposures looks the same in all training views, and wrong in every other. The mean of the exposures
