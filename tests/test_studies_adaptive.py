@@ -38,6 +38,7 @@ def test_each_rule_is_taken_out():
     assert "grow" not in names["no growth"] and len(names["no growth"]) == len(names["adaptive"]) - 1
     assert [n.replace("clones_while_growing", "grow") for n in names["clones of 3DGS"]] == names["adaptive"]
     assert recipes["rates of 3DGS"].learning_rates.at(9, 1.0)["means"] == 1.6e-4
+    assert recipes["faster means"].learning_rates.at(9, 1.0)["means"] == pytest.approx(2.24**2 * 1.6e-4)
     assert recipes["no cool-down"].cooling.last_per_extent == 1.0
     assert recipes["all bands"].sh_milestones and len(names["all bands"]) == len(names["adaptive"]) - 2
     assert settings_of(recipes["no bands"])["views_per_coefficient"] == np.inf

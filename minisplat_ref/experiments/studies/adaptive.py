@@ -121,6 +121,12 @@ def with_published_rates(recipe: Recipe) -> Recipe:
     return recipe._replace(learning_rates=Rates(rates.at(0, 1.0), rates.per_extent))
 
 
+def with_faster_means(recipe: Recipe) -> Recipe:
+    """Return the recipe with the rate of the means raised by the square, as in short runs of other recipes."""
+    rates = recipe.learning_rates
+    return recipe._replace(learning_rates=rates.changed(means=adaptive.RAISED * rates.at(0, extent=1.0)["means"]))
+
+
 def without_cool_down(recipe: Recipe) -> Recipe:
     """Return the recipe with constant rates to the end."""
     assert recipe.cooling is not None
@@ -151,6 +157,7 @@ RULES: Mapping[str, Callable[[Recipe], Recipe]] = {
     "clones of 3DGS": with_clones,
     "largest gradients first": lambda recipe: configured(recipe, error_views=0),
     "rates of 3DGS": with_published_rates,
+    "faster means": with_faster_means,
     "no cool-down": without_cool_down,
     "all bands": with_all_bands,
     "no bands": lambda recipe: configured(recipe, views_per_coefficient=math.inf),
