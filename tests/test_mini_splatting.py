@@ -15,6 +15,7 @@ from minisplat_ref.methods import RECIPES, gaussian_splatting, mini_splatting, m
 from minisplat_ref.methods.mini_splatting import is_culling, measure_importance
 from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.strategy import depth_reinit, importance, simplify, visibility
+from minisplat_ref.strategy.initialization import from_points
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.loop import initial_state, load_state, save_state, train
 from minisplat_ref.training.schedule import At, Every, configured, scaled
@@ -305,6 +306,19 @@ def test_depth_is_given_the_settings_in_world_units(state, iteration, monkeypatc
     assert given["points_of"] is depth_reinit.centre_points and given["rng"] is state.rng
     assert given["n_points"] == 2 * n and 0 < given["n_left"] < n
     assert_array_equal(state.gaussians.means, np.eye(4, 3))
+
+
+def test_few_points_far_away_do_not_become_veils(state, iteration, monkeypatch, rng):
+    """Their neighbours are as far away as the cameras: without a limit they would reach them."""
+    points = np.vstack([rng.uniform(-0.1, 0.1, (50, 3)), 200.0 * np.eye(3)])
+    points_and_colors = points, np.zeros((53, 3), np.uint8)
+    monkeypatch.setattr(mini_splatting, "reinitial_points", lambda *_, **__: points_and_colors)
+    act = next(e.action for e in RECIPES["mini-splatting2"].events if "reinitialise_from_depth" in repr(e.action))
+    act(state, iteration)
+    before = np.exp(from_points(*points_and_colors, sh_degree=0).log_scales)
+    after = np.exp(state.gaussians.log_scales)
+    assert_array_equal(after[:50], before[:50])
+    assert (before[50:] > 100).all() and (after[50:] < 25).all()
 
 
 # Bad input ------------------------------------------------------------------------------------------------------------

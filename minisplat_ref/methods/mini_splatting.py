@@ -28,11 +28,12 @@ from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.rates import LogLinear, Rewind
 from minisplat_ref.training.schedule import BLEND_STATS, At, During, Every
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit, start_anew
-from minisplat_ref.types import Floats
+from minisplat_ref.types import Floats, Scene
 
 Metric = Callable[[ImportanceStats], Floats]
 """Maps the statistics of all training views to importance [N]: ``importance.indoor`` or ``importance.outdoor``."""
 
+LARGE = 0.1  # of the scene's extent, or of the distance: no Gaussian should be larger
 VISIBILITY_MASS = 0.99  # fraction of a view's blend weight that its visible Gaussians carry (Mini-Splatting2)
 
 
@@ -121,7 +122,8 @@ def reinitialise_from_depth(
     Their number is ``points_per_gaussian`` times that of the population. Points that other views see through, by more
     than ``depth_tolerance``, move out to ``backdrop_extents`` times the scene's extent. With ``drawn_mass``, only the
     Gaussians that carry this fraction of the importance are rendered for the depths (Mini-Splatting2); the number of
-    points is that of the population before.
+    points is that of the population before. No Gaussian is larger than :data:`LARGE` of its distance: few points that
+    have moved out are as far from each other as from the cameras, and would cover them.
     """
     n_points = round(points_per_gaussian * n_rows(state.gaussians))
     if drawn_mass is not None:
@@ -139,19 +141,25 @@ def reinitialise_from_depth(
         conventions=iteration.conventions,
         backend=iteration.backend,
     )
-    start_anew(state, iteration, from_points(points, colors, sh_degree=0))
+    gaussians = from_points(points, colors, sh_degree=0)
+    limits = np.log(size_limits(gaussians.means, iteration.scene, LARGE)).astype(gaussians.log_scales.dtype)
+    start_anew(state, iteration, gaussians._replace(log_scales=np.minimum(gaussians.log_scales, limits[:, None])))
 
 
-def prune_large_by_distance(state: TrainState, iteration: Iteration, *, size_fraction: float) -> None:
-    """Remove Gaussians larger than ``size_fraction`` of the scene's extent, or of their distance where that is larger.
+def size_limits(means: Floats, scene: Scene, size_fraction: float) -> Floats:
+    """Return the largest sizes [N], world units: a fraction of the scene's extent, or of the distance where larger.
 
     The distance is from the mean of the cameras. In 3DGS the limit is the same everywhere, so that distant things, such
     as the sky, could not be covered.
     """
-    center = np.mean([view.camera.center for view in iteration.scene.train_views], axis=0)  # [3]
-    distances = np.linalg.norm(state.gaussians.means - center, axis=1)  # [N]
-    size_limits = size_fraction * np.maximum(iteration.scene.extent, distances)
-    apply_edit(state, clone_split.prune_large(state.gaussians, size_limit=size_limits))
+    center = np.mean([view.camera.center for view in scene.train_views], axis=0)  # [3]
+    return size_fraction * np.maximum(scene.extent, np.linalg.norm(means - center, axis=1))
+
+
+def prune_large_by_distance(state: TrainState, iteration: Iteration, *, size_fraction: float) -> None:
+    """Remove Gaussians larger than :func:`size_limits`."""
+    limits = size_limits(state.gaussians.means, iteration.scene, size_fraction)
+    apply_edit(state, clone_split.prune_large(state.gaussians, size_limit=limits))
 
 
 def simplify(
@@ -272,7 +280,7 @@ _DENSIFICATION = (
     ),
     _densifying(_densify, start=500),
     _densifying(partial(prune_faint, least_opacity=0.005), start=500),
-    _densifying(partial(prune_large_by_distance, size_fraction=0.1), start=3_000),
+    _densifying(partial(prune_large_by_distance, size_fraction=LARGE), start=3_000),
     Every(5_000, _reinitialise, stop=15_000),
 )
 _AFTER_SIMPLIFICATION = (
