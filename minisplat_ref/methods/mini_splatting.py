@@ -122,8 +122,8 @@ def reinitialise_from_depth(
     Their number is ``points_per_gaussian`` times that of the population. Points that other views see through, by more
     than ``depth_tolerance``, move out to ``backdrop_extents`` times the scene's extent. With ``drawn_mass``, only the
     Gaussians that carry this fraction of the importance are rendered for the depths (Mini-Splatting2); the number of
-    points is that of the population before. No Gaussian is larger than :data:`LARGE` of its distance: few points that
-    have moved out are as far from each other as from the cameras, and would cover them.
+    points is that of the population before. No Gaussian begins larger than :func:`size_limits`: few points that
+    have moved out are as far from each other as from the cameras, and would cover the views.
     """
     n_points = round(points_per_gaussian * n_rows(state.gaussians))
     if drawn_mass is not None:
