@@ -300,6 +300,7 @@ def test_depth_is_given_the_settings_in_world_units(state, iteration, monkeypatc
         depth_tolerance=0.07,
         backdrop_extents=extents,
         points_per_gaussian=2.0,
+        largest_size=0.1,
         drawn_mass=0.9,
     )
     assert (given["backdrop_distance"], given["least_alpha"], given["depth_tolerance"]) == (distance, 0.3, 0.07)

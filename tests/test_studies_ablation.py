@@ -11,8 +11,8 @@ from minisplat_ref.experiments.studies import FIGURE, RESULT, ablation, front
 from minisplat_ref.experiments.studies.ablation import FULL, variants_of
 from minisplat_ref.experiments.studies.front import RUNS
 from minisplat_ref.io.images import read_image
-from minisplat_ref.methods import RECIPES
-from minisplat_ref.training.schedule import action_name, configured, settings_of
+from minisplat_ref.methods import RECIPES, gaussian_splatting
+from minisplat_ref.training.schedule import action_name, configured, firing_steps, settings_of
 
 
 def names_of(recipe):
@@ -45,6 +45,15 @@ def test_deviations_are_taken_back():
     published = variants_of(RECIPES["mini-splatting"], 30_000, ablation.DEVIATIONS)
     assert "raised rates" not in published and "prune_large" in names_of(published["size limit by distance"])
     assert set(variants_of(RECIPES["3dgs-accel"], 30_000, ablation.DEVIATIONS)) == {FULL, "no bias correction"}
+
+
+def test_fewer_events_are_a_deviation_of_short_runs():
+    assert "fewer events" not in variants_of(RECIPES["mini-splatting2"], 18_000, ablation.DEVIATIONS)
+    variants = variants_of(RECIPES["mini-splatting2"], 1_800, ablation.DEVIATIONS)
+    steps = {name: firing_steps(variants[name], gaussian_splatting.clone_and_split) for name in (FULL, "fewer events")}
+    assert steps["fewer events"] == [step // 10 for step in range(600, 3_000, 100) if step != 2_000]
+    assert set(steps[FULL]) < set(steps["fewer events"]) and len(steps[FULL]) == 1
+    assert settings_of(variants["size limit of new points"])["largest_size"] == np.inf
 
 
 def test_what_never_acts_has_no_row():

@@ -32,13 +32,13 @@ import numpy as np
 
 from minisplat_ref.methods.adaptive_antialiasing import switch_antialiasing_on
 from minisplat_ref.methods.adaptive_bands import cut_bands_when_cooling, grow_bands
+from minisplat_ref.methods.adaptive_evidence import plain_request
 from minisplat_ref.methods.adaptive_exposure import hold_mean_exposure, log_gains, switch_exposure_on
 from minisplat_ref.methods.adaptive_pose import hold_mean_pose, switch_pose_on, turn_held_out
 from minisplat_ref.methods.adaptive_prune import prune_in_slices
 from minisplat_ref.methods.adaptive_sky import switch_sky_on
 from minisplat_ref.methods.gaussian_splatting import GS, GS_ACCEL, collect_gradients, prune_faint
 from minisplat_ref.metrics import psnr
-from minisplat_ref.rendering import Request
 from minisplat_ref.strategy.error_weights import collect_error_weights
 from minisplat_ref.strategy.halving import OFFSET, halves
 from minisplat_ref.strategy.ops import n_rows
@@ -133,8 +133,7 @@ def measure_held_out(state: TrainState, iteration: Iteration) -> str | None:
     gains = np.exp(log_gains(state, iteration, ids) if EXPOSURES in state.shared else np.zeros(len(ids)))
     for index, gain in zip(ids, gains.astype(np.float32), strict=True):
         view = views[index].loaded()
-        request = Request(iteration.scene.background, conventions=iteration.conventions, backend=iteration.backend)
-        output, _ = iteration.renderer.render(state.model, view, request)
+        output, _ = iteration.renderer.render(state.model, view, plain_request(iteration))
         psnrs.append(psnr(np.clip(gain * output.image, 0.0, 1.0), view.image, view.mask))
     measurement = Measurement(iteration.step, tuple(psnrs), n_rows(state.gaussians), state.pace.n_pairs)
     state.pace = state.pace._replace(measurements=(*state.pace.measurements, measurement))

@@ -115,6 +115,7 @@ def reinitialise_from_depth(
     depth_tolerance: float | None,
     backdrop_extents: float | None,
     points_per_gaussian: float,
+    largest_size: float,
     drawn_mass: float | None = None,
 ) -> None:
     """Start again from points that the views' depths give, without view-dependent colour.
@@ -122,8 +123,9 @@ def reinitialise_from_depth(
     Their number is ``points_per_gaussian`` times that of the population. Points that other views see through, by more
     than ``depth_tolerance``, move out to ``backdrop_extents`` times the scene's extent. With ``drawn_mass``, only the
     Gaussians that carry this fraction of the importance are rendered for the depths (Mini-Splatting2); the number of
-    points is that of the population before. No Gaussian begins larger than :func:`size_limits`: few points that
-    have moved out are as far from each other as from the cameras, and would cover the views.
+    points is that of the population before. No Gaussian begins larger than :func:`size_limits`, with the fraction
+    ``largest_size``: few points that have moved out are as far from each other as from the cameras, and would cover the
+    views.
     """
     n_points = round(points_per_gaussian * n_rows(state.gaussians))
     if drawn_mass is not None:
@@ -142,7 +144,7 @@ def reinitialise_from_depth(
         backend=iteration.backend,
     )
     gaussians = from_points(points, colors, sh_degree=0)
-    limits = np.log(size_limits(gaussians.means, iteration.scene, LARGE)).astype(gaussians.log_scales.dtype)
+    limits = np.log(size_limits(gaussians.means, iteration.scene, largest_size)).astype(gaussians.log_scales.dtype)
     start_anew(state, iteration, gaussians._replace(log_scales=np.minimum(gaussians.log_scales, limits[:, None])))
 
 
@@ -272,6 +274,7 @@ _reinitialise = partial(
     least_alpha=0.0,
     depth_tolerance=DEPTH_TOLERANCE,
     backdrop_extents=BACKDROP_EXTENTS,
+    largest_size=LARGE,
 )
 _DENSIFICATION = (
     During(collect_gradients, stop=15_000),

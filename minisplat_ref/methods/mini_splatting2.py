@@ -15,6 +15,7 @@ from minisplat_ref.methods.mini_splatting import (
     BACKDROP_EXTENTS,
     BLUR_AREA,
     DEPTH_TOLERANCE,
+    LARGE,
     LEAST_BLURRED_AREA,
     SHORT_RUN_EXPONENT,
     VISIBILITY_MASS,
@@ -113,6 +114,7 @@ _reinitialise = partial(
     least_alpha=0.0,
     depth_tolerance=DEPTH_TOLERANCE,
     backdrop_extents=BACKDROP_EXTENTS,
+    largest_size=LARGE,
 )
 _densifying = partial(Every, 100, start=500, stop=3_000, skip=2_000, least_gap=DENSIFY_LEAST_GAP)
 

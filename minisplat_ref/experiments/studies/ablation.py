@@ -41,6 +41,7 @@ from minisplat_ref.training.loop import HALF_SIZE, train
 from minisplat_ref.training.schedule import (
     Action,
     Event,
+    Every,
     Recipe,
     configured,
     does,
@@ -76,6 +77,12 @@ def as_3dgs_prunes(recipe: Recipe) -> Recipe:
     return recipe._replace(events=tuple(map(changed, recipe.events)))
 
 
+def with_all_events(recipe: Recipe) -> Recipe:
+    """Return the recipe with all published density events and opacity resets, however few iterations lie between."""
+    events = (event._replace(least_gap=1) if isinstance(event, Every) else event for event in recipe.events)
+    return recipe._replace(events=tuple(events))
+
+
 MECHANISMS: Mapping[str, Callable[[Recipe], Recipe]] = {
     "blur split": partial(without, action=mini_splatting.collect_blur),
     "reinitialisation": partial(without, action=mini_splatting.reinitialise_from_depth),
@@ -95,8 +102,10 @@ DEVIATIONS: Mapping[str, Callable[[Recipe], Recipe]] = {
     "cap of the population": with_settings(most_per_pixel=math.inf),
     "sky guard": with_settings(depth_tolerance=None),
     "size limit by distance": as_3dgs_prunes,
+    "size limit of new points": with_settings(largest_size=math.inf),
     "least size to halve": lambda recipe: recipe._replace(least_half_size=1) if recipe.half_size_until else recipe,
     "raised rates": lambda recipe: recipe._replace(short_run_exponent=0.0),
+    "fewer events": with_all_events,
     "no bias correction": with_bias_correction,
 }
 """A recipe with the published rule in place of each of ours."""
@@ -164,8 +173,14 @@ def variants_of(
 
     full = of_length(published)
     variants = {name: of_length(take_out(published)) for name, take_out in rules.items()}
-    differ = {name: variant for name, variant in variants.items() if variant != full}
+    differ = {name: variant for name, variant in variants.items() if with_strides(variant) != with_strides(full)}
     return {FULL: full, **{name: v for name, v in differ.items() if name not in MECHANISMS or has_date(full, name)}}
+
+
+def with_strides(recipe: Recipe) -> Recipe:
+    """Return the recipe with the gaps that its events have: a lower bound that moves no date makes no difference."""
+    events = (event._replace(least_gap=event.stride) if isinstance(event, Every) else event for event in recipe.events)
+    return recipe._replace(events=tuple(events))
 
 
 def has_date(recipe: Recipe, mechanism: str) -> bool:
