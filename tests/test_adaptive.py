@@ -15,7 +15,7 @@ from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.checkpoint import DamagedCheckpoint, load_checkpoint, save_checkpoint
 from minisplat_ref.methods import get_recipe
-from minisplat_ref.methods.adaptive import ADAPTIVE, cool_when_little_is_gained, grow
+from minisplat_ref.methods.adaptive import ADAPTIVE, grow, proceed_when_little_is_gained
 from minisplat_ref.methods.adaptive_prune import N_SLICES, prune_in_slices, slice_due
 from minisplat_ref.methods.mini_splatting import measure_importance
 from minisplat_ref.rendering import SPLATTING
@@ -118,7 +118,7 @@ def iteration(step):
 
 
 def decide(state, step):
-    return cool_when_little_is_gained(state, iteration(step), least_gain=0.3, least_step=800)
+    return proceed_when_little_is_gained(state, iteration(step), least_gain=0.3, least_step=800)
 
 
 def test_a_slope_by_hand():

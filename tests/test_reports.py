@@ -160,7 +160,7 @@ def test_decisions_are_told_with_their_evidence():
         "went on to iteration 1,280, its end."
     )
     page_ = decisions_section(PACE, 1280)
-    assert page_.count("<svg") == 2 and "The red line has the slope" in page_ and "0.050" in page_
+    assert page_.count("<svg") == 2 and "A red line has the slope" in page_ and "0.050" in page_
 
 
 def test_a_training_that_was_stopped_says_so():

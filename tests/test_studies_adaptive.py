@@ -8,6 +8,7 @@ from scenes import make_gaussians
 
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.studies import FIGURE, RESULT, adaptive, front
 from minisplat_ref.experiments.studies.front import RUNS
 from minisplat_ref.io.images import read_image
@@ -106,6 +107,15 @@ def test_the_sweep_goes_from_little_growth_to_much():
     for each in settings:
         others = {"threshold": 4e-4, "most_at_once": 0.2}
         assert {**each, **others} == settings_of(ADAPTIVE), "nothing else differs"
+
+
+def test_a_rule_can_be_asked_for_by_its_name():
+    named = adaptive._named(["3dgs", "large views at once", "adaptive"])
+    assert list(named) == ["3dgs", "large views at once", "adaptive"] and named["adaptive"] == ADAPTIVE
+    sides = [settings_of(named[name])["least_side"] for name in ("large views at once", "adaptive")]
+    assert sides[0] == np.inf > sides[1]
+    with pytest.raises(InputError, match="recipe 'small views' does not exist"):
+        adaptive._named(["small views"])
 
 
 def test_study_and_its_continuation(tmp_path, capsys, scene, monkeypatch):

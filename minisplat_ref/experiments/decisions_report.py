@@ -3,20 +3,23 @@
 Of the recipe ``adaptive`` (:mod:`minisplat_ref.training.pace`): at which iteration it did what, and why.
 """
 
+import math
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from minisplat_ref.experiments.page import curves, paragraph, section, table
 from minisplat_ref.experiments.plots import BLUE, GREY, RED, plot, to_svg
-from minisplat_ref.training.pace import Decision, Measurement, Pace
+from minisplat_ref.training.pace import COOLED, FINER, Decision, Measurement, Pace
 
-COOLED = "cool down"
 DONE = {
     COOLED: "the rates began to fall",
     "exposures": "exposures were switched on",
+    FINER: "views of twice the width and height were shown",
     "sky": "a sky took the place of the largest Gaussians",
     "poses": "the refinement of poses was switched on",
+    "anti-aliasing": "opacities were compensated for anti-aliasing",
     "prune": "it pruned",
     "bands": "it removed idle bands of the harmonics",
 }
@@ -25,7 +28,7 @@ PSNR = "PSNR of the held-out training views (dB)"
 FIGURES_TEXT = """\
 Thin lines are the held-out training views, the thick one is their mean, broken lines are decisions. The work is the
 number of pairs of a tile and a Gaussian, of all iterations so far."""
-SLOPE_TEXT = "The red line has the slope by which it was decided that little was left to gain."
+SLOPE_TEXT = "A red line has the slope by which it was decided that little was left to gain."
 
 
 def decisions_section(pace: Pace, n_iterations: int) -> str:
@@ -53,10 +56,14 @@ def story(pace: Pace, n_iterations: int) -> str:
     n = len(pace.measurements)
     sentences = []
     if n:
-        first, last = pace.measurements[0], pace.measurements[-1]
+        rises = [
+            f"from {part[0].psnr:.2f} dB after {part[0].step:,} iterations to {part[-1].psnr:.2f} dB after"
+            f" {part[-1].step:,}"
+            for part in _of_one_size(pace)
+        ]
         sentences.append(
-            f"{len(last.psnrs)} training views were held back and measured {n} time{'s'[: n > 1]}: from"
-            f" {first.psnr:.2f} dB after {first.step:,} iterations to {last.psnr:.2f} dB after {last.step:,}."
+            f"{len(pace.measurements[0].psnrs)} training views were held back and measured {n} time{'s'[: n > 1]}:"
+            f" {', at twice the size '.join(rises)}."
         )
     sentences += [f"After iteration {d.step:,} {DONE.get(d.what, d.what)}: {d.why}{_error(d)}." for d in pace.decisions]
     if pace.cooling_from is None:
@@ -68,6 +75,16 @@ def story(pace: Pace, n_iterations: int) -> str:
     else:
         sentences.append(f"It was stopped at iteration {n_iterations:,} of the {pace.last_step:,} that it had planned.")
     return " ".join(sentences)
+
+
+def _of_one_size(pace: Pace) -> list[tuple[Measurement, ...]]:
+    """Return the measurements of views of each size; those of one size cannot be compared with those of another."""
+    steps = [decision.step for decision in pace.decisions if decision.what == FINER]
+    parts = (
+        tuple(m for m in pace.measurements if start < m.step <= end)
+        for start, end in zip([0, *steps], [*steps, math.inf], strict=True)
+    )
+    return [part for part in parts if part]
 
 
 def _error(decision: Decision) -> str:
@@ -82,7 +99,8 @@ def _row(decision: Decision) -> list[str]:
 def over_iterations(pace: Pace) -> Figure:
     """Draw the PSNR of the held-out views over the iterations, with what was decided."""
     with plot(PSNR, "iterations", (5.6, 3.6)) as (figure, axes):
-        _draw(axes, pace.measurements, [float(m.step) for m in pace.measurements])
+        for part in _of_one_size(pace):
+            _draw(axes, part, [float(m.step) for m in part])
         for decision in pace.decisions:
             axes.axvline(decision.step, color=GREY, linestyle="--", linewidth=1)
         _name_decisions(axes, pace.decisions)
@@ -114,17 +132,18 @@ def _name_decisions(axes: Axes, decisions: tuple[Decision, ...]) -> None:
 def over_work(pace: Pace) -> Figure:
     """Draw the same over the work, by whose doublings the gain is counted."""
     with plot(PSNR, "work (pairs of tile and Gaussian)", (5.6, 3.6)) as (figure, axes):
-        _draw(axes, pace.measurements, [float(m.n_pairs) for m in pace.measurements])
+        for part in _of_one_size(pace):
+            _draw(axes, part, [float(m.n_pairs) for m in part])
         axes.set_xscale("log", base=2)
         for decision in pace.decisions:
             if decision.gain is not None and _is_of_slope(decision):
-                _draw_slope(axes, pace.measurements, decision.step, decision.gain)
+                _draw_slope(axes, pace.before(decision).recent(), decision.gain)
     return figure
 
 
 def _is_of_slope(decision: Decision) -> bool:
     """Return whether the gain is one for each doubling of the work; None where a limit ended the growth."""
-    return decision.what == COOLED and decision.gain is not None
+    return decision.what in (COOLED, FINER) and decision.gain is not None
 
 
 def _draw(axes: Axes, measurements: tuple[Measurement, ...], xs: list[float]) -> None:
@@ -132,10 +151,8 @@ def _draw(axes: Axes, measurements: tuple[Measurement, ...], xs: list[float]) ->
     axes.plot(xs, [m.psnr for m in measurements], color=BLUE, linewidth=2.2, marker="o", markersize=3)
 
 
-def _draw_slope(axes: Axes, measurements: tuple[Measurement, ...], step: int, gain: float) -> None:
-    """Draw the line through the measurements since half of the work, of which ``gain`` dB a doubling is the slope."""
-    before = [m for m in measurements if m.step <= step]
-    recent = [m for m in before if 2 * m.n_pairs >= before[-1].n_pairs]
+def _draw_slope(axes: Axes, recent: list[Measurement], gain: float) -> None:
+    """Draw the line through measurements of which ``gain`` dB for each doubling of the work is the slope."""
     doublings = np.log2([m.n_pairs for m in recent])
     middle = np.mean([m.psnr for m in recent])
     axes.plot(2**doublings, middle + gain * (doublings - doublings.mean()), color=RED, linewidth=2, zorder=3)

@@ -29,7 +29,7 @@ from minisplat_ref.metrics import Evaluation
 from minisplat_ref.training.guard import Guard
 from minisplat_ref.training.interruption import Interruptions
 from minisplat_ref.training.loop import StepReport, last_step, train
-from minisplat_ref.training.pace import Decision, to_metadata
+from minisplat_ref.training.pace import COOLED, FINER, Decision, to_metadata
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import TrainState, begin_cooling
 from minisplat_ref.types import Scene
@@ -165,7 +165,11 @@ def _train(
 
 
 def _in_time(settings: Settings, recipe: Recipe, progress: Progress) -> Callable[[StepReport], None]:
-    """Return a callback of the loop that begins the cool-down in time to end after ``settings.minutes``."""
+    """Return a callback of the loop that begins the cool-down in time to end after ``settings.minutes``.
+
+    Halved views are left behind before that, because the cool-down shows the photographs as they are: when it would not
+    end in time with iterations that take as many times longer as the photographs have more pixels.
+    """
     cooling, minutes = recipe.cooling, settings.minutes
     assert cooling is not None and minutes is not None
     clock: deque[float] = deque(maxlen=RECENT)
@@ -173,15 +177,20 @@ def _in_time(settings: Settings, recipe: Recipe, progress: Progress) -> Callable
     def on_step(report: StepReport) -> None:
         clock.append(progress.seconds)
         left = 60 * minutes - clock[-1]
-        if report.state.pace.cooling_from is not None or len(clock) < 2:
+        state = report.state
+        if state.pace.cooling_from is not None or len(clock) < 2:
             return
         length = math.ceil(cooling.part * report.step)
         pace = (clock[-1] - clock[0]) / (len(clock) - 1)  # seconds an iteration
-        if left <= length * pace:
-            why = f"{minutes:g} minutes leave no more time"
+        if left > 4**state.pace.n_halvings * length * pace:
+            return
+        why = f"{minutes:g} minutes leave no more time"
+        if state.pace.n_halvings:
+            state.pace = state.pace.seeing_finer(Decision(report.step, FINER, why, None, None))
+            clock.clear()  # of faster iterations
+        else:
             length = max(1, min(length, round(left / pace)))
-            decision = Decision(report.step, "cool down", why, None, None)
-            begin_cooling(report.state, cooling, settings.iterations, decision, length)
+            begin_cooling(state, cooling, settings.iterations, Decision(report.step, COOLED, why, None, None), length)
 
     return on_step
 

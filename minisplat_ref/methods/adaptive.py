@@ -14,7 +14,8 @@ gradient, so growth fades where a scene has enough.
 *Measure.* Every 100 iterations the held-out training views are rendered. The gain of their PSNR for each doubling of
 the work, in pairs (tile, Gaussian), is the slope of a line through the measurements since half of the work.
 
-*Cool down.* When the slope falls below a threshold, rates fall and all training views are trained on
+*See more, and cool down.* Large photographs are halved at first. When the slope falls below a threshold, they are shown
+at twice the size; when they are as they were taken, rates fall and all training views are trained on
 (:mod:`minisplat_ref.training.pace`).
 
 *Ask the photographs.* A sky, exposures, refined poses and compensated opacities are each switched on once, and only if
@@ -30,6 +31,7 @@ from functools import partial
 
 import numpy as np
 
+from minisplat_ref.errors import InputError
 from minisplat_ref.methods.adaptive_antialiasing import switch_antialiasing_on
 from minisplat_ref.methods.adaptive_bands import cut_bands_when_cooling, grow_bands
 from minisplat_ref.methods.adaptive_evidence import plain_request
@@ -44,16 +46,27 @@ from minisplat_ref.strategy.halving import OFFSET, halves
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.adam import AdamRule
 from minisplat_ref.training.calibration import EXPOSURES
-from minisplat_ref.training.pace import Cooling, Decision, Measurement, held_out_ids, trained_ids
+from minisplat_ref.training.pace import (
+    COOLED,
+    FINER,
+    MOST_HALVINGS,
+    Cooling,
+    Decision,
+    Measurement,
+    held_out_ids,
+    trained_ids,
+)
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.schedule import At, During, Every
-from minisplat_ref.training.state import Iteration, TrainState, apply_edit, begin_cooling
+from minisplat_ref.training.state import Iteration, TrainState, apply_edit, begin_cooling, smallest_side
 from minisplat_ref.types import Floats
 
 MOST_ITERATIONS = 30_000
 LEAST_GAIN = 0.1  # dB of the squared error, for which a calibration of the photographs is worthwhile
 LEAST_SKY_GAIN = 0.2  # dB, likewise, for a sky: larger, because the photographs share it and agree about it
 LEAST_MEASUREMENTS = 4  # to fit a line
+LEAST_SIDE = 120  # pixels: on smaller views a training takes seconds, and there is nothing to save
+SMALLEST_SIDE = 16  # pixels: a tile
 LEAST_VARIATION = 4 / 255  # of a band of the harmonics, out of 1
 
 
@@ -140,12 +153,28 @@ def measure_held_out(state: TrainState, iteration: Iteration) -> str | None:
     return f"{measurement.psnr:.2f} dB"
 
 
-def cool_when_little_is_gained(
+def halve_large_views(state: TrainState, iteration: Iteration, *, least_side: float) -> str:
+    """Train on smaller views at first, halved as often as no side becomes shorter than ``least_side`` pixels.
+
+    Raises
+    ------
+    InputError
+        ``least_side`` is too small for a picture.
+    """
+    if not least_side >= SMALLEST_SIDE:
+        raise InputError(f"least_side is {least_side}: give at least {SMALLEST_SIDE} pixels")
+    side = smallest_side(iteration.scene)
+    n_halvings = sum(side >= 2**times * least_side for times in range(1, MOST_HALVINGS + 1))
+    state.pace = state.pace._replace(n_halvings=n_halvings)
+    return f"to 1/{2**n_halvings} of their size" if n_halvings else f"nothing done: the shortest side has {side} pixels"
+
+
+def proceed_when_little_is_gained(
     state: TrainState, iteration: Iteration, *, least_gain: float, least_step: int
 ) -> str | None:
-    """Begin the cool-down when the held-out views gain less than ``least_gain`` for each doubling of the work.
+    """Go on to larger views, or to the cool-down, when held-out views gain too little for each doubling of the work.
 
-    What counts are the measurements since half of the work, and since a calibration was last switched on.
+    What counts is what was measured since half of the work, and since anything was last decided.
 
     Parameters
     ----------
@@ -159,8 +188,7 @@ def cool_when_little_is_gained(
     pace = state.pace
     if iteration.cooling is None or pace.cooling_from is not None or iteration.step < least_step:
         return None
-    changed = max((decision.step for decision in pace.decisions), default=0)  # before, they are of another model
-    recent = [m for m in pace.measurements if 2 * m.n_pairs >= pace.n_pairs and m.step > changed]
+    recent = pace.recent()
     if len(recent) < LEAST_MEASUREMENTS:
         return None
     doublings = np.log2([m.n_pairs for m in recent])
@@ -169,8 +197,11 @@ def cool_when_little_is_gained(
     if gain >= least_gain:
         return f"{gain:.2f} dB for each doubling of the work"
     why = f"held-out views gain {gain:.2f} dB for each doubling of the work, less than {least_gain}"
-    decision = Decision(iteration.step, "cool down", why, gain, error)
-    begin_cooling(state, iteration.cooling, iteration.iterations, decision)
+    if pace.n_halvings:
+        state.pace = pace.seeing_finer(Decision(iteration.step, FINER, why, gain, error))
+    else:
+        decision = Decision(iteration.step, COOLED, why, gain, error)
+        begin_cooling(state, iteration.cooling, iteration.iterations, decision)
     return why
 
 
@@ -187,13 +218,14 @@ ADAPTIVE = GS._replace(
         During(partial(grow_bands, views_per_coefficient=1.5)),
         During(hold_mean_exposure),
         During(hold_mean_pose),
+        At(1, partial(halve_large_views, least_side=LEAST_SIDE)),
         At(100, partial(switch_sky_on, least_sky_gain=LEAST_SKY_GAIN)),
         At(600, partial(switch_exposure_on, least_exposure_gain=LEAST_GAIN, least_antialiasing_gain=LEAST_GAIN)),
         At(650, partial(switch_antialiasing_on, least_antialiasing_gain=LEAST_GAIN)),
         At(700, partial(switch_pose_on, least_pose_gain=LEAST_GAIN)),
         Every(100, turn_held_out, start=100),
         Every(100, measure_held_out, start=100),
-        Every(100, partial(cool_when_little_is_gained, least_gain=0.3, least_step=800), start=100),
+        Every(100, partial(proceed_when_little_is_gained, least_gain=0.3, least_step=800), start=100),
         Every(
             100,
             partial(grow, threshold=4e-4, most_at_once=0.2, offset=OFFSET, error_views=24, budget=None),

@@ -4,7 +4,7 @@ The order inside an iteration is: render, loss, gradients, Adam, then the events
 control *before* Adam, and because it replaces the parameter tensors, that iteration's step is silently lost (likewise
 in Mini-Splatting; gsplat steps first, as here). Here no step is lost, not even the last.
 
-While a recipe warms up on views of half the size, these are the scene's views for everything in the loop. If an event
+While a recipe trains on smaller views, these are the scene's views for everything in the loop. If an event
 has made a culling table (Mini-Splatting2), it says which Gaussians are rendered in a view; if one has given each
 Gaussian a degree of its harmonics, neither colours nor Adam compute with the bands above it.
 """
@@ -32,11 +32,19 @@ from minisplat_ref.training.case import Case
 from minisplat_ref.training.guard import Guard, Wrong
 from minisplat_ref.training.interruption import Interruptions
 from minisplat_ref.training.losses import Loss, Rendered, total_loss
-from minisplat_ref.training.pace import Cooling, Decision, Pace, to_metadata, trained_ids
+from minisplat_ref.training.pace import COOLED, Cooling, Decision, Pace, to_metadata, trained_ids
 from minisplat_ref.training.rates import active_sh_degree, n_coefficients
 from minisplat_ref.training.saved_state import read_bundles, read_counters, read_generator, read_pace, written_by
 from minisplat_ref.training.schedule import During, Event, Recipe, action_name, as_decided, describe
-from minisplat_ref.training.state import DEGREES, FiredEvent, Iteration, StepReport, TrainState, begin_cooling
+from minisplat_ref.training.state import (
+    DEGREES,
+    FiredEvent,
+    Iteration,
+    StepReport,
+    TrainState,
+    begin_cooling,
+    smallest_side,
+)
 from minisplat_ref.types import NOTHING, Floats, Ints, Scene, View, numbered
 
 HALF_SIZE = "half_size_views"  # name of training on views of half the size in the record of what fired
@@ -134,7 +142,7 @@ def train(
     state = initial_state(scene, recipe, seed) if state is None else state
     scene = scene._replace(train_views=numbered(scene.train_views))
     _check_fits(state, scene, as_decided(recipe, state.pace))
-    small_scene = _half_size(scene, recipe.least_half_size) if state.step < recipe.half_size_until else scene
+    n_halvings, seen = 0, scene
     with ReadingAhead() as ahead, Interruptions() as interruptions:
         around = _Surroundings(as_decided(recipe, state.pace), backend, conventions, guard, ahead)
         switched_on = state.pace.switched_on
@@ -142,9 +150,10 @@ def train(
             _cool_in_time(state, recipe)
             if state.pace.switched_on != switched_on:
                 around, switched_on = around._replace(recipe=as_decided(recipe, state.pace)), state.pace.switched_on
-            seen = small_scene if state.step < recipe.half_size_until else scene
+            if (now := _n_halvings(state, recipe, scene)) != n_halvings:
+                n_halvings, seen = now, _halved(scene, now)
             report = _iterate(state, seen, around, interruptions)
-            if report.step == 1 and seen is not scene:
+            if report.step == 1 and n_halvings and recipe.half_size_until:
                 report = report._replace(fired=(_half_size_event(report, recipe), *report.fired))
             if on_step is not None:
                 on_step(report)
@@ -173,7 +182,7 @@ def _cool_in_time(state: TrainState, recipe: Recipe) -> None:
         return
     if state.step >= recipe.cooling.latest_start(recipe.iterations):
         why = f"the limit of {recipe.iterations} iterations leaves no more time"
-        begin_cooling(state, recipe.cooling, recipe.iterations, Decision(state.step, "cool down", why, None, None))
+        begin_cooling(state, recipe.cooling, recipe.iterations, Decision(state.step, COOLED, why, None, None))
 
 
 def _check_fits(state: TrainState, scene: Scene, recipe: Recipe) -> None:
@@ -370,12 +379,19 @@ def _following_view(state: TrainState, scene: Scene) -> View | None:
     return scene.train_views[state.view_order[-1]] if state.view_order else None
 
 
-def _half_size(scene: Scene, least: int) -> Scene:
-    """Halve the training views, unless they are so small that no structure would be left."""
-    sizes = [min(view.camera.width, view.camera.height) for view in scene.train_views]
-    if min(sizes) < 2 * least:
-        return scene
-    return scene._replace(train_views=tuple(half_size(view) for view in scene.train_views))
+def _n_halvings(state: TrainState, recipe: Recipe, scene: Scene) -> int:
+    """Return how often views are halved now; those so small that no structure would be left are not."""
+    if state.step < recipe.half_size_until and smallest_side(scene) >= 2 * recipe.least_half_size:
+        return 1
+    return state.pace.n_halvings
+
+
+def _halved(scene: Scene, times: int) -> Scene:
+    """Return the scene with its training views at half the width and height, at a quarter, and so on."""
+    views = scene.train_views
+    for _ in range(times):
+        views = tuple(map(half_size, views))
+    return scene._replace(train_views=views)
 
 
 def save_state(path: str | Path, state: TrainState, recipe: Recipe, *, previous: str | Path | None = None) -> None:

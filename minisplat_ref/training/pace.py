@@ -2,16 +2,21 @@
 
 A recipe with a :class:`Cooling` has no schedule. It trains at constant rates, and holds some *training* views back to
 measure the gain of more iterations; test views are never used. When an action of the recipe decides that the gain is
-small (:func:`begin_cooling`), or when the given number of iterations leaves no more time, a cool-down with falling
-rates on all training views ends the training. So a plateau is due to the scene and not to falling rates.
+small, or when the given number of iterations leaves no more time, a cool-down with falling rates on all training views
+ends the training (:func:`minisplat_ref.training.state.begin_cooling`). So a plateau is due to the scene and not to
+falling rates. Large photographs are halved at first; there, the decision is to train on views of twice the width and
+height.
 """
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+COOLED, FINER = "cool down", "resolution"  # decisions: to let the rates fall, to train on larger views
+MOST_HALVINGS = 16  # of a photograph of 65,536 pixels a side one would be left
+
 
 class Measurement(NamedTuple):
-    """One evaluation of the held-out training views."""
+    """One evaluation of the held-out training views, at the size of those that are trained on."""
 
     step: int
     psnrs: tuple[float, ...]
@@ -51,10 +56,30 @@ class Pace(NamedTuple):
     """Iteration at which the training ends; None while that is open."""
     switched_on: tuple[str, ...] = ()
     """Names of the calibrations that the photographs turned out to need."""
+    n_halvings: int = 0
+    """How often the views that are trained on are halved in width and height."""
 
     def decided(self, decision: Decision) -> "Pace":
         """Return the pace with one more decision."""
         return self._replace(decisions=(*self.decisions, decision))
+
+    def seeing_finer(self, decision: Decision) -> "Pace":
+        """Return the pace with views of twice the width and height from the next iteration on."""
+        return self.decided(decision)._replace(n_halvings=self.n_halvings - 1)
+
+    def before(self, decision: Decision) -> "Pace":
+        """Return the measurements and decisions that there were when one was made."""
+        measurements = tuple(m for m in self.measurements if m.step <= decision.step)
+        n_pairs = measurements[-1].n_pairs if measurements else 0
+        return Pace(measurements, self.decisions[: self.decisions.index(decision)], n_pairs)
+
+    def recent(self) -> list[Measurement]:
+        """Return the measurements since half of the work and since the last decision.
+
+        What was measured before a decision is of another model, or of views of another size.
+        """
+        changed = max((decision.step for decision in self.decisions), default=0)
+        return [m for m in self.measurements if 2 * m.n_pairs >= self.n_pairs and m.step > changed]
 
 
 class Cooling(NamedTuple):
@@ -131,7 +156,10 @@ def from_metadata(value: Mapping[str, Any]) -> Pace:
     )
     cooling_from, last_step = (None if value[n] is None else int(value[n]) for n in ("cooling_from", "last_step"))
     switched_on = tuple(str(name) for name in value["switched_on"])
-    return Pace(measurements, decisions, int(value["n_pairs"]), cooling_from, last_step, switched_on)
+    n_halvings = int(value.get("n_halvings", 0))  # records from before there were any
+    if not 0 <= n_halvings <= MOST_HALVINGS:
+        raise ValueError(f"n_halvings is {n_halvings}")
+    return Pace(measurements, decisions, int(value["n_pairs"]), cooling_from, last_step, switched_on, n_halvings)
 
 
 def _optional(number: Any) -> float | None:

@@ -135,6 +135,11 @@ def n_pixels(scene: Scene) -> int:
     return sum(view.camera.width * view.camera.height for view in scene.train_views)
 
 
+def smallest_side(scene: Scene) -> int:
+    """Return the least width or height of the training views, pixels."""
+    return min(min(view.camera.width, view.camera.height) for view in scene.train_views)
+
+
 def begin_cooling(
     state: TrainState, cooling: Cooling, iterations: int, decision: Decision, length: int | None = None
 ) -> None:
@@ -154,7 +159,7 @@ def begin_cooling(
     """
     length = max(1, math.ceil(cooling.part * decision.step)) if length is None else length
     state.pace = state.pace.decided(decision)._replace(
-        cooling_from=decision.step, last_step=min(decision.step + length, iterations)
+        cooling_from=decision.step, last_step=min(decision.step + length, iterations), n_halvings=0
     )
     state.view_order = []
 

@@ -90,7 +90,8 @@ def _add_adaptive_arguments(parser: argparse.ArgumentParser) -> None:
         type=listed(name),
         default=("3dgs-accel", "mini-splatting", "mini-splatting2", "adaptive"),
         metavar="R,Q",
-        help="the first is what the others are compared with (default: three of 3000 iterations, and adaptive)",
+        help="the first is what the others are compared with; also names of --rules (default: three of 3000 iterations,"
+        " and adaptive)",
     )
     variants = parser.add_mutually_exclusive_group()
     variants.add_argument("--rules", action="store_true", help="adaptive beside itself without each of its rules")

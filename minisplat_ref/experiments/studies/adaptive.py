@@ -159,6 +159,7 @@ RULES: Mapping[str, Callable[[Recipe], Recipe]] = {
     "rates of 3DGS": with_published_rates,
     "faster means": with_faster_means,
     "no cool-down": without_cool_down,
+    "large views at once": lambda recipe: configured(recipe, least_side=math.inf),
     "all bands": with_all_bands,
     "no bands": lambda recipe: configured(recipe, views_per_coefficient=math.inf),
     "no cut of bands": lambda recipe: configured(recipe, least_variation=0.0),
@@ -233,7 +234,8 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _named(names: Sequence[str]) -> dict[str, Recipe]:
-    return {name: adaptive.ADAPTIVE if name == "adaptive" else get_recipe(name, ITERATIONS) for name in names}
+    """Return recipes by their names; adaptive without one of its rules has that rule's name."""
+    return {name: RULES[name](adaptive.ADAPTIVE) if name in RULES else get_recipe(name, ITERATIONS) for name in names}
 
 
 def warm_up(scene: Scene, recipes: Iterable[Recipe]) -> None:
