@@ -8,7 +8,16 @@ from scenes import as_dtype, make_camera, make_gaussians
 
 from minisplat_ref.backends import CPU
 from minisplat_ref.methods.adaptive import ADAPTIVE, LEAST_SKY_GAIN
-from minisplat_ref.methods.adaptive_sky import HUGE, LARGE, Behind, behind, compare, fitted_sky, switch_sky_on
+from minisplat_ref.methods.adaptive_sky import (
+    HUGE,
+    LARGE,
+    Behind,
+    behind,
+    compare,
+    fitted_sky,
+    open_pixels,
+    switch_sky_on,
+)
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.strategy.ops import concat
 from minisplat_ref.training.loop import load_state, save_state, train
@@ -110,6 +119,38 @@ def test_veils_before_a_sky_are_replaced_by_it(truth, sky):
     assert_allclose(found, true, atol=RECOVERED)
     assert not state.shared_adam.first[SKY].any()
     assert "there is a sky" in switch_sky_on(state, iteration_of(scene, 100), least_sky_gain=LEAST_SKY_GAIN)
+
+
+def test_what_the_scene_has_not_learned_does_not_drown_a_sky(truth, sky):
+    """Photographs whose lower half is noise: only where the sky shows does it count what a sky explains."""
+    scene = scene_of(truth, {SKY: sky})
+    state = state_of(scene, with_veils(truth, 1.5 * HUGE))
+    iteration, rng = iteration_of(scene, 100), np.random.default_rng(2)
+    is_large = np.arange(len(state.gaussians.means)) >= len(truth.means)
+    pixels = open_pixels(state, iteration, range(N_VIEWS), ~is_large)
+    views = []
+    for view in scene.train_views:
+        image = view.image.copy().reshape(-1, 3)
+        hidden = np.setdiff1d(np.arange(len(image)), pixels.get(view.view_id, []))
+        image[hidden] = rng.integers(0, 256, (len(hidden), 3))
+        views.append(view._replace(image=image.reshape(view.image.shape)))
+    noisy = iteration._replace(scene=scene._replace(train_views=tuple(views)))
+    switch_sky_on(state, noisy, least_sky_gain=LEAST_SKY_GAIN)
+    assert state.pace.switched_on == ("sky",)
+
+
+def test_photographs_that_show_no_sky_say_nothing(truth, sky):
+    """Masks leave out what is behind the scene."""
+    scene = scene_of(truth, {SKY: sky})
+    state = state_of(scene, with_veils(truth, 1.5 * HUGE))
+    is_large = np.arange(len(state.gaussians.means)) >= len(truth.means)
+    pixels = open_pixels(state, iteration_of(scene, 100), range(N_VIEWS), ~is_large)
+    masks = [~np.isin(np.arange(24 * 16), pixels[k]).reshape(16, 24) for k in range(N_VIEWS)]
+    views = tuple(view._replace(mask=mask) for view, mask in zip(scene.train_views, masks, strict=True))
+    masked = iteration_of(scene._replace(train_views=views), 100)
+    note = switch_sky_on(state, masked, least_sky_gain=LEAST_SKY_GAIN)
+    assert note == "nothing done: 0 photographs show what is behind the scene without 3 large Gaussians"
+    assert state.shared == {}
 
 
 def test_gaussians_that_are_large_but_not_huge_stay(truth, sky):

@@ -63,7 +63,7 @@ from minisplat_ref.types import Floats
 
 MOST_ITERATIONS = 30_000
 LEAST_GAIN = 0.1  # dB of the squared error, for which a calibration of the photographs is worthwhile
-LEAST_SKY_GAIN = 0.2  # dB, likewise, for a sky: larger, because the photographs share it and agree about it
+LEAST_SKY_GAIN = 2.0  # dB, likewise, for a sky, where it shows: it explains nearly all that is there
 LEAST_MEASUREMENTS = 4  # to fit a line
 LEAST_SIDE = 120  # pixels: on smaller views a training takes seconds, and there is nothing to save
 SMALLEST_SIDE = 16  # pixels: a tile

@@ -4,7 +4,8 @@ Structure from motion finds no points in a sky, and training covers it with the 
 large: after a hundred iterations hardly any pixel is transparent. So the question is not what shows through, but what
 would do better. The larger a Gaussian is beside the path of the cameras, the more it looks the same from all of them,
 as a sky does. The large Gaussians are taken away, and the harmonics of a sky (:mod:`minisplat_ref.training.sky`) are
-fitted to what is then missing, r = photograph - rendering, by least squares over the pixels of half of the photographs
+fitted to what is then missing, r = photograph - rendering, by least squares over half of the photographs, and there
+over the pixels that the rest of the scene lets more than half of the light through to:
 
     r = sum_k s_k b_k,   b_k = T Y_k        T: transmittance, Y_k: spherical harmonics in the direction of the pixel
 
@@ -14,15 +15,16 @@ sky.
 
     gain of a photograph = 10 log10 (|r - sum s_k b_k|^2 as it is / |r - sum s_k b_k|^2 without the large Gaussians)
 
-A wall that is all of one colour is no sky: its photographs disagree about the direction in which its edges lie. All
-photographs see one sky, so nearly all of them gain by whatever it explains; the mean gain has to exceed three standard
-errors, where a calibration that each photograph has for itself needs one.
+Other pixels would drown it, because of all that the scene has not learned yet. A wall that is all of one colour is no
+sky: its photographs disagree about the direction in which its edges lie. All photographs see one sky, so nearly all of
+them gain by whatever it explains, and a sky explains nearly all of what it shows; so the mean gain has to exceed 2 dB,
+and three standard errors, where a calibration that each photograph has for itself needs one.
 
 If the sky is better, only the largest of these Gaussians are removed, those that are larger than the path of the
 cameras itself. Others show a part of the scene besides, such as the far ground, and training takes the sky off them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -35,12 +37,15 @@ from minisplat_ref.training.calibration import BACKDROP
 from minisplat_ref.training.pace import Decision, trained_ids
 from minisplat_ref.training.sky import N_BASIS, SKY, unit_rays
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
-from minisplat_ref.types import Bools, Floats
+from minisplat_ref.types import Bools, Floats, Ints
 
 LARGE, HUGE = 0.25, 1.0  # of the scene's extent: standard deviation along the longest axis, to question and to remove
 RIDGE = 1e-3  # of the mean diagonal entry of the normal matrix: directions that no photograph shows get no large colour
 N_ERRORS = 3.0  # standard errors that the gain must exceed
 MOST_VIEWS = 24  # photographs that are looked at, evenly spread
+LEAST_VIEWS = 4  # of them that show something behind the scene: two to fit, two to judge
+OPEN = 0.5  # transmittance above which a pixel shows what is behind the scene
+LEAST_OPEN = 0.005  # of a photograph's pixels: fewer say nothing
 
 
 class Behind(NamedTuple):
@@ -102,16 +107,32 @@ def is_larger(state: TrainState, iteration: Iteration, than: float) -> Bools:
     return larger
 
 
-def photographs_behind(
-    state: TrainState, iteration: Iteration, view_ids: Sequence[int], is_drawn: Bools | None
-) -> list[Behind]:
-    """Return the sums of training views whose rendering has the Gaussians ``is_drawn`` [N]; None for all."""
+def open_pixels(state: TrainState, iteration: Iteration, view_ids: Sequence[int], is_drawn: Bools) -> dict[int, Ints]:
+    """Return those pixels of training views, as y W + x, that show what is behind the Gaussians ``is_drawn`` [N].
+
+    Views with too few such pixels are left out.
+    """
     request = plain_request(iteration)._replace(is_visible=is_drawn)
-    photographs = []
+    pixels: dict[int, Ints] = {}
     for index in view_ids:
         view = iteration.scene.train_views[index].loaded()
+        alpha = iteration.renderer.render(state.model, view, request)[0].alpha
+        is_open = 1.0 - alpha > OPEN
+        is_open = is_open if view.mask is None else is_open & view.mask
+        if np.count_nonzero(is_open) > LEAST_OPEN * alpha.size:
+            pixels[index] = np.flatnonzero(is_open)
+    return pixels
+
+
+def photographs_behind(
+    state: TrainState, iteration: Iteration, pixels: Mapping[int, Ints], is_drawn: Bools | None
+) -> list[Behind]:
+    """Return the sums of training views over pixels, rendered with the Gaussians ``is_drawn`` [N]; None for all."""
+    request = plain_request(iteration)._replace(is_visible=is_drawn)
+    photographs = []
+    for index, counted in pixels.items():
+        view = iteration.scene.train_views[index].loaded()
         output = iteration.renderer.render(state.model, view, request)[0]
-        counted = np.arange(output.alpha.size) if view.mask is None else np.flatnonzero(view.mask)
         residual = view.image / 255.0 - np.clip(output.image, 0.0, 1.0)
         rays = unit_rays(view.camera, counted, np.dtype(float)) @ view.camera.cam_from_world_R
         transmittance = 1.0 - output.alpha.ravel()[counted].astype(float)
@@ -128,7 +149,8 @@ def switch_sky_on(state: TrainState, iteration: Iteration, *, least_sky_gain: fl
     state, iteration
         As for every action.
     least_sky_gain : float
-        dB of the squared error that the photographs must gain on average, and more than three standard errors.
+        dB of the squared error that the photographs must gain on average behind the scene, and more than three standard
+        errors.
     """
     if BACKDROP.name in state.pace.switched_on or SKY in state.shared:
         return "nothing done: there is a sky"
@@ -138,11 +160,14 @@ def switch_sky_on(state: TrainState, iteration: Iteration, *, least_sky_gain: fl
         return "nothing done: no Gaussian is large"
     ids = trained_ids(len(iteration.scene.train_views), iteration.cooling, state.pace)
     ids = ids[:: -(-len(ids) // MOST_VIEWS)]
-    evidence = compare(*(photographs_behind(state, iteration, ids, drawn) for drawn in (None, ~large)))
-    why = f"a sky in place of {n:,} Gaussians explains {evidence.gain:.2f} dB more of the other photographs"
+    pixels = open_pixels(state, iteration, ids, ~large)
+    if len(pixels) < LEAST_VIEWS:
+        return f"nothing done: {len(pixels)} photographs show what is behind the scene without {n:,} large Gaussians"
+    evidence = compare(*(photographs_behind(state, iteration, pixels, drawn) for drawn in (None, ~large)))
+    why = f"a sky in place of {n:,} Gaussians explains {evidence.gain:.2f} dB more of what others show there"
     if not evidence.is_above(least_sky_gain, N_ERRORS):
         return f"nothing done: {why}"
-    sky = fitted_sky(photographs_behind(state, iteration, ids, ~huge)).astype(np.float32)
+    sky = fitted_sky(photographs_behind(state, iteration, pixels, ~huge)).astype(np.float32)
     apply_edit(state, keep(state.gaussians, ~huge))
     decision = Decision(iteration.step, "sky", why, evidence.gain, evidence.standard_error)
     switch_on(state, BACKDROP, {SKY: sky}, decision)

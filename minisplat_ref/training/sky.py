@@ -81,9 +81,14 @@ def sky_colors_vjp(rays: Floats, R: Floats, sky: Floats, v_colors: Floats) -> tu
         With respect to the nine entries, unconstrained; both are float64, because they sum over many pixels.
     """
     directions = rays @ R
-    v_sky = np.einsum("pk,pc->kc", sh_basis(directions, SH_DEGREE_MAX), v_colors, dtype=np.float64)
-    v_d = np.einsum("pk,pki->pi", v_colors @ sky.T, sh_basis_jacobian(directions, SH_DEGREE_MAX))
-    return v_sky, np.einsum("pi,pj->ij", rays, v_d, dtype=np.float64)
+    v_sky = _summed_products(sh_basis(directions, SH_DEGREE_MAX), v_colors)
+    v_d = (v_colors @ sky.T)[:, None, :] @ sh_basis_jacobian(directions, SH_DEGREE_MAX)  # [P, 1, 3]
+    return v_sky, _summed_products(rays, v_d[:, 0])
+
+
+def _summed_products(a: Floats, b: Floats) -> Floats:
+    """Return ``sum_p a_pi b_pj`` in float64: not by BLAS, whose order of summation depends on its threads."""
+    return np.einsum("ip,jp->ij", *(np.ascontiguousarray(each.T, dtype=np.float64) for each in (a, b)))
 
 
 def sky_picture(camera: Camera, sky: Floats, dtype: np.dtype) -> Floats:
