@@ -28,6 +28,7 @@ PSNR = "PSNR of the held-out training views (dB)"
 FIGURES_TEXT = """\
 Thin lines are the held-out training views, the thick one is their mean, broken lines are decisions. The work is the
 number of pairs of a tile and a Gaussian, of all iterations so far."""
+SIZES_TEXT = "Views of another size have a line of their own: larger ones show more that can be wrong."
 SLOPE_TEXT = "A red line has the slope by which it was decided that little was left to gain."
 
 
@@ -45,7 +46,8 @@ def decisions_section(pace: Pace, n_iterations: int) -> str:
     if pace.measurements:
         parts += [curves([to_svg(figure) for figure in (over_iterations(pace), over_work(pace))], 2)]
         is_by_slope = any(_is_of_slope(decision) for decision in pace.decisions)
-        parts += [paragraph(f"{FIGURES_TEXT} {SLOPE_TEXT}" if is_by_slope else FIGURES_TEXT)]
+        is_of_sizes = any(decision.what == FINER for decision in pace.decisions)
+        parts += [paragraph(" ".join([FIGURES_TEXT, *[SIZES_TEXT] * is_of_sizes, *[SLOPE_TEXT] * is_by_slope]))]
     if pace.decisions:
         parts.append(table(map(_row, pace.decisions), HEADING))
     return section("What was decided, and why", *parts)
