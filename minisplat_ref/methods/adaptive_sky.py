@@ -20,8 +20,8 @@ sky: its photographs disagree about the direction in which its edges lie. All ph
 them gain by whatever it explains, and a sky explains nearly all of what it shows; so the mean gain has to exceed 2 dB,
 and three standard errors, where a calibration that each photograph has for itself needs one.
 
-If the sky is better, only the largest of these Gaussians are removed, those that are larger than the path of the
-cameras itself. Others show a part of the scene besides, such as the far ground, and training takes the sky off them.
+If the sky is better, it is fitted to all pixels of all photographs, and only the largest of these Gaussians are
+removed, those that are larger than the path of the cameras itself. Others show a part of the scene besides, such as the far ground, and training takes the sky off them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -107,20 +107,28 @@ def is_larger(state: TrainState, iteration: Iteration, than: float) -> Bools:
     return larger
 
 
+def counted_pixels(iteration: Iteration, view_ids: Sequence[int]) -> dict[int, Ints]:
+    """Return the pixels of training views, as y W + x, that their masks leave."""
+    views = {index: iteration.scene.train_views[index].loaded() for index in view_ids}
+    return {
+        index: np.arange(view.camera.width * view.camera.height) if view.mask is None else np.flatnonzero(view.mask)
+        for index, view in views.items()
+    }
+
+
 def open_pixels(state: TrainState, iteration: Iteration, view_ids: Sequence[int], is_drawn: Bools) -> dict[int, Ints]:
-    """Return those pixels of training views, as y W + x, that show what is behind the Gaussians ``is_drawn`` [N].
+    """Return those of the pixels that show what is behind the Gaussians ``is_drawn`` [N].
 
     Views with too few such pixels are left out.
     """
     request = plain_request(iteration)._replace(is_visible=is_drawn)
-    pixels: dict[int, Ints] = {}
-    for index in view_ids:
+    pixels = {}
+    for index, counted in counted_pixels(iteration, view_ids).items():
         view = iteration.scene.train_views[index].loaded()
-        alpha = iteration.renderer.render(state.model, view, request)[0].alpha
-        is_open = 1.0 - alpha > OPEN
-        is_open = is_open if view.mask is None else is_open & view.mask
+        alpha = iteration.renderer.render(state.model, view, request)[0].alpha.ravel()
+        is_open = 1.0 - alpha[counted] > OPEN
         if np.count_nonzero(is_open) > LEAST_OPEN * alpha.size:
-            pixels[index] = np.flatnonzero(is_open)
+            pixels[index] = counted[is_open]
     return pixels
 
 
@@ -167,7 +175,7 @@ def switch_sky_on(state: TrainState, iteration: Iteration, *, least_sky_gain: fl
     why = f"a sky in place of {n:,} Gaussians explains {evidence.gain:.2f} dB more of what others show there"
     if not evidence.is_above(least_sky_gain, N_ERRORS):
         return f"nothing done: {why}"
-    sky = fitted_sky(photographs_behind(state, iteration, pixels, ~huge)).astype(np.float32)
+    sky = fitted_sky(photographs_behind(state, iteration, counted_pixels(iteration, ids), ~huge)).astype(np.float32)
     apply_edit(state, keep(state.gaussians, ~huge))
     decision = Decision(iteration.step, "sky", why, evidence.gain, evidence.standard_error)
     switch_on(state, BACKDROP, {SKY: sky}, decision)
