@@ -21,7 +21,8 @@ them gain by whatever it explains, and a sky explains nearly all of what it show
 and three standard errors, where a calibration that each photograph has for itself needs one.
 
 If the sky is better, it is fitted to all pixels of all photographs, and only the largest of these Gaussians are
-removed, those that are larger than the path of the cameras itself. Others show a part of the scene besides, such as the far ground, and training takes the sky off them.
+removed, those that are larger than the path of the cameras itself. Others show a part of the scene besides, such as the
+far ground, and training takes the sky off them.
 """
 
 from collections.abc import Mapping, Sequence
