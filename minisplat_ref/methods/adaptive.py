@@ -65,7 +65,7 @@ MOST_ITERATIONS = 30_000
 LEAST_GAIN = 0.1  # dB of the squared error, for which a calibration of the photographs is worthwhile
 LEAST_SKY_GAIN = 2.0  # dB, likewise, for a sky, where it shows: it explains nearly all that is there
 LEAST_MEASUREMENTS = 4  # to fit a line
-LEAST_SIDE = 120  # pixels: on smaller views a training takes seconds, and there is nothing to save
+LEAST_SIDE = 120  # pixels: on smaller views, calibrations were found where there are none
 SMALLEST_SIDE = 16  # pixels: a tile
 LEAST_VARIATION = 4 / 255  # of a band of the harmonics, out of 1
 
