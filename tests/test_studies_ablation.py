@@ -7,7 +7,7 @@ import pytest
 
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.experiments.studies import FIGURE, RESULT, ablation, front
+from minisplat_ref.experiments.studies import FIGURE, RESULT, ablation, conditions, front
 from minisplat_ref.experiments.studies.ablation import FULL, variants_of
 from minisplat_ref.experiments.studies.front import RUNS
 from minisplat_ref.io.images import read_image
@@ -103,10 +103,12 @@ def test_what_has_not_fired_has_no_row(tmp_path, capsys, small, monkeypatch):
     """Photographs of 48 x 36 pixels are never halved, though the recipe has a date until which they should be."""
     name = "half-size warm-up"
     monkeypatch.setattr(ablation, "MECHANISMS", {name: ablation.MECHANISMS[name]})
+    monkeypatch.setattr(conditions, "FEW", 2)
     out = tmp_path / "out"
-    command = ["study", "ablation", "room", "--out", str(out), "--recipe", "mini-splatting2"]
+    command = ["study", "ablation", "room", "--out", str(out), "--recipe", "mini-splatting2", "--condition", "few"]
     assert main([*command, "--iterations", "12", "--seeds", "0"]) == 0
     printed = capsys.readouterr().out
+    assert "room, 4 training views" in printed and "12 iterations, condition few" in printed
     assert f"never acted, so that nothing can be said of it: {name}" in printed and f"- {name}" not in printed
     result = json.loads((out / RESULT).read_text())
     assert set(result["summary"]) == {FULL} and result["acts"] == {name: 0}
@@ -116,6 +118,9 @@ def test_bad_input_is_one_line(tmp_path, capsys, small):
     out = tmp_path / "out"
     assert main(["study", "ablation", "room", "--out", str(out), "--recipe", "3dgs", "--iterations", "60"]) == 2
     assert "recipe 3dgs has nothing to take out: choose from mini-splatting, " in capsys.readouterr().err
+    condition = ["--condition", "night"]
+    assert main(["study", "ablation", "room", "--out", str(out), "--iterations", "60", *condition]) == 2
+    assert "condition 'night' does not exist: choose from whole, few, " in capsys.readouterr().err
     assert not out.exists()
     out.mkdir()
     assert main(["study", "ablation", "room", "--out", str(out), "--iterations", "60"]) == 2

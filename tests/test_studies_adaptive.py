@@ -10,6 +10,7 @@ from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.studies import FIGURE, RESULT, adaptive, front
+from minisplat_ref.experiments.studies.conditions import get_condition
 from minisplat_ref.experiments.studies.front import RUNS
 from minisplat_ref.io.images import read_image
 from minisplat_ref.methods.adaptive import ADAPTIVE
@@ -22,7 +23,7 @@ def scene():
 
 
 def test_conditions(scene):
-    few, gains = adaptive.few_photographs(scene), adaptive.random_gains(scene)
+    few, gains, both = (get_condition(name)(scene) for name in ("few", "gains", "few-gains"))
     assert [view.name for view in few.train_views] == [view.name for view in scene.train_views[::5]]
     assert few.test_views is scene.test_views and gains.test_views is scene.test_views
     ratios = [
@@ -30,6 +31,8 @@ def test_conditions(scene):
         for new, old in zip(gains.train_views, scene.train_views, strict=True)
     ]
     assert 0.69 < min(ratios) < 0.9 < 1.1 < max(ratios) < 1.41
+    assert [view.name for view in both.train_views] == [view.name for view in few.train_views]
+    assert all((new.image != old.image).any() for new, old in zip(both.train_views, few.train_views, strict=True))
 
 
 def test_each_rule_is_taken_out():

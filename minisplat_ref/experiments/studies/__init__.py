@@ -14,7 +14,7 @@
 ==========================  =====================================================================
 
 This module has their names and arguments. The other modules do the work and load matplotlib and Numba, so they are
-imported when a study runs. :mod:`.front` has what they share.
+imported when a study runs. :mod:`.front` has what they share, and :mod:`.conditions` how they disturb a scene.
 """
 
 import argparse
@@ -27,6 +27,10 @@ from minisplat_ref.study import Study
 
 RESULT, FIGURE = "result.json", "figure.png"  # files that every study writes
 RECIPE_HELP = "name as in train --recipe"
+CONDITION_HELP = (
+    "whole, few (every fifth photograph), gains (wrong exposures), few-gains (both), poses (wrong cameras),"
+    " sizes (every second at half the size), sky (synthetic scenes, cut off)"
+)
 
 
 def all_studies() -> dict[str, Study]:
@@ -102,8 +106,7 @@ def _add_adaptive_arguments(parser: argparse.ArgumentParser) -> None:
         type=listed(name),
         default=("whole", "few", "gains"),
         metavar="C,D",
-        help="whole, few (every fifth photograph), gains (wrong exposures), poses (wrong cameras), sizes"
-        " (every second at half the size), sky (synthetic scenes, cut off; default: the first three)",
+        help=f"{CONDITION_HELP} (default: the first three)",
     )
     _add_seeds(parser)
 
@@ -119,6 +122,9 @@ def _add_ablation_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--deviations", action="store_true", help="take back what deviates from the published method instead"
+    )
+    parser.add_argument(
+        "--condition", type=name, default="whole", metavar="C", help=f"{CONDITION_HELP} (default whole)"
     )
     _add_seeds(parser)
 

@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.experiments.studies.conditions import get_condition
 from minisplat_ref.experiments.studies.front import (
     BLUE,
     RED,
@@ -141,8 +142,10 @@ def run(args: argparse.Namespace) -> None:
     if len(variants) == 1:
         names = [r.name for r in RECIPES.values() if len(variants_of(r, args.iterations, rules)) > 1]
         raise InputError(f"recipe {args.recipe} has nothing to take out: choose from {', '.join(names)}")
+    scene = get_condition(args.condition)(scene)
     description = describe_scene(scene)
     settings = {"recipe": recipe.name, "iterations": recipe.iterations, "downscale": args.downscale}
+    settings |= {"condition": args.condition}
     records = read_records(args.out, {**settings, "deviations": args.deviations, "scene": description["scene"]})
     done = {(record["without"], record["seed"]) for record in records}
     missing = [(name, seed) for seed in args.seeds for name in variants if (name, seed) not in done]
@@ -157,7 +160,8 @@ def run(args: argparse.Namespace) -> None:
     result = {**description, **settings, "seeds": list(args.seeds), "acts": acts, "summary": summary, "runs": records}
     write(args.out, result, draw(summary))
     print(title(description))
-    print(f"{recipe.name}, {recipe.iterations} iterations, seeds {', '.join(map(str, args.seeds))}\n")
+    length = f"{recipe.name}, {recipe.iterations} iterations"
+    print(f"{length}, condition {args.condition}, seeds {', '.join(map(str, args.seeds))}\n")
     print(markdown_table(["without", "acts", "PSNR (dB)", "difference (dB)", "Gaussians", "seconds"], to_rows(result)))
     if idle:
         print(f"\nnever acted, so that nothing can be said of it: {', '.join(idle)}")

@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.studies.adaptive_candidates import CANDIDATES
-from minisplat_ref.experiments.studies.defects import halved, multiplied, under_a_sky, with_turned_cameras
+from minisplat_ref.experiments.studies.conditions import get_condition
 from minisplat_ref.experiments.studies.front import (
     BLUE,
     RED,
@@ -51,52 +51,9 @@ from minisplat_ref.types import Gaussians, Scene
 ITERATIONS = 3000  # of recipes with a schedule
 WARM_UP = 20  # iterations
 N_MEASUREMENTS = 24  # in those iterations; for adaptive with the same interval
-FEW = 5  # one of every so many training photographs remains
-GAINS = (0.7, 1.4)  # of a photograph, uniform in the logarithm
 NEAR = 0.1  # dB
 MEANS = ("psnr", "n_gaussians", "n_numbers", "step", "seconds")  # over seeds
 COLORS = (BLUE, "#7a9a3a", "#c98a2b", RED, "#6f5b9a")
-
-
-def whole(scene: Scene) -> Scene:
-    """Return the scene."""
-    return scene
-
-
-def few_photographs(scene: Scene) -> Scene:
-    """Return the scene with every fifth training photograph."""
-    return scene._replace(train_views=scene.train_views[::FEW])
-
-
-def random_gains(scene: Scene) -> Scene:
-    """Return the scene with every training photograph multiplied by a gain of its own; test views stay."""
-    low, high = np.log(GAINS)
-    return multiplied(scene, np.exp(np.random.default_rng(0).uniform(low, high, len(scene.train_views))))
-
-
-def half_a_pixel_off(scene: Scene) -> Scene:
-    """Return the scene with every training camera turned by half a pixel; test cameras stay."""
-    return with_turned_cameras(scene, np.random.default_rng(0))
-
-
-def planted_sky(scene: Scene) -> Scene:
-    """Return a synthetic scene cut off under a sky, in the test views, too."""
-    return under_a_sky(scene, np.random.default_rng(0))
-
-
-def two_sizes(scene: Scene) -> Scene:
-    """Return the scene with every second training photograph at half the width and height."""
-    return halved(scene, np.arange(len(scene.train_views)) % 2 == 1)
-
-
-CONDITIONS: Mapping[str, Callable[[Scene], Scene]] = {
-    "whole": whole,
-    "few": few_photographs,
-    "gains": random_gains,
-    "poses": half_a_pixel_off,
-    "sizes": two_sizes,
-    "sky": planted_sky,
-}
 
 
 def with_clones(recipe: Recipe) -> Recipe:
@@ -194,9 +151,7 @@ def run(args: argparse.Namespace) -> None:
     scene = read_scene(args.scene, args.downscale)
     if not scene.test_views:
         raise InputError(f"scene {scene.name} has no test views to compare by: add photographs")
-    unknown = [name for name in args.conditions if name not in CONDITIONS]
-    if unknown:
-        raise InputError(f"condition {unknown[0]!r} does not exist: choose from {', '.join(CONDITIONS)}")
+    conditions = {name: get_condition(name) for name in args.conditions}
     variants = RULES if args.rules else SWEEP if args.sweep else CANDIDATES if args.candidates else {}
     recipes = {name: change(adaptive.ADAPTIVE) for name, change in variants.items()} or _named(args.recipes)
     description = describe_scene(scene)
@@ -207,7 +162,7 @@ def run(args: argparse.Namespace) -> None:
     if todo:
         warm_up(scene, recipes.values())
     for condition, name, seed in tqdm(todo, desc="trainings", leave=False, disable=None):
-        measured = measure(CONDITIONS[condition](scene), recipes[name], seed)
+        measured = measure(conditions[condition](scene), recipes[name], seed)
         record = {"condition": condition, "recipe": name, "seed": seed, **measured}
         append(args.out, record)
         records.append(record)
