@@ -238,7 +238,7 @@ def test_start_anew_has_no_past(state, iteration):
     state.stats["is_blurred"] = np.zeros(n_rows(state.gaussians), bool)
     state.view_order = [2, 0]  # in the middle of a round
     means = state.gaussians.means.copy()
-    mini_splatting.restart_from_means(state, iteration, sh_degree=2)
+    mini_splatting.restart_from_means(state, iteration, sh_degree=2, largest_size=0.1)
     assert_array_equal(state.gaussians.means, means)
     assert state.gaussians.sh_rest.shape[1] == 8 and state.adam.first.sh_rest.shape[1] == 8
     assert not state.adam.second.means.any() and state.adam.step == 0
@@ -309,14 +309,19 @@ def test_depth_is_given_the_settings_in_world_units(state, iteration, monkeypatc
     assert_array_equal(state.gaussians.means, np.eye(4, 3))
 
 
-def test_few_points_far_away_do_not_become_veils(state, iteration, monkeypatch, rng):
+@pytest.mark.parametrize(
+    ("recipe", "action"),
+    [("mini-splatting2", "reinitialise_from_depth"), ("mini-splatting", "restart_from_means")],
+)
+def test_few_points_far_away_do_not_become_veils(state, iteration, monkeypatch, rng, recipe, action):
     """Their neighbours are as far away as the cameras: without a limit they would reach them."""
-    points = np.vstack([rng.uniform(-0.1, 0.1, (50, 3)), 200.0 * np.eye(3)])
+    points = np.vstack([rng.uniform(-0.1, 0.1, (50, 3)), 200.0 * np.eye(3)]).astype(np.float32)
     points_and_colors = points, np.zeros((53, 3), np.uint8)
+    state.gaussians = from_points(*points_and_colors, sh_degree=0)  # the restart's
+    before = np.exp(state.gaussians.log_scales)
     monkeypatch.setattr(mini_splatting, "reinitial_points", lambda *_, **__: points_and_colors)
-    act = next(e.action for e in RECIPES["mini-splatting2"].events if "reinitialise_from_depth" in repr(e.action))
+    act = next(event.action for event in RECIPES[recipe].events if action in repr(event.action))
     act(state, iteration)
-    before = np.exp(from_points(*points_and_colors, sh_degree=0).log_scales)
     after = np.exp(state.gaussians.log_scales)
     assert_array_equal(after[:50], before[:50])
     assert (before[50:] > 100).all() and (after[50:] < 25).all()

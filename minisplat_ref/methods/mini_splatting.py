@@ -28,7 +28,7 @@ from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.rates import LogLinear, Rewind
 from minisplat_ref.training.schedule import BLEND_STATS, At, During, Every
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit, start_anew
-from minisplat_ref.types import Floats, Scene
+from minisplat_ref.types import Floats, Gaussians, Scene
 
 Metric = Callable[[ImportanceStats], Floats]
 """Maps the statistics of all training views to importance [N]: ``importance.indoor`` or ``importance.outdoor``."""
@@ -123,9 +123,8 @@ def reinitialise_from_depth(
     Their number is ``points_per_gaussian`` times that of the population. Points that other views see through, by more
     than ``depth_tolerance``, move out to ``backdrop_extents`` times the scene's extent. With ``drawn_mass``, only the
     Gaussians that carry this fraction of the importance are rendered for the depths (Mini-Splatting2); the number of
-    points is that of the population before. No Gaussian begins larger than :func:`size_limits`, with the fraction
-    ``largest_size``: few points that have moved out are as far from each other as from the cameras, and would cover the
-    views.
+    points is that of the population before. No Gaussian begins larger than :func:`size_limits` with the fraction
+    ``largest_size``.
     """
     n_points = round(points_per_gaussian * n_rows(state.gaussians))
     if drawn_mass is not None:
@@ -144,8 +143,7 @@ def reinitialise_from_depth(
         backend=iteration.backend,
     )
     gaussians = from_points(points, colors, sh_degree=0)
-    limits = np.log(size_limits(gaussians.means, iteration.scene, largest_size)).astype(gaussians.log_scales.dtype)
-    start_anew(state, iteration, gaussians._replace(log_scales=np.minimum(gaussians.log_scales, limits[:, None])))
+    start_anew(state, iteration, limited_sizes(gaussians, iteration.scene, largest_size))
 
 
 def size_limits(means: Floats, scene: Scene, size_fraction: float) -> Floats:
@@ -156,6 +154,16 @@ def size_limits(means: Floats, scene: Scene, size_fraction: float) -> Floats:
     """
     center = np.mean([view.camera.center for view in scene.train_views], axis=0)  # [3]
     return size_fraction * np.maximum(scene.extent, np.linalg.norm(means - center, axis=1))
+
+
+def limited_sizes(gaussians: Gaussians, scene: Scene, size_fraction: float) -> Gaussians:
+    """Return Gaussians that are no larger than :func:`size_limits`.
+
+    What begins anew is as large as the distance to its neighbours. Few points far behind the scene are as far from each
+    other as from the cameras, and would veil the views.
+    """
+    limits = np.log(size_limits(gaussians.means, scene, size_fraction)).astype(gaussians.log_scales.dtype)
+    return gaussians._replace(log_scales=np.minimum(gaussians.log_scales, limits[:, None]))
 
 
 def prune_large_by_distance(state: TrainState, iteration: Iteration, *, size_fraction: float) -> None:
@@ -233,9 +241,13 @@ def prune_tail(
     apply_edit(state, keep(state.gaussians, simplification.carrying_mass(importance, mass)))
 
 
-def restart_from_means(state: TrainState, iteration: Iteration, *, sh_degree: int) -> None:
-    """Start again from the Gaussians' centres and colours; everything else, including the moments, is reset."""
-    start_anew(state, iteration, simplification.reinitialised(state.gaussians, sh_degree))
+def restart_from_means(state: TrainState, iteration: Iteration, *, sh_degree: int, largest_size: float) -> None:
+    """Start again from the Gaussians' centres and colours; everything else, including the moments, is reset.
+
+    No Gaussian begins larger than :func:`size_limits` with the fraction ``largest_size``.
+    """
+    gaussians = simplification.reinitialised(state.gaussians, sh_degree)
+    start_anew(state, iteration, limited_sizes(gaussians, iteration.scene, largest_size))
 
 
 def store_sh(state: TrainState, iteration: Iteration, *, sh_degree: int) -> None:
@@ -288,7 +300,7 @@ _DENSIFICATION = (
 )
 _AFTER_SIMPLIFICATION = (
     At(15_000, partial(store_sh, sh_degree=3)),
-    At(15_000, partial(restart_from_means, sh_degree=3)),
+    At(15_000, partial(restart_from_means, sh_degree=3, largest_size=LARGE)),
 )
 
 MINI_SPLATTING = GS._replace(
