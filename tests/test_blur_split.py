@@ -74,8 +74,9 @@ def test_blurred_are_split_whatever_their_gradient_and_size(gaussians, rng, draw
     without = edit_of(gaussians, pulled, np.zeros(6, bool), rng, draw_children=draw_children)
     assert_array_equal(without.parent_ids, [0, 1, 2, 4, 5, 1, 5, 3, 3])
     edit = edit_of(gaussians, pulled, np.arange(6) < 4, rng, draw_children=draw_children)
-    assert_array_equal(edit.parent_ids, [4, 5, 5, 0, 1, 2, 3, 0, 1, 2, 3])  # 1 is split, no longer cloned
-    assert_array_equal(edit.is_new, [False] * 2 + [True] * 9)
+    assert_array_equal(edit.parent_ids, [4, 5, 1, 5, 0, 1, 2, 3, 0, 1, 2, 3])  # 1 is cloned and split
+    assert_array_equal(edit.is_new, [False] * 2 + [True] * 10)
+    assert_array_equal(edit.gaussians.means[2], gaussians.means[1])
     near = np.linalg.norm(edit.gaussians.means - gaussians.means[edit.parent_ids], axis=1)
     assert np.all(near < 6 * scales[edit.parent_ids])  # rows and parent_ids are in the same order
 

@@ -203,12 +203,16 @@ def published_firings(event):
     return [event.step] if isinstance(event, At) else firing(event, event.stop)
 
 
-LENGTHS = (*range(100, 600), *range(600, 60_001, 487))
-"""Of compressed and stretched runs; densest where rounding bites."""
+LENGTHS = [
+    pytest.param((*range(100, 600), *range(600, 60_001, 487)), id="densest where rounding bites"),
+    pytest.param(range(100, 60_001), id="all", marks=pytest.mark.slow),
+]
+"""Of compressed and stretched runs."""
 
 
+@pytest.mark.parametrize("lengths", LENGTHS)
 @pytest.mark.parametrize("name", ["mini-splatting", "mini-splatting2"])
-def test_events_keep_their_order_and_gaps_at_every_length(name):
+def test_events_keep_their_order_and_gaps_at_every_length(name, lengths):
     """Of any two published iterations, the earlier stays the earlier, and their gap is in proportion.
 
     Rounding moves each by half an iteration at most. What `least_gap` thins is in the next test.
@@ -219,7 +223,7 @@ def test_events_keep_their_order_and_gaps_at_every_length(name):
     ]
     published = sorted((step, number) for number, event in enumerate(events) for step in published_firings(event))
     assert len(published) == {"mini-splatting": 7, "mini-splatting2": 14}[name]
-    for n in LENGTHS:
+    for n in lengths:
         factor = Fraction(n, recipe.iterations)
         steps = [round(step * factor) for step, _ in published]
         for (_, number), step in zip(published, steps, strict=True):
@@ -254,10 +258,6 @@ def test_the_last_density_event_is_as_far_from_simplification_as_published():
         fired = firings(recipe)
         gap = fired["simplify"][0] - fired["aggressive_clone"][-1]
         assert gap == pytest.approx(250 * n / 18_000, abs=1)
-
-
-def test_what_must_not_come_too_early_is_left_out():
-    assert firing(At(4, nothing, least_step=5)) == [] and firing(At(5, nothing, least_step=5)) == [5]
 
 
 def test_rates_of_short_runs_are_raised_where_the_recipe_says_so():

@@ -1,18 +1,44 @@
 """The study of ablations: what each variant lacks, and a study that was interrupted."""
 
 import json
+from functools import partial
 
 import numpy as np
 import pytest
 
+from minisplat_ref.backends import CPU
 from minisplat_ref.cli import main
+from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.errors import InputError
 from minisplat_ref.experiments.studies import FIGURE, RESULT, ablation, conditions, front
-from minisplat_ref.experiments.studies.ablation import FULL, variants_of
 from minisplat_ref.experiments.studies.front import RUNS
+from minisplat_ref.experiments.studies.variants import (
+    DEVIATIONS,
+    FULL,
+    MECHANISMS,
+    reinitialise_from_culled,
+    variants_of,
+    with_lost_steps,
+    with_settings,
+)
 from minisplat_ref.io.images import read_image
 from minisplat_ref.methods import RECIPES, gaussian_splatting
-from minisplat_ref.training.schedule import action_name, configured, firing_steps, settings_of
+from minisplat_ref.methods.mini_splatting import reinitialise_from_depth
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.schedule import At, action_name, configured, firing_steps, settings_of
+from minisplat_ref.training.state import Iteration
+from minisplat_ref.types import numbered
+
+
+def tiny_room():
+    return make_scene("room", n_views=8, width=48, height=36, supersampling=1, n_points=150)
+
+
+@pytest.fixture
+def room():
+    scene = tiny_room().scene
+    return scene._replace(train_views=numbered(scene.train_views))
 
 
 def names_of(recipe):
@@ -23,7 +49,7 @@ def test_each_variant_lacks_one_thing():
     recipe = RECIPES["mini-splatting2"]
     variants = variants_of(recipe, 18_000)
     assert variants[FULL] == recipe._replace(short_run_exponent=0.0)
-    assert set(variants) == set(ablation.MECHANISMS) - {"restart"} | {FULL}
+    assert set(variants) == set(MECHANISMS) - {"restart"} | {FULL}
     assert "collect_blur" in names_of(recipe) and "collect_blur" not in names_of(variants["blur split"])
     assert "reinitialise_from_depth" not in names_of(variants["reinitialisation"])
     assert settings_of(variants["culling"])["visibility_mass"] == 1.0 and settings_of(variants["clone"])["factor"] == 1
@@ -37,23 +63,53 @@ def test_each_variant_lacks_one_thing():
 
 
 def test_deviations_are_taken_back():
-    variants = variants_of(RECIPES["mini-splatting2"], 3_000, ablation.DEVIATIONS)
-    assert set(variants) == set(ablation.DEVIATIONS) - {"size limit by distance", "no bias correction"} | {FULL}
+    variants = variants_of(RECIPES["mini-splatting2"], 3_000, DEVIATIONS)
+    assert set(variants) == set(DEVIATIONS) - {"size limit by distance", "no bias correction"} | {FULL}
     assert settings_of(variants["cap of the population"])["most_per_pixel"] == np.inf
     rates = [variants[name].learning_rates.of["sh_dc"] for name in ("raised rates", FULL)]
     assert rates[0] == RECIPES["3dgs"].learning_rates.of["sh_dc"] < rates[1]
-    published = variants_of(RECIPES["mini-splatting"], 30_000, ablation.DEVIATIONS)
+    published = variants_of(RECIPES["mini-splatting"], 30_000, DEVIATIONS)
     assert "raised rates" not in published and "prune_large" in names_of(published["size limit by distance"])
-    assert set(variants_of(RECIPES["3dgs-accel"], 30_000, ablation.DEVIATIONS)) == {FULL, "no bias correction"}
+    assert published.keys().isdisjoint({"depths of whole views"})  # Mini-Splatting culls no view
+    of_3dgs = variants_of(RECIPES["3dgs-accel"], 30_000, DEVIATIONS)
+    assert set(of_3dgs) == {FULL, "no step lost", "no bias correction"}
 
 
 def test_fewer_events_are_a_deviation_of_short_runs():
-    assert "fewer events" not in variants_of(RECIPES["mini-splatting2"], 18_000, ablation.DEVIATIONS)
-    variants = variants_of(RECIPES["mini-splatting2"], 1_800, ablation.DEVIATIONS)
+    assert "fewer events" not in variants_of(RECIPES["mini-splatting2"], 18_000, DEVIATIONS)
+    variants = variants_of(RECIPES["mini-splatting2"], 1_800, DEVIATIONS)
     steps = {name: firing_steps(variants[name], gaussian_splatting.clone_and_split) for name in (FULL, "fewer events")}
     assert steps["fewer events"] == [step // 10 for step in range(600, 3_000, 100) if step != 2_000]
     assert set(steps[FULL]) < set(steps["fewer events"]) and len(steps[FULL]) == 1
     assert settings_of(variants["size limit of new points"])["largest_size"] == np.inf
+
+
+def test_steps_that_the_released_code_loses(room):
+    """Of six steps the one with an event that may change the population, and the last, change nothing."""
+    events = (At(3, partial(gaussian_splatting.prune_faint, least_opacity=1e-9)),)
+    recipe = with_lost_steps(RECIPES["3dgs-accel"]._replace(iterations=6, events=events))
+    ends = {}
+    state = train(room, recipe, seed=0, on_step=lambda report: ends.update({report.step: copied(report.state)}))
+    assert [step for step in range(2, 7) if not np.array_equal(ends[step], ends[step - 1])] == [2, 4, 5]
+    assert state.adam.step == 4
+
+
+def copied(state):
+    return state.gaussians.means.copy()
+
+
+def test_depths_are_drawn_of_what_the_culling_table_says(room):
+    def begun_anew(act, is_visible):
+        state = train(room, RECIPES["3dgs-accel"]._replace(iterations=12, events=()), seed=0)
+        state.stats["is_visible"] = np.full((len(state.gaussians.means), len(room.train_views)), is_visible)
+        iteration = Iteration(room, room.train_views[0], None, np.arange(0), None, CPU, GSPLAT_MAIN)
+        event = next(e for e in RECIPES["mini-splatting2"].events if action_name(e) == "reinitialise_from_depth")
+        partial(act, **{**event.action.keywords, "drawn_mass": None})(state, iteration)
+        return state.gaussians.means
+
+    assert np.array_equal(begun_anew(reinitialise_from_culled, True), begun_anew(reinitialise_from_depth, False))
+    with pytest.raises(InputError, match="no pixel of any view shows a surface"):
+        begun_anew(reinitialise_from_culled, False)
 
 
 def test_what_never_acts_has_no_row():
@@ -65,12 +121,12 @@ def test_what_never_acts_has_no_row():
 
 @pytest.fixture
 def small(monkeypatch):
-    scene = make_scene("room", n_views=8, width=48, height=36, supersampling=1, n_points=150)
+    scene = tiny_room()
     monkeypatch.setattr(front, "make_scene", lambda name: scene)
 
 
 def test_study_and_its_continuation(tmp_path, capsys, small, monkeypatch):
-    kept = {name: ablation.MECHANISMS[name] for name in ("restart", "sampling")}
+    kept = {name: MECHANISMS[name] for name in ("restart", "sampling")}
     monkeypatch.setattr(ablation, "MECHANISMS", kept)
     out = tmp_path / "out"
     command = ["study", "ablation", "room", "--out", str(out), "--iterations", "60", "--recipe", "mini-splatting"]
@@ -102,7 +158,7 @@ def test_study_and_its_continuation(tmp_path, capsys, small, monkeypatch):
 def test_what_has_not_fired_has_no_row(tmp_path, capsys, small, monkeypatch):
     """Photographs of 48 x 36 pixels are never halved, though the recipe has a date until which they should be."""
     name = "half-size warm-up"
-    monkeypatch.setattr(ablation, "MECHANISMS", {name: ablation.MECHANISMS[name]})
+    monkeypatch.setattr(ablation, "MECHANISMS", {name: MECHANISMS[name]})
     monkeypatch.setattr(conditions, "FEW", 2)
     out = tmp_path / "out"
     command = ["study", "ablation", "room", "--out", str(out), "--recipe", "mini-splatting2", "--condition", "few"]
@@ -128,5 +184,5 @@ def test_bad_input_is_one_line(tmp_path, capsys, small):
 
 
 def test_settings_that_a_recipe_lacks_change_nothing():
-    assert ablation.with_settings(factor=1)(RECIPES["3dgs"]) is RECIPES["3dgs"]
+    assert with_settings(factor=1)(RECIPES["3dgs"]) is RECIPES["3dgs"]
     assert configured(RECIPES["mini-splatting2"], factor=1) != RECIPES["mini-splatting2"]

@@ -98,7 +98,8 @@ def clone_and_split(
         Draws the children's positions.
     is_blurred : ndarray of shape (N,) of booleans, optional
         Split these too, whatever their gradient and size (Mini-Splatting,
-        :func:`minisplat_ref.strategy.blur_split.is_blurred`).
+        :func:`minisplat_ref.strategy.blur_split.is_blurred`). One that is also small and pulled is cloned first, as in
+        the released code, so that its clone and its two children take its place.
     draw_children : function
         :func:`random_children`, or another with its signature and order of rows.
 
@@ -113,7 +114,7 @@ def clone_and_split(
     if is_blurred is not None:
         is_split |= is_blurred
     survivor_ids, split_ids = np.flatnonzero(~is_split), np.flatnonzero(is_split)
-    clone_ids = np.flatnonzero(is_pulled & ~is_split)
+    clone_ids = np.flatnonzero(is_pulled & ~is_large)
     parent_ids = np.concatenate([survivor_ids, clone_ids, np.tile(split_ids, N_CHILDREN)])
     return Edit(
         concat(take(gaussians, survivor_ids), take(gaussians, clone_ids), draw_children(gaussians, split_ids, rng)),

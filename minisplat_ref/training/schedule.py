@@ -95,12 +95,10 @@ class At(NamedTuple):
 
     step: int
     action: Action
-    least_step: int = 0
-    """The action does not happen at all if scaling moves it before this iteration."""
 
     def is_due(self, step: int) -> bool:
         """Return whether the action belongs to iteration ``step``, counted from 1."""
-        return step == self.step and step >= self.least_step
+        return step == self.step
 
     def scaled(self, factor: Fraction) -> "At":
         """Return the event with its iteration multiplied by ``factor``, at least the first."""
@@ -189,9 +187,8 @@ def scaled(recipe: Recipe, iterations: int) -> Recipe:
     Every milestone is multiplied by ``iterations / recipe.iterations`` and rounded to the nearest integer (ties to
     even): those of each event and loss term, of the spherical harmonics and of the rates' schedules. So the order of
     events is that of the recipe, whatever the length. A one-time event happens at iteration 1 at the earliest; periodic
-    ones may happen less often, see :attr:`Every.least_gap`. An event that would come before its ``least_step`` is left
-    out. Thresholds stay; so do learning rates, unless the recipe or the calibration has a ``short_run_exponent``. A
-    recipe that decides its own length keeps everything but the limit.
+    ones may happen less often, see :attr:`Every.least_gap`. Thresholds stay; so do learning rates, unless the recipe or
+    the calibration has a ``short_run_exponent``. A recipe that decides its own length keeps everything but the limit.
 
     Raises
     ------

@@ -10,11 +10,9 @@ folder continues with those that are missing.
 """
 
 import argparse
-import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from matplotlib.figure import Figure
@@ -34,95 +32,15 @@ from minisplat_ref.experiments.studies.front import (
     title,
     write,
 )
-from minisplat_ref.methods import RECIPES, gaussian_splatting, get_recipe, mini_splatting, mini_splatting2
+from minisplat_ref.experiments.studies.variants import ACTIONS, DEVIATIONS, FULL, MECHANISMS, variants_of
+from minisplat_ref.methods import RECIPES, get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.reporting import markdown_table
-from minisplat_ref.strategy import simplify as simplification
 from minisplat_ref.training.loop import HALF_SIZE, train
-from minisplat_ref.training.schedule import (
-    Action,
-    Event,
-    Every,
-    Recipe,
-    configured,
-    does,
-    firing_steps,
-    scaled,
-    settings_of,
-    without,
-)
+from minisplat_ref.training.schedule import Recipe, scaled
 from minisplat_ref.types import Scene
 
-FULL = "everything"
 MEASURES = ("psnr", "ssim", "n_gaussians", "seconds")
-
-
-def with_bias_correction(recipe: Recipe) -> Recipe:
-    """Return 3dgs-accel with bias correction, the baseline of Mini-Splatting2's tables; other recipes have it."""
-    return recipe._replace(adam=recipe.adam._replace(has_bias_correction=True))
-
-
-def with_settings(**settings: Any) -> Callable[[Recipe], Recipe]:
-    """Return a function that replaces settings of a recipe, and returns a recipe without all of them unchanged."""
-    return lambda recipe: configured(recipe, **settings) if settings.keys() <= settings_of(recipe).keys() else recipe
-
-
-def as_3dgs_prunes(recipe: Recipe) -> Recipe:
-    """Return the recipe with the size limit of 3DGS, which is the same near and far."""
-
-    def changed(event: Event) -> Event:
-        if not does(event, mini_splatting.prune_large_by_distance):
-            return event
-        return event._replace(action=partial(gaussian_splatting.prune_large, size_fraction=0.1))
-
-    return recipe._replace(events=tuple(map(changed, recipe.events)))
-
-
-def with_all_events(recipe: Recipe) -> Recipe:
-    """Return the recipe with all published density events and opacity resets, however few iterations lie between."""
-    events = (event._replace(least_gap=1) if isinstance(event, Every) else event for event in recipe.events)
-    return recipe._replace(events=tuple(events))
-
-
-MECHANISMS: Mapping[str, Callable[[Recipe], Recipe]] = {
-    "blur split": partial(without, action=mini_splatting.collect_blur),
-    "reinitialisation": partial(without, action=mini_splatting.reinitialise_from_depth),
-    "sky guard": with_settings(depth_tolerance=None),
-    "intersection preservation": with_settings(is_intersecting=False),
-    "sampling": with_settings(choose=simplification.by_rank),  # keeps the most important ones instead
-    "restart": partial(without, action=mini_splatting.restart_from_means),
-    "culling": with_settings(visibility_mass=1.0),  # every Gaussian with any weight in a view is visible
-    "clone": with_settings(factor=1),
-    "half-size warm-up": lambda recipe: recipe._replace(half_size_until=0),
-    "last prune": partial(without, action=mini_splatting.prune_tail),
-}
-"""The published recipe without each mechanism; a recipe that does not have it stays unchanged."""
-
-DEVIATIONS: Mapping[str, Callable[[Recipe], Recipe]] = {
-    "least blurred area": with_settings(least_area=0),
-    "cap of the population": with_settings(most_per_pixel=math.inf),
-    "sky guard": with_settings(depth_tolerance=None),
-    "size limit by distance": as_3dgs_prunes,
-    "size limit of new points": with_settings(largest_size=math.inf),
-    "least size to halve": lambda recipe: recipe._replace(least_half_size=1) if recipe.half_size_until else recipe,
-    "raised rates": lambda recipe: recipe._replace(short_run_exponent=0.0),
-    "fewer events": with_all_events,
-    "no bias correction": with_bias_correction,
-}
-"""A recipe with the published rule in place of each of ours."""
-
-ACTIONS: Mapping[str, Action] = {
-    "blur split": gaussian_splatting.clone_and_split,
-    "reinitialisation": mini_splatting.reinitialise_from_depth,
-    "sky guard": mini_splatting.reinitialise_from_depth,
-    "intersection preservation": mini_splatting.simplify,
-    "sampling": mini_splatting.simplify,
-    "restart": mini_splatting.restart_from_means,
-    "culling": mini_splatting2.aggressive_clone,
-    "clone": mini_splatting2.aggressive_clone,
-    "last prune": mini_splatting.prune_tail,
-}
-"""The action through which a mechanism acts; half-size views are no action."""
 
 
 def run(args: argparse.Namespace) -> None:
@@ -165,33 +83,6 @@ def run(args: argparse.Namespace) -> None:
     print(markdown_table(["without", "acts", "PSNR (dB)", "difference (dB)", "Gaussians", "seconds"], to_rows(result)))
     if idle:
         print(f"\nnever acted, so that nothing can be said of it: {', '.join(idle)}")
-
-
-def variants_of(
-    published: Recipe, iterations: int, rules: Mapping[str, Callable[[Recipe], Recipe]] = MECHANISMS
-) -> dict[str, Recipe]:
-    """Return the recipe for so many iterations, and without each mechanism that acts within them."""
-
-    def of_length(recipe: Recipe) -> Recipe:
-        return scaled(recipe, iterations)._replace(short_run_exponent=0.0)  # the rates are already raised
-
-    full = of_length(published)
-    variants = {name: of_length(take_out(published)) for name, take_out in rules.items()}
-    differ = {name: variant for name, variant in variants.items() if with_strides(variant) != with_strides(full)}
-    return {FULL: full, **{name: v for name, v in differ.items() if name not in MECHANISMS or has_date(full, name)}}
-
-
-def with_strides(recipe: Recipe) -> Recipe:
-    """Return the recipe with the gaps that its events have: a lower bound that moves no date makes no difference."""
-    events = (event._replace(least_gap=event.stride) if isinstance(event, Every) else event for event in recipe.events)
-    return recipe._replace(events=tuple(events))
-
-
-def has_date(recipe: Recipe, mechanism: str) -> bool:
-    """Return whether a mechanism acts in some iteration of the recipe."""
-    if mechanism not in ACTIONS:
-        return recipe.half_size_until > 0
-    return bool(firing_steps(recipe, ACTIONS[mechanism]))
 
 
 def count_actions(records: Sequence[Mapping[str, Any]], variants: Iterable[str]) -> dict[str, int]:

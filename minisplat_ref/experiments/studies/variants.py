@@ -1,0 +1,191 @@
+"""Recipes with one thing changed: without one mechanism, or with one published rule in the place of ours.
+
+A function takes a published recipe and returns it changed; where there is nothing to change, it returns it as it is.
+:func:`variants_of` scales what it returns to the length of a study. ``docs/FIDELITY.md`` says why we deviate.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+from minisplat_ref.methods import gaussian_splatting, mini_splatting, mini_splatting2
+from minisplat_ref.rendering import Request
+from minisplat_ref.strategy import simplify as simplification
+from minisplat_ref.training.adam import AdamState
+from minisplat_ref.training.schedule import (
+    Action,
+    At,
+    During,
+    Event,
+    Every,
+    Recipe,
+    configured,
+    does,
+    firing_steps,
+    scaled,
+    settings_of,
+    without,
+)
+from minisplat_ref.training.state import Iteration, TrainState
+from minisplat_ref.types import Model, View
+
+FULL = "everything"
+Change = Callable[[Recipe], Recipe]
+
+
+def with_settings(**settings: Any) -> Change:
+    """Return a function that replaces settings of a recipe, and returns a recipe without all of them unchanged."""
+    return lambda recipe: configured(recipe, **settings) if settings.keys() <= settings_of(recipe).keys() else recipe
+
+
+def with_bias_correction(recipe: Recipe) -> Recipe:
+    """Return 3dgs-accel with bias correction, the baseline of Mini-Splatting2's tables; other recipes have it."""
+    return recipe._replace(adam=recipe.adam._replace(has_bias_correction=True))
+
+
+def as_3dgs_prunes(recipe: Recipe) -> Recipe:
+    """Return the recipe with the size limit of 3DGS, which is the same near and far."""
+
+    def changed(event: Event) -> Event:
+        if not does(event, mini_splatting.prune_large_by_distance):
+            return event
+        return event._replace(action=partial(gaussian_splatting.prune_large, size_fraction=0.1))
+
+    return recipe._replace(events=tuple(map(changed, recipe.events)))
+
+
+def with_all_events(recipe: Recipe) -> Recipe:
+    """Return the recipe with all published density events and opacity resets, however few iterations lie between."""
+    events = (event._replace(least_gap=1) if isinstance(event, Every) else event for event in recipe.events)
+    return recipe._replace(events=tuple(events))
+
+
+def with_culled_depths(recipe: Recipe) -> Recipe:
+    """Return the recipe with depths that are drawn of culled views, if it culls any: Mini-Splatting2."""
+
+    def changed(event: Event) -> Event:
+        settings = event.action.keywords if isinstance(event.action, partial) else {}
+        if not does(event, mini_splatting.reinitialise_from_depth) or settings.get("drawn_mass") is None:
+            return event
+        return event._replace(action=partial(reinitialise_from_culled, **settings))
+
+    return recipe._replace(events=tuple(map(changed, recipe.events)))
+
+
+def reinitialise_from_culled(state: TrainState, iteration: Iteration, **settings: Any) -> None:
+    """Do :func:`mini_splatting.reinitialise_from_depth` with what is visible in each view by the culling table alone.
+
+    Importance is measured of all Gaussians; only the request for the surface is culled.
+    """
+    renderer = iteration.renderer
+
+    def render(model: Model, view: View, request: Request) -> Any:
+        if "surface" in request.wants and mini_splatting.is_culling(state):
+            request = request._replace(is_visible=state.stats["is_visible"][:, view.view_id])
+        return renderer.render(model, view, request)
+
+    culled = iteration._replace(renderer=renderer._replace(render=render))
+    mini_splatting.reinitialise_from_depth(state, culled, **settings)
+
+
+KEEPS_ROWS = (
+    gaussian_splatting.reset_opacity,
+    gaussian_splatting.reset_opacity_on_white,
+    mini_splatting.store_sh,
+    mini_splatting.restart_adam,
+    mini_splatting2.stop_culling,
+)
+
+
+def with_lost_steps(recipe: Recipe) -> Recipe:
+    """Return the recipe without the gradient steps that the released code loses.
+
+    There an event comes between gradient and step, and its new tensors have no gradient, so that nothing moves in this
+    iteration; nor does it in the last. Here events come after the step, so that each first takes it back.
+    """
+    before: list[tuple[int, Any, AdamState[Any]]] = []  # the last iteration, and what it ended with
+
+    def copied(bundle: Any) -> Any:
+        return bundle._make(field.copy() for field in bundle)
+
+    def remember(state: TrainState, iteration: Iteration) -> None:
+        adam = state.adam._replace(first=copied(state.adam.first), second=copied(state.adam.second))
+        before[:] = [(iteration.step, copied(state.gaussians), adam)]
+
+    def take_step_back(state: TrainState, iteration: Iteration) -> None:
+        if before and before[0][0] == iteration.step - 1:
+            _, state.gaussians, state.adam = before[0]
+
+    edits = [event for event in recipe.events if not isinstance(event, During) and not does(event, *KEEPS_ROWS)]
+    losses = [event._replace(action=take_step_back) for event in edits]
+    events = (*losses, At(recipe.iterations, take_step_back), *recipe.events, During(remember))
+    return recipe._replace(events=events)
+
+
+MECHANISMS: Mapping[str, Change] = {
+    "blur split": partial(without, action=mini_splatting.collect_blur),
+    "reinitialisation": partial(without, action=mini_splatting.reinitialise_from_depth),
+    "sky guard": with_settings(depth_tolerance=None),
+    "intersection preservation": with_settings(is_intersecting=False),
+    "sampling": with_settings(choose=simplification.by_rank),  # keeps the most important ones instead
+    "restart": partial(without, action=mini_splatting.restart_from_means),
+    "culling": with_settings(visibility_mass=1.0),  # every Gaussian with any weight in a view is visible
+    "clone": with_settings(factor=1),
+    "half-size warm-up": lambda recipe: recipe._replace(half_size_until=0),
+    "last prune": partial(without, action=mini_splatting.prune_tail),
+}
+"""The published recipe without each mechanism; a recipe that does not have it stays unchanged."""
+
+DEVIATIONS: Mapping[str, Change] = {
+    "least blurred area": with_settings(least_area=0),
+    "cap of the population": with_settings(most_per_pixel=math.inf),
+    "sky guard": with_settings(depth_tolerance=None),
+    "size limit by distance": as_3dgs_prunes,
+    "size limit of new points": with_settings(largest_size=math.inf),
+    "least size to halve": lambda recipe: recipe._replace(least_half_size=1) if recipe.half_size_until else recipe,
+    "raised rates": lambda recipe: recipe._replace(short_run_exponent=0.0),
+    "fewer events": with_all_events,
+    "depths of whole views": with_culled_depths,
+    "no step lost": with_lost_steps,
+    "no bias correction": with_bias_correction,
+}
+"""A recipe with the published rule in place of each of ours."""
+
+ACTIONS: Mapping[str, Action] = {
+    "blur split": gaussian_splatting.clone_and_split,
+    "reinitialisation": mini_splatting.reinitialise_from_depth,
+    "sky guard": mini_splatting.reinitialise_from_depth,
+    "intersection preservation": mini_splatting.simplify,
+    "sampling": mini_splatting.simplify,
+    "restart": mini_splatting.restart_from_means,
+    "culling": mini_splatting2.aggressive_clone,
+    "clone": mini_splatting2.aggressive_clone,
+    "last prune": mini_splatting.prune_tail,
+}
+"""The action through which a mechanism acts; half-size views are no action."""
+
+
+def variants_of(published: Recipe, iterations: int, rules: Mapping[str, Change] = MECHANISMS) -> dict[str, Recipe]:
+    """Return the recipe for so many iterations, and without each mechanism that acts within them."""
+
+    def of_length(recipe: Recipe) -> Recipe:
+        return scaled(recipe, iterations)._replace(short_run_exponent=0.0)  # the rates are already raised
+
+    full = of_length(published)
+    variants = {name: of_length(take_out(published)) for name, take_out in rules.items()}
+    differ = {name: variant for name, variant in variants.items() if with_strides(variant) != with_strides(full)}
+    return {FULL: full, **{name: v for name, v in differ.items() if name not in MECHANISMS or has_date(full, name)}}
+
+
+def with_strides(recipe: Recipe) -> Recipe:
+    """Return the recipe with the gaps that its events have: a lower bound that moves no date makes no difference."""
+    events = (event._replace(least_gap=event.stride) if isinstance(event, Every) else event for event in recipe.events)
+    return recipe._replace(events=tuple(events))
+
+
+def has_date(recipe: Recipe, mechanism: str) -> bool:
+    """Return whether a mechanism acts in some iteration of the recipe."""
+    if mechanism not in ACTIONS:
+        return recipe.half_size_until > 0
+    return bool(firing_steps(recipe, ACTIONS[mechanism]))
