@@ -324,12 +324,12 @@ def typical(gaussians):
 
 n_accel, psnr_accel = ends["3dgs-accel"]
 for name in ("mini-splatting", "mini-splatting2"):
-    # Dense first, then simplified and trained on: far fewer Gaussians show nearly the same.
+    # Simplification costs much at once, and training brings most of it back: far fewer Gaussians show nearly the same.
     (n, psnr), (gaussians, _, curve, _) = ends[name], results[name]
     simplified = last_event(name, "simplify")
     assert simplified["counts"][1] < 0.7 * simplified["counts"][0]
     before, after = map(typical, simplified["gaussians"])
-    assert after < before < typical(gaussians)
+    assert after < before - 2 and typical(gaussians) - after > 0.5 * (before - after)
     assert n < 0.5 * n_accel and psnr > psnr_accel - 3
     # The work of an iteration grows with its Gaussians.
     assert curve[:, 2].sum() < 0.5 * results["3dgs-accel"][2][:, 2].sum()
