@@ -96,6 +96,7 @@ KEEPS_ROWS = (
     mini_splatting.restart_adam,
     mini_splatting2.stop_culling,
 )
+"""Actions that lose no step in the released code, or only that of what they replace, or come beside one that does."""
 
 
 def with_lost_steps(recipe: Recipe) -> Recipe:
