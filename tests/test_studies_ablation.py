@@ -89,13 +89,11 @@ def test_steps_that_the_released_code_loses(room):
     events = (At(3, partial(gaussian_splatting.prune_faint, least_opacity=1e-9)),)
     recipe = with_lost_steps(RECIPES["3dgs-accel"]._replace(iterations=6, events=events))
     ends = {}
-    state = train(room, recipe, seed=0, on_step=lambda report: ends.update({report.step: copied(report.state)}))
+    state = train(
+        room, recipe, seed=0, on_step=lambda report: ends.update({report.step: report.state.gaussians.means.copy()})
+    )
     assert [step for step in range(2, 7) if not np.array_equal(ends[step], ends[step - 1])] == [2, 4, 5]
     assert state.adam.step == 4
-
-
-def copied(state):
-    return state.gaussians.means.copy()
 
 
 def test_depths_are_drawn_of_what_the_culling_table_says(room):

@@ -1,7 +1,7 @@
-"""Recipes with one thing changed: without one mechanism, or with one published rule in the place of ours.
+"""Recipes with one change: without one mechanism, or with a published rule in place of ours.
 
-A function takes a published recipe and returns it changed; where there is nothing to change, it returns it as it is.
-:func:`variants_of` scales what it returns to the length of a study. ``docs/FIDELITY.md`` says why we deviate.
+Each change is a function of a published recipe, and returns a recipe that it does not concern unchanged.
+:func:`variants_of` scales the changed recipes to the length of a study. ``docs/FIDELITY.md`` says why we deviate.
 """
 
 import math
@@ -62,7 +62,7 @@ def with_all_events(recipe: Recipe) -> Recipe:
 
 
 def with_culled_depths(recipe: Recipe) -> Recipe:
-    """Return the recipe with depths that are drawn of culled views, if it culls any: Mini-Splatting2."""
+    """Return the recipe that renders culled views for its depths, if it culls views: Mini-Splatting2."""
 
     def changed(event: Event) -> Event:
         settings = event.action.keywords if isinstance(event.action, partial) else {}
@@ -74,9 +74,9 @@ def with_culled_depths(recipe: Recipe) -> Recipe:
 
 
 def reinitialise_from_culled(state: TrainState, iteration: Iteration, **settings: Any) -> None:
-    """Do :func:`mini_splatting.reinitialise_from_depth` with what is visible in each view by the culling table alone.
+    """Start again from the depths of culled views.
 
-    Importance is measured of all Gaussians; only the request for the surface is culled.
+    Otherwise like :func:`mini_splatting.reinitialise_from_depth`: importance is still measured with all Gaussians.
     """
     renderer = iteration.renderer
 
@@ -89,23 +89,27 @@ def reinitialise_from_culled(state: TrainState, iteration: Iteration, **settings
     mini_splatting.reinitialise_from_depth(state, culled, **settings)
 
 
-KEEPS_ROWS = (
+TAKES_ITS_STEP = (
     gaussian_splatting.reset_opacity,
     gaussian_splatting.reset_opacity_on_white,
     mini_splatting.store_sh,
     mini_splatting.restart_adam,
     mini_splatting2.stop_culling,
 )
-"""Actions that lose no step in the released code, or only that of what they replace, or come beside one that does."""
+"""Actions for which the released code loses no step, or only the step of the array that they overwrite anyway.
+
+``store_sh`` and ``restart_adam`` act beside an action that is not listed, which loses the step.
+"""
 
 
 def with_lost_steps(recipe: Recipe) -> Recipe:
     """Return the recipe without the gradient steps that the released code loses.
 
-    There an event comes between gradient and step, and its new tensors have no gradient, so that nothing moves in this
-    iteration; nor does it in the last. Here events come after the step, so that each first takes it back.
+    The released code replaces the parameters after it has computed their gradients and before it takes the step. The
+    new tensors have no gradient, so the step does nothing; the last iteration takes none at all. Here events follow the
+    step, so the recipe undoes the step before such an event.
     """
-    before: list[tuple[int, Any, AdamState[Any]]] = []  # the last iteration, and what it ended with
+    before: list[tuple[int, Any, AdamState[Any]]] = []  # number of the previous iteration, and the state at its end
 
     def copied(bundle: Any) -> Any:
         return bundle._make(field.copy() for field in bundle)
@@ -114,13 +118,13 @@ def with_lost_steps(recipe: Recipe) -> Recipe:
         adam = state.adam._replace(first=copied(state.adam.first), second=copied(state.adam.second))
         before[:] = [(iteration.step, copied(state.gaussians), adam)]
 
-    def take_step_back(state: TrainState, iteration: Iteration) -> None:
+    def undo_step(state: TrainState, iteration: Iteration) -> None:
         if before and before[0][0] == iteration.step - 1:
             _, state.gaussians, state.adam = before[0]
 
-    edits = [event for event in recipe.events if not isinstance(event, During) and not does(event, *KEEPS_ROWS)]
-    losses = [event._replace(action=take_step_back) for event in edits]
-    events = (*losses, At(recipe.iterations, take_step_back), *recipe.events, During(remember))
+    edits = [event for event in recipe.events if not isinstance(event, During) and not does(event, *TAKES_ITS_STEP)]
+    undoing = [event._replace(action=undo_step) for event in (*edits, At(recipe.iterations, undo_step))]
+    events = (*undoing, *recipe.events, During(remember))
     return recipe._replace(events=events)
 
 
@@ -168,7 +172,7 @@ ACTIONS: Mapping[str, Action] = {
 
 
 def variants_of(published: Recipe, iterations: int, rules: Mapping[str, Change] = MECHANISMS) -> dict[str, Recipe]:
-    """Return the recipe for so many iterations, and without each mechanism that acts within them."""
+    """Return the recipe scaled to ``iterations``, and each changed recipe that differs from it within this length."""
 
     def of_length(recipe: Recipe) -> Recipe:
         return scaled(recipe, iterations)._replace(short_run_exponent=0.0)  # the rates are already raised
