@@ -53,9 +53,9 @@ from minisplat_ref.extensions.proxies.binding import bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid
 from minisplat_ref.extensions.proxies.edit_claims import RADIUS, flat_gaussians, rolled
 from minisplat_ref.extensions.proxies.edit_claims import camera as card_camera
-from minisplat_ref.extensions.shared_container import parse
-from minisplat_ref.extensions.shared_mesh import Mesh
-from minisplat_ref.extensions.shared_sampling import block_means, zoomed
+from minisplat_ref.mechanisms.meshes.mesh import Mesh
+from minisplat_ref.mechanisms.packing.container import parse
+from minisplat_ref.mechanisms.sampling import block_means, zoomed
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import psnr
 from minisplat_ref.rendering import Request, render

@@ -56,10 +56,10 @@ from minisplat_ref.extensions.rays.lights import shade
 from minisplat_ref.extensions.rays.method import whitened_model
 from minisplat_ref.extensions.rays.surfaces import GLASS, MIRROR
 from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenated_surfaces, parallelogram, surfaces_of
-from minisplat_ref.extensions.shared_mesh import Mesh
-from minisplat_ref.extensions.shared_rays import pixel_rays
-from minisplat_ref.extensions.shared_tangent_rays import ewa_hits, ray_colors, tangent_hits, yawed
 from minisplat_ref.extensions.vr.foveation import Gaze, eccentricities, render_foveated, zone_begins, zone_weights
+from minisplat_ref.mechanisms.meshes.mesh import Mesh
+from minisplat_ref.mechanisms.rays.pixel_rays import pixel_rays
+from minisplat_ref.mechanisms.tangent.rays import ewa_hits, ray_colors, tangent_hits, yawed
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.reference.pinhole import pinhole_rays
 from minisplat_ref.rendering import SPLATTING, Request, activated
@@ -121,7 +121,7 @@ plt.show()
 # | folder, file | what it holds |
 # |---|---|
 # | `minisplat_ref/extensions/pixel_order/` | exact order, k-buffer, tangent planes (StopThePop, Optimal Projection) |
-# | `minisplat_ref/extensions/shared_tangent_planes.py` | the formulas of both |
+# | `minisplat_ref/mechanisms/tangent/planes.py` | the formulas of both |
 # | `minisplat_ref/extensions/vr/` | the same on a small model, with foveation (VRSplat) |
 # | `minisplat_ref/extensions/rays/` | tracing with a tree; shadows, mirrors, glass (RaySplats) |
 #

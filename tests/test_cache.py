@@ -5,7 +5,6 @@ import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -73,7 +72,7 @@ def test_folder_follows_what_compiles(owner, name, value, monkeypatch):
 def test_every_kernel_is_in_the_hash():
     users = {path.parent.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py") if "@kernel" in path.read_text()}
     users |= {path.parent.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py") if "@scalar" in path.read_text()}
-    folders = {path.parts[0] for path in users} - {"extensions"}  # which have hashes of their own, as below
+    folders = {path.parts[0] for path in users} - {"extensions", "mechanisms"}  # hashed separately, as below
     assert folders == {"jit", "scalar", "cpu", "bench"}, "see _jit.source_hash"
 
 
@@ -95,16 +94,22 @@ def test_kernels_of_an_extension_are_hashed_with_its_sources():
     assert n_kernels > 0
 
 
-def test_shared_kernels_are_hashed_with_what_they_may_call(tmp_path, monkeypatch):
-    name = "minisplat_ref.extensions.shared_kernels"
-    module = ModuleType(name)
-    module.__file__ = str(tmp_path / "shared_kernels.py")
-    monkeypatch.setitem(sys.modules, name, module)
-    for file in ("shared_kernels.py", "shared_formulas.py"):
-        (tmp_path / file).write_text("")
-    before = _jit._folder_of_module(name)
-    (tmp_path / "shared_formulas.py").write_text("ONE = 1\n")
-    assert _jit._folder_of_module(name) != before
+@pytest.mark.parametrize("module", ["minisplat_ref.mechanisms", "minisplat_ref.extensions.rays"])
+def test_kernels_are_hashed_with_the_mechanisms_that_they_may_call(tmp_path, monkeypatch, module):
+    import_module(module)
+    for file in ("rays/kernels.py", "rays/formulas.py"):
+        (tmp_path / "mechanisms" / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "mechanisms" / file).write_text("")
+    monkeypatch.setattr(_jit, "_PACKAGE", tmp_path)
+    before = _jit._folder_of_module(module)
+    assert _jit._folder_of_module(module) == before
+    (tmp_path / "mechanisms/rays/formulas.py").write_text("ONE = 1\n")
+    assert _jit._folder_of_module(module) != before
+
+
+def test_kernels_of_mechanisms_are_kept_together():
+    function = import_module("minisplat_ref.mechanisms.rays.bvh").widest_axis
+    assert _jit._modules_of(function) == {"minisplat_ref.mechanisms"}
 
 
 def test_numba_notices_another_processor_and_another_numba(tmp_path, monkeypatch):

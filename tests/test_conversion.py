@@ -15,7 +15,7 @@ from minisplat_ref.experiments import conversion
 from minisplat_ref.extensions import extension as extension_module
 from minisplat_ref.extensions.compression import levels, msz, spz
 from minisplat_ref.extensions.extension import Extension, find_format, load_extension
-from minisplat_ref.extensions.shared_morton import morton_order
+from minisplat_ref.mechanisms.packing.morton import morton_order
 from minisplat_ref.training.calibration import EXPOSURES
 
 LEVELS = range(levels.N_LEVELS)

@@ -10,7 +10,7 @@ import numpy as np
 
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.shared_sampling import block_means, zoomed
+from minisplat_ref.mechanisms.sampling import block_means, zoomed
 from minisplat_ref.types import Floats, Scene
 
 if TYPE_CHECKING:

@@ -127,7 +127,7 @@ def cache_folder(function: Callable | None = None) -> str | None:
 def _modules_of(value: Any) -> set[str]:
     """Return the modules outside the core that define the functions that a value is, contains or closes over.
 
-    Of an extension only the package itself is returned: ``minisplat_ref.extensions.NAME``.
+    Of an extension only its package is returned, ``minisplat_ref.extensions.NAME``, and of the mechanisms only theirs.
     """
     if isinstance(value, tuple):
         return set[str]().union(*map(_modules_of, value))
@@ -140,14 +140,16 @@ def _modules_of(value: Any) -> set[str]:
     package, *names = module.split(".")
     if names[:1] == ["extensions"] and package == _PACKAGE.name:
         return modules | {".".join((package, *names[:2]))}
+    if names[:1] == ["mechanisms"] and package == _PACKAGE.name:
+        return modules | {f"{package}.mechanisms"}
     return modules if package in (_PACKAGE.name, "numba", "numpy") else modules | {module}
 
 
 def _folder_of_module(module: str) -> str:
     """Return the name of the folder for kernels with functions of a module outside the core: a hash of its sources.
 
-    It covers all files of a package. Files ``shared_*.py`` may call each other: it covers all of them for one of them,
-    and for an extension, which is beside them.
+    It covers all files of a package. Mechanisms may call each other and extensions may call any mechanism, so it covers
+    all of ``mechanisms/``, too.
 
     Raises
     ------
@@ -157,13 +159,11 @@ def _folder_of_module(module: str) -> str:
     file = Path(getattr(sys.modules.get(module), "__file__", None) or "")
     if not file.is_file():
         raise FileNotFoundError(f"module {module} has no source file")
-    sources = {file}
+    sources = [file]
     if file.name == "__init__.py":
-        sources = {*file.parent.rglob("*.py"), *file.parent.parent.glob("shared_*.py")}
-        file = file.parent
-    elif file.name.startswith("shared_"):
-        sources = {*file.parent.glob("shared_*.py")}
-    return f"{module.rpartition('.')[2]}-{_hash_of(module, sources, file.parent)}"
+        sources, file = [*file.parent.rglob("*.py")], file.parent
+    mechanisms = _hash_of("", (_PACKAGE / "mechanisms").rglob("*.py"), _PACKAGE)
+    return f"{module.rpartition('.')[2]}-{_hash_of(module + mechanisms, sources, file.parent)}"
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.experiments.progress import Progress
-from minisplat_ref.extensions import shared_sampling, shared_studies
+from minisplat_ref.extensions import shared_studies
 from minisplat_ref.extensions.antialiasing.method import (
     EPS2D,
     FILTERED,
@@ -26,7 +26,8 @@ from minisplat_ref.extensions.antialiasing.method import (
     with_3d_filter,
 )
 from minisplat_ref.extensions.antialiasing.reference import smoothed, smoothed_vjp
-from minisplat_ref.extensions.shared_sampling import sampling_intervals
+from minisplat_ref.mechanisms import sampling
+from minisplat_ref.mechanisms.sampling import sampling_intervals
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.types import Gaussians, Model, View, view_from
@@ -160,10 +161,10 @@ def test_a_wrong_gradient_is_found():
 def test_blocks_and_cameras_fit():
     """A picture at a third of the size is the mean over blocks of what the camera with a third of the pixels sees."""
     image = np.arange(7 * 10 * 3, dtype=float).reshape(7, 10, 3)
-    small = shared_sampling.block_means(image, 3)
+    small = sampling.block_means(image, 3)
     assert small.shape == (2, 3, 3)
     assert_allclose(small[1, 2], image[3:6, 6:9].mean(axis=(0, 1)), rtol=PARITY_FLOAT64)
-    camera = shared_sampling.zoomed(make_camera(10, 7, fx=30.0, fy=28.0), 1 / 3)
+    camera = sampling.zoomed(make_camera(10, 7, fx=30.0, fy=28.0), 1 / 3)
     assert (camera.width, camera.height) == (3, 2)
     assert_allclose([camera.fx, camera.cx], [10, 5 / 3], rtol=CLOSED_FORM)
 

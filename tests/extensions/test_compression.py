@@ -27,11 +27,11 @@ from minisplat_ref import load_ply
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions import shared_container as container
 from minisplat_ref.extensions.compression import lattice, levels, msz, spz
 from minisplat_ref.extensions.compression import study as rate_distortion
-from minisplat_ref.extensions.shared_morton import morton_order
 from minisplat_ref.io import load_scene
+from minisplat_ref.mechanisms.packing import container as container
+from minisplat_ref.mechanisms.packing.morton import morton_order
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.types import Gaussians, Model, view_from
 

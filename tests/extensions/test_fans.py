@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import make_gaussians
 from tolerances import CLOSED_FORM, PARITY_FLOAT64
 
-from minisplat_ref.extensions.shared_fans import (
+from minisplat_ref.mechanisms.meshes.fans import (
     N_SIDES,
     by_gram_schmidt,
     fan_faces,

@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.testing import assert_array_equal
 
-from minisplat_ref.extensions.shared_morton import morton_codes, morton_order
-from minisplat_ref.extensions.shared_planes import from_planes, to_planes, unzigzag, zigzag
+from minisplat_ref.mechanisms.packing.morton import morton_codes, morton_order
+from minisplat_ref.mechanisms.packing.planes import from_planes, to_planes, unzigzag, zigzag
 
 # Morton order and planes of bytes
 

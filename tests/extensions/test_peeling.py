@@ -15,9 +15,9 @@ from tolerances import (
 )
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions import shared_peeling_kernels as kernels
-from minisplat_ref.extensions import shared_peeling_reference as reference
-from minisplat_ref.extensions.shared_peeling import Frame, TranslucentMesh, check_translucent, to_bytes
+from minisplat_ref.mechanisms.peeling import kernels as kernels
+from minisplat_ref.mechanisms.peeling import reference as reference
+from minisplat_ref.mechanisms.peeling.layers import Frame, TranslucentMesh, check_translucent, to_bytes
 from minisplat_ref.reference.pinhole import pinhole_rays
 
 BACKGROUND = np.array([0.2, 0.5, 0.9])

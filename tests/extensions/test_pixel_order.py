@@ -20,13 +20,13 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions import shared_tangent_planes as planes
 from minisplat_ref.extensions.extension import find_recipe, load_extension
 from minisplat_ref.extensions.pixel_order import clouds
 from minisplat_ref.extensions.pixel_order.method import ORDERED
 from minisplat_ref.extensions.pixel_order.stages import stages
-from minisplat_ref.extensions.shared_tangent_rays import tangent_hits, yawed
-from minisplat_ref.extensions.shared_tangent_renderer import RESPONSE
+from minisplat_ref.mechanisms.tangent import planes as planes
+from minisplat_ref.mechanisms.tangent.rays import tangent_hits, yawed
+from minisplat_ref.mechanisms.tangent.renderer import RESPONSE
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT64
 from minisplat_ref.reference.projection import project as project_ewa
@@ -168,7 +168,7 @@ def test_a_wrong_gradient_is_found(monkeypatch):
         v_normals, v_conics, v_opacities = true(*args)
         return v_normals, 1.001 * v_conics, v_opacities
 
-    path = "minisplat_ref.extensions.shared_tangent_renderer.RESPONSE"
+    path = "minisplat_ref.mechanisms.tangent.renderer.RESPONSE"
     monkeypatch.setattr(path, RESPONSE._replace(hit_vjp=wrong))
     report = check_model_gradients(REFERENCE, GSPLAT_MAIN, ORDERED, lambda *args: stages(*args)[:1])
     assert report.n_failed == 2 and "is wrong" in report.cases[0].note

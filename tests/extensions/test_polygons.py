@@ -30,9 +30,9 @@ from minisplat_ref.extensions.polygons import reference
 from minisplat_ref.extensions.polygons.geometry import Polygons, polygons_of, spans_vjp
 from minisplat_ref.extensions.polygons.method import LOG_THICKNESS, TRACED, pressed_flat, tracer_for
 from minisplat_ref.extensions.polygons.stages import stages
-from minisplat_ref.extensions.shared_fans import opacity_radii, rims
-from minisplat_ref.extensions.shared_ray_blending import summed
-from minisplat_ref.extensions.shared_rays import Rays, pixel_rays
+from minisplat_ref.mechanisms.meshes.fans import opacity_radii, rims
+from minisplat_ref.mechanisms.rays.blending import summed
+from minisplat_ref.mechanisms.rays.pixel_rays import Rays, pixel_rays
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.types import Gaussians, Model, view_from

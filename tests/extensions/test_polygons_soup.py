@@ -12,11 +12,11 @@ from minisplat_ref.cli import main
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.polygons import claims
 from minisplat_ref.extensions.polygons.soup import carried, load_corners, save_soup, soup_of
-from minisplat_ref.extensions.shared_deformation import Deformation, deformed
-from minisplat_ref.extensions.shared_fans import flattened
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.io.ply_faces import read_faces
 from minisplat_ref.io.ply_file import read_vertices, write_vertices
+from minisplat_ref.mechanisms.editing.deformation import Deformation, deformed
+from minisplat_ref.mechanisms.meshes.fans import flattened
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 

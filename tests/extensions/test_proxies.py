@@ -18,10 +18,10 @@ from minisplat_ref.extensions.proxies.affine import Affine, about_point, edited,
 from minisplat_ref.extensions.proxies.binding import UNBOUND, bind, rebuild
 from minisplat_ref.extensions.proxies.cage import convex_hull, grid, sheet_through
 from minisplat_ref.extensions.proxies.nearest import nearest_triangles, triangle_distances
-from minisplat_ref.extensions.shared_deformation import polar_rotations, quaternions
-from minisplat_ref.extensions.shared_mesh import Mesh, check_mesh, frames, load_mesh, save_mesh
-from minisplat_ref.extensions.shared_sh_rotation import sh_rotations
 from minisplat_ref.io.ply import load_ply, save_ply
+from minisplat_ref.mechanisms.editing.deformation import polar_rotations, quaternions
+from minisplat_ref.mechanisms.editing.sh_rotation import sh_rotations
+from minisplat_ref.mechanisms.meshes.mesh import Mesh, check_mesh, frames, load_mesh, save_mesh
 from minisplat_ref.reference.covariance import covariances, rotation_matrices
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.rendering import render

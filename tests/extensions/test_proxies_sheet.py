@@ -32,9 +32,9 @@ from minisplat_ref.extensions.proxies.springs import (
     stiffness_for_stretch,
     vertex_masses,
 )
-from minisplat_ref.extensions.shared_mesh import Mesh, load_mesh, save_mesh
 from minisplat_ref.io.images import read_image
 from minisplat_ref.io.ply import load_ply, save_ply
+from minisplat_ref.mechanisms.meshes.mesh import Mesh, load_mesh, save_mesh
 
 G = np.array([0.0, 9.81, 0.0])
 

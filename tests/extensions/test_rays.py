@@ -28,14 +28,14 @@ from minisplat_ref.constants import GSPLAT_MAIN, INRIA
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions import shared_bvh as bvh
 from minisplat_ref.extensions.rays import claims, reference
 from minisplat_ref.extensions.rays.geometry import Whitened, whiten, whiten_vjp
 from minisplat_ref.extensions.rays.method import TRACED, tracer_for, whitened_model
 from minisplat_ref.extensions.rays.stages import stages
-from minisplat_ref.extensions.shared_ray_blending import summed
-from minisplat_ref.extensions.shared_ray_traversal import limits_of
-from minisplat_ref.extensions.shared_rays import Rays, pixel_rays, pixel_rays_vjp
+from minisplat_ref.mechanisms.rays import bvh as bvh
+from minisplat_ref.mechanisms.rays.blending import summed
+from minisplat_ref.mechanisms.rays.pixel_rays import Rays, pixel_rays, pixel_rays_vjp
+from minisplat_ref.mechanisms.rays.traversal import limits_of
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.types import Gaussians, Model, view_from

@@ -25,9 +25,9 @@ from minisplat_ref.extensions.rays.surfaces import (
     refracted,
 )
 from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenated_surfaces, parallelogram, surfaces_of
-from minisplat_ref.extensions.shared_mesh import Mesh, save_mesh
-from minisplat_ref.extensions.shared_rays import Rays, pixel_rays
 from minisplat_ref.io.ply import save_ply
+from minisplat_ref.mechanisms.meshes.mesh import Mesh, save_mesh
+from minisplat_ref.mechanisms.rays.pixel_rays import Rays, pixel_rays
 from minisplat_ref.rendering import Request
 from minisplat_ref.types import Model, view_from
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.extensions.antialiasing.reference import VARIANCE, smoothed, smoothed_vjp
-from minisplat_ref.extensions.shared_sampling import sampling_intervals
+from minisplat_ref.mechanisms.sampling import sampling_intervals
 from minisplat_ref.methods.gaussian_splatting import DENSIFY_LEAST_GAP, GS_ACCEL
 from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, Request
 from minisplat_ref.training.rates import Rates

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 
 from minisplat_ref.backends import CPU
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.shared_sampling import block_means, zoomed
 from minisplat_ref.extensions.shared_studies import psnr_of, shrunk, tidy, with_progress
+from minisplat_ref.mechanisms.sampling import block_means, zoomed
 from minisplat_ref.rendering import Renderer, Request
 from minisplat_ref.training.loop import train
 from minisplat_ref.types import Floats, Model, Scene, View, view_from

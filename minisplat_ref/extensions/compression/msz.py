@@ -22,10 +22,10 @@ from minisplat_ref.constants import SH_DEGREE_MAX
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.compression import lattice, levels
 from minisplat_ref.extensions.compression.levels import Exponents
-from minisplat_ref.extensions.shared_container import WAY_OUT, Container, Packed, is_count, pack, parse, unpack
-from minisplat_ref.extensions.shared_morton import morton_order
-from minisplat_ref.extensions.shared_planes import MOST_PLANES, from_planes, to_planes, unzigzag, zigzag
 from minisplat_ref.io.formats import Format
+from minisplat_ref.mechanisms.packing.container import WAY_OUT, Container, Packed, is_count, pack, parse, unpack
+from minisplat_ref.mechanisms.packing.morton import morton_order
+from minisplat_ref.mechanisms.packing.planes import MOST_PLANES, from_planes, to_planes, unzigzag, zigzag
 from minisplat_ref.types import Floats, Gaussians, Ints
 from minisplat_ref.validation import check_gaussians
 

@@ -8,7 +8,7 @@ import numpy as np
 from minisplat_ref.extensions.cuts.curve import N_POINTS
 from minisplat_ref.extensions.cuts.kernels import response_for
 from minisplat_ref.extensions.cuts.response import RESPONSE, CutFootprints, image_points, image_points_vjp
-from minisplat_ref.extensions.shared_payload_renderer import Payload, PayloadGradient, Projected, payload_renderer
+from minisplat_ref.mechanisms.payload.renderer import Payload, PayloadGradient, Projected, payload_renderer
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.representation import Representation

@@ -7,8 +7,8 @@ three fans in the planes of its axes, with a colour and an opacity at each verte
     rim vertex j:  mu + k (s_a cos(2 pi j / n) e_a + s_b sin(2 pi j / n) e_b)
     opacity:       o at the centre, rim o on the rim, linear in between;  colour: that of degree 0
 
-The mesh is drawn as a graphics program would, by depth peeling (``shared_peeling``), with gradients, so that its
-vertices can be trained on photographs: position, colour and opacity of each, by the loss of 3DGS.
+The mesh is drawn as a graphics program would, by depth peeling (``mechanisms.peeling.layers``), with gradients, so that
+its vertices can be trained on photographs: position, colour and opacity of each, by the loss of 3DGS.
 
     minisplat-ref fans export runs/fox fox.glb
     minisplat-ref fans fine-tune photos/fox runs/fox fans.ply

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.fans.shapes import SOLID_PLANES, Fans, FanShape, mesh_of
-from minisplat_ref.extensions.shared_peeling import TranslucentMesh, check_translucent, to_bytes
 from minisplat_ref.io.formats import write_content
 from minisplat_ref.io.ply import COLORS, MEANS, check_finite
 from minisplat_ref.io.ply_faces import read_faces
 from minisplat_ref.io.ply_file import property_names, read_vertices, write_vertices
+from minisplat_ref.mechanisms.peeling.layers import TranslucentMesh, check_translucent, to_bytes
 from minisplat_ref.types import Floats
 
 SUFFIXES = (".ply", ".glb", ".obj")

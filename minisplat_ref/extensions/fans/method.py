@@ -11,10 +11,10 @@ import numpy as np
 
 from minisplat_ref.backends import Backend
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions import shared_peeling_kernels as kernels
-from minisplat_ref.extensions import shared_peeling_reference as reference
 from minisplat_ref.extensions.fans.shapes import Fans, FanShape, converted, mesh_of, mesh_of_vjp
-from minisplat_ref.extensions.shared_peeling import ALL_LAYERS, Frame, Peeled, TranslucentMesh
+from minisplat_ref.mechanisms.peeling import kernels as kernels
+from minisplat_ref.mechanisms.peeling import reference as reference
+from minisplat_ref.mechanisms.peeling.layers import ALL_LAYERS, Frame, Peeled, TranslucentMesh
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.reference.pinhole import with_principal_point
 from minisplat_ref.rendering import Renderer, RenderGradient, Request

@@ -3,7 +3,7 @@
 A fan has a centre vertex at mu and n on a rim, k standard deviations away, and the triangles between the centre and
 two neighbours. Opacity is o at the centre and a fraction of it on the rim, and linear in between.
 
-- *Flat*: one fan in the plane of the two larger axes (``shared_fans``): 1 + n vertices, n triangles.
+- *Flat*: one fan in the plane of the two larger axes (``mechanisms.meshes.fans``): 1 + n vertices, n triangles.
 - *Solid*: three fans, in the planes of the axes (0, 1), (1, 2) and (2, 0). Where two of them meet, on an axis, they
   share the vertex: 1 + 3 n - 6 vertices, 3 n triangles. Four must divide n.
 
@@ -18,8 +18,8 @@ import numpy as np
 
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.shared_fans import flattened, rims
-from minisplat_ref.extensions.shared_peeling import TranslucentMesh
+from minisplat_ref.mechanisms.meshes.fans import flattened, rims
+from minisplat_ref.mechanisms.peeling.layers import TranslucentMesh
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.types import Bools, Floats, Gaussians, Ints
 

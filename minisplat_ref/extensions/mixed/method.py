@@ -9,7 +9,7 @@ from minisplat_ref.extensions.mixed.kinds import promoted, simplified
 from minisplat_ref.extensions.mixed.population import MixedGaussians, counts, grouped
 from minisplat_ref.extensions.mixed.projection import Hulls, footprints_of, footprints_vjp
 from minisplat_ref.extensions.mixed.response import RESPONSE, Footprints
-from minisplat_ref.extensions.shared_payload_renderer import Payload, PayloadGradient, Projected, payload_renderer
+from minisplat_ref.mechanisms.payload.renderer import Payload, PayloadGradient, Projected, payload_renderer
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.representation import Representation

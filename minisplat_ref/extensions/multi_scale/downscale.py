@@ -14,8 +14,8 @@ from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.multi_scale.levels import Plan, level_zero, with_levels
 from minisplat_ref.extensions.multi_scale.method import LEAST_COVERAGE, LEVELS, finest_densities
-from minisplat_ref.extensions.shared_sampling import block_means, zoomed
 from minisplat_ref.extensions.shared_studies import psnr_of, tidy, with_progress
+from minisplat_ref.mechanisms.sampling import block_means, zoomed
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import configured

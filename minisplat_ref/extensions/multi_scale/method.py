@@ -8,7 +8,7 @@ import numpy as np
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.multi_scale.levels import MultiScaleGaussians, Plan, level_zero, with_levels
 from minisplat_ref.extensions.multi_scale.reference import are_shown, pixel_densities
-from minisplat_ref.extensions.shared_sampling import block_means, sampling_intervals, zoomed
+from minisplat_ref.mechanisms.sampling import block_means, sampling_intervals, zoomed
 from minisplat_ref.methods.gaussian_splatting import GS
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
 from minisplat_ref.strategy.ops import NO_PARENT, Edit, n_rows

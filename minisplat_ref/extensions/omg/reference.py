@@ -10,7 +10,7 @@ Morton order replaces a neighbour search and costs only a sort. It misses neighb
 
 import numpy as np
 
-from minisplat_ref.extensions.shared_morton import morton_order
+from minisplat_ref.mechanisms.packing.morton import morton_order
 from minisplat_ref.types import Floats
 
 

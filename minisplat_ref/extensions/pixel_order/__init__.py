@@ -9,7 +9,7 @@ that also trains:
   densest, ``t = d^T C^-1 x / (d^T C^-1 d)``: exactly, or within a buffer of k hits (``--set buffer_size=8``), which is
   exact if k is at least the number of hits.
 - *Projection* (Optimal Projection, Huang et al. 2024, arXiv 2402.00752). A footprint lies on the plane that touches the
-  unit sphere in the direction of its mean (:mod:`minisplat_ref.extensions.shared_tangent_planes`).
+  unit sphere in the direction of its mean (:mod:`minisplat_ref.mechanisms.tangent.planes`).
 
 Both depend on rays alone, and so do culling by distance and the low-pass, so a camera that turns sees the same colours
 up to rounding. When the camera turns by half a degree, fixed rays through 100 random Gaussians change by up to 0.11

@@ -7,8 +7,8 @@ from matplotlib.figure import Figure
 
 from minisplat_ref.constants import EXACT_ORDER, GSPLAT_MAIN, LIST_ORDER, Conventions
 from minisplat_ref.extensions.shared_studies import tidy, with_progress
-from minisplat_ref.extensions.shared_tangent_planes import hit, project
-from minisplat_ref.extensions.shared_tangent_rays import (
+from minisplat_ref.mechanisms.tangent.planes import hit, project
+from minisplat_ref.mechanisms.tangent.rays import (
     METHODS,
     color_changes,
     ewa_hits,

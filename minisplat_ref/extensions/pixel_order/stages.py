@@ -6,8 +6,8 @@ import numpy as np
 
 from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.pixel_order.method import ORDERED
-from minisplat_ref.extensions.shared_tangent_renderer import render
-from minisplat_ref.extensions.shared_tangent_stages import renderer_stage
+from minisplat_ref.mechanisms.tangent.renderer import render
+from minisplat_ref.mechanisms.tangent.stages import renderer_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 

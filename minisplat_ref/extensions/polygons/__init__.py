@@ -1,7 +1,7 @@
 """Flat Gaussians carried by polygons: traced as triangles, edited as a mesh, carried back.
 
 REdiSplats, Byrski et al. 2025, arXiv 2503.12284. A flat Gaussian with the axes e_a, e_b and the standard deviations
-s_a, s_b lies in a regular polygon of n = 8 sides (``shared_fans``), whose radius depends on the opacity o:
+s_a, s_b lies in a regular polygon of n = 8 sides (``mechanisms.meshes.fans``), whose radius depends on the opacity o:
 
     x_j = mu + r (s_a cos phi_j e_a + s_b sin phi_j e_b),   phi_j = 2 pi j / n,   r^2 = max(0, 11.3449 + 2 ln o)
 
@@ -10,8 +10,8 @@ The ray of each pixel hits the triangles between the centre and two neighbouring
     alpha = min(alpha_max, o exp(-(u^2 + v^2) / 2))      (u, v): the place in the plane, in standard deviations
 
 Each ray blends its own hits in the order of their depths, with the weights of 3DGS. The loops are those of ``rays``
-(``shared_ray_traversal``, ``shared_ray_kernels``), with eight triangles of a Gaussian in the place of one ellipsoid.
-Kernels know triangles with corners (:mod:`.kernels`), the reference planes with half-planes around them
+(``mechanisms.rays.traversal``, ``mechanisms.rays.kernels``), with eight triangles of a Gaussian in the place of one
+ellipsoid. Kernels know triangles with corners (:mod:`.kernels`), the reference planes with half-planes around them
 (:mod:`.reference`); neither knows the other's way.
 
 A mesh tool edits the polygons, and the Gaussians follow (:mod:`.soup`). The corners of an edited polygon are fitted by

@@ -1,7 +1,8 @@
 """What the study ``polygons/edits`` measures: the way to polygons and back, affine edits, and a sheet that is bent.
 
 All in float64. An affine edit of all corners is compared with the Gaussians themselves under the same map,
-``Sigma' = A Sigma A^T`` refactored by singular values (``shared_deformation``), as covariances and as pictures.
+``Sigma' = A Sigma A^T`` refactored by singular values (``mechanisms.editing.deformation``), as covariances and as
+pictures.
 
 Bending is not affine. The corners of a flat sheet of splats are displaced onto a cylinder,
 
@@ -25,11 +26,11 @@ from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.extensions.polygons.kernels import RESPONSE, Fans, scene_of
 from minisplat_ref.extensions.polygons.method import TRACED
 from minisplat_ref.extensions.polygons.soup import Soup, carried, soup_of
-from minisplat_ref.extensions.shared_deformation import Deformation, deformed
-from minisplat_ref.extensions.shared_fans import Flat, by_gram_schmidt, fitted, fitted_spans, flattened, rims
-from minisplat_ref.extensions.shared_ray_kernels import tracer_of
-from minisplat_ref.extensions.shared_rays import pixel_rays
 from minisplat_ref.extensions.shared_studies import tidy
+from minisplat_ref.mechanisms.editing.deformation import Deformation, deformed
+from minisplat_ref.mechanisms.meshes.fans import Flat, by_gram_schmidt, fitted, fitted_spans, flattened, rims
+from minisplat_ref.mechanisms.rays.kernels import tracer_of
+from minisplat_ref.mechanisms.rays.pixel_rays import pixel_rays
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.rendering import Request
 from minisplat_ref.types import Camera, Floats, Gaussians, Model, view_from

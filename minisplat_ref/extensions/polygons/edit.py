@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from minisplat_ref.extensions.polygons.soup import carried, load_corners, soup_of
-from minisplat_ref.extensions.shared_model_file import load_model
 from minisplat_ref.io.ply import save_ply
+from minisplat_ref.mechanisms.editing.model_file import load_model
 
 EPILOG = """\
 example: move vertices of soup.ply in a mesh tool, then

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from minisplat_ref.extensions.polygons.soup import save_soup
-from minisplat_ref.extensions.shared_fans import N_SIDES
-from minisplat_ref.extensions.shared_model_file import load_model
+from minisplat_ref.mechanisms.editing.model_file import load_model
+from minisplat_ref.mechanisms.meshes.fans import N_SIDES
 
 
 def add_parser(commands: Any) -> None:

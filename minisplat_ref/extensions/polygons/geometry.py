@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.extensions.shared_fans import N_SIDES, flattened, opacity_radii, plane_axes
+from minisplat_ref.mechanisms.meshes.fans import N_SIDES, flattened, opacity_radii, plane_axes
 from minisplat_ref.reference.covariance import rotation_matrices_vjp
 from minisplat_ref.types import Floats
 

@@ -14,7 +14,7 @@ Nothing here knows a plane of the whole polygon, or its axes: the same kernels d
 neither is left. Of a spoke, the triangle before it has the points; of the centre, the first triangle. Neighbours take
 the same product ``p . e``, and so no ray slips through between them.
 
-The loops are those of ``shared_ray_traversal`` and ``shared_ray_kernels``.
+The loops are those of ``mechanisms.rays.traversal`` and ``mechanisms.rays.kernels``.
 """
 
 from typing import NamedTuple
@@ -23,12 +23,12 @@ import numpy as np
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.extensions.polygons.geometry import Polygons
-from minisplat_ref.extensions.shared_bvh import build
-from minisplat_ref.extensions.shared_fans import rims
-from minisplat_ref.extensions.shared_ray_kernels import RayResponse
-from minisplat_ref.extensions.shared_ray_traversal import OPACITY, Scene
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import broadcast, select
+from minisplat_ref.mechanisms.meshes.fans import rims
+from minisplat_ref.mechanisms.rays.bvh import build
+from minisplat_ref.mechanisms.rays.kernels import RayResponse
+from minisplat_ref.mechanisms.rays.traversal import OPACITY, Scene
 from minisplat_ref.types import Floats
 
 SQUARE, COSINE, OWN, CENTRE, E1, E2 = 1, 2, 3, 4, 7, 10  # columns of a record beside the opacity: r^2, cos(2 pi / n)

@@ -4,12 +4,12 @@ import numpy as np
 
 from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
-from minisplat_ref.extensions import shared_ray_blending, shared_ray_kernels
 from minisplat_ref.extensions.polygons.geometry import Polygons, polygons_of, spans_vjp
 from minisplat_ref.extensions.polygons.kernels import RESPONSE, fans_of, scene_of
 from minisplat_ref.extensions.polygons.reference import meeting_of
-from minisplat_ref.extensions.shared_ray_renderer import Traced, renderer_of
-from minisplat_ref.extensions.shared_rays import Tracer
+from minisplat_ref.mechanisms.rays import blending, kernels
+from minisplat_ref.mechanisms.rays.pixel_rays import Tracer
+from minisplat_ref.mechanisms.rays.renderer import Traced, renderer_of
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Gaussians
@@ -20,8 +20,8 @@ LOG_THICKNESS = float(np.log(1e-5))  # of the axis across, as in the paper; what
 def tracer_for(polygons: Polygons, conventions: Conventions, backend: Backend) -> Tracer:
     """Return how a backend traces: every ray against every polygon, or kernels with a tree of all triangles."""
     if backend.is_compiled:
-        return shared_ray_kernels.tracer_of(RESPONSE, scene_of(fans_of(polygons), conventions))
-    return shared_ray_blending.tracer_of(meeting_of(polygons))
+        return kernels.tracer_of(RESPONSE, scene_of(fans_of(polygons), conventions))
+    return blending.tracer_of(meeting_of(polygons))
 
 
 def pressed_flat(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:

@@ -1,4 +1,4 @@
-"""A ray and a flat Gaussian in its polygon, in NumPy; what a ray sees of many of them is in ``shared_ray_blending``.
+"""A ray and a flat Gaussian in its polygon, in NumPy; ``mechanisms.rays.blending`` has what a ray sees of many of them.
 
 REdiSplats, section 3. The spans ``S_a = s_a e_a`` and ``S_b = s_b e_b`` are perpendicular, and so the ray ``O + t d``
 meets the plane of the Gaussian around mu at the place (u, v), in standard deviations:
@@ -19,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.extensions.polygons.geometry import Polygons
-from minisplat_ref.extensions.shared_ray_blending import Meeting, PairGradient
-from minisplat_ref.extensions.shared_rays import Rays
+from minisplat_ref.mechanisms.rays.blending import Meeting, PairGradient
+from minisplat_ref.mechanisms.rays.pixel_rays import Rays
 from minisplat_ref.types import Bools, Floats, Ints
 
 

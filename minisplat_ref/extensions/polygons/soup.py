@@ -2,13 +2,13 @@
 
 The file is a PLY in float64. Polygon m has the vertices ``m n`` to ``m n + n - 1`` and is one face of n corners, with
 the opacity and the colour of degree 0 of its Gaussian. Gaussians that are too faint to have a polygon are not in it
-(:func:`.shared_fans.opacity_radii`), nor are those of no finite size.
+(:func:`~minisplat_ref.mechanisms.meshes.fans.opacity_radii`), nor are those of no finite size.
 
 After an edit, face m says which vertices are the corners of polygon m, in the order in which they were written. What an
-edit changed is fitted (:func:`.shared_fans.fitted`): means, quaternions and scales. The thickness keeps its ratio to
-the smaller of the two scales, so that the plane stays the plane. Higher harmonics are turned by the rotation that is
-nearest to what happened to the plane. Opacities, and with them the radii, stay. A polygon has two sides that look the
-same: a mirrored one counts as turned over, and colours are never mirrored.
+edit changed is fitted (:func:`~minisplat_ref.mechanisms.meshes.fans.fitted`): means, quaternions and scales. The
+thickness keeps its ratio to the smaller of the two scales, so that the plane stays the plane. Higher harmonics are
+turned by the rotation that is nearest to what happened to the plane. Opacities, and with them the radii, stay. A
+polygon has two sides that look the same: a mirrored one counts as turned over, and colours are never mirrored.
 """
 
 from pathlib import Path
@@ -19,8 +19,12 @@ from numpy.typing import NDArray
 
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.shared_deformation import polar_rotations, quaternions
-from minisplat_ref.extensions.shared_fans import (
+from minisplat_ref.io.ply import COLORS, MEANS, check_finite
+from minisplat_ref.io.ply_faces import read_faces
+from minisplat_ref.io.ply_file import read_vertices, write_vertices
+from minisplat_ref.mechanisms.editing.deformation import polar_rotations, quaternions
+from minisplat_ref.mechanisms.editing.sh_rotation import rotated_sh
+from minisplat_ref.mechanisms.meshes.fans import (
     fitted,
     fitted_spans,
     flattened,
@@ -29,10 +33,6 @@ from minisplat_ref.extensions.shared_fans import (
     plane_axes,
     rims,
 )
-from minisplat_ref.extensions.shared_sh_rotation import rotated_sh
-from minisplat_ref.io.ply import COLORS, MEANS, check_finite
-from minisplat_ref.io.ply_faces import read_faces
-from minisplat_ref.io.ply_file import read_vertices, write_vertices
 from minisplat_ref.types import Floats, Gaussians, Ints
 
 LEAST_WIDTH = 1e-9  # of a polygon, across over along: a vertex in float64 has not many more digits than that

@@ -4,10 +4,11 @@ There are three ways to change a trained scene without training it again.
 
 - *Affine edits* (:mod:`.affine`) apply x -> A x + b to what a box, a ball or a mesh selects. They are exact:
   mu' = A mu + b, Sigma' = A Sigma A^T, refactored into quaternion and scales by singular values
-  (``shared_deformation``); colours rotate with the rotation in A (``shared_sh_rotation``).
+  (``mechanisms.editing.deformation``); colours rotate with the rotation in A (``mechanisms.editing.sh_rotation``).
 - *Binding to a mesh* (:mod:`.binding`), after GaMeS (arXiv 2402.01459): each Gaussian belongs to the nearest triangle
   (:mod:`.nearest`), by barycentric coordinates, an offset along the normal, and its axes in the frame of the triangle
-  (``shared_mesh``). When the mesh is deformed, Sigma' = F Sigma F^T with the triangle's deformation gradient F.
+  (``mechanisms.meshes.mesh``). When the mesh is deformed, Sigma' = F Sigma F^T with the triangle's deformation gradient
+  F.
 - *Physics* (:mod:`.mass_spring`, :mod:`.springs`): the mesh moves as masses and springs under gravity, integrated by
   velocity Verlet with an account of the energy, and the scene bound to it follows.
 

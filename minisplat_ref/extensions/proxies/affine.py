@@ -4,8 +4,8 @@ A Gaussian under an affine map is a Gaussian, so nothing is approximated in its 
 
     mu' = A mu + b,   Sigma' = A Sigma A^T
 
-(``shared_deformation`` says how the covariance becomes a quaternion and scales again, and how colours rotate). A
-Gaussian belongs to a selection if its centre does; one that straddles the border is not cut.
+(``mechanisms.editing.deformation`` says how the covariance becomes a quaternion and scales again, and how colours
+rotate). A Gaussian belongs to a selection if its centre does; one that straddles the border is not cut.
 """
 
 import math
@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.shared_deformation import Deformation, deformed
+from minisplat_ref.mechanisms.editing.deformation import Deformation, deformed
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.types import Bools, Floats, Gaussians
 

@@ -2,7 +2,8 @@
 
 After GaMeS (Waczynska et al. 2024, arXiv 2402.01459), which puts Gaussians onto the faces of a mesh by barycentric
 coordinates and derives rotation and scales from the corners, so that whatever moves the mesh moves the scene. Each
-Gaussian is bound to the nearest triangle. In the frame E of that triangle (``shared_mesh``) it has place and axes
+Gaussian is bound to the nearest triangle. In the frame E of that triangle (``mechanisms.meshes.mesh``) it has place and
+axes
 
     (b1, b2, w) = E^-1 (mu - p0)      barycentric coordinates (1 - b1 - b2, b1, b2), signed offset w along the normal
     L = E^-1 R diag(s)                its rotation and scales
@@ -14,7 +15,7 @@ which it keeps when the mesh has moved, with the corners p' and the frame E':
 
 F is the deformation gradient of the triangle, with stretch and shear. It is the same for all Gaussians of a triangle,
 so the code computes F and not L. The covariance is refactored by singular values, and colours rotate with F's rotation
-(``shared_deformation``).
+(``mechanisms.editing.deformation``).
 
 Two things are exact. When the mesh is translated, rotated and scaled, so are the Gaussians; and an affine map within
 the plane of a triangle acts exactly on them. Triangles whose corners have not moved leave their Gaussians as they are,
@@ -38,8 +39,8 @@ import numpy as np
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.proxies.nearest import nearest_triangles
-from minisplat_ref.extensions.shared_deformation import Deformation, deformed
-from minisplat_ref.extensions.shared_mesh import Mesh, frames
+from minisplat_ref.mechanisms.editing.deformation import Deformation, deformed
+from minisplat_ref.mechanisms.meshes.mesh import Mesh, frames
 from minisplat_ref.types import Floats, Gaussians, Ints
 
 UNBOUND = -1

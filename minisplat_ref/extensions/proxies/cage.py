@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.shared_mesh import Mesh, check_mesh, save_mesh
-from minisplat_ref.extensions.shared_model_file import load_model
+from minisplat_ref.mechanisms.editing.model_file import load_model
+from minisplat_ref.mechanisms.meshes.mesh import Mesh, check_mesh, save_mesh
 from minisplat_ref.types import Floats
 
 MIDDLE_FRACTION = 0.98  # of the Gaussians along each axis; the rest are floaters, which would inflate the mesh

@@ -24,8 +24,8 @@ from minisplat_ref.constants import SH_C0
 from minisplat_ref.extensions.proxies.affine import Affine, about_point, edited, in_ball, rotation_about
 from minisplat_ref.extensions.proxies.binding import Binding, bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid
-from minisplat_ref.extensions.shared_deformation import Deformation, deformed, polar_rotations
-from minisplat_ref.extensions.shared_mesh import Mesh
+from minisplat_ref.mechanisms.editing.deformation import Deformation, deformed, polar_rotations
+from minisplat_ref.mechanisms.meshes.mesh import Mesh
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.rendering import render

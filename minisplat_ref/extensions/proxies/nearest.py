@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from minisplat_ref.extensions.shared_mesh import Mesh
+from minisplat_ref.mechanisms.meshes.mesh import Mesh
 from minisplat_ref.types import Floats, Ints
 
 FIRST_CANDIDATES = 8

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import csr_array
 
-from minisplat_ref.extensions.shared_mesh import Mesh
+from minisplat_ref.mechanisms.meshes.mesh import Mesh
 from minisplat_ref.types import Floats, Ints
 
 LONGEST_RATIO = 1 - 1e-9  # rounding: a side of at least this part of the longest one counts as the longest

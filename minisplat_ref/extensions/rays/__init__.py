@@ -9,14 +9,15 @@ of the pixel's ray ``O + t d`` where its density is greatest:
 Each ray blends its own hits in the order of t, with the weights of 3DGS. So ellipsoids are exact at any angle, no
 Gaussian pops in front of another when the camera turns, and rays may start anywhere: shadows, mirrors, glass and
 triangles need no new formula (:mod:`.lights`). A bounding volume hierarchy skips what a ray does not come near
-(``shared_bvh``).
+(``mechanisms.rays.bvh``).
 
 This deviates from the paper as follows. A Gaussian ends where alpha falls below ``alpha_min`` = 1/255, as in 3DGS, and
 not at the ellipsoid of 99 %, which is nearly the same for an opaque one. A ray has any number of hits, where the
 released code stops at 512. The loss uses L1, as that of 3DGS, and not L2, so that trainings differ by the renderer
 alone. Colours are those towards the camera's centre, and behind a mirror or glass towards the apparent position of the
 eye. Density control, which needs gradients in the image, gets them from those in the world
-(``shared_ray_renderer``). Under all conventions a clamped alpha has no gradient, though INRIA's rasteriser has one.
+(``mechanisms.rays.renderer``). Under all conventions a clamped alpha has no gradient, though INRIA's rasteriser has
+one.
 
 There is no low-pass: Gaussians thinner than a pixel fall between rays, and pictures smaller than those of the training
 alias. Shadows, mirrors and glass have no gradient.

@@ -16,8 +16,8 @@ from minisplat_ref.extensions.rays.lights import shade, visibility
 from minisplat_ref.extensions.rays.method import TRACED, tracer_for, whitened_model
 from minisplat_ref.extensions.rays.surfaces import MIRROR
 from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenated_surfaces, parallelogram, surfaces_of
-from minisplat_ref.extensions.shared_rays import pixel_rays
 from minisplat_ref.extensions.shared_studies import tidy, with_progress
+from minisplat_ref.mechanisms.rays.pixel_rays import pixel_rays
 from minisplat_ref.reference.compositing import composite_hits
 from minisplat_ref.reference.hits import Hit, Response
 from minisplat_ref.rendering import SPLATTING, Request

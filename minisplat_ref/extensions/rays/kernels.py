@@ -1,18 +1,18 @@
 """One ray and one 3D Gaussian as kernels read them, and the tree of a population: the formulas of :mod:`.reference`.
 
-The loops, from a ray's way through the tree to the gradient, are those of ``shared_ray_traversal`` and
-``shared_ray_kernels``.
+The loops, from a ray's way through the tree to the gradient, are those of ``mechanisms.rays.traversal`` and
+``mechanisms.rays.kernels``.
 """
 
 import numpy as np
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.extensions.rays.geometry import Whitened
-from minisplat_ref.extensions.shared_bvh import SLACK, build
-from minisplat_ref.extensions.shared_ray_kernels import RayResponse
-from minisplat_ref.extensions.shared_ray_traversal import OPACITY, Scene
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import select
+from minisplat_ref.mechanisms.rays.bvh import SLACK, build
+from minisplat_ref.mechanisms.rays.kernels import RayResponse
+from minisplat_ref.mechanisms.rays.traversal import OPACITY, Scene
 from minisplat_ref.types import Floats
 
 REACH, MEAN, MAP = 1, 2, 5  # columns of a record beside the opacity

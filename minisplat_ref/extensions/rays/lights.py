@@ -31,7 +31,7 @@ from minisplat_ref.extensions.rays.surfaces import (
     refracted,
 )
 from minisplat_ref.extensions.rays.surroundings import Surroundings
-from minisplat_ref.extensions.shared_rays import Hits, Rays, Tracer
+from minisplat_ref.mechanisms.rays.pixel_rays import Hits, Rays, Tracer
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.types import Floats, Gaussians, Ints
 

@@ -6,12 +6,12 @@ import numpy as np
 
 from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
-from minisplat_ref.extensions import shared_ray_blending, shared_ray_kernels
 from minisplat_ref.extensions.rays.geometry import Whitened, whiten, whiten_vjp
 from minisplat_ref.extensions.rays.kernels import RESPONSE, scene_of
 from minisplat_ref.extensions.rays.reference import meeting_of
-from minisplat_ref.extensions.shared_ray_renderer import Traced, renderer_of
-from minisplat_ref.extensions.shared_rays import Tracer
+from minisplat_ref.mechanisms.rays import blending, kernels
+from minisplat_ref.mechanisms.rays.pixel_rays import Tracer
+from minisplat_ref.mechanisms.rays.renderer import Traced, renderer_of
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Floats, Model
@@ -27,8 +27,8 @@ def whitened_model(model: Model) -> Whitened:
 def tracer_for(gaussians: Whitened, conventions: Conventions, backend: Backend) -> Tracer:
     """Return how a backend traces: every ray against every Gaussian, or kernels with a tree, which is built here."""
     if backend.is_compiled:
-        return shared_ray_kernels.tracer_of(RESPONSE, scene_of(gaussians, conventions))
-    return shared_ray_blending.tracer_of(meeting_of(gaussians))
+        return kernels.tracer_of(RESPONSE, scene_of(gaussians, conventions))
+    return blending.tracer_of(meeting_of(gaussians))
 
 
 def _prepare(population: Any, opacities: Floats) -> Whitened:

@@ -1,4 +1,4 @@
-"""A ray and a 3D Gaussian, in NumPy; what a ray sees of many of them is in ``shared_ray_blending``.
+"""A ray and a 3D Gaussian, in NumPy; what a ray sees of many of them is in ``mechanisms.rays.blending``.
 
 This is section 3 of RaySplats. The map ``M = diag(1/s) R^T`` takes the Gaussian around mu to the unit ball. On the ray
 ``O + t d``
@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.extensions.rays.geometry import Whitened
-from minisplat_ref.extensions.shared_ray_blending import Meeting, PairGradient
-from minisplat_ref.extensions.shared_rays import Rays
+from minisplat_ref.mechanisms.rays.blending import Meeting, PairGradient
+from minisplat_ref.mechanisms.rays.pixel_rays import Rays
 from minisplat_ref.types import Floats, Ints
 
 

@@ -12,11 +12,11 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.rays import surroundings
 from minisplat_ref.extensions.rays.lights import World, shade
 from minisplat_ref.extensions.rays.method import tracer_for, whitened_model
-from minisplat_ref.extensions.shared_rays import pixel_rays
 from minisplat_ref.io import orbits, viewpoints, write_image
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.names import file_names
 from minisplat_ref.io.ply import load_ply
+from minisplat_ref.mechanisms.rays.pixel_rays import pixel_rays
 from minisplat_ref.types import Floats, Model
 
 ORBIT_SIZE = (320, 240)  # pixels

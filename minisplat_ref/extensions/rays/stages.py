@@ -8,8 +8,8 @@ from minisplat_ref.backends import Backend
 from minisplat_ref.extensions.rays.geometry import whiten
 from minisplat_ref.extensions.rays.method import TRACED
 from minisplat_ref.extensions.rays.reference import meeting_of
-from minisplat_ref.extensions.shared_ray_blending import Meeting
-from minisplat_ref.extensions.shared_ray_stages import traced_stages
+from minisplat_ref.mechanisms.rays.blending import Meeting
+from minisplat_ref.mechanisms.rays.stages import traced_stages
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 from minisplat_ref.types import Floats

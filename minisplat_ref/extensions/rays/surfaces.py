@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.extensions.shared_rays import Rays
+from minisplat_ref.mechanisms.rays.pixel_rays import Rays
 from minisplat_ref.types import Bools, Floats, Ints
 
 PAIRS_AT_ONCE = 1 << 18  # of rays and triangles: some ten arrays of 3 float64, 60 MB

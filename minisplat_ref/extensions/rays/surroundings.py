@@ -25,8 +25,8 @@ import numpy as np
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.rays.geometry import Whitened
 from minisplat_ref.extensions.rays.surfaces import DIFFUSE, GLASS, MIRROR, Surfaces, normals_of
-from minisplat_ref.extensions.shared_mesh import Mesh, check_mesh, load_mesh
 from minisplat_ref.io.json_file import as_array, as_number, read_json
+from minisplat_ref.mechanisms.meshes.mesh import Mesh, check_mesh, load_mesh
 from minisplat_ref.types import Floats
 
 KINDS = {"diffuse": DIFFUSE, "mirror": MIRROR, "glass": GLASS}

@@ -4,11 +4,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from minisplat_ref.extensions.shared_payload_renderer import Payload, PayloadGradient, Projected, payload_renderer
 from minisplat_ref.extensions.textured.kernels import filled_up, response_for
 from minisplat_ref.extensions.textured.population import TexturedGaussians, blank
 from minisplat_ref.extensions.textured.reference import visible_frames, visible_frames_vjp
 from minisplat_ref.extensions.textured.response import RESPONSE, Footprints, bounds
+from minisplat_ref.mechanisms.payload.renderer import Payload, PayloadGradient, Projected, payload_renderer
 from minisplat_ref.methods.gaussian_splatting import GS, GS_ACCEL
 from minisplat_ref.reference.pinhole import with_principal_point
 from minisplat_ref.training.rates import Rates

@@ -2,7 +2,7 @@
 
 VRSplat, Tu et al. 2025, arXiv 2505.10144, combines three methods, so that a headset shows few Gaussians without popping
 and without stretched edges: Mini-Splatting's small model; StopThePop's order and Optimal Projection
-(:mod:`minisplat_ref.extensions.shared_tangent_planes`, which the extension ``pixel-order`` uses on their own); and
+(:mod:`minisplat_ref.mechanisms.tangent.planes`, which the extension ``pixel-order`` uses on their own); and
 foveated rendering (:mod:`minisplat_ref.extensions.vr.foveation`). The recipe ``vr`` is Mini-Splatting2, trained with
 the footprints and the order with which it is drawn.
 

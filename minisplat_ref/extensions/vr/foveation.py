@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.shared_tangent_renderer import prepare
+from minisplat_ref.mechanisms.tangent.renderer import prepare
 from minisplat_ref.reference.pinhole import pinhole_rays
 from minisplat_ref.rendering import Request
 from minisplat_ref.types import Bools, Camera, Floats, Model, TileBins

@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.extensions.shared_studies import tidy, with_progress
-from minisplat_ref.extensions.shared_tangent_rays import color_changes, ewa_hits, tangent_hits, yawed
 from minisplat_ref.extensions.vr.foveation import Gaze, Zone, eccentricities, render_foveated, resolved_angles
 from minisplat_ref.extensions.vr.method import BUFFER
+from minisplat_ref.mechanisms.tangent.rays import color_changes, ewa_hits, tangent_hits, yawed
 from minisplat_ref.rendering import Request, activated
 from minisplat_ref.types import Camera, Floats, Gaussians, Ints, Model, Primitives, View
 

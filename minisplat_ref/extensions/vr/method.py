@@ -2,7 +2,7 @@
 
 from functools import partial
 
-from minisplat_ref.extensions.shared_tangent_renderer import render, render_vjp
+from minisplat_ref.mechanisms.tangent.renderer import render, render_vjp
 from minisplat_ref.methods.mini_splatting2 import MINI_SPLATTING2
 from minisplat_ref.rendering import SPLATTING, Renderer
 from minisplat_ref.training.representation import Representation

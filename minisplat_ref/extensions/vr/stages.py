@@ -3,8 +3,8 @@
 import numpy as np
 
 from minisplat_ref.backends import Backend
-from minisplat_ref.extensions.shared_tangent_stages import renderer_stage
 from minisplat_ref.extensions.vr.method import BUFFER, HEADSET
+from minisplat_ref.mechanisms.tangent.stages import renderer_stage
 from minisplat_ref.oracle.setting import Setting
 from minisplat_ref.oracle.stages import Stage
 

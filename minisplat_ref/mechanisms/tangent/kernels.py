@@ -16,10 +16,10 @@ import numpy as np
 
 from minisplat_ref.cpu.compositing.exponential import exp_exact, exp_fast
 from minisplat_ref.cpu.compositing.responses import KernelResponse
-from minisplat_ref.extensions.shared_tangent_planes import COSINE_MIN, TangentFootprints, tangent_bases
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import maximum, select
 from minisplat_ref.jit.literals import HALF, ONE, ZERO
+from minisplat_ref.mechanisms.tangent.planes import COSINE_MIN, TangentFootprints, tangent_bases
 from minisplat_ref.types import Floats
 
 # Columns of a record, and of its gradient.

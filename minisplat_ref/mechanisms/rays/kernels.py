@@ -1,4 +1,4 @@
-"""Rays through a tree of Gaussians, forward and back: what ``shared_ray_blending`` says, without all pairs.
+"""Rays through a tree of Gaussians, forward and back: what ``mechanisms.rays.blending`` says, without all pairs.
 
 The gradient needs no lock and depends on no order of threads: each ray writes what its hits contribute to rows of their
 own, and each Gaussian then adds up its rows in the order of the rays.
@@ -14,11 +14,11 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.extensions.shared_ray_traversal import OPACITY, Scene, empty_lists, finder, limits_of, ray_of
-from minisplat_ref.extensions.shared_rays import BlendedRays, Hits, RayGradient, Rays, Tracer
 from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
 from minisplat_ref.jit.lanes import WIDTH
 from minisplat_ref.jit.scheduling import dynamic_range, shared_counter
+from minisplat_ref.mechanisms.rays.pixel_rays import BlendedRays, Hits, RayGradient, Rays, Tracer
+from minisplat_ref.mechanisms.rays.traversal import OPACITY, Scene, empty_lists, finder, limits_of, ray_of
 from minisplat_ref.types import Floats, Ints
 
 RAYS_PER_PART = 64  # a multiple of eight
@@ -29,7 +29,7 @@ class RayResponse(NamedTuple):
     """What one row of a scene does to a ray."""
 
     meet: Callable
-    """``meet(records, row, ray)`` of eight rays: see :func:`.shared_ray_traversal.finder`."""
+    """``meet(records, row, ray)`` of eight rays: see :func:`~minisplat_ref.mechanisms.rays.traversal.finder`."""
     meet_vjp: Callable
     """``meet_vjp(records, row, ray, unclamped, v_unclamped, v_t)`` of one ray: tuples of derivatives with respect to
     the mean [3], the ray's direction [3], and the row's shape [n_shape]. That of its origin is that of the mean,
@@ -207,7 +207,7 @@ def _sort_by_row(rows, offsets, order):
 def blend_rays(
     response: RayResponse, scene: Scene, colors: Floats, rays: Rays, background: Floats, conventions: Conventions
 ) -> BlendedRays:
-    """Blend what each ray meets: see :func:`minisplat_ref.extensions.shared_ray_blending.blend_rays`.
+    """Blend what each ray meets: see :func:`minisplat_ref.mechanisms.rays.blending.blend_rays`.
 
     Parameters
     ----------
@@ -226,7 +226,7 @@ def blend_rays(
 
 
 def list_hits(response: RayResponse, scene: Scene, rays: Rays, conventions: Conventions) -> Hits:
-    """Return the blended hits of each ray: see :func:`minisplat_ref.extensions.shared_ray_blending.list_hits`."""
+    """Return the blended hits of each ray: see :func:`minisplat_ref.mechanisms.rays.blending.list_hits`."""
     counts = blend_rays(response, scene, np.zeros((scene.n, 3)), rays, np.zeros(3), conventions).n_hits
     hits = _listed(response, scene, rays, conventions, counts)
     return hits._replace(gaussian_ids=scene.gaussian_ids[hits.gaussian_ids].astype(np.int64))
@@ -242,7 +242,7 @@ def blend_rays_vjp(
     blended: BlendedRays,
     v_blended: tuple[Floats, Floats, Floats],
 ) -> RayGradient:
-    """Gradient of :func:`blend_rays`: see :func:`minisplat_ref.extensions.shared_ray_blending.blend_rays_vjp`."""
+    """Gradient of :func:`blend_rays`: see :func:`minisplat_ref.mechanisms.rays.blending.blend_rays_vjp`."""
     v_image, v_depths, v_transmittances = (_wide(v) for v in v_blended)
     kernels, hits = _kernels_of(response), _listed(response, scene, rays, conventions, blended.n_hits)
     behind = hits.transmittances * (v_image @ _wide(background) + v_transmittances)

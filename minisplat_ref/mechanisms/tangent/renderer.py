@@ -8,8 +8,8 @@ from minisplat_ref.backends import REFERENCE, Backend
 from minisplat_ref.constants import EXACT_ORDER, Conventions
 from minisplat_ref.cpu.compositing import hits as kernel_hits
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.shared_tangent_kernels import response_for
-from minisplat_ref.extensions.shared_tangent_planes import (
+from minisplat_ref.mechanisms.tangent.kernels import response_for
+from minisplat_ref.mechanisms.tangent.planes import (
     FootprintGradient,
     TangentFootprints,
     hit,

@@ -12,7 +12,7 @@ import numpy as np
 from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.shared_rays import (
+from minisplat_ref.mechanisms.rays.pixel_rays import (
     BlendedRays,
     Rays,
     Tracer,

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.extensions.shared_rays import BlendedRays, Hits, RayGradient, Rays, Tracer
+from minisplat_ref.mechanisms.rays.pixel_rays import BlendedRays, Hits, RayGradient, Rays, Tracer
 from minisplat_ref.reference.hits import goes_on
 from minisplat_ref.types import Floats, Ints
 

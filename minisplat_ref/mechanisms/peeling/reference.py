@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.extensions.shared_peeling import (
+from minisplat_ref.mechanisms.peeling.layers import (
     LEAST_ANGLE,
     Frame,
     Peeled,

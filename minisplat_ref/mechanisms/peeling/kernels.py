@@ -1,4 +1,4 @@
-"""Depth peeling of translucent triangles and its gradient, as kernels: the functions of ``shared_peeling_reference``.
+"""Depth peeling of translucent triangles and its gradient, as kernels: the twins of ``mechanisms.peeling.reference``.
 
 A row of eight pixels, as the plain kernels have, would be all but empty: the triangles of a fan are slivers of a few
 pixels. Here each triangle writes down which pixels it covers, its *fragments*, and each pixel sorts its own::
@@ -25,7 +25,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.extensions.shared_peeling import (
+from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
+from minisplat_ref.jit.literals import ONE, ZERO
+from minisplat_ref.jit.scheduling import dynamic_range, shared_counter
+from minisplat_ref.mechanisms.peeling.layers import (
     LEAST_ANGLE,
     Frame,
     Peeled,
@@ -33,9 +36,6 @@ from minisplat_ref.extensions.shared_peeling import (
     TranslucentMesh,
     gradient_of,
 )
-from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
-from minisplat_ref.jit.literals import ONE, ZERO
-from minisplat_ref.jit.scheduling import dynamic_range, shared_counter
 from minisplat_ref.types import Floats, Ints
 
 G_1, G_2, S = 0, 3, 6  # columns of a plane: each a value at the anchor, and the slopes along x and y, per pixel
@@ -431,7 +431,7 @@ def _triangles_vjp(vertices, faces, rgba, fragments, v_shades, v_corners, v_corn
 
 
 def peel(mesh: TranslucentMesh, frame: Frame, background: Floats) -> Peeled:
-    """Draw a mesh; see ``shared_peeling_reference.peel``."""
+    """Draw a mesh; see ``mechanisms.peeling.reference.peel``."""
     camera, dtype = frame.camera, mesh.vertices.dtype
     R, t = camera.cam_from_world_R.astype(np.float64), camera.cam_from_world_t.astype(np.float64)
     vertices = mesh.vertices.astype(np.float64) @ R.T + t
@@ -470,7 +470,7 @@ def peel(mesh: TranslucentMesh, frame: Frame, background: Floats) -> Peeled:
 def peel_vjp(
     mesh: TranslucentMesh, frame: Frame, background: Floats, peeled: Peeled, v_image: Floats, v_alpha: Floats
 ) -> PeelGradient:
-    """Gradient of :func:`peel`; see ``shared_peeling_reference.peel_vjp``."""
+    """Gradient of :func:`peel`; see ``mechanisms.peeling.reference.peel_vjp``."""
     tape: Tape = peeled.tape
     dtype, n = mesh.vertices.dtype, len(mesh.faces)
     v = np.ascontiguousarray(v_image, dtype).reshape(-1, 3)

@@ -5,8 +5,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from minisplat_ref.backends import Backend
-from minisplat_ref.extensions.shared_ray_blending import Meeting, list_hits
-from minisplat_ref.extensions.shared_rays import pixel_rays
+from minisplat_ref.mechanisms.rays.blending import Meeting, list_hits
+from minisplat_ref.mechanisms.rays.pixel_rays import pixel_rays
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.models import model_stage
 from minisplat_ref.oracle.setting import POSE, Setting

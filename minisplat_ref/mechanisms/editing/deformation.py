@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.extensions.shared_sh_rotation import rotated_sh
+from minisplat_ref.mechanisms.editing.sh_rotation import rotated_sh
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.types import Floats, Gaussians, Ints
 

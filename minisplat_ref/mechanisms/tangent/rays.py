@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import EXACT_ORDER, LIST_ORDER, Conventions
-from minisplat_ref.extensions.shared_tangent_planes import hit, project
+from minisplat_ref.mechanisms.tangent.planes import hit, project
 from minisplat_ref.reference.hits import Hit, blending_order, conic_hit, goes_on
 from minisplat_ref.reference.pinhole import pinhole
 from minisplat_ref.reference.projection import project as project_ewa

@@ -29,7 +29,7 @@ def renderer_stage(
     ----------
     backend, setting, representation, rng
         As for :func:`minisplat_ref.oracle.models.model_stage`; the renderer is one of
-        :func:`minisplat_ref.extensions.shared_payload_renderer.payload_renderer`.
+        :func:`minisplat_ref.mechanisms.payload.renderer.payload_renderer`.
     sides_of : callable
         Returns, for a tile's hits and the coefficients [N, S] of the colours, on which sides of thresholds they are.
     """

@@ -15,9 +15,9 @@ import numpy as np
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.gaussian_rows import rows_from
-from minisplat_ref.extensions.shared_bvh import IS_INNER, MOST_LEVELS
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import WIDTH, gather, load, maximum, minimum, reduce_any, reduce_max, select, store
+from minisplat_ref.mechanisms.rays.bvh import IS_INNER, MOST_LEVELS
 from minisplat_ref.types import Floats, Ints
 
 OPACITY = 0  # column of a record; the others are the extension's
@@ -46,7 +46,7 @@ class Scene(NamedTuple):
     parts: Ints
     """[N'] int32 which part of the Gaussian; 0 of a whole one."""
     boxes: Floats
-    """[K, 2, 6], as in :class:`.shared_bvh.Tree`; a bundle of a kernel holds no other bundle."""
+    """[K, 2, 6], as in :class:`~minisplat_ref.mechanisms.rays.bvh.Tree`; a bundle of a kernel holds no other bundle."""
     children: Ints
     """[K, 2, 2] as in :class:`.bvh.Tree`."""
     n: int

@@ -3,7 +3,7 @@
 import numpy as np
 
 from minisplat_ref.backends import REFERENCE, Backend
-from minisplat_ref.extensions.shared_tangent_renderer import RESPONSE, checked_buffer, prepare
+from minisplat_ref.mechanisms.tangent.renderer import RESPONSE, checked_buffer, prepare
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.models import model_stage
 from minisplat_ref.oracle.setting import POSE, Setting
