@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from tempfile import mkdtemp
 
-from minisplat_ref.experiments.arguments import HelpFormatter, Parser, integer
+from minisplat_ref.arguments import HelpFormatter, Parser, integer
 
 INSTRUMENTED = ["minisplat_ref.io"]  # where files are read; compiled kernels are not Python when they run
 
@@ -34,8 +34,8 @@ def main() -> None:
     except ImportError:
         parser.error("atheris is missing: pip install 'minisplat_ref[fuzzing]'")
     with atheris.instrument_imports(include=INSTRUMENTED):
-        from minisplat_ref.experiments.fuzzing.judging import judge
-        from minisplat_ref.experiments.fuzzing.readers import READERS, mutant
+        from data_tools.fuzz.judging import judge
+        from data_tools.fuzz.readers import READERS, mutant
     if args.reader not in READERS:
         parser.error(f"reader {args.reader!r} does not exist: choose from {', '.join(READERS)}")
     reader, folder = READERS[args.reader], Path(mkdtemp())

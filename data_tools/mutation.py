@@ -34,7 +34,7 @@ from cosmic_ray.mutating import mutate_and_test
 from cosmic_ray.work_db import WorkDB, use_db
 
 from data_tools.sources import Imports, annotations
-from minisplat_ref.experiments.arguments import HelpFormatter, Parser, integer
+from minisplat_ref.arguments import HelpFormatter, Parser, integer
 from minisplat_ref.reporting import markdown_table
 
 ROOT = Path(__file__).resolve().parents[1]

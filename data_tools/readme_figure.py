@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments import run_folder
-from minisplat_ref.experiments.pictures import GAP
-from minisplat_ref.experiments.plots import PLOT_STYLE
 from minisplat_ref.io import read_image
 from minisplat_ref.io.atomic import replacing
+from minisplat_ref.reports.pictures import GAP
+from minisplat_ref.reports.plots import PLOT_STYLE
+from minisplat_ref.runs import run_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

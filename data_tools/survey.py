@@ -26,8 +26,8 @@ import numpy as np
 
 import minisplat_ref
 from data_tools.survey_errors import ERRORS, PlantedLine
+from minisplat_ref.arguments import HelpFormatter, Parser
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.arguments import HelpFormatter, Parser
 from minisplat_ref.reporting import markdown_table
 
 PACKAGE = Path(minisplat_ref.__file__).parent

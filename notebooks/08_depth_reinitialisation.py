@@ -36,13 +36,6 @@ from figures import BLUE, GREEN, GREY, RED, show, show_code
 from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.experiments.studies.depth_types import (
-    OFF_SURFACE,
-    Choice,
-    depth_errors,
-    drawn_points,
-    errors,
-)
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import render
@@ -54,6 +47,13 @@ from minisplat_ref.strategy.depth_reinit import (
     reinitial_points,
 )
 from minisplat_ref.strategy.initialization import from_points
+from minisplat_ref.studies.depth_types import (
+    OFF_SURFACE,
+    Choice,
+    depth_errors,
+    drawn_points,
+    errors,
+)
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.state import TrainState
@@ -109,7 +109,7 @@ plt.show()
 # |---|---|---|
 # | `minisplat_ref/strategy/depth_reinit.py` | points of the pixels; which are drawn; safeguards | MS sec. 4.1, app. D |
 # | `minisplat_ref/strategy/simplify.py` | `sample`: drawing without replacement | |
-# | `minisplat_ref/experiments/studies/depth_types.py` | the comparison below, larger, with several seeds | MS table 4 |
+# | `minisplat_ref/studies/depth_types.py` | the comparison below, larger, with several seeds | MS table 4 |
 #
 # *MS* is Mini-Splatting, Fang and Wang 2024; the safeguards are not in the paper. **Frames and units:** the world is in
 # metres, z up; camera axes are x right, y down, z forward; a depth is the camera z.

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scenes import make_gaussians
 
+from data_tools.fuzz.mutations import change_json
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.fuzzing.mutations import change_json
 from minisplat_ref.types import Gaussians
 
 FEW_BYTES = 2_000_000  # that a refusal may take, whatever the file claims

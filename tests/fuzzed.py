@@ -6,8 +6,8 @@ import warnings
 
 import numpy as np
 
+from data_tools.fuzz.readers import Reader
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.fuzzing.readers import Reader
 
 CONTENT = bytes(range(100))
 

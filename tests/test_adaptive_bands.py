@@ -12,7 +12,6 @@ from tolerances import CLOSED_FORM
 from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0, SH_C1
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.simplification import fine_tuned
 from minisplat_ref.io.checkpoint import DamagedCheckpoint, load_checkpoint, save_checkpoint
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.methods.adaptive import ADAPTIVE
@@ -25,6 +24,7 @@ from minisplat_ref.methods.adaptive_bands import (
 )
 from minisplat_ref.reference.spherical_harmonics import sh_colors
 from minisplat_ref.rendering import render
+from minisplat_ref.runs.simplification import fine_tuned
 from minisplat_ref.training.loop import load_state, save_state, train
 from minisplat_ref.training.pace import Pace, held_out_ids
 from minisplat_ref.training.rates import present_degrees

@@ -7,13 +7,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import make_camera, make_gaussians
 from tolerances import CLOSED_FORM, GRADIENT_REL
 
-from minisplat_ref.experiments.studies.adaptive_candidates import (
+from minisplat_ref.methods.adaptive import ADAPTIVE
+from minisplat_ref.studies.adaptive_candidates import (
     CANDIDATES,
     mean_opacity,
     mean_scale,
     remove_near_cameras,
 )
-from minisplat_ref.methods.adaptive import ADAPTIVE
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.losses import Rendered
 from minisplat_ref.training.state import TrainState

@@ -9,8 +9,8 @@ from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.decisions_report import decisions_section, story
 from minisplat_ref.methods.adaptive import ADAPTIVE, halve_large_views
+from minisplat_ref.runs.decisions_report import decisions_section, story
 from minisplat_ref.training.loop import initial_state, load_state, save_state, train
 from minisplat_ref.training.pace import COOLED, FINER, Decision, Measurement, Pace, from_metadata, to_metadata
 from minisplat_ref.training.schedule import configured

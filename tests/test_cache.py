@@ -19,10 +19,10 @@ from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.experiments import first_use
 from minisplat_ref.jit import compile as _jit
 from minisplat_ref.jit.kernel_cache import kernel_folders
 from minisplat_ref.rendering import render
+from minisplat_ref.runs import first_use
 from minisplat_ref.warm_up import FIRST_ITERATION, STAGES, warm_up
 
 PACKAGE = Path(minisplat_ref.__file__).parent
@@ -128,7 +128,7 @@ def test_numba_notices_another_processor_and_another_numba(tmp_path, monkeypatch
 def test_a_training_starts_without_plots_and_readers_of_other_scenes():
     code = """
 import sys
-import minisplat_ref.experiments.settings, minisplat_ref.experiments.run
+import minisplat_ref.runs.settings, minisplat_ref.runs.run
 print("LOADED", {"matplotlib", "pycolmap", "torch", "IPython"} & set(sys.modules))
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)

@@ -21,12 +21,12 @@ from tolerances import (
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.studies import EXPOSURE, POSE
-from minisplat_ref.experiments.studies import exposures as exposures_study
-from minisplat_ref.experiments.studies import poses as poses_study
 from minisplat_ref.io.images import read_image
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.studies import EXPOSURE, POSE
+from minisplat_ref.studies import exposures as exposures_study
+from minisplat_ref.studies import poses as poses_study
 from minisplat_ref.training.calibration import (
     EXPOSURES,
     LEAST_ANGLE,

@@ -17,19 +17,19 @@ from tolerances import PSNR_FLOAT32
 
 import minisplat_ref
 from minisplat_ref import InputError, load_ply, load_scene, save_ply
+from minisplat_ref.arguments import BACKENDS as BACKEND_CHOICES
+from minisplat_ref.arguments import SYNTHETIC_SCENES
 from minisplat_ref.backends import BACKENDS, CPU
 from minisplat_ref.cli import GROUPS, build_parser, demo, main
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.experiments.arguments import BACKENDS as BACKEND_CHOICES
-from minisplat_ref.experiments.arguments import SYNTHETIC_SCENES
-from minisplat_ref.experiments.pictures import GAP, error_picture, to_picture
-from minisplat_ref.experiments.progress import LOG_EVERY, Progress, read_log
-from minisplat_ref.experiments.studies import all_studies
 from minisplat_ref.io import read_image
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.metrics import evaluate, psnr
 from minisplat_ref.rendering import render
+from minisplat_ref.reports.pictures import GAP, error_picture, to_picture
+from minisplat_ref.runs.progress import LOG_EVERY, Progress, read_log
+from minisplat_ref.studies import all_studies
 
 WIDTH, HEIGHT = 32, 24
 N_TRAIN, N_TEST = 6, 2

@@ -17,12 +17,10 @@ from browser import check_page
 from tolerances import CLOSED_FORM
 
 from minisplat_ref.cli import main
-from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.experiments.comparison import mechanisms, speed
-from minisplat_ref.experiments.comparison import runs as runs_module
-from minisplat_ref.experiments.comparison.crops import best_window, choose_crops, detail, difference
-from minisplat_ref.experiments.comparison.measures import (
+from minisplat_ref.comparison import runs as runs_module
+from minisplat_ref.comparison import speed
+from minisplat_ref.comparison.crops import best_window, choose_crops, detail, difference
+from minisplat_ref.comparison.measures import (
     MEASURES,
     RecipeMeasures,
     Spread,
@@ -33,14 +31,17 @@ from minisplat_ref.experiments.comparison.measures import (
     relation,
     spread,
 )
-from minisplat_ref.experiments.comparison.plan import Plan
-from minisplat_ref.experiments.comparison.table import table_cells
-from minisplat_ref.experiments.events import Mechanism
-from minisplat_ref.experiments.progress import read_log
-from minisplat_ref.experiments.scoring import Trained
+from minisplat_ref.comparison.plan import Plan
+from minisplat_ref.comparison.table import table_cells
+from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.io import load_ply, load_scene
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.rendering import SPLATTING
+from minisplat_ref.runs.events import Mechanism
+from minisplat_ref.runs.fired import Fired, remarks, rows
+from minisplat_ref.runs.progress import read_log
+from minisplat_ref.runs.scoring import Trained
 from minisplat_ref.training.schedule import At, describe
 from minisplat_ref.types import Gaussians, Model
 
@@ -383,13 +384,13 @@ def test_table_of_mechanisms():
         [mechanism("grow", 3, 100, 300, 5000, 0), mechanism("prune", 1, 100, 100, 0, 7, full=1)],
         [mechanism("grow", 3, 100, 400, 4000, 10, paused=2)],
     ]
-    fired = mechanisms.Fired("a", 900, 30_000, {"grow": 145, "prune": 1, "reset": 4}, runs)
-    assert mechanisms.rows(fired) == [
+    fired = Fired("a", 900, 30_000, {"grow": 145, "prune": 1, "reset": 4}, runs)
+    assert rows(fired) == [
         ["grow", "3", "145", "100", "300 to 400", "4,000 to 5,000", "0 to 10"],
         ["prune", "0 to 1", "1", "100", "100", "0", "7"],
     ]
-    assert mechanisms.remarks(fired) == ["prune: full", "grow: paused (2 times)", "never: reset"]
-    assert mechanisms.remarks(fired._replace(published={"grow": 145})) == ["prune: full", "grow: paused (2 times)"]
+    assert remarks(fired) == ["prune: full", "grow: paused (2 times)", "never: reset"]
+    assert remarks(fired._replace(published={"grow": 145})) == ["prune: full", "grow: paused (2 times)"]
 
 
 # Speed and crops

@@ -14,10 +14,15 @@ from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError, InputWarning
-from minisplat_ref.experiments import opened_run, simplification
-from minisplat_ref.experiments.opened_run import HOLD_OUT_EVERY, open_run
-from minisplat_ref.experiments.progress import PSNR_MAX
-from minisplat_ref.experiments.rate_distortion import (
+from minisplat_ref.extensions.extension import find_recipe
+from minisplat_ref.io import load_ply, load_scene, save_ply
+from minisplat_ref.io.images import read_image
+from minisplat_ref.methods import get_recipe
+from minisplat_ref.metrics import evaluate
+from minisplat_ref.runs import opened_run, simplification
+from minisplat_ref.runs.opened_run import HOLD_OUT_EVERY, open_run
+from minisplat_ref.runs.progress import PSNR_MAX
+from minisplat_ref.runs.rate_distortion import (
     N_SIZES,
     PlySize,
     Point,
@@ -27,12 +32,7 @@ from minisplat_ref.experiments.rate_distortion import (
     sizes,
     smallest_within,
 )
-from minisplat_ref.experiments.simplification import Target, decide, fine_tuned, fine_tuning
-from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.io import load_ply, load_scene, save_ply
-from minisplat_ref.io.images import read_image
-from minisplat_ref.methods import get_recipe
-from minisplat_ref.metrics import evaluate
+from minisplat_ref.runs.simplification import Target, decide, fine_tuned, fine_tuning
 from minisplat_ref.strategy.importance import collect_importance
 from minisplat_ref.strategy.ops import take
 from minisplat_ref.training.loop import train

@@ -14,14 +14,14 @@ from pathlib import Path
 import pytest
 
 from minisplat_ref.cli import main
+from minisplat_ref.comparison import runs as runs_module
+from minisplat_ref.comparison.plan import Plan, load_plan, save_plan
+from minisplat_ref.comparison.runs import settings_of, statuses
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.comparison import runs as runs_module
-from minisplat_ref.experiments.comparison.plan import Plan, load_plan, save_plan
-from minisplat_ref.experiments.comparison.runs import settings_of, statuses
-from minisplat_ref.experiments.progress import Progress, read_log
-from minisplat_ref.experiments.settings import load as load_settings
+from minisplat_ref.runs.progress import Progress, read_log
+from minisplat_ref.runs.settings import load as load_settings
 
 SCENE = {"n_views": 8, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
 ITERATIONS = 12

@@ -11,11 +11,11 @@ from numpy.testing import assert_array_equal
 from minisplat_ref import load_ply, save_ply
 from minisplat_ref.cli import main
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments import conversion
 from minisplat_ref.extensions import extension as extension_module
 from minisplat_ref.extensions.compression import levels, msz, spz
 from minisplat_ref.extensions.extension import Extension, find_format, load_extension
 from minisplat_ref.mechanisms.packing.morton import morton_order
+from minisplat_ref.runs import conversion
 from minisplat_ref.training.calibration import EXPOSURES
 
 LEVELS = range(levels.N_LEVELS)

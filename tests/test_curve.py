@@ -10,13 +10,13 @@ import pytest
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.experiments import curve
-from minisplat_ref.experiments import progress as progress_module
-from minisplat_ref.experiments import run as training
-from minisplat_ref.experiments.progress import Progress, read_log
-from minisplat_ref.experiments.surface import surface_distance, true_surface
+from minisplat_ref.datasets.synthetic.surface import surface_distance, true_surface
 from minisplat_ref.io import load_ply, load_scene
 from minisplat_ref.metrics import Evaluation
+from minisplat_ref.runs import curve
+from minisplat_ref.runs import progress as progress_module
+from minisplat_ref.runs import run as training
+from minisplat_ref.runs.progress import Progress, read_log
 
 SCENE = {"n_views": 6, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
 ITERATIONS, EVAL_EVERY = 20, 8

@@ -12,11 +12,11 @@ from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments import events
-from minisplat_ref.experiments.events import describe, mechanisms, never_fired, published_times
-from minisplat_ref.experiments.progress import Progress, read_log
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.methods.gaussian_splatting import clone_and_split, collect_gradients, prune_faint, reset_opacity
+from minisplat_ref.runs import events
+from minisplat_ref.runs.events import describe, mechanisms, never_fired, published_times
+from minisplat_ref.runs.progress import Progress, read_log
 from minisplat_ref.training.loop import HALF_SIZE
 from minisplat_ref.training.schedule import At, During, Every
 from minisplat_ref.training.state import FiredEvent

@@ -10,10 +10,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from data_tools import guided_fuzz
-from minisplat_ref.experiments.fuzzing import run
-from minisplat_ref.experiments.fuzzing.judging import judge
-from minisplat_ref.experiments.fuzzing.readers import READERS, mutant
-from minisplat_ref.experiments.fuzzing.run import chooser, fuzz, keep
+from data_tools.fuzz import run
+from data_tools.fuzz.judging import judge
+from data_tools.fuzz.readers import READERS, mutant
+from data_tools.fuzz.run import chooser, fuzz, keep
 
 ROOT = Path(__file__).parents[1]
 IN_PROCESS = ("ply", "cameras", "config", "checkpoint", "golden")  # whatever Python raises can be caught

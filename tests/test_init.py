@@ -11,16 +11,16 @@ from tolerances import ROUNDED_TO_FLOAT32
 
 import minisplat_ref as ms
 from minisplat_ref.cli import main
+from minisplat_ref.comparison import runs
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.comparison import runs
-from minisplat_ref.experiments.progress import Progress
-from minisplat_ref.experiments.start import load_start
 from minisplat_ref.io import load_ply, load_scene
 from minisplat_ref.io.ply import COLORS, write_vertices
 from minisplat_ref.methods import RECIPES
+from minisplat_ref.runs.progress import Progress
+from minisplat_ref.runs.start import load_start
 from minisplat_ref.training.loop import initial_state
 
 SCENE = {"n_views": 8, "width": 32, "height": 24, "n_points": 60, "test_every": 4}

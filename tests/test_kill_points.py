@@ -5,8 +5,8 @@ import shutil
 
 import pytest
 
-from minisplat_ref.experiments.kill_points import POINTS
-from minisplat_ref.experiments.survival import differences, kill_and_go_on, limit_files, prepare
+from data_tools.kill_points.points import POINTS
+from data_tools.kill_points.survival import differences, kill_and_go_on, limit_files, prepare
 
 SAMPLE = {
     "evaluation: half a line of curve.jsonl": "iteration 179",

@@ -16,11 +16,11 @@ from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments import scoring
-from minisplat_ref.experiments.progress import Progress
 from minisplat_ref.io import load_ply, load_scene
 from minisplat_ref.lpips import ALEXNET, VGG16, Network, convolve, expected_shapes, load_network, lpips, max_pool
 from minisplat_ref.metrics import evaluate
+from minisplat_ref.runs import scoring
+from minisplat_ref.runs.progress import Progress
 from minisplat_ref.types import View
 
 SIDE = 33  # pixels; AlexNet needs 31

@@ -6,9 +6,9 @@ import re
 import pytest
 from networks import write_network
 
+from data_tools.measure import measure_rate, measure_scenes
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.experiments.measure import measure_rate, measure_scenes
 
 
 @pytest.fixture

@@ -16,12 +16,12 @@ from minisplat_ref.cli import sfm as sfm_command
 from minisplat_ref.datasets import sfm
 from minisplat_ref.datasets.downscale import list_images
 from minisplat_ref.errors import InputError, InputWarning
-from minisplat_ref.experiments import first_use
-from minisplat_ref.experiments.notices import warn_of_model, warn_of_scene
 from minisplat_ref.io import images as images_module
 from minisplat_ref.io import load_ply, load_scene, read_image
 from minisplat_ref.io.images import PIXELS_MAX, image_size, is_turned, write_image
 from minisplat_ref.io.lens import import_pycolmap
+from minisplat_ref.runs import first_use
+from minisplat_ref.runs.notices import warn_of_model, warn_of_scene
 from minisplat_ref.types import Model
 
 

@@ -12,11 +12,11 @@ from minisplat_ref import Gaussians, save_ply
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.undistort import undistort_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments import scoring
 from minisplat_ref.io import load_scene, read_image, viewpoints
 from minisplat_ref.io.images import write_image
 from minisplat_ref.io.names import file_names, name_inside, path_beside
 from minisplat_ref.metrics import ViewMetrics
+from minisplat_ref.runs import scoring
 from minisplat_ref.types import numbered
 
 NASTY = ("/abs", "../up", "a/../../b", "C:\\x", "a\0b", "a\nb", "..", "", "x" * 300, "é" * 200, "nul", "A", "a")

@@ -12,9 +12,9 @@ from tolerances import PARITY_FLOAT32_IMAGE, PARITY_FLOAT64, REMOVAL
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.studies.pruning import exact_costs
 from minisplat_ref.rendering import SPLATTING, Request, render, render_vjp
 from minisplat_ref.strategy.removal import RemovalCosts, collect_removal_costs, worth_their_place
+from minisplat_ref.studies.pruning import exact_costs
 from minisplat_ref.training.state import Iteration
 from minisplat_ref.types import Model, Scene, View, view_from
 

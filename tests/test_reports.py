@@ -8,12 +8,12 @@ import pytest
 from browser import check_page
 
 from minisplat_ref.cli import main
-from minisplat_ref.experiments import commands
-from minisplat_ref.experiments.decisions_report import decisions_section, story
-from minisplat_ref.experiments.page import captioned, cards, listing, page, panel, section, slider, table
-from minisplat_ref.experiments.pictures import fitting, side_by_side, split
-from minisplat_ref.experiments.report_parts import training_curves, view_panel
 from minisplat_ref.oracle.cases import Case, Report
+from minisplat_ref.reports import commands
+from minisplat_ref.reports.page import captioned, cards, listing, page, panel, section, slider, table
+from minisplat_ref.reports.pictures import fitting, side_by_side, split
+from minisplat_ref.runs.decisions_report import decisions_section, story
+from minisplat_ref.runs.report_parts import training_curves, view_panel
 from minisplat_ref.training.pace import Decision, Measurement, Pace
 
 LONG = "a_name_without_any_space_" * 12
@@ -125,7 +125,7 @@ def test_a_page_that_cannot_be_written_is_one_line(tmp_path, capsys):
 
 
 def test_a_page_of_a_check_says_what_failed(tmp_path):
-    from minisplat_ref.experiments.check_report import report_html
+    from minisplat_ref.reports.check_report import report_html
 
     cases = (Case("right", True, {"error": 1e-9}), Case("wrong", False, {"error": 0.5}, "why"))
     text = report_html(Report("checks: of two", cases, {"dtype": "float32", "records": [{"a": 1}]}))

@@ -19,12 +19,12 @@ from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments import checkpoints, fingerprint, run, run_folder
-from minisplat_ref.experiments.progress import Progress, read_log
 from minisplat_ref.io import load_scene, read_image, write_image
 from minisplat_ref.io.checkpoint import load_checkpoint, save_checkpoint
 from minisplat_ref.io.viewpoints import scene_viewpoints, to_json
 from minisplat_ref.methods import get_recipe
+from minisplat_ref.runs import checkpoints, fingerprint, run, run_folder
+from minisplat_ref.runs.progress import Progress, read_log
 from minisplat_ref.training import interruption
 from minisplat_ref.training.schedule import action_name
 
@@ -487,7 +487,7 @@ def test_a_log_that_cannot_be_written_stops_with_all_saved(original, finished, t
                 raise OSError(28, "No space left on device", str(path))
             return open(path, mode, **named)
 
-        patch.setattr("minisplat_ref.experiments.progress.open", no_space, raising=False)
+        patch.setattr("minisplat_ref.runs.progress.open", no_space, raising=False)
         line = refused("train", original, *OPTIONS, "--out", folder)
     assert f"{folder / 'log.jsonl'} cannot be written (No space left on device): make room" in line
     assert line.endswith(f"iteration 15 is saved; to go on: minisplat-ref train --resume {folder}")

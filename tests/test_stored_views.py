@@ -18,13 +18,11 @@ from test_train import assert_same_bytes
 from minisplat_ref import memory
 from minisplat_ref.backends import CPU
 from minisplat_ref.cli import main
+from minisplat_ref.comparison.crops import choose_crops
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments import fingerprint, room, run_folder
-from minisplat_ref.experiments.comparison.crops import choose_crops
-from minisplat_ref.experiments.scoring import Trained
 from minisplat_ref.io import load_scene, write_image
 from minisplat_ref.io import scene as scene_io
 from minisplat_ref.io.scene import half_size, rescale_camera
@@ -32,6 +30,8 @@ from minisplat_ref.io.stored_views import Photograph, Pixels, ReadingAhead, Shel
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.runs import fingerprint, room, run_folder
+from minisplat_ref.runs.scoring import Trained
 from minisplat_ref.training.loop import initial_state, train
 from minisplat_ref.training.losses import LossTerm
 from minisplat_ref.types import View, view_from
@@ -275,7 +275,7 @@ def test_evaluations_hold_no_more_than_they_show(scene, alive, monkeypatch):
 
 
 def hide_at(step, path, monkeypatch, change):
-    from minisplat_ref.experiments.progress import Progress
+    from minisplat_ref.runs.progress import Progress
 
     report_step = Progress.__call__
 

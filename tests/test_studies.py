@@ -7,12 +7,12 @@ import pytest
 from tolerances import PRINTED_DIGITS
 
 from minisplat_ref.cli import main
-from minisplat_ref.experiments.studies import FIGURE, RESULT, all_studies, split_forms
 from minisplat_ref.io import load_scene, save_ply
 from minisplat_ref.io.images import read_image
 from minisplat_ref.methods import gaussian_splatting, get_recipe, mini_splatting
 from minisplat_ref.strategy.blur_split import principal_axis_children
 from minisplat_ref.strategy.clone_split import random_children
+from minisplat_ref.studies import FIGURE, RESULT, all_studies, split_forms
 from minisplat_ref.training.loop import initial_state
 from minisplat_ref.training.schedule import does
 

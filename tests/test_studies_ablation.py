@@ -11,9 +11,12 @@ from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.studies import FIGURE, RESULT, ablation, conditions, front
-from minisplat_ref.experiments.studies.front import RUNS
-from minisplat_ref.experiments.studies.variants import (
+from minisplat_ref.io.images import read_image
+from minisplat_ref.methods import RECIPES, gaussian_splatting
+from minisplat_ref.methods.mini_splatting import reinitialise_from_depth
+from minisplat_ref.studies import FIGURE, RESULT, ablation, conditions, front
+from minisplat_ref.studies.front import RUNS
+from minisplat_ref.studies.variants import (
     DEVIATIONS,
     FULL,
     MECHANISMS,
@@ -22,9 +25,6 @@ from minisplat_ref.experiments.studies.variants import (
     with_lost_steps,
     with_settings,
 )
-from minisplat_ref.io.images import read_image
-from minisplat_ref.methods import RECIPES, gaussian_splatting
-from minisplat_ref.methods.mini_splatting import reinitialise_from_depth
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import At, action_name, configured, firing_steps, settings_of
 from minisplat_ref.training.state import Iteration

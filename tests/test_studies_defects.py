@@ -8,7 +8,7 @@ import pytest
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.studies import defects
+from minisplat_ref.studies import defects
 
 
 @pytest.fixture(scope="module")

@@ -10,11 +10,11 @@ from tolerances import CLOSED_FORM, PRINTED_DIGITS
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.tracer import pixel_rays
-from minisplat_ref.experiments.studies import FIGURE, RESULT, depth_types
-from minisplat_ref.experiments.studies.variants import as_3dgs_prunes
 from minisplat_ref.io.images import read_image
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.strategy.initialization import from_points
+from minisplat_ref.studies import FIGURE, RESULT, depth_types
+from minisplat_ref.studies.variants import as_3dgs_prunes
 
 
 def small(name):

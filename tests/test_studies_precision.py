@@ -8,9 +8,9 @@ from numpy.testing import assert_array_equal
 
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.experiments.studies import precision
-from minisplat_ref.experiments.studies.precision import FAST, PRECISIONS, STORED, n_bytes, trained
 from minisplat_ref.methods import get_recipe
+from minisplat_ref.studies import precision
+from minisplat_ref.studies.precision import FAST, PRECISIONS, STORED, n_bytes, trained
 from minisplat_ref.types import Model
 
 ITERATIONS = 30

@@ -9,7 +9,6 @@ from tolerances import CLOSED_FORM, PRINTED_DIGITS
 
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.experiments.studies import FIGURE, RESULT, simplify
 from minisplat_ref.io import load_ply, load_scene, save_ply
 from minisplat_ref.io.images import read_image
 from minisplat_ref.methods import get_recipe
@@ -18,6 +17,7 @@ from minisplat_ref.strategy.importance import collect_importance, indoor
 from minisplat_ref.strategy.initialization import from_points
 from minisplat_ref.strategy.removal import collect_removal_costs
 from minisplat_ref.strategy.simplify import carrying_mass, intersection_preserving, most_important
+from minisplat_ref.studies import FIGURE, RESULT, simplify
 from minisplat_ref.training.loop import train
 
 TINY = ("--views", "6", "--width", "32", "--height", "24", "--supersampling", "1", "--points", "200")

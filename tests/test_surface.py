@@ -10,10 +10,10 @@ from scipy.spatial import cKDTree
 from tolerances import CLOSED_FORM, SYNTHETIC_FLOAT32
 
 from minisplat_ref.datasets.synthetic import make_scene
+from minisplat_ref.datasets.synthetic import surface as surface_module
 from minisplat_ref.datasets.synthetic.files import load_depths, write_scene
+from minisplat_ref.datasets.synthetic.surface import chamfer, shown_points, surface_distance, surface_near, true_surface
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments import surface as surface_module
-from minisplat_ref.experiments.surface import chamfer, shown_points, surface_distance, surface_near, true_surface
 from minisplat_ref.io import load_scene
 
 SCENE = {"n_views": 4, "width": 32, "height": 24, "n_points": 60, "test_every": 3}

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from minisplat_ref.experiments.page import grid, panel, paragraph, section
-from minisplat_ref.experiments.plots import EDGE_COLOR, GRID_COLOR, PLOT_STYLE, SERIES, to_svg
 from minisplat_ref.io.atomic import replacing
 from minisplat_ref.oracle.cases import Case
+from minisplat_ref.reports.page import grid, panel, paragraph, section
+from minisplat_ref.reports.plots import EDGE_COLOR, GRID_COLOR, PLOT_STYLE, SERIES, to_svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -23,13 +23,13 @@ from minisplat_ref.bench.process_memory import forget_peak, held, peak
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments import room
-from minisplat_ref.experiments.run import run_training
-from minisplat_ref.experiments.settings import Settings, load_photographs, recipe_of
 from minisplat_ref.io.images import resize_image, write_image
 from minisplat_ref.io.ply_file import write_vertices
 from minisplat_ref.io.scene import rescale_camera
 from minisplat_ref.oracle.cases import Case, Figure
+from minisplat_ref.runs import room
+from minisplat_ref.runs.run import run_training
+from minisplat_ref.runs.settings import Settings, load_photographs, recipe_of
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import initial_state
 from minisplat_ref.training.state import TrainState

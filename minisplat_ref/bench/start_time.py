@@ -16,12 +16,12 @@ from minisplat_ref.backends import REFERENCE
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments import run_folder
-from minisplat_ref.experiments.progress import read_log
 from minisplat_ref.io import load_scene
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.oracle.cases import Case
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_LOSS
+from minisplat_ref.runs import run_folder
+from minisplat_ref.runs.progress import read_log
 from minisplat_ref.training.loop import train
 from minisplat_ref.types import Scene
 

@@ -17,8 +17,8 @@ from collections.abc import Sequence
 from typing import TextIO
 
 from minisplat_ref import __version__
+from minisplat_ref.arguments import HelpFormatter, Parser
 from minisplat_ref.errors import InputError, InputWarning
-from minisplat_ref.experiments.arguments import HelpFormatter, Parser
 
 from . import (
     bench,

@@ -5,9 +5,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from minisplat_ref.arguments import Commands, HelpFormatter, integer, listed, name
 from minisplat_ref.cli.oracle import add_json_argument
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter, integer, listed, name
 
 if TYPE_CHECKING:
     from minisplat_ref.oracle.cases import Report
@@ -204,9 +204,9 @@ def _tables(report: "Report") -> str:
 def _save_folder(report: "Report", folder: Path) -> None:
     """Write JSON, tables, figure and page into a folder, which is made."""
     from minisplat_ref.bench.figure import pareto_section, save_figure
-    from minisplat_ref.experiments.check_report import write_page
     from minisplat_ref.io.atomic import replacing
     from minisplat_ref.oracle.cases import save_json
+    from minisplat_ref.reports.check_report import write_page
 
     try:
         folder.mkdir(parents=True, exist_ok=True)

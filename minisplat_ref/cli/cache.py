@@ -5,8 +5,8 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
+from minisplat_ref.arguments import Commands, HelpFormatter, integer
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter, integer
 
 if TYPE_CHECKING:
     from minisplat_ref.jit.kernel_cache import KernelFolder

@@ -5,11 +5,11 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from minisplat_ref.arguments import Commands, HelpFormatter, integer, listed, name, option_name
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter, integer, listed, name, option_name
 
 if TYPE_CHECKING:
-    from minisplat_ref.experiments.comparison.plan import Plan
+    from minisplat_ref.comparison.plan import Plan
     from minisplat_ref.types import Scene
 
 DEFAULTS: dict[str, Any] = {
@@ -93,9 +93,9 @@ def add_parser(commands: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Train, measure, write the files, print the table."""
-    from minisplat_ref.experiments import run_folder
-    from minisplat_ref.experiments.comparison.plan import check, remove_if_unused, save_plan
-    from minisplat_ref.experiments.comparison.runs import statuses, train_all, warm_up
+    from minisplat_ref.comparison.plan import check, remove_if_unused, save_plan
+    from minisplat_ref.comparison.runs import statuses, train_all, warm_up
+    from minisplat_ref.runs import run_folder
     from minisplat_ref.training.interruption import terminated_like_interrupted
 
     given = vars(args)
@@ -121,7 +121,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _new(given: dict[str, Any]) -> "Plan":
-    from minisplat_ref.experiments.comparison.plan import Plan, check_free
+    from minisplat_ref.comparison.plan import Plan, check_free
 
     for needed, example in (("scene", "a SCENE to train on"), ("recipes", "--recipes A,B"), ("out", "--out DIR")):
         if needed not in given:
@@ -134,7 +134,7 @@ def _new(given: dict[str, Any]) -> "Plan":
 
 
 def _resumed(given: dict[str, Any]) -> "Plan":
-    from minisplat_ref.experiments.comparison.plan import load_plan
+    from minisplat_ref.comparison.plan import load_plan
 
     surplus = [option_name(name) for name in ("scene", "recipes", "out", *DEFAULTS) if name in given]
     if surplus:
@@ -144,13 +144,14 @@ def _resumed(given: dict[str, Any]) -> "Plan":
 
 def _report(plan: "Plan", scene: "Scene") -> None:
     """Write the figures, the page and compare.json, and print the tables."""
-    from minisplat_ref.experiments import run_folder
-    from minisplat_ref.experiments.comparison import figures, mechanisms
-    from minisplat_ref.experiments.comparison.report import fired_title, notes, report_html
-    from minisplat_ref.experiments.comparison.results import collect, to_json
-    from minisplat_ref.experiments.comparison.table import table_cells
-    from minisplat_ref.experiments.plots import save_png
+    from minisplat_ref.comparison import figures
+    from minisplat_ref.comparison.report import fired_title, notes, report_html
+    from minisplat_ref.comparison.results import collect, to_json
+    from minisplat_ref.comparison.table import table_cells
     from minisplat_ref.reporting import markdown_table
+    from minisplat_ref.reports.plots import save_png
+    from minisplat_ref.runs import run_folder
+    from minisplat_ref.runs.fired import HEADING, remarks, rows
 
     results = collect(plan, scene)
     save_png(figures.psnr_over_time(results.curves), plan.folder / PSNR_OVER_TIME)
@@ -161,10 +162,10 @@ def _report(plan: "Plan", scene: "Scene") -> None:
     save_png(figures.gallery(results.crops, plan.recipes), plan.folder / GALLERY)
     (plan.folder / REPORT).write_text(report_html(plan, scene, results), encoding="utf-8")
     run_folder.write_json(plan.folder / COMPARE, to_json(plan, scene, results))
-    heading, *rows = table_cells(results.recipes)
-    print(f"\n{scene.name}; {results.machine}\n\n{markdown_table(heading, rows)}\n")
+    heading, *cells = table_cells(results.recipes)
+    print(f"\n{scene.name}; {results.machine}\n\n{markdown_table(heading, cells)}\n")
     print("\n".join(notes(plan, results)))
     for fired in results.fired:
-        print(f"\n{fired_title(fired)}\n\n{markdown_table(mechanisms.HEADING, mechanisms.rows(fired))}")
-        print("\n".join(mechanisms.remarks(fired)))
+        print(f"\n{fired_title(fired)}\n\n{markdown_table(HEADING, rows(fired))}")
+        print("\n".join(remarks(fired)))
     print(f"\nopen {(plan.folder / REPORT).resolve()}")

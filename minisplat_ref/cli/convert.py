@@ -6,12 +6,12 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from minisplat_ref.arguments import Commands, HelpFormatter, integer
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter, integer
 
 if TYPE_CHECKING:
-    from minisplat_ref.experiments.conversion import Choice, Source
     from minisplat_ref.io.formats import Format
+    from minisplat_ref.runs.conversion import Choice, Source
 
 DESCRIPTION = """\
 Write the Gaussians of a run, of a checkpoint.npz by itself, of a PLY or of a
@@ -58,8 +58,8 @@ def add_parser(commands: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the file, and say what is in it."""
-    from minisplat_ref.experiments.conversion import check_population, chosen_format, open_source
     from minisplat_ref.io.formats import write_content
+    from minisplat_ref.runs.conversion import check_population, chosen_format, open_source
 
     out: Path = args.output
     format_ = chosen_format(out)
@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _choose(args: argparse.Namespace, source: "Source", format_: "Format") -> "tuple[Choice, list[tuple[str, str]]]":
     """Return the level that the command line asks for, and what was measured for it."""
-    from minisplat_ref.experiments import conversion
+    from minisplat_ref.runs import conversion
 
     gaussians = source.model.gaussians
     if args.max_bytes is not None:

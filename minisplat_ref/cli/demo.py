@@ -7,7 +7,7 @@ import time
 from functools import partial
 from pathlib import Path
 
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter, integer
+from minisplat_ref.arguments import Commands, HelpFormatter, integer
 
 SCENE = {"n_views": 28, "width": 192, "height": 144, "n_points": 8000, "seed": 0, "test_every": 8}
 RECIPE = "3dgs-accel"
@@ -52,12 +52,12 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.constants import GSPLAT_MAIN
     from minisplat_ref.datasets.synthetic import make_scene
     from minisplat_ref.datasets.synthetic.files import write_scene
-    from minisplat_ref.experiments import run_folder
-    from minisplat_ref.experiments.demo_report import report_html, view_pictures
-    from minisplat_ref.experiments.first_use import compile_kernels
-    from minisplat_ref.experiments.run import run_training
-    from minisplat_ref.experiments.scoring import summary
-    from minisplat_ref.experiments.settings import Settings, load_photographs, recipe_of
+    from minisplat_ref.runs import run_folder
+    from minisplat_ref.runs.demo_report import report_html, view_pictures
+    from minisplat_ref.runs.first_use import compile_kernels
+    from minisplat_ref.runs.run import run_training
+    from minisplat_ref.runs.scoring import summary
+    from minisplat_ref.runs.settings import Settings, load_photographs, recipe_of
     from minisplat_ref.training.interruption import terminated_like_interrupted
     from minisplat_ref.training.loop import initial_state
 

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter
+from minisplat_ref.arguments import Commands, HelpFormatter
 
 DESCRIPTION = """\
 Write the photographs of a scene at 1/D of their size into SCENE/images_D.

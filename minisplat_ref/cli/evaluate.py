@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter, integer
+from minisplat_ref.arguments import Commands, HelpFormatter, integer
 
 DESCRIPTION = """\
 Measure a run on its test views: PSNR, SSIM and, given the weights of its
@@ -61,8 +61,8 @@ def add_parser(commands: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, print a table, write the files."""
-    from minisplat_ref.experiments.evaluation import evaluate_run
-    from minisplat_ref.experiments.scoring import summary
+    from minisplat_ref.runs.evaluation import evaluate_run
+    from minisplat_ref.runs.scoring import summary
 
     evaluation, folder, notes = evaluate_run(
         args.folder,

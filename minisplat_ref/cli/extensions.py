@@ -2,7 +2,7 @@
 
 import argparse
 
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter
+from minisplat_ref.arguments import Commands, HelpFormatter
 
 DESCRIPTION = """\
 List the extensions, or say what one of them brings.

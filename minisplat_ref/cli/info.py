@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from minisplat_ref.arguments import Commands, HelpFormatter
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter
 
 if TYPE_CHECKING:
-    from minisplat_ref.experiments.settings import Settings
+    from minisplat_ref.runs.settings import Settings
     from minisplat_ref.types import Floats
 
 NOT_SHOWN = ("per_view", "n_gaussians", "iterations", "lpips_reason")  # of metrics.json: too long, or said elsewhere
@@ -50,7 +50,7 @@ def add_parser(commands: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print a table of names and values."""
-    from minisplat_ref.experiments.run_folder import CONFIG
+    from minisplat_ref.runs.run_folder import CONFIG
 
     path: Path = args.path
     if not path.exists():
@@ -120,9 +120,9 @@ def _shape(array: "Floats") -> str:
 
 
 def _run_rows(folder: Path) -> Rows:
-    from minisplat_ref.experiments.checkpoints import newest
-    from minisplat_ref.experiments.run_folder import CHECKPOINT, EVENTS, METRICS, PREVIOUS, read_json_object
-    from minisplat_ref.experiments.settings import load
+    from minisplat_ref.runs.checkpoints import newest
+    from minisplat_ref.runs.run_folder import CHECKPOINT, EVENTS, METRICS, PREVIOUS, read_json_object
+    from minisplat_ref.runs.settings import load
 
     settings = load(folder)
     rows = [("state", _state_of_run(folder, settings.iterations))]
@@ -142,8 +142,8 @@ def _run_rows(folder: Path) -> Rows:
 
 
 def _state_of_run(folder: Path, iterations: int) -> str:
-    from minisplat_ref.experiments.checkpoints import step_of
-    from minisplat_ref.experiments.run_folder import has_begun, is_finished
+    from minisplat_ref.runs.checkpoints import step_of
+    from minisplat_ref.runs.run_folder import has_begun, is_finished
 
     going_on = f"minisplat-ref train --resume {folder}"
     step = step_of(folder)
@@ -160,9 +160,9 @@ def _state_of_run(folder: Path, iterations: int) -> str:
 
 def _event_rows(folder: Path, settings: "Settings") -> Rows:
     """Say which mechanisms of the recipe were active, and which never."""
-    from minisplat_ref.experiments.events import describe, never_fired, published_times, read_mechanisms
-    from minisplat_ref.experiments.run_folder import EVENTS, is_finished
     from minisplat_ref.extensions.extension import find_recipe
+    from minisplat_ref.runs.events import describe, never_fired, published_times, read_mechanisms
+    from minisplat_ref.runs.run_folder import EVENTS, is_finished
 
     published = published_times(find_recipe(settings.recipe, extension=settings.extension))
     found = read_mechanisms(folder / EVENTS, published)
@@ -173,8 +173,8 @@ def _event_rows(folder: Path, settings: "Settings") -> Rows:
 
 
 def _scene_rows(path: Path) -> Rows:
-    from minisplat_ref.experiments.notices import describe_sizes
     from minisplat_ref.io import load_scene
+    from minisplat_ref.runs.notices import describe_sizes
 
     scene = load_scene(path, undistort=True)
     views = (*scene.train_views, *scene.test_views)

@@ -8,9 +8,7 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from minisplat_ref.constants import GSPLAT_MAIN
-from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.arguments import (
+from minisplat_ref.arguments import (
     Commands,
     HelpFormatter,
     add_renderer_arguments,
@@ -18,10 +16,12 @@ from minisplat_ref.experiments.arguments import (
     integer,
     positive,
 )
+from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.errors import InputError
 
 if TYPE_CHECKING:
-    from minisplat_ref.experiments.scoring import Trained
     from minisplat_ref.io.viewpoints import Viewpoint
+    from minisplat_ref.runs.scoring import Trained
 
 DESCRIPTION = """\
 Render a run (its --out folder), or Gaussians that any program wrote: a PLY or a
@@ -88,13 +88,13 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from minisplat_ref import memory
-    from minisplat_ref.experiments.first_use import warn_if_not_kept
-    from minisplat_ref.experiments.notices import warn_of_model
-    from minisplat_ref.experiments.pictures import depth_picture, depth_range
     from minisplat_ref.io import write_image
     from minisplat_ref.io.film import check_film, write_film
     from minisplat_ref.io.names import file_names
     from minisplat_ref.reference.depth import expected_depth
+    from minisplat_ref.reports.pictures import depth_picture, depth_range
+    from minisplat_ref.runs.first_use import warn_if_not_kept
+    from minisplat_ref.runs.notices import warn_of_model
     from minisplat_ref.types import view_from
 
     source = _open(args)
@@ -133,7 +133,7 @@ def _make_room(out: Path, names: Sequence[str]) -> None:
     InputError
         There are pictures that no rendering has listed and this one would not replace.
     """
-    from minisplat_ref.experiments import run_folder
+    from minisplat_ref.runs import run_folder
 
     listed = run_folder.read_json_object(out / LIST).get("pictures") if (out / LIST).exists() else []
     if not isinstance(listed, list):
@@ -171,9 +171,9 @@ def _open(args: argparse.Namespace) -> _Source:
 
 
 def _open_run(folder: Path, args: argparse.Namespace) -> _Source:
-    from minisplat_ref.experiments import run_folder
-    from minisplat_ref.experiments.scoring import load_trained
     from minisplat_ref.io import viewpoints
+    from minisplat_ref.runs import run_folder
+    from minisplat_ref.runs.scoring import load_trained
 
     if args.extension is not None:
         raise InputError(f"{folder} knows its extension: leave out --extension {args.extension}")
@@ -183,9 +183,9 @@ def _open_run(folder: Path, args: argparse.Namespace) -> _Source:
 def _open_file(path: Path, args: argparse.Namespace) -> _Source:
     import numpy as np
 
-    from minisplat_ref.experiments.conversion import read_population
-    from minisplat_ref.experiments.scoring import Trained
     from minisplat_ref.extensions.extension import CORE, load_extension
+    from minisplat_ref.runs.conversion import read_population
+    from minisplat_ref.runs.scoring import Trained
     from minisplat_ref.types import Model
 
     owner = CORE if args.extension is None else load_extension(args.extension)

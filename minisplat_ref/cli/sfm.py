@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter
+from minisplat_ref.arguments import Commands, HelpFormatter
 
 MATCHINGS = ("exhaustive", "sequential")
 CAMERA_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")

@@ -5,10 +5,10 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter, decibels, integer
+from minisplat_ref.arguments import Commands, HelpFormatter, decibels, integer
 
 if TYPE_CHECKING:
-    from minisplat_ref.experiments.simplified_run import Asked
+    from minisplat_ref.runs.simplified_run import Asked
 
 FINE_TUNE = 300  # iterations at each size
 
@@ -56,10 +56,10 @@ def add_parser(commands: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Simplify, print the table and what became of the test views."""
-    from minisplat_ref.experiments.first_use import compile_kernels
-    from minisplat_ref.experiments.settings import load
-    from minisplat_ref.experiments.simplification import Target
-    from minisplat_ref.experiments.simplified_run import Asked
+    from minisplat_ref.runs.first_use import compile_kernels
+    from minisplat_ref.runs.settings import load
+    from minisplat_ref.runs.simplification import Target
+    from minisplat_ref.runs.simplified_run import Asked
 
     compile_kernels(load(args.folder).backend)
     target = Target(args.max_drop, args.budget, args.max_bytes)
@@ -73,11 +73,11 @@ def simplify(asked: "Asked") -> None:
     Raises
     ------
     InputError
-        See :func:`minisplat_ref.experiments.simplified_run.simplify_run`.
+        See :func:`minisplat_ref.runs.simplified_run.simplify_run`.
     """
-    from minisplat_ref.experiments.simplification_report import TABLE_HEADING, closing_line, table_rows
-    from minisplat_ref.experiments.simplified_run import simplify_run
     from minisplat_ref.reporting import markdown_table
+    from minisplat_ref.runs.simplification_report import TABLE_HEADING, closing_line, table_rows
+    from minisplat_ref.runs.simplified_run import simplify_run
 
     result = simplify_run(asked)
     print(markdown_table(TABLE_HEADING, table_rows(result)))

@@ -3,11 +3,11 @@
 import argparse
 from typing import TYPE_CHECKING
 
+from minisplat_ref.arguments import Commands, HelpFormatter, Parser
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter, Parser
 
 if TYPE_CHECKING:
-    from minisplat_ref.study import Study
+    from minisplat_ref.studies.study import Study
 
 DESCRIPTION = """\
 Measure what a choice in a method does to a scene: it is trained with and
@@ -41,7 +41,7 @@ def add_parser(commands: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run a study, or list all."""
-    from minisplat_ref.experiments.studies import all_studies
+    from minisplat_ref.studies import all_studies
 
     studies = all_studies()
     if args.name is not None and "/" in args.name:

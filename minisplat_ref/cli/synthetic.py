@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from minisplat_ref.experiments.arguments import SYNTHETIC_SCENES, Commands, HelpFormatter
+from minisplat_ref.arguments import SYNTHETIC_SCENES, Commands, HelpFormatter
 
 DESCRIPTION = """\
 Ray-trace photographs of a small world, and write them as a COLMAP scene with

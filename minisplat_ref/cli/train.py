@@ -5,9 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from minisplat_ref.constants import GSPLAT_MAIN
-from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.arguments import (
+from minisplat_ref.arguments import (
     Commands,
     HelpFormatter,
     add_renderer_arguments,
@@ -18,11 +16,13 @@ from minisplat_ref.experiments.arguments import (
     option_name,
     positive,
 )
+from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.errors import InputError
 
 if TYPE_CHECKING:
-    from minisplat_ref.experiments.settings import Settings
-    from minisplat_ref.experiments.simplification import Target
     from minisplat_ref.lpips import Network
+    from minisplat_ref.runs.settings import Settings
+    from minisplat_ref.runs.simplification import Target
     from minisplat_ref.training.loop import TrainState
     from minisplat_ref.training.schedule import Recipe
     from minisplat_ref.types import Scene
@@ -184,11 +184,11 @@ def _start(given: dict[str, Any]) -> int:
     scene_folder = scene_path.parent if scene_path.is_file() else scene_path
     folder: Path = given.get("out", Path("runs") / f"{scene_folder.resolve().name}-{options['recipe']}")
 
-    from minisplat_ref.experiments import curve, run_folder
-    from minisplat_ref.experiments.first_use import compile_kernels
-    from minisplat_ref.experiments.notices import warn_of_scene
-    from minisplat_ref.experiments.proposed_size import propose
-    from minisplat_ref.experiments.settings import Settings, load_lpips, load_photographs, recipe_of
+    from minisplat_ref.runs import curve, run_folder
+    from minisplat_ref.runs.first_use import compile_kernels
+    from minisplat_ref.runs.notices import warn_of_scene
+    from minisplat_ref.runs.proposed_size import propose
+    from minisplat_ref.runs.settings import Settings, load_lpips, load_photographs, recipe_of
 
     run_folder.check_free(folder)
     settings = Settings(scene=str(scene_path.resolve()), schedule_iterations=options["iterations"], **options)
@@ -231,7 +231,7 @@ def _check_time(settings: "Settings", recipe: "Recipe") -> None:
 
 def _target(settings: "Settings") -> "Target | None":
     """Return what a simplification after the training is to reach; None where there is none."""
-    from minisplat_ref.experiments.simplification import Target
+    from minisplat_ref.runs.simplification import Target
 
     target = Target(max_drop=settings.max_drop, max_bytes=settings.max_bytes)
     return None if target == Target() else target
@@ -239,9 +239,9 @@ def _target(settings: "Settings") -> "Target | None":
 
 def _check_target(folder: Path, settings: "Settings", recipe: "Recipe", scene: "Scene", state: "TrainState") -> None:
     """Refuse, before the training, a simplification that could not follow it."""
-    from minisplat_ref.experiments.opened_run import Run
-    from minisplat_ref.experiments.simplification import check_before_training
     from minisplat_ref.extensions.extension import CORE, owner_of
+    from minisplat_ref.runs.opened_run import Run
+    from minisplat_ref.runs.simplification import check_before_training
 
     target = _target(settings)
     if target is not None:
@@ -259,7 +259,7 @@ def _default_iterations(name: str) -> int:
 
 def _first_state(settings: "Settings", scene: "Scene", recipe: "Recipe") -> "TrainState":
     """Return the state before the first iteration, from the scene's points or from those of --init."""
-    from minisplat_ref.experiments.start import load_start
+    from minisplat_ref.runs.start import load_start
     from minisplat_ref.training.loop import initial_state
 
     start, notices = (scene, []) if settings.init is None else load_start(settings.init, scene)
@@ -277,8 +277,8 @@ def _resume(folder: Path, given: dict[str, Any]) -> int:
             f"--resume takes the run's own settings: leave out {', '.join(option_name(name) for name in surplus)}"
         )
 
-    from minisplat_ref.experiments import checkpoints, fingerprint, run_folder, settings
-    from minisplat_ref.experiments.first_use import compile_kernels
+    from minisplat_ref.runs import checkpoints, fingerprint, run_folder, settings
+    from minisplat_ref.runs.first_use import compile_kernels
 
     ours = settings.load(folder)
     with run_folder.held(folder):
@@ -315,7 +315,7 @@ def _check_room(scene: "Scene", state: "TrainState", settings: "Settings") -> st
     from minisplat_ref import memory
     from minisplat_ref.backends import get_backend
     from minisplat_ref.constants import PROFILES
-    from minisplat_ref.experiments import room
+    from minisplat_ref.runs import room
 
     return memory.check_start(room.foresee(scene, state, PROFILES[settings.profile], get_backend(settings.backend)))
 
@@ -343,10 +343,10 @@ def _train(
     given: dict[str, Any],
     room: str,
 ) -> int:
-    from minisplat_ref.experiments import checkpoints, run_folder
-    from minisplat_ref.experiments.notices import describe_sizes
-    from minisplat_ref.experiments.run import run_training
-    from minisplat_ref.experiments.scoring import summary
+    from minisplat_ref.runs import checkpoints, run_folder
+    from minisplat_ref.runs.notices import describe_sizes
+    from minisplat_ref.runs.run import run_training
+    from minisplat_ref.runs.scoring import summary
     from minisplat_ref.training.guard import Guard
 
     views = (*scene.train_views, *scene.test_views)
@@ -377,7 +377,7 @@ def _train(
 def _simplify(folder: Path, settings: "Settings") -> int:
     """Make the finished run smaller if that was asked for; return the exit code."""
     from minisplat_ref.cli.simplify import FINE_TUNE, simplify
-    from minisplat_ref.experiments.simplified_run import Asked
+    from minisplat_ref.runs.simplified_run import Asked
 
     target, out = _target(settings), folder / SIMPLIFIED
     if target is None:

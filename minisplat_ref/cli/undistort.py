@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter
+from minisplat_ref.arguments import Commands, HelpFormatter
 
 DESCRIPTION = """\
 Copy a scene without lens distortion: photographs and masks are warped to the

@@ -14,7 +14,7 @@ from minisplat_ref.extensions import folders, module_of
 from minisplat_ref.io.formats import Format
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.methods import RECIPES
-from minisplat_ref.study import Study
+from minisplat_ref.studies.study import Study
 from minisplat_ref.training.losses import LossTerm
 from minisplat_ref.training.representation import GAUSSIANS, Representation
 from minisplat_ref.training.schedule import Recipe, scaled

@@ -15,7 +15,6 @@ from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.experiments.progress import Progress
 from minisplat_ref.extensions import shared_studies
 from minisplat_ref.extensions.antialiasing.method import (
     EPS2D,
@@ -30,6 +29,7 @@ from minisplat_ref.mechanisms import sampling
 from minisplat_ref.mechanisms.sampling import sampling_intervals
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.runs.progress import Progress
 from minisplat_ref.types import Gaussians, Model, View, view_from
 
 

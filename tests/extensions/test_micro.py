@@ -15,7 +15,6 @@ from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.experiments.progress import Progress
 from minisplat_ref.extensions.extension import find_recipe, load_extension
 from minisplat_ref.extensions.micro.method import clone_and_split_by_detail, clusters, halved_children
 from minisplat_ref.extensions.micro.reference import (
@@ -30,6 +29,7 @@ from minisplat_ref.methods.gaussian_splatting import prune_large
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.runs.progress import Progress
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import At, During, Every, configured, does

@@ -17,13 +17,13 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.progress import Progress
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.multi_scale.levels import MultiScaleGaussians, Plan, level_zero, with_levels
 from minisplat_ref.extensions.multi_scale.method import LEVELS, coarse, finest_densities
 from minisplat_ref.extensions.multi_scale.reference import NO_CELL, are_shown, coverages, pixel_densities
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.runs.progress import Progress
 from minisplat_ref.strategy.simplify import optical_masses
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.losses import Rendered

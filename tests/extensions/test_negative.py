@@ -26,7 +26,6 @@ from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.progress import Progress
 from minisplat_ref.extensions.extension import find_recipe, load_extension
 from minisplat_ref.extensions.negative import rings
 from minisplat_ref.extensions.negative.method import FRACTION, SIGNED, signed_colors, signed_colors_vjp, with_negatives
@@ -34,6 +33,7 @@ from minisplat_ref.extensions.negative.reference import density, difference, lar
 from minisplat_ref.extensions.negative.study import STUDIES
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.runs.progress import Progress
 from minisplat_ref.strategy.clone_split import prune_faint, prune_large
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.state import Iteration, TrainState, start_anew

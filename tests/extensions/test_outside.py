@@ -35,7 +35,7 @@ The colour of degree 0 at time t is sh_dc + t g, the same for red, green and blu
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.glow import brightest
 from minisplat_ref.extensions.glow.method import GLOWING, PENALTY, RECIPE
-from minisplat_ref.study import Study
+from minisplat_ref.studies.study import Study
 
 
 def count(args):

@@ -8,11 +8,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import as_dtype, make_camera, make_gaussians
 from tolerances import AFFINE_EDIT, CLOSED_FORM, COVERAGE_MIN, EDITED_IMAGE, PARITY_FLOAT32_PROJECTION
 
+from data_tools.fuzz.judging import judge
+from data_tools.fuzz.readers import Reader, mutant
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.cli import main
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.fuzzing.judging import judge
-from minisplat_ref.experiments.fuzzing.readers import Reader, mutant
 from minisplat_ref.extensions.extension import load_extension
 from minisplat_ref.extensions.proxies.affine import Affine, about_point, edited, in_ball, in_box, rotation_about
 from minisplat_ref.extensions.proxies.binding import UNBOUND, bind, rebuild

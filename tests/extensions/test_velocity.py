@@ -13,7 +13,6 @@ from tolerances import CLOSED_FORM, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT32_IMAG
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
-from minisplat_ref.experiments.progress import Progress
 from minisplat_ref.extensions.extension import find_recipe, load_extension
 from minisplat_ref.extensions.velocity.method import MOVING, MovingGaussians
 from minisplat_ref.extensions.velocity.reference import means_at, means_at_vjp
@@ -24,6 +23,7 @@ from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.methods import gaussian_splatting
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.runs.progress import Progress
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import During, Every
 from minisplat_ref.types import Gaussians, Model, Scene, View, view_from

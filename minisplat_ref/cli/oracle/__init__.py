@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter
+from minisplat_ref.arguments import Commands, HelpFormatter
 
 if TYPE_CHECKING:
     from minisplat_ref.oracle.cases import Report
@@ -54,7 +54,7 @@ def publish(report: "Report", args: argparse.Namespace) -> int:
     if args.json is not None:
         save_json(report, args.json)
     if args.report is not None:
-        from minisplat_ref.experiments.check_report import write_page
+        from minisplat_ref.reports.check_report import write_page
 
         write_page(report, args.report)
     return 1 if report.n_failed else 0

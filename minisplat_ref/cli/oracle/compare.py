@@ -2,10 +2,10 @@
 
 import argparse
 
+from minisplat_ref.arguments import Commands, HelpFormatter
 from minisplat_ref.cli.oracle import add_output_arguments, publish
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter
 
 DESCRIPTION = """\
 Compare a renderer with the float64 reference, stage by stage, and name the

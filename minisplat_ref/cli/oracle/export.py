@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter
+from minisplat_ref.arguments import Commands, HelpFormatter
 
 DESCRIPTION = """\
 Write golden vectors: the inputs, outputs, cotangents and gradients of every

@@ -2,10 +2,10 @@
 
 import argparse
 
+from minisplat_ref.arguments import BACKENDS as NAMES
+from minisplat_ref.arguments import Commands, HelpFormatter
 from minisplat_ref.cli.oracle import add_output_arguments, publish
 from minisplat_ref.constants import GSPLAT_MAIN, PROFILES
-from minisplat_ref.experiments.arguments import BACKENDS as NAMES
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter
 
 DESCRIPTION = """\
 Check the gradient of every stage, of the whole render and of rasterization in

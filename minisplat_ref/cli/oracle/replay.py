@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from minisplat_ref.arguments import Commands, HelpFormatter
 from minisplat_ref.cli.oracle import add_output_arguments, publish
 from minisplat_ref.errors import InputError
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter
 
 if TYPE_CHECKING:
     from minisplat_ref.training.schedule import Recipe
@@ -54,8 +54,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _recipe(metadata: Mapping[str, Any]) -> "Recipe":
     """Return the recipe of the run; of a training without a run, the one of the name that it had."""
-    from minisplat_ref.experiments.settings import Settings, recipe_of
     from minisplat_ref.extensions.extension import find_recipe
+    from minisplat_ref.runs.settings import Settings, recipe_of
 
     settings = metadata["settings"]
     return recipe_of(Settings(**settings)) if settings else find_recipe(*metadata["recipe"])

@@ -2,8 +2,8 @@
 
 import argparse
 
+from minisplat_ref.arguments import Commands, HelpFormatter
 from minisplat_ref.cli.oracle import add_output_arguments, publish
-from minisplat_ref.experiments.arguments import Commands, HelpFormatter
 
 DESCRIPTION = """\
 Compare covariance, projection and transmittance with 50 digits (mpmath, extra

@@ -7,7 +7,7 @@ import numpy as np
 from minisplat_ref.extensions.shared_studies import add_scene, check_at_least, read_scene, write
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.reporting import markdown_table
-from minisplat_ref.study import Study
+from minisplat_ref.studies.study import Study
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

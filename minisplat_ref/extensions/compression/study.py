@@ -27,7 +27,7 @@ from minisplat_ref.extensions.compression.spz import SPZ
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.formats import Format
 from minisplat_ref.io.ply import load_ply, save_ply
-from minisplat_ref.study import Study
+from minisplat_ref.studies.study import Study
 from minisplat_ref.types import Floats, Gaussians, View
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ import numpy as np
 from minisplat_ref.extensions import shared_studies
 from minisplat_ref.extensions import shared_trainings as shared
 from minisplat_ref.io.atomic import making_folder
-from minisplat_ref.study import Study
+from minisplat_ref.studies.study import Study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -17,7 +17,7 @@ import numpy as np
 from minisplat_ref.extensions import shared_studies
 from minisplat_ref.extensions import shared_trainings as shared
 from minisplat_ref.io.atomic import making_folder
-from minisplat_ref.study import Study
+from minisplat_ref.studies.study import Study
 from minisplat_ref.types import Floats
 
 if TYPE_CHECKING:

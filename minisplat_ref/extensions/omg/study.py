@@ -22,7 +22,7 @@ from minisplat_ref.extensions.omg.file import OMG_FILE, order_of
 from minisplat_ref.extensions.omg.method import POWER
 from minisplat_ref.extensions.omg.reference import distinct_importance, local_distinctiveness
 from minisplat_ref.io.atomic import making_folder
-from minisplat_ref.study import Study
+from minisplat_ref.studies.study import Study
 from minisplat_ref.types import Bools, Floats, Gaussians, Scene, View
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.reporting import markdown_table
-from minisplat_ref.study import Study
+from minisplat_ref.studies.study import Study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -7,7 +7,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.shared_studies import add_out, check_at_least, read_scene, write
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.reporting import markdown_table
-from minisplat_ref.study import Study
+from minisplat_ref.studies.study import Study
 
 FULLS = (2.0, 4.0, 8.0, 12.0)  # degrees
 

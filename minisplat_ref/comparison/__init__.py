@@ -1,0 +1,14 @@
+"""What ``compare`` does, in its order: the plan, the runs, their measures, the table, the report.
+
+========================  ========================================================================
+:mod:`.plan`              which recipe is trained with which seed, where, and for how long
+:mod:`.runs`              the trainings, one after the other; those that were cut off go on
+:mod:`.measures`          what a finished run folder says in numbers; means over seeds
+:mod:`.speed`             rendering the test views, all models by turns
+:mod:`.crops`             the parts of test views that are worth a look
+:mod:`.results`           all of these together, and compare.json
+:mod:`.table`             mean, deviation and ratio to the first recipe, as text
+:mod:`.figures`           PSNR over time, iterations and number of Gaussians; the gallery
+:mod:`.report`            report.html
+========================  ========================================================================
+"""

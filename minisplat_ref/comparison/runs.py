@@ -1,0 +1,192 @@
+"""The trainings of a comparison: one after the other, each in a process of its own, whose peak memory is its own.
+
+A comparison that was cut off goes on where it was: finished runs stay, one with a checkpoint continues from it.
+"""
+
+import contextlib
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from types import FrameType
+from typing import Any, Literal
+
+from minisplat_ref.arguments import option_name
+from minisplat_ref.comparison.plan import Plan, Run
+from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.extension import find_recipe
+from minisplat_ref.runs import run_folder
+from minisplat_ref.runs.settings import Settings
+from minisplat_ref.runs.settings import load as load_settings
+from minisplat_ref.training.loop import train
+from minisplat_ref.types import Scene
+
+WARM_UP = 20  # iterations, to which each recipe is scaled, so that all its events happen
+WARM_UP_VIEWS = 4
+SAVING_SECONDS = 5.0  # after Ctrl-C; a training that goes on for longer has not been told
+
+TRAIN = (sys.executable, "-m", "minisplat_ref", "train")
+
+Status = Literal["finished", "cut off", "lost", "new"]
+"""How far a training has come: to its end, to a checkpoint, not as far, or not begun."""
+
+HEADINGS: dict[Status, str] = {
+    "finished": ": finished, kept",
+    "cut off": ": continued from its checkpoint",
+    "lost": ": has no checkpoint, started again",
+    "new": ": started",
+}
+
+REPORTED_CODES = (0, 2, 130)  # after which the training has said all there is to say
+
+
+def warm_up(plan: Plan, scene: Scene) -> None:
+    """Train every recipe for a moment: no run's clock is to count compiling what the next run finds compiled."""
+    scene = scene._replace(train_views=scene.train_views[:WARM_UP_VIEWS])
+    for recipe in plan.recipes:
+        # So short a schedule may ask for what cannot be; a fault of the recipe itself shows in its own run.
+        with contextlib.suppress(InputError):
+            train(scene, find_recipe(recipe, WARM_UP), seed=0)
+
+
+def statuses(plan: Plan) -> list[Status]:
+    """Return how far each of the plan's trainings has come.
+
+    Raises
+    ------
+    InputError
+        In the place of a run folder is a run of other settings, or something else.
+    """
+    return [_status(plan, run) for run in plan.runs]
+
+
+def _status(plan: Plan, run: Run) -> Status:
+    if not (run.folder / run_folder.CONFIG).exists():
+        run_folder.check_free(run.folder)
+        return "new"
+    ours, asked = load_settings(run.folder), settings_of(plan, run)
+    for name in Settings._fields:
+        is_, should = getattr(ours, name), getattr(asked, name)
+        if is_ != should:
+            raise InputError(
+                f"{run.folder} holds a run of other settings, {name} is {is_} and not {should}: move it away, or give"
+                " another --out"
+            )
+    if run_folder.is_finished(run.folder, run.iterations):
+        return "finished"
+    has_checkpoint = any((run.folder / name).exists() for name in (run_folder.CHECKPOINT, run_folder.PREVIOUS))
+    return "cut off" if has_checkpoint else "lost"
+
+
+def train_all(plan: Plan, statuses: Sequence[Status]) -> int:
+    """Train every recipe with every seed, as far as it goes.
+
+    Parameters
+    ----------
+    plan : Plan
+    statuses : sequence of Status
+        How far each of its trainings has come; see :func:`statuses`.
+
+    Returns
+    -------
+    int
+        Exit code of the first training that fails, 0 if none does.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        After Ctrl-C or SIGTERM, when the running training has saved what there is.
+    CalledProcessError
+        A training has been killed or has a programming error.
+    """
+    for number, (run, status) in enumerate(zip(plan.runs, statuses, strict=True), start=1):
+        heading = f"run {number} of {len(statuses)}: {run.recipe}, seed {run.seed}, {run.iterations} iterations"
+        print(heading + HEADINGS[status], flush=True)  # before the lines of the other process
+        if status == "finished":
+            continue
+        if status == "lost":
+            shutil.rmtree(run.folder)
+        code = _train(_resume_command(run) if status == "cut off" else _command(plan, run))
+        if code != 0:
+            return code
+    return 0
+
+
+def settings_of(plan: Plan, run: Run) -> Settings:
+    """Return the settings with which ``train`` is called for a run, as its config.json has them."""
+    return Settings(
+        scene=str(plan.scene.resolve()),
+        schedule_iterations=run.iterations,
+        undistort=False,
+        profile=GSPLAT_MAIN.name,
+        backend="cpu",
+        **_options(plan, run),
+    )
+
+
+def _options(plan: Plan, run: Run) -> dict[str, Any]:
+    """Return the options of ``train`` for a run, by the names that they have in Settings."""
+    return {
+        "recipe": run.recipe,
+        "iterations": run.iterations,
+        "seed": run.seed,
+        "downscale": plan.downscale,
+        "test_every": plan.test_every,
+        "eval_every": run.eval_every,
+        **plan.files,
+        **run.options,
+    }
+
+
+def _command(plan: Plan, run: Run) -> list[str]:
+    options = {**_options(plan, run), "out": run.folder}
+    texts = [part for name, value in options.items() for part in (option_name(name), str(value))]
+    return [*TRAIN, str(plan.scene), *texts]
+
+
+def _resume_command(run: Run) -> list[str]:
+    return [*TRAIN, "--resume", str(run.folder)]
+
+
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM, which the system sends to this process alone, while Ctrl-C reaches its trainings too."""
+
+
+@contextlib.contextmanager
+def _raising_terminated() -> Iterator[None]:
+    """Make SIGTERM raise :class:`_Terminated`, in the main thread."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def raise_terminated(number: int, frame: FrameType | None) -> None:
+        raise _Terminated
+
+    previous = signal.signal(signal.SIGTERM, raise_terminated)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+
+
+def _train(command: list[str]) -> int:
+    with subprocess.Popen(command) as process, _raising_terminated():
+        try:
+            code = process.wait()
+        except _Terminated:
+            process.terminate()  # it saves now, as after Ctrl-C, however long that takes
+            process.wait()
+            raise
+        except KeyboardInterrupt:
+            # A terminal's Ctrl-C has reached the training, too, which saves now and is better left alone.
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(SAVING_SECONDS)
+            process.send_signal(signal.SIGINT)  # does nothing when the training has ended
+            process.wait()
+            raise
+    if code not in REPORTED_CODES:
+        raise subprocess.CalledProcessError(code, command)
+    return code

@@ -1,0 +1,160 @@
+"""The one look of all reports: an HTML file with pictures, curves and tables, and nothing that it loads from elsewhere.
+
+Pictures are in the page in base64, curves are inline SVG (:mod:`minisplat_ref.reports.plots`), and so are the style
+sheet and the few lines of script (:mod:`minisplat_ref.reports.page_style`), without which nothing is missing: a
+slider is then two pictures beside each other. The page tells the browser to load nothing else.
+"""
+
+import base64
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+
+from PIL import Image
+
+from minisplat_ref.reports.page_style import SCRIPT, STYLE
+from minisplat_ref.reports.pictures import Picture
+
+POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+BAD = {"FAILED", "DIVERGES FIRST", "diverges"}  # cells that stand out
+GOOD = {"passed", "agrees"}
+LONG = 44  # characters of a cell that may break into lines
+TALL = 60  # rows of a table that scrolls in the page instead of making it long
+PNG_PIXELS = 1 << 17  # of larger pictures a PNG would make the page heavy
+JPEG_QUALITY = 92
+
+
+def page(title: str, introduction: str, parts: Iterable[str]) -> str:
+    """Return a self-contained HTML file.
+
+    Parameters
+    ----------
+    title : str
+        Heading, and name of the browser's tab.
+    introduction : str
+        One or two sentences under it.
+    parts : iterable of str
+        HTML: what the functions below return.
+    """
+    newline = "\n"  # an expression in an f-string holds no backslash before Python 3.12
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="Content-Security-Policy" content="{POLICY}">
+<title>{escape(title)}</title>
+<style>{STYLE}</style>
+</head>
+<body>
+<main>
+<h1>{escape(title)}</h1>
+<p>{escape(introduction)}</p>
+{newline.join(parts)}
+</main>
+<script>{SCRIPT}</script>
+</body>
+</html>
+"""
+
+
+def section(heading: str, *parts: str) -> str:
+    """Return parts of a page under a heading."""
+    return "\n".join([f"<h2>{escape(heading)}</h2>", *parts])
+
+
+def paragraph(text: str) -> str:
+    """Return sentences."""
+    return f"<p>{escape(text)}</p>"
+
+
+def listing(texts: Iterable[str]) -> str:
+    """Return sentences as a list."""
+    return f"<ul>{''.join(f'<li>{escape(text)}</li>' for text in texts)}</ul>"
+
+
+def code(text: str) -> str:
+    """Return lines to be copied."""
+    return f'<pre tabindex="0">{escape(text)}</pre>'
+
+
+def cards(figures: Iterable[tuple[str, str]]) -> str:
+    """Return key figures, each a value with its unit and what it is."""
+    boxes = (
+        f'<div class="card"><b>{escape(value)}</b><span>{escape(meaning)}</span></div>' for value, meaning in figures
+    )
+    return f'<div class="cards">{"".join(boxes)}</div>'
+
+
+def table(rows: Iterable[Sequence[str]], heading: Sequence[str] = ()) -> str:
+    """Return a panel with a table whose first column names the rows; a wide one scrolls under that column."""
+    head = f"<thead><tr>{''.join(map(_heading_cell, heading))}</tr></thead>" if heading else ""
+    lines = [f"<tr>{_name_cell(name)}{''.join(map(_cell, cells))}</tr>" for name, *cells in rows]
+    kind, tall = "data" if heading else "facts", " tall" * (len(lines) > TALL)
+    content = f'<table class="{kind}">{head}<tbody>{"".join(lines)}</tbody></table>'
+    return f'<div class="panel scroll{tall}" tabindex="0">{content}</div>'
+
+
+def _heading_cell(text: str) -> str:
+    return f'<th scope="col">{escape(text)}</th>'
+
+
+def _name_cell(text: str) -> str:
+    return f'<th scope="row">{escape(text).replace("_", "_<wbr>")}</th>'
+
+
+def _cell(text: str) -> str:
+    kind = "bad" if text in BAD else "good" if text in GOOD else "long" if len(text) > LONG else ""
+    return f'<td class="{kind}">{escape(text)}</td>' if kind else f"<td>{escape(text)}</td>"
+
+
+def panel(label: str, figures: Sequence[str], n_columns: int = 3) -> str:
+    """Return figures side by side under a label."""
+    return (
+        f'<div class="panel"><div class="label">{escape(label)}</div>'
+        f'<div class="row" style="--columns: {n_columns}">{"".join(figures)}</div></div>'
+    )
+
+
+def grid(panels: Sequence[str], *, is_smooth: bool = True) -> str:
+    """Return panels two beside each other; pictures that are not smoothed show their pixels."""
+    kind = "row" if is_smooth else "row pixels"
+    return f'<div class="{kind}" style="--columns: 2">{"".join(panels)}</div>'
+
+
+def curves(svgs: Sequence[str], n_columns: int = 3) -> str:
+    """Return curves side by side, in as many rows as it takes."""
+    return f'<div class="panel row" style="--columns: {min(n_columns, len(svgs))}">{"".join(svgs)}</div>'
+
+
+def slider(truth: Picture, renders: Mapping[str, Picture]) -> str:
+    """Return a picture of which the left part is the truth and the right part a render, with a line that moves.
+
+    Parameters
+    ----------
+    truth : ndarray of shape (H, W, 3)
+        sRGB.
+    renders : mapping
+        Pictures of the same size by their captions; of several, the reader chooses one.
+    """
+    figures = [captioned(truth, "truth"), *(captioned(picture, caption) for caption, picture in renders.items())]
+    return f'<div class="slider">{"".join(figures)}</div>'
+
+
+def captioned(picture: Picture, caption: str) -> str:
+    """Return a picture with a caption."""
+    height, width = picture.shape[:2]
+    return (
+        f'<figure><img alt="{escape(caption)}" width="{width}" height="{height}" src="{_data_url(picture)}">'
+        f"<figcaption>{escape(caption)}</figcaption></figure>"
+    )
+
+
+def _data_url(picture: Picture) -> str:
+    """Return the picture in base64, a large one as JPEG with colours at full resolution."""
+    is_large = picture.shape[0] * picture.shape[1] > PNG_PIXELS
+    kind = "jpeg" if is_large else "png"
+    options = {"quality": JPEG_QUALITY, "subsampling": 0} if is_large else {}
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, format=kind, **options)
+    return f"data:image/{kind};base64,{base64.b64encode(file.getvalue()).decode('ascii')}"

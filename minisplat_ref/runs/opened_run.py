@@ -1,0 +1,133 @@
+"""A run opened to be simplified: its model, recipe and photographs, and the training views that decide.
+
+These are every eighth (:func:`minisplat_ref.training.pace.held_out_ids`), as for recipe ``adaptive``.
+"""
+
+import warnings
+from pathlib import Path
+from typing import NamedTuple
+
+from minisplat_ref.backends import Backend, get_backend
+from minisplat_ref.constants import PROFILES, Conventions
+from minisplat_ref.errors import InputError, InputWarning, one_line
+from minisplat_ref.runs import fingerprint, run_folder
+from minisplat_ref.runs.checkpoints import newest_model
+from minisplat_ref.runs.settings import Settings, load, load_photographs, recipe_of
+from minisplat_ref.extensions.extension import CORE, Extension, owner_of
+from minisplat_ref.rendering import Request
+from minisplat_ref.strategy.ops import n_rows
+from minisplat_ref.training.pace import held_out_ids
+from minisplat_ref.training.schedule import Recipe, as_trained
+from minisplat_ref.types import Model, Scene, View, numbered
+
+HOLD_OUT_EVERY = 8  # training views of which one decides
+LEAST_VIEWS = 4  # training views: two that are trained on, and two for a standard error
+
+
+class Run(NamedTuple):
+    """What is to be simplified, with all that its training needs."""
+
+    folder: Path
+    settings: Settings
+    recipe: Recipe
+    """With the calibrations that the model has parameters of."""
+    owner: Extension
+    """Whose population it is."""
+    scene: Scene
+    """Training views numbered."""
+    model: Model
+    step: int | None
+    """Iterations that the model has been trained, as far as the folder says."""
+    unfinished: int | None
+    """Iteration of the checkpoint that the model is of; None where the run has ended."""
+
+    @property
+    def backend(self) -> Backend:
+        """The run's."""
+        return get_backend(self.settings.backend)
+
+    @property
+    def conventions(self) -> Conventions:
+        """The run's."""
+        return PROFILES[self.settings.profile]
+
+    @property
+    def held_out(self) -> list[View]:
+        """The training views that decide."""
+        views = self.scene.train_views
+        return [views[k] for k in held_out_ids(len(views), HOLD_OUT_EVERY)]
+
+    @property
+    def others(self) -> list[View]:
+        """The training views that do not decide."""
+        held = set(held_out_ids(len(self.scene.train_views), HOLD_OUT_EVERY))
+        return [view for k, view in enumerate(self.scene.train_views) if k not in held]
+
+
+def open_run(folder: Path, scene: Path | None = None) -> Run:
+    """Read a run and its photographs.
+
+    Parameters
+    ----------
+    folder : Path
+        Of a training that has ended or has a checkpoint.
+    scene : Path, optional
+        Where the photographs are now; where they were by default.
+
+    Raises
+    ------
+    InputError
+        The folder holds no run, the photographs are not there or not the run's, there are too few, or the model cannot
+        be simplified.
+    """
+    settings = load(folder)
+    saved = newest_model(folder, settings)
+    if saved.unfinished is not None:
+        message = f"{folder} has not ended: this is its checkpoint of iteration {saved.unfinished}"
+        warnings.warn(one_line(message), InputWarning, stacklevel=2)
+    settings = settings if scene is None else settings._replace(scene=str(scene.resolve()))
+    if not Path(settings.scene).exists():
+        raise InputError(f"{settings.scene}, the scene of {folder}, is not there: --scene PATH says where it is now")
+    photographs = load_photographs(settings)
+    fingerprint.check(folder, photographs, settings.scene)
+    check_views(photographs, "simplify")
+    if n_rows(saved.model.gaussians) < 2:
+        raise InputError(f"{folder} holds {n_rows(saved.model.gaussians)} Gaussians, of which none can go: train more")
+    recipe = recipe_of(settings)
+    run = Run(
+        folder,
+        settings,
+        as_trained(recipe, saved.model),
+        owner_of(settings.recipe, settings.extension) or CORE,
+        photographs._replace(train_views=numbered(photographs.train_views)),
+        saved.model,
+        run_folder.measured_step(folder) if saved.unfinished is None else saved.unfinished,
+        saved.unfinished,
+    )
+    check_renderer(run)
+    return run
+
+
+def check_views(scene: Scene, what: str) -> None:
+    """Refuse a scene with too few training views to hold some out; ``what`` is what needs them."""
+    n_views = len(scene.train_views)
+    if n_views < LEAST_VIEWS:
+        raise InputError(
+            f"{what} needs at least {LEAST_VIEWS} training views, two of them to decide by, and scene {scene.name} has"
+            f" {n_views}: train with more photographs"
+        )
+
+
+def check_renderer(run: Run) -> None:
+    """Refuse a renderer that does not say how much each row weighs in a picture."""
+    request = Request(conventions=run.conventions, backend=run.backend, wants=frozenset({"stats"}))
+    renderer, reason = run.recipe.renderer, ""
+    try:
+        if renderer.render(run.model, run.scene.train_views[0], request)[0].stats is not None:
+            return
+    except InputError as error:
+        reason = f" ({error})"
+    raise InputError(
+        f"{run.folder}: renderer {renderer.name} of extension {run.owner.name} gives no blend weights, by which"
+        f" simplify chooses{reason}: give a run of another recipe"
+    )

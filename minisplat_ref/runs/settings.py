@@ -1,0 +1,234 @@
+"""What a training is asked to do, as it stands in ``config.json``."""
+
+import platform
+import reprlib
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from minisplat_ref import __version__
+from minisplat_ref.backends import BACKENDS
+from minisplat_ref.constants import PROFILES
+from minisplat_ref.errors import InputError
+from minisplat_ref.runs.run_folder import CONFIG, POINT_CLOUD, SHARED, read_json_object
+from minisplat_ref.extensions.extension import CORE, find_recipe, owner_of
+from minisplat_ref.io import load_scene
+from minisplat_ref.io.atomic import replacing
+from minisplat_ref.io.json_file import as_array
+from minisplat_ref.io.npz import read_npz
+from minisplat_ref.lpips import Network, check_views, load_network
+from minisplat_ref.methods import RECIPES
+from minisplat_ref.strategy import importance, simplify
+from minisplat_ref.training.schedule import Recipe, configured, describe, parsed_settings, settings_of
+from minisplat_ref.types import Floats, Model, Scene
+
+CHOICES = {"sampling": simplify.by_sampling, "rank": simplify.by_rank, "merging": simplify.by_merging}
+METRICS = {"indoor": importance.indoor, "outdoor": importance.outdoor}
+REPORTED_PACKAGES = ("numpy", "numba", "scipy", "pillow", "pycolmap")
+
+
+class Settings(NamedTuple):
+    """Everything besides the scene's files that decides the result."""
+
+    scene: str
+    """Absolute path of the scene's folder."""
+    downscale: int
+    """Factor by which the photographs are made smaller."""
+    test_every: int
+    """One view of so many is held out for testing; 0: none."""
+    undistort: bool
+    """Whether lens distortion is removed while loading."""
+    recipe: str
+    """Name of the recipe."""
+    schedule_iterations: int
+    """Number of iterations that the recipe's milestones are scaled to; stays when a run is made longer."""
+    iterations: int
+    """Iteration at which to stop."""
+    seed: int
+    """Seed of all random draws."""
+    profile: str
+    """Name of the rasteriser's conventions."""
+    backend: str
+    """Name of the backend."""
+    budget: int | None = None
+    """Gaussians that a simplification keeps at most; None for the recipe's own part of the candidates."""
+    simplify: str | None = None
+    """How simplification chooses, a key of ``CHOICES``; None for the recipe's own way."""
+    scene_type: str | None = None
+    """``indoor`` or ``outdoor``, which decides what importance means; None for the recipe's own choice."""
+    extension: str | None = None
+    """Name of an extension that a recipe of the core is trained with; a recipe of an extension brings its own."""
+    set: dict[str, str] = {}  # noqa: RUF012  (never written to)
+    """Settings of the recipe's events, losses and calibrations, as text: ``--set NAME=VALUE``."""
+    eval_every: int = 0
+    """Iterations after which the test views are measured again; 0: only in the end. Does not change the result."""
+    drop_bad_steps: bool = False
+    """Whether a step whose gradient is not finite is left out; otherwise it ends the training."""
+    lpips_weights: str | None = None
+    """Absolute path of the weights of LPIPS; None: it is not measured. Does not change the result."""
+    minutes: float | None = None
+    """Time that the training may take, for a recipe that decides its own length; the result depends on the machine."""
+    max_drop: float | None = None
+    """PSNR, dB, that a simplification after the training may lose; None: there is none."""
+    max_bytes: int | None = None
+    """Size that the PLY of a simplification after the training may have; None: there is none."""
+    init: str | None = None
+    """Absolute path of the PLY whose points the training starts from, not read again; None for the scene's points."""
+    background: list | None = None
+    """[3] RGB in [0, 1] behind the scene, and behind transparent pixels of a transforms.json; None for black."""
+
+
+def recipe_of(settings: Settings) -> Recipe:
+    """Return the recipe of a run, scaled and with what the run sets differently.
+
+    Raises
+    ------
+    InputError
+        There is no such recipe or extension, or the recipe has no such setting.
+    """
+    recipe = find_recipe(settings.recipe, settings.schedule_iterations, extension=settings.extension)
+    recipe = configured(recipe, **parsed_settings(recipe, settings.set))
+    options = {
+        "--budget": ("budget", settings.budget),
+        "--simplify": ("choose", _chosen("simplify", CHOICES, settings.simplify)),
+        "--scene-type": ("metric", _chosen("scene_type", METRICS, settings.scene_type)),
+    }
+    for option, (name, value) in options.items():
+        if value is None:
+            continue
+        if name not in settings_of(recipe):
+            others = ", ".join(other.name for other in RECIPES.values() if name in settings_of(other))
+            raise InputError(f"{option} means nothing to recipe {recipe.name}: leave it out, or take one of {others}")
+        recipe = configured(recipe, **{name: value})
+    return recipe
+
+
+def _chosen(name: str, choices: Mapping[str, Any], key: str | None) -> Any:
+    """Return the choice of a name, None where none was made."""
+    if key is not None and str(key) not in choices:
+        raise InputError(f"{name} {key!r} is unknown; choose one of {', '.join(choices)}")
+    return None if key is None else choices[key]
+
+
+def save_model(folder: Path, settings: Settings, model: Model) -> None:
+    """Write the population, and the shared parameters if there are any, into the folder of a run."""
+    owner = owner_of(settings.recipe, settings.extension) or CORE
+    owner.save(folder / POINT_CLOUD, model.gaussians)
+    if model.shared:
+        with replacing(folder / SHARED) as temporary, open(temporary, "wb") as file:
+            np.savez(file, allow_pickle=False, **model.shared)
+
+
+def load_model(folder: Path, settings: Settings) -> Model:
+    """Read what :func:`save_model` wrote.
+
+    Raises
+    ------
+    InputError
+        A file is missing or damaged, or the extension is.
+    """
+    owner = owner_of(settings.recipe, settings.extension) or CORE
+    gaussians = owner.load(folder / POINT_CLOUD, owner.representation.population)
+    if not (folder / SHARED).exists():
+        return Model(gaussians)
+    return Model(gaussians, read_npz(folder / SHARED, "train anew"))
+
+
+def to_config(settings: Settings, recipe: Recipe, scene: Scene) -> dict[str, Any]:
+    """Return what ``config.json`` holds: the settings, the recipe spelled out, and the versions that run it."""
+    versions = {package: version(package) for package in REPORTED_PACKAGES}
+    return {
+        "settings": settings._asdict(),
+        "background": scene.background.tolist(),
+        "recipe": describe(recipe),
+        "versions": {"minisplat_ref": __version__, "python": platform.python_version(), **versions},
+        "platform": platform.platform(),
+    }
+
+
+def load(folder: Path) -> Settings:
+    """Read the settings of a run.
+
+    Raises
+    ------
+    InputError
+        There is no such folder, it holds no run, or one of another version.
+    """
+    config = _read_config(folder)
+    try:
+        settings = Settings(**config["settings"])
+    except (KeyError, TypeError) as error:
+        raise InputError(
+            f"{folder / CONFIG} is not the configuration of a training of this version: {error}"
+        ) from error
+    kinds = {**Settings.__annotations__, "set": dict}  # of which isinstance cannot tell what it maps to what
+    wrong = [name for name, value in settings._asdict().items() if not isinstance(value, kinds[name])]
+    if not wrong:
+        texts_are_wrong = any(not isinstance(text, str) for text in settings.set.values())
+        wrong = ["set"] * texts_are_wrong + ["profile"] * (settings.profile not in PROFILES)
+        wrong += ["backend"] * (settings.backend not in BACKENDS)
+        wrong += ["background"] * (settings.background is not None and as_array(settings.background, (3,)) is None)
+    if wrong:
+        name = wrong[0]
+        raise InputError(
+            f"{folder / CONFIG}: the setting {name} is {reprlib.repr(getattr(settings, name))}, which no training of"
+            " this version has written"
+        )
+    return settings
+
+
+def load_background(folder: Path) -> Floats:
+    """Read the colour [3] in [0, 1] behind the scene of a run.
+
+    Raises
+    ------
+    InputError
+        As for :func:`load`.
+    """
+    background = as_array(_read_config(folder).get("background"), (3,))
+    if background is None or not ((background >= 0) & (background <= 1)).all():
+        raise InputError(f"{folder / CONFIG} has no background of three numbers from 0 to 1")
+    return background
+
+
+def _read_config(folder: Path) -> dict[str, Any]:
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder: give the --out folder of a training")
+    if not (folder / CONFIG).is_file():
+        raise InputError(f"{folder} holds no run, {CONFIG} is missing: give the --out folder of a training")
+    return read_json_object(folder / CONFIG)
+
+
+def load_photographs(settings: Settings) -> Scene:
+    """Load the scene of a run as it was loaded for the training.
+
+    Raises
+    ------
+    InputError
+        See :func:`minisplat_ref.io.load_scene`.
+    """
+    return load_scene(
+        settings.scene,
+        downscale=settings.downscale,
+        test_every=settings.test_every,
+        background=settings.background,
+        undistort=settings.undistort,
+    )
+
+
+def load_lpips(settings: Settings, scene: Scene) -> Network | None:
+    """Read the network that a run's LPIPS is measured with, None where it has none, and see that it fits the views.
+
+    Raises
+    ------
+    InputError
+        The file is missing or not what it should be, or a test view is too small for the network.
+    """
+    if settings.lpips_weights is None:
+        return None
+    network = load_network(settings.lpips_weights)
+    check_views(network, scene.test_views)
+    return network

@@ -1,0 +1,166 @@
+"""The folder that ``simplify`` leaves: a run like others, without a checkpoint, and what it was chosen by.
+
+``config.json`` is that of the run with one entry more, so ``render``, ``eval``, ``info`` and ``convert`` take the
+folder like that of a training. Nothing in it depends on the time: the same run gives the same bytes.
+"""
+
+import shutil
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from minisplat_ref.runs import fingerprint, run_folder
+from minisplat_ref.runs.opened_run import Run, open_run
+from minisplat_ref.reports.pictures import Picture, to_picture
+from minisplat_ref.reports.plots import save_png
+from minisplat_ref.runs.rate_distortion import Point, paired_drop
+from minisplat_ref.runs.scoring import measure, score, to_metrics
+from minisplat_ref.runs.settings import save_model
+from minisplat_ref.runs.simplification import Decision, Target, decide, finished
+from minisplat_ref.runs.simplification_report import Shown, draw, report_html
+from minisplat_ref.studies import FIGURE, RESULT
+from minisplat_ref.io.atomic import making_folder
+from minisplat_ref.metrics import Evaluation, ViewMetrics
+from minisplat_ref.types import Floats, Model, View
+
+N_SHOWN = 3  # test views
+
+
+class Asked(NamedTuple):
+    """What the command line says."""
+
+    run: Path
+    out: Path
+    target: Target
+    fine_tune: int
+    """Iterations."""
+    scene: Path | None = None
+    """Where the photographs are now, if they have moved."""
+
+
+def simplify_run(asked: Asked) -> dict[str, Any]:
+    """Simplify a run into a new folder.
+
+    Returns
+    -------
+    result : dict
+        What ``result.json`` holds.
+
+    Raises
+    ------
+    InputError
+        The run, its photographs or the folder cannot be used, or the target cannot be met; there is no folder then.
+    """
+    with making_folder(asked.out) as folder:
+        run = open_run(asked.run, asked.scene)
+        decision = decide(run, asked.target, asked.fine_tune)
+        all_alike = finished(run, decision.reference.n_gaussians, asked.fine_tune)
+        model = finished(run, decision.chosen.n_gaussians, asked.fine_tune)
+        save_model(folder, run.settings, model)
+        before, alike = (measure(run.scene, each, run.settings) for each in (run.model, all_alike))
+        after = score(folder, run.scene, model, run.settings)
+        result = {**to_result(run, asked, decision), "test": of_test_views(before, alike, after)}
+        _write_run(folder, run, result, after)
+        run_folder.write_json(folder / RESULT, result)
+        save_png(draw(result), folder / FIGURE)
+        (folder / run_folder.REPORT).write_text(report_html(asked.out, result, _shown(run, model)), encoding="utf-8")
+    return result
+
+
+def _pictures(run: Run, model: Model) -> dict[str, Picture]:
+    """Render the first test views, by their names."""
+    pictures: dict[str, Picture] = {}
+
+    def keep(view: View, image: Floats, _: ViewMetrics) -> None:
+        pictures[view.name] = to_picture(image)
+
+    measure(run.scene._replace(test_views=run.scene.test_views[:N_SHOWN]), model, run.settings, on_view=keep)
+    return pictures
+
+
+def _shown(run: Run, model: Model) -> list[Shown]:
+    """Return the first test views as the run and the new model draw them."""
+    before, after = _pictures(run, run.model), _pictures(run, model)
+    views = [view.loaded() for view in run.scene.test_views[:N_SHOWN]]
+    return [Shown(view.name, view.image, before[view.name], after[view.name]) for view in views]
+
+
+def to_result(run: Run, asked: Asked, decision: Decision) -> dict[str, Any]:
+    """Return how a size was decided on, as JSON holds it."""
+    size = run.scene.train_views[0].camera
+    return {
+        "run": str(asked.run.resolve()),
+        "scene": run.scene.name,
+        "size": [size.width, size.height],
+        "recipe": run.settings.recipe,
+        "iterations": run.step,
+        "target": str(asked.target),
+        **asked.target._asdict(),
+        "fine_tune": asked.fine_tune,
+        "train_views": len(run.scene.train_views),
+        "held_out": [view.name for view in run.held_out],
+        "run_psnr": decision.run_psnr,
+        "all": _of_point(decision.reference),
+        "curve": [_of_point(point) for point in decision.points],
+        "chosen": _of_point(decision.chosen),
+        "knee": _of_point(decision.knee),
+        "is_all_that_matter": decision.is_all_that_matter,
+    }
+
+
+def _of_point(point: Point) -> dict[str, Any]:
+    return {**point._asdict(), "psnrs": list(point.psnrs), "psnr": point.psnr}
+
+
+def of_test_views(before: Evaluation, alike: Evaluation, after: Evaluation) -> dict[str, Any] | None:
+    """Return what became of the test views, as JSON holds it.
+
+    Parameters
+    ----------
+    before : Evaluation
+        Of the run.
+    alike : Evaluation
+        Of all its Gaussians, fine-tuned like those that are left.
+    after : Evaluation
+        Of those that are left.
+
+    Returns
+    -------
+    test : dict or None
+        PSNR of the three in dB; ``drop`` from the second to the third, with its standard error, which one view does not
+        have; None without test views.
+    """
+    if before.psnr is None:
+        return None
+    drop, standard_error = paired_drop(*([view.psnr for view in e.per_view] for e in (alike, after)))
+    return {
+        "views": [view.name for view in before.per_view],
+        "psnr_before": before.psnr,
+        "psnr_alike": alike.psnr,
+        "psnr_after": after.psnr,
+        "ssim_before": before.ssim,
+        "ssim_after": after.ssim,
+        "drop": drop,
+        "standard_error": standard_error if len(before.per_view) > 1 else None,
+    }
+
+
+def _write_run(folder: Path, run: Run, result: dict[str, Any], after: Evaluation) -> None:
+    """Write what makes the folder a run: its configuration, cameras and measures."""
+    config = run_folder.read_json_object(run.folder / run_folder.CONFIG)
+    about = {name: result[name] for name in ("run", "target", "fine_tune")}
+    config |= {"settings": run.settings._asdict(), "simplified": about}
+    run_folder.write_json(folder / run_folder.CONFIG, config)
+    if (run.folder / run_folder.CAMERAS).exists():
+        shutil.copyfile(run.folder / run_folder.CAMERAS, folder / run_folder.CAMERAS)
+    else:
+        run_folder.write_json(folder / run_folder.CAMERAS, fingerprint.of_scene(run.scene))
+    test = result["test"] or {}
+    metrics = {
+        "n_gaussians": result["chosen"]["n_gaussians"],
+        "n_gaussians_before": result["all"]["n_gaussians"],
+        "iterations": result["iterations"],
+        "fine_tune": result["fine_tune"],
+        **{name: test[name] for name in ("psnr_before", "ssim_before") if name in test},
+        **to_metrics(after),
+    }
+    run_folder.write_json(folder / run_folder.METRICS, metrics)

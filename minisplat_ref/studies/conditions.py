@@ -1,0 +1,86 @@
+"""Conditions under which studies train a scene: as it is, with few photographs, and with a known defect.
+
+A disturbance is the same for every recipe and seed, so that trainings under one condition differ in nothing else.
+(:mod:`.defects` plants another one in every trial.) Test views stay as they are but under ``sky``.
+
+=============  =====================================================================================================
+``whole``      the scene as it is
+``few``        every fifth training photograph
+``gains``      each training photograph is multiplied by a gain of its own
+``few-gains``  both
+``poses``      each training camera is turned by half a pixel
+``sizes``      every second training photograph has half the width and height
+``sky``        what is high becomes sky, in the test views, too (synthetic scenes)
+=============  =====================================================================================================
+"""
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.studies.defects import halved, multiplied, under_a_sky, with_turned_cameras
+from minisplat_ref.types import Scene
+
+FEW = 5  # one of every so many training photographs remains
+GAINS = (0.7, 1.4)  # of a photograph, uniform in the logarithm
+
+
+def whole(scene: Scene) -> Scene:
+    """Return the scene."""
+    return scene
+
+
+def few_photographs(scene: Scene) -> Scene:
+    """Return the scene with every fifth training photograph."""
+    return scene._replace(train_views=scene.train_views[::FEW])
+
+
+def random_gains(scene: Scene) -> Scene:
+    """Return the scene with every training photograph multiplied by a gain of its own."""
+    low, high = np.log(GAINS)
+    return multiplied(scene, np.exp(np.random.default_rng(0).uniform(low, high, len(scene.train_views))))
+
+
+def few_with_gains(scene: Scene) -> Scene:
+    """Return the scene with every fifth training photograph, multiplied by a gain of its own."""
+    return random_gains(few_photographs(scene))
+
+
+def half_a_pixel_off(scene: Scene) -> Scene:
+    """Return the scene with every training camera turned by half a pixel."""
+    return with_turned_cameras(scene, np.random.default_rng(0))
+
+
+def two_sizes(scene: Scene) -> Scene:
+    """Return the scene with every second training photograph at half the width and height."""
+    return halved(scene, np.arange(len(scene.train_views)) % 2 == 1)
+
+
+def planted_sky(scene: Scene) -> Scene:
+    """Return a synthetic scene cut off under a sky, in the test views, too."""
+    return under_a_sky(scene, np.random.default_rng(0))
+
+
+CONDITIONS: Mapping[str, Callable[[Scene], Scene]] = {
+    "whole": whole,
+    "few": few_photographs,
+    "gains": random_gains,
+    "few-gains": few_with_gains,
+    "poses": half_a_pixel_off,
+    "sizes": two_sizes,
+    "sky": planted_sky,
+}
+
+
+def get_condition(name: str) -> Callable[[Scene], Scene]:
+    """Return the function that puts a scene under the condition of that name.
+
+    Raises
+    ------
+    InputError
+        There is none.
+    """
+    if name not in CONDITIONS:
+        raise InputError(f"condition {name!r} does not exist: choose from {', '.join(CONDITIONS)}")
+    return CONDITIONS[name]
