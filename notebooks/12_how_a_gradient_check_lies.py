@@ -380,10 +380,10 @@ plt.show()
 #
 # ## And how is the checker checked?
 #
-# With errors that nobody chose. `tests/test_oracle_planted.py` walks the syntax trees of the reference's gradients,
-# changes one sign, factor, transpose, condition or index order at a time, runs the copy, and demands that its stage
-# fails. Each change that survives is listed with the reason why it changes nothing: the length of a quaternion, the
-# transpose of a symmetric matrix, half of infinity.
+# With errors that nobody chose. `tests/oracle/test_oracle_planted.py` walks the syntax trees of the reference's
+# gradients, changes one sign, factor, transpose, condition or index order at a time, runs the copy, and demands that
+# its stage fails. Each change that survives is listed with the reason why it changes nothing: the length of a
+# quaternion, the transpose of a symmetric matrix, half of infinity.
 #
 # ## Play
 #

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import Browser, find_browser
 
+from browser import Browser, find_browser
 from minisplat_ref.backends import BACKENDS, CPU, REFERENCE
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"

@@ -5,11 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from networks import random_network, random_weights, write_network
 from numpy.testing import assert_allclose, assert_array_equal
-from photo_scenes import write_colmap
-from scenes import make_camera, make_gaussians
-from tolerances import CLOSED_FORM, LPIPS_FLOAT32, PARITY_FLOAT64
 
 from minisplat_ref import lpips as module
 from minisplat_ref.cli import main
@@ -22,6 +18,10 @@ from minisplat_ref.metrics import evaluate
 from minisplat_ref.runs import scoring
 from minisplat_ref.runs.progress import Progress
 from minisplat_ref.types import View
+from networks import random_network, random_weights, write_network
+from photo_scenes import write_colmap
+from scenes import make_camera, make_gaussians
+from tolerances import CLOSED_FORM, LPIPS_FLOAT32, PARITY_FLOAT64
 
 SIDE = 33  # pixels; AlexNet needs 31
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from tolerances import LPIPS_FLOAT32, PARITY_FLOAT64
 
 from minisplat_ref.lpips import load_network, lpips
+from tolerances import LPIPS_FLOAT32, PARITY_FLOAT64
 
 torch = pytest.importorskip("torch", reason="the extra minisplat_ref[peers] is not installed")
 from torch import nn  # noqa: E402  (after the line that skips without it)

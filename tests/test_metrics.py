@@ -4,8 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from scenes import as_dtype, make_camera, make_gaussians
-from tolerances import CLOSED_FORM, PARITY_FLOAT64
 
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.errors import InputError
@@ -13,6 +11,8 @@ from minisplat_ref.metrics import evaluate, psnr, ssim
 from minisplat_ref.reference.loss import ssim_map
 from minisplat_ref.rendering import render
 from minisplat_ref.types import View
+from scenes import as_dtype, make_camera, make_gaussians
+from tolerances import CLOSED_FORM, PARITY_FLOAT64
 
 
 def test_psnr_of_a_constant_error():

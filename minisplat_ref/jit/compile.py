@@ -22,7 +22,7 @@ kernels that call it. ``kernel`` compiles a parallel loop. Six facts shape this 
 * Code in the cache has been optimised twice, and a compiler that may reorder a sum gives other last digits the second
   time. Where eight numbers are computed at once, :mod:`minisplat_ref.jit.lanes` says so and fixes the order. The
   compiler may still choose which products to contract; freshly compiled and cached code have nevertheless given the
-  same bytes wherever that was tried, and ``tests/test_kernels.py`` tries it on the processor that it runs on.
+  same bytes wherever that was tried, and ``tests/jit/test_kernels.py`` tries it on the processor that it runs on.
 """
 
 import functools

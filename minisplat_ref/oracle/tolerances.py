@@ -3,8 +3,8 @@
 In order: gradients against differences; reference and kernels against 50 digits and against a peer; another renderer
 against the reference, stage by stage; the benchmark's contenders; the groups of hard cases; and the margins at
 thresholds within which rounding decides. Relative tolerances are relative to the largest value compared. Tolerances
-that only tests need are in ``tests/tolerances.py``; those of a scene's photographs or a strategy are where they are
-used.
+that only tests need are in ``tests/helpers/tolerances.py``; those of a scene's photographs or a strategy are where they
+are used.
 """
 
 from typing import NamedTuple

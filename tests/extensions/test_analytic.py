@@ -4,17 +4,10 @@ import json
 
 import numpy as np
 import pytest
-from gradcheck import check_jacobian
 from numpy.testing import assert_allclose
-from scenes import as_dtype, make_camera, make_gaussians
 from scipy.integrate import dblquad
-from tolerances import (
-    ALPHA_INTEGRAL,
-    COVERAGE_MIN,
-    PARITY_FLOAT32_IMAGE,
-    PARITY_FLOAT64,
-)
 
+from gradcheck import check_jacobian
 from minisplat_ref import load_ply
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
@@ -38,6 +31,13 @@ from minisplat_ref.extensions.analytic.stages import stages
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.types import Model, Projection, view_from
+from scenes import as_dtype, make_camera, make_gaussians
+from tolerances import (
+    ALPHA_INTEGRAL,
+    COVERAGE_MIN,
+    PARITY_FLOAT32_IMAGE,
+    PARITY_FLOAT64,
+)
 
 DRAW = INTEGRATED.renderer
 # The logistic curve differs from the normal distribution by 3.9e-4 at most (``analytic/footprint``), in two

@@ -4,11 +4,9 @@ import json
 
 import numpy as np
 import pytest
-from gradcheck import check_jacobian
 from numpy.testing import assert_allclose, assert_array_equal
-from scenes import as_dtype, make_camera, make_gaussians
-from tolerances import CLOSED_FORM, COVERAGE_MIN, PARITY_FLOAT64, ROUNDED_TO_FLOAT32
 
+from gradcheck import check_jacobian
 from minisplat_ref import load_ply, save_ply
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.cli import main
@@ -31,6 +29,8 @@ from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.runs.progress import Progress
 from minisplat_ref.types import Gaussians, Model, View, view_from
+from scenes import as_dtype, make_camera, make_gaussians
+from tolerances import CLOSED_FORM, COVERAGE_MIN, PARITY_FLOAT64, ROUNDED_TO_FLOAT32
 
 
 def with_filters(gaussians, sigmas):

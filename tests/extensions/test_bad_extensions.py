@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from photo_scenes import write_transforms
 
 import minisplat_ref
 from minisplat_ref import extensions
@@ -16,6 +15,7 @@ from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.extensions import extension as extension_module
+from photo_scenes import write_transforms
 
 ROOT = Path(minisplat_ref.__file__).parent.parent
 IMPORTS = """

@@ -7,6 +7,11 @@ from functools import partial
 
 import numpy as np
 import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from numpy.testing import assert_array_equal
+
 from compact import (
     check_damage,
     check_headers,
@@ -17,12 +22,6 @@ from compact import (
     short_run,
     with_header,
 )
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
-from numpy.testing import assert_array_equal
-from tolerances import CLOSED_FORM, PARITY_FLOAT32_IMAGE, QUATERNION_FLOAT32
-
 from minisplat_ref import load_ply
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
@@ -34,6 +33,7 @@ from minisplat_ref.mechanisms.packing import container as container
 from minisplat_ref.mechanisms.packing.morton import morton_order
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.types import Gaussians, Model, view_from
+from tolerances import CLOSED_FORM, PARITY_FLOAT32_IMAGE, QUATERNION_FLOAT32
 
 LEVELS = range(levels.N_LEVELS)
 

@@ -1,16 +1,13 @@
-"""DisC-GS: masks against polygons, gradients, hard cases, training end to end; see also ``test_shared_payload``."""
+"""DisC-GS: masks against polygons, gradients, hard cases, training end to end."""
 
 import json
 
 import numpy as np
 import pytest
-from gradcheck import check_jacobian
 from matplotlib.path import Path as Polygon
 from numpy.testing import assert_allclose
-from payloads import drawn, random_cuts
-from scenes import as_dtype, make_camera, make_gaussians
-from tolerances import CLOSED_FORM, PARITY_FLOAT32_IMAGE, PARITY_FLOAT64
 
+from gradcheck import check_jacobian
 from minisplat_ref import load_ply
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
@@ -22,6 +19,9 @@ from minisplat_ref.extensions.cuts.curve import N_EDGES, VERTICES, bernstein, cu
 from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CutGaussians
 from minisplat_ref.extensions.cuts.response import image_points, image_points_vjp
 from minisplat_ref.types import Gaussians, Primitives, view_from
+from payloads import drawn, random_cuts
+from scenes import as_dtype, make_camera, make_gaussians
+from tolerances import CLOSED_FORM, PARITY_FLOAT32_IMAGE, PARITY_FLOAT64
 
 HARD, SOFT = np.zeros(1), np.ones(1)
 LOOP = np.array([[[2.0, -5.0], [9.0, -6.0], [6.0, 7.0], [-2.5, 5.0]]])  # px; beside the centre

@@ -9,9 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from photo_scenes import write_transforms
-from scenes import as_dtype, make_gaussians
-from tolerances import GRADIENT_REL, GRADIENT_STEP
 
 import minisplat_ref
 from minisplat_ref import extensions
@@ -21,6 +18,9 @@ from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.training.losses import Rendered
 from minisplat_ref.training.schedule import configured
 from minisplat_ref.types import Model
+from photo_scenes import write_transforms
+from scenes import as_dtype, make_gaussians
+from tolerances import GRADIENT_REL, GRADIENT_STEP
 
 PACKAGE = Path(minisplat_ref.__file__).parent
 PAGE = PACKAGE.parent / "docs" / "EXTENDING.md"

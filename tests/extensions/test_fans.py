@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from scenes import make_gaussians
-from tolerances import CLOSED_FORM, PARITY_FLOAT64
 
 from minisplat_ref.mechanisms.meshes.fans import (
     N_SIDES,
@@ -18,6 +16,8 @@ from minisplat_ref.mechanisms.meshes.fans import (
     plane_axes,
     rims,
 )
+from scenes import make_gaussians
+from tolerances import CLOSED_FORM, PARITY_FLOAT64
 
 
 def flat_of(g):

@@ -6,8 +6,6 @@ import sys
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from scenes import as_dtype, make_camera, make_gaussians
-from tolerances import CLOSED_FORM, COVERAGE_MIN, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT64, PRINTED_DIGITS, PROFILE_GRID
 
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
@@ -38,6 +36,8 @@ from minisplat_ref.rendering import Request
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Gaussians, Model, view_from
+from scenes import as_dtype, make_camera, make_gaussians
+from tolerances import CLOSED_FORM, COVERAGE_MIN, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT64, PRINTED_DIGITS, PROFILE_GRID
 
 FLAT, SOLID = FanShape(8, 2.5, 0.2), FanShape(8, 2.3, 0.1, is_flat=False)
 

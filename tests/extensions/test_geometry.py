@@ -3,18 +3,9 @@
 import numba
 import numpy as np
 import pytest
-from gradcheck import check_inner_products, check_jacobian
 from numpy.testing import assert_allclose, assert_array_equal
-from scenes import make_camera, make_gaussians
-from tolerances import (
-    CLOSED_FORM,
-    COVERAGE_MIN,
-    GRADIENT_FLOOR,
-    PARITY_FLOAT32_GRADIENT,
-    PARITY_FLOAT32_LOSS,
-    PARITY_FLOAT64,
-)
 
+from gradcheck import check_inner_products, check_jacobian
 from minisplat_ref.extensions.geometry import EXTENSION, kernels, reference
 from minisplat_ref.extensions.geometry.depth_map import depth_normals, depth_normals_vjp
 from minisplat_ref.extensions.geometry.reference import edge_weights, normal_smoothness, normal_smoothness_vjp
@@ -24,6 +15,15 @@ from minisplat_ref.oracle.pieces import tiny_setting
 from minisplat_ref.rendering import Request, render, render_vjp
 from minisplat_ref.training.losses import Rendered
 from minisplat_ref.types import Gaussians, Model, RenderOutput, Scene, View
+from scenes import make_camera, make_gaussians
+from tolerances import (
+    CLOSED_FORM,
+    COVERAGE_MIN,
+    GRADIENT_FLOOR,
+    PARITY_FLOAT32_GRADIENT,
+    PARITY_FLOAT32_LOSS,
+    PARITY_FLOAT64,
+)
 
 NO_POINTS = np.zeros((0, 3))
 

@@ -5,11 +5,9 @@ from functools import partial
 
 import numpy as np
 import pytest
-from gradcheck import check_jacobian
 from numpy.testing import assert_allclose, assert_array_equal
-from scenes import as_dtype, make_camera, make_gaussians
-from tolerances import CLOSED_FORM, SAMPLE_MEAN
 
+from gradcheck import check_jacobian
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
@@ -35,6 +33,8 @@ from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import At, During, Every, configured, does
 from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Gaussians, Model, Scene, View, view_from
+from scenes import as_dtype, make_camera, make_gaussians
+from tolerances import CLOSED_FORM, SAMPLE_MEAN
 
 OFF = {"trace": 0.0, "beta": 0.0, "merge_reach": 0.0}
 

@@ -1,15 +1,12 @@
-"""MP-GS: hulls against closed forms and the paper's tangents, gradients, kinds; see also ``test_shared_payload``."""
+"""MP-GS: hulls against closed forms and the paper's tangents, gradients, kinds."""
 
 import json
 
 import numpy as np
 import pytest
-from gradcheck import check_jacobian
 from numpy.testing import assert_allclose
-from payloads import drawn
-from scenes import as_dtype, make_camera, make_gaussians
-from tolerances import CLOSED_FORM, HULL_COVERAGE, PARITY_FLOAT32_IMAGE, PARITY_FLOAT64, TANGENT_LEVEL
 
+from gradcheck import check_jacobian
 from minisplat_ref import load_ply
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.bench.extension_times import extension_cases
@@ -33,6 +30,9 @@ from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.reference.hits import CONIC
 from minisplat_ref.reference.tiling import bin_gaussians
 from minisplat_ref.types import Primitives, Projection, TileGrid, view_from
+from payloads import drawn
+from scenes import as_dtype, make_camera, make_gaussians
+from tolerances import CLOSED_FORM, HULL_COVERAGE, PARITY_FLOAT32_IMAGE, PARITY_FLOAT64, TANGENT_LEVEL
 
 Q = np.array([[[0.31, 0.12], [0.12, 0.2]]])  # px^-2
 WHITENER = np.linalg.cholesky(Q[0]).T  # |W d|^2 = d^T Q d

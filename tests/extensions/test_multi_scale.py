@@ -5,11 +5,9 @@ from functools import partial
 
 import numpy as np
 import pytest
-from gradcheck import check_inner_products
 from numpy.testing import assert_allclose, assert_array_equal
-from scenes import as_dtype, make_camera, make_gaussians
-from tolerances import CLOSED_FORM, COVERAGE_MIN, GRADIENT_STEP_IMAGE, MERGED_MOMENTS
 
+from gradcheck import check_inner_products
 from minisplat_ref import load_ply, save_ply
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.cli import main
@@ -28,6 +26,8 @@ from minisplat_ref.strategy.simplify import optical_masses
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.losses import Rendered
 from minisplat_ref.types import Gaussians, Model, Scene, View, view_from
+from scenes import as_dtype, make_camera, make_gaussians
+from tolerances import CLOSED_FORM, COVERAGE_MIN, GRADIENT_STEP_IMAGE, MERGED_MOMENTS
 
 DRAW = LEVELS.renderer
 EVERYTHING = 1e9  # pixels of coverage, so that all Gaussians that share a cell are merged

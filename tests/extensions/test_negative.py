@@ -6,19 +6,9 @@ import signal
 
 import numpy as np
 import pytest
-from gradcheck import check_inner_products, check_jacobian
 from numpy.testing import assert_allclose, assert_array_equal
-from scenes import as_dtype, make_camera, make_gaussians
-from tolerances import (
-    CLOSED_FORM,
-    COVERAGE_MIN,
-    DENSITY_GRID,
-    GRADIENT_STEP_IMAGE,
-    PARITY_FLOAT32_GRADIENT,
-    PARITY_FLOAT32_IMAGE,
-    PARITY_FLOAT64,
-)
 
+from gradcheck import check_inner_products, check_jacobian
 from minisplat_ref import load_ply, save_ply
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.cli import main
@@ -38,6 +28,16 @@ from minisplat_ref.strategy.clone_split import prune_faint, prune_large
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.state import Iteration, TrainState, start_anew
 from minisplat_ref.types import Gaussians, Model, view_from
+from scenes import as_dtype, make_camera, make_gaussians
+from tolerances import (
+    CLOSED_FORM,
+    COVERAGE_MIN,
+    DENSITY_GRID,
+    GRADIENT_STEP_IMAGE,
+    PARITY_FLOAT32_GRADIENT,
+    PARITY_FLOAT32_IMAGE,
+    PARITY_FLOAT64,
+)
 
 BACKGROUND = np.array([0.2, 0.5, 0.9])
 DRAW = SIGNED.renderer

@@ -5,10 +5,9 @@ import json
 import numpy as np
 import pytest
 import zstandard
-from compact import check_damage, check_headers, population, refusal, short_run, with_header
 from numpy.testing import assert_allclose, assert_array_equal
-from tolerances import CLOSED_FORM, HALF_FLOAT
 
+from compact import check_damage, check_headers, population, refusal, short_run, with_header
 from minisplat_ref import load_ply
 from minisplat_ref.backends import CPU
 from minisplat_ref.cli import main
@@ -29,6 +28,7 @@ from minisplat_ref.training.loop import initial_state
 from minisplat_ref.training.schedule import action_name
 from minisplat_ref.training.state import Iteration
 from minisplat_ref.types import Gaussians
+from tolerances import CLOSED_FORM, HALF_FLOAT
 
 LEVELS = range(len(omg.LEVELS))
 

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
-from photo_scenes import edit_transforms, write_transforms
-from scenes import as_dtype, make_gaussians
 
 import minisplat_ref
 from minisplat_ref.io.images import read_image
 from minisplat_ref.io.ply import load_ply, read_vertices, save_ply
 from minisplat_ref.jit.compile import cache_root, source_hash
+from photo_scenes import edit_transforms, write_transforms
+from scenes import as_dtype, make_gaussians
 
 ROOT = Path(minisplat_ref.__file__).parent.parent
 N = 20

@@ -6,11 +6,9 @@ from functools import partial
 import numba
 import numpy as np
 import pytest
-from gradcheck import check_jacobian
 from numpy.testing import assert_allclose, assert_array_equal
-from scenes import as_dtype, make_camera, make_gaussians
-from tolerances import CLOSED_FORM, COVERAGE_MIN, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT32_IMAGE, PARITY_FLOAT64
 
+from gradcheck import check_jacobian
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.bench import extension_times
 from minisplat_ref.bench.extension_times import extension_cases
@@ -33,6 +31,8 @@ from minisplat_ref.reference.projection import project as project_ewa
 from minisplat_ref.rendering import SPLATTING, Request, activated
 from minisplat_ref.training.schedule import configured, describe, settings_of
 from minisplat_ref.types import Gaussians, Model, Primitives, view_from
+from scenes import as_dtype, make_camera, make_gaussians
+from tolerances import CLOSED_FORM, COVERAGE_MIN, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT32_IMAGE, PARITY_FLOAT64
 
 DRAW = ORDERED.renderer
 # A fixed ray seen by cameras that differ by a rotation: dozens of roundings of 1e-16, in exponents of up to 5.5.

@@ -8,18 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gradcheck import check_jacobian
 from numpy.testing import assert_allclose, assert_array_equal
-from scenes import as_dtype, make_camera, make_gaussians
-from tolerances import (
-    CLOSED_FORM,
-    COVERAGE_MIN,
-    PARITY_FLOAT32_GRADIENT,
-    PARITY_FLOAT32_IMAGE,
-    PARITY_FLOAT64,
-    PLANE_DEPTH,
-)
 
+from gradcheck import check_jacobian
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
@@ -36,6 +27,15 @@ from minisplat_ref.mechanisms.rays.pixel_rays import Rays, pixel_rays
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.types import Gaussians, Model, view_from
+from scenes import as_dtype, make_camera, make_gaussians
+from tolerances import (
+    CLOSED_FORM,
+    COVERAGE_MIN,
+    PARITY_FLOAT32_GRADIENT,
+    PARITY_FLOAT32_IMAGE,
+    PARITY_FLOAT64,
+    PLANE_DEPTH,
+)
 
 ROOT = Path(__file__).parent.parent.parent
 DRAW = TRACED.renderer

@@ -5,8 +5,6 @@ import json
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from scenes import as_dtype, make_gaussians
-from tolerances import AFFINE_EDIT, EDITED_IMAGE, PARITY_FLOAT64
 
 from minisplat_ref.cli import main
 from minisplat_ref.errors import InputError
@@ -19,6 +17,8 @@ from minisplat_ref.mechanisms.editing.deformation import Deformation, deformed
 from minisplat_ref.mechanisms.meshes.fans import flattened
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.reference.spherical_harmonics import sh_basis
+from scenes import as_dtype, make_gaussians
+from tolerances import AFFINE_EDIT, EDITED_IMAGE, PARITY_FLOAT64
 
 TURN = rotation_matrices(np.array([[0.8, 0.2, -0.4, 0.4]]))[0]
 SHIFT = np.array([0.3, -0.2, 0.1])

@@ -5,8 +5,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
-from scenes import as_dtype, make_camera, make_gaussians
-from tolerances import AFFINE_EDIT, CLOSED_FORM, COVERAGE_MIN, EDITED_IMAGE, PARITY_FLOAT32_PROJECTION
 
 from data_tools.fuzz.judging import judge
 from data_tools.fuzz.readers import Reader, mutant
@@ -26,6 +24,8 @@ from minisplat_ref.reference.covariance import covariances, rotation_matrices
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.rendering import render
 from minisplat_ref.types import Gaussians
+from scenes import as_dtype, make_camera, make_gaussians
+from tolerances import AFFINE_EDIT, CLOSED_FORM, COVERAGE_MIN, EDITED_IMAGE, PARITY_FLOAT32_PROJECTION
 
 LINEAR = {  # A of x -> A x + b
     "rotation": rotation_about((20, -50, 70)),

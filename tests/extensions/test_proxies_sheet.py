@@ -5,8 +5,6 @@ import json
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from scenes import as_dtype, make_gaussians
-from tolerances import CLOSED_FORM, GRADIENT_REL, GRADIENT_STEP, SETTLED, VERLET_SLOPE
 
 from minisplat_ref.cli import main
 from minisplat_ref.extensions.proxies import edit_claims, sheet_claims
@@ -35,6 +33,8 @@ from minisplat_ref.extensions.proxies.springs import (
 from minisplat_ref.io.images import read_image
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.mechanisms.meshes.mesh import Mesh, load_mesh, save_mesh
+from scenes import as_dtype, make_gaussians
+from tolerances import CLOSED_FORM, GRADIENT_REL, GRADIENT_STEP, SETTLED, VERLET_SLOPE
 
 G = np.array([0.0, 9.81, 0.0])
 

@@ -9,18 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gradcheck import check_jacobian
 from numpy.testing import assert_allclose, assert_array_equal
-from scenes import as_dtype, make_camera, make_gaussians
-from tolerances import (
-    CLOSED_FORM,
-    COVERAGE_MIN,
-    PARITY_FLOAT32_GRADIENT,
-    PARITY_FLOAT32_IMAGE,
-    PARITY_FLOAT64,
-    RAY_ORDER,
-)
 
+from gradcheck import check_jacobian
 from minisplat_ref import load_ply
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
@@ -39,6 +30,15 @@ from minisplat_ref.mechanisms.rays.traversal import limits_of
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.types import Gaussians, Model, view_from
+from scenes import as_dtype, make_camera, make_gaussians
+from tolerances import (
+    CLOSED_FORM,
+    COVERAGE_MIN,
+    PARITY_FLOAT32_GRADIENT,
+    PARITY_FLOAT32_IMAGE,
+    PARITY_FLOAT64,
+    RAY_ORDER,
+)
 
 ROOT = Path(__file__).parent.parent.parent
 DRAW = TRACED.renderer

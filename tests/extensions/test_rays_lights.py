@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from tolerances import CLOSED_FORM, MITSUBA_DEPTH, PARITY_FLOAT64, RAY_ORDER
 
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
@@ -30,6 +29,7 @@ from minisplat_ref.mechanisms.meshes.mesh import Mesh, save_mesh
 from minisplat_ref.mechanisms.rays.pixel_rays import Rays, pixel_rays
 from minisplat_ref.rendering import Request
 from minisplat_ref.types import Model, view_from
+from tolerances import CLOSED_FORM, MITSUBA_DEPTH, PARITY_FLOAT64, RAY_ORDER
 
 NO_LIGHTS = np.zeros((0, 3))
 BLACK = np.zeros(3)

@@ -7,15 +7,15 @@ import subprocess
 
 import numpy as np
 import pytest
-from compact import population, refusal, rotation_error
 from numpy.testing import assert_allclose
-from tolerances import CLOSED_FORM, ROUNDED_TO_FLOAT32, SPZ_ROTATION
 
+from compact import population, refusal, rotation_error
 from minisplat_ref import load_ply
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.compression import spz
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.types import Gaussians
+from tolerances import CLOSED_FORM, ROUNDED_TO_FLOAT32, SPZ_ROTATION
 
 
 def spz_raw(gaussians, level=0):

@@ -1,15 +1,12 @@
-"""Textured-GS: hits of rays on ellipsoids, gradients, fine-tuning end to end; see also ``test_shared_payload``."""
+"""Textured-GS: hits of rays on ellipsoids, gradients, fine-tuning end to end."""
 
 import json
 
 import numpy as np
 import pytest
-from gradcheck import check_jacobian
 from numpy.testing import assert_allclose
-from payloads import drawn, random_textures
-from scenes import as_dtype, make_camera, make_gaussians
-from tolerances import CLOSED_FORM, PARITY_FLOAT64, TEXTURE_THIN_FLOAT32
 
+from gradcheck import check_jacobian
 from minisplat_ref import load_ply
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
@@ -25,6 +22,9 @@ from minisplat_ref.reference.hits import CONIC
 from minisplat_ref.reference.pinhole import pinhole, pinhole_rays
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.types import Projection, view_from
+from payloads import drawn, random_textures
+from scenes import as_dtype, make_camera, make_gaussians
+from tolerances import CLOSED_FORM, PARITY_FLOAT64, TEXTURE_THIN_FLOAT32
 
 RENDERER = TEXTURED_GAUSSIANS.renderer
 DIRECTIONS = np.random.default_rng(5).normal(size=(4000, 3))

@@ -5,11 +5,9 @@ from functools import partial
 
 import numpy as np
 import pytest
-from gradcheck import check_jacobian
 from numpy.testing import assert_array_equal
-from scenes import as_dtype, make_camera, make_gaussians
-from tolerances import CLOSED_FORM, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT32_IMAGE, PARITY_FLOAT64
 
+from gradcheck import check_jacobian
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
@@ -27,6 +25,8 @@ from minisplat_ref.runs.progress import Progress
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import During, Every
 from minisplat_ref.types import Gaussians, Model, Scene, View, view_from
+from scenes import as_dtype, make_camera, make_gaussians
+from tolerances import CLOSED_FORM, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT32_IMAGE, PARITY_FLOAT64
 
 RENDERER = MOVING.renderer
 SIX = Gaussians._fields

@@ -5,8 +5,6 @@ import json
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from scenes import as_dtype, make_camera, make_gaussians
-from tolerances import CLOSED_FORM
 
 from minisplat_ref import save_ply
 from minisplat_ref.backends import CPU, REFERENCE
@@ -22,6 +20,8 @@ from minisplat_ref.extensions.vr.stages import stages
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import Request
 from minisplat_ref.types import Model, view_from
+from scenes import as_dtype, make_camera, make_gaussians
+from tolerances import CLOSED_FORM
 
 CAMERA = make_camera(80, 60, fx=60.0, fy=60.0)
 REQUEST = Request(np.array([0.2, 0.4, 0.6]), backend=REFERENCE)

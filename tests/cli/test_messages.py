@@ -1,0 +1,264 @@
+"""What a person is told of input that is odd but not broken: one line that says what it means for the run."""
+
+import shutil
+import struct
+import warnings
+import zlib
+
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+
+from minisplat_ref import Gaussians, io, save_ply
+from minisplat_ref.cli import main, train
+from minisplat_ref.cli import sfm as sfm_command
+from minisplat_ref.datasets import sfm
+from minisplat_ref.datasets.downscale import list_images
+from minisplat_ref.errors import InputError, InputWarning
+from minisplat_ref.io import images as images_module
+from minisplat_ref.io import load_ply, load_scene, read_image
+from minisplat_ref.io.images import PIXELS_MAX, image_size, is_turned, write_image
+from minisplat_ref.io.lens import import_pycolmap
+from minisplat_ref.runs import first_use
+from minisplat_ref.runs.notices import warn_of_model, warn_of_scene
+from minisplat_ref.types import Model
+from photo_scenes import HEIGHT, WIDTH, colored_image, write_colmap, write_transforms
+
+
+def no_gaussians():
+    zeros = np.zeros((0, 3))
+    return Gaussians(zeros, np.zeros((0, 4)), zeros, zeros[:, 0], zeros, np.zeros((0, 0, 3)))
+
+
+# photographs
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_turned_photograph(tmp_path, orientation):
+    """The camera is of the upright image, the file holds it lying: turned, it would fit."""
+    write_colmap(tmp_path)
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    path = tmp_path / "images" / "0002.png"
+    Image.fromarray(colored_image(2, HEIGHT, WIDTH)).save(path, exif=exif)
+    assert is_turned(path) == (orientation in (6, 8))
+    with pytest.raises(InputError, match=r"0002\.png: the image is 24x32 but its camera is 32x24[,;]") as caught:
+        load_scene(tmp_path)
+    assert ("EXIF data ask to turn it" in str(caught.value)) == is_turned(path)
+    assert ("full-size" in str(caught.value)) != is_turned(path)
+
+
+def test_photograph_beyond_the_limit_of_pillow(tmp_path, monkeypatch):
+    """Pillow speaks of a bomb from 179 million pixels on, of which telephones take 200; here with a smaller limit."""
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 50)
+    write_image(tmp_path / "a.png", colored_image(1))
+    assert read_image(tmp_path / "a.png").shape == (HEIGHT, WIDTH, 3)
+    assert Image.MAX_IMAGE_PIXELS == 50
+    with pytest.raises(Image.DecompressionBombError):  # so that the limit is one
+        Image.open(tmp_path / "a.png")
+
+
+def png_that_claims(path, width, height):
+    """Write a small PNG with another size in its header, its checksum to match."""
+    write_image(path, colored_image(1))
+    content = path.read_bytes()
+    header = b"IHDR" + struct.pack(">II", width, height) + content[24:29]
+    path.write_bytes(content[:12] + header + struct.pack(">I", zlib.crc32(header)) + content[33:])
+
+
+def test_photograph_of_300_megapixels(tmp_path, monkeypatch):
+    png_that_claims(tmp_path / "a.png", 20_000, 15_000)
+    with pytest.raises(InputError, match=r"a\.png: 20000 x 15000 pixels cannot be in \d+ bytes; copy or export"):
+        image_size(tmp_path / "a.png")
+    monkeypatch.setattr(images_module, "PIXELS_PER_BYTE", 10**9)
+    assert image_size(tmp_path / "a.png") == (20_000, 15_000)
+    png_that_claims(tmp_path / "a.png", 40_000, 15_000)
+    with pytest.raises(InputError, match=rf"40000 x 15000 pixels, more than the {PIXELS_MAX:,} that are read; make it"):
+        image_size(tmp_path / "a.png")
+
+
+def test_damaged_exif_data_are_no_warning(tmp_path):
+    exif = b"II*\0\x08\0\0\0\xff\xff" + bytes(range(40))
+    Image.fromarray(colored_image(1)).save(tmp_path / "a.jpg", exif=b"Exif\0\0" + exif)
+    assert read_image(tmp_path / "a.jpg").shape == (HEIGHT, WIDTH, 3)  # a warning would be an error here
+    assert not is_turned(tmp_path / "a.jpg")
+
+
+def test_heic_and_raw_photographs_are_named(tmp_path, capsys):
+    for name in ("b.HEIC", "c.dng", "notes.txt"):
+        (tmp_path / "photos" / "d").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "photos" / name).write_bytes(b"raw")
+    (tmp_path / "photos" / "d" / "e.nef").write_bytes(b"raw")
+    message = r"but 3 photographs of formats that are not read \(b\.HEIC, c\.dng, d/e\.nef\): convert them to JPEG"
+    with pytest.raises(InputError, match=message):
+        list_images(tmp_path / "photos")
+    write_image(tmp_path / "photos" / "a.jpg", colored_image(1))
+    with pytest.warns(InputWarning, match=r"leaving out 3 photographs of formats .* \(b\.HEIC, c\.dng, d/e\.nef\): "):
+        assert list_images(tmp_path / "photos") == [tmp_path / "photos" / "a.jpg"]
+    assert main(["downscale", str(tmp_path / "photos")]) == 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("minisplat-ref: warning: ") and "b.HEIC" in line
+    for i in range(30):
+        (tmp_path / "photos" / f"{i:02d}.arw").write_bytes(b"raw")
+    with pytest.warns(InputWarning, match=r"leaving out 33 photographs .*, 19\.arw and 13 more\): convert"):
+        list_images(tmp_path / "photos")
+
+
+# scenes
+
+
+def test_missing_frames_are_one_line_of_the_command(tmp_path, capsys):
+    """Not Python's own form, which shows a line of our source."""
+    write_transforms(tmp_path / "scene", n=5, fl_x=40.0)
+    (tmp_path / "scene" / "images" / "0003.png").unlink()
+    assert main(["info", str(tmp_path / "scene")]) == 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("minisplat-ref: warning: ")
+    assert line.endswith("transforms.json: 1 of 5 images are missing and skipped: images/0003.png")
+
+
+def test_other_warnings_keep_their_form(tmp_path, capsys, monkeypatch):
+    def warn(path, **_):
+        warnings.warn("of a library", UserWarning, stacklevel=1)
+        warnings.warn("of ours", InputWarning, stacklevel=1)
+        raise InputError(f"{path}: enough")
+
+    shown = []
+    monkeypatch.setattr(io, "load_scene", warn)
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        monkeypatch.setattr(warnings, "showwarning", lambda message, *_: shown.append(str(message)))
+        assert main(["info", str(tmp_path)]) == 2
+    assert shown == ["of a library"]
+    ours, last = capsys.readouterr().err.splitlines()
+    assert ours == "minisplat-ref: warning: of ours" and last.endswith("enough")
+
+
+def test_scene_without_points(tmp_path, recwarn):
+    scene = load_scene(write_transforms(tmp_path, fl_x=40.0))
+    with pytest.warns(InputWarning, match=r"has 0 sparse points: training begins with 100,000 random ones .* ply_file"):
+        warn_of_scene(scene, 1)
+    points = np.random.default_rng(0).normal(size=(4, 3))
+    warn_of_scene(scene._replace(points=points, point_colors=np.zeros((4, 3), np.uint8)), 1)
+    assert not recwarn.list
+
+
+def test_photographs_of_a_few_pixels(tmp_path):
+    scene = load_scene(write_colmap(tmp_path), downscale=1000)
+    scene = scene._replace(points=np.zeros((4, 3)))
+    with pytest.warns(InputWarning, match="are 1 x 1 pixels after --downscale 1000: give a smaller number; from fewer"):
+        warn_of_scene(scene, 1000)
+    with pytest.warns(InputWarning, match="are 1 x 1 pixels: give larger ones; from fewer than 16 x 16 hardly any"):
+        warn_of_scene(scene, 1)
+
+
+def test_training_says_so(tmp_path, capsys, monkeypatch):
+    scene = write_transforms(tmp_path / "scene", fl_x=40.0)
+    monkeypatch.setattr(train, "_train", lambda *_: 0)
+    options = ["--recipe", "3dgs-accel", "--downscale", "4", "--out", str(tmp_path / "out"), "--backend", "reference"]
+    assert main(["train", str(scene), *options]) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert all(line.startswith("minisplat-ref: warning: ") for line in lines)
+    assert "sparse points" in lines[0] and "8 x 6 pixels after --downscale 4" in lines[1]
+
+
+# Gaussians
+
+
+def test_mesh(tmp_path):
+    header = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    body = "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+    faces = "element face 1\nproperty list uchar int vertex_indices\n"
+    (tmp_path / "mesh.ply").write_text(f"{header}{faces}end_header\n{body}")
+    with pytest.raises(InputError, match=r"no property f_dc_0.*; it is a mesh of 1 faces, which is not rendered: "):
+        load_ply(tmp_path / "mesh.ply")
+    (tmp_path / "cloud.ply").write_text(f"{header}end_header\n{body}")
+    with pytest.raises(InputError, match="it is a point cloud: give it as a scene's points"):
+        load_ply(tmp_path / "cloud.ply")
+
+
+def test_no_gaussians(tmp_path, capsys):
+    with pytest.warns(InputWarning, match=r"here holds no Gaussians: every picture shows the background alone"):
+        warn_of_model(Model(no_gaussians()), "here")
+    save_ply(tmp_path / "a.ply", no_gaussians())
+    options = ["--frames", "1", "--size", "8x6", "--background", "255,0,0", "--out", str(tmp_path / "out")]
+    assert main(["render", str(tmp_path / "a.ply"), *options]) == 0
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("minisplat-ref")]
+    assert line.startswith(f"minisplat-ref: warning: {tmp_path / 'a.ply'} holds no Gaussians")
+    (picture,) = (tmp_path / "out").glob("*.png")
+    assert (read_image(picture) == [255, 0, 0]).all()
+
+
+# kernels
+
+
+def test_kernels_that_cannot_be_kept(tmp_path, monkeypatch, recwarn):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file"))
+    with pytest.warns(InputWarning, match=r"file cannot be written: compiled kernels are not kept, .*; set NUMBA"):
+        first_use.compile_kernels("cpu")
+    first_use.warn_if_not_kept("reference")  # which has none
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    first_use.warn_if_not_kept("cpu")
+    assert not recwarn.list
+
+
+# structure from motion
+
+
+def test_partial_scene_names_what_is_left_out_and_what_helps(tmp_path, capsys, monkeypatch):
+    result = sfm.SfmResult(15, tuple(f"{i}.jpg" for i in range(7)), (4, 3), 1234, 0.5)
+    monkeypatch.setattr(sfm, "run_sfm", lambda *_, **__: result)
+    assert main(["sfm", "photos", "--out", "scene"]) == 0
+    first, left_out, groups, advice = capsys.readouterr().out.splitlines()
+    assert first == "scene: 8 of 15 photographs (53%), 1234 points, reprojection error 0.50 px"
+    assert left_out == "without a place: 0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg, 5.jpg, 6.jpg"
+    assert groups == "groups that fit together, but not with the scene: of 4 and of 3 photographs"
+    assert advice.startswith("what usually helps: more photographs between")
+    monkeypatch.setattr(sfm, "run_sfm", lambda *_, **__: result._replace(left_out=(), other_groups=()))
+    assert main(["sfm", "photos", "--out", "scene"]) == 0
+    assert capsys.readouterr().out == "scene: 15 of 15 photographs (100%), 1234 points, reprojection error 0.50 px\n"
+
+
+class Placed:
+    def __init__(self, n):
+        self.n = n
+
+    def num_reg_images(self):
+        return self.n
+
+
+@pytest.mark.parametrize("matching", sfm_command.MATCHINGS)
+@pytest.mark.parametrize("sizes", [(2,), (1, 2), (3, 2)])
+def test_hardly_any_photograph_finds_a_place(tmp_path, capsys, monkeypatch, matching, sizes):
+    pycolmap = import_pycolmap()
+    for name in ("extract_features", "match_exhaustive", "match_sequential"):
+        monkeypatch.setattr(pycolmap, name, lambda *_, **__: None)
+    models = {i: Placed(n) for i, n in enumerate(sizes)}
+    monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *_: models)
+    (tmp_path / "photos").mkdir()
+    for i in range(15):
+        write_image(tmp_path / "photos" / f"{i}.png", colored_image(i))
+    out = tmp_path / "out"
+    assert main(["sfm", str(tmp_path / "photos"), "--out", str(out), "--matching", matching]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    n = max(sizes)
+    assert f"photos: {n} of 15 photographs ({n / 15:.0%}) found a place, too few for a scene; " in line
+    assert ("use --matching exhaustive" in line) == (matching == "sequential")
+    assert not out.exists()
+
+
+def test_photographs_of_two_places(shared_data, tmp_path, capsys):
+    """Two of another scene among four that overlap: they find no place, and are named as they are called."""
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for i in (23, 24, 25, 38):
+        shutil.copy(shared_data / "banana" / "images" / f"DSC_04{i}.jpg", photos)
+    for i, name in enumerate(sorted((shared_data / "fox" / "images").iterdir())[:50:49]):
+        shutil.copy(name, photos / f"fox{i}.JPEG")
+    assert main(["sfm", str(photos), "--out", str(tmp_path / "scene"), "--long-side", "512"]) == 0
+    first, left_out, *_, advice = capsys.readouterr().out.splitlines()
+    assert ": 4 of 6 photographs (67%), " in first
+    assert left_out == "without a place: fox0.JPEG, fox1.JPEG"
+    assert advice == sfm.advice("exhaustive")
+    assert len(load_scene(tmp_path / "scene", test_every=0).train_views) == 4

@@ -1,0 +1,74 @@
+"""Planted errors: each line is where the list says, a planted function is restored, a command's verdict is told."""
+
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from data_tools import survey as module
+from data_tools.survey import as_markdown, planted_copy, planted_function, survey
+from data_tools.survey_errors import ERRORS
+from minisplat_ref.constants import GSPLAT_MAIN
+from minisplat_ref.errors import InputError
+from minisplat_ref.reference import adam, hits
+from minisplat_ref.reference.adam import adam_update
+
+BY_NAME = {error.what: error for error in ERRORS}
+
+
+def test_every_line_is_where_the_list_says(tmp_path):
+    assert len(BY_NAME) == len(ERRORS) >= 25
+    for k, error in enumerate(ERRORS):
+        if error.is_compiled:
+            planted_copy(error, tmp_path / str(k))
+        else:
+            with planted_function(error):
+                pass
+    with pytest.raises(InputError, match=r"stands 0 times in reference\.adam:adam_update"):
+        with planted_function(BY_NAME["eps inside the root"]._replace(right="no such line")):
+            pass
+
+
+def test_a_function_is_wrong_for_whoever_holds_it_and_right_again():
+    right = adam_update.__code__
+    with planted_function(BY_NAME["eps inside the root"]):
+        assert adam.adam_update is adam_update and adam_update.__code__ is not right
+    assert adam_update.__code__ is right
+
+
+def test_a_copy_differs_in_one_line(tmp_path):
+    error = BY_NAME["kernels: eps inside the root"]
+    planted_copy(error, tmp_path)
+    lines = [
+        (folder / "scalar" / "adam.py").read_text().splitlines()
+        for folder in (module.PACKAGE, tmp_path / "minisplat_ref")
+    ]
+    changed = [pair for pair in zip(*lines, strict=True) if pair[0] != pair[1]]
+    assert len(changed) == 1 and error.right in changed[0][0] and error.wrong in changed[0][1]
+
+
+def test_a_command_notices_or_not(monkeypatch, capsys):
+    commands = {"Adam": ("compare", "reference", "--scene", "equality"), "truth": ("export", "/dev/null/nowhere")}
+    monkeypatch.setattr(module, "COMMANDS", commands)
+    outcome = survey(BY_NAME["eps inside the root"], ["Adam"])
+    assert outcome.notices == {"Adam": True}
+    harmless = BY_NAME["eps inside the root"]._replace(what="none", wrong="(np.sqrt(v) + 1.0 * step.eps)")
+    passed = survey(harmless, ["Adam"])
+    assert passed.notices == {"Adam": False} and capsys.readouterr().out == ""
+    table = as_markdown([outcome, passed]).splitlines()
+    assert "noticed" in table[2] and "noticed" not in table[3] and table[-1].startswith("| 1 of 2 are noticed")
+
+
+def test_an_exception_is_noticed():
+    broken = BY_NAME["goes on where T equals the stop"]._replace(wrong="1 / 0 + conventions")
+    assert survey(broken, ["compare reference"]).notices == {"compare reference": True}
+    assert "/ 0" not in inspect.getsource(hits.goes_on) and hits.goes_on(np.ones(1), GSPLAT_MAIN)
+
+
+def test_the_script_names_its_commands():
+    call = [sys.executable, "-m", "data_tools.survey", "--help"]
+    done = subprocess.run(call, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=True)
+    assert all(heading in done.stdout for heading in module.COMMANDS)

@@ -1,0 +1,263 @@
+"""The commands that prepare scenes: downscaling, undistortion, structure from motion."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+
+from minisplat_ref.cli import main
+from minisplat_ref.datasets.sfm import prepare_photos
+from minisplat_ref.io import load_scene
+from minisplat_ref.io.images import read_image, resize_image, write_image
+from minisplat_ref.io.lens import import_pycolmap
+from minisplat_ref.io.ply import write_vertices
+from photo_scenes import HEIGHT, WIDTH, colored_image, sparse_color_errors, write_colmap, write_transforms
+from tolerances import COLOR_RATIO, SAME_CAMERAS, SFM_CENTERS
+
+ROOT = Path(__file__).parents[2]
+DISTORTED = (40.0, 42.0, 16.0, 12.0, 0.1, -0.05, 0.004, -0.003)  # OPENCV
+NERFSTUDIO = dict(zip(("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"), DISTORTED, strict=True))
+
+
+def assert_refused(capsys, folder, code, message):
+    """Exit code 2, one line that says why, and nothing new in the folder."""
+    assert code == 2
+    error = capsys.readouterr().err
+    assert error.startswith("minisplat-ref: error: ") and error.count("\n") == 1
+    assert message in error
+    assert not [path for path in folder.rglob("*") if path.name.startswith(".") or path.name == "out"]
+
+
+def assert_same_views(scene, other, check_images):
+    for a, b in zip((*scene.train_views, *scene.test_views), (*other.train_views, *other.test_views), strict=True):
+        assert a.name == b.name
+        np.testing.assert_allclose(a.camera.cam_from_world_R, b.camera.cam_from_world_R, atol=SAME_CAMERAS)
+        np.testing.assert_allclose(a.camera.cam_from_world_t, b.camera.cam_from_world_t, atol=SAME_CAMERAS)
+        np.testing.assert_allclose(a.camera[2:], b.camera[2:], rtol=SAME_CAMERAS)
+        if check_images:
+            np.testing.assert_array_equal(a.image, b.image)
+        np.testing.assert_array_equal(a.mask, b.mask)
+
+
+# downscale
+
+
+def test_downscale(tmp_path, rng, capsys):
+    write_colmap(tmp_path, names=["a/0.png", "a/1.png", "2.jpg", "3.png"])
+    images = {name: rng.integers(0, 256, (HEIGHT, WIDTH, 4), dtype=np.uint8) for name in ("a/0.png", "3.png")}
+    for name, image in images.items():
+        write_image(tmp_path / "images" / name, image)
+    on_the_fly = load_scene(tmp_path, downscale=5)
+    assert main(["downscale", str(tmp_path), "--downscale", "5"]) == 0
+    assert capsys.readouterr().out == f"{tmp_path / 'images_5'}\n"
+    for name, image in images.items():
+        np.testing.assert_array_equal(read_image(tmp_path / "images_5" / name), resize_image(image, 6, 5))
+    ready_made = load_scene(tmp_path, downscale=5)
+    for a, b in zip(on_the_fly.train_views, ready_made.train_views, strict=True):
+        assert a.camera[2:] == b.camera[2:] and a.image.shape == b.image.shape
+
+
+def test_downscale_of_a_folder_of_images(tmp_path):
+    (tmp_path / "train").mkdir()
+    write_image(tmp_path / "train" / "a.png", colored_image(1))
+    assert main(["downscale", str(tmp_path / "train")]) == 0
+    np.testing.assert_array_equal(read_image(tmp_path / "train_2" / "a.png"), colored_image(1, 16, 12))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere"], "no such folder"),
+        (["empty"], "no images in it"),
+        (["scene", "--downscale", "1"], "--downscale is 1; it must be at least 2"),
+        (
+            ["scene", "--downscale", "3"],
+            "images_3: already there and not empty; choose another name or remove it first",
+        ),
+        (["broken"], "b.png: not an image that Pillow can read"),
+    ],
+)
+def test_downscale_refuses(tmp_path, capsys, arguments, message):
+    write_colmap(tmp_path / "scene")
+    shutil.copytree(tmp_path / "scene" / "images", tmp_path / "scene" / "images_3")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "broken").mkdir()
+    write_image(tmp_path / "broken" / "a.png", colored_image(1))
+    (tmp_path / "broken" / "b.png").write_text("no picture")
+    before = sorted(tmp_path.rglob("*"))
+    assert_refused(capsys, tmp_path, main(["downscale", str(tmp_path / arguments[0]), *arguments[1:]]), message)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+# undistort
+
+
+def test_undistort_colmap_agrees_with_loading_undistorted(tmp_path, rng):
+    scene = write_colmap(tmp_path / "scene", model="OPENCV", params=DISTORTED)
+    write_image(scene / "images" / "0001.png", rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8))
+    (scene / "masks").mkdir()
+    write_image(scene / "masks" / "0002.png", rng.random((HEIGHT, WIDTH)) < 0.5)
+    assert main(["undistort", str(scene), "--out", str(tmp_path / "deep" / "out")]) == 0
+    undistorted = load_scene(tmp_path / "deep" / "out")
+    expected = load_scene(scene, undistort=True)
+    assert_same_views(undistorted, expected, check_images=True)
+    np.testing.assert_array_equal(undistorted.points, expected.points)
+    assert sorted(path.name for path in (tmp_path / "deep" / "out").iterdir()) == ["images", "masks", "sparse"]
+
+
+def test_undistort_transforms_agrees_with_loading_undistorted(tmp_path, rng):
+    scene = write_transforms(tmp_path / "scene", **NERFSTUDIO, aabb_scale=4, ply_file_path="p.ply")
+    write_image(scene / "images" / "0001.png", rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8))
+    write_vertices(scene / "p.ply", {"x": np.array([1.0]), "y": np.array([2.0]), "z": np.array([3.0])})
+    write_image(scene / "m.png", rng.random((HEIGHT, WIDTH)) < 0.5)
+    content = json.loads((scene / "transforms.json").read_text())
+    content["frames"][2] |= {"mask_path": "m.png", "k1": 0.4}
+    (scene / "transforms.json").write_text(json.dumps(content))
+    assert main(["undistort", str(scene), "--out", str(tmp_path / "out")]) == 0
+    undistorted = load_scene(tmp_path / "out")
+    expected = load_scene(scene, undistort=True)
+    assert_same_views(undistorted, expected, check_images=True)
+    np.testing.assert_array_equal(undistorted.points, expected.points)
+    assert expected.test_views[0].camera[2:] != expected.train_views[1].camera[2:]  # the frame with its own k1
+    assert json.loads((tmp_path / "out" / "transforms.json").read_text())["aabb_scale"] == 4
+
+
+def test_undistort_refuses(tmp_path, capsys):
+    pinhole = write_colmap(tmp_path / "pinhole")
+    code = main(["undistort", str(pinhole), "--out", str(tmp_path / "out")])
+    assert_refused(capsys, tmp_path, code, "all cameras are pinholes already, nothing to undistort; use")
+    code = main(["undistort", str(tmp_path), "--out", str(tmp_path / "out")])
+    assert_refused(capsys, tmp_path, code, "neither a COLMAP model nor a transforms.json; give the folder of a scene")
+    scene = write_colmap(tmp_path / "scene", model="OPENCV", params=DISTORTED)
+    code = main(["undistort", str(scene), "--out", str(pinhole)])
+    assert_refused(capsys, tmp_path, code, "pinhole: already there and not empty; choose another name")
+    (scene / "images" / "0003.png").unlink()
+    code = main(["undistort", str(scene), "--out", str(tmp_path / "out")])
+    assert_refused(capsys, tmp_path, code, "0003.png: missing")
+    code = main(["undistort", str(scene), "--out", str(scene / "images" / "0001.png" / "out")])
+    assert_refused(capsys, tmp_path, code, "out: cannot be made (")
+
+
+def test_interruption_leaves_nothing(tmp_path, capsys, monkeypatch):
+    def interrupt(*arguments, **options):
+        raise KeyboardInterrupt
+
+    scene = write_colmap(tmp_path / "scene", model="OPENCV", params=DISTORTED)
+    monkeypatch.setattr(import_pycolmap(), "undistort_images", interrupt)
+    assert main(["undistort", str(scene), "--out", str(tmp_path / "out")]) == 130
+    assert capsys.readouterr().err == "minisplat-ref: interrupted\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["scene"]
+
+
+# sfm
+
+
+def test_photographs_are_turned_upright_and_shrunk(tmp_path, rng):
+    image = rng.integers(0, 256, (20, 40, 3), dtype=np.uint8)
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6  # turn clockwise to show it
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = 50
+    exif.get_ifd(ExifTags.IFD.GPSInfo)[ExifTags.GPS.GPSLatitudeRef] = "N"
+    photos, target = tmp_path / "photos", tmp_path / "target"
+    photos.mkdir()
+    Image.fromarray(image).save(photos / "a.PNG", exif=exif)
+    Image.fromarray(image).save(photos / "b.JPEG", exif=exif)
+    sizes = prepare_photos(sorted(photos.iterdir()), photos, target, 40)
+    assert sizes == {"a.png": (20, 40), "b.jpg": (20, 40)}
+    np.testing.assert_array_equal(read_image(target / "a.png"), np.rot90(image, -1))
+    with Image.open(target / "b.jpg") as copy:
+        assert ExifTags.Base.Orientation not in copy.getexif()
+        assert not copy.getexif().get_ifd(ExifTags.IFD.GPSInfo)
+    camera = import_pycolmap().infer_camera_from_image(target / "b.jpg")
+    assert camera.has_prior_focal_length
+    assert prepare_photos(sorted(photos.iterdir()), photos, tmp_path / "small", 10)["a.png"] == (5, 10)
+
+
+def run_on_banana(shared_data, tmp_path, names):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for name in names:
+        shutil.copy(shared_data / "banana" / "images" / name, photos)
+    return main(["sfm", str(photos), "--out", str(tmp_path / "scene"), "--long-side", "512"])
+
+
+def check_sfm(shared_data, folder, n_min):
+    """Cameras agree with those from larger photographs, up to a similarity, and the points with the pixels."""
+    scene = load_scene(folder, test_every=0)
+    truth = {view.name: view.camera for view in load_scene(shared_data / "banana", test_every=0).train_views}
+    assert len(scene.train_views) >= n_min
+    a, b = (
+        np.stack([-c.cam_from_world_R.T @ c.cam_from_world_t for c in cameras])
+        for cameras in ([v.camera for v in scene.train_views], [truth[v.name] for v in scene.train_views])
+    )
+    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
+    U, _, Vt = np.linalg.svd(b.T @ a)
+    b_from_a = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+    scale = np.vdot(b, a @ b_from_a.T) / np.vdot(a, a)
+    assert np.linalg.norm(scale * a @ b_from_a.T - b, axis=1).max() < SFM_CENTERS * np.linalg.norm(b, axis=1).max()
+    error, shuffled = sparse_color_errors(scene)
+    assert error < COLOR_RATIO * shuffled
+
+
+def test_sfm_of_four_photographs(shared_data, tmp_path, capsys):
+    assert run_on_banana(shared_data, tmp_path, [f"DSC_04{i}.jpg" for i in (23, 24, 25, 38)]) == 0
+    assert "4 of 4 photographs" in capsys.readouterr().out
+    check_sfm(shared_data, tmp_path / "scene", 4)
+    assert sorted(path.name for path in (tmp_path / "scene").iterdir()) == ["images", "sparse"]
+
+
+@pytest.mark.slow
+def test_sfm_of_all_photographs(shared_data, tmp_path):
+    names = [path.name for path in (shared_data / "banana" / "images").iterdir()]
+    assert run_on_banana(shared_data, tmp_path, names) == 0
+    check_sfm(shared_data, tmp_path / "scene", 8)
+
+
+def test_sfm_refuses(tmp_path, capsys):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    out = ["--out", str(tmp_path / "out")]
+    assert_refused(capsys, tmp_path, main(["sfm", str(tmp_path / "nowhere"), *out]), "no such folder; give a folder")
+    assert_refused(capsys, tmp_path, main(["sfm", str(photos), *out]), "no images in it (looked for .png .jpg")
+    write_image(photos / "a.png", colored_image(1))
+    assert_refused(
+        capsys, tmp_path, main(["sfm", str(photos), *out]), "1 photograph, structure from motion needs at least 2"
+    )
+    write_image(photos / "b.png", colored_image(2))
+    assert_refused(capsys, tmp_path, main(["sfm", str(photos), *out, "--long-side", "0"]), "--long-side is 0")
+    assert_refused(
+        capsys, tmp_path, main(["sfm", str(photos), *out]), "no two photographs could be placed; take them with more"
+    )
+    write_image(photos / "b.jpg", colored_image(2))
+    (photos / "b.png").rename(photos / "b.bmp")
+    assert_refused(
+        capsys, tmp_path, main(["sfm", str(photos), *out]), "another photograph is called b.jpg; give each its own"
+    )
+    (photos / "b.bmp").unlink()
+    (photos / "b.jpg").write_text("no picture")
+    assert_refused(capsys, tmp_path, main(["sfm", str(photos), *out]), "b.jpg: not an image that Pillow can read")
+
+
+def test_pycolmap_is_missing(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    scene = write_colmap(tmp_path / "scene", model="OPENCV", params=DISTORTED)
+    code = main(["undistort", str(scene), "--out", str(tmp_path / "out")])
+    assert_refused(capsys, tmp_path, code, "is not installed; run `pip install pycolmap`")
+
+
+# scripts
+
+
+@pytest.mark.parametrize("name", ["sfm", "undistort", "downscale", "synthetic", "study"])
+def test_script_is_the_command(name):
+    """Of a checkout that nothing has been installed from: the package is found beside the script's folder."""
+    command = [sys.executable, "-m", f"data_tools.{name}"]
+    shown = subprocess.run([*command, "--help"], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert shown.stdout.startswith(f"usage: minisplat-ref {name} ")
+    refused = subprocess.run([*command, "--unknown"], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (refused.returncode, refused.stdout) == (2, "")
