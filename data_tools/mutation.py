@@ -40,7 +40,7 @@ from minisplat_ref.reporting import markdown_table
 ROOT = Path(__file__).resolve().parents[1]
 SETTINGS = "data_tools/mutation.toml"
 TESTS = Path("tests")
-MOST_FILES = 6  # of tests for a change; all are imported before the first runs
+FILES_MAX = 6  # of tests for a change; all are imported before the first runs
 
 
 def drawn_changes(modules: Sequence[Path], settings: Mapping[str, Any], n: int, rng: random.Random) -> list[Any]:
@@ -77,7 +77,7 @@ class Tests:
 
     def result_of(self, changes: Sequence[Any], paths: Iterable[Path]) -> Any:
         """Return cosmic-ray's result; test files that fail without a change have no say."""
-        names = [str(path) for path in paths if self._is_sound.get(str(path), True)][:MOST_FILES]
+        names = [str(path) for path in paths if self._is_sound.get(str(path), True)][:FILES_MAX]
         result = mutate_and_test(changes, shlex.join([*self._command, *names]), self._timeout)
         failed = re.findall(r"^(?:FAILED|ERROR) (\S+?\.py)", result.output or "", re.MULTILINE)
         for name in failed:

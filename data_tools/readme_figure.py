@@ -38,7 +38,7 @@ CONTENDERS = {  # backend of the table: what the figure calls it, its colour, wh
     "textbook float32": ("a textbook loop, compiled, float32", "#8a5a14", (-13, 2)),
 }
 TEXT = "#22272c"
-LEAST_ERROR = 1e-16  # where the reference stands, which has none
+ERROR_MIN = 1e-16  # where the reference stands, which has none
 SIZE, DPI = (11.6, 4.8), 100  # inches; pixels per inch
 N_COLORS = 256  # of the PNG, to keep it small
 
@@ -128,7 +128,7 @@ def _truth_and_render(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]
 def _draw_times(axes: "Axes", found: dict[str, tuple[float, float]]) -> None:
     for name, (label, color, offset) in CONTENDERS.items():
         milliseconds, error = found[name]
-        place = (max(error, LEAST_ERROR), milliseconds)
+        place = (max(error, ERROR_MIN), milliseconds)
         axes.plot(*place, "o", color=color, markersize=12)
         axes.annotate(
             f"{label}\n{milliseconds:,.0f} ms",
@@ -139,7 +139,7 @@ def _draw_times(axes: "Axes", found: dict[str, tuple[float, float]]) -> None:
             ha="left" if offset[0] > 0 else "right",
             va="center",
         )
-    axes.set(xscale="log", yscale="log", xlim=(LEAST_ERROR / 3, 1e-4), ylim=(5, 30_000))
+    axes.set(xscale="log", yscale="log", xlim=(ERROR_MIN / 3, 1e-4), ylim=(5, 30_000))
     axes.set_xlabel("error of the gradient against the reference (relative L2, worst parameter)")
     axes.set_title("50,000 Gaussians, forward and backward, two cores (ms)", fontsize=11, color=TEXT)
     axes.set_axisbelow(True)

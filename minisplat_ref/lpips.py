@@ -43,7 +43,7 @@ HOW_TO_MAKE = (
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
 
-LEAST_LENGTH = 1e-10  # added to the length of a pixel's features, which may all be zero
+LENGTH_MIN = 1e-10  # added to the length of a pixel's features, which may all be zero
 WINDOW_BYTES = 1 << 25  # size of the copied windows of a convolution; more at once is not faster
 
 
@@ -268,7 +268,7 @@ def _layer_distance(y: Floats, y0: Floats, squared_w: Floats) -> float:
 def _unit(features: Floats) -> Floats:
     """Return features [H, W, C] with each pixel's vector divided by its length."""
     lengths = np.sqrt(np.einsum("ijc,ijc->ij", features, features))  # [H, W]
-    return features / (lengths + features.dtype.type(LEAST_LENGTH))[:, :, None]
+    return features / (lengths + features.dtype.type(LENGTH_MIN))[:, :, None]
 
 
 def _apply(layers: Sequence[Convolution | MaxPool], x: Floats, weights: Mapping[str, Floats]) -> Floats:

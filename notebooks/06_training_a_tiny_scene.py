@@ -96,17 +96,17 @@ print_events(get_recipe("3dgs-accel", ITERATIONS))
 
 # %% [markdown]
 # An event needs gradients from most views, so `scaled` leaves at least 100 iterations between two events that add
-# Gaussians (`least_gap`). In a run as short as this one, a single event would remain. With 24 views a gap of 40
+# Gaussians (`min_gap`). In a run as short as this one, a single event would remain. With 24 views a gap of 40
 # iterations is enough, and an opacity reset needs time to recover: we ask for gaps of 40 and 120. That takes one line,
 # because events are tuples.
 
 # %%
-LEAST_GAPS = {"clone_and_split": 40, "prune_faint": 40, "prune_large": 40, "reset_opacity": 120}
+GAPS_MIN = {"clone_and_split": 40, "prune_faint": 40, "prune_large": 40, "reset_opacity": 120}
 
 
 def retimed(event):
     """Return the event with a gap that suits a short run."""
-    return event._replace(least_gap=LEAST_GAPS[event.action.func.__name__]) if isinstance(event, Every) else event
+    return event._replace(min_gap=GAPS_MIN[event.action.func.__name__]) if isinstance(event, Every) else event
 
 
 def recipe_of(iterations):

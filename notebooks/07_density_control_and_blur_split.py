@@ -107,7 +107,7 @@ show_code(is_blurred)
 
 # %% [markdown]
 # In photographs of 128 x 96 pixels a fraction of $2 \cdot 10^{-4}$ is 2.5 pixels, less than any Gaussian can be made to
-# cover; in the recipes an area of up to 64 pixels never counts as blurred (`least_area`). We take $\theta = 6 \cdot
+# cover; in the recipes an area of up to 64 pixels never counts as blurred (`min_area`). We take $\theta = 6 \cdot
 # 10^{-3}$, which is 74 pixels. The threshold of the gradient is raised to $10^{-3}$ for a similar reason: in a small
 # image every Gaussian covers a larger part, and gradients are larger.
 #
@@ -133,7 +133,7 @@ def density_control(start, stop, has_blur_split=False, draw_children=random_chil
         During(gaussian_splatting.collect_gradients),
         *([blur] if has_blur_split else []),
         Every(50, densify, start, stop),
-        Every(50, partial(gaussian_splatting.prune_faint, least_opacity=0.005), start, stop),
+        Every(50, partial(gaussian_splatting.prune_faint, min_opacity=0.005), start, stop),
     )
 
 

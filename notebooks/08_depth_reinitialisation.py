@@ -277,7 +277,7 @@ plt.show()
 #
 # There are three safeguards. The paper has none of them; the recipes use the second together with the third:
 #
-# - **a least accumulated opacity** (`least_alpha`): rays that are nearly empty are not drawn. This costs nothing, and
+# - **a least accumulated opacity** (`min_alpha`): rays that are nearly empty are not drawn. This costs nothing, and
 #   helps only as long as the sky is *not* painted yet;
 # - **a vote of the other views** (`depth_tolerance`): up to 8 other views vote. A point is refuted if at least as many
 #   see through it as have it on their own surface. A view that sees something nearer in that place has no vote;
@@ -290,7 +290,7 @@ show_code(refuted)
 # %% tags=["rounding"]
 GUARDED = {
     "paper": PAPER,
-    "floor": Choice(midpoint_points, least_alpha=0.9),
+    "floor": Choice(midpoint_points, min_alpha=0.9),
     "vote": Choice(midpoint_points, depth_tolerance=0.05),
     "vote, backdrop": Choice(midpoint_points, depth_tolerance=0.05, has_backdrop=True),
     "blended": Choice(blended_points),
@@ -349,12 +349,12 @@ for name in ("outdoor", "plain-wall"):
 # Choose a scene and the safeguards. What to look for:
 #
 # * `depth_tolerance`: at 0.01 views refute each other's noise, at 0.3 they agree with almost everything.
-# * `least_alpha`: at 0.999, what happens outdoors, and what on the plain wall?
+# * `min_alpha`: at 0.999, what happens outdoors, and what on the plain wall?
 # * `name`: in the room the vote removes few points. Which?
 
 # %% tags=["rounding"]
 name = "outdoor"
-my_choice = Choice(midpoint_points, least_alpha=0.0, depth_tolerance=0.02)
+my_choice = Choice(midpoint_points, min_alpha=0.0, depth_tolerance=0.02)
 
 points, pixels, colors = drawn(name, my_choice)
 figure, axes = plt.subplots(1, 2, figsize=(9, 2.8))

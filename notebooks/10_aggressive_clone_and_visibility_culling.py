@@ -146,7 +146,7 @@ def density_control(start, stop):
     return (
         During(gaussian_splatting.collect_gradients, start, stop),
         Every(50, densify, start, stop),
-        Every(50, partial(gaussian_splatting.prune_faint, least_opacity=0.005), start, stop),
+        Every(50, partial(gaussian_splatting.prune_faint, min_opacity=0.005), start, stop),
     )
 
 
@@ -376,7 +376,7 @@ cloning = partial(
     critical=aggressive_clone.critical_by_mass,
     factor=2,
     tail_mass=0.999,
-    least_views=2,
+    min_views=2,
 )
 CLONE_STEPS = (325, 425)
 ways = {

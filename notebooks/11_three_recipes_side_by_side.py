@@ -52,7 +52,7 @@ def named(action):
 
 def shortened(recipe, iterations=ITERATIONS):
     """Return the recipe for few views and iterations."""
-    halved = [e._replace(least_gap=-(-e.least_gap // 2)) if isinstance(e, Every) else e for e in recipe.events]
+    halved = [e._replace(min_gap=-(-e.min_gap // 2)) if isinstance(e, Every) else e for e in recipe.events]
     return scaled(recipe._replace(events=tuple(halved)), iterations)
 
 
@@ -153,7 +153,7 @@ plt.show()
 # ## The recipes
 #
 # A recipe is data, and scales with the number of iterations: every published date is multiplied by the same factor.
-# `least_gap` keeps density control from coming so often that the gradients of most views are missing, or that the last
+# `min_gap` keeps density control from coming so often that the gradients of most views are missing, or that the last
 # event has not been repaired; then only every second published date remains, or every third. With 24 views half of the
 # gap is enough. These are the dates of the three runs:
 

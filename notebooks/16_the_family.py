@@ -45,7 +45,7 @@ from minisplat_ref.extensions.compression.levels import exponents
 from minisplat_ref.extensions.compression.msz import CONTAINER, decode, encode
 from minisplat_ref.extensions.micro.reference import trace_penalty, trace_penalty_vjp, traces
 from minisplat_ref.extensions.multi_scale.levels import Plan, level_zero, with_levels
-from minisplat_ref.extensions.multi_scale.method import LEAST_COVERAGE, LEVELS, finest_densities
+from minisplat_ref.extensions.multi_scale.method import COVERAGE_MIN, LEVELS, finest_densities
 from minisplat_ref.extensions.multi_scale.reference import are_shown, pixel_densities
 from minisplat_ref.extensions.omg.reference import distinct_importance, local_distinctiveness
 from minisplat_ref.extensions.proxies.affine import Affine, edited, rotation_about
@@ -218,7 +218,7 @@ photograph, camera = view.image / 255, view.camera
 
 levels = level_zero(room, np.random.default_rng(0))
 densities = finest_densities(room.means, [v.camera for v in scene.train_views])
-levels = with_levels(levels, densities, Plan(2, 4, LEAST_COVERAGE), GSPLAT_MAIN)
+levels = with_levels(levels, densities, Plan(2, 4, COVERAGE_MIN), GSPLAT_MAIN)
 
 
 def drawn(population, n):

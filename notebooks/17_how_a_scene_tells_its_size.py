@@ -245,7 +245,7 @@ for view, gain in zip(plain.train_views, true_gains, strict=True):
     disturbed_views.append(view._replace(image=pixels))
 disturbed = plain._replace(train_views=tuple(disturbed_views))
 log = {"counts": [], "grown": [], "around the prune": []}
-short = configured(recipe, least_step=500)._replace(iterations=1000)
+short = configured(recipe, min_step=500)._replace(iterations=1000)
 state = train(disturbed, short, seed=0, on_step=partial(note, log))
 
 held = held_out_ids(len(true_gains), recipe.cooling.hold_out_every)

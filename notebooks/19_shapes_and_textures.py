@@ -413,7 +413,7 @@ LAYERS = (1, 4, None)
 request = Request(np.array([0.1, 0.12, 0.16]), backend=REFERENCE)
 fans = converted(round_ball, FanShape())
 as_gaussians = SPLATTING.render(Model(round_ball), view_from(eye), request)[0].image
-peeled = {layers: render_fans(Model(fans), view_from(eye), request, most_layers=layers)[0].image for layers in LAYERS}
+peeled = {layers: render_fans(Model(fans), view_from(eye), request, max_layers=layers)[0].image for layers in LAYERS}
 
 figure, axes = plt.subplots(1, 6, figsize=(11, 2.4), width_ratios=(1.5, 1, 1, 1, 1, 1))
 axes[0].plot(radius_of, np.exp(-(radius_of**2) / 2), color="black", linewidth=3, alpha=0.3, label="Gaussian")

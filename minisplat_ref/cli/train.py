@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 N_ITERATIONS = 3000  # of recipes with a schedule
 SIMPLIFIED = "simplified"  # the run inside of a run that --max-drop and --max-bytes leave
-LEAST_MINUTES = 0.1  # the first iterations take seconds, to compile what has not been
+MINUTES_MIN = 0.1  # the first iterations take seconds, to compile what has not been
 
 DEFAULTS = {
     "downscale": 1,
@@ -223,9 +223,9 @@ def _check_time(settings: "Settings", recipe: "Recipe") -> None:
         return
     if recipe.cooling is None:
         raise InputError(f"--minutes means nothing to recipe {recipe.name}: give --iterations, or --recipe adaptive")
-    if settings.minutes < LEAST_MINUTES:
+    if settings.minutes < MINUTES_MIN:
         raise InputError(
-            f"--minutes {settings.minutes:g} is too short to learn anything: give at least {LEAST_MINUTES:g}"
+            f"--minutes {settings.minutes:g} is too short to learn anything: give at least {MINUTES_MIN:g}"
         )
 
 

@@ -16,7 +16,7 @@ from minisplat_ref.comparison.measures import MEASURES, RecipeMeasures
 from minisplat_ref.comparison.plan import Plan
 from minisplat_ref.comparison.results import Results
 from minisplat_ref.comparison.table import table_cells
-from minisplat_ref.datasets.synthetic.surface import LEAST_OPACITY, NEAR
+from minisplat_ref.datasets.synthetic.surface import NEAR, OPACITY_MIN
 from minisplat_ref.reports.page import cards, curves, grid, listing, page, panel, paragraph, section, slider, table
 from minisplat_ref.reports.plots import to_svg
 from minisplat_ref.runs.fired import Fired
@@ -59,7 +59,7 @@ def notes(plan: Plan, results: Results) -> list[str]:
     if is_chamfer_known(results.curves):
         sentences.append(
             "Chamfer distance: mean distance of the Gaussians' centres to the nearest point that the training views"
-            f" truly show, and of these points to the nearest centre, added; centres of opacity {LEAST_OPACITY} and"
+            f" truly show, and of these points to the nearest centre, added; centres of opacity {OPACITY_MIN} and"
             f" more, within {NEAR:g} extents of the cameras; right after an opacity reset there are none."
         )
     if results.lpips_network is None:

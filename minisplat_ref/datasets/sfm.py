@@ -23,7 +23,7 @@ from minisplat_ref.io.lens import import_quiet_pycolmap
 
 CAMERA_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model)
 FOCAL_TAGS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
-LEAST_PHOTOS, LEAST_SHARE = 3, 0.25  # of the given ones; fewer registered photographs are no scene of them
+PHOTOS_MIN, SHARE_MIN = 3, 0.25  # of the given ones; fewer registered photographs are no scene of them
 SEED = 0  # of RANSAC: the same photographs give the same cameras, up to the order in which threads finish
 
 
@@ -79,7 +79,7 @@ def run_sfm(
         names = prepare_photos(files, photos, work / "images", long_side)
         reconstruction, *others = _reconstruct(work, names, matching, camera_model, photos)
         n_placed = reconstruction.num_reg_images()
-        if n_placed < max(min(len(files), LEAST_PHOTOS), LEAST_SHARE * len(files)):
+        if n_placed < max(min(len(files), PHOTOS_MIN), SHARE_MIN * len(files)):
             raise InputError(
                 f"{photos}: {n_placed} of {len(files)} photographs ({n_placed / len(files):.0%}) found a place, too few"
                 f" for a scene; {advice(matching)}"

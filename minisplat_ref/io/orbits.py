@@ -22,7 +22,7 @@ FULL_CIRCLE = 2.0 * math.pi
 LARGEST_GAP = math.radians(90.0)  # between neighbouring cameras; a larger one is not crossed
 SMOOTHING = math.radians(15.0)  # standard deviation of the weights by which cameras near an angle count
 MEAN_UP_WEIGHT = 0.02  # against the spread of horizontal edges, which is 1/2 all around and 0.1 along 70 degrees
-LEAST_RADIUS = 0.1  # of the median: the angle of a camera nearer to the axis says nothing
+RADIUS_MIN = 0.1  # of the median: the angle of a camera nearer to the axis says nothing
 PARALLEL = 0.9  # length of the mean viewing direction, from which on the axes may meet behind the cameras
 
 
@@ -117,7 +117,7 @@ def _path_of_cameras(cameras: Sequence[Camera], width: int) -> _Path:
     outwards = np.cos(angles)[:, None] * start + np.sin(angles)[:, None] * np.cross(up, start)  # [V, 3]
     local = np.stack([outwards, np.cross(up, outwards), np.broadcast_to(up, outwards.shape)], axis=1)  # [V, 3, 3]
     directions = np.einsum("vij,vj->vi", local, forwards)  # [V, 3]
-    is_off_axis = radii >= LEAST_RADIUS * np.median(radii)  # at least one: the largest
+    is_off_axis = radii >= RADIUS_MIN * np.median(radii)  # at least one: the largest
     places = np.stack([radii, heights], axis=1)
     focal = cameras[0].fx * width / cameras[0].width
     angles, places, directions = angles[is_off_axis], places[is_off_axis], directions[is_off_axis]

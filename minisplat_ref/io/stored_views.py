@@ -39,12 +39,12 @@ class Shelf:
 
     Parameters
     ----------
-    most_bytes : float
+    max_bytes : float
         How much all of them may take together.
     """
 
-    def __init__(self, most_bytes: float) -> None:
-        self._most_bytes = most_bytes
+    def __init__(self, max_bytes: float) -> None:
+        self._max_bytes = max_bytes
         self._n_bytes = 0
         self._cached: dict[Photograph, Pixels] = {}
         self._lock = threading.Lock()
@@ -57,7 +57,7 @@ class Shelf:
     @property
     def n_free(self) -> float:
         """Return the bytes that are still free."""
-        return self._most_bytes - self._n_bytes
+        return self._max_bytes - self._n_bytes
 
     def get(self, photograph: "Photograph") -> Pixels | None:
         """Return the pixels of a photograph if they are in memory."""
@@ -70,10 +70,10 @@ class Shelf:
                 self._cached[photograph] = pixels
                 self._n_bytes += pixels.n_bytes
 
-    def resize(self, most_bytes: float) -> None:
+    def resize(self, max_bytes: float) -> None:
         """Give the photographs more room, or less; those that came last are then evicted first."""
         with self._lock:
-            self._most_bytes = most_bytes
+            self._max_bytes = max_bytes
             while self._cached and self.n_free < 0:
                 self._n_bytes -= self._cached.popitem()[1].n_bytes
 

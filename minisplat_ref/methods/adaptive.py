@@ -49,7 +49,7 @@ from minisplat_ref.training.calibration import EXPOSURES
 from minisplat_ref.training.pace import (
     COOLED,
     FINER,
-    MOST_HALVINGS,
+    HALVINGS_MAX,
     Cooling,
     Decision,
     Measurement,
@@ -61,13 +61,13 @@ from minisplat_ref.training.schedule import At, During, Every
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit, begin_cooling, smallest_side
 from minisplat_ref.types import Floats
 
-MOST_ITERATIONS = 30_000
-LEAST_GAIN = 0.1  # dB of the squared error, for which a calibration of the photographs is worthwhile
-LEAST_SKY_GAIN = 2.0  # dB, likewise, for a sky, where it shows: it explains nearly all that is there
-LEAST_MEASUREMENTS = 4  # to fit a line
-LEAST_SIDE = 120  # pixels: on smaller views, calibrations were found where there are none
+ITERATIONS_MAX = 30_000
+GAIN_MIN = 0.1  # dB of the squared error, for which a calibration of the photographs is worthwhile
+SKY_GAIN_MIN = 2.0  # dB, likewise, for a sky, where it shows: it explains nearly all that is there
+MEASUREMENTS_MIN = 4  # to fit a line
+SIDE_MIN = 120  # pixels: on smaller views, calibrations were found where there are none
 SMALLEST_SIDE = 16  # pixels: a tile
-LEAST_VARIATION = 4 / 255  # of a band of the harmonics, out of 1
+VARIATION_MIN = 4 / 255  # of a band of the harmonics, out of 1
 
 
 def collect_while_growing(state: TrainState, iteration: Iteration) -> None:
@@ -85,7 +85,7 @@ def grow(
     iteration: Iteration,
     *,
     threshold: float,
-    most_at_once: float,
+    max_growth: float,
     offset: float,
     error_views: int,
     budget: int | None = None,
@@ -98,7 +98,7 @@ def grow(
         As for every action.
     threshold : float
         Least mean length of the screen gradient, in normalised device coordinates.
-    most_at_once : float
+    max_growth : float
         At most this fraction of the Gaussians is halved, those behind most of the pictures' error.
     offset : float
         How far apart the halves are, see :func:`minisplat_ref.strategy.halving.halves`.
@@ -113,7 +113,7 @@ def grow(
     means = state.stats.pop("gradient_sum") / np.maximum(state.stats.pop("view_count"), 1)
     n = n_rows(state.gaussians)
     candidates = np.flatnonzero(means >= threshold)
-    most = int(most_at_once * n) if budget is None else min(int(most_at_once * n), max(budget - n, 0))
+    most = int(max_growth * n) if budget is None else min(int(max_growth * n), max(budget - n, 0))
     if len(candidates) > most:
         ranks = _error_weights(state, iteration, error_views) if error_views and most else means
         candidates = np.sort(candidates[np.argsort(-ranks[candidates], kind="stable")[:most]])
@@ -122,13 +122,13 @@ def grow(
     return f"{share:.1%} above the threshold"
 
 
-def _error_weights(state: TrainState, iteration: Iteration, most_views: int) -> Floats:
+def _error_weights(state: TrainState, iteration: Iteration, max_views: int) -> Floats:
     """Return the error behind which each Gaussian stands [N], in at most so many of the views that are trained on."""
     views = iteration.scene.train_views
     ids = trained_ids(len(views), iteration.cooling, state.pace)
     return collect_error_weights(
         state.model,
-        [views[index] for index in ids[:: math.ceil(len(ids) / most_views)]],
+        [views[index] for index in ids[:: math.ceil(len(ids) / max_views)]],
         background=iteration.scene.background,
         renderer=iteration.renderer,
         conventions=iteration.conventions,
@@ -153,24 +153,24 @@ def measure_held_out(state: TrainState, iteration: Iteration) -> str | None:
     return f"{measurement.psnr:.2f} dB"
 
 
-def halve_large_views(state: TrainState, iteration: Iteration, *, least_side: float) -> str:
-    """Train on smaller views at first, halved as often as no side becomes shorter than ``least_side`` pixels.
+def halve_large_views(state: TrainState, iteration: Iteration, *, min_side: float) -> str:
+    """Train on smaller views at first, halved as often as no side becomes shorter than ``min_side`` pixels.
 
     Raises
     ------
     InputError
-        ``least_side`` is too small for a picture.
+        ``min_side`` is too small for a picture.
     """
-    if not least_side >= SMALLEST_SIDE:
-        raise InputError(f"least_side is {least_side}: give at least {SMALLEST_SIDE} pixels")
+    if not min_side >= SMALLEST_SIDE:
+        raise InputError(f"min_side is {min_side}: give at least {SMALLEST_SIDE} pixels")
     side = smallest_side(iteration.scene)
-    n_halvings = sum(side >= 2**times * least_side for times in range(1, MOST_HALVINGS + 1))
+    n_halvings = sum(side >= 2**times * min_side for times in range(1, HALVINGS_MAX + 1))
     state.pace = state.pace._replace(n_halvings=n_halvings)
     return f"to 1/{2**n_halvings} of their size" if n_halvings else f"nothing done: the shortest side has {side} pixels"
 
 
 def proceed_when_little_is_gained(
-    state: TrainState, iteration: Iteration, *, least_gain: float, least_step: int
+    state: TrainState, iteration: Iteration, *, min_gain: float, min_step: int
 ) -> str | None:
     """Go on to larger views, or to the cool-down, when held-out views gain too little for each doubling of the work.
 
@@ -180,23 +180,23 @@ def proceed_when_little_is_gained(
     ----------
     state, iteration
         As for every action.
-    least_gain : float
+    min_gain : float
         dB for each doubling of the work.
-    least_step : int
+    min_step : int
         No decision before this iteration: the first measurements rise steeply.
     """
     pace = state.pace
-    if iteration.cooling is None or pace.cooling_from is not None or iteration.step < least_step:
+    if iteration.cooling is None or pace.cooling_from is not None or iteration.step < min_step:
         return None
     recent = pace.recent()
-    if len(recent) < LEAST_MEASUREMENTS:
+    if len(recent) < MEASUREMENTS_MIN:
         return None
     doublings = np.log2([m.n_pairs for m in recent])
     slopes = np.polyfit(doublings, np.array([m.psnrs for m in recent]), 1)[0]  # [V] dB per doubling
     gain, error = float(slopes.mean()), float(slopes.std(ddof=1) / np.sqrt(len(slopes)))
-    if gain >= least_gain:
+    if gain >= min_gain:
         return f"{gain:.2f} dB for each doubling of the work"
-    why = f"held-out views gain {gain:.2f} dB for each doubling of the work, less than {least_gain}"
+    why = f"held-out views gain {gain:.2f} dB for each doubling of the work, less than {min_gain}"
     if pace.n_halvings:
         state.pace = pace.seeing_finer(Decision(iteration.step, FINER, why, gain, error))
     else:
@@ -209,7 +209,7 @@ RAISED = 2.24  # 6^0.45, as Mini-Splatting2's rates in a sixth of its iterations
 
 ADAPTIVE = GS._replace(
     name="adaptive",
-    iterations=MOST_ITERATIONS,
+    iterations=ITERATIONS_MAX,
     learning_rates=Rates({name: RAISED * rate for name, rate in GS_ACCEL.learning_rates.at(0, extent=1.0).items()}),
     adam=AdamRule(is_visible_only=True, has_bias_correction=True),
     sh_milestones=(2, 2, 2),  # of Gaussians without degrees of their own; grow_bands gives them these in the first one
@@ -218,24 +218,24 @@ ADAPTIVE = GS._replace(
         During(partial(grow_bands, views_per_coefficient=1.5)),
         During(hold_mean_exposure),
         During(hold_mean_pose),
-        At(1, partial(halve_large_views, least_side=LEAST_SIDE)),
-        At(100, partial(switch_sky_on, least_sky_gain=LEAST_SKY_GAIN)),
-        At(600, partial(switch_exposure_on, least_exposure_gain=LEAST_GAIN, least_antialiasing_gain=LEAST_GAIN)),
-        At(650, partial(switch_antialiasing_on, least_antialiasing_gain=LEAST_GAIN)),
-        At(700, partial(switch_pose_on, least_pose_gain=LEAST_GAIN)),
+        At(1, partial(halve_large_views, min_side=SIDE_MIN)),
+        At(100, partial(switch_sky_on, min_sky_gain=SKY_GAIN_MIN)),
+        At(600, partial(switch_exposure_on, min_exposure_gain=GAIN_MIN, min_antialiasing_gain=GAIN_MIN)),
+        At(650, partial(switch_antialiasing_on, min_antialiasing_gain=GAIN_MIN)),
+        At(700, partial(switch_pose_on, min_pose_gain=GAIN_MIN)),
         Every(100, turn_held_out, start=100),
         Every(100, measure_held_out, start=100),
-        Every(100, partial(proceed_when_little_is_gained, least_gain=0.3, least_step=800), start=100),
+        Every(100, partial(proceed_when_little_is_gained, min_gain=0.3, min_step=800), start=100),
         Every(
             100,
-            partial(grow, threshold=4e-4, most_at_once=0.2, offset=OFFSET, error_views=24, budget=None),
+            partial(grow, threshold=4e-4, max_growth=0.2, offset=OFFSET, error_views=24, budget=None),
             start=100,
         ),
-        Every(100, partial(prune_faint, least_opacity=0.005), start=100),
-        During(partial(prune_in_slices, least_views=2, least_slope=1.0, most_pruned=0.2)),
-        During(partial(cut_bands_when_cooling, least_variation=LEAST_VARIATION)),
+        Every(100, partial(prune_faint, min_opacity=0.005), start=100),
+        During(partial(prune_in_slices, min_views=2, min_slope=1.0, max_pruned=0.2)),
+        During(partial(cut_bands_when_cooling, min_variation=VARIATION_MIN)),
     ),
-    least_views=5,
+    min_views=5,
     cooling=Cooling(part=0.6, last=0.1, last_per_extent=0.01, hold_out_every=8),
 )
 """``adaptive``."""

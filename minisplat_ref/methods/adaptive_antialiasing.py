@@ -32,14 +32,14 @@ def antialiasing_evidence(state: TrainState, iteration: Iteration, view_ids: lis
     return weigh(photographs)
 
 
-def switch_antialiasing_on(state: TrainState, iteration: Iteration, *, least_antialiasing_gain: float) -> str | None:
+def switch_antialiasing_on(state: TrainState, iteration: Iteration, *, min_antialiasing_gain: float) -> str | None:
     """Compensate opacities if halves of photographs explain each other by different amounts of it.
 
     Parameters
     ----------
     state, iteration
         As for every action.
-    least_antialiasing_gain : float
+    min_antialiasing_gain : float
         dB of the squared error that the photographs must gain on average, and more than the standard error.
     """
     if COMPENSATION in state.shared or iteration.conventions.is_antialiased:
@@ -47,7 +47,7 @@ def switch_antialiasing_on(state: TrainState, iteration: Iteration, *, least_ant
     n_views = len(iteration.scene.train_views)
     evidence = antialiasing_evidence(state, iteration, trained_ids(n_views, iteration.cooling, state.pace))
     why = f"amounts of compensation that spread by {evidence.spread:.2f} explain {evidence.gain:.2f} dB of other halves"
-    if not evidence.is_above(least_antialiasing_gain):
+    if not evidence.is_above(min_antialiasing_gain):
         return f"nothing done: {why}"
     decision = Decision(iteration.step, "anti-aliasing", why, evidence.gain, evidence.standard_error)
     switch_on(state, ANTIALIASING, compensation(n_views), decision)

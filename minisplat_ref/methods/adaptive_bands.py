@@ -7,7 +7,7 @@ seen from a new side, they are worse than no view dependence at all. So
 *Grow.* Everything begins at degree 0. A Gaussian has degree d once it has been seen in ``views_per_coefficient``
 (d + 1)^2 training views. Those that are halved pass their degree and their views on.
 
-*Cut.* When the cool-down begins, a degree whose part of the colour varies by less than ``least_variation`` over the
+*Cut.* When the cool-down begins, a degree whose part of the colour varies by less than ``min_variation`` over the
 directions from which the Gaussian has been seen is removed, from the highest down. With its part of the colour,
 ``c_l(d) = sum_m k_lm Y_lm(d)``, and the V directions d_v from the cameras that have seen it,
 
@@ -86,21 +86,21 @@ def grow_bands(state: TrainState, iteration: Iteration, *, views_per_coefficient
     state.stats[DEGREES][ids] = np.maximum(state.stats[DEGREES][ids], determined)
 
 
-def cut_bands_when_cooling(state: TrainState, iteration: Iteration, *, least_variation: float) -> None:
+def cut_bands_when_cooling(state: TrainState, iteration: Iteration, *, min_variation: float) -> None:
     """Remove the degrees that vary too little over the seen directions, in the first iteration of the cool-down.
 
     Parameters
     ----------
     state, iteration
         As for every action.
-    least_variation : float
+    min_variation : float
         Standard deviation of a degree's part of the colour, out of 1.
     """
     if state.pace.cooling_from is None or iteration.step != state.pace.cooling_from + 1:
         return
     degrees, is_seen = state.stats[DEGREES], state.stats.pop(SEEN)
     state.gaussians, state.stats[DEGREES] = without_idle_bands(
-        state.gaussians, degrees, iteration.scene.train_views, is_seen, least_variation
+        state.gaussians, degrees, iteration.scene.train_views, is_seen, min_variation
     )
     is_absent = np.arange(state.gaussians.sh_rest.shape[1]) >= n_coefficients(state.stats[DEGREES])[:, None]
     for moments in (state.adam.first, state.adam.second):
@@ -118,9 +118,9 @@ def describe_degrees(state: TrainState) -> str:
 
 
 def without_idle_bands(
-    gaussians: Gaussians, degrees: Ints, views: tuple[View, ...], is_seen: Bools, least_variation: float
+    gaussians: Gaussians, degrees: Ints, views: tuple[View, ...], is_seen: Bools, min_variation: float
 ) -> tuple[Gaussians, Ints]:
-    """Remove the highest degrees of each Gaussian while they vary by less than ``least_variation``.
+    """Remove the highest degrees of each Gaussian while they vary by less than ``min_variation``.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def without_idle_bands(
         V training views.
     is_seen : ndarray of shape (N, V) of bool
         Which views show which Gaussians.
-    least_variation : float
+    min_variation : float
         Of a degree's part of the colour, out of 1.
 
     Returns
@@ -146,7 +146,7 @@ def without_idle_bands(
     sh_dc, sh_rest, degrees = gaussians.sh_dc.copy(), gaussians.sh_rest.copy(), degrees.copy()
     means, deviations = _variations(gaussians, int(degrees.max(initial=0)), views, is_seen)
     for degree in range(int(degrees.max(initial=0)), 0, -1):
-        rows = np.flatnonzero((degrees == degree) & (deviations[degree - 1] < least_variation))
+        rows = np.flatnonzero((degrees == degree) & (deviations[degree - 1] < min_variation))
         sh_dc[rows] += (means[degree - 1, rows] / SH_C0).astype(sh_dc.dtype)
         sh_rest[rows, degree**2 - 1 :] = 0
         degrees[rows] = degree - 1

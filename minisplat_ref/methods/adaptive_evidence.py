@@ -69,9 +69,9 @@ class Evidence(NamedTuple):
         """Root mean square of x over photographs and fields."""
         return float(np.sqrt(np.mean(self.fitted**2)))
 
-    def is_above(self, least_gain: float, n_errors: float = 1.0) -> bool:
-        """Return whether it supports the calibration: by ``least_gain``, dB, and by so many standard errors."""
-        return self.gain > max(least_gain, n_errors * self.standard_error)
+    def is_above(self, min_gain: float, n_errors: float = 1.0) -> bool:
+        """Return whether it supports the calibration: by ``min_gain``, dB, and by so many standard errors."""
+        return self.gain > max(min_gain, n_errors * self.standard_error)
 
 
 def halves_of(residual: Floats, fields: Floats, is_counted: Bools) -> tuple[Half, Half]:

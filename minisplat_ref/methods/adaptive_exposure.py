@@ -53,7 +53,7 @@ def log_gains(state: TrainState, iteration: Iteration, view_ids: Ints | list[int
 
 
 def switch_exposure_on(
-    state: TrainState, iteration: Iteration, *, least_exposure_gain: float, least_antialiasing_gain: float
+    state: TrainState, iteration: Iteration, *, min_exposure_gain: float, min_antialiasing_gain: float
 ) -> str | None:
     """Give each photograph an exposure if halves of photographs explain each other by gains.
 
@@ -61,9 +61,9 @@ def switch_exposure_on(
     ----------
     state, iteration
         As for every action.
-    least_exposure_gain : float
+    min_exposure_gain : float
         dB of the squared error that the photographs must gain on average, and more than the standard error.
-    least_antialiasing_gain : float
+    min_antialiasing_gain : float
         The same for compensated opacities. If these explain more, it is they that the photographs need.
     """
     if EXPOSURE.name in state.pace.switched_on or EXPOSURES in state.shared:
@@ -72,10 +72,10 @@ def switch_exposure_on(
     ids = trained_ids(n_views, iteration.cooling, state.pace)
     evidence = exposure_evidence(state, iteration, ids)
     why = f"gains that spread by {evidence.spread:.3f} explain {evidence.gain:.2f} dB of the other halves"
-    if not evidence.is_above(least_exposure_gain):
+    if not evidence.is_above(min_exposure_gain):
         return f"nothing done: {why}"
     rival = antialiasing_evidence(state, iteration, ids)
-    if rival.gain > evidence.gain and rival.is_above(least_antialiasing_gain):
+    if rival.gain > evidence.gain and rival.is_above(min_antialiasing_gain):
         return f"nothing done: {why}, and amounts of compensation {rival.gain:.2f} dB"
     exposures, gains = identity_exposures(n_views), log_gains(state, iteration, ids)
     _begin_with(exposures[EXPOSURES], ids, gains - gains.mean())

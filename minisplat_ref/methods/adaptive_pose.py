@@ -28,14 +28,14 @@ def rotation_of(camera: Camera, displacement: Floats) -> Floats:
     return np.array([-dv / camera.fy, du / camera.fx, 0.0])
 
 
-def switch_pose_on(state: TrainState, iteration: Iteration, *, least_pose_gain: float) -> str | None:
+def switch_pose_on(state: TrainState, iteration: Iteration, *, min_pose_gain: float) -> str | None:
     """Refine the poses if halves of photographs explain each other by displacements.
 
     Parameters
     ----------
     state, iteration
         As for every action.
-    least_pose_gain : float
+    min_pose_gain : float
         dB of the squared error that the photographs must gain on average, and more than the standard error.
     """
     if POSE.name in state.pace.switched_on or ROTATIONS in state.shared:
@@ -44,7 +44,7 @@ def switch_pose_on(state: TrainState, iteration: Iteration, *, least_pose_gain: 
     ids = trained_ids(len(views), iteration.cooling, state.pace)
     evidence = pose_evidence(state, iteration, ids)
     why = f"displacements of {evidence.spread:.2f} pixels explain {evidence.gain:.2f} dB of the other halves"
-    if not evidence.is_above(least_pose_gain):
+    if not evidence.is_above(min_pose_gain):
         return f"nothing done: {why}"
     corrections = zero_corrections(len(views))
     for index, x in zip(ids, evidence.fitted, strict=True):

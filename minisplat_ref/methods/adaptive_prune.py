@@ -19,8 +19,8 @@ from minisplat_ref.training.state import Iteration, TrainState, apply_edit
 
 N_SLICES = 8
 LAST_SLICE = 0.64  # no slice after this part of the cool-down
-LEAST_GAP = 20  # iterations from slice to slice, in which the others learn to replace what is gone
-LEAST_SLICE = 0.01  # of the Gaussians; a smaller slice is not worth a disturbance
+GAP_MIN = 20  # iterations from slice to slice, in which the others learn to replace what is gone
+SLICE_MIN = 0.01  # of the Gaussians; a smaller slice is not worth a disturbance
 
 
 def slice_due(pace: Pace, step: int) -> int | None:
@@ -28,14 +28,14 @@ def slice_due(pace: Pace, step: int) -> int | None:
     if pace.cooling_from is None or pace.last_step is None:
         return None
     last = LAST_SLICE * (pace.last_step - pace.cooling_from)
-    every = max(LEAST_GAP, int(last / N_SLICES))
+    every = max(GAP_MIN, int(last / N_SLICES))
     since = step - pace.cooling_from - 1
     number, rest = divmod(since, every)
     return number if rest == 0 and 0 <= number < N_SLICES and since <= last else None
 
 
 def prune_in_slices(
-    state: TrainState, iteration: Iteration, *, least_views: int, least_slope: float, most_pruned: float
+    state: TrainState, iteration: Iteration, *, min_views: int, min_slope: float, max_pruned: float
 ) -> None:
     """Remove Gaussians that the training views would hardly miss, a slice at a time, while the rates fall.
 
@@ -43,19 +43,19 @@ def prune_in_slices(
     ----------
     state, iteration
         As for every action.
-    least_views : int
+    min_views : int
         Those that are visible in fewer views are removed before the first slice, however much they change there.
-    least_slope : float
+    min_slope : float
         Those stay whose removal raises the squared error by at least this many times what the count falls by, both
         relative: 1.0 is 3 dB for each doubling, before the others learn to replace them.
-    most_pruned : float
+    max_pruned : float
         A slice is at most this fraction of the Gaussians.
     """
     number = slice_due(state.pace, iteration.step)
     if number is None:
         return
     if number == 0:
-        prune_seen_by_few(state, iteration, least_views)
+        prune_seen_by_few(state, iteration, min_views)
     n = n_rows(state.gaussians)
     try:
         costs = collect_removal_costs(
@@ -70,8 +70,8 @@ def prune_in_slices(
         if number == 0:
             iteration.say(f"nothing more is pruned: {reason}")
         return
-    rows = worth_their_place(costs, least_slope, most_pruned)
-    if n - len(rows) < LEAST_SLICE * n:
+    rows = worth_their_place(costs, min_slope, max_pruned)
+    if n - len(rows) < SLICE_MIN * n:
         return
     apply_edit(state, keep(state.gaussians, rows))
     lost = 10.0 * np.log10(1.0 + float(np.delete(costs.changes, rows).sum()) / costs.squared_error)
@@ -79,13 +79,13 @@ def prune_in_slices(
     _record(state, iteration, why)
 
 
-def prune_seen_by_few(state: TrainState, iteration: Iteration, least_views: int) -> None:
-    """Remove what fewer than ``least_views`` views see, and what none does."""
+def prune_seen_by_few(state: TrainState, iteration: Iteration, min_views: int) -> None:
+    """Remove what fewer than ``min_views`` views see, and what none does."""
     n = n_rows(state.gaussians)
-    rows = np.flatnonzero(candidates(measure_importance(state, iteration), indoor, least_views, is_intersecting=False))
+    rows = np.flatnonzero(candidates(measure_importance(state, iteration), indoor, min_views, is_intersecting=False))
     if len(rows) < n:
         apply_edit(state, keep(state.gaussians, rows))
-        _record(state, iteration, f"{n - len(rows):,} of {n:,} Gaussians are visible in fewer than {least_views} views")
+        _record(state, iteration, f"{n - len(rows):,} of {n:,} Gaussians are visible in fewer than {min_views} views")
 
 
 def _record(state: TrainState, iteration: Iteration, why: str) -> None:

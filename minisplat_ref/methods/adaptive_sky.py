@@ -43,10 +43,10 @@ from minisplat_ref.types import Bools, Floats, Ints
 LARGE, HUGE = 0.25, 1.0  # of the scene's extent: standard deviation along the longest axis, to question and to remove
 RIDGE = 1e-3  # of the mean diagonal entry of the normal matrix: directions that no photograph shows get no large colour
 N_ERRORS = 3.0  # standard errors that the gain must exceed
-MOST_VIEWS = 24  # photographs that are looked at, evenly spread
-LEAST_VIEWS = 4  # of them that show something behind the scene: two to fit, two to judge
+VIEWS_MAX = 24  # photographs that are looked at, evenly spread
+VIEWS_MIN = 4  # of them that show something behind the scene: two to fit, two to judge
 OPEN = 0.5  # transmittance above which a pixel shows what is behind the scene
-LEAST_OPEN = 0.005  # of a photograph's pixels: fewer say nothing
+OPEN_MIN = 0.005  # of a photograph's pixels: fewer say nothing
 
 
 class Behind(NamedTuple):
@@ -128,7 +128,7 @@ def open_pixels(state: TrainState, iteration: Iteration, view_ids: Sequence[int]
         view = iteration.scene.train_views[index].loaded()
         alpha = iteration.renderer.render(state.model, view, request)[0].alpha.ravel()
         is_open = 1.0 - alpha[counted] > OPEN
-        if np.count_nonzero(is_open) > LEAST_OPEN * alpha.size:
+        if np.count_nonzero(is_open) > OPEN_MIN * alpha.size:
             pixels[index] = counted[is_open]
     return pixels
 
@@ -150,14 +150,14 @@ def photographs_behind(
     return photographs
 
 
-def switch_sky_on(state: TrainState, iteration: Iteration, *, least_sky_gain: float) -> str | None:
+def switch_sky_on(state: TrainState, iteration: Iteration, *, min_sky_gain: float) -> str | None:
     """Put a sky in place of the largest Gaussians if photographs explain each other better by it.
 
     Parameters
     ----------
     state, iteration
         As for every action.
-    least_sky_gain : float
+    min_sky_gain : float
         dB of the squared error that the photographs must gain on average behind the scene, and more than three standard
         errors.
     """
@@ -168,13 +168,13 @@ def switch_sky_on(state: TrainState, iteration: Iteration, *, least_sky_gain: fl
     if n == 0:
         return "nothing done: no Gaussian is large"
     ids = trained_ids(len(iteration.scene.train_views), iteration.cooling, state.pace)
-    ids = ids[:: -(-len(ids) // MOST_VIEWS)]
+    ids = ids[:: -(-len(ids) // VIEWS_MAX)]
     pixels = open_pixels(state, iteration, ids, ~large)
-    if len(pixels) < LEAST_VIEWS:
+    if len(pixels) < VIEWS_MIN:
         return f"nothing done: {len(pixels)} photographs show what is behind the scene without {n:,} large Gaussians"
     evidence = compare(*(photographs_behind(state, iteration, pixels, drawn) for drawn in (None, ~large)))
     why = f"a sky in place of {n:,} Gaussians explains {evidence.gain:.2f} dB more of what others show there"
-    if not evidence.is_above(least_sky_gain, N_ERRORS):
+    if not evidence.is_above(min_sky_gain, N_ERRORS):
         return f"nothing done: {why}"
     sky = fitted_sky(photographs_behind(state, iteration, counted_pixels(iteration, ids), ~huge)).astype(np.float32)
     apply_edit(state, keep(state.gaussians, ~huge))

@@ -47,16 +47,16 @@ def clone_and_split(
     threshold: float,
     size_fraction: float,
     draw_children: Callable[..., Gaussians] = clone_split.random_children,
-    most_per_pixel: float = math.inf,
+    max_per_pixel: float = math.inf,
 ) -> str | None:
     """Densify where the mean of the collected gradients reaches ``threshold``, and reset the collected gradients.
 
     Gaussians larger than ``size_fraction`` of the scene's extent are split, the others cloned; those that
     ``stats["is_blurred"]`` marks are split whatever their size and gradient (Mini-Splatting). While there are
-    ``most_per_pixel`` Gaussians or more for each pixel of the training views, gradients are only collected.
+    ``max_per_pixel`` Gaussians or more for each pixel of the training views, gradients are only collected.
     """
-    if n_rows(state.gaussians) >= most_per_pixel * n_pixels(iteration.scene):
-        return "paused: as many Gaussians as most_per_pixel allows"
+    if n_rows(state.gaussians) >= max_per_pixel * n_pixels(iteration.scene):
+        return "paused: as many Gaussians as max_per_pixel allows"
     means = state.stats.pop("gradient_sum") / np.maximum(state.stats.pop("view_count"), 1)
     is_blurred = state.stats.pop("is_blurred", None)
     edit = clone_split.clone_and_split(
@@ -72,9 +72,9 @@ def clone_and_split(
     return None
 
 
-def prune_faint(state: TrainState, iteration: Iteration, *, least_opacity: float) -> None:
-    """Remove Gaussians of opacity below ``least_opacity``."""
-    apply_edit(state, clone_split.prune_faint(state.gaussians, least_opacity=least_opacity))
+def prune_faint(state: TrainState, iteration: Iteration, *, min_opacity: float) -> None:
+    """Remove Gaussians of opacity below ``min_opacity``."""
+    apply_edit(state, clone_split.prune_faint(state.gaussians, min_opacity=min_opacity))
 
 
 def prune_large(state: TrainState, iteration: Iteration, *, size_fraction: float) -> None:
@@ -103,7 +103,7 @@ def reset_opacity_on_white(state: TrainState, iteration: Iteration, *, ceiling: 
 # of Gaussians, so it would explode if events were compressed to every few iterations. After an opacity reset, Gaussians
 # need a few hundred iterations to become opaque again.
 DENSIFY_LEAST_GAP = 100
-_densifying = partial(Every, 100, stop=15_000, least_gap=DENSIFY_LEAST_GAP)
+_densifying = partial(Every, 100, stop=15_000, min_gap=DENSIFY_LEAST_GAP)
 
 GS = Recipe(
     name="3dgs",
@@ -126,9 +126,9 @@ GS = Recipe(
     events=(
         During(collect_gradients, stop=15_000),
         _densifying(partial(clone_and_split, threshold=2e-4, size_fraction=0.01), start=500),
-        _densifying(partial(prune_faint, least_opacity=0.005), start=500),
+        _densifying(partial(prune_faint, min_opacity=0.005), start=500),
         _densifying(partial(prune_large, size_fraction=0.1), start=3_000),
-        Every(3_000, partial(reset_opacity, ceiling=0.01), stop=15_000, least_gap=300),
+        Every(3_000, partial(reset_opacity, ceiling=0.01), stop=15_000, min_gap=300),
         At(500, partial(reset_opacity_on_white, ceiling=0.01)),
     ),
 )

@@ -54,14 +54,14 @@ def measure_importance(
     )
 
 
-def candidates(stats: ImportanceStats, metric: Metric, least_views: int, *, is_intersecting: bool) -> Floats:
+def candidates(stats: ImportanceStats, metric: Metric, min_views: int, *, is_intersecting: bool) -> Floats:
     """Return the importance [N], 0 for Gaussians that may not be kept.
 
     Parameters
     ----------
     stats : ImportanceStats
     metric : Metric
-    least_views : int
+    min_views : int
         Those that are visible in fewer views may not.
     is_intersecting : bool
         If True, those that dominate no pixel of any view may not.
@@ -74,7 +74,7 @@ def candidates(stats: ImportanceStats, metric: Metric, least_views: int, *, is_i
     importance = metric(stats)
     if is_intersecting:
         importance = simplification.intersection_preserving(importance, stats.dominant_count)
-    importance = np.where(visibility.seen_by_few(stats.is_visible, least_views), 0.0, importance)
+    importance = np.where(visibility.seen_by_few(stats.is_visible, min_views), 0.0, importance)
     if not importance.any():
         raise InputError("no Gaussian matters to any training view: check that the cameras look at the scene's points")
     return importance
@@ -92,15 +92,15 @@ def is_culling(state: TrainState) -> bool:
     return "is_visible" in state.stats
 
 
-def collect_blur(state: TrainState, iteration: Iteration, *, area_fraction: float, least_area: int = 0) -> None:
+def collect_blur(state: TrainState, iteration: Iteration, *, area_fraction: float, min_area: int = 0) -> None:
     """Mark in ``stats["is_blurred"]`` the Gaussians that dominate more than ``area_fraction`` of the view's pixels.
 
-    A Gaussian that dominates at most ``least_area`` pixels is not blurred, however small the view.
+    A Gaussian that dominates at most ``min_area`` pixels is not blurred, however small the view.
     """
     stats, camera = iteration.output.stats, iteration.view.camera
     assert stats is not None, "listed in the recipe without BLEND_STATS"
     is_blurred = blur_split.is_blurred(
-        stats.dominant_count, camera.width, camera.height, area_fraction=area_fraction, least_area=least_area
+        stats.dominant_count, camera.width, camera.height, area_fraction=area_fraction, min_area=min_area
     )
     marked = state.stats.get("is_blurred")
     state.stats["is_blurred"] = is_blurred if marked is None else marked | is_blurred
@@ -111,7 +111,7 @@ def reinitialise_from_depth(
     iteration: Iteration,
     *,
     points_of: Callable[..., PixelPoints],
-    least_alpha: float,
+    min_alpha: float,
     depth_tolerance: float | None,
     backdrop_extents: float | None,
     points_per_gaussian: float,
@@ -134,7 +134,7 @@ def reinitialise_from_depth(
         iteration.scene.train_views,
         n_points,
         points_of=points_of,
-        least_alpha=least_alpha,
+        min_alpha=min_alpha,
         depth_tolerance=depth_tolerance,
         backdrop_distance=None if backdrop_extents is None else backdrop_extents * iteration.scene.extent,
         rng=state.rng,
@@ -180,7 +180,7 @@ def simplify(
     choose: Callable[..., Edit],
     keep_fraction: float,
     budget: int | None = None,
-    least_views: int = 0,
+    min_views: int = 0,
     is_intersecting: bool = True,
     visibility_mass: float = VISIBILITY_MASS,
 ) -> str | None:
@@ -198,7 +198,7 @@ def simplify(
         Fraction of the candidates to keep when there is no budget.
     budget : int, optional
         Number of Gaussians to keep; all candidates if there are fewer.
-    least_views : int
+    min_views : int
         Those that are visible in fewer views are no candidates.
     is_intersecting : bool
         If True, nor are those that dominate no pixel of any training view.
@@ -208,7 +208,7 @@ def simplify(
     stats = measure_importance(state, iteration, visibility_mass)
     if is_culling(state):
         cull(state, stats)
-    importance = candidates(stats, metric, least_views, is_intersecting=is_intersecting)
+    importance = candidates(stats, metric, min_views, is_intersecting=is_intersecting)
     n_candidates = int(np.count_nonzero(importance))
     n = round(keep_fraction * n_candidates) if budget is None else min(budget, n_candidates)
     apply_edit(state, choose(state.gaussians, importance, n, state.rng))
@@ -225,19 +225,19 @@ def prune_tail(
     *,
     metric: Metric,
     mass: float,
-    least_views: int = 0,
+    min_views: int = 0,
     is_intersecting: bool = True,
     visibility_mass: float = VISIBILITY_MASS,
 ) -> None:
     """Keep the most important Gaussians that together carry ``mass`` of the importance.
 
-    With ``is_intersecting`` only those count that dominate a pixel of some training view; ``least_views`` and
+    With ``is_intersecting`` only those count that dominate a pixel of some training view; ``min_views`` and
     ``visibility_mass`` as for :func:`simplify`.
     """
     stats = measure_importance(state, iteration, visibility_mass)
     if is_culling(state):
         cull(state, stats)
-    importance = candidates(stats, metric, least_views, is_intersecting=is_intersecting)
+    importance = candidates(stats, metric, min_views, is_intersecting=is_intersecting)
     apply_edit(state, keep(state.gaussians, simplification.carrying_mass(importance, mass)))
 
 
@@ -267,7 +267,7 @@ KEEP_FRACTION = 0.5  # of the Gaussians that dominate a pixel
 BLUR_AREA = 2e-4  # paper, equation 2: a Gaussian that dominates a larger fraction of an image is too large
 # Pixels. The low-pass filter makes the smallest Gaussian some 2 pixels wide: where the paper's fraction is only a few
 # pixels, as in photographs of less than a megapixel, splitting would never end.
-LEAST_BLURRED_AREA = 64
+BLURRED_AREA_MIN = 64
 
 # Photographs do not determine the depth of sky and bare walls. The paper takes the points as they are, which leaves
 # veils in the air; here points that other views see through move far behind the scene.
@@ -276,25 +276,23 @@ BACKDROP_EXTENTS = 30.0
 
 SHORT_RUN_EXPONENT = 0.45  # reinitialised Gaussians have to be learned again: compressed runs raise their rates
 
-_densifying = partial(Every, 100, stop=15_000, skip=5_000, least_gap=DENSIFY_LEAST_GAP)
+_densifying = partial(Every, 100, stop=15_000, skip=5_000, min_gap=DENSIFY_LEAST_GAP)
 
 _densify = partial(clone_and_split, threshold=2e-4, size_fraction=0.01, draw_children=clone_split.random_children)
 _reinitialise = partial(
     reinitialise_from_depth,
     points_of=depth_reinit.midpoint_points,
     points_per_gaussian=1.0,
-    least_alpha=0.0,
+    min_alpha=0.0,
     depth_tolerance=DEPTH_TOLERANCE,
     backdrop_extents=BACKDROP_EXTENTS,
     largest_size=LARGE,
 )
 _DENSIFICATION = (
     During(collect_gradients, stop=15_000),
-    During(
-        partial(collect_blur, area_fraction=BLUR_AREA, least_area=LEAST_BLURRED_AREA), stop=15_000, wants=BLEND_STATS
-    ),
+    During(partial(collect_blur, area_fraction=BLUR_AREA, min_area=BLURRED_AREA_MIN), stop=15_000, wants=BLEND_STATS),
     _densifying(_densify, start=500),
-    _densifying(partial(prune_faint, least_opacity=0.005), start=500),
+    _densifying(partial(prune_faint, min_opacity=0.005), start=500),
     _densifying(partial(prune_large_by_distance, size_fraction=LARGE), start=3_000),
     Every(5_000, _reinitialise, stop=15_000),
 )
@@ -325,7 +323,7 @@ MINI_SPLATTING = GS._replace(
         At(20_000, partial(prune_tail, metric=importance.indoor, mass=0.99, is_intersecting=True)),
         At(20_000, restart_adam),
     ),
-    least_views=3,
+    min_views=3,
     short_run_exponent=SHORT_RUN_EXPONENT,
 )
 """``mini-splatting``: few Gaussians."""

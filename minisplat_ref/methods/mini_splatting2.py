@@ -14,9 +14,9 @@ from minisplat_ref.methods.gaussian_splatting import (
 from minisplat_ref.methods.mini_splatting import (
     BACKDROP_EXTENTS,
     BLUR_AREA,
+    BLURRED_AREA_MIN,
     DEPTH_TOLERANCE,
     LARGE,
-    LEAST_BLURRED_AREA,
     SHORT_RUN_EXPONENT,
     VISIBILITY_MASS,
     collect_blur,
@@ -47,9 +47,9 @@ def aggressive_clone(
     critical: Callable[[ImportanceStats], Bools],
     factor: int,
     tail_mass: float,
-    least_views: int,
+    min_views: int,
     visibility_mass: float = VISIBILITY_MASS,
-    most_per_pixel: float = math.inf,
+    max_per_pixel: float = math.inf,
 ) -> None:
     """Drop Gaussians that hardly any view sees, clone the critical ones, and cull views from now on.
 
@@ -63,19 +63,19 @@ def aggressive_clone(
         Copies that a critical Gaussian becomes.
     tail_mass : float
         Only the most important Gaussians that carry this fraction of the importance stay.
-    least_views : int
+    min_views : int
         Those that are visible in fewer views are dropped.
     visibility_mass : float
         Fraction of a view's blend weight that its visible Gaussians carry.
-    most_per_pixel : float
+    max_per_pixel : float
         Nothing is cloned while there are this many Gaussians or more for each pixel of the training views.
     """
     stats = measure_importance(state, iteration, visibility_mass)
-    stays = mass_mask(indoor(stats), tail_mass) & ~visibility.seen_by_few(stats.is_visible, least_views)  # [N]
+    stays = mass_mask(indoor(stats), tail_mass) & ~visibility.seen_by_few(stats.is_visible, min_views)  # [N]
     apply_edit(state, keep(state.gaussians, stays))
     stats = take(stats, stays)
     cull(state, stats)
-    if n_rows(state.gaussians) < most_per_pixel * n_pixels(iteration.scene):
+    if n_rows(state.gaussians) < max_per_pixel * n_pixels(iteration.scene):
         apply_edit(state, cloning.clone(state.gaussians, critical(stats), factor=factor))
     for name in COLLECTED:
         state.stats.pop(name, None)
@@ -88,43 +88,41 @@ def stop_culling(state: TrainState, iteration: Iteration) -> None:
 
 
 KEEP_FRACTION = 0.6  # of the Gaussians that dominate a pixel
-MOST_PER_PIXEL = 0.1
-_LEAST_VIEWS = 2  # seen by only one view, a Gaussian is as likely a floater as a surface
+PER_PIXEL_MAX = 0.1
+_VIEWS_MIN = 2  # seen by only one view, a Gaussian is as likely a floater as a surface
 _cloning = partial(
     aggressive_clone,
     critical=cloning.critical_by_mass,
     factor=2,
     tail_mass=0.999,
-    least_views=_LEAST_VIEWS,
+    min_views=_VIEWS_MIN,
     visibility_mass=VISIBILITY_MASS,
-    most_per_pixel=MOST_PER_PIXEL,
+    max_per_pixel=PER_PIXEL_MAX,
 )
 _densify = partial(
     clone_and_split,
     threshold=2e-4,
     size_fraction=0.01,
     draw_children=clone_split.random_children,
-    most_per_pixel=MOST_PER_PIXEL,
+    max_per_pixel=PER_PIXEL_MAX,
 )
 _reinitialise = partial(
     reinitialise_from_depth,
     points_of=depth_reinit.midpoint_points,
     points_per_gaussian=1.0,
     drawn_mass=0.99,
-    least_alpha=0.0,
+    min_alpha=0.0,
     depth_tolerance=DEPTH_TOLERANCE,
     backdrop_extents=BACKDROP_EXTENTS,
     largest_size=LARGE,
 )
-_densifying = partial(Every, 100, start=500, stop=3_000, skip=2_000, least_gap=DENSIFY_LEAST_GAP)
+_densifying = partial(Every, 100, start=500, stop=3_000, skip=2_000, min_gap=DENSIFY_LEAST_GAP)
 
 _DENSIFICATION = (
     During(collect_gradients, stop=3_000),
-    During(
-        partial(collect_blur, area_fraction=BLUR_AREA, least_area=LEAST_BLURRED_AREA), stop=3_000, wants=BLEND_STATS
-    ),
+    During(partial(collect_blur, area_fraction=BLUR_AREA, min_area=BLURRED_AREA_MIN), stop=3_000, wants=BLEND_STATS),
     _densifying(_densify),
-    _densifying(partial(prune_faint, least_opacity=0.005)),
+    _densifying(partial(prune_faint, min_opacity=0.005)),
     At(2_000, _reinitialise),
     Every(250, _cloning, start=499, stop=3_000, skip=2_000),
 )
@@ -146,7 +144,7 @@ MINI_SPLATTING2 = GS._replace(
                 choose=simplification.by_sampling,
                 keep_fraction=KEEP_FRACTION,
                 budget=None,
-                least_views=_LEAST_VIEWS,
+                min_views=_VIEWS_MIN,
                 is_intersecting=True,
                 visibility_mass=VISIBILITY_MASS,
             ),
@@ -154,12 +152,12 @@ MINI_SPLATTING2 = GS._replace(
         At(3_000, partial(store_sh, sh_degree=3)),
         At(
             8_000,
-            partial(prune_tail, metric=importance.indoor, mass=0.99, least_views=_LEAST_VIEWS, is_intersecting=True),
+            partial(prune_tail, metric=importance.indoor, mass=0.99, min_views=_VIEWS_MIN, is_intersecting=True),
         ),
         At(13_000, stop_culling),
     ),
     half_size_until=3_000,
-    least_views=3,
+    min_views=3,
     short_run_exponent=SHORT_RUN_EXPONENT,
 )
 """``mini-splatting2``: few Gaussians, fast."""
@@ -168,7 +166,7 @@ _prune_unimportant = partial(
     prune_tail,
     metric=importance.indoor,
     mass=0.99,
-    least_views=_LEAST_VIEWS,
+    min_views=_VIEWS_MIN,
     is_intersecting=False,
     visibility_mass=VISIBILITY_MASS,
 )

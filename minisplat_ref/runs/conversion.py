@@ -19,7 +19,7 @@ from minisplat_ref.training.compensation import with_compensation
 from minisplat_ref.training.sky import with_sky
 from minisplat_ref.types import Gaussians, Model, numbered
 
-MOST_VIEWS = 24
+VIEWS_MAX = 24
 NO_DROP = 1e-5  # dB: files have another order, in which Gaussians of equal depth are drawn; 2e-7 has been seen
 
 
@@ -254,7 +254,7 @@ def judge_of(source: Source, path: Path, scene: Path | None, downscale: int | No
     else:
         raise InputError(f"--max-drop needs photographs to measure on, and {path} is no run: give --scene PATH")
     n = len(photographs.train_views)
-    rows = np.unique(np.linspace(0, n - 1, min(n, MOST_VIEWS)).round().astype(int))
+    rows = np.unique(np.linspace(0, n - 1, min(n, VIEWS_MAX)).round().astype(int))
     views = [photographs.train_views[row] for row in rows]
 
     def psnr_of(gaussians: Gaussians) -> float:

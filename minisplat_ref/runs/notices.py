@@ -13,7 +13,7 @@ from minisplat_ref.strategy.initialization import N_NEIGHBOURS, N_RANDOM_POINTS
 from minisplat_ref.types import Model, Scene
 
 N_SIZES = 3  # of photographs that are all named
-LEAST_SIDE = 16  # pixels; SSIM compares windows of 11 x 11, and 3DGS cuts an image into tiles of 16 x 16
+SIDE_MIN = 16  # pixels; SSIM compares windows of 11 x 11, and 3DGS cuts an image into tiles of 16 x 16
 
 
 def warn_of_scene(scene: Scene, downscale: int) -> None:
@@ -33,11 +33,11 @@ def warn_of_scene(scene: Scene, downscale: int) -> None:
         )
     sizes = [(view.camera.width, view.camera.height) for view in scene.train_views]
     width, height = min(sizes, key=min)
-    if min(width, height) < LEAST_SIDE:
+    if min(width, height) < SIDE_MIN:
         cause = f" after --downscale {downscale}: give a smaller number" if downscale > 1 else ": give larger ones"
         _warn(
-            f"photographs of scene {scene.name} are {width} x {height} pixels{cause}; from fewer than {LEAST_SIDE} x"
-            f" {LEAST_SIDE} hardly any structure can be learned, and measures of them say little"
+            f"photographs of scene {scene.name} are {width} x {height} pixels{cause}; from fewer than {SIDE_MIN} x"
+            f" {SIDE_MIN} hardly any structure can be learned, and measures of them say little"
         )
 
 
@@ -48,10 +48,10 @@ def describe_sizes(sizes: Sequence[tuple[int, int]]) -> str:
         return f"{sizes[0][0]} x {sizes[0][1]}"
     if len(counts) <= N_SIZES:
         return " and ".join(f"{width} x {height} ({n} of them)" for (width, height), n in counts)
-    (least_width, least_height), (width, height) = (pick(sizes, key=math.prod) for pick in (min, max))
+    (min_width, min_height), (width, height) = (pick(sizes, key=math.prod) for pick in (min, max))
     n_portrait = sum(width < height for width, height in sizes)
     return (
-        f"{len(counts)} sizes from {least_width} x {least_height} to {width} x {height} ({len(sizes) - n_portrait}"
+        f"{len(counts)} sizes from {min_width} x {min_height} to {width} x {height} ({len(sizes) - n_portrait}"
         f" landscape, {n_portrait} portrait)"
     )
 

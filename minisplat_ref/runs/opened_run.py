@@ -21,7 +21,7 @@ from minisplat_ref.training.schedule import Recipe, as_trained
 from minisplat_ref.types import Model, Scene, View, numbered
 
 HOLD_OUT_EVERY = 8  # training views of which one decides
-LEAST_VIEWS = 4  # training views: two that are trained on, and two for a standard error
+VIEWS_MIN = 4  # training views: two that are trained on, and two for a standard error
 
 
 class Run(NamedTuple):
@@ -111,9 +111,9 @@ def open_run(folder: Path, scene: Path | None = None) -> Run:
 def check_views(scene: Scene, what: str) -> None:
     """Refuse a scene with too few training views to hold some out; ``what`` is what needs them."""
     n_views = len(scene.train_views)
-    if n_views < LEAST_VIEWS:
+    if n_views < VIEWS_MIN:
         raise InputError(
-            f"{what} needs at least {LEAST_VIEWS} training views, two of them to decide by, and scene {scene.name} has"
+            f"{what} needs at least {VIEWS_MIN} training views, two of them to decide by, and scene {scene.name} has"
             f" {n_views}: train with more photographs"
         )
 

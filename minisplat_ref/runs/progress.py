@@ -121,11 +121,11 @@ class Progress(AbstractContextManager["Progress"]):
                 "its/s": report.step / seconds,
             },
         )
-        line = f"loss {loss:.4f}, {mean_psnr:.2f} dB, {n_gaussians:,} Gaussians{self._least_rest(report)}"
+        line = f"loss {loss:.4f}, {mean_psnr:.2f} dB, {n_gaussians:,} Gaussians{self._min_rest(report)}"
         self._bar.set_postfix_str(line, refresh=False)
         self._losses.clear()
 
-    def _least_rest(self, report: StepReport) -> str:
+    def _min_rest(self, report: StepReport) -> str:
         """Say how long a training that has not decided its length goes on at least: as if it began to cool now."""
         if self._cooling is None or report.last_step is not None:
             return ""

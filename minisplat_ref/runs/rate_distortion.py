@@ -57,7 +57,7 @@ class PlySize(NamedTuple):
         """Return the bytes of a file with ``n`` rows."""
         return self.header + len(str(n)) + n * self.row
 
-    def most_rows(self, n_bytes: int) -> int:
+    def max_rows(self, n_bytes: int) -> int:
         """Return the most rows that a file of at most ``n_bytes`` has; 0 where not even one fits."""
         n = max(0, (n_bytes - self.header) // self.row)
         while n > 0 and self.of(n) > n_bytes:

@@ -114,12 +114,12 @@ def limit_of(target: Target, size: PlySize) -> int | None:
     """
     if target.max_bytes is None:
         return target.budget
-    if size.most_rows(target.max_bytes) == 0:
+    if size.max_rows(target.max_bytes) == 0:
         raise InputError(
             f"--max-bytes {target.max_bytes} is too little: a PLY with one Gaussian takes {size.of(1):,} bytes; allow"
             " more (minisplat-ref convert makes compact files, and has --max-bytes of its own)"
         )
-    return size.most_rows(target.max_bytes)
+    return size.max_rows(target.max_bytes)
 
 
 def fine_tuning(recipe: Recipe, iterations: int, *, holds_out: bool) -> Recipe:

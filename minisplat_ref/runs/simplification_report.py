@@ -18,7 +18,7 @@ from minisplat_ref.runs.rate_distortion import N_SIZES, SIZES_PER_HALVING
 
 TABLE_HEADING = ["Gaussians", "PLY bytes", "PSNR (dB)", "drop (dB)", "std. error", ""]
 N_BELOW = 3  # sizes below the chosen one on the enlarged axes
-LEAST_ZOOM = 0.1  # dB that the enlarged axis of drops shows at least
+ZOOM_MIN = 0.1  # dB that the enlarged axis of drops shows at least
 
 CURVE_TEXT = """\
 Of each size the most important Gaussians were kept, by their blend weights in the training views, and fine-tuned alike.
@@ -112,7 +112,7 @@ def _draw_drop(axes: Axes, result: dict[str, Any]) -> None:
     _mark(axes, result, "drop")
     _finish(axes, result, "drop with its standard error (dB), enlarged", SIZES_PER_HALVING)
     worst = chosen["drop"] + chosen["standard_error"]
-    top = 3 * max(worst, limit or 0.0, LEAST_ZOOM)
+    top = 3 * max(worst, limit or 0.0, ZOOM_MIN)
     lowest = min(0.0, *(drop - error for drop, error in zip(drops, errors, strict=True)))
     axes.set_ylim(max(lowest, -top) - 0.08 * top, top)
     first = max(sum(n <= chosen["n_gaussians"] for n in counts) - N_BELOW - 1, 0)

@@ -23,7 +23,7 @@ from minisplat_ref.strategy.importance import ImportanceStats, mass_mask
 from minisplat_ref.strategy.ops import Edit, concat, n_rows, take
 from minisplat_ref.types import Bools, Floats, Gaussians
 
-LEAST_SHARED_OPACITY = 0.0051
+SHARED_OPACITY_MIN = 0.0051
 """Copies are not made fainter than this, just above density control's limit of 0.005, unless their parent is.
 From the released code. Its other bound, 1 - 1e-7, is not needed: the logits are computed without 1 - o."""
 
@@ -80,7 +80,7 @@ def shared_opacities(opacities: Floats, factor: int) -> Floats:
     Returns
     -------
     shared : ndarray
-        Same shape; without the bound :data:`LEAST_SHARED_OPACITY`.
+        Same shape; without the bound :data:`SHARED_OPACITY_MIN`.
     """
     with np.errstate(divide="ignore"):  # log of 0, where the opacity is 1
         return -np.expm1(np.log1p(-opacities) / factor)
@@ -143,7 +143,7 @@ def clone(gaussians: Gaussians, is_critical: Bools, *, factor: int = 2) -> Edit:
         raise InputError(f"clone factor is {factor}, but a Gaussian becomes at least one: use 2, or 1 for no clones")
     ids = np.flatnonzero(is_critical)
     originals = gaussians.opacity_logits[ids]  # [C]
-    least = logit(LEAST_SHARED_OPACITY)
+    least = logit(SHARED_OPACITY_MIN)
     # ln(1 - o') from the logit: 1 - o has no digits left where o is near 1.
     log_transparencies = -np.logaddexp(0.0, np.maximum(originals, least).astype(np.float64)) / factor
     shared = -np.expm1(log_transparencies)

@@ -22,7 +22,7 @@ HALF_MEAN = math.sqrt(2 / math.pi)  # mean of |x| for x ~ N(0, 1): the centre of
 HALF_SCALE = math.sqrt(1 - 2 / math.pi)  # its standard deviation; 1 / 1.66
 
 
-def is_blurred(dominant_count: Ints, width: int, height: int, *, area_fraction: float, least_area: int = 0) -> Bools:
+def is_blurred(dominant_count: Ints, width: int, height: int, *, area_fraction: float, min_area: int = 0) -> Bools:
     """Return which Gaussians dominate too large a part of one view.
 
     Parameters
@@ -33,14 +33,14 @@ def is_blurred(dominant_count: Ints, width: int, height: int, *, area_fraction: 
         Image size, pixels.
     area_fraction : float
         A Gaussian that dominates a larger fraction of the image is blurred; 2e-4 in the paper.
-    least_area : int
+    min_area : int
         So many pixels are not blurred, however small the image.
 
     Returns
     -------
     mask : ndarray of shape (N,) of booleans
     """
-    return dominant_count > max(area_fraction * width * height, least_area)
+    return dominant_count > max(area_fraction * width * height, min_area)
 
 
 def principal_axis_children(gaussians: Gaussians, parent_ids: Ints, rng: np.random.Generator) -> Gaussians:

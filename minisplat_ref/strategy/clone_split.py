@@ -123,9 +123,9 @@ def clone_and_split(
     )
 
 
-def prune_faint(gaussians: Gaussians, *, least_opacity: float) -> Edit:
-    """Remove nearly transparent Gaussians, of opacity below ``least_opacity``."""
-    return keep(gaussians, gaussians.opacity_logits >= logit(least_opacity))
+def prune_faint(gaussians: Gaussians, *, min_opacity: float) -> Edit:
+    """Remove nearly transparent Gaussians, of opacity below ``min_opacity``."""
+    return keep(gaussians, gaussians.opacity_logits >= logit(min_opacity))
 
 
 def prune_large(gaussians: Gaussians, *, size_limit: float | Floats) -> Edit:

@@ -36,7 +36,7 @@ N_PARTNERS = 8  # views that vote on a point: more of them agree more often by c
 BEST_PARALLAX = np.radians(
     20.0
 )  # of partners: from a nearer one a floater looks the same, from a farther one less is seen
-LEAST_SCORE = 0.05  # of a partner: 1 degree of parallax on all points, or the best on a twentieth of them
+SCORE_MIN = 0.05  # of a partner: 1 degree of parallax on all points, or the best on a twentieth of them
 MAP_BYTES = 8  # per pixel: depth and weight in float32
 N_PROBES = 256  # points of a view with which its partners are chosen
 
@@ -129,7 +129,7 @@ def reinitial_points(
     n_points: int,
     *,
     points_of: Callable[[Any, View, Conventions, Backend, Renderer], PixelPoints] = midpoint_points,
-    least_alpha: float,
+    min_alpha: float,
     depth_tolerance: float | None,
     backdrop_distance: float | None = None,
     rng: np.random.Generator,
@@ -150,7 +150,7 @@ def reinitial_points(
         Points over all views; every view gives ``n_points // n_views``.
     points_of : callable
         :func:`midpoint_points`, :func:`centre_points` or :func:`blended_points`.
-    least_alpha : float
+    min_alpha : float
         Pixels of lower accumulated opacity are not drawn; 0 for the paper's rule.
     depth_tolerance : float or None
         A point is on another view's surface if its depth differs from that view's by at most this, relatively. It is
@@ -184,7 +184,7 @@ def reinitial_points(
     depth_maps, weight_maps = [], []  # MAP_BYTES per pixel of all views; points would be 12 more
     for view in views:
         _, depths, alpha = points_of(model, view, conventions, backend, renderer)
-        is_drawable = (depths > 0) & (alpha >= least_alpha)
+        is_drawable = (depths > 0) & (alpha >= min_alpha)
         if (mask := view.mask) is not None:
             is_drawable &= mask
         depth_maps.append(depths)
@@ -208,7 +208,7 @@ def reinitial_points(
         points.append(view_points[pixels])
         colors.append(view.image.reshape(-1, 3)[pixels])
     if sum(map(len, points)) == 0:
-        raise InputError("no pixel of any view shows a surface: lower least_alpha or raise depth_tolerance")
+        raise InputError("no pixel of any view shows a surface: lower min_alpha or raise depth_tolerance")
     return np.concatenate(points), np.concatenate(colors)
 
 
@@ -297,7 +297,7 @@ def _partners(points: Floats, own_id: int, cameras: Sequence[Camera]) -> Ints:
         _, pixels = _project(probes, camera)
         scores[j] = np.where(pixels >= 0, np.minimum(ratios, 1 / np.maximum(ratios, 1)), 0).sum()
     best = np.argsort(-scores, kind="stable")[:N_PARTNERS]
-    return best[scores[best] >= LEAST_SCORE * len(probes)]
+    return best[scores[best] >= SCORE_MIN * len(probes)]
 
 
 def _rays(points: Floats, camera: Camera) -> Floats:

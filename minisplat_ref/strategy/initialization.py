@@ -15,7 +15,7 @@ from minisplat_ref.strategy.clone_split import logit
 from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Scene
 
 N_NEIGHBOURS = 3
-LEAST_SQUARED_DISTANCE = 1e-7  # world units^2; points in the same place would get a scale of zero, whose log is -inf
+SQUARED_DISTANCE_MIN = 1e-7  # world units^2; points in the same place would get a scale of zero, whose log is -inf
 INITIAL_OPACITY = 0.1
 N_RANDOM_POINTS = 100_000  # as 3DGS draws for scenes without points
 
@@ -89,7 +89,7 @@ def from_means(means: Floats, sh_dc: Floats, sh_degree: int) -> Gaussians:
     if n <= N_NEIGHBOURS:
         raise InputError(f"points has {n} rows, a scale needs {N_NEIGHBOURS} neighbours: give more points")
     distances, _ = cKDTree(means).query(means, N_NEIGHBOURS + 1)  # [P, 4], the first is the point itself
-    squared = np.maximum((distances[:, 1:] ** 2).mean(axis=1), LEAST_SQUARED_DISTANCE)  # [P]
+    squared = np.maximum((distances[:, 1:] ** 2).mean(axis=1), SQUARED_DISTANCE_MIN)  # [P]
     quats = np.zeros((n, 4), dtype)
     quats[:, 0] = 1
     return Gaussians(

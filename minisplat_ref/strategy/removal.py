@@ -84,18 +84,18 @@ def collect_removal_costs(
     return RemovalCosts(changes, squared_error)
 
 
-def worth_their_place(costs: RemovalCosts, least_slope: float, most_at_once: float) -> Ints:
-    """Return the rows to keep, ascending: all but those whose slope is below ``least_slope``.
+def worth_their_place(costs: RemovalCosts, min_slope: float, max_growth: float) -> Ints:
+    """Return the rows to keep, ascending: all but those whose slope is below ``min_slope``.
 
     Parameters
     ----------
     costs : RemovalCosts
-    least_slope : float
+    min_slope : float
         Of the curve of squared error over count, both as logarithms.
-    most_at_once : float
+    max_growth : float
         At most this fraction of the Gaussians goes, those of the smallest change first; of equals the first.
     """
     slopes = costs.slopes
-    most = int(most_at_once * len(slopes))
-    going = np.argsort(slopes, kind="stable")[: min(most, np.count_nonzero(slopes < least_slope))]
+    most = int(max_growth * len(slopes))
+    going = np.argsort(slopes, kind="stable")[: min(most, np.count_nonzero(slopes < min_slope))]
     return np.setdiff1d(np.arange(len(slopes)), going)

@@ -39,8 +39,8 @@ def gradient_factors(is_visible: Bools, frustum_count: Ints) -> Floats:
     return np.count_nonzero(is_visible, axis=1) / (frustum_count + COUNT_OFFSET)
 
 
-def seen_by_few(is_visible: Bools, least_views: int) -> Bools:
-    """Return which Gaussians are visible in fewer than ``least_views`` training views.
+def seen_by_few(is_visible: Bools, min_views: int) -> Bools:
+    """Return which Gaussians are visible in fewer than ``min_views`` training views.
 
     Depth from one view is a guess; the released code removes what fewer than two views see. In a scene with two views
     this would leave next to nothing, so at most half of the views, rounded up, are required.
@@ -49,7 +49,7 @@ def seen_by_few(is_visible: Bools, least_views: int) -> Bools:
     ----------
     is_visible : ndarray of shape (N, V) of booleans
         Per training view.
-    least_views : int
+    min_views : int
         2 in the released code; 0 for none.
 
     Returns
@@ -57,7 +57,7 @@ def seen_by_few(is_visible: Bools, least_views: int) -> Bools:
     mask : ndarray of shape (N,) of booleans
     """
     n_views = is_visible.shape[1]
-    return np.count_nonzero(is_visible, axis=1) < min(least_views, (n_views + 1) // 2)
+    return np.count_nonzero(is_visible, axis=1) < min(min_views, (n_views + 1) // 2)
 
 
 def culled_fraction(is_visible: Bools, frustum_count: Ints) -> float:

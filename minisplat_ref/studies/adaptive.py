@@ -116,24 +116,24 @@ RULES: Mapping[str, Callable[[Recipe], Recipe]] = {
     "rates of 3DGS": with_published_rates,
     "faster means": with_faster_means,
     "no cool-down": without_cool_down,
-    "large views at once": lambda recipe: configured(recipe, least_side=math.inf),
+    "large views at once": lambda recipe: configured(recipe, min_side=math.inf),
     "all bands": with_all_bands,
     "no bands": lambda recipe: configured(recipe, views_per_coefficient=math.inf),
-    "no cut of bands": lambda recipe: configured(recipe, least_variation=0.0),
-    "no sky": lambda recipe: configured(recipe, least_sky_gain=math.inf),
-    "no prune": lambda recipe: configured(recipe, least_slope=0.0, least_views=0),
+    "no cut of bands": lambda recipe: configured(recipe, min_variation=0.0),
+    "no sky": lambda recipe: configured(recipe, min_sky_gain=math.inf),
+    "no prune": lambda recipe: configured(recipe, min_slope=0.0, min_views=0),
     "prune by blend weight": partial(with_pruning_by, action=prune_by_weight),
     "prune by exact change": partial(with_pruning_by, action=prune_by_exact_change),
-    "no exposures": lambda recipe: configured(recipe, least_exposure_gain=math.inf),
-    "no poses": lambda recipe: configured(recipe, least_pose_gain=math.inf),
-    "no anti-aliasing": lambda recipe: configured(recipe, least_antialiasing_gain=math.inf),
+    "no exposures": lambda recipe: configured(recipe, min_exposure_gain=math.inf),
+    "no poses": lambda recipe: configured(recipe, min_pose_gain=math.inf),
+    "no anti-aliasing": lambda recipe: configured(recipe, min_antialiasing_gain=math.inf),
 }
 
 SWEEP: Mapping[str, Callable[[Recipe], Recipe]] = {
     **{f"threshold x {factor:g}": partial(with_growth, threshold=factor) for factor in (8.0, 4.0, 2.0, 1.4)},
     "adaptive": lambda recipe: recipe,
     **{
-        f"threshold / 2, growth x {factor:g}": partial(with_growth, threshold=0.5, most_at_once=factor)
+        f"threshold / 2, growth x {factor:g}": partial(with_growth, threshold=0.5, max_growth=factor)
         for factor in (1.5, 2.0, 3.0)
     },
 }

@@ -53,7 +53,7 @@ from minisplat_ref.training.loop import StepReport, train
 from minisplat_ref.training.schedule import Recipe, configured, firing_steps
 from minisplat_ref.types import Bools, Floats, Model, Scene
 
-LEAST_ALPHA = 0.9  # of the safeguard that requires opacity
+ALPHA_MIN = 0.9  # of the safeguard that requires opacity
 FAR = 0.5 * BACKDROP_EXTENTS  # extents from the origin beyond which there is nothing but the backdrop
 OFF_SURFACE = 0.05  # relative error above which a point is not on its surface
 SKY_BEHIND = 0.95  # share of the surfaces that a point of the sky has to be behind
@@ -63,7 +63,7 @@ class Choice(NamedTuple):
     """How points are drawn."""
 
     points_of: Callable[..., PixelPoints]
-    least_alpha: float = 0.0
+    min_alpha: float = 0.0
     depth_tolerance: float | None = None
     has_backdrop: bool = False
 
@@ -72,7 +72,7 @@ class Choice(NamedTuple):
         return configured(
             recipe,
             points_of=self.points_of,
-            least_alpha=self.least_alpha,
+            min_alpha=self.min_alpha,
             depth_tolerance=self.depth_tolerance,
             backdrop_extents=BACKDROP_EXTENTS if self.has_backdrop else None,
         )
@@ -82,7 +82,7 @@ CHOICES = {
     "mid-point": Choice(midpoint_points),
     "centre": Choice(centre_points),
     "blended": Choice(blended_points),
-    "mid-point, opacity floor": Choice(midpoint_points, LEAST_ALPHA),
+    "mid-point, opacity floor": Choice(midpoint_points, ALPHA_MIN),
     "mid-point, vote": Choice(midpoint_points, 0.0, DEPTH_TOLERANCE),
     "mid-point, vote, backdrop": Choice(midpoint_points, 0.0, DEPTH_TOLERANCE, has_backdrop=True),
     "blended, vote": Choice(blended_points, 0.0, DEPTH_TOLERANCE),
@@ -121,7 +121,7 @@ def run(args: argparse.Namespace) -> None:
             "recipe": recipe.name,
             "iterations": args.iterations,
             "seeds": list(args.seeds),
-            "least_alpha": LEAST_ALPHA,
+            "min_alpha": ALPHA_MIN,
             "depth_tolerance": DEPTH_TOLERANCE,
             "backdrop_extents": BACKDROP_EXTENTS,
         }
@@ -196,7 +196,7 @@ def drawn_points(
         views,
         len(model.gaussians.means) if n_points is None else n_points,
         points_of=choice.points_of,
-        least_alpha=choice.least_alpha,
+        min_alpha=choice.min_alpha,
         depth_tolerance=choice.depth_tolerance,
         backdrop_distance=BACKDROP_EXTENTS * scene.extent if choice.has_backdrop else None,
         rng=rng,
@@ -262,7 +262,7 @@ def draw(summary: dict[str, dict[str, tuple[float, float]]]) -> Figure:
         scale = 1.0 if name == "psnr" else 100.0
         for line, (choice, row) in enumerate(summary.items()):
             mean, deviation = (scale * value for value in row[name])
-            color = RED if CHOICES[choice].depth_tolerance is None and CHOICES[choice].least_alpha == 0 else BLUE
+            color = RED if CHOICES[choice].depth_tolerance is None and CHOICES[choice].min_alpha == 0 else BLUE
             axes.errorbar(mean, line, xerr=deviation, color=color, marker="o", capsize=4)
         axes.set(title=MEASURES[name], xlabel="" if name == "psnr" else "%", ylim=(len(summary) - 0.5, -0.5))
         axes.set_yticks(range(len(summary)), list(summary))

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.methods.adaptive_prune import LEAST_SLICE, prune_in_slices, prune_seen_by_few, slice_due
+from minisplat_ref.methods.adaptive_prune import SLICE_MIN, prune_in_slices, prune_seen_by_few, slice_due
 from minisplat_ref.methods.mini_splatting import prune_tail
 from minisplat_ref.rendering import Request
 from minisplat_ref.strategy.importance import indoor
@@ -25,32 +25,32 @@ MASS = 0.98
 
 def with_pruning_by(recipe: Recipe, action: Any) -> Recipe:
     """Return the recipe with another action in place of its own prune, with the same settings."""
-    settings = {name: settings_of(recipe)[name] for name in ("least_views", "least_slope", "most_pruned")}
+    settings = {name: settings_of(recipe)[name] for name in ("min_views", "min_slope", "max_pruned")}
     own = partial(action, **settings)
     events = (event._replace(action=own) if does(event, prune_in_slices) else event for event in recipe.events)
     return recipe._replace(events=tuple(events))
 
 
 def prune_by_weight(
-    state: TrainState, iteration: Iteration, *, least_views: int, least_slope: float, most_pruned: float
+    state: TrainState, iteration: Iteration, *, min_views: int, min_slope: float, max_pruned: float
 ) -> None:
-    """Keep what carries 98 % of the blend weight, at the first slice; ``least_slope``, ``most_pruned`` are not used."""
+    """Keep what carries 98 % of the blend weight, at the first slice; ``min_slope``, ``max_pruned`` are not used."""
     if slice_due(state.pace, iteration.step) == 0:
-        prune_tail(state, iteration, metric=indoor, mass=MASS, least_views=least_views, is_intersecting=False)
+        prune_tail(state, iteration, metric=indoor, mass=MASS, min_views=min_views, is_intersecting=False)
 
 
 def prune_by_exact_change(
-    state: TrainState, iteration: Iteration, *, least_views: int, least_slope: float, most_pruned: float
+    state: TrainState, iteration: Iteration, *, min_views: int, min_slope: float, max_pruned: float
 ) -> None:
     """Prune as :func:`~minisplat_ref.methods.adaptive_prune.prune_in_slices`, with the gradient subtracted from S."""
     number = slice_due(state.pace, iteration.step)
     if number is None:
         return
     if number == 0:
-        prune_seen_by_few(state, iteration, least_views)
+        prune_seen_by_few(state, iteration, min_views)
     n = n_rows(state.gaussians)
-    rows = worth_their_place(exact_costs(state, iteration), least_slope, most_pruned)
-    if n - len(rows) >= LEAST_SLICE * n:
+    rows = worth_their_place(exact_costs(state, iteration), min_slope, max_pruned)
+    if n - len(rows) >= SLICE_MIN * n:
         apply_edit(state, keep(state.gaussians, rows))
 
 

@@ -57,7 +57,7 @@ def as_3dgs_prunes(recipe: Recipe) -> Recipe:
 
 def with_all_events(recipe: Recipe) -> Recipe:
     """Return the recipe with all published density events and opacity resets, however few iterations lie between."""
-    events = (event._replace(least_gap=1) if isinstance(event, Every) else event for event in recipe.events)
+    events = (event._replace(min_gap=1) if isinstance(event, Every) else event for event in recipe.events)
     return recipe._replace(events=tuple(events))
 
 
@@ -143,12 +143,12 @@ MECHANISMS: Mapping[str, Change] = {
 """The published recipe without each mechanism; a recipe that does not have it stays unchanged."""
 
 DEVIATIONS: Mapping[str, Change] = {
-    "least blurred area": with_settings(least_area=0),
-    "cap of the population": with_settings(most_per_pixel=math.inf),
+    "least blurred area": with_settings(min_area=0),
+    "cap of the population": with_settings(max_per_pixel=math.inf),
     "sky guard": with_settings(depth_tolerance=None),
     "size limit by distance": as_3dgs_prunes,
     "size limit of new points": with_settings(largest_size=math.inf),
-    "least size to halve": lambda recipe: recipe._replace(least_half_size=1) if recipe.half_size_until else recipe,
+    "least size to halve": lambda recipe: recipe._replace(min_half_size=1) if recipe.half_size_until else recipe,
     "raised rates": lambda recipe: recipe._replace(short_run_exponent=0.0),
     "fewer events": with_all_events,
     "depths of whole views": with_culled_depths,
@@ -185,7 +185,7 @@ def variants_of(published: Recipe, iterations: int, rules: Mapping[str, Change] 
 
 def with_strides(recipe: Recipe) -> Recipe:
     """Return the recipe with the gaps that its events have: a lower bound that moves no date makes no difference."""
-    events = (event._replace(least_gap=event.stride) if isinstance(event, Every) else event for event in recipe.events)
+    events = (event._replace(min_gap=event.stride) if isinstance(event, Every) else event for event in recipe.events)
     return recipe._replace(events=tuple(events))
 
 

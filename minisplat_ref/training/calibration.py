@@ -36,7 +36,7 @@ from minisplat_ref.training.sky import SKY, clear_sky, with_sky
 from minisplat_ref.types import Floats, Model, RenderOutput, View
 
 EXPOSURES, ROTATIONS, SHIFTS = "exposures", "pose_rotations", "pose_shifts"  # names of the shared parameters
-LEAST_ANGLE = 1e-4  # radians; below it a series replaces (a - sin a) / a^3, which would cancel
+ANGLE_MIN = 1e-4  # radians; below it a series replaces (a - sin a) / a^3, which would cancel
 
 
 class Calibration(NamedTuple):
@@ -219,7 +219,7 @@ def left_jacobian(w: Floats) -> Floats:
     x, y, z = w
     W = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     first = 0.5 * np.sinc(a / (2 * np.pi)) ** 2  # 1 - cos a = 2 sin^2(a / 2); NumPy's sinc(x) is sin(pi x) / (pi x)
-    second = 1 / 6 if a < LEAST_ANGLE else (a - np.sin(a)) / a**3  # the next term of the series is -a^2 / 120
+    second = 1 / 6 if a < ANGLE_MIN else (a - np.sin(a)) / a**3  # the next term of the series is -a^2 / 120
     return np.eye(3) + first * W + second * W @ W
 
 

@@ -64,10 +64,10 @@ def initial_state(scene: Scene, recipe: Recipe, seed: int) -> TrainState:
     n_views = len(scene.train_views)
     if n_views == 0:
         raise InputError(f"scene {scene.name} has no training views: lower the share of test views or add photographs")
-    if n_views < recipe.least_views:
+    if n_views < recipe.min_views:
         raise InputError(
             f"scene {scene.name} has {n_views} training views, recipe {recipe.name} needs at least"
-            f" {recipe.least_views}: add photographs or use 3dgs-accel"
+            f" {recipe.min_views}: add photographs or use 3dgs-accel"
         )
     rng = np.random.default_rng(seed)
     representation = recipe.representation
@@ -286,7 +286,7 @@ def _change(state: TrainState, scene: Scene, around: _Surroundings, differentiat
         n, n_pairs = len(state.gaussians.means), rendered.output.n_pairs
         n_bytes = sum(field.nbytes for field in state.gaussians)
         to_be_kept = make_room(scene.train_views, memory.bytes_to_double(n, n_bytes, n_pairs))
-        state.most_rows = memory.rows_that_fit(n, n_bytes, n_pairs, memory.free_bytes() - to_be_kept)
+        state.max_rows = memory.rows_that_fit(n, n_bytes, n_pairs, memory.free_bytes() - to_be_kept)
     output = rendered.output._replace(image=rendered.channel("rgb"))
     iteration = Iteration(
         scene,
@@ -381,7 +381,7 @@ def _following_view(state: TrainState, scene: Scene) -> View | None:
 
 def _n_halvings(state: TrainState, recipe: Recipe, scene: Scene) -> int:
     """Return how often views are halved now; those so small that no structure would be left are not."""
-    if state.step < recipe.half_size_until and smallest_side(scene) >= 2 * recipe.least_half_size:
+    if state.step < recipe.half_size_until and smallest_side(scene) >= 2 * recipe.min_half_size:
         return 1
     return state.pace.n_halvings
 

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 COOLED, FINER = "cool down", "resolution"  # decisions: to let the rates fall, to train on larger views
-MOST_HALVINGS = 16  # of a photograph of 65,536 pixels a side one would be left
+HALVINGS_MAX = 16  # of a photograph of 65,536 pixels a side one would be left
 
 
 class Measurement(NamedTuple):
@@ -157,7 +157,7 @@ def from_metadata(value: Mapping[str, Any]) -> Pace:
     cooling_from, last_step = (None if value[n] is None else int(value[n]) for n in ("cooling_from", "last_step"))
     switched_on = tuple(str(name) for name in value["switched_on"])
     n_halvings = int(value.get("n_halvings", 0))  # records from before there were any
-    if not 0 <= n_halvings <= MOST_HALVINGS:
+    if not 0 <= n_halvings <= HALVINGS_MAX:
         raise ValueError(f"n_halvings is {n_halvings}")
     return Pace(measurements, decisions, int(value["n_pairs"]), cooling_from, last_step, switched_on, n_halvings)
 

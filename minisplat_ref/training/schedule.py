@@ -59,7 +59,7 @@ class Every(NamedTuple):
     start: int = 0
     stop: int | None = None
     skip: int | None = None
-    least_gap: int = 1
+    min_gap: int = 1
     """Least number of iterations between two actions, and from the last one to ``stop``. Where compression would go
     below it, only every second published iteration stays, or every third, and so on, counted back from ``stop``."""
     factor: Fraction = Fraction(1)
@@ -68,7 +68,7 @@ class Every(NamedTuple):
     @property
     def stride(self) -> int:
         """Return the number of published iterations from one action that stays to the next."""
-        return self.period * math.ceil(self.least_gap / (self.period * self.factor))
+        return self.period * math.ceil(self.min_gap / (self.period * self.factor))
 
     def is_due(self, step: int) -> bool:
         """Return whether the action belongs to iteration ``step``, counted from 1."""
@@ -128,9 +128,9 @@ class Recipe(NamedTuple):
     """What happens besides gradient steps; several due in one iteration act in this order."""
     half_size_until: int = 0
     """Number of first iterations that train on views of half the width and height (Mini-Splatting2)."""
-    least_half_size: int = 100
+    min_half_size: int = 100
     """Pixels per side; if half of any view were smaller, no view is halved."""
-    least_views: int = 1
+    min_views: int = 1
     """Least number of training views that the method needs."""
     short_run_exponent: float = 0.0
     """p of the factor ``(published / iterations)^p`` by which :func:`scaled` raises the rates of runs shorter than
@@ -187,7 +187,7 @@ def scaled(recipe: Recipe, iterations: int) -> Recipe:
     Every milestone is multiplied by ``iterations / recipe.iterations`` and rounded to the nearest integer (ties to
     even): those of each event and loss term, of the spherical harmonics and of the rates' schedules. So the order of
     events is that of the recipe, whatever the length. A one-time event happens at iteration 1 at the earliest; periodic
-    ones may happen less often, see :attr:`Every.least_gap`. Thresholds stay; so do learning rates, unless the recipe or
+    ones may happen less often, see :attr:`Every.min_gap`. Thresholds stay; so do learning rates, unless the recipe or
     the calibration has a ``short_run_exponent``. A recipe that decides its own length keeps everything but the limit.
 
     Raises

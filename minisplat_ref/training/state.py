@@ -51,7 +51,7 @@ class TrainState:
     """What a recipe that decides its own length has measured and decided."""
     is_whole: bool = True
     """False while an iteration changes the state; if it stays so, the iteration failed halfway: do not save."""
-    most_rows: float = math.inf
+    max_rows: float = math.inf
     """Rows that memory has room for, as far as is known."""
 
     @property
@@ -203,8 +203,8 @@ def start_anew(state: TrainState, iteration: Iteration, gaussians: Gaussians) ->
 
 
 def _check_room(state: TrainState, n: int) -> None:
-    if n > max(state.most_rows, len(state.gaussians.means)):
+    if n > max(state.max_rows, len(state.gaussians.means)):
         raise InputError(
-            f"there is no memory for {n:,} Gaussians, only for some {state.most_rows:,.0f}: train on smaller"
+            f"there is no memory for {n:,} Gaussians, only for some {state.max_rows:,.0f}: train on smaller"
             " photographs (--downscale), or by a recipe that keeps to a --budget"
         )

@@ -75,9 +75,9 @@ def test_least_rest_of_a_training_without_a_schedule(tmp_path):
     cooling = Cooling(part=0.5, last=0.1, last_per_extent=0.1, hold_out_every=8)
     with Progress(tmp_path / "log.jsonl", 0, None, cooling) as progress:
         progress._bar.n, progress._bar.start_t = 200, time.time() - 2.0
-        undecided = progress._least_rest(SimpleNamespace(step=200, last_step=None))
+        undecided = progress._min_rest(SimpleNamespace(step=200, last_step=None))
         assert undecided == ", at least 00:01 to go"
-        assert progress._least_rest(SimpleNamespace(step=200, last_step=300)) == ""
+        assert progress._min_rest(SimpleNamespace(step=200, last_step=300)) == ""
 
 
 def test_info_has_no_empty_rows(run_folder, capsys):

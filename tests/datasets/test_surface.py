@@ -67,7 +67,7 @@ def test_what_counts_of_the_gaussians(rng):
 
 
 def test_truth_is_bounded_and_repeats(monkeypatch):
-    monkeypatch.setattr(surface_module, "MOST_POINTS", 10)
+    monkeypatch.setattr(surface_module, "POINTS_MAX", 10)
     one, other = (surface_near(plane(0.0), [make_camera(8, 8)], extent=9.0).cloud.data for _ in range(2))
     assert len(np.unique(one, axis=0)) == 10 and np.array_equal(one, other)
     assert surface_near(plane(0.0) + 100, [make_camera(8, 8)], extent=9.0) is None

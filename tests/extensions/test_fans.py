@@ -11,7 +11,7 @@ from minisplat_ref.mechanisms.meshes.fans import (
     fan_vertices,
     fitted,
     flattened,
-    least_widths,
+    min_widths,
     opacity_radii,
     plane_axes,
     rims,
@@ -107,5 +107,5 @@ def test_affine_edits_are_carried_exactly(n_sides, rng):
 def test_degenerate_polygons_have_no_width():
     line = np.linspace(0, 1, 8)[:, None] * [[1.0, 2, 3]]
     square = np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])[[0, 0, 1, 1, 2, 2, 3, 3]]
-    widths = least_widths(np.stack([line, np.ones((8, 3)), square]))
+    widths = min_widths(np.stack([line, np.ones((8, 3)), square]))
     assert widths[0] < CLOSED_FORM and widths[1] == 0 and widths[2] > 0.5

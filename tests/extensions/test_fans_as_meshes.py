@@ -209,8 +209,8 @@ def test_what_is_not_drawn_is_refused(rng):
     model, view = Model(fans_of(rng, 2)), view_from(make_camera())
     with pytest.raises(InputError, match="without depth"):
         render(model, view, Request(wants=frozenset({"depth"})))
-    with pytest.raises(InputError, match="most_layers is 0"):
-        render(model, view, Request(), most_layers=0)
+    with pytest.raises(InputError, match="max_layers is 0"):
+        render(model, view, Request(), max_layers=0)
 
 
 # --- training ---
@@ -223,7 +223,7 @@ def test_colors_stay_in_range_and_faint_fans_go(rng):
     keep_in_range(state, None)
     assert state.gaussians.opacities[4, 0] == 1
     assert_array_equal(state.gaussians.colors[0, 3], [0, 0.5, 1])
-    prune_faint_fans(state, None, least_opacity=0.02)
+    prune_faint_fans(state, None, min_opacity=0.02)
     assert_array_equal(state.gaussians.means, fans.means[[0, 1, 3, 4, 5]])
     assert state.adam.first.rims.shape == (5, 1, 8, 3)
 
@@ -359,7 +359,7 @@ def test_a_scene_is_refitted_drawn_and_exported(scene_folder, tmp_path, capsys):
 
 def test_the_recipe_trains_from_points_resumes_and_is_measured(scene_folder, tmp_path, capsys):
     run = tmp_path / "run"
-    options = ["--recipe", "fans", "--test-every", "4", "--set", "n_sides=6", "--set", "most_layers=8"]
+    options = ["--recipe", "fans", "--test-every", "4", "--set", "n_sides=6", "--set", "max_layers=8"]
     assert main(["train", str(scene_folder), *options, "--iterations", "30", "--out", str(run)]) == 0
     assert main(["train", "--resume", str(run), "--iterations", "40"]) == 0
     losses = [json.loads(line)["loss"] for line in (run / "log.jsonl").read_text().splitlines()]
@@ -408,7 +408,7 @@ def test_models_that_hold_nothing_are_refused(model, scene_folder, tmp_path, cap
 def test_the_studies(scene_folder, model, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("minisplat_ref.extensions.fans.claims.REACHES", (2.5,))
     monkeypatch.setattr("minisplat_ref.extensions.fans.claims.SIDES", (4, 8))
-    monkeypatch.setattr("minisplat_ref.extensions.fans.claims.MOST_VIEWS", 1)
+    monkeypatch.setattr("minisplat_ref.extensions.fans.claims.VIEWS_MAX", 1)
     monkeypatch.setattr("minisplat_ref.extensions.fans.tuning.EVALUATIONS", 4)
     monkeypatch.setattr("minisplat_ref.extensions.fans.tuning.FIRST_REACHES", (2.5,))
     monkeypatch.setattr("minisplat_ref.extensions.fans.profile.ANGLES", (0, 90))

@@ -12,7 +12,7 @@ from minisplat_ref.extensions import folders, module_of, summaries
 from minisplat_ref.extensions.extension import Extension, load_extension
 from minisplat_ref.training.schedule import describe
 
-MOST_POSITIONAL = 8
+POSITIONAL_MAX = 8
 COLUMNS_MAX = 80
 NAMES = list(folders())
 FILES = [(name, path) for name, folder in folders().items() for path in sorted(folder.rglob("*.py"))]
@@ -89,7 +89,7 @@ def test_every_file_is_documented_and_its_functions_take_few_arguments(name, pat
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             n_positional = len(node.args.posonlyargs) + len(node.args.args)
-            assert n_positional <= MOST_POSITIONAL, f"{path}: {node.name} takes {n_positional} positional arguments"
+            assert n_positional <= POSITIONAL_MAX, f"{path}: {node.name} takes {n_positional} positional arguments"
 
 
 def imported_modules(path):

@@ -279,14 +279,14 @@ def test_hulls_that_make_no_difference_lose_vertices(rng):
     one = as_ellipses(make_gaussians(rng, 4))._replace(log_scales=np.zeros((4, 3)))
     vertices = np.array([[0.1, 0.1, -0.1, 0.0], [3.0, 0.1, -1.0, 0.0], [0.1, 0.1, 7.0, 7.0], [3, 0.0, 0.0, 3.0]])
     population = one._replace(vertices=vertices, n_vertices=np.array([3, 3, 2, 3.0]))
-    after, changed = simplified(population, least=0.5, least_height=0.5)
+    after, changed = simplified(population, least=0.5, min_height=0.5)
     assert changed.tolist() == [True, True, True, False] and counts(after).tolist() == [1, 2, 1, 3]
     # The line of the longest edge, from (-2, -0.1) to (3, 0.1).
     assert_allclose(np.abs(after.vertices[1]), [2.5, 0.1, 0, 0], atol=CLOSED_FORM)
     axes = rotation_matrices(population.quats)[1]
     assert_allclose(after.means[1] - population.means[1], 0.5 * axes[:, 0], atol=CLOSED_FORM)
     assert_allclose(after.means[[0, 2, 3]], population.means[[0, 2, 3]])
-    again, changed = simplified(after, least=0.5, least_height=0.5)
+    again, changed = simplified(after, least=0.5, min_height=0.5)
     assert not changed.any() and again.means.tobytes() == after.means.tobytes()
 
 

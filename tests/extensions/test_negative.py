@@ -234,7 +234,7 @@ def test_a_reinitialisation_begins_with_negatives_too(rng):
 def test_pruning_does_not_look_at_the_color():
     gaussians = of_colors([[-0.5] * 3, [0.0] * 3, [1e-3] * 3, [0.8] * 3])
     faint = gaussians._replace(opacity_logits=np.array([0.0, 0, 0, -9]))
-    assert_array_equal(prune_faint(faint, least_opacity=0.005).parent_ids, [0, 1, 2])
+    assert_array_equal(prune_faint(faint, min_opacity=0.005).parent_ids, [0, 1, 2])
     assert_array_equal(prune_large(gaussians, size_limit=0.3).parent_ids, [0, 1, 2, 3])
 
 

@@ -232,7 +232,7 @@ def test_no_rotation_becomes_zero():
     gaussians.quats[::2] = [0, 0, -1, -1]
     for level in LEVELS:
         back = omg.decode(omg.encode(gaussians, level), "file")
-        assert_array_equal(back.quats[:, :2], np.tile([omg.LEAST_QUAT, 0.0], (40, 1)))
+        assert_array_equal(back.quats[:, :2], np.tile([omg.QUAT_MIN, 0.0], (40, 1)))
 
 
 def test_what_half_floats_do_not_reach():

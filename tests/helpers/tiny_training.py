@@ -19,7 +19,7 @@ N_VIEWS, N_GAUSSIANS = 4, 30
 EVENTS = (
     During(gaussian_splatting.collect_gradients, stop=30),
     Every(10, partial(gaussian_splatting.clone_and_split, threshold=2e-3, size_fraction=0.15), start=5, stop=30),
-    Every(10, partial(gaussian_splatting.prune_faint, least_opacity=0.005), start=5, stop=30),
+    Every(10, partial(gaussian_splatting.prune_faint, min_opacity=0.005), start=5, stop=30),
     Every(10, partial(gaussian_splatting.prune_large, size_fraction=2.0), start=15, stop=30),
     Every(25, partial(gaussian_splatting.reset_opacity, ceiling=0.05)),
 )

@@ -197,7 +197,7 @@ def test_training_ends_with_the_same_bytes(original, tmp_path, alive, monkeypatc
 
 
 def test_half_size_views_give_the_same_bytes(original, monkeypatch):
-    recipe = get_recipe("3dgs-accel", 20)._replace(half_size_until=10, least_half_size=4)
+    recipe = get_recipe("3dgs-accel", 20)._replace(half_size_until=10, min_half_size=4)
     held = train(load_scene(original), recipe, seed=0)
     keep_few(monkeypatch)
     stored = train(load_scene(original), recipe, seed=0)

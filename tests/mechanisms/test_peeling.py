@@ -163,7 +163,7 @@ def test_only_the_nearest_layers_are_blended_if_so_many_are_asked_for(peeling, r
     rgba = rng.uniform(0.1, 0.9, (40, 4))
     depths = 2 + 0.01 * rng.permutation(40)
     order = np.argsort(depths)
-    few = peeling.peel(cards(depths, rgba), frame_of(most_layers=3), BACKGROUND)
+    few = peeling.peel(cards(depths, rgba), frame_of(max_layers=3), BACKGROUND)
     nearest = peeling.peel(cards(depths[order[:3]], rgba[order[:3]]), frame_of(), BACKGROUND)
     assert_array_equal(few.image, nearest.image)
     assert (few.n_layers == 40).all()
@@ -174,8 +174,8 @@ def test_only_the_nearest_layers_are_blended_if_so_many_are_asked_for(peeling, r
 # --- gradients ---
 
 
-@pytest.mark.parametrize("most_layers", [2, 1 << 30], ids=["two layers", "all"])
-def test_the_gradient_by_differences(peeling, most_layers):
+@pytest.mark.parametrize("max_layers", [2, 1 << 30], ids=["two layers", "all"])
+def test_the_gradient_by_differences(peeling, max_layers):
     """Three slivers of 60 pixels, an opaque one in front of another: alpha = 1 has a gradient, too."""
     rng = np.random.default_rng(2)
     camera = make_camera(8, 6, fx=10.0, fy=9.0, rng=rng)
@@ -188,7 +188,7 @@ def test_the_gradient_by_differences(peeling, most_layers):
     mesh.rgba[3:6, 3] = 1
 
     def pictures(vertices, rgba, background, R, t):
-        at = Frame(camera._replace(cam_from_world_R=R, cam_from_world_t=t), NEAR, most_layers)
+        at = Frame(camera._replace(cam_from_world_R=R, cam_from_world_t=t), NEAR, max_layers)
         return peeling.peel(TranslucentMesh(vertices, rgba, mesh.faces), at, background)
 
     inputs = [mesh.vertices, mesh.rgba, BACKGROUND, camera.cam_from_world_R, camera.cam_from_world_t]
@@ -201,7 +201,7 @@ def test_the_gradient_by_differences(peeling, most_layers):
         return moved.image, moved.alpha
 
     def vjp(v_image, v_alpha):
-        return tuple(peeling.peel_vjp(mesh, Frame(camera, NEAR, most_layers), BACKGROUND, peeled, v_image, v_alpha))
+        return tuple(peeling.peel_vjp(mesh, Frame(camera, NEAR, max_layers), BACKGROUND, peeled, v_image, v_alpha))
 
     check_jacobian(function, vjp, inputs, names=["vertices", "rgba", "background", "R", "t"])
 
@@ -209,10 +209,10 @@ def test_the_gradient_by_differences(peeling, most_layers):
 # --- parity ---
 
 
-@pytest.mark.parametrize("most_layers", [2, 1 << 30], ids=["two layers", "all"])
-def test_kernels_are_the_reference(most_layers, rng):
+@pytest.mark.parametrize("max_layers", [2, 1 << 30], ids=["two layers", "all"])
+def test_kernels_are_the_reference(max_layers, rng):
     mesh, camera = soup(rng, 80), make_camera(50, 37, fx=60.0, fy=55.0, rng=rng)
-    frame = frame_of(camera, most_layers=most_layers)
+    frame = frame_of(camera, max_layers=max_layers)
     (ours, v_ours), (theirs, v_theirs) = both(mesh, frame, rng)
     assert theirs.n_layers.max() > 5 and theirs.alpha.mean() > COVERAGE_MIN
     assert_allclose(ours.image, theirs.image, atol=PARITY_FLOAT64)

@@ -58,9 +58,9 @@ def compressed(name):
     has no time to be undone, would leave nothing.
     """
     recipe = RECIPES[name]
-    least_gap = 2 if name.startswith("mini-splatting2") else 5
-    events = [e._replace(least_gap=least_gap) if isinstance(e, Every) else e for e in recipe.events]
-    return scaled(recipe._replace(events=tuple(events), least_half_size=32), ITERATIONS)
+    min_gap = 2 if name.startswith("mini-splatting2") else 5
+    events = [e._replace(min_gap=min_gap) if isinstance(e, Every) else e for e in recipe.events]
+    return scaled(recipe._replace(events=tuple(events), min_half_size=32), ITERATIONS)
 
 
 # Whole recipes --------------------------------------------------------------------------------------------------------
@@ -147,7 +147,7 @@ def test_clone_culls_and_forgets_what_was_collected(state, iteration):
     n = n_rows(state.gaussians)
     state.stats = {"gradient_sum": np.ones(n), "view_count": np.ones(n, int), "is_blurred": np.ones(n, bool)}
     mini_splatting2.aggressive_clone(
-        state, iteration, critical=lambda stats: stats.dominant_count > 0, factor=2, tail_mass=0.999, least_views=0
+        state, iteration, critical=lambda stats: stats.dominant_count > 0, factor=2, tail_mass=0.999, min_views=0
     )
     n = n_rows(state.gaussians)
     assert n > N_GAUSSIANS * 0.9 and state.stats["is_visible"].shape == (n, N_VIEWS)
@@ -194,7 +194,7 @@ def test_the_share_kept_is_one_of_the_candidates(state, iteration):
 @pytest.mark.parametrize("choose", [simplify.by_sampling, simplify.by_rank, simplify.by_merging])
 def test_each_choice_leaves_the_budget(state, iteration, choose):
     mini_splatting.simplify(
-        state, iteration, metric=importance.indoor, choose=choose, keep_fraction=0.5, budget=17, least_views=0
+        state, iteration, metric=importance.indoor, choose=choose, keep_fraction=0.5, budget=17, min_views=0
     )
     assert n_rows(state.gaussians) == n_rows(state.adam.first) == 17
 
@@ -265,10 +265,10 @@ def test_blur_is_remembered_from_view_to_view(state, scene):
 def test_densification_pauses_above_the_most(state, iteration):
     n = n_rows(state.gaussians)
     act = partial(gaussian_splatting.clone_and_split, threshold=0.0, size_fraction=10.0)
-    note = "paused: as many Gaussians as most_per_pixel allows"
+    note = "paused: as many Gaussians as max_per_pixel allows"
     for most, expected, expected_note in ((n - 1, n, note), (n + 1, 2 * n, None)):
         state.stats = {"gradient_sum": np.ones(n), "view_count": np.ones(n), "is_blurred": np.zeros(n, bool)}
-        assert act(state, iteration, most_per_pixel=most / n_pixels(iteration.scene)) == expected_note
+        assert act(state, iteration, max_per_pixel=most / n_pixels(iteration.scene)) == expected_note
         assert n_rows(state.gaussians) == expected and (state.stats == {}) == (expected == 2 * n)
 
 
@@ -296,14 +296,14 @@ def test_depth_is_given_the_settings_in_world_units(state, iteration, monkeypatc
         state,
         iteration._replace(scene=iteration.scene._replace(extent=2.5)),
         points_of=depth_reinit.centre_points,
-        least_alpha=0.3,
+        min_alpha=0.3,
         depth_tolerance=0.07,
         backdrop_extents=extents,
         points_per_gaussian=2.0,
         largest_size=0.1,
         drawn_mass=0.9,
     )
-    assert (given["backdrop_distance"], given["least_alpha"], given["depth_tolerance"]) == (distance, 0.3, 0.07)
+    assert (given["backdrop_distance"], given["min_alpha"], given["depth_tolerance"]) == (distance, 0.3, 0.07)
     assert given["points_of"] is depth_reinit.centre_points and given["rng"] is state.rng
     assert given["n_points"] == 2 * n and 0 < given["n_left"] < n
     assert_array_equal(state.gaussians.means, np.eye(4, 3))
@@ -342,7 +342,7 @@ def test_tiny_images_are_not_halved(scene):
         view._replace(camera=view.camera._replace(width=63), image=view.image[:, :63]) for view in scene.train_views
     )
     sizes = []
-    recipe = RECIPES["3dgs"]._replace(iterations=2, events=(), half_size_until=2, least_half_size=32)
+    recipe = RECIPES["3dgs"]._replace(iterations=2, events=(), half_size_until=2, min_half_size=32)
     train(scene._replace(train_views=views), recipe, seed=0, on_step=lambda r: sizes.append(r.view.camera.width))
     assert sizes == [63, 63]
 

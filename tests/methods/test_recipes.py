@@ -96,7 +96,7 @@ def test_dense_recipes_do_not_sample(name):
 
 
 # Published values: those of the released code of 3DGS (2023), of its later optimiser (``-accel``), of Mini-Splatting
-# and of Mini-Splatting2. What is our own (``most_per_pixel``, ``least_area``, the vote on depths) is not among them.
+# and of Mini-Splatting2. What is our own (``max_per_pixel``, ``min_area``, the vote on depths) is not among them.
 PUBLISHED = [name for name, recipe in RECIPES.items() if recipe.cooling is None]  # the others have no schedule
 OPACITY_RATES = {"3dgs": 0.05, "mini-splatting": 0.05, "mini-splatting-d": 0.05}  # the others: half of it
 SH_MILESTONES = {"3dgs": (1_000, 2_000, 3_000), "mini-splatting": (16_000, 17_000, 18_000)}
@@ -105,7 +105,7 @@ ADAMS = {"3dgs": (False, True), "3dgs-accel": (True, False)}  # is_visible_only,
 ADAMS |= {"mini-splatting": (False, True), "mini-splatting-d": (False, True)}
 OF_3DGS = {
     "clone_and_split": {"threshold": 2e-4, "size_fraction": 0.01},
-    "prune_faint": {"least_opacity": 0.005},
+    "prune_faint": {"min_opacity": 0.005},
     "prune_large": {"size_fraction": 0.1},
     "reset_opacity": {"ceiling": 0.01},
     "reset_opacity_on_white": {"ceiling": 0.01},
@@ -115,13 +115,13 @@ OF_MINI_SPLATTING = {
     "prune_faint": OF_3DGS["prune_faint"],
     "prune_large_by_distance": {"size_fraction": 0.1},
     "collect_blur": {"area_fraction": 2e-4},
-    "reinitialise_from_depth": {"points_of": "midpoint_points", "least_alpha": 0.0},
-    "simplify": {"choose": "by_sampling", "keep_fraction": 0.5, "least_views": 0, "is_intersecting": True},
+    "reinitialise_from_depth": {"points_of": "midpoint_points", "min_alpha": 0.0},
+    "simplify": {"choose": "by_sampling", "keep_fraction": 0.5, "min_views": 0, "is_intersecting": True},
     "store_sh": {"sh_degree": 3},
     "restart_from_means": {"sh_degree": 3},
-    "prune_tail": {"mass": 0.99, "least_views": 0, "is_intersecting": True},
+    "prune_tail": {"mass": 0.99, "min_views": 0, "is_intersecting": True},
 }
-_FEW_SEE = {"least_views": 2, "visibility_mass": 0.99}
+_FEW_SEE = {"min_views": 2, "visibility_mass": 0.99}
 OF_MINI_SPLATTING2 = {
     **{action: OF_MINI_SPLATTING[action] for action in ("clone_and_split", "prune_faint", "collect_blur", "store_sh")},
     "reinitialise_from_depth": {
@@ -215,7 +215,7 @@ LENGTHS = [
 def test_events_keep_their_order_and_gaps_at_every_length(name, lengths):
     """Of any two published iterations, the earlier stays the earlier, and their gap is in proportion.
 
-    Rounding moves each by half an iteration at most. What `least_gap` thins is in the next test.
+    Rounding moves each by half an iteration at most. What `min_gap` thins is in the next test.
     """
     recipe = RECIPES[name]
     events = [
@@ -246,8 +246,8 @@ def test_a_compressed_schedule_is_part_of_the_published_one(name, n):
             steps = firing(event.scaled(factor), n)
             assert set(steps) <= published
             gaps = np.diff([*steps, round(event.stop * factor)])
-            assert all(gaps >= event.least_gap - 1), gaps  # each end is rounded by up to a half
-            if event.period * factor >= event.least_gap:
+            assert all(gaps >= event.min_gap - 1), gaps  # each end is rounded by up to a half
+            if event.period * factor >= event.min_gap:
                 assert set(steps) == published
 
 
@@ -292,8 +292,8 @@ def test_scaled_to_a_tenth():
 def test_a_published_iteration_is_rounded_by_itself():
     event = Every(100, nothing, start=500, stop=15_000).scaled(Fraction(7, 30))  # 140, 163.33, 186.67, 210
     assert firing(event)[:4] == [140, 163, 187, 210] and len(firing(event)) == 144
-    assert firing(Every(100, nothing, stop=1_000, least_gap=50).scaled(Fraction(1, 5)), 200) == [20, 80, 140]
-    assert firing(Every(100, nothing, least_gap=50).scaled(Fraction(1, 5)), 200) == [60, 120, 180]  # without an end
+    assert firing(Every(100, nothing, stop=1_000, min_gap=50).scaled(Fraction(1, 5)), 200) == [20, 80, 140]
+    assert firing(Every(100, nothing, min_gap=50).scaled(Fraction(1, 5)), 200) == [60, 120, 180]  # without an end
     longer = firings(scaled(RECIPES["3dgs"], 60_000))
     assert longer["collect_gradients"] == list(range(1, 30_000))  # every iteration, not every second one
     assert longer["clone_and_split"] == list(range(1_200, 30_000, 200))
@@ -340,5 +340,5 @@ def test_description_is_json_and_tells_settings_apart():
     densify = description["events"][1]
     assert densify["event"] == "Every" and densify["action"] == "clone_and_split"
     assert densify["settings"] == {"threshold": 2e-4, "size_fraction": 0.01}
-    other = recipe._replace(events=(Every(100, partial(gaussian_splatting.prune_faint, least_opacity=0.1)),))
+    other = recipe._replace(events=(Every(100, partial(gaussian_splatting.prune_faint, min_opacity=0.1)),))
     assert json.loads(json.dumps(describe(other))) != description

@@ -150,13 +150,13 @@ def test_ply_size_is_that_of_the_file(run_folder, tmp_path):
         save_ply(tmp_path / "a.ply", take(gaussians, np.arange(n)))
         n_bytes = (tmp_path / "a.ply").stat().st_size
         assert size.of(n) == n_bytes
-        assert size.most_rows(n_bytes) == n and size.most_rows(n_bytes - 1) == n - 1
+        assert size.max_rows(n_bytes) == n and size.max_rows(n_bytes - 1) == n - 1
 
 
 def test_digits_of_the_count_count():
     size = PlySize(header=100, row=10)
     assert size.of(9) == 191 and size.of(10) == 202
-    assert size.most_rows(201) == 9 and size.most_rows(202) == 10 and size.most_rows(50) == 0
+    assert size.max_rows(201) == 9 and size.max_rows(202) == 10 and size.max_rows(50) == 0
 
 
 # Fine-tuning ----------------------------------------------------------------------------------------------------------

@@ -34,7 +34,7 @@ RECIPE = RECIPES["3dgs"]._replace(
     events=(
         During(collect_gradients),
         Every(6, partial(clone_and_split, threshold=1e-4, size_fraction=0.01)),
-        Every(6, partial(prune_faint, least_opacity=0.005)),
+        Every(6, partial(prune_faint, min_opacity=0.005)),
         At(9, noted),
         At(25, partial(reset_opacity, ceiling=0.01)),
     ),

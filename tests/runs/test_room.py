@@ -147,6 +147,6 @@ def test_training_goes_on_where_they_fit(scene, monkeypatch):  # noqa: F811
 
 def test_fewer_gaussians_are_never_refused(scene, monkeypatch):  # noqa: F811
     monkeypatch.setattr(memory, "free_bytes", lambda: 0.0)
-    prune = partial(gaussian_splatting.prune_faint, least_opacity=0.09)
+    prune = partial(gaussian_splatting.prune_faint, min_opacity=0.09)
     recipe = PLAIN._replace(iterations=5, events=(At(3, prune),))
     assert train(scene, recipe, seed=0).step == 5

@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from minisplat_ref.errors import InputError
 from minisplat_ref.rendering import render
 from minisplat_ref.strategy.aggressive_clone import (
-    LEAST_SHARED_OPACITY,
+    SHARED_OPACITY_MIN,
     clone,
     critical_by_mass,
     critical_by_weight,
@@ -179,7 +179,7 @@ def test_faint_copies_are_not_pruned():
     gaussians = make_gaussians(np.random.default_rng(0), 3)
     gaussians = gaussians._replace(opacity_logits=np.array([logit(o) for o in opacities]))
     copies = opacities_of(clone(gaussians, np.ones(3, bool)).gaussians)[3:]
-    assert_allclose(copies, [1 - np.sqrt(0.98), LEAST_SHARED_OPACITY, 0.004], rtol=CLOSED_FORM)
+    assert_allclose(copies, [1 - np.sqrt(0.98), SHARED_OPACITY_MIN, 0.004], rtol=CLOSED_FORM)
 
 
 def test_many_copies_of_an_opaque_gaussian():

@@ -93,7 +93,7 @@ def test_the_mask_is_not_edited(gaussians, rng):
 def test_tiny_image_does_not_split_everybody():
     """2e-4 of 40 x 30 pixels is a quarter of a pixel."""
     counts = np.array([0, 1, 64, 65])
-    assert_array_equal(is_blurred(counts, 40, 30, area_fraction=AREA_FRACTION, least_area=64), [0, 0, 0, 1])
+    assert_array_equal(is_blurred(counts, 40, 30, area_fraction=AREA_FRACTION, min_area=64), [0, 0, 0, 1])
     assert_array_equal(is_blurred(counts, 40, 30, area_fraction=AREA_FRACTION), [0, 1, 1, 1])
 
 

@@ -75,7 +75,7 @@ def test_children_are_distributed_as_the_parent(rng):
 
 def test_prune_faint(gaussians):
     opacities = np.array([0.004, 0.0051, 0.5, 0.0049, 0.9])
-    edit = prune_faint(gaussians._replace(opacity_logits=np.log(opacities / (1 - opacities))), least_opacity=0.005)
+    edit = prune_faint(gaussians._replace(opacity_logits=np.log(opacities / (1 - opacities))), min_opacity=0.005)
     assert_array_equal(edit.parent_ids, [1, 2, 4])
     assert not edit.is_new.any()
 
@@ -101,7 +101,7 @@ def test_empty_population(rng):
     nobody = make_gaussians(rng, 0)
     for edit in (
         edit_of(nobody, np.zeros(0), rng),
-        prune_faint(nobody, least_opacity=0.005),
+        prune_faint(nobody, min_opacity=0.005),
         prune_large(nobody, size_limit=1.0),
     ):
         assert len(edit.gaussians.means) == len(edit.parent_ids) == len(edit.is_new) == 0

@@ -55,7 +55,7 @@ def given(*pixel_points):
 
 def draw(views, n_points, points_of, rng, *, gaussians=None, **guards):
     """As in the paper but for the guards given."""
-    guards = {"least_alpha": 0.0, "depth_tolerance": None} | guards
+    guards = {"min_alpha": 0.0, "depth_tolerance": None} | guards
     return reinitial_points(gaussians, views, n_points, points_of=points_of, rng=rng, **guards)
 
 
@@ -162,7 +162,7 @@ def test_opacity_floor_and_mask(rng):
     alpha = np.full((18, 24), 0.49)
     alpha[:10] = 0.5
     view = view._replace(mask=np.arange(24) < np.full((18, 1), 6))
-    _, colors = draw([view], 10_000, given((np.ones((18, 24)), alpha)), rng, least_alpha=0.5)
+    _, colors = draw([view], 10_000, given((np.ones((18, 24)), alpha)), rng, min_alpha=0.5)
     assert_array_equal(np.unique(pixel_ids(colors, view)), np.flatnonzero(view.mask & (alpha >= 0.5)))
 
 
@@ -356,7 +356,7 @@ def test_paper_puts_points_off_the_surface_and_the_vote_fewer(outdoor, trained):
 def test_opacity_floor_spares_a_sky_that_is_not_painted(outdoor, rng):
     gaussians = initial_gaussians(outdoor.scene, 0, rng)
     _, paper = wrong_and_sky_shares(gaussians, outdoor)
-    _, floored = wrong_and_sky_shares(gaussians, outdoor, least_alpha=0.9)
+    _, floored = wrong_and_sky_shares(gaussians, outdoor, min_alpha=0.9)
     assert paper > 0.15  # the failure: measured 0.20
     assert floored < 0.5 * paper  # measured 0.06
 
@@ -378,15 +378,15 @@ def test_blended_depth_is_worst(outdoor, trained):
 @pytest.mark.parametrize("depth_tolerance", [None, DEPTH_TOLERANCE])
 def test_nothing_to_draw_is_one_clear_line(points_of, depth_tolerance, rng):
     views = views_of([make_camera()] * 3, rng)
-    for gaussians, least_alpha in ((make_gaussians(rng, 0), 0.0), (round_gaussian(3.0, 0.5), 0.6)):
-        with pytest.raises(InputError, match="lower least_alpha"):
+    for gaussians, min_alpha in ((make_gaussians(rng, 0), 0.0), (round_gaussian(3.0, 0.5), 0.6)):
+        with pytest.raises(InputError, match="lower min_alpha"):
             draw(
                 views,
                 100,
                 points_of,
                 rng,
                 gaussians=gaussians,
-                least_alpha=least_alpha,
+                min_alpha=min_alpha,
                 depth_tolerance=depth_tolerance,
             )
 
@@ -402,5 +402,5 @@ def test_depths_that_do_not_fit_into_memory_are_one_clear_line(rng, monkeypatch)
     with pytest.raises(InputError, match=r"depths of all 3 views take 10 kB of memory, 10 kB are free: .*3dgs-accel"):
         draw(views, 100, given(), rng)
     monkeypatch.setattr(memory, "free_bytes", lambda: 8.0 * 3 * 24 * 18)
-    with pytest.raises(InputError, match="lower least_alpha"):  # it went on
+    with pytest.raises(InputError, match="lower min_alpha"):  # it went on
         draw(views, 100, midpoint_points, rng, gaussians=make_gaussians(rng, 0))

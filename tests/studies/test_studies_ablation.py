@@ -65,7 +65,7 @@ def test_each_variant_lacks_one_thing():
 def test_deviations_are_taken_back():
     variants = variants_of(RECIPES["mini-splatting2"], 3_000, DEVIATIONS)
     assert set(variants) == set(DEVIATIONS) - {"size limit by distance", "no bias correction"} | {FULL}
-    assert settings_of(variants["cap of the population"])["most_per_pixel"] == np.inf
+    assert settings_of(variants["cap of the population"])["max_per_pixel"] == np.inf
     rates = [variants[name].learning_rates.of["sh_dc"] for name in ("raised rates", FULL)]
     assert rates[0] == RECIPES["3dgs"].learning_rates.of["sh_dc"] < rates[1]
     published = variants_of(RECIPES["mini-splatting"], 30_000, DEVIATIONS)
@@ -86,7 +86,7 @@ def test_fewer_events_are_a_deviation_of_short_runs():
 
 def test_steps_that_the_released_code_loses(room):
     """Of six steps the one with an event that may change the population, and the last, change nothing."""
-    events = (At(3, partial(gaussian_splatting.prune_faint, least_opacity=1e-9)),)
+    events = (At(3, partial(gaussian_splatting.prune_faint, min_opacity=1e-9)),)
     recipe = with_lost_steps(RECIPES["3dgs-accel"]._replace(iterations=6, events=events))
     ends = {}
     state = train(

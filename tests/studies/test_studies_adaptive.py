@@ -46,14 +46,14 @@ def test_each_rule_is_taken_out():
     assert recipes["no cool-down"].cooling.last_per_extent == 1.0
     assert recipes["all bands"].sh_milestones and len(names["all bands"]) == len(names["adaptive"]) - 2
     assert settings_of(recipes["no bands"])["views_per_coefficient"] == np.inf
-    assert settings_of(recipes["no cut of bands"])["least_variation"] == 0.0
-    assert settings_of(recipes["no prune"])["least_slope"] == 0.0
+    assert settings_of(recipes["no cut of bands"])["min_variation"] == 0.0
+    assert settings_of(recipes["no prune"])["min_slope"] == 0.0
     assert settings_of(recipes["largest gradients first"])["error_views"] == 0
     for name, way in (("prune by blend weight", "prune_by_weight"), ("prune by exact change", "prune_by_exact_change")):
         assert [n.replace(way, "prune_in_slices") for n in names[name]] == names["adaptive"] != names[name]
-    assert settings_of(recipes["no sky"])["least_sky_gain"] == np.inf
-    assert settings_of(recipes["no exposures"])["least_exposure_gain"] == np.inf
-    assert settings_of(recipes["no poses"])["least_pose_gain"] == np.inf
+    assert settings_of(recipes["no sky"])["min_sky_gain"] == np.inf
+    assert settings_of(recipes["no exposures"])["min_exposure_gain"] == np.inf
+    assert settings_of(recipes["no poses"])["min_pose_gain"] == np.inf
     for recipe in recipes.values():
         assert recipe.cooling.hold_out_every == ADAPTIVE.cooling.hold_out_every
 
@@ -104,18 +104,18 @@ def test_regret_by_hand():
 
 def test_the_sweep_goes_from_little_growth_to_much():
     settings = [settings_of(change(ADAPTIVE)) for change in adaptive.SWEEP.values()]
-    growth = [(-each["threshold"], each["most_at_once"]) for each in settings]
+    growth = [(-each["threshold"], each["max_growth"]) for each in settings]
     assert len(growth) == 8 and growth == sorted(set(growth))
     assert adaptive.SWEEP["adaptive"](ADAPTIVE) == ADAPTIVE
     for each in settings:
-        others = {"threshold": 4e-4, "most_at_once": 0.2}
+        others = {"threshold": 4e-4, "max_growth": 0.2}
         assert {**each, **others} == settings_of(ADAPTIVE), "nothing else differs"
 
 
 def test_a_rule_can_be_asked_for_by_its_name():
     named = adaptive._named(["3dgs", "large views at once", "adaptive"])
     assert list(named) == ["3dgs", "large views at once", "adaptive"] and named["adaptive"] == ADAPTIVE
-    sides = [settings_of(named[name])["least_side"] for name in ("large views at once", "adaptive")]
+    sides = [settings_of(named[name])["min_side"] for name in ("large views at once", "adaptive")]
     assert sides[0] == np.inf > sides[1]
     with pytest.raises(InputError, match="recipe 'small views' does not exist"):
         adaptive._named(["small views"])

@@ -19,8 +19,8 @@ from minisplat_ref.studies import EXPOSURE, POSE
 from minisplat_ref.studies import exposures as exposures_study
 from minisplat_ref.studies import poses as poses_study
 from minisplat_ref.training.calibration import (
+    ANGLE_MIN,
     EXPOSURES,
-    LEAST_ANGLE,
     ROTATIONS,
     SHIFTS,
     correct_pose,
@@ -50,7 +50,7 @@ BACKGROUND = np.array([0.2, 0.5, 0.8])
 DEPTH = frozenset({"depth"})
 
 # Angles with a formula of their own each: none, rounding alone, both sides of the series' limit, usual, half a turn.
-ANGLES = (0.0, 1e-9, 1e-5, 0.9 * LEAST_ANGLE, 1.1 * LEAST_ANGLE, 1.0, np.pi - 1e-6)
+ANGLES = (0.0, 1e-9, 1e-5, 0.9 * ANGLE_MIN, 1.1 * ANGLE_MIN, 1.0, np.pi - 1e-6)
 
 # A Jacobian by central differences with a step of 1e-6: 1e-12 times third derivatives of order 1, 1e-16 by 1e-6.
 JACOBIAN_BY_DIFFERENCES = 1e-9
@@ -221,7 +221,7 @@ def test_left_jacobian_is_the_derivative_of_the_exponential(rng, angle):
 def test_left_jacobian_has_no_step_where_the_series_ends(rng):
     """The two formulas meet: a difference between them would be one of the gradient, too small to see otherwise."""
     axis = rotation_vector(rng, 1.0)
-    below, above = (left_jacobian(LEAST_ANGLE * (1 + side * 1e-12) * axis) for side in (-1, 1))
+    below, above = (left_jacobian(ANGLE_MIN * (1 + side * 1e-12) * axis) for side in (-1, 1))
     assert_allclose(below, above, rtol=0, atol=3e-16)  # what 1e-12 of the angle changes, and a rounding
 
 

@@ -12,7 +12,7 @@ from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.io.scene import half_size
 from minisplat_ref.methods import adaptive_exposure
-from minisplat_ref.methods.adaptive import LEAST_GAIN
+from minisplat_ref.methods.adaptive import GAIN_MIN
 from minisplat_ref.methods.adaptive_antialiasing import switch_antialiasing_on
 from minisplat_ref.methods.adaptive_evidence import Evidence
 from minisplat_ref.rendering import SPLATTING, Request
@@ -104,26 +104,26 @@ def scene_of(truth, has_two_sizes):
 def decided(truth, scene):
     """Where the Gaussians are a little weaker than in truth, as if they had learned what the low-pass adds."""
     state = state_of(scene, truth._replace(opacity_logits=truth.opacity_logits - 1))
-    return state, switch_antialiasing_on(state, iteration_of(scene), least_antialiasing_gain=LEAST_GAIN)
+    return state, switch_antialiasing_on(state, iteration_of(scene), min_antialiasing_gain=GAIN_MIN)
 
 
 def test_two_sizes_ask_for_it(truth):
     scene = scene_of(truth, has_two_sizes=True)
     state, note = decided(truth, scene)
     assert "explain" in note and state.pace.switched_on == ("antialiasing",) and COMPENSATION in state.shared
-    assert state.pace.decisions[0].gain > LEAST_GAIN
-    again = switch_antialiasing_on(state, iteration_of(scene), least_antialiasing_gain=LEAST_GAIN)
+    assert state.pace.decisions[0].gain > GAIN_MIN
+    again = switch_antialiasing_on(state, iteration_of(scene), min_antialiasing_gain=GAIN_MIN)
     assert again == "nothing done: opacities are compensated"
 
 
 @pytest.mark.parametrize(
-    ("gain", "least_antialiasing_gain", "are_on"),
-    [(0.2, LEAST_GAIN, False), (0.2, np.inf, True), (20.0, LEAST_GAIN, True)],
+    ("gain", "min_antialiasing_gain", "are_on"),
+    [(0.2, GAIN_MIN, False), (0.2, np.inf, True), (20.0, GAIN_MIN, True)],
 )
-def test_of_gains_and_compensation_what_explains_more(gain, least_antialiasing_gain, are_on, truth, monkeypatch):
+def test_of_gains_and_compensation_what_explains_more(gain, min_antialiasing_gain, are_on, truth, monkeypatch):
     found = Evidence(gain, 0.01, np.zeros((N_VIEWS, 1)))
     monkeypatch.setattr(adaptive_exposure, "exposure_evidence", lambda *_: found)
-    least = {"least_exposure_gain": LEAST_GAIN, "least_antialiasing_gain": least_antialiasing_gain}
+    least = {"min_exposure_gain": GAIN_MIN, "min_antialiasing_gain": min_antialiasing_gain}
     scene = scene_of(truth, has_two_sizes=True)
     state = state_of(scene, truth._replace(opacity_logits=truth.opacity_logits - 1))
     note = adaptive_exposure.switch_exposure_on(state, iteration_of(scene), **least)

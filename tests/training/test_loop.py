@@ -121,7 +121,7 @@ def test_the_loop_tells_whether_views_were_halved(scene):
     recipe, told = PLAIN._replace(iterations=4, half_size_until=3), []
     train(scene, recipe, seed=0, on_step=lambda report: told.extend((report.step, event) for event in report.fired))
     assert told == []  # the views are too small for it
-    recipe = recipe._replace(least_half_size=8)
+    recipe = recipe._replace(min_half_size=8)
     train(scene, recipe, seed=0, on_step=lambda report: told.extend((report.step, event) for event in report.fired))
     n = N_GAUSSIANS
     assert told == [(1, FiredEvent("half_size_views", n, n, 0.0, "until iteration 3"))]

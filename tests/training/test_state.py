@@ -66,7 +66,7 @@ def test_pruning_keeps_moments_and_statistics_in_step(state):
     state.stats = {"view_count": np.arange(N), "is_blurred": np.eye(N, dtype=bool)}
     state.gaussians.opacity_logits[:] = [0.0, -9.0, 0.0, -9.0]
     kept = take(state.gaussians, np.array([0, 2]))
-    gaussian_splatting.prune_faint(state, make_iteration(), least_opacity=0.005)
+    gaussian_splatting.prune_faint(state, make_iteration(), min_opacity=0.005)
     for field, expected in zip(state.gaussians, kept, strict=True):
         assert_array_equal(field, expected)
     assert_array_equal(state.adam.first.quats[:, 0], [1, 3])

@@ -170,8 +170,8 @@ def _write_wide(part, survey, projection, screen, layers, cells, cursors, wide):
         ids = survey.wide[part, kind]
         for i in range(0, ids[-1], WIDTH):
             rows = listed_rows(ids, i)
-            outline, most_rows = outlines(rows, projection, alpha_min)
-            for row in range(most_rows):
+            outline, max_rows = outlines(rows, projection, alpha_min)
+            for row in range(max_rows):
                 write_spans(rows, row, outline, projection, spans)
             for k in range(min(WIDTH, ids[-1] - i)):
                 n = ids[i + k]

@@ -16,10 +16,10 @@ from minisplat_ref.datasets.synthetic.tracer import pixel_rays
 from minisplat_ref.io.scene import rescale_camera
 from minisplat_ref.types import Camera, Floats, Scene
 
-MOST_POINTS = 200_000  # of the true surface; a few centimetres apart in a room, and searched in a fraction of a second
+POINTS_MAX = 200_000  # of the true surface; a few centimetres apart in a room, and searched in a fraction of a second
 # A Gaussian of less than this opacity lets nine tenths of the light by even at its centre: it is hardly a surface.
 # Right after an opacity reset (to 0.01) there is none above it, and no distance.
-LEAST_OPACITY = 0.1
+OPACITY_MIN = 0.1
 # Extents around the cameras. Beyond, points are sparse on either side and the sky has no surface, so that a few
 # distances would outweigh all others.
 NEAR = 3.0
@@ -29,7 +29,7 @@ class Surface(NamedTuple):
     """Points of the true surface near the cameras."""
 
     cloud: cKDTree
-    """Of at most MOST_POINTS points, world frame."""
+    """Of at most POINTS_MAX points, world frame."""
     centre: Floats
     """[3] mean of the training cameras' centres."""
     extent: float
@@ -65,8 +65,8 @@ def surface_near(points: Floats, cameras: Sequence[Camera], extent: float) -> Su
     """Return the surface of what is near the cameras of points [P, 3]; None if nothing is."""
     centre = np.mean([camera.center for camera in cameras], axis=0)  # [3]
     points = points[_is_near(points, centre, extent)]
-    if len(points) > MOST_POINTS:
-        points = np.random.default_rng(0).choice(points, MOST_POINTS, replace=False)
+    if len(points) > POINTS_MAX:
+        points = np.random.default_rng(0).choice(points, POINTS_MAX, replace=False)
     return Surface(cKDTree(points), centre, extent) if len(points) else None
 
 
@@ -83,12 +83,12 @@ def shown_points(cameras: Sequence[Camera], depths: Sequence[Floats]) -> Floats:
 def surface_distance(gaussians: Any, surface: Surface) -> float | None:
     """Return the Chamfer distance between the centres of Gaussians and the true surface, in extents of the scene.
 
-    Of the Gaussians those near the cameras count that have an opacity of at least LEAST_OPACITY; None if there is none.
+    Of the Gaussians those near the cameras count that have an opacity of at least OPACITY_MIN; None if there is none.
     """
     means = gaussians.means.astype(np.float64)  # [N, 3]
     counts = _is_near(means, surface.centre, surface.extent)
     if hasattr(gaussians, "opacity_logits"):  # an extension's population may have none
-        counts &= gaussians.opacity_logits >= np.log(LEAST_OPACITY / (1 - LEAST_OPACITY))
+        counts &= gaussians.opacity_logits >= np.log(OPACITY_MIN / (1 - OPACITY_MIN))
     return chamfer(means[counts], surface.cloud) / surface.extent if counts.any() else None
 
 

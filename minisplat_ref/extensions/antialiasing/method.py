@@ -98,6 +98,6 @@ _measure = partial(measure_filters, variance=VARIANCE)
 
 ANTIALIASING = GS_ACCEL._replace(
     name="antialiasing",
-    events=(*GS_ACCEL.events, At(1, _measure), Every(100, _measure, least_gap=DENSIFY_LEAST_GAP // 2)),
+    events=(*GS_ACCEL.events, At(1, _measure), Every(100, _measure, min_gap=DENSIFY_LEAST_GAP // 2)),
 )
 """The recipe ``antialiasing``: 3DGS with Mip-Splatting's two filters."""

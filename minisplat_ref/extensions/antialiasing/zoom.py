@@ -19,7 +19,7 @@ from minisplat_ref.types import Floats, Model, Scene, View, view_from
 
 RECIPES = {"3dgs-accel": "#8a8580", "antialiasing": "#d2493f", "analytic": "#35608c"}
 FARTHEST = 8  # times smaller than the training views
-LEAST_SIZE = 4  # pixels per side of the smallest picture that is measured
+SIZE_MIN = 4  # pixels per side of the smallest picture that is measured
 
 
 class Trained(NamedTuple):
@@ -48,7 +48,7 @@ def blocks(scene: Scene, downscale: int) -> list[int]:
     sides = [FARTHEST * downscale]
     while sides[-1] % 2 == 0:
         sides.append(sides[-1] // 2)
-    return [n for n in sides if min(camera.width, camera.height) // n >= LEAST_SIZE]
+    return [n for n in sides if min(camera.width, camera.height) // n >= SIZE_MIN]
 
 
 def psnrs(found: Trained, scene: Scene, sides: list[int]) -> list[float]:

@@ -25,12 +25,12 @@ from minisplat_ref.extensions.compression.levels import Exponents
 from minisplat_ref.io.formats import Format
 from minisplat_ref.mechanisms.packing.container import WAY_OUT, Container, Packed, is_count, pack, parse, unpack
 from minisplat_ref.mechanisms.packing.morton import morton_order
-from minisplat_ref.mechanisms.packing.planes import MOST_PLANES, from_planes, to_planes, unzigzag, zigzag
+from minisplat_ref.mechanisms.packing.planes import PLANES_MAX, from_planes, to_planes, unzigzag, zigzag
 from minisplat_ref.types import Floats, Gaussians, Ints
 from minisplat_ref.validation import check_gaussians
 
 CONTAINER = Container(b"MSZ\n", version=1)
-MOST_GAUSSIANS = 2**31 - 1
+GAUSSIANS_MAX = 2**31 - 1
 EXPONENT_MAX = 200  # of a step, positive or negative: beyond the range of float32. Only steps of centres may exceed 1
 
 
@@ -164,14 +164,14 @@ def _checked(packed: Packed) -> _Header:
     """Return the header after checking every value that is read."""
     values, source = packed.header, packed.source
     n, degree, level, steps, planes = (values.get(name) for name in ("n", "sh_degree", "level", "steps", "planes"))
-    if not is_count(n, MOST_GAUSSIANS) or not is_count(degree, SH_DEGREE_MAX) or not is_count(level):
+    if not is_count(n, GAUSSIANS_MAX) or not is_count(degree, SH_DEGREE_MAX) or not is_count(level):
         raise InputError(
             f"{source}: damaged, its header says n {n}, sh_degree {degree}, level {level}, which is invalid; {WAY_OUT}"
         )
     assert isinstance(n, int) and isinstance(degree, int) and isinstance(level, int)
     header = _Header(n, degree, level, None, planes if isinstance(planes, dict) else {})
     for name in header.stream_widths:
-        if not is_count(header.planes.get(name), MOST_PLANES) or header.planes[name] == 0:
+        if not is_count(header.planes.get(name), PLANES_MAX) or header.planes[name] == 0:
             raise InputError(f"{source}: damaged, its header does not say how many planes {name} has; {WAY_OUT}")
     if level == 0:
         return header

@@ -22,7 +22,7 @@ from minisplat_ref.types import Gaussians, Model, Scene, View
 REACHES, RIMS = (2.0, 2.5, 3.0, 3.5), (0.0, 0.1, 0.2)
 SIDES = (3, 4, 6, 8, 12, 16)
 LAYERS = (4, 8, 16, 32, 64)
-MOST_VIEWS = 4  # training views that shapes are compared and fitted on
+VIEWS_MAX = 4  # training views that shapes are compared and fitted on
 FLAT, SOLID = "flat fans", "solid fans"
 FORMS = {FLAT: FanShape(reach=FRONT_REACH), SOLID: FanShape(reach=FRONT_REACH, is_flat=False)}
 
@@ -37,7 +37,7 @@ class Judge(NamedTuple):
 def judge_of(scene: Scene) -> Judge:
     """Return the scene with a few of its training views, spread evenly."""
     n = len(scene.train_views)
-    rows = np.unique(np.linspace(0, n - 1, min(n, MOST_VIEWS)).round().astype(int))
+    rows = np.unique(np.linspace(0, n - 1, min(n, VIEWS_MAX)).round().astype(int))
     return Judge(scene, [scene.train_views[row].loaded() for row in rows])
 
 
@@ -119,7 +119,7 @@ def layer_rows(fans: Fans, judge: Judge) -> list[dict[str, Any]]:
     layers = np.concatenate([tape.peeled.n_layers.ravel() for _, tape in whole])
     rows: list[dict[str, Any]] = [{"layers": "all", "mean": float(layers.mean()), "most": int(layers.max())}]
     for n in LAYERS:
-        images = [render(Model(fans), view, request, most_layers=n)[0].image for view in judge.views]
+        images = [render(Model(fans), view, request, max_layers=n)[0].image for view in judge.views]
         squares = [np.mean((image - output.image) ** 2) for image, (output, _) in zip(images, whole, strict=True)]
         rows.append({"layers": n, "rms_levels": 255 * float(np.sqrt(np.mean(squares)))})
     return rows

@@ -54,11 +54,11 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.extensions.fans.shapes import mesh_of, visible_mesh
 
     check_suffix(args.out)
-    if not 0 <= args.least_opacity <= 1:
-        raise InputError(f"--least-opacity is {args.least_opacity:g}, not in [0, 1]: give such an opacity")
+    if not 0 <= args.min_opacity <= 1:
+        raise InputError(f"--least-opacity is {args.min_opacity:g}, not in [0, 1]: give such an opacity")
     fans = load_as_fans(args.model, shape_of(args))
     whole = mesh_of(fans)
-    mesh = visible_mesh(whole, args.least_opacity)
+    mesh = visible_mesh(whole, args.min_opacity)
     write_mesh(args.out, mesh)
     left_out = len(whole.faces) - len(mesh.faces)
     print(

@@ -25,7 +25,7 @@ from minisplat_ref.training.schedule import During, Every
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
 from minisplat_ref.types import Floats, Gaussians, Model, RenderOutput, View
 
-LEAST_OPACITY = 0.02  # of a fan's most opaque vertex: 5 of 255
+OPACITY_MIN = 0.02  # of a fan's most opaque vertex: 5 of 255
 
 
 def as_fans(
@@ -46,25 +46,25 @@ class _Tape(NamedTuple):
     backend: Backend
 
 
-def render(model: Model, view: View, request: Request, *, most_layers: int | None = None) -> tuple[RenderOutput, _Tape]:
-    """Draw fans by depth peeling; ``most_layers`` are blended in a pixel, by default all.
+def render(model: Model, view: View, request: Request, *, max_layers: int | None = None) -> tuple[RenderOutput, _Tape]:
+    """Draw fans by depth peeling; ``max_layers`` are blended in a pixel, by default all.
 
     Raises
     ------
     InputError
-        Something is wanted besides colours, or ``most_layers`` is below 1.
+        Something is wanted besides colours, or ``max_layers`` is below 1.
     """
     if request.wants:
         raise InputError(f"fans are drawn without {', '.join(sorted(request.wants))}: draw the Gaussians for that")
-    if most_layers is not None and most_layers < 1:
-        raise InputError(f"most_layers is {most_layers}: give at least 1, or none for all")
+    if max_layers is not None and max_layers < 1:
+        raise InputError(f"max_layers is {max_layers}: give at least 1, or none for all")
     fans, conventions, backend = model.gaussians, request.conventions, request.backend
     dtype, v = fans.means.dtype, fans.n_vertices
     background = np.zeros(3, dtype) if request.background is None else np.asarray(request.background, dtype)
     frame = Frame(
         with_principal_point(view.camera, conventions),
         conventions.near_plane,
-        ALL_LAYERS if most_layers is None else most_layers,
+        ALL_LAYERS if max_layers is None else max_layers,
     )
     mesh = mesh_of(fans, request.is_visible)
     peeled = (kernels if backend.is_compiled else reference).peel(mesh, frame, background)
@@ -107,16 +107,16 @@ def keep_in_range(state: TrainState, iteration: Iteration) -> None:
         np.clip(field, 0, 1, out=field)
 
 
-def prune_faint_fans(state: TrainState, iteration: Iteration, *, least_opacity: float) -> None:
-    """Remove fans of which every vertex is fainter than ``least_opacity``."""
-    apply_edit(state, keep(state.gaussians, state.gaussians.opacities.max(axis=1) >= least_opacity))
+def prune_faint_fans(state: TrainState, iteration: Iteration, *, min_opacity: float) -> None:
+    """Remove fans of which every vertex is fainter than ``min_opacity``."""
+    apply_edit(state, keep(state.gaussians, state.gaussians.opacities.max(axis=1) >= min_opacity))
 
 
 FANS_OF_GAUSSIANS = Representation(
     "fans",
     population=Fans,
     extend=partial(as_fans, **FanShape()._asdict()),
-    renderer=Renderer("fans", partial(render, most_layers=None), render_vjp, channels),
+    renderer=Renderer("fans", partial(render, max_layers=None), render_vjp, channels),
     rates=Rates(
         {"rims": LogLinear(1.6e-4, 1.6e-6, 30_000), "colors": 2.5e-3, "opacities": 5e-3},
         frozenset({"rims"}),
@@ -129,7 +129,7 @@ FANS = GS_ACCEL._replace(
     sh_milestones=(),
     events=(
         During(keep_in_range),
-        Every(1_000, partial(prune_faint_fans, least_opacity=LEAST_OPACITY), least_gap=100),
+        Every(1_000, partial(prune_faint_fans, min_opacity=OPACITY_MIN), min_gap=100),
     ),
 )
 """``fans``: the vertices of fans, from the points of the scene; their number only falls."""

@@ -186,8 +186,8 @@ def mesh_of_vjp(fans: Fans, v_vertices: Floats, v_rgba: Floats) -> Fans:
     return Fans._make(np.ascontiguousarray(field) for field in fields)
 
 
-def visible_mesh(mesh: TranslucentMesh, least_opacity: float) -> TranslucentMesh:
-    """Return the mesh without triangles whose vertices all are fainter than ``least_opacity``, and unused vertices."""
-    faces = mesh.faces[(mesh.rgba[mesh.faces, 3] >= least_opacity).any(axis=1)]
+def visible_mesh(mesh: TranslucentMesh, min_opacity: float) -> TranslucentMesh:
+    """Return the mesh without triangles whose vertices all are fainter than ``min_opacity``, and unused vertices."""
+    faces = mesh.faces[(mesh.rgba[mesh.faces, 3] >= min_opacity).any(axis=1)]
     used, rows = np.unique(faces, return_inverse=True)
     return TranslucentMesh(mesh.vertices[used], mesh.rgba[used], rows.reshape(faces.shape))

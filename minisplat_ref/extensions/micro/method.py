@@ -155,14 +155,14 @@ MICRO = GS_ACCEL._replace(
             partial(halve_large, trace=WEIGHT, trace_limit=LIMIT),
             start=500,
             stop=15_000,
-            least_gap=DENSIFY_LEAST_GAP,
+            min_gap=DENSIFY_LEAST_GAP,
         ),
         Every(
             1_000,
             partial(merge_alike, merge_reach=MERGE_REACH, merge_color=MERGE_COLOR),
             start=14_999,  # the first occasion after densification, also in shorter runs
             stop=25_000,
-            least_gap=DENSIFY_LEAST_GAP,
+            min_gap=DENSIFY_LEAST_GAP,
         ),
     ),
 )

@@ -47,7 +47,7 @@ def coverage(whitened_vertices: Floats, n_vertices: Ints) -> Floats:
     return covered
 
 
-def simplified(population: MixedGaussians, *, least: float, least_height: float) -> tuple[MixedGaussians, Bools]:
+def simplified(population: MixedGaussians, *, least: float, min_height: float) -> tuple[MixedGaussians, Bools]:
     """Return a population with fewer vertices where they make no difference, and which rows have changed, [N].
 
     Parameters
@@ -55,7 +55,7 @@ def simplified(population: MixedGaussians, *, least: float, least_height: float)
     population : MixedGaussians
     least : float
         Deviations: a hull whose vertices are all nearer to each other becomes an ellipse.
-    least_height : float
+    min_height : float
         Deviations: a triangle of a smaller altitude becomes the line of its longest edge.
     """
     n, y = counts(population), whitened(population)
@@ -65,7 +65,7 @@ def simplified(population: MixedGaussians, *, least: float, least_height: float)
     longest = lengths.max(axis=1)
     is_point = (n > 1) & (longest < least)
     double = np.abs(y[:, 1, 0] * y[:, 2, 1] - y[:, 1, 1] * y[:, 2, 0])
-    is_line = (n == 3) & ~is_point & (double < least_height * longest)
+    is_line = (n == 3) & ~is_point & (double < min_height * longest)
 
     rows = np.arange(len(n))
     start = np.where(is_line, np.argmax(lengths, axis=1), 0)

@@ -54,9 +54,9 @@ PAYLOAD = Payload(
 )
 
 
-def simplify_hulls(state: TrainState, iteration: Iteration, *, least: float, least_height: float) -> str:
+def simplify_hulls(state: TrainState, iteration: Iteration, *, least: float, min_height: float) -> str:
     """Take vertices away where they make no difference; see :func:`minisplat_ref.extensions.mixed.kinds.simplified`."""
-    population, changed = simplified(state.gaussians, least=least, least_height=least_height)
+    population, changed = simplified(state.gaussians, least=least, min_height=min_height)
     return _changed(state, population, changed)
 
 
@@ -85,13 +85,13 @@ MIXED_GAUSSIANS = Representation(
     rates=Rates({"vertices": 2e-4, "n_vertices": 0.0}, frozenset({"vertices"})),
 )
 
-_changing = partial(Every, 500, stop=15_000, least_gap=100)
+_changing = partial(Every, 500, stop=15_000, min_gap=100)
 
 MIXED = GS_ACCEL._replace(
     name="mixed",
     events=(
         *GS_ACCEL.events,
-        _changing(partial(simplify_hulls, least=0.5, least_height=0.5), start=1_000),
+        _changing(partial(simplify_hulls, least=0.5, min_height=0.5), start=1_000),
         _changing(partial(promote, ratio=6.0, size_fraction=0.01), start=1_000),
     ),
 )

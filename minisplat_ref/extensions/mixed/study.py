@@ -52,7 +52,7 @@ def run(name: str, args: argparse.Namespace) -> None:
     shared_studies.check_at_least(1, iterations=args.iterations, seeds=args.seeds)
     with making_folder(args.out) as folder:
         rows, pictures = outcomes(name, args.iterations, args.seeds)
-        needed = [least_number(rows, *pair) for pair in dict.fromkeys((row["picture"], row["kind"]) for row in rows)]
+        needed = [min_number(rows, *pair) for pair in dict.fromkeys((row["picture"], row["kind"]) for row in rows)]
         result = {"iterations": args.iterations, "seeds": args.seeds, "rows": rows, "needed": needed}
         shared_studies.write(folder, result, draw(name, rows, pictures))
     print(markdown_table(["picture", "kind", "number", "floats", "PSNR", "best"], [to_line(row) for row in rows]))
@@ -88,7 +88,7 @@ def outcomes(name: str, iterations: int, n_seeds: int) -> tuple[list[dict[str, A
     return rows, pictures
 
 
-def least_number(rows: list[dict[str, Any]], picture: str, kind: str) -> dict[str, Any]:
+def min_number(rows: list[dict[str, Any]], picture: str, kind: str) -> dict[str, Any]:
     """Return how many of a kind the best training needed to reach ``ENOUGH``."""
     of_kind = [row for row in rows if (row["picture"], row["kind"]) == (picture, kind)]
     enough = [row for row in of_kind if max(row["psnr"]) >= ENOUGH]

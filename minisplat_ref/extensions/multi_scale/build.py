@@ -9,7 +9,7 @@ import numpy as np
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.multi_scale.levels import Plan, level_zero, with_levels
-from minisplat_ref.extensions.multi_scale.method import FACTOR, LEAST_COVERAGE, N_LEVELS, finest_densities
+from minisplat_ref.extensions.multi_scale.method import COVERAGE_MIN, FACTOR, N_LEVELS, finest_densities
 from minisplat_ref.io.ply import further_properties, load_ply, save_ply
 
 
@@ -27,9 +27,9 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--least-coverage",
         type=float,
-        default=LEAST_COVERAGE,
+        default=COVERAGE_MIN,
         metavar="PX",
-        help=f"merge Gaussians that cover fewer pixels (default {LEAST_COVERAGE:g})",
+        help=f"merge Gaussians that cover fewer pixels (default {COVERAGE_MIN:g})",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="PLY to write")
     parser.set_defaults(run=run)
@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     """
     from minisplat_ref.io import viewpoints
 
-    if not (1 < args.factor <= 1024 and 1 <= args.levels <= 16 and args.least_coverage > 0):
+    if not (1 < args.factor <= 1024 and 1 <= args.levels <= 16 and args.min_coverage > 0):
         raise InputError("give a --factor above 1, 1 to 16 --levels, and a --least-coverage above 0")
     gaussians = load_ply(args.ply)
     if "cells_0" in further_properties(args.ply):
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     cameras = [view.camera for view in views if view.split != "test"]
     levels = level_zero(gaussians, np.random.default_rng(0))
     if len(gaussians.means) > 0:
-        plan = Plan(args.factor, args.levels, args.least_coverage)
+        plan = Plan(args.factor, args.levels, args.min_coverage)
         levels = with_levels(levels, finest_densities(gaussians.means, cameras), plan, GSPLAT_MAIN)
     save_ply(args.out, levels)
     added = len(levels.means) - len(gaussians.means)

@@ -13,7 +13,7 @@ from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.multi_scale.levels import Plan, level_zero, with_levels
-from minisplat_ref.extensions.multi_scale.method import LEAST_COVERAGE, LEVELS, finest_densities
+from minisplat_ref.extensions.multi_scale.method import COVERAGE_MIN, LEVELS, finest_densities
 from minisplat_ref.extensions.shared_studies import psnr_of, tidy, with_progress
 from minisplat_ref.mechanisms.sampling import block_means, zoomed
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
@@ -22,8 +22,8 @@ from minisplat_ref.training.schedule import configured
 from minisplat_ref.types import Floats, Model, Scene, view_from
 
 BLOCKS = (1, 2, 4, 8, 16)
-LEAST_SIZE = 4  # pixels per side of the smallest picture that is measured
-PLANS = {"levels 2": Plan(2, 4, LEAST_COVERAGE), "levels 4": Plan(4, 2, LEAST_COVERAGE)}
+SIZE_MIN = 4  # pixels per side of the smallest picture that is measured
+PLANS = {"levels 2": Plan(2, 4, COVERAGE_MIN), "levels 4": Plan(4, 2, COVERAGE_MIN)}
 EARLY = 4  # cells are divided by this, so that coarse Gaussians appear while their cells are 4 pixels wide
 COMPENSATED = GSPLAT_MAIN._replace(is_antialiased=True)
 COLORS = dict(
@@ -102,7 +102,7 @@ class Measured(NamedTuple):
 def measure(scene: Scene, iterations: int, seeds: int) -> Measured:
     """Train with every seed, and measure every variant at every size."""
     camera = scene.test_views[0].camera
-    blocks = [n for n in BLOCKS if min(camera.width, camera.height) // n >= LEAST_SIZE]
+    blocks = [n for n in BLOCKS if min(camera.width, camera.height) // n >= SIZE_MIN]
     found: dict[str, list[list[Figures]]] = {name: [] for name in COLORS}
     counts: dict[str, list[int]] = {name: [] for name in COLORS}
     shown = min(4, blocks[-1])

@@ -39,7 +39,7 @@ class Plan(NamedTuple):
     """F: each level is for pictures smaller by this factor."""
     n_levels: int
     """Number of levels besides the finest."""
-    least_coverage: float
+    min_coverage: float
     """Gaussians that cover fewer pixels than this are merged."""
 
 
@@ -77,7 +77,7 @@ def with_levels(
     for level in range(1, plan.n_levels + 1):
         density = np.exp2(octaves[front]) / plan.factor**level  # [M]
         g = take(gaussians, front)
-        is_small = coverages(g.log_scales, g.opacity_logits, density, conventions) < plan.least_coverage
+        is_small = coverages(g.log_scales, g.opacity_logits, density, conventions) < plan.min_coverage
         ids, labels = _in_common_cells(g.means, 1 / density, is_small)
         if len(ids) == 0:
             continue

@@ -20,9 +20,9 @@ from minisplat_ref.training.state import Iteration, TrainState, apply_edit
 from minisplat_ref.types import Camera, Floats, Gaussians, Model, RenderOutput, View, view_from
 
 FACTOR, N_LEVELS = 4, 3  # levels for pictures of 1/4, 1/16 and 1/64 of the size, as in the paper
-LEAST_COVERAGE = 4.0  # pixels, of the ellipse where alpha is at least 1/255; if opaque, a standard deviation of 0.6
+COVERAGE_MIN = 4.0  # pixels, of the ellipse where alpha is at least 1/255; if opaque, a standard deviation of 0.6
 INSERTION = 15_000  # iteration at which densification has ended
-LEAST_SIZE = 8  # pixels per side of the smallest picture that is trained on
+SIZE_MIN = 8  # pixels per side of the smallest picture that is trained on
 
 
 def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
@@ -59,10 +59,10 @@ def finest_densities(means: Floats, cameras: list[Camera]) -> Floats:
 
 
 def insert_levels(
-    state: TrainState, iteration: Iteration, *, factor: int, n_levels: int, least_coverage: float
+    state: TrainState, iteration: Iteration, *, factor: int, n_levels: int, min_coverage: float
 ) -> str | None:
     """Add the coarser levels to the population."""
-    n, plan = n_rows(state.gaussians), Plan(factor, n_levels, least_coverage)
+    n, plan = n_rows(state.gaussians), Plan(factor, n_levels, min_coverage)
     if n == 0:
         return "nothing done: there are no Gaussians"
     densities = finest_densities(state.gaussians.means, [view.camera for view in iteration.scene.train_views])
@@ -77,13 +77,13 @@ def coarse(
 ) -> tuple[float, Cotangents]:
     """Return the photometric loss of a smaller picture of the view in every ``period``-th iteration, otherwise zero.
 
-    The levels alternate, as far as pictures have at least ``LEAST_SIZE`` pixels per side. The gradient goes to the
+    The levels alternate, as far as pictures have at least ``SIZE_MIN`` pixels per side. The gradient goes to the
     Gaussians directly: this picture is not the one of the other terms, and trained exposures and poses are not applied
     to it.
     """
     view, request, model = rendered.view, rendered.request, rendered.model
     sizes = [factor**level for level in range(1, n_levels + 1)]
-    sizes = [n for n in sizes if min(view.camera.width, view.camera.height) // n >= LEAST_SIZE]
+    sizes = [n for n in sizes if min(view.camera.width, view.camera.height) // n >= SIZE_MIN]
     if rendered.step % period or not sizes:
         return 0.0, Cotangents()
     n = sizes[rendered.step // period % len(sizes)]
@@ -111,7 +111,7 @@ MULTI_SCALE = GS._replace(
     ),
     events=(
         *GS.events,
-        At(INSERTION, partial(insert_levels, factor=FACTOR, n_levels=N_LEVELS, least_coverage=LEAST_COVERAGE)),
+        At(INSERTION, partial(insert_levels, factor=FACTOR, n_levels=N_LEVELS, min_coverage=COVERAGE_MIN)),
     ),
 )
 """The recipe ``multi-scale``: 3DGS and, from mid-training on, coarser levels trained on smaller pictures."""

@@ -28,16 +28,16 @@ from minisplat_ref.extensions.omg.svq import Quantised, quantise
 from minisplat_ref.io.formats import Format
 from minisplat_ref.mechanisms.packing.container import WAY_OUT, Container, Packed, is_count, pack, parse, unpack
 from minisplat_ref.mechanisms.packing.morton import morton_order
-from minisplat_ref.mechanisms.packing.planes import MOST_PLANES, from_planes, to_planes, unzigzag, zigzag
+from minisplat_ref.mechanisms.packing.planes import PLANES_MAX, from_planes, to_planes, unzigzag, zigzag
 from minisplat_ref.types import Floats, Gaussians, Ints
 from minisplat_ref.validation import check_gaussians
 
 CONTAINER = Container(b"OMG\n", version=1)
-MOST_GAUSSIANS = 2**31 - 1
-MOST_CODES = 2**16
+GAUSSIANS_MAX = 2**31 - 1
+CODES_MAX = 2**16
 LARGEST_HALF = 65504.0
 FARTHEST = 1e30  # distance of a scene's median from the origin along an axis
-LEAST_QUAT = 2.0**-10  # replaces w in a code (w, x) of zero, since (y, z) may be zero, too
+QUAT_MIN = 2.0**-10  # replaces w in a code (w, x) of zero, since (y, z) may be zero, too
 
 
 class Sizes(NamedTuple):
@@ -104,7 +104,7 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
         for name, values in vectors.items()
     }
     is_zero = (quantised["rotations"].codes[0] == 0).all(axis=1)
-    quantised["rotations"].codes[0][is_zero] = [LEAST_QUAT, 0.0]
+    quantised["rotations"].codes[0][is_zero] = [QUAT_MIN, 0.0]
     streams, planes = {}, {}
     for name, integers in _integers(offsets[order], quantised).items():
         streams[name], planes[name] = to_planes(integers)
@@ -225,7 +225,7 @@ def _checked(packed: Packed) -> _Header:
     values = {name: packed.header.get(name) for name in _Header._fields}
     n, degree, level, center, n_features, codes, planes = values.values()
     is_right = (
-        is_count(n, MOST_GAUSSIANS)
+        is_count(n, GAUSSIANS_MAX)
         and is_count(degree, SH_DEGREE_MAX)
         and is_count(level)
         and isinstance(center, list)
@@ -236,13 +236,13 @@ def _checked(packed: Packed) -> _Header:
         and set(codes) == set(WIDTHS)
         and isinstance(planes, dict)
         and set(planes) == {"means", *WIDTHS}
-        and all(is_count(n_planes, MOST_PLANES) and n_planes for n_planes in planes.values())
+        and all(is_count(n_planes, PLANES_MAX) and n_planes for n_planes in planes.values())
     )
     if is_right:
         assert isinstance(codes, dict) and isinstance(n_features, int)
         n_parts = {"scales": 3, "rotations": 2, "opacities": 1, "appearance": -(-(3 + n_features) // 2)}
         is_right = all(
-            isinstance(counts, list) and len(counts) == n_parts[name] and all(is_count(k, MOST_CODES) for k in counts)
+            isinstance(counts, list) and len(counts) == n_parts[name] and all(is_count(k, CODES_MAX) for k in counts)
             for name, counts in codes.items()
         )
     if not is_right:

@@ -20,8 +20,8 @@ from scipy.spatial import cKDTree
 from minisplat_ref.types import Floats, Ints
 
 ITERATIONS = 12
-MOST_BITS = 50  # log2 of the cells per side
-MOST_SAMPLES = 1 << 17  # vectors to which codes are fitted, evenly spaced among all
+BITS_MAX = 50  # log2 of the cells per side
+SAMPLES_MAX = 1 << 17  # vectors to which codes are fitted, evenly spaced among all
 
 
 class Quantised(NamedTuple):
@@ -61,7 +61,7 @@ def quantise(vectors: Floats, width: int, n_codes: int) -> Quantised:
 
 def fitted_codes(vectors: Floats, n_codes: int) -> Floats:
     """Return at most K codes [K, w] for vectors [N, w]; if no more than K vectors differ, these are the codes."""
-    different = np.unique(vectors[:: -(-len(vectors) // MOST_SAMPLES) or 1], axis=0)
+    different = np.unique(vectors[:: -(-len(vectors) // SAMPLES_MAX) or 1], axis=0)
     if len(different) <= n_codes:
         return different
     codes = _initial_codes(different, n_codes)
@@ -77,7 +77,7 @@ def _initial_codes(vectors: Floats, n_codes: int) -> Floats:
     """Return vectors [K, w] spread evenly over the occupied space: one per cell, of the largest cells that give K."""
     low = vectors.min(axis=0)
     side = float((vectors.max(axis=0) - low).max())
-    for bits in range(1, MOST_BITS):
+    for bits in range(1, BITS_MAX):
         cells = np.floor((vectors - low) / side * 2.0**bits)
         _, rows = np.unique(cells, axis=0, return_index=True)
         if len(rows) >= n_codes:

@@ -28,15 +28,15 @@ from minisplat_ref.mechanisms.meshes.fans import (
     fitted,
     fitted_spans,
     flattened,
-    least_widths,
+    min_widths,
     opacity_radii,
     plane_axes,
     rims,
 )
 from minisplat_ref.types import Floats, Gaussians, Ints
 
-LEAST_WIDTH = 1e-9  # of a polygon, across over along: a vertex in float64 has not many more digits than that
-MOST_SIDES = 255  # that a face of a PLY can have here
+WIDTH_MIN = 1e-9  # of a polygon, across over along: a vertex in float64 has not many more digits than that
+SIDES_MAX = 255  # that a face of a PLY can have here
 
 
 class Soup(NamedTuple):
@@ -67,8 +67,8 @@ def save_soup(path: str | Path, gaussians: Gaussians, n_sides: int) -> Soup:
     InputError
         Polygons have 3 to 255 sides, and the model has to have one.
     """
-    if not 3 <= n_sides <= MOST_SIDES:
-        raise InputError(f"a polygon has 3 to {MOST_SIDES} sides, not {n_sides}")
+    if not 3 <= n_sides <= SIDES_MAX:
+        raise InputError(f"a polygon has 3 to {SIDES_MAX} sides, not {n_sides}")
     soup = soup_of(gaussians, n_sides)
     if len(soup.rows) == 0:
         raise InputError(f"none of the {len(gaussians.means):,} Gaussians is opaque enough to have a polygon")
@@ -165,8 +165,8 @@ def carried(gaussians: Gaussians, soup: Soup, corners: Floats, source: str | Pat
     if len(moved) == 0:
         return gaussians, 0
     rows, radii, after = soup.rows[moved], soup.radii[moved], corners[moved].astype(np.float64)
-    widths = least_widths(after)
-    is_degenerate = widths <= LEAST_WIDTH
+    widths = min_widths(after)
+    is_degenerate = widths <= WIDTH_MIN
     if is_degenerate.any():
         raise InputError(
             f"{source}: polygon {moved[np.argmax(is_degenerate)]} has no area ({is_degenerate.sum()} have none): its"

@@ -20,7 +20,7 @@ from minisplat_ref.mechanisms.editing.deformation import Deformation, deformed
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.types import Bools, Floats, Gaussians
 
-LEAST_STRETCH = 1e-9  # smallest singular value of A over its largest; below this, Gaussians would be numerically flat
+STRETCH_MIN = 1e-9  # smallest singular value of A over its largest; below this, Gaussians would be numerically flat
 
 
 class Affine(NamedTuple):
@@ -99,7 +99,7 @@ def edited(gaussians: Gaussians, affine: Affine, is_selected: Bools) -> Gaussian
     if not (np.isfinite(A).all() and np.isfinite(b).all()):
         raise InputError("the map A x + b is not finite; give finite numbers")
     stretches = np.linalg.svd(A, compute_uv=False)  # descending
-    if not stretches[2] > LEAST_STRETCH * stretches[0]:
+    if not stretches[2] > STRETCH_MIN * stretches[0]:
         raise InputError(
             f"A stretches by {stretches[0]:g}, {stretches[1]:g} and {stretches[2]:g}, which flattens Gaussians;"
             " scale by numbers that are not 0"

@@ -12,7 +12,7 @@ The light that reaches x is ``E = a + (1 - a) mean_l |n . l| V_l``, with the amb
 normal is unknown, it is ``a + (1 - a) mean_l V_l``. V_l is the transmittance between x and lamp l, 0 behind a triangle
 that is not glass. A Gaussian's colour includes the light under which it was photographed; shadows multiply it.
 
-Rays that have hit ``MOST_BOUNCES`` surfaces ignore further ones, and those that carry less than ``LEAST`` end.
+Rays that have hit ``BOUNCES_MAX`` surfaces ignore further ones, and those that carry less than ``LEAST`` end.
 """
 
 from typing import NamedTuple
@@ -35,7 +35,7 @@ from minisplat_ref.mechanisms.rays.pixel_rays import Hits, Rays, Tracer
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.types import Floats, Gaussians, Ints
 
-MOST_BOUNCES = 3
+BOUNCES_MAX = 3
 LEAST = 1e-4  # of the light that a ray carries, in the brightest channel
 HITS_AT_ONCE = 1 << 17
 
@@ -78,10 +78,10 @@ def shade(world: World, rays: Rays) -> Floats:
     n_rays = len(rays.near)
     image = np.zeros((n_rays, 3))
     waiting = [_Bundle(rays, np.arange(n_rays), np.ones((n_rays, 3)))]
-    for bounce in range(MOST_BOUNCES + 1):
+    for bounce in range(BOUNCES_MAX + 1):
         following: list[_Bundle] = []
         for bundle in waiting:
-            following += _advance(world, bundle, image, sees_surfaces=bounce < MOST_BOUNCES)
+            following += _advance(world, bundle, image, sees_surfaces=bounce < BOUNCES_MAX)
         waiting = following
     return image
 

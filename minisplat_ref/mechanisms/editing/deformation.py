@@ -27,7 +27,7 @@ from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.types import Floats, Gaussians, Ints
 
 SIMILARITY = 1e-14  # rounding: by this much F^T F / c^2 may differ from the identity if F counts as a rotation times c
-LEAST_LOG_RATIO = -30.0  # of a scale to the largest; thinner ones, below 1e-13 of the length, count as that thin
+LOG_RATIO_MIN = -30.0  # of a scale to the largest; thinner ones, below 1e-13 of the length, count as that thin
 
 
 class Deformation(NamedTuple):
@@ -96,7 +96,7 @@ def _refactored(F: Floats, rows: Ints, R: Floats, log_scales: Floats) -> tuple[F
     The largest scale of each is divided out first, so that no exponential overflows.
     """
     largest = log_scales.max(axis=1, keepdims=True)  # [N, 1]
-    ratios = np.maximum(log_scales - largest, LEAST_LOG_RATIO)  # [N, 3]
+    ratios = np.maximum(log_scales - largest, LOG_RATIO_MIN)  # [N, 3]
     U, s, _ = np.linalg.svd(F[rows] @ (R * np.exp(ratios)[:, None, :]))
     log_s = np.log(s)  # [N, 3], descending
     log_s[:, 2] = np.log(np.abs(np.linalg.det(F)))[rows] + ratios.sum(axis=1) - log_s[:, 0] - log_s[:, 1]

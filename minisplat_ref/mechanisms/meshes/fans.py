@@ -164,7 +164,7 @@ def fitted(corners: Floats, radii: Floats) -> Flat:
     Parameters
     ----------
     corners, radii
-        As for :func:`fitted_spans`; no polygon may be degenerate (:func:`least_widths`).
+        As for :func:`fitted_spans`; no polygon may be degenerate (:func:`min_widths`).
 
     Returns
     -------
@@ -200,7 +200,7 @@ def by_gram_schmidt(corners: Floats, radii: Floats) -> Flat:
     return _orthogonal(means, a, b)
 
 
-def least_widths(corners: Floats) -> Floats:
+def min_widths(corners: Floats) -> Floats:
     """Return how wide polygons are, across over along: 0 where all corners coincide or lie on one line.
 
     Parameters

@@ -22,7 +22,7 @@ from minisplat_ref.io.ply_faces import read_faces
 from minisplat_ref.io.ply_file import read_vertices, write_vertices
 from minisplat_ref.types import Floats, Ints
 
-LEAST_HEIGHT = 1e-6  # of a triangle over its longest side; below, its frame loses more than half of float64's digits
+HEIGHT_MIN = 1e-6  # of a triangle over its longest side; below, its frame loses more than half of float64's digits
 
 
 class Mesh(NamedTuple):
@@ -121,7 +121,7 @@ def check_mesh(mesh: Mesh, source: str | Path) -> None:
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)  # [T, 3]
     longest = sides.max(axis=1)  # [T]
     doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)  # 2 area
-    is_flat = ~(doubled > LEAST_HEIGHT * longest**2)
+    is_flat = ~(doubled > HEIGHT_MIN * longest**2)
     if is_flat.any():
         raise InputError(
             f"{source}: triangle {np.argmax(is_flat)} has no area ({is_flat.sum()} of {len(is_flat)} have none): its"

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from minisplat_ref.types import Ints
 
-MOST_PLANES = 8
+PLANES_MAX = 8
 
 
 def zigzag(values: Ints) -> NDArray[np.uint64]:

@@ -29,7 +29,7 @@ from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
 from minisplat_ref.jit.literals import ONE, ZERO
 from minisplat_ref.jit.scheduling import dynamic_range, shared_counter
 from minisplat_ref.mechanisms.peeling.layers import (
-    LEAST_ANGLE,
+    ANGLE_MIN,
     Frame,
     Peeled,
     PeelGradient,
@@ -52,7 +52,7 @@ class Lens(NamedTuple):
     cx: float
     cy: float
     near: float
-    least_angle: float
+    min_angle: float
     width: int
     height: int
 
@@ -200,7 +200,7 @@ def _set_up(vertices, faces, lens, planes):
         row_1, row_2, normal, volume = inverse_rows(P_0, P_1, P_2)
         boxes[n, :] = 0
         # Written so that NaN is not drawn.
-        if not abs(volume) > lens.least_angle * math.sqrt(dot(normal, normal)) * math.sqrt(dot(P_0, P_0)):
+        if not abs(volume) > lens.min_angle * math.sqrt(dot(normal, normal)) * math.sqrt(dot(P_0, P_0)):
             continue
         box = np.inf, np.inf, -np.inf, -np.inf
         box = grown_by_side(box, P_0, P_1, lens)
@@ -349,7 +349,7 @@ def _shade(fragments, faces, rgba, shades):
 
 
 @kernel()
-def _blend(layers, places, shades, background, most_layers, n_threads, out):
+def _blend(layers, places, shades, background, max_layers, n_threads, out):
     taken, n_pixels = shared_counter(), layers.offsets.size - 1
     for _ in prange(n_threads):
         image, T_end, transmittances, n_blended = out
@@ -360,7 +360,7 @@ def _blend(layers, places, shades, background, most_layers, n_threads, out):
                     sift_down(ids, i, ids.size, places)
                 T, n_left = shades.dtype.type(1), ids.size
                 image[p, :] = ZERO
-                while n_left > max(ids.size - most_layers, 0):
+                while n_left > max(ids.size - max_layers, 0):
                     f = ids[0]
                     n_left -= 1
                     ids[0], ids[n_left] = ids[n_left], f
@@ -440,7 +440,7 @@ def peel(mesh: TranslucentMesh, frame: Frame, background: Floats) -> Peeled:
         np.zeros((n, 3, 3)), np.zeros((n, N_COLUMNS), dtype), np.zeros((n, 2), np.int32), np.zeros((n, 4), np.int32)
     )
     fx, fy, cx, cy = map(float, (camera.fx, camera.fy, camera.cx, camera.cy))
-    lens = Lens(fx, fy, cx, cy, float(frame.near), LEAST_ANGLE, camera.width, camera.height)
+    lens = Lens(fx, fy, cx, cy, float(frame.near), ANGLE_MIN, camera.width, camera.height)
     _set_up(vertices, mesh.faces, lens, planes)
     counts = np.zeros(n, np.int64)
     rays = Rays((np.arange(size[1]) + 0.5 - cx) / fx, (np.arange(size[0]) + 0.5 - cy) / fy, fx, lens.near)
@@ -457,7 +457,7 @@ def peel(mesh: TranslucentMesh, frame: Frame, background: Floats) -> Peeled:
     image, T_end = np.empty((n_pixels, 3), dtype), np.empty(n_pixels, dtype)
     transmittances, n_blended = np.zeros(n_fragments, dtype), np.empty(n_pixels, np.int64)
     out = image, T_end, transmittances, n_blended
-    _blend(layers, fragments.places, shades, background.astype(dtype), frame.most_layers, n_threads(), out)
+    _blend(layers, fragments.places, shades, background.astype(dtype), frame.max_layers, n_threads(), out)
     return Peeled(
         image.reshape(*size, 3),
         (1 - T_end).reshape(size),

@@ -14,7 +14,7 @@ a fixed number of them, and leaves out what lies behind.
   that also contains the point a little to the right, or else below: neither to both nor to none.
 - Of equally distant triangles the first in the list is in front.
 - What is not further than the near plane is not drawn, pixel by pixel: a triangle may pass through it.
-- A triangle that is seen at less than ``LEAST_ANGLE``, or has no area, is not drawn.
+- A triangle that is seen at less than ``ANGLE_MIN``, or has no area, is not drawn.
 
 The gradient holds coverage and order fixed: at the border of a mesh that is not transparent there, the picture jumps.
 """
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from minisplat_ref.errors import InputError
 from minisplat_ref.types import Bools, Camera, Floats, Ints
 
-LEAST_ANGLE = 1e-9  # radians between a triangle's plane and the ray to its first corner: less is noise in float64
+ANGLE_MIN = 1e-9  # radians between a triangle's plane and the ray to its first corner: less is noise in float64
 ALL_LAYERS = 1 << 30
 
 
@@ -48,7 +48,7 @@ class Frame(NamedTuple):
     camera: Camera
     near: float
     """Camera z of the near plane, world units."""
-    most_layers: int = ALL_LAYERS
+    max_layers: int = ALL_LAYERS
     """Of a pixel, at least 1; what lies behind them is left out."""
 
 
@@ -60,7 +60,7 @@ class Peeled(NamedTuple):
     alpha: Floats
     """[H, W] accumulated opacity."""
     n_layers: Ints
-    """[H, W] triangles that the pixel's ray meets, also those beyond ``most_layers``."""
+    """[H, W] triangles that the pixel's ray meets, also those beyond ``max_layers``."""
     is_seen: Bools
     """[T] whether a pixel's ray meets the triangle."""
     tape: Any

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.mechanisms.peeling.layers import (
-    LEAST_ANGLE,
+    ANGLE_MIN,
     Frame,
     Peeled,
     PeelGradient,
@@ -69,7 +69,7 @@ def peel(mesh: TranslucentMesh, frame: Frame, background: Floats) -> Peeled:
     n_pixels = camera.width * camera.height
     n_layers = np.bincount(found.pixels, minlength=n_pixels)
     is_seen = np.bincount(found.faces, minlength=len(mesh.faces)) > 0
-    found = Fragments._make(field[found.layers < frame.most_layers] for field in found)
+    found = Fragments._make(field[found.layers < frame.max_layers] for field in found)
 
     colors, alphas = _shade(mesh, found)
     image, T, transmittances = np.zeros((n_pixels, 3)), np.ones(n_pixels), np.ones(len(alphas))
@@ -161,7 +161,7 @@ def meet(corners: Floats, frame: Frame) -> Fragments:
     normals = np.cross(e_1, e_2)
     with np.errstate(divide="ignore", invalid="ignore"):
         volumes = np.sum(normals * P_0, axis=1)  # [T]
-        limits = LEAST_ANGLE * np.linalg.norm(normals, axis=1) * np.linalg.norm(P_0, axis=1)
+        limits = ANGLE_MIN * np.linalg.norm(normals, axis=1) * np.linalg.norm(P_0, axis=1)
         is_drawn = np.abs(volumes) > limits
         # [T, 3, 3]: b_i / t is the product of row i with d. Only the sign of its slope matters, and only on an edge.
         slopes = np.stack([np.cross(*corners[:, pair].swapaxes(0, 1)) for pair in ([1, 2], [2, 0], [0, 1])], axis=1)

@@ -16,7 +16,7 @@ from minisplat_ref.jit.compile import kernel, scalar
 from minisplat_ref.types import Floats, Ints
 
 LEAF = 8
-MOST_LEVELS = 64  # of a balanced tree: more than 2^63 leaves
+LEVELS_MAX = 64  # of a balanced tree: more than 2^63 leaves
 IS_INNER = -1
 SLACK = 1e-9  # of a box, relative to its size and to its distance from the origin
 
@@ -86,8 +86,8 @@ def widest_axis(rows: Ints, first: int, end: int, low: Floats, high: Floats) -> 
 @kernel(parallel=False)
 def _split_all(low: Floats, high: Floats, tree: Tree) -> int:
     """Fill the tree from the root down, and return the number of its nodes."""
-    firsts, ends = np.zeros(MOST_LEVELS, np.int64), np.zeros(MOST_LEVELS, np.int64)
-    nodes = np.zeros(MOST_LEVELS, np.int64)
+    firsts, ends = np.zeros(LEVELS_MAX, np.int64), np.zeros(LEVELS_MAX, np.int64)
+    nodes = np.zeros(LEVELS_MAX, np.int64)
     ends[0] = len(tree.rows)
     n_waiting, used = 1, 1
     while n_waiting > 0:

@@ -17,7 +17,7 @@ from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.gaussian_rows import rows_from
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import WIDTH, gather, load, maximum, minimum, reduce_any, reduce_max, select, store
-from minisplat_ref.mechanisms.rays.bvh import IS_INNER, MOST_LEVELS
+from minisplat_ref.mechanisms.rays.bvh import IS_INNER, LEVELS_MAX
 from minisplat_ref.types import Floats, Ints
 
 OPACITY = 0  # column of a record; the others are the extension's
@@ -62,8 +62,8 @@ class Found(NamedTuple):
     counts: Ints  # [8]
     left: Floats  # [8] transmittance behind all hits
     bounds: Floats  # [8] t beyond which nothing counts
-    nodes: Ints  # [MOST_LEVELS]
-    entries: Floats  # [MOST_LEVELS] a lower bound of t in the node
+    nodes: Ints  # [LEVELS_MAX]
+    entries: Floats  # [LEVELS_MAX] a lower bound of t in the node
     t: Floats  # [8] of one Gaussian
     q: Floats  # [8] of it; infinite where it is missed
 
@@ -78,8 +78,8 @@ def empty_lists(capacity):
         np.empty(WIDTH, np.int64),
         np.empty(WIDTH, np.float64),
         np.empty(WIDTH, np.float64),
-        np.empty(MOST_LEVELS, np.int64),
-        np.empty(MOST_LEVELS, np.float64),
+        np.empty(LEVELS_MAX, np.int64),
+        np.empty(LEVELS_MAX, np.float64),
         np.empty(WIDTH, np.float64),
         np.empty(WIDTH, np.float64),
     )

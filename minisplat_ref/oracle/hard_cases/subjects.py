@@ -21,7 +21,7 @@ from minisplat_ref.validation import check_gaussians, chosen_conventions
 
 Arrays = dict[str, Floats]
 
-LEAST_SLOPE = 1e-30  # of a sigmoid: float32 holds its product with a gradient still
+SLOPE_MIN = 1e-30  # of a sigmoid: float32 holds its product with a gradient still
 
 
 class Parameters(NamedTuple):
@@ -189,7 +189,7 @@ def _by_opacity(logits: Floats, v_logits: Floats) -> Floats:
     """Divide gradients with respect to logits by o (1 - o): near the ends they are too small to be compared."""
     small = np.exp(-np.abs(logits))  # float64, all digits
     slopes = small / (1 + small) ** 2
-    return np.where(slopes > LEAST_SLOPE, v_logits / np.maximum(slopes, LEAST_SLOPE), 0)
+    return np.where(slopes > SLOPE_MIN, v_logits / np.maximum(slopes, SLOPE_MIN), 0)
 
 
 def _draw_call(subject: Call, backend: Backend, dtype: np.dtype) -> Drawing:

@@ -37,7 +37,7 @@ from minisplat_ref.training.state import Iteration
 
 OPTIONS = {"n_views": 12, "width": 48, "height": 36, "n_points": 200, "test_every": 6}
 COOLING = ADAPTIVE.cooling
-FAST = configured(ADAPTIVE._replace(iterations=700), least_gain=1e9, least_step=300)  # ends as soon as it may
+FAST = configured(ADAPTIVE._replace(iterations=700), min_gain=1e9, min_step=300)  # ends as soon as it may
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +96,7 @@ def test_it_ends_after_the_cool_down(reports):
 
 
 def test_the_limit_leaves_time_to_cool(scene):
-    state = train(scene, configured(ADAPTIVE._replace(iterations=160), least_step=10_000), seed=0)
+    state = train(scene, configured(ADAPTIVE._replace(iterations=160), min_step=10_000), seed=0)
     assert state.step == 160 and state.pace.cooling_from == 100
     assert "limit of 160 iterations" in state.pace.decisions[0].why
 
@@ -118,7 +118,7 @@ def iteration(step):
 
 
 def decide(state, step):
-    return proceed_when_little_is_gained(state, iteration(step), least_gain=0.3, least_step=800)
+    return proceed_when_little_is_gained(state, iteration(step), min_gain=0.3, min_step=800)
 
 
 def test_a_slope_by_hand():
@@ -164,13 +164,13 @@ def test_those_behind_most_error_are_halved_and_not_too_many(scene):
     settings = {"threshold": 4e-4, "offset": 0.5}
     for error_views, chosen in ((24, above[1:]), (0, above[:2])):
         state.gaussians, state.stats = before, {"gradient_sum": 2 * means, "view_count": views}
-        grow(state, here, most_at_once=2 / n, error_views=error_views, **settings)
+        grow(state, here, max_growth=2 / n, error_views=error_views, **settings)
         expected = halves(before, np.sort(chosen), offset=0.5).gaussians
         for field, other in zip(state.gaussians, expected, strict=True):
             assert_array_equal(field, other)
         assert state.stats == {}
     state.pace = state.pace._replace(cooling_from=100)
-    assert "falling" in grow(state, here, most_at_once=1.0, error_views=0, **settings)
+    assert "falling" in grow(state, here, max_growth=1.0, error_views=0, **settings)
 
 
 def test_a_budget_is_a_ceiling(scene):
@@ -197,7 +197,7 @@ def test_slices_are_spread_over_the_first_part_of_the_cool_down():
     ]
 
 
-PRUNING = {"least_views": 2, "least_slope": 0.3, "most_pruned": 0.2}
+PRUNING = {"min_views": 2, "min_slope": 0.3, "max_pruned": 0.2}
 
 
 @pytest.fixture
@@ -217,7 +217,7 @@ def test_what_few_views_see_goes_when_the_rates_begin_to_fall(cooling):
         prune_in_slices(state, here._replace(step=step), **PRUNING)
         assert state.gaussians is before
     is_visible = measure_importance(state, here).is_visible
-    prune_in_slices(state, here._replace(step=11), **PRUNING | {"least_slope": 0.0})
+    prune_in_slices(state, here._replace(step=11), **PRUNING | {"min_slope": 0.0})
     assert_array_equal(state.gaussians.means, before.means[is_visible.sum(axis=1) >= 2])
     (decision,) = state.pace.decisions
     assert decision.what == "prune" and "fewer than 2 views" in decision.why
@@ -225,12 +225,12 @@ def test_what_few_views_see_goes_when_the_rates_begin_to_fall(cooling):
 
 def test_what_the_photographs_would_hardly_miss_goes_in_slices(cooling):
     state, here = cooling
-    before, settings = state.gaussians, PRUNING | {"least_views": 0}
+    before, settings = state.gaussians, PRUNING | {"min_views": 0}
     keep_out = collect_removal_costs(state.model, here.scene.train_views, background=here.scene.background)
-    prune_in_slices(state, here._replace(step=31), **settings | {"least_slope": 1e9})
+    prune_in_slices(state, here._replace(step=31), **settings | {"min_slope": 1e9})
     assert_array_equal(state.gaussians.means, before.means[np.sort(np.argsort(keep_out.changes, kind="stable")[40:])])
     assert "40 of 200 Gaussians change the training views by" in state.pace.decisions[-1].why
-    prune_in_slices(state, here._replace(step=51), **settings | {"least_slope": 1e-9})
+    prune_in_slices(state, here._replace(step=51), **settings | {"min_slope": 1e-9})
     assert len(state.gaussians.means) == 160 and len(state.pace.decisions) == 1  # a slice of less than 1 % is left out
 
 
@@ -306,7 +306,7 @@ def scene_folder(tmp_path_factory):
     return folder
 
 
-SETTINGS = ["--set", "least_gain=1e9", "--set", "least_step=300"]
+SETTINGS = ["--set", "min_gain=1e9", "--set", "min_step=300"]
 
 
 def test_train_ends_by_itself_and_says_why(scene_folder, tmp_path, capsys):
@@ -330,7 +330,7 @@ def test_train_ends_by_itself_and_says_why(scene_folder, tmp_path, capsys):
 
 def test_minutes_are_a_limit(scene_folder, tmp_path, capsys):
     run = tmp_path / "run"
-    options = ["--recipe", "adaptive", "--test-every", "6", "--set", "least_step=100000"]
+    options = ["--recipe", "adaptive", "--test-every", "6", "--set", "min_step=100000"]
     start = time.perf_counter()
     assert main(["train", str(scene_folder), *options, "--minutes", "0.1", "--out", str(run)]) == 0
     assert time.perf_counter() - start < 60  # 6 s and the evaluation, on a machine that does other things too

@@ -34,7 +34,7 @@ from tolerances import CLOSED_FORM
 
 BACKGROUND = np.array([0.3, 0.3, 0.3])
 N_VIEWS = 24
-SHORT = configured(ADAPTIVE._replace(iterations=600), least_step=10_000, budget=40)
+SHORT = configured(ADAPTIVE._replace(iterations=600), min_step=10_000, budget=40)
 
 
 # Grow -----------------------------------------------------------------------------------------------------------------
@@ -129,9 +129,9 @@ def test_it_is_cut_once_and_moments_go_too(matt):
     state.adam.first.sh_rest[:], state.adam.second.sh_rest[:] = 1, 1
     state.pace = Pace(cooling_from=10, last_step=20)
     for step in (10, 12):
-        cut_bands_when_cooling(state, iteration_of(scene, step), least_variation=0.01)
+        cut_bands_when_cooling(state, iteration_of(scene, step), min_variation=0.01)
         assert (state.stats[DEGREES] == 2).all() and SEEN in state.stats
-    cut_bands_when_cooling(state, iteration_of(scene, 11), least_variation=0.01)
+    cut_bands_when_cooling(state, iteration_of(scene, 11), min_variation=0.01)
     assert not state.stats[DEGREES].any() and not state.gaussians.sh_rest.any() and SEEN not in state.stats
     assert not state.adam.first.sh_rest.any() and not state.adam.second.sh_rest.any()
     (decision,) = state.pace.decisions

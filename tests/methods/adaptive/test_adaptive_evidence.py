@@ -138,7 +138,7 @@ def test_displacements_are_read_off(disturbed, truth, pixels):
 def test_right_poses_switch_nothing_on(truth):
     scene = scene_of(truth, np.zeros((N_VIEWS, 2)))
     state = state_of(scene, truth)
-    assert "nothing done" in switch_pose_on(state, iteration_of(scene), least_pose_gain=0.05)
+    assert "nothing done" in switch_pose_on(state, iteration_of(scene), min_pose_gain=0.05)
     assert state.shared == {} and state.pace == Pace()
     assert "nothing done" in turn_held_out(state, iteration_of(scene))
     hold_mean_pose(state, iteration_of(scene))
@@ -147,7 +147,7 @@ def test_right_poses_switch_nothing_on(truth):
 def test_wrong_poses_are_refined_from_their_displacements(disturbed, truth, pixels):
     state = state_of(disturbed, truth)
     iteration = iteration_of(disturbed)
-    switch_pose_on(state, iteration, least_pose_gain=0.05)
+    switch_pose_on(state, iteration, min_pose_gain=0.05)
     ids, held = trained_ids(N_VIEWS, ADAPTIVE.cooling, Pace()), held_out_ids(N_VIEWS, 8)
     relative = pixels[ids] - pixels[ids].mean(axis=0)
     expected = [rotation_of(disturbed.train_views[i].camera, d) for i, d in zip(ids, relative, strict=True)]
@@ -155,12 +155,12 @@ def test_wrong_poses_are_refined_from_their_displacements(disturbed, truth, pixe
     assert_allclose(state.shared[ROTATIONS][ids] * focal, np.array(expected) * focal, atol=DISPLACEMENT_PX)
     assert not state.shared[ROTATIONS][held].any() and not state.shared[SHIFTS].any()
     assert state.pace.switched_on == ("pose",) and state.pace.decisions[0].gain > 0.05
-    assert "are refined" in switch_pose_on(state, iteration, least_pose_gain=0.05)
+    assert "are refined" in switch_pose_on(state, iteration, min_pose_gain=0.05)
 
 
 def test_held_out_views_are_turned_to_the_scene(disturbed, truth, pixels):
     state = state_of(disturbed, truth)
-    switch_pose_on(state, iteration_of(disturbed), least_pose_gain=0.05)
+    switch_pose_on(state, iteration_of(disturbed), min_pose_gain=0.05)
     turn_held_out(state, iteration_of(disturbed))
     for index in held_out_ids(N_VIEWS, 8):
         camera = disturbed.train_views[index].camera
@@ -170,7 +170,7 @@ def test_held_out_views_are_turned_to_the_scene(disturbed, truth, pixels):
 
 def test_the_mean_correction_stays_zero_in_the_world(disturbed, truth):
     state = state_of(disturbed, truth)
-    switch_pose_on(state, iteration_of(disturbed), least_pose_gain=0.05)
+    switch_pose_on(state, iteration_of(disturbed), min_pose_gain=0.05)
     rng = np.random.default_rng(0)
     for name in (ROTATIONS, SHIFTS):
         state.shared[name] += rng.normal(size=3) + 0.1 * rng.normal(size=(N_VIEWS, 3))
@@ -191,7 +191,7 @@ def early(recipe):
         return event._replace(period=20, start=20) if isinstance(event, Every) else event
 
     events = tuple(changed(event) for event in recipe.events)
-    return configured(recipe._replace(events=events, iterations=320), least_step=10_000)
+    return configured(recipe._replace(events=events, iterations=320), min_step=10_000)
 
 
 def test_training_refines_the_poses_and_continues_byte_for_byte(truth, tmp_path):

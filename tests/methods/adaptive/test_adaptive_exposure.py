@@ -67,7 +67,7 @@ def test_equal_exposures_switch_nothing_on(truth):
     scene = scene_of(truth, np.ones(8))
     state = state_of(scene, truth)
     assert "nothing done" in switch_exposure_on(
-        state, iteration_of(scene), least_exposure_gain=0.05, least_antialiasing_gain=0.05
+        state, iteration_of(scene), min_exposure_gain=0.05, min_antialiasing_gain=0.05
     )
     assert state.shared == {} and state.pace == Pace()
 
@@ -76,7 +76,7 @@ def test_different_exposures_switch_them_on(disturbed, truth):
     """They begin with the gains, relative to the geometric mean; held-out views begin with the identity."""
     state = state_of(disturbed, truth)
     iteration = iteration_of(disturbed)
-    switch_exposure_on(state, iteration, least_exposure_gain=0.05, least_antialiasing_gain=0.05)
+    switch_exposure_on(state, iteration, min_exposure_gain=0.05, min_antialiasing_gain=0.05)
     ids, held = trained_ids(8, ADAPTIVE.cooling, Pace()), held_out_ids(8, 8)
     relative = np.log(GAINS[ids]) - np.log(GAINS[ids]).mean()
     exposures = state.shared[EXPOSURES]
@@ -84,13 +84,13 @@ def test_different_exposures_switch_them_on(disturbed, truth):
     assert_array_equal(exposures[held], np.tile(np.eye(3, 4), (len(held), 1, 1)))
     assert state.pace.switched_on == ("exposure",) and state.pace.decisions[0].what == "exposures"
     assert not state.shared_adam.first[EXPOSURES].any() and state.shared_adam.second[EXPOSURES].shape == (8, 3, 4)
-    assert "are on" in switch_exposure_on(state, iteration, least_exposure_gain=0.05, least_antialiasing_gain=0.05)
+    assert "are on" in switch_exposure_on(state, iteration, min_exposure_gain=0.05, min_antialiasing_gain=0.05)
 
 
 def test_the_mean_stays_the_identity(disturbed, truth):
     state = state_of(disturbed, truth)
     hold_mean_exposure(state, iteration_of(disturbed))  # nothing to hold
-    switch_exposure_on(state, iteration_of(disturbed), least_exposure_gain=0.05, least_antialiasing_gain=0.05)
+    switch_exposure_on(state, iteration_of(disturbed), min_exposure_gain=0.05, min_antialiasing_gain=0.05)
     ids, held = trained_ids(8, ADAPTIVE.cooling, Pace()), held_out_ids(8, 8)
     state.shared[EXPOSURES] += np.float32(0.1)
     before = state.shared[EXPOSURES].copy()
@@ -115,7 +115,7 @@ def early(recipe):
         return event._replace(period=20, start=20) if isinstance(event, Every) else event
 
     events = tuple(changed(event) for event in recipe.events)
-    return configured(recipe._replace(events=events, iterations=320), least_step=10_000, least_antialiasing_gain=np.inf)
+    return configured(recipe._replace(events=events, iterations=320), min_step=10_000, min_antialiasing_gain=np.inf)
 
 
 def test_training_recovers_the_gains_and_continues_byte_for_byte(disturbed, tmp_path):

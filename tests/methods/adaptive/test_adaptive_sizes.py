@@ -17,7 +17,7 @@ from minisplat_ref.training.schedule import configured
 from minisplat_ref.training.state import Iteration
 
 OPTIONS = {"n_views": 12, "width": 48, "height": 36, "n_points": 200, "test_every": 6}
-TWICE = configured(ADAPTIVE._replace(iterations=3000), least_gain=1e9, least_step=300, least_side=18)
+TWICE = configured(ADAPTIVE._replace(iterations=3000), min_gain=1e9, min_step=300, min_side=18)
 SMALL, WHOLE = (24, 18), (48, 36)
 
 
@@ -35,7 +35,7 @@ def trained(scene):
 
 
 @pytest.mark.parametrize(
-    ("width", "height", "least_side", "times"),
+    ("width", "height", "min_side", "times"),
     [
         (270, 480, 120, 1),
         (600, 240, 120, 1),
@@ -45,20 +45,20 @@ def trained(scene):
         (9, 9, 16, 0),
     ],
 )
-def test_no_side_of_any_view_becomes_shorter(scene, width, height, least_side, times):
+def test_no_side_of_any_view_becomes_shorter(scene, width, height, min_side, times):
     first, *_ = scene.train_views
     large, small = (first._replace(camera=first.camera._replace(width=k * width, height=k * height)) for k in (3, 1))
     state = initial_state(scene, ADAPTIVE, 0)
     note = halve_large_views(
-        state, Iteration(scene._replace(train_views=(large, small)), *[None] * 6), least_side=least_side
+        state, Iteration(scene._replace(train_views=(large, small)), *[None] * 6), min_side=min_side
     )
     assert state.pace.n_halvings == times and ("nothing done" in note) == (times == 0)
 
 
-@pytest.mark.parametrize("least_side", [0, -5, 15.9, float("nan")])
-def test_a_size_of_nothing_is_refused(scene, least_side):
-    with pytest.raises(InputError, match=r"least_side is .*: give at least 16 pixels"):
-        train(scene, configured(TWICE, least_side=least_side), seed=0)
+@pytest.mark.parametrize("min_side", [0, -5, 15.9, float("nan")])
+def test_a_size_of_nothing_is_refused(scene, min_side):
+    with pytest.raises(InputError, match=r"min_side is .*: give at least 16 pixels"):
+        train(scene, configured(TWICE, min_side=min_side), seed=0)
 
 
 def test_views_grow_before_the_rates_fall(trained):
@@ -103,7 +103,7 @@ def test_continued_byte_for_byte(scene, trained, tmp_path, at):
 
 def test_the_limit_leaves_small_views_behind(scene):
     sizes = []
-    recipe = configured(TWICE._replace(iterations=160), least_step=10_000)
+    recipe = configured(TWICE._replace(iterations=160), min_step=10_000)
     state = train(scene, recipe, seed=0, on_step=lambda r: sizes.append((r.view.camera.width, r.view.camera.height)))
     assert state.pace.cooling_from == 100 and set(sizes[1:100]) == {SMALL} and set(sizes[100:]) == {WHOLE}
 
@@ -117,7 +117,7 @@ def test_a_damaged_size_is_refused(n_halvings):
 def test_from_the_command_line_in_time(tmp_path, capsys):
     folder, run = tmp_path / "nook", tmp_path / "run"
     write_scene(make_scene("room", supersampling=1, **OPTIONS), folder, OPTIONS)
-    options = ["--test-every", "6", "--set", "least_step=100000", "--set", "least_side=18"]
+    options = ["--test-every", "6", "--set", "min_step=100000", "--set", "min_side=18"]
     assert main(["train", str(folder), *options, "--minutes", "0.1", "--out", str(run)]) == 0
     decisions = json.loads((run / "decisions.json").read_text())
     finer, cooled = decisions["decisions"][:2]

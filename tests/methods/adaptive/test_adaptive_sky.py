@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from adaptive_states import iteration_of, state_of
 from minisplat_ref.backends import CPU
-from minisplat_ref.methods.adaptive import ADAPTIVE, LEAST_SKY_GAIN
+from minisplat_ref.methods.adaptive import ADAPTIVE, SKY_GAIN_MIN
 from minisplat_ref.methods.adaptive_sky import (
     HUGE,
     LARGE,
@@ -106,10 +106,10 @@ def test_photographs_judge_each_other():
 def test_veils_before_a_sky_are_replaced_by_it(truth, sky):
     scene = scene_of(truth, {SKY: sky})
     state = state_of(scene, with_veils(truth, 1.5 * HUGE))
-    assert "in place of 3" in switch_sky_on(state, iteration_of(scene, 100), least_sky_gain=LEAST_SKY_GAIN)
+    assert "in place of 3" in switch_sky_on(state, iteration_of(scene, 100), min_sky_gain=SKY_GAIN_MIN)
     assert_array_equal(state.gaussians.means, truth.means)
     assert state.adam.first.means.shape == truth.means.shape
-    assert state.pace.switched_on == ("sky",) and state.pace.decisions[0].gain > LEAST_SKY_GAIN
+    assert state.pace.switched_on == ("sky",) and state.pace.decisions[0].gain > SKY_GAIN_MIN
     view = scene.train_views[0]
     nothing = type(truth)(*(field[:0] for field in truth))
     found, true = (
@@ -118,7 +118,7 @@ def test_veils_before_a_sky_are_replaced_by_it(truth, sky):
     )
     assert_allclose(found, true, atol=RECOVERED)
     assert not state.shared_adam.first[SKY].any()
-    assert "there is a sky" in switch_sky_on(state, iteration_of(scene, 100), least_sky_gain=LEAST_SKY_GAIN)
+    assert "there is a sky" in switch_sky_on(state, iteration_of(scene, 100), min_sky_gain=SKY_GAIN_MIN)
 
 
 def test_what_the_scene_has_not_learned_does_not_count(truth, sky):
@@ -135,7 +135,7 @@ def test_what_the_scene_has_not_learned_does_not_count(truth, sky):
         views.append(view._replace(image=np.where(is_hidden[:, :, None], noise, view.image)))
     for each in (scene, scene._replace(train_views=tuple(views))):
         state = state_of(each, with_veils(truth, 1.5 * HUGE))
-        switch_sky_on(state, iteration_of(each, 100), least_sky_gain=LEAST_SKY_GAIN)
+        switch_sky_on(state, iteration_of(each, 100), min_sky_gain=SKY_GAIN_MIN)
         decisions += state.pace.decisions
     assert len(decisions) == 2 and decisions[0] == decisions[1]
 
@@ -149,7 +149,7 @@ def test_photographs_that_show_no_sky_say_nothing(truth, sky):
     masks = [~np.isin(np.arange(24 * 16), pixels[k]).reshape(16, 24) for k in range(N_VIEWS)]
     views = tuple(view._replace(mask=mask) for view, mask in zip(scene.train_views, masks, strict=True))
     masked = iteration_of(scene._replace(train_views=views), 100)
-    note = switch_sky_on(state, masked, least_sky_gain=LEAST_SKY_GAIN)
+    note = switch_sky_on(state, masked, min_sky_gain=SKY_GAIN_MIN)
     assert note == "nothing done: 0 photographs show what is behind the scene without 3 large Gaussians"
     assert state.shared == {}
 
@@ -157,7 +157,7 @@ def test_photographs_that_show_no_sky_say_nothing(truth, sky):
 def test_gaussians_that_are_large_but_not_huge_stay(truth, sky):
     scene = scene_of(truth, {SKY: sky})
     state = state_of(scene, with_veils(truth, 0.5 * (LARGE + HUGE)))
-    switch_sky_on(state, iteration_of(scene, 100), least_sky_gain=LEAST_SKY_GAIN)
+    switch_sky_on(state, iteration_of(scene, 100), min_sky_gain=SKY_GAIN_MIN)
     assert state.pace.switched_on == ("sky",) and len(state.gaussians.means) == len(truth.means) + 3
 
 
@@ -166,7 +166,7 @@ def test_large_things_that_are_there_stay(truth):
     scene = scene_of(everything, {})
     state = state_of(scene, everything)
     assert "nothing done: a sky in place of 3" in switch_sky_on(
-        state, iteration_of(scene, 100), least_sky_gain=LEAST_SKY_GAIN
+        state, iteration_of(scene, 100), min_sky_gain=SKY_GAIN_MIN
     )
     assert state.shared == {} and state.pace == Pace() and len(state.gaussians.means) == len(everything.means)
 
@@ -174,7 +174,7 @@ def test_large_things_that_are_there_stay(truth):
 def test_without_large_gaussians_nothing_is_asked(truth, sky):
     scene = scene_of(truth, {SKY: sky})
     state = state_of(scene, truth)
-    assert "no Gaussian is large" in switch_sky_on(state, iteration_of(scene, 100), least_sky_gain=LEAST_SKY_GAIN)
+    assert "no Gaussian is large" in switch_sky_on(state, iteration_of(scene, 100), min_sky_gain=SKY_GAIN_MIN)
 
 
 def test_training_goes_on_with_the_sky_byte_for_byte(truth, sky, tmp_path):
