@@ -115,7 +115,7 @@ def render(
         return backend.sh_colors(gaussians.means, gaussians.sh_dc, gaussians.sh_rest, camera, sh_degree, radii)
 
     splats = splat(
-        activated(gaussians, is_visible),
+        activate(gaussians, is_visible),
         shade,
         camera,
         background,
@@ -144,7 +144,7 @@ def drawn_degree(sh_rest: Floats, wanted: int | Ints | None) -> int | Ints:
     return stored if wanted is None else np.minimum(wanted, stored)
 
 
-def activated(gaussians: Any, is_visible: Bools | None = None) -> Primitives:
+def activate(gaussians: Any, is_visible: Bools | None = None) -> Primitives:
     """Return Gaussians after their activations.
 
     Parameters

@@ -68,7 +68,7 @@ def paragraph(text: str) -> str:
     return f"<p>{escape(text)}</p>"
 
 
-def listing(texts: Iterable[str]) -> str:
+def make_list(texts: Iterable[str]) -> str:
     """Return sentences as a list."""
     return f"<ul>{''.join(f'<li>{escape(text)}</li>' for text in texts)}</ul>"
 
@@ -137,11 +137,11 @@ def slider(truth: Picture, renders: Mapping[str, Picture]) -> str:
     renders : mapping
         Pictures of the same size by their captions; of several, the reader chooses one.
     """
-    figures = [captioned(truth, "truth"), *(captioned(picture, caption) for caption, picture in renders.items())]
+    figures = [add_caption(truth, "truth"), *(add_caption(picture, caption) for caption, picture in renders.items())]
     return f'<div class="slider">{"".join(figures)}</div>'
 
 
-def captioned(picture: Picture, caption: str) -> str:
+def add_caption(picture: Picture, caption: str) -> str:
     """Return a picture with a caption."""
     height, width = picture.shape[:2]
     return (

@@ -22,12 +22,12 @@ def error_picture(truth: Picture, render: Picture) -> Picture:
     levels = truth.astype(np.int16)  # [H, W, 3]
     levels -= render
     difference = np.abs(levels, out=levels).mean(axis=2, dtype=np.float32) / 255.0  # [H, W]
-    return colored(difference, 0.0, ERROR_RANGE, "magma")
+    return colorize(difference, 0.0, ERROR_RANGE, "magma")
 
 
 def depth_picture(depth: Floats, near: float, far: float) -> Picture:
     """Colour a depth map [H, W]: near is bright, far is dark, pixels that see nothing (0) are black."""
-    return colored(depth, far, near, "viridis") * (depth > 0)[..., None].astype(np.uint8)
+    return colorize(depth, far, near, "viridis") * (depth > 0)[..., None].astype(np.uint8)
 
 
 def depth_range(depth: Floats) -> tuple[float, float]:
@@ -39,7 +39,7 @@ def depth_range(depth: Floats) -> tuple[float, float]:
     return float(near), float(far)
 
 
-def colored(values: Floats, low: float, high: float, colormap: str) -> Picture:
+def colorize(values: Floats, low: float, high: float, colormap: str) -> Picture:
     """Colour values [H, W] with a map whose ends stand for ``low`` and ``high``, in either order."""
     from matplotlib import colormaps  # not at the top: a training would wait for it before its first iteration
 
@@ -55,13 +55,13 @@ def side_by_side(pictures: list[Picture]) -> Picture:
     return np.concatenate(with_gaps[1:], axis=1)
 
 
-def split(joined: Picture, n: int) -> list[Picture]:
+def split_images(joined: Picture, n: int) -> list[Picture]:
     """Take pictures apart that :func:`side_by_side` has joined; all are of one width."""
     width = (joined.shape[1] - (n - 1) * GAP) // n
     return [joined[:, k * (width + GAP) : k * (width + GAP) + width] for k in range(n)]
 
 
-def fitting(picture: Picture, longest: int) -> Picture:
+def fit_image(picture: Picture, longest: int) -> Picture:
     """Return a picture [H, W, 3] whose longer side has at most so many pixels, averaged down where it has more."""
     height, width = picture.shape[:2]
     scale = longest / max(height, width)

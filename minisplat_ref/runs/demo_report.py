@@ -9,10 +9,11 @@ import numpy as np
 
 from minisplat_ref import __version__
 from minisplat_ref.datasets.synthetic import SyntheticScene
-from minisplat_ref.runs import run_folder
+from minisplat_ref.metrics import Evaluation
+from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.reports.commands import command
 from minisplat_ref.reports.page import (
-    captioned,
+    add_caption,
     cards,
     code,
     curves,
@@ -25,19 +26,18 @@ from minisplat_ref.reports.page import (
 )
 from minisplat_ref.reports.pictures import (
     Picture,
-    colored,
+    colorize,
     depth_picture,
     depth_range,
     error_picture,
     to_picture,
 )
+from minisplat_ref.runs import run_folder
 from minisplat_ref.runs.progress import read_log
 from minisplat_ref.runs.report_parts import ERROR_TEXT, training_curves, view_panel
 from minisplat_ref.runs.run import Outcome
 from minisplat_ref.runs.scoring import load_trained
 from minisplat_ref.runs.settings import Settings
-from minisplat_ref.metrics import Evaluation
-from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.types import Floats, Scene
 
 DEPTH_ERROR_RANGE = 0.1  # of the true depth: larger differences are all shown as the brightest colour
@@ -157,10 +157,10 @@ def _depth_panel(view: ViewPictures) -> str:
     relative = np.abs(view.depth - view.true_depth) / np.where(is_seen, view.true_depth, 1.0) * is_seen  # [H, W]
     median = float(np.median(relative[is_seen])) if is_seen.any() else 0.0
     true, rendered = (depth_picture(depth, near, far) for depth in (view.true_depth, view.depth))
-    difference = colored(relative, 0.0, DEPTH_ERROR_RANGE, "magma")
+    difference = colorize(relative, 0.0, DEPTH_ERROR_RANGE, "magma")
     pictures = [
         slider(true, {f"render, {near:.2f} to {far:.2f} units": rendered}),
-        captioned(difference, "relative difference, 0 to 10 % or more"),
+        add_caption(difference, "relative difference, 0 to 10 % or more"),
     ]
     return panel(f"{view.name}: median difference {100 * median:.1f} %", pictures, n_columns=2)
 

@@ -39,7 +39,7 @@ def gradient_factors(is_visible: Bools, frustum_count: Ints) -> Floats:
     return np.count_nonzero(is_visible, axis=1) / (frustum_count + COUNT_OFFSET)
 
 
-def seen_by_few(is_visible: Bools, min_views: int) -> Bools:
+def find_seen_by_few(is_visible: Bools, min_views: int) -> Bools:
     """Return which Gaussians are visible in fewer than ``min_views`` training views.
 
     Depth from one view is a guess; the released code removes what fewer than two views see. In a scene with two views

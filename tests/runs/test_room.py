@@ -8,13 +8,13 @@ from functools import partial
 
 import numpy as np
 import pytest
-from tiny_training import PLAIN, scene  # noqa: F401  (a fixture)
 
 from minisplat_ref import memory
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods import gaussian_splatting
 from minisplat_ref.training.loop import initial_state, train
 from minisplat_ref.training.schedule import At
+from tiny_training import PLAIN, scene  # noqa: F401  (a fixture)
 
 GIGA = 10**9
 
@@ -127,7 +127,7 @@ def double(recipe, step):
     return recipe._replace(iterations=20, events=(collect, At(step, clone)))
 
 
-def test_training_is_stopped_before_there_are_more_gaussians_than_fit(scene, monkeypatch):  # noqa: F811
+def test_training_is_stopped_before_there_are_more_gaussians_than_fit(scene, monkeypatch):
     recipe = double(PLAIN, 10)
     state = initial_state(scene, recipe, 0)
     n, row_bytes = len(state.gaussians.means), sum(field[:1].nbytes for field in state.gaussians)
@@ -139,13 +139,13 @@ def test_training_is_stopped_before_there_are_more_gaussians_than_fit(scene, mon
     assert len(state.gaussians.means) == n and np.isfinite(state.gaussians.means).all()
 
 
-def test_training_goes_on_where_they_fit(scene, monkeypatch):  # noqa: F811
+def test_training_goes_on_where_they_fit(scene, monkeypatch):
     monkeypatch.setattr(memory, "free_bytes", lambda: 1e9)
     state = train(scene, double(PLAIN, 10), seed=0)
     assert len(state.gaussians.means) == 2 * 30
 
 
-def test_fewer_gaussians_are_never_refused(scene, monkeypatch):  # noqa: F811
+def test_fewer_gaussians_are_never_refused(scene, monkeypatch):
     monkeypatch.setattr(memory, "free_bytes", lambda: 0.0)
     prune = partial(gaussian_splatting.prune_faint, min_opacity=0.09)
     recipe = PLAIN._replace(iterations=5, events=(At(3, prune),))

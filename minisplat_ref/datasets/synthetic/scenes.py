@@ -99,16 +99,16 @@ def glossy(rng: np.random.Generator) -> Setting:
     marble = Noise("#2f4858", "#dfe7e4", np.full(3, 0.3), lattice, contrast=2.2)
     primitives = [
         place(Cylinder(1.7, 0.05), Checker("#e9dfcb", "#8c6d52", 0.25), [0.0, 0.0, -0.05]),
-        place(Sphere(0.42), _polished(Plain("#a81e2b"), 0.06), [0.0, 0.0, 0.42]),
-        place(Sphere(0.26), _polished(Plain("#6d7278"), 0.7), [0.62, 0.42, 0.26]),
-        place(Sphere(0.24), _polished(marble, 0.04), [-0.6, 0.4, 0.24]),
+        place(Sphere(0.42), _polish(Plain("#a81e2b"), 0.06), [0.0, 0.0, 0.42]),
+        place(Sphere(0.26), _polish(Plain("#6d7278"), 0.7), [0.62, 0.42, 0.26]),
+        place(Sphere(0.24), _polish(marble, 0.04), [-0.6, 0.4, 0.24]),
         place(
             Box(0.22, 0.22, 0.22),
-            _polished(Checker("#f0e2c0", "#2c6e8f", 0.148), 0.05),
+            _polish(Checker("#f0e2c0", "#2c6e8f", 0.148), 0.05),
             [-0.42, -0.58, 0.22],
             turn_z(28),
         ),
-        place(Cylinder(0.15, 0.3), _polished(Plain("#d99a2b"), 0.25), [0.5, -0.5, 0.3]),
+        place(Cylinder(0.15, 0.3), _polish(Plain("#d99a2b"), 0.25), [0.5, -0.5, 0.3]),
     ]
     world = World(
         primitives=tuple(primitives),
@@ -203,7 +203,7 @@ def _studio(directions: Floats) -> Floats:
     return colors
 
 
-def _polished(texture: Texture, reflectance: float) -> Material:
+def _polish(texture: Texture, reflectance: float) -> Material:
     """A lacquered or metallic surface."""
     return Material(texture, highlight=0.8, shininess=120.0, reflectance=reflectance)
 

@@ -112,7 +112,7 @@ def meet_vjp(
     return PairGradient(v_m, v_S, v_opacities, -v_m, -t * v_m)
 
 
-def meeting_of(polygons: Polygons) -> Meeting:
+def prepare_meeting(polygons: Polygons) -> Meeting:
     """Return how rays meet these polygons."""
 
     def alphas_and_depths(rays: Rays, ray_ids: Ints, gaussian_ids: Ints) -> tuple[Floats, Floats]:

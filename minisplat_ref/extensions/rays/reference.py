@@ -97,7 +97,7 @@ def evaluate_pairs_vjp(
     return PairGradient(v_means, v_maps, v_opacities, -v_means, np.einsum("hij,hi->hj", M, v_v))
 
 
-def meeting_of(gaussians: Whitened) -> Meeting:
+def prepare_meeting(gaussians: Whitened) -> Meeting:
     """Return how rays meet these Gaussians."""
 
     def alphas_and_depths(rays: Rays, ray_ids: Ints, gaussian_ids: Ints) -> tuple[Floats, Floats]:

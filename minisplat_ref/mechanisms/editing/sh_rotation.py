@@ -59,7 +59,7 @@ def sh_rotations(Q: Floats, degree: int) -> list[Floats]:
     return [there[:, block].T @ before[:, :, block] for block in blocks]
 
 
-def rotated_sh(sh_rest: Floats, Q: Floats, rows: Ints) -> Floats:
+def rotate_sh(sh_rest: Floats, Q: Floats, rows: Ints) -> Floats:
     """Return coefficients rotated by the matrix of each row: ``c'_l = D_l(Q) c_l`` for every degree and channel.
 
     Parameters

@@ -165,17 +165,17 @@ def blend_rays_vjp(
     v_unclamped = np.where(hits.unclamped <= conventions.alpha_max, v_alphas, 0.0)
     pairs = meeting.meet_vjp(rays, ray_ids, ids, v_unclamped, hits.weights * v_depths[ray_ids])
     return RayGradient(
-        means=summed(pairs.means, ids, meeting.n),
-        shapes=summed(pairs.shapes, ids, meeting.n),
-        opacities=summed(pairs.opacities, ids, meeting.n),
-        colors=summed(hits.weights[:, None] * v_image[ray_ids], ids, meeting.n),
+        means=sum_by_row(pairs.means, ids, meeting.n),
+        shapes=sum_by_row(pairs.shapes, ids, meeting.n),
+        opacities=sum_by_row(pairs.opacities, ids, meeting.n),
+        colors=sum_by_row(hits.weights[:, None] * v_image[ray_ids], ids, meeting.n),
         background=np.sum(blended.transmittances[:, None] * v_image, axis=0),
-        origins=summed(pairs.origins, ray_ids, len(rays.near)),
-        directions=summed(pairs.directions, ray_ids, len(rays.near)),
+        origins=sum_by_row(pairs.origins, ray_ids, len(rays.near)),
+        directions=sum_by_row(pairs.directions, ray_ids, len(rays.near)),
     )
 
 
-def summed(values: Floats, rows: Ints, n_rows: int) -> Floats:
+def sum_by_row(values: Floats, rows: Ints, n_rows: int) -> Floats:
     """Return the sums [n_rows, ...] of those values [H, ...] that belong to the same row."""
     sums = np.zeros((n_rows, *values.shape[1:]))
     np.add.at(sums, rows, values)
