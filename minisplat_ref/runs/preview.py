@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from minisplat_ref.io import write_image
-from minisplat_ref.reports.pictures import error_picture, side_by_side, to_picture
+from minisplat_ref.reports.images import error_image, side_by_side, to_8_bits
 from minisplat_ref.runs.progress import Progress
 from minisplat_ref.runs.scoring import Trained, renderer_of
 from minisplat_ref.runs.settings import Settings
@@ -43,8 +43,8 @@ def make_preview(folder: Path, scene: Scene, settings: Settings, progress: Progr
             model = report.state.model
             renderer = renderer_of(settings, model)
             trained = Trained(model, renderer, scene.background, settings.profile, settings.backend)
-            picture = to_picture(trained.render(view).image[..., :3])
-            write_image(folder / FILE, side_by_side([view.image, picture, error_picture(view.image, picture)]))
+            render = to_8_bits(trained.render(view).image[..., :3])
+            write_image(folder / FILE, side_by_side([view.image, render, error_image(view.image, render)]))
         last = time.perf_counter()
 
     return on_step

@@ -3,8 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from minisplat_ref.reports.images import Image8
 from minisplat_ref.reports.page import add_caption, panel, slider, table
-from minisplat_ref.reports.pictures import Picture
 from minisplat_ref.reports.plots import BLUE, GREEN, RED, plot, to_svg
 from minisplat_ref.runs.fired import HEADING, Fired, remarks_by_mechanism, rows
 
@@ -15,7 +15,7 @@ Records = Sequence[Mapping[str, Any]]
 """Of ``log.jsonl`` or ``curve.jsonl``."""
 
 
-def view_panel(label: str, truth: Picture, render: Picture, error: Picture) -> str:
+def view_panel(label: str, truth: Image8, render: Image8, error: Image8) -> str:
     """Return a held-out view: truth against render, and the error beside them.
 
     Parameters

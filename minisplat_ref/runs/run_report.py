@@ -10,8 +10,8 @@ from minisplat_ref.io import read_image
 from minisplat_ref.io.atomic import replacing
 from minisplat_ref.io.names import file_names
 from minisplat_ref.reports.commands import command
+from minisplat_ref.reports.images import fit_image, split_images
 from minisplat_ref.reports.page import cards, code, curves, page, paragraph, section, table
-from minisplat_ref.reports.pictures import fit_image, split_images
 from minisplat_ref.reports.plots import PURPLE
 from minisplat_ref.runs import run_folder
 from minisplat_ref.runs.decisions_report import decisions_section

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.metrics import Evaluation, ViewMetrics
-from minisplat_ref.reports.pictures import Picture, to_picture
+from minisplat_ref.reports.images import Image8, to_8_bits
 from minisplat_ref.reports.plots import save_png
 from minisplat_ref.runs import fingerprint, run_folder
 from minisplat_ref.runs.opened_run import Run, open_run
@@ -68,12 +68,12 @@ def simplify_run(asked: Asked) -> dict[str, Any]:
     return result
 
 
-def _pictures(run: Run, model: Model) -> dict[str, Picture]:
+def _pictures(run: Run, model: Model) -> dict[str, Image8]:
     """Render the first test views, by their names."""
-    pictures: dict[str, Picture] = {}
+    pictures: dict[str, Image8] = {}
 
     def keep(view: View, image: Floats, _: ViewMetrics) -> None:
-        pictures[view.name] = to_picture(image)
+        pictures[view.name] = to_8_bits(image)
 
     measure(run.scene._replace(test_views=run.scene.test_views[:N_SHOWN]), model, run.settings, on_view=keep)
     return pictures

@@ -10,8 +10,8 @@ from browser import check_page
 from minisplat_ref.cli import main
 from minisplat_ref.oracle.cases import Case, Report
 from minisplat_ref.reports import commands
+from minisplat_ref.reports.images import fit_image, side_by_side, split_images
 from minisplat_ref.reports.page import add_caption, cards, make_list, page, panel, section, slider, table
-from minisplat_ref.reports.pictures import fit_image, side_by_side, split_images
 from minisplat_ref.runs.decisions_report import decisions_section, story
 from minisplat_ref.runs.report_parts import training_curves, view_panel
 from minisplat_ref.training.pace import Decision, Measurement, Pace

@@ -78,11 +78,11 @@ def test_rows_that_fit(free, rows):
 
 def test_a_picture_that_does_not_fit_names_the_size_that_does(monkeypatch):
     monkeypatch.setattr(memory, "free_bytes", lambda: 6.5e9)
-    memory.check_picture(10_000, 10_000, with_depth=False)
+    memory.check_render_size(10_000, 10_000, with_depth=False)
     with pytest.raises(InputError, match=r"20000x10000 takes about 13.0 GB, 6.5 GB are free: 14142x7071 fits"):
-        memory.check_picture(20_000, 10_000, with_depth=False)
+        memory.check_render_size(20_000, 10_000, with_depth=False)
     with pytest.raises(InputError, match="9705x9705 fits"):
-        memory.check_picture(10_000, 10_000, with_depth=True)
+        memory.check_render_size(10_000, 10_000, with_depth=True)
 
 
 def test_photographs_keep_half_of_the_free_memory(monkeypatch):
