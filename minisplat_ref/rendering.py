@@ -5,7 +5,7 @@ out: checks for NaN, which belong where a file is read; a Gaussian whose footpri
 
 A :class:`Renderer` is the pair of functions that all code calls to draw a model: training, evaluation, importance,
 depth reinitialisation, the commands. ``SPLATTING`` is that of 3DGS. Another way of drawing is another value; most wrap
-``SPLATTING``: they turn what they have into Gaussians (moved to the view's time, decoded, chosen by level), draw these,
+``SPLATTING``: they make Gaussians of what they have (moved to the view's time, decoded, chosen by level), draw these,
 and carry the gradient back.
 """
 

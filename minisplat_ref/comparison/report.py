@@ -48,7 +48,7 @@ def notes(plan: Plan, results: Results) -> list[str]:
         "Model, gradients and moments: their arrays, at most; while densifying is until cloning and splitting ends,"
         " which is when Mini-Splatting simplifies.",
         "Peak memory of the process: photographs, compiler and measuring included, LPIPS not.",
-        "Rendering: all models in one process by turns, the median of several rounds.",
+        "Rendering: all models in one process, interleaved, the median of several rounds.",
     ]
     if len(plan.seeds) > 1:
         sentences.insert(

@@ -87,7 +87,7 @@ def _direction(centre, means, rows):
 
 
 @scalar
-def _turn(staged, column, buffer, k):
+def _transpose_out(staged, column, buffer, k):
     """Transpose eight columns of the staged rows into a buffer, where number k of all eight starts at 8 k."""
     rows = (
         load(staged, column),
@@ -103,8 +103,8 @@ def _turn(staged, column, buffer, k):
 
 
 @scalar
-def _turn_back(buffer, k, staged, column):
-    """Transpose eight columns of a buffer back into staged rows: the inverse of ``_turn``."""
+def _transpose_back(buffer, k, staged, column):
+    """Transpose eight columns of a buffer back into staged rows: the inverse of ``_transpose_out``."""
     columns = (
         _at(buffer, k),
         _at(buffer, k + 1),
@@ -164,7 +164,7 @@ def _chunk_colors(span, degree, shaded, harmonics, radii, colors):
                 k = min(column, 3 * n_rest - WIDTH)
                 store(staged, r * STAGE + column, load(sh_rest, visible[i + r] * width + k))
         for column in range(0, 3 * n_rest, WIDTH):
-            _turn(staged, column, rest, min(column, 3 * n_rest - WIDTH))
+            _transpose_out(staged, column, rest, min(column, 3 * n_rest - WIDTH))
         red, green, blue = _constant(sh_dc, rows, c[0])
         for k in range(n_rest):
             red = red + _at(y, k) * _at(rest, 3 * k)
@@ -265,7 +265,7 @@ def _chunk_vjp(span, degree, shaded, harmonics, radii, v_colors, v, v_offset):
                 k = min(column, 3 * n_rest - WIDTH)
                 store(staged, r * STAGE + column, load(sh_rest, visible[i + r] * width + k))
         for column in range(0, 3 * n_rest, WIDTH):
-            _turn(staged, column, rest, min(column, 3 * n_rest - WIDTH))
+            _transpose_out(staged, column, rest, min(column, 3 * n_rest - WIDTH))
         red, green, blue = _constant(sh_dc, rows, c[0])
         for k in range(n_rest):
             red = red + _at(y, k) * _at(rest, 3 * k)
@@ -283,7 +283,7 @@ def _chunk_vjp(span, degree, shaded, harmonics, radii, v_colors, v, v_offset):
         for column in range(0, width, WIDTH):
             k = min(column, width - WIDTH)
             if k < 3 * n_rest:
-                _turn_back(rest, k, staged, column)
+                _transpose_back(rest, k, staged, column)
             for r in range(WIDTH):
                 if k < 3 * n_rest:
                     store(v_rest, visible[i + r] * width + k, load(staged, r * STAGE + column))

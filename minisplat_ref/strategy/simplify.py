@@ -231,11 +231,11 @@ def mutual_neighbours(places: Floats) -> Ints:
     is_self = nearest[:, 0] == rows
     other = np.where(is_self, nearest[:, 1], nearest[:, 0])
     order = np.argsort(np.where(is_self, distances[:, 1], distances[:, 0]), kind="stable")
-    pairs = np.column_stack([np.minimum(rows, other), np.maximum(rows, other)])[order]
-    ranks = np.full(len(places), len(pairs))
-    for column in pairs.T:
+    neighbours = np.column_stack([np.minimum(rows, other), np.maximum(rows, other)])[order]
+    ranks = np.full(len(places), len(neighbours))
+    for column in neighbours.T:
         np.minimum.at(ranks, column, rows)
-    return pairs[(ranks[pairs[:, 0]] == rows) & (ranks[pairs[:, 1]] == rows)]
+    return neighbours[(ranks[neighbours[:, 0]] == rows) & (ranks[neighbours[:, 1]] == rows)]
 
 
 def _merge_clusters(members: Any, weights: Floats, labels: Ints) -> Gaussians:

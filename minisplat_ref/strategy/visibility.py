@@ -61,7 +61,7 @@ def find_seen_by_few(is_visible: Bools, min_views: int) -> Bools:
 
 
 def culled_fraction(is_visible: Bools, frustum_count: Ints) -> float:
-    """Return the fraction of the (Gaussian, view) pairs in the frustum that culling removes.
+    """Return the fraction of the Gaussians in the frusta of all views that culling removes.
 
     Parameters
     ----------
@@ -75,5 +75,5 @@ def culled_fraction(is_visible: Bools, frustum_count: Ints) -> float:
     fraction : float
         In [0, 1]; 0 where no view sees anything.
     """
-    n_pairs = int(frustum_count.sum())
-    return 1.0 - np.count_nonzero(is_visible) / n_pairs if n_pairs else 0.0
+    n_in_frustum = int(frustum_count.sum())
+    return 1.0 - np.count_nonzero(is_visible) / n_in_frustum if n_in_frustum else 0.0

@@ -97,11 +97,11 @@ def test_the_gradient_of_pairs(rng):
 
     def forward(means, maps, opacities, origins, directions):
         moved = rays._replace(origins=origins, directions=directions)
-        pairs = reference.evaluate_pairs(Whitened(means, maps, opacities), moved, rays_ids, ids)
+        pairs = reference.intersect(Whitened(means, maps, opacities), moved, rays_ids, ids)
         return pairs.unclamped, pairs.depths
 
     def vjp(v_unclamped, v_depths):
-        parts = reference.evaluate_pairs_vjp(gaussians, rays, rays_ids, ids, v_unclamped, v_depths)
+        parts = reference.intersect_vjp(gaussians, rays, rays_ids, ids, v_unclamped, v_depths)
         rows = (ids, ids, ids, rays_ids, rays_ids)
         return tuple(sum_by_row(part, row, 3 + (row is rays_ids)) for part, row in zip(parts, rows, strict=True))
 
@@ -228,13 +228,13 @@ def test_the_gradient_of_the_whole_model(backend):
 
 
 def test_a_wrong_gradient_is_found(monkeypatch):
-    correct = reference.evaluate_pairs_vjp
+    correct = reference.intersect_vjp
 
     def wrong(*args):
         v = correct(*args)
         return v._replace(means=1.001 * v.means)
 
-    monkeypatch.setattr(reference, "evaluate_pairs_vjp", wrong)
+    monkeypatch.setattr(reference, "intersect_vjp", wrong)
     report = check_model_gradients(REFERENCE, GSPLAT_MAIN, TRACED, stages)
     assert report.n_failed == 2 and "is wrong" in report.cases[0].note
 

@@ -12,7 +12,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.rays import claims, demo, surroundings
 from minisplat_ref.extensions.rays.lights import shade, visibility
 from minisplat_ref.extensions.rays.method import TRACED, whiten_model
-from minisplat_ref.extensions.rays.reference import evaluate_pairs
+from minisplat_ref.extensions.rays.reference import intersect
 from minisplat_ref.extensions.rays.surfaces import (
     DIFFUSE,
     GLASS,
@@ -281,7 +281,7 @@ def test_mitsuba_meets_the_same_ellipsoids():
         {"type": "scene", "all": {"type": "ellipsoids", "extent": 3.0, "extent_adaptive_clamping": False, **shape}}
     )
     n, n_rays = len(g.means), len(rays.near)
-    pairs = evaluate_pairs(gaussians, rays, np.repeat(np.arange(n_rays), n), np.tile(np.arange(n), n_rays))
+    pairs = intersect(gaussians, rays, np.repeat(np.arange(n_rays), n), np.tile(np.arange(n), n_rays))
     q = np.sum(pairs.e**2, axis=1)
     entries = (pairs.depths - np.sqrt(np.maximum(9 - q, 0) / np.sum(pairs.v**2, axis=1))).reshape(-1, n)
     is_met, is_clear = (q < 9).reshape(-1, n), (np.abs(q - 9) > 0.5).reshape(-1, n)

@@ -216,9 +216,9 @@ def loss_kernel(dtype: np.dtype) -> Callable:
         sums,  # [H, 2] of |I - T| and of SSIM
         v_image,  # [H, 3 W]
     ):
-        n_rows, n_pairs = len(sums), (len(sums) + 1) // 2
+        n_rows, n_row_pairs = len(sums), (len(sums) + 1) // 2
         for band in prange(n_bands):
-            start, end = 2 * (n_pairs * band // n_bands), 2 * (n_pairs * (band + 1) // n_bands)
+            start, end = 2 * (n_row_pairs * band // n_bands), 2 * (n_row_pairs * (band + 1) // n_bands)
             loss_band(start, min(end, n_rows), inputs, v_l1, v_ssim, sums, v_image)
 
     return loss_rows

@@ -91,7 +91,7 @@ def tilts() -> list[Tilt]:
 
 
 def _turned(scales: tuple[float, float, float], angle: float) -> Gaussians:
-    """Return one gray Gaussian before the camera, turned about the x axis."""
+    """Return one gray Gaussian before the camera, rotated about the x axis."""
     quats = np.array([[math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0]])
     return Gaussians(
         means=np.array([[0.0, 0.0, DISTANCE]]),

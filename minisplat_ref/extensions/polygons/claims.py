@@ -68,7 +68,7 @@ def cloud(rng: np.random.Generator) -> Gaussians:
 def round_trips(seed: int) -> dict[int, float]:
     """Return by the number of sides the largest distance of a corner from itself after the way to a Gaussian and back.
 
-    Relative to the largest coordinate, of polygons with turned, long and thin, and round Gaussians.
+    Relative to the largest coordinate, of polygons with rotated, long and thin, and round Gaussians.
     """
     gaussians, worst = cloud(np.random.default_rng(seed)), {}
     gaussians.log_scales[::4, 1] = gaussians.log_scales[::4, 0]

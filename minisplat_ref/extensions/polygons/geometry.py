@@ -1,6 +1,6 @@
 """Flat Gaussians before they are traced, as polygons, beside the gradient.
 
-Both backends use these: they are of the size of the population, and no loop over pairs.
+Both backends use these: they are of the size of the population, and no loop over intersections.
 """
 
 from typing import Any, NamedTuple

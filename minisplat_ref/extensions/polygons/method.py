@@ -25,7 +25,7 @@ def tracer_for(polygons: Polygons, conventions: Conventions, backend: Backend) -
 
 
 def press_flat(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
-    """Return the Gaussians with a thickness of 1e-5 along their thinnest axes; balls are turned at random first.
+    """Return the Gaussians with a thickness of 1e-5 along their thinnest axes; balls are rotated at random first.
 
     Parameters
     ----------

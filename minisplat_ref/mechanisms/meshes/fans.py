@@ -15,8 +15,8 @@ Back: the corners of an edited polygon give spans again, and these an ellipse. T
 
 - :func:`fit_flat_gaussians`, the least squares over all corners, ``S = 2 / (n r) sum_j (x_j - mu) (cos phi_j, sin
   phi_j)`` with ``mu`` the mean of the corners. It is exact for every affine edit: spans that it leaves at an oblique
-  angle, as a shear does, are turned by the angle ``tan 2 theta = 2 S_a . S_b / (S_a . S_a - S_b . S_b)`` to the axes of
-  the same ellipse.
+  angle, as a shear does, are rotated by the angle ``tan 2 theta = 2 S_a . S_b / (S_a . S_a - S_b . S_b)`` to the axes
+  of the same ellipse.
 - :func:`by_gram_schmidt`, the paper's: the first corner gives the first span, the corner a quarter further on the
   second, less its component along the first. It is exact where the spans stay perpendicular, and loses any shear.
 
@@ -169,7 +169,7 @@ def fit_flat_gaussians(corners: Floats, radii: Floats) -> Flat:
     Returns
     -------
     Flat
-        Their axes are turned as little as possible from the polygons' first corner and the quarter after it.
+        Their axes are rotated as little as possible from the polygons' first corner and the quarter after it.
     """
     means, spans = fit_spans(corners, radii)
     a, b = spans[:, :, 0], spans[:, :, 1]

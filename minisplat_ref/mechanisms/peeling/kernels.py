@@ -41,7 +41,7 @@ from minisplat_ref.types import Floats, Ints
 G_1, G_2, S = 0, 3, 6  # columns of a plane: each a value at the anchor, and the slopes along x and y, per pixel
 N_COLUMNS = 9
 SLACK = 1e-6  # px that boxes and rows are too large by
-PIXELS_A_TURN = 64
+PIXELS_PER_CHUNK = 64
 
 
 class Lens(NamedTuple):
@@ -353,8 +353,8 @@ def _blend(layers, places, shades, background, max_layers, n_threads, out):
     taken, n_pixels = make_shared_counter(), layers.offsets.size - 1
     for _ in prange(n_threads):
         image, T_end, transmittances, n_blended = out
-        for turn in dynamic_range(taken, (n_pixels + PIXELS_A_TURN - 1) // PIXELS_A_TURN):
-            for p in range(turn * PIXELS_A_TURN, min((turn + 1) * PIXELS_A_TURN, n_pixels)):
+        for chunk in dynamic_range(taken, (n_pixels + PIXELS_PER_CHUNK - 1) // PIXELS_PER_CHUNK):
+            for p in range(chunk * PIXELS_PER_CHUNK, min((chunk + 1) * PIXELS_PER_CHUNK, n_pixels)):
                 ids = layers.ids[layers.offsets[p] : layers.offsets[p + 1]]
                 for i in range(ids.size // 2 - 1, -1, -1):
                     sift_down(ids, i, ids.size, places)
@@ -380,8 +380,8 @@ def _blend_vjp(layers, shades, n_blended, transmittances, background, v_output, 
     taken, n_pixels = make_shared_counter(), n_blended.size
     for _ in prange(n_threads):
         v, v_alpha = v_output
-        for turn in dynamic_range(taken, (n_pixels + PIXELS_A_TURN - 1) // PIXELS_A_TURN):
-            for p in range(turn * PIXELS_A_TURN, min((turn + 1) * PIXELS_A_TURN, n_pixels)):
+        for chunk in dynamic_range(taken, (n_pixels + PIXELS_PER_CHUNK - 1) // PIXELS_PER_CHUNK):
+            for p in range(chunk * PIXELS_PER_CHUNK, min((chunk + 1) * PIXELS_PER_CHUNK, n_pixels)):
                 ids = layers.ids[layers.offsets[p] : layers.offsets[p + 1]]
                 behind = v[p, 0] * background[0] + v[p, 1] * background[1] + v[p, 2] * background[2]
                 for i in range(ids.size - n_blended[p], ids.size):

@@ -1,4 +1,4 @@
-"""Rays through a tree of Gaussians, forward and back: what ``mechanisms.rays.blending`` says, without all pairs.
+"""Rays through a tree of Gaussians, forward and back: ``mechanisms.rays.blending`` without testing every Gaussian.
 
 The gradient needs no lock and depends on no order of threads: each ray writes what its hits contribute to rows of their
 own, and each Gaussian then adds up its rows in the order of the rays.

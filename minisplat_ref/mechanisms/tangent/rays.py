@@ -93,12 +93,12 @@ def count_misordered(is_hit: Bools, depths: Floats) -> tuple[int, int]:
     depths : ndarray of shape (G, P)
         Depths in that order, world units.
     """
-    n_pairs = n_wrong = 0
+    n_all = n_wrong = 0
     for ray in range(depths.shape[1]):
         own = depths[is_hit[:, ray], ray]
-        n_pairs += len(own) * (len(own) - 1) // 2
+        n_all += len(own) * (len(own) - 1) // 2
         n_wrong += int(np.triu(own[:, None] > own[None, :], 1).sum())
-    return n_pairs, n_wrong
+    return n_all, n_wrong
 
 
 def _list_visible(depths: Floats, radii: Ints) -> Ints:
