@@ -103,7 +103,7 @@ def rasterization(
     stages = get_backend(backend) if isinstance(backend, str) else backend
     primitives, views = Primitives(means, quats, scales, opacities), Views(viewmats, Ks, width, height)
     batch = check_batch(primitives, views, colors, sh_degree, backgrounds, render_mode)
-    tapes = [draw(batch, c, conventions, stages) for c in range(len(batch.cameras))]
+    tapes = [render_one(batch, c, conventions, stages) for c in range(len(batch.cameras))]
     images = _stack([tape.output.image for tape in tapes])  # [C, H, W, D]
     alphas = _stack([tape.output.alpha for tape in tapes])  # [C, H, W]
     if batch.has_expected_depth:
@@ -155,7 +155,7 @@ def rasterization_vjp(
     stages = get_backend(backend) if isinstance(backend, str) else backend
     primitives, views = Primitives(means, quats, scales, opacities), Views(viewmats, Ks, width, height)
     batch = check_batch(primitives, views, colors, sh_degree, backgrounds, render_mode)
-    tapes = [draw(batch, c, conventions, stages) for c in range(len(batch.cameras))]
+    tapes = [render_one(batch, c, conventions, stages) for c in range(len(batch.cameras))]
     dtype, sizes = batch.colors.dtype, {"C": len(tapes), "H": height, "W": width}
     sizes["D"] = tapes[0].output.image.shape[2]
     v_images = check.check_array("v_render_colors", v_render_colors, (("C", "H", "W", "D"),), sizes, dtype)
@@ -171,7 +171,7 @@ def rasterization_vjp(
             v_depth, v_alpha_of_depth = expected_depth_vjp(depth, tape.output.alpha, v_image[..., -1])
             v_image = np.concatenate([v_image[..., :-1], v_depth[..., None]], axis=-1)
             v_alpha = v_alpha + v_alpha_of_depth
-        v = draw_vjp(batch, c, tape, v_image, v_alpha)
+        v = render_one_vjp(batch, c, tape, v_image, v_alpha)
         for total, part in zip(v_given, v.primitives, strict=True):
             total += part
         v_own_colors = v_colors[c] if batch.has_own_colors else v_colors
@@ -311,7 +311,7 @@ def check_batch(
     return Batch(given, colors, has_own_colors, cameras, backgrounds, sh_degree, render_mode)
 
 
-def draw(batch: Batch, c: int, conventions: Conventions, backend: Backend) -> SplatTape:
+def render_one(batch: Batch, c: int, conventions: Conventions, backend: Backend) -> SplatTape:
     """Render view c; where an expected depth is wanted, the channel still holds the accumulated depth."""
     means, colors = batch.primitives.means, batch.colors_of(c)
     background = batch.backgrounds[c]
@@ -334,8 +334,8 @@ def draw(batch: Batch, c: int, conventions: Conventions, backend: Backend) -> Sp
     )
 
 
-def draw_vjp(batch: Batch, c: int, tape: SplatTape, v_image: Floats, v_alpha: Floats) -> ViewGradient:
-    """Gradient of :func:`draw`.
+def render_one_vjp(batch: Batch, c: int, tape: SplatTape, v_image: Floats, v_alpha: Floats) -> ViewGradient:
+    """Gradient of :func:`render_one`.
 
     Spherical harmonics add, via the camera's centre::
 

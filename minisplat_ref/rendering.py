@@ -130,7 +130,7 @@ def render(
     return output, RenderTape(gaussians, sh_degree, splats)
 
 
-def drawn_degree(sh_rest: Floats, wanted: int | Ints | None) -> int | Ints:
+def choose_degree(sh_rest: Floats, wanted: int | Ints | None) -> int | Ints:
     """Return the degree of the spherical harmonics to draw: the stored one, or less where less is wanted.
 
     Parameters

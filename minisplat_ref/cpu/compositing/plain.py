@@ -66,7 +66,7 @@ def forward_kernel(response: KernelResponse, n_channels: int) -> Callable:
     hit, shade, is_sorted = response.hit, response.shade, response.buffer_size > LIST_ORDER
 
     @scalar
-    def draw_row(state, scene, row, frame):
+    def composite_row(state, scene, row, frame):
         """Blend the members of a row's list, in its order."""
         T = load(state, 0)
         for m in row.members:
@@ -87,7 +87,7 @@ def forward_kernel(response: KernelResponse, n_channels: int) -> Callable:
         for k in range(n_channels):
             accumulate(state, (1 + k) * WIDTH, weight * gather(hits, rows, CHANNELS + k))
 
-    draw_sorted_row = walk_sorted(hit, shade, n_channels, take)
+    composite_sorted_row = walk_sorted(hit, shade, n_channels, take)
 
     @kernel()
     def composite_tiles(scene, background, lists, frame, n_threads, out):
@@ -101,9 +101,9 @@ def forward_kernel(response: KernelResponse, n_channels: int) -> Callable:
                     state[:] = ZERO
                     store(state, 0, full_transmittance(row, frame, state.dtype.type))
                     if is_sorted:
-                        draw_sorted_row(state, buffer, scene, row, lists.buffer_size, frame)
+                        composite_sorted_row(state, buffer, scene, row, lists.buffer_size, frame)
                     else:
-                        draw_row(state, scene, row, frame)
+                        composite_row(state, scene, row, frame)
                     pixels, T_end = row_pixels(row, frame), abs(field_of(state, 0, row, frame))
                     scatter(out.alpha, pixels, 0, ONE - T_end)
                     for k in range(n_channels):

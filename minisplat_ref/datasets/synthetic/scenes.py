@@ -19,10 +19,10 @@ from minisplat_ref.datasets.synthetic.furniture import (
     place,
     rack,
     room_shell,
+    rotate_z,
     sheet,
     table,
     tree,
-    rotate_z,
 )
 from minisplat_ref.datasets.synthetic.geometry import Primitive
 from minisplat_ref.datasets.synthetic.materials import (

@@ -68,8 +68,8 @@ def list_hits(meeting: Meeting, rays: Rays, conventions: Conventions) -> Hits:
     ids, alphas, depths, weights, rows = ([np.zeros(0, kind)] for kind in (int, float, float, float, int))
     transmittances = np.ones(n_rays)
     for some in _chunks(n_rays, n):
-        found = meeting.meet(rays, np.repeat(some, n), np.tile(np.arange(n), len(some)))
-        unclamped, t = (array.reshape(len(some), n) for array in found)
+        intersections = meeting.meet(rays, np.repeat(some, n), np.tile(np.arange(n), len(some)))
+        unclamped, t = (array.reshape(len(some), n) for array in intersections)
         alpha = np.minimum(conventions.alpha_max, unclamped)
         is_hit = (alpha >= conventions.alpha_min) & (t > rays.near[some, None]) & (t < rays.far[some, None])
         order = np.argsort(np.where(is_hit, t, np.inf), axis=1, kind="stable")  # [P', N]

@@ -19,7 +19,7 @@ from minisplat_ref.mechanisms.tangent.planes import (
 )
 from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
 from minisplat_ref.reference.hits import Response
-from minisplat_ref.rendering import SPLATTING, RenderGradient, Request, activate, drawn_degree
+from minisplat_ref.rendering import SPLATTING, RenderGradient, Request, activate, choose_degree
 from minisplat_ref.types import (
     Camera,
     Floats,
@@ -92,7 +92,7 @@ def prepare(model: Model, camera: Camera, request: Request, buffer_size: int | N
     g, backend = model.gaussians, request.backend
     size = check_buffer_size(buffer_size)
     dtype = g.means.dtype
-    sh_degree = drawn_degree(g.sh_rest, request.sh_degree)
+    sh_degree = choose_degree(g.sh_rest, request.sh_degree)
     background = np.zeros(3, dtype) if request.background is None else np.asarray(request.background, dtype)
     primitives = activate(g, request.is_visible)
     footprints = project(primitives, camera, request.conventions)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN, INRIA, MINI_SPLATTING2
-from minisplat_ref.oracle.hard_cases.scenes import call, camera, cloud, gaussians, rounded, rotation_quat
+from minisplat_ref.oracle.hard_cases.scenes import call, camera, cloud, gaussians, rotation_quat, rounded
 from minisplat_ref.oracle.hard_cases.subjects import HardCase, Parameters
 from minisplat_ref.oracle.tolerances import BEHIND, DEEP
 from minisplat_ref.reference.covariance import rotation_matrices

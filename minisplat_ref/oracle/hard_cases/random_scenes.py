@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN, INRIA, MINI_SPLATTING2
-from minisplat_ref.oracle.hard_cases.scenes import ANTIALIASED, BACKGROUND, camera, intrinsics, rounded, rotation_quat
+from minisplat_ref.oracle.hard_cases.scenes import ANTIALIASED, BACKGROUND, camera, intrinsics, rotation_quat, rounded
 from minisplat_ref.oracle.hard_cases.subjects import Call, HardCase, Parameters, Subject
 from minisplat_ref.oracle.tolerances import BEHIND, DEEP, HARMONICS, LONG, ORDINARY, WORLD, HardCaseTolerance
 from minisplat_ref.reference.covariance import rotation_matrices

@@ -10,8 +10,8 @@ from minisplat_ref.oracle.hard_cases.scenes import (
     cloud,
     gaussians,
     needle,
-    rounded,
     rotation_quat,
+    rounded,
 )
 from minisplat_ref.oracle.hard_cases.subjects import HardCase, Parameters, Surface
 from minisplat_ref.oracle.tolerances import LONG, ORDINARY

@@ -12,7 +12,7 @@ import numpy as np
 
 from minisplat_ref.backends import Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
-from minisplat_ref.gsplat_compat import Views, check_batch, draw, rasterization, rasterization_vjp
+from minisplat_ref.gsplat_compat import Views, check_batch, rasterization, rasterization_vjp, render_one
 from minisplat_ref.oracle.tolerances import ORDINARY, HardCaseTolerance
 from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.splatting import Primitives, SplatTape
@@ -107,7 +107,7 @@ def cast(bundle: Any, dtype: np.dtype) -> Any:
     return type(bundle)(*(cast(field, dtype) for field in bundle)) if isinstance(bundle, tuple) else bundle
 
 
-def drawing(subject: Subject, backend: Backend, dtype: np.dtype) -> Drawing:
+def render_subject(subject: Subject, backend: Backend, dtype: np.dtype) -> Drawing:
     """Draw a subject in one precision.
 
     Raises
@@ -157,7 +157,7 @@ def splat_tapes(subject: Subject, backend: Backend) -> list[SplatTape]:
     views = Views(a["viewmats"], a["Ks"], subject.width, subject.height)
     sh_degree, backgrounds = options.get("sh_degree"), options.get("backgrounds")
     batch = check_batch(primitives, views, a["colors"], sh_degree, backgrounds, "RGB")
-    return [draw(batch, c, conventions, backend) for c in range(len(batch.cameras))]
+    return [render_one(batch, c, conventions, backend) for c in range(len(batch.cameras))]
 
 
 def _draw_parameters(subject: Parameters, backend: Backend, dtype: np.dtype) -> Drawing:
