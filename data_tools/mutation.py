@@ -43,7 +43,7 @@ TESTS = Path("tests")
 FILES_MAX = 6  # of tests for a change; all are imported before the first runs
 
 
-def drawn_changes(modules: Sequence[Path], settings: Mapping[str, Any], n: int, rng: random.Random) -> list[Any]:
+def draw_changes(modules: Sequence[Path], settings: Mapping[str, Any], n: int, rng: random.Random) -> list[Any]:
     """Return the work items of cosmic-ray for ``n`` changes, no two of them in one place."""
     unwanted = re.compile("|".join(settings["filters"]["operators-filter"]["exclude-operators"]))
     with TemporaryDirectory() as folder, use_db(Path(folder, "all.sqlite")) as db:
@@ -124,7 +124,7 @@ def _score(counts: Counter[bool]) -> tuple[str, str, str]:
     return str(counts[True]), str(counts[False]), f"{counts[True] / counts.total():.0%}"
 
 
-def copied(folder: Path) -> Path:
+def copy_tree(folder: Path) -> Path:
     """Return a copy of the working tree as git sees it, beside the real scenes if they are there."""
     names = subprocess.run(
         ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
@@ -159,14 +159,14 @@ def main() -> None:
     args = parser.parse_args()
     session = args.session.resolve()
     with TemporaryDirectory() as folder, use_db(session) as db:
-        os.chdir(copied(Path(folder)))
+        os.chdir(copy_tree(Path(folder)))
         os.environ["PYTHONPATH"] = os.getcwd()
         settings = load_config(SETTINGS)
         every = sorted(find_modules(map(Path, settings["module-path"])))
         if db.num_work_items == 0:
             paths = find_modules(map(Path, args.paths or settings["module-path"]))
             modules = sorted(filter_paths(paths, settings["excluded-modules"]))
-            db.add_work_items(drawn_changes(modules, settings, args.sample, random.Random(args.seed)))
+            db.add_work_items(draw_changes(modules, settings, args.sample, random.Random(args.seed)))
         run(db, Imports(every, sorted(TESTS.rglob("test_*.py"))), settings, args.seconds, args.again)
         print("\n".join(report(db)))
         os.chdir(ROOT)

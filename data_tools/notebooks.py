@@ -61,7 +61,7 @@ _ROUNDING_ERROR = re.compile(r"[-+]?\d(\.\d+)?e-(0[6-9]|[1-9]\d)|\b0(\.0+)?e\+00
 _SOLUTION = re.compile(r"<details>.*?```python\n(.*?)```.*?</details>", re.DOTALL)
 
 
-def executed(text: Path) -> Notebook:
+def execute(text: Path) -> Notebook:
     """Run a notebook and its solutions.
 
     Parameters
@@ -105,11 +105,11 @@ def executed(text: Path) -> Notebook:
     except (CellTimeoutError, DeadKernelError) as error:
         raise InputError(f"{text.name}: a cell takes more than {SECONDS_MAX} s, or Python died: {error}") from None
     notebook.cells = cells
-    return stripped(notebook, text.stem)
+    return strip_notebook(notebook, text.stem)
 
 
-def stripped(notebook: Notebook, name: str) -> Notebook:
-    """Return the notebook without what a second run would change; raises as :func:`executed` does."""
+def strip_notebook(notebook: Notebook, name: str) -> Notebook:
+    """Return the notebook without what a second run would change; raises as :func:`execute` does."""
     notebook.metadata.pop("language_info", None)
     seen: dict[str, int] = {}
     for number, cell in enumerate(notebook.cells):
@@ -119,7 +119,7 @@ def stripped(notebook: Notebook, name: str) -> Notebook:
             continue
         cell.execution_count = None
         cell.metadata.pop("execution", None)
-        cell.outputs = [_stripped_output(out) for out in cell.outputs if out.get("name") != "stderr"]
+        cell.outputs = [_strip_output(out) for out in cell.outputs if out.get("name") != "stderr"]
         for out in cell.outputs:
             size = len(_png(out))
             if size > PNG_MAX:
@@ -129,7 +129,7 @@ def stripped(notebook: Notebook, name: str) -> Notebook:
     return notebook
 
 
-def _stripped_output(out: Cell) -> Cell:
+def _strip_output(out: Cell) -> Cell:
     if out.output_type == "stream":
         out.text = _without_paths(out.text)
         return out
@@ -179,7 +179,7 @@ def differences(stored: Notebook, fresh: Notebook) -> Iterator[str]:
             continue
         tags = old.metadata.get("tags", [])
         if [_kind(out) for out in old.outputs] != [_kind(out) for out in new.outputs]:
-            yield f"cell {number}: shows {_listed(new.outputs)}, stored is {_listed(old.outputs)}"
+            yield f"cell {number}: shows {_list_outputs(new.outputs)}, stored is {_list_outputs(old.outputs)}"
         elif "clock" not in tags:
             for a, b in zip(old.outputs, new.outputs, strict=True):
                 if what := _difference(a, b, "rounding" in tags):
@@ -190,7 +190,7 @@ def _kind(out: Cell) -> str:
     return "a picture" if _png(out) else "text"
 
 
-def _listed(outputs: Sequence[Cell]) -> str:
+def _list_outputs(outputs: Sequence[Cell]) -> str:
     return ", ".join(map(_kind, outputs)) or "nothing"
 
 
@@ -252,7 +252,7 @@ def _paths(names: Sequence[str]) -> list[Path]:
 
 def store(text: Path) -> str:
     """Run a notebook, write it beside its text, and return what there is to say."""
-    notebook = executed(text)
+    notebook = execute(text)
     with replacing(text.with_suffix(".ipynb")) as part:
         part.write_text(nbformat.writes(notebook) + "\n", encoding="utf-8")  # type: ignore[no-untyped-call]
     sizes = [len(_png(out)) for cell in notebook.cells for out in cell.get("outputs", []) if _png(out)]
@@ -263,7 +263,7 @@ def check(text: Path) -> str:
     """Run a notebook afresh; return how it differs from what is stored, or nothing."""
     if not text.with_suffix(".ipynb").exists():
         return "nothing is stored"
-    return "; ".join(differences(nbformat.read(text.with_suffix(".ipynb"), as_version=4), executed(text)))  # type: ignore[no-untyped-call]
+    return "; ".join(differences(nbformat.read(text.with_suffix(".ipynb"), as_version=4), execute(text)))  # type: ignore[no-untyped-call]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

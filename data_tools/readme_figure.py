@@ -23,7 +23,7 @@ from PIL import Image
 from minisplat_ref.errors import InputError
 from minisplat_ref.io import read_image
 from minisplat_ref.io.atomic import replacing
-from minisplat_ref.reports.pictures import GAP
+from minisplat_ref.reports.images import GAP
 from minisplat_ref.reports.plots import PLOT_STYLE
 from minisplat_ref.runs import run_folder
 

@@ -11,14 +11,14 @@ class Imports:
 
     def __init__(self, modules: Iterable[Path], tests: Iterable[Path]) -> None:
         self._re_exports = {
-            (dotted(path), alias.asname or alias.name): node.module or ""
+            (module_name(path), alias.asname or alias.name): node.module or ""
             for path in modules
             if path.name == "__init__.py"
             for node in ast.walk(ast.parse(path.read_text()))
             if isinstance(node, ast.ImportFrom)
             for alias in node.names
         }
-        self._of_modules = {dotted(path): self._of(path) for path in modules}
+        self._of_modules = {module_name(path): self._of(path) for path in modules}
         self._of_tests = {path: self._of(path) for path in tests}
 
     def tests_of(self, module: Path) -> list[Path]:
@@ -26,7 +26,7 @@ class Imports:
 
         Named like the module come first, then those that import most of its names and least besides.
         """
-        name, wanted = dotted(module), {dotted(module)}
+        name, wanted = module_name(module), {module_name(module)}
         stem = name.rpartition(".")[2]
         found = [path for path in self._of_tests if f'"{stem}"' in path.read_text()]
         n_before = 0
@@ -58,7 +58,7 @@ class Imports:
         return names
 
 
-def dotted(path: Path) -> str:
+def module_name(path: Path) -> str:
     """Return the name by which a file is imported."""
     return ".".join(path.with_suffix("").parts).removesuffix(".__init__")
 

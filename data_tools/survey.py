@@ -50,7 +50,7 @@ class Outcome(NamedTuple):
 
 
 @contextmanager
-def planted_function(error: PlantedLine) -> Iterator[None]:
+def plant_in_function(error: PlantedLine) -> Iterator[None]:
     """Give a function of Python other code for a while, whoever holds it.
 
     Raises
@@ -60,7 +60,7 @@ def planted_function(error: PlantedLine) -> Iterator[None]:
     """
     module, name = error.where.split(":")
     function = inspect.unwrap(getattr(import_module(f"minisplat_ref.{module}"), name))
-    changed = _changed(error, textwrap.dedent(inspect.getsource(function)))
+    changed = _change_source(error, textwrap.dedent(inspect.getsource(function)))
     names = dict(function.__globals__)
     exec(compile(changed, inspect.getfile(function), "exec"), names)
     wrong = inspect.unwrap(names[name])
@@ -73,14 +73,14 @@ def planted_function(error: PlantedLine) -> Iterator[None]:
         function.__code__ = right
 
 
-def planted_copy(error: PlantedLine, folder: Path) -> None:
-    """Copy the package into a folder, with the line changed; raises as :func:`planted_function` does."""
+def plant_in_copy(error: PlantedLine, folder: Path) -> None:
+    """Copy the package into a folder, with the line changed; raises as :func:`plant_in_function` does."""
     shutil.copytree(PACKAGE, folder / PACKAGE.name, ignore=shutil.ignore_patterns("__pycache__"))
     file = (folder / PACKAGE.name).joinpath(*error.where.partition(":")[0].split(".")).with_suffix(".py")
-    file.write_text(_changed(error, file.read_text(encoding="utf-8")), encoding="utf-8")
+    file.write_text(_change_source(error, file.read_text(encoding="utf-8")), encoding="utf-8")
 
 
-def _changed(error: PlantedLine, source: str) -> str:
+def _change_source(error: PlantedLine, source: str) -> str:
     if (n := source.count(error.right)) != 1:
         raise InputError(f"{error.what}: {error.right!r} stands {n} times in {error.where}; mend survey_errors.py")
     return source.replace(error.right, error.wrong)
@@ -103,9 +103,9 @@ def survey(error: PlantedLine, commands: Sequence[str]) -> Outcome:
     """
     if error.is_compiled:
         with TemporaryDirectory() as folder:
-            planted_copy(error, Path(folder))
+            plant_in_copy(error, Path(folder))
             return Outcome(error, {heading: _fails_apart(COMMANDS[heading], folder) for heading in commands})
-    with planted_function(error):
+    with plant_in_function(error):
         return Outcome(error, {heading: _fails(COMMANDS[heading]) for heading in commands})
 
 

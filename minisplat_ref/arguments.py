@@ -51,7 +51,7 @@ def name(text: str) -> str:
     return text
 
 
-def listed(parse: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
+def list_of(parse: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
     """Return the type of values between commas."""
     return lambda text: tuple(parse(part.strip()) for part in text.split(","))
 

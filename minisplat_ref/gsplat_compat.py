@@ -99,13 +99,13 @@ def rasterization(
     InputError
         If an argument has a wrong shape, dtype or value. No Gaussians, or none in sight, is no error.
     """
-    conventions = check.chosen_conventions(profile, near_plane, far_plane, eps2d, rasterize_mode)
+    conventions = check.choose_conventions(profile, near_plane, far_plane, eps2d, rasterize_mode)
     stages = get_backend(backend) if isinstance(backend, str) else backend
     primitives, views = Primitives(means, quats, scales, opacities), Views(viewmats, Ks, width, height)
-    batch = checked_batch(primitives, views, colors, sh_degree, backgrounds, render_mode)
-    tapes = [draw(batch, c, conventions, stages) for c in range(len(batch.cameras))]
-    images = _stacked([tape.output.image for tape in tapes])  # [C, H, W, D]
-    alphas = _stacked([tape.output.alpha for tape in tapes])  # [C, H, W]
+    batch = check_batch(primitives, views, colors, sh_degree, backgrounds, render_mode)
+    tapes = [render_one(batch, c, conventions, stages) for c in range(len(batch.cameras))]
+    images = _stack([tape.output.image for tape in tapes])  # [C, H, W, D]
+    alphas = _stack([tape.output.alpha for tape in tapes])  # [C, H, W]
     if batch.has_expected_depth:
         images[..., -1] = expected_depth(images[..., -1], alphas)
     return images, alphas[..., None], _meta(tapes)
@@ -151,11 +151,11 @@ def rasterization_vjp(
         ``v_means, v_quats, v_scales, v_opacities, v_colors, v_viewmats`` in the shapes of the arguments, summed over
         the cameras; ``v_backgrounds`` where there are backgrounds. The last row of ``v_viewmats`` is 0.
     """
-    conventions = check.chosen_conventions(profile, near_plane, far_plane, eps2d, rasterize_mode)
+    conventions = check.choose_conventions(profile, near_plane, far_plane, eps2d, rasterize_mode)
     stages = get_backend(backend) if isinstance(backend, str) else backend
     primitives, views = Primitives(means, quats, scales, opacities), Views(viewmats, Ks, width, height)
-    batch = checked_batch(primitives, views, colors, sh_degree, backgrounds, render_mode)
-    tapes = [draw(batch, c, conventions, stages) for c in range(len(batch.cameras))]
+    batch = check_batch(primitives, views, colors, sh_degree, backgrounds, render_mode)
+    tapes = [render_one(batch, c, conventions, stages) for c in range(len(batch.cameras))]
     dtype, sizes = batch.colors.dtype, {"C": len(tapes), "H": height, "W": width}
     sizes["D"] = tapes[0].output.image.shape[2]
     v_images = check.check_array("v_render_colors", v_render_colors, (("C", "H", "W", "D"),), sizes, dtype)
@@ -171,7 +171,7 @@ def rasterization_vjp(
             v_depth, v_alpha_of_depth = expected_depth_vjp(depth, tape.output.alpha, v_image[..., -1])
             v_image = np.concatenate([v_image[..., :-1], v_depth[..., None]], axis=-1)
             v_alpha = v_alpha + v_alpha_of_depth
-        v = draw_vjp(batch, c, tape, v_image, v_alpha)
+        v = render_one_vjp(batch, c, tape, v_image, v_alpha)
         for total, part in zip(v_given, v.primitives, strict=True):
             total += part
         v_own_colors = v_colors[c] if batch.has_own_colors else v_colors
@@ -264,7 +264,7 @@ class ViewGradient(NamedTuple):
     background: Floats  # [D]
 
 
-def checked_batch(
+def check_batch(
     primitives: Primitives,
     views: Views,
     colors: Any,
@@ -311,7 +311,7 @@ def checked_batch(
     return Batch(given, colors, has_own_colors, cameras, backgrounds, sh_degree, render_mode)
 
 
-def draw(batch: Batch, c: int, conventions: Conventions, backend: Backend) -> SplatTape:
+def render_one(batch: Batch, c: int, conventions: Conventions, backend: Backend) -> SplatTape:
     """Render view c; where an expected depth is wanted, the channel still holds the accumulated depth."""
     means, colors = batch.primitives.means, batch.colors_of(c)
     background = batch.backgrounds[c]
@@ -321,7 +321,7 @@ def draw(batch: Batch, c: int, conventions: Conventions, backend: Backend) -> Sp
             return np.zeros((len(means), 0), means.dtype)
         if batch.sh_degree is None:
             return colors
-        return backend.sh_colors(means, *_split(colors), _unrotated(batch.cameras[c]), batch.sh_degree, radii)
+        return backend.sh_colors(means, *_split(colors), _remove_rotation(batch.cameras[c]), batch.sh_degree, radii)
 
     return splat(
         batch.primitives,
@@ -334,8 +334,8 @@ def draw(batch: Batch, c: int, conventions: Conventions, backend: Backend) -> Sp
     )
 
 
-def draw_vjp(batch: Batch, c: int, tape: SplatTape, v_image: Floats, v_alpha: Floats) -> ViewGradient:
-    """Gradient of :func:`draw`.
+def render_one_vjp(batch: Batch, c: int, tape: SplatTape, v_image: Floats, v_alpha: Floats) -> ViewGradient:
+    """Gradient of :func:`render_one`.
 
     Spherical harmonics add, via the camera's centre::
 
@@ -351,7 +351,7 @@ def draw_vjp(batch: Batch, c: int, tape: SplatTape, v_image: Floats, v_alpha: Fl
     elif batch.sh_degree is None:
         v_colors = v.colors
     else:
-        unrotated = _unrotated(tape.camera)
+        unrotated = _remove_rotation(tape.camera)
         dc, rest = _split(batch.colors_of(c))
         v_sh = tape.backend.sh_colors_vjp(
             batch.primitives.means, dc, rest, unrotated, batch.sh_degree, tape.projection.radii, v.colors
@@ -410,12 +410,12 @@ def _tile_lists(projections: list[Projection], grid: TileGrid, conventions: Conv
     return {key: array.astype(np.int32) for key, array in zip(TILE_LISTS, arrays, strict=True)}
 
 
-def _stacked(arrays: list[Floats]) -> Floats:
+def _stack(arrays: list[Floats]) -> Floats:
     """Stack C arrays to [C, ...]; that of a single camera is not copied."""
     return arrays[0][None] if len(arrays) == 1 else np.stack(arrays)
 
 
-def _unrotated(camera: Camera) -> Camera:
+def _remove_rotation(camera: Camera) -> Camera:
     """Return a camera at the same centre with R = I: colours depend on the centre only."""
     R, t = camera.cam_from_world_R.astype(np.float64), camera.cam_from_world_t.astype(np.float64)
     return camera._replace(cam_from_world_R=np.eye(3), cam_from_world_t=np.linalg.solve(R, t))

@@ -244,7 +244,7 @@ def lpips(image: Floats, target: Floats | Ints, network: Network, mask: Bools | 
         if not mask.any():
             raise InputError("mask leaves no pixel to compare: leave the view out")
         image, counted = np.where(mask[:, :, None], image, target), float(np.mean(mask))
-    x, x0 = _shifted_and_scaled(image), _shifted_and_scaled(target)  # [H, W, 3]
+    x, x0 = _normalize(image), _normalize(target)  # [H, W, 3]
     distance = 0.0
     for i, layers in enumerate(backbone.slices):
         x, x0 = (_apply(layers, features, weights) for features in (x, x0))  # [H_l, W_l, C_l]
@@ -252,7 +252,7 @@ def lpips(image: Floats, target: Floats | Ints, network: Network, mask: Bools | 
     return distance / counted
 
 
-def _shifted_and_scaled(image: Floats) -> Floats:
+def _normalize(image: Floats) -> Floats:
     """Return the network's input [H, W, 3] for colours in [0, 1]."""
     return (2 * image - 1 - np.array(SHIFT, image.dtype)) / np.array(SCALE, image.dtype)
 

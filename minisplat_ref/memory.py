@@ -28,7 +28,7 @@ BYTES_PER_PAIR = 48
 PAIRS_PER_GAUSSIAN = 3.0  # where no view has been rendered yet; in three small scenes 0.7 to 3.3
 # Per pixel, at the peak of rendering a picture and writing it; measured at 12 and 48 megapixels: 64.2 and 64.1, with
 # depth 68.2 and 68.1.
-PICTURE_BYTES, DEPTH_PICTURE_BYTES = 65, 69
+RENDER_BYTES, DEPTH_RENDER_BYTES = 65, 69
 SHELF_SHARE = 0.5  # share of the free memory that photographs may fill; Gaussians need the rest
 READING_BYTES = 10  # per pixel of the file while it is decoded; measured with JPEG and PNG of 12 megapixels: 10.0
 RESERVE = 0.95  # share of the free memory that may be planned with
@@ -196,7 +196,7 @@ def check_start(needs: Needs) -> str:
     )
 
 
-def check_picture(width: int, height: int, with_depth: bool) -> None:
+def check_render_size(width: int, height: int, with_depth: bool) -> None:
     """Refuse a picture that does not fit into memory.
 
     Raises
@@ -204,7 +204,7 @@ def check_picture(width: int, height: int, with_depth: bool) -> None:
     InputError
         Names the largest one of the same proportions that does.
     """
-    needed, free = (DEPTH_PICTURE_BYTES if with_depth else PICTURE_BYTES) * width * height, free_bytes()
+    needed, free = (DEPTH_RENDER_BYTES if with_depth else RENDER_BYTES) * width * height, free_bytes()
     if needed > free:
         shrink = math.sqrt(free / needed)
         fits = f"{max(1, int(width * shrink))}x{max(1, int(height * shrink))}"

@@ -5,7 +5,7 @@ out: checks for NaN, which belong where a file is read; a Gaussian whose footpri
 
 A :class:`Renderer` is the pair of functions that all code calls to draw a model: training, evaluation, importance,
 depth reinitialisation, the commands. ``SPLATTING`` is that of 3DGS. Another way of drawing is another value; most wrap
-``SPLATTING``: they turn what they have into Gaussians (moved to the view's time, decoded, chosen by level), draw these,
+``SPLATTING``: they make Gaussians of what they have (moved to the view's time, decoded, chosen by level), draw these,
 and carry the gradient back.
 """
 
@@ -115,7 +115,7 @@ def render(
         return backend.sh_colors(gaussians.means, gaussians.sh_dc, gaussians.sh_rest, camera, sh_degree, radii)
 
     splats = splat(
-        activated(gaussians, is_visible),
+        activate(gaussians, is_visible),
         shade,
         camera,
         background,
@@ -130,7 +130,7 @@ def render(
     return output, RenderTape(gaussians, sh_degree, splats)
 
 
-def drawn_degree(sh_rest: Floats, wanted: int | Ints | None) -> int | Ints:
+def choose_degree(sh_rest: Floats, wanted: int | Ints | None) -> int | Ints:
     """Return the degree of the spherical harmonics to draw: the stored one, or less where less is wanted.
 
     Parameters
@@ -144,7 +144,7 @@ def drawn_degree(sh_rest: Floats, wanted: int | Ints | None) -> int | Ints:
     return stored if wanted is None else np.minimum(wanted, stored)
 
 
-def activated(gaussians: Any, is_visible: Bools | None = None) -> Primitives:
+def activate(gaussians: Any, is_visible: Bools | None = None) -> Primitives:
     """Return Gaussians after their activations.
 
     Parameters

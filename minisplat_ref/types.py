@@ -234,7 +234,7 @@ class RenderOutput(NamedTuple):
     extras: Mapping[str, Any] = NOTHING
     """Results requested by name that are not channels, such as ``surface``, a :class:`SurfacePoints`."""
     n_pairs: int = 0
-    """Pairs (tile, Gaussian) of the view, with which memory grows; 0 where the renderer does not say."""
+    """Pairs (tile, Gaussian) of the view, or what a renderer lists instead; memory grows with them."""
 
 
 class CompositeGradient(NamedTuple):

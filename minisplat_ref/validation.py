@@ -155,7 +155,7 @@ def check_intrinsics(name: str, Ks: Floats) -> None:
             raise InputError(f"{name}[{c}] is not of the form [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; rewrite it so")
 
 
-def chosen_conventions(
+def choose_conventions(
     profile: str | Conventions,
     near_plane: float | None,
     far_plane: float | None,

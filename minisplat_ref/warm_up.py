@@ -70,7 +70,7 @@ def _stage(name: str, with_depth: bool = False, with_stats: bool = False) -> Cal
 
     def compile_stage(dtype: Dtype) -> None:
         backend = replace(_REFERENCE, **{name: getattr(CPU, name)})
-        tape = _draw(dtype, backend, with_depth, with_stats)
+        tape = _render_view(dtype, backend, with_depth, with_stats)
         if name.endswith("_vjp"):
             render_vjp(tape, np.ones_like(tape.splats.output.image))
 
@@ -78,14 +78,14 @@ def _stage(name: str, with_depth: bool = False, with_stats: bool = False) -> Cal
 
 
 def _surface_points(dtype: Dtype) -> None:
-    tape = _draw(dtype, _REFERENCE, False, with_stats=True)
+    tape = _render_view(dtype, _REFERENCE, False, with_stats=True)
     primitives, stats = tape.splats.primitives, tape.splats.output.stats
     assert stats is not None
     CPU.surface_points(primitives.means, primitives.quats, primitives.scales, tape.splats.camera, stats.dominant_ids)
 
 
 def _removal_changes(dtype: Dtype) -> None:
-    s = _draw(dtype, _REFERENCE, False, with_stats=False).splats
+    s = _render_view(dtype, _REFERENCE, False, with_stats=False).splats
     CPU.removal_changes(s.projection, s.channels, s.bins, s.conventions, s.output)
 
 
@@ -243,7 +243,7 @@ _REFERENCE = replace(
 )
 
 
-def _draw(dtype: Dtype, backend: Backend, with_depth: bool = False, with_stats: bool = False) -> RenderTape:
+def _render_view(dtype: Dtype, backend: Backend, with_depth: bool = False, with_stats: bool = False) -> RenderTape:
     return render(_gaussians(dtype), _camera(), backend=backend, with_depth=with_depth, with_stats=with_stats)[1]
 
 

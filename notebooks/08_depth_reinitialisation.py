@@ -40,10 +40,10 @@ from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import render
 from minisplat_ref.strategy.depth_reinit import (
-    blended_points,
+    blend_points,
     centre_points,
+    find_refuted,
     midpoint_points,
-    refuted,
     reinitial_points,
 )
 from minisplat_ref.strategy.initialization import from_points
@@ -59,7 +59,7 @@ from minisplat_ref.training.loop import train
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Camera, Gaussians, view_from
 
-KINDS = {"mid-point": (midpoint_points, BLUE), "centre": (centre_points, GREEN), "blended": (blended_points, RED)}
+KINDS = {"mid-point": (midpoint_points, BLUE), "centre": (centre_points, GREEN), "blended": (blend_points, RED)}
 
 
 # %%
@@ -285,7 +285,7 @@ plt.show()
 #   something left to paint the sky on.
 
 # %%
-show_code(refuted)
+show_code(find_refuted)
 
 # %% tags=["rounding"]
 GUARDED = {
@@ -293,7 +293,7 @@ GUARDED = {
     "floor": Choice(midpoint_points, min_alpha=0.9),
     "vote": Choice(midpoint_points, depth_tolerance=0.05),
     "vote, backdrop": Choice(midpoint_points, depth_tolerance=0.05, has_backdrop=True),
-    "blended": Choice(blended_points),
+    "blended": Choice(blend_points),
     "centre": Choice(centre_points),
 }
 figures_of = {}  # (scene, choice): what the true depths say

@@ -335,9 +335,9 @@ plt.show()
 # than it gives.
 
 # %% tags=["rounding"]
-show_code(simplify.reinitialised)
+show_code(simplify.reinitialise)
 
-restarted = simplify.reinitialised(at_once["sampling"], 3)
+restarted = simplify.reinitialise(at_once["sampling"], 3)
 rows = {
     "drawn": at_once["sampling"],
     "drawn, new start": restarted,
@@ -360,7 +360,7 @@ plt.show()
 few = after["sampling"]
 few_stats = importance.collect_importance(few, scene.train_views)
 few_candidates = simplify.intersection_preserving(importance.indoor(few_stats), few_stats.dominant_count)
-heavy_ids = simplify.carrying_mass(few_candidates, MASS)
+heavy_ids = simplify.select_mass(few_candidates, MASS)
 trimmed = take(few, heavy_ids)
 
 figure, axes = plt.subplots(1, 3, figsize=(11, 2.9))
@@ -451,7 +451,7 @@ assert abs(expected.sum() - 1) < 1e-12
 assert (np.abs(shares - expected) < 4 * np.sqrt(expected * (1 - expected) / N_DRAWS)).all()
 
 # A mass keeps what rank keeps at the same number, and far more than one part in a hundred.
-heaviest = simplify.carrying_mass(candidates, MASS)
+heaviest = simplify.select_mass(candidates, MASS)
 assert np.array_equal(heaviest, simplify.most_important(candidates, len(heaviest)))
 assert len(heaviest) > 0.5 * np.count_nonzero(candidates)
 

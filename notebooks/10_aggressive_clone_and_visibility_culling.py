@@ -280,7 +280,7 @@ axes[2].hist(n_views, bins=np.arange(-0.5, len(cameras) + 1.5), color=BLUE)
 axes[2].set(title="views per Gaussian", xlabel="views where it is visible", ylabel="Gaussians")
 plt.show()
 fraction = visibility.culled_fraction(is_visible, stats.frustum_count)
-few = visibility.seen_by_few(is_visible, 2)
+few = visibility.find_seen_by_few(is_visible, 2)
 print(f"culling removes {fraction:.0%} of the (Gaussian, view) pairs that the frustum leaves")
 print(f"{few.sum()} of {n} Gaussians are visible in fewer than two views; the event removes them")
 

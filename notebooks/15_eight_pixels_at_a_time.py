@@ -40,7 +40,7 @@ from minisplat_ref.bench.roofline import rows_worked_on
 from minisplat_ref.bench.workloads import synth
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.cpu.compositing.records import records_of
-from minisplat_ref.cpu.compositing.tile_rows import reached_rows
+from minisplat_ref.cpu.compositing.tile_rows import find_reached_rows
 from minisplat_ref.cpu.compositing.tile_state import N_ROWS, N_STRIPS, rows_of
 from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
 from minisplat_ref.jit.lanes import WIDTH, load, store
@@ -75,7 +75,7 @@ GRID = TileGrid(TILE_WIDTH, TILE_HEIGHT, TILE_WIDTH, TILE_HEIGHT)
 def reached(projection):
     """Rows that the kernel visits, as bits."""
     records = records_of(projection, np.zeros((1, 3)), GSPLAT_MAIN)
-    return reached_rows(records, np.zeros(1, np.int32), 0, 0, 0)
+    return find_reached_rows(records, np.zeros(1, np.int32), 0, 0, 0)
 
 
 slanted = footprint(np.array([15.3, 8.1]), 0.5, (5.5, 0.8), 0.8)

@@ -39,7 +39,7 @@ from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.extensions.analytic.footprint import METHODS, OPACITY, REACH, approximations, covariance, truth
-from minisplat_ref.extensions.antialiasing.reference import smoothed
+from minisplat_ref.extensions.antialiasing.reference import smooth
 from minisplat_ref.extensions.compression.lattice import from_lattice, to_lattice
 from minisplat_ref.extensions.compression.levels import exponents
 from minisplat_ref.extensions.compression.msz import CONTAINER, decode, encode
@@ -48,14 +48,14 @@ from minisplat_ref.extensions.multi_scale.levels import Plan, level_zero, with_l
 from minisplat_ref.extensions.multi_scale.method import COVERAGE_MIN, LEVELS, finest_densities
 from minisplat_ref.extensions.multi_scale.reference import are_shown, pixel_densities
 from minisplat_ref.extensions.omg.reference import distinct_importance, local_distinctiveness
-from minisplat_ref.extensions.proxies.affine import Affine, edited, rotation_about
+from minisplat_ref.extensions.proxies.affine import Affine, edit_gaussians, rotation_about
 from minisplat_ref.extensions.proxies.binding import bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid
 from minisplat_ref.extensions.proxies.edit_claims import RADIUS, flat_gaussians, rolled
 from minisplat_ref.extensions.proxies.edit_claims import camera as card_camera
 from minisplat_ref.mechanisms.meshes.mesh import Mesh
 from minisplat_ref.mechanisms.packing.container import parse
-from minisplat_ref.mechanisms.sampling import block_means, zoomed
+from minisplat_ref.mechanisms.sampling import block_means, zoom_camera
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import psnr
 from minisplat_ref.rendering import Request, render
@@ -182,7 +182,7 @@ FILTER = 0.02  # deviation of the filter in space
 thin = np.geomspace(0.002, 0.2, 40)
 before = np.log(np.column_stack([thin, np.full((40, 2), 0.1)]))
 logits = np.full(40, np.log(OPACITY / (1 - OPACITY)))
-after, after_logits = smoothed(before, logits, np.full(40, FILTER))
+after, after_logits = smooth(before, logits, np.full(40, FILTER))
 opacities = 1 / (1 + np.exp(-after_logits))
 
 figure, axes = plt.subplots(1, 3, figsize=(11, 2.9))
@@ -224,12 +224,12 @@ levels = with_levels(levels, densities, Plan(2, 4, COVERAGE_MIN), GSPLAT_MAIN)
 def drawn(population, n):
     """Render the view at 1/n of its size; with levels, if the population has any."""
     request = Request(scene.background, backend=CPU)
-    return LEVELS.renderer.render(Model(population), view_from(zoomed(camera, 1 / n)), request)[0]
+    return LEVELS.renderer.render(Model(population), view_from(zoom_camera(camera, 1 / n)), request)[0]
 
 
 def shown_at(n):
     """Return which rows of all levels are drawn at 1/n."""
-    return are_shown(levels.cells, pixel_densities(levels.means, zoomed(camera, 1 / n), GSPLAT_MAIN.near_plane))
+    return are_shown(levels.cells, pixel_densities(levels.means, zoom_camera(camera, 1 / n), GSPLAT_MAIN.near_plane))
 
 
 plain = level_zero(room, np.random.default_rng(0))
@@ -382,7 +382,7 @@ looking = card_camera()
 
 def pictured(gaussians):
     """Render a card as it is seen obliquely from above, on white."""
-    tilted = edited(gaussians, TILT, np.ones(len(gaussians.means), bool))
+    tilted = edit_gaussians(gaussians, TILT, np.ones(len(gaussians.means), bool))
     return render(tilted, looking, background=np.ones(3), backend=CPU)[0].image
 
 

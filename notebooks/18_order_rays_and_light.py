@@ -46,23 +46,23 @@ from minisplat_ref.extensions.rays.demo import (
     MIRROR_CORNER,
     MIRROR_SIDES,
     ball,
-    concatenated,
+    concatenate_populations,
     discs,
     floor,
     world_of,
 )
 from minisplat_ref.extensions.rays.kernels import scene_of
 from minisplat_ref.extensions.rays.lights import shade
-from minisplat_ref.extensions.rays.method import whitened_model
+from minisplat_ref.extensions.rays.method import whiten_model
 from minisplat_ref.extensions.rays.surfaces import GLASS, MIRROR
-from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenated_surfaces, parallelogram, surfaces_of
+from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenate_surfaces, parallelogram, surfaces_of
 from minisplat_ref.extensions.vr.foveation import Gaze, eccentricities, render_foveated, zone_begins, zone_weights
 from minisplat_ref.mechanisms.meshes.mesh import Mesh
 from minisplat_ref.mechanisms.rays.pixel_rays import pixel_rays
-from minisplat_ref.mechanisms.tangent.rays import ewa_hits, ray_colors, tangent_hits, yawed
+from minisplat_ref.mechanisms.tangent.rays import ewa_hits, ray_colors, tangent_hits, yaw_camera
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.reference.pinhole import pinhole_rays
-from minisplat_ref.rendering import SPLATTING, Request, activated
+from minisplat_ref.rendering import SPLATTING, Request, activate
 from minisplat_ref.types import Camera, Model, Primitives, view_from
 
 # %%
@@ -83,12 +83,12 @@ def pictured(gaussians, renderer, view_camera, background=1.0, render=None):
     return (render or renderer.render)(Model(gaussians), view_from(view_camera), request)[0].image
 
 
-seen = {name: [pictured(pair, renderer, yawed(camera, yaw)) for yaw in TURNS] for name, renderer in WAYS.items()}
+seen = {name: [pictured(pair, renderer, yaw_camera(camera, yaw)) for yaw in TURNS] for name, renderer in WAYS.items()}
 yaws = FLIP + np.radians(np.linspace(-3, 3, 61))
 ray = np.array([[0.0, 0.0, 1.0]])  # of the world: it stays where it is
 on_ray = {
     name: np.concatenate(
-        [ray_colors(way, activated(pair), PAINT, yawed(camera, yaw), ray, GSPLAT_MAIN) for yaw in yaws]
+        [ray_colors(way, activate(pair), PAINT, yaw_camera(camera, yaw), ray, GSPLAT_MAIN) for yaw in yaws]
     )
     for name, way in zip(WAYS, ("3DGS: EWA, by z", "tangent planes, exact order"), strict=True)
 }
@@ -261,7 +261,7 @@ plt.show()
 # of 2 x 2 and of 4 x 4 pixels, and interpolates between them.
 
 # %%
-scene = concatenated(ball(), floor())
+scene = concatenate_populations(ball(), floor())
 headset = Camera(np.eye(3), np.zeros(3), 90.0, 90.0, 72.0, 54.0, 144, 108)
 request = Request(np.array([0.1, 0.12, 0.16]), backend=REFERENCE)
 at = headset.fx * CENTRE[:2] / CENTRE[2] + [headset.cx, headset.cy]
@@ -319,7 +319,7 @@ three = pair._replace(
     log_scales=np.log(in_plane.scales),
     opacity_logits=np.log(in_plane.opacities / (1 - in_plane.opacities)),
 )
-M = whitened_model(Model(three)).maps
+M = whiten_model(Model(three)).maps
 d = np.array([0.03, 0.0, 1.0])
 p, v = np.einsum("nij,nj->ni", M, in_plane.means), M @ d
 nearest = np.sum(v * p, axis=1) / np.sum(v * v, axis=1)
@@ -358,7 +358,7 @@ plt.show()
 
 # %%
 eye = Camera(np.eye(3), np.zeros(3), 132.0, 132.0, 60.0, 45.0, 120, 90)
-tree = scene_of(whitened_model(Model(scene)), GSPLAT_MAIN)
+tree = scene_of(whiten_model(Model(scene)), GSPLAT_MAIN)
 rays = pixel_rays(eye, GSPLAT_MAIN)
 n_asked, n_boxes = np.zeros(len(rays.near), int), np.zeros(len(rays.near), int)
 by_level = {}
@@ -384,7 +384,7 @@ def descend(node, ids, level):
 
 
 descend(0, np.arange(len(rays.near)), 0)
-world = world_of(scene, Surroundings(np.zeros((0, 3)), 1.0, 0.0, concatenated_surfaces([])), request.background)
+world = world_of(scene, Surroundings(np.zeros((0, 3)), 1.0, 0.0, concatenate_surfaces([])), request.background)
 hits = world.tracer.list_hits(rays, GSPLAT_MAIN)
 n_hits = np.diff(hits.offsets)
 
@@ -413,7 +413,7 @@ print(f"a ray asks {asked}, and hits {n_hits.mean():.1f}")
 
 # %%
 DARK = request.background
-NO_LAMP, NO_SURFACE = np.zeros((0, 3)), concatenated_surfaces([])
+NO_LAMP, NO_SURFACE = np.zeros((0, 3)), concatenate_surfaces([])
 
 
 def cube(centre, half, yaw):
@@ -431,8 +431,8 @@ block = surfaces_of(cube(np.array([0.15, 0.58, 3.3]), 0.3, 0.5), GLASS, np.array
 around = {
     "as it was photographed": Surroundings(NO_LAMP, 1.0, 0.0, NO_SURFACE),
     "a lamp": Surroundings(LAMP[None], 0.35, BIAS, NO_SURFACE),
-    "a mirror": Surroundings(LAMP[None], 0.35, BIAS, concatenated_surfaces([mirror])),
-    "a block of glass": Surroundings(LAMP[None], 0.35, BIAS, concatenated_surfaces([mirror, block])),
+    "a mirror": Surroundings(LAMP[None], 0.35, BIAS, concatenate_surfaces([mirror])),
+    "a block of glass": Surroundings(LAMP[None], 0.35, BIAS, concatenate_surfaces([mirror, block])),
 }
 lit = {
     name: shade(world_of(scene, these, DARK), rays).reshape(eye.height, eye.width, 3) for name, these in around.items()
@@ -463,7 +463,7 @@ leaning = np.array([[np.sin(np.radians(s * lean)), 0.0, np.cos(np.radians(lean))
 two = discs(np.array([[-0.3, 0.0, 4.0], [0.3, 0.0, 4.0 + apart]]), leaning, 0.45, PAINT)
 figure, axes = plt.subplots(1, 4, figsize=(11, 2.7))
 for panel, (degrees, (name, renderer)) in zip(axes, [(a, way) for way in WAYS.items() for a in (0, yaw)], strict=True):
-    show(panel, pictured(two, renderer, yawed(camera, np.radians(degrees))), f"{name}, yaw {degrees:g}")
+    show(panel, pictured(two, renderer, yaw_camera(camera, np.radians(degrees))), f"{name}, yaw {degrees:g}")
 plt.show()
 
 # %% [markdown]

@@ -41,7 +41,7 @@ from minisplat_ref.extensions.cuts import card
 from minisplat_ref.extensions.cuts.curve import VERTICES, cut
 from minisplat_ref.extensions.fans.method import render as render_fans
 from minisplat_ref.extensions.fans.profile import fan_profile, profile_error
-from minisplat_ref.extensions.fans.shapes import FanShape, converted, mesh_of
+from minisplat_ref.extensions.fans.shapes import FanShape, convert_gaussians, mesh_of
 from minisplat_ref.extensions.mixed import fit
 from minisplat_ref.extensions.mixed import response as hull_response
 from minisplat_ref.extensions.polygons import claims as polygon_claims
@@ -53,7 +53,7 @@ from minisplat_ref.extensions.textured.population import with_textures
 from minisplat_ref.extensions.textured.reference import frames, meet
 from minisplat_ref.extensions.textured.study import colors_across
 from minisplat_ref.extensions.textured.tuning import floats_of
-from minisplat_ref.mechanisms.meshes.fans import fitted_spans, rims
+from minisplat_ref.mechanisms.meshes.fans import fit_spans, rims
 from minisplat_ref.reference.pinhole import pinhole
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.rendering import SPLATTING, Request
@@ -364,7 +364,7 @@ misses = {}
 figure, axes = plt.subplots(1, 4, figsize=(11, 3), width_ratios=(1, 1, 1, 1.1))
 paint = np.column_stack([np.clip(0.5 + SH_C0 * sheet.sh_dc[soup.rows], 0, 1), np.full(len(soup.rows), 0.5)])
 for panel, (name, corners) in zip(axes, edits.items(), strict=False):
-    refit = rims(*fitted_spans(corners, soup.radii), soup.radii, 8)
+    refit = rims(*fit_spans(corners, soup.radii), soup.radii, 8)
     misses[name] = np.abs(refit - corners).max()
     seen, seen_refit = (in_view[..., :2] / in_view[..., 2:] for in_view in map(polygon_claims.placed, (corners, refit)))
     panel.add_collection(PolyCollection(seen, facecolors=paint, edgecolors="black", linewidths=0.6))
@@ -377,7 +377,7 @@ for angle, color in ((45, BLUE), (180, RED)):
     for number in per_side:
         these = soup_of(polygon_claims.sheet(number), 8)
         corners = polygon_claims.bent(these.corners, angle)
-        refit = rims(*fitted_spans(corners, these.radii), these.radii, 8)
+        refit = rims(*fit_spans(corners, these.radii), these.radii, 8)
         spread = np.sqrt(np.mean((corners - corners.mean(axis=1, keepdims=True)) ** 2))
         found.append(np.sqrt(np.mean((refit - corners) ** 2)) / spread)
     bend_misses[angle] = found
@@ -411,7 +411,7 @@ round_ball = ball_of_discs(120)
 eye = Camera(np.eye(3), np.zeros(3), 150.0, 150.0, 47.0, 24.0, 64, 64)
 LAYERS = (1, 4, None)
 request = Request(np.array([0.1, 0.12, 0.16]), backend=REFERENCE)
-fans = converted(round_ball, FanShape())
+fans = convert_gaussians(round_ball, FanShape())
 as_gaussians = SPLATTING.render(Model(round_ball), view_from(eye), request)[0].image
 peeled = {layers: render_fans(Model(fans), view_from(eye), request, max_layers=layers)[0].image for layers in LAYERS}
 

@@ -83,7 +83,7 @@ def fuzz(
     judged: list[_Judged] = []
     number = first
     while (last is None or number < last) and (seconds is None or time.monotonic() < start + seconds):
-        for entry in _judged_by_one_process(reader, seed, number, last, seconds and start + seconds - time.monotonic()):
+        for entry in _judge_in_one_process(reader, seed, number, last, seconds and start + seconds - time.monotonic()):
             judged.append(entry)
         number = judged[-1].number + 1 if judged else number + 1
     by_what: dict[str, list[_Judged]] = {}
@@ -98,7 +98,7 @@ def fuzz(
     return Outcome(len(judged), n_bytes, time.monotonic() - start, n_refused, findings)
 
 
-def _judged_by_one_process(
+def _judge_in_one_process(
     reader: Reader, seed: int, first: int, last: int | None, seconds: float | None
 ) -> Iterator[_Judged]:
     """Yield a judgement for each file, until the process is done or has died of one."""

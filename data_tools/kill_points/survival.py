@@ -94,14 +94,14 @@ def kill_and_go_on(point: str, scene: Path, whole: Path, out: Path) -> Row:
         return Row(point, f"did not die: {_last_line(died)}", "", False)
     left = _what_is_left(out)
     if not (out / run_folder.CONFIG).exists():
-        return _compared(point, left, "began again", train(scene, out, env=environment), whole, out)
+        return _compare_runs(point, left, "began again", train(scene, out, env=environment), whole, out)
     done = resume(out, env=environment)
     if f"has done {ITERATIONS} iterations" in done.stderr:
         return Row(point, left, f"was complete, {differences(whole, out) or 'same bytes'}", not differences(whole, out))
-    return _compared(point, left, "resumed", done, whole, out)
+    return _compare_runs(point, left, "resumed", done, whole, out)
 
 
-def _compared(what: str, left: str, how: str, done: Done, whole: Path, out: Path) -> Row:
+def _compare_runs(what: str, left: str, how: str, done: Done, whole: Path, out: Path) -> Row:
     """Judge a training that has gone on."""
     differs = differences(whole, out) if done.returncode == 0 else _last_line(done)
     return Row(what, left, f"{how}, {differs or 'same bytes'}", not differs)
@@ -125,10 +125,10 @@ def _last_line(done: Done) -> str:
 def differences(whole: Path, other: Path) -> str:
     """Say which files of two runs differ; nothing where none does."""
     names = {path.name for path in whole.iterdir()} ^ {path.name for path in other.iterdir()}
-    return ", ".join([*(f"{name} in one only" for name in sorted(names)), *_differing(whole, other)])
+    return ", ".join([*(f"{name} in one only" for name in sorted(names)), *_find_differences(whole, other)])
 
 
-def _differing(whole: Path, other: Path) -> Iterator[str]:
+def _find_differences(whole: Path, other: Path) -> Iterator[str]:
     if (whole / run_folder.POINT_CLOUD).read_bytes() != (other / run_folder.POINT_CLOUD).read_bytes():
         yield f"other {run_folder.POINT_CLOUD}"
     if not _is_same_state(whole / run_folder.CHECKPOINT, other / run_folder.CHECKPOINT):
@@ -164,7 +164,7 @@ def fill_disk(scene: Path, whole: Path, out: Path) -> Row:
     """Train where three checkpoints of the beginning fit and not a larger one; then make room."""
     out.mkdir()
     size = int(4.2 * (whole / run_folder.PREVIOUS).stat().st_size)
-    with _mounted("-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(out)):
+    with _mount("-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(out)):
         failed = train(scene, out / "run", OFTEN_SAVED)
         left = f"{_what_is_left(out / 'run')}; {_last_line(failed)}"
         _system("mount", "-o", "remount,size=64m", str(out))
@@ -185,7 +185,7 @@ def limit_files(scene: Path, whole: Path, out: Path) -> Row:
 def forbid_writing(scene: Path, whole: Path, out: Path) -> Row:
     """Continue a killed run on a disk that can only be read; then where it can be written."""
     train(scene, out, "training: after iteration 133")
-    with _mounted("--bind", str(out), str(out)):
+    with _mount("--bind", str(out), str(out)):
         _system("mount", "-o", "remount,bind,ro", str(out))
         failed = resume(out)
     return _after_refusal("read-only disk", f"{_what_is_left(out)}; {_last_line(failed)}", failed, whole, out)
@@ -211,11 +211,11 @@ def _after_refusal(what: str, left: str, failed: Done, whole: Path, out: Path) -
     """Continue a training that had to be refused in one line."""
     if failed.returncode != 2 or "Traceback" in failed.stderr:
         return Row(what, left, f"ended with code {failed.returncode}", False)
-    return _compared(what, left, "resumed", resume(out), whole, out)
+    return _compare_runs(what, left, "resumed", resume(out), whole, out)
 
 
 @contextlib.contextmanager
-def _mounted(*arguments: str) -> Iterator[None]:
+def _mount(*arguments: str) -> Iterator[None]:
     """Mount something on the last argument for a while."""
     _system("mount", *arguments)
     try:

@@ -23,7 +23,7 @@ from minisplat_ref.cpu.compositing.tile_rows import (
     ALPHAS,
     SCRATCH_SIZE,
     alpha_writer,
-    reached_rows,
+    find_reached_rows,
     sigma_of,
     start_scratch,
     to_mean_y,
@@ -164,7 +164,7 @@ def _count_rows(records, ids, tile_offsets, frame):  # type: ignore[no-untyped-d
         for m in range(tile_ids.size):
             if m % CHECK_EVERY == CHECK_EVERY - 1:
                 is_open = open_rows(state, 1)
-            rows = reached_rows(records, tile_ids, m, x0, y0) & is_open
+            rows = find_reached_rows(records, tile_ids, m, x0, y0) & is_open
             _write_alphas(scratch, rows, records, tile_ids[m], x0, y0)
             for row in rows_of(rows):
                 total += 1

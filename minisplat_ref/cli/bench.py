@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from minisplat_ref.arguments import Commands, HelpFormatter, integer, listed, name
+from minisplat_ref.arguments import Commands, HelpFormatter, integer, list_of, name
 from minisplat_ref.cli.oracle import add_json_argument
 from minisplat_ref.errors import InputError
 
@@ -47,13 +47,13 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument(
         "--workloads",
-        type=listed(name),
+        type=list_of(name),
         metavar="A,B",
         help="synth, synth5k, garden, garden20k (default: those that there are data for)",
     )
     parser.add_argument("--data", type=Path, metavar="FILE", help="test_garden.npz of gsplat's repository, for garden")
     parser.add_argument(
-        "--backends", type=listed(name), metavar="A,B", help="contenders, like cpu-f32,textbook-f32 (default all)"
+        "--backends", type=list_of(name), metavar="A,B", help="contenders, like cpu-f32,textbook-f32 (default all)"
     )
     parser.add_argument(
         "--repeats",
@@ -64,7 +64,7 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument(
         "--against",
-        type=listed(name),
+        type=list_of(name),
         default=(),
         metavar="A,B",
         help="gsplat-torch, opensplat=PROGRAM: time them, too",

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from minisplat_ref.arguments import Commands, HelpFormatter, integer, listed, name, option_name
+from minisplat_ref.arguments import Commands, HelpFormatter, integer, list_of, name, option_name
 from minisplat_ref.errors import InputError
 
 if TYPE_CHECKING:
@@ -60,16 +60,16 @@ def add_parser(commands: Commands) -> None:
         argument_default=argparse.SUPPRESS,
     )
     parser.add_argument("scene", nargs="?", metavar="SCENE", help="folder of a scene, as for train")
-    parser.add_argument("--recipes", type=listed(name), metavar="A,B", help="names as in train --recipe")
+    parser.add_argument("--recipes", type=list_of(name), metavar="A,B", help="names as in train --recipe")
     parser.add_argument("--out", type=Path, metavar="DIR", help="new folder for the results")
     parser.add_argument("--resume", type=Path, metavar="DIR", help="continue the comparison in DIR")
     parser.add_argument(
         "--iterations",
-        type=listed(integer(1)),
+        type=list_of(integer(1)),
         metavar="N",
         help="of every training, or N,M with a number for each recipe (default 3000)",
     )
-    parser.add_argument("--seeds", type=listed(integer(0)), metavar="S,T", help="of the trainings (default 0)")
+    parser.add_argument("--seeds", type=list_of(integer(0)), metavar="S,T", help="of the trainings (default 0)")
     parser.add_argument(
         "--eval-every", type=integer(1), metavar="K", help="measure test views each K-th (default 24 times in all)"
     )

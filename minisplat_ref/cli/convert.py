@@ -59,10 +59,10 @@ def add_parser(commands: Commands) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write the file, and say what is in it."""
     from minisplat_ref.io.formats import write_content
-    from minisplat_ref.runs.conversion import check_population, chosen_format, open_source
+    from minisplat_ref.runs.conversion import check_population, choose_format, open_source
 
     out: Path = args.output
-    format_ = chosen_format(out)
+    format_ = choose_format(out)
     if args.max_drop is None and (args.scene is not None or args.downscale is not None):
         raise InputError("--scene and --downscale are for --max-drop, which is not given: leave them out")
     source = open_source(args.input, args.extension)

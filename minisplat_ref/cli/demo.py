@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     recipe = recipe_of(settings)
     state = initial_state(scene, recipe, settings.seed)
     compile_kernels(settings.backend)
-    with terminated_like_interrupted(), run_folder.held(folder):
+    with terminated_like_interrupted(), run_folder.hold_folder(folder):
         outcome = run_training(folder, scene, settings, recipe, state)
     if outcome.evaluation is None:
         print(f"minisplat-ref: stopped; to continue: minisplat-ref train --resume {folder}", file=sys.stderr)

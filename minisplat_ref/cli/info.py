@@ -161,10 +161,10 @@ def _state_of_run(folder: Path, iterations: int) -> str:
 def _event_rows(folder: Path, settings: "Settings") -> Rows:
     """Say which mechanisms of the recipe were active, and which never."""
     from minisplat_ref.extensions.extension import find_recipe
-    from minisplat_ref.runs.events import describe, never_fired, published_times, read_mechanisms
+    from minisplat_ref.runs.events import count_published_times, describe, never_fired, read_mechanisms
     from minisplat_ref.runs.run_folder import EVENTS, is_finished
 
-    published = published_times(find_recipe(settings.recipe, extension=settings.extension))
+    published = count_published_times(find_recipe(settings.recipe, extension=settings.extension))
     found = read_mechanisms(folder / EVENTS, published)
     never = never_fired(found, published)
     rows = [(f"fired: {mechanism.action}", describe(mechanism)) for mechanism in found]

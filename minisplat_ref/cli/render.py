@@ -92,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.io.film import check_film, write_film
     from minisplat_ref.io.names import file_names
     from minisplat_ref.reference.depth import expected_depth
-    from minisplat_ref.reports.pictures import depth_picture, depth_range
+    from minisplat_ref.reports.images import depth_image, depth_range
     from minisplat_ref.runs.first_use import warn_if_not_kept
     from minisplat_ref.runs.notices import warn_of_model
     from minisplat_ref.types import view_from
@@ -103,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
     views = _choose_views(args, source)
     out: Path = args.out or source.default_out
     largest = max((view.camera for view in views), key=lambda camera: camera.width * camera.height)
-    memory.check_picture(largest.width, largest.height, args.depth)
+    memory.check_render_size(largest.width, largest.height, args.depth)
     if args.film is not None:
         check_film(args.film, [(view.camera.width, view.camera.height) for view in views])
     names = file_names([view.name for view in views])
@@ -117,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
         if args.depth:
             depth = expected_depth(output.image[..., 3], output.alpha)  # [H, W]
             np.save(out / f"{name}_depth.npy", depth)
-            write_image(out / f"{name}_depth.png", depth_picture(depth, *depth_range(depth)))
+            write_image(out / f"{name}_depth.png", depth_image(depth, *depth_range(depth)))
     print(f"{len(views)} pictures in {out}")
     if args.film is not None:
         write_film(args.film, [out / f"{name}.png" for name in names], args.fps)

@@ -207,7 +207,7 @@ def _start(given: dict[str, Any]) -> int:
     proposal = None if "downscale" in given else propose(scene, state, recipe, settings)
     if proposal is not None:
         print(f"minisplat-ref: {proposal}", file=sys.stderr)
-    with run_folder.held(folder):
+    with run_folder.hold_folder(folder):
         run_folder.check_free(folder)  # another process may have trained there meanwhile
         try:
             return _train(folder, scene, settings, recipe, state, network, given, room)
@@ -281,7 +281,7 @@ def _resume(folder: Path, given: dict[str, Any]) -> int:
     from minisplat_ref.runs.first_use import compile_kernels
 
     ours = settings.load(folder)
-    with run_folder.held(folder):
+    with run_folder.hold_folder(folder):
         ours = ours._replace(**{name: given[name] for name in AFRESH if name in given})
         if "lpips_weights" in given:
             ours = ours._replace(lpips_weights=_absolute(given["lpips_weights"]))

@@ -4,7 +4,7 @@
 :mod:`.plan`              which recipe is trained with which seed, where, and for how long
 :mod:`.runs`              the trainings, one after the other; those that were cut off go on
 :mod:`.measures`          what a finished run folder says in numbers; means over seeds
-:mod:`.speed`             rendering the test views, all models by turns
+:mod:`.speed`             rendering the test views, all models interleaved
 :mod:`.crops`             the parts of test views that are worth a look
 :mod:`.results`           all of these together, and compare.json
 :mod:`.table`             mean, deviation and ratio to the first recipe, as text

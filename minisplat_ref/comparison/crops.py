@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.reports.pictures import Picture, to_picture
+from minisplat_ref.reports.images import Image8, to_8_bits
 from minisplat_ref.runs.scoring import Trained
 from minisplat_ref.types import Floats, Scene, View
 
@@ -20,9 +20,9 @@ class Crop(NamedTuple):
     """Name of the view."""
     reason: str
     """Why it is shown."""
-    truth: Picture
+    truth: Image8
     """[h, w, 3] photograph, sRGB."""
-    renders: tuple[Picture, ...]
+    renders: tuple[Image8, ...]
     """[h, w, 3] renders, sRGB, per model."""
 
 
@@ -53,14 +53,14 @@ def choose_crops(models: Sequence[Trained], scene: Scene) -> list[Crop]:
 
 def _best_crops(models: Sequence[Trained], view: View) -> tuple[Scored, Scored]:
     """Return the crop of a view in which the recipes differ most, and that with the most detail."""
-    renders = [to_picture(model.render(view).image) for model in models]
+    renders = [to_8_bits(model.render(view).image) for model in models]
     return (
         _best_crop(view, renders, difference(view.image, renders), "where the recipes differ most"),
         _best_crop(view, renders, detail(view.image), "where there is most detail"),
     )
 
 
-def _best_crop(view: View, renders: Sequence[Picture], values: Floats, reason: str) -> Scored:
+def _best_crop(view: View, renders: Sequence[Image8], values: Floats, reason: str) -> Scored:
     height, width = (max(1, round(CROP_FRACTION * length)) for length in values.shape)
     row, column, score = best_window(values, height, width)
     window = np.s_[row : row + height, column : column + width]
@@ -69,13 +69,13 @@ def _best_crop(view: View, renders: Sequence[Picture], values: Floats, reason: s
     )
 
 
-def difference(truth: Picture, renders: Sequence[Picture]) -> Floats:
+def difference(truth: Image8, renders: Sequence[Image8]) -> Floats:
     """Return per pixel [H, W] how far the errors of the renders are apart, in levels of 8 bits."""
     errors = np.array([np.abs(image.astype(np.float64) - truth).mean(axis=2) for image in renders])  # [M, H, W]
     return errors.max(axis=0) - errors.min(axis=0)
 
 
-def detail(truth: Picture) -> Floats:
+def detail(truth: Image8) -> Floats:
     """Return per pixel [H, W] how steeply the photograph changes, in levels per pixel."""
     down, right = np.gradient(truth.mean(axis=2))  # [H, W] each
     return np.hypot(down, right)

@@ -17,7 +17,7 @@ from minisplat_ref.comparison.plan import Plan
 from minisplat_ref.comparison.results import Results
 from minisplat_ref.comparison.table import table_cells
 from minisplat_ref.datasets.synthetic.surface import NEAR, OPACITY_MIN
-from minisplat_ref.reports.page import cards, curves, grid, listing, page, panel, paragraph, section, slider, table
+from minisplat_ref.reports.page import cards, curves, grid, make_list, page, panel, paragraph, section, slider, table
 from minisplat_ref.reports.plots import to_svg
 from minisplat_ref.runs.fired import Fired
 from minisplat_ref.runs.report_parts import fired_tables
@@ -48,7 +48,7 @@ def notes(plan: Plan, results: Results) -> list[str]:
         "Model, gradients and moments: their arrays, at most; while densifying is until cloning and splitting ends,"
         " which is when Mini-Splatting simplifies.",
         "Peak memory of the process: photographs, compiler and measuring included, LPIPS not.",
-        "Rendering: all models in one process by turns, the median of several rounds.",
+        "Rendering: all models in one process, interleaved, the median of several rounds.",
     ]
     if len(plan.seeds) > 1:
         sentences.insert(
@@ -77,7 +77,7 @@ def report_html(plan: Plan, scene: Scene, results: Results) -> str:
     heading, *cells = table_cells(results.recipes)
     sections = [
         cards(map(_card, results.recipes)),
-        section("Measures", table(cells, heading), listing(notes(plan, results))),
+        section("Measures", table(cells, heading), make_list(notes(plan, results))),
         section("On the way", paragraph(CURVES_TEXT), _curves(results)),
         section("What fired, and when", paragraph(FIRED_TEXT), *(_fired_table(fired) for fired in results.fired)),
         section(
@@ -90,7 +90,7 @@ def report_html(plan: Plan, scene: Scene, results: Results) -> str:
         ),
         section("What was run", table(_settings(plan, scene, results))),
     ]
-    return page(f"{_enumerated(plan.recipes)} on {scene.name}", introduction, sections)
+    return page(f"{_enumerate(plan.recipes)} on {scene.name}", introduction, sections)
 
 
 def _card(recipe: RecipeMeasures) -> tuple[str, str]:
@@ -142,5 +142,5 @@ def _settings(plan: Plan, scene: Scene, results: Results) -> list[tuple[str, str
     ]
 
 
-def _enumerated(names: Sequence[str]) -> str:
+def _enumerate(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -18,7 +18,7 @@ from minisplat_ref.comparison.speed import render_rates
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.reporting import describe_machine
 from minisplat_ref.runs import run_folder
-from minisplat_ref.runs.events import published_times, read_mechanisms
+from minisplat_ref.runs.events import count_published_times, read_mechanisms
 from minisplat_ref.runs.fired import Fired
 from minisplat_ref.runs.scoring import load_trained
 from minisplat_ref.types import Scene
@@ -111,7 +111,7 @@ def read_fired(plan: Plan) -> list[Fired]:
     found = []
     for name, iterations in zip(plan.recipes, plan.iterations, strict=True):
         recipe = find_recipe(name)
-        published = published_times(recipe)
+        published = count_published_times(recipe)
         runs = [read_mechanisms(run.folder / run_folder.EVENTS, published) for run in plan.runs_of(name)]
         found.append(Fired(name, iterations, recipe.iterations, published, runs))
     return found

@@ -1,4 +1,4 @@
-"""How fast models are rendered: by turns in one process, so that all of them meet the same machine."""
+"""How fast models are rendered: interleaved in one process, so that all of them meet the same machine."""
 
 import statistics
 import time

@@ -10,9 +10,9 @@ import numpy as np
 from minisplat_ref.cpu.projection import pose_of
 from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.jit.literals import HALF, ZERO
-from minisplat_ref.scalar.covariance import normalized, normalized_vjp, rotation_vjp
+from minisplat_ref.scalar.covariance import normalize, normalize_vjp, rotation_vjp
 from minisplat_ref.scalar.depth import densest_depth, densest_depth_vjp, gaussian_axes, pixel_ray
-from minisplat_ref.scalar.projection import dot, rows_of, transposed
+from minisplat_ref.scalar.projection import dot, rows_of, transpose3
 from minisplat_ref.types import Camera, Floats, Ints, SurfacePoints
 
 
@@ -114,9 +114,9 @@ def _gaussian_vjp(n, pixels, ellipsoids, pose, lens, depths, v_surface, v):
             for i in range(3):
                 v_axes[k, i] += v_axis[i]
                 v_mean[i] += v_p * axes[k][i]
-    w, x, y, z, inverse_length = normalized(*quat)
-    v_unit = rotation_vjp(w, x, y, z, transposed(rows_of(v_axes)))
-    v_quat = normalized_vjp((w, x, y, z), inverse_length, v_unit)
+    w, x, y, z, inverse_length = normalize(*quat)
+    v_unit = rotation_vjp(w, x, y, z, transpose3(rows_of(v_axes)))
+    v_quat = normalize_vjp((w, x, y, z), inverse_length, v_unit)
     for i in range(4):
         v.quats[n, i] = v_quat[i]
 

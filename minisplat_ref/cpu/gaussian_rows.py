@@ -23,7 +23,7 @@ def rows_from(n, end):
 
 
 @scalar
-def listed_rows(rows, i):
+def load_rows(rows, i):
     """Return the eight rows of a list from ``i`` on."""
     return rows[i], rows[i + 1], rows[i + 2], rows[i + 3], rows[i + 4], rows[i + 5], rows[i + 6], rows[i + 7]
 
@@ -38,7 +38,7 @@ def list_visible(radii, first, end, rows):
     for n in range(first, end):
         rows[count] = n
         count += int(radii[n, 0] > 0)
-    return padded(rows, count)
+    return pad_rows(rows, count)
 
 
 @scalar
@@ -48,11 +48,11 @@ def list_visible_of(radii, degrees, degree, first, end, rows):
     for n in range(first, end):
         rows[count] = n
         count += int(radii[n, 0] > 0) & int(degrees[n] == degree)
-    return padded(rows, count)
+    return pad_rows(rows, count)
 
 
 @scalar
-def padded(rows, count):
+def pad_rows(rows, count):
     """Pad a list with copies of its last row; return the number without these."""
     for i in range(count, count + WIDTH):
         rows[i] = rows[max(count - 1, 0)]
@@ -72,7 +72,7 @@ def triple(table, rows):
 
 
 @scalar
-def rounded(lanes, zero):
+def round_lanes(lanes, zero):
     """Return three lanes in the dtype of a number."""
     return cast(lanes[0], zero), cast(lanes[1], zero), cast(lanes[2], zero)
 

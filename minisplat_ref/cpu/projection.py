@@ -19,7 +19,7 @@ from minisplat_ref.cpu.gaussian_rows import (
     add,
     gather_wide,
     list_visible,
-    listed_rows,
+    load_rows,
     rows_from,
     total_of,
     triple,
@@ -37,12 +37,12 @@ from minisplat_ref.scalar.projection import (
     conic,
     conic_vjp,
     dot,
+    matmul3,
     project_gaussian,
     project_gaussian_vjp,
-    rotated,
     rows_of,
     to_camera,
-    transposed,
+    transpose3,
 )
 from minisplat_ref.types import Camera, Floats, PrimitiveGradient, Primitives, Projection, ProjectionGradient
 
@@ -91,7 +91,7 @@ def _project_eight(rows, primitives, pose, lens, extent, out):
     x, y, z = triple(primitives.means, rows)
     p = to_camera(R, pose.centre, x, y, z)
     M = axes(_quaternion(primitives.quats, rows), triple(primitives.scales, rows))
-    footprint = project_gaussian(p, rotated(R, M), lens)
+    footprint = project_gaussian(p, matmul3(R, M), lens)
     opacity = gather_wide(primitives.opacities, rows, 0) * footprint.compensation
     a, b, c = conic(footprint)
     if extent.has_full_support:
@@ -162,7 +162,7 @@ def _project_eight_vjp(rows, is_counted, primitives, pose, lens, v, out, v_pose)
     p = to_camera(R, centre, x, y, z)
     quat, scale = _quaternion(primitives.quats, rows), triple(primitives.scales, rows)
     M = axes(quat, scale)
-    V = rotated(R, M)
+    V = matmul3(R, M)
     footprint = project_gaussian(p, V, lens)
     v_opacity = gather_wide(v.opacities, rows, 0)
     from_conic = conic_vjp(footprint, triple(v.conics, rows))
@@ -170,8 +170,8 @@ def _project_eight_vjp(rows, is_counted, primitives, pose, lens, v, out, v_pose)
     v_cov = (from_conic[0] + from_blur[0], from_conic[1] + from_blur[1], from_conic[2] + from_blur[2])
     v_x, v_y, v_z = gather_wide(v.means2d, rows, 0), gather_wide(v.means2d, rows, 1), gather_wide(v.depths, rows, 0)
     v_p, v_V = project_gaussian_vjp(p, V, lens, footprint, v_x, v_y, v_z, v_cov)
-    R_transposed = transposed(R)
-    v_quat, v_scale = axes_vjp(quat, scale, rotated(R_transposed, v_V))
+    R_transposed = transpose3(R)
+    v_quat, v_scale = axes_vjp(quat, scale, matmul3(R_transposed, v_V))
     _scatter_triple(out.means, rows, (dot(R_transposed[0], v_p), dot(R_transposed[1], v_p), dot(R_transposed[2], v_p)))
     _scatter_triple(out.scales, rows, v_scale)
     _scatter_triple(out.quats, rows, v_quat)
@@ -216,7 +216,7 @@ def _project_chunk_vjp(chunk, primitives, radii, pose, lens, v, out, v_poses):
     v_poses[chunk] = ZERO
     for i in range(0, count, WIDTH):
         is_counted = iota(DOUBLE) < count - i
-        _project_eight_vjp(listed_rows(visible, i), is_counted, primitives, in_rows, lens, v, out, v_poses[chunk])
+        _project_eight_vjp(load_rows(visible, i), is_counted, primitives, in_rows, lens, v, out, v_poses[chunk])
 
 
 @kernel()

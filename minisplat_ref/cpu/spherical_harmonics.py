@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import SH_C0, SH_C1, SH_C2, SH_C3
-from minisplat_ref.cpu.gaussian_rows import DOUBLE, add, list_visible_of, listed_rows, total_of, triple
+from minisplat_ref.cpu.gaussian_rows import DOUBLE, add, list_visible_of, load_rows, total_of, triple
 from minisplat_ref.cpu.memory import large_empty
 from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.jit.compile import kernel, prange, scalar
@@ -87,7 +87,7 @@ def _direction(centre, means, rows):
 
 
 @scalar
-def _turn(staged, column, buffer, k):
+def _transpose_out(staged, column, buffer, k):
     """Transpose eight columns of the staged rows into a buffer, where number k of all eight starts at 8 k."""
     rows = (
         load(staged, column),
@@ -103,8 +103,8 @@ def _turn(staged, column, buffer, k):
 
 
 @scalar
-def _turn_back(buffer, k, staged, column):
-    """Transpose eight columns of a buffer back into staged rows: the inverse of ``_turn``."""
+def _transpose_back(buffer, k, staged, column):
+    """Transpose eight columns of a buffer back into staged rows: the inverse of ``_transpose_out``."""
     columns = (
         _at(buffer, k),
         _at(buffer, k + 1),
@@ -151,7 +151,7 @@ def _chunk_colors(span, degree, shaded, harmonics, radii, colors):
     count = list_visible_of(radii, degrees, degree, first, end, visible)
     n_rest = (degree + 1) * (degree + 1) - 1
     for i in range(0, count, WIDTH):
-        rows = listed_rows(visible, i)
+        rows = load_rows(visible, i)
         dx, dy, dz, _ = _direction(centre, means, rows)
         if degree >= 1:
             store(y, 0, basis_1(dx, dy, dz, c))
@@ -164,7 +164,7 @@ def _chunk_colors(span, degree, shaded, harmonics, radii, colors):
                 k = min(column, 3 * n_rest - WIDTH)
                 store(staged, r * STAGE + column, load(sh_rest, visible[i + r] * width + k))
         for column in range(0, 3 * n_rest, WIDTH):
-            _turn(staged, column, rest, min(column, 3 * n_rest - WIDTH))
+            _transpose_out(staged, column, rest, min(column, 3 * n_rest - WIDTH))
         red, green, blue = _constant(sh_dc, rows, c[0])
         for k in range(n_rest):
             red = red + _at(y, k) * _at(rest, 3 * k)
@@ -221,7 +221,7 @@ def _triple_at(buffer, k):
 
 
 @scalar
-def _added(a, b):
+def _add_lanes(a, b):
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
@@ -252,7 +252,7 @@ def _chunk_vjp(span, degree, shaded, harmonics, radii, v_colors, v, v_offset):
     count = list_visible_of(radii, degrees, degree, first, end, visible)
     n_rest = (degree + 1) * (degree + 1) - 1
     for i in range(0, count, WIDTH):
-        rows = listed_rows(visible, i)
+        rows = load_rows(visible, i)
         dx, dy, dz, inverse = _direction(centre, means, rows)
         if degree >= 1:
             store(y, 0, basis_1(dx, dy, dz, c))
@@ -265,7 +265,7 @@ def _chunk_vjp(span, degree, shaded, harmonics, radii, v_colors, v, v_offset):
                 k = min(column, 3 * n_rest - WIDTH)
                 store(staged, r * STAGE + column, load(sh_rest, visible[i + r] * width + k))
         for column in range(0, 3 * n_rest, WIDTH):
-            _turn(staged, column, rest, min(column, 3 * n_rest - WIDTH))
+            _transpose_out(staged, column, rest, min(column, 3 * n_rest - WIDTH))
         red, green, blue = _constant(sh_dc, rows, c[0])
         for k in range(n_rest):
             red = red + _at(y, k) * _at(rest, 3 * k)
@@ -283,7 +283,7 @@ def _chunk_vjp(span, degree, shaded, harmonics, radii, v_colors, v, v_offset):
         for column in range(0, width, WIDTH):
             k = min(column, width - WIDTH)
             if k < 3 * n_rest:
-                _turn_back(rest, k, staged, column)
+                _transpose_back(rest, k, staged, column)
             for r in range(WIDTH):
                 if k < 3 * n_rest:
                     store(v_rest, visible[i + r] * width + k, load(staged, r * STAGE + column))
@@ -291,12 +291,12 @@ def _chunk_vjp(span, degree, shaded, harmonics, radii, v_colors, v, v_offset):
                     store(v_rest, visible[i + r] * width + k, v_rest.dtype.type(0))
         v_d = (ZERO * dx, ZERO * dx, ZERO * dx)
         if degree >= 1:
-            v_d = _added(v_d, basis_1_vjp(c, _triple_at(y, 0)))
+            v_d = _add_lanes(v_d, basis_1_vjp(c, _triple_at(y, 0)))
         if degree >= 2:
-            v_d = _added(v_d, basis_2_vjp(dx, dy, dz, c, (*_triple_at(y, 3), _at(y, 6), _at(y, 7))))
+            v_d = _add_lanes(v_d, basis_2_vjp(dx, dy, dz, c, (*_triple_at(y, 3), _at(y, 6), _at(y, 7))))
         if degree >= 3:
             v_basis = (*_triple_at(y, 8), *_triple_at(y, 11), _at(y, 14))
-            v_d = _added(v_d, basis_3_vjp(dx, dy, dz, c, v_basis))
+            v_d = _add_lanes(v_d, basis_3_vjp(dx, dy, dz, c, v_basis))
         v_x, v_y, v_z = direction_vjp(dx, dy, dz, inverse, v_d[0], v_d[1], v_d[2])
         scatter(v_means, rows, 0, v_x)
         scatter(v_means, rows, 1, v_y)

@@ -1,6 +1,6 @@
 """Estimate cameras and sparse points from a folder of photographs, on the CPU: structure from motion by pycolmap.
 
-Photographs are turned upright (EXIF) and shrunk, SIFT features are found and matched, cameras and points are estimated
+Photographs are rotated upright (EXIF) and shrunk, SIFT features are found and matched, cameras and points are estimated
 one image after the other (incremental mapping), and the result is undistorted. What is left is a COLMAP scene with
 pinhole cameras: ``images/`` and ``sparse/0/``. Photographs that could not be registered are named and left out. The
 focal length in the EXIF data is COLMAP's initial value; location and time are not copied.

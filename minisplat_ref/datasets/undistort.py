@@ -24,7 +24,7 @@ from minisplat_ref.io.images import SAVE_OPTIONS, write_image
 from minisplat_ref.io.lens import import_quiet_pycolmap
 from minisplat_ref.io.names import file_names
 from minisplat_ref.io.scene import Photo, build_reading, check_photo, read_view
-from minisplat_ref.io.transforms import existing_frames, find_points, find_transforms, read_transforms
+from minisplat_ref.io.transforms import find_frames, find_points, find_transforms, read_transforms
 from minisplat_ref.types import Camera
 
 # What a transforms.json says about lenses; every frame gets its pinhole's entries instead.
@@ -87,7 +87,7 @@ def _undistort_colmap(scene: Path, model: Path, folder: Path) -> None:
 def _undistort_transforms(files: Sequence[Path], folder: Path) -> None:
     """Write images, masks, points and each transforms file, with intrinsics per frame."""
     contents = [read_transforms(file) for file in files]
-    pairs = [existing_frames(file, content) for file, content in zip(files, contents, strict=True)]
+    pairs = [find_frames(file, content) for file, content in zip(files, contents, strict=True)]
     photos = [photo for of_file in pairs for _, photo in of_file]
     _check_distorted(files[0], photos)
     names = iter(_names_of_copies(files[0], photos))

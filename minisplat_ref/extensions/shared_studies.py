@@ -10,7 +10,7 @@ import numpy as np
 
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.mechanisms.sampling import block_means, zoomed
+from minisplat_ref.mechanisms.sampling import block_means, zoom_camera
 from minisplat_ref.types import Floats, Scene
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ def shrunk(scene: Scene, n: int) -> Scene:
     views = []
     for view in scene.train_views:
         photograph = view.loaded()
-        camera = zoomed(photograph.camera, 1 / n)
+        camera = zoom_camera(photograph.camera, 1 / n)
         if min(camera.width, camera.height) < 16:
             raise InputError(f"photograph {view.name} at 1/{n} of its size has fewer than 16 pixels: lower --downscale")
         image = np.rint(block_means(photograph.image.astype(np.float64), n)).astype(np.uint8)

@@ -173,7 +173,7 @@ def _lens(camera: Any) -> Lens | None:
     return None if name in PINHOLE_MODELS or has_zero_distortion else Lens(name, tuple(params.tolist()))
 
 
-def _sorted_points(reconstruction: Any) -> list[Any]:
+def _sort_points(reconstruction: Any) -> list[Any]:
     """Return the sparse points by ascending id, so that the order does not depend on the file's."""
     return [point for _, point in sorted(reconstruction.points3D.items())]
 
@@ -181,7 +181,7 @@ def _sorted_points(reconstruction: Any) -> list[Any]:
 def _point_ids(reconstruction: Any) -> dict[int, Ints] | None:
     """Return the rows of the points that each image sees, by the image's id; None for a model without tracks."""
     rows: dict[int, list[int]] = {}
-    for row, point in enumerate(_sorted_points(reconstruction)):
+    for row, point in enumerate(_sort_points(reconstruction)):
         for element in point.track.elements:
             rows.setdefault(element.image_id, []).append(row)
     # An image may have matched a point twice.
@@ -190,7 +190,7 @@ def _point_ids(reconstruction: Any) -> dict[int, Ints] | None:
 
 def _points(reconstruction: Any) -> tuple[Floats, NDArray[np.uint8]]:
     """Return the sparse points and their colours, [P, 3] each."""
-    points = _sorted_points(reconstruction)
+    points = _sort_points(reconstruction)
     positions = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
     return positions, np.array([point.color for point in points], np.uint8).reshape(-1, 3)
 

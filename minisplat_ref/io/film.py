@@ -1,4 +1,4 @@
-"""Films from the pictures of a rendering: GIF by Pillow, MP4 (H.264) by imageio and its ffmpeg, which are optional."""
+"""Films from the images of a rendering: GIF by Pillow, MP4 (H.264) by imageio and its ffmpeg, which are optional."""
 
 import os
 from collections.abc import Sequence
@@ -25,19 +25,19 @@ MP4_OPTIONS: dict[str, Any] = {
 
 
 def check_film(path: Path, sizes: Sequence[tuple[int, int]]) -> None:
-    """Refuse a film that cannot be written, before its pictures are rendered.
+    """Refuse a film that cannot be written, before its images are rendered.
 
     Parameters
     ----------
     path : Path
         The film.
     sizes : sequence of (width, height)
-        Of its pictures, pixels.
+        Of its images, pixels.
 
     Raises
     ------
     InputError
-        The suffix is unknown, imageio is missing, the folder does not exist, or the pictures differ in size.
+        The suffix is unknown, imageio is missing, the folder does not exist, or the images differ in size.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: a film is {' or '.join(SUFFIXES)}; give one of these suffixes")
@@ -47,7 +47,7 @@ def check_film(path: Path, sizes: Sequence[tuple[int, int]]) -> None:
         if len(different) > 1:
             (width, height), (other_width, other_height) = different[:2]
             raise InputError(
-                f"{path}: the pictures of a film have one size, and these are {width} x {height} and {other_width} x"
+                f"{path}: the images of a film have one size, and these are {width} x {height} and {other_width} x"
                 f" {other_height}: give --cameras orbit"
             )
         if path.suffix.lower() == ".mp4" and min(different[0]) < 2:
@@ -56,40 +56,40 @@ def check_film(path: Path, sizes: Sequence[tuple[int, int]]) -> None:
         _import_imageio(path)
 
 
-def write_film(path: Path, pictures: Sequence[Path], fps: float) -> None:
-    """Write pictures as a film, which a GIF repeats without end.
+def write_film(path: Path, paths: Sequence[Path], fps: float) -> None:
+    """Write images as a film, which a GIF repeats without end.
 
     Parameters
     ----------
     path : Path
         ``.gif`` or ``.mp4``, see :func:`check_film`.
-    pictures : sequence of Path
+    paths : sequence of Path
         Image files of one size, in order. One is read at a time. An MP4 loses the last row or column of an odd size.
     fps : float
-        Pictures per second. A GIF counts in hundredths of a second.
+        Images per second. A GIF counts in hundredths of a second.
     """
     with replacing(path) as temporary:
         if path.suffix.lower() == ".gif":
-            _write_gif(temporary, pictures, fps)
+            _write_gif(temporary, paths, fps)
         else:
-            _write_mp4(temporary, pictures, fps)
+            _write_mp4(temporary, paths, fps)
 
 
-def _write_gif(path: Path, pictures: Sequence[Path], fps: float) -> None:
-    frames = (Image.fromarray(np.asarray(read_image(picture))).quantize(N_COLORS) for picture in pictures)
+def _write_gif(film: Path, paths: Sequence[Path], fps: float) -> None:
+    frames = (Image.fromarray(np.asarray(read_image(path))).quantize(N_COLORS) for path in paths)
     first = next(frames)
     hundredths = max(1, round(100 / fps))
-    first.save(path, format="GIF", save_all=True, append_images=frames, duration=10 * hundredths, loop=0)
+    first.save(film, format="GIF", save_all=True, append_images=frames, duration=10 * hundredths, loop=0)
 
 
-def _write_mp4(path: Path, pictures: Sequence[Path], fps: float) -> None:
-    with TemporaryDirectory(dir=path.parent) as folder:
-        film = Path(folder) / "film.mp4"  # imageio refuses other suffixes
-        with _import_imageio(path).get_writer(film, fps=fps, **MP4_OPTIONS) as writer:
-            for picture in pictures:
-                image = read_image(picture)  # [H, W, 3]
+def _write_mp4(film: Path, paths: Sequence[Path], fps: float) -> None:
+    with TemporaryDirectory(dir=film.parent) as folder:
+        unfinished = Path(folder) / "film.mp4"  # imageio refuses other suffixes
+        with _import_imageio(film).get_writer(unfinished, fps=fps, **MP4_OPTIONS) as writer:
+            for path in paths:
+                image = read_image(path)  # [H, W, 3]
                 writer.append_data(image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2])
-        os.replace(film, path)
+        os.replace(unfinished, film)
 
 
 def _import_imageio(path: Path) -> Any:

@@ -85,12 +85,12 @@ def file_names(names: Sequence[str]) -> list[str]:
     Letters, digits, ``.``, ``-`` and ``_`` stay, others become ``_``. If the results would not differ, even on file
     systems that ignore case, or one of them would be invalid, all are prefixed with their number.
     """
-    stems = [_shortened(re.sub(r"[^\w.-]", "_", name)) for name in names]
+    stems = [_shorten(re.sub(r"[^\w.-]", "_", name)) for name in names]
     is_unique = len({stem.casefold() for stem in stems}) == len(stems)
     is_usable = all(stem.strip("._") and not RESERVED.fullmatch(stem) for stem in stems)
     return stems if is_unique and is_usable else [f"{index:04d}_{stem}" for index, stem in enumerate(stems)]
 
 
-def _shortened(stem: str) -> str:
+def _shorten(stem: str) -> str:
     """Return the last characters of a name that is too long, because numbers are usually at the end."""
     return stem[-CHARACTERS_MAX:].encode()[-BYTES_MAX:].decode(errors="ignore")

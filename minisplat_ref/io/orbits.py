@@ -62,7 +62,7 @@ def orbit(
         is_closed = last - first >= FULL_CIRCLE
         share = time if is_closed else 0.5 - 0.5 * math.cos(FULL_CIRCLE * time)  # slows down where it turns
         position, forward = _place(path, first + share * (last - first))
-        rotation = _looking(forward, path.up)
+        rotation = _look_along(forward, path.up)
         camera = Camera(
             rotation, -rotation @ position, path.focal, path.focal, 0.5 * width, 0.5 * height, width, height
         )
@@ -121,7 +121,7 @@ def _path_of_cameras(cameras: Sequence[Camera], width: int) -> _Path:
     places = np.stack([radii, heights], axis=1)
     focal = cameras[0].fx * width / cameras[0].width
     angles, places, directions = angles[is_off_axis], places[is_off_axis], directions[is_off_axis]
-    return _Path(target, up, start, angles, places, directions, _covered(angles), focal)
+    return _Path(target, up, start, angles, places, directions, _find_covered(angles), focal)
 
 
 def _nearest_to_axes(centres: Floats, forwards: Floats) -> Floats:
@@ -147,7 +147,7 @@ def _up(rotations: Floats) -> Floats:
     return np.copysign(1.0, up @ mean_up) * up
 
 
-def _covered(angles: Floats) -> tuple[float, float]:
+def _find_covered(angles: Floats) -> tuple[float, float]:
     """Return the first and last angle of the path: a full circle, or all but the largest gap between cameras."""
     ordered = np.sort(angles)
     gaps = np.diff(ordered, append=ordered[0] + FULL_CIRCLE)  # [V]
@@ -169,7 +169,7 @@ def _path_of_means(means: Floats, width: int, height: int) -> _Path:
     return _Path(target, up, _perpendicular(up), np.zeros(1), place, direction, (0.0, FULL_CIRCLE), focal)
 
 
-def _looking(forward: Floats, up: Floats) -> Floats:
+def _look_along(forward: Floats, up: Floats) -> Floats:
     """Rotation cam_from_world [3, 3] whose rows are the camera's right, down and forward."""
     forward = _unit(forward, fallback=_perpendicular(up))
     right = _unit(np.cross(forward, up), fallback=_perpendicular(up))

@@ -41,7 +41,7 @@ def read_faces(path: str | Path) -> list[Corners]:
             raise InputError(f"{path}: its property {corners.name} is not of integers; export the mesh again")
         if header.encoding == "ascii":
             lines = islice(file, sum(element.n for element in before), None)
-            return [_of_words(path, line.split(), faces, corners) for line in _declared(lines, path, faces.n)]
+            return [_of_words(path, line.split(), faces, corners) for line in _take_declared(lines, path, faces.n)]
         for element in before:
             pass_over(file, path, element)
         return [_of_bytes(file, path, faces, corners) for _ in range(faces.n)]
@@ -62,7 +62,7 @@ def _of_bytes(file: BinaryIO, path: Path, faces: Element, corners: Property) -> 
     return np.frombuffer(found, corners.dtype).astype(np.int64)
 
 
-def _declared(lines: Iterable[bytes], path: Path, n: int) -> Iterator[bytes]:
+def _take_declared(lines: Iterable[bytes], path: Path, n: int) -> Iterator[bytes]:
     """Yield the next n lines, which must be there."""
     n_found = 0
     for line in islice(lines, n):

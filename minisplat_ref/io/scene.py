@@ -147,10 +147,10 @@ def build_scene(
     names = _view_names(photos, source)
     shelf_bytes = memory.shelf_bytes(sum(map(_n_bytes, photos)) / reading.downscale**2)
     if shelf_bytes is None:
-        views = tuple(read_view(photo, name, reading) for photo, name in _shown(photos, names))
+        views = tuple(read_view(photo, name, reading) for photo, name in _show_progress(photos, names))
     else:
         shelf = Shelf(shelf_bytes)
-        views = tuple(stored_view(photo, name, reading, shelf) for photo, name in _shown(photos, names))
+        views = tuple(make_stored_view(photo, name, reading, shelf) for photo, name in _show_progress(photos, names))
     folder = source if source.is_dir() else source.parent
     return Scene(
         name=folder.resolve().name,
@@ -163,7 +163,7 @@ def build_scene(
     )
 
 
-def _shown(photos: Sequence[Photo], names: Sequence[str]) -> Iterable[tuple[Photo, str]]:
+def _show_progress(photos: Sequence[Photo], names: Sequence[str]) -> Iterable[tuple[Photo, str]]:
     """Return photographs with their names, with a progress bar on a terminal if reading takes a while."""
     pairs = list(zip(photos, names, strict=True))
     return tqdm(pairs, desc="photographs", unit=" images", delay=SILENT_SECONDS, leave=False, disable=None)
@@ -230,7 +230,7 @@ def read_view(photo: Photo, name: str, reading: Reading) -> View:
     return View(name, camera, image, mask, photo.point_ids, time=photo.time)
 
 
-def stored_view(photo: Photo, name: str, reading: Reading, shelf: Shelf) -> View:
+def make_stored_view(photo: Photo, name: str, reading: Reading, shelf: Shelf) -> View:
     """Return the view of a photograph whose pixels are read on demand; now only the file's size is read."""
     camera = _camera(photo, reading)
     read = partial(_read_again, photo, reading, camera, _signature(photo, reading))
@@ -266,7 +266,7 @@ def _read_pixels(photo: Photo, reading: Reading, camera: Camera) -> Pixels:
     image, mask = _apply_alpha_and_mask(image, photo, reading)
     if photo.lens is not None:
         image, mask, _ = undistort(image, mask, photo.camera, photo.lens)
-    return _resized(Pixels(image, mask), camera.width, camera.height)
+    return _resize(Pixels(image, mask), camera.width, camera.height)
 
 
 def _read_again(photo: Photo, reading: Reading, camera: Camera, signature: list[tuple[int, int] | None]) -> Pixels:
@@ -294,12 +294,12 @@ def half_size(view: View) -> View:
     width, height = downscaled_size(view.camera.width, view.camera.height, 2)
     camera = rescale_camera(view.camera, width, height)
     if isinstance(view, StoredView):
-        return view.changed(partial(_resized, width=width, height=height))._replace(camera=camera)
-    image, mask = _resized(Pixels(view.image, view.mask), width, height)
+        return view.changed(partial(_resize, width=width, height=height))._replace(camera=camera)
+    image, mask = _resize(Pixels(view.image, view.mask), width, height)
     return view._replace(camera=camera, image=image, mask=mask)
 
 
-def _resized(pixels: Pixels, width: int, height: int) -> Pixels:
+def _resize(pixels: Pixels, width: int, height: int) -> Pixels:
     """Return a photograph and its mask at another size."""
     image, mask = pixels
     if image.shape[:2] == (height, width):

@@ -78,7 +78,7 @@ def load_transforms(
     if not files:
         raise InputError(f"{path}: no {BLENDER_FILES[0]} or {SINGLE_FILE}; give the folder that holds one, or the file")
     sets = [read_transforms(file) for file in files[: 1 if test_every == 0 else 2]]
-    photos = [[photo for _, photo in existing_frames(*pair)] for pair in zip(files, sets, strict=False)]
+    photos = [[photo for _, photo in find_frames(*pair)] for pair in zip(files, sets, strict=False)]
     train_photos, test_photos = split_photos(photos[0], test_every if len(files) == 1 else 0)
     if len(photos) == 2:
         test_photos, _ = split_photos(photos[1], 0)
@@ -113,7 +113,7 @@ def read_transforms(file: Path) -> dict[str, Any]:
     return transforms
 
 
-def existing_frames(file: Path, transforms: Mapping[str, Any]) -> list[tuple[dict[str, Any], Photo]]:
+def find_frames(file: Path, transforms: Mapping[str, Any]) -> list[tuple[dict[str, Any], Photo]]:
     """Pair the frames of a file with their photographs; one warning names the images that do not exist."""
     frames = [(frame, _image_file(file, frame["file_path"])) for frame in transforms["frames"]]
     missing = [frame["file_path"] for frame, image_file in frames if image_file is None]

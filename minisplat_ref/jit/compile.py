@@ -197,10 +197,10 @@ def scalar(function: Callable) -> Callable:
     """Mark a formula of one Gaussian or one pixel that kernels call; in Python the function stays itself."""
     # Always inlined: a call would count references to every array argument, an atomic operation each. Nothing calls it
     # through a C pointer, and the wrapper for that would be a tenth of the compiled code.
-    return register_jitable(forceinline=True, no_cfunc_wrapper=True)(_named_after_closure(function))
+    return register_jitable(forceinline=True, no_cfunc_wrapper=True)(_add_closure_to_name(function))
 
 
-def _named_after_closure(function: Callable) -> Callable:
+def _add_closure_to_name(function: Callable) -> Callable:
     """Add what a function closes over to its name, after which compiled symbols are named."""
     names = [_name_of(cell.cell_contents) for cell in function.__closure__ or ()]
     if names:
@@ -263,7 +263,7 @@ def kernel(parallel: bool = True) -> Callable[[Callable], Callable]:
                 error_model="numpy",
                 fastmath={"contract"},
                 no_cfunc_wrapper=True,
-            )(_named_after_closure(function))
+            )(_add_closure_to_name(function))
         finally:
             numba.config.CACHE_DIR = previous  # type: ignore[attr-defined]
         if folder is not None and not numba.config.DISABLE_JIT:  # type: ignore[attr-defined]  # then it is plain Python

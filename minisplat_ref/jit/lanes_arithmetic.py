@@ -52,7 +52,7 @@ class _Model(models.PrimitiveModel):
 # --- how operations are made ---
 
 
-def joined(*kinds: types.Type) -> LanesType | None:
+def join_types(*kinds: types.Type) -> LanesType | None:
     """Return the type of lanes that all operands become; None if none are lanes, or one is too wide for them."""
     lanes = next((kind for kind in kinds if isinstance(kind, LanesType)), None)
     if lanes is None:
@@ -64,7 +64,7 @@ def joined(*kinds: types.Type) -> LanesType | None:
     return lanes
 
 
-def spread(context: Any, builder: Any, value: Any, kind: types.Type, lanes: LanesType) -> Any:
+def broadcast_value(context: Any, builder: Any, value: Any, kind: types.Type, lanes: LanesType) -> Any:
     """Broadcast a single number; lanes stay as they are."""
     if isinstance(kind, LanesType):
         return value
@@ -74,8 +74,8 @@ def spread(context: Any, builder: Any, value: Any, kind: types.Type, lanes: Lane
 
 
 def _operands(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
-    lanes: Any = joined(*signature.args)
-    return [spread(context, builder, *pair, lanes) for pair in zip(args, signature.args, strict=True)]
+    lanes: Any = join_types(*signature.args)
+    return [broadcast_value(context, builder, *pair, lanes) for pair in zip(args, signature.args, strict=True)]
 
 
 def _call(builder: Any, name: str, result: Any, args: Any) -> Any:
@@ -85,7 +85,7 @@ def _call(builder: Any, name: str, result: Any, args: Any) -> Any:
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"{name}.v{WIDTH}{element}"), args)
 
 
-def compiled(function: Callable) -> Callable[[Callable], None]:
+def register_lowering(function: Callable) -> Callable[[Callable], None]:
     """Register a function's compiled implementation.
 
     Numba's ``overload`` would do, but compiles a wrapper for each of them, which takes longer than everything else.
@@ -99,11 +99,11 @@ def compiled(function: Callable) -> Callable[[Callable], None]:
     return register
 
 
-def _typed(emit: Callable, has_boolean_result: bool = False) -> Callable:
+def _type_lanes(emit: Callable, has_boolean_result: bool = False) -> Callable:
     """Return the typing of a function of lanes, together with ``emit``, which writes its instruction."""
 
     def typed(*kinds: Any) -> Any:
-        lanes = joined(*kinds)
+        lanes = join_types(*kinds)
         if lanes is None:
             return None
         result = LanesType(types.boolean) if has_boolean_result else lanes
@@ -118,8 +118,8 @@ def _typed(emit: Callable, has_boolean_result: bool = False) -> Callable:
 
 def _register_unary(function: Callable, emit: Callable, of_one: Callable | None = None) -> None:
     """Register a function of lanes; ``of_one`` is the function of single numbers if Numba has none."""
-    typed = _typed(emit)
-    compiled(function)(lambda typing, a: typed(a))
+    typed = _type_lanes(emit)
+    register_lowering(function)(lambda typing, a: typed(a))
     if of_one is not None:
         overload(function)(lambda a: None if isinstance(a, LanesType) else of_one)
 
@@ -127,8 +127,8 @@ def _register_unary(function: Callable, emit: Callable, of_one: Callable | None 
 def _register_binary(
     function: Callable, emit: Callable, has_boolean_result: bool = False, of_one: Callable | None = None
 ) -> None:
-    typed = _typed(emit, has_boolean_result)
-    compiled(function)(lambda typing, a, b: typed(a, b))
+    typed = _type_lanes(emit, has_boolean_result)
+    register_lowering(function)(lambda typing, a, b: typed(a, b))
     if of_one is not None:
         overload(function)(lambda a, b: None if isinstance(a, LanesType) or isinstance(b, LanesType) else of_one)
 
@@ -170,7 +170,7 @@ _register_unary(exp_of, lambda builder, a: _call(builder, "llvm.exp", a.type, [a
 _register_unary(log_of, lambda builder, a: _call(builder, "llvm.log", a.type, [a]), of_one=lambda a: math.log(a))
 
 
-@compiled(ldexp)
+@register_lowering(ldexp)
 def _ldexp(typing: Any, a: Any, n: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bits = ir.VectorType(I32, WIDTH)
@@ -185,14 +185,14 @@ def _select_one(condition, a, b):
     return None if isinstance(condition, LanesType) else lambda condition, a, b: a if condition else b
 
 
-@compiled(select)
+@register_lowering(select)
 def _select(typing: Any, condition: Any, a: Any, b: Any) -> Any:
-    lanes = joined(a, b)
+    lanes = join_types(a, b)
     if lanes is None or not isinstance(condition, LanesType):
         return None
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         pair = zip(args[1:], signature.args[1:], strict=True)
-        return builder.select(args[0], *(spread(context, builder, *one, lanes) for one in pair))
+        return builder.select(args[0], *(broadcast_value(context, builder, *one, lanes) for one in pair))
 
     return lanes(condition, a, b), generate

@@ -26,16 +26,25 @@ from minisplat_ref.jit.lanes import (
     store,
     transpose,
 )
-from minisplat_ref.jit.lanes_arithmetic import I32, LanesType, compiled, joined, maximum_lanes, spread
+from minisplat_ref.jit.lanes_arithmetic import (
+    I32,
+    LanesType,
+    broadcast_value,
+    join_types,
+    maximum_lanes,
+    register_lowering,
+)
 
 
-@compiled(broadcast)
+@register_lowering(broadcast)
 def _broadcast(typing: Any, number: Any) -> Any:
     lanes = LanesType(number)
-    return lanes(number), lambda context, builder, signature, args: spread(context, builder, args[0], number, lanes)
+    return lanes(number), lambda context, builder, signature, args: broadcast_value(
+        context, builder, args[0], number, lanes
+    )
 
 
-@compiled(iota)
+@register_lowering(iota)
 def _iota(typing: Any, zero: Any) -> Any:
     lanes = LanesType(zero)
     return lanes(zero), lambda context, builder, signature, args: ir.Constant(
@@ -49,7 +58,7 @@ def _pointer(context: Any, builder: Any, signature: Any, args: Any) -> Any:
     return builder.bitcast(builder.gep(data, [args[1]], inbounds=True), vector.as_pointer())
 
 
-@compiled(load)
+@register_lowering(load)
 def _load(typing: Any, array: Any, i: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.load(_pointer(context, builder, signature, args), align=array.dtype.bitwidth // 8)
@@ -57,18 +66,18 @@ def _load(typing: Any, array: Any, i: Any) -> Any:
     return LanesType(array.dtype)(array, i), generate
 
 
-def _written(typing: Any, array: Any, i: Any, lanes: Any, is_added: bool) -> Any:
+def _type_writing(typing: Any, array: Any, i: Any, lanes: Any, is_added: bool) -> Any:
     """Return the typing of a function that writes lanes, or a tuple of them, to an array, or adds them to it."""
     kind = LanesType(array.dtype)
     kinds = list(lanes) if isinstance(lanes, types.BaseTuple) else [lanes]
-    if any(joined(kind, one) is None for one in kinds):
+    if any(join_types(kind, one) is None for one in kinds):
         return None
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         first, align = _pointer(context, builder, signature, args), array.dtype.bitwidth // 8
         for k, of_one in enumerate(kinds):
             one = builder.extract_value(args[2], k) if isinstance(lanes, types.BaseTuple) else args[2]
-            value, place = spread(context, builder, one, of_one, kind), builder.gep(first, [I32(k)])
+            value, place = broadcast_value(context, builder, one, of_one, kind), builder.gep(first, [I32(k)])
             if is_added:
                 value = builder.fadd(builder.load(place, align=align), value, flags=["contract"])
             builder.store(value, place, align=align)
@@ -77,8 +86,8 @@ def _written(typing: Any, array: Any, i: Any, lanes: Any, is_added: bool) -> Any
     return types.void(array, i, lanes), generate
 
 
-compiled(store)(lambda typing, array, i, lanes: _written(typing, array, i, lanes, is_added=False))
-compiled(accumulate)(lambda typing, array, i, lanes: _written(typing, array, i, lanes, is_added=True))
+register_lowering(store)(lambda typing, array, i, lanes: _type_writing(typing, array, i, lanes, is_added=False))
+register_lowering(accumulate)(lambda typing, array, i, lanes: _type_writing(typing, array, i, lanes, is_added=True))
 
 
 def _row_pointers(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
@@ -96,7 +105,7 @@ def _row_pointers(context: Any, builder: Any, signature: Any, args: Any) -> list
     ]
 
 
-@compiled(gather)
+@register_lowering(gather)
 def _gather(typing: Any, table: Any, rows: Any, column: Any) -> Any:
     if table.ndim > 2 and table.layout != "C":
         return None
@@ -111,7 +120,7 @@ def _gather(typing: Any, table: Any, rows: Any, column: Any) -> Any:
     return lanes(table, rows, types.int64), generate
 
 
-@compiled(scatter)
+@register_lowering(scatter)
 def _scatter(typing: Any, table: Any, rows: Any, column: Any, lanes: Any) -> Any:
     if table.layout != "C" and (table.ndim > 2 or not isinstance(lanes, LanesType)):
         return None
@@ -125,7 +134,7 @@ def _scatter(typing: Any, table: Any, rows: Any, column: Any, lanes: Any) -> Any
                 builder.store(builder.extract_element(vector, I32(k)), pointer)
             return context.get_dummy_value()
         columns = [_convert(builder, builder.extract_value(args[3], k), kind) for k in range(WIDTH)]
-        for row, pointer in zip(_turned(builder, columns), pointers, strict=True):
+        for row, pointer in zip(_transpose_rows(builder, columns), pointers, strict=True):
             builder.store(row, builder.bitcast(pointer, kind.as_pointer()), align=table.dtype.bitwidth // 8)
         return context.get_dummy_value()
 
@@ -142,7 +151,7 @@ def _convert(builder: Any, vector: Any, kind: Any) -> Any:
     return (builder.fptrunc if isinstance(kind.element, ir.FloatType) else builder.fpext)(vector, kind)
 
 
-@compiled(cast)
+@register_lowering(cast)
 def _cast(typing: Any, lanes: Any, zero: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return _convert(builder, args[0], context.get_value_type(LanesType(zero)))
@@ -150,7 +159,7 @@ def _cast(typing: Any, lanes: Any, zero: Any) -> Any:
     return LanesType(zero)(lanes, zero), generate
 
 
-def _turned(builder: Any, rows: list[Any]) -> list[Any]:
+def _transpose_rows(builder: Any, rows: list[Any]) -> list[Any]:
     """Return the columns of an 8 x 8 matrix, given its rows."""
     vectors = list(rows)
     for size in (4, 2, 1):  # swap blocks of this size across the diagonal
@@ -163,10 +172,10 @@ def _turned(builder: Any, rows: list[Any]) -> list[Any]:
     return vectors
 
 
-@compiled(transpose)
+@register_lowering(transpose)
 def _transpose(typing: Any, rows: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return context.make_tuple(builder, rows, _turned(builder, cgutils.unpack_tuple(builder, args[0])))
+        return context.make_tuple(builder, rows, _transpose_rows(builder, cgutils.unpack_tuple(builder, args[0])))
 
     return rows(rows), generate
 
@@ -183,10 +192,10 @@ def _register_reduction(function: Callable, emit: Callable) -> None:
             vector = emit(builder, *(builder.shuffle_vector(vector, vector, half) for half in halves))
         return builder.extract_element(vector, I32(0))
 
-    compiled(function)(lambda typing, lanes: (lanes.element(lanes), generate))
+    register_lowering(function)(lambda typing, lanes: (lanes.element(lanes), generate))
 
 
-@compiled(reduce_sums)
+@register_lowering(reduce_sums)
 def _reduce_sums(typing: Any, rows: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         vectors, width = cgutils.unpack_tuple(builder, args[0]), WIDTH
@@ -205,7 +214,7 @@ _register_reduction(reduce_sum, lambda builder, a, b: builder.fadd(a, b))
 _register_reduction(reduce_max, maximum_lanes)
 
 
-@compiled(reduce_any)
+@register_lowering(reduce_any)
 def _reduce_any(typing: Any, condition: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bits = builder.bitcast(args[0], ir.IntType(WIDTH))
@@ -214,7 +223,7 @@ def _reduce_any(typing: Any, condition: Any) -> Any:
     return types.boolean(condition), generate
 
 
-@compiled(prefetch)
+@register_lowering(prefetch)
 def _prefetch(typing: Any, table: Any, row: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         array = context.make_array(table)(context, builder, args[0])
@@ -233,7 +242,7 @@ def _prefetch(typing: Any, table: Any, row: Any) -> Any:
     return types.void(table, row), generate
 
 
-@compiled(lowest_bit)
+@register_lowering(lowest_bit)
 def _lowest_bit(typing: Any, bits: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.cttz(args[0], ir.IntType(1)(1))
@@ -241,7 +250,7 @@ def _lowest_bit(typing: Any, bits: Any) -> Any:
     return types.int64(bits), generate
 
 
-@compiled(bits_between)
+@register_lowering(bits_between)
 def _bits_between(typing: Any, bounds: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         half = WIDTH // 2

@@ -20,11 +20,11 @@ from llvmlite import ir
 from numba import types
 
 from minisplat_ref.jit.compile import scalar
-from minisplat_ref.jit.lanes_arithmetic import compiled
+from minisplat_ref.jit.lanes_arithmetic import register_lowering
 
 
 @scalar
-def shared_counter():
+def make_shared_counter():
     """Return a counter of the parts that have been taken, shared by all threads of one loop."""
     taken = np.empty(1, np.int64)
     taken[0] = 0
@@ -37,7 +37,7 @@ def fetch_and_increment(taken: Any) -> int:
     return int(taken[0]) - 1
 
 
-@compiled(fetch_and_increment)
+@register_lowering(fetch_and_increment)
 def _fetch_and_increment(typing: Any, taken: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         counter = context.make_array(taken)(context, builder, args[0]).data

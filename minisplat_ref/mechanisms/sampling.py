@@ -42,7 +42,7 @@ def sampling_intervals(means: Floats, cameras: Sequence[Camera]) -> Floats:
     return intervals
 
 
-def zoomed(camera: Camera, scale: float) -> Camera:
+def zoom_camera(camera: Camera, scale: float) -> Camera:
     """Return the camera with ``scale`` times as many pixels per side, rounded down; the edge pixels are cut off.
 
     The focal length is exactly ``scale`` times the old one, so that a block of old pixels is exactly one new pixel.

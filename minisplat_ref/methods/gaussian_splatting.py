@@ -85,7 +85,7 @@ def prune_large(state: TrainState, iteration: Iteration, *, size_fraction: float
 
 def reset_opacity(state: TrainState, iteration: Iteration, *, ceiling: float) -> None:
     """Lower all opacities to at most ``ceiling`` and forget their moments, which point back up."""
-    logits = clone_split.capped_opacity_logits(state.gaussians.opacity_logits, ceiling=ceiling)
+    logits = clone_split.cap_opacity_logits(state.gaussians.opacity_logits, ceiling=ceiling)
     state.gaussians = state.gaussians._replace(opacity_logits=logits)
     for moment in (state.adam.first, state.adam.second):
         moment.opacity_logits[:] = 0

@@ -74,7 +74,7 @@ def candidates(stats: ImportanceStats, metric: Metric, min_views: int, *, is_int
     importance = metric(stats)
     if is_intersecting:
         importance = simplification.intersection_preserving(importance, stats.dominant_count)
-    importance = np.where(visibility.seen_by_few(stats.is_visible, min_views), 0.0, importance)
+    importance = np.where(visibility.find_seen_by_few(stats.is_visible, min_views), 0.0, importance)
     if not importance.any():
         raise InputError("no Gaussian matters to any training view: check that the cameras look at the scene's points")
     return importance
@@ -238,7 +238,7 @@ def prune_tail(
     if is_culling(state):
         cull(state, stats)
     importance = candidates(stats, metric, min_views, is_intersecting=is_intersecting)
-    apply_edit(state, keep(state.gaussians, simplification.carrying_mass(importance, mass)))
+    apply_edit(state, keep(state.gaussians, simplification.select_mass(importance, mass)))
 
 
 def restart_from_means(state: TrainState, iteration: Iteration, *, sh_degree: int, largest_size: float) -> None:
@@ -246,7 +246,7 @@ def restart_from_means(state: TrainState, iteration: Iteration, *, sh_degree: in
 
     No Gaussian begins larger than :func:`size_limits` with the fraction ``largest_size``.
     """
-    gaussians = simplification.reinitialised(state.gaussians, sh_degree)
+    gaussians = simplification.reinitialise(state.gaussians, sh_degree)
     start_anew(state, iteration, limited_sizes(gaussians, iteration.scene, largest_size))
 
 

@@ -71,7 +71,7 @@ def aggressive_clone(
         Nothing is cloned while there are this many Gaussians or more for each pixel of the training views.
     """
     stats = measure_importance(state, iteration, visibility_mass)
-    stays = mass_mask(indoor(stats), tail_mass) & ~visibility.seen_by_few(stats.is_visible, min_views)  # [N]
+    stays = mass_mask(indoor(stats), tail_mass) & ~visibility.find_seen_by_few(stats.is_visible, min_views)  # [N]
     apply_edit(state, keep(state.gaussians, stays))
     stats = take(stats, stays)
     cull(state, stats)

@@ -74,7 +74,7 @@ def rasterization_stage(
     rng : Generator
         For colours that are no spherical harmonics, and for backgrounds.
     n_cameras : int
-        1 or 2; the second is turned, moved and of another focal length.
+        1 or 2; the second is rotated, moved and of another focal length.
     """
     camera = setting.camera
     fixed: dict[str, Any] = {

@@ -222,7 +222,7 @@ def _product(p: list[Any], q: list[Any]) -> list[Any]:
 
 
 def _camera(offset: Floats) -> Camera:
-    """Return a turned camera near ``offset``, whose centre float32 holds exactly."""
+    """Return a rotated camera near ``offset``, whose centre float32 holds exactly."""
     R = np.array([[float(x) for x in row] for row in true_rotation(np.array([1, 0.1, -0.07, 0.05])).tolist()])
     center = offset + np.array([0.25, -0.125, 0.0625])
     return Camera(R, -R @ center, 500.0, 480.0, 530.0, 435.0, 1040, 880)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from minisplat_ref.constants import MEDIAN_TRANSMITTANCE, Conventions
-from minisplat_ref.reference.hits import CONIC, Response, goes_on, sorted_by, tile_hits, unsorted_by
+from minisplat_ref.reference.hits import CONIC, Response, goes_on, sort_by, tile_hits, undo_sort_by
 from minisplat_ref.types import (
     BlendGradient,
     BlendStats,
@@ -66,7 +66,7 @@ def composite_hits(
     stats = _no_hits(n, height, width, dtype) if with_stats else None
     for tile in tile_hits(primitives, bins, conventions, response):
         ids, ys, xs, order = tile.ids, tile.ys, tile.xs, tile.order
-        weights = tile.alphas * unsorted_by(order, tile.transmittances[:-1])  # [G, P]
+        weights = tile.alphas * undo_sort_by(order, tile.transmittances[:-1])  # [G, P]
         transmittance = tile.transmittances[-1]  # [P]
         if response.shade is None:
             light = weights.T @ colors[ids]  # [P, D]
@@ -77,15 +77,15 @@ def composite_hits(
         if median_depth is not None and len(ids):
             is_beyond = tile.transmittances[1:] < MEDIAN_TRANSMITTANCE  # [G, P] true from the hit that crosses one half
             crossing = np.argmax(is_beyond, axis=0)[None]
-            depths = sorted_by(crossing, sorted_by(order, tile.hit.depths))[0]
+            depths = sort_by(crossing, sort_by(order, tile.hit.depths))[0]
             median_depth[ys, xs] = np.where(transmittance < MEDIAN_TRANSMITTANCE, depths, 0)
         if stats is not None and len(ids):
             stats.blend_weight_sum[ids] += weights.sum(axis=1)
             stats.blend_weight_max[ids] = np.maximum(stats.blend_weight_max[ids], weights.max(axis=1))
             stats.hit_count[ids] += (weights > 0).sum(axis=1, dtype=np.int32)
-            heaviest = np.argmax(sorted_by(order, weights), axis=0)  # of equals the first, which is in front
-            ids_in_order = sorted_by(order, np.broadcast_to(ids[:, None], weights.shape))  # [G, P]
-            dominant = np.where(weights.max(axis=0) > 0, sorted_by(heaviest[None], ids_in_order)[0], -1)
+            heaviest = np.argmax(sort_by(order, weights), axis=0)  # of equals the first, which is in front
+            ids_in_order = sort_by(order, np.broadcast_to(ids[:, None], weights.shape))  # [G, P]
+            dominant = np.where(weights.max(axis=0) > 0, sort_by(heaviest[None], ids_in_order)[0], -1)
             stats.dominant_ids[ys, xs] = dominant
             np.add.at(stats.dominant_count, dominant[dominant >= 0], 1)
     return RenderOutput(image, alpha, median_depth, stats)
@@ -134,23 +134,23 @@ def composite_hits_vjp(
     v_colors, v_background = np.zeros_like(colors), np.zeros_like(background)
     for tile in tile_hits(primitives, bins, conventions, response):
         ids, alphas, hit = tile.ids, tile.alphas, tile.hit
-        T = unsorted_by(tile.order, tile.transmittances[:-1])  # [G, P]
+        T = undo_sort_by(tile.order, tile.transmittances[:-1])  # [G, P]
         T_end = tile.transmittances[-1]  # [P]
         v, c = v_image[tile.ys, tile.xs], colors[ids]  # [P, D], [G, S]
         weights, v_place = alphas * T, None  # [G, P]
         if response.shade is None or response.shade_vjp is None:
             v_colors[ids] += weights @ v
-            light = c @ v.T  # [G, P] c_g . v
+            v_dot_c = c @ v.T  # [G, P] c_g . v
         else:
             v_c, v_place = response.shade_vjp(c, hit.place, weights[:, :, None] * v)
             v_colors[ids] += v_c
-            light = np.einsum("gpd,pd->gp", response.shade(c, hit.place), v)
+            v_dot_c = np.einsum("gpd,pd->gp", response.shade(c, hit.place), v)
         v_background += T_end @ v
 
         v_T_end = v @ background - v_alpha[tile.ys, tile.xs]  # [P]
-        in_front = sorted_by(tile.order, weights * light)
-        behind = unsorted_by(tile.order, _sum_behind(in_front)) + T_end * v_T_end
-        v_alphas = np.where(alphas > 0, T * light - behind / (1 - alphas), 0)
+        in_front = sort_by(tile.order, weights * v_dot_c)
+        behind = undo_sort_by(tile.order, _sum_behind(in_front)) + T_end * v_T_end
+        v_alphas = np.where(alphas > 0, T * v_dot_c - behind / (1 - alphas), 0)
 
         v_shape = np.where(tile.is_clamped & conventions.clamp_stops_shape_gradient, 0, v_alphas)
         v_mean = np.where(tile.is_clamped & conventions.clamp_stops_mean_gradient, 0, v_alphas)

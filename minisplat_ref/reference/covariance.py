@@ -30,7 +30,7 @@ def rotation_matrices(quats: Floats) -> Floats:
     ndarray of shape (N, 3, 3)
         world_from_gaussian.
     """
-    u, *_ = _normalized(quats)
+    u, *_ = _normalize(quats)
     w, K = _cross_product_matrices(u)
     return np.eye(3, dtype=quats.dtype) + 2 * w * K + 2 * K @ K
 
@@ -57,7 +57,7 @@ def rotation_matrices_vjp(quats: Floats, v_rotations: Floats) -> Floats:
     ndarray of shape (N, 4)
         Derivative with respect to ``quats``; orthogonal to each, because their length does not matter.
     """
-    u, length, exponent = _normalized(quats)
+    u, length, exponent = _normalize(quats)
     w, K = _cross_product_matrices(u)
     K_transposed = np.swapaxes(K, 1, 2)
     v_w = 2 * np.einsum("nij,nij->n", K, v_rotations)
@@ -119,7 +119,7 @@ def covariances_vjp(quats: Floats, scales: Floats, v_covariances: Floats) -> tup
     return rotation_matrices_vjp(quats, v_R), v_scales
 
 
-def _normalized(quats: Floats) -> tuple[Floats, Floats, Ints]:
+def _normalize(quats: Floats) -> tuple[Floats, Floats, Ints]:
     """Return ``u = q / |q|`` [N, 4], and l and k [N, 1] with ``|q| = l 2^k``; for the zero quaternion 0, 1 and 0.
 
     Squares of entries above 1e19 or below 1e-23 leave the range of float32. Therefore q is first divided by a power of

@@ -193,9 +193,9 @@ def tile_hits(
         order = None if is_listed else blending_order(is_hit, hit.depths, response.buffer_size)
 
         # T never rises: once a hit would take it below the threshold, that hit and all behind it are left out.
-        in_order = sorted_by(order, alphas)
+        in_order = sort_by(order, alphas)
         in_order = np.where(goes_on(_transmittances(in_order)[1:], conventions), in_order, 0)
-        alphas, is_clamped = unsorted_by(order, in_order), hit.unclamped > conventions.alpha_max
+        alphas, is_clamped = undo_sort_by(order, in_order), hit.unclamped > conventions.alpha_max
         yield TileHits(ids, ys, xs, hit, is_clamped, alphas, order, _transmittances(in_order))
 
 
@@ -236,13 +236,13 @@ def blending_order(is_hit: Bools, depths: Floats, buffer_size: int) -> Ints:
     return order
 
 
-def sorted_by(order: Ints | None, values: Any) -> Any:
+def sort_by(order: Ints | None, values: Any) -> Any:
     """Return ``values`` [G, P], given by rows of the list, in the pixels' own ``order`` [G, P], if they have one."""
     return values if order is None else np.take_along_axis(values, order, axis=0)
 
 
-def unsorted_by(order: Ints | None, values: Any) -> Any:
-    """Return ``values`` [G, P], given in the pixels' own ``order``, by rows of the list: undo :func:`sorted_by`."""
+def undo_sort_by(order: Ints | None, values: Any) -> Any:
+    """Return ``values`` [G, P], given in the pixels' own ``order``, by rows of the list: undo :func:`sort_by`."""
     if order is None:
         return values
     rows = np.empty_like(values)

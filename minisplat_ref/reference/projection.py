@@ -1,4 +1,4 @@
-"""Stage 2: a pinhole camera turns each 3D Gaussian into a 2D Gaussian on the image.
+"""Stage 2: a pinhole camera projects each 3D Gaussian to a 2D Gaussian on the image.
 
 A perspective map is not affine, so it is replaced by its first-order expansion at the mean: EWA splatting (Zwicker et
 al. 2002) equation (31), 3DGS equation (5), ``Sigma' = J W Sigma W^T J^T``. Left out: EWA's normalisation of the

@@ -13,11 +13,11 @@ def program() -> str:
     """Return how the program is called from anywhere: by its name, or through the interpreter that runs it now."""
     if shutil.which("minisplat-ref") is not None:
         return "minisplat-ref"
-    call = f"{_quoted(sys.executable)} -m minisplat_ref"
+    call = f"{_quote(sys.executable)} -m minisplat_ref"
     if _is_installed():
         return call
     root = Path(__file__).resolve().parents[2]  # a clone, which Python finds from its own folder only
-    return f"cd {_quoted(str(root))} && {call}"
+    return f"cd {_quote(str(root))} && {call}"
 
 
 def command(*words: str | Path) -> str:
@@ -28,7 +28,7 @@ def command(*words: str | Path) -> str:
     *words : str or Path
         Arguments in their order; a str stays as it is.
     """
-    arguments = [_quoted(str(word.resolve())) if isinstance(word, Path) else word for word in words]
+    arguments = [_quote(str(word.resolve())) if isinstance(word, Path) else word for word in words]
     return " ".join([program(), *arguments])
 
 
@@ -40,5 +40,5 @@ def _is_installed() -> bool:
     return True
 
 
-def _quoted(word: str) -> str:
+def _quote(word: str) -> str:
     return subprocess.list2cmdline([word]) if os.name == "nt" else shlex.quote(word)

@@ -12,8 +12,8 @@ from html import escape
 
 from PIL import Image
 
+from minisplat_ref.reports.images import Image8
 from minisplat_ref.reports.page_style import SCRIPT, STYLE
-from minisplat_ref.reports.pictures import Picture
 
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 BAD = {"FAILED", "DIVERGES FIRST", "diverges"}  # cells that stand out
@@ -68,7 +68,7 @@ def paragraph(text: str) -> str:
     return f"<p>{escape(text)}</p>"
 
 
-def listing(texts: Iterable[str]) -> str:
+def make_list(texts: Iterable[str]) -> str:
     """Return sentences as a list."""
     return f"<ul>{''.join(f'<li>{escape(text)}</li>' for text in texts)}</ul>"
 
@@ -127,7 +127,7 @@ def curves(svgs: Sequence[str], n_columns: int = 3) -> str:
     return f'<div class="panel row" style="--columns: {min(n_columns, len(svgs))}">{"".join(svgs)}</div>'
 
 
-def slider(truth: Picture, renders: Mapping[str, Picture]) -> str:
+def slider(truth: Image8, renders: Mapping[str, Image8]) -> str:
     """Return a picture of which the left part is the truth and the right part a render, with a line that moves.
 
     Parameters
@@ -137,11 +137,11 @@ def slider(truth: Picture, renders: Mapping[str, Picture]) -> str:
     renders : mapping
         Pictures of the same size by their captions; of several, the reader chooses one.
     """
-    figures = [captioned(truth, "truth"), *(captioned(picture, caption) for caption, picture in renders.items())]
+    figures = [add_caption(truth, "truth"), *(add_caption(picture, caption) for caption, picture in renders.items())]
     return f'<div class="slider">{"".join(figures)}</div>'
 
 
-def captioned(picture: Picture, caption: str) -> str:
+def add_caption(picture: Image8, caption: str) -> str:
     """Return a picture with a caption."""
     height, width = picture.shape[:2]
     return (
@@ -150,7 +150,7 @@ def captioned(picture: Picture, caption: str) -> str:
     )
 
 
-def _data_url(picture: Picture) -> str:
+def _data_url(picture: Image8) -> str:
     """Return the picture in base64, a large one as JPEG with colours at full resolution."""
     is_large = picture.shape[0] * picture.shape[1] > PNG_PIXELS
     kind = "jpeg" if is_large else "png"

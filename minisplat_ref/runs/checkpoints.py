@@ -12,9 +12,9 @@ from typing import NamedTuple, TypeVar
 
 from minisplat_ref import memory
 from minisplat_ref.errors import InputError, InputWarning, one_line
+from minisplat_ref.io.checkpoint import WAY_OUT, DamagedCheckpoint, load_checkpoint, load_metadata
 from minisplat_ref.runs.run_folder import CHECKPOINT, POINT_CLOUD, PREVIOUS, measured_step
 from minisplat_ref.runs.settings import Settings, load_model, recipe_of
-from minisplat_ref.io.checkpoint import WAY_OUT, DamagedCheckpoint, load_checkpoint, load_metadata
 from minisplat_ref.training.loop import load_state, save_state
 from minisplat_ref.training.schedule import During, Recipe
 from minisplat_ref.training.state import StepReport, TrainState
@@ -30,7 +30,7 @@ def save(folder: Path, state: TrainState, recipe: Recipe) -> None:
     save_state(folder / CHECKPOINT, state, recipe, previous=folder / PREVIOUS)
 
 
-def saving(folder: Path, recipe: Recipe) -> Callable[[StepReport], None]:
+def save_regularly(folder: Path, recipe: Recipe) -> Callable[[StepReport], None]:
     """Return a callback of the loop that saves every SECONDS, and before what may find no room in memory."""
     last_saved = time.monotonic()
 

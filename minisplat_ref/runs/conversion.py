@@ -118,7 +118,7 @@ def _of_checkpoint(path: Path) -> Source:
     return Source(Model(bundles.gaussians, bundles.shared), owner, f"iteration {step}")
 
 
-def chosen_format(path: Path) -> Format | None:
+def choose_format(path: Path) -> Format | None:
     """Return the format that a file to be written has by its name; None for a PLY.
 
     Raises
@@ -230,10 +230,10 @@ def judge_of(source: Source, path: Path, scene: Path | None, downscale: int | No
     """
     from minisplat_ref.backends import get_backend
     from minisplat_ref.constants import GSPLAT_MAIN, PROFILES
-    from minisplat_ref.runs.scoring import renderer_of
-    from minisplat_ref.runs.settings import load, load_photographs
     from minisplat_ref.io import load_scene
     from minisplat_ref.metrics import evaluate
+    from minisplat_ref.runs.scoring import renderer_of
+    from minisplat_ref.runs.settings import load, load_photographs
 
     profile, backend = GSPLAT_MAIN.name, "cpu"
     renderer = with_sky(with_compensation(source.owner.representation.renderer))

@@ -6,8 +6,8 @@ Where the scene folder holds true depths, a record also has ``chamfer``: see :mo
 from pathlib import Path
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.runs.progress import PSNR_MAX, append_log, read_log, write_log
 from minisplat_ref.metrics import Evaluation
+from minisplat_ref.runs.progress import PSNR_MAX, append_log, read_log, write_log
 from minisplat_ref.types import Scene
 
 

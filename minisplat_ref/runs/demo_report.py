@@ -9,10 +9,19 @@ import numpy as np
 
 from minisplat_ref import __version__
 from minisplat_ref.datasets.synthetic import SyntheticScene
-from minisplat_ref.runs import run_folder
+from minisplat_ref.metrics import Evaluation
+from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.reports.commands import command
+from minisplat_ref.reports.images import (
+    Image8,
+    colorize,
+    depth_image,
+    depth_range,
+    error_image,
+    to_8_bits,
+)
 from minisplat_ref.reports.page import (
-    captioned,
+    add_caption,
     cards,
     code,
     curves,
@@ -23,21 +32,12 @@ from minisplat_ref.reports.page import (
     slider,
     table,
 )
-from minisplat_ref.reports.pictures import (
-    Picture,
-    colored,
-    depth_picture,
-    depth_range,
-    error_picture,
-    to_picture,
-)
+from minisplat_ref.runs import run_folder
 from minisplat_ref.runs.progress import read_log
 from minisplat_ref.runs.report_parts import ERROR_TEXT, training_curves, view_panel
 from minisplat_ref.runs.run import Outcome
 from minisplat_ref.runs.scoring import load_trained
 from minisplat_ref.runs.settings import Settings
-from minisplat_ref.metrics import Evaluation
-from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.types import Floats, Scene
 
 DEPTH_ERROR_RANGE = 0.1  # of the true depth: larger differences are all shown as the brightest colour
@@ -58,11 +58,11 @@ class ViewPictures(NamedTuple):
     """Name of the view."""
     caption: str
     """What was measured on it."""
-    truth: Picture
+    truth: Image8
     """[H, W, 3] photograph, sRGB."""
-    render: Picture
+    render: Image8
     """[H, W, 3] render, sRGB."""
-    error: Picture
+    error: Image8
     """[H, W, 3] picture of the difference."""
     true_depth: Floats
     """[H, W] exact camera z, world units; 0 where the view sees nothing."""
@@ -76,14 +76,14 @@ def view_pictures(folder: Path, synthetic: SyntheticScene, scene: Scene, evaluat
     trained, pictures = load_trained(folder), []
     for view, metrics in zip(scene.test_views, evaluation.per_view, strict=True):
         output = trained.render(view, frozenset({"depth"}))
-        image = to_picture(output.image[..., :3])
+        image = to_8_bits(output.image[..., :3])
         pictures.append(
             ViewPictures(
                 name=view.name,
                 caption=f"PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.3f}",
                 truth=view.image,
                 render=image,
-                error=error_picture(view.image, image),
+                error=error_image(view.image, image),
                 true_depth=true_depths[view.name],
                 depth=expected_depth(output.image[..., 3], output.alpha),
             )
@@ -156,11 +156,11 @@ def _depth_panel(view: ViewPictures) -> str:
     is_seen = view.true_depth > 0  # [H, W]
     relative = np.abs(view.depth - view.true_depth) / np.where(is_seen, view.true_depth, 1.0) * is_seen  # [H, W]
     median = float(np.median(relative[is_seen])) if is_seen.any() else 0.0
-    true, rendered = (depth_picture(depth, near, far) for depth in (view.true_depth, view.depth))
-    difference = colored(relative, 0.0, DEPTH_ERROR_RANGE, "magma")
+    true, rendered = (depth_image(depth, near, far) for depth in (view.true_depth, view.depth))
+    difference = colorize(relative, 0.0, DEPTH_ERROR_RANGE, "magma")
     pictures = [
         slider(true, {f"render, {near:.2f} to {far:.2f} units": rendered}),
-        captioned(difference, "relative difference, 0 to 10 % or more"),
+        add_caption(difference, "relative difference, 0 to 10 % or more"),
     ]
     return panel(f"{view.name}: median difference {100 * median:.1f} %", pictures, n_columns=2)
 

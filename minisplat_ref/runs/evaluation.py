@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.extensions.extension import CORE, owner_of
+from minisplat_ref.metrics import Evaluation
 from minisplat_ref.runs import fingerprint, run_folder
 from minisplat_ref.runs.checkpoints import Saved, newest_model
 from minisplat_ref.runs.conversion import read_population
@@ -15,8 +17,6 @@ from minisplat_ref.runs.first_use import warn_if_not_kept
 from minisplat_ref.runs.notices import warn_of_model
 from minisplat_ref.runs.scoring import score, to_metrics
 from minisplat_ref.runs.settings import Settings, load, load_lpips, load_photographs
-from minisplat_ref.extensions.extension import CORE, owner_of
-from minisplat_ref.metrics import Evaluation
 from minisplat_ref.types import Scene
 
 
@@ -92,10 +92,10 @@ def evaluate_run(
             notes.append(f"not the scene that it was trained on: {differs}")
         if not fingerprint.is_split_alike(entries, others):
             parts.append(f"test-every-{asked.test_every}")
-        notes += _trained_on(entries, photographs)
+        notes += _describe_training_views(entries, photographs)
     target = out or (folder / "-".join(["eval", *parts]) if parts else folder)
     if target == folder:
-        with run_folder.held(folder):
+        with run_folder.hold_folder(folder):
             evaluation = score(folder, photographs, saved.model, settings, network)
             metrics = _metrics_of(folder) | to_metrics(evaluation)
             run_folder.write_json(
@@ -131,7 +131,7 @@ def _about(folder: Path, asked: Settings, unfinished: int | None, notes: list[st
     }
 
 
-def _trained_on(entries: fingerprint.Entries, scene: Scene) -> list[str]:
+def _describe_training_views(entries: fingerprint.Entries, scene: Scene) -> list[str]:
     """Say how many of the measured views the run was trained on."""
     names = fingerprint.trained_on(entries)
     n_known = sum(view.name in names for view in scene.test_views)

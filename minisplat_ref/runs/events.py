@@ -53,7 +53,7 @@ def append(path: Path, step: int, fired: Iterable[FiredEvent]) -> None:
         append_log(path, {"step": step, **event._asdict()})
 
 
-def published_times(recipe: Recipe) -> dict[str, int]:
+def count_published_times(recipe: Recipe) -> dict[str, int]:
     """Return how often each mechanism of a recipe acts, by the name of its action; half-size views count once."""
     times: Counter[str] = Counter({HALF_SIZE: 1} if recipe.half_size_until else {})
     for event in recipe.events:
@@ -86,7 +86,7 @@ def mechanisms(records: Records, published: Mapping[str, int]) -> list[Mechanism
     records : sequence of mappings
         Of one run, in their order.
     published : mapping
-        See :func:`published_times`.
+        See :func:`count_published_times`.
     """
     by_action: dict[str, list[Mapping[str, Any]]] = {}
     for record in records:

@@ -21,9 +21,9 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from minisplat_ref.errors import InputError, InputWarning, one_line
-from minisplat_ref.runs.run_folder import CAMERAS
 from minisplat_ref.io import viewpoints
 from minisplat_ref.io.stored_views import Photograph, StoredView
+from minisplat_ref.runs.run_folder import CAMERAS
 from minisplat_ref.types import Scene, View
 
 PHOTOGRAPH = "photograph"  # key of the hash

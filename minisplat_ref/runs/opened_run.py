@@ -10,11 +10,11 @@ from typing import NamedTuple
 from minisplat_ref.backends import Backend, get_backend
 from minisplat_ref.constants import PROFILES, Conventions
 from minisplat_ref.errors import InputError, InputWarning, one_line
+from minisplat_ref.extensions.extension import CORE, Extension, owner_of
+from minisplat_ref.rendering import Request
 from minisplat_ref.runs import fingerprint, run_folder
 from minisplat_ref.runs.checkpoints import newest_model
 from minisplat_ref.runs.settings import Settings, load, load_photographs, recipe_of
-from minisplat_ref.extensions.extension import CORE, Extension, owner_of
-from minisplat_ref.rendering import Request
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.pace import held_out_ids
 from minisplat_ref.training.schedule import Recipe, as_trained

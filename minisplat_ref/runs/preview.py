@@ -5,11 +5,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from minisplat_ref.reports.pictures import error_picture, side_by_side, to_picture
+from minisplat_ref.io import write_image
+from minisplat_ref.reports.images import error_image, side_by_side, to_8_bits
 from minisplat_ref.runs.progress import Progress
 from minisplat_ref.runs.scoring import Trained, renderer_of
 from minisplat_ref.runs.settings import Settings
-from minisplat_ref.io import write_image
 from minisplat_ref.training.loop import StepReport
 from minisplat_ref.types import Scene
 
@@ -17,7 +17,7 @@ SECONDS = 3.0  # between pictures; a viewer that follows the file shows the newe
 FILE = "preview.png"
 
 
-def previewing(folder: Path, scene: Scene, settings: Settings, progress: Progress) -> Callable[[StepReport], None]:
+def make_preview(folder: Path, scene: Scene, settings: Settings, progress: Progress) -> Callable[[StepReport], None]:
     """Return a callback of the training loop that writes truth, render and error of a view side by side.
 
     The view is the first test view, or where there are none the first training view. The clock of the training stands
@@ -43,8 +43,8 @@ def previewing(folder: Path, scene: Scene, settings: Settings, progress: Progres
             model = report.state.model
             renderer = renderer_of(settings, model)
             trained = Trained(model, renderer, scene.background, settings.profile, settings.backend)
-            picture = to_picture(trained.render(view).image[..., :3])
-            write_image(folder / FILE, side_by_side([view.image, picture, error_picture(view.image, picture)]))
+            render = to_8_bits(trained.render(view).image[..., :3])
+            write_image(folder / FILE, side_by_side([view.image, render, error_image(view.image, render)]))
         last = time.perf_counter()
 
     return on_step

@@ -3,10 +3,10 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from minisplat_ref.runs.fired import HEADING, Fired, remarks_by_mechanism, rows
-from minisplat_ref.reports.page import captioned, panel, slider, table
-from minisplat_ref.reports.pictures import Picture
+from minisplat_ref.reports.images import Image8
+from minisplat_ref.reports.page import add_caption, panel, slider, table
 from minisplat_ref.reports.plots import BLUE, GREEN, RED, plot, to_svg
+from minisplat_ref.runs.fired import HEADING, Fired, remarks_by_mechanism, rows
 
 ERROR_TEXT = """\
 Error is the mean absolute difference of the three channels: dark is none, bright is a quarter of the range or more."""
@@ -15,7 +15,7 @@ Records = Sequence[Mapping[str, Any]]
 """Of ``log.jsonl`` or ``curve.jsonl``."""
 
 
-def view_panel(label: str, truth: Picture, render: Picture, error: Picture) -> str:
+def view_panel(label: str, truth: Image8, render: Image8, error: Image8) -> str:
     """Return a held-out view: truth against render, and the error beside them.
 
     Parameters
@@ -25,7 +25,7 @@ def view_panel(label: str, truth: Picture, render: Picture, error: Picture) -> s
     truth, render, error : ndarray of shape (H, W, 3)
         sRGB.
     """
-    return panel(label, [slider(truth, {"render": render}), captioned(error, "error")], n_columns=2)
+    return panel(label, [slider(truth, {"render": render}), add_caption(error, "error")], n_columns=2)
 
 
 def training_curves(log: Records) -> list[str]:

@@ -17,15 +17,15 @@ from typing import Any, NamedTuple
 
 from minisplat_ref.backends import get_backend
 from minisplat_ref.constants import PROFILES
+from minisplat_ref.datasets.synthetic.surface import Surface, surface_distance, true_surface
 from minisplat_ref.errors import InputError
+from minisplat_ref.lpips import Network
+from minisplat_ref.metrics import Evaluation
 from minisplat_ref.runs import checkpoints, curve, events, fingerprint, run_folder
-from minisplat_ref.runs.preview import previewing
+from minisplat_ref.runs.preview import make_preview
 from minisplat_ref.runs.progress import Clock, Progress
 from minisplat_ref.runs.scoring import measure, score, to_metrics
 from minisplat_ref.runs.settings import Settings, save_model, to_config
-from minisplat_ref.datasets.synthetic.surface import Surface, surface_distance, true_surface
-from minisplat_ref.lpips import Network
-from minisplat_ref.metrics import Evaluation
 from minisplat_ref.training.guard import Guard
 from minisplat_ref.training.interruption import Interruptions
 from minisplat_ref.training.loop import StepReport, last_step, train
@@ -88,7 +88,7 @@ def run_training(
     InputError
         A file cannot be written, memory has no room, or a number is not finite: says what has been saved.
     """
-    with _telling_what_is_saved(folder, recipe, state):
+    with saving_on_error(folder, recipe, state):
         run_folder.write_json(folder / run_folder.CONFIG, to_config(settings, recipe, scene))
         run_folder.write_json(folder / run_folder.CAMERAS, fingerprint.of_scene(scene))
         if state.step == 0:
@@ -101,7 +101,7 @@ def run_training(
 
 
 @contextmanager
-def _telling_what_is_saved(folder: Path, recipe: Recipe, state: TrainState) -> Iterator[None]:
+def saving_on_error(folder: Path, recipe: Recipe, state: TrainState) -> Iterator[None]:
     """Save the state if an error leaves it whole, and let the error say from where the run can go on."""
     try:
         yield
@@ -140,10 +140,10 @@ def _train(
         curve.keep_until(folder / run_folder.CURVE, state.step)
         callbacks.append(_curve(folder / run_folder.CURVE, scene, settings, progress, surface))
     if shows_preview:
-        callbacks.append(previewing(folder, scene, settings, progress))
+        callbacks.append(make_preview(folder, scene, settings, progress))
     if settings.minutes is not None:
         callbacks.append(_in_time(settings, recipe, progress))
-    callbacks.append(checkpoints.saving(folder, recipe))  # after the records: what it continues from is in them
+    callbacks.append(checkpoints.save_regularly(folder, recipe))  # after the records: what it continues from is in them
 
     def on_step(report: StepReport) -> None:
         for callback in callbacks:

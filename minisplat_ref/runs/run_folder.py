@@ -53,7 +53,7 @@ def has_begun(folder: Path) -> bool:
 
 
 @contextmanager
-def held(folder: Path) -> Iterator[None]:
+def hold_folder(folder: Path) -> Iterator[None]:
     """Keep other processes from writing into a run, and clear away what killed ones were writing.
 
     The lock is the system's, on the folder itself, and ends with the process. Windows and some network disks have none.

@@ -5,21 +5,21 @@ from pathlib import Path
 from typing import Any
 
 from minisplat_ref import __version__
-from minisplat_ref.runs import run_folder
-from minisplat_ref.reports.commands import command
-from minisplat_ref.runs.fired import Fired
-from minisplat_ref.runs.decisions_report import decisions_section
-from minisplat_ref.runs.events import published_times, read_mechanisms
-from minisplat_ref.reports.page import cards, code, curves, page, paragraph, section, table
-from minisplat_ref.reports.pictures import fitting, split
-from minisplat_ref.reports.plots import PURPLE
-from minisplat_ref.runs.progress import read_log
-from minisplat_ref.runs.report_parts import ERROR_TEXT, curve, fired_tables, training_curves, view_panel
-from minisplat_ref.runs.settings import Settings, load
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.io import read_image
 from minisplat_ref.io.atomic import replacing
 from minisplat_ref.io.names import file_names
+from minisplat_ref.reports.commands import command
+from minisplat_ref.reports.images import fit_image, split_images
+from minisplat_ref.reports.page import cards, code, curves, page, paragraph, section, table
+from minisplat_ref.reports.plots import PURPLE
+from minisplat_ref.runs import run_folder
+from minisplat_ref.runs.decisions_report import decisions_section
+from minisplat_ref.runs.events import count_published_times, read_mechanisms
+from minisplat_ref.runs.fired import Fired
+from minisplat_ref.runs.progress import read_log
+from minisplat_ref.runs.report_parts import ERROR_TEXT, curve, fired_tables, training_curves, view_panel
+from minisplat_ref.runs.settings import Settings, load
 from minisplat_ref.training.pace import from_metadata
 from minisplat_ref.types import Scene
 
@@ -117,7 +117,7 @@ def _views(folder: Path, views: list[dict[str, Any]]) -> str:
     panels = []
     for view in shown:
         strip = read_image(folder / run_folder.RENDERS / f"{stems[view['name']]}.png")
-        pictures = (fitting(picture, LARGEST) for picture in split(strip, 3))
+        pictures = (fit_image(picture, LARGEST) for picture in split_images(strip, 3))
         rank = f" ({ranked.index(view) + 1} of {len(ranked)})" if len(ranked) > 1 else ""
         panels.append(view_panel(f"{view['name']}{rank}: {_measured(view)}", *pictures))
     how = f" Shown are {n} of {len(ranked)}, from the worst to the best." if n < len(ranked) else " The worst is first."
@@ -148,7 +148,7 @@ def _curves(folder: Path, log: list[dict[str, Any]]) -> str:
 
 def _fired(folder: Path, settings: Settings, n_iterations: int) -> str:
     recipe = find_recipe(settings.recipe)
-    published = published_times(recipe)
+    published = count_published_times(recipe)
     runs = [read_mechanisms(folder / run_folder.EVENTS, published)]
     fired = Fired(settings.recipe, n_iterations, recipe.iterations, published, runs)
     return section("What fired, and when", paragraph(FIRED_TEXT), *fired_tables(fired))

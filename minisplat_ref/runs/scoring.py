@@ -11,16 +11,16 @@ from tqdm import tqdm
 from minisplat_ref.backends import get_backend
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputWarning, one_line
-from minisplat_ref.runs.checkpoints import newest_model
-from minisplat_ref.reports.pictures import error_picture, side_by_side, to_picture
-from minisplat_ref.runs.run_folder import RENDERS
-from minisplat_ref.runs.settings import Settings, load, load_background, recipe_of
 from minisplat_ref.io import write_image
 from minisplat_ref.io.atomic import replacing_folder
 from minisplat_ref.io.names import file_names
 from minisplat_ref.lpips import Network
 from minisplat_ref.metrics import Evaluation, ViewMetrics, evaluate
 from minisplat_ref.rendering import Renderer, Request
+from minisplat_ref.reports.images import error_image, side_by_side, to_8_bits
+from minisplat_ref.runs.checkpoints import newest_model
+from minisplat_ref.runs.run_folder import RENDERS
+from minisplat_ref.runs.settings import Settings, load, load_background, recipe_of
 from minisplat_ref.training.schedule import as_trained
 from minisplat_ref.types import Floats, Model, RenderOutput, Scene, View
 
@@ -115,8 +115,8 @@ def score(folder: Path, scene: Scene, model: Model, settings: Settings, network:
     ):
 
         def save(view: View, image: Floats, _: ViewMetrics) -> None:
-            picture = to_picture(image)
-            panels = [view.image, picture, error_picture(view.image, picture)]
+            render = to_8_bits(image)
+            panels = [view.image, render, error_image(view.image, render)]
             write_image(renders / f"{stems[view.name]}.png", side_by_side(panels))
             bar.update()
 

@@ -13,7 +13,6 @@ from minisplat_ref import __version__
 from minisplat_ref.backends import BACKENDS
 from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
-from minisplat_ref.runs.run_folder import CONFIG, POINT_CLOUD, SHARED, read_json_object
 from minisplat_ref.extensions.extension import CORE, find_recipe, owner_of
 from minisplat_ref.io import load_scene
 from minisplat_ref.io.atomic import replacing
@@ -21,6 +20,7 @@ from minisplat_ref.io.json_file import as_array
 from minisplat_ref.io.npz import read_npz
 from minisplat_ref.lpips import Network, check_views, load_network
 from minisplat_ref.methods import RECIPES
+from minisplat_ref.runs.run_folder import CONFIG, POINT_CLOUD, SHARED, read_json_object
 from minisplat_ref.strategy import importance, simplify
 from minisplat_ref.training.schedule import Recipe, configured, describe, parsed_settings, settings_of
 from minisplat_ref.types import Floats, Model, Scene
@@ -93,8 +93,8 @@ def recipe_of(settings: Settings) -> Recipe:
     recipe = configured(recipe, **parsed_settings(recipe, settings.set))
     options = {
         "--budget": ("budget", settings.budget),
-        "--simplify": ("choose", _chosen("simplify", CHOICES, settings.simplify)),
-        "--scene-type": ("metric", _chosen("scene_type", METRICS, settings.scene_type)),
+        "--simplify": ("choose", _choose("simplify", CHOICES, settings.simplify)),
+        "--scene-type": ("metric", _choose("scene_type", METRICS, settings.scene_type)),
     }
     for option, (name, value) in options.items():
         if value is None:
@@ -106,7 +106,7 @@ def recipe_of(settings: Settings) -> Recipe:
     return recipe
 
 
-def _chosen(name: str, choices: Mapping[str, Any], key: str | None) -> Any:
+def _choose(name: str, choices: Mapping[str, Any], key: str | None) -> Any:
     """Return the choice of a name, None where none was made."""
     if key is not None and str(key) not in choices:
         raise InputError(f"{name} {key!r} is unknown; choose one of {', '.join(choices)}")

@@ -22,6 +22,7 @@ import numpy as np
 from tqdm import tqdm
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.metrics import evaluate
 from minisplat_ref.runs.opened_run import HOLD_OUT_EVERY, Run, check_renderer, check_views
 from minisplat_ref.runs.rate_distortion import (
     PlySize,
@@ -32,7 +33,6 @@ from minisplat_ref.runs.rate_distortion import (
     sizes,
     smallest_within,
 )
-from minisplat_ref.metrics import evaluate
 from minisplat_ref.strategy.importance import collect_importance, indoor
 from minisplat_ref.strategy.ops import contiguous, n_rows, take
 from minisplat_ref.strategy.simplify import most_important
@@ -246,20 +246,20 @@ def decide(run: Run, target: Target, iterations: int) -> Decision:
     return Decision(
         reference,
         tuple(points),
-        _chosen(points, target, bend, None if limit is None else min(limit, n_candidates)),
+        _choose_by_target(points, target, bend, None if limit is None else min(limit, n_candidates)),
         bend,
         float(np.mean(psnrs_of(run, run.model, run.held_out))),
         limit is not None and limit > n_candidates,
     )
 
 
-def _chosen(points: Sequence[Point], target: Target, bend: Point, limit: int | None) -> Point:
+def _choose_by_target(points: Sequence[Point], target: Target, bend: Point, limit: int | None) -> Point:
     if limit is not None:
         return next(point for point in points if point.n_gaussians == limit)
     return bend if target.max_drop is None else smallest_within(points, target.max_drop)
 
 
-def finished(run: Run, n: int, iterations: int) -> Model:
+def finish(run: Run, n: int, iterations: int) -> Model:
     """Return the ``n`` most important Gaussians, ranked and fine-tuned by all training views; or all, if ``n`` are."""
     is_all = n == n_rows(run.model.gaussians)
     rows = np.arange(n) if is_all else most_important(blend_weights(run, run.scene.train_views), n)

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, NullLocator
 
 from minisplat_ref.reports.commands import command
+from minisplat_ref.reports.images import Image8
 from minisplat_ref.reports.page import cards, code, curves, grid, page, panel, paragraph, section, slider, table
-from minisplat_ref.reports.pictures import Picture
 from minisplat_ref.reports.plots import BLUE, EDGE_COLOR, PLOT_STYLE, RED, TITLE_COLOR, to_svg
 from minisplat_ref.runs.rate_distortion import N_SIZES, SIZES_PER_HALVING
 
@@ -39,9 +39,9 @@ class Shown(NamedTuple):
     """A test view of the report."""
 
     name: str
-    truth: Picture
-    before: Picture
-    after: Picture
+    truth: Image8
+    before: Image8
+    after: Image8
 
 
 def table_rows(result: dict[str, Any]) -> list[list[str]]:

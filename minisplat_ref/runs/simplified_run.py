@@ -8,18 +8,18 @@ import shutil
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from minisplat_ref.io.atomic import making_folder
+from minisplat_ref.metrics import Evaluation, ViewMetrics
+from minisplat_ref.reports.images import Image8, to_8_bits
+from minisplat_ref.reports.plots import save_png
 from minisplat_ref.runs import fingerprint, run_folder
 from minisplat_ref.runs.opened_run import Run, open_run
-from minisplat_ref.reports.pictures import Picture, to_picture
-from minisplat_ref.reports.plots import save_png
 from minisplat_ref.runs.rate_distortion import Point, paired_drop
 from minisplat_ref.runs.scoring import measure, score, to_metrics
 from minisplat_ref.runs.settings import save_model
-from minisplat_ref.runs.simplification import Decision, Target, decide, finished
+from minisplat_ref.runs.simplification import Decision, Target, decide, finish
 from minisplat_ref.runs.simplification_report import Shown, draw, report_html
 from minisplat_ref.studies import FIGURE, RESULT
-from minisplat_ref.io.atomic import making_folder
-from minisplat_ref.metrics import Evaluation, ViewMetrics
 from minisplat_ref.types import Floats, Model, View
 
 N_SHOWN = 3  # test views
@@ -53,8 +53,8 @@ def simplify_run(asked: Asked) -> dict[str, Any]:
     with making_folder(asked.out) as folder:
         run = open_run(asked.run, asked.scene)
         decision = decide(run, asked.target, asked.fine_tune)
-        all_alike = finished(run, decision.reference.n_gaussians, asked.fine_tune)
-        model = finished(run, decision.chosen.n_gaussians, asked.fine_tune)
+        all_alike = finish(run, decision.reference.n_gaussians, asked.fine_tune)
+        model = finish(run, decision.chosen.n_gaussians, asked.fine_tune)
         save_model(folder, run.settings, model)
         before, alike = (measure(run.scene, each, run.settings) for each in (run.model, all_alike))
         after = score(folder, run.scene, model, run.settings)
@@ -62,22 +62,24 @@ def simplify_run(asked: Asked) -> dict[str, Any]:
         _write_run(folder, run, result, after)
         run_folder.write_json(folder / RESULT, result)
         save_png(draw(result), folder / FIGURE)
-        (folder / run_folder.REPORT).write_text(report_html(asked.out, result, _shown(run, model)), encoding="utf-8")
+        (folder / run_folder.REPORT).write_text(
+            report_html(asked.out, result, _render_both(run, model)), encoding="utf-8"
+        )
     return result
 
 
-def _pictures(run: Run, model: Model) -> dict[str, Picture]:
+def _pictures(run: Run, model: Model) -> dict[str, Image8]:
     """Render the first test views, by their names."""
-    pictures: dict[str, Picture] = {}
+    pictures: dict[str, Image8] = {}
 
     def keep(view: View, image: Floats, _: ViewMetrics) -> None:
-        pictures[view.name] = to_picture(image)
+        pictures[view.name] = to_8_bits(image)
 
     measure(run.scene._replace(test_views=run.scene.test_views[:N_SHOWN]), model, run.settings, on_view=keep)
     return pictures
 
 
-def _shown(run: Run, model: Model) -> list[Shown]:
+def _render_both(run: Run, model: Model) -> list[Shown]:
     """Return the first test views as the run and the new model draw them."""
     before, after = _pictures(run, run.model), _pictures(run, model)
     views = [view.loaded() for view in run.scene.test_views[:N_SHOWN]]

@@ -85,7 +85,7 @@ def blend(transmittance, unclamped, frame):
 
 
 @scalar
-def blend_vjp(transmittance, weight, unclamped, behind, light, frame):
+def blend_vjp(transmittance, weight, unclamped, behind, v_dot_c, frame):
     """Return the derivative of the loss with respect to the alpha of one hit, ignoring the clamp.
 
     With S the part of <v, image> that is composited behind the hit, background and alpha channel included, the image is
@@ -101,7 +101,7 @@ def blend_vjp(transmittance, weight, unclamped, behind, light, frame):
         alpha before the clamp.
     behind : lanes
         S.
-    light : lanes
+    v_dot_c : lanes
         <v, c>.
 
     Returns
@@ -110,11 +110,11 @@ def blend_vjp(transmittance, weight, unclamped, behind, light, frame):
         dL/dalpha, 0 where the hit was skipped.
     """
     alpha = minimum(unclamped, frame.alpha_max)
-    return select(weight > ZERO, transmittance * light - behind / (ONE - alpha), ZERO)
+    return select(weight > ZERO, transmittance * v_dot_c - behind / (ONE - alpha), ZERO)
 
 
 @scalar
-def sigma_vjp(transmittance, weight, unclamped, behind, shade, frame):
+def sigma_vjp(transmittance, weight, unclamped, behind, v_dot_c, frame):
     """Return the derivative of the loss with respect to the sigma of one hit, where alpha is not clamped.
 
     With S the part of <v, image> that is composited behind the hit, background and alpha channel included, the image is
@@ -131,7 +131,7 @@ def sigma_vjp(transmittance, weight, unclamped, behind, shade, frame):
         opacity exp(-sigma).
     behind : lanes
         S.
-    shade : lanes
+    v_dot_c : lanes
         <v, c>.
 
     Returns
@@ -140,4 +140,4 @@ def sigma_vjp(transmittance, weight, unclamped, behind, shade, frame):
         dL/dsigma, 0 where the hit was skipped.
     """
     alpha = minimum(unclamped, frame.alpha_max)
-    return select(weight > ZERO, unclamped * (behind / (ONE - alpha) - transmittance * shade), ZERO)
+    return select(weight > ZERO, unclamped * (behind / (ONE - alpha) - transmittance * v_dot_c), ZERO)

@@ -14,7 +14,7 @@ TINY = np.finfo(np.float64).tiny  # the smallest number whose reciprocal is fini
 
 
 @scalar
-def normalized(w, x, y, z):
+def normalize(w, x, y, z):
     """Return the unit quaternion and the reciprocal of the original length; zeros for the zero quaternion.
 
     The quaternion is float64 and divided by its largest entry first, so that no square overflows or underflows.
@@ -54,7 +54,7 @@ def rotation_vjp(w, x, y, z, v):
 
 
 @scalar
-def normalized_vjp(unit, inverse_length, v_unit):
+def normalize_vjp(unit, inverse_length, v_unit):
     """Chain through q / |q|, which removes the part of the cotangent along the unit quaternion."""
     w, x, y, z = unit
     v_w, v_x, v_y, v_z = v_unit

@@ -10,21 +10,21 @@ which is also the middle of the chord through the ellipsoid at any number of sta
 
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.literals import ONE, TWO
-from minisplat_ref.scalar.covariance import normalized, rotation
-from minisplat_ref.scalar.projection import dot, transposed
+from minisplat_ref.scalar.covariance import normalize, rotation
+from minisplat_ref.scalar.projection import dot, transpose3
 
 
 @scalar
 def gaussian_axes(quat):
     """Return a Gaussian's unit axes in the world frame, one per row."""
-    w, x, y, z, _ = normalized(quat[0], quat[1], quat[2], quat[3])
-    return transposed(rotation(w, x, y, z))
+    w, x, y, z, _ = normalize(quat[0], quat[1], quat[2], quat[3])
+    return transpose3(rotation(w, x, y, z))
 
 
 @scalar
 def pixel_ray(R, x, y, fx, fy, cx, cy):
     """Return the world direction of the ray through an image point, scaled to a camera z of 1."""
-    columns = transposed(R)
+    columns = transpose3(R)
     in_camera = ((x - cx) / fx, (y - cy) / fy, ONE * fx / fx)
     return dot(columns[0], in_camera), dot(columns[1], in_camera), dot(columns[2], in_camera)
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import maximum, minimum, select, sqrt
 from minisplat_ref.jit.literals import HALF, ONE, TWO, ZERO
-from minisplat_ref.scalar.covariance import normalized, normalized_vjp, rotation, rotation_vjp
+from minisplat_ref.scalar.covariance import normalize, normalize_vjp, rotation, rotation_vjp
 from minisplat_ref.types import Floats
 
 
@@ -93,7 +93,7 @@ def to_camera(R, centre, x, y, z):
 @scalar
 def axes(quat, scale):
     """Return M = R_g diag(s) as rows: M[j][k] is world component j of axis k times its standard deviation."""
-    qw, qx, qy, qz, _ = normalized(quat[0], quat[1], quat[2], quat[3])
+    qw, qx, qy, qz, _ = normalize(quat[0], quat[1], quat[2], quat[3])
     r = rotation(qw, qx, qy, qz)
     return (
         (r[0][0] * scale[0], r[0][1] * scale[1], r[0][2] * scale[2]),
@@ -103,7 +103,7 @@ def axes(quat, scale):
 
 
 @scalar
-def rotated(R, M):
+def matmul3(R, M):
     """Return the matrix product of two 3 x 3 tuples of rows."""
     c0 = (M[0][0], M[1][0], M[2][0])
     c1 = (M[0][1], M[1][1], M[2][1])
@@ -116,7 +116,7 @@ def rotated(R, M):
 
 
 @scalar
-def transposed(M):
+def transpose3(M):
     """Return the transpose of a 3 x 3 tuple of rows."""
     return ((M[0][0], M[1][0], M[2][0]), (M[0][1], M[1][1], M[2][1]), (M[0][2], M[1][2], M[2][2]))
 
@@ -254,7 +254,7 @@ def project_gaussian_vjp(p, V, lens, footprint, v_x, v_y, v_depth, v_cov):
 @scalar
 def axes_vjp(quat, scale, v_M):
     """Chain dL/dM to the quaternion, as given, and the scales."""
-    qw, qx, qy, qz, inverse_length = normalized(quat[0], quat[1], quat[2], quat[3])
+    qw, qx, qy, qz, inverse_length = normalize(quat[0], quat[1], quat[2], quat[3])
     r = rotation(qw, qx, qy, qz)
     v_scale = (
         v_M[0][0] * r[0][0] + v_M[1][0] * r[1][0] + v_M[2][0] * r[2][0],
@@ -266,4 +266,4 @@ def axes_vjp(quat, scale, v_M):
         (v_M[1][0] * scale[0], v_M[1][1] * scale[1], v_M[1][2] * scale[2]),
         (v_M[2][0] * scale[0], v_M[2][1] * scale[1], v_M[2][2] * scale[2]),
     )
-    return normalized_vjp((qw, qx, qy, qz), inverse_length, rotation_vjp(qw, qx, qy, qz, v_r)), v_scale
+    return normalize_vjp((qw, qx, qy, qz), inverse_length, rotation_vjp(qw, qx, qy, qz, v_r)), v_scale

@@ -133,7 +133,7 @@ def prune_large(gaussians: Gaussians, *, size_limit: float | Floats) -> Edit:
     return keep(gaussians, gaussians.log_scales.max(axis=1, initial=-np.inf) <= np.log(size_limit))
 
 
-def capped_opacity_logits(opacity_logits: Floats, *, ceiling: float) -> Floats:
+def cap_opacity_logits(opacity_logits: Floats, *, ceiling: float) -> Floats:
     """Return the logits with opacities lowered to ``ceiling`` where they are above it (the opacity reset).
 
     Gaussians that the photographs need become opaque again within a few hundred iterations; floaters near the cameras

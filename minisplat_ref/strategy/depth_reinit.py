@@ -99,7 +99,7 @@ def centre_points(
     return _on_rays(output.extras["dominant_depth"], output.alpha, view.camera, conventions)
 
 
-def blended_points(
+def blend_points(
     model: Any, view: View, conventions: Conventions, backend: Backend, renderer: Renderer = SPLATTING
 ) -> PixelPoints:
     """Return the point on each ray at the blended depth, ``sum w z / sum w``.
@@ -149,7 +149,7 @@ def reinitial_points(
     n_points : int
         Points over all views; every view gives ``n_points // n_views``.
     points_of : callable
-        :func:`midpoint_points`, :func:`centre_points` or :func:`blended_points`.
+        :func:`midpoint_points`, :func:`centre_points` or :func:`blend_points`.
     min_alpha : float
         Pixels of lower accumulated opacity are not drawn; 0 for the paper's rule.
     depth_tolerance : float or None
@@ -193,10 +193,10 @@ def reinitial_points(
     points: list[Floats] = []
     colors: list[NDArray[np.uint8]] = []
     for i, view in enumerate(views):
-        view_points, weights = unprojected(depth_maps[i], cameras[i]).reshape(-1, 3), weight_maps[i].ravel()
+        view_points, weights = unproject(depth_maps[i], cameras[i]).reshape(-1, 3), weight_maps[i].ravel()
         if depth_tolerance is not None:
             candidates = np.flatnonzero(weights)
-            is_refuted = refuted(view_points[candidates], i, cameras, depth_maps, depth_tolerance)
+            is_refuted = find_refuted(view_points[candidates], i, cameras, depth_maps, depth_tolerance)
             unsure = candidates[is_refuted]
             if backdrop_distance is None:
                 weights[unsure] = 0
@@ -224,7 +224,7 @@ def _check_room(cameras: Sequence[Camera]) -> None:
         )
 
 
-def unprojected(depths: Floats, camera: Camera) -> Floats:
+def unproject(depths: Floats, camera: Camera) -> Floats:
     """Return the points on the rays of the pixels' centres.
 
     Parameters
@@ -245,11 +245,11 @@ def unprojected(depths: Floats, camera: Camera) -> Floats:
 
 
 def _on_rays(depths: Floats, alpha: Floats, camera: Camera, conventions: Conventions) -> PixelPoints:
-    points = unprojected(depths, with_principal_point(camera, conventions))  # [H, W, 3]
+    points = unproject(depths, with_principal_point(camera, conventions))  # [H, W, 3]
     return PixelPoints(np.where(depths[:, :, None] > 0, points, 0).astype(depths.dtype), depths, alpha)
 
 
-def refuted(
+def find_refuted(
     points: Floats, own_id: int, cameras: Sequence[Camera], depth_maps: Sequence[Floats], tolerance: float
 ) -> Bools:
     """Return which points of a view are refuted: at least as many partners see through one as have it on their surface.

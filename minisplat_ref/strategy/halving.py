@@ -46,7 +46,7 @@ def halves(gaussians: Gaussians, parent_ids: Ints, *, offset: float = OFFSET) ->
     shifts = dtype.type(offset) * np.exp(parents.log_scales[rows, longest])[:, None] * axes  # [P, 3]
     shrink = math.sqrt(1.0 - offset**2)
     parents.log_scales[rows, longest] += dtype.type(math.log(shrink))  # take() copied
-    parents = parents._replace(opacity_logits=thinned_logits(parents.opacity_logits, 1.0 / (2.0 * shrink)))
+    parents = parents._replace(opacity_logits=thin_logits(parents.opacity_logits, 1.0 / (2.0 * shrink)))
     second = parents._replace(means=parents.means + shifts)
     first = parents._replace(means=parents.means - shifts)
     changed = type(gaussians)(*(field.copy() for field in gaussians))
@@ -56,7 +56,7 @@ def halves(gaussians: Gaussians, parent_ids: Ints, *, offset: float = OFFSET) ->
     return Edit(concat(changed, second), np.concatenate([np.arange(len(gaussians.means)), parent_ids]), is_new)
 
 
-def thinned_logits(opacity_logits: Floats, factor: float) -> Floats:
+def thin_logits(opacity_logits: Floats, factor: float) -> Floats:
     """Return the logits of Gaussians whose optical depth is ``factor`` times as large: 1 - o' = (1 - o)^factor.
 
     Parameters

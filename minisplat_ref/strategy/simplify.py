@@ -81,7 +81,7 @@ def most_important(importance: Floats, n: int) -> Ints:
     return np.sort(ids[np.argsort(-importance[ids], kind="stable")[:n]])
 
 
-def carrying_mass(importance: Floats, mass: float) -> Ints:
+def select_mass(importance: Floats, mass: float) -> Ints:
     """Return the rows, ascending, that :func:`mass_mask` marks.
 
     Raises
@@ -184,7 +184,7 @@ def merge_clusters(gaussians: Any, weights: Floats, labels: Ints) -> Edit:
     is_member = is_merged[labels]  # [N]
     left = take(gaussians, parent_ids)
     members = type(gaussians)._make(field.astype(np.float64) for field in take(gaussians, order[is_member]))
-    for field, merged in zip(left, _merged(members, weights[is_member], labels[is_member]), strict=True):
+    for field, merged in zip(left, _merge_clusters(members, weights[is_member], labels[is_member]), strict=True):
         field[is_merged] = merged
     return Edit(left, parent_ids, is_merged)
 
@@ -231,14 +231,14 @@ def mutual_neighbours(places: Floats) -> Ints:
     is_self = nearest[:, 0] == rows
     other = np.where(is_self, nearest[:, 1], nearest[:, 0])
     order = np.argsort(np.where(is_self, distances[:, 1], distances[:, 0]), kind="stable")
-    pairs = np.column_stack([np.minimum(rows, other), np.maximum(rows, other)])[order]
-    ranks = np.full(len(places), len(pairs))
-    for column in pairs.T:
+    neighbours = np.column_stack([np.minimum(rows, other), np.maximum(rows, other)])[order]
+    ranks = np.full(len(places), len(neighbours))
+    for column in neighbours.T:
         np.minimum.at(ranks, column, rows)
-    return pairs[(ranks[pairs[:, 0]] == rows) & (ranks[pairs[:, 1]] == rows)]
+    return neighbours[(ranks[neighbours[:, 0]] == rows) & (ranks[neighbours[:, 1]] == rows)]
 
 
-def _merged(members: Any, weights: Floats, labels: Ints) -> Gaussians:
+def _merge_clusters(members: Any, weights: Floats, labels: Ints) -> Gaussians:
     """Return one Gaussian, float64, per cluster; the members of a cluster are contiguous."""
     starts = np.flatnonzero(np.diff(labels, prepend=-1))  # [n]
     sizes = np.diff(starts, append=len(labels))
@@ -274,7 +274,7 @@ def _cross_sections(variances: Floats) -> Floats:
     return np.sqrt(s1 * s2 + s2 * s3 + s3 * s1)
 
 
-def reinitialised(gaussians: Gaussians, sh_degree: int) -> Gaussians:
+def reinitialise(gaussians: Gaussians, sh_degree: int) -> Gaussians:
     """Return Gaussians with these centres and colours, and all other fields as at the start of training.
 
     Mini-Splatting does this after sampling: the Gaussians that remain have to grow over the gaps.

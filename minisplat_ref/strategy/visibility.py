@@ -39,7 +39,7 @@ def gradient_factors(is_visible: Bools, frustum_count: Ints) -> Floats:
     return np.count_nonzero(is_visible, axis=1) / (frustum_count + COUNT_OFFSET)
 
 
-def seen_by_few(is_visible: Bools, min_views: int) -> Bools:
+def find_seen_by_few(is_visible: Bools, min_views: int) -> Bools:
     """Return which Gaussians are visible in fewer than ``min_views`` training views.
 
     Depth from one view is a guess; the released code removes what fewer than two views see. In a scene with two views
@@ -61,7 +61,7 @@ def seen_by_few(is_visible: Bools, min_views: int) -> Bools:
 
 
 def culled_fraction(is_visible: Bools, frustum_count: Ints) -> float:
-    """Return the fraction of the (Gaussian, view) pairs in the frustum that culling removes.
+    """Return the fraction of the Gaussians in the frusta of all views that culling removes.
 
     Parameters
     ----------
@@ -75,5 +75,5 @@ def culled_fraction(is_visible: Bools, frustum_count: Ints) -> float:
     fraction : float
         In [0, 1]; 0 where no view sees anything.
     """
-    n_pairs = int(frustum_count.sum())
-    return 1.0 - np.count_nonzero(is_visible) / n_pairs if n_pairs else 0.0
+    n_in_frustum = int(frustum_count.sum())
+    return 1.0 - np.count_nonzero(is_visible) / n_in_frustum if n_in_frustum else 0.0

@@ -22,7 +22,7 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
-from minisplat_ref.arguments import SYNTHETIC_SCENES, fraction, integer, listed, name
+from minisplat_ref.arguments import SYNTHETIC_SCENES, fraction, integer, list_of, name
 from minisplat_ref.studies.study import Study
 
 RESULT, FIGURE = "result.json", "figure.png"  # files that every study writes
@@ -79,7 +79,7 @@ def _add_resumed_scene_arguments(parser: argparse.ArgumentParser) -> None:
 def _add_seeds(parser: argparse.ArgumentParser) -> None:
     """Add ``--seeds``."""
     parser.add_argument(
-        "--seeds", type=listed(integer(0)), default=(0, 1, 2), metavar="S,T", help="of the trainings (default 0,1,2)"
+        "--seeds", type=list_of(integer(0)), default=(0, 1, 2), metavar="S,T", help="of the trainings (default 0,1,2)"
     )
 
 
@@ -91,7 +91,7 @@ def _add_adaptive_arguments(parser: argparse.ArgumentParser) -> None:
     _add_resumed_scene_arguments(parser)
     parser.add_argument(
         "--recipes",
-        type=listed(name),
+        type=list_of(name),
         default=("3dgs-accel", "mini-splatting", "mini-splatting2", "adaptive"),
         metavar="R,Q",
         help="the first is what the others are compared with; also names of --rules (default: three of 3000 iterations,"
@@ -103,7 +103,7 @@ def _add_adaptive_arguments(parser: argparse.ArgumentParser) -> None:
     variants.add_argument("--sweep", action="store_true", help="adaptive beside itself with more Gaussians and fewer")
     parser.add_argument(
         "--conditions",
-        type=listed(name),
+        type=list_of(name),
         default=("whole", "few", "gains"),
         metavar="C,D",
         help=f"{CONDITION_HELP} (default: the first three)",
@@ -161,7 +161,7 @@ def _add_simplify_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--ply", type=Path, metavar="FILE", help="simplify these Gaussians, and train none")
     parser.add_argument(
         "--fractions",
-        type=listed(fraction),
+        type=list_of(fraction),
         default=(0.05, 0.1, 0.2, 0.4),
         metavar="F,G",
         help="of the candidates to keep (default 0.05,0.1,0.2,0.4)",
@@ -219,14 +219,14 @@ def _add_defects_arguments(parser: argparse.ArgumentParser) -> None:
     _add_resumed_scene_arguments(parser)
     parser.add_argument(
         "--conditions",
-        type=listed(name),
+        type=list_of(name),
         default=(),
         metavar="C,D",
         help="clean, gains, poses, sizes, sky (default: all, sky of synthetic scenes alone)",
     )
     parser.add_argument(
         "--asked",
-        type=listed(name),
+        type=list_of(name),
         default=("sky", "exposure", "pose", "antialiasing"),
         metavar="A,B",
         help="train until it is decided about these alone (default: all: sky,exposure,pose,antialiasing)",

@@ -35,7 +35,7 @@ from minisplat_ref.rendering import as_model
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.strategy.depth_reinit import (
     PixelPoints,
-    blended_points,
+    blend_points,
     centre_points,
     midpoint_points,
     reinitial_points,
@@ -81,11 +81,11 @@ class Choice(NamedTuple):
 CHOICES = {
     "mid-point": Choice(midpoint_points),
     "centre": Choice(centre_points),
-    "blended": Choice(blended_points),
+    "blended": Choice(blend_points),
     "mid-point, opacity floor": Choice(midpoint_points, ALPHA_MIN),
     "mid-point, vote": Choice(midpoint_points, 0.0, DEPTH_TOLERANCE),
     "mid-point, vote, backdrop": Choice(midpoint_points, 0.0, DEPTH_TOLERANCE, has_backdrop=True),
-    "blended, vote": Choice(blended_points, 0.0, DEPTH_TOLERANCE),
+    "blended, vote": Choice(blend_points, 0.0, DEPTH_TOLERANCE),
 }
 
 MEASURES = {

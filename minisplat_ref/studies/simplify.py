@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 from tqdm import tqdm
 
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
-from minisplat_ref.datasets.synthetic.surface import chamfer, shown_points
+from minisplat_ref.datasets.synthetic.surface import chamfer, unproject_views
 from minisplat_ref.errors import InputError
 from minisplat_ref.io import load_ply
 from minisplat_ref.io.atomic import making_folder
@@ -119,14 +119,14 @@ def true_surface(source: str) -> dict[str, Floats]:
         return {}
     synthetic = make_scene(source, supersampling=1, n_points=0)  # its depths do not depend on these two
     cameras = [view.camera for view in synthetic.scene.train_views]
-    return {"surface": shown_points(cameras, list(synthetic.train_depths))}
+    return {"surface": unproject_views(cameras, list(synthetic.train_depths))}
 
 
 def counts_to_keep(importance: Floats, fractions: tuple[float, ...]) -> dict[str, int]:
     """Return the numbers to keep, ascending, by name: those of the fractions, and the one that has the mass."""
     n_candidates = np.count_nonzero(importance)
     counts = {f"{100 * fraction:g} %": max(1, round(fraction * n_candidates)) for fraction in fractions}
-    counts[f"mass {MASS:g}"] = len(simplify.carrying_mass(importance, MASS))
+    counts[f"mass {MASS:g}"] = len(simplify.select_mass(importance, MASS))
     return dict(sorted(counts.items(), key=lambda item: item[1]))
 
 
@@ -178,7 +178,7 @@ def measure(
             "psnr": evaluate(gaussians, scene.test_views, background=scene.background).psnr,
             **{f"chamfer_{name}": chamfer(gaussians.means, tree) for name, tree in trees.items()},
         }
-        begun = simplify.reinitialised(gaussians, SH_DEGREE) if is_restart else gaussians
+        begun = simplify.reinitialise(gaussians, SH_DEGREE) if is_restart else gaussians
         tuned = fine_tune(begun, scene, iterations, rng)
         yield {**row, "psnr_tuned": evaluate(tuned, scene.test_views, background=scene.background).psnr}
 

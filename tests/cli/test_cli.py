@@ -26,7 +26,7 @@ from minisplat_ref.io import read_image
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.metrics import evaluate, psnr
 from minisplat_ref.rendering import render
-from minisplat_ref.reports.pictures import GAP, error_picture, to_picture
+from minisplat_ref.reports.images import GAP, error_image, to_8_bits
 from minisplat_ref.runs.progress import LOG_EVERY, Progress, read_log
 from minisplat_ref.studies import all_studies
 from tolerances import PSNR_FLOAT32
@@ -146,8 +146,8 @@ def test_renders_are_truth_render_error_side_by_side(run_folder, scene_folder):
     truth, shown, error = (picture[:, start : start + WIDTH] for start in range(0, 3 * WIDTH, WIDTH + GAP))
     output, _ = render(load_ply(run_folder / "point_cloud.ply"), view.camera, backend=CPU)
     np.testing.assert_array_equal(truth, view.image)
-    np.testing.assert_array_equal(shown, to_picture(output.image))
-    np.testing.assert_array_equal(error, error_picture(view.image, shown))
+    np.testing.assert_array_equal(shown, to_8_bits(output.image))
+    np.testing.assert_array_equal(error, error_image(view.image, shown))
 
 
 def test_interrupted_then_resumed_gives_the_bytes_of_an_uninterrupted_run(
@@ -220,9 +220,7 @@ def test_render_test_views_with_depth(run_folder, scene_folder, tmp_path):
     assert {path.name for path in (tmp_path / "views").iterdir()} == expected | {"pictures.json"}
     view = scene.test_views[0]
     output, _ = render(load_ply(run_folder / "point_cloud.ply"), view.camera, backend=CPU, with_depth=True)
-    np.testing.assert_array_equal(
-        read_image(tmp_path / "views" / f"{view.name}.png"), to_picture(output.image[..., :3])
-    )
+    np.testing.assert_array_equal(read_image(tmp_path / "views" / f"{view.name}.png"), to_8_bits(output.image[..., :3]))
     depth = np.load(tmp_path / "views" / f"{view.name}_depth.npy")
     is_hit = output.alpha > 0
     assert is_hit.any()

@@ -14,7 +14,7 @@ from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.io import load_ply, read_image
-from minisplat_ref.reports.pictures import GAP
+from minisplat_ref.reports.images import GAP
 from minisplat_ref.runs.notices import describe_sizes
 from minisplat_ref.runs.preview import FILE
 from minisplat_ref.runs.progress import Progress

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from data_tools.sources import Imports, annotations, dotted
+from data_tools.sources import Imports, annotations, module_name
 
 SOURCES = {
     "package/__init__.py": "from package.shapes import area\nfrom package.deep.inner import core",
@@ -52,7 +52,7 @@ def test_tests_of_a_module(imports, module, tests):
 
 
 def test_modules_are_named_as_they_are_imported():
-    assert dotted(Path("a/b/c.py")) == "a.b.c" and dotted(Path("a/b/__init__.py")) == "a.b"
+    assert module_name(Path("a/b/c.py")) == "a.b.c" and module_name(Path("a/b/__init__.py")) == "a.b"
 
 
 def test_types_are_found_where_they_stand():
@@ -70,12 +70,12 @@ def test_what_comes_too_late_has_no_say(tmp_path, seconds, code):
 
 def test_the_same_changes_are_drawn_again(imports, monkeypatch):
     pytest.importorskip("cosmic_ray", reason="of the extra [mutation]")
-    from data_tools.mutation import SETTINGS, drawn_changes, load_config
+    from data_tools.mutation import SETTINGS, draw_changes, load_config
 
     module = Path("package/shapes.py")
     module.write_text("def f(a: int | None, b=2) -> int | None:\n    return a + b if a > 0 and not b < 7 else None\n")
     settings = load_config(Path(__file__).parents[2] / SETTINGS)
-    draws = [drawn_changes([module], settings, n, random.Random(3)) for n in (3, 3, 100)]
+    draws = [draw_changes([module], settings, n, random.Random(3)) for n in (3, 3, 100)]
     first, second, every = (
         [(change.start_pos, change.operator_name) for item in draw for change in item.mutations] for draw in draws
     )

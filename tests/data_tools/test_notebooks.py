@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from data_tools import notebooks
-from data_tools.notebooks import FOLDER, PNG_MAX, ROOT, comparable, differences, executed, main, stripped
+from data_tools.notebooks import FOLDER, PNG_MAX, ROOT, comparable, differences, execute, main, strip_notebook
 
 STORED = sorted(FOLDER.glob("*.ipynb"))
 
@@ -144,7 +144,7 @@ def test_what_changes_is_stripped():
     notebook.cells[0].execution_count = 3
     notebook.cells[0].metadata["execution"] = {"iopub.execute_input": "2024-01-01T00:00:00"}
     notebook.metadata["language_info"] = {"version": "3.11"}
-    [cell] = stripped(notebook, "x").cells
+    [cell] = strip_notebook(notebook, "x").cells
     assert [out.get("text") for out in cell.outputs] == ["./notebooks/x\n", None, None]
     assert cell.execution_count is None and cell.outputs[1].execution_count is None
     assert "execution" not in cell.metadata and "language_info" not in notebook.metadata
@@ -154,7 +154,7 @@ def test_what_changes_is_stripped():
 def test_a_large_picture_is_refused():
     noise = np.random.default_rng(0).integers(0, 256, (400, 400, 3))
     with pytest.raises(notebooks.InputError, match=r"x, cell 0: its picture has [\d,]+ bytes, more than 100,000"):
-        stripped(notebook_of(picture(noise)), "x")
+        strip_notebook(notebook_of(picture(noise)), "x")
 
 
 TEXT = """# %% [markdown]
@@ -200,7 +200,7 @@ def test_a_wrong_solution_is_named(folder):
     path = folder / "00_small.py"
     path.write_text(TEXT.replace("SOLUTION", "41"))
     with pytest.raises(notebooks.InputError, match=r"00_small.py, solution 1: AssertionError .*assert number == 41"):
-        executed(path)
+        execute(path)
 
 
 def test_a_cell_that_does_not_end_is_named(folder, monkeypatch):
@@ -208,7 +208,7 @@ def test_a_cell_that_does_not_end_is_named(folder, monkeypatch):
     path = folder / "00_small.py"
     path.write_text("# %%\nimport time\n\ntime.sleep(60)\n")
     with pytest.raises(notebooks.InputError, match=r"00_small.py: a cell takes more than 1 s"):
-        executed(path)
+        execute(path)
 
 
 def test_an_unknown_name_is_answered_with_those_that_exist(folder, capsys):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from data_tools import survey as module
-from data_tools.survey import as_markdown, planted_copy, planted_function, survey
+from data_tools.survey import as_markdown, plant_in_copy, plant_in_function, survey
 from data_tools.survey_errors import ERRORS
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
@@ -23,25 +23,25 @@ def test_every_line_is_where_the_list_says(tmp_path):
     assert len(BY_NAME) == len(ERRORS) >= 25
     for k, error in enumerate(ERRORS):
         if error.is_compiled:
-            planted_copy(error, tmp_path / str(k))
+            plant_in_copy(error, tmp_path / str(k))
         else:
-            with planted_function(error):
+            with plant_in_function(error):
                 pass
     with pytest.raises(InputError, match=r"stands 0 times in reference\.adam:adam_update"):
-        with planted_function(BY_NAME["eps inside the root"]._replace(right="no such line")):
+        with plant_in_function(BY_NAME["eps inside the root"]._replace(right="no such line")):
             pass
 
 
 def test_a_function_is_wrong_for_whoever_holds_it_and_right_again():
     right = adam_update.__code__
-    with planted_function(BY_NAME["eps inside the root"]):
+    with plant_in_function(BY_NAME["eps inside the root"]):
         assert adam.adam_update is adam_update and adam_update.__code__ is not right
     assert adam_update.__code__ is right
 
 
 def test_a_copy_differs_in_one_line(tmp_path):
     error = BY_NAME["kernels: eps inside the root"]
-    planted_copy(error, tmp_path)
+    plant_in_copy(error, tmp_path)
     lines = [
         (folder / "scalar" / "adam.py").read_text().splitlines()
         for folder in (module.PACKAGE, tmp_path / "minisplat_ref")

@@ -10,7 +10,13 @@ from scipy.spatial import cKDTree
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic import surface as surface_module
 from minisplat_ref.datasets.synthetic.files import load_depths, write_scene
-from minisplat_ref.datasets.synthetic.surface import chamfer, shown_points, surface_distance, surface_near, true_surface
+from minisplat_ref.datasets.synthetic.surface import (
+    chamfer,
+    surface_distance,
+    surface_near,
+    true_surface,
+    unproject_views,
+)
 from minisplat_ref.errors import InputError
 from minisplat_ref.io import load_scene
 from scenes import make_camera, make_gaussians
@@ -75,7 +81,7 @@ def test_truth_is_bounded_and_repeats(monkeypatch):
 
 def test_true_surface_is_what_the_training_views_show(synthetic, folder):
     cameras = [view.camera for view in synthetic.scene.train_views]
-    shown = shown_points(cameras, list(synthetic.train_depths))
+    shown = unproject_views(cameras, list(synthetic.train_depths))
     assert 0 < len(shown) == np.count_nonzero(synthetic.train_depths) < synthetic.train_depths.size  # there is sky
     scene = load_scene(folder, test_every=3)
     distances = np.linalg.norm(shown - np.mean([camera.center for camera in cameras], axis=0), axis=1)

@@ -19,10 +19,10 @@ from minisplat_ref.extensions.antialiasing.method import (
     FILTERED,
     MIP,
     FilteredGaussians,
-    unfiltered,
+    add_filters,
     with_3d_filter,
 )
-from minisplat_ref.extensions.antialiasing.reference import smoothed, smoothed_vjp
+from minisplat_ref.extensions.antialiasing.reference import smooth, smooth_vjp
 from minisplat_ref.mechanisms import sampling
 from minisplat_ref.mechanisms.sampling import sampling_intervals
 from minisplat_ref.oracle.models import check_model_gradients
@@ -60,7 +60,7 @@ def test_the_nearest_camera_that_sees_it_counts():
 def test_a_filtered_gaussian_by_hand():
     """A filter of 4 makes deviations of 3, 4 and 12 become 5, sqrt(32) and sqrt(160); opacity keeps the integral."""
     scales, opacity = np.array([[3.0, 4, 12]]), 0.7
-    found, logits = smoothed(np.log(scales), np.log([opacity / (1 - opacity)]), np.array([4.0]))
+    found, logits = smooth(np.log(scales), np.log([opacity / (1 - opacity)]), np.array([4.0]))
     expected = np.sqrt([[25.0, 32, 160]])
     assert_allclose(np.exp(found), expected, rtol=CLOSED_FORM)
     assert_allclose(1 / (1 + np.exp(-logits)), opacity * scales.prod() / expected.prod(), rtol=CLOSED_FORM)
@@ -68,7 +68,7 @@ def test_a_filtered_gaussian_by_hand():
 
 def test_the_gradient_of_the_filter(rng):
     inputs = [rng.normal(size=(5, 3)), 2 * rng.normal(size=5), rng.uniform(0.3, 2, 5)]
-    check_jacobian(smoothed, lambda *v: smoothed_vjp(*inputs, *v), inputs, names=["log_scales", "logits", "sigmas"])
+    check_jacobian(smooth, lambda *v: smooth_vjp(*inputs, *v), inputs, names=["log_scales", "logits", "sigmas"])
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -76,9 +76,9 @@ def test_filters_of_zero_change_no_bit(dtype, rng):
     log_scales, logits = rng.normal(size=(50, 3)).astype(dtype), (9 * rng.normal(size=50)).astype(dtype)
     v = rng.normal(size=(50, 3)).astype(dtype), rng.normal(size=50).astype(dtype)
     zeros = np.zeros(50, dtype)
-    for found, expected in zip(smoothed(log_scales, logits, zeros), (log_scales, logits), strict=True):
+    for found, expected in zip(smooth(log_scales, logits, zeros), (log_scales, logits), strict=True):
         assert found.tobytes() == expected.tobytes()
-    for found, expected in zip(smoothed_vjp(log_scales, logits, zeros, *v), v, strict=False):
+    for found, expected in zip(smooth_vjp(log_scales, logits, zeros, *v), v, strict=False):
         assert found.tobytes() == expected.tobytes()
 
 
@@ -87,8 +87,8 @@ def test_filters_of_zero_change_no_bit(dtype, rng):
 def test_extremes_stay_finite(log_scale, logit):
     arrays = np.full((1, 3), log_scale, np.float32), np.array([logit], np.float32), np.ones(1, np.float32)
     with np.errstate(over="raise", invalid="raise"):
-        found = smoothed(*arrays)
-        v = smoothed_vjp(*arrays, np.ones((1, 3), np.float32), np.ones(1, np.float32))
+        found = smooth(*arrays)
+        v = smooth_vjp(*arrays, np.ones((1, 3), np.float32), np.ones(1, np.float32))
     assert all(np.isfinite(array).all() for array in (*found, *v))
     assert all(array.dtype == np.float32 for array in (*found, *v))
 
@@ -118,7 +118,7 @@ def test_the_image_keeps_its_mass_when_a_gaussian_is_filtered():
 def test_without_filters_it_is_3dgs_exactly(backend, dtype, rng):
     """The 3D filter alone wraps 3DGS's renderer, and the 2D filter is 3DGS's compensation with another variance."""
     gaussians, view = as_dtype(make_gaussians(rng, 40), dtype), view_from(make_camera(rng=rng))
-    zero = unfiltered(gaussians, rng)
+    zero = add_filters(gaussians, rng)
     mip = GSPLAT_MAIN._replace(eps2d=EPS2D, is_antialiased=True)
     for renderer, conventions in ((with_3d_filter(SPLATTING), GSPLAT_MAIN), (MIP, mip)):
         ours, tape = renderer.render(Model(zero), view, Request(backend=backend))
@@ -164,7 +164,7 @@ def test_blocks_and_cameras_fit():
     small = sampling.block_means(image, 3)
     assert small.shape == (2, 3, 3)
     assert_allclose(small[1, 2], image[3:6, 6:9].mean(axis=(0, 1)), rtol=PARITY_FLOAT64)
-    camera = sampling.zoomed(make_camera(10, 7, fx=30.0, fy=28.0), 1 / 3)
+    camera = sampling.zoom_camera(make_camera(10, 7, fx=30.0, fy=28.0), 1 / 3)
     assert (camera.width, camera.height) == (3, 2)
     assert_allclose([camera.fx, camera.cx], [10, 5 / 3], rtol=CLOSED_FORM)
 

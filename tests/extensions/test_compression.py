@@ -146,7 +146,7 @@ def test_msz_step_of_centres_follows_the_scene():
     """A scene eight times as large has the same integers, because eight is a power of two."""
     gaussians = population()
     larger = gaussians._replace(means=8 * gaussians.means, log_scales=gaussians.log_scales + np.float32(np.log(8.0)))
-    steps = [msz._checked(container.parse(msz.CONTAINER, msz.encode(g, 6), "")).steps for g in (gaussians, larger)]
+    steps = [msz._check_header(container.parse(msz.CONTAINER, msz.encode(g, 6), "")).steps for g in (gaussians, larger)]
     assert steps[1].means - steps[0].means in (2, 3, 4)  # log scales are rounded, too
     assert steps[0].means < np.log2(np.exp(gaussians.log_scales).min())
 
@@ -199,7 +199,7 @@ def test_damaged_anywhere(format_, rng):
 
 def test_headers_that_lie_at_random(rng):
     check_headers(msz.MSZ, msz.encode(population(7, 1), 5), rng, 300)
-    header = msz._checked(container.parse(msz.CONTAINER, msz.encode(population(7, 1), 5), ""))
+    header = msz._check_header(container.parse(msz.CONTAINER, msz.encode(population(7, 1), 5), ""))
     steps = header.steps._replace(log_scales=55)._asdict()  # once an overflow
     assert "which steps" in refusal(msz.MSZ, with_header(msz.encode(population(), 3), steps=steps))
 

@@ -9,8 +9,8 @@ from minisplat_ref.mechanisms.meshes.fans import (
     by_gram_schmidt,
     fan_faces,
     fan_vertices,
-    fitted,
-    flattened,
+    fit_flat_gaussians,
+    flatten,
     min_widths,
     opacity_radii,
     plane_axes,
@@ -21,7 +21,7 @@ from tolerances import CLOSED_FORM, PARITY_FLOAT64
 
 
 def flat_of(g):
-    return flattened(g.means, g.quats, g.log_scales)
+    return flatten(g.means, g.quats, g.log_scales)
 
 
 def polygons(rng, n=40, n_sides=N_SIDES):
@@ -40,7 +40,7 @@ def planar_covariances(flat):
 
 def test_a_polygon_by_hand():
     """An octagon in the plane x = 1, whose axis x is the thinnest; its corners are as far out as the opacity says."""
-    flat = flattened(np.array([[1.0, 2, 3]]), np.array([[1.0, 0, 0, 0]]), np.log([[1e-3, 2.0, 0.5]]))
+    flat = flatten(np.array([[1.0, 2, 3]]), np.array([[1.0, 0, 0, 0]]), np.log([[1e-3, 2.0, 0.5]]))
     radius = np.sqrt(11.3449 + 2 * np.log(0.25))
     assert_allclose(opacity_radii(np.array([np.log(1 / 3)])), [radius], rtol=CLOSED_FORM)
     phi = np.pi / 4 * np.arange(8)
@@ -77,7 +77,7 @@ def test_faces_of_fans_cover_the_polygons(rng):
 
 
 @pytest.mark.parametrize("n_sides", [3, 4, 5, 8, 12])
-@pytest.mark.parametrize("inverse", [fitted, by_gram_schmidt])
+@pytest.mark.parametrize("inverse", [fit_flat_gaussians, by_gram_schmidt])
 def test_polygons_come_back(inverse, n_sides, rng):
     flat, radii, corners = polygons(rng, n_sides=n_sides)
     back = inverse(corners, radii)
@@ -94,7 +94,7 @@ def test_affine_edits_are_carried_exactly(n_sides, rng):
     for A in (rng.normal(size=(3, 3)), np.diag([1.0, -1, 1]) + np.eye(3, k=1)):
         expected = A @ planar_covariances(flat) @ A.T
         edited = corners @ A.T + [1.0, 2, 3]
-        back, paper = fitted(edited, radii), by_gram_schmidt(edited, radii)
+        back, paper = fit_flat_gaussians(edited, radii), by_gram_schmidt(edited, radii)
         assert_allclose(back.means, flat.means @ A.T + [1.0, 2, 3], atol=PARITY_FLOAT64)
         assert_allclose(planar_covariances(back), expected, atol=PARITY_FLOAT64)
         assert_allclose(paper.means, back.means, atol=PARITY_FLOAT64)

@@ -19,7 +19,7 @@ from minisplat_ref.extensions.fans.profile import fan_profile, mass, profile_err
 from minisplat_ref.extensions.fans.shapes import (
     Fans,
     FanShape,
-    converted,
+    convert_gaussians,
     mesh_of,
     mesh_of_vjp,
     table,
@@ -27,7 +27,7 @@ from minisplat_ref.extensions.fans.shapes import (
     visible_mesh,
 )
 from minisplat_ref.extensions.fans.stages import stages
-from minisplat_ref.extensions.fans.tuning import alpha_of, best_shape, drawn
+from minisplat_ref.extensions.fans.tuning import alpha_of, best_shape, render_clipped
 from minisplat_ref.io.ply import save_ply
 from minisplat_ref.oracle.gradients import jacobian_case
 from minisplat_ref.oracle.pieces import SEED, tiny_setting
@@ -43,7 +43,7 @@ FLAT, SOLID = FanShape(8, 2.5, 0.2), FanShape(8, 2.3, 0.1, is_flat=False)
 
 
 def fans_of(rng, n, shape=FLAT, dtype=np.float64):
-    return converted(as_dtype(make_gaussians(rng, n, sh_degree=1), dtype), shape)
+    return convert_gaussians(as_dtype(make_gaussians(rng, n, sh_degree=1), dtype), shape)
 
 
 def pieces(rng, n, shape, backend, dtype=np.float64):
@@ -67,7 +67,7 @@ def test_a_flat_fan_by_hand():
         sh_dc=np.array([[0.5, -3, 4]]),
         sh_rest=np.ones((1, 3, 3)),
     )
-    fans = converted(one, FanShape(4, 2.5, 0.2))
+    fans = convert_gaussians(one, FanShape(4, 2.5, 0.2))
     corners = [[1, 2 + 5, 3], [1, 2, 3 + 1.25], [1, 2 - 5, 3], [1, 2, 3 - 1.25]]
     assert_allclose(vertices_of(fans)[0], [[1, 2, 3], *corners], rtol=CLOSED_FORM, atol=CLOSED_FORM)
     assert_allclose(fans.colors[0], np.tile([0.5 + 0.5 * SH_C0, 0, 1], (5, 1)), rtol=CLOSED_FORM)  # clipped
@@ -79,7 +79,7 @@ def test_a_flat_fan_by_hand():
 def test_solid_fans_share_the_ends_of_the_axes(n_sides, rng):
     """On the ellipsoid of k deviations, in three planes, all vertices used; with 8 sides, 19 vertices, 24 triangles."""
     g = make_gaussians(rng, 5)
-    fans = converted(g, FanShape(n_sides, 2.3, 0.1, is_flat=False))
+    fans = convert_gaussians(g, FanShape(n_sides, 2.3, 0.1, is_flat=False))
     assert fans.n_vertices == 1 + 3 * n_sides - 6
     triangles = table(*fans.rims.shape[1:3])
     assert triangles.shape == (3 * n_sides, 3)
@@ -119,7 +119,7 @@ def test_the_gradient_of_the_mesh_is_its_adjoint(shape, rng):
 )
 def test_shapes_that_are_none_are_refused(shape, named, rng):
     with pytest.raises(InputError, match=named):
-        converted(make_gaussians(rng, 2), shape)
+        convert_gaussians(make_gaussians(rng, 2), shape)
 
 
 # --- the profile ---
@@ -132,7 +132,7 @@ def test_a_fan_seen_from_the_front_has_the_profile(backend):
         np.float64,
     )
     camera = make_camera(40, 30, fx=50.0, fy=50.0, cx=20.2, cy=15.1)
-    alpha = alpha_of(converted(one, FLAT), view_from(camera), backend=backend)
+    alpha = alpha_of(convert_gaussians(one, FLAT), view_from(camera), backend=backend)
     x, y = np.meshgrid((np.arange(40) + 0.5 - 20.2) / 50 * 3 / 0.4, (np.arange(30) + 0.5 - 15.1) / 50 * 3 / 0.4)
     expected = fan_profile(np.stack([x, y], axis=-1), FLAT) / (1 + np.exp(-1))
     assert expected.max() > 0.7 and (expected == 0).any()
@@ -231,7 +231,7 @@ def test_colors_stay_in_range_and_faint_fans_go(rng):
 def test_the_best_shape_is_found_again(rng):
     """Pictures of fans themselves, of another reach and rim than where the search begins."""
     g, view = make_gaussians(rng, 8), view_from(make_camera())
-    target = drawn(converted(g, FanShape(8, 2.0, 0.15)), view)
+    target = render_clipped(convert_gaussians(g, FanShape(8, 2.0, 0.15)), view)
     found = best_shape(g, FanShape(), [view], [target], np.zeros(3))
     assert found.reach == pytest.approx(2.0, abs=0.05) and found.rim == pytest.approx(0.15, abs=0.05)
 
@@ -313,7 +313,9 @@ def test_trimesh_opens_what_is_exported(suffix, model, tmp_path, capsys):
     assert ("opaque" in told.err) == (suffix == "obj")
     (opened,) = trimesh.load_scene(out, process=False).geometry.values()
     assert len(opened.faces) == 960 and len(opened.vertices) == 760
-    fans = converted(as_dtype(make_gaussians(np.random.default_rng(3), 40), np.float32), FanShape(8, 3.0, 0.2, False))
+    fans = convert_gaussians(
+        as_dtype(make_gaussians(np.random.default_rng(3), 40), np.float32), FanShape(8, 3.0, 0.2, False)
+    )
     mesh = mesh_of(fans)
     assert_allclose(opened.vertices[opened.faces], mesh.vertices[mesh.faces], atol=1e-6)
     if suffix == "glb":

@@ -14,7 +14,7 @@ from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.extensions.extension import find_recipe, load_extension
-from minisplat_ref.extensions.micro.method import clone_and_split_by_detail, clusters, halved_children
+from minisplat_ref.extensions.micro.method import clone_and_split_by_detail, clusters, halve_children
 from minisplat_ref.extensions.micro.reference import (
     are_alike,
     box_means,
@@ -131,7 +131,7 @@ def test_children_have_half_the_covariance_and_stand_where_the_other_half_is(rng
     parent = balls(np.zeros((4000, 3)), np.ones(4000))
     quats = np.tile(rng.normal(size=4), (4000, 1))
     parent = parent._replace(quats=quats, log_scales=np.tile(np.log([1.0, 0.5, 0.2]), (4000, 1)))
-    children = halved_children(parent, np.arange(4000), rng)
+    children = halve_children(parent, np.arange(4000), rng)
     sigma = covariances(parent.quats[:1], np.exp(parent.log_scales[:1]))[0]
     own = covariances(children.quats[:1], np.exp(children.log_scales[:1]))[0]
     assert len(children.means) == 8000

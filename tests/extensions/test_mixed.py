@@ -20,9 +20,16 @@ from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.extensions.extension import load_extension
 from minisplat_ref.extensions.mixed import fit
 from minisplat_ref.extensions.mixed.kernels import response_for
-from minisplat_ref.extensions.mixed.kinds import coverage, promoted, simplified, whitened
+from minisplat_ref.extensions.mixed.kinds import coverage, promote_kinds, simplify_kinds, whiten_vertices
 from minisplat_ref.extensions.mixed.method import MIXED_GAUSSIANS
-from minisplat_ref.extensions.mixed.population import MixedGaussians, as_ellipses, counts, grouped, groups, to_lab
+from minisplat_ref.extensions.mixed.population import (
+    MixedGaussians,
+    as_ellipses,
+    counts,
+    group_gaussians,
+    groups,
+    to_lab,
+)
 from minisplat_ref.extensions.mixed.projection import Hulls, footprints_of, footprints_vjp, in_plane
 from minisplat_ref.extensions.mixed.response import INSIDE, RESPONSE, Footprints, nearest
 from minisplat_ref.extensions.shared_studies import psnr_of
@@ -264,7 +271,7 @@ def test_lab_of_known_colours():
 def test_a_group_has_its_points_for_vertices(rng):
     colors = np.repeat(np.arange(40) % 8 == 0, 3).reshape(40, 3).astype(np.float32)
     g = as_dtype(make_gaussians(rng, 40), np.float32)._replace(sh_dc=colors)
-    population = grouped(g, rng)
+    population = group_gaussians(g, rng)
     m = counts(population)
     assert m.sum() == 40 and set(m) == {1, 2, 3} and population.means.dtype == np.float32
     local = in_plane(population.vertices, m)
@@ -279,14 +286,14 @@ def test_hulls_that_make_no_difference_lose_vertices(rng):
     one = as_ellipses(make_gaussians(rng, 4))._replace(log_scales=np.zeros((4, 3)))
     vertices = np.array([[0.1, 0.1, -0.1, 0.0], [3.0, 0.1, -1.0, 0.0], [0.1, 0.1, 7.0, 7.0], [3, 0.0, 0.0, 3.0]])
     population = one._replace(vertices=vertices, n_vertices=np.array([3, 3, 2, 3.0]))
-    after, changed = simplified(population, least=0.5, min_height=0.5)
+    after, changed = simplify_kinds(population, least=0.5, min_height=0.5)
     assert changed.tolist() == [True, True, True, False] and counts(after).tolist() == [1, 2, 1, 3]
     # The line of the longest edge, from (-2, -0.1) to (3, 0.1).
     assert_allclose(np.abs(after.vertices[1]), [2.5, 0.1, 0, 0], atol=CLOSED_FORM)
     axes = rotation_matrices(population.quats)[1]
     assert_allclose(after.means[1] - population.means[1], 0.5 * axes[:, 0], atol=CLOSED_FORM)
     assert_allclose(after.means[[0, 2, 3]], population.means[[0, 2, 3]])
-    again, changed = simplified(after, least=0.5, min_height=0.5)
+    again, changed = simplify_kinds(after, least=0.5, min_height=0.5)
     assert not changed.any() and again.means.tobytes() == after.means.tobytes()
 
 
@@ -294,10 +301,10 @@ def test_needles_become_lines_and_discs_triangles_that_cover_as_much(rng):
     """Whatever the order of the axes; the picture from the front stays nearly the same."""
     log_scales = np.log([[0.05, 0.8, 0.05], [0.3, 0.01, 0.35], [0.3, 0.3, 0.3], [0.01, 0.01, 0.09]])
     population = as_ellipses(make_gaussians(rng, 4))._replace(log_scales=log_scales)
-    after, changed = promoted(population, ratio=6.0, size_limit=0.2)
+    after, changed = promote_kinds(population, ratio=6.0, size_limit=0.2)
     assert changed.tolist() == [True, True, False, False] and counts(after).tolist() == [2, 3, 1, 1]
     largest_two = np.sort(log_scales, axis=1)[:2, 1:].sum(axis=1)
-    covers = coverage(whitened(after), counts(after))[:2] * np.exp(after.log_scales[:2, :2].sum(axis=1))
+    covers = coverage(whiten_vertices(after), counts(after))[:2] * np.exp(after.log_scales[:2, :2].sum(axis=1))
     assert_allclose(covers, 2 * np.pi * np.exp(largest_two), rtol=CLOSED_FORM * 10)
     R, R_before = rotation_matrices(after.quats), rotation_matrices(population.quats)
     assert_allclose(np.abs(np.sum(R[0, :, 0] * R_before[0, :, 1])), 1)  # along the needle

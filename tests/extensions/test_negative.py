@@ -18,8 +18,14 @@ from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe, load_extension
 from minisplat_ref.extensions.negative import rings
-from minisplat_ref.extensions.negative.method import FRACTION, SIGNED, signed_colors, signed_colors_vjp, with_negatives
-from minisplat_ref.extensions.negative.reference import density, difference, largest_weight, negated
+from minisplat_ref.extensions.negative.method import (
+    FRACTION,
+    SIGNED,
+    compute_signed_colors,
+    compute_signed_colors_vjp,
+    with_negatives,
+)
+from minisplat_ref.extensions.negative.reference import density, difference, largest_weight, negate
 from minisplat_ref.extensions.negative.study import STUDIES
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.rendering import SPLATTING, Request
@@ -69,7 +75,7 @@ def small_view():
 
 def colors_of(gaussians, camera, backend, degree=3):
     radii = np.ones((len(gaussians.means), 2), np.int32)
-    return signed_colors(backend, gaussians.means, gaussians.sh_dc, gaussians.sh_rest, camera, degree, radii)
+    return compute_signed_colors(backend, gaussians.means, gaussians.sh_dc, gaussians.sh_rest, camera, degree, radii)
 
 
 def drawn(renderer, gaussians, view, backend, **options):
@@ -102,7 +108,7 @@ def test_colors_are_the_polynomial_without_the_clamp(backend, rng):
 
 def test_negated_coefficients_give_the_negative_color(backend, rng):
     gaussians, camera = make_gaussians(rng, 50), make_camera(rng=rng)
-    sh_dc, sh_rest = negated(gaussians.sh_dc, gaussians.sh_rest)
+    sh_dc, sh_rest = negate(gaussians.sh_dc, gaussians.sh_rest)
     opposite = gaussians._replace(sh_dc=sh_dc, sh_rest=sh_rest)
     colors = colors_of(gaussians, camera, backend)
     assert np.abs(colors).min() > 0
@@ -140,7 +146,7 @@ def test_culled_gaussians_have_no_color(backend, rng):
     gaussians, camera = of_either_sign(rng, 6), make_camera()
     radii = np.ones((6, 2), np.int32)
     radii[::2] = 0
-    colors = signed_colors(backend, gaussians.means, gaussians.sh_dc, gaussians.sh_rest, camera, 3, radii)
+    colors = compute_signed_colors(backend, gaussians.means, gaussians.sh_dc, gaussians.sh_rest, camera, 3, radii)
     assert not colors[::2].any() and (colors[1::2] < 0).any()
 
 
@@ -183,8 +189,8 @@ def test_color_has_its_gradient_on_either_side_of_zero_and_at_it(backend, color)
     gaussians, camera = of_colors([[color] * 3]), small_view().camera
     radii, v_colors = np.ones((1, 2), np.int32), np.array([[1.0, -2.0, 0.5]])
     arguments = (gaussians.means, gaussians.sh_dc, gaussians.sh_rest, camera, 0, radii)
-    assert_allclose(signed_colors(backend, *arguments), [[color] * 3], atol=CLOSED_FORM)
-    assert_allclose(signed_colors_vjp(backend, *arguments, v_colors).sh_dc, SH_C0 * v_colors, rtol=CLOSED_FORM)
+    assert_allclose(compute_signed_colors(backend, *arguments), [[color] * 3], atol=CLOSED_FORM)
+    assert_allclose(compute_signed_colors_vjp(backend, *arguments, v_colors).sh_dc, SH_C0 * v_colors, rtol=CLOSED_FORM)
 
 
 # --- parity ---

@@ -17,10 +17,10 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_format, find_recipe
 from minisplat_ref.extensions.omg import file as omg
 from minisplat_ref.extensions.omg import study
-from minisplat_ref.extensions.omg.appearance import features_of, fitted_decoder
+from minisplat_ref.extensions.omg.appearance import features_of, fit_decoder
 from minisplat_ref.extensions.omg.method import prune_indistinct
 from minisplat_ref.extensions.omg.reference import distinct_importance, local_distinctiveness
-from minisplat_ref.extensions.omg.svq import fitted_codes, quantise
+from minisplat_ref.extensions.omg.svq import fit_codes, quantise
 from minisplat_ref.methods.mini_splatting import MINI_SPLATTING, prune_tail
 from minisplat_ref.rendering import SPLATTING
 from minisplat_ref.strategy.importance import indoor
@@ -128,7 +128,7 @@ def test_codes_are_means_of_their_own_and_vectors_take_the_nearest(rng):
     vectors = np.concatenate(
         [middle + rng.normal(size=(n, 2)) for n, middle in ((40, 0.0), (40, 50.0), (20, np.array([-60.0, 0.0])))]
     )
-    codes = fitted_codes(vectors, 3)
+    codes = fit_codes(vectors, 3)
     expected = [vectors[:40].mean(axis=0), vectors[40:80].mean(axis=0), vectors[80:].mean(axis=0)]
     assert_allclose(codes[np.argsort(codes[:, 0])], np.array(expected)[[2, 0, 1]], rtol=CLOSED_FORM, atol=CLOSED_FORM)
     quantised = quantise(rng.normal(size=(400, 2)), 2, 16)
@@ -158,7 +158,7 @@ def test_sub_vectors_are_cheap_at_high_rates_and_no_better_at_low_ones(rng):
 def test_harmonics_of_few_dimensions_are_recovered(rng):
     directions, mean = rng.normal(size=(3, 45)), rng.normal(size=45)
     harmonics = mean + rng.normal(size=(200, 3)) @ directions
-    decoder = fitted_decoder(harmonics, 3)
+    decoder = fit_decoder(harmonics, 3)
     back = decoder.harmonics(features_of(harmonics, decoder))
     assert np.abs(back - harmonics).max() < 10 * HALF_FLOAT * np.abs(harmonics).max()
     basis = decoder.directions.astype(np.float64)
@@ -168,7 +168,7 @@ def test_harmonics_of_few_dimensions_are_recovered(rng):
 def test_the_decoder_is_the_best_linear_one(rng):
     """Three directions of random rotations do no better, and the error is the variance that is left."""
     harmonics = rng.normal(size=(500, 8)) * [5, 4, 3, 1, 0.5, 0.4, 0.3, 0.2]
-    decoder = fitted_decoder(harmonics, 3)
+    decoder = fit_decoder(harmonics, 3)
     error = np.sum((decoder.harmonics(features_of(harmonics, decoder)) - harmonics) ** 2)
     left = np.linalg.svd(harmonics - harmonics.mean(axis=0), compute_uv=False)[3:]
     assert error == pytest.approx(np.sum(left**2), rel=0.01)

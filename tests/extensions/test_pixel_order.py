@@ -23,12 +23,12 @@ from minisplat_ref.extensions.pixel_order import clouds
 from minisplat_ref.extensions.pixel_order.method import ORDERED
 from minisplat_ref.extensions.pixel_order.stages import stages
 from minisplat_ref.mechanisms.tangent import planes as planes
-from minisplat_ref.mechanisms.tangent.rays import tangent_hits, yawed
+from minisplat_ref.mechanisms.tangent.rays import tangent_hits, yaw_camera
 from minisplat_ref.mechanisms.tangent.renderer import RESPONSE
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT64
 from minisplat_ref.reference.projection import project as project_ewa
-from minisplat_ref.rendering import SPLATTING, Request, activated
+from minisplat_ref.rendering import SPLATTING, Request, activate
 from minisplat_ref.training.schedule import configured, describe, settings_of
 from minisplat_ref.types import Gaussians, Model, Primitives, view_from
 from scenes import as_dtype, make_camera, make_gaussians
@@ -85,7 +85,7 @@ def test_on_the_axis_it_is_3dgs():
 def test_away_from_the_axis_it_is_ewa_with_a_denominator(rng):
     """EWA's exp(-d^T Q d / 2) becomes exp(-d^T Q d / (2 (1 + h . d)^2)), which is derived independently."""
     gaussians, camera = make_gaussians(rng, 12), make_camera(60, 44, fx=30.0, fy=33.0)
-    primitives = activated(gaussians)
+    primitives = activate(gaussians)
     projection, footprints = project_ewa(*primitives, camera, BARE), planes.project(primitives, camera, BARE)
     ids = np.flatnonzero((projection.radii[:, 0] > 0) & (footprints.radii[:, 0] > 0))
     pixels = rng.uniform((5, 5), (55, 39), (9, 2))
@@ -102,7 +102,7 @@ def test_away_from_the_axis_it_is_ewa_with_a_denominator(rng):
 def test_boxes_hold_what_is_seen_and_little_more(rng):
     camera = make_camera(120, 90, fx=30.0, fy=30.0)  # 127 degrees wide
     primitives = Primitives(
-        *activated(
+        *activate(
             make_gaussians(rng, 60, size=0.3)._replace(means=rng.normal(size=(60, 3)) * [4, 3, 2] + [0, 0, 1.5]), None
         )
     )
@@ -133,7 +133,7 @@ def test_turning_changes_no_colour(rng):
             for ray in ([0.1, -0.05, 1.0], [-0.2, 0.15, 1.0]):
                 colors, alphas = [], []
                 for yaw in np.radians([-35, -10, 0, 20, 40]):
-                    seen = yawed(eye, yaw)
+                    seen = yaw_camera(eye, yaw)
                     d = seen.cam_from_world_R @ ray
                     pixel = seen._replace(
                         width=1, height=1, cx=0.5 - seen.fx * d[0] / d[2], cy=0.5 - seen.fy * d[1] / d[2]
@@ -195,7 +195,7 @@ def test_means2d_move_a_footprint_in_the_image(rng):
 
 def test_the_gradient_of_alpha(rng):
     """It is right with respect to opacities and, in the tangent plane, to conics."""
-    primitives = activated(make_gaussians(rng, 3))
+    primitives = activate(make_gaussians(rng, 3))
     footprints = planes.project(primitives, make_camera(), GSPLAT_MAIN)
     ids, pixels = np.arange(3), rng.uniform((4, 4), (20, 14), (5, 2))
 
@@ -424,7 +424,7 @@ def test_hits_of_a_rotated_camera_are_those_of_the_ray(rng):
     rays = clouds.rays_ahead(3, 10.0)
     first, second = (
         tangent_hits(primitives, camera, rays @ camera.cam_from_world_R.T, GSPLAT_MAIN)
-        for camera in (clouds.wide_camera(), yawed(clouds.wide_camera(), 0.4))
+        for camera in (clouds.wide_camera(), yaw_camera(clouds.wide_camera(), 0.4))
     )
     both, a, b = np.intersect1d(first.ids, second.ids, return_indices=True)
     assert len(both) > 10

@@ -19,10 +19,10 @@ from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.polygons import reference
 from minisplat_ref.extensions.polygons.geometry import Polygons, polygons_of, spans_vjp
-from minisplat_ref.extensions.polygons.method import LOG_THICKNESS, TRACED, pressed_flat, tracer_for
+from minisplat_ref.extensions.polygons.method import LOG_THICKNESS, TRACED, press_flat, tracer_for
 from minisplat_ref.extensions.polygons.stages import stages
 from minisplat_ref.mechanisms.meshes.fans import opacity_radii, rims
-from minisplat_ref.mechanisms.rays.blending import summed
+from minisplat_ref.mechanisms.rays.blending import sum_by_row
 from minisplat_ref.mechanisms.rays.pixel_rays import Rays, pixel_rays
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
@@ -158,7 +158,7 @@ def test_the_gradient_of_a_meeting(rng):
     def vjp(v_unclamped, v_depths):
         parts = reference.meet_vjp(polygons, rays, ray_ids, ids, v_unclamped, v_depths)
         rows = (ids, ids, ids, ray_ids, ray_ids)
-        return tuple(summed(part, row, 3 + (row is ray_ids)) for part, row in zip(parts, rows, strict=True))
+        return tuple(sum_by_row(part, row, 3 + (row is ray_ids)) for part, row in zip(parts, rows, strict=True))
 
     inputs = [polygons.means, polygons.spans, polygons.opacities, rays.origins, rays.directions]
     check_jacobian(forward, vjp, inputs, names=["means", "spans", "opacities", "origins", "directions"])
@@ -306,13 +306,13 @@ def test_hidden_rows_are_not_drawn_and_too_much_is_refused(backend, rng):
 def test_training_starts_flat_and_facing_everywhere(rng):
     g = make_gaussians(rng, 50)
     g.log_scales[:30] = g.log_scales[:30, :1]
-    flat = pressed_flat(g, np.random.default_rng(0))
+    flat = press_flat(g, np.random.default_rng(0))
     assert_allclose(flat.log_scales.min(axis=1), LOG_THICKNESS)
     assert_array_equal(flat.quats[30:], g.quats[30:])
     normals = polygons_of(flat, np.ones(50)).spans[:30]
     normals = np.cross(normals[:, :, 0], normals[:, :, 1])
     assert np.linalg.matrix_rank(normals / np.linalg.norm(normals, axis=1, keepdims=True), tol=1.0) == 3
-    again = pressed_flat(flat, np.random.default_rng(1))
+    again = press_flat(flat, np.random.default_rng(1))
     assert all(a.tobytes() == b.tobytes() for a, b in zip(flat, again, strict=True))
 
 

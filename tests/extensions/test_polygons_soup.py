@@ -9,12 +9,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from minisplat_ref.cli import main
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.polygons import claims
-from minisplat_ref.extensions.polygons.soup import carried, load_corners, save_soup, soup_of
+from minisplat_ref.extensions.polygons.soup import carry_gaussians, load_corners, save_soup, soup_of
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.io.ply_faces import read_faces
 from minisplat_ref.io.ply_file import read_vertices, write_vertices
-from minisplat_ref.mechanisms.editing.deformation import Deformation, deformed
-from minisplat_ref.mechanisms.meshes.fans import flattened
+from minisplat_ref.mechanisms.editing.deformation import Deformation, deform
+from minisplat_ref.mechanisms.meshes.fans import flatten
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from scenes import as_dtype, make_gaussians
@@ -33,7 +33,7 @@ def model(rng, n=30):
 
 
 def planar(gaussians):
-    spans = flattened(gaussians.means, gaussians.quats, gaussians.log_scales).spans
+    spans = flatten(gaussians.means, gaussians.quats, gaussians.log_scales).spans
     return spans @ np.swapaxes(spans, 1, 2)
 
 
@@ -86,7 +86,7 @@ def test_what_was_not_moved_keeps_its_bytes(files, tmp_path, capsys):
 def test_an_affine_edit_is_the_gaussians_transformed(name, n_sides, rng):
     before, A = model(rng), claims.MAPS[name]
     soup = soup_of(before, n_sides)
-    after, n = carried(before, soup, soup.corners @ A.T + SHIFT, "it")
+    after, n = carry_gaussians(before, soup, soup.corners @ A.T + SHIFT, "it")
     assert n == 28
     direct = planar(before)[soup.rows]
     expected = A @ direct @ A.T
@@ -102,8 +102,8 @@ def test_an_affine_edit_is_the_gaussians_transformed(name, n_sides, rng):
 def test_colours_turn_along(rng):
     before = model(rng)
     soup = soup_of(before, 8)
-    after, _ = carried(before, soup, 0.7 * soup.corners @ TURN.T, "it")
-    direct = deformed(before, before.means, Deformation(0.7 * TURN[None], np.zeros(30, int)))
+    after, _ = carry_gaussians(before, soup, 0.7 * soup.corners @ TURN.T, "it")
+    direct = deform(before, before.means, Deformation(0.7 * TURN[None], np.zeros(30, int)))
     assert_allclose(after.sh_rest[soup.rows], direct.sh_rest[soup.rows], atol=AFFINE_EDIT)
     d = rng.normal(size=(5, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
@@ -117,7 +117,7 @@ def test_the_plane_stays_the_plane_when_a_polygon_shrinks(rng):
     before = make_gaussians(rng, 20)
     soup = soup_of(before, 8)
     centres = soup.corners.mean(axis=1, keepdims=True)
-    after, _ = carried(before, soup, centres + 0.01 * (soup.corners - centres), "it")
+    after, _ = carry_gaussians(before, soup, centres + 0.01 * (soup.corners - centres), "it")
     assert_allclose(soup_of(after, 8).corners, centres + 0.01 * (soup.corners - centres), atol=PARITY_FLOAT64)
     assert_allclose(after.log_scales, before.log_scales + np.log(0.01), atol=1e-9)
 
@@ -225,7 +225,7 @@ def test_a_bent_soup_is_drawn_as_it_is(rng):
     gaussians = claims.sheet(6)
     soup = soup_of(gaussians, 8)
     moved = claims.placed(soup.corners)
-    after, _ = carried(gaussians, soup, moved, "it")
+    after, _ = carry_gaussians(gaussians, soup, moved, "it")
     drawn = claims.picture_of_soup(gaussians, soup, moved)
     assert drawn.min() < 0.5
     assert_allclose(claims.picture(after), drawn, atol=EDITED_IMAGE)

@@ -12,7 +12,7 @@ from minisplat_ref.backends import REFERENCE
 from minisplat_ref.cli import main
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import load_extension
-from minisplat_ref.extensions.proxies.affine import Affine, about_point, edited, in_ball, in_box, rotation_about
+from minisplat_ref.extensions.proxies.affine import Affine, about_point, edit_gaussians, in_ball, in_box, rotation_about
 from minisplat_ref.extensions.proxies.binding import UNBOUND, bind, rebuild
 from minisplat_ref.extensions.proxies.cage import convex_hull, grid, sheet_through
 from minisplat_ref.extensions.proxies.nearest import nearest_triangles, triangle_distances
@@ -98,7 +98,7 @@ def test_rotations_of_colours_compose_and_are_orthogonal(rng):
 @pytest.mark.parametrize("name", LINEAR)
 def test_an_affine_edit_is_the_gaussian_transformed(name, rng):
     gaussians, A = make_gaussians(rng, 100), LINEAR[name]
-    after = edited(gaussians, Affine(A, SHIFT), all_of(gaussians))
+    after = edit_gaussians(gaussians, Affine(A, SHIFT), all_of(gaussians))
     assert_allclose(after.means, gaussians.means @ A.T + SHIFT, atol=AFFINE_EDIT)
     expected = A @ sigma(gaussians) @ A.T
     assert np.abs(expected - sigma(gaussians)).max() > 0.01
@@ -110,7 +110,7 @@ def test_thin_gaussians_stay_thin(name, rng):
     """The volume of needles and discs a billion times as long as thick is right in every digit."""
     gaussians, A = make_gaussians(rng, 60), LINEAR[name]
     thin = gaussians._replace(log_scales=np.log(rng.permuted(np.tile([1.0, 1e-4, 1e-9], (60, 1)), axis=1)))
-    after = edited(thin, Affine(A, SHIFT), all_of(thin))
+    after = edit_gaussians(thin, Affine(A, SHIFT), all_of(thin))
     grown = after.log_scales.sum(axis=1) - thin.log_scales.sum(axis=1)
     assert_allclose(grown, np.log(abs(np.linalg.det(A))), atol=AFFINE_EDIT)
 
@@ -119,11 +119,13 @@ def test_thin_gaussians_stay_thin(name, rng):
 def test_nothing_and_what_is_not_selected_keep_their_bytes(dtype, rng):
     gaussians = as_dtype(make_gaussians(rng, 50), dtype)
     everything, some = all_of(gaussians), rng.random(50) < 0.5
-    assert is_same(edited(gaussians, about_point(np.eye(3), rng.normal(size=3), np.zeros(3)), everything), gaussians)
+    assert is_same(
+        edit_gaussians(gaussians, about_point(np.eye(3), rng.normal(size=3), np.zeros(3)), everything), gaussians
+    )
     assert_array_equal(rotation_about((0.0, 0.0, 0.0)), np.eye(3), strict=True)
-    moved = edited(gaussians, Affine(np.eye(3), SHIFT), everything)
+    moved = edit_gaussians(gaussians, Affine(np.eye(3), SHIFT), everything)
     assert is_same(moved[1:], gaussians[1:]) and not (moved.means == gaussians.means).any()
-    part = edited(gaussians, Affine(LINEAR["shear"], SHIFT), some)
+    part = edit_gaussians(gaussians, Affine(LINEAR["shear"], SHIFT), some)
     assert all(field.dtype == dtype for field in part)
     for after, before in zip(part, gaussians, strict=True):
         assert after[~some].tobytes() == before[~some].tobytes()
@@ -133,14 +135,14 @@ def test_nothing_and_what_is_not_selected_keep_their_bytes(dtype, rng):
 def test_float32_is_rounded_once(rng):
     gaussians = as_dtype(make_gaussians(rng, 50), np.float32)
     A = LINEAR["shear"]
-    after = edited(gaussians, Affine(A, SHIFT), all_of(gaussians))
+    after = edit_gaussians(gaussians, Affine(A, SHIFT), all_of(gaussians))
     assert_allclose(sigma(after), A @ sigma(gaussians) @ A.T, atol=PARITY_FLOAT32_PROJECTION)
 
 
 def test_an_edit_and_its_inverse_cancel(rng):
     gaussians, A = make_gaussians(rng, 50), LINEAR["rotation and scale"]
-    there = edited(gaussians, Affine(A, SHIFT), all_of(gaussians))
-    back = edited(there, Affine(np.linalg.inv(A), -np.linalg.solve(A, SHIFT)), all_of(gaussians))
+    there = edit_gaussians(gaussians, Affine(A, SHIFT), all_of(gaussians))
+    back = edit_gaussians(there, Affine(np.linalg.inv(A), -np.linalg.solve(A, SHIFT)), all_of(gaussians))
     assert np.abs(there.sh_rest - gaussians.sh_rest).max() > 0.1
     for name in ("means", "log_scales", "sh_rest"):
         assert_allclose(getattr(back, name), getattr(gaussians, name), atol=AFFINE_EDIT)
@@ -152,7 +154,7 @@ def test_a_rotated_scene_looks_as_from_a_camera_rotated_back(scale, rng):
     """With R_c' = R_c Q^T and t_c' = s t_c - R_c Q^T b, shapes, places, order and colours of every degree agree."""
     gaussians, camera = make_gaussians(rng, 60), make_camera(rng=rng)
     Q = rotation_about((20, -50, 70))
-    turned = edited(gaussians, Affine(scale * Q, SHIFT), all_of(gaussians))
+    turned = edit_gaussians(gaussians, Affine(scale * Q, SHIFT), all_of(gaussians))
     R = camera.cam_from_world_R @ Q.T
     moved = camera._replace(cam_from_world_R=R, cam_from_world_t=scale * camera.cam_from_world_t - R @ SHIFT)
     before, _ = render(gaussians, camera, backend=REFERENCE)
@@ -188,7 +190,7 @@ def test_the_polar_factor_is_the_nearest_rotation(rng):
 def test_maps_without_an_inverse_are_refused(A, rng):
     gaussians = make_gaussians(rng, 3)
     with pytest.raises(InputError, match=r"flat|finite"):
-        edited(gaussians, Affine(A, SHIFT), all_of(gaussians))
+        edit_gaussians(gaussians, Affine(A, SHIFT), all_of(gaussians))
 
 
 def test_the_fixed_point_stays(rng):
@@ -249,7 +251,7 @@ def test_a_mesh_at_rest_keeps_every_byte(rng):
 def test_a_mesh_that_is_rotated_and_scaled_takes_everything_along(name, rng):
     gaussians, mesh, A = make_gaussians(rng, 60), crumpled(rng), LINEAR[name]
     carried = rebuild(Mesh(mesh.vertices @ A.T + SHIFT, mesh.faces), bind(gaussians, mesh))
-    expected = edited(gaussians, Affine(A, SHIFT), all_of(gaussians))
+    expected = edit_gaussians(gaussians, Affine(A, SHIFT), all_of(gaussians))
     assert_allclose(sigma(carried), sigma(expected), atol=AFFINE_EDIT)
     for field, other in zip(carried, expected, strict=True):
         assert_allclose(field, other, atol=AFFINE_EDIT)
@@ -389,7 +391,7 @@ def test_edit_from_the_command_line(model, tmp_path, capsys):
     is_selected = before.means[:, 0] <= 0
     assert f"{is_selected.sum()} of 60 Gaussians edited" in capsys.readouterr().out
     affine = about_point(2 * rotation_about((0, 30, 0)), np.array([0.0, 0, 3]), np.array([-1.0, 0, 0]))
-    assert is_same(load_ply(out), edited(before, affine, is_selected))
+    assert is_same(load_ply(out), edit_gaussians(before, affine, is_selected))
     assert run("edit", model, out, "--sphere", 0, 0, 3, 0.7, "--matrix", 1, 0.5, 0, 0, 1, 0, 0, 0, 1) == 0
     assert run("edit", model, out, "--scale", 1, 2, 3) == 0
     assert_allclose(load_ply(out).means.mean(axis=0), before.means.mean(axis=0), atol=PARITY_FLOAT32_PROJECTION)

@@ -19,12 +19,12 @@ from minisplat_ref.extensions.proxies.mass_spring import (
     State,
     energies,
     forces,
-    integrated,
+    integrate,
     longest_step,
 )
 from minisplat_ref.extensions.proxies.springs import (
     Stiffness,
-    spring_ends,
+    find_springs,
     springs_between,
     springs_of,
     stiffness_for_stretch,
@@ -65,23 +65,23 @@ def hanging_chain(n, k, drag):
 
 def test_the_springs_of_two_triangles_and_of_a_strip():
     """One cell has four sides, a diagonal, and the other diagonal; two cells also bend across their common edge."""
-    edges, shear, bend = spring_ends(grid(np.zeros(3), np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), (1, 1)))
+    edges, shear, bend = find_springs(grid(np.zeros(3), np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), (1, 1)))
     assert edges.tolist() == [[0, 1], [0, 2], [0, 3], [1, 3], [2, 3]]
     assert [sorted(pair) for pair in shear.tolist()] == [[1, 2]] and len(bend) == 0
-    edges, shear, bend = spring_ends(grid(np.zeros(3), np.array([2.0, 0, 0]), np.array([0, 1.0, 0]), (2, 1)))
+    edges, shear, bend = find_springs(grid(np.zeros(3), np.array([2.0, 0, 0]), np.array([0, 1.0, 0]), (2, 1)))
     assert len(edges) == 9 and sorted(sorted(pair) for pair in shear.tolist()) == [[1, 3], [2, 4]]
     assert [sorted(pair) for pair in bend.tolist()] == [[0, 5]]
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])
 def test_the_numbers_of_springs_of_a_grid(n):
-    edges, shear, bend = spring_ends(flat_sheet(n))
+    edges, shear, bend = find_springs(flat_sheet(n))
     assert len(edges) == 2 * n * (n + 1) + n * n and len(shear) == n * n and len(bend) == 2 * n * (n - 1)
 
 
 def test_an_edge_that_is_the_longest_of_one_triangle_only_is_bent():
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0.5, 0.3, 0], [0.5, -5, 0]])
-    _, shear, bend = spring_ends(Mesh(vertices, np.array([[0, 1, 2], [1, 0, 3]])))
+    _, shear, bend = find_springs(Mesh(vertices, np.array([[0, 1, 2], [1, 0, 3]])))
     assert len(shear) == 0 and sorted(bend[0].tolist()) == [2, 3]
 
 
@@ -89,7 +89,7 @@ def test_faces_that_share_an_edge_three_times_are_no_trouble():
     mesh = Mesh(
         np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -1, 0]]), np.array([[0, 1, i] for i in (2, 3, 4)])
     )
-    edges, shear, bend = spring_ends(mesh)
+    edges, shear, bend = find_springs(mesh)
     assert len(edges) == 7 and len(shear) + len(bend) == 1
 
 
@@ -143,7 +143,7 @@ def test_free_fall_is_exact_and_carries_the_gaussians(rng):
     mesh = flat_sheet()
     sheet = sheet_of(mesh, Setting(G, np.zeros(len(mesh.vertices), bool), 0.01, 0.0, None))
     v = np.array([0.2, -1.0, 0.4])
-    state = integrated(State(mesh.vertices, np.broadcast_to(v, mesh.vertices.shape)), sheet, 0.5 / 400, 400)
+    state = integrate(State(mesh.vertices, np.broadcast_to(v, mesh.vertices.shape)), sheet, 0.5 / 400, 400)
     way = 0.5 * v + 0.125 * G
     assert 0.5 / 400 < longest_step(sheet)
     assert_allclose(state.positions, mesh.vertices + way, atol=CLOSED_FORM)
@@ -157,7 +157,7 @@ def test_drag_alone_slows_down_exactly():
     sheet = hanging_chain(3, 1.0, 1.3)[1]._replace(gravity=np.zeros(3), is_pinned=np.zeros(4, bool))
     v = np.array([1.0, 2.0, 3.0])
     x = hanging_chain(3, 1.0, 1.3)[0]
-    state = integrated(State(x, np.broadcast_to(v, x.shape)), sheet, 0.01, 50)
+    state = integrate(State(x, np.broadcast_to(v, x.shape)), sheet, 0.01, 50)
     assert_allclose(state.velocities, np.broadcast_to(v * np.exp(-1.3 * 0.5), x.shape), rtol=CLOSED_FORM)
     lost = (1 - np.exp(-1.3)) * sheet.masses.sum() * v @ v / 2
     assert_allclose(state.dissipated, lost, rtol=CLOSED_FORM)
@@ -168,7 +168,7 @@ def test_one_mass_on_a_spring_swings_at_its_frequency():
     k, h, n = 7.0, 0.05, 123
     vertices, sheet = hanging_chain(1, k, 0.0)
     sheet = sheet._replace(masses=np.ones(2), gravity=np.zeros(3))
-    state = integrated(State(vertices + np.diag([0, 0.1, 0])[:2], np.zeros((2, 3))), sheet, h, n)
+    state = integrate(State(vertices + np.diag([0, 0.1, 0])[:2], np.zeros((2, 3))), sheet, h, n)
     w = 2 / h * np.arcsin(np.sqrt(k) * h / 2)
     assert_allclose(state.positions[1, 1] - 1, 0.1 * np.cos(w * h * n), atol=1e-12)
 
@@ -177,7 +177,7 @@ def test_a_chain_comes_to_rest_where_it_should():
     """Spring j of n carries the n - j masses below it, each of weight 1: it is longer by (n - j) / k."""
     n, k = 6, 40.0
     vertices, sheet = hanging_chain(n, k, 3.0)
-    state = integrated(State(vertices, np.zeros_like(vertices)), sheet, 0.5 * longest_step(sheet), 4000)
+    state = integrate(State(vertices, np.zeros_like(vertices)), sheet, 0.5 * longest_step(sheet), 4000)
     expected = np.concatenate([[0], np.cumsum(1 + (n - np.arange(n)) / k)])
     assert_allclose(state.positions[:, 1], expected, atol=SETTLED)
     assert not state.positions[0].any() and not state.velocities[0].any()
@@ -186,7 +186,7 @@ def test_a_chain_comes_to_rest_where_it_should():
 def test_a_sheet_lies_on_the_floor():
     mesh = grid(np.zeros(3), np.array([0, 0, 1.0]), np.array([1.0, 0, 0]), (3, 3))
     sheet = sheet_of(mesh, Setting(G, np.zeros(16, bool), 0.01, 1.0, 0.2))
-    state = integrated(State(mesh.vertices, np.zeros((16, 3))), sheet, 0.5 * longest_step(sheet), 4000)
+    state = integrate(State(mesh.vertices, np.zeros((16, 3))), sheet, 0.5 * longest_step(sheet), 4000)
     sunk = state.positions[:, 1] - 0.2
     assert_allclose(np.sum(sunk * sheet.floor.stiffness), sheet.masses.sum() * 9.81, rtol=1e-3)
     assert (sunk > 0).all() and sunk.max() < 0.05
@@ -213,9 +213,9 @@ def test_the_energy_balance_closes_with_the_square_of_the_step(name):
 def test_without_drag_nothing_is_dissipated_and_with_it_everything_is(rng):
     vertices, sheet = hanging_chain(3, 40.0, 0.0)
     state = State(vertices, np.zeros_like(vertices))
-    assert integrated(state, sheet, 0.01, 500).dissipated == 0
+    assert integrate(state, sheet, 0.01, 500).dissipated == 0
     damped = sheet._replace(drag=2.0)
-    end = integrated(state, damped, 0.005, 8000)
+    end = integrate(state, damped, 0.005, 8000)
     rest = energies(end, damped)
     assert rest.kinetic < 1e-12 and rest.dissipated > 0.1
     # A load that is let go stores half of what it gives: the other half is dissipated.
@@ -228,7 +228,7 @@ def test_the_longest_step_is_that_of_stability(rng):
     sheet = sheet_of(mesh, Setting(G, mesh.vertices[:, 1] < -0.9, 0.05, 0.0, None))
     start = State(mesh.vertices + 1e-3 * rng.normal(size=mesh.vertices.shape), np.zeros_like(mesh.vertices))
     with np.errstate(all="ignore"):
-        sizes = [np.abs(integrated(start, sheet, f * longest_step(sheet), 300).velocities).max() for f in (0.99, 2.0)]
+        sizes = [np.abs(integrate(start, sheet, f * longest_step(sheet), 300).velocities).max() for f in (0.99, 2.0)]
     assert sizes[0] < 20 and not sizes[1] < 1e3
     assert longest_step(sheet._replace(is_pinned=np.ones(16, bool))) == np.inf
 
@@ -252,7 +252,7 @@ def test_a_sheet_stretches_as_much_as_was_asked(rng):
     masses = vertex_masses(mesh, 1.0)
     stiffness = stiffness_for_stretch(mesh, float(masses.sum()) * 9.81, 0.02)
     sheet = Sheet(masses, springs_of(mesh, stiffness), mesh.vertices[:, 1] < 1e-9, G, 10.0)
-    end = integrated(State(mesh.vertices, np.zeros_like(mesh.vertices)), sheet, 0.5 * longest_step(sheet), 3000)
+    end = integrate(State(mesh.vertices, np.zeros_like(mesh.vertices)), sheet, 0.5 * longest_step(sheet), 3000)
     assert 0.005 < end.positions[:, 1].max() - 1 < 0.04  # "about": diagonals help, corners pull
     assert isinstance(stiffness, Stiffness) and stiffness.bend < stiffness.shear
     assert len(springs_of(mesh, stiffness._replace(bend=0.0)).stiffness) < len(sheet.springs.stiffness)
@@ -333,7 +333,7 @@ def test_bad_input_of_fall_is_one_line_and_writes_nothing(model, tmp_path, capsy
 
 @pytest.mark.parametrize("positions", [np.zeros((16, 3)), np.full((16, 3), np.nan)])
 def test_a_sheet_that_collapses_or_explodes_leaves_nothing(positions, model, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(fall_command, "integrated", lambda *_: State(positions, np.zeros((16, 3))))
+    monkeypatch.setattr(fall_command, "integrate", lambda *_: State(positions, np.zeros((16, 3))))
     assert fall(model, "--out", tmp_path / "out") == 2
     error = capsys.readouterr().err
     assert "frame 1, folded flat" in error and error.count("\n") == 1

@@ -21,10 +21,10 @@ from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.rays import claims, reference
 from minisplat_ref.extensions.rays.geometry import Whitened, whiten, whiten_vjp
-from minisplat_ref.extensions.rays.method import TRACED, tracer_for, whitened_model
+from minisplat_ref.extensions.rays.method import TRACED, tracer_for, whiten_model
 from minisplat_ref.extensions.rays.stages import stages
 from minisplat_ref.mechanisms.rays import bvh as bvh
-from minisplat_ref.mechanisms.rays.blending import summed
+from minisplat_ref.mechanisms.rays.blending import sum_by_row
 from minisplat_ref.mechanisms.rays.pixel_rays import Rays, pixel_rays, pixel_rays_vjp
 from minisplat_ref.mechanisms.rays.traversal import limits_of
 from minisplat_ref.oracle.models import check_model_gradients
@@ -61,7 +61,7 @@ def hits_of(gaussians, rays, backend=CPU, conventions=GSPLAT_MAIN):
 
 
 def random_whitened(rng, n, size=0.15):
-    return whitened_model(Model(make_gaussians(rng, n, size=size)))
+    return whiten_model(Model(make_gaussians(rng, n, size=size)))
 
 
 # --- one ray and one Gaussian ---
@@ -97,20 +97,20 @@ def test_the_gradient_of_pairs(rng):
 
     def forward(means, maps, opacities, origins, directions):
         moved = rays._replace(origins=origins, directions=directions)
-        pairs = reference.evaluate_pairs(Whitened(means, maps, opacities), moved, rays_ids, ids)
+        pairs = reference.intersect(Whitened(means, maps, opacities), moved, rays_ids, ids)
         return pairs.unclamped, pairs.depths
 
     def vjp(v_unclamped, v_depths):
-        parts = reference.evaluate_pairs_vjp(gaussians, rays, rays_ids, ids, v_unclamped, v_depths)
+        parts = reference.intersect_vjp(gaussians, rays, rays_ids, ids, v_unclamped, v_depths)
         rows = (ids, ids, ids, rays_ids, rays_ids)
-        return tuple(summed(part, row, 3 + (row is rays_ids)) for part, row in zip(parts, rows, strict=True))
+        return tuple(sum_by_row(part, row, 3 + (row is rays_ids)) for part, row in zip(parts, rows, strict=True))
 
     check_jacobian(forward, vjp, inputs, names=["means", "maps", "opacities", "origins", "directions"])
 
 
 def test_the_gradient_of_maps_and_of_pixels(rng):
     g, camera = make_gaussians(rng, 2), make_camera(4, 3, rng=rng)
-    gaussians = whitened_model(Model(g))
+    gaussians = whiten_model(Model(g))
     check_jacobian(
         lambda quats, log_scales: (whiten(g.means, quats, log_scales, gaussians.opacities).maps,),
         lambda v: whiten_vjp(g.quats, g.log_scales, gaussians, v),
@@ -228,13 +228,13 @@ def test_the_gradient_of_the_whole_model(backend):
 
 
 def test_a_wrong_gradient_is_found(monkeypatch):
-    correct = reference.evaluate_pairs_vjp
+    correct = reference.intersect_vjp
 
     def wrong(*args):
         v = correct(*args)
         return v._replace(means=1.001 * v.means)
 
-    monkeypatch.setattr(reference, "evaluate_pairs_vjp", wrong)
+    monkeypatch.setattr(reference, "intersect_vjp", wrong)
     report = check_model_gradients(REFERENCE, GSPLAT_MAIN, TRACED, stages)
     assert report.n_failed == 2 and "is wrong" in report.cases[0].note
 

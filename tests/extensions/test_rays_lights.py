@@ -11,19 +11,19 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.rays import claims, demo, surroundings
 from minisplat_ref.extensions.rays.lights import shade, visibility
-from minisplat_ref.extensions.rays.method import TRACED, whitened_model
-from minisplat_ref.extensions.rays.reference import evaluate_pairs
+from minisplat_ref.extensions.rays.method import TRACED, whiten_model
+from minisplat_ref.extensions.rays.reference import intersect
 from minisplat_ref.extensions.rays.surfaces import (
     DIFFUSE,
     GLASS,
     MIRROR,
-    continued,
+    continue_rays,
     nearest_triangles,
     normals_of,
-    reflected,
-    refracted,
+    reflect,
+    refract,
 )
-from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenated_surfaces, parallelogram, surfaces_of
+from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenate_surfaces, parallelogram, surfaces_of
 from minisplat_ref.io.ply import save_ply
 from minisplat_ref.mechanisms.meshes.mesh import Mesh, save_mesh
 from minisplat_ref.mechanisms.rays.pixel_rays import Rays, pixel_rays
@@ -45,7 +45,7 @@ def box(low, high):
 
 
 def around(*surfaces, lights=NO_LIGHTS, ambient=0.0):
-    return Surroundings(np.asarray(lights, float), ambient, 0.0, concatenated_surfaces(list(surfaces)))
+    return Surroundings(np.asarray(lights, float), ambient, 0.0, concatenate_surfaces(list(surfaces)))
 
 
 def rays_of(origins, directions):
@@ -87,7 +87,7 @@ def test_the_normals_of_a_box_point_outwards():
 
 def test_a_mirrored_ray_seems_to_come_from_the_mirrored_eye():
     rays, n = rays_of([[1, 2, 0]], [[0.3, -0.2, 1]]), np.array([[0.0, 0.0, -1.0]])
-    back = continued(rays, np.array([5.0]), reflected(rays.directions, n))
+    back = continue_rays(rays, np.array([5.0]), reflect(rays.directions, n))
     assert_allclose(back.origins, [[1, 2, 10]], rtol=CLOSED_FORM)
     assert_allclose(back.directions, [[0.3, -0.2, -1]])
 
@@ -96,7 +96,7 @@ def test_snell_schlick_and_total_reflection():
     angles = np.radians([0, 30, 60, 30, 60])
     entering = np.array([1, 1, 1, -1, -1])  # against the normal or along it
     d = 2.0 * np.column_stack([np.sin(angles), np.zeros(5), -entering * np.cos(angles)])
-    bent, shares, is_total = refracted(d, np.tile([0.0, 0, 1], (5, 1)), np.full(5, 1.5))
+    bent, shares, is_total = refract(d, np.tile([0.0, 0, 1], (5, 1)), np.full(5, 1.5))
     assert_array_equal(is_total, [False, False, False, False, True])  # beyond asin(1 / 1.5) = 41.8 degrees
     assert_allclose(np.linalg.norm(bent, axis=1), 2, rtol=CLOSED_FORM)
     assert_allclose(bent[:4, 0] / 2, np.sin(angles[:4]) * [1 / 1.5, 1 / 1.5, 1 / 1.5, 1.5], rtol=CLOSED_FORM)
@@ -114,8 +114,8 @@ def test_a_pane_shifts_what_is_behind_it():
     rays = rays_of([[0, 0, 0]], d)
     for _ in range(2):
         depths, faces = nearest_triangles(pane.corners, rays._replace(near=rays.near * (1 + 1e-7)))
-        bent, _, _ = refracted(rays.directions, pane.normals[faces], pane.indices[faces])
-        rays = continued(rays, depths, bent)
+        bent, _, _ = refract(rays.directions, pane.normals[faces], pane.indices[faces])
+        rays = continue_rays(rays, depths, bent)
     assert_allclose(rays.directions, d, atol=CLOSED_FORM)
     beside = np.linalg.norm(np.cross(rays.origins + depths * rays.directions, d))
     assert beside == pytest.approx(h * np.sin(a - b) / np.cos(b), rel=1e-9)
@@ -191,7 +191,7 @@ def test_a_lamp_in_front_of_a_gaussian_is_not_dimmed_by_it(rng):
 @pytest.fixture
 def ply(tmp_path):
     path = tmp_path / "ball.ply"
-    save_ply(path, demo.concatenated(demo.ball(60), demo.floor(8)))
+    save_ply(path, demo.concatenate_populations(demo.ball(60), demo.floor(8)))
     return path
 
 
@@ -243,7 +243,7 @@ def test_bad_scenes_are_refused_in_one_line(content, message, ply, tmp_path, cap
 def test_a_light_in_a_faint_gaussian_is_taken():
     one = demo.discs(np.array([[0.0, 0, 2]]), np.array([[0.0, 0, 1]]), 0.5, np.full((1, 3), 0.5))
     for logit, is_refused in ((4.0, True), (-1.0, False)):
-        gaussians = whitened_model(Model(one._replace(opacity_logits=np.array([logit]))))
+        gaussians = whiten_model(Model(one._replace(opacity_logits=np.array([logit]))))
         lit = around(lights=[[0.0, 0, 2]])
         if is_refused:
             with pytest.raises(InputError, match="lies inside Gaussian 0"):
@@ -273,7 +273,7 @@ def test_mitsuba_meets_the_same_ellipsoids():
     mitsuba = pytest.importorskip("mitsuba", reason="needs mitsuba: pip install 'minisplat_ref[rays]'")
     mitsuba.set_variant("scalar_rgb")
     g = claims.random_gaussians(30, np.random.default_rng(4), size=0.05)
-    gaussians, rays = whitened_model(Model(g)), pixel_rays(demo.camera_of(12, 9), GSPLAT_MAIN)
+    gaussians, rays = whiten_model(Model(g)), pixel_rays(demo.camera_of(12, 9), GSPLAT_MAIN)
     unit = g.quats / np.linalg.norm(g.quats, axis=1, keepdims=True)
     tensors = {"centers": g.means, "scales": np.exp(g.log_scales), "quaternions": np.roll(unit, -1, axis=1)}
     shape = {name: mitsuba.TensorXf(array.astype(np.float32)) for name, array in tensors.items()}
@@ -281,7 +281,7 @@ def test_mitsuba_meets_the_same_ellipsoids():
         {"type": "scene", "all": {"type": "ellipsoids", "extent": 3.0, "extent_adaptive_clamping": False, **shape}}
     )
     n, n_rays = len(g.means), len(rays.near)
-    pairs = evaluate_pairs(gaussians, rays, np.repeat(np.arange(n_rays), n), np.tile(np.arange(n), n_rays))
+    pairs = intersect(gaussians, rays, np.repeat(np.arange(n_rays), n), np.tile(np.arange(n), n_rays))
     q = np.sum(pairs.e**2, axis=1)
     entries = (pairs.depths - np.sqrt(np.maximum(9 - q, 0) / np.sum(pairs.v**2, axis=1))).reshape(-1, n)
     is_met, is_clear = (q < 9).reshape(-1, n), (np.abs(q - 9) > 0.5).reshape(-1, n)

@@ -81,7 +81,7 @@ def test_the_fovea_is_drawn_in_full_and_the_rest_is_near(rng):
 def test_what_is_smooth_is_interpolated_exactly():
     """A plane of light: bilinear between the middles of blocks, wherever four of them lie around."""
     coarse = np.add.outer(np.arange(5.0), 2 * np.arange(7.0))[:, :, None] * np.ones(3)
-    fine = foveation._interpolated(coarse, 2, (10, 14))
+    fine = foveation._interpolate(coarse, 2, (10, 14))
     ys, xs = (np.arange(10) + 0.5) / 2 - 0.5, (np.arange(14) + 0.5) / 2 - 0.5
     assert_allclose(fine[1:-1, 1:-1, 0], np.add.outer(ys, 2 * xs)[1:-1, 1:-1], rtol=CLOSED_FORM)
 

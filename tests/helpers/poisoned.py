@@ -16,7 +16,7 @@ from minisplat_ref.backends import CPU, CPU_EXACT, PLAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.jit.compile import kernel
 from minisplat_ref.oracle.hard_cases import HARD_CASES
-from minisplat_ref.oracle.hard_cases.subjects import drawing
+from minisplat_ref.oracle.hard_cases.subjects import render_subject
 
 ENVIRONMENT = {"GLIBC_TUNABLES": "glibc.malloc.tcache_count=0"}
 M_PERTURB = -6  # of mallopt: fill with the other byte, b ^ 0xff
@@ -61,7 +61,7 @@ def poison(pattern):
 
 def results(case, backend, dtype):
     """Outputs and gradients of a case as bytes, by name."""
-    drawn = drawing(case.build(), backend, np.dtype(dtype))
+    drawn = render_subject(case.build(), backend, np.dtype(dtype))
     rng = np.random.default_rng(0)
     v = {name: rng.normal(size=drawn.outputs[name].shape).astype(dtype) for name in drawn.differentiable}
     named = {**drawn.outputs, **{f"v_{name}": value for name, value in drawn.vjp(v).items()}}

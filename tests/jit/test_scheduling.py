@@ -5,12 +5,12 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from minisplat_ref.jit.compile import kernel, n_threads, prange
-from minisplat_ref.jit.scheduling import dynamic_range, fetch_and_increment, shared_counter
+from minisplat_ref.jit.scheduling import dynamic_range, fetch_and_increment, make_shared_counter
 
 
 @kernel()
 def count_parts(n, counts):
-    taken = shared_counter()
+    taken = make_shared_counter()
     for _ in prange(n):
         for part in dynamic_range(taken, counts.size):
             counts[part] += 1
@@ -24,7 +24,7 @@ def test_every_part_is_taken_once(n_parts):
 
 
 def test_python_takes_the_same_parts():
-    taken = shared_counter()
+    taken = make_shared_counter()
     assert fetch_and_increment(taken) == 0
     assert list(dynamic_range(taken, 4)) == [1, 2, 3]
     assert list(dynamic_range(taken, 4)) == []

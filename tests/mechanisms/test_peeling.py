@@ -54,7 +54,7 @@ def as_float32(mesh):
 
 
 def both(mesh, frame, rng):
-    """Picture and gradient by the kernels and by the reference."""
+    """Pixels and gradient by the kernels and by the reference."""
     height, width = frame.camera.height, frame.camera.width
     v_image, v_alpha = rng.normal(size=(height, width, 3)), rng.normal(size=(height, width))
     results = []

@@ -187,14 +187,14 @@ def test_a_wrong_gradient_of_the_expected_depth_is_found(monkeypatch, rng):
 
 
 def test_harmonics_missing_from_the_view_matrix_are_found(monkeypatch, rng):
-    right = gsplat_compat.draw_vjp
+    right = gsplat_compat.render_one_vjp
 
     def wrong(batch, c, tape, v_image, v_alpha):
         p = splat_vjp(tape, v_image, v_alpha).primitives
         v_viewmat = np.vstack([np.column_stack([p.cam_from_world_R, p.cam_from_world_t]), np.zeros(4)])
         return right(batch, c, tape, v_image, v_alpha)._replace(viewmat=v_viewmat)
 
-    monkeypatch.setattr(gsplat_compat, "draw_vjp", wrong)
+    monkeypatch.setattr(gsplat_compat, "render_one_vjp", wrong)
     assert public_case(Call("RGB", n_channels=5), rng).passed
     assert public_case(Call("RGB"), rng).note == "gradient with respect to viewmats is wrong"
 

@@ -11,7 +11,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.oracle import hard_cases
 from minisplat_ref.oracle.hard_cases import GROUPS, HARD_CASES, subjects
 from minisplat_ref.oracle.hard_cases.run import PRECISIONS, Precision, by_group, matching, run_hard_case, run_hard_cases
-from minisplat_ref.oracle.hard_cases.subjects import Call, Parameters, drawing
+from minisplat_ref.oracle.hard_cases.subjects import Call, Parameters, render_subject
 from minisplat_ref.oracle.tolerances import ORDINARY
 from minisplat_ref.rendering import render_vjp
 
@@ -172,7 +172,7 @@ def test_tolerances_are_what_decides():
 
 @pytest.mark.parametrize("backend", BACKENDS.values(), ids=BACKENDS.keys())
 def test_drawing_is_in_the_dtype_asked_for(backend):
-    drawn = drawing(BY_NAME["needle-end-on"].build(), backend, np.dtype(np.float32))
+    drawn = render_subject(BY_NAME["needle-end-on"].build(), backend, np.dtype(np.float32))
     assert {output.dtype for output in drawn.outputs.values()} == {np.dtype(np.float32)}
 
 
@@ -253,7 +253,7 @@ def test_extreme_numbers_stay_finite(dtype, rng):
             "profile": tuple(PROFILES)[turn // 4 % 4],
         }
         subject = Call(arrays, 16, 12, options)
-        drawn = drawing(subject, CPU, np.dtype(dtype))
+        drawn = render_subject(subject, CPU, np.dtype(dtype))
         v = {name: rng.normal(size=drawn.outputs[name].shape).astype(dtype) for name in drawn.differentiable}
         for name, values in {**drawn.outputs, **drawn.vjp(v)}.items():
             assert np.isfinite(values).all(), (turn, name)

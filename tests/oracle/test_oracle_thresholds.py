@@ -5,7 +5,7 @@ import pytest
 
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
-from minisplat_ref.oracle.hard_cases.scenes import camera, gaussians, turn
+from minisplat_ref.oracle.hard_cases.scenes import camera, gaussians, rotation_quat
 from minisplat_ref.oracle.hard_cases.subjects import cast
 from minisplat_ref.oracle.thresholds import thresholds, thresholds_of_view
 from minisplat_ref.oracle.tolerances import FLOAT32_RENDERER, IMAGE, OWN_KERNELS
@@ -116,7 +116,7 @@ def test_a_tie_at_the_stop_moves_all_that_is_left():
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_a_wall_before_a_turned_camera_is_explained(dtype):
     """Its depths differ by less than float32 can tell: order by float32 depths is that of the rows."""
-    rng, R = np.random.default_rng(0), rotation_matrices(turn(0.7, (1, 2, 3))[None])[0]
+    rng, R = np.random.default_rng(0), rotation_matrices(rotation_quat(0.7, (1, 2, 3))[None])[0]
     on_wall = np.column_stack([rng.uniform((-1.6, -1.2), (1.6, 1.2), size=(100, 2)), np.full(100, 4.0)])
     wall = gaussians(on_wall @ R, 0.05, logits=rng.normal(1, 1, 100))
     view = camera(80, 58, fx=100.0, fy=100.0, cam_from_world_R=R)

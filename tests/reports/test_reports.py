@@ -10,8 +10,8 @@ from browser import check_page
 from minisplat_ref.cli import main
 from minisplat_ref.oracle.cases import Case, Report
 from minisplat_ref.reports import commands
-from minisplat_ref.reports.page import captioned, cards, listing, page, panel, section, slider, table
-from minisplat_ref.reports.pictures import fitting, side_by_side, split
+from minisplat_ref.reports.images import fit_image, side_by_side, split_images
+from minisplat_ref.reports.page import add_caption, cards, make_list, page, panel, section, slider, table
 from minisplat_ref.runs.decisions_report import decisions_section, story
 from minisplat_ref.runs.report_parts import training_curves, view_panel
 from minisplat_ref.training.pace import Decision, Measurement, Pace
@@ -31,12 +31,12 @@ def specimen(tmp_path_factory):
         cards([(LONG[:40], LONG), ("1", "figure")]),
         section("Pictures", view_panel(LONG, picture(200), picture(100), picture(0))),
         panel("two renders", [slider(picture(200), {"one": picture(100), "two": picture(50)})], 1),
-        captioned(picture(9, 600, 600), "large"),
+        add_caption(picture(9, 600, 600), "large"),
         section("Curves", *training_curves(log)),
         table([[LONG, LONG], ["b", "2"]]),
         table([[f"row_{k}", *["12.345"] * 20, LONG] for k in range(80)], [f"column {k}" for k in range(22)]),
         table([["stage", "FAILED", "diverges"], ["other", "passed", "agrees"]], ["case", "verdict", "result"]),
-        listing(["one & <two>", LONG]),
+        make_list(["one & <two>", LONG]),
     ]
     path = tmp_path_factory.mktemp("pages") / "specimen.html"
     path.write_text(page("A specimen <of> everything", LONG, parts), encoding="utf-8")
@@ -174,12 +174,16 @@ def test_a_training_that_was_stopped_says_so():
 
 def test_pictures_come_apart_as_they_were_joined(rng):
     parts = [rng.integers(0, 256, (5, 7, 3), dtype=np.uint8) for _ in range(3)]
-    assert all(np.array_equal(a, b) for a, b in zip(split(side_by_side(parts), 3), parts, strict=True))
+    assert all(np.array_equal(a, b) for a, b in zip(split_images(side_by_side(parts), 3), parts, strict=True))
 
 
 def test_large_pictures_are_averaged_down():
-    assert fitting(picture(80, 300, 400), 100).shape == (75, 100, 3) and fitting(picture(80), 100).shape == (30, 40, 3)
-    assert np.all(fitting(picture(80, 300, 400), 100) == 80)
+    assert fit_image(picture(80, 300, 400), 100).shape == (75, 100, 3) and fit_image(picture(80), 100).shape == (
+        30,
+        40,
+        3,
+    )
+    assert np.all(fit_image(picture(80, 300, 400), 100) == 80)
 
 
 def test_paths_in_a_command_are_absolute_and_quoted(monkeypatch, tmp_path):

@@ -6,10 +6,9 @@ import shutil
 
 import numpy as np
 import pytest
-from browser import check_page
 from numpy.testing import assert_array_equal
-from tolerances import CLOSED_FORM
 
+from browser import check_page
 from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
@@ -37,6 +36,7 @@ from minisplat_ref.strategy.importance import collect_importance
 from minisplat_ref.strategy.ops import take
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import held_out_ids
+from tolerances import CLOSED_FORM
 
 SCENE = {"n_views": 12, "width": 32, "height": 24, "n_points": 150, "test_every": 6}
 FILES = {

@@ -5,9 +5,9 @@ from functools import partial
 
 import numpy as np
 import pytest
-from compact import population, refused_line, short_run
 from numpy.testing import assert_array_equal
 
+from compact import population, refused_line, short_run
 from minisplat_ref import load_ply, save_ply
 from minisplat_ref.cli import main
 from minisplat_ref.errors import InputError

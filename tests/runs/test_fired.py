@@ -15,7 +15,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.methods.gaussian_splatting import clone_and_split, collect_gradients, prune_faint, reset_opacity
 from minisplat_ref.runs import events
-from minisplat_ref.runs.events import describe, mechanisms, never_fired, published_times
+from minisplat_ref.runs.events import count_published_times, describe, mechanisms, never_fired
 from minisplat_ref.runs.progress import Progress, read_log
 from minisplat_ref.training.loop import HALF_SIZE
 from minisplat_ref.training.schedule import At, During, Every
@@ -170,6 +170,6 @@ def test_mechanisms_by_hand():
 
 def test_published_times_by_hand():
     """Several events of one action count together, those of every iteration not; half-size views are one mechanism."""
-    assert published_times(RECIPE) == {"clone_and_split": 3, "prune_faint": 3, "noted": 1, "reset_opacity": 0}
+    assert count_published_times(RECIPE) == {"clone_and_split": 3, "prune_faint": 3, "noted": 1, "reset_opacity": 0}
     both = RECIPE._replace(events=(*RECIPE.events, At(2, prune_faint)), half_size_until=3)
-    assert published_times(both) == {HALF_SIZE: 1, **published_times(RECIPE), "prune_faint": 4}
+    assert count_published_times(both) == {HALF_SIZE: 1, **count_published_times(RECIPE), "prune_faint": 4}

@@ -8,13 +8,13 @@ from functools import partial
 
 import numpy as np
 import pytest
-from tiny_training import PLAIN, scene  # noqa: F401  (a fixture)
 
 from minisplat_ref import memory
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods import gaussian_splatting
 from minisplat_ref.training.loop import initial_state, train
 from minisplat_ref.training.schedule import At
+from tiny_training import PLAIN, scene  # noqa: F401  (a fixture)
 
 GIGA = 10**9
 
@@ -78,11 +78,11 @@ def test_rows_that_fit(free, rows):
 
 def test_a_picture_that_does_not_fit_names_the_size_that_does(monkeypatch):
     monkeypatch.setattr(memory, "free_bytes", lambda: 6.5e9)
-    memory.check_picture(10_000, 10_000, with_depth=False)
+    memory.check_render_size(10_000, 10_000, with_depth=False)
     with pytest.raises(InputError, match=r"20000x10000 takes about 13.0 GB, 6.5 GB are free: 14142x7071 fits"):
-        memory.check_picture(20_000, 10_000, with_depth=False)
+        memory.check_render_size(20_000, 10_000, with_depth=False)
     with pytest.raises(InputError, match="9705x9705 fits"):
-        memory.check_picture(10_000, 10_000, with_depth=True)
+        memory.check_render_size(10_000, 10_000, with_depth=True)
 
 
 def test_photographs_keep_half_of_the_free_memory(monkeypatch):
@@ -127,7 +127,7 @@ def double(recipe, step):
     return recipe._replace(iterations=20, events=(collect, At(step, clone)))
 
 
-def test_training_is_stopped_before_there_are_more_gaussians_than_fit(scene, monkeypatch):  # noqa: F811
+def test_training_is_stopped_before_there_are_more_gaussians_than_fit(scene, monkeypatch):
     recipe = double(PLAIN, 10)
     state = initial_state(scene, recipe, 0)
     n, row_bytes = len(state.gaussians.means), sum(field[:1].nbytes for field in state.gaussians)
@@ -139,13 +139,13 @@ def test_training_is_stopped_before_there_are_more_gaussians_than_fit(scene, mon
     assert len(state.gaussians.means) == n and np.isfinite(state.gaussians.means).all()
 
 
-def test_training_goes_on_where_they_fit(scene, monkeypatch):  # noqa: F811
+def test_training_goes_on_where_they_fit(scene, monkeypatch):
     monkeypatch.setattr(memory, "free_bytes", lambda: 1e9)
     state = train(scene, double(PLAIN, 10), seed=0)
     assert len(state.gaussians.means) == 2 * 30
 
 
-def test_fewer_gaussians_are_never_refused(scene, monkeypatch):  # noqa: F811
+def test_fewer_gaussians_are_never_refused(scene, monkeypatch):
     monkeypatch.setattr(memory, "free_bytes", lambda: 0.0)
     prune = partial(gaussian_splatting.prune_faint, min_opacity=0.09)
     recipe = PLAIN._replace(iterations=5, events=(At(3, prune),))

@@ -12,7 +12,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from run_commands import ITERATIONS, OPTIONS, RECIPE, SCENE, contents, interrupt_at, photograph, read_json, refused  # noqa: F401  (a fixture)
 
 from minisplat_ref import load_ply, memory
 from minisplat_ref.backends import CPU
@@ -25,9 +24,10 @@ from minisplat_ref.io.checkpoint import load_checkpoint, save_checkpoint
 from minisplat_ref.io.viewpoints import scene_viewpoints, to_json
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.runs import checkpoints, fingerprint, run, run_folder
-from minisplat_ref.runs.progress import Progress, read_log
+from minisplat_ref.runs.progress import read_log
 from minisplat_ref.training import interruption
 from minisplat_ref.training.schedule import action_name
+from run_commands import ITERATIONS, OPTIONS, RECIPE, SCENE, contents, interrupt_at, photograph, read_json, refused  # noqa: F401  (a fixture)
 
 
 @pytest.fixture(scope="module")
@@ -373,7 +373,7 @@ def test_convert_of_a_finished_run_and_of_what_is_none(finished, tmp_path, refus
 def test_two_trainings_do_not_write_into_one_folder(original, tmp_path, refused):
     folder = stopped_run(original, tmp_path / "run")
     before = contents(folder)
-    with run_folder.held(folder):
+    with run_folder.hold_folder(folder):
         for command in (["train", "--resume", folder], ["eval", folder]):
             assert f"another process is writing into {folder}" in refused(*command)
     assert contents(folder) == before

@@ -6,8 +6,6 @@ import signal
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from photo_scenes import write_colmap
-from tolerances import ROUNDED_TO_FLOAT32
 
 import minisplat_ref as ms
 from minisplat_ref.cli import main
@@ -22,6 +20,8 @@ from minisplat_ref.methods import RECIPES
 from minisplat_ref.runs.progress import Progress
 from minisplat_ref.runs.start import load_start
 from minisplat_ref.training.loop import initial_state
+from photo_scenes import write_colmap
+from tolerances import ROUNDED_TO_FLOAT32
 
 SCENE = {"n_views": 8, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
 SQUARE = np.array([[1.0, 0, 5], [2, 0, 5], [1, 1, 5], [2, 1, 5]])  # before the cameras of write_colmap

@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.strategy.clone_split import (
-    capped_opacity_logits,
+    cap_opacity_logits,
     clone_and_split,
     logit,
     prune_faint,
@@ -86,7 +86,7 @@ def test_prune_large(gaussians):
 
 def test_opacity_reset_only_lowers():
     opacities = np.array([0.9, 0.01, 0.003])
-    logits = capped_opacity_logits(np.log(opacities / (1 - opacities)), ceiling=0.01)
+    logits = cap_opacity_logits(np.log(opacities / (1 - opacities)), ceiling=0.01)
     assert_allclose(1 / (1 + np.exp(-logits)), [0.01, 0.01, 0.003], rtol=CLOSED_FORM)
 
 

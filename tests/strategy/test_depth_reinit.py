@@ -13,11 +13,11 @@ from minisplat_ref.methods import get_recipe
 from minisplat_ref.reference.pinhole import pinhole
 from minisplat_ref.strategy.depth_reinit import (
     PixelPoints,
-    blended_points,
+    blend_points,
     centre_points,
     midpoint_points,
     reinitial_points,
-    unprojected,
+    unproject,
 )
 from minisplat_ref.strategy.initialization import initial_gaussians
 from minisplat_ref.strategy.ops import concat
@@ -26,7 +26,7 @@ from minisplat_ref.types import Gaussians, View, view_from
 from scenes import as_dtype, make_camera, make_gaussians
 from tolerances import CLOSED_FORM, PARITY_FLOAT64, SAMPLED_SHARE
 
-ALL_KINDS = pytest.mark.parametrize("points_of", [midpoint_points, centre_points, blended_points])
+ALL_KINDS = pytest.mark.parametrize("points_of", [midpoint_points, centre_points, blend_points])
 DEPTH_TOLERANCE = 0.05
 
 
@@ -49,7 +49,7 @@ def views_of(cameras, rng):
 
 def given(*pixel_points):
     """A ``points_of`` that answers with these depths and alphas, view by view, whatever the Gaussians."""
-    answers = iter([PixelPoints(unprojected(d, make_camera()), d, a) for d, a in pixel_points])
+    answers = iter([PixelPoints(unproject(d, make_camera()), d, a) for d, a in pixel_points])
     return lambda *_: next(answers)
 
 
@@ -88,7 +88,7 @@ def test_blended_depth_lies_between_surfaces(backend):
     """Opacities 0.5 and 0.8 at depths 2 and 4: weights 0.5 and 0.4, so the dominant is at 2, the mean at 2.6 / 0.9."""
     camera = make_camera(width=5, height=5)
     gaussians = concat(round_gaussian(4.0, 0.8), round_gaussian(2.0, 0.5))
-    blended = blended_points(gaussians, view_from(camera), GSPLAT_MAIN, backend)
+    blended = blend_points(gaussians, view_from(camera), GSPLAT_MAIN, backend)
     assert blended.depths[2, 2] == pytest.approx(2.6 / 0.9, rel=CLOSED_FORM)
     assert blended.alpha[2, 2] == pytest.approx(0.9, rel=CLOSED_FORM)
     for points_of in (midpoint_points, centre_points):
@@ -145,7 +145,7 @@ def test_drawing_is_without_replacement_and_spares_what_has_no_point(rng):
         ids = pixel_ids(colors[300 * i : 300 * (i + 1)], view)
         assert len(np.unique(ids)) == 300
         assert np.all((depths * alpha).ravel()[ids] > 0)
-        expected = unprojected((i + 1) * depths, make_camera()).reshape(-1, 3)[ids]
+        expected = unproject((i + 1) * depths, make_camera()).reshape(-1, 3)[ids]
         assert_allclose(points[300 * i : 300 * (i + 1)], expected, rtol=PARITY_FLOAT64)
 
 
@@ -286,7 +286,7 @@ def test_unconfirmed_points_go_behind_the_scene(rng):
     points, _ = draw(views, 10**9, answers, rng, depth_tolerance=DEPTH_TOLERANCE, backdrop_distance=50.0)
     right = points[2 * 18 * 24 :].reshape(18, 24, 3) - [2.0, 0.0, 0.0]  # from its camera
     assert_allclose(np.linalg.norm(right[:, :6], axis=-1), 50.0, rtol=CLOSED_FORM)
-    rays = unprojected(np.ones((18, 24)), make_camera())
+    rays = unproject(np.ones((18, 24)), make_camera())
     assert_allclose(right / right[..., 2:], rays, rtol=PARITY_FLOAT64, atol=PARITY_FLOAT64)
     assert_allclose(right[:, 6:16, 2], WALL, rtol=CLOSED_FORM)
 
@@ -365,7 +365,7 @@ def test_blended_depth_is_worst(outdoor, trained):
     """Table 4 of the paper: mid-point and centre are close, blended depth fails. Measured 0.62, 0.69, 0.88."""
     midpoint, centre, blended = (
         wrong_and_sky_shares(trained, outdoor, points_of)[0]
-        for points_of in (midpoint_points, centre_points, blended_points)
+        for points_of in (midpoint_points, centre_points, blend_points)
     )
     assert midpoint < centre < blended
     assert blended - centre > centre - midpoint

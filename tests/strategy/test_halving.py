@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from minisplat_ref.backends import CPU
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.rendering import render
-from minisplat_ref.strategy.halving import halves, thinned_logits
+from minisplat_ref.strategy.halving import halves, thin_logits
 from scenes import make_camera, make_gaussians
 from tolerances import CLOSED_FORM
 
@@ -79,11 +79,11 @@ def test_nothing_to_halve(gaussians):
 def test_logits_of_any_size(dtype):
     """1 - o is 1e-44 for a logit of 100; what is nearly transparent has o' = factor o."""
     logits = np.array([-80.0, -20.0, 0.0, 20.0, 100.0], dtype)
-    thinned = thinned_logits(logits, 0.5)
+    thinned = thin_logits(logits, 0.5)
     assert thinned.dtype == dtype and np.isfinite(thinned).all()
     assert_allclose(thinned[:2], logits[:2] + np.log(0.5), rtol=1e-6)
     assert_allclose(thinned[3:], logits[3:] / 2, rtol=1e-4)
-    assert_allclose(thinned_logits(logits, 1.0), logits, rtol=1e-6, atol=1e-6)
+    assert_allclose(thin_logits(logits, 1.0), logits, rtol=1e-6, atol=1e-6)
 
 
 def test_the_picture_hardly_changes(rng):

@@ -15,14 +15,14 @@ from minisplat_ref.strategy.simplify import (
     by_merging,
     by_rank,
     by_sampling,
-    carrying_mass,
     intersection_preserving,
     merge_clusters,
     merge_neighbours,
     most_important,
     optical_masses,
-    reinitialised,
+    reinitialise,
     sample,
+    select_mass,
 )
 from scenes import as_dtype, make_gaussians
 from tolerances import CLOSED_FORM, MERGED_MOMENTS, ROUNDED_TO_FLOAT32, SAMPLE_FREQUENCY
@@ -67,8 +67,8 @@ def test_most_important_by_hand():
 
 
 def test_carrying_mass_by_hand():
-    assert_array_equal(carrying_mass(IMPORTANCE, 0.9), [2, 3, 4])
-    assert_array_equal(carrying_mass(IMPORTANCE, 1.0), [0, 2, 3, 4])
+    assert_array_equal(select_mass(IMPORTANCE, 0.9), [2, 3, 4])
+    assert_array_equal(select_mass(IMPORTANCE, 1.0), [0, 2, 3, 4])
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
@@ -293,7 +293,7 @@ def test_impossible_budgets(choose, importance, n, message, rng):
 
 def test_no_mass_to_carry():
     with pytest.raises(InputError, match="all importance is 0"):
-        carrying_mass(np.zeros(3), 0.99)
+        select_mass(np.zeros(3), 0.99)
 
 
 # Starting again -------------------------------------------------------------------------------------------------------
@@ -303,12 +303,12 @@ def test_reinitialised_is_as_at_the_start(rng):
     points, colors = rng.normal(size=(50, 3)).astype(np.float32), rng.integers(0, 256, (50, 3), np.uint8)
     start = from_points(points, colors, 3)
     trained = as_dtype(make_gaussians(rng, 50), np.float32)._replace(means=start.means, sh_dc=start.sh_dc)
-    for field, expected in zip(reinitialised(trained, 3), start, strict=True):
+    for field, expected in zip(reinitialise(trained, 3), start, strict=True):
         assert field.dtype == np.float32
         assert_array_equal(field, expected)
-    assert reinitialised(trained, 1).sh_rest.shape == (50, 3, 3)
+    assert reinitialise(trained, 1).sh_rest.shape == (50, 3, 3)
 
 
 def test_three_cannot_start_again(rng):
     with pytest.raises(InputError, match="3 rows"):
-        reinitialised(make_gaussians(rng, 3), 3)
+        reinitialise(make_gaussians(rng, 3), 3)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from minisplat_ref.strategy.visibility import culled_fraction, gradient_factors, seen_by_few
+from minisplat_ref.strategy.visibility import culled_fraction, find_seen_by_few, gradient_factors
 from tolerances import CLOSED_FORM
 
 IS_VISIBLE = np.array([[1, 1, 1, 1], [1, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 0]], bool)
@@ -34,9 +34,9 @@ def test_mean_gradient_is_that_without_culling(rng):
 
 
 def test_seen_by_few():
-    assert_array_equal(seen_by_few(IS_VISIBLE, 2), [False, False, True, True])
-    assert_array_equal(seen_by_few(IS_VISIBLE, 1), [False, False, False, True])
-    assert_array_equal(seen_by_few(IS_VISIBLE, 0), [False] * 4)
+    assert_array_equal(find_seen_by_few(IS_VISIBLE, 2), [False, False, True, True])
+    assert_array_equal(find_seen_by_few(IS_VISIBLE, 1), [False, False, False, True])
+    assert_array_equal(find_seen_by_few(IS_VISIBLE, 0), [False] * 4)
 
 
 def test_culled_fraction():
@@ -53,12 +53,12 @@ def test_culled_fraction():
 def test_few_views_do_not_empty_the_scene(n_views, least):
     """Row i is visible in i views: those below `least` go."""
     is_visible = np.arange(n_views) < np.arange(n_views + 1)[:, None]
-    assert_array_equal(seen_by_few(is_visible, 2), np.arange(n_views + 1) < least)
+    assert_array_equal(find_seen_by_few(is_visible, 2), np.arange(n_views + 1) < least)
 
 
 def test_nobody_and_no_view():
     nobody = np.zeros((0, 4), bool)
-    assert len(gradient_factors(nobody, np.zeros(0, int))) == len(seen_by_few(nobody, 2)) == 0
+    assert len(gradient_factors(nobody, np.zeros(0, int))) == len(find_seen_by_few(nobody, 2)) == 0
     assert culled_fraction(nobody, np.zeros(0, int)) == 0.0
     assert culled_fraction(np.zeros((4, 3), bool), np.zeros(4, int)) == 0.0
-    assert_array_equal(seen_by_few(np.zeros((3, 0), bool), 2), [False] * 3)
+    assert_array_equal(find_seen_by_few(np.zeros((3, 0), bool), 2), [False] * 3)

@@ -15,7 +15,7 @@ from minisplat_ref.metrics import evaluate
 from minisplat_ref.strategy.importance import collect_importance, indoor
 from minisplat_ref.strategy.initialization import from_points
 from minisplat_ref.strategy.removal import collect_removal_costs
-from minisplat_ref.strategy.simplify import carrying_mass, intersection_preserving, most_important
+from minisplat_ref.strategy.simplify import intersection_preserving, most_important, select_mass
 from minisplat_ref.studies import FIGURE, RESULT, simplify
 from minisplat_ref.training.loop import train
 from tolerances import CLOSED_FORM, PRINTED_DIGITS
@@ -56,14 +56,14 @@ def test_study(scene_folder, dense_file, tmp_path, capsys, restart):
     stats = collect_importance(dense, scene.train_views)
     importance = intersection_preserving(indoor(stats), stats.dominant_count)
     n_candidates = np.count_nonzero(importance)
-    n_of_mass = len(carrying_mass(importance, simplify.MASS))
+    n_of_mass = len(select_mass(importance, simplify.MASS))
     assert result["dense"]["n_gaussians"] == len(dense.means) > n_candidates == result["dense"]["n_candidates"]
     assert result["counts"] == {
         "20 %": round(0.2 * n_candidates),
         "50 %": round(0.5 * n_candidates),
         "mass 0.99": n_of_mass,
     }
-    assert np.array_equal(carrying_mass(importance, simplify.MASS), most_important(importance, n_of_mass))
+    assert np.array_equal(select_mass(importance, simplify.MASS), most_important(importance, n_of_mass))
 
     runs = {(run["kept"], run["choice"], run["seed"]): run for run in result["runs"]}
     assert len(runs) == len(result["runs"]) == 3 * 4 * 2

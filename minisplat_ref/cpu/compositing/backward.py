@@ -29,7 +29,7 @@ from minisplat_ref.cpu.compositing.tile_rows import (
     ALPHAS,
     SCRATCH_SIZE,
     alpha_writer,
-    reached_rows,
+    find_reached_rows,
     start_scratch,
     to_mean_y,
     to_ridge,
@@ -42,14 +42,14 @@ from minisplat_ref.cpu.compositing.tile_state import (
     open_rows,
     row_in_image,
     rows_of,
-    scheduled_tiles,
     start_tile,
+    take_tiles,
 )
 from minisplat_ref.cpu.gaussian_rows import rows_from
 from minisplat_ref.jit.compile import kernel, prange, scalar
 from minisplat_ref.jit.lanes import WIDTH, broadcast, gather, iota, load, reduce_sum, reduce_sums, select, store
 from minisplat_ref.jit.literals import ONE, ZERO
-from minisplat_ref.jit.scheduling import shared_counter
+from minisplat_ref.jit.scheduling import make_shared_counter
 from minisplat_ref.scalar.compositing import blend, sigma_vjp
 
 
@@ -99,7 +99,7 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
         as_data = s.dtype.type
         zero = broadcast(as_data(0))
         is_open = open_rows(s, n_fields)
-        next_rows = reached_rows(records, ids, 0, x0, y0)
+        next_rows = find_reached_rows(records, ids, 0, x0, y0)
         for m in range(ids.size):
             place = np.int64(slots_of[m]) * slot_width
             if m % CHECK_EVERY == CHECK_EVERY - 1 and is_open != np.uint64(0):
@@ -108,7 +108,7 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
                 slots[place : place + slot_width] = ZERO
                 continue
             rows = next_rows & is_open
-            next_rows = reached_rows(records, ids, m + 1, x0, y0)
+            next_rows = find_reached_rows(records, ids, m + 1, x0, y0)
             n = ids[m]
             write_alphas(scratch, rows, records, n, x0, y0)
             red, green, blue = records[n, COLOR], records[n, COLOR + 1], records[n, COLOR + 2]
@@ -125,14 +125,14 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
                 v_red = v_red + weight * v_0
                 v_green = v_green + weight * v_1
                 v_blue = v_blue + weight * v_2
-                shade = v_0 * red + v_1 * green + v_2 * blue
+                v_dot_c = v_0 * red + v_1 * green + v_2 * blue
                 for k in range(N_FUSED, n_channels):
                     v, at = v_channel(s, k, i), (k - N_FUSED) * WIDTH
-                    shade = shade + v * records[n, COLOR + k]
+                    v_dot_c = v_dot_c + v * records[n, COLOR + k]
                     store(further, at, load(further, at) + weight * v)
-                behind = load(s, i + behind_place) - weight * shade
+                behind = load(s, i + behind_place) - weight * v_dot_c
                 store(s, i + behind_place, behind)
-                q = sigma_vjp(transmittance, weight, unclamped, behind, shade, frame)
+                q = sigma_vjp(transmittance, weight, unclamped, behind, v_dot_c, frame)
                 q_mean = select(unclamped <= frame.mean_gradient_max, q, ZERO)
                 q_shape = select(unclamped <= frame.shape_gradient_max, q, ZERO)
                 shape_e, shape_y = q_shape * e, q_shape * dy
@@ -162,13 +162,13 @@ def backward_kernel(exp: Callable, n_channels: int) -> Callable:
         offsets, ids, slots_of = lists
         image, alpha = pixels
         v_image, v_alpha = v_pixels
-        taken = shared_counter()
+        taken = make_shared_counter()
         for _ in prange(n_threads):
             state = np.empty(N_ROWS * row_size, image.dtype)
             scratch = np.empty(SCRATCH_SIZE, image.dtype)
             start_scratch(scratch)
             further = np.empty((slot_width - N_MOMENTS - N_FUSED) * WIDTH, image.dtype)  # further channels
-            for i in scheduled_tiles(taken, n_threads, offsets):
+            for i in take_tiles(taken, n_threads, offsets):
                 x0, y0 = corner(i, frame)
                 tile = Tile(x0, y0, ids[offsets[i] : offsets[i + 1]], slots_of[offsets[i] :])
                 start_tile(state, x0, y0, frame, n_fields)

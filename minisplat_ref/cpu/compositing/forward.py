@@ -15,7 +15,7 @@ import numpy as np
 
 from minisplat_ref.constants import MEDIAN_TRANSMITTANCE
 from minisplat_ref.cpu.compositing.records import COLOR, N_FUSED
-from minisplat_ref.cpu.compositing.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, reached_rows, start_scratch
+from minisplat_ref.cpu.compositing.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, find_reached_rows, start_scratch
 from minisplat_ref.cpu.compositing.tile_state import (
     CHECK_EVERY,
     N_ROWS,
@@ -24,8 +24,8 @@ from minisplat_ref.cpu.compositing.tile_state import (
     open_rows,
     row_in_image,
     rows_of,
-    scheduled_tiles,
     start_tile,
+    take_tiles,
 )
 from minisplat_ref.cpu.gaussian_rows import rows_from
 from minisplat_ref.jit.compile import kernel, prange, scalar
@@ -42,7 +42,7 @@ from minisplat_ref.jit.lanes import (
     store,
 )
 from minisplat_ref.jit.literals import ONE, ZERO
-from minisplat_ref.jit.scheduling import shared_counter
+from minisplat_ref.jit.scheduling import make_shared_counter
 from minisplat_ref.scalar.compositing import blend
 from minisplat_ref.types import Floats, Ints
 
@@ -115,14 +115,14 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
         as_data = s.dtype.type
         zero = broadcast(as_data(0))
         is_open = open_rows(s, n_fields)
-        next_rows = reached_rows(records, ids, 0, x0, y0)
+        next_rows = find_reached_rows(records, ids, 0, x0, y0)
         for m in range(ids.size):
             if m % CHECK_EVERY == CHECK_EVERY - 1:
                 is_open = open_rows(s, n_fields)
                 if is_open == np.uint64(0):
                     break
             rows = next_rows & is_open
-            next_rows = reached_rows(records, ids, m + 1, x0, y0)
+            next_rows = find_reached_rows(records, ids, m + 1, x0, y0)
             n = ids[m]
             write_alphas(scratch, rows, records, n, x0, y0)
             fused = records[n, COLOR], records[n, COLOR + 1], records[n, COLOR + 2]
@@ -162,12 +162,12 @@ def forward_kernel(exp: Callable, n_channels: int, has_stats: bool) -> Callable:
         offsets, ids, slots_of = lists
         image, alpha = pixels
         slots, median_depth, dominant_ids = stats
-        taken = shared_counter()
+        taken = make_shared_counter()
         for _ in prange(n_threads):
             state = np.empty(N_ROWS * row_size, image.dtype)
             scratch = np.empty(SCRATCH_SIZE, image.dtype)
             start_scratch(scratch)
-            for i in scheduled_tiles(taken, n_threads, offsets):
+            for i in take_tiles(taken, n_threads, offsets):
                 x0, y0 = corner(i, frame)
                 tile = Tile(x0, y0, ids[offsets[i] : offsets[i + 1]], slots_of[offsets[i] :])
                 start_tile(state, x0, y0, frame, n_fields)

@@ -65,7 +65,7 @@ def enqueue(queue, first, end, depth, row):
 
 
 @scalar
-def queued_rows(queue, at):
+def load_queued(queue, at):
     """Return the eight rows of hits at a position of ``queue``."""
     i = at * 2 * WIDTH + WIDTH
     near = np.int64(queue[i]), np.int64(queue[i + 1]), np.int64(queue[i + 2]), np.int64(queue[i + 3])
@@ -100,12 +100,12 @@ def walk_sorted(hit: Callable, shade: Callable, n_channels: int, take: Callable)
             enqueue(queue, first, end, select(is_hit, zero + depth, MISSED), iota(as_data(0)) + as_data(end * WIDTH))
             end += 1
             if end - first == buffer_size:
-                take(state, hits, queued_rows(queue, first), frame)
+                take(state, hits, load_queued(queue, first), frame)
                 first += 1
             if not reduce_any(load(state, 0) > ZERO):
                 break
         while first < end and reduce_any(load(state, 0) > ZERO):
-            take(state, hits, queued_rows(queue, first), frame)
+            take(state, hits, load_queued(queue, first), frame)
             first += 1
         return end
 

@@ -36,7 +36,7 @@ def composite_hits(
     """Blend the primitives of every tile, front to back; see ``reference.compositing.composite_hits``."""
     height, width, dtype, n_channels = bins.grid.height, bins.grid.width, colors.dtype, len(background)
     image, alpha = np.empty((height, width, n_channels), dtype), np.empty((height, width), dtype)
-    forward_kernel(_compiled_for(response), n_channels)(
+    forward_kernel(_find_shared(response), n_channels)(
         Scene(response.records(primitives, dtype), colors, response.boxes(primitives)),
         background,
         _lists(bins, response),
@@ -61,7 +61,7 @@ def composite_hits_vjp(
     dtype, n_channels = colors.dtype, len(background)
     slots = np.empty((len(bins.gaussian_ids), response.n_gradients + n_channels * response.n_coefficients), dtype)
     v_backgrounds = np.zeros((len(bins.tile_offsets) - 1, n_channels))  # by tiles
-    backward_kernel(_compiled_for(response), n_channels)(
+    backward_kernel(_find_shared(response), n_channels)(
         Scene(response.records(primitives, dtype), colors, response.boxes(primitives)),
         _lists(bins, response),
         frame_of(bins, conventions, dtype),
@@ -85,7 +85,7 @@ def _lists(bins: TileBins, response: KernelResponse) -> Lists:
     return Lists(bins.tile_offsets, bins.gaussian_ids, bins.slots, *size, response.buffer_size)
 
 
-def _compiled_for(response: KernelResponse) -> KernelResponse:
+def _find_shared(response: KernelResponse) -> KernelResponse:
     """Return the response whose kernel is shared by those that differ only in the size of their buffers."""
     return response._replace(buffer_size=min(response.buffer_size, LIST_ORDER + 1))
 

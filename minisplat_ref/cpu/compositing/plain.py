@@ -56,7 +56,7 @@ from minisplat_ref.jit.lanes import (
     store,
 )
 from minisplat_ref.jit.literals import ONE, ZERO
-from minisplat_ref.jit.scheduling import dynamic_range, shared_counter
+from minisplat_ref.jit.scheduling import dynamic_range, make_shared_counter
 from minisplat_ref.scalar.compositing import blend, blend_vjp
 
 
@@ -66,7 +66,7 @@ def forward_kernel(response: KernelResponse, n_channels: int) -> Callable:
     hit, shade, is_sorted = response.hit, response.shade, response.buffer_size > LIST_ORDER
 
     @scalar
-    def draw_row(state, scene, row, frame):
+    def composite_row(state, scene, row, frame):
         """Blend the members of a row's list, in its order."""
         T = load(state, 0)
         for m in row.members:
@@ -87,11 +87,11 @@ def forward_kernel(response: KernelResponse, n_channels: int) -> Callable:
         for k in range(n_channels):
             accumulate(state, (1 + k) * WIDTH, weight * gather(hits, rows, CHANNELS + k))
 
-    draw_sorted_row = walk_sorted(hit, shade, n_channels, take)
+    composite_sorted_row = walk_sorted(hit, shade, n_channels, take)
 
     @kernel()
     def composite_tiles(scene, background, lists, frame, n_threads, out):
-        taken = shared_counter()
+        taken = make_shared_counter()
         for _ in prange(n_threads):
             state = np.empty((1 + n_channels) * WIDTH, out.image.dtype)
             for tile in dynamic_range(taken, lists.offsets.size - 1):
@@ -101,9 +101,9 @@ def forward_kernel(response: KernelResponse, n_channels: int) -> Callable:
                     state[:] = ZERO
                     store(state, 0, full_transmittance(row, frame, state.dtype.type))
                     if is_sorted:
-                        draw_sorted_row(state, buffer, scene, row, lists.buffer_size, frame)
+                        composite_sorted_row(state, buffer, scene, row, lists.buffer_size, frame)
                     else:
-                        draw_row(state, scene, row, frame)
+                        composite_row(state, scene, row, frame)
                     pixels, T_end = row_pixels(row, frame), abs(field_of(state, 0, row, frame))
                     scatter(out.alpha, pixels, 0, ONE - T_end)
                     for k in range(n_channels):
@@ -133,14 +133,14 @@ def backward_kernel(response: KernelResponse, n_channels: int) -> Callable:
         store(state, behind_place, behind)
 
     @scalar
-    def blend_again(state, unclamped, light, frame):
-        """Repeat the blending of a hit with <v, colour> = ``light``; return dL/dalpha and the weight."""
+    def blend_again(state, unclamped, v_dot_c, frame):
+        """Repeat the blending of a hit with <v, colour> = ``v_dot_c``; return dL/dalpha and the weight."""
         T = load(state, 0)
         after, weight = blend(T, unclamped, frame)
-        behind = load(state, behind_place) - weight * light
+        behind = load(state, behind_place) - weight * v_dot_c
         store(state, 0, after)
         store(state, behind_place, behind)
-        return blend_vjp(T, weight, unclamped, behind, light, frame), weight
+        return blend_vjp(T, weight, unclamped, behind, v_dot_c, frame), weight
 
     @scalar
     def chain(sums, v_place, state, scene, n, place, gradient, frame):
@@ -162,10 +162,10 @@ def backward_kernel(response: KernelResponse, n_channels: int) -> Callable:
         for m in row.members:
             n = row.ids[m]
             unclamped, _, place = hit_row(hit, scene, n, row)
-            light = broadcast(state.dtype.type(0))
+            v_dot_c = broadcast(state.dtype.type(0))
             for k in range(n_channels):
-                light = light + load(state, v_first + k * WIDTH) * shade(scene.colors, n, k, place)
-            v_alpha, weight = blend_again(state, unclamped, light, frame)
+                v_dot_c = v_dot_c + load(state, v_first + k * WIDTH) * shade(scene.colors, n, k, place)
+            v_alpha, weight = blend_again(state, unclamped, v_dot_c, frame)
             gradient = unclamped, v_alpha, weight
             chain(sums[m * n_sums * WIDTH :], v_place, state, scene, n, place, gradient, frame)
             if not reduce_any(load(state, 0) > ZERO):
@@ -174,10 +174,10 @@ def backward_kernel(response: KernelResponse, n_channels: int) -> Callable:
     @scalar
     def take(state, hits, rows, frame):
         """Repeat the blending of one hit of a buffer in each pixel, and store its gradient."""
-        light = broadcast(state.dtype.type(0))
+        v_dot_c = broadcast(state.dtype.type(0))
         for k in range(n_channels):
-            light = light + load(state, v_first + k * WIDTH) * gather(hits, rows, CHANNELS + k)
-        v_alpha, weight = blend_again(state, gather(hits, rows, ALPHA), light, frame)
+            v_dot_c = v_dot_c + load(state, v_first + k * WIDTH) * gather(hits, rows, CHANNELS + k)
+        v_alpha, weight = blend_again(state, gather(hits, rows, ALPHA), v_dot_c, frame)
         scatter(hits, rows, V_ALPHA, v_alpha)
         scatter(hits, rows, WEIGHT, weight)
 
@@ -194,7 +194,7 @@ def backward_kernel(response: KernelResponse, n_channels: int) -> Callable:
 
     @kernel()
     def composite_tiles_vjp(scene, lists, frame, n_threads, output, v_output, slots, v_backgrounds):
-        taken = shared_counter()
+        taken = make_shared_counter()
         for _ in prange(n_threads):
             state = np.empty((2 + n_channels) * WIDTH, slots.dtype)
             v_place = np.empty(n_places * WIDTH, slots.dtype)

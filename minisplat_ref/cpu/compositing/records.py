@@ -8,7 +8,7 @@ transposing the numbers of eight Gaussians.
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.cpu.gaussian_rows import list_visible, listed_rows, rounded, triple
+from minisplat_ref.cpu.gaussian_rows import list_visible, load_rows, round_lanes, triple
 from minisplat_ref.cpu.projection import N_CHUNKS
 from minisplat_ref.cpu.tiling import ELLIPSE_MARGIN
 from minisplat_ref.jit.compile import kernel, prange, scalar
@@ -43,11 +43,11 @@ def _write_eight(rows, projection, colors, alpha_min, records):
     a, b, c = triple(projection.conics, rows)
     a_factor, slope, pivot = factors(a, b, c)
     opacity = gather(projection.opacities, rows, 0)
-    outline = visible_outline(*rounded(factors(c, b, a), zero), opacity, alpha_min, ELLIPSE_MARGIN)
+    outline = visible_outline(*round_lanes(factors(c, b, a), zero), opacity, alpha_min, ELLIPSE_MARGIN)
     means2d, boxes = projection.means2d, projection.boxes
     first_half = (
         *(gather(means2d, rows, 0), gather(means2d, rows, 1)),
-        *rounded((_half(a_factor), slope, _half(pivot)), zero),
+        *round_lanes((_half(a_factor), slope, _half(pivot)), zero),
         *(opacity, outline.slope, outline.inverse_a),
     )
     second_half = (
@@ -64,7 +64,7 @@ def _write_part(first, end, projection, colors, alpha_min, records):
     visible = np.empty(end - first + WIDTH, np.int64)
     count = list_visible(projection.radii, first, end, visible)
     for i in range(0, count, WIDTH):
-        _write_eight(listed_rows(visible, i), projection, colors, alpha_min, records)
+        _write_eight(load_rows(visible, i), projection, colors, alpha_min, records)
     for k in range(N_FUSED, colors.shape[1]):
         records[first:end, COLOR + k] = colors[first:end, k]
 
@@ -82,7 +82,7 @@ def _write_records(
 
 
 @scalar
-def turned_outline(records, n):
+def transpose_outline(records, n):
     """Return the visible ellipse with x and y exchanged, of which ``rightmost_offset`` gives the lowest point."""
     return Outline(
         records[n, TURNED_SLOPE],

@@ -21,7 +21,7 @@ from minisplat_ref.cpu.compositing.records import (
     MEAN_Y,
     OPACITY,
     SLOPE,
-    turned_outline,
+    transpose_outline,
 )
 from minisplat_ref.cpu.compositing.tile_state import N_ROWS, N_STRIPS, rows_of
 from minisplat_ref.cpu.tiling import ELLIPSE_MARGIN, TILE_HEIGHT
@@ -98,7 +98,7 @@ def sigma_of(scratch, row, half_a):
 
 
 @scalar
-def reached_rows(records, ids, m, x0, y0):
+def find_reached_rows(records, ids, m, x0, y0):
     """Return as bits the rows of eight pixels that the visible ellipse of the tile's m-th Gaussian reaches.
 
     It computes eight bounds at once: how far the ellipse reaches up and down in each of the four strips. A kernel calls
@@ -115,7 +115,7 @@ def reached_rows(records, ids, m, x0, y0):
     left = (k - select(is_up, zero, FOUR)) * as_data(WIDTH)  # edges of the strips
     side = select(is_up, broadcast(as_data(-1)), ONE)
     low = left + (HALF - mx)
-    offset = rightmost_offset(turned_outline(records, n), low, low + as_data(WIDTH - 1), side)
+    offset = rightmost_offset(transpose_outline(records, n), low, low + as_data(WIDTH - 1), side)
     bound = floor(side * my + offset + (HALF + ELLIPSE_MARGIN))  # minus the first row, or the one after the last
     bound = side * maximum(as_data(-TILE_HEIGHT), minimum(select(is_up, zero, as_data(TILE_HEIGHT)), bound))
     is_in_box = (left < records[n, COLUMN_END] - as_data(x0)) & (left > records[n, COLUMN_FIRST] - as_data(x0 + WIDTH))

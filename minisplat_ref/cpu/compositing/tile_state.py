@@ -98,7 +98,7 @@ def first_tile(i, n_ranges, offsets):
 
 
 @scalar
-def scheduled_tiles(taken, n_threads, offsets):
+def take_tiles(taken, n_threads, offsets):
     """Yield the tiles of the ranges that this thread takes."""
     n_ranges = RANGES_PER_THREAD * n_threads
     for i in dynamic_range(taken, n_ranges):

@@ -55,9 +55,9 @@ def row_length(width: int) -> int:
 
 
 @scalar
-def _pad_row(row, pictures, padded_image, padded_target):
+def _pad_row(row, inputs, padded_image, padded_target):
     """Copy a row of both images, minus 1/2, between black margins; numbers that do not count are the target's."""
-    image, target, unit, counts = pictures
+    image, target, unit, counts = inputs
     if row < 0 or row >= image.shape[0]:
         padded_image[:] = -HALF
         padded_target[:] = -HALF
@@ -167,9 +167,9 @@ def loss_kernel(dtype: np.dtype) -> Callable:
             v_row[i] = s[3 * length + i]
 
     @scalar
-    def loss_band(start, end, pictures, v_l1, v_ssim, sums, v_image):
+    def loss_band(start, end, inputs, v_l1, v_ssim, sums, v_image):
         n_rows, n_values = v_image.shape
-        counts, length = pictures.counts, pictures.counts.shape[1]
+        counts, length = inputs.counts, inputs.counts.shape[1]
         images, targets = np.empty(N_RING * length, v_image.dtype), np.empty(N_RING * length, v_image.dtype)
         images[:] = targets[:] = -HALF
         ring, s = np.zeros(N_RING * 3 * length, v_image.dtype), np.empty(8 * length, v_image.dtype)
@@ -180,7 +180,7 @@ def loss_kernel(dtype: np.dtype) -> Callable:
                 row = y + HALF_WINDOW + half
                 place = row % N_RING * length
                 own = slice(place, place + length)
-                _pad_row(row, pictures, images[own], targets[own])
+                _pad_row(row, inputs, images[own], targets[own])
             if y < start - HALF_WINDOW:
                 continue
             _find_rows(y - HALF_WINDOW, length, places)
@@ -209,16 +209,16 @@ def loss_kernel(dtype: np.dtype) -> Callable:
 
     @kernel()
     def loss_rows(
-        pictures,  # Pictures
+        inputs,  # Pictures
         v_l1,
         v_ssim,
         n_bands,
         sums,  # [H, 2] of |I - T| and of SSIM
         v_image,  # [H, 3 W]
     ):
-        n_rows, n_pairs = len(sums), (len(sums) + 1) // 2
+        n_rows, n_row_pairs = len(sums), (len(sums) + 1) // 2
         for band in prange(n_bands):
-            start, end = 2 * (n_pairs * band // n_bands), 2 * (n_pairs * (band + 1) // n_bands)
-            loss_band(start, min(end, n_rows), pictures, v_l1, v_ssim, sums, v_image)
+            start, end = 2 * (n_row_pairs * band // n_bands), 2 * (n_row_pairs * (band + 1) // n_bands)
+            loss_band(start, min(end, n_rows), inputs, v_l1, v_ssim, sums, v_image)
 
     return loss_rows

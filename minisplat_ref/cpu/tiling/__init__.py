@@ -33,7 +33,7 @@ from minisplat_ref.cpu.tiling.layers import (
 )
 from minisplat_ref.jit.compile import kernel, n_threads, prange
 from minisplat_ref.jit.lanes import WIDTH
-from minisplat_ref.jit.scheduling import dynamic_range, shared_counter
+from minisplat_ref.jit.scheduling import dynamic_range, make_shared_counter
 from minisplat_ref.types import Ints, Projection, TileBins, TileGrid
 
 __all__ = ["ELLIPSE_MARGIN", "TILE_HEIGHT", "TILE_WIDTH", "bin_gaussians"]
@@ -52,14 +52,14 @@ def _list_tiles(
 ):
     """Write the offsets, and return the lists and the slots of their pairs. The three passes are one kernel."""
     n_threads = len(counts)
-    taken = shared_counter()
+    taken = make_shared_counter()
     for _ in prange(n_threads):
         for part in dynamic_range(taken, N_PARTS):
             survey_part(part, projection.boxes, projection.depths, survey)
     cut_layers(survey.up_to, layers.of_buckets, layers.edges)
 
     cells = np.empty(layers.edges[-1, TILES], np.int32)
-    taken = shared_counter()
+    taken = make_shared_counter()
     for thread in prange(n_threads):
         for part in dynamic_range(taken, N_PARTS):
             list_part(part, survey, projection, screen, layers, cells, offsets, counts[thread])
@@ -67,7 +67,7 @@ def _list_tiles(
     start_lists(counts, offsets, first_slots, tile_offsets)
 
     lists = np.empty((2, tile_offsets[-1]), np.int32)
-    taken = shared_counter()
+    taken = make_shared_counter()
     for _ in prange(n_threads):
         for i in dynamic_range(taken, N_PARTS):
             layer = i % 2 * (N_PARTS // 2) + i // 2  # neighbours share cache lines: far apart in time

@@ -12,7 +12,7 @@ advances only if the tile is reached; otherwise the next write overwrites it.
 
 import numpy as np
 
-from minisplat_ref.cpu.gaussian_rows import rounded, triple
+from minisplat_ref.cpu.gaussian_rows import round_lanes, triple
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import WIDTH, cast, ceil, floor, gather, maximum, minimum, reduce_max, store
 from minisplat_ref.jit.literals import HALF, ONE
@@ -90,7 +90,7 @@ def write_wide(box, spans, i, n_tiles_x, base, tiles, place):
 def outlines(rows, projection, alpha_min):
     """Return the visible ellipses of eight Gaussians, and the largest number of rows of tiles in their boxes."""
     zero = projection.opacities.dtype.type(0)
-    ellipse = rounded(factors(*triple(projection.conics, rows)), zero)
+    ellipse = round_lanes(factors(*triple(projection.conics, rows)), zero)
     _, y0, _, y1 = _boxes(projection.boxes, rows, zero)
     n_rows = reduce_max(floor((y1 - ONE) * ROWS_PER_PIXEL) - floor(y0 * ROWS_PER_PIXEL)) + ONE
     opacity = gather(projection.opacities, rows, 0)

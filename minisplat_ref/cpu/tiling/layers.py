@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.cpu.gaussian_rows import listed_rows
+from minisplat_ref.cpu.gaussian_rows import load_rows
 from minisplat_ref.cpu.tiling.footprints import SPARE, outlines, tiles_of_box, write_line, write_spans, write_wide
 from minisplat_ref.cpu.tiling.sorting import DIGIT_BITS, sort_stably
 from minisplat_ref.jit.compile import scalar
@@ -169,7 +169,7 @@ def _write_wide(part, survey, projection, screen, layers, cells, cursors, wide):
     for kind in (SQUARES, OTHERS):
         ids = survey.wide[part, kind]
         for i in range(0, ids[-1], WIDTH):
-            rows = listed_rows(ids, i)
+            rows = load_rows(ids, i)
             outline, max_rows = outlines(rows, projection, alpha_min)
             for row in range(max_rows):
                 write_spans(rows, row, outline, projection, spans)

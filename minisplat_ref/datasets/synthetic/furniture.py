@@ -23,15 +23,15 @@ def room_shell(floor: Texture, walls: tuple[Texture, ...]) -> list[Primitive]:
         sheet(ROOM_HALF, ROOM_HALF, Plain("#efe9df"), [0.0, 0.0, ROOM_HEIGHT]),
     ]
     for index, texture in enumerate(walls):
-        upright = turn_z(90.0 * index) @ _STANDING
+        upright = rotate_z(90.0 * index) @ _STANDING
         centre = upright @ np.array([0.0, 0.0, -ROOM_HALF]) + np.array([0.0, 0.0, 0.5 * ROOM_HEIGHT])
         shell.append(sheet(ROOM_HALF, 0.5 * ROOM_HEIGHT, texture, centre, upright))
     return shell
 
 
-def picture(centre: Floats, turn: float, lattice: Floats, low: str, high: str) -> list[Primitive]:
+def picture(centre: Floats, angle: float, lattice: Floats, low: str, high: str) -> list[Primitive]:
     """A framed abstract painting, flat on a wall."""
-    upright = turn_z(turn) @ _STANDING
+    upright = rotate_z(angle) @ _STANDING
     front = upright[:, 2]
     painting = Noise(low, high, np.array([0.35, 0.25, 1.0]), lattice, contrast=2.5)
     return [
@@ -40,11 +40,11 @@ def picture(centre: Floats, turn: float, lattice: Floats, low: str, high: str) -
     ]
 
 
-def chair(foot: Floats, turn: float) -> list[Primitive]:
+def chair(foot: Floats, angle: float) -> list[Primitive]:
     """Four legs, a seat and a barred back, all rods of 1 to 2 cm radius."""
     wood = Plain("#c9793b")
     half, seat, top = 0.21, 0.45, 0.95
-    at = _Placement(foot, turn_z(turn))
+    at = _Placement(foot, rotate_z(angle))
     corners = [(sx * half, sy * half) for sx in (-1, 1) for sy in (-1, 1)]
     legs = [at.rod([x, y, 0.0], [x, y, top if y > 0 else seat], 0.018, wood) for x, y in corners]
     bars = [at.thin_rod([x, half, seat], [x, half, top], 0.009, wood) for x in np.linspace(-half, half, 7)[1:-1]]
@@ -67,9 +67,9 @@ def table(foot: Floats, lattice: Floats) -> list[Primitive]:
     ]
 
 
-def rack(foot: Floats, turn: float) -> list[Primitive]:
+def rack(foot: Floats, angle: float) -> list[Primitive]:
     """A clothes rack: a lattice of rods of 6 to 10 mm radius, the thinnest things in the room."""
-    at = _Placement(foot, turn_z(turn))
+    at = _Placement(foot, rotate_z(angle))
     steel = Material(Plain("#3c4650"), highlight=0.25, shininess=40.0)
     height, half = 0.85, 0.34
     posts = [at.thin_rod([x, 0.0, 0.0], [x, 0.0, height], 0.01, steel) for x in np.linspace(-half, half, 5)]
@@ -89,7 +89,7 @@ def tree(foot: Floats, leaves: Texture) -> list[Primitive]:
 
 def fence(foot: Floats) -> list[Primitive]:
     """Thin posts with two rails."""
-    at = _Placement(foot, turn_z(-40.0))
+    at = _Placement(foot, rotate_z(-40.0))
     white = Plain("#efe9dd")
     posts = [at.rod([x, 0.0, 0.0], [x, 0.0, 0.7], 0.025, white) for x in np.linspace(-0.9, 0.9, 10)]
     rails = [at.rod([-0.95, 0.0, z], [0.95, 0.0, z], 0.02, white) for z in (0.25, 0.55)]
@@ -136,7 +136,7 @@ _STANDING = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """[3, 3] rotation of a sheet from lying to standing: its y becomes the world's z, and it faces -y."""
 
 
-def turn_z(degrees: float) -> Floats:
+def rotate_z(degrees: float) -> Floats:
     """[3, 3] rotation about the vertical."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

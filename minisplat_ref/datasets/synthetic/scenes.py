@@ -19,10 +19,10 @@ from minisplat_ref.datasets.synthetic.furniture import (
     place,
     rack,
     room_shell,
+    rotate_z,
     sheet,
     table,
     tree,
-    turn_z,
 )
 from minisplat_ref.datasets.synthetic.geometry import Primitive
 from minisplat_ref.datasets.synthetic.materials import (
@@ -71,9 +71,9 @@ def room(rng: np.random.Generator) -> Setting:
         *table(np.array([-0.5, 0.35, 0.02]), lattice),
         *rack(np.array([0.1, -0.95, 0.02]), 12.0),
         place(
-            Box(0.2, 0.2, 0.2), Stripes("#f1e6cf", "#3f8f6b", 0.13, axis=2, share=0.5), [0.75, -0.4, 0.22], turn_z(25)
+            Box(0.2, 0.2, 0.2), Stripes("#f1e6cf", "#3f8f6b", 0.13, axis=2, share=0.5), [0.75, -0.4, 0.22], rotate_z(25)
         ),
-        place(Sphere(0.18), Checker("#f5efe3", "#d2493f", 0.12), [0.05, -0.25, 0.2], turn_z(20)),
+        place(Sphere(0.18), Checker("#f5efe3", "#d2493f", 0.12), [0.05, -0.25, 0.2], rotate_z(20)),
         place(Sphere(0.1), Plain("#f0b93a"), [-0.45, -0.6, 0.12]),
     ]
     return Setting(_lamp_world(primitives), Orbit(np.array([0.0, 0.0, 0.55]), (1.75, 2.2), (0.75, 1.75), 68.0))
@@ -86,7 +86,7 @@ def plain_wall(rng: np.random.Generator) -> Setting:
     streaks = Noise("#000000", "#ffffff", np.array([0.9, 0.06, 1.0]), lattice)
     primitives = [
         *room_shell(Bricks("#5b3a24", "#8a5a34", "#c08a55", 1.3, 0.2, 0.012, streaks), (bare,) * 4),
-        place(Box(0.25, 0.25, 0.3), Checker("#f1e6cf", "#35608c", 0.16), [0.3, 0.25, 0.3], turn_z(30)),
+        place(Box(0.25, 0.25, 0.3), Checker("#f1e6cf", "#35608c", 0.16), [0.3, 0.25, 0.3], rotate_z(30)),
         place(Sphere(0.24), Noise("#7a2848", "#f2c48d", np.full(3, 0.25), lattice, contrast=2.0), [-0.3, -0.15, 0.24]),
         place(Cylinder(0.12, 0.35), Stripes("#f5efe3", "#3f8f6b", 0.16, axis=2), [-0.25, 0.45, 0.35]),
     ]
@@ -99,16 +99,16 @@ def glossy(rng: np.random.Generator) -> Setting:
     marble = Noise("#2f4858", "#dfe7e4", np.full(3, 0.3), lattice, contrast=2.2)
     primitives = [
         place(Cylinder(1.7, 0.05), Checker("#e9dfcb", "#8c6d52", 0.25), [0.0, 0.0, -0.05]),
-        place(Sphere(0.42), _polished(Plain("#a81e2b"), 0.06), [0.0, 0.0, 0.42]),
-        place(Sphere(0.26), _polished(Plain("#6d7278"), 0.7), [0.62, 0.42, 0.26]),
-        place(Sphere(0.24), _polished(marble, 0.04), [-0.6, 0.4, 0.24]),
+        place(Sphere(0.42), _polish(Plain("#a81e2b"), 0.06), [0.0, 0.0, 0.42]),
+        place(Sphere(0.26), _polish(Plain("#6d7278"), 0.7), [0.62, 0.42, 0.26]),
+        place(Sphere(0.24), _polish(marble, 0.04), [-0.6, 0.4, 0.24]),
         place(
             Box(0.22, 0.22, 0.22),
-            _polished(Checker("#f0e2c0", "#2c6e8f", 0.148), 0.05),
+            _polish(Checker("#f0e2c0", "#2c6e8f", 0.148), 0.05),
             [-0.42, -0.58, 0.22],
-            turn_z(28),
+            rotate_z(28),
         ),
-        place(Cylinder(0.15, 0.3), _polished(Plain("#d99a2b"), 0.25), [0.5, -0.5, 0.3]),
+        place(Cylinder(0.15, 0.3), _polish(Plain("#d99a2b"), 0.25), [0.5, -0.5, 0.3]),
     ]
     world = World(
         primitives=tuple(primitives),
@@ -134,11 +134,11 @@ def outdoor(rng: np.random.Generator) -> Setting:
         place(Cylinder(1.7, 0.01), Noise("#a98d66", "#d8c19a", np.full(3, 0.3), lattice), [0.0, 0.0, 0.01]),
         *tree(np.array([-0.75, 0.7, 0.0]), leaves),
         *fence(np.array([1.1, 1.0, 0.0])),
-        place(Box(0.45, 0.4, 0.45), brick, [0.8, -0.65, 0.45], turn_z(20)),
-        place(Box(0.55, 0.5, 0.04), Stripes("#7b3f35", "#99564a", 0.14, axis=1), [0.8, -0.65, 0.94], turn_z(20)),
+        place(Box(0.45, 0.4, 0.45), brick, [0.8, -0.65, 0.45], rotate_z(20)),
+        place(Box(0.55, 0.5, 0.04), Stripes("#7b3f35", "#99564a", 0.14, axis=1), [0.8, -0.65, 0.94], rotate_z(20)),
         place(Sphere(0.3), stone, [-0.75, -0.7, 0.2]),
         place(Sphere(0.18), stone, [-0.25, -1.0, 0.1]),
-        place(Sphere(0.25), Stripes("#f5efe3", "#d2493f", 0.2, axis=0), [0.0, 0.1, 0.27], turn_z(40)),
+        place(Sphere(0.25), Stripes("#f5efe3", "#d2493f", 0.2, axis=0), [0.0, 0.1, 0.27], rotate_z(40)),
     ]
     world = World(
         primitives=tuple(primitives),
@@ -203,7 +203,7 @@ def _studio(directions: Floats) -> Floats:
     return colors
 
 
-def _polished(texture: Texture, reflectance: float) -> Material:
+def _polish(texture: Texture, reflectance: float) -> Material:
     """A lacquered or metallic surface."""
     return Material(texture, highlight=0.8, shininess=120.0, reflectance=reflectance)
 

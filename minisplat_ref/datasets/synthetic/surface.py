@@ -58,7 +58,7 @@ def true_surface(folder: Path, scene: Scene) -> Surface | None:
         rescale_camera(view.camera, width=depth.shape[1], height=depth.shape[0])
         for view, depth in zip(scene.train_views, depths, strict=True)
     ]
-    return surface_near(shown_points(cameras, depths), cameras, scene.extent)
+    return surface_near(unproject_views(cameras, depths), cameras, scene.extent)
 
 
 def surface_near(points: Floats, cameras: Sequence[Camera], extent: float) -> Surface | None:
@@ -70,7 +70,7 @@ def surface_near(points: Floats, cameras: Sequence[Camera], extent: float) -> Su
     return Surface(cKDTree(points), centre, extent) if len(points) else None
 
 
-def shown_points(cameras: Sequence[Camera], depths: Sequence[Floats]) -> Floats:
+def unproject_views(cameras: Sequence[Camera], depths: Sequence[Floats]) -> Floats:
     """Return the points [P, 3] of the world that pixels of depth [H, W] show; a depth of 0 is that of the sky."""
     points = []
     for camera, depth in zip(cameras, depths, strict=True):

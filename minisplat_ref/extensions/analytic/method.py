@@ -73,7 +73,7 @@ def reference_composite_vjp(
     return CompositeGradient(v_means2d, v_conics, v_opacities, v.colors, v.background)
 
 
-def integrating(backend: Backend) -> Backend:
+def with_pixel_integrals(backend: Backend) -> Backend:
     """Return the backend with integrals over pixels instead of samples at their centres.
 
     Lists of tiles are the reference's, because those of the kernels omit footprints that reach no pixel's centre.
@@ -95,7 +95,7 @@ def integrating(backend: Backend) -> Backend:
 def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
     """Draw the view as 3DGS does, but with integrals and without a low-pass; the tape keeps the backend."""
     conventions = request.conventions._replace(eps2d=0.0, is_antialiased=False)
-    backend = integrating(request.backend)
+    backend = with_pixel_integrals(request.backend)
     return SPLATTING.render(model, view, request._replace(backend=backend, conventions=conventions))
 
 

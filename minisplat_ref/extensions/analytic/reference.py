@@ -168,7 +168,7 @@ def pixel_response(distribution: Distribution) -> Response:
         axes = axes_of(projection.conics[ids])
         dtype = projection.means2d.dtype
         offsets = projection.means2d[ids, None] - centers.astype(dtype)  # [G, P, 2]
-        u = _rotated(offsets, axes.angles.astype(dtype))
+        u = _rotate(offsets, axes.angles.astype(dtype))
         rates = axes.rates.astype(dtype)[:, None, :]  # [G, 1, 2]
         parts = integrals(u, rates, distribution)  # [G, P, 2] I_1 and I_2
         unclamped = _masses(projection, ids, rates) * parts[..., 0] * parts[..., 1]
@@ -190,12 +190,12 @@ def pixel_response(distribution: Distribution) -> Response:
         v_angles = np.sum(v_u[..., 0] * u[..., 1] - v_u[..., 1] * u[..., 0], axis=1)
         v_conics = axes_of_vjp(projection.conics[ids], axes, Axes(v_rates, v_angles))
         v_opacities = np.sum(v_shape * parts[..., 0] * parts[..., 1], axis=1) * (2 * np.pi / rates.prod(axis=2)[:, 0])
-        return _rotated(v_u_mean.sum(axis=1, keepdims=True), -angles)[:, 0], v_conics, v_opacities
+        return _rotate(v_u_mean.sum(axis=1, keepdims=True), -angles)[:, 0], v_conics, v_opacities
 
     return Response(conic_boxes, hit, hit_vjp, ("means2d", "conics", "opacities"))
 
 
-def _rotated(offsets: Floats, angles: Floats) -> Floats:
+def _rotate(offsets: Floats, angles: Floats) -> Floats:
     """Return the components of vectors [G, P, 2] along axes at ``angles`` [G]."""
     cos, sin = np.cos(angles)[:, None], np.sin(angles)[:, None]
     x, y = offsets[..., 0], offsets[..., 1]

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.extensions.antialiasing.reference import VARIANCE, smoothed, smoothed_vjp
+from minisplat_ref.extensions.antialiasing.reference import VARIANCE, smooth, smooth_vjp
 from minisplat_ref.mechanisms.sampling import sampling_intervals
 from minisplat_ref.methods.gaussian_splatting import DENSIFY_LEAST_GAP, GS_ACCEL
 from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, Request
@@ -36,14 +36,14 @@ class _Tape(NamedTuple):
     gaussians: FilteredGaussians
 
 
-def unfiltered(gaussians: Gaussians, rng: np.random.Generator) -> FilteredGaussians:
+def add_filters(gaussians: Gaussians, rng: np.random.Generator) -> FilteredGaussians:
     """Return the Gaussians with filters of size zero, which an event measures later."""
     return FilteredGaussians(**gaussians._asdict(), filter_sigmas=np.zeros_like(gaussians.opacity_logits))
 
 
-def filtered(g: FilteredGaussians) -> Gaussians:
+def apply_filters(g: FilteredGaussians) -> Gaussians:
     """Return the Gaussians of 3DGS after the 3D filter."""
-    log_scales, opacity_logits = smoothed(g.log_scales, g.opacity_logits, g.filter_sigmas)
+    log_scales, opacity_logits = smooth(g.log_scales, g.opacity_logits, g.filter_sigmas)
     return Gaussians(g.means, g.quats, log_scales, opacity_logits, g.sh_dc, g.sh_rest)
 
 
@@ -51,12 +51,12 @@ def with_3d_filter(inner: Renderer) -> Renderer:
     """Return a renderer that filters the Gaussians in space before ``inner`` draws them."""
 
     def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, _Tape]:
-        output, tape = inner.render(model._replace(gaussians=filtered(model.gaussians)), view, request)
+        output, tape = inner.render(model._replace(gaussians=apply_filters(model.gaussians)), view, request)
         return output, _Tape(tape, model.gaussians)
 
     def render_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None) -> RenderGradient:
         v, g = inner.render_vjp(tape.inner, v_image, v_alpha), tape.gaussians
-        v_log_scales, v_logits, v_sigmas = smoothed_vjp(
+        v_log_scales, v_logits, v_sigmas = smooth_vjp(
             g.log_scales, g.opacity_logits, g.filter_sigmas, v.gaussians.log_scales, v.gaussians.opacity_logits
         )
         v_drawn = v.gaussians._replace(log_scales=v_log_scales, opacity_logits=v_logits)
@@ -89,7 +89,7 @@ MIP = with_3d_filter(with_2d_filter(SPLATTING))
 FILTERED = Representation(
     "filtered Gaussians",
     population=FilteredGaussians,
-    extend=unfiltered,
+    extend=add_filters,
     renderer=MIP,
     rates=Rates({"filter_sigmas": 0.0}, frozenset()),
 )

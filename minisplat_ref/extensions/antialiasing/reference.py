@@ -12,7 +12,7 @@ VARIANCE = 0.2  # of the filter, in units of the squared sampling interval
 EXPONENT_MAX = 80.0  # of e^l, which float32 holds up to e^88; an opacity within 1e-35 of 1 has no gradient left
 
 
-def smoothed(log_scales: Floats, opacity_logits: Floats, sigmas: Floats) -> tuple[Floats, Floats]:
+def smooth(log_scales: Floats, opacity_logits: Floats, sigmas: Floats) -> tuple[Floats, Floats]:
     """Return scales and opacities of Gaussians convolved with round ones; their integrals do not change.
 
     ::
@@ -45,10 +45,10 @@ def smoothed(log_scales: Floats, opacity_logits: Floats, sigmas: Floats) -> tupl
     return log_scales + growths, opacity_logits + log_rhos - np.logaddexp(0, _lost_logits(opacity_logits, log_rhos))
 
 
-def smoothed_vjp(
+def smooth_vjp(
     log_scales: Floats, opacity_logits: Floats, sigmas: Floats, v_log_scales: Floats, v_logits: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Gradient of :func:`smoothed` with respect to its three arguments.
+    """Gradient of :func:`smooth` with respect to its three arguments.
 
     With ``E = (1 - rho) e^l`` and ``d E / d log rho = -rho e^l``::
 

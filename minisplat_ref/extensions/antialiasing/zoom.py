@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from minisplat_ref.backends import CPU
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.shared_studies import psnr_of, shrunk, tidy, with_progress
-from minisplat_ref.mechanisms.sampling import block_means, zoomed
+from minisplat_ref.mechanisms.sampling import block_means, zoom_camera
 from minisplat_ref.rendering import Renderer, Request
 from minisplat_ref.training.loop import train
 from minisplat_ref.types import Floats, Model, Scene, View, view_from
@@ -32,7 +32,7 @@ class Trained(NamedTuple):
     def picture(self, view: View, scale: float) -> Floats:
         """Return the view [H, W, 3] with ``scale`` times the pixels of its camera."""
         request = Request(self.background, backend=CPU)
-        return self.renderer.render(self.model, view_from(zoomed(view.camera, scale)), request)[0].image
+        return self.renderer.render(self.model, view_from(zoom_camera(view.camera, scale)), request)[0].image
 
 
 def trained(name: str, scene: Scene, iterations: int, seed: int) -> Trained:

@@ -131,7 +131,7 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
         The file is damaged, of another kind or version, or holds no Gaussians of 3DGS.
     """
     packed = parse(CONTAINER, content, source)
-    header = _checked(packed)
+    header = _check_header(packed)
     streams = {}
     for name, width in header.stream_widths.items():
         n_planes = header.planes[name]
@@ -160,7 +160,7 @@ def _from_lattices(streams: Mapping[str, Any], steps: Exponents, source: str | P
     return {**fields, "quats": quats}
 
 
-def _checked(packed: Packed) -> _Header:
+def _check_header(packed: Packed) -> _Header:
     """Return the header after checking every value that is read."""
     values, source = packed.header, packed.source
     n, degree, level, steps, planes = (values.get(name) for name in ("n", "sh_degree", "level", "steps", "planes"))
@@ -192,7 +192,7 @@ def describe(content: bytes, source: str | Path) -> list[tuple[str, str]]:
     InputError
         The header is refused, as by :func:`decode`.
     """
-    header = _checked(parse(CONTAINER, content, source))
+    header = _check_header(parse(CONTAINER, content, source))
     if header.steps is None:
         return [("level", "0: every float32 as it was, in Morton order")]
     half = {name: 2.0 ** (exponent - 1) for name, exponent in header.steps._asdict().items()}

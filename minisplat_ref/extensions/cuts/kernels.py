@@ -31,7 +31,7 @@ _FAR = np.float32(1e30)  # px^2
 
 
 @functools.cache
-def cut_response(exp: Callable) -> KernelResponse:
+def make_cut_response(exp: Callable) -> KernelResponse:
     """Return the response of cut Gaussians with an exponential of :mod:`minisplat_ref.cpu.compositing.exponential`."""
     conic = conic_response(exp)
     flat_hit, flat_hit_vjp = conic.hit, conic.hit_vjp
@@ -137,7 +137,7 @@ def _along(records, n, dx, dy, end):
 
 def response_for(dtype: np.dtype) -> KernelResponse:
     """Return the response for arrays of a dtype: float32 data use the polynomial exponential."""
-    return cut_response(exp_fast if dtype == np.float32 else exp_exact)
+    return make_cut_response(exp_fast if dtype == np.float32 else exp_exact)
 
 
 def _records(conic_records: Callable, footprints: CutFootprints, dtype: np.dtype) -> Floats:

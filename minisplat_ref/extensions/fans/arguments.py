@@ -6,7 +6,7 @@ from typing import Any
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.fans.mesh_files import is_fans, load_fans
-from minisplat_ref.extensions.fans.shapes import Fans, FanShape, check_shape, converted
+from minisplat_ref.extensions.fans.shapes import Fans, FanShape, check_shape, convert_gaussians
 from minisplat_ref.io.ply import load_ply
 from minisplat_ref.types import Gaussians
 
@@ -73,7 +73,7 @@ def load_as_fans(path: Path, shape: FanShape) -> Fans:
     """
     file = _file(path)
     if not is_fans(file):
-        return converted(load_gaussians(path), shape)
+        return convert_gaussians(load_gaussians(path), shape)
     fans = load_fans(file)
     if len(fans.means) == 0:
         raise InputError(f"{path} holds no fans: give a model that has been trained")

@@ -8,8 +8,8 @@ import numpy as np
 
 from minisplat_ref.extensions.fans.mesh_files import write_mesh
 from minisplat_ref.extensions.fans.method import render
-from minisplat_ref.extensions.fans.shapes import FRONT_REACH, Fans, FanShape, converted, mesh_of, visible_mesh
-from minisplat_ref.extensions.fans.tuning import best_shape, drawn, measured, tuned
+from minisplat_ref.extensions.fans.shapes import FRONT_REACH, Fans, FanShape, convert_gaussians, mesh_of, visible_mesh
+from minisplat_ref.extensions.fans.tuning import best_shape, fine_tune, measure, render_clipped
 from minisplat_ref.extensions.shared_studies import psnr_of
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.rendering import Request
@@ -44,12 +44,12 @@ def judge_of(scene: Scene) -> Judge:
 def shape_rows(gaussians: Gaussians, judge: Judge, shape: FanShape) -> list[dict[str, Any]]:
     """Return the PSNR of fans against splats of degree 0, over reach and rim, and at the best of these over sides."""
     background = judge.scene.background
-    targets = [drawn(gaussians, view, background=background, sh_degree=0) for view in judge.views]
+    targets = [render_clipped(gaussians, view, background=background, sh_degree=0) for view in judge.views]
 
     def row(shape: FanShape) -> dict[str, Any]:
-        fans = converted(gaussians, shape)
+        fans = convert_gaussians(gaussians, shape)
         psnrs = [
-            psnr_of(drawn(fans, v, background=background), target)
+            psnr_of(render_clipped(fans, v, background=background), target)
             for v, target in zip(judge.views, targets, strict=True)
         ]
         return {**shape._asdict(), "psnr": float(np.mean(psnrs))}
@@ -88,14 +88,14 @@ def refit_rows(
     shapes: dict[str, FanShape] = {}
     for name, shape in FORMS.items():
         told(name)
-        forms[name] = converted(gaussians, shape)
+        forms[name] = convert_gaussians(gaussians, shape)
         fitted = best_shape(gaussians, shape, judge.views, photographs, scene.background)
         shapes[f"{name}, reach and rim"] = fitted
-        forms[f"{name}, reach and rim"] = converted(gaussians, fitted)
-        forms[f"{name}, vertices"] = tuned(forms[f"{name}, reach and rim"], scene, iterations, seed)
+        forms[f"{name}, reach and rim"] = convert_gaussians(gaussians, fitted)
+        forms[f"{name}, vertices"] = fine_tune(forms[f"{name}, reach and rim"], scene, iterations, seed)
     rows = []
     for name, population in forms.items():
-        test, training = (measured(population, scene, views) for views in (scene.test_views, scene.train_views))
+        test, training = (measure(population, scene, views) for views in (scene.test_views, scene.train_views))
         shape_found = shapes.get(name)
         fit = {} if shape_found is None else {"reach": shape_found.reach, "rim": shape_found.rim}
         size = {} if isinstance(population, Gaussians) else _size(population, folder / "mesh.ply")

@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from minisplat_ref.extensions.fans.mesh_files import save_fans
-    from minisplat_ref.extensions.fans.tuning import measured, tuned
+    from minisplat_ref.extensions.fans.tuning import fine_tune, measure
     from minisplat_ref.extensions.shared_studies import check_at_least, read_scene
 
     check_at_least(1, downscale=args.downscale, iterations=args.iterations)
@@ -55,10 +55,10 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"{args.out.parent} is no folder: make it, or give another OUT")
     start = load_as_fans(args.model, shape_of(args))
     scene = read_scene(args.scene, args.downscale)
-    before = measured(start, scene, scene.test_views)
+    before = measure(start, scene, scene.test_views)
     with tqdm(total=args.iterations, desc="vertices", leave=False, disable=None) as bar:
-        fans = tuned(start, scene, args.iterations, args.seed, lambda _: bar.update())
-    after = measured(fans, scene, scene.test_views)
+        fans = fine_tune(start, scene, args.iterations, args.seed, lambda _: bar.update())
+    after = measure(fans, scene, scene.test_views)
     save_fans(args.out, fans)
     print(
         f"{len(start.means):,} fans: test PSNR {before.psnr:.2f} dB, SSIM {before.ssim:.4f}\n"

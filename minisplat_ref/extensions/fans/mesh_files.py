@@ -130,7 +130,7 @@ def load_fans(path: str | Path, population: Any = Fans) -> Fans:
     )
     polygons = read_faces(path)
     if len(vertices) == 0 and not polygons:
-        return _split(vertices, rgba, 0, 1, FanShape().n_sides)
+        return _split_fans(vertices, rgba, 0, 1, FanShape().n_sides)
     faces = np.array(polygons) if all(len(polygon) == 3 for polygon in polygons) else np.zeros((0, 3), int)
     n = len(np.unique(faces[:, 0])) if len(faces) else 0
     if n == 0 or len(vertices) % n or len(faces) % n:
@@ -143,7 +143,7 @@ def load_fans(path: str | Path, population: Any = Fans) -> Fans:
         raise InputError(
             f"{path}: {n_faces} triangles about {n_rim} vertices make no fan; give the PLY of a run as it is"
         )
-    fans = _split(vertices, rgba, n, planes, owned)
+    fans = _split_fans(vertices, rgba, n, planes, owned)
     mesh = mesh_of(fans)
     if not np.array_equal(mesh.faces, faces):
         raise InputError(f"{path}: its triangles are not those of {n:,} fans, one after the other; do not sort them")
@@ -156,7 +156,7 @@ def _columns(vertices: Floats, rgba: NDArray[np.uint8]) -> dict[str, NDArray]:
     return dict(zip((*MEANS, *BYTES), (*vertices.astype(np.float32).T, *rgba.T), strict=True))
 
 
-def _split(vertices: Floats, rgba: Floats, n: int, planes: int, owned: int) -> Fans:
+def _split_fans(vertices: Floats, rgba: Floats, n: int, planes: int, owned: int) -> Fans:
     """Return the fans of vertices [N V, 3] and RGBA [N V, 4]."""
     v = 1 + planes * owned
     vertices, rgba = vertices.reshape(n, v, 3), rgba.reshape(n, v, 4)

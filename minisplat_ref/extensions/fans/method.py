@@ -11,7 +11,7 @@ import numpy as np
 
 from minisplat_ref.backends import Backend
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.fans.shapes import Fans, FanShape, converted, mesh_of, mesh_of_vjp
+from minisplat_ref.extensions.fans.shapes import Fans, FanShape, convert_gaussians, mesh_of, mesh_of_vjp
 from minisplat_ref.mechanisms.peeling import kernels as kernels
 from minisplat_ref.mechanisms.peeling import reference as reference
 from minisplat_ref.mechanisms.peeling.layers import ALL_LAYERS, Frame, Peeled, TranslucentMesh
@@ -32,7 +32,7 @@ def as_fans(
     gaussians: Gaussians, rng: np.random.Generator, *, n_sides: int, reach: float, rim: float, is_flat: bool
 ) -> Fans:
     """Return the fans of Gaussians; see :class:`.shapes.FanShape`."""
-    return converted(gaussians, FanShape(n_sides, reach, rim, is_flat))
+    return convert_gaussians(gaussians, FanShape(n_sides, reach, rim, is_flat))
 
 
 class _Tape(NamedTuple):

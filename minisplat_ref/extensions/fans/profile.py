@@ -17,7 +17,7 @@ from scipy.optimize import minimize
 
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
-from minisplat_ref.extensions.fans.shapes import FRONT_REACH, FanShape, converted
+from minisplat_ref.extensions.fans.shapes import FRONT_REACH, FanShape, convert_gaussians
 from minisplat_ref.extensions.fans.tuning import alpha_of
 from minisplat_ref.types import Camera, Floats, Gaussians, view_from
 
@@ -83,7 +83,7 @@ def tilts() -> list[Tilt]:
             for angle in np.radians(ANGLES):
                 one = _turned(scales, angle)
                 expected = alpha_of(one, view, conventions=sharp, backend=REFERENCE)
-                fans = converted(one, FanShape(reach=FRONT_REACH, is_flat=is_flat))
+                fans = convert_gaussians(one, FanShape(reach=FRONT_REACH, is_flat=is_flat))
                 found = alpha_of(fans, view, conventions=sharp, backend=REFERENCE)
                 errors.append(float(np.linalg.norm(found - expected) / np.linalg.norm(expected)))
             results.append(Tilt(kind, is_flat, errors))
@@ -91,7 +91,7 @@ def tilts() -> list[Tilt]:
 
 
 def _turned(scales: tuple[float, float, float], angle: float) -> Gaussians:
-    """Return one gray Gaussian before the camera, turned about the x axis."""
+    """Return one gray Gaussian before the camera, rotated about the x axis."""
     quats = np.array([[math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0]])
     return Gaussians(
         means=np.array([[0.0, 0.0, DISTANCE]]),

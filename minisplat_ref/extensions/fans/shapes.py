@@ -18,7 +18,7 @@ import numpy as np
 
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.errors import InputError
-from minisplat_ref.mechanisms.meshes.fans import flattened, rims
+from minisplat_ref.mechanisms.meshes.fans import flatten, rims
 from minisplat_ref.mechanisms.peeling.layers import TranslucentMesh
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.types import Bools, Floats, Gaussians, Ints
@@ -79,7 +79,7 @@ def check_shape(shape: FanShape) -> None:
         raise InputError(f"the rim's opacity is {shape.rim:g} times the centre's, not in [0, 1]: give such a part")
 
 
-def converted(gaussians: Gaussians, shape: FanShape) -> Fans:
+def convert_gaussians(gaussians: Gaussians, shape: FanShape) -> Fans:
     """Return the fans of Gaussians, in their dtype.
 
     Colours are those of degree 0, ``0.5 + C_0 c_0``, clipped to [0, 1], which is what mesh files hold.
@@ -98,7 +98,7 @@ def converted(gaussians: Gaussians, shape: FanShape) -> Fans:
     check_shape(shape)
     dtype, n = gaussians.means.dtype, len(gaussians.means)
     if shape.is_flat:
-        flat = flattened(gaussians.means, gaussians.quats, gaussians.log_scales)
+        flat = flatten(gaussians.means, gaussians.quats, gaussians.log_scales)
         corners = rims(flat.means, flat.spans, np.full(n, shape.reach), shape.n_sides)[:, None]  # [N, 1, n, 3]
     else:
         corners = _solid_rims(gaussians, shape)
@@ -125,14 +125,14 @@ def _solid_rims(gaussians: Gaussians, shape: FanShape) -> Floats:
                 half_axes[:, :, [p, (p + 1) % SOLID_PLANES]],
                 np.full(len(R), shape.reach),
                 shape.n_sides,
-            )[:, _owned(shape.n_sides)]
+            )[:, _find_owned(shape.n_sides)]
             for p in range(SOLID_PLANES)
         ],
         axis=1,
     )
 
 
-def _owned(n_sides: int) -> list[int]:
+def _find_owned(n_sides: int) -> list[int]:
     """Return which of a solid plane's rim vertices it owns."""
     return [j for j in range(n_sides) if j not in (n_sides // 4, 3 * n_sides // 4)]
 
@@ -144,7 +144,7 @@ def table(n_planes: int, n_owned: int) -> Ints:
         rings = [list(range(n_owned))]
     else:
         n_sides = n_owned + 2
-        own = {j: place for place, j in enumerate(_owned(n_sides))}
+        own = {j: place for place, j in enumerate(_find_owned(n_sides))}
         crossing = {n_sides // 4: 0, 3 * n_sides // 4: own[n_sides // 2]}  # of the next plane: its axis, either end
         rings = [
             [

@@ -137,11 +137,11 @@ def run(args: argparse.Namespace) -> None:
 def pictures_of(forms: dict[str, Any], scene: Any) -> dict[str, Any]:
     """Return crops of the first test view by their titles."""
     from minisplat_ref.extensions.fans import claims
-    from minisplat_ref.extensions.fans.tuning import drawn
+    from minisplat_ref.extensions.fans.tuning import render_clipped
 
     view = scene.test_views[0].loaded()
     names = ["splats", claims.FLAT, f"{claims.FLAT}, reach and rim", f"{claims.FLAT}, vertices"]
-    drawings = {name: drawn(forms[name], view, background=scene.background) for name in names}
+    drawings = {name: render_clipped(forms[name], view, background=scene.background) for name in names}
     return {"photograph": view.image / 255, **drawings}
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from minisplat_ref.extensions.fans.method import FANS_OF_GAUSSIANS, FINE_TUNING
-from minisplat_ref.extensions.fans.shapes import Fans, FanShape, converted
+from minisplat_ref.extensions.fans.shapes import Fans, FanShape, convert_gaussians
 from minisplat_ref.metrics import Evaluation, evaluate
 from minisplat_ref.rendering import Request
 from minisplat_ref.training.adam import zero_moments
@@ -23,7 +23,7 @@ FIRST_REACHES, FIRST_RIMS = (1.5, 2.0, 2.5, 3.0, 3.5), (0.0, 0.2)  # the best of
 EVALUATIONS = 60  # at most, of one search
 
 
-def tuned(
+def fine_tune(
     fans: Fans, scene: Scene, iterations: int, seed: int, on_step: Callable[[StepReport], None] | None = None
 ) -> Fans:
     """Return fans after some iterations of ``FINE_TUNING`` of their vertices; the given ones are not changed."""
@@ -59,8 +59,8 @@ def best_shape(
         return shape._replace(reach=float(np.clip(x[0], *REACHES)), rim=float(np.clip(x[1], 0, 1)))
 
     def cost(x: Floats) -> float:
-        fans = converted(gaussians, clipped(x))
-        pictures = [drawn(fans, view, background=background) for view in views]
+        fans = convert_gaussians(gaussians, clipped(x))
+        pictures = [render_clipped(fans, view, background=background) for view in views]
         return sum(float(np.mean((p - target) ** 2)) for p, target in zip(pictures, targets, strict=True))
 
     first = min((np.array(place) for place in product(FIRST_REACHES, FIRST_RIMS)), key=cost)
@@ -74,7 +74,7 @@ def representation_of(population: Any) -> Any:
     return FANS_OF_GAUSSIANS if isinstance(population, Fans) else GAUSSIANS
 
 
-def drawn(population: Any, view: View, **request: Any) -> Floats:
+def render_clipped(population: Any, view: View, **request: Any) -> Floats:
     """Return the picture [H, W, 3] of fans or Gaussians, clipped to [0, 1]; ``request`` as for :class:`Request`."""
     image = representation_of(population).renderer.render(Model(population), view, Request(**request))[0].image
     clipped: Floats = np.clip(image, 0, 1)
@@ -88,7 +88,7 @@ def alpha_of(population: Any, view: View, **request: Any) -> Floats:
     return alpha
 
 
-def measured(population: Any, scene: Scene, views: tuple[View, ...]) -> Evaluation:
+def measure(population: Any, scene: Scene, views: tuple[View, ...]) -> Evaluation:
     """Compare pictures of fans or Gaussians with photographs."""
     renderer = representation_of(population).renderer
     return evaluate(Model(population), views, background=scene.background, renderer=renderer)

@@ -234,11 +234,11 @@ def geometric_loss(
         _normal_differences(normals, edges, sums[1])
     pixels, costs, slopes = _seen_points(depth, camera, lens, points if weights.sfm_depth else points[:0])
 
-    costs_of_pairs, n_pairs = np.moveaxis(sums.sum(axis=1), 1, 0)
-    means = costs_of_pairs / np.maximum(n_pairs, 1)
+    costs_of_differences, n_differences = np.moveaxis(sums.sum(axis=1), 1, 0)
+    means = costs_of_differences / np.maximum(n_differences, 1)
     loss = weights.depth_smoothness * means[0] + weights.normal_smoothness * means[1]
     loss += weights.sfm_depth * costs.sum() / max(1, len(costs))
-    counts = n_pairs.astype(np.int64)
+    counts = n_differences.astype(np.int64)
     lens = lens.astype(dtype)
     tape = GeometricTape(accumulated_depth, alpha, depth, lens, edges, normals, counts, pixels, slopes, weights)
     return float(loss), tape

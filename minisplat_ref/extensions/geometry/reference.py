@@ -243,9 +243,9 @@ def normal_smoothness(normals: Floats, photograph: Floats) -> float:
 def normal_smoothness_vjp(normals: Floats, photograph: Floats, v_loss: float = 1.0) -> Floats:
     """Gradient of :func:`normal_smoothness`.
 
-    With n_pairs pairs, each difference adds its derivative to its second normal and the negative to its first::
+    Each of the n_differences adds its derivative to its second normal and the negative to its first::
 
-        v_difference = v_loss e (n' - n) / n_pairs
+        v_difference = v_loss e (n' - n) / n_differences
 
     Parameters
     ----------

@@ -69,7 +69,7 @@ def clone_and_split_by_detail(
     return clone_and_split(state, iteration, threshold=threshold, size_fraction=size_fraction)
 
 
-def halved_children(gaussians: Gaussians, parent_ids: Ints, rng: np.random.Generator) -> Gaussians:
+def halve_children(gaussians: Gaussians, parent_ids: Ints, rng: np.random.Generator) -> Gaussians:
     """Return two children with half the parent's covariance each, whose centres are drawn from the other half.
 
     So the children's covariance and that of their centres add up to the parent's in expectation. Their cross-sections
@@ -101,7 +101,7 @@ def halve_large(state: TrainState, iteration: Iteration, *, trace: float, trace_
         size_limit=np.inf,
         rng=state.rng,
         is_blurred=traces(state.gaussians.log_scales) > squared_limit(iteration.scene, trace_limit),
-        draw_children=halved_children,
+        draw_children=halve_children,
     )
     apply_edit(state, edit)
     return None

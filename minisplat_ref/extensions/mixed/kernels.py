@@ -31,8 +31,10 @@ from minisplat_ref.types import Floats, Ints
 CONIC_GRADIENTS = 6  # a record begins with the conic's own: centre, factors and opacity
 V_1, V_2, V_3 = range(CONIC_GRADIENTS, CONIC_GRADIENTS + 6, 2)  # vertices from the centre
 N_GRADIENTS = V_3 + 2
-DEPTH, COUNT, TURN = range(N_GRADIENTS, N_GRADIENTS + 3)  # TURN: sign of the triangle's area, 0 if it is flat
-G_12, G_23, G_31 = range(TURN + 1, TURN + 7, 2)
+DEPTH, COUNT, ORIENTATION = range(
+    N_GRADIENTS, N_GRADIENTS + 3
+)  # ORIENTATION: sign of the triangle's area, 0 if it is flat
+G_12, G_23, G_31 = range(ORIENTATION + 1, ORIENTATION + 7, 2)
 N_COLUMNS = G_31 + 2
 
 
@@ -72,9 +74,11 @@ def hull_response(exp: Callable) -> KernelResponse:
         is_nearer = new < sigma
         d_x, d_y, sigma = select(is_nearer, x, d_x), select(is_nearer, y, d_y), select(is_nearer, new, sigma)
         w_1, w_2, w_3 = select(is_nearer, f, w_1), select(is_nearer, ZERO, w_2), select(is_nearer, ONE - f, w_3)
-        turn = records[n, TURN]
-        turns = minimum(minimum(turn * side(o_1, o_2), turn * side(o_2, o_3)), turn * side(o_3, o_1))
-        inside = turns > ZERO
+        orientation = records[n, ORIENTATION]
+        from_inside = minimum(
+            minimum(orientation * side(o_1, o_2), orientation * side(o_2, o_3)), orientation * side(o_3, o_1)
+        )
+        inside = from_inside > ZERO
         d_x, d_y, sigma = select(inside, ZERO, d_x), select(inside, ZERO, d_y), select(inside, ZERO, sigma)
         return d_x, d_y, sigma, select(inside, ZERO, w_1), select(inside, ZERO, w_2), select(inside, ZERO, w_3)
 
@@ -156,7 +160,7 @@ def _records(conic_records: Callable, footprints: Footprints, dtype: np.dtype) -
     records[rows, G_12:N_COLUMNS:2], records[rows, G_12 + 1 : N_COLUMNS : 2] = Q_x * inverses, Q_y * inverses
     area = y[:, 0] * x[:, 2] - x[:, 0] * y[:, 2]  # twice
     is_flat = np.abs(area) <= FLAT * np.max(x * x + y * y, axis=1)
-    records[rows, TURN] = np.where(is_flat, 0, np.sign(area))
+    records[rows, ORIENTATION] = np.where(is_flat, 0, np.sign(area))
     return records
 
 

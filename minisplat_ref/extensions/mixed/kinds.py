@@ -33,7 +33,7 @@ EDGE = (-3 * ROOT_HALF_PI + math.sqrt(9 * math.pi / 2 + math.sqrt(3) * 2 * math.
 CORNERS = EDGE * np.array([-1 / math.sqrt(12), 0.5, -1 / math.sqrt(12), -0.5])  # the second and the third, whitened
 
 
-def whitened(population: MixedGaussians) -> Floats:
+def whiten_vertices(population: MixedGaussians) -> Floats:
     """Return the vertices [N, 3, 2] in deviations, in their plane."""
     return in_plane(population.vertices, counts(population)) * np.exp(-population.log_scales[:, None, :2])
 
@@ -47,7 +47,7 @@ def coverage(whitened_vertices: Floats, n_vertices: Ints) -> Floats:
     return covered
 
 
-def simplified(population: MixedGaussians, *, least: float, min_height: float) -> tuple[MixedGaussians, Bools]:
+def simplify_kinds(population: MixedGaussians, *, least: float, min_height: float) -> tuple[MixedGaussians, Bools]:
     """Return a population with fewer vertices where they make no difference, and which rows have changed, [N].
 
     Parameters
@@ -58,7 +58,7 @@ def simplified(population: MixedGaussians, *, least: float, min_height: float) -
     min_height : float
         Deviations: a triangle of a smaller altitude becomes the line of its longest edge.
     """
-    n, y = counts(population), whitened(population)
+    n, y = counts(population), whiten_vertices(population)
     places = in_plane(population.vertices, n)
     lengths = np.linalg.norm(np.roll(y, -1, axis=1) - y, axis=2)  # [N, 3] of the edges from k to k + 1
     lengths[n == 2, 1:] = 0  # of a line only the first counts
@@ -84,7 +84,7 @@ def simplified(population: MixedGaussians, *, least: float, min_height: float) -
     return simpler, changed
 
 
-def promoted(population: MixedGaussians, *, ratio: float, size_limit: float) -> tuple[MixedGaussians, Bools]:
+def promote_kinds(population: MixedGaussians, *, ratio: float, size_limit: float) -> tuple[MixedGaussians, Bools]:
     """Return a population in which needles have become lines and discs triangles, and which rows have changed, [N].
 
     Parameters

@@ -5,8 +5,8 @@ from functools import partial
 import numpy as np
 
 from minisplat_ref.extensions.mixed.kernels import response_for
-from minisplat_ref.extensions.mixed.kinds import promoted, simplified
-from minisplat_ref.extensions.mixed.population import MixedGaussians, counts, grouped
+from minisplat_ref.extensions.mixed.kinds import promote_kinds, simplify_kinds
+from minisplat_ref.extensions.mixed.population import MixedGaussians, counts, group_gaussians
 from minisplat_ref.extensions.mixed.projection import Hulls, footprints_of, footprints_vjp
 from minisplat_ref.extensions.mixed.response import RESPONSE, Footprints
 from minisplat_ref.mechanisms.payload.renderer import Payload, PayloadGradient, Projected, payload_renderer
@@ -42,7 +42,7 @@ def _footprints_vjp(projected: Projected, v: tuple[Floats, ...]) -> PayloadGradi
     return PayloadGradient(fields, found.means, found.quats, v_scales, found.cam_from_world_R, found.cam_from_world_t)
 
 
-def _listed(footprints: Footprints) -> Projection:
+def _list_boxes(footprints: Footprints) -> Projection:
     """Return the projection with ellipses that reach all tiles under the boxes of lines and triangles."""
     projection = footprints.projection
     conics = np.where((footprints.n_vertices > 1)[:, None], BOUNDLESS, projection.conics)
@@ -50,24 +50,24 @@ def _listed(footprints: Footprints) -> Projection:
 
 
 PAYLOAD = Payload(
-    "lines and triangles", RESPONSE, response_for, _is_plain, _footprints, _footprints_vjp, listed=_listed
+    "lines and triangles", RESPONSE, response_for, _is_plain, _footprints, _footprints_vjp, listed=_list_boxes
 )
 
 
 def simplify_hulls(state: TrainState, iteration: Iteration, *, least: float, min_height: float) -> str:
-    """Take vertices away where they make no difference; see :func:`minisplat_ref.extensions.mixed.kinds.simplified`."""
-    population, changed = simplified(state.gaussians, least=least, min_height=min_height)
-    return _changed(state, population, changed)
+    """Take vertices away where they make no difference, by :func:`.kinds.simplify_kinds`."""
+    population, changed = simplify_kinds(state.gaussians, least=least, min_height=min_height)
+    return _replace_population(state, population, changed)
 
 
 def promote(state: TrainState, iteration: Iteration, *, ratio: float, size_fraction: float) -> str:
-    """Make lines of needles and triangles of discs; see :func:`minisplat_ref.extensions.mixed.kinds.promoted`."""
+    """Make lines of needles and triangles of discs; see :func:`minisplat_ref.extensions.mixed.kinds.promote_kinds`."""
     size_limit = size_fraction * iteration.scene.extent
-    population, changed = promoted(state.gaussians, ratio=ratio, size_limit=size_limit)
-    return _changed(state, population, changed)
+    population, changed = promote_kinds(state.gaussians, ratio=ratio, size_limit=size_limit)
+    return _replace_population(state, population, changed)
 
 
-def _changed(state: TrainState, population: MixedGaussians, changed: Bools) -> str:
+def _replace_population(state: TrainState, population: MixedGaussians, changed: Bools) -> str:
     """Replace the population; what has changed its shape loses the moments of its shape."""
     state.gaussians = population
     for moment in (state.adam.first, state.adam.second):
@@ -80,7 +80,7 @@ def _changed(state: TrainState, population: MixedGaussians, changed: Bools) -> s
 MIXED_GAUSSIANS = Representation(
     "ellipses, lines and triangles",
     population=MixedGaussians,
-    extend=grouped,
+    extend=group_gaussians,
     renderer=payload_renderer("mixed", PAYLOAD),
     rates=Rates({"vertices": 2e-4, "n_vertices": 0.0}, frozenset({"vertices"})),
 )

@@ -54,7 +54,7 @@ def as_ellipses(gaussians: Gaussians) -> MixedGaussians:
     return MixedGaussians(**six, vertices=np.zeros((n, 4), dtype), n_vertices=np.ones(n, dtype))
 
 
-def grouped(gaussians: Gaussians, rng: np.random.Generator) -> MixedGaussians:
+def group_gaussians(gaussians: Gaussians, rng: np.random.Generator) -> MixedGaussians:
     """Return fewer primitives: each group of near Gaussians of like colour as an ellipse, a line or a triangle.
 
     A group has the mean opacity and colour of its members, and is as thick in all directions as they are on average,
@@ -96,7 +96,7 @@ def groups(points: Floats, lab: Floats) -> Ints:
     for i, j in _pairs(points, lab):
         a, b = sorted((group_of[i], group_of[j]))
         together = members[a] + members[b]
-        if a == b or len(together) > 3 or _spread(lab[together]) >= COLOR_DISTANCE:
+        if a == b or len(together) > 3 or _measure_spread(lab[together]) >= COLOR_DISTANCE:
             continue
         members[a], members[b] = sorted(together), []
         for k in together:
@@ -122,7 +122,7 @@ def _pairs(points: Floats, lab: Floats) -> list[list[int]]:
     return found
 
 
-def _spread(lab: Floats) -> float:
+def _measure_spread(lab: Floats) -> float:
     """Return the largest distance between two colours of a few."""
     return float(np.max(np.linalg.norm(lab[:, None] - lab[None], axis=2)))
 

@@ -116,8 +116,8 @@ def _inside(vertices: Floats, from_pixels: Floats) -> Bools:
     edges = np.stack([vertices[:, j] - vertices[:, i] for i, j in EDGES], axis=1)  # [G, 3, 2]
     area = _cross(edges[:, 0], -edges[:, 2])  # twice
     is_flat = np.abs(area) <= FLAT * np.max(np.sum(edges**2, axis=2), axis=1)
-    turns = np.where(is_flat, 0, np.sign(area))[:, None, None] * _cross(edges[:, :, None], -from_pixels)
-    inside: Bools = np.logical_and.reduce(turns > 0, axis=1)
+    from_inside = np.where(is_flat, 0, np.sign(area))[:, None, None] * _cross(edges[:, :, None], -from_pixels)
+    inside: Bools = np.logical_and.reduce(from_inside > 0, axis=1)
     return inside
 
 

@@ -22,7 +22,7 @@ def stages(backend: Backend, setting: Setting, rng: np.random.Generator) -> tupl
 
 
 def of_all_kinds(gaussians: Gaussians, rng: np.random.Generator) -> MixedGaussians:
-    """Return the Gaussians themselves as triangles, ellipses and lines in turn, with random vertices."""
+    """Return the Gaussians themselves as alternating triangles, ellipses and lines, with random vertices."""
     population, n = as_ellipses(gaussians), len(gaussians.means)
     in_deviations = SPAN * rng.normal(size=(n, 2, 2))
     vertices = in_deviations * np.exp(gaussians.log_scales[:, None, :2])

@@ -15,7 +15,7 @@ from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.multi_scale.levels import Plan, level_zero, with_levels
 from minisplat_ref.extensions.multi_scale.method import COVERAGE_MIN, LEVELS, finest_densities
 from minisplat_ref.extensions.shared_studies import psnr_of, tidy, with_progress
-from minisplat_ref.mechanisms.sampling import block_means, zoomed
+from minisplat_ref.mechanisms.sampling import block_means, zoom_camera
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import configured
@@ -72,7 +72,7 @@ def variants(scene: Scene, iterations: int, seed: int) -> dict[str, Variant]:
 
 def picture(variant: Variant, scene: Scene, i: int, n: int) -> Any:
     """Return test view ``i`` at 1/n of its size, with blend statistics."""
-    camera = zoomed(scene.test_views[i].camera, 1 / n)
+    camera = zoom_camera(scene.test_views[i].camera, 1 / n)
     request = Request(scene.background, conventions=variant.conventions, backend=CPU, wants=frozenset({"stats"}))
     return variant.renderer.render(Model(variant.gaussians), view_from(camera), request)[0]
 

@@ -81,7 +81,7 @@ def with_levels(
         ids, labels = _in_common_cells(g.means, 1 / density, is_small)
         if len(ids) == 0:
             continue
-        merged, sides, members = _merged(take(g, ids), labels), 1 / density[ids], front[ids]
+        merged, sides, members = _merge_members(take(g, ids), labels), 1 / density[ids], front[ids]
         first = np.unique(labels, return_index=True)[1]  # [C] a member of each cell
         merged = merged._replace(cells=_cells(sides[first], gaussians.cells.dtype))
         gaussians.cells[members, 1] = sides
@@ -101,7 +101,7 @@ def _in_common_cells(means: Floats, sides: Floats, is_small: Any) -> tuple[Ints,
     return ids[is_shared], np.unique(labels[is_shared], return_inverse=True)[1]
 
 
-def _merged(members: MultiScaleGaussians, labels: Ints) -> MultiScaleGaussians:
+def _merge_members(members: MultiScaleGaussians, labels: Ints) -> MultiScaleGaussians:
     """Return one Gaussian per label, with moments weighted by the light that the members stop."""
     masses = np.maximum(optical_masses(members), np.finfo(np.float64).tiny)
     merged: Any = merge_clusters(members, masses, labels).gaussians

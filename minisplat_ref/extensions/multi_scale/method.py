@@ -8,7 +8,7 @@ import numpy as np
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.multi_scale.levels import MultiScaleGaussians, Plan, level_zero, with_levels
 from minisplat_ref.extensions.multi_scale.reference import are_shown, pixel_densities
-from minisplat_ref.mechanisms.sampling import block_means, sampling_intervals, zoomed
+from minisplat_ref.mechanisms.sampling import block_means, sampling_intervals, zoom_camera
 from minisplat_ref.methods.gaussian_splatting import GS
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
 from minisplat_ref.strategy.ops import NO_PARENT, Edit, n_rows
@@ -90,7 +90,7 @@ def coarse(
     mask = None if view.mask is None else block_means(view.mask[..., None].astype(np.float32), n)[..., 0] == 1
     if mask is not None and not mask.any():
         return 0.0, Cotangents()
-    small = view_from(zoomed(view.camera, 1 / n), time=view.time)
+    small = view_from(zoom_camera(view.camera, 1 / n), time=view.time)
     output, tape = render(model, small, request._replace(wants=frozenset()))
     target = block_means(view.image.astype(np.float32) / 255, n).astype(output.image.dtype)
     loss, loss_tape = request.backend.photometric_loss(output.image, target, dssim_weight, mask)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from minisplat_ref.backends import Backend
-from minisplat_ref.extensions.negative.reference import negated
+from minisplat_ref.extensions.negative.reference import negate
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
 from minisplat_ref.training.representation import Representation
@@ -25,7 +25,7 @@ from minisplat_ref.types import Camera, Floats, Gaussians, Ints, Model, RenderOu
 FRACTION = 0.2  # of the Gaussians start negative: reported as best for the paper's scenes
 
 
-def signed_colors(
+def compute_signed_colors(
     backend: Backend, means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int, radii: Ints
 ) -> Floats:
     """Return colours towards the camera without a clamp, ``c = 0.5 + sum_k c_k Y_k(d)``.
@@ -43,7 +43,7 @@ def signed_colors(
         RGB of either sign; zero for culled rows.
     """
     colors = backend.sh_colors(means, sh_dc, sh_rest, camera, degree, radii)  # u [N, 3]
-    rows = _clamped_rows(colors, radii)
+    rows = _find_clamped(colors, radii)
     if len(rows) > 0:
         upper = colors[rows]  # [M, 3]
         own = np.broadcast_to(degree, len(means))[rows]  # [M]
@@ -52,7 +52,7 @@ def signed_colors(
     return colors
 
 
-def signed_colors_vjp(
+def compute_signed_colors_vjp(
     backend: Backend,
     means: Floats,
     sh_dc: Floats,
@@ -62,7 +62,7 @@ def signed_colors_vjp(
     radii: Ints,
     v_colors: Floats,
 ) -> SHGradient:
-    """Gradient of :func:`signed_colors`.
+    """Gradient of :func:`compute_signed_colors`.
 
     ::
 
@@ -72,13 +72,13 @@ def signed_colors_vjp(
     Parameters
     ----------
     backend, means, sh_dc, sh_rest, camera, degree, radii
-        As for :func:`signed_colors`.
+        As for :func:`compute_signed_colors`.
     v_colors : ndarray of shape (N, 3)
         Derivative with respect to the colours.
     """
     v = backend.sh_colors_vjp(means, sh_dc, sh_rest, camera, degree, radii, v_colors)  # zero where u = 0
     colors = backend.sh_colors(means, sh_dc, sh_rest, camera, degree, radii)  # u [N, 3]
-    rows = _clamped_rows(colors, radii)
+    rows = _find_clamped(colors, radii)
     if len(rows) == 0:
         return v
     v_lower = np.where(colors[rows] == 0, -v_colors[rows], v_colors.dtype.type(0))  # [M, 3]
@@ -93,24 +93,24 @@ def signed_colors_vjp(
     )
 
 
-def _clamped_rows(upper: Floats, radii: Ints) -> Ints:
+def _find_clamped(upper: Floats, radii: Ints) -> Ints:
     """Return the rows [M] of visible Gaussians with a channel of u [N, 3] at zero; the others need no second call."""
     return np.flatnonzero((radii[:, 0] > 0) & (upper == 0).any(axis=1))
 
 
-def signed(backend: Backend) -> Backend:
+def with_signed_colors(backend: Backend) -> Backend:
     """Return the backend with colours of either sign."""
     return replace(
         backend,
         name=f"{backend.name} with signed colours",
-        sh_colors=partial(signed_colors, backend),
-        sh_colors_vjp=partial(signed_colors_vjp, backend),
+        sh_colors=partial(compute_signed_colors, backend),
+        sh_colors_vjp=partial(compute_signed_colors_vjp, backend),
     )
 
 
 def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
     """Draw the view as 3DGS does, with colours of either sign; the tape keeps the backend for the gradient."""
-    return SPLATTING.render(model, view, request._replace(backend=signed(request.backend)))
+    return SPLATTING.render(model, view, request._replace(backend=with_signed_colors(request.backend)))
 
 
 def with_negatives(gaussians: Gaussians, rng: np.random.Generator, *, fraction: float) -> Gaussians:
@@ -128,7 +128,7 @@ def with_negatives(gaussians: Gaussians, rng: np.random.Generator, *, fraction: 
     n = len(gaussians.means)
     rows = rng.choice(n, size=round(fraction * n), replace=False)
     sh_dc, sh_rest = gaussians.sh_dc.copy(), gaussians.sh_rest.copy()
-    sh_dc[rows], sh_rest[rows] = negated(sh_dc[rows], sh_rest[rows])
+    sh_dc[rows], sh_rest[rows] = negate(sh_dc[rows], sh_rest[rows])
     return gaussians._replace(sh_dc=sh_dc, sh_rest=sh_rest)
 
 

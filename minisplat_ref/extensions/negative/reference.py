@@ -94,7 +94,7 @@ def largest_weight(mean0: Floats, covariance0: Floats, mean1: Floats, covariance
     return float(np.sqrt(np.linalg.det(covariance1) / np.linalg.det(covariance0)) * np.exp(-0.5 * exponent))
 
 
-def negated(sh_dc: Floats, sh_rest: Floats) -> tuple[Floats, Floats]:
+def negate(sh_dc: Floats, sh_rest: Floats) -> tuple[Floats, Floats]:
     """Return the coefficients of the colour -c, where ``c(d) = 0.5 + sum_k c_k Y_k(d)``.
 
     ::

@@ -29,7 +29,7 @@ class Decoder(NamedTuple):
         return (self.mean.astype(np.float32) + features.astype(np.float32) @ directions).astype(np.float32)
 
 
-def fitted_decoder(harmonics: Floats, n_features: int) -> Decoder:
+def fit_decoder(harmonics: Floats, n_features: int) -> Decoder:
     """Return the linear decoder of harmonics [N, D] with the least squared error.
 
     Parameters

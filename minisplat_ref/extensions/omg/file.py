@@ -23,7 +23,7 @@ import numpy as np
 
 from minisplat_ref.constants import SH_DEGREE_MAX
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions.omg.appearance import Decoder, features_of, fitted_decoder
+from minisplat_ref.extensions.omg.appearance import Decoder, features_of, fit_decoder
 from minisplat_ref.extensions.omg.svq import Quantised, quantise
 from minisplat_ref.io.formats import Format
 from minisplat_ref.mechanisms.packing.container import WAY_OUT, Container, Packed, is_count, pack, parse, unpack
@@ -90,7 +90,7 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
     rows = Gaussians(*(np.asarray(field, np.float64)[order] for field in gaussians))
     harmonics = rows.sh_rest.reshape(n, 3 * n_rest)
     _halves(harmonics, "sh_rest")
-    decoder = fitted_decoder(harmonics, sizes.n_features)
+    decoder = fit_decoder(harmonics, sizes.n_features)
     features = features_of(harmonics, decoder)
     quats = rows.quats / np.linalg.norm(rows.quats, axis=1, keepdims=True)
     vectors = {
@@ -168,7 +168,7 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
         The file is damaged, or of another kind or version.
     """
     packed = parse(CONTAINER, content, source)
-    header = _checked(packed)
+    header = _check_header(packed)
     n, n_rest = header.n, (header.sh_degree + 1) ** 2 - 1
     differences = unzigzag(_planes(packed, header, "means", 3))
     ordered = np.cumsum(differences, axis=0)
@@ -220,7 +220,7 @@ def _vectors(packed: Packed, header: _Header, name: str) -> Floats:
     return Quantised(tuple(codes), indices).vectors()
 
 
-def _checked(packed: Packed) -> _Header:
+def _check_header(packed: Packed) -> _Header:
     """Return the header after checking every value that is read."""
     values = {name: packed.header.get(name) for name in _Header._fields}
     n, degree, level, center, n_features, codes, planes = values.values()
@@ -258,7 +258,7 @@ def describe(content: bytes, source: str | Path) -> list[tuple[str, str]]:
     InputError
         The header is refused, as by :func:`decode`.
     """
-    header = _checked(parse(CONTAINER, content, source))
+    header = _check_header(parse(CONTAINER, content, source))
     rows = [("level", f"{header.level} of {len(LEVELS) - 1}")]
     rows += [("centres", "half floats of the offset from the median")]
     rows += [(name, f"{', '.join(map(str, counts))} codes") for name, counts in header.codes.items()]

@@ -53,13 +53,13 @@ def quantise(vectors: Floats, width: int, n_codes: int) -> Quantised:
     codes, indices = [], []
     for begin in range(0, vectors.shape[1], width):
         part = vectors[:, begin : begin + width].astype(np.float64)
-        book = np.unique(fitted_codes(part, n_codes).astype(np.float16), axis=0)
+        book = np.unique(fit_codes(part, n_codes).astype(np.float16), axis=0)
         codes.append(book)
         indices.append(_nearest(book.astype(np.float64), part))
     return Quantised(tuple(codes), np.stack(indices, axis=1))
 
 
-def fitted_codes(vectors: Floats, n_codes: int) -> Floats:
+def fit_codes(vectors: Floats, n_codes: int) -> Floats:
     """Return at most K codes [K, w] for vectors [N, w]; if no more than K vectors differ, these are the codes."""
     different = np.unique(vectors[:: -(-len(vectors) // SAMPLES_MAX) or 1], axis=0)
     if len(different) <= n_codes:

@@ -11,11 +11,11 @@ from minisplat_ref.mechanisms.tangent.planes import hit, project
 from minisplat_ref.mechanisms.tangent.rays import (
     METHODS,
     color_changes,
+    count_misordered,
     ewa_hits,
-    misordered_pairs,
     tangent_hits,
-    translated,
-    yawed,
+    translate_camera,
+    yaw_camera,
 )
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.reference.hits import blending_order
@@ -62,12 +62,12 @@ def rotation(n: int, n_steps: int, seed: int, conventions: Conventions = GSPLAT_
     """
     primitives, colors = cloud(n, np.random.default_rng(seed))
     camera, rays = wide_camera(), rays_ahead(8, 18.0)
-    yaws = [yawed(camera, yaw) for yaw in np.radians(np.linspace(-20, 20, n_steps + 1))]
+    yaws = [yaw_camera(camera, yaw) for yaw in np.radians(np.linspace(-20, 20, n_steps + 1))]
     found: dict[str, dict[str, Any]] = {}
     for method in with_progress(METHODS, "methods"):
         found[method] = {"yaw": color_changes(method, primitives, colors, yaws, rays, conventions)[0].tolist()}
         for name, k in WALKS.items():
-            path = [translated(camera, dx) for dx in np.linspace(0, WALK, k * WALK_STEPS + 1)]
+            path = [translate_camera(camera, dx) for dx in np.linspace(0, WALK, k * WALK_STEPS + 1)]
             worst, mean = color_changes(method, primitives, colors, path, rays, conventions)
             found[method] |= {f"{name}_worst": float(worst.max()), f"{name}_mean": float(mean.max())}
     return found
@@ -111,7 +111,7 @@ def projection_errors(n: int, seed: int) -> dict[str, list[float]]:
     camera = wide_camera(170.0, 2000, 2000)
     found: dict[str, list[float]] = {"EWA": [], "tangent planes": []}
     for angle in with_progress(ANGLES, "angles"):
-        seen = yawed(camera, np.radians(angle))  # so that what lay ahead is off the axis
+        seen = yaw_camera(camera, np.radians(angle))  # so that what lay ahead is off the axis
         in_camera = rays @ seen.cam_from_world_R.T
         is_ahead = in_camera[:, 2] > 0.05
         for name, hits in (("EWA", ewa_hits), ("tangent planes", tangent_hits)):
@@ -159,7 +159,7 @@ def orders(primitives: Primitives, colors: Floats, camera: Camera, centers: Floa
             a, depths = (np.take_along_axis(array[listed], order, axis=0) for array in (alphas, found.depths))
             T = np.cumprod(np.concatenate([np.ones((1, a.shape[1])), 1 - a]), axis=0)
             pictures[name].append(np.einsum("gp,gpd->pd", a * T[:-1], colors[ids[listed]][order]))
-            n_pairs, n_wrong = misordered_pairs(a > 0, depths)
+            n_pairs, n_wrong = count_misordered(a > 0, depths)
             pairs[name], wrong[name] = pairs[name] + n_pairs, wrong[name] + n_wrong
     exact = np.concatenate(pictures["exact"])
     result = []

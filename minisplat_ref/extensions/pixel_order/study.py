@@ -120,14 +120,14 @@ def _of_run(ply: Path) -> "tuple[Primitives, Floats, Camera]":
     from minisplat_ref.constants import SH_C0
     from minisplat_ref.io import viewpoints
     from minisplat_ref.io.ply import load_ply
-    from minisplat_ref.rendering import activated
+    from minisplat_ref.rendering import activate
 
     gaussians = load_ply(ply)
     cameras = [view.camera for view in viewpoints.read(ply.parent / "cameras.json") if view.split == "test"]
     if not cameras or not len(gaussians.means):
         raise InputError(f"{ply} has no Gaussians, or its cameras.json no test views: give the PLY of a run")
     wide = gaussians._make(field.astype(np.float64) for field in gaussians)
-    return activated(wide), np.maximum(0.5 + SH_C0 * wide.sh_dc, 0), cameras[0]
+    return activate(wide), np.maximum(0.5 + SH_C0 * wide.sh_dc, 0), cameras[0]
 
 
 ROTATION = Study(

@@ -25,10 +25,10 @@ from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.extensions.polygons.kernels import RESPONSE, Fans, scene_of
 from minisplat_ref.extensions.polygons.method import TRACED
-from minisplat_ref.extensions.polygons.soup import Soup, carried, soup_of
+from minisplat_ref.extensions.polygons.soup import Soup, carry_gaussians, soup_of
 from minisplat_ref.extensions.shared_studies import tidy
-from minisplat_ref.mechanisms.editing.deformation import Deformation, deformed
-from minisplat_ref.mechanisms.meshes.fans import Flat, by_gram_schmidt, fitted, fitted_spans, flattened, rims
+from minisplat_ref.mechanisms.editing.deformation import Deformation, deform
+from minisplat_ref.mechanisms.meshes.fans import Flat, by_gram_schmidt, fit_flat_gaussians, fit_spans, flatten, rims
 from minisplat_ref.mechanisms.rays.kernels import tracer_of
 from minisplat_ref.mechanisms.rays.pixel_rays import pixel_rays
 from minisplat_ref.reference.covariance import rotation_matrices
@@ -43,7 +43,7 @@ MAPS = {
     "stretch": np.diag([0.5, 1.0, 1.6]),
     "shear": np.array([[1.0, 0.8, -0.3], [0.0, 1.0, 0.5], [0.2, 0.0, 1.0]]),
 }
-WAYS: dict[str, Callable[[Floats, Floats], Flat]] = {"fit": fitted, "Gram-Schmidt": by_gram_schmidt}
+WAYS: dict[str, Callable[[Floats, Floats], Flat]] = {"fit": fit_flat_gaussians, "Gram-Schmidt": by_gram_schmidt}
 SIDES = (3, 4, 8, 16)
 N = 200  # Gaussians of a cloud
 ANGLES = (5, 10, 20, 45, 90, 180, 360)  # degrees that a sheet is bent by
@@ -68,14 +68,14 @@ def cloud(rng: np.random.Generator) -> Gaussians:
 def round_trips(seed: int) -> dict[int, float]:
     """Return by the number of sides the largest distance of a corner from itself after the way to a Gaussian and back.
 
-    Relative to the largest coordinate, of polygons with turned, long and thin, and round Gaussians.
+    Relative to the largest coordinate, of polygons with rotated, long and thin, and round Gaussians.
     """
     gaussians, worst = cloud(np.random.default_rng(seed)), {}
     gaussians.log_scales[::4, 1] = gaussians.log_scales[::4, 0]
     gaussians.log_scales[1::4, 1] -= 7
     for n_sides in SIDES:
         soup = soup_of(gaussians, n_sides)
-        back = fitted(soup.corners, soup.radii)
+        back = fit_flat_gaussians(soup.corners, soup.radii)
         again = rims(back.means, back.spans, soup.radii, n_sides)
         worst[n_sides] = float(np.abs(again - soup.corners).max() / np.abs(soup.corners).max())
     return worst
@@ -90,9 +90,9 @@ def affine_errors(name: str, seed: int) -> dict[str, float]:
     centre = np.array([0.0, 0, 4])
     soup, shift = soup_of(before, 8), centre - A @ centre
     corners = soup.corners @ A.T + shift
-    after, _ = carried(before, soup, corners, name)
-    direct = deformed(before, before.means @ A.T + shift, Deformation(A[None], np.zeros(N, int)))
-    spans = A @ flattened(before.means, before.quats, before.log_scales).spans
+    after, _ = carry_gaussians(before, soup, corners, name)
+    direct = deform(before, before.means @ A.T + shift, Deformation(A[None], np.zeros(N, int)))
+    spans = A @ flatten(before.means, before.quats, before.log_scales).spans
     expected = (spans @ np.swapaxes(spans, 1, 2))[soup.rows]
     errors = {}
     for way, inverse in WAYS.items():
@@ -169,14 +169,14 @@ def bend_errors(n: int, angle: float) -> dict[str, float]:
     gaussians = sheet(n)
     soup = soup_of(gaussians, 8)
     corners = placed(bent(soup.corners, angle))
-    centres, spans = fitted_spans(corners, soup.radii)
+    centres, spans = fit_spans(corners, soup.radii)
     paper = by_gram_schmidt(corners, soup.radii)
     spread = np.sqrt(np.mean((corners - centres[:, None]) ** 2))
     errors = {
         f"corners, {way}": float(np.sqrt(np.mean((rims(centres, S, soup.radii) - corners) ** 2)) / spread)
         for way, S in zip(WAYS, (spans, paper.spans), strict=True)
     }
-    after, _ = carried(gaussians, soup, corners, "the bent sheet")
+    after, _ = carry_gaussians(gaussians, soup, corners, "the bent sheet")
     black = np.full_like(gaussians.sh_dc, -10.0)
     for name, sh_dc in (("light that passes", black), ("colours", gaussians.sh_dc)):
         found = picture(after._replace(sh_dc=sh_dc))
@@ -204,7 +204,7 @@ def draw(result: dict[str, Any]) -> Figure:
     gaussians, angle = sheet(USUAL_PER_SIDE), 180
     soup = soup_of(gaussians, 8)
     corners = placed(bent(soup.corners, angle))
-    fitting, _ = carried(gaussians, soup, corners, "the bent sheet")
+    fitting, _ = carry_gaussians(gaussians, soup, corners, "the bent sheet")
     pictures = {
         f"polygons bent by {angle}°": picture_of_soup(gaussians, soup, corners),
         "the Gaussians that fit": picture(fitting),

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from minisplat_ref.extensions.polygons.soup import carried, load_corners, soup_of
+from minisplat_ref.extensions.polygons.soup import carry_gaussians, load_corners, soup_of
 from minisplat_ref.io.ply import save_ply
 from minisplat_ref.mechanisms.editing.model_file import load_model
 
@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     gaussians = load_model(args.model)
     n_polygons = len(soup_of(gaussians, 3).rows)
     corners = load_corners(args.soup, n_polygons)
-    edited, n_edited = carried(gaussians, soup_of(gaussians, corners.shape[1]), corners, args.soup)
+    edited, n_edited = carry_gaussians(gaussians, soup_of(gaussians, corners.shape[1]), corners, args.soup)
     save_ply(args.out, edited)
     print(f"{n_edited:,} of {len(gaussians.means):,} Gaussians follow their polygons, in {args.out}")
     return 0

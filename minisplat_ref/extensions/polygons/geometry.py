@@ -1,13 +1,13 @@
 """Flat Gaussians before they are traced, as polygons, beside the gradient.
 
-Both backends use these: they are of the size of the population, and no loop over pairs.
+Both backends use these: they are of the size of the population, and no loop over intersections.
 """
 
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.mechanisms.meshes.fans import N_SIDES, flattened, opacity_radii, plane_axes
+from minisplat_ref.mechanisms.meshes.fans import N_SIDES, flatten, opacity_radii, plane_axes
 from minisplat_ref.reference.covariance import rotation_matrices_vjp
 from minisplat_ref.types import Floats
 
@@ -39,7 +39,7 @@ def polygons_of(population: Any, opacities: Floats, n_sides: int = N_SIDES) -> P
     n_sides : int
         3 or more.
     """
-    flat = flattened(population.means, population.quats, population.log_scales)
+    flat = flatten(population.means, population.quats, population.log_scales)
     return Polygons(flat.means, flat.spans, opacity_radii(population.opacity_logits), opacities, n_sides)
 
 

@@ -6,7 +6,7 @@ from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.extensions.polygons.geometry import Polygons, polygons_of, spans_vjp
 from minisplat_ref.extensions.polygons.kernels import RESPONSE, fans_of, scene_of
-from minisplat_ref.extensions.polygons.reference import meeting_of
+from minisplat_ref.extensions.polygons.reference import prepare_meeting
 from minisplat_ref.mechanisms.rays import blending, kernels
 from minisplat_ref.mechanisms.rays.pixel_rays import Tracer
 from minisplat_ref.mechanisms.rays.renderer import Traced, renderer_of
@@ -21,11 +21,11 @@ def tracer_for(polygons: Polygons, conventions: Conventions, backend: Backend) -
     """Return how a backend traces: every ray against every polygon, or kernels with a tree of all triangles."""
     if backend.is_compiled:
         return kernels.tracer_of(RESPONSE, scene_of(fans_of(polygons), conventions))
-    return blending.tracer_of(meeting_of(polygons))
+    return blending.tracer_of(prepare_meeting(polygons))
 
 
-def pressed_flat(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
-    """Return the Gaussians with a thickness of 1e-5 along their thinnest axes; balls are turned at random first.
+def press_flat(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
+    """Return the Gaussians with a thickness of 1e-5 along their thinnest axes; balls are rotated at random first.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def pressed_flat(gaussians: Gaussians, rng: np.random.Generator) -> Gaussians:
 
 TRACED = Representation(
     "flat Gaussians in polygons",
-    extend=pressed_flat,
+    extend=press_flat,
     renderer=renderer_of(Traced("polygons", polygons_of, tracer_for, spans_vjp)),
 )
 

@@ -19,13 +19,13 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.extensions.polygons.geometry import Polygons
-from minisplat_ref.mechanisms.rays.blending import Meeting, PairGradient
+from minisplat_ref.mechanisms.rays.blending import IntersectionGradient, Meeting
 from minisplat_ref.mechanisms.rays.pixel_rays import Rays
 from minisplat_ref.types import Bools, Floats, Ints
 
 
-class Pairs(NamedTuple):
-    """Rays and polygons that meet, pair by pair."""
+class Intersections(NamedTuple):
+    """Rays and polygons that meet, one by one."""
 
     x: Floats  # [H, 3] from mu to the place
     places: Floats  # [H, 2] u, v
@@ -33,8 +33,8 @@ class Pairs(NamedTuple):
     unclamped: Floats  # [H] o exp(-(u^2 + v^2) / 2), 0 outside of the polygon
 
 
-def meet(polygons: Polygons, rays: Rays, ray_ids: Ints, gaussian_ids: Ints) -> Pairs:
-    """Evaluate flat Gaussians on rays, pair by pair.
+def meet(polygons: Polygons, rays: Rays, ray_ids: Ints, gaussian_ids: Ints) -> Intersections:
+    """Evaluate flat Gaussians on rays, one by one.
 
     Parameters
     ----------
@@ -43,11 +43,11 @@ def meet(polygons: Polygons, rays: Rays, ray_ids: Ints, gaussian_ids: Ints) -> P
     rays : Rays
         P rays.
     ray_ids, gaussian_ids : ndarray of shape (H,)
-        The pairs.
+        The found.
 
     Returns
     -------
-    Pairs
+    Intersections
         t in units of the ray's direction.
     """
     S, d = polygons.spans[gaussian_ids], rays.directions[ray_ids]  # [H, 3, 2], [H, 3]
@@ -59,13 +59,13 @@ def meet(polygons: Polygons, rays: Rays, ray_ids: Ints, gaussian_ids: Ints) -> P
         places = np.einsum("hi,hik->hk", x, S) / np.sum(S * S, axis=1)
         unclamped = polygons.opacities[gaussian_ids] * np.exp(-0.5 * np.sum(places**2, axis=1))
         is_hit = is_inside(places, polygons.radii[gaussian_ids], polygons.n_sides)
-    return Pairs(x, places, t, np.where(is_hit, unclamped, 0.0))
+    return Intersections(x, places, t, np.where(is_hit, unclamped, 0.0))
 
 
 def is_inside(places: Floats, radii: Floats, n_sides: int) -> Bools:
     """Return whether places (u, v) [H, 2] lie in polygons of radii [H], their edges included."""
     psi = (2 * np.arange(n_sides) + 1) * np.pi / n_sides
-    is_in: Bools = (radii > 0) & (np.abs(places) <= radii[:, None]).all(axis=1)  # few pairs go on from here
+    is_in: Bools = (radii > 0) & (np.abs(places) <= radii[:, None]).all(axis=1)  # few are left
     near = np.flatnonzero(is_in)
     outermost = np.max(places[near] @ np.array([np.cos(psi), np.sin(psi)]), axis=1)
     is_in[near] = outermost <= radii[near] * np.cos(np.pi / n_sides)
@@ -74,8 +74,8 @@ def is_inside(places: Floats, radii: Floats, n_sides: int) -> Bools:
 
 def meet_vjp(
     polygons: Polygons, rays: Rays, ray_ids: Ints, gaussian_ids: Ints, v_unclamped: Floats, v_depths: Floats
-) -> PairGradient:
-    """Gradient of :func:`meet`, of pairs that meet.
+) -> IntersectionGradient:
+    """Gradient of :func:`meet`, where they meet.
 
     With the spans S_k, k = a, b, the places u_k and the offset ``m = mu - O``::
 
@@ -95,28 +95,28 @@ def meet_vjp(
 
     Returns
     -------
-    PairGradient
+    IntersectionGradient
         Its shapes are with respect to the spans, [H, 3, 2].
     """
-    pairs = meet(polygons, rays, ray_ids, gaussian_ids)
-    S, d, x, t = polygons.spans[gaussian_ids], rays.directions[ray_ids], pairs.x, pairs.depths[:, None]
+    found = meet(polygons, rays, ray_ids, gaussian_ids)
+    S, d, x, t = polygons.spans[gaussian_ids], rays.directions[ray_ids], found.x, found.depths[:, None]
     n, squares = np.cross(S[:, :, 0], S[:, :, 1]), np.sum(S * S, axis=1)  # [H, 3], [H, 2]
-    v_u = -(pairs.unclamped * v_unclamped)[:, None] * pairs.places / squares  # [H, 2] over |S_k|^2
+    v_u = -(found.unclamped * v_unclamped)[:, None] * found.places / squares  # [H, 2] over |S_k|^2
     v_x = np.einsum("hik,hk->hi", S, v_u)
     w = ((v_depths + np.sum(v_x * d, axis=1)) / np.sum(n * d, axis=1))[:, None]
     v_n = -w * x
-    v_S = v_u[:, None, :] * (x[:, :, None] - 2 * pairs.places[:, None, :] * S)
+    v_S = v_u[:, None, :] * (x[:, :, None] - 2 * found.places[:, None, :] * S)
     v_S += np.stack([np.cross(S[:, :, 1], v_n), np.cross(v_n, S[:, :, 0])], axis=2)
     v_m = w * n - v_x
-    v_opacities = pairs.unclamped / polygons.opacities[gaussian_ids] * v_unclamped
-    return PairGradient(v_m, v_S, v_opacities, -v_m, -t * v_m)
+    v_opacities = found.unclamped / polygons.opacities[gaussian_ids] * v_unclamped
+    return IntersectionGradient(v_m, v_S, v_opacities, -v_m, -t * v_m)
 
 
-def meeting_of(polygons: Polygons) -> Meeting:
+def prepare_meeting(polygons: Polygons) -> Meeting:
     """Return how rays meet these polygons."""
 
     def alphas_and_depths(rays: Rays, ray_ids: Ints, gaussian_ids: Ints) -> tuple[Floats, Floats]:
-        pairs = meet(polygons, rays, ray_ids, gaussian_ids)
-        return pairs.unclamped, pairs.depths
+        found = meet(polygons, rays, ray_ids, gaussian_ids)
+        return found.unclamped, found.depths
 
     return Meeting(len(polygons.means), alphas_and_depths, lambda *args: meet_vjp(polygons, *args))

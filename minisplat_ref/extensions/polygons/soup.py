@@ -5,10 +5,10 @@ the opacity and the colour of degree 0 of its Gaussian. Gaussians that are too f
 (:func:`~minisplat_ref.mechanisms.meshes.fans.opacity_radii`), nor are those of no finite size.
 
 After an edit, face m says which vertices are the corners of polygon m, in the order in which they were written. What an
-edit changed is fitted (:func:`~minisplat_ref.mechanisms.meshes.fans.fitted`): means, quaternions and scales. The
-thickness keeps its ratio to the smaller of the two scales, so that the plane stays the plane. Higher harmonics are
-turned by the rotation that is nearest to what happened to the plane. Opacities, and with them the radii, stay. A
-polygon has two sides that look the same: a mirrored one counts as turned over, and colours are never mirrored.
+edit changed is fitted (:func:`~minisplat_ref.mechanisms.meshes.fans.fit_flat_gaussians`): means, quaternions and
+scales. The thickness keeps its ratio to the smaller of the two scales, so that the plane stays the plane. Higher
+harmonics are turned by the rotation that is nearest to what happened to the plane. Opacities, and with them the radii,
+stay. A polygon has two sides that look the same: a mirrored one counts as turned over, and colours are never mirrored.
 """
 
 from pathlib import Path
@@ -23,11 +23,11 @@ from minisplat_ref.io.ply import COLORS, MEANS, check_finite
 from minisplat_ref.io.ply_faces import read_faces
 from minisplat_ref.io.ply_file import read_vertices, write_vertices
 from minisplat_ref.mechanisms.editing.deformation import polar_rotations, quaternions
-from minisplat_ref.mechanisms.editing.sh_rotation import rotated_sh
+from minisplat_ref.mechanisms.editing.sh_rotation import rotate_sh
 from minisplat_ref.mechanisms.meshes.fans import (
-    fitted,
-    fitted_spans,
-    flattened,
+    fit_flat_gaussians,
+    fit_spans,
+    flatten,
     min_widths,
     opacity_radii,
     plane_axes,
@@ -52,7 +52,7 @@ class Soup(NamedTuple):
 
 def soup_of(gaussians: Gaussians, n_sides: int) -> Soup:
     """Return the polygons of a model, of those Gaussians that have one."""
-    flat = flattened(gaussians.means, gaussians.quats, gaussians.log_scales)
+    flat = flatten(gaussians.means, gaussians.quats, gaussians.log_scales)
     radii = opacity_radii(gaussians.opacity_logits)
     has_size = np.isfinite(flat.scales).all(axis=1) & (flat.scales > 0).all(axis=1)
     rows = np.flatnonzero((radii > 0) & has_size)
@@ -134,7 +134,7 @@ def load_corners(path: str | Path, n_polygons: int) -> NDArray:
     return edited
 
 
-def carried(gaussians: Gaussians, soup: Soup, corners: Floats, source: str | Path) -> tuple[Gaussians, int]:
+def carry_gaussians(gaussians: Gaussians, soup: Soup, corners: Floats, source: str | Path) -> tuple[Gaussians, int]:
     """Return the Gaussians after an edit of their polygons, and how many it changed.
 
     Parameters
@@ -174,8 +174,8 @@ def carried(gaussians: Gaussians, soup: Soup, corners: Floats, source: str | Pat
         )
     columns = plane_axes(gaussians.log_scales[rows])
     before, now = (
-        flattened(gaussians.means[rows], gaussians.quats[rows], gaussians.log_scales[rows]),
-        fitted(after, radii),
+        flatten(gaussians.means[rows], gaussians.quats[rows], gaussians.log_scales[rows]),
+        fit_flat_gaussians(after, radii),
     )
     R = np.empty((len(rows), 3, 3))
     np.put_along_axis(R, columns[:, None, :], now.axes, axis=2)
@@ -183,12 +183,12 @@ def carried(gaussians: Gaussians, soup: Soup, corners: Floats, source: str | Pat
     thin = np.take_along_axis(gaussians.log_scales[rows], columns[:, 2:], axis=1)[:, 0] + shrinkage
     log_scales = np.empty((len(rows), 3))
     np.put_along_axis(log_scales, columns, np.column_stack([np.log(now.scales), thin]), axis=1)
-    Q = polar_rotations(_plane_maps(before.axes, before.scales, fitted_spans(after, radii)[1]))
+    Q = polar_rotations(_plane_maps(before.axes, before.scales, fit_spans(after, radii)[1]))
     fields = {
         "means": now.means,
         "quats": quaternions(R),
         "log_scales": log_scales,
-        "sh_rest": rotated_sh(gaussians.sh_rest[rows], Q, np.arange(len(rows))),
+        "sh_rest": rotate_sh(gaussians.sh_rest[rows], Q, np.arange(len(rows))),
     }
     result = {}
     for name, values in fields.items():

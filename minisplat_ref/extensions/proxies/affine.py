@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.mechanisms.editing.deformation import Deformation, deformed
+from minisplat_ref.mechanisms.editing.deformation import Deformation, deform
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.types import Bools, Floats, Gaussians
 
@@ -73,7 +73,7 @@ def in_ball(means: Floats, centre: Floats, radius: float) -> Bools:
     return np.linalg.norm(means - centre, axis=1) <= radius
 
 
-def edited(gaussians: Gaussians, affine: Affine, is_selected: Bools) -> Gaussians:
+def edit_gaussians(gaussians: Gaussians, affine: Affine, is_selected: Bools) -> Gaussians:
     """Return the Gaussians with x -> A x + b applied to a selection.
 
     Parameters
@@ -108,7 +108,7 @@ def edited(gaussians: Gaussians, affine: Affine, is_selected: Bools) -> Gaussian
     means = gaussians.means.astype(np.float64)
     is_identity = np.array_equal(A, np.eye(3)) and not b.any()
     moved = means if is_identity else np.where(is_selected[:, None], means @ A.T + b, means)
-    return deformed(gaussians, moved, maps)
+    return deform(gaussians, moved, maps)
 
 
 def check_selected(is_selected: Bools, source: str | Path) -> None:

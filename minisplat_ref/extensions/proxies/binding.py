@@ -39,7 +39,7 @@ import numpy as np
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.proxies.nearest import nearest_triangles
-from minisplat_ref.mechanisms.editing.deformation import Deformation, deformed
+from minisplat_ref.mechanisms.editing.deformation import Deformation, deform
 from minisplat_ref.mechanisms.meshes.mesh import Mesh, frames
 from minisplat_ref.types import Floats, Gaussians, Ints
 
@@ -134,7 +134,7 @@ def rebuild(deformed_mesh: Mesh, binding: Binding) -> Gaussians:
         + binding.offsets[:, None] * E[faces, :, 2]
     )  # [N, 3]
     means = np.where(is_carried[:, None], carried, gaussians.means.astype(np.float64))
-    return deformed(gaussians, means, Deformation(F, faces))
+    return deform(gaussians, means, Deformation(F, faces))
 
 
 def check_bound(binding: Binding, reach: float, source: str | Path) -> None:

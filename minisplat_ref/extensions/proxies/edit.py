@@ -11,7 +11,7 @@ from minisplat_ref.extensions.proxies.affine import (
     Affine,
     about_point,
     check_selected,
-    edited,
+    edit_gaussians,
     in_ball,
     in_box,
     rotation_about,
@@ -72,11 +72,11 @@ def run(args: argparse.Namespace) -> int:
     linear = _linear(args)
     gaussians = load_model(args.model)
     means = gaussians.means.astype(np.float64)
-    is_selected = _selected(args, means)
+    is_selected = _select(args, means)
     check_selected(is_selected, args.model)
     pivot = means[is_selected].mean(axis=0) if args.about is None else np.array(args.about)
     affine: Affine = about_point(linear, pivot, np.array(args.translate or (0.0, 0.0, 0.0)))
-    save_ply(args.out, edited(gaussians, affine, is_selected))
+    save_ply(args.out, edit_gaussians(gaussians, affine, is_selected))
     print(f"{is_selected.sum():,} of {len(means):,} Gaussians edited, in {args.out}")
     return 0
 
@@ -93,7 +93,7 @@ def _linear(args: argparse.Namespace) -> Floats:
     return rotation_about(args.rotate or (0.0, 0.0, 0.0)) * np.broadcast_to(scale, 3)
 
 
-def _selected(args: argparse.Namespace, means: Floats) -> Bools:
+def _select(args: argparse.Namespace, means: Floats) -> Bools:
     """Return which Gaussians [N] are in all selections."""
     if (args.near is None) != (args.within is None):
         raise InputError("--near MESH and --within D belong together: give both, or neither")

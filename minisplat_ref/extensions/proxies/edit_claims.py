@@ -21,10 +21,10 @@ from matplotlib.figure import Figure
 
 from minisplat_ref.backends import CPU
 from minisplat_ref.constants import SH_C0
-from minisplat_ref.extensions.proxies.affine import Affine, about_point, edited, in_ball, rotation_about
+from minisplat_ref.extensions.proxies.affine import Affine, about_point, edit_gaussians, in_ball, rotation_about
 from minisplat_ref.extensions.proxies.binding import Binding, bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid
-from minisplat_ref.mechanisms.editing.deformation import Deformation, deformed, polar_rotations
+from minisplat_ref.mechanisms.editing.deformation import Deformation, deform, polar_rotations
 from minisplat_ref.mechanisms.meshes.mesh import Mesh
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.reference.spherical_harmonics import sh_basis
@@ -81,7 +81,7 @@ def edit_errors(name: str, seed: int) -> EditErrors:
     """Return the errors of a map for one cloud."""
     A = MAPS[name]
     before = cloud(np.random.default_rng(seed))
-    after = edited(before, Affine(A, SHIFT), np.ones(N, bool))
+    after = edit_gaussians(before, Affine(A, SHIFT), np.ones(N, bool))
     long_A = A.astype(np.longdouble)  # so that the truth is not rounded as the edit is
     expected = long_A @ _sigma(before) @ long_A.T  # [N, 3, 3]
     relative = np.abs(_sigma(after) - expected).max(axis=(1, 2)) / np.abs(expected).max(axis=(1, 2))
@@ -164,7 +164,7 @@ def _by_two_lengths(binding: Binding, moved: Mesh, means: Floats) -> Gaussians:
     """Return the Gaussians with ``F = Q' diag(1, s2' / s2, s3' / s3) Q^T`` of the frames Q and lengths of GaMeS."""
     (Q, lengths), (moved_Q, moved_lengths) = _gram_schmidt(binding.mesh), _gram_schmidt(moved)
     F = (moved_Q * (moved_lengths / lengths)[:, None, :]) @ np.swapaxes(Q, 1, 2)
-    return deformed(binding.gaussians, means, Deformation(F, binding.faces))
+    return deform(binding.gaussians, means, Deformation(F, binding.faces))
 
 
 def _gram_schmidt(mesh: Mesh) -> tuple[Floats, Floats]:
@@ -204,7 +204,7 @@ def draw(bend: dict[str, Any], seed: int) -> Figure:
     raised = about_point(rotation_about((0.0, 0.0, 45.0)), centre, np.array([0.0, 0.0, -0.4]))
     pictures = {
         "a sheet": sheet,
-        "its middle rotated\nby 45° and raised": edited(sheet, raised, in_ball(sheet.means, centre, 0.6)),
+        "its middle rotated\nby 45° and raised": edit_gaussians(sheet, raised, in_ball(sheet.means, centre, 0.6)),
         f"sheared and rolled\nby {CELLS[3]} x {CELLS[3]} cells": bent_by(CELLS[3], sheet, True),
     }
     for axes, (title, gaussians) in zip(panels, pictures.items(), strict=False):
@@ -228,4 +228,4 @@ def draw(bend: dict[str, Any], seed: int) -> Figure:
 def _before_the_camera(sheet: Gaussians) -> Gaussians:
     """Return the sheet tilted and moved so that the camera sees it obliquely from above."""
     tilted = Affine(rotation_about((-50.0, 0.0, 0.0)), np.array([0.0, -0.1, 3.2]))
-    return edited(sheet, tilted, np.ones(len(sheet.means), bool))
+    return edit_gaussians(sheet, tilted, np.ones(len(sheet.means), bool))

@@ -17,7 +17,7 @@ from minisplat_ref.extensions.proxies.mass_spring import (
     Sheet,
     State,
     energies,
-    integrated,
+    integrate,
     longest_step,
 )
 from minisplat_ref.extensions.proxies.springs import springs_of, stiffness_for_stretch, vertex_masses
@@ -124,7 +124,7 @@ def run(args: argparse.Namespace) -> int:
 
     _check(args)
     gaussians, mesh = load_model(args.model), load_mesh(args.mesh)
-    setting = Setting(np.array(args.gravity), _pinned(args, mesh), args.stretch, args.drag, args.floor)
+    setting = Setting(np.array(args.gravity), _select_pinned(args, mesh), args.stretch, args.drag, args.floor)
     camera = _camera(args.cameras, gaussians.means)
     sheet = sheet_of(mesh, setting)
     n_steps = max(1, int(np.ceil(args.seconds / (args.frames - 1) / (STEP_FRACTION * longest_step(sheet)))))
@@ -136,7 +136,7 @@ def run(args: argparse.Namespace) -> int:
         check_bound(binding, args.reach, args.model)
         for frame in tqdm(range(args.frames), desc="frames", leave=False, disable=None):
             if frame > 0:
-                state = integrated(state, sheet, step, n_steps)
+                state = integrate(state, sheet, step, n_steps)
             now = Mesh(state.positions, mesh.faces)
             check_mesh(now, f"frame {frame}, folded flat: give a smaller --stretch or more --drag")
             moved = rebuild(now, binding)
@@ -169,7 +169,7 @@ def _check(args: argparse.Namespace) -> None:
             raise InputError(f"{name} is {number:g}: give a number that is not negative")
 
 
-def _pinned(args: argparse.Namespace, mesh: Mesh) -> Bools:
+def _select_pinned(args: argparse.Namespace, mesh: Mesh) -> Bools:
     """Return which vertices [P] are held."""
     heights = -mesh.vertices @ np.array(args.gravity)
     is_pinned = np.zeros(len(heights), bool)

@@ -145,7 +145,7 @@ def longest_step(sheet: Sheet) -> float:
     return 2 / float(np.sqrt(squared.max())) if len(squared) and squared.max() > 0 else np.inf
 
 
-def integrated(state: State, sheet: Sheet, step: float, n_steps: int) -> State:
+def integrate(state: State, sheet: Sheet, step: float, n_steps: int) -> State:
     """Return the state of a sheet after a number of steps of velocity Verlet; the top of this file states the step.
 
     Parameters

@@ -23,7 +23,7 @@ from minisplat_ref.constants import SH_C0
 from minisplat_ref.extensions.proxies.binding import bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid
 from minisplat_ref.extensions.proxies.fall import Setting, sheet_of
-from minisplat_ref.extensions.proxies.mass_spring import Energies, Sheet, State, energies, integrated, longest_step
+from minisplat_ref.extensions.proxies.mass_spring import Energies, Sheet, State, energies, integrate, longest_step
 from minisplat_ref.extensions.proxies.springs import springs_of, stiffness_for_stretch, vertex_masses
 from minisplat_ref.mechanisms.meshes.mesh import Mesh
 from minisplat_ref.reference.covariance import covariances
@@ -65,7 +65,7 @@ def free_fall(seed: int) -> dict[str, float]:
     n_steps = int(np.ceil(1 / (0.2 * longest_step(sheet))))
     velocity = np.array([0.3, -2.0, 0.1])
     state = State(mesh.vertices, np.broadcast_to(velocity, mesh.vertices.shape))
-    after = rebuild(Mesh(integrated(state, sheet, 1 / n_steps, n_steps).positions, mesh.faces), bind(gaussians, mesh))
+    after = rebuild(Mesh(integrate(state, sheet, 1 / n_steps, n_steps).positions, mesh.faces), bind(gaussians, mesh))
     sigma, sigma_after = (covariances(g.quats, np.exp(g.log_scales)) for g in (gaussians, after))
     return {
         "steps": n_steps,
@@ -98,7 +98,7 @@ def hanging_sheet(n_cells: int, stretch: float) -> tuple[Floats, Floats]:
     is_pinned = np.abs(np.abs(s) - LENGTH / 2) < 1e-9
     sheet = Sheet(masses, springs_of(rest, stiffness), is_pinned, GRAVITY, SETTLING_DRAG)
     step = SETTLING_STEP * longest_step(sheet)
-    end = integrated(State(start, np.zeros_like(start)), sheet, step, int(SETTLING / step))
+    end = integrate(State(start, np.zeros_like(start)), sheet, step, int(SETTLING / step))
     return end.positions[:, :2], catenary(s)
 
 
@@ -111,7 +111,7 @@ def swinging_sheet(swing: Swing, fraction: float) -> list[Energies]:
     state = State(mesh.vertices, np.zeros_like(mesh.vertices))
     found = [energies(state, sheet)]
     for _ in range(SAMPLES):
-        state = integrated(state, sheet, SWING_TIME / SAMPLES / n_steps, n_steps)
+        state = integrate(state, sheet, SWING_TIME / SAMPLES / n_steps, n_steps)
         found.append(energies(state, sheet))
     return found
 
@@ -180,7 +180,7 @@ def pictures(seed: int) -> list[Floats]:
     camera = Camera(R, -R @ target + [0, 0, distance], 1.55 * SIZE, 1.55 * SIZE, SIZE / 2, SIZE / 2, SIZE, SIZE)
     for moment in FRAMES:
         n_steps = round((moment - time) / step)
-        state, time = integrated(state, sheet, step, n_steps), time + n_steps * step
+        state, time = integrate(state, sheet, step, n_steps), time + n_steps * step
         moved = rebuild(Mesh(state.positions, mesh.faces), binding)
         images.append(np.clip(render(moved, camera, background=np.ones(3))[0].image, 0, 1))
     return images

@@ -69,13 +69,13 @@ def springs_of(mesh: Mesh, stiffness: Stiffness) -> Springs:
     stiffness : Stiffness
         Constants of the three kinds, force per length.
     """
-    edges, shear, bend = spring_ends(mesh)
+    edges, shear, bend = find_springs(mesh)
     kinds = [(ends, k) for ends, k in zip((edges, shear, bend), stiffness, strict=True) if k > 0]
     ends = np.concatenate([ends for ends, _ in kinds])
     return springs_between(ends, mesh.vertices, np.repeat([k for _, k in kinds], [len(ends) for ends, _ in kinds]))
 
 
-def spring_ends(mesh: Mesh) -> tuple[Ints, Ints, Ints]:
+def find_springs(mesh: Mesh) -> tuple[Ints, Ints, Ints]:
     """Return the vertices [S, 2] that structural, shear and bend springs connect.
 
     Of an edge that more than two triangles share, only the first two have a shear or bend spring.
@@ -134,7 +134,7 @@ def stiffness_for_stretch(mesh: Mesh, weight: float, stretch: float) -> Stiffnes
     stretch : float
         f, above 0.
     """
-    edges, _, _ = spring_ends(mesh)
+    edges, _, _ = find_springs(mesh)
     e = np.linalg.norm(mesh.vertices[edges[:, 0]] - mesh.vertices[edges[:, 1]], axis=1).mean()
     extent = np.ptp(mesh.vertices, axis=0).max()
     k = float(extent * weight / len(mesh.vertices) / (2 * e * e * stretch))

@@ -13,9 +13,9 @@ from minisplat_ref.constants import EXACT_ORDER, GSPLAT_MAIN
 from minisplat_ref.extensions.rays import demo
 from minisplat_ref.extensions.rays.kernels import scene_of
 from minisplat_ref.extensions.rays.lights import shade, visibility
-from minisplat_ref.extensions.rays.method import TRACED, tracer_for, whitened_model
+from minisplat_ref.extensions.rays.method import TRACED, tracer_for, whiten_model
 from minisplat_ref.extensions.rays.surfaces import MIRROR
-from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenated_surfaces, parallelogram, surfaces_of
+from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenate_surfaces, parallelogram, surfaces_of
 from minisplat_ref.extensions.shared_studies import tidy, with_progress
 from minisplat_ref.mechanisms.rays.pixel_rays import pixel_rays
 from minisplat_ref.reference.compositing import composite_hits
@@ -54,7 +54,7 @@ def exact_order(gaussians: Gaussians, camera: Camera) -> Floats:
     With ``S = Sigma^-1``, ``a = d^T S d``, ``b = d^T S (mu - O)`` and ``c = (mu - O)^T S (mu - O)``, the peak lies at
     ``t = b / a`` and is ``o exp(-(c - b^2 / a) / 2)``.
     """
-    M = whitened_model(Model(gaussians)).maps
+    M = whiten_model(Model(gaussians)).maps
     S = np.swapaxes(M, 1, 2) @ M  # [N, 3, 3]
     opacities = 1 / (1 + np.exp(-gaussians.opacity_logits))
     offsets = gaussians.means - camera.center
@@ -94,7 +94,7 @@ def mirror_difference(n: int, seed: int) -> float:
     z = 1.5
     sides = np.array([[4.0, 0.0, 0.0], [0.0, 4.0, 0.0]])
     wall = surfaces_of(parallelogram(np.array([-2.0, -2.0, z]), sides), MIRROR)
-    world = demo.world_of(gaussians, Surroundings(np.zeros((0, 3)), 1.0, 0.0, concatenated_surfaces([wall])), BLACK)
+    world = demo.world_of(gaussians, Surroundings(np.zeros((0, 3)), 1.0, 0.0, concatenate_surfaces([wall])), BLACK)
     in_mirror = shade(world, pixel_rays(camera, GSPLAT_MAIN))
     flip = np.diag([1.0, 1.0, -1.0])
     mirrored = camera._replace(cam_from_world_R=flip, cam_from_world_t=-flip @ [0.0, 0.0, 2 * z])
@@ -113,7 +113,7 @@ def shadow_edge(n_samples: int = 2000) -> dict[str, float]:
     centre, lamp = np.array([0.0, 1.0, 4.0]), np.array([0.0, -1.0, 4.0])
     one = demo.discs(centre[None], np.array([[0.0, 0.0, 1.0]]), s, np.full((1, 3), 0.5))
     one = one._replace(log_scales=np.full((1, 3), np.log(s)), opacity_logits=np.array([6.0]))
-    world = demo.world_of(one, Surroundings(lamp[None], 0.0, 0.0, concatenated_surfaces([])), BLACK)
+    world = demo.world_of(one, Surroundings(lamp[None], 0.0, 0.0, concatenate_surfaces([])), BLACK)
     x = np.linspace(0, 2, n_samples)
     points = np.column_stack([x, np.full_like(x, height), np.full_like(x, 4.0)])
     V = visibility(world, points, lamp - points, 0.0)
@@ -193,13 +193,13 @@ def speed(n: int, repeats: int) -> dict[str, float]:
         forward = seconds_of(partial(renderer.render, Model(gaussians), view, request), repeats)
         backward = seconds_of(partial(renderer.render_vjp, tape, np.ones_like(output.image), None), repeats)
         result |= {f"{name} forward us": forward / n_pixels * 1e6, f"{name} backward us": backward / n_pixels * 1e6}
-    whitened = whitened_model(Model(gaussians))
+    whitened = whiten_model(Model(gaussians))
     result["tree ms"] = 1e3 * seconds_of(partial(scene_of, whitened, GSPLAT_MAIN), repeats)
     result["hits per ray"] = output.n_pairs / n_pixels
     few = pixel_rays(demo.camera_of(40, 22), GSPLAT_MAIN)
     colors = np.clip(0.5 + gaussians.sh_dc.astype(np.float64), 0, 1)
     exact, traced = (
         tracer_for(some, GSPLAT_MAIN, backend).blend(colors, few, BLACK, GSPLAT_MAIN).image
-        for some, backend in ((whitened_model(Model(wide)), REFERENCE), (whitened, CPU))
+        for some, backend in ((whiten_model(Model(wide)), REFERENCE), (whitened, CPU))
     )
     return {**result, "error of float32": float(np.abs(traced.astype(np.float32) - exact).max())}

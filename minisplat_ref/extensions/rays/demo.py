@@ -8,9 +8,9 @@ import numpy as np
 from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.extensions.rays.lights import World
-from minisplat_ref.extensions.rays.method import tracer_for, whitened_model
+from minisplat_ref.extensions.rays.method import tracer_for, whiten_model
 from minisplat_ref.extensions.rays.surfaces import MIRROR
-from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenated_surfaces, parallelogram, surfaces_of
+from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenate_surfaces, parallelogram, surfaces_of
 from minisplat_ref.types import Camera, Floats, Gaussians, Model
 
 CENTRE, RADIUS, N_BALL = np.array([-0.4, 0.2, 4.0]), 0.6, 300
@@ -55,7 +55,7 @@ def discs(means: Floats, normals: Floats, size: float, colors: Floats) -> Gaussi
     )
 
 
-def concatenated(*parts: Gaussians) -> Gaussians:
+def concatenate_populations(*parts: Gaussians) -> Gaussians:
     """Return several populations concatenated to one."""
     return Gaussians(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
 
@@ -67,12 +67,12 @@ def camera_of(width: int = 240, height: int = 180) -> Camera:
 
 def world_of(gaussians: Gaussians, surroundings: Surroundings, background: Floats) -> World:
     """Return Gaussians and their surroundings as a world for the kernels."""
-    tracer = tracer_for(whitened_model(Model(gaussians)), GSPLAT_MAIN, CPU)
+    tracer = tracer_for(whiten_model(Model(gaussians)), GSPLAT_MAIN, CPU)
     return World(gaussians, tracer, surroundings, background, GSPLAT_MAIN)
 
 
 def demo_world() -> World:
     """Return the whole scene."""
     mirror = surfaces_of(parallelogram(MIRROR_CORNER, MIRROR_SIDES), MIRROR, np.array([0.9, 0.9, 0.95]))
-    around = Surroundings(LAMP[None], 0.35, BIAS, concatenated_surfaces([mirror]))
-    return world_of(concatenated(ball(), floor()), around, np.array([0.1, 0.12, 0.16]))
+    around = Surroundings(LAMP[None], 0.35, BIAS, concatenate_surfaces([mirror]))
+    return world_of(concatenate_populations(ball(), floor()), around, np.array([0.1, 0.12, 0.16]))

@@ -1,6 +1,6 @@
 """Gaussians before they are traced, as maps to the unit ball, beside the gradient.
 
-Both backends use these: they are of the size of the population, and no loop over pairs.
+Both backends use these: they are of the size of the population, and no loop over intersections.
 """
 
 from typing import NamedTuple

@@ -20,7 +20,7 @@ N_COLUMNS = 14
 
 
 @scalar
-def whitened(records, row, ray):
+def whiten_ray(records, row, ray):
     """Return ``p = M (mu - O)`` and ``v = M d`` of one ray or of eight."""
     ox, oy, oz, dx, dy, dz = ray
     ux, uy, uz = records[row, MEAN] - ox, records[row, MEAN + 1] - oy, records[row, MEAN + 2] - oz
@@ -43,7 +43,7 @@ def nearest_point(p0, p1, p2, v0, v1, v2):
 @scalar
 def meet(records, row, ray):
     """Return t and q of eight rays; q is infinite where alpha is below its least value, and where it is no number."""
-    t, e0, e1, e2 = nearest_point(*whitened(records, row, ray))
+    t, e0, e1, e2 = nearest_point(*whiten_ray(records, row, ray))
     q = e0 * e0 + e1 * e1 + e2 * e2
     return t, select(q <= records[row, REACH], q, np.inf)
 
@@ -61,7 +61,7 @@ def back(records, row, v):
 @scalar
 def meet_vjp(records, row, ray, unclamped, v_unclamped, v_t):
     """Return the gradient with respect to mean, direction and map [9]; see the reference's ``meet_vjp``."""
-    p0, p1, p2, v0, v1, v2 = whitened(records, row, ray)
+    p0, p1, p2, v0, v1, v2 = whiten_ray(records, row, ray)
     t, e0, e1, e2 = nearest_point(p0, p1, p2, v0, v1, v2)
     k = -unclamped * v_unclamped  # 2 v_q
     j = v_t / (v0 * v0 + v1 * v1 + v2 * v2)

@@ -25,10 +25,10 @@ from minisplat_ref.extensions.rays.surfaces import (
     DIFFUSE,
     GLASS,
     MIRROR,
-    continued,
+    continue_rays,
     nearest_triangles,
-    reflected,
-    refracted,
+    reflect,
+    refract,
 )
 from minisplat_ref.extensions.rays.surroundings import Surroundings
 from minisplat_ref.mechanisms.rays.pixel_rays import Hits, Rays, Tracer
@@ -106,12 +106,12 @@ def _advance(world: World, bundle: _Bundle, image: Floats, *, sees_surfaces: boo
     for rows in (mirror, glass):
         arriving, normals = _rows(rays, rows), surfaces.normals[faces[rows]]
         colors = rest[rows] * surfaces.colors[faces[rows]]
-        back = continued(arriving, depths[rows], reflected(arriving.directions, normals))
+        back = continue_rays(arriving, depths[rows], reflect(arriving.directions, normals))
         if rows is mirror:
             following.append(bundle.some(rows, back, colors))
             continue
-        bent, shares, _ = refracted(arriving.directions, normals, surfaces.indices[faces[rows]])
-        through = continued(arriving, depths[rows], bent)
+        bent, shares, _ = refract(arriving.directions, normals, surfaces.indices[faces[rows]])
+        through = continue_rays(arriving, depths[rows], bent)
         following.append(bundle.some(rows, back, rest[rows] * shares[:, None]))
         following.append(bundle.some(rows, through, colors * (1 - shares)[:, None]))
     return [some for some in following if len(some.pixels)]

@@ -8,7 +8,7 @@ from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.extensions.rays.geometry import Whitened, whiten, whiten_vjp
 from minisplat_ref.extensions.rays.kernels import RESPONSE, scene_of
-from minisplat_ref.extensions.rays.reference import meeting_of
+from minisplat_ref.extensions.rays.reference import prepare_meeting
 from minisplat_ref.mechanisms.rays import blending, kernels
 from minisplat_ref.mechanisms.rays.pixel_rays import Tracer
 from minisplat_ref.mechanisms.rays.renderer import Traced, renderer_of
@@ -17,7 +17,7 @@ from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Floats, Model
 
 
-def whitened_model(model: Model) -> Whitened:
+def whiten_model(model: Model) -> Whitened:
     """Return the Gaussians of a model as rays meet them."""
     with np.errstate(over="ignore"):
         opacities = 1 / (1 + np.exp(-model.gaussians.opacity_logits.astype(np.float64)))
@@ -28,7 +28,7 @@ def tracer_for(gaussians: Whitened, conventions: Conventions, backend: Backend) 
     """Return how a backend traces: every ray against every Gaussian, or kernels with a tree, which is built here."""
     if backend.is_compiled:
         return kernels.tracer_of(RESPONSE, scene_of(gaussians, conventions))
-    return blending.tracer_of(meeting_of(gaussians))
+    return blending.tracer_of(prepare_meeting(gaussians))
 
 
 def _prepare(population: Any, opacities: Floats) -> Whitened:

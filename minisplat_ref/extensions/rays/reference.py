@@ -14,13 +14,13 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.extensions.rays.geometry import Whitened
-from minisplat_ref.mechanisms.rays.blending import Meeting, PairGradient
+from minisplat_ref.mechanisms.rays.blending import IntersectionGradient, Meeting
 from minisplat_ref.mechanisms.rays.pixel_rays import Rays
 from minisplat_ref.types import Floats, Ints
 
 
-class Pairs(NamedTuple):
-    """The intermediate values of H pairs of a ray and a Gaussian."""
+class Intersections(NamedTuple):
+    """The intermediate values of H intersections of a ray and a Gaussian."""
 
     p: Floats  # [H, 3]
     v: Floats  # [H, 3]
@@ -29,8 +29,8 @@ class Pairs(NamedTuple):
     unclamped: Floats  # [H] o exp(-q / 2)
 
 
-def evaluate_pairs(gaussians: Whitened, rays: Rays, ray_ids: Ints, gaussian_ids: Ints) -> Pairs:
-    """Return the values of Gaussians at their peaks on rays, pair by pair.
+def intersect(gaussians: Whitened, rays: Rays, ray_ids: Ints, gaussian_ids: Ints) -> Intersections:
+    """Return the values of Gaussians at their peaks on rays, one by one.
 
     Parameters
     ----------
@@ -39,11 +39,11 @@ def evaluate_pairs(gaussians: Whitened, rays: Rays, ray_ids: Ints, gaussian_ids:
     rays : Rays
         P rays.
     ray_ids, gaussian_ids : ndarray of shape (H,)
-        Indices of the ray and of the Gaussian of each pair.
+        Indices of the ray and of the Gaussian of each intersection.
 
     Returns
     -------
-    Pairs
+    Intersections
         t in units of the ray's direction.
     """
     M = gaussians.maps[gaussian_ids]  # [H, 3, 3]
@@ -53,13 +53,13 @@ def evaluate_pairs(gaussians: Whitened, rays: Rays, ray_ids: Ints, gaussian_ids:
         t = np.sum(v * p, axis=1) / np.sum(v * v, axis=1)
         e = p - t[:, None] * v
         unclamped = gaussians.opacities[gaussian_ids] * np.exp(-0.5 * np.sum(e * e, axis=1))
-    return Pairs(p, v, e, t, unclamped)
+    return Intersections(p, v, e, t, unclamped)
 
 
-def evaluate_pairs_vjp(
+def intersect_vjp(
     gaussians: Whitened, rays: Rays, ray_ids: Ints, gaussian_ids: Ints, v_unclamped: Floats, v_depths: Floats
-) -> PairGradient:
-    """Gradient of :func:`evaluate_pairs`, pair by pair.
+) -> IntersectionGradient:
+    """Gradient of :func:`intersect`, one by one.
 
     Because e is orthogonal to v, the dependence of t on p does not contribute to dq/dp::
 
@@ -73,35 +73,35 @@ def evaluate_pairs_vjp(
     Parameters
     ----------
     gaussians, rays, ray_ids, gaussian_ids
-        As for :func:`evaluate_pairs`.
+        As for :func:`intersect`.
     v_unclamped, v_depths : ndarray of shape (H,)
         Derivatives with respect to its results.
 
     Returns
     -------
-    PairGradient
+    IntersectionGradient
         Its shapes are the maps, [H, 3, 3].
     """
-    pairs = evaluate_pairs(gaussians, rays, ray_ids, gaussian_ids)
-    t, e = pairs.depths[:, None], pairs.e
-    a = np.sum(pairs.v * pairs.v, axis=1, keepdims=True)  # [H, 1]
-    v_q = (-0.5 * pairs.unclamped * v_unclamped)[:, None]
+    found = intersect(gaussians, rays, ray_ids, gaussian_ids)
+    t, e = found.depths[:, None], found.e
+    a = np.sum(found.v * found.v, axis=1, keepdims=True)  # [H, 1]
+    v_q = (-0.5 * found.unclamped * v_unclamped)[:, None]
     v_t = v_depths[:, None]
-    v_p = 2 * v_q * e + v_t * pairs.v / a
-    v_v = -2 * t * v_q * e + v_t * (pairs.p - 2 * t * pairs.v) / a
+    v_p = 2 * v_q * e + v_t * found.v / a
+    v_v = -2 * t * v_q * e + v_t * (found.p - 2 * t * found.v) / a
     M = gaussians.maps[gaussian_ids]
     offsets = gaussians.means[gaussian_ids] - rays.origins[ray_ids]
     v_maps = v_p[:, :, None] * offsets[:, None] + v_v[:, :, None] * rays.directions[ray_ids][:, None]
     v_means = np.einsum("hij,hi->hj", M, v_p)
-    v_opacities = pairs.unclamped / gaussians.opacities[gaussian_ids] * v_unclamped
-    return PairGradient(v_means, v_maps, v_opacities, -v_means, np.einsum("hij,hi->hj", M, v_v))
+    v_opacities = found.unclamped / gaussians.opacities[gaussian_ids] * v_unclamped
+    return IntersectionGradient(v_means, v_maps, v_opacities, -v_means, np.einsum("hij,hi->hj", M, v_v))
 
 
-def meeting_of(gaussians: Whitened) -> Meeting:
+def prepare_meeting(gaussians: Whitened) -> Meeting:
     """Return how rays meet these Gaussians."""
 
     def alphas_and_depths(rays: Rays, ray_ids: Ints, gaussian_ids: Ints) -> tuple[Floats, Floats]:
-        pairs = evaluate_pairs(gaussians, rays, ray_ids, gaussian_ids)
-        return pairs.unclamped, pairs.depths
+        found = intersect(gaussians, rays, ray_ids, gaussian_ids)
+        return found.unclamped, found.depths
 
-    return Meeting(len(gaussians.means), alphas_and_depths, lambda *args: evaluate_pairs_vjp(gaussians, *args))
+    return Meeting(len(gaussians.means), alphas_and_depths, lambda *args: intersect_vjp(gaussians, *args))

@@ -11,7 +11,7 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.rays import surroundings
 from minisplat_ref.extensions.rays.lights import World, shade
-from minisplat_ref.extensions.rays.method import tracer_for, whitened_model
+from minisplat_ref.extensions.rays.method import tracer_for, whiten_model
 from minisplat_ref.io import orbits, viewpoints, write_image
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.names import file_names
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--background is {' '.join(f'{x:g}' for x in background)}: give three numbers from 0 to 1")
     around = surroundings.read(args.scene)
     gaussians = load_ply(args.model / "point_cloud.ply" if args.model.is_dir() else args.model)
-    whitened = whitened_model(Model(gaussians))
+    whitened = whiten_model(Model(gaussians))
     surroundings.check_lights(around, whitened, args.scene)
     views = _views(args, gaussians.means)
     world = World(gaussians, tracer_for(whitened, GSPLAT_MAIN, CPU), around, background, GSPLAT_MAIN)

@@ -83,18 +83,18 @@ def nearest_triangles(corners: Floats, rays: Rays) -> tuple[Floats, Ints]:
     return depths, faces
 
 
-def continued(rays: Rays, depths: Floats, directions: Floats) -> Rays:
+def continue_rays(rays: Rays, depths: Floats, directions: Floats) -> Rays:
     """Return rays [P] that leave ``O + t d`` in new directions [P, 3] of the same lengths and keep counting t."""
     points = rays.origins + depths[:, None] * rays.directions
     return Rays(points - depths[:, None] * directions, directions, depths, rays.far)
 
 
-def reflected(directions: Floats, normals: Floats) -> Floats:
+def reflect(directions: Floats, normals: Floats) -> Floats:
     """Return ``d' = d - 2 (d . n) n`` [P, 3]."""
     return directions - 2 * np.sum(directions * normals, axis=1, keepdims=True) * normals
 
 
-def refracted(directions: Floats, normals: Floats, indices: Floats) -> tuple[Floats, Floats, Bools]:
+def refract(directions: Floats, normals: Floats, indices: Floats) -> tuple[Floats, Floats, Bools]:
     """Return the refracted directions at the boundary of glass by Snell's law, and the reflected fraction by Schlick's.
 
     With the ratio r of the indices before and behind the boundary, c = |d . n| / |d| and n against the ray::

@@ -56,7 +56,7 @@ def surfaces_of(mesh: Mesh, kind: int, color: Floats | None = None, index: float
     return Surfaces(mesh.corners, normals_of(mesh.corners), np.full(n, kind), colors, np.full(n, index))
 
 
-def concatenated_surfaces(surfaces: list[Surfaces]) -> Surfaces:
+def concatenate_surfaces(surfaces: list[Surfaces]) -> Surfaces:
     """Return several surfaces as one, which is empty if there are none."""
     nothing = Surfaces(np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0, int), np.zeros((0, 3)), np.zeros(0))
     return Surfaces(*(np.concatenate(fields) for fields in zip(nothing, *surfaces, strict=True)))
@@ -89,7 +89,7 @@ def read(path: Path) -> Surroundings:
         if not 0 <= number <= 1:
             raise InputError(f"{path}: {name} is {content[name]}: give a number from 0 to 1")
     parts = [_surface(entry, f"{path}, surface {i}", path.parent) for i, entry in enumerate(surfaces)]
-    return Surroundings(np.array(places).reshape(-1, 3), ambient, bias, concatenated_surfaces(parts))
+    return Surroundings(np.array(places).reshape(-1, 3), ambient, bias, concatenate_surfaces(parts))
 
 
 def check_lights(surroundings: Surroundings, gaussians: Whitened, source: str | Path) -> None:

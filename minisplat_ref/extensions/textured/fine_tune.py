@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from minisplat_ref.extensions.shared_studies import check_at_least, read_scene
-    from minisplat_ref.extensions.textured.tuning import floats_of, measured, prepared, tuned
+    from minisplat_ref.extensions.textured.tuning import fine_tune, floats_of, measure, prepare
 
     check_at_least(1, downscale=args.downscale, iterations=args.iterations)
     check_at_least(0, seed=args.seed)
@@ -54,11 +54,11 @@ def run(args: argparse.Namespace) -> int:
     if len(gaussians.means) == 0:
         raise InputError(f"{args.ply} holds no Gaussians: give the PLY of a run")
     scene = read_scene(args.scene, args.downscale)
-    before = measured(gaussians, scene, scene.test_views)
+    before = measure(gaussians, scene, scene.test_views)
     with tqdm(total=args.iterations, desc="textures", leave=False, disable=None) as bar:
-        start = prepared(gaussians, args.degree, args.replace)
-        textured = tuned(start, scene, args.iterations, args.seed, lambda _: bar.update())
-    after = measured(textured, scene, scene.test_views)
+        start = prepare(gaussians, args.degree, args.replace)
+        textured = fine_tune(start, scene, args.iterations, args.seed, lambda _: bar.update())
+    after = measure(textured, scene, scene.test_views)
     save_ply(args.out, textured)
     print(
         f"{len(gaussians.means):,} Gaussians, {floats_of(gaussians)} numbers each: test PSNR {before.psnr:.2f} dB,"

@@ -52,7 +52,7 @@ ODDS_MAX = 1e30  # so that a product with it stays finite in float32
 
 
 @functools.cache
-def textured_response(exp: Callable, constants: tuple) -> KernelResponse:
+def make_textured_response(exp: Callable, constants: tuple) -> KernelResponse:
     """Return the response of textured Gaussians; ``constants`` are those of the harmonics, then LIMB^2."""
     conic = conic_response(exp)
     flat_hit, flat_hit_vjp = conic.hit, conic.hit_vjp
@@ -154,10 +154,10 @@ def response_for(dtype: np.dtype) -> KernelResponse:
     """Return the response for arrays of a dtype: float32 data use the polynomial exponential."""
     constants = (SH_C0, SH_C1, *SH_C2, *SH_C3, LIMB**2)
     as_data = np.dtype(dtype).type
-    return textured_response(exp_fast if dtype == np.float32 else exp_exact, tuple(map(as_data, constants)))
+    return make_textured_response(exp_fast if dtype == np.float32 else exp_exact, tuple(map(as_data, constants)))
 
 
-def filled_up(textures: Floats, n_rows: int) -> Floats:
+def pad_textures(textures: Floats, n_rows: int) -> Floats:
     """Return coefficients [N, n_rows (K-1)] of any degree padded with zeros to [N, n_rows, 15]."""
     n, k = len(textures), textures.shape[1] // n_rows
     full = np.zeros((n, n_rows, N_TEXTURE), textures.dtype)
@@ -179,7 +179,7 @@ def _records(conic_records: Callable, footprints: Footprints, dtype: np.dtype) -
     records = np.zeros((len(a), BOUND + 1), dtype)
     records[:, :CONIC_GRADIENTS] = conic_records(footprints.projection, dtype)[:, :CONIC_GRADIENTS]
     records[:, LOGIT] = footprints.logits
-    records[:, H : H + N_TEXTURE] = filled_up(footprints.opacity_textures, 1)[:, 0]
+    records[:, H : H + N_TEXTURE] = pad_textures(footprints.opacity_textures, 1)[:, 0]
     records[:, A : A + 3], records[:, D_X : D_X + 6] = a / length, _by_columns(D)
     records[:, C_X : C_X + 6] = _by_columns(C)
     records[:, DEPTH], records[:, ODDS] = footprints.projection.depths, np.minimum(footprints.odds, ODDS_MAX)

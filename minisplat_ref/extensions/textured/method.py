@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from minisplat_ref.extensions.textured.kernels import filled_up, response_for
+from minisplat_ref.extensions.textured.kernels import pad_textures, response_for
 from minisplat_ref.extensions.textured.population import TexturedGaussians, blank
 from minisplat_ref.extensions.textured.reference import visible_frames, visible_frames_vjp
 from minisplat_ref.extensions.textured.response import RESPONSE, Footprints, bounds
@@ -20,7 +20,7 @@ def _is_plain(gaussians: TexturedGaussians) -> bool:
     return gaussians.opacity_textures.shape[1] == 0
 
 
-def _bounded_logits(gaussians: TexturedGaussians) -> Floats:
+def _bound_logits(gaussians: TexturedGaussians) -> Floats:
     """Return l + B [N], the logits of the opacities o_B."""
     return gaussians.opacity_logits + bounds(gaussians.opacity_textures)
 
@@ -46,7 +46,7 @@ def _coefficients(projected: Projected, channels: Floats) -> Floats:
     g = projected.gaussians
     n, k = g.opacity_textures.shape
     is_compiled = projected.backend.is_compiled
-    textures = filled_up(g.color_textures, 3) if is_compiled else g.color_textures.reshape(n, 3, k)
+    textures = pad_textures(g.color_textures, 3) if is_compiled else g.color_textures.reshape(n, 3, k)
     n_channels, n_coefficients = channels.shape[1], 1 + textures.shape[2]
     coefficients = np.zeros((n, n_channels, n_coefficients), channels.dtype)
     coefficients[:, :, 0], coefficients[:, :3, 1:] = channels, textures
@@ -69,7 +69,7 @@ PAYLOAD = Payload(
     _is_plain,
     _footprints,
     _footprints_vjp,
-    _bounded_logits,
+    _bound_logits,
     _coefficients,
     _coefficients_vjp,
 )

@@ -54,7 +54,7 @@ def frames(means: Floats, quats: Floats, scales: Floats, camera: Camera) -> Floa
     ndarray of shape (N, 3, 3)
         A.
     """
-    U, depths, _ = _rotated_rays(means, quats, camera)
+    U, depths, _ = _rotate_rays(means, quats, camera)
     return (depths[:, None] / np.maximum(scales, SCALE_MIN))[:, :, None] * U
 
 
@@ -84,7 +84,7 @@ def frames_vjp(means: Floats, quats: Floats, scales: Floats, camera: Camera, v_f
     v_frames : ndarray of shape (N, 3, 3)
         Derivative with respect to the frames.
     """
-    U, depths, R = _rotated_rays(means, quats, camera)
+    U, depths, R = _rotate_rays(means, quats, camera)
     R_c, _ = pose(camera, means.dtype)
     ratios = 1 / np.maximum(scales, SCALE_MIN)  # [N, 3]
     v_ratios = np.einsum("nij,nij->ni", v_frames, U) * depths[:, None]
@@ -104,7 +104,7 @@ def frames_vjp(means: Floats, quats: Floats, scales: Floats, camera: Camera, v_f
     )
 
 
-def _rotated_rays(means: Floats, quats: Floats, camera: Camera) -> tuple[Floats, Floats, Floats]:
+def _rotate_rays(means: Floats, quats: Floats, camera: Camera) -> tuple[Floats, Floats, Floats]:
     """Return ``U = (R_c R)^T K^-1`` [N, 3, 3], depths z [N] and R [N, 3, 3]."""
     R_c, t = pose(camera, means.dtype)
     R = rotation_matrices(quats)

@@ -64,24 +64,24 @@ def outcomes(whole: Gaussians, scene: Scene, iterations: int, seed: int) -> list
     """Return the measurements of each form of a trained population."""
     from tqdm import tqdm
 
-    from minisplat_ref.extensions.textured.tuning import floats_of, measured, prepared, tuned
+    from minisplat_ref.extensions.textured.tuning import fine_tune, floats_of, measure, prepare
     from minisplat_ref.strategy.importance import collect_importance, indoor
     from minisplat_ref.strategy.ops import take
     from minisplat_ref.strategy.simplify import most_important
 
     importance = indoor(collect_importance(whole, scene.train_views))
     jobs: list[tuple[str, str, int, Any]] = [("all", PLAIN, 0, whole)]
-    jobs += [("all", PAPER, degree, prepared(whole, degree, True)) for degree in (1, 2, 3)]
-    jobs.append(("all", BOTH, 3, prepared(whole, 3, False)))
+    jobs += [("all", PAPER, degree, prepare(whole, degree, True)) for degree in (1, 2, 3)]
+    jobs.append(("all", BOTH, 3, prepare(whole, 3, False)))
     n_floats = len(whole.means) * floats_of(whole)
     for form, replaces in ((PAPER, True), (BOTH, False)):
-        n = n_floats // floats_of(prepared(whole, 3, replaces))
+        n = n_floats // floats_of(prepare(whole, 3, replaces))
         kept = take(whole, most_important(importance, min(n, int(np.count_nonzero(importance)))))
-        jobs.append(("as many floats", form, 3, prepared(kept, 3, replaces)))
+        jobs.append(("as many floats", form, 3, prepare(kept, 3, replaces)))
     rows = []
     for kept_by, form, degree, population in tqdm(jobs, desc=f"seed {seed}", leave=False, disable=None):
-        after = tuned(population, scene, iterations, seed)
-        test, training = (measured(after, scene, views) for views in (scene.test_views, scene.train_views))
+        after = fine_tune(population, scene, iterations, seed)
+        test, training = (measure(after, scene, views) for views in (scene.test_views, scene.train_views))
         rows.append(
             {
                 "kept": kept_by,

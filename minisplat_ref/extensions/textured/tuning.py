@@ -16,7 +16,7 @@ from minisplat_ref.training.state import StepReport, TrainState
 from minisplat_ref.types import Gaussians, Model, Scene, View
 
 
-def prepared(gaussians: Gaussians, degree: int, replaces_view: bool) -> TexturedGaussians:
+def prepare(gaussians: Gaussians, degree: int, replaces_view: bool) -> TexturedGaussians:
     """Return Gaussians with textures of zeros, and without view-dependent colour if textures replace it."""
     if replaces_view:
         gaussians = gaussians._replace(sh_rest=gaussians.sh_rest[:, :0])
@@ -28,7 +28,7 @@ def representation_of(population: Any) -> Representation:
     return TEXTURED_GAUSSIANS if isinstance(population, TexturedGaussians) else GAUSSIANS
 
 
-def tuned(
+def fine_tune(
     population: Any, scene: Scene, iterations: int, seed: int, on_step: Callable[[StepReport], None] | None = None
 ) -> Any:
     """Return a population with or without textures after fine-tuning; the given one is not changed."""
@@ -39,7 +39,7 @@ def tuned(
     return train(scene, recipe, seed=seed, state=state, on_step=on_step).gaussians
 
 
-def measured(population: Any, scene: Scene, views: tuple[View, ...]) -> Evaluation:
+def measure(population: Any, scene: Scene, views: tuple[View, ...]) -> Evaluation:
     """Compare pictures of a population with photographs."""
     renderer = representation_of(population).renderer
     return evaluate(Model(population), views, background=scene.background, renderer=renderer)

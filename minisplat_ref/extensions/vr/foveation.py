@@ -141,15 +141,15 @@ def render_foveated(
         block = 2**k
         conventions = request.conventions._replace(eps2d=request.conventions.eps2d / block**2)
         coarse = _coarser(camera, block)
-        is_needed = _needed_samples(weight > 0, block)
+        is_needed = _find_needed_samples(weight > 0, block)
         if not is_needed.any():
             zones.append(Zone(block, begins, 0, 0, 0))
             continue
         prepared = prepare(model, coarse, request._replace(conventions=conventions), buffer_size)
         bins = prepared.listed()
-        tiles = _needed_tiles(is_needed, bins)
-        kept = _kept(bins, tiles)
-        image += weight[:, :, None] * _interpolated(prepared.blended(kept).image, block, weight.shape)
+        tiles = _find_needed_tiles(is_needed, bins)
+        kept = _keep_tiles(bins, tiles)
+        image += weight[:, :, None] * _interpolate(prepared.blended(kept).image, block, weight.shape)
         zones.append(Zone(block, begins, int(tiles.sum()), _n_pixels(tiles, bins), len(kept.gaussian_ids)))
     return image, zones
 
@@ -166,7 +166,7 @@ def _coarser(camera: Camera, block: int) -> Camera:
     )
 
 
-def _needed_samples(is_needed: Bools, block: int) -> Bools:
+def _find_needed_samples(is_needed: Bools, block: int) -> Bools:
     """Return which samples are needed: those of the blocks of needed pixels, and their neighbours for interpolation."""
     if block == 1:
         return is_needed
@@ -178,7 +178,7 @@ def _needed_samples(is_needed: Bools, block: int) -> Bools:
     return np.logical_or.reduce(shifted)
 
 
-def _needed_tiles(is_needed: Bools, bins: TileBins) -> Bools:
+def _find_needed_tiles(is_needed: Bools, bins: TileBins) -> Bools:
     """Return which tiles [n_tiles] hold a sample that is needed."""
     grid = bins.grid
     ys, xs = np.nonzero(is_needed)
@@ -187,7 +187,7 @@ def _needed_tiles(is_needed: Bools, bins: TileBins) -> Bools:
     return tiles
 
 
-def _kept(bins: TileBins, is_kept: Bools) -> TileBins:
+def _keep_tiles(bins: TileBins, is_kept: Bools) -> TileBins:
     """Return the lists with those of other tiles empty; this suffices for drawing, not for differentiating."""
     counts = np.diff(bins.tile_offsets)
     offsets = np.concatenate([[0], np.cumsum(np.where(is_kept, counts, 0))])
@@ -206,7 +206,7 @@ def _n_pixels(tiles: Bools, bins: TileBins) -> int:
     return total
 
 
-def _interpolated(coarse: Floats, block: int, shape: tuple[int, int]) -> Floats:
+def _interpolate(coarse: Floats, block: int, shape: tuple[int, int]) -> Floats:
     """Return a picture [H, W, 3] by bilinear interpolation between the centres of blocks, clamped at the edges."""
     if block == 1:
         return coarse

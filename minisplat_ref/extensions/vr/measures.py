@@ -13,8 +13,8 @@ from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.extensions.shared_studies import tidy, with_progress
 from minisplat_ref.extensions.vr.foveation import Gaze, Zone, eccentricities, render_foveated, resolved_angles
 from minisplat_ref.extensions.vr.method import BUFFER
-from minisplat_ref.mechanisms.tangent.rays import color_changes, ewa_hits, tangent_hits, yawed
-from minisplat_ref.rendering import Request, activated
+from minisplat_ref.mechanisms.tangent.rays import color_changes, ewa_hits, tangent_hits, yaw_camera
+from minisplat_ref.rendering import Request, activate
 from minisplat_ref.types import Camera, Floats, Gaussians, Ints, Model, Primitives, View
 
 EVERYWHERE = 180.0  # degrees: every pixel is drawn
@@ -112,11 +112,11 @@ def yaw_steps(
     those that no ray hits at any of five of the cameras are left out.
     """
     wide = Gaussians._make(field.astype(np.float64) for field in gaussians)
-    primitives, colors = activated(wide), np.maximum(0.5 + SH_C0 * wide.sh_dc, 0)
+    primitives, colors = activate(wide), np.maximum(0.5 + SH_C0 * wide.sh_dc, 0)
     slopes = np.linspace(-1, 1, n_rays) * np.tan(np.radians(6.0))
     x, y = np.meshgrid(slopes, slopes)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ camera.cam_from_world_R
-    path = [yawed(camera, yaw) for yaw in np.radians(np.linspace(-half_angle, half_angle, n_steps + 1))]
+    path = [yaw_camera(camera, yaw) for yaw in np.radians(np.linspace(-half_angle, half_angle, n_steps + 1))]
     rows = _hit_rows(primitives, path[:: max(n_steps // 4, 1)], rays)
     seen = Primitives._make(field[rows] for field in primitives)
     seen_by = (seen, colors[rows], path, rays, GSPLAT_MAIN)

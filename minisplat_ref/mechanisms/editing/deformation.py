@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.mechanisms.editing.sh_rotation import rotated_sh
+from minisplat_ref.mechanisms.editing.sh_rotation import rotate_sh
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.types import Floats, Gaussians, Ints
 
@@ -60,7 +60,7 @@ def polar_rotations(F: Floats) -> Floats:
     return U @ Vt
 
 
-def deformed(gaussians: Gaussians, means: Floats, deformation: Deformation) -> Gaussians:
+def deform(gaussians: Gaussians, means: Floats, deformation: Deformation) -> Gaussians:
     """Return the Gaussians after a deformation.
 
     Parameters
@@ -83,14 +83,14 @@ def deformed(gaussians: Gaussians, means: Floats, deformation: Deformation) -> G
     quats, log_scales, sh_rest = gaussians.quats.copy(), gaussians.log_scales.copy(), gaussians.sh_rest.copy()
     if len(moved):
         R = rotation_matrices(gaussians.quats[moved].astype(np.float64))  # [N', 3, 3]
-        quats[moved], log_scales[moved] = _refactored(F, rows[moved], R, gaussians.log_scales[moved].astype(np.float64))
-        sh_rest[moved] = rotated_sh(gaussians.sh_rest[moved], polar_rotations(F), rows[moved])
+        quats[moved], log_scales[moved] = _refactor(F, rows[moved], R, gaussians.log_scales[moved].astype(np.float64))
+        sh_rest[moved] = rotate_sh(gaussians.sh_rest[moved], polar_rotations(F), rows[moved])
     return gaussians._replace(
         means=means.astype(gaussians.means.dtype), quats=quats, log_scales=log_scales, sh_rest=sh_rest
     )
 
 
-def _refactored(F: Floats, rows: Ints, R: Floats, log_scales: Floats) -> tuple[Floats, Floats]:
+def _refactor(F: Floats, rows: Ints, R: Floats, log_scales: Floats) -> tuple[Floats, Floats]:
     """Return the quaternions [N, 4] and logarithms of scales [N, 3] of ``F R diag(s)``.
 
     The largest scale of each is divided out first, so that no exponential overflows.

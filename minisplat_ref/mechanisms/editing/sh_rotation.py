@@ -52,14 +52,14 @@ def sh_rotations(Q: Floats, degree: int) -> list[Floats]:
     list of ndarray of shape (M, 2 l + 1, 2 l + 1)
         D_1 to D_degree, orthogonal; none for degree 0, which no rotation changes.
     """
-    turned = (_DIRECTIONS @ Q).reshape(-1, 3)  # rows (Q^T d_p)^T, [M P, 3]
+    rotated = (_DIRECTIONS @ Q).reshape(-1, 3)  # rows (Q^T d_p)^T, [M P, 3]
     there = sh_basis(_DIRECTIONS, degree) * _WEIGHTS[:, None]  # [P, K]
-    before = sh_basis(turned, degree).reshape(len(Q), len(_DIRECTIONS), -1)  # [M, P, K]
+    before = sh_basis(rotated, degree).reshape(len(Q), len(_DIRECTIONS), -1)  # [M, P, K]
     blocks = [slice(n * n, (n + 1) ** 2) for n in range(1, degree + 1)]
     return [there[:, block].T @ before[:, :, block] for block in blocks]
 
 
-def rotated_sh(sh_rest: Floats, Q: Floats, rows: Ints) -> Floats:
+def rotate_sh(sh_rest: Floats, Q: Floats, rows: Ints) -> Floats:
     """Return coefficients rotated by the matrix of each row: ``c'_l = D_l(Q) c_l`` for every degree and channel.
 
     Parameters
@@ -77,10 +77,10 @@ def rotated_sh(sh_rest: Floats, Q: Floats, rows: Ints) -> Floats:
         Float64.
     """
     degree = math.isqrt(sh_rest.shape[1] + 1) - 1
-    turned, start = np.empty(sh_rest.shape), 0
+    rotated, start = np.empty(sh_rest.shape), 0
     used, rows = np.unique(rows, return_inverse=True)
     for D in sh_rotations(Q[used], degree):
         part = slice(start, start + D.shape[1])
-        turned[:, part] = D[rows] @ sh_rest[:, part].astype(np.float64)
+        rotated[:, part] = D[rows] @ sh_rest[:, part].astype(np.float64)
         start = part.stop
-    return turned
+    return rotated

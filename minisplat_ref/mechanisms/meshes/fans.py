@@ -13,10 +13,10 @@ every corner is the same, ``exp(-q / 2)`` = 1/291, and a fainter Gaussian has a 
 
 Back: the corners of an edited polygon give spans again, and these an ellipse. Two ways:
 
-- :func:`fitted`, the least squares over all corners, ``S = 2 / (n r) sum_j (x_j - mu) (cos phi_j, sin phi_j)`` with
-  ``mu`` the mean of the corners. It is exact for every affine edit: spans that it leaves at an oblique angle, as a
-  shear does, are turned by the angle ``tan 2 theta = 2 S_a . S_b / (S_a . S_a - S_b . S_b)`` to the axes of the same
-  ellipse.
+- :func:`fit_flat_gaussians`, the least squares over all corners, ``S = 2 / (n r) sum_j (x_j - mu) (cos phi_j, sin
+  phi_j)`` with ``mu`` the mean of the corners. It is exact for every affine edit: spans that it leaves at an oblique
+  angle, as a shear does, are rotated by the angle ``tan 2 theta = 2 S_a . S_b / (S_a . S_a - S_b . S_b)`` to the axes
+  of the same ellipse.
 - :func:`by_gram_schmidt`, the paper's: the first corner gives the first span, the corner a quarter further on the
   second, less its component along the first. It is exact where the spans stay perpendicular, and loses any shear.
 
@@ -71,7 +71,7 @@ def plane_axes(log_scales: Floats) -> Ints:
     return (normal[:, None] + np.array([1, 2, 3])) % 3
 
 
-def flattened(means: Floats, quats: Floats, log_scales: Floats) -> Flat:
+def flatten(means: Floats, quats: Floats, log_scales: Floats) -> Flat:
     """Return the flat Gaussians in the planes of the two larger axes.
 
     Parameters
@@ -142,7 +142,7 @@ def fan_faces(n_fans: int, n_sides: int = N_SIDES) -> Ints:
     return ((n_sides + 1) * np.arange(n_fans)[:, None, None] + one).reshape(-1, 3)
 
 
-def fitted_spans(corners: Floats, radii: Floats) -> tuple[Floats, Floats]:
+def fit_spans(corners: Floats, radii: Floats) -> tuple[Floats, Floats]:
     """Return the centres [N, 3] and spans [N, 3, 2] that fit polygons best, by least squares over all corners.
 
     Parameters
@@ -158,20 +158,20 @@ def fitted_spans(corners: Floats, radii: Floats) -> tuple[Floats, Floats]:
     return means, sums * (2 / n / radii[:, None, None])
 
 
-def fitted(corners: Floats, radii: Floats) -> Flat:
+def fit_flat_gaussians(corners: Floats, radii: Floats) -> Flat:
     """Return the flat Gaussians whose polygons fit edited ones best; after an affine edit, exactly.
 
     Parameters
     ----------
     corners, radii
-        As for :func:`fitted_spans`; no polygon may be degenerate (:func:`min_widths`).
+        As for :func:`fit_spans`; no polygon may be degenerate (:func:`min_widths`).
 
     Returns
     -------
     Flat
-        Their axes are turned as little as possible from the polygons' first corner and the quarter after it.
+        Their axes are rotated as little as possible from the polygons' first corner and the quarter after it.
     """
-    means, spans = fitted_spans(corners, radii)
+    means, spans = fit_spans(corners, radii)
     a, b = spans[:, :, 0], spans[:, :, 1]
     aa, bb, ab = np.sum(a * a, axis=1), np.sum(b * b, axis=1), np.sum(a * b, axis=1)
     # Of a disc any angle is right, and rounding would choose it: what rounding can have done is no shear.
@@ -188,8 +188,8 @@ def by_gram_schmidt(corners: Floats, radii: Floats) -> Flat:
     Parameters
     ----------
     corners, radii
-        As for :func:`fitted`. Of a polygon whose number of sides four does not divide, the second corner is the one
-        nearest to a quarter, and its component along the first span is known.
+        As for :func:`fit_flat_gaussians`. Of a polygon whose number of sides four does not divide, the second corner is
+        the one nearest to a quarter, and its component along the first span is known.
     """
     n = corners.shape[1]
     means = corners.mean(axis=1)
@@ -211,9 +211,9 @@ def min_widths(corners: Floats) -> Floats:
     Returns
     -------
     ndarray of shape (N,)
-        The smaller over the larger half-axis of the ellipse of :func:`fitted_spans`, in [0, 1].
+        The smaller over the larger half-axis of the ellipse of :func:`fit_spans`, in [0, 1].
     """
-    _, spans = fitted_spans(corners, np.ones(len(corners)))
+    _, spans = fit_spans(corners, np.ones(len(corners)))
     s = np.linalg.svd(spans, compute_uv=False)  # [N, 2]
     return np.divide(s[:, 1], s[:, 0], out=np.zeros(len(s)), where=s[:, 0] > 0)
 

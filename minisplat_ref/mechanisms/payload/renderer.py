@@ -18,7 +18,7 @@ from minisplat_ref.cpu.compositing.responses import KernelResponse
 from minisplat_ref.errors import InputError
 from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
 from minisplat_ref.reference.hits import Response
-from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, RenderTape, Request, activated, drawn_degree
+from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, RenderTape, Request, activate, choose_degree
 from minisplat_ref.types import (
     Camera,
     Floats,
@@ -154,10 +154,10 @@ def _render(payload: Payload, model: Model, view: View, request: Request) -> tup
     if missing:
         way_out = "use --backend reference" if missing <= BY_REFERENCE else "train a recipe that does without"
         raise InputError(f"{payload.plural} are drawn without {', '.join(sorted(missing))}: {way_out}")
-    sh_degree = drawn_degree(g.sh_rest, request.sh_degree)
+    sh_degree = choose_degree(g.sh_rest, request.sh_degree)
     background = np.zeros(3, dtype) if request.background is None else np.asarray(request.background, dtype)
 
-    primitives = activated(g._replace(opacity_logits=payload.opacity_logits(g)), request.is_visible)
+    primitives = activate(g._replace(opacity_logits=payload.opacity_logits(g)), request.is_visible)
     projection = backend.project(*primitives, camera, conventions)
     projected = Projected(g, primitives, camera, conventions, backend, projection)
     footprints = payload.footprints(projected)

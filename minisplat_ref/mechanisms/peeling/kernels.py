@@ -27,7 +27,7 @@ import numpy as np
 
 from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
 from minisplat_ref.jit.literals import ONE, ZERO
-from minisplat_ref.jit.scheduling import dynamic_range, shared_counter
+from minisplat_ref.jit.scheduling import dynamic_range, make_shared_counter
 from minisplat_ref.mechanisms.peeling.layers import (
     ANGLE_MIN,
     Frame,
@@ -41,7 +41,7 @@ from minisplat_ref.types import Floats, Ints
 G_1, G_2, S = 0, 3, 6  # columns of a plane: each a value at the anchor, and the slopes along x and y, per pixel
 N_COLUMNS = 9
 SLACK = 1e-6  # px that boxes and rows are too large by
-PIXELS_A_TURN = 64
+PIXELS_PER_CHUNK = 64
 
 
 class Lens(NamedTuple):
@@ -169,20 +169,20 @@ def edge_row(P, Q):
 
 
 @scalar
-def grown(box, x, y):
+def grow_box(box, x, y):
     """Return the box with a point of the image in it."""
     return min(box[0], x), min(box[1], y), max(box[2], x), max(box[3], y)
 
 
 @scalar
-def grown_by_side(box, P, Q, lens):
+def grow_box_by_side(box, P, Q, lens):
     """Return the box with the first end of a side in it, and the point where the side meets the near plane."""
     if P[2] > lens.near:
-        box = grown(box, lens.fx * P[0] / P[2] + lens.cx, lens.fy * P[1] / P[2] + lens.cy)
+        box = grow_box(box, lens.fx * P[0] / P[2] + lens.cx, lens.fy * P[1] / P[2] + lens.cy)
     if (P[2] > lens.near) != (Q[2] > lens.near):
         f = (lens.near - P[2]) / (Q[2] - P[2])
         x, y = P[0] + f * (Q[0] - P[0]), P[1] + f * (Q[1] - P[1])
-        box = grown(box, lens.fx * x / lens.near + lens.cx, lens.fy * y / lens.near + lens.cy)
+        box = grow_box(box, lens.fx * x / lens.near + lens.cx, lens.fy * y / lens.near + lens.cy)
     return box
 
 
@@ -203,9 +203,9 @@ def _set_up(vertices, faces, lens, planes):
         if not abs(volume) > lens.min_angle * math.sqrt(dot(normal, normal)) * math.sqrt(dot(P_0, P_0)):
             continue
         box = np.inf, np.inf, -np.inf, -np.inf
-        box = grown_by_side(box, P_0, P_1, lens)
-        box = grown_by_side(box, P_1, P_2, lens)
-        box = grown_by_side(box, P_2, P_0, lens)
+        box = grow_box_by_side(box, P_0, P_1, lens)
+        box = grow_box_by_side(box, P_1, P_2, lens)
+        box = grow_box_by_side(box, P_2, P_0, lens)
         if not box[0] <= box[2]:  # nothing is in front of the near plane
             continue
         boxes[n, 0], boxes[n, 1] = pixel_at(box[0] - SLACK, lens.width), pixel_at(box[1] - SLACK, lens.height)
@@ -350,11 +350,11 @@ def _shade(fragments, faces, rgba, shades):
 
 @kernel()
 def _blend(layers, places, shades, background, max_layers, n_threads, out):
-    taken, n_pixels = shared_counter(), layers.offsets.size - 1
+    taken, n_pixels = make_shared_counter(), layers.offsets.size - 1
     for _ in prange(n_threads):
         image, T_end, transmittances, n_blended = out
-        for turn in dynamic_range(taken, (n_pixels + PIXELS_A_TURN - 1) // PIXELS_A_TURN):
-            for p in range(turn * PIXELS_A_TURN, min((turn + 1) * PIXELS_A_TURN, n_pixels)):
+        for chunk in dynamic_range(taken, (n_pixels + PIXELS_PER_CHUNK - 1) // PIXELS_PER_CHUNK):
+            for p in range(chunk * PIXELS_PER_CHUNK, min((chunk + 1) * PIXELS_PER_CHUNK, n_pixels)):
                 ids = layers.ids[layers.offsets[p] : layers.offsets[p + 1]]
                 for i in range(ids.size // 2 - 1, -1, -1):
                     sift_down(ids, i, ids.size, places)
@@ -377,22 +377,22 @@ def _blend(layers, places, shades, background, max_layers, n_threads, out):
 @kernel()
 def _blend_vjp(layers, shades, n_blended, transmittances, background, v_output, n_threads, v_shades):
     """Give every blended fragment the derivatives of its colour and alpha, from a pixel's last to its first."""
-    taken, n_pixels = shared_counter(), n_blended.size
+    taken, n_pixels = make_shared_counter(), n_blended.size
     for _ in prange(n_threads):
         v, v_alpha = v_output
-        for turn in dynamic_range(taken, (n_pixels + PIXELS_A_TURN - 1) // PIXELS_A_TURN):
-            for p in range(turn * PIXELS_A_TURN, min((turn + 1) * PIXELS_A_TURN, n_pixels)):
+        for chunk in dynamic_range(taken, (n_pixels + PIXELS_PER_CHUNK - 1) // PIXELS_PER_CHUNK):
+            for p in range(chunk * PIXELS_PER_CHUNK, min((chunk + 1) * PIXELS_PER_CHUNK, n_pixels)):
                 ids = layers.ids[layers.offsets[p] : layers.offsets[p + 1]]
                 behind = v[p, 0] * background[0] + v[p, 1] * background[1] + v[p, 2] * background[2]
                 for i in range(ids.size - n_blended[p], ids.size):
                     f = ids[i]
                     alpha, T = shades[f, 3], transmittances[f]
-                    light = v_alpha[p]
+                    v_dot_c = v_alpha[p]
                     for k in range(3):
-                        light += v[p, k] * shades[f, k]
+                        v_dot_c += v[p, k] * shades[f, k]
                         v_shades[f, k] = alpha * T * v[p, k]
-                    v_shades[f, 3] = T * (light - behind)
-                    behind = alpha * light + (ONE - alpha) * behind
+                    v_shades[f, 3] = T * (v_dot_c - behind)
+                    behind = alpha * v_dot_c + (ONE - alpha) * behind
 
 
 @kernel()

@@ -126,14 +126,14 @@ def peel_vjp(
     found, T = tape.fragments, tape.transmittances
     colors, alphas = _shade(mesh, found)
     v, v_A = v_image.reshape(-1, 3).astype(np.float64), v_alpha.ravel().astype(np.float64)
-    light = np.sum(v[found.pixels] * colors, axis=1) + v_A[found.pixels]  # [F] v . c + v_A
+    v_dot_c = np.sum(v[found.pixels] * colors, axis=1) + v_A[found.pixels]  # [F] v . c + v_A
     behind = v @ background  # [H W] s
     v_rgba = np.empty((len(alphas), 4))
     v_rgba[:, :3] = (alphas * T)[:, None] * v[found.pixels]
     for layer in reversed(list(_layers(found))):
         at = found.pixels[layer]
-        v_rgba[layer, 3] = T[layer] * (light[layer] - behind[at])
-        behind[at] = alphas[layer] * light[layer] + (1 - alphas[layer]) * behind[at]
+        v_rgba[layer, 3] = T[layer] * (v_dot_c[layer] - behind[at])
+        behind[at] = alphas[layer] * v_dot_c[layer] + (1 - alphas[layer]) * behind[at]
 
     rows = mesh.faces[found.faces]  # [F, 3] of the vertices
     v_places = np.einsum("fk,fik->fi", v_rgba, mesh.rgba[rows].astype(np.float64))  # v_b

@@ -20,7 +20,7 @@ from minisplat_ref.types import Floats, Ints
 PAIRS_AT_ONCE = 1 << 18  # of rays and Gaussians: some thirty arrays of float64, 60 MB
 
 
-class PairGradient(NamedTuple):
+class IntersectionGradient(NamedTuple):
     """Gradient with respect to what a Gaussian and a ray are, pair by pair."""
 
     means: Floats
@@ -41,9 +41,9 @@ class Meeting(NamedTuple):
     n: int
     """Gaussians."""
     meet: Callable[[Rays, Ints, Ints], tuple[Floats, Floats]]
-    """``meet(rays, ray_ids, gaussian_ids)``: alpha before the clamp [H] and t [H] of pairs; alpha is 0, or t not a
-    number, where the ray misses the Gaussian."""
-    meet_vjp: Callable[..., PairGradient]
+    """``meet(rays, ray_ids, gaussian_ids)``: alpha before the clamp [H] and t [H]; alpha is 0, or t not a number,
+    where the ray misses the Gaussian."""
+    meet_vjp: Callable[..., IntersectionGradient]
     """``meet_vjp(rays, ray_ids, gaussian_ids, v_unclamped, v_depths)``: the gradient of that."""
 
 
@@ -68,8 +68,8 @@ def list_hits(meeting: Meeting, rays: Rays, conventions: Conventions) -> Hits:
     ids, alphas, depths, weights, rows = ([np.zeros(0, kind)] for kind in (int, float, float, float, int))
     transmittances = np.ones(n_rays)
     for some in _chunks(n_rays, n):
-        pairs = meeting.meet(rays, np.repeat(some, n), np.tile(np.arange(n), len(some)))
-        unclamped, t = (array.reshape(len(some), n) for array in pairs)
+        intersections = meeting.meet(rays, np.repeat(some, n), np.tile(np.arange(n), len(some)))
+        unclamped, t = (array.reshape(len(some), n) for array in intersections)
         alpha = np.minimum(conventions.alpha_max, unclamped)
         is_hit = (alpha >= conventions.alpha_min) & (t > rays.near[some, None]) & (t < rays.far[some, None])
         order = np.argsort(np.where(is_hit, t, np.inf), axis=1, kind="stable")  # [P', N]
@@ -163,19 +163,19 @@ def blend_rays_vjp(
     behind = np.cumsum(table[:, :0:-1], axis=1)[:, ::-1] - table[:, 1:] + table[:, :1]  # B [P, K]
     v_alphas = hits.weights / alphas * f - behind[ray_ids, places] / (1 - alphas)
     v_unclamped = np.where(hits.unclamped <= conventions.alpha_max, v_alphas, 0.0)
-    pairs = meeting.meet_vjp(rays, ray_ids, ids, v_unclamped, hits.weights * v_depths[ray_ids])
+    by_hit = meeting.meet_vjp(rays, ray_ids, ids, v_unclamped, hits.weights * v_depths[ray_ids])
     return RayGradient(
-        means=summed(pairs.means, ids, meeting.n),
-        shapes=summed(pairs.shapes, ids, meeting.n),
-        opacities=summed(pairs.opacities, ids, meeting.n),
-        colors=summed(hits.weights[:, None] * v_image[ray_ids], ids, meeting.n),
+        means=sum_by_row(by_hit.means, ids, meeting.n),
+        shapes=sum_by_row(by_hit.shapes, ids, meeting.n),
+        opacities=sum_by_row(by_hit.opacities, ids, meeting.n),
+        colors=sum_by_row(hits.weights[:, None] * v_image[ray_ids], ids, meeting.n),
         background=np.sum(blended.transmittances[:, None] * v_image, axis=0),
-        origins=summed(pairs.origins, ray_ids, len(rays.near)),
-        directions=summed(pairs.directions, ray_ids, len(rays.near)),
+        origins=sum_by_row(by_hit.origins, ray_ids, len(rays.near)),
+        directions=sum_by_row(by_hit.directions, ray_ids, len(rays.near)),
     )
 
 
-def summed(values: Floats, rows: Ints, n_rows: int) -> Floats:
+def sum_by_row(values: Floats, rows: Ints, n_rows: int) -> Floats:
     """Return the sums [n_rows, ...] of those values [H, ...] that belong to the same row."""
     sums = np.zeros((n_rows, *values.shape[1:]))
     np.add.at(sums, rows, values)
@@ -183,7 +183,7 @@ def summed(values: Floats, rows: Ints, n_rows: int) -> Floats:
 
 
 def _chunks(n_rays: int, n: int) -> Iterator[Ints]:
-    """Yield the rays in chunks, so that not too many pairs are in memory at once."""
+    """Yield the rays in chunks, so that not too many intersections are in memory at once."""
     step = max(1, PAIRS_AT_ONCE // max(n, 1))
     for first in range(0, n_rays, step):
         yield np.arange(first, min(first + step, n_rays))

@@ -1,4 +1,4 @@
-"""Rays through a tree of Gaussians, forward and back: what ``mechanisms.rays.blending`` says, without all pairs.
+"""Rays through a tree of Gaussians, forward and back: ``mechanisms.rays.blending`` without testing every Gaussian.
 
 The gradient needs no lock and depends on no order of threads: each ray writes what its hits contribute to rows of their
 own, and each Gaussian then adds up its rows in the order of the rays.
@@ -16,7 +16,7 @@ import numpy as np
 from minisplat_ref.constants import Conventions
 from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
 from minisplat_ref.jit.lanes import WIDTH
-from minisplat_ref.jit.scheduling import dynamic_range, shared_counter
+from minisplat_ref.jit.scheduling import dynamic_range, make_shared_counter
 from minisplat_ref.mechanisms.rays.pixel_rays import BlendedRays, Hits, RayGradient, Rays, Tracer
 from minisplat_ref.mechanisms.rays.traversal import OPACITY, Scene, empty_lists, finder, limits_of, ray_of
 from minisplat_ref.types import Floats, Ints
@@ -82,7 +82,7 @@ def _kernels_of(response: RayResponse) -> _Kernels:
     @kernel()
     def blend(scene, colors, rays, background, limits, n_threads, blended):
         n_rays = len(rays.near)
-        taken = shared_counter()
+        taken = make_shared_counter()
         for _ in prange(n_threads):
             found = empty_lists(limits.capacity)
             image, depths, transmittances, n_hits, is_seen = blended
@@ -115,7 +115,7 @@ def _kernels_of(response: RayResponse) -> _Kernels:
     def list_all(scene, rays, limits, n_threads, hits):
         """Write the hits with rows of the scene; ``hits.offsets`` tells how many each ray has."""
         n_rays = len(rays.near)
-        taken = shared_counter()
+        taken = make_shared_counter()
         for _ in prange(n_threads):
             found = empty_lists(limits.capacity)
             offsets, ray_ids, rows, unclamped, depths, weights, transmittances = hits
@@ -137,7 +137,7 @@ def _kernels_of(response: RayResponse) -> _Kernels:
     def differentiate_rays(scene, colors, rays, limits, n_threads, hits, cotangents, v):
         """Write the gradient with respect to each hit and each ray, from the last hit to the first."""
         n_rays = len(rays.near)
-        taken = shared_counter()
+        taken = make_shared_counter()
         for _ in prange(n_threads):
             v_unclamped, v_depths, v_rays = v
             for part in dynamic_range(taken, (n_rays + RAYS_PER_PART - 1) // RAYS_PER_PART):
@@ -150,10 +150,10 @@ def _kernels_of(response: RayResponse) -> _Kernels:
                         row = hits.gaussian_ids[h]
                         g, weight, unclamped = scene.gaussian_ids[row], hits.weights[h], hits.unclamped[h]
                         alpha = min(limits.alpha_max, unclamped)
-                        light = red * colors[g, 0] + green * colors[g, 1] + blue * colors[g, 2]
-                        light += cotangents.depths[r] * hits.depths[h]
-                        v_alpha = weight / alpha * light - behind / (1.0 - alpha)
-                        behind += weight * light
+                        v_dot_c = red * colors[g, 0] + green * colors[g, 1] + blue * colors[g, 2]
+                        v_dot_c += cotangents.depths[r] * hits.depths[h]
+                        v_alpha = weight / alpha * v_dot_c - behind / (1.0 - alpha)
+                        behind += weight * v_dot_c
                         v_unclamped[h] = v_alpha if unclamped <= limits.alpha_max else 0.0
                         v_depths[h] = weight * cotangents.depths[r]
                         of_mean, of_direction, _of_shape = meet_vjp(
@@ -167,7 +167,7 @@ def _kernels_of(response: RayResponse) -> _Kernels:
     def add_up(scene, rays, n_threads, hits, groups, v_image, v, sums):
         """Add the gradient of each row up: mean, opacity, colour, shape."""
         n_rows = len(scene.gaussian_ids)
-        taken = shared_counter()
+        taken = make_shared_counter()
         order, offsets = groups
         for _ in prange(n_threads):
             for part in dynamic_range(taken, (n_rows + GAUSSIANS_PER_PART - 1) // GAUSSIANS_PER_PART):
@@ -228,7 +228,7 @@ def blend_rays(
 def list_hits(response: RayResponse, scene: Scene, rays: Rays, conventions: Conventions) -> Hits:
     """Return the blended hits of each ray: see :func:`minisplat_ref.mechanisms.rays.blending.list_hits`."""
     counts = blend_rays(response, scene, np.zeros((scene.n, 3)), rays, np.zeros(3), conventions).n_hits
-    hits = _listed(response, scene, rays, conventions, counts)
+    hits = _list_hits(response, scene, rays, conventions, counts)
     return hits._replace(gaussian_ids=scene.gaussian_ids[hits.gaussian_ids].astype(np.int64))
 
 
@@ -244,7 +244,7 @@ def blend_rays_vjp(
 ) -> RayGradient:
     """Gradient of :func:`blend_rays`: see :func:`minisplat_ref.mechanisms.rays.blending.blend_rays_vjp`."""
     v_image, v_depths, v_transmittances = (_wide(v) for v in v_blended)
-    kernels, hits = _kernels_of(response), _listed(response, scene, rays, conventions, blended.n_hits)
+    kernels, hits = _kernels_of(response), _list_hits(response, scene, rays, conventions, blended.n_hits)
     behind = hits.transmittances * (v_image @ _wide(background) + v_transmittances)
     n_hits, n_rays, n_rows = len(hits.ray_ids), len(rays.near), len(scene.gaussian_ids)
     v = _HitGradient(np.empty(n_hits), np.empty(n_hits), np.empty((n_rays, 6)))
@@ -266,7 +266,7 @@ def blend_rays_vjp(
     )
 
 
-def _listed(response: RayResponse, scene: Scene, rays: Rays, conventions: Conventions, counts: Ints) -> Hits:
+def _list_hits(response: RayResponse, scene: Scene, rays: Rays, conventions: Conventions, counts: Ints) -> Hits:
     """Return the hits, ``counts`` [P] per ray, with rows of the scene instead of the population's."""
     offsets = np.concatenate([[0], np.cumsum(counts)])
     n_hits = int(offsets[-1])

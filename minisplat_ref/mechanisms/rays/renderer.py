@@ -21,7 +21,7 @@ from minisplat_ref.mechanisms.rays.pixel_rays import (
     pixel_rays,
     pixel_rays_vjp,
 )
-from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, Request, drawn_degree
+from minisplat_ref.rendering import SPLATTING, Renderer, RenderGradient, Request, choose_degree
 from minisplat_ref.types import Bools, Camera, Floats, Ints, Model, RenderOutput, View
 
 WANTS = frozenset({"depth", "stats"})
@@ -76,7 +76,7 @@ def render(traced: Traced, model: Model, view: View, request: Request) -> tuple[
         names = ", ".join(sorted(wants - WANTS))
         raise InputError(f"{traced.name} does not give {names}: use a recipe that does not ask for it")
     dtype, conventions, backend = g.means.dtype, request.conventions, request.backend
-    degree = drawn_degree(g.sh_rest, request.sh_degree)
+    degree = choose_degree(g.sh_rest, request.sh_degree)
     background = np.zeros(3) if request.background is None else np.asarray(request.background, np.float64)
     opacities = _opacities(g.opacity_logits, request.is_visible)
     prepared = traced.prepare(g, opacities)

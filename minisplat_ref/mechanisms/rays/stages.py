@@ -15,7 +15,7 @@ from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Floats
 
 
-def traced_stages(
+def trace_stages(
     representation: Representation,
     meeting_of: Callable[[Mapping[str, Floats]], Meeting],
     backend: Backend,

@@ -23,14 +23,14 @@ class RayHits(NamedTuple):
 def ewa_hits(primitives: Primitives, camera: Camera, rays: Floats, conventions: Conventions) -> RayHits:
     """Return the hits of 3DGS's footprints on rays [P, 3] of the camera's frame, listed by camera z."""
     projection = project_ewa(*primitives, camera, conventions)
-    ids = _listed(projection.depths, projection.radii)
+    ids = _list_visible(projection.depths, projection.radii)
     return RayHits(ids, conic_hit(projection, ids, pinhole(rays, camera)))
 
 
 def tangent_hits(primitives: Primitives, camera: Camera, rays: Floats, conventions: Conventions) -> RayHits:
     """Return the hits of footprints on tangent planes on rays [P, 3] of the camera's frame, listed by distance."""
     footprints = project(primitives, camera, conventions)
-    ids = _listed(footprints.distances, footprints.radii)
+    ids = _list_visible(footprints.distances, footprints.radii)
     return RayHits(ids, hit(footprints, ids, pinhole(rays, camera)))
 
 
@@ -83,7 +83,7 @@ def ray_colors(
     return light
 
 
-def misordered_pairs(is_hit: Bools, depths: Floats) -> tuple[int, int]:
+def count_misordered(is_hit: Bools, depths: Floats) -> tuple[int, int]:
     """Return the number of pairs of hits of all rays, and of those in the opposite order to their depths.
 
     Parameters
@@ -93,22 +93,22 @@ def misordered_pairs(is_hit: Bools, depths: Floats) -> tuple[int, int]:
     depths : ndarray of shape (G, P)
         Depths in that order, world units.
     """
-    n_pairs = n_wrong = 0
+    n_all = n_wrong = 0
     for ray in range(depths.shape[1]):
         own = depths[is_hit[:, ray], ray]
-        n_pairs += len(own) * (len(own) - 1) // 2
+        n_all += len(own) * (len(own) - 1) // 2
         n_wrong += int(np.triu(own[:, None] > own[None, :], 1).sum())
-    return n_pairs, n_wrong
+    return n_all, n_wrong
 
 
-def _listed(depths: Floats, radii: Ints) -> Ints:
+def _list_visible(depths: Floats, radii: Ints) -> Ints:
     """Return the rows that are seen, nearest first."""
     rows = np.flatnonzero(radii[:, 0] > 0)
     listed: Ints = rows[np.argsort(depths[rows], kind="stable")]
     return listed
 
 
-def yawed(camera: Camera, yaw: float) -> Camera:
+def yaw_camera(camera: Camera, yaw: float) -> Camera:
     """Return the camera rotated in place by ``yaw`` radians about its own y axis."""
     cos, sin = np.cos(yaw), np.sin(yaw)
     Y = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
@@ -116,7 +116,7 @@ def yawed(camera: Camera, yaw: float) -> Camera:
     return camera._replace(cam_from_world_R=R, cam_from_world_t=Y @ np.asarray(camera.cam_from_world_t, np.float64))
 
 
-def translated(camera: Camera, dx: float) -> Camera:
+def translate_camera(camera: Camera, dx: float) -> Camera:
     """Return the camera moved by ``dx`` world units along its own x axis."""
     return camera._replace(cam_from_world_t=camera.cam_from_world_t - np.array([dx, 0.0, 0.0]))
 

@@ -19,7 +19,7 @@ from minisplat_ref.mechanisms.tangent.planes import (
 )
 from minisplat_ref.reference.compositing import composite_hits, composite_hits_vjp
 from minisplat_ref.reference.hits import Response
-from minisplat_ref.rendering import SPLATTING, RenderGradient, Request, activated, drawn_degree
+from minisplat_ref.rendering import SPLATTING, RenderGradient, Request, activate, choose_degree
 from minisplat_ref.types import (
     Camera,
     Floats,
@@ -90,11 +90,11 @@ def prepare(model: Model, camera: Camera, request: Request, buffer_size: int | N
         The size of the buffer is out of range, or the conventions ask for compensated opacities.
     """
     g, backend = model.gaussians, request.backend
-    size = checked_buffer(buffer_size)
+    size = check_buffer_size(buffer_size)
     dtype = g.means.dtype
-    sh_degree = drawn_degree(g.sh_rest, request.sh_degree)
+    sh_degree = choose_degree(g.sh_rest, request.sh_degree)
     background = np.zeros(3, dtype) if request.background is None else np.asarray(request.background, dtype)
-    primitives = activated(g, request.is_visible)
+    primitives = activate(g, request.is_visible)
     footprints = project(primitives, camera, request.conventions)
     channels = backend.sh_colors(g.means, g.sh_dc, g.sh_rest, camera, sh_degree, footprints.radii)
     has_depth = "depth" in request.wants
@@ -116,7 +116,7 @@ def prepare(model: Model, camera: Camera, request: Request, buffer_size: int | N
     )
 
 
-def checked_buffer(buffer_size: int | None) -> int:
+def check_buffer_size(buffer_size: int | None) -> int:
     """Return the number of hits that a pixel sorts in its buffer; None for all.
 
     Raises

@@ -3,7 +3,7 @@
 import numpy as np
 
 from minisplat_ref.backends import REFERENCE, Backend
-from minisplat_ref.mechanisms.tangent.renderer import RESPONSE, checked_buffer, prepare
+from minisplat_ref.mechanisms.tangent.renderer import RESPONSE, check_buffer_size, prepare
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.models import model_stage
 from minisplat_ref.oracle.setting import POSE, Setting
@@ -26,7 +26,7 @@ def renderer_stage(
     The reference computes these records again, so that the check notices a step across a threshold.
     """
     stage = model_stage(backend, setting, representation, rng)
-    response = RESPONSE._replace(buffer_size=checked_buffer(buffer_size))
+    response = RESPONSE._replace(buffer_size=check_buffer_size(buffer_size))
 
     def function(*args: Floats) -> Point:
         point, named = stage.function(*args), dict(zip(stage.inputs, args, strict=True))
@@ -38,13 +38,13 @@ def renderer_stage(
         tiles = list(tile_hits(prepared.footprints, bins, setting.conventions, response))
         sides = [np.concatenate([np.ravel(tile.alphas > 0) for tile in tiles])]
         sides += [np.concatenate([np.ravel(tile.is_clamped) for tile in tiles])]
-        sides += [np.concatenate([_blended_order(tile.order, tile.alphas) for tile in tiles])]
+        sides += [np.concatenate([_select_blended(tile.order, tile.alphas) for tile in tiles])]
         return Point(point.outputs, (*point.sides, bins.gaussian_ids, *sides))
 
     return stage._replace(function=function)
 
 
-def _blended_order(order: Ints | None, alphas: Floats) -> Ints:
+def _select_blended(order: Ints | None, alphas: Floats) -> Ints:
     """Return the order [G * P] of the blended hits; the place of the others does not matter."""
     if order is None:
         return np.zeros(0, int)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN, INRIA, MINI_SPLATTING2
-from minisplat_ref.oracle.hard_cases.scenes import call, camera, cloud, gaussians, rounded, turn
+from minisplat_ref.oracle.hard_cases.scenes import call, camera, cloud, gaussians, rotation_quat, rounded
 from minisplat_ref.oracle.hard_cases.subjects import HardCase, Parameters
 from minisplat_ref.oracle.tolerances import BEHIND, DEEP
 from minisplat_ref.reference.covariance import rotation_matrices
@@ -19,7 +19,7 @@ def _stack(n: int, logit: float, **changes: object) -> Parameters:
 
 
 def _wall() -> Parameters:
-    rng, R = np.random.default_rng(8), rotation_matrices(turn(0.7, (1, 2, 3))[None])[0]
+    rng, R = np.random.default_rng(8), rotation_matrices(rotation_quat(0.7, (1, 2, 3))[None])[0]
     on_wall = np.column_stack([rng.uniform((-1.6, -1.2), (1.6, 1.2), size=(100, 2)), np.full(100, 4.0)])
     wall = gaussians(on_wall @ R, 0.05, logits=rng.normal(1, 1, 100))
     return Parameters(wall, camera(48, 36, fx=60.0, fy=60.0, cam_from_world_R=R))
@@ -57,7 +57,7 @@ LAYERS = (
     ),
     HardCase(
         "logits-plus-minus-30",
-        "opaque and invisible by turns",
+        "opaque and invisible, alternating",
         "only the opaque are drawn and have gradients",
         lambda: Parameters(cloud(opacity_logits=np.tile([30.0, -30.0], 15)), camera()),
         BEHIND,

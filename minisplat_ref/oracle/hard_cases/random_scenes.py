@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN, INRIA, MINI_SPLATTING2
-from minisplat_ref.oracle.hard_cases.scenes import ANTIALIASED, BACKGROUND, camera, intrinsics, rounded, turn
+from minisplat_ref.oracle.hard_cases.scenes import ANTIALIASED, BACKGROUND, camera, intrinsics, rotation_quat, rounded
 from minisplat_ref.oracle.hard_cases.subjects import Call, HardCase, Parameters, Subject
 from minisplat_ref.oracle.tolerances import BEHIND, DEEP, HARMONICS, LONG, ORDINARY, WORLD, HardCaseTolerance
 from minisplat_ref.reference.covariance import rotation_matrices
@@ -87,7 +87,7 @@ def _scaled(low: float, high: float, **changes: object) -> Callable[[Draw], Subj
 
 
 def _shaped(long: float, short: float, n_long: int) -> Callable[[Draw], Subject]:
-    """One or two axes of a length and the others of another, turned at random."""
+    """One or two axes of a length and the others of another, rotated at random."""
 
     def make(d: Draw) -> Subject:
         axes = np.where(np.arange(3) < n_long, long, short) * d.log_uniform(0.3, 3, d.n, 3)
@@ -145,8 +145,8 @@ def _one_depth(d: Draw) -> Subject:
 
 
 def _wall(d: Draw) -> Subject:
-    """One depth before a camera that is turned against the world's axes: rounding the means decides the order."""
-    R = rotation_matrices(turn(0.7, (1, 2, 3))[None])[0]
+    """One depth before a camera that is rotated against the world's axes: rounding the means decides the order."""
+    R = rotation_matrices(rotation_quat(0.7, (1, 2, 3))[None])[0]
     means = d.means(np.full(d.n, 4.0)) @ R
     view = d.view(cam_from_world_R=R)
     log_scales = np.log(d.log_uniform(0.02, 0.1, d.n, 3))
@@ -210,7 +210,7 @@ def _quaternions(d: Draw) -> Subject:
     return Parameters(d.gaussians(quats=quats), d.view())
 
 
-def _turns(d: Draw) -> Subject:
+def _align_with_axes(d: Draw) -> Subject:
     """Draw axes on the world's axes, or nearly, and equal scales, where a rotation's derivatives vanish."""
     quats = np.eye(4)[d.rng.integers(0, 4, d.n)] + d.rng.choice([0, 1e-20, 1e-7], (d.n, 1)) * d.rng.normal(
         size=(d.n, 4)
@@ -324,7 +324,7 @@ KINDS = (
     Kind("harmonics", "coefficients of degree 3 up to 1e5", "their sum, clamped at 0", _harmonics, HARMONICS),
     Kind("world", "UTM coordinates, 5e6 metres from the origin", "the image of the means as rounded", _world, WORLD),
     Kind("quaternion-lengths", "|q| from 1e-30 to 1e30", "length does not matter", _quaternions),
-    Kind("turns-on-axes", "quaternions with zeros, and scales that are equal", "finite gradients", _turns),
+    Kind("turns-on-axes", "quaternions with zeros, and scales that are equal", "finite gradients", _align_with_axes),
     Kind("channels-1", "one channel, where kernels keep three", "as many channels", _channels(1)),
     Kind("channels-4", "one more channel than kernels keep together", "as many channels", _channels(4)),
     Kind("tile-edges", "centres and boxes on edges of tiles and pixels", "each in all its tiles", _on_tile_edges),

@@ -16,7 +16,7 @@ import numpy as np
 from minisplat_ref.backends import CPU, CPU_EXACT, REFERENCE, Backend
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.cases import Case, Figure, Report
-from minisplat_ref.oracle.hard_cases.subjects import Arrays, Drawing, HardCase, Subject, drawing, splat_tapes
+from minisplat_ref.oracle.hard_cases.subjects import Arrays, Drawing, HardCase, Subject, render_subject, splat_tapes
 from minisplat_ref.oracle.thresholds import Thresholds, span_of, thresholds
 from minisplat_ref.oracle.tolerances import BLOCK_FLOOR, OWN_KERNELS
 from minisplat_ref.splatting import SplatTape
@@ -96,7 +96,7 @@ def _refusal(case: HardCase, refusal: str, subject: Subject, precisions: Sequenc
     """Check that the reference and every precision refuse the subject, in one line with the expected text."""
     for precision in (Precision("reference", REFERENCE, np.float64), *precisions):
         try:
-            drawing(subject, precision.backend, np.dtype(precision.dtype))
+            render_subject(subject, precision.backend, np.dtype(precision.dtype))
         except InputError as error:
             message = str(error)
             if refusal not in message or "\n" in message:
@@ -107,7 +107,7 @@ def _refusal(case: HardCase, refusal: str, subject: Subject, precisions: Sequenc
 
 
 def _comparison(case: HardCase, subject: Subject, precisions: Sequence[Precision]) -> Case:
-    expected_drawing = drawing(subject, REFERENCE, np.dtype(np.float64))
+    expected_drawing = render_subject(subject, REFERENCE, np.dtype(np.float64))
     tapes = splat_tapes(subject, REFERENCE)
     at = _thresholds(tapes[0], _size(expected_drawing.outputs)) if tapes else None
     at_threshold = None if at is None else at.is_near | at.medians
@@ -117,7 +117,9 @@ def _comparison(case: HardCase, subject: Subject, precisions: Sequence[Precision
     figures: dict[str, Figure] = {}
     n_flips = 0
     for precision in precisions:
-        actual = _outcome(drawing(subject, precision.backend, np.dtype(precision.dtype)), cotangents, precision.dtype)
+        actual = _outcome(
+            render_subject(subject, precision.backend, np.dtype(precision.dtype)), cotangents, precision.dtype
+        )
         image_error, flips = _image_error(actual.outputs, expected.outputs, at_threshold)
         block, gradient_error = _gradient_error(actual.gradients, expected.gradients, expected_drawing.gradient_size)
         is_wide = precision.dtype is np.float64

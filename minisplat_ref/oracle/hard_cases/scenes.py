@@ -26,13 +26,13 @@ def camera(width: int = 24, height: int = 18, **changes: Any) -> Camera:
 
 
 def gaussians(means: Any, scales: Any = 0.2, *, quats: Any = None, logits: Any = 1.0, sh_rest: Any = None) -> Gaussians:
-    """Return Gaussians at ``means`` [N, 3]; the other values may be one for all. Random turns and colours."""
+    """Return Gaussians at ``means`` [N, 3]; the other values may be one for all. Random rotations and colours."""
     means = rounded(means)
     n, rng = len(means), np.random.default_rng(7)
-    turns, colors = rng.normal(size=(n, 4)), rng.normal(size=(n, 3))
+    quaternions, colors = rng.normal(size=(n, 4)), rng.normal(size=(n, 3))
     return Gaussians(
         means=means,
-        quats=rounded(np.broadcast_to(turns if quats is None else quats, (n, 4))),
+        quats=rounded(np.broadcast_to(quaternions if quats is None else quats, (n, 4))),
         log_scales=rounded(np.log(np.broadcast_to(scales, (n, 3)))),
         opacity_logits=rounded(np.broadcast_to(logits, n)),
         sh_dc=rounded(colors),
@@ -49,8 +49,8 @@ def cloud(n: int = 30, *, sh_degree: int = 0, scales: Any = (0.25, 0.15, 0.08), 
     return gaussians(means, scales, logits=rng.normal(size=n), sh_rest=rest)._replace(**changes)
 
 
-def turn(angle: float, axis: tuple[float, float, float] = (0, 0, 1)) -> Floats:
-    """Return the quaternion of a turn by an angle in radians about an axis."""
+def rotation_quat(angle: float, axis: tuple[float, float, float] = (0, 0, 1)) -> Floats:
+    """Return the quaternion of a rotation by an angle in radians about an axis."""
     unit = np.asarray(axis, float) / np.linalg.norm(axis)
     return np.append(np.cos(angle / 2), np.sin(angle / 2) * unit)
 
@@ -62,8 +62,8 @@ def needle(scales: tuple[float, float, float], quat: Any, **changes: Any) -> Par
 
 
 def moved_world(offset: Any, n: int = 30, scale: float = 1.0, **changes: Any) -> Parameters:
-    """Return the cloud and a turned camera, both displaced by ``offset`` and scaled, as a georeferenced scene is."""
-    R = rotation_matrices(turn(0.7, (1, 2, 3))[None])[0]
+    """Return the cloud and a rotated camera, both displaced by ``offset`` and scaled, as a georeferenced scene is."""
+    R = rotation_matrices(rotation_quat(0.7, (1, 2, 3))[None])[0]
     centre = np.broadcast_to(offset, 3) + scale * np.array([0.317, -0.143, 0.059])  # no float32 far from the origin
     population = cloud(n)
     means = rounded(scale * population.means @ R + centre)  # the camera's frame is R (x - centre)

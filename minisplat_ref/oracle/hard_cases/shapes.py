@@ -3,12 +3,21 @@
 import numpy as np
 
 from minisplat_ref.constants import INRIA
-from minisplat_ref.oracle.hard_cases.scenes import ANTIALIASED, call, camera, cloud, gaussians, needle, rounded, turn
+from minisplat_ref.oracle.hard_cases.scenes import (
+    ANTIALIASED,
+    call,
+    camera,
+    cloud,
+    gaussians,
+    needle,
+    rotation_quat,
+    rounded,
+)
 from minisplat_ref.oracle.hard_cases.subjects import HardCase, Parameters, Surface
 from minisplat_ref.oracle.tolerances import LONG, ORDINARY
 
 RIDGE = "a ridge without holes; the gradient that the float64 formula has"
-DIAGONAL, TILTED = turn(np.pi / 4), turn(0.3)
+DIAGONAL, TILTED = rotation_quat(np.pi / 4), rotation_quat(0.3)
 
 
 def _with_quats(factor: float) -> Parameters:
@@ -49,27 +58,27 @@ SHAPES = (
         "needle-1e6-along-x",
         "on the pixels' rows: b is 0 and the extents differ by 1e5",
         RIDGE,
-        lambda: needle((1e3, 1e-3, 1e-3), turn(0.0)),
+        lambda: needle((1e3, 1e-3, 1e-3), rotation_quat(0.0)),
         LONG,
     ),
     HardCase(
         "needle-1e6-nearly-along-y",
         "slope and pivot of the conic are at opposite ends of their ranges",
         RIDGE,
-        lambda: needle((1e3, 1e-3, 1e-3), turn(np.pi / 2 - 1e-4)),
+        lambda: needle((1e3, 1e-3, 1e-3), rotation_quat(np.pi / 2 - 1e-4)),
         LONG,
     ),
     HardCase(
         "needle-end-on",
         "points at the camera: its length vanishes in the difference V_0 - x' V_2",
         "a dot of the low-pass's size",
-        lambda: needle((1e-3, 1e-3, 1), turn(0.0)),
+        lambda: needle((1e-3, 1e-3, 1), rotation_quat(0.0)),
     ),
     HardCase(
         "needle-through-the-camera",
         "long along the view, 1e3 behind and before the camera",
         "its linear footprint at the mean; nothing overflows",
-        lambda: needle((1e-3, 1e-3, 1e3), turn(0.05, (0, 1, 0))),
+        lambda: needle((1e-3, 1e-3, 1e3), rotation_quat(0.05, (0, 1, 0))),
         LONG,
     ),
     HardCase(
@@ -97,27 +106,27 @@ SHAPES = (
         "pancake-1e6-face-on",
         "thickness 1e-6 of the width, along the view",
         "as a ball of its width",
-        lambda: needle((0.3, 0.3, 3e-7), turn(0.0)),
+        lambda: needle((0.3, 0.3, 3e-7), rotation_quat(0.0)),
     ),
     HardCase(
         "pancake-1e6-edge-on",
         "two long axes fall onto one line",
         RIDGE,
-        lambda: needle((1, 1, 1e-6), turn(np.pi / 2, (1, 0, 0))),
+        lambda: needle((1, 1, 1e-6), rotation_quat(np.pi / 2, (1, 0, 0))),
         LONG,
     ),
     HardCase(
         "pancake-1e6-oblique-edge",
         "edge-on and turned in the image: u x w is a difference of products 1e6 times larger",
         RIDGE,
-        lambda: needle((1, 1, 1e-6), turn(np.pi / 2, (1, 1, 0))),
+        lambda: needle((1, 1, 1e-6), rotation_quat(np.pi / 2, (1, 1, 0))),
         LONG,
     ),
     HardCase(
         "pancake-1e6-huge",
         "a plane through the view, 1e3 wide",
         "a half-space's band; nothing overflows",
-        lambda: needle((1e3, 1e3, 1e-3), turn(1.5, (1, 0.2, 0))),
+        lambda: needle((1e3, 1e3, 1e-3), rotation_quat(1.5, (1, 0.2, 0))),
         LONG,
     ),
     HardCase(
@@ -167,7 +176,7 @@ SHAPES = (
         "scales-1e-8-to-1e4-in-one",
         "axis ratio 1e12",
         "a half-space's band; nothing overflows",
-        lambda: Parameters(gaussians([[0.1, 0.1, 3]], [[1e-8, 1, 1e4]], quats=turn(0.8, (1, 2, 3))), camera()),
+        lambda: Parameters(gaussians([[0.1, 0.1, 3]], [[1e-8, 1, 1e4]], quats=rotation_quat(0.8, (1, 2, 3))), camera()),
         LONG,
     ),
     HardCase(
@@ -186,7 +195,7 @@ SHAPES = (
         "disc-inria",
         "equal eigenvalues: the root of mid^2 - det cancels",
         "radius by the floored root",
-        lambda: Parameters(gaussians([[0, 0, 3]], 20.0, quats=turn(0.0)), camera(64, 48), conventions=INRIA),
+        lambda: Parameters(gaussians([[0, 0, 3]], 20.0, quats=rotation_quat(0.0)), camera(64, 48), conventions=INRIA),
     ),
     HardCase(
         "singular-without-low-pass",

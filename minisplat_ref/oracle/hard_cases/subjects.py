@@ -12,12 +12,12 @@ import numpy as np
 
 from minisplat_ref.backends import Backend
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
-from minisplat_ref.gsplat_compat import Views, checked_batch, draw, rasterization, rasterization_vjp
+from minisplat_ref.gsplat_compat import Views, check_batch, rasterization, rasterization_vjp, render_one
 from minisplat_ref.oracle.tolerances import ORDINARY, HardCaseTolerance
 from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.splatting import Primitives, SplatTape
 from minisplat_ref.types import Bools, Camera, Floats, Gaussians
-from minisplat_ref.validation import check_gaussians, chosen_conventions
+from minisplat_ref.validation import check_gaussians, choose_conventions
 
 Arrays = dict[str, Floats]
 
@@ -107,7 +107,7 @@ def cast(bundle: Any, dtype: np.dtype) -> Any:
     return type(bundle)(*(cast(field, dtype) for field in bundle)) if isinstance(bundle, tuple) else bundle
 
 
-def drawing(subject: Subject, backend: Backend, dtype: np.dtype) -> Drawing:
+def render_subject(subject: Subject, backend: Backend, dtype: np.dtype) -> Drawing:
     """Draw a subject in one precision.
 
     Raises
@@ -147,7 +147,7 @@ def splat_tapes(subject: Subject, backend: Backend) -> list[SplatTape]:
         return []
     a, options = subject.arrays, subject.options
     primitives = Primitives(a["means"], a["quats"], a["scales"], a["opacities"])
-    conventions = chosen_conventions(
+    conventions = choose_conventions(
         options.get("profile", GSPLAT_MAIN),
         options.get("near_plane"),
         options.get("far_plane"),
@@ -156,8 +156,8 @@ def splat_tapes(subject: Subject, backend: Backend) -> list[SplatTape]:
     )
     views = Views(a["viewmats"], a["Ks"], subject.width, subject.height)
     sh_degree, backgrounds = options.get("sh_degree"), options.get("backgrounds")
-    batch = checked_batch(primitives, views, a["colors"], sh_degree, backgrounds, "RGB")
-    return [draw(batch, c, conventions, backend) for c in range(len(batch.cameras))]
+    batch = check_batch(primitives, views, a["colors"], sh_degree, backgrounds, "RGB")
+    return [render_one(batch, c, conventions, backend) for c in range(len(batch.cameras))]
 
 
 def _draw_parameters(subject: Parameters, backend: Backend, dtype: np.dtype) -> Drawing:

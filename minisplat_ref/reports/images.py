@@ -6,32 +6,32 @@ from PIL import Image
 
 from minisplat_ref.types import Floats
 
-Picture = NDArray[np.uint8]  # [H, W, 3] sRGB
+Image8 = NDArray[np.uint8]  # [H, W, 3] sRGB
 
 ERROR_RANGE = 0.25  # of [0, 1]: larger differences are all shown as the brightest colour
 GAP = 4  # white pixels between pictures side by side
 
 
-def to_picture(image: Floats) -> Picture:
+def to_8_bits(image: Floats) -> Image8:
     """Round a render [H, W, 3] in [0, 1] to 8 bits; values outside are clipped."""
     return np.rint(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
-def error_picture(truth: Picture, render: Picture) -> Picture:
+def error_image(truth: Image8, render: Image8) -> Image8:
     """Colour the mean absolute difference of the three channels: dark is none, bright is ERROR_RANGE or more."""
     levels = truth.astype(np.int16)  # [H, W, 3]
     levels -= render
     difference = np.abs(levels, out=levels).mean(axis=2, dtype=np.float32) / 255.0  # [H, W]
-    return colored(difference, 0.0, ERROR_RANGE, "magma")
+    return colorize(difference, 0.0, ERROR_RANGE, "magma")
 
 
-def depth_picture(depth: Floats, near: float, far: float) -> Picture:
+def depth_image(depth: Floats, near: float, far: float) -> Image8:
     """Colour a depth map [H, W]: near is bright, far is dark, pixels that see nothing (0) are black."""
-    return colored(depth, far, near, "viridis") * (depth > 0)[..., None].astype(np.uint8)
+    return colorize(depth, far, near, "viridis") * (depth > 0)[..., None].astype(np.uint8)
 
 
 def depth_range(depth: Floats) -> tuple[float, float]:
-    """Near and far end for :func:`depth_picture`: the 1st and 99th percentile of what is seen."""
+    """Near and far end for :func:`depth_image`: the 1st and 99th percentile of what is seen."""
     seen = depth[depth > 0]
     if seen.size == 0:
         return 0.0, 1.0
@@ -39,29 +39,29 @@ def depth_range(depth: Floats) -> tuple[float, float]:
     return float(near), float(far)
 
 
-def colored(values: Floats, low: float, high: float, colormap: str) -> Picture:
+def colorize(values: Floats, low: float, high: float, colormap: str) -> Image8:
     """Colour values [H, W] with a map whose ends stand for ``low`` and ``high``, in either order."""
     from matplotlib import colormaps  # not at the top: a training would wait for it before its first iteration
 
     fractions = np.clip((values - low) / ((high - low) or 1.0), 0.0, 1.0)  # [H, W]
-    picture: Picture = colormaps[colormap](fractions, bytes=True)[..., :3]  # [H, W, 3]
+    picture: Image8 = colormaps[colormap](fractions, bytes=True)[..., :3]  # [H, W, 3]
     return picture
 
 
-def side_by_side(pictures: list[Picture]) -> Picture:
+def side_by_side(pictures: list[Image8]) -> Image8:
     """Join pictures of one height from left to right with a white gap."""
     gap = np.full((pictures[0].shape[0], GAP, 3), 255, dtype=np.uint8)
     with_gaps = [part for picture in pictures for part in (gap, picture)]
     return np.concatenate(with_gaps[1:], axis=1)
 
 
-def split(joined: Picture, n: int) -> list[Picture]:
+def split_images(joined: Image8, n: int) -> list[Image8]:
     """Take pictures apart that :func:`side_by_side` has joined; all are of one width."""
     width = (joined.shape[1] - (n - 1) * GAP) // n
     return [joined[:, k * (width + GAP) : k * (width + GAP) + width] for k in range(n)]
 
 
-def fitting(picture: Picture, longest: int) -> Picture:
+def fit_image(picture: Image8, longest: int) -> Image8:
     """Return a picture [H, W, 3] whose longer side has at most so many pixels, averaged down where it has more."""
     height, width = picture.shape[:2]
     scale = longest / max(height, width)
