@@ -137,7 +137,7 @@ def evaluate(
         check_views(network, views)
     per_view = []
     request = Request(background, conventions=conventions, backend=backend)
-    for view in (view.loaded() for view in views):
+    for view in (view.load() for view in views):
         image = np.clip(renderer.render(as_model(model), view, request)[0].image, 0.0, 1.0)  # [H, W, 3]
         metrics = ViewMetrics(
             view.name,

@@ -49,7 +49,7 @@ def collect_error_weights(
     weights = np.zeros(n_rows(model.gaussians))
     request = Request(background, conventions=conventions, backend=backend)
     for view in views:
-        photographed = view.loaded()
+        photographed = view.load()
         output, tape = renderer.render(model, photographed, request)
         errors = np.abs(output.image - photographed.image / output.image.dtype.type(255)).mean(axis=2)  # [H, W]
         if photographed.mask is not None:

@@ -73,7 +73,7 @@ def collect_removal_costs(
     request = Request(background, conventions=conventions, backend=backend, wants=frozenset({CHANGES}))
     rgb = renderer.channels(request.wants)["rgb"]
     for view in views:
-        photographed = view.loaded()
+        photographed = view.load()
         output, _ = renderer.render(model, photographed, request)
         if CHANGES not in output.extras:
             raise InputError(f"renderer {renderer.name} does not say what the removal of a Gaussian changes")

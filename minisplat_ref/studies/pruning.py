@@ -68,7 +68,7 @@ def exact_costs(state: TrainState, iteration: Iteration) -> RemovalCosts:
         wants=frozenset({CHANGES}),
     )
     for view in iteration.scene.train_views:
-        photographed = view.loaded()
+        photographed = view.load()
         output, tape = iteration.renderer.render(state.model, photographed, request)
         residual = output.image - photographed.image / np.float32(255.0)
         v_logits = iteration.renderer.render_vjp(tape, 2 * residual, None).gaussians.opacity_logits
