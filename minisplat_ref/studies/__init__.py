@@ -27,6 +27,7 @@ from minisplat_ref.studies.study import (
     SEEDS,
     Study,
     argument,
+    declare,
     downscale,
     fine_tune,
     iterations,
@@ -34,7 +35,6 @@ from minisplat_ref.studies.study import (
     one_of,
     recipe,
     seed,
-    study,
 )
 
 CONDITION_HELP = (
@@ -59,7 +59,7 @@ def all_studies() -> dict[str, Study]:
     return {each.name: each for each in studies}
 
 
-ADAPTIVE = study(
+ADAPTIVE = declare(
     "adaptive",
     "the recipe that decides for itself, beside those with a schedule",
     f"{__name__}.adaptive.run",
@@ -86,7 +86,7 @@ ADAPTIVE = study(
     SEEDS,
     description=f"Train a scene by adaptive and by recipes with a schedule, as it is and disturbed. {CONTINUES}",
 )
-ABLATION = study(
+ABLATION = declare(
     "ablation",
     "Mini-Splatting without each of its mechanisms",
     f"{__name__}.ablation.run",
@@ -98,7 +98,7 @@ ABLATION = study(
     SEEDS,
     description=f"Train a scene by a recipe, and by the recipe without each of its mechanisms. {CONTINUES}",
 )
-CULLING = study(
+CULLING = declare(
     "culling",
     "visibility culling: what it removes, and the time it saves",
     f"{__name__}.culling.run",
@@ -111,7 +111,7 @@ CULLING = study(
     number("--repeats", 100, "iterations to time, of either kind"),
     description="Train a scene with mini-splatting2, and measure what visibility culling does.",
 )
-SIMPLIFY = study(
+SIMPLIFY = declare(
     "simplify",
     "quality against count: sampling, rank and mass, merging",
     f"{__name__}.simplify.run",
@@ -133,7 +133,7 @@ SIMPLIFY = study(
     SEEDS,
     description="Simplify a dense population in several ways to equal numbers, and fine-tune what is left.",
 )
-DEPTH = study(
+DEPTH = declare(
     "depth",
     "depth reinitialisation: mid-points, centres, blended depth; guards",
     f"{__name__}.depth_types.run",
@@ -145,13 +145,13 @@ DEPTH = study(
     description="Train a synthetic scene by a recipe that reinitialises from depth, which is done in several"
     " ways, and compare with the truth.",
 )
-EXPOSURE = study(
+EXPOSURE = declare(
     "exposure",
     "exposure per photograph: disturbed by known maps, and recovered",
     f"{__name__}.exposures.run",
     *_CALIBRATION,
 )
-POSE = study(
+POSE = declare(
     "pose",
     "pose refinement: cameras moved by known amounts, and recovered",
     f"{__name__}.poses.run",
@@ -159,7 +159,7 @@ POSE = study(
     argument("--degrees", type=float, default=0.5, metavar="A", help="by which each camera is turned (default 0.5)"),
     argument("--shift", type=float, default=0.005, metavar="F", help="of the extent, of each camera (default 0.005)"),
 )
-DEFECTS = study(
+DEFECTS = declare(
     "defects",
     "planted defects of photographs: found where they are, nowhere else",
     f"{__name__}.defects.run",
@@ -181,7 +181,7 @@ DEFECTS = study(
     number("--trials", 10, "of each kind"),
     description=f"Disturb the photographs of a scene in known ways, and count what adaptive switches on. {CONTINUES}",
 )
-PRECISION = study(
+PRECISION = declare(
     "precision",
     "float64, float32 exact and fast, colours in float16: what it takes",
     f"{__name__}.precision.run",

@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> kit.Report:
         resume_from(state, load_ply(args.ply), recipe.iterations)
     rows = {}
     for name, step in last_steps.items():
-        kit.trained(scene, recipe._replace(iterations=step), 0, state=state)
+        kit.train_with_progress(scene, recipe._replace(iterations=step), 0, state=state)
         rows[name] = measure(state, scene, recipe, args.repeats)
     found = {name: summarise(row) for name, row in rows.items()}
     settings = {**kit.settings_of(args, "iterations", "seed", "repeats"), "ply": args.ply and str(args.ply)}

@@ -11,6 +11,7 @@ from minisplat_ref.types import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 STYLE: dict[Any, Any] = {
     "axes.axisbelow": True,
@@ -81,6 +82,16 @@ def show(axes: "Axes", image: Any, heading: str = "", **settings: Any) -> None:
     axes.set_title(heading, fontsize=8)
     axes.set(xticks=[], yticks=[])
     axes.spines[:].set_visible(True)
+
+
+def beside_images(figure: "Figure", images: Mapping[str, Sequence[tuple[str, Any]]]) -> dict[str, "Axes"]:
+    """Show each row of images, with their headings, and return the axes on the left of each row, by its name."""
+    columns = 2 + max(map(len, images.values()))
+    places = figure.add_gridspec(len(images), columns)
+    for i, row in enumerate(images.values()):
+        for k, (heading, image) in enumerate(row):
+            show(figure.add_subplot(places[i, 2 + k]), image, heading)
+    return {name: figure.add_subplot(places[i, :2]) for i, name in enumerate(images)}
 
 
 def plot_deviations(axes: "Axes", x: Any, by_seed: Iterable[Sequence[float]], **style: Any) -> None:

@@ -161,10 +161,10 @@ def populations(args: argparse.Namespace, scene: Scene) -> list[Gaussians]:
     if args.ply is not None:
         return [load_ply(args.ply)]
     recipe = get_recipe(args.recipe, args.iterations)
-    return [trained(scene, recipe, seed).gaussians for seed in range(args.seeds)]
+    return [train_with_progress(scene, recipe, seed).gaussians for seed in range(args.seeds)]
 
 
-def trained(scene: Scene, recipe: "Recipe", seed: int, **arguments: Any) -> "TrainState":
+def train_with_progress(scene: Scene, recipe: "Recipe", seed: int, **arguments: Any) -> "TrainState":
     """Train with a progress bar; other arguments as for :func:`~minisplat_ref.training.loop.train`."""
     from minisplat_ref.training.loop import train
 
@@ -172,7 +172,7 @@ def trained(scene: Scene, recipe: "Recipe", seed: int, **arguments: Any) -> "Tra
         return train(scene, recipe, seed=seed, on_step=lambda _: bar.update(), **arguments)
 
 
-def fine_tuned(
+def fine_tune(
     population: Any, scene: Scene, recipe: "Recipe", rng: np.random.Generator | int, on_step: Any = None
 ) -> Any:
     """Return a population after a training that begins with it; the given one is not changed.

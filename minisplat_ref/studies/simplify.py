@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> kit.Report:
     """Train, simplify in every way to every count with every seed, and measure."""
     scene = kit.read_scene(args.scene, args.downscale)
     recipe = get_recipe(args.recipe, args.iterations)
-    dense = load_ply(args.ply) if args.ply else kit.trained(scene, recipe, args.seeds[0]).gaussians
+    dense = load_ply(args.ply) if args.ply else kit.train_with_progress(scene, recipe, args.seeds[0]).gaussians
     clouds = {"dense": dense.means, **true_surface(args.scene)}
     trees = {name: cKDTree(cloud) for name, cloud in clouds.items()}
     stats = collect_importance(dense, scene.train_views)
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> kit.Report:
             "psnr": evaluate(edit.gaussians, scene.test_views, background=scene.background).psnr,
             **{f"chamfer_{name}": chamfer(edit.gaussians.means, tree) for name, tree in trees.items()},
         }
-        tuned = kit.fine_tuned(begun, scene, tuning, rng)
+        tuned = kit.fine_tune(begun, scene, tuning, rng)
         runs.append({**row, "psnr_tuned": evaluate(tuned, scene.test_views, background=scene.background).psnr})
     settings = {
         "recipe": None if args.ply else args.recipe,

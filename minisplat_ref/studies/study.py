@@ -1,7 +1,7 @@
 """A study: a claim about a method, which a command measures and puts in a table and a figure.
 
 Studies of 3DGS and Mini-Splatting are in :mod:`minisplat_ref.studies`; an extension brings its own.
-``minisplat-ref study NAME`` runs either. :func:`study` makes one of a module that is imported when it runs, because it
+``minisplat-ref study NAME`` runs either. Most are made by :func:`declare`, of a module that is imported when the study runs, because it
 loads Numba and matplotlib, and of the arguments that this module names, which the help lists without either. What the
 module is made of is in :mod:`minisplat_ref.studies.kit`.
 """
@@ -32,7 +32,7 @@ class Study(NamedTuple):
     """Measures, writes, prints; returns the exit code, None for 0. Raises InputError for bad input."""
 
 
-def study(title: str, summary: str, function: str, *arguments: Argument, description: str | None = None) -> Study:
+def declare(title: str, summary: str, function: str, *arguments: Argument, description: str | None = None) -> Study:
     """Return a study whose work is a function of a module that is imported when it runs.
 
     Parameters
