@@ -1,9 +1,9 @@
 """A study: a claim about a method, which a command measures and puts in a table and a figure.
 
 Studies of 3DGS and Mini-Splatting are in :mod:`minisplat_ref.studies`; an extension brings its own.
-``minisplat-ref study NAME`` runs either. Most are made by :func:`declare`, of a module that is imported when the study runs, because it
-loads Numba and matplotlib, and of the arguments that this module names, which the help lists without either. What the
-module is made of is in :mod:`minisplat_ref.studies.kit`.
+``minisplat-ref study NAME`` runs either. :func:`declare` makes a study of the arguments that this module names and of a
+function that is imported when it runs, because its module loads Numba and matplotlib, which the help must not.
+:mod:`minisplat_ref.studies.kit` has what such functions are made of.
 """
 
 import argparse
