@@ -55,11 +55,6 @@ SWITCHES: Mapping[str, Action] = {
 }
 
 
-def clean(scene: Scene, rng: np.random.Generator) -> Scene:
-    """Return the scene."""
-    return scene
-
-
 def with_gains(scene: Scene, rng: np.random.Generator) -> Scene:
     """Return the scene with every training photograph multiplied by a gain of its own."""
     return multiplied(scene, rng.uniform(1 - LARGEST_GAIN, 1 + LARGEST_GAIN, len(scene.train_views)))
@@ -81,11 +76,6 @@ def with_turned_cameras(scene: Scene, rng: np.random.Generator) -> Scene:
         w = PIXELS * np.array([np.sin(angle) / view.camera.fy, np.cos(angle) / view.camera.fx, 0.0])
         views.append(view._replace(camera=moved(view.camera, w, np.zeros(3))))
     return scene._replace(train_views=tuple(views))
-
-
-def with_two_sizes(scene: Scene, rng: np.random.Generator) -> Scene:
-    """Return the scene with about half of the training photographs at half the width and height."""
-    return halved(scene, rng.random(len(scene.train_views)) < 0.5)
 
 
 def halved(scene: Scene, is_halved: Bools) -> Scene:
@@ -134,10 +124,10 @@ def under_a_sky(scene: Scene, rng: np.random.Generator) -> Scene:
 
 
 CONDITIONS: Mapping[str, Callable[[Scene, np.random.Generator], Scene]] = {
-    "clean": clean,
+    "clean": lambda scene, rng: scene,
     "gains": with_gains,
     "poses": with_turned_cameras,
-    "sizes": with_two_sizes,
+    "sizes": lambda scene, rng: halved(scene, rng.random(len(scene.train_views)) < 0.5),
     "sky": under_a_sky,
 }
 

@@ -221,5 +221,6 @@ def draw(outcomes: dict[str, list[Outcome]], beta: float, weight: float) -> Figu
         lower.scatter(*result.gaussians.means[:, :2].T, s=3, color=variants(beta, weight)[name].color, lw=0)
         lower.axvline(0, color=TITLE_COLOR, lw=0.8)
         lower.set(xlim=(-2.2, 2.2), ylim=(1.6, -1.6), aspect="equal", xticks=[], yticks=[])
+        lower.spines[:].set_visible(True)
         lower.set_title(f"{result.n} Gaussians, {result.n_smooth} on the ramp", fontsize=8)
     return figure
