@@ -415,7 +415,7 @@ plt.show()
 # every event comes before the last one is repaired. The released code draws at random and has thousands of iterations
 # for the repair. The recipes of this package use halves.
 #
-# The thresholds matter too. `minisplat-ref study split SCENE --out DIR` trains a whole recipe in all four ways: on this
+# The thresholds matter too. `minisplat-ref study ablation SCENE --out DIR` trains a whole recipe in these ways: on this
 # room at 160 x 120 pixels, in 1500 iterations of `mini-splatting-d`, they end within 0.1 dB of each other. There the
 # gradient's threshold is the published one, which asks for a split nearly everywhere in small images, and the area adds
 # hardly any.

@@ -47,16 +47,15 @@ from minisplat_ref.extensions.mixed import response as hull_response
 from minisplat_ref.extensions.polygons import claims as polygon_claims
 from minisplat_ref.extensions.polygons.soup import soup_of
 from minisplat_ref.extensions.rays.demo import ball as ball_of_discs
-from minisplat_ref.extensions.shared_studies import psnr_of
 from minisplat_ref.extensions.textured.method import TEXTURED_GAUSSIANS
 from minisplat_ref.extensions.textured.population import with_textures
 from minisplat_ref.extensions.textured.reference import frames, meet
 from minisplat_ref.extensions.textured.study import colors_across
-from minisplat_ref.extensions.textured.tuning import floats_of
 from minisplat_ref.mechanisms.meshes.fans import fit_spans, rims
 from minisplat_ref.reference.pinhole import pinhole
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.studies.kit import floats_of, psnr_of
 from minisplat_ref.types import Camera, Model, view_from
 
 # %% tags=["rounding"]

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from minisplat_ref.io.atomic import replacing
 from minisplat_ref.oracle.cases import Case
 from minisplat_ref.reports.page import grid, panel, paragraph, section
-from minisplat_ref.reports.plots import EDGE_COLOR, GRID_COLOR, PLOT_STYLE, SERIES, to_svg
+from minisplat_ref.reports.palette import EDGE_COLOR, GRID_COLOR, SERIES
+from minisplat_ref.reports.plots import PLOT_STYLE, save_png, to_svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,9 +79,7 @@ def save_figure(cases: Sequence[Case], path: str | Path) -> None:
     InputError
         If the folder does not exist.
     """
-    figure = pareto_figure(cases)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=120, facecolor="white")
+    save_png(pareto_figure(cases), Path(path))
 
 
 def _timed(cases: Sequence[Case]) -> list[Case]:

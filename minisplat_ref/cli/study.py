@@ -18,8 +18,8 @@ Without a NAME: list the studies.
 EPILOG = """\
 examples:
   minisplat-ref study
-  minisplat-ref study split --help
-  minisplat-ref study split room --iterations 1500 --out studies/split"""
+  minisplat-ref study ablation --help
+  minisplat-ref study ablation room --iterations 1500 --out studies/ablation"""
 
 
 def add_parser(commands: Commands) -> None:

@@ -10,7 +10,8 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from minisplat_ref.comparison.crops import Crop
 from minisplat_ref.comparison.measures import best_record
-from minisplat_ref.reports.plots import PLOT_STYLE, SERIES, TITLE_COLOR, plot
+from minisplat_ref.reports.palette import SERIES, TITLE_COLOR
+from minisplat_ref.reports.plots import PLOT_STYLE, plot
 
 SIZE = (5.6, 4.0)  # inches, of a plot
 CROP_WIDTH = 2.2  # inches, in the gallery

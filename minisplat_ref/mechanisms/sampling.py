@@ -8,7 +8,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from minisplat_ref.types import Camera, Floats
+from minisplat_ref.errors import InputError
+from minisplat_ref.types import Camera, Floats, Scene
 
 MARGIN = 0.15  # fraction of the image's size by which a centre may lie outside and still count as seen
 NEAR = 0.2  # world units: a camera does not see what is nearer than that
@@ -64,3 +65,24 @@ def block_means(image: Floats, n: int) -> Floats:
     blocks = image[: height * n, : width * n].reshape(height, n, width, n, -1)
     means: Floats = blocks.mean(axis=(1, 3))
     return means
+
+
+def shrink_photographs(scene: Scene, n: int) -> Scene:
+    """Return the scene with photographs of 1/n of the size, by :func:`block_means`.
+
+    Raises
+    ------
+    InputError
+        A photograph has fewer than 16 n pixels a side.
+    """
+    if n == 1:
+        return scene
+    views = []
+    for view in scene.train_views:
+        photograph = view.load()
+        camera = zoom_camera(photograph.camera, 1 / n)
+        if min(camera.width, camera.height) < 16:
+            raise InputError(f"photograph {view.name} at 1/{n} of its size has fewer than 16 pixels: lower --downscale")
+        image = np.rint(block_means(photograph.image.astype(np.float64), n)).astype(np.uint8)
+        views.append(photograph._replace(camera=camera, image=image, mask=None))
+    return scene._replace(train_views=tuple(views))

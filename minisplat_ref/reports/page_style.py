@@ -1,7 +1,7 @@
 """The style sheet and the script of a report.
 
 Colours are CSS variables with a light and a dark value; curves take theirs from the same names, see
-:data:`minisplat_ref.reports.plots.PALETTE`. The script turns every ``.slider``, which without it is a row of
+:data:`minisplat_ref.reports.palette.PAGE_NAMES`. The script turns every ``.slider``, which without it is a row of
 pictures, into one picture: the first on the left of a line, another on the right. The line moves with the range below,
 by keyboard as well, or with the pointer on the picture.
 """

@@ -13,24 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from minisplat_ref.io.atomic import replacing
+from minisplat_ref.reports.palette import EDGE_COLOR, GRID_COLOR, PAGE_NAMES, PNG_DPI, TICK_COLOR, TITLE_COLOR
 
-TITLE_COLOR = "#4a5560"
-GRID_COLOR = "#e6eaee"
-EDGE_COLOR = "#8a94a0"
-TICK_COLOR = "#6a7580"
-RED, BLUE, GREEN, PURPLE = "#b4553d", "#2d6a8e", "#4b7f52", "#8a5a9e"
-OCHRE, GREY, TEAL, BROWN = "#b08a2e", "#5a6570", "#2c7f86", "#8c5a2e"
-SERIES = (RED, BLUE, GREEN, PURPLE, OCHRE, GREY, TEAL, BROWN)
-PALETTE = {
-    TITLE_COLOR: "soft",
-    GRID_COLOR: "grid",
-    EDGE_COLOR: "edge",
-    TICK_COLOR: "faint",
-    "#ffffff": "panel",
-    **dict(zip(SERIES, ("red", "blue", "green", "purple", "ochre", "grey", "teal", "brown"), strict=True)),
-}
-"""Names of the colours in a page, which has a light and a dark value of each."""
-PNG_DPI = 150
 PLOT_STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # text stays text: smaller, and in the page's own font
     "svg.hashsalt": "minisplat-ref",  # the same run gives the same bytes
@@ -79,7 +63,7 @@ def to_svg(figure: Figure) -> str:
     svg = re.sub(
         r'<g id="[^"]*">', "<g>", text[text.index("<svg") :]
     )  # the same in every figure, and nothing needs them
-    for color, name in PALETTE.items():
+    for color, name in PAGE_NAMES.items():
         svg = svg.replace(color, f"var(--{name})")
     titles = ", ".join(axes.get_title(loc="left") for axes in figure.axes)
     return svg.replace("<svg", f'<svg role="img" aria-label="{escape(titles)}"', 1)

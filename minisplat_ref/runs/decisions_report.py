@@ -10,7 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from minisplat_ref.reports.page import curves, paragraph, section, table
-from minisplat_ref.reports.plots import BLUE, GREY, RED, plot, to_svg
+from minisplat_ref.reports.palette import BLUE, GREY, RED
+from minisplat_ref.reports.plots import plot, to_svg
 from minisplat_ref.training.pace import COOLED, FINER, Decision, Measurement, Pace
 
 DONE = {

@@ -5,7 +5,8 @@ from typing import Any
 
 from minisplat_ref.reports.images import Image8
 from minisplat_ref.reports.page import add_caption, panel, slider, table
-from minisplat_ref.reports.plots import BLUE, GREEN, RED, plot, to_svg
+from minisplat_ref.reports.palette import BLUE, GREEN, RED
+from minisplat_ref.reports.plots import plot, to_svg
 from minisplat_ref.runs.fired import HEADING, Fired, remarks_by_mechanism, rows
 
 ERROR_TEXT = """\

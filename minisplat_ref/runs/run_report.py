@@ -12,7 +12,7 @@ from minisplat_ref.io.names import file_names
 from minisplat_ref.reports.commands import command
 from minisplat_ref.reports.images import fit_image, split_images
 from minisplat_ref.reports.page import cards, code, curves, page, paragraph, section, table
-from minisplat_ref.reports.plots import PURPLE
+from minisplat_ref.reports.palette import PURPLE
 from minisplat_ref.runs import run_folder
 from minisplat_ref.runs.decisions_report import decisions_section
 from minisplat_ref.runs.events import count_published_times, read_mechanisms

@@ -13,7 +13,8 @@ from matplotlib.ticker import NullFormatter, NullLocator
 from minisplat_ref.reports.commands import command
 from minisplat_ref.reports.images import Image8
 from minisplat_ref.reports.page import cards, code, curves, grid, page, panel, paragraph, section, slider, table
-from minisplat_ref.reports.plots import BLUE, EDGE_COLOR, PLOT_STYLE, RED, TITLE_COLOR, to_svg
+from minisplat_ref.reports.palette import BLUE, EDGE_COLOR, RED, TITLE_COLOR
+from minisplat_ref.reports.plots import PLOT_STYLE, to_svg
 from minisplat_ref.runs.rate_distortion import N_SIZES, SIZES_PER_HALVING
 
 TABLE_HEADING = ["Gaussians", "PLY bytes", "PSNR (dB)", "drop (dB)", "std. error", ""]

@@ -19,9 +19,9 @@ from minisplat_ref.runs.scoring import measure, score, to_metrics
 from minisplat_ref.runs.settings import save_model
 from minisplat_ref.runs.simplification import Decision, Target, decide, finish
 from minisplat_ref.runs.simplification_report import Shown, draw, report_html
-from minisplat_ref.studies import FIGURE, RESULT
 from minisplat_ref.types import Floats, Model, View
 
+RESULT, FIGURE = "result.json", "figure.png"  # the decision, beside what every run has
 N_SHOWN = 3  # test views
 
 

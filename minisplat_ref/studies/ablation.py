@@ -16,25 +16,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods import RECIPES, get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.reporting import markdown_table
+from minisplat_ref.reports.palette import BLUE, RED
+from minisplat_ref.studies import kit
 from minisplat_ref.studies.conditions import get_condition
-from minisplat_ref.studies.front import (
-    BLUE,
-    RED,
-    append,
-    describe_scene,
-    mean_and_deviation,
-    read_records,
-    read_scene,
-    tidy,
-    title,
-    write,
-)
+from minisplat_ref.studies.figures import plus_minus, summarise
 from minisplat_ref.studies.variants import ACTIONS, DEVIATIONS, FULL, MECHANISMS, variants_of
 from minisplat_ref.training.loop import HALF_SIZE, train
 from minisplat_ref.training.schedule import Recipe, scaled
@@ -43,17 +33,15 @@ from minisplat_ref.types import Scene
 MEASURES = ("psnr", "ssim", "n_gaussians", "seconds")
 
 
-def run(args: argparse.Namespace) -> None:
-    """Train, measure, write, print the table.
+def run(args: argparse.Namespace) -> kit.Report:
+    """Train and measure.
 
     Raises
     ------
     InputError
         The scene, a recipe or the output folder cannot be used.
     """
-    scene = read_scene(args.scene, args.downscale)
-    if not scene.test_views:
-        raise InputError(f"scene {scene.name} has no test views to compare by: add photographs")
+    scene = kit.read_scene(args.scene, args.downscale)
     published, rules = get_recipe(args.recipe), DEVIATIONS if args.deviations else MECHANISMS
     recipe = scaled(published, args.iterations)
     variants = variants_of(published, args.iterations, rules)
@@ -61,28 +49,23 @@ def run(args: argparse.Namespace) -> None:
         names = [r.name for r in RECIPES.values() if len(variants_of(r, args.iterations, rules)) > 1]
         raise InputError(f"recipe {args.recipe} has nothing to take out: choose from {', '.join(names)}")
     scene = get_condition(args.condition)(scene)
-    description = describe_scene(scene)
+    description = kit.describe_scene(scene)
     settings = {"recipe": recipe.name, "iterations": recipe.iterations, "downscale": args.downscale}
     settings |= {"condition": args.condition}
-    records = read_records(args.out, {**settings, "deviations": args.deviations, "scene": description["scene"]})
-    done = {(record["without"], record["seed"]) for record in records}
-    missing = [(name, seed) for seed in args.seeds for name in variants if (name, seed) not in done]
-    for name, seed in tqdm(missing, desc="trainings", leave=False, disable=None):
-        record = {"without": name, "seed": seed, **measure(scene, variants[name], seed)}
-        append(args.out, record)
-        records.append(record)
+
+    jobs = [{"without": name, "seed": seed} for seed in args.seeds for name in variants]
+    identity = {**settings, "deviations": args.deviations, "scene": description["scene"]}
+    records = kit.resume(args.out, identity, jobs, lambda without, seed: [measure(scene, variants[without], seed)])
     records = [record for record in records if record["seed"] in args.seeds]
     acts = count_actions(records, variants)
     idle = [name for name, n in acts.items() if n == 0]
-    summary = summarise(records, [name for name in variants if name not in idle])
+    summary = differences([record for record in records if record["without"] not in idle])
     result = {**description, **settings, "seeds": list(args.seeds), "acts": acts, "summary": summary, "runs": records}
-    write(args.out, result, draw(summary))
-    print(title(description))
     length = f"{recipe.name}, {recipe.iterations} iterations"
-    print(f"{length}, condition {args.condition}, seeds {', '.join(map(str, args.seeds))}\n")
-    print(markdown_table(["without", "acts", "PSNR (dB)", "difference (dB)", "Gaussians", "seconds"], to_rows(result)))
-    if idle:
-        print(f"\nnever acted, so that nothing can be said of it: {', '.join(idle)}")
+    table = markdown_table(["without", "acts", "PSNR (dB)", "difference (dB)", "Gaussians", "seconds"], to_rows(result))
+    text = f"{kit.title(description)}\n{length}, condition {args.condition}, {kit.seeds_of(args)}\n\n{table}"
+    text += f"\n\nnever acted, so that nothing can be said of it: {', '.join(idle)}" if idle else ""
+    return kit.Report(result, draw(summary), text)
 
 
 def count_actions(records: Sequence[Mapping[str, Any]], variants: Iterable[str]) -> dict[str, int]:
@@ -103,21 +86,15 @@ def measure(scene: Scene, recipe: Recipe, seed: int) -> dict[str, Any]:
     return {**dict(zip(MEASURES, measures, strict=True)), "fired": dict(fired)}
 
 
-def summarise(
-    records: Sequence[Mapping[str, Any]], variants: Sequence[str]
-) -> dict[str, dict[str, tuple[float, float]]]:
+def differences(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, tuple[float, float]]]:
     """Return mean and deviation over the seeds, for each variant and measure.
 
     ``difference`` is that of the PSNR from the full recipe's with the same seed, so that its deviation excludes the
     effect of the seed that both share.
     """
     full = {record["seed"]: record["psnr"] for record in records if record["without"] == FULL}
-    summary = {}
-    for variant in variants:
-        own = [record for record in records if record["without"] == variant]
-        summary[variant] = {name: mean_and_deviation([record[name] for record in own]) for name in MEASURES}
-        summary[variant]["difference"] = mean_and_deviation([r["psnr"] - full[r["seed"]] for r in own])
-    return summary
+    compared = [{**record, "difference": record["psnr"] - full[record["seed"]]} for record in records]
+    return summarise(compared, "without", (*MEASURES, "difference"))
 
 
 def to_rows(result: Mapping[str, Any]) -> list[list[str]]:
@@ -126,7 +103,7 @@ def to_rows(result: Mapping[str, Any]) -> list[list[str]]:
     for variant, row in result["summary"].items():
         difference = "" if variant == FULL else "{:+.2f} ± {:.2f}".format(*row["difference"])
         acts = str(result["acts"].get(variant, ""))
-        psnr = "{:.2f} ± {:.2f}".format(*row["psnr"])
+        psnr = plus_minus(row["psnr"], 2)
         counts = (f"{row['n_gaussians'][0]:,.0f}", f"{row['seconds'][0]:.0f}")
         rows.append([variant if variant == FULL else f"- {variant}", acts, psnr, difference, *counts])
     return rows
@@ -146,5 +123,5 @@ def draw(summary: Mapping[str, Mapping[str, tuple[float, float]]]) -> Figure:
     right.set_xlabel("Gaussians")
     left.invert_yaxis()
     for axes in (left, right):
-        tidy(axes, grid="x")
+        axes.grid(visible=False, axis="y")
     return figure

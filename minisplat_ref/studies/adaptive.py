@@ -6,8 +6,7 @@ a recipe reaches the final PSNR of the first recipe minus 0.1 dB, and how far th
 Times are processor times (of all threads of the process together), which other programs disturb less than wall time.
 
 With ``--rules`` it compares ``adaptive`` with itself without one of its rules; with ``--sweep``, with itself at other
-thresholds of growth, which give more Gaussians and fewer: which number would have been best, and by how much. With
-``--candidates``, with itself and one rule more (:mod:`minisplat_ref.studies.adaptive_candidates`).
+thresholds of growth, which give more Gaussians and fewer: which number would have been best, and by how much.
 
 Trainings take long. Each writes its record to ``runs.jsonl``, and the same command with the same folder continues.
 """
@@ -22,26 +21,15 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods import adaptive, adaptive_bands, gaussian_splatting, get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.reporting import markdown_table
-from minisplat_ref.studies.adaptive_candidates import CANDIDATES
+from minisplat_ref.reports.palette import BLUE, GREEN, OCHRE, PURPLE, RED
+from minisplat_ref.studies import kit
 from minisplat_ref.studies.conditions import get_condition
-from minisplat_ref.studies.front import (
-    BLUE,
-    RED,
-    append,
-    describe_scene,
-    read_records,
-    read_scene,
-    tidy,
-    title,
-    write,
-)
-from minisplat_ref.studies.pruning import prune_by_exact_change, prune_by_weight, with_pruning_by
+from minisplat_ref.studies.figures import standard_error
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.rates import Rates, n_coefficients, present_degrees
 from minisplat_ref.training.schedule import Recipe, as_trained, configured, does, scaled, settings_of
@@ -53,7 +41,7 @@ WARM_UP = 20  # iterations
 N_MEASUREMENTS = 24  # in those iterations; for adaptive with the same interval
 NEAR = 0.1  # dB
 MEANS = ("psnr", "n_gaussians", "n_numbers", "step", "seconds")  # over seeds
-COLORS = (BLUE, "#7a9a3a", "#c98a2b", RED, "#6f5b9a")
+COLORS = (BLUE, GREEN, OCHRE, RED, PURPLE)
 
 
 def with_clones(recipe: Recipe) -> Recipe:
@@ -122,8 +110,6 @@ RULES: Mapping[str, Callable[[Recipe], Recipe]] = {
     "no cut of bands": lambda recipe: configured(recipe, min_variation=0.0),
     "no sky": lambda recipe: configured(recipe, min_sky_gain=math.inf),
     "no prune": lambda recipe: configured(recipe, min_slope=0.0, min_views=0),
-    "prune by blend weight": partial(with_pruning_by, action=prune_by_weight),
-    "prune by exact change": partial(with_pruning_by, action=prune_by_exact_change),
     "no exposures": lambda recipe: configured(recipe, min_exposure_gain=math.inf),
     "no poses": lambda recipe: configured(recipe, min_pose_gain=math.inf),
     "no anti-aliasing": lambda recipe: configured(recipe, min_antialiasing_gain=math.inf),
@@ -140,52 +126,37 @@ SWEEP: Mapping[str, Callable[[Recipe], Recipe]] = {
 """Eight counts. In small photographs nearly all gradients are above the threshold, and the growth at a time decides."""
 
 
-def run(args: argparse.Namespace) -> None:
-    """Train, measure, write, print the table.
+def run(args: argparse.Namespace) -> kit.Report:
+    """Train and measure.
 
     Raises
     ------
     InputError
         The scene, a recipe or the output folder cannot be used.
     """
-    scene = read_scene(args.scene, args.downscale)
-    if not scene.test_views:
-        raise InputError(f"scene {scene.name} has no test views to compare by: add photographs")
+    scene = kit.read_scene(args.scene, args.downscale)
     conditions = {name: get_condition(name) for name in args.conditions}
-    variants = RULES if args.rules else SWEEP if args.sweep else CANDIDATES if args.candidates else {}
+    variants = RULES if args.rules else SWEEP if args.sweep else {}
     recipes = {name: change(adaptive.ADAPTIVE) for name, change in variants.items()} or _named(args.recipes)
-    description = describe_scene(scene)
+    description = kit.describe_scene(scene)
     settings = {"scene": description["scene"], "downscale": args.downscale, "recipes": list(recipes)}
-    records = read_records(args.out, settings)
-    done = {(record["condition"], record["recipe"], record["seed"]) for record in records}
-    todo = [(c, r, s) for c in args.conditions for s in args.seeds for r in recipes if (c, r, s) not in done]
-    if todo:
-        warm_up(scene, recipes.values())
-    for condition, name, seed in tqdm(todo, desc="trainings", leave=False, disable=None):
-        measured = measure(conditions[condition](scene), recipes[name], seed)
-        record = {"condition": condition, "recipe": name, "seed": seed, **measured}
-        append(args.out, record)
-        records.append(record)
+    records = kit.resume(
+        args.out,
+        settings,
+        [{"condition": c, "recipe": r, "seed": s} for c in args.conditions for s in args.seeds for r in recipes],
+        lambda condition, recipe, seed: [measure(conditions[condition](scene), recipes[recipe], seed)],
+        lambda missing: warm_up(scene, recipes.values() if missing else ()),
+    )
     records = [r for r in records if r["seed"] in args.seeds and r["condition"] in args.conditions]
     rows = summarise(records)
     result = {**description, **settings, "seeds": list(args.seeds), "summary": rows, "runs": records}
-    write(args.out, result, draw(records))
-    print(title(description))
-    print(f"seeds {', '.join(map(str, args.seeds))}; seconds of the processor\n")
-    heading = [
-        "condition",
-        "recipe",
-        "PSNR (dB)",
-        "fall since its best",
-        "Gaussians",
-        "numbers",
-        "iterations",
-        "seconds",
-    ]
-    print(markdown_table([*heading, f"until {next(iter(recipes))} - {NEAR} dB"], [_cells(row) for row in rows]))
-    if args.sweep:
-        for condition in args.conditions:
-            print(f"\n{condition}: {describe_regret([r for r in records if r['condition'] == condition])}")
+    heading = ["PSNR (dB)", "fall since its best", "Gaussians", "numbers", "iterations", "seconds"]
+    until = f"until {next(iter(recipes))} - {NEAR} dB"
+    table = markdown_table(["condition", "recipe", *heading, until], [_cells(row) for row in rows])
+    text = f"{kit.title(description)}\n{kit.seeds_of(args)}; seconds of the processor\n\n{table}"
+    for condition in args.conditions if args.sweep else ():
+        text += f"\n\n{condition}: {describe_regret([r for r in records if r['condition'] == condition])}"
+    return kit.Report(result, draw(records), text)
 
 
 def _named(names: Sequence[str]) -> dict[str, Recipe]:
@@ -282,11 +253,6 @@ def describe_regret(records: Sequence[Mapping[str, Any]]) -> str:
     return f"the count of adaptive costs {cost:.2f} dB, and is {ratio:.2f} times the smallest adequate one"
 
 
-def standard_error(values: Sequence[float]) -> float | None:
-    """Return the standard error of the mean; None for one value."""
-    return float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None
-
-
 def seconds_until(curve: Sequence[Mapping[str, float]], psnr: float) -> float | None:
     """Return when a training first had a PSNR, None if it never did."""
     return next((point["seconds"] for point in curve if point["psnr"] >= psnr), None)
@@ -323,6 +289,5 @@ def draw(records: Sequence[Mapping[str, Any]]) -> Figure:
         axes.set(title=condition, xlabel="seconds of the processor", ylabel="held-out PSNR (dB)")
         highest = max(point["psnr"] for r in records if r["condition"] == condition for point in r["curve"])
         axes.set_ylim(highest - 8, highest + 0.5)
-        tidy(axes)
-    figure.axes[0].legend(frameon=False, fontsize=8)
+    figure.axes[0].legend()
     return figure

@@ -26,11 +26,6 @@ FEW = 5  # one of every so many training photographs remains
 GAINS = (0.7, 1.4)  # of a photograph, uniform in the logarithm
 
 
-def whole(scene: Scene) -> Scene:
-    """Return the scene."""
-    return scene
-
-
 def few_photographs(scene: Scene) -> Scene:
     """Return the scene with every fifth training photograph."""
     return scene._replace(train_views=scene.train_views[::FEW])
@@ -42,34 +37,14 @@ def random_gains(scene: Scene) -> Scene:
     return multiplied(scene, np.exp(np.random.default_rng(0).uniform(low, high, len(scene.train_views))))
 
 
-def few_with_gains(scene: Scene) -> Scene:
-    """Return the scene with every fifth training photograph, multiplied by a gain of its own."""
-    return random_gains(few_photographs(scene))
-
-
-def half_a_pixel_off(scene: Scene) -> Scene:
-    """Return the scene with every training camera turned by half a pixel."""
-    return with_turned_cameras(scene, np.random.default_rng(0))
-
-
-def two_sizes(scene: Scene) -> Scene:
-    """Return the scene with every second training photograph at half the width and height."""
-    return halved(scene, np.arange(len(scene.train_views)) % 2 == 1)
-
-
-def planted_sky(scene: Scene) -> Scene:
-    """Return a synthetic scene cut off under a sky, in the test views, too."""
-    return under_a_sky(scene, np.random.default_rng(0))
-
-
 CONDITIONS: Mapping[str, Callable[[Scene], Scene]] = {
-    "whole": whole,
+    "whole": lambda scene: scene,
     "few": few_photographs,
     "gains": random_gains,
-    "few-gains": few_with_gains,
-    "poses": half_a_pixel_off,
-    "sizes": two_sizes,
-    "sky": planted_sky,
+    "few-gains": lambda scene: random_gains(few_photographs(scene)),
+    "poses": lambda scene: with_turned_cameras(scene, np.random.default_rng(0)),
+    "sizes": lambda scene: halved(scene, np.arange(len(scene.train_views)) % 2 == 1),
+    "sky": lambda scene: under_a_sky(scene, np.random.default_rng(0)),
 }
 
 

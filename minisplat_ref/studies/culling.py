@@ -15,26 +15,17 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from minisplat_ref.io import load_ply
-from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.methods import get_recipe, mini_splatting, mini_splatting2
 from minisplat_ref.metrics import psnr
 from minisplat_ref.rendering import render
 from minisplat_ref.reporting import markdown_table
+from minisplat_ref.reports.palette import BLUE, RED
 from minisplat_ref.strategy.importance import collect_importance
 from minisplat_ref.strategy.ops import contiguous
 from minisplat_ref.strategy.visibility import culled_fraction
-from minisplat_ref.studies.front import (
-    BLUE,
-    RED,
-    describe_scene,
-    read_scene,
-    tidy,
-    title,
-    write,
-)
+from minisplat_ref.studies import kit
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import initial_state, train
 from minisplat_ref.training.schedule import Action, Recipe, firing_steps
@@ -45,15 +36,9 @@ RECIPE = "mini-splatting2"
 WARM_UP = 5  # iterations of either arm that are not timed
 
 
-def run(args: argparse.Namespace) -> None:
-    """Train, measure, write, print the table.
-
-    Raises
-    ------
-    InputError
-        The scene, the PLY or the output folder cannot be used.
-    """
-    scene = read_scene(args.scene, args.downscale)
+def run(args: argparse.Namespace) -> kit.Report:
+    """Train and measure."""
+    scene = kit.read_scene(args.scene, args.downscale, is_tested=False)
     recipe = get_recipe(RECIPE, args.iterations)._replace(half_size_until=0)
     state = initial_state(scene, recipe, args.seed)
     if args.ply is None:
@@ -65,20 +50,18 @@ def run(args: argparse.Namespace) -> None:
     else:
         last_steps = {args.ply.name: recipe.iterations}
         resume_from(state, load_ply(args.ply), recipe.iterations)
-    with making_folder(args.out) as folder:
-        rows = {}
-        for name, step in last_steps.items():
-            reach(state, scene, recipe, step)
-            rows[name] = measure(state, scene, recipe, args.repeats)
-        description = describe_scene(scene)
-        settings = {"iterations": args.iterations, "seed": args.seed, "ply": args.ply and str(args.ply)}
-        result = {name: summarise(row) for name, row in rows.items()}
-        write(folder, {**description, **settings, "repeats": args.repeats, "places": result}, draw(rows))
-    print(f"{title(description)}\n{RECIPE}, {args.iterations} iterations, seed {args.seed}, {args.repeats} timed\n")
-    header = ("", "Gaussians", "in the frustum of a view", "culled of these", "of the pairs with tiles")
-    print(
-        markdown_table([*header, "ms without", "ms with", "ratio", "PSNR without (dB)", "with (dB)"], to_rows(result))
-    )
+    rows = {}
+    for name, step in last_steps.items():
+        kit.train_with_progress(scene, recipe._replace(iterations=step), 0, state=state)
+        rows[name] = measure(state, scene, recipe, args.repeats)
+    found = {name: summarise(row) for name, row in rows.items()}
+    settings = {**kit.settings_of(args, "iterations", "seed", "repeats"), "ply": args.ply and str(args.ply)}
+    result = {**kit.describe_scene(scene), **settings, "places": found}
+    counts = ("Gaussians", "in the frustum of a view", "culled of these", "of the pairs with tiles")
+    costs = ("ms without", "ms with", "ratio", "PSNR without (dB)", "with (dB)")
+    text = f"{RECIPE}, {args.iterations} iterations, seed {args.seed}, {args.repeats} timed"
+    table = markdown_table(["", *counts, *costs], to_rows(found))
+    return kit.Report(result, draw(rows), f"{kit.title(result)}\n{text}\n\n{table}")
 
 
 def resume_from(state: TrainState, gaussians: Gaussians, step: int) -> None:
@@ -86,12 +69,6 @@ def resume_from(state: TrainState, gaussians: Gaussians, step: int) -> None:
     state.gaussians = contiguous(gaussians)
     state.adam = zero_moments(state.gaussians)
     state.step = step
-
-
-def reach(state: TrainState, scene: Scene, recipe: Recipe, step: int) -> None:
-    """Train until ``step``."""
-    with tqdm(total=step - state.step, desc=f"to iteration {step}", leave=False, disable=None) as bar:
-        train(scene, recipe._replace(iterations=step), seed=0, state=state, on_step=lambda _: bar.update())
 
 
 def measure(state: TrainState, scene: Scene, recipe: Recipe, repeats: int) -> dict[str, NDArray[Any]]:
@@ -153,7 +130,7 @@ def time_both(state: TrainState, scene: Scene, recipe: Recipe, is_visible: Bools
         arm.stats.pop("is_visible", None)
     arms[1].stats["is_visible"] = is_visible
     seconds = np.zeros((WARM_UP + repeats, 2))
-    for i in tqdm(range(len(seconds)), desc="timing", leave=False, disable=None):
+    for i in kit.with_progress(range(len(seconds)), "timing"):
         for k in (0, 1) if i % 2 else (1, 0):  # each is first as often as second
             one_more = recipe._replace(iterations=arms[k].step + 1, events=())
             start = time.process_time()
@@ -215,9 +192,7 @@ def draw(places: dict[str, dict[str, NDArray[Any]]]) -> Figure:
     culled.set(title="culled of what the frustum leaves", xlabel="training view", ylabel="%", ylim=(0, None))
     times.set(title="training iterations that take at most", xlabel="ms", ylabel="%", xlim=(0, None))
     cost.set(title="PSNR with culling less PSNR without", xlabel="training view", ylabel="dB")
-    for axes in (culled, times, cost):
-        tidy(axes)
-    culled.legend(frameon=False, fontsize=8)
+    culled.legend()
     styles = [Line2D([], [], color="black", linestyle=style) for style in ("--", "-")]
-    times.legend(styles, ["without", "with"], frameon=False, fontsize=8, loc="center left")
+    times.legend(styles, ["without", "with"], loc="center left")
     return figure

@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
 from minisplat_ref.errors import InputError
@@ -33,17 +32,8 @@ from minisplat_ref.methods.adaptive_exposure import switch_exposure_on
 from minisplat_ref.methods.adaptive_pose import switch_pose_on
 from minisplat_ref.methods.adaptive_sky import switch_sky_on
 from minisplat_ref.reporting import markdown_table
-from minisplat_ref.studies.front import (
-    BLUE,
-    RED,
-    append,
-    describe_scene,
-    read_records,
-    read_scene,
-    tidy,
-    title,
-    write,
-)
+from minisplat_ref.reports.palette import BLUE, GREEN, OCHRE, RED
+from minisplat_ref.studies import kit
 from minisplat_ref.studies.poses import moved
 from minisplat_ref.training.calibration import ANTIALIASING, BACKDROP, EXPOSURE, POSE
 from minisplat_ref.training.loop import train
@@ -54,7 +44,7 @@ from minisplat_ref.types import Bools, Floats, Scene, View
 
 LARGEST_GAIN = 0.1
 PIXELS = 0.5
-COLORS = {"sky": "#7a9a3a", "exposure": BLUE, "pose": RED, "antialiasing": "#c98a2b"}
+COLORS = {"sky": GREEN, "exposure": BLUE, "pose": RED, "antialiasing": OCHRE}
 HEIGHT = 0.2  # of a bar
 CUT = 1.2  # metres
 SWITCHES: Mapping[str, Action] = {
@@ -63,11 +53,6 @@ SWITCHES: Mapping[str, Action] = {
     POSE.name: switch_pose_on,
     ANTIALIASING.name: switch_antialiasing_on,
 }
-
-
-def clean(scene: Scene, rng: np.random.Generator) -> Scene:
-    """Return the scene."""
-    return scene
 
 
 def with_gains(scene: Scene, rng: np.random.Generator) -> Scene:
@@ -91,11 +76,6 @@ def with_turned_cameras(scene: Scene, rng: np.random.Generator) -> Scene:
         w = PIXELS * np.array([np.sin(angle) / view.camera.fy, np.cos(angle) / view.camera.fx, 0.0])
         views.append(view._replace(camera=moved(view.camera, w, np.zeros(3))))
     return scene._replace(train_views=tuple(views))
-
-
-def with_two_sizes(scene: Scene, rng: np.random.Generator) -> Scene:
-    """Return the scene with about half of the training photographs at half the width and height."""
-    return halved(scene, rng.random(len(scene.train_views)) < 0.5)
 
 
 def halved(scene: Scene, is_halved: Bools) -> Scene:
@@ -144,10 +124,10 @@ def under_a_sky(scene: Scene, rng: np.random.Generator) -> Scene:
 
 
 CONDITIONS: Mapping[str, Callable[[Scene, np.random.Generator], Scene]] = {
-    "clean": clean,
+    "clean": lambda scene, rng: scene,
     "gains": with_gains,
     "poses": with_turned_cameras,
-    "sizes": with_two_sizes,
+    "sizes": lambda scene, rng: halved(scene, rng.random(len(scene.train_views)) < 0.5),
     "sky": under_a_sky,
 }
 
@@ -156,40 +136,36 @@ class _DecidedError(Exception):
     """Ends a training once it has decided."""
 
 
-def run(args: argparse.Namespace) -> None:
-    """Train, count, write, print the table.
+def run(args: argparse.Namespace) -> kit.Report:
+    """Train until the decisions, and count them.
 
     Raises
     ------
     InputError
-        The scene or the output folder cannot be used.
+        The scene or the output folder cannot be used, or a name is unknown.
     """
-    scene = read_scene(args.scene, args.downscale)
-    description = describe_scene(scene)
-    settings = {"scene": description["scene"], "downscale": args.downscale, "asked": list(args.asked)}
-    records = read_records(args.out, settings)
-    done = {(record["condition"], record["seed"]) for record in records}
     unknown = [name for name in args.conditions if name not in CONDITIONS]
     if unknown:
         raise InputError(f"condition {unknown[0]!r} does not exist: choose from {', '.join(CONDITIONS)}")
     unasked = [name for name in args.asked if name not in SWITCHES]
     if unasked:
         raise InputError(f"{unasked[0]!r} is nothing that adaptive switches on: choose from {', '.join(SWITCHES)}")
+    scene = kit.read_scene(args.scene, args.downscale, is_tested=False)
+    description = kit.describe_scene(scene)
+    settings = {"scene": description["scene"], "downscale": args.downscale, "asked": list(args.asked)}
     names = args.conditions or [name for name in CONDITIONS if name != "sky" or not Path(args.scene).exists()]
-    todo = [(name, seed) for seed in range(args.trials) for name in names if (name, seed) not in done]
-    for name, seed in tqdm(todo, desc="trials", leave=False, disable=None):
-        disturbed = CONDITIONS[name](scene, np.random.default_rng(seed))
-        record = {"condition": name, "seed": seed, **decide(disturbed, seed, args.asked)}
-        append(args.out, record)
-        records.append(record)
+
+    def measured(condition: str, seed: int) -> list[dict[str, Any]]:
+        return [decide(CONDITIONS[condition](scene, np.random.default_rng(seed)), seed, args.asked)]
+
+    jobs = [{"condition": name, "seed": seed} for seed in range(args.trials) for name in names]
+    records = kit.resume(args.out, settings, jobs, measured)
     records = [record for record in records if record["seed"] < args.trials and record["condition"] in names]
     summary = summarise(records, args.asked)
     result = {**description, **settings, "trials": args.trials, "summary": summary, "runs": records}
-    write(args.out, result, draw(summary, args.asked))
-    print(title(description))
-    print(f"after {decision_step(args.asked)} iterations of adaptive\n")
     heading = ["photographs", "trials", *(f"{name} switched on" for name in args.asked)]
-    print(markdown_table(heading, to_rows(summary)))
+    text = f"{kit.title(description)}\nafter {decision_step(args.asked)} iterations of adaptive\n\n"
+    return kit.Report(result, draw(summary, args.asked), text + markdown_table(heading, to_rows(summary)))
 
 
 def decision_step(asked: Sequence[str]) -> int:
@@ -242,6 +218,6 @@ def draw(summary: Mapping[str, Mapping[str, int]], asked: Sequence[str]) -> Figu
     axes.set(xlim=(0, 100), xlabel="trials in which it is switched on (%)", yticks=range(len(summary)))
     axes.set_yticklabels(summary)
     axes.invert_yaxis()
-    axes.legend(frameon=False)
-    tidy(axes, grid="x")
+    axes.legend()
+    axes.grid(visible=False, axis="y")
     return figure

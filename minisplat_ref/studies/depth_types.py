@@ -10,17 +10,15 @@ it hangs in front of the sky if it is nearer than the depth within which most of
 """
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, SyntheticScene, make_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.methods import RECIPES, get_recipe
 from minisplat_ref.methods.mini_splatting import (
     BACKDROP_EXTENTS,
@@ -33,6 +31,7 @@ from minisplat_ref.methods.mini_splatting import (
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import as_model
 from minisplat_ref.reporting import markdown_table
+from minisplat_ref.reports.palette import BLUE, RED
 from minisplat_ref.strategy.depth_reinit import (
     PixelPoints,
     blend_points,
@@ -40,15 +39,8 @@ from minisplat_ref.strategy.depth_reinit import (
     midpoint_points,
     reinitial_points,
 )
-from minisplat_ref.studies.front import (
-    BLUE,
-    RED,
-    describe_scene,
-    mean_and_deviation,
-    tidy,
-    title,
-    write,
-)
+from minisplat_ref.studies import kit
+from minisplat_ref.studies.figures import plus_minus, summarise
 from minisplat_ref.training.loop import StepReport, train
 from minisplat_ref.training.schedule import Recipe, configured, firing_steps
 from minisplat_ref.types import Bools, Floats, Model, Scene
@@ -100,59 +92,42 @@ MEASURES = {
 SHARES = ("median_error", "high_error", "off_surface", "in_front_of_sky")
 
 
-def run(args: argparse.Namespace) -> None:
-    """Train, measure, write, print the table.
+def run(args: argparse.Namespace) -> kit.Report:
+    """Train with every seed and every choice, and measure.
 
     Raises
     ------
     InputError
-        There is no such scene, the recipe does not reinitialise, or the output folder cannot be used.
+        There is no such scene, or the recipe does not reinitialise.
     """
     if args.scene not in SCENE_NAMES:
         raise InputError(f"{args.scene}: true depths are known of {', '.join(SCENE_NAMES)} alone; give one of these")
     recipe = get_recipe(args.recipe, args.iterations)
-    if not firing_steps(recipe, reinitialise_from_depth):
+    steps = firing_steps(recipe, reinitialise_from_depth)
+    if not steps:
         names = ", ".join(name for name, other in RECIPES.items() if firing_steps(other, reinitialise_from_depth))
         raise InputError(f"recipe {args.recipe} does not reinitialise from depth: choose from {names}")
-    with making_folder(args.out) as folder:
-        truth = make_scene(args.scene)
-        runs = list(measure(truth, recipe, args.seeds))
-        settings = {
-            "recipe": recipe.name,
-            "iterations": args.iterations,
-            "seeds": list(args.seeds),
-            "min_alpha": ALPHA_MIN,
-            "depth_tolerance": DEPTH_TOLERANCE,
-            "backdrop_extents": BACKDROP_EXTENTS,
-        }
-        summary = summarise(runs)
-        result = {**describe_scene(truth.scene), **settings, "summary": summary, "runs": runs}
-        write(folder, result, draw(summary))
-    print(title(result))
-    steps = " and ".join(map(str, firing_steps(recipe, reinitialise_from_depth)))
-    seeds = ", ".join(map(str, args.seeds))
-    print(f"{recipe.name}, {args.iterations} iterations, reinitialised at {steps}; seeds {seeds}\n")
-    print(markdown_table(["points", *MEASURES.values()], to_rows(summary)))
+    truth = make_scene(args.scene)
+    jobs = [(name, seed) for seed in args.seeds for name in CHOICES]
+    runs = [
+        {"choice": name, "seed": seed, **measure(truth, recipe, CHOICES[name], seed)}
+        for name, seed in kit.with_progress(jobs, "trainings")
+    ]
+    guards = {"min_alpha": ALPHA_MIN, "depth_tolerance": DEPTH_TOLERANCE, "backdrop_extents": BACKDROP_EXTENTS}
+    settings = {"recipe": recipe.name, "iterations": args.iterations, "seeds": list(args.seeds), **guards}
+    summary = summarise(runs, "choice", MEASURES)
+    result = {**kit.describe_scene(truth.scene), **settings, "summary": summary, "runs": runs}
+    length = f"{recipe.name}, {args.iterations} iterations, reinitialised at {' and '.join(map(str, steps))}"
+    table = markdown_table(["points", *MEASURES.values()], to_rows(summary))
+    return kit.Report(result, draw(summary), f"{kit.title(result)}\n{length}; {kit.seeds_of(args)}\n\n{table}")
 
 
-def measure(truth: SyntheticScene, recipe: Recipe, seeds: tuple[int, ...]) -> Iterator[dict[str, Any]]:
-    """Train with every seed and every choice.
+def measure(truth: SyntheticScene, recipe: Recipe, choice: Choice, seed: int) -> dict[str, float | None]:
+    """Train once; return the :data:`MEASURES`, with the final ``psnr`` of the test views.
 
-    Yields
-    ------
-    run : dict
-        The :data:`MEASURES`, with the final ``psnr`` of the test views. ``backdrop_left`` is the fraction of the points
-        moved behind the scene that survive densification, None if none were moved.
+    ``backdrop_left`` is the fraction of the points moved behind the scene that survive densification, None if none were
+    moved.
     """
-    with tqdm(total=len(seeds) * len(CHOICES), desc="trainings", leave=False, disable=None) as bar:
-        for seed in seeds:
-            for name, choice in CHOICES.items():
-                yield {"choice": name, "seed": seed, **measure_one(truth, recipe, choice, seed)}
-                bar.update()
-
-
-def measure_one(truth: SyntheticScene, recipe: Recipe, choice: Choice, seed: int) -> dict[str, float | None]:
-    """Train once; return the :data:`MEASURES`."""
     scene = truth.scene
     reinitialised = firing_steps(recipe, reinitialise_from_depth)
     densified = min(s for s in firing_steps(recipe, simplify, store_sh, restart_from_means) if s > reinitialised[-1])
@@ -231,26 +206,13 @@ def errors(points: Floats, pixels: NDArray[np.int64], truth: SyntheticScene) -> 
     }
 
 
-def summarise(runs: list[dict[str, Any]]) -> dict[str, dict[str, tuple[float, float]]]:
-    """Return mean and standard deviation over the seeds, for each choice and measure."""
-    return {
-        choice: {
-            name: mean_and_deviation([row[name] for row in runs if row["choice"] == choice and row[name] is not None])
-            for name in MEASURES
-            if any(row[name] is not None for row in runs if row["choice"] == choice)
-        }
-        for choice in CHOICES
-    }
-
-
 def to_rows(summary: dict[str, dict[str, tuple[float, float]]]) -> list[list[str]]:
     """Return the lines of the table: means, and for PSNR also the deviation over the seeds."""
     rows = []
     for choice, row in summary.items():
-        mean, deviation = row["psnr"]
         shares = [f"{row[name][0]:.1%}" for name in SHARES]
         left = f"{row['backdrop_left'][0]:.1%}" if "backdrop_left" in row else ""
-        rows.append([choice, *shares, f"{row['n_points'][0]:,.0f}", left, f"{mean:.2f} ± {deviation:.2f}"])
+        rows.append([choice, *shares, f"{row['n_points'][0]:,.0f}", left, plus_minus(row["psnr"], 2)])
     return rows
 
 
@@ -266,5 +228,5 @@ def draw(summary: dict[str, dict[str, tuple[float, float]]]) -> Figure:
             axes.errorbar(mean, line, xerr=deviation, color=color, marker="o", capsize=4)
         axes.set(title=MEASURES[name], xlabel="" if name == "psnr" else "%", ylim=(len(summary) - 0.5, -0.5))
         axes.set_yticks(range(len(summary)), list(summary))
-        tidy(axes, grid="x")
+        axes.grid(visible=False, axis="y")
     return figure

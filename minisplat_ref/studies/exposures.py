@@ -15,48 +15,30 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
-from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.errors import InputError
-from minisplat_ref.io.atomic import making_folder
-from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import SPLATTING
 from minisplat_ref.reporting import markdown_table
-from minisplat_ref.studies.front import BLUE, RED, describe_scene, title, write
+from minisplat_ref.studies import kit, recovery
+from minisplat_ref.studies.recovery import ARMS, COLORS
 from minisplat_ref.training.calibration import EXPOSURES, expose, identity_exposures, with_exposures
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import Recipe, configured
 from minisplat_ref.types import Floats, Gaussians, Model, Scene
 
-RECIPE = "3dgs-accel"
 GAINS = (0.7, 1.4)  # per channel, uniform in the logarithm
 OFFSETS = (0.0, 0.09)
 DARKER = 1 / 1.5  # factor of all photographs, so that none saturates: part of the common map
-ARMS = ("undisturbed", "disturbed", "calibrated")
 
 
-def run(args: argparse.Namespace) -> None:
-    """Disturb, train, measure, write, print the table.
-
-    Raises
-    ------
-    InputError
-        The scene or the output folder cannot be used.
-    """
-    scene = make_scene(args.scene, n_views=args.views, width=args.width, height=args.width * 3 // 4).scene
-    if not scene.test_views:
-        raise InputError(f"scene {scene.name} has no test views to compare by: give more --views")
-    with making_folder(args.out) as folder:
-        result = measure(scene, get_recipe(RECIPE, args.iterations), args.seed)
-        description = describe_scene(scene)
-        settings = {"recipe": RECIPE, "iterations": args.iterations, "seed": args.seed}
-        write(folder, {**description, **settings, "arms": result}, draw(result))
-    print(title(description))
-    print(f"{RECIPE}, {args.iterations} iterations, seed {args.seed}\n")
-    rows = [[arm, f"{np.mean(row['levels']):.2f}", f"{row['psnr']:.2f}"] for arm, row in result.items()]
-    print(markdown_table(["training", "maps off by (levels of 255)", "held-out PSNR (dB)"], rows))
+def run(args: argparse.Namespace) -> kit.Report:
+    """Disturb, train and measure."""
+    scene, recipe = recovery.scene_and_recipe(args)
+    arms = measure(scene, recipe, args.seed)
+    description, heading = recovery.describe(args, scene)
+    rows = [[arm, f"{np.mean(row['levels']):.2f}", f"{row['psnr']:.2f}"] for arm, row in arms.items()]
+    table = markdown_table(["training", "maps off by (levels of 255)", "held-out PSNR (dB)"], rows)
+    return kit.Report({**description, "arms": arms}, draw(arms), f"{heading}\n\n{table}")
 
 
 def measure(scene: Scene, recipe: Recipe, seed: int, arms: tuple[str, ...] = ARMS) -> dict[str, dict[str, Any]]:
@@ -66,7 +48,7 @@ def measure(scene: Scene, recipe: Recipe, seed: int, arms: tuple[str, ...] = ARM
     disturbed, maps = disturbed_exposures(scene, np.random.default_rng(seed))
     colors = np.concatenate([view.image.reshape(-1, 3) for view in scene.train_views]) / 255
     result = {}
-    for arm in tqdm(arms, desc="trainings", leave=False, disable=None):
+    for arm in kit.with_progress(arms, "trainings"):
         photographed, truth = (scene, identities) if arm == "undisturbed" else (disturbed, maps)
         state = train(photographed, configured(recipe, exposure=arm == "calibrated"), seed=seed)
         exposures = state.shared.get(EXPOSURES, identities)
@@ -153,21 +135,14 @@ def draw(result: dict[str, dict[str, Any]]) -> Figure:
     figure = Figure(figsize=(10, 3), layout="constrained")
     maps, errors, quality = figure.subplots(1, 3)
     maps.axline((0.5, 0.5), slope=1, color="black", linewidth=0.5)
-    before, after = (result[arm]["levels"] for arm in ("disturbed", "calibrated"))
-    errors.vlines(np.arange(1, len(before) + 1), after, before, color="#cccccc", linewidth=1)
-    for arm, color in (("disturbed", RED), ("calibrated", BLUE)):
-        row = result[arm]
-        maps.plot(np.ravel(row["mean_color"]["true"]), np.ravel(row["mean_color"]["found"]), ".", color=color)
-        errors.plot(np.arange(1, len(row["levels"]) + 1), row["levels"], ".", color=color, label=arm)
+    for arm in ARMS[1:]:
+        means = result[arm]["mean_color"]
+        maps.plot(np.ravel(means["true"]), np.ravel(means["found"]), ".", color=COLORS[arm])
     true = np.ravel(result["calibrated"]["mean_color"]["true"])
     limits = (true.min() - 0.02, true.max() + 0.02)
     maps.set(title="mean colour, each channel", xlabel="as disturbed", ylabel="as recovered", xlim=limits, ylim=limits)
-    errors.set(title="maps against the truth", xlabel="training view", ylabel="levels of 255", ylim=(0, None))
-    errors.legend(frameon=False, fontsize=8)
-    quality.barh(list(result), [row["psnr"] for row in result.values()], color=["gray", RED, BLUE])
-    quality.set(title="held-out views", xlabel="PSNR (dB)", xlim=(0.9 * min(r["psnr"] for r in result.values()), None))
-    quality.invert_yaxis()
-    for axes in (maps, errors, quality):
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(color="#e6eaee")
+    recovery.draw_errors(errors, result, "levels")
+    errors.set(title="maps against the truth", ylabel="levels of 255")
+    errors.legend()
+    recovery.draw_quality(quality, result)
     return figure

@@ -16,22 +16,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
-from tqdm import tqdm
 
-from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.io.atomic import making_folder
-from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.reporting import markdown_table
-from minisplat_ref.studies.front import BLUE, RED, describe_scene, title, write
+from minisplat_ref.studies import kit, recovery
+from minisplat_ref.studies.recovery import ARMS
 from minisplat_ref.training.calibration import ROTATIONS, SHIFTS, correct_pose
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import Recipe, configured
 from minisplat_ref.types import Camera, Floats, Gaussians, Scene, View
-
-RECIPE = "3dgs-accel"
-ARMS = ("undisturbed", "disturbed", "calibrated")
 
 
 class Disturbance(NamedTuple):
@@ -52,42 +46,30 @@ class Similarity(NamedTuple):
     """[3] world units."""
 
 
-def run(args: argparse.Namespace) -> None:
-    """Disturb, train, measure, write, print the table.
+def run(args: argparse.Namespace) -> kit.Report:
+    """Disturb, train and measure.
 
     Raises
     ------
     InputError
-        The scene or the output folder cannot be used, or the disturbance is out of range.
+        The disturbance is out of range.
     """
     if not (0 <= args.degrees < 90 and 0 <= args.shift < 1):
         raise InputError(f"--degrees is {args.degrees} and --shift {args.shift}: give 0 to 90 and 0 to 1")
-    scene = make_scene(args.scene, n_views=args.views, width=args.width, height=args.width * 3 // 4).scene
-    if not scene.test_views:
-        raise InputError(f"scene {scene.name} has no test views to compare by: give more --views")
-    with making_folder(args.out) as folder:
-        disturbance = Disturbance(args.degrees, args.shift)
-        result = measure(scene, get_recipe(RECIPE, args.iterations), disturbance, args.seed)
-        description = describe_scene(scene)
-        settings = {"recipe": RECIPE, "iterations": args.iterations, "seed": args.seed, **disturbance._asdict()}
-        write(folder, {**description, **settings, "extent": scene.extent, "arms": result}, draw(result))
-    print(title(description))
-    print(f"{RECIPE}, {args.iterations} iterations, seed {args.seed}\n")
-    rows = [
-        [
-            arm,
-            f"{np.mean(row['degrees']):.3f}",
-            f"{100 * np.mean(row['shifts']) / scene.extent:.3f}",
-            f"{np.mean(row['pixels']):.3f}",
-            f"{row['psnr']:.2f}",
-        ]
-        for arm, row in result.items()
-    ]
-    print(
-        markdown_table(
-            ["training", "angle (degrees)", "centre (% of extent)", "points (px)", "held-out PSNR (dB)"], rows
-        )
+    scene, recipe = recovery.scene_and_recipe(args)
+    disturbance = Disturbance(args.degrees, args.shift)
+    arms = measure(scene, recipe, disturbance, args.seed)
+    description, heading = recovery.describe(args, scene)
+    rows = []
+    for arm, row in arms.items():
+        degrees, shift, pixels = (float(np.mean(row[key])) for key in ("degrees", "shifts", "pixels"))
+        cells = (f"{degrees:.3f}", f"{100 * shift / scene.extent:.3f}", f"{pixels:.3f}", f"{row['psnr']:.2f}")
+        rows.append([arm, *cells])
+    table = markdown_table(
+        ["training", "angle (degrees)", "centre (% of extent)", "points (px)", "held-out PSNR (dB)"], rows
     )
+    result = {**description, **disturbance._asdict(), "extent": scene.extent, "arms": arms}
+    return kit.Report(result, draw(arms), f"{heading}\n\n{table}")
 
 
 def measure(
@@ -97,7 +79,7 @@ def measure(
     disturbed = disturbed_poses(scene, disturbance, np.random.default_rng(seed))
     truth = [view.camera for view in scene.train_views]
     result = {}
-    for arm in tqdm(arms, desc="trainings", leave=False, disable=None):
+    for arm in kit.with_progress(arms, "trainings"):
         seen = scene if arm == "undisturbed" else disturbed
         cameras = [view.camera for view in seen.train_views]
         state = train(seen, configured(recipe, pose=arm == "calibrated"), seed=seed)
@@ -196,22 +178,11 @@ def held_out_psnr(gaussians: Gaussians, scene: Scene, similarity: Similarity) ->
 def draw(result: dict[str, dict[str, Any]]) -> Figure:
     """Draw each camera's error before and after, and the PSNR of the three trainings."""
     figure = Figure(figsize=(10, 3), layout="constrained")
-    panels = figure.subplots(1, 3)
-    for axes, key in zip(panels, ("degrees", "pixels"), strict=False):
-        before, after = (result[arm][key] for arm in ("disturbed", "calibrated"))
-        views = np.arange(1, len(before) + 1)
-        axes.vlines(views, after, before, color="#cccccc", linewidth=1)
-        axes.plot(views, before, ".", color=RED, label="disturbed")
-        axes.plot(views, after, ".", color=BLUE, label="calibrated")
-        axes.set(xlabel="training view", ylabel=key, ylim=(0, None))
-    panels[0].set_title("rotation against the truth")
-    panels[1].set_title("points in the image against the truth")
-    panels[0].legend(frameon=False, fontsize=8)
-    quality = panels[2]
-    quality.barh(list(result), [row["psnr"] for row in result.values()], color=["gray", RED, BLUE])
-    quality.set(title="held-out views", xlabel="PSNR (dB)", xlim=(0.9 * min(r["psnr"] for r in result.values()), None))
-    quality.invert_yaxis()
-    for axes in panels:
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(color="#e6eaee")
+    degrees, pixels, quality = figure.subplots(1, 3)
+    recovery.draw_errors(degrees, result, "degrees")
+    recovery.draw_errors(pixels, result, "pixels")
+    degrees.set(title="rotation against the truth", ylabel="degrees")
+    pixels.set(title="points in the image against the truth", ylabel="pixels")
+    degrees.legend()
+    recovery.draw_quality(quality, result)
     return figure

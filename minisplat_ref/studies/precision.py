@@ -19,31 +19,22 @@ import argparse
 import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import DTypeLike
-from tqdm import tqdm
 
 from minisplat_ref.backends import CPU, CPU_EXACT, Backend
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.reporting import markdown_table
-from minisplat_ref.studies.adaptive import WARM_UP, standard_error
-from minisplat_ref.studies.front import (
-    BLUE,
-    RED,
-    append,
-    describe_scene,
-    mean_and_deviation,
-    read_records,
-    read_scene,
-    tidy,
-    title,
-    write,
-)
+from minisplat_ref.reports.palette import BLUE, RED
+from minisplat_ref.studies import kit
+from minisplat_ref.studies.adaptive import WARM_UP
+from minisplat_ref.studies.figures import plus_minus, standard_error, summarise
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import initial_state, train
 from minisplat_ref.training.schedule import Recipe, as_trained
@@ -74,38 +65,32 @@ PRECISIONS: Mapping[str, Precision] = {
 """The trainings; :data:`STORED` is a rounding of the first."""
 
 
-def run(args: argparse.Namespace) -> None:
-    """Train, measure, write, print the table.
+def run(args: argparse.Namespace) -> kit.Report:
+    """Train and measure.
 
     Raises
     ------
     InputError
         The scene, the recipe or the output folder cannot be used.
     """
-    scene = read_scene(args.scene, args.downscale)
-    if not scene.test_views:
-        raise InputError(f"scene {scene.name} has no test views to compare by: add photographs")
+    scene = kit.read_scene(args.scene, args.downscale)
     recipe = get_recipe(args.recipe, args.iterations)
-    description = describe_scene(scene)
-    settings = {"scene": description["scene"], "downscale": args.downscale, "recipe": args.recipe}
-    settings |= {"iterations": args.iterations}
-    records = read_records(args.out, settings)
-    done = {(record["precision"], record["seed"]) for record in records}
-    todo = [(name, seed) for seed in args.seeds for name in PRECISIONS if (name, seed) not in done]
-    for name in dict.fromkeys(name for name, _ in todo):  # compile: no training is to count that
-        with contextlib.suppress(InputError):  # so short a schedule may ask for what cannot be
-            trained(scene, get_recipe(args.recipe, WARM_UP), PRECISIONS[name], 0)
-    for name, seed in tqdm(todo, desc="trainings", leave=False, disable=None):
-        for record in measure(scene, recipe, name, seed):
-            append(args.out, record)
-            records.append(record)
+    description = kit.describe_scene(scene)
+    settings = {"scene": description["scene"], **kit.settings_of(args, "downscale", "recipe", "iterations")}
+
+    def warm_up(missing: list[Mapping[str, Any]]) -> None:
+        for name in dict.fromkeys(job["precision"] for job in missing):
+            with contextlib.suppress(InputError):  # so short a schedule may ask for what cannot be
+                trained(scene, get_recipe(args.recipe, WARM_UP), PRECISIONS[name], 0)
+
+    jobs = [{"precision": name, "seed": seed} for seed in args.seeds for name in PRECISIONS]
+    records = kit.resume(args.out, settings, jobs, partial(measure, scene, recipe), warm_up)
     records = [record for record in records if record["seed"] in args.seeds]
-    rows = summarise(records)
+    rows = compare(records)
     result = {**description, **settings, "seeds": list(args.seeds), "summary": rows, "runs": records}
-    write(args.out, result, draw(rows))
-    print(title(description))
-    print(f"{args.recipe}, {args.iterations} iterations, seeds {', '.join(map(str, args.seeds))}\n")
-    print(markdown_table(HEADING, [_cells(name, row) for name, row in rows.items()]))
+    length = f"{args.recipe}, {args.iterations} iterations, {kit.seeds_of(args)}"
+    table = markdown_table(HEADING, [_cells(name, row) for name, row in rows.items()])
+    return kit.Report(result, draw(rows), f"{kit.title(description)}\n{length}\n\n{table}")
 
 
 def trained(scene: Scene, recipe: Recipe, precision: Precision, seed: int) -> TrainState:
@@ -158,20 +143,19 @@ def n_bytes(population: Any, *, has_half_colours: bool) -> int:
     return sum(sizes.values())
 
 
-def measure(scene: Scene, recipe: Recipe, name: str, seed: int) -> list[dict[str, Any]]:
+def measure(scene: Scene, recipe: Recipe, precision: str, seed: int) -> list[dict[str, Any]]:
     """Train once; return the record of the training, and that of its rounded colours if these are evaluated."""
-    precision = PRECISIONS[name]
+    computed = PRECISIONS[precision]
     start = time.process_time()
-    state = trained(scene, recipe, precision, seed)
+    state = trained(scene, recipe, computed, seed)
     seconds = time.process_time() - start
 
-    def record(precision_name: str, model: Model, *, has_half_colours: bool) -> dict[str, Any]:
+    def record(name: str, model: Model, *, has_half_colours: bool) -> dict[str, Any]:
         quality = evaluate(
             model, scene.test_views, background=scene.background, renderer=as_trained(recipe, model).renderer
         )
         return {
-            "precision": precision_name,
-            "seed": seed,
+            "precision": name,
             "psnr": quality.psnr,
             "ssim": quality.ssim,
             "n_gaussians": len(model.gaussians.means),
@@ -179,25 +163,23 @@ def measure(scene: Scene, recipe: Recipe, name: str, seed: int) -> list[dict[str
             "seconds": seconds,
         }
 
-    records = [record(name, state.model, has_half_colours=precision.has_half_colours)]
-    if name == FAST:
+    records = [record(precision, state.model, has_half_colours=computed.has_half_colours)]
+    if precision == FAST:
         records.append(record(STORED, with_half_colours(state.model), has_half_colours=True))
     return records
 
 
-def summarise(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+def compare(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
     """Return for each precision mean and deviation over the seeds, and the difference from the fast one of each seed.
 
     ``difference`` is a mean with its standard error, None for a single seed.
     """
     fast = {record["seed"]: record["psnr"] for record in records if record["precision"] == FAST}
+    summary = summarise(records, "precision", ("psnr", "ssim", "n_gaussians", "megabytes", "seconds"))
     rows: dict[str, dict[str, Any]] = {}
     for name in (*PRECISIONS, STORED):
-        own = [record for record in records if record["precision"] == name]
-        differences = [record["psnr"] - fast[record["seed"]] for record in own]
-        measures = ("psnr", "ssim", "n_gaussians", "megabytes", "seconds")
-        rows[name] = {key: mean_and_deviation([record[key] for record in own]) for key in measures}
-        rows[name]["difference"] = (float(np.mean(differences)), standard_error(differences))
+        differences = [record["psnr"] - fast[record["seed"]] for record in records if record["precision"] == name]
+        rows[name] = {**summary[name], "difference": (float(np.mean(differences)), standard_error(differences))}
     return rows
 
 
@@ -206,7 +188,7 @@ def _cells(name: str, row: Mapping[str, Any]) -> list[str]:
     difference = f"{mean:+.3f}" + ("" if error is None else f" ± {error:.3f}")
     return [
         name,
-        "{:.2f} ± {:.2f}".format(*row["psnr"]),
+        plus_minus(row["psnr"], 2),
         "" if name == FAST else difference,
         f"{row['ssim'][0]:.4f}",
         f"{row['n_gaussians'][0]:,.0f}",
@@ -232,6 +214,5 @@ def draw(rows: Mapping[str, Mapping[str, Any]]) -> Figure:
             axes.annotate(name, (row[key][0], row["psnr"][0]), (6, 4), textcoords="offset points", fontsize=8)
         axes.set(xlabel=label, xlim=(0, None))
         axes.margins(x=0.3)
-        tidy(axes)
     panels[0].set_ylabel("PSNR of the test views (dB)")
     return figure

@@ -13,42 +13,27 @@ population's centres and, where a synthetic scene knows them, the points that th
 """
 
 import argparse
-from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
-from tqdm import tqdm
 
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
 from minisplat_ref.datasets.synthetic.surface import chamfer, unproject_views
-from minisplat_ref.errors import InputError
 from minisplat_ref.io import load_ply
-from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.reporting import markdown_table
+from minisplat_ref.reports.palette import BLUE, GREEN, GREY, OCHRE, RED
 from minisplat_ref.strategy import simplify
 from minisplat_ref.strategy.importance import collect_importance, indoor
-from minisplat_ref.strategy.ops import Edit, contiguous, n_rows
+from minisplat_ref.strategy.ops import Edit, n_rows
 from minisplat_ref.strategy.removal import collect_removal_costs
-from minisplat_ref.studies.front import (
-    BLUE,
-    RED,
-    describe_scene,
-    mean_and_deviation,
-    read_scene,
-    tidy,
-    title,
-    write,
-)
-from minisplat_ref.training.adam import zero_moments
-from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import Recipe
-from minisplat_ref.training.state import TrainState
-from minisplat_ref.types import Floats, Gaussians, Scene
+from minisplat_ref.studies import kit
+from minisplat_ref.studies.figures import mean_and_deviation, plus_minus
+from minisplat_ref.types import Floats
 
 CHANGE = "least change"
 CHOICES = {
@@ -57,60 +42,57 @@ CHOICES = {
     "merging": simplify.by_merging,
     CHANGE: simplify.by_rank,
 }
-COLORS = dict(zip(CHOICES, (BLUE, RED, "#e0a526", "#7a9a3a"), strict=True))
-GREY = "#8a8580"
+COLORS = dict(zip(CHOICES, (BLUE, RED, OCHRE, GREEN), strict=True))
 MASS = 0.99  # of both papers
 FINE_TUNING = "3dgs"  # its learning rates, from the first to the last
 SH_DEGREE = 3  # stored when fine-tuning begins from the centres
 
 
-def run(args: argparse.Namespace) -> None:
-    """Train, measure, write, print the table.
-
-    Raises
-    ------
-    InputError
-        The scene, the recipe, the PLY or the output folder cannot be used.
-    """
-    scene = read_scene(args.scene, args.downscale)
-    if not scene.test_views:
-        raise InputError(f"scene {scene.name} has no test views to compare by: add photographs")
+def run(args: argparse.Namespace) -> kit.Report:
+    """Train, simplify in every way to every count with every seed, and measure."""
+    scene = kit.read_scene(args.scene, args.downscale)
     recipe = get_recipe(args.recipe, args.iterations)
-    given = None if args.ply is None else load_ply(args.ply)
-    with making_folder(args.out) as folder:
-        dense = train_dense(scene, recipe, args.seeds[0]) if given is None else given
-        clouds = {"dense": dense.means, **true_surface(args.scene)}
-        stats = collect_importance(dense, scene.train_views)
-        importance = simplify.intersection_preserving(indoor(stats), stats.dominant_count)
-        changes = collect_removal_costs(dense, scene.train_views, background=scene.background).changes
-        weights = dict.fromkeys(CHOICES, importance) | {CHANGE: np.where(importance > 0, changes, 0)}
-        counts = counts_to_keep(importance, args.fractions)
-        runs = list(
-            measure(scene, dense, weights, counts, clouds, args.fine_tune, is_restart=args.restart, seeds=args.seeds)
-        )
-        settings = {
-            "recipe": None if args.ply else args.recipe,
-            "iterations": None if args.ply else args.iterations,
-            "ply": args.ply and str(args.ply),
-            "fine_tune": args.fine_tune,
-            "restart": args.restart,
-            "seeds": list(args.seeds),
-            "dense": {
-                "n_gaussians": n_rows(dense),
-                "n_candidates": int(np.count_nonzero(importance)),
-                "psnr": evaluate(dense, scene.test_views, background=scene.background).psnr,
-            },
+    dense = load_ply(args.ply) if args.ply else kit.train_with_progress(scene, recipe, args.seeds[0]).gaussians
+    clouds = {"dense": dense.means, **true_surface(args.scene)}
+    trees = {name: cKDTree(cloud) for name, cloud in clouds.items()}
+    stats = collect_importance(dense, scene.train_views)
+    importance = simplify.intersection_preserving(indoor(stats), stats.dominant_count)
+    changes = collect_removal_costs(dense, scene.train_views, background=scene.background).changes
+    weights = dict.fromkeys(CHOICES, importance) | {CHANGE: np.where(importance > 0, changes, 0)}
+    counts = counts_to_keep(importance, args.fractions)
+    tuning = kit.without_events(get_recipe(FINE_TUNING, args.fine_tune))
+    runs = []
+    jobs = [(kept, choice, seed) for kept in counts for choice in CHOICES for seed in args.seeds]
+    for kept, choice, seed in kit.with_progress(jobs, "fine-tunings"):
+        rng = np.random.default_rng(seed)
+        edit: Edit = CHOICES[choice](dense, weights[choice], counts[kept], rng)
+        begun = simplify.reinitialise(edit.gaussians, SH_DEGREE) if args.restart else edit.gaussians
+        row = {
+            "kept": kept,
+            "n_gaussians": n_rows(edit.gaussians),
+            "choice": choice,
+            "seed": seed,
+            "psnr": evaluate(edit.gaussians, scene.test_views, background=scene.background).psnr,
+            **{f"chamfer_{name}": chamfer(edit.gaussians.means, tree) for name, tree in trees.items()},
         }
-        result = {**describe_scene(scene), **settings, "counts": counts, "summary": summarise(runs), "runs": runs}
-        write(folder, result, draw(result))
-    print(f"{title(result)}\n{describe_dense(result)}\n")
-    print(markdown_table(*to_table(result)))
-
-
-def train_dense(scene: Scene, recipe: Recipe, seed: int) -> Gaussians:
-    """Return the population that is to be simplified."""
-    with tqdm(total=recipe.iterations, desc=recipe.name, leave=False, disable=None) as bar:
-        return train(scene, recipe, seed=seed, on_step=lambda _: bar.update()).gaussians
+        tuned = kit.fine_tune(begun, scene, tuning, rng)
+        runs.append({**row, "psnr_tuned": evaluate(tuned, scene.test_views, background=scene.background).psnr})
+    settings = {
+        "recipe": None if args.ply else args.recipe,
+        "iterations": None if args.ply else args.iterations,
+        "ply": args.ply and str(args.ply),
+        "fine_tune": args.fine_tune,
+        "restart": args.restart,
+        "seeds": list(args.seeds),
+        "dense": {
+            "n_gaussians": n_rows(dense),
+            "n_candidates": int(np.count_nonzero(importance)),
+            "psnr": evaluate(dense, scene.test_views, background=scene.background).psnr,
+        },
+    }
+    result = {**kit.describe_scene(scene), **settings, "counts": counts, "summary": summarise(runs), "runs": runs}
+    text = f"{kit.title(result)}\n{describe_dense(result)}\n\n{markdown_table(*to_table(result))}"
+    return kit.Report(result, draw(result), text)
 
 
 def true_surface(source: str) -> dict[str, Floats]:
@@ -128,67 +110,6 @@ def counts_to_keep(importance: Floats, fractions: tuple[float, ...]) -> dict[str
     counts = {f"{100 * fraction:g} %": max(1, round(fraction * n_candidates)) for fraction in fractions}
     counts[f"mass {MASS:g}"] = len(simplify.select_mass(importance, MASS))
     return dict(sorted(counts.items(), key=lambda item: item[1]))
-
-
-def measure(
-    scene: Scene,
-    dense: Gaussians,
-    weights: Mapping[str, Floats],
-    counts: dict[str, int],
-    clouds: dict[str, Floats],
-    iterations: int,
-    *,
-    is_restart: bool,
-    seeds: tuple[int, ...],
-) -> Iterator[dict[str, Any]]:
-    """Simplify in every way to every count with every seed.
-
-    Parameters
-    ----------
-    scene : Scene
-    dense : Gaussians
-        Stays as it is.
-    weights : dict of ndarrays of shape (N,)
-        What each choice weighs by; 0 for those that may not be kept.
-    counts : dict
-    clouds : dict of ndarrays of shape (P, 3)
-        World frame.
-    iterations : int
-        Of fine-tuning.
-    is_restart : bool
-        Fine-tune from centres and colours alone.
-    seeds : sequence of int
-
-    Yields
-    ------
-    run : dict
-        ``psnr`` right after simplification, ``psnr_tuned``, in dB, of the test views; ``chamfer_CLOUD``, world units.
-    """
-    trees = {name: cKDTree(cloud) for name, cloud in clouds.items()}
-    jobs = [(kept, choice, seed) for kept in counts for choice in CHOICES for seed in seeds]
-    for kept, choice, seed in tqdm(jobs, desc="fine-tunings", leave=False, disable=None):
-        rng = np.random.default_rng(seed)
-        edit: Edit = CHOICES[choice](dense, weights[choice], counts[kept], rng)
-        gaussians = edit.gaussians
-        row = {
-            "kept": kept,
-            "n_gaussians": n_rows(gaussians),
-            "choice": choice,
-            "seed": seed,
-            "psnr": evaluate(gaussians, scene.test_views, background=scene.background).psnr,
-            **{f"chamfer_{name}": chamfer(gaussians.means, tree) for name, tree in trees.items()},
-        }
-        begun = simplify.reinitialise(gaussians, SH_DEGREE) if is_restart else gaussians
-        tuned = fine_tune(begun, scene, iterations, rng)
-        yield {**row, "psnr_tuned": evaluate(tuned, scene.test_views, background=scene.background).psnr}
-
-
-def fine_tune(gaussians: Gaussians, scene: Scene, iterations: int, rng: np.random.Generator) -> Gaussians:
-    """Train on with all stored colour and without events; ``gaussians`` are changed in place."""
-    recipe = get_recipe(FINE_TUNING, iterations)._replace(events=(), sh_milestones=(0,) * SH_DEGREE)
-    gaussians = contiguous(gaussians)
-    state = TrainState(gaussians, zero_moments(gaussians), step=0, view_order=[], rng=rng, stats={})
-    return train(scene, recipe, seed=0, state=state).gaussians
 
 
 def summarise(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -232,9 +153,7 @@ def to_table(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
     for row in result["summary"]:
         cells = []
         for name in measures:
-            mean, deviation = row[name]
-            digits = 2 if name.startswith("psnr") else 4
-            cells.append(f"{mean:.{digits}f} ± {deviation:.{digits}f}")
+            cells.append(plus_minus(row[name], 2 if name.startswith("psnr") else 4))
         lines.append([row["kept"], f"{row['n_gaussians']:,}", row["choice"], *cells])
     return ["kept of the candidates", "Gaussians", "choice", *(headers[name] for name in measures)], lines
 
@@ -274,7 +193,6 @@ def draw(result: dict[str, Any]) -> Figure:
         axes.set(title=heading, ylabel=label, xlabel="Gaussians", xscale="log")
         axes.set_xticks(ticks, [f"{n:,}" for n in ticks])
         axes.minorticks_off()
-        tidy(axes)
         if name == "psnr":
-            axes.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(0, 0.92))
+            axes.legend(loc="upper left", bbox_to_anchor=(0, 0.92))
     return figure

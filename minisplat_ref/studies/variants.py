@@ -12,6 +12,7 @@ from typing import Any
 from minisplat_ref.methods import gaussian_splatting, mini_splatting, mini_splatting2
 from minisplat_ref.rendering import Request
 from minisplat_ref.strategy import simplify as simplification
+from minisplat_ref.strategy.blur_split import principal_axis_children
 from minisplat_ref.training.adam import AdamState
 from minisplat_ref.training.schedule import (
     Action,
@@ -128,8 +129,13 @@ def with_lost_steps(recipe: Recipe) -> Recipe:
     return recipe._replace(events=events)
 
 
+HALVES = with_settings(draw_children=principal_axis_children)
+"""With children that are cut on the longest axis; the released code, and so the recipes, draw them at random."""
+
 MECHANISMS: Mapping[str, Change] = {
     "blur split": partial(without, action=mini_splatting.collect_blur),
+    "random children": HALVES,
+    "blur split and random children": lambda recipe: HALVES(without(recipe, mini_splatting.collect_blur)),
     "reinitialisation": partial(without, action=mini_splatting.reinitialise_from_depth),
     "sky guard": with_settings(depth_tolerance=None),
     "intersection preservation": with_settings(is_intersecting=False),
@@ -140,7 +146,11 @@ MECHANISMS: Mapping[str, Change] = {
     "half-size warm-up": lambda recipe: recipe._replace(half_size_until=0),
     "last prune": partial(without, action=mini_splatting.prune_tail),
 }
-"""The published recipe without each mechanism; a recipe that does not have it stays unchanged."""
+"""The published recipe without each mechanism; a recipe that does not have it stays unchanged.
+
+Blur split has four forms. The split by gradients uses the same rule for children, and its effect has to be separated
+from that of blur split, so the rule for children is also exchanged where there is no blur split.
+"""
 
 DEVIATIONS: Mapping[str, Change] = {
     "least blurred area": with_settings(min_area=0),
@@ -159,6 +169,8 @@ DEVIATIONS: Mapping[str, Change] = {
 
 ACTIONS: Mapping[str, Action] = {
     "blur split": gaussian_splatting.clone_and_split,
+    "random children": gaussian_splatting.clone_and_split,
+    "blur split and random children": gaussian_splatting.clone_and_split,
     "reinitialisation": mini_splatting.reinitialise_from_depth,
     "sky guard": mini_splatting.reinitialise_from_depth,
     "intersection preservation": mini_splatting.simplify,

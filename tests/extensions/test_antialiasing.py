@@ -13,7 +13,7 @@ from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.extensions import shared_studies
+from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.antialiasing.method import (
     EPS2D,
     FILTERED,
@@ -24,7 +24,7 @@ from minisplat_ref.extensions.antialiasing.method import (
 )
 from minisplat_ref.extensions.antialiasing.reference import smooth, smooth_vjp
 from minisplat_ref.mechanisms import sampling
-from minisplat_ref.mechanisms.sampling import sampling_intervals
+from minisplat_ref.mechanisms.sampling import sampling_intervals, shrink_photographs
 from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.runs.progress import Progress
@@ -171,9 +171,9 @@ def test_blocks_and_cameras_fit():
 
 def test_a_photograph_cannot_shrink_to_nothing():
     scene = make_scene("room", n_views=2, width=32, height=24, supersampling=1, n_points=10).scene
-    with pytest.raises(shared_studies.InputError, match="lower --downscale"):
-        shared_studies.shrunk(scene, 2)
-    bigger = shared_studies.shrunk(scene._replace(train_views=(View("a", make_camera(64, 48), BLACK, None),)), 3)
+    with pytest.raises(InputError, match="lower --downscale"):
+        shrink_photographs(scene, 2)
+    bigger = shrink_photographs(scene._replace(train_views=(View("a", make_camera(64, 48), BLACK, None),)), 3)
     assert bigger.train_views[0].image.shape == (16, 21, 3)
 
 

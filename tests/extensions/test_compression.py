@@ -312,7 +312,7 @@ def test_study_trains(run, tmp_path, capsys):
     assert "nook" in capsys.readouterr().out
 
 
-def test_study_that_cannot_be(run, tmp_path, one_line):
+def test_study_that_cannot_be(run, tmp_path, one_line, capfd):
     out = str(tmp_path / "out")
     program = ["--splat-transform", "not-there"]
     ply = str(run / "point_cloud.ply")
@@ -320,4 +320,6 @@ def test_study_that_cannot_be(run, tmp_path, one_line):
     nook = str(run.parent / "nook")
     assert "not-there does not work" in one_line("study", name, nook, "--ply", ply, "--out", out, *program)
     assert "neither a folder" in one_line("study", name, "nowhere", "--out", out)
-    assert "--seeds is 0" in one_line("study", name, nook, "--out", out, "--seeds", "0")
+    with pytest.raises(SystemExit, match="2"):
+        main(["study", name, nook, "--out", out, "--seeds", "0"])
+    assert "--seeds: '0' is not a whole number of at least 1" in capfd.readouterr().err

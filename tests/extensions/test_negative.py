@@ -15,9 +15,8 @@ from minisplat_ref.cli import main
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
-from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_recipe, load_extension
-from minisplat_ref.extensions.negative import rings
+from minisplat_ref.extensions.negative import STUDIES, rings
 from minisplat_ref.extensions.negative.method import (
     FRACTION,
     SIGNED,
@@ -26,7 +25,6 @@ from minisplat_ref.extensions.negative.method import (
     with_negatives,
 )
 from minisplat_ref.extensions.negative.reference import density, difference, largest_weight, negate
-from minisplat_ref.extensions.negative.study import STUDIES
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.runs.progress import Progress
@@ -344,11 +342,13 @@ def test_backdrop_a_negative_color_blackens_a_hole_and_does_not_open_it(tmp_path
     assert "| dots  | 4, clamped " in capsys.readouterr().out
 
 
-def test_studies_refuse_to_fit_nothing(tmp_path):
-    (study, _) = STUDIES
-    with pytest.raises(InputError, match="starts is 0"):
-        study.run(argparse.Namespace(out=tmp_path / "out", seeds=1, starts=0))
-    assert not (tmp_path / "out").exists()
+@pytest.mark.parametrize("study", STUDIES)
+def test_studies_refuse_to_fit_nothing(study, tmp_path, capsys):
+    parser = argparse.ArgumentParser()
+    study.add_arguments(parser)
+    with pytest.raises(SystemExit, match="2"):
+        parser.parse_args(["--out", str(tmp_path / "out"), "--starts", "0"])
+    assert "--starts: '0' is not a whole number of at least 1" in capsys.readouterr().err
 
 
 # --- from end to end ---

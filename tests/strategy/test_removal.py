@@ -1,7 +1,5 @@
 """What the removal of each Gaussian changes, against the picture without it, and which are not worth their place."""
 
-from types import SimpleNamespace
-
 import numba
 import numpy as np
 import pytest
@@ -12,9 +10,7 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.rendering import SPLATTING, Request, render, render_vjp
 from minisplat_ref.strategy.removal import RemovalCosts, collect_removal_costs, worth_their_place
-from minisplat_ref.studies.pruning import exact_costs
-from minisplat_ref.training.state import Iteration
-from minisplat_ref.types import Model, Scene, View, view_from
+from minisplat_ref.types import Model, View, view_from
 from scenes import as_dtype, make_camera, make_gaussians
 from tolerances import PARITY_FLOAT32_IMAGE, PARITY_FLOAT64, REMOVAL
 
@@ -138,19 +134,29 @@ def test_without_an_error_everything_that_changes_is_worth_it():
     assert_array_equal(RemovalCosts(np.array([0.0, 2.0]), 0.0).slopes, [0.0, np.inf])
 
 
+def exact_costs(gaussians, views):
+    """Return the exact change of the squared error by each removal, ``S - o dSSE/do``, where alpha is not clamped."""
+    changes, squared_error = np.zeros(N), 0.0
+    request = Request(BACKGROUND, backend=CPU, wants=frozenset({"removal_changes"}))
+    for view in views:
+        output, tape = SPLATTING.render(Model(gaussians), view, request)
+        residual = output.image - view.image / np.float32(255.0)
+        v_logits = SPLATTING.render_vjp(tape, 2 * residual, None).gaussians.opacity_logits
+        changes += output.extras["removal_changes"] - v_logits * (1 + np.exp(gaussians.opacity_logits))
+        squared_error += float(np.sum(residual**2, dtype=np.float64))  # v_logit = o (1 - o) v_o
+    return RemovalCosts(changes, squared_error)
+
+
 def test_the_exact_change_is_that_of_the_photographs_squared_error(gaussians, camera, rng):
-    """The study's other way to prune: against the pictures without each Gaussian."""
+    """S is the part of it that is no gradient, and the whole is that of the pictures without each Gaussian."""
     photographs = rng.integers(0, 256, (2, 29, 37, 3), dtype=np.uint8)
-    views = tuple(View(str(i), camera, photographs[i], None) for i in range(2))
-    scene = Scene("two", views, (), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), BACKGROUND, 1.0)
-    state = SimpleNamespace(gaussians=gaussians, model=Model(gaussians))
-    iteration = Iteration(scene, views[0], None, np.zeros(0, int), None, CPU, GSPLAT_MAIN)
+    views = [View(str(i), camera, photographs[i], None) for i in range(2)]
 
     def squared_error(without=None):
         image = picture(gaussians, camera, CPU, without)
         return np.sum((image - photographs / np.float32(255)) ** 2)
 
-    costs = exact_costs(state, iteration)
+    costs = exact_costs(gaussians, views)
     assert_allclose(costs.squared_error, squared_error(), rtol=PARITY_FLOAT64)
     expected = [squared_error(i) - squared_error() for i in range(N)]
     assert_allclose(costs.changes, expected, rtol=REMOVAL, atol=REMOVAL)

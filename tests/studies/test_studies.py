@@ -8,13 +8,10 @@ import pytest
 from minisplat_ref.cli import main
 from minisplat_ref.io import load_scene, save_ply
 from minisplat_ref.io.images import read_image
-from minisplat_ref.methods import gaussian_splatting, get_recipe, mini_splatting
-from minisplat_ref.strategy.blur_split import principal_axis_children
-from minisplat_ref.strategy.clone_split import random_children
-from minisplat_ref.studies import FIGURE, RESULT, all_studies, split_forms
+from minisplat_ref.methods import get_recipe
+from minisplat_ref.studies import all_studies, depth_types
+from minisplat_ref.studies.study import FIGURE, RESULT
 from minisplat_ref.training.loop import initial_state
-from minisplat_ref.training.schedule import does
-from tolerances import PRINTED_DIGITS
 
 TINY = ("--views", "6", "--width", "32", "--height", "24", "--supersampling", "1", "--points", "150")
 
@@ -45,35 +42,6 @@ def test_studies_are_listed(capsys):
     for name, study in all_studies().items():
         (line,) = [line for line in lines if line.split()[:1] == [name]]
         assert study.name == name and line.endswith(study.summary) and len(line) <= 80
-
-
-# split
-
-
-def test_split_forms(scene_folder, tmp_path, capsys):
-    out = tmp_path / "out"
-    assert main(["study", "split", str(scene_folder), "--out", str(out), "--iterations", "30", "--seeds", "0,1"]) == 0
-    result, rows = read_result(out), table_rows(capsys.readouterr().out)
-    assert list(rows) == list(result["summary"]) == list(split_forms.FORMS)
-    assert result["machine"] and result["size"] == [32, 24] and len(result["runs"]) == 8
-    for form, cells in rows.items():
-        values = [run["psnr"] for run in result["runs"] if run["form"] == form]
-        mean, deviation = map(float, cells[0].split(" ± "))
-        assert abs(mean - np.mean(values)) < 100 * PRINTED_DIGITS
-        assert abs(deviation - abs(values[0] - values[1]) / np.sqrt(2)) < 100 * PRINTED_DIGITS
-        assert all(0 < run["ssim"] < 1 and run["seconds"] > 0 for run in result["runs"])
-
-
-@pytest.mark.parametrize("name", ["mini-splatting-d", "mini-splatting2"])
-def test_split_variants_differ_in_blur_split_and_children_alone(name):
-    recipe = get_recipe(name)
-    for form, (has_blur_split, children) in split_forms.FORMS.items():
-        variant = split_forms.variant(recipe, form)
-        assert any(does(event, mini_splatting.collect_blur) for event in variant.events) == has_blur_split
-        assert len(recipe.events) - len(variant.events) == (not has_blur_split)
-        (split,) = [event for event in variant.events if does(event, gaussian_splatting.clone_and_split)]
-        assert split.action.keywords["draw_children"] is children
-    assert {children for _, children in split_forms.FORMS.values()} == {random_children, principal_axis_children}
 
 
 # culling
@@ -122,16 +90,12 @@ def test_culling_of_given_gaussians(scene_folder, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["split", "nowhere"], "nowhere: neither a folder nor one of room, "),
-        (
-            ["split", "SCENE", "--recipe", "3dgs"],
-            "recipe 3dgs has no blur split to compare: choose from mini-splatting, ",
-        ),
-        (["split", "SCENE", "--recipe", "5dgs"], "recipe '5dgs' does not exist"),
+        (["ablation", "nowhere"], "nowhere: neither a folder nor one of room, "),
+        (["ablation", "SCENE", "--recipe", "5dgs"], "recipe '5dgs' does not exist"),
         (["simplify", "SCENE", "--recipe", "5dgs"], "recipe '5dgs' does not exist"),
         (
-            ["spilt", "SCENE"],
-            "there is no study 'spilt': choose from adaptive, ablation, split, culling, simplify, depth",
+            ["ablaton", "SCENE"],
+            "there is no study 'ablaton': choose from adaptive, ablation, culling, simplify, depth",
         ),
         (
             ["culling", "room", "--downscale", "2"],
@@ -150,11 +114,11 @@ def test_bad_input_is_one_line(scene_folder, tmp_path, capsys, arguments, messag
     assert not (tmp_path / "out").exists()
 
 
-def test_interrupted_study_leaves_nothing(scene_folder, tmp_path, capsys, monkeypatch):
+def test_interrupted_study_leaves_nothing(tmp_path, capsys, monkeypatch):
     def interrupt(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(split_forms, "measure", interrupt)
-    assert main(["study", "split", str(scene_folder), "--out", str(tmp_path / "out")]) == 130
+    monkeypatch.setattr(depth_types, "measure", interrupt)
+    assert main(["study", "depth", "room", "--out", str(tmp_path / "out")]) == 130
     assert "minisplat-ref: interrupted\n" in capsys.readouterr().err
     assert not any(tmp_path.iterdir())

@@ -12,10 +12,13 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.images import read_image
-from minisplat_ref.methods import RECIPES, gaussian_splatting
+from minisplat_ref.methods import RECIPES, gaussian_splatting, mini_splatting
 from minisplat_ref.methods.mini_splatting import reinitialise_from_depth
-from minisplat_ref.studies import FIGURE, RESULT, ablation, conditions, front
-from minisplat_ref.studies.front import RUNS
+from minisplat_ref.strategy.blur_split import principal_axis_children
+from minisplat_ref.strategy.clone_split import random_children
+from minisplat_ref.studies import ablation, conditions, kit
+from minisplat_ref.studies.kit import RUNS
+from minisplat_ref.studies.study import FIGURE, RESULT
 from minisplat_ref.studies.variants import (
     DEVIATIONS,
     FULL,
@@ -26,7 +29,7 @@ from minisplat_ref.studies.variants import (
     with_settings,
 )
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import At, action_name, configured, firing_steps, settings_of
+from minisplat_ref.training.schedule import At, action_name, configured, does, firing_steps, settings_of
 from minisplat_ref.training.state import Iteration
 from minisplat_ref.types import numbered
 
@@ -60,6 +63,25 @@ def test_each_variant_lacks_one_thing():
         assert changed == {FULL: [], "half-size warm-up": ["half_size_until"]}.get(name, ["events"])
     assert {"restart", "sampling"} < set(variants_of(RECIPES["mini-splatting"], 30_000))
     assert "clone" not in variants_of(RECIPES["mini-splatting"], 30_000)
+
+
+@pytest.mark.parametrize("name", ["mini-splatting-d", "mini-splatting2"])
+def test_the_four_forms_of_blur_split(name):
+    """They differ in blur split and children alone."""
+    recipe = RECIPES[name]
+    variants = variants_of(recipe, recipe.iterations)
+    forms = {
+        FULL: (True, random_children),
+        "random children": (True, principal_axis_children),
+        "blur split": (False, random_children),
+        "blur split and random children": (False, principal_axis_children),
+    }
+    for form, (has_blur_split, children) in forms.items():
+        events = variants[form].events
+        assert any(does(event, mini_splatting.collect_blur) for event in events) == has_blur_split
+        assert len(recipe.events) - len(events) == (not has_blur_split)
+        (split,) = [event for event in events if does(event, gaussian_splatting.clone_and_split)]
+        assert split.action.keywords["draw_children"] is children
 
 
 def test_deviations_are_taken_back():
@@ -120,7 +142,7 @@ def test_what_never_acts_has_no_row():
 @pytest.fixture
 def small(monkeypatch):
     scene = tiny_room()
-    monkeypatch.setattr(front, "make_scene", lambda name: scene)
+    monkeypatch.setattr(kit, "make_scene", lambda name: scene)
 
 
 def test_study_and_its_continuation(tmp_path, capsys, small, monkeypatch):

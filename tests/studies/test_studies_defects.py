@@ -34,7 +34,7 @@ def test_cameras_are_turned_by_half_a_pixel(scene):
 
 
 def test_about_half_of_the_photographs_are_halved(scene):
-    disturbed = defects.with_two_sizes(scene, np.random.default_rng(0))
+    disturbed = defects.CONDITIONS["sizes"](scene, np.random.default_rng(0))
     sizes = [view.image.shape[:2] for view in disturbed.train_views]
     assert set(sizes) == {(30, 40), (15, 20)} and [view.camera.width for view in disturbed.train_views] == [
         width for _, width in sizes

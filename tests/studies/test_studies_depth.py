@@ -12,7 +12,8 @@ from minisplat_ref.datasets.synthetic.tracer import pixel_rays
 from minisplat_ref.io.images import read_image
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.strategy.initialization import from_points
-from minisplat_ref.studies import FIGURE, RESULT, depth_types
+from minisplat_ref.studies import depth_types
+from minisplat_ref.studies.study import FIGURE, RESULT
 from minisplat_ref.studies.variants import as_3dgs_prunes
 from tolerances import CLOSED_FORM, PRINTED_DIGITS
 
@@ -101,8 +102,8 @@ def test_the_backdrop_survives_density_control(outdoor):
     """
     recipe = get_recipe("mini-splatting", 900)
     choice = depth_types.CHOICES["mid-point, vote, backdrop"]
-    with_ours = depth_types.measure_one(outdoor, recipe, choice, 0)["backdrop_left"]
-    with_3dgs = depth_types.measure_one(outdoor, as_3dgs_prunes(recipe), choice, 0)["backdrop_left"]
+    with_ours = depth_types.measure(outdoor, recipe, choice, 0)["backdrop_left"]
+    with_3dgs = depth_types.measure(outdoor, as_3dgs_prunes(recipe), choice, 0)["backdrop_left"]
     assert with_ours > 0.3 and with_3dgs == 0
 
 

@@ -16,7 +16,8 @@ from minisplat_ref.strategy.importance import collect_importance, indoor
 from minisplat_ref.strategy.initialization import from_points
 from minisplat_ref.strategy.removal import collect_removal_costs
 from minisplat_ref.strategy.simplify import intersection_preserving, most_important, select_mass
-from minisplat_ref.studies import FIGURE, RESULT, simplify
+from minisplat_ref.studies import simplify
+from minisplat_ref.studies.study import FIGURE, RESULT
 from minisplat_ref.training.loop import train
 from tolerances import CLOSED_FORM, PRINTED_DIGITS
 

@@ -25,7 +25,15 @@ thresholds for the longest and thinnest footprints are replaced by bounds of the
 
 from minisplat_ref.extensions.analytic.method import ANALYTIC, INTEGRATED
 from minisplat_ref.extensions.analytic.stages import stages
-from minisplat_ref.extensions.analytic.study import FOOTPRINT
 from minisplat_ref.extensions.extension import Extension
+from minisplat_ref.studies.study import OUT, declare, number, seed
 
+FOOTPRINT = declare(
+    "footprint",
+    "alpha of one Gaussian against its integral over pixels",
+    f"{__name__}.footprint.run",
+    OUT,
+    number("--places", 64, "positions within a pixel"),
+    seed("of positions and angles"),
+)
 EXTENSION = Extension("analytic", recipes=(ANALYTIC,), representation=INTEGRATED, stages=stages, studies=(FOOTPRINT,))

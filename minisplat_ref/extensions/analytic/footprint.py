@@ -6,15 +6,18 @@ or with Mip-Splatting's filter, which keeps the integral, and the integral along
 distribution function.
 """
 
-from typing import Any
+import argparse
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from minisplat_ref.extensions.analytic.reference import EXACT_RESPONSE, LOGISTIC, NORMAL, RESPONSE, integrals
-from minisplat_ref.extensions.shared_studies import tidy, with_progress
 from minisplat_ref.reference.antialiasing import compensations
 from minisplat_ref.reference.hits import CONIC, Response
+from minisplat_ref.reporting import markdown_table
+from minisplat_ref.reports.palette import BLUE, GREEN, GREY, OCHRE, RED
+from minisplat_ref.studies import kit
+from minisplat_ref.studies.figures import set_ticks
 from minisplat_ref.types import Floats, Projection
 
 SIGMAS = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0)  # px
@@ -24,7 +27,23 @@ SAMPLES = 48  # per pixel and side
 DILATION, MIP = 0.3, 0.1  # px^2
 OPACITY = 0.8
 METHODS = ("centre", "dilation", "Mip filter", "integral, logistic", "integral, erf")
-COLORS = ("#8a8580", "#d2493f", "#e0a526", "#35608c", "#6aa84f")
+COLORS = (GREY, RED, OCHRE, BLUE, GREEN)
+
+
+def run(args: argparse.Namespace) -> kit.Report:
+    """Measure the errors over sizes, for a round Gaussian and for a needle."""
+    found, largest = measure(args.places, args.seed), largest_difference()
+    settings = {**kit.settings_of(args, "places", "seed"), "sigmas": list(SIGMAS)}
+    rows = [
+        [shape, f"{sigma:g}", *(f"{methods[name][s]:.2g}" for name in METHODS)]
+        for shape, methods in found.items()
+        for s, sigma in enumerate(SIGMAS)
+    ]
+    text = "RMS error of alpha, relative to the RMS of its exact mean over the pixel\n\n"
+    text += markdown_table(["shape", "sigma (px)", *METHODS], rows)
+    text += f"\n\nThe distribution functions differ by {largest:.1e} at most."
+    result = {**settings, "errors": found, "largest_difference_of_distributions": largest}
+    return kit.Report(result, draw(found), text)
 
 
 def centres() -> Floats:
@@ -93,7 +112,7 @@ def measure(n: int, seed: int) -> dict[str, dict[str, list[float]]]:
     found: dict[str, dict[str, list[float]]] = {}
     for shape, elongation, places in (("round", 1.0, n), ("needle", ELONGATION, max(1, n // 8))):
         rng = np.random.default_rng(seed)
-        rows = [errors(sigma, elongation, places, rng) for sigma in with_progress(SIGMAS, shape)]
+        rows = [errors(sigma, elongation, places, rng) for sigma in kit.with_progress(SIGMAS, shape)]
         found[shape] = {name: [row[name] for row in rows] for name in METHODS}
     return found
 
@@ -112,15 +131,8 @@ def draw(found: dict[str, dict[str, list[float]]]) -> Figure:
     for axes, (shape, methods) in zip(panels, found.items(), strict=True):
         for name, color in zip(METHODS, COLORS, strict=True):
             axes.loglog(SIGMAS, np.maximum(methods[name], 1e-6), "o-", ms=4, color=color, label=name)
-        axes.set(title=titles[shape], xlabel="standard deviation (px)", xticks=(0.1, 0.3, 1, 3), ylim=(1e-4, 100))
-        axes.set_xticklabels(["0.1", "0.3", "1", "3"])
-        axes.minorticks_off()
-        tidy(axes)
+        axes.set(title=titles[shape], xlabel="standard deviation (px)", ylim=(1e-4, 100))
+        set_ticks(axes, (0.1, 0.3, 1, 3), ("0.1", "0.3", "1", "3"))
     panels[0].set_ylabel("RMS error / RMS of the integral")
-    panels[1].legend(frameon=False, fontsize=8)
+    panels[1].legend()
     return figure
-
-
-def summarise(found: dict[str, dict[str, list[float]]]) -> dict[str, Any]:
-    """Return the content of ``result.json``."""
-    return {"sigmas": list(SIGMAS), "errors": found, "largest_difference_of_distributions": largest_difference()}

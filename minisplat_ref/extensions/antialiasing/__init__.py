@@ -25,7 +25,13 @@ over a pixel, is the extension ``analytic``; ``docs/FAMILY.md`` has the figures 
 """
 
 from minisplat_ref.extensions.antialiasing.method import ANTIALIASING, FILTERED
-from minisplat_ref.extensions.antialiasing.study import ZOOM
 from minisplat_ref.extensions.extension import Extension
+from minisplat_ref.studies.study import OUT, declare, downscale, iterations, scene, seeds
 
+ZOOM = declare(
+    "zoom",
+    "a scene seen from farther and nearer than in training",
+    f"{__name__}.zoom.run",
+    *(scene("room"), OUT, downscale(4), iterations(1000), seeds(2)),
+)
 EXTENSION = Extension("antialiasing", recipes=(ANTIALIASING,), representation=FILTERED, studies=(ZOOM,))

@@ -4,20 +4,24 @@ Training uses photographs at 1/D of their size. Test views are drawn with the sa
 compared with means over blocks of the photographs' pixels; so zooms of more than D have no truth.
 """
 
-from typing import Any, NamedTuple
+import argparse
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from minisplat_ref.backends import CPU
 from minisplat_ref.extensions.extension import find_recipe
-from minisplat_ref.extensions.shared_studies import psnr_of, shrunk, tidy, with_progress
-from minisplat_ref.mechanisms.sampling import block_means, zoom_camera
+from minisplat_ref.mechanisms.sampling import block_means, shrink_photographs, zoom_camera
 from minisplat_ref.rendering import Renderer, Request
+from minisplat_ref.reporting import markdown_table
+from minisplat_ref.reports.palette import BLUE, GREY, RED
+from minisplat_ref.studies import kit
+from minisplat_ref.studies.figures import plot_range, show, with_range
 from minisplat_ref.training.loop import train
 from minisplat_ref.types import Floats, Model, Scene, View, view_from
 
-RECIPES = {"3dgs-accel": "#8a8580", "antialiasing": "#d2493f", "analytic": "#35608c"}
+RECIPES = {"3dgs-accel": GREY, "antialiasing": RED, "analytic": BLUE}
 FARTHEST = 8  # times smaller than the training views
 SIZE_MIN = 4  # pixels per side of the smallest picture that is measured
 
@@ -54,14 +58,11 @@ def blocks(scene: Scene, downscale: int) -> list[int]:
 def psnrs(found: Trained, scene: Scene, sides: list[int]) -> list[float]:
     """Return the mean PSNR of the test views, dB, for each size of block."""
     views = [view.load() for view in scene.test_views]
-    return [
-        float(
-            np.mean(
-                [psnr_of(found.picture(view, 1 / n), block_means(view.image.astype(float) / 255, n)) for view in views]
-            )
-        )
-        for n in sides
-    ]
+    return [float(np.mean([kit.psnr_of(found.picture(v, 1 / n), _photograph(v, n)) for v in views])) for n in sides]
+
+
+def _photograph(view: View, n: int) -> Floats:
+    return block_means(view.load().image.astype(float) / 255, n)
 
 
 class Measured(NamedTuple):
@@ -79,18 +80,33 @@ class Measured(NamedTuple):
 
 def measure(scene: Scene, downscale: int, iterations: int, seeds: int) -> Measured:
     """Train the scene with every recipe and seed, and measure."""
-    small, sides = shrunk(scene, downscale), blocks(scene, downscale)
+    small, sides = shrink_photographs(scene, downscale), blocks(scene, downscale)
     psnr: dict[str, list[list[float]]] = {name: [] for name in RECIPES}
     counts: dict[str, list[int]] = {name: [] for name in RECIPES}
-    view = scene.test_views[0].load()
-    pictures = {"photograph": block_means(view.image.astype(float) / 255, sides[-1])}
+    view = scene.test_views[0]
+    pictures = {"photograph": _photograph(view, sides[-1])}
     for seed in range(seeds):
-        for name in with_progress(RECIPES, f"trainings, seed {seed}"):
+        for name in kit.with_progress(RECIPES, f"trainings, seed {seed}"):
             found = trained(name, small, iterations, seed)
             psnr[name].append(psnrs(found, scene, sides))
             counts[name].append(len(found.model.gaussians.means))
             pictures.setdefault(name, np.clip(found.picture(view, 1 / sides[-1]), 0, 1))
     return Measured([downscale / n for n in sides], psnr, counts, pictures)
+
+
+def run(args: argparse.Namespace) -> kit.Report:
+    """Train and measure."""
+    scene = kit.read_scene(args.scene)
+    found = measure(scene, args.downscale, args.iterations, args.seeds)
+    rows = [
+        [name, f"{np.mean(found.counts[name]):,.0f}", *(with_range(values, 2) for values in zip(*runs, strict=True))]
+        for name, runs in found.psnr.items()
+    ]
+    table = markdown_table(["recipe", "Gaussians", *(f"x {zoom:g}" for zoom in found.zooms)], rows)
+    result = kit.settings_of(args, "scene", "downscale", "iterations", "seeds")
+    result |= {"zooms": found.zooms, "psnr": found.psnr, "counts": found.counts}
+    text = f"PSNR (dB) of test views: mean over the seeds ± half their range\n\n{table}"
+    return kit.Report(result, draw(found), text)
 
 
 def draw(found: Measured) -> Figure:
@@ -99,23 +115,14 @@ def draw(found: Measured) -> Figure:
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1, 1.1))[0]
     axes = left.subplots()
     for name, color in RECIPES.items():
-        values = np.array(found.psnr[name])  # [seeds, zooms]
-        axes.fill_between(found.zooms, values.min(axis=0), values.max(axis=0), color=color, alpha=0.25, lw=0)
-        axes.plot(found.zooms, values.mean(axis=0), "o-", ms=4, color=color, label=name)
+        plot_range(axes, found.zooms, np.array(found.psnr[name]), color, name)
     axes.set_xscale("log", base=2)
     axes.set_xticks(found.zooms, [f"{zoom:g}" if zoom >= 1 else f"1/{1 / zoom:g}" for zoom in found.zooms])
     axes.set(title="PSNR of test views (dB)", xlabel="pixels per side, relative to the training views")
-    axes.legend(frameon=False)
-    tidy(axes)
+    axes.legend()
     height, width = found.pictures["photograph"].shape[:2]
     panels = right.subplots(*((1, 4) if height > width else (2, 2))).ravel()
     for panel, (name, picture) in zip(panels, found.pictures.items(), strict=True):
-        panel.imshow(picture[height // 4 : 3 * height // 4, width // 4 : 3 * width // 4])
-        panel.set_title(f"{name}, x {found.zooms[-1]:g}", fontsize=9)
-        panel.set(xticks=[], yticks=[])
+        middle = picture[height // 4 : 3 * height // 4, width // 4 : 3 * width // 4]
+        show(panel, middle, f"{name}, x {found.zooms[-1]:g}")
     return figure
-
-
-def summarise(found: Measured) -> dict[str, Any]:
-    """Return the content of ``result.json``."""
-    return {"zooms": found.zooms, "psnr": found.psnr, "counts": found.counts}

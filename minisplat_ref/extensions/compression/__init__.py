@@ -27,8 +27,15 @@ vector quantisation, which ``.omg`` does; and arithmetic coding. ``docs/FAMILY.m
 
 from minisplat_ref.extensions.compression.msz import MSZ
 from minisplat_ref.extensions.compression.spz import SPZ
-from minisplat_ref.extensions.compression.study import RATE_DISTORTION
 from minisplat_ref.extensions.extension import Extension
+from minisplat_ref.studies.study import argument, declare, trainings
 
+RATE_DISTORTION = declare(
+    "rate-distortion",
+    "bytes against quality: .msz beside PLY, SPZ and SOG",
+    f"{__name__}.study.run",
+    *trainings(1000, "mini-splatting2"),
+    argument("--splat-transform", metavar="CMD", help="measure SOG, too, written by this program"),
+)
 EXTENSION = Extension("compression", formats=(MSZ, SPZ), studies=(RATE_DISTORTION,))
 """The formats ``.msz`` and ``.spz``, and a study."""

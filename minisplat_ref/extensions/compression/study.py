@@ -14,29 +14,28 @@ import subprocess
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
-from minisplat_ref.extensions import shared_studies
-from minisplat_ref.extensions import shared_trainings as shared
 from minisplat_ref.extensions.compression.msz import MSZ
 from minisplat_ref.extensions.compression.spz import SPZ
-from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.formats import Format
 from minisplat_ref.io.ply import load_ply, save_ply
-from minisplat_ref.studies.study import Study
+from minisplat_ref.metrics import evaluate
+from minisplat_ref.reporting import markdown_table
+from minisplat_ref.reports.palette import BLUE, GREY, OCHRE, RED
+from minisplat_ref.studies import kit
+from minisplat_ref.studies.figures import plot_deviations, set_ticks, with_deviation
 from minisplat_ref.types import Floats, Gaussians, View
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 SHRUNK = (1.0, 1 / 8, 1 / 64, 1 / 512)  # sizes of the scene, relative to the original
 SHRUNK_LEVEL = 5  # of .msz
-COLORS = {"ply": shared.GREY, "msz": shared.BLUE, "spz": shared.RED, "sog": shared.YELLOW}
+COLORS = {"ply": GREY, "msz": BLUE, "spz": RED, "sog": OCHRE}
 
 
 class Point(NamedTuple):
@@ -50,57 +49,36 @@ class Point(NamedTuple):
     """Loss of PSNR on the test views, dB."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the study."""
-    shared.add_scene_arguments(parser, iterations=1000, recipe="mini-splatting2")
-    parser.add_argument("--splat-transform", metavar="CMD", help="measure SOG, too, written by this program")
-
-
-def run(args: argparse.Namespace) -> None:
-    """Train, measure, write the results, and print the tables.
+def run(args: argparse.Namespace) -> kit.Report:
+    """Train and measure.
 
     Raises
     ------
     InputError
-        The scene, the recipe, the PLY, the program or the output folder cannot be used.
+        The program cannot be used.
     """
-    from minisplat_ref.reporting import markdown_table
-
-    scene = shared.read_scene(args)
-    with making_folder(args.out) as folder:
-        runs, shrunk, psnrs, counts = [], [], [], []
-        for gaussians in shared.populations(args, scene):
-            psnr = mean_psnr(gaussians, scene.test_views, scene.background)
-            psnrs.append(psnr)
-            counts.append(len(gaussians.means))
-            judge = (scene.test_views, scene.background, psnr)
-            files = rate_points(gaussians, *judge, args.splat_transform)
-            runs.append([point._asdict() for point in shared_studies.with_progress(files, "files")])
-            shrunk.append(drops_when_shrunk(gaussians, scene.test_views, scene.background))
-        result = {
-            **shared.describe(args, scene),
-            "psnr": psnrs,
-            "gaussians": counts,
-            "runs": runs,
-            "shrunk": {name: [of_seed[name] for of_seed in shrunk] for name in shrunk[0]},
-        }
-        shared_studies.write(folder, result, draw(result))
-    print(f"{scene.name}: {shared.with_deviation(psnrs, 2)} dB, {np.mean(counts):,.0f} Gaussians\n")
-    print(markdown_table(["file", "bytes", "bytes per Gaussian", "dB lost"], to_rows(runs)))
-    print("\ndB lost by size of the scene\n")
-    rows = [
-        [name, *(shared.with_deviation(list(of_seeds), 3) for of_seeds in zip(*drops, strict=True))]
-        for name, drops in result["shrunk"].items()
-    ]
-    print(markdown_table(["file", *(f"1/{1 / factor:.0f}" for factor in SHRUNK)], rows))
+    scene = kit.read_scene(args.scene, args.downscale)
+    runs, shrunk, psnrs, counts = [], [], [], []
+    for gaussians in kit.populations(args, scene):
+        psnrs.append(mean_psnr(gaussians, scene.test_views, scene.background))
+        counts.append(len(gaussians.means))
+        files = rate_points(gaussians, scene.test_views, scene.background, psnrs[-1], args.splat_transform)
+        runs.append([point._asdict() for point in kit.with_progress(files, "files")])
+        shrunk.append(drops_when_shrunk(gaussians, scene.test_views, scene.background))
+    drops = {name: [of_seed[name] for of_seed in shrunk] for name in shrunk[0]}
+    result = {**kit.describe_trainings(args, scene), "psnr": psnrs, "gaussians": counts, "runs": runs, "shrunk": drops}
+    text = f"{scene.name}: {with_deviation(psnrs, 2)} dB, {np.mean(counts):,.0f} Gaussians\n\n"
+    text += markdown_table(["file", "bytes", "bytes per Gaussian", "dB lost"], to_rows(runs))
+    text += "\n\ndB lost by size of the scene\n\n"
+    rows = [[name, *(with_deviation(d, 3) for d in zip(*of_seeds, strict=True))] for name, of_seeds in drops.items()]
+    text += markdown_table(["file", *(f"1/{1 / factor:.0f}" for factor in SHRUNK)], rows)
+    return kit.Report(result, draw(result), text)
 
 
 def mean_psnr(
     gaussians: Gaussians, views: tuple[View, ...], background: Floats, conventions: Conventions = GSPLAT_MAIN
 ) -> float:
     """Return the mean PSNR over views, dB."""
-    from minisplat_ref.metrics import evaluate
-
     psnr = evaluate(gaussians, views, background=background, conventions=conventions).psnr
     assert psnr is not None
     return psnr
@@ -152,7 +130,7 @@ def sog_round_trip(program: str, ply: Path) -> tuple[int, Gaussians]:
 def drops_when_shrunk(gaussians: Gaussians, views: tuple[View, ...], background: Floats) -> dict[str, list[float]]:
     """Return the loss of each format, dB, at each size of the scene in ``SHRUNK``."""
     drops: dict[str, list[float]] = {"msz 5": [], "spz version 3": []}
-    for factor in shared_studies.with_progress(SHRUNK, "sizes"):
+    for factor in kit.with_progress(SHRUNK, "sizes"):
         small = shrink(gaussians, factor)
         near = tuple(view.load()._replace(camera=shrunk_camera(view, factor)) for view in views)
         conventions = GSPLAT_MAIN._replace(near_plane=factor * GSPLAT_MAIN.near_plane)
@@ -180,53 +158,41 @@ def to_rows(runs: list[list[dict[str, Any]]]) -> list[list[str]]:
     rows = []
     for of_seeds in zip(*runs, strict=True):
         sizes = [f"{np.mean([point[name] for point in of_seeds]):,.{digits}f}" for name, digits in _SIZES.items()]
-        rows.append([of_seeds[0]["name"], *sizes, shared.with_deviation([point["drop"] for point in of_seeds], 3)])
+        rows.append([of_seeds[0]["name"], *sizes, with_deviation([point["drop"] for point in of_seeds], 3)])
     return rows
 
 
 _SIZES = {"n_bytes": 0, "bytes_per_gaussian": 1}  # digits in the table
 
 
-def draw(result: dict[str, Any]) -> "Figure":
+def draw(result: dict[str, Any]) -> Figure:
     """Draw loss against bytes, and loss against the size of the scene."""
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(9.6, 3.6), layout="constrained")
     rate, small = figure.subplots(1, 2, width_ratios=(3, 2))
     for kind in COLORS:
         _draw_kind(rate, kind, result["runs"])
-    rate.axhline(0, color=shared.GREY, linewidth=0.8)
+    rate.axhline(0, color=GREY, linewidth=0.8)
     rate.set(
         xscale="log", xlabel="bytes per Gaussian", ylabel="PSNR lost (dB)", title=f"{result['scene']}: bytes and loss"
     )
     ticks = (8, 16, 32, 64, 128, 256)
-    rate.set_xticks(ticks, [str(tick) for tick in ticks])
-    rate.minorticks_off()
+    set_ticks(rate, ticks, [str(tick) for tick in ticks])
     for name, drops in result["shrunk"].items():
         color = COLORS[name.split()[0]]
-        means, deviations = np.transpose([shared.mean_and_deviation(d) for d in zip(*drops, strict=True)])
-        small.errorbar(SHRUNK, means, yerr=deviations, color=color, marker="o", ms=4, capsize=3, label=f".{name}")
+        plot_deviations(small, SHRUNK, zip(*drops, strict=True), color=color, label=f".{name}")
     small.set(xscale="log", xlabel="size of the scene", ylabel="PSNR lost (dB)", title="the same scene made smaller")
-    small.set_xticks(SHRUNK, ["1", *(f"1/{1 / factor:.0f}" for factor in SHRUNK[1:])])
-    small.minorticks_off()
+    set_ticks(small, SHRUNK, ["1", *(f"1/{1 / factor:.0f}" for factor in SHRUNK[1:])])
     small.invert_xaxis()
     for axes in (rate, small):
-        shared_studies.tidy(axes)
-        axes.legend(frameon=False, fontsize=9)
+        axes.legend()
     return figure
 
 
-def _draw_kind(axes: "Axes", kind: str, runs: list[list[dict[str, Any]]]) -> None:
+def _draw_kind(axes: Axes, kind: str, runs: list[list[dict[str, Any]]]) -> None:
     """Draw the files of one format as a line through its levels."""
     of_levels = [of_seeds for of_seeds in zip(*runs, strict=True) if of_seeds[0]["name"].split()[0] == kind]
     if not of_levels:
         return
     sizes = [np.mean([point["bytes_per_gaussian"] for point in of_seeds]) for of_seeds in of_levels]
-    losses = [shared.mean_and_deviation([point["drop"] for point in of_seeds]) for of_seeds in of_levels]
-    means, deviations = np.transpose(losses)
-    style = "-o" if kind == "msz" else "s"
-    axes.errorbar(sizes, means, yerr=deviations, fmt=style, color=COLORS[kind], ms=4, capsize=3, label=f".{kind}")
-
-
-RATE_DISTORTION = Study("rate-distortion", "bytes against quality: .msz beside PLY, SPZ and SOG", add_arguments, run)
-"""The study ``compression/rate-distortion``."""
+    losses = [[point["drop"] for point in of_seeds] for of_seeds in of_levels]
+    plot_deviations(axes, sizes, losses, fmt="-o" if kind == "msz" else "s", color=COLORS[kind], label=f".{kind}")

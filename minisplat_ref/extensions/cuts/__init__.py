@@ -28,7 +28,13 @@ Gaussian becomes flat along one of them, its curve is seen edge on.
 
 from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CUTS
 from minisplat_ref.extensions.cuts.stages import stages
-from minisplat_ref.extensions.cuts.study import CARD
 from minisplat_ref.extensions.extension import Extension
+from minisplat_ref.studies.study import OUT, declare, iterations, seeds
 
+CARD = declare(
+    "card",
+    "pictures with a sharp edge, by few Gaussians with and without cuts",
+    f"{__name__}.study.run",
+    *(OUT, iterations(300), seeds(4)),
+)
 EXTENSION = Extension("cuts", recipes=(CUTS,), representation=CUT_GAUSSIANS, stages=stages, studies=(CARD,))

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CUTS, CutGaussians, set_width, with_cuts
-from minisplat_ref.extensions.shared_studies import psnr_of
 from minisplat_ref.rendering import Request
+from minisplat_ref.studies.kit import psnr_of
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.representation import GAUSSIANS, Representation

@@ -34,8 +34,18 @@ from minisplat_ref.extensions.fans import export, fine_tune
 from minisplat_ref.extensions.fans.mesh_files import load_fans, save_fans
 from minisplat_ref.extensions.fans.method import FANS, FANS_OF_GAUSSIANS
 from minisplat_ref.extensions.fans.stages import stages
-from minisplat_ref.extensions.fans.study import PROFILE, REFIT
+from minisplat_ref.studies import study
 
+PROFILE = study.declare(
+    "profile", "which fan stands best for a Gaussian, from any side", f"{__name__}.study.run_profile", study.OUT
+)
+REFIT = study.declare(
+    "refit",
+    "what a scene loses as a mesh, and what refitting gives back",
+    f"{__name__}.study.run",
+    *study.trainings(1000, "mini-splatting"),
+    study.fine_tune(500),
+)
 EXTENSION = Extension(
     "fans",
     recipes=(FANS,),

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,13 +11,10 @@ from minisplat_ref.extensions.fans.mesh_files import write_mesh
 from minisplat_ref.extensions.fans.method import render
 from minisplat_ref.extensions.fans.shapes import FRONT_REACH, Fans, FanShape, convert_gaussians, mesh_of, visible_mesh
 from minisplat_ref.extensions.fans.tuning import best_shape, fine_tune, measure, render_clipped
-from minisplat_ref.extensions.shared_studies import psnr_of
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.rendering import Request
-from minisplat_ref.training.adam import zero_moments
-from minisplat_ref.training.loop import train
+from minisplat_ref.studies import kit
 from minisplat_ref.training.schedule import scaled
-from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Gaussians, Model, Scene, View
 
 REACHES, RIMS = (2.0, 2.5, 3.0, 3.5), (0.0, 0.1, 0.2)
@@ -49,7 +47,7 @@ def shape_rows(gaussians: Gaussians, judge: Judge, shape: FanShape) -> list[dict
     def row(shape: FanShape) -> dict[str, Any]:
         fans = convert_gaussians(gaussians, shape)
         psnrs = [
-            psnr_of(render_clipped(fans, v, background=background), target)
+            kit.psnr_of(render_clipped(fans, v, background=background), target)
             for v, target in zip(judge.views, targets, strict=True)
         ]
         return {**shape._asdict(), "psnr": float(np.mean(psnrs))}
@@ -62,7 +60,7 @@ def shape_rows(gaussians: Gaussians, judge: Judge, shape: FanShape) -> list[dict
 
 
 def refit_rows(
-    gaussians: Gaussians, judge: Judge, iterations: int, seed: int, folder: Path, told: Callable[[str], None]
+    gaussians: Gaussians, judge: Judge, iterations: int, seed: int, told: Callable[[str], None]
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Return a row for each form of a scene, and the populations by its name.
 
@@ -73,8 +71,6 @@ def refit_rows(
     iterations : int
         Of the vertices' refit, and of the splats that are trained on beside it.
     seed : int
-    folder : Path
-        Where meshes are written, to be counted in bytes.
     told : callable
         Called with the name of what comes next.
     """
@@ -82,8 +78,9 @@ def refit_rows(
     without_view = gaussians._replace(sh_rest=gaussians.sh_rest[:, :0])
     forms: dict[str, Any] = {"splats": gaussians, "splats, degree 0": without_view}
     told("splats, trained on")
-    forms["splats, trained on"] = trained_on(gaussians, scene, iterations, seed)
-    forms["splats, degree 0, trained on"] = trained_on(without_view, scene, iterations, seed)
+    recipe = kit.without_events(scaled(GS_ACCEL, iterations))
+    forms["splats, trained on"] = kit.fine_tune(gaussians, scene, recipe, seed)
+    forms["splats, degree 0, trained on"] = kit.fine_tune(without_view, scene, recipe, seed)
     photographs = [view.image / 255 for view in judge.views]
     shapes: dict[str, FanShape] = {}
     for name, shape in FORMS.items():
@@ -98,18 +95,9 @@ def refit_rows(
         test, training = (measure(population, scene, views) for views in (scene.test_views, scene.train_views))
         shape_found = shapes.get(name)
         fit = {} if shape_found is None else {"reach": shape_found.reach, "rim": shape_found.rim}
-        size = {} if isinstance(population, Gaussians) else _size(population, folder / "mesh.ply")
+        size = {} if isinstance(population, Gaussians) else _size(population)
         rows.append({"form": name, "psnr": test.psnr, "ssim": test.ssim, "training_psnr": training.psnr, **fit, **size})
     return rows, forms
-
-
-def trained_on(gaussians: Gaussians, scene: Scene, iterations: int, seed: int) -> Gaussians:
-    """Return Gaussians after further iterations of 3DGS that leave their number as it is."""
-    recipe = scaled(GS_ACCEL._replace(events=(), sh_milestones=(0, 0, 0)), iterations)
-    copy = Gaussians(*(field.copy() for field in gaussians))
-    state = TrainState(copy, zero_moments(copy), step=0, view_order=[], rng=np.random.default_rng(seed), stats={})
-    result: Gaussians = train(scene, recipe, seed=seed, state=state).gaussians
-    return result
 
 
 def layer_rows(fans: Fans, judge: Judge) -> list[dict[str, Any]]:
@@ -125,10 +113,10 @@ def layer_rows(fans: Fans, judge: Judge) -> list[dict[str, Any]]:
     return rows
 
 
-def _size(fans: Fans, path: Path) -> dict[str, int]:
-    """Return the triangles and vertices of a mesh, and its bytes as a PLY; the file does not stay."""
+def _size(fans: Fans) -> dict[str, int]:
+    """Return the triangles and vertices of a mesh, and its bytes as a PLY."""
     mesh = visible_mesh(mesh_of(fans), 1 / 255)
-    write_mesh(path, mesh)
-    n_bytes = path.stat().st_size
-    path.unlink()
-    return {"triangles": len(mesh.faces), "vertices": len(mesh.vertices), "bytes": n_bytes}
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "mesh.ply")
+        write_mesh(path, mesh)
+        return {"triangles": len(mesh.faces), "vertices": len(mesh.vertices), "bytes": path.stat().st_size}

@@ -6,6 +6,7 @@ from typing import Any
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.fans.arguments import add_shape, load_as_fans, shape_of
+from minisplat_ref.studies.study import downscale, iterations, seed
 
 EPILOG = """\
 example:
@@ -26,9 +27,9 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("scene", metavar="SCENE", help="folder of photographs that the model was trained on")
     parser.add_argument("model", type=Path, metavar="MODEL", help="PLY of Gaussians or of fans, or a run's folder")
     parser.add_argument("out", type=Path, metavar="OUT", help="PLY of fans to write")
-    parser.add_argument("--downscale", type=int, default=1, metavar="D", help="make photographs D times smaller")
-    parser.add_argument("--iterations", type=int, default=1000, metavar="N", help="default 1000")
-    parser.add_argument("--seed", type=int, default=0, metavar="S", help="default 0")
+    downscale()(parser)
+    iterations(1000, "length")(parser)
+    seed("of the training")(parser)
     add_shape(parser)
     parser.set_defaults(run=run)
 
@@ -45,10 +46,8 @@ def run(args: argparse.Namespace) -> int:
 
     from minisplat_ref.extensions.fans.mesh_files import save_fans
     from minisplat_ref.extensions.fans.tuning import fine_tune, measure
-    from minisplat_ref.extensions.shared_studies import check_at_least, read_scene
+    from minisplat_ref.studies.kit import read_scene
 
-    check_at_least(1, downscale=args.downscale, iterations=args.iterations)
-    check_at_least(0, seed=args.seed)
     if args.out.suffix.lower() != ".ply":
         raise InputError(f"{args.out}: fine-tuned fans are written as a .ply, of which fans export makes other formats")
     if not args.out.parent.is_dir():

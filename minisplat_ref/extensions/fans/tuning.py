@@ -11,11 +11,10 @@ from minisplat_ref.extensions.fans.method import FANS_OF_GAUSSIANS, FINE_TUNING
 from minisplat_ref.extensions.fans.shapes import Fans, FanShape, convert_gaussians
 from minisplat_ref.metrics import Evaluation, evaluate
 from minisplat_ref.rendering import Request
-from minisplat_ref.training.adam import zero_moments
-from minisplat_ref.training.loop import train
+from minisplat_ref.studies import kit
 from minisplat_ref.training.representation import GAUSSIANS
 from minisplat_ref.training.schedule import scaled
-from minisplat_ref.training.state import StepReport, TrainState
+from minisplat_ref.training.state import StepReport
 from minisplat_ref.types import Floats, Gaussians, Model, Scene, View
 
 REACHES = 1.0, 4.0  # between which k is sought
@@ -27,10 +26,8 @@ def fine_tune(
     fans: Fans, scene: Scene, iterations: int, seed: int, on_step: Callable[[StepReport], None] | None = None
 ) -> Fans:
     """Return fans after some iterations of ``FINE_TUNING`` of their vertices; the given ones are not changed."""
-    copy = Fans(*(field.copy() for field in fans))
-    state = TrainState(copy, zero_moments(copy), step=0, view_order=[], rng=np.random.default_rng(seed), stats={})
     recipe = scaled(FINE_TUNING, iterations)._replace(representation=FANS_OF_GAUSSIANS)
-    result: Fans = train(scene, recipe, seed=seed, state=state, on_step=on_step).gaussians
+    result: Fans = kit.fine_tune(fans, scene, recipe, seed, on_step)
     return result
 
 

@@ -32,6 +32,14 @@ steps.
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.micro.method import MICRO
 from minisplat_ref.extensions.micro.stages import stages
-from minisplat_ref.extensions.micro.study import CHECKER
+from minisplat_ref.studies.study import OUT, argument, declare, iterations, seeds
 
+CHECKER = declare(
+    "checker",
+    "small Gaussians and detail at equal count, on edges and on a ramp",
+    f"{__name__}.checker.run",
+    *(OUT, iterations(1500, minimum=100), seeds(3)),
+    argument("--beta", type=float, default=1.0, metavar="B", help="weight of the detail (default 1)"),
+    argument("--trace", type=float, default=0.001, metavar="L", help="weight of the penalty (default 0.001)"),
+)
 EXTENSION = Extension("micro", recipes=(MICRO,), stages=stages, studies=(CHECKER,))

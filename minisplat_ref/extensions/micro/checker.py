@@ -5,8 +5,9 @@ Gaussians at each densification, from those with the largest scaled gradients. S
 differ in the places and shapes of their Gaussians.
 """
 
+import argparse
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -14,10 +15,13 @@ from matplotlib.figure import Figure
 from minisplat_ref.backends import CPU
 from minisplat_ref.extensions.micro.method import collect_detail, trace
 from minisplat_ref.extensions.micro.reference import detail_map
-from minisplat_ref.extensions.shared_studies import psnr_of, with_progress
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL, collect_gradients
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.reporting import markdown_table
+from minisplat_ref.reports.palette import BLUE, GREY, OCHRE, RED, TITLE_COLOR
 from minisplat_ref.strategy import clone_split
+from minisplat_ref.studies import kit
+from minisplat_ref.studies.figures import show, with_range
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.losses import LossTerm
 from minisplat_ref.training.schedule import During, Every, scaled
@@ -62,10 +66,10 @@ class Outcome(NamedTuple):
 def variants(beta: float, weight: float) -> dict[str, Variant]:
     """Return the variants that are compared, by name."""
     return {
-        "3dgs": Variant(0.0, 0.0, "#8a8580"),
-        "detail": Variant(beta, 0.0, "#35608c"),
-        "trace": Variant(0.0, weight, "#e0a526"),
-        "both": Variant(beta, weight, "#d2493f"),
+        "3dgs": Variant(0.0, 0.0, GREY),
+        "detail": Variant(beta, 0.0, BLUE),
+        "trace": Variant(0.0, weight, OCHRE),
+        "both": Variant(beta, weight, RED),
     }
 
 
@@ -177,40 +181,46 @@ def measure(iterations: int, seeds: int, beta: float, weight: float) -> dict[str
     outcomes: dict[str, list[Outcome]] = {name: [] for name in variants(beta, weight)}
     for seed in range(seeds):
         scene = checker_scene(seed)
-        for name, variant in with_progress(variants(beta, weight).items(), f"trainings, seed {seed}"):
+        for name, variant in kit.with_progress(variants(beta, weight).items(), f"trainings, seed {seed}"):
             outcomes[name].append(outcome(trained(variant, scene, iterations, seed), scene))
     return outcomes
 
 
-NUMBERS = ("n", "psnr_edges", "psnr_smooth", "psnr", "anisotropy", "n_smooth")
+NUMBERS = {
+    "n": "Gaussians",
+    "psnr_edges": "PSNR at edges",
+    "psnr_smooth": "PSNR of the ramp",
+    "psnr": "PSNR",
+    "anisotropy": "largest / middle scale",
+    "n_smooth": "on ramp",
+}
 
 
-def summarise(outcomes: dict[str, list[Outcome]]) -> dict[str, Any]:
-    """Return the numbers of every training, by variant."""
-    return {
-        name: {key: [getattr(outcome, key) for outcome in found] for key in NUMBERS} for name, found in outcomes.items()
-    }
+def run(args: argparse.Namespace) -> kit.Report:
+    """Train the chart with every variant and seed."""
+    outcomes = measure(args.iterations, args.seeds, args.beta, args.trace)
+    found = {name: {key: [getattr(one, key) for one in own] for key in NUMBERS} for name, own in outcomes.items()}
+    rows = [[name, *(with_range(numbers[key], 2) for key in NUMBERS)] for name, numbers in found.items()]
+    table = markdown_table(["variant", *NUMBERS.values()], rows)
+    result = {**kit.settings_of(args, "iterations", "seeds", "beta", "trace"), "variants": found}
+    text = f"mean over the seeds ± half their range\n\n{table}"
+    return kit.Report(result, draw(outcomes, args.beta, args.trace), text)
 
 
 def draw(outcomes: dict[str, list[Outcome]], beta: float, weight: float) -> Figure:
     """Draw the photograph and, for each variant, its picture and its Gaussians on the chart."""
     figure = Figure(figsize=(12, 3.7), layout="constrained")
-    names = list(outcomes)
     target = checker_scene(0).test_views[-1].image / 255
-    rows = figure.subplots(2, len(names) + 1)
-    rows[0, 0].imshow(target)
-    rows[0, 0].set_title("held-out photograph", fontsize=9)
+    rows = figure.subplots(2, len(outcomes) + 1)
+    show(rows[0, 0], target, "held-out photograph")
     rows[1, 0].axis("off")
-    for column, name in enumerate(names, 1):
-        result, color = outcomes[name][0], variants(beta, weight)[name].color
-        upper, lower = rows[:, column]
-        upper.imshow(result.picture)
-        edges, smooth = psnr_of(result.picture[:, : WIDTH // 2], target[:, : WIDTH // 2]), result.psnr_smooth
-        upper.set_title(f"{name}: edges {edges:.1f}, ramp {smooth:.1f} dB", fontsize=9)
-        lower.scatter(*result.gaussians.means[:, :2].T, s=3, color=color, lw=0)
-        lower.axvline(0, color="#4a5560", lw=0.8)
-        lower.set(xlim=(-2.2, 2.2), ylim=(1.6, -1.6), aspect="equal")
-        lower.set_title(f"{result.n} Gaussians, {result.n_smooth} on the ramp", fontsize=9)
-    for axes in rows.ravel():
-        axes.set(xticks=[], yticks=[])
+    for (upper, lower), (name, own) in zip(rows.T[1:], outcomes.items(), strict=True):
+        result = own[0]
+        edges = kit.psnr_of(result.picture[:, : WIDTH // 2], target[:, : WIDTH // 2])
+        show(upper, result.picture, f"{name}: edges {edges:.1f}, ramp {result.psnr_smooth:.1f} dB")
+        lower.scatter(*result.gaussians.means[:, :2].T, s=3, color=variants(beta, weight)[name].color, lw=0)
+        lower.axvline(0, color=TITLE_COLOR, lw=0.8)
+        lower.set(xlim=(-2.2, 2.2), ylim=(1.6, -1.6), aspect="equal", xticks=[], yticks=[])
+        lower.spines[:].set_visible(True)
+        lower.set_title(f"{result.n} Gaussians, {result.n_smooth} on the ramp", fontsize=8)
     return figure

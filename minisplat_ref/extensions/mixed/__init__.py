@@ -28,10 +28,21 @@ a split keeps its parent's vertices, as in the paper, and size limits look at de
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.mixed.method import MIXED, MIXED_GAUSSIANS
-from minisplat_ref.extensions.mixed.scene_study import SCENE
 from minisplat_ref.extensions.mixed.stages import of_all_kinds, stages
-from minisplat_ref.extensions.mixed.study import LETTER, SHAPES
+from minisplat_ref.studies.study import OUT, argument, declare, downscale, iterations, seeds
 
+_FITS = (OUT, iterations(400, "of each training"), seeds(3))
+SHAPES = declare("shapes", "how many ellipses match a line or a triangle", f"{__name__}.study.run_shapes", *_FITS)
+LETTER = declare(
+    "letter", "a letter and a ring by few ellipses, lines or triangles", f"{__name__}.study.run_letter", *_FITS
+)
+SCENE = declare(
+    "scene",
+    "ellipses, lines and triangles against 3DGS of as many floats",
+    f"{__name__}.scene_study.run",
+    argument("scenes", nargs="+", metavar="SCENE", help="folders, or synthetic scenes such as room"),
+    *(downscale(4), iterations(400), seeds(2), OUT),
+)
 EXTENSION = Extension(
     "mixed",
     recipes=(MIXED,),

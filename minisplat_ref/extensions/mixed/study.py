@@ -10,21 +10,20 @@ primitive of another kind draws. Of a round Gaussian an ellipse is enough, and v
 
 import argparse
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from minisplat_ref.extensions import shared_studies
-from minisplat_ref.extensions import shared_trainings as shared
-from minisplat_ref.io.atomic import making_folder
-from minisplat_ref.studies.study import Study
+from minisplat_ref.extensions.mixed import fit
+from minisplat_ref.reporting import markdown_table
+from minisplat_ref.reports.palette import BLUE, GREY, RED
+from minisplat_ref.studies import kit
+from minisplat_ref.studies.figures import beside_images, with_deviation
 from minisplat_ref.types import Floats
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 ENOUGH = 30.0  # dB
-COLORS = {1: shared.GREY, 2: shared.BLUE, 3: shared.RED}
+COLORS = {1: GREY, 2: BLUE, 3: RED}
 NUMBERS: dict[str, dict[int, tuple[int, ...]]] = {
     "shapes": {1: (1, 2, 3, 4, 6, 8, 12), 2: (1, 2), 3: (1, 2)},
     "letter": {1: (3, 5, 9, 14), 2: (2, 4, 8, 12), 3: (2, 4, 7, 11)},
@@ -32,53 +31,34 @@ NUMBERS: dict[str, dict[int, tuple[int, ...]]] = {
 SHOWN = {"shapes": {1: 3, 2: 1, 3: 1}, "letter": {1: 5, 2: 4, 3: 4}}  # about as many floats of each kind
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add ``--out``, ``--iterations`` and ``--seeds``."""
-    shared_studies.add_out(parser)
-    parser.add_argument("--iterations", type=int, default=400, metavar="N", help="of each training (default 400)")
-    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="trainings, seeds from 0 on (default 3)")
-
-
-def run(name: str, args: argparse.Namespace) -> None:
-    """Train, measure, write, print the table.
-
-    Raises
-    ------
-    InputError
-        A number is out of range, or the output folder cannot be used.
-    """
-    from minisplat_ref.reporting import markdown_table
-
-    shared_studies.check_at_least(1, iterations=args.iterations, seeds=args.seeds)
-    with making_folder(args.out) as folder:
-        rows, pictures = outcomes(name, args.iterations, args.seeds)
-        needed = [min_number(rows, *pair) for pair in dict.fromkeys((row["picture"], row["kind"]) for row in rows)]
-        result = {"iterations": args.iterations, "seeds": args.seeds, "rows": rows, "needed": needed}
-        shared_studies.write(folder, result, draw(name, rows, pictures))
-    print(markdown_table(["picture", "kind", "number", "floats", "PSNR", "best"], [to_line(row) for row in rows]))
-    print()
+def run(name: str, args: argparse.Namespace) -> kit.Report:
+    """Train and measure."""
+    rows, pictures = outcomes(name, args.iterations, args.seeds)
+    needed = [min_number(rows, *pair) for pair in dict.fromkeys((row["picture"], row["kind"]) for row in rows)]
+    result = {**kit.settings_of(args, "iterations", "seeds"), "rows": rows, "needed": needed}
+    text = markdown_table(["picture", "kind", "number", "floats", "PSNR", "best"], [to_line(row) for row in rows])
     heading = ["picture", "kind", f"for {ENOUGH:.0f} dB at best", "floats"]
-    print(markdown_table(heading, [[str(value) for value in row.values()] for row in needed]))
+    text += "\n\n" + markdown_table(heading, [[str(value) for value in row.values()] for row in needed])
+    return kit.Report(result, draw(rows, pictures), text)
+
+
+run_shapes, run_letter = partial(run, "shapes"), partial(run, "letter")
 
 
 def outcomes(name: str, iterations: int, n_seeds: int) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Return a row for each picture, kind and number, and for each picture the target and some of the best fits."""
-    from tqdm import tqdm
-
-    from minisplat_ref.extensions.mixed import fit
-
     shapes = {"line": fit.one_line, "triangle": fit.one_triangle, "round": fit.one_blob}
     draws = shapes if name == "shapes" else {"letter": fit.letter_a, "ring": fit.ring}
     targets = {picture: draw().astype(np.float64) for picture, draw in draws.items()}
     jobs = [(picture, m, n) for picture in targets for m, numbers in NUMBERS[name].items() for n in numbers]
     rows: list[dict[str, Any]] = []
     pictures: dict[str, list[tuple[str, Floats]]] = {key: [("target", target)] for key, target in targets.items()}
-    for picture, m, n in tqdm(jobs, desc="trainings", leave=False, disable=None):
+    for picture, m, n in kit.with_progress(jobs, "trainings"):
         fits = [
             fit.drawn(fit.fitted(targets[picture], n, n_vertices=m, iterations=iterations, seed=seed))
             for seed in range(n_seeds)
         ]
-        psnr = [shared_studies.psnr_of(image, targets[picture]) for image in fits]
+        psnr = [kit.psnr_of(image, targets[picture]) for image in fits]
         if n == SHOWN[name][m]:
             best = int(np.argmax(psnr))
             name_of_kind = fit.NAMES[m].removesuffix("s") if n == 1 else fit.NAMES[m]
@@ -98,18 +78,15 @@ def min_number(rows: list[dict[str, Any]], picture: str, kind: str) -> dict[str,
 
 def to_line(row: dict[str, Any]) -> list[str]:
     """Return a line of the table."""
-    measures = [shared.with_deviation(row["psnr"], 1), f"{max(row['psnr']):.1f}"]
+    measures = [with_deviation(row["psnr"], 1), f"{max(row['psnr']):.1f}"]
     return [row["picture"], row["kind"], str(row["number"]), str(row["n_floats"]), *measures]
 
 
-def draw(name: str, rows: list[dict[str, Any]], pictures: dict[str, Any]) -> "Figure":
+def draw(rows: list[dict[str, Any]], pictures: dict[str, Any]) -> Figure:
     """Draw the best PSNR over the number of floats, and pictures."""
-    from matplotlib.figure import Figure
-
     columns = 2 + len(next(iter(pictures.values())))
     figure = Figure(figsize=(2.4 * columns, 2.7 * len(pictures)), layout="constrained")
-    for i, (picture, shown) in enumerate(pictures.items()):
-        axes = figure.add_subplot(len(pictures), columns, (i * columns + 1, i * columns + 2))
+    for picture, axes in beside_images(figure, pictures).items():
         for m, color in COLORS.items():
             of_kind = [row for row in rows if (row["picture"], row["n_vertices"]) == (picture, m)]
             floats, best = [row["n_floats"] for row in of_kind], [max(row["psnr"]) for row in of_kind]
@@ -117,20 +94,5 @@ def draw(name: str, rows: list[dict[str, Any]], pictures: dict[str, Any]) -> "Fi
             axes.plot(floats, [np.mean(row["psnr"]) for row in of_kind], ":", color=color, lw=1)
         axes.axhline(ENOUGH, color="black", lw=0.6)
         axes.set(title=picture, xlabel="floats", ylabel="PSNR (dB), best and mean")
-        axes.legend(frameon=False, fontsize=8)
-        shared_studies.tidy(axes)
-        for k, (title, image) in enumerate(shown):
-            axes = figure.add_subplot(len(pictures), columns, i * columns + 3 + k)
-            axes.imshow(np.clip(image, 0, 1))
-            axes.set_title(title, fontsize=8)
-            axes.set_axis_off()
+        axes.legend()
     return figure
-
-
-SHAPES = Study("shapes", "how many ellipses match a line or a triangle", add_arguments, partial(run, "shapes"))
-"""``mixed/shapes``."""
-
-LETTER = Study(
-    "letter", "a letter and a ring by few ellipses, lines or triangles", add_arguments, partial(run, "letter")
-)
-"""``mixed/letter``."""

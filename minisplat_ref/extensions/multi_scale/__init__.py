@@ -33,8 +33,14 @@ not.
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.multi_scale import build
 from minisplat_ref.extensions.multi_scale.method import LEVELS, MULTI_SCALE
-from minisplat_ref.extensions.multi_scale.study import DOWNSCALE
+from minisplat_ref.studies.study import OUT, declare, downscale, iterations, scene, seeds
 
+DOWNSCALE = declare(
+    "downscale",
+    "a trained scene in smaller pictures, with and without levels",
+    f"{__name__}.downscale.run",
+    *(scene("room"), OUT, downscale(), iterations(1000, minimum=10), seeds(2)),
+)
 EXTENSION = Extension(
     "multi-scale", recipes=(MULTI_SCALE,), representation=LEVELS, commands=(build,), studies=(DOWNSCALE,)
 )

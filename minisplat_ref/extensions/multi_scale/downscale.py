@@ -4,6 +4,7 @@ The truth at 1/n of the size is the mean over blocks of n x n pixels of the held
 study counts the work: pairs of a Gaussian and a tile, which are sorted, and hits, which are blended.
 """
 
+import argparse
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,9 +15,12 @@ from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.extensions.extension import find_recipe
 from minisplat_ref.extensions.multi_scale.levels import Plan, level_zero, with_levels
 from minisplat_ref.extensions.multi_scale.method import COVERAGE_MIN, LEVELS, finest_densities
-from minisplat_ref.extensions.shared_studies import psnr_of, tidy, with_progress
 from minisplat_ref.mechanisms.sampling import block_means, zoom_camera
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
+from minisplat_ref.reporting import markdown_table
+from minisplat_ref.reports.palette import BLUE, GREEN, GREY, OCHRE, PURPLE, RED, TEAL
+from minisplat_ref.studies import kit
+from minisplat_ref.studies.figures import plot_range, show
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import configured
 from minisplat_ref.types import Floats, Model, Scene, view_from
@@ -29,7 +33,7 @@ COMPENSATED = GSPLAT_MAIN._replace(is_antialiased=True)
 COLORS = dict(
     zip(
         ("3dgs", "compensated", *PLANS, "levels 4, compensated", "too early", "trained"),
-        ("#8a8580", "#e0a526", "#6aa84f", "#35608c", "#2fa3a3", "#9b6fb0", "#d2493f"),
+        (GREY, OCHRE, GREEN, BLUE, TEAL, PURPLE, RED),
         strict=True,
     )
 )
@@ -83,7 +87,7 @@ def figures(variant: Variant, scene: Scene, n: int) -> Figures:
     for i, view in enumerate(scene.test_views):
         output = picture(variant, scene, i, n)
         target = block_means(view.load().image.astype(float) / 255, n)
-        rows.append((psnr_of(output.image, target), output.n_pairs, output.stats.hit_count.sum()))
+        rows.append((kit.psnr_of(output.image, target), output.n_pairs, output.stats.hit_count.sum()))
     return Figures(*(float(value) for value in np.mean(rows, axis=0)))
 
 
@@ -108,11 +112,35 @@ def measure(scene: Scene, iterations: int, seeds: int) -> Measured:
     shown = min(4, blocks[-1])
     pictures = {"photograph": block_means(scene.test_views[0].load().image.astype(float) / 255, shown)}
     for seed in range(seeds):
-        for name, variant in with_progress(variants(scene, iterations, seed).items(), f"measuring, seed {seed}"):
+        for name, variant in kit.with_progress(variants(scene, iterations, seed).items(), f"measuring, seed {seed}"):
             found[name].append([figures(variant, scene, n) for n in blocks])
             counts[name].append(len(variant.gaussians.means))
             pictures.setdefault(name, np.clip(picture(variant, scene, 0, shown).image, 0, 1))
     return Measured(blocks, found, counts, pictures)
+
+
+def run(args: argparse.Namespace) -> kit.Report:
+    """Train and measure."""
+    scene = kit.read_scene(args.scene, args.downscale)
+    found = measure(scene, args.iterations, args.seeds)
+    rows = []
+    for name, runs in found.figures.items():
+        psnr, pairs, hits = np.moveaxis(np.mean(np.array(runs), axis=0), -1, 0)  # [blocks] each
+        cells = [f"{p:.2f}, {n / 1e3:.1f}, {h / 1e3:.0f}" for p, n, h in zip(psnr, pairs, hits, strict=True)]
+        rows.append([name, f"{np.mean(found.counts[name]):,.0f}", *cells])
+    table = markdown_table(["", "Gaussians", *_sizes(found)], rows)
+    by_name = {
+        name: {key: [[getattr(row, key) for row in rows] for rows in runs] for key in Figures._fields}
+        for name, runs in found.figures.items()
+    }
+    result = kit.settings_of(args, "scene", "downscale", "iterations", "seeds")
+    result |= {"blocks": found.blocks, "counts": found.counts, "figures": by_name}
+    text = "PSNR (dB) of test views, and thousands of pairs and of hits per view: means over the seeds"
+    return kit.Report(result, draw(found), f"{text}\n\n{table}")
+
+
+def _sizes(found: Measured) -> list[str]:
+    return ["1", *(f"1/{n}" for n in found.blocks[1:])]
 
 
 def draw(found: Measured) -> Figure:
@@ -122,28 +150,14 @@ def draw(found: Measured) -> Figure:
     left, right = upper.subplots(1, 2)
     for name, color in COLORS.items():
         values = np.array(found.figures[name])  # [seeds, blocks, 3]
-        for axes, column in ((left, 0), (right, 2)):
-            low, high = values[..., column].min(axis=0), values[..., column].max(axis=0)
-            axes.fill_between(found.blocks, low, high, color=color, alpha=0.25, lw=0)
-            axes.plot(found.blocks, values[..., column].mean(axis=0), "o-", ms=4, color=color, label=name)
+        plot_range(left, found.blocks, values[..., 0], color, name)
+        plot_range(right, found.blocks, values[..., 2], color, name)
     for axes, title in ((left, "PSNR of test views (dB)"), (right, "blended hits per view")):
         axes.set_xscale("log", base=2)
-        axes.set_xticks(found.blocks, ["1", *(f"1/{n}" for n in found.blocks[1:])])
+        axes.set_xticks(found.blocks, _sizes(found))
         axes.set(title=title, xlabel="size of the picture")
-        tidy(axes)
     right.set_yscale("log")
-    left.legend(frameon=False, fontsize=8)
+    left.legend()
     for panel, (name, image) in zip(lower.subplots(1, len(found.pictures)), found.pictures.items(), strict=True):
-        panel.imshow(image)
-        panel.set_title(name.replace(", ", ",\n"), fontsize=9)
-        panel.set(xticks=[], yticks=[])
+        show(panel, image, name.replace(", ", ",\n"))
     return figure
-
-
-def summarise(found: Measured) -> dict[str, Any]:
-    """Return the content of ``result.json``."""
-    by_name = {
-        name: {key: [[getattr(row, key) for row in rows] for rows in runs] for key in Figures._fields}
-        for name, runs in found.figures.items()
-    }
-    return {"blocks": found.blocks, "counts": found.counts, "figures": by_name}

@@ -36,7 +36,22 @@ components pair up, or not, as the photographs require.
 
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.negative.method import NEGATIVE, SIGNED
-from minisplat_ref.extensions.negative.study import STUDIES
+from minisplat_ref.studies.study import OUT, declare, number, seed, seeds
 
+STARTS = "per fit; the best counts"
+STUDIES = (
+    declare(
+        "rings",
+        "one Gaussian minus another against 2 to 4 positive ones",
+        f"{__name__}.rings.run",
+        *(OUT, seeds(3), number("--starts", 16, STARTS)),
+    ),
+    declare(
+        "backdrop",
+        "the hole of a ring: negative colours do not open it",
+        f"{__name__}.backdrop.run",
+        *(OUT, seed("of the starts"), number("--starts", 4, STARTS)),
+    ),
+)
 EXTENSION = Extension("negative", recipes=(NEGATIVE,), representation=SIGNED, studies=STUDIES)
 """Gaussians of either sign with their renderer, the recipe that trains them, and two studies."""

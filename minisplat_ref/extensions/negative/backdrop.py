@@ -6,6 +6,7 @@ ring is a wall. It is black, so that the hole of the ring is a matter of colour,
 through the hole. Truth and fits are rendered by this package in float64; everything that is not fitted is fixed.
 """
 
+import argparse
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,10 +17,12 @@ from scipy.special import erf
 from minisplat_ref.backends import CPU
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.extensions.negative.method import SIGNED
-from minisplat_ref.extensions.shared_studies import with_progress
 from minisplat_ref.metrics import psnr
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
+from minisplat_ref.reporting import markdown_table
 from minisplat_ref.strategy.ops import concat
+from minisplat_ref.studies import kit
+from minisplat_ref.studies.figures import show
 from minisplat_ref.types import Camera, Floats, Gaussians, Model, View, view_from
 
 SIZE = 64  # pixels a side
@@ -167,31 +170,36 @@ def measure(n_starts: int, seed: int) -> dict[str, dict[str, Fit]]:
     return {
         name: {
             case_name: fitted(wall(name), truth(wall(name)), case, n_starts, np.random.default_rng(seed))
-            for case_name, case in with_progress(CASES.items(), f"fits before {name}")
+            for case_name, case in kit.with_progress(CASES.items(), f"fits before {name}")
         }
         for name in WALLS
     }
 
 
-def summarise(fits: dict[str, dict[str, Fit]]) -> dict[str, Any]:
-    """Return the content of ``result.json``."""
-    return {
+def run(args: argparse.Namespace) -> kit.Report:
+    """Fit a ring in front of a black wall and of a dotted one."""
+    fits = measure(args.starts, args.seed)
+    walls = {
         name: {case: {k: v for k, v in fit._asdict().items() if k != "image"} for case, fit in row.items()}
         for name, row in fits.items()
     }
+    rows = [
+        [name, case, f"{fit.psnr:.2f}", f"{fit.hole_psnr:.2f}", f"{fit.see_through:.1%}"]
+        for name, cases in fits.items()
+        for case, fit in cases.items()
+    ]
+    heading = ["wall", "Gaussians of the ring", "PSNR (dB)", "in the hole", "transmittance of the hole"]
+    result = {**kit.settings_of(args, "seed", "starts"), "walls": walls}
+    return kit.Report(result, draw(fits), markdown_table(heading, rows))
 
 
 def draw(fits: dict[str, dict[str, Fit]]) -> Figure:
     """Draw truth and fits, one row per wall."""
     figure = Figure(figsize=(8.4, 4.9), layout="constrained")
     for row, (name, cases) in zip(figure.subplots(len(WALLS), 1 + len(CASES)), fits.items(), strict=True):
-        row[0].imshow(np.clip(truth(wall(name)), 0, 1))
-        row[0].set_title("ring, the truth", fontsize=9)
+        show(row[0], truth(wall(name)), "ring, the truth")
         row[0].set_ylabel(f"wall: {name}", fontsize=9)
         for axes, (case, fit) in zip(row[1:], cases.items(), strict=True):
-            axes.imshow(fit.image)
             hole = f"hole {fit.hole_psnr:.1f} dB, transmits {fit.see_through:.0%}"
-            axes.set_title(f"{case}: {fit.psnr:.1f} dB\n{hole}", fontsize=8)
-        for axes in row:
-            axes.set(xticks=[], yticks=[])
+            show(axes, fit.image, f"{case}: {fit.psnr:.1f} dB\n{hole}")
     return figure

@@ -9,15 +9,18 @@ ones that almost cancel, the derivative of a Gaussian with respect to its width;
 of the heights.
 """
 
-from typing import Any, NamedTuple
+import argparse
+from typing import NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.optimize import least_squares
 from scipy.special import erf, expit, logit
 
-from minisplat_ref.extensions.shared_studies import with_progress
+from minisplat_ref.reporting import markdown_table
+from minisplat_ref.reports.palette import BLUE, LIGHT_BLUE, MIDDLE_BLUE, OCHRE, RED
+from minisplat_ref.studies import kit
+from minisplat_ref.studies.figures import plot_range, show, with_range
 from minisplat_ref.types import Floats
 
 OUTER = 0.7  # radius; the picture is the square from -1 to 1
@@ -37,11 +40,11 @@ class Sum(NamedTuple):
 
 
 MODELS = {
-    "pair, heights to 2": Sum((1, -1), 2.0, "#e0a526"),
-    "pair, heights to 100": Sum((1, -1), 100.0, "#d2493f"),
-    "2 positive": Sum((1,) * 2, 100.0, "#a9c1d9"),
-    "3 positive": Sum((1,) * 3, 100.0, "#6d96bd"),
-    "4 positive": Sum((1,) * 4, 100.0, "#35608c"),
+    "pair, heights to 2": Sum((1, -1), 2.0, OCHRE),
+    "pair, heights to 100": Sum((1, -1), 100.0, RED),
+    "2 positive": Sum((1,) * 2, 100.0, LIGHT_BLUE),
+    "3 positive": Sum((1,) * 3, 100.0, MIDDLE_BLUE),
+    "4 positive": Sum((1,) * 4, 100.0, BLUE),
 }
 PAIRS, POSITIVES = tuple(MODELS)[:2], tuple(MODELS)[2:]
 
@@ -138,7 +141,7 @@ def measure(n_seeds: int, n_starts: int) -> dict[float, dict[str, list[Fit]]]:
             name: [fitted(ring(thickness), model, n_starts, np.random.default_rng(seed)) for seed in range(n_seeds)]
             for name, model in MODELS.items()
         }
-        for thickness in with_progress(THICKNESSES, "rings")
+        for thickness in kit.with_progress(THICKNESSES, "rings")
     }
 
 
@@ -151,6 +154,26 @@ def crossings(pair: list[float], other: list[float]) -> list[float]:
     return places
 
 
+def run(args: argparse.Namespace) -> kit.Report:
+    """Fit rings of several thicknesses with one pair and with 2 to 4 positive Gaussians."""
+    fits = measure(args.seeds, args.starts)
+    psnrs = {name: [[fit.psnr for fit in fits[t][name]] for t in THICKNESSES] for name in MODELS}
+    means = {name: [float(np.mean(values)) for values in rows] for name, rows in psnrs.items()}
+    crossed = {pair: {name: crossings(means[pair], means[name]) for name in POSITIVES} for pair in PAIRS}
+    heights = {pair: [[fit.heights for fit in fits[t][pair]] for t in THICKNESSES] for pair in PAIRS}
+    result = {**kit.settings_of(args, "seeds", "starts"), "thicknesses": list(THICKNESSES), "psnr": psnrs}
+    result |= {"mean_psnr": means, "crossings": crossed, "heights": heights}
+    rows = [
+        [f"{thickness}", *(with_range(psnrs[name][t], 1) for name in MODELS)] for t, thickness in enumerate(THICKNESSES)
+    ]
+    text = "PSNR (dB) of the best fit: mean over the seeds ± half their range\n\n"
+    text += markdown_table(["thickness / outer radius", *MODELS], rows) + "\n"
+    for pair, others in crossed.items():
+        places = [f"{name} at {', '.join(f'{x:.2f}' for x in xs) or 'no thickness'}" for name, xs in others.items()]
+        text += f"\n{pair}: crosses {'; '.join(places)}"
+    return kit.Report(result, draw(fits), text)
+
+
 def draw(fits: dict[float, dict[str, list[Fit]]]) -> Figure:
     """Draw the PSNR over the thickness, and the fits of a thick and of a thin ring."""
     figure = Figure(figsize=(11, 3.6), layout="constrained")
@@ -158,35 +181,14 @@ def draw(fits: dict[float, dict[str, list[Fit]]]) -> Figure:
     axes = left.subplots()
     for name, model in MODELS.items():
         values = np.array([[fit.psnr for fit in fits[thickness][name]] for thickness in THICKNESSES])  # [T, seeds]
-        axes.fill_between(THICKNESSES, values.min(axis=1), values.max(axis=1), color=model.color, alpha=0.25, lw=0)
-        axes.plot(THICKNESSES, values.mean(axis=1), "o-", color=model.color, ms=4, label=name)
+        plot_range(axes, THICKNESSES, values.T, model.color, name)
     axes.set(title="best fit, PSNR (dB)", xlabel="thickness of the ring / outer radius")
     axes.set_ylim(bottom=axes.get_ylim()[0] - 2)  # room for the legend
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(color="#e6eaee")
-    axes.legend(frameon=False, fontsize=8, loc="lower center", ncols=2)
+    axes.legend(loc="lower center", ncols=2)
+    colors = {"cmap": "RdBu_r", "vmin": -1, "vmax": 1}
     for row, thickness in zip(right.subplots(2, len(MODELS)), (0.75, 0.2), strict=True):
-        _panel(row[0], ring(thickness).reshape(SIZE, SIZE), f"ring of {thickness}")
+        show(row[0], ring(thickness).reshape(SIZE, SIZE), f"ring of {thickness}", **colors)
         for ax, name in zip(row[1:], (*PAIRS, *POSITIVES[1:]), strict=True):
             fit = fits[thickness][name][0]
-            _panel(ax, fit.picture, f"{name}\n{fit.psnr:.1f} dB")
+            show(ax, fit.picture, f"{name}\n{fit.psnr:.1f} dB", **colors)
     return figure
-
-
-def _panel(axes: Axes, picture: Floats, title: str) -> None:
-    axes.imshow(picture, cmap="RdBu_r", vmin=-1, vmax=1)
-    axes.set_title(title, fontsize=8)
-    axes.set(xticks=[], yticks=[])
-
-
-def summarise(fits: dict[float, dict[str, list[Fit]]]) -> dict[str, Any]:
-    """Return the content of ``result.json``."""
-    psnrs = {name: [[fit.psnr for fit in fits[t][name]] for t in THICKNESSES] for name in MODELS}
-    means = {name: [float(np.mean(values)) for values in rows] for name, rows in psnrs.items()}
-    return {
-        "thicknesses": list(THICKNESSES),
-        "psnr": psnrs,
-        "mean_psnr": means,
-        "crossings": {pair: {name: crossings(means[pair], means[name]) for name in POSITIVES} for pair in PAIRS},
-        "heights": {pair: [[fit.heights for fit in fits[t][pair]] for t in THICKNESSES] for pair in PAIRS},
-    }

@@ -30,7 +30,14 @@ rows are sorted already; here it is the inverse.
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.omg.file import OMG_FILE
 from minisplat_ref.extensions.omg.method import OMG
-from minisplat_ref.extensions.omg.study import DISTINCTIVENESS
+from minisplat_ref.studies.study import declare, fine_tune, trainings
 
+DISTINCTIVENESS = declare(
+    "distinctiveness",
+    "which 50, 25 and 12.5 % of the Gaussians to keep",
+    f"{__name__}.study.run",
+    *trainings(1000, "mini-splatting2"),
+    fine_tune(200),
+)
 EXTENSION = Extension("omg", recipes=(OMG,), formats=(OMG_FILE,), studies=(DISTINCTIVENESS,))
 """The recipe ``omg``, the format ``.omg`` and a study."""

@@ -10,29 +10,31 @@ study splits the pixels of each test photograph by their gradient into the flatt
 """
 
 import argparse
-from collections.abc import Callable
-from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from minisplat_ref.extensions import shared_studies
-from minisplat_ref.extensions import shared_trainings as shared
 from minisplat_ref.extensions.omg.file import OMG_FILE, order_of
 from minisplat_ref.extensions.omg.method import POWER
 from minisplat_ref.extensions.omg.reference import distinct_importance, local_distinctiveness
-from minisplat_ref.io.atomic import making_folder
-from minisplat_ref.studies.study import Study
+from minisplat_ref.methods import get_recipe
+from minisplat_ref.metrics import ViewMetrics, evaluate, psnr
+from minisplat_ref.reporting import markdown_table
+from minisplat_ref.reports.palette import BLUE, GREY, OCHRE, RED
+from minisplat_ref.strategy.importance import collect_importance, indoor
+from minisplat_ref.strategy.ops import take
+from minisplat_ref.strategy.simplify import intersection_preserving, most_important
+from minisplat_ref.studies import kit
+from minisplat_ref.studies.figures import plot_deviations, set_ticks, with_deviation
 from minisplat_ref.types import Bools, Floats, Gaussians, Scene, View
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 FRACTIONS = (0.5, 0.25, 0.125)
 FINE_TUNING = "3dgs"  # the recipe whose learning rates are used, from the first to the last
 CHOICES = {"importance": 0.0, "with distinctiveness": POWER}
 """The selections, with the power of distinctiveness in their score."""
-COLORS = dict(zip(CHOICES, (shared.BLUE, shared.RED), strict=True))
+COLORS = dict(zip(CHOICES, (BLUE, RED), strict=True))
 
 
 class Quality(NamedTuple):
@@ -45,76 +47,41 @@ class Quality(NamedTuple):
     """Over the other half."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the study."""
-    shared.add_scene_arguments(parser, iterations=1000, recipe="mini-splatting2")
-    parser.add_argument(
-        "--fine-tune", type=int, default=200, metavar="M", help="iterations of fine-tuning (default 200)"
-    )
-
-
-def run(args: argparse.Namespace) -> None:
-    """Train, prune, fine-tune, measure, write the results, and print the tables.
-
-    Raises
-    ------
-    InputError
-        The scene, the recipe, the PLY or the output folder cannot be used.
-    """
-    from minisplat_ref.errors import InputError
-    from minisplat_ref.reporting import markdown_table
-
-    if args.fine_tune < 1:
-        raise InputError(f"--fine-tune is {args.fine_tune}: give at least 1")
-    scene = shared.read_scene(args)
-    with making_folder(args.out) as folder:
-        wholes = shared.populations(args, scene)
-        runs = [measured(whole, scene, args.fine_tune, seed) for seed, whole in enumerate(wholes)]
-        losses = [losses_of_fields(whole, scene) for whole in wholes]
-        result = {**shared.describe(args, scene), "fine_tune": args.fine_tune, "power": POWER, "runs": runs}
-        result["losses"] = {field: [of_seed[field] for of_seed in losses] for field in losses[0]}
-        shared_studies.write(folder, result, draw(result))
-    print(f"{scene.name}; fine-tuned {args.fine_tune} iterations\n")
-    heading = [
-        "kept",
-        "by",
-        "Gaussians",
-        "at once",
-        "fine-tuned",
-        "flat half",
-        "textured half",
-        "kB of .omg",
-        "dB as .omg",
-    ]
-    print(markdown_table(heading, to_rows(runs)))
-    print("\ndB lost by one field from the file, at each level\n")
+def run(args: argparse.Namespace) -> kit.Report:
+    """Train, prune, fine-tune and measure."""
+    scene = kit.read_scene(args.scene, args.downscale)
+    wholes = kit.populations(args, scene)
+    runs = [measure(whole, scene, args.fine_tune, seed) for seed, whole in enumerate(wholes)]
+    by_seed = [losses_of_fields(whole, scene) for whole in wholes]
+    losses = {field: [of_seed[field] for of_seed in by_seed] for field in by_seed[0]}
+    result = {**kit.describe_trainings(args, scene), "fine_tune": args.fine_tune, "power": POWER}
+    result |= {"runs": runs, "losses": losses}
+    text = f"{scene.name}; fine-tuned {args.fine_tune} iterations\n\n"
+    text += markdown_table(["kept", "by", "Gaussians", *COLUMNS], to_rows(runs))
+    text += "\n\ndB lost by one field from the file, at each level\n\n"
     rows = [
-        [field, *(shared.with_deviation(list(of_seeds), 2) for of_seeds in zip(*of_levels, strict=True))]
-        for field, of_levels in result["losses"].items()
+        [field, *(with_deviation(of_seeds, 2) for of_seeds in zip(*of_levels, strict=True))]
+        for field, of_levels in losses.items()
     ]
-    print(markdown_table(["field", *map(str, range(len(OMG_FILE.levels)))], rows))
+    text += markdown_table(["field", *map(str, range(len(OMG_FILE.levels)))], rows)
+    return kit.Report(result, draw(result), text)
 
 
-def measured(whole: Gaussians, scene: Scene, iterations: int, seed: int) -> list[dict[str, Any]]:
+def measure(whole: Gaussians, scene: Scene, iterations: int, seed: int) -> list[dict[str, Any]]:
     """Return the measurements of the whole population, and of each fraction and choice."""
-    from tqdm import tqdm
-
-    from minisplat_ref.strategy.importance import collect_importance, indoor
-    from minisplat_ref.strategy.ops import take
-    from minisplat_ref.strategy.simplify import intersection_preserving, most_important
-
     stats = collect_importance(whole, scene.train_views)
     importance = intersection_preserving(indoor(stats), stats.dominant_count)  # [N]
     distinctiveness = local_distinctiveness(whole.means, whole.sh_dc)
-    tuned = fine_tuned(whole, scene, iterations, seed)
+    recipe = kit.without_events(get_recipe(FINE_TUNING, iterations))
+    tuned = kit.fine_tune(whole, scene, recipe, seed)
     rows = [_row("all", "", quality(whole, scene), tuned, scene)]
     jobs = [(fraction, choice) for fraction in FRACTIONS for choice in CHOICES]
-    for fraction, choice in tqdm(jobs, desc=f"fine-tunings, seed {seed}", leave=False, disable=None):
+    for fraction, choice in kit.with_progress(jobs, f"fine-tunings, seed {seed}"):
         score = distinct_importance(importance, distinctiveness, CHOICES[choice])
         n = max(1, round(fraction * np.count_nonzero(importance)))
-        kept = take(whole, most_important(score, min(n, np.count_nonzero(score))))
+        kept = take(whole, most_important(score, min(n, int(np.count_nonzero(score)))))
         at_once = quality(kept, scene)
-        rows.append(_row(f"{100 * fraction:g} %", choice, at_once, fine_tuned(kept, scene, iterations, seed), scene))
+        rows.append(_row(f"{100 * fraction:g} %", choice, at_once, kit.fine_tune(kept, scene, recipe, seed), scene))
     return rows
 
 
@@ -133,8 +100,6 @@ def _row(kept: str, choice: str, at_once: Quality, tuned: Gaussians, scene: Scen
 
 def losses_of_fields(gaussians: Gaussians, scene: Scene) -> dict[str, list[float]]:
     """Return the loss at each level, dB, when one field alone is taken from a file; by field."""
-    from minisplat_ref.strategy.ops import take
-
     whole = take(gaussians, order_of(gaussians))
     before = quality(whole, scene).psnr
     losses: dict[str, list[float]] = {field: [] for field in Gaussians._fields}
@@ -145,26 +110,8 @@ def losses_of_fields(gaussians: Gaussians, scene: Scene) -> dict[str, list[float
     return losses
 
 
-def fine_tuned(gaussians: Gaussians, scene: Scene, iterations: int, seed: int) -> Gaussians:
-    """Return the Gaussians after fine-tuning with all stored harmonics and without events; the input is not changed."""
-    from minisplat_ref.methods import get_recipe
-    from minisplat_ref.training.adam import zero_moments
-    from minisplat_ref.training.loop import train
-    from minisplat_ref.training.state import TrainState
-
-    recipe = get_recipe(FINE_TUNING, iterations)
-    recipe = recipe._replace(events=(), sh_milestones=(0,) * recipe.sh_degree)
-    copy = Gaussians(*(field.copy() for field in gaussians))
-    rng = np.random.default_rng(seed)
-    state = TrainState(copy, zero_moments(copy), step=0, view_order=[], rng=rng, stats={})
-    trained: Gaussians = train(scene, recipe, seed=seed, state=state).gaussians
-    return trained
-
-
 def quality(gaussians: Gaussians, scene: Scene) -> Quality:
     """Return the mean PSNR over the test views of all pixels, of the flatter half of each view, and of the rest."""
-    from minisplat_ref.metrics import ViewMetrics, evaluate, psnr
-
     found = []
 
     def on_view(view: View, image: Floats, metrics: ViewMetrics) -> None:
@@ -186,90 +133,59 @@ def flatter_half(pixels: Any) -> Bools:
     return is_flat
 
 
+COLUMNS: dict[str, tuple[Callable[[dict[str, Any]], float], int]] = {
+    "at once": (lambda row: row["at_once"]["psnr"], 2),
+    "fine-tuned": (lambda row: row["tuned"]["psnr"], 2),
+    "flat half": (lambda row: row["tuned"]["flat"], 2),
+    "textured half": (lambda row: row["tuned"]["textured"], 2),
+    "kB of .omg": (lambda row: row["n_bytes"] / 1e3, 1),
+    "dB as .omg": (lambda row: row["packed"]["psnr"], 2),
+}
+"""Measures of a row of the results, and their digits in the table."""
+
+
 def to_rows(runs: list[list[dict[str, Any]]]) -> list[list[str]]:
     """Return the lines of the table: means and deviations over the seeds."""
     lines = []
     for rows in zip(*runs, strict=True):
-        columns: list[tuple[Callable[[dict[str, Any]], float], int]] = [
-            (lambda row: row["at_once"]["psnr"], 2),
-            (lambda row: row["tuned"]["psnr"], 2),
-            (lambda row: row["tuned"]["flat"], 2),
-            (lambda row: row["tuned"]["textured"], 2),
-            (lambda row: row["n_bytes"] / 1e3, 1),
-            (lambda row: row["packed"]["psnr"], 2),
-        ]
-        cells = [shared.with_deviation([value(row) for row in rows], digits) for value, digits in columns]
+        cells = [with_deviation([value(row) for row in rows], digits) for value, digits in COLUMNS.values()]
         n = np.mean([row["n_gaussians"] for row in rows])
         lines.append([rows[0]["kept"], rows[0]["choice"], f"{n:,.0f}", *cells])
     return lines
 
 
-def draw(result: dict[str, Any]) -> "Figure":
+def draw(result: dict[str, Any]) -> Figure:
     """Draw PSNR against the fraction kept, the gain of distinctiveness in either half, and PSNR against bytes."""
-    from matplotlib.figure import Figure
-
     runs = result["runs"]
     figure = Figure(figsize=(12.0, 3.6), layout="constrained")
     kept, halves, size = figure.subplots(1, 3)
     for choice, color in COLORS.items():
-        for key, style, label in (("tuned", "-o", f"{choice}, fine-tuned"), ("at_once", ":o", f"{choice}, at once")):
-            means, deviations = _over_seeds(runs, choice, partial(_psnr, key))
-            kept.errorbar(FRACTIONS, means, yerr=deviations, fmt=style, color=color, ms=4, capsize=3, label=label)
-        sizes = [_over_seeds(runs, name, lambda row: row["n_bytes"] / 1e3)[0] for name in ("", choice)]
-        losses = [_over_seeds(runs, name, partial(_psnr, "packed")) for name in ("", choice)]
-        means, deviations = (np.concatenate([losses[0][i], losses[1][i]]) for i in (0, 1))
-        size.errorbar(
-            np.concatenate(sizes), means, yerr=deviations, fmt="-o", color=color, ms=4, capsize=3, label=choice
+        for column, style in (("fine-tuned", "-o"), ("at once", ":o")):
+            values = _by_seed(runs, choice, column)
+            plot_deviations(kept, FRACTIONS, values, fmt=style, color=color, label=f"{choice}, {column}")
+        sizes, losses = (
+            [values for name in ("", choice) for values in _by_seed(runs, name, column)]  # all, then the fractions
+            for column in ("kB of .omg", "dB as .omg")
         )
-    for half, color, style in (("flat", shared.GREY, "-o"), ("textured", shared.YELLOW, "-s")):
-        means, deviations = _gain(runs, half)
-        label = f"{half} half of the pixels"
-        halves.errorbar(FRACTIONS, means, yerr=deviations, fmt=style, color=color, ms=4, capsize=3, label=label)
-    halves.axhline(0, color=shared.GREY, linewidth=0.8)
+        plot_deviations(size, np.mean(sizes, axis=1), losses, color=color, label=choice)
+    for half, color, style in (("flat half", GREY, "-o"), ("textured half", OCHRE, "-s")):
+        pairs = zip(*(_by_seed(runs, choice, half) for choice in CHOICES), strict=True)
+        gains = [np.subtract(distinct, plain) for plain, distinct in pairs]
+        plot_deviations(halves, FRACTIONS, gains, fmt=style, color=color, label=f"{half} of the pixels")
+    halves.axhline(0, color=GREY, linewidth=0.8)
     for axes in (kept, halves):
         axes.set(xscale="log", xlabel="kept of the Gaussians that dominate a pixel")
-        axes.set_xticks(FRACTIONS, [f"{100 * fraction:g} %" for fraction in FRACTIONS])
-        axes.minorticks_off()
+        set_ticks(axes, FRACTIONS, [f"{100 * fraction:g} %" for fraction in FRACTIONS])
     kept.set(ylabel="PSNR (dB)", title=result["scene"])
     halves.set(ylabel="PSNR gained by distinctiveness (dB)", title="where it helps and where it hurts")
-    size.set(xlabel="kB of .omg", ylabel="PSNR when read again (dB)", title="bytes and quality", ylim=None)
+    size.set(xlabel="kB of .omg", ylabel="PSNR when read again (dB)", title="bytes and quality")
     for axes in (kept, halves, size):
-        shared_studies.tidy(axes)
-        axes.legend(frameon=False, fontsize=8)
+        axes.legend()
     return figure
 
 
-def _psnr(key: str, row: dict[str, Any]) -> float:
-    psnr: float = row[key]["psnr"]
-    return psnr
-
-
-def _over_seeds(
-    runs: list[list[dict[str, Any]]], choice: str, value: Callable[[dict[str, Any]], float]
-) -> tuple[Floats, Floats]:
-    """Return means and deviations of the rows of a choice, in their order."""
+def _by_seed(runs: list[list[dict[str, Any]]], choice: str, column: str) -> list[Sequence[float]]:
+    """Return a measure of each row of a choice, in their order, for every seed."""
+    value = COLUMNS[column][0]
     groups = [rows for rows in zip(*runs, strict=True) if rows[0]["choice"] == choice]
-    pairs = [shared.mean_and_deviation([value(row) for row in rows]) for rows in groups]
-    means, deviations = np.transpose(pairs)
-    return means, deviations
-
-
-def _gain(runs: list[list[dict[str, Any]]], half: str) -> tuple[Floats, Floats]:
-    """Return the gain of distinctiveness in a half of the pixels after fine-tuning: mean and deviation by fraction."""
-    plain, distinct = CHOICES
-    gains = [
-        [b["tuned"][half] - a["tuned"][half] for a, b in zip(_of(rows, plain), _of(rows, distinct), strict=True)]
-        for rows in runs
-    ]
-    means, deviations = np.transpose(
-        [shared.mean_and_deviation(of_fraction) for of_fraction in zip(*gains, strict=True)]
-    )
-    return means, deviations
-
-
-def _of(rows: list[dict[str, Any]], choice: str) -> list[dict[str, Any]]:
-    return [row for row in rows if row["choice"] == choice]
-
-
-DISTINCTIVENESS = Study("distinctiveness", "which 50, 25 and 12.5 % of the Gaussians to keep", add_arguments, run)
-"""The study ``omg/distinctiveness``."""
+    return [[value(row) for row in rows] for rows in groups]

@@ -27,11 +27,38 @@ footprints.
     minisplat-ref oracle gradients --extension pixel-order
 """
 
+from pathlib import Path
+
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.pixel_order.method import ORDERED, PIXEL_ORDER
 from minisplat_ref.extensions.pixel_order.stages import stages
-from minisplat_ref.extensions.pixel_order.study import ORDER, PROJECTION, ROTATION
+from minisplat_ref.studies.study import OUT, Argument, argument, declare, number, seed
 
+
+def _cloud(n: int) -> tuple[Argument, ...]:
+    return (OUT, number("--gaussians", n, "number of Gaussians"), seed("of the Gaussians"))
+
+
+ROTATION = declare(
+    "rotation",
+    "colours of fixed rays while the camera turns and moves",
+    f"{__name__}.clouds.run_rotation",
+    *(*_cloud(100), number("--steps", 80, "steps of the yaw")),
+)
+PROJECTION = declare(
+    "projection",
+    "footprints against the peak along rays, off the axis",
+    f"{__name__}.clouds.run_projection",
+    *_cloud(20),
+)
+ORDER = declare(
+    "order",
+    "hits out of order in a list and in buffers",
+    f"{__name__}.clouds.run_order",
+    *_cloud(300),
+    argument("--ply", type=Path, metavar="FILE", help="use the PLY of a run, seen by its first test camera"),
+    number("--every", 4, "N-th pixels along both axes"),
+)
 EXTENSION = Extension(
     "pixel-order",
     recipes=(PIXEL_ORDER,),

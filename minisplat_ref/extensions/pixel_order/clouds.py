@@ -1,12 +1,12 @@
 """The random Gaussians, cameras and measurements of the studies."""
 
+import argparse
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from minisplat_ref.constants import EXACT_ORDER, GSPLAT_MAIN, LIST_ORDER, Conventions
-from minisplat_ref.extensions.shared_studies import tidy, with_progress
+from minisplat_ref.constants import EXACT_ORDER, GSPLAT_MAIN, LIST_ORDER, SH_C0, Conventions
 from minisplat_ref.mechanisms.tangent.planes import hit, project
 from minisplat_ref.mechanisms.tangent.rays import (
     METHODS,
@@ -19,7 +19,12 @@ from minisplat_ref.mechanisms.tangent.rays import (
 )
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.reference.hits import blending_order
-from minisplat_ref.types import Camera, Floats, Primitives
+from minisplat_ref.rendering import activate
+from minisplat_ref.reporting import markdown_table
+from minisplat_ref.reports.palette import BLUE, GREEN, GREY, OCHRE, RED
+from minisplat_ref.studies import kit
+from minisplat_ref.studies.figures import table_of
+from minisplat_ref.types import Camera, Floats, Gaussians, Primitives
 
 BARE = GSPLAT_MAIN._replace(eps2d=0.0)
 ANGLES = (0.0, 15.0, 30.0, 45.0, 55.0)  # degrees off the optical axis
@@ -27,7 +32,7 @@ BUFFERS = {"list by distance": LIST_ORDER, "buffer of 4": 4, "buffer of 8": 8, "
 WALK, WALK_STEPS = 0.4, 40  # sideways distance in world units, and steps
 WALKS = {"walk": 1, "walk_in_tenths": 10}
 CHUNK = 64  # pixels at a time
-COLORS = ("#8a8580", "#e0a526", "#6aa84f", "#35608c", "#d2493f")
+COLORS = (GREY, OCHRE, GREEN, BLUE, RED)
 
 
 def cloud(n: int, rng: np.random.Generator) -> tuple[Primitives, Floats]:
@@ -64,13 +69,24 @@ def rotation(n: int, n_steps: int, seed: int, conventions: Conventions = GSPLAT_
     camera, rays = wide_camera(), rays_ahead(8, 18.0)
     yaws = [yaw_camera(camera, yaw) for yaw in np.radians(np.linspace(-20, 20, n_steps + 1))]
     found: dict[str, dict[str, Any]] = {}
-    for method in with_progress(METHODS, "methods"):
+    for method in kit.with_progress(METHODS, "methods"):
         found[method] = {"yaw": color_changes(method, primitives, colors, yaws, rays, conventions)[0].tolist()}
         for name, k in WALKS.items():
             path = [translate_camera(camera, dx) for dx in np.linspace(0, WALK, k * WALK_STEPS + 1)]
             worst, mean = color_changes(method, primitives, colors, path, rays, conventions)
             found[method] |= {f"{name}_worst": float(worst.max()), f"{name}_mean": float(mean.max())}
     return found
+
+
+def run_rotation(args: argparse.Namespace) -> kit.Report:
+    """Rotate and move a camera."""
+    found = rotation(args.gaussians, args.steps, args.seed)
+    keys = ("walk_worst", "walk_in_tenths_worst", "walk_mean", "walk_in_tenths_mean")
+    rows = [[method, f"{max(v['yaw']):.1e}", *(f"{v[key]:.1e}" for key in keys)] for method, v in found.items()]
+    heads = ["worst ray, yaw", "worst ray, walk", "tenth of a step", "mean of rays, walk", "tenth of a step"]
+    text = f"Largest change of fixed rays' colours in a step of {40 / args.steps:g} degrees, or of a sideways walk\n\n"
+    result = {**kit.settings_of(args, "gaussians", "seed"), "ways": found}
+    return kit.Report(result, draw_rotation(found), text + markdown_table(["method", *heads], rows))
 
 
 def draw_rotation(found: dict[str, dict[str, Any]]) -> Figure:
@@ -81,8 +97,7 @@ def draw_rotation(found: dict[str, dict[str, Any]]) -> Figure:
         steps = np.maximum(values["yaw"], 1e-17)
         axes.semilogy(np.linspace(-20, 20, len(steps)), steps, color=color, lw=1.2, label=method)
     axes.set(title="Largest colour change of a fixed ray per step", xlabel="yaw (degrees)", ylim=(1e-17, 1))
-    axes.legend(frameon=False, fontsize=8)
-    tidy(axes)
+    axes.legend()
     return figure
 
 
@@ -110,7 +125,7 @@ def projection_errors(n: int, seed: int) -> dict[str, list[float]]:
     truth = peak_responses(ahead, rays)
     camera = wide_camera(170.0, 2000, 2000)
     found: dict[str, list[float]] = {"EWA": [], "tangent planes": []}
-    for angle in with_progress(ANGLES, "angles"):
+    for angle in kit.with_progress(ANGLES, "angles"):
         seen = yaw_camera(camera, np.radians(angle))  # so that what lay ahead is off the axis
         in_camera = rays @ seen.cam_from_world_R.T
         is_ahead = in_camera[:, 2] > 0.05
@@ -122,6 +137,18 @@ def projection_errors(n: int, seed: int) -> dict[str, list[float]]:
     return found
 
 
+def run_projection(args: argparse.Namespace) -> kit.Report:
+    """Measure footprints against the peak along the ray."""
+    found = projection_errors(args.gaussians, args.seed)
+    by_angle = {
+        name: {f"{angle:g} degrees": error for angle, error in zip(ANGLES, errors, strict=True)}
+        for name, errors in found.items()
+    }
+    text = "Error of a footprint against the peak along each ray, sum |G - peak| / sum peak\n\n"
+    result = {**kit.settings_of(args, "gaussians", "seed"), "angles": ANGLES, "errors": found}
+    return kit.Report(result, draw_projection(found), text + table_of("projection", by_angle, ".3f"))
+
+
 def draw_projection(found: dict[str, list[float]]) -> Figure:
     """Draw the errors against the angle."""
     figure = Figure(figsize=(6, 4), layout="constrained")
@@ -129,8 +156,7 @@ def draw_projection(found: dict[str, list[float]]) -> Figure:
     for (name, errors), color in zip(found.items(), (COLORS[0], COLORS[4]), strict=True):
         axes.plot(ANGLES, errors, "o-", color=color, label=name)
     axes.set(title="Error of the footprint, relative", xlabel="degrees off the axis", ylim=(0, None))
-    axes.legend(frameon=False)
-    tidy(axes)
+    axes.legend()
     return figure
 
 
@@ -148,7 +174,7 @@ def orders(primitives: Primitives, colors: Floats, camera: Camera, centers: Floa
     pairs, wrong = dict.fromkeys(ways, 0), dict.fromkeys(ways, 0)
     pictures: dict[str, list[Floats]] = {name: [] for name in ways}
     ids = np.flatnonzero(footprints.radii[:, 0] > 0)
-    for first in with_progress(range(0, len(centers), CHUNK), "pixels"):
+    for first in kit.with_progress(range(0, len(centers), CHUNK), "pixels"):
         found = hit(footprints, ids, centers[first : first + CHUNK])
         alphas = np.minimum(GSPLAT_MAIN.alpha_max, found.unclamped)
         alphas = np.where(alphas >= GSPLAT_MAIN.alpha_min, alphas, 0)
@@ -171,6 +197,32 @@ def orders(primitives: Primitives, colors: Floats, camera: Camera, centers: Floa
     return result
 
 
+def run_order(args: argparse.Namespace) -> kit.Report:
+    """Count pairs of hits out of order.
+
+    Raises
+    ------
+    InputError
+        The PLY or the cameras beside it cannot be used.
+    """
+    if args.ply is None:
+        primitives, colors = cloud(args.gaussians, np.random.default_rng(args.seed))
+        camera, source = wide_camera(70.0), f"{args.gaussians} random Gaussians"
+    else:
+        gaussians, camera = kit.read_run(args.ply)
+        wide = Gaussians._make(field.astype(np.float64) for field in gaussians)
+        primitives, colors = activate(wide), np.maximum(0.5 + SH_C0 * wide.sh_dc, 0)
+        source = f"{len(colors):,} Gaussians of {args.ply}"
+    rows = orders(primitives, colors, camera, grid_centers(camera, args.every))
+    table = [
+        [row["order"], f"{100 * row['misordered']:.2f}", f"{row['mean_error']:.1e}", f"{row['largest_error']:.1e}"]
+        for row in rows
+    ]
+    text = f"{source}: pairs of hits of a pixel out of order, and colours against the exact order\n\n"
+    text += markdown_table(["order", "pairs (%)", "mean error", "largest error"], table)
+    return kit.Report({"source": source, "orders": rows}, draw_orders(rows), text)
+
+
 def draw_orders(rows: list[dict[str, Any]]) -> Figure:
     """Draw the fraction of misordered pairs, and the resulting error of colours."""
     figure = Figure(figsize=(9, 3.6), layout="constrained")
@@ -184,7 +236,6 @@ def draw_orders(rows: list[dict[str, Any]]) -> Figure:
         axes.barh(names, [100 * row[key] for row in rows], color=COLORS[3])
         axes.invert_yaxis()
         axes.set_title(title)
-        tidy(axes)
     return figure
 
 

@@ -42,14 +42,26 @@ from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.polygons import edit, export
 from minisplat_ref.extensions.polygons.method import POLYGONS, TRACED
 from minisplat_ref.extensions.polygons.stages import stages
-from minisplat_ref.extensions.polygons.study import STUDIES
+from minisplat_ref.studies.study import OUT, declare, number, seeds
 
+EDITS = declare(
+    "edits",
+    "polygons to Gaussians and back, affine edits, a bent sheet",
+    f"{__name__}.claims.run",
+    *(OUT, seeds(3)),
+)
+COST = declare(
+    "cost",
+    "a pixel of polygons beside one of ellipsoids on rays and of splats",
+    f"{__name__}.cost.run",
+    *(number("--gaussians", 10_000, "number"), number("--repeats", 5, "timings; the least counts")),
+)
 EXTENSION = Extension(
     "polygons",
     recipes=(POLYGONS,),
     representation=TRACED,
     commands=(export, edit),
     stages=stages,
-    studies=STUDIES,
+    studies=(EDITS, COST),
 )
 """Flat Gaussians in polygons, the recipe that trains them, two commands that edit them, and two studies."""

@@ -15,7 +15,8 @@ with the alpha that barycentric coordinates carry along: once as the light that 
 of splats does not matter, and once in colours, where neighbours that cross each other change places.
 """
 
-from collections.abc import Callable, Iterable
+import argparse
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -26,13 +27,16 @@ from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.extensions.polygons.kernels import RESPONSE, Fans, scene_of
 from minisplat_ref.extensions.polygons.method import TRACED
 from minisplat_ref.extensions.polygons.soup import Soup, carry_gaussians, soup_of
-from minisplat_ref.extensions.shared_studies import tidy
 from minisplat_ref.mechanisms.editing.deformation import Deformation, deform
 from minisplat_ref.mechanisms.meshes.fans import Flat, by_gram_schmidt, fit_flat_gaussians, fit_spans, flatten, rims
 from minisplat_ref.mechanisms.rays.kernels import tracer_of
 from minisplat_ref.mechanisms.rays.pixel_rays import pixel_rays
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.rendering import Request
+from minisplat_ref.reporting import markdown_table
+from minisplat_ref.reports.palette import BLUE, GREY, OCHRE, RED
+from minisplat_ref.studies import kit
+from minisplat_ref.studies.figures import set_ticks, show, table_of
 from minisplat_ref.types import Camera, Floats, Gaussians, Model, view_from
 
 TURN = rotation_matrices(np.array([[0.8, 0.2, -0.4, 0.4]]))[0]
@@ -185,16 +189,30 @@ def bend_errors(n: int, angle: float) -> dict[str, float]:
     return errors
 
 
-def measure(seeds: int, progress: Callable[[Iterable[Any]], Iterable[Any]]) -> dict[str, Any]:
+def measure(seeds: int) -> dict[str, Any]:
     """Return all that the study tells, by claim."""
     trips = [round_trips(seed) for seed in range(seeds)]
     result: dict[str, Any] = {"round trip": {n: max(trip[n] for trip in trips) for n in SIDES}, "affine": {}}
-    for name in progress(MAPS):
+    for name in kit.with_progress(MAPS, "edits"):
         rows = [affine_errors(name, seed) for seed in range(seeds)]
         result["affine"][name] = {key: max(row[key] for row in rows) for key in rows[0]}
-    result["angle"] = {angle: bend_errors(USUAL_PER_SIDE, angle) for angle in progress(ANGLES)}
-    result["splats"] = {n * n: bend_errors(n, USUAL_ANGLE) for n in progress(PER_SIDE)}
+    result["angle"] = {angle: bend_errors(USUAL_PER_SIDE, angle) for angle in kit.with_progress(ANGLES, "angles")}
+    result["splats"] = {n * n: bend_errors(n, USUAL_ANGLE) for n in kit.with_progress(PER_SIDE, "splats")}
     return result
+
+
+def run(args: argparse.Namespace) -> kit.Report:
+    """Take polygons to Gaussians and back, edit them, bend a sheet of them."""
+    found = measure(args.seeds)
+    trips = markdown_table(["sides", "distance"], [[str(n), f"{e:.1e}"] for n, e in found["round trip"].items()])
+    text = (
+        f"largest distance of a corner from itself, after the way to a Gaussian and back\n\n{trips}\n\n"
+        "largest error of an affine edit of the corners, against the Gaussians under the same map\n\n"
+        f"{table_of('map', found['affine'])}\n\n"
+        f"a sheet of {USUAL_PER_SIDE**2} splats that is bent\n\n{table_of('degrees', found['angle'])}\n\n"
+        f"a sheet that is bent by {USUAL_ANGLE} degrees\n\n{table_of('splats', found['splats'])}"
+    )
+    return kit.Report({"seeds": args.seeds, **found}, draw(found), text)
 
 
 def draw(result: dict[str, Any]) -> Figure:
@@ -210,14 +228,12 @@ def draw(result: dict[str, Any]) -> Figure:
         "the Gaussians that fit": picture(fitting),
     }
     for axes, (title, image) in zip(panels, pictures.items(), strict=False):
-        axes.imshow(np.clip(image, 0, 1))
-        axes.set_title(title, fontsize=8)
-        axes.set(xticks=[], yticks=[])
+        show(axes, image, title)
     curves = {
-        "corners, fit": "#35608c",
-        "corners, Gram-Schmidt": "#e0a526",
-        "light that passes, RMS": "#d2493f",
-        "colours, RMS": "0.5",
+        "corners, fit": BLUE,
+        "corners, Gram-Schmidt": OCHRE,
+        "light that passes, RMS": RED,
+        "colours, RMS": GREY,
     }
     labels = (f"degrees, {USUAL_PER_SIDE**2} splats", f"splats, {USUAL_ANGLE} degrees")
     for axes, key, label in zip(panels[2:], ("angle", "splats"), labels, strict=True):
@@ -225,10 +241,8 @@ def draw(result: dict[str, Any]) -> Figure:
         for name, color in curves.items():
             axes.loglog(list(rows), [row[name] for row in rows.values()], "o-", ms=3, color=color, label=name)
         axes.set_xlabel(label, fontsize=8)
-        axes.set_xticks(list(rows), [str(value) for value in rows])
-        axes.minorticks_off()
+        set_ticks(axes, list(rows), [str(value) for value in rows])
         axes.tick_params(labelsize=7)
-        tidy(axes)
     panels[2].set_ylabel("error", fontsize=8)
-    panels[3].legend(fontsize=6.5, frameon=False, loc="lower left")
+    panels[3].legend(fontsize=6.5, loc="lower left")
     return figure

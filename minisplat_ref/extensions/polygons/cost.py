@@ -5,8 +5,7 @@ the tuned ones. Splats are looked at for every pixel of a tile that they may tou
 ray comes near their boxes.
 """
 
-import time
-from collections.abc import Callable
+import argparse
 from functools import partial
 from typing import Any
 
@@ -19,6 +18,8 @@ from minisplat_ref.extensions.polygons.geometry import polygons_of
 from minisplat_ref.extensions.polygons.kernels import fans_of, scene_of
 from minisplat_ref.extensions.polygons.method import TRACED
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
+from minisplat_ref.studies import kit
+from minisplat_ref.studies.figures import table_of
 from minisplat_ref.types import Camera, Gaussians, Model, View, view_from
 
 WIDTH, HEIGHT = 240, 135  # pixels
@@ -38,6 +39,11 @@ def flat_gaussians(n: int, rng: np.random.Generator) -> Gaussians:
         sh_rest=np.zeros((n, 0, 3)),
     )
     return Gaussians(*(field.astype(np.float32) for field in wide))
+
+
+def run(args: argparse.Namespace) -> str:
+    """Count and time what a pixel costs, and return a table."""
+    return table_of("", measure(args.gaussians, args.repeats), ".3g")
 
 
 def measure(n: int, repeats: int) -> dict[str, dict[str, float | None]]:
@@ -63,7 +69,7 @@ def measure(n: int, repeats: int) -> dict[str, dict[str, float | None]]:
     opacities = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
     fans = fans_of(polygons_of(gaussians, opacities))
     found["polygons"]["triangles in the tree"] = float(len(scene_of(fans, GSPLAT_MAIN).records))
-    found["polygons"]["tree ms"] = 1e3 * _seconds_of(partial(scene_of, fans, GSPLAT_MAIN), repeats)
+    found["polygons"]["tree ms"] = 1e3 * kit.least_seconds(partial(scene_of, fans, GSPLAT_MAIN), repeats)
     found["polygons"]["error of float32"] = _error(gaussians, view)
     return found
 
@@ -76,8 +82,8 @@ def _row(
     counted = Request(backend=CPU, wants=frozenset({"stats"}))  # the plain kernels collect no statistics
     stats: Any = renderer.render(model, view, counted)[0].stats
     output, tape = renderer.render(model, view, request)
-    forward = _seconds_of(partial(renderer.render, model, view, request), repeats)
-    backward = _seconds_of(partial(renderer.render_vjp, tape, np.ones_like(output.image), None), repeats)
+    forward = kit.least_seconds(partial(renderer.render, model, view, request), repeats)
+    backward = kit.least_seconds(partial(renderer.render_vjp, tape, np.ones_like(output.image), None), repeats)
     looked_at = output.n_pairs * backend.tile_width * backend.tile_height / n_pixels if renderer is SPLATTING else None
     return {
         "hits a pixel": float(stats.hit_count.sum() / n_pixels),
@@ -99,13 +105,3 @@ def _error(gaussians: Gaussians, view: View) -> float:
         for some, backend in ((gaussians, CPU), (wide, REFERENCE))
     ]
     return float(np.abs(images[0] - images[1]).max())
-
-
-def _seconds_of(function: Callable[[], Any], repeats: int) -> float:
-    """Return the least time of processors that a call takes, of all threads together."""
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        function()
-        times.append(time.process_time() - start)
-    return min(times)

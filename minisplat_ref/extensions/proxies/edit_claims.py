@@ -13,7 +13,7 @@ the whole gradient F of the triangle, and once with the frame of GaMeS, which is
 centroid to the first corner, and the Gram-Schmidt remainder of the second, with two lengths.
 """
 
-from collections.abc import Iterable
+import argparse
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,6 +29,10 @@ from minisplat_ref.mechanisms.meshes.mesh import Mesh
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.rendering import render
+from minisplat_ref.reporting import markdown_table
+from minisplat_ref.reports.palette import BLUE, GREY, RED
+from minisplat_ref.studies import kit
+from minisplat_ref.studies.figures import set_ticks, show, table_of
 from minisplat_ref.types import Camera, Floats, Gaussians
 
 MAPS = {
@@ -180,13 +184,13 @@ def _gram_schmidt(mesh: Mesh) -> tuple[Floats, Floats]:
     return np.stack([normal, r2, rest / s3[:, None]], axis=2), np.column_stack([np.ones(len(s2)), s2, s3])
 
 
-def bend_errors(gaussians: Gaussians, all_cells: Iterable[int]) -> dict[str, Any]:
+def bend_errors(gaussians: Gaussians) -> dict[str, Any]:
     """Return the largest errors of centres and, for each frame, of covariances, by number of cells."""
     J = rolled_jacobian(gaussians.means)
     truth = J @ _sigma(gaussians) @ np.swapaxes(J, 1, 2)
     size = np.abs(truth).max(axis=(1, 2))
     result: dict[str, Any] = {"cells": [], "centre": [], "covariance": {name: [] for name in FRAMES}}
-    for cells in all_cells:
+    for cells in kit.with_progress(CELLS, "bending"):
         result["cells"].append(cells)
         for name, is_whole in FRAMES.items():
             carried = bent_by(cells, gaussians, is_whole)
@@ -194,6 +198,21 @@ def bend_errors(gaussians: Gaussians, all_cells: Iterable[int]) -> dict[str, Any
             result["covariance"][name].append(float(relative.max()))
         result["centre"].append(float(np.linalg.norm(carried.means - rolled(gaussians.means), axis=1).max()))
     return result
+
+
+def run(args: argparse.Namespace) -> kit.Report:
+    """Compare edits with the affine maps themselves, and a rolled sheet with the cylinder."""
+    edits = {}
+    for name in kit.with_progress(MAPS, "edits"):
+        rows = [edit_errors(name, seed)._asdict() for seed in range(args.seeds)]
+        edits[name] = {key: None if rows[0][key] is None else max(row[key] for row in rows) for key in rows[0]}
+    bend = bend_errors(flat_gaussians(np.random.default_rng(0)))
+    columns = (bend["cells"], bend["centre"], *bend["covariance"].values())
+    lines = [[str(n), *(f"{e:.1e}" for e in row)] for n, *row in zip(*columns, strict=True)]
+    heading = ["cells a side", "centre", *(f"covariance, {name}" for name in bend["covariance"])]
+    text = f"largest error of an affine edit, in float64\n\n{table_of('map', edits)}\n\n"
+    text += "largest error of a sheet that a mesh shears and rolls onto a cylinder\n\n" + markdown_table(heading, lines)
+    return kit.Report({"seeds": args.seeds, "edits": edits, "bend": bend}, draw(bend, seed=0), text)
 
 
 def draw(bend: dict[str, Any], seed: int) -> Figure:
@@ -209,15 +228,12 @@ def draw(bend: dict[str, Any], seed: int) -> Figure:
     }
     for axes, (title, gaussians) in zip(panels, pictures.items(), strict=False):
         image = render(_before_the_camera(gaussians), camera(), background=np.ones(3))[0].image
-        axes.imshow(np.clip(image, 0, 1))
-        axes.set_title(title, fontsize=8)
-        axes.set(xticks=[], yticks=[])
+        show(axes, image, title)
     axes = panels[3]
-    axes.loglog(bend["cells"], bend["centre"], "o-", color="0.5", label="centre (the sheet is 2 wide)")
-    for (name, errors), color in zip(bend["covariance"].items(), ("tab:blue", "tab:red"), strict=True):
+    axes.loglog(bend["cells"], bend["centre"], "o-", color=GREY, label="centre (the sheet is 2 wide)")
+    for (name, errors), color in zip(bend["covariance"].items(), (BLUE, RED), strict=True):
         axes.loglog(bend["cells"], errors, "o-", color=color, label=f"covariance, {name}")
-    axes.set_xticks(bend["cells"], [str(n) for n in bend["cells"]])
-    axes.minorticks_off()
+    set_ticks(axes, bend["cells"], [str(n) for n in bend["cells"]])
     axes.set_xlabel("cells a side", fontsize=8)
     axes.set_title("largest error of the rolled sheet", fontsize=8)
     axes.tick_params(labelsize=7)

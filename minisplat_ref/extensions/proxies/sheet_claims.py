@@ -13,6 +13,7 @@
   change of the sum of all energies over the largest sum of kinetic and dissipated energy, by the length of the step.
 """
 
+import argparse
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,6 +29,9 @@ from minisplat_ref.extensions.proxies.springs import springs_of, stiffness_for_s
 from minisplat_ref.mechanisms.meshes.mesh import Mesh
 from minisplat_ref.reference.covariance import covariances
 from minisplat_ref.rendering import render
+from minisplat_ref.reports.palette import BLUE, GREEN, RED
+from minisplat_ref.studies import kit
+from minisplat_ref.studies.figures import set_ticks, show, table_of
 from minisplat_ref.types import Camera, Floats, Gaussians
 
 GRAVITY = np.array([0.0, 9.81, 0.0])
@@ -121,18 +125,34 @@ def energy_error(found: list[Energies]) -> float:
     return max(abs(e.total - found[0].total) for e in found) / max(e.kinetic + e.dissipated for e in found)
 
 
-def measure(seed: int, progress: Any) -> dict[str, Any]:
-    """Run all simulations and return their errors; ``progress`` wraps the sequence of simulations."""
+def measure(seed: int) -> dict[str, Any]:
+    """Run all simulations and return their errors."""
     hanging = {f"{stretch:g}": dict.fromkeys(map(str, CELLS), 0.0) for stretch in STRETCHES}
     energy = {name: dict.fromkeys(map(str, STEPS), 0.0) for name in SWINGS}
-    jobs = [*((stretch, n) for stretch in STRETCHES for n in CELLS), *((name, f) for name in SWINGS for f in STEPS)]
-    for key, number in progress(jobs):
+    jobs: list[tuple[Any, float]] = [(stretch, n) for stretch in STRETCHES for n in CELLS]
+    jobs += [(name, fraction) for name in SWINGS for fraction in STEPS]
+    for key, number in kit.with_progress(jobs, "sheets"):
         if isinstance(key, str):
             energy[key][str(number)] = energy_error(swinging_sheet(SWINGS[key], number))
         else:
             found, expected = hanging_sheet(int(number), key)
             hanging[f"{key:g}"][str(number)] = float(np.linalg.norm(found - expected, axis=1).max() / LENGTH)
     return {"free_fall": free_fall(seed), "hanging": hanging, "energy": energy}
+
+
+def run(args: argparse.Namespace) -> kit.Report:
+    """Let sheets fall, hang and swing."""
+    result = {"seed": args.seed, **measure(args.seed)}
+    fall = result["free_fall"]
+    text = (
+        f"free fall for 1 s in {fall['steps']} steps, over {fall['distance']:.1f} units: centres off by"
+        f" {fall['centre']:.1e}, covariances by {fall['covariance']:.1e} of the largest\n\n"
+        "a hanging sheet: largest distance from the catenary over the sheet's length\n\n"
+        f"{table_of('stretch under its own weight', result['hanging'], unit=' cells')}\n\n"
+        "a swinging sheet: largest change of the total energy over the kinetic and dissipated energy\n\n"
+        f"{table_of('step over the longest stable one', result['energy'])}"
+    )
+    return kit.Report(result, draw(result, args.seed), text)
 
 
 def carpet(seed: int) -> Gaussians:
@@ -193,11 +213,9 @@ def draw(result: dict[str, Any], seed: int) -> Figure:
     places = figure.add_gridspec(2, 3 * n, height_ratios=[1, 1.25])
     for i, (image, moment) in enumerate(zip(pictures(seed), FRAMES, strict=True)):
         axes = figure.add_subplot(places[0, 3 * i : 3 * i + 3])
-        axes.imshow(image)
-        axes.set_title(f"{moment:g} s", fontsize=9)
-        axes.set(xticks=[], yticks=[])
+        show(axes, image, f"{moment:g} s")
     hanging, shares, errors = (figure.add_subplot(places[1, n * i : n * i + n]) for i in range(3))
-    for stretch, color in zip(STRETCHES[:2], ("tab:red", "tab:blue"), strict=True):
+    for stretch, color in zip(STRETCHES[:2], (RED, BLUE), strict=True):
         found, _ = hanging_sheet(CELLS[0], stretch)
         hanging.plot(*found[: CELLS[0] + 1].T, "o", color=color, ms=4, label=f"{CELLS[0]} cells, stretch {stretch:g}")
     hanging.plot(*catenary(np.linspace(-LENGTH / 2, LENGTH / 2, 200)).T, "k", lw=0.8, label="catenary")
@@ -213,12 +231,11 @@ def draw(result: dict[str, Any], seed: int) -> Figure:
     shares.plot(times, [e.total - swing[0].total for e in swing], "k", label="total", lw=1.2)
     shares.set_title("energies of a sheet that falls\nonto a floor, less their initial values", fontsize=9)
     shares.set_xlabel("seconds", fontsize=8)
-    for (name, by_step), color in zip(result["energy"].items(), ("tab:blue", "tab:green", "tab:red"), strict=True):
+    for (name, by_step), color in zip(result["energy"].items(), (BLUE, GREEN, RED), strict=True):
         errors.loglog(STEPS, list(by_step.values()), "o-", color=color, ms=4, label=name)
     least = result["energy"]["no drag"][str(STEPS[-1])]
     errors.loglog(STEPS, [least * (f / STEPS[-1]) ** 2 for f in STEPS], "k:", lw=1, label="square of the step")
-    errors.set_xticks(STEPS, [str(f) for f in STEPS])
-    errors.minorticks_off()
+    set_ticks(errors, STEPS, [str(f) for f in STEPS])
     errors.set_xlabel("step over the longest stable one", fontsize=8)
     errors.set_title("error of the energy balance", fontsize=9)
     for axes in (hanging, shares, errors):

@@ -1,7 +1,6 @@
 """The measurements of the studies, one function per claim."""
 
-import time
-from collections.abc import Callable
+import argparse
 from functools import partial
 from typing import Any
 
@@ -16,11 +15,14 @@ from minisplat_ref.extensions.rays.lights import shade, visibility
 from minisplat_ref.extensions.rays.method import TRACED, tracer_for, whiten_model
 from minisplat_ref.extensions.rays.surfaces import MIRROR
 from minisplat_ref.extensions.rays.surroundings import Surroundings, concatenate_surfaces, parallelogram, surfaces_of
-from minisplat_ref.extensions.shared_studies import tidy, with_progress
 from minisplat_ref.mechanisms.rays.pixel_rays import pixel_rays
 from minisplat_ref.reference.compositing import composite_hits
 from minisplat_ref.reference.hits import Hit, Response
 from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.reporting import markdown_table
+from minisplat_ref.reports.palette import BLUE, OCHRE, RED
+from minisplat_ref.studies import kit
+from minisplat_ref.studies.figures import show, table_of
 from minisplat_ref.types import Camera, Floats, Gaussians, Ints, Model, TileBins, TileGrid, view_from
 
 SIGMAS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3)  # of a Gaussian over its distance
@@ -131,7 +133,7 @@ def splatting_errors() -> dict[str, list[float]]:
     """
     found: dict[str, list[float]] = {}
     bare = GSPLAT_MAIN._replace(eps2d=0.0)
-    for angle in with_progress(OFF_AXIS, "angles off the axis"):
+    for angle in kit.with_progress(OFF_AXIS, "angles off the axis"):
         errors = []
         for sigma in SIGMAS:
             direction = np.array([np.sin(np.radians(angle)), 0.0, np.cos(np.radians(angle))])
@@ -150,30 +152,45 @@ def splatting_errors() -> dict[str, list[float]]:
     return found
 
 
+def run_claims(args: argparse.Namespace) -> kit.Report:
+    """Measure each claim, and draw the scene."""
+    edge, errors = shadow_edge(), splatting_errors()
+    found = {
+        "tree against brute force": tree_against_brute_force(args.gaussians, args.seed),
+        "tracing against exact order": order_difference(args.gaussians, args.seed),
+        "mirror against mirrored camera": mirror_difference(args.gaussians, args.seed),
+        "edge of a shadow, pixels": edge["pixels"],
+    }
+    result = {**kit.settings_of(args, "gaussians", "seed"), **found, "shadow": edge}
+    result["splatting against tracing"] = {"sigmas": list(SIGMAS), "errors": errors}
+    by_sigma = {f"{sigma:g}": {angle: errors[angle][s] for angle in errors} for s, sigma in enumerate(SIGMAS)}
+    text = markdown_table(["claim", "difference"], [[name, f"{value:.1e}"] for name, value in found.items()])
+    text += "\n\nalpha of one round Gaussian, splatted against traced: mean difference over mean\n\n"
+    text += table_of("sigma over distance", by_sigma, ".1%")
+    return kit.Report(result, draw(errors), text)
+
+
 def draw(errors: dict[str, list[float]]) -> Figure:
     """Draw the demo scene beside the errors of splatting."""
     camera = demo.camera_of()
     picture = shade(demo.demo_world(), pixel_rays(camera, GSPLAT_MAIN)).reshape(camera.height, camera.width, 3)
     figure = Figure(figsize=(9.5, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
-    left.imshow(np.clip(picture, 0, 1))
-    left.set_axis_off()
-    for (name, values), color in zip(errors.items(), ("#35608c", "#e0a526", "#d2493f"), strict=True):
+    show(left, picture)
+    for (name, values), color in zip(errors.items(), (BLUE, OCHRE, RED), strict=True):
         right.loglog(SIGMAS, values, "o-", ms=4, color=color, label=f"{name} off the axis")
     right.set(xlabel="standard deviation over distance", ylabel="difference of splatting from tracing")
-    right.legend(frameon=False, fontsize=8)
-    tidy(right)
+    right.legend()
     return figure
 
 
-def seconds_of(function: Callable[[], Any], repeats: int) -> float:
-    """Return the least processor time of a call, summed over all threads, seconds."""
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        function()
-        times.append(time.process_time() - start)
-    return min(times)
+def run_speed(args: argparse.Namespace) -> str:
+    """Time a ray and a rasterised pixel."""
+    found = speed(args.gaussians, args.repeats)
+    table = markdown_table(["measure", "value"], [[name, f"{value:.3g}"] for name, value in found.items()])
+    tuned, plain = (found["ray forward us"] / found[f"{name} forward us"] for name in ("pixel", "plain pixel"))
+    text = f"A ray takes {tuned:.1f} times as long as a pixel of the tuned kernels, {plain:.1f} times a plain one."
+    return f"{table}\n\n{text}"
 
 
 def speed(n: int, repeats: int) -> dict[str, float]:
@@ -187,14 +204,14 @@ def speed(n: int, repeats: int) -> dict[str, float]:
     view = view_from(demo.camera_of(240, 135))
     n_pixels, result = 240 * 135, dict[str, float]()
     ways = (("pixel", SPLATTING, CPU), ("plain pixel", SPLATTING, PLAIN), ("ray", TRACED.renderer, CPU))
-    for name, renderer, backend in with_progress(ways, "timing"):
+    for name, renderer, backend in kit.with_progress(ways, "timing"):
         request = Request(backend=backend)
         output, tape = renderer.render(Model(gaussians), view, request)
-        forward = seconds_of(partial(renderer.render, Model(gaussians), view, request), repeats)
-        backward = seconds_of(partial(renderer.render_vjp, tape, np.ones_like(output.image), None), repeats)
+        forward = kit.least_seconds(partial(renderer.render, Model(gaussians), view, request), repeats)
+        backward = kit.least_seconds(partial(renderer.render_vjp, tape, np.ones_like(output.image), None), repeats)
         result |= {f"{name} forward us": forward / n_pixels * 1e6, f"{name} backward us": backward / n_pixels * 1e6}
     whitened = whiten_model(Model(gaussians))
-    result["tree ms"] = 1e3 * seconds_of(partial(scene_of, whitened, GSPLAT_MAIN), repeats)
+    result["tree ms"] = 1e3 * kit.least_seconds(partial(scene_of, whitened, GSPLAT_MAIN), repeats)
     result["hits per ray"] = output.n_pairs / n_pixels
     few = pixel_rays(demo.camera_of(40, 22), GSPLAT_MAIN)
     colors = np.clip(0.5 + gaussians.sh_dc.astype(np.float64), 0, 1)

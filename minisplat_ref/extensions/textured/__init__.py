@@ -31,8 +31,16 @@ from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.textured import fine_tune
 from minisplat_ref.extensions.textured.method import TEXTURED, TEXTURED_GAUSSIANS
 from minisplat_ref.extensions.textured.stages import stages
-from minisplat_ref.extensions.textured.study import COUNTS, LIMB
+from minisplat_ref.studies import study
 
+COUNTS = study.declare(
+    "counts",
+    "textures at equal numbers of Gaussians, and of floats",
+    f"{__name__}.study.run",
+    *study.trainings(1000, "mini-splatting"),
+    study.fine_tune(500),
+)
+LIMB = study.declare("limb", "whether a texture jumps where rays begin to miss", f"{__name__}.study.run_limb")
 EXTENSION = Extension(
     "textured",
     recipes=(TEXTURED,),

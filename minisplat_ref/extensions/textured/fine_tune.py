@@ -7,6 +7,7 @@ from typing import Any
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.textured.population import DEGREE
 from minisplat_ref.io.ply import load_ply, save_ply
+from minisplat_ref.studies.study import downscale, iterations, seed
 
 
 def add_parser(commands: Any) -> None:
@@ -19,15 +20,15 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("scene", metavar="SCENE", help="folder that the run was trained on")
     parser.add_argument("ply", type=Path, metavar="PLY", help="its point_cloud.ply; the paper uses Mini-Splatting")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="PLY to write")
-    parser.add_argument("--downscale", type=int, default=1, metavar="D", help="make photographs D times smaller")
-    parser.add_argument("--iterations", type=int, default=1000, metavar="N", help="length (default 1000)")
+    downscale()(parser)
+    iterations(1000, "length")(parser)
     parser.add_argument(
         "--degree", type=int, default=DEGREE, metavar="L", help="degree of textures, 1 to 3 (default 3)"
     )
     parser.add_argument(
         "--replace", action="store_true", help="replace the view-dependent colour by textures, as in the paper"
     )
-    parser.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the training (default 0)")
+    seed("of the training")(parser)
     parser.set_defaults(run=run)
 
 
@@ -41,11 +42,9 @@ def run(args: argparse.Namespace) -> int:
     """
     from tqdm import tqdm
 
-    from minisplat_ref.extensions.shared_studies import check_at_least, read_scene
-    from minisplat_ref.extensions.textured.tuning import fine_tune, floats_of, measure, prepare
+    from minisplat_ref.extensions.textured.tuning import fine_tune, measure, prepare
+    from minisplat_ref.studies.kit import floats_of, read_scene
 
-    check_at_least(1, downscale=args.downscale, iterations=args.iterations)
-    check_at_least(0, seed=args.seed)
     if not 1 <= args.degree <= DEGREE:
         raise InputError(f"--degree is {args.degree}: give 1, 2 or 3")
     if not args.out.parent.is_dir():

@@ -11,75 +11,53 @@ Gaussian; the largest change from one to the next is compared with that of a tex
 """
 
 import argparse
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from minisplat_ref.extensions import shared_studies
-from minisplat_ref.extensions import shared_trainings as shared
-from minisplat_ref.io.atomic import making_folder
-from minisplat_ref.studies.study import Study
-from minisplat_ref.types import Floats, Gaussians, Scene
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from minisplat_ref.extensions.textured.reference import frames, meet
+from minisplat_ref.extensions.textured.tuning import fine_tune, measure, prepare
+from minisplat_ref.reference.spherical_harmonics import sh_basis
+from minisplat_ref.reporting import markdown_table
+from minisplat_ref.reports.palette import BLUE, GREY, RED
+from minisplat_ref.strategy.importance import collect_importance, indoor
+from minisplat_ref.strategy.ops import take
+from minisplat_ref.strategy.simplify import most_important
+from minisplat_ref.studies import kit
+from minisplat_ref.studies.figures import with_deviation
+from minisplat_ref.types import Camera, Floats, Gaussians, Scene
 
 PLAIN = "3DGS"
 PAPER, BOTH = "textures for view", "textures and view"
-COLORS = {PLAIN: shared.GREY, PAPER: shared.RED, BOTH: shared.BLUE}
+COLORS = {PLAIN: GREY, PAPER: RED, BOTH: BLUE}
 STEPS = (0.1, 0.01, 0.001)  # px from ray to ray
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of ``counts``."""
-    shared.add_scene_arguments(parser, iterations=1000, recipe="mini-splatting")
-    parser.add_argument(
-        "--fine-tune", type=int, default=500, metavar="M", help="iterations of fine-tuning (default 500)"
-    )
-
-
-def run(args: argparse.Namespace) -> None:
-    """Train, fine-tune, measure, write the results, and print the table.
-
-    Raises
-    ------
-    InputError
-        The scene, the recipe, the PLY or the output folder cannot be used.
-    """
-    from minisplat_ref.reporting import markdown_table
-
-    shared_studies.check_at_least(1, **{"fine-tune": args.fine_tune})
-    scene = shared.read_scene(args)
-    with making_folder(args.out) as folder:
-        wholes = shared.populations(args, scene)
-        runs = [outcomes(whole, scene, args.fine_tune, seed) for seed, whole in enumerate(wholes)]
-        result = {**shared.describe(args, scene), "fine_tune": args.fine_tune, "runs": runs}
-        shared_studies.write(folder, result, draw(result))
-    print(f"{scene.name}; fine-tuned {args.fine_tune} iterations\n")
+def run(args: argparse.Namespace) -> kit.Report:
+    """Train, fine-tune and measure."""
+    scene = kit.read_scene(args.scene, args.downscale)
+    wholes = kit.populations(args, scene)
+    runs = [outcomes(whole, scene, args.fine_tune, seed) for seed, whole in enumerate(wholes)]
+    result = {**kit.describe_trainings(args, scene), "fine_tune": args.fine_tune, "runs": runs}
     heading = ["Gaussians", "with", "degree", "number", "floats", "test PSNR", "test SSIM", "training PSNR"]
-    print(markdown_table(heading, to_rows(runs)))
+    text = f"{scene.name}; fine-tuned {args.fine_tune} iterations\n\n{markdown_table(heading, to_rows(runs))}"
+    return kit.Report(result, draw(result), text)
 
 
 def outcomes(whole: Gaussians, scene: Scene, iterations: int, seed: int) -> list[dict[str, Any]]:
     """Return the measurements of each form of a trained population."""
-    from tqdm import tqdm
-
-    from minisplat_ref.extensions.textured.tuning import fine_tune, floats_of, measure, prepare
-    from minisplat_ref.strategy.importance import collect_importance, indoor
-    from minisplat_ref.strategy.ops import take
-    from minisplat_ref.strategy.simplify import most_important
-
     importance = indoor(collect_importance(whole, scene.train_views))
     jobs: list[tuple[str, str, int, Any]] = [("all", PLAIN, 0, whole)]
     jobs += [("all", PAPER, degree, prepare(whole, degree, True)) for degree in (1, 2, 3)]
     jobs.append(("all", BOTH, 3, prepare(whole, 3, False)))
-    n_floats = len(whole.means) * floats_of(whole)
+    n_floats = len(whole.means) * kit.floats_of(whole)
     for form, replaces in ((PAPER, True), (BOTH, False)):
-        n = n_floats // floats_of(prepare(whole, 3, replaces))
+        n = n_floats // kit.floats_of(prepare(whole, 3, replaces))
         kept = take(whole, most_important(importance, min(n, int(np.count_nonzero(importance)))))
         jobs.append(("as many floats", form, 3, prepare(kept, 3, replaces)))
     rows = []
-    for kept_by, form, degree, population in tqdm(jobs, desc=f"seed {seed}", leave=False, disable=None):
+    for kept_by, form, degree, population in kit.with_progress(jobs, f"seed {seed}"):
         after = fine_tune(population, scene, iterations, seed)
         test, training = (measure(after, scene, views) for views in (scene.test_views, scene.train_views))
         rows.append(
@@ -88,7 +66,7 @@ def outcomes(whole: Gaussians, scene: Scene, iterations: int, seed: int) -> list
                 "form": form,
                 "degree": degree,
                 "n_gaussians": len(population.means),
-                "n_floats": len(population.means) * floats_of(population),
+                "n_floats": len(population.means) * kit.floats_of(population),
                 "psnr": test.psnr,
                 "ssim": test.ssim,
                 "training_psnr": training.psnr,
@@ -103,7 +81,7 @@ def to_rows(runs: list[list[dict[str, Any]]]) -> list[list[str]]:
     for rows in zip(*runs, strict=True):
         n, n_floats = (np.mean([row[key] for row in rows]) for key in ("n_gaussians", "n_floats"))
         measures = [
-            shared.with_deviation([row[key] for row in rows], digits)
+            with_deviation([row[key] for row in rows], digits)
             for key, digits in (("psnr", 2), ("ssim", 4), ("training_psnr", 2))
         ]
         first = rows[0]
@@ -111,10 +89,8 @@ def to_rows(runs: list[list[dict[str, Any]]]) -> list[list[str]]:
     return lines
 
 
-def draw(result: dict[str, Any]) -> "Figure":
+def draw(result: dict[str, Any]) -> Figure:
     """Draw PSNR against the number of floats, for test views and training views."""
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(9.5, 3.6), layout="constrained")
     for axes, key in zip(figure.subplots(1, 2), ("psnr", "training_psnr"), strict=True):
         for form, color in COLORS.items():
@@ -124,18 +100,13 @@ def draw(result: dict[str, Any]) -> "Figure":
                     x, y = [r["n_floats"] / 1e3 for r in rows], [r[key] for r in rows]
                     axes.plot(x, y, marker, color=color, label=f"{form}, {kept}")
         axes.set(xlabel="thousands of floats", ylabel=f"{'test' if key == 'psnr' else 'training'} PSNR (dB)")
-        shared_studies.tidy(axes)
-    axes.legend(frameon=False, fontsize=8)
+    axes.legend()
     figure.suptitle(result["scene"])
     return figure
 
 
 def colors_across(step: float) -> tuple[Floats, Floats]:
     """Return the colours of rays across a round Gaussian's limb, with the texture and without it beyond the limb."""
-    from minisplat_ref.extensions.textured.reference import frames, meet
-    from minisplat_ref.reference.spherical_harmonics import sh_basis
-    from minisplat_ref.types import Camera
-
     camera = Camera(np.eye(3), np.zeros(3), 100.0, 100.0, 50.0, 50.0, 100, 100)
     means, quats, scales = np.array([[0.1, 0.0, 4.0]]), np.array([[1.0, 0.2, 0.3, 0.1]]), np.full((1, 3), 0.4)
     p = 50 + 25 * means[:, :2]
@@ -145,23 +116,11 @@ def colors_across(step: float) -> tuple[Floats, Floats]:
     return texture, np.where(np.sum(met.q[0] ** 2, axis=1) < 1, texture, 0)
 
 
-def add_limb_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add no arguments."""
-
-
-def run_limb(args: argparse.Namespace) -> None:
-    """Print the largest change from ray to ray."""
-    from minisplat_ref.reporting import markdown_table
-
+def run_limb(args: argparse.Namespace) -> str:
+    """Return the largest change from ray to ray."""
     rows = []
-    for step in shared_studies.with_progress(STEPS, "spacings"):
+    for step in kit.with_progress(STEPS, "spacings"):
         continued, cut = (float(np.abs(np.diff(colors)).max()) for colors in colors_across(step))
         rows.append([f"{step:g}", f"{continued:.2g}", f"{cut:.2g}"])
-    print("largest change of a texture from ray to ray across the limb\n")
-    print(markdown_table(["rays apart (px)", "nearest point beyond", "no texture beyond"], rows))
-
-
-COUNTS = Study("counts", "textures at equal numbers of Gaussians, and of floats", add_arguments, run)
-"""The study ``textured/counts``."""
-LIMB = Study("limb", "whether a texture jumps where rays begin to miss", add_limb_arguments, run_limb)
-"""The study ``textured/limb``."""
+    table = markdown_table(["rays apart (px)", "nearest point beyond", "no texture beyond"], rows)
+    return f"largest change of a texture from ray to ray across the limb\n\n{table}"

@@ -3,16 +3,13 @@
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
 from minisplat_ref.extensions.textured.method import FINE_TUNING, TEXTURED_GAUSSIANS
 from minisplat_ref.extensions.textured.population import TexturedGaussians, with_textures
 from minisplat_ref.metrics import Evaluation, evaluate
-from minisplat_ref.training.adam import zero_moments
-from minisplat_ref.training.loop import train
+from minisplat_ref.studies import kit
 from minisplat_ref.training.representation import GAUSSIANS, Representation
 from minisplat_ref.training.schedule import scaled
-from minisplat_ref.training.state import StepReport, TrainState
+from minisplat_ref.training.state import StepReport
 from minisplat_ref.types import Gaussians, Model, Scene, View
 
 
@@ -33,18 +30,10 @@ def fine_tune(
 ) -> Any:
     """Return a population with or without textures after fine-tuning; the given one is not changed."""
     recipe = scaled(FINE_TUNING, iterations)._replace(representation=representation_of(population))
-    copy = type(population)(*(field.copy() for field in population))
-    rng = np.random.default_rng(seed)
-    state = TrainState(copy, zero_moments(copy), step=0, view_order=[], rng=rng, stats={})
-    return train(scene, recipe, seed=seed, state=state, on_step=on_step).gaussians
+    return kit.fine_tune(population, scene, recipe, seed, on_step)
 
 
 def measure(population: Any, scene: Scene, views: tuple[View, ...]) -> Evaluation:
     """Compare pictures of a population with photographs."""
     renderer = representation_of(population).renderer
     return evaluate(Model(population), views, background=scene.background, renderer=renderer)
-
-
-def floats_of(population: Any) -> int:
-    """Return the number of floats per Gaussian of a population."""
-    return sum(int(np.prod(field.shape[1:])) for field in population)

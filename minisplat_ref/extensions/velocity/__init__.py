@@ -21,6 +21,12 @@ followed; linear motion is the first-order case of all of them.
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.velocity import freeze
 from minisplat_ref.extensions.velocity.method import MOVING, VELOCITY
-from minisplat_ref.extensions.velocity.study import MOTION
+from minisplat_ref.studies.study import declare, iterations, seed
 
+MOTION = declare(
+    "motion",
+    "find the velocities of a scene whose Gaussians are known",
+    f"{__name__}.study.run",
+    *(iterations(600), seed("of scene and trainings")),
+)
 EXTENSION = Extension("velocity", recipes=(VELOCITY,), representation=MOVING, commands=(freeze,), studies=(MOTION,))

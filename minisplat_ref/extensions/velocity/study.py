@@ -14,12 +14,12 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.extensions.shared_studies import with_progress
 from minisplat_ref.extensions.velocity.method import MOVING, VELOCITY, MovingGaussians
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import Request
-from minisplat_ref.studies.study import Study
+from minisplat_ref.reporting import markdown_table
+from minisplat_ref.studies import kit
 from minisplat_ref.training.loop import initial_state, train
 from minisplat_ref.training.schedule import Recipe, scaled
 from minisplat_ref.types import Camera, Gaussians, Model, Scene, View, numbered, view_from
@@ -105,27 +105,11 @@ def outcome(recipe: Recipe, truth: MovingGaussians, seed: int) -> Outcome:
     return Outcome(evaluation.psnr, float(np.sqrt(np.mean((found - truth.velocities) ** 2))))
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the study."""
-    parser.add_argument(
-        "--iterations", type=int, default=600, metavar="N", help="iterations per training (default 600)"
-    )
-    parser.add_argument("--seed", type=int, default=0, metavar="S", help="seed of scene and trainings (default 0)")
-
-
-def run(args: argparse.Namespace) -> int:
-    """Train both recipes and print a table."""
+def run(args: argparse.Namespace) -> str:
+    """Train both recipes, and return a table."""
     truth, rows = moving_gaussians(np.random.default_rng(args.seed)), []
     recipes = (GS_ACCEL, VELOCITY._replace(representation=MOVING))
-    for recipe in with_progress(recipes, "trainings"):
+    for recipe in kit.with_progress(recipes, "trainings"):
         psnr, error = outcome(scaled(recipe, args.iterations), truth, args.seed)
-        rows.append(f"| {recipe.name:<10} | {psnr:7.2f} | {error:19.4f} |")
-    print(
-        "| recipe     | PSNR dB | error of velocities |\n|------------|---------|---------------------|",
-        *rows,
-        sep="\n",
-    )
-    return 0
-
-
-MOTION = Study("motion", "find the velocities of a scene whose Gaussians are known", add_arguments, run)
+        rows.append([recipe.name, f"{psnr:.2f}", f"{error:.4f}"])
+    return markdown_table(["recipe", "PSNR dB", "error of velocities"], rows)

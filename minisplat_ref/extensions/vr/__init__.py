@@ -21,12 +21,27 @@ eccentricity. Frame rates, which are a GPU's, are left out; work is counted in r
 cannot be repeated.
 """
 
+from pathlib import Path
+
 from minisplat_ref.extensions.extension import Extension
 from minisplat_ref.extensions.vr import render
 from minisplat_ref.extensions.vr.method import HEADSET, VR
 from minisplat_ref.extensions.vr.stages import stages
-from minisplat_ref.extensions.vr.study import FOVEATION, YAW
+from minisplat_ref.studies.study import OUT, SCENE, argument, declare, downscale, number
 
+PLY = argument("--ply", type=Path, required=True, metavar="FILE", help="point_cloud.ply of a run")
+FOVEATION = declare(
+    "foveation",
+    "work against PSNR with fewer rays away from the gaze",
+    f"{__name__}.measures.run_foveation",
+    *(SCENE, PLY, downscale(), number("--repeats", 3, "timings per picture"), OUT),
+)
+YAW = declare(
+    "yaw",
+    "colours of fixed rays through a trained scene while the camera turns",
+    f"{__name__}.measures.run_yaw",
+    *(PLY, number("--steps", 40, "steps of a yaw of +-10 degrees"), OUT),
+)
 EXTENSION = Extension(
     "vr", recipes=(VR,), representation=HEADSET, commands=(render,), stages=stages, studies=(FOVEATION, YAW)
 )

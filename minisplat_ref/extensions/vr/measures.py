@@ -1,5 +1,6 @@
 """The measurements of the studies ``vr/foveation`` and ``vr/yaw``."""
 
+import argparse
 import statistics
 import time
 from collections.abc import Sequence
@@ -10,16 +11,22 @@ from matplotlib.figure import Figure
 
 from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
-from minisplat_ref.extensions.shared_studies import tidy, with_progress
 from minisplat_ref.extensions.vr.foveation import Gaze, Zone, eccentricities, render_foveated, resolved_angles
 from minisplat_ref.extensions.vr.method import BUFFER
+from minisplat_ref.io import load_ply
 from minisplat_ref.mechanisms.tangent.rays import color_changes, ewa_hits, tangent_hits, yaw_camera
 from minisplat_ref.rendering import Request, activate
+from minisplat_ref.reporting import markdown_table
+from minisplat_ref.reports.palette import BLUE, GREY, RED
+from minisplat_ref.studies import kit
 from minisplat_ref.types import Camera, Floats, Gaussians, Ints, Model, Primitives, View
 
 EVERYWHERE = 180.0  # degrees: every pixel is drawn
 METHODS = ("3DGS: EWA, by z", "tangent planes, buffer of 16", "tangent planes, exact order")
-COLORS = ("#8a8580", "#35608c", "#d2493f")
+COLORS = (GREY, BLUE, RED)
+FULLS = (2.0, 4.0, 8.0, 12.0)  # degrees
+COUNTS = ("n_tiles", "n_samples", "n_pairs")
+HALF_ANGLE = 10.0  # of the yaw, degrees
 
 
 def weighted_psnr(image: Floats, target: Floats, angles: Floats) -> float:
@@ -46,7 +53,7 @@ def foveated(
     """
     request, rows = Request(background, backend=CPU), []
     whole: list[Floats] = []
-    for full in with_progress((EVERYWHERE, *fulls), "angles"):
+    for full in kit.with_progress((EVERYWHERE, *fulls), "angles"):
         psnrs, against_whole, plain, times = [], [], [], []
         zones: list[list[Zone]] = []
         for v, view in enumerate(views):
@@ -84,7 +91,32 @@ def foveated(
     return rows
 
 
-COUNTS = ("n_tiles", "n_samples", "n_pairs")
+def run_foveation(args: argparse.Namespace) -> kit.Report:
+    """Render the test views at rates by eccentricity."""
+    scene, model = kit.read_scene(args.scene, args.downscale), Model(load_ply(args.ply))
+    rows = foveated(model, scene.test_views, scene.background, FULLS, args.repeats)
+    first, *others = rows
+    names = ["everywhere", *(f"{row['full']:g} degrees" for row in others)]
+    table = [
+        [
+            name,
+            *(f"{100 * row[key] / first[key]:.0f}" for key in ("n_samples", "n_pairs", "seconds")),
+            *(f"{row[key]:.2f}" for key in ("weighted_psnr", "psnr")),
+            "" if row is first else f"{row['weighted_psnr_of_whole']:.1f}",
+        ]
+        for name, row in zip(names, rows, strict=True)
+    ]
+    quality = ("weighted PSNR (dB)", "PSNR (dB)", "of the whole picture (dB)")
+    zones = [
+        [f"{row['full']:g}", f"{zone['begins']:.1f}", str(zone["block"] ** 2), *(f"{zone[n]:,}" for n in COUNTS[:2])]
+        for row in others
+        for zone in row["zones"]
+    ]
+    n = len(model.gaussians.means)
+    text = f"{scene.name}, {len(scene.test_views)} test views, {n:,} Gaussians, gaze in the middle\n\n"
+    text += markdown_table(["in full", "rays (%)", "pairs (%)", "time (%)", *quality], table) + "\n\n"
+    text += markdown_table(["in full (degrees)", "zone begins at", "pixels a ray", "tiles", "rays"], zones)
+    return kit.Report({"scene": scene.name, "gaussians": n, "rows": rows}, draw_foveated(rows), text)
 
 
 def draw_foveated(rows: list[dict[str, Any]]) -> Figure:
@@ -98,8 +130,7 @@ def draw_foveated(rows: list[dict[str, Any]]) -> Figure:
         label = "everywhere" if row["full"] == EVERYWHERE else f"{row['full']:g} degrees"
         axes.annotate(label, (x, row["weighted_psnr"]), fontsize=8, xytext=(4, 4), textcoords="offset points")
     axes.set(title="Test views: PSNR (dB)", xlabel="rays drawn (% of the pixels)")
-    axes.legend(frameon=False)
-    tidy(axes)
+    axes.legend()
     return figure
 
 
@@ -120,7 +151,7 @@ def yaw_steps(
     rows = _hit_rows(primitives, path[:: max(n_steps // 4, 1)], rays)
     seen = Primitives._make(field[rows] for field in primitives)
     seen_by = (seen, colors[rows], path, rays, GSPLAT_MAIN)
-    return {method: color_changes(method, *seen_by)[0].tolist() for method in with_progress(METHODS, "methods")}
+    return {method: color_changes(method, *seen_by)[0].tolist() for method in kit.with_progress(METHODS, "methods")}
 
 
 def _hit_rows(primitives: Primitives, cameras: Sequence[Camera], rays: Floats) -> Ints:
@@ -132,6 +163,17 @@ def _hit_rows(primitives: Primitives, cameras: Sequence[Camera], rays: Floats) -
     return np.flatnonzero(is_hit)
 
 
+def run_yaw(args: argparse.Namespace) -> kit.Report:
+    """Yaw the first test camera of a run."""
+    gaussians, camera = kit.read_run(args.ply)
+    found = yaw_steps(gaussians, camera, 6, HALF_ANGLE, args.steps)
+    step, n = 2 * HALF_ANGLE / args.steps, len(gaussians.means)
+    rows = [[method, f"{max(steps):.1e}", f"{sorted(steps)[len(steps) // 2]:.1e}"] for method, steps in found.items()]
+    text = f"Largest change of a fixed ray's colour in a step of {step:g} degrees, {n:,} Gaussians\n\n"
+    text += markdown_table(["method", "largest", "median of the steps"], rows)
+    return kit.Report({"gaussians": n, "steps": args.steps, "ways": found}, draw_yaw(found, HALF_ANGLE), text)
+
+
 def draw_yaw(found: dict[str, list[float]], half_angle: float) -> Figure:
     """Draw the largest change in each step."""
     figure = Figure(figsize=(8, 4), layout="constrained")
@@ -141,6 +183,5 @@ def draw_yaw(found: dict[str, list[float]], half_angle: float) -> Figure:
             np.linspace(-half_angle, half_angle, len(steps)), np.maximum(steps, 1e-17), color=color, label=method
         )
     axes.set(title="Largest colour change of a fixed ray per step", xlabel="yaw (degrees)", ylim=(1e-17, 1))
-    axes.legend(frameon=False, fontsize=8)
-    tidy(axes)
+    axes.legend()
     return figure

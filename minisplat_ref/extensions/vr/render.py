@@ -39,7 +39,6 @@ def run(args: argparse.Namespace) -> int:
     InputError
         The PLY or the cameras cannot be used, the gaze lies outside a picture, or the folder exists.
     """
-    from minisplat_ref.extensions.shared_studies import with_progress
     from minisplat_ref.extensions.vr.foveation import Gaze, check_gaze, render_foveated
     from minisplat_ref.extensions.vr.method import BUFFER
     from minisplat_ref.io import load_ply, viewpoints, write_image
@@ -47,6 +46,7 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.io.names import file_names
     from minisplat_ref.rendering import Request
     from minisplat_ref.reporting import markdown_table
+    from minisplat_ref.studies.kit import with_progress
     from minisplat_ref.types import Model
 
     x, y = args.gaze

@@ -1,0 +1,296 @@
+"""What studies are made of: a scene, trainings by seed, records that resume, and the report that is written.
+
+A study's module measures, draws and returns a :class:`Report`; :func:`carry_out` gives figures their style, and writes
+and prints the report. Trainings take long: with :func:`resume` a study stores the record of each as soon as it ends,
+and continues with the missing ones when it is called again with the same folder.
+
+Means over seeds, tables and curves are in :mod:`.figures`. Neither module loads Numba or matplotlib by itself, so that
+commands can use them.
+"""
+
+import argparse
+import contextlib
+import json
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+import numpy as np
+from tqdm import tqdm
+
+from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
+from minisplat_ref.errors import InputError
+from minisplat_ref.io import load_ply, load_scene, viewpoints
+from minisplat_ref.io.atomic import making_folder
+from minisplat_ref.reporting import describe_machine
+from minisplat_ref.reports.palette import PNG_DPI
+from minisplat_ref.studies.figures import STYLE
+from minisplat_ref.studies.study import FIGURE, RESULT
+from minisplat_ref.types import Camera, Floats, Gaussians, Scene
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from minisplat_ref.training.schedule import Recipe
+    from minisplat_ref.training.state import TrainState
+
+RUNS = "runs.jsonl"  # what has been measured so far, below the settings
+Item = TypeVar("Item")
+
+
+class Report(NamedTuple):
+    """What a study has found."""
+
+    result: Mapping[str, Any]
+    """For ``result.json``."""
+    figure: "Figure"
+    text: str
+    """For the terminal: tables in Markdown, with a line about each."""
+
+
+def carry_out(measure: Callable[[argparse.Namespace], Any], args: argparse.Namespace, *, is_resumed: bool) -> None:
+    """Measure, write the report to ``--out``, and print it.
+
+    Parameters
+    ----------
+    measure : callable
+        Returns a :class:`Report`, or only its text if there is no ``--out``.
+    args : Namespace
+    is_resumed : bool
+        The folder may be there, with the records of an earlier call; otherwise it is new, and not there if the study
+        fails.
+    """
+    if "out" not in args:
+        print(measure(args))
+        return
+    from matplotlib import rc_context
+
+    with rc_context(STYLE), contextlib.nullcontext(args.out) if is_resumed else making_folder(args.out) as folder:
+        report = measure(args)
+        (folder / RESULT).write_text(json.dumps(report.result, indent=2) + "\n", encoding="utf-8")
+        report.figure.savefig(folder / FIGURE, dpi=PNG_DPI, facecolor="white")
+    print(report.text)
+
+
+def settings_of(args: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Return arguments by their names, for the result."""
+    return {name: getattr(args, name) for name in names}
+
+
+def seeds_of(args: argparse.Namespace) -> str:
+    """Return the seeds of a study that names each of them."""
+    return f"seeds {', '.join(map(str, args.seeds))}"
+
+
+def with_progress(items: Iterable[Item], description: str) -> Iterable[Item]:
+    """Return an iterable that shows a progress bar while it is consumed; none is shown outside a terminal."""
+    bar: Iterable[Item] = tqdm(items, desc=description, leave=False, disable=None)
+    return bar
+
+
+# Scenes and trainings
+
+
+def read_scene(source: str, downscale: int = 1, *, is_tested: bool = True) -> Scene:
+    """Load a scene from a folder, with photographs ``downscale`` times smaller, or make the synthetic one of that name.
+
+    Parameters
+    ----------
+    source : str
+    downscale : int
+    is_tested : bool
+        Whether the study needs test views.
+
+    Raises
+    ------
+    InputError
+        ``source`` is neither, has no test views, or is a synthetic scene that is to be made smaller.
+    """
+    if Path(source).exists():
+        scene = load_scene(source, downscale=downscale)
+    elif source not in SCENE_NAMES:
+        raise InputError(f"{source}: neither a folder nor one of {', '.join(SCENE_NAMES)}; give a scene")
+    elif downscale != 1:
+        raise InputError(f"{source} is made at 160 x 120; write it with minisplat-ref synthetic for another size")
+    else:
+        scene = make_scene(source).scene
+    if is_tested and not scene.test_views:
+        raise InputError(f"scene {scene.name} has no test views to measure: add photographs")
+    return scene
+
+
+def describe_scene(scene: Scene) -> dict[str, Any]:
+    """Return what results depend on besides the method: photographs, their size, points, machine."""
+    camera = scene.train_views[0].camera
+    return {
+        "scene": scene.name,
+        "size": [camera.width, camera.height],
+        "train_views": len(scene.train_views),
+        "test_views": len(scene.test_views),
+        "points": len(scene.points),
+        "machine": describe_machine(),
+    }
+
+
+def title(description: Mapping[str, Any]) -> str:
+    """Return the description in one line."""
+    width, height = description["size"]
+    return (
+        f"{description['scene']}, {description['train_views']} training views of {width} x {height}; "
+        f"{description['machine']}"
+    )
+
+
+def describe_trainings(args: argparse.Namespace, scene: Scene) -> dict[str, Any]:
+    """Return the scene, and where the :func:`populations` come from."""
+    origin = {"ply": str(args.ply)} if args.ply else settings_of(args, "recipe", "iterations")
+    return {**describe_scene(scene), **origin, "seeds": 1 if args.ply else args.seeds}
+
+
+def populations(args: argparse.Namespace, scene: Scene) -> list[Gaussians]:
+    """Return the given Gaussians, or those of one training per seed.
+
+    Raises
+    ------
+    InputError
+        There is no such recipe, or the PLY cannot be read.
+    """
+    from minisplat_ref.methods import get_recipe
+
+    if args.ply is not None:
+        return [load_ply(args.ply)]
+    recipe = get_recipe(args.recipe, args.iterations)
+    return [train_with_progress(scene, recipe, seed).gaussians for seed in range(args.seeds)]
+
+
+def train_with_progress(scene: Scene, recipe: "Recipe", seed: int, **arguments: Any) -> "TrainState":
+    """Train with a progress bar; other arguments as for :func:`~minisplat_ref.training.loop.train`."""
+    from minisplat_ref.training.loop import train
+
+    with tqdm(total=recipe.iterations, desc=f"{recipe.name}, seed {seed}", leave=False, disable=None) as bar:
+        return train(scene, recipe, seed=seed, on_step=lambda _: bar.update(), **arguments)
+
+
+def fine_tune(
+    population: Any, scene: Scene, recipe: "Recipe", rng: np.random.Generator | int, on_step: Any = None
+) -> Any:
+    """Return a population after a training that begins with it; the given one is not changed.
+
+    Parameters
+    ----------
+    population : Gaussians or a relative's population
+    scene : Scene
+    recipe : Recipe
+        Of the length of the fine-tuning. :func:`without_events` keeps the number as it is.
+    rng : Generator or int
+        Draws what events draw, and the order of views; or its seed.
+    on_step : callable, optional
+        Called after each iteration.
+    """
+    from minisplat_ref.training.adam import zero_moments
+    from minisplat_ref.training.loop import train
+    from minisplat_ref.training.state import TrainState
+
+    copy = type(population)(*(np.ascontiguousarray(field).copy() for field in population))
+    generator = np.random.default_rng(rng) if isinstance(rng, int) else rng
+    state = TrainState(copy, zero_moments(copy), step=0, view_order=[], rng=generator, stats={})
+    return train(scene, recipe, seed=0, state=state, on_step=on_step).gaussians
+
+
+def without_events(recipe: "Recipe") -> "Recipe":
+    """Return the recipe for fine-tuning: the number of Gaussians stays, and all stored harmonics are trained."""
+    return recipe._replace(events=(), sh_milestones=(0,) * recipe.sh_degree)
+
+
+def floats_of(population: Any) -> int:
+    """Return how many floats a primitive of the population has."""
+    return sum(int(np.prod(field.shape[1:])) for field in population)
+
+
+def read_run(ply: Path) -> tuple[Gaussians, Camera]:
+    """Read the Gaussians of a run, and its first test camera.
+
+    Raises
+    ------
+    InputError
+        The PLY or the cameras beside it cannot be used.
+    """
+    gaussians = load_ply(ply)
+    cameras = [view.camera for view in viewpoints.read(ply.parent / "cameras.json") if view.split == "test"]
+    if not cameras or not len(gaussians.means):
+        raise InputError(f"{ply} has no Gaussians, or its cameras.json no test views: give the PLY of a run")
+    return gaussians, cameras[0]
+
+
+# Records
+
+
+def resume(
+    folder: Path,
+    settings: Mapping[str, Any],
+    jobs: Sequence[Mapping[str, Any]],
+    measure: Callable[..., Iterable[Mapping[str, Any]]],
+    warm_up: Callable[[list[Mapping[str, Any]]], None] = lambda missing: None,
+) -> list[dict[str, Any]]:
+    """Measure the jobs that have no record in the folder, and return all its records.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if it is not there.
+    settings : dict
+        On which all records depend.
+    jobs : sequence of dict
+        Keyword arguments of ``measure``, which a record has, too.
+    measure : callable
+        Returns the further entries of each record of a job.
+    warm_up : callable
+        Called with the missing jobs before the first, so that none counts the time of compiling.
+
+    Raises
+    ------
+    InputError
+        The folder belongs to other settings, or contains something else.
+    """
+    records = _read_records(folder, settings)
+    missing = [job for job in jobs if not any(job.items() <= record.items() for record in records)]
+    warm_up(missing)
+    for job in with_progress(missing, "trainings"):
+        for measured in measure(**job):
+            records.append({**job, **measured})
+            with open(folder / RUNS, "a", encoding="utf-8") as file:
+                file.write(json.dumps(records[-1]) + "\n")
+    return records
+
+
+def _read_records(folder: Path, settings: Mapping[str, Any]) -> list[dict[str, Any]]:
+    path = folder / RUNS
+    if not folder.exists():
+        folder.mkdir(parents=True)
+        path.write_text(json.dumps(settings) + "\n", encoding="utf-8")
+        return []
+    if not path.is_file():
+        raise InputError(f"{folder} exists and is not of this study: give another --out")
+    first, *lines = path.read_text(encoding="utf-8").splitlines()
+    if json.loads(first) != settings:
+        raise InputError(f"{folder} holds trainings of {first}: give another --out, or the same settings")
+    return [json.loads(line) for line in lines]
+
+
+# Measurements
+
+
+def psnr_of(image: Floats, target: Floats) -> float:
+    """Return the PSNR of an image clipped to [0, 1], dB."""
+    return float(-10 * np.log10(np.mean((np.clip(image, 0, 1).astype(np.float64) - target) ** 2)))
+
+
+def least_seconds(function: Callable[[], Any], repeats: int) -> float:
+    """Return the least processor time of a call, summed over all threads, seconds."""
+    times = []
+    for _ in range(repeats):
+        start = time.process_time()
+        function()
+        times.append(time.process_time() - start)
+    return min(times)
