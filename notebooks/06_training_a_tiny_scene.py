@@ -38,7 +38,8 @@ from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.strategy import clone_split
 from minisplat_ref.training.adam import adam_step
-from minisplat_ref.training.loop import initial_state, train
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
 from minisplat_ref.training.rates import active_sh_degree
 from minisplat_ref.training.schedule import Every, configured, scaled
 

@@ -41,7 +41,8 @@ from minisplat_ref.metrics import evaluate, psnr
 from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.strategy.blur_split import is_blurred, principal_axis_children
 from minisplat_ref.strategy.clone_split import clone_and_split, logit, random_children, screen_gradient_norms
-from minisplat_ref.training.loop import initial_state, train
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import BLEND_STATS, During, Every
 from minisplat_ref.types import Camera, Gaussians
 

@@ -34,7 +34,7 @@ from IPython.display import Markdown, display
 from figures import BLUE, GREEN, GREY, RED, show, show_code
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods.adaptive import ADAPTIVE
-from minisplat_ref.methods.adaptive_prune import LAST_SLICE
+from minisplat_ref.methods.adaptive.prune import LAST_SLICE
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import render
 from minisplat_ref.strategy.clone_split import logit
@@ -115,14 +115,14 @@ for name, log in logs.items():
 # |---|---|
 # | `minisplat_ref/methods/adaptive.py` | the recipe: grow, measure, cool down, prune |
 # | `minisplat_ref/strategy/halving.py` | one Gaussian becomes two halves |
-# | `minisplat_ref/methods/adaptive_prune.py` | what is pruned, in slices |
-# | `minisplat_ref/methods/adaptive_bands.py` | how many bands of the harmonics each Gaussian has |
+# | `minisplat_ref/methods/adaptive/prune.py` | what is pruned, in slices |
+# | `minisplat_ref/methods/adaptive/degrees.py` | how many bands of the harmonics each Gaussian has |
 # | `minisplat_ref/training/pace.py` | what was measured and decided; which views are held back |
-# | `minisplat_ref/methods/adaptive_evidence.py` | whether photographs need an exposure, or another pose |
-# | `minisplat_ref/methods/adaptive_exposure.py` | the gains of photographs |
-# | `minisplat_ref/methods/adaptive_pose.py` | the displacements of photographs |
-# | `minisplat_ref/methods/adaptive_antialiasing.py` | whether photographs differ in resolution |
-# | `minisplat_ref/methods/adaptive_sky.py` | whether there is a sky behind everything |
+# | `minisplat_ref/methods/adaptive/evidence.py` | whether photographs need an exposure, or another pose |
+# | `minisplat_ref/methods/adaptive/exposure.py` | the gains of photographs |
+# | `minisplat_ref/methods/adaptive/pose.py` | the displacements of photographs |
+# | `minisplat_ref/methods/adaptive/antialiasing.py` | whether photographs differ in resolution |
+# | `minisplat_ref/methods/adaptive/sky.py` | whether there is a sky behind everything |
 #
 # **Frames and units:** the world is in metres, work is counted in pairs (tile, Gaussian), PSNR in dB.
 #

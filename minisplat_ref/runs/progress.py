@@ -15,7 +15,7 @@ from tqdm import tqdm
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import replacing, unwritable
 from minisplat_ref.metrics import psnr
-from minisplat_ref.training.loop import StepReport
+from minisplat_ref.training.state import StepReport
 from minisplat_ref.training.pace import Cooling
 
 LOG_EVERY = 5  # iterations; a PSNR is measured as often

@@ -36,7 +36,7 @@ from minisplat_ref.studies.front import (
     write,
 )
 from minisplat_ref.studies.variants import ACTIONS, DEVIATIONS, FULL, MECHANISMS, variants_of
-from minisplat_ref.training.loop import HALF_SIZE, train
+from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import Recipe, scaled
 from minisplat_ref.types import Scene
 
@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> None:
 def count_actions(records: Sequence[Mapping[str, Any]], variants: Iterable[str]) -> dict[str, int]:
     """Return how often each mechanism fired in a full training, the least of all seeds."""
     fired = [record["fired"] for record in records if record["without"] == FULL]
-    names = {name: ACTIONS[name].__name__ if name in ACTIONS else HALF_SIZE for name in variants if name in MECHANISMS}
+    names = {name: ACTIONS[name].__name__ for name in variants if name in MECHANISMS}
     return {name: min(times.get(action, 0) for times in fired) for name, action in names.items()}
 
 

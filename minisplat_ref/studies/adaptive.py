@@ -97,7 +97,7 @@ def without_growth(recipe: Recipe) -> Recipe:
 
 def with_all_bands(recipe: Recipe) -> Recipe:
     """Return the recipe with the harmonics of 3DGS: all degrees for all Gaussians, one more every 200 iterations."""
-    actions = adaptive_bands.grow_bands, adaptive_bands.cut_bands_when_cooling
+    actions = adaptive_bands.raise_degrees, adaptive_bands.cut_degrees_when_cooling
     events = tuple(event for event in recipe.events if not does(event, *actions))
     return recipe._replace(events=events, sh_milestones=(200, 400, 600))
 

@@ -37,7 +37,7 @@ def remove_near_cameras(state: TrainState, iteration: Iteration, *, nearness: fl
     radii, is_veil = 2.0 * np.exp(g.log_scales).max(axis=1), np.zeros(n, bool)
     for camera in (view.camera for view in iteration.scene.train_views):
         x, y, z = (g.means @ camera.cam_from_world_R.T + camera.cam_from_world_t).T
-        in_front = z > iteration.conventions.near_plane
+        in_front = z > iteration.render_settings.conventions.near_plane
         if not in_front.any():
             continue
         is_near = in_front & (z < nearness * np.median(z[in_front]))

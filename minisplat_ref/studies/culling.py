@@ -36,8 +36,10 @@ from minisplat_ref.studies.front import (
     write,
 )
 from minisplat_ref.training.adam import zero_moments
-from minisplat_ref.training.loop import initial_state, train
-from minisplat_ref.training.schedule import Action, Recipe, firing_steps
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.schedule import Action, Recipe, firing_steps, without
+from minisplat_ref.training.smaller_views import halve_large_views
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Bools, Gaussians, Scene
 
@@ -54,7 +56,7 @@ def run(args: argparse.Namespace) -> None:
         The scene, the PLY or the output folder cannot be used.
     """
     scene = read_scene(args.scene, args.downscale)
-    recipe = get_recipe(RECIPE, args.iterations)._replace(half_size_until=0)
+    recipe = without(get_recipe(RECIPE, args.iterations), halve_large_views)
     state = initial_state(scene, recipe, args.seed)
     if args.ply is None:
         places: dict[str, Action] = {

@@ -49,7 +49,8 @@ from minisplat_ref.studies.front import (
     title,
     write,
 )
-from minisplat_ref.training.loop import StepReport, train
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.state import StepReport
 from minisplat_ref.training.schedule import Recipe, configured, firing_steps
 from minisplat_ref.types import Bools, Floats, Model, Scene
 

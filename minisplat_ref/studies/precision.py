@@ -45,7 +45,8 @@ from minisplat_ref.studies.front import (
     write,
 )
 from minisplat_ref.training.adam import zero_moments
-from minisplat_ref.training.loop import initial_state, train
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import Recipe, as_trained
 from minisplat_ref.training.state import StepReport, TrainState
 from minisplat_ref.types import Model, Scene

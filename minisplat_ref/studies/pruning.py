@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.methods.adaptive_prune import SLICE_MIN, prune_in_slices, prune_seen_by_few, slice_due
+from minisplat_ref.methods.adaptive.prune import SLICE_MIN, prune_in_slices, prune_seen_by_few, slice_due
 from minisplat_ref.methods.mini_splatting import prune_tail
-from minisplat_ref.rendering import Request
 from minisplat_ref.strategy.importance import indoor
 from minisplat_ref.strategy.ops import keep, n_rows
 from minisplat_ref.strategy.removal import CHANGES, RemovalCosts, worth_their_place
@@ -42,7 +41,7 @@ def prune_by_weight(
 def prune_by_exact_change(
     state: TrainState, iteration: Iteration, *, min_views: int, min_slope: float, max_pruned: float
 ) -> None:
-    """Prune as :func:`~minisplat_ref.methods.adaptive_prune.prune_in_slices`, with the gradient subtracted from S."""
+    """Prune as :func:`~minisplat_ref.methods.adaptive.prune.prune_in_slices`, with the gradient subtracted from S."""
     number = slice_due(state.pace, iteration.step)
     if number is None:
         return
@@ -61,17 +60,12 @@ def exact_costs(state: TrainState, iteration: Iteration) -> RemovalCosts:
     """
     changes, squared_error = np.zeros(n_rows(state.gaussians)), 0.0
     logits = state.gaussians.opacity_logits.astype(np.float64)
-    request = Request(
-        iteration.scene.background,
-        conventions=iteration.conventions,
-        backend=iteration.backend,
-        wants=frozenset({CHANGES}),
-    )
+    settings = iteration.render_settings
     for view in iteration.scene.train_views:
         photographed = view.loaded()
-        output, tape = iteration.renderer.render(state.model, photographed, request)
+        output, tape = settings.render(state.model, photographed, frozenset({CHANGES}))
         residual = output.image - photographed.image / np.float32(255.0)
-        v_logits = iteration.renderer.render_vjp(tape, 2 * residual, None).gaussians.opacity_logits
+        v_logits = settings.renderer.render_vjp(tape, 2 * residual, None).gaussians.opacity_logits
         changes += output.extras[CHANGES] - v_logits * (1 + np.exp(logits))  # v_logit = o (1 - o) v_o
         squared_error += float(np.sum(residual**2, dtype=np.float64))
     return RemovalCosts(changes, squared_error)

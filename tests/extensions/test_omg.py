@@ -24,7 +24,7 @@ from minisplat_ref.extensions.omg.svq import fit_codes, quantise
 from minisplat_ref.methods.mini_splatting import MINI_SPLATTING, prune_tail
 from minisplat_ref.rendering import SPLATTING
 from minisplat_ref.strategy.importance import indoor
-from minisplat_ref.training.loop import initial_state
+from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.schedule import action_name
 from minisplat_ref.training.state import Iteration
 from minisplat_ref.types import Gaussians

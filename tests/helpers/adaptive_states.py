@@ -6,7 +6,7 @@ from minisplat_ref.backends import CPU
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.methods.adaptive import ADAPTIVE
 from minisplat_ref.training.adam import zero_moments
-from minisplat_ref.training.loop import initial_state
+from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.state import Iteration
 
 

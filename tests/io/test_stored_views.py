@@ -28,7 +28,8 @@ from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.runs import fingerprint, room, run_folder
 from minisplat_ref.runs.scoring import Trained
-from minisplat_ref.training.loop import initial_state, train
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
 from minisplat_ref.training.losses import LossTerm
 from minisplat_ref.types import View, view_from
 from photo_scenes import DISTORTED, HEIGHT, WIDTH, colored_image, write_colmap, write_transforms

@@ -16,7 +16,9 @@ from minisplat_ref.rendering import render, render_vjp
 from minisplat_ref.strategy import depth_reinit, importance, simplify, visibility
 from minisplat_ref.strategy.initialization import from_points
 from minisplat_ref.strategy.ops import n_rows
-from minisplat_ref.training.loop import initial_state, load_state, save_state, train
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.saved_state import load_state, save_state
 from minisplat_ref.training.schedule import At, Every, configured, scaled
 from minisplat_ref.training.state import Iteration, n_pixels
 from minisplat_ref.types import Scene, View

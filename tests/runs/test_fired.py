@@ -17,7 +17,7 @@ from minisplat_ref.methods.gaussian_splatting import clone_and_split, collect_gr
 from minisplat_ref.runs import events
 from minisplat_ref.runs.events import count_published_times, describe, mechanisms, never_fired
 from minisplat_ref.runs.progress import Progress, read_log
-from minisplat_ref.training.loop import HALF_SIZE
+
 from minisplat_ref.training.schedule import At, During, Every
 from minisplat_ref.training.state import FiredEvent
 

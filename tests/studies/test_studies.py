@@ -12,7 +12,7 @@ from minisplat_ref.methods import gaussian_splatting, get_recipe, mini_splatting
 from minisplat_ref.strategy.blur_split import principal_axis_children
 from minisplat_ref.strategy.clone_split import random_children
 from minisplat_ref.studies import FIGURE, RESULT, all_studies, split_forms
-from minisplat_ref.training.loop import initial_state
+from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.schedule import does
 from tolerances import PRINTED_DIGITS
 

@@ -13,8 +13,8 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.io.scene import half_size
 from minisplat_ref.methods import adaptive_exposure
 from minisplat_ref.methods.adaptive import GAIN_MIN
-from minisplat_ref.methods.adaptive_antialiasing import switch_antialiasing_on
-from minisplat_ref.methods.adaptive_evidence import Evidence
+from minisplat_ref.methods.adaptive.antialiasing import switch_antialiasing_on
+from minisplat_ref.methods.adaptive.evidence import Evidence
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.training.calibration import EXPOSURES
 from minisplat_ref.training.compensation import COMPENSATION, compensation, with_compensation

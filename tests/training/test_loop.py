@@ -19,7 +19,9 @@ from minisplat_ref.extensions.geometry.weights import GeometricWeights
 from minisplat_ref.methods import RECIPES, gaussian_splatting
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import render
-from minisplat_ref.training.loop import initial_state, load_state, save_state, train
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.saved_state import load_state, save_state
 from minisplat_ref.training.rates import LogLinear
 from minisplat_ref.training.schedule import BLEND_STATS, At, During, configured
 from minisplat_ref.training.state import FiredEvent

@@ -26,7 +26,9 @@ from minisplat_ref.strategy.ops import take
 from minisplat_ref.strategy.simplify import by_rank, merge_neighbours
 from minisplat_ref.training.adam import AdamRule, AdamState, adam_step, zero_moments
 from minisplat_ref.training.calibration import EXPOSURES, POSE, ROTATIONS, SHIFTS
-from minisplat_ref.training.loop import initial_state, load_state, save_state, train
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.saved_state import load_state, save_state
 from minisplat_ref.training.losses import Cotangents, LossTerm, Rendered, photometric, total_loss
 from minisplat_ref.training.rates import LogLinear, Rates, Rewind
 from minisplat_ref.training.representation import Representation

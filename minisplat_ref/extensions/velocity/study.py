@@ -20,7 +20,8 @@ from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import Request
 from minisplat_ref.studies.study import Study
-from minisplat_ref.training.loop import initial_state, train
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import Recipe, scaled
 from minisplat_ref.types import Camera, Gaussians, Model, Scene, View, numbered, view_from
 

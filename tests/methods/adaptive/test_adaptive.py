@@ -16,13 +16,15 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.io.checkpoint import DamagedCheckpoint, load_checkpoint, save_checkpoint
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.methods.adaptive import ADAPTIVE, grow, proceed_when_little_is_gained
-from minisplat_ref.methods.adaptive_prune import N_SLICES, prune_in_slices, slice_due
+from minisplat_ref.methods.adaptive.prune import N_SLICES, prune_in_slices, slice_due
 from minisplat_ref.methods.mini_splatting import measure_importance
 from minisplat_ref.rendering import SPLATTING
 from minisplat_ref.strategy.error_weights import collect_error_weights
 from minisplat_ref.strategy.halving import halves
 from minisplat_ref.strategy.removal import collect_removal_costs
-from minisplat_ref.training.loop import initial_state, load_state, save_state, train
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.saved_state import load_state, save_state
 from minisplat_ref.training.pace import (
     Cooling,
     Measurement,

@@ -11,7 +11,9 @@ from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods.adaptive import ADAPTIVE, halve_large_views
 from minisplat_ref.runs.decisions_report import decisions_section, story
-from minisplat_ref.training.loop import initial_state, load_state, save_state, train
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.saved_state import load_state, save_state
 from minisplat_ref.training.pace import COOLED, FINER, Decision, Measurement, Pace, from_metadata, to_metadata
 from minisplat_ref.training.schedule import configured
 from minisplat_ref.training.state import Iteration
