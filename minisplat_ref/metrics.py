@@ -128,7 +128,7 @@ def evaluate(
     if network is not None:
         check_views(network, views)
     per_view = []
-    for view in (view.loaded() for view in views):
+    for view in (view.load() for view in views):
         image = np.clip(settings.render(model, view)[0].image, 0.0, 1.0)  # [H, W, 3]
         metrics = ViewMetrics(
             view.name,

@@ -306,7 +306,7 @@ class View(NamedTuple):
     time: float = 0.0
     """When it was taken, in the scene's own unit, usually from 0 to 1; for scenes that move."""
 
-    def loaded(self) -> "View":
+    def load(self) -> "View":
         """Return a view that holds its pixels: itself, or a copy if the view reads its pixels on demand.
 
         Scenes whose photographs do not fit into memory have such views:

@@ -44,7 +44,7 @@ from minisplat_ref.oracle.differences import (
 )
 from minisplat_ref.oracle.gradients import inner_product_case, jacobian_case
 from minisplat_ref.oracle.pieces import tiny_setting
-from minisplat_ref.oracle.planted import PLANTED, planted
+from minisplat_ref.oracle.planted import PLANTED, plant
 from minisplat_ref.oracle.setting import Setting, make_setting
 from minisplat_ref.oracle.stages import composite_stage, project_stage, render_stage, sh_stage
 from minisplat_ref.oracle.tolerances import GRADIENT_REL, GRADIENT_REL_NEAR_THRESHOLD
@@ -216,7 +216,7 @@ scenes = {
     "all behind the camera": small._replace(gaussians=tiny_gaussians._replace(means=tiny_gaussians.means * [1, 1, -1])),
     "as it should be": small,
 }
-wrong_backend = planted("transposed-rs", REFERENCE)
+wrong_backend = plant("transposed-rs", REFERENCE)
 vacuous = {}
 figure, axes = plt.subplots(1, 3, figsize=(9, 2.6))
 for axis, (name, scene) in zip(axes, scenes.items(), strict=True):
@@ -352,7 +352,7 @@ def is_found(backend):
 
 found = {"no error": is_found(REFERENCE)}
 for error in (*gradient_errors, *forward_errors):
-    found[error.name] = is_found(planted(error.name, REFERENCE))
+    found[error.name] = is_found(plant(error.name, REFERENCE))
 
 table = np.array(list(found.values()), dtype=int)
 figure, axis = plt.subplots(figsize=(6.5, 5))
@@ -397,7 +397,7 @@ error_name, step = "half-off-diagonal", 1e-5
 print("choose from:", ", ".join(error.name for error in PLANTED))
 
 gaps = {}
-for label, backend in (("right", REFERENCE), (error_name, planted(error_name, REFERENCE))):
+for label, backend in (("right", REFERENCE), (error_name, plant(error_name, REFERENCE))):
     mine = render_stage(backend, branches)
 
     def unguarded(*arrays, function=mine.function):

@@ -49,7 +49,7 @@ from minisplat_ref.oracle.comparison.staged import compare_scene, first_divergen
 from minisplat_ref.oracle.golden.files import export
 from minisplat_ref.oracle.golden.running import run_stages
 from minisplat_ref.oracle.golden.scenes import Recipe, inputs, truth
-from minisplat_ref.oracle.planted import planted
+from minisplat_ref.oracle.planted import plant
 
 
 def show_digits(axes, given, expected, title, lowest=-16):
@@ -77,7 +77,7 @@ def cosine(a, b):
 # %%
 RECIPE = Recipe("picture", "250 Gaussians to look at", GSPLAT_MAIN, (96, 64), sh_degree=2, scales=(0.03, 0.3), n=250)
 scene = truth(inputs(RECIPE))
-suspect = planted("half-off-diagonal", CPU)
+suspect = plant("half-off-diagonal", CPU)
 suspected = run_stages(suspect, scene, "float64")  # by itself, from the scene to the gradients
 a = scene.arrays
 
@@ -211,7 +211,7 @@ plt.show()
 
 # %%
 turned = with_planted_error("transposed-view", "float64")
-transposed = run_stages(planted("transposed-view", CPU), scene, "float64")
+transposed = run_stages(plant("transposed-view", CPU), scene, "float64")
 
 figure, axes = plt.subplots(1, 4, figsize=(11, 2.3))
 show(axes[0], a["image"], "reference")
@@ -242,7 +242,7 @@ for angle in np.radians(angles):
     points = level.arrays["means"] @ level.camera.cam_from_world_R.T + t  # the same view, another world frame
     level = level._replace(arrays=level.arrays | {"means": (points - t) @ R, "cam_from_world_R": R})
     right = run_stages(REFERENCE, level, "float64")
-    wrong = run_stages(planted("transposed-view", REFERENCE), level, "float64")
+    wrong = run_stages(plant("transposed-view", REFERENCE), level, "float64")
     errors.append([np.abs(wrong[key] - right[key]).max() / np.abs(right[key]).max() for key in ("conics", "image")])
 errors = np.array(errors)
 

@@ -40,7 +40,7 @@ from minisplat_ref.bench.judging import backward, expect, failure, forward, judg
 from minisplat_ref.bench.judging import relative_errors as by_parameter
 from minisplat_ref.bench.workloads import synth
 from minisplat_ref.constants import GSPLAT_MAIN
-from minisplat_ref.oracle.planted import planted
+from minisplat_ref.oracle.planted import plant
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_GRADIENT, BENCH_FLOAT32_IMAGE, BENCH_FLOAT64
 from minisplat_ref.reference.hits import tile_hits
 from minisplat_ref.types import TileGrid
@@ -232,7 +232,7 @@ plt.show()
 # one line of its gradient.
 
 # %% tags=["clock"]
-wrong = contenders["cpu-f32"]._replace(name="planted", backend=planted("half-off-diagonal"))
+wrong = contenders["cpu-f32"]._replace(name="planted", backend=plant("half-off-diagonal"))
 small = synth(4_000, width=96, height=54, focal=80.0)
 runners = [contenders[name] for name in contenders if "exp6" not in name and "exp4" not in name]
 cases = benchmark(small, [*runners, wrong], repeats=3)

@@ -99,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.training.interruption import terminated_like_interrupted
 
     given = vars(args)
-    plan = _resumed(given) if "resume" in given else _new(given)
+    plan = _resume(given) if "resume" in given else _new(given)
     scene = check(plan)
     stages = statuses(plan)
     if any(stage != "finished" for stage in stages):
@@ -133,7 +133,7 @@ def _new(given: dict[str, Any]) -> "Plan":
     return Plan(scene=Path(given["scene"]), folder=given["out"], recipes=given["recipes"], **options)
 
 
-def _resumed(given: dict[str, Any]) -> "Plan":
+def _resume(given: dict[str, Any]) -> "Plan":
     from minisplat_ref.comparison.plan import load_plan
 
     surplus = [option_name(name) for name in ("scene", "recipes", "out", *DEFAULTS) if name in given]

@@ -43,7 +43,7 @@ def choose_crops(models: Sequence[Trained], scene: Scene) -> list[Crop]:
     scene : Scene
         Its test views are shown.
     """
-    pairs = [_best_crops(models, view.loaded()) for view in scene.test_views]
+    pairs = [_best_crops(models, view.load()) for view in scene.test_views]
     n_different = (min(N_CROPS, len(pairs)) + 1) // 2 if len(models) > 1 else 0
     pairs.sort(key=lambda pair: pair[0].score, reverse=True)
     different, others = pairs[:n_different], pairs[n_different:]

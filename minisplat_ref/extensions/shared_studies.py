@@ -96,7 +96,7 @@ def shrunk(scene: Scene, n: int) -> Scene:
         return scene
     views = []
     for view in scene.train_views:
-        photograph = view.loaded()
+        photograph = view.load()
         camera = zoom_camera(photograph.camera, 1 / n)
         if min(camera.width, camera.height) < 16:
             raise InputError(f"photograph {view.name} at 1/{n} of its size has fewer than 16 pixels: lower --downscale")

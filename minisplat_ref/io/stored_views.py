@@ -112,7 +112,7 @@ class Photograph:
 class StoredView(View):
     """A view whose image and mask are read again at every access, unless they stay in memory.
 
-    Code that needs both, or one of them twice, calls :meth:`loaded` once. In place of the image the tuple has a
+    Code that needs both, or one of them twice, calls :meth:`load` once. In place of the image the tuple has a
     :class:`Photograph`.
     """
 
@@ -133,7 +133,7 @@ class StoredView(View):
         """Return the mask [H, W] or None, as for any view."""
         return self.photograph.pixels().mask
 
-    def loaded(self) -> View:
+    def load(self) -> View:
         """Return a view that holds its pixels."""
         image, mask = self.photograph.pixels()
         return View(*self)._replace(image=image, mask=mask)
@@ -141,7 +141,7 @@ class StoredView(View):
     def _replace(self, **fields: Any) -> View:  # type: ignore[override]
         """Return the view with other fields; with another image or mask it has both in memory."""
         if fields.keys() & {"image", "mask"}:
-            return self.loaded()._replace(**fields)
+            return self.load()._replace(**fields)
         return super()._replace(**fields)
 
     def changed(self, change: Callable[[Pixels], Pixels]) -> View:
@@ -200,7 +200,7 @@ class ReadingAhead(AbstractContextManager["ReadingAhead"]):
             The view that is needed next, if known; the thread starts to read its photograph.
         """
         expected, self._next = self._next, None
-        loaded = expected[1].result() if expected is not None and expected[0] is view else view.loaded()
+        loaded = expected[1].result() if expected is not None and expected[0] is view else view.load()
         if isinstance(following, StoredView):
-            self._next = following, self._executor.submit(following.loaded)
+            self._next = following, self._executor.submit(following.load)
         return loaded

@@ -22,7 +22,7 @@ from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.gradients import inner_product_case, jacobian_case
 from minisplat_ref.oracle.pieces import SEED, tiny_setting
 from minisplat_ref.oracle.setting import POSE, Setting, make_setting
-from minisplat_ref.oracle.stages import Stage, watched
+from minisplat_ref.oracle.stages import Stage, watch
 from minisplat_ref.rendering import Request
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.types import Camera, Floats, Gaussians, Model, RenderOutput, Scene, View
@@ -111,7 +111,7 @@ def model_stage(backend: Backend, setting: Setting, representation: Representati
         return {"background": setting.background, **held, **dict(zip(inputs, args, strict=True))}
 
     def function(*args: Floats) -> Point:
-        on_watch, sides = watched(backend)
+        on_watch, sides = watch(backend)
         output, _ = draw(arrays_of(args), on_watch)
         return Point((output.image, output.alpha), tuple(sides))
 

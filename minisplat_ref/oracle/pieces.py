@@ -38,7 +38,7 @@ def tiny_setting(conventions: Conventions = GSPLAT_MAIN, sh_degree: int = 1) -> 
     return make_setting(np.random.default_rng(SEED), 5, 9, 7, conventions, sh_degree)
 
 
-def projected(setting: Setting) -> tuple[Projection, TileBins]:
+def project_setting(setting: Setting) -> tuple[Projection, TileBins]:
     """Return footprints and tile lists, computed by the reference."""
     backend, camera, conventions = with_module(), setting.camera, setting.conventions
     projection = backend.project(*setting.primitives, camera, conventions)
@@ -161,7 +161,7 @@ def _sh_pieces(m: Module) -> tuple[Stage, ...]:
     return (sh_stage(stages, tiny_setting(sh_degree=3)),)
 
 
-def _slanted(hits: Module) -> Response:
+def _slant(hits: Module) -> Response:
     """Return the conic with depths and colours that vary over the Gaussian; pixels sort two hits at a time."""
 
     def hit(projection: Projection, ids: Ints, centers: Floats) -> Hit:
@@ -185,7 +185,7 @@ def _slanted(hits: Module) -> Response:
 
 def _blending_stage(compositing: Module, response: Response) -> Stage:
     """Return ``composite_hits`` of a response to projected Gaussians; tile lists and boxes are fixed."""
-    plain, p, bins = composite_stage(with_module(), tiny_setting()), *projected(tiny_setting())
+    plain, p, bins = composite_stage(with_module(), tiny_setting()), *project_setting(tiny_setting())
 
     def moved(means2d: Floats, conics: Floats, opacities: Floats) -> Projection:
         return p._replace(means2d=means2d, conics=conics, opacities=opacities)
@@ -206,12 +206,12 @@ def _blending_stage(compositing: Module, response: Response) -> Stage:
 
 
 def _hits_pieces(m: Module) -> tuple[Stage, ...]:
-    return (_blending_stage(reference.compositing, _slanted(m)),)
+    return (_blending_stage(reference.compositing, _slant(m)),)
 
 
 def _compositing_pieces(m: Module) -> tuple[Stage, ...]:
     stage = composite_stage(with_module(composite=m.composite, composite_vjp=m.composite_vjp), tiny_setting())
-    return stage, _blending_stage(m, _slanted(reference.hits))
+    return stage, _blending_stage(m, _slant(reference.hits))
 
 
 PIECES: dict[ModuleType, Callable[[Module], tuple[Stage, ...]]] = {

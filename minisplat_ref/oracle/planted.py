@@ -55,7 +55,7 @@ class Planted(NamedTuple):
         return not self.stage.startswith("v_")
 
 
-def planted(name: str, backend: Backend = CPU) -> Backend:
+def plant(name: str, backend: Backend = CPU) -> Backend:
     """Return a backend with one error.
 
     Parameters
@@ -86,18 +86,18 @@ def _corner_pixels(base: Backend) -> Backend:
     def project(
         means: Floats, quats: Floats, scales: Floats, opacities: Floats, camera: Camera, conventions: Conventions
     ) -> Projection:
-        return base.project(means, quats, scales, opacities, _shifted(camera), conventions)
+        return base.project(means, quats, scales, opacities, _shift(camera), conventions)
 
     @wraps(base.project_vjp)
     def project_vjp(
         means: Floats, quats: Floats, scales: Floats, opacities: Floats, camera: Camera, *rest: Any, **named: Any
     ) -> PrimitiveGradient:
-        return base.project_vjp(means, quats, scales, opacities, _shifted(camera), *rest, **named)
+        return base.project_vjp(means, quats, scales, opacities, _shift(camera), *rest, **named)
 
     return replace(base, project=project, project_vjp=project_vjp)
 
 
-def _shifted(camera: Camera) -> Camera:
+def _shift(camera: Camera) -> Camera:
     return camera._replace(cx=camera.cx - 0.5, cy=camera.cy - 0.5)
 
 

@@ -14,7 +14,7 @@ from minisplat_ref.backends import Backend
 from minisplat_ref.gsplat_compat import rasterization, rasterization_vjp
 from minisplat_ref.oracle.differences import Point
 from minisplat_ref.oracle.setting import Setting
-from minisplat_ref.oracle.stages import Stage, watched
+from minisplat_ref.oracle.stages import Stage, watch
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.types import Floats
 
@@ -98,7 +98,7 @@ def rasterization_stage(
         return {**given, "viewmats": np.concatenate([given["viewmats"], last_rows], axis=1)}
 
     def function(*args: Floats) -> Point:
-        on_watch, sides = watched(backend)
+        on_watch, sides = watch(backend)
         image, alpha, _ = rasterization(**arguments(args), **fixed, backend=on_watch)
         return Point((image, alpha), tuple(sides))
 

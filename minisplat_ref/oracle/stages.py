@@ -79,7 +79,7 @@ def project_stage(backend: Backend, setting: Setting) -> Stage:
     inputs = {**setting.primitives._asdict(), **setting.pose}
 
     def function(means: Floats, quats: Floats, scales: Floats, opacities: Floats, R: Floats, t: Floats) -> Point:
-        moved = _moved(camera, R, t)
+        moved = _move_camera(camera, R, t)
         p = backend.project(means, quats, scales, opacities, moved, conventions)
         return Point(
             (p.means2d, p.depths, p.conics, p.opacities), (p.radii > 0, slope_sides(means, moved, conventions))
@@ -102,7 +102,7 @@ def sh_stage(backend: Backend, setting: Setting) -> Stage:
     inputs = {"means": g.means, "sh_dc": g.sh_dc, "sh_rest": g.sh_rest, **setting.pose}
 
     def function(means: Floats, sh_dc: Floats, sh_rest: Floats, R: Floats, t: Floats) -> Point:
-        colors = backend.sh_colors(means, sh_dc, sh_rest, _moved(camera, R, t), degree, radii)
+        colors = backend.sh_colors(means, sh_dc, sh_rest, _move_camera(camera, R, t), degree, radii)
         return Point((colors,), (colors > 0,))
 
     def vjp(v_colors: Floats) -> tuple[Floats, ...]:
@@ -113,7 +113,7 @@ def sh_stage(backend: Backend, setting: Setting) -> Stage:
 
 def composite_stage(backend: Backend, setting: Setting) -> Stage:
     """Return ``composite`` of footprints, opacities, three channels and background; tile lists and boxes are fixed."""
-    projection, bins, colors = _composited(backend, setting)
+    projection, bins, colors = _prepare_compositing(backend, setting)
     conventions, background = setting.conventions, setting.background
     inputs = {
         "means2d": projection.means2d,
@@ -137,7 +137,7 @@ def composite_stage(backend: Backend, setting: Setting) -> Stage:
 
 def surface_stage(backend: Backend, setting: Setting) -> Stage:
     """Return ``surface_points`` of Gaussians, for the view's dominant ones, one of them moved behind the camera."""
-    projection, bins, colors = _composited(backend, setting)
+    projection, bins, colors = _prepare_compositing(backend, setting)
     output = backend.composite(projection, colors, setting.background, bins, setting.conventions, with_stats=True)
     ids, camera = output.stats.dominant_ids, setting.camera  # type: ignore[union-attr]  # stats were asked for
     means, quats, scales, _ = setting.primitives
@@ -173,13 +173,20 @@ def photometric_stage(backend: Backend, camera: Camera, rng: np.random.Generator
 
 def splat_stage(backend: Backend, setting: Setting, module: object = splatting, *, with_depth: bool = True) -> Stage:
     """Return ``splat`` as a function of activated Gaussians, colours, background and pose."""
-    _, _, colors = _composited(backend, setting)
+    _, _, colors = _prepare_compositing(backend, setting)
     _, camera, background, conventions = setting
     inputs = {**setting.primitives._asdict(), "colors": colors, "background": background, **setting.pose}
 
     def tape_of(*args: Floats) -> splatting.SplatTape:
         *primitives, colors, background, R, t = args
-        view = Primitives(*primitives), lambda radii: colors, _moved(camera, R, t), background, conventions, backend
+        view = (
+            Primitives(*primitives),
+            lambda radii: colors,
+            _move_camera(camera, R, t),
+            background,
+            conventions,
+            backend,
+        )
         return module.splat(*view, with_depth=with_depth)  # type: ignore[attr-defined]
 
     def vjp(v_image: Floats, v_alpha: Floats) -> tuple[Floats, ...]:
@@ -204,7 +211,7 @@ def render_stage(backend: Backend, setting: Setting, module: object = rendering)
         *parameters, background, R, t = args
         _, tape = module.render(  # type: ignore[attr-defined]
             Gaussians(*parameters),
-            _moved(camera, R, t),
+            _move_camera(camera, R, t),
             background=background,
             conventions=conventions,
             backend=backend,
@@ -229,11 +236,11 @@ def with_module(**functions: object) -> Backend:
     return dataclasses.replace(REFERENCE, **functions)  # type: ignore[arg-type]
 
 
-def _moved(camera: Camera, R: Floats, t: Floats) -> Camera:
+def _move_camera(camera: Camera, R: Floats, t: Floats) -> Camera:
     return camera._replace(cam_from_world_R=R, cam_from_world_t=t)
 
 
-def _composited(backend: Backend, setting: Setting) -> tuple[Projection, TileBins, Floats]:
+def _prepare_compositing(backend: Backend, setting: Setting) -> tuple[Projection, TileBins, Floats]:
     """Return footprints, tile lists and degree-0 colours of the scene, to start in the middle of the pipeline."""
     camera, conventions = setting.camera, setting.conventions
     projection = backend.project(*setting.primitives, camera, conventions)
@@ -263,7 +270,7 @@ def slope_sides(means: Floats, camera: Camera, conventions: Conventions) -> np.n
     return pinhole_jacobians(in_camera, camera, *slope_limits(camera, conventions, means.dtype)) == free
 
 
-def watched(backend: Backend) -> tuple[Backend, list[np.ndarray]]:
+def watch(backend: Backend) -> tuple[Backend, list[np.ndarray]]:
     """Return the backend, and a list to which its stages append the sides of their thresholds."""
     sides: list[np.ndarray] = []
 

@@ -70,15 +70,15 @@ def views() -> tuple[View, ...]:
     rng = np.random.default_rng(SEED)
     z = rng.uniform(2, 4, size=N_GAUSSIANS)
     means = np.column_stack([rng.uniform(-0.25, 0.25, size=(N_GAUSSIANS, 2)) * z[:, None], z])
-    quats = _rounded(rng.normal(size=(N_GAUSSIANS, 4)))
-    scales = _rounded(np.exp(rng.uniform(np.log(0.03), np.log(0.3), size=(N_GAUSSIANS, 3))))
+    quats = _round_to_float32(rng.normal(size=(N_GAUSSIANS, 4)))
+    scales = _round_to_float32(np.exp(rng.uniform(np.log(0.03), np.log(0.3), size=(N_GAUSSIANS, 3))))
     needles = scales.copy()
     needles[:, 0], needles[:, 1:] = 3.0, 1e-3
     far = np.array([1e6, -5e5, 2.5e5])
     return (
-        View("ordinary", _rounded(means), quats, scales, _camera(np.zeros(3))),
-        View("needles", _rounded(means), quats, _rounded(needles), _camera(np.zeros(3))),
-        View("far world", _rounded(means + far), quats, scales, _camera(far)),
+        View("ordinary", _round_to_float32(means), quats, scales, _camera(np.zeros(3))),
+        View("needles", _round_to_float32(means), quats, _round_to_float32(needles), _camera(np.zeros(3))),
+        View("far world", _round_to_float32(means + far), quats, scales, _camera(far)),
     )
 
 
@@ -140,7 +140,7 @@ def _view_cases(view: View) -> Iterator[Case]:
     depths = (view.means @ view.camera.cam_from_world_R.T + view.camera.cam_from_world_t)[:, 2]
     reach = 1 + np.linalg.norm(view.means, axis=1) / depths
     stretch = reach * [float(mp.cond(B)) for _, B in truths]
-    results = [_projected(b, view, dtype) for b, dtype in ((REFERENCE, float), (CPU, "f4"), (REFERENCE, "f4"))]
+    results = [_project(b, view, dtype) for b, dtype in ((REFERENCE, float), (CPU, "f4"), (REFERENCE, "f4"))]
 
     pixels = [[_errors(p, got) for (p, _), got in zip(truths, result.means2d, strict=True)] for result in results]
     yield _case(f"means2d, {view.name}", reach, *np.array(pixels))
@@ -155,11 +155,11 @@ def _view_cases(view: View) -> Iterator[Case]:
 def _transmittance_cases() -> Iterator[Case]:
     rng = np.random.default_rng(SEED)
     n, center = N_LAYERS, np.array([4.5, 4.5])
-    means2d = _rounded(center + rng.uniform(-1, 1, size=(n, 2)))
-    conics = _rounded(
+    means2d = _round_to_float32(center + rng.uniform(-1, 1, size=(n, 2)))
+    conics = _round_to_float32(
         np.column_stack([rng.uniform(0.1, 0.4, n), rng.uniform(-0.08, 0.08, n), rng.uniform(0.1, 0.4, n)])
     )
-    opacities = _rounded(rng.uniform(0.1, 0.6, size=n))
+    opacities = _round_to_float32(rng.uniform(0.1, 0.6, size=n))
     truth = true_transmittance(means2d, conics, opacities, center)
     conventions = GSPLAT_MAIN._replace(transmittance_min=0.0)  # no pixel is finished
 
@@ -197,7 +197,7 @@ def _case(
     return Case(name, not problems, figures, "; ".join(problems))
 
 
-def _projected(backend: Backend, view: View, dtype: Any) -> Projection:
+def _project(backend: Backend, view: View, dtype: Any) -> Projection:
     means, quats, scales = (x.astype(dtype) for x in (view.means, view.quats, view.scales))
     return backend.project(means, quats, scales, np.full(N_GAUSSIANS, 0.5, dtype), view.camera, GSPLAT_MAIN)
 
@@ -228,7 +228,7 @@ def _camera(offset: Floats) -> Camera:
     return Camera(R, -R @ center, 500.0, 480.0, 530.0, 435.0, 1040, 880)
 
 
-def _rounded(array: Floats) -> Floats:
+def _round_to_float32(array: Floats) -> Floats:
     return array.astype(np.float32).astype(np.float64)
 
 

@@ -48,7 +48,7 @@ def _hash(view: View) -> str:
     if not isinstance(view, StoredView):
         return _hash_of_pixels(view)
     if view.photograph not in _HASHES:
-        _HASHES[view.photograph] = _hash_of_pixels(view.loaded())
+        _HASHES[view.photograph] = _hash_of_pixels(view.load())
     return _HASHES[view.photograph]
 
 

@@ -119,7 +119,7 @@ def _views(folder: Path, views: list[dict[str, Any]]) -> str:
         strip = read_image(folder / run_folder.RENDERS / f"{stems[view['name']]}.png")
         pictures = (fit_image(picture, LARGEST) for picture in split_images(strip, 3))
         rank = f" ({ranked.index(view) + 1} of {len(ranked)})" if len(ranked) > 1 else ""
-        panels.append(view_panel(f"{view['name']}{rank}: {_measured(view)}", *pictures))
+        panels.append(view_panel(f"{view['name']}{rank}: {_describe_measures(view)}", *pictures))
     how = f" Shown are {n} of {len(ranked)}, from the worst to the best." if n < len(ranked) else " The worst is first."
     has_lpips = ranked[0]["lpips"] is not None
     heading = ["view", "PSNR (dB)", "SSIM", *(["LPIPS"] if has_lpips else [])]
@@ -135,7 +135,7 @@ def _views(folder: Path, views: list[dict[str, Any]]) -> str:
     return section("Held-out views", paragraph(VIEWS_TEXT + how), *panels, table(cells, heading))
 
 
-def _measured(view: dict[str, Any]) -> str:
+def _describe_measures(view: dict[str, Any]) -> str:
     return f"PSNR {_decibels(view['psnr'])}, SSIM {view['ssim']:.3f}"
 
 

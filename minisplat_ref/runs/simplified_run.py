@@ -82,7 +82,7 @@ def _pictures(run: Run, model: Model) -> dict[str, Image8]:
 def _render_both(run: Run, model: Model) -> list[Shown]:
     """Return the first test views as the run and the new model draw them."""
     before, after = _pictures(run, run.model), _pictures(run, model)
-    views = [view.loaded() for view in run.scene.test_views[:N_SHOWN]]
+    views = [view.load() for view in run.scene.test_views[:N_SHOWN]]
     return [Shown(view.name, view.image, before[view.name], after[view.name]) for view in views]
 
 

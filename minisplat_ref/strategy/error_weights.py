@@ -35,7 +35,7 @@ def collect_error_weights(model: Any, views: Sequence[View], settings: RenderSet
     model = as_model(model)
     weights = np.zeros(n_rows(model.gaussians))
     for view in views:
-        photographed = view.loaded()
+        photographed = view.load()
         output, tape = settings.render(model, photographed)
         errors = np.abs(output.image - photographed.image / output.image.dtype.type(255)).mean(axis=2)  # [H, W]
         if photographed.mask is not None:

@@ -59,7 +59,7 @@ def collect_removal_costs(model: Any, views: Sequence[View], settings: RenderSet
     wants, renderer = frozenset({CHANGES}), settings.renderer
     rgb = renderer.channels(wants)["rgb"]
     for view in views:
-        photographed = view.loaded()
+        photographed = view.load()
         output, _ = settings.render(model, photographed, wants)
         if CHANGES not in output.extras:
             raise InputError(f"renderer {renderer.name} does not say what the removal of a Gaussian changes")

@@ -69,7 +69,7 @@ def multiplied(scene: Scene, gains: Floats) -> Scene:
     """Return the scene with its training photographs multiplied by ``gains`` [V]; test photographs stay."""
     views = []
     for view, gain in zip(scene.train_views, gains, strict=True):
-        view = view.loaded()
+        view = view.load()
         views.append(view._replace(image=np.clip(np.round(gain * view.image), 0, 255).astype(np.uint8)))
     return scene._replace(train_views=tuple(views))
 

@@ -62,7 +62,7 @@ def exact_costs(state: TrainState, iteration: Iteration) -> RemovalCosts:
     logits = state.gaussians.opacity_logits.astype(np.float64)
     settings = iteration.render_settings
     for view in iteration.scene.train_views:
-        photographed = view.loaded()
+        photographed = view.load()
         output, tape = settings.render(state.model, photographed, frozenset({CHANGES}))
         residual = output.image - photographed.image / np.float32(255.0)
         v_logits = settings.renderer.render_vjp(tape, 2 * residual, None).gaussians.opacity_logits

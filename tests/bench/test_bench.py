@@ -36,7 +36,7 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.images import read_image
 from minisplat_ref.jit.compile import cache_root
-from minisplat_ref.oracle.planted import planted
+from minisplat_ref.oracle.planted import plant
 from minisplat_ref.oracle.thresholds import thresholds_of_view
 from minisplat_ref.oracle.tolerances import (
     BENCH_FLOAT32_GRADIENT,
@@ -110,7 +110,7 @@ def test_ratios_are_of_the_least_times(cases):
     assert reference.figures["x textbook"] is None and reference.figures["x textbook, forward"] is None
 
 
-@pytest.mark.parametrize("backend", [CPU, planted("half-off-diagonal")], ids=["right", "half-off-diagonal"])
+@pytest.mark.parametrize("backend", [CPU, plant("half-off-diagonal")], ids=["right", "half-off-diagonal"])
 def test_rasterization_is_judged_as_render_is(backend):
     """In float64 its image and gradient are the reference's, activations included, or it gets no time."""
     bounds = BENCH_FLOAT64, BENCH_FLOAT64
@@ -133,7 +133,7 @@ def with_pixel(value):
 
 @pytest.mark.parametrize(
     ("backend", "reason"),
-    [(planted("half-off-diagonal"), "gradient of"), (with_pixel(1.001), "1 pixels"), (with_pixel(np.nan), "1 pixels")],
+    [(plant("half-off-diagonal"), "gradient of"), (with_pixel(1.001), "1 pixels"), (with_pixel(np.nan), "1 pixels")],
     ids=["half-off-diagonal", "pixel", "nan"],
 )
 def test_a_wrong_backend_gets_no_time(backend, reason):
@@ -265,7 +265,7 @@ def test_the_page_in_a_browser(bench_folder, browser):
 
 def test_command_fails_with_a_wrong_backend(monkeypatch, tmp_path, capsys):
     listed = contenders.all_contenders()
-    wrong = {**listed, "cpu-f32": listed["cpu-f32"]._replace(backend=planted("half-off-diagonal"))}
+    wrong = {**listed, "cpu-f32": listed["cpu-f32"]._replace(backend=plant("half-off-diagonal"))}
     monkeypatch.setattr(contenders, "all_contenders", lambda: wrong)
     file = tmp_path / "bench.json"
     args = ["bench", "--workloads", "synth", "--backends", "cpu-f32", "--repeats", "1", "--json", str(file)]

@@ -148,10 +148,10 @@ def test_views_are_those_that_memory_would_hold(name, tmp_path, monkeypatch):
             for a, b in ((view, other), (half_size(view), half_size(other)), (view._replace(name="x"), other)):
                 np.testing.assert_array_equal(a.image, b.image)
                 np.testing.assert_array_equal(a.mask, b.mask)
-                assert [a.loaded().image is a.loaded().mask, a.camera[2:]] == [False, b.camera[2:]]
+                assert [a.load().image is a.load().mask, a.camera[2:]] == [False, b.camera[2:]]
                 assert (view.view_id, view.time) == (other.view_id, other.time)
             assert np.array_equal(view.camera.cam_from_world_R, other.camera.cam_from_world_R)
-            assert type(half_size(view)) is StoredView and type(view.loaded()) is View
+            assert type(half_size(view)) is StoredView and type(view.load()) is View
     assert fingerprint.of_scene(stored) == fingerprint.of_scene(held)
 
 
@@ -346,15 +346,15 @@ def test_photographs_give_way(monkeypatch):
     shelf = Shelf(700)
     views = stored_views(3, shelf)
     for view in views:
-        view.loaded()
+        view.load()
     assert shelf.n_bytes == 600
     monkeypatch.setattr(memory, "free_bytes", lambda: 1000.0 - shelf.n_bytes)
     assert make_room(views, 0.0) == 200 and shelf.n_bytes == 300
     assert make_room([half_size_of(views[2])], 650.0) == 50 and shelf.n_bytes == 300
     assert make_room(views, 900.0) == 100 and shelf.n_bytes == 0
     assert make_room(views, 2000.0) == 0
-    assert make_room([view.loaded() for view in views], 0.0) == 0
-    views[0].loaded()
+    assert make_room([view.load() for view in views], 0.0) == 0
+    views[0].load()
     assert shelf.n_bytes == 0
     make_room(views, 0.0)
     assert half_size_of(views[0]).image.shape == (5, 5, 3) and shelf.n_bytes == 300

@@ -10,7 +10,7 @@ from minisplat_ref.extensions.geometry.stages import PIECES as GEOMETRY_PIECES
 from minisplat_ref.oracle.differences import careful_derivative
 from minisplat_ref.oracle.gradients import inner_product_case, jacobian_case
 from minisplat_ref.oracle.pieces import PIECES, tiny_setting
-from minisplat_ref.oracle.planted import PLANTED, planted
+from minisplat_ref.oracle.planted import PLANTED, plant
 from minisplat_ref.oracle.setting import make_setting
 from minisplat_ref.oracle.stages import composite_stage, project_stage, render_stage, sh_stage
 from minisplat_ref.oracle.tolerances import GRADIENT_REL
@@ -45,7 +45,7 @@ def test_planted_errors_are_where_they_say(backend, rng, error):
     setting = make_setting(rng, 12, 24, 20, GSPLAT_MAIN, sh_degree=2)
     seed = rng.integers(1000)
     right = quantities(backend, setting, np.random.default_rng(seed))
-    wrong = quantities(planted(error.name, backend), setting, np.random.default_rng(seed))
+    wrong = quantities(plant(error.name, backend), setting, np.random.default_rng(seed))
     differs = [
         name
         for (name, a), (_, b) in zip(right, wrong, strict=True)
@@ -56,7 +56,7 @@ def test_planted_errors_are_where_they_say(backend, rng, error):
 
 @pytest.mark.parametrize("error", PLANTED, ids=lambda error: error.name)
 def test_gradient_checks_find_errors_of_gradients(backend, error):
-    wrong = planted(error.name, backend)
+    wrong = plant(error.name, backend)
     touched = [
         make_stage
         for name, make_stage in STAGES.items()
@@ -72,13 +72,13 @@ def test_gradient_checks_find_errors_of_gradients(backend, error):
 
 def test_the_whole_render_finds_them_too(rng):
     for error in PLANTED:
-        stage = render_stage(planted(error.name, CPU), tiny_setting())
+        stage = render_stage(plant(error.name, CPU), tiny_setting())
         assert inner_product_case(stage, rng).passed == error.is_forward, error.name
 
 
 def test_an_unknown_name_is_refused():
     with pytest.raises(InputError, match="half-off-diagonal"):
-        planted("no-such-error")
+        plant("no-such-error")
 
 
 def transposed_products(stage, cotangents):

@@ -53,7 +53,7 @@ def blocks(scene: Scene, downscale: int) -> list[int]:
 
 def psnrs(found: Trained, scene: Scene, sides: list[int]) -> list[float]:
     """Return the mean PSNR of the test views, dB, for each size of block."""
-    views = [view.loaded() for view in scene.test_views]
+    views = [view.load() for view in scene.test_views]
     return [
         float(
             np.mean(
@@ -82,7 +82,7 @@ def measure(scene: Scene, downscale: int, iterations: int, seeds: int) -> Measur
     small, sides = shrunk(scene, downscale), blocks(scene, downscale)
     psnr: dict[str, list[list[float]]] = {name: [] for name in RECIPES}
     counts: dict[str, list[int]] = {name: [] for name in RECIPES}
-    view = scene.test_views[0].loaded()
+    view = scene.test_views[0].load()
     pictures = {"photograph": block_means(view.image.astype(float) / 255, sides[-1])}
     for seed in range(seeds):
         for name in with_progress(RECIPES, f"trainings, seed {seed}"):

@@ -154,7 +154,7 @@ def drops_when_shrunk(gaussians: Gaussians, views: tuple[View, ...], background:
     drops: dict[str, list[float]] = {"msz 5": [], "spz version 3": []}
     for factor in shared_studies.with_progress(SHRUNK, "sizes"):
         small = shrink(gaussians, factor)
-        near = tuple(view.loaded()._replace(camera=shrunk_camera(view, factor)) for view in views)
+        near = tuple(view.load()._replace(camera=shrunk_camera(view, factor)) for view in views)
         conventions = GSPLAT_MAIN._replace(near_plane=factor * GSPLAT_MAIN.near_plane)
         before = mean_psnr(small, near, background, conventions)
         for name, (format_, level) in zip(drops, ((MSZ, SHRUNK_LEVEL), (SPZ, 0)), strict=True):

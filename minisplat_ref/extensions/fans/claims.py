@@ -38,7 +38,7 @@ def judge_of(scene: Scene) -> Judge:
     """Return the scene with a few of its training views, spread evenly."""
     n = len(scene.train_views)
     rows = np.unique(np.linspace(0, n - 1, min(n, VIEWS_MAX)).round().astype(int))
-    return Judge(scene, [scene.train_views[row].loaded() for row in rows])
+    return Judge(scene, [scene.train_views[row].load() for row in rows])
 
 
 def shape_rows(gaussians: Gaussians, judge: Judge, shape: FanShape) -> list[dict[str, Any]]:

@@ -139,7 +139,7 @@ def pictures_of(forms: dict[str, Any], scene: Any) -> dict[str, Any]:
     from minisplat_ref.extensions.fans import claims
     from minisplat_ref.extensions.fans.tuning import render_clipped
 
-    view = scene.test_views[0].loaded()
+    view = scene.test_views[0].load()
     names = ["splats", claims.FLAT, f"{claims.FLAT}, reach and rim", f"{claims.FLAT}, vertices"]
     drawings = {name: render_clipped(forms[name], view, background=scene.background) for name in names}
     return {"photograph": view.image / 255, **drawings}

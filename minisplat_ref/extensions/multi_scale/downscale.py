@@ -82,7 +82,7 @@ def figures(variant: Variant, scene: Scene, n: int) -> Figures:
     rows = []
     for i, view in enumerate(scene.test_views):
         output = picture(variant, scene, i, n)
-        target = block_means(view.loaded().image.astype(float) / 255, n)
+        target = block_means(view.load().image.astype(float) / 255, n)
         rows.append((psnr_of(output.image, target), output.n_pairs, output.stats.hit_count.sum()))
     return Figures(*(float(value) for value in np.mean(rows, axis=0)))
 
@@ -106,7 +106,7 @@ def measure(scene: Scene, iterations: int, seeds: int) -> Measured:
     found: dict[str, list[list[Figures]]] = {name: [] for name in COLORS}
     counts: dict[str, list[int]] = {name: [] for name in COLORS}
     shown = min(4, blocks[-1])
-    pictures = {"photograph": block_means(scene.test_views[0].loaded().image.astype(float) / 255, shown)}
+    pictures = {"photograph": block_means(scene.test_views[0].load().image.astype(float) / 255, shown)}
     for seed in range(seeds):
         for name, variant in with_progress(variants(scene, iterations, seed).items(), f"measuring, seed {seed}"):
             found[name].append([figures(variant, scene, n) for n in blocks])

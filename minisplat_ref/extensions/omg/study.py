@@ -168,7 +168,7 @@ def quality(gaussians: Gaussians, scene: Scene) -> Quality:
     found = []
 
     def on_view(view: View, image: Floats, metrics: ViewMetrics) -> None:
-        pixels = view.loaded().image
+        pixels = view.load().image
         is_flat = flatter_half(pixels)
         clipped = np.clip(image, 0, 1)
         found.append((metrics.psnr, psnr(clipped, pixels, is_flat), psnr(clipped, pixels, ~is_flat)))

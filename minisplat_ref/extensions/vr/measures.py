@@ -61,7 +61,7 @@ def foveated(
                 whole.append(image)
             zones.append(found)
             times.append(min(seconds))
-            angles, truth = eccentricities(camera, gaze.x, gaze.y), view.loaded().image / 255
+            angles, truth = eccentricities(camera, gaze.x, gaze.y), view.load().image / 255
             psnrs.append(weighted_psnr(image, truth, angles))
             plain.append(weighted_psnr(image, truth, np.zeros_like(angles)))
             if full != EVERYWHERE:

@@ -139,7 +139,7 @@ def pairs(state: TrainState, iteration: Iteration, view_ids: Sequence[int]) -> I
     """Iterate over training views beside what the scene shows of them."""
     request = iteration.render_settings.request()
     for index in view_ids:
-        view = iteration.scene.train_views[index].loaded()
+        view = iteration.scene.train_views[index].load()
         rendered = render_clipped(state, iteration, view, request)
         is_counted: Bools = np.ones(rendered.shape[:2], bool) if view.mask is None else view.mask
         yield Pair(view, view.image / np.float32(255.0), rendered, is_counted)

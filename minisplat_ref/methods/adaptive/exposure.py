@@ -42,7 +42,7 @@ def log_gains(state: TrainState, iteration: Iteration, view_ids: Ints | list[int
     renderer = with_sky(with_compensation(iteration.representation.renderer))
     request = iteration.render_settings.request()
     for k, index in enumerate(view_ids):
-        view = iteration.scene.train_views[index].loaded()
+        view = iteration.scene.train_views[index].load()
         rendered = renderer.render(state.model, view, request)[0].image
         seen, photographed = (np.mean(image, axis=2) for image in (np.clip(rendered, 0, 1), view.image / 255.0))
         says = (seen > DARK) & (photographed > DARK) & (photographed < BRIGHT)

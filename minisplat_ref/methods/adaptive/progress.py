@@ -20,7 +20,7 @@ def measure_held_out(state: TrainState, iteration: Iteration) -> str | None:
     # Their exposures are not trained and must not enter the measurement. For poses, see turn_held_out.
     gains = np.exp(log_gains(state, iteration, ids) if EXPOSURES in state.shared else np.zeros(len(ids)))
     for index, gain in zip(ids, gains.astype(np.float32), strict=True):
-        view = views[index].loaded()
+        view = views[index].load()
         output, _ = iteration.render_settings.render(state.model, view)
         psnrs.append(psnr(np.clip(gain * output.image, 0.0, 1.0), view.image, view.mask))
     measurement = Measurement(iteration.step, tuple(psnrs), n_rows(state.gaussians), state.pace.n_pairs)

@@ -102,7 +102,7 @@ def is_larger(state: TrainState, iteration: Iteration, than: float) -> Bools:
 
 def counted_pixels(iteration: Iteration, view_ids: Sequence[int]) -> dict[int, Ints]:
     """Return the pixels of training views, as y W + x, that their masks leave."""
-    views = {index: iteration.scene.train_views[index].loaded() for index in view_ids}
+    views = {index: iteration.scene.train_views[index].load() for index in view_ids}
     return {
         index: np.arange(view.camera.width * view.camera.height) if view.mask is None else np.flatnonzero(view.mask)
         for index, view in views.items()
@@ -117,7 +117,7 @@ def open_pixels(state: TrainState, iteration: Iteration, view_ids: Sequence[int]
     request = iteration.render_settings.request()._replace(is_visible=is_drawn)
     pixels = {}
     for index, counted in counted_pixels(iteration, view_ids).items():
-        view = iteration.scene.train_views[index].loaded()
+        view = iteration.scene.train_views[index].load()
         alpha = iteration.render_settings.renderer.render(state.model, view, request)[0].alpha.ravel()
         is_open = 1.0 - alpha[counted] > OPEN
         if np.count_nonzero(is_open) > OPEN_MIN * alpha.size:
@@ -132,7 +132,7 @@ def photographs_behind(
     request = iteration.render_settings.request()._replace(is_visible=is_drawn)
     photographs = []
     for index, counted in pixels.items():
-        view = iteration.scene.train_views[index].loaded()
+        view = iteration.scene.train_views[index].load()
         output = iteration.render_settings.renderer.render(state.model, view, request)[0]
         residual = view.image / 255.0 - np.clip(output.image, 0.0, 1.0)
         rays = unit_rays(view.camera, counted, np.dtype(float)) @ view.camera.cam_from_world_R

@@ -19,7 +19,7 @@ from minisplat_ref.oracle.golden.files import load, read_manifest, read_npz
 from minisplat_ref.oracle.golden.format import SPECS, Arrays, Golden
 from minisplat_ref.oracle.golden.running import run_stages
 from minisplat_ref.oracle.golden.scenes import RECIPES, inputs, truth
-from minisplat_ref.oracle.planted import PLANTED, planted
+from minisplat_ref.oracle.planted import PLANTED, plant
 
 
 def _as_they_are(conventions: Conventions) -> Conventions:
@@ -68,7 +68,7 @@ def from_backend(backend: Backend, dtype: str, conventions: Conventions | None =
 
 def with_planted_error(name: str, dtype: str) -> Renderer:
     """Compare the cpu backend with one error in it."""
-    renderer = from_backend(planted(name, CPU), dtype)
+    renderer = from_backend(plant(name, CPU), dtype)
 
     def arrays(truth: Golden) -> Arrays:
         with np.errstate(all="ignore"):  # an error may divide by zero, and is then found

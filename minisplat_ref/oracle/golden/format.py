@@ -349,10 +349,10 @@ def readme(scenes: Mapping[str, Golden]) -> str:
     stages = [
         (
             stage,
-            _listed(STAGE_INPUTS[stage]),
-            _listed(names_of(stage, "output")),
-            _listed(STAGE_COTANGENTS[stage]),
-            _listed(names_of(stage, "gradient")),
+            _list_names(STAGE_INPUTS[stage]),
+            _list_names(names_of(stage, "output")),
+            _list_names(STAGE_COTANGENTS[stage]),
+            _list_names(names_of(stage, "gradient")),
         )
         for stage in STAGE_INPUTS
     ]
@@ -410,7 +410,7 @@ def _scene(scene: Golden) -> str:
     return f"- `{scene.name}`: {scene.what}. {n} Gaussians, {exact}{width} x {height} px; {c.name}: {rules}."
 
 
-def _listed(names: tuple[str, ...]) -> str:
+def _list_names(names: tuple[str, ...]) -> str:
     return ", ".join(f"`{name}`" for name in names)
 
 

@@ -129,7 +129,7 @@ def inputs(recipe: Recipe, seed: int = 0) -> Golden:
     """
     rng = np.random.default_rng((seed, *recipe.name.encode()))
     size, center = np.array(recipe.size), np.multiply(recipe.size, recipe.principal_point)
-    placed = _at_thresholds(recipe, rng) if recipe.is_exact else _scattered(recipe, rng)
+    placed = _at_thresholds(recipe, rng) if recipe.is_exact else _scatter(recipe, rng)
     n = len(placed["means"])
     n_rest = (recipe.sh_degree + 1) ** 2 - 1
     image_shape = (size[1], size[0])
@@ -159,7 +159,7 @@ def inputs(recipe: Recipe, seed: int = 0) -> Golden:
     return Golden(recipe.name, recipe.what, recipe.conventions, rounded | exact, recipe.is_exact)
 
 
-def _scattered(recipe: Recipe, rng: np.random.Generator) -> Arrays:
+def _scatter(recipe: Recipe, rng: np.random.Generator) -> Arrays:
     """Scatter Gaussians over the view; those behind the camera would be seen if their depth had the other sign."""
     size, center, n = np.array(recipe.size), np.multiply(recipe.size, recipe.principal_point), recipe.n
     R = rotation_matrices(np.array([[1.0, 0.21, -0.34, 0.13]]))[0]

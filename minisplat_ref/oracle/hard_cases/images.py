@@ -3,7 +3,7 @@
 import numpy as np
 
 from minisplat_ref.constants import SH_C0
-from minisplat_ref.oracle.hard_cases.scenes import call, camera, cloud, gaussians, rounded
+from minisplat_ref.oracle.hard_cases.scenes import call, camera, cloud, gaussians, round_to_float32
 from minisplat_ref.oracle.hard_cases.subjects import Call, HardCase, Parameters, Pictures
 from minisplat_ref.oracle.tolerances import FAINT, HARMONICS, SIMILARITY
 from minisplat_ref.types import Floats
@@ -11,18 +11,22 @@ from minisplat_ref.types import Floats
 EVERY_PIXEL = "as a cut from a larger image"
 
 
-def _sized(width: int, height: int, **focal: float) -> Parameters:
+def _make_sized(width: int, height: int, **focal: float) -> Parameters:
     return Parameters(cloud(40), camera(width, height, **focal))
 
 
 IMAGES = (
-    HardCase("1x1", "one pixel: smaller than any tile", EVERY_PIXEL, lambda: _sized(1, 1)),
-    HardCase("2x1", "two pixels", EVERY_PIXEL, lambda: _sized(2, 1)),
-    HardCase("3x1000", "63 tiles that are mostly beyond the edge", EVERY_PIXEL, lambda: _sized(3, 1000, fy=1400.0)),
-    HardCase("1000x3", "125 tiles that are mostly beyond the edge", EVERY_PIXEL, lambda: _sized(1000, 3, fx=1400.0)),
-    HardCase("no-tile-divides", "37 x 41: both are prime", EVERY_PIXEL, lambda: _sized(37, 41, fx=50.0, fy=50.0)),
-    HardCase("one-more-than-tiles", "17 x 33: one pixel over 16 and 8", EVERY_PIXEL, lambda: _sized(17, 33)),
-    HardCase("one-less-than-tiles", "15 x 31", EVERY_PIXEL, lambda: _sized(15, 31)),
+    HardCase("1x1", "one pixel: smaller than any tile", EVERY_PIXEL, lambda: _make_sized(1, 1)),
+    HardCase("2x1", "two pixels", EVERY_PIXEL, lambda: _make_sized(2, 1)),
+    HardCase(
+        "3x1000", "63 tiles that are mostly beyond the edge", EVERY_PIXEL, lambda: _make_sized(3, 1000, fy=1400.0)
+    ),
+    HardCase(
+        "1000x3", "125 tiles that are mostly beyond the edge", EVERY_PIXEL, lambda: _make_sized(1000, 3, fx=1400.0)
+    ),
+    HardCase("no-tile-divides", "37 x 41: both are prime", EVERY_PIXEL, lambda: _make_sized(37, 41, fx=50.0, fy=50.0)),
+    HardCase("one-more-than-tiles", "17 x 33: one pixel over 16 and 8", EVERY_PIXEL, lambda: _make_sized(17, 33)),
+    HardCase("one-less-than-tiles", "15 x 31", EVERY_PIXEL, lambda: _make_sized(15, 31)),
     HardCase(
         "more-tiles-than-gaussians",
         "one small Gaussian in 256 tiles",
@@ -90,13 +94,13 @@ def _along(axis: int, sign: float) -> Parameters:
     return Parameters(gaussians([3 * sign * np.eye(3)[axis]], sh_rest=rest), camera(cam_from_world_R=R))
 
 
-def _clamped(value: float) -> Parameters:
-    return Parameters(cloud(sh_dc=np.full((30, 3), rounded((value - 0.5) / SH_C0))), camera())
+def _make_clamped(value: float) -> Parameters:
+    return Parameters(cloud(sh_dc=np.full((30, 3), round_to_float32((value - 0.5) / SH_C0))), camera())
 
 
 def _coefficients(factor: float) -> Parameters:
     population = cloud(sh_degree=3)
-    return Parameters(population._replace(sh_rest=rounded(factor * population.sh_rest)), camera())
+    return Parameters(population._replace(sh_rest=round_to_float32(factor * population.sh_rest)), camera())
 
 
 def _channels(colors: Floats) -> Call:
@@ -128,28 +132,31 @@ COLORS = (
         "color-below-0",
         "all channels are negative before the clamp",
         "black, and no gradient with respect to the colours",
-        lambda: _clamped(-0.3),
+        lambda: _make_clamped(-0.3),
     ),
     HardCase(
         "color-just-above-0",
         "1e-3 above the clamp",
         "nearly black, and the whole gradient with respect to the colours",
-        lambda: _clamped(1e-3),
+        lambda: _make_clamped(1e-3),
     ),
     HardCase(
         "colors-negative-and-huge",
         "given channels from -1e6 to 1e6",
         "no clamp: they are any numbers",
-        lambda: _channels(rounded(np.linspace(-1e6, 1e6, 60).reshape(20, 3))),
+        lambda: _channels(round_to_float32(np.linspace(-1e6, 1e6, 60).reshape(20, 3))),
     ),
     HardCase(
         "colors-1e30",
         "their squares are beyond float32",
         "sums of 1e30, finite",
-        lambda: _channels(np.full((20, 3), rounded(1e30))),
+        lambda: _channels(np.full((20, 3), round_to_float32(1e30))),
     ),
     HardCase(
-        "colors-1e-40", "subnormal in float32", "as good as black", lambda: _channels(np.full((20, 3), rounded(1e-40)))
+        "colors-1e-40",
+        "subnormal in float32",
+        "as good as black",
+        lambda: _channels(np.full((20, 3), round_to_float32(1e-40))),
     ),
     HardCase(
         "background-1e6",
@@ -162,11 +169,11 @@ COLORS = (
 
 
 def _noise(height: int = 20, width: int = 24, seed: int = 0) -> Floats:
-    return rounded(np.random.default_rng(seed).uniform(size=(height, width, 3)))
+    return round_to_float32(np.random.default_rng(seed).uniform(size=(height, width, 3)))
 
 
 def _flat(value: float, height: int = 20, width: int = 24) -> Floats:
-    return np.full((height, width, 3), rounded(value))
+    return np.full((height, width, 3), round_to_float32(value))
 
 
 def _one_bright() -> Floats:
@@ -226,7 +233,7 @@ LOSSES = (
         "ssim-nearly-equal",
         "differences of 1e-7, one float32",
         "signs of the differences; SSIM 1 but for rounding",
-        lambda: Pictures(_noise(), rounded(_noise() + 1e-7)),
+        lambda: Pictures(_noise(), round_to_float32(_noise() + 1e-7)),
         SIMILARITY,
     ),
     HardCase(

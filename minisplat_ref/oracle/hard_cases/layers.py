@@ -3,7 +3,7 @@
 import numpy as np
 
 from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN, INRIA, MINI_SPLATTING2
-from minisplat_ref.oracle.hard_cases.scenes import call, camera, cloud, gaussians, rotation_quat, rounded
+from minisplat_ref.oracle.hard_cases.scenes import call, camera, cloud, gaussians, rotation_quat, round_to_float32
 from minisplat_ref.oracle.hard_cases.subjects import HardCase, Parameters
 from minisplat_ref.oracle.tolerances import BEHIND, DEEP
 from minisplat_ref.reference.covariance import rotation_matrices
@@ -30,7 +30,7 @@ def _seen_through_layers() -> Parameters:
     population = gaussians([[0, 0, 2], [0, 0, 2.5], [0, 0, 3], [0.1, 0.05, 4]], [[1.0] * 3] * 3 + [[0.05, 0.02, 0.02]])
     quats, logits = population.quats.copy(), np.array([2.9, 2.9, 2.9, -3.0])
     quats[3] *= 2.0**-20
-    return Parameters(population._replace(quats=quats, opacity_logits=rounded(logits)), camera())
+    return Parameters(population._replace(quats=quats, opacity_logits=round_to_float32(logits)), camera())
 
 
 LAYERS = (
@@ -195,7 +195,8 @@ LAYERS = (
         "2000 layers, opacities from 1e-4 to 1",
         "the order of depths decides",
         lambda: Parameters(
-            _stack(2000, 0.0).gaussians._replace(opacity_logits=rounded(np.linspace(-9, 3, 2000))), camera(6, 5)
+            _stack(2000, 0.0).gaussians._replace(opacity_logits=round_to_float32(np.linspace(-9, 3, 2000))),
+            camera(6, 5),
         ),
         DEEP,
     ),

@@ -12,7 +12,14 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN, INRIA, MINI_SPLATTING2
-from minisplat_ref.oracle.hard_cases.scenes import ANTIALIASED, BACKGROUND, camera, intrinsics, rotation_quat, rounded
+from minisplat_ref.oracle.hard_cases.scenes import (
+    ANTIALIASED,
+    BACKGROUND,
+    camera,
+    intrinsics,
+    rotation_quat,
+    round_to_float32,
+)
 from minisplat_ref.oracle.hard_cases.subjects import Call, HardCase, Parameters, Subject
 from minisplat_ref.oracle.tolerances import BEHIND, DEEP, HARMONICS, LONG, ORDINARY, WORLD, HardCaseTolerance
 from minisplat_ref.reference.covariance import rotation_matrices
@@ -58,7 +65,7 @@ class Draw(NamedTuple):
             "sh_dc": rng.normal(size=(n, 3)),
             "sh_rest": 0.3 * rng.normal(size=(n, (sh_degree + 1) ** 2 - 1, 3)),
         }
-        return Gaussians(**{name: rounded(value) for name, value in (fields | changes).items()})
+        return Gaussians(**{name: round_to_float32(value) for name, value in (fields | changes).items()})
 
     def call(self, n_channels: int = 3, options: dict | None = None, **changes: Floats) -> Call:
         """Return the same activated."""
@@ -72,12 +79,12 @@ class Draw(NamedTuple):
             "viewmats": np.eye(4)[None],
             "Ks": intrinsics(view.fx, view.fy, view.cx, view.cy),
         }
-        arrays = {name: rounded(value) for name, value in (arrays | changes).items()}
+        arrays = {name: round_to_float32(value) for name, value in (arrays | changes).items()}
         backgrounds = np.resize(BACKGROUND, (1, n_channels))
         return Call(arrays, self.width, self.height, {"backgrounds": backgrounds, **(options or {})})
 
 
-def _scaled(low: float, high: float, **changes: object) -> Callable[[Draw], Subject]:
+def _draw_scales(low: float, high: float, **changes: object) -> Callable[[Draw], Subject]:
     """Scales between two numbers, for each axis by itself."""
     return lambda d: Parameters(
         d.gaussians(log_scales=np.log(d.log_uniform(low, high, d.n, 3))),
@@ -86,7 +93,7 @@ def _scaled(low: float, high: float, **changes: object) -> Callable[[Draw], Subj
     )
 
 
-def _shaped(long: float, short: float, n_long: int) -> Callable[[Draw], Subject]:
+def _draw_shapes(long: float, short: float, n_long: int) -> Callable[[Draw], Subject]:
     """One or two axes of a length and the others of another, rotated at random."""
 
     def make(d: Draw) -> Subject:
@@ -199,7 +206,7 @@ def _harmonics(d: Draw) -> Subject:
 def _world(d: Draw) -> Subject:
     R = rotation_matrices(d.rng.normal(size=(1, 4)))[0]
     centre = np.array([448e3, 5412e3, 300]) + d.rng.uniform(-1, 1, 3)
-    means = rounded(50 * d.means() @ R + centre)
+    means = round_to_float32(50 * d.means() @ R + centre)
     log_scales = np.log(d.log_uniform(1, 25, d.n, 3))
     view = d.view(cam_from_world_R=R, cam_from_world_t=-R @ centre)
     return Parameters(d.gaussians(means=means, log_scales=log_scales), view)
@@ -253,7 +260,7 @@ def _beside(d: Draw) -> Subject:
 
 def _by(conventions: object) -> Callable[[Draw], Subject]:
     """Shapes of all sizes by the rules of another rasteriser."""
-    return _scaled(1e-3, 3, conventions=conventions)
+    return _draw_scales(1e-3, 3, conventions=conventions)
 
 
 def _everything(d: Draw) -> Subject:
@@ -279,11 +286,11 @@ class Kind(NamedTuple):
 
 SHARP = "the sum of their footprints, as float64 has it"
 KINDS = (
-    Kind("needles", "axis ratio of 1e3 and more at all angles", SHARP, _shaped(1, 1e-3, 1), LONG),
-    Kind("discs", "thickness 1e-3 of the width at all angles, some edge-on", SHARP, _shaped(0.5, 5e-4, 2), LONG),
-    Kind("enormous", "each covers the image many times", "nearly constant layers", _scaled(1e2, 1e5), BEHIND),
-    Kind("sub-pixel", "footprints are nothing but the low-pass", "dots", _scaled(1e-6, 1e-3)),
-    Kind("of-all-scales", "axis ratios up to 1e8 in one Gaussian", SHARP, _scaled(1e-6, 1e2), LONG),
+    Kind("needles", "axis ratio of 1e3 and more at all angles", SHARP, _draw_shapes(1, 1e-3, 1), LONG),
+    Kind("discs", "thickness 1e-3 of the width at all angles, some edge-on", SHARP, _draw_shapes(0.5, 5e-4, 2), LONG),
+    Kind("enormous", "each covers the image many times", "nearly constant layers", _draw_scales(1e2, 1e5), BEHIND),
+    Kind("sub-pixel", "footprints are nothing but the low-pass", "dots", _draw_scales(1e-6, 1e-3)),
+    Kind("of-all-scales", "axis ratios up to 1e8 in one Gaussian", SHARP, _draw_scales(1e-6, 1e2), LONG),
     Kind("log-scales-plus-minus-40", "scales from 1e-18 to 1e17", SHARP, _log_scales_40, BEHIND),
     Kind(
         "near-plane", "on the near plane and one or two roundings beside it", "only what is beyond", _at_the_near_plane

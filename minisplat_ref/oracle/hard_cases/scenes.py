@@ -13,7 +13,7 @@ ANTIALIASED = GSPLAT_MAIN._replace(name="ANTIALIASED", is_antialiased=True)
 BACKGROUND = np.array([[0.25, 0.5, 0.75]])
 
 
-def rounded(values: Any) -> Floats:
+def round_to_float32(values: Any) -> Floats:
     """Return float64 numbers that float32 holds too."""
     with np.errstate(over="ignore"):
         return np.asarray(values, np.float64).astype(np.float32).astype(np.float64)
@@ -27,16 +27,16 @@ def camera(width: int = 24, height: int = 18, **changes: Any) -> Camera:
 
 def gaussians(means: Any, scales: Any = 0.2, *, quats: Any = None, logits: Any = 1.0, sh_rest: Any = None) -> Gaussians:
     """Return Gaussians at ``means`` [N, 3]; the other values may be one for all. Random rotations and colours."""
-    means = rounded(means)
+    means = round_to_float32(means)
     n, rng = len(means), np.random.default_rng(7)
     quaternions, colors = rng.normal(size=(n, 4)), rng.normal(size=(n, 3))
     return Gaussians(
         means=means,
-        quats=rounded(np.broadcast_to(quaternions if quats is None else quats, (n, 4))),
-        log_scales=rounded(np.log(np.broadcast_to(scales, (n, 3)))),
-        opacity_logits=rounded(np.broadcast_to(logits, n)),
-        sh_dc=rounded(colors),
-        sh_rest=np.zeros((n, 0, 3)) if sh_rest is None else rounded(sh_rest),
+        quats=round_to_float32(np.broadcast_to(quaternions if quats is None else quats, (n, 4))),
+        log_scales=round_to_float32(np.log(np.broadcast_to(scales, (n, 3)))),
+        opacity_logits=round_to_float32(np.broadcast_to(logits, n)),
+        sh_dc=round_to_float32(colors),
+        sh_rest=np.zeros((n, 0, 3)) if sh_rest is None else round_to_float32(sh_rest),
     )
 
 
@@ -61,13 +61,13 @@ def needle(scales: tuple[float, float, float], quat: Any, **changes: Any) -> Par
     return Parameters(population, camera(160, 160, fx=120.0, fy=120.0), **changes)
 
 
-def moved_world(offset: Any, n: int = 30, scale: float = 1.0, **changes: Any) -> Parameters:
+def move_world(offset: Any, n: int = 30, scale: float = 1.0, **changes: Any) -> Parameters:
     """Return the cloud and a rotated camera, both displaced by ``offset`` and scaled, as a georeferenced scene is."""
     R = rotation_matrices(rotation_quat(0.7, (1, 2, 3))[None])[0]
     centre = np.broadcast_to(offset, 3) + scale * np.array([0.317, -0.143, 0.059])  # no float32 far from the origin
     population = cloud(n)
-    means = rounded(scale * population.means @ R + centre)  # the camera's frame is R (x - centre)
-    log_scales = rounded(population.log_scales + np.log(scale))
+    means = round_to_float32(scale * population.means @ R + centre)  # the camera's frame is R (x - centre)
+    log_scales = round_to_float32(population.log_scales + np.log(scale))
     view = camera(cam_from_world_R=R, cam_from_world_t=-R @ centre)
     return Parameters(population._replace(means=means, log_scales=log_scales), view, **changes)
 
@@ -81,15 +81,15 @@ def call(
     """
     n, (width, height) = len(means), size
     arrays = {
-        "means": rounded(means),
+        "means": round_to_float32(means),
         "quats": np.tile([1.0, 0, 0, 0], (n, 1)),
-        "scales": rounded(np.broadcast_to(scales, (n, 3))),
-        "opacities": rounded(np.broadcast_to(opacities, n)),
-        "colors": rounded(np.random.default_rng(5).uniform(size=(n, 3))),
+        "scales": round_to_float32(np.broadcast_to(scales, (n, 3))),
+        "opacities": round_to_float32(np.broadcast_to(opacities, n)),
+        "colors": round_to_float32(np.random.default_rng(5).uniform(size=(n, 3))),
         "viewmats": np.eye(4)[None],
         "Ks": intrinsics(30, 30, width / 2, height / 2),
     }
-    arrays.update({key: rounded(options.pop(key)) for key in list(options) if key in arrays})
+    arrays.update({key: round_to_float32(options.pop(key)) for key in list(options) if key in arrays})
     return Call(arrays, width, height, {"backgrounds": BACKGROUND, **options})
 
 

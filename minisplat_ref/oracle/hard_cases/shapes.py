@@ -11,7 +11,7 @@ from minisplat_ref.oracle.hard_cases.scenes import (
     gaussians,
     needle,
     rotation_quat,
-    rounded,
+    round_to_float32,
 )
 from minisplat_ref.oracle.hard_cases.subjects import HardCase, Parameters, Surface
 from minisplat_ref.oracle.tolerances import LONG, ORDINARY
@@ -22,7 +22,7 @@ DIAGONAL, TILTED = rotation_quat(np.pi / 4), rotation_quat(0.3)
 
 def _with_quats(factor: float) -> Parameters:
     population = cloud()
-    return Parameters(population._replace(quats=rounded(population.quats * factor)), camera())
+    return Parameters(population._replace(quats=round_to_float32(population.quats * factor)), camera())
 
 
 SHAPES = (
@@ -145,7 +145,7 @@ SHAPES = (
         "scale-underflows",
         "exp(-100) is subnormal in float32, exp(-110) is 0",
         "the low-pass's dot; no division by 0",
-        lambda: Parameters(cloud(log_scales=rounded(np.linspace(-110, -95, 90).reshape(30, 3))), camera()),
+        lambda: Parameters(cloud(log_scales=round_to_float32(np.linspace(-110, -95, 90).reshape(30, 3))), camera()),
     ),
     HardCase(
         "scale-1e4",

@@ -1,0 +1,25 @@
+"""Runs: a training with everything around it, and what is done with its folder afterwards.
+
+Train: what ``train`` does
+    :mod:`.settings` (what was asked for, ``config.json``), :mod:`.proposed_size` and :mod:`.room` (which size fits into
+    memory), :mod:`.start` (points to start from), :mod:`.run_folder` (the folder is made; which file has which name),
+    :mod:`.run` (the training), :mod:`.first_use` (compiles the kernels ahead), :mod:`.checkpoints` (the last two, and
+    the newest model), :mod:`.fingerprint` (which scene the run belongs to).
+
+What a run records
+    :mod:`.progress` (bar and ``log.jsonl``), :mod:`.events` (what fired, ``events.jsonl``), :mod:`.curve`
+    (``curve.jsonl``), :mod:`.preview` (an image of the training), :mod:`.scoring` (``metrics.json`` and ``renders/``).
+
+Afterwards
+    :mod:`.evaluation` (``eval``: measure again), :mod:`.conversion` (``convert``), :mod:`.notices` (what a run can do
+    without, but should be told of).
+
+A smaller model: what ``simplify`` does
+    :mod:`.opened_run` (what is read of the run, and the views that decide), :mod:`.rate_distortion` (drop, standard
+    error, rule and knee, by which a size is chosen), :mod:`.simplification` (sizes ranked, fine-tuned and measured),
+    :mod:`.simplified_run` (the new folder).
+
+Its reports
+    :mod:`.run_report`, :mod:`.demo_report`, :mod:`.simplification_report`, of :mod:`.report_parts`, :mod:`.fired`
+    (which mechanisms acted) and :mod:`.decisions_report` (what ``adaptive`` decided).
+"""
