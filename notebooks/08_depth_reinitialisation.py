@@ -38,7 +38,7 @@ from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
-from minisplat_ref.rendering import render
+from minisplat_ref.rendering import RenderSettings, render
 from minisplat_ref.strategy.depth_reinit import (
     blend_points,
     centre_points,
@@ -133,7 +133,7 @@ truths = {name: make_scene(name, **VIEW_SETTINGS) for name in ("room", "outdoor"
 # %% tags=["rounding"]
 trained = {name: train(truth.scene, recipe, seed=0).gaussians for name, truth in truths.items()}
 for name, gaussians in trained.items():
-    result = evaluate(gaussians, truths[name].scene.test_views, background=truths[name].scene.background)
+    result = evaluate(gaussians, truths[name].scene.test_views, RenderSettings(truths[name].scene.background))
     print(f"{name:<12}{len(gaussians.means):>6} Gaussians, held-out views {result.psnr:.1f} dB")
 
 
@@ -200,7 +200,7 @@ def train_from(gaussians, scene, iterations, rng):
 
 def scored(gaussians, name):
     """Return the mean PSNR of the held-out views, dB."""
-    return evaluate(gaussians, truths[name].scene.test_views, background=truths[name].scene.background).psnr
+    return evaluate(gaussians, truths[name].scene.test_views, RenderSettings(truths[name].scene.background)).psnr
 
 
 points, pixels, colors = drawn("room", PAPER)

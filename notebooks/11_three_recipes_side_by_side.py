@@ -34,7 +34,7 @@ from figures import BLUE, GREEN, RED, show, show_error
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.metrics import evaluate
-from minisplat_ref.rendering import render
+from minisplat_ref.rendering import RenderSettings, render
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import During, Every, configured, scaled
@@ -73,7 +73,7 @@ spent = [0.0]  # seconds of measuring, of the current run
 def quality(gaussians):
     """PSNR of the views that training never sees, dB."""
     start = time.perf_counter()
-    result = evaluate(gaussians, scene.test_views, background=scene.background)
+    result = evaluate(gaussians, scene.test_views, RenderSettings(scene.background))
     spent[0] += time.perf_counter() - start
     return result.psnr
 
@@ -320,7 +320,7 @@ for name, (_, log, curve, _) in results.items():
 
 def typical(gaussians):
     """Median PSNR of the held-out views, dB: one Gaussian in front of a camera spoils a mean of four."""
-    return np.median([evaluate(gaussians, [view], background=scene.background).psnr for view in scene.test_views])
+    return np.median([evaluate(gaussians, [view], RenderSettings(scene.background)).psnr for view in scene.test_views])
 
 
 n_accel, psnr_accel = ends["3dgs-accel"]

@@ -33,10 +33,10 @@ from IPython.display import Markdown, display
 
 from figures import BLUE, GREEN, GREY, RED, show, show_code
 from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.methods.adaptive import ADAPTIVE
-from minisplat_ref.methods.adaptive.prune import LAST_SLICE
+from minisplat_ref.methods.adaptive.numbers import LAST_SLICE
+from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.metrics import evaluate
-from minisplat_ref.rendering import render
+from minisplat_ref.rendering import RenderSettings, render
 from minisplat_ref.strategy.clone_split import logit
 from minisplat_ref.strategy.halving import OFFSET, halves
 from minisplat_ref.strategy.ops import concat
@@ -202,7 +202,7 @@ for name, state in states.items():
     axes[1].semilogy(steps, factors, color=COLORS[name])
     models = (*logs[name]["around the prune"], state.gaussians)
     views, background = scenes[name].test_views, scenes[name].background
-    psnrs = [evaluate(model, views, background=background).psnr for model in models]
+    psnrs = [evaluate(model, views, RenderSettings(background)).psnr for model in models]
     around[name] = (psnrs, [len(model.means) for model in models])
     axes[2].plot(psnrs, "o-", color=COLORS[name], markersize=4)
 axes[0].set(xlabel="log2 of pairs (tile, Gaussian)", ylabel="PSNR, held back [dB]", title="slope since half the work")

@@ -87,8 +87,7 @@ def measure(folder: str) -> None:
     from minisplat_ref.methods import get_recipe
     from minisplat_ref.training.adam import zero_moments
     from minisplat_ref.training.loop import train
-    from minisplat_ref.training.state import StepReport
-    from minisplat_ref.training.state import TrainState
+    from minisplat_ref.training.state import StepReport, TrainState
     from minisplat_ref.types import Scene, View
 
     recipe = get_recipe("3dgs-accel")._replace(iterations=N_ITERATIONS, events=())

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from minisplat_ref.lpips import Network
     from minisplat_ref.runs.settings import Settings
     from minisplat_ref.runs.simplification import Target
-    from minisplat_ref.training.state import TrainState
     from minisplat_ref.training.schedule import Recipe
+    from minisplat_ref.training.state import TrainState
     from minisplat_ref.types import Scene
 
 N_ITERATIONS = 3000  # of recipes with a schedule

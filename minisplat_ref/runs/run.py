@@ -29,10 +29,9 @@ from minisplat_ref.runs.settings import Settings, save_model, to_config
 from minisplat_ref.training.guard import Guard
 from minisplat_ref.training.interruption import Interruptions
 from minisplat_ref.training.loop import last_step, train
-from minisplat_ref.training.state import StepReport
 from minisplat_ref.training.pace import COOLED, FINER, Decision, to_metadata
 from minisplat_ref.training.schedule import Recipe
-from minisplat_ref.training.state import TrainState, begin_cooling
+from minisplat_ref.training.state import StepReport, TrainState, begin_cooling
 from minisplat_ref.types import Scene
 
 RECENT = 100  # iterations by which the time of the next ones is foreseen

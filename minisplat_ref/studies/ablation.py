@@ -21,6 +21,7 @@ from tqdm import tqdm
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods import RECIPES, get_recipe
 from minisplat_ref.metrics import evaluate
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.studies.conditions import get_condition
 from minisplat_ref.studies.front import (
@@ -98,7 +99,7 @@ def measure(scene: Scene, recipe: Recipe, seed: int) -> dict[str, Any]:
     start = time.process_time()
     state = train(scene, recipe, seed=seed, on_step=lambda report: fired.update(e.action for e in report.fired))
     seconds = time.process_time() - start
-    result = evaluate(state.model, scene.test_views, background=scene.background)
+    result = evaluate(state.model, scene.test_views, RenderSettings(scene.background))
     measures = (result.psnr, result.ssim, len(state.gaussians.means), seconds)
     return {**dict(zip(MEASURES, measures, strict=True)), "fired": dict(fired)}
 

@@ -22,7 +22,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
-from minisplat_ref.rendering import SPLATTING
+from minisplat_ref.rendering import SPLATTING, RenderSettings
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.studies.front import BLUE, RED, describe_scene, title, write
 from minisplat_ref.training.calibration import EXPOSURES, expose, identity_exposures, with_exposures
@@ -143,7 +143,7 @@ def held_out_psnr(gaussians: Gaussians, scene: Scene, K: Floats) -> float:
     """
     views = [view._replace(view_id=0) for view in scene.test_views]
     model = Model(gaussians, {EXPOSURES: inverse(K)[None]})
-    psnr = evaluate(model, views, background=scene.background, renderer=with_exposures(SPLATTING)).psnr
+    psnr = evaluate(model, views, RenderSettings(scene.background, renderer=with_exposures(SPLATTING))).psnr
     assert psnr is not None, "there are test views"
     return psnr
 

@@ -30,6 +30,7 @@ from minisplat_ref.backends import CPU, CPU_EXACT, Backend
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.studies.adaptive import WARM_UP, standard_error
 from minisplat_ref.studies.front import (
@@ -168,7 +169,7 @@ def measure(scene: Scene, recipe: Recipe, name: str, seed: int) -> list[dict[str
 
     def record(precision_name: str, model: Model, *, has_half_colours: bool) -> dict[str, Any]:
         quality = evaluate(
-            model, scene.test_views, background=scene.background, renderer=as_trained(recipe, model).renderer
+            model, scene.test_views, RenderSettings(scene.background, renderer=as_trained(recipe, model).renderer)
         )
         return {
             "precision": precision_name,

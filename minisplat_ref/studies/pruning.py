@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.methods.adaptive.prune import SLICE_MIN, prune_in_slices, prune_seen_by_few, slice_due
+from minisplat_ref.methods.adaptive.numbers import SLICE_MIN
+from minisplat_ref.methods.adaptive.prune import prune_in_slices, prune_seen_by_few, slice_due
 from minisplat_ref.methods.mini_splatting import prune_tail
 from minisplat_ref.strategy.importance import indoor
 from minisplat_ref.strategy.ops import keep, n_rows

@@ -29,6 +29,7 @@ from minisplat_ref.io import load_ply
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.strategy import simplify
 from minisplat_ref.strategy.importance import collect_importance, indoor
@@ -82,7 +83,7 @@ def run(args: argparse.Namespace) -> None:
         clouds = {"dense": dense.means, **true_surface(args.scene)}
         stats = collect_importance(dense, scene.train_views)
         importance = simplify.intersection_preserving(indoor(stats), stats.dominant_count)
-        changes = collect_removal_costs(dense, scene.train_views, background=scene.background).changes
+        changes = collect_removal_costs(dense, scene.train_views, RenderSettings(scene.background)).changes
         weights = dict.fromkeys(CHOICES, importance) | {CHANGE: np.where(importance > 0, changes, 0)}
         counts = counts_to_keep(importance, args.fractions)
         runs = list(
@@ -98,7 +99,7 @@ def run(args: argparse.Namespace) -> None:
             "dense": {
                 "n_gaussians": n_rows(dense),
                 "n_candidates": int(np.count_nonzero(importance)),
-                "psnr": evaluate(dense, scene.test_views, background=scene.background).psnr,
+                "psnr": evaluate(dense, scene.test_views, RenderSettings(scene.background)).psnr,
             },
         }
         result = {**describe_scene(scene), **settings, "counts": counts, "summary": summarise(runs), "runs": runs}
@@ -175,12 +176,12 @@ def measure(
             "n_gaussians": n_rows(gaussians),
             "choice": choice,
             "seed": seed,
-            "psnr": evaluate(gaussians, scene.test_views, background=scene.background).psnr,
+            "psnr": evaluate(gaussians, scene.test_views, RenderSettings(scene.background)).psnr,
             **{f"chamfer_{name}": chamfer(gaussians.means, tree) for name, tree in trees.items()},
         }
         begun = simplify.reinitialise(gaussians, SH_DEGREE) if is_restart else gaussians
         tuned = fine_tune(begun, scene, iterations, rng)
-        yield {**row, "psnr_tuned": evaluate(tuned, scene.test_views, background=scene.background).psnr}
+        yield {**row, "psnr_tuned": evaluate(tuned, scene.test_views, RenderSettings(scene.background)).psnr}
 
 
 def fine_tune(gaussians: Gaussians, scene: Scene, iterations: int, rng: np.random.Generator) -> Gaussians:

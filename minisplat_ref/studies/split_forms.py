@@ -17,6 +17,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.methods import RECIPES, get_recipe, mini_splatting
 from minisplat_ref.metrics import evaluate
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.strategy.blur_split import principal_axis_children
 from minisplat_ref.strategy.clone_split import random_children
@@ -90,7 +91,7 @@ def measure(scene: Scene, recipe: Recipe, form: str, seed: int) -> dict[str, Any
     start = time.process_time()
     state = train(scene, variant(recipe, form), seed=seed)
     seconds = time.process_time() - start
-    result = evaluate(state.gaussians, scene.test_views, background=scene.background)
+    result = evaluate(state.gaussians, scene.test_views, RenderSettings(scene.background))
     measures = (result.psnr, result.ssim, len(state.gaussians.means), seconds)
     return {"form": form, "seed": seed, **dict(zip(MEASURES, measures, strict=True))}
 

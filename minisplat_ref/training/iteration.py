@@ -1,8 +1,8 @@
 """One iteration of a training: one photograph, one gradient step, and the events of the recipe that are due.
 
-The order is: render, loss, gradients, Adam, then the events. 3DGS runs its density control *before* Adam, and because it
-replaces the parameter tensors, that iteration's step is silently lost (likewise in Mini-Splatting; gsplat steps first,
-as here). Here no step is lost, not even the last.
+The order is: render, loss, gradients, Adam, then the events. 3DGS runs its density control *before* Adam, and because
+it replaces the parameter tensors, that iteration's step is silently lost (likewise in Mini-Splatting; gsplat steps
+first, as here). Here no step is lost, not even the last.
 
 While a recipe trains on smaller views, these are the scene's views for everything in an iteration. If an event has made
 a culling table (Mini-Splatting2), it says which Gaussians are rendered in a view; if one has given each Gaussian a

@@ -112,7 +112,7 @@ class SmallerViews(NamedTuple):
     width and height; see :mod:`minisplat_ref.training.smaller_views`.
     """
 
-    action: Callable[..., int]
+    action: Callable[..., Any]
     start: int = 0
     until: int | None = None
     """The last such iteration; None: until the training decides to proceed."""

@@ -1,7 +1,7 @@
 """Training on smaller views at first: how often they are halved in each iteration, and the halved views.
 
-A recipe asks for it by an event (:class:`minisplat_ref.training.schedule.SmallerViews`), which ends at a given iteration
-(Mini-Splatting2) or whose halvings the training takes back one by one when it decides to (``adaptive``).
+A recipe asks for it by an event (:class:`minisplat_ref.training.schedule.SmallerViews`). It ends at a given iteration
+(Mini-Splatting2), or the training takes the halvings back one by one when it decides to (``adaptive``).
 """
 
 from minisplat_ref.errors import InputError

@@ -73,7 +73,7 @@ def test_mini_splatting2_schedule():
     """As the released code: clones every 250 from 500 to 2750 but not at 2000, where depth reinitialises."""
     recipe = RECIPES["mini-splatting2"]
     fired = firings(recipe)
-    assert recipe.iterations == 18_000 and recipe.half_size_until == 3_000
+    assert recipe.iterations == 18_000 and fired["halve_large_views"] == list(range(1, 3_001))
     assert fired["aggressive_clone"] == [500, 750, 1_000, 1_250, 1_500, 1_750, 2_250, 2_500, 2_750]
     assert fired["clone_and_split"] == [step for step in range(600, 3_000, 100) if step != 2_000]
     assert fired["reinitialise_from_depth"] == [2_000]
@@ -271,7 +271,7 @@ def test_rates_of_short_runs_are_raised_where_the_recipe_says_so():
 
 def test_rewind_and_warm_up_are_scaled():
     assert get_recipe("mini-splatting", 3_000).learning_rates.of["means"].rewind == (1_500, 500)
-    assert get_recipe("mini-splatting2", 1_800).half_size_until == 300
+    assert firings(get_recipe("mini-splatting2", 1_800))["halve_large_views"] == list(range(1, 301))
 
 
 def test_scaled_to_a_tenth():

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from adaptive_states import iteration_of
-from minisplat_ref.methods.adaptive import ADAPTIVE
+from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.studies.adaptive_candidates import (
     CANDIDATES,
     mean_opacity,

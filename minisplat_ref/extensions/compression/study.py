@@ -27,6 +27,7 @@ from minisplat_ref.extensions.compression.spz import SPZ
 from minisplat_ref.io.atomic import making_folder
 from minisplat_ref.io.formats import Format
 from minisplat_ref.io.ply import load_ply, save_ply
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.studies.study import Study
 from minisplat_ref.types import Floats, Gaussians, View
 
@@ -101,7 +102,7 @@ def mean_psnr(
     """Return the mean PSNR over views, dB."""
     from minisplat_ref.metrics import evaluate
 
-    psnr = evaluate(gaussians, views, background=background, conventions=conventions).psnr
+    psnr = evaluate(gaussians, views, RenderSettings(background, conventions=conventions)).psnr
     assert psnr is not None
     return psnr
 

@@ -16,6 +16,7 @@ from minisplat_ref.datasets.synthetic import SCENE_NAMES
 from minisplat_ref.extensions import shared_studies
 from minisplat_ref.extensions import shared_trainings as shared
 from minisplat_ref.io.atomic import making_folder
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.studies.study import Study
 from minisplat_ref.types import Scene
 
@@ -99,7 +100,7 @@ def trained(recipe: "Recipe", scene: Scene, iterations: int, n_seeds: int) -> di
         with tqdm(total=iterations, desc=f"{recipe.name}, seed {seed}", leave=False, disable=None) as bar:
             state = train(scene, scaled(recipe, iterations), seed=seed, on_step=lambda _: bar.update())
         renderer = recipe.representation.renderer
-        found = evaluate(state.model, scene.test_views, background=scene.background, renderer=renderer)
+        found = evaluate(state.model, scene.test_views, RenderSettings(scene.background, renderer=renderer))
         row["psnr"].append(found.psnr)
         row["ssim"].append(found.ssim)
     g = state.gaussians

@@ -22,6 +22,7 @@ from minisplat_ref.extensions.omg.file import OMG_FILE, order_of
 from minisplat_ref.extensions.omg.method import POWER
 from minisplat_ref.extensions.omg.reference import distinct_importance, local_distinctiveness
 from minisplat_ref.io.atomic import making_folder
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.studies.study import Study
 from minisplat_ref.types import Bools, Floats, Gaussians, Scene, View
 
@@ -173,7 +174,7 @@ def quality(gaussians: Gaussians, scene: Scene) -> Quality:
         clipped = np.clip(image, 0, 1)
         found.append((metrics.psnr, psnr(clipped, pixels, is_flat), psnr(clipped, pixels, ~is_flat)))
 
-    evaluate(gaussians, scene.test_views, background=scene.background, on_view=on_view)
+    evaluate(gaussians, scene.test_views, RenderSettings(scene.background), on_view=on_view)
     return Quality(*np.mean(found, axis=0).tolist())
 
 

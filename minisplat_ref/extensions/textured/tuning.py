@@ -8,6 +8,7 @@ import numpy as np
 from minisplat_ref.extensions.textured.method import FINE_TUNING, TEXTURED_GAUSSIANS
 from minisplat_ref.extensions.textured.population import TexturedGaussians, with_textures
 from minisplat_ref.metrics import Evaluation, evaluate
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.representation import GAUSSIANS, Representation
@@ -42,7 +43,7 @@ def fine_tune(
 def measure(population: Any, scene: Scene, views: tuple[View, ...]) -> Evaluation:
     """Compare pictures of a population with photographs."""
     renderer = representation_of(population).renderer
-    return evaluate(Model(population), views, background=scene.background, renderer=renderer)
+    return evaluate(Model(population), views, RenderSettings(scene.background, renderer=renderer))
 
 
 def floats_of(population: Any) -> int:

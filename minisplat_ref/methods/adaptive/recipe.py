@@ -10,10 +10,10 @@ from minisplat_ref.methods.adaptive.pose import hold_mean_pose, turn_held_out
 from minisplat_ref.methods.adaptive.progress import measure_held_out, proceed_when_little_is_gained
 from minisplat_ref.methods.adaptive.prune import prune_in_slices
 from minisplat_ref.methods.adaptive.switches import (
-    SWITCH_ANTIALIASING_ON,
-    SWITCH_EXPOSURE_ON,
-    SWITCH_POSE_ON,
-    SWITCH_SKY_ON,
+    switch_antialiasing_on,
+    switch_exposure_on,
+    switch_pose_on,
+    switch_sky_on,
 )
 from minisplat_ref.methods.gaussian_splatting import GS, GS_ACCEL, prune_faint
 from minisplat_ref.strategy.halving import OFFSET
@@ -42,13 +42,13 @@ ADAPTIVE = GS._replace(
         During(partial(raise_degrees, views_per_coefficient=numbers.VIEWS_PER_COEFFICIENT)),
         During(hold_mean_exposure),
         During(hold_mean_pose),
-        At(numbers.SKY_STEP, partial(SWITCH_SKY_ON, min_sky_gain=numbers.SKY_GAIN_MIN)),
+        At(numbers.SKY_STEP, partial(switch_sky_on, min_sky_gain=numbers.SKY_GAIN_MIN)),
         At(
             numbers.EXPOSURE_STEP,
-            partial(SWITCH_EXPOSURE_ON, min_exposure_gain=numbers.GAIN_MIN, min_antialiasing_gain=numbers.GAIN_MIN),
+            partial(switch_exposure_on, min_exposure_gain=numbers.GAIN_MIN, min_antialiasing_gain=numbers.GAIN_MIN),
         ),
-        At(numbers.ANTIALIASING_STEP, partial(SWITCH_ANTIALIASING_ON, min_antialiasing_gain=numbers.GAIN_MIN)),
-        At(numbers.POSE_STEP, partial(SWITCH_POSE_ON, min_pose_gain=numbers.GAIN_MIN)),
+        At(numbers.ANTIALIASING_STEP, partial(switch_antialiasing_on, min_antialiasing_gain=numbers.GAIN_MIN)),
+        At(numbers.POSE_STEP, partial(switch_pose_on, min_pose_gain=numbers.GAIN_MIN)),
         _regularly(turn_held_out),
         _regularly(measure_held_out),
         _regularly(

@@ -99,15 +99,15 @@ def add_calibration(
     state.pace = pace._replace(switched_on=(*pace.switched_on, calibration.name))
 
 
-SWITCH_SKY_ON = Switch(BACKDROP, "sky", "there is a sky", ask_about_a_sky, SKY_N_ERRORS)
-SWITCH_ANTIALIASING_ON = Switch(ANTIALIASING, "anti-aliasing", "opacities are compensated", ask_about_antialiasing)
-SWITCH_EXPOSURE_ON = Switch(
-    EXPOSURE, "exposures", "exposures are on", ask_about_exposures, rival=SWITCH_ANTIALIASING_ON
+switch_sky_on = Switch(BACKDROP, "sky", "there is a sky", ask_about_a_sky, SKY_N_ERRORS)
+switch_antialiasing_on = Switch(ANTIALIASING, "anti-aliasing", "opacities are compensated", ask_about_antialiasing)
+switch_exposure_on = Switch(
+    EXPOSURE, "exposures", "exposures are on", ask_about_exposures, rival=switch_antialiasing_on
 )
-SWITCH_POSE_ON = Switch(POSE, "poses", "poses are refined", ask_about_poses)
+switch_pose_on = Switch(POSE, "poses", "poses are refined", ask_about_poses)
 
 SWITCHES = {
     switch.calibration.name: switch
-    for switch in (SWITCH_SKY_ON, SWITCH_EXPOSURE_ON, SWITCH_ANTIALIASING_ON, SWITCH_POSE_ON)
+    for switch in (switch_sky_on, switch_exposure_on, switch_antialiasing_on, switch_pose_on)
 }
 """By the name of the calibration, in the order in which they are asked about."""

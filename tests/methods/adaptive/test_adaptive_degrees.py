@@ -12,7 +12,6 @@ from minisplat_ref.constants import GSPLAT_MAIN, SH_C0, SH_C1
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.checkpoint import DamagedCheckpoint, load_checkpoint, save_checkpoint
 from minisplat_ref.io.ply import load_ply, save_ply
-from minisplat_ref.methods.adaptive import ADAPTIVE
 from minisplat_ref.methods.adaptive.degrees import (
     SEEN,
     cut_degrees_when_cooling,
@@ -20,13 +19,14 @@ from minisplat_ref.methods.adaptive.degrees import (
     raise_degrees,
     without_idle_degrees,
 )
+from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.reference.spherical_harmonics import sh_colors
 from minisplat_ref.rendering import render
 from minisplat_ref.runs.simplification import fine_tuned
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.saved_state import load_state, save_state
 from minisplat_ref.training.pace import Pace, held_out_ids
 from minisplat_ref.training.rates import present_degrees
+from minisplat_ref.training.saved_state import load_state, save_state
 from minisplat_ref.training.schedule import configured
 from minisplat_ref.training.state import DEGREES
 from minisplat_ref.types import Camera, Gaussians, Scene, View, view_from
