@@ -231,7 +231,7 @@ ORDER = (
     ("`oracle/`: `golden`, `comparison`, `thresholds`", "13", "comparing a backend with the oracle"),
     ("`bench/`", "14", "speed against error"),
     ("`extensions/`", "16", "relatives of 3DGS: scale, compactness, storage"),
-    ("`methods/adaptive.py`, `training/pace.py`", "17", "how a scene tells its size"),
+    ("`methods/adaptive/`, `training/pace.py`", "17", "how a scene tells its size"),
     ("`pixel_order`, `vr`, `rays`", "18", "orders of pixels, tangent planes, rays that go on"),
     ("`textured`, `cuts`, `mixed`, `polygons`, `fans`", "19", "paint and sharp edges; lines, polygons, meshes"),
 )

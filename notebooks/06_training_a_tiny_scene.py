@@ -63,7 +63,7 @@ print(f"{len(scene.train_views)} training views, {len(scene.test_views)} held-ou
 # %% [markdown]
 # | file | what it holds | where in the paper |
 # |---|---|---|
-# | `minisplat_ref/training/loop.py` | the loop | 3DGS sec. 4 |
+# | `minisplat_ref/training/loop.py`, `iteration.py` | the loop, and one iteration | 3DGS sec. 4 |
 # | `minisplat_ref/methods/`, `training/schedule.py` | what is due when, as data | 3DGS sec. 7.1 |
 # | `minisplat_ref/strategy/` | initialisation; clone, split, prune, opacity reset | 3DGS sec. 5.1, 5.2 |
 # | `minisplat_ref/training/adam.py`, `rates.py` | Adam, schedules of the learning rates | |

@@ -113,12 +113,14 @@ for name, log in logs.items():
 #
 # | file | what it holds |
 # |---|---|
-# | `minisplat_ref/methods/adaptive.py` | the recipe: grow, measure, cool down, prune |
+# | `minisplat_ref/methods/adaptive/recipe.py` | the recipe: which rule acts when |
+# | `minisplat_ref/methods/adaptive/numbers.py` | all its numbers, each with its reason |
+# | `minisplat_ref/methods/adaptive/growth.py`, `progress.py` | what is halved; what is measured, and when it ends |
 # | `minisplat_ref/strategy/halving.py` | one Gaussian becomes two halves |
 # | `minisplat_ref/methods/adaptive/prune.py` | what is pruned, in slices |
-# | `minisplat_ref/methods/adaptive/degrees.py` | how many bands of the harmonics each Gaussian has |
+# | `minisplat_ref/methods/adaptive/degrees.py` | how many degrees of the harmonics each Gaussian has |
 # | `minisplat_ref/training/pace.py` | what was measured and decided; which views are held back |
-# | `minisplat_ref/methods/adaptive/evidence.py` | whether photographs need an exposure, or another pose |
+# | `minisplat_ref/methods/adaptive/switches.py`, `evidence.py` | what photographs need, and how they show it |
 # | `minisplat_ref/methods/adaptive/exposure.py` | the gains of photographs |
 # | `minisplat_ref/methods/adaptive/pose.py` | the displacements of photographs |
 # | `minisplat_ref/methods/adaptive/antialiasing.py` | whether photographs differ in resolution |

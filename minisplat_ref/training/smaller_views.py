@@ -4,6 +4,8 @@ A recipe asks for it by an event (:class:`minisplat_ref.training.schedule.Smalle
 (Mini-Splatting2), or the training takes the halvings back one by one when it decides to (``adaptive``).
 """
 
+import math
+
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.scene import half_size
 from minisplat_ref.training.pace import Pace
@@ -11,11 +13,10 @@ from minisplat_ref.training.schedule import Recipe, SmallerViews, action_name
 from minisplat_ref.training.state import FiredEvent
 from minisplat_ref.types import Scene
 
-HALVINGS_MAX = 16  # of a photograph of 65,536 pixels a side one would be left
 SIDE_MIN = 16  # pixels: a tile
 
 
-def halve_large_views(scene: Scene, *, min_side: float, max_halvings: int) -> int:
+def halve_large_views(scene: Scene, *, min_side: float, max_halvings: float = math.inf) -> int:
     """Return how often to halve views at first: as often as no side becomes shorter than ``min_side``.
 
     Parameters
@@ -25,7 +26,7 @@ def halve_large_views(scene: Scene, *, min_side: float, max_halvings: int) -> in
     min_side : float
         Pixels.
     max_halvings : int
-        At most so often.
+        At most so often; no limit by default.
 
     Raises
     ------
@@ -35,7 +36,10 @@ def halve_large_views(scene: Scene, *, min_side: float, max_halvings: int) -> in
     if not min_side >= SIDE_MIN:
         raise InputError(f"min_side is {min_side}: give at least {SIDE_MIN} pixels")
     side = min(min(view.camera.width, view.camera.height) for view in scene.train_views)
-    return sum(side >= 2**times * min_side for times in range(1, max_halvings + 1))
+    times = 0
+    while times < max_halvings and side >= 2 ** (times + 1) * min_side:
+        times += 1
+    return times
 
 
 class ViewSizes:

@@ -21,7 +21,7 @@ from minisplat_ref.training.adam import AdamRule
 from minisplat_ref.training.pace import Cooling
 from minisplat_ref.training.rates import Rates
 from minisplat_ref.training.schedule import At, During, Every, SmallerViews
-from minisplat_ref.training.smaller_views import HALVINGS_MAX, halve_large_views
+from minisplat_ref.training.smaller_views import halve_large_views
 
 _regularly = partial(Every, numbers.PERIOD, start=numbers.PERIOD)  # not in the first of these iterations
 
@@ -35,7 +35,7 @@ ADAPTIVE = GS._replace(
     sh_milestones=numbers.DEGREE_STEPS,
     events=(
         SmallerViews(
-            partial(halve_large_views, min_side=numbers.VIEW_SIDE_MIN, max_halvings=HALVINGS_MAX),
+            partial(halve_large_views, min_side=numbers.VIEW_SIDE_MIN),
             start=numbers.WHOLE_VIEWS_UNTIL,
         ),
         During(collect_while_growing),
