@@ -2,7 +2,7 @@
 
 The public names below are loaded when they are first used: importing the package costs nothing, and neither NumPy nor
 Numba is loaded before something needs it. Stages are reached through their modules, for example
-``minisplat_ref.reference.projection`` or ``minisplat_ref.rendering``.
+``minisplat_ref.reference.projection`` or ``minisplat_ref.rendering``. ``docs/ARCHITECTURE.md`` has the reading order.
 """
 
 from importlib import import_module

@@ -150,24 +150,39 @@ layers = [[name for name in layer if name in exists] for layer in layers]
 layers = [layer for layer in layers if layer and layer != ["__main__"]]
 notes = {
     "cli": "arguments, progress, files",
-    "bench": "speed, memory, start-up",
-    "experiments": "runs, comparisons, studies, reports",
+    "bench": "speed beside error",
+    "comparison": "recipes side by side",
+    "runs": "a training and its folder",
     "warm_up": "kernels ahead of their use",
-    "oracle": "correctness only",
-    "stages": "what the functions of a backend take and return",
-    "lpips": "the perceptual distance; compiling, lanes",
+    "testing": "the oracle for other tests",
     "extensions": "relatives of 3DGS; no layer below imports them",
-    "datasets": "scenes to train on; what a study is",
-    "methods": "one file per paper: its events and their dates",
-    "training": "the loop",
-    "strategy": "edits of a population; measures; files",
+    "mechanisms": "what several relatives are made of",
+    "studies": "claims, and the kit that measures them",
+    "reports": "pages, plots, images",
+    "oracle": "correctness only",
+    "datasets": "scenes to train on",
+    "methods": "one per paper: its events and their dates",
+    "training": "the loop, and what an iteration changes",
+    "strategy": "edits of a population",
+    "metrics": "metrics",
+    "io": "files",
+    "gsplat_compat": "gsplat's call",
     "rendering": "from parameters to an image and back",
     "splatting": "one view of activated Gaussians",
     "backends": "one function for every stage",
+    "stages": "what these functions take and return",
     "cpu": "loops over all Gaussians, all pixels",
-    "reference": "the formulas, as matrices and as scalars",
+    "reference": "the formulas as matrices",
+    "scalar": "the same for one Gaussian or pixel",
+    "lpips": "the perceptual distance",
+    "jit": "compiling, lanes",
     "validation": "checks of input",
-    "types": "arrays with shape, frame, unit; constants",
+    "types": "arrays",
+    "constants": "conventions",
+    "errors": "bad input",
+    "reporting": "tables",
+    "memory": "estimates",
+    "arguments": "options",
 }
 figure, axes = plt.subplots(figsize=(10.5, 0.48 * len(layers) + 0.3))
 for level, layer in enumerate(reversed(layers)):
@@ -181,8 +196,7 @@ for level, layer in enumerate(reversed(layers)):
         axes.text(
             (position + 0.5) * width, level + 0.5, name, ha="center", va="center", color="white" if is_dark else "black"
         )
-    note = next((notes[name] for name in layer if name in notes), "")
-    axes.text(8.15, level + 0.5, note, va="center", color="#5d5853")
+    axes.text(8.15, level + 0.5, "; ".join(notes[name] for name in layer), va="center", color="#5d5853", fontsize=8)
 axes.annotate("", (-0.25, 0.2), (-0.25, len(layers) - 0.2), arrowprops={"arrowstyle": "->", "color": GREY})
 axes.text(-0.45, len(layers) / 2, "imports", rotation=90, va="center", ha="center", color=GREY)
 axes.set(xlim=(-0.7, 12.3), ylim=(0, len(layers)))
@@ -209,34 +223,13 @@ display(Markdown("\n".join(["| module | its docstring |", "|---|---|", *table]))
 # %% [markdown]
 # ## Reading order
 #
-# This is the order of `docs/ARCHITECTURE.md`, with the notebooks beside it. Everything up to the training loop is NumPy
-# and can be read without knowing Numba.
+# This is the table of `docs/ARCHITECTURE.md`, with paths below `minisplat_ref/`. Everything in its first two parts is
+# NumPy and can be read without Numba.
 
 # %%
-ORDER = (
-    ("`types.py`, `constants.py`", "this one", "what is passed around, in which frames and units"),
-    ("`reference/`: `covariance`, `projection`", "01", "from ellipsoid to ellipse, with `pinhole` and `extent`"),
-    ("`spherical_harmonics`", "02", "how a colour depends on the viewing direction"),
-    ("`tiling`, `hits`, `compositing`", "03, 04", "how ellipses become pixels; how an error reaches every parameter"),
-    ("`depth`, `loss`", "03, 05", "depth maps; what is minimised"),
-    ("`rendering.py`", "06", "from parameters to an image and back"),
-    ("`strategy/`: `initialization`, `clone_split`", "06, 07", "the first Gaussians; which become two"),
-    ("`blur_split`, `depth_reinit`", "07, 08", "blur split; where surfaces are, and what fools that"),
-    ("`importance`, `simplify`", "09", "which Gaussians may go"),
-    ("`aggressive_clone`, `visibility`", "10", "many Gaussians early; few in each view"),
-    ("`methods/`", "11", "recipes: what happens when, for three methods"),
-    ("`training/loop.py`", "06 again", "what happens in an iteration"),
-    ("`scalar/`, then `cpu/`, first `cpu/compositing/plain.py`", "15", "the same formulas as fast loops"),
-    ("`oracle/`: `differences`, `gradients`, `planted`", "12", "how a gradient check lies"),
-    ("`oracle/`: `golden`, `comparison`, `thresholds`", "13", "comparing a backend with the oracle"),
-    ("`bench/`", "14", "speed against error"),
-    ("`extensions/`", "16", "relatives of 3DGS: scale, compactness, storage"),
-    ("`methods/adaptive/`, `training/pace.py`", "17", "how a scene tells its size"),
-    ("`pixel_order`, `vr`, `rays`", "18", "orders of pixels, tangent planes, rays that go on"),
-    ("`textured`, `cuts`, `mixed`, `polygons`, `fans`", "19", "paint and sharp edges; lines, polygons, meshes"),
-)
-steps = [f"| {step} | {read} | {notebook} | {know} |" for step, (read, notebook, know) in enumerate(ORDER, 1)]
-display(Markdown("\n".join(["| step | read | notebook | you will know |", "|---|---|---|---|", *steps])))
+page = (pyproject.parent / "docs" / "ARCHITECTURE.md").read_text()
+order = page.partition("<!-- reading order: begin -->")[2].partition("<!-- reading order: end -->")[0].strip()
+display(Markdown(order))
 
 # %% [markdown]
 # Names are those of the field: `means`, `quats` (wxyz, any length), `log_scales` and `opacity_logits` are trained;
@@ -351,13 +344,10 @@ assert (
     level["training"] < level["rendering"] < level["backends"] < level["reference"] == level["scalar"] < level["types"]
 )
 
-# The page on the architecture has the same reading order, and every notebook is in it.
-page = (pyproject.parent / "docs" / "ARCHITECTURE.md").read_text().split("## Reading order")[1].split("\n| question")[0]
-on_page = [name for name in re.findall(r"`([^`]+)`", page) if name not in ("00", "notebooks/")]
-here = re.findall(r"`([^`]+)`", " ".join(read for read, _, _ in ORDER))
-assert on_page == [name for name in here if name in on_page]
-named = {number for _, notebooks, _ in ORDER for number in re.findall(r"\d\d", notebooks)}
-assert named | {"00"} == {path.name[:2] for path in (pyproject.parent / "notebooks").glob("[0-9]*.ipynb")}
+# Every module has a note on the map, and every notebook a place in the reading order.
+assert set(modules) == set(notes)
+read_with = {number for row in order.splitlines() for number in re.findall(r"\d\d", row.split("|")[3])}
+assert read_with == {path.name[:2] for path in (pyproject.parent / "notebooks").glob("[0-9]*.ipynb")}
 
 # Profiles differ, in name and in pixels, but little.
 assert len(set(PROFILES.values())) == len(PROFILES) == 4

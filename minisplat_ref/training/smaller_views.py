@@ -61,7 +61,7 @@ class ViewSizes:
         """Return how often the views of an iteration, counted from 1, are halved."""
         if pace.cooling_from is not None:
             return 0
-        return max((times - pace.n_finer for event, times in self._planned if event.is_due(step)), default=0)
+        return max([0, *(times - pace.n_finer for event, times in self._planned if event.is_due(step))])
 
     def scene(self, n_halvings: int) -> Scene:
         """Return the scene with its training views halved so often in width and height."""

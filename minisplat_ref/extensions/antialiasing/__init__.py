@@ -5,24 +5,19 @@ it is. At the size of training that is harmless, since training compensates for 
 swells and brightens, and from nearer it thins out, down to needles. Two filters replace this dilation:
 
 - one in space (:mod:`minisplat_ref.extensions.antialiasing.reference`), once for all views:
-  ``s'^2 = s^2 + 0.2 nu^2`` and ``o' = o prod_j s_j / s'_j``, where nu is the least distance ``z / f`` between two
+  ``s'^2 = s^2 + 0.2 nu^2`` and ``o' = o prod_j s_j / s'_j``, where nu is the minimum distance ``z / f`` between two
   pixels' rays over the training views that see the Gaussian. So nothing is thinner than the cameras could resolve;
 - one in the image, ``C' = C + 0.1 I`` and ``o'' = o' sqrt(det C / det C')``. This is the core's own compensation with
   Mip-Splatting's variance (:mod:`minisplat_ref.reference.antialiasing`).
 
 The standard deviation of the spatial filter is a further field, ``filter_sigmas``, and a column of the PLY. An event
-measures it at the first iteration and then every 100 iterations. A filter of 0 draws the Gaussians as they are, bit for
-bit.
-
-Measured on the fox, trained at 33 x 60 for 1000 iterations and drawn at other sizes (``study antialiasing/zoom``): at
-an eighth of the size 25.4 dB against 14.5 dB of ``3dgs-accel``, at eight times the size 24.8 against 19.2, and as good
-at the size of training. Integrals over pixels (``analytic``) are as good from farther away, better from nearer with
-25.5 dB, and better by 1.3 dB at the size of training.
+measures it at the first iteration and then every 100 iterations. A filter of 0 renders the Gaussians as they are,
+bit for bit.
 
 The filter is measured from centres in front of a camera's image and 15 % around it, as in the released code, and a new
 Gaussian has its parent's filter until it is measured. A recipe of the core that is trained with
 ``--extension antialiasing`` has the filter in the image alone. The alternative to filters, the integral of a Gaussian
-over a pixel, is the extension ``analytic``.
+over a pixel, is the extension ``analytic``; ``docs/FAMILY.md`` has the figures of both.
 
     minisplat-ref train SCENE --recipe antialiasing
     minisplat-ref study antialiasing/zoom SCENE --out DIR

@@ -21,14 +21,8 @@ are stored together, and zstandard packs them. There are 13 levels; level 0 keep
 The order of the Gaussians is not preserved; only ties in depth depend on it. Quaternions come back with another length,
 which has no meaning. Files hold the six fields of 3DGS; the fields of an extension need a PLY.
 
-Measured on the room (``study compression/rate-distortion room``, three seeds): where a PLY takes 248 bytes per
-Gaussian, level 5 takes 34 and loses 0.004 dB, level 10 takes 18.5 and loses 0.10 dB, and SPZ takes 18.8 and loses
-0.29 dB. On the fox, after 1,500 iterations, SPZ loses 1.21 dB, of which its higher harmonics of 4 and 5 bits make 1.19,
-and level 10 loses 0.21 dB at the same size. When the room is made 512 times smaller, the fixed steps of SPZ lose
-10.9 dB, and level 5 loses no more than before.
-
 Left out are pruning, merging and training with the quantiser in the loop, which gain more than any entropy coder;
-vector quantisation, which ``.omg`` does; and arithmetic coding.
+vector quantisation, which ``.omg`` does; and arithmetic coding. ``docs/FAMILY.md`` has the measured figures.
 """
 
 from minisplat_ref.extensions.compression.msz import MSZ

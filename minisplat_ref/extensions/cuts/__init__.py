@@ -10,24 +10,19 @@ shows. Here each has a cubic curve in the plane of its first two axes
 
 A step has no derivative. So training uses ``1 / (1 + exp(-distance / w))`` of the signed distance to the edge of the
 part that is cut away, with its exact gradient; w is 1 pixel at first, then half a pixel, and 0 in the last iteration,
-so what is saved, measured and rendered has hard edges. ``widths`` is a column of the PLY.
+so what is saved, evaluated and rendered has hard edges. ``widths`` is a column of the PLY.
 
     minisplat-ref train SCENE --recipe cuts
     minisplat-ref study cuts/card --out DIR
     minisplat-ref oracle gradients --extension cuts
 
-Measured (``study cuts/card``, 4 seeds): the picture of a Gaussian with a straight cut is reproduced by one Gaussian
-with a cut at 65 dB in the best of four trainings, with an edge of 0.9 pixels from 10 to 90 %; twelve without cuts reach
-36 dB and 2.2 pixels. Two of the four trainings found no cut and ended at 21 dB: their curves started on a side where
-there is nothing to cut, and were pushed out. On a bright card with a curved edge six Gaussians with cuts reach 28.5 dB
-at best and 26.3 ± 2.4 in the mean, twelve without reach 24.7 and 23.6 ± 0.9, with 132 and 168 floats. Within 1.5 pixels
-of the edge these are 16.5 and 13.5 dB, since a hard edge has steps where pixels are partly covered.
+``docs/FAMILY.md`` has the measured figures.
 
 This deviates from the paper, which keeps the step and replaces its gradient by an approximation. Each Gaussian has one
-curve here. Control points are in standard deviations instead of world units, and follow the affine map that draws the
-Gaussian, so that its cut rotates and shrinks with it. The curve is drawn as a polygon of 8 edges, so that crossings are
+curve here. Control points are in standard deviations instead of world units, and follow the affine map that projects
+the Gaussian, so that its cut rotates and shrinks with it. The curve is a polygon of 8 edges, so that crossings are
 counted without roots of cubics. Where a curve moves across the centre, what was cut away and what was left change
-places, and the picture jumps, which no gradient shows. Training does not change which axes are the first two; if a
+places, and the image jumps, which no gradient shows. Training does not change which axes are the first two; if a
 Gaussian becomes flat along one of them, its curve is seen edge on.
 """
 

@@ -16,11 +16,7 @@ explains an edge in one place is wrong beside it. There are three changes to 3DG
 extents of the scene), ``beta``, ``merge_reach`` and ``merge_color``. With ``trace=0``, ``beta=0`` and ``merge_reach=0``
 the method is ``3dgs-accel``, bit for bit.
 
-Measured at equal count on a test chart that is half a fine checkerboard, half a ramp (``study micro/checker``, 840
-Gaussians): at the edges 20.5 dB against 16.9 dB of 3DGS, with a ratio of the in-plane scales of 3.8 against 7.4; on the
-ramp, where a few large Gaussians were enough, 38.9 dB against 52.0. The penalty costs the ramp: detail alone gains
-2.2 dB at the edges and costs 0.9 on the ramp. On the fox at 68 x 120, after 1000 iterations with seed 0, the method
-reaches 31.5 dB with 36,752 Gaussians; 3DGS, its threshold lowered until it had 36,121, reaches 30.8 dB.
+``docs/FAMILY.md`` has the measured figures.
 
 This deviates from the paper as follows. The paper sums P_k = max(tr(Sigma_k) - tau, 0); here the P_k are averaged and
 measured in units of tau, so that lambda depends neither on the scene's unit nor on the number of Gaussians. Lambda,

@@ -1,7 +1,7 @@
 """Mixed: ellipses, lines and triangles by one formula, the distance to a hull.
 
-MP-GS, arXiv 2507.11321. A Gaussian is an ellipse in the image. A line has two vertices with one covariance, a triangle
-three; one formula draws them all (:mod:`minisplat_ref.extensions.mixed.response`):
+This follows MP-GS, arXiv 2507.11321. A Gaussian is an ellipse in the image. A line has two vertices with one
+covariance, a triangle three; one formula renders them all (:mod:`minisplat_ref.extensions.mixed.response`):
 
     alpha = o exp(-dist(y, conv{y_1 .. y_m})^2 / 2),   y = L^-1 x,  L L^T = Sigma_2
 
@@ -17,19 +17,13 @@ no difference, and needles and discs get some (:mod:`minisplat_ref.extensions.mi
     minisplat-ref study mixed/scene SCENE room --iterations 300 --out DIR
     minisplat-ref oracle gradients --extension mixed
 
-:mod:`minisplat_ref.extensions.mixed.fit` draws a picture with a few primitives of one kind.
+:mod:`minisplat_ref.extensions.mixed.fit` fits an image with a few primitives of one kind. ``docs/FAMILY.md`` has the
+measured figures.
 
-Measured, the better of two seeds (``--seeds 2``). One line is matched at 30 dB by 3 ellipses, one triangle with a soft
-rim by 12; one of their own kind reaches 57.9 and 68.4 dB. Of a round Gaussian vertices are of no use. A letter A in
-some 200 numbers: 14 ellipses 22.4 dB, 12 lines 25.9, 11 triangles 31.4; a ring, whose curve no line follows: 20.0, 20.0
-and 22.2 dB. Random starts matter: the letter's means lie up to 6.5 dB below. Scenes with as many numbers as 3DGS, none
-densified, 300 iterations: the room 22.73 ± 0.04 dB against 21.60 ± 0.06, as good as 3DGS with all points and half more
-numbers; the fox at a quarter 25.41 ± 0.15 against 25.31 ± 0.27, no difference: four fifths of its groups are points.
-
-Where this deviates: a hull is placed by the mean of its vertices, where the paper counts from the first; what makes a
-triangle a line is its altitude instead of Pearson's correlation, which depends on the axes; changes to more vertices
-are not the paper's. It trains by 3DGS's losses, not by those of surfels, and makes no mesh. A child of a split keeps
-its parent's vertices, as in the paper, and size limits look at deviations alone.
+This deviates from the paper as follows. A hull is placed by the mean of its vertices, where the paper counts from the
+first; what makes a triangle a line is its altitude instead of Pearson's correlation, which depends on the axes; changes
+to more vertices are not the paper's. It trains by 3DGS's losses, not by those of surfels, and makes no mesh. A child of
+a split keeps its parent's vertices, as in the paper, and size limits look at deviations alone.
 """
 
 from minisplat_ref.extensions.extension import Extension

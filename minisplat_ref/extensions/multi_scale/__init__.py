@@ -1,25 +1,21 @@
-"""Multi-scale: coarse Gaussians for small pictures, chosen by pixel coverage.
+"""Multi-scale: coarse Gaussians for small images, chosen by pixel coverage.
 
-This follows Multi-Scale 3D Gaussian Splatting, Yan et al. 2023, arXiv 2311.17089. In a small picture most Gaussians of
+This follows Multi-Scale 3D Gaussian Splatting, Yan et al. 2023, arXiv 2311.17089. In a small image most Gaussians of
 a scene are smaller than a pixel. 3DGS widens each to about one, so that they cover too much, and as many are sorted as
-for a large picture. Here a scene has several levels, and a view draws at each place the one that suits it:
+for a large image. Here a scene has several levels, and a view renders at each place the one that suits it:
 
-- *Levels* (:mod:`minisplat_ref.extensions.multi_scale.levels`). For pictures of 1/F^l of the size, the Gaussians that
+- *Levels* (:mod:`minisplat_ref.extensions.multi_scale.levels`). For images of 1/F^l of the size, the Gaussians that
   would cover fewer than four pixels, ``S = 2 sqrt(2 ln(255 o)) s f / z``, are sorted into cubes as large as a pixel
   there, and each cube becomes one Gaussian with the moments of its members that stops as much light.
-- *Selection* (:mod:`minisplat_ref.extensions.multi_scale.reference`). A Gaussian is drawn where its own cube covers
-  less than a pixel and its parent's at least one: ``w f / z < 1 <= w' f / z``.
-- *Training.* After densification the levels are inserted, for pictures of 1/4, 1/16 and 1/64 of the size; in every
-  fourth iteration a smaller picture joins the loss, with the weight 0.1.
+- *Selection* (:mod:`minisplat_ref.extensions.multi_scale.reference`). A Gaussian is rendered where its own cube
+  covers less than a pixel and its parent's at least one: ``w f / z < 1 <= w' f / z``.
+- *Training.* After densification the levels are inserted, for images of 1/4, 1/16 and 1/64 of the size; in every
+  fourth iteration a smaller image joins the loss, with the weight 0.1.
 
 The sides w and w' are a further field, ``cells``, and columns of the PLY. A population of level 0 alone is 3DGS, bit
 for bit.
 
-Measured on the fox at 135 x 240 after 1000 iterations (``study multi-scale/downscale``): at a quarter, an eighth and a
-sixteenth of the size trained levels gain 3.1, 2.8 and 6.7 dB, and draw 1.7, 3 and 10 times fewer pairs; levels that are
-only built gain about 1 to 2 dB. The core's compensation of opacities alone, on the same Gaussians, gives better
-pictures than levels down to an eighth, but costs 1.8 dB at the full size and saves few pairs. The choice of the level
-matters: cubes of 4 pixels instead of one cost 1.3 dB at the full size and 0.9 dB at a half.
+``docs/FAMILY.md`` has the measured figures.
 
 This deviates from the paper, which drops every Gaussian by its own coverage, within bounds that follow the training;
 there the members of a cube disappear at other distances than their parent appears, and training has to compensate for

@@ -19,20 +19,16 @@ Four consequences are worth knowing:
 - A negative Gaussian in front of others dims them like any other: it adds ``-w |c|`` and takes its part of the
   transmittance. It cancels a *colour*, but makes no hole to see through. ``study negative/backdrop`` measures this;
   ``study negative/rings`` measures when a difference saves more Gaussians than it costs.
-- The image may be below zero, too. What is written and measured is clipped to [0, 1]; the loss sees it unclipped, as
+- The image may be below zero, too. What is written and evaluated is clipped to [0, 1]; the loss sees it unclipped, as
   3DGS's loss sees values above one, because a clipped pixel has no gradient.
 - Pruning considers opacity and size, never the colour, so a Gaussian whose colour is near zero, which may be about to
   change its sign, stays. That colour has a gradient, which 3DGS loses at zero.
 - The PLY is that of 3DGS, with ``f_dc`` below -1.77 where the colour is negative. Other programs read it and clamp.
 
-Measured: in a plane one pair fits a ring better than two positive Gaussians at any thickness from 0.2 to 0.9 of the
-outer radius, better than three only above 0.42 and if the heights may be a hundred times the ring's, and never as well
-as four (``study negative/rings``). In front of a black wall a negative colour makes the hole of a ring black, with
-37.5 dB there against 14.9 dB; in front of dots the hole transmits 1 to 2 % with colours of either kind, where four
-Gaussians side by side leave 90 %.
+``docs/FAMILY.md`` has the measured figures.
 
 How the released code chooses its negative components, and with which colours they start, was not known to us. Here they
-are drawn at random, and a drawn Gaussian starts with its colour negated. A density for each pair is left out; the
+are sampled at random, and a sampled Gaussian starts with its colour negated. A density for each pair is left out; the
 components pair up, or not, as the photographs require.
 
     minisplat-ref train SCENE --recipe negative

@@ -8,8 +8,8 @@ multiplied by the difference of a Gaussian's colour from its neighbours' in Mort
     S_i = I_i LD_i^lambda,   LD_i = mean_channels |c_i - c_prev| + |c_i - c_next|,   lambda = 2
 
 and the Gaussians of the largest scores that together carry 99 % of the sum stay
-(:mod:`minisplat_ref.extensions.omg.method`). They are stored with few attributes. The appearance has three numbers of
-colour and a few features, from which a shared decoder computes the spherical harmonics
+(:mod:`minisplat_ref.extensions.omg.method`). They are stored with few attributes. The appearance has three parameters
+of colour and a few features, from which a shared decoder computes the spherical harmonics
 (:mod:`minisplat_ref.extensions.omg.appearance`). Each vector is split into parts, with a codebook for each part
 (:mod:`minisplat_ref.extensions.omg.svq`). ``.omg`` is the file (:mod:`minisplat_ref.extensions.omg.file`).
 
@@ -17,13 +17,7 @@ colour and a few features, from which a shared decoder computes the spherical ha
     minisplat-ref convert runs/small small.omg
     minisplat-ref study omg/distinctiveness room --out DIR
 
-Measured (``study omg/distinctiveness``): when half the Gaussians are kept, distinctiveness gains 0.3 dB on the room and
-on the fox, because the textured half of the pixels gains more (0.7 and 0.4 dB) than the flat half, whose error is far
-smaller, loses (1.6 and 0.3 dB). When an eighth is kept, it gains 1.2 dB on the room and loses 0.7 dB on the fox, where
-the flat half is 2.1 dB worse. Before fine-tuning it is worse everywhere. A file with the paper's codebooks loses 0.35
-and 0.87 dB, of which the three features of the harmonics alone cost 0.28 and 0.59. At these sizes the codebooks do not
-pay: the fox, 10,250 Gaussians after 300 iterations, takes 112 kB and loses 0.68 dB at level 3, where the coarsest
-``.msz``, also of 112 kB, loses 0.45.
+``docs/FAMILY.md`` has the measured figures.
 
 This deviates from the paper in four ways. The paper's networks, trained from iteration 15,000 on, are replaced by a
 linear decoder that is fitted when the file is written; opacity, which a network computes there, has a codebook. The

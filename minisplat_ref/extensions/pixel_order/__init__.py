@@ -1,7 +1,7 @@
 """Pixel order: footprints on tangent planes, each pixel in the order of its own ray.
 
-3DGS draws with two approximations that become visible when a camera turns. It sorts Gaussians by the camera z of their
-means, the same for all pixels, so that one pops in front of another in a whole picture at once; and it expands the
+3DGS renders with two approximations that become visible when a camera turns. It sorts Gaussians by the camera z of
+their means, the same for all pixels, so that one pops in front of another in a whole image at once; and it expands the
 perspective map on the image plane, which stretches footprints at the edges. This extension replaces both in a renderer
 that also trains:
 
@@ -12,19 +12,13 @@ that also trains:
   unit sphere in the direction of its mean (:mod:`minisplat_ref.mechanisms.tangent.planes`).
 
 Both depend on rays alone, and so do culling by distance and the low-pass, so a camera that turns sees the same colours
-up to rounding. When the camera turns by half a degree, fixed rays through 100 random Gaussians change by up to 0.11
-under 3DGS and by 3e-15 here (``study pixel-order/rotation``). Compared with the peak along each ray, the error of a
-footprint is 10.5 % at any angle; that of EWA is 10.5 % on the axis and 27.6 % at 55 degrees
-(``study pixel-order/projection``). Of the pairs of hits of a pixel, 3DGS blends 10.9 % out of order, a buffer of 4
-hits 2.5 %, and one of 16 hits 0.03 % (``study pixel-order/order``, 300 random Gaussians).
-
-Sorting does not remove every jump. Where two Gaussians interpenetrate, two hits of a pixel change places as the camera
-*moves*, pixel by pixel instead of all at once. With the same Gaussians a ray still changes by 0.13 when the camera
-moves 0.001 sideways, and by 0.005 under 3DGS, whose order such a move does not change.
+up to rounding. Sorting does not remove every jump: where two Gaussians interpenetrate, two hits of a pixel change
+places as the camera *moves*, pixel by pixel instead of all at once. ``docs/FAMILY.md`` has the measured figures.
 
 This deviates from StopThePop, which sorts in a hierarchy of queues for tiles, blocks and pixels; here each pixel has
-one queue over a list by distance. Its least thickness of 0.001 world units is a thousandth of the longest axis here. As
-there, the order has no derivative. Statistics of blending, surfaces and median depths are those of 3DGS's footprints.
+one queue over a list by distance. Its minimum thickness of 0.001 world units is a thousandth of the longest axis here.
+As there, the order has no derivative. Statistics of blending, surfaces and median depths are those of 3DGS's
+footprints.
 
     minisplat-ref train SCENE --recipe pixel-order
     minisplat-ref train SCENE --recipe pixel-order --set buffer_size=8

@@ -1,7 +1,8 @@
 """Flat Gaussians carried by polygons: traced as triangles, edited as a mesh, carried back.
 
-REdiSplats, Byrski et al. 2025, arXiv 2503.12284. A flat Gaussian with the axes e_a, e_b and the standard deviations
-s_a, s_b lies in a regular polygon of n = 8 sides (``mechanisms.meshes.fans``), whose radius depends on the opacity o:
+This follows REdiSplats, Byrski et al. 2025, arXiv 2503.12284. A flat Gaussian with the axes e_a, e_b and the standard
+deviations s_a, s_b lies in a regular polygon of n = 8 sides (``mechanisms.meshes.fans``), whose radius depends on the
+opacity o:
 
     x_j = mu + r (s_a cos phi_j e_a + s_b sin phi_j e_b),   phi_j = 2 pi j / n,   r^2 = max(0, 11.3449 + 2 ln o)
 
@@ -10,28 +11,24 @@ The ray of each pixel hits the triangles between the centre and two neighbouring
     alpha = min(alpha_max, o exp(-(u^2 + v^2) / 2))      (u, v): the place in the plane, in standard deviations
 
 Each ray blends its own hits in the order of their depths, with the weights of 3DGS. The loops are those of ``rays``
-(``mechanisms.rays.traversal``, ``mechanisms.rays.kernels``), with eight triangles of a Gaussian in the place of one
-ellipsoid. Kernels know triangles with corners (:mod:`.kernels`), the reference planes with half-planes around them
-(:mod:`.reference`); neither knows the other's way.
+(``mechanisms.rays.traversal``, ``mechanisms.rays.kernels``), with eight triangles per Gaussian instead of one
+ellipsoid. The kernels intersect triangles with corners (:mod:`.kernels`), the reference planes bounded by half-planes
+(:mod:`.reference`), so that the two derivations share nothing.
 
 A mesh tool edits the polygons, and the Gaussians follow (:mod:`.soup`). The corners of an edited polygon are fitted by
 spans, whose ellipse is the Gaussian. Every affine edit is carried exactly.
 
-Where this deviates from the paper: it recovers a Gaussian from three vertices by Gram-Schmidt, which loses shear; here
-all corners are fitted, and the paper's way is measured beside it. A ray has any number of hits, sorted exactly. The
-thickness is 1e-5 where training starts and has no effect on a picture; it keeps its ratio under an edit. A Gaussian is
-flattened along whichever axis is its thinnest. Training starts from balls, whose planes are drawn at random; its loss
+This deviates from the paper, which recovers a Gaussian from three vertices by Gram-Schmidt and so loses shear; here all
+corners are fitted, and the study measures the paper's way beside it. A ray has any number of hits, sorted exactly. The
+thickness is 1e-5 where training starts and has no effect on an image; it keeps its ratio under an edit. A Gaussian is
+flattened along whichever axis is its thinnest. Training starts from balls, whose planes are chosen at random; its loss
 and schedule are those of 3DGS. Hits of alpha below ``alpha_min`` = 1/255 do not count.
 
-What to know: the edge of a polygon has no gradient; it cuts less than 0.008 of alpha. There is no low-pass: Gaussians
-thinner than a pixel fall between rays. A polygon in a plane with the camera is not seen. Of polygons that lie in one
+The edge of a polygon has no gradient; it cuts less than 0.008 of alpha. There is no low-pass: Gaussians thinner than a
+pixel fall between rays. A polygon in a plane with the camera is not seen. Of polygons that lie in one
 plane, copies are taken in the order of their rows, and others in the order in which rounding puts their depths.
 
-Measured (``study polygons/edits``, ``polygons/cost``): there and back, corners move by 3e-16 of the largest coordinate.
-Affine edits change covariances as they should to 9e-15, and the picture is that of the transformed Gaussians to 9e-14;
-Gram-Schmidt is off by 85 % under a shear. A sheet of 400 splats that is bent by 90 degrees has corners 2.8 % from where
-the fit puts them, twice that for 180 degrees, and half for four times as many splats. At 10,000 Gaussians a ray takes
-2.7 times as long as through ellipsoids and 26 times as long as a pixel of the plain kernels.
+``docs/FAMILY.md`` has the measured figures.
 
     minisplat-ref train SCENE --recipe polygons
     minisplat-ref polygons export runs/fox --out soup.ply

@@ -14,7 +14,7 @@ There are three ways to change a trained scene without training it again.
 
 :mod:`.binding` says where this deviates from GaMeS: nothing is trained on the faces, and the whole of F acts on a
 Gaussian. Left out are training with a mesh, collisions of a sheet with itself, solids, and relighting of what was
-rotated.
+rotated. ``docs/FAMILY.md`` has the measured figures.
 
     minisplat-ref proxies edit runs/fox out.ply --sphere 0 0 2 0.5 --rotate 0 30 0
     minisplat-ref proxies cage runs/banana sheet.ply --cells 20

@@ -17,11 +17,7 @@ textures of degree 0 the method is 3DGS, to the last byte.
     minisplat-ref study textured/limb
     minisplat-ref oracle gradients --extension textured
 
-Measured on the fox at 135 x 240 (``study textured/counts fox --downscale 2 --fine-tune 300 --seeds 1``), 4,422
-Gaussians after 1,000 iterations of Mini-Splatting, fine-tuned for 300 more: textures in addition to view-dependent
-colour gain 0.62 dB and 0.018 of SSIM on the test views. Instead of it they lose 0.49 dB and gain 0.006 of SSIM; those
-of degree 1 and 2 lose 1.06 and 0.76 dB. At an equal number of floats, 3,525 Gaussians with textures instead of view
-dependence lose 1.2 dB, and 2,192 with both lose 3.2 dB, so here one more Gaussian is worth more than a texture.
+``docs/FAMILY.md`` has the measured figures.
 
 This deviates from the paper as follows. The ellipsoid is exactly that of one standard deviation; the released kernel
 divides by standard deviations where their squares belong. Most rays that a footprint reaches miss the ellipsoid. In the
