@@ -12,7 +12,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.methods import RECIPES, gaussian_splatting, get_recipe
 from minisplat_ref.strategy.importance import outdoor
 from minisplat_ref.training.losses import LossTerm
-from minisplat_ref.training.schedule import At, DatedEvent, Every, action_name, configured, describe, scaled
+from minisplat_ref.training.schedule import At, DatedEvent, During, Every, action_name, configured, describe, scaled
 
 
 def nothing(state, iteration, **settings):
