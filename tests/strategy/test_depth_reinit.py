@@ -5,7 +5,6 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from minisplat_ref import memory
-from minisplat_ref.backends import CPU
 from minisplat_ref.constants import INRIA
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
@@ -115,8 +114,8 @@ def test_principal_point_is_the_conventions(points_of, rng):
     """INRIA's rasteriser takes it for the image's centre, so the rays of its pictures go through there."""
     gaussians, moved, centred = make_gaussians(rng, 60), make_camera(cx=10.0, cy=11.0), make_camera()
     for of_moved, of_centred in zip(
-        points_of(gaussians, view_from(moved), INRIA, CPU),
-        points_of(gaussians, view_from(centred), INRIA, CPU),
+        points_of(gaussians, view_from(moved), RenderSettings(conventions=INRIA)),
+        points_of(gaussians, view_from(centred), RenderSettings(conventions=INRIA)),
         strict=True,
     ):
         assert_array_equal(of_moved, of_centred)

@@ -245,7 +245,8 @@ def test_a_renderer_that_does_not_say_is_not_pruned_by_it(cooling):
         return SPLATTING.render(model, view, request._replace(wants=request.wants & {"stats"}))
 
     said = []
-    silent = here._replace(renderer=SPLATTING._replace(name="silent", render=render), say=said.append)
+    settings = here.render_settings._replace(renderer=SPLATTING._replace(name="silent", render=render))
+    silent = here._replace(render_settings=settings, say=said.append)
     prune_in_slices(state, silent._replace(step=11), **PRUNING)
     prune_in_slices(state, silent._replace(step=31), **PRUNING)
     assert len(said) == 1 and "renderer silent does not say" in said[0]

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from adaptive_states import iteration_of, state_of
 from minisplat_ref.backends import CPU
-from minisplat_ref.constants import GSPLAT_MAIN, SH_C0, SH_C1
+from minisplat_ref.constants import SH_C0, SH_C1
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.checkpoint import DamagedCheckpoint, load_checkpoint, save_checkpoint
 from minisplat_ref.io.ply import load_ply, save_ply
@@ -21,7 +21,7 @@ from minisplat_ref.methods.adaptive.degrees import (
 )
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.reference.spherical_harmonics import sh_colors
-from minisplat_ref.rendering import render
+from minisplat_ref.rendering import RenderSettings, render
 from minisplat_ref.runs.simplification import fine_tuned
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import Pace, held_out_ids
@@ -207,8 +207,7 @@ def test_fine_tuning_leaves_absent_bands_absent(matt, trained):
         recipe=SHORT,
         settings=SimpleNamespace(seed=0),
         scene=scene,
-        backend=CPU,
-        conventions=GSPLAT_MAIN,
+        render_settings=RenderSettings(),
     )
     rows = np.arange(len(degrees))
     tuned = fine_tuned(run, rows, 5, holds_out=False, on_step=lambda: None).gaussians.sh_rest
