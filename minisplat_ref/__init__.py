@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from minisplat_ref.rendering import render, render_vjp
     from minisplat_ref.types import Camera, Gaussians, RenderOutput, Scene, View
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"  # stated here; pyproject.toml reads it, so that a checkout that is not installed knows it, too
 
 _MODULES = {
     "minisplat_ref.backends": ("CPU", "REFERENCE", "Backend", "get_backend"),

@@ -381,7 +381,7 @@ def test_the_recipe_trains_from_points_resumes_and_is_measured(scene_folder, tmp
         (["mesh.ply", "--rim", "1.2"], "1.2 times"),
         (["mesh.ply", "--reach", "-1"], "-1 standard"),
         (["mesh.ply", "--solid", "--sides", "6"], "which are 6"),
-        (["mesh.ply", "--least-opacity", "2"], "--least-opacity"),
+        (["mesh.ply", "--min-opacity", "2"], "--min-opacity"),
         (["nowhere/mesh.ply"], "nowhere"),
     ],
 )

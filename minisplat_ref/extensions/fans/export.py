@@ -32,7 +32,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("model", type=Path, metavar="MODEL", help="PLY of Gaussians or of fans, or a run's folder")
     parser.add_argument("out", type=Path, metavar="OUT", help="mesh to write: .ply, .glb or .obj")
     parser.add_argument(
-        "--least-opacity",
+        "--min-opacity",
         type=float,
         default=1 / 255,
         metavar="A",
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
 
     check_suffix(args.out)
     if not 0 <= args.min_opacity <= 1:
-        raise InputError(f"--least-opacity is {args.min_opacity:g}, not in [0, 1]: give such an opacity")
+        raise InputError(f"--min-opacity is {args.min_opacity:g}, not in [0, 1]: give such an opacity")
     fans = load_as_fans(args.model, shape_of(args))
     whole = mesh_of(fans)
     mesh = visible_mesh(whole, args.min_opacity)

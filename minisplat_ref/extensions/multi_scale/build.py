@@ -25,7 +25,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--factor", type=float, default=FACTOR, metavar="F", help=f"ratio of sizes (default {FACTOR})")
     parser.add_argument("--levels", type=int, default=N_LEVELS, metavar="N", help=f"levels to add (default {N_LEVELS})")
     parser.add_argument(
-        "--least-coverage",
+        "--min-coverage",
         type=float,
         default=COVERAGE_MIN,
         metavar="PX",
@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.io import viewpoints
 
     if not (1 < args.factor <= 1024 and 1 <= args.levels <= 16 and args.min_coverage > 0):
-        raise InputError("give a --factor above 1, 1 to 16 --levels, and a --least-coverage above 0")
+        raise InputError("give a --factor above 1, 1 to 16 --levels, and a --min-coverage above 0")
     gaussians = load_ply(args.ply)
     if "cells_0" in further_properties(args.ply):
         raise InputError(f"{args.ply} has levels already: give a scene that was trained without any")
