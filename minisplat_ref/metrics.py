@@ -14,10 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.backends import CPU, Backend
-from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.lpips import HOW_TO_MAKE, Network, check_views, lpips
-from minisplat_ref.rendering import SPLATTING, Renderer, Request, as_model
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.types import Bools, Floats, Ints, View
 
 NO_WEIGHTS = (
@@ -102,13 +101,10 @@ def ssim(image: Floats, target: Floats | Ints, mask: Bools | None = None, *, bac
 def evaluate(
     model: Any,
     views: Sequence[View],
+    settings: RenderSettings,
     *,
-    background: Floats,
     on_view: Callable[[View, Floats, ViewMetrics], None] | None = None,
     network: Network | None = None,
-    renderer: Renderer = SPLATTING,
-    backend: Backend = CPU,
-    conventions: Conventions = GSPLAT_MAIN,
 ) -> Evaluation:
     """Render views with all stored spherical-harmonic degrees and compare them with their photographs.
 
@@ -117,16 +113,12 @@ def evaluate(
     model : Model or Gaussians
     views : sequence of View
         Usually ``scene.test_views``; pixels outside a view's mask do not count.
-    background : ndarray of shape (3,)
-        ``scene.background``.
+    settings : RenderSettings
+        With ``scene.background``.
     on_view : callable, optional
         Called after each view with the view, its rendering [H, W, 3] clipped to [0, 1], and its metrics.
     network : Network, optional
         Of :func:`minisplat_ref.lpips.load_network`; without it LPIPS is not measured.
-    renderer : Renderer
-        How the model is drawn.
-    backend : Backend
-    conventions : Conventions
 
     Raises
     ------
@@ -136,13 +128,12 @@ def evaluate(
     if network is not None:
         check_views(network, views)
     per_view = []
-    request = Request(background, conventions=conventions, backend=backend)
     for view in (view.load() for view in views):
-        image = np.clip(renderer.render(as_model(model), view, request)[0].image, 0.0, 1.0)  # [H, W, 3]
+        image = np.clip(settings.render(model, view)[0].image, 0.0, 1.0)  # [H, W, 3]
         metrics = ViewMetrics(
             view.name,
             psnr(image, view.image, view.mask),
-            ssim(image, view.image, view.mask, backend=backend),
+            ssim(image, view.image, view.mask, backend=settings.backend),
             None if network is None else lpips(image, view.image, network, view.mask),
         )
         per_view.append(metrics)

@@ -310,3 +310,23 @@ def _channels(wants: frozenset[str]) -> dict[str, slice]:
 
 SPLATTING = Renderer("splatting", _render_model, render_vjp, _channels)
 """3DGS: any population that has the six fields of :class:`Gaussians`."""
+
+
+class RenderSettings(NamedTuple):
+    """What all renderings of a training or an evaluation share; a :class:`Request` adds what one of them asks for."""
+
+    background: Floats | None = None
+    """[3] RGB behind everything; black by default."""
+    conventions: Conventions = GSPLAT_MAIN
+    backend: Backend = CPU
+    renderer: Renderer = SPLATTING
+
+    def request(self, wants: frozenset[str] = frozenset(), *, sh_degree: int | None = None) -> Request:
+        """Return the request for a view; see :class:`Request`."""
+        return Request(self.background, sh_degree, self.conventions, self.backend, wants=wants)
+
+    def render(
+        self, model: Any, view: View, wants: frozenset[str] = frozenset(), *, sh_degree: int | None = None
+    ) -> tuple[RenderOutput, Any]:
+        """Render a view of a :class:`Model` or population; return it with the tape for the gradient."""
+        return self.renderer.render(as_model(model), view, self.request(wants, sh_degree=sh_degree))

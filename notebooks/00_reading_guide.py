@@ -46,7 +46,8 @@ from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import psnr
 from minisplat_ref.reference.tiling import bin_gaussians
 from minisplat_ref.rendering import render
-from minisplat_ref.training.loop import initial_state, train
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
 from minisplat_ref.types import TileGrid
 
 # %%

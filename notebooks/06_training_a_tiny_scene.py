@@ -35,10 +35,11 @@ from minisplat_ref.backends import CPU
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods import RECIPES, get_recipe
 from minisplat_ref.metrics import evaluate
-from minisplat_ref.rendering import render, render_vjp
+from minisplat_ref.rendering import RenderSettings, render, render_vjp
 from minisplat_ref.strategy import clone_split
 from minisplat_ref.training.adam import adam_step
-from minisplat_ref.training.loop import initial_state, train
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
 from minisplat_ref.training.rates import active_sh_degree
 from minisplat_ref.training.schedule import Every, configured, scaled
 
@@ -62,7 +63,7 @@ print(f"{len(scene.train_views)} training views, {len(scene.test_views)} held-ou
 # %% [markdown]
 # | file | what it holds | where in the paper |
 # |---|---|---|
-# | `minisplat_ref/training/loop.py` | the loop | 3DGS sec. 4 |
+# | `minisplat_ref/training/loop.py`, `iteration.py` | the loop, and one iteration | 3DGS sec. 4 |
 # | `minisplat_ref/methods/`, `training/schedule.py` | what is due when, as data | 3DGS sec. 7.1 |
 # | `minisplat_ref/strategy/` | initialisation; clone, split, prune, opacity reset | 3DGS sec. 5.1, 5.2 |
 # | `minisplat_ref/training/adam.py`, `rates.py` | Adam, schedules of the learning rates | |
@@ -205,7 +206,7 @@ curve = []  # step, count, mean PSNR of the held-out views, median opacity
 
 def measure(step, gaussians):
     """Add a point to the curves."""
-    result = evaluate(gaussians, scene.test_views, background=scene.background)
+    result = evaluate(gaussians, scene.test_views, RenderSettings(scene.background))
     median = float(np.median(1 / (1 + np.exp(-gaussians.opacity_logits))))
     curve.append((step, len(gaussians.means), result.psnr, median))
     return result
@@ -221,7 +222,7 @@ state = initial_state(scene, recipe, seed=0)
 first = state.gaussians._make(field.copy() for field in state.gaussians)  # training works in place
 result_before = measure(0, first)
 train(scene, recipe._replace(events=tuple(map(watched, recipe.events))), seed=0, state=state, on_step=on_step)
-result_after = evaluate(state.gaussians, scene.test_views, background=scene.background)
+result_after = evaluate(state.gaussians, scene.test_views, RenderSettings(scene.background))
 print(f"before: PSNR {result_before.psnr:.2f} dB, SSIM {result_before.ssim:.3f}, {len(first.means)} Gaussians")
 print(f"after:  PSNR {result_after.psnr:.2f} dB, SSIM {result_after.ssim:.3f}, {len(state.gaussians.means)} Gaussians")
 
@@ -350,7 +351,7 @@ my_events = tuple(e for e in my_recipe.events if partial(e.action).func.__name__
 mine = train(scene, my_recipe._replace(events=my_events), seed=0).gaussians
 image = render(mine, held_out.camera, background=scene.background)[0].image
 figure, axes = plt.subplots(1, 3, figsize=(9, 2.4))
-my_psnr = evaluate(mine, scene.test_views, background=scene.background).psnr
+my_psnr = evaluate(mine, scene.test_views, RenderSettings(scene.background)).psnr
 for panel, picture, title in (
     (axes[0], truth, "photograph"),
     (axes[1], renders[1][0].image, f"above: {len(state.gaussians.means)}, {result_after.psnr:.1f} dB"),

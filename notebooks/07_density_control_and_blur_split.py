@@ -38,10 +38,11 @@ from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods import gaussian_splatting, get_recipe, mini_splatting
 from minisplat_ref.metrics import evaluate, psnr
-from minisplat_ref.rendering import render, render_vjp
+from minisplat_ref.rendering import RenderSettings, render, render_vjp
 from minisplat_ref.strategy.blur_split import is_blurred, principal_axis_children
 from minisplat_ref.strategy.clone_split import clone_and_split, logit, random_children, screen_gradient_norms
-from minisplat_ref.training.loop import initial_state, train
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import BLEND_STATS, During, Every
 from minisplat_ref.types import Camera, Gaussians
 
@@ -353,7 +354,7 @@ ways = {
     "and blur; longest axis": (True, principal_axis_children),
 }
 curves, results, ends = {}, {}, {}
-result_before, inside_before = evaluate(before, scene.test_views, background=scene.background), inside(before)
+result_before, inside_before = evaluate(before, scene.test_views, RenderSettings(scene.background)), inside(before)
 for name, (has_blur_split, draw_children) in ways.items():
     recipe = base._replace(
         iterations=ITERATIONS, events=density_control(FIRST_STOP - 1, STOP + 1, has_blur_split, draw_children)
@@ -364,11 +365,11 @@ for name, (has_blur_split, draw_children) in ways.items():
         """Measure every 25 iterations."""
         if report.step % 25 == 0:
             gaussians = report.state.gaussians
-            result = evaluate(gaussians, scene.test_views, background=scene.background)
+            result = evaluate(gaussians, scene.test_views, RenderSettings(scene.background))
             curve.append((report.step, len(gaussians.means), result.psnr))
 
     ends[name] = train(scene, recipe, seed=0, state=copy.deepcopy(state), on_step=on_step).gaussians
-    result = evaluate(ends[name], scene.test_views, background=scene.background)
+    result = evaluate(ends[name], scene.test_views, RenderSettings(scene.background))
     results[name] = (result.psnr, result.ssim, inside(ends[name]), len(ends[name].means))
 print(f"{'':<26}PSNR (dB)   SSIM   inside (dB)   Gaussians")
 for name, (quality, similarity, within, count) in results.items():

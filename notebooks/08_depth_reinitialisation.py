@@ -33,12 +33,11 @@ import numpy as np
 from matplotlib.patches import Ellipse
 
 from figures import BLUE, GREEN, GREY, RED, show, show_code
-from minisplat_ref.backends import CPU
-from minisplat_ref.constants import GSPLAT_MAIN, SH_C0
+from minisplat_ref.constants import SH_C0
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
-from minisplat_ref.rendering import render
+from minisplat_ref.rendering import RenderSettings, render
 from minisplat_ref.strategy.depth_reinit import (
     blend_points,
     centre_points,
@@ -74,7 +73,7 @@ toy = Gaussians(
     sh_dc=np.zeros((2, 3)),
     sh_rest=np.zeros((2, 0, 3)),
 )
-toy_points = {name: points_of(toy, view_from(toy_camera), GSPLAT_MAIN, CPU) for name, (points_of, _) in KINDS.items()}
+toy_points = {name: points_of(toy, view_from(toy_camera), RenderSettings()) for name, (points_of, _) in KINDS.items()}
 
 row = SIZE // 2
 figure, axes = plt.subplots(1, 3, figsize=(10, 3.5), sharex=True, sharey=True)
@@ -133,7 +132,7 @@ truths = {name: make_scene(name, **VIEW_SETTINGS) for name in ("room", "outdoor"
 # %% tags=["rounding"]
 trained = {name: train(truth.scene, recipe, seed=0).gaussians for name, truth in truths.items()}
 for name, gaussians in trained.items():
-    result = evaluate(gaussians, truths[name].scene.test_views, background=truths[name].scene.background)
+    result = evaluate(gaussians, truths[name].scene.test_views, RenderSettings(truths[name].scene.background))
     print(f"{name:<12}{len(gaussians.means):>6} Gaussians, held-out views {result.psnr:.1f} dB")
 
 
@@ -151,7 +150,7 @@ figure, axes = plt.subplots(2, 4, figsize=(11, 4.4))
 show(axes[0, 0], view.image / 255, "photograph")
 show(axes[1, 0], true_depth, "true depth", cmap="viridis", vmin=0, vmax=farthest)
 for k, (name, (points_of, _)) in enumerate(KINDS.items(), start=1):
-    pixel_points = points_of(room, view, GSPLAT_MAIN, CPU)
+    pixel_points = points_of(room, view, RenderSettings())
     shown_depth = show(axes[0, k], pixel_points.depths, name, cmap="viridis", vmin=0, vmax=farthest)
     error = relative_errors(pixel_points.depths, true_depth)
     shown_error = show(axes[1, k], error, f"error, median {np.median(error):.1%}", cmap="magma", vmin=0, vmax=0.3)
@@ -200,7 +199,7 @@ def train_from(gaussians, scene, iterations, rng):
 
 def scored(gaussians, name):
     """Return the mean PSNR of the held-out views, dB."""
-    return evaluate(gaussians, truths[name].scene.test_views, background=truths[name].scene.background).psnr
+    return evaluate(gaussians, truths[name].scene.test_views, RenderSettings(truths[name].scene.background)).psnr
 
 
 points, pixels, colors = drawn("room", PAPER)
@@ -259,7 +258,7 @@ def elevation(axes, name, points, pixels, title):
 figure, axes = plt.subplots(2, 5, figsize=(11, 3.9), width_ratios=(1, 1, 1, 1, 1.7))
 for line, name in zip(axes, ("outdoor", "plain-wall"), strict=True):
     view, true_depth = truths[name].scene.train_views[VIEW_ID], truths[name].train_depths[VIEW_ID]
-    pixel_points = midpoint_points(trained[name], view, GSPLAT_MAIN, CPU)
+    pixel_points = midpoint_points(trained[name], view, RenderSettings())
     farthest = np.quantile(true_depth[true_depth > 0], 0.9)
     show(line[0], view.image / 255, name)
     show(line[1], pixel_points.alpha, "opacity", cmap="gray", vmin=0, vmax=1)

@@ -38,7 +38,7 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.reference.covariance import covariances
-from minisplat_ref.rendering import render
+from minisplat_ref.rendering import RenderSettings, render
 from minisplat_ref.strategy import importance, simplify
 from minisplat_ref.strategy.ops import take
 from minisplat_ref.training.adam import zero_moments
@@ -54,7 +54,7 @@ dense = train(scene, get_recipe("3dgs-accel", 250)._replace(events=()), seed=0).
 
 def quality(gaussians):
     """PSNR of the views that training never sees, dB."""
-    return evaluate(gaussians, scene.test_views, background=scene.background).psnr
+    return evaluate(gaussians, scene.test_views, RenderSettings(scene.background)).psnr
 
 
 output, tape = render(dense, held_out.camera, background=scene.background, with_stats=True)

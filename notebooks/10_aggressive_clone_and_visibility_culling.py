@@ -40,7 +40,7 @@ from minisplat_ref.backends import CPU
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods import gaussian_splatting, get_recipe, mini_splatting2
 from minisplat_ref.metrics import evaluate, psnr
-from minisplat_ref.rendering import render, render_vjp
+from minisplat_ref.rendering import RenderSettings, render, render_vjp
 from minisplat_ref.strategy import aggressive_clone, visibility
 from minisplat_ref.strategy.blur_split import principal_axis_children
 from minisplat_ref.strategy.clone_split import screen_gradient_norms
@@ -212,7 +212,7 @@ doubled = {
     "plain copies": plain_copies(gaussians, is_critical).gaussians,
     "copies that share": aggressive_clone.clone(gaussians, is_critical).gaussians,
 }
-quality = {name: evaluate(g, scene.train_views, background=scene.background).psnr for name, g in doubled.items()}
+quality = {name: evaluate(g, scene.train_views, RenderSettings(scene.background)).psnr for name, g in doubled.items()}
 
 figure, axes = plt.subplots(1, 5, figsize=(11, 2.1))
 for panel, (name, g) in zip(axes[:3], doubled.items(), strict=True):
@@ -387,13 +387,13 @@ ways = {
 curves, ends = {}, {}
 for name, more_events in ways.items():
     recipe = base._replace(iterations=ITERATIONS, events=(*density_control(START - 1, STOP + 1), *more_events))
-    start_result = evaluate(gaussians, scene.test_views, background=scene.background)
+    start_result = evaluate(gaussians, scene.test_views, RenderSettings(scene.background))
     curve = curves[name] = [(START, n, start_result.psnr)]
 
     def on_step(report, curve=curve):
         """Measure every 25 iterations, just after events."""
         if report.step % 25 == 0:
-            result = evaluate(report.state.gaussians, scene.test_views, background=scene.background)
+            result = evaluate(report.state.gaussians, scene.test_views, RenderSettings(scene.background))
             curve.append((report.step, len(report.state.gaussians.means), result.psnr))
 
     ends[name] = train(scene, recipe, seed=0, state=copy.deepcopy(state), on_step=on_step)
@@ -417,7 +417,7 @@ show(axes[1, 0], render(gaussians, held_out.camera, **options)[0].image, f"befor
 results = {}
 for column, (name, end) in enumerate(ends.items(), start=1):
     image = render(end.gaussians, held_out.camera, **options)[0].image
-    results[name] = evaluate(end.gaussians, scene.test_views, background=scene.background)
+    results[name] = evaluate(end.gaussians, scene.test_views, RenderSettings(scene.background))
     show(axes[0, column], image, f"{name}: {len(end.gaussians.means)}")
     error = show_error(axes[1, column], image, truth)
 figure.colorbar(error, ax=axes[1, 1:], shrink=0.9)

@@ -34,9 +34,10 @@ from figures import BLUE, GREEN, RED, show, show_error
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.metrics import evaluate
-from minisplat_ref.rendering import render
-from minisplat_ref.training.loop import initial_state, train
-from minisplat_ref.training.schedule import During, Every, configured, scaled
+from minisplat_ref.rendering import RenderSettings, render
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.schedule import DatedEvent, During, Every, SmallerViews, configured, scaled
 
 # %%
 ITERATIONS = 900
@@ -72,7 +73,7 @@ spent = [0.0]  # seconds of measuring, of the current run
 def quality(gaussians):
     """PSNR of the views that training never sees, dB."""
     start = time.perf_counter()
-    result = evaluate(gaussians, scene.test_views, background=scene.background)
+    result = evaluate(gaussians, scene.test_views, RenderSettings(scene.background))
     spent[0] += time.perf_counter() - start
     return result.psnr
 
@@ -101,7 +102,7 @@ def run(recipe):
     """Train; return the state, the log of events, and the curve: step, seconds, count, PSNR, ms of the iteration."""
     log, curve, ticks = [], [], []
     events = tuple(
-        event if isinstance(event, During) else event._replace(action=partial(noted, log, event.action))
+        event._replace(action=partial(noted, log, event.action)) if isinstance(event, DatedEvent) else event
         for event in recipe.events
     )
     state = initial_state(scene, recipe, seed=0)
@@ -159,8 +160,9 @@ plt.show()
 
 # %%
 for recipe in recipes.values():
-    print(f"{recipe.name}: half size until {recipe.half_size_until}, colour degrees at {recipe.sh_milestones}")
-    for event in recipe.events:
+    half_size_until = sum(event.until for event in recipe.events if isinstance(event, SmallerViews))
+    print(f"{recipe.name}: half size until {half_size_until}, colour degrees at {recipe.sh_milestones}")
+    for event in (event for event in recipe.events if not isinstance(event, SmallerViews)):
         steps = due_steps(event)
         when = f"{steps[0]} to {steps[-1]}" if isinstance(event, During) else ", ".join(map(str, steps)) or "never"
         print(f"    {named(event.action)[0]:<26}{when}")
@@ -319,7 +321,7 @@ for name, (_, log, curve, _) in results.items():
 
 def typical(gaussians):
     """Median PSNR of the held-out views, dB: one Gaussian in front of a camera spoils a mean of four."""
-    return np.median([evaluate(gaussians, [view], background=scene.background).psnr for view in scene.test_views])
+    return np.median([evaluate(gaussians, [view], RenderSettings(scene.background)).psnr for view in scene.test_views])
 
 
 n_accel, psnr_accel = ends["3dgs-accel"]

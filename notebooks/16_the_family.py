@@ -58,7 +58,7 @@ from minisplat_ref.mechanisms.packing.container import parse
 from minisplat_ref.mechanisms.sampling import block_means, zoom_camera
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import psnr
-from minisplat_ref.rendering import Request, render
+from minisplat_ref.rendering import RenderSettings, Request, render
 from minisplat_ref.strategy.importance import collect_importance, indoor
 from minisplat_ref.strategy.ops import take
 from minisplat_ref.training.loop import train
@@ -278,7 +278,7 @@ for n, (n_plain, n_levels, n_shown) in counts.items():
 # kept first.
 
 # %% tags=["rounding"]
-importance = indoor(collect_importance(room, scene.train_views, backend=CPU))
+importance = indoor(collect_importance(room, scene.train_views, RenderSettings(backend=CPU)))
 distinctiveness = local_distinctiveness(room.means, room.sh_dc)
 scores = {
     "importance": importance,

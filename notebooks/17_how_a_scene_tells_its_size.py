@@ -33,10 +33,10 @@ from IPython.display import Markdown, display
 
 from figures import BLUE, GREEN, GREY, RED, show, show_code
 from minisplat_ref.datasets.synthetic import make_scene
-from minisplat_ref.methods.adaptive import ADAPTIVE
-from minisplat_ref.methods.adaptive_prune import LAST_SLICE
+from minisplat_ref.methods.adaptive.numbers import LAST_SLICE
+from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.metrics import evaluate
-from minisplat_ref.rendering import render
+from minisplat_ref.rendering import RenderSettings, render
 from minisplat_ref.strategy.clone_split import logit
 from minisplat_ref.strategy.halving import OFFSET, halves
 from minisplat_ref.strategy.ops import concat
@@ -113,16 +113,18 @@ for name, log in logs.items():
 #
 # | file | what it holds |
 # |---|---|
-# | `minisplat_ref/methods/adaptive.py` | the recipe: grow, measure, cool down, prune |
+# | `minisplat_ref/methods/adaptive/recipe.py` | the recipe: which rule acts when |
+# | `minisplat_ref/methods/adaptive/numbers.py` | all its numbers, each with its reason |
+# | `minisplat_ref/methods/adaptive/growth.py`, `progress.py` | what is halved; what is measured, and when it ends |
 # | `minisplat_ref/strategy/halving.py` | one Gaussian becomes two halves |
-# | `minisplat_ref/methods/adaptive_prune.py` | what is pruned, in slices |
-# | `minisplat_ref/methods/adaptive_bands.py` | how many bands of the harmonics each Gaussian has |
+# | `minisplat_ref/methods/adaptive/prune.py` | what is pruned, in slices |
+# | `minisplat_ref/methods/adaptive/degrees.py` | how many degrees of the harmonics each Gaussian has |
 # | `minisplat_ref/training/pace.py` | what was measured and decided; which views are held back |
-# | `minisplat_ref/methods/adaptive_evidence.py` | whether photographs need an exposure, or another pose |
-# | `minisplat_ref/methods/adaptive_exposure.py` | the gains of photographs |
-# | `minisplat_ref/methods/adaptive_pose.py` | the displacements of photographs |
-# | `minisplat_ref/methods/adaptive_antialiasing.py` | whether photographs differ in resolution |
-# | `minisplat_ref/methods/adaptive_sky.py` | whether there is a sky behind everything |
+# | `minisplat_ref/methods/adaptive/switches.py`, `evidence.py` | what photographs need, and how they show it |
+# | `minisplat_ref/methods/adaptive/exposure.py` | the gains of photographs |
+# | `minisplat_ref/methods/adaptive/pose.py` | the displacements of photographs |
+# | `minisplat_ref/methods/adaptive/antialiasing.py` | whether photographs differ in resolution |
+# | `minisplat_ref/methods/adaptive/sky.py` | whether there is a sky behind everything |
 #
 # **Frames and units:** the world is in metres, work is counted in pairs (tile, Gaussian), PSNR in dB.
 #
@@ -202,7 +204,7 @@ for name, state in states.items():
     axes[1].semilogy(steps, factors, color=COLORS[name])
     models = (*logs[name]["around the prune"], state.gaussians)
     views, background = scenes[name].test_views, scenes[name].background
-    psnrs = [evaluate(model, views, background=background).psnr for model in models]
+    psnrs = [evaluate(model, views, RenderSettings(background)).psnr for model in models]
     around[name] = (psnrs, [len(model.means) for model in models])
     axes[2].plot(psnrs, "o-", color=COLORS[name], markersize=4)
 axes[0].set(xlabel="log2 of pairs (tile, Gaussian)", ylabel="PSNR, held back [dB]", title="slope since half the work")

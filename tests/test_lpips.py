@@ -15,6 +15,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.io import load_ply, load_scene
 from minisplat_ref.lpips import ALEXNET, VGG16, Network, convolve, expected_shapes, load_network, lpips, max_pool
 from minisplat_ref.metrics import evaluate
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.runs import scoring
 from minisplat_ref.runs.progress import Progress
 from minisplat_ref.types import View
@@ -217,7 +218,7 @@ def test_evaluation(rng, network):
     result = evaluate(
         make_gaussians(rng, 20),
         views,
-        background=np.zeros(3),
+        RenderSettings(np.zeros(3)),
         network=network,
         on_view=lambda view, image, _: seen.update({view.name: lpips(image, view.image, network)}),
     )
@@ -232,7 +233,7 @@ def test_small_view_is_found_before_anything_is_rendered(rng, network):
         for name, width in (("fine", 40), ("narrow", 30))
     ]
     with pytest.raises(InputError, match="view narrow is 30 x 40 pixels"):
-        evaluate(make_gaussians(rng, 3), views, background=np.zeros(3), network=network, on_view=pytest.fail)
+        evaluate(make_gaussians(rng, 3), views, RenderSettings(np.zeros(3)), network=network, on_view=pytest.fail)
 
 
 SCENE = {"n_views": 8, "width": 40, "height": 36, "n_points": 60, "test_every": 4}
@@ -273,7 +274,7 @@ def test_train_measures_lpips(run_folder, scene_folder, weights, network):
     assert json.loads((run_folder / "config.json").read_text())["settings"]["lpips_weights"] == str(weights.resolve())
     scene = load_scene(scene_folder, test_every=4)
     gaussians = load_ply(run_folder / "point_cloud.ply")
-    expected = evaluate(gaussians, scene.test_views, background=scene.background, network=network)
+    expected = evaluate(gaussians, scene.test_views, RenderSettings(scene.background), network=network)
     assert metrics["lpips"] == pytest.approx(expected.lpips, rel=LPIPS_FLOAT32, abs=0)
     assert metrics["lpips_reason"] is None and metrics["lpips_network"] == "AlexNet"
     assert [view["lpips"] for view in metrics["per_view"]] == [view.lpips for view in expected.per_view]

@@ -9,7 +9,7 @@ from minisplat_ref.backends import REFERENCE
 from minisplat_ref.errors import InputError
 from minisplat_ref.metrics import evaluate, psnr, ssim
 from minisplat_ref.reference.loss import ssim_map
-from minisplat_ref.rendering import render
+from minisplat_ref.rendering import RenderSettings, render
 from minisplat_ref.types import View
 from scenes import as_dtype, make_camera, make_gaussians
 from tolerances import CLOSED_FORM, PARITY_FLOAT64
@@ -74,7 +74,9 @@ def test_evaluation(rng, backend):
         worse = np.clip(image + 0.05 * i, 0, 1)
         views.append(View(f"view{i}", camera, np.round(255 * worse).astype(np.uint8), None))
     seen = []
-    result = evaluate(gaussians, views, background=background, on_view=lambda *args: seen.append(args), backend=backend)
+    result = evaluate(
+        gaussians, views, RenderSettings(background, backend=backend), on_view=lambda *args: seen.append(args)
+    )
     values = [view.psnr for view in result.per_view]
     assert [view.name for view in result.per_view] == ["view0", "view1", "view2"]
     assert values[0] > 50  # rounding to 8 bits only: 10 log10(12 * 255^2) = 58.9 dB
@@ -88,5 +90,5 @@ def test_evaluation(rng, backend):
 
 
 def test_no_views(rng):
-    result = evaluate(make_gaussians(rng, 3), [], background=np.zeros(3), backend=REFERENCE)
+    result = evaluate(make_gaussians(rng, 3), [], RenderSettings(np.zeros(3), backend=REFERENCE))
     assert result.psnr is None and result.ssim is None and result.per_view == []

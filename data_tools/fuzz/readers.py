@@ -26,7 +26,8 @@ from minisplat_ref.oracle.golden.scenes import RECIPES, inputs, truth
 from minisplat_ref.runs import settings
 from minisplat_ref.runs.run_folder import CONFIG
 from minisplat_ref.strategy.initialization import from_points
-from minisplat_ref.training.loop import initial_state, load_state, save_state
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.saved_state import load_state, save_state
 from minisplat_ref.training.schedule import configured
 from minisplat_ref.types import Gaussians
 

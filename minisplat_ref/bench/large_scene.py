@@ -31,7 +31,7 @@ from minisplat_ref.runs import room
 from minisplat_ref.runs.run import run_training
 from minisplat_ref.runs.settings import Settings, load_photographs, recipe_of
 from minisplat_ref.training.adam import zero_moments
-from minisplat_ref.training.loop import initial_state
+from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Gaussians, Scene
 

@@ -86,8 +86,8 @@ def measure(folder: str) -> None:
     """Train on the inputs in a folder, and store the first image and the peak there; runs in its own process."""
     from minisplat_ref.methods import get_recipe
     from minisplat_ref.training.adam import zero_moments
-    from minisplat_ref.training.loop import StepReport, train
-    from minisplat_ref.training.state import TrainState
+    from minisplat_ref.training.loop import train
+    from minisplat_ref.training.state import StepReport, TrainState
     from minisplat_ref.types import Scene, View
 
     recipe = get_recipe("3dgs-accel")._replace(iterations=N_ITERATIONS, events=())

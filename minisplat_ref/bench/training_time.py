@@ -22,7 +22,8 @@ from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.io import load_scene
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.oracle.cases import Case, Figure
-from minisplat_ref.training.loop import initial_state, train
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
 from minisplat_ref.types import Scene
 
 WARM_UP = 5  # iterations that compile and are not timed

@@ -58,8 +58,8 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.runs.run import run_training
     from minisplat_ref.runs.scoring import summary
     from minisplat_ref.runs.settings import Settings, load_photographs, recipe_of
+    from minisplat_ref.training.initial_state import initial_state
     from minisplat_ref.training.interruption import terminated_like_interrupted
-    from minisplat_ref.training.loop import initial_state
 
     start = time.perf_counter()
     folder = args.out or _first_free(Path(DEFAULT_OUT))

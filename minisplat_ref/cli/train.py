@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from minisplat_ref.lpips import Network
     from minisplat_ref.runs.settings import Settings
     from minisplat_ref.runs.simplification import Target
-    from minisplat_ref.training.loop import TrainState
     from minisplat_ref.training.schedule import Recipe
+    from minisplat_ref.training.state import TrainState
     from minisplat_ref.types import Scene
 
 N_ITERATIONS = 3000  # of recipes with a schedule
@@ -260,7 +260,7 @@ def _default_iterations(name: str) -> int:
 def _first_state(settings: "Settings", scene: "Scene", recipe: "Recipe") -> "TrainState":
     """Return the state before the first iteration, from the scene's points or from those of --init."""
     from minisplat_ref.runs.start import load_start
-    from minisplat_ref.training.loop import initial_state
+    from minisplat_ref.training.initial_state import initial_state
 
     start, notices = (scene, []) if settings.init is None else load_start(settings.init, scene)
     for notice in notices:

@@ -10,7 +10,7 @@ from minisplat_ref.io import load_scene
 from minisplat_ref.lpips import check_views, load_network
 from minisplat_ref.runs import run_folder
 from minisplat_ref.runs.start import load_start
-from minisplat_ref.training.loop import initial_state
+from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.schedule import describe
 from minisplat_ref.types import Scene
 

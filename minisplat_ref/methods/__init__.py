@@ -4,7 +4,7 @@ A recipe is data (:mod:`minisplat_ref.training.schedule`), written for its publi
 """
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.methods.adaptive import ADAPTIVE
+from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.methods.gaussian_splatting import GS, GS_ACCEL
 from minisplat_ref.methods.mini_splatting import MINI_SPLATTING, MINI_SPLATTING_D
 from minisplat_ref.methods.mini_splatting2 import MINI_SPLATTING2, MINI_SPLATTING2_D

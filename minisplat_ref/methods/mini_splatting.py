@@ -45,12 +45,7 @@ def measure_importance(
     ``visibility_mass`` is the fraction of a view's blend weight that its visible Gaussians carry.
     """
     return collect_importance(
-        state.model,
-        iteration.scene.train_views,
-        renderer=iteration.renderer,
-        conventions=iteration.conventions,
-        backend=iteration.backend,
-        visibility_mass=visibility_mass,
+        state.model, iteration.scene.train_views, iteration.render_settings, visibility_mass=visibility_mass
     )
 
 
@@ -133,14 +128,12 @@ def reinitialise_from_depth(
         state.model,
         iteration.scene.train_views,
         n_points,
+        settings=iteration.render_settings,
         points_of=points_of,
         min_alpha=min_alpha,
         depth_tolerance=depth_tolerance,
         backdrop_distance=None if backdrop_extents is None else backdrop_extents * iteration.scene.extent,
         rng=state.rng,
-        renderer=iteration.renderer,
-        conventions=iteration.conventions,
-        backend=iteration.backend,
     )
     gaussians = from_points(points, colors, sh_degree=0)
     start_anew(state, iteration, limited_sizes(gaussians, iteration.scene, largest_size))

@@ -33,10 +33,12 @@ from minisplat_ref.strategy import simplify as simplification
 from minisplat_ref.strategy.importance import ImportanceStats, indoor, mass_mask
 from minisplat_ref.strategy.ops import keep, n_rows, take
 from minisplat_ref.training.adam import AdamRule
-from minisplat_ref.training.schedule import BLEND_STATS, At, During, Every
+from minisplat_ref.training.schedule import BLEND_STATS, At, During, Every, SmallerViews
+from minisplat_ref.training.smaller_views import halve_large_views
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit, n_pixels
 from minisplat_ref.types import Bools
 
+HALF_SIDE_MIN = 100  # pixels; so small a photograph shows little of what the whole one does
 COLLECTED = ("gradient_sum", "view_count", "is_blurred")
 
 
@@ -119,6 +121,7 @@ _reinitialise = partial(
 _densifying = partial(Every, 100, start=500, stop=3_000, skip=2_000, min_gap=DENSIFY_LEAST_GAP)
 
 _DENSIFICATION = (
+    SmallerViews(partial(halve_large_views, min_side=HALF_SIDE_MIN, max_halvings=1), until=3_000),
     During(collect_gradients, stop=3_000),
     During(partial(collect_blur, area_fraction=BLUR_AREA, min_area=BLURRED_AREA_MIN), stop=3_000, wants=BLEND_STATS),
     _densifying(_densify),
@@ -156,7 +159,6 @@ MINI_SPLATTING2 = GS._replace(
         ),
         At(13_000, stop_culling),
     ),
-    half_size_until=3_000,
     min_views=3,
     short_run_exponent=SHORT_RUN_EXPONENT,
 )

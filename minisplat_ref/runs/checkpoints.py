@@ -15,8 +15,8 @@ from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.io.checkpoint import WAY_OUT, DamagedCheckpoint, load_checkpoint, load_metadata
 from minisplat_ref.runs.run_folder import CHECKPOINT, POINT_CLOUD, PREVIOUS, measured_step
 from minisplat_ref.runs.settings import Settings, load_model, recipe_of
-from minisplat_ref.training.loop import load_state, save_state
-from minisplat_ref.training.schedule import During, Recipe
+from minisplat_ref.training.saved_state import load_state, save_state
+from minisplat_ref.training.schedule import DatedEvent, Recipe
 from minisplat_ref.training.state import StepReport, TrainState
 from minisplat_ref.types import Model
 
@@ -45,7 +45,7 @@ def save_regularly(folder: Path, recipe: Recipe) -> Callable[[StepReport], None]
 
 def _may_burst(report: StepReport, recipe: Recipe) -> bool:
     """Return whether rows may be added in the next iteration, and there is no room for twice as many."""
-    if all(isinstance(event, During) or not event.is_due(report.step + 1) for event in recipe.events):
+    if not any(isinstance(event, DatedEvent) and event.is_due(report.step + 1) for event in recipe.events):
         return False
     gaussians = report.state.gaussians
     n, n_bytes = len(gaussians.means), sum(field.nbytes for field in gaussians)

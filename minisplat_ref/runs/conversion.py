@@ -15,6 +15,7 @@ from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.extensions.extension import CORE, Extension, all_formats, find_format, load_extension, owner_of
 from minisplat_ref.io.formats import Format, read_content
 from minisplat_ref.io.ply import further_properties
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.training.compensation import with_compensation
 from minisplat_ref.training.sky import with_sky
 from minisplat_ref.types import Gaussians, Model, numbered
@@ -261,10 +262,9 @@ def judge_of(source: Source, path: Path, scene: Path | None, downscale: int | No
         psnr = evaluate(
             source.model._replace(gaussians=gaussians),
             views,
-            background=photographs.background,
-            renderer=renderer,
-            backend=get_backend(backend),
-            conventions=PROFILES[profile],
+            RenderSettings(
+                photographs.background, renderer=renderer, backend=get_backend(backend), conventions=PROFILES[profile]
+            ),
         ).psnr
         assert psnr is not None
         return psnr

@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.runs.progress import append_log, read_log
-from minisplat_ref.training.loop import HALF_SIZE
-from minisplat_ref.training.schedule import During, Recipe, action_name
+from minisplat_ref.training.schedule import DatedEvent, Recipe, SmallerViews, action_name
 from minisplat_ref.training.state import FiredEvent
 
 N_NOTES = 3  # of a mechanism that a line names: the first ones and the last
@@ -54,11 +53,14 @@ def append(path: Path, step: int, fired: Iterable[FiredEvent]) -> None:
 
 
 def count_published_times(recipe: Recipe) -> dict[str, int]:
-    """Return how often each mechanism of a recipe acts, by the name of its action; half-size views count once."""
-    times: Counter[str] = Counter({HALF_SIZE: 1} if recipe.half_size_until else {})
+    """Return how often each mechanism of a recipe acts, by the name of its action; smaller views count once."""
+    times: Counter[str] = Counter()
     for event in recipe.events:
-        if not isinstance(event, During):
-            times[action_name(event)] += sum(event.is_due(step) for step in range(1, recipe.iterations + 1))
+        n_steps = sum(event.is_due(step) for step in range(1, recipe.iterations + 1))
+        if isinstance(event, DatedEvent):
+            times[action_name(event)] += n_steps
+        elif isinstance(event, SmallerViews) and n_steps > 0:
+            times[action_name(event)] += 1
     return dict(times)
 
 

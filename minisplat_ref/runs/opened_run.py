@@ -7,11 +7,11 @@ import warnings
 from pathlib import Path
 from typing import NamedTuple
 
-from minisplat_ref.backends import Backend, get_backend
-from minisplat_ref.constants import PROFILES, Conventions
+from minisplat_ref.backends import get_backend
+from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.extensions.extension import CORE, Extension, owner_of
-from minisplat_ref.rendering import Request
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.runs import fingerprint, run_folder
 from minisplat_ref.runs.checkpoints import newest_model
 from minisplat_ref.runs.settings import Settings, load, load_photographs, recipe_of
@@ -42,14 +42,10 @@ class Run(NamedTuple):
     """Iteration of the checkpoint that the model is of; None where the run has ended."""
 
     @property
-    def backend(self) -> Backend:
-        """The run's."""
-        return get_backend(self.settings.backend)
-
-    @property
-    def conventions(self) -> Conventions:
-        """The run's."""
-        return PROFILES[self.settings.profile]
+    def render_settings(self) -> RenderSettings:
+        """How the run renders its views."""
+        conventions, backend = PROFILES[self.settings.profile], get_backend(self.settings.backend)
+        return RenderSettings(self.scene.background, conventions, backend, self.recipe.renderer)
 
     @property
     def held_out(self) -> list[View]:
@@ -120,14 +116,13 @@ def check_views(scene: Scene, what: str) -> None:
 
 def check_renderer(run: Run) -> None:
     """Refuse a renderer that does not say how much each row weighs in a picture."""
-    request = Request(conventions=run.conventions, backend=run.backend, wants=frozenset({"stats"}))
-    renderer, reason = run.recipe.renderer, ""
+    settings, reason = run.render_settings, ""
     try:
-        if renderer.render(run.model, run.scene.train_views[0], request)[0].stats is not None:
+        if settings.render(run.model, run.scene.train_views[0], frozenset({"stats"}))[0].stats is not None:
             return
     except InputError as error:
         reason = f" ({error})"
     raise InputError(
-        f"{run.folder}: renderer {renderer.name} of extension {run.owner.name} gives no blend weights, by which"
-        f" simplify chooses{reason}: give a run of another recipe"
+        f"{run.folder}: renderer {settings.renderer.name} of extension {run.owner.name} gives no blend weights, by"
+        f" which simplify chooses{reason}: give a run of another recipe"
     )

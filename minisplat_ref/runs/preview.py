@@ -10,7 +10,7 @@ from minisplat_ref.reports.images import error_image, side_by_side, to_8_bits
 from minisplat_ref.runs.progress import Progress
 from minisplat_ref.runs.scoring import Trained, renderer_of
 from minisplat_ref.runs.settings import Settings
-from minisplat_ref.training.loop import StepReport
+from minisplat_ref.training.state import StepReport
 from minisplat_ref.types import Scene
 
 SECONDS = 3.0  # between pictures; a viewer that follows the file shows the newest

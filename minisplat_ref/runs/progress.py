@@ -15,8 +15,8 @@ from tqdm import tqdm
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import replacing, unwritable
 from minisplat_ref.metrics import psnr
-from minisplat_ref.training.loop import StepReport
 from minisplat_ref.training.pace import Cooling
+from minisplat_ref.training.state import StepReport
 
 LOG_EVERY = 5  # iterations; a PSNR is measured as often
 PSNR_WINDOW = 20  # measured views that the shown PSNR is the mean of: single views differ too much to show a trend

@@ -18,8 +18,8 @@ from minisplat_ref.io.images import downscaled_size
 from minisplat_ref.io.scene import rescale_camera
 from minisplat_ref.rendering import Request
 from minisplat_ref.runs.settings import Settings
-from minisplat_ref.training.loop import TrainState
 from minisplat_ref.training.schedule import Recipe
+from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Model, Scene, View
 
 COMFORTABLE = 640  # pixels of the longer side, at which a training takes minutes

@@ -28,10 +28,10 @@ from minisplat_ref.runs.scoring import measure, score, to_metrics
 from minisplat_ref.runs.settings import Settings, save_model, to_config
 from minisplat_ref.training.guard import Guard
 from minisplat_ref.training.interruption import Interruptions
-from minisplat_ref.training.loop import StepReport, last_step, train
+from minisplat_ref.training.loop import last_step, train
 from minisplat_ref.training.pace import COOLED, FINER, Decision, to_metadata
 from minisplat_ref.training.schedule import Recipe
-from minisplat_ref.training.state import TrainState, begin_cooling
+from minisplat_ref.training.state import StepReport, TrainState, begin_cooling
 from minisplat_ref.types import Scene
 
 RECENT = 100  # iterations by which the time of the next ones is foreseen
@@ -182,11 +182,11 @@ def _in_time(settings: Settings, recipe: Recipe, progress: Progress) -> Callable
             return
         length = math.ceil(cooling.part * report.step)
         pace = (clock[-1] - clock[0]) / (len(clock) - 1)  # seconds an iteration
-        if left > 4**state.pace.n_halvings * length * pace:
+        if left > 4**report.n_halvings * length * pace:
             return
         why = f"{minutes:g} minutes leave no more time"
-        if state.pace.n_halvings:
-            state.pace = state.pace.seeing_finer(Decision(report.step, FINER, why, None, None))
+        if report.n_halvings:
+            state.pace = state.pace.decided(Decision(report.step, FINER, why, None, None))
             clock.clear()  # of faster iterations
         else:
             length = max(1, min(length, round(left / pace)))

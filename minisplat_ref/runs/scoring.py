@@ -16,7 +16,7 @@ from minisplat_ref.io.atomic import replacing_folder
 from minisplat_ref.io.names import file_names
 from minisplat_ref.lpips import Network
 from minisplat_ref.metrics import Evaluation, ViewMetrics, evaluate
-from minisplat_ref.rendering import Renderer, Request
+from minisplat_ref.rendering import Renderer, RenderSettings, Request
 from minisplat_ref.reports.images import error_image, side_by_side, to_8_bits
 from minisplat_ref.runs.checkpoints import newest_model
 from minisplat_ref.runs.run_folder import RENDERS
@@ -76,12 +76,14 @@ def measure(
     return evaluate(
         model,
         scene.test_views,
-        background=scene.background,
+        RenderSettings(
+            scene.background,
+            renderer=renderer_of(settings, model),
+            backend=get_backend(settings.backend),
+            conventions=PROFILES[settings.profile],
+        ),
         on_view=on_view,
         network=network,
-        renderer=renderer_of(settings, model),
-        backend=get_backend(settings.backend),
-        conventions=PROFILES[settings.profile],
     )
 
 

@@ -168,30 +168,19 @@ def fine_tuned(run: Run, rows: Ints, iterations: int, *, holds_out: bool, on_ste
         seed=run.settings.seed,
         state=state,
         on_step=lambda _: on_step(),
-        backend=run.backend,
-        conventions=run.conventions,
+        backend=run.render_settings.backend,
+        conventions=run.render_settings.conventions,
     ).model
 
 
 def blend_weights(run: Run, views: Sequence[View]) -> Floats:
     """Return the importance [N] of the run's Gaussians: their blend weights, summed over the pixels of the views."""
-    return indoor(
-        collect_importance(
-            run.model, views, renderer=run.recipe.renderer, conventions=run.conventions, backend=run.backend
-        )
-    )
+    return indoor(collect_importance(run.model, views, run.render_settings))
 
 
 def psnrs_of(run: Run, model: Model, views: Sequence[View]) -> tuple[float, ...]:
     """Return the PSNR, dB, of each view, with its own exposure and pose where the run has trained them."""
-    evaluation = evaluate(
-        model,
-        views,
-        background=run.scene.background,
-        renderer=run.recipe.renderer,
-        backend=run.backend,
-        conventions=run.conventions,
-    )
+    evaluation = evaluate(model, views, run.render_settings)
     return tuple(view.psnr for view in evaluation.per_view)
 
 

@@ -23,12 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from minisplat_ref import memory
-from minisplat_ref.backends import CPU, Backend
-from minisplat_ref.constants import GSPLAT_MAIN, Conventions
+from minisplat_ref.constants import Conventions
 from minisplat_ref.errors import InputError
 from minisplat_ref.reference.depth import expected_depth
 from minisplat_ref.reference.pinhole import pinhole_rays, with_principal_point
-from minisplat_ref.rendering import SPLATTING, Renderer, Request, as_model
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.strategy.simplify import sample
 from minisplat_ref.types import Bools, Camera, Floats, Ints, View
 
@@ -52,9 +51,7 @@ class PixelPoints(NamedTuple):
     """[H, W] accumulated opacity."""
 
 
-def midpoint_points(
-    model: Any, view: View, conventions: Conventions, backend: Backend, renderer: Renderer = SPLATTING
-) -> PixelPoints:
+def midpoint_points(model: Any, view: View, settings: RenderSettings) -> PixelPoints:
     """Return the densest point of the dominant Gaussian on each ray, the midpoint of the ray's chord through it.
 
     Parameters
@@ -62,31 +59,26 @@ def midpoint_points(
     model : Model or Gaussians
     view : View
         Only its camera is used.
-    conventions : Conventions
-    backend : Backend
-    renderer : Renderer
+    settings : RenderSettings
 
     Returns
     -------
     PixelPoints
         In the dtype of the Gaussians.
     """
-    request = Request(sh_degree=0, conventions=conventions, backend=backend, wants=frozenset({"surface"}))
-    output, _ = renderer.render(as_model(model), view, request)
+    output, _ = settings.render(model, view, frozenset({"surface"}), sh_degree=0)
     points, depths = output.extras["surface"]
     return PixelPoints(points, depths, output.alpha)
 
 
-def centre_points(
-    model: Any, view: View, conventions: Conventions, backend: Backend, renderer: Renderer = SPLATTING
-) -> PixelPoints:
+def centre_points(model: Any, view: View, settings: RenderSettings) -> PixelPoints:
     """Return the point on each ray at the depth of the dominant Gaussian's mean.
 
     It is not the mean itself, with which all pixels of a large Gaussian would become one point.
 
     Parameters
     ----------
-    model, view, conventions, backend, renderer
+    model, view, settings
         As for :func:`midpoint_points`.
 
     Returns
@@ -94,21 +86,18 @@ def centre_points(
     PixelPoints
         In the dtype of the Gaussians.
     """
-    request = Request(sh_degree=0, conventions=conventions, backend=backend, wants=frozenset({"dominant_depth"}))
-    output, _ = renderer.render(as_model(model), view, request)
-    return _on_rays(output.extras["dominant_depth"], output.alpha, view.camera, conventions)
+    output, _ = settings.render(model, view, frozenset({"dominant_depth"}), sh_degree=0)
+    return _on_rays(output.extras["dominant_depth"], output.alpha, view.camera, settings.conventions)
 
 
-def blend_points(
-    model: Any, view: View, conventions: Conventions, backend: Backend, renderer: Renderer = SPLATTING
-) -> PixelPoints:
+def blend_points(model: Any, view: View, settings: RenderSettings) -> PixelPoints:
     """Return the point on each ray at the blended depth, ``sum w z / sum w``.
 
     Where a ray passes through several surfaces, at the edge of an object or under a floater, it lies on none of them.
 
     Parameters
     ----------
-    model, view, conventions, backend, renderer
+    model, view, settings
         As for :func:`midpoint_points`.
 
     Returns
@@ -116,11 +105,11 @@ def blend_points(
     PixelPoints
         In the dtype of the Gaussians.
     """
-    request = Request(sh_degree=0, conventions=conventions, backend=backend, wants=frozenset({"depth"}))
-    output, _ = renderer.render(as_model(model), view, request)
-    sums = output.image[..., renderer.channels(request.wants)["depth"]][..., 0]  # [H, W]
+    wants = frozenset({"depth"})
+    output, _ = settings.render(model, view, wants, sh_degree=0)
+    sums = output.image[..., settings.renderer.channels(wants)["depth"]][..., 0]  # [H, W]
     depths = expected_depth(sums, output.alpha)  # [H, W]
-    return _on_rays(depths, output.alpha, view.camera, conventions)
+    return _on_rays(depths, output.alpha, view.camera, settings.conventions)
 
 
 def reinitial_points(
@@ -128,14 +117,12 @@ def reinitial_points(
     views: Sequence[View],
     n_points: int,
     *,
-    points_of: Callable[[Any, View, Conventions, Backend, Renderer], PixelPoints] = midpoint_points,
+    settings: RenderSettings = RenderSettings(),  # noqa: B008  (a constant)
+    points_of: Callable[[Any, View, RenderSettings], PixelPoints] = midpoint_points,
     min_alpha: float,
     depth_tolerance: float | None,
     backdrop_distance: float | None = None,
     rng: np.random.Generator,
-    renderer: Renderer = SPLATTING,
-    conventions: Conventions = GSPLAT_MAIN,
-    backend: Backend = CPU,
 ) -> tuple[Floats, NDArray[np.uint8]]:
     """Draw points of the surface that the Gaussians show, equally many from every view.
 
@@ -148,6 +135,7 @@ def reinitial_points(
     views : sequence of View
     n_points : int
         Points over all views; every view gives ``n_points // n_views``.
+    settings : RenderSettings
     points_of : callable
         :func:`midpoint_points`, :func:`centre_points` or :func:`blend_points`.
     min_alpha : float
@@ -161,9 +149,6 @@ def reinitial_points(
         are not drawn.
     rng : numpy.random.Generator
         Draws the pixels.
-    renderer : Renderer
-    conventions : Conventions
-    backend : Backend
 
     Returns
     -------
@@ -179,11 +164,11 @@ def reinitial_points(
     """
     if n_points < len(views):
         raise InputError(f"{n_points} points from {len(views)} views are none from each: ask for more points")
-    cameras = [with_principal_point(view.camera, conventions) for view in views]
+    cameras = [with_principal_point(view.camera, settings.conventions) for view in views]
     _check_room(cameras)
     depth_maps, weight_maps = [], []  # MAP_BYTES per pixel of all views; points would be 12 more
     for view in views:
-        _, depths, alpha = points_of(model, view, conventions, backend, renderer)
+        _, depths, alpha = points_of(model, view, settings)
         is_drawable = (depths > 0) & (alpha >= min_alpha)
         if (mask := view.mask) is not None:
             is_drawable &= mask

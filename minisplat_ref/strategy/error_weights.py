@@ -16,22 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from minisplat_ref.backends import CPU, Backend
-from minisplat_ref.constants import GSPLAT_MAIN, SH_C0, Conventions
-from minisplat_ref.rendering import SPLATTING, Renderer, Request, as_model
+from minisplat_ref.constants import SH_C0
+from minisplat_ref.rendering import RenderSettings, as_model
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.types import Floats, View
 
 
-def collect_error_weights(
-    model: Any,
-    views: Sequence[View],
-    *,
-    background: Floats,
-    renderer: Renderer = SPLATTING,
-    conventions: Conventions = GSPLAT_MAIN,
-    backend: Backend = CPU,
-) -> Floats:
+def collect_error_weights(model: Any, views: Sequence[View], settings: RenderSettings) -> Floats:
     """Return E [N], float64, summed over the views.
 
     Parameters
@@ -39,21 +30,16 @@ def collect_error_weights(
     model : Model or Gaussians
     views : sequence of View
         Training views, with their photographs; masked pixels have no error.
-    background : ndarray of shape (3,)
-        Behind everything.
-    renderer : Renderer
-    conventions : Conventions
-    backend : Backend
+    settings : RenderSettings
     """
     model = as_model(model)
     weights = np.zeros(n_rows(model.gaussians))
-    request = Request(background, conventions=conventions, backend=backend)
     for view in views:
         photographed = view.load()
-        output, tape = renderer.render(model, photographed, request)
+        output, tape = settings.render(model, photographed)
         errors = np.abs(output.image - photographed.image / output.image.dtype.type(255)).mean(axis=2)  # [H, W]
         if photographed.mask is not None:
             errors[~photographed.mask] = 0
         v_image = np.repeat(errors[:, :, None], 3, axis=2)
-        weights += renderer.render_vjp(tape, v_image, None).gaussians.sh_dc.mean(axis=1) / SH_C0
+        weights += settings.renderer.render_vjp(tape, v_image, None).gaussians.sh_dc.mean(axis=1) / SH_C0
     return weights

@@ -13,9 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import CPU, Backend
-from minisplat_ref.constants import GSPLAT_MAIN, Conventions
-from minisplat_ref.rendering import SPLATTING, Renderer, Request, as_model
+from minisplat_ref.rendering import RenderSettings, as_model
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.types import Bools, Floats, Ints, View
 
@@ -40,10 +38,8 @@ class ImportanceStats(NamedTuple):
 def collect_importance(
     model: Any,
     views: Sequence[View],
+    settings: RenderSettings = RenderSettings(),  # noqa: B008  (a constant)
     *,
-    renderer: Renderer = SPLATTING,
-    conventions: Conventions = GSPLAT_MAIN,
-    backend: Backend = CPU,
     visibility_mass: float = 0.99,
 ) -> ImportanceStats:
     """Render every view for its blend statistics, and accumulate them in float64.
@@ -53,9 +49,7 @@ def collect_importance(
     model : Model or Gaussians
     views : sequence of View
         The training views, at the resolution of training; only their cameras, indices and times matter.
-    renderer : Renderer
-    conventions : Conventions
-    backend : Backend
+    settings : RenderSettings
     visibility_mass : float
         Fraction of a view's blend weight that its visible Gaussians carry.
 
@@ -74,9 +68,8 @@ def collect_importance(
         frustum_count=np.zeros(n, np.int32),
         is_visible=np.zeros((n, len(views)), bool),
     )
-    request = Request(sh_degree=0, conventions=conventions, backend=backend, wants=frozenset({"stats"}))
     for v, seen_from in enumerate(views):
-        output, _ = renderer.render(model, seen_from, request)
+        output, _ = settings.render(model, seen_from, frozenset({"stats"}), sh_degree=0)
         view = output.stats
         assert view is not None
         total.blend_weight_sum[:] += view.blend_weight_sum

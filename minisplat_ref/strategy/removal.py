@@ -16,10 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.backends import CPU, Backend
-from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
-from minisplat_ref.rendering import SPLATTING, Renderer, Request, as_model
+from minisplat_ref.rendering import RenderSettings, as_model
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.types import Floats, Ints, View
 
@@ -41,15 +39,7 @@ class RemovalCosts(NamedTuple):
             return np.where(self.changes != 0, len(self.changes) * self.changes / self.squared_error, 0.0)
 
 
-def collect_removal_costs(
-    model: Any,
-    views: Sequence[View],
-    *,
-    background: Floats,
-    renderer: Renderer = SPLATTING,
-    conventions: Conventions = GSPLAT_MAIN,
-    backend: Backend = CPU,
-) -> RemovalCosts:
+def collect_removal_costs(model: Any, views: Sequence[View], settings: RenderSettings) -> RemovalCosts:
     """Render every view beside its photograph, and accumulate in float64.
 
     Parameters
@@ -57,11 +47,7 @@ def collect_removal_costs(
     model : Model or Gaussians
     views : sequence of View
         Training views, with their photographs.
-    background : ndarray of shape (3,)
-        Behind everything.
-    renderer : Renderer
-    conventions : Conventions
-    backend : Backend
+    settings : RenderSettings
 
     Raises
     ------
@@ -70,11 +56,11 @@ def collect_removal_costs(
     """
     model = as_model(model)
     changes, squared_error = np.zeros(n_rows(model.gaussians)), 0.0
-    request = Request(background, conventions=conventions, backend=backend, wants=frozenset({CHANGES}))
-    rgb = renderer.channels(request.wants)["rgb"]
+    wants, renderer = frozenset({CHANGES}), settings.renderer
+    rgb = renderer.channels(wants)["rgb"]
     for view in views:
         photographed = view.load()
-        output, _ = renderer.render(model, photographed, request)
+        output, _ = settings.render(model, photographed, wants)
         if CHANGES not in output.extras:
             raise InputError(f"renderer {renderer.name} does not say what the removal of a Gaussian changes")
         changes += output.extras[CHANGES]

@@ -20,13 +20,14 @@ from matplotlib.figure import Figure
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods import RECIPES, get_recipe
 from minisplat_ref.metrics import evaluate
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.reports.palette import BLUE, RED
 from minisplat_ref.studies import kit
 from minisplat_ref.studies.conditions import get_condition
 from minisplat_ref.studies.figures import plus_minus, summarise
 from minisplat_ref.studies.variants import ACTIONS, DEVIATIONS, FULL, MECHANISMS, variants_of
-from minisplat_ref.training.loop import HALF_SIZE, train
+from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import Recipe, scaled
 from minisplat_ref.types import Scene
 
@@ -71,7 +72,7 @@ def run(args: argparse.Namespace) -> kit.Report:
 def count_actions(records: Sequence[Mapping[str, Any]], variants: Iterable[str]) -> dict[str, int]:
     """Return how often each mechanism fired in a full training, the least of all seeds."""
     fired = [record["fired"] for record in records if record["without"] == FULL]
-    names = {name: ACTIONS[name].__name__ if name in ACTIONS else HALF_SIZE for name in variants if name in MECHANISMS}
+    names = {name: ACTIONS[name].__name__ for name in variants if name in MECHANISMS}
     return {name: min(times.get(action, 0) for times in fired) for name, action in names.items()}
 
 
@@ -81,7 +82,7 @@ def measure(scene: Scene, recipe: Recipe, seed: int) -> dict[str, Any]:
     start = time.process_time()
     state = train(scene, recipe, seed=seed, on_step=lambda report: fired.update(e.action for e in report.fired))
     seconds = time.process_time() - start
-    result = evaluate(state.model, scene.test_views, background=scene.background)
+    result = evaluate(state.model, scene.test_views, RenderSettings(scene.background))
     measures = (result.psnr, result.ssim, len(state.gaussians.means), seconds)
     return {**dict(zip(MEASURES, measures, strict=True)), "fired": dict(fired)}
 

@@ -23,8 +23,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.methods import adaptive, adaptive_bands, gaussian_splatting, get_recipe
+from minisplat_ref.methods import gaussian_splatting, get_recipe
+from minisplat_ref.methods.adaptive.degrees import cut_degrees_when_cooling, raise_degrees
+from minisplat_ref.methods.adaptive.growth import grow
+from minisplat_ref.methods.adaptive.numbers import RAISED
+from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.metrics import evaluate
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.reports.palette import BLUE, GREEN, OCHRE, PURPLE, RED
 from minisplat_ref.studies import kit
@@ -47,7 +52,7 @@ COLORS = (BLUE, GREEN, OCHRE, RED, PURPLE)
 def with_clones(recipe: Recipe) -> Recipe:
     """Return the recipe with the clones and splits of 3DGS in place of halves."""
     action = partial(clones_while_growing, threshold=2e-4, size_fraction=0.01)
-    events = (event._replace(action=action) if does(event, adaptive.grow) else event for event in recipe.events)
+    events = (event._replace(action=action) if does(event, grow) else event for event in recipe.events)
     return recipe._replace(events=tuple(events))
 
 
@@ -69,7 +74,7 @@ def with_published_rates(recipe: Recipe) -> Recipe:
 def with_faster_means(recipe: Recipe) -> Recipe:
     """Return the recipe with the rate of the means raised by the square, as in short runs of other recipes."""
     rates = recipe.learning_rates
-    return recipe._replace(learning_rates=rates.changed(means=adaptive.RAISED * rates.at(0, extent=1.0)["means"]))
+    return recipe._replace(learning_rates=rates.changed(means=RAISED * rates.at(0, extent=1.0)["means"]))
 
 
 def without_cool_down(recipe: Recipe) -> Recipe:
@@ -80,12 +85,12 @@ def without_cool_down(recipe: Recipe) -> Recipe:
 
 def without_growth(recipe: Recipe) -> Recipe:
     """Return the recipe with as many Gaussians as there are points."""
-    return recipe._replace(events=tuple(event for event in recipe.events if not does(event, adaptive.grow)))
+    return recipe._replace(events=tuple(event for event in recipe.events if not does(event, grow)))
 
 
 def with_all_bands(recipe: Recipe) -> Recipe:
     """Return the recipe with the harmonics of 3DGS: all degrees for all Gaussians, one more every 200 iterations."""
-    actions = adaptive_bands.grow_bands, adaptive_bands.cut_bands_when_cooling
+    actions = raise_degrees, cut_degrees_when_cooling
     events = tuple(event for event in recipe.events if not does(event, *actions))
     return recipe._replace(events=events, sh_milestones=(200, 400, 600))
 
@@ -137,7 +142,7 @@ def run(args: argparse.Namespace) -> kit.Report:
     scene = kit.read_scene(args.scene, args.downscale)
     conditions = {name: get_condition(name) for name in args.conditions}
     variants = RULES if args.rules else SWEEP if args.sweep else {}
-    recipes = {name: change(adaptive.ADAPTIVE) for name, change in variants.items()} or _named(args.recipes)
+    recipes = {name: change(ADAPTIVE) for name, change in variants.items()} or _named(args.recipes)
     description = kit.describe_scene(scene)
     settings = {"scene": description["scene"], "downscale": args.downscale, "recipes": list(recipes)}
     records = kit.resume(
@@ -161,7 +166,7 @@ def run(args: argparse.Namespace) -> kit.Report:
 
 def _named(names: Sequence[str]) -> dict[str, Recipe]:
     """Return recipes by their names; adaptive without one of its rules has that rule's name."""
-    return {name: RULES[name](adaptive.ADAPTIVE) if name in RULES else get_recipe(name, ITERATIONS) for name in names}
+    return {name: RULES[name](ADAPTIVE) if name in RULES else get_recipe(name, ITERATIONS) for name in names}
 
 
 def warm_up(scene: Scene, recipes: Iterable[Recipe]) -> None:
@@ -184,7 +189,7 @@ def measure(scene: Scene, recipe: Recipe, seed: int) -> dict[str, Any]:
         now = time.process_time()
         model = report.state.model
         renderer = as_trained(recipe, model).renderer
-        value = evaluate(model, scene.test_views, background=scene.background, renderer=renderer)
+        value = evaluate(model, scene.test_views, RenderSettings(scene.background, renderer=renderer))
         n = len(report.state.gaussians.means)
         curve.append({"step": report.step, "seconds": now - start - paused, "psnr": value.psnr, "n_gaussians": n})
         curve[-1] |= {"ssim": value.ssim, "n_numbers": n_numbers(report.state.gaussians)}

@@ -27,8 +27,10 @@ from minisplat_ref.strategy.ops import contiguous
 from minisplat_ref.strategy.visibility import culled_fraction
 from minisplat_ref.studies import kit
 from minisplat_ref.training.adam import zero_moments
-from minisplat_ref.training.loop import initial_state, train
-from minisplat_ref.training.schedule import Action, Recipe, firing_steps
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.schedule import Action, Recipe, firing_steps, without
+from minisplat_ref.training.smaller_views import halve_large_views
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Bools, Gaussians, Scene
 
@@ -39,7 +41,7 @@ WARM_UP = 5  # iterations of either arm that are not timed
 def run(args: argparse.Namespace) -> kit.Report:
     """Train and measure."""
     scene = kit.read_scene(args.scene, args.downscale, is_tested=False)
-    recipe = get_recipe(RECIPE, args.iterations)._replace(half_size_until=0)
+    recipe = without(get_recipe(RECIPE, args.iterations), halve_large_views)
     state = initial_state(scene, recipe, args.seed)
     if args.ply is None:
         places: dict[str, Action] = {

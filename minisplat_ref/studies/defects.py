@@ -26,18 +26,14 @@ from matplotlib.figure import Figure
 from minisplat_ref.datasets.synthetic import SCENE_NAMES, make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.scene import half_size
-from minisplat_ref.methods import adaptive
-from minisplat_ref.methods.adaptive_antialiasing import switch_antialiasing_on
-from minisplat_ref.methods.adaptive_exposure import switch_exposure_on
-from minisplat_ref.methods.adaptive_pose import switch_pose_on
-from minisplat_ref.methods.adaptive_sky import switch_sky_on
+from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
+from minisplat_ref.methods.adaptive.switches import SWITCHES
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.reports.palette import BLUE, GREEN, OCHRE, RED
 from minisplat_ref.studies import kit
 from minisplat_ref.studies.poses import moved
-from minisplat_ref.training.calibration import ANTIALIASING, BACKDROP, EXPOSURE, POSE
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import Action, firing_steps
+from minisplat_ref.training.schedule import firing_steps
 from minisplat_ref.training.sky import unit_rays
 from minisplat_ref.training.state import StepReport
 from minisplat_ref.types import Bools, Floats, Scene, View
@@ -47,12 +43,6 @@ PIXELS = 0.5
 COLORS = {"sky": GREEN, "exposure": BLUE, "pose": RED, "antialiasing": OCHRE}
 HEIGHT = 0.2  # of a bar
 CUT = 1.2  # metres
-SWITCHES: Mapping[str, Action] = {
-    BACKDROP.name: switch_sky_on,
-    EXPOSURE.name: switch_exposure_on,
-    POSE.name: switch_pose_on,
-    ANTIALIASING.name: switch_antialiasing_on,
-}
 
 
 def with_gains(scene: Scene, rng: np.random.Generator) -> Scene:
@@ -170,7 +160,7 @@ def run(args: argparse.Namespace) -> kit.Report:
 
 def decision_step(asked: Sequence[str]) -> int:
     """Return the iteration after which it has been decided about all that is asked."""
-    return max(firing_steps(adaptive.ADAPTIVE, *(SWITCHES[name] for name in asked)))
+    return max(firing_steps(ADAPTIVE, *(SWITCHES[name] for name in asked)))
 
 
 def decide(scene: Scene, seed: int, asked: Sequence[str]) -> dict[str, Any]:
@@ -187,7 +177,7 @@ def decide(scene: Scene, seed: int, asked: Sequence[str]) -> dict[str, Any]:
             raise _DecidedError
 
     with contextlib.suppress(_DecidedError):
-        train(scene, adaptive.ADAPTIVE, seed=seed, on_step=on_step)
+        train(scene, ADAPTIVE, seed=seed, on_step=on_step)
     return {"switched_on": list(switched_on), "evidence": notes, "seconds": time.process_time() - start}
 
 

@@ -29,7 +29,7 @@ from minisplat_ref.methods.mini_splatting import (
     store_sh,
 )
 from minisplat_ref.metrics import evaluate
-from minisplat_ref.rendering import as_model
+from minisplat_ref.rendering import RenderSettings, as_model
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.reports.palette import BLUE, RED
 from minisplat_ref.strategy.depth_reinit import (
@@ -41,8 +41,9 @@ from minisplat_ref.strategy.depth_reinit import (
 )
 from minisplat_ref.studies import kit
 from minisplat_ref.studies.figures import plus_minus, summarise
-from minisplat_ref.training.loop import StepReport, train
+from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import Recipe, configured, firing_steps
+from minisplat_ref.training.state import StepReport
 from minisplat_ref.types import Bools, Floats, Model, Scene
 
 ALPHA_MIN = 0.9  # of the safeguard that requires opacity
@@ -144,7 +145,7 @@ def measure(truth: SyntheticScene, recipe: Recipe, choice: Choice, seed: int) ->
 
     model = train(scene, choice.applied_to(recipe), seed=seed, on_step=look).model
     n_sent, n_left = counts[reinitialised[-1]], counts[densified - 1]
-    psnr = evaluate(model, scene.test_views, background=scene.background).psnr
+    psnr = evaluate(model, scene.test_views, RenderSettings(scene.background)).psnr
     return {**drawn, "backdrop_left": n_left / n_sent if n_sent else None, "psnr": psnr}
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from minisplat_ref.metrics import evaluate
-from minisplat_ref.rendering import SPLATTING
+from minisplat_ref.rendering import SPLATTING, RenderSettings
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.studies import kit, recovery
 from minisplat_ref.studies.recovery import ARMS, COLORS
@@ -125,7 +125,7 @@ def held_out_psnr(gaussians: Gaussians, scene: Scene, K: Floats) -> float:
     """
     views = [view._replace(view_id=0) for view in scene.test_views]
     model = Model(gaussians, {EXPOSURES: inverse(K)[None]})
-    psnr = evaluate(model, views, background=scene.background, renderer=with_exposures(SPLATTING)).psnr
+    psnr = evaluate(model, views, RenderSettings(scene.background, renderer=with_exposures(SPLATTING))).psnr
     assert psnr is not None, "there are test views"
     return psnr
 

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from minisplat_ref.errors import InputError
 from minisplat_ref.metrics import evaluate
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.studies import kit, recovery
 from minisplat_ref.studies.recovery import ARMS
@@ -170,7 +171,7 @@ def displacement(camera: Camera, view: View, scene: Scene) -> float:
 def held_out_psnr(gaussians: Gaussians, scene: Scene, similarity: Similarity) -> float:
     """Return the mean PSNR of the test views, with their cameras mapped into the trained scene."""
     views = [view._replace(camera=carried_back(view.camera, similarity)) for view in scene.test_views]
-    psnr = evaluate(gaussians, views, background=scene.background).psnr
+    psnr = evaluate(gaussians, views, RenderSettings(scene.background)).psnr
     assert psnr is not None, "there are test views"
     return psnr
 

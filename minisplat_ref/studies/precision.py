@@ -30,13 +30,15 @@ from minisplat_ref.backends import CPU, CPU_EXACT, Backend
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.reports.palette import BLUE, RED
 from minisplat_ref.studies import kit
 from minisplat_ref.studies.adaptive import WARM_UP
 from minisplat_ref.studies.figures import plus_minus, standard_error, summarise
 from minisplat_ref.training.adam import zero_moments
-from minisplat_ref.training.loop import initial_state, train
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import Recipe, as_trained
 from minisplat_ref.training.state import StepReport, TrainState
 from minisplat_ref.types import Model, Scene
@@ -152,7 +154,7 @@ def measure(scene: Scene, recipe: Recipe, precision: str, seed: int) -> list[dic
 
     def record(name: str, model: Model, *, has_half_colours: bool) -> dict[str, Any]:
         quality = evaluate(
-            model, scene.test_views, background=scene.background, renderer=as_trained(recipe, model).renderer
+            model, scene.test_views, RenderSettings(scene.background, renderer=as_trained(recipe, model).renderer)
         )
         return {
             "precision": name,

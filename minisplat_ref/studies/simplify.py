@@ -25,6 +25,7 @@ from minisplat_ref.datasets.synthetic.surface import chamfer, unproject_views
 from minisplat_ref.io import load_ply
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.reports.palette import BLUE, GREEN, GREY, OCHRE, RED
 from minisplat_ref.strategy import simplify
@@ -57,7 +58,7 @@ def run(args: argparse.Namespace) -> kit.Report:
     trees = {name: cKDTree(cloud) for name, cloud in clouds.items()}
     stats = collect_importance(dense, scene.train_views)
     importance = simplify.intersection_preserving(indoor(stats), stats.dominant_count)
-    changes = collect_removal_costs(dense, scene.train_views, background=scene.background).changes
+    changes = collect_removal_costs(dense, scene.train_views, RenderSettings(scene.background)).changes
     weights = dict.fromkeys(CHOICES, importance) | {CHANGE: np.where(importance > 0, changes, 0)}
     counts = counts_to_keep(importance, args.fractions)
     tuning = kit.without_events(get_recipe(FINE_TUNING, args.fine_tune))
@@ -72,11 +73,11 @@ def run(args: argparse.Namespace) -> kit.Report:
             "n_gaussians": n_rows(edit.gaussians),
             "choice": choice,
             "seed": seed,
-            "psnr": evaluate(edit.gaussians, scene.test_views, background=scene.background).psnr,
+            "psnr": evaluate(edit.gaussians, scene.test_views, RenderSettings(scene.background)).psnr,
             **{f"chamfer_{name}": chamfer(edit.gaussians.means, tree) for name, tree in trees.items()},
         }
         tuned = kit.fine_tune(begun, scene, tuning, rng)
-        runs.append({**row, "psnr_tuned": evaluate(tuned, scene.test_views, background=scene.background).psnr})
+        runs.append({**row, "psnr_tuned": evaluate(tuned, scene.test_views, RenderSettings(scene.background)).psnr})
     settings = {
         "recipe": None if args.ply else args.recipe,
         "iterations": None if args.ply else args.iterations,
@@ -87,7 +88,7 @@ def run(args: argparse.Namespace) -> kit.Report:
         "dense": {
             "n_gaussians": n_rows(dense),
             "n_candidates": int(np.count_nonzero(importance)),
-            "psnr": evaluate(dense, scene.test_views, background=scene.background).psnr,
+            "psnr": evaluate(dense, scene.test_views, RenderSettings(scene.background)).psnr,
         },
     }
     result = {**kit.describe_scene(scene), **settings, "counts": counts, "summary": summarise(runs), "runs": runs}

@@ -15,8 +15,8 @@ from minisplat_ref.strategy import simplify as simplification
 from minisplat_ref.strategy.blur_split import principal_axis_children
 from minisplat_ref.training.adam import AdamState
 from minisplat_ref.training.schedule import (
-    Action,
     At,
+    DatedEvent,
     During,
     Event,
     Every,
@@ -28,6 +28,7 @@ from minisplat_ref.training.schedule import (
     settings_of,
     without,
 )
+from minisplat_ref.training.smaller_views import SIDE_MIN, halve_large_views
 from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Model, View
 
@@ -79,14 +80,15 @@ def reinitialise_from_culled(state: TrainState, iteration: Iteration, **settings
 
     Otherwise like :func:`mini_splatting.reinitialise_from_depth`: importance is still measured with all Gaussians.
     """
-    renderer = iteration.renderer
+    rendered_by = iteration.render_settings
 
     def render(model: Model, view: View, request: Request) -> Any:
         if "surface" in request.wants and mini_splatting.is_culling(state):
             request = request._replace(is_visible=state.stats["is_visible"][:, view.view_id])
-        return renderer.render(model, view, request)
+        return rendered_by.renderer.render(model, view, request)
 
-    culled = iteration._replace(renderer=renderer._replace(render=render))
+    renderer = rendered_by.renderer._replace(render=render)
+    culled = iteration._replace(render_settings=rendered_by._replace(renderer=renderer))
     mini_splatting.reinitialise_from_depth(state, culled, **settings)
 
 
@@ -123,10 +125,20 @@ def with_lost_steps(recipe: Recipe) -> Recipe:
         if before and before[0][0] == iteration.step - 1:
             _, state.gaussians, state.adam = before[0]
 
-    edits = [event for event in recipe.events if not isinstance(event, During) and not does(event, *TAKES_ITS_STEP)]
+    edits = [event for event in recipe.events if isinstance(event, DatedEvent) and not does(event, *TAKES_ITS_STEP)]
     undoing = [event._replace(action=undo_step) for event in (*edits, At(recipe.iterations, undo_step))]
     events = (*undoing, *recipe.events, During(remember))
     return recipe._replace(events=events)
+
+
+def without_half_size(recipe: Recipe) -> Recipe:
+    """Return the recipe with views at full size from the start; ``adaptive`` has its own rule."""
+    return recipe if recipe.cooling is not None else without(recipe, halve_large_views)
+
+
+def with_half_size_of_small_views(recipe: Recipe) -> Recipe:
+    """Return the recipe with half-size views however small they are, down to a tile."""
+    return recipe if recipe.cooling is not None else with_settings(min_side=SIDE_MIN)(recipe)
 
 
 HALVES = with_settings(draw_children=principal_axis_children)
@@ -143,7 +155,7 @@ MECHANISMS: Mapping[str, Change] = {
     "restart": partial(without, action=mini_splatting.restart_from_means),
     "culling": with_settings(visibility_mass=1.0),  # every Gaussian with any weight in a view is visible
     "clone": with_settings(factor=1),
-    "half-size warm-up": lambda recipe: recipe._replace(half_size_until=0),
+    "half-size warm-up": without_half_size,
     "last prune": partial(without, action=mini_splatting.prune_tail),
 }
 """The published recipe without each mechanism; a recipe that does not have it stays unchanged.
@@ -158,7 +170,7 @@ DEVIATIONS: Mapping[str, Change] = {
     "sky guard": with_settings(depth_tolerance=None),
     "size limit by distance": as_3dgs_prunes,
     "size limit of new points": with_settings(largest_size=math.inf),
-    "least size to halve": lambda recipe: recipe._replace(min_half_size=1) if recipe.half_size_until else recipe,
+    "least size to halve": with_half_size_of_small_views,
     "raised rates": lambda recipe: recipe._replace(short_run_exponent=0.0),
     "fewer events": with_all_events,
     "depths of whole views": with_culled_depths,
@@ -167,7 +179,7 @@ DEVIATIONS: Mapping[str, Change] = {
 }
 """A recipe with the published rule in place of each of ours."""
 
-ACTIONS: Mapping[str, Action] = {
+ACTIONS: Mapping[str, Callable[..., Any]] = {
     "blur split": gaussian_splatting.clone_and_split,
     "random children": gaussian_splatting.clone_and_split,
     "blur split and random children": gaussian_splatting.clone_and_split,
@@ -178,9 +190,10 @@ ACTIONS: Mapping[str, Action] = {
     "restart": mini_splatting.restart_from_means,
     "culling": mini_splatting2.aggressive_clone,
     "clone": mini_splatting2.aggressive_clone,
+    "half-size warm-up": halve_large_views,
     "last prune": mini_splatting.prune_tail,
 }
-"""The action through which a mechanism acts; half-size views are no action."""
+"""The action through which a mechanism acts."""
 
 
 def variants_of(published: Recipe, iterations: int, rules: Mapping[str, Change] = MECHANISMS) -> dict[str, Recipe]:
@@ -203,6 +216,4 @@ def with_strides(recipe: Recipe) -> Recipe:
 
 def has_date(recipe: Recipe, mechanism: str) -> bool:
     """Return whether a mechanism acts in some iteration of the recipe."""
-    if mechanism not in ACTIONS:
-        return recipe.half_size_until > 0
     return bool(firing_steps(recipe, ACTIONS[mechanism]))

@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 COOLED, FINER = "cool down", "resolution"  # decisions: to let the rates fall, to train on larger views
-HALVINGS_MAX = 16  # of a photograph of 65,536 pixels a side one would be left
 
 
 class Measurement(NamedTuple):
@@ -56,16 +55,15 @@ class Pace(NamedTuple):
     """Iteration at which the training ends; None while that is open."""
     switched_on: tuple[str, ...] = ()
     """Names of the calibrations that the photographs turned out to need."""
-    n_halvings: int = 0
-    """How often the views that are trained on are halved in width and height."""
+
+    @property
+    def n_finer(self) -> int:
+        """Return how often it was decided to train on views of twice the width and height."""
+        return sum(decision.what == FINER for decision in self.decisions)
 
     def decided(self, decision: Decision) -> "Pace":
         """Return the pace with one more decision."""
         return self._replace(decisions=(*self.decisions, decision))
-
-    def seeing_finer(self, decision: Decision) -> "Pace":
-        """Return the pace with views of twice the width and height from the next iteration on."""
-        return self.decided(decision)._replace(n_halvings=self.n_halvings - 1)
 
     def before(self, decision: Decision) -> "Pace":
         """Return the measurements and decisions that there were when one was made."""
@@ -156,10 +154,7 @@ def from_metadata(value: Mapping[str, Any]) -> Pace:
     )
     cooling_from, last_step = (None if value[n] is None else int(value[n]) for n in ("cooling_from", "last_step"))
     switched_on = tuple(str(name) for name in value["switched_on"])
-    n_halvings = int(value.get("n_halvings", 0))  # records from before there were any
-    if not 0 <= n_halvings <= HALVINGS_MAX:
-        raise ValueError(f"n_halvings is {n_halvings}")
-    return Pace(measurements, decisions, int(value["n_pairs"]), cooling_from, last_step, switched_on, n_halvings)
+    return Pace(measurements, decisions, int(value["n_pairs"]), cooling_from, last_step, switched_on)
 
 
 def _optional(number: Any) -> float | None:

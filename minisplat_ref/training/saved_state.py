@@ -1,9 +1,10 @@
-"""Check each part of a checkpoint before a training continues from it.
+"""Save a training, and load it: each part of a checkpoint is checked before the training continues from it.
 
 A checkpoint that was truncated, mixed with another or edited by hand would otherwise fail in the middle of an
 iteration, or continue with numbers that make no sense.
 """
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,11 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from minisplat_ref.constants import SH_DEGREE_MAX
-from minisplat_ref.io.checkpoint import DamagedCheckpoint
+from minisplat_ref.errors import InputError
+from minisplat_ref.io.checkpoint import DamagedCheckpoint, load_checkpoint, save_checkpoint
+from minisplat_ref.training.adam import AdamState, fields_of
 from minisplat_ref.training.calibration import CALIBRATIONS
-from minisplat_ref.training.pace import Pace, from_metadata
+from minisplat_ref.training.pace import Pace, from_metadata, to_metadata
 from minisplat_ref.training.rates import n_coefficients
-from minisplat_ref.training.state import DEGREES
+from minisplat_ref.training.schedule import Recipe, as_decided, describe
+from minisplat_ref.training.state import DEGREES, TrainState
 from minisplat_ref.types import Floats, Gaussians
 
 WAY_OUT = "give another checkpoint or train anew"
@@ -48,6 +52,73 @@ class Bundles(NamedTuple):
     shared_first: dict[str, Floats]
     shared_second: dict[str, Floats]
     stats: dict[str, NDArray[Any]]
+
+
+def save_state(path: str | Path, state: TrainState, recipe: Recipe, *, previous: str | Path | None = None) -> None:
+    """Write a checkpoint from which :func:`load_state` continues bit by bit.
+
+    Parameters
+    ----------
+    path : str or Path
+    state : TrainState
+        Whole.
+    recipe : Recipe
+        By which it is trained.
+    previous : str or Path, optional
+        The checkpoint that was at ``path`` moves here.
+    """
+    assert state.is_whole, "half an iteration must not be saved"
+    groups = {
+        **{"gaussians": state.gaussians, "first": state.adam.first, "second": state.adam.second},
+        **{"shared": state.shared, "shared_first": state.shared_adam.first, "shared_second": state.shared_adam.second},
+    }
+    arrays = {f"{group}.{name}": array for group, fields in groups.items() for name, array in fields_of(fields).items()}
+    arrays |= {f"stats.{name}": field for name, field in state.stats.items()}
+    metadata = {
+        "step": state.step,
+        "adam_step": state.adam.step,
+        "shared_adam_step": state.shared_adam.step,
+        "view_order": state.view_order,
+        "rng": state.rng.bit_generator.state,
+        "recipe": describe(recipe),
+    }
+    if recipe.cooling is not None:
+        metadata["pace"] = to_metadata(state.pace)
+    save_checkpoint(path, arrays, metadata, previous=previous)
+
+
+def load_state(path: str | Path, recipe: Recipe) -> TrainState:
+    """Read what :func:`save_state` wrote.
+
+    Raises
+    ------
+    InputError
+        The file is missing or damaged, or was written under another recipe.
+    """
+    arrays, metadata = load_checkpoint(path)
+    counters = read_counters(path, metadata)
+    if metadata.get("recipe") != json.loads(json.dumps(describe(recipe))):
+        name, length = written_by(metadata)
+        raise InputError(
+            f"{path} was written by recipe {name} of {length} iterations with other settings than"
+            f" {recipe.name} of {recipe.iterations} iterations: continue with the recipe of the run"
+        )
+    pace = Pace() if recipe.cooling is None else read_pace(path, metadata.get("pace"))
+    bundles = read_bundles(path, arrays, recipe.representation.population)
+    without_rate = [name for name in bundles.shared if name not in as_decided(recipe, pace).rates.of]
+    if without_rate:
+        raise InputError(f"{path}: holds {', '.join(without_rate)}, which recipe {recipe.name} does not train")
+    return TrainState(
+        bundles.gaussians,
+        AdamState(bundles.first, bundles.second, counters.adam_step),
+        counters.step,
+        counters.view_order,
+        read_generator(path, metadata.get("rng")),
+        bundles.stats,
+        bundles.shared,
+        AdamState(bundles.shared_first, bundles.shared_second, counters.shared_adam_step),
+        pace=pace,
+    )
 
 
 def written_by(metadata: Mapping[str, Any]) -> tuple[str, str]:

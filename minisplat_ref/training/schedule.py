@@ -105,7 +105,31 @@ class At(NamedTuple):
         return self._replace(step=max(1, _scaled(self.step, factor)))
 
 
-Event = During | Every | At
+class SmallerViews(NamedTuple):
+    """Train on smaller views in the iterations with ``start < step <= until``.
+
+    Here the action is ``action(scene)``, called once, before the training. It returns how often to halve the views in
+    width and height; see :mod:`minisplat_ref.training.smaller_views`.
+    """
+
+    action: Callable[..., Any]
+    start: int = 0
+    until: int | None = None
+    """The last such iteration; None: until the training decides to proceed."""
+
+    def is_due(self, step: int) -> bool:
+        """Return whether iteration ``step``, counted from 1, may see smaller views."""
+        return self.start < step and (self.until is None or step <= self.until)
+
+    def scaled(self, factor: Fraction) -> "SmallerViews":
+        """Return the event with both milestones multiplied by ``factor``."""
+        return self._replace(start=_scaled(self.start, factor), until=_scaled_limit(self.until, factor))
+
+
+DatedEvent = Every | At
+"""Acts in some iterations only, and may add or remove rows."""
+
+Event = During | DatedEvent | SmallerViews
 
 
 class Recipe(NamedTuple):
@@ -126,10 +150,6 @@ class Recipe(NamedTuple):
     """Render each iteration over a random colour rather than the scene's background."""
     events: tuple[Event, ...]
     """What happens besides gradient steps; several due in one iteration act in this order."""
-    half_size_until: int = 0
-    """Number of first iterations that train on views of half the width and height (Mini-Splatting2)."""
-    min_half_size: int = 100
-    """Pixels per side; if half of any view were smaller, no view is halved."""
     min_views: int = 1
     """Least number of training views that the method needs."""
     short_run_exponent: float = 0.0
@@ -164,19 +184,19 @@ class Recipe(NamedTuple):
         return functools.reduce(Rates.joined, (calibration.rates for calibration in self.active_calibrations), rates)
 
 
-def does(event: Event, *actions: Action) -> bool:
+def does(event: Event, *actions: Callable[..., Any]) -> bool:
     """Return whether an event's action is one of these, whatever settings are bound to it."""
-    action = event.action
+    action: Callable[..., Any] = event.action
     return (action.func if isinstance(action, partial) else action) in actions
 
 
-def firing_steps(recipe: Recipe, *actions: Action) -> list[int]:
+def firing_steps(recipe: Recipe, *actions: Callable[..., Any]) -> list[int]:
     """Return the iterations in which one of the actions of a recipe acts."""
     events = [event for event in recipe.events if does(event, *actions)]
     return [step for step in range(1, recipe.iterations + 1) if any(event.is_due(step) for event in events)]
 
 
-def without(recipe: Recipe, action: Action) -> Recipe:
+def without(recipe: Recipe, action: Callable[..., Any]) -> Recipe:
     """Return the recipe without the events of ``action``."""
     return recipe._replace(events=tuple(event for event in recipe.events if not does(event, action)))
 
@@ -213,7 +233,6 @@ def scaled(recipe: Recipe, iterations: int) -> Recipe:
         sh_milestones=tuple(_scaled(milestone, factor) for milestone in recipe.sh_milestones),
         losses=tuple(term.scaled(factor) for term in recipe.losses),
         events=tuple(event.scaled(factor) for event in recipe.events),
-        half_size_until=_scaled(recipe.half_size_until, factor),
         calibrations=tuple(map(of_calibration, recipe.calibrations)),
         representation=recipe.representation._replace(
             rates=recipe.representation.rates.scaled(factor, raised, raised**2)

@@ -13,10 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from minisplat_ref.backends import Backend
-from minisplat_ref.constants import Conventions
 from minisplat_ref.errors import InputError
-from minisplat_ref.rendering import SPLATTING, Renderer
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.strategy.ops import Edit, contiguous, inherit, inherit_fields
 from minisplat_ref.training.adam import AdamState, zero_moments
 from minisplat_ref.training.pace import Cooling, Decision, Pace
@@ -79,9 +77,7 @@ class Iteration(NamedTuple):
     """[V] rows that the view saw (radius above zero), ascending."""
     v_means2d: Floats
     """[N, 2] gradient of the loss with respect to the projected centres, per pixel."""
-    backend: Backend
-    conventions: Conventions
-    renderer: Renderer = SPLATTING
+    render_settings: RenderSettings = RenderSettings()
     """How the model is rendered."""
     representation: Representation = GAUSSIANS
     """What is trained."""
@@ -91,6 +87,8 @@ class Iteration(NamedTuple):
     """Upper limit of the training's length."""
     cooling: Cooling | None = None
     """How it ends, if it has no schedule."""
+    n_halvings: int = 0
+    """How often the views were halved in width and height."""
     say: Callable[[str], None] = unheard
     """Tells the user something in one line, at once; a note for the record alone is returned instead."""
 
@@ -124,6 +122,8 @@ class StepReport(NamedTuple):
     """The state after the iteration; it is safe to save."""
     last_step: int | None = None
     """Iteration at which the training ends; None while a recipe that decides this has not done so."""
+    n_halvings: int = 0
+    """How often the views of the next iteration are halved in width and height."""
     fired: tuple[FiredEvent, ...] = ()
     """Events that acted after the gradient step, in their order."""
     notes: tuple[str, ...] = ()
@@ -133,11 +133,6 @@ class StepReport(NamedTuple):
 def n_pixels(scene: Scene) -> int:
     """Return the number of pixels of all training views: the amount of data to learn from."""
     return sum(view.camera.width * view.camera.height for view in scene.train_views)
-
-
-def smallest_side(scene: Scene) -> int:
-    """Return the least width or height of the training views, pixels."""
-    return min(min(view.camera.width, view.camera.height) for view in scene.train_views)
 
 
 def begin_cooling(
@@ -159,7 +154,7 @@ def begin_cooling(
     """
     length = max(1, math.ceil(cooling.part * decision.step)) if length is None else length
     state.pace = state.pace.decided(decision)._replace(
-        cooling_from=decision.step, last_step=min(decision.step + length, iterations), n_halvings=0
+        cooling_from=decision.step, last_step=min(decision.step + length, iterations)
     )
     state.view_order = []
 

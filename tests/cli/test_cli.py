@@ -25,7 +25,7 @@ from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.io import read_image
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.metrics import evaluate, psnr
-from minisplat_ref.rendering import render
+from minisplat_ref.rendering import RenderSettings, render
 from minisplat_ref.reports.images import GAP, error_image, to_8_bits
 from minisplat_ref.runs.progress import LOG_EVERY, Progress, read_log
 from minisplat_ref.studies import all_studies
@@ -93,7 +93,7 @@ def test_train_leaves_a_complete_folder(run_folder, scene_folder):
     assert metrics["train_seconds"] > 0 and metrics["peak_rss_mb"] > 1
     assert [view["name"] for view in metrics["per_view"]] == ["view_0000", "view_0004"]
     scene = load_scene(scene_folder, test_every=4)
-    expected = evaluate(gaussians, scene.test_views, background=scene.background, backend=CPU)
+    expected = evaluate(gaussians, scene.test_views, RenderSettings(scene.background, backend=CPU))
     assert (metrics["psnr"], metrics["ssim"]) == (expected.psnr, expected.ssim)
 
     config = read_json(run_folder / "config.json")

@@ -118,7 +118,7 @@ def test_detail_lowers_the_threshold(rng):
         }
         state = TrainState(gaussians, zero_moments(gaussians), 0, [], rng, stats)
         scene = Scene("", (), (), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(3), 1.0)
-        iteration = Iteration(scene, *[None] * 6)
+        iteration = Iteration(scene, *[None] * 4)
         clone_and_split_by_detail(state, iteration, threshold=0.7, size_fraction=1.0, beta=beta)
         assert len(state.gaussians.means) == n
         assert not state.stats

@@ -26,7 +26,7 @@ from minisplat_ref.extensions.negative.method import (
 )
 from minisplat_ref.extensions.negative.reference import density, difference, largest_weight, negate
 from minisplat_ref.reference.spherical_harmonics import sh_basis
-from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.rendering import SPLATTING, RenderSettings, Request
 from minisplat_ref.runs.progress import Progress
 from minisplat_ref.strategy.clone_split import prune_faint, prune_large
 from minisplat_ref.training.adam import zero_moments
@@ -230,7 +230,7 @@ def test_a_fifth_begins_with_the_negative_of_its_color(rng):
 def test_a_reinitialisation_begins_with_negatives_too(rng):
     fresh = as_dtype(of_colors(np.full((30, 3), 0.5)), np.float32)
     state = TrainState(fresh, zero_moments(fresh), 0, [], rng, {})
-    iteration = Iteration(*[None] * 7, DRAW, find_recipe("negative").representation)
+    iteration = Iteration(*[None] * 5, RenderSettings(), find_recipe("negative").representation)
     start_anew(state, iteration, fresh)
     assert np.count_nonzero(0.5 + SH_C0 * state.gaussians.sh_dc[:, 0] < 0) == 6
 

@@ -9,9 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from compact import check_damage, check_headers, population, refusal, short_run, with_header
 from minisplat_ref import load_ply
-from minisplat_ref.backends import CPU
 from minisplat_ref.cli import main
-from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.extensions.extension import find_format, find_recipe
@@ -22,9 +20,9 @@ from minisplat_ref.extensions.omg.method import prune_indistinct
 from minisplat_ref.extensions.omg.reference import distinct_importance, local_distinctiveness
 from minisplat_ref.extensions.omg.svq import fit_codes, quantise
 from minisplat_ref.methods.mini_splatting import MINI_SPLATTING, prune_tail
-from minisplat_ref.rendering import SPLATTING
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.strategy.importance import indoor
-from minisplat_ref.training.loop import initial_state
+from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.schedule import action_name
 from minisplat_ref.training.state import Iteration
 from minisplat_ref.types import Gaussians
@@ -74,9 +72,7 @@ def scene():
 def state_and_iteration(scene):
     state = initial_state(scene, MINI_SPLATTING, seed=0)
     nothing = dict.fromkeys(Iteration._fields)
-    iteration = Iteration(
-        **nothing | {"scene": scene, "renderer": SPLATTING, "conventions": GSPLAT_MAIN, "backend": CPU}
-    )
+    iteration = Iteration(**nothing | {"scene": scene, "render_settings": RenderSettings(scene.background)})
     return state, iteration
 
 

@@ -2,11 +2,10 @@
 
 import numpy as np
 
-from minisplat_ref.backends import CPU
-from minisplat_ref.constants import GSPLAT_MAIN
-from minisplat_ref.methods.adaptive import ADAPTIVE
+from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.training.adam import zero_moments
-from minisplat_ref.training.loop import initial_state
+from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.state import Iteration
 
 
@@ -21,7 +20,7 @@ def state_of(scene, truth):
 def iteration_of(scene, step=600):
     """An iteration whose view and rendering no decision uses."""
     return Iteration(
-        *(scene, scene.train_views[0], None, np.zeros(0, int), None, CPU, GSPLAT_MAIN),
+        *(scene, scene.train_views[0], None, np.zeros(0, int), None, RenderSettings(scene.background)),
         step=step,
         iterations=30_000,
         cooling=ADAPTIVE.cooling,

@@ -22,7 +22,9 @@ from minisplat_ref.io.lens import import_pycolmap
 from minisplat_ref.io.npz import read_npz
 from minisplat_ref.io.ply import read_vertices, save_ply
 from minisplat_ref.methods import get_recipe
-from minisplat_ref.training.loop import initial_state, load_state, save_state, train
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.saved_state import load_state, save_state
 from minisplat_ref.training.schedule import configured
 from minisplat_ref.types import Gaussians
 from photo_scenes import edit_transforms, write_colmap, write_transforms

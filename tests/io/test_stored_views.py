@@ -25,11 +25,13 @@ from minisplat_ref.io.scene import half_size, rescale_camera
 from minisplat_ref.io.stored_views import Photograph, Pixels, ReadingAhead, Shelf, StoredView, make_room
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
-from minisplat_ref.rendering import SPLATTING, Request
+from minisplat_ref.rendering import SPLATTING, RenderSettings, Request
 from minisplat_ref.runs import fingerprint, room, run_folder
 from minisplat_ref.runs.scoring import Trained
-from minisplat_ref.training.loop import initial_state, train
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
 from minisplat_ref.training.losses import LossTerm
+from minisplat_ref.training.schedule import SmallerViews
 from minisplat_ref.types import View, view_from
 from photo_scenes import DISTORTED, HEIGHT, WIDTH, colored_image, write_colmap, write_transforms
 from run_commands import OPTIONS, SCENE, contents, interrupt_at, photograph, read_json, refused  # noqa: F401  (a fixture)
@@ -197,7 +199,7 @@ def test_training_ends_with_the_same_bytes(original, tmp_path, alive, monkeypatc
 
 
 def test_half_size_views_give_the_same_bytes(original, monkeypatch):
-    recipe = get_recipe("3dgs-accel", 20)._replace(half_size_until=10, min_half_size=4)
+    recipe = get_recipe("3dgs-accel", 20)._replace(events=(SmallerViews(lambda scene: 1, until=10),))
     held = train(load_scene(original), recipe, seed=0)
     keep_few(monkeypatch)
     stored = train(load_scene(original), recipe, seed=0)
@@ -263,7 +265,7 @@ def test_evaluations_hold_no_more_than_they_show(scene, alive, monkeypatch):
     assert alive["threads"] == []
     assert fingerprint.of_scene(loaded) == fingerprint.of_scene(loaded)
     assert len(alive["threads"]) == N_PHOTOS  # not twice
-    evaluate(model, loaded.test_views, background=loaded.background)
+    evaluate(model, loaded.test_views, RenderSettings(loaded.background))
     assert len(alive["threads"]) == 2 * N_PHOTOS
     choose_crops([Trained(model, SPLATTING, loaded.background, GSPLAT_MAIN.name, "cpu")], loaded)
     assert len(alive["threads"]) == 3 * N_PHOTOS

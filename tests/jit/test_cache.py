@@ -175,7 +175,7 @@ collect_importance(state.gaussians, scene.train_views[:1])
 output, tape = render(state.gaussians, camera, with_stats=True)
 g = tape.splats.primitives
 CPU.surface_points(g.means, g.quats, g.scales, camera, output.stats.dominant_ids)
-evaluate(state.gaussians, scene.train_views[:1], background=scene.background)
+evaluate(state.gaussians, scene.train_views[:1], RenderSettings(scene.background))
 smooth = recipe._replace(losses=(*recipe.losses, *(term._replace(weight=1.0) for term in GEOMETRY.losses[1:])))
 train(scene, smooth, seed=0)
 assert signatures() == every, signatures() - every

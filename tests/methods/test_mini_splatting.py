@@ -8,16 +8,18 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods import RECIPES, gaussian_splatting, mini_splatting, mini_splatting2
 from minisplat_ref.methods.mini_splatting import is_culling, measure_importance
-from minisplat_ref.rendering import render, render_vjp
+from minisplat_ref.rendering import RenderSettings, render, render_vjp
 from minisplat_ref.strategy import depth_reinit, importance, simplify, visibility
 from minisplat_ref.strategy.initialization import from_points
 from minisplat_ref.strategy.ops import n_rows
-from minisplat_ref.training.loop import initial_state, load_state, save_state, train
-from minisplat_ref.training.schedule import At, Every, configured, scaled
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.saved_state import load_state, save_state
+from minisplat_ref.training.schedule import At, Every, SmallerViews, configured, firing_steps, scaled, settings_of
+from minisplat_ref.training.smaller_views import halve_large_views
 from minisplat_ref.training.state import Iteration, n_pixels
 from minisplat_ref.types import Scene, View
 from scenes import as_dtype, make_camera, make_gaussians
@@ -48,7 +50,7 @@ def state(scene):
 
 @pytest.fixture
 def iteration(scene):
-    return Iteration(scene, scene.train_views[0], None, np.arange(0), None, CPU, GSPLAT_MAIN)
+    return Iteration(scene, scene.train_views[0], None, np.arange(0), None, RenderSettings(scene.background))
 
 
 def compressed(name):
@@ -60,7 +62,8 @@ def compressed(name):
     recipe = RECIPES[name]
     min_gap = 2 if name.startswith("mini-splatting2") else 5
     events = [e._replace(min_gap=min_gap) if isinstance(e, Every) else e for e in recipe.events]
-    return scaled(recipe._replace(events=tuple(events), min_half_size=32), ITERATIONS)
+    recipe = scaled(recipe._replace(events=tuple(events)), ITERATIONS)
+    return configured(recipe, min_side=32) if "min_side" in settings_of(recipe) else recipe
 
 
 # Whole recipes --------------------------------------------------------------------------------------------------------
@@ -81,7 +84,9 @@ def test_recipe_runs_to_the_end(scene, name):
     rounds = np.reshape(losses, (-1, N_VIEWS)).mean(axis=1)
     assert rounds[-1] < 0.8 * rounds.max()
     assert degrees[0] == 0 and degrees[-1] == 15 and sorted(degrees) == degrees
-    assert sizes == [36] * recipe.half_size_until + [72] * (ITERATIONS - recipe.half_size_until)
+    n_small = len(firing_steps(recipe, halve_large_views))
+    assert n_small == (15 if name.startswith("mini-splatting2") else 0)
+    assert sizes == [36] * n_small + [72] * (ITERATIONS - n_small)
     assert all(len(array) == n_rows(state.gaussians) for array in (*state.adam.first, *state.stats.values()))
     assert not is_culling(state)
 
@@ -138,7 +143,7 @@ def test_gradients_are_lowered_while_views_are_culled(state, scene):
     v_means2d = np.ones((n_rows(state.gaussians), 2))
     ids = np.array([1, 4])
     gaussian_splatting.collect_gradients(
-        state, Iteration(scene, scene.train_views[0], None, ids, v_means2d, CPU, GSPLAT_MAIN)
+        state, Iteration(scene, scene.train_views[0], None, ids, v_means2d, RenderSettings(scene.background))
     )
     assert state.stats["gradient_sum"][ids] == pytest.approx(0.25 * np.hypot(36, 32))
 
@@ -254,7 +259,7 @@ def test_blur_is_remembered_from_view_to_view(state, scene):
     def see(counts):
         stats = SimpleNamespace(dominant_count=np.array(counts + [0] * (n - 3)))
         output = SimpleNamespace(stats=stats)
-        iteration = Iteration(scene, scene.train_views[0], output, np.arange(0), None, CPU, GSPLAT_MAIN)
+        iteration = Iteration(scene, scene.train_views[0], output, np.arange(0), None, RenderSettings(scene.background))
         mini_splatting.collect_blur(state, iteration, area_fraction=64 / (72 * 64))
 
     see([65, 64, 0])
@@ -342,7 +347,8 @@ def test_tiny_images_are_not_halved(scene):
         view._replace(camera=view.camera._replace(width=63), image=view.image[:, :63]) for view in scene.train_views
     )
     sizes = []
-    recipe = RECIPES["3dgs"]._replace(iterations=2, events=(), half_size_until=2, min_half_size=32)
+    smaller = SmallerViews(partial(halve_large_views, min_side=32, max_halvings=1), until=2)
+    recipe = RECIPES["3dgs"]._replace(iterations=2, events=(smaller,))
     train(scene._replace(train_views=views), recipe, seed=0, on_step=lambda r: sizes.append(r.view.camera.width))
     assert sizes == [63, 63]
 

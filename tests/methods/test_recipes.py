@@ -12,7 +12,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.methods import RECIPES, gaussian_splatting, get_recipe
 from minisplat_ref.strategy.importance import outdoor
 from minisplat_ref.training.losses import LossTerm
-from minisplat_ref.training.schedule import At, During, Every, action_name, configured, describe, scaled
+from minisplat_ref.training.schedule import At, DatedEvent, During, Every, action_name, configured, describe, scaled
 
 
 def nothing(state, iteration, **settings):
@@ -73,7 +73,7 @@ def test_mini_splatting2_schedule():
     """As the released code: clones every 250 from 500 to 2750 but not at 2000, where depth reinitialises."""
     recipe = RECIPES["mini-splatting2"]
     fired = firings(recipe)
-    assert recipe.iterations == 18_000 and recipe.half_size_until == 3_000
+    assert recipe.iterations == 18_000 and fired["halve_large_views"] == list(range(1, 3_001))
     assert fired["aggressive_clone"] == [500, 750, 1_000, 1_250, 1_500, 1_750, 2_250, 2_500, 2_750]
     assert fired["clone_and_split"] == [step for step in range(600, 3_000, 100) if step != 2_000]
     assert fired["reinitialise_from_depth"] == [2_000]
@@ -123,6 +123,7 @@ OF_MINI_SPLATTING = {
 }
 _FEW_SEE = {"min_views": 2, "visibility_mass": 0.99}
 OF_MINI_SPLATTING2 = {
+    "halve_large_views": {"max_halvings": 1},
     **{action: OF_MINI_SPLATTING[action] for action in ("clone_and_split", "prune_faint", "collect_blur", "store_sh")},
     "reinitialise_from_depth": {
         **OF_MINI_SPLATTING["reinitialise_from_depth"],
@@ -219,7 +220,7 @@ def test_events_keep_their_order_and_gaps_at_every_length(name, lengths):
     """
     recipe = RECIPES[name]
     events = [
-        event for event in recipe.events if getattr(event, "period", 250) >= 250 and not isinstance(event, During)
+        event for event in recipe.events if getattr(event, "period", 250) >= 250 and isinstance(event, DatedEvent)
     ]
     published = sorted((step, number) for number, event in enumerate(events) for step in published_firings(event))
     assert len(published) == {"mini-splatting": 7, "mini-splatting2": 14}[name]
@@ -271,7 +272,7 @@ def test_rates_of_short_runs_are_raised_where_the_recipe_says_so():
 
 def test_rewind_and_warm_up_are_scaled():
     assert get_recipe("mini-splatting", 3_000).learning_rates.of["means"].rewind == (1_500, 500)
-    assert get_recipe("mini-splatting2", 1_800).half_size_until == 300
+    assert firings(get_recipe("mini-splatting2", 1_800))["halve_large_views"] == list(range(1, 301))
 
 
 def test_scaled_to_a_tenth():

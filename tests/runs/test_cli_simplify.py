@@ -18,6 +18,7 @@ from minisplat_ref.io import load_ply, load_scene, save_ply
 from minisplat_ref.io.images import read_image
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.runs import opened_run, simplification
 from minisplat_ref.runs.opened_run import HOLD_OUT_EVERY, open_run
 from minisplat_ref.runs.progress import PSNR_MAX
@@ -262,7 +263,7 @@ def test_without_fine_tuning_the_most_important_stay_as_they_are(run_folder, sce
     kept = take(dense, np.sort(np.argsort(-weights, kind="stable")[:60]))
     views = [scene.train_views[k] for k in held]
     before, after = (
-        [view.psnr for view in evaluate(g, views, background=scene.background).per_view] for g in (dense, kept)
+        [view.psnr for view in evaluate(g, views, RenderSettings(scene.background)).per_view] for g in (dense, kept)
     )
     chosen = read(tmp_path / "out" / "result.json")["chosen"]
     assert (chosen["drop"], chosen["standard_error"]) == pytest.approx(paired_drop(before, after), rel=1e-9)

@@ -17,8 +17,8 @@ from minisplat_ref.methods.gaussian_splatting import clone_and_split, collect_gr
 from minisplat_ref.runs import events
 from minisplat_ref.runs.events import count_published_times, describe, mechanisms, never_fired
 from minisplat_ref.runs.progress import Progress, read_log
-from minisplat_ref.training.loop import HALF_SIZE
-from minisplat_ref.training.schedule import At, During, Every
+from minisplat_ref.training.schedule import At, During, Every, SmallerViews
+from minisplat_ref.training.smaller_views import halve_large_views
 from minisplat_ref.training.state import FiredEvent
 
 SCENE = {"n_views": 6, "width": 32, "height": 24, "n_points": 60, "test_every": 4}
@@ -171,5 +171,8 @@ def test_mechanisms_by_hand():
 def test_published_times_by_hand():
     """Several events of one action count together, those of every iteration not; half-size views are one mechanism."""
     assert count_published_times(RECIPE) == {"clone_and_split": 3, "prune_faint": 3, "noted": 1, "reset_opacity": 0}
-    both = RECIPE._replace(events=(*RECIPE.events, At(2, prune_faint)), half_size_until=3)
-    assert count_published_times(both) == {HALF_SIZE: 1, **count_published_times(RECIPE), "prune_faint": 4}
+    both = RECIPE._replace(events=(*RECIPE.events, At(2, prune_faint)))
+    both = both._replace(
+        events=(SmallerViews(partial(halve_large_views, min_side=16, max_halvings=1), until=3), *both.events)
+    )
+    assert count_published_times(both) == {"halve_large_views": 1, **count_published_times(RECIPE), "prune_faint": 4}

@@ -12,7 +12,8 @@ import pytest
 from minisplat_ref import memory
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods import gaussian_splatting
-from minisplat_ref.training.loop import initial_state, train
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import At
 from tiny_training import PLAIN, scene  # noqa: F401  (a fixture)
 

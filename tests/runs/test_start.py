@@ -19,7 +19,7 @@ from minisplat_ref.io.ply import COLORS, write_vertices
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.runs.progress import Progress
 from minisplat_ref.runs.start import load_start
-from minisplat_ref.training.loop import initial_state
+from minisplat_ref.training.initial_state import initial_state
 from photo_scenes import write_colmap
 from tolerances import ROUNDED_TO_FLOAT32
 

@@ -5,12 +5,12 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from minisplat_ref import memory
-from minisplat_ref.backends import CPU
-from minisplat_ref.constants import GSPLAT_MAIN, INRIA
+from minisplat_ref.constants import INRIA
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.reference.pinhole import pinhole
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.strategy.depth_reinit import (
     PixelPoints,
     blend_points,
@@ -75,11 +75,11 @@ def test_midpoint_lies_on_a_sphere_and_centre_on_a_plane(backend):
     camera, gaussians = make_camera(width=5, height=5), round_gaussian(3.0, 0.9)
     slopes = (np.arange(5) - 2) / np.array([[30.0], [28.0]])  # [2, 5]
     squared = slopes[0] ** 2 + slopes[1][:, None] ** 2
-    midpoint = midpoint_points(gaussians, view_from(camera), GSPLAT_MAIN, backend)
+    midpoint = midpoint_points(gaussians, view_from(camera), RenderSettings(backend=backend))
     assert_allclose(midpoint.depths, 3 / (1 + squared), rtol=CLOSED_FORM)
     assert_allclose(midpoint.points[4, 1], midpoint.depths[4, 1] * np.array([-1 / 30, 2 / 28, 1]), rtol=CLOSED_FORM)
     assert midpoint.alpha[2, 2] == pytest.approx(0.9, rel=CLOSED_FORM)
-    centre = centre_points(gaussians, view_from(camera), GSPLAT_MAIN, backend)
+    centre = centre_points(gaussians, view_from(camera), RenderSettings(backend=backend))
     assert_allclose(centre.depths, 3.0, rtol=CLOSED_FORM)
     assert_allclose(centre.points[4, 1], 3 * np.array([-1 / 30, 2 / 28, 1]), rtol=CLOSED_FORM)
 
@@ -88,11 +88,11 @@ def test_blended_depth_lies_between_surfaces(backend):
     """Opacities 0.5 and 0.8 at depths 2 and 4: weights 0.5 and 0.4, so the dominant is at 2, the mean at 2.6 / 0.9."""
     camera = make_camera(width=5, height=5)
     gaussians = concat(round_gaussian(4.0, 0.8), round_gaussian(2.0, 0.5))
-    blended = blend_points(gaussians, view_from(camera), GSPLAT_MAIN, backend)
+    blended = blend_points(gaussians, view_from(camera), RenderSettings(backend=backend))
     assert blended.depths[2, 2] == pytest.approx(2.6 / 0.9, rel=CLOSED_FORM)
     assert blended.alpha[2, 2] == pytest.approx(0.9, rel=CLOSED_FORM)
     for points_of in (midpoint_points, centre_points):
-        assert points_of(gaussians, view_from(camera), GSPLAT_MAIN, backend).depths[2, 2] == pytest.approx(
+        assert points_of(gaussians, view_from(camera), RenderSettings(backend=backend)).depths[2, 2] == pytest.approx(
             2.0, rel=CLOSED_FORM
         )
 
@@ -100,7 +100,7 @@ def test_blended_depth_lies_between_surfaces(backend):
 @ALL_KINDS
 def test_points_fall_back_on_the_centres_of_their_pixels(points_of, backend, rng):
     camera = make_camera(rng=rng, cx=10.0, cy=11.0)
-    points, depths, _ = points_of(make_gaussians(rng, 60), view_from(camera), GSPLAT_MAIN, backend)
+    points, depths, _ = points_of(make_gaussians(rng, 60), view_from(camera), RenderSettings(backend=backend))
     assert (depths > 0).any()
     assert not points[depths == 0].any()
     in_camera = points[depths > 0] @ camera.cam_from_world_R.T + camera.cam_from_world_t
@@ -114,8 +114,8 @@ def test_principal_point_is_the_conventions(points_of, rng):
     """INRIA's rasteriser takes it for the image's centre, so the rays of its pictures go through there."""
     gaussians, moved, centred = make_gaussians(rng, 60), make_camera(cx=10.0, cy=11.0), make_camera()
     for of_moved, of_centred in zip(
-        points_of(gaussians, view_from(moved), INRIA, CPU),
-        points_of(gaussians, view_from(centred), INRIA, CPU),
+        points_of(gaussians, view_from(moved), RenderSettings(conventions=INRIA)),
+        points_of(gaussians, view_from(centred), RenderSettings(conventions=INRIA)),
         strict=True,
     ):
         assert_array_equal(of_moved, of_centred)

@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from minisplat_ref.backends import REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.reference.compositing import composite_all_pairs
-from minisplat_ref.rendering import render
+from minisplat_ref.rendering import RenderSettings, render
 from minisplat_ref.strategy.error_weights import collect_error_weights
 from minisplat_ref.types import View
 from scenes import activated, make_camera, make_gaussians
@@ -43,6 +43,6 @@ def test_it_is_the_sum_of_error_times_weight(backend, gaussians, rng, has_mask):
         errors = np.abs(image - photograph / 255).mean(axis=2)
         expected += np.einsum("hwn,hw->n", w, errors if mask is None else errors * mask)
     expected[BLACK] = 0.0
-    weights = collect_error_weights(gaussians, views, background=BACKGROUND, backend=backend)
+    weights = collect_error_weights(gaussians, views, RenderSettings(BACKGROUND, backend=backend))
     assert_allclose(weights, expected, rtol=PARITY_FLOAT64)
     assert_array_equal(np.flatnonzero(weights == 0), [BLACK, BEHIND])

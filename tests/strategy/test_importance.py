@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.reference.compositing import composite_all_pairs
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.strategy.importance import ImportanceStats, collect_importance, indoor, mass_mask, outdoor
 from minisplat_ref.strategy.ops import take
 from minisplat_ref.types import view_from
@@ -48,7 +49,7 @@ def weights_of(gaussians, camera):
 
 
 def test_sums_over_views(backend, gaussians, cameras):
-    stats = collect_importance(gaussians, looking(cameras), backend=backend)
+    stats = collect_importance(gaussians, looking(cameras), RenderSettings(backend=backend))
     expected_mean = np.zeros(N_GAUSSIANS)
     images = [weights_of(gaussians, camera) for camera in cameras]
     for image in images:
@@ -65,7 +66,7 @@ def test_sums_over_views(backend, gaussians, cameras):
 
 
 def test_visible_are_those_that_carry_the_view(backend, gaussians, cameras):
-    stats = collect_importance(gaussians, looking(cameras), backend=backend, visibility_mass=0.9)
+    stats = collect_importance(gaussians, looking(cameras), RenderSettings(backend=backend), visibility_mass=0.9)
     for v, camera in enumerate(cameras):
         weight_sums = weights_of(gaussians, camera).sum(axis=(0, 1))
         is_visible = stats.is_visible[:, v]
@@ -76,7 +77,7 @@ def test_visible_are_those_that_carry_the_view(backend, gaussians, cameras):
 
 
 def test_the_frustum_is_wider_than_what_is_seen(backend, gaussians, cameras):
-    stats = collect_importance(gaussians, looking(cameras), backend=backend)
+    stats = collect_importance(gaussians, looking(cameras), RenderSettings(backend=backend))
     radii = [backend.project(*activated(gaussians), camera, GSPLAT_MAIN).radii for camera in cameras]
     assert_array_equal(stats.frustum_count, np.sum([(r > 0).all(axis=1) for r in radii], axis=0))
     assert stats.frustum_count[-2] == 0 and stats.frustum_count.max() == 3
@@ -85,8 +86,10 @@ def test_the_frustum_is_wider_than_what_is_seen(backend, gaussians, cameras):
 
 @pytest.mark.parametrize("field", ImportanceStats._fields)
 def test_float32_and_types(gaussians, cameras, field):
-    expected = getattr(collect_importance(gaussians, looking(cameras), backend=REFERENCE), field)
-    actual = getattr(collect_importance(as_dtype(gaussians, np.float32), looking(cameras), backend=CPU), field)
+    expected = getattr(collect_importance(gaussians, looking(cameras), RenderSettings(backend=REFERENCE)), field)
+    actual = getattr(
+        collect_importance(as_dtype(gaussians, np.float32), looking(cameras), RenderSettings(backend=CPU)), field
+    )
     assert actual.dtype == expected.dtype
     if expected.dtype == np.float64:
         assert_allclose(actual, expected, rtol=0, atol=PARITY_FLOAT32_IMAGE * expected.max())

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.errors import InputError
-from minisplat_ref.rendering import SPLATTING, Request, render, render_vjp
+from minisplat_ref.rendering import SPLATTING, RenderSettings, Request, render, render_vjp
 from minisplat_ref.strategy.removal import RemovalCosts, collect_removal_costs, worth_their_place
 from minisplat_ref.types import Model, View, view_from
 from scenes import as_dtype, make_camera, make_gaussians
@@ -103,7 +103,7 @@ def test_costs_are_sums_over_views(gaussians, camera, rng):
     mask = rng.uniform(size=(29, 37)) < 0.5
     cameras = [camera, make_camera(37, 29)]
     views = [View(str(i), cameras[i], photographs[i], (None, mask)[i]) for i in range(2)]
-    costs = collect_removal_costs(gaussians, views, background=BACKGROUND)
+    costs = collect_removal_costs(gaussians, views, RenderSettings(BACKGROUND))
     assert_allclose(costs.changes, sum(changes_of(gaussians, own, CPU) for own in cameras), rtol=PARITY_FLOAT64)
     errors = [(picture(gaussians, own, CPU) - p / 255) ** 2 for own, p in zip(cameras, photographs, strict=True)]
     assert_allclose(costs.squared_error, errors[0].sum() + errors[1][mask].sum(), rtol=PARITY_FLOAT32_IMAGE)
@@ -117,7 +117,7 @@ def test_a_renderer_that_does_not_say(gaussians, camera):
     views = [View("a", camera, np.zeros((29, 37, 3), np.uint8), None)]
     with pytest.raises(InputError, match="renderer silent does not say"):
         silent = SPLATTING._replace(name="silent", render=render)
-        collect_removal_costs(gaussians, views, background=BACKGROUND, renderer=silent)
+        collect_removal_costs(gaussians, views, RenderSettings(BACKGROUND, renderer=silent))
 
 
 def test_what_is_not_worth_its_place():

@@ -11,7 +11,7 @@ from minisplat_ref.io.images import read_image
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.studies import all_studies, depth_types
 from minisplat_ref.studies.study import FIGURE, RESULT
-from minisplat_ref.training.loop import initial_state
+from minisplat_ref.training.initial_state import initial_state
 
 TINY = ("--views", "6", "--width", "32", "--height", "24", "--supersampling", "1", "--points", "150")
 

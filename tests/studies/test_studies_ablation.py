@@ -6,14 +6,13 @@ from functools import partial
 import numpy as np
 import pytest
 
-from minisplat_ref.backends import CPU
 from minisplat_ref.cli import main
-from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.images import read_image
 from minisplat_ref.methods import RECIPES, gaussian_splatting, mini_splatting
 from minisplat_ref.methods.mini_splatting import reinitialise_from_depth
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.strategy.blur_split import principal_axis_children
 from minisplat_ref.strategy.clone_split import random_children
 from minisplat_ref.studies import ablation, conditions, kit
@@ -57,10 +56,11 @@ def test_each_variant_lacks_one_thing():
     assert "reinitialise_from_depth" not in names_of(variants["reinitialisation"])
     assert settings_of(variants["culling"])["visibility_mass"] == 1.0 and settings_of(variants["clone"])["factor"] == 1
     assert not settings_of(variants["intersection preservation"])["is_intersecting"]
-    assert (recipe.half_size_until, variants["half-size warm-up"].half_size_until) == (3_000, 0)
+    assert "halve_large_views" in names_of(recipe)
+    assert "halve_large_views" not in names_of(variants["half-size warm-up"])
     for name, variant in variants.items():
         changed = [f for f in recipe._fields if getattr(variants[FULL], f) != getattr(variant, f)]
-        assert changed == {FULL: [], "half-size warm-up": ["half_size_until"]}.get(name, ["events"])
+        assert changed == ([] if name == FULL else ["events"])
     assert {"restart", "sampling"} < set(variants_of(RECIPES["mini-splatting"], 30_000))
     assert "clone" not in variants_of(RECIPES["mini-splatting"], 30_000)
 
@@ -122,7 +122,7 @@ def test_depths_are_drawn_of_what_the_culling_table_says(room):
     def begun_anew(act, is_visible):
         state = train(room, RECIPES["3dgs-accel"]._replace(iterations=12, events=()), seed=0)
         state.stats["is_visible"] = np.full((len(state.gaussians.means), len(room.train_views)), is_visible)
-        iteration = Iteration(room, room.train_views[0], None, np.arange(0), None, CPU, GSPLAT_MAIN)
+        iteration = Iteration(room, room.train_views[0], None, np.arange(0), None, RenderSettings(room.background))
         event = next(e for e in RECIPES["mini-splatting2"].events if action_name(e) == "reinitialise_from_depth")
         partial(act, **{**event.action.keywords, "drawn_mass": None})(state, iteration)
         return state.gaussians.means

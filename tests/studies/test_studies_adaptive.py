@@ -9,7 +9,7 @@ from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.images import read_image
-from minisplat_ref.methods.adaptive import ADAPTIVE
+from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.studies import adaptive, kit
 from minisplat_ref.studies.conditions import get_condition
 from minisplat_ref.studies.kit import RUNS

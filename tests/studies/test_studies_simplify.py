@@ -12,6 +12,7 @@ from minisplat_ref.io import load_ply, load_scene, save_ply
 from minisplat_ref.io.images import read_image
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import evaluate
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.strategy.importance import collect_importance, indoor
 from minisplat_ref.strategy.initialization import from_points
 from minisplat_ref.strategy.removal import collect_removal_costs
@@ -75,15 +76,17 @@ def test_study(scene_folder, dense_file, tmp_path, capsys, restart):
         assert runs[kept, "rank, mass", 0]["psnr"] == runs[kept, "rank, mass", 1]["psnr"]
         assert runs[kept, "sampling", 0]["psnr"] != runs[kept, "sampling", 1]["psnr"]
 
-    changes = collect_removal_costs(dense, scene.train_views, background=scene.background).changes * (importance > 0)
+    changes = collect_removal_costs(dense, scene.train_views, RenderSettings(scene.background)).changes * (
+        importance > 0
+    )
     kept = dense._make(field[most_important(changes, n_of_mass)] for field in dense)
-    psnr = evaluate(kept, scene.test_views, background=scene.background).psnr
+    psnr = evaluate(kept, scene.test_views, RenderSettings(scene.background)).psnr
     assert runs["mass 0.99", "least change", 0]["psnr"] == psnr != runs["mass 0.99", "rank, mass", 0]["psnr"]
 
     # One of the measures by another way.
     kept = dense._make(field[most_important(importance, n_of_mass)] for field in dense)
     row = runs["mass 0.99", "rank, mass", 0]
-    assert row["psnr"] == evaluate(kept, scene.test_views, background=scene.background).psnr
+    assert row["psnr"] == evaluate(kept, scene.test_views, RenderSettings(scene.background)).psnr
     nearest = np.linalg.norm(dense.means[:, None].astype(float) - kept.means, axis=2).min(axis=1)
     assert abs(row["chamfer_dense"] - nearest.mean()) < CLOSED_FORM  # the other way it is 0: they were kept
 

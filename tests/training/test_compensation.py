@@ -11,10 +11,10 @@ from minisplat_ref.backends import CPU
 from minisplat_ref.cli import main
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.io.scene import half_size
-from minisplat_ref.methods import adaptive_exposure
-from minisplat_ref.methods.adaptive import GAIN_MIN
-from minisplat_ref.methods.adaptive_antialiasing import switch_antialiasing_on
-from minisplat_ref.methods.adaptive_evidence import Evidence
+from minisplat_ref.methods.adaptive import exposure
+from minisplat_ref.methods.adaptive.evidence import Evidence
+from minisplat_ref.methods.adaptive.numbers import GAIN_MIN
+from minisplat_ref.methods.adaptive.switches import switch_antialiasing_on, switch_exposure_on
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.training.calibration import EXPOSURES
 from minisplat_ref.training.compensation import COMPENSATION, compensation, with_compensation
@@ -122,11 +122,11 @@ def test_two_sizes_ask_for_it(truth):
 )
 def test_of_gains_and_compensation_what_explains_more(gain, min_antialiasing_gain, are_on, truth, monkeypatch):
     found = Evidence(gain, 0.01, np.zeros((N_VIEWS, 1)))
-    monkeypatch.setattr(adaptive_exposure, "exposure_evidence", lambda *_: found)
+    monkeypatch.setattr(exposure, "exposure_evidence", lambda *_: found)
     least = {"min_exposure_gain": GAIN_MIN, "min_antialiasing_gain": min_antialiasing_gain}
     scene = scene_of(truth, has_two_sizes=True)
     state = state_of(scene, truth._replace(opacity_logits=truth.opacity_logits - 1))
-    note = adaptive_exposure.switch_exposure_on(state, iteration_of(scene), **least)
+    note = switch_exposure_on(state, iteration_of(scene), **least)
     assert ("compensation" not in note) == (EXPOSURES in state.shared) == are_on
 
 

@@ -12,7 +12,8 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.io.checkpoint import save_checkpoint
 from minisplat_ref.training.case import load_case
 from minisplat_ref.training.guard import BadNumbers, Guard, examine
-from minisplat_ref.training.loop import initial_state, train
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import At
 from tiny_training import RECIPE, all_arrays, assert_same_bytes, scene, uninterrupted  # noqa: F401  (fixtures)
 

@@ -10,9 +10,11 @@ import pytest
 from minisplat_ref.backends import CPU
 from minisplat_ref.errors import InputError
 from minisplat_ref.training import interruption
+from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.interruption import Interruptions, terminated_like_interrupted
-from minisplat_ref.training.loop import initial_state, save_state, train
+from minisplat_ref.training.loop import train
 from minisplat_ref.training.losses import LossTerm
+from minisplat_ref.training.saved_state import save_state
 from minisplat_ref.training.schedule import At
 from tiny_training import RECIPE, assert_same_bytes, scene, uninterrupted  # noqa: F401  (fixtures)
 

@@ -18,10 +18,13 @@ from minisplat_ref.extensions.geometry import kernels
 from minisplat_ref.extensions.geometry.weights import GeometricWeights
 from minisplat_ref.methods import RECIPES, gaussian_splatting
 from minisplat_ref.metrics import evaluate
-from minisplat_ref.rendering import render
-from minisplat_ref.training.loop import initial_state, load_state, save_state, train
+from minisplat_ref.rendering import RenderSettings, render
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
 from minisplat_ref.training.rates import LogLinear
-from minisplat_ref.training.schedule import BLEND_STATS, At, During, configured
+from minisplat_ref.training.saved_state import load_state, save_state
+from minisplat_ref.training.schedule import BLEND_STATS, At, During, SmallerViews, configured
+from minisplat_ref.training.smaller_views import halve_large_views
 from minisplat_ref.training.state import FiredEvent
 from minisplat_ref.types import Gaussians
 from tiny_training import (  # noqa: F401  (fixtures)
@@ -59,9 +62,9 @@ def test_an_image_is_gone_before_the_next_is_made(scene):
 def test_overfits_a_tiny_scene(scene, name, backend):
     recipe = PLAIN._replace(name=name, adam=RECIPES[name].adam, learning_rates=RECIPES[name].learning_rates)
     state, losses = initial_state(scene, recipe, 0), []
-    before = evaluate(state.gaussians, scene.train_views, background=scene.background, backend=backend)
+    before = evaluate(state.gaussians, scene.train_views, RenderSettings(scene.background, backend=backend))
     train(scene, recipe, seed=0, state=state, on_step=lambda report: losses.append(report.loss), backend=backend)
-    after = evaluate(state.gaussians, scene.train_views, background=scene.background, backend=backend)
+    after = evaluate(state.gaussians, scene.train_views, RenderSettings(scene.background, backend=backend))
     assert len(losses) == 60
     assert np.mean(losses[-N_VIEWS:]) < 0.75 * np.mean(losses[:N_VIEWS])
     assert after.psnr > before.psnr + 3.0
@@ -117,14 +120,25 @@ def test_the_loop_tells_what_fired(scene):
     assert fired[-1][1].seconds >= 0.05
 
 
+def once(scene):
+    return 1
+
+
 def test_the_loop_tells_whether_views_were_halved(scene):
-    recipe, told = PLAIN._replace(iterations=4, half_size_until=3), []
+    def recipe_with(action):
+        return PLAIN._replace(iterations=4, events=(SmallerViews(action, until=3),))
+
+    told, recipe = [], recipe_with(partial(halve_large_views, min_side=16, max_halvings=1))
     train(scene, recipe, seed=0, on_step=lambda report: told.extend((report.step, event) for event in report.fired))
     assert told == []  # the views are too small for it
-    recipe = recipe._replace(min_half_size=8)
-    train(scene, recipe, seed=0, on_step=lambda report: told.extend((report.step, event) for event in report.fired))
+    train(
+        scene,
+        recipe_with(once),
+        seed=0,
+        on_step=lambda report: told.extend((report.step, event) for event in report.fired),
+    )
     n = N_GAUSSIANS
-    assert told == [(1, FiredEvent("half_size_views", n, n, 0.0, "until iteration 3"))]
+    assert told == [(1, FiredEvent("once", n, n, 0.0, "to 1/2 of their size until iteration 3"))]
 
 
 def test_rates_are_those_of_the_iteration_that_is_done(scene):

@@ -26,10 +26,12 @@ from minisplat_ref.strategy.ops import take
 from minisplat_ref.strategy.simplify import by_rank, merge_neighbours
 from minisplat_ref.training.adam import AdamRule, AdamState, adam_step, zero_moments
 from minisplat_ref.training.calibration import EXPOSURES, POSE, ROTATIONS, SHIFTS
-from minisplat_ref.training.loop import initial_state, load_state, save_state, train
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
 from minisplat_ref.training.losses import Cotangents, LossTerm, Rendered, photometric, total_loss
 from minisplat_ref.training.rates import LogLinear, Rates, Rewind
 from minisplat_ref.training.representation import Representation
+from minisplat_ref.training.saved_state import load_state, save_state
 from minisplat_ref.training.schedule import Every, configured, describe, parsed_settings, scaled, settings_of
 from minisplat_ref.training.state import Iteration, TrainState, start_anew
 from minisplat_ref.types import Floats, Gaussians, Model, Scene, View
@@ -481,7 +483,7 @@ def test_beginning_anew_keeps_what_is_shared(population, rng):
     shared = {"table": rng.normal(size=(2, 3))}
     moments = AdamState({"table": np.ones((2, 3))}, {"table": np.full((2, 3), 2.0)}, 7)
     state = TrainState(population, zero_moments(population), 9, [1], rng, {"x": np.ones(12)}, shared, moments)
-    iteration = Iteration(None, None, None, None, None, REFERENCE, None, representation=LABELLED)
+    iteration = Iteration(*[None] * 5, representation=LABELLED)
     start_anew(state, iteration, Gaussians(*take(population, np.arange(4))[:6])._replace())
     assert type(state.gaussians) is Labelled
     assert_array_equal(state.gaussians.weights, np.arange(4))

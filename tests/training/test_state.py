@@ -28,7 +28,7 @@ def state(rng):
 def make_iteration(v_means2d=None, visible_ids=(), *, background=0.0, extent=10.0):
     view = SimpleNamespace(camera=make_camera(40, 20))
     scene = SimpleNamespace(extent=extent, background=np.full(3, background), train_views=(view,))
-    return Iteration(scene, view, None, np.array(visible_ids, int), v_means2d, None, None)
+    return Iteration(scene, view, None, np.array(visible_ids, int), v_means2d)
 
 
 def test_gradients_are_collected_where_visible(state):

@@ -27,6 +27,7 @@ from minisplat_ref.extensions.compression.spz import SPZ
 from minisplat_ref.io.formats import Format
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.metrics import evaluate
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.reports.palette import BLUE, GREY, OCHRE, RED
 from minisplat_ref.studies import kit
@@ -79,7 +80,7 @@ def mean_psnr(
     gaussians: Gaussians, views: tuple[View, ...], background: Floats, conventions: Conventions = GSPLAT_MAIN
 ) -> float:
     """Return the mean PSNR over views, dB."""
-    psnr = evaluate(gaussians, views, background=background, conventions=conventions).psnr
+    psnr = evaluate(gaussians, views, RenderSettings(background, conventions=conventions)).psnr
     assert psnr is not None
     return psnr
 

@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from minisplat_ref.extensions.fans.method import FANS_OF_GAUSSIANS, FINE_TUNING
 from minisplat_ref.extensions.fans.shapes import Fans, FanShape, convert_gaussians
 from minisplat_ref.metrics import Evaluation, evaluate
-from minisplat_ref.rendering import Request
+from minisplat_ref.rendering import RenderSettings, Request
 from minisplat_ref.studies import kit
 from minisplat_ref.training.representation import GAUSSIANS
 from minisplat_ref.training.schedule import scaled
@@ -88,4 +88,4 @@ def alpha_of(population: Any, view: View, **request: Any) -> Floats:
 def measure(population: Any, scene: Scene, views: tuple[View, ...]) -> Evaluation:
     """Compare pictures of fans or Gaussians with photographs."""
     renderer = representation_of(population).renderer
-    return evaluate(Model(population), views, background=scene.background, renderer=renderer)
+    return evaluate(Model(population), views, RenderSettings(scene.background, renderer=renderer))

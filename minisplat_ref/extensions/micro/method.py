@@ -50,8 +50,9 @@ def collect_detail(state: TrainState, iteration: Iteration) -> None:
     ids = iteration.visible_ids
     g = take(state.gaussians, ids)
     opacities = 1 / (1 + np.exp(-g.opacity_logits))
-    projection = iteration.backend.project(
-        g.means, g.quats, np.exp(g.log_scales), opacities, iteration.view.camera, iteration.conventions
+    settings = iteration.render_settings
+    projection = settings.backend.project(
+        g.means, g.quats, np.exp(g.log_scales), opacities, iteration.view.camera, settings.conventions
     )
     state.stats["detail_sum"][ids] += box_means(detail_map(iteration.view.image), projection.boxes).astype(np.float32)
 

@@ -19,6 +19,7 @@ from minisplat_ref.extensions.mixed.method import MIXED_GAUSSIANS, promote, simp
 from minisplat_ref.extensions.mixed.population import MixedGaussians, counts
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.metrics import evaluate
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.reporting import describe_machine, markdown_table
 from minisplat_ref.reports.palette import BLUE, GREY, OCHRE, RED
 from minisplat_ref.strategy.initialization import initial_gaussians
@@ -68,7 +69,7 @@ def trained(recipe: Recipe, scene: Scene, iterations: int, n_seeds: int) -> dict
     for seed in range(n_seeds):
         state = kit.train_with_progress(scene, scaled(recipe, iterations), seed)
         renderer = recipe.representation.renderer
-        found = evaluate(state.model, scene.test_views, background=scene.background, renderer=renderer)
+        found = evaluate(state.model, scene.test_views, RenderSettings(scene.background, renderer=renderer))
         row["psnr"].append(found.psnr)
         row["ssim"].append(found.ssim)
     g = state.gaussians

@@ -66,7 +66,7 @@ def insert_levels(
     if n == 0:
         return "nothing done: there are no Gaussians"
     densities = finest_densities(state.gaussians.means, [view.camera for view in iteration.scene.train_views])
-    gaussians: Any = with_levels(state.gaussians, densities, plan, iteration.conventions)
+    gaussians: Any = with_levels(state.gaussians, densities, plan, iteration.render_settings.conventions)
     is_new = np.arange(n_rows(gaussians)) >= n
     apply_edit(state, Edit(gaussians, np.where(is_new, NO_PARENT, np.arange(len(is_new))), is_new))
     return None

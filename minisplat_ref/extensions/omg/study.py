@@ -21,6 +21,7 @@ from minisplat_ref.extensions.omg.method import POWER
 from minisplat_ref.extensions.omg.reference import distinct_importance, local_distinctiveness
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.metrics import ViewMetrics, evaluate, psnr
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.reports.palette import BLUE, GREY, OCHRE, RED
 from minisplat_ref.strategy.importance import collect_importance, indoor
@@ -120,7 +121,7 @@ def quality(gaussians: Gaussians, scene: Scene) -> Quality:
         clipped = np.clip(image, 0, 1)
         found.append((metrics.psnr, psnr(clipped, pixels, is_flat), psnr(clipped, pixels, ~is_flat)))
 
-    evaluate(gaussians, scene.test_views, background=scene.background, on_view=on_view)
+    evaluate(gaussians, scene.test_views, RenderSettings(scene.background), on_view=on_view)
     return Quality(*np.mean(found, axis=0).tolist())
 
 

@@ -6,6 +6,7 @@ from typing import Any
 from minisplat_ref.extensions.textured.method import FINE_TUNING, TEXTURED_GAUSSIANS
 from minisplat_ref.extensions.textured.population import TexturedGaussians, with_textures
 from minisplat_ref.metrics import Evaluation, evaluate
+from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.studies import kit
 from minisplat_ref.training.representation import GAUSSIANS, Representation
 from minisplat_ref.training.schedule import scaled
@@ -36,4 +37,4 @@ def fine_tune(
 def measure(population: Any, scene: Scene, views: tuple[View, ...]) -> Evaluation:
     """Compare pictures of a population with photographs."""
     renderer = representation_of(population).renderer
-    return evaluate(Model(population), views, background=scene.background, renderer=renderer)
+    return evaluate(Model(population), views, RenderSettings(scene.background, renderer=renderer))

@@ -17,10 +17,11 @@ from minisplat_ref.backends import CPU, REFERENCE
 from minisplat_ref.extensions.velocity.method import MOVING, VELOCITY, MovingGaussians
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.metrics import evaluate
-from minisplat_ref.rendering import Request
+from minisplat_ref.rendering import RenderSettings, Request
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.studies import kit
-from minisplat_ref.training.loop import initial_state, train
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import Recipe, scaled
 from minisplat_ref.types import Camera, Gaussians, Model, Scene, View, numbered, view_from
 
@@ -98,7 +99,7 @@ def outcome(recipe: Recipe, truth: MovingGaussians, seed: int) -> Outcome:
     state.gaussians = recipe.representation.extend(still, state.rng)
     train(scene, recipe, seed=seed, state=state, backend=CPU)
     evaluation = evaluate(
-        state.model, scene.test_views, background=scene.background, renderer=recipe.renderer, backend=CPU
+        state.model, scene.test_views, RenderSettings(scene.background, renderer=recipe.renderer, backend=CPU)
     )
     found = getattr(state.gaussians, "velocities", np.zeros_like(truth.velocities))
     assert evaluation.psnr is not None

@@ -7,22 +7,23 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from minisplat_ref.backends import CPU
 from minisplat_ref.cli import main
-from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.checkpoint import DamagedCheckpoint, load_checkpoint, save_checkpoint
 from minisplat_ref.methods import get_recipe
-from minisplat_ref.methods.adaptive import ADAPTIVE, grow, proceed_when_little_is_gained
-from minisplat_ref.methods.adaptive_prune import N_SLICES, prune_in_slices, slice_due
+from minisplat_ref.methods.adaptive.growth import grow
+from minisplat_ref.methods.adaptive.progress import proceed_when_little_is_gained
+from minisplat_ref.methods.adaptive.prune import N_SLICES, prune_in_slices, slice_due
+from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.methods.mini_splatting import measure_importance
-from minisplat_ref.rendering import SPLATTING
+from minisplat_ref.rendering import SPLATTING, RenderSettings
 from minisplat_ref.strategy.error_weights import collect_error_weights
 from minisplat_ref.strategy.halving import halves
 from minisplat_ref.strategy.removal import collect_removal_costs
-from minisplat_ref.training.loop import initial_state, load_state, save_state, train
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import (
     Cooling,
     Measurement,
@@ -32,6 +33,7 @@ from minisplat_ref.training.pace import (
     to_metadata,
     trained_ids,
 )
+from minisplat_ref.training.saved_state import load_state, save_state
 from minisplat_ref.training.schedule import configured
 from minisplat_ref.training.state import Iteration
 
@@ -114,7 +116,7 @@ def measured(psnrs_of_steps, **changes):
 
 
 def iteration(step):
-    return Iteration(*[None] * 7, step=step, iterations=30_000, cooling=COOLING)
+    return Iteration(*[None] * 5, step=step, iterations=30_000, cooling=COOLING)
 
 
 def decide(state, step):
@@ -155,9 +157,11 @@ def test_those_behind_most_error_are_halved_and_not_too_many(scene):
     """Of three above the threshold two: those of largest error, or of largest gradient, which are others."""
     state = initial_state(scene, ADAPTIVE, 0)
     before, n = state.gaussians, len(state.gaussians.means)
-    here = Iteration(scene, scene.train_views[0], None, np.zeros(0, int), None, CPU, GSPLAT_MAIN, cooling=COOLING)
+    here = Iteration(
+        scene, scene.train_views[0], None, np.zeros(0, int), None, RenderSettings(scene.background), cooling=COOLING
+    )
     trained = [scene.train_views[k] for k in trained_ids(len(scene.train_views), COOLING, state.pace)]
-    errors = collect_error_weights(before, trained, background=scene.background)
+    errors = collect_error_weights(before, trained, RenderSettings(scene.background))
     above = np.argsort(errors)[-3:]
     means, views = np.zeros(n, np.float32), np.full(n, 2, np.int32)
     means[above] = (3e-3, 2e-3, 1e-3)
@@ -207,7 +211,7 @@ def cooling(scene):
     centres = np.array([view.camera.center for view in scene.train_views])
     state.gaussians.means[0] = 100 * (centres.mean(axis=0) - scene.points.mean(axis=0))
     state.pace = Pace(cooling_from=10, last_step=110)
-    return state, Iteration(scene, scene.train_views[0], None, np.zeros(0, int), None, CPU, GSPLAT_MAIN)
+    return state, Iteration(scene, scene.train_views[0], None, np.zeros(0, int), None, RenderSettings(scene.background))
 
 
 def test_what_few_views_see_goes_when_the_rates_begin_to_fall(cooling):
@@ -226,7 +230,7 @@ def test_what_few_views_see_goes_when_the_rates_begin_to_fall(cooling):
 def test_what_the_photographs_would_hardly_miss_goes_in_slices(cooling):
     state, here = cooling
     before, settings = state.gaussians, PRUNING | {"min_views": 0}
-    keep_out = collect_removal_costs(state.model, here.scene.train_views, background=here.scene.background)
+    keep_out = collect_removal_costs(state.model, here.scene.train_views, RenderSettings(here.scene.background))
     prune_in_slices(state, here._replace(step=31), **settings | {"min_slope": 1e9})
     assert_array_equal(state.gaussians.means, before.means[np.sort(np.argsort(keep_out.changes, kind="stable")[40:])])
     assert "40 of 200 Gaussians change the training views by" in state.pace.decisions[-1].why
@@ -241,7 +245,8 @@ def test_a_renderer_that_does_not_say_is_not_pruned_by_it(cooling):
         return SPLATTING.render(model, view, request._replace(wants=request.wants & {"stats"}))
 
     said = []
-    silent = here._replace(renderer=SPLATTING._replace(name="silent", render=render), say=said.append)
+    settings = here.render_settings._replace(renderer=SPLATTING._replace(name="silent", render=render))
+    silent = here._replace(render_settings=settings, say=said.append)
     prune_in_slices(state, silent._replace(step=11), **PRUNING)
     prune_in_slices(state, silent._replace(step=31), **PRUNING)
     assert len(said) == 1 and "renderer silent does not say" in said[0]

@@ -7,12 +7,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 from adaptive_states import iteration_of, state_of
 from minisplat_ref.backends import CPU
 from minisplat_ref.io.checkpoint import DamagedCheckpoint, load_checkpoint, save_checkpoint
-from minisplat_ref.methods.adaptive import ADAPTIVE
-from minisplat_ref.methods.adaptive_exposure import hold_mean_exposure, log_gains, switch_exposure_on
+from minisplat_ref.methods.adaptive.exposure import hold_mean_exposure, log_gains
+from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
+from minisplat_ref.methods.adaptive.switches import switch_exposure_on
 from minisplat_ref.rendering import render
 from minisplat_ref.training.calibration import EXPOSURES
-from minisplat_ref.training.loop import load_state, save_state, train
+from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import Pace, held_out_ids, trained_ids
+from minisplat_ref.training.saved_state import load_state, save_state
 from minisplat_ref.training.schedule import At, Every, configured
 from minisplat_ref.types import Scene, View
 from scenes import as_dtype, make_camera, make_gaussians

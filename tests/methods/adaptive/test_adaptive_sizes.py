@@ -9,12 +9,14 @@ from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.errors import InputError
-from minisplat_ref.methods.adaptive import ADAPTIVE, halve_large_views
+from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.runs.decisions_report import decisions_section, story
-from minisplat_ref.training.loop import initial_state, load_state, save_state, train
-from minisplat_ref.training.pace import COOLED, FINER, Decision, Measurement, Pace, from_metadata, to_metadata
+from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.loop import train
+from minisplat_ref.training.pace import COOLED, FINER, Decision, Measurement, Pace
+from minisplat_ref.training.saved_state import load_state, save_state
 from minisplat_ref.training.schedule import configured
-from minisplat_ref.training.state import Iteration
+from minisplat_ref.training.smaller_views import halve_large_views
 
 OPTIONS = {"n_views": 12, "width": 48, "height": 36, "n_points": 200, "test_every": 6}
 TWICE = configured(ADAPTIVE._replace(iterations=3000), min_gain=1e9, min_step=300, min_side=18)
@@ -48,11 +50,9 @@ def trained(scene):
 def test_no_side_of_any_view_becomes_shorter(scene, width, height, min_side, times):
     first, *_ = scene.train_views
     large, small = (first._replace(camera=first.camera._replace(width=k * width, height=k * height)) for k in (3, 1))
-    state = initial_state(scene, ADAPTIVE, 0)
-    note = halve_large_views(
-        state, Iteration(scene._replace(train_views=(large, small)), *[None] * 6), min_side=min_side
-    )
-    assert state.pace.n_halvings == times and ("nothing done" in note) == (times == 0)
+    scene = scene._replace(train_views=(large, small))
+    assert halve_large_views(scene, min_side=min_side) == times
+    assert halve_large_views(scene, min_side=min_side, max_halvings=1) == min(times, 1)
 
 
 @pytest.mark.parametrize("min_side", [0, -5, 15.9, float("nan")])
@@ -67,7 +67,7 @@ def test_views_grow_before_the_rates_fall(trained):
     finer, cooled = state.pace.decisions[:2]
     assert (finer.what, cooled.what) == (FINER, COOLED) and state.pace.cooling_from == cooled.step
     assert sizes[0] == WHOLE and set(sizes[1 : finer.step]) == {SMALL} and set(sizes[finer.step :]) == {WHOLE}
-    assert len(sizes) == state.step == state.pace.last_step and state.pace.n_halvings == 0
+    assert len(sizes) == state.step == state.pace.last_step and state.pace.n_finer == 1
 
 
 def test_each_size_is_judged_by_its_own_measurements(trained):
@@ -94,7 +94,7 @@ def test_continued_byte_for_byte(scene, trained, tmp_path, at):
         train(scene, TWICE, seed=0, state=state, on_step=stop)
     save_state(tmp_path / "state.npz", state, TWICE)
     state = load_state(tmp_path / "state.npz", TWICE)
-    assert state.pace.n_halvings == (at == 150)
+    assert state.pace.n_finer == (at == 1000)
     train(scene, TWICE, seed=0, state=state)
     assert state.pace == straight.pace
     for field, other in zip(state.gaussians, straight.gaussians, strict=True):
@@ -108,12 +108,6 @@ def test_the_limit_leaves_small_views_behind(scene):
     assert state.pace.cooling_from == 100 and set(sizes[1:100]) == {SMALL} and set(sizes[100:]) == {WHOLE}
 
 
-@pytest.mark.parametrize("n_halvings", [-1, 17, "many", None])
-def test_a_damaged_size_is_refused(n_halvings):
-    with pytest.raises((ValueError, TypeError)):
-        from_metadata({**to_metadata(Pace()), "n_halvings": n_halvings})
-
-
 def test_from_the_command_line_in_time(tmp_path, capsys):
     folder, run = tmp_path / "nook", tmp_path / "run"
     write_scene(make_scene("room", supersampling=1, **OPTIONS), folder, OPTIONS)
@@ -122,7 +116,7 @@ def test_from_the_command_line_in_time(tmp_path, capsys):
     decisions = json.loads((run / "decisions.json").read_text())
     finer, cooled = decisions["decisions"][:2]
     assert (finer["what"], cooled["what"]) == (FINER, COOLED) and "0.1 minutes" in finer["why"]
-    assert 0 < finer["step"] < cooled["step"] and decisions["n_halvings"] == 0
+    assert 0 < finer["step"] < cooled["step"]
     events = [json.loads(line) for line in (run / "events.jsonl").read_text().splitlines()]
     (halved,) = [event for event in events if event["action"] == "halve_large_views"]
     assert halved["note"] == "to 1/2 of their size"

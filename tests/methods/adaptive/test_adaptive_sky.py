@@ -6,8 +6,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from adaptive_states import iteration_of, state_of
 from minisplat_ref.backends import CPU
-from minisplat_ref.methods.adaptive import ADAPTIVE, SKY_GAIN_MIN
-from minisplat_ref.methods.adaptive_sky import (
+from minisplat_ref.methods.adaptive.numbers import SKY_GAIN_MIN
+from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
+from minisplat_ref.methods.adaptive.sky import (
     HUGE,
     LARGE,
     Behind,
@@ -15,12 +16,13 @@ from minisplat_ref.methods.adaptive_sky import (
     compare,
     fitted_sky,
     open_pixels,
-    switch_sky_on,
 )
+from minisplat_ref.methods.adaptive.switches import switch_sky_on
 from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.strategy.ops import concat
-from minisplat_ref.training.loop import load_state, save_state, train
+from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import Pace
+from minisplat_ref.training.saved_state import load_state, save_state
 from minisplat_ref.training.schedule import At
 from minisplat_ref.training.sky import SKY, with_sky
 from minisplat_ref.types import Model, Scene, View, view_from

@@ -31,22 +31,14 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import SH_DEGREE_MAX
-from minisplat_ref.methods.adaptive_evidence import Evidence, plain_request, switch_on
+from minisplat_ref.methods.adaptive.evidence import Answer, Evidence
+from minisplat_ref.methods.adaptive.numbers import HUGE, LARGE, OPEN, OPEN_MIN, SKY_RIDGE, SKY_VIEWS_MAX, SKY_VIEWS_MIN
 from minisplat_ref.reference.spherical_harmonics import sh_basis
 from minisplat_ref.strategy.ops import keep
-from minisplat_ref.training.calibration import BACKDROP
-from minisplat_ref.training.pace import Decision, trained_ids
+from minisplat_ref.training.pace import trained_ids
 from minisplat_ref.training.sky import N_BASIS, SKY, unit_rays
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
 from minisplat_ref.types import Bools, Floats, Ints
-
-LARGE, HUGE = 0.25, 1.0  # of the scene's extent: standard deviation along the longest axis, to question and to remove
-RIDGE = 1e-3  # of the mean diagonal entry of the normal matrix: directions that no photograph shows get no large colour
-N_ERRORS = 3.0  # standard errors that the gain must exceed
-VIEWS_MAX = 24  # photographs that are looked at, evenly spread
-VIEWS_MIN = 4  # of them that show something behind the scene: two to fit, two to judge
-OPEN = 0.5  # transmittance above which a pixel shows what is behind the scene
-OPEN_MIN = 0.005  # of a photograph's pixels: fewer say nothing
 
 
 class Behind(NamedTuple):
@@ -84,7 +76,7 @@ def fitted_sky(photographs: Sequence[Behind]) -> Floats:
     """Return the coefficients [16, 3] that explain photographs best, drawn a little towards zero."""
     normal = np.sum([photograph.normal for photograph in photographs], axis=0)
     projected = np.sum([photograph.projected for photograph in photographs], axis=0)
-    ridge = max(RIDGE * np.trace(normal) / N_BASIS, np.finfo(float).tiny)
+    ridge = max(SKY_RIDGE * np.trace(normal) / N_BASIS, np.finfo(float).tiny)
     return np.linalg.solve(normal + ridge * np.eye(N_BASIS), projected)
 
 
@@ -122,11 +114,11 @@ def open_pixels(state: TrainState, iteration: Iteration, view_ids: Sequence[int]
 
     Views with too few such pixels are left out.
     """
-    request = plain_request(iteration)._replace(is_visible=is_drawn)
+    request = iteration.render_settings.request()._replace(is_visible=is_drawn)
     pixels = {}
     for index, counted in counted_pixels(iteration, view_ids).items():
         view = iteration.scene.train_views[index].load()
-        alpha = iteration.renderer.render(state.model, view, request)[0].alpha.ravel()
+        alpha = iteration.render_settings.renderer.render(state.model, view, request)[0].alpha.ravel()
         is_open = 1.0 - alpha[counted] > OPEN
         if np.count_nonzero(is_open) > OPEN_MIN * alpha.size:
             pixels[index] = counted[is_open]
@@ -137,11 +129,11 @@ def photographs_behind(
     state: TrainState, iteration: Iteration, pixels: Mapping[int, Ints], is_drawn: Bools | None
 ) -> list[Behind]:
     """Return the sums of training views over pixels, rendered with the Gaussians ``is_drawn`` [N]; None for all."""
-    request = plain_request(iteration)._replace(is_visible=is_drawn)
+    request = iteration.render_settings.request()._replace(is_visible=is_drawn)
     photographs = []
     for index, counted in pixels.items():
         view = iteration.scene.train_views[index].load()
-        output = iteration.renderer.render(state.model, view, request)[0]
+        output = iteration.render_settings.renderer.render(state.model, view, request)[0]
         residual = view.image / 255.0 - np.clip(output.image, 0.0, 1.0)
         rays = unit_rays(view.camera, counted, np.dtype(float)) @ view.camera.cam_from_world_R
         transmittance = 1.0 - output.alpha.ravel()[counted].astype(float)
@@ -150,34 +142,26 @@ def photographs_behind(
     return photographs
 
 
-def switch_sky_on(state: TrainState, iteration: Iteration, *, min_sky_gain: float) -> str | None:
-    """Put a sky in place of the largest Gaussians if photographs explain each other better by it.
+def ask_about_a_sky(state: TrainState, iteration: Iteration) -> Answer | str:
+    """Return whether photographs explain each other better by a sky in place of the large Gaussians.
 
-    Parameters
-    ----------
-    state, iteration
-        As for every action.
-    min_sky_gain : float
-        dB of the squared error that the photographs must gain on average behind the scene, and more than three standard
-        errors.
+    It begins with the fit to all pixels, and the largest of these Gaussians go.
     """
-    if BACKDROP.name in state.pace.switched_on or SKY in state.shared:
-        return "nothing done: there is a sky"
     large, huge = (is_larger(state, iteration, than) for than in (LARGE, HUGE))
     n = int(np.count_nonzero(large))
     if n == 0:
-        return "nothing done: no Gaussian is large"
+        return "no Gaussian is large"
     ids = trained_ids(len(iteration.scene.train_views), iteration.cooling, state.pace)
-    ids = ids[:: -(-len(ids) // VIEWS_MAX)]
+    ids = ids[:: -(-len(ids) // SKY_VIEWS_MAX)]
     pixels = open_pixels(state, iteration, ids, ~large)
-    if len(pixels) < VIEWS_MIN:
-        return f"nothing done: {len(pixels)} photographs show what is behind the scene without {n:,} large Gaussians"
-    evidence = compare(*(photographs_behind(state, iteration, pixels, drawn) for drawn in (None, ~large)))
+    if len(pixels) < SKY_VIEWS_MIN:
+        return f"{len(pixels)} photographs show what is behind the scene without {n:,} large Gaussians"
+    evidence = compare(*(photographs_behind(state, iteration, pixels, rows) for rows in (None, ~large)))
     why = f"a sky in place of {n:,} Gaussians explains {evidence.gain:.2f} dB more of what others show there"
-    if not evidence.is_above(min_sky_gain, N_ERRORS):
-        return f"nothing done: {why}"
-    sky = fitted_sky(photographs_behind(state, iteration, counted_pixels(iteration, ids), ~huge)).astype(np.float32)
-    apply_edit(state, keep(state.gaussians, ~huge))
-    decision = Decision(iteration.step, "sky", why, evidence.gain, evidence.standard_error)
-    switch_on(state, BACKDROP, {SKY: sky}, decision)
-    return why
+
+    def begin() -> dict[str, Floats]:
+        sky = fitted_sky(photographs_behind(state, iteration, counted_pixels(iteration, ids), ~huge))
+        apply_edit(state, keep(state.gaussians, ~huge))
+        return {SKY: sky.astype(np.float32)}
+
+    return Answer(evidence, why, begin)

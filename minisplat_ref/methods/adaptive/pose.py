@@ -5,7 +5,7 @@ A camera that is turned by a small rotation w = (w_x, w_y, 0), in its own frame,
     du = f_x w_y,   dv = -f_y w_x        pixels, near the middle of the image
 
 Where the displacement of one half of a photograph explains the other half
-(:mod:`minisplat_ref.methods.adaptive_evidence`) its pose is off. All photographs then get corrections of their poses
+(:mod:`minisplat_ref.methods.adaptive.evidence`) its pose is off. All photographs then get corrections of their poses
 (:mod:`minisplat_ref.training.calibration`), which begin with the rotations that correspond to these displacements.
 Held-out photographs are not trained on: before each measurement they are rotated by their displacements alone.
 
@@ -15,9 +15,9 @@ from elsewhere; so the mean rotation and the mean shift, in the world frame, are
 
 import numpy as np
 
-from minisplat_ref.methods.adaptive_evidence import displacements, pose_evidence, switch_on
-from minisplat_ref.training.calibration import POSE, ROTATIONS, SHIFTS, zero_corrections
-from minisplat_ref.training.pace import Decision, held_out_ids, trained_ids
+from minisplat_ref.methods.adaptive.evidence import Answer, displacements, pose_evidence
+from minisplat_ref.training.calibration import ROTATIONS, SHIFTS, zero_corrections
+from minisplat_ref.training.pace import held_out_ids, trained_ids
 from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Camera, Floats
 
@@ -28,30 +28,20 @@ def rotation_of(camera: Camera, displacement: Floats) -> Floats:
     return np.array([-dv / camera.fy, du / camera.fx, 0.0])
 
 
-def switch_pose_on(state: TrainState, iteration: Iteration, *, min_pose_gain: float) -> str | None:
-    """Refine the poses if halves of photographs explain each other by displacements.
-
-    Parameters
-    ----------
-    state, iteration
-        As for every action.
-    min_pose_gain : float
-        dB of the squared error that the photographs must gain on average, and more than the standard error.
-    """
-    if POSE.name in state.pace.switched_on or ROTATIONS in state.shared:
-        return "nothing done: poses are refined"
+def ask_about_poses(state: TrainState, iteration: Iteration) -> Answer:
+    """Return whether halves of photographs explain each other by displacements; poses begin with these."""
     views = iteration.scene.train_views
     ids = trained_ids(len(views), iteration.cooling, state.pace)
     evidence = pose_evidence(state, iteration, ids)
     why = f"displacements of {evidence.spread:.2f} pixels explain {evidence.gain:.2f} dB of the other halves"
-    if not evidence.is_above(min_pose_gain):
-        return f"nothing done: {why}"
-    corrections = zero_corrections(len(views))
-    for index, x in zip(ids, evidence.fitted, strict=True):
-        corrections[ROTATIONS][index] = rotation_of(views[index].camera, -x)
-    decision = Decision(iteration.step, "poses", why, evidence.gain, evidence.standard_error)
-    switch_on(state, POSE, corrections, decision)
-    return why
+
+    def begin() -> dict[str, Floats]:
+        corrections = zero_corrections(len(views))
+        for index, x in zip(ids, evidence.fitted, strict=True):
+            corrections[ROTATIONS][index] = rotation_of(views[index].camera, -x)
+        return corrections
+
+    return Answer(evidence, why, begin)
 
 
 def turn_held_out(state: TrainState, iteration: Iteration) -> str | None:

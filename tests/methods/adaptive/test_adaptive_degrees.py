@@ -8,24 +8,25 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from adaptive_states import iteration_of, state_of
 from minisplat_ref.backends import CPU
-from minisplat_ref.constants import GSPLAT_MAIN, SH_C0, SH_C1
+from minisplat_ref.constants import SH_C0, SH_C1
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.checkpoint import DamagedCheckpoint, load_checkpoint, save_checkpoint
 from minisplat_ref.io.ply import load_ply, save_ply
-from minisplat_ref.methods.adaptive import ADAPTIVE
-from minisplat_ref.methods.adaptive_bands import (
+from minisplat_ref.methods.adaptive.degrees import (
     SEEN,
-    cut_bands_when_cooling,
-    grow_bands,
+    cut_degrees_when_cooling,
     highest_degree,
-    without_idle_bands,
+    raise_degrees,
+    without_idle_degrees,
 )
+from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.reference.spherical_harmonics import sh_colors
-from minisplat_ref.rendering import render
+from minisplat_ref.rendering import RenderSettings, render
 from minisplat_ref.runs.simplification import fine_tuned
-from minisplat_ref.training.loop import load_state, save_state, train
+from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import Pace, held_out_ids
 from minisplat_ref.training.rates import present_degrees
+from minisplat_ref.training.saved_state import load_state, save_state
 from minisplat_ref.training.schedule import configured
 from minisplat_ref.training.state import DEGREES
 from minisplat_ref.types import Camera, Gaussians, Scene, View, view_from
@@ -56,7 +57,7 @@ def test_a_view_counts_once_and_only_where_it_shows_something(matt):
     v[0] = 0
     for view in (*scene.train_views[:3], scene.train_views[1]):
         here = iteration_of(scene)._replace(view=view, visible_ids=np.array([0, 1, 2]), v_means2d=v)
-        grow_bands(state, here, views_per_coefficient=0.75)
+        raise_degrees(state, here, views_per_coefficient=0.75)
     assert state.stats[SEEN].sum(axis=1)[:4].tolist() == [0, 3, 3, 0]
     assert state.stats[DEGREES][:4].tolist() == [0, 1, 1, 0]
 
@@ -81,7 +82,7 @@ def gray(**rest):
 
 def cut(gaussians, degree, least, views):
     is_seen = np.ones((1, len(views)), bool)
-    return without_idle_bands(gaussians, np.array([degree], np.uint8), views, is_seen, least)
+    return without_idle_degrees(gaussians, np.array([degree], np.uint8), views, is_seen, least)
 
 
 def test_variation_by_hand():
@@ -117,7 +118,7 @@ def test_only_seen_directions_count():
     """From one side alone there is nothing that varies."""
     views, g = around(12, 1.0), gray(k2=1.0)
     is_seen = np.arange(12)[None] == 3
-    _, degrees = without_idle_bands(g, np.array([1], np.uint8), views, is_seen, 1e-6)
+    _, degrees = without_idle_degrees(g, np.array([1], np.uint8), views, is_seen, 1e-6)
     assert degrees.tolist() == [0]
 
 
@@ -129,9 +130,9 @@ def test_it_is_cut_once_and_moments_go_too(matt):
     state.adam.first.sh_rest[:], state.adam.second.sh_rest[:] = 1, 1
     state.pace = Pace(cooling_from=10, last_step=20)
     for step in (10, 12):
-        cut_bands_when_cooling(state, iteration_of(scene, step), min_variation=0.01)
+        cut_degrees_when_cooling(state, iteration_of(scene, step), min_variation=0.01)
         assert (state.stats[DEGREES] == 2).all() and SEEN in state.stats
-    cut_bands_when_cooling(state, iteration_of(scene, 11), min_variation=0.01)
+    cut_degrees_when_cooling(state, iteration_of(scene, 11), min_variation=0.01)
     assert not state.stats[DEGREES].any() and not state.gaussians.sh_rest.any() and SEEN not in state.stats
     assert not state.adam.first.sh_rest.any() and not state.adam.second.sh_rest.any()
     (decision,) = state.pace.decisions
@@ -206,8 +207,7 @@ def test_fine_tuning_leaves_absent_bands_absent(matt, trained):
         recipe=SHORT,
         settings=SimpleNamespace(seed=0),
         scene=scene,
-        backend=CPU,
-        conventions=GSPLAT_MAIN,
+        render_settings=RenderSettings(),
     )
     rows = np.arange(len(degrees))
     tuned = fine_tuned(run, rows, 5, holds_out=False, on_step=lambda: None).gaussians.sh_rest

@@ -19,20 +19,15 @@ It is in decibels of the squared error. It supports the calibration if its mean 
 least gain and its standard error. One suffices: gains differ much between photographs, and there are few of these.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from minisplat_ref.methods.adaptive.numbers import BRIGHT, DARK, N_ERRORS, RIDGE
 from minisplat_ref.rendering import Request
-from minisplat_ref.training.adam import zero_moments
-from minisplat_ref.training.calibration import Calibration
-from minisplat_ref.training.pace import Decision
 from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Bools, Floats, View
-
-RIDGE = 1e-3  # of the mean square of a field over the halves: where next to nothing is drawn, x would be arbitrary
-DARK, BRIGHT = 0.05, 0.98  # brightness, out of 1, beyond which pixels say nothing about a gain: noise, saturation
 
 
 class Half(NamedTuple):
@@ -69,9 +64,19 @@ class Evidence(NamedTuple):
         """Root mean square of x over photographs and fields."""
         return float(np.sqrt(np.mean(self.fitted**2)))
 
-    def is_above(self, min_gain: float, n_errors: float = 1.0) -> bool:
+    def is_above(self, min_gain: float, n_errors: float = N_ERRORS) -> bool:
         """Return whether it supports the calibration: by ``min_gain``, dB, and by so many standard errors."""
         return self.gain > max(min_gain, n_errors * self.standard_error)
+
+
+class Answer(NamedTuple):
+    """What the photographs answer when they are asked whether they need a calibration."""
+
+    evidence: Evidence
+    why: str
+    """The evidence in words."""
+    begin: Callable[[], dict[str, Floats]]
+    """Returns the initial parameters of the calibration, and changes the model as far as it has to make way for it."""
 
 
 def halves_of(residual: Floats, fields: Floats, is_counted: Bools) -> tuple[Half, Half]:
@@ -132,22 +137,17 @@ class Pair(NamedTuple):
 
 def pairs(state: TrainState, iteration: Iteration, view_ids: Sequence[int]) -> Iterator[Pair]:
     """Iterate over training views beside what the scene shows of them."""
-    request = plain_request(iteration)
+    request = iteration.render_settings.request()
     for index in view_ids:
         view = iteration.scene.train_views[index].load()
-        rendered = drawn(state, iteration, view, request)
+        rendered = render_clipped(state, iteration, view, request)
         is_counted: Bools = np.ones(rendered.shape[:2], bool) if view.mask is None else view.mask
         yield Pair(view, view.image / np.float32(255.0), rendered, is_counted)
 
 
-def plain_request(iteration: Iteration) -> Request:
-    """Return a request for colours, in the conventions of the training."""
-    return Request(iteration.scene.background, conventions=iteration.conventions, backend=iteration.backend)
-
-
-def drawn(state: TrainState, iteration: Iteration, view: View, request: Request) -> Floats:
+def render_clipped(state: TrainState, iteration: Iteration, view: View, request: Request) -> Floats:
     """Return the scene as it is, [H, W, 3] in [0, 1]."""
-    return np.clip(iteration.renderer.render(state.model, view, request)[0].image, 0.0, 1.0)
+    return np.clip(iteration.render_settings.renderer.render(state.model, view, request)[0].image, 0.0, 1.0)
 
 
 def exposure_evidence(state: TrainState, iteration: Iteration, view_ids: Sequence[int]) -> Evidence:
@@ -176,24 +176,3 @@ def _halves_beside_slopes(
     for _, photograph, rendered, is_counted in pairs(state, iteration, view_ids):
         slopes = np.stack([np.gradient(rendered, axis=1), np.gradient(rendered, axis=0)])  # [2, H, W, 3] along u, v
         yield halves_of(photograph - rendered, slopes, is_counted)
-
-
-def switch_on(state: TrainState, calibration: Calibration, parameters: dict[str, Floats], decision: Decision) -> None:
-    """Continue the training with a calibration.
-
-    Parameters
-    ----------
-    state : TrainState
-    calibration : Calibration
-    parameters : dict
-        Its initial shared parameters.
-    decision : Decision
-        Its evidence.
-    """
-    zeros = zero_moments(parameters)
-    state.shared = {**state.shared, **parameters}
-    state.shared_adam = state.shared_adam._replace(
-        first={**state.shared_adam.first, **zeros.first}, second={**state.shared_adam.second, **zeros.second}
-    )
-    pace = state.pace.decided(decision)
-    state.pace = pace._replace(switched_on=(*pace.switched_on, calibration.name))

@@ -16,7 +16,7 @@ directions from which the Gaussian has been seen is removed, from the highest do
 and the mean, which does not depend on the view, goes to the coefficient of degree 0: ``k_00 += mean c_l / Y_00``. What
 hardly shows in photographs is not worth its numbers.
 
-Absent bands are zeros in ``sh_rest``, which every viewer of PLY files understands; neither colours nor Adam compute
+Absent degrees are zeros in ``sh_rest``, which every viewer of PLY files understands; neither colours nor Adam compute
 with them (``stats["sh_degree"]`` is the degree of each Gaussian).
 """
 
@@ -62,7 +62,7 @@ def highest_degree(n_views: Ints, views_per_coefficient: float, most: int = SH_D
     return np.searchsorted(least, n_views, side="right").astype(np.uint8)
 
 
-def grow_bands(state: TrainState, iteration: Iteration, *, views_per_coefficient: float) -> None:
+def raise_degrees(state: TrainState, iteration: Iteration, *, views_per_coefficient: float) -> None:
     """Note which Gaussians the view has shown, and raise the degrees of those that enough views have.
 
     Parameters
@@ -86,7 +86,7 @@ def grow_bands(state: TrainState, iteration: Iteration, *, views_per_coefficient
     state.stats[DEGREES][ids] = np.maximum(state.stats[DEGREES][ids], determined)
 
 
-def cut_bands_when_cooling(state: TrainState, iteration: Iteration, *, min_variation: float) -> None:
+def cut_degrees_when_cooling(state: TrainState, iteration: Iteration, *, min_variation: float) -> None:
     """Remove the degrees that vary too little over the seen directions, in the first iteration of the cool-down.
 
     Parameters
@@ -99,7 +99,7 @@ def cut_bands_when_cooling(state: TrainState, iteration: Iteration, *, min_varia
     if state.pace.cooling_from is None or iteration.step != state.pace.cooling_from + 1:
         return
     degrees, is_seen = state.stats[DEGREES], state.stats.pop(SEEN)
-    state.gaussians, state.stats[DEGREES] = without_idle_bands(
+    state.gaussians, state.stats[DEGREES] = without_idle_degrees(
         state.gaussians, degrees, iteration.scene.train_views, is_seen, min_variation
     )
     is_absent = np.arange(state.gaussians.sh_rest.shape[1]) >= n_coefficients(state.stats[DEGREES])[:, None]
@@ -117,7 +117,7 @@ def describe_degrees(state: TrainState) -> str:
     return f"{each} of the Gaussians have degree 0, 1, 2, 3: {mean:.1f} numbers for a colour, not 48"
 
 
-def without_idle_bands(
+def without_idle_degrees(
     gaussians: Gaussians, degrees: Ints, views: tuple[View, ...], is_seen: Bools, min_variation: float
 ) -> tuple[Gaussians, Ints]:
     """Remove the highest degrees of each Gaussian while they vary by less than ``min_variation``.
@@ -165,9 +165,9 @@ def _variations(gaussians: Gaussians, most: int, views: tuple[View, ...], is_see
         offsets = (gaussians.means[rows] - view.camera.center).astype(np.float64)
         basis = sh_basis(offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-300), most)
         for degree in range(1, most + 1):
-            band = slice(degree**2, (degree + 1) ** 2)
+            own = slice(degree**2, (degree + 1) ** 2)
             rest = gaussians.sh_rest[rows, degree**2 - 1 : (degree + 1) ** 2 - 1]
-            colors = np.einsum("nk,nkc->nc", basis[:, band], rest)  # the band's part
+            colors = np.einsum("nk,nkc->nc", basis[:, own], rest)  # the degree's part
             sums[degree - 1, rows] += colors
             squares[degree - 1, rows] += (colors**2).mean(axis=1)
     count = np.maximum(is_seen.sum(axis=1), 1)

@@ -1,8 +1,8 @@
 """Exposure of each photograph, which ``adaptive`` switches on where the photographs show that they need it.
 
 After a few hundred iterations the scene is a blur of the right brightness. If the gain of one half of a photograph
-explains the other half (:mod:`minisplat_ref.methods.adaptive_evidence`), the camera has changed its exposure, unless
-compensated opacities explain more (:mod:`minisplat_ref.methods.adaptive_antialiasing`), which change the brightness of
+explains the other half (:mod:`minisplat_ref.methods.adaptive.evidence`), the camera has changed its exposure, unless
+compensated opacities explain more (:mod:`minisplat_ref.methods.adaptive.antialiasing`), which change the brightness of
 photographs, too. The photographs then get exposures (:mod:`minisplat_ref.training.calibration`) that begin with their
 gains, the medians of photograph / rendering over the pixels.
 
@@ -13,11 +13,11 @@ is therefore kept at the identity.
 
 import numpy as np
 
-from minisplat_ref.methods.adaptive_antialiasing import antialiasing_evidence
-from minisplat_ref.methods.adaptive_evidence import BRIGHT, DARK, exposure_evidence, plain_request, switch_on
-from minisplat_ref.training.calibration import EXPOSURE, EXPOSURES, identity_exposures
+from minisplat_ref.methods.adaptive.evidence import Answer, exposure_evidence
+from minisplat_ref.methods.adaptive.numbers import BRIGHT, DARK
+from minisplat_ref.training.calibration import EXPOSURES, identity_exposures
 from minisplat_ref.training.compensation import with_compensation
-from minisplat_ref.training.pace import Decision, trained_ids
+from minisplat_ref.training.pace import trained_ids
 from minisplat_ref.training.sky import with_sky
 from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Floats, Ints
@@ -40,7 +40,7 @@ def log_gains(state: TrainState, iteration: Iteration, view_ids: Ints | list[int
     """
     gains = np.zeros(len(view_ids))
     renderer = with_sky(with_compensation(iteration.representation.renderer))
-    request = plain_request(iteration)
+    request = iteration.render_settings.request()
     for k, index in enumerate(view_ids):
         view = iteration.scene.train_views[index].load()
         rendered = renderer.render(state.model, view, request)[0].image
@@ -52,36 +52,19 @@ def log_gains(state: TrainState, iteration: Iteration, view_ids: Ints | list[int
     return gains
 
 
-def switch_exposure_on(
-    state: TrainState, iteration: Iteration, *, min_exposure_gain: float, min_antialiasing_gain: float
-) -> str | None:
-    """Give each photograph an exposure if halves of photographs explain each other by gains.
-
-    Parameters
-    ----------
-    state, iteration
-        As for every action.
-    min_exposure_gain : float
-        dB of the squared error that the photographs must gain on average, and more than the standard error.
-    min_antialiasing_gain : float
-        The same for compensated opacities. If these explain more, it is they that the photographs need.
-    """
-    if EXPOSURE.name in state.pace.switched_on or EXPOSURES in state.shared:
-        return "nothing done: exposures are on"
+def ask_about_exposures(state: TrainState, iteration: Iteration) -> Answer:
+    """Return whether halves of photographs explain each other by gains; exposures begin with these."""
     n_views = len(iteration.scene.train_views)
     ids = trained_ids(n_views, iteration.cooling, state.pace)
     evidence = exposure_evidence(state, iteration, ids)
     why = f"gains that spread by {evidence.spread:.3f} explain {evidence.gain:.2f} dB of the other halves"
-    if not evidence.is_above(min_exposure_gain):
-        return f"nothing done: {why}"
-    rival = antialiasing_evidence(state, iteration, ids)
-    if rival.gain > evidence.gain and rival.is_above(min_antialiasing_gain):
-        return f"nothing done: {why}, and amounts of compensation {rival.gain:.2f} dB"
-    exposures, gains = identity_exposures(n_views), log_gains(state, iteration, ids)
-    _begin_with(exposures[EXPOSURES], ids, gains - gains.mean())
-    decision = Decision(iteration.step, "exposures", why, evidence.gain, evidence.standard_error)
-    switch_on(state, EXPOSURE, exposures, decision)
-    return why
+
+    def begin() -> dict[str, Floats]:
+        exposures, gains = identity_exposures(n_views), log_gains(state, iteration, ids)
+        _begin_with(exposures[EXPOSURES], ids, gains - gains.mean())
+        return exposures
+
+    return Answer(evidence, why, begin)
 
 
 def hold_mean_exposure(state: TrainState, iteration: Iteration) -> None:

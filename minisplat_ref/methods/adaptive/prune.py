@@ -10,17 +10,13 @@ removed, so that it can converge.
 import numpy as np
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.methods.adaptive.numbers import GAP_MIN, LAST_SLICE, N_SLICES, SLICE_MIN
 from minisplat_ref.methods.mini_splatting import candidates, measure_importance
 from minisplat_ref.strategy.importance import indoor
 from minisplat_ref.strategy.ops import keep, n_rows
 from minisplat_ref.strategy.removal import collect_removal_costs, worth_their_place
 from minisplat_ref.training.pace import Decision, Pace
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
-
-N_SLICES = 8
-LAST_SLICE = 0.64  # no slice after this part of the cool-down
-GAP_MIN = 20  # iterations from slice to slice, in which the others learn to replace what is gone
-SLICE_MIN = 0.01  # of the Gaussians; a smaller slice is not worth a disturbance
 
 
 def slice_due(pace: Pace, step: int) -> int | None:
@@ -58,14 +54,7 @@ def prune_in_slices(
         prune_seen_by_few(state, iteration, min_views)
     n = n_rows(state.gaussians)
     try:
-        costs = collect_removal_costs(
-            state.model,
-            iteration.scene.train_views,
-            background=iteration.scene.background,
-            renderer=iteration.renderer,
-            conventions=iteration.conventions,
-            backend=iteration.backend,
-        )
+        costs = collect_removal_costs(state.model, iteration.scene.train_views, iteration.render_settings)
     except InputError as reason:
         if number == 0:
             iteration.say(f"nothing more is pruned: {reason}")

@@ -1,0 +1,33 @@
+"""Compensated opacities, which ``adaptive`` switches on where photographs differ in resolution.
+
+What the compensation would do to a photograph is a field, b = compensated rendering - rendering, and its amount x is
+fitted to each half of each photograph and judged on the other (:mod:`minisplat_ref.methods.adaptive.evidence`). Where
+all photographs show things at the same size, the Gaussians have learned what the low-pass adds, and no photograph wants
+another x than the mean. Where some show them smaller, by their own size or from afar, those want more of it, and the
+others less: then opacities are compensated from now on (:mod:`minisplat_ref.training.compensation`).
+"""
+
+from minisplat_ref.methods.adaptive.evidence import Answer, Evidence, halves_of, pairs, render_clipped, weigh
+from minisplat_ref.training.compensation import compensated, compensation
+from minisplat_ref.training.pace import trained_ids
+from minisplat_ref.training.state import Iteration, TrainState
+
+
+def antialiasing_evidence(state: TrainState, iteration: Iteration, view_ids: list[int]) -> Evidence:
+    """Return the training views' evidence for individual amounts of compensation."""
+    request = compensated(iteration.render_settings.request())
+    photographs = []
+    for view, photograph, rendered, is_counted in pairs(state, iteration, view_ids):
+        field = render_clipped(state, iteration, view, request) - rendered
+        photographs.append(halves_of(photograph - rendered, field[None], is_counted))
+    return weigh(photographs)
+
+
+def ask_about_antialiasing(state: TrainState, iteration: Iteration) -> Answer | str:
+    """Return whether halves of photographs explain each other by different amounts of compensation."""
+    if iteration.render_settings.conventions.is_antialiased:
+        return "opacities are compensated"
+    n_views = len(iteration.scene.train_views)
+    evidence = antialiasing_evidence(state, iteration, trained_ids(n_views, iteration.cooling, state.pace))
+    why = f"amounts of compensation that spread by {evidence.spread:.2f} explain {evidence.gain:.2f} dB of other halves"
+    return Answer(evidence, why, lambda: compensation(n_views))

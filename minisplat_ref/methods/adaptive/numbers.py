@@ -1,0 +1,130 @@
+"""All numbers of ``adaptive``: what each is, its unit, and the reason for its value as far as one is recorded.
+
+Letters name the sections of ``docs/measured/adaptive.md``. ``--set`` reaches those that an action takes as a setting.
+Two numbers are shared with others: how far halves are apart (:data:`minisplat_ref.strategy.halving.OFFSET`), and the
+least side that any halved view may have (:data:`minisplat_ref.training.smaller_views.SIDE_MIN`).
+"""
+
+# --- the recipe ---
+
+ITERATIONS_MAX = 30_000
+"""Iterations; a limit, as many as 3DGS trains. No reason recorded."""
+TRAIN_VIEWS_MIN = 5
+"""Training views that the recipe needs: two are held out. No reason recorded for five."""
+RAISED = 2.24
+"""Factor of the rates of ``3dgs-accel``: 6^0.45, as Mini-Splatting2's rates in a sixth of its iterations. For the
+means, too, and not its square: a Gaussian that overshoots does not settle while the rates are constant (A)."""
+DEGREE_STEPS = (2, 2, 2)
+"""Iterations at which degrees 1 to 3 would begin for Gaussians without a degree of their own, which all have after
+the first iteration."""
+PERIOD = 100
+"""Iterations from one growth to the next, and from one measurement to the next. No reason recorded."""
+FAINT = 0.005
+"""Opacity below which Gaussians are removed every 100 iterations, as in 3DGS."""
+
+# --- growth ---
+
+GRADIENT_MIN = 4e-4
+"""Mean length of the screen gradient, in normalised device coordinates, from which Gaussians are halved. Measured
+beside multiples from a half to eight (F)."""
+GROWTH_MAX = 0.2
+"""Fraction of the Gaussians that are halved at a time, at most. Measured beside greater ones at half the threshold
+(F)."""
+ERROR_VIEWS = 24
+"""Views in which the error is looked for, at most. The order by error is worth 0.04 dB on the room (B); no reason
+recorded for 24."""
+
+# --- view dependence ---
+
+VIEWS_PER_COEFFICIENT = 1.5
+"""Training views for each coefficient of a channel of the colour. Fewer are a matter of taste (G)."""
+VARIATION_MIN = 4 / 255
+"""Standard deviation of a degree's part of the colour, out of 1, below which the degree is removed: what hardly shows
+in photographs is not worth its numbers. Without this rule the room has 309,102 numbers, not 224,855, and 27.57 dB,
+not 27.59 (B)."""
+
+# --- measurement, the next size, and the end ---
+
+HOLD_OUT_EVERY = 8
+"""One of so many training views is held out. No reason recorded."""
+VIEW_SIDE_MIN = 120
+"""Pixels: no side of a halved view is shorter. With 60 some scenes gain, but on snowmiku calibrations were found
+where there are none (J)."""
+WHOLE_VIEWS_UNTIL = 1
+"""Iteration after which large views are halved. No reason recorded."""
+MEASUREMENTS_MIN = 4
+"""Measurements to fit a line through."""
+SLOPE_MIN = 0.3
+"""dB for each doubling of the work that held-out views must gain for a training to go on as it is. Leaving small
+views at 1 dB is much faster on fox and snowmiku, and ends lower (J)."""
+DECISION_STEP_MIN = 800
+"""Iteration before which nothing is decided: the first measurements rise steeply."""
+COOLING_PART = 0.6
+"""Length of the cool-down, as a fraction of the iterations before it. No reason recorded; without a cool-down the
+room loses 0.2 dB (B)."""
+COOLING_LAST, COOLING_LAST_PER_EXTENT = 0.1, 0.01
+"""Factors of the rates at the end of the cool-down, and of those per unit of the extent. No reason recorded."""
+
+# --- what the photographs need ---
+
+SKY_STEP = 100
+"""Iteration in which a sky is asked about. No reason recorded for 100; large Gaussians have covered it by then
+(H)."""
+EXPOSURE_STEP = 600
+"""Iteration in which exposures are asked about: after a few hundred, the scene is a blur of the right brightness."""
+ANTIALIASING_STEP = 650
+"""Iteration in which anti-aliasing is asked about, before poses: asked after them, it found poses on in half of the
+trials with two sizes on the room, wrongly (D)."""
+POSE_STEP = 700
+"""Iteration in which poses are asked about, after anti-aliasing."""
+GAIN_MIN = 0.1
+"""dB of the squared error for which a calibration is worthwhile. With 0.05 dB exposures came on in some trials of
+brighton_beach, and cost 1.2 dB (D)."""
+N_ERRORS = 1.0
+"""Standard errors that the gain of a calibration must exceed. With two, one of ten planted gains was found on banana,
+where eleven photographs provide the evidence (D)."""
+RIDGE = 1e-3
+"""Of the mean square of a field over the halves: where next to nothing is rendered, x would be arbitrary."""
+DARK, BRIGHT = 0.05, 0.98
+"""Brightness, out of 1, beyond which pixels say nothing about a gain: noise, saturation."""
+
+# --- a sky ---
+
+SKY_GAIN_MIN = 2.0
+"""dB of the squared error, where a sky shows: it explains nearly all that is there. Skies explain 2.7 dB and more,
+what is none 1.2 or less (H)."""
+SKY_N_ERRORS = 3.0
+"""Standard errors that the gain of a sky must exceed: nearly all photographs gain by it, because they see one sky."""
+LARGE, HUGE = 0.25, 1.0
+"""Standard deviation along the longest axis, in units of the scene's extent: to question a Gaussian, and to remove
+it. The extent is the path of the cameras; no reason recorded for a quarter."""
+SKY_RIDGE = 1e-3
+"""Of the mean diagonal entry of the normal matrix: directions that no photograph shows get no large colour."""
+SKY_VIEWS_MAX = 24
+"""Photographs that are looked at, evenly spread, at most. No reason recorded."""
+SKY_VIEWS_MIN = 4
+"""Photographs that must show something behind the scene: two to fit, two to judge."""
+OPEN = 0.5
+"""Transmittance above which a pixel shows what is behind the scene. No reason recorded."""
+OPEN_MIN = 0.005
+"""Fraction of a photograph's pixels that must be open: fewer say nothing."""
+
+# --- pruning ---
+
+SEEN_BY_MIN = 2
+"""Views that must see a Gaussian when the rates begin to fall. No reason recorded."""
+REMOVAL_SLOPE_MIN = 1.0
+"""Relative rise of the squared error over the relative fall of the count, from which a Gaussian stays: 3 dB for each
+doubling of the count, before the others learn to replace it. Less keeps more Gaussians for under 0.1 dB (C)."""
+PRUNED_MAX = 0.2
+"""Fraction of the Gaussians in a slice, at most. No reason recorded."""
+N_SLICES = 8
+"""Slices, at most. At once, all of several Gaussians that replace each other would go (C); no reason recorded for
+eight."""
+LAST_SLICE = 0.64
+"""Part of the cool-down after which no slice comes, so that it can converge. Later slices were tried and are no
+better (C)."""
+GAP_MIN = 20
+"""Iterations from slice to slice, in which the others learn to replace what is gone."""
+SLICE_MIN = 0.01
+"""Fraction of the Gaussians; a smaller slice is not worth a disturbance."""

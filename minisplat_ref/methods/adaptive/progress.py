@@ -1,0 +1,64 @@
+"""How ``adaptive`` measures its progress on held-out views, and goes on to larger views or to the cool-down."""
+
+import numpy as np
+
+from minisplat_ref.methods.adaptive.exposure import log_gains
+from minisplat_ref.methods.adaptive.numbers import MEASUREMENTS_MIN
+from minisplat_ref.metrics import psnr
+from minisplat_ref.strategy.ops import n_rows
+from minisplat_ref.training.calibration import EXPOSURES
+from minisplat_ref.training.pace import COOLED, FINER, Decision, Measurement, held_out_ids
+from minisplat_ref.training.state import Iteration, TrainState, begin_cooling
+
+
+def measure_held_out(state: TrainState, iteration: Iteration) -> str | None:
+    """Render the held-out training views and record their PSNR."""
+    if iteration.cooling is None or state.pace.cooling_from is not None:
+        return "nothing done: all training views are trained on"
+    views = iteration.scene.train_views
+    ids, psnrs = held_out_ids(len(views), iteration.cooling.hold_out_every), []
+    # Their exposures are not trained and must not enter the measurement. For poses, see turn_held_out.
+    gains = np.exp(log_gains(state, iteration, ids) if EXPOSURES in state.shared else np.zeros(len(ids)))
+    for index, gain in zip(ids, gains.astype(np.float32), strict=True):
+        view = views[index].load()
+        output, _ = iteration.render_settings.render(state.model, view)
+        psnrs.append(psnr(np.clip(gain * output.image, 0.0, 1.0), view.image, view.mask))
+    measurement = Measurement(iteration.step, tuple(psnrs), n_rows(state.gaussians), state.pace.n_pairs)
+    state.pace = state.pace._replace(measurements=(*state.pace.measurements, measurement))
+    return f"{measurement.psnr:.2f} dB"
+
+
+def proceed_when_little_is_gained(
+    state: TrainState, iteration: Iteration, *, min_gain: float, min_step: int
+) -> str | None:
+    """Go on to larger views, or to the cool-down, when held-out views gain too little for each doubling of the work.
+
+    What counts is what was measured since half of the work, and since anything was last decided.
+
+    Parameters
+    ----------
+    state, iteration
+        As for every action.
+    min_gain : float
+        dB for each doubling of the work.
+    min_step : int
+        No decision before this iteration: the first measurements rise steeply.
+    """
+    pace = state.pace
+    if iteration.cooling is None or pace.cooling_from is not None or iteration.step < min_step:
+        return None
+    recent = pace.recent()
+    if len(recent) < MEASUREMENTS_MIN:
+        return None
+    doublings = np.log2([m.n_pairs for m in recent])
+    slopes = np.polyfit(doublings, np.array([m.psnrs for m in recent]), 1)[0]  # [V] dB per doubling
+    gain, error = float(slopes.mean()), float(slopes.std(ddof=1) / np.sqrt(len(slopes)))
+    if gain >= min_gain:
+        return f"{gain:.2f} dB for each doubling of the work"
+    why = f"held-out views gain {gain:.2f} dB for each doubling of the work, less than {min_gain}"
+    if iteration.n_halvings:
+        state.pace = pace.decided(Decision(iteration.step, FINER, why, gain, error))
+    else:
+        decision = Decision(iteration.step, COOLED, why, gain, error)
+        begin_cooling(state, iteration.cooling, iteration.iterations, decision)
+    return why

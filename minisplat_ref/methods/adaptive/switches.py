@@ -1,0 +1,113 @@
+"""What ``adaptive`` switches on, and the rule by which it does: one function, and a table.
+
+Each calibration (:mod:`minisplat_ref.training.calibration`) is asked about once, in one iteration. It is switched on if
+what the photographs gain by it is above a least gain and above a number of standard errors
+(:mod:`minisplat_ref.methods.adaptive.evidence`), unless a rival explains more.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from minisplat_ref.methods.adaptive.antialiasing import ask_about_antialiasing
+from minisplat_ref.methods.adaptive.evidence import Answer
+from minisplat_ref.methods.adaptive.exposure import ask_about_exposures
+from minisplat_ref.methods.adaptive.numbers import N_ERRORS, SKY_N_ERRORS
+from minisplat_ref.methods.adaptive.pose import ask_about_poses
+from minisplat_ref.methods.adaptive.sky import ask_about_a_sky
+from minisplat_ref.training.adam import zero_moments
+from minisplat_ref.training.calibration import ANTIALIASING, BACKDROP, EXPOSURE, POSE, Calibration
+from minisplat_ref.training.pace import Decision
+from minisplat_ref.training.state import Iteration, TrainState
+from minisplat_ref.types import Floats
+
+
+@dataclass(frozen=True)
+class Switch:
+    """An action that switches a calibration on if the photographs need it, ``switch_NAME_on``."""
+
+    calibration: Calibration
+    decision: str
+    """Its name in the record of decisions."""
+    already: str
+    """What to say where it is on."""
+    ask: Callable[[TrainState, Iteration], Answer | str]
+    """Asks the photographs; returns a text where there is nothing to ask."""
+    n_errors: float = N_ERRORS
+    """Standard errors that the gain must exceed."""
+    rival: "Switch | None" = None
+    """It is the rival that the photographs need if they gain more by it."""
+
+    @property
+    def __name__(self) -> str:
+        """Name of the action in records and descriptions."""
+        return f"switch_{self.calibration.name}_on"
+
+    def __call__(self, state: TrainState, iteration: Iteration, **min_gains: float) -> str | None:
+        """Switch the calibration on, or say why not.
+
+        Parameters
+        ----------
+        state, iteration
+            As for every action.
+        **min_gains
+            ``min_NAME_gain`` of this calibration and of its rival: dB of the squared error that the photographs must
+            gain on average.
+        """
+        answer = self._supported(state, iteration, min_gains)
+        if isinstance(answer, str):
+            return f"nothing done: {answer}"
+        if self.rival is not None:
+            other = self.rival._supported(state, iteration, min_gains)
+            if isinstance(other, Answer) and other.evidence.gain > answer.evidence.gain:
+                return f"nothing done: {answer.why}, but {other.why}"
+        evidence = answer.evidence
+        decision = Decision(iteration.step, self.decision, answer.why, evidence.gain, evidence.standard_error)
+        add_calibration(state, self.calibration, answer.begin(), decision)
+        return answer.why
+
+    def _supported(self, state: TrainState, iteration: Iteration, min_gains: Mapping[str, float]) -> Answer | str:
+        """Return the photographs' answer if it supports the calibration, and otherwise why nothing is to be done."""
+        if self.calibration.initial(1).keys() <= state.shared.keys():
+            return self.already
+        answer = self.ask(state, iteration)
+        if isinstance(answer, str):
+            return answer
+        min_gain = min_gains[f"min_{self.calibration.name}_gain"]
+        return answer if answer.evidence.is_above(min_gain, self.n_errors) else answer.why
+
+
+def add_calibration(
+    state: TrainState, calibration: Calibration, parameters: Mapping[str, Floats], decision: Decision
+) -> None:
+    """Continue the training with a calibration.
+
+    Parameters
+    ----------
+    state : TrainState
+    calibration : Calibration
+    parameters : mapping
+        Its initial shared parameters.
+    decision : Decision
+        Its evidence.
+    """
+    zeros = zero_moments(parameters)
+    state.shared = {**state.shared, **parameters}
+    state.shared_adam = state.shared_adam._replace(
+        first={**state.shared_adam.first, **zeros.first}, second={**state.shared_adam.second, **zeros.second}
+    )
+    pace = state.pace.decided(decision)
+    state.pace = pace._replace(switched_on=(*pace.switched_on, calibration.name))
+
+
+switch_sky_on = Switch(BACKDROP, "sky", "there is a sky", ask_about_a_sky, SKY_N_ERRORS)
+switch_antialiasing_on = Switch(ANTIALIASING, "anti-aliasing", "opacities are compensated", ask_about_antialiasing)
+switch_exposure_on = Switch(
+    EXPOSURE, "exposures", "exposures are on", ask_about_exposures, rival=switch_antialiasing_on
+)
+switch_pose_on = Switch(POSE, "poses", "poses are refined", ask_about_poses)
+
+SWITCHES = {
+    switch.calibration.name: switch
+    for switch in (switch_sky_on, switch_exposure_on, switch_antialiasing_on, switch_pose_on)
+}
+"""By the name of the calibration, in the order in which they are asked about."""

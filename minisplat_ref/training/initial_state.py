@@ -1,0 +1,68 @@
+"""The state before the first iteration, and whether a given state belongs to a scene."""
+
+import numpy as np
+
+from minisplat_ref.errors import InputError
+from minisplat_ref.strategy.initialization import initial_gaussians
+from minisplat_ref.strategy.ops import contiguous
+from minisplat_ref.training.adam import zero_moments
+from minisplat_ref.training.schedule import Recipe
+from minisplat_ref.training.state import TrainState
+from minisplat_ref.types import Scene
+
+
+def initial_state(scene: Scene, recipe: Recipe, seed: int) -> TrainState:
+    """Return the state before the first iteration.
+
+    Raises
+    ------
+    InputError
+        The scene has no training views, or fewer than the recipe needs.
+    """
+    n_views = len(scene.train_views)
+    if n_views == 0:
+        raise InputError(f"scene {scene.name} has no training views: lower the share of test views or add photographs")
+    if n_views < recipe.min_views:
+        raise InputError(
+            f"scene {scene.name} has {n_views} training views, recipe {recipe.name} needs at least"
+            f" {recipe.min_views}: add photographs or use 3dgs-accel"
+        )
+    rng = np.random.default_rng(seed)
+    representation = recipe.representation
+    gaussians = contiguous(representation.extend(initial_gaussians(scene, recipe.sh_degree, rng), rng))
+    shared = dict(representation.shared(scene, rng))
+    for calibration in recipe.active_calibrations:
+        shared |= calibration.initial(n_views)
+    shared = {name: np.ascontiguousarray(array) for name, array in shared.items()}  # Adam writes through views
+    without_rate = [name for name in (*gaussians._fields, *shared) if name not in recipe.rates.of]
+    if without_rate:
+        raise InputError(
+            f"recipe {recipe.name} has no learning rate for {', '.join(without_rate)} of {representation.name}: give"
+            " the representation Rates for them"
+        )
+    return TrainState(
+        gaussians,
+        zero_moments(gaussians),
+        step=0,
+        view_order=[],
+        rng=rng,
+        stats={},
+        shared=shared,
+        shared_adam=zero_moments(shared),
+    )
+
+
+def check_fits(state: TrainState, scene: Scene, recipe: Recipe) -> None:
+    """Refuse a state of another scene: its views, and its arrays with a row per view, must match the scene's."""
+    n_views = len(scene.train_views)
+    if max(state.view_order, default=0) >= n_views:
+        raise InputError(f"scene {scene.name} has fewer training views than the run to continue: give the same scene")
+    expected = {name: a.shape for c in recipe.active_calibrations for name, a in c.initial(n_views).items()}
+    differing = [name for name, shape in expected.items() if getattr(state.shared.get(name), "shape", None) != shape]
+    per_view = [name for name in ("is_visible", "is_seen") if name in state.stats]
+    differing += [name for name in per_view if state.stats[name].shape[1:] != (n_views,)]
+    if differing:
+        raise InputError(
+            f"scene {scene.name} has {n_views} training views, for which the run to continue holds no"
+            f" {', '.join(differing)}: give the same scene"
+        )
