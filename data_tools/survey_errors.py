@@ -117,7 +117,7 @@ _EQUALITY = (
     ),
     PlantedLine(
         "kernels: drawn on the near plane",
-        "cpu.projection:lens_of",
+        "cpu.projection:constants_of",
         "conventions.near_plane, conv",
         "np.nextafter(conventions.near_plane, 0.0), conv",
     ),
@@ -141,15 +141,15 @@ _PROJECTION = (
     ),
     PlantedLine(
         "kernels: y clamped by the limit of x",
-        "cpu.projection:lens_of",
+        "cpu.projection:constants_of",
         "(camera.height - cy) / camera.fy + margin * tan_y",
         "(camera.width - cx) / camera.fx + margin * tan_x",
     ),
     PlantedLine(
         "kernels: gradient of y by the limits of x",
         "scalar.projection:project_gaussian_vjp",
-        "(y > lens.y_min) & (y < lens.y_max)",
-        "(y > lens.x_min) & (y < lens.x_max)",
+        "(y > constants.y_min) & (y < constants.y_max)",
+        "(y > constants.x_min) & (y < constants.x_max)",
         is_compiled=True,
     ),
 )

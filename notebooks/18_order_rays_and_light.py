@@ -51,7 +51,7 @@ from minisplat_ref.extensions.rays.demo import (
     floor,
     world_of,
 )
-from minisplat_ref.extensions.rays.kernels import scene_of
+from minisplat_ref.extensions.rays.kernels import tree_of
 from minisplat_ref.extensions.rays.lights import shade
 from minisplat_ref.extensions.rays.method import whiten_model
 from minisplat_ref.extensions.rays.surfaces import GLASS, MIRROR
@@ -358,7 +358,7 @@ plt.show()
 
 # %%
 eye = Camera(np.eye(3), np.zeros(3), 132.0, 132.0, 60.0, 45.0, 120, 90)
-tree = scene_of(whiten_model(Model(scene)), GSPLAT_MAIN)
+tree = tree_of(whiten_model(Model(scene)), GSPLAT_MAIN)
 rays = pixel_rays(eye, GSPLAT_MAIN)
 n_asked, n_boxes = np.zeros(len(rays.near), int), np.zeros(len(rays.near), int)
 by_level = {}

@@ -57,7 +57,7 @@ def _scale(scales, n):
 def _surface_points(
     ellipsoids,  # Ellipsoids
     pose,  # Pose
-    lens,  # [4] fx, fy, cx, cy
+    intrinsics,  # [4] fx, fy, cx, cy
     dominant_ids,  # [H, W]
     points,  # [H, W, 3]
     depths,  # [H, W]
@@ -70,7 +70,7 @@ def _surface_points(
             n = dominant_ids[y, x]
             if n < 0:
                 continue
-            d = pixel_ray(R, x + HALF, y + HALF, lens[0], lens[1], lens[2], lens[3])
+            d = pixel_ray(R, x + HALF, y + HALF, intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3])
             t = densest_depth(gaussian_axes(_wide(quats[n])), _scale(scales, n), _offset(means, n, centre), d)
             if t > 0:
                 depths[y, x] = t
@@ -91,7 +91,7 @@ def surface_points(means: Floats, quats: Floats, scales: Floats, camera: Camera,
 
 
 @scalar
-def _gaussian_vjp(n, pixels, ellipsoids, pose, lens, depths, v_surface, v):
+def _gaussian_vjp(n, pixels, ellipsoids, pose, intrinsics, depths, v_surface, v):
     """Write the gradient with respect to one Gaussian, the sum over its pixels."""
     R = rows_of(pose.R)
     quat = _wide(ellipsoids.quats[n])
@@ -103,7 +103,7 @@ def _gaussian_vjp(n, pixels, ellipsoids, pose, lens, depths, v_surface, v):
         t = depths[y, x]
         if t <= ZERO:
             continue
-        d = pixel_ray(R, x + HALF, y + HALF, lens[0], lens[1], lens[2], lens[3])
+        d = pixel_ray(R, x + HALF, y + HALF, intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3])
         v_t = v_depths[y, x] + dot(v_points[y, x], d)
         precision = ZERO * t
         for k in range(3):
@@ -125,7 +125,7 @@ def _gaussian_vjp(n, pixels, ellipsoids, pose, lens, depths, v_surface, v):
 def _surface_points_vjp(
     ellipsoids,  # Ellipsoids
     pose,  # Pose
-    lens,  # [4] fx, fy, cx, cy
+    intrinsics,  # [4] fx, fy, cx, cy
     lists,  # PixelLists
     depths,  # [H, W]
     v_surface,  # SurfacePoints
@@ -135,7 +135,7 @@ def _surface_points_vjp(
     for n in prange(offsets.size - 1):
         if offsets[n] < offsets[n + 1]:
             own = pixels[offsets[n] : offsets[n + 1]]
-            _gaussian_vjp(n, own, ellipsoids, pose, lens, depths, v_surface, v)
+            _gaussian_vjp(n, own, ellipsoids, pose, intrinsics, depths, v_surface, v)
 
 
 def surface_points_vjp(

@@ -29,8 +29,8 @@ from minisplat_ref.jit.lanes import WIDTH, iota, scatter, select
 from minisplat_ref.jit.literals import ZERO
 from minisplat_ref.scalar.extent import Extent, inria_box, support_box
 from minisplat_ref.scalar.projection import (
-    Lens,
     Pose,
+    ProjectionConstants,
     axes,
     axes_vjp,
     compensation_vjp,
@@ -59,7 +59,7 @@ def pose_of(camera: Camera) -> Pose:
     return Pose(R, -np.linalg.solve(R, np.asarray(camera.cam_from_world_t, np.float64)))
 
 
-def lens_of(camera: Camera, conventions: Conventions) -> Lens:
+def constants_of(camera: Camera, conventions: Conventions) -> ProjectionConstants:
     """Return camera intrinsics and conventions as float64 scalars."""
     cx, cy = camera.cx, camera.cy
     if not conventions.uses_principal_point:
@@ -77,7 +77,7 @@ def lens_of(camera: Camera, conventions: Conventions) -> Lens:
         )
     numbers = (camera.fx, camera.fy, cx, cy, *limits, conventions.near_plane, conventions.far_plane)
     scalars = [np.float64(number) for number in (*numbers, conventions.eps2d, COMPENSATION_FLOOR)]
-    return Lens._make([*scalars, conventions.is_antialiased])
+    return ProjectionConstants._make([*scalars, conventions.is_antialiased])
 
 
 @scalar
@@ -86,19 +86,19 @@ def _quaternion(quats, rows):
 
 
 @scalar
-def _project_eight(rows, primitives, pose, lens, extent, out):
+def _project_eight(rows, primitives, pose, constants, extent, out):
     R = rows_of(pose.R)
     x, y, z = triple(primitives.means, rows)
     p = to_camera(R, pose.centre, x, y, z)
     M = axes(_quaternion(primitives.quats, rows), triple(primitives.scales, rows))
-    footprint = project_gaussian(p, matmul3(R, M), lens)
+    footprint = project_gaussian(p, matmul3(R, M), constants)
     opacity = gather_wide(primitives.opacities, rows, 0) * footprint.compensation
     a, b, c = conic(footprint)
     if extent.has_full_support:
         rx, ry, x0, y0, x1, y1 = support_box(footprint, opacity, extent.alpha_min, extent.width, extent.height)
     else:
         rx, ry, x0, y0, x1, y1 = inria_box(footprint, extent.width, extent.height)
-    is_seen = (p[2] > lens.near) & (p[2] < lens.far) & (opacity >= extent.alpha_min) & (footprint.det > ZERO)
+    is_seen = (p[2] > constants.near) & (p[2] < constants.far) & (opacity >= extent.alpha_min) & (footprint.det > ZERO)
     size = footprint.det + abs(a) + abs(c) + abs(footprint.x) + abs(footprint.y)  # finite if all of them are
     is_seen = is_seen & (size < np.inf) & (rx > ZERO) & (ry > ZERO) & (x1 > x0) & (y1 > y0)
     _scatter_seen(is_seen, out.means2d, rows, 0, footprint.x)
@@ -126,13 +126,13 @@ def _scatter_seen(is_seen, table, rows, column, lanes):
 def _project(
     primitives,  # Primitives
     pose,  # Pose
-    lens,
+    constants,
     extent,
     out,  # Projection
 ):
     n_gaussians = primitives.opacities.shape[0]
     for block in prange((n_gaussians + WIDTH - 1) // WIDTH):
-        _project_eight(rows_from(block * WIDTH, n_gaussians), primitives, pose, lens, extent, out)
+        _project_eight(rows_from(block * WIDTH, n_gaussians), primitives, pose, constants, extent, out)
 
 
 def project(
@@ -151,25 +151,25 @@ def project(
     primitives = Primitives(means, quats, scales, opacities)
     alpha_min = dtype.type(conventions.alpha_min)
     extent = Extent(alpha_min, conventions.has_full_support, camera.width, camera.height)
-    _project(primitives, pose_of(camera), lens_of(camera, conventions), extent, out)
+    _project(primitives, pose_of(camera), constants_of(camera, conventions), extent, out)
     return out
 
 
 @scalar
-def _project_eight_vjp(rows, is_counted, primitives, pose, lens, v, out, v_pose):
+def _project_eight_vjp(rows, is_counted, primitives, pose, constants, v, out, v_pose):
     R, centre = pose
     x, y, z = triple(primitives.means, rows)
     p = to_camera(R, centre, x, y, z)
     quat, scale = _quaternion(primitives.quats, rows), triple(primitives.scales, rows)
     M = axes(quat, scale)
     V = matmul3(R, M)
-    footprint = project_gaussian(p, V, lens)
+    footprint = project_gaussian(p, V, constants)
     v_opacity = gather_wide(v.opacities, rows, 0)
     from_conic = conic_vjp(footprint, triple(v.conics, rows))
-    from_blur = compensation_vjp(footprint, v_opacity * gather_wide(primitives.opacities, rows, 0), lens)
+    from_blur = compensation_vjp(footprint, v_opacity * gather_wide(primitives.opacities, rows, 0), constants)
     v_cov = (from_conic[0] + from_blur[0], from_conic[1] + from_blur[1], from_conic[2] + from_blur[2])
     v_x, v_y, v_z = gather_wide(v.means2d, rows, 0), gather_wide(v.means2d, rows, 1), gather_wide(v.depths, rows, 0)
-    v_p, v_V = project_gaussian_vjp(p, V, lens, footprint, v_x, v_y, v_z, v_cov)
+    v_p, v_V = project_gaussian_vjp(p, V, constants, footprint, v_x, v_y, v_z, v_cov)
     R_transposed = transpose3(R)
     v_quat, v_scale = axes_vjp(quat, scale, matmul3(R_transposed, v_V))
     _scatter_triple(out.means, rows, (dot(R_transposed[0], v_p), dot(R_transposed[1], v_p), dot(R_transposed[2], v_p)))
@@ -199,7 +199,7 @@ def _add_row(v_pose, first, is_counted, v_p, v_V, mean, M):
 
 
 @scalar
-def _project_chunk_vjp(chunk, primitives, radii, pose, lens, v, out, v_poses):
+def _project_chunk_vjp(chunk, primitives, radii, pose, constants, v, out, v_poses):
     n_chunks, n_gaussians = v_poses.shape[0], radii.shape[0]
     first, end = n_gaussians * chunk // n_chunks, n_gaussians * (chunk + 1) // n_chunks
     for n in range(first, end):
@@ -216,7 +216,7 @@ def _project_chunk_vjp(chunk, primitives, radii, pose, lens, v, out, v_poses):
     v_poses[chunk] = ZERO
     for i in range(0, count, WIDTH):
         is_counted = iota(DOUBLE) < count - i
-        _project_eight_vjp(load_rows(visible, i), is_counted, primitives, in_rows, lens, v, out, v_poses[chunk])
+        _project_eight_vjp(load_rows(visible, i), is_counted, primitives, in_rows, constants, v, out, v_poses[chunk])
 
 
 @kernel()
@@ -224,13 +224,13 @@ def _project_vjp(
     primitives,  # Primitives
     radii,  # [N, 2]
     pose,  # Pose
-    lens,
+    constants,
     v,  # ProjectionGradient
     out,  # PrimitiveGradient
 ):
     v_poses = np.empty((N_CHUNKS, 12 * WIDTH), np.float64)
     for chunk in prange(N_CHUNKS):
-        _project_chunk_vjp(chunk, primitives, radii, pose, lens, v, out, v_poses)
+        _project_chunk_vjp(chunk, primitives, radii, pose, constants, v, out, v_poses)
     return total_of(v_poses)
 
 
@@ -254,8 +254,12 @@ def project_vjp(
         np.empty((3, 3), dtype),
         np.empty(3, dtype),
     )
-    primitives, pose, lens = Primitives(means, quats, scales, opacities), pose_of(camera), lens_of(camera, conventions)
-    v_pose = _project_vjp(primitives, projection.radii, pose, lens, v_projection, out).reshape(3, 4)
+    primitives, pose, constants = (
+        Primitives(means, quats, scales, opacities),
+        pose_of(camera),
+        constants_of(camera, conventions),
+    )
+    v_pose = _project_vjp(primitives, projection.radii, pose, constants, v_projection, out).reshape(3, 4)
     out.cam_from_world_R[:] = v_pose[:, :3]
     out.cam_from_world_t[:] = v_pose[:, 3]
     return out

@@ -18,6 +18,7 @@ module           content                                                        
 ``truth``        is float64 enough? The formulas in 50 digits                                  ``truth``
 ``hard_cases``   what breaks renderers, as data; every precision against the reference         ``hard-cases``
 ``golden``       arrays of every stage, for authors of other renderers                         ``export``
+``renderer``     what can be compared: a name, a precision and arrays for a scene
 ``comparison``   where does another renderer differ, and does it matter?                       ``compare``
 ``peers``        other renderers: gsplat in PyTorch and in CUDA, the 3DGS rasteriser           ``compare``
 ===============  ============================================================================  =============

@@ -29,8 +29,8 @@ class Pose(NamedTuple):
     """[3] float64, world units."""
 
 
-class Lens(NamedTuple):
-    """A camera and the conventions as scalars of the data's dtype."""
+class ProjectionConstants(NamedTuple):
+    """What is the same for all Gaussians of a view: the camera and the conventions, as scalars of the data's dtype."""
 
     fx: float
     fy: float
@@ -132,30 +132,30 @@ def image_row(focal_over_z, direction, V_row, V_2):
 
 
 @scalar
-def project_gaussian(p, V, lens):
+def project_gaussian(p, V, constants):
     """Return the footprint of a Gaussian with camera coordinates p and camera-frame axes V."""
     inverse_z = ONE / p[2]
     x = p[0] * inverse_z
     y = p[1] * inverse_z
-    u = image_row(lens.fx * inverse_z, minimum(maximum(x, lens.x_min), lens.x_max), V[0], V[2])
-    w = image_row(lens.fy * inverse_z, minimum(maximum(y, lens.y_min), lens.y_max), V[1], V[2])
+    u = image_row(constants.fx * inverse_z, minimum(maximum(x, constants.x_min), constants.x_max), V[0], V[2])
+    w = image_row(constants.fy * inverse_z, minimum(maximum(y, constants.y_min), constants.y_max), V[1], V[2])
     cov_xx = dot(u, u)
     cov_xy = dot(u, w)
     cov_yy = dot(w, w)
     area = (u[1] * w[2] - u[2] * w[1], u[2] * w[0] - u[0] * w[2], u[0] * w[1] - u[1] * w[0])
     det_sharp = dot(area, area)
-    det = det_sharp + lens.eps2d * (cov_xx + cov_yy) + lens.eps2d * lens.eps2d
+    det = det_sharp + constants.eps2d * (cov_xx + cov_yy) + constants.eps2d * constants.eps2d
     compensation = ZERO * det + ONE  # NaN where det is not finite
-    if lens.is_antialiased:
-        compensation = sqrt(maximum(det_sharp / det, lens.compensation_floor * lens.compensation_floor))
+    if constants.is_antialiased:
+        compensation = sqrt(maximum(det_sharp / det, constants.compensation_floor * constants.compensation_floor))
     return Footprint(
-        lens.fx * x + lens.cx,
-        lens.fy * y + lens.cy,
+        constants.fx * x + constants.cx,
+        constants.fy * y + constants.cy,
         u,
         w,
-        cov_xx + lens.eps2d,
+        cov_xx + constants.eps2d,
         cov_xy,
-        cov_yy + lens.eps2d,
+        cov_yy + constants.eps2d,
         det,
         compensation,
     )
@@ -193,17 +193,17 @@ def conic_vjp(footprint, v_conic):
 
 
 @scalar
-def compensation_vjp(footprint, v_compensation, lens):
+def compensation_vjp(footprint, v_compensation, constants):
     """Return the gradient of sqrt(det_sharp / det) with respect to (cov_xx, cov_xy, cov_yy); zero on the floor."""
     rho = footprint.compensation
-    if not lens.is_antialiased:
+    if not constants.is_antialiased:
         return ZERO * rho, ZERO * rho, ZERO * rho
-    k = select(rho > lens.compensation_floor, HALF * v_compensation / (rho * footprint.det), ZERO)
+    k = select(rho > constants.compensation_floor, HALF * v_compensation / (rho * footprint.det), ZERO)
     keep = rho * rho
     return (
-        k * (footprint.cov_yy - lens.eps2d - keep * footprint.cov_yy),
+        k * (footprint.cov_yy - constants.eps2d - keep * footprint.cov_yy),
         -TWO * k * footprint.cov_xy * (ONE - keep),
-        k * (footprint.cov_xx - lens.eps2d - keep * footprint.cov_xx),
+        k * (footprint.cov_xx - constants.eps2d - keep * footprint.cov_xx),
     )
 
 
@@ -216,7 +216,7 @@ def image_row_vjp(focal_over_z, direction, V_2, v_row):
 
 
 @scalar
-def project_gaussian_vjp(p, V, lens, footprint, v_x, v_y, v_depth, v_cov):
+def project_gaussian_vjp(p, V, constants, footprint, v_x, v_y, v_depth, v_cov):
     """Chain gradients with respect to image position, depth and projected covariance to p and V.
 
     A row has the factor f / z, so its own share of dL/dz is -(row . v_row) / z; a clamped direction does not depend on
@@ -237,12 +237,16 @@ def project_gaussian_vjp(p, V, lens, footprint, v_x, v_y, v_depth, v_cov):
         TWO * v_cov[2] * w[1] + v_cov[1] * u[1],
         TWO * v_cov[2] * w[2] + v_cov[1] * u[2],
     )
-    v_V0, v_V2x, v_dir_x = image_row_vjp(lens.fx * inverse_z, minimum(maximum(x, lens.x_min), lens.x_max), V[2], v_u)
-    v_V1, v_V2y, v_dir_y = image_row_vjp(lens.fy * inverse_z, minimum(maximum(y, lens.y_min), lens.y_max), V[2], v_w)
+    v_V0, v_V2x, v_dir_x = image_row_vjp(
+        constants.fx * inverse_z, minimum(maximum(x, constants.x_min), constants.x_max), V[2], v_u
+    )
+    v_V1, v_V2y, v_dir_y = image_row_vjp(
+        constants.fy * inverse_z, minimum(maximum(y, constants.y_min), constants.y_max), V[2], v_w
+    )
     v_V2 = (v_V2x[0] + v_V2y[0], v_V2x[1] + v_V2y[1], v_V2x[2] + v_V2y[2])
 
-    v_ratio_x = lens.fx * v_x + select((x > lens.x_min) & (x < lens.x_max), v_dir_x, ZERO)
-    v_ratio_y = lens.fy * v_y + select((y > lens.y_min) & (y < lens.y_max), v_dir_y, ZERO)
+    v_ratio_x = constants.fx * v_x + select((x > constants.x_min) & (x < constants.x_max), v_dir_x, ZERO)
+    v_ratio_y = constants.fy * v_y + select((y > constants.y_min) & (y < constants.y_max), v_dir_y, ZERO)
     v_p = (
         v_ratio_x * inverse_z,
         v_ratio_y * inverse_z,

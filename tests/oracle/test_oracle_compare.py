@@ -14,7 +14,7 @@ from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN, INRIA
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.comparison.measures import difference
 from minisplat_ref.oracle.comparison.renderers import (
-    Renderer,
+    ComparedRenderer,
     by_profile,
     choose_renderer,
     choose_scenes,
@@ -143,7 +143,7 @@ def test_radii_alone_are_judged_too(ordinary):
     a = ordinary.arrays
 
     def give(radii):
-        return Renderer("other", "float64", True, lambda truth: {"radii": radii})
+        return ComparedRenderer("other", "float64", True, lambda truth: {"radii": radii})
 
     assert by_stage(compare_scene(give(a["radii"] + 4 * (a["radii"] > 0)), ordinary))["radii"].status == "harmless"
     assert by_stage(compare_scene(give(a["radii"].max(axis=1)), ordinary))["radii"].status == "harmless"
@@ -174,7 +174,9 @@ def test_lists_are_compared_as_sets_and_in_their_order(ordinary):
 
     def status(ids, offsets=offsets):
         given = {"gaussian_ids": ids, "tile_offsets": offsets}
-        return by_stage(compare_scene(Renderer("other", "float64", True, lambda truth: given), ordinary))["tile lists"]
+        return by_stage(compare_scene(ComparedRenderer("other", "float64", True, lambda truth: given), ordinary))[
+            "tile lists"
+        ]
 
     assert status(ids).status == "agrees"
     backwards = ids.copy()
@@ -444,7 +446,7 @@ def test_an_exported_folder_agrees_with_itself(odd, tmp_path):
 
 def test_what_is_missing_is_not_given_and_does_not_pass(odd, tmp_path):
     arrays = {"image": odd.arrays["image"], "v_means": odd.arrays["v_means"]}
-    renderer = Renderer("other", None, False, lambda truth: arrays)
+    renderer = ComparedRenderer("other", None, False, lambda truth: arrays)
     rows = compare_scene(renderer, odd)
     report = as_report(renderer, rows, {})
     assert [case.name for case in report.cases] == ["image", "v_means"]

@@ -80,13 +80,13 @@ def walk_sorted(hit: Callable, shade: Callable, n_channels: int, take: Callable)
     """
 
     @scalar
-    def walk(state, buffer, scene, row, buffer_size, frame):
+    def walk(state, buffer, primitives, row, buffer_size, frame):
         as_data = state.dtype.type
         zero, hits, queue = broadcast(as_data(0)), buffer.hits, buffer.queue
         first = end = 0
         for m in row.members:
             n = row.ids[m]
-            unclamped, depth, place = hit_row(hit, scene, n, row)
+            unclamped, depth, place = hit_row(hit, primitives, n, row)
             is_hit = unclamped >= frame.alpha_min
             if not reduce_any(is_hit):
                 continue
@@ -95,7 +95,7 @@ def walk_sorted(hit: Callable, shade: Callable, n_channels: int, take: Callable)
             scatter(hits, rows, V_ALPHA, zero)
             scatter(hits, rows, WEIGHT, zero)
             for k in range(n_channels):
-                scatter(hits, rows, CHANNELS + k, zero + shade(scene.colors, n, k, place))
+                scatter(hits, rows, CHANNELS + k, zero + shade(primitives.colors, n, k, place))
             buffer.members[end] = m
             enqueue(queue, first, end, select(is_hit, zero + depth, MISSED), iota(as_data(0)) + as_data(end * WIDTH))
             end += 1

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from minisplat_ref.constants import LIST_ORDER, Conventions
-from minisplat_ref.cpu.compositing.pixel_rows import Lists, Pixels, Scene
+from minisplat_ref.cpu.compositing.pixel_rows import KernelPrimitives, Lists, Pixels
 from minisplat_ref.cpu.compositing.plain import backward_kernel, forward_kernel
 from minisplat_ref.cpu.compositing.responses import KernelResponse
 from minisplat_ref.cpu.compositing.tile_state import frame_of
@@ -37,7 +37,7 @@ def composite_hits(
     height, width, dtype, n_channels = bins.grid.height, bins.grid.width, colors.dtype, len(background)
     image, alpha = np.empty((height, width, n_channels), dtype), np.empty((height, width), dtype)
     forward_kernel(_find_shared(response), n_channels)(
-        Scene(response.records(primitives, dtype), colors, response.boxes(primitives)),
+        KernelPrimitives(response.records(primitives, dtype), colors, response.boxes(primitives)),
         background,
         _lists(bins, response),
         frame_of(bins, conventions, dtype),
@@ -62,7 +62,7 @@ def composite_hits_vjp(
     slots = np.empty((len(bins.gaussian_ids), response.n_gradients + n_channels * response.n_coefficients), dtype)
     v_backgrounds = np.zeros((len(bins.tile_offsets) - 1, n_channels))  # by tiles
     backward_kernel(_find_shared(response), n_channels)(
-        Scene(response.records(primitives, dtype), colors, response.boxes(primitives)),
+        KernelPrimitives(response.records(primitives, dtype), colors, response.boxes(primitives)),
         _lists(bins, response),
         frame_of(bins, conventions, dtype),
         n_threads(),

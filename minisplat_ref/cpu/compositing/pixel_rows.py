@@ -11,7 +11,7 @@ from minisplat_ref.jit.literals import HALF, ONE, ZERO
 from minisplat_ref.types import Floats, Ints
 
 
-class Scene(NamedTuple):
+class KernelPrimitives(NamedTuple):
     """The primitives, as the kernels read them."""
 
     records: Floats  # [N, F] of the response
@@ -80,10 +80,10 @@ def list_rows(boxes, ids, tile, lists, frame):
 
 
 @scalar
-def rows_of_tile(tile, scene, lists, frame):
+def rows_of_tile(tile, primitives, lists, frame):
     """Yield the rows of a tile that lie inside the image."""
     ids = lists.ids[lists.offsets[tile] : lists.offsets[tile + 1]]
-    members, counts = list_rows(scene.boxes, ids, tile, lists, frame)
+    members, counts = list_rows(primitives.boxes, ids, tile, lists, frame)
     x0, y0, n_per_line = start_tile(tile, lists, frame)
     for i in range(counts.size):
         x, y = x0 + i % n_per_line * WIDTH, y0 + i // n_per_line
@@ -111,10 +111,10 @@ def full_transmittance(row, frame, as_data):
 
 
 @scalar
-def hit_row(hit, scene, n, row):
+def hit_row(hit, primitives, n, row):
     """Return the response's ``hit``, with alpha 0 in pixels outside the box."""
-    as_data = scene.records.dtype.type
+    as_data = primitives.records.dtype.type
     xs = iota(as_data(0)) + (as_data(row.x) + HALF)  # pixel centres
-    unclamped, depth, place = hit(scene.records, n, xs, as_data(row.y) + HALF)
-    is_in_box = (xs > scene.boxes[n, 0]) & (xs < scene.boxes[n, 2])
+    unclamped, depth, place = hit(primitives.records, n, xs, as_data(row.y) + HALF)
+    is_in_box = (xs > primitives.boxes[n, 0]) & (xs < primitives.boxes[n, 2])
     return select(is_in_box, unclamped, ZERO), depth, place

@@ -66,15 +66,15 @@ def forward_kernel(response: KernelResponse, n_channels: int) -> Callable:
     hit, shade, is_sorted = response.hit, response.shade, response.buffer_size > LIST_ORDER
 
     @scalar
-    def composite_row(state, scene, row, frame):
+    def composite_row(state, primitives, row, frame):
         """Blend the members of a row's list, in its order."""
         T = load(state, 0)
         for m in row.members:
             n = row.ids[m]
-            unclamped, _, place = hit_row(hit, scene, n, row)
+            unclamped, _, place = hit_row(hit, primitives, n, row)
             T, weight = blend(T, unclamped, frame)
             for k in range(n_channels):
-                accumulate(state, (1 + k) * WIDTH, weight * shade(scene.colors, n, k, place))
+                accumulate(state, (1 + k) * WIDTH, weight * shade(primitives.colors, n, k, place))
             if not reduce_any(T > ZERO):
                 break
         store(state, 0, T)
@@ -90,20 +90,20 @@ def forward_kernel(response: KernelResponse, n_channels: int) -> Callable:
     composite_sorted_row = walk_sorted(hit, shade, n_channels, take)
 
     @kernel()
-    def composite_tiles(scene, background, lists, frame, n_threads, out):
+    def composite_tiles(primitives, background, lists, frame, n_threads, out):
         taken = make_shared_counter()
         for _ in prange(n_threads):
             state = np.empty((1 + n_channels) * WIDTH, out.image.dtype)
             for tile in dynamic_range(taken, lists.offsets.size - 1):
                 n_listed = lists.offsets[tile + 1] - lists.offsets[tile]
                 buffer = hit_buffer(n_listed if is_sorted else 0, n_channels, state.dtype)
-                for row in rows_of_tile(tile, scene, lists, frame):
+                for row in rows_of_tile(tile, primitives, lists, frame):
                     state[:] = ZERO
                     store(state, 0, full_transmittance(row, frame, state.dtype.type))
                     if is_sorted:
-                        composite_sorted_row(state, buffer, scene, row, lists.buffer_size, frame)
+                        composite_sorted_row(state, buffer, primitives, row, lists.buffer_size, frame)
                     else:
-                        composite_row(state, scene, row, frame)
+                        composite_row(state, primitives, row, frame)
                     pixels, T_end = row_pixels(row, frame), abs(field_of(state, 0, row, frame))
                     scatter(out.alpha, pixels, 0, ONE - T_end)
                     for k in range(n_channels):
@@ -143,31 +143,31 @@ def backward_kernel(response: KernelResponse, n_channels: int) -> Callable:
         return blend_vjp(T, weight, unclamped, behind, v_dot_c, frame), weight
 
     @scalar
-    def chain(sums, v_place, state, scene, n, place, gradient, frame):
+    def chain(sums, v_place, state, primitives, n, place, gradient, frame):
         """Add the contributions of eight pixels to the ``sums`` [(G + S) * 8] of primitive n."""
         unclamped, v_alpha, weight = gradient
         v_place[:] = ZERO
         for k in range(n_channels):
             v_channel = weight * load(state, v_first + k * WIDTH)
-            v_coefficients, v_place_k = shade_vjp(scene.colors, n, k, place, v_channel)
+            v_coefficients, v_place_k = shade_vjp(primitives.colors, n, k, place, v_channel)
             accumulate(sums, (n_gradients + k * n_coefficients) * WIDTH, v_coefficients)
             accumulate(v_place, 0, v_place_k)
         v_mean = select(unclamped <= frame.mean_gradient_max, v_alpha, ZERO)
         v_shape = select(unclamped <= frame.shape_gradient_max, v_alpha, ZERO)
-        accumulate(sums, 0, hit_vjp(scene.records, n, place, v_mean, v_shape, v_place))
+        accumulate(sums, 0, hit_vjp(primitives.records, n, place, v_mean, v_shape, v_place))
 
     @scalar
-    def chain_row(sums, v_place, state, scene, row, frame):
+    def chain_row(sums, v_place, state, primitives, row, frame):
         """Loop over the members of a row's list once more and add to their ``sums``."""
         for m in row.members:
             n = row.ids[m]
-            unclamped, _, place = hit_row(hit, scene, n, row)
+            unclamped, _, place = hit_row(hit, primitives, n, row)
             v_dot_c = broadcast(state.dtype.type(0))
             for k in range(n_channels):
-                v_dot_c = v_dot_c + load(state, v_first + k * WIDTH) * shade(scene.colors, n, k, place)
+                v_dot_c = v_dot_c + load(state, v_first + k * WIDTH) * shade(primitives.colors, n, k, place)
             v_alpha, weight = blend_again(state, unclamped, v_dot_c, frame)
             gradient = unclamped, v_alpha, weight
-            chain(sums[m * n_sums * WIDTH :], v_place, state, scene, n, place, gradient, frame)
+            chain(sums[m * n_sums * WIDTH :], v_place, state, primitives, n, place, gradient, frame)
             if not reduce_any(load(state, 0) > ZERO):
                 break
 
@@ -184,16 +184,16 @@ def backward_kernel(response: KernelResponse, n_channels: int) -> Callable:
     walk = walk_sorted(hit, shade, n_channels, take)
 
     @scalar
-    def chain_sorted_row(sums, v_place, buffer, state, scene, row, buffer_size, frame):
+    def chain_sorted_row(sums, v_place, buffer, state, primitives, row, buffer_size, frame):
         """Do :func:`chain_row` where pixels sort their hits: dL/dalpha in their order, the rest in the list's order."""
-        for h in range(walk(state, buffer, scene, row, buffer_size, frame)):
+        for h in range(walk(state, buffer, primitives, row, buffer_size, frame)):
             m, rows = buffer.members[h], hit_rows(h)
-            unclamped, _, place = hit_row(hit, scene, row.ids[m], row)
+            unclamped, _, place = hit_row(hit, primitives, row.ids[m], row)
             gradient = unclamped, gather(buffer.hits, rows, V_ALPHA), gather(buffer.hits, rows, WEIGHT)
-            chain(sums[m * n_sums * WIDTH :], v_place, state, scene, row.ids[m], place, gradient, frame)
+            chain(sums[m * n_sums * WIDTH :], v_place, state, primitives, row.ids[m], place, gradient, frame)
 
     @kernel()
-    def composite_tiles_vjp(scene, lists, frame, n_threads, output, v_output, slots, v_backgrounds):
+    def composite_tiles_vjp(primitives, lists, frame, n_threads, output, v_output, slots, v_backgrounds):
         taken = make_shared_counter()
         for _ in prange(n_threads):
             state = np.empty((2 + n_channels) * WIDTH, slots.dtype)
@@ -202,12 +202,12 @@ def backward_kernel(response: KernelResponse, n_channels: int) -> Callable:
                 first, n_listed = lists.offsets[tile], lists.offsets[tile + 1] - lists.offsets[tile]
                 sums = np.zeros(n_listed * n_sums * WIDTH, slots.dtype)
                 buffer = hit_buffer(n_listed if is_sorted else 0, n_channels, state.dtype)
-                for row in rows_of_tile(tile, scene, lists, frame):
+                for row in rows_of_tile(tile, primitives, lists, frame):
                     start_row(state, output, v_output, row, frame)
                     if is_sorted:
-                        chain_sorted_row(sums, v_place, buffer, state, scene, row, lists.buffer_size, frame)
+                        chain_sorted_row(sums, v_place, buffer, state, primitives, row, lists.buffer_size, frame)
                     else:
-                        chain_row(sums, v_place, state, scene, row, frame)
+                        chain_row(sums, v_place, state, primitives, row, frame)
                     for k in range(n_channels):
                         v_backgrounds[tile, k] += reduce_sum(abs(load(state, 0)) * load(state, v_first + k * WIDTH))
                 for m in range(n_listed):

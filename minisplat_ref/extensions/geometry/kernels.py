@@ -27,7 +27,7 @@ class GeometricTape(NamedTuple):
     alpha: Floats
     depth: Floats
     """[H, W] 0 where there is none."""
-    lens: Floats
+    intrinsics: Floats
     """[4] fx, fy, cx, cy."""
     edges: Floats
     """[2, H, W] weight between a pixel and its right and its lower neighbour; 0 where one of them has no depth."""
@@ -101,9 +101,9 @@ def _depth_steps_vjp(depth, edges, v_pair, v_logs):
 
 
 @kernel()
-def _normals(depth, lens, normals):
+def _normals(depth, intrinsics, normals):
     height, width = depth.shape
-    fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     for y in prange(height - 1):
         for x in range(width - 1):
             z, z_right, z_down = depth[y, x], depth[y, x + 1], depth[y + 1, x]
@@ -150,9 +150,9 @@ def _add_difference(v, weight, a, b):
 
 
 @kernel()
-def _normal_differences_vjp(depth, lens, normals, edges, v_pair, v_steps):
+def _normal_differences_vjp(depth, intrinsics, normals, edges, v_pair, v_steps):
     height, width = depth.shape
-    fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     for y in prange(height - 1):
         for x in range(width - 1):
             n = normals[y, x]
@@ -179,7 +179,7 @@ def _normal_differences_vjp(depth, lens, normals, edges, v_pair, v_steps):
 def _look_up(
     points,  # [P, 3]
     pose,  # Pose
-    lens,  # [4] fx, fy, cx, cy
+    intrinsics,  # [4] fx, fy, cx, cy
     depth,  # [H, W]
     tolerance,
     pixels,  # [P]
@@ -191,7 +191,7 @@ def _look_up(
         x, y, z = to_camera(rows_of(pose.R), pose.centre, points[i, 0], points[i, 1], points[i, 2])
         if not z > ZERO:
             continue
-        u, v = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
+        u, v = intrinsics[0] * x / z + intrinsics[2], intrinsics[1] * y / z + intrinsics[3]
         if not (u >= ZERO and u < width and v >= ZERO and v < height):
             continue
         column, row = int(u), int(v)
@@ -221,7 +221,7 @@ def geometric_loss(
         counts_here &= mask
     depth = np.zeros((height, width), dtype)
     np.divide(accumulated_depth, alpha, out=depth, where=counts_here)
-    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     edges, normals = np.zeros((2, height, width), dtype), np.zeros((height, width, 3), dtype)
     sums = np.zeros((2, height, 2))  # for depths and for normals: sum of costs, number of pairs
     if weights.depth_smoothness or weights.normal_smoothness:
@@ -230,26 +230,26 @@ def geometric_loss(
     if weights.depth_smoothness:
         _depth_steps(depth, edges, sums[0])
     if weights.normal_smoothness:
-        _normals(depth, lens.astype(dtype), normals)
+        _normals(depth, intrinsics.astype(dtype), normals)
         _normal_differences(normals, edges, sums[1])
-    pixels, costs, slopes = _seen_points(depth, camera, lens, points if weights.sfm_depth else points[:0])
+    pixels, costs, slopes = _seen_points(depth, camera, intrinsics, points if weights.sfm_depth else points[:0])
 
     costs_of_differences, n_differences = np.moveaxis(sums.sum(axis=1), 1, 0)
     means = costs_of_differences / np.maximum(n_differences, 1)
     loss = weights.depth_smoothness * means[0] + weights.normal_smoothness * means[1]
     loss += weights.sfm_depth * costs.sum() / max(1, len(costs))
     counts = n_differences.astype(np.int64)
-    lens = lens.astype(dtype)
-    tape = GeometricTape(accumulated_depth, alpha, depth, lens, edges, normals, counts, pixels, slopes, weights)
+    intrinsics = intrinsics.astype(dtype)
+    tape = GeometricTape(accumulated_depth, alpha, depth, intrinsics, edges, normals, counts, pixels, slopes, weights)
     return float(loss), tape
 
 
-def _seen_points(depth: Floats, camera: Camera, lens: Floats, points: Floats) -> tuple[Ints, Floats, Floats]:
+def _seen_points(depth: Floats, camera: Camera, intrinsics: Floats, points: Floats) -> tuple[Ints, Floats, Floats]:
     """Return pixel, cost and slope [n] of the points that fall on a pixel with depth, in float64 as their positions."""
     n = len(points)
     pixels, costs, slopes = np.full(n, -1), np.zeros(n), np.zeros(n)
     points = np.ascontiguousarray(points, np.float64)
-    _look_up(points, pose_of(camera), lens, depth, SFM_DEPTH_TOLERANCE, pixels, costs, slopes)
+    _look_up(points, pose_of(camera), intrinsics, depth, SFM_DEPTH_TOLERANCE, pixels, costs, slopes)
     is_seen = pixels >= 0
     return pixels[is_seen], costs[is_seen], slopes[is_seen]
 
@@ -264,7 +264,7 @@ def geometric_loss_vjp(tape: GeometricTape, v_loss: float = 1.0) -> tuple[Floats
     if weights.normal_smoothness:
         v_pair = dtype.type(v_loss * weights.normal_smoothness / max(1, tape.counts[1]))
         v_right, v_down = v_steps = np.zeros((2, *depth.shape), dtype)
-        _normal_differences_vjp(depth, tape.lens, tape.normals, tape.edges, v_pair, v_steps)
+        _normal_differences_vjp(depth, tape.intrinsics, tape.normals, tape.edges, v_pair, v_steps)
         v_logs -= v_right + v_down
         v_logs[:, 1:] += v_right[:, :-1]
         v_logs[1:] += v_down[:-1]

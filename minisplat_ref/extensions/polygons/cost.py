@@ -15,7 +15,7 @@ from minisplat_ref.backends import CPU, PLAIN, REFERENCE, Backend
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions.extension import load_extension
 from minisplat_ref.extensions.polygons.geometry import polygons_of
-from minisplat_ref.extensions.polygons.kernels import fans_of, scene_of
+from minisplat_ref.extensions.polygons.kernels import fans_of, tree_of
 from minisplat_ref.extensions.polygons.method import TRACED
 from minisplat_ref.rendering import SPLATTING, Renderer, Request
 from minisplat_ref.studies import kit
@@ -68,8 +68,8 @@ def measure(n: int, repeats: int) -> dict[str, dict[str, float | None]]:
     found = {name: _row(renderer, backend, gaussians, view, repeats) for name, (renderer, backend) in ways.items()}
     opacities = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
     fans = fans_of(polygons_of(gaussians, opacities))
-    found["polygons"]["triangles in the tree"] = float(len(scene_of(fans, GSPLAT_MAIN).records))
-    found["polygons"]["tree ms"] = 1e3 * kit.least_seconds(partial(scene_of, fans, GSPLAT_MAIN), repeats)
+    found["polygons"]["triangles in the tree"] = float(len(tree_of(fans, GSPLAT_MAIN).records))
+    found["polygons"]["tree ms"] = 1e3 * kit.least_seconds(partial(tree_of, fans, GSPLAT_MAIN), repeats)
     found["polygons"]["error of float32"] = _error(gaussians, view)
     return found
 

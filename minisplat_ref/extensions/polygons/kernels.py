@@ -28,7 +28,7 @@ from minisplat_ref.jit.lanes import broadcast, select
 from minisplat_ref.mechanisms.meshes.fans import rims
 from minisplat_ref.mechanisms.rays.bvh import build
 from minisplat_ref.mechanisms.rays.kernels import RayResponse
-from minisplat_ref.mechanisms.rays.traversal import OPACITY, Scene
+from minisplat_ref.mechanisms.rays.traversal import OPACITY, RayTree
 from minisplat_ref.types import Floats
 
 SQUARE, COSINE, OWN, CENTRE, E1, E2 = 1, 2, 3, 4, 7, 10  # columns of a record beside the opacity: r^2, cos(2 pi / n)
@@ -56,7 +56,7 @@ def fans_of(polygons: Polygons) -> Fans:
     return Fans(polygons.means, spokes, polygons.radii, polygons.opacities)
 
 
-def scene_of(fans: Fans, conventions: Conventions) -> Scene:
+def tree_of(fans: Fans, conventions: Conventions) -> RayTree:
     """Return the triangles of fans with their tree; fans that are too faint, empty or not finite are left out."""
     n, n_sides = fans.spokes.shape[:2]
     corners = fans.centres[:, None] + fans.spokes
@@ -79,7 +79,7 @@ def scene_of(fans: Fans, conventions: Conventions) -> Scene:
     records[:, CENTRE:E1] = fans.centres[ids]
     records[:, E1:E2] = fans.spokes[ids, parts]
     records[:, E2:] = fans.spokes[ids, (parts + 1) % n_sides]
-    return Scene(records, ids.astype(np.int32), parts.astype(np.int32), tree.boxes, tree.children, n)
+    return RayTree(records, ids.astype(np.int32), parts.astype(np.int32), tree.boxes, tree.children, n)
 
 
 @scalar
@@ -140,18 +140,18 @@ def meet_vjp(records, row, ray, unclamped, v_unclamped, v_t):
     return (-x, -y, -z), (t * x, t * y, t * z), (-b1 * x, -b1 * y, -b1 * z, -b2 * x, -b2 * y, -b2 * z)
 
 
-def _spans_of(scene: Scene, v_edges: Floats) -> Floats:
+def _spans_of(tree: RayTree, v_edges: Floats) -> Floats:
     """Return the gradient of the spans [N, 3, 2] from those of the triangles' edges [N', 6].
 
     The edges of triangle j are ``r S (cos phi, sin phi)^T`` at the angles ``phi_j`` and ``phi_j+1``.
     """
-    r, step = np.sqrt(scene.records[:, SQUARE]), np.arccos(scene.records[:, COSINE])
-    v_spans = np.zeros((scene.n, 3, 2))
+    r, step = np.sqrt(tree.records[:, SQUARE]), np.arccos(tree.records[:, COSINE])
+    v_spans = np.zeros((tree.n, 3, 2))
     for edge in range(2):
-        phi = (scene.parts + edge) * step
+        phi = (tree.parts + edge) * step
         directions = r[:, None] * np.column_stack([np.cos(phi), np.sin(phi)])  # [N', 2]
         v_edge = v_edges[:, 3 * edge : 3 * edge + 3]
-        np.add.at(v_spans, scene.gaussian_ids, v_edge[:, :, None] * directions[:, None, :])
+        np.add.at(v_spans, tree.gaussian_ids, v_edge[:, :, None] * directions[:, None, :])
     return v_spans
 
 

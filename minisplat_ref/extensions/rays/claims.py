@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from minisplat_ref.backends import CPU, PLAIN, REFERENCE
 from minisplat_ref.constants import EXACT_ORDER, GSPLAT_MAIN
 from minisplat_ref.extensions.rays import demo
-from minisplat_ref.extensions.rays.kernels import scene_of
+from minisplat_ref.extensions.rays.kernels import tree_of
 from minisplat_ref.extensions.rays.lights import shade, visibility
 from minisplat_ref.extensions.rays.method import TRACED, tracer_for, whiten_model
 from minisplat_ref.extensions.rays.surfaces import MIRROR
@@ -211,7 +211,7 @@ def speed(n: int, repeats: int) -> dict[str, float]:
         backward = kit.least_seconds(partial(renderer.render_vjp, tape, np.ones_like(output.image), None), repeats)
         result |= {f"{name} forward us": forward / n_pixels * 1e6, f"{name} backward us": backward / n_pixels * 1e6}
     whitened = whiten_model(Model(gaussians))
-    result["tree ms"] = 1e3 * kit.least_seconds(partial(scene_of, whitened, GSPLAT_MAIN), repeats)
+    result["tree ms"] = 1e3 * kit.least_seconds(partial(tree_of, whitened, GSPLAT_MAIN), repeats)
     result["hits per ray"] = output.n_pairs / n_pixels
     few = pixel_rays(demo.camera_of(40, 22), GSPLAT_MAIN)
     colors = np.clip(0.5 + gaussians.sh_dc.astype(np.float64), 0, 1)

@@ -12,7 +12,7 @@ from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import select
 from minisplat_ref.mechanisms.rays.bvh import SLACK, build
 from minisplat_ref.mechanisms.rays.kernels import RayResponse
-from minisplat_ref.mechanisms.rays.traversal import OPACITY, Scene
+from minisplat_ref.mechanisms.rays.traversal import OPACITY, RayTree
 from minisplat_ref.types import Floats
 
 REACH, MEAN, MAP = 1, 2, 5  # columns of a record beside the opacity
@@ -86,10 +86,10 @@ def meet_vjp(records, row, ray, unclamped, v_unclamped, v_t):
     return back(records, row, of_p), back(records, row, of_v), of_map
 
 
-def _maps_of(scene: Scene, v_maps: Floats) -> Floats:
+def _maps_of(tree: RayTree, v_maps: Floats) -> Floats:
     """Return the gradient of each Gaussian's map [N, 3, 3] from those of the rows [N', 9], each of which is one."""
-    v: Floats = np.zeros((scene.n, 3, 3))
-    v[scene.gaussian_ids] = v_maps.reshape(-1, 3, 3)
+    v: Floats = np.zeros((tree.n, 3, 3))
+    v[tree.gaussian_ids] = v_maps.reshape(-1, 3, 3)
     return v
 
 
@@ -97,7 +97,7 @@ RESPONSE = RayResponse(meet, meet_vjp, 9, _maps_of)
 """A 3D Gaussian where its density on the ray is greatest."""
 
 
-def scene_of(gaussians: Whitened, conventions: Conventions) -> Scene:
+def tree_of(gaussians: Whitened, conventions: Conventions) -> RayTree:
     """Return Gaussians with their tree, without those that are too faint or not finite."""
     # Half-extents of the ellipsoid |M x|^2 = q: Sigma = M^-1 M^-T, and row i of M is R_i / s_i.
     least = max(conventions.alpha_min, np.finfo(np.float64).tiny)
@@ -116,4 +116,4 @@ def scene_of(gaussians: Whitened, conventions: Conventions) -> Scene:
     records[:, MEAN:MAP] = gaussians.means[ids]
     records[:, MAP:] = gaussians.maps[ids].reshape(-1, 9)
     parts = np.zeros(len(ids), np.int32)
-    return Scene(records, ids.astype(np.int32), parts, tree.boxes, tree.children, len(gaussians.means))
+    return RayTree(records, ids.astype(np.int32), parts, tree.boxes, tree.children, len(gaussians.means))

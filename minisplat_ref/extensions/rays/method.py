@@ -7,7 +7,7 @@ import numpy as np
 from minisplat_ref.backends import Backend
 from minisplat_ref.constants import Conventions
 from minisplat_ref.extensions.rays.geometry import Whitened, whiten, whiten_vjp
-from minisplat_ref.extensions.rays.kernels import RESPONSE, scene_of
+from minisplat_ref.extensions.rays.kernels import RESPONSE, tree_of
 from minisplat_ref.extensions.rays.reference import prepare_meeting
 from minisplat_ref.mechanisms.rays import blending, kernels
 from minisplat_ref.mechanisms.rays.pixel_rays import Tracer
@@ -27,7 +27,7 @@ def whiten_model(model: Model) -> Whitened:
 def tracer_for(gaussians: Whitened, conventions: Conventions, backend: Backend) -> Tracer:
     """Return how a backend traces: every ray against every Gaussian, or kernels with a tree, which is built here."""
     if backend.is_compiled:
-        return kernels.tracer_of(RESPONSE, scene_of(gaussians, conventions))
+        return kernels.tracer_of(RESPONSE, tree_of(gaussians, conventions))
     return blending.tracer_of(prepare_meeting(gaussians))
 
 

@@ -44,8 +44,8 @@ SLACK = 1e-6  # px that boxes and rows are too large by
 PIXELS_PER_CHUNK = 64
 
 
-class Lens(NamedTuple):
-    """What projects a vertex, in float64."""
+class Pinhole(NamedTuple):
+    """The camera that projects vertices, as float64 scalars."""
 
     fx: float
     fy: float
@@ -175,14 +175,14 @@ def grow_box(box, x, y):
 
 
 @scalar
-def grow_box_by_side(box, P, Q, lens):
+def grow_box_by_side(box, P, Q, pinhole):
     """Return the box with the first end of a side in it, and the point where the side meets the near plane."""
-    if P[2] > lens.near:
-        box = grow_box(box, lens.fx * P[0] / P[2] + lens.cx, lens.fy * P[1] / P[2] + lens.cy)
-    if (P[2] > lens.near) != (Q[2] > lens.near):
-        f = (lens.near - P[2]) / (Q[2] - P[2])
+    if P[2] > pinhole.near:
+        box = grow_box(box, pinhole.fx * P[0] / P[2] + pinhole.cx, pinhole.fy * P[1] / P[2] + pinhole.cy)
+    if (P[2] > pinhole.near) != (Q[2] > pinhole.near):
+        f = (pinhole.near - P[2]) / (Q[2] - P[2])
         x, y = P[0] + f * (Q[0] - P[0]), P[1] + f * (Q[1] - P[1])
-        box = grow_box(box, lens.fx * x / lens.near + lens.cx, lens.fy * y / lens.near + lens.cy)
+        box = grow_box(box, pinhole.fx * x / pinhole.near + pinhole.cx, pinhole.fy * y / pinhole.near + pinhole.cy)
     return box
 
 
@@ -193,29 +193,33 @@ def pixel_at(x, end):
 
 
 @kernel()
-def _set_up(vertices, faces, lens, planes):
+def _set_up(vertices, faces, pinhole, planes):
     edges, columns, anchors, boxes = planes
     for n in prange(faces.shape[0]):
         P_0, P_1, P_2 = vertex(vertices, faces, n, 0), vertex(vertices, faces, n, 1), vertex(vertices, faces, n, 2)
         row_1, row_2, normal, volume = inverse_rows(P_0, P_1, P_2)
         boxes[n, :] = 0
         # Written so that NaN is not drawn.
-        if not abs(volume) > lens.min_angle * math.sqrt(dot(normal, normal)) * math.sqrt(dot(P_0, P_0)):
+        if not abs(volume) > pinhole.min_angle * math.sqrt(dot(normal, normal)) * math.sqrt(dot(P_0, P_0)):
             continue
         box = np.inf, np.inf, -np.inf, -np.inf
-        box = grow_box_by_side(box, P_0, P_1, lens)
-        box = grow_box_by_side(box, P_1, P_2, lens)
-        box = grow_box_by_side(box, P_2, P_0, lens)
+        box = grow_box_by_side(box, P_0, P_1, pinhole)
+        box = grow_box_by_side(box, P_1, P_2, pinhole)
+        box = grow_box_by_side(box, P_2, P_0, pinhole)
         if not box[0] <= box[2]:  # nothing is in front of the near plane
             continue
-        boxes[n, 0], boxes[n, 1] = pixel_at(box[0] - SLACK, lens.width), pixel_at(box[1] - SLACK, lens.height)
-        boxes[n, 2], boxes[n, 3] = pixel_at(box[2] + SLACK, lens.width), pixel_at(box[3] + SLACK, lens.height)
-        anchors[n, 0], anchors[n, 1] = lens.width // 2, lens.height // 2
-        if P_0[2] > lens.near:
-            anchors[n, 0] = min(pixel_at(lens.fx * P_0[0] / P_0[2] + lens.cx - 0.5, lens.width), lens.width - 1)
-            anchors[n, 1] = min(pixel_at(lens.fy * P_0[1] / P_0[2] + lens.cy - 0.5, lens.height), lens.height - 1)
-        x = (anchors[n, 0] + 0.5 - lens.cx) / lens.fx
-        y = (anchors[n, 1] + 0.5 - lens.cy) / lens.fy
+        boxes[n, 0], boxes[n, 1] = pixel_at(box[0] - SLACK, pinhole.width), pixel_at(box[1] - SLACK, pinhole.height)
+        boxes[n, 2], boxes[n, 3] = pixel_at(box[2] + SLACK, pinhole.width), pixel_at(box[3] + SLACK, pinhole.height)
+        anchors[n, 0], anchors[n, 1] = pinhole.width // 2, pinhole.height // 2
+        if P_0[2] > pinhole.near:
+            anchors[n, 0] = min(
+                pixel_at(pinhole.fx * P_0[0] / P_0[2] + pinhole.cx - 0.5, pinhole.width), pinhole.width - 1
+            )
+            anchors[n, 1] = min(
+                pixel_at(pinhole.fy * P_0[1] / P_0[2] + pinhole.cy - 0.5, pinhole.height), pinhole.height - 1
+            )
+        x = (anchors[n, 0] + 0.5 - pinhole.cx) / pinhole.fx
+        y = (anchors[n, 1] + 0.5 - pinhole.cy) / pinhole.fy
         sign = 1.0 if volume > 0 else -1.0
         opposite = edge_row(P_1, P_2), edge_row(P_2, P_0), edge_row(P_0, P_1)
         for i in range(3):
@@ -223,8 +227,8 @@ def _set_up(vertices, faces, lens, planes):
                 edges[n, i, axis] = sign * opposite[i][axis]
         for column, row in ((G_1, row_1), (G_2, row_2), (S, normal)):
             columns[n, column] = (row[0] * x + row[1] * y + row[2]) / volume
-            columns[n, column + 1] = row[0] / volume / lens.fx
-            columns[n, column + 2] = row[1] / volume / lens.fy
+            columns[n, column + 1] = row[0] / volume / pinhole.fx
+            columns[n, column + 2] = row[1] / volume / pinhole.fy
 
 
 @scalar
@@ -440,10 +444,10 @@ def peel(mesh: TranslucentMesh, frame: Frame, background: Floats) -> Peeled:
         np.zeros((n, 3, 3)), np.zeros((n, N_COLUMNS), dtype), np.zeros((n, 2), np.int32), np.zeros((n, 4), np.int32)
     )
     fx, fy, cx, cy = map(float, (camera.fx, camera.fy, camera.cx, camera.cy))
-    lens = Lens(fx, fy, cx, cy, float(frame.near), ANGLE_MIN, camera.width, camera.height)
-    _set_up(vertices, mesh.faces, lens, planes)
+    pinhole = Pinhole(fx, fy, cx, cy, float(frame.near), ANGLE_MIN, camera.width, camera.height)
+    _set_up(vertices, mesh.faces, pinhole, planes)
     counts = np.zeros(n, np.int64)
-    rays = Rays((np.arange(size[1]) + 0.5 - cx) / fx, (np.arange(size[0]) + 0.5 - cy) / fy, fx, lens.near)
+    rays = Rays((np.arange(size[1]) + 0.5 - cx) / fx, (np.arange(size[0]) + 0.5 - cy) / fy, fx, pinhole.near)
     _count(planes, rays, counts)
     offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
     n_fragments = int(offsets[-1])

@@ -36,7 +36,7 @@ class Limits(NamedTuple):
     """Largest number of hits that a ray stores."""
 
 
-class Scene(NamedTuple):
+class RayTree(NamedTuple):
     """What rays may meet, in the order of a tree's leaves: whole Gaussians, or parts of them such as triangles."""
 
     records: Floats
@@ -58,7 +58,7 @@ class Found(NamedTuple):
 
     depths: Floats  # [8, capacity]
     unclamped: Floats  # [8, capacity]
-    rows: Ints  # [8, capacity] of the scene
+    rows: Ints  # [8, capacity] of the tree
     counts: Ints  # [8]
     left: Floats  # [8] transmittance behind all hits
     bounds: Floats  # [8] t beyond which nothing counts
@@ -150,17 +150,17 @@ def finder(meet: Callable) -> Callable:
     ----------
     meet : callable
         ``meet(records, row, ray)`` returns t and the squared distance q from the centre in standard deviations, of
-        eight rays and a row of the scene; alpha is ``o exp(-q / 2)``, and q infinite where a ray misses.
+        eight rays and a row of the tree; alpha is ``o exp(-q / 2)``, and q infinite where a ray misses.
     """
 
     @scalar
-    def find_hits(scene, rays, first, end, limits, found):
+    def find_hits(tree, rays, first, end, limits, found):
         """Fill ``found`` with all hits that may count, of the eight rays from ``first`` on, or fewer before ``end``.
 
         One long loop: of every array that a helper with branches is given, references would be counted, which takes
         longer than what the helper does.
         """
-        records, ids, boxes, children = scene.records, scene.gaussian_ids, scene.boxes, scene.children
+        records, ids, boxes, children = tree.records, tree.gaussian_ids, tree.boxes, tree.children
         depths, alphas, rows, counts, left, bounds, nodes, entries, ts, qs = found
         least, alpha_min, alpha_max = END_MARGIN * limits.transmittance_min, limits.alpha_min, limits.alpha_max
         eight = rows_from(first, end)

@@ -1,13 +1,13 @@
 """The renderers that can be compared: anything that returns arrays of the golden format for a scene; and their names.
 
-The module defines a renderer; then ours (the backends, a backend with a planted error, the reference under other
-conventions); then a folder of arrays written by some other renderer; last, how names that users type select a renderer
-and the scenes to compare. Other people's renderers are in :mod:`minisplat_ref.oracle.peers`.
+First ours (the backends, a backend with a planted error, the reference under other conventions); then a folder of
+arrays written by some other renderer; last, how names that users type select a renderer and the scenes to compare.
+Other people's renderers are in :mod:`minisplat_ref.oracle.peers`; :mod:`minisplat_ref.oracle.renderer` has their type.
 """
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,32 +20,10 @@ from minisplat_ref.oracle.golden.format import SPECS, Arrays, Golden
 from minisplat_ref.oracle.golden.running import run_stages
 from minisplat_ref.oracle.golden.scenes import RECIPES, inputs, truth
 from minisplat_ref.oracle.planted import PLANTED, plant
+from minisplat_ref.oracle.renderer import ComparedRenderer
 
 
-def _as_they_are(conventions: Conventions) -> Conventions:
-    return conventions
-
-
-class Renderer(NamedTuple):
-    """A renderer that is compared."""
-
-    name: str
-    """For messages and reports."""
-    dtype: str | None
-    """``"float32"`` or ``"float64"``, in which it computes and which sets tolerances; None: the dtype of each array."""
-    is_staged: bool
-    """Whether the truth is the input of every stage, so that a difference arises in its own stage."""
-    arrays: Callable[[Golden], Arrays]
-    """Returns all arrays that it can for a scene with known truth; shapes as in the golden format."""
-    rules: Callable[[Conventions], Conventions | None] = _as_they_are
-    """The conventions that it follows when a scene asks for these; None where it cannot draw the scene at all."""
-    ignores: tuple[str, ...] = ()
-    """Cotangents that it cannot take; they are set to zero for the truth as well."""
-    scenes: tuple[str, ...] | None = None
-    """Names of the scenes that it has; None for any."""
-
-
-def from_backend(backend: Backend, dtype: str, conventions: Conventions | None = None) -> Renderer:
+def from_backend(backend: Backend, dtype: str, conventions: Conventions | None = None) -> ComparedRenderer:
     """Compare a backend, every stage by itself.
 
     Parameters
@@ -63,10 +41,10 @@ def from_backend(backend: Backend, dtype: str, conventions: Conventions | None =
         return run_stages(backend, scene, dtype, fed=truth.arrays)
 
     name = f"{backend.name} {dtype}" if conventions is None else f"{backend.name} {dtype} by {conventions.name}"
-    return Renderer(name, dtype, True, arrays)
+    return ComparedRenderer(name, dtype, True, arrays)
 
 
-def with_planted_error(name: str, dtype: str) -> Renderer:
+def with_planted_error(name: str, dtype: str) -> ComparedRenderer:
     """Compare the cpu backend with one error in it."""
     renderer = from_backend(plant(name, CPU), dtype)
 
@@ -77,12 +55,12 @@ def with_planted_error(name: str, dtype: str) -> Renderer:
     return renderer._replace(arrays=arrays)
 
 
-def by_profile(conventions: Conventions, dtype: str) -> Renderer:
+def by_profile(conventions: Conventions, dtype: str) -> ComparedRenderer:
     """Compare the reference under other conventions than the scene's: the effect of a choice of conventions."""
     return from_backend(REFERENCE, dtype, conventions)
 
 
-def from_dumps(path: str | Path, dtype: str | None = None) -> Renderer:
+def from_dumps(path: str | Path, dtype: str | None = None) -> ComparedRenderer:
     """Compare what is in ``path/SCENE/*.npz``.
 
     Parameters
@@ -104,7 +82,7 @@ def from_dumps(path: str | Path, dtype: str | None = None) -> Renderer:
     scenes = tuple(sorted(entry.name for entry in folder.iterdir() if entry.is_dir() and any(entry.glob("*.npz"))))
     if not scenes:
         raise InputError(f"{folder} holds no SCENE/*.npz; minisplat-ref oracle export DIR shows the format")
-    return Renderer(str(folder), dtype, False, lambda truth: _read(folder / truth.name, truth), scenes=scenes)
+    return ComparedRenderer(str(folder), dtype, False, lambda truth: _read(folder / truth.name, truth), scenes=scenes)
 
 
 def _read(folder: Path, truth: Golden) -> Arrays:
@@ -139,7 +117,7 @@ def _check_kind(file: Path, name: str, array: NDArray[Any]) -> None:
 NOT_OF_GSPLAT = ("loss", "statistics", "surface", "adam")  # stages that gsplat's functions in torch do not have
 
 
-def _gsplat_torch(dtype: str) -> Renderer:
+def _gsplat_torch(dtype: str) -> ComparedRenderer:
     from minisplat_ref.oracle.peers.cuda import rules_of
     from minisplat_ref.oracle.peers.gsplat_torch import gsplat_torch
 
@@ -151,22 +129,22 @@ def _gsplat_torch(dtype: str) -> Renderer:
     return from_backend(backend, dtype)._replace(arrays=arrays, rules=rules_of(GSPLAT_1_5))
 
 
-def _gsplat() -> Renderer:
+def _gsplat() -> ComparedRenderer:
     from minisplat_ref.oracle.peers.cuda import gsplat_cuda
 
     return gsplat_cuda()
 
 
-def _inria() -> Renderer:
+def _inria() -> ComparedRenderer:
     from minisplat_ref.oracle.peers.cuda import inria_cuda
 
     return inria_cuda()
 
 
-OTHERS: dict[str, Callable[[], Renderer]] = {"gsplat": _gsplat, "inria": _inria}  # float32 only
+OTHERS: dict[str, Callable[[], ComparedRenderer]] = {"gsplat": _gsplat, "inria": _inria}  # float32 only
 
 
-def choose_renderer(name: str, dtype: str | None) -> Renderer:
+def choose_renderer(name: str, dtype: str | None) -> ComparedRenderer:
     """Return the renderer of a name.
 
     Parameters
@@ -213,8 +191,8 @@ def is_function(name: str) -> bool:
     return ":" in name and name.partition(":")[0] not in ("planted", "profile") and not Path(name).is_dir()
 
 
-def choose_function(name: str, dtype: str | None, profile: str | None, arrays: str | None) -> Renderer:
-    """Renderer of ``package.module:function``.
+def choose_function(name: str, dtype: str | None, profile: str | None, arrays: str | None) -> ComparedRenderer:
+    """Return the renderer of ``package.module:function``.
 
     Parameters
     ----------
@@ -240,13 +218,13 @@ def choose_function(name: str, dtype: str | None, profile: str | None, arrays: s
 
 
 def choose_scenes(
-    renderer: Renderer, name: str, against: str, profile: str | None
+    renderer: ComparedRenderer, name: str, against: str, profile: str | None
 ) -> tuple[dict[str, Golden], tuple[str, ...]]:
     """Return the truths for a renderer.
 
     Parameters
     ----------
-    renderer : Renderer
+    renderer : ComparedRenderer
         Says which conventions it follows, and which scenes it has.
     name : str
         Of a scene, or ``"all"`` that the renderer has.

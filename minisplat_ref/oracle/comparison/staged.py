@@ -13,8 +13,8 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.cases import Case, Figure, Report
 from minisplat_ref.oracle.comparison.doubts import doubts
 from minisplat_ref.oracle.comparison.measures import Bounds, Difference, compare_bounds, compare_lists, difference
-from minisplat_ref.oracle.comparison.renderers import Renderer
 from minisplat_ref.oracle.golden.format import SPECS, STAGE_COTANGENTS, STAGE_INPUTS, Arrays, Golden, names_of
+from minisplat_ref.oracle.renderer import ComparedRenderer
 from minisplat_ref.types import Bools
 
 Status = Literal["agrees", "diverges", "harmless", "not given"]
@@ -84,12 +84,12 @@ class Row(NamedTuple):
     """One line."""
 
 
-def compare_scene(renderer: Renderer, truth: Golden) -> list[Row]:
+def compare_scene(renderer: ComparedRenderer, truth: Golden) -> list[Row]:
     """Compare one scene.
 
     Parameters
     ----------
-    renderer : Renderer
+    renderer : ComparedRenderer
         The renderer that is compared.
     truth : Golden
         All arrays, by the conventions that the renderer follows.
@@ -136,7 +136,7 @@ def excess(row: Row) -> float:
     return row.difference.excess if row.difference is not None else 0.0
 
 
-def _relation(renderer: Renderer, row: Row, first: Row) -> str:
+def _relation(renderer: ComparedRenderer, row: Row, first: Row) -> str:
     """Say how a difference is related to the first one; return nothing if neither can cause the other.
 
     It may follow from the first if it is computed from the wrong values; if the truth is the input of every stage, this
@@ -174,7 +174,7 @@ _PARTS_OF_VIEW = (*names_of("composite", "output"), "accumulated_depth")
 _PARTS_OF_V_VIEW = tuple(name for stage in ("composite", "project", "colors") for name in names_of(stage, "gradient"))
 
 
-def _check_shapes(renderer: Renderer, given: Arrays, truth: Golden) -> None:
+def _check_shapes(renderer: ComparedRenderer, given: Arrays, truth: Golden) -> None:
     free = ("gaussian_ids", "tile_offsets", "tile_size", "radii")  # checked where they are judged
     for name, array in given.items():
         expected = truth.arrays[name].shape
@@ -202,7 +202,7 @@ def _row_of_bounds(scene: str, stage: str, bounds: Bounds | None) -> Row:
 
 
 def _row_of_arrays(
-    renderer: Renderer,
+    renderer: ComparedRenderer,
     given: Arrays,
     truth: Golden,
     stage: str,
@@ -253,7 +253,7 @@ def _shape_of_error(given: np.ndarray, expected: np.ndarray, d: Difference) -> s
     return " ".join(filter(None, [words, f"times {factor:.4g}" if is_factor else ""]))
 
 
-def as_report(renderer: Renderer, rows: list[Row], settings: Mapping[str, Any]) -> Report:
+def as_report(renderer: ComparedRenderer, rows: list[Row], settings: Mapping[str, Any]) -> Report:
     """Return one case for each stage that was given, with the scene of the largest error."""
     scenes = list(dict.fromkeys(row.scene for row in rows))
     first = first_divergence(rows)

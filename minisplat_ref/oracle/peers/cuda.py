@@ -16,16 +16,16 @@ import numpy as np
 
 from minisplat_ref.constants import GSPLAT_1_5, GSPLAT_MAIN, INRIA, Conventions
 from minisplat_ref.errors import InputError
-from minisplat_ref.oracle.comparison.renderers import Renderer
 from minisplat_ref.oracle.golden.format import Arrays, Golden
 from minisplat_ref.oracle.golden.running import COLORS_GRADIENT, PROJECT_GRADIENT, grid_of, reference_bins
+from minisplat_ref.oracle.renderer import ComparedRenderer
 from minisplat_ref.types import Floats
 
 TILE = 16  # pixels
 Tensor = Any
 
 
-def gsplat_cuda() -> Renderer:
+def gsplat_cuda() -> ComparedRenderer:
     """Compare the installed gsplat.
 
     Raises
@@ -44,7 +44,7 @@ def gsplat_cuda() -> Renderer:
     return from_functions(gsplat, f"gsplat {gsplat.__version__}", profile, "cuda")
 
 
-def from_functions(functions: ModuleType, name: str, profile: Conventions, device: str) -> Renderer:
+def from_functions(functions: ModuleType, name: str, profile: Conventions, device: str) -> ComparedRenderer:
     """Compare functions of gsplat's names and signatures.
 
     Parameters
@@ -64,7 +64,7 @@ def from_functions(functions: ModuleType, name: str, profile: Conventions, devic
         scene = _Scene(functions, truth, device)
         return _project(scene) | _list_tiles(scene) | _shade(scene) | _composite(scene)
 
-    return Renderer(name, "float32", True, arrays, rules_of(profile))
+    return ComparedRenderer(name, "float32", True, arrays, rules_of(profile))
 
 
 def rules_of(profile: Conventions) -> Callable[[Conventions], Conventions | None]:
@@ -200,7 +200,7 @@ def _numpy(value: Tensor) -> Floats:
 NEAR, FAR = 0.01, 100.0  # of the projection matrix, whose depth is only tested for being in front
 
 
-def inria_cuda() -> Renderer:
+def inria_cuda() -> ComparedRenderer:
     """Compare the installed ``diff_gaussian_rasterization``.
 
     Raises
@@ -221,13 +221,13 @@ def inria_cuda() -> Renderer:
     return from_module(rasterizer, "cuda")
 
 
-def from_module(rasterizer: ModuleType, device: str) -> Renderer:
+def from_module(rasterizer: ModuleType, device: str) -> ComparedRenderer:
     """Compare a module of the names ``GaussianRasterizationSettings`` and ``GaussianRasterizer``."""
 
     def rules(asked: Conventions) -> Conventions | None:
         return INRIA if asked == INRIA else None
 
-    return Renderer(
+    return ComparedRenderer(
         "diff_gaussian_rasterization",
         "float32",
         False,

@@ -16,11 +16,11 @@ import numpy as np
 
 from minisplat_ref.constants import GSPLAT_MAIN, Conventions
 from minisplat_ref.errors import InputError
-from minisplat_ref.oracle.comparison.renderers import Renderer
 from minisplat_ref.oracle.golden.format import Arrays, Golden
 from minisplat_ref.oracle.golden.running import VIEW_GRADIENT
 from minisplat_ref.oracle.peers.array_kinds import ARRAY_KINDS, Call, Result, kind_of, run
 from minisplat_ref.oracle.peers.cuda import rules_of
+from minisplat_ref.oracle.renderer import ComparedRenderer
 from minisplat_ref.types import Floats
 
 PRIMITIVES = ("means", "quats", "scales", "opacities")
@@ -50,7 +50,7 @@ def from_function(
     arrays: str | None = None,
     dtype: str = "float32",
     profile: Conventions = GSPLAT_MAIN,
-) -> Renderer:
+) -> ComparedRenderer:
     """Compare a function.
 
     Parameters
@@ -88,7 +88,7 @@ def from_function(
     def give(truth: Golden) -> Arrays:
         return _colors(rasterizer, truth, dtype) | _features(rasterizer, truth, dtype) | _view(rasterizer, truth, dtype)
 
-    return Renderer(f"{called} {dtype}", dtype, False, give, drawn, ignores=("v_depths",))
+    return ComparedRenderer(f"{called} {dtype}", dtype, False, give, drawn, ignores=("v_depths",))
 
 
 def _parameters(function: Callable[..., Any], name: str) -> Callable[[str], bool]:
