@@ -156,7 +156,7 @@ def short() -> str:
     lines = []
     for number, part in enumerate(ORDER, 1):
         notebooks = _ranges({notebook for step in part.steps for notebook in step.notebooks})
-        line = f"{number}. {part.subject}: {_quoted(part.files)}"
+        line = f"{number}. {part.subject}: {_quote_files(part.files)}"
         lines.append(f"{line}; notebook{'s' if len(notebooks) > 2 else ''} {notebooks}" if notebooks else line)
     return "\n".join(lines)
 
@@ -167,7 +167,7 @@ def full() -> str:
     for part in ORDER:
         for k, step in enumerate(part.steps):
             notebooks = ", ".join(f"{number:02}" for number in step.notebooks)
-            cells = (part.subject if k == 0 else "", _quoted(step.files), notebooks, step.content)
+            cells = (part.subject if k == 0 else "", _quote_files(step.files), notebooks, step.content)
             lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
@@ -175,7 +175,7 @@ def full() -> str:
 PAGES = {ROOT / "README.md": short, ROOT / "docs" / "ARCHITECTURE.md": full}
 
 
-def _quoted(files: tuple[str, ...]) -> str:
+def _quote_files(files: tuple[str, ...]) -> str:
     return ", ".join(f"`{file}`" for file in files)
 
 

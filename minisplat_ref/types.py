@@ -315,7 +315,7 @@ class View(NamedTuple):
         return self
 
 
-def numbered(views: Iterable[View]) -> tuple[View, ...]:
+def number_views(views: Iterable[View]) -> tuple[View, ...]:
     """Return training views with their indices as ``view_id``."""
     return tuple(view._replace(view_id=i) for i, view in enumerate(views))
 

@@ -53,7 +53,7 @@ from minisplat_ref.types import TileGrid
 # %%
 scene = make_scene("room", n_views=14, width=64, height=48, n_points=1500, supersampling=3).scene
 recipe = get_recipe("3dgs", iterations=60)
-rates = recipe.learning_rates.changed(log_scales=0.03, opacity_logits=0.3, sh_dc=0.02)
+rates = recipe.learning_rates.change(log_scales=0.03, opacity_logits=0.3, sh_dc=0.02)
 recipe = recipe._replace(learning_rates=rates, events=(), sh_milestones=())
 view = scene.test_views[1]
 state, losses = initial_state(scene, recipe, seed=0), []

@@ -41,7 +41,7 @@ from minisplat_ref.training.adam import adam_step
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.rates import active_sh_degree
-from minisplat_ref.training.schedule import Every, configured, scaled
+from minisplat_ref.training.schedule import Every, configure, scale_recipe
 
 # %%
 scene = make_scene("room", n_views=24, width=80, height=60, n_points=600, seed=0).scene
@@ -96,7 +96,7 @@ print_events(RECIPES["3dgs-accel"])
 print_events(get_recipe("3dgs-accel", ITERATIONS))
 
 # %% [markdown]
-# An event needs gradients from most views, so `scaled` leaves at least 100 iterations between two events that add
+# An event needs gradients from most views, so `scale_recipe` leaves at least 100 iterations between two events that add
 # Gaussians (`min_gap`). In a run as short as this one, a single event would remain. With 24 views a gap of 40
 # iterations is enough, and an opacity reset needs time to recover: we ask for gaps of 40 and 120. That takes one line,
 # because events are tuples.
@@ -113,7 +113,7 @@ def retimed(event):
 def recipe_of(iterations):
     """3dgs-accel with these gaps, compressed to a number of iterations."""
     published = RECIPES["3dgs-accel"]
-    return scaled(published._replace(events=tuple(map(retimed, published.events))), iterations)
+    return scale_recipe(published._replace(events=tuple(map(retimed, published.events))), iterations)
 
 
 recipe = recipe_of(ITERATIONS)
@@ -346,7 +346,7 @@ plt.show()
 left_out = {"reset_opacity"}
 n_iterations, threshold = 400, 2e-4
 
-my_recipe = configured(recipe_of(n_iterations), threshold=threshold)
+my_recipe = configure(recipe_of(n_iterations), threshold=threshold)
 my_events = tuple(e for e in my_recipe.events if partial(e.action).func.__name__ not in left_out)
 mine = train(scene, my_recipe._replace(events=my_events), seed=0).gaussians
 image = render(mine, held_out.camera, background=scene.background)[0].image

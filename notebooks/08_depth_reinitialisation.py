@@ -50,7 +50,7 @@ from minisplat_ref.studies.depth_types import (
     OFF_SURFACE,
     Choice,
     depth_errors,
-    drawn_points,
+    draw_points,
     errors,
 )
 from minisplat_ref.training.adam import zero_moments
@@ -181,7 +181,7 @@ def drawn(name, choice):
     """Draw points with a fixed generator: points [P, 3], their pixels [P], colours [P, 3] in 0 .. 1."""
     scene = truths[name].scene
     n_points = round(POINTS_PER_PIXEL * sum(view.camera.width * view.camera.height for view in scene.train_views))
-    points, pixels = drawn_points(trained[name], scene, choice, np.random.default_rng(0), n_points)
+    points, pixels = draw_points(trained[name], scene, choice, np.random.default_rng(0), n_points)
     return points, pixels, np.concatenate([v.image.reshape(-1, 3) for v in scene.train_views])[pixels] / 255
 
 

@@ -37,7 +37,7 @@ from minisplat_ref.metrics import evaluate
 from minisplat_ref.rendering import RenderSettings, render
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import DatedEvent, During, Every, SmallerViews, configured, scaled
+from minisplat_ref.training.schedule import DatedEvent, During, Every, SmallerViews, configure, scale_recipe
 
 # %%
 ITERATIONS = 900
@@ -54,7 +54,7 @@ def named(action):
 def shortened(recipe, iterations=ITERATIONS):
     """Return the recipe for few views and iterations."""
     halved = [e._replace(min_gap=-(-e.min_gap // 2)) if isinstance(e, Every) else e for e in recipe.events]
-    return scaled(recipe._replace(events=tuple(halved)), iterations)
+    return scale_recipe(recipe._replace(events=tuple(halved)), iterations)
 
 
 def due_steps(event):
@@ -254,7 +254,7 @@ plt.show()
 name, n_iterations, budget = "mini-splatting2", 900, 300
 
 settings = {} if budget is None else {"budget": budget}
-mine = run(configured(shortened(RECIPES[name], n_iterations), **settings))[0]
+mine = run(configure(shortened(RECIPES[name], n_iterations), **settings))[0]
 figure, axes = plt.subplots(1, 3, figsize=(9.5, 2.7))
 show(axes[0], truth, "photograph, held out")
 for panel, gaussians, title in ((axes[1], results["mini-splatting2"][0], "above"), (axes[2], mine, "yours")):

@@ -51,7 +51,7 @@ from minisplat_ref.extensions.omg.reference import distinct_importance, local_di
 from minisplat_ref.extensions.proxies.affine import Affine, edit_gaussians, rotation_about
 from minisplat_ref.extensions.proxies.binding import bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid
-from minisplat_ref.extensions.proxies.edit_claims import RADIUS, flat_gaussians, rolled
+from minisplat_ref.extensions.proxies.edit_claims import RADIUS, flat_gaussians, roll
 from minisplat_ref.extensions.proxies.edit_claims import camera as card_camera
 from minisplat_ref.mechanisms.meshes.mesh import Mesh
 from minisplat_ref.mechanisms.packing.container import parse
@@ -210,7 +210,7 @@ plt.show()
 # %% tags=["rounding"]
 scene = make_scene("room", n_views=14, width=64, height=48, n_points=1500, supersampling=3).scene
 recipe = get_recipe("3dgs", iterations=60)
-rates = recipe.learning_rates.changed(log_scales=0.03, opacity_logits=0.3, sh_dc=0.02)
+rates = recipe.learning_rates.change(log_scales=0.03, opacity_logits=0.3, sh_dc=0.02)
 recipe = recipe._replace(learning_rates=rates, events=(), sh_milestones=())
 room = train(scene, recipe, seed=0, backend=CPU).gaussians
 view = scene.test_views[1]
@@ -372,7 +372,7 @@ for level, content in files.items():
 card = flat_gaussians(np.random.default_rng(0))
 N_CELLS = 12
 mesh = grid(np.array([-1.0, -1.0, 0.0]), np.array([2.0, 0, 0]), np.array([0, 2.0, 0]), (N_CELLS, N_CELLS))
-bent_mesh = Mesh(rolled(mesh.vertices), mesh.faces)
+bent_mesh = Mesh(roll(mesh.vertices), mesh.faces)
 binding = bind(card, mesh)
 bent = rebuild(bent_mesh, binding)
 moved = card._replace(means=bent.means)

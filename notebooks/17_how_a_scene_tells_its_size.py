@@ -43,7 +43,7 @@ from minisplat_ref.strategy.ops import concat
 from minisplat_ref.training.calibration import EXPOSURES
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import held_out_ids, trained_ids
-from minisplat_ref.training.schedule import configured
+from minisplat_ref.training.schedule import configure
 from minisplat_ref.types import Camera, Gaussians
 
 # %%
@@ -247,7 +247,7 @@ for view, gain in zip(plain.train_views, true_gains, strict=True):
     disturbed_views.append(view._replace(image=pixels))
 disturbed = plain._replace(train_views=tuple(disturbed_views))
 log = {"counts": [], "grown": [], "around the prune": []}
-short = configured(recipe, min_step=500)._replace(iterations=1000)
+short = configure(recipe, min_step=500)._replace(iterations=1000)
 state = train(disturbed, short, seed=0, on_step=partial(note, log))
 
 held = held_out_ids(len(true_gains), recipe.cooling.hold_out_every)

@@ -38,7 +38,7 @@ from minisplat_ref.constants import SH_C0
 from minisplat_ref.extensions.analytic.footprint import OPACITY, approximations, covariance, truth
 from minisplat_ref.extensions.analytic.reference import NORMAL, integrals
 from minisplat_ref.extensions.cuts import card
-from minisplat_ref.extensions.cuts.curve import VERTICES, cut
+from minisplat_ref.extensions.cuts.curve import VERTICES, evaluate_cuts
 from minisplat_ref.extensions.fans.method import render as render_fans
 from minisplat_ref.extensions.fans.profile import fan_profile, profile_error
 from minisplat_ref.extensions.fans.shapes import FanShape, convert_gaussians, mesh_of
@@ -62,7 +62,7 @@ from minisplat_ref.types import Camera, Model, view_from
 SIZE = card.SIZE
 ys, xs = np.mgrid[:SIZE, :SIZE] + 0.5
 centers = np.column_stack([xs.ravel(), ys.ravel()])
-one = card.spread(1, np.random.default_rng(0))
+one = card.place_cards(1, np.random.default_rng(0))
 one = type(one)(*(field.astype(np.float64) for field in one))
 one = one._replace(log_scales=np.log(np.full((1, 3), 0.45)), opacity_logits=np.array([4.0]))
 
@@ -94,11 +94,11 @@ for degree in range(4):
     terms = alpha.reshape(-1, 1) * basis[:, : (degree + 1) ** 2]
     k = np.linalg.lstsq(terms, ball.reshape(-1, 3), rcond=None)[0]
     textured[degree] = painted(k)
-tries = [card.fitted(card.Target(ball, lambda rows: rows), 5, False, 1500, seed) for seed in (0, 2)]
-five = max(tries, key=lambda population: psnr_of(card.drawn(population), ball))
+tries = [card.fit_card(card.Target(ball, lambda rows: rows), 5, False, 1500, seed) for seed in (0, 2)]
+five = max(tries, key=lambda population: psnr_of(card.render_card(population), ball))
 
 pictures = {f"degree {degree}": (drawn(g), floats_of(g)) for degree, g in textured.items()}
-pictures["five plain"] = (card.drawn(five), 5 * floats_of(one))
+pictures["five plain"] = (card.render_card(five), 5 * floats_of(one))
 figure, axes = plt.subplots(1, 6, figsize=(11, 2.4))
 show(axes[0], ball, "a soft ball")
 for panel, (name, (image, n_floats)) in zip(axes[1:], pictures.items(), strict=True):
@@ -175,7 +175,7 @@ falloff = np.exp(-np.sum(d**2, axis=2) / (2 * 3.5**2))
 
 def masked(points, width):
     """Return the mask [81, 81] of a curve."""
-    return cut(points[None], np.array([width]), d.reshape(1, -1, 2)).masks.reshape(81, 81)
+    return evaluate_cuts(points[None], np.array([width]), d.reshape(1, -1, 2)).masks.reshape(81, 81)
 
 
 figure, axes = plt.subplots(1, 4, figsize=(11, 2.9))
@@ -202,10 +202,10 @@ plt.show()
 
 # %% tags=["rounding"]
 half = card.cut_gaussian()
-plain = {number: card.fitted(half, number, False, 300, seed=3) for number in (1, 4)}
-with_cut = {seed: card.fitted(half, 1, True, 300, seed) for seed in (3, 1)}
+plain = {number: card.fit_card(half, number, False, 300, seed=3) for number in (1, 4)}
+with_cut = {seed: card.fit_card(half, 1, True, 300, seed) for seed in (3, 1)}
 found = {"1 plain": plain[1], "4 plain": plain[4], "1 with a cut": with_cut[3], "begun left": with_cut[1]}
-results = {name: (card.drawn(g), card.measured(half, g)) for name, g in found.items()}
+results = {name: (card.render_card(g), card.measure_card(half, g)) for name, g in found.items()}
 
 figure, axes = plt.subplots(1, 6, figsize=(11, 2.5), width_ratios=(1, 1, 1, 1, 1, 1.9))
 show(axes[0], half.image, "half a Gaussian")
@@ -290,8 +290,8 @@ ATTEMPTS = {"line": ((3, 1), (1, 2)), "triangle": ((4, 1), (1, 3)), "letter": ((
 
 def best_fit(target, n, n_vertices):
     """Return the better of two fits, its picture and its PSNR."""
-    fits = [fit.fitted(target, n, n_vertices=n_vertices, iterations=400, seed=seed) for seed in range(2)]
-    pictures = [fit.drawn(population) for population in fits]
+    fits = [fit.fit_primitives(target, n, n_vertices=n_vertices, iterations=400, seed=seed) for seed in range(2)]
+    pictures = [fit.render_primitives(population) for population in fits]
     psnrs = [psnr_of(image, target) for image in pictures]
     best = int(np.argmax(psnrs))
     return fits[best], pictures[best], psnrs[best]
@@ -358,14 +358,16 @@ sheet = sheet._replace(log_scales=sheet.log_scales - np.log(2.5))  # so small th
 soup = soup_of(sheet, 8)
 SHEAR = np.array([[1.0, 0.5, 0.0], [0.0, 0.8, 0.0], [0.3, 0.0, 1.0]])
 edits = {"at rest": soup.corners, "sheared": soup.corners @ SHEAR.T}
-edits["bent by 180 degrees"] = polygon_claims.bent(soup.corners, 180)
+edits["bent by 180 degrees"] = polygon_claims.bend(soup.corners, 180)
 misses = {}
 figure, axes = plt.subplots(1, 4, figsize=(11, 3), width_ratios=(1, 1, 1, 1.1))
 paint = np.column_stack([np.clip(0.5 + SH_C0 * sheet.sh_dc[soup.rows], 0, 1), np.full(len(soup.rows), 0.5)])
 for panel, (name, corners) in zip(axes, edits.items(), strict=False):
     refit = rims(*fit_spans(corners, soup.radii), soup.radii, 8)
     misses[name] = np.abs(refit - corners).max()
-    seen, seen_refit = (in_view[..., :2] / in_view[..., 2:] for in_view in map(polygon_claims.placed, (corners, refit)))
+    seen, seen_refit = (
+        in_view[..., :2] / in_view[..., 2:] for in_view in map(polygon_claims.place_sheet, (corners, refit))
+    )
     panel.add_collection(PolyCollection(seen, facecolors=paint, edgecolors="black", linewidths=0.6))
     panel.add_collection(PolyCollection(seen_refit, facecolors="none", edgecolors=RED, linewidths=0.7))
     panel.set(aspect="equal", xlim=(-0.42, 0.42), ylim=(0.3, -0.4), xticks=[], yticks=[])
@@ -375,7 +377,7 @@ for angle, color in ((45, BLUE), (180, RED)):
     found = []
     for number in per_side:
         these = soup_of(polygon_claims.sheet(number), 8)
-        corners = polygon_claims.bent(these.corners, angle)
+        corners = polygon_claims.bend(these.corners, angle)
         refit = rims(*fit_spans(corners, these.radii), these.radii, 8)
         spread = np.sqrt(np.mean((corners - corners.mean(axis=1, keepdims=True)) ** 2))
         found.append(np.sqrt(np.mean((refit - corners) ** 2)) / spread)
@@ -501,7 +503,7 @@ plt.show()
 # A higher degree is never worse, and paint gains several dB; as many numbers in five plain Gaussians gain as much.
 psnrs = [psnr_of(drawn(textured[degree]), ball) for degree in range(4)]
 assert np.all(np.diff(psnrs) > 0) and psnrs[3] > psnrs[0] + 5
-assert abs(psnr_of(card.drawn(five), ball) - psnrs[3]) < 3
+assert abs(psnr_of(card.render_card(five), ball) - psnrs[3]) < 3
 # Beyond the limb a texture goes on without a jump.
 assert np.abs(np.diff(across)).max() < 0.2 * np.abs(np.diff(without)).max()
 # A mask is a step, a soft one is in between, and both cut away the same side.

@@ -67,7 +67,7 @@ class Text(NamedTuple):
     words: list[str]
     gaps: list[str]  # one more than words
 
-    def joined(self) -> bytes:
+    def join(self) -> bytes:
         """Return the text, with whatever could not be encoded."""
         pairs = (part for pair in zip(self.gaps, [*self.words, ""], strict=True) for part in pair)
         return "".join(pairs).encode("utf-8", errors="surrogatepass")
@@ -145,7 +145,7 @@ def change_text(content: bytes, choose: Choose) -> bytes:
             words[one_of(numbers, choose)] = one_of(WORDS, choose)
         case _:
             words[i] = one_of(WORDS, choose)
-    return text.joined()
+    return text.join()
 
 
 def change_json(content: bytes, choose: Choose) -> bytes:

@@ -28,10 +28,10 @@ from minisplat_ref.runs.run_folder import CONFIG
 from minisplat_ref.strategy.initialization import from_points
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.saved_state import load_state, save_state
-from minisplat_ref.training.schedule import configured
+from minisplat_ref.training.schedule import configure
 from minisplat_ref.types import Gaussians
 
-RECIPE = configured(get_recipe("3dgs-accel"), exposure=True)
+RECIPE = configure(get_recipe("3dgs-accel"), exposure=True)
 
 
 class Reader(NamedTuple):

@@ -78,7 +78,7 @@ def benchmark(
             times = Times([expected.forward_seconds], [expected.backward_seconds])
             entries.append(Entry(contender, _flawless(), "", times))
         else:
-            entries.append(_judged(contender, workload, expected, trust))
+            entries.append(_judge(contender, workload, expected, trust))
     for round_ in range(repeats):
         report(f"{workload.name}: round {round_ + 1} of {repeats}")
         for entry in entries:
@@ -88,7 +88,7 @@ def benchmark(
     return [_case(workload, entry, baseline.times if baseline else Times([], [])) for entry in entries]
 
 
-def _judged(contender: Contender, workload: Workload, expected: Expected, trust: str) -> Entry:
+def _judge(contender: Contender, workload: Workload, expected: Expected, trust: str) -> Entry:
     if contender.slack:  # its margins come from the float64 kernels, if those are right
         expected = with_slack(expected, workload, contender.conventions, contender.slack)
     verdict = judge(contender, workload, expected)

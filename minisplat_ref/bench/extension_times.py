@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from minisplat_ref.backends import CPU, PLAIN, REFERENCE, Backend
-from minisplat_ref.bench.interleaving import Times, interleaved_times, seconds_of
+from minisplat_ref.bench.interleaving import Times, seconds_of, time_interleaved
 from minisplat_ref.bench.textbook import TEXTBOOK
 from minisplat_ref.bench.workloads import Workload
 from minisplat_ref.extensions.extension import CORE, Extension
@@ -84,7 +84,7 @@ def extension_cases(
         answers[row.extension.name] = steps.answer()
     report(f"{workload.name}: {len(kernels)} renderers, interleaved")
     tasks = [_Steps(row, workload) for row in kernels]
-    times = interleaved_times([[s.forward for s in tasks], [s.backward for s in tasks]], repeats, 1)
+    times = time_interleaved([[s.forward for s in tasks], [s.backward for s in tasks]], repeats, 1)
     of = {row.name: pair for row, *pair in zip(kernels, *times, strict=True)}
     baseline = sum(time.least for time in of[BASELINE])
     cases = [_case(workload, row, own_times[row.name], None, baseline) for row in references]

@@ -41,7 +41,7 @@ def pareto_figure(cases: Sequence[Case]) -> "Figure":
     """
     from matplotlib.figure import Figure
 
-    timed = _timed(cases)
+    timed = _time_cases(cases)
     workloads = _workloads(timed) or ["nothing was timed"]
     styles = _styles(timed)
     figure = Figure(figsize=(12, 0.8 + 4.4 * len(workloads)), layout="constrained")
@@ -59,7 +59,7 @@ def pareto_section(cases: Sequence[Case]) -> str:
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    timed, panels = _timed(cases), []
+    timed, panels = _time_cases(cases), []
     styles = _styles(timed)
     for workload in _workloads(timed):
         for kind in PANELS:
@@ -82,7 +82,7 @@ def save_figure(cases: Sequence[Case], path: str | Path) -> None:
     save_png(pareto_figure(cases), Path(path))
 
 
-def _timed(cases: Sequence[Case]) -> list[Case]:
+def _time_cases(cases: Sequence[Case]) -> list[Case]:
     return [case for case in cases if case.passed and case.figures.get(TIME)]
 
 

@@ -39,7 +39,7 @@ def seconds_of(task: Task) -> float:
     return time.perf_counter() - start
 
 
-def interleaved_times(groups: Sequence[Sequence[Task]], rounds: int, repeats: int) -> list[list[Times]]:
+def time_interleaved(groups: Sequence[Sequence[Task]], rounds: int, repeats: int) -> list[list[Times]]:
     """Time tasks; those in a group alternate.
 
     Parameters
@@ -66,5 +66,5 @@ def interleaved_times(groups: Sequence[Sequence[Task]], rounds: int, repeats: in
 
 def time_contests(contests: Sequence[Contest], repeats: int) -> list[Case]:
     """Time all tasks in ``ROUNDS`` rounds; return the cases of all contests, in their order."""
-    times = interleaved_times([contest.tasks for contest in contests], ROUNDS, repeats)
+    times = time_interleaved([contest.tasks for contest in contests], ROUNDS, repeats)
     return [case for contest, own in zip(contests, times, strict=True) for case in contest.judge(own)]

@@ -15,7 +15,7 @@ from minisplat_ref.oracle.cases import Case
 REST, WHOLE = "rest", "whole iteration"
 
 
-def timed(backend: Backend, seconds: dict[str, float]) -> Backend:
+def time_stages(backend: Backend, seconds: dict[str, float]) -> Backend:
     """Return the backend with a timer around each stage.
 
     Parameters
@@ -25,11 +25,11 @@ def timed(backend: Backend, seconds: dict[str, float]) -> Backend:
         Receives the total time of every stage that is called, by its name.
     """
     stages: dict[str, Any] = {field.name: getattr(backend, field.name) for field in fields(backend)}
-    watched: dict[str, Any] = {name: _timed(f, name, seconds) for name, f in stages.items() if callable(f)}
+    watched: dict[str, Any] = {name: _add_timer(f, name, seconds) for name, f in stages.items() if callable(f)}
     return replace(backend, **watched)
 
 
-def _timed(function: Callable, name: str, seconds: dict[str, float]) -> Callable:
+def _add_timer(function: Callable, name: str, seconds: dict[str, float]) -> Callable:
     @wraps(function)
     def stage(*args: Any, **kwargs: Any) -> Any:
         start = time.perf_counter()
@@ -46,7 +46,7 @@ def profile_cases(seconds: dict[str, float], total: float, iterations: int) -> l
     Parameters
     ----------
     seconds : dict
-        From :func:`timed`, of all iterations.
+        From :func:`time_stages`, of all iterations.
     total : float
         Seconds of all iterations.
     iterations : int

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.backends import CPU
-from minisplat_ref.bench.interleaving import interleaved_times
+from minisplat_ref.bench.interleaving import time_interleaved
 from minisplat_ref.bench.workloads import Workload, synth
 from minisplat_ref.oracle.cases import Case, Figure
 from minisplat_ref.oracle.tolerances import BENCH_FLIPPED_PIXELS, BENCH_FLOAT32_IMAGE
@@ -65,7 +65,7 @@ def slope_cases(repeats: int, report: Callable[[str], None] = lambda _: None) ->
         report(f"slopes: {n:,} Gaussians, {width} x {height}")
         views.append(_view(synth(n, width, height, FOCAL_OF_WIDTH * width)))
     report("slopes: taking turns")
-    [times] = interleaved_times([[view.draw for view in views]], 1, repeats)
+    [times] = time_interleaved([[view.draw for view in views]], 1, repeats)
     least = [view.least for view in times]
     cases = [_case(view, seconds) for view, seconds in zip(views, least, strict=True)]
     sizes = [(len(v.workload.gaussians.means), v.workload.camera.width * v.workload.camera.height) for v in views]

@@ -16,7 +16,7 @@ import numpy as np
 from minisplat_ref.backends import CPU, Backend
 from minisplat_ref.bench.interleaving import seconds_of
 from minisplat_ref.bench.opensplat import iteration_seconds
-from minisplat_ref.bench.profiling import REST, WHOLE, profile_cases, timed
+from minisplat_ref.bench.profiling import REST, WHOLE, profile_cases, time_stages
 from minisplat_ref.bench.roofline import StraightLines
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.io import load_scene
@@ -46,7 +46,7 @@ def profile(folder: Path | None, downscale: int, iterations: int) -> list[Case]:
         To time.
     """
     seconds: dict[str, float] = {}
-    total = sum(_train(_scene(folder, downscale), iterations, timed(CPU, seconds), seconds.clear))
+    total = sum(_train(_scene(folder, downscale), iterations, time_stages(CPU, seconds), seconds.clear))
     return profile_cases(seconds, total, iterations)
 
 
@@ -77,7 +77,9 @@ def thread_cases(folder: Path | None, downscale: int, iterations: int) -> list[C
                 for step in range(first, min(first + TURN, WARM_UP + iterations + 1)):
                     seconds: dict[str, float] = {}
                     start = time.perf_counter()
-                    train(scene, recipe._replace(iterations=step), seed=0, state=state, backend=timed(CPU, seconds))
+                    train(
+                        scene, recipe._replace(iterations=step), seed=0, state=state, backend=time_stages(CPU, seconds)
+                    )
                     total = time.perf_counter() - start
                     line = seconds_of(lines.forward)
                     measured[n].append({**seconds, REST: total - sum(seconds.values()), WHOLE: total, LINE: line})

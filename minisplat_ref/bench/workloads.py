@@ -41,14 +41,14 @@ def synth(n: int = SYNTH_SIZE, width: int = 480, height: int = 270, focal: float
     Centres are uniform in [-1, 1]^2 x [2, 6], scales log-normal with median 0.01, opacities sigmoid(N(0, 2)), colours
     uniform and without view dependence; world and camera frame are the same.
     """
-    return _workload("synth", _trained_like(n), _centred(width, height, focal))
+    return _workload("synth", _imitate_training(n), _centre_camera(width, height, focal))
 
 
 def synth5k(n: int = 5_000) -> Workload:
     """Return the first 5,000 Gaussians of ``synth``, twice as large, on a quarter of the pixels."""
-    first = Gaussians._make(field[:n] for field in _trained_like(SYNTH_SIZE))
+    first = Gaussians._make(field[:n] for field in _imitate_training(SYNTH_SIZE))
     doubled = first._replace(log_scales=first.log_scales + np.log(2))
-    return _workload("synth5k", doubled, _centred(240, 135, 200.0))
+    return _workload("synth5k", doubled, _centre_camera(240, 135, 200.0))
 
 
 def garden(data: Path, subset: int | None = None) -> Workload:
@@ -84,7 +84,7 @@ def garden(data: Path, subset: int | None = None) -> Workload:
     rows = np.flatnonzero(points @ R[2] + t[2] > GARDEN_NEAR)
     if subset is not None:
         rows = np.random.default_rng(1).choice(rows, subset, replace=False)
-    camera = _centred(648, 420, GARDEN_FOCAL)._replace(cam_from_world_R=R, cam_from_world_t=t)
+    camera = _centre_camera(648, 420, GARDEN_FOCAL)._replace(cam_from_world_R=R, cam_from_world_t=t)
     name = "garden" if subset is None else "garden20k"
     return _workload(name, Gaussians._make(field[rows] for field in gaussians), camera)
 
@@ -113,7 +113,7 @@ def get_workload(name: str, data: Path | None) -> Workload:
     return WITH_DATA[name](data)
 
 
-def _trained_like(n: int) -> Gaussians:
+def _imitate_training(n: int) -> Gaussians:
     rng = np.random.default_rng(0)
     return Gaussians(
         means=np.column_stack([rng.uniform(-1, 1, (n, 2)), rng.uniform(2, 6, n)]),
@@ -125,7 +125,7 @@ def _trained_like(n: int) -> Gaussians:
     )
 
 
-def _centred(width: int, height: int, focal: float) -> Camera:
+def _centre_camera(width: int, height: int, focal: float) -> Camera:
     return Camera(np.eye(3), np.zeros(3), focal, focal, width / 2, height / 2, width, height)
 
 
@@ -133,12 +133,13 @@ def _workload(name: str, gaussians: Gaussians, camera: Camera) -> Workload:
     """Round everything to float32 numbers, including the camera."""
     v_image = np.random.default_rng(1).normal(size=(camera.height, camera.width, 3))
     camera = camera._replace(
-        cam_from_world_R=_rounded(camera.cam_from_world_R), cam_from_world_t=_rounded(camera.cam_from_world_t)
+        cam_from_world_R=_round_to_float32(camera.cam_from_world_R),
+        cam_from_world_t=_round_to_float32(camera.cam_from_world_t),
     )
-    return Workload(name, Gaussians._make(map(_rounded, gaussians)), camera, _rounded(v_image))
+    return Workload(name, Gaussians._make(map(_round_to_float32, gaussians)), camera, _round_to_float32(v_image))
 
 
-def _rounded(values: Floats) -> Floats:
+def _round_to_float32(values: Floats) -> Floats:
     return values.astype(np.float32).astype(np.float64)
 
 

@@ -76,7 +76,7 @@ def simplify(asked: "Asked") -> None:
         See :func:`minisplat_ref.runs.simplified_run.simplify_run`.
     """
     from minisplat_ref.reporting import markdown_table
-    from minisplat_ref.runs.simplification_report import TABLE_HEADING, closing_line, table_rows
+    from minisplat_ref.runs.simplification_report import TABLE_HEADING, describe_outcome, table_rows
     from minisplat_ref.runs.simplified_run import simplify_run
 
     result = simplify_run(asked)
@@ -87,4 +87,4 @@ def simplify(asked: "Asked") -> None:
         n = result["chosen"]["n_gaussians"]
         print(f"minisplat-ref: {asked.target} is more than all {n:,} Gaussians that matter", file=sys.stderr)
     print(f"results in {asked.out}: point_cloud.ply, metrics.json, report.html")
-    print(closing_line(result))
+    print(describe_outcome(result))

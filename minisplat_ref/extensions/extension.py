@@ -17,7 +17,7 @@ from minisplat_ref.methods import RECIPES
 from minisplat_ref.studies.study import Study
 from minisplat_ref.training.losses import LossTerm
 from minisplat_ref.training.representation import GAUSSIANS, Representation
-from minisplat_ref.training.schedule import Recipe, scaled
+from minisplat_ref.training.schedule import Recipe, scale_recipe
 from minisplat_ref.types import Gaussians
 
 
@@ -156,7 +156,7 @@ def find_recipe(name: str, iterations: int | None = None, *, extension: str | No
         owner = load_extension(extension)
     if owner is not None:
         recipe = recipe._replace(representation=owner.representation, losses=(*recipe.losses, *owner.losses))
-    return recipe if iterations is None else scaled(recipe, iterations)
+    return recipe if iterations is None else scale_recipe(recipe, iterations)
 
 
 def owner_of(recipe: str, extension: str | None = None) -> Extension | None:

@@ -32,7 +32,7 @@ from minisplat_ref.io.images import (
 from minisplat_ref.io.lens import Lens, pinhole_of, undistort
 from minisplat_ref.io.names import is_file
 from minisplat_ref.io.stored_views import Photograph, Pixels, Shelf, StoredView
-from minisplat_ref.types import Bools, Camera, Floats, Ints, Scene, View, numbered
+from minisplat_ref.types import Bools, Camera, Floats, Ints, Scene, View, number_views
 
 EXTENT_MARGIN = 1.1  # the 3DGS code's factor on the radius of the cameras; the learning rates were tuned with it
 COORDINATE_MAX = 1e18  # world units or pixels; the square of more would overflow float32
@@ -154,7 +154,7 @@ def build_scene(
     folder = source if source.is_dir() else source.parent
     return Scene(
         name=folder.resolve().name,
-        train_views=numbered(views[: len(train_photos)]),
+        train_views=number_views(views[: len(train_photos)]),
         test_views=views[len(train_photos) :],
         points=points,
         point_colors=point_colors,
@@ -294,7 +294,7 @@ def half_size(view: View) -> View:
     width, height = downscaled_size(view.camera.width, view.camera.height, 2)
     camera = rescale_camera(view.camera, width, height)
     if isinstance(view, StoredView):
-        return view.changed(partial(_resize, width=width, height=height))._replace(camera=camera)
+        return view.change(partial(_resize, width=width, height=height))._replace(camera=camera)
     image, mask = _resize(Pixels(view.image, view.mask), width, height)
     return view._replace(camera=camera, image=image, mask=mask)
 

@@ -144,7 +144,7 @@ class StoredView(View):
             return self.load()._replace(**fields)
         return super()._replace(**fields)
 
-    def changed(self, change: Callable[[Pixels], Pixels]) -> View:
+    def change(self, change: Callable[[Pixels], Pixels]) -> View:
         """Return the view with pixels that are computed from its own at every access."""
         photograph = self.photograph
         changed: Any = Photograph(

@@ -8,7 +8,7 @@ from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.methods.gaussian_splatting import GS, GS_ACCEL
 from minisplat_ref.methods.mini_splatting import MINI_SPLATTING, MINI_SPLATTING_D
 from minisplat_ref.methods.mini_splatting2 import MINI_SPLATTING2, MINI_SPLATTING2_D
-from minisplat_ref.training.schedule import Recipe, scaled
+from minisplat_ref.training.schedule import Recipe, scale_recipe
 
 __all__ = ["RECIPES", "get_recipe"]
 
@@ -29,4 +29,4 @@ def get_recipe(name: str, iterations: int | None = None) -> Recipe:
     """
     if name not in RECIPES:
         raise InputError(f"recipe {name!r} does not exist: choose from {', '.join(RECIPES)}")
-    return RECIPES[name] if iterations is None else scaled(RECIPES[name], iterations)
+    return RECIPES[name] if iterations is None else scale_recipe(RECIPES[name], iterations)

@@ -136,7 +136,7 @@ GS = Recipe(
 
 GS_ACCEL = GS._replace(
     name="3dgs-accel",
-    learning_rates=GS.learning_rates.changed(opacity_logits=2.5e-2),
+    learning_rates=GS.learning_rates.change(opacity_logits=2.5e-2),
     adam=AdamRule(is_visible_only=True, has_bias_correction=False),
 )
 """``3dgs-accel``."""

@@ -136,7 +136,7 @@ def reinitialise_from_depth(
         rng=state.rng,
     )
     gaussians = from_points(points, colors, sh_degree=0)
-    start_anew(state, iteration, limited_sizes(gaussians, iteration.scene, largest_size))
+    start_anew(state, iteration, limit_sizes(gaussians, iteration.scene, largest_size))
 
 
 def size_limits(means: Floats, scene: Scene, size_fraction: float) -> Floats:
@@ -149,7 +149,7 @@ def size_limits(means: Floats, scene: Scene, size_fraction: float) -> Floats:
     return size_fraction * np.maximum(scene.extent, np.linalg.norm(means - center, axis=1))
 
 
-def limited_sizes(gaussians: Gaussians, scene: Scene, size_fraction: float) -> Gaussians:
+def limit_sizes(gaussians: Gaussians, scene: Scene, size_fraction: float) -> Gaussians:
     """Return Gaussians that are no larger than :func:`size_limits`.
 
     What begins anew is as large as the distance to its neighbours. Few points far behind the scene are as far from each
@@ -240,7 +240,7 @@ def restart_from_means(state: TrainState, iteration: Iteration, *, sh_degree: in
     No Gaussian begins larger than :func:`size_limits` with the fraction ``largest_size``.
     """
     gaussians = simplification.reinitialise(state.gaussians, sh_degree)
-    start_anew(state, iteration, limited_sizes(gaussians, iteration.scene, largest_size))
+    start_anew(state, iteration, limit_sizes(gaussians, iteration.scene, largest_size))
 
 
 def store_sh(state: TrainState, iteration: Iteration, *, sh_degree: int) -> None:
@@ -296,7 +296,7 @@ _AFTER_SIMPLIFICATION = (
 
 MINI_SPLATTING = GS._replace(
     name="mini-splatting",
-    learning_rates=GS.learning_rates.changed(means=LogLinear(1.6e-4, 1.6e-6, 30_000, Rewind(at=15_000, to=5_000))),
+    learning_rates=GS.learning_rates.change(means=LogLinear(1.6e-4, 1.6e-6, 30_000, Rewind(at=15_000, to=5_000))),
     sh_degree=0,
     sh_milestones=(16_000, 17_000, 18_000),
     events=(

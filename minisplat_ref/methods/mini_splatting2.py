@@ -133,7 +133,7 @@ _DENSIFICATION = (
 MINI_SPLATTING2 = GS._replace(
     name="mini-splatting2",
     iterations=18_000,
-    learning_rates=GS.learning_rates.changed(opacity_logits=2.5e-2),
+    learning_rates=GS.learning_rates.change(opacity_logits=2.5e-2),
     adam=AdamRule(is_visible_only=True, has_bias_correction=True),
     sh_degree=0,
     sh_milestones=(4_000, 5_000, 6_000),

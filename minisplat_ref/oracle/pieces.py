@@ -183,7 +183,7 @@ def _slant(hits: Module) -> Response:
     return Response(CONIC.boxes, hit, hit_vjp, CONIC.fields, shade, shade_vjp, buffer_size=2)
 
 
-def _blending_stage(compositing: Module, response: Response) -> Stage:
+def _make_blending_stage(compositing: Module, response: Response) -> Stage:
     """Return ``composite_hits`` of a response to projected Gaussians; tile lists and boxes are fixed."""
     plain, p, bins = composite_stage(with_module(), tiny_setting()), *project_setting(tiny_setting())
 
@@ -206,12 +206,12 @@ def _blending_stage(compositing: Module, response: Response) -> Stage:
 
 
 def _hits_pieces(m: Module) -> tuple[Stage, ...]:
-    return (_blending_stage(reference.compositing, _slant(m)),)
+    return (_make_blending_stage(reference.compositing, _slant(m)),)
 
 
 def _compositing_pieces(m: Module) -> tuple[Stage, ...]:
     stage = composite_stage(with_module(composite=m.composite, composite_vjp=m.composite_vjp), tiny_setting())
-    return stage, _blending_stage(m, _slant(reference.hits))
+    return stage, _make_blending_stage(m, _slant(reference.hits))
 
 
 PIECES: dict[ModuleType, Callable[[Module], tuple[Stage, ...]]] = {

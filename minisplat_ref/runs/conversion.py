@@ -18,7 +18,7 @@ from minisplat_ref.io.ply import further_properties
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.training.compensation import with_compensation
 from minisplat_ref.training.sky import with_sky
-from minisplat_ref.types import Gaussians, Model, numbered
+from minisplat_ref.types import Gaussians, Model, number_views
 
 VIEWS_MAX = 24
 NO_DROP = 1e-5  # dB: files have another order, in which Gaussians of equal depth are drawn; 2e-7 has been seen
@@ -249,7 +249,7 @@ def judge_of(source: Source, path: Path, scene: Path | None, downscale: int | No
         profile, backend = settings.profile, settings.backend
         if scene is None:  # its own photographs, for which it may have exposures and poses
             renderer = renderer_of(settings, source.model)
-            photographs = photographs._replace(train_views=numbered(photographs.train_views))
+            photographs = photographs._replace(train_views=number_views(photographs.train_views))
     elif scene is not None:
         photographs = load_scene(scene, downscale=downscale or 1, undistort=True)
     else:

@@ -18,7 +18,7 @@ from minisplat_ref.runs.settings import Settings, load, load_photographs, recipe
 from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.pace import held_out_ids
 from minisplat_ref.training.schedule import Recipe, as_trained
-from minisplat_ref.types import Model, Scene, View, numbered
+from minisplat_ref.types import Model, Scene, View, number_views
 
 HOLD_OUT_EVERY = 8  # training views of which one decides
 VIEWS_MIN = 4  # training views: two that are trained on, and two for a standard error
@@ -95,7 +95,7 @@ def open_run(folder: Path, scene: Path | None = None) -> Run:
         settings,
         as_trained(recipe, saved.model),
         owner_of(settings.recipe, settings.extension) or CORE,
-        photographs._replace(train_views=numbered(photographs.train_views)),
+        photographs._replace(train_views=number_views(photographs.train_views)),
         saved.model,
         run_folder.measured_step(folder) if saved.unfinished is None else saved.unfinished,
         saved.unfinished,

@@ -186,7 +186,7 @@ def _in_time(settings: Settings, recipe: Recipe, progress: Progress) -> Callable
             return
         why = f"{minutes:g} minutes leave no more time"
         if report.n_halvings:
-            state.pace = state.pace.decided(Decision(report.step, FINER, why, None, None))
+            state.pace = state.pace.with_decision(Decision(report.step, FINER, why, None, None))
             clock.clear()  # of faster iterations
         else:
             length = max(1, min(length, round(left / pace)))

@@ -22,7 +22,7 @@ from minisplat_ref.lpips import Network, check_views, load_network
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.runs.run_folder import CONFIG, POINT_CLOUD, SHARED, read_json_object
 from minisplat_ref.strategy import importance, simplify
-from minisplat_ref.training.schedule import Recipe, configured, describe, parsed_settings, settings_of
+from minisplat_ref.training.schedule import Recipe, configure, describe, parse_settings, settings_of
 from minisplat_ref.types import Floats, Model, Scene
 
 CHOICES = {"sampling": simplify.by_sampling, "rank": simplify.by_rank, "merging": simplify.by_merging}
@@ -90,7 +90,7 @@ def recipe_of(settings: Settings) -> Recipe:
         There is no such recipe or extension, or the recipe has no such setting.
     """
     recipe = find_recipe(settings.recipe, settings.schedule_iterations, extension=settings.extension)
-    recipe = configured(recipe, **parsed_settings(recipe, settings.set))
+    recipe = configure(recipe, **parse_settings(recipe, settings.set))
     options = {
         "--budget": ("budget", settings.budget),
         "--simplify": ("choose", _choose("simplify", CHOICES, settings.simplify)),
@@ -102,7 +102,7 @@ def recipe_of(settings: Settings) -> Recipe:
         if name not in settings_of(recipe):
             others = ", ".join(other.name for other in RECIPES.values() if name in settings_of(other))
             raise InputError(f"{option} means nothing to recipe {recipe.name}: leave it out, or take one of {others}")
-        recipe = configured(recipe, **{name: value})
+        recipe = configure(recipe, **{name: value})
     return recipe
 
 

@@ -126,7 +126,7 @@ def fine_tuning(recipe: Recipe, iterations: int, *, holds_out: bool) -> Recipe:
     """Return the recipe of so many iterations after the schedule's end, at the rates of the end and without events."""
     rates = Rates(recipe.rates.at(recipe.iterations, 1.0), recipe.rates.per_extent)
     if recipe.cooling is not None:
-        rates = rates.scaled(Fraction(1), recipe.cooling.last, recipe.cooling.last_per_extent)
+        rates = rates.scale(Fraction(1), recipe.cooling.last, recipe.cooling.last_per_extent)
     return recipe._replace(
         iterations=recipe.iterations + iterations,
         learning_rates=rates,
@@ -135,7 +135,7 @@ def fine_tuning(recipe: Recipe, iterations: int, *, holds_out: bool) -> Recipe:
     )
 
 
-def fine_tuned(run: Run, rows: Ints, iterations: int, *, holds_out: bool, on_step: Callable[[], None]) -> Model:
+def fine_tune(run: Run, rows: Ints, iterations: int, *, holds_out: bool, on_step: Callable[[], None]) -> Model:
     """Return the chosen rows after fine-tuning; the run's model stays as it is.
 
     Parameters
@@ -214,7 +214,7 @@ def decide(run: Run, target: Target, iterations: int) -> Decision:
 
         def measured(rows: Ints) -> tuple[float, ...]:
             bar.set_description_str(f"measuring {len(rows):,} Gaussians")
-            model = fine_tuned(run, rows, iterations, holds_out=True, on_step=bar.update)
+            model = fine_tune(run, rows, iterations, holds_out=True, on_step=bar.update)
             psnrs = psnrs_of(run, model, run.held_out)
             bar.update()
             return psnrs
@@ -254,4 +254,4 @@ def finish(run: Run, n: int, iterations: int) -> Model:
     rows = np.arange(n) if is_all else most_important(blend_weights(run, run.scene.train_views), n)
     name = f"fine-tuning {n:,} Gaussians"
     with tqdm(total=iterations, desc=name, leave=False, unit="it", dynamic_ncols=True, disable=None) as bar:
-        return fine_tuned(run, rows, iterations, holds_out=False, on_step=bar.update)
+        return fine_tune(run, rows, iterations, holds_out=False, on_step=bar.update)

@@ -59,7 +59,7 @@ def table_rows(result: dict[str, Any]) -> list[list[str]]:
     return rows
 
 
-def closing_line(result: dict[str, Any]) -> str:
+def describe_outcome(result: dict[str, Any]) -> str:
     """Return what became of the test views, in one line."""
     counts = f"{result['all']['n_gaussians']:,} -> {result['chosen']['n_gaussians']:,} Gaussians"
     test = result["test"]
@@ -174,7 +174,7 @@ def report_html(folder: Path, result: dict[str, Any], shown: Sequence[Shown]) ->
         paragraph(KNEE_TEXT),
     ]
     if test is not None:
-        about = paragraph(f"{closing_line(result)}. {TEST_TEXT}")
+        about = paragraph(f"{describe_outcome(result)}. {TEST_TEXT}")
         sections.append(section("Test views", about, grid(list(map(_panel, shown)))))
     walk = command("render", folder, "--cameras", "orbit")
     pack = command("convert", folder, folder.parent / f"{folder.name}.spz")

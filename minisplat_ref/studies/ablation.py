@@ -28,7 +28,7 @@ from minisplat_ref.studies.conditions import get_condition
 from minisplat_ref.studies.figures import plus_minus, summarise
 from minisplat_ref.studies.variants import ACTIONS, DEVIATIONS, FULL, MECHANISMS, variants_of
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import Recipe, scaled
+from minisplat_ref.training.schedule import Recipe, scale_recipe
 from minisplat_ref.types import Scene
 
 MEASURES = ("psnr", "ssim", "n_gaussians", "seconds")
@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> kit.Report:
     """
     scene = kit.read_scene(args.scene, args.downscale)
     published, rules = get_recipe(args.recipe), DEVIATIONS if args.deviations else MECHANISMS
-    recipe = scaled(published, args.iterations)
+    recipe = scale_recipe(published, args.iterations)
     variants = variants_of(published, args.iterations, rules)
     if len(variants) == 1:
         names = [r.name for r in RECIPES.values() if len(variants_of(r, args.iterations, rules)) > 1]

@@ -37,7 +37,7 @@ from minisplat_ref.studies.conditions import get_condition
 from minisplat_ref.studies.figures import standard_error
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.rates import Rates, n_coefficients, present_degrees
-from minisplat_ref.training.schedule import Recipe, as_trained, configured, does, scaled, settings_of
+from minisplat_ref.training.schedule import Recipe, as_trained, configure, does, scale_recipe, settings_of
 from minisplat_ref.training.state import Iteration, StepReport, TrainState
 from minisplat_ref.types import Gaussians, Scene
 
@@ -74,7 +74,7 @@ def with_published_rates(recipe: Recipe) -> Recipe:
 def with_faster_means(recipe: Recipe) -> Recipe:
     """Return the recipe with the rate of the means raised by the square, as in short runs of other recipes."""
     rates = recipe.learning_rates
-    return recipe._replace(learning_rates=rates.changed(means=RAISED * rates.at(0, extent=1.0)["means"]))
+    return recipe._replace(learning_rates=rates.change(means=RAISED * rates.at(0, extent=1.0)["means"]))
 
 
 def without_cool_down(recipe: Recipe) -> Recipe:
@@ -98,26 +98,26 @@ def with_all_bands(recipe: Recipe) -> Recipe:
 def with_growth(recipe: Recipe, **factors: float) -> Recipe:
     """Return the recipe with settings of its growth multiplied by factors."""
     settings = settings_of(recipe)
-    return configured(recipe, **{name: factor * settings[name] for name, factor in factors.items()})
+    return configure(recipe, **{name: factor * settings[name] for name, factor in factors.items()})
 
 
 RULES: Mapping[str, Callable[[Recipe], Recipe]] = {
     "adaptive": lambda recipe: recipe,
     "no growth": without_growth,
     "clones of 3DGS": with_clones,
-    "largest gradients first": lambda recipe: configured(recipe, error_views=0),
+    "largest gradients first": lambda recipe: configure(recipe, error_views=0),
     "rates of 3DGS": with_published_rates,
     "faster means": with_faster_means,
     "no cool-down": without_cool_down,
-    "large views at once": lambda recipe: configured(recipe, min_side=math.inf),
+    "large views at once": lambda recipe: configure(recipe, min_side=math.inf),
     "all bands": with_all_bands,
-    "no bands": lambda recipe: configured(recipe, views_per_coefficient=math.inf),
-    "no cut of bands": lambda recipe: configured(recipe, min_variation=0.0),
-    "no sky": lambda recipe: configured(recipe, min_sky_gain=math.inf),
-    "no prune": lambda recipe: configured(recipe, min_slope=0.0, min_views=0),
-    "no exposures": lambda recipe: configured(recipe, min_exposure_gain=math.inf),
-    "no poses": lambda recipe: configured(recipe, min_pose_gain=math.inf),
-    "no anti-aliasing": lambda recipe: configured(recipe, min_antialiasing_gain=math.inf),
+    "no bands": lambda recipe: configure(recipe, views_per_coefficient=math.inf),
+    "no cut of bands": lambda recipe: configure(recipe, min_variation=0.0),
+    "no sky": lambda recipe: configure(recipe, min_sky_gain=math.inf),
+    "no prune": lambda recipe: configure(recipe, min_slope=0.0, min_views=0),
+    "no exposures": lambda recipe: configure(recipe, min_exposure_gain=math.inf),
+    "no poses": lambda recipe: configure(recipe, min_pose_gain=math.inf),
+    "no anti-aliasing": lambda recipe: configure(recipe, min_antialiasing_gain=math.inf),
 }
 
 SWEEP: Mapping[str, Callable[[Recipe], Recipe]] = {
@@ -142,7 +142,7 @@ def run(args: argparse.Namespace) -> kit.Report:
     scene = kit.read_scene(args.scene, args.downscale)
     conditions = {name: get_condition(name) for name in args.conditions}
     variants = RULES if args.rules else SWEEP if args.sweep else {}
-    recipes = {name: change(ADAPTIVE) for name, change in variants.items()} or _named(args.recipes)
+    recipes = {name: change(ADAPTIVE) for name, change in variants.items()} or _recipes_by_name(args.recipes)
     description = kit.describe_scene(scene)
     settings = {"scene": description["scene"], "downscale": args.downscale, "recipes": list(recipes)}
     records = kit.resume(
@@ -164,7 +164,7 @@ def run(args: argparse.Namespace) -> kit.Report:
     return kit.Report(result, draw(records), text)
 
 
-def _named(names: Sequence[str]) -> dict[str, Recipe]:
+def _recipes_by_name(names: Sequence[str]) -> dict[str, Recipe]:
     """Return recipes by their names; adaptive without one of its rules has that rule's name."""
     return {name: RULES[name](ADAPTIVE) if name in RULES else get_recipe(name, ITERATIONS) for name in names}
 
@@ -173,7 +173,7 @@ def warm_up(scene: Scene, recipes: Iterable[Recipe]) -> None:
     """Train every recipe for a moment, so that no training counts the time of compiling."""
     for recipe in recipes:
         with contextlib.suppress(InputError):  # so short a schedule may be impossible
-            train(scene, scaled(recipe, WARM_UP), seed=0)
+            train(scene, scale_recipe(recipe, WARM_UP), seed=0)
 
 
 def measure(scene: Scene, recipe: Recipe, seed: int) -> dict[str, Any]:

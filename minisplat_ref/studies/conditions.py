@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from minisplat_ref.errors import InputError
-from minisplat_ref.studies.defects import halved, multiplied, under_a_sky, with_turned_cameras
+from minisplat_ref.studies.defects import halve, multiply, under_a_sky, with_rotated_cameras
 from minisplat_ref.types import Scene
 
 FEW = 5  # one of every so many training photographs remains
@@ -34,7 +34,7 @@ def few_photographs(scene: Scene) -> Scene:
 def random_gains(scene: Scene) -> Scene:
     """Return the scene with every training photograph multiplied by a gain of its own."""
     low, high = np.log(GAINS)
-    return multiplied(scene, np.exp(np.random.default_rng(0).uniform(low, high, len(scene.train_views))))
+    return multiply(scene, np.exp(np.random.default_rng(0).uniform(low, high, len(scene.train_views))))
 
 
 CONDITIONS: Mapping[str, Callable[[Scene], Scene]] = {
@@ -42,8 +42,8 @@ CONDITIONS: Mapping[str, Callable[[Scene], Scene]] = {
     "few": few_photographs,
     "gains": random_gains,
     "few-gains": lambda scene: random_gains(few_photographs(scene)),
-    "poses": lambda scene: with_turned_cameras(scene, np.random.default_rng(0)),
-    "sizes": lambda scene: halved(scene, np.arange(len(scene.train_views)) % 2 == 1),
+    "poses": lambda scene: with_rotated_cameras(scene, np.random.default_rng(0)),
+    "sizes": lambda scene: halve(scene, np.arange(len(scene.train_views)) % 2 == 1),
     "sky": lambda scene: under_a_sky(scene, np.random.default_rng(0)),
 }
 

@@ -31,7 +31,7 @@ from minisplat_ref.methods.adaptive.switches import SWITCHES
 from minisplat_ref.reporting import markdown_table
 from minisplat_ref.reports.palette import BLUE, GREEN, OCHRE, RED
 from minisplat_ref.studies import kit
-from minisplat_ref.studies.poses import moved
+from minisplat_ref.studies.poses import move
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import firing_steps
 from minisplat_ref.training.sky import unit_rays
@@ -47,10 +47,10 @@ CUT = 1.2  # metres
 
 def with_gains(scene: Scene, rng: np.random.Generator) -> Scene:
     """Return the scene with every training photograph multiplied by a gain of its own."""
-    return multiplied(scene, rng.uniform(1 - LARGEST_GAIN, 1 + LARGEST_GAIN, len(scene.train_views)))
+    return multiply(scene, rng.uniform(1 - LARGEST_GAIN, 1 + LARGEST_GAIN, len(scene.train_views)))
 
 
-def multiplied(scene: Scene, gains: Floats) -> Scene:
+def multiply(scene: Scene, gains: Floats) -> Scene:
     """Return the scene with its training photographs multiplied by ``gains`` [V]; test photographs stay."""
     views = []
     for view, gain in zip(scene.train_views, gains, strict=True):
@@ -59,16 +59,16 @@ def multiplied(scene: Scene, gains: Floats) -> Scene:
     return scene._replace(train_views=tuple(views))
 
 
-def with_turned_cameras(scene: Scene, rng: np.random.Generator) -> Scene:
+def with_rotated_cameras(scene: Scene, rng: np.random.Generator) -> Scene:
     """Return the scene with every training camera turned so that the middle of its image moves by half a pixel."""
     views = []
     for view, angle in zip(scene.train_views, rng.uniform(0, 2 * np.pi, len(scene.train_views)), strict=True):
         w = PIXELS * np.array([np.sin(angle) / view.camera.fy, np.cos(angle) / view.camera.fx, 0.0])
-        views.append(view._replace(camera=moved(view.camera, w, np.zeros(3))))
+        views.append(view._replace(camera=move(view.camera, w, np.zeros(3))))
     return scene._replace(train_views=tuple(views))
 
 
-def halved(scene: Scene, is_halved: Bools) -> Scene:
+def halve(scene: Scene, is_halved: Bools) -> Scene:
     """Return the scene with the training photographs ``is_halved`` [V] at half the width and height."""
     views = (half_size(view) if small else view for view, small in zip(scene.train_views, is_halved, strict=True))
     return scene._replace(train_views=tuple(views))
@@ -116,8 +116,8 @@ def under_a_sky(scene: Scene, rng: np.random.Generator) -> Scene:
 CONDITIONS: Mapping[str, Callable[[Scene, np.random.Generator], Scene]] = {
     "clean": lambda scene, rng: scene,
     "gains": with_gains,
-    "poses": with_turned_cameras,
-    "sizes": lambda scene, rng: halved(scene, rng.random(len(scene.train_views)) < 0.5),
+    "poses": with_rotated_cameras,
+    "sizes": lambda scene, rng: halve(scene, rng.random(len(scene.train_views)) < 0.5),
     "sky": under_a_sky,
 }
 

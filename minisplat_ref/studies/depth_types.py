@@ -42,7 +42,7 @@ from minisplat_ref.strategy.depth_reinit import (
 from minisplat_ref.studies import kit
 from minisplat_ref.studies.figures import plus_minus, summarise
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import Recipe, configured, firing_steps
+from minisplat_ref.training.schedule import Recipe, configure, firing_steps
 from minisplat_ref.training.state import StepReport
 from minisplat_ref.types import Bools, Floats, Model, Scene
 
@@ -60,9 +60,9 @@ class Choice(NamedTuple):
     depth_tolerance: float | None = None
     has_backdrop: bool = False
 
-    def applied_to(self, recipe: Recipe) -> Recipe:
+    def apply_to(self, recipe: Recipe) -> Recipe:
         """Return the recipe with this choice in its reinitialisation."""
-        return configured(
+        return configure(
             recipe,
             points_of=self.points_of,
             min_alpha=self.min_alpha,
@@ -138,12 +138,12 @@ def measure(truth: SyntheticScene, recipe: Recipe, choice: Choice, seed: int) ->
     def look(report: StepReport) -> None:
         model = report.state.model
         if report.step == reinitialised[0] - 1:
-            points, pixels = drawn_points(model, scene, choice, np.random.default_rng(seed))
+            points, pixels = draw_points(model, scene, choice, np.random.default_rng(seed))
             drawn.update(n_points=len(points), **errors(points, pixels, truth))
         if report.step in (reinitialised[-1], densified - 1):
             counts[report.step] = n_far(model, scene)
 
-    model = train(scene, choice.applied_to(recipe), seed=seed, on_step=look).model
+    model = train(scene, choice.apply_to(recipe), seed=seed, on_step=look).model
     n_sent, n_left = counts[reinitialised[-1]], counts[densified - 1]
     psnr = evaluate(model, scene.test_views, RenderSettings(scene.background)).psnr
     return {**drawn, "backdrop_left": n_left / n_sent if n_sent else None, "psnr": psnr}
@@ -154,7 +154,7 @@ def n_far(model: Model, scene: Scene) -> int:
     return int(np.count_nonzero(np.linalg.norm(model.gaussians.means, axis=1) > FAR * scene.extent))
 
 
-def drawn_points(
+def draw_points(
     model: Any, scene: Scene, choice: Choice, rng: np.random.Generator, n_points: int | None = None
 ) -> tuple[Floats, NDArray[np.int64]]:
     """Return points [P, 3] and the pixels [P] they come from, numbered through all training views.

@@ -23,7 +23,7 @@ from minisplat_ref.studies import kit, recovery
 from minisplat_ref.studies.recovery import ARMS, COLORS
 from minisplat_ref.training.calibration import EXPOSURES, expose, identity_exposures, with_exposures
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import Recipe, configured
+from minisplat_ref.training.schedule import Recipe, configure
 from minisplat_ref.types import Floats, Gaussians, Model, Scene
 
 GAINS = (0.7, 1.4)  # per channel, uniform in the logarithm
@@ -45,24 +45,24 @@ def measure(scene: Scene, recipe: Recipe, seed: int, arms: tuple[str, ...] = ARM
     """Train the arms, and return for each the errors of its maps, and the PSNR of held-out views."""
     n_views = len(scene.train_views)
     identities = identity_exposures(n_views)[EXPOSURES]
-    disturbed, maps = disturbed_exposures(scene, np.random.default_rng(seed))
+    disturbed, maps = disturb_exposures(scene, np.random.default_rng(seed))
     colors = np.concatenate([view.image.reshape(-1, 3) for view in scene.train_views]) / 255
     result = {}
     for arm in kit.with_progress(arms, "trainings"):
         photographed, truth = (scene, identities) if arm == "undisturbed" else (disturbed, maps)
-        state = train(photographed, configured(recipe, exposure=arm == "calibrated"), seed=seed)
+        state = train(photographed, configure(recipe, exposure=arm == "calibrated"), seed=seed)
         exposures = state.shared.get(EXPOSURES, identities)
         K = common_map(exposures, truth)
-        recovered = composed(exposures, K)
+        recovered = compose(exposures, K)
         result[arm] = {
             "levels": (255 * color_errors(recovered, truth, colors)).tolist(),
-            "mean_color": {name: mapped_mean(maps, colors) for name, maps in (("true", truth), ("found", recovered))},
-            "psnr": held_out_psnr(state.gaussians, scene, K),
+            "mean_color": {name: map_mean(maps, colors) for name, maps in (("true", truth), ("found", recovered))},
+            "psnr": measure_held_out_psnr(state.gaussians, scene, K),
         }
     return result
 
 
-def disturbed_exposures(scene: Scene, rng: np.random.Generator) -> tuple[Scene, Floats]:
+def disturb_exposures(scene: Scene, rng: np.random.Generator) -> tuple[Scene, Floats]:
     """Return the scene with every training photograph mapped by a random T_v, and these maps [V, 3, 4]."""
     maps = np.zeros((len(scene.train_views), 3, 4))
     low, high = np.log(GAINS)
@@ -92,7 +92,7 @@ def common_map(exposures: Floats, truth: Floats) -> Floats:
     return np.linalg.lstsq(A.reshape(-1, 3), rest.reshape(-1, 4))[0]
 
 
-def composed(exposures: Floats, K: Floats) -> Floats:
+def compose(exposures: Floats, K: Floats) -> Floats:
     """Return the maps ``E_v K`` [V, 3, 4]: first K, then E_v."""
     maps = exposures[..., :3] @ K
     maps[..., 3] += exposures[..., 3]
@@ -107,7 +107,7 @@ def color_errors(maps: Floats, truth: Floats, colors: Floats) -> Floats:
     return np.sqrt(np.einsum("vij,jk,vik->v", differences, moments, differences) / 3)
 
 
-def mapped_mean(maps: Floats, colors: Floats) -> list[list[float]]:
+def map_mean(maps: Floats, colors: Floats) -> list[list[float]]:
     """Return the mean of colours [P, 3] under each of the maps, [V, 3]."""
     return (maps @ np.append(colors.mean(axis=0), 1)).tolist()
 
@@ -118,7 +118,7 @@ def inverse(K: Floats) -> Floats:
     return np.column_stack([M, -M @ K[:, 3]])
 
 
-def held_out_psnr(gaussians: Gaussians, scene: Scene, K: Floats) -> float:
+def measure_held_out_psnr(gaussians: Gaussians, scene: Scene, K: Floats) -> float:
     """Return the mean PSNR of the test views, whose renderings are mapped by the inverse of K.
 
     The renderer with exposures does this: its only exposure is the inverse, and every view uses it.

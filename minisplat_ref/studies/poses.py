@@ -25,7 +25,7 @@ from minisplat_ref.studies import kit, recovery
 from minisplat_ref.studies.recovery import ARMS
 from minisplat_ref.training.calibration import ROTATIONS, SHIFTS, correct_pose
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import Recipe, configured
+from minisplat_ref.training.schedule import Recipe, configure
 from minisplat_ref.types import Camera, Floats, Gaussians, Scene, View
 
 
@@ -77,39 +77,39 @@ def measure(
     scene: Scene, recipe: Recipe, disturbance: Disturbance, seed: int, arms: tuple[str, ...] = ARMS
 ) -> dict[str, dict[str, Any]]:
     """Train the arms, and return for each the errors of its cameras, and the PSNR of held-out views."""
-    disturbed = disturbed_poses(scene, disturbance, np.random.default_rng(seed))
+    disturbed = disturb_poses(scene, disturbance, np.random.default_rng(seed))
     truth = [view.camera for view in scene.train_views]
     result = {}
     for arm in kit.with_progress(arms, "trainings"):
         seen = scene if arm == "undisturbed" else disturbed
         cameras = [view.camera for view in seen.train_views]
-        state = train(seen, configured(recipe, pose=arm == "calibrated"), seed=seed)
+        state = train(seen, configure(recipe, pose=arm == "calibrated"), seed=seed)
         if arm == "calibrated":
             corrections = zip(cameras, state.shared[ROTATIONS], state.shared[SHIFTS], strict=True)
-            cameras = [moved(camera, w, u) for camera, w, u in corrections]
-        similarity = aligning(cameras, truth)
-        aligned = [carried(camera, similarity) for camera in cameras]
+            cameras = [move(camera, w, u) for camera, w, u in corrections]
+        similarity = align(cameras, truth)
+        aligned = [carry(camera, similarity) for camera in cameras]
         degrees, shifts = errors(aligned, truth)
         result[arm] = {
             "degrees": degrees.tolist(),
             "shifts": shifts.tolist(),
             "pixels": [displacement(*pair, scene) for pair in zip(aligned, scene.train_views, strict=True)],
-            "psnr": held_out_psnr(state.gaussians, scene, similarity),
+            "psnr": measure_held_out_psnr(state.gaussians, scene, similarity),
         }
     return result
 
 
-def disturbed_poses(scene: Scene, disturbance: Disturbance, rng: np.random.Generator) -> Scene:
+def disturb_poses(scene: Scene, disturbance: Disturbance, rng: np.random.Generator) -> Scene:
     """Return the scene with every training camera rotated and shifted in its own random directions."""
     directions = rng.normal(size=(2, len(scene.train_views), 3))
     directions /= np.linalg.norm(directions, axis=2, keepdims=True)
     rotations = np.radians(disturbance.degrees) * directions[0]  # [V, 3]
     shifts = disturbance.shift * scene.extent * directions[1]
     views = zip(scene.train_views, rotations, shifts, strict=True)
-    return scene._replace(train_views=tuple(v._replace(camera=moved(v.camera, w, u)) for v, w, u in views))
+    return scene._replace(train_views=tuple(v._replace(camera=move(v.camera, w, u)) for v, w, u in views))
 
 
-def moved(camera: Camera, w: Floats, u: Floats) -> Camera:
+def move(camera: Camera, w: Floats, u: Floats) -> Camera:
     """Return the camera with its pose corrected by :func:`correct_pose`."""
     R, t = correct_pose(camera.cam_from_world_R, camera.cam_from_world_t, w, u)
     return camera._replace(cam_from_world_R=R, cam_from_world_t=t)
@@ -120,7 +120,7 @@ def centres(cameras: list[Camera]) -> Floats:
     return np.array([camera.center for camera in cameras])
 
 
-def aligning(cameras: list[Camera], truth: list[Camera]) -> Similarity:
+def align(cameras: list[Camera], truth: list[Camera]) -> Similarity:
     """Return the least-squares similarity that maps the camera centres to the true ones (Umeyama 1991).
 
     ::
@@ -137,14 +137,14 @@ def aligning(cameras: list[Camera], truth: list[Camera]) -> Similarity:
     return Similarity(s, S, p.mean(axis=0) - s * S @ q.mean(axis=0))
 
 
-def carried(camera: Camera, similarity: Similarity) -> Camera:
+def carry(camera: Camera, similarity: Similarity) -> Camera:
     """Map a camera from the trained scene to the true frame."""
     s, S, d = similarity
     R = camera.cam_from_world_R @ S.T
     return camera._replace(cam_from_world_R=R, cam_from_world_t=s * camera.cam_from_world_t - R @ d)
 
 
-def carried_back(camera: Camera, similarity: Similarity) -> Camera:
+def carry_back(camera: Camera, similarity: Similarity) -> Camera:
     """Map a camera from the true frame to the trained scene."""
     s, S, d = similarity
     R, t = camera.cam_from_world_R, camera.cam_from_world_t
@@ -168,9 +168,9 @@ def displacement(camera: Camera, view: View, scene: Scene) -> float:
     return float(np.median(np.linalg.norm(images[0] - images[1], axis=0)))
 
 
-def held_out_psnr(gaussians: Gaussians, scene: Scene, similarity: Similarity) -> float:
+def measure_held_out_psnr(gaussians: Gaussians, scene: Scene, similarity: Similarity) -> float:
     """Return the mean PSNR of the test views, with their cameras mapped into the trained scene."""
-    views = [view._replace(camera=carried_back(view.camera, similarity)) for view in scene.test_views]
+    views = [view._replace(camera=carry_back(view.camera, similarity)) for view in scene.test_views]
     psnr = evaluate(gaussians, views, RenderSettings(scene.background)).psnr
     assert psnr is not None, "there are test views"
     return psnr

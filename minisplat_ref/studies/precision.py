@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> kit.Report:
     def warm_up(missing: list[Mapping[str, Any]]) -> None:
         for name in dict.fromkeys(job["precision"] for job in missing):
             with contextlib.suppress(InputError):  # so short a schedule may ask for what cannot be
-                trained(scene, get_recipe(args.recipe, WARM_UP), PRECISIONS[name], 0)
+                train_in_precision(scene, get_recipe(args.recipe, WARM_UP), PRECISIONS[name], 0)
 
     jobs = [{"precision": name, "seed": seed} for seed in args.seeds for name in PRECISIONS]
     records = kit.resume(args.out, settings, jobs, partial(measure, scene, recipe), warm_up)
@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> kit.Report:
     return kit.Report(result, draw(rows), f"{kit.title(description)}\n{length}\n\n{table}")
 
 
-def trained(scene: Scene, recipe: Recipe, precision: Precision, seed: int) -> TrainState:
+def train_in_precision(scene: Scene, recipe: Recipe, precision: Precision, seed: int) -> TrainState:
     """Train in a precision and return the state after the last iteration.
 
     Parameters
@@ -114,7 +114,7 @@ def trained(scene: Scene, recipe: Recipe, precision: Precision, seed: int) -> Tr
         recipe,
         seed=seed,
         state=state,
-        on_step=round_colours if precision.has_half_colours else _nothing,
+        on_step=round_colours if precision.has_half_colours else _do_nothing,
         backend=precision.backend,
     )
 
@@ -126,7 +126,7 @@ def round_colours(report: StepReport) -> None:
         array[...] = array.astype(np.float16)
 
 
-def _nothing(report: StepReport) -> None:
+def _do_nothing(report: StepReport) -> None:
     pass
 
 
@@ -149,7 +149,7 @@ def measure(scene: Scene, recipe: Recipe, precision: str, seed: int) -> list[dic
     """Train once; return the record of the training, and that of its rounded colours if these are evaluated."""
     computed = PRECISIONS[precision]
     start = time.process_time()
-    state = trained(scene, recipe, computed, seed)
+    state = train_in_precision(scene, recipe, computed, seed)
     seconds = time.process_time() - start
 
     def record(name: str, model: Model, *, has_half_colours: bool) -> dict[str, Any]:

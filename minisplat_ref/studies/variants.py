@@ -21,10 +21,10 @@ from minisplat_ref.training.schedule import (
     Event,
     Every,
     Recipe,
-    configured,
+    configure,
     does,
     firing_steps,
-    scaled,
+    scale_recipe,
     settings_of,
     without,
 )
@@ -38,7 +38,7 @@ Change = Callable[[Recipe], Recipe]
 
 def with_settings(**settings: Any) -> Change:
     """Return a function that replaces settings of a recipe, and returns a recipe without all of them unchanged."""
-    return lambda recipe: configured(recipe, **settings) if settings.keys() <= settings_of(recipe).keys() else recipe
+    return lambda recipe: configure(recipe, **settings) if settings.keys() <= settings_of(recipe).keys() else recipe
 
 
 def with_bias_correction(recipe: Recipe) -> Recipe:
@@ -200,7 +200,7 @@ def variants_of(published: Recipe, iterations: int, rules: Mapping[str, Change] 
     """Return the recipe scaled to ``iterations``, and each changed recipe that differs from it within this length."""
 
     def of_length(recipe: Recipe) -> Recipe:
-        return scaled(recipe, iterations)._replace(short_run_exponent=0.0)  # the rates are already raised
+        return scale_recipe(recipe, iterations)._replace(short_run_exponent=0.0)  # the rates are already raised
 
     full = of_length(published)
     variants = {name: of_length(take_out(published)) for name, take_out in rules.items()}

@@ -32,11 +32,11 @@ def with_compensation(inner: Renderer) -> Renderer:
     """Return a renderer that compensates opacities if the model asks for it."""
 
     def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
-        return inner.render(model, view, compensated(request) if COMPENSATION in model.shared else request)
+        return inner.render(model, view, compensate(request) if COMPENSATION in model.shared else request)
 
     return Renderer(f"{inner.name} with compensation", render, inner.render_vjp, inner.channels)
 
 
-def compensated(request: Request) -> Request:
+def compensate(request: Request) -> Request:
     """Return the request with compensated opacities."""
     return request._replace(conventions=request.conventions._replace(is_antialiased=True))

@@ -90,7 +90,7 @@ def examine(case: Case) -> Examination:
             found.append(wrong)
 
     look(PARAMETERS, _parameters(case.model))
-    request = case.request._replace(backend=_watched(case.request.backend, look))
+    request = case.request._replace(backend=_watch(case.request.backend, look))
     with np.errstate(all="ignore"):  # the checks report what is wrong
         output, tape = renderer.render(case.model, case.view, request)
         channels = renderer.channels(request.wants)
@@ -113,7 +113,7 @@ def _gradients(gradient: RenderGradient, loss: Loss) -> dict[str, Floats]:
     return {f"v_{name}": array for name, array in {**through_image, **direct}.items()}
 
 
-def _watched(backend: Backend, look: Callable[[str, Mapping[str, Any]], None]) -> Backend:
+def _watch(backend: Backend, look: Callable[[str, Mapping[str, Any]], None]) -> Backend:
     """Return the backend with every stage wrapped so that ``look`` sees its outputs."""
 
     def watched(stage: str) -> Callable[..., Any]:
@@ -176,7 +176,7 @@ class Guard(NamedTuple):
         if self.drops_steps and wrong.stage != PARAMETERS:
             self._save(case, wrong)
             return wrong
-        raise self.stopped(case, wrong)
+        raise self.stop(case, wrong)
 
     def check_parameters(self, case: Case, stage: str) -> None:
         """Check the parameters after a step or an event.
@@ -187,9 +187,9 @@ class Guard(NamedTuple):
             One is not finite.
         """
         if wrong := first_wrong(stage, _parameters(case.model)):
-            raise self.stopped(case, wrong)
+            raise self.stop(case, wrong)
 
-    def stopped(self, case: Case, wrong: Wrong) -> BadNumbers:
+    def stop(self, case: Case, wrong: Wrong) -> BadNumbers:
         """Write the case and return the error that says what is wrong."""
         text = f"iteration {case.step}, view {case.view.name}, {wrong}"
         if wrong.stage == PARAMETERS and self.every > 1:

@@ -18,7 +18,7 @@ from minisplat_ref.training.pace import COOLED, Decision
 from minisplat_ref.training.schedule import Recipe, as_decided
 from minisplat_ref.training.smaller_views import ViewSizes
 from minisplat_ref.training.state import StepReport, TrainState, begin_cooling
-from minisplat_ref.types import Scene, numbered
+from minisplat_ref.types import Scene, number_views
 
 
 def train(
@@ -67,7 +67,7 @@ def train(
     After any of these ``state.is_whole`` says whether the state lies between two iterations and can be saved.
     """
     state = initial_state(scene, recipe, seed) if state is None else state
-    scene = scene._replace(train_views=numbered(scene.train_views))
+    scene = scene._replace(train_views=number_views(scene.train_views))
     check_fits(state, scene, as_decided(recipe, state.pace))
     sizes, switched_on = ViewSizes(recipe, scene), None
     with ReadingAhead() as ahead, Interruptions() as interruptions:
@@ -78,7 +78,7 @@ def train(
                 settings = RenderSettings(scene.background, conventions, backend, decided.renderer)
             n_halvings = sizes.n_halvings(state.step + 1, state.pace)
             around = Surroundings(decided, sizes.scene(n_halvings), n_halvings, settings, guard, ahead)
-            report = _completed(iterate(state, around, interruptions), recipe, sizes)
+            report = _complete(iterate(state, around, interruptions), recipe, sizes)
             if on_step is not None:
                 on_step(report)
             del report  # frees its image before the next is made
@@ -86,7 +86,7 @@ def train(
     return state
 
 
-def _completed(report: StepReport, recipe: Recipe, sizes: ViewSizes) -> StepReport:
+def _complete(report: StepReport, recipe: Recipe, sizes: ViewSizes) -> StepReport:
     """Return the report of an iteration with what the loop knows: where the training ends, and the views' sizes."""
     state = report.state
     is_open = recipe.cooling is not None and state.pace.last_step is None

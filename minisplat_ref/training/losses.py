@@ -68,7 +68,7 @@ class LossTerm(NamedTuple):
         """Return whether the term counts in iteration ``step``, counted from 1."""
         return self.weight != 0 and self.start < step and (self.stop is None or step < self.stop)
 
-    def scaled(self, factor: Fraction) -> "LossTerm":
+    def scale(self, factor: Fraction) -> "LossTerm":
         """Return the term with its iterations multiplied by ``factor``."""
         return self._replace(
             start=round(self.start * factor), stop=None if self.stop is None else round(self.stop * factor)
@@ -123,20 +123,20 @@ def total_loss(terms: Sequence[LossTerm], rendered: Rendered) -> Loss:
         _add(v_gaussians, v.gaussians, term.weight)
         _add(v_shared, v.shared, term.weight)
         if v.alpha is not None:
-            v_alpha = _weighted(v.alpha, term.weight) if v_alpha is None else v_alpha + _weighted(v.alpha, term.weight)
-    return Loss(value, _joined(v_channels, rendered), v_alpha, v_gaussians, v_shared)
+            v_alpha = _weigh(v.alpha, term.weight) if v_alpha is None else v_alpha + _weigh(v.alpha, term.weight)
+    return Loss(value, _join_channels(v_channels, rendered), v_alpha, v_gaussians, v_shared)
 
 
-def _weighted(v: Floats, weight: float) -> Floats:
+def _weigh(v: Floats, weight: float) -> Floats:
     return v if weight == 1 else v.dtype.type(weight) * v
 
 
 def _add(totals: dict[str, Floats], parts: Mapping[str, Floats], weight: float) -> None:
     for name, part in parts.items():
-        totals[name] = totals[name] + _weighted(part, weight) if name in totals else _weighted(part, weight)
+        totals[name] = totals[name] + _weigh(part, weight) if name in totals else _weigh(part, weight)
 
 
-def _joined(v_channels: Mapping[str, Floats], rendered: Rendered) -> Floats:
+def _join_channels(v_channels: Mapping[str, Floats], rendered: Rendered) -> Floats:
     """Return the derivatives of all channels as one array [H, W, D], zero where no term depends on a channel."""
     image = rendered.output.image
     if list(v_channels) == ["rgb"] and image.shape[2] == 3:

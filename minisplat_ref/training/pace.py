@@ -61,7 +61,7 @@ class Pace(NamedTuple):
         """Return how often it was decided to train on views of twice the width and height."""
         return sum(decision.what == FINER for decision in self.decisions)
 
-    def decided(self, decision: Decision) -> "Pace":
+    def with_decision(self, decision: Decision) -> "Pace":
         """Return the pace with one more decision."""
         return self._replace(decisions=(*self.decisions, decision))
 

@@ -38,12 +38,12 @@ class LogLinear(NamedTuple):
         progress = min(step / self.steps, 1.0)
         return float(self.first * (self.last / self.first) ** progress)
 
-    def scaled(self, factor: Fraction, times: float) -> "LogLinear":
+    def scale(self, factor: Fraction, times: float) -> "LogLinear":
         """Return the rate with the iterations multiplied by ``factor``, and itself by ``times``."""
         rewind = self.rewind and Rewind(round(self.rewind.at * factor), round(self.rewind.to * factor))
         return LogLinear(self.first * times, self.last * times, max(1, round(self.steps * factor)), rewind)
 
-    def described(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, Any]:
         """Return the schedule in numbers and dicts."""
         return {**self._asdict(), "rewind": self.rewind and self.rewind._asdict()}
 
@@ -68,15 +68,15 @@ class Rates(NamedTuple):
         rates = {name: rate.at(step) if isinstance(rate, LogLinear) else rate for name, rate in self.of.items()}
         return {name: rate * extent if name in self.per_extent else rate for name, rate in rates.items()}
 
-    def changed(self, **rates: float | LogLinear) -> "Rates":
+    def change(self, **rates: float | LogLinear) -> "Rates":
         """Return the rates with some of them replaced or added."""
         return self._replace(of={**self.of, **rates})
 
-    def joined(self, other: "Rates") -> "Rates":
+    def join(self, other: "Rates") -> "Rates":
         """Return these rates and the other's; for a name in both, these decide rate and extent."""
         return Rates({**other.of, **self.of}, self.per_extent | (other.per_extent - self.of.keys()))
 
-    def scaled(self, factor: Fraction, raised: float, raised_per_extent: float) -> "Rates":
+    def scale(self, factor: Fraction, raised: float, raised_per_extent: float) -> "Rates":
         """Return the rates for a run of another length.
 
         Parameters
@@ -91,13 +91,13 @@ class Rates(NamedTuple):
 
         def scaled_one(name: str, rate: float | LogLinear) -> float | LogLinear:
             times = raised_per_extent if name in self.per_extent else raised
-            return rate.scaled(factor, times) if isinstance(rate, LogLinear) else rate * times
+            return rate.scale(factor, times) if isinstance(rate, LogLinear) else rate * times
 
         return self._replace(of={name: scaled_one(name, rate) for name, rate in self.of.items()})
 
-    def described(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, Any]:
         """Return the rates in numbers, strings, lists and dicts."""
-        of = {name: rate.described() if isinstance(rate, LogLinear) else rate for name, rate in self.of.items()}
+        of = {name: rate.describe() if isinstance(rate, LogLinear) else rate for name, rate in self.of.items()}
         return {"of": of, "per_extent": sorted(self.per_extent)}
 
 

@@ -42,9 +42,9 @@ class During(NamedTuple):
         """Return whether the action belongs to iteration ``step``, counted from 1."""
         return self.start < step and (self.stop is None or step < self.stop)
 
-    def scaled(self, factor: Fraction) -> "During":
+    def scale(self, factor: Fraction) -> "During":
         """Return the event with all milestones multiplied by ``factor``."""
-        return self._replace(start=_scaled(self.start, factor), stop=_scaled_limit(self.stop, factor))
+        return self._replace(start=_scale_step(self.start, factor), stop=_scale_limit(self.stop, factor))
 
 
 class Every(NamedTuple):
@@ -75,7 +75,7 @@ class Every(NamedTuple):
         length, of = self.factor.as_integer_ratio()  # the action published at p comes at p length / of
         first, last = (2 * step - 1) * of // (2 * length), (2 * step + 1) * of // (2 * length)
         multiples = range(first + -first % self.period, last + 1, self.period)
-        return any(self._stays(published) and _scaled(published, self.factor) == step for published in multiples)
+        return any(self._stays(published) and _scale_step(published, self.factor) == step for published in multiples)
 
     def _stays(self, step: int) -> bool:
         """Return whether the action belongs to this multiple of the period in the published schedule, and stays."""
@@ -85,7 +85,7 @@ class Every(NamedTuple):
         end = 0 if self.stop is None else -(-self.stop // self.period) * self.period  # the first multiple too late
         return not is_skipped and (end - step) % self.stride == 0
 
-    def scaled(self, factor: Fraction) -> "Every":
+    def scale(self, factor: Fraction) -> "Every":
         """Return the event for a run of ``factor`` times the length."""
         return self._replace(factor=self.factor * factor)
 
@@ -100,9 +100,9 @@ class At(NamedTuple):
         """Return whether the action belongs to iteration ``step``, counted from 1."""
         return step == self.step
 
-    def scaled(self, factor: Fraction) -> "At":
+    def scale(self, factor: Fraction) -> "At":
         """Return the event with its iteration multiplied by ``factor``, at least the first."""
-        return self._replace(step=max(1, _scaled(self.step, factor)))
+        return self._replace(step=max(1, _scale_step(self.step, factor)))
 
 
 class SmallerViews(NamedTuple):
@@ -121,9 +121,9 @@ class SmallerViews(NamedTuple):
         """Return whether iteration ``step``, counted from 1, may see smaller views."""
         return self.start < step and (self.until is None or step <= self.until)
 
-    def scaled(self, factor: Fraction) -> "SmallerViews":
+    def scale(self, factor: Fraction) -> "SmallerViews":
         """Return the event with both milestones multiplied by ``factor``."""
-        return self._replace(start=_scaled(self.start, factor), until=_scaled_limit(self.until, factor))
+        return self._replace(start=_scale_step(self.start, factor), until=_scale_limit(self.until, factor))
 
 
 DatedEvent = Every | At
@@ -153,7 +153,7 @@ class Recipe(NamedTuple):
     min_views: int = 1
     """Least number of training views that the method needs."""
     short_run_exponent: float = 0.0
-    """p of the factor ``(published / iterations)^p`` by which :func:`scaled` raises the rates of runs shorter than
+    """p of the factor ``(published / iterations)^p`` by which :func:`scale` raises the rates of runs shorter than
     published; the rate of the means is raised by its square."""
     calibrations: tuple[Calibration, ...] = CALIBRATIONS
     """Parameters of each photograph, and a sky; all are off unless asked for."""
@@ -180,8 +180,8 @@ class Recipe(NamedTuple):
     @property
     def rates(self) -> Rates:
         """Return all learning rates: the recipe's, the representation's, the calibrations'."""
-        rates = self.learning_rates.joined(self.representation.rates)
-        return functools.reduce(Rates.joined, (calibration.rates for calibration in self.active_calibrations), rates)
+        rates = self.learning_rates.join(self.representation.rates)
+        return functools.reduce(Rates.join, (calibration.rates for calibration in self.active_calibrations), rates)
 
 
 def does(event: Event, *actions: Callable[..., Any]) -> bool:
@@ -201,7 +201,7 @@ def without(recipe: Recipe, action: Callable[..., Any]) -> Recipe:
     return recipe._replace(events=tuple(event for event in recipe.events if not does(event, action)))
 
 
-def scaled(recipe: Recipe, iterations: int) -> Recipe:
+def scale_recipe(recipe: Recipe, iterations: int) -> Recipe:
     """Return the recipe for another number of iterations, all milestones moved in proportion.
 
     Every milestone is multiplied by ``iterations / recipe.iterations`` and rounded to the nearest integer (ties to
@@ -225,27 +225,27 @@ def scaled(recipe: Recipe, iterations: int) -> Recipe:
 
     def of_calibration(calibration: Calibration) -> Calibration:
         raised = shortening**calibration.short_run_exponent
-        return calibration._replace(rates=calibration.rates.scaled(factor, raised, raised))
+        return calibration._replace(rates=calibration.rates.scale(factor, raised, raised))
 
     return recipe._replace(
         iterations=iterations,
-        learning_rates=recipe.learning_rates.scaled(factor, raised, raised**2),
-        sh_milestones=tuple(_scaled(milestone, factor) for milestone in recipe.sh_milestones),
-        losses=tuple(term.scaled(factor) for term in recipe.losses),
-        events=tuple(event.scaled(factor) for event in recipe.events),
+        learning_rates=recipe.learning_rates.scale(factor, raised, raised**2),
+        sh_milestones=tuple(_scale_step(milestone, factor) for milestone in recipe.sh_milestones),
+        losses=tuple(term.scale(factor) for term in recipe.losses),
+        events=tuple(event.scale(factor) for event in recipe.events),
         calibrations=tuple(map(of_calibration, recipe.calibrations)),
         representation=recipe.representation._replace(
-            rates=recipe.representation.rates.scaled(factor, raised, raised**2)
+            rates=recipe.representation.rates.scale(factor, raised, raised**2)
         ),
     )
 
 
-def _scaled(step: int, factor: Fraction) -> int:
+def _scale_step(step: int, factor: Fraction) -> int:
     return round(step * factor)
 
 
-def _scaled_limit(step: int | None, factor: Fraction) -> int | None:
-    return None if step is None else _scaled(step, factor)
+def _scale_limit(step: int | None, factor: Fraction) -> int | None:
+    return None if step is None else _scale_step(step, factor)
 
 
 # --- settings ---
@@ -253,17 +253,17 @@ def _scaled_limit(step: int | None, factor: Fraction) -> int | None:
 
 def as_decided(recipe: Recipe, pace: Pace) -> Recipe:
     """Return the recipe with those calibrations on that a training has switched on."""
-    return configured(recipe, **dict.fromkeys(pace.switched_on, True)) if pace.switched_on else recipe
+    return configure(recipe, **dict.fromkeys(pace.switched_on, True)) if pace.switched_on else recipe
 
 
 def as_trained(recipe: Recipe, model: Model) -> Recipe:
     """Return the recipe with those calibrations on that a model has parameters of, given or decided upon."""
     on = {c.name: True for c in recipe.calibrations if c.initial(1).keys() <= model.shared.keys()}
-    return configured(recipe, **on)
+    return configure(recipe, **on)
 
 
 def settings_of(recipe: Recipe) -> dict[str, Any]:
-    """Return the settings that :func:`configured` can replace, each with its present value, the first of several.
+    """Return the settings that :func:`configure` can replace, each with its present value, the first of several.
 
     Settings of events, of loss terms, and of the representation's initialisation and renderer go by their own names;
     the weight of a loss term by the term's name; whether a calibration is on by the calibration's name.
@@ -276,7 +276,7 @@ def settings_of(recipe: Recipe) -> dict[str, Any]:
     return {name: value for settings in reversed(found) for name, value in settings.items()}
 
 
-def configured(recipe: Recipe, **settings: Any) -> Recipe:
+def configure(recipe: Recipe, **settings: Any) -> Recipe:
     """Return the recipe with settings replaced, each wherever the recipe has it; see :func:`settings_of`.
 
     Raises
@@ -314,8 +314,8 @@ def _with_setting(representation: Representation, name: str, value: Any) -> Repr
     )
 
 
-def parsed_settings(recipe: Recipe, texts: Mapping[str, str]) -> dict[str, Any]:
-    """Return settings for :func:`configured` from text, each of the type of the present value.
+def parse_settings(recipe: Recipe, texts: Mapping[str, str]) -> dict[str, Any]:
+    """Return settings for :func:`configure` from text, each of the type of the present value.
 
     A function is given by its name, such as ``metric=outdoor``; it must be defined in the module of the present one and
     take the same arguments. For a number other than the weight of a loss term, ``none`` is None.
@@ -332,10 +332,10 @@ def parsed_settings(recipe: Recipe, texts: Mapping[str, str]) -> dict[str, Any]:
             f"recipe {recipe.name} has no {', '.join(unknown)} to set: choose from {', '.join(sorted(known))}"
         )
     weights = {term.name for term in recipe.losses}
-    return {name: _parsed(name, text, known[name], name not in weights) for name, text in texts.items()}
+    return {name: _parse(name, text, known[name], name not in weights) for name, text in texts.items()}
 
 
-def _parsed(name: str, text: str, present: Any, may_be_none: bool) -> Any:
+def _parse(name: str, text: str, present: Any, may_be_none: bool) -> Any:
     if callable(present):
         choices = _alternatives(present)
         if text not in choices:
@@ -395,7 +395,7 @@ def describe(recipe: Recipe) -> dict[str, Any]:
     return {
         **fields,
         **cooling,
-        "learning_rates": recipe.rates.described(),
+        "learning_rates": recipe.rates.describe(),
         "adam": recipe.adam._asdict(),
         "sh_milestones": list(recipe.sh_milestones),
         "losses": [_describe_term(term) for term in recipe.losses if term.weight != 0],
@@ -415,14 +415,18 @@ def action_name(event: Event) -> str:
 
 
 def _describe_event(event: Event) -> dict[str, Any]:
-    return {"event": type(event).__name__, **_described(event._asdict()), **_describe_function(event.action, "action")}
+    return {
+        "event": type(event).__name__,
+        **_describe_fields(event._asdict()),
+        **_describe_function(event.action, "action"),
+    }
 
 
 def _describe_term(term: LossTerm) -> dict[str, Any]:
-    return {**_described(term._asdict()), **_describe_function(term.function, "function")}
+    return {**_describe_fields(term._asdict()), **_describe_function(term.function, "function")}
 
 
-def _described(fields: Mapping[str, Any]) -> dict[str, Any]:
+def _describe_fields(fields: Mapping[str, Any]) -> dict[str, Any]:
     return {name: _plain(value) for name, value in fields.items()}
 
 

@@ -153,7 +153,7 @@ def begin_cooling(
         Iterations of the cool-down; by default ``cooling.part`` of those before it.
     """
     length = max(1, math.ceil(cooling.part * decision.step)) if length is None else length
-    state.pace = state.pace.decided(decision)._replace(
+    state.pace = state.pace.with_decision(decision)._replace(
         cooling_from=decision.step, last_step=min(decision.step + length, iterations)
     )
     state.view_order = []

@@ -28,7 +28,7 @@ from minisplat_ref.bench import (
     workloads,
 )
 from minisplat_ref.bench.exponentials import EXPONENTIALS, relative_errors
-from minisplat_ref.bench.interleaving import interleaved_times, time_contests
+from minisplat_ref.bench.interleaving import time_contests, time_interleaved
 from minisplat_ref.bench.passes import RASTERIZATION
 from minisplat_ref.bench.peers import peers_of
 from minisplat_ref.cli import main
@@ -368,7 +368,7 @@ def test_tasks_alternate_in_every_round(monkeypatch):
 
     monkeypatch.setattr(interleaving.time, "perf_counter", lambda: clock[0])
     groups = [[task("a", 9, 1, 5, 2, 1), task("b", 9, 3, 3, 3, 3)], [task("c", 9, 4, 4, 4, 4)]]
-    [a, b], [c] = interleaved_times(groups, rounds=2, repeats=2)
+    [a, b], [c] = time_interleaved(groups, rounds=2, repeats=2)
     assert "".join(runs) == "abc" + "ababcc" * 2
     assert (a, b, c) == ((1, 1.5), (3, 3), (4, 4))  # without the first turn, which compiles
 
@@ -426,7 +426,7 @@ def test_adam_moves_the_part_that_is_seen(monkeypatch):
 
 def test_stopwatches_change_nothing():
     seconds = {}
-    backend = profiling.timed(CPU, seconds)
+    backend = profiling.time_stages(CPU, seconds)
     workload = tiny()
     plain, _ = render(workload.gaussians, workload.camera, conventions=GSPLAT_MAIN)
     watched, _ = render(workload.gaussians, workload.camera, conventions=GSPLAT_MAIN, backend=backend)

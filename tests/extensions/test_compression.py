@@ -288,7 +288,7 @@ def test_a_smaller_scene_is_the_same_picture_and_only_spz_suffers(run):
     views, gaussians = load_scene(run.parent / "nook").test_views, load_ply(run / "point_cloud.ply")
     pictures = []
     for factor in (1.0, 1 / 512):
-        small, camera = rate_distortion.shrink(gaussians, factor), rate_distortion.shrunk_camera(views[0], factor)
+        small, camera = rate_distortion.shrink(gaussians, factor), rate_distortion.shrink_camera(views[0], factor)
         conventions = GSPLAT_MAIN._replace(near_plane=factor * GSPLAT_MAIN.near_plane)
         files = [format_.decode(format_.encode(small, level), "") for format_, level in ((msz.MSZ, 5), (spz.SPZ, 0))]
         request = Request(conventions=conventions)

@@ -15,7 +15,14 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.extensions.cuts import card
-from minisplat_ref.extensions.cuts.curve import N_EDGES, VERTICES, bernstein, cut, cut_vjp, n_crossings
+from minisplat_ref.extensions.cuts.curve import (
+    N_EDGES,
+    VERTICES,
+    bernstein,
+    evaluate_cuts,
+    evaluate_cuts_vjp,
+    n_crossings,
+)
 from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CutGaussians
 from minisplat_ref.extensions.cuts.response import image_points, image_points_vjp
 from minisplat_ref.types import Gaussians, Primitives, view_from
@@ -45,7 +52,7 @@ def test_what_is_cut_away_is_the_shadow_of_the_curve(points):
     directions = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
     shadow = Polygon(np.concatenate([vertices, 1e3 * directions[::-1], vertices[:1]]))
     expected = shadow.contains_points(d[0])
-    found = cut(points, HARD, d)
+    found = evaluate_cuts(points, HARD, d)
     assert 0.1 < expected.mean() < 0.95
     assert (found.masks[0] == ~expected).all()
     assert set(np.unique(found.masks)) == {0.0, 1.0}
@@ -71,18 +78,18 @@ def test_the_polygon_is_the_curve_at_its_vertices():
 def test_a_straight_cut_is_a_logistic_curve_of_the_distance():
     points = np.array([[[1.5, -90.0], [1.5, -30.0], [1.5, 30.0], [1.5, 90.0]]])
     d = np.array([[[x, 0.4] for x in (-3.0, 1.0, 1.5, 1.75, 4.0)]])
-    found = cut(points, 2 * SOFT, d).masks[0]
+    found = evaluate_cuts(points, 2 * SOFT, d).masks[0]
     assert_allclose(found, 1 / (1 + np.exp(-(1.5 - d[0, :, 0]) / 2)), rtol=CLOSED_FORM)
-    assert_allclose(cut(points, HARD, d).masks[0], [1, 1, 0, 0, 0])
+    assert_allclose(evaluate_cuts(points, HARD, d).masks[0], [1, 1, 0, 0, 0])
 
 
 @pytest.mark.parametrize("points", [LOOP, AROUND], ids=["beside", "around"])
 def test_the_soft_mask_does_not_jump_and_narrows_to_the_hard_one(points):
     path = np.linspace([[-8.0, -5.0]], [[8.0, 6.3]], 20_001).swapaxes(0, 1)
-    soft, hard = cut(points, SOFT, path).masks[0], cut(points, HARD, path).masks[0]
+    soft, hard = evaluate_cuts(points, SOFT, path).masks[0], evaluate_cuts(points, HARD, path).masks[0]
     step = np.linalg.norm(path[0, 1] - path[0, 0])
     assert np.abs(np.diff(hard)).max() == 1 and np.abs(np.diff(soft)).max() <= 0.2501 * step
-    narrow = cut(points, 1e-4 * SOFT, path).masks[0]
+    narrow = evaluate_cuts(points, 1e-4 * SOFT, path).masks[0]
     assert np.mean(np.abs(narrow - hard) > 1e-6) < 0.002
 
 
@@ -99,10 +106,10 @@ def test_the_soft_mask_does_not_jump_and_narrows_to_the_hard_one(points):
 def test_degenerate_curves_are_finite_and_cut_nothing_if_they_have_no_breadth(points):
     d = np.concatenate([grid(), points, np.zeros((1, 1, 2))], axis=1)
     for widths in (HARD, SOFT):
-        found = cut(points, widths, d)
-        v_points, v_offsets = cut_vjp(points, widths, found, np.ones_like(found.masks))
+        found = evaluate_cuts(points, widths, d)
+        v_points, v_offsets = evaluate_cuts_vjp(points, widths, found, np.ones_like(found.masks))
         assert all(np.isfinite(array).all() for array in (found.masks, v_points, v_offsets))
-    share = cut(points, HARD, grid()).masks.mean()
+    share = evaluate_cuts(points, HARD, grid()).masks.mean()
     assert 0.3 < share < 0.7 if np.ptp(points[0, :, 1]) > 1 else share > 0.999
 
 
@@ -110,8 +117,8 @@ def test_degenerate_curves_are_finite_and_cut_nothing_if_they_have_no_breadth(po
 def test_the_gradient_of_the_mask(points, rng):
     d = rng.uniform(-5, 8, size=(1, 12, 2))
     check_jacobian(
-        lambda points, d: (cut(points, SOFT, d).masks,),
-        lambda v: cut_vjp(points, SOFT, cut(points, SOFT, d), v),
+        lambda points, d: (evaluate_cuts(points, SOFT, d).masks,),
+        lambda v: evaluate_cuts_vjp(points, SOFT, evaluate_cuts(points, SOFT, d), v),
         [points, d],
         names=["points", "offsets"],
     )
@@ -187,7 +194,7 @@ def test_trains_evaluates_and_renders(tmp_path, capsys):
 def test_one_gaussian_with_a_cut_is_a_cut_gaussian():
     """Starting with a curve on the right side it is reproduced; 3DGS spills over the edge."""
     target = card.cut_gaussian()
-    plain, found = (card.measured(target, card.fitted(target, 1, is_cut, 300, 3)) for is_cut in (False, True))
+    plain, found = (card.measure_card(target, card.fit_card(target, 1, is_cut, 300, 3)) for is_cut in (False, True))
     assert found["psnr"] > plain["psnr"] + 20 and found["edge_width"] < 2 < plain["edge_width"]
 
 

@@ -16,7 +16,7 @@ from minisplat_ref.cli import _parser_of, main
 from minisplat_ref.extensions.extension import find_recipe, load_extension
 from minisplat_ref.io.ply import load_ply, save_ply
 from minisplat_ref.training.losses import Rendered
-from minisplat_ref.training.schedule import configured
+from minisplat_ref.training.schedule import configure
 from minisplat_ref.types import Model
 from photo_scenes import write_transforms
 from scenes import as_dtype, make_gaussians
@@ -126,7 +126,7 @@ def faint(tmp_path, monkeypatch):
 
 
 def test_its_gradient_is_right(faint, rng):
-    recipe = configured(find_recipe("3dgs-accel", extension="faint"), faint=0.01, power=0.5)
+    recipe = configure(find_recipe("3dgs-accel", extension="faint"), faint=0.01, power=0.5)
     term = recipe.losses[-1]
     gaussians = make_gaussians(rng, 5)
     blank = Rendered(None, {}, None, None, Model(gaussians), 1, None)

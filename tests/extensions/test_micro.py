@@ -30,7 +30,7 @@ from minisplat_ref.rendering import SPLATTING, Request
 from minisplat_ref.runs.progress import Progress
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import At, During, Every, configured, does
+from minisplat_ref.training.schedule import At, During, Every, configure, does
 from minisplat_ref.training.state import Iteration, TrainState
 from minisplat_ref.types import Gaussians, Model, Scene, View, view_from
 from scenes import as_dtype, make_camera, make_gaussians
@@ -188,13 +188,13 @@ def shortened(recipe):
         prune = partial(prune_large, size_fraction=2.0)
         return Every(10, prune if does(event, prune_large) else event.action, start=start, stop=stop)
 
-    recipe = configured(recipe, threshold=2e-3, size_fraction=0.15, ceiling=0.05)
+    recipe = configure(recipe, threshold=2e-3, size_fraction=0.15, ceiling=0.05)
     return recipe._replace(iterations=40, events=tuple(sooner(event) for event in recipe.events))
 
 
 def test_switched_off_it_is_3dgs_to_the_byte(backend, rng):
     scene = tiny_scene(rng)
-    recipes = (configured(shortened(find_recipe("micro")), **OFF), shortened(find_recipe("3dgs-accel")))
+    recipes = (configure(shortened(find_recipe("micro")), **OFF), shortened(find_recipe("3dgs-accel")))
     ours, theirs = (train(scene, recipe, seed=1, backend=backend) for recipe in recipes)
     assert len(ours.gaussians.means) > 40  # rows have come
     for a, b in ((ours.gaussians, theirs.gaussians), *zip(ours.adam[:2], theirs.adam[:2], strict=True)):
@@ -207,7 +207,7 @@ def test_each_of_the_three_changes_something(name, value, rng):
     scene = tiny_scene(rng)
     settings = {**OFF, name: value, "trace_limit": 0.2, "merge_color": 1.0}
     changed, plain = (
-        train(scene, configured(shortened(find_recipe("micro")), **each), seed=1) for each in (settings, OFF)
+        train(scene, configure(shortened(find_recipe("micro")), **each), seed=1) for each in (settings, OFF)
     )
     assert min(len(changed.gaussians.means), len(plain.gaussians.means)) > 30
     assert changed.gaussians.means.tobytes() != plain.gaussians.means.tobytes()

@@ -352,8 +352,8 @@ def test_trains_evaluates_and_renders(tmp_path, capsys):
 
 def test_one_line_is_found_and_one_ellipse_is_not_enough():
     target = fit.one_line()
-    line, ellipse = (fit.fitted(target, 1, n_vertices=m, iterations=200, seed=0) for m in (2, 1))
-    assert psnr_of(fit.drawn(line), target) > psnr_of(fit.drawn(ellipse), target) + 10
+    line, ellipse = (fit.fit_primitives(target, 1, n_vertices=m, iterations=200, seed=0) for m in (2, 1))
+    assert psnr_of(fit.render_primitives(line), target) > psnr_of(fit.render_primitives(ellipse), target) + 10
 
 
 def test_bench_times_hulls():

@@ -29,7 +29,7 @@ from minisplat_ref.oracle.models import check_model_gradients
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT64
 from minisplat_ref.reference.projection import project as project_ewa
 from minisplat_ref.rendering import SPLATTING, Request, activate
-from minisplat_ref.training.schedule import configured, describe, settings_of
+from minisplat_ref.training.schedule import configure, describe, settings_of
 from minisplat_ref.types import Gaussians, Model, Primitives, view_from
 from scenes import as_dtype, make_camera, make_gaussians
 from tolerances import CLOSED_FORM, COVERAGE_MIN, PARITY_FLOAT32_GRADIENT, PARITY_FLOAT32_IMAGE, PARITY_FLOAT64
@@ -438,7 +438,7 @@ def test_hits_of_a_rotated_camera_are_those_of_the_ray(rng):
 def test_settings_of_a_renderer_are_set_and_recorded():
     recipe = find_recipe("pixel-order", 100)
     assert settings_of(recipe)["buffer_size"] is None
-    changed = configured(recipe, buffer_size=4)
+    changed = configure(recipe, buffer_size=4)
     assert changed.representation.renderer.render.keywords == {"buffer_size": 4}
     assert describe(changed)["representation"]["renderer"] == {"buffer_size": 4} != describe(recipe)["representation"]
     assert "renderer" not in describe(find_recipe("3dgs-accel"))["representation"]

@@ -224,7 +224,7 @@ def test_a_bent_soup_is_drawn_as_it_is(rng):
     """A sheet that is only moved looks like its Gaussians; the more it is bent, the more these differ."""
     gaussians = claims.sheet(6)
     soup = soup_of(gaussians, 8)
-    moved = claims.placed(soup.corners)
+    moved = claims.place_sheet(soup.corners)
     after, _ = carry_gaussians(gaussians, soup, moved, "it")
     drawn = claims.picture_of_soup(gaussians, soup, moved)
     assert drawn.min() < 0.5

@@ -11,7 +11,7 @@ from minisplat_ref.extensions.proxies import edit_claims, sheet_claims
 from minisplat_ref.extensions.proxies import fall as fall_command
 from minisplat_ref.extensions.proxies.binding import UNBOUND, bind, rebuild
 from minisplat_ref.extensions.proxies.cage import grid
-from minisplat_ref.extensions.proxies.edit_claims import rolled, rolled_jacobian
+from minisplat_ref.extensions.proxies.edit_claims import roll, rolled_jacobian
 from minisplat_ref.extensions.proxies.fall import Setting, sheet_of
 from minisplat_ref.extensions.proxies.mass_spring import (
     Floor,
@@ -193,7 +193,7 @@ def test_a_sheet_lies_on_the_floor():
 
 
 def test_the_hanging_sheet_nears_the_catenary():
-    errors = [np.linalg.norm(np.subtract(*sheet_claims.hanging_sheet(n, 1e-3)), axis=1).max() for n in (4, 8)]
+    errors = [np.linalg.norm(np.subtract(*sheet_claims.hang_sheet(n, 1e-3)), axis=1).max() for n in (4, 8)]
     assert errors[1] < 4e-3 and errors[0] > 3 * errors[1]
 
 
@@ -203,7 +203,7 @@ def test_the_hanging_sheet_nears_the_catenary():
 @pytest.mark.parametrize("name", ["no drag", "drag"])
 def test_the_energy_balance_closes_with_the_square_of_the_step(name):
     errors = [
-        sheet_claims.energy_error(sheet_claims.swinging_sheet(sheet_claims.SWINGS[name], f)) for f in (0.8, 0.4, 0.2)
+        sheet_claims.energy_error(sheet_claims.swing_sheet(sheet_claims.SWINGS[name], f)) for f in (0.8, 0.4, 0.2)
     ]
     assert errors[0] > 1e-6  # else there is no slope to see
     slopes = np.log2(np.divide(errors[:-1], errors[1:]))
@@ -348,7 +348,7 @@ def test_the_derivative_of_the_cylinder(rng):
     J = rolled_jacobian(points)
     for axis in range(2):
         moved = GRADIENT_STEP * np.eye(3)[axis]
-        numeric = (rolled(points + moved) - rolled(points - moved)) / (2 * GRADIENT_STEP)
+        numeric = (roll(points + moved) - roll(points - moved)) / (2 * GRADIENT_STEP)
         assert_allclose(J[:, :, axis], numeric, atol=GRADIENT_REL)
     assert_allclose(np.linalg.det(J), 1, atol=CLOSED_FORM)
 

@@ -14,7 +14,7 @@ from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.extensions.extension import find_recipe, load_extension
 from minisplat_ref.extensions.velocity.method import MOVING, MovingGaussians
 from minisplat_ref.extensions.velocity.reference import means_at, means_at_vjp
-from minisplat_ref.extensions.velocity.study import moving_gaussians, outcome, photographs
+from minisplat_ref.extensions.velocity.study import make_moving_gaussians, outcome, photographs
 from minisplat_ref.io import load_scene
 from minisplat_ref.io.images import read_image, write_image
 from minisplat_ref.io.ply import load_ply, save_ply
@@ -171,7 +171,7 @@ def test_standing_still_is_3dgs_to_the_byte(case, backend, rng):
     scene = tiny_scene(rng, times)
     recipe = find_recipe("velocity")._replace(iterations=40, events=EVENTS)
     if case == "no rate":
-        recipe = recipe._replace(learning_rates=recipe.learning_rates.changed(velocities=0.0))
+        recipe = recipe._replace(learning_rates=recipe.learning_rates.change(velocities=0.0))
     results = []
     for each in (recipe, find_recipe("3dgs-accel")._replace(iterations=40, events=EVENTS)):
         images = []
@@ -193,7 +193,7 @@ def test_standing_still_is_3dgs_to_the_byte(case, backend, rng):
 @pytest.mark.parametrize("seed", [0, 1])
 def test_velocities_are_found(seed, record_property):
     """This runs the study on its known scene, with and without velocities."""
-    truth = moving_gaussians(np.random.default_rng(seed))
+    truth = make_moving_gaussians(np.random.default_rng(seed))
     still, moved = (outcome(find_recipe(name, 600), truth, seed) for name in ("3dgs-accel", "velocity"))
     record_property("velocity_rmse", moved.velocity_rmse)
     assert still.velocity_rmse == pytest.approx(np.sqrt(np.mean(truth.velocities**2)))
@@ -204,7 +204,7 @@ def test_velocities_are_found(seed, record_property):
 def test_the_study_prints_what_it_measures(capsys):
     assert main(["study", "velocity/motion", "--iterations", "20"]) == 0
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in capsys.readouterr().out.splitlines()]
-    truth = moving_gaussians(np.random.default_rng(0))
+    truth = make_moving_gaussians(np.random.default_rng(0))
     expected = outcome(find_recipe("velocity", 20), truth, 0)
     assert rows[0] == ["recipe", "PSNR dB", "error of velocities"] and rows[2][0] == "3dgs-accel"
     assert rows[3] == ["velocity", f"{expected.psnr:.2f}", f"{expected.velocity_rmse:.4f}"]
@@ -217,7 +217,7 @@ def test_the_study_prints_what_it_measures(capsys):
 
 @pytest.fixture(scope="module")
 def truth():
-    return moving_gaussians(np.random.default_rng(3))
+    return make_moving_gaussians(np.random.default_rng(3))
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from minisplat_ref.extensions.cuts.curve import cut_vjp
+from minisplat_ref.extensions.cuts.curve import evaluate_cuts_vjp
 from minisplat_ref.extensions.cuts.method import CUT_GAUSSIANS, CutGaussians, with_cuts
 from minisplat_ref.extensions.cuts.stages import stages as cuts_stages
 from minisplat_ref.extensions.mixed.method import MIXED_GAUSSIANS
@@ -72,7 +72,7 @@ CASES = {
         uncut,
         lambda gaussians: uncut(gaussians, 8),
         cuts_stages,
-        ("minisplat_ref.extensions.cuts.response.cut_vjp", cut_vjp),
+        ("minisplat_ref.extensions.cuts.response.evaluate_cuts_vjp", evaluate_cuts_vjp),
         frozenset({"widths"}),
     ),
     "mixed": Case(

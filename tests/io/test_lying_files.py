@@ -25,7 +25,7 @@ from minisplat_ref.methods import get_recipe
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.saved_state import load_state, save_state
-from minisplat_ref.training.schedule import configured
+from minisplat_ref.training.schedule import configure
 from minisplat_ref.types import Gaussians
 from photo_scenes import edit_transforms, write_colmap, write_transforms
 
@@ -152,7 +152,7 @@ def test_checkpoint_whose_header_is_no_header(tmp_path, refused):
 
 # checkpoints that are whole, and yet no state of a training
 
-RECIPE = configured(get_recipe("3dgs-accel"), exposure=True)._replace(iterations=2)
+RECIPE = configure(get_recipe("3dgs-accel"), exposure=True)._replace(iterations=2)
 
 
 @pytest.fixture(scope="module")

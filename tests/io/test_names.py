@@ -16,7 +16,7 @@ from minisplat_ref.io.images import write_image
 from minisplat_ref.io.names import file_names, name_inside, path_beside
 from minisplat_ref.metrics import ViewMetrics
 from minisplat_ref.runs import scoring
-from minisplat_ref.types import numbered
+from minisplat_ref.types import number_views
 from photo_scenes import PINHOLE, colored_image, edit_transforms, write_colmap, write_transforms
 
 NASTY = ("/abs", "../up", "a/../../b", "C:\\x", "a\0b", "a\nb", "..", "", "x" * 300, "é" * 200, "nul", "A", "a")
@@ -151,7 +151,7 @@ def test_scores_stay_in_their_folder(tmp_path, nothing_outside, monkeypatch):
     monkeypatch.setattr(scoring, "measure", measure)
     (tmp_path / "deep" / "out").mkdir()
     nothing_outside()
-    scoring.score(tmp_path / "deep" / "out", scene._replace(test_views=numbered(views)), None, None)
+    scoring.score(tmp_path / "deep" / "out", scene._replace(test_views=number_views(views)), None, None)
     assert len(list((tmp_path / "deep" / "out" / "renders").iterdir())) == len(views)
 
 

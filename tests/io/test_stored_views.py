@@ -362,7 +362,7 @@ def test_photographs_give_way(monkeypatch):
 
 
 def half_size_of(view):
-    return view.changed(lambda pixels: Pixels(pixels.image[::2, ::2], None))
+    return view.change(lambda pixels: Pixels(pixels.image[::2, ::2], None))
 
 
 def test_growing_gaussians_take_the_room_of_photographs(scene, monkeypatch):

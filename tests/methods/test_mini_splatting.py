@@ -18,7 +18,7 @@ from minisplat_ref.strategy.ops import n_rows
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.saved_state import load_state, save_state
-from minisplat_ref.training.schedule import At, Every, SmallerViews, configured, firing_steps, scaled, settings_of
+from minisplat_ref.training.schedule import At, Every, SmallerViews, configure, firing_steps, scale_recipe, settings_of
 from minisplat_ref.training.smaller_views import halve_large_views
 from minisplat_ref.training.state import Iteration, n_pixels
 from minisplat_ref.types import Scene, View
@@ -62,8 +62,8 @@ def compressed(name):
     recipe = RECIPES[name]
     min_gap = 2 if name.startswith("mini-splatting2") else 5
     events = [e._replace(min_gap=min_gap) if isinstance(e, Every) else e for e in recipe.events]
-    recipe = scaled(recipe._replace(events=tuple(events)), ITERATIONS)
-    return configured(recipe, min_side=32) if "min_side" in settings_of(recipe) else recipe
+    recipe = scale_recipe(recipe._replace(events=tuple(events)), ITERATIONS)
+    return configure(recipe, min_side=32) if "min_side" in settings_of(recipe) else recipe
 
 
 # Whole recipes --------------------------------------------------------------------------------------------------------
@@ -93,7 +93,7 @@ def test_recipe_runs_to_the_end(scene, name):
 
 @pytest.mark.parametrize("name", ["mini-splatting", "mini-splatting2"])
 def test_budget_is_kept(scene, name):
-    recipe = configured(compressed(name), budget=20)
+    recipe = configure(compressed(name), budget=20)
     counts = []
     train(scene, recipe, seed=0, on_step=lambda report: counts.append(n_rows(report.state.gaussians)))
     simplified = next(event.step for event in recipe.events if "simplify" in repr(event.action))
@@ -358,5 +358,5 @@ def test_recipe_settings_reach_the_event(scene):
     recipe = RECIPES["3dgs"]._replace(
         iterations=1, events=(At(1, partial(lambda *_, budget: seen.append(budget), budget=None)),)
     )
-    train(scene, configured(recipe, budget=7), seed=0)
+    train(scene, configure(recipe, budget=7), seed=0)
     assert seen == [7]

@@ -12,7 +12,16 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.methods import RECIPES, gaussian_splatting, get_recipe
 from minisplat_ref.strategy.importance import outdoor
 from minisplat_ref.training.losses import LossTerm
-from minisplat_ref.training.schedule import At, DatedEvent, During, Every, action_name, configured, describe, scaled
+from minisplat_ref.training.schedule import (
+    At,
+    DatedEvent,
+    During,
+    Every,
+    action_name,
+    configure,
+    describe,
+    scale_recipe,
+)
 
 
 def nothing(state, iteration, **settings):
@@ -184,13 +193,13 @@ def test_settings_are_the_published_ones(name):
 
 
 def test_settings_are_replaced_in_every_event_that_has_them():
-    recipe = configured(RECIPES["mini-splatting"], metric=outdoor, budget=1_000)
+    recipe = configure(RECIPES["mini-splatting"], metric=outdoor, budget=1_000)
     settings = [event["settings"] for event in describe(recipe)["events"]]
     assert [s["metric"] for s in settings if "metric" in s] == ["outdoor", "outdoor"]
     assert [s["budget"] for s in settings if "budget" in s] == [1_000]
     assert firings(recipe) == firings(RECIPES["mini-splatting"])
     with pytest.raises(InputError, match="recipe 3dgs has no budget to set"):
-        configured(RECIPES["3dgs"], budget=1_000)
+        configure(RECIPES["3dgs"], budget=1_000)
 
 
 @pytest.mark.parametrize("name", RECIPES)
@@ -228,7 +237,7 @@ def test_events_keep_their_order_and_gaps_at_every_length(name, lengths):
         factor = Fraction(n, recipe.iterations)
         steps = [round(step * factor) for step, _ in published]
         for (_, number), step in zip(published, steps, strict=True):
-            event = events[number].scaled(factor)
+            event = events[number].scale(factor)
             assert event.is_due(step), (n, step)
         assert steps == sorted(steps), n
         gaps = np.diff(steps) - np.diff([step for step, _ in published]) * (n / recipe.iterations)
@@ -244,7 +253,7 @@ def test_a_compressed_schedule_is_part_of_the_published_one(name, n):
     for event in recipe.events:
         if isinstance(event, Every):
             published = {round(step * factor) for step in firing(event, event.stop)}
-            steps = firing(event.scaled(factor), n)
+            steps = firing(event.scale(factor), n)
             assert set(steps) <= published
             gaps = np.diff([*steps, round(event.stop * factor)])
             assert all(gaps >= event.min_gap - 1), gaps  # each end is rounded by up to a half
@@ -263,11 +272,11 @@ def test_the_last_density_event_is_as_far_from_simplification_as_published():
 
 def test_rates_of_short_runs_are_raised_where_the_recipe_says_so():
     recipe = RECIPES["3dgs"]._replace(short_run_exponent=0.5)
-    short, rates = (dict(r.learning_rates.of) for r in (scaled(recipe, 7_500), recipe))
+    short, rates = (dict(r.learning_rates.of) for r in (scale_recipe(recipe, 7_500), recipe))
     short_means, means = short.pop("means"), rates.pop("means")
     assert len(short) == 5 and short == pytest.approx({name: 2 * rate for name, rate in rates.items()})
     assert (short_means.first, short_means.last) == pytest.approx((4 * means.first, 4 * means.last))
-    assert rates.items() <= scaled(recipe, 60_000).learning_rates.of.items()  # longer runs keep them
+    assert rates.items() <= scale_recipe(recipe, 60_000).learning_rates.of.items()  # longer runs keep them
 
 
 def test_rewind_and_warm_up_are_scaled():
@@ -291,23 +300,23 @@ def test_scaled_to_a_tenth():
 
 
 def test_a_published_iteration_is_rounded_by_itself():
-    event = Every(100, nothing, start=500, stop=15_000).scaled(Fraction(7, 30))  # 140, 163.33, 186.67, 210
+    event = Every(100, nothing, start=500, stop=15_000).scale(Fraction(7, 30))  # 140, 163.33, 186.67, 210
     assert firing(event)[:4] == [140, 163, 187, 210] and len(firing(event)) == 144
-    assert firing(Every(100, nothing, stop=1_000, min_gap=50).scaled(Fraction(1, 5)), 200) == [20, 80, 140]
-    assert firing(Every(100, nothing, min_gap=50).scaled(Fraction(1, 5)), 200) == [60, 120, 180]  # without an end
-    longer = firings(scaled(RECIPES["3dgs"], 60_000))
+    assert firing(Every(100, nothing, stop=1_000, min_gap=50).scale(Fraction(1, 5)), 200) == [20, 80, 140]
+    assert firing(Every(100, nothing, min_gap=50).scale(Fraction(1, 5)), 200) == [60, 120, 180]  # without an end
+    longer = firings(scale_recipe(RECIPES["3dgs"], 60_000))
     assert longer["collect_gradients"] == list(range(1, 30_000))  # every iteration, not every second one
     assert longer["clone_and_split"] == list(range(1_200, 30_000, 200))
 
 
 def test_scaled_to_next_to_nothing():
     assert firings(get_recipe("3dgs", 1)).keys() == firings(RECIPES["3dgs"]).keys()
-    assert firing(Every(100, nothing).scaled(Fraction(1, 1_000)), 5) == [1, 2, 3, 4, 5]
-    assert At(100, nothing).scaled(Fraction(1, 1_000)) == At(1, nothing)
+    assert firing(Every(100, nothing).scale(Fraction(1, 1_000)), 5) == [1, 2, 3, 4, 5]
+    assert At(100, nothing).scale(Fraction(1, 1_000)) == At(1, nothing)
 
 
 def test_scaled_by_one_changes_nothing():
-    assert scaled(RECIPES["3dgs"], 30_000) == RECIPES["3dgs"]
+    assert scale_recipe(RECIPES["3dgs"], 30_000) == RECIPES["3dgs"]
 
 
 def test_what_tells_the_two_recipes_apart():

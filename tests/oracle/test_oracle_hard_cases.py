@@ -10,7 +10,14 @@ from minisplat_ref.constants import PROFILES
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle import hard_cases
 from minisplat_ref.oracle.hard_cases import GROUPS, HARD_CASES, subjects
-from minisplat_ref.oracle.hard_cases.run import PRECISIONS, Precision, by_group, matching, run_hard_case, run_hard_cases
+from minisplat_ref.oracle.hard_cases.run import (
+    PRECISIONS,
+    Precision,
+    by_group,
+    run_hard_case,
+    run_hard_cases,
+    select_cases,
+)
 from minisplat_ref.oracle.hard_cases.subjects import Call, Parameters, render_subject
 from minisplat_ref.oracle.tolerances import ORDINARY
 from minisplat_ref.rendering import render_vjp
@@ -184,7 +191,7 @@ def test_command_prints_and_writes(tmp_path, capsys):
     assert main(["oracle", "hard-cases", "--only", "quaternion", "--json", str(path)]) == 0
     printed = capsys.readouterr().out
     cases = json.loads(path.read_text())["cases"]
-    assert len(cases) == len(matching(HARD_CASES, "quaternion")) >= 4
+    assert len(cases) == len(select_cases(HARD_CASES, "quaternion")) >= 4
     for case in cases:
         assert case["passed"] is True and case["name"] in printed
         assert set(case) >= {"name", "passed", "note"}
@@ -206,8 +213,8 @@ def test_command_knows_its_cases(capsys):
     assert main(["oracle", "hard-cases", "--only", "no such case"]) == 2
     assert "no such case" in capsys.readouterr().err
     with pytest.raises(InputError, match="run without --only"):
-        matching(HARD_CASES, "no such case")
-    assert {case.name for case in matching(HARD_CASES, "needle-*-oblique")} < set(BY_NAME)
+        select_cases(HARD_CASES, "no such case")
+    assert {case.name for case in select_cases(HARD_CASES, "needle-*-oblique")} < set(BY_NAME)
 
 
 def test_summary_has_the_worst_of_each_kind():
@@ -221,7 +228,7 @@ def test_summary_has_the_worst_of_each_kind():
 
 
 def test_report_has_every_case():
-    cases = matching(HARD_CASES, "ssim-flat")
+    cases = select_cases(HARD_CASES, "ssim-flat")
     report = run_hard_cases(cases)
     assert [case.name for case in report.cases] == [case.name for case in cases] and report.n_failed == 0
     assert REFERENCE not in [precision.backend for precision in PRECISIONS]

@@ -32,7 +32,7 @@ from minisplat_ref.runs.rate_distortion import (
     sizes,
     smallest_within,
 )
-from minisplat_ref.runs.simplification import Target, decide, fine_tuned, fine_tuning
+from minisplat_ref.runs.simplification import Target, decide, fine_tune, fine_tuning
 from minisplat_ref.strategy.importance import collect_importance
 from minisplat_ref.strategy.ops import take
 from minisplat_ref.training.loop import train
@@ -190,7 +190,7 @@ def test_held_out_views_do_not_enter_the_fine_tuning(run_folder, monkeypatch):
     n = len(run.scene.train_views)
     for holds_out in (True, False):
         seen[holds_out] = set()
-        fine_tuned(run, np.arange(50), n, holds_out=holds_out, on_step=lambda: None)
+        fine_tune(run, np.arange(50), n, holds_out=holds_out, on_step=lambda: None)
     held = {view.name for view in run.held_out}
     assert held == {run.scene.train_views[k].name for k in held_out_ids(n, HOLD_OUT_EVERY)}
     assert seen[True] == {view.name for view in run.others} and seen[False] == seen[True] | held

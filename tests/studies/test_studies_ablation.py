@@ -28,9 +28,9 @@ from minisplat_ref.studies.variants import (
     with_settings,
 )
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import At, action_name, configured, does, firing_steps, settings_of
+from minisplat_ref.training.schedule import At, action_name, configure, does, firing_steps, settings_of
 from minisplat_ref.training.state import Iteration
-from minisplat_ref.types import numbered
+from minisplat_ref.types import number_views
 
 
 def tiny_room():
@@ -40,7 +40,7 @@ def tiny_room():
 @pytest.fixture
 def room():
     scene = tiny_room().scene
-    return scene._replace(train_views=numbered(scene.train_views))
+    return scene._replace(train_views=number_views(scene.train_views))
 
 
 def names_of(recipe):
@@ -205,4 +205,4 @@ def test_bad_input_is_one_line(tmp_path, capsys, small):
 
 def test_settings_that_a_recipe_lacks_change_nothing():
     assert with_settings(factor=1)(RECIPES["3dgs"]) is RECIPES["3dgs"]
-    assert configured(RECIPES["mini-splatting2"], factor=1) != RECIPES["mini-splatting2"]
+    assert configure(RECIPES["mini-splatting2"], factor=1) != RECIPES["mini-splatting2"]

@@ -112,12 +112,12 @@ def test_the_sweep_goes_from_little_growth_to_much():
 
 
 def test_a_rule_can_be_asked_for_by_its_name():
-    named = adaptive._named(["3dgs", "large views at once", "adaptive"])
+    named = adaptive._recipes_by_name(["3dgs", "large views at once", "adaptive"])
     assert list(named) == ["3dgs", "large views at once", "adaptive"] and named["adaptive"] == ADAPTIVE
     sides = [settings_of(named[name])["min_side"] for name in ("large views at once", "adaptive")]
     assert sides[0] == np.inf > sides[1]
     with pytest.raises(InputError, match="recipe 'small views' does not exist"):
-        adaptive._named(["small views"])
+        adaptive._recipes_by_name(["small views"])
 
 
 def test_study_and_its_continuation(tmp_path, capsys, scene, monkeypatch):

@@ -24,7 +24,7 @@ def test_gains_are_planted(scene):
 
 
 def test_cameras_are_turned_by_half_a_pixel(scene):
-    disturbed = defects.with_turned_cameras(scene, np.random.default_rng(0))
+    disturbed = defects.with_rotated_cameras(scene, np.random.default_rng(0))
     for view, other in zip(scene.train_views, disturbed.train_views, strict=True):
         camera, moved = view.camera, other.camera
         axis = camera.cam_from_world_R.T @ np.array([0.0, 0.0, 1.0])  # what stands in the middle of the image

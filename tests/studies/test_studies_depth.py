@@ -83,7 +83,7 @@ def test_each_point_is_on_the_ray_of_its_pixel(outdoor, rng):
     is_seen = outdoor.train_depths.ravel() > 0
     surface = true_points(outdoor)[is_seen]
     gaussians = from_points(surface, np.zeros((len(surface), 3), np.uint8), sh_degree=0)
-    points, pixels = depth_types.drawn_points(gaussians, outdoor.scene, depth_types.CHOICES["centre"], rng)
+    points, pixels = depth_types.draw_points(gaussians, outdoor.scene, depth_types.CHOICES["centre"], rng)
     n_pixels = outdoor.train_depths[0].size
     assert len(np.unique(pixels)) == len(pixels) > 0
     for i, view in enumerate(outdoor.scene.train_views):

@@ -10,7 +10,7 @@ from minisplat_ref.cli import main
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.methods import get_recipe
 from minisplat_ref.studies import precision
-from minisplat_ref.studies.precision import FAST, PRECISIONS, STORED, n_bytes, trained
+from minisplat_ref.studies.precision import FAST, PRECISIONS, STORED, n_bytes, train_in_precision
 from minisplat_ref.types import Model
 
 ITERATIONS = 30
@@ -25,7 +25,7 @@ def scene():
 def states(scene):
     """One training of a recipe that begins anew half way, for each precision."""
     recipe = get_recipe("mini-splatting", ITERATIONS)
-    return {name: trained(scene, recipe, each, 0) for name, each in PRECISIONS.items()}
+    return {name: train_in_precision(scene, recipe, each, 0) for name, each in PRECISIONS.items()}
 
 
 def test_dtypes_last_through_a_reinitialisation(states):

@@ -303,7 +303,7 @@ def test_common_map_is_found_exactly(rng):
     exposures = np.eye(3, 4) + 0.2 * rng.normal(size=(5, 3, 4))
     K = np.eye(3, 4) + 0.2 * rng.normal(size=(3, 4))
     color = rng.random(3)
-    truth = exposures_study.composed(exposures, K)
+    truth = exposures_study.compose(exposures, K)
     assert_allclose(expose(expose(color, K), exposures[2]), expose(color, truth[2]), rtol=CLOSED_FORM)
     assert_allclose(exposures_study.common_map(exposures, truth), K, atol=1e2 * CLOSED_FORM)  # by a 15 x 3 system
     assert_allclose(expose(expose(color, K), exposures_study.inverse(K)), color, rtol=1e2 * CLOSED_FORM)
@@ -335,11 +335,11 @@ def test_similarity_is_found_exactly(rng):
     """Cameras that are all moved by one similarity are the same cameras, and see the same."""
     truth = [make_camera(rng=rng) for _ in range(5)]
     similarity = poses_study.Similarity(1.3, expm(cross_matrix(rng.normal(size=3))), rng.normal(size=3))
-    given = [poses_study.carried_back(camera, similarity) for camera in truth]
-    found = poses_study.aligning(given, truth)
+    given = [poses_study.carry_back(camera, similarity) for camera in truth]
+    found = poses_study.align(given, truth)
     for field, expected in zip(found, similarity, strict=True):
         assert_allclose(field, expected, atol=1e3 * CLOSED_FORM)  # centres are 0.1 apart
-    aligned = [poses_study.carried(camera, found) for camera in given]
+    aligned = [poses_study.carry(camera, found) for camera in given]
     degrees, shifts = poses_study.errors(aligned, truth)
     assert max(degrees) < 1e-5 and max(shifts) < 1e3 * CLOSED_FORM  # an angle of 1e-13 radians is a cosine of 1
     point = rng.normal(size=3)
@@ -352,7 +352,7 @@ def test_similarity_is_found_exactly(rng):
 
 def test_disturbance_is_as_large_as_it_says(scene):
     disturbance = poses_study.Disturbance(degrees=1.0, shift=0.01)
-    disturbed = poses_study.disturbed_poses(scene, disturbance, np.random.default_rng(0))
+    disturbed = poses_study.disturb_poses(scene, disturbance, np.random.default_rng(0))
     cameras, truth = ([view.camera for view in s.train_views] for s in (disturbed, scene))
     degrees, _ = poses_study.errors(cameras, truth)
     assert_allclose(degrees, 1.0, rtol=1e-9)  # an angle from a matrix loses half the digits of a small one

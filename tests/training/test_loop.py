@@ -23,7 +23,7 @@ from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.rates import LogLinear
 from minisplat_ref.training.saved_state import load_state, save_state
-from minisplat_ref.training.schedule import BLEND_STATS, At, During, SmallerViews, configured
+from minisplat_ref.training.schedule import BLEND_STATS, At, During, SmallerViews, configure
 from minisplat_ref.training.smaller_views import halve_large_views
 from minisplat_ref.training.state import FiredEvent
 from minisplat_ref.types import Gaussians
@@ -149,7 +149,7 @@ def test_rates_are_those_of_the_iteration_that_is_done(scene):
         taken.append(arrays_and_step[-1].rate)
         return CPU.adam_update(*arrays_and_step)
 
-    recipe = PLAIN._replace(iterations=3, learning_rates=PLAIN.learning_rates.changed(means=schedule))
+    recipe = PLAIN._replace(iterations=3, learning_rates=PLAIN.learning_rates.change(means=schedule))
     train(scene._replace(extent=2.0), recipe, seed=0, backend=replace(CPU, adam_update=adam_update))
     assert taken[:: len(Gaussians._fields)] == [2.0 * schedule.at(step) for step in (1, 2, 3)]
 
@@ -178,7 +178,7 @@ def test_blend_statistics_only_where_asked_for(scene):
 
 
 def with_geometry(**weights):
-    return configured(PLAIN._replace(losses=(*PLAIN.losses, *GEOMETRY.losses)), **weights)
+    return configure(PLAIN._replace(losses=(*PLAIN.losses, *GEOMETRY.losses)), **weights)
 
 
 def test_geometric_terms_join_the_loss(scene):

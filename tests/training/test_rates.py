@@ -29,7 +29,7 @@ def test_rates_per_extent_scale_with_the_scene():
         {"means": LogLinear(1.0, 0.25, 10), "quats": 2.0, "velocities": 3.0}, frozenset({"means", "velocities"})
     )
     assert rates.at(5, 10.0) == pytest.approx({"means": 5.0, "quats": 2.0, "velocities": 30.0})
-    joined = rates.joined(Rates({"quats": 7.0, "exposures": 8.0}, frozenset({"exposures"})))
+    joined = rates.join(Rates({"quats": 7.0, "exposures": 8.0}, frozenset({"exposures"})))
     assert joined.of["quats"] == 2.0 and joined.at(0, 10.0)["exposures"] == 80.0
 
 

@@ -32,7 +32,7 @@ from minisplat_ref.training.losses import Cotangents, LossTerm, Rendered, photom
 from minisplat_ref.training.rates import LogLinear, Rates, Rewind
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.training.saved_state import load_state, save_state
-from minisplat_ref.training.schedule import Every, configured, describe, parsed_settings, scaled, settings_of
+from minisplat_ref.training.schedule import Every, configure, describe, parse_settings, scale_recipe, settings_of
 from minisplat_ref.training.state import Iteration, TrainState, start_anew
 from minisplat_ref.types import Floats, Gaussians, Model, Scene, View
 from scenes import make_camera, make_gaussians
@@ -102,7 +102,7 @@ def test_rates_per_extent_are_multiplied_by_it():
 
 
 def test_changed_rates_replace_and_add():
-    rates = Rates({"means": 1.0, "quats": 2.0}).changed(quats=3.0, labels=4.0)
+    rates = Rates({"means": 1.0, "quats": 2.0}).change(quats=3.0, labels=4.0)
     assert dict(rates.of) == {"means": 1.0, "quats": 3.0, "labels": 4.0}
     assert rates.per_extent == {"means"}
 
@@ -110,27 +110,27 @@ def test_changed_rates_replace_and_add():
 def test_of_one_name_the_first_of_joined_rates_counts():
     """With its own unit: what is per extent in the other is not so in the first."""
     first = Rates({"means": 1.0, "quats": 2.0}, frozenset())
-    joined = first.joined(Rates({"quats": 5.0, "shifts": 6.0, "means": 7.0}, frozenset({"means", "shifts"})))
+    joined = first.join(Rates({"quats": 5.0, "shifts": 6.0, "means": 7.0}, frozenset({"means", "shifts"})))
     assert joined.at(1, 10.0) == {"means": 1.0, "quats": 2.0, "shifts": 60.0}
-    assert Rates({"shifts": 6.0}, frozenset({"shifts"})).joined(first).at(1, 10.0)["means"] == 1.0
+    assert Rates({"shifts": 6.0}, frozenset({"shifts"})).join(first).at(1, 10.0)["means"] == 1.0
 
 
 def test_scaled_rates():
     rates = Rates({"means": LogLinear(1.0, 0.1, 100, Rewind(50, 20)), "quats": 2.0})
-    halved = rates.scaled(Fraction(1, 2), 3.0, 9.0)
+    halved = rates.scale(Fraction(1, 2), 3.0, 9.0)
     assert halved.of["means"] == LogLinear(9.0, pytest.approx(0.9), 50, Rewind(25, 10))
     assert halved.of["quats"] == 6.0
-    assert json.loads(json.dumps(halved.described()))["per_extent"] == ["means"]
+    assert json.loads(json.dumps(halved.describe()))["per_extent"] == ["means"]
 
 
 def test_short_runs_keep_the_path_of_poses_and_the_rate_of_exposures():
-    published, short = (configured(get_recipe("3dgs", n), **CALIBRATED).rates.of for n in (30_000, 300))
+    published, short = (configure(get_recipe("3dgs", n), **CALIBRATED).rates.of for n in (30_000, 300))
     for name in (ROTATIONS, SHIFTS):
         assert short[name].first == pytest.approx(100 * published[name].first)
         assert short[name].last == pytest.approx(100 * published[name].last)
         assert short[name].steps == 300
     assert short[EXPOSURES] == published[EXPOSURES]._replace(steps=300)
-    longer = configured(get_recipe("3dgs", 60_000), pose=True).rates.of
+    longer = configure(get_recipe("3dgs", 60_000), pose=True).rates.of
     assert longer[ROTATIONS] == POSE.rates.of[ROTATIONS]._replace(steps=60_000)
 
 
@@ -258,8 +258,8 @@ def test_term_is_due_between_start_and_stop():
     assert [step for step in range(10) if term.is_due(step)] == [4, 5]
     assert not any(term._replace(weight=0.0).is_due(step) for step in range(10))
     assert [step for step in range(9) if term._replace(stop=None).is_due(step)] == [4, 5, 6, 7, 8]
-    assert term._replace(start=30, stop=60).scaled(Fraction(1, 10)) == term
-    assert term._replace(stop=None).scaled(Fraction(2)) == term._replace(start=6, stop=None)
+    assert term._replace(start=30, stop=60).scale(Fraction(1, 10)) == term
+    assert term._replace(stop=None).scale(Fraction(2)) == term._replace(start=6, stop=None)
 
 
 def test_terms_act_in_training_when_they_are_due_alone(scene):
@@ -291,11 +291,11 @@ def test_settings_are_of_events_terms_and_calibrations():
 
 def test_what_is_set_is_set_and_nothing_else():
     for name, value in {"exposure": True, "photometric": 0.5, "dssim_weight": 0.3, "threshold": 1e-3}.items():
-        changed = configured(MINI, **{name: value})
+        changed = configure(MINI, **{name: value})
         assert settings_of(changed) == {**settings_of(MINI), name: value}
         assert describe(changed) != describe(MINI)
-    assert configured(MINI) == MINI
-    assert [c.name for c in configured(MINI, **CALIBRATED).active_calibrations] == ["exposure", "pose"]
+    assert configure(MINI) == MINI
+    assert [c.name for c in configure(MINI, **CALIBRATED).active_calibrations] == ["exposure", "pose"]
 
 
 TEXTS = [
@@ -316,7 +316,7 @@ TEXTS = [
 
 @pytest.mark.parametrize(("name", "text", "value"), TEXTS)
 def test_text_becomes_a_value_of_the_present_type(name, text, value):
-    (parsed,) = parsed_settings(MINI, {name: text}).values()
+    (parsed,) = parse_settings(MINI, {name: text}).values()
     assert parsed == value and type(parsed) is type(value)
 
 
@@ -340,20 +340,20 @@ def test_text_becomes_a_value_of_the_present_type(name, text, value):
 )
 def test_text_that_is_no_such_value_is_refused(name, text, message):
     with pytest.raises(InputError, match=message):
-        parsed_settings(MINI, {name: text})
+        parse_settings(MINI, {name: text})
 
 
 def test_unknown_setting_lists_those_that_exist():
     with pytest.raises(InputError, match="has no nonsense to set") as caught:
-        configured(MINI, nonsense=1)
+        configure(MINI, nonsense=1)
     assert all(name in str(caught.value) for name in settings_of(MINI))
     with pytest.raises(InputError, match="has no a, b to set"):
-        parsed_settings(MINI, {"a": "1", "b": "2"})
+        parse_settings(MINI, {"a": "1", "b": "2"})
 
 
 def test_infinite_number_where_none_stands():
     """The present value says nothing of the type, and infinity is no whole number."""
-    assert parsed_settings(MINI, {"budget": "inf"}) == {"budget": np.inf}
+    assert parse_settings(MINI, {"budget": "inf"}) == {"budget": np.inf}
 
 
 # Shared parameters ----------------------------------------------------------------------------------------------------
@@ -371,7 +371,7 @@ def all_bytes(state):
 
 @pytest.mark.parametrize("stop", [5, 12])
 def test_resumed_run_with_calibrations_has_the_same_bytes(scene, stop, tmp_path):
-    recipe = configured(brief(), **CALIBRATED)
+    recipe = configure(brief(), **CALIBRATED)
     whole = train(scene, recipe, seed=3)
     path = tmp_path / "checkpoint.npz"
     save_state(path, train(scene, recipe._replace(iterations=stop), seed=3), recipe)
@@ -392,7 +392,7 @@ def test_resuming_with_other_calibrations_is_refused(scene, tmp_path):
     path = tmp_path / "checkpoint.npz"
     save_state(path, initial_state(scene, brief(), 0), brief())
     with pytest.raises(InputError, match="other settings"):
-        load_state(path, configured(brief(), pose=True))
+        load_state(path, configure(brief(), pose=True))
 
 
 def test_adam_updates_a_mapping_as_it_does_a_population(backend, rng):
@@ -534,7 +534,7 @@ def test_calibrated_training_from_end_to_end(scene_folder, tmp_path, capsys):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     assert main(["train", str(scene_folder), "--out", str(whole), "--iterations", "12", *options]) == 0
     assert json.loads((whole / "config.json").read_text())["recipe"]["calibrations"] == ["exposure", "pose"]
-    recipe = configured(get_recipe("3dgs-accel", 12), **CALIBRATED)
+    recipe = configure(get_recipe("3dgs-accel", 12), **CALIBRATED)
     state = load_state(whole / "checkpoint.npz", recipe)
     assert state.step == state.shared_adam.step == 12
     shapes = {name: array.shape for name, array in state.shared.items()}
@@ -585,7 +585,7 @@ def test_checkpoint_of_an_older_version_is_one_line(scene_folder, tmp_path, caps
 
 
 def test_scaled_recipe_keeps_its_calibrations_switched_on():
-    assert scaled(configured(RECIPES["3dgs"], pose=True), 3_000).active_calibrations[0].name == "pose"
+    assert scale_recipe(configure(RECIPES["3dgs"], pose=True), 3_000).active_calibrations[0].name == "pose"
 
 
 def test_damaged_shared_parameters_are_named(scene_folder, tmp_path, capsys):

@@ -6,7 +6,7 @@ from numpy.testing import assert_array_equal
 from minisplat_ref.io.scene import half_size
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.training.pace import COOLED, FINER, Decision, Pace
-from minisplat_ref.training.schedule import SmallerViews, scaled
+from minisplat_ref.training.schedule import SmallerViews, scale_recipe
 from minisplat_ref.training.smaller_views import ViewSizes
 from tiny_training import PLAIN, scene  # noqa: F401  (a fixture)
 
@@ -31,9 +31,9 @@ def test_decisions_take_halvings_back(scene):
     sizes, pace, found = sizes_of(scene), Pace(), []
     for step in range(3):
         found.append(sizes.n_halvings(step + 1, pace))
-        pace = pace.decided(Decision(step, FINER, "little is gained", 0.1, 0.1))
+        pace = pace.with_decision(Decision(step, FINER, "little is gained", 0.1, 0.1))
     assert found == [2, 1, 0] and sizes.n_halvings(9, pace) == 0
-    cooling = Pace(cooling_from=1).decided(Decision(1, COOLED, "little is gained", 0.1, 0.1))
+    cooling = Pace(cooling_from=1).with_decision(Decision(1, COOLED, "little is gained", 0.1, 0.1))
     assert sizes.n_halvings(2, cooling) == 0
 
 
@@ -48,7 +48,11 @@ def test_each_size_is_made_once(scene):
 
 
 def test_dates_are_scaled():
-    (event,) = [event for event in scaled(RECIPES["mini-splatting2"], 1_800).events if isinstance(event, SmallerViews)]
+    (event,) = [
+        event for event in scale_recipe(RECIPES["mini-splatting2"], 1_800).events if isinstance(event, SmallerViews)
+    ]
     assert (event.start, event.until) == (0, 300)
-    (event,) = [event for event in scaled(RECIPES["mini-splatting2"], 2).events if isinstance(event, SmallerViews)]
+    (event,) = [
+        event for event in scale_recipe(RECIPES["mini-splatting2"], 2).events if isinstance(event, SmallerViews)
+    ]
     assert event.until == 0 and not event.is_due(1)

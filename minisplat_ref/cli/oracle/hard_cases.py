@@ -42,9 +42,9 @@ def run(args: argparse.Namespace) -> int:
     """Run the cases, print the table and the worst of each kind."""
     from minisplat_ref.oracle.cases import as_markdown
     from minisplat_ref.oracle.hard_cases import GROUPS, HARD_CASES
-    from minisplat_ref.oracle.hard_cases.run import by_group, matching, run_hard_cases
+    from minisplat_ref.oracle.hard_cases.run import by_group, run_hard_cases, select_cases
 
-    report = run_hard_cases(matching(HARD_CASES, args.only))
+    report = run_hard_cases(select_cases(HARD_CASES, args.only))
     exit_code = publish(report, args)
     print(f"\nworst of each kind\n\n{as_markdown(by_group(report, GROUPS))}")
     return exit_code

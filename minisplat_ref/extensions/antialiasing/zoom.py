@@ -39,7 +39,7 @@ class Trained(NamedTuple):
         return self.renderer.render(self.model, view_from(zoom_camera(view.camera, scale)), request)[0].image
 
 
-def trained(name: str, scene: Scene, iterations: int, seed: int) -> Trained:
+def train_recipe(name: str, scene: Scene, iterations: int, seed: int) -> Trained:
     """Train a scene with a recipe."""
     recipe = find_recipe(name, iterations)
     state = train(scene, recipe, seed=seed, backend=CPU)
@@ -87,7 +87,7 @@ def measure(scene: Scene, downscale: int, iterations: int, seeds: int) -> Measur
     pictures = {"photograph": _photograph(view, sides[-1])}
     for seed in range(seeds):
         for name in kit.with_progress(RECIPES, f"trainings, seed {seed}"):
-            found = trained(name, small, iterations, seed)
+            found = train_recipe(name, small, iterations, seed)
             psnr[name].append(psnrs(found, scene, sides))
             counts[name].append(len(found.model.gaussians.means))
             pictures.setdefault(name, np.clip(found.picture(view, 1 / sides[-1]), 0, 1))

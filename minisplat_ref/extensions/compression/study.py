@@ -133,7 +133,7 @@ def drops_when_shrunk(gaussians: Gaussians, views: tuple[View, ...], background:
     drops: dict[str, list[float]] = {"msz 5": [], "spz version 3": []}
     for factor in kit.with_progress(SHRUNK, "sizes"):
         small = shrink(gaussians, factor)
-        near = tuple(view.load()._replace(camera=shrunk_camera(view, factor)) for view in views)
+        near = tuple(view.load()._replace(camera=shrink_camera(view, factor)) for view in views)
         conventions = GSPLAT_MAIN._replace(near_plane=factor * GSPLAT_MAIN.near_plane)
         before = mean_psnr(small, near, background, conventions)
         for name, (format_, level) in zip(drops, ((MSZ, SHRUNK_LEVEL), (SPZ, 0)), strict=True):
@@ -149,7 +149,7 @@ def shrink(gaussians: Gaussians, factor: float) -> Gaussians:
     )
 
 
-def shrunk_camera(view: View, factor: float) -> Any:
+def shrink_camera(view: View, factor: float) -> Any:
     """Return the camera of a view in a scene that is ``factor`` times as large."""
     return view.camera._replace(cam_from_world_t=view.camera.cam_from_world_t * factor)
 

@@ -11,9 +11,9 @@ from minisplat_ref.studies.kit import psnr_of
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.representation import GAUSSIANS, Representation
-from minisplat_ref.training.schedule import action_name, scaled
+from minisplat_ref.training.schedule import action_name, scale_recipe
 from minisplat_ref.training.state import TrainState
-from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Model, Scene, View, numbered, view_from
+from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Model, Scene, View, number_views, view_from
 
 SIZE, FOCAL, DISTANCE = 48, 60.0, 3.0  # px, px, world units
 BAND = 1.5  # px on either side of the edge
@@ -38,7 +38,7 @@ class Target(NamedTuple):
         return near
 
 
-def spread(n: int, rng: np.random.Generator) -> Gaussians:
+def place_cards(n: int, rng: np.random.Generator) -> Gaussians:
     """Return n flat grey Gaussians that face the camera, spread over the picture and large enough to fill it."""
     extent = SIZE / FOCAL * DISTANCE  # width of the picture, world units
     places = rng.uniform(-0.35, 0.35, (n, 2)) * extent if n > 1 else np.zeros((1, 2))
@@ -55,12 +55,12 @@ def spread(n: int, rng: np.random.Generator) -> Gaussians:
 
 def cut_gaussian() -> Target:
     """Return a Gaussian whose right side is cut away by a straight edge 0.4 standard deviations from its centre."""
-    one = spread(1, np.random.default_rng(0))
+    one = place_cards(1, np.random.default_rng(0))
     points = np.array([[0.4, -3.0, 0.4, -1.0, 0.4, 1.0, 0.4, 3.0]], np.float32)
     bright = one._replace(opacity_logits=np.full(1, 3, np.float32), sh_dc=np.ones((1, 3), np.float32))
     hard = CutGaussians(*bright, curves=points, widths=np.zeros(1, np.float32))
     edge = SIZE / 2 + 0.4 * float(np.exp(one.log_scales[0, 0])) * FOCAL / DISTANCE
-    return Target(drawn(hard).astype(np.float64), lambda ys: np.full_like(ys, edge))
+    return Target(render_card(hard).astype(np.float64), lambda ys: np.full_like(ys, edge))
 
 
 def card() -> Target:
@@ -79,7 +79,7 @@ def representation_of(population: Any) -> Representation:
     return CUT_GAUSSIANS if isinstance(population, CutGaussians) else GAUSSIANS
 
 
-def drawn(population: Any) -> Floats:
+def render_card(population: Any) -> Floats:
     """Return the picture [H, W, 3] of a population in front of black."""
     image: Floats = (
         representation_of(population).renderer.render(Model(population), view_from(CAMERA), Request())[0].image
@@ -87,17 +87,17 @@ def drawn(population: Any) -> Floats:
     return image
 
 
-def fitted(target: Target, n: int, is_cut: bool, iterations: int, seed: int) -> Any:
+def fit_card(target: Target, n: int, is_cut: bool, iterations: int, seed: int) -> Any:
     """Return n Gaussians with or without cuts, trained on the target without density control."""
     rng = np.random.default_rng(seed)
     view = View("card", CAMERA, np.rint(255 * np.clip(target.image, 0, 1)).astype(np.uint8), None)
     none = np.zeros((0, 3))
-    scene = Scene("card", numbered([view]), (), none, none.astype(np.uint8), np.zeros(3), EXTENT)
-    population: Any = with_cuts(spread(n, rng), rng) if is_cut else spread(n, rng)
+    scene = Scene("card", number_views([view]), (), none, none.astype(np.uint8), np.zeros(3), EXTENT)
+    population: Any = with_cuts(place_cards(n, rng), rng) if is_cut else place_cards(n, rng)
     events = tuple(event for event in CUTS.events if is_cut and action_name(event) == set_width.__name__)
     recipe = CUTS._replace(events=events, sh_degree=0, representation=representation_of(population))
     state = TrainState(population, zero_moments(population), step=0, view_order=[], rng=rng, stats={})
-    return train(scene, scaled(recipe, iterations), seed=seed, state=state).gaussians
+    return train(scene, scale_recipe(recipe, iterations), seed=seed, state=state).gaussians
 
 
 def edge_width(image: Floats) -> float:
@@ -118,9 +118,9 @@ def edge_width(image: Floats) -> float:
     return float(np.mean(widths))
 
 
-def measured(target: Target, population: Any) -> dict[str, float]:
+def measure_card(target: Target, population: Any) -> dict[str, float]:
     """Return the PSNR of the picture, of the band around the edge and of the rest, dB, and the edge's width, px."""
-    image = drawn(population)
+    image = render_card(population)
     band = target.band
     return {
         "psnr": psnr_of(image, target.image),

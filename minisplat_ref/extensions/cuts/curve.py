@@ -47,7 +47,7 @@ class Cut(NamedTuple):
     masks: Floats  # [G, P]
 
 
-def cut(points: Floats, widths: Floats, offsets: Floats) -> Cut:
+def evaluate_cuts(points: Floats, widths: Floats, offsets: Floats) -> Cut:
     """Return the masks that curves make, and the nearest points on them.
 
     Parameters
@@ -97,8 +97,8 @@ def n_crossings(points: Floats, offsets: Floats) -> Ints:
     return np.sum((is_left[:, :, 1:] != is_left[:, :, :-1]) & is_beyond, axis=2)
 
 
-def cut_vjp(points: Floats, widths: Floats, found: Cut, v_masks: Floats) -> tuple[Floats, Floats]:
-    """Gradient of :func:`cut` with respect to control points [G, 4, 2] and offsets [G, P, 2].
+def evaluate_cuts_vjp(points: Floats, widths: Floats, found: Cut, v_masks: Floats) -> tuple[Floats, Floats]:
+    """Gradient of :func:`evaluate_cuts` with respect to control points [G, 4, 2] and offsets [G, P, 2].
 
     At the nearest point a displacement along its piece does not change the distance, so f counts as fixed. With the
     unit vector e along d - q, along which the distance grows where the pixel is visible::

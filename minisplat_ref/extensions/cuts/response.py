@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.extensions.cuts.curve import N_POINTS, Cut, cut, cut_vjp
+from minisplat_ref.extensions.cuts.curve import N_POINTS, Cut, evaluate_cuts, evaluate_cuts_vjp
 from minisplat_ref.reference.covariance import rotation_matrices, rotation_matrices_vjp
 from minisplat_ref.reference.hits import CONIC, ConicPlace, Hit, Response
 from minisplat_ref.reference.pinhole import (
@@ -139,7 +139,7 @@ def boxes(footprints: CutFootprints) -> Ints:
 def hit(footprints: CutFootprints, ids: Ints, centers: Floats) -> Hit:
     """Return the hits of footprints with their masks at pixels; see :func:`minisplat_ref.reference.hits.conic_hit`."""
     flat = CONIC.hit(footprints.projection, ids, centers)
-    found = cut(footprints.points[ids], footprints.widths[ids], -flat.place.offsets)
+    found = evaluate_cuts(footprints.points[ids], footprints.widths[ids], -flat.place.offsets)
     return Hit(flat.unclamped * found.masks, flat.depths, Place(flat.place, flat.unclamped, found))
 
 
@@ -153,7 +153,9 @@ def hit_vjp(
     v_means2d, v_conics, v_opacities = CONIC.hit_vjp(
         footprints.projection, ids, flat, v_mean * masks, v_shape * masks, None
     )
-    v_points, v_offsets = cut_vjp(footprints.points[ids], footprints.widths[ids], place.cut, v_shape * place.uncut)
+    v_points, v_offsets = evaluate_cuts_vjp(
+        footprints.points[ids], footprints.widths[ids], place.cut, v_shape * place.uncut
+    )
     return v_means2d - v_offsets.sum(axis=1), v_conics, v_opacities, v_points
 
 

@@ -14,7 +14,7 @@ from minisplat_ref.extensions.fans.tuning import best_shape, fine_tune, measure,
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.rendering import Request
 from minisplat_ref.studies import kit
-from minisplat_ref.training.schedule import scaled
+from minisplat_ref.training.schedule import scale_recipe
 from minisplat_ref.types import Gaussians, Model, Scene, View
 
 REACHES, RIMS = (2.0, 2.5, 3.0, 3.5), (0.0, 0.1, 0.2)
@@ -78,7 +78,7 @@ def refit_rows(
     without_view = gaussians._replace(sh_rest=gaussians.sh_rest[:, :0])
     forms: dict[str, Any] = {"splats": gaussians, "splats, degree 0": without_view}
     told("splats, trained on")
-    recipe = kit.without_events(scaled(GS_ACCEL, iterations))
+    recipe = kit.without_events(scale_recipe(GS_ACCEL, iterations))
     forms["splats, trained on"] = kit.fine_tune(gaussians, scene, recipe, seed)
     forms["splats, degree 0, trained on"] = kit.fine_tune(without_view, scene, recipe, seed)
     photographs = [view.image / 255 for view in judge.views]

@@ -81,7 +81,7 @@ def tilts() -> list[Tilt]:
         for is_flat in (True, False):
             errors = []
             for angle in np.radians(ANGLES):
-                one = _turned(scales, angle)
+                one = _rotate(scales, angle)
                 expected = alpha_of(one, view, conventions=sharp, backend=REFERENCE)
                 fans = convert_gaussians(one, FanShape(reach=FRONT_REACH, is_flat=is_flat))
                 found = alpha_of(fans, view, conventions=sharp, backend=REFERENCE)
@@ -90,7 +90,7 @@ def tilts() -> list[Tilt]:
     return results
 
 
-def _turned(scales: tuple[float, float, float], angle: float) -> Gaussians:
+def _rotate(scales: tuple[float, float, float], angle: float) -> Gaussians:
     """Return one gray Gaussian before the camera, rotated about the x axis."""
     quats = np.array([[math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0]])
     return Gaussians(

@@ -13,7 +13,7 @@ from minisplat_ref.metrics import Evaluation, evaluate
 from minisplat_ref.rendering import RenderSettings, Request
 from minisplat_ref.studies import kit
 from minisplat_ref.training.representation import GAUSSIANS
-from minisplat_ref.training.schedule import scaled
+from minisplat_ref.training.schedule import scale_recipe
 from minisplat_ref.training.state import StepReport
 from minisplat_ref.types import Floats, Gaussians, Model, Scene, View
 
@@ -26,7 +26,7 @@ def fine_tune(
     fans: Fans, scene: Scene, iterations: int, seed: int, on_step: Callable[[StepReport], None] | None = None
 ) -> Fans:
     """Return fans after some iterations of ``FINE_TUNING`` of their vertices; the given ones are not changed."""
-    recipe = scaled(FINE_TUNING, iterations)._replace(representation=FANS_OF_GAUSSIANS)
+    recipe = scale_recipe(FINE_TUNING, iterations)._replace(representation=FANS_OF_GAUSSIANS)
     result: Fans = kit.fine_tune(fans, scene, recipe, seed, on_step)
     return result
 

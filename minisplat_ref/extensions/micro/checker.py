@@ -24,9 +24,9 @@ from minisplat_ref.studies import kit
 from minisplat_ref.studies.figures import show, with_range
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.losses import LossTerm
-from minisplat_ref.training.schedule import During, Every, scaled
+from minisplat_ref.training.schedule import During, Every, scale_recipe
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
-from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Model, Scene, View, numbered
+from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Model, Scene, View, number_views
 
 WIDTH, HEIGHT, FOCAL, DISTANCE = 96, 64, 96.0, 4.0  # pixels, world units
 CELL = 4.5 * DISTANCE / FOCAL  # side of a square of the checkerboard, world units; not a whole number of pixels
@@ -106,7 +106,7 @@ def checker_scene(seed: int) -> Scene:
     half = DISTANCE / FOCAL * np.array([WIDTH / 2, HEIGHT / 2]) + SHIFT
     points = np.column_stack([rng.uniform(-half, half, (N_POINTS, 2)), np.zeros(N_POINTS)])
     gray = np.full(points.shape, 128, np.uint8)
-    return Scene("card", numbered(views[:N_VIEWS]), tuple(views[N_VIEWS:]), points, gray, np.zeros(3), EXTENT)
+    return Scene("card", number_views(views[:N_VIEWS]), tuple(views[N_VIEWS:]), points, gray, np.zeros(3), EXTENT)
 
 
 def grow(state: TrainState, iteration: Iteration, *, beta: float) -> None:
@@ -124,9 +124,9 @@ def grow(state: TrainState, iteration: Iteration, *, beta: float) -> None:
     apply_edit(state, edit)
 
 
-def trained(variant: Variant, scene: Scene, iterations: int, seed: int) -> Gaussians:
+def train_variant(variant: Variant, scene: Scene, iterations: int, seed: int) -> Gaussians:
     """Train the chart with a variant; densification ends after three quarters of the iterations."""
-    base = scaled(GS_ACCEL, iterations)
+    base = scale_recipe(GS_ACCEL, iterations)
     period = iterations * 3 // 4 // (N_STEPS + 1)
     stop = period * (N_STEPS + 1)
     recipe = base._replace(
@@ -182,7 +182,7 @@ def measure(iterations: int, seeds: int, beta: float, weight: float) -> dict[str
     for seed in range(seeds):
         scene = checker_scene(seed)
         for name, variant in kit.with_progress(variants(beta, weight).items(), f"trainings, seed {seed}"):
-            outcomes[name].append(outcome(trained(variant, scene, iterations, seed), scene))
+            outcomes[name].append(outcome(train_variant(variant, scene, iterations, seed), scene))
     return outcomes
 
 

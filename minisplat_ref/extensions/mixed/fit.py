@@ -15,9 +15,9 @@ from minisplat_ref.extensions.mixed.population import MixedGaussians, as_ellipse
 from minisplat_ref.rendering import Request
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import scaled
+from minisplat_ref.training.schedule import scale_recipe
 from minisplat_ref.training.state import TrainState
-from minisplat_ref.types import Camera, Floats, Gaussians, Model, Scene, View, numbered, view_from
+from minisplat_ref.types import Camera, Floats, Gaussians, Model, Scene, View, number_views, view_from
 
 SIZE, FOCAL, DISTANCE = 48, 60.0, 3.0  # px, px, world units
 PICTURE = SIZE / FOCAL * DISTANCE  # its side, world units
@@ -28,7 +28,7 @@ NAMES = {1: "ellipses", 2: "lines", 3: "triangles"}
 N_FLOATS = {1: 14, 2: 16, 3: 18}  # of one without view-dependent colour: the second and third vertex have two each
 
 
-def placed(places: Floats, vertices: Floats, n_vertices: int, thickness: Floats) -> MixedGaussians:
+def place_in_plane(places: Floats, vertices: Floats, n_vertices: int, thickness: Floats) -> MixedGaussians:
     """Return bright primitives in the plane that faces the camera.
 
     Parameters
@@ -57,29 +57,29 @@ def placed(places: Floats, vertices: Floats, n_vertices: int, thickness: Floats)
     return ellipses._replace(vertices=(scale * vertices).astype(np.float32), n_vertices=kinds)
 
 
-def scattered(n: int, n_vertices: int, rng: np.random.Generator) -> MixedGaussians:
+def scatter(n: int, n_vertices: int, rng: np.random.Generator) -> MixedGaussians:
     """Return n primitives at random places, together about as large as the picture."""
     reach = SIZE / np.sqrt(n)
     places = rng.uniform(-0.3, 0.3, (n, 2)) * SIZE * (n > 1)
     vertices = rng.normal(size=(n, 4)) * 0.25 * reach
-    start = placed(places, vertices, n_vertices, np.full(n, reach * (0.25 if n_vertices == 1 else 0.12)))
+    start = place_in_plane(places, vertices, n_vertices, np.full(n, reach * (0.25 if n_vertices == 1 else 0.12)))
     return start._replace(opacity_logits=np.ones(n, np.float32), sh_dc=np.zeros((n, 3), np.float32))
 
 
-def drawn(population: MixedGaussians) -> Floats:
+def render_primitives(population: MixedGaussians) -> Floats:
     """Return the picture [H, W, 3] of a population before black."""
     image: Floats = MIXED_GAUSSIANS.renderer.render(Model(population), view_from(CAMERA), Request())[0].image
     return image
 
 
-def fitted(target: Floats, n: int, *, n_vertices: int, iterations: int, seed: int) -> MixedGaussians:
+def fit_primitives(target: Floats, n: int, *, n_vertices: int, iterations: int, seed: int) -> MixedGaussians:
     """Return n primitives of one kind, trained on a picture [48, 48, 3] in [0, 1]."""
     rng = np.random.default_rng(seed)
     view = View("target", CAMERA, np.rint(255 * np.clip(target, 0, 1)).astype(np.uint8), None)
     none = np.zeros((0, 3))
-    scene = Scene("target", numbered([view]), (), none, none.astype(np.uint8), np.zeros(3), EXTENT)
-    population = scattered(n, n_vertices, rng)
-    recipe = scaled(MIXED._replace(events=(), sh_degree=0, representation=MIXED_GAUSSIANS), iterations)
+    scene = Scene("target", number_views([view]), (), none, none.astype(np.uint8), np.zeros(3), EXTENT)
+    population = scatter(n, n_vertices, rng)
+    recipe = scale_recipe(MIXED._replace(events=(), sh_degree=0, representation=MIXED_GAUSSIANS), iterations)
     state = TrainState(population, zero_moments(population), step=0, view_order=[], rng=rng, stats={})
     fit: MixedGaussians = train(scene, recipe, seed=seed, state=state).gaussians
     return fit
@@ -87,17 +87,17 @@ def fitted(target: Floats, n: int, *, n_vertices: int, iterations: int, seed: in
 
 def one_line() -> Floats:
     """Return the picture of one line."""
-    return drawn(placed(np.zeros((1, 2)), np.array([[14.0, 7.0, 0.0, 0.0]]), 2, np.full(1, 2.0)))
+    return render_primitives(place_in_plane(np.zeros((1, 2)), np.array([[14.0, 7.0, 0.0, 0.0]]), 2, np.full(1, 2.0)))
 
 
 def one_triangle() -> Floats:
     """Return the picture of one triangle with a soft rim."""
-    return drawn(placed(np.zeros((1, 2)), np.array([[15.0, 5.0, -3.0, -14.0]]), 3, np.full(1, 2.0)))
+    return render_primitives(place_in_plane(np.zeros((1, 2)), np.array([[15.0, 5.0, -3.0, -14.0]]), 3, np.full(1, 2.0)))
 
 
 def one_blob() -> Floats:
     """Return the picture of one round Gaussian, where further vertices are of no use."""
-    return drawn(placed(np.zeros((1, 2)), np.zeros((1, 4)), 1, np.full(1, 8.0)))
+    return render_primitives(place_in_plane(np.zeros((1, 2)), np.zeros((1, 4)), 1, np.full(1, 8.0)))
 
 
 def letter_a() -> Floats:
@@ -109,14 +109,14 @@ def letter_a() -> Floats:
         u_x, u_y, length = x1 - x0, y1 - y0, np.hypot(x1 - x0, y1 - y0)
         along, across = (xs - x0) * u_x + (ys - y0) * u_y, (xs - x0) * u_y - (ys - y0) * u_x
         is_in |= (np.abs(across) <= 2.5 * length) & (along >= 0) & (along <= length**2)
-    return _covered(is_in)
+    return _cover(is_in)
 
 
 def ring() -> Floats:
     """Return a bright ring, whose curve no straight line follows."""
     xs, ys = _samples()
     radii = np.hypot(xs - SIZE / 2, ys - SIZE / 2)
-    return _covered((radii > 12.5) & (radii < 17.5))
+    return _cover((radii > 12.5) & (radii < 17.5))
 
 
 def _samples() -> tuple[Floats, Floats]:
@@ -126,7 +126,7 @@ def _samples() -> tuple[Floats, Floats]:
     return xs, ys
 
 
-def _covered(is_in: np.ndarray) -> Floats:
+def _cover(is_in: np.ndarray) -> Floats:
     """Return the picture of a silhouette: 0.8 times the part of each pixel that it covers."""
     shares = is_in.reshape(SIZE, SUPERSAMPLING, SIZE, SUPERSAMPLING).mean(axis=(1, 3))
     return np.repeat(0.8 * shares[:, :, None], 3, axis=2)

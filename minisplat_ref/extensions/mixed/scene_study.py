@@ -25,7 +25,7 @@ from minisplat_ref.reports.palette import BLUE, GREY, OCHRE, RED
 from minisplat_ref.strategy.initialization import initial_gaussians
 from minisplat_ref.studies import kit
 from minisplat_ref.studies.figures import plot_deviations, with_deviation
-from minisplat_ref.training.schedule import Recipe, action_name, scaled
+from minisplat_ref.training.schedule import Recipe, action_name, scale_recipe
 from minisplat_ref.types import Scene
 
 ALL, PLAIN, GROUPS, MIXED = "3DGS, all points", "3DGS, as many floats", "3DGS, one for each group", "mixed"
@@ -58,16 +58,16 @@ def outcomes(scene: Scene, iterations: int, n_seeds: int) -> list[dict[str, Any]
     middles = scene._replace(points=groups.means.astype(np.float64), point_colors=colors)
     jobs = ((ALL, plain, scene), (PLAIN, plain, part), (GROUPS, plain, middles), (MIXED, mixed, scene))
     return [
-        {"scene": scene.name, "primitives": name, **trained(recipe, of_points, iterations, n_seeds)}
+        {"scene": scene.name, "primitives": name, **train_and_measure(recipe, of_points, iterations, n_seeds)}
         for name, recipe, of_points in jobs
     ]
 
 
-def trained(recipe: Recipe, scene: Scene, iterations: int, n_seeds: int) -> dict[str, Any]:
+def train_and_measure(recipe: Recipe, scene: Scene, iterations: int, n_seeds: int) -> dict[str, Any]:
     """Return the measures of trainings, and what has become of the population of the last."""
     row: dict[str, Any] = {"psnr": [], "ssim": []}
     for seed in range(n_seeds):
-        state = kit.train_with_progress(scene, scaled(recipe, iterations), seed)
+        state = kit.train_with_progress(scene, scale_recipe(recipe, iterations), seed)
         renderer = recipe.representation.renderer
         found = evaluate(state.model, scene.test_views, RenderSettings(scene.background, renderer=renderer))
         row["psnr"].append(found.psnr)

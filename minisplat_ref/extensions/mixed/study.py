@@ -55,7 +55,9 @@ def outcomes(name: str, iterations: int, n_seeds: int) -> tuple[list[dict[str, A
     pictures: dict[str, list[tuple[str, Floats]]] = {key: [("target", target)] for key, target in targets.items()}
     for picture, m, n in kit.with_progress(jobs, "trainings"):
         fits = [
-            fit.drawn(fit.fitted(targets[picture], n, n_vertices=m, iterations=iterations, seed=seed))
+            fit.render_primitives(
+                fit.fit_primitives(targets[picture], n, n_vertices=m, iterations=iterations, seed=seed)
+            )
             for seed in range(n_seeds)
         ]
         psnr = [kit.psnr_of(image, targets[picture]) for image in fits]

@@ -22,7 +22,7 @@ from minisplat_ref.reports.palette import BLUE, GREEN, GREY, OCHRE, PURPLE, RED,
 from minisplat_ref.studies import kit
 from minisplat_ref.studies.figures import plot_range, show
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import configured
+from minisplat_ref.training.schedule import configure
 from minisplat_ref.types import Floats, Model, Scene, view_from
 
 BLOCKS = (1, 2, 4, 8, 16)
@@ -62,7 +62,7 @@ def variants(scene: Scene, iterations: int, seed: int) -> dict[str, Variant]:
     densities = finest_densities(plain.means, [view.camera for view in scene.train_views])
     built = {name: with_levels(zero, densities, plan, GSPLAT_MAIN) for name, plan in PLANS.items()}
     early = built["levels 4"]._replace(cells=built["levels 4"].cells / EARLY)
-    recipe = configured(find_recipe("multi-scale", iterations), factor=4, n_levels=2)
+    recipe = configure(find_recipe("multi-scale", iterations), factor=4, n_levels=2)
     trained = train(scene, recipe, seed=seed, backend=CPU).gaussians
     return {
         "3dgs": Variant(plain, SPLATTING),

@@ -118,7 +118,7 @@ def start(n: int, rng: np.random.Generator) -> Gaussians:
     return balls(np.column_stack([unit * centres, z]), unit * scales, np.full(n, 0.8), colors)
 
 
-def fitted(behind: Gaussians, target: Floats, case: Case, n_starts: int, rng: np.random.Generator) -> Fit:
+def fit_behind(behind: Gaussians, target: Floats, case: Case, n_starts: int, rng: np.random.Generator) -> Fit:
     """Return the best of several fits of the Gaussians in front of a wall, by the renderer's gradient and L-BFGS.
 
     Means move parallel to the image plane, so that the order stays; scales, opacities and colours are free.
@@ -169,7 +169,7 @@ def measure(n_starts: int, seed: int) -> dict[str, dict[str, Fit]]:
     """Return the fits by wall and case."""
     return {
         name: {
-            case_name: fitted(wall(name), truth(wall(name)), case, n_starts, np.random.default_rng(seed))
+            case_name: fit_behind(wall(name), truth(wall(name)), case, n_starts, np.random.default_rng(seed))
             for case_name, case in kit.with_progress(CASES.items(), f"fits before {name}")
         }
         for name in WALLS

@@ -106,7 +106,7 @@ def _heights(parameters: Floats, model: Sum) -> Floats:
     return np.array(model.signs) * model.height_max * expit(parameters[:, 0])
 
 
-def fitted(target: Floats, model: Sum, n_starts: int, rng: np.random.Generator) -> Fit:
+def fit_ring(target: Floats, model: Sum, n_starts: int, rng: np.random.Generator) -> Fit:
     """Return the best of ``n_starts`` least-squares fits to a picture [SIZE^2]."""
     points, n = grid(), len(model.signs)
 
@@ -138,7 +138,7 @@ def measure(n_seeds: int, n_starts: int) -> dict[float, dict[str, list[Fit]]]:
     """Return the fits by thickness and model, one per seed."""
     return {
         thickness: {
-            name: [fitted(ring(thickness), model, n_starts, np.random.default_rng(seed)) for seed in range(n_seeds)]
+            name: [fit_ring(ring(thickness), model, n_starts, np.random.default_rng(seed)) for seed in range(n_seeds)]
             for name, model in MODELS.items()
         }
         for thickness in kit.with_progress(THICKNESSES, "rings")

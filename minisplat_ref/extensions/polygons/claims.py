@@ -154,14 +154,14 @@ def sheet(n: int) -> Gaussians:
     )
 
 
-def bent(points: Floats, angle: float) -> Floats:
+def bend(points: Floats, angle: float) -> Floats:
     """Return phi of points [..., 3], for a sheet that is bent by an angle in degrees."""
     rho = 2 / np.radians(angle)
     x, y, z = np.moveaxis(points, -1, 0)
     return np.stack([(rho - z) * np.sin(x / rho), y, rho - (rho - z) * np.cos(x / rho)], axis=-1)
 
 
-def placed(points: Floats) -> Floats:
+def place_sheet(points: Floats) -> Floats:
     """Return points [..., 3] as they stand before the camera, seen obliquely from above."""
     c, s = np.cos(np.radians(50)), np.sin(np.radians(50))
     oblique = np.array([[1, 0, 0], [0, c, s], [0, -s, c]])
@@ -172,7 +172,7 @@ def bend_errors(n: int, angle: float) -> dict[str, float]:
     """Return the errors of a sheet of n by n splats that is bent by an angle: corners by both ways, and pictures."""
     gaussians = sheet(n)
     soup = soup_of(gaussians, 8)
-    corners = placed(bent(soup.corners, angle))
+    corners = place_sheet(bend(soup.corners, angle))
     centres, spans = fit_spans(corners, soup.radii)
     paper = by_gram_schmidt(corners, soup.radii)
     spread = np.sqrt(np.mean((corners - centres[:, None]) ** 2))
@@ -221,7 +221,7 @@ def draw(result: dict[str, Any]) -> Figure:
     panels = figure.subplots(1, 4, gridspec_kw={"width_ratios": [1, 1, 1.4, 1.4]})
     gaussians, angle = sheet(USUAL_PER_SIDE), 180
     soup = soup_of(gaussians, 8)
-    corners = placed(bent(soup.corners, angle))
+    corners = place_sheet(bend(soup.corners, angle))
     fitting, _ = carry_gaussians(gaussians, soup, corners, "the bent sheet")
     pictures = {
         f"polygons bent by {angle}°": picture_of_soup(gaussians, soup, corners),

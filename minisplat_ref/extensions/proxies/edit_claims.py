@@ -95,13 +95,13 @@ def edit_errors(name: str, seed: int) -> EditErrors:
     color = np.abs(_colors(after, d @ Q.T) - _colors(before, d)).max()
     picture = None
     if name in SIMILAR:
-        difference = _picture(after, _moved_back(A, Q)) - _picture(before, camera())
+        difference = _picture(after, _move_back(A, Q)) - _picture(before, camera())
         picture = float(np.abs(difference).max())
     centre = np.abs(after.means - (before.means @ long_A.T + SHIFT)).max()
     return EditErrors(float(centre), float(relative.max()), float(color), picture)
 
 
-def _moved_back(A: Floats, Q: Floats) -> Camera:
+def _move_back(A: Floats, Q: Floats) -> Camera:
     """Return the camera that sees ``A x + b`` as :func:`camera` sees x, for ``A = s Q``: R' = R Q^T, t' = s t - R' b.
 
     For a reflection the camera's rotation becomes a reflection, too, and so the picture is mirrored; the formulas stay.
@@ -142,7 +142,7 @@ def flat_gaussians(rng: np.random.Generator) -> Gaussians:
     )
 
 
-def rolled(points: Floats) -> Floats:
+def roll(points: Floats) -> Floats:
     """Return phi of points [N, 3] in the plane z = 0."""
     u = (points[:, 0] + points[:, 1] / 2) / RADIUS
     return np.column_stack([RADIUS * np.sin(u), points[:, 1], RADIUS - RADIUS * np.cos(u)])
@@ -156,10 +156,10 @@ def rolled_jacobian(points: Floats) -> Floats:
     return np.moveaxis(np.array(columns), (0, 1, 2), (2, 1, 0))
 
 
-def bent_by(cells: int, gaussians: Gaussians, is_whole: bool) -> Gaussians:
+def bend_by(cells: int, gaussians: Gaussians, is_whole: bool) -> Gaussians:
     """Return the sheet after a mesh of n x n cells has rolled it, by the whole gradient or by GaMeS's frame."""
     mesh = grid(np.array([-1.0, -1.0, 0.0]), np.array([2.0, 0.0, 0.0]), np.array([0.0, 2.0, 0.0]), (cells, cells))
-    binding, moved = bind(gaussians, mesh), Mesh(rolled(mesh.vertices), mesh.faces)
+    binding, moved = bind(gaussians, mesh), Mesh(roll(mesh.vertices), mesh.faces)
     carried = rebuild(moved, binding)
     return carried if is_whole else _by_two_lengths(binding, moved, carried.means)
 
@@ -193,10 +193,10 @@ def bend_errors(gaussians: Gaussians) -> dict[str, Any]:
     for cells in kit.with_progress(CELLS, "bending"):
         result["cells"].append(cells)
         for name, is_whole in FRAMES.items():
-            carried = bent_by(cells, gaussians, is_whole)
+            carried = bend_by(cells, gaussians, is_whole)
             relative = np.abs(_sigma(carried) - truth).max(axis=(1, 2)) / size
             result["covariance"][name].append(float(relative.max()))
-        result["centre"].append(float(np.linalg.norm(carried.means - rolled(gaussians.means), axis=1).max()))
+        result["centre"].append(float(np.linalg.norm(carried.means - roll(gaussians.means), axis=1).max()))
     return result
 
 
@@ -224,7 +224,7 @@ def draw(bend: dict[str, Any], seed: int) -> Figure:
     pictures = {
         "a sheet": sheet,
         "its middle rotated\nby 45° and raised": edit_gaussians(sheet, raised, in_ball(sheet.means, centre, 0.6)),
-        f"sheared and rolled\nby {CELLS[3]} x {CELLS[3]} cells": bent_by(CELLS[3], sheet, True),
+        f"sheared and rolled\nby {CELLS[3]} x {CELLS[3]} cells": bend_by(CELLS[3], sheet, True),
     }
     for axes, (title, gaussians) in zip(panels, pictures.items(), strict=False):
         image = render(_before_the_camera(gaussians), camera(), background=np.ones(3))[0].image

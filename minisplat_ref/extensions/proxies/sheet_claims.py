@@ -85,7 +85,7 @@ def catenary(s: Floats) -> Floats:
     return np.column_stack([a * np.arcsinh(s / a), a * np.cosh(SPAN / 2 / a) - np.sqrt(a * a + s * s)])
 
 
-def hanging_sheet(n_cells: int, stretch: float) -> tuple[Floats, Floats]:
+def hang_sheet(n_cells: int, stretch: float) -> tuple[Floats, Floats]:
     """Return the vertices [P, 2] of a sheet at rest, across and below, and the catenary's points [P, 2]."""
     rest = grid(
         np.array([-LENGTH / 2, 0.0, 0.0]),
@@ -106,7 +106,7 @@ def hanging_sheet(n_cells: int, stretch: float) -> tuple[Floats, Floats]:
     return end.positions[:, :2], catenary(s)
 
 
-def swinging_sheet(swing: Swing, fraction: float) -> list[Energies]:
+def swing_sheet(swing: Swing, fraction: float) -> list[Energies]:
     """Return the energies over time of a sheet held at one side; a step is ``fraction`` of the longest stable one."""
     mesh = level_sheet(SWING_CELLS)
     is_pinned = mesh.vertices[:, 0] < -0.5 + 1e-9
@@ -133,9 +133,9 @@ def measure(seed: int) -> dict[str, Any]:
     jobs += [(name, fraction) for name in SWINGS for fraction in STEPS]
     for key, number in kit.with_progress(jobs, "sheets"):
         if isinstance(key, str):
-            energy[key][str(number)] = energy_error(swinging_sheet(SWINGS[key], number))
+            energy[key][str(number)] = energy_error(swing_sheet(SWINGS[key], number))
         else:
-            found, expected = hanging_sheet(int(number), key)
+            found, expected = hang_sheet(int(number), key)
             hanging[f"{key:g}"][str(number)] = float(np.linalg.norm(found - expected, axis=1).max() / LENGTH)
     return {"free_fall": free_fall(seed), "hanging": hanging, "energy": energy}
 
@@ -216,14 +216,14 @@ def draw(result: dict[str, Any], seed: int) -> Figure:
         show(axes, image, f"{moment:g} s")
     hanging, shares, errors = (figure.add_subplot(places[1, n * i : n * i + n]) for i in range(3))
     for stretch, color in zip(STRETCHES[:2], (RED, BLUE), strict=True):
-        found, _ = hanging_sheet(CELLS[0], stretch)
+        found, _ = hang_sheet(CELLS[0], stretch)
         hanging.plot(*found[: CELLS[0] + 1].T, "o", color=color, ms=4, label=f"{CELLS[0]} cells, stretch {stretch:g}")
     hanging.plot(*catenary(np.linspace(-LENGTH / 2, LENGTH / 2, 200)).T, "k", lw=0.8, label="catenary")
     hanging.invert_yaxis()
     hanging.set_aspect("equal")
     hanging.set_xlabel("across and below the supports, world units", fontsize=8)
     hanging.set_title("a sheet that hangs from two sides", fontsize=9)
-    swing = swinging_sheet(SWINGS["drag, onto a floor"], STEPS[2])
+    swing = swing_sheet(SWINGS["drag, onto a floor"], STEPS[2])
     times = np.linspace(0, SWING_TIME, len(swing))
     for name in Energies._fields:
         values = np.array([getattr(e, name) for e in swing])

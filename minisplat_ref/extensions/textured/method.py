@@ -90,7 +90,7 @@ TEXTURED = GS_ACCEL._replace(name="textured")
 
 FINE_TUNING = GS._replace(
     name="textured-fine-tuning",
-    learning_rates=GS.learning_rates.changed(means=0.0, quats=0.0, log_scales=0.0),
+    learning_rates=GS.learning_rates.change(means=0.0, quats=0.0, log_scales=0.0),
     events=(),
     sh_milestones=(0, 0, 0),
 )

@@ -9,7 +9,7 @@ from minisplat_ref.metrics import Evaluation, evaluate
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.studies import kit
 from minisplat_ref.training.representation import GAUSSIANS, Representation
-from minisplat_ref.training.schedule import scaled
+from minisplat_ref.training.schedule import scale_recipe
 from minisplat_ref.training.state import StepReport
 from minisplat_ref.types import Gaussians, Model, Scene, View
 
@@ -30,7 +30,7 @@ def fine_tune(
     population: Any, scene: Scene, iterations: int, seed: int, on_step: Callable[[StepReport], None] | None = None
 ) -> Any:
     """Return a population with or without textures after fine-tuning; the given one is not changed."""
-    recipe = scaled(FINE_TUNING, iterations)._replace(representation=representation_of(population))
+    recipe = scale_recipe(FINE_TUNING, iterations)._replace(representation=representation_of(population))
     return kit.fine_tune(population, scene, recipe, seed, on_step)
 
 

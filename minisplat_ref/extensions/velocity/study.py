@@ -22,8 +22,8 @@ from minisplat_ref.reporting import markdown_table
 from minisplat_ref.studies import kit
 from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
-from minisplat_ref.training.schedule import Recipe, scaled
-from minisplat_ref.types import Camera, Gaussians, Model, Scene, View, numbered, view_from
+from minisplat_ref.training.schedule import Recipe, scale_recipe
+from minisplat_ref.types import Camera, Gaussians, Model, Scene, View, number_views, view_from
 
 N_GAUSSIANS, N_VIEWS, TEST_EVERY = 12, 24, 6
 WIDTH, HEIGHT, FOCAL = 40, 32, 50.0  # pixels
@@ -41,7 +41,7 @@ class Outcome(NamedTuple):
     """RMS error over all axes, world units per unit of time; without velocities, the RMS of the true ones."""
 
 
-def moving_gaussians(rng: np.random.Generator) -> MovingGaussians:
+def make_moving_gaussians(rng: np.random.Generator) -> MovingGaussians:
     """Return round Gaussians with random colours and velocities on a grid near the plane z = 0."""
     n = N_GAUSSIANS
     rows, columns = np.divmod(np.arange(n), 4)
@@ -74,15 +74,15 @@ def photographs(truth: MovingGaussians) -> tuple[View, ...]:
         image = MOVING.renderer.render(Model(truth), view_from(camera, time=time), request)[0].image
         levels = np.round(255 * np.clip(image, 0, 1)).astype(np.uint8)  # [H, W, 3]
         views.append(View(f"{i:04d}", camera, levels, None, time=time))
-    return numbered(views)
+    return number_views(views)
 
 
-def moving_scene(truth: MovingGaussians) -> Scene:
+def make_moving_scene(truth: MovingGaussians) -> Scene:
     """Return the photographs as a scene, every sixth held out; its points are the centres at time 0."""
     views = photographs(truth)
     return Scene(
         "moving",
-        numbered(view for i, view in enumerate(views) if i % TEST_EVERY),
+        number_views(view for i, view in enumerate(views) if i % TEST_EVERY),
         tuple(view._replace(view_id=-1) for view in views[::TEST_EVERY]),
         truth.means.astype(np.float64),
         np.full(truth.means.shape, 128, np.uint8),
@@ -93,7 +93,7 @@ def moving_scene(truth: MovingGaussians) -> Scene:
 
 def outcome(recipe: Recipe, truth: MovingGaussians, seed: int) -> Outcome:
     """Train a recipe without density control from the scene at rest, and return its errors."""
-    scene, recipe = moving_scene(truth), recipe._replace(events=(), sh_degree=0)
+    scene, recipe = make_moving_scene(truth), recipe._replace(events=(), sh_degree=0)
     state = initial_state(scene, recipe, seed)
     still = Gaussians(*(field.copy() for field in truth[: len(Gaussians._fields)]))
     state.gaussians = recipe.representation.extend(still, state.rng)
@@ -108,9 +108,9 @@ def outcome(recipe: Recipe, truth: MovingGaussians, seed: int) -> Outcome:
 
 def run(args: argparse.Namespace) -> str:
     """Train both recipes, and return a table."""
-    truth, rows = moving_gaussians(np.random.default_rng(args.seed)), []
+    truth, rows = make_moving_gaussians(np.random.default_rng(args.seed)), []
     recipes = (GS_ACCEL, VELOCITY._replace(representation=MOVING))
     for recipe in kit.with_progress(recipes, "trainings"):
-        psnr, error = outcome(scaled(recipe, args.iterations), truth, args.seed)
+        psnr, error = outcome(scale_recipe(recipe, args.iterations), truth, args.seed)
         rows.append([recipe.name, f"{psnr:.2f}", f"{error:.4f}"])
     return markdown_table(["recipe", "PSNR dB", "error of velocities"], rows)

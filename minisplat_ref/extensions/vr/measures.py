@@ -44,7 +44,7 @@ def weighted_psnr(image: Floats, target: Floats, angles: Floats) -> float:
     return float(-10 * np.log10(np.average(squared, weights=weights)))
 
 
-def foveated(
+def measure_foveation(
     model: Model, views: Sequence[View], background: Floats, fulls: Sequence[float], repeats: int
 ) -> list[dict[str, Any]]:
     """Return work and errors for each angle of ``fulls``, after those of pictures that are drawn in full everywhere.
@@ -94,7 +94,7 @@ def foveated(
 def run_foveation(args: argparse.Namespace) -> kit.Report:
     """Render the test views at rates by eccentricity."""
     scene, model = kit.read_scene(args.scene, args.downscale), Model(load_ply(args.ply))
-    rows = foveated(model, scene.test_views, scene.background, FULLS, args.repeats)
+    rows = measure_foveation(model, scene.test_views, scene.background, FULLS, args.repeats)
     first, *others = rows
     names = ["everywhere", *(f"{row['full']:g} degrees" for row in others)]
     table = [

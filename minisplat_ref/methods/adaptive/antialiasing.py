@@ -8,14 +8,14 @@ others less: then opacities are compensated from now on (:mod:`minisplat_ref.tra
 """
 
 from minisplat_ref.methods.adaptive.evidence import Answer, Evidence, halves_of, pairs, render_clipped, weigh
-from minisplat_ref.training.compensation import compensated, compensation
+from minisplat_ref.training.compensation import compensate, compensation
 from minisplat_ref.training.pace import trained_ids
 from minisplat_ref.training.state import Iteration, TrainState
 
 
 def antialiasing_evidence(state: TrainState, iteration: Iteration, view_ids: list[int]) -> Evidence:
     """Return the training views' evidence for individual amounts of compensation."""
-    request = compensated(iteration.render_settings.request())
+    request = compensate(iteration.render_settings.request())
     photographs = []
     for view, photograph, rendered, is_counted in pairs(state, iteration, view_ids):
         field = render_clipped(state, iteration, view, request) - rendered

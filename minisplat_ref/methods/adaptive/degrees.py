@@ -105,7 +105,7 @@ def cut_degrees_when_cooling(state: TrainState, iteration: Iteration, *, min_var
     is_absent = np.arange(state.gaussians.sh_rest.shape[1]) >= n_coefficients(state.stats[DEGREES])[:, None]
     for moments in (state.adam.first, state.adam.second):
         moments.sh_rest[is_absent] = 0
-    state.pace = state.pace.decided(Decision(iteration.step, "bands", describe_degrees(state), None, None))
+    state.pace = state.pace.with_decision(Decision(iteration.step, "bands", describe_degrees(state), None, None))
 
 
 def describe_degrees(state: TrainState) -> str:

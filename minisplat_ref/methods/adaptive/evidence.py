@@ -44,7 +44,7 @@ class Half(NamedTuple):
         """Return the x [K] that minimises ``|r - sum x_k b_k|^2 + ridge |x|^2``; of several that of least norm."""
         return np.linalg.lstsq(self.normal + ridge * np.eye(len(self.normal)), self.projected, rcond=1e-6)[0]
 
-    def left_by(self, x: Floats) -> float:
+    def squared_residual(self, x: Floats) -> float:
         """Return ``|r - sum x_k b_k|^2``."""
         return float(self.energy - 2.0 * x @ self.projected + x @ self.normal @ x)
 
@@ -109,8 +109,8 @@ def weigh(photographs: Sequence[tuple[Half, Half]]) -> Evidence:
     common = everything.fitted(ridge)
     gains = []
     for (left, right), (x_left, x_right) in zip(photographs, fitted, strict=True):
-        before = left.left_by(common) + right.left_by(common)
-        after = left.left_by(x_right) + right.left_by(x_left)
+        before = left.squared_residual(common) + right.squared_residual(common)
+        after = left.squared_residual(x_right) + right.squared_residual(x_left)
         gains.append(10.0 * np.log10(before / after) if before > 0 and after > 0 else 0.0)
     error = np.std(gains, ddof=1) / np.sqrt(len(gains))
     whole = np.array([together(pair).fitted(ridge) for pair in photographs])  # [V, K]

@@ -57,7 +57,7 @@ def proceed_when_little_is_gained(
         return f"{gain:.2f} dB for each doubling of the work"
     why = f"held-out views gain {gain:.2f} dB for each doubling of the work, less than {min_gain}"
     if iteration.n_halvings:
-        state.pace = pace.decided(Decision(iteration.step, FINER, why, gain, error))
+        state.pace = pace.with_decision(Decision(iteration.step, FINER, why, gain, error))
     else:
         decision = Decision(iteration.step, COOLED, why, gain, error)
         begin_cooling(state, iteration.cooling, iteration.iterations, decision)

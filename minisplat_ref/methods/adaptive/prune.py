@@ -78,4 +78,4 @@ def prune_seen_by_few(state: TrainState, iteration: Iteration, min_views: int) -
 
 
 def _record(state: TrainState, iteration: Iteration, why: str) -> None:
-    state.pace = state.pace.decided(Decision(iteration.step, "prune", why, None, None))
+    state.pace = state.pace.with_decision(Decision(iteration.step, "prune", why, None, None))

@@ -51,7 +51,7 @@ class Behind(NamedTuple):
     energy: float
     """``sum r^2``."""
 
-    def left_by(self, sky: Floats) -> float:
+    def squared_residual(self, sky: Floats) -> float:
         """Return ``|r - sum_k s_k b_k|^2`` for the coefficients s [16, 3]."""
         return float(self.energy - 2.0 * np.sum(sky * self.projected) + np.sum(sky * (self.normal @ sky)))
 
@@ -72,7 +72,7 @@ def behind(residual: Floats, transmittance: Floats, basis: Floats) -> Behind:
     return Behind(b.T @ b, b.T @ residual, float(np.sum(residual**2)))
 
 
-def fitted_sky(photographs: Sequence[Behind]) -> Floats:
+def fit_sky(photographs: Sequence[Behind]) -> Floats:
     """Return the coefficients [16, 3] that explain photographs best, drawn a little towards zero."""
     normal = np.sum([photograph.normal for photograph in photographs], axis=0)
     projected = np.sum([photograph.projected for photograph in photographs], axis=0)
@@ -80,18 +80,18 @@ def fitted_sky(photographs: Sequence[Behind]) -> Floats:
     return np.linalg.solve(normal + ridge * np.eye(N_BASIS), projected)
 
 
-def left_by_the_others(photographs: Sequence[Behind]) -> Floats:
+def cross_validate(photographs: Sequence[Behind]) -> Floats:
     """Return what is left of each photograph [V] by a sky that was fitted to every second one, not to itself."""
-    skies = [fitted_sky(photographs[1 - parity :: 2]) for parity in (0, 1)]
-    return np.array([photograph.left_by(skies[k % 2]) for k, photograph in enumerate(photographs)])
+    skies = [fit_sky(photographs[1 - parity :: 2]) for parity in (0, 1)]
+    return np.array([photograph.squared_residual(skies[k % 2]) for k, photograph in enumerate(photographs)])
 
 
 def compare(as_it_is: Sequence[Behind], without_large: Sequence[Behind]) -> Evidence:
     """Return what at least two photographs say about a sky in place of the large Gaussians; ``fitted`` is its s_k."""
-    before, after = left_by_the_others(as_it_is), left_by_the_others(without_large)
+    before, after = cross_validate(as_it_is), cross_validate(without_large)
     gains = [10.0 * np.log10(b / a) if a > 0 and b > 0 else 0.0 for a, b in zip(after, before, strict=True)]
     error = np.std(gains, ddof=1) / np.sqrt(len(gains))
-    return Evidence(float(np.mean(gains)), float(error), fitted_sky(without_large))
+    return Evidence(float(np.mean(gains)), float(error), fit_sky(without_large))
 
 
 def is_larger(state: TrainState, iteration: Iteration, than: float) -> Bools:
@@ -100,7 +100,7 @@ def is_larger(state: TrainState, iteration: Iteration, than: float) -> Bools:
     return larger
 
 
-def counted_pixels(iteration: Iteration, view_ids: Sequence[int]) -> dict[int, Ints]:
+def find_counted_pixels(iteration: Iteration, view_ids: Sequence[int]) -> dict[int, Ints]:
     """Return the pixels of training views, as y W + x, that their masks leave."""
     views = {index: iteration.scene.train_views[index].load() for index in view_ids}
     return {
@@ -116,7 +116,7 @@ def open_pixels(state: TrainState, iteration: Iteration, view_ids: Sequence[int]
     """
     request = iteration.render_settings.request()._replace(is_visible=is_drawn)
     pixels = {}
-    for index, counted in counted_pixels(iteration, view_ids).items():
+    for index, counted in find_counted_pixels(iteration, view_ids).items():
         view = iteration.scene.train_views[index].load()
         alpha = iteration.render_settings.renderer.render(state.model, view, request)[0].alpha.ravel()
         is_open = 1.0 - alpha[counted] > OPEN
@@ -160,7 +160,7 @@ def ask_about_a_sky(state: TrainState, iteration: Iteration) -> Answer | str:
     why = f"a sky in place of {n:,} Gaussians explains {evidence.gain:.2f} dB more of what others show there"
 
     def begin() -> dict[str, Floats]:
-        sky = fitted_sky(photographs_behind(state, iteration, counted_pixels(iteration, ids), ~huge))
+        sky = fit_sky(photographs_behind(state, iteration, find_counted_pixels(iteration, ids), ~huge))
         apply_edit(state, keep(state.gaussians, ~huge))
         return {SKY: sky.astype(np.float32)}
 

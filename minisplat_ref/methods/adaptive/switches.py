@@ -95,7 +95,7 @@ def add_calibration(
     state.shared_adam = state.shared_adam._replace(
         first={**state.shared_adam.first, **zeros.first}, second={**state.shared_adam.second, **zeros.second}
     )
-    pace = state.pace.decided(decision)
+    pace = state.pace.with_decision(decision)
     state.pace = pace._replace(switched_on=(*pace.switched_on, calibration.name))
 
 

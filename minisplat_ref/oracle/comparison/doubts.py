@@ -39,8 +39,8 @@ def doubts(truth: Golden) -> dict[str, Bools]:
         **dict.fromkeys(PIXELWISE, jumps),
         "median_depth": medians,
         "dominant_ids": ties,
-        **dict.fromkeys(BY_GAUSSIAN, _touching(truth, jumps)),
-        "dominant_count": _touching(truth, ties),
+        **dict.fromkeys(BY_GAUSSIAN, _find_touching(truth, jumps)),
+        "dominant_count": _find_touching(truth, ties),
     }
 
 
@@ -56,7 +56,7 @@ def _ties(truth: Golden) -> Bools:
     return ties
 
 
-def _touching(truth: Golden, pixels: Bools) -> Bools:
+def _find_touching(truth: Golden, pixels: Bools) -> Bools:
     """Find the Gaussians [N] whose box contains one of these pixels."""
     boxes = truth.arrays["boxes"]
     return np.array([pixels[y0:y1, x0:x1].any() for x0, y0, x1, y1 in boxes], bool).reshape(len(boxes))

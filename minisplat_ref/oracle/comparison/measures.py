@@ -121,7 +121,7 @@ def compare_bounds(given: Arrays, truth: Golden) -> Bounds | None:
         shows = np.min(bounds["boxes"][:, 2:] - bounds["boxes"][:, :2], axis=1) > 0
     is_extra = shows & ~is_shown
     if is_extra.any() and all(key in given for key in FOOTPRINT):
-        rows = {key: _merged(is_extra, given[key], expected[key]) for key in FOOTPRINT}
+        rows = {key: _merge_rows(is_extra, given[key], expected[key]) for key in FOOTPRINT}
         projection = projection_of(expected | rows)
     boxes = bounds["boxes"] if "boxes" in bounds else _boxes_of(projection, bounds["radii"], truth)
     projection = projection._replace(boxes=np.where(shows[:, None], boxes, 0).astype(np.int32))
@@ -188,7 +188,7 @@ def _boxes_of(projection: Projection, radii: Ints, truth: Golden) -> Ints:
     return np.hstack([low, high]).astype(np.int32)
 
 
-def _merged(rows: Bools, given: Floats, expected: Floats) -> Floats:
+def _merge_rows(rows: Bools, given: Floats, expected: Floats) -> Floats:
     """Return the given values in these rows and the expected ones in all others."""
     merged = expected.copy()
     merged[rows] = given[rows]

@@ -67,7 +67,7 @@ def run_hard_cases(cases: Sequence[HardCase], precisions: Sequence[Precision] = 
     )
 
 
-def matching(cases: Sequence[HardCase], pattern: str) -> tuple[HardCase, ...]:
+def select_cases(cases: Sequence[HardCase], pattern: str) -> tuple[HardCase, ...]:
     """Return the cases whose name contains the pattern, in which ``*`` and ``?`` are wildcards.
 
     Raises

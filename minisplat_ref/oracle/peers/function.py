@@ -142,7 +142,7 @@ def _colors(rasterizer: Rasterizer, truth: Golden, dtype: str) -> Arrays:
         gradients |= {"v_sh_dc": v["colors"][:, 0], "v_sh_rest": v["colors"][:, 1:]}
     if "backgrounds" in v:
         gradients["v_background"] = v["backgrounds"][0]
-    return {"image": result.colors[0], "alpha": result.alphas[0, ..., 0], **_told(rasterizer, result), **gradients}
+    return {"image": result.colors[0], "alpha": result.alphas[0, ..., 0], **_read_meta(rasterizer, result), **gradients}
 
 
 def _features(rasterizer: Rasterizer, truth: Golden, dtype: str) -> Arrays:
@@ -247,7 +247,7 @@ def _check_shapes(where: str, result: Result, call: Call) -> None:
             raise InputError(f"{where}: {name} has dtype {given.dtype}, expected floating-point numbers")
 
 
-def _told(rasterizer: Rasterizer, result: Result) -> Arrays:
+def _read_meta(rasterizer: Rasterizer, result: Result) -> Arrays:
     """Return what the meta says of the one camera, in the golden format."""
     meta, n = result.meta, len(result.colors)
     for name in (*META, "isect_offsets"):

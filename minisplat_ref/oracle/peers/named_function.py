@@ -28,7 +28,7 @@ def load_function(text: str) -> tuple[Callable[..., Any], Callable[..., Any] | N
     module_name, _, name = text.partition(":")
     if not module_name or not name.isidentifier():
         raise InputError(f"{text!r} is no function: write package.module:function")
-    module = _imported(module_name)
+    module = _import_module(module_name)
     function = getattr(module, name, None)
     if function is None:
         own = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
@@ -39,7 +39,7 @@ def load_function(text: str) -> tuple[Callable[..., Any], Callable[..., Any] | N
     return function, getattr(module, f"{name}_vjp", None)
 
 
-def _imported(name: str) -> ModuleType:
+def _import_module(name: str) -> ModuleType:
     here = str(Path.cwd())
     if here not in sys.path:
         sys.path.insert(0, here)

@@ -34,12 +34,12 @@ from minisplat_ref.training.pace import (
     trained_ids,
 )
 from minisplat_ref.training.saved_state import load_state, save_state
-from minisplat_ref.training.schedule import configured
+from minisplat_ref.training.schedule import configure
 from minisplat_ref.training.state import Iteration
 
 OPTIONS = {"n_views": 12, "width": 48, "height": 36, "n_points": 200, "test_every": 6}
 COOLING = ADAPTIVE.cooling
-FAST = configured(ADAPTIVE._replace(iterations=700), min_gain=1e9, min_step=300)  # ends as soon as it may
+FAST = configure(ADAPTIVE._replace(iterations=700), min_gain=1e9, min_step=300)  # ends as soon as it may
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +98,7 @@ def test_it_ends_after_the_cool_down(reports):
 
 
 def test_the_limit_leaves_time_to_cool(scene):
-    state = train(scene, configured(ADAPTIVE._replace(iterations=160), min_step=10_000), seed=0)
+    state = train(scene, configure(ADAPTIVE._replace(iterations=160), min_step=10_000), seed=0)
     assert state.step == 160 and state.pace.cooling_from == 100
     assert "limit of 160 iterations" in state.pace.decisions[0].why
 
@@ -181,7 +181,7 @@ def test_a_budget_is_a_ceiling(scene):
     """Also where it is below what the training begins with."""
     for budget in (230, 100):
         counts = []
-        recipe = configured(ADAPTIVE._replace(iterations=500), budget=budget, threshold=0.0)
+        recipe = configure(ADAPTIVE._replace(iterations=500), budget=budget, threshold=0.0)
         train(scene, recipe, seed=0, on_step=lambda report, own=counts: own.append(len(report.state.gaussians.means)))
         assert max(counts) == max(budget, 200)
 

@@ -22,12 +22,12 @@ from minisplat_ref.methods.adaptive.degrees import (
 from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.reference.spherical_harmonics import sh_colors
 from minisplat_ref.rendering import RenderSettings, render
-from minisplat_ref.runs.simplification import fine_tuned
+from minisplat_ref.runs.simplification import fine_tune
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import Pace, held_out_ids
 from minisplat_ref.training.rates import present_degrees
 from minisplat_ref.training.saved_state import load_state, save_state
-from minisplat_ref.training.schedule import configured
+from minisplat_ref.training.schedule import configure
 from minisplat_ref.training.state import DEGREES
 from minisplat_ref.types import Camera, Gaussians, Scene, View, view_from
 from scenes import as_dtype, make_camera, make_gaussians
@@ -35,7 +35,7 @@ from tolerances import CLOSED_FORM
 
 BACKGROUND = np.array([0.3, 0.3, 0.3])
 N_VIEWS = 24
-SHORT = configured(ADAPTIVE._replace(iterations=600), min_step=10_000, budget=40)
+SHORT = configure(ADAPTIVE._replace(iterations=600), min_step=10_000, budget=40)
 
 
 # Grow -----------------------------------------------------------------------------------------------------------------
@@ -210,7 +210,7 @@ def test_fine_tuning_leaves_absent_bands_absent(matt, trained):
         render_settings=RenderSettings(),
     )
     rows = np.arange(len(degrees))
-    tuned = fine_tuned(run, rows, 5, holds_out=False, on_step=lambda: None).gaussians.sh_rest
+    tuned = fine_tune(run, rows, 5, holds_out=False, on_step=lambda: None).gaussians.sh_rest
     assert_array_equal(present_degrees(tuned), degrees)
     assert (tuned != trained[1].gaussians.sh_rest)[degrees > 1][:, 3:].any()
 

@@ -15,7 +15,7 @@ from minisplat_ref.training.calibration import ROTATIONS, SHIFTS, correct_pose
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import Pace, held_out_ids, trained_ids
 from minisplat_ref.training.saved_state import load_state, save_state
-from minisplat_ref.training.schedule import At, Every, configured
+from minisplat_ref.training.schedule import At, Every, configure
 from minisplat_ref.types import Scene, View
 from scenes import as_dtype, make_camera, make_gaussians
 from tolerances import DISPLACEMENT_PX
@@ -31,8 +31,8 @@ def test_half_by_hand():
     """Residuals 1, 2 beside fields 1, 1: x = 3 / 2, and (1/4 + 1/4) is left."""
     half = Half(np.array([[2.0]]), np.array([3.0]), 5.0)
     assert_allclose(half.fitted(), [1.5])
-    assert half.left_by(np.array([1.5])) == pytest.approx(0.5)
-    assert half.left_by(np.array([0.0])) == 5.0
+    assert half.squared_residual(np.array([1.5])) == pytest.approx(0.5)
+    assert half.squared_residual(np.array([0.0])) == 5.0
 
 
 def test_a_field_of_zeros_explains_nothing():
@@ -193,7 +193,7 @@ def early(recipe):
         return event._replace(period=20, start=20) if isinstance(event, Every) else event
 
     events = tuple(changed(event) for event in recipe.events)
-    return configured(recipe._replace(events=events, iterations=320), min_step=10_000)
+    return configure(recipe._replace(events=events, iterations=320), min_step=10_000)
 
 
 def test_training_refines_the_poses_and_continues_byte_for_byte(truth, tmp_path):

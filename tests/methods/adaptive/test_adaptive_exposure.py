@@ -15,7 +15,7 @@ from minisplat_ref.training.calibration import EXPOSURES
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import Pace, held_out_ids, trained_ids
 from minisplat_ref.training.saved_state import load_state, save_state
-from minisplat_ref.training.schedule import At, Every, configured
+from minisplat_ref.training.schedule import At, Every, configure
 from minisplat_ref.types import Scene, View
 from scenes import as_dtype, make_camera, make_gaussians
 
@@ -117,7 +117,7 @@ def early(recipe):
         return event._replace(period=20, start=20) if isinstance(event, Every) else event
 
     events = tuple(changed(event) for event in recipe.events)
-    return configured(recipe._replace(events=events, iterations=320), min_step=10_000, min_antialiasing_gain=np.inf)
+    return configure(recipe._replace(events=events, iterations=320), min_step=10_000, min_antialiasing_gain=np.inf)
 
 
 def test_training_recovers_the_gains_and_continues_byte_for_byte(disturbed, tmp_path):

@@ -15,11 +15,11 @@ from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import COOLED, FINER, Decision, Measurement, Pace
 from minisplat_ref.training.saved_state import load_state, save_state
-from minisplat_ref.training.schedule import configured
+from minisplat_ref.training.schedule import configure
 from minisplat_ref.training.smaller_views import halve_large_views
 
 OPTIONS = {"n_views": 12, "width": 48, "height": 36, "n_points": 200, "test_every": 6}
-TWICE = configured(ADAPTIVE._replace(iterations=3000), min_gain=1e9, min_step=300, min_side=18)
+TWICE = configure(ADAPTIVE._replace(iterations=3000), min_gain=1e9, min_step=300, min_side=18)
 SMALL, WHOLE = (24, 18), (48, 36)
 
 
@@ -58,7 +58,7 @@ def test_no_side_of_any_view_becomes_shorter(scene, width, height, min_side, tim
 @pytest.mark.parametrize("min_side", [0, -5, 15.9, float("nan")])
 def test_a_size_of_nothing_is_refused(scene, min_side):
     with pytest.raises(InputError, match=r"min_side is .*: give at least 16 pixels"):
-        train(scene, configured(TWICE, min_side=min_side), seed=0)
+        train(scene, configure(TWICE, min_side=min_side), seed=0)
 
 
 def test_views_grow_before_the_rates_fall(trained):
@@ -103,7 +103,7 @@ def test_continued_byte_for_byte(scene, trained, tmp_path, at):
 
 def test_the_limit_leaves_small_views_behind(scene):
     sizes = []
-    recipe = configured(TWICE._replace(iterations=160), min_step=10_000)
+    recipe = configure(TWICE._replace(iterations=160), min_step=10_000)
     state = train(scene, recipe, seed=0, on_step=lambda r: sizes.append((r.view.camera.width, r.view.camera.height)))
     assert state.pace.cooling_from == 100 and set(sizes[1:100]) == {SMALL} and set(sizes[100:]) == {WHOLE}
 

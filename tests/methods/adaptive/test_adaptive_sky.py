@@ -14,7 +14,7 @@ from minisplat_ref.methods.adaptive.sky import (
     Behind,
     behind,
     compare,
-    fitted_sky,
+    fit_sky,
     open_pixels,
 )
 from minisplat_ref.methods.adaptive.switches import switch_sky_on
@@ -80,11 +80,11 @@ def test_sums_by_hand():
     assert photograph.normal[0, 0] == 5.0 and photograph.projected[0, 0] == 5.0 and photograph.energy == 10.0
     coefficients = np.zeros((16, 3))
     coefficients[0, 0] = 1.0
-    assert photograph.left_by(coefficients) == pytest.approx((1 - 2) ** 2 + (3 - 1) ** 2)
+    assert photograph.squared_residual(coefficients) == pytest.approx((1 - 2) ** 2 + (3 - 1) ** 2)
 
 
 def test_what_nobody_sees_through_has_no_colour():
-    assert_array_equal(fitted_sky([Behind(np.zeros((16, 16)), np.zeros((16, 3)), 1.0)]), np.zeros((16, 3)))
+    assert_array_equal(fit_sky([Behind(np.zeros((16, 16)), np.zeros((16, 3)), 1.0)]), np.zeros((16, 3)))
 
 
 def test_photographs_judge_each_other():
