@@ -36,7 +36,7 @@ from matplotlib.patches import Rectangle
 
 from figures import BLUE, GREY, RED, YELLOW, covariances2d, draw_ellipses
 from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.bench.roofline import rows_worked_on
+from minisplat_ref.bench.worked_rows import rows_worked_on
 from minisplat_ref.bench.workloads import synth
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.cpu.compositing.records import records_of

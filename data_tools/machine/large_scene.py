@@ -17,9 +17,9 @@ from unittest.mock import patch
 
 import numpy as np
 
+from data_tools.machine.process_memory import forget_peak, held, peak
 from minisplat_ref import memory
 from minisplat_ref.backends import CPU
-from minisplat_ref.bench.process_memory import forget_peak, held, peak
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
@@ -45,7 +45,7 @@ TOLERANCE = 0.2  # of a predicted peak
 WITHIN = 8e9  # bytes, of the whole process
 SIGMA = 1.5  # pixels: standard deviation of the Gaussians that are given
 RESULT = "result.json"
-CHILD = "import sys; from minisplat_ref.bench.large_scene import measure; measure(*sys.argv[1:])"
+CHILD = "import sys; from data_tools.machine.large_scene import measure; measure(*sys.argv[1:])"
 MEGA = 1e6
 
 

@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
+from data_tools.machine.process_memory import forget_peak, held, peak
+from data_tools.machine.slopes import FOCAL_OF_WIDTH, LARGE, flipped_pixels
 from minisplat_ref import memory
 from minisplat_ref.backends import CPU
-from minisplat_ref.bench.process_memory import forget_peak, held, peak
-from minisplat_ref.bench.slopes import FOCAL_OF_WIDTH, LARGE, flipped_pixels
 from minisplat_ref.bench.workloads import synth
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.cases import Case, Figure
@@ -31,7 +31,7 @@ N, SIZE = 200_000, LARGE
 N_ITERATIONS = 4
 N_REST = 15  # coefficients of degree 3 beyond the constant
 INPUTS, IMAGE, RESULT = "inputs.npz", "image.npy", "result.json"
-CHILD = "import sys; from minisplat_ref.bench.peak_memory import measure; measure(sys.argv[1])"
+CHILD = "import sys; from data_tools.machine.peak_memory import measure; measure(sys.argv[1])"
 MEGA = 1e6
 
 
