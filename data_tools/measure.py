@@ -2,8 +2,8 @@
 
 ``python -m data_tools.measure scenes SCENE... --out DIR`` trains every scene through the command line, as a user would,
 and prints a table. ``python -m data_tools.measure rate SCENE`` times training iterations while the number of Gaussians
-stays the same. Times depend on the machine; compare figures of one run only. Stages and kernels are measured by
-``minisplat-ref bench``, beside their errors.
+stays the same. Times depend on the machine; compare figures of one run only. ``minisplat-ref bench`` measures stages
+beside their errors, :mod:`data_tools.machine` what this machine's limits are.
 """
 
 import argparse

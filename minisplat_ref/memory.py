@@ -1,8 +1,8 @@
 """Estimate the memory that a training or a picture needs, and refuse before the system would kill the process.
 
-The model of a training is the one that ``bench --memory`` measures against: the parameters, their gradient and Adam's
-two moments; the intermediate values of each Gaussian in a view; the images of an iteration, or of an evaluation where
-this is more; 48 bytes for every pair (tile, Gaussian).
+The model of a training is the one that ``python -m data_tools.machine memory`` measures against: the parameters, their
+gradient and Adam's two moments; the intermediate values of each Gaussian in a view; the images of an iteration, or of
+an evaluation where this is more; 48 bytes for every pair (tile, Gaussian).
 The program, its compiled kernels and the photographs are in memory already and are not counted. Photographs that are
 read on demand, because all together would take too much, count as far as they will stay in memory.
 

@@ -36,7 +36,7 @@ from matplotlib.patches import Rectangle
 
 from figures import BLUE, GREY, RED, YELLOW, covariances2d, draw_ellipses
 from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.bench.roofline import rows_worked_on
+from minisplat_ref.bench.worked_rows import count_worked_rows
 from minisplat_ref.bench.workloads import synth
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.cpu.compositing.records import records_of
@@ -148,7 +148,7 @@ boxes = projection.boxes.astype(np.int64)
 visited = {
     "16 x 16 tiles\nat 3 sigma": int((high - low).prod(axis=1).sum()) * 256,
     "tight boxes": int(((boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])).sum()),
-    "the kernel's\nrows": rows_worked_on(projection, tape.splats.channels, bins) * WIDTH,
+    "the kernel's\nrows": count_worked_rows(projection, tape.splats.channels, bins) * WIDTH,
     "hits": int(output.stats.hit_count.sum()),
 }
 figure, axis = plt.subplots(figsize=(7.5, 3.0))

@@ -10,10 +10,6 @@ import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from minisplat_ref.oracle.cases import Case
-
-ROUNDS = 10
-
 Task = Callable[[], object]
 
 
@@ -22,14 +18,6 @@ class Times(NamedTuple):
 
     least: float
     median: float
-
-
-class Contest(NamedTuple):
-    """Tasks that are compared with each other."""
-
-    tasks: tuple[Task, ...]
-    judge: Callable[[Sequence[Times]], list[Case]]
-    """Makes the cases from the times, one for each task."""
 
 
 def seconds_of(task: Task) -> float:
@@ -62,9 +50,3 @@ def time_interleaved(groups: Sequence[Sequence[Task]], rounds: int, repeats: int
                 for task, own in zip(tasks, of_group, strict=True):
                     own.append(seconds_of(task))
     return [[Times(min(own), statistics.median(own)) for own in of_group] for of_group in seconds]
-
-
-def time_contests(contests: Sequence[Contest], repeats: int) -> list[Case]:
-    """Time all tasks in ``ROUNDS`` rounds; return the cases of all contests, in their order."""
-    times = time_interleaved([contest.tasks for contest in contests], ROUNDS, repeats)
-    return [case for contest, own in zip(contests, times, strict=True) for case in contest.judge(own)]

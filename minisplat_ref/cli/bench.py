@@ -56,11 +56,7 @@ def add_parser(commands: Commands) -> None:
         "--backends", type=list_of(name), metavar="A,B", help="contenders, like cpu-f32,textbook-f32 (default all)"
     )
     parser.add_argument(
-        "--repeats",
-        type=integer(1),
-        default=10,
-        metavar="N",
-        help="turns of each, with --stages in each of ten rounds (default 10)",
+        "--repeats", type=integer(1), default=10, metavar="N", help="turns of each contender (default 10)"
     )
     parser.add_argument(
         "--against",
@@ -70,18 +66,10 @@ def add_parser(commands: Commands) -> None:
         help="gsplat-torch, opensplat=PROGRAM: time them, too",
     )
     others = parser.add_mutually_exclusive_group()
-    others.add_argument(
-        "--stages", action="store_true", help="instead: a training iteration, and how far from the limits"
-    )
-    others.add_argument("--slopes", action="store_true", help="instead: time against hits, 12,500 to 200,000 Gaussians")
-    others.add_argument(
-        "--memory", action="store_true", help="instead: peak of training in 1920 x 1080 and 12 megapixels"
-    )
-    others.add_argument("--large", action="store_true", help="instead: 2,000 photographs of 12 megapixels within 8 GB")
+    others.add_argument("--stages", action="store_true", help="instead: the time of a training iteration by stages")
     others.add_argument(
         "--extension", metavar="NAME", help="instead: an extension's renderer on both backends, beside 3DGS's"
     )
-    others.add_argument("--start", action="store_true", help="instead: seconds to the first iteration, cold and warm")
     parser.add_argument(
         "--scene", type=Path, metavar="SCENE", help="photographs for --stages (default a made room) and opensplat"
     )
@@ -89,17 +77,26 @@ def add_parser(commands: Commands) -> None:
         "--downscale", type=integer(1), default=1, metavar="D", help="make them D times smaller (default 1)"
     )
     parser.add_argument("--iterations", type=integer(1), default=100, metavar="N", help="of the scene (default 100)")
+    add_output_arguments(parser)
+    parser.set_defaults(run=run)
+
+
+def add_output_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add ``--out DIR`` or ``--json FILE``."""
     outputs = parser.add_mutually_exclusive_group()
     outputs.add_argument("--out", type=Path, metavar="DIR", help=f"write {PAGE}, {JSON}, {TABLE} and {FIGURE}")
     add_json_argument(outputs)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure, print the table, write what was asked for."""
+    return publish(_measure(args), args)
+
+
+def publish(report: "Report", args: argparse.Namespace) -> int:
+    """Print tables and verdict, write the files that were asked for; return 1 where a case failed, else 0."""
     from minisplat_ref.oracle.cases import save_json, verdict
 
-    report = _measure(args)
     print(f"{report.title}\n\n{_tables(report)}\n\n{verdict([report])}")
     if args.json is not None:
         save_json(report, args.json)
@@ -109,33 +106,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _measure(args: argparse.Namespace) -> "Report":
-    from minisplat_ref.oracle.cases import Report
-
     if args.stages:
-        return _stages(args)
+        return _profile(args)
     if args.extension is not None:
         return _extension(args)
-    if args.slopes:
-        from minisplat_ref.bench.slopes import slope_cases
-
-        cases = slope_cases(args.repeats, progress)
-        return Report("What time grows with: forward and backward, float32", tuple(cases), {"repeats": args.repeats})
-    if args.memory:
-        from minisplat_ref.bench.large_scene import MODERATE, large_case
-        from minisplat_ref.bench.peak_memory import memory_case
-
-        progress("memory: a few iterations in processes of their own")
-        return Report("Peak memory of training", (memory_case(), large_case(MODERATE)), {})
-    if args.large:
-        from minisplat_ref.bench.large_scene import LARGEST, large_case
-
-        progress("large: reads thousands of photographs, which takes a quarter of an hour")
-        return Report("Photographs beyond memory", (large_case(LARGEST),), {})
-    if args.start:
-        from minisplat_ref.bench.start_time import start_cases
-
-        progress("start: train with no compiled kernels, then with them")
-        return Report("From the start of train to the end of its first iteration", tuple(start_cases()), {})
     return _benchmark(args)
 
 
@@ -176,22 +150,12 @@ def _extension(args: argparse.Namespace) -> "Report":
     return Report(title, tuple(cases), {"workloads": list(names), "repeats": args.repeats})
 
 
-def _stages(args: argparse.Namespace) -> "Report":
-    from minisplat_ref.bench.interleaving import time_contests
-    from minisplat_ref.bench.limits import adams, stages, threads
-    from minisplat_ref.bench.roofline import blending
-    from minisplat_ref.bench.training_time import profile, thread_cases
-    from minisplat_ref.bench.workloads import get_workload
+def _profile(args: argparse.Namespace) -> "Report":
+    from minisplat_ref.bench.training_time import profile
     from minisplat_ref.oracle.cases import Report
 
     cases = profile(args.scene, args.downscale, args.iterations)
-    progress("the same on one thread and on all, by turns")
-    cases += thread_cases(args.scene, args.downscale, args.iterations)
-    progress("blending against straight-line loops, Adam against a copy, other stages by themselves, all by turns")
-    workloads = [get_workload(workload, args.data) for workload in args.workloads or ("synth",)]
-    contests = [contest for made in workloads for contest in (blending(made), *threads(made))]
-    cases += time_contests([*contests, *adams(), *stages()], args.repeats)
-    return Report("A training iteration by stages, and how far the kernels are from the limits", tuple(cases), {})
+    return Report("A training iteration by stages", tuple(cases), {"iterations": args.iterations})
 
 
 def _tables(report: "Report") -> str:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.cpu.compositing.exponential import exp_exact, exp_fast
+from minisplat_ref.cpu.compositing.exponential import choose_exponential
 from minisplat_ref.cpu.compositing.records import COLOR, records_of
 from minisplat_ref.cpu.compositing.tile_rows import ALPHAS, SCRATCH_SIZE, alpha_writer, find_reached_rows, start_scratch
 from minisplat_ref.cpu.compositing.tile_state import (
@@ -47,7 +47,7 @@ def removal_changes(
     """Return the squared change of the picture without each Gaussian; see ``reference.removal.removal_changes``."""
     dtype, n_channels = colors.dtype, colors.shape[1]
     slots = np.zeros(len(bins.gaussian_ids), dtype)  # remain zero behind the hit that finishes a tile
-    exp = exp_fast if dtype == np.float32 else exp_exact
+    exp = choose_exponential(dtype)
     removal_kernel(exp, n_channels)(
         output.saved if output.saved is not None else records_of(projection, colors, conventions),
         lists_of(bins),

@@ -10,6 +10,7 @@ Helpers have no loops and no branches: the compiler would count references of th
 an atomic operation each.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -139,75 +140,6 @@ def _constant(sh_dc, rows, c0):
 
 
 @scalar
-def _chunk_colors(span, degree, shaded, harmonics, radii, colors):
-    """Evaluate the colours of the Gaussians of one degree; the others' are left as they are."""
-    first, end = span
-    means, sh_dc, sh_rest, width = shaded
-    centre, c, degrees = harmonics.centre, harmonics.constants, harmonics.degrees
-    staged = np.empty(STAGE * WIDTH, means.dtype)
-    y = np.empty(N_BASES * WIDTH, means.dtype)
-    rest = np.empty(N_REST * WIDTH, means.dtype)
-    visible = np.empty(end - first + WIDTH, np.int64)
-    count = list_visible_of(radii, degrees, degree, first, end, visible)
-    n_rest = (degree + 1) * (degree + 1) - 1
-    for i in range(0, count, WIDTH):
-        rows = load_rows(visible, i)
-        dx, dy, dz, _ = _direction(centre, means, rows)
-        if degree >= 1:
-            store(y, 0, basis_1(dx, dy, dz, c))
-        if degree >= 2:
-            store(y, 3 * WIDTH, basis_2(dx, dy, dz, c))
-        if degree >= 3:
-            store(y, 8 * WIDTH, basis_3(dx, dy, dz, c))
-        for r in range(WIDTH):
-            for column in range(0, 3 * n_rest, WIDTH):
-                k = min(column, 3 * n_rest - WIDTH)
-                store(staged, r * STAGE + column, load(sh_rest, visible[i + r] * width + k))
-        for column in range(0, 3 * n_rest, WIDTH):
-            _transpose_out(staged, column, rest, min(column, 3 * n_rest - WIDTH))
-        red, green, blue = _constant(sh_dc, rows, c[0])
-        for k in range(n_rest):
-            red = red + _at(y, k) * _at(rest, 3 * k)
-            green = green + _at(y, k) * _at(rest, 3 * k + 1)
-            blue = blue + _at(y, k) * _at(rest, 3 * k + 2)
-        scatter(colors, rows, 0, maximum(red, ZERO))
-        scatter(colors, rows, 1, maximum(green, ZERO))
-        scatter(colors, rows, 2, maximum(blue, ZERO))
-
-
-@kernel()
-def _sh_colors(
-    shaded,  # Shaded
-    harmonics,  # Harmonics
-    radii,  # [N, 2]
-    colors,  # [N, 3]
-):
-    n_gaussians = radii.shape[0]
-    for chunk in prange(N_CHUNKS):
-        first, end = n_gaussians * chunk // N_CHUNKS, n_gaussians * (chunk + 1) // N_CHUNKS
-        for n in range(first, end):
-            for channel in range(3):
-                colors[n, channel] = ZERO
-        for degree in range(harmonics.lowest, harmonics.highest + 1):
-            _chunk_colors((first, end), degree, shaded, harmonics, radii, colors)
-
-
-def _harmonics(camera: Camera, degree: int | Ints, means: Floats) -> Harmonics:
-    degrees = np.full(len(means), degree, np.uint8)
-    lowest, highest = (int(np.min(degree, initial=255)), int(np.max(degree, initial=0)))
-    constants = np.array(_CONSTANTS, means.dtype)
-    return Harmonics(camera.astype(np.float64).center, constants, degrees, lowest, highest)
-
-
-def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int | Ints, radii: Ints) -> Floats:
-    """Evaluate the colour of every visible Gaussian; see ``reference.spherical_harmonics.sh_colors``."""
-    colors = np.empty(sh_dc.shape, sh_dc.dtype)
-    shaded = Shaded(means, sh_dc, sh_rest.ravel(), 3 * sh_rest.shape[1])
-    _sh_colors(shaded, _harmonics(camera, degree, means), radii, colors)
-    return colors
-
-
-@scalar
 def _rest_vjp(k, v_red, v_green, v_blue, y, rest):
     """Replace a basis function and its coefficients by the gradients with respect to them."""
     y_k = _at(y, k)
@@ -238,73 +170,121 @@ def _zero_culled(first, end, radii, v):
                 store(v_rest, n * width + min(column, width - WIDTH), v_rest.dtype.type(0))
 
 
-@scalar
-def _chunk_vjp(span, degree, shaded, harmonics, radii, v_colors, v, v_offset):
-    """Chain the gradient of the Gaussians of one degree, and add up those with respect to their offsets."""
-    first, end = span
-    means, sh_dc, sh_rest, width = shaded
-    centre, c, degrees = harmonics.centre, harmonics.constants, harmonics.degrees
-    v_means, v_dc, v_rest, _ = v
-    staged = np.empty(STAGE * WIDTH, means.dtype)
-    y = np.empty(N_BASES * WIDTH, means.dtype)
-    rest = np.zeros(max(width, WIDTH) * WIDTH, means.dtype)  # beyond the active degree the gradient is zero
-    visible = np.empty(end - first + WIDTH, np.int64)
-    count = list_visible_of(radii, degrees, degree, first, end, visible)
-    n_rest = (degree + 1) * (degree + 1) - 1
-    for i in range(0, count, WIDTH):
-        rows = load_rows(visible, i)
-        dx, dy, dz, inverse = _direction(centre, means, rows)
-        if degree >= 1:
-            store(y, 0, basis_1(dx, dy, dz, c))
-        if degree >= 2:
-            store(y, 3 * WIDTH, basis_2(dx, dy, dz, c))
-        if degree >= 3:
-            store(y, 8 * WIDTH, basis_3(dx, dy, dz, c))
-        for r in range(WIDTH):
-            for column in range(0, 3 * n_rest, WIDTH):
-                k = min(column, 3 * n_rest - WIDTH)
-                store(staged, r * STAGE + column, load(sh_rest, visible[i + r] * width + k))
-        for column in range(0, 3 * n_rest, WIDTH):
-            _transpose_out(staged, column, rest, min(column, 3 * n_rest - WIDTH))
-        red, green, blue = _constant(sh_dc, rows, c[0])
-        for k in range(n_rest):
-            red = red + _at(y, k) * _at(rest, 3 * k)
-            green = green + _at(y, k) * _at(rest, 3 * k + 1)
-            blue = blue + _at(y, k) * _at(rest, 3 * k + 2)
-        # A colour that is clamped at zero has no derivative.
-        v_red = select(red > ZERO, gather(v_colors, rows, 0), ZERO)
-        v_green = select(green > ZERO, gather(v_colors, rows, 1), ZERO)
-        v_blue = select(blue > ZERO, gather(v_colors, rows, 2), ZERO)
-        scatter(v_dc, rows, 0, c[0] * v_red)
-        scatter(v_dc, rows, 1, c[0] * v_green)
-        scatter(v_dc, rows, 2, c[0] * v_blue)
-        for k in range(n_rest):
-            _rest_vjp(k, v_red, v_green, v_blue, y, rest)
-        for column in range(0, width, WIDTH):
-            k = min(column, width - WIDTH)
-            if k < 3 * n_rest:
-                _transpose_back(rest, k, staged, column)
+def _loop_over_chunk(has_gradient: bool) -> Callable:
+    """Return the loop over the Gaussians of one degree: it writes their colours, or with a gradient chains it.
+
+    One function for both, because a helper for what they share would itself loop over the coefficients.
+    """
+
+    @scalar
+    def loop(span, degree, shaded, harmonics, radii, colors, backward):
+        """``colors`` are written, or ``backward`` is v_colors, the gradient and its sums over offsets."""
+        first, end = span
+        means, sh_dc, sh_rest, width = shaded
+        centre, c, degrees = harmonics.centre, harmonics.constants, harmonics.degrees
+        staged = np.empty(STAGE * WIDTH, means.dtype)
+        y = np.empty(N_BASES * WIDTH, means.dtype)
+        rest = np.zeros(max(width, WIDTH) * WIDTH, means.dtype)  # beyond the active degree the gradient is zero
+        visible = np.empty(end - first + WIDTH, np.int64)
+        count = list_visible_of(radii, degrees, degree, first, end, visible)
+        n_rest = (degree + 1) * (degree + 1) - 1
+        for i in range(0, count, WIDTH):
+            rows = load_rows(visible, i)
+            dx, dy, dz, inverse = _direction(centre, means, rows)
+            if degree >= 1:
+                store(y, 0, basis_1(dx, dy, dz, c))
+            if degree >= 2:
+                store(y, 3 * WIDTH, basis_2(dx, dy, dz, c))
+            if degree >= 3:
+                store(y, 8 * WIDTH, basis_3(dx, dy, dz, c))
             for r in range(WIDTH):
+                for column in range(0, 3 * n_rest, WIDTH):
+                    k = min(column, 3 * n_rest - WIDTH)
+                    store(staged, r * STAGE + column, load(sh_rest, visible[i + r] * width + k))
+            for column in range(0, 3 * n_rest, WIDTH):
+                _transpose_out(staged, column, rest, min(column, 3 * n_rest - WIDTH))
+            red, green, blue = _constant(sh_dc, rows, c[0])
+            for k in range(n_rest):
+                red = red + _at(y, k) * _at(rest, 3 * k)
+                green = green + _at(y, k) * _at(rest, 3 * k + 1)
+                blue = blue + _at(y, k) * _at(rest, 3 * k + 2)
+            if not has_gradient:
+                scatter(colors, rows, 0, maximum(red, ZERO))
+                scatter(colors, rows, 1, maximum(green, ZERO))
+                scatter(colors, rows, 2, maximum(blue, ZERO))
+                continue
+            v_colors, (v_means, v_dc, v_rest, _), v_offset = backward
+            # A colour that is clamped at zero has no derivative.
+            v_red = select(red > ZERO, gather(v_colors, rows, 0), ZERO)
+            v_green = select(green > ZERO, gather(v_colors, rows, 1), ZERO)
+            v_blue = select(blue > ZERO, gather(v_colors, rows, 2), ZERO)
+            scatter(v_dc, rows, 0, c[0] * v_red)
+            scatter(v_dc, rows, 1, c[0] * v_green)
+            scatter(v_dc, rows, 2, c[0] * v_blue)
+            for k in range(n_rest):
+                _rest_vjp(k, v_red, v_green, v_blue, y, rest)
+            for column in range(0, width, WIDTH):
+                k = min(column, width - WIDTH)
                 if k < 3 * n_rest:
-                    store(v_rest, visible[i + r] * width + k, load(staged, r * STAGE + column))
-                else:
-                    store(v_rest, visible[i + r] * width + k, v_rest.dtype.type(0))
-        v_d = (ZERO * dx, ZERO * dx, ZERO * dx)
-        if degree >= 1:
-            v_d = _add_lanes(v_d, basis_1_vjp(c, _triple_at(y, 0)))
-        if degree >= 2:
-            v_d = _add_lanes(v_d, basis_2_vjp(dx, dy, dz, c, (*_triple_at(y, 3), _at(y, 6), _at(y, 7))))
-        if degree >= 3:
-            v_basis = (*_triple_at(y, 8), *_triple_at(y, 11), _at(y, 14))
-            v_d = _add_lanes(v_d, basis_3_vjp(dx, dy, dz, c, v_basis))
-        v_x, v_y, v_z = direction_vjp(dx, dy, dz, inverse, v_d[0], v_d[1], v_d[2])
-        scatter(v_means, rows, 0, v_x)
-        scatter(v_means, rows, 1, v_y)
-        scatter(v_means, rows, 2, v_z)
-        is_counted = iota(means.dtype.type(0)) < count - i
-        add(v_offset, 0, is_counted, cast(v_x, DOUBLE))
-        add(v_offset, 1, is_counted, cast(v_y, DOUBLE))
-        add(v_offset, 2, is_counted, cast(v_z, DOUBLE))
+                    _transpose_back(rest, k, staged, column)
+                for r in range(WIDTH):
+                    if k < 3 * n_rest:
+                        store(v_rest, visible[i + r] * width + k, load(staged, r * STAGE + column))
+                    else:
+                        store(v_rest, visible[i + r] * width + k, v_rest.dtype.type(0))
+            v_d = (ZERO * dx, ZERO * dx, ZERO * dx)
+            if degree >= 1:
+                v_d = _add_lanes(v_d, basis_1_vjp(c, _triple_at(y, 0)))
+            if degree >= 2:
+                v_d = _add_lanes(v_d, basis_2_vjp(dx, dy, dz, c, (*_triple_at(y, 3), _at(y, 6), _at(y, 7))))
+            if degree >= 3:
+                v_basis = (*_triple_at(y, 8), *_triple_at(y, 11), _at(y, 14))
+                v_d = _add_lanes(v_d, basis_3_vjp(dx, dy, dz, c, v_basis))
+            v_x, v_y, v_z = direction_vjp(dx, dy, dz, inverse, v_d[0], v_d[1], v_d[2])
+            scatter(v_means, rows, 0, v_x)
+            scatter(v_means, rows, 1, v_y)
+            scatter(v_means, rows, 2, v_z)
+            is_counted = iota(means.dtype.type(0)) < count - i
+            add(v_offset, 0, is_counted, cast(v_x, DOUBLE))
+            add(v_offset, 1, is_counted, cast(v_y, DOUBLE))
+            add(v_offset, 2, is_counted, cast(v_z, DOUBLE))
+
+    return loop
+
+
+_evaluate_chunk, _differentiate_chunk = _loop_over_chunk(False), _loop_over_chunk(True)
+
+
+@kernel()
+def _sh_colors(
+    shaded,  # Shaded
+    harmonics,  # Harmonics
+    radii,  # [N, 2]
+    colors,  # [N, 3]
+):
+    n_gaussians = radii.shape[0]
+    for chunk in prange(N_CHUNKS):
+        first, end = n_gaussians * chunk // N_CHUNKS, n_gaussians * (chunk + 1) // N_CHUNKS
+        for n in range(first, end):
+            for channel in range(3):
+                colors[n, channel] = ZERO
+        for degree in range(harmonics.lowest, harmonics.highest + 1):
+            _evaluate_chunk((first, end), degree, shaded, harmonics, radii, colors, None)
+
+
+def _harmonics(camera: Camera, degree: int | Ints, means: Floats) -> Harmonics:
+    degrees = np.full(len(means), degree, np.uint8)
+    lowest, highest = (int(np.min(degree, initial=255)), int(np.max(degree, initial=0)))
+    constants = np.array(_CONSTANTS, means.dtype)
+    return Harmonics(camera.astype(np.float64).center, constants, degrees, lowest, highest)
+
+
+def sh_colors(means: Floats, sh_dc: Floats, sh_rest: Floats, camera: Camera, degree: int | Ints, radii: Ints) -> Floats:
+    """Evaluate the colour of every visible Gaussian; see ``reference.spherical_harmonics.sh_colors``."""
+    colors = np.empty(sh_dc.shape, sh_dc.dtype)
+    shaded = Shaded(means, sh_dc, sh_rest.ravel(), 3 * sh_rest.shape[1])
+    _sh_colors(shaded, _harmonics(camera, degree, means), radii, colors)
+    return colors
 
 
 @kernel()
@@ -322,7 +302,7 @@ def _sh_colors_vjp(
         v_offsets[chunk] = ZERO
         _zero_culled(first, end, radii, v)
         for degree in range(harmonics.lowest, harmonics.highest + 1):
-            _chunk_vjp((first, end), degree, shaded, harmonics, radii, v_colors, v, v_offsets[chunk])
+            _differentiate_chunk((first, end), degree, shaded, harmonics, radii, None, (v_colors, v, v_offsets[chunk]))
     return total_of(v_offsets)
 
 

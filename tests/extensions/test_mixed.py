@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from minisplat_ref.extensions.shared_studies import psnr_of
 from numpy.testing import assert_allclose
 
 from gradcheck import check_jacobian
@@ -31,7 +32,7 @@ from minisplat_ref.extensions.mixed.population import (
     to_lab,
 )
 from minisplat_ref.extensions.mixed.projection import Hulls, footprints_of, footprints_vjp, in_plane
-from minisplat_ref.extensions.mixed.response import INSIDE, RESPONSE, Footprints, nearest
+from minisplat_ref.extensions.mixed.response import INSIDE, RESPONSE, HullFootprints, nearest
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.reference.hits import CONIC
 from minisplat_ref.reference.tiling import bin_gaussians
@@ -52,7 +53,7 @@ def footprints(vertices, n_vertices, opacity=0.9, conics=Q[:, [0, 0, 1], [0, 1, 
     centres, n = vertices.mean(axis=1), len(vertices)
     box = np.tile([0, 0, 64, 64], (n, 1))
     projection = Projection(centres, np.ones(n), conics, np.full(n, opacity), np.full((n, 2), 9), box)
-    return Footprints(projection, vertices - centres[:, None], np.full(n, n_vertices))
+    return HullFootprints(projection, vertices - centres[:, None], np.full(n, n_vertices))
 
 
 def of_first(n_vertices):
@@ -160,7 +161,7 @@ def test_the_gradient_of_the_response(rng):
 
     def moved(means2d, conics, opacities, vertices):
         projection = hulls.projection._replace(means2d=means2d, conics=conics, opacities=opacities)
-        return Footprints(projection, vertices, hulls.n_vertices)
+        return HullFootprints(projection, vertices, hulls.n_vertices)
 
     inputs = [getattr(hulls, name) for name in RESPONSE.fields]
     one = np.zeros(1, int)

@@ -15,7 +15,7 @@ from minisplat_ref.datasets.synthetic.files import write_scene
 from minisplat_ref.extensions.textured.method import TEXTURED_GAUSSIANS
 from minisplat_ref.extensions.textured.population import TexturedGaussians, with_textures
 from minisplat_ref.extensions.textured.reference import LIMB, frames, frames_vjp, meet, meet_vjp
-from minisplat_ref.extensions.textured.response import RESPONSE, Footprints, bounds
+from minisplat_ref.extensions.textured.response import RESPONSE, TexturedFootprints, bounds
 from minisplat_ref.extensions.textured.study import colors_across
 from minisplat_ref.reference.covariance import rotation_matrices
 from minisplat_ref.reference.hits import CONIC
@@ -120,7 +120,7 @@ def test_opacity_is_the_sigmoid_of_logit_and_texture(rng):
     box, ones = np.zeros((1, 4), np.int32), np.ones((1, 2), np.int32)
     projection = Projection(p, np.ones(1), conic, 1 / (1 + np.exp(-(logit + bounds(h)))), ones, box)
     pixels = p + rng.uniform(-6, 6, size=(9, 2))
-    hit = RESPONSE.hit(Footprints(projection, logit, h, frame), np.zeros(1, int), pixels)
+    hit = RESPONSE.hit(TexturedFootprints(projection, logit, h, frame), np.zeros(1, int), pixels)
     x = sh_basis(meet(frame, p, pixels).directions[0], 3)[:, 1:] @ h[0]
     falloff = CONIC.hit(projection._replace(opacities=np.ones(1)), np.zeros(1, int), pixels).unclamped[0]
     assert np.ptp(x) > 0.5

@@ -35,7 +35,7 @@ def add_parser(commands: Commands) -> None:
         check.add_parser(checks)
 
 
-def add_json_argument(parser: argparse.ArgumentParser) -> None:
+def add_json_argument(parser: argparse._ActionsContainer) -> None:
     """Add ``--json FILE``."""
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the cases to FILE")
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.cpu.compositing.backward import backward_kernel
-from minisplat_ref.cpu.compositing.exponential import exp_exact, exp_fast
+from minisplat_ref.cpu.compositing.exponential import choose_exponential
 from minisplat_ref.cpu.compositing.forward import HitStats, forward_kernel
 from minisplat_ref.cpu.compositing.pair_sums import N_PAIR_STATS, slot_size, sum_pair_stats, sum_slots
 from minisplat_ref.cpu.compositing.records import records_of
@@ -17,10 +17,6 @@ from minisplat_ref.cpu.compositing.tile_state import Pixels, frame_of, lists_of
 from minisplat_ref.cpu.memory import large_empty
 from minisplat_ref.jit.compile import n_threads
 from minisplat_ref.types import BlendStats, CompositeGradient, Floats, Projection, RenderOutput, TileBins
-
-
-def _exponential(dtype: np.dtype) -> Callable:
-    return exp_fast if dtype == np.float32 else exp_exact
 
 
 def composite(
@@ -34,7 +30,7 @@ def composite(
     with_median_depth: bool = False,
 ) -> RenderOutput:
     """Blend every tile's Gaussians front to back; see ``reference.compositing.composite``."""
-    exp = _exponential(colors.dtype)
+    exp = choose_exponential(colors.dtype)
     return composite_with(exp, projection, colors, background, bins, conventions, with_stats, with_median_depth)
 
 
@@ -49,7 +45,7 @@ def composite_vjp(
     v_alpha: Floats,
 ) -> CompositeGradient:
     """Chain the gradient of the image to its inputs; see ``reference.compositing.composite_vjp``."""
-    exp = _exponential(colors.dtype)
+    exp = choose_exponential(colors.dtype)
     return composite_vjp_with(exp, projection, colors, bins, conventions, output, v_image, v_alpha)
 
 

@@ -6,6 +6,7 @@ exponent bits.
 """
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -45,3 +46,8 @@ def exp_fast(x):
     square = f * f
     low, middle, high = _C0 + _C1 * f, _C2 + _C3 * f, _C4 + _C5 * f  # independent, as in Estrin's scheme
     return ldexp(low + (middle + high * square) * square, n)
+
+
+def choose_exponential(dtype: np.dtype) -> Callable:
+    """Return the exponential for data of a dtype: the polynomial for float32, libm's for float64."""
+    return exp_fast if dtype == np.float32 else exp_exact

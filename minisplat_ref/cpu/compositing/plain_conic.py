@@ -6,7 +6,7 @@ As in ``compositing``, float32 data use the polynomial exponential and float64 d
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.cpu.compositing.exponential import exp_exact, exp_fast
+from minisplat_ref.cpu.compositing.exponential import choose_exponential
 from minisplat_ref.cpu.compositing.hits import composite_hits, composite_hits_vjp
 from minisplat_ref.cpu.compositing.responses import KernelResponse, conic_response
 from minisplat_ref.errors import InputError
@@ -14,7 +14,7 @@ from minisplat_ref.types import CompositeGradient, Floats, Projection, RenderOut
 
 
 def _response(dtype: np.dtype) -> KernelResponse:
-    return conic_response(exp_fast if dtype == np.float32 else exp_exact)
+    return conic_response(choose_exponential(dtype))
 
 
 def composite(

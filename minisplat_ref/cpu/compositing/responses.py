@@ -75,6 +75,7 @@ class KernelResponse(NamedTuple):
 
 # Columns of a conic's record; the depth has no derivative.
 MEAN_X, MEAN_Y, HALF_A, SLOPE, HALF_PIVOT, OPACITY, DEPTH = range(7)
+CONIC_GRADIENTS = DEPTH  # records that extend a conic's begin with these columns
 HALF_A_MAX = 1e30  # without a low-pass a footprint can be thinner than float32 can square
 
 
@@ -99,7 +100,7 @@ def conic_response(exp: Callable) -> KernelResponse:
         v_dy = pivot * dy + slope * v_e
         return q_mean * v_e, q_mean * v_dy, q_shape * e * e, q_shape * v_e * dy, q_shape * dy * dy, falloff * v_shape
 
-    return KernelResponse(_conic_records, _conic_records_vjp, _conic_boxes, conic_hit, conic_hit_vjp, n_gradients=6)
+    return KernelResponse(_conic_records, _conic_records_vjp, _conic_boxes, conic_hit, conic_hit_vjp, CONIC_GRADIENTS)
 
 
 def _conic_factors(projection: Projection) -> tuple[Floats, Floats, Floats]:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from minisplat_ref.cpu.compositing.exponential import exp_exact, exp_fast
+from minisplat_ref.cpu.compositing.exponential import choose_exponential
 from minisplat_ref.cpu.compositing.responses import KernelResponse
 from minisplat_ref.extensions.analytic.reference import CUBIC, LINEAR, Axes, axes_of, axes_of_vjp
 from minisplat_ref.jit.compile import scalar
@@ -74,7 +74,7 @@ def pixel_response(exp: Callable) -> KernelResponse:
 
 def response_for(dtype: np.dtype) -> KernelResponse:
     """Return the response for arrays of a dtype: float32 data use the polynomial exponential."""
-    return pixel_response(exp_fast if dtype == np.float32 else exp_exact)
+    return pixel_response(choose_exponential(dtype))
 
 
 def _records(projection, dtype):

@@ -9,16 +9,16 @@ from collections.abc import Callable
 
 import numpy as np
 
-from minisplat_ref.cpu.compositing.exponential import exp_exact, exp_fast
-from minisplat_ref.cpu.compositing.responses import MEAN_X, OPACITY, KernelResponse, conic_response
+from minisplat_ref.cpu.compositing.exponential import choose_exponential
+from minisplat_ref.cpu.compositing.responses import CONIC_GRADIENTS, MEAN_X, OPACITY, KernelResponse, conic_response
 from minisplat_ref.extensions.cuts.curve import LENGTH_MIN, N_EDGES, N_POINTS, VERTICES
 from minisplat_ref.extensions.cuts.response import CutFootprints
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import broadcast, maximum, minimum, select, sqrt
 from minisplat_ref.jit.literals import ONE, ZERO
-from minisplat_ref.types import Floats, Ints
+from minisplat_ref.mechanisms.payload.footprints import boxes_of
+from minisplat_ref.types import Floats
 
-CONIC_GRADIENTS = 6  # a record begins with the conic's own: mean, factors and opacity
 POINTS = CONIC_GRADIENTS  # gradients of the control points; the kernels do not read these columns
 SHIFT = POINTS + 2 * N_POINTS  # gradient of the mask with respect to the centre's pixel
 N_GRADIENTS = SHIFT + 2
@@ -120,7 +120,7 @@ def make_cut_response(exp: Callable) -> KernelResponse:
     return KernelResponse(
         functools.partial(_records, conic.records),
         functools.partial(_records_vjp, conic.records_vjp),
-        _boxes,
+        boxes_of,
         hit,
         hit_vjp,
         N_GRADIENTS,
@@ -137,7 +137,7 @@ def _along(records, n, dx, dy, end):
 
 def response_for(dtype: np.dtype) -> KernelResponse:
     """Return the response for arrays of a dtype: float32 data use the polynomial exponential."""
-    return make_cut_response(exp_fast if dtype == np.float32 else exp_exact)
+    return make_cut_response(choose_exponential(dtype))
 
 
 def _records(conic_records: Callable, footprints: CutFootprints, dtype: np.dtype) -> Floats:
@@ -159,7 +159,3 @@ def _records_vjp(conic_records_vjp: Callable, footprints: CutFootprints, v_recor
     dtype = footprints.means2d.dtype
     v_points = v_records[:, POINTS:SHIFT].reshape(-1, N_POINTS, 2).astype(dtype)
     return v_means2d + v_records[:, SHIFT:N_GRADIENTS].astype(dtype), v_conics, v_opacities, v_points
-
-
-def _boxes(footprints: CutFootprints) -> Ints:
-    return footprints.projection.boxes

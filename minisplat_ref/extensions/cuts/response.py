@@ -7,12 +7,14 @@ applies to them, and the mask multiplies alpha::
     M = J(x) R_c R diag(s),   P_j = c_j1 M_1 + c_j2 M_2,   alpha = o exp(-d^T Q d / 2) mask(d)
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from minisplat_ref.constants import Conventions
 from minisplat_ref.extensions.cuts.curve import N_POINTS, Cut, evaluate_cuts, evaluate_cuts_vjp
+from minisplat_ref.mechanisms.payload.footprints import Footprints, boxes_of
 from minisplat_ref.reference.covariance import rotation_matrices, rotation_matrices_vjp
 from minisplat_ref.reference.hits import CONIC, ConicPlace, Hit, Response
 from minisplat_ref.reference.pinhole import (
@@ -22,7 +24,7 @@ from minisplat_ref.reference.pinhole import (
     slope_limits,
     with_principal_point,
 )
-from minisplat_ref.types import Camera, Floats, Ints, Primitives, Projection
+from minisplat_ref.types import Camera, Floats, Ints, Primitives
 
 
 def image_points(curves: Floats, primitives: Primitives, camera: Camera, conventions: Conventions) -> Floats:
@@ -95,32 +97,17 @@ def _maps(primitives: Primitives, camera: Camera, conventions: Conventions) -> t
     return x, R, J, (J @ R_c @ R)[:, :, :2] * scales[:, None, :2]
 
 
-class CutFootprints(NamedTuple):
+@dataclass(frozen=True)
+class CutFootprints(Footprints):
     """The footprints of Gaussians with cuts."""
 
-    projection: Projection
     points: Floats
     """[N, 4, 2] control points, px from the centre."""
     widths: Floats
     """[N] w of the mask, px."""
 
-    @property
-    def means2d(self) -> Floats:
-        """[N, 2] px."""
-        return self.projection.means2d
 
-    @property
-    def conics(self) -> Floats:
-        """[N, 3]."""
-        return self.projection.conics
-
-    @property
-    def opacities(self) -> Floats:
-        """[N]."""
-        return self.projection.opacities
-
-
-FIELDS = ("means2d", "conics", "opacities", "points")
+FIELDS = (*CONIC.fields, "points")
 
 
 class Place(NamedTuple):
@@ -129,11 +116,6 @@ class Place(NamedTuple):
     conic: ConicPlace
     uncut: Floats  # [G, P] alpha without the mask
     cut: Cut
-
-
-def boxes(footprints: CutFootprints) -> Ints:
-    """Return the boxes of the projection, which a cut cannot enlarge."""
-    return footprints.projection.boxes
 
 
 def hit(footprints: CutFootprints, ids: Ints, centers: Floats) -> Hit:
@@ -159,4 +141,4 @@ def hit_vjp(
     return v_means2d - v_offsets.sum(axis=1), v_conics, v_opacities, v_points
 
 
-RESPONSE = Response(boxes, hit, hit_vjp, FIELDS)
+RESPONSE = Response(boxes_of, hit, hit_vjp, FIELDS)

@@ -10,8 +10,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from minisplat_ref.cpu.compositing.exponential import exp_exact, exp_fast
+from minisplat_ref.cpu.compositing.exponential import choose_exponential
 from minisplat_ref.cpu.compositing.responses import (
+    CONIC_GRADIENTS,
     HALF_A,
     HALF_PIVOT,
     MEAN_X,
@@ -21,14 +22,14 @@ from minisplat_ref.cpu.compositing.responses import (
     KernelResponse,
     conic_response,
 )
-from minisplat_ref.extensions.mixed.response import FLAT, Footprints
+from minisplat_ref.extensions.mixed.response import FLAT, HullFootprints
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import broadcast, maximum, minimum, select
 from minisplat_ref.jit.literals import ONE, TWO, ZERO
+from minisplat_ref.mechanisms.payload.footprints import boxes_of
 from minisplat_ref.scalar.compositing import mahalanobis
-from minisplat_ref.types import Floats, Ints
+from minisplat_ref.types import Floats
 
-CONIC_GRADIENTS = 6  # a record begins with the conic's own: centre, factors and opacity
 V_1, V_2, V_3 = range(CONIC_GRADIENTS, CONIC_GRADIENTS + 6, 2)  # vertices from the centre
 N_GRADIENTS = V_3 + 2
 DEPTH, COUNT, ORIENTATION = range(
@@ -126,7 +127,7 @@ def hull_response(exp: Callable) -> KernelResponse:
     return KernelResponse(
         functools.partial(_records, conic.records),
         functools.partial(_records_vjp, conic.records_vjp),
-        _boxes,
+        boxes_of,
         hit,
         hit_vjp,
         N_GRADIENTS,
@@ -141,11 +142,11 @@ def side(a, b):
 
 def response_for(dtype: np.dtype) -> KernelResponse:
     """Return the response for arrays of a dtype: float32 data use the polynomial exponential."""
-    return hull_response(exp_fast if dtype == np.float32 else exp_exact)
+    return hull_response(choose_exponential(dtype))
 
 
-def _records(conic_records: Callable, footprints: Footprints, dtype: np.dtype) -> Floats:
-    projection, vertices, n_vertices = footprints
+def _records(conic_records: Callable, footprints: HullFootprints, dtype: np.dtype) -> Floats:
+    projection, vertices, n_vertices = footprints.projection, footprints.vertices, footprints.n_vertices
     records = np.zeros((len(n_vertices), N_COLUMNS), dtype)
     records[:, :CONIC_GRADIENTS] = conic_records(projection, dtype)[:, :CONIC_GRADIENTS]
     records[:, V_1:N_GRADIENTS], records[:, DEPTH] = vertices.reshape(-1, 6), projection.depths
@@ -164,11 +165,7 @@ def _records(conic_records: Callable, footprints: Footprints, dtype: np.dtype) -
     return records
 
 
-def _records_vjp(conic_records_vjp: Callable, footprints: Footprints, v_records: Floats) -> tuple[Floats, ...]:
+def _records_vjp(conic_records_vjp: Callable, footprints: HullFootprints, v_records: Floats) -> tuple[Floats, ...]:
     """Gradient with respect to the footprints' ``FIELDS``."""
     v_vertices = v_records[:, V_1:N_GRADIENTS].reshape(-1, 3, 2).astype(footprints.vertices.dtype)
     return *conic_records_vjp(footprints.projection, v_records), v_vertices
-
-
-def _boxes(footprints: Footprints) -> Ints:
-    return footprints.projection.boxes

@@ -8,7 +8,7 @@ from minisplat_ref.extensions.mixed.kernels import response_for
 from minisplat_ref.extensions.mixed.kinds import promote_kinds, simplify_kinds
 from minisplat_ref.extensions.mixed.population import MixedGaussians, counts, group_gaussians
 from minisplat_ref.extensions.mixed.projection import Hulls, footprints_of, footprints_vjp
-from minisplat_ref.extensions.mixed.response import RESPONSE, Footprints
+from minisplat_ref.extensions.mixed.response import RESPONSE, HullFootprints
 from minisplat_ref.mechanisms.payload.renderer import Payload, PayloadGradient, Projected, payload_renderer
 from minisplat_ref.methods.gaussian_splatting import GS_ACCEL
 from minisplat_ref.training.rates import Rates
@@ -29,7 +29,7 @@ def _hulls(projected: Projected) -> Hulls:
     return Hulls(projected.primitives, g.vertices, counts(g))
 
 
-def _footprints(projected: Projected) -> Footprints:
+def _footprints(projected: Projected) -> HullFootprints:
     return footprints_of(_hulls(projected), projected.projection, projected.camera, projected.conventions)
 
 
@@ -42,7 +42,7 @@ def _footprints_vjp(projected: Projected, v: tuple[Floats, ...]) -> PayloadGradi
     return PayloadGradient(fields, found.means, found.quats, v_scales, found.cam_from_world_R, found.cam_from_world_t)
 
 
-def _list_boxes(footprints: Footprints) -> Projection:
+def _list_boxes(footprints: HullFootprints) -> Projection:
     """Return the projection with ellipses that reach all tiles under the boxes of lines and triangles."""
     projection = footprints.projection
     conics = np.where((footprints.n_vertices > 1)[:, None], BOUNDLESS, projection.conics)

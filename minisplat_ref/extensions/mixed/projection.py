@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from minisplat_ref.constants import Conventions
-from minisplat_ref.extensions.mixed.response import Footprints
+from minisplat_ref.extensions.mixed.response import HullFootprints
 from minisplat_ref.reference.antialiasing import adjugates, compensations, determinants
 from minisplat_ref.reference.covariance import covariances, rotation_matrices, rotation_matrices_vjp
 from minisplat_ref.reference.extent import extents
@@ -86,7 +86,7 @@ class Hulls(NamedTuple):
         return x, x[:, None] + placed, G
 
 
-def footprints_of(hulls: Hulls, projection: Projection, camera: Camera, conventions: Conventions) -> Footprints:
+def footprints_of(hulls: Hulls, projection: Projection, camera: Camera, conventions: Conventions) -> HullFootprints:
     """Return what the camera sees.
 
     Parameters
@@ -104,7 +104,7 @@ def footprints_of(hulls: Hulls, projection: Projection, camera: Camera, conventi
     merged = Projection._make(field.copy() for field in projection)
     for whole, part in zip(merged, of_rows, strict=True):
         whole[rows] = part
-    return Footprints(merged, vertices, hulls.n_vertices)
+    return HullFootprints(merged, vertices, hulls.n_vertices)
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # non-finite rows are culled, not reported

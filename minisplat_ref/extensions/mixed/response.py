@@ -18,45 +18,31 @@ ones (the envelope theorem). Its gradient is that of an ellipse around the neare
 Vertices are given from the hull's centre, which moves them all.
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.reference.hits import Hit, Response, conic_matrices
-from minisplat_ref.types import Bools, Floats, Ints, Projection
+from minisplat_ref.mechanisms.payload.footprints import Footprints, boxes_of
+from minisplat_ref.reference.hits import CONIC, Hit, Response, conic_matrices
+from minisplat_ref.types import Bools, Floats, Ints
 
 EDGES = ((0, 1), (1, 2), (2, 0))
 INSIDE = -1  # in Nearest.edges
 FLAT = 1e-5  # twice a triangle's area over its longest edge squared: below, it is its edges
 
 
-class Footprints(NamedTuple):
-    """Hulls as a camera sees them."""
+@dataclass(frozen=True)
+class HullFootprints(Footprints):
+    """Hulls as a camera sees them; the projection is that of their centres, and its conics belong to all vertices."""
 
-    projection: Projection
-    """Of the centres; the conics belong to all vertices."""
     vertices: Floats
     """[N, 3, 2] p_k from the centre, px; zeros where a hull has no such vertex, and for an ellipse."""
     n_vertices: Ints
     """[N] 1, 2 or 3."""
 
-    @property
-    def means2d(self) -> Floats:
-        """[N, 2] the centres, px."""
-        return self.projection.means2d
 
-    @property
-    def conics(self) -> Floats:
-        """[N, 3] Q."""
-        return self.projection.conics
-
-    @property
-    def opacities(self) -> Floats:
-        """[N] o."""
-        return self.projection.opacities
-
-
-FIELDS = ("means2d", "conics", "opacities", "vertices")
+FIELDS = (*CONIC.fields, "vertices")
 
 
 class Nearest(NamedTuple):
@@ -133,12 +119,7 @@ class Place(NamedTuple):
     falloffs: Floats  # [G, P] exp(-sigma)
 
 
-def boxes(footprints: Footprints) -> Ints:
-    """Return the boxes of the projection, which hold the ellipses around all vertices."""
-    return footprints.projection.boxes
-
-
-def hit(footprints: Footprints, ids: Ints, centers: Floats) -> Hit:
+def hit(footprints: HullFootprints, ids: Ints, centers: Floats) -> Hit:
     """Evaluate hulls at pixels; see :func:`minisplat_ref.reference.hits.conic_hit`."""
     projection, Q = footprints.projection, conic_matrices(footprints.conics[ids])
     vertices = footprints.means2d[ids, None] + footprints.vertices[ids]
@@ -152,7 +133,7 @@ def hit(footprints: Footprints, ids: Ints, centers: Floats) -> Hit:
 
 
 def hit_vjp(
-    footprints: Footprints, ids: Ints, hit: Hit, v_mean: Floats, v_shape: Floats, v_place: None
+    footprints: HullFootprints, ids: Ints, hit: Hit, v_mean: Floats, v_shape: Floats, v_place: None
 ) -> tuple[Floats, ...]:
     """Gradient of :func:`hit` with respect to ``FIELDS``, summed over the pixels.
 
@@ -172,4 +153,4 @@ def hit_vjp(
     return v_d.sum(axis=1), v_conics, np.sum(falloffs * v_shape, axis=1), v_vertices
 
 
-RESPONSE = Response(boxes, hit, hit_vjp, FIELDS)
+RESPONSE = Response(boxes_of, hit, hit_vjp, FIELDS)

@@ -13,8 +13,8 @@ from collections.abc import Callable
 import numpy as np
 
 from minisplat_ref.constants import SH_C0, SH_C1, SH_C2, SH_C3
-from minisplat_ref.cpu.compositing.exponential import exp_exact, exp_fast
-from minisplat_ref.cpu.compositing.responses import MEAN_X, OPACITY, KernelResponse, conic_response
+from minisplat_ref.cpu.compositing.exponential import choose_exponential
+from minisplat_ref.cpu.compositing.responses import CONIC_GRADIENTS, MEAN_X, OPACITY, KernelResponse, conic_response
 from minisplat_ref.extensions.textured.formulas import (
     cross,
     dot_3,
@@ -34,15 +34,15 @@ from minisplat_ref.extensions.textured.formulas import (
     times_7,
 )
 from minisplat_ref.extensions.textured.reference import LIMB
-from minisplat_ref.extensions.textured.response import Footprints, bounds
+from minisplat_ref.extensions.textured.response import TexturedFootprints, bounds
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import maximum, minimum, select, sqrt
 from minisplat_ref.jit.literals import HALF, ONE, TWO, ZERO
+from minisplat_ref.mechanisms.payload.footprints import boxes_of
 from minisplat_ref.scalar.spherical_harmonics import basis_1, basis_1_vjp, basis_2, basis_2_vjp, basis_3, basis_3_vjp
-from minisplat_ref.types import Floats, Ints
+from minisplat_ref.types import Floats
 
 N_TEXTURE = 15  # coefficients of degree 1 to 3
-CONIC_GRADIENTS = 6  # a record begins with the conic's own: mean, factors and opacity
 LOGIT, H = CONIC_GRADIENTS, CONIC_GRADIENTS + 1
 A, D_X, D_Y, C_X, C_Y = range(H + N_TEXTURE, H + N_TEXTURE + 15, 3)
 SHIFT = C_Y + 3  # of the texture by the centre's pixel: two gradients, no numbers
@@ -139,7 +139,7 @@ def make_textured_response(exp: Callable, constants: tuple) -> KernelResponse:
     return KernelResponse(
         functools.partial(_records, conic.records),
         functools.partial(_records_vjp, conic.records_vjp),
-        _boxes,
+        boxes_of,
         hit,
         hit_vjp,
         N_GRADIENTS,
@@ -154,7 +154,7 @@ def response_for(dtype: np.dtype) -> KernelResponse:
     """Return the response for arrays of a dtype: float32 data use the polynomial exponential."""
     constants = (SH_C0, SH_C1, *SH_C2, *SH_C3, LIMB**2)
     as_data = np.dtype(dtype).type
-    return make_textured_response(exp_fast if dtype == np.float32 else exp_exact, tuple(map(as_data, constants)))
+    return make_textured_response(choose_exponential(dtype), tuple(map(as_data, constants)))
 
 
 def pad_textures(textures: Floats, n_rows: int) -> Floats:
@@ -165,7 +165,7 @@ def pad_textures(textures: Floats, n_rows: int) -> Floats:
     return full
 
 
-def _units(footprints: Footprints) -> tuple[Floats, Floats, Floats, Floats]:
+def _units(footprints: TexturedFootprints) -> tuple[Floats, Floats, Floats, Floats]:
     """Return a [N, 3], its length [N, 1], and D and C [N, 3, 2], in float64."""
     frames, p = footprints.frames.astype(np.float64), footprints.means2d.astype(np.float64)
     a = np.einsum("nij,nj->ni", frames[:, :, :2], p) + frames[:, :, 2]
@@ -174,7 +174,7 @@ def _units(footprints: Footprints) -> tuple[Floats, Floats, Floats, Floats]:
     return a, length, frames[:, :, :2] / length[:, :, None], C
 
 
-def _records(conic_records: Callable, footprints: Footprints, dtype: np.dtype) -> Floats:
+def _records(conic_records: Callable, footprints: TexturedFootprints, dtype: np.dtype) -> Floats:
     a, length, D, C = _units(footprints)
     records = np.zeros((len(a), BOUND + 1), dtype)
     records[:, :CONIC_GRADIENTS] = conic_records(footprints.projection, dtype)[:, :CONIC_GRADIENTS]
@@ -187,7 +187,7 @@ def _records(conic_records: Callable, footprints: Footprints, dtype: np.dtype) -
     return records
 
 
-def _records_vjp(conic_records_vjp: Callable, footprints: Footprints, v_records: Floats) -> tuple[Floats, ...]:
+def _records_vjp(conic_records_vjp: Callable, footprints: TexturedFootprints, v_records: Floats) -> tuple[Floats, ...]:
     """Gradient with respect to the footprints' ``FIELDS``.
 
     With ``a^ = a / |a|``, ``D = A_xy / |a|``, ``C = a^ x A_xy``, ``a = A (p, 1)``::
@@ -227,7 +227,3 @@ def _by_columns(matrices: Floats) -> Floats:
 def _to_columns(rows: Floats) -> Floats:
     """Return [N, 6] as [N, 3, 2]: the inverse of :func:`_by_columns`."""
     return np.swapaxes(rows.reshape(-1, 2, 3), 1, 2)
-
-
-def _boxes(footprints: Footprints) -> Ints:
-    return footprints.projection.boxes

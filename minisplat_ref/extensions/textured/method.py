@@ -7,7 +7,7 @@ import numpy as np
 from minisplat_ref.extensions.textured.kernels import pad_textures, response_for
 from minisplat_ref.extensions.textured.population import TexturedGaussians, blank
 from minisplat_ref.extensions.textured.reference import visible_frames, visible_frames_vjp
-from minisplat_ref.extensions.textured.response import RESPONSE, Footprints, bounds
+from minisplat_ref.extensions.textured.response import RESPONSE, TexturedFootprints, bounds
 from minisplat_ref.mechanisms.payload.renderer import Payload, PayloadGradient, Projected, payload_renderer
 from minisplat_ref.methods.gaussian_splatting import GS, GS_ACCEL
 from minisplat_ref.reference.pinhole import with_principal_point
@@ -25,11 +25,11 @@ def _bound_logits(gaussians: TexturedGaussians) -> Floats:
     return gaussians.opacity_logits + bounds(gaussians.opacity_textures)
 
 
-def _footprints(projected: Projected) -> Footprints:
+def _footprints(projected: Projected) -> TexturedFootprints:
     g, projection = projected.gaussians, projected.projection
     seen = with_principal_point(projected.camera, projected.conventions)
     frames = visible_frames(g.means, g.quats, projected.primitives.scales, seen, projection.radii)
-    return Footprints(projection, g.opacity_logits, g.opacity_textures, frames)
+    return TexturedFootprints(projection, g.opacity_logits, g.opacity_textures, frames)
 
 
 def _footprints_vjp(projected: Projected, v: tuple[Floats, ...]) -> PayloadGradient:

@@ -17,14 +17,16 @@ B needs no derivative, because a change of o_B and of m by B cancel.
 """
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from minisplat_ref.extensions.textured.reference import Meeting, meet, meet_vjp
+from minisplat_ref.mechanisms.payload.footprints import Footprints, boxes_of
 from minisplat_ref.reference.hits import CONIC, ConicPlace, Hit, Response
 from minisplat_ref.reference.spherical_harmonics import sh_basis, sh_basis_jacobian
-from minisplat_ref.types import Floats, Ints, Projection
+from minisplat_ref.types import Floats, Ints
 
 
 def degree_of(n_coefficients: int) -> int:
@@ -38,11 +40,13 @@ def bounds(opacity_textures: Floats) -> Floats:
     return bound * bound.dtype.type(math.sqrt(opacity_textures.shape[1] / (4 * math.pi)))
 
 
-class Footprints(NamedTuple):
-    """The footprints of textured Gaussians."""
+@dataclass(frozen=True)
+class TexturedFootprints(Footprints):
+    """The footprints of textured Gaussians.
 
-    projection: Projection
-    """Of the opacity o_B, compensated where the conventions ask for it."""
+    The projection is that of the opacity o_B, compensated where the conventions ask for it.
+    """
+
     logits: Floats
     """[N] l."""
     opacity_textures: Floats
@@ -51,28 +55,13 @@ class Footprints(NamedTuple):
     """[N, 3, 3] A."""
 
     @property
-    def means2d(self) -> Floats:
-        """[N, 2] px."""
-        return self.projection.means2d
-
-    @property
-    def conics(self) -> Floats:
-        """[N, 3]."""
-        return self.projection.conics
-
-    @property
-    def opacities(self) -> Floats:
-        """[N] o_B of the projection."""
-        return self.projection.opacities
-
-    @property
     def odds(self) -> Floats:
         """[N] w, which may be infinite for Gaussians that are too faint to be seen."""
         with np.errstate(over="ignore"):
             return np.exp(-(self.logits + bounds(self.opacity_textures)))
 
 
-FIELDS = ("means2d", "conics", "opacities", "logits", "opacity_textures", "frames")
+FIELDS = (*CONIC.fields, "logits", "opacity_textures", "frames")
 
 
 class Place(NamedTuple):
@@ -85,12 +74,7 @@ class Place(NamedTuple):
     transparencies: Floats  # [G, P] 1 - opacity(n)
 
 
-def boxes(footprints: Footprints) -> Ints:
-    """Return the boxes of the projection."""
-    return footprints.projection.boxes
-
-
-def hit(footprints: Footprints, ids: Ints, centers: Floats) -> Hit:
+def hit(footprints: TexturedFootprints, ids: Ints, centers: Floats) -> Hit:
     """Return the hits of footprints at pixels; see :func:`minisplat_ref.reference.hits.conic_hit`."""
     flat = CONIC.hit(footprints.projection, ids, centers)
     h = footprints.opacity_textures[ids]  # [G, K-1]
@@ -104,7 +88,7 @@ def hit(footprints: Footprints, ids: Ints, centers: Floats) -> Hit:
 
 
 def hit_vjp(
-    footprints: Footprints, ids: Ints, hit: Hit, v_mean: Floats, v_shape: Floats, v_basis: Floats
+    footprints: TexturedFootprints, ids: Ints, hit: Hit, v_mean: Floats, v_shape: Floats, v_basis: Floats
 ) -> tuple[Floats, ...]:
     """Gradient of :func:`hit` with respect to ``FIELDS``; ``v_basis`` is the colours' derivative with respect to Y_k.
 
@@ -159,4 +143,4 @@ def _by_channel(coefficients: Floats, n_coefficients: int) -> Floats:
     return coefficients.reshape(len(coefficients), coefficients.shape[1] // n_coefficients, n_coefficients)
 
 
-RESPONSE = Response(boxes, hit, hit_vjp, FIELDS, shade, shade_vjp)
+RESPONSE = Response(boxes_of, hit, hit_vjp, FIELDS, shade, shade_vjp)

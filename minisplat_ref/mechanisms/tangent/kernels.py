@@ -14,7 +14,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from minisplat_ref.cpu.compositing.exponential import exp_exact, exp_fast
+from minisplat_ref.cpu.compositing.exponential import choose_exponential
 from minisplat_ref.cpu.compositing.responses import KernelResponse
 from minisplat_ref.jit.compile import scalar
 from minisplat_ref.jit.lanes import maximum, select
@@ -64,7 +64,7 @@ def tangent_response(exp: Callable) -> KernelResponse:
 
 def response_for(dtype: np.dtype, buffer_size: int) -> KernelResponse:
     """Return the response for arrays of a dtype: float32 data use the polynomial exponential."""
-    return tangent_response(exp_fast if dtype == np.float32 else exp_exact)._replace(buffer_size=buffer_size)
+    return tangent_response(choose_exponential(dtype))._replace(buffer_size=buffer_size)
 
 
 def _numerators(footprints: TangentFootprints) -> tuple[Floats, Floats]:

@@ -73,12 +73,12 @@ def slope_cases(repeats: int, report: Callable[[str], None] = lambda _: None) ->
     passed = all(case.passed for case in cases)
     note = "" if passed else "an image is wrong"
     for name, costs in (("hits", hits), ("N x pixels", [n * pixels for n, pixels in sizes])):
-        slope, spread = fitted_slope(costs, least)
+        slope, spread = fit_slope(costs, least)
         cases.append(Case(f"slope/time against {name}", passed, {"slope": slope, "spread": spread}, note))
     return cases
 
 
-def fitted_slope(costs: Sequence[float], seconds: Sequence[float]) -> tuple[float, float]:
+def fit_slope(costs: Sequence[float], seconds: Sequence[float]) -> tuple[float, float]:
     """Fit ``log seconds = slope log costs + constant``.
 
     Returns

@@ -17,9 +17,9 @@ from unittest.mock import patch
 
 import numpy as np
 
+from data_tools.machine.process_memory import bytes_in_use, forget_peak, peak
 from minisplat_ref import memory
 from minisplat_ref.backends import CPU
-from minisplat_ref.bench.process_memory import forget_peak, held, peak
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.datasets.synthetic import make_scene
 from minisplat_ref.errors import InputError
@@ -45,7 +45,7 @@ TOLERANCE = 0.2  # of a predicted peak
 WITHIN = 8e9  # bytes, of the whole process
 SIGMA = 1.5  # pixels: standard deviation of the Gaussians that are given
 RESULT = "result.json"
-CHILD = "import sys; from minisplat_ref.bench.large_scene import measure; measure(*sys.argv[1:])"
+CHILD = "import sys; from data_tools.machine.large_scene import measure; measure(*sys.argv[1:])"
 MEGA = 1e6
 
 
@@ -133,7 +133,7 @@ def measure(folder: str, n_gaussians: str, within: str) -> None:
     _train(path / "small", path / "first", None)  # loads the kernels
     note = forget_peak()
     with patch.object(
-        memory, "free_bytes", memory.free_bytes if most is None else lambda: memory.RESERVE * (most - held())
+        memory, "free_bytes", memory.free_bytes if most is None else lambda: memory.RESERVE * (most - bytes_in_use())
     ):
         result = _train(path / "large", path / "run", n)
     (path / RESULT).write_text(json.dumps({**result, "note": note}))
@@ -155,7 +155,7 @@ def _train(scene_folder: Path, out: Path, n: int | None) -> dict[str, float]:
     )
     recipe = recipe_of(settings)._replace(events=())  # the number of Gaussians stays
     scene = load_photographs(settings)
-    before = held()
+    before = bytes_in_use()
     state = initial_state(scene, recipe, settings.seed) if n is None else _state(scene, n)
     needs = room.foresee(scene, state, GSPLAT_MAIN, CPU)
     out.mkdir()

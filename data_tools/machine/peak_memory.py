@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
+from data_tools.machine.process_memory import bytes_in_use, forget_peak, peak
+from data_tools.machine.slopes import FOCAL_OF_WIDTH, LARGE, flipped_pixels
 from minisplat_ref import memory
 from minisplat_ref.backends import CPU
-from minisplat_ref.bench.process_memory import forget_peak, held, peak
-from minisplat_ref.bench.slopes import FOCAL_OF_WIDTH, LARGE, flipped_pixels
 from minisplat_ref.bench.workloads import synth
 from minisplat_ref.errors import InputError
 from minisplat_ref.oracle.cases import Case, Figure
@@ -31,7 +31,7 @@ N, SIZE = 200_000, LARGE
 N_ITERATIONS = 4
 N_REST = 15  # coefficients of degree 3 beyond the constant
 INPUTS, IMAGE, RESULT = "inputs.npz", "image.npy", "result.json"
-CHILD = "import sys; from minisplat_ref.bench.peak_memory import measure; measure(sys.argv[1])"
+CHILD = "import sys; from data_tools.machine.peak_memory import measure; measure(sys.argv[1])"
 MEGA = 1e6
 
 
@@ -108,7 +108,7 @@ def measure(folder: str) -> None:
     small = synth(500, 64, 48, 50.0)
     iterate(Gaussians._make(field.astype(np.float32) for field in small.gaussians), small.camera)  # loads the kernels
     note = forget_peak()
-    before = peak() if note else held()
+    before = peak() if note else bytes_in_use()
     with np.load(path / INPUTS) as inputs:
         gaussians = Gaussians._make(inputs[name] for name in Gaussians._fields)
         camera = Camera._make(_plain(inputs[f"camera_{name}"]) for name in Camera._fields)

@@ -1,18 +1,18 @@
-"""Single stages on 200,000 Gaussians, Adam against a copy, and the gain of more threads."""
+"""Single stages on 200,000 Gaussians, and Adam against a copy."""
 
 from collections.abc import Callable, Sequence
 
-import numba
 import numpy as np
 
+from data_tools.machine.contests import Contest, in_ms
 from minisplat_ref.backends import CPU, REFERENCE, Backend
-from minisplat_ref.bench.interleaving import Contest, Task, Times
-from minisplat_ref.bench.workloads import Workload, synth
+from minisplat_ref.bench.interleaving import Task, Times
+from minisplat_ref.bench.workloads import synth
 from minisplat_ref.constants import GSPLAT_MAIN, SH_DEGREE_MAX
 from minisplat_ref.jit.compile import kernel, prange
 from minisplat_ref.oracle.cases import Case, Figure
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_GRADIENT
-from minisplat_ref.rendering import render, render_vjp
+from minisplat_ref.rendering import render
 from minisplat_ref.training.adam import AdamRule, adam_step, zero_moments
 from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Ints, Primitives, ProjectionGradient
 
@@ -83,35 +83,6 @@ def _adam(name: str, is_seen: Bools, is_visible_only: bool) -> Contest:
         adam_step(gaussians, gradient, state, dict.fromkeys(Gaussians._fields, 1e-3), rule, rows)
 
     return Contest((step, lambda: _copy(source, target)), judge)
-
-
-def in_ms(times: Times) -> dict[str, Figure]:
-    """Return both times as figures."""
-    return {"ms": 1e3 * times.least, "median ms": 1e3 * times.median}
-
-
-def threads(workload: Workload) -> list[Contest]:
-    """Return contests of forward and backward on one thread and on all; none if there is only one thread."""
-    n_all = numba.get_num_threads()
-    if n_all == 1:
-        return []
-    gaussians, v_image = _float32(workload.gaussians), workload.v_image.astype(np.float32)
-
-    def gradient(n_threads: int) -> Gaussians:
-        numba.set_num_threads(n_threads)
-        try:
-            return render_vjp(render(gaussians, workload.camera)[1], v_image).gaussians
-        finally:
-            numba.set_num_threads(n_all)
-
-    def judge(times: Sequence[Times]) -> list[Case]:
-        one, all_ = (1e3 * own.least for own in times)
-        is_same = all(np.array_equal(a, b) for a, b in zip(gradient(1), gradient(n_all), strict=True))
-        figures: dict[str, Figure] = {"1 thread ms": one, f"{n_all} threads ms": all_, "x": one / all_}
-        note = "" if is_same else "the gradients are not the same bytes"
-        return [Case(f"threads/{workload.name}", is_same, figures, note)]
-
-    return [Contest((lambda: gradient(1), lambda: gradient(n_all)), judge)]
 
 
 def _projection() -> Contest:

@@ -15,7 +15,7 @@ def forget_peak() -> str:
     return ""
 
 
-def held() -> int:
+def bytes_in_use() -> int:
     """Return the bytes of memory in use now; Linux only, like :func:`forget_peak`."""
     return _from_status("VmRSS") or 0
 

@@ -1,10 +1,10 @@
 """The processor's limit: compare the blending kernels with straight-line loops.
 
 The straight-line loops do the arithmetic of one hit on all pixels of a tile, over and over on the same numbers: without
-lists, sorting, memory accesses or branches. A kernel that took no longer per pair would be perfect. They run on as many
-threads as the kernels, one copy on each, because cores that share a clock or execution units with each other, or with
-other programs, slow down both. A *pair* is a Gaussian and a pixel in one of the rows of eight that a kernel computes
-for it: those that the visible ellipse reaches and that are not finished.
+lists, sorting, memory accesses or branches. A kernel that took no longer per evaluation would be perfect. They run on
+as many threads as the kernels, one copy on each, because cores that share a clock or execution units with each other,
+or with other programs, slow down both. An *evaluation* is that of one Gaussian at one pixel, in one of the rows of
+eight that a kernel computes: those that the visible ellipse reaches and that are not finished.
 """
 
 from collections.abc import Sequence
@@ -12,33 +12,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from data_tools.machine.contests import Contest, in_ms
 from minisplat_ref.backends import CPU, REFERENCE
-from minisplat_ref.bench.interleaving import Contest, Times
-from minisplat_ref.bench.limits import in_ms
+from minisplat_ref.bench.interleaving import Times
+from minisplat_ref.bench.worked_rows import count_worked_rows
 from minisplat_ref.bench.workloads import Workload
 from minisplat_ref.constants import GSPLAT_MAIN
 from minisplat_ref.cpu.compositing.exponential import exp_fast
-from minisplat_ref.cpu.compositing.records import records_of
 from minisplat_ref.cpu.compositing.tile_rows import (
     ALPHAS,
     SCRATCH_SIZE,
-    alpha_writer,
-    find_reached_rows,
     sigma_of,
     start_scratch,
     to_mean_y,
     to_ridge,
     write_lines,
 )
-from minisplat_ref.cpu.compositing.tile_state import (
-    CHECK_EVERY,
-    N_ROWS,
-    corner,
-    frame_of,
-    open_rows,
-    rows_of,
-    start_tile,
-)
+from minisplat_ref.cpu.compositing.tile_state import N_ROWS, frame_of, start_tile
 from minisplat_ref.cpu.tiling import TILE_HEIGHT, TILE_WIDTH
 from minisplat_ref.jit.compile import kernel, n_threads, prange, scalar
 from minisplat_ref.jit.lanes import WIDTH, broadcast, load, reduce_sum, select, store
@@ -47,7 +37,7 @@ from minisplat_ref.oracle.cases import Case, Figure
 from minisplat_ref.oracle.tolerances import BENCH_FLOAT32_GRADIENT, BENCH_FLOAT32_IMAGE
 from minisplat_ref.rendering import render
 from minisplat_ref.scalar.compositing import blend, conic_vjp_of_moments, factors, sigma_vjp
-from minisplat_ref.types import CompositeGradient, Floats, Gaussians, Projection, TileBins, TileGrid
+from minisplat_ref.types import CompositeGradient, Floats, Gaussians, Projection, TileGrid
 
 N_HITS = 100  # of opacity 0.005: they leave transmittance 0.6, so that no pixel is finished
 N_PASSES = 50
@@ -147,39 +137,6 @@ def _backward_lines(fresh, hit, frame, sums, n_hits, n_passes):  # type: ignore[
         _backward_line(fresh, hit, frame, sums[copy], n_hits, n_passes)
 
 
-_write_alphas = alpha_writer(exp_fast)
-
-
-@kernel(parallel=False)
-def _count_rows(records, ids, tile_offsets, frame):  # type: ignore[no-untyped-def]
-    """Count the rows that the kernels compute, by updating only the transmittance."""
-    state, scratch = np.empty(N_ROWS * WIDTH, records.dtype), np.empty(SCRATCH_SIZE, records.dtype)
-    start_scratch(scratch)
-    total = 0
-    for tile in range(tile_offsets.size - 1):
-        x0, y0 = corner(tile, frame)
-        tile_ids = ids[tile_offsets[tile] : tile_offsets[tile + 1]]
-        start_tile(state, x0, y0, frame, 1)
-        is_open = open_rows(state, 1)
-        for m in range(tile_ids.size):
-            if m % CHECK_EVERY == CHECK_EVERY - 1:
-                is_open = open_rows(state, 1)
-            rows = find_reached_rows(records, tile_ids, m, x0, y0) & is_open
-            _write_alphas(scratch, rows, records, tile_ids[m], x0, y0)
-            for row in rows_of(rows):
-                total += 1
-                after, _ = blend(load(state, row * WIDTH), load(scratch, ALPHAS + row * WIDTH), frame)
-                store(state, row * WIDTH, after)
-    return total
-
-
-def rows_worked_on(projection: Projection, channels: Floats, bins: TileBins) -> int:
-    """Return how many rows of eight pixels the blending kernels compute, all Gaussians and tiles together."""
-    records = records_of(projection, channels, GSPLAT_MAIN)
-    frame = frame_of(bins, GSPLAT_MAIN, records.dtype)
-    return int(_count_rows(records, bins.gaussian_ids, bins.tile_offsets, frame))
-
-
 def blending(workload: Workload) -> Contest:
     """Return the contest between the blending kernels, in float32 on a workload, and the straight-line loops.
 
@@ -194,7 +151,7 @@ def blending(workload: Workload) -> Contest:
     inputs = (splats.projection, splats.channels, splats.background, splats.bins, GSPLAT_MAIN)
     v_image, v_alpha = workload.v_image.astype(np.float32), np.zeros(output.alpha.shape, np.float32)
     lines = StraightLines(n_threads())
-    n_pairs = WIDTH * rows_worked_on(splats.projection, splats.channels, splats.bins)
+    n_evaluations = WIDTH * count_worked_rows(splats.projection, splats.channels, splats.bins)
     assert output.stats is not None
     n_hits = int(output.stats.hit_count.sum())
 
@@ -204,15 +161,15 @@ def blending(workload: Workload) -> Contest:
             ("forward", times[0], times[1], lines.image_error(), BENCH_FLOAT32_IMAGE),
             ("backward", times[2], times[3], lines.gradient_error(), BENCH_FLOAT32_GRADIENT),
         ):
-            pair, roof = own.least * n_threads() / n_pairs, line.least * n_threads() / lines.n_pairs
+            own_time, roof = own.least * n_threads() / n_evaluations, line.least * n_threads() / lines.n_evaluations
             figures: dict[str, Figure] = {
                 **in_ms(own),
                 "million hits": n_hits / 1e6,
-                "million pairs": n_pairs / 1e6,
-                "million pairs/s": n_pairs / own.least / 1e6,
-                "ns a pair and core": 1e9 * pair,
+                "million evaluations": n_evaluations / 1e6,
+                "million evaluations/s": n_evaluations / own.least / 1e6,
+                "ns per evaluation and core": 1e9 * own_time,
                 "straight line ns": 1e9 * roof,
-                "x straight line": pair / roof,
+                "x straight line": own_time / roof,
             }
             note = "" if error <= bound else f"the straight-line loop is off by {error:.1e}"
             cases.append(Case(f"roof/{workload.name} {name}", not note, figures, note))
@@ -256,7 +213,7 @@ class StraightLines:
         self.fresh[:, 1] = _by_rows((self.v_image * self.expected.image).sum(axis=2, keepdims=True))[:, 0]
         self.fresh[:, 2:] = _by_rows(self.v_image)
         self.sums = np.zeros((n_copies, SUMS_SIZE), np.float64)
-        self.n_pairs = n_copies * N_PASSES * N_HITS * N_ROWS * WIDTH
+        self.n_evaluations = n_copies * N_PASSES * N_HITS * N_ROWS * WIDTH
 
     def forward(self) -> None:
         """Draw the tile, many times."""

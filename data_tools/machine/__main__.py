@@ -1,0 +1,111 @@
+"""``python -m data_tools.machine large|memory|slopes|start|roofline``: measure, print a table, write files."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from minisplat_ref.arguments import HelpFormatter, Parser, integer, list_of, name
+from minisplat_ref.cli.bench import add_output_arguments, progress, publish
+from minisplat_ref.errors import InputError
+from minisplat_ref.oracle.cases import Report
+
+
+def measure_large(args: argparse.Namespace) -> Report:
+    """Train on more photographs than fit into memory."""
+    from data_tools.machine.large_scene import LARGEST, large_case
+
+    progress("large: reads thousands of photographs, which takes a quarter of an hour")
+    return Report("Photographs beyond memory", (large_case(LARGEST),), {})
+
+
+def measure_memory(args: argparse.Namespace) -> Report:
+    """Measure the peak memory of two trainings."""
+    from data_tools.machine.large_scene import MODERATE, large_case
+    from data_tools.machine.peak_memory import memory_case
+
+    progress("memory: a few iterations in processes of their own")
+    return Report("Peak memory of training", (memory_case(), large_case(MODERATE)), {})
+
+
+def measure_slopes(args: argparse.Namespace) -> Report:
+    """Time views from few Gaussians to many."""
+    from data_tools.machine.slopes import slope_cases
+
+    cases = slope_cases(args.repeats, progress)
+    return Report("What time grows with: forward and backward, float32", tuple(cases), {"repeats": args.repeats})
+
+
+def measure_start(args: argparse.Namespace) -> Report:
+    """Time the first iteration of ``train``."""
+    from data_tools.machine.start_time import start_cases
+
+    progress("start: train with no compiled kernels, then with them")
+    return Report("From the start of train to the end of its first iteration", tuple(start_cases()), {})
+
+
+def measure_roofline(args: argparse.Namespace) -> Report:
+    """Compare kernels with the limits of the machine."""
+    from data_tools.machine.contests import time_contests
+    from data_tools.machine.limits import adams, stages
+    from data_tools.machine.roofline import blending
+    from data_tools.machine.threads import thread_cases, threads
+    from minisplat_ref.bench.workloads import get_workload
+
+    workloads = [get_workload(workload, args.data) for workload in args.workloads]  # before anything takes its time
+    progress("a training iteration on one thread and on all, by turns")
+    cases = thread_cases(args.scene, args.downscale, args.iterations)
+    progress("blending against straight-line loops, Adam against a copy, other stages by themselves, all by turns")
+    contests = [contest for made in workloads for contest in (blending(made), *threads(made))]
+    cases += time_contests([*contests, *adams(), *stages()], args.repeats)
+    return Report("How far the kernels are from the limits", tuple(cases), {})
+
+
+MEASUREMENTS = {
+    "large": (measure_large, "2,000 photographs of 12 megapixels within 8 GB"),
+    "memory": (measure_memory, "peak of training in 1920 x 1080 and 12 megapixels"),
+    "slopes": (measure_slopes, "time against hits, 12,500 to 200,000 Gaussians"),
+    "start": (measure_start, "seconds to the first iteration, cold and warm"),
+    "roofline": (measure_roofline, "kernels and threads against what the processor can give"),
+}
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of all measurements."""
+    parser = Parser(
+        prog="python -m data_tools.machine",
+        description="Measure this machine with the package.",
+        formatter_class=HelpFormatter,
+    )
+    commands = parser.add_subparsers(dest="measurement", metavar="COMMAND", required=True)
+    own = {
+        title: commands.add_parser(title, help=text, description=text, formatter_class=HelpFormatter)
+        for title, (_, text) in MEASUREMENTS.items()
+    }
+    for measurement in own.values():
+        add_output_arguments(measurement)
+    for title in ("slopes", "roofline"):
+        own[title].add_argument(
+            "--repeats", type=integer(1), default=10, metavar="N", help="turns of each, in each round (default 10)"
+        )
+    add = own["roofline"].add_argument
+    add("--scene", type=Path, metavar="SCENE", help="photographs to train on (default a made room)")
+    add("--downscale", type=integer(1), default=1, metavar="D", help="make them D times smaller (default 1)")
+    add("--iterations", type=integer(1), default=100, metavar="N", help="of each training (default 100)")
+    add("--workloads", type=list_of(name), default=("synth",), metavar="A,B", help="as for bench (default synth)")
+    add("--data", type=Path, metavar="FILE", help="test_garden.npz of gsplat's repository, for garden")
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one measurement; return 0, 1 where a case failed, or 2 for bad input."""
+    args = build_parser().parse_args(argv)
+    measure, _ = MEASUREMENTS[args.measurement]
+    try:
+        return publish(measure(args), args)
+    except InputError as error:
+        print(f"data_tools.machine: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())
