@@ -56,7 +56,7 @@ def add_parser(commands: Commands) -> None:
         "--backends", type=list_of(name), metavar="A,B", help="contenders, like cpu-f32,textbook-f32 (default all)"
     )
     parser.add_argument(
-        "--repeats", type=integer(1), default=10, metavar="N", help="turns of each contender (default 10)"
+        "--repeats", type=integer(1), default=10, metavar="N", help="timings of each contender (default 10)"
     )
     parser.add_argument(
         "--against",

@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from minisplat_ref.extensions.shared_studies import psnr_of
 from numpy.testing import assert_allclose
 
 from gradcheck import check_jacobian
