@@ -76,8 +76,8 @@ def train(
             if state.pace.switched_on != switched_on:
                 switched_on, decided = state.pace.switched_on, as_decided(recipe, state.pace)
                 settings = RenderSettings(scene.background, conventions, backend, decided.renderer)
-            n_halvings = sizes.n_halvings(state.step + 1, state.pace)
-            around = Surroundings(decided, sizes.scene(n_halvings), n_halvings, settings, guard, ahead)
+            n_halvings = sizes.count_halvings(state.step + 1, state.pace)
+            around = Surroundings(decided, sizes.halve(n_halvings), n_halvings, settings, guard, ahead)
             report = _complete(iterate(state, around, interruptions), recipe, sizes)
             if on_step is not None:
                 on_step(report)
@@ -92,8 +92,8 @@ def _complete(report: StepReport, recipe: Recipe, sizes: ViewSizes) -> StepRepor
     is_open = recipe.cooling is not None and state.pace.last_step is None
     return report._replace(
         last_step=None if is_open else last_step(state, recipe),
-        n_halvings=sizes.n_halvings(state.step + 1, state.pace),
-        fired=(*sizes.begun(state.step, n_rows(state.gaussians)), *report.fired),
+        n_halvings=sizes.count_halvings(state.step + 1, state.pace),
+        fired=(*sizes.record_start(state.step, n_rows(state.gaussians)), *report.fired),
     )
 
 

@@ -57,13 +57,13 @@ class ViewSizes:
         self._planned = [(event, event.action(scene)) for event in events]
         self._scenes = {0: scene}
 
-    def n_halvings(self, step: int, pace: Pace) -> int:
+    def count_halvings(self, step: int, pace: Pace) -> int:
         """Return how often the views of an iteration, counted from 1, are halved."""
         if pace.cooling_from is not None:
             return 0
         return max([0, *(times - pace.n_finer for event, times in self._planned if event.is_due(step))])
 
-    def scene(self, n_halvings: int) -> Scene:
+    def halve(self, n_halvings: int) -> Scene:
         """Return the scene with its training views halved so often in width and height."""
         if n_halvings not in self._scenes:
             views = self._scenes[0].train_views
@@ -72,7 +72,7 @@ class ViewSizes:
             self._scenes = {0: self._scenes[0], n_halvings: self._scenes[0]._replace(train_views=views)}
         return self._scenes[n_halvings]
 
-    def begun(self, step: int, n_gaussians: int) -> list[FiredEvent]:
+    def record_start(self, step: int, n_gaussians: int) -> list[FiredEvent]:
         """Return the record that views are halved from this iteration on."""
         return [
             FiredEvent(action_name(event), n_gaussians, n_gaussians, 0.0, _describe(event, times))

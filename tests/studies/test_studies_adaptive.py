@@ -123,7 +123,7 @@ def test_a_rule_can_be_asked_for_by_its_name():
 def test_study_and_its_continuation(tmp_path, capsys, scene, monkeypatch):
     monkeypatch.setattr(kit, "make_scene", lambda name: make_scene("room", **SMALL))
     monkeypatch.setattr(adaptive, "ITERATIONS", 48)
-    monkeypatch.setattr(adaptive.adaptive, "ADAPTIVE", ADAPTIVE._replace(iterations=40))
+    monkeypatch.setattr(adaptive, "ADAPTIVE", ADAPTIVE._replace(iterations=40))
     out = tmp_path / "out"
     command = ["study", "adaptive", "room", "--out", str(out), "--recipes", "3dgs,adaptive", "--seeds", "0"]
     assert main([*command, "--conditions", "whole,gains"]) == 0

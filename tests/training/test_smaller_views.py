@@ -21,26 +21,26 @@ def sizes_of(scene, **dates):
 
 def test_between_two_iterations(scene):
     sizes = sizes_of(scene, start=1, until=3)
-    assert [sizes.n_halvings(step, Pace()) for step in range(1, 6)] == [0, 2, 2, 0, 0]
-    assert [len(sizes.begun(step, 30)) for step in range(1, 6)] == [0, 1, 0, 0, 0]
-    assert ViewSizes(PLAIN, scene).n_halvings(1, Pace()) == 0
+    assert [sizes.count_halvings(step, Pace()) for step in range(1, 6)] == [0, 2, 2, 0, 0]
+    assert [len(sizes.record_start(step, 30)) for step in range(1, 6)] == [0, 1, 0, 0, 0]
+    assert ViewSizes(PLAIN, scene).count_halvings(1, Pace()) == 0
 
 
 def test_decisions_take_halvings_back(scene):
     """One for each decision to proceed; in the cool-down views are as they are."""
     sizes, pace, found = sizes_of(scene), Pace(), []
     for step in range(3):
-        found.append(sizes.n_halvings(step + 1, pace))
+        found.append(sizes.count_halvings(step + 1, pace))
         pace = pace.with_decision(Decision(step, FINER, "little is gained", 0.1, 0.1))
-    assert found == [2, 1, 0] and sizes.n_halvings(9, pace) == 0
+    assert found == [2, 1, 0] and sizes.count_halvings(9, pace) == 0
     cooling = Pace(cooling_from=1).with_decision(Decision(1, COOLED, "little is gained", 0.1, 0.1))
-    assert sizes.n_halvings(2, cooling) == 0
+    assert sizes.count_halvings(2, cooling) == 0
 
 
 def test_each_size_is_made_once(scene):
     sizes = sizes_of(scene)
-    small = sizes.scene(2)
-    assert sizes.scene(2) is small and sizes.scene(0) is scene
+    small = sizes.halve(2)
+    assert sizes.halve(2) is small and sizes.halve(0) is scene
     for view, original in zip(small.train_views, scene.train_views, strict=True):
         assert_array_equal(view.image, half_size(half_size(original)).image)
         assert view.camera.width == original.camera.width // 4
