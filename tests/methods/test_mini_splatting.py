@@ -339,7 +339,8 @@ def test_too_few_views(scene, name):
 def test_tiny_images_are_not_halved(scene):
     """Half of 63 pixels would be fewer than 32."""
     views = tuple(
-        view._replace(camera=view.camera._replace(width=63), image=view.image[:, :63]) for view in scene.train_views
+        view._replace(camera=view.camera._replace(width=63), image=view.image[:, :63].copy())
+        for view in scene.train_views
     )
     sizes = []
     recipe = RECIPES["3dgs"]._replace(iterations=2, events=(), half_size_until=2, min_half_size=32)
