@@ -1,5 +1,12 @@
 """Fixtures for all test files."""
 
+import os
+
+# The workers of pytest-xdist and the processes that tests start share the cores. A thread that spins while it waits for
+# work keeps another process from running: small trainings take four times the processor time. So the threads of OpenMP
+# sleep, and NumPy's matrix products have one. Both libraries read this once, when they are loaded.
+os.environ |= {"GOMP_SPINCOUNT": "0", "OPENBLAS_NUM_THREADS": "1"}
+
 import signal
 from pathlib import Path
 

@@ -154,8 +154,8 @@ def test_needles_and_curves_through_the_centre(rng):
     )
     population.curves[1], population.curves[2] = [-2, -2, -1, -1, 1, 1, 2, 2], 0.5
     view = view_from(make_camera())
-    theirs, v_theirs = drawn(RENDERER, population, view, REFERENCE)
     for dtype, rel in ((np.float64, 100 * PARITY_FLOAT64), (np.float32, 10 * PARITY_FLOAT32_IMAGE)):
+        theirs, v_theirs = drawn(RENDERER, population, view, REFERENCE, compared_to=dtype)
         ours, v_ours = drawn(RENDERER, as_dtype(population, dtype), view, CPU)
         assert (ours.visible_ids == np.arange(4)).all()
         assert np.abs(ours.image - theirs.image).max() <= rel

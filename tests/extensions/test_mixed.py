@@ -223,8 +223,8 @@ def hard_hulls():
 
 def test_hard_cases():
     population, view = hard_hulls(), view_from(make_camera(48, 36, fx=60.0, fy=60.0))
-    theirs, v_theirs = drawn(RENDERER, population, view, REFERENCE)
     for dtype, rel in ((np.float64, 100 * PARITY_FLOAT64), (np.float32, 10 * PARITY_FLOAT32_IMAGE)):
+        theirs, v_theirs = drawn(RENDERER, population, view, REFERENCE, compared_to=dtype)
         ours, v_ours = drawn(RENDERER, as_dtype(population, dtype), view, CPU)
         assert (ours.visible_ids == np.arange(7)).all()
         assert np.abs(ours.image - theirs.image).max() <= rel

@@ -148,8 +148,8 @@ def thin(rng):
 
 def test_needles_sheets_and_a_camera_inside(rng):
     population, view = thin(rng), view_from(make_camera())
-    theirs, v_theirs = drawn(RENDERER, population, view, REFERENCE)
     for dtype, rel in ((np.float64, 100 * PARITY_FLOAT64), (np.float32, TEXTURE_THIN_FLOAT32)):
+        theirs, v_theirs = drawn(RENDERER, population, view, REFERENCE, compared_to=dtype)
         ours, v_ours = drawn(RENDERER, as_dtype(population, dtype), view, CPU)
         assert (ours.visible_ids == np.arange(3)).all()
         assert np.abs(ours.image - theirs.image).max() <= rel

@@ -95,9 +95,14 @@ CASES = {
 }
 
 
-def drawn(renderer, population, view, backend):
-    """Return a picture, and its gradient with random weights."""
-    output, tape = renderer.render(Model(population), view, Request(BACKGROUND, backend=backend))
+def drawn(renderer, population, view, backend, compared_to=None):
+    """Return a picture, and its gradient with random weights.
+
+    In float64 with the depth, as the oracle renders, so that both share the compiled kernels; without it if it is
+    compared to a picture in float32.
+    """
     rng, dtype = np.random.default_rng(1), population.means.dtype
+    wants = frozenset({"depth"} if np.dtype(compared_to or dtype) == np.float64 else ())
+    output, tape = renderer.render(Model(population), view, Request(BACKGROUND, backend=backend, wants=wants))
     v_image, v_alpha = rng.normal(size=output.image.shape), rng.normal(size=output.alpha.shape)
     return output, renderer.render_vjp(tape, v_image.astype(dtype), v_alpha.astype(dtype))

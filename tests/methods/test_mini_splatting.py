@@ -344,7 +344,8 @@ def test_too_few_views(scene, name):
 def test_tiny_images_are_not_halved(scene):
     """Half of 63 pixels would be fewer than 32."""
     views = tuple(
-        view._replace(camera=view.camera._replace(width=63), image=view.image[:, :63]) for view in scene.train_views
+        view._replace(camera=view.camera._replace(width=63), image=view.image[:, :63].copy())
+        for view in scene.train_views
     )
     sizes = []
     smaller = SmallerViews(partial(halve_large_views, min_side=32, max_halvings=1), until=2)

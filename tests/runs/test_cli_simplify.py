@@ -315,9 +315,10 @@ def test_of_an_extension(scene_folder, tmp_path):
 # After a training -----------------------------------------------------------------------------------------------------
 
 
-def test_a_training_is_followed_by_its_simplification(scene_folder, tmp_path, capsys):
+def test_a_training_is_followed_by_its_simplification(scene_folder, tmp_path, capsys, monkeypatch):
     """To the same bytes as the command does it, also where a continued run is what ends."""
     limit = "9000"
+    monkeypatch.setattr("minisplat_ref.cli.simplify.FINE_TUNE", 10)
     run = trained(scene_folder, tmp_path / "run", "--recipe", "3dgs-accel", "--max-bytes", limit)
     small = run / "simplified"
     assert (small / "point_cloud.ply").stat().st_size <= int(limit) < (run / "point_cloud.ply").stat().st_size

@@ -370,7 +370,7 @@ def test_what_passes_a_clamped_alpha(backend, stops_mean, stops_shape):
 def test_alpha_gradient_behind_a_clamped_hit(backend, rng):
     # What lies behind a clamped hit still gets its gradient; the clamped one keeps that of its colour.
     projection = stack([1.0, 0.7, 0.6])
-    inputs = (projection.means2d, projection.conics, projection.opacities, rng.normal(size=(3, 2)), rng.normal(size=2))
+    inputs = (projection.means2d, projection.conics, projection.opacities, rng.normal(size=(3, 3)), rng.normal(size=3))
     function, vjp = functions_of_arrays(backend, projection, (6, 5), GSPLAT_MAIN, inputs)
     cotangents = [rng.normal(size=output.shape) for output in function(*inputs)]
     check_inner_products(function, vjp(*cotangents), inputs, cotangents, rng, names=NAMES)

@@ -176,9 +176,10 @@ def test_one_dome_by_hand():
     bins = REFERENCE.bin_gaussians(
         Projection(domes.means2d, *[domes.depths] * 4, domes.boxes), TileGrid(9, 9, 16, 16), GSPLAT_MAIN
     )
-    arguments = domes, np.array([[10.0, 4, 40]]), np.array([100.0]), bins, GSPLAT_MAIN
-    v_image, v_alpha = np.zeros((9, 9, 1)), np.zeros((9, 9))
-    v_image[3, 3] = 1  # one pixel: (u, v) = (1/4, 2/4)
+    colors, background = np.tile([10.0, 4, 40], (1, N_CHANNELS)), np.full(N_CHANNELS, 100.0)
+    arguments = domes, colors, background, bins, GSPLAT_MAIN
+    v_image, v_alpha = np.zeros((9, 9, N_CHANNELS)), np.zeros((9, 9))
+    v_image[3, 3, 0] = 1  # one pixel: (u, v) = (1/4, 2/4)
     alpha, color = 0.8 * (1 - 1 / 16 - 4 / 16), 10 + 4 / 4 + 40 / 2
     for package, response in ((compositing, DOMES), (plain, KERNEL_DOMES)):
         output = package.composite_hits(response, *arguments)
@@ -189,8 +190,9 @@ def test_one_dome_by_hand():
         assert_allclose(v.primitives[0], [-v_place / 4], rtol=CLOSED_FORM)
         assert_allclose(v.primitives[1], [-v_place @ [0.25, 0.5] / 4], rtol=CLOSED_FORM)
         assert_allclose(v.primitives[2], [(color - 100) * alpha / 0.8], rtol=CLOSED_FORM)
-        assert_allclose(v.colors, [[alpha, alpha / 4, alpha / 2]], rtol=CLOSED_FORM)
-        assert_allclose(v.background, [1 - alpha], rtol=CLOSED_FORM)
+        others = [0.0] * (N_CHANNELS - 1)
+        assert_allclose(v.colors, [[alpha, alpha / 4, alpha / 2, *3 * others]], rtol=CLOSED_FORM)
+        assert_allclose(v.background, [1 - alpha, *others], rtol=CLOSED_FORM)
 
 
 # --- gradients ---
