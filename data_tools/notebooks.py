@@ -6,7 +6,7 @@ cell whose output depends on more says so by a tag:
 
 ``rounding``
     Another processor rounds differently, and hundreds of training steps make that visible. Numbers are left out of
-    the comparison, and pictures have more room.
+    the comparison, and images have more room.
 ``clock``
     Its output is a time, or depends on what is installed. It runs, and what it shows is stored, but only the kinds of
     its outputs are compared.
@@ -43,14 +43,14 @@ from minisplat_ref.io.atomic import replacing
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "notebooks"
 SECONDS_MAX = 300  # of a cell, on a busy machine that compiles its kernels
-PNG_MAX = 100_000  # bytes of a picture
+PNG_MAX = 100_000  # bytes of an image
 
-# Mean absolute difference of two pictures' values, 0 to 255: room for another version's fonts.
-PICTURE_EXACT = 1.0
-# The same for a picture after a training, averaged over squares, so that lines may move a little, and as a part of its
+# Mean absolute difference of two images' values, 0 to 255: room for another version's fonts.
+IMAGE_EXACT = 1.0
+# The same for an image after a training, averaged over squares, so that lines may move a little, and as a part of its
 # difference from a white page. With kernels compiled for another processor (NUMBA_CPU_NAME=haswell on a Zen 5) the
-# pictures of notebooks 06 to 11 differ by up to 0.42: the points that notebook 08 draws at random.
-PICTURE_ROUNDED = 0.6
+# images of notebooks 06 to 11 differ by up to 0.42: the points that notebook 08 draws at random.
+IMAGE_ROUNDED = 0.6
 SQUARE = 8  # pixels
 
 Cell = Any  # nbformat's nodes are dictionaries whose keys are attributes, too
@@ -77,7 +77,7 @@ def execute(text: Path) -> Notebook:
     Raises
     ------
     InputError
-        If a cell or a solution fails or takes longer than :data:`SECONDS_MAX`, or a picture is larger than
+        If a cell or a solution fails or takes longer than :data:`SECONDS_MAX`, or an image is larger than
         :data:`PNG_MAX`.
     """
     notebook = jupytext.read(text)
@@ -92,7 +92,7 @@ def execute(text: Path) -> Notebook:
         coalesce_streams=True,
         extra_arguments=["--log-level=ERROR"],  # it warns that others could listen
     )
-    # The matrices and pictures are small: threads that wait for each other cost more than they help.
+    # The matrices and images are small: threads that wait for each other cost more than they help.
     threads = {"OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     try:
         client.execute(env={**os.environ, **threads, "PYTHONPATH": str(ROOT)})
@@ -124,7 +124,7 @@ def strip_notebook(notebook: Notebook, name: str) -> Notebook:
             size = len(_png(out))
             if size > PNG_MAX:
                 raise InputError(
-                    f"{name}, cell {number}: its picture has {size:,} bytes, more than {PNG_MAX:,}; make it smaller"
+                    f"{name}, cell {number}: its image has {size:,} bytes, more than {PNG_MAX:,}; make it smaller"
                 )
     return notebook
 
@@ -146,9 +146,9 @@ def _strip_output(out: Cell) -> Cell:
 
 
 def _compact(png: bytes) -> bytes:
-    """Return a picture in fewer bytes: the same, or with 256 colours if it would be larger than allowed."""
-    with Image.open(io.BytesIO(png)) as picture:
-        whole = picture.convert("RGB")
+    """Return an image in fewer bytes: the same, or with 256 colours if it would be larger than allowed."""
+    with Image.open(io.BytesIO(png)) as image:
+        whole = image.convert("RGB")
     for candidate in (whole, whole.quantize(256, dither=Image.Dither.NONE)):
         file = io.BytesIO()
         candidate.save(file, "PNG", optimize=True)
@@ -187,7 +187,7 @@ def differences(stored: Notebook, fresh: Notebook) -> Iterator[str]:
 
 
 def _kind(out: Cell) -> str:
-    return "a picture" if _png(out) else "text"
+    return "an image" if _png(out) else "text"
 
 
 def _list_outputs(outputs: Sequence[Cell]) -> str:
@@ -199,25 +199,25 @@ def _difference(old: Cell, new: Cell, is_rounded: bool) -> str:
         before, after = (comparable(_text(out), is_rounded) for out in (old, new))
         gone_and_come = [line for line in difflib.ndiff(before, after) if line[0] in "-+"]
         return f"text differs: {' '.join(gone_and_come)[:200]}" if gone_and_come else ""
-    pictures = []
+    images = []
     for out in (old, new):
-        with Image.open(io.BytesIO(_png(out))) as picture:
-            pictures.append(np.asarray(picture.convert("RGB"), dtype=float))
-    a, b = pictures
+        with Image.open(io.BytesIO(_png(out))) as image:
+            images.append(np.asarray(image.convert("RGB"), dtype=float))
+    a, b = images
     if a.shape != b.shape:
-        return f"picture of {b.shape[1]} x {b.shape[0]} pixels, stored are {a.shape[1]} x {a.shape[0]}"
-    allowed = PICTURE_EXACT
+        return f"image of {b.shape[1]} x {b.shape[0]} pixels, stored are {a.shape[1]} x {a.shape[0]}"
+    allowed = IMAGE_EXACT
     if is_rounded:
         a, b = _coarse(a), _coarse(b)
-        allowed = max(allowed, PICTURE_ROUNDED * np.abs(255 - a).mean())
+        allowed = max(allowed, IMAGE_ROUNDED * np.abs(255 - a).mean())
     difference = np.abs(a - b).mean()
-    return f"picture differs by {difference:.2f} of 255, more than {allowed:.2f}" if difference > allowed else ""
+    return f"image differs by {difference:.2f} of 255, more than {allowed:.2f}" if difference > allowed else ""
 
 
-def _coarse(picture: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Average a picture [H, W, 3] over squares; what is left over at the right and at the bottom does not count."""
-    height, width = picture.shape[0] // SQUARE, picture.shape[1] // SQUARE
-    squares = picture[: height * SQUARE, : width * SQUARE].reshape(height, SQUARE, width, SQUARE, 3)
+def _coarse(image: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Average an image [H, W, 3] over squares; what is left over at the right and at the bottom does not count."""
+    height, width = image.shape[0] // SQUARE, image.shape[1] // SQUARE
+    squares = image[: height * SQUARE, : width * SQUARE].reshape(height, SQUARE, width, SQUARE, 3)
     return np.asarray(squares.mean(axis=(1, 3)))
 
 
@@ -256,7 +256,7 @@ def store(text: Path) -> str:
     with replacing(text.with_suffix(".ipynb")) as part:
         part.write_text(nbformat.writes(notebook) + "\n", encoding="utf-8")  # type: ignore[no-untyped-call]
     sizes = [len(_png(out)) for cell in notebook.cells for out in cell.get("outputs", []) if _png(out)]
-    return f"{len(sizes)} pictures, the largest {max(sizes, default=0) / 1000:.0f} kB"
+    return f"{len(sizes)} images, the largest {max(sizes, default=0) / 1000:.0f} kB"
 
 
 def check(text: Path) -> str:

@@ -21,7 +21,7 @@ class Step(NamedTuple):
     files: tuple[str, ...]
     """Files and folders of ``minisplat_ref/``."""
     notebooks: tuple[int, ...]
-    """Numbers of the notebooks that show the same with pictures."""
+    """Numbers of the notebooks that show the same with images."""
     content: str
     """What the reader knows afterwards."""
 

@@ -1,6 +1,6 @@
 """The README's figure: a photograph beside its render, and speed beside error.
 
-Nothing is measured here. The pictures are of one test view of a run; the times and errors are those of the table in
+Nothing is measured here. The images are of one test view of a run; the times and errors are those of the table in
 ``docs/measured/speed.md``, which ``minisplat-ref bench`` has printed::
 
     minisplat-ref train BANANA --out runs/banana
@@ -69,14 +69,14 @@ def draw(run: Path, name: str, out: Path) -> None:
     with rc_context(PLOT_STYLE):
         figure = Figure(figsize=SIZE, dpi=DPI, layout="constrained", facecolor="white")
         grid = figure.add_gridspec(2, 2, width_ratios=[1, 1.75])
-        for row, (picture, title) in enumerate(
+        for row, (image, title) in enumerate(
             (
                 (truth, "a photograph, held out"),
                 (render, f"its render: {psnrs[name]:.1f} dB, {metrics['n_gaussians']:,} Gaussians"),
             )
         ):
             axes = figure.add_subplot(grid[row, 0])
-            axes.imshow(picture, interpolation="lanczos")
+            axes.imshow(image, interpolation="lanczos")
             axes.set_title(title, fontsize=11, color=TEXT)
             axes.set_axis_off()
         times = times_and_errors((DOCS / "measured" / "speed.md").read_text(encoding="utf-8"))
@@ -119,10 +119,10 @@ def _number(cell: str) -> float:
 
 
 def _truth_and_render(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return the first two of the three pictures side by side in ``renders/``."""
-    picture = read_image(path)  # [H, 3 W + 2 GAP, 3]
-    width = (picture.shape[1] - 2 * GAP) // 3
-    return picture[:, :width], picture[:, width + GAP : 2 * width + GAP]
+    """Return the first two of the three images side by side in ``renders/``."""
+    image = read_image(path)  # [H, 3 W + 2 GAP, 3]
+    width = (image.shape[1] - 2 * GAP) // 3
+    return image[:, :width], image[:, width + GAP : 2 * width + GAP]
 
 
 def _draw_times(axes: "Axes", found: dict[str, tuple[float, float]]) -> None:

@@ -1,8 +1,8 @@
 """Which command of the oracle notices which error: errors are planted one at a time, and every command is run.
 
 A planted error is a changed line of one function (:mod:`data_tools.survey_errors`). In a function of
-Python it is planted in the running program, and the commands are called; kernels that contain it are compiled anew, in
-a copy of the package, by processes of their own, which takes minutes. A command notices an error if its exit code is
+Python it is planted in the running program, and the commands are called; kernels that contain it are recompiled, in
+a copy of the package, by separate processes, which takes minutes. A command notices an error if its exit code is
 not 0, or if it ends in an exception.
 """
 

@@ -56,7 +56,7 @@ _CALL = (
 )
 _EQUALITY = (
     PlantedLine(
-        "goes on where T equals the stop",
+        "continues where T equals the stop",
         "reference.hits:goes_on",
         "transmittances > conventions",
         "transmittances >= conventions",

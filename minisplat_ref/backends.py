@@ -39,7 +39,7 @@ class Backend:
     name : str
         For messages and reports.
     is_compiled : bool
-        Whether compiled kernels do the work; an extension with a stage of its own chooses its implementation by this.
+        Whether compiled kernels do the work; an extension with its own stage chooses its implementation by this.
     tile_width, tile_height : int
         Size of the tiles that the image is cut into, pixels.
     """

@@ -15,7 +15,7 @@ class InputError(ValueError):
 
 
 class InputWarning(UserWarning):
-    """Input that is used, though perhaps not as intended; one line, which the command line prints before it goes on.
+    """Input that is used, though perhaps not as intended; one line, which the command line prints before it continues.
 
     A message that quotes text from a file has been through :func:`one_line`.
     """

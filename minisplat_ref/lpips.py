@@ -171,7 +171,7 @@ def _read_arrays(path: str | Path) -> dict[str, NDArray]:
             return {name: np.asarray(archive[name]) for name in names & set(archive)}
     except FileNotFoundError:
         raise InputError(
-            f"{path}: no such file; say with --lpips-weights where the weights of LPIPS are now, or make them anew:"
+            f"{path}: no such file; say with --lpips-weights where the weights of LPIPS are now, or make them again:"
             f" {HOW_TO_MAKE}"
         ) from None
     except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:

@@ -1,4 +1,4 @@
-"""Estimate the memory that a training or a picture needs, and refuse before the system would kill the process.
+"""Estimate the memory that a training or an image needs, and refuse before the system would kill the process.
 
 The model of a training is the one that ``python -m data_tools.machine memory`` measures against: the parameters, their
 gradient and Adam's two moments; the intermediate values of each Gaussian in a view; the images of an iteration, or of
@@ -26,7 +26,7 @@ BYTES_PER_GAUSSIAN = 150
 # Per pair: the 9 sums of its gradient, its indices in the tile's list and in the Gaussian's, and one spare number.
 BYTES_PER_PAIR = 48
 PAIRS_PER_GAUSSIAN = 3.0  # where no view has been rendered yet; in three small scenes 0.7 to 3.3
-# Per pixel, at the peak of rendering a picture and writing it; measured at 12 and 48 megapixels: 64.2 and 64.1, with
+# Per pixel, at the peak of rendering an image and writing it; measured at 12 and 48 megapixels: 64.2 and 64.1, with
 # depth 68.2 and 68.1.
 RENDER_BYTES, DEPTH_RENDER_BYTES = 65, 69
 SHELF_SHARE = 0.5  # share of the free memory that photographs may fill; Gaussians need the rest
@@ -197,7 +197,7 @@ def check_start(needs: Needs) -> str:
 
 
 def check_render_size(width: int, height: int, with_depth: bool) -> None:
-    """Refuse a picture that does not fit into memory.
+    """Refuse an image that does not fit into memory.
 
     Raises
     ------
@@ -209,7 +209,7 @@ def check_render_size(width: int, height: int, with_depth: bool) -> None:
         shrink = math.sqrt(free / needed)
         fits = f"{max(1, int(width * shrink))}x{max(1, int(height * shrink))}"
         raise InputError(
-            f"a picture of {width}x{height} takes about {as_text(needed)}, {as_text(free)} are free: {fits} fits"
+            f"an image of {width}x{height} takes about {as_text(needed)}, {as_text(free)} are free: {fits} fits"
         )
 
 

@@ -3,7 +3,7 @@
 Activations live here (3DGS section 5.1): ``scales = exp(log_scales)``, ``opacities = sigmoid(opacity_logits)``. Left
 out: checks for NaN, which belong where a file is read; a Gaussian whose footprint is not finite is culled.
 
-A :class:`Renderer` is the pair of functions that all code calls to draw a model: training, evaluation, importance,
+A :class:`Renderer` is the pair of functions that all code calls to render a model: training, evaluation, importance,
 depth reinitialisation, the commands. ``SPLATTING`` is that of 3DGS. Another way of drawing is another value; most wrap
 ``SPLATTING``: they make Gaussians of what they have (moved to the view's time, decoded, chosen by level), draw these,
 and carry the gradient back.
@@ -89,7 +89,7 @@ def render(
     backend : Backend
         Implementation of the stages.
     is_visible : ndarray of shape (N,) of booleans, optional
-        Rows to draw; the others are culled as if they were transparent. All by default.
+        Rows to render; the others are culled as if they were transparent. All by default.
     with_depth : bool
         Append the accumulated depth, ``sum w z``, as the last channel of the image.
     with_stats, with_median_depth : bool
@@ -224,7 +224,7 @@ class Request(NamedTuple):
     conventions: Conventions = GSPLAT_MAIN
     backend: Backend = CPU
     is_visible: Bools | None = None
-    """[N] rows to draw; all by default."""
+    """[N] rows to render; all by default."""
     behind: Floats | None = None
     """[H, W, 3] light that a wrapping renderer adds where it comes through the model; the output's extras count it."""
     wants: frozenset[str] = frozenset()
@@ -252,7 +252,7 @@ def as_model(model: Any) -> Model:
 
 
 def _render_model(model: Model, view: View, request: Request) -> tuple[RenderOutput, RenderTape]:
-    """Draw a model by :func:`render`."""
+    """Render a model by :func:`render`."""
     gaussians, wants = model.gaussians, request.wants
     stored_degree = math.isqrt(gaussians.sh_rest.shape[1] + 1) - 1
     output, tape = render(

@@ -128,7 +128,7 @@ class CompositeVjp(Protocol):
 
 
 class RemovalChanges(Protocol):
-    """Compute for each Gaussian [N], float64, the squared change of the picture without it."""
+    """Compute for each Gaussian [N], float64, the squared change of the image without it."""
 
     def __call__(
         self,

@@ -45,7 +45,7 @@ def assert_matches_oracle(
         Takes the same, ``v_render_colors`` and ``v_render_alphas``; returns a dict of ``v_means`` and so on. Without it
         torch and JAX differentiate the function.
     scenes : sequence of str
-        Names, of those that ``minisplat-ref oracle compare --help`` lists; by default all that the function can draw.
+        Names, of those that ``minisplat-ref oracle compare --help`` lists; by default all that the function can render.
     arrays : {"numpy", "torch", "jax"}, optional
         What to call it with; by default what its module has imported.
     dtype : {"float32", "float64"}

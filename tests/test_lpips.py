@@ -140,7 +140,7 @@ def test_smallest_image(rng, backbone, least):
 
 @pytest.mark.parametrize("backbone", [ALEXNET, VGG16], ids=lambda b: b.name)
 def test_file_of_the_package(rng, tmp_path, backbone):
-    """A backbone is told by its arrays; what else the package has in its state dict does not matter."""
+    """A backbone is measured by its arrays; what else the package has in its state dict does not matter."""
     network = load_network(write_network(tmp_path / "weights.npz", np.random.default_rng(3), backbone))
     assert network.backbone is backbone
     expected = random_weights(np.random.default_rng(3), backbone)

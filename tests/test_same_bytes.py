@@ -17,7 +17,7 @@ ITERATIONS = {"3dgs-accel": 60, "mini-splatting2": 120}
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """A room in four pictures of 39 lines: half of them and a third of them are odd."""
+    """A room in four images of 39 lines: half of them and a third of them are odd."""
     folder = tmp_path_factory.mktemp("room")
     settings = {"n_views": 4, "width": 50, "height": 39, "n_points": 1000}
     write_scene(make_scene("room", supersampling=1, **settings), folder, settings)
@@ -25,7 +25,7 @@ def scene(tmp_path_factory):
 
 
 def started(scene, out, recipe, n_threads):
-    """Start a training in a process of its own."""
+    """Start a training in a separate process."""
     command = [sys.executable, "-m", "minisplat_ref", "train", str(scene), "--out", str(out), "--recipe", recipe]
     command += ["--iterations", str(ITERATIONS[recipe]), "--seed", "3"]
     environment = os.environ | {"NUMBA_NUM_THREADS": str(n_threads)}

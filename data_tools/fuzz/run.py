@@ -1,4 +1,4 @@
-"""Many damaged files, one after the other, read in a process of their own: it may crash, hang or take all memory.
+"""Many damaged files, one after the other, read in a separate process: it may crash, hang or take all memory.
 
 ``python -m data_tools.fuzz READER --seconds N`` damages the files of one reader, or of all, and prints what came of it.
 File number i of a seed is always the same one, so that a finding can be made again.

@@ -159,7 +159,7 @@ def saving_always(install: Install) -> Install:
 
 
 def compiling(n_stages: int) -> Install:
-    """Die when so many stages have been compiled; the cache must be empty."""
+    """Die when this many stages have been compiled; the cache must be empty."""
 
     def wrap(warm_up: Callable[..., Any]) -> Callable[..., Any]:
         def dying(*args: Any) -> Iterator[Any]:
@@ -203,7 +203,7 @@ POINTS: dict[str, Install] = {
     "evaluation: half a line of curve.jsonl": saving_always(half_a_line(run_folder.CURVE, 2)),
     "evaluation: last checkpoint there": before("runs.run:save_model"),
     "evaluation: PLY written, not named": renaming(run_folder.POINT_CLOUD, is_done=False),
-    "evaluation: first picture there": after("runs.scoring:write_image"),
+    "evaluation: first image there": after("runs.scoring:write_image"),
     "evaluation: renders/ there": renaming(run_folder.RENDERS, is_done=True),
     "evaluation: metrics.json written, not named": renaming(run_folder.METRICS, is_done=False),
     "evaluation: metrics.json there": renaming(run_folder.METRICS, is_done=True),

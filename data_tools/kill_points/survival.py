@@ -1,12 +1,12 @@
 """Kill a small training at every place where it could hurt, continue it, and compare with one that was left alone.
 
 ``python -m data_tools.kill_points`` prints a table. Whatever lies in the folder of a training that was killed at one of
-the :data:`POINTS` of :mod:`data_tools.kill_points.points` must go on by ``train --resume``, or begin again by
+the :data:`POINTS` of :mod:`data_tools.kill_points.points` must continue by ``train --resume``, or begin again by
 the same command where nothing had been done, and end with the same bytes as the training that nobody disturbed. The
 same is asked after a full disk, a limit to the size of files, a read-only disk and a photograph that disappears; the
 first and the third mount disks, which takes a system administrator's rights.
 
-Of the log, times are left out, and loss and PSNR, which are running means and begin anew.
+Of the log, times are left out, and loss and PSNR, which are running means and start again.
 """
 
 import argparse
@@ -35,8 +35,8 @@ from minisplat_ref.runs import checkpoints, run_folder
 from minisplat_ref.runs.progress import read_log
 
 SCENE: dict[str, Any] = {"n_views": 6, "width": 32, "height": 24, "n_points": 120, "test_every": 4}
-# Mini-Splatting, whose events at 240 iterations are: densify at 20, begin anew from depth at 40 and 80, simplify and
-# begin anew from the centres at 120, prune the tail at 160.
+# Mini-Splatting, whose events at 240 iterations are: densify at 20, start again from depth at 40 and 80, simplify and
+# start again from the centres at 120, prune the tail at 160.
 ITERATIONS = 240
 OPTIONS = ("--recipe", "mini-splatting", "--iterations", str(ITERATIONS), "--test-every", "4", "--eval-every", "90")
 # What no two trainings have in common:
@@ -56,7 +56,7 @@ class Row(NamedTuple):
     left: str
     """What it left behind, and what it said if it had the time."""
     then: str
-    """How it went on."""
+    """How it continued."""
     is_good: bool
 
 
@@ -255,6 +255,6 @@ def main() -> None:
                 for folder in (out, out.with_name(f"{out.name}-kernels")):
                     shutil.rmtree(folder, ignore_errors=True)
     table = [[row.what, row.left.replace(name, "..."), row.then, "yes" if row.is_good else "NO"] for row in rows]
-    print(markdown_table(["killed at", "left behind", "went on", "good"], table, is_aligned=False))
+    print(markdown_table(["killed at", "left behind", "continued", "good"], table, is_aligned=False))
     print(f"\n{sum(row.is_good for row in rows)} of {len(rows)} are good")
     sys.exit(not all(row.is_good for row in rows))

@@ -23,7 +23,7 @@ def measure_memory(args: argparse.Namespace) -> Report:
     from data_tools.machine.large_scene import MODERATE, large_case
     from data_tools.machine.peak_memory import memory_case
 
-    progress("memory: a few iterations in processes of their own")
+    progress("memory: a few iterations in separate processes")
     return Report("Peak memory of training", (memory_case(), large_case(MODERATE)), {})
 
 

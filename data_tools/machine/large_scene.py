@@ -1,6 +1,6 @@
 """Trainings on photographs of 12 megapixels: compare the predicted peak of memory with the measured one.
 
-Each is a training as ``train`` does it, in a process of its own: checkpoint, some iterations, PLY and evaluation.
+Each is a training as ``train`` does it, in a separate process: checkpoint, some iterations, PLY and evaluation.
 One has all photographs in memory. One has two thousand of them, which would take 72 GB, and as many Gaussians as fit
 into 8 GB; it runs as if there were no more memory than that. Photographs are traced small and enlarged, and a few are
 repeated under different names to make many views: their memory does not depend on their content.

@@ -1,4 +1,4 @@
-"""The memory that training takes: a few iterations on 200,000 Gaussians in 1920 x 1080, in a process of its own.
+"""The memory that training takes: a few iterations on 200,000 Gaussians in 1920 x 1080, in a separate process.
 
 There are several iterations, because moments are first written at the end of the first, and some memory passes from one
 iteration to the next. The figure is the peak of that process beyond its memory before the Gaussians existed, with all

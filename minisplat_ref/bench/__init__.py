@@ -1,6 +1,6 @@
 """Speed against error: the time that a backend, a precision or a shortcut takes, and the error that it makes.
 
-Reading order: ``workloads`` (what is drawn), ``contenders`` (what draws it: backends, ``exponentials``, cut-offs, the
+Reading order: ``workloads`` (what is drawn), ``contenders`` (what renders it: backends, ``exponentials``, cut-offs, the
 ``textbook`` loop, ``peers``), ``passes`` (through which public functions), ``judging`` (errors against float64, apart
 from pixels at a threshold), ``benchmark`` (times and errors in one run), ``figure`` (the Pareto figure); then
 ``profiling`` and ``training_time`` (where an iteration spends its time), ``worked_rows`` (how much work blending is),

@@ -1,7 +1,7 @@
 """Polynomial exponentials of other degrees than the one in use: the cost and gain of a term less, or one more.
 
 The form is that of :mod:`minisplat_ref.cpu.compositing.exponential`: exp(x) = 2^n 2^f with n the nearest integer to
-x log2(e), a polynomial for 2^f on [-1/2, 1/2], and n added to the exponent bits. Each degree has a function of its own
+x log2(e), a polynomial for 2^f on [-1/2, 1/2], and n added to the exponent bits. Each degree has its own function
 at module level, because compiled kernels on disk are identified by the name of the exponential.
 """
 

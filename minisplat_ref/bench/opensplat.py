@@ -91,9 +91,9 @@ def _lay_out(scene: Path, folder: Path) -> Path:
     model = folder / "sparse" / "0"
     model.mkdir(parents=True)
     read_model(scene).write_binary(str(model))
-    for pictures in ("images", "masks"):
-        if (scene / pictures).is_dir():
-            (folder / pictures).symlink_to(scene / pictures, target_is_directory=True)
+    for images in ("images", "masks"):
+        if (scene / images).is_dir():
+            (folder / images).symlink_to(scene / images, target_is_directory=True)
     return folder
 
 

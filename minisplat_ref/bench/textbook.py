@@ -108,7 +108,7 @@ def _differentiate(  # type: ignore[no-untyped-def]
     height, width, n_channels = v_image.shape
     n_workers, n_tiles = sums.shape[0], tile_offsets.size - 1
     for worker in prange(n_workers):
-        total = sums[worker]  # each thread has an array of its own
+        total = sums[worker]  # each thread has its own array
         for tile in range(worker, n_tiles, n_workers):
             x0, y0 = tile % n_tiles_x * tile_width, tile // n_tiles_x * tile_height
             for y in range(y0, min(y0 + tile_height, height)):

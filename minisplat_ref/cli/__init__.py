@@ -178,7 +178,7 @@ def _run(argv: Sequence[str]) -> int:
     except KeyboardInterrupt:
         print("minisplat-ref: interrupted", file=sys.stderr)
         return 130
-    except BrokenPipeError:  # whoever reads the output has seen enough, like head
+    except BrokenPipeError:  # the reader of the output has seen enough, like head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else the interpreter fails to flush at its end
         return 0
     return code

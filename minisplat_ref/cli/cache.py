@@ -60,7 +60,7 @@ def _warm(args: argparse.Namespace) -> int:
     extensions: tuple[str, ...] = ()
     try:
         extensions = tuple(folders())
-    except InputError as error:  # the core's kernels do not depend on somebody's folders
+    except InputError as error:  # the core's kernels do not depend on the user's folders
         print(f"minisplat-ref: warning: {error}", file=sys.stderr)
     done = 0
     for dtype in dtypes:

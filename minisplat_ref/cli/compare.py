@@ -31,7 +31,7 @@ results side by side. DIR will hold a run folder RECIPE-seedS for each training,
 compare.json, the figures as PNG, and report.html with all of it.
 
 The first recipe is what the others are compared with. After Ctrl-C or a crash
---resume goes on: finished trainings are kept, one that was cut off continues.
+--resume continues: finished trainings are kept, one that was cut off continues.
 """
 EPILOG = """\
 examples:

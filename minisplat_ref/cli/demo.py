@@ -19,7 +19,7 @@ DESCRIPTION = f"""\
 See the program work, with nothing to download: ray-trace photographs of a
 small room, train Gaussians on them (the first {ITERATIONS} iterations of recipe
 {RECIPE}), measure views that the training never saw, and write report.html:
-pictures, depth against the exact depth, curves, and what to try next.
+images, depth against the exact depth, curves, and what to try next.
 
 Takes a minute or two on two cores. The folder that it leaves is a run like
 those of train, with the photographs in DIR/scene.
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     from minisplat_ref.datasets.synthetic import make_scene
     from minisplat_ref.datasets.synthetic.files import write_scene
     from minisplat_ref.runs import run_folder
-    from minisplat_ref.runs.demo_report import report_html, view_pictures
+    from minisplat_ref.runs.demo_report import report_html, view_images
     from minisplat_ref.runs.first_use import compile_kernels
     from minisplat_ref.runs.run import run_training
     from minisplat_ref.runs.scoring import summary
@@ -87,8 +87,8 @@ def run(args: argparse.Namespace) -> int:
     if outcome.evaluation is None:
         print(f"minisplat-ref: stopped; to continue: minisplat-ref train --resume {folder}", file=sys.stderr)
         return 130
-    pictures = view_pictures(folder, synthetic, scene, outcome.evaluation)
-    page = report_html(folder, scene, settings, outcome, pictures, time.perf_counter() - start)
+    images = view_images(folder, synthetic, scene, outcome.evaluation)
+    page = report_html(folder, scene, settings, outcome, images, time.perf_counter() - start)
     (folder / run_folder.REPORT).write_text(page, encoding="utf-8")
     if not outcome.is_complete:
         report = folder / run_folder.REPORT

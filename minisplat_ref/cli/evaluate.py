@@ -11,7 +11,7 @@ Measure a run on its test views: PSNR, SSIM and, given the weights of its
 network, LPIPS of point_cloud.ply, view by view.
 
 Rewrites DIR/metrics.json and DIR/renders/ (truth | render | error). Everything
-but the run's result on its own test views goes into a folder of its own: other
+but the run's result on its own test views goes into its own folder: other
 views of its photographs (--test-every), other Gaussians (--model) and a run
 that has not ended into DIR/eval-..., another scene into --out, then required.
 Renders are clipped to [0, 1] and not rounded; SSIM has an 11 x 11 window and

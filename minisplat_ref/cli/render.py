@@ -1,4 +1,4 @@
-"""``render``: pictures of a trained scene from a run's cameras, an orbit or a camera file."""
+"""``render``: images of a trained scene from a run's cameras, an orbit or a camera file."""
 
 import argparse
 import math
@@ -52,7 +52,7 @@ def add_parser(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "render",
-        help="render a run or a PLY to pictures",
+        help="render a run or a PLY to images",
         description=DESCRIPTION,
         epilog=EPILOG,
         formatter_class=HelpFormatter,
@@ -60,21 +60,21 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("input", type=Path, metavar="DIR|PLY", help="run folder, PLY or compact file")
     parser.add_argument("--cameras", metavar="WHICH", help="see above")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where to write (default: beside the input)")
-    parser.add_argument("--depth", action="store_true", help="also NAME_depth.npy (camera z) and its picture")
+    parser.add_argument("--depth", action="store_true", help="also NAME_depth.npy (camera z) and its image")
     parser.add_argument("--extension", metavar="E", help="the one that the PLY was trained with (a run knows its own)")
     parser.add_argument(
-        "--frames", type=integer(1), default=60, metavar="N", help="number of pictures of an orbit (default 60)"
+        "--frames", type=integer(1), default=60, metavar="N", help="number of images of an orbit (default 60)"
     )
     parser.add_argument(
         "--arc", type=_arc, metavar="A", help="degrees that an orbit covers (default: what was photographed)"
     )
     parser.add_argument(
-        "--size", type=_size, metavar="WxH", help="pixels of an orbit's pictures (default: the run's, or 640x480)"
+        "--size", type=_size, metavar="WxH", help="pixels of an orbit's images (default: the run's, or 640x480)"
     )
     parser.add_argument(
         "--film", type=Path, metavar="FILE", help="also make a film: .gif, or .mp4 with imageio[ffmpeg]"
     )
-    parser.add_argument("--fps", type=positive, default=25.0, metavar="F", help="pictures a second (default 25)")
+    parser.add_argument("--fps", type=positive, default=25.0, metavar="F", help="images a second (default 25)")
     parser.add_argument(
         "--background", type=color, metavar="R,G,B", help="0 to 255 each (default: the run's, or 0,0,0)"
     )
@@ -118,7 +118,7 @@ def run(args: argparse.Namespace) -> int:
             depth = expected_depth(output.image[..., 3], output.alpha)  # [H, W]
             np.save(out / f"{name}_depth.npy", depth)
             write_image(out / f"{name}_depth.png", depth_image(depth, *depth_range(depth)))
-    print(f"{len(views)} pictures in {out}")
+    print(f"{len(views)} images in {out}")
     if args.film is not None:
         write_film(args.film, [out / f"{name}.png" for name in names], args.fps)
         print(f"film: {args.film}")
@@ -126,30 +126,30 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _make_room(out: Path, names: Sequence[str]) -> None:
-    """Make the folder, and remove the pictures of an earlier rendering, which it lists; others are not touched.
+    """Make the folder, and remove the images of an earlier rendering, which it lists; others are not touched.
 
     Raises
     ------
     InputError
-        There are pictures that no rendering has listed and this one would not replace.
+        There are images that no rendering has listed and this one would not replace.
     """
     from minisplat_ref.runs import run_folder
 
-    listed = run_folder.read_json_object(out / LIST).get("pictures") if (out / LIST).exists() else []
+    listed = run_folder.read_json_object(out / LIST).get("images") if (out / LIST).exists() else []
     if not isinstance(listed, list):
-        raise InputError(f"{out / LIST} does not list the pictures of a rendering: give another --out")
+        raise InputError(f"{out / LIST} does not list the images of a rendering: give another --out")
     found = {path.name for path in out.glob("*.png")} if out.is_dir() else set()
     strange = sorted(found - {f"{name}{end}" for name in (*listed, *names) for end in ENDS})
     if strange:
         raise InputError(
-            f"{out} holds pictures other than those of a rendering, such as {strange[0]}: give another --out, or remove"
+            f"{out} holds images other than those of a rendering, such as {strange[0]}: give another --out, or remove"
             " them"
         )
     run_folder.create(out)
     for path in (out / f"{name}{end}" for name in listed for end in ENDS):
         if path.parent == out:
             path.unlink(missing_ok=True)
-    run_folder.write_json(out / LIST, {"pictures": list(names)})
+    run_folder.write_json(out / LIST, {"images": list(names)})
 
 
 class _Source(NamedTuple):
@@ -176,7 +176,7 @@ def _open_run(folder: Path, args: argparse.Namespace) -> _Source:
     from minisplat_ref.runs.scoring import load_trained
 
     if args.extension is not None:
-        raise InputError(f"{folder} knows its extension: leave out --extension {args.extension}")
+        raise InputError(f"{folder} has its extension recorded: leave out --extension {args.extension}")
     return _Source(load_trained(folder), viewpoints.read(folder / run_folder.CAMERAS), folder / "views")
 
 

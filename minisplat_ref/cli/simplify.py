@@ -19,7 +19,7 @@ decide by; the test views are measured once, at the end.
 
   --max-drop dB   the smallest size that loses at most so much PSNR, with one
                   standard error on top
-  --budget N      at most so many Gaussians
+  --budget N      at most this many Gaussians
   --max-bytes B   as many as a PLY of at most B bytes holds (for a compact
                   file, minisplat-ref convert has --max-bytes of its own)
   none of these   the knee of the curve

@@ -11,7 +11,7 @@ sparse points. Beside it stands what no photograph has: the exact depths/ and
 normals/ of every pixel, and scene_info.json. Equal arguments give equal bytes.
 
   room         textured walls, furniture with thin rods
-  plain-wall   walls without any texture fill most of the picture
+  plain-wall   walls without any texture fill most of the image
   glossy       polished things, whose look changes with the viewpoint
   outdoor      open ground under a sky that has no depth
 """

@@ -1,4 +1,4 @@
-"""``train``: from photographs with cameras to a folder with Gaussians, measures and pictures."""
+"""``train``: from photographs with cameras to a folder with Gaussians, measures and images."""
 
 import argparse
 import sys
@@ -59,7 +59,7 @@ AFRESH = ("iterations", "lpips_weights", "drop_bad_steps")  # what may be new wh
 DESCRIPTION = """\
 Train Gaussians on SCENE, the folder of a COLMAP scene or of a transforms.json.
 DIR will hold report.html, point_cloud.ply, metrics.json, renders/ of the test
-views and checkpoints. Ctrl-C saves what there is; --resume goes on.
+views and checkpoints. Ctrl-C saves what there is; --resume continues.
 """
 EPILOG = """\
 example:
@@ -290,7 +290,7 @@ def _resume(folder: Path, given: dict[str, Any]) -> int:
         state = checkpoints.load(folder, ours) if run_folder.has_begun(folder) else None
         if state is not None and state.pace.last_step == state.step and run_folder.is_finished(folder, state.step):
             raise InputError(
-                f"{folder} has ended after {state.step} iterations, of which the last had falling rates: train anew"
+                f"{folder} has ended after {state.step} iterations, of which the last had falling rates: train again"
             )
         is_done = state is not None and state.step == ours.iterations and run_folder.is_finished(folder, state.step)
         if state is not None and (is_done or state.step > ours.iterations):
@@ -321,7 +321,7 @@ def _check_room(scene: "Scene", state: "TrainState", settings: "Settings") -> st
 
 
 def _how_it_goes_on(state: "TrainState", settings: "Settings", is_rescaled: bool) -> str:
-    """Say by which schedule a run goes on."""
+    """Say by which schedule a run continues."""
     if state.step >= settings.iterations:
         return f"all {state.step} iterations are done: measuring"
     length = settings.schedule_iterations

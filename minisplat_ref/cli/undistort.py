@@ -11,7 +11,7 @@ pinhole camera that COLMAP chooses for their lens, with the same focal length
 and no blank pixels. Poses and points stay.
 
 The renderer knows pinholes only. train --undistort does the same while it
-loads, each time anew.
+loads, each time.
 """
 EPILOG = """\
 example:

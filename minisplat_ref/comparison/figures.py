@@ -113,8 +113,8 @@ def gallery(crops: Sequence[Crop], recipes: Sequence[str]) -> Figure:
         rows = figure.subplots(len(crops), n_columns, squeeze=False)
         for row, crop in zip(rows, crops, strict=True):
             titles = (f"{crop.view}, truth", *recipes)
-            for axes, picture, title in zip(row, (crop.truth, *crop.renders), titles, strict=True):
-                axes.imshow(picture, interpolation="nearest")
+            for axes, image, title in zip(row, (crop.truth, *crop.renders), titles, strict=True):
+                axes.imshow(image, interpolation="nearest")
                 axes.set_title(title, fontsize=9, loc="left", color=TITLE_COLOR)
                 axes.set_axis_off()
     return figure

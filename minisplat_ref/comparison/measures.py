@@ -173,7 +173,7 @@ def peak_training_mb(log: Sequence[Mapping[str, Any]], end: float) -> tuple[floa
 def densification_end(recipe: Mapping[str, Any]) -> float:
     """Return the iteration at which a recipe, as config.json describes it, has stopped cloning and splitting.
 
-    Mini-Splatting simplifies in this iteration; 3DGS goes on with what it has. Infinite where there is no such end.
+    Mini-Splatting simplifies in this iteration; 3DGS continues with what it has. Infinite where there is no such end.
     """
     events = [event for event in recipe["events"] if event["action"] == "clone_and_split"]
     stops = [math.inf if event["stop"] is None else event["stop"] * Fraction(event["factor"]) for event in events]

@@ -56,7 +56,7 @@ class Plan(NamedTuple):
     downscale: int
     """Factor by which the photographs are made smaller."""
     test_every: int
-    """One view of so many is held out."""
+    """One view of this many is held out."""
     eval_every: int | None
     """Iterations after which the test views are measured again; None for POINTS_PER_RUN times in each run."""
     budget: int | None

@@ -1,6 +1,6 @@
-"""The trainings of a comparison: one after the other, each in a process of its own, whose peak memory is its own.
+"""The trainings of a comparison: one after the other, each in a separate process, whose peak memory is its own.
 
-A comparison that was cut off goes on where it was: finished runs stay, one with a checkpoint continues from it.
+A comparison that was cut off continues where it was: finished runs stay, one with a checkpoint continues from it.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ from minisplat_ref.types import Scene
 
 WARM_UP = 20  # iterations, to which each recipe is scaled, so that all its events happen
 WARM_UP_VIEWS = 4
-SAVING_SECONDS = 5.0  # after Ctrl-C; a training that goes on for longer has not been told
+SAVING_SECONDS = 5.0  # after Ctrl-C; a training that continues for longer has not been told
 
 TRAIN = (sys.executable, "-m", "minisplat_ref", "train")
 

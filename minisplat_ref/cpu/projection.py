@@ -1,6 +1,6 @@
 """Projection of all Gaussians of a view, forward and backward: the loops over ``scalar/projection.py``.
 
-The body of a parallel loop is a function of its own: Numba 0.68 loses writes to a NamedTuple's arrays directly under
+The body of a parallel loop is its own function: Numba 0.68 loses writes to a NamedTuple's arrays directly under
 ``prange``. Every Gaussian has one writer. Only the camera gradient is a sum over Gaussians: a fixed number of chunks,
 whatever the number of threads, each sum their part in float64, and the parts are added in order.
 

@@ -1,8 +1,8 @@
-"""How much the picture would change without each Gaussian; see ``reference.removal``.
+"""How much the image would change without each Gaussian; see ``reference.removal``.
 
 The loop is that of :mod:`minisplat_ref.cpu.compositing.backward`: front to back, with the arithmetic of the forward
 pass. Each channel keeps its own light from behind the current hit, because the square of a sum over channels would be
-another quantity. A pair (tile, Gaussian) has a slot of its own, and the slots of each Gaussian are summed in order, in
+another quantity. A pair (tile, Gaussian) has its own slot, and the slots of each Gaussian are summed in order, in
 float64: the same bytes at any number of threads.
 """
 
@@ -44,7 +44,7 @@ def removal_changes(
     conventions: Conventions,
     output: RenderOutput,
 ) -> Floats:
-    """Return the squared change of the picture without each Gaussian; see ``reference.removal.removal_changes``."""
+    """Return the squared change of the image without each Gaussian; see ``reference.removal.removal_changes``."""
     dtype, n_channels = colors.dtype, colors.shape[1]
     slots = np.zeros(len(bins.gaussian_ids), dtype)  # remain zero behind the hit that finishes a tile
     exp = choose_exponential(dtype)

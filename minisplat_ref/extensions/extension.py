@@ -66,7 +66,7 @@ def load_extension(name: str) -> Extension:
         raise InputError(f"extension {name!r} does not exist: choose from {', '.join(found) or 'none'}")
     try:
         module = import_module(module_of(name))
-    except (Exception, SystemExit) as error:  # whatever the file of somebody else does
+    except (Exception, SystemExit) as error:  # whatever the user's file does
         reason = " ".join(str(error).split())
         raise InputError(
             f"extension {name} in {found[name]} cannot be loaded, {type(error).__name__}: {reason}; mend or remove it"

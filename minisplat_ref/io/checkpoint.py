@@ -21,7 +21,7 @@ from minisplat_ref.io.json_file import parse_json
 from minisplat_ref.io.npz import read_npz
 
 FORMAT = "minisplat_ref checkpoint 2"  # changes when an older file can no longer be continued
-WAY_OUT = "delete it and train anew"
+WAY_OUT = "delete it and train again"
 _HEADER = "header"
 
 
@@ -128,5 +128,5 @@ def _read(path: str | Path, names: Collection[str] | None = None) -> tuple[dict[
     except InputError as error:
         raise DamagedCheckpoint(str(error)) from error
     if header.get("format") != FORMAT:
-        raise InputError(f"{path} is {header.get('format')!r}, this version reads {FORMAT!r}: train anew")
+        raise InputError(f"{path} is {header.get('format')!r}, this version reads {FORMAT!r}: train again")
     return arrays, header

@@ -30,7 +30,7 @@ class Lens(NamedTuple):
 def import_pycolmap() -> ModuleType:
     """Import pycolmap when it is first needed: it takes a while to load, and a few platforms have no wheel.
 
-    Pillow must be loaded before, as it is by the imports of this module: pycolmap 4.2 exports a zlib of its own, and if
+    Pillow must be loaded before, as it is by the imports of this module: pycolmap 4.2 exports its own zlib, and if
     it is loaded first, the system's zlib binds partly to it; the next PNG that Pillow writes then aborts the process.
     """
     try:

@@ -1,7 +1,7 @@
 """Paths around a scene for ``render``: along the training cameras of a run, or on a circle around a point cloud.
 
 A camera is described in the cylinder about the scene's axis, which is at right angles to the horizontal edges of the
-pictures and passes through the point nearest to all optical axes. At every angle the path takes the mean of radius,
+images and passes through the point nearest to all optical axes. At every angle the path takes the mean of radius,
 height and viewing direction of the training cameras near that angle, so that it stays where the scene was photographed:
 beyond, nothing has taught the Gaussians what to show. Where more than a quarter of the circle was never photographed,
 the path leaves it out, and goes there and back along the rest.
@@ -37,7 +37,7 @@ def orbit(
         Centres of the Gaussians, world frame.
     like : sequence of Viewpoint
         Training cameras, which the path follows. Without any, it is a circle around the median of the means, so wide
-        that nine tenths of them are in the picture, with -y up (the y axis of COLMAP scenes points down).
+        that nine tenths of them are in the image, with -y up (the y axis of COLMAP scenes points down).
     n_frames : int
         Number of cameras.
     width, height : int
@@ -139,7 +139,7 @@ def _nearest_to_axes(centres: Floats, forwards: Floats) -> Floats:
 
 
 def _up(rotations: Floats) -> Floats:
-    """Return the direction [3] at a right angle to the horizontal edges of all pictures."""
+    """Return the direction [3] at a right angle to the horizontal edges of all images."""
     rights, mean_up = rotations[:, 0], -rotations[:, 1].mean(axis=0)  # [V, 3], [3]
     # The mean itself leans towards an arc of cameras that look down; it decides where all edges are parallel.
     spread = rights.T @ rights / len(rights) - MEAN_UP_WEIGHT * np.outer(mean_up, mean_up)  # [3, 3]

@@ -21,7 +21,7 @@ NEEDED = "needed are position, rotation, width, height, fx, fy"
 
 
 class Viewpoint(NamedTuple):
-    """A camera with the name of its picture."""
+    """A camera with the name of its image."""
 
     name: str
     """File name without suffix."""

@@ -1,6 +1,6 @@
 """The folders of compiled kernels: list them, describe them, and remove them.
 
-Every version of the kernels has a folder of its own, named by a hash (:mod:`minisplat_ref.jit.compile`). So nothing
+Every version of the kernels has its own folder, named by a hash (:mod:`minisplat_ref.jit.compile`). So nothing
 stale can be loaded, but the folders of old versions stay behind: only the user knows which of them another installation
 still uses. Other content in the same place, such as the cache of other packages that use Numba where
 ``NUMBA_CACHE_DIR`` is set, is neither listed nor touched.

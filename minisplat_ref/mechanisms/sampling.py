@@ -1,6 +1,6 @@
-"""Sampling intervals of cameras, and pictures at other samplings.
+"""Sampling intervals of cameras, and images at other samplings.
 
-At scale z a picture has z times as many pixels per side. A smaller photograph is the mean over blocks of pixels, which
+At scale z an image has z times as many pixels per side. A smaller photograph is the mean over blocks of pixels, which
 is what a sensor with larger pixels would have measured.
 """
 

@@ -152,8 +152,8 @@ def size_limits(means: Floats, scene: Scene, size_fraction: float) -> Floats:
 def limit_sizes(gaussians: Gaussians, scene: Scene, size_fraction: float) -> Gaussians:
     """Return Gaussians that are no larger than :func:`size_limits`.
 
-    What begins anew is as large as the distance to its neighbours. Few points far behind the scene are as far from each
-    other as from the cameras, and would veil the views.
+    What starts again is as large as the distance to its neighbours. Few points far behind the scene are as far from
+    each other as from the cameras, and would veil the views.
     """
     limits = np.log(size_limits(gaussians.means, scene, size_fraction)).astype(gaussians.log_scales.dtype)
     return gaussians._replace(log_scales=np.minimum(gaussians.log_scales, limits[:, None]))

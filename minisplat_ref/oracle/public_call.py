@@ -25,7 +25,7 @@ class Call(NamedTuple):
     render_mode: str
     """Of ``rasterization``."""
     n_channels: int = 0
-    """Given colours of so many channels; 0: spherical harmonics."""
+    """Given colours of this many channels; 0: spherical harmonics."""
     has_own_colors: bool = False
     """Whether each camera is given colours of its own."""
     is_antialiased: bool = False

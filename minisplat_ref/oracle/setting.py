@@ -40,7 +40,7 @@ class Setting(NamedTuple):
 def make_setting(
     rng: np.random.Generator, n: int, width: int, height: int, conventions: Conventions, sh_degree: int
 ) -> Setting:
-    """Draw a scene.
+    """Render a scene.
 
     Parameters
     ----------

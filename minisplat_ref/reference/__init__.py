@@ -14,9 +14,9 @@ spherical_harmonics  how its colour depends on the viewing direction            
 tiling               how ellipses are sorted, tile by tile, front to back            3DGS sec. 6
 hits                 how strongly an ellipse covers a pixel, and what it leaves      3DGS (3), (4)
 compositing          how hits become a pixel, and a pixel's error becomes theirs     3DGS (3)
-removal              how much a picture would change without one of the ellipses      LeCun et al. 1990
+removal              how much an image would change without one of the ellipses      LeCun et al. 1990
 depth                the depth of what a pixel shows, by two definitions             Mini-Splatting appendix D
-loss                 how far a rendered picture is from a photograph                 3DGS (7), Wang et al. 2004
+loss                 how far a rendered image is from a photograph                 3DGS (7), Wang et al. 2004
 adam                 how a gradient becomes a step                                   Kingma and Ba 2015
 ===================  ==============================================================  ============================
 

@@ -1,4 +1,4 @@
-"""Stage 7: how far a rendered picture is from a photograph.
+"""Stage 7: how far a rendered image is from a photograph.
 
 This is 3DGS equation (7), ``(1 - w) L1 + w (1 - SSIM)``, with the structural similarity of Wang et al. (2004): a
 Gaussian window of 11 pixels, here with zeros beyond the border as in the 3DGS code. Left out: the halving of D-SSIM in

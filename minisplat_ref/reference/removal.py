@@ -1,4 +1,4 @@
-"""How much the picture would change without each Gaussian.
+"""How much the image would change without each Gaussian.
 
 A pixel is linear in the alpha of each of its hits (3DGS equation (3)), so without hit g its colour C changes by exactly
 ``-q_g = -alpha_g dC/dalpha_g``. With the residual ``r = C - photograph``, the squared error changes by::
@@ -27,7 +27,7 @@ def removal_changes(
     conventions: Conventions,
     output: RenderOutput,
 ) -> Floats:
-    """Return the squared change of the picture without each Gaussian.
+    """Return the squared change of the image without each Gaussian.
 
     Behind hit g comes the light that the pixel's colour C has besides that of the hits up to g: from other hits, the
     background, a sky. Removing the hit takes its own light away and lets all of B_g through, of which it has let only

@@ -22,7 +22,7 @@ def write_page(report: Report, path: Path, figures: Sequence[str] = (), *, is_by
     figures : sequence of str
         Parts of a page that stand before the tables.
     is_by_kind : bool
-        Whether cases with other figures have a table of their own; else there is one, in the order of the cases.
+        Whether cases with other figures have their own table; else there is one, in the order of the cases.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Pictures for a person to look at: renders beside photographs, errors and depths in colour."""
+"""Images for a person to look at: renders beside photographs, errors and depths in colour."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ from minisplat_ref.types import Floats
 Image8 = NDArray[np.uint8]  # [H, W, 3] sRGB
 
 ERROR_RANGE = 0.25  # of [0, 1]: larger differences are all shown as the brightest colour
-GAP = 4  # white pixels between pictures side by side
+GAP = 4  # white pixels between images side by side
 
 
 def to_8_bits(image: Floats) -> Image8:
@@ -44,28 +44,28 @@ def colorize(values: Floats, low: float, high: float, colormap: str) -> Image8:
     from matplotlib import colormaps  # not at the top: a training would wait for it before its first iteration
 
     fractions = np.clip((values - low) / ((high - low) or 1.0), 0.0, 1.0)  # [H, W]
-    picture: Image8 = colormaps[colormap](fractions, bytes=True)[..., :3]  # [H, W, 3]
-    return picture
+    image: Image8 = colormaps[colormap](fractions, bytes=True)[..., :3]  # [H, W, 3]
+    return image
 
 
-def side_by_side(pictures: list[Image8]) -> Image8:
-    """Join pictures of one height from left to right with a white gap."""
-    gap = np.full((pictures[0].shape[0], GAP, 3), 255, dtype=np.uint8)
-    with_gaps = [part for picture in pictures for part in (gap, picture)]
+def side_by_side(images: list[Image8]) -> Image8:
+    """Join images of one height from left to right with a white gap."""
+    gap = np.full((images[0].shape[0], GAP, 3), 255, dtype=np.uint8)
+    with_gaps = [part for image in images for part in (gap, image)]
     return np.concatenate(with_gaps[1:], axis=1)
 
 
 def split_images(joined: Image8, n: int) -> list[Image8]:
-    """Take pictures apart that :func:`side_by_side` has joined; all are of one width."""
+    """Take images apart that :func:`side_by_side` has joined; all are of one width."""
     width = (joined.shape[1] - (n - 1) * GAP) // n
     return [joined[:, k * (width + GAP) : k * (width + GAP) + width] for k in range(n)]
 
 
-def fit_image(picture: Image8, longest: int) -> Image8:
-    """Return a picture [H, W, 3] whose longer side has at most so many pixels, averaged down where it has more."""
-    height, width = picture.shape[:2]
+def fit_image(image: Image8, longest: int) -> Image8:
+    """Return an image [H, W, 3] whose longer side has at most this many pixels, averaged down where it has more."""
+    height, width = image.shape[:2]
     scale = longest / max(height, width)
     if scale >= 1:
-        return picture
+        return image
     size = (max(1, round(scale * width)), max(1, round(scale * height)))
-    return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BOX))
+    return np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BOX))

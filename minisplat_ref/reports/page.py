@@ -1,8 +1,8 @@
-"""The one look of all reports: an HTML file with pictures, curves and tables, and nothing that it loads from elsewhere.
+"""The one look of all reports: an HTML file with images, curves and tables, and nothing that it loads from elsewhere.
 
-Pictures are in the page in base64, curves are inline SVG (:mod:`minisplat_ref.reports.plots`), and so are the style
+Images are in the page in base64, curves are inline SVG (:mod:`minisplat_ref.reports.plots`), and so are the style
 sheet and the few lines of script (:mod:`minisplat_ref.reports.page_style`), without which nothing is missing: a
-slider is then two pictures beside each other. The page tells the browser to load nothing else.
+slider is then two images beside each other. The page tells the browser to load nothing else.
 """
 
 import base64
@@ -20,7 +20,7 @@ BAD = {"FAILED", "DIVERGES FIRST", "diverges"}  # cells that stand out
 GOOD = {"passed", "agrees"}
 LONG = 44  # characters of a cell that may break into lines
 TALL = 60  # rows of a table that scrolls in the page instead of making it long
-PNG_PIXELS = 1 << 17  # of larger pictures a PNG would make the page heavy
+PNG_PIXELS = 1 << 17  # of larger images a PNG would make the page heavy
 JPEG_QUALITY = 92
 
 
@@ -117,7 +117,7 @@ def panel(label: str, figures: Sequence[str], n_columns: int = 3) -> str:
 
 
 def grid(panels: Sequence[str], *, is_smooth: bool = True) -> str:
-    """Return panels two beside each other; pictures that are not smoothed show their pixels."""
+    """Return panels two beside each other; images that are not smoothed show their pixels."""
     kind = "row" if is_smooth else "row pixels"
     return f'<div class="{kind}" style="--columns: 2">{"".join(panels)}</div>'
 
@@ -128,33 +128,33 @@ def curves(svgs: Sequence[str], n_columns: int = 3) -> str:
 
 
 def slider(truth: Image8, renders: Mapping[str, Image8]) -> str:
-    """Return a picture of which the left part is the truth and the right part a render, with a line that moves.
+    """Return an image of which the left part is the truth and the right part a render, with a line that moves.
 
     Parameters
     ----------
     truth : ndarray of shape (H, W, 3)
         sRGB.
     renders : mapping
-        Pictures of the same size by their captions; of several, the reader chooses one.
+        Images of the same size by their captions; of several, the reader chooses one.
     """
-    figures = [add_caption(truth, "truth"), *(add_caption(picture, caption) for caption, picture in renders.items())]
+    figures = [add_caption(truth, "truth"), *(add_caption(image, caption) for caption, image in renders.items())]
     return f'<div class="slider">{"".join(figures)}</div>'
 
 
-def add_caption(picture: Image8, caption: str) -> str:
-    """Return a picture with a caption."""
-    height, width = picture.shape[:2]
+def add_caption(image: Image8, caption: str) -> str:
+    """Return an image with a caption."""
+    height, width = image.shape[:2]
     return (
-        f'<figure><img alt="{escape(caption)}" width="{width}" height="{height}" src="{_data_url(picture)}">'
+        f'<figure><img alt="{escape(caption)}" width="{width}" height="{height}" src="{_data_url(image)}">'
         f"<figcaption>{escape(caption)}</figcaption></figure>"
     )
 
 
-def _data_url(picture: Image8) -> str:
-    """Return the picture in base64, a large one as JPEG with colours at full resolution."""
-    is_large = picture.shape[0] * picture.shape[1] > PNG_PIXELS
+def _data_url(image: Image8) -> str:
+    """Return the image in base64, a large one as JPEG with colours at full resolution."""
+    is_large = image.shape[0] * image.shape[1] > PNG_PIXELS
     kind = "jpeg" if is_large else "png"
     options = {"quality": JPEG_QUALITY, "subsampling": 0} if is_large else {}
     file = io.BytesIO()
-    Image.fromarray(picture).save(file, format=kind, **options)
+    Image.fromarray(image).save(file, format=kind, **options)
     return f"data:image/{kind};base64,{base64.b64encode(file.getvalue()).decode('ascii')}"

@@ -2,8 +2,8 @@
 
 Colours are CSS variables with a light and a dark value; curves take theirs from the same names, see
 :data:`minisplat_ref.reports.palette.PAGE_NAMES`. The script turns every ``.slider``, which without it is a row of
-pictures, into one picture: the first on the left of a line, another on the right. The line moves with the range below,
-by keyboard as well, or with the pointer on the picture.
+images, into one image: the first on the left of a line, another on the right. The line moves with the range below,
+by keyboard as well, or with the pointer on the image.
 """
 
 STYLE = """
@@ -102,7 +102,7 @@ for (const box of document.querySelectorAll(".slider")) {
   const range = make("input", {type: "range", min: 0, max: 100, value: 50});
   const choice = make("select");
   choice.append(...others.map(other => new Option(name(other))));
-  choice.setAttribute("aria-label", "picture on the right");
+  choice.setAttribute("aria-label", "image on the right");
   const show = () => {
     const right = others[choice.selectedIndex];
     others.forEach(other => { other.hidden = other !== right; });

@@ -84,7 +84,7 @@ def open_source(path: Path, extension: str | None = None) -> Source:
     is_checkpoint = path.suffix == ".npz"
     if path.is_dir() or is_checkpoint:
         if extension is not None:
-            raise InputError(f"{path} knows its extension: leave out --extension {extension}")
+            raise InputError(f"{path} has its extension recorded: leave out --extension {extension}")
         return _of_checkpoint(path) if is_checkpoint else _of_run(path)
     if not path.exists():
         raise InputError(f"{path} does not exist: give a run folder, a checkpoint, a PLY or a compact file")
@@ -150,7 +150,7 @@ def check_population(population: Any, format_: Format, what: str) -> None:
 
 
 def finest_within(gaussians: Gaussians, format_: Format, max_bytes: int) -> Choice:
-    """Return the finest level whose file has at most so many bytes.
+    """Return the finest level whose file has at most this many bytes.
 
     Raises
     ------
@@ -172,7 +172,7 @@ def finest_within(gaussians: Gaussians, format_: Format, max_bytes: int) -> Choi
 def coarsest_within(
     gaussians: Gaussians, format_: Format, max_drop: float, psnr_of: Callable[[Gaussians], float]
 ) -> Choice:
-    """Return the coarsest level that loses at most so many dB.
+    """Return the coarsest level that loses at most this many dB.
 
     Parameters
     ----------

@@ -29,7 +29,7 @@ PSNR = "PSNR of the held-out training views (dB)"
 FIGURES_TEXT = """\
 Thin lines are the held-out training views, the thick one is their mean, broken lines are decisions. The work is the
 number of pairs of a tile and a Gaussian, of all iterations so far."""
-SIZES_TEXT = "Views of another size have a line of their own: larger ones show more that can be wrong."
+SIZES_TEXT = "Views of another size have their own line: larger ones show more that can be wrong."
 SLOPE_TEXT = "A red line has the slope by which it was decided that little was left to gain."
 
 
@@ -73,7 +73,7 @@ def story(pace: Pace, n_iterations: int) -> str:
         sentences.append(f"It was stopped at iteration {n_iterations:,}, while the rates were constant.")
     elif pace.last_step == n_iterations:
         sentences.append(
-            f"With all training views and falling rates it went on to iteration {n_iterations:,}, its end."
+            f"With all training views and falling rates it continued to iteration {n_iterations:,}, its end."
         )
     else:
         sentences.append(f"It was stopped at iteration {n_iterations:,} of the {pace.last_step:,} that it had planned.")

@@ -1,4 +1,4 @@
-"""The demo's ``report.html``: pictures of held-out views, depth beside the true depth, curves, and what to try next."""
+"""The demo's ``report.html``: images of held-out views, depth beside the true depth, curves, and what to try next."""
 
 import os
 import platform
@@ -51,7 +51,7 @@ Where the number of Gaussians jumps, those with a large gradient were cloned or 
 jumps with it, and recovers."""
 
 
-class ViewPictures(NamedTuple):
+class ViewImages(NamedTuple):
     """One held-out view of the report."""
 
     name: str
@@ -63,22 +63,22 @@ class ViewPictures(NamedTuple):
     render: Image8
     """[H, W, 3] render, sRGB."""
     error: Image8
-    """[H, W, 3] picture of the difference."""
+    """[H, W, 3] image of the difference."""
     true_depth: Floats
     """[H, W] exact camera z, world units; 0 where the view sees nothing."""
     depth: Floats
     """[H, W] rendered camera z, world units; 0 where nothing was hit."""
 
 
-def view_pictures(folder: Path, synthetic: SyntheticScene, scene: Scene, evaluation: Evaluation) -> list[ViewPictures]:
+def view_images(folder: Path, synthetic: SyntheticScene, scene: Scene, evaluation: Evaluation) -> list[ViewImages]:
     """Render the test views with depth."""
     true_depths = {view.name: synthetic.test_depths[i] for i, view in enumerate(synthetic.scene.test_views)}
-    trained, pictures = load_trained(folder), []
+    trained, images = load_trained(folder), []
     for view, metrics in zip(scene.test_views, evaluation.per_view, strict=True):
         output = trained.render(view, frozenset({"depth"}))
         image = to_8_bits(output.image[..., :3])
-        pictures.append(
-            ViewPictures(
+        images.append(
+            ViewImages(
                 name=view.name,
                 caption=f"PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.3f}",
                 truth=view.image,
@@ -88,7 +88,7 @@ def view_pictures(folder: Path, synthetic: SyntheticScene, scene: Scene, evaluat
                 depth=expected_depth(output.image[..., 3], output.alpha),
             )
         )
-    return pictures
+    return images
 
 
 def report_html(
@@ -96,7 +96,7 @@ def report_html(
     scene: Scene,
     settings: Settings,
     outcome: Outcome,
-    pictures: list[ViewPictures],
+    images: list[ViewImages],
     total_seconds: float,
 ) -> str:
     """Return the page as text of one self-contained HTML file."""
@@ -131,15 +131,15 @@ def report_html(
         ("Backend", f"{settings.backend}: Numba, float32, {os.cpu_count()} cores"),
         ("Memory", "not known here" if metrics["peak_rss_mb"] is None else f"{metrics['peak_rss_mb']:.0f} MB at most"),
         ("Program", f"minisplat_ref {__version__}, Python {platform.python_version()}, {platform.system()}"),
-        ("Files", f"{folder.resolve()}: Gaussians, measures, log, checkpoint, pictures"),
+        ("Files", f"{folder.resolve()}: Gaussians, measures, log, checkpoint, images"),
     ]
     steps = [
         part for text, lines in _next_steps(folder, metrics["iterations"]) for part in (paragraph(text), code(lines))
     ]
     sections = [
         cards(key_figures),
-        section("Held-out views", paragraph(VIEWS_TEXT), *map(_view_panel, pictures)),
-        section("Depth", paragraph(DEPTH_TEXT), *map(_depth_panel, pictures)),
+        section("Held-out views", paragraph(VIEWS_TEXT), *map(_view_panel, images)),
+        section("Depth", paragraph(DEPTH_TEXT), *map(_depth_panel, images)),
         section("How the training went", paragraph(CURVES_TEXT), curves(training_curves(log))),
         section("What was run", table(rows)),
         section("What to try next", *steps),
@@ -147,22 +147,22 @@ def report_html(
     return page("A room, rebuilt from photographs", introduction, sections)
 
 
-def _view_panel(view: ViewPictures) -> str:
+def _view_panel(view: ViewImages) -> str:
     return view_panel(f"{view.name}: {view.caption}", view.truth, view.render, view.error)
 
 
-def _depth_panel(view: ViewPictures) -> str:
+def _depth_panel(view: ViewImages) -> str:
     near, far = depth_range(view.true_depth)
     is_seen = view.true_depth > 0  # [H, W]
     relative = np.abs(view.depth - view.true_depth) / np.where(is_seen, view.true_depth, 1.0) * is_seen  # [H, W]
     median = float(np.median(relative[is_seen])) if is_seen.any() else 0.0
     true, rendered = (depth_image(depth, near, far) for depth in (view.true_depth, view.depth))
     difference = colorize(relative, 0.0, DEPTH_ERROR_RANGE, "magma")
-    pictures = [
+    images = [
         slider(true, {f"render, {near:.2f} to {far:.2f} units": rendered}),
         add_caption(difference, "relative difference, 0 to 10 % or more"),
     ]
-    return panel(f"{view.name}: median difference {100 * median:.1f} %", pictures, n_columns=2)
+    return panel(f"{view.name}: median difference {100 * median:.1f} %", images, n_columns=2)
 
 
 def _next_steps(folder: Path, n_iterations: int) -> list[tuple[str, str]]:

@@ -73,7 +73,7 @@ def read_mechanisms(path: Path, published: Mapping[str, int]) -> list[Mechanism]
         There is no record of it, or it is damaged.
     """
     if not path.exists():
-        raise InputError(f"{path}, which says what fired in the run, is missing: train anew")
+        raise InputError(f"{path}, which says what fired in the run, is missing: train again")
     try:
         return mechanisms(read_log(path), published)
     except (KeyError, TypeError) as error:

@@ -19,7 +19,7 @@ def warn_if_not_kept(backend: str) -> None:
     if backend == REFERENCE.name or numba.config.DISABLE_JIT or cache_folder() is not None:  # type: ignore[attr-defined]
         return
     message = (
-        f"{cache_root()} cannot be written: compiled kernels are not kept, and every start compiles them anew before it"
+        f"{cache_root()} cannot be written: compiled kernels are not kept, and every start recompiles them before it"
         " begins; set NUMBA_CACHE_DIR to a folder that can be written"
     )
     warnings.warn(one_line(message), InputWarning, stacklevel=2)

@@ -1,6 +1,6 @@
 """What a run can do without, but should be told of: a scene without points, photographs of a few pixels, no Gaussians.
 
-Each is a warning of one line, which the command line prints before it goes on.
+Each is a warning of one line, which the command line prints before it continues.
 """
 
 import math
@@ -59,7 +59,7 @@ def describe_sizes(sizes: Sequence[tuple[int, int]]) -> str:
 def warn_of_model(model: Model, source: object) -> None:
     """Warn of a model of nothing; ``source`` is the file or folder that it comes from."""
     if len(model.gaussians.means) == 0:
-        _warn(f"{source} holds no Gaussians: every picture shows the background alone; give another file or train anew")
+        _warn(f"{source} holds no Gaussians: every image shows the background alone; give another file or train again")
 
 
 def _warn(message: str) -> None:

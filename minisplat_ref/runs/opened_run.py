@@ -115,7 +115,7 @@ def check_views(scene: Scene, what: str) -> None:
 
 
 def check_renderer(run: Run) -> None:
-    """Refuse a renderer that does not say how much each row weighs in a picture."""
+    """Refuse a renderer that does not say how much each row weighs in an image."""
     settings, reason = run.render_settings, ""
     try:
         if settings.render(run.model, run.scene.train_views[0], frozenset({"stats"}))[0].stats is not None:

@@ -1,4 +1,4 @@
-"""``train --preview``: one picture of the training as it stands, replaced every few seconds."""
+"""``train --preview``: one image of the training as it stands, replaced every few seconds."""
 
 import math
 import time
@@ -13,7 +13,7 @@ from minisplat_ref.runs.settings import Settings
 from minisplat_ref.training.state import StepReport
 from minisplat_ref.types import Scene
 
-SECONDS = 3.0  # between pictures; a viewer that follows the file shows the newest
+SECONDS = 3.0  # between images; a viewer that follows the file shows the newest
 FILE = "preview.png"
 
 

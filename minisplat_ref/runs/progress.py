@@ -20,7 +20,7 @@ from minisplat_ref.training.state import StepReport
 
 LOG_EVERY = 5  # iterations; a PSNR is measured as often
 PSNR_WINDOW = 20  # measured views that the shown PSNR is the mean of: single views differ too much to show a trend
-PSNR_MAX = 100.0  # dB; equal pictures have an infinite one, which JSON cannot hold
+PSNR_MAX = 100.0  # dB; equal images have an infinite one, which JSON cannot hold
 BAR_SECONDS = 0.3  # between redraws of the bar
 PLAIN_SECONDS = 30.0  # likewise where stderr is a file, in which every redraw is a line
 
@@ -126,7 +126,7 @@ class Progress(AbstractContextManager["Progress"]):
         self._losses.clear()
 
     def _min_rest(self, report: StepReport) -> str:
-        """Say how long a training that has not decided its length goes on at least: as if it began to cool now."""
+        """Say how long a training that has not decided its length continues at least: as if it began to cool now."""
         if self._cooling is None or report.last_step is not None:
             return ""
         bar = self._bar.format_dict
@@ -135,7 +135,7 @@ class Progress(AbstractContextManager["Progress"]):
 
 
 def write_log(path: Path, records: Iterable[dict[str, Any]]) -> None:
-    """Write a log anew; a reader sees the old one or this."""
+    """Rewrite a log; a reader sees the old one or this."""
     with replacing(path) as temporary:
         temporary.write_text("".join(map(_line, records)), encoding="utf-8")
 

@@ -71,7 +71,7 @@ def paired_drop(before: Sequence[float], after: Sequence[float]) -> tuple[float,
     Parameters
     ----------
     before, after : sequence of V floats
-        dB, of the same views; what is above ``PSNR_MAX``, as that of equal pictures is, counts as that.
+        dB, of the same views; what is above ``PSNR_MAX``, as that of equal images is, counts as that.
 
     Returns
     -------

@@ -77,7 +77,7 @@ def run_training(
     check_every : int
         Iterations after which parameters and gradients are looked at for numbers that are not finite.
     shows_preview : bool
-        Keep a picture of the training up to date: :mod:`.preview`.
+        Keep an image of the training up to date: :mod:`.preview`.
 
     Returns
     -------
@@ -102,7 +102,7 @@ def run_training(
 
 @contextmanager
 def saving_on_error(folder: Path, recipe: Recipe, state: TrainState) -> Iterator[None]:
-    """Save the state if an error leaves it whole, and let the error say from where the run can go on."""
+    """Save the state if an error leaves it whole, and let the error say from where the run can continue."""
     try:
         yield
     except Exception as error:
@@ -110,7 +110,7 @@ def saving_on_error(folder: Path, recipe: Recipe, state: TrainState) -> Iterator
             with contextlib.suppress(InputError):  # a full disk, perhaps, which is what the error says already
                 checkpoints.save(folder, state, recipe)
         step = checkpoints.step_of(folder)
-        saved = f"; iteration {step} is saved; to go on: minisplat-ref train --resume {folder}" if step else ""
+        saved = f"; iteration {step} is saved; to continue: minisplat-ref train --resume {folder}" if step else ""
         if isinstance(error, MemoryError):
             raise InputError(f"memory is full: train on smaller photographs (--downscale){saved}") from error
         if isinstance(error, InputError):

@@ -139,7 +139,7 @@ def read_json_object(path: Path) -> dict[str, Any]:
     InputError
         The file is not JSON or holds something else.
     """
-    value = read_json(path, "give another folder or train anew")
+    value = read_json(path, "give another folder or train again")
     if not isinstance(value, Mapping):
         raise InputError(f"{path} does not hold a JSON object")
     return dict(value)

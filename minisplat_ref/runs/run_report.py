@@ -23,8 +23,8 @@ from minisplat_ref.runs.settings import Settings, load
 from minisplat_ref.training.pace import from_metadata
 from minisplat_ref.types import Scene
 
-N_SHOWN = 6  # test views with pictures; all are in the table
-LARGEST = 1000  # pixels of a picture's longer side in the page
+N_SHOWN = 6  # test views with images; all are in the table
+LARGEST = 1000  # pixels of an image's longer side in the page
 
 VIEWS_TEXT = f"The training never saw these views. {ERROR_TEXT}"
 FIRED_TEXT = """\
@@ -99,7 +99,7 @@ def _key_figures(metrics: dict[str, Any], n_first: int | None) -> list[tuple[str
 
 
 def _worst_first(views: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Sort views by PSNR; that of equal pictures, null in the file, is the best."""
+    """Sort views by PSNR; that of equal images, null in the file, is the best."""
     return sorted(views, key=lambda view: (view["psnr"] is None, view["psnr"] or 0.0))
 
 
@@ -117,9 +117,9 @@ def _views(folder: Path, views: list[dict[str, Any]]) -> str:
     panels = []
     for view in shown:
         strip = read_image(folder / run_folder.RENDERS / f"{stems[view['name']]}.png")
-        pictures = (fit_image(picture, LARGEST) for picture in split_images(strip, 3))
+        images = (fit_image(image, LARGEST) for image in split_images(strip, 3))
         rank = f" ({ranked.index(view) + 1} of {len(ranked)})" if len(ranked) > 1 else ""
-        panels.append(view_panel(f"{view['name']}{rank}: {_describe_measures(view)}", *pictures))
+        panels.append(view_panel(f"{view['name']}{rank}: {_describe_measures(view)}", *images))
     how = f" Shown are {n} of {len(ranked)}, from the worst to the best." if n < len(ranked) else " The worst is first."
     has_lpips = ranked[0]["lpips"] is not None
     heading = ["view", "PSNR (dB)", "SSIM", *(["LPIPS"] if has_lpips else [])]
@@ -174,7 +174,7 @@ def _settings(folder: Path, settings: Settings, metrics: dict[str, Any], scene: 
         ("Backend", settings.backend),
         ("Memory", memory),
         ("Program", f"minisplat_ref {__version__}, Python {platform.python_version()}, {platform.system()}"),
-        ("Files", f"{folder.resolve()}: Gaussians, measures, log, checkpoint, pictures of all test views in renders"),
+        ("Files", f"{folder.resolve()}: Gaussians, measures, log, checkpoint, images of all test views in renders"),
     ]
 
 

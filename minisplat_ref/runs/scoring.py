@@ -1,4 +1,4 @@
-"""Measures a trained scene on its test views, and keeps the pictures: ``metrics.json`` and ``renders/``."""
+"""Measures a trained scene on its test views, and keeps the images: ``metrics.json`` and ``renders/``."""
 
 import math
 import warnings
@@ -36,7 +36,7 @@ class Trained(NamedTuple):
     backend: str
 
     def render(self, view: View, wants: frozenset[str] = frozenset()) -> RenderOutput:
-        """Draw a view; ``wants`` as in :class:`minisplat_ref.rendering.Request`."""
+        """Render a view; ``wants`` as in :class:`minisplat_ref.rendering.Request`."""
         request = Request(
             self.background, conventions=PROFILES[self.profile], backend=get_backend(self.backend), wants=wants
         )
@@ -126,7 +126,7 @@ def score(folder: Path, scene: Scene, model: Model, settings: Settings, network:
 
 
 def to_metrics(evaluation: Evaluation) -> dict[str, Any]:
-    """Return the measures as ``metrics.json`` holds them; an infinite PSNR, of equal pictures, becomes null."""
+    """Return the measures as ``metrics.json`` holds them; an infinite PSNR, of equal images, becomes null."""
     per_view = [_finite(view._asdict()) for view in evaluation.per_view]
     return {**_finite(evaluation._asdict()), "per_view": per_view}
 

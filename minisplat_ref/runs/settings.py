@@ -38,7 +38,7 @@ class Settings(NamedTuple):
     downscale: int
     """Factor by which the photographs are made smaller."""
     test_every: int
-    """One view of so many is held out for testing; 0: none."""
+    """One view of this many is held out for testing; 0: none."""
     undistort: bool
     """Whether lens distortion is removed while loading."""
     recipe: str
@@ -134,7 +134,7 @@ def load_model(folder: Path, settings: Settings) -> Model:
     gaussians = owner.load(folder / POINT_CLOUD, owner.representation.population)
     if not (folder / SHARED).exists():
         return Model(gaussians)
-    return Model(gaussians, read_npz(folder / SHARED, "train anew"))
+    return Model(gaussians, read_npz(folder / SHARED, "train again"))
 
 
 def to_config(settings: Settings, recipe: Recipe, scene: Scene) -> dict[str, Any]:

@@ -5,10 +5,10 @@ at some ten sizes, and each is fine-tuned. Some *training* views decide (:func:`
 count neither for the importance nor for the fine-tuning while the sizes are measured. The test views stay sealed until
 the size has been chosen, and ranked and fine-tuned once more by all training views.
 
-Fine-tuning alone changes a run: it may go on learning, and it forgets what is peculiar to the held-out views, which it
-was trained on until then. So the drop of a size is not from the run, but from *all* its Gaussians, fine-tuned alike.
+Fine-tuning alone changes a run: it may continue to learn, and it forgets what is peculiar to the held-out views, which
+it was trained on until then. So the drop of a size is not from the run, but from *all* its Gaussians, fine-tuned alike.
 
-Fine-tuning goes on where the run's schedule ends: its losses, its last rates, all degrees of the spherical harmonics,
+Fine-tuning continues where the run's schedule ends: its losses, its last rates, all degrees of the spherical harmonics,
 no events, moments of zero.
 """
 
@@ -123,7 +123,7 @@ def limit_of(target: Target, size: PlySize) -> int | None:
 
 
 def fine_tuning(recipe: Recipe, iterations: int, *, holds_out: bool) -> Recipe:
-    """Return the recipe of so many iterations after the schedule's end, at the rates of the end and without events."""
+    """Return the recipe of this many iterations after the schedule's end, at its last rates and without events."""
     rates = Rates(recipe.rates.at(recipe.iterations, 1.0), recipe.rates.per_extent)
     if recipe.cooling is not None:
         rates = rates.scale(Fraction(1), recipe.cooling.last, recipe.cooling.last_per_extent)

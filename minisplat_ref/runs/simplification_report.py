@@ -26,8 +26,8 @@ Of each size the most important Gaussians were kept, by their blend weights in t
 The held-out training views took part in neither. Bars are one standard error of the paired differences between these
 views, so what makes one view harder than another is not in them."""
 REFERENCE_TEXT = """\
-Fine-tuning alone changes a run: it may go on learning, and it forgets what is peculiar to the held-out views, which it
-was trained on until now. The drop is therefore measured against all Gaussians, fine-tuned in the same way."""
+Fine-tuning alone changes a run: it may continue to learn, and it forgets what is peculiar to the held-out views, which
+it was trained on until now. The drop is therefore measured against all Gaussians, fine-tuned in the same way."""
 KNEE_TEXT = """\
 The knee is where the PSNR over the logarithm of the count lies highest above the straight line between the ends of the
 measured sizes. It moves with these ends, so it decides only where no target was given."""

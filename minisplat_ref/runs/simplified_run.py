@@ -68,20 +68,20 @@ def simplify_run(asked: Asked) -> dict[str, Any]:
     return result
 
 
-def _pictures(run: Run, model: Model) -> dict[str, Image8]:
+def _images(run: Run, model: Model) -> dict[str, Image8]:
     """Render the first test views, by their names."""
-    pictures: dict[str, Image8] = {}
+    images: dict[str, Image8] = {}
 
     def keep(view: View, image: Floats, _: ViewMetrics) -> None:
-        pictures[view.name] = to_8_bits(image)
+        images[view.name] = to_8_bits(image)
 
     measure(run.scene._replace(test_views=run.scene.test_views[:N_SHOWN]), model, run.settings, on_view=keep)
-    return pictures
+    return images
 
 
 def _render_both(run: Run, model: Model) -> list[Shown]:
     """Return the first test views as the run and the new model draw them."""
-    before, after = _pictures(run, run.model), _pictures(run, model)
+    before, after = _images(run, run.model), _images(run, model)
     views = [view.load() for view in run.scene.test_views[:N_SHOWN]]
     return [Shown(view.name, view.image, before[view.name], after[view.name]) for view in views]
 

@@ -1,4 +1,4 @@
-"""Aggressive clone of Mini-Splatting2: clone the Gaussians that matter without changing the picture.
+"""Aggressive clone of Mini-Splatting2: clone the Gaussians that matter without changing the image.
 
 A plain copy makes a Gaussian more opaque. Here the N copies share the opacity and the size of the one that they replace
 (the rule by which 3DGS-MCMC relocates Gaussians). With its opacity o and scales s,

@@ -1,6 +1,6 @@
-"""Growth that hardly changes the picture: replace a Gaussian by two halves, side by side on its longest axis.
+"""Growth that hardly changes the image: replace a Gaussian by two halves, side by side on its longest axis.
 
-A clone of 3DGS doubles the opacity where it is put, and a child of its split lands at random: both spoil the picture,
+A clone of 3DGS doubles the opacity where it is put, and a child of its split lands at random: both spoil the image,
 and the next iterations repair it. Here the two halves together have the mean, the covariance and the optical depth of
 the Gaussian that they replace. With the offset d from its centre, in standard deviations along the longest axis k,
 

@@ -1,6 +1,6 @@
 """What the removal of each Gaussian would cost, in squared error, and which ones are not worth their place.
 
-:mod:`minisplat_ref.reference.removal` has S_i, the squared change of a picture without Gaussian i: where the training
+:mod:`minisplat_ref.reference.removal` has S_i, the squared change of an image without Gaussian i: where the training
 has converged, the increase of the squared error. Summed over the views it has a unit, unlike blend weight, which counts
 a Gaussian in front of others of the same colour as highly as one that alone shows something. Beside the squared error E
 of the N Gaussians, it is the slope of the curve of error over count at Gaussian i::
@@ -8,7 +8,7 @@ of the N Gaussians, it is the slope of the curve of error over count at Gaussian
     slope_i = N S_i / E = -(d ln E / d ln N)          3 slope_i dB for each doubling of the count
 
 The others learn to replace what is gone, so the true loss is smaller; and S is not additive. So Gaussians are removed a
-slice at a time, and S is computed anew when the training has gone on for a while.
+slice at a time, and S is computed again when the training has gone on for a while.
 """
 
 from collections.abc import Sequence

@@ -5,7 +5,7 @@
 :data:`ABLATION`            :mod:`.ablation`: what each mechanism of Mini-Splatting is worth
 :data:`CULLING`             :mod:`.culling`: what visibility culling removes, saves and costs
 :data:`SIMPLIFY`            :mod:`.simplify`: sampling, rank and mass, and merging at equal counts
-:data:`DEPTH`               :mod:`.depth_types`: from which depth Gaussians begin anew
+:data:`DEPTH`               :mod:`.depth_types`: from which depth Gaussians start again
 :data:`EXPOSURE`            :mod:`.exposures`: exposures that were disturbed, found again
 :data:`POSE`                :mod:`.poses`: poses that were disturbed, found again
 :data:`DEFECTS`             :mod:`.defects`: planted defects of photographs, found by ``adaptive`` where they are

@@ -6,7 +6,7 @@ A disturbance is the same for every recipe and seed, so that trainings under one
 =============  =====================================================================================================
 ``whole``      the scene as it is
 ``few``        every fifth training photograph
-``gains``      each training photograph is multiplied by a gain of its own
+``gains``      each training photograph is multiplied by its own gain
 ``few-gains``  both
 ``poses``      each training camera is turned by half a pixel
 ``sizes``      every second training photograph has half the width and height
@@ -22,7 +22,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.studies.defects import halve, multiply, under_a_sky, with_rotated_cameras
 from minisplat_ref.types import Scene
 
-FEW = 5  # one of every so many training photographs remains
+FEW = 5  # one of every few training photographs remains
 GAINS = (0.7, 1.4)  # of a photograph, uniform in the logarithm
 
 
@@ -32,7 +32,7 @@ def few_photographs(scene: Scene) -> Scene:
 
 
 def random_gains(scene: Scene) -> Scene:
-    """Return the scene with every training photograph multiplied by a gain of its own."""
+    """Return the scene with every training photograph multiplied by its own gain."""
     low, high = np.log(GAINS)
     return multiply(scene, np.exp(np.random.default_rng(0).uniform(low, high, len(scene.train_views))))
 

@@ -6,8 +6,8 @@ switched on. Its seed is used for the disturbance and the training.
 
 =========  ========================================================================================================
 ``clean``  the scene as it is; a real one may have defects of its own
-``gains``  each photograph is multiplied by a gain of its own, from 0.9 to 1.1
-``poses``  each camera is turned about an axis of its own, across its own, so that its image moves by half a pixel
+``gains``  each photograph is multiplied by its own gain, from 0.9 to 1.1
+``poses``  each camera is turned about its own axis, across its own, so that its image moves by half a pixel
 ``sizes``  each photograph has the half width and height, or not, by chance
 ``sky``    what is higher than 1.2 m becomes sky: two random colours, from the horizon to the zenith (synthetic scenes)
 =========  ========================================================================================================
@@ -46,7 +46,7 @@ CUT = 1.2  # metres
 
 
 def with_gains(scene: Scene, rng: np.random.Generator) -> Scene:
-    """Return the scene with every training photograph multiplied by a gain of its own."""
+    """Return the scene with every training photograph multiplied by its own gain."""
     return multiply(scene, rng.uniform(1 - LARGEST_GAIN, 1 + LARGEST_GAIN, len(scene.train_views)))
 
 

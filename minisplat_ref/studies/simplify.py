@@ -5,7 +5,7 @@ are then fine-tuned for the same number of iterations, without any event. A seed
 views. Gaussians that dominate no pixel are no candidates, whatever the choice. Pruning by mass keeps the same as rank
 and only determines the number by itself; so its number is one of those that are measured, and both share one line. The
 choices weigh by importance (equation 12 of Mini-Splatting) but for the last, which keeps those without which the
-pictures would change most (:mod:`minisplat_ref.strategy.removal`).
+images would change most (:mod:`minisplat_ref.strategy.removal`).
 
 Chamfer distances are those of the centres that are kept, before fine-tuning: the mean distance to the nearest point of
 a cloud, and the mean distance from the cloud's points to the nearest centre, added. The clouds are the dense

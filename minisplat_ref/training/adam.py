@@ -89,7 +89,7 @@ def adam_step(
     backend : Backend
         Implementation of the update.
     widths : mapping of str to ndarray of shape (N,)
-        For fields of which a row has only so many numbers, the first ones, to update; the others are neither read nor
+        For fields of which a row has only this many numbers, the first ones, to update; the others are neither read nor
         written.
 
     Returns

@@ -1,6 +1,6 @@
 """Catch numbers that are not finite where they arise, and name the first by stage, view and row.
 
-One NaN in a gradient is a NaN parameter after the step, and the projection culls what is not finite: the picture loses
+One NaN in a gradient is a NaN parameter after the step, and the projection culls what is not finite: the image loses
 a Gaussian, and nothing says so. The loss is checked in every iteration, which costs nothing; all parameters and their
 gradient every few iterations, and when rows are added or removed. If one of them is not finite, the view is rendered
 and differentiated again with a backend that checks every stage: the first whose output is not finite is the culprit.
@@ -147,7 +147,7 @@ class Guard(NamedTuple):
     """How often a training's numbers are checked, and what happens when one is not finite."""
 
     every: int = 10
-    """Parameters and gradient are checked every so many iterations, the loss in every one."""
+    """Parameters and gradient are checked at regular intervals, the loss in every one."""
     drops_steps: bool = False
     """Skip the step whose gradient is wrong, and go on; then every iteration is checked."""
     folder: Path | None = None

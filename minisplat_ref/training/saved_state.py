@@ -23,7 +23,7 @@ from minisplat_ref.training.schedule import Recipe, as_decided, describe
 from minisplat_ref.training.state import DEGREES, TrainState
 from minisplat_ref.types import Floats, Gaussians
 
-WAY_OUT = "give another checkpoint or train anew"
+WAY_OUT = "give another checkpoint or train again"
 N_STATE_BITS = 128  # of the generator PCG64
 MOMENTS = {"first": "gaussians", "second": "gaussians", "shared_first": "shared", "shared_second": "shared"}
 GAUSSIAN_SHAPES: Mapping[str, tuple[tuple[int, ...], ...]] = {

@@ -91,7 +91,7 @@ def _summed_products(a: Floats, b: Floats) -> Floats:
     return np.einsum("ip,jp->ij", *(np.ascontiguousarray(each.T, dtype=np.float64) for each in (a, b)))
 
 
-def sky_picture(camera: Camera, sky: Floats, dtype: np.dtype) -> Floats:
+def sky_image(camera: Camera, sky: Floats, dtype: np.dtype) -> Floats:
     """Return the colours [H, W, 3] of the sky alone."""
     rays = unit_rays(camera, np.arange(camera.height * camera.width), dtype)
     colors = sky_colors(rays, camera.cam_from_world_R.astype(dtype), sky.astype(dtype, copy=False))
@@ -118,7 +118,7 @@ def with_sky(inner: Renderer) -> Renderer:
             return inner.render(model, view, request)
         camera = with_principal_point(view.camera, request.conventions)
         if CHANGES in request.wants:
-            request = request._replace(behind=sky_picture(camera, model.shared[SKY], model.gaussians.means.dtype))
+            request = request._replace(behind=sky_image(camera, model.shared[SKY], model.gaussians.means.dtype))
         output, tape = inner.render(model, view, request)
         image, dtype = output.image.copy(), output.image.dtype  # the inner tape may refer to the original
         transmittance = 1 - output.alpha.ravel()

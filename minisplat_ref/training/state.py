@@ -22,7 +22,7 @@ from minisplat_ref.training.representation import GAUSSIANS, Representation
 from minisplat_ref.types import Floats, Gaussians, Ints, Model, RenderOutput, Scene, View
 
 DEGREES = "sh_degree"
-"""Name of the statistic by which each Gaussian has a degree of its spherical harmonics of its own."""
+"""Name of the statistic by which each Gaussian has a degree of the spherical harmonics for itself."""
 
 
 @dataclass

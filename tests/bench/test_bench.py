@@ -209,8 +209,8 @@ def test_command_writes_json_table_figure_and_page(bench_folder):
     table, page = ((bench_folder / name).read_text() for name in ("bench.md", "report.html"))
     for text in (table, page):
         assert all(name in text for name in expected)
-    picture = read_image(bench_folder / "bench.png")
-    assert picture.shape[1] > 800 and len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 20
+    image = read_image(bench_folder / "bench.png")
+    assert image.shape[1] > 800 and len(np.unique(image.reshape(-1, image.shape[2]), axis=0)) > 20
     assert page.count("<svg") == 4 and "6 of 6" in page
 
 

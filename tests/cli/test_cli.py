@@ -141,9 +141,9 @@ def test_renders_are_truth_render_error_side_by_side(run_folder, scene_folder):
     scene = load_scene(scene_folder, test_every=4)
     assert {path.stem for path in (run_folder / "renders").iterdir()} == {view.name for view in scene.test_views}
     view = scene.test_views[1]
-    picture = read_image(run_folder / "renders" / f"{view.name}.png")
-    assert picture.shape == (HEIGHT, 3 * WIDTH + 2 * GAP, 3)
-    truth, shown, error = (picture[:, start : start + WIDTH] for start in range(0, 3 * WIDTH, WIDTH + GAP))
+    strip = read_image(run_folder / "renders" / f"{view.name}.png")
+    assert strip.shape == (HEIGHT, 3 * WIDTH + 2 * GAP, 3)
+    truth, shown, error = (strip[:, start : start + WIDTH] for start in range(0, 3 * WIDTH, WIDTH + GAP))
     output, _ = render(load_ply(run_folder / "point_cloud.ply"), view.camera, backend=CPU)
     np.testing.assert_array_equal(truth, view.image)
     np.testing.assert_array_equal(shown, to_8_bits(output.image))
@@ -228,7 +228,7 @@ def test_render_test_views_with_depth(run_folder, scene_folder, tmp_path):
 
 
 def test_render_from_a_camera_file_equals_the_run_s_own(run_folder, tmp_path):
-    """cameras.json holds poses as position and rotation: the way there and back must not move the pictures."""
+    """cameras.json holds poses as position and rotation: the way there and back must not move the images."""
     cameras = run_folder / "cameras.json"
     assert main(["render", str(run_folder), "--cameras", "all", "--out", str(tmp_path / "own")]) == 0
     ply = str(run_folder / "point_cloud.ply")
@@ -242,10 +242,10 @@ def test_render_orbit_of_a_ply_beside_it(run_folder, tmp_path):
     ply = tmp_path / "thing.ply"
     ply.write_bytes((run_folder / "point_cloud.ply").read_bytes())
     assert main(["render", str(ply), "--frames", "3", "--size", "20x10", "--background", "255,0,0"]) == 0
-    pictures = sorted((tmp_path / "thing-views").glob("*.png"))
-    assert [path.name for path in pictures] == ["orbit_000.png", "orbit_001.png", "orbit_002.png"]
-    assert all(read_image(path).shape == (10, 20, 3) for path in pictures)
-    assert len({path.read_bytes() for path in pictures}) == 3
+    images = sorted((tmp_path / "thing-views").glob("*.png"))
+    assert [path.name for path in images] == ["orbit_000.png", "orbit_001.png", "orbit_002.png"]
+    assert all(read_image(path).shape == (10, 20, 3) for path in images)
+    assert len({path.read_bytes() for path in images}) == 3
 
 
 def test_zero_gaussians_render_the_background(run_folder, tmp_path):

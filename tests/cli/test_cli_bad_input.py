@@ -90,7 +90,7 @@ def test_folder_without_a_scene(train_refused, tmp_path):
 
 def test_missing_images_folder(train_refused, tmp_path):
     scene = write_colmap(tmp_path / "scene")
-    (scene / "images").rename(tmp_path / "pictures")
+    (scene / "images").rename(tmp_path / "images")
     assert "images/" in train_refused(scene)
 
 

@@ -178,15 +178,15 @@ def test_mesh(tmp_path):
 
 
 def test_no_gaussians(tmp_path, capsys):
-    with pytest.warns(InputWarning, match=r"here holds no Gaussians: every picture shows the background alone"):
+    with pytest.warns(InputWarning, match=r"here holds no Gaussians: every image shows the background alone"):
         warn_of_model(Model(no_gaussians()), "here")
     save_ply(tmp_path / "a.ply", no_gaussians())
     options = ["--frames", "1", "--size", "8x6", "--background", "255,0,0", "--out", str(tmp_path / "out")]
     assert main(["render", str(tmp_path / "a.ply"), *options]) == 0
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("minisplat-ref")]
     assert line.startswith(f"minisplat-ref: warning: {tmp_path / 'a.ply'} holds no Gaussians")
-    (picture,) = (tmp_path / "out").glob("*.png")
-    assert (read_image(picture) == [255, 0, 0]).all()
+    (image,) = (tmp_path / "out").glob("*.png")
+    assert (read_image(image) == [255, 0, 0]).all()
 
 
 # kernels

@@ -443,9 +443,9 @@ def test_difference_is_that_of_the_errors():
 
 
 def test_detail_is_where_an_edge_is():
-    picture = np.zeros((6, 8, 3), np.uint8)
-    picture[:, 4:] = 200
-    assert np.flatnonzero(detail(picture)[2]).tolist() == [3, 4]
+    image = np.zeros((6, 8, 3), np.uint8)
+    image[:, 4:] = 200
+    assert np.flatnonzero(detail(image)[2]).tolist() == [3, 4]
 
 
 def test_crops_show_what_differs(scene_folder):

@@ -87,7 +87,7 @@ def test_what_is_a_finding(tmp_path, read, finding):
 def test_dead_and_hanging_processes_are_findings(monkeypatch, read, finding):
     monkeypatch.setattr(run, "SILENT_SECONDS", 1.0)
     outcome = fuzz(fuzzed.reader(read), n_files=3)
-    assert outcome.n_files == 3  # each in a process of its own
+    assert outcome.n_files == 3  # each in a separate process
     assert [(found.what, found.n_files) for found in outcome.findings] == [(finding, 3)]
 
 

@@ -1,4 +1,4 @@
-"""A training that is killed goes on with the same bytes: five of the points of ``python -m data_tools.kill_points``."""
+"""A training that is killed continues with the same bytes: five points of ``python -m data_tools.kill_points``."""
 
 import json
 import shutil
@@ -13,7 +13,7 @@ SAMPLE = {
     "training: half of an Adam step": "iteration 0",
     "event: population new, moments old": "iteration 0",
     "checkpoint: the one before kept": "iteration 59, 1 unfinished",
-    "evaluation: first picture there": "iteration 240, 1 unfinished",
+    "evaluation: first image there": "iteration 240, 1 unfinished",
 }
 
 

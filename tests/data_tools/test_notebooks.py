@@ -33,7 +33,7 @@ def printed(text, name="stdout"):
     return nbformat.v4.new_output("stream", name=name, text=text)
 
 
-def picture(values):
+def image(values):
     return nbformat.v4.new_output("display_data", {"image/png": png(values), "text/plain": "<Figure>"})
 
 
@@ -69,7 +69,7 @@ def test_stored_notebook(path):
                 pngs.append(base64.b64decode(out.data["image/png"]))
         assert cell.get("execution_count") is None and "execution" not in cell.metadata
     assert len(pngs) >= 4 and max(map(len, pngs)) <= PNG_MAX
-    # A picture comes first: before a formula, and before the table of files.
+    # An image comes first: before a formula, and before the table of files.
     first = next(k for k, cell in enumerate(stored.cells) if any("data" in out for out in cell.get("outputs", [])))
     assert "$$" not in "".join(cell.source for cell in stored.cells[:first])
 
@@ -89,7 +89,7 @@ def test_notebook_imports_public_names_and_names_files_that_exist(path):
 
 
 def test_the_same_is_the_same():
-    old, new = (notebook_of(printed("a 1.25\n"), picture(GREY)) for _ in range(2))
+    old, new = (notebook_of(printed("a 1.25\n"), image(GREY)) for _ in range(2))
     assert list(differences(old, new)) == []
 
 
@@ -97,9 +97,9 @@ def test_the_same_is_the_same():
     ("old", "new", "what"),
     [
         (printed("a 1.25\n"), printed("a 1.26\n"), "1.26"),
-        (printed("a\n"), picture(GREY), "a picture"),
-        (picture(GREY), picture(GREY + 3), "3.00 of 255"),
-        (picture(GREY), picture(GREY[1:]), "24 x 15 pixels"),
+        (printed("a\n"), image(GREY), "an image"),
+        (image(GREY), image(GREY + 3), "3.00 of 255"),
+        (image(GREY), image(GREY[1:]), "24 x 15 pixels"),
     ],
 )
 def test_a_difference_is_named(old, new, what):
@@ -116,16 +116,16 @@ def test_tags_leave_room():
     assert list(differences(old, new)) == []
     [difference] = differences(old, notebook_of(printed("y 10.5 dB\n")))
     assert "y # dB" in difference
-    noisy = notebook_of(picture(GREY), tags=["rounding"])
-    assert list(differences(noisy, notebook_of(picture(GREY + 92)))) == []  # 0.6 times the 155 to a white page is 93
-    assert len(list(differences(noisy, notebook_of(picture(GREY + 94))))) == 1
+    noisy = notebook_of(image(GREY), tags=["rounding"])
+    assert list(differences(noisy, notebook_of(image(GREY + 92)))) == []  # 0.6 times the 155 to a white page is 93
+    assert len(list(differences(noisy, notebook_of(image(GREY + 94))))) == 1
     white = GREY + 155
     line, moved = (np.where(np.arange(24)[:, None] == column, 0, white) for column in (11, 12))
-    assert list(differences(notebook_of(picture(line), tags=["rounding"]), notebook_of(picture(moved)))) == []
-    assert len(list(differences(notebook_of(picture(line), tags=["rounding"]), notebook_of(picture(white))))) == 1
+    assert list(differences(notebook_of(image(line), tags=["rounding"]), notebook_of(image(moved)))) == []
+    assert len(list(differences(notebook_of(image(line), tags=["rounding"]), notebook_of(image(white))))) == 1
     timed = notebook_of(printed("3 s\n"), tags=["clock"])
     assert list(differences(timed, notebook_of(printed("4 ms\n")))) == []
-    assert len(list(differences(timed, notebook_of(picture(GREY))))) == 1
+    assert len(list(differences(timed, notebook_of(image(GREY))))) == 1
 
 
 def test_how_often_a_line_comes_is_rounding():
@@ -141,7 +141,7 @@ def test_errors_of_rounding_are_left_out():
 def test_what_changes_is_stripped():
     path = printed(f"{ROOT}/notebooks/x\n")
     result = nbformat.v4.new_output("execute_result", {"text/plain": "5"}, execution_count=7)
-    notebook = notebook_of(path, printed("a warning", name="stderr"), result, picture(GREY))
+    notebook = notebook_of(path, printed("a warning", name="stderr"), result, image(GREY))
     notebook.cells[0].execution_count = 3
     notebook.cells[0].metadata["execution"] = {"iopub.execute_input": "2024-01-01T00:00:00"}
     notebook.metadata["language_info"] = {"version": "3.11"}
@@ -152,10 +152,10 @@ def test_what_changes_is_stripped():
     assert list(cell.outputs[2].data) == ["image/png"]
 
 
-def test_a_large_picture_is_refused():
+def test_a_large_image_is_refused():
     noise = np.random.default_rng(0).integers(0, 256, (400, 400, 3))
-    with pytest.raises(notebooks.InputError, match=r"x, cell 0: its picture has [\d,]+ bytes, more than 100,000"):
-        strip_notebook(notebook_of(picture(noise)), "x")
+    with pytest.raises(notebooks.InputError, match=r"x, cell 0: its image has [\d,]+ bytes, more than 100,000"):
+        strip_notebook(notebook_of(image(noise)), "x")
 
 
 TEXT = """# %% [markdown]

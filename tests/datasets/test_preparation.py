@@ -88,7 +88,7 @@ def test_downscale_refuses(tmp_path, capsys, arguments, message):
     (tmp_path / "empty").mkdir()
     (tmp_path / "broken").mkdir()
     write_image(tmp_path / "broken" / "a.png", colored_image(1))
-    (tmp_path / "broken" / "b.png").write_text("no picture")
+    (tmp_path / "broken" / "b.png").write_text("no image")
     before = sorted(tmp_path.rglob("*"))
     assert_refused(capsys, tmp_path, main(["downscale", str(tmp_path / arguments[0]), *arguments[1:]]), message)
     assert sorted(tmp_path.rglob("*")) == before
@@ -239,7 +239,7 @@ def test_sfm_refuses(tmp_path, capsys):
         capsys, tmp_path, main(["sfm", str(photos), *out]), "another photograph is called b.jpg; give each its own"
     )
     (photos / "b.bmp").unlink()
-    (photos / "b.jpg").write_text("no picture")
+    (photos / "b.jpg").write_text("no image")
     assert_refused(capsys, tmp_path, main(["sfm", str(photos), *out]), "b.jpg: not an image that Pillow can read")
 
 

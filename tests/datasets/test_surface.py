@@ -86,7 +86,7 @@ def test_true_surface_is_what_the_training_views_show(synthetic, folder):
     scene = load_scene(folder, test_every=3)
     distances = np.linalg.norm(shown - np.mean([camera.center for camera in cameras], axis=0), axis=1)
     surface = true_surface(folder, scene)
-    assert len(surface.cloud.data) == np.count_nonzero(distances <= 3 * scene.extent) < len(shown)  # the meadow goes on
+    assert len(surface.cloud.data) == np.count_nonzero(distances <= 3 * scene.extent) < len(shown)  # a wide meadow
     assert cKDTree(shown).query(surface.cloud.data)[0].max() < 10 * SYNTHETIC_FLOAT32 * np.abs(surface.cloud.data).max()
 
 

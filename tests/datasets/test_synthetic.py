@@ -185,7 +185,7 @@ def test_camera_looks_at_target_upright():
     assert_allclose(pixels[0], [32, 24], rtol=CLOSED_FORM)
     assert_allclose(depths[0], np.linalg.norm(target - position), rtol=CLOSED_FORM)
     assert_allclose(pixels[1, 0], 32, rtol=CLOSED_FORM)
-    assert pixels[1, 1] < 24  # image y runs down, so up in the world is up in the picture
+    assert pixels[1, 1] < 24  # image y runs down, so up in the world is up in the image
 
 
 # --- truth: depth and normals ---
@@ -249,7 +249,7 @@ def test_sky_has_no_depth():
     is_sky = outdoor.train_depths == 0
     assert 0.1 < is_sky.mean() < 0.6
     assert np.all(np.isfinite(outdoor.train_depths))
-    assert is_sky[:, 0].mean() > 0.5  # the top of the pictures
+    assert is_sky[:, 0].mean() > 0.5  # the top of the images
     assert not is_sky[:, -1].any()  # their bottom
     assert np.all(outdoor.train_depths >= 0)
     assert np.all(make_scene("room", **SMALL).train_depths > 0)

@@ -154,7 +154,7 @@ def test_a_round_footprint_has_a_finite_gradient():
     assert all(np.isfinite(array).all() for array in v) and np.abs(v[1]).max() > 0
 
 
-# --- whole pictures ---
+# --- whole images ---
 
 
 def test_the_gradient_of_the_whole_model(backend):

@@ -131,7 +131,7 @@ def test_without_filters_it_is_3dgs_exactly(backend, dtype, rng):
             assert getattr(v.gaussians, name).tobytes() == getattr(v_other.gaussians, name).tobytes(), name
 
 
-def test_filters_change_the_picture(backend, rng):
+def test_filters_change_the_image(backend, rng):
     gaussians, view = make_gaussians(rng, 40), view_from(make_camera(rng=rng))
     images = [
         MIP.render(Model(with_filters(gaussians, np.full(40, sigma))), view, Request(backend=backend))[0].image
@@ -159,7 +159,7 @@ def test_a_wrong_gradient_is_found():
 
 
 def test_blocks_and_cameras_fit():
-    """A picture at a third of the size is the mean over blocks of what the camera with a third of the pixels sees."""
+    """An image at a third of the size is the mean over blocks of what the camera with a third of the pixels sees."""
     image = np.arange(7 * 10 * 3, dtype=float).reshape(7, 10, 3)
     small = sampling.block_means(image, 3)
     assert small.shape == (2, 3, 3)
@@ -228,8 +228,8 @@ def test_a_ply_is_drawn_with_its_filters_and_one_without_is_refused(run_folder, 
     ply, options = str(run_folder / "point_cloud.ply"), ["--cameras", str(run_folder / "cameras.json")]
     for name, extension in (("ours", ["--extension", "antialiasing"]), ("theirs", [])):
         assert main(["render", ply, *options, *extension, "--out", str(tmp_path / name)]) == 0
-    pictures = [{p.name: p.read_bytes() for p in (tmp_path / name).glob("*.png")} for name in ("ours", "theirs")]
-    assert pictures[0].keys() == pictures[1].keys() and pictures[0] != pictures[1]
+    images = [{p.name: p.read_bytes() for p in (tmp_path / name).glob("*.png")} for name in ("ours", "theirs")]
+    assert images[0].keys() == images[1].keys() and images[0] != images[1]
     save_ply(tmp_path / "plain.ply", load_ply(ply))
     assert main(["render", str(tmp_path / "plain.ply"), "--extension", "antialiasing"]) == 2
     assert "no property filter_sigmas" in capsys.readouterr().err

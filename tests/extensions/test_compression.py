@@ -283,17 +283,17 @@ def test_study_of_a_ply(run, tmp_path, capsys):
     assert "bytes per Gaussian" in capsys.readouterr().out
 
 
-def test_a_smaller_scene_is_the_same_picture_and_only_spz_suffers(run):
+def test_a_smaller_scene_is_the_same_image_and_only_spz_suffers(run):
     """At 1/512 of the size the step of SPZ, 2^-12, is an eighth of an original unit."""
     views, gaussians = load_scene(run.parent / "nook").test_views, load_ply(run / "point_cloud.ply")
-    pictures = []
+    images = []
     for factor in (1.0, 1 / 512):
         small, camera = rate_distortion.shrink(gaussians, factor), rate_distortion.shrink_camera(views[0], factor)
         conventions = GSPLAT_MAIN._replace(near_plane=factor * GSPLAT_MAIN.near_plane)
         files = [format_.decode(format_.encode(small, level), "") for format_, level in ((msz.MSZ, 5), (spz.SPZ, 0))]
         request = Request(conventions=conventions)
-        pictures.append([SPLATTING.render(Model(g), view_from(camera), request)[0].image for g in (small, *files)])
-    (large, large_msz, large_spz), (small, small_msz, small_spz) = pictures
+        images.append([SPLATTING.render(Model(g), view_from(camera), request)[0].image for g in (small, *files)])
+    (large, large_msz, large_spz), (small, small_msz, small_spz) = images
     assert np.abs(small - large).max() < 20 * PARITY_FLOAT32_IMAGE
     assert rms(small_msz - small) < 2 * rms(large_msz - large)
     assert rms(small_spz - small) > 2 * rms(large_spz - large)

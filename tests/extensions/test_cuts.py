@@ -142,7 +142,7 @@ def test_the_gradient_of_the_points(rng):
     )
 
 
-# --- whole pictures ---
+# --- whole images ---
 
 
 def test_needles_and_curves_through_the_centre(rng):

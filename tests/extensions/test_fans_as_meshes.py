@@ -47,7 +47,7 @@ def fans_of(rng, n, shape=FLAT, dtype=np.float64):
 
 
 def pieces(rng, n, shape, backend, dtype=np.float64):
-    """A picture of fans, and its gradient for random cotangents."""
+    """An image of fans, and its gradient for random cotangents."""
     fans, view = fans_of(rng, n, shape, dtype), view_from(make_camera(rng=rng))
     output, tape = render(Model(fans), view, Request(np.full(3, 0.3), backend=backend))
     v_image, v_alpha = rng.normal(size=output.image.shape), rng.normal(size=output.alpha.shape)
@@ -229,7 +229,7 @@ def test_colors_stay_in_range_and_faint_fans_go(rng):
 
 
 def test_the_best_shape_is_found_again(rng):
-    """Pictures of fans themselves, of another reach and rim than where the search begins."""
+    """Images of fans themselves, of another reach and rim than where the search begins."""
     g, view = make_gaussians(rng, 8), view_from(make_camera())
     target = render_clipped(convert_gaussians(g, FanShape(8, 2.0, 0.15)), view)
     found = best_shape(g, FanShape(), [view], [target], np.zeros(3))
@@ -349,10 +349,10 @@ def test_a_scene_is_refitted_drawn_and_exported(scene_folder, tmp_path, capsys):
     assert after > before + 0.2
     assert main([*tune[:4], str(again), *tune[5:]]) == 0 and again.read_bytes() == fans.read_bytes()
     cameras = ["--cameras", str(run / "cameras.json")]
-    assert main(["render", str(fans), "--extension", "fans", *cameras, "--out", str(tmp_path / "pictures")]) == 0
+    assert main(["render", str(fans), "--extension", "fans", *cameras, "--out", str(tmp_path / "images")]) == 0
     command = ["render", str(fans), "--extension", "fans", *cameras, "--depth", "--out", str(tmp_path / "depths")]
     assert main(command) == 2 and not (tmp_path / "depths").exists()
-    assert len(list((tmp_path / "pictures").glob("*.png"))) == 8
+    assert len(list((tmp_path / "images").glob("*.png"))) == 8
     capsys.readouterr()
     assert main(["fans", "export", str(fans), str(tmp_path / "mesh.ply")]) == 0
     assert f"{len(load_fans(fans).means):,} fans in" in capsys.readouterr().out

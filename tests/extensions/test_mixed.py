@@ -298,7 +298,7 @@ def test_hulls_that_make_no_difference_lose_vertices(rng):
 
 
 def test_needles_become_lines_and_discs_triangles_that_cover_as_much(rng):
-    """Whatever the order of the axes; the picture from the front stays nearly the same."""
+    """Whatever the order of the axes; the image from the front stays nearly the same."""
     log_scales = np.log([[0.05, 0.8, 0.05], [0.3, 0.01, 0.35], [0.3, 0.3, 0.3], [0.01, 0.01, 0.09]])
     population = as_ellipses(make_gaussians(rng, 4))._replace(log_scales=log_scales)
     after, changed = promote_kinds(population, ratio=6.0, size_limit=0.2)
@@ -377,8 +377,8 @@ def test_the_letter_is_a_silhouette():
     assert 0.05 < np.mean((image > 0) & (image < 0.79)) < 0.2
 
 
-@pytest.mark.parametrize(("name", "n_pictures"), [("shapes", 3), ("letter", 2)])
-def test_the_studies_of_pictures(name, n_pictures, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(("name", "n_images"), [("shapes", 3), ("letter", 2)])
+def test_the_studies_of_images(name, n_images, tmp_path, monkeypatch, capsys):
     from minisplat_ref.extensions.mixed import study
 
     monkeypatch.setitem(study.NUMBERS, name, {1: (1,), 2: (1,), 3: (1,)})
@@ -386,7 +386,7 @@ def test_the_studies_of_pictures(name, n_pictures, tmp_path, monkeypatch, capsys
     out = tmp_path / "study"
     assert main(["study", f"mixed/{name}", "--iterations", "3", "--seeds", "2", "--out", str(out)]) == 0
     result = json.loads((out / "result.json").read_text())
-    assert len(result["rows"]) == len(result["needed"]) == 3 * n_pictures
+    assert len(result["rows"]) == len(result["needed"]) == 3 * n_images
     assert (out / "figure.png").stat().st_size > 10_000 and "| triangles" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="2"):
         main(["study", f"mixed/{name}", "--seeds", "0", "--out", str(tmp_path / "none")])

@@ -387,8 +387,8 @@ def test_a_ply_is_drawn_with_its_extension(run_folder, tmp_path):
     ply, options = str(run_folder / "point_cloud.ply"), ["--cameras", str(run_folder / "cameras.json")]
     for name, extension in (("ours", ["--extension", "negative"]), ("theirs", [])):
         assert main(["render", ply, *options, *extension, "--out", str(tmp_path / name)]) == 0
-    pictures = [{p.name: p.read_bytes() for p in (tmp_path / name).iterdir()} for name in ("ours", "theirs")]
-    assert pictures[0].keys() == pictures[1].keys() and pictures[0] != pictures[1]
+    images = [{p.name: p.read_bytes() for p in (tmp_path / name).iterdir()} for name in ("ours", "theirs")]
+    assert images[0].keys() == images[1].keys() and images[0] != images[1]
 
 
 def test_interrupted_then_resumed_gives_the_bytes_of_an_uninterrupted_run(

@@ -335,13 +335,13 @@ def test_study(folders, tmp_path, capsys):
     assert counts == sorted(counts, reverse=True) and counts[1] == counts[2] < counts[0]
     losses = {field: of_seeds[0] for field, of_seeds in result["losses"].items()}
     assert set(losses) == set(Gaussians._fields) and all(len(of_levels) == 5 for of_levels in losses.values())
-    assert abs(losses["means"][0]) < 0.05  # half floats of a room of some metres, in pictures of 32 x 24
+    assert abs(losses["means"][0]) < 0.05  # half floats of a room of some metres, in images of 32 x 24
     assert (tmp_path / "out" / "figure.png").stat().st_size > 10_000
     assert "textured half" in capsys.readouterr().out
 
 
 def test_the_flatter_half_is_half():
-    """This holds for a picture whose right half is a ramp, and for one that is flat everywhere."""
+    """This holds for an image whose right half is a ramp, and for one that is flat everywhere."""
     pixels = np.zeros((4, 8, 3), np.uint8)
     pixels[:, 4:] = 20 * np.arange(1, 5)[None, :, None]
     assert_array_equal(study.flatter_half(pixels)[:, :3], True)

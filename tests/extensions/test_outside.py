@@ -1,4 +1,4 @@
-"""A stranger's extension in a folder of its own: everything works, from training to its own kernel, without an edit."""
+"""A stranger's extension in its own folder: everything works, from training to its own kernel, without an edit."""
 
 import json
 import os
@@ -247,7 +247,7 @@ def test_it_is_listed_and_described(stranger):
 
 def test_training_trains_it(run_folder):
     trained = read_vertices(run_folder / "point_cloud.ply")["glow"]
-    assert len(trained) >= N and trained.std() > 1e-3  # the pictures move it, and ...
+    assert len(trained) >= N and trained.std() > 1e-3  # the images move it, and ...
     assert abs(trained.mean() - 0.25) < 0.1  # ... the penalty keeps it near its target
     config = json.loads((run_folder / "config.json").read_text())
     assert config["recipe"]["losses"][1]["weight"] == 0.5
@@ -290,20 +290,20 @@ def test_its_ply_is_one_of_3dgs(run_folder):
 
 
 def test_an_edited_kernel_is_compiled_alone(stranger, run_folder):
-    """The picture changes, the kernels of the core stay as they are, and so does what the old kernel left."""
+    """The image changes, the kernels of the core stay as they are, and so does what the old kernel left."""
 
-    def picture(name):
+    def image(name):
         stranger.run("render", run_folder, "--out", stranger.folder / name)
         return np.stack([read_image(file) for file in sorted((stranger.folder / name).glob("*.png"))]).astype(int)
 
-    before, own, core = picture("before"), stranger.own_kernels(), stranger.core_kernels()
+    before, own, core = image("before"), stranger.own_kernels(), stranger.core_kernels()
     assert len(own) == 1 and len(core) > 10
-    assert_array_equal(picture("again"), before)
+    assert_array_equal(image("again"), before)
     assert (stranger.own_kernels(), stranger.core_kernels()) == (own, core)
 
     file = stranger.package / "kernels.py"
     file.write_text(file.read_text().replace("time * glow[n]", "time * glow[n] * 4"))
-    after, new = picture("after"), stranger.own_kernels()
+    after, new = image("after"), stranger.own_kernels()
     assert np.abs(after - before).max() > 3
     assert len(new) == 2 and new.items() > own.items()
     assert stranger.core_kernels() == core

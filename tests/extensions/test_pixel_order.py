@@ -124,7 +124,7 @@ def test_boxes_hold_what_is_seen_and_little_more(rng):
 
 
 def test_turning_changes_no_colour(rng):
-    """The whole renderer draws pictures of one pixel with a camera whose principal point follows a ray."""
+    """The whole renderer draws images of one pixel with a camera whose principal point follows a ray."""
     primitives, _ = clouds.cloud(40, rng)
     model = Model(as_gaussians(primitives, rng))
     eye = clouds.wide_camera()

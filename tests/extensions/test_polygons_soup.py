@@ -226,9 +226,9 @@ def test_a_bent_soup_is_drawn_as_it_is(rng):
     soup = soup_of(gaussians, 8)
     moved = claims.place_sheet(soup.corners)
     after, _ = carry_gaussians(gaussians, soup, moved, "it")
-    drawn = claims.picture_of_soup(gaussians, soup, moved)
+    drawn = claims.render_soup(gaussians, soup, moved)
     assert drawn.min() < 0.5
-    assert_allclose(claims.picture(after), drawn, atol=EDITED_IMAGE)
+    assert_allclose(claims.render_float64(after), drawn, atol=EDITED_IMAGE)
 
 
 def test_what_bending_costs_grows_with_the_angle_and_falls_with_the_number():
@@ -250,7 +250,7 @@ def test_the_studies_draw_and_print(tmp_path, capsys, monkeypatch):
     result = json.loads((out / "result.json").read_text())
     assert max(result["round trip"].values()) < PARITY_FLOAT64
     for name, errors in result["affine"].items():
-        assert errors["covariance, fit"] < AFFINE_EDIT and errors["picture"] < EDITED_IMAGE, name
+        assert errors["covariance, fit"] < AFFINE_EDIT and errors["image"] < EDITED_IMAGE, name
     assert result["affine"]["shear"]["covariance, Gram-Schmidt"] > 0.1
     assert (out / "figure.png").stat().st_size > 20_000 and "| shear" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="2"):

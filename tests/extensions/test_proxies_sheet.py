@@ -282,8 +282,8 @@ def test_fall_from_the_command_line(model, tmp_path, capsys):
     first, last = load_ply(model), load_ply(out / "frame_002.ply")
     assert_allclose(last.means, first.means + 0.02 * G, atol=1e-5)  # freely, in float32
     assert_allclose(load_mesh(out / "mesh.ply").vertices, flat_sheet().vertices + 0.02 * G, atol=CLOSED_FORM)
-    pictures = [read_image(out / f"frame_00{i}.png").astype(int) for i in range(3)]
-    assert pictures[0].max() > 50 and np.abs(pictures[0] - pictures[2]).max() > 20
+    images = [read_image(out / f"frame_00{i}.png").astype(int) for i in range(3)]
+    assert images[0].max() > 50 and np.abs(images[0] - images[2]).max() > 20
     records = json.loads((out / "energy.json").read_text())["frames"]
     assert [round(record["time"], 9) for record in records] == [0, 0.1, 0.2]
     assert_allclose([record["total"] for record in records], records[0]["total"], atol=1e-9)
@@ -358,7 +358,7 @@ def test_the_study_of_edits(tmp_path, capsys):
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     for errors in result["edits"].values():
         assert 0 < errors["centre"] < 1e-12 and 0 < errors["covariance"] < 1e-12 and 0 < errors["color"] < 1e-12
-    assert 0 < result["edits"]["rotation"]["picture"] < 1e-10 and result["edits"]["shear"]["picture"] is None
+    assert 0 < result["edits"]["rotation"]["image"] < 1e-10 and result["edits"]["shear"]["image"] is None
     bend = result["bend"]
     assert bend["centre"][-1] < bend["centre"][0] / 500  # second order over five halvings
     whole, lengths = bend["covariance"].values()

@@ -207,14 +207,14 @@ def test_draws_a_scene_with_all_there_is(ply, tmp_path, capsys):
     glass, block = ({"kind": kind, "mesh": "block.ply"} for kind in ("glass", "diffuse"))
     camera = {"position": [0, 0, 0], "rotation": np.eye(3).tolist(), "width": 32, "height": 24, "fx": 35, "fy": 35}
     (tmp_path / "cameras.json").write_text(json.dumps([{**camera, "img_name": "front"}]))
-    pictures = set()
+    images = set()
     for number, surfaces in enumerate(([], [mirror], [glass], [block])):
         scene = described(tmp_path, lights=[demo.LAMP.tolist()], bias=0.1, surfaces=surfaces)
         out = tmp_path / f"out{number}"
         options = ["--scene", str(scene), "--cameras", str(tmp_path / "cameras.json"), "--out", str(out)]
         assert main(["rays", "render", str(ply), *options]) == 0
-        pictures.add((out / "front.png").read_bytes())
-    assert len(pictures) == 4 and "1 pictures in" in capsys.readouterr().out
+        images.add((out / "front.png").read_bytes())
+    assert len(images) == 4 and "1 images in" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -128,12 +128,12 @@ def test_opacity_is_the_sigmoid_of_logit_and_texture(rng):
 
 
 def test_textures_of_zeros_have_a_gradient(rng):
-    """So training changes them; that they change no picture is tested for all payloads."""
+    """So training changes them; that they change no image is tested for all payloads."""
     _, v = drawn(RENDERER, with_textures(make_gaussians(rng, 30), 3), view_from(make_camera(rng=rng)), REFERENCE)
     assert np.abs(v.gaussians.color_textures).max() > 0 and np.abs(v.gaussians.opacity_textures).max() > 0
 
 
-# --- whole pictures ---
+# --- whole images ---
 
 
 def thin(rng):

@@ -52,7 +52,7 @@ def draw(gaussians, camera, time, **options):
 
 
 def test_a_gaussian_is_where_it_should_be():
-    """The picture of one round Gaussian that crosses the optical axis at time 0.5 is known in closed form."""
+    """The image of one round Gaussian that crosses the optical axis at time 0.5 is known in closed form."""
     z, sigma, opacity = 4.0, 0.3, 0.9
     velocity = np.array([1.0, -0.6, 2.0])
     means = np.array([[0.0, 0.0, z]]) - 0.5 * velocity
@@ -79,7 +79,7 @@ def test_a_gaussian_is_where_it_should_be():
 
 @pytest.mark.parametrize("time", [-0.5, 0.0, 0.25, 1.0])
 def test_a_moment_is_a_still_scene(time, backend, rng):
-    """At any time, the picture of moving Gaussians is that of static ones at the same positions."""
+    """At any time, the image of moving Gaussians is that of static ones at the same positions."""
     gaussians = as_dtype(make_gaussians(rng, 20), np.float32)
     velocities = (0.3 * rng.normal(size=(20, 3))).astype(np.float32)
     there = gaussians._replace(means=gaussians.means + np.float32(time) * velocities)
@@ -212,7 +212,7 @@ def test_the_study_prints_what_it_measures(capsys):
     assert "there is no study 'velocity/rest'" in capsys.readouterr().err
 
 
-# From a folder of photographs to pictures
+# From a folder of photographs to images
 
 
 @pytest.fixture(scope="module")
@@ -264,8 +264,8 @@ def test_training_moves_what_moves(run_folder, truth):
     assert (run_folder / "shared.npz").exists()  # of the exposures, which wrap the extension's renderer
 
 
-def test_pictures_are_of_their_times(run_folder, tmp_path, capsys):
-    """One camera at two times: the pictures differ; and a still population gives the same twice."""
+def test_images_are_of_their_times(run_folder, tmp_path, capsys):
+    """One camera at two times: the images differ; and a still population gives the same twice."""
     entry = json.loads((run_folder / "cameras.json").read_text())[0]
     cameras = [{**entry, "img_name": name, "time": time} for name, time in (("early", 0.0), ("late", 1.0))]
     (tmp_path / "cameras.json").write_text(json.dumps(cameras))

@@ -1,4 +1,4 @@
-"""VR: acuity and zones by hand, foveated pictures against whole ones, gradients, from end to end."""
+"""VR: acuity and zones by hand, foveated images against whole ones, gradients, from end to end."""
 
 import json
 
@@ -57,10 +57,10 @@ def test_weights_add_up_and_never_draw_too_coarsely():
         assert not weight[angles < begins].any() and weight.max() == 1
 
 
-# --- pictures ---
+# --- images ---
 
 
-def test_all_in_full_is_the_whole_picture(rng):
+def test_all_in_full_is_the_whole_image(rng):
     model = Model(make_gaussians(rng, 25))
     image, zones = render_foveated(model, CAMERA, REQUEST, Gaze(40, 30, 180.0), BUFFER)
     assert_array_equal(image, whole(model))
@@ -99,7 +99,7 @@ def test_weighted_psnr_counts_the_fovea(rng):
 
 @pytest.mark.parametrize("gaze", [Gaze(-1, 5, 8), Gaze(81, 5, 8), Gaze(5, 60.5, 8), Gaze(np.nan, 5, 8), Gaze(5, 5, -1)])
 def test_a_gaze_outside_is_refused(gaze, rng):
-    with pytest.raises(InputError, match=r"gaze .* lies outside picture|--full is -1 degrees"):
+    with pytest.raises(InputError, match=r"gaze .* lies outside image|--full is -1 degrees"):
         render_foveated(Model(make_gaussians(rng, 2)), CAMERA, REQUEST, gaze, BUFFER)
 
 
@@ -124,9 +124,9 @@ def test_trains_renders_and_studies(tmp_path, capsys):
     write_scene(make_scene("room", supersampling=1, **SCENE), scene, SCENE)
     options = ["--recipe", "vr", "--test-every", "4", "--iterations", "30", "--out", str(run)]
     assert main(["train", str(scene), *options]) == 0
-    ply, pictures = str(run / "point_cloud.ply"), tmp_path / "pictures"
-    assert main(["vr", "render", ply, "--gaze", "10,12", "--full", "4", "--out", str(pictures)]) == 0
-    assert len(list(pictures.glob("*.png"))) == 2 and "1 for 4 x 4" in capsys.readouterr().out
+    ply, images = str(run / "point_cloud.ply"), tmp_path / "images"
+    assert main(["vr", "render", ply, "--gaze", "10,12", "--full", "4", "--out", str(images)]) == 0
+    assert len(list(images.glob("*.png"))) == 2 and "1 for 4 x 4" in capsys.readouterr().out
     study = ["--ply", ply, "--repeats", "1", "--out", str(tmp_path / "study")]
     assert main(["study", "vr/foveation", str(scene), *study]) == 0
     rows = json.loads((tmp_path / "study" / "result.json").read_text())["rows"]

@@ -1,4 +1,4 @@
-"""A headless Chromium for tests: opens a page, runs script in it, presses keys, takes pictures.
+"""A headless Chromium for tests: opens a page, runs script in it, presses keys, takes images.
 
 It is driven through its DevTools protocol over two pipes, so nothing but the browser itself is needed. Where there is
 none, :func:`find_browser` says None and tests skip.
@@ -122,7 +122,7 @@ class Browser:
             url for url in urls[1:] if url.startswith("file:")
         ]
 
-    def picture(self, path: Path) -> None:
+    def image(self, path: Path) -> None:
         """Write the whole page as PNG."""
         data = self.send("Page.captureScreenshot", format="png", captureBeyondViewport=True)["data"]
         path.write_bytes(base64.b64decode(data))
@@ -134,7 +134,7 @@ def check_page(browser: Browser, path: Path) -> None:
         for is_dark in (False, True):
             browser.open(path, width=width, is_dark=is_dark)
             assert browser.complaints() == [] and browser.requests() == []
-            # Where the script has not run there are no pictures to compare, or something is wrong.
+            # Where the script has not run there are no images to compare, or something is wrong.
             assert browser.run("document.querySelectorAll('.slider:not(.live)').length") == 0
             assert browser.run("document.documentElement.scrollWidth") <= width, browser.run(TOO_WIDE)
             assert browser.run("[...document.images].every(image => image.naturalWidth > 0)")

@@ -1,4 +1,4 @@
-"""Readers that do what none may do, for tests of the fuzzing itself; a module of its own, for processes to import."""
+"""Readers that do what none may do, for tests of the fuzzing itself; its own module, for processes to import."""
 
 import os
 import time

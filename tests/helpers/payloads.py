@@ -96,10 +96,10 @@ CASES = {
 
 
 def drawn(renderer, population, view, backend, compared_to=None):
-    """Return a picture, and its gradient with random weights.
+    """Return an image, and its gradient with random weights.
 
     In float64 with the depth, as the oracle renders, so that both share the compiled kernels; without it if it is
-    compared to a picture in float32.
+    compared to an image in float32.
     """
     rng, dtype = np.random.default_rng(1), population.means.dtype
     wants = frozenset({"depth"} if np.dtype(compared_to or dtype) == np.float64 else ())

@@ -29,7 +29,7 @@ PLAIN = RECIPE._replace(iterations=60, events=())
 
 @pytest.fixture(scope="module")
 def scene():
-    """Pictures of 30 Gaussians, and their centres with wrong colours as the points to start from."""
+    """Images of 30 Gaussians, and their centres with wrong colours as the points to start from."""
     rng = np.random.default_rng(5)
     truth = as_dtype(make_gaussians(rng, N_GAUSSIANS), np.float32)
     views = []

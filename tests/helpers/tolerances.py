@@ -174,6 +174,6 @@ PLANE_DEPTH = 1e-10
 # The integral of a fan's profile by a sum over a grid of spacing 0.01, relative: its rim, a jump of up to one half, is
 # off by half a spacing of a reach of 2.
 PROFILE_GRID = 5e-3
-# The picture with and without a Gaussian, in float64: the difference has the rounding of both, 1e-16 for each of a few
+# The image with and without a Gaussian, in float64: the difference has the rounding of both, 1e-16 for each of a few
 # hits, relative to pixels of the order of one, of which a thousand are squared and summed.
 REMOVAL = 1e-10

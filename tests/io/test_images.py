@@ -126,7 +126,7 @@ def test_truncated_image(tmp_path, rng):
 
 
 def test_not_an_image(tmp_path):
-    (tmp_path / "a.png").write_text("no picture")
+    (tmp_path / "a.png").write_text("no image")
     with pytest.raises(InputError, match=r"a\.png: not an image .*; convert it to PNG or JPEG"):
         read_image(tmp_path / "a.png")
     with pytest.raises(InputError, match=r"b\.png: no such image"):

@@ -119,8 +119,8 @@ FLOATS = "{'descr': '<f4', 'fortran_order': False, 'shape': (%s), }"
 )
 def test_array_that_is_not_what_its_header_says(tmp_path, refused, part, reason):
     path = write_npz(tmp_path / "a.npz", [("a.npy", part)])
-    message = refused(read_npz, path, "write it anew")
-    assert reason in message and message.endswith("write it anew")
+    message = refused(read_npz, path, "write it again")
+    assert reason in message and message.endswith("write it again")
 
 
 def test_array_twice(tmp_path, refused):

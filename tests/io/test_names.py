@@ -139,10 +139,10 @@ def test_file_names():
 
 
 def test_scores_stay_in_their_folder(tmp_path, nothing_outside, monkeypatch):
-    """As a picture at the root of the file system did not, of a COLMAP model with absolute names."""
+    """As an image at the root of the file system did not, of a COLMAP model with absolute names."""
     scene = load_scene(write_transforms(tmp_path / "deep" / "scene", fl_x=40.0), test_every=0)
     view = scene.train_views[0]
-    views = tuple(view._replace(name=name) for name in (str(tmp_path / "deep" / "picture"), *NASTY))
+    views = tuple(view._replace(name=name) for name in (str(tmp_path / "deep" / "image"), *NASTY))
 
     def measure(scene, model, settings, on_view, network):
         for view in scene.test_views:
@@ -211,7 +211,7 @@ def test_undistort_refuses_one_image_twice(tmp_path):
 def test_cameras_of_a_file_are_rendered_into_their_folder(tmp_path, nothing_outside):
     cameras, out = tmp_path / "cameras.json", tmp_path / "deep" / "out"
     entry = {"width": 8, "height": 6, "fx": 9, "fy": 9, "position": [0, 0, -3], "rotation": np.eye(3).tolist()}
-    names = [str(tmp_path / "deep" / "picture"), *NASTY]
+    names = [str(tmp_path / "deep" / "image"), *NASTY]
     cameras.write_text(json.dumps([{**entry, "img_name": name} for name in names]))
     zeros = np.zeros((1, 3))
     save_ply(tmp_path / "a.ply", Gaussians(zeros, np.eye(1, 4), zeros, zeros[:, 0], zeros, np.zeros((1, 0, 3))))

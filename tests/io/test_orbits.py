@@ -91,15 +91,15 @@ def test_cameras_side_by_side():
 
 
 @pytest.fixture
-def pictures(tmp_path):
+def images(tmp_path):
     paths = [tmp_path / f"{k}.png" for k in range(3)]
     for k, path in enumerate(paths):
         write_image(path, np.full((7, 9, 3), 60 * k, np.uint8))
     return paths
 
 
-def test_gif_holds_the_pictures(tmp_path, pictures):
-    write_film(tmp_path / "a.gif", pictures, fps=20)
+def test_gif_holds_the_images(tmp_path, images):
+    write_film(tmp_path / "a.gif", images, fps=20)
     with Image.open(tmp_path / "a.gif") as film:
         assert (film.n_frames, film.size, film.info["duration"], film.info["loop"]) == (3, (9, 7), 50, 0)
         for k in range(3):
@@ -108,10 +108,10 @@ def test_gif_holds_the_pictures(tmp_path, pictures):
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # imageio-ffmpeg leaves pipes open
-def test_mp4_holds_the_pictures(tmp_path, pictures):
+def test_mp4_holds_the_images(tmp_path, images):
     imageio = pytest.importorskip("imageio.v2", reason="needs imageio, of the extra [video]")
     pytest.importorskip("imageio_ffmpeg", reason="needs ffmpeg, of the extra [video]")
-    write_film(tmp_path / "a.mp4", pictures, fps=20)
+    write_film(tmp_path / "a.mp4", images, fps=20)
     with imageio.get_reader(tmp_path / "a.mp4") as reader:
         frames = list(reader.iter_data())
     assert [frame.shape for frame in frames] == 3 * [(6, 8, 3)]

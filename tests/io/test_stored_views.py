@@ -308,7 +308,7 @@ def test_a_photograph_that_is_lost_in_training_is_named(scene, whole, tmp_path, 
         hide_at(7, path, patch, change)
         line = refused("train", scene, *OPTIONS, "--out", out)
     assert f"{path}: {text}" in line and "leave them as they are" in line
-    assert f"; to go on: minisplat-ref train --resume {out}" in line and readers() == []
+    assert f"; to continue: minisplat-ref train --resume {out}" in line and readers() == []
     path.with_suffix(".away").replace(path)
     assert main(["train", "--resume", str(out)]) == 0
     assert result(out) == whole

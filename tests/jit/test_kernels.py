@@ -301,7 +301,7 @@ np.savez(sys.argv[1], **arrays)
 
 
 def test_compiled_and_cached_kernels_give_the_same_bytes(tmp_path):
-    """Every stage, in both precisions, and a training; and the second process must not compile anything anew.
+    """Every stage, in both precisions, and a training; and the second process must not compile anything again.
 
     The body of a parallel loop is compiled two or three times, each time within other code, and a process that loads it
     may run another copy than the one that compiled it. The copies round alike if the same products are contracted in

@@ -43,7 +43,7 @@ def test_a_wrong_gradient_is_found(case, monkeypatch):
 )
 @pytest.mark.parametrize("size", [0.15, 0.6])
 def test_kernels_and_reference_agree(case, dtype, image_rel, gradient_rel, size, rng):
-    """The second scene has Gaussians as large as the picture, and the camera is inside some of them."""
+    """The second scene has Gaussians as large as the image, and the camera is inside some of them."""
     population, view = case.random(rng, make_gaussians(rng, 40, size=size)), view_from(make_camera(rng=rng))
     agree(case, population, view, dtype, image_rel, gradient_rel)
 

@@ -38,7 +38,7 @@ def soup(rng, n, size=0.5):
 
 
 def cards(depths, rgba):
-    """Triangles across the whole picture that face the camera, one colour each."""
+    """Triangles across the whole image that face the camera, one colour each."""
     one = np.array([[-9.0, -9, 1], [9, -9, 1], [0, 18, 1]])
     n = len(depths)
     vertices = (np.asarray(depths)[:, None, None] * one).reshape(-1, 3)
@@ -187,16 +187,16 @@ def test_the_gradient_by_differences(peeling, max_layers):
     )
     mesh.rgba[3:6, 3] = 1
 
-    def pictures(vertices, rgba, background, R, t):
+    def images(vertices, rgba, background, R, t):
         at = Frame(camera._replace(cam_from_world_R=R, cam_from_world_t=t), NEAR, max_layers)
         return peeling.peel(TranslucentMesh(vertices, rgba, mesh.faces), at, background)
 
     inputs = [mesh.vertices, mesh.rgba, BACKGROUND, camera.cam_from_world_R, camera.cam_from_world_t]
-    peeled = pictures(*inputs)
+    peeled = images(*inputs)
     assert peeled.n_layers.max() == 3
 
     def function(*inputs):
-        moved = pictures(*inputs)
+        moved = images(*inputs)
         assert_array_equal(moved.n_layers, peeled.n_layers)  # or a difference would be no derivative
         return moved.image, moved.alpha
 

@@ -1,4 +1,4 @@
-"""Mini-Splatting and Mini-Splatting2 as whole recipes, and their actions, on a scene of six tiny pictures."""
+"""Mini-Splatting and Mini-Splatting2 as whole recipes, and their actions, on a scene of six tiny images."""
 
 from functools import partial
 from types import SimpleNamespace
@@ -30,7 +30,7 @@ NEW_RECIPES = [name for name in RECIPES if name.startswith("mini-splatting")]
 
 @pytest.fixture(scope="module")
 def scene():
-    """Pictures of 60 Gaussians, and their centres with wrong colours as the points to start from."""
+    """Images of 60 Gaussians, and their centres with wrong colours as the points to start from."""
     rng = np.random.default_rng(5)
     truth = as_dtype(make_gaussians(rng, N_GAUSSIANS, sh_degree=0), np.float32)
     views = []

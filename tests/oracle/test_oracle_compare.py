@@ -337,7 +337,7 @@ def test_the_kernels_keep_the_rules_at_equality(backend, equality):
 
 
 def test_scenes_of_equality_are_for_float64():
-    with pytest.raises(InputError, match="can draw none of the scenes equality"):
+    with pytest.raises(InputError, match="can render none of the scenes equality"):
         choose_scenes(from_backend(CPU, "float32"), "equality", "reference", None)
     assert choose_scenes(from_backend(CPU, "float64"), "equality", "reference", None)[0]["equality"].is_exact
 
@@ -540,7 +540,7 @@ def test_the_truth_follows_the_renderers_rules():
     assert not scenes["sh3"].arrays["v_depths"].any()
     forced, _ = choose_scenes(renderer, "inria", "reference", "GSPLAT_MAIN")
     assert forced["inria"].conventions == GSPLAT_MAIN
-    with pytest.raises(InputError, match="can draw none of the scenes inria"):
+    with pytest.raises(InputError, match="can render none of the scenes inria"):
         choose_scenes(renderer, "inria", "reference", None)
 
 

@@ -74,7 +74,7 @@ def test_a_function_without_options_is_compared_without_depth(module, capsys):
     not_given = re.search("not given: (.*)", said.out)[1].split(", ")
     assert "view" in not_given and "v_means" in not_given and "features" not in not_given
     code, said = compare(capsys, "theirs:plain", "--scene", "antialiased")
-    assert code == 2 and "can draw none of the scenes antialiased" in said.err
+    assert code == 2 and "can render none of the scenes antialiased" in said.err
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from minisplat_ref.training.pace import Decision, Measurement, Pace
 LONG = "a_name_without_any_space_" * 12
 
 
-def picture(level, height=30, width=40):
+def image(level, height=30, width=40):
     return np.full((height, width, 3), level, np.uint8)
 
 
@@ -29,9 +29,9 @@ def specimen(tmp_path_factory):
     log = [{"step": k, "loss": 1 / k, "psnr": 20.0 + k, "n_gaussians": 10 * k} for k in range(1, 9)]
     parts = [
         cards([(LONG[:40], LONG), ("1", "figure")]),
-        section("Pictures", view_panel(LONG, picture(200), picture(100), picture(0))),
-        panel("two renders", [slider(picture(200), {"one": picture(100), "two": picture(50)})], 1),
-        add_caption(picture(9, 600, 600), "large"),
+        section("Images", view_panel(LONG, image(200), image(100), image(0))),
+        panel("two renders", [slider(image(200), {"one": image(100), "two": image(50)})], 1),
+        add_caption(image(9, 600, 600), "large"),
         section("Curves", *training_curves(log)),
         table([[LONG, LONG], ["b", "2"]]),
         table([[f"row_{k}", *["12.345"] * 20, LONG] for k in range(80)], [f"column {k}" for k in range(22)]),
@@ -86,8 +86,8 @@ def test_a_slider_shows_the_render_that_is_chosen(specimen, browser):
     assert browser.run(shown) == [True, False, True]
 
 
-def test_without_script_a_slider_is_two_pictures(specimen, browser):
-    """Their layout is read from the page's picture: no script, no questions."""
+def test_without_script_a_slider_is_two_images(specimen, browser):
+    """Their layout is read from the page's image: no script, no questions."""
     browser.open(specimen, width=1280, has_script=False)
     nodes = browser.send("DOM.getDocument", depth=-1)["root"]["nodeId"]
     images = browser.send("DOM.querySelectorAll", nodeId=nodes, selector=".slider:not(.live) img")["nodeIds"]
@@ -157,7 +157,7 @@ def test_decisions_are_told_with_their_evidence():
     assert "from 21.00 dB after 100 iterations to 28.00 dB after 800" in text
     assert "After iteration 800 the rates began to fall: they gain little (standard error 0.05 dB)." in text
     assert "After iteration 801 it pruned: 9 of 10 carry 0.98." in text and text.endswith(
-        "went on to iteration 1,280, its end."
+        "continued to iteration 1,280, its end."
     )
     page_ = decisions_section(PACE, 1280)
     assert page_.count("<svg") == 2 and "A red line has the slope" in page_ and "0.050" in page_
@@ -172,18 +172,18 @@ def test_a_training_that_was_stopped_says_so():
 # Pieces
 
 
-def test_pictures_come_apart_as_they_were_joined(rng):
+def test_images_come_apart_as_they_were_joined(rng):
     parts = [rng.integers(0, 256, (5, 7, 3), dtype=np.uint8) for _ in range(3)]
     assert all(np.array_equal(a, b) for a, b in zip(split_images(side_by_side(parts), 3), parts, strict=True))
 
 
-def test_large_pictures_are_averaged_down():
-    assert fit_image(picture(80, 300, 400), 100).shape == (75, 100, 3) and fit_image(picture(80), 100).shape == (
+def test_large_images_are_averaged_down():
+    assert fit_image(image(80, 300, 400), 100).shape == (75, 100, 3) and fit_image(image(80), 100).shape == (
         30,
         40,
         3,
     )
-    assert np.all(fit_image(picture(80, 300, 400), 100) == 80)
+    assert np.all(fit_image(image(80, 300, 400), 100) == 80)
 
 
 def test_paths_in_a_command_are_absolute_and_quoted(monkeypatch, tmp_path):

@@ -98,7 +98,7 @@ def test_what_all_views_have_in_common_is_no_error():
     assert drop == 0.5 and error == 0.0
 
 
-def test_drop_of_equal_pictures_and_of_one_view():
+def test_drop_of_equal_images_and_of_one_view():
     drop, error = paired_drop((math.inf, math.inf), (math.inf, PSNR_MAX - 1.0))
     assert drop == 0.5 and error == 0.5
     drop, error = paired_drop((30.0,), (29.0,))
@@ -176,7 +176,7 @@ def test_rates_stay_at_their_last(name):
 
 
 def test_held_out_views_do_not_enter_the_fine_tuning(run_folder, monkeypatch):
-    """Which is told by the views that the loop reports: without holding out, all come up."""
+    """Which is measured by the views that the loop reports: without holding out, all come up."""
     run, seen = open_run(run_folder), {}
 
     def watched(*args, on_step, **named):

@@ -48,7 +48,7 @@ def test_finest_that_fits_and_coarsest_that_is_good_enough():
 
 
 def test_a_drop_that_is_rounding_is_none():
-    """Another order of equal depths changes a picture in its last bits: level 0 loses nothing all the same."""
+    """Another order of equal depths changes an image in its last bits: level 0 loses nothing all the same."""
     gaussians = population(20)
 
     def psnr_of(given):
@@ -169,14 +169,14 @@ def test_further_fields_need_a_ply(run, tmp_path, one_line, capfd):
 
 
 def test_compact_files_are_drawn_and_measured_and_described(run, tmp_path, capsys):
-    """At level 0 every picture and every measure is that of the run, but for the order, which nothing depends on."""
+    """At level 0 every image and every measure is that of the run, but for the order, which nothing depends on."""
     convert(run, tmp_path / "a.msz", "--level", "0")
     cameras = ["--cameras", str(run / "cameras.json")]
     for source, out in ((tmp_path / "a.msz", "one"), (run / "point_cloud.ply", "other")):
         assert main(["render", str(source), *cameras, "--out", str(tmp_path / out)]) == 0
-    pictures = sorted((tmp_path / "one").glob("*.png"))
-    assert len(pictures) == 8
-    for path in pictures:
+    images = sorted((tmp_path / "one").glob("*.png"))
+    assert len(images) == 8
+    for path in images:
         assert path.read_bytes() == (tmp_path / "other" / path.name).read_bytes()
     before = json.loads((run / "metrics.json").read_text())
     assert main(["eval", str(run), "--model", str(tmp_path / "a.msz"), "--out", str(tmp_path / "eval")]) == 0

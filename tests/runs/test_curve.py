@@ -127,7 +127,7 @@ def test_records_after_the_checkpoint_are_dropped(tmp_path):
     assert [record["step"] for record in read_log(path)] == [5, 10]
 
 
-def test_equal_pictures_have_a_psnr_that_json_can_hold(tmp_path):
+def test_equal_images_have_a_psnr_that_json_can_hold(tmp_path):
     path = tmp_path / "curve.jsonl"
     curve.append(path, 1, 0.5, Evaluation(float("inf"), 1.0, None, None, []), 7)
     assert read_log(path)[0]["psnr"] == 100.0

@@ -1,4 +1,4 @@
-"""What training and pictures take of memory, what there is, and how what does not fit is refused."""
+"""What training and images take of memory, what there is, and how what does not fit is refused."""
 
 import math
 import resource
@@ -77,7 +77,7 @@ def test_rows_that_fit(free, rows):
     assert memory.rows_that_fit(0, 0, 0, free) == math.inf
 
 
-def test_a_picture_that_does_not_fit_names_the_size_that_does(monkeypatch):
+def test_a_image_that_does_not_fit_names_the_size_that_does(monkeypatch):
     monkeypatch.setattr(memory, "free_bytes", lambda: 6.5e9)
     memory.check_render_size(10_000, 10_000, with_depth=False)
     with pytest.raises(InputError, match=r"20000x10000 takes about 13.0 GB, 6.5 GB are free: 14142x7071 fits"):

@@ -53,7 +53,7 @@ def scene(original, tmp_path):
 
 @pytest.fixture
 def done(scene, tmp_path):
-    """A finished training on a scene of its own, which may be changed."""
+    """A finished training on its own scene, which may be changed."""
     assert main(["train", str(scene), *OPTIONS, "--out", str(tmp_path / "run")]) == 0
     return tmp_path / "run"
 
@@ -199,7 +199,7 @@ def test_measuring_other_photographs_needs_a_place_for_it(done, scene, tmp_path,
     assert f"{out} holds something other than an evaluation" in refused("eval", done, "--out", out)
 
 
-def test_pictures_of_views_that_are_no_more_do_not_stay(done):
+def test_images_of_views_that_are_no_more_do_not_stay(done):
     write_image(done / "renders" / "of_long_ago.png", np.zeros((4, 4, 3), np.uint8))
     assert main(["eval", str(done)]) == 0
     assert {path.stem for path in (done / "renders").iterdir()} == {"view_0000", "view_0004"}
@@ -325,7 +325,7 @@ def killed(original, tmp_path, monkeypatch):
     return folder
 
 
-def test_pictures_and_a_ply_of_a_killed_run(killed, tmp_path, capfd):
+def test_images_and_a_ply_of_a_killed_run(killed, tmp_path, capfd):
     assert main(["render", str(killed), "--out", str(tmp_path / "views")]) == 0
     assert f"{killed} has not ended: this is its checkpoint of iteration 15" in capfd.readouterr().err
     expected = ["render", str(tmp_path / "expected.ply"), "--cameras", str(killed / "cameras.json")]
@@ -381,14 +381,14 @@ def test_two_trainings_do_not_write_into_one_folder(original, tmp_path, refused)
 
 
 def test_a_failure_in_the_middle_of_an_iteration_keeps_the_last_checkpoint(original, finished, tmp_path, refused):
-    """An event that fails half-way: what is saved is whole, and the run goes on from there."""
+    """An event that fails half-way: what is saved is whole, and the run continues from there."""
     folder = tmp_path / "run"
     get_backend = run.get_backend
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(checkpoints, "SECONDS", -1.0)
         patch.setattr(run, "get_backend", lambda name: replace(get_backend(name), adam_update=failing_adam(6 * 13 + 2)))
         line = refused("train", original, *OPTIONS, "--out", folder)
-    assert line.endswith(f"too much; iteration 13 is saved; to go on: minisplat-ref train --resume {folder}")
+    assert line.endswith(f"too much; iteration 13 is saved; to continue: minisplat-ref train --resume {folder}")
     assert main(["train", "--resume", str(folder)]) == 0
     assert (folder / "point_cloud.ply").read_bytes() == (finished / "point_cloud.ply").read_bytes()
 
@@ -446,7 +446,7 @@ def test_a_log_that_cannot_be_written_stops_with_all_saved(original, finished, t
         patch.setattr("minisplat_ref.runs.progress.open", no_space, raising=False)
         line = refused("train", original, *OPTIONS, "--out", folder)
     assert f"{folder / 'log.jsonl'} cannot be written (No space left on device): make room" in line
-    assert line.endswith(f"iteration 15 is saved; to go on: minisplat-ref train --resume {folder}")
+    assert line.endswith(f"iteration 15 is saved; to continue: minisplat-ref train --resume {folder}")
     assert main(["train", "--resume", str(folder)]) == 0
     assert (folder / "point_cloud.ply").read_bytes() == (finished / "point_cloud.ply").read_bytes()
 
@@ -528,10 +528,10 @@ def test_ctrl_c_while_compiling_is_heard_at_once(original, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-# --- pictures ---
+# --- images ---
 
 
-def test_pictures_of_an_earlier_rendering_do_not_stay(done, capsys):
+def test_images_of_an_earlier_rendering_do_not_stay(done, capsys):
     for frames in (5, 2):
         options = ["--cameras", "orbit", "--frames", str(frames), "--size", "8x6", "--depth"]
         assert main(["render", str(done), *options]) == 0
@@ -541,24 +541,24 @@ def test_pictures_of_an_earlier_rendering_do_not_stay(done, capsys):
     assert names == {"view_0000.png", "view_0004.png", "pictures.json"}
 
 
-def test_pictures_of_somebody_else_are_not_touched(done, tmp_path, refused):
+def test_images_of_somebody_else_are_not_touched(done, tmp_path, refused):
     out = tmp_path / "holidays"
     out.mkdir()
     (out / "beach.png").write_bytes(b"")
     (out / "notes.txt").write_text("")
     line = refused("render", done, "--out", out)
-    assert f"{out} holds pictures other than those of a rendering, such as beach.png" in line
+    assert f"{out} holds images other than those of a rendering, such as beach.png" in line
     assert {path.name for path in out.iterdir()} == {"beach.png", "notes.txt"}
     (out / "beach.png").unlink()
-    (out / "pictures.json").write_text('{"pictures": ["../../run/checkpoint", "../x"]}')
+    (out / "pictures.json").write_text('{"images": ["../../run/checkpoint", "../x"]}')
     (tmp_path / "x.png").write_bytes(b"")
     assert main(["render", str(done), "--out", str(out)]) == 0
     assert (tmp_path / "x.png").exists() and (out / "notes.txt").exists()
 
 
-def test_a_picture_that_does_not_fit_into_memory_is_foreseen(done, refused):
+def test_a_image_that_does_not_fit_into_memory_is_foreseen(done, refused):
     line = refused("render", done, "--cameras", "orbit", "--size", "1000000x1000000")
-    assert "a picture of 1000000x1000000 takes about 65000.0 GB" in line and re.search(r"\d+x\d+ fits", line)
+    assert "an image of 1000000x1000000 takes about 65000.0 GB" in line and re.search(r"\d+x\d+ fits", line)
     assert not (done / "views").exists()
 
 
@@ -584,7 +584,7 @@ def test_densification_that_does_not_fit_stops_with_all_saved(original, tmp_path
     out = tmp_path / "run"
     line = refused("train", original, *options, "--set", "threshold=0", "--out", out)
     assert "there is no memory for 120 Gaussians, only for some 90: train on smaller photographs" in line
-    step = int(re.search(r"iteration (\d+) is saved; to go on: ", line)[1])
+    step = int(re.search(r"iteration (\d+) is saved; to continue: ", line)[1])
     recipe = get_recipe("3dgs-accel", 240)
     densify = next(event for event in recipe.events if action_name(event) == "clone_and_split")
     assert densify.is_due(step + 1) and not any(densify.is_due(earlier) for earlier in range(1, step + 1))
@@ -614,7 +614,7 @@ def test_a_schedule_is_stretched_where_that_is_asked_for(done, capsys):
 
 
 def test_killed_between_the_settings_and_the_checkpoint_of_a_stretched_schedule(done, tmp_path, capsys):
-    """config.json says 40 already, the checkpoint still 20: it goes on as was asked."""
+    """config.json says 40 already, the checkpoint still 20: it continues as was asked."""
     straight = shutil.copytree(done, tmp_path / "straight")
     assert main(["train", "--resume", str(straight), "--iterations", "40", "--rescale"]) == 0
     config = read_json(done / "config.json")
@@ -648,7 +648,7 @@ def test_a_nan_stops_the_run_with_all_saved_and_can_be_dropped(original, tmp_pat
         path = folder / "bad-numbers-10.npz"
         assert re.search(r"iteration 10, view view_000\d, project_vjp: v_quats is nan in row 5 of 60; ", line)
         assert f"minisplat-ref oracle replay {path} shows it" in line
-        assert line.endswith(f"iteration 9 is saved; to go on: minisplat-ref train --resume {folder}")
+        assert line.endswith(f"iteration 9 is saved; to continue: minisplat-ref train --resume {folder}")
         drawn[:] = [None] * 9
         assert main(["train", "--resume", str(folder), "--drop-bad-steps"]) == 0
     assert "v_quats is nan in row 5 of 60; step left out" in capfd.readouterr().err
@@ -691,5 +691,5 @@ def test_an_error_of_the_program_keeps_its_traceback_and_the_work(original, tmp_
         with pytest.raises(ZeroDivisionError) as caught:
             main(["train", "--resume", str(folder)])
     (note,) = caught.value.__notes__
-    assert note == f"minisplat-ref: stopped; iteration 12 is saved; to go on: minisplat-ref train --resume {folder}"
+    assert note == f"minisplat-ref: stopped; iteration 12 is saved; to continue: minisplat-ref train --resume {folder}"
     assert main(["train", "--resume", str(folder)]) == 0

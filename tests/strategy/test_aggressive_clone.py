@@ -116,7 +116,7 @@ def test_the_old_population_is_not_written(rng):
         assert_array_equal(field, old)
 
 
-def test_the_picture_stays(rng):
+def test_the_image_stays(rng):
     """One Gaussian, rendered: two shared copies change the alpha a fifth as much as two plain ones, or less."""
     gaussians, camera = make_gaussians(rng, 1, opacity_logit=1.0), make_camera(64, 48, fx=90.0, fy=90.0)
     gaussians = gaussians._replace(means=np.array([[0.0, 0.0, 3.0]]))

@@ -111,7 +111,7 @@ def test_points_fall_back_on_the_centres_of_their_pixels(points_of, backend, rng
 
 @ALL_KINDS
 def test_principal_point_is_the_conventions(points_of, rng):
-    """INRIA's rasteriser takes it for the image's centre, so the rays of its pictures go through there."""
+    """INRIA's rasteriser takes it for the image's centre, so the rays of its images go through there."""
     gaussians, moved, centred = make_gaussians(rng, 60), make_camera(cx=10.0, cy=11.0), make_camera()
     for of_moved, of_centred in zip(
         points_of(gaussians, view_from(moved), RenderSettings(conventions=INRIA)),
@@ -402,5 +402,5 @@ def test_depths_that_do_not_fit_into_memory_are_one_clear_line(rng, monkeypatch)
     with pytest.raises(InputError, match=r"depths of all 3 views take 10 kB of memory, 10 kB are free: .*3dgs-accel"):
         draw(views, 100, given(), rng)
     monkeypatch.setattr(memory, "free_bytes", lambda: 8.0 * 3 * 24 * 18)
-    with pytest.raises(InputError, match="lower min_alpha"):  # it went on
+    with pytest.raises(InputError, match="lower min_alpha"):  # it continued
         draw(views, 100, midpoint_points, rng, gaussians=make_gaussians(rng, 0))

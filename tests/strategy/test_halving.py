@@ -86,7 +86,7 @@ def test_logits_of_any_size(dtype):
     assert_allclose(thin_logits(logits, 1.0), logits, rtol=1e-6, atol=1e-6)
 
 
-def test_the_picture_hardly_changes(rng):
+def test_the_image_hardly_changes(rng):
     """Unlike that of a plain clone, which is more opaque; the rest is the mixture's flatter top."""
     gaussians, camera = make_gaussians(rng, 1, size=0.3), make_camera()
     gaussians = gaussians._replace(opacity_logits=np.zeros(1))

@@ -1,4 +1,4 @@
-"""What the removal of each Gaussian changes, against the picture without it, and which are not worth their place."""
+"""What the removal of each Gaussian changes, against the image without it, and which are not worth their place."""
 
 import numba
 import numpy as np
@@ -38,7 +38,7 @@ def changes_of(gaussians, camera, backend):
     return SPLATTING.render(Model(gaussians), view_from(camera), request)[0].extras["removal_changes"]
 
 
-def picture(gaussians, camera, backend, without=None):
+def render_without(gaussians, camera, backend, without=None):
     is_visible = None if without is None else np.arange(len(gaussians.means)) != without
     return render(gaussians, camera, background=BACKGROUND, backend=backend, is_visible=is_visible)[0].image
 
@@ -46,10 +46,10 @@ def picture(gaussians, camera, backend, without=None):
 # One view -------------------------------------------------------------------------------------------------------------
 
 
-def test_it_is_the_squared_change_of_the_picture_without_each(backend, gaussians, camera):
+def test_it_is_the_squared_change_of_the_image_without_each(backend, gaussians, camera):
     gaussians.opacity_logits[0] = 9  # clamped
-    whole = picture(gaussians, camera, backend)
-    expected = [np.sum((picture(gaussians, camera, backend, i) - whole) ** 2) for i in range(N)]
+    whole = render_without(gaussians, camera, backend)
+    expected = [np.sum((render_without(gaussians, camera, backend, i) - whole) ** 2) for i in range(N)]
     changes = changes_of(gaussians, camera, backend)
     assert_allclose(changes, expected, rtol=REMOVAL, atol=REMOVAL)
     assert np.count_nonzero(changes) >= 15 and not changes[-2:].any()
@@ -62,7 +62,7 @@ def test_with_the_gradient_it_is_the_change_of_the_squared_error(backend, gaussi
     residual = output.image - photograph
     v_logits = render_vjp(tape, 2 * residual).gaussians.opacity_logits
     gradients = v_logits * (1 + np.exp(gaussians.opacity_logits))  # divided by 1 - o
-    without = [np.sum((picture(gaussians, camera, backend, i) - photograph) ** 2) for i in range(N)]
+    without = [np.sum((render_without(gaussians, camera, backend, i) - photograph) ** 2) for i in range(N)]
     exact = without - np.sum(residual**2)
     assert_allclose(changes_of(gaussians, camera, backend) - gradients, exact, rtol=REMOVAL, atol=REMOVAL)
     assert exact.min() < 0 < exact.max()  # some are in the way
@@ -105,7 +105,7 @@ def test_costs_are_sums_over_views(gaussians, camera, rng):
     views = [View(str(i), cameras[i], photographs[i], (None, mask)[i]) for i in range(2)]
     costs = collect_removal_costs(gaussians, views, RenderSettings(BACKGROUND))
     assert_allclose(costs.changes, sum(changes_of(gaussians, own, CPU) for own in cameras), rtol=PARITY_FLOAT64)
-    errors = [(picture(gaussians, own, CPU) - p / 255) ** 2 for own, p in zip(cameras, photographs, strict=True)]
+    errors = [(render_without(gaussians, own, CPU) - p / 255) ** 2 for own, p in zip(cameras, photographs, strict=True)]
     assert_allclose(costs.squared_error, errors[0].sum() + errors[1][mask].sum(), rtol=PARITY_FLOAT32_IMAGE)
     assert_allclose(costs.slopes, N * costs.changes / costs.squared_error, rtol=PARITY_FLOAT64)
 
@@ -148,12 +148,12 @@ def exact_costs(gaussians, views):
 
 
 def test_the_exact_change_is_that_of_the_photographs_squared_error(gaussians, camera, rng):
-    """S is the part of it that is no gradient, and the whole is that of the pictures without each Gaussian."""
+    """S is the part of it that is no gradient, and the whole is that of the images without each Gaussian."""
     photographs = rng.integers(0, 256, (2, 29, 37, 3), dtype=np.uint8)
     views = [View(str(i), camera, photographs[i], None) for i in range(2)]
 
     def squared_error(without=None):
-        image = picture(gaussians, camera, CPU, without)
+        image = render_without(gaussians, camera, CPU, without)
         return np.sum((image - photographs / np.float32(255)) ** 2)
 
     costs = exact_costs(gaussians, views)

@@ -24,7 +24,7 @@ def scene_folder(tmp_path_factory):
 
 
 def read_result(folder):
-    """The JSON, and a figure that is a picture with something in it."""
+    """The JSON, and a figure that is an image with something in it."""
     assert sorted(path.name for path in folder.iterdir()) == sorted([FIGURE, RESULT])
     assert read_image(folder / FIGURE).std() > 1
     return json.loads((folder / RESULT).read_text())

@@ -97,7 +97,7 @@ def test_each_point_is_on_the_ray_of_its_pixel(outdoor, rng):
 def test_the_backdrop_survives_density_control(outdoor):
     """What was sent 30 extents away is still there when simplification comes: with the size limit of 3DGS it was not.
 
-    In 900 iterations, density control follows once on the last reinitialisation, 48 iterations later. In pictures as
+    In 900 iterations, density control follows once on the last reinitialisation, 48 iterations later. In images as
     coarse as these half of the backdrop is large even for its distance.
     """
     recipe = get_recipe("mini-splatting", 900)

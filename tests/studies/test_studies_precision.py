@@ -23,7 +23,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def states(scene):
-    """One training of a recipe that begins anew half way, for each precision."""
+    """One training of a recipe that starts again half way, for each precision."""
     recipe = get_recipe("mini-splatting", ITERATIONS)
     return {name: train_in_precision(scene, recipe, each, 0) for name, each in PRECISIONS.items()}
 
@@ -82,5 +82,5 @@ def test_command(tmp_path, capsys):
     assert result["summary"]["float64"]["difference"][0] == pytest.approx(np.mean(by_hand))
     printed = capsys.readouterr().out
     assert all(f"| {name} " in printed for name in (*PRECISIONS, STORED))
-    assert main(["study", "precision", str(tmp_path / "room"), *options]) == 0, "goes on, with nothing left to do"
+    assert main(["study", "precision", str(tmp_path / "room"), *options]) == 0, "continues, with nothing left to do"
     assert len((tmp_path / "out" / "runs.jsonl").read_text().splitlines()) == 1 + 2 * 5

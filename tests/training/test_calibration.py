@@ -49,7 +49,7 @@ CALIBRATED = with_poses(with_exposures(SPLATTING))
 BACKGROUND = np.array([0.2, 0.5, 0.8])
 DEPTH = frozenset({"depth"})
 
-# Angles with a formula of their own each: none, rounding alone, both sides of the series' limit, usual, half a turn.
+# Angles with their own formula each: none, rounding alone, both sides of the series' limit, usual, half a turn.
 ANGLES = (0.0, 1e-9, 1e-5, 0.9 * ANGLE_MIN, 1.1 * ANGLE_MIN, 1.0, np.pi - 1e-6)
 
 # A Jacobian by central differences with a step of 1e-6: 1e-12 times third derivatives of order 1, 1e-16 by 1e-6.

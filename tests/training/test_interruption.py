@@ -45,7 +45,7 @@ def test_ctrl_c_while_a_view_is_drawn_comes_at_once(scene, uninterrupted, stage,
         calls.append(1)
         if len(calls) == call:
             press()
-            raise AssertionError("went on after Ctrl-C")
+            raise AssertionError("continued after Ctrl-C")
         return getattr(CPU, stage)(*args, **named)
 
     state = initial_state(scene, RECIPE, 3)

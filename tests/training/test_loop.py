@@ -1,4 +1,4 @@
-"""The loop on a scene of five tiny pictures: it learns, it repeats, it resumes, it stops when told to."""
+"""The loop on a scene of five tiny images: it learns, it repeats, it resumes, it stops when told to."""
 
 import os
 import signal
@@ -308,7 +308,7 @@ def test_resuming_with_another_recipe(scene, tmp_path):
 
 
 def test_no_gaussians_left(scene):
-    """A recipe that prunes everybody goes on rendering the background."""
+    """A recipe that prunes everybody continues rendering the background."""
     recipe = RECIPE._replace(events=(*EVENTS, At(5, partial(gaussian_splatting.prune_large, size_fraction=1e-9))))
     state = train(scene, recipe, seed=0)
     assert len(state.gaussians.means) == 0 and state.step == 40

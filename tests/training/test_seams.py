@@ -479,7 +479,7 @@ def test_further_fields_of_merged_gaussians_are_weighted_means(population):
 
 
 def test_beginning_anew_keeps_what_is_shared(population, rng):
-    """Rows, moments and statistics go; the table, its moments and its step stay; further fields begin anew."""
+    """Rows, moments and statistics go; the table, its moments and its step stay; further fields start again."""
     shared = {"table": rng.normal(size=(2, 3))}
     moments = AdamState({"table": np.ones((2, 3))}, {"table": np.full((2, 3), 2.0)}, 7)
     state = TrainState(population, zero_moments(population), 9, [1], rng, {"x": np.ones(12)}, shared, moments)
@@ -556,8 +556,8 @@ def test_calibrated_training_from_end_to_end(scene_folder, tmp_path, capsys):
     metrics = json.loads((whole / "metrics.json").read_text())
     assert main(["eval", str(whole)]) == 0
     assert json.loads((whole / "metrics.json").read_text())["psnr"] == metrics["psnr"]
-    assert main(["render", str(whole), "--out", str(tmp_path / "pictures"), "--cameras", "train"]) == 0
-    assert len(list((tmp_path / "pictures").glob("*.png"))) == 6
+    assert main(["render", str(whole), "--out", str(tmp_path / "images"), "--cameras", "train"]) == 0
+    assert len(list((tmp_path / "images").glob("*.png"))) == 6
 
 
 def test_unknown_setting_on_the_command_line(scene_folder, tmp_path, capsys):
@@ -581,7 +581,7 @@ def test_checkpoint_of_an_older_version_is_one_line(scene_folder, tmp_path, caps
         capsys.readouterr()
         assert main(command) == 2
         (line,) = capsys.readouterr().err.splitlines()
-        assert "checkpoint.npz is 'minisplat_ref checkpoint 1', this version reads" in line and "train anew" in line
+        assert "checkpoint.npz is 'minisplat_ref checkpoint 1', this version reads" in line and "train again" in line
 
 
 def test_scaled_recipe_keeps_its_calibrations_switched_on():

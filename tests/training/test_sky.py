@@ -134,7 +134,7 @@ def test_gradient_through_the_whole_renderer(rng, model, view, wants):
 
 @pytest.mark.parametrize("backend", [REFERENCE, CPU], ids=["reference", "cpu"])
 def test_what_a_removal_changes_counts_the_sky_behind(model, view, backend):
-    """Against the pictures without each Gaussian; a sky of TRANSMITTANCE_MIN is drawn or not, and tolerated."""
+    """Against the images without each Gaussian; a sky of TRANSMITTANCE_MIN is drawn or not, and tolerated."""
     whole = drawn(BEHIND, model, view, backend).image
     n = len(model.gaussians.means)
     expected = []
@@ -173,11 +173,11 @@ def test_a_run_keeps_its_sky(run, tmp_path, capsys):
     assert main(["eval", str(run)]) == 0
     assert json.loads((run / "metrics.json").read_text())["psnr"] == psnr
 
-    pictures = [tmp_path / name for name in ("sky", "ply")]
-    assert main(["render", str(run), "--cameras", "test", "--out", str(pictures[0])]) == 0
+    images = [tmp_path / name for name in ("sky", "ply")]
+    assert main(["render", str(run), "--cameras", "test", "--out", str(images[0])]) == 0
     np.savez(run / "shared.npz", **{SKY: np.full((16, 3), 1.0, np.float32)})
-    assert main(["render", str(run), "--cameras", "test", "--out", str(pictures[1])]) == 0
-    first, second = (read_image(min(folder.glob("*.png"))).astype(float) for folder in pictures)
+    assert main(["render", str(run), "--cameras", "test", "--out", str(images[1])]) == 0
+    first, second = (read_image(min(folder.glob("*.png"))).astype(float) for folder in images)
     assert np.abs(first - second).mean() > 1
 
     capsys.readouterr()

@@ -47,7 +47,7 @@ def test_densification_averages_over_the_views_that_saw_it(state):
     assert_array_equal(state.gaussians.means[N], state.gaussians.means[0])
     assert_array_equal(state.adam.first.opacity_logits, [1, 2, 3, 4, 0])
     assert_array_equal(state.adam.second.sh_rest[:, 0, 0], [10, 20, 30, 40, 0])
-    assert state.stats == {}  # collected anew
+    assert state.stats == {}  # collected again
     assert state.adam.step == 5
 
 

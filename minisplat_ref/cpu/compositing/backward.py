@@ -13,7 +13,7 @@ footprint are moments of q over its pixels:
 Moments in e rather than dx keep a needle's gradient accurate: in dx they grow with its length squared and cancel later.
 The conversion to derivatives with respect to the conic's entries is done in float64.
 
-A pair (tile, Gaussian) has a slot of its own for its moments, which are summed afterwards: see
+A pair (tile, Gaussian) has its own slot for its moments, which are summed afterwards: see
 :mod:`minisplat_ref.cpu.compositing.pair_sums`. The background lies behind all Gaussians; each tile returns its share of
 the background's gradient.
 """

@@ -1,6 +1,6 @@
 """Sum a Gaussian's contributions over tiles: its gradient and its blend statistics.
 
-A pair (tile, Gaussian) has a slot of its own, which only the thread that blends the tile writes; afterwards the slots
+A pair (tile, Gaussian) has its own slot, which only the thread that blends the tile writes; afterwards the slots
 of each Gaussian are summed in order, in float64. No two threads write the same number, and the sums have the same bytes
 at any number of threads. This costs 6 + D numbers per pair.
 """

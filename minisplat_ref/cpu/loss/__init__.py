@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.cpu.loss.rows import Pictures, loss_kernel, row_length
+from minisplat_ref.cpu.loss.rows import Images, loss_kernel, row_length
 from minisplat_ref.jit.compile import n_threads
 from minisplat_ref.types import Bools, Floats, Ints
 
@@ -32,14 +32,14 @@ def photometric_loss(
     if n_values == 0:
         return 0.0, LossTape(np.zeros_like(image))
     sums, v_image = np.empty((height, 2)), np.empty((height, 3 * width), dtype)
-    pictures = Pictures(
+    images = Images(
         image.reshape(height, 3 * width),
         target.reshape(height, 3 * width),
         dtype.type(1 / 255 if target.dtype == np.uint8 else 1),
         _counts(mask, width, dtype),
     )
     v_l1, v_ssim = dtype.type((1 - dssim_weight) / n_values), dtype.type(-dssim_weight / n_values)
-    loss_kernel(dtype)(pictures, v_l1, v_ssim, n_threads(), sums, v_image)
+    loss_kernel(dtype)(images, v_l1, v_ssim, n_threads(), sums, v_image)
     v_image = v_image.reshape(image.shape)
     if mask is not None:
         v_image[~mask] = 0

@@ -35,7 +35,7 @@ N_RING = SSIM_WINDOW + 1  # rows that two windows cover
 PAD = 3 * HALF_WINDOW  # width of the margin before an interleaved row; the one behind it is at least as wide
 
 
-class Pictures(NamedTuple):
+class Images(NamedTuple):
     """An image and its target, row by row."""
 
     image: Floats
@@ -209,7 +209,7 @@ def loss_kernel(dtype: np.dtype) -> Callable:
 
     @kernel()
     def loss_rows(
-        inputs,  # Pictures
+        inputs,  # Images
         v_l1,
         v_ssim,
         n_bands,

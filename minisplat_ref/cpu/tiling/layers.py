@@ -1,7 +1,7 @@
 """The steps of making tile lists, for each part of the input and for each layer.
 
 :mod:`minisplat_ref.cpu.tiling` explains the algorithm. Branch mispredictions and cache misses are expensive. So there
-are no unpredictable branches: the culled Gaussians are a layer of their own, behind all others, and wide boxes are
+are no unpredictable branches: the culled Gaussians are their own layer, behind all others, and wide boxes are
 listed first and processed together. Random accesses are prefetched.
 """
 

@@ -20,7 +20,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.io.images import write_image
 from minisplat_ref.types import Camera, Floats, Ints, View
 
-CAMERA_ID = 1  # one camera takes all pictures; COLMAP counts from 1
+CAMERA_ID = 1  # one camera takes all images; COLMAP counts from 1
 INFO = "scene_info.json"
 UNITS = (
     "metres, world z up; depths are camera z at pixel centres, 0 at the sky; normals are in the world frame, towards "
@@ -106,9 +106,9 @@ def _load_depth(path: Path) -> Floats:
     try:
         depth = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path} cannot be read ({error}): write the scene anew, or remove depths/") from error
+        raise InputError(f"{path} cannot be read ({error}): write the scene again, or remove depths/") from error
     if depth.ndim != 2 or depth.dtype != np.float32:
-        raise InputError(f"{path} holds no depth [H, W] of float32: write the scene anew, or remove depths/")
+        raise InputError(f"{path} holds no depth [H, W] of float32: write the scene again, or remove depths/")
     return depth
 
 

@@ -1,6 +1,6 @@
 """Synthetic scenes, stage 6: the furniture. Metres, z up.
 
-Every piece is a list of primitives, described in a frame of its own on the floor.
+Every piece is a list of primitives, described in its own frame on the floor.
 """
 
 from typing import NamedTuple

@@ -1,7 +1,7 @@
 """Synthetic scenes, stage 7: the four worlds. Metres, z up, the floor at z = 0.
 
 ``room``: textured walls, furniture with thin rods, spheres and boxes. ``plain-wall``: walls without any texture fill
-most of the picture. ``glossy``: polished things, whose look changes with the viewpoint. ``outdoor``: open ground with a
+most of the image. ``glossy``: polished things, whose look changes with the viewpoint. ``outdoor``: open ground with a
 few objects under a sky that has no depth.
 """
 
@@ -51,7 +51,7 @@ class Setting(NamedTuple):
 
 
 def room(rng: np.random.Generator) -> Setting:
-    """A furnished room: every wall has a texture of its own, the chair and the clothes rack are thin rods."""
+    """A furnished room: every wall has its own texture, the chair and the clothes rack are thin rods."""
     lattice = random_lattice(rng)
     streaks = Noise("#000000", "#ffffff", np.array([0.9, 0.06, 1.0]), lattice)
     clouds = Noise("#6f8f86", "#a9bfae", np.array([0.5, 0.5, 0.5]), lattice, contrast=1.6)
@@ -123,7 +123,7 @@ def glossy(rng: np.random.Generator) -> Setting:
 
 
 def outdoor(rng: np.random.Generator) -> Setting:
-    """A meadow with a path, a tree, a fence, a hut and boulders; half of the picture is sky."""
+    """A meadow with a path, a tree, a fence, a hut and boulders; half of the image is sky."""
     lattice = random_lattice(rng)
     grass = Noise("#4f6b2c", "#a3b35f", np.array([1.1, 1.1, 1.0]), lattice, n_octaves=4, contrast=1.5)
     leaves = Noise("#2f5a24", "#86a843", np.full(3, 0.4), lattice, contrast=1.8)

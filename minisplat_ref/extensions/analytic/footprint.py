@@ -22,7 +22,7 @@ from minisplat_ref.types import Floats, Projection
 
 SIGMAS = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0)  # px
 ELONGATION = 5.0  # of the needle
-REACH = 12  # pixels from the middle to the edge of the picture
+REACH = 12  # pixels from the middle to the edge of the image
 SAMPLES = 48  # per pixel and side
 DILATION, MIP = 0.3, 0.1  # px^2
 OPACITY = 0.8

@@ -93,7 +93,7 @@ def with_pixel_integrals(backend: Backend) -> Backend:
 
 
 def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
-    """Draw the view as 3DGS does, but with integrals and without a low-pass; the tape keeps the backend."""
+    """Render the view as 3DGS does, but with integrals and without a low-pass; the tape keeps the backend."""
     conventions = request.conventions._replace(eps2d=0.0, is_antialiased=False)
     backend = with_pixel_integrals(request.backend)
     return SPLATTING.render(model, view, request._replace(backend=backend, conventions=conventions))

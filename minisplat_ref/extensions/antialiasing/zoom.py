@@ -23,7 +23,7 @@ from minisplat_ref.types import Floats, Model, Scene, View, view_from
 
 RECIPES = {"3dgs-accel": GREY, "antialiasing": RED, "analytic": BLUE}
 FARTHEST = 8  # times smaller than the training views
-SIZE_MIN = 4  # pixels per side of the smallest picture that is measured
+SIZE_MIN = 4  # pixels per side of the smallest image that is measured
 
 
 class Trained(NamedTuple):
@@ -33,7 +33,7 @@ class Trained(NamedTuple):
     renderer: Renderer
     background: Floats
 
-    def picture(self, view: View, scale: float) -> Floats:
+    def render_at(self, view: View, scale: float) -> Floats:
         """Return the view [H, W, 3] with ``scale`` times the pixels of its camera."""
         request = Request(self.background, backend=CPU)
         return self.renderer.render(self.model, view_from(zoom_camera(view.camera, scale)), request)[0].image
@@ -58,7 +58,7 @@ def blocks(scene: Scene, downscale: int) -> list[int]:
 def psnrs(found: Trained, scene: Scene, sides: list[int]) -> list[float]:
     """Return the mean PSNR of the test views, dB, for each size of block."""
     views = [view.load() for view in scene.test_views]
-    return [float(np.mean([kit.psnr_of(found.picture(v, 1 / n), _photograph(v, n)) for v in views])) for n in sides]
+    return [float(np.mean([kit.psnr_of(found.render_at(v, 1 / n), _photograph(v, n)) for v in views])) for n in sides]
 
 
 def _photograph(view: View, n: int) -> Floats:
@@ -74,7 +74,7 @@ class Measured(NamedTuple):
     """dB by recipe, then seed, then zoom."""
     counts: dict[str, list[int]]
     """Number of Gaussians by recipe, then seed."""
-    pictures: dict[str, Floats]
+    images: dict[str, Floats]
     """The first test view at the largest zoom by recipe, and the photograph."""
 
 
@@ -84,14 +84,14 @@ def measure(scene: Scene, downscale: int, iterations: int, seeds: int) -> Measur
     psnr: dict[str, list[list[float]]] = {name: [] for name in RECIPES}
     counts: dict[str, list[int]] = {name: [] for name in RECIPES}
     view = scene.test_views[0]
-    pictures = {"photograph": _photograph(view, sides[-1])}
+    images = {"photograph": _photograph(view, sides[-1])}
     for seed in range(seeds):
         for name in kit.with_progress(RECIPES, f"trainings, seed {seed}"):
             found = train_recipe(name, small, iterations, seed)
             psnr[name].append(psnrs(found, scene, sides))
             counts[name].append(len(found.model.gaussians.means))
-            pictures.setdefault(name, np.clip(found.picture(view, 1 / sides[-1]), 0, 1))
-    return Measured([downscale / n for n in sides], psnr, counts, pictures)
+            images.setdefault(name, np.clip(found.render_at(view, 1 / sides[-1]), 0, 1))
+    return Measured([downscale / n for n in sides], psnr, counts, images)
 
 
 def run(args: argparse.Namespace) -> kit.Report:
@@ -120,9 +120,9 @@ def draw(found: Measured) -> Figure:
     axes.set_xticks(found.zooms, [f"{zoom:g}" if zoom >= 1 else f"1/{1 / zoom:g}" for zoom in found.zooms])
     axes.set(title="PSNR of test views (dB)", xlabel="pixels per side, relative to the training views")
     axes.legend()
-    height, width = found.pictures["photograph"].shape[:2]
+    height, width = found.images["photograph"].shape[:2]
     panels = right.subplots(*((1, 4) if height > width else (2, 2))).ravel()
-    for panel, (name, picture) in zip(panels, found.pictures.items(), strict=True):
-        middle = picture[height // 4 : 3 * height // 4, width // 4 : 3 * width // 4]
+    for panel, (name, image) in zip(panels, found.images.items(), strict=True):
+        middle = image[height // 4 : 3 * height // 4, width // 4 : 3 * width // 4]
         show(panel, middle, f"{name}, x {found.zooms[-1]:g}")
     return figure

@@ -6,7 +6,7 @@ PlayCanvas, its SOG. Sizes are those of whole files.
 
 SPZ has a fixed step of 2^-12 world units for centres and a fixed range for scales; the step of ``.msz`` follows the
 small Gaussians. So the study also makes the scene smaller and smaller, with Gaussians, cameras and near plane together:
-every picture stays the same, and so should the loss of a file.
+every image stays the same, and so should the loss of a file.
 """
 
 import argparse

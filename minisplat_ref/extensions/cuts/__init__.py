@@ -33,7 +33,7 @@ from minisplat_ref.studies.study import OUT, declare, iterations, seeds
 
 CARD = declare(
     "card",
-    "pictures with a sharp edge, by few Gaussians with and without cuts",
+    "images with a sharp edge, by few Gaussians with and without cuts",
     f"{__name__}.study.run",
     *(OUT, iterations(300), seeds(4)),
 )

@@ -1,4 +1,4 @@
-"""The study ``cuts/card``: pictures with one sharp edge, drawn by few Gaussians with and without cuts."""
+"""The study ``cuts/card``: images with one sharp edge, drawn by few Gaussians with and without cuts."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ CAMERA = Camera(np.eye(3), np.zeros(3), FOCAL, FOCAL, SIZE / 2, SIZE / 2, SIZE, 
 
 
 class Target(NamedTuple):
-    """A picture with an edge."""
+    """An image with an edge."""
 
     image: Floats
     """[H, W, 3] in [0, 1]."""
@@ -39,8 +39,8 @@ class Target(NamedTuple):
 
 
 def place_cards(n: int, rng: np.random.Generator) -> Gaussians:
-    """Return n flat grey Gaussians that face the camera, spread over the picture and large enough to fill it."""
-    extent = SIZE / FOCAL * DISTANCE  # width of the picture, world units
+    """Return n flat grey Gaussians that face the camera, spread over the image and large enough to fill it."""
+    extent = SIZE / FOCAL * DISTANCE  # width of the image, world units
     places = rng.uniform(-0.35, 0.35, (n, 2)) * extent if n > 1 else np.zeros((1, 2))
     scale = 0.25 * extent / np.sqrt(n)
     return Gaussians(
@@ -64,7 +64,7 @@ def cut_gaussian() -> Target:
 
 
 def card() -> Target:
-    """Return a bright card that fills the picture up to a curved edge; pixels on the edge are partly covered."""
+    """Return a bright card that fills the image up to a curved edge; pixels on the edge are partly covered."""
 
     def edge(ys: Floats) -> Floats:
         return 30 - 6 * ((ys - SIZE / 2) / (SIZE / 2)) ** 2
@@ -80,7 +80,7 @@ def representation_of(population: Any) -> Representation:
 
 
 def render_card(population: Any) -> Floats:
-    """Return the picture [H, W, 3] of a population in front of black."""
+    """Return the image [H, W, 3] of a population in front of black."""
     image: Floats = (
         representation_of(population).renderer.render(Model(population), view_from(CAMERA), Request())[0].image
     )
@@ -119,7 +119,7 @@ def edge_width(image: Floats) -> float:
 
 
 def measure_card(target: Target, population: Any) -> dict[str, float]:
-    """Return the PSNR of the picture, of the band around the edge and of the rest, dB, and the edge's width, px."""
+    """Return the PSNR of the image, of the band around the edge and of the rest, dB, and the edge's width, px."""
     image = render_card(population)
     band = target.band
     return {

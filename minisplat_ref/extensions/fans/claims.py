@@ -101,7 +101,7 @@ def refit_rows(
 
 
 def layer_rows(fans: Fans, judge: Judge) -> list[dict[str, Any]]:
-    """Return the error of pictures of a few layers against that of all, and the number of layers of a pixel."""
+    """Return the error of images of a few layers against that of all, and the number of layers of a pixel."""
     request = Request(judge.scene.background.astype(np.float32))
     whole = [render(Model(fans), view, request) for view in judge.views]
     layers = np.concatenate([tape.peeled.n_layers.ravel() for _, tape in whole])

@@ -55,7 +55,7 @@ def render(model: Model, view: View, request: Request, *, max_layers: int | None
         Something is wanted besides colours, or ``max_layers`` is below 1.
     """
     if request.wants:
-        raise InputError(f"fans are drawn without {', '.join(sorted(request.wants))}: draw the Gaussians for that")
+        raise InputError(f"fans are drawn without {', '.join(sorted(request.wants))}: render the Gaussians for that")
     if max_layers is not None and max_layers < 1:
         raise InputError(f"max_layers is {max_layers}: give at least 1, or none for all")
     fans, conventions, backend = model.gaussians, request.conventions, request.backend
@@ -97,7 +97,7 @@ def render_vjp(tape: _Tape, v_image: Floats, v_alpha: Floats | None = None) -> R
 
 
 def channels(wants: frozenset[str]) -> dict[str, slice]:
-    """Return the channels of a picture, which are colours whatever is wanted."""
+    """Return the channels of an image, which are colours whatever is wanted."""
     return {"rgb": slice(0, 3)}
 
 

@@ -73,7 +73,7 @@ class Tilt(NamedTuple):
 
 def tilts() -> list[Tilt]:
     """Return the errors of flat and of solid fans of a disc and of a ball."""
-    f = SIZE * DISTANCE / 10  # the picture is ten standard deviations wide
+    f = SIZE * DISTANCE / 10  # the image is ten standard deviations wide
     view = view_from(Camera(np.eye(3), np.zeros(3), f, f, SIZE / 2, SIZE / 2, SIZE, SIZE))
     sharp = GSPLAT_MAIN._replace(eps2d=0.0)
     results = []

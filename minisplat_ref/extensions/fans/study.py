@@ -4,7 +4,7 @@
 becomes of a disc and of a ball that turn away from the camera.
 
 ``refit``: on a scene, what fans lose against the splats that they were made of, over reach, rim and sides; what is
-gained by fitting these two numbers to photographs, and by training every vertex; how many layers a picture needs; and
+gained by fitting these two numbers to photographs, and by training every vertex; how many layers an image needs; and
 what the meshes weigh. Splats are trained on for as many iterations as the vertices are, for comparison.
 """
 
@@ -127,8 +127,8 @@ def tables(runs: list[dict[str, Any]]) -> str:
     return text
 
 
-def draw(result: dict[str, Any], pictures: dict[str, Any]) -> Figure:
-    """Draw PSNR over the reach, what refitting brings, and pictures."""
+def draw(result: dict[str, Any], images: dict[str, Any]) -> Figure:
+    """Draw PSNR over the reach, what refitting brings, and images."""
     figure = Figure(figsize=(12.0, 6.6), layout="constrained")
     parts: Any = figure.subfigures(2, 1)
     left, right = parts[0].subplots(1, 2)
@@ -147,7 +147,7 @@ def draw(result: dict[str, Any], pictures: dict[str, Any]) -> Figure:
     right.barh(places, [p for p, _ in psnrs], xerr=[d for _, d in psnrs], color=colors, height=0.7)
     right.set_yticks(places, names, fontsize=8)
     right.set(xlabel="test PSNR (dB)", xlim=(min(p for p, _ in psnrs) - 2, None))
-    for axes, (title, image) in zip(parts[1].subplots(1, len(pictures)), pictures.items(), strict=True):
+    for axes, (title, image) in zip(parts[1].subplots(1, len(images)), images.items(), strict=True):
         show(axes, image, title)
     figure.suptitle(f"{result['scene']}, {run['n_gaussians']:,} Gaussians, seed 0 where it is one")
     return figure

@@ -34,7 +34,7 @@ def fine_tune(
 def best_shape(
     gaussians: Gaussians, shape: FanShape, views: Sequence[View], targets: Sequence[Floats], background: Floats
 ) -> FanShape:
-    """Return the shape with the reach and the rim whose pictures are nearest to targets.
+    """Return the shape with the reach and the rim whose images are nearest to targets.
 
     The simplex method starts from the best of a coarse grid: where a rim is not transparent, the error jumps as it
     moves over a pixel, and has many small minima.
@@ -47,7 +47,7 @@ def best_shape(
     views : sequence of View
         From where.
     targets : sequence of ndarray of shape (H, W, 3)
-        Photographs or pictures in [0, 1]; the sum of squared differences counts.
+        Photographs or images in [0, 1]; the sum of squared differences counts.
     background : ndarray of shape (3,)
         RGB behind everything.
     """
@@ -57,8 +57,8 @@ def best_shape(
 
     def cost(x: Floats) -> float:
         fans = convert_gaussians(gaussians, clipped(x))
-        pictures = [render_clipped(fans, view, background=background) for view in views]
-        return sum(float(np.mean((p - target) ** 2)) for p, target in zip(pictures, targets, strict=True))
+        images = [render_clipped(fans, view, background=background) for view in views]
+        return sum(float(np.mean((p - target) ** 2)) for p, target in zip(images, targets, strict=True))
 
     first = min((np.array(place) for place in product(FIRST_REACHES, FIRST_RIMS)), key=cost)
     simplex = first + np.array([[0.0, 0.0], [-0.2, 0.0], [0.0, 0.05]])
@@ -72,7 +72,7 @@ def representation_of(population: Any) -> Any:
 
 
 def render_clipped(population: Any, view: View, **request: Any) -> Floats:
-    """Return the picture [H, W, 3] of fans or Gaussians, clipped to [0, 1]; ``request`` as for :class:`Request`."""
+    """Return the image [H, W, 3] of fans or Gaussians, clipped to [0, 1]; ``request`` as for :class:`Request`."""
     image = representation_of(population).renderer.render(Model(population), view, Request(**request))[0].image
     clipped: Floats = np.clip(image, 0, 1)
     return clipped
@@ -86,6 +86,6 @@ def alpha_of(population: Any, view: View, **request: Any) -> Floats:
 
 
 def measure(population: Any, scene: Scene, views: tuple[View, ...]) -> Evaluation:
-    """Compare pictures of fans or Gaussians with photographs."""
+    """Compare images of fans or Gaussians with photographs."""
     renderer = representation_of(population).renderer
     return evaluate(Model(population), views, RenderSettings(scene.background, renderer=renderer))

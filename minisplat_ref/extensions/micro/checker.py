@@ -59,7 +59,7 @@ class Outcome(NamedTuple):
     """Median ratio of the largest to the middle scale; no camera sees the thickness across the chart."""
     n_smooth: int
     """Number of Gaussians on the ramp."""
-    picture: Floats
+    image: Floats
     gaussians: Gaussians
 
 
@@ -208,7 +208,7 @@ def run(args: argparse.Namespace) -> kit.Report:
 
 
 def draw(outcomes: dict[str, list[Outcome]], beta: float, weight: float) -> Figure:
-    """Draw the photograph and, for each variant, its picture and its Gaussians on the chart."""
+    """Draw the photograph and, for each variant, its image and its Gaussians on the chart."""
     figure = Figure(figsize=(12, 3.7), layout="constrained")
     target = checker_scene(0).test_views[-1].image / 255
     rows = figure.subplots(2, len(outcomes) + 1)
@@ -216,8 +216,8 @@ def draw(outcomes: dict[str, list[Outcome]], beta: float, weight: float) -> Figu
     rows[1, 0].axis("off")
     for (upper, lower), (name, own) in zip(rows.T[1:], outcomes.items(), strict=True):
         result = own[0]
-        edges = kit.psnr_of(result.picture[:, : WIDTH // 2], target[:, : WIDTH // 2])
-        show(upper, result.picture, f"{name}: edges {edges:.1f}, ramp {result.psnr_smooth:.1f} dB")
+        edges = kit.psnr_of(result.image[:, : WIDTH // 2], target[:, : WIDTH // 2])
+        show(upper, result.image, f"{name}: edges {edges:.1f}, ramp {result.psnr_smooth:.1f} dB")
         lower.scatter(*result.gaussians.means[:, :2].T, s=3, color=variants(beta, weight)[name].color, lw=0)
         lower.axvline(0, color=TITLE_COLOR, lw=0.8)
         lower.set(xlim=(-2.2, 2.2), ylim=(1.6, -1.6), aspect="equal", xticks=[], yticks=[])

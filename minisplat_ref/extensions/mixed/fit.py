@@ -1,4 +1,4 @@
-"""Fitting a picture by few primitives of one kind, in the plane: what studies and notebooks play with.
+"""Fitting an image by few primitives of one kind, in the plane: what studies and notebooks play with.
 
 All lie in one plane that faces the camera, are white or gray and equally bright from everywhere. They begin at random
 places as small ellipses, lines or triangles, and are trained by 3DGS's rates; their number and kind stay.
@@ -20,7 +20,7 @@ from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Camera, Floats, Gaussians, Model, Scene, View, number_views, view_from
 
 SIZE, FOCAL, DISTANCE = 48, 60.0, 3.0  # px, px, world units
-PICTURE = SIZE / FOCAL * DISTANCE  # its side, world units
+IMAGE = SIZE / FOCAL * DISTANCE  # its side, world units
 CAMERA = Camera(np.eye(3), np.zeros(3), FOCAL, FOCAL, SIZE / 2, SIZE / 2, SIZE, SIZE)
 EXTENT = 10.0  # of the scene: so far primitives may move, in units of the rates of 3DGS
 SUPERSAMPLING = 8  # samples along each side of a pixel of a silhouette
@@ -34,7 +34,7 @@ def place_in_plane(places: Floats, vertices: Floats, n_vertices: int, thickness:
     Parameters
     ----------
     places : ndarray of shape (N, 2)
-        Means of the vertices, px from the middle of the picture.
+        Means of the vertices, px from the middle of the image.
     vertices : ndarray of shape (N, 4)
         The second and the third vertex from the mean, px.
     n_vertices : int
@@ -58,7 +58,7 @@ def place_in_plane(places: Floats, vertices: Floats, n_vertices: int, thickness:
 
 
 def scatter(n: int, n_vertices: int, rng: np.random.Generator) -> MixedGaussians:
-    """Return n primitives at random places, together about as large as the picture."""
+    """Return n primitives at random places, together about as large as the image."""
     reach = SIZE / np.sqrt(n)
     places = rng.uniform(-0.3, 0.3, (n, 2)) * SIZE * (n > 1)
     vertices = rng.normal(size=(n, 4)) * 0.25 * reach
@@ -67,13 +67,13 @@ def scatter(n: int, n_vertices: int, rng: np.random.Generator) -> MixedGaussians
 
 
 def render_primitives(population: MixedGaussians) -> Floats:
-    """Return the picture [H, W, 3] of a population before black."""
+    """Return the image [H, W, 3] of a population before black."""
     image: Floats = MIXED_GAUSSIANS.renderer.render(Model(population), view_from(CAMERA), Request())[0].image
     return image
 
 
 def fit_primitives(target: Floats, n: int, *, n_vertices: int, iterations: int, seed: int) -> MixedGaussians:
-    """Return n primitives of one kind, trained on a picture [48, 48, 3] in [0, 1]."""
+    """Return n primitives of one kind, trained on an image [48, 48, 3] in [0, 1]."""
     rng = np.random.default_rng(seed)
     view = View("target", CAMERA, np.rint(255 * np.clip(target, 0, 1)).astype(np.uint8), None)
     none = np.zeros((0, 3))
@@ -86,17 +86,17 @@ def fit_primitives(target: Floats, n: int, *, n_vertices: int, iterations: int, 
 
 
 def one_line() -> Floats:
-    """Return the picture of one line."""
+    """Return the image of one line."""
     return render_primitives(place_in_plane(np.zeros((1, 2)), np.array([[14.0, 7.0, 0.0, 0.0]]), 2, np.full(1, 2.0)))
 
 
 def one_triangle() -> Floats:
-    """Return the picture of one triangle with a soft rim."""
+    """Return the image of one triangle with a soft rim."""
     return render_primitives(place_in_plane(np.zeros((1, 2)), np.array([[15.0, 5.0, -3.0, -14.0]]), 3, np.full(1, 2.0)))
 
 
 def one_blob() -> Floats:
-    """Return the picture of one round Gaussian, where further vertices are of no use."""
+    """Return the image of one round Gaussian, where further vertices are of no use."""
     return render_primitives(place_in_plane(np.zeros((1, 2)), np.zeros((1, 4)), 1, np.full(1, 8.0)))
 
 
@@ -127,6 +127,6 @@ def _samples() -> tuple[Floats, Floats]:
 
 
 def _cover(is_in: np.ndarray) -> Floats:
-    """Return the picture of a silhouette: 0.8 times the part of each pixel that it covers."""
+    """Return the image of a silhouette: 0.8 times the part of each pixel that it covers."""
     shares = is_in.reshape(SIZE, SUPERSAMPLING, SIZE, SUPERSAMPLING).mean(axis=(1, 3))
     return np.repeat(0.8 * shares[:, :, None], 3, axis=2)

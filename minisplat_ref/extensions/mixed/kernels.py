@@ -1,8 +1,8 @@
 """Hulls on lanes: a response for the plain kernels.
 
 A record begins with the conic's, whose factors whiten: ``e = dx + slope dy`` and dy are, but for their lengths, the
-whitened coordinates. It goes on with the vertices from the centre, and for each edge u with ``g = Q u / (u . Q u)``, so
-that the nearest point of a line through o along u is found by one product, ``f = -(o . g)``.
+whitened coordinates. It continues with the vertices from the centre, and for each edge u with ``g = Q u / (u . Q u)``,
+so that the nearest point of a line through o along u is found by one product, ``f = -(o . g)``.
 """
 
 import functools

@@ -48,7 +48,7 @@ def counts(population: MixedGaussians) -> Ints:
 
 
 def as_ellipses(gaussians: Gaussians) -> MixedGaussians:
-    """Return Gaussians as a population of ellipses, which is drawn as 3DGS draws them."""
+    """Return Gaussians as a population of ellipses, which is rendered as 3DGS renders them."""
     n, dtype = len(gaussians.means), gaussians.means.dtype
     six = {name: getattr(gaussians, name) for name in Gaussians._fields}
     return MixedGaussians(**six, vertices=np.zeros((n, 4), dtype), n_vertices=np.ones(n, dtype))

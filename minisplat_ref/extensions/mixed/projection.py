@@ -93,7 +93,7 @@ def footprints_of(hulls: Hulls, projection: Projection, camera: Camera, conventi
     ----------
     hulls : Hulls
     projection : Projection
-        Of the hulls as ellipses around their means. Those of lines and triangles are made anew, in float64, because
+        Of the hulls as ellipses around their means. Those of lines and triangles are made again, in float64, because
         they can be in the image where their ellipses are not, and the other way round.
     camera, conventions
         As for the projection.

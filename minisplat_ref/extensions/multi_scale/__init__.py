@@ -37,7 +37,7 @@ from minisplat_ref.studies.study import OUT, declare, downscale, iterations, sce
 
 DOWNSCALE = declare(
     "downscale",
-    "a trained scene in smaller pictures, with and without levels",
+    "a trained scene in smaller images, with and without levels",
     f"{__name__}.downscale.run",
     *(scene("room"), OUT, downscale(), iterations(1000, minimum=10), seeds(2)),
 )

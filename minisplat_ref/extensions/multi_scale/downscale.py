@@ -1,4 +1,4 @@
-"""The study ``multi-scale/downscale``: a trained scene in smaller and smaller pictures.
+"""The study ``multi-scale/downscale``: a trained scene in smaller and smaller images.
 
 The truth at 1/n of the size is the mean over blocks of n x n pixels of the held-out photographs. Beside the error the
 study counts the work: pairs of a Gaussian and a tile, which are sorted, and hits, which are blended.
@@ -26,7 +26,7 @@ from minisplat_ref.training.schedule import configure
 from minisplat_ref.types import Floats, Model, Scene, view_from
 
 BLOCKS = (1, 2, 4, 8, 16)
-SIZE_MIN = 4  # pixels per side of the smallest picture that is measured
+SIZE_MIN = 4  # pixels per side of the smallest image that is measured
 PLANS = {"levels 2": Plan(2, 4, COVERAGE_MIN), "levels 4": Plan(4, 2, COVERAGE_MIN)}
 EARLY = 4  # cells are divided by this, so that coarse Gaussians appear while their cells are 4 pixels wide
 COMPENSATED = GSPLAT_MAIN._replace(is_antialiased=True)
@@ -74,7 +74,7 @@ def variants(scene: Scene, iterations: int, seed: int) -> dict[str, Variant]:
     }
 
 
-def picture(variant: Variant, scene: Scene, i: int, n: int) -> Any:
+def render_reduced(variant: Variant, scene: Scene, i: int, n: int) -> Any:
     """Return test view ``i`` at 1/n of its size, with blend statistics."""
     camera = zoom_camera(scene.test_views[i].camera, 1 / n)
     request = Request(scene.background, conventions=variant.conventions, backend=CPU, wants=frozenset({"stats"}))
@@ -85,7 +85,7 @@ def figures(variant: Variant, scene: Scene, n: int) -> Figures:
     """Measure the test views at 1/n of their size."""
     rows = []
     for i, view in enumerate(scene.test_views):
-        output = picture(variant, scene, i, n)
+        output = render_reduced(variant, scene, i, n)
         target = block_means(view.load().image.astype(float) / 255, n)
         rows.append((kit.psnr_of(output.image, target), output.n_pairs, output.stats.hit_count.sum()))
     return Figures(*(float(value) for value in np.mean(rows, axis=0)))
@@ -99,7 +99,7 @@ class Measured(NamedTuple):
     """Figures by variant, then seed, then size of block."""
     counts: dict[str, list[int]]
     """Number of Gaussians of all levels by variant, then seed."""
-    pictures: dict[str, Floats]
+    images: dict[str, Floats]
     """The first test view at a quarter of its size by variant, and the photograph."""
 
 
@@ -110,13 +110,13 @@ def measure(scene: Scene, iterations: int, seeds: int) -> Measured:
     found: dict[str, list[list[Figures]]] = {name: [] for name in COLORS}
     counts: dict[str, list[int]] = {name: [] for name in COLORS}
     shown = min(4, blocks[-1])
-    pictures = {"photograph": block_means(scene.test_views[0].load().image.astype(float) / 255, shown)}
+    images = {"photograph": block_means(scene.test_views[0].load().image.astype(float) / 255, shown)}
     for seed in range(seeds):
         for name, variant in kit.with_progress(variants(scene, iterations, seed).items(), f"measuring, seed {seed}"):
             found[name].append([figures(variant, scene, n) for n in blocks])
             counts[name].append(len(variant.gaussians.means))
-            pictures.setdefault(name, np.clip(picture(variant, scene, 0, shown).image, 0, 1))
-    return Measured(blocks, found, counts, pictures)
+            images.setdefault(name, np.clip(render_reduced(variant, scene, 0, shown).image, 0, 1))
+    return Measured(blocks, found, counts, images)
 
 
 def run(args: argparse.Namespace) -> kit.Report:
@@ -144,7 +144,7 @@ def _sizes(found: Measured) -> list[str]:
 
 
 def draw(found: Measured) -> Figure:
-    """Draw PSNR and hits over the size, and a small picture of each variant."""
+    """Draw PSNR and hits over the size, and a small image of each variant."""
     figure = Figure(figsize=(11, 6), layout="constrained")
     upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.6, 1))[:, 0]
     left, right = upper.subplots(1, 2)
@@ -155,9 +155,9 @@ def draw(found: Measured) -> Figure:
     for axes, title in ((left, "PSNR of test views (dB)"), (right, "blended hits per view")):
         axes.set_xscale("log", base=2)
         axes.set_xticks(found.blocks, _sizes(found))
-        axes.set(title=title, xlabel="size of the picture")
+        axes.set(title=title, xlabel="size of the image")
     right.set_yscale("log")
     left.legend()
-    for panel, (name, image) in zip(lower.subplots(1, len(found.pictures)), found.pictures.items(), strict=True):
+    for panel, (name, image) in zip(lower.subplots(1, len(found.images)), found.images.items(), strict=True):
         show(panel, image, name.replace(", ", ",\n"))
     return figure

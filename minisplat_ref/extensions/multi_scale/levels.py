@@ -1,6 +1,6 @@
 """From Gaussians to levels: Gaussians that are too small to be seen from farther away are merged, cell by cell.
 
-Level l is made for pictures of 1/F^l of the size of the training views. Of the Gaussians that are shown at the previous
+Level l is made for images of 1/F^l of the size of the training views. Of the Gaussians that are shown at the previous
 level, those that would cover too few pixels are sorted into cubes as large as a pixel of that size, and all in a cube
 become one Gaussian with their common moments, which stops as much light (``strategy.simplify.merge_clusters``). The
 others stay as they are, and a cube with a single small one keeps it.
@@ -36,7 +36,7 @@ class Plan(NamedTuple):
     """Settings of the levels."""
 
     factor: float
-    """F: each level is for pictures smaller by this factor."""
+    """F: each level is for images smaller by this factor."""
     n_levels: int
     """Number of levels besides the finest."""
     min_coverage: float

@@ -19,10 +19,10 @@ from minisplat_ref.training.schedule import At
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit
 from minisplat_ref.types import Camera, Floats, Gaussians, Model, RenderOutput, View, view_from
 
-FACTOR, N_LEVELS = 4, 3  # levels for pictures of 1/4, 1/16 and 1/64 of the size, as in the paper
+FACTOR, N_LEVELS = 4, 3  # levels for images of 1/4, 1/16 and 1/64 of the size, as in the paper
 COVERAGE_MIN = 4.0  # pixels, of the ellipse where alpha is at least 1/255; if opaque, a standard deviation of 0.6
 INSERTION = 15_000  # iteration at which densification has ended
-SIZE_MIN = 8  # pixels per side of the smallest picture that is trained on
+SIZE_MIN = 8  # pixels per side of the smallest image that is trained on
 
 
 def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
@@ -75,10 +75,10 @@ def insert_levels(
 def coarse(
     rendered: Rendered, *, factor: int, n_levels: int, period: int, dssim_weight: float
 ) -> tuple[float, Cotangents]:
-    """Return the photometric loss of a smaller picture of the view in every ``period``-th iteration, otherwise zero.
+    """Return the photometric loss of a smaller image of the view in every ``period``-th iteration, otherwise zero.
 
-    The levels alternate, as far as pictures have at least ``SIZE_MIN`` pixels per side. The gradient goes to the
-    Gaussians directly: this picture is not the one of the other terms, and trained exposures and poses are not applied
+    The levels alternate, as far as images have at least ``SIZE_MIN`` pixels per side. The gradient goes to the
+    Gaussians directly: this image is not the one of the other terms, and trained exposures and poses are not applied
     to it.
     """
     view, request, model = rendered.view, rendered.request, rendered.model
@@ -114,4 +114,4 @@ MULTI_SCALE = GS._replace(
         At(INSERTION, partial(insert_levels, factor=FACTOR, n_levels=N_LEVELS, min_coverage=COVERAGE_MIN)),
     ),
 )
-"""The recipe ``multi-scale``: 3DGS and, from mid-training on, coarser levels trained on smaller pictures."""
+"""The recipe ``multi-scale``: 3DGS and, from mid-training on, coarser levels trained on smaller images."""

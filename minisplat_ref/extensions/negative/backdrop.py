@@ -1,6 +1,6 @@
 """The study ``negative/backdrop``: what a negative colour does, and does not do, in compositing.
 
-A wide Gaussian and a smaller one in front of it are fitted to the picture of an opaque ring, with colours clamped at
+A wide Gaussian and a smaller one in front of it are fitted to the image of an opaque ring, with colours clamped at
 zero as in 3DGS and with colours of either sign; four clamped Gaussians side by side are the alternative. Behind the
 ring is a wall. It is black, so that the hole of the ring is a matter of colour, or it has dots, which should be visible
 through the hole. Truth and fits are rendered by this package in float64; everything that is not fitted is fixed.

@@ -1,6 +1,6 @@
 """Colours of either sign from the stages of any backend, and the recipe that trains them.
 
-No stage is written anew. The backends compute ``u = max(0, c)``; with all coefficients negated, which reflects the
+No stage is written again. The backends compute ``u = max(0, c)``; with all coefficients negated, which reflects the
 colour at mid-grey, 0.5, they compute ``l = max(0, 1 - c)``; and
 
     c = u  where u > 0,   1 - l  elsewhere
@@ -109,7 +109,7 @@ def with_signed_colors(backend: Backend) -> Backend:
 
 
 def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
-    """Draw the view as 3DGS does, with colours of either sign; the tape keeps the backend for the gradient."""
+    """Render the view as 3DGS does, with colours of either sign; the tape keeps the backend for the gradient."""
     return SPLATTING.render(model, view, request._replace(backend=with_signed_colors(request.backend)))
 
 

@@ -1,7 +1,7 @@
 """The study ``negative/rings``: differences of two Gaussians against sums of positive ones, without compositing.
 
 This is the setting of the paper's argument. In a plane, ``f(x) = sum_k s_k w_k exp(-|L_k (x - m_k)|^2 / 2)`` has given
-signs s_k, and everything else is fitted to the picture of a ring by least squares. The fit is not convex, so it starts
+signs s_k, and everything else is fitted to the image of a ring by least squares. The fit is not convex, so it starts
 several times, and the best result counts.
 
 The quality of a pair depends on the allowed heights of its two Gaussians. The best pair of all consists of two huge
@@ -23,7 +23,7 @@ from minisplat_ref.studies import kit
 from minisplat_ref.studies.figures import plot_range, show, with_range
 from minisplat_ref.types import Floats
 
-OUTER = 0.7  # radius; the picture is the square from -1 to 1
+OUTER = 0.7  # radius; the image is the square from -1 to 1
 THICKNESSES = (0.9, 0.75, 0.6, 0.45, 0.3, 0.2)  # of the ring, in units of its outer radius
 BLUR = 0.04  # standard deviation of the edges
 SIZE = 32  # samples per side
@@ -53,7 +53,7 @@ class Fit(NamedTuple):
     """The best of several fits."""
 
     psnr: float  # dB, peak 1, over the square
-    picture: Floats  # [SIZE, SIZE]
+    image: Floats  # [SIZE, SIZE]
     heights: tuple[float, ...]  # s_k w_k
 
 
@@ -64,7 +64,7 @@ def grid() -> Floats:
 
 
 def ring(thickness: float) -> Floats:
-    """Return the picture [SIZE^2] of a ring with soft edges; the thickness is in units of the outer radius."""
+    """Return the image [SIZE^2] of a ring with soft edges; the thickness is in units of the outer radius."""
     radii = np.linalg.norm(grid(), axis=1)
     inside, outside = (erf((radii - r) / (np.sqrt(2) * BLUR)) for r in (OUTER * (1 - thickness), OUTER))
     return 0.5 * (inside - outside)
@@ -107,7 +107,7 @@ def _heights(parameters: Floats, model: Sum) -> Floats:
 
 
 def fit_ring(target: Floats, model: Sum, n_starts: int, rng: np.random.Generator) -> Fit:
-    """Return the best of ``n_starts`` least-squares fits to a picture [SIZE^2]."""
+    """Return the best of ``n_starts`` least-squares fits to an image [SIZE^2]."""
     points, n = grid(), len(model.signs)
 
     def residuals(flat: Floats) -> Floats:
@@ -121,9 +121,9 @@ def fit_ring(target: Floats, model: Sum, n_starts: int, rng: np.random.Generator
         for _ in range(n_starts)
     ]
     best = min(fits, key=lambda fit: fit.cost)
-    picture = (best.fun + target).reshape(SIZE, SIZE)
+    image = (best.fun + target).reshape(SIZE, SIZE)
     heights = _heights(best.x.reshape(n, -1), model)  # [K]
-    return Fit(float(-10 * np.log10(np.mean(best.fun**2))), picture, tuple(heights.tolist()))
+    return Fit(float(-10 * np.log10(np.mean(best.fun**2))), image, tuple(heights.tolist()))
 
 
 def _start(model: Sum, rng: np.random.Generator) -> Floats:
@@ -190,5 +190,5 @@ def draw(fits: dict[float, dict[str, list[Fit]]]) -> Figure:
         show(row[0], ring(thickness).reshape(SIZE, SIZE), f"ring of {thickness}", **colors)
         for ax, name in zip(row[1:], (*PAIRS, *POSITIVES[1:]), strict=True):
             fit = fits[thickness][name][0]
-            show(ax, fit.picture, f"{name}\n{fit.psnr:.1f} dB", **colors)
+            show(ax, fit.image, f"{name}\n{fit.psnr:.1f} dB", **colors)
     return figure

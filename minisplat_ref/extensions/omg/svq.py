@@ -1,4 +1,4 @@
-"""Sub-vector quantisation: vectors are split into parts, and each part has a codebook of its own.
+"""Sub-vector quantisation: vectors are split into parts, and each part has its own codebook.
 
 A vector of d numbers becomes d / w parts of w numbers, and each part the index of the nearest of its K codes. So d / w
 times log2 K bits choose among K^(d / w) vectors, while only K d numbers are stored. One codebook for whole vectors

@@ -172,7 +172,7 @@ def orders(primitives: Primitives, colors: Floats, camera: Camera, centers: Floa
     ways = {"list by z": (LIST_ORDER, footprints.depths)}
     ways |= {name: (buffer_size, footprints.distances) for name, buffer_size in BUFFERS.items()}
     pairs, wrong = dict.fromkeys(ways, 0), dict.fromkeys(ways, 0)
-    pictures: dict[str, list[Floats]] = {name: [] for name in ways}
+    images: dict[str, list[Floats]] = {name: [] for name in ways}
     ids = np.flatnonzero(footprints.radii[:, 0] > 0)
     for first in kit.with_progress(range(0, len(centers), CHUNK), "pixels"):
         found = hit(footprints, ids, centers[first : first + CHUNK])
@@ -184,12 +184,12 @@ def orders(primitives: Primitives, colors: Floats, camera: Camera, centers: Floa
             order = blending_order(alphas[listed] > 0, found.depths[listed], buffer_size)
             a, depths = (np.take_along_axis(array[listed], order, axis=0) for array in (alphas, found.depths))
             T = np.cumprod(np.concatenate([np.ones((1, a.shape[1])), 1 - a]), axis=0)
-            pictures[name].append(np.einsum("gp,gpd->pd", a * T[:-1], colors[ids[listed]][order]))
+            images[name].append(np.einsum("gp,gpd->pd", a * T[:-1], colors[ids[listed]][order]))
             n_pairs, n_wrong = count_misordered(a > 0, depths)
             pairs[name], wrong[name] = pairs[name] + n_pairs, wrong[name] + n_wrong
-    exact = np.concatenate(pictures["exact"])
+    exact = np.concatenate(images["exact"])
     result = []
-    for name, parts in pictures.items():
+    for name, parts in images.items():
         errors = np.abs(np.concatenate(parts) - exact)
         largest, mean = float(errors.max()), float(errors.mean())
         share = wrong[name] / max(pairs[name], 1)

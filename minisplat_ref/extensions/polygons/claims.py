@@ -2,15 +2,15 @@
 
 All in float64. An affine edit of all corners is compared with the Gaussians themselves under the same map,
 ``Sigma' = A Sigma A^T`` refactored by singular values (``mechanisms.editing.deformation``), as covariances and as
-pictures.
+images.
 
 Bending is not affine. The corners of a flat sheet of splats are displaced onto a cylinder,
 
     phi(x, y, z) = ((rho - z) sin(x / rho), y, rho - (rho - z) cos(x / rho)),   rho = 2 / angle   for a sheet 2 wide
 
-which takes flat polygons to bent ones; the Gaussians that fit them stay flat and elliptical. What is lost is told by
-the corners: the root mean square distance of the displaced ones from where the fitted spans have them, over that from
-the centres. And by the picture, against that of the bent polygons themselves, whose triangles are drawn as they are,
+which takes flat polygons to bent ones; the Gaussians that fit them stay flat and elliptical. What is lost is measured
+by the corners: the root mean square distance of the displaced ones from where the fitted spans have them, over that
+from the centres. And by the image, against that of the bent polygons themselves, whose triangles are drawn as they are,
 with the alpha that barycentric coordinates carry along: once as the light that the sheet lets pass, to which the order
 of splats does not matter, and once in colours, where neighbours that cross each other change places.
 """
@@ -86,7 +86,7 @@ def round_trips(seed: int) -> dict[int, float]:
 
 
 def affine_errors(name: str, seed: int) -> dict[str, float]:
-    """Return the largest errors of an affine edit of the corners: covariances by both ways, colours, and the picture.
+    """Return the largest errors of an affine edit of the corners: covariances by both ways, colours, and the image.
 
     Covariances are relative to the largest entry of each.
     """
@@ -106,7 +106,7 @@ def affine_errors(name: str, seed: int) -> dict[str, float]:
     seen = Gaussians(*(field[soup.rows] for field in direct))  # the others have no polygon, and stay behind
     mine = Gaussians(*(field[soup.rows] for field in after))
     plain = mine._replace(sh_rest=np.zeros((len(soup.rows), 0, 3)))
-    errors["picture"] = float(np.abs(picture(plain) - picture(seen._replace(sh_rest=plain.sh_rest))).max())
+    errors["image"] = float(np.abs(render_float64(plain) - render_float64(seen._replace(sh_rest=plain.sh_rest))).max())
     return errors
 
 
@@ -115,14 +115,14 @@ def camera() -> Camera:
     return Camera(np.eye(3), np.zeros(3), SIZE, SIZE, SIZE / 2, SIZE / 2, SIZE, SIZE)
 
 
-def picture(gaussians: Gaussians) -> Floats:
+def render_float64(gaussians: Gaussians) -> Floats:
     """Return Gaussians in their polygons over white, [H, W, 3]."""
     request = Request(np.ones(3), backend=CPU)
     image: Floats = TRACED.renderer.render(Model(gaussians), view_from(camera()), request)[0].image
     return image
 
 
-def picture_of_soup(gaussians: Gaussians, soup: Soup, corners: Floats) -> Floats:
+def render_soup(gaussians: Gaussians, soup: Soup, corners: Floats) -> Floats:
     """Return edited polygons as they are, flat or not, over white, [H, W, 3]."""
     centres = corners.mean(axis=1)
     opacities = 1 / (1 + np.exp(-gaussians.opacity_logits[soup.rows]))
@@ -169,7 +169,7 @@ def place_sheet(points: Floats) -> Floats:
 
 
 def bend_errors(n: int, angle: float) -> dict[str, float]:
-    """Return the errors of a sheet of n by n splats that is bent by an angle: corners by both ways, and pictures."""
+    """Return the errors of a sheet of n by n splats that is bent by an angle: corners by both ways, and images."""
     gaussians = sheet(n)
     soup = soup_of(gaussians, 8)
     corners = place_sheet(bend(soup.corners, angle))
@@ -183,14 +183,14 @@ def bend_errors(n: int, angle: float) -> dict[str, float]:
     after, _ = carry_gaussians(gaussians, soup, corners, "the bent sheet")
     black = np.full_like(gaussians.sh_dc, -10.0)
     for name, sh_dc in (("light that passes", black), ("colours", gaussians.sh_dc)):
-        found = picture(after._replace(sh_dc=sh_dc))
-        difference = found - picture_of_soup(gaussians._replace(sh_dc=sh_dc), soup, corners)
+        found = render_float64(after._replace(sh_dc=sh_dc))
+        difference = found - render_soup(gaussians._replace(sh_dc=sh_dc), soup, corners)
         errors[f"{name}, RMS"] = float(np.sqrt(np.mean(difference**2)))
     return errors
 
 
 def measure(seeds: int) -> dict[str, Any]:
-    """Return all that the study tells, by claim."""
+    """Return all that the study reports, by claim."""
     trips = [round_trips(seed) for seed in range(seeds)]
     result: dict[str, Any] = {"round trip": {n: max(trip[n] for trip in trips) for n in SIDES}, "affine": {}}
     for name in kit.with_progress(MAPS, "edits"):
@@ -223,11 +223,11 @@ def draw(result: dict[str, Any]) -> Figure:
     soup = soup_of(gaussians, 8)
     corners = place_sheet(bend(soup.corners, angle))
     fitting, _ = carry_gaussians(gaussians, soup, corners, "the bent sheet")
-    pictures = {
-        f"polygons bent by {angle}°": picture_of_soup(gaussians, soup, corners),
-        "the Gaussians that fit": picture(fitting),
+    images = {
+        f"polygons bent by {angle}°": render_soup(gaussians, soup, corners),
+        "the Gaussians that fit": render_float64(fitting),
     }
-    for axes, (title, image) in zip(panels, pictures.items(), strict=False):
+    for axes, (title, image) in zip(panels, images.items(), strict=False):
         show(axes, image, title)
     curves = {
         "corners, fit": BLUE,

@@ -97,7 +97,7 @@ def _row(
 
 
 def _error(gaussians: Gaussians, view: View) -> float:
-    """Return the largest difference of a small picture in float32 from the reference in float64."""
+    """Return the largest difference of a small image in float32 from the reference in float64."""
     few = view.camera._replace(width=40, height=22, fx=40.0, fy=40.0, cx=20.0, cy=11.0)
     wide = Gaussians(*(field.astype(np.float64) for field in gaussians))
     images: list[Any] = [

@@ -1,7 +1,7 @@
 """What the study ``proxies/affine`` measures: how exact edits are, and what bending a sheet of Gaussians costs.
 
 Affine edits are compared with the affine map itself, in float64: centres, covariances, colours towards rotated
-directions and, where the map is a similarity, the picture with that of a camera which was moved the other way.
+directions and, where the map is a similarity, the image with that of a camera which was moved the other way.
 
 Bending is not affine. A flat sheet of flat Gaussians is sheared and rolled onto a cylinder of radius r,
 
@@ -60,8 +60,8 @@ class EditErrors(NamedTuple):
     """Relative to the largest entry of each matrix."""
     color: float
     """On the scale from 0 to 1."""
-    picture: float | None
-    """On the scale from 0 to 1; None where no camera sees the same picture."""
+    image: float | None
+    """On the scale from 0 to 1; None where no camera sees the same image."""
 
 
 def cloud(rng: np.random.Generator) -> Gaussians:
@@ -93,18 +93,18 @@ def edit_errors(name: str, seed: int) -> EditErrors:
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     Q = polar_rotations(A[None])[0]
     color = np.abs(_colors(after, d @ Q.T) - _colors(before, d)).max()
-    picture = None
+    image = None
     if name in SIMILAR:
-        difference = _picture(after, _move_back(A, Q)) - _picture(before, camera())
-        picture = float(np.abs(difference).max())
+        difference = _image(after, _move_back(A, Q)) - _image(before, camera())
+        image = float(np.abs(difference).max())
     centre = np.abs(after.means - (before.means @ long_A.T + SHIFT)).max()
-    return EditErrors(float(centre), float(relative.max()), float(color), picture)
+    return EditErrors(float(centre), float(relative.max()), float(color), image)
 
 
 def _move_back(A: Floats, Q: Floats) -> Camera:
     """Return the camera that sees ``A x + b`` as :func:`camera` sees x, for ``A = s Q``: R' = R Q^T, t' = s t - R' b.
 
-    For a reflection the camera's rotation becomes a reflection, too, and so the picture is mirrored; the formulas stay.
+    For a reflection the camera's rotation becomes a reflection, too, and so the image is mirrored; the formulas stay.
     """
     s = np.linalg.norm(A[:, 0])
     R = camera().cam_from_world_R @ Q.T
@@ -120,7 +120,7 @@ def _colors(gaussians: Gaussians, directions: Floats) -> Floats:
     return 0.5 + np.einsum("nk,nkc->nc", sh_basis(directions, 3), coefficients)
 
 
-def _picture(gaussians: Gaussians, view: Camera) -> Floats:
+def _image(gaussians: Gaussians, view: Camera) -> Floats:
     return render(gaussians, view, backend=CPU)[0].image
 
 
@@ -221,12 +221,12 @@ def draw(bend: dict[str, Any], seed: int) -> Figure:
     panels = figure.subplots(1, 4, gridspec_kw={"width_ratios": [1, 1, 1, 1.5]})
     sheet, centre = flat_gaussians(np.random.default_rng(seed)), np.zeros(3)
     raised = about_point(rotation_about((0.0, 0.0, 45.0)), centre, np.array([0.0, 0.0, -0.4]))
-    pictures = {
+    images = {
         "a sheet": sheet,
         "its middle rotated\nby 45° and raised": edit_gaussians(sheet, raised, in_ball(sheet.means, centre, 0.6)),
         f"sheared and rolled\nby {CELLS[3]} x {CELLS[3]} cells": bend_by(CELLS[3], sheet, True),
     }
-    for axes, (title, gaussians) in zip(panels, pictures.items(), strict=False):
+    for axes, (title, gaussians) in zip(panels, images.items(), strict=False):
         image = render(_before_the_camera(gaussians), camera(), background=np.ones(3))[0].image
         show(axes, image, title)
     axes = panels[3]

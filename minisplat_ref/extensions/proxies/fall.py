@@ -32,11 +32,11 @@ from minisplat_ref.types import Bools, Camera, Floats
 
 STEP_FRACTION = 0.2  # of the longest stable step; the study proxies/sheet measures what it does to the energy
 FLOOR_DEPTH = 0.02  # how far the floor gives way under a sheet that lies on it, in mean edges
-PICTURE_SIZE = (480, 360)  # pixels, without --cameras
+IMAGE_SIZE = (480, 360)  # pixels, without --cameras
 
 DESCRIPTION = """\
 Bind the Gaussians of a model to a mesh, let the mesh fall as a sheet of masses
-and springs, and write to DIR the Gaussians (frame_000.ply) and the picture
+and springs, and write to DIR the Gaussians (frame_000.ply) and the image
 (frame_000.png) of every frame, the mesh at the end (mesh.ply), and where the
 energy went (energy.json).
 
@@ -188,4 +188,4 @@ def _camera(cameras: Path | None, means: Floats) -> Camera:
     """Return the first camera of a file, or one that sees the whole scene."""
     if cameras is not None:
         return viewpoints.read(cameras)[0].camera
-    return orbits.orbit(means, [], 1, *PICTURE_SIZE)[0].camera
+    return orbits.orbit(means, [], 1, *IMAGE_SIZE)[0].camera

@@ -7,10 +7,11 @@
 
       x = a asinh(s / a),   y = a cosh(D / 2a) - sqrt(a^2 + s^2)  below the supports,   2 a sinh(D / 2a) = L
 
-  The study tells the largest distance of a vertex from its place over L, by number of cells and by stretch under the
+  The study reports the largest distance of a vertex from its place over L, by number of cells and by stretch under the
   sheet's own weight.
-- *Energy*: a sheet held at one side swings down without drag, with drag, and onto a floor. The study tells the largest
-  change of the sum of all energies over the largest sum of kinetic and dissipated energy, by the length of the step.
+- *Energy*: a sheet held at one side swings down without drag, with drag, and onto a floor. The study reports the
+  largest change of the sum of all energies over the largest sum of kinetic and dissipated energy, by the length of the
+  step.
 """
 
 import argparse
@@ -185,8 +186,8 @@ def carpet(seed: int) -> Gaussians:
     )
 
 
-def pictures(seed: int) -> list[Floats]:
-    """Return pictures [SIZE, SIZE, 3] of a carpet that is held at two corners and swings down."""
+def render_swing(seed: int) -> list[Floats]:
+    """Return images [SIZE, SIZE, 3] of a carpet that is held at two corners and swings down."""
     gaussians, mesh = carpet(seed), level_sheet(20)
     is_pinned = np.isclose(mesh.vertices[:, 0], -0.5) & np.isclose(np.abs(mesh.vertices[:, 2]), 0.5)
     sheet = sheet_of(mesh, Setting(GRAVITY, is_pinned, 0.05, 1.0, None))
@@ -211,7 +212,7 @@ def draw(result: dict[str, Any], seed: int) -> Figure:
     figure = Figure(figsize=(9.6, 5.0), layout="constrained")
     n = len(FRAMES)
     places = figure.add_gridspec(2, 3 * n, height_ratios=[1, 1.25])
-    for i, (image, moment) in enumerate(zip(pictures(seed), FRAMES, strict=True)):
+    for i, (image, moment) in enumerate(zip(render_swing(seed), FRAMES, strict=True)):
         axes = figure.add_subplot(places[0, 3 * i : 3 * i + 3])
         show(axes, image, f"{moment:g} s")
     hanging, shares, errors = (figure.add_subplot(places[1, n * i : n * i + n]) for i in range(3))

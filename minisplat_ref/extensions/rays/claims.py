@@ -44,14 +44,14 @@ def random_gaussians(n: int, rng: np.random.Generator, size: float = 0.1) -> Gau
 
 
 def tree_against_brute_force(n: int, seed: int) -> float:
-    """Return the largest difference between pictures by the tree and by all pairs of rays and Gaussians."""
+    """Return the largest difference between images by the tree and by all pairs of rays and Gaussians."""
     gaussians, view = random_gaussians(n, np.random.default_rng(seed)), view_from(demo.camera_of(64, 48))
     images = [TRACED.renderer.render(Model(gaussians), view, Request(backend=b))[0].image for b in (CPU, REFERENCE)]
     return float(np.abs(images[0] - images[1]).max())
 
 
 def exact_order(gaussians: Gaussians, camera: Camera) -> Floats:
-    """Return the picture [H, W, 3] of a response with which every pixel sorts the peaks on its ray.
+    """Return the image [H, W, 3] of a response with which every pixel sorts the peaks on its ray.
 
     With ``S = Sigma^-1``, ``a = d^T S d``, ``b = d^T S (mu - O)`` and ``c = (mu - O)^T S (mu - O)``, the peak lies at
     ``t = b / a`` and is ``o exp(-(c - b^2 / a) / 2)``.
@@ -90,7 +90,7 @@ def order_difference(n: int, seed: int) -> float:
 
 
 def mirror_difference(n: int, seed: int) -> float:
-    """Return the largest difference between the picture in a mirror and that of the mirrored camera."""
+    """Return the largest difference between the image in a mirror and that of the mirrored camera."""
     gaussians, camera = random_gaussians(n, np.random.default_rng(seed)), demo.camera_of(64, 48)
     gaussians.means[:, 2] -= 10  # behind the camera, which sees them only in the mirror
     z = 1.5
@@ -109,7 +109,7 @@ def shadow_edge(n_samples: int = 2000) -> dict[str, float]:
 
     The ball is one opaque Gaussian. Its silhouette from the lamp is where it transmits one half of the light, ``o
     exp(-q / 2) = 1/2``, which is a ball of radius ``s sqrt(2 ln 2 o)``. The edge is interpolated along a line on the
-    floor below the lamp; the unit is a pixel there of a picture 240 wide.
+    floor below the lamp; the unit is a pixel there of an image 240 wide.
     """
     s, opacity, height = 0.3, 1 / (1 + np.exp(-6.0)), 2.0
     centre, lamp = np.array([0.0, 1.0, 4.0]), np.array([0.0, -1.0, 4.0])
@@ -153,7 +153,7 @@ def splatting_errors() -> dict[str, list[float]]:
 
 
 def run_claims(args: argparse.Namespace) -> kit.Report:
-    """Measure each claim, and draw the scene."""
+    """Measure each claim, and render the scene."""
     edge, errors = shadow_edge(), splatting_errors()
     found = {
         "tree against brute force": tree_against_brute_force(args.gaussians, args.seed),
@@ -173,10 +173,10 @@ def run_claims(args: argparse.Namespace) -> kit.Report:
 def draw(errors: dict[str, list[float]]) -> Figure:
     """Draw the demo scene beside the errors of splatting."""
     camera = demo.camera_of()
-    picture = shade(demo.demo_world(), pixel_rays(camera, GSPLAT_MAIN)).reshape(camera.height, camera.width, 3)
+    image = shade(demo.demo_world(), pixel_rays(camera, GSPLAT_MAIN)).reshape(camera.height, camera.width, 3)
     figure = Figure(figsize=(9.5, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
-    show(left, picture)
+    show(left, image)
     for (name, values), color in zip(errors.items(), (BLUE, OCHRE, RED), strict=True):
         right.loglog(SIGMAS, values, "o-", ms=4, color=color, label=f"{name} off the axis")
     right.set(xlabel="standard deviation over distance", ylabel="difference of splatting from tracing")
@@ -196,7 +196,7 @@ def run_speed(args: argparse.Namespace) -> str:
 def speed(n: int, repeats: int) -> dict[str, float]:
     """Return processor microseconds per ray and per rasterised pixel, and the error of float32 tracing.
 
-    Pixels are drawn by the tuned kernels and by the plain ones. The error is that of float32 Gaussians and pictures
+    Pixels are drawn by the tuned kernels and by the plain ones. The error is that of float32 Gaussians and images
     against the reference in float64.
     """
     wide = random_gaussians(n, np.random.default_rng(0), size=0.02)

@@ -87,7 +87,7 @@ def shade(world: World, rays: Rays) -> Floats:
 
 
 def _advance(world: World, bundle: _Bundle, image: Floats, *, sees_surfaces: bool) -> list[_Bundle]:
-    """Add the light of one segment of each ray to the picture, and return the secondary rays."""
+    """Add the light of one segment of each ray to the image, and return the secondary rays."""
     rays, surfaces = bundle.rays, world.surroundings.surfaces
     leaving = rays._replace(near=rays.near * (1 + AWAY))
     corners = surfaces.corners if sees_surfaces else surfaces.corners[:0]

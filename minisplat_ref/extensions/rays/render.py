@@ -43,14 +43,14 @@ def add_parser(commands: Any) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "render",
-        help="draw a scene among lights, mirrors, glass and meshes",
+        help="render a scene among lights, mirrors, glass and meshes",
         description=DESCRIPTION,
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("model", type=Path, metavar="MODEL", help="PLY of Gaussians, or the folder of a run")
     parser.add_argument("--scene", type=Path, required=True, metavar="JSON", help="lights and surfaces, see above")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for the pictures")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for the images")
     parser.add_argument("--cameras", type=Path, metavar="JSON", help="cameras.json (default: the run's test views)")
     parser.add_argument("--frames", type=int, default=12, metavar="N", help="of an orbit without cameras (default 12)")
     parser.add_argument(
@@ -60,7 +60,7 @@ def add_parser(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Trace a picture for each camera.
+    """Trace an image for each camera.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
         for name, view in zip(names, tqdm(views, desc="tracing", unit="view", disable=None), strict=True):
             image = shade(world, pixel_rays(view.camera, GSPLAT_MAIN))
             write_image(folder / f"{name}.png", image.reshape(view.camera.height, view.camera.width, 3))
-    print(f"{len(views)} pictures in {args.out}")
+    print(f"{len(views)} images in {args.out}")
     return 0
 
 

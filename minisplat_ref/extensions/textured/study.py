@@ -3,7 +3,7 @@
 ``counts`` measures what textures gain at an equal number of Gaussians, and at an equal number of floats. The Gaussians
 come from a training with Mini-Splatting or from a PLY. They are fine-tuned for the same number of iterations without
 textures, with textures instead of view-dependent colour (the paper's form), and with both; textures of degree 1 and 2
-are tried, too. Then only so many of the most important Gaussians are kept that the textured ones have no more floats
+are tried, too. Then only this many of the most important Gaussians are kept that the textured ones have no more floats
 than the plain ones had.
 
 ``limb`` asks whether the colour jumps where rays begin to miss the ellipsoid. A row of rays crosses the limb of one

@@ -35,6 +35,6 @@ def fine_tune(
 
 
 def measure(population: Any, scene: Scene, views: tuple[View, ...]) -> Evaluation:
-    """Compare pictures of a population with photographs."""
+    """Compare images of a population with photographs."""
     renderer = representation_of(population).renderer
     return evaluate(Model(population), views, RenderSettings(scene.background, renderer=renderer))

@@ -43,7 +43,7 @@ def still_at(moving: MovingGaussians, time: float) -> Gaussians:
 
 
 def render(model: Model, view: View, request: Request) -> tuple[RenderOutput, _Tape]:
-    """Draw the scene at the time of the view."""
+    """Render the scene at the time of the view."""
     still = still_at(model.gaussians, view.time)
     output, tape = SPLATTING.render(model._replace(gaussians=still), view, request)
     return output, _Tape(tape, view.time)

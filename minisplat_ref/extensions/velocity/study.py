@@ -1,6 +1,6 @@
 """The study ``velocity/motion`` asks whether velocities are found, and what is lost without them.
 
-The scene is known exactly: a dozen round Gaussians, each with a velocity of its own, are photographed by cameras on an
+The scene is known exactly: a dozen round Gaussians, each with its own velocity, are photographed by cameras on an
 arc at times from 0 to 1. Both recipes start from the Gaussians at time 0, at rest, and keep their number, so that row n
 of the result is Gaussian n of the scene.
 
@@ -66,7 +66,7 @@ def camera_at(azimuth: float) -> Camera:
 
 
 def photographs(truth: MovingGaussians) -> tuple[View, ...]:
-    """Return 8-bit pictures of the scene by the reference; the order of the times is not that of the cameras."""
+    """Return 8-bit images of the scene by the reference; the order of the times is not that of the cameras."""
     views = []
     for i in range(N_VIEWS):
         camera, time = camera_at(ARC * np.sin(2.4 * i)), (7 * i % N_VIEWS) / (N_VIEWS - 1)

@@ -7,7 +7,7 @@ foveated rendering (:mod:`minisplat_ref.extensions.vr.foveation`). The recipe ``
 the footprints and the order with which it is rendered.
 
     minisplat-ref train SCENE --recipe vr --out runs/vr
-    minisplat-ref vr render runs/vr/point_cloud.ply --gaze 320,240 --out pictures
+    minisplat-ref vr render runs/vr/point_cloud.ply --gaze 320,240 --out images
     minisplat-ref study vr/foveation SCENE --ply runs/vr/point_cloud.ply --out DIR
     minisplat-ref study vr/yaw --ply runs/vr/point_cloud.ply --out DIR
 
@@ -34,7 +34,7 @@ FOVEATION = declare(
     "foveation",
     "work against PSNR with fewer rays away from the gaze",
     f"{__name__}.measures.run_foveation",
-    *(SCENE, PLY, downscale(), number("--repeats", 3, "timings per picture"), OUT),
+    *(SCENE, PLY, downscale(), number("--repeats", 3, "timings per image"), OUT),
 )
 YAW = declare(
     "yaw",

@@ -7,8 +7,8 @@ et al. 2012)::
 
 The pixel of the display counts as what the eye resolves at the eccentricity ``full``; up to there every pixel is drawn.
 Where MAR has doubled, one ray for each block of 2 x 2 pixels is enough, and where it has doubled again, one for 4 x 4.
-These coarse pictures are drawn through the centres of the blocks with the same footprints, low-pass included, and only
-in the tiles that need them. They are interpolated between the centres, and blended with the finer picture in a ring
+These coarse images are drawn through the centres of the blocks with the same footprints, low-pass included, and only
+in the tiles that need them. They are interpolated between the centres, and blended with the finer image in a ring
 where a zone begins.
 """
 
@@ -28,7 +28,7 @@ RING = 0.2  # width of a blended ring, relative to the eccentricity at which it 
 
 
 class Gaze(NamedTuple):
-    """The point of the picture at which the eye looks."""
+    """The point of the image at which the eye looks."""
 
     x: float
     """Pixels."""
@@ -75,7 +75,7 @@ def eccentricities(camera: Camera, x: float, y: float) -> Floats:
 
 
 def zone_weights(eccentricities: Floats, full: float) -> list[Floats]:
-    """Return the weight [H, W] of each zone's picture; the weights add up to one.
+    """Return the weight [H, W] of each zone's image; the weights add up to one.
 
     A ring lies in the coarser zone, so that no pixel is drawn more coarsely than its eccentricity allows.
     """
@@ -88,8 +88,8 @@ def zone_weights(eccentricities: Floats, full: float) -> list[Floats]:
     return [*weights, rest]
 
 
-def check_gaze(gaze: Gaze, camera: Camera, name: str = "picture") -> None:
-    """Refuse a gaze outside a picture, and an angle out of range.
+def check_gaze(gaze: Gaze, camera: Camera, name: str = "image") -> None:
+    """Refuse a gaze outside an image, and an angle out of range.
 
     Raises
     ------
@@ -108,14 +108,14 @@ def check_gaze(gaze: Gaze, camera: Camera, name: str = "picture") -> None:
 def render_foveated(
     model: Model, camera: Camera, request: Request, gaze: Gaze, buffer_size: int | None
 ) -> tuple[Floats, list[Zone]]:
-    """Draw a view with rates by eccentricity.
+    """Render a view with rates by eccentricity.
 
     Parameters
     ----------
     model : Model
         The Gaussians.
     camera : Camera
-        The camera of the whole picture.
+        The camera of the whole image.
     request : Request
         It asks for colours only.
     gaze : Gaze
@@ -132,7 +132,7 @@ def render_foveated(
     Raises
     ------
     InputError
-        The gaze lies outside the picture.
+        The gaze lies outside the image.
     """
     check_gaze(gaze, camera)
     weights = zone_weights(eccentricities(camera, gaze.x, gaze.y), gaze.full)
@@ -155,7 +155,7 @@ def render_foveated(
 
 
 def _coarser(camera: Camera, block: int) -> Camera:
-    """Return the camera whose pixels are blocks; those at the edges may extend beyond the picture."""
+    """Return the camera whose pixels are blocks; those at the edges may extend beyond the image."""
     return camera._replace(
         fx=camera.fx / block,
         fy=camera.fy / block,
@@ -196,7 +196,7 @@ def _keep_tiles(bins: TileBins, is_kept: Bools) -> TileBins:
 
 
 def _n_pixels(tiles: Bools, bins: TileBins) -> int:
-    """Return how many pixels of the picture lie in tiles."""
+    """Return how many pixels of the image lie in tiles."""
     grid, total = bins.grid, 0
     for tile in np.flatnonzero(tiles):
         y, x = divmod(int(tile), grid.n_tiles_x)
@@ -207,7 +207,7 @@ def _n_pixels(tiles: Bools, bins: TileBins) -> int:
 
 
 def _interpolate(coarse: Floats, block: int, shape: tuple[int, int]) -> Floats:
-    """Return a picture [H, W, 3] by bilinear interpolation between the centres of blocks, clamped at the edges."""
+    """Return an image [H, W, 3] by bilinear interpolation between the centres of blocks, clamped at the edges."""
     if block == 1:
         return coarse
     for axis, size in enumerate(shape):

@@ -47,7 +47,7 @@ def weighted_psnr(image: Floats, target: Floats, angles: Floats) -> float:
 def measure_foveation(
     model: Model, views: Sequence[View], background: Floats, fulls: Sequence[float], repeats: int
 ) -> list[dict[str, Any]]:
-    """Return work and errors for each angle of ``fulls``, after those of pictures that are drawn in full everywhere.
+    """Return work and errors for each angle of ``fulls``, after those of images that are drawn in full everywhere.
 
     The eye looks at the middle of each view. Counts are totals over the views.
     """
@@ -106,7 +106,7 @@ def run_foveation(args: argparse.Namespace) -> kit.Report:
         ]
         for name, row in zip(names, rows, strict=True)
     ]
-    quality = ("weighted PSNR (dB)", "PSNR (dB)", "of the whole picture (dB)")
+    quality = ("weighted PSNR (dB)", "PSNR (dB)", "of the whole image (dB)")
     zones = [
         [f"{row['full']:g}", f"{zone['begins']:.1f}", str(zone["block"] ** 2), *(f"{zone[n]:,}" for n in COUNTS[:2])]
         for row in others

@@ -1,4 +1,4 @@
-"""The command ``minisplat-ref vr render``, which draws pictures for an eye that looks at a given pixel."""
+"""The command ``minisplat-ref vr render``, which draws images for an eye that looks at a given pixel."""
 
 import argparse
 from pathlib import Path
@@ -11,14 +11,14 @@ def add_parser(commands: Any) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "render",
-        help="draw pictures with fewer rays away from the gaze",
-        epilog="example: minisplat-ref vr render runs/vr/point_cloud.ply --gaze 320,240 --out pictures",
+        help="draw images with fewer rays away from the gaze",
+        epilog="example: minisplat-ref vr render runs/vr/point_cloud.ply --gaze 320,240 --out images",
     )
     parser.add_argument("ply", type=Path, metavar="PLY", help="point_cloud.ply of a run")
     parser.add_argument("--gaze", type=gaze, required=True, metavar="X,Y", help="pixel at which the eye looks")
     parser.add_argument("--full", type=float, default=FULL, metavar="DEG", help=f"drawn in full (default {FULL:g})")
     parser.add_argument("--cameras", type=Path, metavar="FILE", help="default cameras.json beside the PLY")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for the pictures")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for the images")
     parser.set_defaults(run=run)
 
 
@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     InputError
-        The PLY or the cameras cannot be used, the gaze lies outside a picture, or the folder exists.
+        The PLY or the cameras cannot be used, the gaze lies outside an image, or the folder exists.
     """
     from minisplat_ref.extensions.vr.foveation import Gaze, check_gaze, render_foveated
     from minisplat_ref.extensions.vr.method import BUFFER
@@ -72,5 +72,5 @@ def run(args: argparse.Namespace) -> int:
             [f"from {first.begins:.1f}", f"1 for {first.block} x {first.block}", f"{tiles:,}", share, f"{pairs:,}"]
         )
     print(markdown_table(["degrees", "rays", "tiles", "rays of all pixels", "pairs"], rows))
-    print(f"\n{len(views)} pictures in {args.out}")
+    print(f"\n{len(views)} images in {args.out}")
     return 0

@@ -108,7 +108,7 @@ class Payload(NamedTuple):
     response_for: Callable[[np.dtype], KernelResponse]
     """That of the kernels, for arrays of a dtype."""
     is_plain: Callable[[Any], bool]
-    """Return whether a population has no payload, so that 3DGS draws it."""
+    """Return whether a population has no payload, so that 3DGS renders it."""
     footprints: Callable[[Projected], Any]
     """Return what the responses take. Its field ``projection`` says what is seen: the ellipses', or more or less."""
     footprints_vjp: Callable[[Projected, tuple[Floats, ...]], PayloadGradient]
@@ -139,7 +139,7 @@ def payload_renderer(name: str, payload: Payload) -> Renderer:
 
 
 def _render(payload: Payload, model: Model, view: View, request: Request) -> tuple[RenderOutput, Any]:
-    """Draw the view; without a payload 3DGS draws it.
+    """Render the view; without a payload 3DGS renders it.
 
     Raises
     ------

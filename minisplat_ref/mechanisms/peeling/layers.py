@@ -16,7 +16,7 @@ a fixed number of them, and leaves out what lies behind.
 - What is not further than the near plane is not drawn, pixel by pixel: a triangle may pass through it.
 - A triangle that is seen at less than ``ANGLE_MIN``, or has no area, is not drawn.
 
-The gradient holds coverage and order fixed: at the border of a mesh that is not transparent there, the picture jumps.
+The gradient holds coverage and order fixed: at the border of a mesh that is not transparent there, the image jumps.
 """
 
 from typing import Any, NamedTuple
@@ -37,7 +37,7 @@ class TranslucentMesh(NamedTuple):
     vertices: Floats
     """[P, 3] world frame, world units."""
     rgba: Floats
-    """[P, 4] red, green, blue and opacity; a picture is meaningful where all are in [0, 1]."""
+    """[P, 4] red, green, blue and opacity; an image is meaningful where all are in [0, 1]."""
     faces: Ints
     """[T, 3] int64 rows of the vertices that are the corners of each triangle."""
 
@@ -53,7 +53,7 @@ class Frame(NamedTuple):
 
 
 class Peeled(NamedTuple):
-    """A picture of a mesh."""
+    """An image of a mesh."""
 
     image: Floats
     """[H, W, 3] background included."""
@@ -68,7 +68,7 @@ class Peeled(NamedTuple):
 
 
 class PeelGradient(NamedTuple):
-    """Gradient of the loss with respect to what a picture of a mesh depends on."""
+    """Gradient of the loss with respect to what an image of a mesh depends on."""
 
     vertices: Floats
     """[P, 3] world frame."""
@@ -93,7 +93,7 @@ def gradient_of(
 
 
 def check_translucent(mesh: TranslucentMesh, source: object) -> None:
-    """Refuse a mesh whose numbers do not make a picture; ``source`` is what messages begin with.
+    """Refuse a mesh whose numbers do not make an image; ``source`` is what messages begin with.
 
     Raises
     ------

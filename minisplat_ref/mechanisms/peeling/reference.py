@@ -52,7 +52,7 @@ def peel(mesh: TranslucentMesh, frame: Frame, background: Floats) -> Peeled:
     Parameters
     ----------
     mesh : TranslucentMesh
-        Float32 or float64, of which the picture is.
+        Float32 or float64, of which the image is.
     frame : Frame
         From where it is seen.
     background : ndarray of shape (3,)

@@ -140,12 +140,12 @@ def pixel_rays_vjp(
 
 
 def blend_stats(hits: Hits, size: tuple[int, int], n: int) -> BlendStats:
-    """Return the contribution of each of n Gaussians to a picture.
+    """Return the contribution of each of n Gaussians to an image.
 
     Parameters
     ----------
     hits : Hits
-        Hits of the picture's rays, row by row.
+        Hits of the image's rays, row by row.
     size : tuple of 2 ints
         Height and width.
     n : int

@@ -1,4 +1,4 @@
-"""A picture by rays through its pixels, and its gradient: what the renderers share that trace Gaussians of any kind.
+"""An image by rays through its pixels, and its gradient: what the renderers share that trace Gaussians of any kind.
 
 A renderer is made of a :class:`Traced`: what becomes of a population before it is traced, and how that is traced.
 """

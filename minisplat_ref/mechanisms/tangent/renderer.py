@@ -66,7 +66,7 @@ class Prepared(NamedTuple):
         return REFERENCE.bin_gaussians(by_distance, grid, self.conventions)
 
     def blended(self, bins: TileBins) -> RenderOutput:
-        """Return the picture, drawn by kernels or by the reference."""
+        """Return the image, drawn by kernels or by the reference."""
         inputs = self.footprints, self.channels, self.background, bins, self.conventions
         if self.backend.is_compiled:
             return kernel_hits.composite_hits(response_for(self.channels.dtype, self.buffer_size), *inputs)
@@ -135,7 +135,7 @@ def check_buffer_size(buffer_size: int | None) -> int:
 
 
 def render(model: Model, view: View, request: Request, *, buffer_size: int | None = None) -> tuple[RenderOutput, Tape]:
-    """Draw a view; return the picture and a tape.
+    """Render a view; return the image and a tape.
 
     Statistics of blending, surfaces and median depths, which the kernels do not collect, are those of 3DGS's footprints
     in its order.

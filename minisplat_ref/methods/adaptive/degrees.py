@@ -1,4 +1,4 @@
-"""View dependence where it pays: each Gaussian of ``adaptive`` has a degree of its spherical harmonics of its own.
+"""View dependence where it pays: each Gaussian of ``adaptive`` has a degree of the spherical harmonics for itself.
 
 Colours of degree d have (d + 1)^2 coefficients, and every photograph that shows a Gaussian is one observation of its
 colour. With about as many coefficients as photographs, the harmonics pass through all of them and are wrong between:
@@ -35,7 +35,7 @@ SEEN = "is_seen"  # name of the statistic
 
 
 def highest_degree(n_views: Ints, views_per_coefficient: float, most: int = SH_DEGREE_MAX) -> Ints:
-    """Return the highest degree that so many views determine: the largest d with n >= views_per_coefficient (d + 1)^2.
+    """Return the highest degree that this many views determine: the largest with n >= views_per_coefficient (d + 1)^2.
 
     Parameters
     ----------

@@ -65,7 +65,7 @@ class Evidence(NamedTuple):
         return float(np.sqrt(np.mean(self.fitted**2)))
 
     def is_above(self, min_gain: float, n_errors: float = N_ERRORS) -> bool:
-        """Return whether it supports the calibration: by ``min_gain``, dB, and by so many standard errors."""
+        """Return whether it supports the calibration: by ``min_gain``, dB, and by this many standard errors."""
         return self.gain > max(min_gain, n_errors * self.standard_error)
 
 

@@ -42,7 +42,7 @@ def grow(
     threshold : float
         Least mean length of the screen gradient, in normalised device coordinates.
     max_growth : float
-        At most this fraction of the Gaussians is halved, those behind most of the pictures' error.
+        At most this fraction of the Gaussians is halved, those behind most of the images' error.
     offset : float
         How far apart the halves are, see :func:`minisplat_ref.strategy.halving.halves`.
     error_views : int
@@ -66,7 +66,7 @@ def grow(
 
 
 def _error_weights(state: TrainState, iteration: Iteration, max_views: int) -> Floats:
-    """Return the error behind which each Gaussian stands [N], in at most so many of the views that are trained on."""
+    """Return the error behind which each Gaussian stands [N], in at most this many of the views that are trained on."""
     views = iteration.scene.train_views
     ids = trained_ids(len(views), iteration.cooling, state.pace)
     chosen = [views[index] for index in ids[:: math.ceil(len(ids) / max_views)]]

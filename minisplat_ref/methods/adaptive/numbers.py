@@ -15,7 +15,7 @@ RAISED = 2.24
 """Factor of the rates of ``3dgs-accel``: 6^0.45, as Mini-Splatting2's rates in a sixth of its iterations. For the
 means, too, and not its square: a Gaussian that overshoots does not settle while the rates are constant (A)."""
 DEGREE_STEPS = (2, 2, 2)
-"""Iterations at which degrees 1 to 3 would begin for Gaussians without a degree of their own, which all have after
+"""Iterations at which degrees 1 to 3 would begin for Gaussians without their own degree, which all have after
 the first iteration."""
 PERIOD = 100
 """Iterations from one growth to the next, and from one measurement to the next. No reason recorded."""

@@ -1,4 +1,4 @@
-"""How ``adaptive`` measures its progress on held-out views, and goes on to larger views or to the cool-down."""
+"""How ``adaptive`` measures its progress on held-out views, and continues to larger views or to the cool-down."""
 
 import numpy as np
 

@@ -1,9 +1,9 @@
 """How ``adaptive`` prunes: in slices, while the rates fall, what the photographs would hardly miss.
 
 With the cool-down all photographs are trained on, and the error falls because the rates do. What most Gaussians add to
-the pictures is then known: :mod:`minisplat_ref.strategy.removal` computes the change of the squared error without each
+the images is then known: :mod:`minisplat_ref.strategy.removal` computes the change of the squared error without each
 of them, in one pass over the training views. Those that are not worth their place go, a slice at a time; after each
-slice the training repairs what it can, and the changes are computed anew. At the end of the cool-down nothing is
+slice the training repairs what it can, and the changes are recomputed. At the end of the cool-down nothing is
 removed, so that it can converge.
 """
 

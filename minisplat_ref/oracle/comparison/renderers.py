@@ -268,7 +268,7 @@ def choose_scenes(
         else:
             chosen[scene] = _with_truth(golden, rules, renderer.ignores)
     if not chosen:
-        raise InputError(f"{renderer.name} can draw none of the scenes {', '.join(wanted)}: other conventions")
+        raise InputError(f"{renderer.name} can render none of the scenes {', '.join(wanted)}: other conventions")
     return chosen, tuple(left_out)
 
 

@@ -32,7 +32,7 @@ from minisplat_ref.oracle.golden.format import (
 FORMAT = "minisplat_ref golden vectors"
 VERSION = 2  # changes when an older folder can no longer be read
 MANIFEST, README = "manifest.json", "README.md"
-AGAIN = "write it anew with: minisplat-ref oracle export DIR"
+AGAIN = "write it again with: minisplat-ref oracle export DIR"
 
 
 def export(path: str | Path, scenes: Mapping[str, Golden]) -> None:
@@ -129,7 +129,7 @@ def read_npz(path: Path) -> Arrays:
     InputError
         If it cannot be read, or holds anything but arrays of numbers.
     """
-    arrays = read_arrays(path, "write it anew")
+    arrays = read_arrays(path, "write it again")
     for name, array in arrays.items():
         if array.dtype.kind not in "fiu":
             raise InputError(f"{path}: {name} has dtype {array.dtype}; only floating point and integers are read")

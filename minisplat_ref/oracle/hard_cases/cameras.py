@@ -115,7 +115,7 @@ CAMERAS = (
     HardCase(
         "principal-point-outside",
         "the axis does not meet the image",
-        "what is left of the picture",
+        "what is left of the image",
         lambda: Parameters(cloud(60, scales=0.5), camera(cx=-8.0, cy=30.0)),
     ),
     HardCase(

@@ -4,7 +4,7 @@ import numpy as np
 
 from minisplat_ref.constants import SH_C0
 from minisplat_ref.oracle.hard_cases.scenes import call, camera, cloud, gaussians, round_to_float32
-from minisplat_ref.oracle.hard_cases.subjects import Call, HardCase, Parameters, Pictures
+from minisplat_ref.oracle.hard_cases.subjects import Call, HardCase, Images, Parameters
 from minisplat_ref.oracle.tolerances import FAINT, HARMONICS, SIMILARITY
 from minisplat_ref.types import Floats
 
@@ -177,9 +177,9 @@ def _flat(value: float, height: int = 20, width: int = 24) -> Floats:
 
 
 def _one_bright() -> Floats:
-    picture = _flat(0.0)
-    picture[9, 11] = 1
-    return picture
+    image = _flat(0.0)
+    image[9, 11] = 1
+    return image
 
 
 def _checkers() -> Floats:
@@ -197,102 +197,102 @@ EQUAL = "loss 0 and, but for rounding, no gradient"
 FLAT = "variance 0, as a difference of means: rounding decides its sign; C2 keeps the quotient away from 0 / 0"
 
 LOSSES = (
-    HardCase("ssim-flat-equal", FLAT, EQUAL, lambda: Pictures(_flat(0.5), _flat(0.5)), SIMILARITY),
+    HardCase("ssim-flat-equal", FLAT, EQUAL, lambda: Images(_flat(0.5), _flat(0.5)), SIMILARITY),
     HardCase(
         "ssim-flat-white",
         "the same at 1, where squares are largest",
         EQUAL,
-        lambda: Pictures(_flat(1.0), _flat(1.0)),
+        lambda: Images(_flat(1.0), _flat(1.0)),
         SIMILARITY,
     ),
     HardCase(
         "ssim-black",
         "all moments are 0: (C1 C2) / (C1 C2)",
         EQUAL,
-        lambda: Pictures(_flat(0.0), _flat(0.0)),
+        lambda: Images(_flat(0.0), _flat(0.0)),
         SIMILARITY,
     ),
     HardCase(
-        "ssim-flat-different", FLAT, "luminance alone differs", lambda: Pictures(_flat(0.25), _flat(0.75)), SIMILARITY
+        "ssim-flat-different", FLAT, "luminance alone differs", lambda: Images(_flat(0.25), _flat(0.75)), SIMILARITY
     ),
     HardCase(
         "ssim-black-white",
         "structure 1, luminance C1 / (1 + C1)",
         "nearly the largest loss",
-        lambda: Pictures(_flat(0.0), _flat(1.0)),
+        lambda: Images(_flat(0.0), _flat(1.0)),
         SIMILARITY,
     ),
     HardCase(
         "ssim-equal",
         "the derivative is a sum of terms that cancel, and the sign of 0 is asked for",
         EQUAL,
-        lambda: Pictures(_noise(), _noise()),
+        lambda: Images(_noise(), _noise()),
         SIMILARITY,
     ),
     HardCase(
         "ssim-nearly-equal",
         "differences of 1e-7, one float32",
         "signs of the differences; SSIM 1 but for rounding",
-        lambda: Pictures(_noise(), round_to_float32(_noise() + 1e-7)),
+        lambda: Images(_noise(), round_to_float32(_noise() + 1e-7)),
         SIMILARITY,
     ),
     HardCase(
         "ssim-one-bright-pixel",
         "one pixel in a flat image",
         "finite, largest around it",
-        lambda: Pictures(_one_bright(), _flat(0.0)),
+        lambda: Images(_one_bright(), _flat(0.0)),
         SIMILARITY,
     ),
     HardCase(
         "ssim-checkers",
         "the largest variance there is, against its inverse",
         "SSIM near -1",
-        lambda: Pictures(_checkers(), 1 - _checkers()),
+        lambda: Images(_checkers(), 1 - _checkers()),
         SIMILARITY,
     ),
     HardCase(
-        "ssim-alone", "w = 1: no L1 beside it", "1 - SSIM", lambda: Pictures(_noise(), _noise(seed=1), 1.0), SIMILARITY
+        "ssim-alone", "w = 1: no L1 beside it", "1 - SSIM", lambda: Images(_noise(), _noise(seed=1), 1.0), SIMILARITY
     ),
     HardCase(
         "l1-alone",
         "w = 0",
         "mean difference and its signs",
-        lambda: Pictures(_noise(), _noise(seed=1), 0.0),
+        lambda: Images(_noise(), _noise(seed=1), 0.0),
         SIMILARITY,
     ),
     HardCase(
         "ssim-beyond-1",
         "values up to 30, whose squares are far above C1 and C2",
         "the same formula",
-        lambda: Pictures(30 * _noise(), 30 * _noise(seed=1)),
+        lambda: Images(30 * _noise(), 30 * _noise(seed=1)),
         SIMILARITY,
     ),
     HardCase(
         "ssim-1x1",
         "the window of 11 pixels finds one",
         "zeros beyond the border",
-        lambda: Pictures(_noise(1, 1), _noise(1, 1, 1)),
+        lambda: Images(_noise(1, 1), _noise(1, 1, 1)),
         SIMILARITY,
     ),
     HardCase(
         "ssim-3x1000",
         "narrower than the window",
         "zeros beyond the border",
-        lambda: Pictures(_noise(1000, 3), _noise(1000, 3, 1)),
+        lambda: Images(_noise(1000, 3), _noise(1000, 3, 1)),
         SIMILARITY,
     ),
     HardCase(
         "ssim-mask-empty",
         "no pixel counts: a mean over nothing",
         "loss 0, gradient 0",
-        lambda: Pictures(_noise(), _noise(seed=1), mask=_mask(20)),
+        lambda: Images(_noise(), _noise(seed=1), mask=_mask(20)),
         SIMILARITY,
     ),
     HardCase(
         "ssim-mask-one-pixel",
         "one pixel counts, windows see its neighbours",
         "nothing leaks in from outside",
-        lambda: Pictures(_noise(), _noise(seed=1), mask=_mask(19)),
+        lambda: Images(_noise(), _noise(seed=1), mask=_mask(19)),
         SIMILARITY,
     ),
 )

@@ -46,7 +46,7 @@ class Call(NamedTuple):
     cotangent_scale: float = 1.0
 
 
-class Pictures(NamedTuple):
+class Images(NamedTuple):
     """A rendered image and a photograph: the photometric loss."""
 
     image: Floats
@@ -64,7 +64,7 @@ class Surface(NamedTuple):
     cotangent_scale: float = 1.0
 
 
-Subject = Parameters | Call | Pictures | Surface
+Subject = Parameters | Call | Images | Surface
 
 
 class HardCase(NamedTuple):

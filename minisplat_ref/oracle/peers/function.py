@@ -230,7 +230,7 @@ def _call(
         raise InputError(f"{where}: {error}: it has to have colours at least") from error
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
-    except Exception as error:  # of somebody else's code, whatever it is
+    except Exception as error:  # in the user's code, whatever it is
         kinds = f"it was called with {rasterizer.kind} arrays, --arrays takes others"
         raise InputError(f"{where} raised {type(error).__name__}: {error}; {kinds}") from error
     _check_shapes(where, result, call)

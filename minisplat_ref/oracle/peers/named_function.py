@@ -49,5 +49,5 @@ def _import_module(name: str) -> ModuleType:
         if error.name is None or not f"{name}.".startswith(f"{error.name}."):
             raise InputError(f"module {name} needs {error.name}, which is not installed") from error
         raise InputError(f"module {error.name} is not found: start in its folder, or install it") from error
-    except Exception as error:  # of somebody else's code, whatever it is
+    except Exception as error:  # in the user's code, whatever it is
         raise InputError(f"importing {name} raised {type(error).__name__}: {error}") from error

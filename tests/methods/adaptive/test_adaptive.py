@@ -49,7 +49,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def reports(scene):
-    """Of a whole training, without the pictures: iteration, view, end, population, pace."""
+    """Of a whole training, without the images: iteration, view, end, population, pace."""
     seen = []
     state = train(
         scene,

@@ -135,5 +135,5 @@ def test_the_report_does_not_compare_sizes():
         " to 23.50 dB after 800." in story(pace, 1280)
     )
     page = decisions_section(pace, 1280)
-    assert page.count("<svg") == 2 and "A red line" in page and "a line of their own" in page
+    assert page.count("<svg") == 2 and "A red line" in page and "their own line" in page
     assert pace.before(decisions[1]).recent() == list(measurements[4:])

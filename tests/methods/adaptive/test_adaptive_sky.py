@@ -88,7 +88,7 @@ def test_what_nobody_sees_through_has_no_colour():
 
 
 def test_photographs_judge_each_other():
-    """Residuals of one field: where all agree the sky is worth it; where each has a colour of its own it costs."""
+    """Residuals of one field: where all agree the sky is worth it; where each has its own colour it costs."""
 
     def photograph(color):
         normal, projected = np.zeros((16, 16)), np.zeros((16, 3))
