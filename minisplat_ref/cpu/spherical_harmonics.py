@@ -177,7 +177,7 @@ def _loop_over_chunk(has_gradient: bool) -> Callable:
     """
 
     @scalar
-    def loop(span, degree, shaded, harmonics, radii, colors, backward):
+    def _loop(span, degree, shaded, harmonics, radii, colors, backward):
         """``colors`` are written, or ``backward`` is v_colors, the gradient and its sums over offsets."""
         first, end = span
         means, sh_dc, sh_rest, width = shaded
@@ -249,7 +249,7 @@ def _loop_over_chunk(has_gradient: bool) -> Callable:
             add(v_offset, 1, is_counted, cast(v_y, DOUBLE))
             add(v_offset, 2, is_counted, cast(v_z, DOUBLE))
 
-    return loop
+    return _loop
 
 
 _evaluate_chunk, _differentiate_chunk = _loop_over_chunk(False), _loop_over_chunk(True)
