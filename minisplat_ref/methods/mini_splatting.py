@@ -27,7 +27,7 @@ from minisplat_ref.strategy.ops import Edit, keep, n_rows
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.rates import LogLinear, Rewind
 from minisplat_ref.training.schedule import BLEND_STATS, At, During, Every
-from minisplat_ref.training.state import Iteration, TrainState, apply_edit, start_anew
+from minisplat_ref.training.state import Iteration, TrainState, apply_edit, start_again
 from minisplat_ref.types import Floats, Gaussians, Scene
 
 Metric = Callable[[ImportanceStats], Floats]
@@ -136,7 +136,7 @@ def reinitialise_from_depth(
         rng=state.rng,
     )
     gaussians = from_points(points, colors, sh_degree=0)
-    start_anew(state, iteration, limit_sizes(gaussians, iteration.scene, largest_size))
+    start_again(state, iteration, limit_sizes(gaussians, iteration.scene, largest_size))
 
 
 def size_limits(means: Floats, scene: Scene, size_fraction: float) -> Floats:
@@ -240,7 +240,7 @@ def restart_from_means(state: TrainState, iteration: Iteration, *, sh_degree: in
     No Gaussian begins larger than :func:`size_limits` with the fraction ``largest_size``.
     """
     gaussians = simplification.reinitialise(state.gaussians, sh_degree)
-    start_anew(state, iteration, limit_sizes(gaussians, iteration.scene, largest_size))
+    start_again(state, iteration, limit_sizes(gaussians, iteration.scene, largest_size))
 
 
 def store_sh(state: TrainState, iteration: Iteration, *, sh_degree: int) -> None:

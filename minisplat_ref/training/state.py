@@ -2,7 +2,7 @@
 
 An action is a function ``action(state, iteration, **settings)`` that changes the :class:`TrainState` it is given; a
 recipe names it, its settings and the iterations in which it acts. It returns None, or a note of a few words for the
-record, for example why it has changed nothing. Only :func:`apply_edit` and :func:`start_anew` add or remove rows.
+record, for example why it has changed nothing. Only :func:`apply_edit` and :func:`start_again` add or remove rows.
 """
 
 import math
@@ -177,7 +177,7 @@ def apply_edit(state: TrainState, edit: Edit) -> None:
     state.stats = {name: inherit(array, edit.parent_ids, no_reset) for name, array in state.stats.items()}
 
 
-def start_anew(state: TrainState, iteration: Iteration, gaussians: Gaussians) -> None:
+def start_again(state: TrainState, iteration: Iteration, gaussians: Gaussians) -> None:
     """Replace the population and forget its history: zero moments, no statistics, all views still to come.
 
     Fields that the representation has besides those of ``gaussians`` get their initial values. Shared parameters stay,

@@ -30,7 +30,7 @@ from minisplat_ref.rendering import SPLATTING, RenderSettings, Request
 from minisplat_ref.runs.progress import Progress
 from minisplat_ref.strategy.clone_split import prune_faint, prune_large
 from minisplat_ref.training.adam import zero_moments
-from minisplat_ref.training.state import Iteration, TrainState, start_anew
+from minisplat_ref.training.state import Iteration, TrainState, start_again
 from minisplat_ref.types import Gaussians, Model, view_from
 from scenes import as_dtype, make_camera, make_gaussians
 from tolerances import (
@@ -231,7 +231,7 @@ def test_a_reinitialisation_begins_with_negatives_too(rng):
     fresh = as_dtype(of_colors(np.full((30, 3), 0.5)), np.float32)
     state = TrainState(fresh, zero_moments(fresh), 0, [], rng, {})
     iteration = Iteration(*[None] * 5, RenderSettings(), find_recipe("negative").representation)
-    start_anew(state, iteration, fresh)
+    start_again(state, iteration, fresh)
     assert np.count_nonzero(0.5 + SH_C0 * state.gaussians.sh_dc[:, 0] < 0) == 6
 
 

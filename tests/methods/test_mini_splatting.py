@@ -239,7 +239,7 @@ def test_tail_is_pruned_and_moments_stay(state, iteration):
     assert_array_equal(state.adam.first.means, moment[kept])
 
 
-def test_start_anew_has_no_past(state, iteration):
+def test_start_again_has_no_past(state, iteration):
     state.stats["is_blurred"] = np.zeros(n_rows(state.gaussians), bool)
     state.view_order = [2, 0]  # in the middle of a round
     means = state.gaussians.means.copy()

@@ -33,7 +33,7 @@ from minisplat_ref.training.rates import LogLinear, Rates, Rewind
 from minisplat_ref.training.representation import Representation
 from minisplat_ref.training.saved_state import load_state, save_state
 from minisplat_ref.training.schedule import Every, configure, describe, parse_settings, scale_recipe, settings_of
-from minisplat_ref.training.state import Iteration, TrainState, start_anew
+from minisplat_ref.training.state import Iteration, TrainState, start_again
 from minisplat_ref.types import Floats, Gaussians, Model, Scene, View
 from scenes import make_camera, make_gaussians
 from tolerances import CLOSED_FORM, GRADIENT_REL, ROUNDED_TO_FLOAT32
@@ -484,7 +484,7 @@ def test_beginning_anew_keeps_what_is_shared(population, rng):
     moments = AdamState({"table": np.ones((2, 3))}, {"table": np.full((2, 3), 2.0)}, 7)
     state = TrainState(population, zero_moments(population), 9, [1], rng, {"x": np.ones(12)}, shared, moments)
     iteration = Iteration(*[None] * 5, representation=LABELLED)
-    start_anew(state, iteration, Gaussians(*take(population, np.arange(4))[:6])._replace())
+    start_again(state, iteration, Gaussians(*take(population, np.arange(4))[:6])._replace())
     assert type(state.gaussians) is Labelled
     assert_array_equal(state.gaussians.weights, np.arange(4))
     assert not state.adam.first.labels.any() and state.adam.step == 0
