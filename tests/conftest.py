@@ -17,6 +17,7 @@ import pytest
 from browser import Browser, find_browser
 from minisplat_ref.backends import BACKENDS, CPU, REFERENCE
 from minisplat_ref.oracle.pieces import tiny_setting
+from minisplat_ref.oracle.setting import make_setting
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -47,12 +48,17 @@ def fast_backend(request):
 
 
 @pytest.fixture
-def flat_colors(monkeypatch):
-    """Give colours of degree 0 to the oracle's Jacobians of a model: a quarter fewer inputs, of formulas of the core.
+def small_proof(monkeypatch):
+    """Let the oracle check a model on less: Jacobians with colours of degree 0, inner products of half the Gaussians.
 
-    Its inner products have all degrees.
+    The inner products have colours of all degrees, and two by two of the kernels' tiles.
     """
+
+    def smaller(rng, n, width, height, *rest, **named):
+        return make_setting(rng, n // 2, 36, 20, *rest, **named)
+
     monkeypatch.setattr("minisplat_ref.oracle.models.tiny_setting", partial(tiny_setting, sh_degree=0))
+    monkeypatch.setattr("minisplat_ref.oracle.models.make_setting", smaller)
 
 
 @pytest.fixture(scope="session")

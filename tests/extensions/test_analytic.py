@@ -157,12 +157,12 @@ def test_a_round_footprint_has_a_finite_gradient():
 # --- whole images ---
 
 
-def test_the_gradient_of_the_whole_model(backend):
+def test_the_gradient_of_the_whole_model(backend, small_proof):
     report = check_model_gradients(backend, GSPLAT_MAIN, INTEGRATED, stages)
     assert len(report.cases) == 2 and report.n_failed == 0, report.cases
 
 
-def test_a_wrong_gradient_is_found(monkeypatch):
+def test_a_wrong_gradient_is_found(monkeypatch, small_proof):
     path = "minisplat_ref.extensions.analytic.reference.axes_of_vjp"
     monkeypatch.setattr(path, lambda conics, axes, v_axes: 1.001 * axes_of_vjp(conics, axes, v_axes))
     report = check_model_gradients(REFERENCE, GSPLAT_MAIN, INTEGRATED, stages)

@@ -156,12 +156,12 @@ def test_footprints_err_the_same_at_any_angle():
 # --- gradients ---
 
 
-def test_the_gradient_of_the_whole_model(backend, flat_colors):
+def test_the_gradient_of_the_whole_model(backend, small_proof):
     report = check_model_gradients(backend, GSPLAT_MAIN, ORDERED, stages)
     assert len(report.cases) == 4 and report.n_failed == 0, report.cases
 
 
-def test_a_wrong_gradient_is_found(monkeypatch, flat_colors):
+def test_a_wrong_gradient_is_found(monkeypatch, small_proof):
     true = planes.hit_vjp
 
     def wrong(*args):

@@ -222,12 +222,12 @@ def test_kernels_and_reference_agree(dtype, image_rel, gradient_rel, rng):
         assert np.abs(found - expected).max() <= gradient_rel * scale, name
 
 
-def test_the_gradient_of_the_whole_model(backend):
+def test_the_gradient_of_the_whole_model(backend, small_proof):
     report = check_model_gradients(backend, GSPLAT_MAIN, TRACED, stages)
     assert len(report.cases) == 2 and report.n_failed == 0, report.cases
 
 
-def test_a_wrong_gradient_is_found(monkeypatch):
+def test_a_wrong_gradient_is_found(monkeypatch, small_proof):
     correct = reference.intersect_vjp
 
     def wrong(*args):

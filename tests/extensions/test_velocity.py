@@ -102,12 +102,12 @@ def test_the_gradient_of_the_motion(rng):
     )
 
 
-def test_the_gradient_of_the_whole_model(backend):
+def test_the_gradient_of_the_whole_model(backend, small_proof):
     report = check_model_gradients(backend, GSPLAT_MAIN, MOVING)
     assert len(report.cases) == 2 and report.n_failed == 0, report.cases
 
 
-def test_a_wrong_gradient_is_found():
+def test_a_wrong_gradient_is_found(small_proof):
     def wrong(tape, v_image, v_alpha):
         v = RENDERER.render_vjp(tape, v_image, v_alpha)
         return v._replace(gaussians=v.gaussians._replace(velocities=(1 + 1e-6) * v.gaussians.velocities))

@@ -21,7 +21,7 @@ OF_ALL = pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
 
 
 @OF_ALL
-def test_the_gradient_of_the_whole_model(case, backend, flat_colors):
+def test_the_gradient_of_the_whole_model(case, backend, small_proof):
     report = check_model_gradients(backend, GSPLAT_MAIN, case.representation, case.stages)
     assert len(report.cases) == 2 and report.n_failed == 0, report.cases
 
