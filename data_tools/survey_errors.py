@@ -31,12 +31,12 @@ _CALL = (
     ),
     PlantedLine(
         "view matrix without the harmonics' share",
-        "gsplat_compat:draw_vjp",
+        "gsplat_compat:render_one_vjp",
         "v_R, v_t = v_R + np.outer(w, unrotated.cam_from_world_t), v_t - w",
         "pass",
     ),
     PlantedLine(
-        "means without the harmonics' share", "gsplat_compat:draw_vjp", "v_means = v_means + v_sh.means", "pass"
+        "means without the harmonics' share", "gsplat_compat:render_one_vjp", "v_means = v_means + v_sh.means", "pass"
     ),
     PlantedLine(
         "expected depth not divided",
