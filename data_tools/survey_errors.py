@@ -47,7 +47,7 @@ _CALL = (
     PlantedLine(
         "colours of all cameras to the first", "gsplat_compat:rasterization_vjp", "v_colors[c] if", "v_colors[0] if"
     ),
-    PlantedLine("camera's centre by the transpose", "gsplat_compat:_unrotated", "np.linalg.solve(R, t)", "R.T @ t"),
+    PlantedLine("camera's centre by the transpose", "gsplat_compat:_remove_rotation", "np.linalg.solve(R, t)", "R.T @ t"),
     PlantedLine("depths over white", "splatting:splat", "background.dtype.type(0)", "background.dtype.type(1)"),
     PlantedLine(
         "gradient of depths lost", "splatting:splat_vjp", "v.colors[:, -1].copy()", "np.zeros_like(projection.depths)"
@@ -172,8 +172,8 @@ _BLENDING = (
     PlantedLine(
         "last of the largest weights dominates",
         "reference.compositing:composite_hits",
-        "np.argmax(sorted_by(order, weights), axis=0)",
-        "len(ids) - 1 - np.argmin(sorted_by(order, weights)[::-1], axis=0)",
+        "np.argmax(sort_by(order, weights), axis=0)",
+        "len(ids) - 1 - np.argmin(sort_by(order, weights)[::-1], axis=0)",
     ),
     PlantedLine(
         "expected depth's gradient",
@@ -190,7 +190,7 @@ _BLENDING = (
     PlantedLine(
         "kernels: fourth channel without its share of alpha's gradient",
         "cpu.compositing.backward:backward_kernel",
-        "shade = shade + v * records[n, COLOR + k]",
+        "v_dot_c = v_dot_c + v * records[n, COLOR + k]",
         "pass",
         is_compiled=True,
     ),

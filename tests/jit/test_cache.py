@@ -146,7 +146,7 @@ from minisplat_ref.extensions.geometry import EXTENSION as GEOMETRY
 from minisplat_ref.io import load_scene
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.methods import get_recipe
-from minisplat_ref.rendering import render
+from minisplat_ref.rendering import RenderSettings, render
 from minisplat_ref.strategy.importance import collect_importance
 from minisplat_ref.training.loop import train
 from minisplat_ref.warm_up import FIRST_ITERATION, STAGES, _draw_extension
