@@ -47,7 +47,9 @@ _CALL = (
     PlantedLine(
         "colours of all cameras to the first", "gsplat_compat:rasterization_vjp", "v_colors[c] if", "v_colors[0] if"
     ),
-    PlantedLine("camera's centre by the transpose", "gsplat_compat:_remove_rotation", "np.linalg.solve(R, t)", "R.T @ t"),
+    PlantedLine(
+        "camera's centre by the transpose", "gsplat_compat:_remove_rotation", "np.linalg.solve(R, t)", "R.T @ t"
+    ),
     PlantedLine("depths over white", "splatting:splat", "background.dtype.type(0)", "background.dtype.type(1)"),
     PlantedLine(
         "gradient of depths lost", "splatting:splat_vjp", "v.colors[:, -1].copy()", "np.zeros_like(projection.depths)"
