@@ -286,7 +286,7 @@ def psnr_of(image: Floats, target: Floats) -> float:
     return float(-10 * np.log10(np.mean((np.clip(image, 0, 1).astype(np.float64) - target) ** 2)))
 
 
-def least_seconds(function: Callable[[], Any], repeats: int) -> float:
+def min_seconds(function: Callable[[], Any], repeats: int) -> float:
     """Return the least processor time of a call, summed over all threads, seconds."""
     times = []
     for _ in range(repeats):

@@ -69,7 +69,7 @@ def measure(n: int, repeats: int) -> dict[str, dict[str, float | None]]:
     opacities = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
     fans = fans_of(polygons_of(gaussians, opacities))
     found["polygons"]["triangles in the tree"] = float(len(tree_of(fans, GSPLAT_MAIN).records))
-    found["polygons"]["tree ms"] = 1e3 * kit.least_seconds(partial(tree_of, fans, GSPLAT_MAIN), repeats)
+    found["polygons"]["tree ms"] = 1e3 * kit.min_seconds(partial(tree_of, fans, GSPLAT_MAIN), repeats)
     found["polygons"]["error of float32"] = _error(gaussians, view)
     return found
 
@@ -82,8 +82,8 @@ def _row(
     counted = Request(backend=CPU, wants=frozenset({"stats"}))  # the plain kernels collect no statistics
     stats: Any = renderer.render(model, view, counted)[0].stats
     output, tape = renderer.render(model, view, request)
-    forward = kit.least_seconds(partial(renderer.render, model, view, request), repeats)
-    backward = kit.least_seconds(partial(renderer.render_vjp, tape, np.ones_like(output.image), None), repeats)
+    forward = kit.min_seconds(partial(renderer.render, model, view, request), repeats)
+    backward = kit.min_seconds(partial(renderer.render_vjp, tape, np.ones_like(output.image), None), repeats)
     looked_at = output.n_pairs * backend.tile_width * backend.tile_height / n_pixels if renderer is SPLATTING else None
     return {
         "hits a pixel": float(stats.hit_count.sum() / n_pixels),

@@ -207,11 +207,11 @@ def speed(n: int, repeats: int) -> dict[str, float]:
     for name, renderer, backend in kit.with_progress(ways, "timing"):
         request = Request(backend=backend)
         output, tape = renderer.render(Model(gaussians), view, request)
-        forward = kit.least_seconds(partial(renderer.render, Model(gaussians), view, request), repeats)
-        backward = kit.least_seconds(partial(renderer.render_vjp, tape, np.ones_like(output.image), None), repeats)
+        forward = kit.min_seconds(partial(renderer.render, Model(gaussians), view, request), repeats)
+        backward = kit.min_seconds(partial(renderer.render_vjp, tape, np.ones_like(output.image), None), repeats)
         result |= {f"{name} forward us": forward / n_pixels * 1e6, f"{name} backward us": backward / n_pixels * 1e6}
     whitened = whiten_model(Model(gaussians))
-    result["tree ms"] = 1e3 * kit.least_seconds(partial(tree_of, whitened, GSPLAT_MAIN), repeats)
+    result["tree ms"] = 1e3 * kit.min_seconds(partial(tree_of, whitened, GSPLAT_MAIN), repeats)
     result["hits per ray"] = output.n_pairs / n_pixels
     few = pixel_rays(demo.camera_of(40, 22), GSPLAT_MAIN)
     colors = np.clip(0.5 + gaussians.sh_dc.astype(np.float64), 0, 1)
