@@ -147,7 +147,7 @@ def test_what_convert_refuses(run, tmp_path, one_line):
     assert "a PLY has one precision" in one_line("convert", run, tmp_path / "a.ply", "--max-bytes", "9")
     assert ".ply or .msz or .spz" in one_line("convert", run, tmp_path / "a.xyz")
     assert "are for --max-drop" in one_line("convert", run, tmp_path / "a.msz", "--scene", run)
-    assert "knows its extension" in one_line("convert", run, tmp_path / "a.msz", "--extension", "velocity")
+    assert "has its extension recorded" in one_line("convert", run, tmp_path / "a.msz", "--extension", "velocity")
     (tmp_path / "bad.msz").write_bytes(b"MSZ\n")
     assert "bad.msz: not an MSZ file" in one_line("convert", tmp_path / "bad.msz", tmp_path / "a.ply")
     assert "bad.msz" in one_line("info", tmp_path / "bad.msz")

@@ -11,8 +11,8 @@ from minisplat_ref.datasets.synthetic.files import write_scene
 
 @pytest.fixture(scope="module")
 def large_scene(tmp_path_factory):
-    """Three portraits of 640 x 960 pixels, the smallest that are remarked on."""
-    options = {"n_views": 3, "width": 640, "height": 960, "n_points": 60, "test_every": 0}
+    """Five portraits, as many as adaptive needs, of 640 x 960 pixels, the smallest that are remarked on."""
+    options = {"n_views": 5, "width": 640, "height": 960, "n_points": 60, "test_every": 0}
     folder = tmp_path_factory.mktemp("scenes") / "large"
     write_scene(make_scene("room", supersampling=1, **options), folder, options)
     return folder
