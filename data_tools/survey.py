@@ -51,7 +51,7 @@ class Outcome(NamedTuple):
 
 @contextmanager
 def plant_in_function(error: PlantedLine) -> Iterator[None]:
-    """Give a function of Python other code for a while, whoever holds it.
+    """Give a function of Python other code for a while, wherever it is referenced.
 
     Raises
     ------

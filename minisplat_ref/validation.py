@@ -162,7 +162,7 @@ def choose_conventions(
     eps2d: float | None,
     rasterize_mode: str,
 ) -> Conventions:
-    """Return the profile, given itself or by name, with the other values that were given in place of its own."""
+    """Return the profile, given itself or by name, with the other values that were given instead of its own."""
     if isinstance(profile, str):
         check_choice("profile", profile, tuple(PROFILES))
         profile = PROFILES[profile]

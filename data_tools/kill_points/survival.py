@@ -2,8 +2,8 @@
 
 ``python -m data_tools.kill_points`` prints a table. Whatever lies in the folder of a training that was killed at one of
 the :data:`POINTS` of :mod:`data_tools.kill_points.points` must continue by ``train --resume``, or begin again by
-the same command where nothing had been done, and end with the same bytes as the training that nobody disturbed. The
-same is asked after a full disk, a limit to the size of files, a read-only disk and a photograph that disappears; the
+the same command where nothing had been done, and end with the same bytes as an undisturbed training. The same must
+hold after a full disk, a limit to the size of files, a read-only disk and a photograph that disappears; the
 first and the third mount disks, which takes a system administrator's rights.
 
 Of the log, times are left out, and loss and PSNR, which are running means and start again.
@@ -75,7 +75,7 @@ def _run(command: Sequence[str], **options: Any) -> Done:
 
 
 def prepare(folder: Path) -> tuple[Path, Path]:
-    """Make a scene and a training that nobody disturbs; return their folders."""
+    """Make a scene and a training that is not disturbed; return their folders."""
     scene, whole = folder / "scene", folder / "whole"
     write_scene(make_scene("room", supersampling=1, **SCENE), scene, SCENE)
     done = train(scene, whole)

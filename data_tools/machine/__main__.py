@@ -52,9 +52,9 @@ def measure_roofline(args: argparse.Namespace) -> Report:
     from minisplat_ref.bench.workloads import get_workload
 
     workloads = [get_workload(workload, args.data) for workload in args.workloads]  # before anything takes its time
-    progress("a training iteration on one thread and on all, by turns")
+    progress("a training iteration on one thread and on all, alternating")
     cases = thread_cases(args.scene, args.downscale, args.iterations)
-    progress("blending against straight-line loops, Adam against a copy, other stages by themselves, all by turns")
+    progress("blending against straight-line loops, Adam against a copy, other stages by themselves, all alternating")
     contests = [contest for made in workloads for contest in (blending(made), *threads(made))]
     cases += time_contests([*contests, *adams(), *stages()], args.repeats)
     return Report("How far the kernels are from the limits", tuple(cases), {})

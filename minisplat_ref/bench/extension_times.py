@@ -1,11 +1,11 @@
 """What an extension's renderer costs: forward and backward on both backends, each beside its error.
 
-The answer is its own on the reference in float64. Beside it stand the renderer of 3DGS by the plain kernels, which an
-extension's response runs in, by the tuned ones and by the textbook loop, on the same Gaussians, with errors against
+The truth is its own result on the reference in float64. Beside it are the renderer of 3DGS by the plain kernels, which
+an extension's response runs in, by the tuned ones and by the textbook loop, on the same Gaussians, with errors against
 3DGS's own reference.
 
-In float32 a hit may fall on the other side of a threshold, and two hits of nearly one depth change places. A renderer
-of somebody else's does not say where its thresholds are, so such pixels cannot be set aside by name: what is judged is
+In float32 a hit may fall on the other side of a threshold, and two hits of nearly one depth change places. A user's
+renderer does not say where its thresholds are, so such pixels cannot be set aside by name: what is judged is
 the part of the pixels that are off, and the root mean square over the others.
 """
 

@@ -9,7 +9,7 @@ reaches a refinement. It stays in its densifying phase, because afterwards it wo
 32nd or 64th iteration. These differences remain: it steps the SH coefficients above degree 0 in every 16th iteration,
 all other parameters of all Gaussians in every one, and it accumulates the statistics that a refinement would use.
 
-It renders with threads of its own, while the OpenMP threads of its libtorch spin as they wait and take the cores from
+It renders with its own threads, while the OpenMP threads of its libtorch spin as they wait and take the cores from
 them, which on a busy machine multiplies its time. They are told to sleep.
 """
 

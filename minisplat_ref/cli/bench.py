@@ -21,7 +21,7 @@ Time every backend and precision on fixed workloads, and measure its error
 against the float64 reference in the same run. What exceeds its bound of error
 has failed and gets no time.
 
-Errors are given with and without the pixels at which a hit stands at a
+Errors are given with and without the pixels at which a hit is at a
 threshold (alpha 1/255, the stop, depths); correct renderers differ there, and
 "flips" counts where. Ratios of times mean something inside one run only.
 """

@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 EXAMPLES = {"SCENE": "room", "FILE": "runs/mine.ply", "DIR": "study"}
-"""What stands in the example of a study for a required argument, by its placeholder."""
+"""What the example of a study shows for a required argument, by its placeholder."""
 
 
 def _example(parser: argparse.ArgumentParser) -> str:

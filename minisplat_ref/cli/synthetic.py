@@ -7,7 +7,7 @@ from minisplat_ref.arguments import SYNTHETIC_SCENES, Commands, HelpFormatter
 
 DESCRIPTION = """\
 Ray-trace photographs of a small world, and write them as a COLMAP scene with
-sparse points. Beside it stands what no photograph has: the exact depths/ and
+sparse points. Beside it is what no photograph has: the exact depths/ and
 normals/ of every pixel, and scene_info.json. Equal arguments give equal bytes.
 
   room         textured walls, furniture with thin rods

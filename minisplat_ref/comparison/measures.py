@@ -181,7 +181,7 @@ def densification_end(recipe: Mapping[str, Any]) -> float:
 
 
 def relation(measure: Measure, value: Spread, first: Spread) -> float | None:
-    """Return how a recipe's mean stands to that of the first recipe: its ratio or difference; None where one lacks."""
+    """Compare a recipe's mean with that of the first recipe: its ratio or difference; None where one lacks."""
     if measure.relation is None or value.mean is None or first.mean is None:
         return None
     if measure.relation == "ratio" and first.mean == 0:

@@ -87,7 +87,7 @@ TIE = 1e-4
 # What float32 promises of an image where no hit falls on the other side of a threshold: hundreds of hits, each with an
 # exponential of 1e-7 relative error at a distance that has lost digits to a coordinate of some hundred pixels.
 BENCH_FLOAT32_IMAGE = 2e-5
-# The same of every parameter's gradient, relative L2, without the pixels that stand at a threshold.
+# The same of every parameter's gradient, relative L2, without the pixels at a threshold.
 BENCH_FLOAT32_GRADIENT = 1e-4
 # Part of the pixels in which a hit may fall on the other side of a threshold in float32: none to 1e-4 on random scenes.
 BENCH_FLIPPED_PIXELS = 1e-3

@@ -20,7 +20,7 @@ def write_page(report: Report, path: Path, figures: Sequence[str] = (), *, is_by
     path : Path
         Its folder must exist.
     figures : sequence of str
-        Parts of a page that stand before the tables.
+        Parts of a page before the tables.
     is_by_kind : bool
         Whether cases with other figures have their own table; else there is one, in the order of the cases.
 

@@ -40,7 +40,7 @@ def depth_range(depth: Floats) -> tuple[float, float]:
 
 
 def colorize(values: Floats, low: float, high: float, colormap: str) -> Image8:
-    """Colour values [H, W] with a map whose ends stand for ``low`` and ``high``, in either order."""
+    """Colour values [H, W] with a map from ``low`` to ``high``, in either order."""
     from matplotlib import colormaps  # not at the top: a training would wait for it before its first iteration
 
     fractions = np.clip((values - low) / ((high - low) or 1.0), 0.0, 1.0)  # [H, W]

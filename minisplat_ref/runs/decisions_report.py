@@ -112,7 +112,7 @@ def over_iterations(pace: Pace) -> Figure:
 
 
 def _name_decisions(axes: Axes, decisions: tuple[Decision, ...]) -> None:
-    """Write what was decided at the foot of its line; what was decided at nearly one iteration stands in one label."""
+    """Write what was decided at the foot of its line; what was decided at nearly one iteration is in one label."""
     labels: dict[int, list[str]] = {}
     for decision in decisions:
         near = next((step for step in labels if decision.step - step <= 1), decision.step)

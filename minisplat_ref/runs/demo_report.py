@@ -45,7 +45,7 @@ DEPTH_ERROR_RANGE = 0.1  # of the true depth: larger differences are all shown a
 VIEWS_TEXT = f"The training never saw these views. {ERROR_TEXT}"
 DEPTH_TEXT = """\
 Nothing taught the Gaussians depth. Here is the distance that they came to, next to the exact one
-of the ray tracer. Near is bright; beside it stands the difference relative to the true depth."""
+of the ray tracer. Near is bright; beside it is the difference relative to the true depth."""
 CURVES_TEXT = """\
 Where the number of Gaussians jumps, those with a large gradient were cloned or split: the loss
 jumps with it, and recovers."""

@@ -47,7 +47,7 @@ def evaluate_run(
     scene : Path, optional
         Where the photographs are now, or others; where they were by default.
     model : Path, optional
-        Gaussians that stand in for those of the run: a PLY or a compact file.
+        Gaussians instead of those of the run: a PLY or a compact file.
     test_every : int, optional
         Measure every K-th view; those that the run held out by default.
     out : Path, optional

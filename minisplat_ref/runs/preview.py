@@ -1,4 +1,4 @@
-"""``train --preview``: one image of the training as it stands, replaced every few seconds."""
+"""``train --preview``: one image of the present training, replaced every few seconds."""
 
 import math
 import time
@@ -20,7 +20,7 @@ FILE = "preview.png"
 def make_preview(folder: Path, scene: Scene, settings: Settings, progress: Progress) -> Callable[[StepReport], None]:
     """Return a callback of the training loop that writes truth, render and error of a view side by side.
 
-    The view is the first test view, or where there are none the first training view. The clock of the training stands
+    The view is the first test view, or where there are none the first training view. The clock of the training stops
     still meanwhile, and the training ends with the same bytes as without.
 
     Parameters

@@ -1,9 +1,9 @@
 """Runs a training into its folder: progress, checkpoints, and everything that the folder holds in the end.
 
-Nothing that has taken time is ever deleted. The first checkpoint stands before the first iteration; Ctrl-C, SIGTERM, a
-full disk, a number that is not finite or an error of the program end the training with the last whole state saved, or
-with the checkpoint of at most a minute ago where the state is half changed. ``metrics.json`` comes last: a folder whose
-measures are not of its checkpoint's iteration has not ended.
+Nothing that has taken time is ever deleted. The first checkpoint is written before the first iteration; Ctrl-C,
+SIGTERM, a full disk, a number that is not finite or an error of the program end the training with the last whole state
+saved, or with the checkpoint of at most a minute ago where the state is half changed. ``metrics.json`` comes last: a
+folder whose measures are not of its checkpoint's iteration has not ended.
 """
 
 import contextlib

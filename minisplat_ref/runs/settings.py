@@ -1,4 +1,4 @@
-"""What a training is asked to do, as it stands in ``config.json``."""
+"""The settings of a run, and their file ``config.json``."""
 
 import platform
 import reprlib

@@ -9,7 +9,7 @@ from minisplat_ref.types import Scene
 
 
 def load_start(path: str | Path, scene: Scene) -> tuple[Scene, list[str]]:
-    """Read a point cloud and put it in the place of the scene's points.
+    """Read a point cloud and replace the scene's points by it.
 
     The scene that is returned is for the start alone: its views do not know which of these points they see.
 

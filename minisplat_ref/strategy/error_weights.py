@@ -1,4 +1,4 @@
-"""The error of the images behind which each Gaussian stands: the sum of error times blend weight.
+"""The error of the images that each Gaussian is responsible for: the sum of error times blend weight.
 
 A Gaussian that covers much of what is wrong deserves more Gaussians in its place than one that moves a lot, which the
 gradient of its centre measures: that vanishes, too, where the pulls of a pixel on either side cancel. With the error e

@@ -5,7 +5,7 @@ iteration in which ``adaptive`` has decided about a sky, exposures, poses and an
 switched on. Its seed is used for the disturbance and the training.
 
 =========  ========================================================================================================
-``clean``  the scene as it is; a real one may have defects of its own
+``clean``  the scene as it is; a real one may have other defects
 ``gains``  each photograph is multiplied by its own gain, from 0.9 to 1.1
 ``poses``  each camera is turned about its own axis, across its own, so that its image moves by half a pixel
 ``sizes``  each photograph has the half width and height, or not, by chance
@@ -87,7 +87,7 @@ def under_a_sky(scene: Scene, rng: np.random.Generator) -> Scene:
     Raises
     ------
     InputError
-        The scene is not synthetic: nobody knows how high its pixels are.
+        The scene is not synthetic: the height of its pixels is unknown.
     """
     truth = make_scene(scene.name) if scene.name in SCENE_NAMES else None
     if truth is None or not np.array_equal(_places(truth.scene), _places(scene)):

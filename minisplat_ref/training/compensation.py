@@ -8,7 +8,7 @@ low-pass has added::
     o' = o sqrt(det S / det(S + 0.3 I))        S: covariance of the footprint, px^2
 
 so that a photograph of half the size shows the same scene at half the size. The core's conventions have it
-(``is_antialiased``). Here it is a property of the model: who has trained with it must be drawn with it. The shared
+(``is_antialiased``). Here it is a property of the model: what was trained with it must be rendered with it. The shared
 parameter ``compensation`` [1] says so by being there; it is not trained, and its value does not matter. A PLY file has
 no place for it: other viewers draw thin Gaussians a little too strong, unless they can be told.
 """

@@ -80,7 +80,7 @@ def room(rng: np.random.Generator) -> Setting:
 
 
 def plain_wall(rng: np.random.Generator) -> Setting:
-    """The same room with bare walls: a photograph says nothing about where such a wall stands."""
+    """The same room with bare walls: a photograph says nothing about where such a wall is."""
     lattice = random_lattice(rng)
     bare = Plain("#e4d8c6")
     streaks = Noise("#000000", "#ffffff", np.array([0.9, 0.06, 1.0]), lattice)

@@ -192,7 +192,7 @@ def radiance(
 
 
 def _is_shadowed(world: World, points: Floats, light_ids: Ints) -> NDArray[np.bool_]:
-    """[n] whether something stands between a point and its sample of the light."""
+    """[n] whether something lies between a point and its sample of the light."""
     blockers = tuple(primitive for primitive in world.primitives if primitive.casts_shadow)
     is_shadowed = np.zeros(len(points), bool)
     for light_id in np.unique(light_ids):

@@ -37,7 +37,7 @@ from minisplat_ref.extensions.fans.stages import stages
 from minisplat_ref.studies import study
 
 PROFILE = study.declare(
-    "profile", "which fan stands best for a Gaussian, from any side", f"{__name__}.study.run_profile", study.OUT
+    "profile", "which fan approximates a Gaussian best, from any side", f"{__name__}.study.run_profile", study.OUT
 )
 REFIT = study.declare(
     "refit",

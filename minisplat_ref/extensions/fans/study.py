@@ -1,6 +1,6 @@
 """The studies ``fans/profile`` and ``fans/refit``.
 
-``profile``: which reach and rim stand best for a Gaussian seen from the front, for each number of sides; and what
+``profile``: which reach and rim approximate a Gaussian best seen from the front, for each number of sides; and what
 becomes of a disc and of a ball that turn away from the camera.
 
 ``refit``: on a scene, what fans lose against the splats that they were made of, over reach, rim and sides; what is

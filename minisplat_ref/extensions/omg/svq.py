@@ -33,7 +33,7 @@ class Quantised(NamedTuple):
     """[N, P] rows of the codebooks."""
 
     def vectors(self) -> Floats:
-        """Return the vectors [N, P w] that the codes stand for, float32."""
+        """Return the vectors [N, P w] that the codes represent, float32."""
         parts = [codes[rows] for codes, rows in zip(self.codes, self.indices.T, strict=True)]
         return np.concatenate(parts, axis=1).astype(np.float32)
 

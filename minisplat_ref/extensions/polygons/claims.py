@@ -162,7 +162,7 @@ def bend(points: Floats, angle: float) -> Floats:
 
 
 def place_sheet(points: Floats) -> Floats:
-    """Return points [..., 3] as they stand before the camera, seen obliquely from above."""
+    """Return points [..., 3] placed before the camera and seen obliquely from above."""
     c, s = np.cos(np.radians(50)), np.sin(np.radians(50))
     oblique = np.array([[1, 0, 0], [0, c, s], [0, -s, c]])
     return points @ oblique.T + [0, -0.1, 3.9]

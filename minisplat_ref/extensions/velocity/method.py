@@ -37,7 +37,7 @@ def at_rest(gaussians: Gaussians, rng: np.random.Generator) -> MovingGaussians:
 
 
 def still_at(moving: MovingGaussians, time: float) -> Gaussians:
-    """Return the Gaussians of 3DGS that stand where these are at a time."""
+    """Return the Gaussians of 3DGS at the places of these at a time."""
     still = Gaussians(*(getattr(moving, name) for name in Gaussians._fields))
     return still._replace(means=means_at(moving.means, moving.velocities, time))
 

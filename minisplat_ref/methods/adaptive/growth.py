@@ -46,8 +46,8 @@ def grow(
     offset : float
         How far apart the halves are, see :func:`minisplat_ref.strategy.halving.halves`.
     error_views : int
-        At most so many of the views that are trained on, evenly spread, are rendered to say where the error is; with 0
-        the gradients decide which come first.
+        At most this many of the views that are trained on, evenly spread, are rendered to say where the error is; with
+        0 the gradients decide which come first.
     budget : int, optional
         Largest number of Gaussians to grow to; the training may begin with more.
     """
@@ -66,7 +66,7 @@ def grow(
 
 
 def _error_weights(state: TrainState, iteration: Iteration, max_views: int) -> Floats:
-    """Return the error behind which each Gaussian stands [N], in at most this many of the views that are trained on."""
+    """Return the error that each Gaussian [N] is responsible for, in at most this many training views."""
     views = iteration.scene.train_views
     ids = trained_ids(len(views), iteration.cooling, state.pace)
     chosen = [views[index] for index in ids[:: math.ceil(len(ids) / max_views)]]

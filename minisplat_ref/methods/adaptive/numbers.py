@@ -46,7 +46,7 @@ not 27.59 (B)."""
 # --- measurement, the next size, and the end ---
 
 HOLD_OUT_EVERY = 8
-"""One of so many training views is held out. No reason recorded."""
+"""One in this many training views is held out. No reason recorded."""
 VIEW_SIDE_MIN = 120
 """Pixels: no side of a halved view is shorter. With 60 some scenes gain, but on snowmiku calibrations were found
 where there are none (J)."""

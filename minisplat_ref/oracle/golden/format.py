@@ -312,7 +312,7 @@ The other stages are each by itself; nothing of L depends on them:
 In a scene that is called exact, some values equal their thresholds in binary (a transmittance, an alpha, a depth). In
 float64 no rounding is an excuse there: it shows what a renderer does at equality.
 
-`b` of a conic stands twice in its matrix; `v_conics[:, 1]` is the derivative with respect to b itself and holds both.
+`b` of a conic occurs twice in its matrix; `v_conics[:, 1]` is the derivative with respect to b itself and holds both.
 Pose gradients are with respect to the nine entries of R as if they were free. Skips, stops, boxes and the order of the
 Gaussians count as fixed.
 
@@ -384,7 +384,7 @@ def readme(scenes: Mapping[str, Golden]) -> str:
 
 
 def convention_words() -> dict[str, str]:
-    """What each field of :class:`Conventions` means, by its name or names: the words of its own documentation."""
+    """What each field of :class:`Conventions` means, by its name or names: in the words of its documentation."""
     words: dict[str, str] = {}
     _, _, attributes = inspect.cleandoc(Conventions.__doc__ or "").partition("----------\n")
     for line in attributes.splitlines():

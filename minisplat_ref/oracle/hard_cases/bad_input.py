@@ -117,7 +117,7 @@ BAD_INPUT = (
     _call_with("call-opacity-below-0", "the same", "give sigmoid(opacity_logits)", opacities=np.array([0.5, -0.1])),
     _call_with(
         "call-transposed-view",
-        "t stands in the last row",
+        "t is in the last row",
         "transposed if yours has t in its last row",
         viewmats=_view(3, 0, 1.0),
     ),

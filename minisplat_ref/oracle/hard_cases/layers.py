@@ -117,7 +117,7 @@ LAYERS = (
     ),
     HardCase(
         "opacity-at-alpha-min",
-        "a Gaussian of radius 0 whose box holds a pixel: it must be in no list, for nobody writes its record",
+        "a Gaussian of radius 0 whose box holds a pixel: it must be in no list, since nothing writes its record",
         "culled: the background",
         lambda: call([[0.013, 0.007, 3]], opacities=1 / 256, profile=AT_1_OF_256),
         is_background=True,
