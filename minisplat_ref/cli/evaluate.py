@@ -81,5 +81,5 @@ def run(args: argparse.Namespace) -> int:
     for note in notes:
         print(f"minisplat-ref: warning: {note}", file=sys.stderr)
     if folder != args.folder:
-        print(f"measures and renders in {folder}")
+        print(f"metrics and renders in {folder}")
     return 0

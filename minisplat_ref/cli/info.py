@@ -22,7 +22,7 @@ Say what is in a file or folder: counts, SH degree, bounds, sizes.
 
   point_cloud.ply   Gaussians in the 3DGS layout, from any program
   checkpoint.npz    a training that can be continued
-  run folder        the --out of a training: settings, measures, what fired
+  run folder        the --out of a training: settings, metrics, what fired
   scene folder      COLMAP (images/, sparse/0/) or transforms.json
   .spz and others   compact files of Gaussians, see minisplat-ref convert
 

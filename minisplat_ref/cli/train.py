@@ -1,4 +1,4 @@
-"""``train``: from photographs with cameras to a folder with Gaussians, measures and images."""
+"""``train``: from photographs with cameras to a folder with Gaussians, metrics and images."""
 
 import argparse
 import sys

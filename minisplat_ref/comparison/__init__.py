@@ -1,9 +1,9 @@
-"""What ``compare`` does, in its order: the plan, the runs, their measures, the table, the report.
+"""What ``compare`` does, in its order: the plan, the runs, their metrics, the table, the report.
 
 ========================  ========================================================================
 :mod:`.plan`              which recipe is trained with which seed, where, and for how long
-:mod:`.runs`              the trainings, one after the other; those that were cut off go on
-:mod:`.measures`          what a finished run folder says in numbers; means over seeds
+:mod:`.runs`              the trainings, one after the other; those that were cut off continue
+:mod:`.metrics`           what a finished run folder says in numbers; means over seeds
 :mod:`.speed`             rendering the test views, all models interleaved
 :mod:`.crops`             the parts of test views that are worth a look
 :mod:`.results`           all of these together, and compare.json

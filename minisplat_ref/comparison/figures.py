@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from minisplat_ref.comparison.crops import Crop
-from minisplat_ref.comparison.measures import best_record
+from minisplat_ref.comparison.metrics import best_record
 from minisplat_ref.reports.palette import SERIES, TITLE_COLOR
 from minisplat_ref.reports.plots import PLOT_STYLE, plot
 

@@ -12,7 +12,7 @@ from minisplat_ref.comparison.figures import (
     psnr_over_iterations,
     psnr_over_time,
 )
-from minisplat_ref.comparison.measures import MEASURES, RecipeMeasures
+from minisplat_ref.comparison.metrics import METRICS, RecipeMetrics
 from minisplat_ref.comparison.plan import Plan
 from minisplat_ref.comparison.results import Results
 from minisplat_ref.comparison.table import table_cells
@@ -93,10 +93,10 @@ def report_html(plan: Plan, scene: Scene, results: Results) -> str:
     return page(f"{_enumerate(plan.recipes)} on {scene.name}", introduction, sections)
 
 
-def _card(recipe: RecipeMeasures) -> tuple[str, str]:
+def _card(recipe: RecipeMetrics) -> tuple[str, str]:
     psnr, count, seconds, rate = (
         "null" if value is None else f"{value:{measure.format}}"
-        for measure, value in ((m, recipe.spread_of(m).mean) for m in MEASURES)
+        for measure, value in ((m, recipe.spread_of(m).mean) for m in METRICS)
         if measure.key in ("psnr", "n_gaussians", "train_seconds", "render_fps")
     )
     return f"{psnr} dB", f"{recipe.recipe}: {count} Gaussians, trained in {seconds} s, {rate} views/s"

@@ -5,12 +5,12 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from minisplat_ref.comparison.crops import Crop, choose_crops
-from minisplat_ref.comparison.measures import (
-    MEASURES,
-    RecipeMeasures,
+from minisplat_ref.comparison.metrics import (
+    METRICS,
+    RecipeMetrics,
     final_psnr,
     read_curve,
-    read_measures,
+    read_metrics,
     relation,
 )
 from minisplat_ref.comparison.plan import Plan
@@ -27,7 +27,7 @@ from minisplat_ref.types import Scene
 class Results(NamedTuple):
     """All that was found."""
 
-    recipes: Sequence[RecipeMeasures]
+    recipes: Sequence[RecipeMetrics]
     """Measures, in the order of the plan."""
     curves: dict[str, list[list[dict[str, Any]]]]
     """For every recipe the records of ``curve.jsonl`` of each seed."""
@@ -58,8 +58,8 @@ def collect(plan: Plan, scene: Scene) -> Results:
     rates = dict(zip((run.folder for run in runs), render_rates(models, scene), strict=True))
     targets = {run.seed: final_psnr(run.folder) for run in plan.runs_of(plan.recipes[0])}
     recipes = [
-        RecipeMeasures(
-            recipe, [read_measures(run.folder, targets[run.seed], rates[run.folder]) for run in plan.runs_of(recipe)]
+        RecipeMetrics(
+            recipe, [read_metrics(run.folder, targets[run.seed], rates[run.folder]) for run in plan.runs_of(recipe)]
         )
         for recipe in plan.recipes
     ]
@@ -98,7 +98,7 @@ def to_json(plan: Plan, scene: Scene, results: Results) -> dict[str, Any]:
         "machine": results.machine,
         "lpips_reason": results.lpips_reason,
         "lpips_network": results.lpips_network,
-        "measures": [measure._asdict() for measure in MEASURES],
+        "measures": [metric._asdict() for metric in METRICS],
         "recipes": [
             _recipe_to_json(plan, recipe, results.recipes[0], fired)
             for recipe, fired in zip(results.recipes, results.fired, strict=True)
@@ -117,29 +117,29 @@ def read_fired(plan: Plan) -> list[Fired]:
     return found
 
 
-def _recipe_to_json(plan: Plan, recipe: RecipeMeasures, first: RecipeMeasures, fired: Fired) -> dict[str, Any]:
-    spreads = {measure: recipe.spread_of(measure) for measure in MEASURES}
+def _recipe_to_json(plan: Plan, recipe: RecipeMetrics, first: RecipeMetrics, fired: Fired) -> dict[str, Any]:
+    spreads = {metric: recipe.spread_of(metric) for metric in METRICS}
     runs = zip(plan.runs_of(recipe.recipe), recipe.runs, fired.runs, strict=True)
     return {
         "recipe": recipe.recipe,
-        "mean": {measure.key: value.mean for measure, value in spreads.items()},
-        "std": {measure.key: value.std for measure, value in spreads.items()},
+        "mean": {metric.key: value.mean for metric, value in spreads.items()},
+        "std": {metric.key: value.std for metric, value in spreads.items()},
         "relative_to_first": {
-            measure.key: relation(measure, value, first.spread_of(measure)) for measure, value in spreads.items()
+            metric.key: relation(metric, value, first.spread_of(metric)) for metric, value in spreads.items()
         },
         "error_of_difference": {
-            measure.key: recipe.error_of_difference(measure, first)
-            for measure in MEASURES
-            if measure.relation == "difference"
+            metric.key: recipe.error_of_difference(metric, first)
+            for metric in METRICS
+            if metric.relation == "difference"
         },
         "never_fired": fired.never,
         "runs": [
             {
                 "seed": run.seed,
                 "folder": run.folder.name,
-                **measures,
+                **metrics,
                 "mechanisms": [mechanism._asdict() for mechanism in mechanisms],
             }
-            for run, measures, mechanisms in runs
+            for run, metrics, mechanisms in runs
         ],
     }

@@ -30,7 +30,7 @@ from minisplat_ref.training.schedule import BLEND_STATS, At, During, Every
 from minisplat_ref.training.state import Iteration, TrainState, apply_edit, start_again
 from minisplat_ref.types import Floats, Gaussians, Scene
 
-Metric = Callable[[ImportanceStats], Floats]
+ImportanceMetric = Callable[[ImportanceStats], Floats]
 """Maps the statistics of all training views to importance [N]: ``importance.indoor`` or ``importance.outdoor``."""
 
 LARGE = 0.1  # of the scene's extent, or of the distance: no Gaussian should be larger
@@ -49,13 +49,13 @@ def measure_importance(
     )
 
 
-def candidates(stats: ImportanceStats, metric: Metric, min_views: int, *, is_intersecting: bool) -> Floats:
+def candidates(stats: ImportanceStats, metric: ImportanceMetric, min_views: int, *, is_intersecting: bool) -> Floats:
     """Return the importance [N], 0 for Gaussians that may not be kept.
 
     Parameters
     ----------
     stats : ImportanceStats
-    metric : Metric
+    metric : ImportanceMetric
     min_views : int
         Those that are visible in fewer views may not.
     is_intersecting : bool
@@ -169,7 +169,7 @@ def simplify(
     state: TrainState,
     iteration: Iteration,
     *,
-    metric: Metric,
+    metric: ImportanceMetric,
     choose: Callable[..., Edit],
     keep_fraction: float,
     budget: int | None = None,
@@ -216,7 +216,7 @@ def prune_tail(
     state: TrainState,
     iteration: Iteration,
     *,
-    metric: Metric,
+    metric: ImportanceMetric,
     mass: float,
     min_views: int = 0,
     is_intersecting: bool = True,

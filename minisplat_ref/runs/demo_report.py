@@ -131,7 +131,7 @@ def report_html(
         ("Backend", f"{settings.backend}: Numba, float32, {os.cpu_count()} cores"),
         ("Memory", "not known here" if metrics["peak_rss_mb"] is None else f"{metrics['peak_rss_mb']:.0f} MB at most"),
         ("Program", f"minisplat_ref {__version__}, Python {platform.python_version()}, {platform.system()}"),
-        ("Files", f"{folder.resolve()}: Gaussians, measures, log, checkpoint, images"),
+        ("Files", f"{folder.resolve()}: Gaussians, metrics, log, checkpoint, images"),
     ]
     steps = [
         part for text, lines in _next_steps(folder, metrics["iterations"]) for part in (paragraph(text), code(lines))

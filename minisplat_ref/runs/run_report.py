@@ -174,7 +174,7 @@ def _settings(folder: Path, settings: Settings, metrics: dict[str, Any], scene: 
         ("Backend", settings.backend),
         ("Memory", memory),
         ("Program", f"minisplat_ref {__version__}, Python {platform.python_version()}, {platform.system()}"),
-        ("Files", f"{folder.resolve()}: Gaussians, measures, log, checkpoint, images of all test views in renders"),
+        ("Files", f"{folder.resolve()}: Gaussians, metrics, log, checkpoint, images of all test views in renders"),
     ]
 
 

@@ -31,7 +31,7 @@ from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import Recipe, scale_recipe
 from minisplat_ref.types import Scene
 
-MEASURES = ("psnr", "ssim", "n_gaussians", "seconds")
+METRICS = ("psnr", "ssim", "n_gaussians", "seconds")
 
 
 def run(args: argparse.Namespace) -> kit.Report:
@@ -77,14 +77,14 @@ def count_actions(records: Sequence[Mapping[str, Any]], variants: Iterable[str])
 
 
 def measure(scene: Scene, recipe: Recipe, seed: int) -> dict[str, Any]:
-    """Train once; return the test views' measures, the training's processor seconds, and counts of fired events."""
+    """Train once; return the test views' metrics, the training's processor seconds, and counts of fired events."""
     fired: Counter[str] = Counter()
     start = time.process_time()
     state = train(scene, recipe, seed=seed, on_step=lambda report: fired.update(e.action for e in report.fired))
     seconds = time.process_time() - start
     result = evaluate(state.model, scene.test_views, RenderSettings(scene.background))
     measures = (result.psnr, result.ssim, len(state.gaussians.means), seconds)
-    return {**dict(zip(MEASURES, measures, strict=True)), "fired": dict(fired)}
+    return {**dict(zip(METRICS, measures, strict=True)), "fired": dict(fired)}
 
 
 def differences(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, tuple[float, float]]]:
@@ -95,7 +95,7 @@ def differences(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, tup
     """
     full = {record["seed"]: record["psnr"] for record in records if record["without"] == FULL}
     compared = [{**record, "difference": record["psnr"] - full[record["seed"]]} for record in records]
-    return summarise(compared, "without", (*MEASURES, "difference"))
+    return summarise(compared, "without", (*METRICS, "difference"))
 
 
 def to_rows(result: Mapping[str, Any]) -> list[list[str]]:

@@ -81,7 +81,7 @@ CHOICES = {
     "blended, vote": Choice(blend_points, 0.0, DEPTH_TOLERANCE),
 }
 
-MEASURES = {
+METRICS = {
     "median_error": "median error",
     "high_error": "90 % below",
     "off_surface": "off the surface",
@@ -116,15 +116,15 @@ def run(args: argparse.Namespace) -> kit.Report:
     ]
     guards = {"min_alpha": ALPHA_MIN, "depth_tolerance": DEPTH_TOLERANCE, "backdrop_extents": BACKDROP_EXTENTS}
     settings = {"recipe": recipe.name, "iterations": args.iterations, "seeds": list(args.seeds), **guards}
-    summary = summarise(runs, "choice", MEASURES)
+    summary = summarise(runs, "choice", METRICS)
     result = {**kit.describe_scene(truth.scene), **settings, "summary": summary, "runs": runs}
     length = f"{recipe.name}, {args.iterations} iterations, reinitialised at {' and '.join(map(str, steps))}"
-    table = markdown_table(["points", *MEASURES.values()], to_rows(summary))
+    table = markdown_table(["points", *METRICS.values()], to_rows(summary))
     return kit.Report(result, draw(summary), f"{kit.title(result)}\n{length}; {kit.seeds_of(args)}\n\n{table}")
 
 
 def measure(truth: SyntheticScene, recipe: Recipe, choice: Choice, seed: int) -> dict[str, float | None]:
-    """Train once; return the :data:`MEASURES`, with the final ``psnr`` of the test views.
+    """Train once; return the :data:`METRICS`, with the final ``psnr`` of the test views.
 
     ``backdrop_left`` is the fraction of the points moved behind the scene that survive densification, None if none were
     moved.
@@ -227,7 +227,7 @@ def draw(summary: dict[str, dict[str, tuple[float, float]]]) -> Figure:
             mean, deviation = (scale * value for value in row[name])
             color = RED if CHOICES[choice].depth_tolerance is None and CHOICES[choice].min_alpha == 0 else BLUE
             axes.errorbar(mean, line, xerr=deviation, color=color, marker="o", capsize=4)
-        axes.set(title=MEASURES[name], xlabel="" if name == "psnr" else "%", ylim=(len(summary) - 0.5, -0.5))
+        axes.set(title=METRICS[name], xlabel="" if name == "psnr" else "%", ylim=(len(summary) - 0.5, -0.5))
         axes.set_yticks(range(len(summary)), list(summary))
         axes.grid(visible=False, axis="y")
     return figure

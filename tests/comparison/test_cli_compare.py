@@ -19,9 +19,9 @@ from minisplat_ref.cli import main
 from minisplat_ref.comparison import runs as runs_module
 from minisplat_ref.comparison import speed
 from minisplat_ref.comparison.crops import best_window, choose_crops, detail, difference
-from minisplat_ref.comparison.measures import (
-    MEASURES,
-    RecipeMeasures,
+from minisplat_ref.comparison.metrics import (
+    METRICS,
+    RecipeMetrics,
     Spread,
     best_record,
     densification_end,
@@ -324,7 +324,7 @@ def test_spread():
 
 
 def test_relation():
-    by_key = {measure.key: measure for measure in MEASURES}
+    by_key = {measure.key: measure for measure in METRICS}
     assert relation(by_key["n_gaussians"], Spread(25.0, None), Spread(100.0, None)) == 0.25
     assert relation(by_key["psnr"], Spread(24.0, None), Spread(25.5, None)) == -1.5
     assert relation(by_key["lpips"], Spread(None, None), Spread(None, None)) is None
@@ -332,30 +332,30 @@ def test_relation():
 
 
 def measures(**values):
-    return {**{measure.key: 1.0 for measure in MEASURES}, "lpips": None, **values}
+    return {**{measure.key: 1.0 for measure in METRICS}, "lpips": None, **values}
 
 
 def test_error_of_a_difference_is_paired_by_seed():
     """Seeds differ by far more than recipes do: differences 1, 2 and 3 have deviation 1, their mean 1 / sqrt(3)."""
-    psnr = MEASURES[0]
-    first = RecipeMeasures("a", [measures(psnr=psnr) for psnr in (10.0, 20.0, 30.0)])
-    other = RecipeMeasures("b", [measures(psnr=psnr) for psnr in (11.0, 22.0, 33.0)])
+    psnr = METRICS[0]
+    first = RecipeMetrics("a", [measures(psnr=psnr) for psnr in (10.0, 20.0, 30.0)])
+    other = RecipeMetrics("b", [measures(psnr=psnr) for psnr in (11.0, 22.0, 33.0)])
     assert other.error_of_difference(psnr, first) == pytest.approx(1 / math.sqrt(3), rel=CLOSED_FORM)
-    single = [RecipeMeasures(recipe.recipe, recipe.runs[:1]) for recipe in (other, first)]
+    single = [RecipeMetrics(recipe.recipe, recipe.runs[:1]) for recipe in (other, first)]
     assert single[0].error_of_difference(psnr, single[1]) is None
-    lacking = RecipeMeasures("b", [*other.runs[:2], measures(psnr=None)])
+    lacking = RecipeMetrics("b", [*other.runs[:2], measures(psnr=None)])
     assert lacking.error_of_difference(psnr, first) is None
 
 
 def test_table():
     recipes = [
-        RecipeMeasures("a", [measures(psnr=25.0, n_gaussians=9000), measures(psnr=27.0, n_gaussians=11000)]),
-        RecipeMeasures("b", [measures(psnr=24.5, n_gaussians=2000, seconds_to_first=None), measures(psnr=24.5)]),
-        RecipeMeasures("c", [measures(seconds_to_first=None, iterations_to_first=None, psnr=25.0)] * 2),
+        RecipeMetrics("a", [measures(psnr=25.0, n_gaussians=9000), measures(psnr=27.0, n_gaussians=11000)]),
+        RecipeMetrics("b", [measures(psnr=24.5, n_gaussians=2000, seconds_to_first=None), measures(psnr=24.5)]),
+        RecipeMetrics("c", [measures(seconds_to_first=None, iterations_to_first=None, psnr=25.0)] * 2),
     ]
     heading, *rows = table_cells(recipes)
     assert heading == ["", "a", "b", "c"]
-    assert [row[0] for row in rows] == [measure.title for measure in MEASURES]
+    assert [row[0] for row in rows] == [measure.title for measure in METRICS]
     by_title = {title: cells for title, *cells in rows}
     assert by_title["PSNR (dB)"][:2] == ["26.00 ± 1.41", "24.50 ± 0.00 (-1.50 ± 1.00)"]
     assert by_title["LPIPS"] == ["null"] * 3
@@ -367,8 +367,8 @@ def test_table():
 
 def test_table_without_a_true_surface():
     """Not the row of a distance that nobody could know; a null of LPIPS has its reason told."""
-    rows = table_cells([RecipeMeasures("a", [measures(chamfer=None)])])[1:]
-    assert [row[0] for row in rows] == [measure.title for measure in MEASURES if measure.key != "chamfer"]
+    rows = table_cells([RecipeMetrics("a", [measures(chamfer=None)])])[1:]
+    assert [row[0] for row in rows] == [measure.title for measure in METRICS if measure.key != "chamfer"]
 
 
 # Mechanisms by hand

@@ -5,7 +5,13 @@ from functools import partial
 import numpy as np
 
 from minisplat_ref.extensions.omg.reference import distinct_importance, local_distinctiveness
-from minisplat_ref.methods.mini_splatting import MINI_SPLATTING, Metric, candidates, measure_importance, prune_tail
+from minisplat_ref.methods.mini_splatting import (
+    MINI_SPLATTING,
+    ImportanceMetric,
+    candidates,
+    measure_importance,
+    prune_tail,
+)
 from minisplat_ref.strategy import importance
 from minisplat_ref.strategy.ops import keep
 from minisplat_ref.training.schedule import action_name
@@ -16,7 +22,7 @@ MASS = 0.99  # tau of the paper's model M; XS has 0.96, XL 0.9999
 
 
 def prune_indistinct(
-    state: TrainState, iteration: Iteration, *, metric: Metric, distinct_mass: float, distinct_power: float
+    state: TrainState, iteration: Iteration, *, metric: ImportanceMetric, distinct_mass: float, distinct_power: float
 ) -> str | None:
     """Keep the Gaussians of the largest scores that together carry the fraction ``distinct_mass`` of the sum.
 

@@ -14,7 +14,7 @@ from minisplat_ref.runs.progress import read_log
 TRAINING_COPIES = 4  # the model, its gradients, and Adam's two moments, all of one size
 
 
-class Measure(NamedTuple):
+class Metric(NamedTuple):
     """A row of the table."""
 
     key: str
@@ -27,29 +27,29 @@ class Measure(NamedTuple):
     """How a recipe is set against the first; decibels and SSIM have no meaningful ratio."""
 
 
-MEASURES = (
-    Measure("psnr", "PSNR (dB)", ".2f", "difference"),
-    Measure("ssim", "SSIM", ".4f", "difference"),
-    Measure("lpips", "LPIPS", ".4f", "difference"),
-    Measure("best_psnr", "best PSNR on the way (dB)", ".2f", "difference"),
-    Measure("best_iteration", "reached at iteration", ",.0f", None),
-    Measure("chamfer", "Chamfer distance to the true surface (extents)", ".4f", "ratio"),
-    Measure("n_gaussians", "Gaussians", ",.0f", "ratio"),
-    Measure("train_seconds", "training (s)", ".1f", "ratio"),
-    Measure("train_cpu_seconds", "processor time of all threads (s)", ".1f", "ratio"),
-    Measure("seconds_to_first", "until the first's final PSNR (s)", ".1f", "ratio"),
-    Measure("iterations_to_first", "the same (iterations)", ",.0f", "ratio"),
-    Measure("iterations_per_second", "iterations/s", ".1f", "ratio"),
-    Measure("peak_rss_mb", "peak memory of the process (MB)", ".0f", "ratio"),
-    Measure("densifying_mb", "model, gradients, moments while densifying (MB)", ".1f", "ratio"),
-    Measure("densified_mb", "the same afterwards (MB)", ".1f", "ratio"),
-    Measure("render_fps", "rendering (views/s)", ".1f", "ratio"),
-    Measure("ply_bytes", "PLY (bytes)", ",.0f", "ratio"),
+METRICS = (
+    Metric("psnr", "PSNR (dB)", ".2f", "difference"),
+    Metric("ssim", "SSIM", ".4f", "difference"),
+    Metric("lpips", "LPIPS", ".4f", "difference"),
+    Metric("best_psnr", "best PSNR on the way (dB)", ".2f", "difference"),
+    Metric("best_iteration", "reached at iteration", ",.0f", None),
+    Metric("chamfer", "Chamfer distance to the true surface (extents)", ".4f", "ratio"),
+    Metric("n_gaussians", "Gaussians", ",.0f", "ratio"),
+    Metric("train_seconds", "training (s)", ".1f", "ratio"),
+    Metric("train_cpu_seconds", "processor time of all threads (s)", ".1f", "ratio"),
+    Metric("seconds_to_first", "until the first's final PSNR (s)", ".1f", "ratio"),
+    Metric("iterations_to_first", "the same (iterations)", ",.0f", "ratio"),
+    Metric("iterations_per_second", "iterations/s", ".1f", "ratio"),
+    Metric("peak_rss_mb", "peak memory of the process (MB)", ".0f", "ratio"),
+    Metric("densifying_mb", "model, gradients, moments while densifying (MB)", ".1f", "ratio"),
+    Metric("densified_mb", "the same afterwards (MB)", ".1f", "ratio"),
+    Metric("render_fps", "rendering (views/s)", ".1f", "ratio"),
+    Metric("ply_bytes", "PLY (bytes)", ",.0f", "ratio"),
 )
 """The rows, top to bottom."""
 
-RunMeasures = Mapping[str, float | None]
-"""Values of one run by the keys of ``MEASURES``; None where something was not measured or not reached."""
+RunMetrics = Mapping[str, float | None]
+"""Values of one run by the keys of ``METRICS``; None where something was not measured or not reached."""
 
 
 class Spread(NamedTuple):
@@ -69,25 +69,25 @@ def spread(values: Sequence[float | None]) -> Spread:
     return Spread(float(np.mean(known)), float(np.std(known, ddof=1)) if len(known) > 1 else None)
 
 
-class RecipeMeasures(NamedTuple):
+class RecipeMetrics(NamedTuple):
     """All runs of one recipe."""
 
     recipe: str
     """Its name."""
-    runs: Sequence[RunMeasures]
+    runs: Sequence[RunMetrics]
     """One per seed."""
 
-    def spread_of(self, measure: Measure) -> Spread:
-        """Return mean and standard deviation of a measure over the seeds."""
-        return spread([run[measure.key] for run in self.runs])
+    def spread_of(self, metric: Metric) -> Spread:
+        """Return mean and standard deviation of a metric over the seeds."""
+        return spread([run[metric.key] for run in self.runs])
 
-    def error_of_difference(self, measure: Measure, first: "RecipeMeasures") -> float | None:
+    def error_of_difference(self, metric: Metric, first: "RecipeMetrics") -> float | None:
         """Return the standard error of the mean difference to the first recipe, paired by seed.
 
         Recipes that are trained with one seed see the same views in the same order; what such a seed does to both is no
         part of the difference. None of a single seed, or where a value lacks.
         """
-        pairs = zip((run[measure.key] for run in self.runs), (run[measure.key] for run in first.runs), strict=True)
+        pairs = zip((run[metric.key] for run in self.runs), (run[metric.key] for run in first.runs), strict=True)
         differences = [ours - theirs for ours, theirs in pairs if ours is not None and theirs is not None]
         if len(differences) < max(2, len(self.runs)):
             return None
@@ -99,15 +99,15 @@ def read_curve(folder: Path) -> list[dict[str, Any]]:
     return read_log(folder / run_folder.CURVE)
 
 
-def read_measures(folder: Path, target_psnr: float, render_fps: float) -> dict[str, float | None]:
-    """Return the measures of a finished run.
+def read_metrics(folder: Path, target_psnr: float, render_fps: float) -> dict[str, float | None]:
+    """Return the metrics of a finished run.
 
     Parameters
     ----------
     folder : Path
         The run.
     target_psnr : float
-        dB; how soon the run has reached it is one of the measures.
+        dB; how soon the run has reached it is one of the metrics.
     render_fps : float
         How fast its Gaussians are rendered, views per second.
     """
@@ -180,10 +180,10 @@ def densification_end(recipe: Mapping[str, Any]) -> float:
     return max(map(float, stops), default=math.inf)
 
 
-def relation(measure: Measure, value: Spread, first: Spread) -> float | None:
+def relation(metric: Metric, value: Spread, first: Spread) -> float | None:
     """Compare a recipe's mean with that of the first recipe: its ratio or difference; None where one lacks."""
-    if measure.relation is None or value.mean is None or first.mean is None:
+    if metric.relation is None or value.mean is None or first.mean is None:
         return None
-    if measure.relation == "ratio" and first.mean == 0:
+    if metric.relation == "ratio" and first.mean == 0:
         return None
-    return value.mean - first.mean if measure.relation == "difference" else value.mean / first.mean
+    return value.mean - first.mean if metric.relation == "difference" else value.mean / first.mean
