@@ -56,16 +56,17 @@ def train(tree: Path, scene: Path, options: list[str], out: Path, iterations: in
 
 
 def check(tree: Path, name: str, out: Path) -> Any:
-    """Run a check of the oracle, and return its report without times."""
+    """Run a check of the oracle, and return the figures of its report."""
     run(tree, "oracle", name, "--json", str(out))
-    return without_times(json.loads(out.read_text()))
+    return figures_of(json.loads(out.read_text()))
 
 
-def without_times(value: Any) -> Any:
-    """Return a JSON value without entries that are times, memory or the machine."""
+def figures_of(value: Any) -> Any:
+    """Return a JSON value without words, and without entries that are times, memory or the machine."""
     if isinstance(value, dict):
-        return {k: without_times(v) for k, v in value.items() if not any(word in k.lower() for word in TIMES)}
-    return [without_times(item) for item in value] if isinstance(value, list) else value
+        kept = {k: v for k, v in value.items() if not any(word in k.lower() for word in TIMES)}
+        return {k: figures_of(v) for k, v in kept.items() if not isinstance(v, str)}
+    return [figures_of(item) for item in value if not isinstance(item, str)] if isinstance(value, list) else value
 
 
 def main() -> None:

@@ -10,9 +10,9 @@ from data_tools import same_results, same_speed
 ROOT = Path(__file__).parents[2]
 
 
-def test_times_are_no_results():
-    report = {"error": 0.1, "ms forward": 3.0, "cases": [{"name": "a", "seconds": 1.0, "figures": {"x": 2}}], "rate": 1}
-    assert same_results.without_times(report) == {"error": 0.1, "cases": [{"name": "a", "figures": {"x": 2}}]}
+def test_times_and_words_are_no_figures():
+    report = {"error": 0.1, "ms forward": 3.0, "cases": [{"name": "a", "seconds": 1.0, "figures": {"x": 2}}, "b"]}
+    assert same_results.figures_of(report) == {"error": 0.1, "cases": [{"figures": {"x": 2}}]}
 
 
 def test_every_recipe_is_compared():
