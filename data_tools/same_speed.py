@@ -2,7 +2,8 @@
 
 For refactors that must not cost time: training iterations, the passes of ``bench``, and the seconds from the program's
 start to its end after one iteration, with compiled kernels and without. The two trees alternate, so that both meet the
-same machine; what is reported is the least time of each, and its spread. Every tree has its own folder of kernels.
+same machine; the table has the least time of each, and the median and range of the ratios of single rounds. Each tree
+has its own folder of kernels.
 """
 
 import argparse

@@ -85,7 +85,7 @@ def build_parser() -> argparse.ArgumentParser:
         add_output_arguments(measurement)
     for title in ("slopes", "roofline"):
         own[title].add_argument(
-            "--repeats", type=integer(1), default=10, metavar="N", help="turns of each, in each round (default 10)"
+            "--repeats", type=integer(1), default=10, metavar="N", help="timings of each, in each round (default 10)"
         )
     add = own["roofline"].add_argument
     add("--scene", type=Path, metavar="SCENE", help="photographs to train on (default a made room)")

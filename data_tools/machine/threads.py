@@ -21,7 +21,7 @@ from minisplat_ref.training.initial_state import initial_state
 from minisplat_ref.training.loop import train
 from minisplat_ref.types import Gaussians
 
-TURN = 10  # consecutive iterations on as many threads: after a few, the caches have this training and not the other
+BLOCK = 10  # consecutive iterations on as many threads: after a few, the caches have this training and not the other
 LINE = "straight line"
 
 
@@ -46,10 +46,10 @@ def thread_cases(folder: Path | None, downscale: int, iterations: int) -> list[C
     lines.forward()  # compiled
     measured: dict[int, list[dict[str, float]]] = {n: [] for n in states}
     try:
-        for first in range(1, WARM_UP + iterations + 1, TURN):
+        for first in range(1, WARM_UP + iterations + 1, BLOCK):
             for n, state in states.items():
                 numba.set_num_threads(n)
-                for step in range(first, min(first + TURN, WARM_UP + iterations + 1)):
+                for step in range(first, min(first + BLOCK, WARM_UP + iterations + 1)):
                     seconds: dict[str, float] = {}
                     start = time.perf_counter()
                     train(

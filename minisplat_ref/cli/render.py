@@ -135,7 +135,7 @@ def _make_room(out: Path, names: Sequence[str]) -> None:
     """
     from minisplat_ref.runs import run_folder
 
-    listed = run_folder.read_json_object(out / LIST).get("images") if (out / LIST).exists() else []
+    listed = run_folder.read_json_object(out / LIST).get("pictures") if (out / LIST).exists() else []
     if not isinstance(listed, list):
         raise InputError(f"{out / LIST} does not list the images of a rendering: give another --out")
     found = {path.name for path in out.glob("*.png")} if out.is_dir() else set()
@@ -149,7 +149,7 @@ def _make_room(out: Path, names: Sequence[str]) -> None:
     for path in (out / f"{name}{end}" for name in listed for end in ENDS):
         if path.parent == out:
             path.unlink(missing_ok=True)
-    run_folder.write_json(out / LIST, {"images": list(names)})
+    run_folder.write_json(out / LIST, {"pictures": list(names)})
 
 
 class _Source(NamedTuple):

@@ -95,9 +95,9 @@ def report_html(plan: Plan, scene: Scene, results: Results) -> str:
 
 def _card(recipe: RecipeMetrics) -> tuple[str, str]:
     psnr, count, seconds, rate = (
-        "null" if value is None else f"{value:{measure.format}}"
-        for measure, value in ((m, recipe.spread_of(m).mean) for m in METRICS)
-        if measure.key in ("psnr", "n_gaussians", "train_seconds", "render_fps")
+        "null" if value is None else f"{value:{metric.format}}"
+        for metric, value in ((m, recipe.spread_of(m).mean) for m in METRICS)
+        if metric.key in ("psnr", "n_gaussians", "train_seconds", "render_fps")
     )
     return f"{psnr} dB", f"{recipe.recipe}: {count} Gaussians, trained in {seconds} s, {rate} views/s"
 

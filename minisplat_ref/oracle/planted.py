@@ -242,7 +242,7 @@ def _forgotten_background(base: Backend) -> Backend:
 
 
 def _transposed_rs(base: Backend) -> Backend:
-    """The reference's gradient in which one function is another: v_M continues to M = diag(s) R, not to R diag(s)."""
+    """The reference's gradient with one function exchanged: v_M is passed on to M = diag(s) R, not to R diag(s)."""
 
     def covariances_vjp(quats: Floats, scales: Floats, v_covariances: Floats) -> tuple[Floats, Floats]:
         R, rows = rotation_matrices(quats), scales[:, :, None]

@@ -120,7 +120,7 @@ def _metrics_of(folder: Path) -> dict[str, Any]:
 
 
 def _about(folder: Path, asked: Settings, unfinished: int | None, notes: list[str]) -> dict[str, Any]:
-    """Say of measures in their own folder what they are of."""
+    """Say for metrics in a separate folder what was measured."""
     iterations = _metrics_of(folder).get("iterations") if unfinished is None else unfinished
     return {
         "run": str(folder.resolve()),

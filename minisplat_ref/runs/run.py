@@ -3,7 +3,7 @@
 Nothing that has taken time is ever deleted. The first checkpoint is written before the first iteration; Ctrl-C,
 SIGTERM, a full disk, a number that is not finite or an error of the program end the training with the last whole state
 saved, or with the checkpoint of at most a minute ago where the state is half changed. ``metrics.json`` comes last: a
-folder whose measures are not of its checkpoint's iteration has not ended.
+folder whose metrics are not of its checkpoint's iteration has not ended.
 """
 
 import contextlib

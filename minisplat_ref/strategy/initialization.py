@@ -17,7 +17,7 @@ from minisplat_ref.types import Bools, Camera, Floats, Gaussians, Scene
 N_NEIGHBOURS = 3
 SQUARED_DISTANCE_MIN = 1e-7  # world units^2; points in the same place would get a scale of zero, whose log is -inf
 INITIAL_OPACITY = 0.1
-N_RANDOM_POINTS = 100_000  # as 3DGS renders for scenes without points
+N_RANDOM_POINTS = 100_000  # as 3DGS draws for scenes without points
 
 
 def initial_gaussians(scene: Scene, sh_degree: int, rng: np.random.Generator) -> Gaussians:

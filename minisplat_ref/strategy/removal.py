@@ -8,7 +8,7 @@ of the N Gaussians, it is the slope of the curve of error over count at Gaussian
     slope_i = N S_i / E = -(d ln E / d ln N)          3 slope_i dB for each doubling of the count
 
 The others learn to replace what is gone, so the true loss is smaller; and S is not additive. So Gaussians are removed a
-slice at a time, and S is computed again when the training has gone on for a while.
+slice at a time, and S is computed again when the training has continued for a while.
 """
 
 from collections.abc import Sequence

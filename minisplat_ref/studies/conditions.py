@@ -8,7 +8,7 @@ A disturbance is the same for every recipe and seed, so that trainings under one
 ``few``        every fifth training photograph
 ``gains``      each training photograph is multiplied by its own gain
 ``few-gains``  both
-``poses``      each training camera is turned by half a pixel
+``poses``      each training camera is rotated by half a pixel
 ``sizes``      every second training photograph has half the width and height
 ``sky``        what is high becomes sky, in the test views, too (synthetic scenes)
 =============  =====================================================================================================
@@ -22,7 +22,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.studies.defects import halve, multiply, under_a_sky, with_rotated_cameras
 from minisplat_ref.types import Scene
 
-FEW = 5  # one of every few training photographs remains
+FEW = 5  # one in this many training photographs remains
 GAINS = (0.7, 1.4)  # of a photograph, uniform in the logarithm
 
 

@@ -7,7 +7,7 @@ switched on. Its seed is used for the disturbance and the training.
 =========  ========================================================================================================
 ``clean``  the scene as it is; a real one may have other defects
 ``gains``  each photograph is multiplied by its own gain, from 0.9 to 1.1
-``poses``  each camera is turned about its own axis, across its own, so that its image moves by half a pixel
+``poses``  each camera is rotated about a random axis in its image plane, so that its image moves by half a pixel
 ``sizes``  each photograph has the half width and height, or not, by chance
 ``sky``    what is higher than 1.2 m becomes sky: two random colours, from the horizon to the zenith (synthetic scenes)
 =========  ========================================================================================================
@@ -60,7 +60,7 @@ def multiply(scene: Scene, gains: Floats) -> Scene:
 
 
 def with_rotated_cameras(scene: Scene, rng: np.random.Generator) -> Scene:
-    """Return the scene with every training camera turned so that the middle of its image moves by half a pixel."""
+    """Return the scene with every training camera rotated so that the middle of its image moves by half a pixel."""
     views = []
     for view, angle in zip(scene.train_views, rng.uniform(0, 2 * np.pi, len(scene.train_views)), strict=True):
         w = PIXELS * np.array([np.sin(angle) / view.camera.fy, np.cos(angle) / view.camera.fx, 0.0])

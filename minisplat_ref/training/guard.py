@@ -147,9 +147,9 @@ class Guard(NamedTuple):
     """How often a training's numbers are checked, and what happens when one is not finite."""
 
     every: int = 10
-    """Parameters and gradient are checked at regular intervals, the loss in every one."""
+    """Iterations from one check of parameters and gradient to the next; the loss is checked in every iteration."""
     drops_steps: bool = False
-    """Skip the step whose gradient is wrong, and go on; then every iteration is checked."""
+    """Skip the step whose gradient is wrong, and continue; then every iteration is checked."""
     folder: Path | None = None
     """Folder to which the case is written; by default it is not."""
     settings: Mapping[str, Any] = NOTHING

@@ -196,7 +196,7 @@ def _with_direct(gradient: Any, direct: Mapping[str, Floats]) -> Any:
 
 
 def _next_view(state: TrainState, n_views: int, cooling: Cooling | None) -> int:
-    """Render a view without replacement; when all views that may be trained on have been seen, shuffle them again."""
+    """Draw a view without replacement; when all views that may be trained on have been seen, shuffle them again."""
     if not state.view_order:
         state.view_order = state.rng.permutation(trained_ids(n_views, cooling, state.pace)).tolist()
     return state.view_order.pop()

@@ -90,7 +90,7 @@ class Cooling(NamedTuple):
     last_per_extent: float
     """The same for rates per unit of the scene's extent; until the end, the factors' logarithms fall linearly."""
     hold_out_every: int
-    """Before the cool-down, one of every few training views is held back for decisions."""
+    """Before the cool-down, one in this many training views is held back for decisions."""
 
     def factors(self, step: int, pace: Pace) -> tuple[float, float]:
         """Return the factors of the rates, and of those per unit of the extent, at an iteration."""

@@ -26,7 +26,7 @@ def halve_large_views(scene: Scene, *, min_side: float, max_halvings: float = ma
     min_side : float
         Pixels.
     max_halvings : int
-        At most so often; no limit by default.
+        At most this many times; no limit by default.
 
     Raises
     ------
@@ -64,7 +64,7 @@ class ViewSizes:
         return max([0, *(times - pace.n_finer for event, times in self._planned if event.is_due(step))])
 
     def halve(self, n_halvings: int) -> Scene:
-        """Return the scene with its training views halved so often in width and height."""
+        """Return the scene with its training views halved this many times in width and height."""
         if n_halvings not in self._scenes:
             views = self._scenes[0].train_views
             for _ in range(n_halvings):

@@ -11,8 +11,8 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_times_and_words_are_no_figures():
-    report = {"error": 0.1, "ms forward": 3.0, "cases": [{"name": "a", "seconds": 1.0, "figures": {"x": 2}}, "b"]}
-    assert same_results.figures_of(report) == {"error": 0.1, "cases": [{"figures": {"x": 2}}]}
+    report = {"RMS": 0.1, "ms forward": 3.0, "cases": [{"name": "a", "seconds": 1.0, "figures": {"x": 2}}, "b"]}
+    assert same_results.figures_of(report) == {"RMS": 0.1, "cases": [{"figures": {"x": 2}}]}
 
 
 def test_every_recipe_is_compared():

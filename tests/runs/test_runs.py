@@ -550,7 +550,7 @@ def test_images_of_somebody_else_are_not_touched(done, tmp_path, refused):
     assert f"{out} holds images other than those of a rendering, such as beach.png" in line
     assert {path.name for path in out.iterdir()} == {"beach.png", "notes.txt"}
     (out / "beach.png").unlink()
-    (out / "pictures.json").write_text('{"images": ["../../run/checkpoint", "../x"]}')
+    (out / "pictures.json").write_text('{"pictures": ["../../run/checkpoint", "../x"]}')
     (tmp_path / "x.png").write_bytes(b"")
     assert main(["render", str(done), "--out", str(out)]) == 0
     assert (tmp_path / "x.png").exists() and (out / "notes.txt").exists()

@@ -75,7 +75,7 @@ def make_scene(
     point_noise : float
         Standard deviation of the error of each point coordinate, metres.
     test_every : int
-        In walking order the first of every few views is a test view, like in loaders; 0 for no test views.
+        In walking order the first of this many views is a test view, like in loaders; 0 for no test views.
     progress : callable
         Wraps the sequence of cameras while the views are traced; ``tqdm.tqdm`` shows a bar.
 

@@ -46,7 +46,7 @@ def run_profile(args: argparse.Namespace) -> kit.Report:
     }
     text = "the best for each number of sides, then others of 8\n\n"
     text += markdown_table(["sides", "reach", "rim", "RMS error", "mass"], lines)
-    text += f"\n\nRMS error of alpha, turned by\n\n{table_of('', by_angle, '.0%', '°')}"
+    text += f"\n\nRMS error of alpha, rotated by\n\n{table_of('', by_angle, '.0%', '°')}"
     return kit.Report(result, draw_profile(result), text)
 
 

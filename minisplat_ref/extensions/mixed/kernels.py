@@ -32,9 +32,8 @@ from minisplat_ref.types import Floats
 
 V_1, V_2, V_3 = range(CONIC_GRADIENTS, CONIC_GRADIENTS + 6, 2)  # vertices from the centre
 N_GRADIENTS = V_3 + 2
-DEPTH, COUNT, ORIENTATION = range(
-    N_GRADIENTS, N_GRADIENTS + 3
-)  # ORIENTATION: sign of the triangle's area, 0 if it is flat
+# ORIENTATION: sign of the triangle's area, 0 if it is flat
+DEPTH, COUNT, ORIENTATION = range(N_GRADIENTS, N_GRADIENTS + 3)
 G_12, G_23, G_31 = range(ORIENTATION + 1, ORIENTATION + 7, 2)
 N_COLUMNS = G_31 + 2
 

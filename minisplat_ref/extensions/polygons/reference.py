@@ -43,7 +43,7 @@ def meet(polygons: Polygons, rays: Rays, ray_ids: Ints, gaussian_ids: Ints) -> I
     rays : Rays
         P rays.
     ray_ids, gaussian_ids : ndarray of shape (H,)
-        The found.
+        The ray and the polygon that may meet.
 
     Returns
     -------

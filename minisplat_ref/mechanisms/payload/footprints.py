@@ -28,5 +28,5 @@ class Footprints:
 
 
 def boxes_of(footprints: Footprints) -> Ints:
-    """Return the boxes [N, 4] of the projection, outside of which a payload draws nothing."""
+    """Return the boxes [N, 4] of the projection, outside of which a payload renders nothing."""
     return footprints.projection.boxes

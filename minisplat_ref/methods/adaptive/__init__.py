@@ -4,8 +4,8 @@ No paper has published the whole; ``docs/measured/adaptive.md`` has the evidence
 without success. There is no schedule, and no setting depends on the scene:
 
 *Grow.* Every 100 iterations the Gaussians whose mean screen gradient reaches a threshold are halved
-(:mod:`minisplat_ref.strategy.halving`), at most a fifth of all at a time; those come first that stand behind most of
-the images' error (:mod:`minisplat_ref.strategy.error_weights`). A Gaussian that fits what it covers has a small
+(:mod:`minisplat_ref.strategy.halving`), at most a fifth of all at a time; those come first that are responsible for
+most of the images' error (:mod:`minisplat_ref.strategy.error_weights`). A Gaussian that fits what it covers has a small
 gradient, so growth fades where a scene has enough.
 
 *View dependence.* Each Gaussian has as many degrees of the harmonics as the views that show it determine.

@@ -55,7 +55,7 @@ WHOLE_VIEWS_UNTIL = 1
 MEASUREMENTS_MIN = 4
 """Measurements to fit a line through."""
 SLOPE_MIN = 0.3
-"""dB for each doubling of the work that held-out views must gain for a training to go on as it is. Leaving small
+"""dB for each doubling of the work that held-out views must gain for a training to continue as it is. Leaving small
 views at 1 dB is much faster on fox and snowmiku, and ends lower (J)."""
 DECISION_STEP_MIN = 800
 """Iteration before which nothing is decided: the first measurements rise steeply."""

@@ -31,7 +31,7 @@ def measure_held_out(state: TrainState, iteration: Iteration) -> str | None:
 def proceed_when_little_is_gained(
     state: TrainState, iteration: Iteration, *, min_gain: float, min_step: int
 ) -> str | None:
-    """Go on to larger views, or to the cool-down, when held-out views gain too little for each doubling of the work.
+    """Continue to larger views, or to the cool-down, when held-out views gain too little for each doubling of the work.
 
     What counts is what was measured since half of the work, and since anything was last decided.
 

@@ -1,7 +1,7 @@
 """What ``adaptive`` switches on, and the rule by which it does: one function, and a table.
 
 Each calibration (:mod:`minisplat_ref.training.calibration`) is asked about once, in one iteration. It is switched on if
-what the photographs gain by it is above a least gain and above a number of standard errors
+what the photographs gain by it is above a minimum gain and above a number of standard errors
 (:mod:`minisplat_ref.methods.adaptive.evidence`), unless a rival explains more.
 """
 

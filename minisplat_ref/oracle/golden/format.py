@@ -384,7 +384,7 @@ def readme(scenes: Mapping[str, Golden]) -> str:
 
 
 def convention_words() -> dict[str, str]:
-    """What each field of :class:`Conventions` means, by its name or names: in the words of its documentation."""
+    """What each field of :class:`Conventions` means, in the words of its documentation, by its name or names."""
     words: dict[str, str] = {}
     _, _, attributes = inspect.cleandoc(Conventions.__doc__ or "").partition("----------\n")
     for line in attributes.splitlines():
