@@ -6,6 +6,7 @@ from minisplat_ref.errors import InputError
 from minisplat_ref.strategy.initialization import initial_gaussians
 from minisplat_ref.strategy.ops import contiguous
 from minisplat_ref.training.adam import zero_moments
+from minisplat_ref.training.dense_start import densify_points
 from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Scene
@@ -29,6 +30,9 @@ def initial_state(scene: Scene, recipe: Recipe, seed: int) -> TrainState:
         )
     rng = np.random.default_rng(seed)
     representation = recipe.representation
+    if recipe.starts_densely:
+        points, colors = densify_points(scene)
+        scene = scene._replace(points=points, point_colors=colors)
     gaussians = contiguous(representation.extend(initial_gaussians(scene, recipe.sh_degree, rng), rng))
     shared = dict(representation.shared(scene, rng))
     for calibration in recipe.active_calibrations:

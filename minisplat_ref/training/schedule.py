@@ -159,6 +159,8 @@ class Recipe(NamedTuple):
     """Parameters of each photograph, and a sky; all are off unless asked for."""
     representation: Representation = GAUSSIANS
     """What is trained and how it is rendered."""
+    starts_densely: bool = False
+    """Begin with stereo's points, too, not with the sparse points alone (:mod:`minisplat_ref.training.dense_start`)."""
     cooling: Cooling | None = None
     """How a method without a schedule ends: its milestones do not scale with the length, and ``iterations`` is a limit.
     None for methods with a schedule."""

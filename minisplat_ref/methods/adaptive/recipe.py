@@ -76,6 +76,7 @@ ADAPTIVE = GS._replace(
         During(partial(cut_degrees_when_cooling, min_variation=numbers.VARIATION_MIN)),
     ),
     min_views=numbers.TRAIN_VIEWS_MIN,
+    starts_densely=True,
     cooling=Cooling(
         numbers.COOLING_PART, numbers.COOLING_LAST, numbers.COOLING_LAST_PER_EXTENT, numbers.HOLD_OUT_EVERY
     ),
