@@ -27,12 +27,16 @@ from minisplat_ref.types import Bools, Camera, Floats
 
 WINDOW = 5
 """Pixels, side of W."""
-CORRELATION_MIN = 0.7
-"""Of a depth that counts. Not tuned: noise alone correlates by 0.2 (one over the root of 25 pixels)."""
+CORRELATION_MIN = 0.8
+"""Of a depth that counts. Noise alone correlates by 0.2, one over the root of 25 pixels."""
 CONTRAST_MIN = 0.01
 """Standard deviation of the brightness in W, out of 1, below which a pixel has no depth: 2.5 levels of 255."""
 AGREEMENT = 0.02
 """Of the depth; a neighbour's depth that differs by less confirms a point."""
+CONFIRMATIONS = 2
+"""Neighbours that must confirm a point, where there are so many and one more; otherwise one must."""
+ALL = 1 - 0.5 / WINDOW**2
+"""Share of a window, rounding aside, that only a whole one has."""
 VARIANCE_PRODUCT_MIN = 1e-10
 """Guards the division where a window is uniform; the contrast rules these pixels out."""
 
@@ -79,7 +83,8 @@ def sweep_planes(view: GrayView, others: Sequence[GrayView], inverse_depths: Flo
             mean_b, var_b = _moments(b)
             covariance = uniform_filter(view.gray * b, WINDOW) - mean_a * mean_b
             zncc = covariance / np.sqrt(np.maximum(var_a * var_b, VARIANCE_PRODUCT_MIN))
-            scores[k, i] = np.where(is_inside, zncc, -1.0)
+            has_window = uniform_filter(is_inside.astype(np.float32), WINDOW, mode="constant") > ALL
+            scores[k, i] = np.where(has_window, zncc, -1.0)
     better_half = max(1, (len(others) + 1) // 2)
     total = np.sort(scores, axis=0)[-better_half:].mean(axis=0)  # [D, H, W]
     best = total.argmax(axis=0)  # [H, W]
@@ -112,10 +117,10 @@ def warp(camera: Camera, other: GrayView, inverse_depth: float) -> tuple[Floats,
 
 
 def are_confirmed(view: GrayView, own: DepthMap, others: Sequence[tuple[GrayView, DepthMap]]) -> Bools:
-    """Return where the depth of a photograph is also that of a neighbour, [H, W]."""
+    """Return where the depth of a photograph is also that of :data:`CONFIRMATIONS` neighbours, [H, W]."""
     ys, xs = np.nonzero(own.depths > 0)
     points = surface_points(view.camera, own.depths, ys, xs)
-    is_confirmed = np.zeros(own.depths.shape, bool)
+    n_agreeing = np.zeros(own.depths.shape, int)
     for other, found in others:
         camera = other.camera
         seen = points @ camera.cam_from_world_R.T + camera.cam_from_world_t  # [P, 3]
@@ -125,8 +130,8 @@ def are_confirmed(view: GrayView, own: DepthMap, others: Sequence[tuple[GrayView
         is_inside = (z > 0) & (columns >= 0) & (rows >= 0) & (columns < camera.width) & (rows < camera.height)
         there = found.depths[np.where(is_inside, rows, 0).astype(int), np.where(is_inside, columns, 0).astype(int)]
         agrees = is_inside & (there > 0) & (np.abs(there - z) < AGREEMENT * z)
-        is_confirmed[ys[agrees], xs[agrees]] = True
-    return is_confirmed
+        n_agreeing[ys[agrees], xs[agrees]] += 1
+    return n_agreeing >= (CONFIRMATIONS if len(others) > CONFIRMATIONS else 1)
 
 
 def surface_points(camera: Camera, depths: Floats, rows: np.ndarray, columns: np.ndarray) -> Floats:

@@ -4,7 +4,7 @@ A pixel whose surface no training photograph shows cannot be rendered rightly, e
 about a recipe. So that recipes cannot influence what counts, coverage is computed from the sparse points alone: the
 depth of each photograph is interpolated between the points that structure from motion found in it, linearly in 1/z, and
 the surface point of each pixel is projected into the training photographs. One of them shows the point if it lies
-inside the image and not far behind the interpolated surface there.
+inside the image and, where that is known, not far behind the interpolated surface there.
 
 Left out: occlusion by what no sparse point lies on.
 """

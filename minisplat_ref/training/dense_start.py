@@ -19,6 +19,7 @@ from tqdm import tqdm
 from minisplat_ref.io.images import resize_image, resize_mask
 from minisplat_ref.io.scene import SILENT_SECONDS, rescale_camera
 from minisplat_ref.reference.pinhole import pinhole
+from minisplat_ref.strategy.line_of_sight import MARGIN
 from minisplat_ref.strategy.plane_sweep import DepthMap, GrayView, are_confirmed, surface_points, sweep_planes
 from minisplat_ref.types import Bools, Camera, Floats, Ints, Scene, View
 
@@ -32,6 +33,8 @@ VIEWS_MAX = 48
 """Photographs that are compared, evenly spread, at most: some twelve seconds."""
 SPACING = 3.0
 """Pixels of the small photographs: nearer than this to another point no point is added."""
+NEAR_A_RAY = 1.0
+"""Pixels of the small photographs: a point is on the ray to a sparse point that is not farther from it."""
 ANGLE_GOOD, ANGLE_MAX = 6.0, 40.0
 """Degrees between the rays to a point: from the first on depth is well determined, beyond the second windows look
 different."""
@@ -39,7 +42,7 @@ POINTS_MIN = 8
 """Sparse points of a photograph that say how deep it is; with fewer, all that lie in its image count."""
 DEPTH_MARGINS = (0.7, 2.0)
 """Factors of the depths of the nearest and the farthest hundredth of these points, between which planes are swept."""
-EXTENT_DEPTHS = (0.1, 20.0)
+EXTENT_DEPTHS = (0.3, 20.0)
 """In units of the scene's extent: depths that are swept where no point says how deep the scene is."""
 
 
@@ -81,7 +84,9 @@ def densify_points(scene: Scene) -> tuple[Floats, NDArray[np.uint8]]:
         chosen = choose_spread(found, SPACING * own.depths[rows, columns] / camera.fx, points)
         points = np.concatenate([points, found[chosen]])
         colors = np.concatenate([colors, small.rgb[rows[chosen], columns[chosen]]])
-    return points, colors
+    stays = ~stand_before(points, views, scene.points)
+    stays[: len(scene.points)] = True
+    return points[stays], colors[stays]
 
 
 def choose_neighbours(views: Sequence[View], points: Floats) -> list[list[int]]:
@@ -110,6 +115,27 @@ def choose_neighbours(views: Sequence[View], points: Floats) -> list[list[int]]:
         best = np.argsort(-scores, kind="stable")[:N_NEIGHBOURS]
         chosen.append([int(k) for k in best if scores[k] > 0])
     return chosen
+
+
+def stand_before(points: Floats, views: Sequence[View], sparse_points: Floats) -> Bools:
+    """Return which points [P] stand before a sparse point that a view shows beside them, within a small pixel.
+
+    A photograph that shows a sparse point says that the ray up to it is free
+    (:mod:`minisplat_ref.strategy.line_of_sight`); stereo that is deceived by a repeated pattern puts points there.
+    """
+    found = np.zeros(len(points), bool)
+    for view in views:
+        if view.point_ids is None or not len(view.point_ids):
+            continue
+        camera = view.camera
+        radius = NEAR_A_RAY * max(1.0, max(camera.width, camera.height) / LONG_SIDE)
+        _, known_xy, known_z = _project(sparse_points[view.point_ids], camera)
+        rows, xy, z = _project(points, camera)
+        if len(known_z) and len(z):
+            distances, nearest = cKDTree(known_xy).query(xy, distance_upper_bound=radius)
+            is_near = np.isfinite(distances)
+            found[rows[is_near]] |= z[is_near] < (1.0 - MARGIN) * known_z[nearest[is_near]]
+    return found
 
 
 def choose_spread(points: Floats, spacings: Floats, others: Floats) -> Ints:
@@ -159,11 +185,10 @@ def _shrink(view: View, scene: Scene) -> _Small:
 
 def _depth_range(view: View, scene: Scene) -> tuple[float, float]:
     """Return the nearest and the farthest depth at which a view may show something, world units."""
-    ids = _seen_ids(view, scene.points)
-    depths = _depths(scene.points[ids], view.camera)
-    if not len(ids) or depths.max() <= 0:
+    _, _, depths = _project(scene.points[_seen_ids(view, scene.points)], view.camera)
+    if not len(depths):
         return EXTENT_DEPTHS[0] * scene.extent, EXTENT_DEPTHS[1] * scene.extent
-    near, far = np.percentile(depths[depths > 0], (1, 99)) * DEPTH_MARGINS
+    near, far = np.percentile(depths, (1, 99)) * DEPTH_MARGINS
     return float(near), float(far)
 
 
@@ -171,15 +196,16 @@ def _seen_ids(view: View, points: Floats) -> Ints:
     """Return which sparse points a view shows: those of its track, or all in its image."""
     if view.point_ids is not None and len(view.point_ids) >= POINTS_MIN:
         return view.point_ids
-    seen = points @ view.camera.cam_from_world_R.T + view.camera.cam_from_world_t
-    in_front = np.flatnonzero(seen[:, 2] > 0)
-    xy = pinhole(seen[in_front], view.camera)
-    is_inside = (xy >= 0).all(axis=1) & (xy < (view.camera.width, view.camera.height)).all(axis=1)
-    return in_front[is_inside]
+    return _project(points, view.camera)[0]
 
 
-def _depths(points: Floats, camera: Camera) -> Floats:
-    return points @ camera.cam_from_world_R[2] + camera.cam_from_world_t[2]
+def _project(points: Floats, camera: Camera) -> tuple[Ints, Floats, Floats]:
+    """Return rows, pixels [Q, 2] and depths [Q] of the points that lie in the image of a camera."""
+    seen = points @ camera.cam_from_world_R.T + camera.cam_from_world_t
+    rows = np.flatnonzero(seen[:, 2] > 0)
+    xy = pinhole(seen[rows], camera)
+    is_inside = (xy >= 0).all(axis=1) & (xy < (camera.width, camera.height)).all(axis=1)
+    return rows[is_inside], xy[is_inside], seen[rows[is_inside], 2]
 
 
 def _sweep(small: _Small, others: Sequence[GrayView]) -> DepthMap:
