@@ -4,8 +4,8 @@ Renderings are clipped to [0, 1] but not rounded to 8 bits, which would add 1.3e
 at 30 dB. PSNR is computed from the mean squared error over all pixels and channels of an image; the released 3DGS
 script averages the PSNR of the channels instead, which is never lower. Means over views are means of the views' values.
 
-A held-out photograph has an exposure and a white balance that nothing else says. So the PSNR is given twice: as rendered,
-and after the affine map of the colours that brings the rendering closest to the photograph (:func:`correct_colors`).
+Nothing says what exposure and white balance a held-out photograph had. So its PSNR is given twice: as rendered, and
+after the affine map of the colours that brings the rendering closest to the photograph (:func:`correct_colors`).
 
 LPIPS needs the weights of a network, which are not ours to ship; without them an :class:`Evaluation` says so.
 """

@@ -208,9 +208,7 @@ def run(args: argparse.Namespace) -> kit.Report:
         args.out,
         settings,
         jobs,
-        lambda scene, fold, recipe, seed: [
-            measure(make_fold(*scenes[scene], args.folds, fold), recipes[recipe], seed)
-        ],
+        lambda scene, fold, recipe, seed: [measure(make_fold(*scenes[scene], args.folds, fold), recipes[recipe], seed)],
         lambda missing: warm_up(first[0], recipes.values() if missing else ()),
     )
     records = [r for r in records if r["scene"] in scenes and r["recipe"] in recipes and r["seed"] in args.seeds]
@@ -300,7 +298,7 @@ def describe_differences(records: Sequence[Mapping[str, Any]], recipes: Sequence
         means = fold_means(records, key)
         scenes = {scene for scene, _ in means}
         best = {
-            scene: max(others, key=lambda o: np.mean([of[o] for (s, _), of in means.items() if s == scene]))  # noqa: B023
+            scene: max(others, key=lambda o: np.mean([of[o] for (s, _), of in means.items() if s == scene]))
             for scene in scenes
         }
         for name, rival in [*((o, lambda _, o=o: o) for o in others), ("the best other recipe of the scene", best.get)]:
@@ -323,7 +321,7 @@ def leave_one_scene_out(records: Sequence[Mapping[str, Any]], recipes: Sequence[
         of_others = [of for fold, of in means.items() if not is_own[fold]]
         if not of_others:
             return "one scene alone: nothing to choose a recipe on"
-        chosen = max(recipes, key=lambda name: np.mean([of[name] for of in of_others]))  # noqa: B023
+        chosen = max(recipes, key=lambda name: np.mean([of[name] for of in of_others]))
         own = [of for fold, of in means.items() if is_own[fold]]
         gain = float(np.mean([of[chosen] - of[recipes[0]] for of in own]))
         rows.append([left_out, chosen, f"{gain:+.2f}"])

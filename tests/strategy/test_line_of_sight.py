@@ -32,7 +32,7 @@ def view_of(*rows):
 
 @pytest.mark.parametrize(("margin", "expected"), [(0.1, 0.6), (0.01, 0.6 * 0.75)])
 def test_transmittance_before_a_point(margin, expected):
-    """0.4 at depth 1 is before the point at 5; 0.25 at depth 4.6 is only with a margin below a twelfth; 0.9 is behind."""
+    """0.4 at depth 1 is before the point at 5, 0.25 at 4.6 only with a margin below a twelfth, 0.9 is behind."""
     model = Model(on_the_axis([4.6, 1.0, 6.0], [0.25, 0.4, 0.9]))
     lines = trace_sight_lines(model, view_of(0), POINTS, RenderSettings(), margin)
     np.testing.assert_allclose(lines.transmittances, [expected], rtol=1e-5)

@@ -112,8 +112,8 @@ OPEN_MIN = 0.005
 # --- veils ---
 
 VEIL_SHARE = 0.5
-"""Of a Gaussian's weight on the rays of sparse points, above which it is a veil: more of it is before the points than at
-or behind them."""
+"""Of a Gaussian's weight on the rays of sparse points, above which it is a veil: more of it is before the points than
+at or behind them."""
 VEIL_WEIGHT_MIN = 0.1
 """Weight before points, in opaque pixels, below which a Gaussian is left alone: a tenth of one pixel."""
 VEIL_START = 500
