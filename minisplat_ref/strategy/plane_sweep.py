@@ -28,8 +28,9 @@ from minisplat_ref.types import Bools, Camera, Floats
 WINDOW = 5
 """Pixels, side of W."""
 CORRELATION_MIN = 0.7
-"""Of a depth that counts. Noise alone correlates by 0.2, one over the root of 25 pixels. With 0.8 and a second
-confirmation more of the points are right, and held-out photographs are worse (``docs/measured/real_photographs.md``)."""
+"""Of a depth that counts. Noise alone correlates by 0.2, one over the root of 25 pixels. With 0.8, and with two
+neighbours that confirm, more points are right, and held-out photographs worse (``docs/measured/real_photographs.md``).
+"""
 CONTRAST_MIN = 0.01
 """Standard deviation of the brightness in W, out of 1, below which a pixel has no depth: 2.5 levels of 255."""
 AGREEMENT = 0.02
