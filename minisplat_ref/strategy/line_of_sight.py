@@ -110,5 +110,5 @@ def hidden_share(
     for view in views:
         if view.point_ids is not None and len(view.point_ids):
             T = trace_sight_lines(as_model(model), view, points, settings, margin).transmittances
-            n_hidden, n_points = n_hidden + np.count_nonzero(OPAQUE > T), n_points + len(T)
+            n_hidden, n_points = n_hidden + int(np.count_nonzero(OPAQUE > T)), n_points + len(T)
     return n_hidden / n_points if n_points else None

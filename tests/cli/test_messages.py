@@ -138,14 +138,19 @@ def test_scene_without_points(tmp_path, recwarn):
     scene = load_scene(write_transforms(tmp_path, fl_x=40.0))
     with pytest.warns(InputWarning, match=r"has 0 sparse points: training begins with 100,000 random ones .* ply_file"):
         warn_of_scene(scene, 1)
-    points = np.random.default_rng(0).normal(size=(4, 3))
-    warn_of_scene(scene._replace(points=points, point_colors=np.zeros((4, 3), np.uint8)), 1)
+    with pytest.warns(InputWarning, match=r"has 0 sparse points: training begins with those that stereo finds"):
+        warn_of_scene(scene, 1, is_dense=True)
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    with pytest.warns(InputWarning, match=r"has 4 sparse points: training begins with 4 Gaussians and has to find"):
+        warn_of_scene(scene._replace(points=points[:4]), 1)
+    recwarn.clear()
+    warn_of_scene(scene._replace(points=points), 1)
     assert not recwarn.list
 
 
 def test_photographs_of_a_few_pixels(tmp_path):
     scene = load_scene(write_colmap(tmp_path), downscale=1000)
-    scene = scene._replace(points=np.zeros((4, 3)))
+    scene = scene._replace(points=np.zeros((20, 3)))
     with pytest.warns(InputWarning, match="are 1 x 1 pixels after --downscale 1000: give a smaller number; from fewer"):
         warn_of_scene(scene, 1000)
     with pytest.warns(InputWarning, match="are 1 x 1 pixels: give larger ones; from fewer than 16 x 16 hardly any"):
