@@ -133,11 +133,16 @@ def read_image(path: str | Path) -> NDArray[np.uint8]:
         If the file is missing, is not an image or is truncated.
     """
     with open_image(Path(path)) as image:
-        if image.mode.startswith("I"):  # gray of 16 bits; Pillow itself keeps the upper byte of 16-bit colour files
-            gray = (np.asarray(image) >> 8).clip(0, 255).astype(np.uint8)  # [H, W]
-            return np.repeat(gray[..., None], 3, axis=2)  # [H, W, 3]
-        mode = "RGBA" if image.has_transparency_data else "RGB"
-        return np.array(image if image.mode == mode else image.convert(mode))  # converting would copy it in any case
+        return pixels_of(image)
+
+
+def pixels_of(image: Image.Image) -> NDArray[np.uint8]:
+    """Return the pixels of an opened image as :func:`read_image` does, [H, W, 3] or [H, W, 4]."""
+    if image.mode.startswith("I"):  # gray of 16 bits; Pillow itself keeps the upper byte of 16-bit colour files
+        gray = (np.asarray(image) >> 8).clip(0, 255).astype(np.uint8)  # [H, W]
+        return np.repeat(gray[..., None], 3, axis=2)  # [H, W, 3]
+    mode = "RGBA" if image.has_transparency_data else "RGB"
+    return np.array(image if image.mode == mode else image.convert(mode))  # converting would copy it in any case
 
 
 def read_mask(path: str | Path) -> Bools:

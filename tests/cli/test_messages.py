@@ -13,7 +13,7 @@ from minisplat_ref import Gaussians, io, save_ply
 from minisplat_ref.cli import main, train
 from minisplat_ref.cli import sfm as sfm_command
 from minisplat_ref.datasets import sfm
-from minisplat_ref.datasets.downscale import list_images
+from minisplat_ref.datasets.photo_files import list_images
 from minisplat_ref.errors import InputError, InputWarning
 from minisplat_ref.io import images as images_module
 from minisplat_ref.io import load_ply, load_scene, read_image

@@ -1,0 +1,167 @@
+"""Estimate cameras and sparse points from a folder of photographs, on the CPU: structure from motion by COLMAP.
+
+Photographs are rotated upright (EXIF) and shrunk (:mod:`.photographs`), features are found and matched
+(:mod:`.features`), two mappers estimate cameras and points (:mod:`.mapping`), and the better result is undistorted. What
+is left is a COLMAP scene with pinhole cameras: ``images/``, ``sparse/0/``, and ``masks/`` if there were any. Photographs
+that could not be placed are named and left out.
+"""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+from minisplat_ref.datasets.photo_files import MASKS
+from minisplat_ref.datasets.sfm.features import (
+    DENSE,
+    STANDARD,
+    Features,
+    Pair,
+    find_features,
+    match_features,
+    overlapping_pairs,
+    pairs_to_match,
+)
+from minisplat_ref.datasets.sfm.mapping import Mapped, map_photographs
+from minisplat_ref.datasets.sfm.photographs import Group, Photographs, prepare_photos
+from minisplat_ref.datasets.undistort import undistort_model
+from minisplat_ref.errors import InputError
+from minisplat_ref.io.atomic import making_folder
+
+PHOTOS_MIN, SHARE_MIN = 3, 0.25  # of the given ones; fewer placed photographs are no scene of them
+POINTS_MIN = 200  # for each photograph; with fewer, dense features are tried
+
+
+class SfmResult(NamedTuple):
+    """The result, for the report."""
+
+    n_photos: int
+    """Photographs that were given."""
+    left_out: tuple[str, ...]
+    """Names of those that could not be placed, in the folder of photographs."""
+    n_points: int
+    """Sparse points."""
+    error: float
+    """Mean reprojection error before undistortion, pixels."""
+    kept: Mapped
+    """The result that was kept, without its model."""
+    others: tuple[Mapped, ...]
+    """The other results, without their models: of the other mapper, and of other features if they were tried."""
+    groups: dict[Group, int]
+    """Photographs that share a camera."""
+    n_masks: int
+    """Photographs with a mask."""
+    size: tuple[int, int]
+    """Width and height of the largest photograph in the scene, pixels."""
+
+
+def run_sfm(
+    photos: Path,
+    out: Path,
+    *,
+    long_side: int = 1600,
+    matching: str = "exhaustive",
+    features: str = "auto",
+    camera_model: str = "SIMPLE_RADIAL",
+) -> SfmResult:
+    """Make a COLMAP scene with pinhole cameras from photographs, complete or not at all.
+
+    Parameters
+    ----------
+    photos : Path
+        Folder of photographs.
+    out : Path
+        Folder to make.
+    long_side : int
+        Photographs with a longer side are shrunk to this, pixels.
+    matching : str
+        "exhaustive": every pair. "sequential": neighbours in the order of file names, for videos.
+    features : str
+        "standard": COLMAP's own setting. "dense": more features, matched more thoroughly, which takes longer. "auto":
+        standard, then dense if that leaves photographs without a place or gives few points; the better result is kept.
+    camera_model : str
+        COLMAP model that is estimated, for each group of photographs with one size, camera and focal length.
+
+    Returns
+    -------
+    SfmResult
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two photographs, one cannot be read, or hardly any finds a place.
+    """
+    if long_side < 1:
+        raise InputError(f"--long-side is {long_side}; it must be positive")
+    with making_folder(out) as folder, TemporaryDirectory(dir=folder) as temporary:
+        work = Path(temporary)
+        photographs = prepare_photos(photos, work, long_side)
+        n_photos = len(photographs.originals)
+        if n_photos < 2:
+            raise InputError(f"{photos}: 1 photograph, structure from motion needs at least 2 that overlap; take more")
+        results = _reconstruct(photographs, work, matching, features, camera_model)
+        best = max(results, key=lambda result: result.merit)
+        _check_placed(best, n_photos, photos, matching)
+        (work / "sparse" / "0").mkdir(parents=True)
+        best.model.write(work / "sparse" / "0")
+        undistort_model(work / "sparse" / "0", work / "images", folder)
+    placed = {image.name for image in best.model.images.values() if image.has_pose}
+    return SfmResult(
+        n_photos=n_photos,
+        left_out=tuple(str(original) for name, original in photographs.originals.items() if name not in placed),
+        n_points=best.n_points,
+        error=best.model.compute_mean_reprojection_error(),
+        kept=best._replace(model=None),
+        others=tuple(result._replace(model=None) for result in results if result is not best),
+        groups={group: len(names) for group, names in photographs.groups.items()},
+        n_masks=len(photographs.masked),
+        size=(0, 0),
+    )
+
+
+def _reconstruct(photographs: Photographs, work: Path, matching: str, features: str, camera_model: str) -> list[Mapped]:
+    """Return the results of both mappers, with standard features, dense ones or both."""
+    all_pairs = pairs_to_match(list(photographs.originals), matching)
+
+    def attempt(kind: Features, pairs: list[Pair]) -> list[Mapped]:
+        folder = work / kind.name
+        folder.mkdir()
+        find_features(folder / "database.db", photographs, kind, camera_model)
+        match_features(folder / "database.db", folder, pairs, kind)
+        return map_photographs(folder / "database.db", photographs.images, folder, kind.name)
+
+    results = attempt(STANDARD, all_pairs)
+    best = max(results, key=lambda result: result.merit)
+    n_photos = len(photographs.originals)
+    is_enough = best.n_placed == n_photos and best.n_points >= POINTS_MIN * n_photos
+    if features == "standard" or (features == "auto" and is_enough):
+        return results
+    placed = () if best.model is None else [image.name for image in best.model.images.values() if image.has_pose]
+    pairs = overlapping_pairs(work / STANDARD.name / "database.db", all_pairs, frozenset(placed))
+    dense = attempt(DENSE, pairs)
+    return dense if features == "dense" else [*results, *dense]
+
+
+def _check_placed(best: Mapped, n_photos: int, photos: Path, matching: str) -> None:
+    """Refuse a result that is no scene of the photographs."""
+    if best.model is None:
+        raise InputError(
+            f"{photos}: no two photographs could be placed; take them with more overlap, of something with texture"
+        )
+    if best.n_placed < max(min(n_photos, PHOTOS_MIN), SHARE_MIN * n_photos):
+        raise InputError(
+            f"{photos}: {best.n_placed} of {n_photos} photographs ({best.n_placed / n_photos:.0%}) found a place, too"
+            f" few for a scene; {advice(matching)}"
+        )
+
+
+def advice(matching: str) -> str:
+    """Return what usually helps photographs that could not be placed after this kind of matching."""
+    if matching == "sequential":
+        return (
+            "--matching sequential compares neighbours in the order of file names, which suits frames of a video; for"
+            " other photographs use --matching exhaustive"
+        )
+    return (
+        "what usually helps: more photographs between those that do not join, so that each shares most of its view with"
+        " two others; sharp ones, with a step to the side between shots; a subject with texture that does not move"
+    )
