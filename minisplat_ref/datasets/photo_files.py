@@ -8,7 +8,6 @@ are none.
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterable
 from pathlib import Path
 
 from minisplat_ref.errors import InputError, InputWarning, one_line
@@ -21,7 +20,8 @@ UNREAD_SUFFIXES = (
 """Formats of phones and cameras that Pillow does not decode."""
 MASKS = "masks"
 """Folder of masks beside the photographs."""
-BY_PRODUCT = re.compile(r"\..+|@eaDir|__MACOSX|thumbnails?|thumbs|images_\d+", re.IGNORECASE)  # of a file or a folder
+BY_PRODUCT = re.compile(r"\..+|@eaDir|__MACOSX|thumbnails?|thumbs", re.IGNORECASE)  # of a file or a folder
+SMALLER = re.compile(r"images_\d+")  # folder of smaller copies, if there is images/ beside it
 NAMED_MAX = 20  # files that a message names
 
 
@@ -39,8 +39,9 @@ def list_images(folder: Path) -> list[Path]:
         raise InputError(f"{folder}: no such folder; give a folder with photographs")
     found = sorted(file.relative_to(folder) for file in folder.rglob("*") if file.is_file())
     found = [file for file in found if MASKS not in file.parent.parts]
-    by_products = [file for file in found if _by_product(file) is not None]
-    photos = [file for file in found if _by_product(file) is None]
+    sorted_out = [(file, _by_product(folder, file)) for file in found]
+    photos = [file for file, by_product in sorted_out if by_product is None]
+    by_products = [(file, by_product) for file, by_product in sorted_out if by_product is not None]
     files = [folder / file for file in photos if file.suffix.lower() in IMAGE_SUFFIXES]
     others = [str(file) for file in photos if file.suffix.lower() in UNREAD_SUFFIXES]
     problems = []
@@ -48,7 +49,7 @@ def list_images(folder: Path) -> list[Path]:
         problems.append(
             f"{len(others)} photographs of formats that are not read ({enumerate_names(others)}): convert them to JPEG"
         )
-    left_out = Counter(_by_product(file) for file in by_products if file.suffix.lower() in IMAGE_SUFFIXES)
+    left_out = Counter(by_product for file, by_product in by_products if file.suffix.lower() in IMAGE_SUFFIXES)
     if left_out:
         names = enumerate_names([name if n == 1 else f"{name} with {n} images" for name, n in left_out.items()])
         problems.append(f"what is hidden or a by-product of other programs ({names})")
@@ -60,11 +61,13 @@ def list_images(folder: Path) -> list[Path]:
     return files
 
 
-def _by_product(file: Path) -> str | None:
-    """Return the first part of a relative path that is hidden or a by-product, with what is above it; None if none."""
+def _by_product(folder: Path, file: Path) -> str | None:
+    """Return the path to the first part that is hidden or a by-product; None if there is none."""
     for i, part in enumerate(file.parts, 1):
-        if BY_PRODUCT.fullmatch(part):
-            return Path(*file.parts[:i]).as_posix() + ("/" if i < len(file.parts) else "")
+        path = Path(*file.parts[:i])
+        is_smaller = SMALLER.fullmatch(part) and (folder / path).with_name("images").is_dir()
+        if is_smaller or BY_PRODUCT.fullmatch(part):
+            return path.as_posix() + ("/" if i < len(file.parts) else "")
     return None
 
 

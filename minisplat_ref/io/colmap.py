@@ -6,7 +6,9 @@ Poses follow COLMAP's convention, which is also ours: cam_from_world, OpenCV axe
 and images that COLMAP could not register.
 """
 
+import re
 import struct
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,13 +16,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from minisplat_ref.errors import InputError
+from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.io.lens import PINHOLE_MODELS, POLYNOMIAL_MODELS, Lens, import_pycolmap
 from minisplat_ref.io.names import is_file, name_inside
 from minisplat_ref.io.scene import Photo, build_reading, build_scene, split_photos
 from minisplat_ref.types import Camera, Floats, Ints, Scene
 
 MODEL_FOLDERS = ("sparse/0", "sparse")
+N_IMAGES = re.compile(r"# Number of images: (\d+)")  # in a model as text
 
 
 class Records(NamedTuple):
@@ -116,6 +119,8 @@ def read_model(path: Path) -> Any:
         found = (model / "cameras.bin").stat().st_size
         if found < size:  # pycolmap does not notice
             raise InputError(f"{model / 'cameras.bin'}: truncated, {found} of {size} bytes; copy or export it again")
+    else:
+        _check_text_images(model / "images.txt", reconstruction.num_images())
     return reconstruction
 
 
@@ -193,6 +198,33 @@ def _points(reconstruction: Any) -> tuple[Floats, NDArray[np.uint8]]:
     points = _sort_points(reconstruction)
     positions = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
     return positions, np.array([point.color for point in points], np.uint8).reshape(-1, 3)
+
+
+def _check_text_images(file: Path, n_read: int) -> None:
+    """Refuse a text file of images that holds more of them than pycolmap has read; warn if its heading states more.
+
+    An image takes two lines, the second of which lists its 2D features and is empty if there are none. Where a program
+    has left out empty lines, every second image is read as the features of the one before.
+    """
+    lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
+    # Features are triples of numbers; an image has nine numbers and a name.
+    n_found = sum(len(line.split()) % 3 != 0 for line in lines if not line.startswith("#"))
+    if n_read < n_found:
+        raise InputError(
+            f"{file}: {n_found} images, of which {n_read} can be read: each needs a second line with its 2D features,"
+            " empty if it has none; add the empty lines, or export the model as binary"
+        )
+    headings = (N_IMAGES.match(line) for line in lines)
+    n_stated = next((int(heading[1]) for heading in headings if heading is not None), n_read)
+    if n_read < n_stated:
+        warnings.warn(
+            one_line(
+                f"{file}: {n_read} images, though its heading says {n_stated}; export the model again, unless images"
+                " were taken out on purpose"
+            ),
+            InputWarning,
+            stacklevel=4,
+        )
 
 
 def _check_records(file: Path, layout: Records) -> None:

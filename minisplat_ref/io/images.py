@@ -28,7 +28,7 @@ from minisplat_ref.types import Bools, Floats
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 """Files that count as photographs."""
 
-SAVE_OPTIONS: dict[str, dict[str, Any]] = {"JPEG": {"quality": 95, "subsampling": 0}}
+SAVE_OPTIONS: dict[str, dict[str, Any]] = {"JPEG": {"quality": 95, "subsampling": 0}, "WEBP": {"quality": 95}}
 PIXELS_MAX = 2**29  # per image: more than cameras have, and 1.6 GB in memory
 PLAUSIBLE_PIXELS = 100_000_000  # up to this size, an image may be compressed into any number of bytes
 PIXELS_PER_BYTE = 10_000  # limit for larger ones: a white 1-bit PNG has 8256 pixels per byte
@@ -200,7 +200,8 @@ def write_image(path: str | Path, image: NDArray) -> None:
     Parameters
     ----------
     path : str or Path
-        File to make or replace; its suffix chooses the format. JPEGs are of quality 95 without chroma subsampling.
+        File to make or replace; its suffix chooses the format. JPEGs are of quality 95 without chroma subsampling,
+        WebPs of quality 95.
     image : ndarray of shape (H, W), (H, W, 3) or (H, W, 4)
         uint8, bool as black and white, or floats, clipped to [0, 1] and rounded to the nearest of 256 levels.
 

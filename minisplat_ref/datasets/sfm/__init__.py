@@ -1,16 +1,15 @@
 """Estimate cameras and sparse points from a folder of photographs, on the CPU: structure from motion by COLMAP.
 
-Photographs are rotated upright (EXIF) and shrunk (:mod:`.photographs`), features are found and matched
-(:mod:`.features`), two mappers estimate cameras and points (:mod:`.mapping`), and the better result is undistorted. What
-is left is a COLMAP scene with pinhole cameras: ``images/``, ``sparse/0/``, and ``masks/`` if there were any. Photographs
-that could not be placed are named and left out.
+Photographs are rotated upright and shrunk (:mod:`.photographs`), features are found and matched (:mod:`.features`), two
+mappers estimate cameras and points (:mod:`.mapping`), and the better result is undistorted. What is left is a COLMAP
+scene with pinhole cameras: ``images/``, ``sparse/0/``, and ``masks/`` if there were masks. Photographs that could not
+be placed are named and left out.
 """
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-from minisplat_ref.datasets.photo_files import MASKS
 from minisplat_ref.datasets.sfm.features import (
     DENSE,
     STANDARD,
@@ -21,14 +20,16 @@ from minisplat_ref.datasets.sfm.features import (
     overlapping_pairs,
     pairs_to_match,
 )
+from minisplat_ref.datasets.sfm.judging import Matches, choose, read_matches
 from minisplat_ref.datasets.sfm.mapping import Mapped, map_photographs
 from minisplat_ref.datasets.sfm.photographs import Group, Photographs, prepare_photos
-from minisplat_ref.datasets.undistort import undistort_model
+from minisplat_ref.datasets.undistort import undistort_colmap
 from minisplat_ref.errors import InputError
 from minisplat_ref.io.atomic import making_folder
+from minisplat_ref.io.colmap import colmap_photos
 
 PHOTOS_MIN, SHARE_MIN = 3, 0.25  # of the given ones; fewer placed photographs are no scene of them
-POINTS_MIN = 200  # for each photograph; with fewer, dense features are tried
+POINTS_MIN = 150  # for each photograph; with fewer, dense features are tried
 
 
 class SfmResult(NamedTuple):
@@ -46,12 +47,14 @@ class SfmResult(NamedTuple):
     """The result that was kept, without its model."""
     others: tuple[Mapped, ...]
     """The other results, without their models: of the other mapper, and of other features if they were tried."""
+    n_matches: int
+    """Verified matches, with which the results were judged."""
     groups: dict[Group, int]
     """Photographs that share a camera."""
     n_masks: int
     """Photographs with a mask."""
-    size: tuple[int, int]
-    """Width and height of the largest photograph in the scene, pixels."""
+    sizes: tuple[tuple[int, int], ...]
+    """Width and height of each photograph in the scene, pixels."""
 
 
 def run_sfm(
@@ -98,12 +101,11 @@ def run_sfm(
         n_photos = len(photographs.originals)
         if n_photos < 2:
             raise InputError(f"{photos}: 1 photograph, structure from motion needs at least 2 that overlap; take more")
-        results = _reconstruct(photographs, work, matching, features, camera_model)
-        best = max(results, key=lambda result: result.merit)
+        best, others, n_matches = _reconstruct(photographs, work, matching, features, camera_model)
         _check_placed(best, n_photos, photos, matching)
         (work / "sparse" / "0").mkdir(parents=True)
         best.model.write(work / "sparse" / "0")
-        undistort_model(work / "sparse" / "0", work / "images", folder)
+        written = undistort_colmap(work, colmap_photos(work, best.model), folder)
     placed = {image.name for image in best.model.images.values() if image.has_pose}
     return SfmResult(
         n_photos=n_photos,
@@ -111,34 +113,39 @@ def run_sfm(
         n_points=best.n_points,
         error=best.model.compute_mean_reprojection_error(),
         kept=best._replace(model=None),
-        others=tuple(result._replace(model=None) for result in results if result is not best),
+        others=tuple(other._replace(model=None) for other in others),
+        n_matches=n_matches,
         groups={group: len(names) for group, names in photographs.groups.items()},
         n_masks=len(photographs.masked),
-        size=(0, 0),
+        sizes=tuple((photo.camera.width, photo.camera.height) for photo in written),
     )
 
 
-def _reconstruct(photographs: Photographs, work: Path, matching: str, features: str, camera_model: str) -> list[Mapped]:
-    """Return the results of both mappers, with standard features, dense ones or both."""
+def _reconstruct(
+    photographs: Photographs, work: Path, matching: str, features: str, camera_model: str
+) -> tuple[Mapped, list[Mapped], int]:
+    """Return the best result, the others, and the number of matches with which they were judged."""
     all_pairs = pairs_to_match(list(photographs.originals), matching)
 
-    def attempt(kind: Features, pairs: list[Pair]) -> list[Mapped]:
+    def attempt(kind: Features, pairs: list[Pair]) -> tuple[list[Mapped], list[Matches]]:
         folder = work / kind.name
         folder.mkdir()
-        find_features(folder / "database.db", photographs, kind, camera_model)
-        match_features(folder / "database.db", folder, pairs, kind)
-        return map_photographs(folder / "database.db", photographs.images, folder, kind.name)
+        database = folder / "database.db"
+        find_features(database, photographs, kind, camera_model)
+        match_features(database, folder, pairs, kind)
+        return map_photographs(database, photographs.images, folder, kind.name), read_matches(database)
 
-    results = attempt(STANDARD, all_pairs)
-    best = max(results, key=lambda result: result.merit)
+    results, matches = attempt(STANDARD, all_pairs)
+    best, others = choose(results, matches)
     n_photos = len(photographs.originals)
     is_enough = best.n_placed == n_photos and best.n_points >= POINTS_MIN * n_photos
-    if features == "standard" or (features == "auto" and is_enough):
-        return results
-    placed = () if best.model is None else [image.name for image in best.model.images.values() if image.has_pose]
-    pairs = overlapping_pairs(work / STANDARD.name / "database.db", all_pairs, frozenset(placed))
-    dense = attempt(DENSE, pairs)
-    return dense if features == "dense" else [*results, *dense]
+    if features == "dense" or (features == "auto" and not is_enough):
+        images = [] if best.model is None else best.model.images.values()
+        placed = frozenset(image.name for image in images if image.has_pose)
+        pairs = overlapping_pairs(work / STANDARD.name / "database.db", all_pairs, placed)
+        dense, matches = attempt(DENSE, pairs)
+        best, others = choose(dense if features == "dense" else [best, *others, *dense], matches)
+    return best, others, sum(len(pair.first) for pair in matches)
 
 
 def _check_placed(best: Mapped, n_photos: int, photos: Path, matching: str) -> None:

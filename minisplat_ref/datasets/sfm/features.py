@@ -1,9 +1,9 @@
 """Find features in photographs and match them between pairs, into the database that the mappers read.
 
 SIFT, by COLMAP, on the CPU. *Standard* is COLMAP's own setting. *Dense* finds weaker features, and more of them, and
-searches once more along the epipolar lines of pairs that match. That takes some twenty times as long, so it is done only
-between photographs whose standard features say that they overlap. Photographs and pairs are handed over in batches:
-between them the bar on a terminal moves, and an interruption is noticed.
+searches once more along the epipolar lines of pairs that match. That takes some twenty times as long, so it is done
+only between photographs whose standard features say that they overlap. Photographs and pairs are handed over in
+batches: between them the bar on a terminal moves, and an interruption is noticed.
 """
 
 import os
@@ -64,13 +64,16 @@ def find_features(database: Path, photographs: Photographs, features: Features, 
     """
     pycolmap = import_quiet_pycolmap()
     options = pycolmap.FeatureExtractionOptions()
+    n_at_once = os.cpu_count() or 1
     options.sift.max_num_features, options.sift.peak_threshold = features.n_max, features.peak_threshold
     with _bar(f"{features.name} features", len(photographs.originals), " images") as bar:
         for names in photographs.groups.values():
             reader = pycolmap.ImageReaderOptions(camera_model=camera_model)
-            if photographs.masks is not None:
-                reader.mask_path = photographs.masks
-            for batch in _batches(names, os.cpu_count() or 1):
+            masked = [name for name in names if name in photographs.masked]
+            others = [name for name in names if name not in photographs.masked]
+            for batch in (*_batches(masked, n_at_once), *_batches(others, n_at_once)):
+                # With a folder of masks, COLMAP skips a photograph that has none.
+                reader.mask_path = photographs.masks if batch[0] in photographs.masked else ""
                 pycolmap.extract_features(
                     database,
                     photographs.images,
@@ -80,10 +83,10 @@ def find_features(database: Path, photographs: Photographs, features: Features, 
                     extraction_options=options,
                     device=pycolmap.Device.cpu,
                 )
-                with _opened(database) as content:
+                with opened(database) as content:
                     reader.existing_camera_id = max(camera.camera_id for camera in content.read_all_cameras())
                 bar.update(len(batch))
-    with _opened(database) as content:
+    with opened(database) as content:
         found = {image.name for image in content.read_all_images()}
     missing = [str(original) for name, original in photographs.originals.items() if name not in found]
     if missing:
@@ -128,8 +131,8 @@ def pairs_to_match(names: Sequence[str], matching: str) -> list[Pair]:
 def overlapping_pairs(database: Path, pairs: Sequence[Pair], placed: frozenset[str]) -> list[Pair]:
     """Return those of the pairs that are worth a denser search, in their order.
 
-    A photograph is paired with the PARTNERS with which it has most verified matches, and one that is not ``placed`` with
-    every other as well.
+    A photograph is paired with the PARTNERS with which it has most verified matches, and one that is not ``placed``
+    with every other as well.
 
     Parameters
     ----------
@@ -140,7 +143,7 @@ def overlapping_pairs(database: Path, pairs: Sequence[Pair], placed: frozenset[s
         Names of photographs whose cameras were found.
     """
     pycolmap = import_quiet_pycolmap()
-    with _opened(database) as content:
+    with opened(database) as content:
         names = {image.image_id: image.name for image in content.read_all_images()}
         ids, counts = content.read_two_view_geometry_num_inliers()
     partners: dict[str, list[tuple[int, str]]] = {}
@@ -158,7 +161,7 @@ def overlapping_pairs(database: Path, pairs: Sequence[Pair], placed: frozenset[s
 
 
 @contextmanager
-def _opened(database: Path) -> Iterator[Any]:
+def opened(database: Path) -> Iterator[Any]:
     """Open a database of COLMAP while COLMAP is not working with it."""
     content = import_quiet_pycolmap().Database.open(database)
     try:

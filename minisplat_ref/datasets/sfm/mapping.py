@@ -1,12 +1,11 @@
-"""Estimate cameras and points from matches, by two mappers of COLMAP, and keep the better model.
+"""Estimate cameras and points from matches by two mappers of COLMAP.
 
-The *incremental* mapper begins with two photographs and adds one after the other; it is accurate, but may find no good
-beginning, for example where the photographer walked forwards. The *global* one (GLOMAP) estimates all cameras at once and
-places every photograph that matches at all, however badly. Both models are therefore judged alike: points are
-triangulated again by the same rules, a photograph with too few of them loses its place, and the model that has placed
-more photographs is better, then the one with more points.
+The *incremental* mapper begins with two photographs and adds one after the other. It is accurate, but may find no good
+beginning, for example where the photographer walked forwards. The *global* one (GLOMAP) estimates all cameras at once;
+it places every photograph that matches another, however badly. Therefore the points of both are triangulated again, by
+the same rules, and a photograph that sees too few of them loses its place.
 
-A point that only two photographs see is kept too, if it projects closely: COLMAP leaves such points out, because they help
+A point that only two photographs see is kept if it projects closely. COLMAP leaves such points out, because they help
 no camera, but training can start from them.
 """
 
@@ -36,11 +35,8 @@ class Mapped(NamedTuple):
     """Points in the largest model."""
     other_groups: tuple[int, ...]
     """Photographs in each of the other models."""
-
-    @property
-    def merit(self) -> tuple[int, int]:
-        """What is compared: more is better."""
-        return self.n_placed, self.n_points
+    n_explained: int = 0
+    """Matches that the cameras explain, see :mod:`.judging`."""
 
 
 def map_photographs(database: Path, images: Path, work: Path, features: str) -> list[Mapped]:

@@ -59,10 +59,10 @@ class Photographs(NamedTuple):
     """The original of each copy, relative to ``source``; sorted."""
     groups: dict[Group, list[str]]
     """Names of the photographs that share a camera."""
-    masks: Path | None
-    """Folder with a mask for each copy, as COLMAP names it; None if there is no mask at all."""
+    masks: Path
+    """Folder of the masks of copies, named as COLMAP does."""
     masked: frozenset[str]
-    """Names of the photographs that have a mask; the others' are white."""
+    """Names of the photographs that have a mask."""
 
 
 def prepare_photos(source: Path, work: Path, long_side: int) -> Photographs:
@@ -99,15 +99,12 @@ def prepare_photos(source: Path, work: Path, long_side: int) -> Photographs:
         groups.setdefault(group, []).append(name)
         if mask is not None:
             masked.add(name)
-            _write_mask(masks, name, mask)
+            (masks / f"{name}.png").parent.mkdir(parents=True, exist_ok=True)
+            write_image(masks / f"{name}.png", mask)
         if mask_file is not None:
             used.add(mask_file)
     _warn_of_unused(source, used)
-    if masked:  # COLMAP leaves out a photograph without a mask if others have one
-        sizes = {name: (group.height, group.width) for group, names in groups.items() for name in names}
-        for name in originals.keys() - masked:
-            _write_mask(masks, name, np.ones(sizes[name], np.bool_))
-    return Photographs(source, images, originals, groups, masks if masked else None, frozenset(masked))
+    return Photographs(source, images, originals, groups, masks, frozenset(masked))
 
 
 def _name_copy(original: Path) -> str:
@@ -133,8 +130,8 @@ def _copy(file: Path, mask_file: Path | None, target: Path, long_side: int) -> t
         given = read_mask(mask_file)
         if given.shape != pixels.shape[:2]:
             raise InputError(
-                f"{mask_file}: the mask is {given.shape[1]}x{given.shape[0]} but its photograph {file.name}, upright, is"
-                f" {pixels.shape[1]}x{pixels.shape[0]}; resize, turn or remove the mask"
+                f"{mask_file}: the mask is {given.shape[1]}x{given.shape[0]} but its photograph {file.name}, upright,"
+                f" is {pixels.shape[1]}x{pixels.shape[0]}; resize, turn or remove the mask"
             )
         mask = given if mask is None else given & mask
     image = Image.fromarray(np.ascontiguousarray(pixels[..., :3]))
@@ -168,13 +165,6 @@ def _positive(value: object) -> float | None:
     except (TypeError, ValueError, ZeroDivisionError):
         return None
     return length if math.isfinite(length) and length > 0 else None
-
-
-def _write_mask(masks: Path, name: str, mask: Bools) -> None:
-    """Write a mask where COLMAP looks for it."""
-    file = masks / f"{name}.png"
-    file.parent.mkdir(parents=True, exist_ok=True)
-    write_image(file, mask)
 
 
 def _warn_of_unused(source: Path, used: set[Path]) -> None:
