@@ -108,6 +108,8 @@ def read_model(path: Path) -> Any:
         for name, layout in BINARY_RECORDS.items():
             if (model / name).is_file():
                 _check_records(model / name, layout)
+    elif (model / "images.txt").is_file():
+        _check_text_images(model / "images.txt")
     pycolmap = import_pycolmap()
     try:
         reconstruction = pycolmap.Reconstruction(str(model))
@@ -119,8 +121,6 @@ def read_model(path: Path) -> Any:
         found = (model / "cameras.bin").stat().st_size
         if found < size:  # pycolmap does not notice
             raise InputError(f"{model / 'cameras.bin'}: truncated, {found} of {size} bytes; copy or export it again")
-    else:
-        _check_text_images(model / "images.txt", reconstruction.num_images())
     return reconstruction
 
 
@@ -200,18 +200,23 @@ def _points(reconstruction: Any) -> tuple[Floats, NDArray[np.uint8]]:
     return positions, np.array([point.color for point in points], np.uint8).reshape(-1, 3)
 
 
-def _check_text_images(file: Path, n_read: int) -> None:
-    """Refuse a text file of images that holds more of them than pycolmap has read; warn if its heading states more.
+def _check_text_images(file: Path) -> None:
+    """Refuse a text file of images in which second lines are missing; warn if its heading states more images.
 
     An image takes two lines, the second of which lists its 2D features and is empty if there are none. Where a program
-    has left out empty lines, every second image is read as the features of the one before.
+    has left out empty lines, pycolmap takes every second image for the features of the one before.
     """
     lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
     # Features are triples of numbers; an image has nine numbers and a name.
-    n_found = sum(len(line.split()) % 3 != 0 for line in lines if not line.startswith("#"))
-    if n_read < n_found:
+    n_images = sum(len(line.split()) % 3 != 0 for line in lines if not line.startswith("#"))
+    n_read = 0
+    rest = iter(lines)
+    for line in rest:
+        if line.strip() and not line.startswith("#") and next(rest, None) is not None:
+            n_read += 1
+    if n_read < n_images:
         raise InputError(
-            f"{file}: {n_found} images, of which {n_read} can be read: each needs a second line with its 2D features,"
+            f"{file}: {n_images} images, of which {n_read} can be read: each needs a second line with its 2D features,"
             " empty if it has none; add the empty lines, or export the model as binary"
         )
     headings = (N_IMAGES.match(line) for line in lines)

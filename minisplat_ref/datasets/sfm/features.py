@@ -66,28 +66,29 @@ def find_features(database: Path, photographs: Photographs, features: Features, 
     options = pycolmap.FeatureExtractionOptions()
     n_at_once = os.cpu_count() or 1
     options.sift.max_num_features, options.sift.peak_threshold = features.n_max, features.peak_threshold
+    reader = pycolmap.ImageReaderOptions(camera_model=camera_model)
+    with opened(database):
+        pass  # which makes the file
+    for names in photographs.groups.values():  # threads finish in any order; images that are in it keep theirs
+        pycolmap.import_images(database, photographs.images, pycolmap.CameraMode.SINGLE, names, reader)
+    masked = [name for name in photographs.originals if name in photographs.masked]
+    others = [name for name in photographs.originals if name not in photographs.masked]
     with _bar(f"{features.name} features", len(photographs.originals), " images") as bar:
-        for names in photographs.groups.values():
-            reader = pycolmap.ImageReaderOptions(camera_model=camera_model)
-            masked = [name for name in names if name in photographs.masked]
-            others = [name for name in names if name not in photographs.masked]
-            for batch in (*_batches(masked, n_at_once), *_batches(others, n_at_once)):
-                # With a folder of masks, COLMAP skips a photograph that has none.
-                reader.mask_path = photographs.masks if batch[0] in photographs.masked else ""
-                pycolmap.extract_features(
-                    database,
-                    photographs.images,
-                    batch,
-                    pycolmap.CameraMode.SINGLE,
-                    reader_options=reader,
-                    extraction_options=options,
-                    device=pycolmap.Device.cpu,
-                )
-                with opened(database) as content:
-                    reader.existing_camera_id = max(camera.camera_id for camera in content.read_all_cameras())
-                bar.update(len(batch))
+        for batch in (*_batches(masked, n_at_once), *_batches(others, n_at_once)):
+            # With a folder of masks, COLMAP skips a photograph that has none.
+            reader.mask_path = photographs.masks if batch[0] in photographs.masked else ""
+            pycolmap.extract_features(
+                database,
+                photographs.images,
+                batch,
+                reader_options=reader,
+                extraction_options=options,
+                device=pycolmap.Device.cpu,
+            )
+            bar.update(len(batch))
     with opened(database) as content:
-        found = {image.name for image in content.read_all_images()}
+        images = content.read_all_images()
+        found = {image.name for image in images if content.exists_keypoints(image.image_id)}
     missing = [str(original) for name, original in photographs.originals.items() if name not in found]
     if missing:
         raise InputError(

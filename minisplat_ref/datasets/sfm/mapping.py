@@ -54,16 +54,19 @@ def map_photographs(database: Path, images: Path, work: Path, features: str) -> 
         Name of the features, for the results.
     """
     pycolmap = import_quiet_pycolmap()
-    pycolmap.set_random_seed(SEED)
     results = []
     for mapper in MAPPERS:
         folder = work / mapper
         folder.mkdir(parents=True)
+        pycolmap.set_random_seed(SEED)  # for parts that have no seed among their options
         if mapper == "incremental":
             options = pycolmap.IncrementalPipelineOptions(random_seed=SEED)
             found = pycolmap.incremental_mapping(database, images, folder, options)
         else:
-            found = pycolmap.global_mapping(database, images, folder, pycolmap.GlobalPipelineOptions(random_seed=SEED))
+            options = pycolmap.GlobalPipelineOptions(random_seed=SEED)
+            for part in (options.mapper, options.mapper.rotation_averaging, options.mapper.global_positioning):
+                part.random_seed = SEED
+            found = pycolmap.global_mapping(database, images, folder, options)
         models = [complete(model, database, images, folder) for model in found.values()]
         models = sorted((model for model in models if model.num_reg_images() > 0), key=_size, reverse=True)
         results.append(_result(mapper, features, models))
