@@ -68,7 +68,9 @@ def run_sfm(photos, scene, *options):
 def test_two_focal_lengths_at_one_size(shots, tmp_path, capsys):
     write_photographs(tmp_path / "photos", shots, (24.0, 41.5) * 6)
     assert run_sfm(tmp_path / "photos", tmp_path / "scene", "--features", "standard") == 0
-    first, kept, other, groups, *_, following = capsys.readouterr().out.splitlines()
+    printed = capsys.readouterr()
+    assert printed.err == ""  # no bars where there is no terminal
+    first, kept, other, groups, *_, following = printed.out.splitlines()
     assert ": 12 of 12 photographs (100%), " in first and " points, reprojection error 0." in first
     assert kept.startswith("kept: ") and other.startswith("not kept: ")
     assert all(f"{mapper} mapper with standard features: 12 " in kept + other for mapper in mapping.MAPPERS)

@@ -133,7 +133,8 @@ def _reconstruct(
         database = folder / "database.db"
         find_features(database, photographs, kind, camera_model)
         match_features(database, folder, pairs, kind)
-        return map_photographs(database, photographs.images, folder, kind.name), read_matches(database)
+        n_photos = len(photographs.originals)
+        return map_photographs(database, photographs.images, folder, kind.name, n_photos), read_matches(database)
 
     results, matches = attempt(STANDARD, all_pairs)
     best, others = choose(results, matches)

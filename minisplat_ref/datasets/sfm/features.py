@@ -22,7 +22,7 @@ SEED = 0  # of RANSAC: the same photographs give the same matches
 NEIGHBOURS = (*range(1, 11), 16, 32, 64, 128, 256, 512)  # distances in the order of names, for sequential matching
 MATCHES_MIN = 15  # of a pair that overlaps, after geometric verification: COLMAP's own threshold
 PARTNERS = 10  # of a photograph in dense matching: those with which it has most standard matches
-PAIRS_AT_ONCE = 32  # a call takes 0.06 s besides its pairs
+PAIRS_AT_ONCE = 16  # a call takes 0.06 s besides its pairs
 GUIDED_AT_ONCE = 2  # for each core
 
 Pair = tuple[str, str]

@@ -12,6 +12,8 @@ no camera, but training can start from them.
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from tqdm import tqdm
+
 from minisplat_ref.io.lens import import_quiet_pycolmap
 
 SEED = 0
@@ -39,7 +41,7 @@ class Mapped(NamedTuple):
     """Matches that the cameras explain, see :mod:`.judging`."""
 
 
-def map_photographs(database: Path, images: Path, work: Path, features: str) -> list[Mapped]:
+def map_photographs(database: Path, images: Path, work: Path, features: str, n_photos: int) -> list[Mapped]:
     """Return the results of both mappers, in the order of MAPPERS.
 
     Parameters
@@ -52,6 +54,8 @@ def map_photographs(database: Path, images: Path, work: Path, features: str) -> 
         New folder for COLMAP's files.
     features : str
         Name of the features, for the results.
+    n_photos : int
+        For the progress bar.
     """
     pycolmap = import_quiet_pycolmap()
     results = []
@@ -59,15 +63,18 @@ def map_photographs(database: Path, images: Path, work: Path, features: str) -> 
         folder = work / mapper
         folder.mkdir(parents=True)
         pycolmap.set_random_seed(SEED)  # for parts that have no seed among their options
-        if mapper == "incremental":
-            options = pycolmap.IncrementalPipelineOptions(random_seed=SEED)
-            found = pycolmap.incremental_mapping(database, images, folder, options)
-        else:
-            options = pycolmap.GlobalPipelineOptions(random_seed=SEED)
-            for part in (options.mapper, options.mapper.rotation_averaging, options.mapper.global_positioning):
-                part.random_seed = SEED
-            found = pycolmap.global_mapping(database, images, folder, options)
-        models = [complete(model, database, images, folder) for model in found.values()]
+        with tqdm(total=n_photos, desc=f"{mapper} mapper", unit=" images", leave=False, disable=None) as bar:
+            if mapper == "incremental":
+                options = pycolmap.IncrementalPipelineOptions(random_seed=SEED)
+                found = pycolmap.incremental_mapping(
+                    database, images, folder, options, next_image_callback=lambda: bar.update()
+                )
+            else:  # which reports nothing in between
+                options = pycolmap.GlobalPipelineOptions(random_seed=SEED)
+                for part in (options.mapper, options.mapper.rotation_averaging, options.mapper.global_positioning):
+                    part.random_seed = SEED
+                found = pycolmap.global_mapping(database, images, folder, options)
+            models = [complete(model, database, images, folder) for model in found.values()]
         models = sorted((model for model in models if model.num_reg_images() > 0), key=_size, reverse=True)
         results.append(_result(mapper, features, models))
     return results
