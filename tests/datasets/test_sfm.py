@@ -249,6 +249,16 @@ def test_cameras_of_too_few_points_are_taken_back(shots, tmp_path, capsys, monke
     assert_refused(capsys, tmp_path, code, "no two photographs could be placed; take them with more overlap")
 
 
+def test_points_of_two_views_project_closely(shots, tmp_path, monkeypatch):
+    monkeypatch.setattr(mapping, "PAIR_ERROR_MAX", 0.1)
+    write_photographs(tmp_path / "photos", shots[:5], (24.0, 41.5, 24.0, 41.5, 24.0))
+    assert run_sfm(tmp_path / "photos", tmp_path / "scene", "--features", "standard") == 0
+    points = import_pycolmap().Reconstruction(tmp_path / "scene" / "sparse" / "0").points3D.values()
+    errors = np.array([(point.track.length() == 2, point.error) for point in points])
+    is_pair = errors[:, 0] == 1
+    assert is_pair.any() and errors[is_pair, 1].max() <= 0.1 < errors[~is_pair, 1].max()
+
+
 # real photographs
 
 
