@@ -29,7 +29,7 @@ Photographs of another size, camera or focal length may be mixed in.
 EPILOG = """\
 examples:
   minisplat-ref sfm holiday/fountain --out scenes/fountain
-  minisplat-ref train scenes/fountain --out runs/fountain"""
+  minisplat-ref train scenes/fountain --downscale 3 --out runs/fountain"""
 
 
 def add_parser(commands: Commands) -> None:
