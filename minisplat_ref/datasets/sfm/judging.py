@@ -1,7 +1,7 @@
 """Choose among the models that mappers and features have given.
 
 A wrong model may place all photographs, have more points than a right one and a smaller reprojection error: the global
-mapper gave one of 50 photographs of a fox before a wallpaper that repeats, with cameras off by half of the scene. What
+mapper gave one of 50 photographs of a fox before a wallpaper that repeats, with half of the cameras far off. What
 contradicts it are the matches: features that two photographs share lie off each other's epipolar lines if a pose is
 wrong. So the matches are counted that a model explains; for all models the same ones, of the densest features that were
 tried. A photograph without a place explains none. Among models that explain nearly as many, the one with more points is
