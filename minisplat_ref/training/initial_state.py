@@ -7,7 +7,7 @@ from minisplat_ref.strategy.initialization import initial_gaussians
 from minisplat_ref.strategy.ops import contiguous
 from minisplat_ref.training.adam import zero_moments
 from minisplat_ref.training.dense_start import densify_points
-from minisplat_ref.training.schedule import Recipe
+from minisplat_ref.training.schedule import Recipe, settings_of
 from minisplat_ref.training.state import TrainState
 from minisplat_ref.types import Scene
 
@@ -31,8 +31,7 @@ def initial_state(scene: Scene, recipe: Recipe, seed: int) -> TrainState:
     rng = np.random.default_rng(seed)
     representation = recipe.representation
     if recipe.starts_densely:
-        points, colors = densify_points(scene)
-        scene = scene._replace(points=points, point_colors=colors)
+        scene = _with_dense_points(scene, settings_of(recipe).get("budget"))
     gaussians = contiguous(representation.extend(initial_gaussians(scene, recipe.sh_degree, rng), rng))
     shared = dict(representation.shared(scene, rng))
     for calibration in recipe.active_calibrations:
@@ -54,6 +53,15 @@ def initial_state(scene: Scene, recipe: Recipe, seed: int) -> TrainState:
         shared=shared,
         shared_adam=zero_moments(shared),
     )
+
+
+def _with_dense_points(scene: Scene, budget: int | None) -> Scene:
+    """Return the scene with stereo's points besides its own, evenly chosen if there are more than the budget allows."""
+    points, colors = densify_points(scene)
+    n_own, n = len(scene.points), len(points)
+    room = n - n_own if budget is None else min(max(budget - n_own, 0), n - n_own)
+    rows = np.concatenate([np.arange(n_own), np.linspace(n_own, n - 1, room).astype(int)])
+    return scene._replace(points=points[rows], point_colors=colors[rows])
 
 
 def check_fits(state: TrainState, scene: Scene, recipe: Recipe) -> None:

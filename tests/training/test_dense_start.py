@@ -10,6 +10,7 @@ from minisplat_ref.reference.pinhole import pinhole
 from minisplat_ref.strategy.plane_sweep import surface_points
 from minisplat_ref.training.dense_start import SPACING, choose_neighbours, choose_spread, densify_points, stand_before
 from minisplat_ref.training.initial_state import initial_state
+from minisplat_ref.training.schedule import configure
 from minisplat_ref.types import view_from
 from scenes import make_camera
 
@@ -147,3 +148,6 @@ def test_adaptive_starts_with_them(synthetic, monkeypatch):
     np.testing.assert_array_equal(state.gaussians.sh_dc[40:], state.gaussians.sh_dc[5:10])
     sparse = initial_state(scene, ADAPTIVE._replace(starts_densely=False), 0)
     assert len(sparse.gaussians.means) == 40
+    for budget, expected in ((43, [*range(40), 40, 42, 44]), (30, range(40)), (99, range(45))):
+        limited = initial_state(scene, configure(ADAPTIVE, budget=budget), 0)
+        np.testing.assert_array_equal(limited.gaussians.means, points[list(expected)].astype(np.float32))
