@@ -155,7 +155,7 @@ def test_factors_fall_on_a_line_of_logarithms():
 
 def test_those_behind_most_error_are_halved_and_not_too_many(scene):
     """Of three above the threshold two: those of largest error, or of largest gradient, which are others."""
-    state = initial_state(scene, ADAPTIVE, 0)
+    state = initial_state(scene, ADAPTIVE._replace(starts_densely=False), 0)
     before, n = state.gaussians, len(state.gaussians.means)
     here = Iteration(
         scene, scene.train_views[0], None, np.zeros(0, int), None, RenderSettings(scene.background), cooling=COOLING
