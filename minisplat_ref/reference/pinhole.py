@@ -6,7 +6,7 @@ Left out: lens distortion (images are undistorted beforehand) and rolling shutte
 import numpy as np
 
 from minisplat_ref.constants import JACOBIAN_CLAMP, Conventions
-from minisplat_ref.types import Camera, Floats
+from minisplat_ref.types import Camera, Floats, Ints
 
 
 def pose(camera: Camera, dtype: np.dtype) -> tuple[Floats, Floats]:
@@ -52,6 +52,31 @@ def pinhole_vjp(means_cam: Floats, camera: Camera, v_means2d: Floats) -> Floats:
     """
     limits = np.full(2, np.inf, dtype=means_cam.dtype)
     return np.einsum("nki,nk->ni", pinhole_jacobians(means_cam, camera, -limits, limits), v_means2d)
+
+
+def project_into_image(points: Floats, camera: Camera) -> tuple[Ints, Floats, Floats]:
+    """Return which points a camera sees in its image, and where.
+
+    Parameters
+    ----------
+    points : ndarray of shape (P, 3)
+        World frame.
+    camera : Camera
+
+    Returns
+    -------
+    rows : ndarray of shape (Q,) of int
+        Points in front of the camera and inside the image, ascending.
+    xy : ndarray of shape (Q, 2)
+        Pixels.
+    depths : ndarray of shape (Q,)
+        Camera z, world units.
+    """
+    seen = points @ camera.cam_from_world_R.T + camera.cam_from_world_t
+    rows = np.flatnonzero(seen[:, 2] > 0)
+    xy = pinhole(seen[rows], camera)
+    is_inside = (xy >= 0).all(axis=1) & (xy < (camera.width, camera.height)).all(axis=1)
+    return rows[is_inside], xy[is_inside], seen[rows[is_inside], 2]
 
 
 def pinhole_rays(xs: Floats | float, ys: Floats | float, camera: Camera) -> Floats:

@@ -1,4 +1,4 @@
-"""What stands before the sparse points: a photograph that shows a point says that the ray up to the point is free.
+"""What lies before the sparse points: a photograph that shows a point says that the ray up to the point is free.
 
 Structure from motion has found each sparse point in several photographs. In each of them the point lies on the ray
 through its pixel at a known depth d, and whatever a model blends at less than ``(1 - margin) d`` on that ray cannot be
@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.reference.pinhole import pinhole
+from minisplat_ref.reference.pinhole import project_into_image
 from minisplat_ref.rendering import RenderSettings, activate, as_model
-from minisplat_ref.types import Floats, Ints, Model, TileGrid, View
+from minisplat_ref.types import Bools, Floats, Ints, Model, TileGrid, View
 
 MARGIN = 0.1
 """Part of the depth of a point within which a Gaussian may belong to the point's surface."""
@@ -36,8 +36,8 @@ class SightLines(NamedTuple):
     """[M] ray of the hit, an index from 0 to R - 1."""
     weights: Floats
     """[M] w, its part of what the ray shows."""
-    is_before: np.ndarray
-    """[M] of bool: whether it is nearer than the point."""
+    is_before: Bools
+    """[M] whether it is nearer than the point."""
     transmittances: Floats
     """[R] T of each ray before its point."""
 
@@ -59,7 +59,7 @@ def trace_sight_lines(model: Model, view: View, points: Floats, settings: Render
         Part of the depth of a point.
     """
     camera, conventions, backend = view.camera, settings.conventions, settings.backend
-    xy, d = _visible_points(view, points)
+    _, xy, d = project_into_image(points[view.point_ids], camera)
     p = backend.project(*activate(model.gaussians), camera, conventions)
     grid = TileGrid(camera.width, camera.height, backend.tile_width, backend.tile_height)
     bins = backend.bin_gaussians(p, grid, conventions)
@@ -79,16 +79,6 @@ def trace_sight_lines(model: Model, view: View, points: Floats, settings: Render
     absorbed = np.bincount(rays, np.where(is_before, np.log1p(-alpha), 0.0), minlength=len(tile))
     is_hit = alpha > 0
     return SightLines(rows[is_hit], rays[is_hit], (alpha * T)[is_hit], is_before[is_hit], np.exp(absorbed))
-
-
-def _visible_points(view: View, points: Floats) -> tuple[Floats, Floats]:
-    """Return pixels [R, 2] and depths [R] of the sparse points of a view that lie in its image."""
-    camera = view.camera
-    seen = points[view.point_ids] @ camera.cam_from_world_R.T + camera.cam_from_world_t  # [Q, 3]
-    seen = seen[seen[:, 2] > 0]
-    xy = pinhole(seen, camera)
-    is_inside = (xy >= 0).all(axis=1) & (xy < (camera.width, camera.height)).all(axis=1)
-    return xy[is_inside], seen[is_inside, 2]
 
 
 def hidden_share(

@@ -1,7 +1,7 @@
 """Plane-sweep stereo (Collins 1996): the depth of each pixel of a small photograph, from its neighbours.
 
-Structure from motion finds points where a photograph has corners; a sweep asks every pixel. For a plane parallel to
-the image at depth d, a neighbour's photograph is warped by the homography of the plane,
+Structure from motion finds points where a photograph has corners; a sweep gives depths between them. For a plane
+parallel to the image at depth d, a neighbour's photograph is warped by the homography of the plane,
 
     x_n ~ K_n (R + t e_z^T / d) K^-1 x        (R, t): neighbour's camera from the photograph's
 
@@ -11,7 +11,7 @@ brightness changes:
     zncc = (E[a b] - E[a] E[b]) / sqrt(Var[a] Var[b])        E, Var over W
 
 The planes are evenly spaced in 1/d. The score of a plane is the mean over the better half of the neighbours, because
-in the others something may stand before it; the depth is that of the best plane, refined by the parabola through it and
+in the others something may hide it; the depth is that of the best plane, refined by the parabola through it and
 the planes beside it. A depth counts where the correlation is high, and where a neighbour's own depth agrees
 (:func:`are_confirmed`). Left out: slanted planes, and any smoothness between pixels.
 """
@@ -22,8 +22,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import map_coordinates, uniform_filter
 
-from minisplat_ref.reference.pinhole import pinhole, pinhole_rays
-from minisplat_ref.types import Bools, Camera, Floats
+from minisplat_ref.reference.pinhole import pinhole_rays, project_into_image
+from minisplat_ref.types import Bools, Camera, Floats, Ints
 
 WINDOW = 5
 """Pixels, side of W."""
@@ -149,19 +149,15 @@ def are_confirmed(view: GrayView, own: DepthMap, others: Sequence[tuple[GrayView
     points = surface_points(view.camera, own.depths, ys, xs)
     is_confirmed = np.zeros(own.depths.shape, bool)
     for other, found in others:
-        camera = other.camera
-        seen = points @ camera.cam_from_world_R.T + camera.cam_from_world_t  # [P, 3]
-        z = seen[:, 2].copy()
-        seen[:, 2] = np.where(z > 0, z, 1.0)
-        columns, rows = np.floor(pinhole(seen, camera)).T
-        is_inside = (z > 0) & (columns >= 0) & (rows >= 0) & (columns < camera.width) & (rows < camera.height)
-        there = found.depths[np.where(is_inside, rows, 0).astype(int), np.where(is_inside, columns, 0).astype(int)]
-        agrees = is_inside & (there > 0) & (np.abs(there - z) < AGREEMENT * z)
+        ids, xy, z = project_into_image(points, other.camera)
+        columns, rows = xy.astype(int).T
+        there = found.depths[rows, columns]
+        agrees = ids[(there > 0) & (np.abs(there - z) < AGREEMENT * z)]
         is_confirmed[ys[agrees], xs[agrees]] = True
     return is_confirmed
 
 
-def surface_points(camera: Camera, depths: Floats, rows: np.ndarray, columns: np.ndarray) -> Floats:
+def surface_points(camera: Camera, depths: Floats, rows: Ints, columns: Ints) -> Floats:
     """Return the points [P, 3], world frame, at the depths of these pixels."""
     in_camera = pinhole_rays(columns + 0.5, rows + 0.5, camera) * depths[rows, columns][:, None]
     return (in_camera - camera.cam_from_world_t) @ camera.cam_from_world_R
@@ -173,7 +169,7 @@ def _moments(gray: Floats) -> tuple[Floats, Floats]:
     return mean, np.maximum(uniform_filter(gray * gray, WINDOW) - mean * mean, 0.0)
 
 
-def _vertex(total: Floats, middle: np.ndarray) -> Floats:
+def _vertex(total: Floats, middle: Ints) -> Floats:
     """Return where the parabola through three neighbouring planes is highest, in planes from the middle one."""
     left, center, right = (np.take_along_axis(total, (middle + k)[None], axis=0)[0] for k in (-1, 0, 1))
     curvature = left - 2 * center + right

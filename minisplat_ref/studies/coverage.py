@@ -14,8 +14,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
-from minisplat_ref.reference.pinhole import pinhole, pinhole_rays
-from minisplat_ref.types import Camera, Floats, Ints, View
+from minisplat_ref.reference.pinhole import pinhole_rays, project_into_image
+from minisplat_ref.types import Floats, Ints, View
 
 POINTS_MIN = 8
 """Sparse points that a photograph needs for an interpolated depth."""
@@ -60,8 +60,7 @@ def interpolate_depths(view: View, points: Floats, xy: Floats) -> Floats | None:
     """Return the depth at pixels (x, y) [..., 2] between the sparse points of a view, [...]; None if it has too few."""
     if view.point_ids is None or len(view.point_ids) < POINTS_MIN:
         return None
-    uv, z = _project(points[view.point_ids], view.camera)
-    uv, z = uv[z > 0], z[z > 0]
+    _, uv, z = project_into_image(points[view.point_ids], view.camera)
     if len(z) < POINTS_MIN:
         return None
     flat = xy.reshape(-1, 2)
@@ -73,19 +72,8 @@ def interpolate_depths(view: View, points: Floats, xy: Floats) -> Floats | None:
 
 def _shows(view: View, surface: Floats, points: Floats) -> Ints:
     """Return for surface points [h, w, 3] whether a view shows them."""
-    camera = view.camera
-    uv, z = _project(surface.reshape(-1, 3), camera)
-    is_inside = (z > 0) & (uv > 0).all(axis=1) & (uv < (camera.width, camera.height)).all(axis=1)
-    here = np.flatnonzero(is_inside)
-    depths = interpolate_depths(view, points, uv[here]) if len(here) else None
-    if depths is not None:
-        is_inside[here] = z[here] < BEHIND * depths
-    return is_inside.reshape(surface.shape[:2]).astype(int)
-
-
-def _project(points: Floats, camera: Camera) -> tuple[Floats, Floats]:
-    """Return pixels [P, 2] and depths [P] of points [P, 3]; pixels of points behind the camera mean nothing."""
-    seen = points @ camera.cam_from_world_R.T + camera.cam_from_world_t  # [P, 3] camera frame
-    z = seen[:, 2].copy()
-    seen[:, 2] = np.where(z > 0, z, 1.0)
-    return pinhole(seen, camera), z
+    here, uv, z = project_into_image(surface.reshape(-1, 3), view.camera)
+    depths = interpolate_depths(view, points, uv) if len(here) else None
+    is_shown = np.zeros(surface.shape[0] * surface.shape[1], int)
+    is_shown[here] = 1 if depths is None else z < BEHIND * depths
+    return is_shown.reshape(surface.shape[:2])

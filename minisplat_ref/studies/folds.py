@@ -13,15 +13,17 @@ scene, and chooses among all recipes as one must: on the other scenes, and repor
 import argparse
 import math
 import time
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from minisplat_ref.errors import InputError
+from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.io.scene import camera_extent
 from minisplat_ref.methods import get_recipe
+from minisplat_ref.methods.adaptive.numbers import TRAIN_VIEWS_MIN
 from minisplat_ref.metrics import ViewMetrics, correct_colors, evaluate, psnr
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.reporting import describe_machine, markdown_table
@@ -34,12 +36,11 @@ from minisplat_ref.studies.figures import standard_error
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.schedule import Recipe, as_trained, configure, parse_settings
 from minisplat_ref.training.state import StepReport
-from minisplat_ref.types import Floats, Ints, Scene, View, number_views
+from minisplat_ref.types import Bools, Floats, Ints, Scene, View, number_views
 
 KNOWN = 2  # training photographs that must show a pixel's surface
 N_MOMENTS = 12  # evaluations of a training of ITERATIONS iterations
 THINNED = 10  # photographs of a thinned scene, about
-TRAIN_VIEWS_MIN = 5  # as adaptive needs
 
 
 class Fold(NamedTuple):
@@ -89,7 +90,7 @@ def make_fold(scene: Scene, views: Sequence[View], n_folds: int, fold: int) -> F
     return Fold(fold_scene, coverage)
 
 
-def known_points(train_views: Sequence[View], n_points: int) -> np.ndarray:
+def known_points(train_views: Sequence[View], n_points: int) -> Bools:
     """Return which sparse points [P] two training photographs have found; all of a scene that has no tracks."""
     if any(view.point_ids is None for view in train_views):
         return np.ones(n_points, bool)
@@ -184,15 +185,17 @@ def run(args: argparse.Namespace) -> kit.Report:
         A scene, a recipe or the output folder cannot be used, or a scene has too few photographs.
     """
     recipes = {text: recipe_of(text) for text in args.recipes}
-    scenes, sources = {}, {}
+    scenes = {}
     for source in args.scenes:
         for thin in {"whole": (False,), "thinned": (True,), "both": (False, True)}[args.photographs]:
             scene = read_small(source, args.long_side)
             name = f"{scene.name}, thinned" if thin else scene.name
             views = all_photographs(scene, thin)
             if len(views) - -(-len(views) // args.folds) < TRAIN_VIEWS_MIN:
+                message = f"{name} is left out: {len(views)} photographs are too few for {args.folds} folds"
+                warnings.warn(one_line(message), InputWarning, stacklevel=2)
                 continue
-            scenes[name], sources[name] = (scene, views), source
+            scenes[name] = scene, views
     if not scenes:
         raise InputError(f"no scene has the photographs for {args.folds} folds; give another --folds")
     jobs = [

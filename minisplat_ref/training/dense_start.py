@@ -18,13 +18,13 @@ from tqdm import tqdm
 
 from minisplat_ref.io.images import resize_image, resize_mask
 from minisplat_ref.io.scene import SILENT_SECONDS, rescale_camera
-from minisplat_ref.reference.pinhole import pinhole
+from minisplat_ref.reference.pinhole import project_into_image
 from minisplat_ref.strategy.line_of_sight import MARGIN
 from minisplat_ref.strategy.plane_sweep import DepthMap, GrayView, are_confirmed, surface_points, sweep_planes
-from minisplat_ref.types import Bools, Camera, Floats, Ints, Scene, View
+from minisplat_ref.types import Bools, Floats, Ints, Scene, View
 
 LONG_SIDE = 144
-"""Pixels, of the small photographs: a sweep takes a tenth of a second or two."""
+"""Pixels, of the small photographs: a sweep takes a quarter of a second."""
 N_PLANES = 48
 """Depths that are compared. No reason recorded."""
 N_NEIGHBOURS = 4
@@ -87,7 +87,7 @@ def densify_points(scene: Scene) -> tuple[Floats, NDArray[np.uint8]]:
         chosen = choose_spread(found, wide, points)
         points, spacings = np.concatenate([points, found[chosen]]), np.concatenate([spacings, wide[chosen]])
         colors = np.concatenate([colors, small.rgb[rows[chosen], columns[chosen]]])
-    stays = ~stand_before(points, views, scene.points) & have_company(points, spacings)
+    stays = ~lie_before(points, views, scene.points) & have_company(points, spacings)
     stays[: len(scene.points)] = True
     return points[stays], colors[stays]
 
@@ -120,8 +120,8 @@ def choose_neighbours(views: Sequence[View], points: Floats) -> list[list[int]]:
     return chosen
 
 
-def stand_before(points: Floats, views: Sequence[View], sparse_points: Floats) -> Bools:
-    """Return which points [P] stand before a sparse point that a view shows beside them, within a small pixel.
+def lie_before(points: Floats, views: Sequence[View], sparse_points: Floats) -> Bools:
+    """Return which points [P] lie before a sparse point that a view shows beside them, within a small pixel.
 
     A photograph that shows a sparse point says that the ray up to it is free
     (:mod:`minisplat_ref.strategy.line_of_sight`); stereo that is deceived by a repeated pattern puts points there.
@@ -132,8 +132,8 @@ def stand_before(points: Floats, views: Sequence[View], sparse_points: Floats) -
             continue
         camera = view.camera
         radius = NEAR_A_RAY * max(1.0, max(camera.width, camera.height) / LONG_SIDE)
-        _, known_xy, known_z = _project(sparse_points[view.point_ids], camera)
-        rows, xy, z = _project(points, camera)
+        _, known_xy, known_z = project_into_image(sparse_points[view.point_ids], camera)
+        rows, xy, z = project_into_image(points, camera)
         if len(known_z) and len(z):
             distances, nearest = cKDTree(known_xy).query(xy, distance_upper_bound=radius)
             is_near = np.isfinite(distances)
@@ -199,7 +199,7 @@ def _shrink(view: View, scene: Scene) -> _Small:
 
 def _depth_range(view: View, scene: Scene) -> tuple[float, float]:
     """Return the nearest and the farthest depth at which a view may show something, world units."""
-    _, _, depths = _project(scene.points[_seen_ids(view, scene.points)], view.camera)
+    _, _, depths = project_into_image(scene.points[_seen_ids(view, scene.points)], view.camera)
     if not len(depths):
         return EXTENT_DEPTHS[0] * scene.extent, EXTENT_DEPTHS[1] * scene.extent
     near, far = np.percentile(depths, (1, 99)) * DEPTH_MARGINS
@@ -210,16 +210,7 @@ def _seen_ids(view: View, points: Floats) -> Ints:
     """Return which sparse points a view shows: those of its track, or all in its image."""
     if view.point_ids is not None and len(view.point_ids) >= POINTS_MIN:
         return view.point_ids
-    return _project(points, view.camera)[0]
-
-
-def _project(points: Floats, camera: Camera) -> tuple[Ints, Floats, Floats]:
-    """Return rows, pixels [Q, 2] and depths [Q] of the points that lie in the image of a camera."""
-    seen = points @ camera.cam_from_world_R.T + camera.cam_from_world_t
-    rows = np.flatnonzero(seen[:, 2] > 0)
-    xy = pinhole(seen[rows], camera)
-    is_inside = (xy >= 0).all(axis=1) & (xy < (camera.width, camera.height)).all(axis=1)
-    return rows[is_inside], xy[is_inside], seen[rows[is_inside], 2]
+    return project_into_image(points, view.camera)[0]
 
 
 def _sweep(small: _Small, others: Sequence[GrayView]) -> DepthMap:

@@ -1,4 +1,4 @@
-"""Lines of sight, worked by hand: two Gaussians on the ray of one sparse point, and what stands before it."""
+"""Lines of sight, worked by hand: two Gaussians on the ray of one sparse point, and what lies before it."""
 
 import numpy as np
 import pytest

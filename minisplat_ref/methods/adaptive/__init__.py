@@ -23,7 +23,7 @@ one half of the photographs, or of each photograph, shows the other half what it
 *Begin densely.* Stereo adds surface points where structure from motion has found few
 (:mod:`minisplat_ref.training.dense_start`).
 
-*Look through.* Gaussians that stand before sparse points which photographs show are removed every 100 iterations.
+*Look through.* Gaussians that lie before sparse points which photographs show are removed every 100 iterations.
 
 *Prune.* While the rates fall, what the photographs would hardly miss is removed in slices.
 

@@ -120,7 +120,7 @@ VEIL_START = 500
 """Iteration before which nothing is removed: until then Gaussians are large and lie on several surfaces."""
 VEIL_VIEWS_MAX, VEIL_RAYS_MAX = 8, 256
 """Training views that are looked at each time, and rays of each, at most, so that this takes a small part of the time:
-a third of a second, every 100 iterations."""
+a quarter of a second, every 100 iterations."""
 
 # --- pruning ---
 

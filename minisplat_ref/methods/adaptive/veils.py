@@ -1,4 +1,4 @@
-"""How ``adaptive`` removes veils: Gaussians that stand before sparse points which photographs show.
+"""How ``adaptive`` removes veils: Gaussians that lie before sparse points which photographs show.
 
 A photograph shows a sparse point, so nothing opaque lies between. A Gaussian may be blended there all the same, because
 it makes that photograph right where its depth does not matter; any other camera sees it as fog. What it costs cannot be
@@ -40,7 +40,7 @@ def remove_veils(
     is_veil = (before > max_share_before * all_) & (before >= min_weight_before)
     if is_veil.any():
         apply_edit(state, keep(state.gaussians, ~is_veil))
-    return f"{np.count_nonzero(is_veil)} stood before sparse points"
+    return f"{np.count_nonzero(is_veil)} lay before sparse points"
 
 
 def weigh_sight_lines(state: TrainState, iteration: Iteration) -> tuple[Floats, Floats]:

@@ -49,7 +49,7 @@ def test_a_veil_goes_and_surfaces_stay():
     np.testing.assert_allclose(before, [0.4, 0, 0, 0], rtol=1e-5)
     np.testing.assert_allclose(all_, [0.4, 0.54, 0.9, 0], rtol=1e-4)
     note = veils.remove_veils(state, iteration, **SETTINGS)
-    assert note == "1 stood before sparse points"
+    assert note == "1 lay before sparse points"
     np.testing.assert_array_equal(state.gaussians.means, model.means[1:])
     assert len(state.adam.first.means) == 3
 
@@ -66,7 +66,7 @@ def test_what_stays(opacity, changes):
 
 
 def test_a_surface_that_covers_two_rays_is_weighed_on_both():
-    """A Gaussian at 4 stands before the point at 5 and behind the one at 3.5: half of its weight is before."""
+    """A Gaussian at 4 lies before the point at 5 and behind the one at 3.5: half of its weight is before."""
     model = gaussians([[0.4, 0, 4.0]], [0.8], scale=2.0)
     points = np.array([[0.0, 0, 5], [0.56, 0, 3.5]])  # both 0.8 from the axis of the Gaussian's image, one on each side
     state, iteration = setting(model)
