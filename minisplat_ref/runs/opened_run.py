@@ -56,7 +56,7 @@ class Fold(NamedTuple):
     """Two parts of the training views, by their numbers."""
 
     trained: list[int]
-    """Those that rank and fine-tune."""
+    """Those that fine-tune."""
     held_out: list[int]
     """Those that measure what comes out."""
 

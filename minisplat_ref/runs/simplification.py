@@ -6,10 +6,10 @@ fields may have no mean, keeps its Gaussians of the largest blend weight instead
 pixels and views (equation 12 of Mini-Splatting).
 
 What a size loses is measured by cross-validation: the *training* views are divided into folds
-(:attr:`..runs.opened_run.Run.folds`), and the views of each fold measure a copy that was merged and fine-tuned without
-them. So every training view counts, and the standard error is as small as the photographs allow. The model that is
-delivered has the same size, and is merged and fine-tuned in the same way by all training views. The test views stay
-sealed until then.
+(:attr:`..runs.opened_run.Run.folds`), and the views of each fold measure a copy that was fine-tuned without them. So
+every training view counts, and the standard error is as small as the photographs allow. The model that is delivered
+begins with the same Gaussians, and is fine-tuned in the same way by all training views. (Weights say nothing about
+photographs, only about cameras.) The test views stay sealed until then.
 
 Fine-tuning alone changes a copy: it may continue to learn, and it forgets what is peculiar to the held-out views, which
 the run was trained on. So the drop of a size is not from the run, but from *all* its Gaussians, fine-tuned alike. Since
@@ -224,9 +224,9 @@ def _shuffled(views: Sequence[int], iterations: int, rng: np.random.Generator) -
     return [int(view) for each in rounds for view in each][:iterations]
 
 
-def blend_weights(run: Run, views: Sequence[View]) -> Floats:
-    """Return the importance [N] of the run's Gaussians: their blend weights, summed over the pixels of the views."""
-    return indoor(collect_importance(run.model, views, run.render_settings))
+def blend_weights(run: Run) -> Floats:
+    """Return the importance [N] of the run's Gaussians: blend weights, summed over the pixels of all training views."""
+    return indoor(collect_importance(run.model, run.scene.train_views, run.render_settings))
 
 
 def metrics_of(run: Run, model: Model, views: Sequence[View]) -> list[ViewMetrics]:
@@ -248,14 +248,14 @@ def measuring(run: Run, iterations: int) -> Callable[[int], Point]:
     InputError
         The views see no Gaussian.
     """
-    size, n, views = ply_size(run), n_rows(run.model.gaussians), run.scene.train_views
-    importances = [blend_weights(run, [views[k] for k in fold.trained]) for fold in run.folds]
-    if not all(importance.any() for importance in importances):
-        raise InputError(f"{run.folder}: training views see no Gaussian: train longer, or check the cameras")
+    size, n = ply_size(run), n_rows(run.model.gaussians)
+    importance = blend_weights(run)
+    if not importance.any():
+        raise InputError(f"{run.folder}: no training view sees any Gaussian: train longer, or check the cameras")
 
     @cache
     def point_of(count: int) -> Point:
-        measured = cross_validate(run, importances, count, iterations)
+        measured = cross_validate(run, reduce(run, importance, count), iterations)
         psnrs, ssims = tuple(view.psnr for view in measured), tuple(view.ssim for view in measured)
         before = psnrs if count == n else point_of(n).psnrs
         return Point(count, size.of(count), psnrs, ssims, *paired_drop(before, psnrs))
@@ -279,8 +279,7 @@ def decide(run: Run, target: Target, point_of: Callable[[int], Point]) -> Decisi
         Not even one Gaussian fits.
     """
     limit = limit_of(target, ply_size(run))
-    n, views = n_rows(run.model.gaussians), run.scene.train_views
-    n_candidates = int(np.count_nonzero(blend_weights(run, views)))
+    n, n_candidates = n_rows(run.model.gaussians), int(np.count_nonzero(blend_weights(run)))
     reference = point_of(n)
     points: list[Point] = []
     chosen: Point | None = None
@@ -295,28 +294,19 @@ def decide(run: Run, target: Target, point_of: Callable[[int], Point]) -> Decisi
         reference,
         tuple(sorted(points, key=lambda point: point.n_gaussians)),
         reference if chosen is None else chosen,
-        float(np.mean([view.psnr for view in metrics_of(run, run.model, views)])),
+        float(np.mean([view.psnr for view in metrics_of(run, run.model, run.scene.train_views)])),
         limit is not None and limit > n_candidates,
     )
 
 
-def cross_validate(run: Run, importances: Sequence[Floats], count: int, iterations: int) -> list[ViewMetrics]:
-    """Return the metrics of every training view, each of a copy that was reduced and fine-tuned without it.
-
-    Parameters
-    ----------
-    run : Run
-    importances : sequence of ndarrays of shape (N,)
-        By the trained views of each fold.
-    count : int
-    iterations : int
-    """
-    views = run.scene.train_views
+def cross_validate(run: Run, gaussians: Any, iterations: int) -> list[ViewMetrics]:
+    """Return the metrics of every training view, each of a copy of the Gaussians that was fine-tuned without it."""
+    views, every_row = run.scene.train_views, np.arange(n_rows(gaussians))
     measured: dict[int, ViewMetrics] = {}
-    with _bar(f"measuring {count:,} Gaussians", len(importances) * iterations) as bar:
-        for fold, importance in zip(run.folds, importances, strict=True):
-            smaller = reduce(run, importance, count)
-            model = fine_tune(run, smaller, iterations, views=fold.trained, on_step=bar.update)
+    with _bar(f"measuring {len(every_row):,} Gaussians", len(run.folds) * iterations) as bar:
+        for fold in run.folds:
+            copy = take(gaussians, every_row)
+            model = fine_tune(run, copy, iterations, views=fold.trained, on_step=bar.update)
             held_out = metrics_of(run, model, [views[k] for k in fold.held_out])
             measured.update(zip(fold.held_out, held_out, strict=True))
     return [measured[k] for k in range(len(views))]
@@ -325,7 +315,7 @@ def cross_validate(run: Run, importances: Sequence[Floats], count: int, iteratio
 def finish(run: Run, n: int, iterations: int) -> Model:
     """Return ``n`` Gaussians in place of the run's, reduced and fine-tuned by all training views."""
     views = run.scene.train_views
-    smaller = reduce(run, blend_weights(run, views), n)
+    smaller = reduce(run, blend_weights(run), n)
     with _bar(f"fine-tuning {n:,} Gaussians", iterations) as bar:
         return fine_tune(run, smaller, iterations, views=range(len(views)), on_step=bar.update)
 

@@ -21,7 +21,7 @@ MARGIN = 1.05  # of the axis of sizes, a factor
 
 CURVE_TEXT = """\
 Each size was reached by {how}, and was fine-tuned. Every training view was held out once: it
-measured a copy that was made and fine-tuned without it. Bars are one standard error of the paired differences between
+measured a copy that was fine-tuned without it. Bars are one standard error of the paired differences between
 these views, so what makes one view harder than another is not in them."""
 MERGED = "merging near neighbours, those of small blend weight first"
 RANKED = "keeping the Gaussians of the largest blend weight"
@@ -30,8 +30,8 @@ Fine-tuning alone changes a copy: it may continue to learn, and it forgets what 
 the run was trained on. The drop is therefore measured against all Gaussians, fine-tuned in the same way. Neither
 forgets everything, and more Gaussians know more, so the drop is rather too large than too small."""
 TEST_TEXT = """\
-Nothing was decided on these views, and neither model was trained on them. All training views had a part in making and
-fine-tuning the new one. Below 0 the drop is a gain."""
+Nothing was decided on these views, and neither model was trained on them. The new one was fine-tuned by all training
+views. Below 0 the drop is a gain."""
 
 
 class Shown(NamedTuple):

@@ -182,17 +182,14 @@ def test_every_training_view_is_held_out_once(run_folder):
 
 
 def test_a_view_is_measured_by_a_copy_that_never_saw_it(run_folder, monkeypatch):
-    """By the views that the loop reports and those that the importance is collected of; the last model has seen all."""
-    run, trained, ranked, measured = open_run(run_folder), [], [], []
+    """By the views that the loop reports; all copies begin with the same Gaussians, and the last sees all views."""
+    run, trained, begun, measured = open_run(run_folder), [], [], []
 
-    def watched_train(*args, on_step, **named):
+    def watched_train(*args, state, on_step, **named):
         seen = set()
         trained.append(seen)
-        return train(*args, on_step=lambda report: (seen.add(report.view.name), on_step(report)), **named)
-
-    def watched_importance(model, views, settings):
-        ranked.append({view.name for view in views})
-        return collect_importance(model, views, settings)
+        begun.append(take(state.gaussians, np.arange(len(state.gaussians.means))))
+        return train(*args, state=state, on_step=lambda report: (seen.add(report.view.name), on_step(report)), **named)
 
     def watched_evaluate(model, views, settings):
         measured.append({view.name for view in views})
@@ -200,18 +197,17 @@ def test_a_view_is_measured_by_a_copy_that_never_saw_it(run_folder, monkeypatch)
 
     names = {view.name for view in run.scene.train_views}
     monkeypatch.setattr(simplification, "train", watched_train)
-    monkeypatch.setattr(simplification, "collect_importance", watched_importance)
     monkeypatch.setattr(simplification, "evaluate", watched_evaluate)
-    point = measuring(run, len(names))(
-        50
-    )  # enough iterations for every view to come up; all Gaussians are measured, too
+    point = measuring(run, len(names))(50)  # enough iterations for every view to come up; all Gaussians come after it
     assert len(trained) == len(measured) == 2 * N_FOLDS
     for seen, held_out in zip(trained, measured, strict=True):
         assert seen == names - held_out
-    assert ranked == [names - held_out for held_out in measured[:N_FOLDS]]
     assert len(point.psnrs) == len(point.ssims) == len(names)
     simplification.finish(run, 50, len(names))
-    assert trained[-1] == ranked[-1] == names
+    assert trained[-1] == names
+    for other in (*begun[1:N_FOLDS], begun[-1]):
+        for ours, theirs in zip(begun[0], other, strict=True):
+            assert_array_equal(ours, theirs)
 
 
 # From end to end ------------------------------------------------------------------------------------------------------
@@ -273,18 +269,10 @@ def test_without_fine_tuning_neighbours_are_merged(run_folder, scene_folder, tmp
     dense, scene = load_ply(run_folder / "point_cloud.ply"), load_scene(scene_folder, test_every=6)
     settings, views = RenderSettings(scene.background), scene.train_views
 
-    def merged(views):
-        return merge_neighbours(dense, collect_importance(dense, views).blend_weight_sum, 60).gaussians
-
-    for ours, theirs in zip(load_ply(tmp_path / "out" / "point_cloud.ply"), merged(views), strict=True):
+    merged = merge_neighbours(dense, collect_importance(dense, views).blend_weight_sum, 60).gaussians
+    for ours, theirs in zip(load_ply(tmp_path / "out" / "point_cloud.ply"), merged, strict=True):
         assert_array_equal(ours, theirs)
-
-    # And what it loses, from the beginning: every third view is measured by what the others have merged.
-    before = [view.psnr for view in evaluate(dense, views, settings).per_view]
-    after = np.zeros(len(views))
-    for first in range(3):
-        others = [view for k, view in enumerate(views) if k % 3 != first]
-        after[first::3] = [view.psnr for view in evaluate(merged(others), views[first::3], settings).per_view]
+    before, after = ([view.psnr for view in evaluate(g, views, settings).per_view] for g in (dense, merged))
     chosen = read(tmp_path / "out" / "result.json")["chosen"]
     assert (chosen["drop"], chosen["standard_error"]) == pytest.approx(paired_drop(before, after), rel=1e-9)
 
