@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 FINE_TUNE = 300  # iterations at each size
 
 DESCRIPTION = """\
-Make a run smaller: merge Gaussians that are near each other, and fine-tune. What
-is lost is measured on every training view, by copies that were fine-tuned
+Make a run smaller: merge Gaussians that are near each other, and fine-tune.
+What is lost is measured on every training view, by copies that were fine-tuned
 without it; the test views are measured once, at the end.
 
   --max-drop dB   the smallest size that loses at most so much PSNR, with one

@@ -48,7 +48,7 @@ from minisplat_ref.training.schedule import Recipe
 from minisplat_ref.training.state import DEGREES, TrainState
 from minisplat_ref.types import Floats, Model, View
 
-DEFAULT_DROP = 0.1  # dB, what may be lost where nothing is asked for: not visible when two renders alternate
+DEFAULT_DROP = 0.1  # dB, what may be lost where nothing is asked for
 
 
 class Target(NamedTuple):
@@ -140,12 +140,9 @@ def limit_of(target: Target, size: PlySize) -> int | None:
 def fine_tuning(recipe: Recipe, iterations: int) -> tuple[Recipe, Pace]:
     """Return the recipe of this many iterations after the schedule's end without events, and how far it has cooled."""
     end = recipe.iterations + iterations
-    rates = (
-        recipe.learning_rates
-        if recipe.cooling
-        else Rates(recipe.rates.at(recipe.iterations, 1.0), recipe.rates.per_extent)
-    )
-    pace = Pace(cooling_from=recipe.iterations, last_step=end)
+    rates, pace = recipe.learning_rates, Pace(cooling_from=recipe.iterations, last_step=end)
+    if recipe.cooling is None:
+        rates = Rates(recipe.rates.at(recipe.iterations, 1.0), recipe.rates.per_extent)
     return recipe._replace(iterations=end, learning_rates=rates, events=()), pace
 
 

@@ -20,9 +20,9 @@ N_TICKS = 8  # sizes along an axis whose numbers do not cover each other
 MARGIN = 1.05  # of the axis of sizes, a factor
 
 CURVE_TEXT = """\
-Each size was reached by {how}, and was fine-tuned. Every training view was held out once: it
-measured a copy that was fine-tuned without it. Bars are one standard error of the paired differences between
-these views, so what makes one view harder than another is not in them."""
+Each size was reached by {how}, and was fine-tuned. Every training
+view was held out once: it measured a copy that was fine-tuned without it. Bars are one standard error of the paired
+differences between these views, so what makes one view harder than another is not in them."""
 MERGED = "merging near neighbours, those of small blend weight first"
 RANKED = "keeping the Gaussians of the largest blend weight"
 REFERENCE_TEXT = """\

@@ -5,7 +5,7 @@
 :data:`ABLATION`            :mod:`.ablation`: what each mechanism of Mini-Splatting is worth
 :data:`CULLING`             :mod:`.culling`: what visibility culling removes, saves and costs
 :data:`SIMPLIFY`            :mod:`.simplify`: sampling, rank and mass, and merging at equal counts
-:data:`MAX_DROP`            :mod:`.max_drop`: what ``simplify --max-drop`` promises, and what test views lose
+:data:`MAX_DROP`            :mod:`..runs.max_drop_study`: what ``simplify --max-drop`` promises, and what it keeps
 :data:`DEPTH`               :mod:`.depth_types`: from which depth Gaussians start again
 :data:`EXPOSURE`            :mod:`.exposures`: exposures that were disturbed, found again
 :data:`POSE`                :mod:`.poses`: poses that were disturbed, found again
@@ -138,7 +138,7 @@ SIMPLIFY = declare(
 MAX_DROP = declare(
     "max-drop",
     "simplify --max-drop: dB that were asked for, dB that are lost",
-    f"{__name__}.max_drop.run",
+    "minisplat_ref.runs.max_drop_study.run",  # which simplifies runs, and so is above this layer
     *_RESUMED_SCENE,
     recipe("adaptive"),
     iterations(3000, "per training, of recipes with a schedule"),
