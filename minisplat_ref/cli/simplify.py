@@ -24,7 +24,7 @@ without it; the test views are measured once, at the end.
                   file, minisplat-ref convert has --max-bytes of its own)
 
 Where every smaller size loses more than --max-drop, the run is as small as it
-gets: a line says so, and NEW holds its Gaussians unchanged. So it usually is
+gets: a line says so, and NEW holds its Gaussians unchanged. So it may be
 after recipe adaptive, which removes by itself what is not worth its place.
 
 NEW is a run folder for render, eval, info and convert, with point_cloud.ply,

@@ -15,7 +15,7 @@ Fine-tuning alone changes a copy: it may continue to learn, and it forgets what 
 the run was trained on. So the drop of a size is not from the run, but from *all* its Gaussians, fine-tuned alike. Since
 neither copy forgets all of it, and the larger one knows more of it, the drop is rather too large than too small.
 
-Where every smaller size loses more than the limit, the run is as small as it gets, and stays as it is. So it usually is
+Where every smaller size loses more than the limit, the run is as small as it gets, and stays as it is. So it may be
 after ``adaptive``, which has removed by itself what is not worth its place.
 
 Fine-tuning has the run's losses, all degrees of the spherical harmonics, no events, and moments of zero. Of a recipe
