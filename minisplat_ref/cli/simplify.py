@@ -13,20 +13,24 @@ if TYPE_CHECKING:
 FINE_TUNE = 300  # iterations at each size
 
 DESCRIPTION = """\
-Make a run smaller: keep its most important Gaussians, fine-tune them, and
-measure at about ten sizes what is lost. Some training views are held out to
-decide by; the test views are measured once, at the end.
+Make a run smaller: merge Gaussians that are near each other, and fine-tune.
+What is lost is measured on every training view, by copies that were fine-tuned
+without it; the test views are measured once, at the end.
 
   --max-drop dB   the smallest size that loses at most so much PSNR, with one
-                  standard error on top
-  --budget N      at most this many Gaussians
+                  standard error on top; 0.1 where no option is given
+  --budget N      at most this many Gaussians, whatever is lost
   --max-bytes B   as many as a PLY of at most B bytes holds (for a compact
                   file, minisplat-ref convert has --max-bytes of its own)
-  none of these   the knee of the curve
+
+Where every smaller size loses more than --max-drop, the run is as small as it
+gets: a line says so, and NEW holds its Gaussians unchanged. So it may be
+after recipe adaptive, which removes by itself what is not worth its place.
 
 NEW is a run folder for render, eval, info and convert, with point_cloud.ply,
 metrics.json, result.json (curve and decision), figure.png and report.html.
-It takes as long as about 13 times --fine-tune iterations of training.
+Each size takes as long as 3 times --fine-tune iterations of training, and the
+search measures some 4 to 10 sizes.
 """
 EPILOG = """\
 example:
@@ -45,7 +49,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("folder", type=Path, metavar="RUN", help="the --out folder of a training")
     parser.add_argument("--out", type=Path, required=True, metavar="NEW", help="new folder for the smaller model")
     target = parser.add_mutually_exclusive_group()
-    target.add_argument("--max-drop", type=decibels, metavar="dB", help="PSNR that may be lost")
+    target.add_argument("--max-drop", type=decibels, metavar="dB", help="PSNR that may be lost (default 0.1)")
     target.add_argument("--budget", type=integer(1), metavar="N", help="Gaussians that may stay")
     target.add_argument("--max-bytes", type=integer(1), metavar="B", help="size that the PLY may have")
     fine_tune = f"iterations at each size (default {FINE_TUNE})"
@@ -55,7 +59,7 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simplify, print the table and what became of the test views."""
+    """Simplify, print the table, what was decided and what became of the test views."""
     from minisplat_ref.runs.first_use import compile_kernels
     from minisplat_ref.runs.settings import load
     from minisplat_ref.runs.simplification import Target
@@ -76,13 +80,17 @@ def simplify(asked: "Asked") -> None:
         See :func:`minisplat_ref.runs.simplified_run.simplify_run`.
     """
     from minisplat_ref.reporting import markdown_table
-    from minisplat_ref.runs.simplification_report import TABLE_HEADING, describe_outcome, table_rows
+    from minisplat_ref.runs.simplification_report import (
+        TABLE_HEADING,
+        describe_decision,
+        describe_outcome,
+        table_rows,
+    )
     from minisplat_ref.runs.simplified_run import simplify_run
 
     result = simplify_run(asked)
     print(markdown_table(TABLE_HEADING, table_rows(result)))
-    n_held = len(result["held_out"])
-    print(f"measured on {n_held} of {result['train_views']} training views, held out from ranking and fine-tuning")
+    print(describe_decision(result))
     if result["is_all_that_matter"]:
         n = result["chosen"]["n_gaussians"]
         print(f"minisplat-ref: {asked.target} is more than all {n:,} Gaussians that matter", file=sys.stderr)

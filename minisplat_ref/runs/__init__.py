@@ -15,9 +15,9 @@ Afterwards
     without, but should be told of).
 
 A smaller model: what ``simplify`` does
-    :mod:`.opened_run` (what is read of the run, and the views that decide), :mod:`.rate_distortion` (drop, standard
-    error, rule and knee, by which a size is chosen), :mod:`.simplification` (sizes ranked, fine-tuned and measured),
-    :mod:`.simplified_run` (the new folder).
+    :mod:`.opened_run` (what is read of the run, and its folds of views), :mod:`.rate_distortion` (drop, standard error,
+    and the search for a size by them), :mod:`.simplification` (sizes reached, fine-tuned and measured),
+    :mod:`.simplified_run` (the new folder), :mod:`.max_drop_study` (``study max-drop``: what is promised and kept).
 
 Its reports
     :mod:`.run_report`, :mod:`.demo_report`, :mod:`.simplification_report`, of :mod:`.report_parts`, :mod:`.fired`

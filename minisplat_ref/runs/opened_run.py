@@ -1,7 +1,4 @@
-"""A run opened to be simplified: its model, recipe and photographs, and the training views that decide.
-
-These are every eighth (:func:`minisplat_ref.training.pace.held_out_ids`), as for recipe ``adaptive``.
-"""
+"""A run opened to be simplified: its model, recipe and photographs, and the folds by which its sizes are measured."""
 
 import warnings
 from pathlib import Path
@@ -16,12 +13,11 @@ from minisplat_ref.runs import fingerprint, run_folder
 from minisplat_ref.runs.checkpoints import newest_model
 from minisplat_ref.runs.settings import Settings, load, load_photographs, recipe_of
 from minisplat_ref.strategy.ops import n_rows
-from minisplat_ref.training.pace import held_out_ids
 from minisplat_ref.training.schedule import Recipe, as_trained
-from minisplat_ref.types import Model, Scene, View, number_views
+from minisplat_ref.types import Model, Scene, number_views
 
-HOLD_OUT_EVERY = 8  # training views of which one decides
-VIEWS_MIN = 4  # training views: two that are trained on, and two for a standard error
+N_FOLDS = 3  # parts of the training views, each of which is held out once
+VIEWS_MIN = 4  # training views: at least two are trained on while the others are held out
 
 
 class Run(NamedTuple):
@@ -48,16 +44,21 @@ class Run(NamedTuple):
         return RenderSettings(self.scene.background, conventions, backend, self.recipe.renderer)
 
     @property
-    def held_out(self) -> list[View]:
-        """The training views that decide."""
-        views = self.scene.train_views
-        return [views[k] for k in held_out_ids(len(views), HOLD_OUT_EVERY)]
+    def folds(self) -> "list[Fold]":
+        """The training views, divided so that each is held out in one fold, and each fold spreads over the scene."""
+        ids = range(len(self.scene.train_views))
+        return [
+            Fold([k for k in ids if k % N_FOLDS != f], [k for k in ids if k % N_FOLDS == f]) for f in range(N_FOLDS)
+        ]
 
-    @property
-    def others(self) -> list[View]:
-        """The training views that do not decide."""
-        held = set(held_out_ids(len(self.scene.train_views), HOLD_OUT_EVERY))
-        return [view for k, view in enumerate(self.scene.train_views) if k not in held]
+
+class Fold(NamedTuple):
+    """Two parts of the training views, by their numbers."""
+
+    trained: list[int]
+    """Those that fine-tune."""
+    held_out: list[int]
+    """Those that measure what comes out."""
 
 
 def open_run(folder: Path, scene: Path | None = None) -> Run:
@@ -109,8 +110,8 @@ def check_views(scene: Scene, what: str) -> None:
     n_views = len(scene.train_views)
     if n_views < VIEWS_MIN:
         raise InputError(
-            f"{what} needs at least {VIEWS_MIN} training views, two of them to decide by, and scene {scene.name} has"
-            f" {n_views}: train with more photographs"
+            f"{what} needs at least {VIEWS_MIN} training views, some of which are held out in turn to measure what is"
+            f" lost, and scene {scene.name} has {n_views}: train with more photographs"
         )
 
 

@@ -1,13 +1,15 @@
-"""How small a model may be: the drop of each size with its standard error, the rule that chooses one, and the knee.
+"""How small a model may be: the drop of each size with its standard error, and the search for the smallest.
 
 A *size* is a number of Gaussians. The same V photographs are measured before and after, so the drop is a mean of paired
 differences d_v = PSNR_v(before) - PSNR_v(after), in which what makes one photograph harder than another cancels::
 
     drop = mean of d_v,   standard error = sqrt(sum (d_v - drop)^2 / (V - 1) / V)
 
-The knee is that of Kneedle (Satopaa et al. 2011): both axes go from 0 to 1, and the knee is where the curve lies
-highest above its chord. The count is taken as a logarithm. Left out: Kneedle's smoothing and its threshold, for which
-ten points are too few. The knee depends on where the curve begins and ends, so it decides only if nothing else does.
+A size is within a limit if its drop plus one standard error is. The search goes down from all Gaussians by factors of
+sqrt(2) to the first size that is not within the limit, and then halves, on a logarithmic scale, what lies between.
+
+There is no knee. Where the PSNR falls evenly with the logarithm of the count, as it does once a training has removed
+what it does not need, a knee lies wherever the measured sizes happen to begin and end, and may cost many dB.
 """
 
 from collections.abc import Sequence
@@ -15,11 +17,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from minisplat_ref.errors import InputError
 from minisplat_ref.runs.progress import PSNR_MAX
 
-N_SIZES = 8
-SIZES_PER_HALVING = 2  # so that the smallest is 1 / 16 of all
+STEP = 2**0.5  # ratio of neighbouring sizes while all are within the limit
+CLOSE = 1.1  # ratio of the smallest size within the limit to the next smaller one, at which the search ends
 
 
 class Point(NamedTuple):
@@ -30,6 +31,8 @@ class Point(NamedTuple):
     """Of the PLY."""
     psnrs: tuple[float, ...]
     """dB, of each view."""
+    ssims: tuple[float, ...]
+    """Of each view."""
     drop: float
     """dB, mean over the views; 0 for all Gaussians."""
     standard_error: float
@@ -39,6 +42,11 @@ class Point(NamedTuple):
     def psnr(self) -> float:
         """Mean of the views, dB."""
         return float(np.mean(self.psnrs))
+
+    @property
+    def ssim(self) -> float:
+        """Mean of the views."""
+        return float(np.mean(self.ssims))
 
     @property
     def worst(self) -> float:
@@ -85,80 +93,32 @@ def paired_drop(before: Sequence[float], after: Sequence[float]) -> tuple[float,
     return float(d.mean()), float(np.sqrt(np.sum((d - d.mean()) ** 2) / (V - 1) / V))
 
 
-def sizes(n: int, n_candidates: int, *further: int) -> list[int]:
-    """Return the numbers of Gaussians to measure, ascending: a geometric series below ``n``, and ``further`` ones.
+def next_size(points: Sequence[Point], n: int, n_candidates: int, max_drop: float) -> int | None:
+    """Return the size to measure next, on the way to the smallest one within a limit; None where it has been found.
 
     Parameters
     ----------
+    points : sequence of Point
+        The sizes that have been measured, smaller than ``n``, in any order.
     n : int
-        Gaussians that there are.
+        All Gaussians, which lose nothing.
     n_candidates : int
         Those of any importance, at most ``n``: no size is larger.
-    *further : int
-        At least 1 each.
-    """
-    series = (round(n * 2 ** (-k / SIZES_PER_HALVING)) for k in range(1, N_SIZES + 1))
-    return sorted({min(max(1, size), n_candidates) for size in (*series, *further)})
-
-
-def between(points: Sequence[Point], reference: Point, max_drop: float) -> int | None:
-    """Return a size that tells more of where the limit lies: the geometric mean of two neighbours, one on either side.
-
-    Parameters
-    ----------
-    points : sequence of Point
-        Smaller than ``reference``.
-    reference : Point
-        All Gaussians, which lose nothing.
     max_drop : float
         dB, for the drop plus one standard error.
-
-    Returns
-    -------
-    n_gaussians : int or None
-        Between the smallest size within the limit and the next smaller one; None where there is none or no number lies
-        between them.
     """
-    upper = min(p.n_gaussians for p in (*points, reference) if p is reference or p.worst <= max_drop)
-    lower = max((p.n_gaussians for p in points if p.n_gaussians < upper), default=upper)
-    middle = round((lower * upper) ** 0.5)
-    return middle if lower < middle < upper else None
+    upper = min((point.n_gaussians for point in points if point.worst <= max_drop), default=n)
+    lower = max((point.n_gaussians for point in points if point.n_gaussians < upper), default=None)
+    if lower is None:
+        size = min(round(upper / STEP), n_candidates)
+    elif upper <= CLOSE * lower:
+        return None
+    else:
+        size = round((lower * upper) ** 0.5)
+    return size if (lower or 0) < size < upper and size <= n_candidates else None
 
 
-def smallest_within(points: Sequence[Point], max_drop: float) -> Point:
-    """Return the smallest size whose drop, plus one standard error, is at most ``max_drop`` dB.
-
-    Raises
-    ------
-    InputError
-        There is none.
-    """
-    within = [point for point in points if point.worst <= max_drop]
-    if not within:
-        best = min(points, key=lambda point: point.worst)
-        raise InputError(
-            f"no smaller model loses at most {max_drop:g} dB: {best.n_gaussians:,} Gaussians come nearest with"
-            f" {best.drop:.3f} +- {best.standard_error:.3f} dB on {len(best.psnrs)} held-out training views; allow"
-            " more, or a longer --fine-tune"
-        )
-    return min(within, key=lambda point: point.n_gaussians)
-
-
-def knee(points: Sequence[Point]) -> Point:
-    """Return the size where the PSNR over the logarithm of the count lies highest above its chord.
-
-    Parameters
-    ----------
-    points : sequence of Point
-        Of different sizes; of equals the smallest counts.
-    """
-    points = sorted(points, key=lambda point: point.n_gaussians)
-    x = _unit(np.log([point.n_gaussians for point in points]))
-    y = _unit(np.minimum([point.psnr for point in points], PSNR_MAX))
-    return points[int(np.argmax(y - x))]
-
-
-def _unit(values: np.ndarray) -> np.ndarray:
-    """Return values moved to [0, 1]; zeros where all are equal."""
-    span = np.ptp(values)
-    return (values - values.min()) / span if span > 0 else np.zeros_like(values)
+def smallest_within(points: Sequence[Point], max_drop: float) -> Point | None:
+    """Return the smallest size whose drop, plus one standard error, is at most ``max_drop`` dB; None if none is."""
+    within = (point for point in points if point.worst <= max_drop)
+    return min(within, key=lambda point: point.n_gaussians, default=None)

@@ -182,7 +182,11 @@ def _next_steps(folder: Path) -> list[str]:
     steps = [
         ("Walk around the scene:", command("render", folder, "--cameras", "orbit")),
         ("Measure it again, or with LPIPS:", command("eval", folder)),
-        ("Make it smaller, at the price of at most 0.1 dB:", command("simplify", folder, "--max-drop", "0.1")),
+        ("Make it smaller, if that costs at most 0.1 dB:", _simplify(folder)),
         ("Pack it for a viewer on the web:", command("convert", folder, folder.parent / f"{folder.name}.spz")),
     ]
     return [part for text, line in steps for part in (paragraph(text), code(line))]
+
+
+def _simplify(folder: Path) -> str:
+    return command("simplify", folder, "--out", folder.parent / f"{folder.name}-small", "--max-drop", "0.1")

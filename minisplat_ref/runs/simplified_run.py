@@ -17,7 +17,7 @@ from minisplat_ref.runs.opened_run import Run, open_run
 from minisplat_ref.runs.rate_distortion import Point, paired_drop
 from minisplat_ref.runs.scoring import measure, score, to_metrics
 from minisplat_ref.runs.settings import save_model
-from minisplat_ref.runs.simplification import Decision, Target, decide, finish
+from minisplat_ref.runs.simplification import Decision, Target, decide, finish, is_merged, measuring
 from minisplat_ref.runs.simplification_report import Shown, draw, report_html
 from minisplat_ref.types import Floats, Model, View
 
@@ -38,7 +38,7 @@ class Asked(NamedTuple):
 
 
 def simplify_run(asked: Asked) -> dict[str, Any]:
-    """Simplify a run into a new folder.
+    """Simplify a run into a new folder; where it is as small as it gets, that holds the run's own model.
 
     Returns
     -------
@@ -48,17 +48,17 @@ def simplify_run(asked: Asked) -> dict[str, Any]:
     Raises
     ------
     InputError
-        The run, its photographs or the folder cannot be used, or the target cannot be met; there is no folder then.
+        The run, its photographs or the folder cannot be used, or not even one Gaussian fits; there is no folder then.
     """
     with making_folder(asked.out) as folder:
         run = open_run(asked.run, asked.scene)
-        decision = decide(run, asked.target, asked.fine_tune)
-        all_alike = finish(run, decision.reference.n_gaussians, asked.fine_tune)
-        model = finish(run, decision.chosen.n_gaussians, asked.fine_tune)
+        decision = decide(run, asked.target, measuring(run, asked.fine_tune))
+        is_unchanged, n = decision.is_unchanged, decision.chosen.n_gaussians
+        model = run.model if is_unchanged else finish(run, n, asked.fine_tune)
         save_model(folder, run.settings, model)
-        before, alike = (measure(run.scene, each, run.settings) for each in (run.model, all_alike))
         after = score(folder, run.scene, model, run.settings)
-        result = {**to_result(run, asked, decision), "test": of_test_views(before, alike, after)}
+        before = after if is_unchanged else measure(run.scene, run.model, run.settings)
+        result = {**to_result(run, asked, decision), "test": of_test_views(before, after)}
         _write_run(folder, run, result, after)
         run_folder.write_json(folder / RESULT, result)
         save_png(draw(result), folder / FIGURE)
@@ -97,47 +97,47 @@ def to_result(run: Run, asked: Asked, decision: Decision) -> dict[str, Any]:
         "iterations": run.step,
         "target": str(asked.target),
         **asked.target._asdict(),
+        "max_drop": asked.target.limit,
+        "is_merged": is_merged(run),
         "fine_tune": asked.fine_tune,
-        "train_views": len(run.scene.train_views),
-        "held_out": [view.name for view in run.held_out],
+        "folds": len(run.folds),
+        "views": [view.name for view in run.scene.train_views],
         "run_psnr": decision.run_psnr,
         "all": _of_point(decision.reference),
         "curve": [_of_point(point) for point in decision.points],
         "chosen": _of_point(decision.chosen),
-        "knee": _of_point(decision.knee),
+        "is_unchanged": decision.is_unchanged,
         "is_all_that_matter": decision.is_all_that_matter,
     }
 
 
 def _of_point(point: Point) -> dict[str, Any]:
-    return {**point._asdict(), "psnrs": list(point.psnrs), "psnr": point.psnr}
+    values = {**point._asdict(), "psnrs": list(point.psnrs), "ssims": list(point.ssims)}
+    return {**values, "psnr": point.psnr, "ssim": point.ssim}
 
 
-def of_test_views(before: Evaluation, alike: Evaluation, after: Evaluation) -> dict[str, Any] | None:
+def of_test_views(before: Evaluation, after: Evaluation) -> dict[str, Any] | None:
     """Return what became of the test views, as JSON holds it.
 
     Parameters
     ----------
     before : Evaluation
         Of the run.
-    alike : Evaluation
-        Of all its Gaussians, fine-tuned like those that are left.
     after : Evaluation
-        Of those that are left.
+        Of the new model.
 
     Returns
     -------
     test : dict or None
-        PSNR of the three in dB; ``drop`` from the second to the third, with its standard error, which one view does not
+        PSNR of both in dB; ``drop`` from the first to the second, with its standard error, which one view does not
         have; None without test views.
     """
     if before.psnr is None:
         return None
-    drop, standard_error = paired_drop(*([view.psnr for view in e.per_view] for e in (alike, after)))
+    drop, standard_error = paired_drop(*([view.psnr for view in e.per_view] for e in (before, after)))
     return {
         "views": [view.name for view in before.per_view],
         "psnr_before": before.psnr,
-        "psnr_alike": alike.psnr,
         "psnr_after": after.psnr,
         "ssim_before": before.ssim,
         "ssim_after": after.ssim,
@@ -156,13 +156,24 @@ def _write_run(folder: Path, run: Run, result: dict[str, Any], after: Evaluation
         shutil.copyfile(run.folder / run_folder.CAMERAS, folder / run_folder.CAMERAS)
     else:
         run_folder.write_json(folder / run_folder.CAMERAS, fingerprint.of_scene(run.scene))
-    test = result["test"] or {}
+    test, lost = result["test"] or {}, _lost(result)
     metrics = {
         "n_gaussians": result["chosen"]["n_gaussians"],
         "n_gaussians_before": result["all"]["n_gaussians"],
         "iterations": result["iterations"],
         "fine_tune": result["fine_tune"],
+        **lost,
         **{name: test[name] for name in ("psnr_before", "ssim_before") if name in test},
         **to_metrics(after),
     }
     run_folder.write_json(folder / run_folder.METRICS, metrics)
+
+
+def _lost(result: dict[str, Any]) -> dict[str, Any]:
+    """Return what the chosen size loses on held-out training views, as ``metrics.json`` holds it."""
+    chosen = result["chosen"]
+    return {
+        "drop": chosen["drop"],
+        "drop_standard_error": chosen["standard_error"],
+        "ssim_drop": result["all"]["ssim"] - chosen["ssim"],
+    }

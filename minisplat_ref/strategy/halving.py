@@ -20,6 +20,7 @@ from minisplat_ref.strategy.ops import Edit, concat, take
 from minisplat_ref.types import Floats, Gaussians, Ints
 
 OFFSET = 0.5  # standard deviations from the old centre to the new ones
+LINEAR_BELOW = -40.0  # logits at which an opacity is its own optical depth, in float64; below -745 it would become 0
 
 
 def halves(gaussians: Gaussians, parent_ids: Ints, *, offset: float = OFFSET) -> Edit:
@@ -71,6 +72,8 @@ def thin_logits(opacity_logits: Floats, factor: float) -> Floats:
     ndarray
         Same shape and dtype.
     """
+    logits = opacity_logits.astype(np.float64)
     # ln(1 - o) from the logit: 1 - o has no digits left where o is near 1.
-    log_transparencies = -np.logaddexp(0.0, opacity_logits.astype(np.float64)) * factor
-    return (np.log(-np.expm1(log_transparencies)) - log_transparencies).astype(opacity_logits.dtype)
+    log_transparencies = -np.logaddexp(0.0, np.maximum(logits, LINEAR_BELOW)) * factor
+    thinned = np.log(-np.expm1(log_transparencies)) - log_transparencies
+    return np.where(logits < LINEAR_BELOW, logits + math.log(factor), thinned).astype(opacity_logits.dtype)

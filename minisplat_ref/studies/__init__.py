@@ -6,6 +6,7 @@
 :data:`ABLATION`            :mod:`.ablation`: what each mechanism of Mini-Splatting is worth
 :data:`CULLING`             :mod:`.culling`: what visibility culling removes, saves and costs
 :data:`SIMPLIFY`            :mod:`.simplify`: sampling, rank and mass, and merging at equal counts
+:data:`MAX_DROP`            :mod:`..runs.max_drop_study`: what ``simplify --max-drop`` promises, and what it keeps
 :data:`DEPTH`               :mod:`.depth_types`: from which depth Gaussians start again
 :data:`EXPOSURE`            :mod:`.exposures`: exposures that were disturbed, found again
 :data:`POSE`                :mod:`.poses`: poses that were disturbed, found again
@@ -18,7 +19,7 @@ imported when a study runs. :mod:`.study`, :mod:`.kit` and :mod:`.figures` have 
 extensions, and :mod:`.conditions` how they disturb a scene.
 """
 
-from minisplat_ref.arguments import SYNTHETIC_SCENES, fraction, list_of, name
+from minisplat_ref.arguments import SYNTHETIC_SCENES, decibels, fraction, list_of, name
 from minisplat_ref.studies.study import (
     CONTINUES,
     OUT,
@@ -42,6 +43,7 @@ CONDITION_HELP = (
     "whole, few (every fifth photograph), gains (wrong exposures), few-gains (both), poses (wrong cameras),"
     " sizes (every second at half the size), sky (synthetic scenes, cut off)"
 )
+_CONDITION = argument("--condition", type=name, default="whole", metavar="C", help=f"{CONDITION_HELP} (default whole)")
 _RESUMED_SCENE = (SCENE, RESUMED_OUT, downscale())
 _SYNTHETIC_SCENE = argument("scene", metavar="SCENE", help=f"a synthetic scene: {', '.join(SYNTHETIC_SCENES)}")
 _CALIBRATION = (
@@ -56,7 +58,7 @@ _CALIBRATION = (
 
 def all_studies() -> dict[str, Study]:
     """Return the studies of this package by the name that users type; an extension's are EXTENSION/NAME."""
-    studies = (ADAPTIVE, FOLDS, ABLATION, CULLING, SIMPLIFY, DEPTH, EXPOSURE, POSE, DEFECTS, PRECISION)
+    studies = (ADAPTIVE, FOLDS, ABLATION, CULLING, SIMPLIFY, MAX_DROP, DEPTH, EXPOSURE, POSE, DEFECTS, PRECISION)
     return {each.name: each for each in studies}
 
 
@@ -121,7 +123,7 @@ ABLATION = declare(
     iterations(6000),
     recipe("mini-splatting2"),
     argument("--deviations", action="store_true", help="take back what deviates from the published method instead"),
-    argument("--condition", type=name, default="whole", metavar="C", help=f"{CONDITION_HELP} (default whole)"),
+    _CONDITION,
     SEEDS,
     description=f"Train a scene by a recipe, and by the recipe without each of its mechanisms. {CONTINUES}",
 )
@@ -159,6 +161,25 @@ SIMPLIFY = declare(
     argument("--restart", action="store_true", help="fine-tune from centres and colours alone, as mini-splatting does"),
     SEEDS,
     description="Simplify a dense population in several ways to equal numbers, and fine-tune what is left.",
+)
+MAX_DROP = declare(
+    "max-drop",
+    "simplify --max-drop: dB that were asked for, dB that are lost",
+    "minisplat_ref.runs.max_drop_study.run",  # which simplifies runs, and so is above this layer
+    *_RESUMED_SCENE,
+    recipe("adaptive"),
+    iterations(3000, "per training, of recipes with a schedule"),
+    argument(
+        "--limits",
+        type=list_of(decibels),
+        default=(0.1, 0.5, 1.0),
+        metavar="L,M",
+        help="of --max-drop, dB (default 0.1,0.5,1)",
+    ),
+    fine_tune(300),
+    _CONDITION,
+    SEEDS,
+    description=f"Train a scene, simplify to each limit, and measure what test views lose. {CONTINUES}",
 )
 DEPTH = declare(
     "depth",

@@ -86,6 +86,13 @@ def test_logits_of_any_size(dtype):
     assert_allclose(thin_logits(logits, 1.0), logits, rtol=1e-6, atol=1e-6)
 
 
+def test_logits_whose_opacity_is_no_number_above_0():
+    """Below -745 the opacity underflows in float64; its logarithm does not. Above and below -40 the formulas agree."""
+    logits = np.array([-1e4, -800.0, -745.2, -40.000001, -39.999999])
+    assert_allclose(thin_logits(logits, 0.5), logits - np.log(2), rtol=1e-14)
+    assert_allclose(thin_logits(logits, 3.0), logits + np.log(3), rtol=1e-14)
+
+
 def test_the_image_hardly_changes(rng):
     """Unlike that of a plain clone, which is more opaque; the rest is the mixture's flatter top."""
     gaussians, camera = make_gaussians(rng, 1, size=0.3), make_camera()

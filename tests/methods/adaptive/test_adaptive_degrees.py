@@ -23,6 +23,7 @@ from minisplat_ref.methods.adaptive.recipe import ADAPTIVE
 from minisplat_ref.reference.spherical_harmonics import sh_colors
 from minisplat_ref.rendering import RenderSettings, render
 from minisplat_ref.runs.simplification import fine_tune
+from minisplat_ref.strategy.ops import take
 from minisplat_ref.training.loop import train
 from minisplat_ref.training.pace import Pace, held_out_ids
 from minisplat_ref.training.rates import present_degrees
@@ -209,8 +210,8 @@ def test_fine_tuning_leaves_absent_bands_absent(matt, trained):
         scene=scene,
         render_settings=RenderSettings(),
     )
-    rows = np.arange(len(degrees))
-    tuned = fine_tune(run, rows, 5, holds_out=False, on_step=lambda: None).gaussians.sh_rest
+    gaussians = take(run.model.gaussians, np.arange(len(degrees)))
+    tuned = fine_tune(run, gaussians, 5, views=range(3), on_step=lambda: None).gaussians.sh_rest
     assert_array_equal(present_degrees(tuned), degrees)
     assert (tuned != trained[1].gaussians.sh_rest)[degrees > 1][:, 3:].any()
 
