@@ -35,6 +35,7 @@ DEFAULTS = {
     "downscale": 1,
     "test_every": 8,
     "undistort": False,
+    "model": None,
     "recipe": "adaptive",
     "iterations": None,
     "budget": None,
@@ -96,6 +97,9 @@ def add_parser(commands: Commands) -> None:
         "--background", type=color, metavar="R,G,B", help="behind the scene (default 0,0,0; white 255,255,255)"
     )
     data.add_argument("--undistort", action="store_true", help="remove lens distortion instead of refusing it")
+    data.add_argument(
+        "--model", metavar="FOLDER", help="which COLMAP model, relative to SCENE (default sparse/0 or sparse)"
+    )
 
     training = parser.add_argument_group("training")
     training.add_argument(
@@ -186,7 +190,7 @@ def _start(given: dict[str, Any]) -> int:
 
     from minisplat_ref.runs import curve, run_folder
     from minisplat_ref.runs.first_use import compile_kernels
-    from minisplat_ref.runs.notices import warn_of_scene
+    from minisplat_ref.runs.notices import report_inventory, warn_of_scene
     from minisplat_ref.runs.proposed_size import propose
     from minisplat_ref.runs.settings import Settings, load_lpips, load_photographs, recipe_of
 
@@ -204,6 +208,7 @@ def _start(given: dict[str, Any]) -> int:
     compile_kernels(settings.backend)
     run_folder.create(folder)
     warn_of_scene(scene, settings.downscale)
+    report_inventory(Path(settings.scene), scene, settings.model)
     proposal = None if "downscale" in given else propose(scene, state, recipe, settings)
     if proposal is not None:
         print(f"minisplat-ref: {proposal}", file=sys.stderr)
@@ -300,7 +305,7 @@ def _resume(folder: Path, given: dict[str, Any]) -> int:
         if "rescale" in given:
             ours = ours._replace(schedule_iterations=ours.iterations)
         recipe = settings.recipe_of(ours)
-        scene = settings.load_photographs(ours)
+        scene = settings.load_photographs(ours, settings.load_frame(folder))
         fingerprint.check(folder, scene, ours.scene)
         network = settings.load_lpips(ours, scene)
         state = _first_state(ours, scene, recipe) if state is None else state
@@ -344,7 +349,7 @@ def _train(
     room: str,
 ) -> int:
     from minisplat_ref.runs import checkpoints, run_folder
-    from minisplat_ref.runs.notices import describe_sizes
+    from minisplat_ref.runs.notices import describe_place, describe_sizes
     from minisplat_ref.runs.run import run_training
     from minisplat_ref.runs.scoring import summary
     from minisplat_ref.training.guard import Guard
@@ -354,6 +359,8 @@ def _train(
         f"{scene.name}: {len(scene.train_views)} training and {len(scene.test_views)} test views of"
         f" {describe_sizes([(view.camera.width, view.camera.height) for view in views])}, {len(scene.points):,} points"
     )
+    if place := describe_place(scene):
+        print(place)
     if room:
         print(room)
     check_every = given.get("check_every", Guard().every)

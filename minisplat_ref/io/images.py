@@ -31,6 +31,7 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 """Files that count as photographs."""
 
 SAVE_OPTIONS: dict[str, dict[str, Any]] = {"JPEG": {"quality": 95, "subsampling": 0}}
+SOURCE = "minisplat_ref source"  # key of an opened image's path among its data, for messages on its values
 SIXTEEN_BIT_FORMATS = ("PNG", "PPM")  # whose 16-bit images some versions of Pillow keep in 32 bits
 HALF_LEVEL = 0.5 / 255.0  # by which a float may be outside 0 to 1: it rounds to black or white all the same
 PIXELS_MAX = 2**29  # per image: more than cameras have, and 1.6 GB in memory
@@ -63,6 +64,7 @@ def open_image(path: Path) -> Iterator[Image.Image]:
                         f"{path}: {image.width} x {image.height} pixels cannot be in {file.n_bytes} bytes; copy or"
                         " export the file again"
                     )
+                image.info[SOURCE] = str(path)
                 yield image
     except InputError:
         raise
@@ -124,7 +126,7 @@ def has_transparency(path: str | Path) -> bool:
         return image.has_transparency_data
 
 
-def white_of(path: Path, image: Image.Image) -> float:
+def white_of(image: Image.Image) -> float:
     """Return the value that is white in an open image file.
 
     Raises
@@ -139,8 +141,8 @@ def white_of(path: Path, image: Image.Image) -> float:
     if image.mode == "I":
         low, high = image.getextrema()
         raise InputError(
-            f"{path}: integers of 32 bits, from {low} to {high}, do not say which value is white; export the image with"
-            " 8 or 16 bits a channel"
+            f"{image.info[SOURCE]}: integers of 32 bits, from {low} to {high}, do not say which value is white; export"
+            " the image with 8 or 16 bits a channel"
         )
     return 255.0
 
@@ -164,23 +166,26 @@ def read_image(path: str | Path) -> NDArray[np.uint8]:
     InputError
         If the file is missing, is not an image, is truncated, or does not say which value is white.
     """
-    path = Path(path)
-    with open_image(path) as image:
-        white = white_of(path, image)
-        if white != 255.0:  # gray; Pillow itself keeps the upper byte of 16-bit colour files
-            levels = np.asarray(image)  # [H, W]
-            gray = _floats_as_bytes(path, levels) if white == 1.0 else (levels >> 8).clip(0, 255).astype(np.uint8)
-            return np.repeat(gray[..., None], 3, axis=2)  # [H, W, 3]
-        return read_as_bytes(image)
+    with open_image(Path(path)) as image:
+        return pixels_of(image)
 
 
-def read_as_bytes(image: Image.Image) -> NDArray[np.uint8]:
-    """Return the pixels of an open image of 8 bits a channel: [H, W, 4] if it has transparency, else [H, W, 3]."""
+def pixels_of(image: Image.Image) -> NDArray[np.uint8]:
+    """Return the pixels of an opened image as :func:`read_image` does, [H, W, 3] or [H, W, 4]."""
+    white = white_of(image)
+    if white != 255.0:  # gray; Pillow itself keeps the upper byte of 16-bit colour files
+        levels = np.asarray(image)  # [H, W]
+        gray = (
+            _floats_as_bytes(image.info[SOURCE], levels)
+            if white == 1.0
+            else (levels >> 8).clip(0, 255).astype(np.uint8)
+        )
+        return np.repeat(gray[..., None], 3, axis=2)  # [H, W, 3]
     mode = "RGBA" if image.has_transparency_data else "RGB"
     return np.array(image if image.mode == mode else image.convert(mode))  # converting would copy it in any case
 
 
-def _floats_as_bytes(path: Path, levels: Floats) -> NDArray[np.uint8]:
+def _floats_as_bytes(path: str, levels: Floats) -> NDArray[np.uint8]:
     """Return floats from 0 to 1 as bytes; refuse others, except for what rounding would hide."""
     low, high = levels.min(), levels.max()
     if not (low >= -HALF_LEVEL and high <= 1.0 + HALF_LEVEL):  # True for NaN

@@ -11,6 +11,7 @@ owner of the disk put it there.
 
 import os
 import re
+import unicodedata
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -27,6 +28,18 @@ def is_file(path: Path) -> bool:
         return path.is_file()
     except (OSError, ValueError):  # too long, or with a zero byte
         return False
+
+
+def spelled_on_disk(folder: Path, name: str) -> str:
+    """Return the name by which a file is there: as given, or as another system would take it for the same.
+
+    Windows and macOS take ``a.JPG`` for ``a.jpg``, Windows writes backslashes, and macOS may decompose accents.
+    """
+    suffix = Path(name).suffix
+    stem = name[: len(name) - len(suffix)]
+    forms = [name, stem + suffix.lower(), stem + suffix.upper(), name.replace("\\", "/")]
+    forms += [unicodedata.normalize(form, name) for form in ("NFC", "NFD")]
+    return next((form for form in forms if ".." not in Path(form).parts and is_file(folder / form)), name)
 
 
 def name_inside(name: str, source: str | Path) -> str:

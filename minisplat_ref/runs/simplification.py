@@ -161,6 +161,7 @@ def fine_tune(run: Run, rows: Ints, iterations: int, *, holds_out: bool, on_step
         stats={DEGREES: present_degrees(gaussians.sh_rest)} if has_own_degrees else {},
         shared=shared,
         shared_adam=zero_moments(shared),
+        frame=run.scene.frame,
     )
     return train(
         run.scene,

@@ -55,7 +55,7 @@ def simplify_run(asked: Asked) -> dict[str, Any]:
         decision = decide(run, asked.target, asked.fine_tune)
         all_alike = finish(run, decision.reference.n_gaussians, asked.fine_tune)
         model = finish(run, decision.chosen.n_gaussians, asked.fine_tune)
-        save_model(folder, run.settings, model)
+        save_model(folder, run.settings, model, run.scene.frame)
         before, alike = (measure(run.scene, each, run.settings) for each in (run.model, all_alike))
         after = score(folder, run.scene, model, run.settings)
         result = {**to_result(run, asked, decision), "test": of_test_views(before, alike, after)}

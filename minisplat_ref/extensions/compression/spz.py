@@ -5,7 +5,7 @@ fractional bits, flags) and then, each for all Gaussians, centres, opacities, co
 harmonics.
 
 ===========  ==========================================================================================
-centres      3 x 24 bits, two's complement, in steps of ``2^-12`` (the fractional bits of the header)
+centres      3 x 24 bits, two's complement, in steps of ``2^-b``, for the b fractional bits of the header
 opacity      ``255 o``
 colour       ``255 (0.15 c + 0.5)`` of the coefficient c of degree 0, which is not its colour
 scales       ``16 (ln s + 10)``, 8 bits, so from e^-10 to e^5.94
@@ -14,8 +14,9 @@ rotation     version 2: x, y, z as ``127.5 (q + 1)`` with w >= 0; version 3: 2 b
 harmonics    ``128 c + 128``, to a multiple of 8 for degree 1 and of 16 above; RGB last
 ===========  ==========================================================================================
 
-Colours, scales and harmonics outside their ranges are clipped; centres outside are refused, since clipping would move
-them.
+Colours, scales and harmonics outside their ranges are clipped. Of the fractional bits we write 12, as Niantic does, so
+that centres reach 2048; fewer if one is further away, more if the Gaussians are so small that they would move by much
+of their size. What neither would hold is refused.
 
 **Axes.** The file's frame is RUB (x right, y up, z backward), as in OpenGL. That of a PLY of 3DGS is RDF (x right, y
 down, z forward). Niantic's library converts one to the other when its caller asks for it; we always do, in agreement
@@ -46,8 +47,9 @@ from minisplat_ref.validation import check_gaussians
 
 MAGIC = 0x5053474E  # "NGSP"
 VERSIONS = (3, 2)  # as levels: the finest first
-FRACTIONAL_BITS = 12
-REACH = 2.0 ** (23 - FRACTIONAL_BITS)  # 2048
+FRACTIONAL_BITS, FRACTIONAL_BITS_MAX = 12, 23
+STEP_MAX = 0.1  # of the median of the largest scales; the step of 12 bits is about 0.02 of it in a usual scene
+LOG_SCALE_MIN = -10.0
 COLOR_SCALE = 0.15
 SH_BITS = {1: 5, 2: 4, 3: 4}  # by degree
 GZIP_RATIO_MAX = 1032  # bytes made of one, by deflate
@@ -93,14 +95,8 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
     check_gaussians(gaussians, "Gaussians")
     n, n_rest = gaussians.sh_rest.shape[:2]
     means = gaussians.means.astype(np.float64) * _AXES
-    steps = np.floor(means * 2.0**FRACTIONAL_BITS + 0.5)  # [N, 3]
-    out = (steps < -(2**23)) | (steps >= 2**23)
-    if out.any():
-        row = int(np.flatnonzero(out.any(axis=1))[0])
-        raise InputError(
-            f"the centre of row {row} is {np.abs(means[row]).max():.6g} away, but SPZ reaches {REACH:g}"
-            f" ({int(out.any(axis=1).sum()):,} of {n:,} are too far): scale the scene down, or choose another format"
-        )
+    fractional_bits = _fractional_bits(means, gaussians.log_scales)
+    steps = np.floor(means * 2.0**fractional_bits + 0.5)  # [N, 3]
     opacities = 0.5 * (1.0 + np.tanh(0.5 * gaussians.opacity_logits.astype(np.float64)))  # the sigmoid
     quats = gaussians.quats.astype(np.float64) * np.concatenate([[1.0], _AXES])
     sh_rest = 128.0 * gaussians.sh_rest * SIGNS[:n_rest, None]  # [N, K-1, 3]
@@ -114,9 +110,41 @@ def encode(gaussians: Gaussians, level: int) -> bytes:
         _to_buckets(sh_rest),
     )
     sh_degree = math.isqrt(n_rest + 1) - 1
-    header = HEADER.pack(MAGIC, version, n, sh_degree, FRACTIONAL_BITS, 0, 0)
+    header = HEADER.pack(MAGIC, version, n, sh_degree, fractional_bits, 0, 0)
     compressor = zlib.compressobj(9, zlib.DEFLATED, 31)  # gzip, without a file name and a time
     return compressor.compress(header + b"".join(part.tobytes() for part in parts)) + compressor.flush()
+
+
+def _fractional_bits(means: Floats, log_scales: Floats) -> int:
+    """Return the number of fractional bits by which all centres [N, 3] are in reach and none moves by much.
+
+    Raises
+    ------
+    InputError
+        There is none, or most Gaussians are of a size that the format does not hold.
+    """
+    if not len(means):
+        return FRACTIONAL_BITS
+    sizes = log_scales.max(axis=1)  # [N]
+    n_smaller = np.count_nonzero(sizes < LOG_SCALE_MIN)
+    size, reach = float(np.exp(np.median(sizes))), float(np.abs(means).max())
+    if 2 * n_smaller > len(sizes):
+        raise InputError(
+            f"SPZ holds scales from {math.exp(LOG_SCALE_MIN):.2g} on, but {n_smaller:,} of {len(sizes):,} Gaussians are"
+            f" smaller, the median is {size:.2g}: scale the scene, or choose another format"
+        )
+    bits_max = FRACTIONAL_BITS_MAX
+    while bits_max >= 0 and math.floor(reach * 2.0**bits_max + 0.5) >= 2**23:
+        bits_max -= 1
+    bits = min(max(FRACTIONAL_BITS, math.ceil(-math.log2(STEP_MAX * size))), bits_max)
+    if bits < 0 or (bits < FRACTIONAL_BITS and 2.0**-bits > STEP_MAX * size):
+        row = int(np.argmax(np.abs(means).max(axis=1)))
+        raise InputError(
+            f"the centre of row {row} is {reach:.6g} away, where SPZ has steps of {2.0 ** -max(bits, 0):g}, and the"
+            f" median size is {size:.2g}: move the scene to the origin, remove what is far away, or choose another"
+            " format"
+        )
+    return bits
 
 
 def _to_bytes(values: Floats) -> NDArray[np.uint8]:
@@ -220,7 +248,7 @@ def _parse(content: bytes, source: str | Path) -> tuple[_Header, bytes]:
     _, version, n, degree, fractional_bits, _, _ = HEADER.unpack(head)
     if version not in VERSIONS:
         raise InputError(f"{source}: SPZ of version {version}, which is not supported: export it as version 2 or 3")
-    if degree >= len(BYTES_OF_REST) or fractional_bits > 23:
+    if degree >= len(BYTES_OF_REST) or fractional_bits > FRACTIONAL_BITS_MAX:
         raise InputError(
             f"{source}: damaged, spherical harmonics of degree {degree} and {fractional_bits} fractional bits;"
             f" {WAY_OUT}"
