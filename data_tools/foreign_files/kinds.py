@@ -6,7 +6,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from data_tools.foreign_files import masks, places, ranges
+from data_tools.foreign_files import leftovers, masks, names, places, ranges
 from minisplat_ref.arguments import HelpFormatter, Parser
 from minisplat_ref.reporting import markdown_table
 
@@ -15,7 +15,9 @@ Case = Callable[[Path], None]
 KINDS: Mapping[str, Mapping[str, Case]] = {
     "masks that leave nothing": masks.CASES,
     "size and place of the scene": places.CASES,
+    "files that are not used": leftovers.CASES,
     "ranges of pixel values": ranges.CASES,
+    "names": names.CASES,
 }
 """By what they are about; a case takes an empty folder and raises where something is wrong."""
 

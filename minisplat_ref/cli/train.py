@@ -31,7 +31,7 @@ N_ITERATIONS = 3000  # of recipes with a schedule
 SIMPLIFIED = "simplified"  # the run inside of a run that --max-drop and --max-bytes leave
 MINUTES_MIN = 0.1  # the first iterations take seconds, to compile what has not been
 
-DEFAULTS = {
+DEFAULTS: dict[str, Any] = {
     "downscale": 1,
     "test_every": 8,
     "undistort": False,

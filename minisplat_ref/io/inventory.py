@@ -27,6 +27,7 @@ from minisplat_ref.io.transforms import (
 from minisplat_ref.types import Camera, Floats, Scene, View
 
 MASK_FOLDERS = re.compile(r"(masks?|segmentations?|mattes?)(_png)?", re.IGNORECASE)
+MAPS = re.compile(r"_(depth|normal|disp|alpha|albedo|mask|seg)", re.IGNORECASE)  # r_0_depth_0001.png beside r_0.png
 SPLIT_FILES = re.compile(r"(test|train|val|split|train_test_split|train_list|test_list)\.(txt|json|csv)", re.IGNORECASE)
 SPLIT_KEYS = ("train_filenames", "val_filenames", "test_filenames")
 FRAME_KEYS = ("depth_file_path", "normal_file_path", "semantic_path")
@@ -207,31 +208,24 @@ def _of_transforms(path: Path) -> Inventory:
     folder = files[0].parent
     sets = [read_transforms(file) for file in files]
     frames = [frame for transforms in sets for frame in transforms["frames"]]
-    stems = {(folder / frame["file_path"]).with_suffix("").as_posix() for frame in frames}
+    stems = {_stem(folder, frame) for frame in frames}
     masks = {(folder / frame["mask_path"]).as_posix() for frame in frames if isinstance(frame.get("mask_path"), str)}
     photographs = set()
     for parent in sorted({Path(stem).parent for stem in stems}):
         for file in parent.iterdir() if parent.is_dir() else ():
             if file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".") and file.as_posix() not in masks:
                 photographs.add(file.with_suffix("").as_posix())
-    # A depth or normal map beside its photograph: r_0_depth_0001.png beside r_0.png.
-    photographs = {stem for stem in photographs if stem in stems or not _is_derived(stem, stems)}
+    photographs = {stem for stem in photographs if stem in stems or not MAPS.search(Path(stem).name)}
     used = f"{len(photographs & stems)} of {len(photographs)} photographs have cameras"
     missing = [Path(stem).name for stem in sorted(photographs - stems)]
     unused = [
         *_without_camera(missing),
         *_unnamed_masks(folder, masks),
-        *_splits_of(files, sets),
+        *_splits_of(files, sets, stems),
         *_clouds_of(files[0], sets[0]),
         *(f"{key} of {n} frames is not used" for key in FRAME_KEYS if (n := sum(key in frame for frame in frames))),
     ]
     return Inventory(used, tuple(unused))
-
-
-def _is_derived(stem: str, stems: set[str]) -> bool:
-    """Return whether a name begins with that of a photograph and an underscore."""
-    ends = (i for i, character in enumerate(stem) if character == "_")
-    return any(stem[:i] in stems for i in ends)
 
 
 def _unnamed_masks(folder: Path, masks: set[str]) -> list[str]:
@@ -245,7 +239,7 @@ def _unnamed_masks(folder: Path, masks: set[str]) -> list[str]:
     return said
 
 
-def _splits_of(files: Sequence[Path], sets: Sequence[Mapping[str, Any]]) -> list[str]:
+def _splits_of(files: Sequence[Path], sets: Sequence[Mapping[str, Any]], stems: set[str]) -> list[str]:
     """Say which splits of the photographs are not used."""
     folder = files[0].parent
     said = [
@@ -253,8 +247,26 @@ def _splits_of(files: Sequence[Path], sets: Sequence[Mapping[str, Any]]) -> list
         for key in SPLIT_KEYS
         if isinstance(sets[0].get(key), list)
     ]
-    others = [name for name in OTHER_SETS if (folder / name).is_file() and folder / name not in files]
-    return [*said, *(f"{name} is not used" for name in others), *_own_splits([folder])]
+    for name in OTHER_SETS:
+        if (folder / name).is_file() and folder / name not in files:
+            n_others = _count_others(folder / name, stems)
+            said += [f"{name} is not used, {n_others} of its images are in no other file"] if n_others else []
+    return [*said, *_own_splits([folder])]
+
+
+def _count_others(file: Path, stems: set[str]) -> int:
+    """Return how many frames of a file are of images that others do not list; 0 if it is no such file."""
+    try:
+        frames = read_transforms(file)["frames"]
+    except InputError:
+        return 0
+    return sum(_stem(file.parent, frame) not in stems for frame in frames)
+
+
+def _stem(folder: Path, frame: Mapping[str, Any]) -> str:
+    """Return the path of a frame's image without its suffix."""
+    path = folder / frame["file_path"]
+    return (path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path).as_posix()
 
 
 def _clouds_of(file: Path, transforms: Mapping[str, Any]) -> list[str]:
