@@ -6,7 +6,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from data_tools.foreign_files import leftovers, masks, names, places, ranges
+from data_tools.foreign_files import dialects, leftovers, masks, names, places, ranges
 from minisplat_ref.arguments import HelpFormatter, Parser
 from minisplat_ref.reporting import markdown_table
 
@@ -18,6 +18,7 @@ KINDS: Mapping[str, Mapping[str, Case]] = {
     "files that are not used": leftovers.CASES,
     "ranges of pixel values": ranges.CASES,
     "names": names.CASES,
+    "Gaussians of other programs": dialects.CASES,
 }
 """By what they are about; a case takes an empty folder and raises where something is wrong."""
 

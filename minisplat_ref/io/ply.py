@@ -5,7 +5,8 @@ The 3DGS layout holds one vertex per Gaussian: ``x y z``, normals (unused, zero)
 channel-major: all red coefficients, then all green, then all blue, whereas :class:`Gaussians` keeps RGB last. Rotations
 are wxyz, the frame is COLMAP's (x right, y down, z forward).
 
-Files are read by property name, so order, normals and extra properties do not matter; :mod:`.ply_file` reads the bytes.
+Files are read by property name, so order, normals and extra properties do not matter; :mod:`.ply_file` reads the bytes,
+:mod:`.ply_dialects` knows what other programs call the properties.
 Left out: compressed variants.
 """
 
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from minisplat_ref.constants import SH_C0, SH_DEGREE_MAX
 from minisplat_ref.errors import InputError
+from minisplat_ref.io.ply_dialects import as_usual, renamed
 from minisplat_ref.io.ply_file import n_rows_of, property_names, read_vertices, write_vertices
 from minisplat_ref.types import Floats, Gaussians
 from minisplat_ref.validation import check_quats
@@ -62,9 +64,10 @@ def load_ply(path: str | Path, population: Any = Gaussians) -> Any:
     Raises
     ------
     InputError
-        If the file is missing, truncated, not a PLY of Gaussians, or holds NaN, infinity or a zero quaternion.
+        If the file is missing, truncated, not a PLY of Gaussians, or holds NaN, a zero quaternion, or an infinity other
+        than those that :mod:`.ply_dialects` understands.
     """
-    columns = read_vertices(path)
+    columns = as_usual(path, read_vertices(path))
     rest_names = _sh_rest_names(columns, path)
     further = {field: _further_names(columns, field) for field in population._fields if field not in Gaussians._fields}
     names = (*MEANS, *SH_DC, *rest_names, "opacity", *SCALES, *QUATS)
@@ -115,8 +118,12 @@ def further_properties(path: str | Path) -> tuple[str, ...]:
     InputError
         If the file cannot be opened or its header is malformed.
     """
-    usual = {*MEANS, *NORMALS, *SH_DC, "opacity", *SCALES, *QUATS}
-    return tuple(name for name in property_names(path) if name not in usual and not name.startswith("f_rest_"))
+    names = property_names(path)
+    others = renamed(names)
+    usual = {*MEANS, *NORMALS, *SH_DC, "opacity", *SCALES, *QUATS, *others}
+    if not any(others.get(name, name) in SH_DC for name in names):
+        usual |= set(color_names(names) or ())
+    return tuple(name for name in names if name not in usual and not name.startswith("f_rest_"))
 
 
 def save_ply(path: str | Path, gaussians: Any) -> None:
@@ -298,6 +305,8 @@ def _way_out(path: str | Path, columns: Mapping[str, NDArray]) -> str:
     n_faces = n_rows_of(path, "face")
     if n_faces:
         return f"it is a mesh of {n_faces:,} faces, which is not rendered: give a trained point_cloud.ply"
+    if "opacity" in columns or any(name in columns for name in (*SCALES, *QUATS)):
+        return "export it again with all properties of Gaussians (colours may also be red, green, blue)"
     if all(name in columns for name in MEANS):
         return "it is a point cloud: give it as a scene's points, or give a trained point_cloud.ply"
     return "give a trained point_cloud.ply"

@@ -1,8 +1,8 @@
-"""``.spz``: Niantic's format, versions 2 and 3, read and written.
+"""``.spz``: Niantic's format, versions 2 to 4 read, 2 and 3 written.
 
-A file is a gzip stream. It holds a header of 16 bytes (magic, version, number N, degree of the spherical harmonics,
-fractional bits, flags) and then, each for all Gaussians, centres, opacities, colours, scales, rotations and higher
-harmonics.
+A file is a gzip stream, in version 4 a plain header and a zstandard frame for each part (:mod:`.spz_streams`). It holds
+a header of 16 bytes (magic, version, number N, degree of the spherical harmonics, fractional bits, flags) and then,
+each for all Gaussians, centres, opacities, colours, scales, rotations and higher harmonics.
 
 ===========  ==========================================================================================
 centres      3 x 24 bits, two's complement, in steps of ``2^-b``, for the b fractional bits of the header
@@ -26,12 +26,13 @@ derives from their polynomials. PlayCanvas' splat-transform reads what we write 
 
 Opacities 0 and 1 have no logit. They are read as a quarter of a quantisation level away from the end.
 
-Left out are version 1 (half floats), version 4 (zstandard, extensions), and the flag that a scene was trained with
-antialiasing, which is ignored when read and written as 0.
+Left out are version 1 (half floats), harmonics of degree 4, which are dropped with a warning, records of vendors, and
+the flag that a scene was trained with antialiasing, which is ignored when read and written as 0.
 """
 
 import math
 import struct
+import warnings
 import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,7 +41,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from minisplat_ref import memory
-from minisplat_ref.errors import InputError
+from minisplat_ref.constants import SH_DEGREE_MAX
+from minisplat_ref.errors import InputError, InputWarning, one_line
+from minisplat_ref.extensions.compression import spz_streams
 from minisplat_ref.io.formats import Format
 from minisplat_ref.types import Floats, Gaussians, Ints
 from minisplat_ref.validation import check_gaussians
@@ -55,7 +58,7 @@ SH_BITS = {1: 5, 2: 4, 3: 4}  # by degree
 GZIP_RATIO_MAX = 1032  # bytes made of one, by deflate
 HEADER = struct.Struct("<IIIBBBB")
 WAY_OUT = "copy or export the file again"
-BYTES_OF_REST = (0, 9, 24, 45)  # by degree
+BYTES_OF_REST = (0, 9, 24, 45, 72)  # by degree
 
 # Signs of the harmonics of degree 1 to 3 under (x, y, z) -> (x, -y, -z), by whether their polynomials are odd in y and
 # z together: y, z, x; xy, yz, 2zz-xx-yy, xz, xx-yy; y(3xx-yy), xyz, y(4zz-xx-yy), z(..), x(..), z(xx-yy), x(xx-3yy).
@@ -72,7 +75,7 @@ class _Header(NamedTuple):
     @property
     def sizes(self) -> dict[str, int]:
         """Bytes per Gaussian of each attribute, in the order of the file."""
-        rotation = 4 if self.version == 3 else 3
+        rotation = 3 if self.version == 2 else 4
         rest = BYTES_OF_REST[self.sh_degree]
         return {"means": 9, "opacities": 1, "colors": 3, "scales": 3, "rotations": rotation, "sh_rest": rest}
 
@@ -210,7 +213,8 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
         The file is damaged, of another kind or version, or claims more than it holds.
     """
     header, body = _parse(content, source)
-    raw, begin = {}, 0
+    raw: dict[str, NDArray[np.uint8]] = {}
+    begin = 0
     for name, size in header.sizes.items():
         part = np.frombuffer(body, np.uint8, header.n * size, begin)
         raw[name] = part.reshape(header.n, size)
@@ -220,9 +224,14 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
     words[..., 1:] = raw["means"].reshape(header.n, 3, 3)
     steps: Ints = words.view("<i4")[..., 0] >> 8  # [N, 3]
     levels = np.clip(raw["opacities"][:, 0].astype(np.float64), 0.25, 254.75)  # [N]
-    unpack_rotations: Any = _from_smallest_three if header.version == 3 else _from_vector
-    n_rest = header.sizes["sh_rest"] // 3
-    sh_rest = (raw["sh_rest"].reshape(header.n, n_rest, 3).astype(np.float32) - 128) / 128
+    unpack_rotations: Any = _from_vector if header.version == 2 else _from_smallest_three
+    n_rest = min(header.sizes["sh_rest"] // 3, len(SIGNS))
+    if header.sh_degree > SH_DEGREE_MAX:
+        message = f"{source}: its harmonics of degree {header.sh_degree} are cut off at degree {SH_DEGREE_MAX}"
+        warnings.warn(one_line(message), InputWarning, stacklevel=2)
+    sh_rest = (
+        raw["sh_rest"].reshape(header.n, header.sizes["sh_rest"] // 3, 3)[:, :n_rest].astype(np.float32) - 128
+    ) / 128
     fields = (
         steps * 2.0**-header.fractional_bits * _AXES,
         unpack_rotations(raw["rotations"]) * np.concatenate([[1.0], _AXES]),
@@ -239,7 +248,10 @@ def decode(content: bytes, source: str | Path) -> Gaussians:
 def _parse(content: bytes, source: str | Path) -> tuple[_Header, bytes]:
     """Return the header and all that follows it, after checking the header."""
     if content[:4] == struct.pack("<I", MAGIC):
-        raise InputError(f"{source}: SPZ of version 4 or later, which is not supported: export it as version 2 or 3")
+        streams = spz_streams.parse(content, source)
+        header = _Header(spz_streams.VERSION, streams.n, streams.sh_degree, streams.fractional_bits)
+        _check_header(header, source)
+        return header, spz_streams.unpack(streams, header.sizes, source)
     if content[:2] != b"\x1f\x8b":
         raise InputError(f"{source}: not an SPZ file, it is not packed by gzip; give one that ends in .spz")
     head, _ = _inflate(content, HEADER.size, source)
@@ -247,13 +259,9 @@ def _parse(content: bytes, source: str | Path) -> tuple[_Header, bytes]:
         raise InputError(f"{source}: not an SPZ file, its content does not begin with NGSP; {WAY_OUT}")
     _, version, n, degree, fractional_bits, _, _ = HEADER.unpack(head)
     if version not in VERSIONS:
-        raise InputError(f"{source}: SPZ of version {version}, which is not supported: export it as version 2 or 3")
-    if degree >= len(BYTES_OF_REST) or fractional_bits > FRACTIONAL_BITS_MAX:
-        raise InputError(
-            f"{source}: damaged, spherical harmonics of degree {degree} and {fractional_bits} fractional bits;"
-            f" {WAY_OUT}"
-        )
+        raise InputError(f"{source}: SPZ of version {version}, which is not supported: export it as version 2, 3 or 4")
     header = _Header(version, n, degree, fractional_bits)
+    _check_header(header, source)
     n_bytes = HEADER.size + n * sum(header.sizes.values())
     if n_bytes > min(GZIP_RATIO_MAX * len(content), memory.free_bytes()):
         raise InputError(f"{source}: {n:,} Gaussians cannot be in {len(content):,} packed bytes; {WAY_OUT}")
@@ -263,6 +271,15 @@ def _parse(content: bytes, source: str | Path) -> tuple[_Header, bytes]:
             f"{source}: truncated, {n_bytes:,} bytes and their end expected, {len(body):,} found; {WAY_OUT}"
         )
     return header, body[HEADER.size :]
+
+
+def _check_header(header: _Header, source: str | Path) -> None:
+    """Refuse a header of which two numbers are impossible."""
+    if header.sh_degree >= len(BYTES_OF_REST) or header.fractional_bits > FRACTIONAL_BITS_MAX:
+        raise InputError(
+            f"{source}: damaged, spherical harmonics of degree {header.sh_degree} and {header.fractional_bits}"
+            f" fractional bits; {WAY_OUT}"
+        )
 
 
 def _inflate(content: bytes, n_bytes: int, source: str | Path) -> tuple[bytes, bool]:
@@ -296,7 +313,7 @@ def describe(content: bytes, source: str | Path) -> list[tuple[str, str]]:
 
 SPZ = Format(
     suffix=".spz",
-    summary="Niantic's, versions 3 and 2",
+    summary="Niantic's, versions 3 and 2 (4 is read)",
     levels=tuple(f"version {version}" for version in VERSIONS),
     default_level=0,
     encode=encode,
