@@ -6,7 +6,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from data_tools.foreign_files import dialects, leftovers, masks, names, places, ranges
+from data_tools.foreign_files import dialects, leftovers, masks, names, places, ranges, terminals
 from minisplat_ref.arguments import HelpFormatter, Parser
 from minisplat_ref.reporting import markdown_table
 
@@ -19,6 +19,7 @@ KINDS: Mapping[str, Mapping[str, Case]] = {
     "ranges of pixel values": ranges.CASES,
     "names": names.CASES,
     "Gaussians of other programs": dialects.CASES,
+    "terminals and processes": terminals.CASES,
 }
 """By what they are about; a case takes an empty folder and raises where something is wrong."""
 

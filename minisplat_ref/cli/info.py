@@ -45,7 +45,7 @@ def add_parser(commands: Commands) -> None:
         formatter_class=HelpFormatter,
     )
     parser.add_argument("path", type=Path, metavar="FILE", help="any of the above")
-    parser.add_argument("--model", metavar="FOLDER", help="which COLMAP model of a scene (default sparse/0 or sparse)")
+    parser.add_argument("--model", metavar="M", help="folder of the COLMAP model in a scene (default sparse/0)")
     parser.set_defaults(run=run)
 
 

@@ -59,8 +59,7 @@ AFRESH = ("iterations", "lpips_weights", "drop_bad_steps")  # what may be new wh
 
 DESCRIPTION = """\
 Train Gaussians on SCENE, the folder of a COLMAP scene or of a transforms.json.
-DIR will hold report.html, point_cloud.ply, metrics.json, renders/ of the test
-views and checkpoints. Ctrl-C saves what there is; --resume continues.
+DIR will hold report.html, point_cloud.ply, metrics.json, renders/, checkpoints.
 """
 EPILOG = """\
 example:
@@ -82,7 +81,9 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="new folder for the results (default runs/SCENE-RECIPE)"
     )
-    parser.add_argument("--resume", type=Path, metavar="DIR", help="continue the run in DIR from its last checkpoint")
+    parser.add_argument(
+        "--resume", type=Path, metavar="DIR", help="continue the run in DIR; Ctrl-C saves what there is"
+    )
     parser.add_argument("--scene", dest="moved", metavar="PATH", help="with --resume: where its photographs are now")
     parser.add_argument("--rescale", action="store_true", help="with --resume: stretch its schedule to --iterations")
 
@@ -97,9 +98,7 @@ def add_parser(commands: Commands) -> None:
         "--background", type=color, metavar="R,G,B", help="behind the scene (default 0,0,0; white 255,255,255)"
     )
     data.add_argument("--undistort", action="store_true", help="remove lens distortion instead of refusing it")
-    data.add_argument(
-        "--model", metavar="FOLDER", help="which COLMAP model, relative to SCENE (default sparse/0 or sparse)"
-    )
+    data.add_argument("--model", metavar="M", help="folder of the COLMAP model in SCENE (default sparse/0)")
 
     training = parser.add_argument_group("training")
     training.add_argument(
