@@ -141,11 +141,30 @@ def _simplified(folder: Path) -> None:
 
 
 def _packed_far(folder: Path) -> None:
-    """SPZ cannot hold coordinates of UTM, and says how far it reaches."""
+    """Compact files hold float32, which has no room for coordinates in UTM: refused with the distance."""
     moved(folder, 1.0, UTM)
     _trained(folder)
-    line = refused("convert", folder / "run", folder / "far.spz", names="far.spz")
-    assert "5.41e+06" in line or "541" in line, line
+    for suffix in (".spz", ".msz", ".omg"):
+        line = refused("convert", folder / "run", folder / f"far{suffix}", names=f"far{suffix}")
+        assert "5.41e+06 from the origin, where float32 has steps of 0.5; write a PLY" in line, line
+    done("convert", folder / "run", folder / "far.ply")
+
+
+def _extension(folder: Path, recipe: str) -> None:
+    """Fields of an extension that are lengths are in the unit of the scene; files of float32 alone are refused."""
+    scene = moved(folder, 1e-3, ZERO)
+    options = ("--recipe", recipe, "--iterations", 30, "--test-every", "4")
+    done("train", scene, *options, "--out", folder / "run")
+    before = metrics_of(folder / "run")["psnr"]
+    assert before > 10
+    done("eval", folder / "run")
+    np.testing.assert_allclose(metrics_of(folder / "run")["psnr"], before, atol=1e-3)
+
+
+def _far_extension(folder: Path) -> None:
+    scene = moved(folder, 1.0, UTM)
+    line = refused("train", scene, "--recipe", "fans", "--iterations", 5, "--out", folder / "run", names=scene)
+    assert "5.429e+06 from the origin" in line and "subtract" in line
 
 
 def _packed_small(folder: Path) -> None:
@@ -180,7 +199,9 @@ CASES: dict[str, Callable[[Path], None]] = {
     "moved a little, ordinary": partial(_ordinary, scale=1.0, shift=(20.0, -30.0, 5.0)),
     "--init": _started,
     "simplify": _simplified,
-    "SPZ of UTM": _packed_far,
+    "compact files of UTM": _packed_far,
+    **{f"recipe {recipe}": partial(_extension, recipe=recipe) for recipe in ("antialiasing", "velocity")},
+    "fans in UTM": _far_extension,
     "SPZ of a small scene": _packed_small,
     "PLY alone": _alone,
 }

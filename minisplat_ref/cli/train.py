@@ -191,13 +191,14 @@ def _start(given: dict[str, Any]) -> int:
     from minisplat_ref.runs.first_use import compile_kernels
     from minisplat_ref.runs.notices import report_inventory, warn_of_scene
     from minisplat_ref.runs.proposed_size import propose
-    from minisplat_ref.runs.settings import Settings, load_lpips, load_photographs, recipe_of
+    from minisplat_ref.runs.settings import Settings, check_frame, load_lpips, load_photographs, recipe_of
 
     run_folder.check_free(folder)
     settings = Settings(scene=str(scene_path.resolve()), schedule_iterations=options["iterations"], **options)
     recipe = recipe_of(settings)
     _check_time(settings, recipe)
     scene = load_photographs(settings)
+    check_frame(settings, scene)
     if settings.eval_every:
         curve.check_views(scene)
     network = load_lpips(settings, scene)

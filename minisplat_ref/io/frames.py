@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from minisplat_ref.io.json_file import as_array, as_number
 from minisplat_ref.types import FILE_FRAME, Camera, Floats, Frame, Scene
 
 EXTENT_MIN, EXTENT_MAX = 1.0, 1e4  # world units of ordinary scenes: 100 or 5 times the near planes, at least
@@ -198,10 +199,9 @@ def frame_from_json(value: Any) -> Frame | None:
     """Return what :func:`frame_to_json` wrote, :data:`FILE_FRAME` for None; None if it is no frame."""
     if value is None:
         return FILE_FRAME
-    try:
-        x, y, z = map(float, value["origin"])
-        unit = float(value["unit"])
-    except (KeyError, TypeError, ValueError):
+    entries = value if isinstance(value, dict) else {}
+    origin, unit = as_array(entries.get("origin"), (3,)), as_number(entries.get("unit"))
+    if origin is None or not np.isfinite(origin).all() or not 0 < unit < math.inf:
         return None
-    is_usable = all(map(math.isfinite, (x, y, z, unit))) and unit > 0
-    return Frame((x, y, z), unit) if is_usable else None
+    x, y, z = origin.tolist()
+    return Frame((x, y, z), unit)

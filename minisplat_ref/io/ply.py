@@ -161,13 +161,13 @@ def save_ply(path: str | Path, gaussians: Any) -> None:
     columns: dict[str, NDArray] = {}  # where they are float32, views: a large population is not copied
     with np.errstate(over="ignore"):  # becomes infinite, which check_finite names
         for names, values in fields:
-            dtype = np.float64 if names == MEANS and _are_far(gaussians) else np.float32
+            dtype = np.float64 if names == MEANS and are_far(gaussians) else np.float32
             columns |= zip(names, (column.astype(dtype, copy=False) for column in values), strict=True)
     check_finite(path, columns)
     write_vertices(path, columns)
 
 
-def _are_far(gaussians: Any) -> bool:
+def are_far(gaussians: Any) -> bool:
     """Return whether centres lie so far from the origin that in float32 most would move by much of their size."""
     means, log_scales = gaussians.means, getattr(gaussians, "log_scales", None)
     if means.dtype != np.float64 or log_scales is None or not len(means):

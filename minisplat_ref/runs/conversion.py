@@ -15,7 +15,7 @@ from minisplat_ref.errors import InputError, InputWarning, one_line
 from minisplat_ref.extensions.extension import CORE, Extension, all_formats, find_format, load_extension, owner_of
 from minisplat_ref.io.formats import Format, read_content
 from minisplat_ref.io.frames import frame_of_means, place_scene
-from minisplat_ref.io.ply import further_properties
+from minisplat_ref.io.ply import are_far, further_properties
 from minisplat_ref.rendering import RenderSettings
 from minisplat_ref.training.compensation import with_compensation
 from minisplat_ref.training.sky import with_sky
@@ -164,6 +164,12 @@ def encode_as(format_: Format, path: Path, gaussians: Gaussians, level: int) -> 
     InputError
         A value does not fit the format.
     """
+    if are_far(gaussians):
+        distance = float(np.abs(np.median(gaussians.means, axis=0)).max())
+        raise InputError(
+            f"{path} cannot be written: its centres are some {distance:.6g} from the origin, where float32 has steps of"
+            f" {np.spacing(np.float32(distance)):.2g}; write a PLY, which holds them in float64"
+        )
     try:
         return format_.encode(gaussians, level)
     except InputError as error:

@@ -28,6 +28,7 @@ from minisplat_ref.io.frames import (
 )
 from minisplat_ref.io.json_file import as_array
 from minisplat_ref.io.npz import read_npz
+from minisplat_ref.io.ply import save_ply
 from minisplat_ref.lpips import Network, check_views, load_network
 from minisplat_ref.methods import RECIPES
 from minisplat_ref.runs.run_folder import CONFIG, POINT_CLOUD, SHARED, read_json_object
@@ -285,6 +286,23 @@ def load_photographs(settings: Settings, frame: Frame | None = None) -> Scene:
         model=settings.model,
     )
     return place_scene(scene, frame)
+
+
+def check_frame(settings: Settings, scene: Scene) -> None:
+    """Refuse a scene far from the origin for an extension whose own files hold float32 alone.
+
+    Raises
+    ------
+    InputError
+        Says how far it is.
+    """
+    owner = owner_of(settings.recipe, settings.extension) or CORE
+    if any(scene.frame.origin) and owner.save is not save_ply:
+        distance = float(np.linalg.norm(scene.frame.origin))
+        raise InputError(
+            f"{settings.scene} is {distance:.4g} from the origin, where files of extension {owner.name}, of float32,"
+            " cannot place it: subtract the mean of the cameras' positions from cameras and points"
+        )
 
 
 def load_lpips(settings: Settings, scene: Scene) -> Network | None:

@@ -22,6 +22,7 @@ import numpy as np
 from tqdm import tqdm
 
 from minisplat_ref.errors import InputError
+from minisplat_ref.io.frames import return_population
 from minisplat_ref.metrics import evaluate
 from minisplat_ref.runs.opened_run import HOLD_OUT_EVERY, Run, check_renderer, check_views
 from minisplat_ref.runs.rate_distortion import (
@@ -85,7 +86,8 @@ def ply_size(run: Run) -> PlySize:
     with tempfile.TemporaryDirectory() as folder:
         for n in (1, 2):
             path = Path(folder, f"{n}.ply")
-            run.owner.save(path, take(run.model.gaussians, np.arange(n)))
+            rows, units = take(run.model.gaussians, np.arange(n)), run.owner.representation.units
+            run.owner.save(path, return_population(rows, units, run.scene.frame))
             n_bytes.append(path.stat().st_size)
     row = n_bytes[1] - n_bytes[0]
     return PlySize(n_bytes[0] - row - 1, row)
